@@ -83,7 +83,7 @@ def timed(rig: Rig, rays: int, seconds: float) -> dict[str, Any]:
 @contextmanager
 def watched(cupy: Any, rig: Rig) -> Iterator[Split]:
     """Take the times of kernels and of copies of columns."""
-    split, engine = Split(cupy), rig._world.caster._engine
+    split, engine = Split(cupy), rig._caster.caster._engine
     run, kernel = engine._run, lidarpool.simulator.device._kernel  # type: ignore[attr-defined]
     send = Outbox.send
 
@@ -120,7 +120,7 @@ def columns(here: Here) -> Rows:
         row = timed(rig, rays, 3 * sizes.seconds)
         row["bus_share"] = row["mpoints_s"] * row["bytes_a_point"] / 1e3 / bus
         yield name, row
-    engine: Any = rig._world.caster._engine
+    engine: Any = rig._caster.caster._engine
     for chunk in (1 << 16, 1 << 18):  # copies of a chunk run while the next is cast
         with patch.object(engine, "chunk", chunk):
             yield f"chunks of {chunk:,} rays", timed(rig, sizes.batch, sizes.seconds)

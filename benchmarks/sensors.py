@@ -32,7 +32,7 @@ import numpy as np
 from lidarpool import Beams, Noise, Returns, Scene, Sensor, Spin, Survey, Track, load_sensor
 from lidarpool.scene.actors import Actor, box
 from lidarpool.scene.generated.city import city
-from lidarpool.simulator.returns import BatchReturns
+from lidarpool.simulator.points import BatchPoints
 from lidarpool.simulator.rig import Rig
 from raybeam import available_backends
 
@@ -103,12 +103,12 @@ def _on_ground(way: Track) -> Track:
     return replace(way, positions=np.asarray(way.positions) * (1, 1, 0))
 
 
-def turn(rig: Rig) -> list[BatchReturns]:
+def turn(rig: Rig) -> list[BatchPoints]:
     """Cast the one scan there is."""
     return list(rig.cast(0, rig.survey.scan_count))
 
 
-def columns(found: list[BatchReturns]) -> int:
+def columns(found: list[BatchPoints]) -> int:
     """Make all columns of a cloud, and count the points."""
     for returns in found:
         for column in returns.survey.stored_columns:

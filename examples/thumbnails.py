@@ -35,7 +35,7 @@ def run(client, path, total=24):
     writer, gpu, cpu = Pool.from_client(client).divide(rules).values()
     pipes = [Pipe(f"{way}-{client.id}", 2 * WINDOW, client) for way in ("keys", "written")]
     futures, done, sent = {}, 0, 0  # {number: future of a thumbnail that is not written yet}
-    with pipes[0].create() as keys, pipes[1].create() as written:
+    with pipes[0] as keys, pipes[1] as written:
         task = writer.submit(write, keys, written, path)
         while done < total and not task.done():
             for number in range(done + len(futures), min(done + WINDOW, total)):

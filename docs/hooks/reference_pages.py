@@ -123,8 +123,8 @@ def scenario_page() -> str:
     head = (
         "# Scenario files\n\n"
         f"{schema['description']} All of it may be left out: an empty file is the default survey. "
-        "Fields that are not in these tables are refused. `lidarpool init` writes a file with all "
-        "of them, and `lidarpool schema` prints this as JSON Schema.\n"
+        "Fields that are not in these tables are refused. `lidarpool init --all` writes a file "
+        "with all of them, and `lidarpool schema` prints this as JSON Schema.\n"
     )
     return _schema_page(head, schema, _SECTIONS)
 

@@ -63,7 +63,7 @@ class _Visit:
 
 
 @dataclass(frozen=True)
-class _Bundle:
+class _Packet:
     """Rays ready for traversal, in the local coordinates of the scene or of a mesh.
 
     Attributes
@@ -119,7 +119,7 @@ class _Nodes:
         ]
         self._child = tree.child.astype(np.intp)
 
-    def walk(self, rays: _Bundle, root: Indices, test: Callable[[_Pairs], None]) -> None:
+    def walk(self, rays: _Packet, root: Indices, test: Callable[[_Pairs], None]) -> None:
         """Take each ray down from its root, and call `test` with pairs of a ray and a leaf.
 
         The number of such a pair's node says what the leaf holds. `test` lowers `rays.limit`.
@@ -144,7 +144,7 @@ class _Nodes:
             if len(inner):
                 blocks.append(pairs.only(inner))
 
-    def _meets(self, rays: _Bundle, ray: Indices, node: Indices) -> tuple[Floats32, Bools]:
+    def _meets(self, rays: _Packet, ray: Indices, node: Indices) -> tuple[Floats32, Bools]:
         """Where rays enter children's boxes, and whether before they leave: (m * width,) each."""
         enter = np.zeros((len(ray), _WIDTH), np.float32)
         leave = np.empty_like(enter)
@@ -229,7 +229,7 @@ class NumpyBackend(Backend):
             (key >> _SHIFT).astype(np.int32),
         )
 
-    def _walk(self, rays: _Bundle, root: Indices, best: _Best, t_min: float) -> None:
+    def _walk(self, rays: _Packet, root: Indices, best: _Best, t_min: float) -> None:
         self._nodes.walk(rays, root, lambda leaves: self._test(rays, best, t_min, leaves))
 
     def _visit(
@@ -237,7 +237,7 @@ class NumpyBackend(Backend):
         leaves: _Pairs,
         origins: Floats,
         directions: Floats,
-        rays: _Bundle,
+        rays: _Packet,
         best: _Best,
         t_min: float,
     ) -> None:
@@ -265,7 +265,7 @@ class NumpyBackend(Backend):
             self._walk(inside, self._roots[self._scene.mesh[instance]], best, t_min)
             rays.limit[ray] = _limit(best.t[ray], rays.entry[ray])
 
-    def _test(self, rays: _Bundle, best: _Best, t_min: float, leaves: _Pairs) -> None:
+    def _test(self, rays: _Packet, best: _Best, t_min: float, leaves: _Pairs) -> None:
         """Test rays against the triangles of leaves and keep what is closer."""
         count = (leaves.node & ((1 << LEAF_BITS) - 1)) + 1
         first = leaves.node >> LEAF_BITS
@@ -306,13 +306,13 @@ def _bundle(
     entry: Floats,
     t_max: Floats | float,
     visit: _Visit | None = None,
-) -> _Bundle:
+) -> _Packet:
     # If the ray is too far away for float64 to place the start, it stays near the scene.
     start = np.clip(origins + entry[:, None] * directions, -2, 2).T.astype(np.float32)
     along = directions.T.astype(np.float32)
     along = np.where(np.abs(along) < TINY, np.copysign(np.float32(TINY), along), along)
     inverse = np.float32(1) / along
-    return _Bundle(
+    return _Packet(
         entry,
         start * inverse,
         inverse,

@@ -299,6 +299,13 @@ class Results(Iterator[Any]):
             raise TypeError("The length of a map is that of its iterables; one of them has none.")
         return int(self._length)
 
+    def __bool__(self) -> bool:
+        # Dask's `as_completed` asks first; it would take the results for futures.
+        raise TypeError(
+            "Partition.map gives results, not futures: loop over them, with ordered=False as they "
+            "complete, or list(partition.map(…)). Partition.submit gives a future for as_completed."
+        )
+
     def __repr__(self) -> str:
         state = "closed" if self._closed else f"{len(self._running)} tasks under way"
         last = self._stages[-1]

@@ -228,7 +228,7 @@ class Partition:
             CancelledError after `Client.restart`. To stop early, close or delete the iterator:
             waiting tasks are cancelled. ``len`` is the number of items if each iterable has one, so
             that progress bars such as ``tqdm(partition.map(…))`` work, and `Results.done` counts
-            those read.
+            those read. ``client.gather`` of it is an iterator of the same results.
 
         Raises
         ------

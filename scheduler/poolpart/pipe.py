@@ -48,7 +48,8 @@ class Pipe:
     """A bounded first-in-first-out connection that can be closed and can fail.
 
     The maker of the pipe calls `create`, passes it to the tasks on both ends (it is small when
-    pickled), and finally calls `delete`; it is also deleted when the maker's client closes or dies.
+    pickled), and finally calls `delete`, as a ``with`` block does; it is also deleted when the
+    maker's client closes or dies.
     Any number of producers and consumers may share it, in any process and thread; threads may
     share the object itself.
 
@@ -76,11 +77,11 @@ class Pipe:
     --------
     >>> from distributed import Client
     >>> client = Client(processes=False, dashboard_address=None)
-    >>> pipe = Pipe("numbers-1f3a", capacity=3, client=client).create()
-    >>> pipe.put((1, 2)); pipe.put("three"); pipe.close()
-    >>> list(pipe)
+    >>> with Pipe("numbers-1f3a", capacity=3, client=client) as pipe:
+    ...     pipe.put((1, 2)); pipe.put("three"); pipe.close()
+    ...     list(pipe)
     [(1, 2), 'three']
-    >>> pipe.delete(); client.close()
+    >>> client.close()
     """
 
     def __init__(self, name: str, capacity: int = 16, client: Client | None = None) -> None:
@@ -128,7 +129,7 @@ class Pipe:
         forget_pipes(self.client, [self.name])
 
     def __enter__(self) -> Pipe:
-        return self
+        return self.create()
 
     def __exit__(self, *_: object) -> None:
         self.delete()

@@ -6,7 +6,7 @@ import logging
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence, Set
 from dataclasses import replace
-from typing import Any
+from typing import Any, Self
 
 from distributed import Client
 
@@ -29,7 +29,8 @@ class Pool:
 
     Start with all of them (`Pool.from_client`); `partition` takes some out under a name and also
     returns the rest, which can be divided again. If workers were started with
-    ``--resources "GPU=1"`` and the like, the cluster is divided already: see `partitions`.
+    ``--resources "GPU=1"`` and the like, the cluster is divided already: ``pool["GPU"]`` finds a
+    partition. At the end of a ``with pool:`` block, those that it made are dissolved.
 
     Examples
     --------
@@ -44,6 +45,7 @@ class Pool:
     def __init__(self, client: Client, workers: Sequence[WorkerInfo]) -> None:
         self.client = client
         self.workers = tuple(workers)
+        self._made: list[str] = []  # partitions, also of its remainders
 
     @classmethod
     def from_client(cls, client: Client, declaring: Set[str] | None = None) -> Pool:
@@ -92,9 +94,20 @@ class Pool:
     def __repr__(self) -> str:
         hosts = {worker.host for worker in self.workers}
         gpus = {gpu for worker in self.workers for gpu in worker.gpus}
-        declared = Counter(name for worker in self.workers for name in worker.partitions)
-        parts = "".join(f", {name} {count}" for name, count in sorted(declared.items()))
+        try:
+            now = all_workers(self.client)
+        except (PoolError, OSError):  # its client was closed
+            now = list(self.workers)
+        declared = Counter(name for worker in now for name in worker.partitions)
+        parts = ", ".join(f"{name} {count}" for name, count in sorted(declared.items()))
+        parts = f"; partitions: {parts}" if parts else ""
         return f"<Pool: workers {len(self)}, hosts {len(hosts)}, GPUs {len(gpus)}{parts}>"
+
+    def __getitem__(self, name: str) -> Partition:
+        if (part := (parts := self.partitions()).get(name)) is None:
+            there = ", ".join(parts) or "none yet: divide makes some"
+            raise PoolError(f"There is no partition {name!r}; there are {there}.")
+        return part
 
     @property
     def names(self) -> list[str]:
@@ -150,6 +163,15 @@ class Pool:
                 )
 
     # -- dividing ----------------------------------------------------------------------
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._made:  # by now `dissolve` may have undone them
+            ask(self.client, dissolve, names=self._made, timeout_s=30.0)
+            forget_memberships()
+            self._made.clear()
 
     def divide(self, rules: Mapping[str, Rule]) -> dict[str, Partition]:
         """Divide this pool by rules, which stay in force, also when this client has gone.
@@ -296,6 +318,7 @@ class Pool:
             If their tasks have not ended; then everything stays.
         """
         names: list[str] = ask(self.client, dissolve, names=None, timeout_s=timeout_s)
+        self._made.clear()
         forget_memberships()
         return names
 
@@ -326,4 +349,7 @@ class Pool:
             if part.note:
                 logger.warning("Partition %r: %s", part.name, part.note)
         forget_memberships()
-        return parts, Pool(self.client, left)
+        self._made += parts
+        remainder = Pool(self.client, left)
+        remainder._made = self._made
+        return parts, remainder

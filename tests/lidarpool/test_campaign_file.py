@@ -263,6 +263,19 @@ def test_a_mesh_file_may_be_the_base(campaign):
     assert [(value,) * 3 for value in values(found, "scene.files.0.scale")[:3]] == scales
 
 
+def test_values_may_have_short_forms(campaign, folder):
+    (folder / "base.yaml").write_text("actors: [{name: Van, box: [5, 2, 2], at: [9, 0, 0]}]\n")
+    found = campaign({
+        "sensor": {"each": ["velodyne/vlp16", "ouster/os1-64"]},
+        "mount": {"choice": [[0, 0, 1.5]]},
+        "actors.Van.at": {"choice": [[8, 1, 0]]},
+    })  # fmt: skip
+    made = found.scenario(1)
+    assert values(found, "sensor")[:2] == ["velodyne/vlp16", "ouster/os1-64"]
+    assert (made.sensor.model, made.mount.position) == ("ouster/os1-64", (0, 0, 1.5))
+    assert made.actors[0].at.position == (8, 1, 0)
+
+
 # --- noise, splits, what is kept ----------------------------------------------------------------
 
 
@@ -427,6 +440,7 @@ WRONG = {
         {"actors.0.box.0": {"uniform": [1, 2]}, "actors.Van.box.0": {"uniform": [1, 2]}},
         "actors.0.box.0 and actors.Van.box.0 lead to the same field",
     ),
+    "other section": ({"performance": {"choice": ["ideal"]}}, "performance is a field of sensor"),
     "within": (
         {"scene": {"choice": ["hall.glb"]}, "scene.files.0.file": {"choice": ["hall.glb"]}},
         "scene is chosen as a whole",

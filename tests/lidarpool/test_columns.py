@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from lidarpool import Cloud, Column, LidarpoolError, save_cloud
 from lidarpool.columns.table import ALWAYS, OPTIONAL, TABLE, chosen, stored
-from lidarpool.simulator.returns import BatchReturns
+from lidarpool.simulator.points import BatchPoints
 
 # -- the table ------------------------------------------------------------------------------------
 
@@ -21,7 +21,7 @@ def test_the_table_describes_every_column():
     assert next(iter(TABLE)) == "scan" and set(TABLE) >= {"time", "intensity", "class"}
     for name, column in TABLE.items():
         assert column.name == name and column.meaning and not column.meaning.endswith(".")
-        assert name == "scan" or hasattr(BatchReturns, column.source or name), name
+        assert name == "scan" or hasattr(BatchPoints, column.source or name), name
     assert len({column.in_files for column in TABLE.values()}) == len(TABLE)
 
 
@@ -135,14 +135,46 @@ def test_a_column_that_is_not_there():
         cloud_of()["time"]
     with pytest.raises(AttributeError, match="no attribute or column 'time'"):
         _ = cloud_of().time
-    assert not hasattr(cloud_of(), "__array__")
+    assert not hasattr(cloud_of(), "__array_interface__")
+
+
+def test_numpy_takes_a_cloud_as_positions():
+    cloud = cloud_of()
+    assert np.shares_memory(np.asarray(cloud), cloud.positions)
+    assert np.asarray(Cloud(np.ones((2, 3), np.float32), {})).dtype == np.float64
+    assert np.asarray(cloud, np.float32).dtype == np.float32
+    assert np.linalg.norm(cloud, axis=1).shape == (5,)
+
+
+def test_points_are_selected_as_rows_of_an_array():
+    cloud = cloud_of()
+    assert np.shares_memory(cloud[1:3].positions, cloud.positions)
+    for rows in (slice(1, 3), [1, 2], np.array([2, 1]), cloud.scan == 1, [-1], [], cloud.scan < 0):
+        some = cloud[rows]
+        index = np.arange(5)[rows] if len(some) else np.arange(0)
+        assert some.positions.tolist() == cloud.positions[index].tolist()
+        assert some.mine.tolist() == cloud.mine[index].tolist() and some.scan.dtype == np.int32
+    assert len(cloud.head()) == len(cloud.head(9)) == 5 and len(cloud.head(2)) == 2
+
+
+@pytest.mark.parametrize("key", [2, [9], 0.5, [0.5], None, np.ones((5, 3), bool), [True], True])
+def test_what_selects_no_points(key):
+    with pytest.raises(LidarpoolError, match=r"cloud of 5 are a slice, as cloud\[:100\], a mask"):
+        cloud_of()[key]
+
+
+def test_a_notebook_shows_the_columns_and_the_first_points():
+    html = Cloud(np.ones((7, 3)), {"range": np.full(7, 0.5), "mine": np.zeros(7)})._repr_html_()
+    assert "7 points" in html and html.count("<tr>") == 2 + 5
+    assert "<td>float32</td>" in html and "<td>0.5</td>" in html and "<td>mine</td>" in html
+    assert "0 points" in Cloud(np.empty((0, 3)), {})._repr_html_()
 
 
 def test_a_column_of_ones_own_is_held_to_its_description():
     own = (Column("mine", "uint8", "dB", "how loud"),)
     cloud = Cloud(np.zeros((2, 3)), {"mine": [1, 2]}, own)
     assert cloud.mine.dtype == np.uint8 and cloud.table == own
-    assert cloud.part(slice(1, 2)).table == own
+    assert cloud[1:2].table == own
     with pytest.raises(LidarpoolError, match="mine holds 1 to 256"):
         Cloud(np.zeros((2, 3)), {"mine": [1, 256]}, own)
 

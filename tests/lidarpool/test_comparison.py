@@ -144,7 +144,7 @@ def test_distances_between_parallel_planes():
         (0.02, 0.0), (0.05, 1.0),
     ]  # fmt: skip
     # Half of A has no B beside it: all that B has is found, half of what A has is right.
-    half = b.part(np.flatnonzero(plane[:, 0] < 15))
+    half = b[plane[:, 0] < 15]
     score = compare(a, half, distances_m=[0.05]).figures["distances"]["f_scores"][0]
     assert (score["precision"], score["recall"]) == (0.5, 1.0)
     assert score["f1"] == pytest.approx(2 / 3)
@@ -407,7 +407,7 @@ def test_results_with_the_same_rays_are_paired_by_ray(tmp_path, told):
     for name, errors, kept in (("a", noise, there), ("b", 0 * noise, there | True)):
         (tmp_path / name).mkdir()
         places = start + (ranges.ravel() + errors)[:, None] * way
-        made = Cloud(places, columns, sweeps=lambda: sweeps).part(np.flatnonzero(kept))
+        made = Cloud(places, columns, sweeps=lambda: sweeps)[kept]
         save_cloud(made, tmp_path / name / "cloud.ply")
         sweeps.save(tmp_path / name / "sweeps.npz")
     found = compare(tmp_path / "a", tmp_path / "b")

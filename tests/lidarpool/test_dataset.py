@@ -123,7 +123,7 @@ def test_nuscenes_has_a_scene_for_each_job(written, job, sweeps):
         assert count == scene["nbr_samples"] == TURNS
     cloud = job(7)
     rows = np.fromfile(place / "samples/rear_left/007/000002.pcd.bin", "<f4").reshape(-1, 5)
-    points = cloud.part(np.flatnonzero(cloud.scan // SCANS == TURNS + 2))
+    points = cloud[cloud.scan // SCANS == TURNS + 2]
     inside = sweeps.in_sensor(TURNS + 2, points.positions)
     np.testing.assert_allclose(rows[:, :3], inside, atol=1e-5)
     np.testing.assert_allclose(rows[:, 3], points.intensity * 255, rtol=1e-6)
@@ -233,7 +233,7 @@ def test_parquet_with_as_many_files_as_sweeps(scene, sweeps, job, tmp_path):
     """One of each: a file of Parquet is not a sweep, and has no boxes of actors."""
     one = Survey(Sensor.grid(360, 4), [(0, 0, 1)], steps=SCANS)
     only, cloud = Sweeps.of(one, scene), job(0)
-    cloud = cloud.part(np.flatnonzero(cloud.scan < SCANS))
+    cloud = cloud[cloud.scan < SCANS]
     assert len(only) == 1 and only.actors
     DataSet(Storage.at(tmp_path), "parquet").write_job(JobRow(0, "0"), cloud, only)
     with np.load(tmp_path / "boxes/0.npz") as kept:

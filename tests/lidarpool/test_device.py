@@ -41,7 +41,7 @@ from lidarpool.sensor.models import load_sensor
 from lidarpool.sensor.optics import Returns
 from lidarpool.sensor.trajectory import Stations
 from lidarpool.simulator.batch import columns_of
-from lidarpool.simulator.device import OPTIONS, DeviceReturns
+from lidarpool.simulator.device import OPTIONS, DevicePoints
 from lidarpool.simulator.memory import cast_bytes
 from lidarpool.simulator.rig import Rig
 from raybeam import registry
@@ -126,7 +126,7 @@ def same(scene, survey, backend, cuts):
     assert tally == counted
     made, plain = (list(rig.cast(*cuts[:2])) for rig in rigs)
     for mine, other in zip(made, plain, strict=True):
-        assert isinstance(mine, DeviceReturns)
+        assert isinstance(mine, DevicePoints)
         assert np.array_equal(mine.counts, other.counts)
         assert np.array_equal(mine.hits, other.hits)
         rows = np.arange(0, len(other), 7)
@@ -156,7 +156,7 @@ def test_columns_after_instances_have_moved(scene, scenes, backend):
         rigs = [rig.moved(owner, Pose((1.0, 2.0, 0.1), yaw)) for rig in rigs]
         got, want = (cast_between(rig, survey, (0, survey.scan_count)) for rig in rigs)
         assert got == want
-    assert isinstance(next(rigs[0].cast(0, 1)), DeviceReturns)
+    assert isinstance(next(rigs[0].cast(0, 1)), DevicePoints)
 
 
 def test_a_survey_that_hits_nothing(scenes, backend):
@@ -195,7 +195,7 @@ def test_pulses_and_noise_are_made_on_the_host(name, scenes, backend):
     rigs = [Rig(scenes["plain"], survey, which) for which in (backend, "numpy")]
     got, want = (cast_between(rig, survey, (0, survey.scan_count)) for rig in rigs)
     assert got == want
-    assert not isinstance(next(rigs[0].cast(0, 1)), DeviceReturns)
+    assert not isinstance(next(rigs[0].cast(0, 1)), DevicePoints)
 
 
 @pytest.mark.parametrize("scene", ["plain", "instances", "both"])

@@ -23,9 +23,9 @@ from lidarpool import (
 from lidarpool.scene.actors import Actor, box
 from lidarpool.scene.robot import Hinge, LinkPath
 from lidarpool.sensor.trajectory import Stations, quaternions_of, rotations_of, velocities
-from lidarpool.simulator.hits import AIR, FALSE_ALARM, Hits
+from lidarpool.simulator.returns import AIR, FALSE_ALARM, PulseReturns
 from lidarpool.simulator.rig import Rig
-from lidarpool.simulator.separation import AirHits, separated
+from lidarpool.simulator.separation import separated
 
 SPEED, RADIUS = 25.0, 50.0  # of the train
 RATE = SPEED / RADIUS
@@ -223,9 +223,10 @@ def test_drops_are_at_rest(subrays):
 
 def test_drops_in_an_open_sky_have_a_velocity():
     """Where no ray of all that are cast together hits a surface."""
-    air = AirHits(np.arange(5), np.full(5, 3.0), np.ones(5), np.full(5, -2.0))
+    drops = np.full(5, -1, np.int32)
+    air = PulseReturns(np.arange(5), np.full(5, 3.0), drops, np.ones(5), velocity=np.full(5, -2.0))
     none = np.zeros(0)
-    hits = Hits(np.zeros(0, int), none, np.zeros(0, np.int32), none, velocity=none)
+    hits = PulseReturns(np.zeros(0, int), none, np.zeros(0, np.int32), none, velocity=none)
     assert separated(hits, 0.5, air=air).velocity.tolist() == [-2.0] * 5
 
 

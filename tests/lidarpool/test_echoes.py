@@ -39,9 +39,10 @@ from lidarpool.scene.scene_mesh import SceneMesh
 from lidarpool.scene.shapes import seed_objects
 from lidarpool.sensor.materials import extinction, fresnel
 from lidarpool.sensor.noise import Purpose, raw
-from lidarpool.simulator.hits import Hits
+from lidarpool.simulator.returns import PulseReturns
 from lidarpool.simulator.rig import Rig
-from lidarpool.simulator.separation import chosen, separated
+from lidarpool.simulator.selection import chosen
+from lidarpool.simulator.separation import separated
 
 # -- random numbers ------------------------------------------------------------------------------
 
@@ -131,7 +132,7 @@ MODES = {
 
 @pytest.mark.parametrize("mode", MODES)
 def test_modes(mode):
-    hits = Hits(
+    hits = PulseReturns(
         np.array([1, 4, 4, 4, 4]),
         np.array([2.0, 9.0, 3.0, 7.0, 5.0]),
         np.arange(5, dtype=np.int32),
@@ -248,7 +249,7 @@ def test_weak_returns_are_lost_by_the_model(distance):
     sigma = math.sqrt(MANY * share * (1 - share))
     assert abs(len(found["range"]) - MANY * share) < 3 * sigma + 2
     batch = found["batch"]
-    assert len(found["range"]) == batch.found.hits.sum() == tally_of([batch]).sum()
+    assert len(found["range"]) == batch.hits.sum() == tally_of([batch]).sum()
 
 
 # -- the same bits however it is batched ----------------------------------------------------------
@@ -283,7 +284,7 @@ def test_batches_and_chunks_leave_no_trace(options, path, per_turn, monkeypatch)
     whole = cast_between(rig, survey, [0, 28])
     assert len(whole[0]["x"]) > 200
     assert cast_between(rig, survey, [0, 1, 5, 14, 17, 28]) == whole
-    monkeypatch.setattr("lidarpool.simulator.echoes.CHUNK_RAYS", 100)
+    monkeypatch.setattr("lidarpool.simulator.pulses.CHUNK_RAYS", 100)
     assert cast_between(rig, survey, list(range(29))) == whole
 
 
@@ -295,8 +296,8 @@ def test_returns_are_thinned_out_scan_by_scan():
     assert every["returns"].max() > 1
     for name in COLUMNS:
         assert np.array_equal(every[name][::3], third[name])
-    assert every["batch"].found.hits.tolist() == third["batch"].found.hits.tolist()
-    assert every["batch"].found.hits.sum() == len(every["ray"])
+    assert every["batch"].hits.tolist() == third["batch"].hits.tolist()
+    assert every["batch"].hits.sum() == len(every["ray"])
 
 
 def test_one_subray_without_noise_is_the_plain_ray():

@@ -123,7 +123,7 @@ def written(cloud, sweeps, tmp_path):
 
 
 def of_sweep(cloud, sweep):
-    return cloud.part(np.flatnonzero(cloud.scan // 36 == sweep))
+    return cloud[cloud.scan // 36 == sweep]
 
 
 def test_a_sweep_is_a_turn_and_has_the_pose_of_its_first_ray(survey, sweeps):
@@ -204,7 +204,7 @@ def test_kitti_poses_bring_the_sweeps_of_a_sensor_together(written, cloud):
             np.testing.assert_array_equal(labels >> 16, points.object + 1)
             firsts.append(rows[:, :3] @ back.T @ pose[:, :3].T + pose[:, 3])
         # All in the axes of the first pose: distances are those in the world.
-        own = cloud.part(np.flatnonzero(cloud.sensor == sensor)).positions
+        own = cloud[cloud.sensor == sensor].positions
         placed = np.concatenate(firsts)
         apart = np.linalg.norm(placed[1:] - placed[:-1], axis=1)
         np.testing.assert_allclose(apart, np.linalg.norm(own[1:] - own[:-1], axis=1), atol=1e-4)
@@ -527,7 +527,7 @@ def test_boxes_of_tilted_sensors_hold_the_points_of_one_turn(scene, tmp_path, ti
         folder = tmp_path / "kitti/sequences" / sequence
         camera, centre, turn, size = in_camera(folder, 0, len(sweeps.objects) + 1)
         assert inside_box(camera, centre, turn, size, 0.02).all()
-    seen = cloud.part(slice(200, 400))  # by the second sensor alone
+    seen = cloud[200:400]  # by the second sensor alone
     save_cloud(seen, tmp_path / "nuscenes", format="nuscenes")
     (table,) = (tmp_path / "nuscenes").glob("v1.0-*/sample_annotation.json")
     row, other = json.loads(table.read_text())
@@ -574,7 +574,7 @@ def test_a_cloud_is_saved_in_the_format_of_its_ending(cloud, sweeps, tmp_path):
     assert save_cloud(bare, tmp_path / "a.laz") == []
     las = laspy.read(tmp_path / "a.laz")
     assert len(las) == len(cloud) and las.header.scales[0] == 0.001
-    save_cloud(known.part(slice(9)), tmp_path / "b.las")
+    save_cloud(known[:9], tmp_path / "b.las")
     assert laspy.read(tmp_path / "b.las").header.scales[0] == sweeps.precision_m
     left_out = save_cloud(known, tmp_path / "c.mcap", layout="ouster")
     assert left_out[:2] == ["scan", "object"] and "range" not in left_out
@@ -607,7 +607,7 @@ def test_a_cloud_is_saved_in_the_format_of_its_ending(cloud, sweeps, tmp_path):
             Cloud(cloud.positions, {}, sweeps=lambda: sweeps), tmp_path / "x", format="kitti"
         )
     with pytest.raises(LidarpoolError, match="not in the order of their scans"):
-        save_cloud(known.part(np.arange(len(cloud))[::-1]), tmp_path / "x.e57")
+        save_cloud(known[::-1], tmp_path / "x.e57")
     shorter = replace(sweeps, scans=sweeps.scans[:6], begins_ns=sweeps.begins_ns[:5])
     with pytest.raises(LidarpoolError, match="or of another survey than the sweeps"):
         save_cloud(replace(cloud, sweeps=lambda: shorter), tmp_path / "x.mcap")

@@ -213,7 +213,7 @@ def test_copies_of_a_node(tmp_path):
         load(path, header, body)
 
 
-GLASS = "has transparent materials without holes, taken as solid: Leaf; transparent: pass"
+GLASS = 'without holes, taken as solid: Leaf; Material(…, transparent="pass") makes objects glass'
 
 
 @pytest.mark.parametrize(

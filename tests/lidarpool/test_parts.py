@@ -210,6 +210,8 @@ def test_a_cloud_is_the_same_however_it_is_divided(tmp_path_factory, counts, poi
         values = [v for part in parts for v in part.columns[name].tolist()]
         assert whole[name].tolist() == values
     assert np.array_equal(whole.bounds, cloud.bounds)
+    assert np.array_equal(np.asarray(cloud), np.asarray(whole))
+    assert cloud._repr_html_() == whole._repr_html_() and f"{len(whole)} points" in repr(cloud)
     chunks = list(cloud.chunks(points))
     assert all(len(chunk) == points for chunk in chunks[:-1])
     assert len(chunks) == -(-len(cloud) // points)

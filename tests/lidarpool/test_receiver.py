@@ -29,7 +29,7 @@ from lidarpool import (
 )
 from lidarpool.scene.scene_mesh import SceneMesh
 from lidarpool.sensor.noise import THRESHOLD_SIGMAS
-from lidarpool.simulator.hits import BLOOMING, CROSSTALK, FALSE_ALARM, SURFACE
+from lidarpool.simulator.returns import BLOOMING, CROSSTALK, FALSE_ALARM, SURFACE
 from lidarpool.simulator.rig import Rig
 from raybeam import available_backends
 

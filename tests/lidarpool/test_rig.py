@@ -16,7 +16,7 @@ from lidarpool.pipeline import rigs
 from lidarpool.pipeline.failures import naming_scans
 from lidarpool.scene.actors import box
 from lidarpool.scene.shapes import seed_objects
-from lidarpool.simulator import world
+from lidarpool.simulator import scene_caster
 from lidarpool.simulator.batch import columns_of
 from lidarpool.simulator.rig import Rig
 from poolpart import WorkerLeft
@@ -165,7 +165,7 @@ def test_a_rig_of_another_survey_shares_the_trees_and_casts_the_same(monkeypatch
             built.append(len(faces))
             super().__init__(vertices, faces, **options)
 
-    monkeypatch.setattr(world, "RayCaster", Counted)
+    monkeypatch.setattr(scene_caster, "RayCaster", Counted)
     scene = Scene.from_meshes(seed_objects(rings=8, segments=12))
     car = Actor(box("Car", (4.5, 1.8, 1.5)), Track([0, 2], [[6, -3, 0.5], [6, 7, 0.5]]))
     surveys = [survey(poses=TURNED), survey(trajectory=CART)]

@@ -495,11 +495,21 @@ def test_a_scenario_has_its_robot_and_its_sensor_on_a_link(folder):
     )
 
 
+def test_a_robot_that_stands_moves_its_joints_by_the_clock_of_the_survey(folder):
+    data = SCENARIO | {"actors": [ROVER | {"at": {"position": [9, 0, 0], "yaw_deg": 90}}]}
+    actors = {a.name: a for a in build(Scenario.from_data(data, folder=folder)).scene.actors}
+    assert actors["Rover/base_link"].trajectory.pose(0, 1e9).yaw_deg == pytest.approx(90)
+    turret = actors["Rover/shoulder_block"].trajectory.pose(0, 1e9)
+    expected = [9, 0.3, 0.4, 90 + np.degrees(0.5)]
+    assert np.allclose([*turret.position, turret.yaw_deg], expected)
+
+
 @pytest.mark.parametrize(
     ("change", "words"),
     [
         ({"trajectory": None, "poses": [[0, 0, 1]]}, "give the survey a trajectory"),
         ({"actors": []}, "no robot is the carrier"),
+        ({"actors": [ROVER | {"at": [0, 0, 0]}]}, "no robot is the carrier"),
         ({"mount": {"link": "lidor"}}, "no robots on the carrier have.*Did you mean 'lidar'"),
         ({"mount": {"link": "hand"}}, "'hand', which joints.csv moves"),
         ({"actors": [ROVER | {"name": name} for name in "AB"]}, "which 2 robots on the carrier"),

@@ -157,7 +157,7 @@ def assert_image(image, sweep, sensor, number):
     """The nearest ranges of a sweep, firing by firing."""
     steps = sensor.steps_of_turn(number)
     begins = np.array([sensor.firings(step)[0] for step in steps]) * sensor.channels
-    sweep = sweep.part(np.flatnonzero(sweep.return_number == 1))
+    sweep = sweep[sweep.return_number == 1]
     expected = np.full(image.size, np.inf, np.float32)
     expected[(begins - begins[0])[sweep.scan - steps.start] + sweep.ray] = sweep.range
     assert np.isfinite(expected).sum() > 20
@@ -206,7 +206,7 @@ def test_each_name_has_random_numbers_of_its_own(scene):
     names = ("left", "right")
     clouds = [Scanner(scene, GRID, name=name, **given, **options).sweep(HERE) for name in names]
     for cause in (0, 1, 2):
-        some = [cloud.part(np.flatnonzero(cloud.cause == cause)) for cloud in clouds]
+        some = [cloud[cloud.cause == cause] for cloud in clouds]
         rays = [{*zip(cloud.scan.tolist(), cloud.ray.tolist(), strict=True)} for cloud in some]
         assert len(rays[0]) > 10 and len(rays[0] - rays[1]) > 0.02 * len(rays[0]), cause
     mounted = Mounted(GRID, name="left")

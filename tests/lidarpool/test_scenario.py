@@ -2,6 +2,7 @@
 
 import re
 from datetime import UTC, datetime
+from importlib.resources import files
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from trimesh.exchange.gltf import export_glb
 
+from lidarpool import Scene
 from lidarpool.base.errors import LidarpoolError
 from lidarpool.base.fingerprint import fingerprint
 from lidarpool.scenario.advice import advice
@@ -147,6 +149,44 @@ def test_numbers_as_everybody_writes_them(scenario):
     assert (loaded.cloud.precision_m, loaded.sensor.step_deg) == (0.001, 20)
 
 
+def test_short_forms_say_the_same(scenario):
+    short = (
+        "sensors: {a: vlp16, b: {model: ouster/os1-64, mount: [0, 0, 1]}}\n"
+        "navigation: {imu: {mount: [1, 0, 0]}}\nposes: [[0, 0, 1]]\n"
+    )
+    long = (
+        "sensors: {a: {model: velodyne/vlp16}, b: {model: ouster/os1-64, mount: {position: "
+        "[0, 0, 1]}}}\nnavigation: {imu: {mount: {position: [1, 0, 0]}}}\nposes: [[0, 0, 1]]\n"
+    )
+    one, other = (fingerprint(build(scenario(text)).survey) for text in (short, long))
+    assert one == other
+    short, long = (
+        "sensor: vlp16\nmount: [0, 0, 2]",
+        ("sensor: {model: velodyne/vlp16}\nmount: {position: [0, 0, 2]}"),
+    )
+    one, other = (fingerprint(build(scenario(text)).survey) for text in (short, long))
+    assert one == other
+
+
+def test_a_model_of_ones_own_is_a_file_beside_the_scenario(scenario, tmp_path):
+    data = files("lidarpool.sensor") / "data" / "velodyne" / "vlp16.yaml"
+    (tmp_path / "mine.yaml").write_text(data.read_text().replace("VLP-16", "Mine"))
+    made = scenario("sensor: mine.yaml")
+    assert made.files == (tmp_path / "mine.yaml",)
+    assert build(made).survey.carried[0].sensor.name == "Velodyne Mine"
+
+
+def test_actors_that_stand(scenario):
+    text = "actors:\n  - {name: A, box: [2, 1, 1], at: [9, 8, 1]}\n"
+    text += "  - {name: B, box: [2, 1, 1], at: {position: [9, 8, 1], yaw_deg: 90}}\n"
+    straight, turned = build(scenario(text)).scene.actors
+    for time in (0, 1e9, 1e12):
+        low, high = (corner(straight.placed(time).vertices, 0) for corner in (np.min, np.max))
+        np.testing.assert_allclose([low, high], [[8, 7.5, 1], [10, 8.5, 2]], atol=1e-12)
+    low, high = (corner(turned.placed(5e9).vertices, 0) for corner in (np.min, np.max))
+    np.testing.assert_allclose([low, high], [[8.5, 7, 1], [9.5, 9, 2]], atol=1e-12)
+
+
 IDENTITY = "[[1,0,0,0],[0,1,0,0],[0,0,1,0],[0,0,0,1]]"
 BAD = [
     ("sensor: {layers: 4}\nsensors: {a: {}}", "give either sensor and mount, or sensors"),
@@ -160,8 +200,23 @@ BAD = [
         r"files\[0\]\.position is not a field\. Did you mean 'translation'\?",
     ),
     ("sensr: {}", r"sensr is not a field\. Did you mean 'sensor'\?"),
+    ("performance: datasheet", r"\. performance is a field of sensor: write it there\."),
+    ("sensor: {rain_mm_h: 9}", r"sensor\.rain_mm_h is .* rain_mm_h is a field of weather: write"),
+    ("columns: [range]", "a field of sensor, trajectory and cloud: write it there"),
+    ("unit: mm", r"unit is a field of scene\.files and actors\.file: write it there"),
+    ("trajectory: {start: 3}", "mean 'start_s'[?] start is a field of cloud and planning: write"),
     ("sensor: {vertical_fov_deg: .nan}", r"is nan; it must be a finite number"),
     ("sensor: {model: velodyne/vlp61}", "no sensor model .* Did you mean 'velodyne/vlp16'"),
+    ("sensor: vlp61", "no sensor model .* Did you mean 'vlp16'"),
+    ("mount: roof", r"mount is 'roof'; it must be x, y and z in metres, \[0, 0, 1\], or"),
+    (
+        "actors: [{name: A, box: [1, 1, 1], at: [1, 2]}]",
+        r"actors\[0\]\.at\.position\[2\] is missing",
+    ),
+    (
+        "actors: [{name: A, box: [1, 1, 1], at: [1, 2, 0], trajectory: a.csv}]",
+        "give either trajectory or at",
+    ),
     ("sensor: {model: ouster/os1-64, layers: 64}", "a model defines the beams: leave out layers"),
     ("sensor: [1]", r"sensor is \[1\]; it must be a mapping"),
     ("poses: [0, 0, 1]", r"poses\[0\] is 0; it must be x, y and z in metres"),
@@ -358,7 +413,16 @@ def test_it_is_told_that_gltf_was_turned_and_what_to_say(tmp_path, size, generat
     told = [note for note in advice(build(made)) if "up_axis" in note]
     assert len(told) == bool(says)
     if says:
-        assert says in told[0] and "set up_axis: z in scene.files" in told[0]
+        assert says in told[0] and "give up_axis: z in scene.files; any" in told[0]
+
+
+def test_notes_say_settings_as_in_a_scenario_or_as_in_python(tmp_path, caplog):
+    mesh_file(tmp_path / "hall.glb", (8, 6, 2), 0, generator="Blender", version="2.0")
+    made = Scenario.from_data({"scene": {"files": ["hall.glb"]}}, folder=tmp_path)
+    assert any("give up_axis: z in scene.files; any" in note for note in advice(build(made)))
+    assert not caplog.messages
+    Scene.load(tmp_path / "hall.glb")
+    assert 'give Scene.load(path, up_axis="z"); any up_axis ends' in caplog.messages[0]
 
 
 def test_a_start_is_a_time_of_yaml_or_text(scenario):

@@ -12,7 +12,9 @@ import yaml
 from jsonschema import Draft202012Validator
 
 from lidarpool import LidarpoolError
+from lidarpool.base.fingerprint import fingerprint
 from lidarpool.base.validation import fields_of, is_section
+from lidarpool.scenario.build import build
 from lidarpool.scenario.campaign import CampaignSpec, is_campaign
 from lidarpool.scenario.scenario import Scenario
 from lidarpool.scenario.schema import (
@@ -20,12 +22,14 @@ from lidarpool.scenario.schema import (
     scenario_schema,
     scenario_template,
     schema_text,
+    short_scenario,
 )
 
 FILES = sorted((Path(__file__).parents[2] / "examples").glob("*.yaml"))
 CAMPAIGNS = [path for path in FILES if is_campaign(path)]
 EXAMPLES = [path for path in FILES if path not in CAMPAIGNS]
 
+TEXT = scenario_template({}, "")
 GOOD: list[dict[str, Any]] = [
     {},
     {"scene": ["hall.glb", {"file": "part.stl", "scale": 0.001}]},
@@ -45,6 +49,11 @@ GOOD: list[dict[str, Any]] = [
     {"planning": {"obstacles": ["Shelf*", {"centre": [1, 2], "radius_m": 3}], "start": [1, 1]}},
     {"pool": {"gpu": 2, "backend": "numpy"}},
     {"sensor": {"max_range_m": float("inf")}},
+    {"sensor": "velodyne/vlp16", "mount": [0, 0, 1.9]},
+    {"sensors": {"a": "ouster/os1-64", "b": {"model": "velodyne/vlp16", "mount": [0, 0, 1]}}},
+    {"actors": [{"name": "A", "box": [1, 2, 3], "at": [4, 5, 0]},
+                {"name": "B", "box": [1, 2, 3], "at": {"position": [4, 5, 0], "yaw_deg": 9}}]},
+    {"poses": [[0, 0, 1]], "navigation": {"imu": {"mount": [0, 0, 1]}}},
 ]  # fmt: skip
 BAD: list[dict[str, Any]] = [
     {"sensor_s": {}},
@@ -58,6 +67,9 @@ BAD: list[dict[str, Any]] = [
     {"planning": {"obstacles": [{"centre": [1, 2, 3], "radius_m": 1}]}},
     {"pool": {"backend": "embre"}},
     {"cloud": {"keep_every": 2.5}},
+    {"sensor": 64},
+    {"mount": [0, 0]},
+    {"actors": [{"name": "A", "box": [1, 2, 3], "at": [4, 5]}]},
 ]
 
 
@@ -84,7 +96,7 @@ def test_what_a_scenario_refuses_is_not(validator, data):
 
 
 def test_the_examples_and_the_template_are_valid(validator):
-    texts = [path.read_text() for path in EXAMPLES] + [scenario_template()]
+    texts = [path.read_text() for path in EXAMPLES] + [TEXT, short_scenario({}, "")]
     assert len(texts) >= 3
     for text in texts:
         assert list(validator.iter_errors(yaml.safe_load(text))) == []
@@ -155,7 +167,6 @@ def test_the_example_of_a_campaign_is_valid(of_campaigns):
         assert list(of_campaigns.iter_errors(yaml.safe_load(path.read_text()))) == []
 
 
-TEXT = scenario_template()
 # A field that is commented out: its name, a colon and a value in YAML.
 OFF = re.compile(r"^( *)# ([a-z_]+: \S.*)$")
 
@@ -186,3 +197,15 @@ def test_what_is_commented_out_is_valid_too(line):
     scenario = Scenario.from_data(data)
     # What cannot be told from a default that follows from other things says it in words.
     assert "auto" in line or scenario.model_dump() != Scenario().model_dump()
+
+
+def test_a_short_one_is_the_default_survey_and_its_examples_are_valid(tmp_path):
+    text = short_scenario({}, "")
+    assert len(text.splitlines()) < 15
+    (tmp_path / "scenario.yaml").write_text(text)
+    made = build(Scenario.load(tmp_path / "scenario.yaml"))
+    assert fingerprint(made.survey) == fingerprint(build(Scenario()).survey)
+    on = [OFF.sub(r"\1\2", line) for line in text.splitlines() if "$schema" not in line]
+    scenario = Scenario.from_data(yaml.safe_load("\n".join(on)))
+    given = {"scene", "sensor", "poses", "cloud", "output"}
+    assert scenario.model_fields_set == given

@@ -67,7 +67,7 @@ def test_a_sweep_is_what_was_written(written, all_sweeps, name, scene):
         sweep = data[number]
         inside = number % (2 * TURNS)
         cloud = points_of(scene, sweep.job_number)
-        points = cloud.part(np.flatnonzero(cloud.scan // SCANS == inside))
+        points = cloud[cloud.scan // SCANS == inside]
         assert sweep.sensor == ("front", "rear/left")[inside // TURNS]
         assert sweep.number == inside % TURNS and len(sweep) == len(points)
         assert sweep.time_ns == sweep.number * 100_000_000

@@ -14,9 +14,10 @@ from lidarpool import Beams, Material, Noise, Optics, Returns, Scene, Sensor, Sp
 from lidarpool.sensor.disc import Beam
 from lidarpool.sensor.noise import Purpose, named_seed, raw
 from lidarpool.sensor.optics import FWHM
-from lidarpool.simulator.air import AirCaster
-from lidarpool.simulator.hits import AIR, NO_SURFACE, Hits, Keys
-from lidarpool.simulator.separation import AirHits, Report, separated
+from lidarpool.simulator.air import WeatherStep
+from lidarpool.simulator.returns import AIR, NO_SURFACE, Keys, PulseReturns
+from lidarpool.simulator.separation import Report, separated
+from lidarpool.simulator.step import Setup
 from lidarpool.simulator.surfaces import Light, Surfaces
 from lidarpool.simulator.waveform import Digitizer, returns_in
 
@@ -91,7 +92,7 @@ def columns_of(pulses, each):
     columns = {name: np.array([getattr(hit, name) for hit in every]) for name in NAMES}
     planes = tuple(np.array([getattr(hit, n) for hit in every]) for n in ("normal", "direction"))
     surface = [NO_SURFACE if hit.surface is None else hit.surface for hit in every]
-    return Hits(np.array(ray), triangle=np.array(surface, np.int32), **columns), planes
+    return PulseReturns(np.array(ray), triangle=np.array(surface, np.int32), **columns), planes
 
 
 def same_returns(found, expected, tolerance=0.0):
@@ -126,7 +127,7 @@ def test_returns_are_those_of_the_twin(each, airy, planes):
     solid = hits.triangle != NO_SURFACE
     ground, flies = hits.take(solid), hits.take(~solid)
     given = tuple(one[solid] for one in normals) if planes else None
-    air = AirHits(flies.ray, flies.distance, flies.energy, flies.velocity) if airy else None
+    air = flies if airy else None
     found = separated(ground, GAP, each, given, air)
     expected = {k: twin.separated(own, GAP, each, planes) for k, own in pulses.items()}
     counts = same_returns(found, expected)
@@ -209,7 +210,7 @@ def test_what_the_air_returns_is_as_in_the_twin(weather, each):
     survey = Survey(sensor, poses=[(0, 0, 0)], steps=1, materials=materials, **options)
     corners = (0, 0, 0), (1, 0, 0), (1, 1, 0), (0, 1, 0)
     scene = Scene.from_meshes([quad(name, *corners) for name in ("Wall", "Pane")])
-    caster = AirCaster(0, survey, Surfaces(scene, survey.materials))
+    caster = WeatherStep(Setup(scene, survey, 0), None, Surfaces(scene, survey.materials))
     # Sub-rays hit nothing, a wall, a pane, or a pane a metre before a wall.
     rng, count = np.random.default_rng(7), 1500
     what, place = rng.integers(0, 4, count * each), rng.uniform(1, 60, count * each)
@@ -217,7 +218,7 @@ def test_what_the_air_returns_is_as_in_the_twin(weather, each):
     ray = np.repeat(np.arange(count * each), [0, 1, 1, 2] @ (what == np.arange(4)[:, None]))
     second = np.diff(ray, prepend=-1) == 0
     triangle = np.where((what[ray] == 1) | second, 0, 2).astype(np.int32)
-    hits = Hits(ray, place[ray] + second, triangle, np.ones(len(ray)))
+    hits = PulseReturns(ray, place[ray] + second, triangle, np.ones(len(ray)))
     found = caster.found(hits, (FIRST, FIRST + count), KEYS, each)
     air, cloud, expected = survey.air(0), caster._fog, []
     for pulse in range(count):

@@ -254,7 +254,7 @@ def test_files_elsewhere_are_read_if_their_folder_is_named(tmp_path):
         files = [{"file": "scenes/m.usda"} | more]
         return build(Scenario.from_data({"scene": {"files": files}}, folder=tmp_path)).scene.names
 
-    with pytest.raises(LidarpoolError, match=r"name a folder .* by assets in scene\.files"):
+    with pytest.raises(LidarpoolError, match=r"name a folder .* as assets"):
         names()
     assert names(assets="assets") == names(assets=".") == ("A", "B")
     write(scenes / "m.usda", outer, prim("C", "", "", "references = @../q.usda@</Quad>"))
@@ -662,7 +662,7 @@ def test_packed_images_and_shapes(folder):
         (IMAGE, "asset inputs:file = @no.png@\nfloat4 inputs:fallback = (1, 0, 0, 1)",
          "UsdPreviewSurface", [255, 0, 0], "is not there"),
         (IMAGE, "asset inputs:file = @../out.png@", "UsdPreviewSurface", GREY,
-         "is not in the scene's folder, see assets in scene.files"),
+         "is not in the scene's folder, name one that holds it as assets"),
         (IMAGE, "asset inputs:file = @t.<UDIM>.png@", "UsdPreviewSurface", GREY, "several tiles"),
         ("", "", "MyShader", GREY, "M (its shader is MyShader)"),
         (IMAGE.replace("T.outputs:rgb", "X.outputs:result"), "", "UsdPreviewSurface", GREY,

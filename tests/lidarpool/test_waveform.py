@@ -27,7 +27,7 @@ from lidarpool.columns.waveforms import WAVEFORM
 from lidarpool.report.report import CountedCloud
 from lidarpool.sensor.optics import FWHM, LIGHT_M_NS, Optics
 from lidarpool.simulator.batch import columns_of
-from lidarpool.simulator.hits import Hits
+from lidarpool.simulator.returns import PulseReturns
 from lidarpool.simulator.rig import Rig
 from lidarpool.simulator.waveform import Digitizer, returns_in
 from raybeam import available_backends
@@ -40,7 +40,7 @@ COLUMNS = ("ray", "range", "intensity", "amplitude", "pulse_width", "return_numb
 def found(apart, decomposes, energies=(2.0, 1.4), sample_ns=1.0):
     """Ranges behind the first hit, in σ, energies and widths of two hits so many σ apart."""
     distance = 100 + np.array([0, apart]) * SIGMA_M
-    hits = Hits(np.arange(2), distance, np.zeros(2, np.int32), np.array(energies))
+    hits = PulseReturns(np.arange(2), distance, np.zeros(2, np.int32), np.array(energies))
     made = returns_in(hits, Digitizer(SIGMA_NS, sample_ns, decomposes), each=2)
     return (made.distance - 100) / SIGMA_M, 2 * made.energy, made.width
 

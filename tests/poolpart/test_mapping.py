@@ -10,7 +10,7 @@ import uuid
 from collections import Counter
 
 import pytest
-from distributed import CancelledError, Client, Event, get_worker
+from distributed import CancelledError, Client, Event, as_completed, get_worker
 from tests.poolpart.helpers import twice, wait_for
 
 from poolpart import Partition, Pool, PoolError, rest
@@ -154,6 +154,14 @@ def test_the_window_of_small_chunks_grows_with_short_items_and_shrinks_with_long
         next(results)
     assert task_count(client) <= 4 * a.slots  # those that are done go a moment later
     results.close()
+
+
+def test_what_dask_does_with_results(a, client):
+    assert list(client.gather(a.map(twice, range(50)))) == list(range(0, 100, 2))
+    results = a.map(twice, iter(range(3)))
+    with pytest.raises(TypeError, match=r"map gives results, not futures.* list\(partition\.map"):
+        as_completed(results)
+    assert list(results) == [0, 2, 4]
 
 
 def test_the_first_tasks_start_at_once(a, client, wait_until):

@@ -76,7 +76,7 @@ def test_what_it_tells(client, wait_until):
     part = Partition("A", client)
     results = [part.submit(work, i) for i in range(6)]
     failing = part.submit(broken)
-    with Pipe("frames-12345678", 5, client).create() as pipe:
+    with Pipe("frames-12345678", 5, client) as pipe:
         for item in range(3):
             pipe.put(item)
         client.gather(results)

@@ -202,7 +202,7 @@ def test_using_a_deleted_pipe_says_so_and_does_not_bring_it_back(client, make_pi
 
 def test_leaving_its_block_deletes_a_pipe_also_after_an_error(client):
     scheduler = client.cluster.scheduler
-    with pytest.raises(ZeroDivisionError), Pipe("in-a-block", 2, client).create() as pipe:
+    with pytest.raises(ZeroDivisionError), Pipe("in-a-block", 2, client) as pipe:
         pipe.put(1)
         assert "in-a-block" in pipes_of(scheduler)
         raise ZeroDivisionError

@@ -7,7 +7,7 @@ import pytest
 from distributed import Client, LocalCluster
 from tests.poolpart.helpers import declared, here
 
-from poolpart import Pool, PoolError, WorkerInfo, probe
+from poolpart import Pool, PoolError, WorkerInfo, n_workers, probe, rest
 
 PLAIN = {name: {} for name in ("a", "b", "c")}
 
@@ -20,7 +20,7 @@ def test_what_a_pool_knows(start):
         "b": (1, (), {"GPU"}),
     }
     assert sorted(pool.names) == ["a", "b"]
-    assert repr(pool) == "<Pool: workers 2, hosts 1, GPUs 0, GPU 1>"
+    assert repr(pool) == "<Pool: workers 2, hosts 1, GPUs 0; partitions: GPU 1>"
 
 
 def test_a_cluster_without_workers(start):
@@ -112,6 +112,33 @@ def test_a_worker_that_has_left_is_not_chosen(start, wait_until):
         pool.divide({"Q": 3})
     with pytest.raises(PoolError, match="would have 0 of the 1 workers"):
         pool.partition("Q", workers=["a"])
+
+
+def test_a_partition_is_found_by_its_name(start):
+    pool = Pool.from_client(start(PLAIN))
+    with pytest.raises(PoolError, match="no partition 'P'; there are none yet: divide makes some"):
+        pool["P"]
+    pool.divide({"P": n_workers(1), "Q": rest()})
+    assert pool["P"].submit(pow, 2, 3).result() == 8 and len(pool["Q"]) == 2
+    assert repr(pool) == "<Pool: workers 3, hosts 1, GPUs 0; partitions: P 1, Q 2>"
+    with pytest.raises(PoolError, match="no partition 'GPU'; there are P, Q"):
+        pool["GPU"]
+    pool.client.close()
+    assert repr(pool) == "<Pool: workers 3, hosts 1, GPUs 0>"
+
+
+def test_a_block_dissolves_what_its_pool_has_made(start):
+    client = start(PLAIN | {"d": {"resources": {"OLD": 1}}})
+    Pool.from_client(client).partition("OTHERS", workers=["a"])
+    with pytest.raises(ZeroDivisionError), Pool.from_client(client) as pool:
+        _, left = pool.partition("P", n_workers=1)
+        left.divide({"Q": n_workers(1)})
+        assert sorted(pool.partitions()) == ["OLD", "OTHERS", "P", "Q"]
+        raise ZeroDivisionError
+    assert sorted(pool.partitions()) == ["OLD", "OTHERS"]
+    with pool:
+        pool.dissolve()
+    assert list(pool.partitions()) == ["OLD"]
 
 
 def test_one_worker_for_each_gpu_of_a_host(start, monkeypatch):

@@ -51,6 +51,16 @@ FILES |= {text: ("s.yaml", text.encode(), says) for text, says in RETURNS.items(
 OPTIONS: dict[str, tuple[list[str], str]] = {
     "no scenario": (["run"], "Usage: lidarpool run"),
     "unknown backend": (["run", "good.yaml", "--backend", "gpu"], "'gpu' is not one of 'auto'"),
+    "options of a mesh": (
+        ["run", "good.yaml", "--sensor", "vlp16"],
+        "in good.yaml, change sensor.",
+    ),
+    "several meshes": (["run", "a.stl", "a.stl", "--pose", "0,0,1"], "are for one mesh"),
+    "misspelt model": (["run", "a.stl", "--sensor", "vlp61"], "Did you mean 'vlp16'?"),
+    "no model": (["run", "a.stl", "--sensor", ""], "There is no sensor model ''."),
+    "misspelt column": (["run", "a.stl", "--columns", "rang,time"], "Did you mean 'range'?"),
+    "misspelt format": (["run", "a.stl", "--format", "lass"], "Did you mean 'las'?"),
+    "no place": (["run", "a.stl", "--pose", "0,0"], "'0,0' is no place: give x,y,z"),
     "no time": (["run", "good.yaml", "--wait", "soon"], "'soon' is not a time"),
     "both": (["run", "good.yaml", "--resume", "--fresh"], "give one of them"),
     "certificates alone": (["info", "--tls-key", "a.stl"], "are for the cluster of --scheduler"),

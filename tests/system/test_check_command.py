@@ -2,6 +2,7 @@
 
 import json
 import re
+import shlex
 import shutil
 from collections import namedtuple
 from collections.abc import Callable, Iterator
@@ -17,7 +18,7 @@ from tests.clusters import thread_cluster
 from tests.meshes import PLY
 
 import lidarpool.cli.forecast
-from lidarpool import Mounted, Returns, Sensor, Survey, Track, simulate
+from lidarpool import Mounted, Returns, Sensor, Survey, Track, read_cloud, simulate
 from lidarpool.cli.forecast import forecast, sample_survey
 from lidarpool.run.options import RunOptions
 from lidarpool.scenario.build import build
@@ -240,6 +241,30 @@ def test_an_object_is_looked_at_from_around_it_and_no_gpu_is_spoken_of(tmp_path,
     assert re.search(rf"^cast by     \d+ {kind} workers? \({backend}\)$", outcome.out, re.M)
 
 
+def test_options_describe_the_survey_of_a_mesh(cluster, tmp_path, lidarpool):
+    mesh = trimesh.creation.box((8000, 3000, 6000))
+    (tmp_path / "there").mkdir()
+    (tmp_path / "there" / "my part.stl").write_bytes(mesh.export(file_type="stl"))
+    options = ["--sensor", "vlp16", "--unit", "mm", "--up-axis", "y", "--pose", "-1,0,0.5"]
+    options += ["--pose", "1,0,1.9", "--columns", "range,intensity", "--format", "las"]
+    with_options = ["there/my part.stl", *options, "--no-plan", "--scheduler", cluster]
+    outcome = lidarpool("check", *with_options)
+    assert outcome.code == 0, outcome.err
+    assert "size        8.00 x 6.00 x 3.00 m" in outcome.out and "72 scans from 2" in outcome.out
+    words = shlex.split(outcome.out.splitlines()[-1].partition("it can run: ")[2])
+    assert words[:14] == ["lidarpool", "run", "there/my part.stl", *options[:11]]
+    assert lidarpool(*words[1:], "--only", "cloud", "--quiet").code == 0
+    # The scenario that init writes of the same options gives the same.
+    assert lidarpool("init", "a/b", "--mesh", "there/my part.stl", *options).code == 0
+    of_scenario = ["--no-plan", "--scheduler", cluster, "--out", "second", "--only", "cloud"]
+    assert lidarpool("run", "a/b/scenario.yaml", *of_scenario).code == 0
+    for name in ("cloud.ply", "cloud.las"):
+        made = [(tmp_path / f / name).read_bytes() for f in ("lidarpool-out", "second")]
+        assert made[0] == made[1]
+    cloud = read_cloud(tmp_path / "second" / "cloud.ply")
+    assert {"range", "intensity"} <= cloud.columns.keys()
+
+
 def test_triangles_too_fine_for_embree_are_told_of(tmp_path, lidarpool):
     if reason := available_backends()["embree"]:
         pytest.skip(f"embree: {reason}")
@@ -284,6 +309,6 @@ def test_sizes_that_speak_of_another_unit(size, unit, check, tmp_path, lidarpool
     assert outcome.code == 0
     assert ("my box.stl states no unit" in outcome.out) == (unit is not None)
     assert unit is None or f"give the file's unit ({unit}?) in scene.files" in outcome.out
-    assert unit is None or f"lidarpool init DIR --mesh FILE --unit {unit}" in outcome.out
+    assert unit is None or f"or --unit {unit} with a mesh file" in outcome.out
     given = check(text="scene: {files: [{file: my box.stl, unit: m}]}")
     assert given.code == 0 and "states no unit" not in given.out

@@ -28,6 +28,7 @@ import numpy as np
 import pytest
 import yaml
 from distributed.cli import dask_scheduler, dask_worker
+from tests.clusters import import_jobqueue
 
 import lidarpool.run.cluster
 from lidarpool import Cloud, save_cloud
@@ -88,6 +89,7 @@ def programs() -> Iterator[Block]:
 
 ALL = [block for path in DOCUMENTS for block in blocks_of(path)]
 PROGRAMS = list(programs())
+[FIRST] = (block for block in PROGRAMS if block.where.startswith("docs/overview.md"))
 
 
 def of(*languages: str) -> Any:
@@ -115,6 +117,8 @@ def test_python_runs(tmp_path, block, in_threads, capsys):
     compile(block.code, block.where, "exec")
     if block.reason:
         return
+    if "dask_jobqueue" in block.code:
+        import_jobqueue()
     folder = tmp_path / "lidarpool-out"
     folder.mkdir()
     one = np.ones(1, np.int32)
@@ -128,16 +132,16 @@ def test_python_runs(tmp_path, block, in_threads, capsys):
     # What a comment beside a print promises is what is printed.
     for promised in re.findall(r"print\(.*\)  # (.*)", block.code):
         assert promised in printed
-    if block is PROGRAMS[0]:
+    if block is FIRST:
         assert re.fullmatch(r"\d+ points, a path of 71\.\d\d m", *printed)
 
 
 @pytest.mark.slow
 @pytest.mark.sample
-def test_the_first_program_of_the_readme_runs_as_a_script(tmp_path):
+def test_the_program_of_the_overview_runs_as_a_script(tmp_path):
     """It starts processes, each of which imports it."""
     script = tmp_path / "example.py"
-    script.write_text(PROGRAMS[0].code, encoding="utf-8")
+    script.write_text(FIRST.code, encoding="utf-8")
     done = subprocess.run(
         [sys.executable, script], cwd=tmp_path, capture_output=True, text=True, check=False
     )
@@ -250,7 +254,7 @@ def test_the_tutorial_from_beginning_to_end(tmp_path, lidarpool):
                 outcome = lidarpool(*words[1:])
                 assert outcome.code == 0, outcome.err
                 told, ran = outcome.out + outcome.err, ran + 1
-    assert ran == 4
+    assert ran == 6
     for name in ("cloud.ply", "report.html"):
         assert (tmp_path / "hall/result" / name).stat().st_size > 1000
 
@@ -284,9 +288,9 @@ def plain(line: str) -> str:
     return " ".join(re.sub(r"[\d,.]+(?: [kMG]?B\b)?", "N", line).split())
 
 
-def test_the_readme_shows_the_example_as_it_is():
+def test_the_overview_shows_the_example_as_it_is():
     example = (ROOT / "examples/survey.py").read_text(encoding="utf-8").split('"""', 2)[2].strip()
-    assert example in (ROOT / "README.md").read_text(encoding="utf-8")
+    assert example in (ROOT / "docs/overview.md").read_text(encoding="utf-8")
 
 
 @pytest.mark.parametrize("path", [*sorted(ROOT.glob("*.md")), *DOCUMENTS[1:]])
@@ -335,7 +339,8 @@ def test_numbers_of_formats_and_models_are_those_of_the_code():
     [count] = re.findall(r"the (\w+) formats", page)
     assert words.index(count) + 4 == len(DATA_SETS)
     names = model_names()
-    assert f"lists {len(names)} models" in (ROOT / "README.md").read_text("utf-8")
+    assert f"lists {len(names)} models" in (ROOT / "docs/overview.md").read_text("utf-8")
+    assert f"**{len(names)} sensors**" in (ROOT / "README.md").read_text("utf-8")
     stated = sum(read_model(name).performance is not None for name in names)
     assert f"[{stated} models]" in (ROOT / "docs/how-to/noise.md").read_text("utf-8")
 
@@ -343,7 +348,10 @@ def test_numbers_of_formats_and_models_are_those_of_the_code():
 @pytest.mark.parametrize(
     ("pages", "suffixes"),
     [
-        (("tutorial", "how-to/terrain", "how-to/cityjson", "how-to/openusd"), meshfile.SUFFIXES),
+        (
+            ("how-to/meshes", "how-to/terrain", "how-to/cityjson", "how-to/openusd"),
+            meshfile.SUFFIXES,
+        ),
         (("how-to/terrain",), rasters.SUFFIXES),
         (("how-to/point-clouds",), points.SUFFIXES),
     ],

@@ -32,7 +32,7 @@ BAD = [
     ("trajectory: {points: [{position: [0, 0, 0]}]}", "", "time_s is missing"),
     ("trajectory: t.txt\nposes: [[0, 0, 1]]", LINE, "either poses or a trajectory"),
     ("sensors: {a: {}}\nmount: {yaw_deg: 3}", "", "either sensor and mount, or sensors"),
-    (CAR % "", "", "actor 'Car' has no trajectory: give it one, or give the survey"),
+    (CAR % "", "", "actor 'Car' has no trajectory: give it one, or at: .* give the survey"),
     (CAR % ", trajectory: t.txt", LINE, "actor 'Car': .* start_s is 0 s, 1 s outside"),
     (CAR % ", trajectory: {file: t.txt, start_s: 1}", LINE, "give offset_s"),
     (CAR % (", trajectory: {points: [" + POINTS + "]}") + "\nsteps: 150", "", "0.25 s outside"),

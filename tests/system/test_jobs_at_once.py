@@ -13,7 +13,7 @@ from distributed import Client
 from tests.clusters import thread_cluster
 from tests.daemons import wait_until
 
-import lidarpool.simulator.world
+import lidarpool.simulator.scene_caster
 from lidarpool import Campaign, Column, Job, Scene, Sensor, Survey, save_cloud, simulate
 from lidarpool.pipeline import rigs
 from lidarpool.scene.actors import box
@@ -87,9 +87,11 @@ def test_jobs_of_a_scene_share_its_trees_and_others_that_fail_do_no_harm(
     client, tmp_path, left_over, monkeypatch
 ):
     before = {*rigs._kept}  # of other tests of this process
-    trees, build = [], lidarpool.simulator.world.RayCaster
+    trees, build = [], lidarpool.simulator.scene_caster.RayCaster
     monkeypatch.setattr(
-        lidarpool.simulator.world, "RayCaster", lambda *a, **o: trees.append(1) or build(*a, **o)
+        lidarpool.simulator.scene_caster,
+        "RayCaster",
+        lambda *a, **o: trees.append(1) or build(*a, **o),
     )
     loose = survey(sensor=Loose(SENSOR.beams, SENSOR.head), steps=30)
     made = run(client, tmp_path, [*JOBS, (SEED, loose), (SEED, survey(faulty, steps=30))])

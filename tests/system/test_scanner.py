@@ -36,4 +36,4 @@ def test_sweeps_of_a_moving_sensor_are_those_of_a_run(cluster_client, same_cloud
     scanner = Scanner(scene, sensor, **OPTIONS)
     for number in range(2):
         rows = np.flatnonzero(cloud["scan"] // 36 == number)
-        assert len(rows) > 500 and same_cloud(scanner.sweep(track, number=number), cloud.part(rows))
+        assert len(rows) > 500 and same_cloud(scanner.sweep(track, number=number), cloud[rows])

@@ -1,10 +1,13 @@
 """What helps before the first run: init, schema, help, words for mistakes."""
 
 import re
+from importlib.resources import files
+from pathlib import Path
 
 import pytest
 import trimesh
 
+from lidarpool.base.fingerprint import fingerprint
 from lidarpool.cli.commands import cli
 from lidarpool.scenario.build import build
 from lidarpool.scenario.scenario import Scenario
@@ -12,7 +15,7 @@ from lidarpool.scenario.scenario import Scenario
 
 def test_init_writes_a_scenario_and_says_what_to_do_next(tmp_path, lidarpool):
     folder = tmp_path / "my surveys" / "hall"
-    outcome = lidarpool("init", folder)
+    outcome = lidarpool("init", folder, "--all")
     assert (outcome.code, outcome.err) == (0, "")
     assert {path.name for path in folder.iterdir()} == {"scenario.schema.json", "scenario.yaml"}
     assert outcome.out.endswith(f"next: lidarpool check '{folder / 'scenario.yaml'}'\n")
@@ -43,15 +46,53 @@ def test_init_with_meshes_names_them_as_seen_from_the_scenario(tmp_path, lidarpo
     assert len(build(made).scene.names) == 2
     assert (made.cloud.keep_every, made.cloud.precision_m) == (None, 0.001)
     assert made.poses is not None and len(made.poses) == 5, "around boxes of a millimetre"
+    text = Path("a/b/scenario.yaml").read_text()
+    assert "# This looks like an object of " in text and len(text.splitlines()) < 22
     rest = {"scene": {"files", "preset"}, "cloud": True, "poses": True}
     assert made.model_dump(exclude=rest) == Scenario().model_dump(exclude=rest)
+
+
+@pytest.mark.parametrize("every", [True, False])
+def test_init_writes_what_the_options_say(every, tmp_path, lidarpool):
+    (tmp_path / "hall.stl").write_bytes(trimesh.creation.box((8, 6, 3)).export(file_type="stl"))
+    model = files("lidarpool.sensor") / "data" / "velodyne" / "vlp16.yaml"
+    (tmp_path / "mine.yaml").write_text(model.read_text())
+    options = ["--mesh", "hall.stl", "--up-axis", "x", "--sensor", "mine.yaml", "--pose", "1,2.5,0"]
+    options += ["--columns", "range", "--columns", "time,ray", "--format", "laz,mcap"]
+    assert lidarpool("init", "new", *options, *["--all"] * every).code == 0
+    text = (tmp_path / "new" / "scenario.yaml").read_text()
+    assert ("  step_deg: 10.0 " in text) == every and "  - [1, 2.5, 0]\n" in text
+    assert every or "\nsensor: ../mine.yaml " in text
+    made = Scenario.load("new/scenario.yaml")
+    (entry,), (pose,) = made.scene.files, made.poses
+    assert (entry.file, entry.unit, entry.up_axis) == ("../hall.stl", None, "x")
+    assert (made.sensor.model, pose.position) == ("../mine.yaml", (1, 2.5, 0))
+    assert made.cloud.columns == ("range", "time", "ray")
+    assert [one.format for one in made.output.write] == ["laz", "mcap"]
+
+
+def test_init_writes_the_poses_that_were_chosen(tmp_path, lidarpool):
+    (tmp_path / "hall.stl").write_bytes(trimesh.creation.box((8, 6, 3)).export(file_type="stl"))
+    assert lidarpool("init", "new", "--mesh", "hall.stl", "--sensor", "vlp16").code == 0
+    made = Scenario.load("new/scenario.yaml")
+    chosen = build(Scenario.load("hall.stl", {"sensor": "vlp16"})).survey
+    assert fingerprint(build(made).survey) == fingerprint(chosen)
+    assert made.poses is not None
+
+
+def test_init_without_a_mesh_is_short_too(tmp_path, lidarpool):
+    assert lidarpool("init", "new", "--sensor", "vlp16").code == 0
+    text = (tmp_path / "new" / "scenario.yaml").read_text()
+    assert "\nscene: seed " in text and "\nsensor: vlp16 " in text and text.count("\n") < 15
+    assert len(build(Scenario.load("new/scenario.yaml")).scene.names) == 6
 
 
 @pytest.mark.parametrize(
     ("options", "says"),
     [
-        (["--mesh", "nowhere.stl"], "nowhere.stl has no mesh format"),
-        (["--mesh", "notes.txt"], "notes.txt has no mesh format"),
+        (["--mesh", "nowhere.stl"], "nowhere.stl does not exist"),
+        (["--mesh", "notes.txt"], "notes.txt has the ending .txt, which is not a mesh format"),
+        (["--sensor", "vlp61"], "Did you mean 'vlp16'?"),
         (["--unit", "mm"], "name it with --mesh"),
         (["--mesh", "notes.txt", "--unit", "ells"], "ells"),
     ],
@@ -98,11 +139,13 @@ def test_sensors_lists_models_and_draws_the_beams_of_one(tmp_path, lidarpool):
     assert max(map(len, outcome.out.splitlines())) <= 110
     outcome = lidarpool("sensors", "velodyne/vlp16")
     assert outcome.out.startswith("Velodyne VLP-16\nangles ")
-    assert outcome.out.endswith("\nvelodyne-vlp16.png\n")
-    for name, target in (("livox/mid40", "rose.png"), ("airborne/riegl-vq780i", "lines.png")):
-        assert lidarpool("sensors", name, "--out", target).code == 0
-    pictures = ("velodyne-vlp16.png", "rose.png", "lines.png")
-    assert {(tmp_path / name).read_bytes()[:4] for name in pictures} == {b"\x89PNG"}
+    draw = "lidarpool sensors velodyne/vlp16 --out beams.png"
+    assert outcome.out.endswith(f"\nto draw its beams: {draw}\n")
+    assert list(tmp_path.iterdir()) == []
+    pictures = {"livox/mid40": "rose.png", "airborne/riegl-vq780i": "lines.png", "vlp16": "v.png"}
+    for name, target in pictures.items():
+        assert lidarpool("sensors", name, "--out", target).out.endswith(f"\n{target}\n")
+    assert {(tmp_path / name).read_bytes()[:4] for name in pictures.values()} == {b"\x89PNG"}
     assert lidarpool("sensors", "").code == 2
     outcome = lidarpool("sensors", "velodyne/vlp61")
     assert outcome.code == 2 and "Did you mean 'velodyne/vlp16'?" in outcome.err

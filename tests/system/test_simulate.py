@@ -101,7 +101,7 @@ def raise_at(scan: int | str | None, scan_of=None):
             r"stage intersect failed: scan \d+: FloatingPointError",
         ),
         (
-            "lidarpool.simulator.world.RayCaster",
+            "lidarpool.simulator.scene_caster.RayCaster",
             raise_at(None),
             "preparing the scene on the GPU workers failed: .*the mirror is loose",
         ),

@@ -86,7 +86,7 @@ def test_a_mesh_needs_no_scenario_and_a_number_may_be_more_than_needed(hall, lid
 @pytest.mark.parametrize(
     ("arguments", "says"),
     [
-        (["--sensor", "riegl-vz4000"], "Did you mean 'terrestrial/riegl-vz400'?"),
+        (["--sensor", "riegl-vz4000"], "Did you mean 'riegl-vz400'?"),
         (["--sensor", "vlp16", "--coverage", "most"], "'most' is not 1% to 100%"),
         (["--sensor", "mid70"], "Livox Mid-70 does not look all around"),
     ],

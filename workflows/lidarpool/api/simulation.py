@@ -26,7 +26,7 @@ from ..scenario import campaign as described
 from ..scenario.build import Job
 from ..scene.scene import Scene
 from ..sensor import Survey
-from ..simulator.world import check_backend_here
+from ..simulator.scene_caster import check_backend_here
 from .result import Result
 
 

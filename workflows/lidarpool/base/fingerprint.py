@@ -121,12 +121,12 @@ class _Digest:
                 self.add(item)
         elif isinstance(thing, Mapping):
             self._mark("mapping", len(thing))
-            for key in sorted(thing, key=repr):
+            for key in sorted(thing, key=fingerprint):
                 self.add(key)
                 self.add(thing[key])
         elif isinstance(thing, Set):
             self._mark("set")
-            self.add(sorted(thing, key=repr))
+            self.add(sorted(thing, key=fingerprint))
         elif isinstance(thing, partial):
             self.add((thing.func, thing.args, thing.keywords))
         elif isinstance(thing, types.FunctionType):

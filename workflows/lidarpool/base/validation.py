@@ -8,6 +8,7 @@ import re
 import reprlib
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import MISSING, is_dataclass
 from dataclasses import fields as dataclass_fields
 from datetime import datetime
 from functools import cache, partial, reduce, wraps
@@ -27,7 +28,7 @@ from typing import (
 
 import numpy as np
 from numpy.typing import ArrayLike, DTypeLike
-from pydantic import ConfigDict, GetCoreSchemaHandler, WrapValidator
+from pydantic import ConfigDict, GetCoreSchemaHandler, GetPydanticSchema, WrapValidator
 from pydantic.fields import FieldInfo
 from pydantic_core import (
     ErrorDetails,
@@ -98,6 +99,7 @@ _SCALARS: dict[Any, tuple[Callable[..., Any], Collection[str]]] = {
     NoneType: (core_schema.none_schema, ()),
 }
 _LETTERS = 160  # of a value that is shown
+_LINE, _VALUE = 119, 64  # most characters of all, and of the value of a field
 
 
 def checked(function: Callable[P, R]) -> Callable[P, R]:
@@ -121,7 +123,7 @@ def checked(function: Callable[P, R]) -> Callable[P, R]:
 def checked_fields(cls: C) -> C:
     """Let a dataclass refuse values that do not fit their annotations, also in subclasses.
 
-    In a section of a file it is a section itself, of the same fields.
+    In a section of a file it is a section itself, of the same fields. Its `repr` is one line.
 
     Apply it before `dataclass`, which calls `__post_init__` only if the class has one.
     """
@@ -134,6 +136,12 @@ def checked_fields(cls: C) -> C:
     cls.__post_init__ = __post_init__  # type: ignore[attr-defined]
     cls.__pydantic_config__ = STRICT  # type: ignore[attr-defined]
     cls.__get_pydantic_core_schema__ = classmethod(_section)  # type: ignore[attr-defined]
+    if "__repr__" not in vars(cls):
+        cls.__repr__ = one_line  # type: ignore[method-assign, assignment]
+        # Else `dataclass` gives a subclass, another kind of sensor, a repr of all fields.
+        cls.__init_subclass__ = classmethod(  # type: ignore[assignment]
+            lambda kind: setattr(kind, "__repr__", vars(kind).get("__repr__", one_line))
+        )
     return cls
 
 
@@ -268,7 +276,7 @@ def sentences(section: Any, source: object = "") -> Iterator[None]:
 def validation_errors(error: ValidationError, section: Any) -> Iterator[str]:
     """Yield a line for each error in a file: field, value given, values allowed.
 
-    For a misspelt name, a field of the same section is suggested.
+    For a name that is no field, one like it is suggested, and the sections that have it are named.
     """
     found = {detail["loc"]: detail for detail in error.errors(include_url=False)}
     alike: dict[Any, list[FieldPath]] = {}  # {field and kind of mistake: where it was made}
@@ -282,7 +290,8 @@ def validation_errors(error: ValidationError, section: Any) -> Iterator[str]:
     for first, *others in alike.values():
         more = f" {plural(len(others), 'more entry', 'more entries')} like it." if others else ""
         hint, known = _at(first, section)
-        yield _sentence(first, [found[first]], hint, known, _in_file) + more
+        near = field_hint(str(first[-1]), known, section) if first else ""
+        yield _sentence(first, [found[first]], hint, near, _in_file) + more
 
 
 def _in_file(value: Any) -> str:
@@ -298,14 +307,14 @@ def _argument_error(error: ValidationError, hints: Mapping[str, Any]) -> str:
         entry = (name, *(step for step in steps if isinstance(step, int)))
         places.setdefault(entry, []).append(detail)
     place, details = next(iter(places.items()))
-    return _sentence(place, details, hints[str(place[0])], (), shown)
+    return _sentence(place, details, hints[str(place[0])], "", shown)
 
 
 def _sentence(
     place: FieldPath,
     details: Sequence[ErrorDetails],
     hint: Any,
-    known: Collection[str],
+    near: str,
     show: Callable[[Any], str],
 ) -> str:
     at, kind, given = dotted(place), details[0]["type"], details[0]["input"]
@@ -313,9 +322,6 @@ def _sentence(
         message = str(details[0]["ctx"]["error"])
         return f"{at}: {message}" if at else message
     if kind in ("extra_forbidden", "invalid_key", "unexpected_keyword_argument"):
-        name = str(place[-1])
-        other = _ALIKE.get(name, "")
-        near = f" Did you mean {other!r}?" if other in known else did_you_mean(name, known)
         return f"{at} is not a field.{near}"
     if kind == "missing":
         return f"{at} is missing; it must be given."
@@ -362,6 +368,31 @@ def _range(limits: Mapping[str, Any]) -> str:
     if numbers.keys() == {"ge", "le"}:
         return f"{numbers['ge']} to {numbers['le']}"
     return ", ".join(f"{_LIMITS[name]} {number}" for name, number in numbers.items())
+
+
+def field_hint(name: str, known: Collection[str], root: Any) -> str:
+    """Advise on a name that a section lacks: one like it of the `known`, and where it is a field.
+
+    `root` is the section of the whole file. Of the sections with such a field, the outermost are
+    named, and none that is derived from another of them.
+    """
+    if (other := _ALIKE.get(name)) in known:
+        return f" Did you mean {other!r}?"
+    level, owners = [("", root)], list[tuple[str, Any]]()
+    while level and not owners:
+        level = [
+            (f"{place}.{inner}", kind)
+            for place, outer in level
+            for inner, field in _named(outer).items()
+            if not any(isinstance(note, GetPydanticSchema) for note in field.metadata)  # of Python
+            for kind in sections_in(field.annotation)
+        ]
+        owners = [(place[1:], kind) for place, kind in level if name in _named(kind)]
+    kinds = {kind for _, kind in owners}
+    places = [place for place, kind in owners if kinds.isdisjoint(kind.__mro__[1:])]
+    listed = " and ".join(filter(None, [", ".join(places[:-1]), *places[-1:]]))
+    where = f" {name} is a field of {listed}: write it there." if places else ""
+    return did_you_mean(name, known) + where
 
 
 def _at(place: FieldPath, hint: Any) -> tuple[Any, Fields]:
@@ -426,6 +457,35 @@ def shown(value: object) -> str:
     short.maxlevel = 3  # YAML aliases make deeply nested lists of a few letters
     text = short.repr(value)
     return text if len(text) <= _LETTERS else f"{text[:_LETTERS]}…"
+
+
+def one_line(thing: Any) -> str:
+    """`repr` of a dataclass: the fields that differ from their defaults, as far as a line holds."""
+    name, kept, left_out = type(thing).__name__, list[str](), False
+    fields = sorted(dataclass_fields(thing), key=lambda f: (f.name != "name", bool(f.kw_only)))
+    for field in fields:
+        value, make = getattr(thing, field.name), field.default_factory
+        default = field.default if make is MISSING else make()
+        if not field.repr or (not isinstance(value, np.ndarray) and (value == default) is True):
+            continue
+        text = f"{field.name}={_short(value)}"
+        if fits := len(f"{name}({', '.join([*kept, text, '…'])})") <= _LINE:
+            kept.append(text)
+        left_out |= not fits
+    return f"{name}({', '.join(kept + ['…'] * left_out)})"
+
+
+def _short(value: Any) -> str:
+    if isinstance(value, np.ndarray):
+        return f"{value.dtype}{value.shape}"
+    if is_dataclass(value) and (name := getattr(value, "name", "")):
+        return f"{type(value).__name__}({name!r})"
+    if len(text := repr(value)) <= _VALUE and "\n" not in text:
+        return text
+    if isinstance(value, Collection) and not isinstance(value, (str, bytes)):
+        kinds = {type(one).__name__ for one in value}
+        return f"[{len(value)} {kinds.pop() if len(kinds) == 1 else 'items'}]"
+    return f"{type(value).__name__}(…)" if is_dataclass(value) else f"{text[: _VALUE - 1]}…"
 
 
 def _with_article(name: str) -> str:

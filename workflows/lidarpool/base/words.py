@@ -21,6 +21,21 @@ def did_you_mean(word: str, known: Iterable[str]) -> str:
     return f" Did you mean {lower[near[0]]!r}?" if near else ""
 
 
+# In a note, a setting; and the calls of Python that take those of a section.
+_SETTING = re.compile(r'<(scene\.files|cloud|materials)\.(\w+)=("?)(\w+)\3>')
+_CALLS = {"scene.files": "Scene.load(path", "cloud": "Survey(…", "materials": "Material(…"}
+
+
+def as_python(note: str) -> str:
+    """Return a note with its settings as in Python: Scene.load(path, up_axis="z")."""
+    return _SETTING.sub(lambda m: f"{_CALLS[m[1]]}, {m[2]}={m[3]}{m[4]}{m[3]})", note)
+
+
+def as_scenario(note: str) -> str:
+    """Return a note with its settings as in a scenario: up_axis: z in scene.files."""
+    return _SETTING.sub(r"\2: \4 in \1", note)
+
+
 def plural(number: float, what: str, several: str = "") -> str:
     """Return number and noun: «1 worker», «1,200 workers»."""
     return f"{number:,} {what if number == 1 else several or what + 's'}"

@@ -79,8 +79,12 @@ def _runs(command: Callable[..., None]) -> Callable[..., None]:
 
     @wraps(command)
     def prepared(
-        *, quiet: bool, verbose: bool, as_json: bool, cluster: Path | None = None, **given: Any
-    ) -> None:
+        *, quiet: bool, verbose: bool, as_json: bool, cluster: Path | None = None,
+        only: str | None, pictures: bool = False, **given: Any,
+    ) -> None:  # fmt: skip
+        if only and pictures:
+            raise click.UsageError("--only leaves out what --pictures draws: give one of them.")
+        given["extent"] = "pictures" if pictures else only
         from ..base.fork_server import keep_freed_memory, start_fork_server, stop_fork_server
 
         keep_freed_memory()
@@ -121,7 +125,7 @@ def cli() -> None:
 @shared.out
 @_shown
 @_runs
-def demo(terminal: Terminal, options: RunOptions, only: str | None) -> None:
+def demo(terminal: Terminal, options: RunOptions, extent: str | None) -> None:
     """Run the default survey and plan a path, on this machine, and draw the pictures.
 
     \b
@@ -132,11 +136,12 @@ def demo(terminal: Terminal, options: RunOptions, only: str | None) -> None:
     from ..scenario.scenario import Scenario
     from .run_command import run_scenario
 
-    run_scenario(Scenario(), terminal, options, extent=only or "pictures")
+    run_scenario(Scenario(), terminal, options, extent=extent or "pictures")
 
 
 @cli.command()
 @click.argument("scenarios", metavar="SCENARIO...", nargs=-1, required=True, type=click.Path())
+@shared.mesh_options
 @shared.out
 @shared.scheduler
 @shared.cluster
@@ -175,9 +180,9 @@ def run(
     terminal: Terminal,
     options: RunOptions,
     scenarios: tuple[str, ...],
+    of_mesh: dict[str, Any],
     no_plan: bool,
-    only: str | None,
-    pictures: bool,
+    extent: str | None,
     number: int | None,
     backend: str | None,
 ) -> None:
@@ -186,13 +191,14 @@ def run(
     A campaign file, or several scenarios, make one data set.
 
     A mesh file is scanned from the middle of its floor, below the ceiling, or from around and
-    above if it is an object; every hit is kept, to 1 mm. For another sensor, pose or unit of
-    length, lidarpool init DIR --mesh FILE writes a scenario to edit.
+    above if it is an object; every hit is kept, to 1 mm. --sensor, --pose and the like say it
+    otherwise; lidarpool init DIR --mesh FILE writes the same as a scenario to edit.
 
     \b
     Examples:
       lidarpool run examples/seed.yaml --out seed
       lidarpool run hall.glb --no-plan --resume --scheduler tcp://127.0.0.1:8786
+      lidarpool run part.stl --unit mm --sensor ouster/os1-64 --pose 0,0,1.9 --format las
       lidarpool run examples/seed.yaml --cluster examples/clusters/slurm.yaml
       lidarpool run examples/campaign.yaml --out dataset
       lidarpool run --verify dataset
@@ -208,17 +214,18 @@ def run(
         raise click.UsageError("--resume continues the run that --fresh deletes: give one of them.")
     if options.retry_failed and (options.fresh or number is not None):
         raise click.UsageError("--retry-failed goes on with a campaign: not with --fresh or --job.")
-    if only is not None and pictures:
-        raise click.UsageError("--only cloud leaves out what --pictures draws: give one of them.")
-    extent = "pictures" if pictures else only
     paths = [*map(Path, scenarios)]
     if options.verify and not paths[0].is_file():
         click.echo(verify(Storage.at(scenarios[0])))
         return
     assert options.out is not None, "it has a default"
     options = replace(options, folder=Storage.at(options.out).below(RUN_FOLDER))
-    if len(paths) > 1 or is_campaign(paths[0]):
-        several = len(paths) > 1
+    several = len(paths) > 1
+    if of_mesh and several:
+        raise click.UsageError(
+            "--sensor, --pose and the like are for one mesh: run each by itself."
+        )
+    if several or (not of_mesh and is_campaign(paths[0])):
         campaign = CampaignSpec.of_scenarios(paths) if several else CampaignSpec.load(paths[0])
         if number is not None:
             run_job(campaign, number, terminal, options, backend, extent)
@@ -231,7 +238,7 @@ def run(
     elif options.retry_failed or options.verify or number is not None:
         raise click.UsageError("--job, --retry-failed and --verify are for campaigns.")
     else:
-        scenario = Scenario.load(paths[0])
+        scenario = Scenario.load(paths[0], of_mesh)
         run_scenario(scenario, terminal, options, backend, no_plan=no_plan, extent=extent)
 
 

@@ -6,7 +6,7 @@ import math
 import os
 import shutil
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -47,7 +47,7 @@ from ..sensor import Sensor, Survey
 from ..sensor.beams import Beams
 from ..simulator.memory import MB, cast_bytes, scans_that_fit
 from ..simulator.rig import PATTERN_RAYS, Rig
-from ..simulator.world import check_backend_here
+from ..simulator.scene_caster import check_backend_here
 from .run_command import no_hits
 from .terminal import Terminal
 
@@ -76,6 +76,7 @@ GOLDEN = (5**0.5 - 1) / 2
 
 def look_at(
     path: Path,
+    of_mesh: Mapping[str, Any],
     number: int | None,
     client: Client | None,
     options: RunOptions,
@@ -86,20 +87,21 @@ def look_at(
 ) -> tuple[dict[str, Any], Iterator[str]]:
     """Find out what the run of a scenario, a campaign or one of its jobs would do and need.
 
-    Of a campaign, some jobs are looked at, the first and the last among them; they plan no paths.
+    `of_mesh` are for `mesh_data`. Of a campaign, some jobs are looked at, the first and the
+    last among them; they plan no paths.
 
     Returns
     -------
     Plain data for JSON, and the same as lines of text.
     """
-    campaign = CampaignSpec.load(path) if is_campaign(path) else None
+    campaign = CampaignSpec.load(path) if not of_mesh and is_campaign(path) else None
     if campaign is None and number is not None:
         raise LidarpoolError(f"{path} is no campaign, and has no job {number}.")
 
     terminal = Terminal(quiet)
 
     def look(one: int = 0) -> tuple[Job, dict[str, Any]]:
-        read = Scenario.load(path) if campaign is None else campaign.scenario(one)
+        read = Scenario.load(path, of_mesh) if campaign is None else campaign.scenario(one)
         assert read is not None, "of a file"
         with terminal.status("reading the scene", logged=False):
             built = build(read, plans=campaign is None and not no_plan)

@@ -36,7 +36,7 @@ from ..scenario.build import Built, Job, build
 from ..scenario.campaign import CampaignSpec
 from ..scenario.placing import seen_from
 from ..scenario.scenario import Scenario
-from ..simulator.world import check_backend_here
+from ..simulator.scene_caster import check_backend_here
 from .shared_options import show
 from .terminal import Terminal
 

@@ -13,7 +13,6 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from ..base.errors import LidarpoolError
-from ..base.vocabulary import UNITS_M
 from ..base.words import plural, without_common_prefix
 from . import shared_options as options
 from .shared_options import Command, overwrite, together
@@ -42,18 +41,10 @@ _OBJECTS_TOLD = 12
     multiple=True,
     help="Mesh file to survey; may be given several times.",
 )
-@click.option(
-    "--unit",
-    type=click.Choice(list(UNITS_M)),
-    help="Length unit of these files; by default the one they state, else metres.",
-)
-@click.option(
-    "--up-axis",
-    type=click.Choice(["x", "y", "z"]),
-    help="Axis of these files that points up; by default the one they state, else z.",
-)
-def init(folder: Path, meshes: tuple[Path, ...], unit: str | None, up_axis: str | None) -> None:
-    """Write a commented scenario file with all defaults.
+@options.mesh_options
+@options.flag("--all", "every", help="Write every field with its default and a description.")
+def init(folder: Path, meshes: tuple[Path, ...], of_mesh: dict[str, Any], every: bool) -> None:
+    """Write a commented scenario file: what you say, and poses; the rest has defaults.
 
     Its JSON Schema is written beside it, so that editors complete and check it. An existing
     scenario is not overwritten.
@@ -61,33 +52,37 @@ def init(folder: Path, meshes: tuple[Path, ...], unit: str | None, up_axis: str 
     \b
     Examples:
       lidarpool init
-      lidarpool init surveys/hall --mesh hall.stl --unit mm
+      lidarpool init surveys/hall --mesh hall.stl --unit mm --sensor ouster/os1-64
+      lidarpool init every --all
     """  # noqa: D301 - click wants the character, not its name
     from ..scenario.advice import advice
     from ..scenario.build import build
-    from ..scenario.scenario import Scenario
+    from ..scenario.placing import as_entry
+    from ..scenario.scenario import Scenario, mesh_data
     from ..scenario.schema import (
         SCENARIO_FILE,
         SCHEMA_FILE,
         scenario_schema,
         scenario_template,
         schema_text,
+        short_scenario,
     )
 
-    if not meshes and (unit or up_axis):
+    if not meshes and {"unit", "up_axis"} & of_mesh.keys():
         raise click.UsageError("--unit and --up-axis say how to read a mesh: name it with --mesh.")
-    target = folder / SCENARIO_FILE
-    entries = [_entry(path, folder, unit, up_axis) for path in meshes]
-    placing, notes = None, []
-    if meshes and not target.exists():
-        there = [e | {"file": str(p.absolute())} for e, p in zip(entries, meshes, strict=True)]
-        read = Scenario.from_data({"scene": {"files": there}}, source=str(target))
-        built = build(read)
-        placing, notes = built.placing, advice(built)
+    target, data = folder / SCENARIO_FILE, mesh_data(meshes, folder, of_mesh)
+    note, notes = "", []
+    if data and not target.exists():
+        # From here: the scenario's folder need not be there yet.
+        read = Scenario.from_data(mesh_data(meshes, Path(), of_mesh), source=str(target))
+        built = build(read, plans=False)
+        notes = advice(built)
+        if (placing := built.placing) is not None:
+            note, data["poses"] = placing.note, [as_entry(pose) for pose in placing.poses]
     try:
         folder.mkdir(parents=True, exist_ok=True)
         with target.open("x", encoding="utf-8", newline="\n") as file:
-            file.write(scenario_template(entries, placing))
+            file.write((scenario_template if every else short_scenario)(data, note))
         (folder / SCHEMA_FILE).write_text(
             schema_text(scenario_schema()), encoding="utf-8", newline="\n"
         )
@@ -106,18 +101,6 @@ def init(folder: Path, meshes: tuple[Path, ...], unit: str | None, up_axis: str 
         click.echo(f"{name} is the default survey: change what you like.")
         click.echo("for a mesh of your own: lidarpool init DIR --mesh FILE [--unit mm]")
     click.echo(f"next: lidarpool check {shlex.quote(str(target))}")
-
-
-def _entry(path: Path, folder: Path, unit: str | None, up_axis: str | None) -> dict[str, str]:
-    """Entry of `scene.files` for a mesh file, relative to the scenario's folder."""
-    from ..scene.files.meshfile import SUFFIXES
-
-    if not path.is_file() or path.suffix.lower() not in SUFFIXES:
-        raise LidarpoolError(
-            f"{path} has no mesh format that can be read; these can: {' '.join(SUFFIXES)}."
-        )
-    said = {"file": Path(os.path.relpath(path, folder)).as_posix()}
-    return said | {k: v for k, v in (("unit", unit), ("up_axis", up_axis)) if v}
 
 
 @click.command(name="import")
@@ -160,6 +143,7 @@ def import_(survey: Path, assets: tuple[Path, ...], out: Path | None) -> None:
 
 @click.command()
 @click.argument("scenario", type=click.Path(path_type=Path))
+@options.mesh_options
 @options.out
 @options.scheduler
 @options.cluster
@@ -169,6 +153,7 @@ def import_(survey: Path, assets: tuple[Path, ...], out: Path | None) -> None:
 @options.as_json
 def check(
     scenario: Path,
+    of_mesh: dict[str, Any],
     out: Path | Storage,
     scheduler: str | None,
     files: TlsFiles,
@@ -191,6 +176,7 @@ def check(
       lidarpool check scenario.yaml
       lidarpool check campaign.yaml --job 17
       lidarpool check hall.glb --no-plan --scheduler tcp://127.0.0.1:8786 --json
+      lidarpool check part.stl --unit mm --sensor ouster/os1-64 --pose 0,0,1.9
     """  # noqa: D301 - click wants the character, not its name
     from ..run.cluster_file import ClusterFile
     from ..run.connection import connected
@@ -202,7 +188,7 @@ def check(
         with nullcontext() if scheduler is None else connected(scheduler, files) as client:
             asked = RunOptions(out=out, cluster=file)
             found, lines = look_at(
-                scenario, number, client, asked, backend, no_plan=no_plan, quiet=as_json
+                scenario, of_mesh, number, client, asked, backend, no_plan=no_plan, quiet=as_json
             )
     except LidarpoolError as error:
         if as_json:
@@ -212,7 +198,7 @@ def check(
     if found["reasons"]:
         raise LidarpoolError("it cannot run. " + " ".join(found["reasons"]))
     if not as_json:
-        words = ["lidarpool", "run", str(scenario)]
+        words = ["lidarpool", "run", str(scenario), *options.as_words(of_mesh)]
         given: dict[str, object] = {"out": out, "scheduler": scheduler, "cluster": cluster}
         given |= {"backend": backend, "job": number}
         for name, value in given.items():
@@ -353,14 +339,15 @@ def _write(out: Path, make: Callable[[], Scene], overwrite: bool) -> None:
     "--out",
     type=click.Path(path_type=Path),
     metavar="FILE.png",
-    help="File for the picture.  [default: named after the model]",
+    help="Draw the model's beams into this file.",
 )
 def sensors(model: str | None, out: Path | None) -> None:
-    """List sensor models, or draw the beams of one.
+    """List sensor models, or show the figures of one and draw its beams.
 
     \b
     Examples:
       lidarpool sensors
+      lidarpool sensors velodyne/vlp16
       lidarpool sensors velodyne/vlp16 --out vlp16.png
     """  # noqa: D301 - click wants the character, not its name
     from ..sensor.models import datasheet, load_sensor, model_names, read_model, shown_noise
@@ -373,11 +360,8 @@ def sensors(model: str | None, out: Path | None) -> None:
             click.echo("  ".join(map(str.ljust, row, widths)).rstrip())
         return
     described = read_model(model)
-    from ..render.beam_picture import draw_beams  # imports Matplotlib, which lists do not need
-
-    target = out or Path("-".join(Path(model).with_suffix("").parts[-2:]) + ".png")
-    if target.suffix.lower() != ".png":
-        raise click.UsageError(f"{target} is not a picture: give a name that ends in .png.")
+    if out is not None and out.suffix.lower() != ".png":
+        raise click.UsageError(f"{out} is not a picture: give a name that ends in .png.")
     click.echo(described.name)
     lines = [*described.sources.items()]
     if described.performance is not None:
@@ -387,8 +371,13 @@ def sensors(model: str | None, out: Path | None) -> None:
         lines += [("unknown", ", ".join(sheet.missing))] if sheet.missing else []
     for figure, words in lines:
         click.echo(f"{figure:<11}  {words}")
-    draw_beams(target, load_sensor(model))
-    click.echo(click.format_filename(target))
+    if out is None:
+        click.echo(f"to draw its beams: lidarpool sensors {shlex.quote(model)} --out beams.png")
+        return
+    from ..render.beam_picture import draw_beams  # imports Matplotlib, which figures do not need
+
+    draw_beams(out, load_sensor(model))
+    click.echo(click.format_filename(out))
 
 
 def _row(name: str) -> tuple[str, ...]:

@@ -6,15 +6,16 @@ import json
 import logging
 import sys
 import warnings
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from functools import partial, reduce, wraps
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
 import click
 
 from ..base.storage import Storage, is_url
-from ..base.vocabulary import BACKENDS
+from ..base.vocabulary import BACKENDS, UNITS_M
 
 Command = Callable[..., None]
 
@@ -66,6 +67,56 @@ copies = click.option(
 def together(*added: Callable[[Command], Command]) -> Callable[[Command], Command]:
     """Return what adds options to a command, in their order."""
     return lambda command: reduce(lambda made, option: option(made), reversed(added), command)
+
+
+def _position(text: str) -> list[float]:
+    """Parse x,y,z; whole numbers stay so, to be written as they were."""
+    try:
+        x, y, z = map(float, text.split(","))
+    except ValueError as error:
+        told = f"{text!r} is no place: give x,y,z, such as 0,0,1.9; angles are for scenario files."
+        raise click.BadParameter(told) from error
+    return [int(one) if one.is_integer() else one for one in (x, y, z)]
+
+
+def _names(text: str) -> list[str]:
+    return [name.strip() for name in text.split(",")]
+
+
+def _of_mesh(name: str, what: str, **more: Any) -> Callable[[Command], Command]:
+    return click.option(f"--{name}", help=f"Of a mesh: {what}.", **more)
+
+
+_list_of_mesh = partial(_of_mesh, metavar="NAME,…", type=_names, multiple=True)
+_mesh_options = together(
+    _of_mesh("sensor", "sensor, one of lidarpool sensors or a file", metavar="MODEL|FILE.yaml"),
+    _of_mesh("unit", "length unit; by default its own, or m", type=click.Choice([*UNITS_M])),
+    _of_mesh("up-axis", "upward axis; by default its own, or z", type=click.Choice([*"xyz"])),
+    _list_of_mesh("pose", "place of the sensor, metres", metavar="X,Y,Z", type=_position),
+    _list_of_mesh("columns", "further columns of its points, such as range,intensity"),
+    _list_of_mesh("format", "further formats of the cloud, such as las"),
+)
+
+
+def mesh_options(command: Command) -> Command:
+    """Add what may be said of a mesh file; the command gets a dict of it, see `mesh_data`."""
+
+    @wraps(command)
+    def with_options(*arguments: Any, pose: Any, columns: Any, format: Any, **given: Any) -> None:  # noqa: A002
+        said = {name: given.pop(name) for name in ("sensor", "unit", "up_axis")}
+        said |= {"pose": [*pose], "columns": [*chain(*columns)], "format": [*chain(*format)]}
+        said = {name: value for name, value in said.items() if value not in (None, [])}
+        command(*arguments, of_mesh=said, **given)
+
+    return _mesh_options(with_options)
+
+
+def as_words(of_mesh: Mapping[str, Any]) -> Iterator[str]:
+    """Yield the words of a command that give these options."""
+    for name, value in of_mesh.items():
+        for one in value if name == "pose" else [value]:
+            yield f"--{name.replace('_', '-')}"
+            yield one if isinstance(one, str) else ",".join(map(str, one))
 
 
 def scheduler(command: Command) -> Command:

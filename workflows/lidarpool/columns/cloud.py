@@ -5,21 +5,24 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
+from html import escape
 from importlib import import_module
 from importlib.util import find_spec
+from textwrap import shorten
 from typing import Any, Literal, Protocol
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, DTypeLike
 
-from ..base.arrays import AnyArray, AnyFloats, Integers
+from ..base.arrays import AnyArray, AnyFloats
 from ..base.errors import LidarpoolError
 from ..base.open3d_module import load_open3d
-from ..base.validation import as_array, checked, checked_fields
+from ..base.validation import as_array, checked, checked_fields, shown
 from .table import TABLE, Column
 from .waveforms import WAVEFORM, Waveforms
 
 CHUNK_POINTS = 1_000_000  # points in memory at a time while a cloud is read in order
+SHOWN_POINTS = 5
 
 
 class CloudLike(Protocol):
@@ -42,12 +45,33 @@ class CloudLike(Protocol):
         """Row of the first point of a scan, if the points are in the order of scans."""
 
 
+class Shown:
+    """How prompts and notebooks show a cloud."""
+
+    def __repr__(self: CloudLike) -> str:
+        names = ", ".join(("x", "y", "z", *(column.name for column in self.table)))
+        kept = shorten(names, 80, placeholder=" …")
+        return f"<{type(self).__name__} of {len(self):,} points: {kept}>"
+
+    def _repr_html_(self: CloudLike) -> str:
+        """Table that notebooks show: columns, their types, the first points."""
+        first = next(self.chunks(SHOWN_POINTS), None)
+        values = {} if first is None else first.by_name
+        kinds = [array.dtype for array in values.values()]
+        rows = (values, kinds, *zip(*values.values(), strict=True))
+        cells = ("".join(f"<td>{escape(str(cell))}</td>" for cell in row) for row in rows)
+        body = "".join(f"<tr>{row}</tr>" for row in cells)
+        return f"<table><caption>{len(self):,} points</caption>{body}</table>"
+
+
 @dataclass(frozen=True, eq=False, repr=False)
 @checked_fields
-class Cloud:
+class Cloud(Shown):
     """Points of a survey, ordered by scan and ray.
 
     Read a column as ``cloud["channel"]``, or as ``cloud.scan`` unless an attribute has its name.
+    Select points as ``cloud[:100]``, ``cloud[mask]`` or ``cloud[indices]``; ``np.asarray(cloud)``
+    is their positions, float64 (n, 3).
 
     Parameters
     ----------
@@ -95,17 +119,30 @@ class Cloud:
     def __len__(self) -> int:
         return len(self.positions)
 
-    def __repr__(self) -> str:
-        return described(self)
+    def __array__(self, dtype: DTypeLike | None = None, copy: bool | None = None) -> AnyArray:
+        return np.array(self.positions, np.float64 if dtype is None else dtype, copy=copy)
 
-    def __getitem__(self, name: str) -> AnyArray:
+    def __getitem__(self, key: str | slice | ArrayLike) -> Any:
+        if isinstance(key, str):
+            try:
+                return self.columns[key]
+            except KeyError:
+                raise KeyError(
+                    f"the cloud has no column {key!r}; it has {list(self.columns)}, and x, y and "
+                    "z in `positions`"
+                ) from None
+        rows = key if isinstance(key, slice) else np.asarray(key, None if np.size(key) else int)
         try:
-            return self.columns[name]
-        except KeyError:
-            raise KeyError(
-                f"the cloud has no column {name!r}; it has {list(self.columns)}, and x, y and z "
-                "in `positions`"
-            ) from None
+            positions = self.positions[rows]
+        except (IndexError, TypeError):
+            positions = np.empty(0)
+        if positions.ndim != 2:
+            raise LidarpoolError(
+                f"Points of a cloud of {len(self):,} are a slice, as cloud[:100], a mask, or a "
+                f"list of their rows, not {shown(key)}; a column is its name, as cloud['range']."
+            )
+        columns = {name: array[rows] for name, array in self.columns.items()}
+        return Cloud(positions, columns, self.own, self.sweeps)
 
     def __getattr__(self, name: str) -> AnyArray:
         columns: Mapping[str, AnyArray] = self.__dict__.get("columns", {})
@@ -125,6 +162,12 @@ class Cloud:
             for name, array in self.columns.items()
             if name != WAVEFORM
         )
+
+    @property
+    def by_name(self) -> dict[str, AnyArray]:
+        """Coordinates and columns, {name: (n,)}, without waveforms."""
+        axes = dict(zip("xyz", self.positions.T, strict=True))
+        return axes | {column.name: self[column.name] for column in self.table}
 
     @property
     def recorded(self) -> bool:
@@ -161,9 +204,7 @@ class Cloud:
             If the library is not installed.
         """
         need_packages(library)
-        columns = dict(zip("xyz", self.positions.T, strict=True))
-        columns |= {column.name: self[column.name] for column in self.table}
-        return import_module(library).DataFrame(columns)
+        return import_module(library).DataFrame(self.by_name)
 
     def to_open3d(self) -> Any:
         """Return an `open3d.t.geometry.PointCloud` of all columns, by their names in files."""
@@ -174,15 +215,14 @@ class Cloud:
             cloud.point[column.in_files] = o3d.core.Tensor(values)
         return cloud
 
-    def part(self, rows: slice | Integers) -> Cloud:
-        """Select points; consecutive ones as views."""
-        columns = {name: array[rows] for name, array in self.columns.items()}
-        return Cloud(self.positions[rows], columns, self.own, self.sweeps)
+    def head(self, points: int = SHOWN_POINTS) -> Cloud:
+        """Select the first points, or all if there are fewer."""
+        return self[:points]
 
     def chunks(self, points: int = CHUNK_POINTS, first: int = 0) -> Iterator[Cloud]:
         """Yield the points in order, from row `first` on, at most so many at a time, as views."""
         for start in range(first, len(self), points):
-            yield self.part(slice(start, start + points))
+            yield self[start : start + points]
 
     def row_of(self, scan: int) -> int:
         """Row of the first point of a scan, if the points are in the order of scans."""
@@ -211,12 +251,6 @@ def need_packages(*packages: str) -> None:
         raise LidarpoolError(
             f"Dataframes need {' and '.join(missing)}: pip install {' '.join(missing)}."
         )
-
-
-def described(cloud: CloudLike) -> str:
-    """Describe a cloud by its number of points and its columns."""
-    names = ", ".join(("x", "y", "z", *(column.name for column in cloud.table)))
-    return f"<{type(cloud).__name__} of {len(cloud):,} points: {names}>"
 
 
 def _fitting(column: Column, values: ArrayLike) -> AnyArray:

@@ -18,6 +18,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
+from numpy.typing import DTypeLike
 
 from ..base.archives import read_array, read_arrays
 from ..base.arrays import AnyArray, Floats, Floats32, Integers, Ints, Ints32, UInts32
@@ -25,7 +26,7 @@ from ..base.elementary import decade
 from ..base.errors import LidarpoolError
 from ..base.sampling import even_indices
 from ..base.storage import Storage, target_of
-from .cloud import CHUNK_POINTS, Cloud, described, need_packages
+from .cloud import CHUNK_POINTS, Cloud, Shown, need_packages
 from .table import AXES, SCAN, Column
 from .waveforms import WAVEFORM
 
@@ -221,7 +222,7 @@ def read_tally(storage: Storage, name: str) -> tuple[Ints32, Ints]:
 
 
 @dataclass(eq=False, repr=False)
-class StoredCloud:
+class StoredCloud(Shown):
     """The points of parts in (scan, ray) order, read in pieces; a `CloudLike`."""
 
     storage: Storage  # of the parts
@@ -240,8 +241,8 @@ class StoredCloud:
         # Both hold the scene, and nobody hears of other processes.
         return self.__dict__ | {"keeper": None, "sweeps": None, "tell": abs}
 
-    def __repr__(self) -> str:
-        return described(self)
+    def __array__(self, dtype: DTypeLike | None = None, copy: bool | None = None) -> AnyArray:
+        return self.load().__array__(dtype)
 
     def __len__(self) -> int:
         return sum(self.rows)
@@ -283,8 +284,8 @@ class StoredCloud:
             self.tell(len(cloud))
             while count + len(cloud) >= points:
                 cut = points - count
-                yield Cloud.joined([*held, cloud.part(slice(0, cut))])
-                cloud, held, count = cloud.part(slice(cut, None)), [], 0
+                yield Cloud.joined([*held, cloud[:cut]])
+                cloud, held, count = cloud[cut:], [], 0
             if len(cloud):
                 held.append(cloud)
                 count += len(cloud)

@@ -201,7 +201,7 @@ class Sweeps:
                 while current < sweep[start]:
                     yield Cloud.joined(held) if held else empty
                     held, current = [], current + 1
-                held.append(chunk.part(slice(start, after)))
+                held.append(chunk[start:after])
             if end < len(sweep):
                 break
         while current < stop:

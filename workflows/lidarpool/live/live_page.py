@@ -403,7 +403,7 @@ class LiveJob:
             cloud = Cloud.joined(clouds)
             while len(cloud) > self._most:
                 self._share /= 2
-                cloud = cloud.part(np.flatnonzero(self._random.random(len(cloud)) < 0.5))
+                cloud = cloud[self._random.random(len(cloud)) < 0.5]
             self.cloud = cloud
         self._show()
 

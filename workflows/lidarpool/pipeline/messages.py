@@ -15,6 +15,7 @@ from poolpart import TaskRecord
 
 from ..base.arrays import Floats32
 from ..base.tracing import trace
+from ..base.validation import one_line
 from ..columns.cloud import Cloud
 from ..columns.parts import PartColumns
 from ..sensor import Pose
@@ -182,6 +183,7 @@ class ScanFrame:
     count: int
     samples: Floats32
     _read: Callable[[int], Cloud] = field(repr=False, compare=False)
+    __repr__ = one_line
 
     def points(self) -> Cloud:
         """Points of this scan, read from its part.

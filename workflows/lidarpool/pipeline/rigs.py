@@ -26,8 +26,8 @@ from ..columns.parts import PartColumns
 from ..scene.scene import Scene
 from ..sensor import Survey
 from ..simulator.batch import columns_of
-from ..simulator.device import DeviceReturns
-from ..simulator.returns import BatchReturns
+from ..simulator.device import DevicePoints
+from ..simulator.points import BatchPoints
 from ..simulator.rig import Rig
 from .failures import naming_scans
 from .messages import BatchRange, samples_of_scan
@@ -179,7 +179,7 @@ def _cast(rig: Rig, work: CastWork, first: int, stop: int) -> CastBatch:
     return batch
 
 
-def _samples(returns: BatchReturns | DeviceReturns) -> Floats32:
+def _samples(returns: BatchPoints | DevicePoints) -> Floats32:
     """Sample rays: spread over the points of each scan, (scans, samples, 3); NaN if missing."""
     samples = samples_of_scan(returns.survey.scan_count)
     begins = np.cumsum(returns.counts) - returns.counts

@@ -10,6 +10,7 @@ import numpy as np
 
 from ..base.arrays import Floats
 from ..base.errors import LidarpoolError
+from ..base.validation import one_line
 from .cost import PathCost
 from .geometry import PathAxes, clearance, path_length, segment_distances
 from .planning import Planning
@@ -102,6 +103,7 @@ class Plan:
     clearance: float
     trial: int
     trials: int
+    __repr__ = one_line
 
     @property
     def collision_free(self) -> bool:

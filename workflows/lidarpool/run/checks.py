@@ -29,7 +29,7 @@ from ..pipeline.names import COLLECT, GENERATE, GPU, LIDAR, OTHER, SORT
 from ..scenario.build import Job
 from ..scenario.sections import TaskOptions
 from ..simulator.memory import MB, cast_bytes
-from ..simulator.world import AUTO_TAKES
+from ..simulator.scene_caster import AUTO_TAKES
 from .watch import Waiting, queued
 
 LOOK_EVERY_S = 0.2

@@ -14,7 +14,7 @@ from ..datasets.job_table import JobRow
 from ..pipeline.database import FILE
 from ..pipeline.messages import ScanFrame
 from ..plan import best
-from ..simulator.world import check_backend_here
+from ..simulator.scene_caster import check_backend_here
 from .cluster import Cluster
 from .job_source import JobMaker, Jobs, MadeJob, OneJob
 from .options import RunOptions

@@ -10,6 +10,7 @@ from typing import Any
 from poolpart import TaskRecord
 
 from ..base.arrays import Floats32, Ints
+from ..base.validation import one_line
 from ..columns.cloud import Cloud
 from ..columns.parts import StoredCloud
 from ..datasets.job_table import JobRow
@@ -123,6 +124,7 @@ class CampaignRun:
     stages: tuple[StageTotals, ...] = ()
     notes: tuple[str, ...] = ()
     sensors: Mapping[str, str] = field(default_factory=dict)
+    __repr__ = one_line
 
     @classmethod
     def of(

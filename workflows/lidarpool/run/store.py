@@ -30,7 +30,7 @@ from ..pipeline.database import (
 )
 from ..pipeline.failures import storing
 from ..scenario.build import Job
-from ..simulator.world import AUTO_TAKES
+from ..simulator.scene_caster import AUTO_TAKES
 from .job_points import JobPoints
 from .job_source import CONTENT, Jobs, OneJob, identity_of
 from .remote import OWNER, RemoteRun, fetch_database

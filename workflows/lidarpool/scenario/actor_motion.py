@@ -29,13 +29,22 @@ from ..sensor.survey import StepCount
 from ..sensor.trajectory import CLOCK_S, Beyond, InstrumentPose, quaternions_of, rotations_of
 from ..sensor.trajectory_files import Duration, Seconds, TrajectoryFormat, quaternions_from_degrees
 from .ground import Standing, following
-from .sections import MeshEntry, MeshFile, PathOf, Section, SensorSection, ShapeSection
+from .sections import (
+    MeshEntry,
+    MeshFile,
+    PathOf,
+    PoseEntry,
+    Section,
+    SensorSection,
+    ShapeSection,
+    by_position,
+)
 
 _OF_ROBOTS = {"file", "opacity"}  # fields of a mesh file that robots have
 
 
 class MountSection(Section, InstrumentPose):
-    """Position and angles of a sensor on its carrier, in the carrier's axes."""
+    """Position and angles of a sensor on its carrier; in YAML also just [x, y, z]."""
 
     link: Annotated[
         Text | None,
@@ -51,10 +60,13 @@ class MountSection(Section, InstrumentPose):
         return Pose(**declared(self, Pose))
 
 
-class CarriedSection(SensorSection):
-    """One of several sensors: its mount, and when it scans."""
+MountEntry = Annotated[MountSection, by_position(MountSection)]
 
-    mount: MountSection = MountSection()
+
+class CarriedSection(SensorSection):
+    """One of several sensors: its mount, and when it scans; in YAML also just the model."""
+
+    mount: MountEntry = MountSection()
     start_s: Annotated[
         float, about("start, in seconds after that of the survey or station", ge=0, le=1e9)
     ] = 0.0
@@ -68,6 +80,9 @@ class CarriedSection(SensorSection):
         made = super().mounted(*given)
         sensor = replace(made.sensor, start_ns=self.start_s * 1e9) if self.start_s else made.sensor
         return replace(made, sensor=sensor, steps=self.steps)
+
+
+CarriedEntry = Annotated[CarriedSection, by_text("model", CarriedSection)]
 
 
 class TimedPose(Section, Pose):
@@ -182,7 +197,7 @@ TrajectoryEntry = Annotated[TrajectorySection, by_text("file", TrajectorySection
 
 
 class ActorSection(ShapeSection):
-    """An object or robot that moves through the scene; its axes have x ahead and z up."""
+    """An object or robot that moves or stands; its axes have x ahead and z up."""
 
     name: Annotated[Text, about("name of the object")]
     file: Annotated[
@@ -192,10 +207,14 @@ class ActorSection(ShapeSection):
     trajectory: Annotated[
         TrajectoryEntry | None,
         about(
-            "its trajectory, by the clock of the survey's; by default it is the carrier, and has "
-            "the survey's",
+            "its trajectory, by the clock of the survey's; without it and at it is the carrier, "
+            "and has the survey's",
             "van.csv",
         ),
+    ] = None
+    at: Annotated[
+        PoseEntry | None,
+        about("instead of a trajectory: where it stands, [x, y, z] or with angles", [4, 5, 0]),
     ] = None
     joints: Annotated[
         Text | None,
@@ -207,6 +226,8 @@ class ActorSection(ShapeSection):
     @model_validator(mode="after")
     def _of_actor(self) -> ActorSection:
         way = self.trajectory
+        if way is not None and self.at is not None:
+            raise ValueError("give either trajectory or at, not both.")
         if way is not None and (way.start_s is not None or way.duration_s is not None):
             raise ValueError("an actor starts with the survey: give offset_s, not start_s.")
         if not self.robot and self.joints is not None:
@@ -216,16 +237,27 @@ class ActorSection(ShapeSection):
         return self
 
     @property
+    def is_carrier(self) -> bool:
+        """Whether it has the survey's trajectory, and carries its sensors."""
+        return self.trajectory is None and self.at is None
+
+    @property
     def robot(self) -> MeshFile | None:
         """Its file, if that is one of a robot."""
         return self.file if self.file and self.file.file.lower().endswith(ROBOTS) else None
 
     def way(self, path: PathOf, standing: Standing, carrier: Track | None) -> Track:
         """Return its trajectory from the survey's start on."""
+        start_s = 0.0 if carrier is None else carrier.start_s or 0.0
+        if self.at is not None:
+            # Of two poses: joints of a robot go by the clock of its trajectory.
+            places = np.array([self.at.position] * 2) - standing.origin
+            turns = quaternions_of(np.array([self.at.turn] * 2))
+            times = start_s + np.arange(2.0)
+            return Track(times, places, turns, start_s=start_s, beyond="hold")
         if self.trajectory is None:
             assert carrier is not None, "checked with the scenario"
             return carrier
-        start_s = 0.0 if carrier is None else carrier.start_s
         with prefixed(f"actor {self.name!r}"):
             return self.trajectory.track(path, standing, start_s)
 

@@ -6,7 +6,7 @@ from collections.abc import Iterator, Mapping
 
 import numpy as np
 
-from ..base.words import plural
+from ..base.words import as_scenario, plural
 from ..columns.table import VELOCITY
 from ..scene.files.meshfile import CITYJSON, UNITLESS, wrote_it
 from ..sensor.materials import MaterialTable
@@ -31,12 +31,13 @@ def advice(built: Built) -> list[str]:
     on figures that data sheets lack, and on settings without effect.
     """
     notes, remarks = built.found.notes, built.found.remarks
-    axes = remarks[:1]
+    axes = [f"{remark} (--up-axis AXIS with a mesh file)" for remark in remarks[:1]]
     if remarks[1:]:
         axes = [f"{axes[0]}; {plural(len(remarks) - 1, 'more file')}, too"]
     likely = filter(None, (_of_size(built), _of_poses(built), _of_colours(built)))
     unstated = dict.fromkeys(_of_datasheets(built))
-    return [*notes, *axes, *likely, *unstated, *_without_effect(built.scenario)]
+    lines = (*notes, *axes, *likely, *unstated, *_without_effect(built.scenario))
+    return [as_scenario(line) for line in lines]
 
 
 def _of_size(built: Built) -> str:
@@ -55,8 +56,8 @@ def _of_size(built: Built) -> str:
     said = "states no unit" if unitless else "is in metres by its format"
     return (
         f"{(unitless or files)[0]} {said}, and in metres the scene is {side:,.5g} m long. If "
-        f"that is wrong, give the file's unit ({unit}?) in scene.files (lidarpool init DIR "
-        f"--mesh FILE --unit {unit} writes such a scenario)"
+        f"that is wrong, give the file's unit ({unit}?) in scene.files, or --unit {unit} with a "
+        "mesh file"
     )
 
 

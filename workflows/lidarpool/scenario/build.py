@@ -235,7 +235,7 @@ def _mount(section: SensorSection, shapes: Shapes) -> Pose:
     carriers = [
         (entry, shapes.robot(entry.robot))
         for entry in scenario.actors
-        if entry.trajectory is None and entry.robot
+        if entry.is_carrier and entry.robot
     ]
     on = [(entry, robot) for entry, robot in carriers if mount.link in robot.links]
     if len(on) != 1:
@@ -276,7 +276,7 @@ def _actors(shapes: Shapes, standing: Standing, track: Track | None) -> list[Act
 def _links(entry: ActorSection, robot: Robot, way: Track, shapes: Shapes) -> Sequence[Actor]:
     """Actors of a robot, without the links that sensors are mounted on."""
     tell, links = shapes.found.notes.append, shapes.scenario.links
-    without = links.intersection(robot.meshes) if entry.trajectory is None else ()
+    without = links.intersection(robot.meshes) if entry.is_carrier else ()
     for link in sorted(without):
         tell(f"{entry.name}: link {link} is left out: a sensor is mounted on it")
     joints = _joints(entry, shapes.scenario)

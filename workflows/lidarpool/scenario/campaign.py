@@ -16,11 +16,21 @@ from typing import Annotated, Any
 
 import numpy as np
 from pydantic import BaseModel, Field
+from pydantic_core import to_json
 
 from ..base.declared import Seed
 from ..base.errors import LidarpoolError, Mistakes, prefixed
 from ..base.fingerprint import fingerprint
-from ..base.validation import checked, dotted, fields_of, is_section, sections_in, sentences, shown
+from ..base.validation import (
+    checked,
+    dotted,
+    field_hint,
+    fields_of,
+    is_section,
+    sections_in,
+    sentences,
+    shown,
+)
 from ..base.words import did_you_mean, plural
 from ..base.yamlfile import read_yaml
 from ..datasets.job_table import Value
@@ -436,7 +446,7 @@ class _Varied(_JobSource):
         return {
             "vary": fingerprint({t: c.model_dump() for t, c in self._vary.items()}, [*self._vary]),
             "base": fingerprint([(base.name, _print(base.scenario)) for base in self._bases]),
-            "tables": fingerprint(repr([base.tables for base in self._bases])),
+            "tables": fingerprint(to_json([base.tables for base in self._bases])),
         }
 
     def values(self, number: int) -> dict[str, Value]:
@@ -657,7 +667,7 @@ def _field(node: BaseModel, name: str, at: str) -> tuple[str, Any, Any]:
     fields = {field.alias or own: own for own, field in fields_of(type(node)).items()}
     if name not in fields:
         place = f"a field of {at}" if at else "a section of a scenario"
-        raise LidarpoolError(f"{name!r} is not {place}.{did_you_mean(name, fields)}")
+        raise LidarpoolError(f"{name!r} is not {place}.{field_hint(name, fields, Scenario)}")
     own = fields[name]
     return name, getattr(node, own, None), fields_of(type(node))[own].annotation
 

@@ -136,8 +136,10 @@ def on_one_line(value: Any) -> str:
     return text.removesuffix("\n").removesuffix("...").removesuffix("\n")
 
 
-def as_entry(pose: Pose) -> dict[str, object]:
-    """Return a pose as a scenario has it."""
+def as_entry(pose: Pose) -> list[float] | dict[str, object]:
+    """Return a level or pitched pose as a scenario has it, in short if it has no angles."""
+    if pose.rotation is None:
+        return [*pose.position]
     return {"position": [*pose.position], "yaw_deg": pose.yaw_deg, "pitch_deg": pose.pitch_deg}
 
 

@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import os
 from collections import Counter
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from types import MappingProxyType
 from typing import Annotated, Any
 
 from pydantic import PrivateAttr
 
-from ..base.declared import Several, Text, about
-from ..base.errors import Mistakes, prefixed
+from ..base.declared import Several, Text, about, by_text
+from ..base.errors import LidarpoolError, Mistakes, prefixed
 from ..base.validation import sentences
 from ..base.yamlfile import read_yaml
 from ..columns.table import COLOURS
@@ -21,8 +23,8 @@ from ..sensor.trajectory import CENTRE
 from ..sensor.weather import Weather
 from .actor_motion import (
     ActorSection,
-    CarriedSection,
-    MountSection,
+    CarriedEntry,
+    MountEntry,
     TrafficSection,
     TrajectoryEntry,
 )
@@ -43,6 +45,40 @@ from .sections import (
 
 # The cloud of a mesh file without a scenario.
 MESH_CLOUD = {"precision_m": 0.001}
+
+# Options of a mesh file without a scenario, and where a scenario has them.
+MESH_OPTIONS = {
+    "sensor": "sensor",
+    "unit": "unit of scene.files",
+    "up_axis": "up_axis of scene.files",
+    "pose": "poses",
+    "columns": "cloud.columns",
+    "format": "output.write",
+}
+
+
+def mesh_data(files: Sequence[Path], folder: Path, options: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the scenario of mesh files as data, as its YAML would have it.
+
+    Names of files start from `folder`, that of the scenario. `options` are {name in
+    `MESH_OPTIONS`: value}; what is not among them is left out, and so is the scene without files.
+    """
+
+    def moved(file: str | Path) -> str:
+        return Path(os.path.relpath(file, folder)).as_posix()
+
+    read = {name: options[name] for name in ("unit", "up_axis") if name in options}
+    entries = [{"file": name} | read if read else name for name in map(moved, files)]
+    cloud = (MESH_CLOUD if files else {}) | {k: options[k] for k in ("columns",) if k in options}
+    model = options.get("sensor")
+    data = {
+        "scene": {"files": entries} if files else None,
+        "sensor": moved(model) if model and model.endswith((".yaml", ".yml")) else model,
+        "poses": options.get("pose"),
+        "cloud": cloud or None,
+        "output": {"write": options["format"]} if "format" in options else None,
+    }
+    return {name: value for name, value in data.items() if value is not None}
 
 
 class Scenario(Section):
@@ -68,7 +104,9 @@ class Scenario(Section):
     """
 
     scene: Annotated[SceneSection, scene_in_short] = SceneSection()
-    sensor: Annotated[SensorSection, may_be_empty(SensorSection)] = SensorSection()
+    sensor: Annotated[
+        SensorSection, may_be_empty(SensorSection), by_text("model", SensorSection | None)
+    ] = SensorSection()
     poses: Annotated[
         Several[PoseEntry] | None,
         about(
@@ -89,18 +127,20 @@ class Scenario(Section):
         ),
     ] = None
     sensors: Annotated[
-        dict[Text, CarriedSection],
+        dict[Text, CarriedEntry],
         about(
             "instead of sensor: several on one carrier, by name, each with its mount",
-            {"front": {"model": "velodyne/vlp16", "mount": {"position": [2, 0, 0.5]}}},
+            {"front": {"model": "velodyne/vlp16", "mount": [2, 0, 0.5]}, "roof": "ouster/os1-64"},
             max_length=SENSORS_MOST,
         ),
     ] = {}  # noqa: RUF012 - of a frozen model
     actors: Annotated[
         Several[ActorSection],
         about(
-            "moving objects: meshes, boxes or robots; one without a trajectory is the carrier",
+            "objects that move, or stand at a pose: meshes, boxes or robots; one without "
+            "trajectory and at is the carrier",
             [{"name": "Van", "box": [5, 2, 2.2], "trajectory": "van.tum", "class": 3}],
+            [{"name": "Crane", "file": "crane.urdf", "at": [4, 5, 0]}],
             max_length=10_000,
         ),
     ] = ()
@@ -112,9 +152,10 @@ class Scenario(Section):
         ),
     ] = None
     mount: Annotated[
-        MountSection | None,
+        MountEntry | None,
         about(
             "pose of the sensor on its carrier, in the carrier's axes",
+            [1, 0, 2],
             {"position": [1, 0, 2], "pitch_deg": 10},
         ),
     ] = None
@@ -152,8 +193,8 @@ class Scenario(Section):
     _source: str = PrivateAttr(default="the default survey")  # for messages
 
     @classmethod
-    def load(cls, path: str | Path) -> Scenario:
-        """Read a scenario file (YAML), or make a scenario of a mesh file.
+    def load(cls, path: str | Path, options: Mapping[str, Any] = MappingProxyType({})) -> Scenario:
+        """Read a scenario file (YAML), or make a scenario of a mesh file; see `mesh_data`.
 
         Raises
         ------
@@ -162,7 +203,13 @@ class Scenario(Section):
         """
         path = Path(path)
         mesh = path.suffix.lower() in SUFFIXES
-        data = {"scene": {"files": [path.name]}, "cloud": MESH_CLOUD} if mesh else read_yaml(path)
+        data = mesh_data([path], path.parent, options) if mesh else read_yaml(path)
+        if options and not mesh:
+            name = next(iter(options))
+            raise LidarpoolError(
+                f"--{name.replace('_', '-')} is for a mesh file: in {path}"
+                f"{', or rather its base' * ('base' in data)}, change {MESH_OPTIONS[name]}."
+            )
         return cls.from_data(data, source=str(path), folder=path.parent)
 
     @classmethod
@@ -215,11 +262,11 @@ class Scenario(Section):
             wrong.append("trajectory.beyond is for actors; the carrier's has to cover the survey.")
         if self.trajectory is not None and self.poses is not None:
             wrong.append("give either poses or a trajectory, not both.")
-        carried = [entry for entry in self.actors if entry.trajectory is None]
+        carried = [entry for entry in self.actors if entry.is_carrier]
         if carried and self.trajectory is None:
             wrong.append(
-                f"actor {carried[0].name!r} has no trajectory: give it one, or give the survey a "
-                "trajectory in place of poses, to be its carrier."
+                f"actor {carried[0].name!r} has no trajectory: give it one, or at: [x, y, z] if it "
+                "stands, or give the survey a trajectory in place of poses, to be its carrier."
             )
         if self.links and not any(entry.robot for entry in carried):
             wrong.append(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import inspect
 import json
 import textwrap
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 from pydantic.fields import FieldInfo
@@ -13,8 +13,8 @@ from pydantic.json_schema import GenerateJsonSchema
 
 from ..base.validation import fields_of, is_section
 from .campaign_sections import CampaignSection
-from .placing import Placing, as_entry, on_one_line
-from .scenario import MESH_CLOUD, Scenario
+from .placing import on_one_line
+from .scenario import Scenario
 from .sections import Section
 
 SCHEMA_FILE = "scenario.schema.json"  # in the folder of a scenario
@@ -74,32 +74,55 @@ SCENARIO_FILE = "scenario.yaml"
 _WIDTH = 100
 _COMMENT_AT = 30  # column of the comments that stand beside a field
 
-_HEAD = f"""\
-# yaml-language-server: $schema={SCHEMA_FILE}
+_HEAD = f"# yaml-language-server: $schema={SCHEMA_FILE}"
+_EVERY = f"""\
+{_HEAD}
 # A lidar survey for lidarpool, with path planning. Every field has its default here, and may be
 # left out. A name after "# " is an example for a field whose default lidarpool chooses. Lengths
 # are in metres, angles in degrees, Z is up.
 #
 #     lidarpool check {SCENARIO_FILE}
 #     lidarpool run {SCENARIO_FILE}"""
+_FEW = f"""\
+{_HEAD}
+# A lidar survey for lidarpool; lengths are in metres, Z is up. Fields that are left out have their
+# defaults; lidarpool init DIR --all writes all of them."""
+# {section of a short scenario: (an example, what it is)}
+_SECTIONS = {
+    "scene": ("seed", "mesh files, named from this folder; seed is six objects"),
+    "sensor": ("ouster/os1-64", "a model of `lidarpool sensors`, or your own .yaml"),
+    "poses": ("[[0, 0, 1], {position: [0, 0, 2], yaw_deg: 90}]", "where the sensor stands"),
+    "cloud": ("{columns: [range, intensity]}", "precision and further columns of the points"),
+    "output": ("{write: [las]}", "further formats of the cloud"),
+}
 
 
-def scenario_template(files: Sequence[dict[str, str]] = (), placing: Placing | None = None) -> str:
+def short_scenario(data: Mapping[str, Any], note: str) -> str:
+    """Return a commented scenario in YAML of a few sections, those not in `data` as examples.
+
+    `data` is what `mesh_data` returns, `note` a remark on its poses.
+    """
+    lines, data = [_FEW, ""], {"scene": "seed"} | dict(data)
+    for name, (example, words) in _SECTIONS.items():
+        given = name in data
+        code = f"{name}: {on_one_line(data[name])}" if given else f"# {name}: {example}"
+        placed = name == "poses" and given
+        lines += _poses(data[name], note) if placed else _beside(code, words, "")
+    return "\n".join([*lines, ""])
+
+
+def scenario_template(data: Mapping[str, Any], note: str) -> str:
     """Return a commented scenario in YAML that holds all defaults.
 
-    `files` are mesh files to survey, as in `scene.files`. `placing` is where the sensor is put in
-    them; its poses are written if they are around an object.
+    `data` is what `mesh_data` returns, in place of some of them, `note` a remark on its poses.
     """
-    lines = [_HEAD]
-    given: dict[str, Any] = {}
-    if files:
-        given = {"scene": {"files": [*files]}, "cloud": MESH_CLOUD}
+    lines, given = [_EVERY], dict(data)
+    if "sensor" in given:
+        given["sensor"] = {"model": given["sensor"]}
     for name, field in Scenario.model_fields.items():
         lines.append("")
-        if name == "poses" and placing is not None:
-            lines += _placed(placing)
-        if name != "poses" or placing is None or not placing.around:
-            lines += _top(name, field, given.get(name, {}))
+        placed = name == "poses" and name in given
+        lines += _poses(given[name], note) if placed else _top(name, field, given.get(name, {}))
     return "\n".join([*lines, ""])
 
 
@@ -115,18 +138,17 @@ def _top(name: str, field: FieldInfo, given: dict[str, Any]) -> Iterator[str]:
         yield from _lines(inner, content, "  ", given)
 
 
-def _placed(placing: Placing) -> Iterator[str]:
-    """Return the poses around an object, or a remark on where the sensor is."""
-    if placing.note:
-        note = f"{placing.note[:1].upper()}{placing.note[1:]}."
+def _poses(poses: Sequence[Any], note: str) -> Iterator[str]:
+    """Yield poses, a line each, below a remark on where the sensor is."""
+    if note:
+        note = f"{note[:1].upper()}{note[1:]}."
         # A pose stays on one line, to be copied.
-        text, mark, poses = note.partition("poses: ")
+        text, mark, others = note.partition("poses: ")
         yield from textwrap.wrap(text, _WIDTH, initial_indent="# ", subsequent_indent="# ")
         if mark:
-            yield f"# poses: {poses.removesuffix('.')}"
-    if placing.around:
-        yield "poses:"
-        yield from (f"  - {on_one_line(as_entry(pose))}" for pose in placing.poses)
+            yield f"# poses: {others.removesuffix('.')}"
+    yield from _beside("poses:", _SECTIONS["poses"][1], "")
+    yield from (f"  - {on_one_line(pose)}" for pose in poses)
 
 
 def _lines(name: str, field: FieldInfo, indent: str, given: dict[str, Any]) -> Iterator[str]:

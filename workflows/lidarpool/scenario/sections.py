@@ -162,7 +162,7 @@ MeshEntries = Several[MeshEntry]
 def _pose(value: Any) -> Any:
     if isinstance(value, list):
         return {"position": value}
-    if not isinstance(value, (dict, Pose, CopySection)):
+    if not isinstance(value, (dict, Pose)):
         raise must_be(
             "x, y and z in metres, [0, 0, 1], or position and angles, {position: [0, 0, 1], "
             "yaw_deg: 90}"
@@ -170,7 +170,12 @@ def _pose(value: Any) -> Any:
     return value
 
 
-PoseEntry = Annotated[Pose, BeforeValidator(_pose, json_schema_input_type=Triple | Pose)]
+def by_position(kind: Any, position: Any = Triple) -> BeforeValidator:
+    """Let a scenario give just the position of a pose: [0, 0, 1]."""
+    return BeforeValidator(_pose, json_schema_input_type=position | kind)
+
+
+PoseEntry = Annotated[Pose, by_position(Pose)]
 PointXYZ = Annotated[Several[Coordinate], Field(min_length=2, max_length=3)]  # x, y, perhaps z
 
 
@@ -239,11 +244,7 @@ class CopiesSection(ShapeSection):
 
     name: Annotated[Text, about("name of the first; the others are numbered: Tree, Tree.2, …")]
     at: Annotated[
-        Several[
-            Annotated[
-                CopySection, BeforeValidator(_pose, json_schema_input_type=PointXYZ | CopySection)
-            ]
-        ],
+        Several[Annotated[CopySection, by_position(CopySection, PointXYZ)]],
         about("places: [x, y], [x, y, z], or with angles and scale", max_length=COPIES_MOST),
     ] = ()
     table: Annotated[
@@ -315,7 +316,7 @@ class SceneSection(Section):
 class SensorSection(Section):
     """The lidar: a model, a calibrated unit, or a turning head with evenly spaced beams.
 
-    See `load_sensor` for the first two, and `Sensor` for the grid.
+    In YAML also just the model. See `load_sensor` for the first two, and `Sensor` for the grid.
     """
 
     model: Annotated[
@@ -363,7 +364,7 @@ class SensorSection(Section):
     @model_validator(mode="after")
     def _one_source(self) -> SensorSection:
         own = [name for name in ("model", "calibration") if getattr(self, name) is not None]
-        # Defaults are allowed, because `lidarpool init` writes them.
+        # Defaults are allowed, because `lidarpool init --all` writes them.
         known = SensorSection.model_fields
         names = ("rays_per_revolution", "layers", "vertical_fov_deg")
         grid = [name for name in names if getattr(self, name) != known[name].default]

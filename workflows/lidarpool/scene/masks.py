@@ -259,7 +259,7 @@ class MaskNotes:
         if self.glass:
             out.append(
                 f"has transparent materials without holes, taken as solid: {_some([*self.glass])}; "
-                "transparent: pass, under materials, makes objects glass"
+                '<materials.transparent="pass"> makes objects glass'
             )
         return out
 

@@ -64,6 +64,10 @@ class Beams:
     def __len__(self) -> int:
         return len(self.elevation)
 
+    def __repr__(self) -> str:
+        low, high = np.degrees([self.elevation.min(), self.elevation.max()])
+        return f"<Beams: {len(self)}, {low:.4g} to {high:.4g} deg>"
+
     @classmethod
     @checked
     def even(cls, layers: int, vertical_fov_deg: float) -> Beams:

@@ -248,7 +248,7 @@ def full_name(name: str) -> str:
 
 
 def read_model(name: str | Path) -> SensorModel:
-    """Read a model: one that comes with the package by name, or a data file (.yaml).
+    """Read a model: one that comes with the package, its maker left out or not, or a file (.yaml).
 
     Raises
     ------
@@ -257,15 +257,16 @@ def read_model(name: str | Path) -> SensorModel:
     """
     if str(name).endswith((".yaml", ".yml")):
         return _read(Path(name))
-    known = model_names()
-    if str(name) not in known:
-        near = [model for model in known if _plain(str(name)) in _plain(model)][:3]
+    known, name = model_names(), full_name(str(name))
+    if name not in known:
+        near = [model for model in known if _plain(name) in _plain(model)][:3]
         hint = f" Did you mean {' or '.join(map(repr, near))}?" if near else ""
+        names = [*known, *(model.partition("/")[2] for model in known)]
         raise LidarpoolError(
-            f"There is no sensor model {str(name)!r}.{hint or did_you_mean(str(name), known)} "
+            f"There is no sensor model {name!r}.{hint or did_you_mean(name, names)} "
             "lidarpool sensors lists them; give your own as a file, such as mine.yaml."
         )
-    return _built_in(str(name))
+    return _built_in(name)
 
 
 def _plain(name: str) -> str:

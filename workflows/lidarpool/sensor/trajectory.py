@@ -13,7 +13,7 @@ from ..base.arrays import Bools, Floats, Indices
 from ..base.declared import AngleDeg, Triple, about, short, written_as
 from ..base.elementary import arctan2, sin_cos
 from ..base.errors import LidarpoolError
-from ..base.validation import as_array, checked_fields, shown
+from ..base.validation import as_array, checked_fields, one_line, shown
 from ..base.vectors import applied, hypot, length, matmul
 from .spline import knots_of, on_curve
 
@@ -118,9 +118,11 @@ class InstrumentPose(Pose):
     position: Annotated[Triple, about("x, y and z, metres")] = (0, 0, 0)
 
 
-# A pose in a file whose position may be left out.
+# A pose in a file whose position may be left out, or is all that is given.
 AT_CENTRE = short(
-    lambda v: isinstance(v, dict), lambda v: {"position": [0] * 3} | v, InstrumentPose
+    lambda v: isinstance(v, (dict, list)),
+    lambda v: {"position": v} if isinstance(v, list) else {"position": [0] * 3} | v,
+    Triple | InstrumentPose,
 )
 
 
@@ -197,6 +199,7 @@ class Stations:
     at: tuple[Pose, ...]
     moves: ClassVar[bool] = False
     duration_ns: ClassVar[float] = np.inf
+    __repr__ = one_line
 
     @property
     def stations(self) -> int:

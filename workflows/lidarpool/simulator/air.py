@@ -15,13 +15,13 @@ import numpy as np
 
 from ..base.arrays import Bools, Floats, Indices, Ints
 from ..base.elementary import exp, exp_of, expm1, geomspace, interp, log1p
-from ..scene.colours import GREY, packed
-from ..sensor import Survey
 from ..sensor.noise import THRESHOLD_SIGMAS, Purpose, named_seed, starts
 from ..sensor.weather import FAINTEST, FARTHEST_M, NODES, Air, Particles
 from ..sensor.weather import reach as reach_of
-from .hits import AIR, NO_SURFACE, Hits, Keys, Planes, joined, numbers
-from .separation import AirHits
+from .doppler import approach
+from .returns import AIR, OF_RETURNS, Keys, Planes, PulseReturns, joined, numbers, unreal
+from .scene_caster import SceneCaster
+from .step import Memory, PulseBatch, PulseStep, Setup, Sizes
 from .surfaces import Surfaces
 
 QUANTILES = 1 << 16
@@ -52,8 +52,8 @@ class _Fog(NamedTuple):
     peaks: Floats
 
 
-class AirCaster:
-    """Finds where the air returns light to one sensor.
+class WeatherStep(PulseStep):
+    """Finds where rain, snow, fog and dust return light to one sensor.
 
     Raises
     ------
@@ -61,20 +61,59 @@ class AirCaster:
         If one of its beams would return from too many particles.
     """
 
-    def __init__(self, number: int, survey: Survey, surfaces: Surfaces) -> None:
-        sensor, noise = survey.carried[number].sensor, survey.noise_each[number]
-        self._seed, self._surfaces = noise.seed, surfaces
-        self._wavelength_nm = sensor.optics.wavelength_nm
-        _, self._gap_m = survey.returns_each[number].of(sensor.optics)
-        air, least = survey.air(number), FAINTEST * noise.threshold
+    effects = "Rain", "Snow", "Fog", "Dust"
+    reads = "ray", "distance", "triangle", "velocity"
+    writes = *OF_RETURNS, "velocity"
+    purposes = (
+        Purpose.FOG_CELL, Purpose.FOG_PLACE, Purpose.PARTICLES, Purpose.PARTICLE_RANGE,
+        Purpose.PARTICLE_SUBRAY, Purpose.PARTICLE_DIAMETER,
+    )  # fmt: skip
+
+    def __init__(self, setup: Setup, caster: SceneCaster, surfaces: Surfaces) -> None:
+        super().__init__(setup, caster, surfaces)
+        sensor, noise, survey = setup.sensor, setup.noise, setup.survey
+        self._seed, self._wavelength_nm = noise.seed, sensor.optics.wavelength_nm
+        air, least = survey.air(setup.number), FAINTEST * noise.threshold
         begins, ends = reach_of(sensor.min_range_m, sensor.max_range_m)
         self._seen = [_seen(air, kind, least, begins, ends) for kind in survey.particles]
         names = [f"kind {kind}" if kind else "" for kind in range(len(self._seen))]
         self._seeds = [named_seed(noise.seed, name) for name in names]
         scatters = survey.scatters(self._wavelength_nm)
-        self._fog = _fog(air, scatters, noise.threshold, begins, ends, self._gap_m)
+        self._fog = _fog(air, scatters, noise.threshold, begins, ends, setup.gap_m)
 
-    def found(self, hits: Hits, rays: tuple[int, int], keys: Keys, each: int) -> AirHits | None:
+    @staticmethod
+    def applies(setup: Setup) -> bool:
+        """See `PulseStep.applies`."""
+        return setup.survey.returns_light
+
+    @staticmethod
+    def added(setup: Setup) -> float:
+        """See `PulseStep.added`."""
+        scatters = setup.survey.scatters(setup.sensor.optics.wavelength_nm)
+        return setup.survey.met(setup.number) + bool(scatters)
+
+    @staticmethod
+    def memory(setup: Setup, sizes: Sizes) -> Memory:
+        """See `PulseStep.memory`."""
+        return Memory(casting=110 * sizes.subrays + 170 * WeatherStep.added(setup) * sizes.beams)
+
+    def apply(self, returns: PulseReturns, batch: PulseBatch) -> PulseReturns:
+        """Leave hits in the air for `SeparationStep`, or insert them for waveforms."""
+        drawn = self.found(returns, (batch.start, batch.stop), batch.keys, batch.each)
+        if drawn is None:
+            return returns
+        if returns.velocity is not None:  # the air is at rest
+            rays = batch.here.rays(batch.beams, drawn.ray, batch.window[0])
+            drawn = drawn._replace(velocity=approach(batch.here, drawn.ray, *rays))
+        if not (self.setup.in_waveforms or self.setup.recorded):
+            batch.air = drawn
+            return returns
+        batch.hits, batch.planes = inserted(returns, batch.planes, drawn)
+        return batch.hits
+
+    def found(
+        self, hits: PulseReturns, rays: tuple[int, int], keys: Keys, each: int
+    ) -> PulseReturns | None:
         """Find hits in the air, of beams `rays` with `each` sub-rays, before those of surfaces.
 
         Hits are in the order of rays, numbered from the first beam's.
@@ -93,32 +132,33 @@ class AirCaster:
             parts.append(_in_fog(self._fog, self._seed, count, each, given, clouded))
         if not parts:
             return None
-        drawn = AirHits(*map(np.concatenate, zip(*parts, strict=True)))
+        ray, distance, energy = map(np.concatenate, zip(*parts, strict=True))
+        drawn = unreal(hits, ray, distance, energy, AIR)
         if len(self._bent(hits)):
-            drawn = _taken(drawn, ~self._within(hits, drawn.ray, drawn.distance))
+            drawn = drawn.take(~self._within(hits, ray, distance))
         if parts[1:] or each > 1:
-            drawn = _taken(drawn, np.argsort(drawn.ray, kind="stable"))
+            drawn = drawn.take(np.argsort(drawn.ray, kind="stable"))
         return drawn
 
-    def _reach(self, hits: Hits, count: int) -> Floats:
+    def _reach(self, hits: PulseReturns, count: int) -> Floats:
         """How far the light of sub-rays gets, (count,): inf if no surface ends it."""
-        materials = self._surfaces.at(self._wavelength_nm)
+        materials = self.surfaces.at(self._wavelength_nm)
         ends = hits.distance
         on = materials.passes | materials.mirrors
         if on.any():
-            ends = np.where(on[self._surfaces.objects(hits.triangle)], np.inf, ends)
+            ends = np.where(on[self.surfaces.objects(hits.triangle)], np.inf, ends)
         reach = np.full(count, np.inf)
         reach[hits.ray] = ends  # of several, the last
         return reach
 
-    def _bent(self, hits: Hits) -> Indices:
+    def _bent(self, hits: PulseReturns) -> Indices:
         """Rows of hits where light is refracted; of each ray the first, third, … are entries."""
-        refracts = self._surfaces.at(self._wavelength_nm).refracts
+        refracts = self.surfaces.at(self._wavelength_nm).refracts
         if not refracts.any():
             return np.zeros(0, np.intp)
-        return np.flatnonzero(refracts[self._surfaces.objects(hits.triangle)])
+        return np.flatnonzero(refracts[self.surfaces.objects(hits.triangle)])
 
-    def _within(self, hits: Hits, ray: Ints, distance: Floats) -> Bools:
+    def _within(self, hits: PulseReturns, ray: Ints, distance: Floats) -> Bools:
         """Whether places on rays are within water or glass, where nothing falls: (n,)."""
         rows = self._bent(hits)
         bent, where = hits.ray[rows], hits.distance[rows]
@@ -129,7 +169,7 @@ class AirCaster:
             count[some] += where[first[some] + number] < distance[some]
         return np.asarray(count % 2 == 1)
 
-    def _clouded(self, hits: Hits, reach: Floats) -> Floats:
+    def _clouded(self, hits: PulseReturns, reach: Floats) -> Floats:
         """How far fog goes: to surfaces, and to what light is refracted into, but for panes."""
         rows = self._bent(hits)
         if not len(rows):
@@ -138,7 +178,7 @@ class AirCaster:
         out = np.full(len(rows), np.inf)
         same = ray[1:] == ray[:-1]
         out[:-1][same] = where[1:][same]
-        enters = (numbers(ray) % 2 == 0) & (out - where > self._gap_m)
+        enters = (numbers(ray) % 2 == 0) & (out - where > self.setup.gap_m)
         reach = reach.copy()
         np.minimum.at(reach, ray[enters], where[enters])
         return reach
@@ -178,23 +218,16 @@ def _in_fog(
     return out[0][:count], out[1][:count], out[2][:count]
 
 
-def _taken(drawn: AirHits, rows: Bools | Indices) -> AirHits:
-    return AirHits(drawn.ray[rows], drawn.distance[rows], drawn.energy[rows])
-
-
-def inserted(hits: Hits, planes: Planes | None, drawn: AirHits) -> tuple[Hits, Planes | None]:
+def inserted(
+    hits: PulseReturns, planes: Planes | None, drawn: PulseReturns
+) -> tuple[PulseReturns, Planes | None]:
     """Insert hits in the air before the others of their rays."""
-    count = len(drawn.ray)
-    triangle, cause = np.full(count, NO_SURFACE, np.int32), np.full(count, AIR, np.uint8)
-    colour = None if hits.colour is None else np.full(count, packed(GREY[0])[0])
-    velocity = None if hits.velocity is None else drawn.velocity
-    air = Hits(drawn.ray, drawn.distance, triangle, drawn.energy, colour, cause, velocity)
     order = np.argsort(np.concatenate([drawn.ray, hits.ray]), kind="stable")
     if planes is not None:
-        none = np.zeros((count, 3))
+        none = np.zeros((len(drawn.ray), 3))
         normals, directions = (np.concatenate([none, one])[order] for one in planes)
         planes = normals, directions
-    return joined([air, hits]).take(order), planes
+    return joined([drawn, hits]).take(order), planes
 
 
 @lru_cache(TABLES_KEPT)

@@ -8,11 +8,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..columns.parts import PartColumns
-from .device import DeviceReturns
-from .returns import BatchReturns
+from .device import DevicePoints
+from .points import BatchPoints
 
 
-def columns_of(found: Sequence[BatchReturns | DeviceReturns]) -> PartColumns:
+def columns_of(found: Sequence[BatchPoints | DevicePoints]) -> PartColumns:
     """Make the columns of consecutive scans, and count the hits of each triangle."""
     columns = {
         column.name: _joined([returns.column(column) for returns in found])

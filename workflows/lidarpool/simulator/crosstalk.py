@@ -15,11 +15,14 @@ from ..base.elementary import arccos, exp, sin_cos_of
 from ..base.vectors import into_axes, length, products, turned
 from ..sensor import Sensor, Survey
 from ..sensor.materials import at_right_angles
+from ..sensor.noise import Purpose
 from ..sensor.optics import LIGHT_M_NS
 from ..sensor.survey import begin_ns
 from .motion import Clock, Poses
+from .returns import CROSSTALK, OF_RETURNS, PulseReturns, merged, numbers, unreal
+from .scene_caster import SceneCaster
+from .step import Memory, PulseBatch, PulseStep, Setup, Sizes
 from .surfaces import Surfaces
-from .world import World
 
 CELL_RAYS = 1 << 6  # rays that are compared with a spot at a time
 FILTER_NM = 20.0  # wavelengths that differ by more do not pass a receiver's filter
@@ -36,25 +39,52 @@ class _Spots(NamedTuple):
     distance: Floats  # from that sensor
 
 
-class Crosstalk:
-    """Finds the pulses of other sensors that a sensor receives.
+class CrosstalkStep(PulseStep):
+    """Adds the pulses of other sensors that a sensor receives.
 
     A pulse of another sensor lights a spot. A ray receives its light if the spot is in the field of
     view of its receiver, as wide as its beam, nothing stands between them, and the light arrives
     while the receiver waits for its own pulse.
     """
 
-    def __init__(self, number: int, survey: Survey, world: World, surfaces: Surfaces) -> None:
-        self._survey, self._world, self._surfaces = survey, world, surfaces
-        self._number, self._sensor = number, survey.carried[number].sensor
-        wide, _ = survey.returns_each[number].of(self._sensor.optics)
+    effects = ("Crosstalk",)
+    reads = "ray", "distance"
+    writes = OF_RETURNS
+    purposes = (Purpose.OTHER,)
+
+    def __init__(self, setup: Setup, caster: SceneCaster, surfaces: Surfaces) -> None:
+        super().__init__(setup, caster, surfaces)
+        self._survey, self._sensor = setup.survey, setup.sensor
+        wide, _ = setup.reporting.of(self._sensor.optics)
         self._cosine = sin_cos_of(wide / 2)[1]
         nm = self._sensor.optics.wavelength_nm
         self._others = [
             other
-            for other, carried in enumerate(survey.carried)
-            if other != number and abs(carried.sensor.optics.wavelength_nm - nm) <= FILTER_NM
+            for other, carried in enumerate(self._survey.carried)
+            if other != setup.number and abs(carried.sensor.optics.wavelength_nm - nm) <= FILTER_NM
         ]
+
+    @staticmethod
+    def applies(setup: Setup) -> bool:
+        """See `PulseStep.applies`."""
+        return setup.noise.crosstalk
+
+    @staticmethod
+    def memory(setup: Setup, sizes: Sizes) -> Memory:
+        """See `PulseStep.memory`."""
+        others = _pulses_meanwhile(setup.survey, setup.sensor)
+        return Memory(kept=10 * sizes.returns, casting=(120 + 370 * others) * sizes.beams)
+
+    def apply(self, returns: PulseReturns, batch: PulseBatch) -> PulseReturns:
+        """See `PulseStep.apply`."""
+        rays = np.arange(batch.start, batch.stop)
+        row, distance, energy = self.received(batch.keys.scan, rays, *batch.middles, batch.here)
+        order = np.lexsort((distance, row))
+        ray, distance, energy = rays[row[order]], distance[order], energy[order]
+        key = *batch.keys.of(ray), numbers(ray)
+        seen = self.setup.noise.passes(Purpose.OTHER, energy, *key)
+        others = unreal(returns, ray[seen], distance[seen], energy[seen], CROSSTALK)
+        return merged(returns, others)
 
     def received(
         self, scan: int, rays: Ints, origins: Floats, directions: Floats, poses: Poses
@@ -89,7 +119,7 @@ class Crosstalk:
             some = np.flatnonzero(seen & (far > 0))
             when = fired[row[some]] + spec.start_ns
             given = origins[row[some]], towards[some], far[some], when, poses.ways
-            some = some[self._world.free(*given)]
+            some = some[self.caster.free(*given)]
             energy = self._energy(spots, spot[some], towards[some], far[some])
             found.append((row[some], distance[some], energy))
         if not found:
@@ -155,20 +185,20 @@ class Crosstalk:
         starts = starts + np.repeat(places, sensor.channels, axis=0)
         now = Poses(np.zeros(3), clock=Clock(fired + start_ns, np.zeros(1), poses.ways))
         low, high = sensor.min_range_m, sensor.max_range_m
-        found = self._world.scan(Pattern(ahead, starts), now, t_min=low, t_max=high)
+        found = self.caster.scan(Pattern(ahead, starts), now, t_min=low, t_max=high)
         ray, distance = found.ray.astype(np.int64), found.distance
         times = fired[ray] + start_ns
         return _Spots(
             fired[ray] + distance / LIGHT_M_NS,
             starts[ray] + distance[:, None] * ahead[ray],
-            self._surfaces.normals(found.triangle, times, poses.ways),
+            self.surfaces.normals(found.triangle, times, poses.ways),
             found.triangle,
             distance,
         )
 
     def _energy(self, spots: _Spots, spot: Indices, towards: Floats, far: Floats) -> Floats:
         """Energies that are received of spots: (n,), as of a sensor's own pulses."""
-        surfaces, nm = self._surfaces, self._sensor.optics.wavelength_nm
+        surfaces, nm = self.surfaces, self._sensor.optics.wavelength_nm
         triangle = spots.triangle[spot]
         cosine = np.abs(products(spots.normal[spot].T, towards.T)) / far
         # The air on the way there and back.
@@ -191,3 +221,15 @@ def _fired_in(sensor: Sensor, steps: int, span: tuple[float, float]) -> tuple[in
     last, begins = range(sensor.firings(steps - 1)[1]), partial(begin_ns, sensor)
     early = span[0] - float(sensor.beams.time_ns.max())  # its slowest beam is in the span
     return bisect_left(last, early, key=begins), bisect_left(last, span[1], key=begins)
+
+
+def _pulses_meanwhile(survey: Survey, sensor: Sensor) -> float:
+    """Pulses of all sensors but one in the time in which that one fires once."""
+
+    def rate(one: Sensor) -> float:
+        first, stop = one.firings(0)
+        begin, end = one.begins_ns(np.array([first, stop], np.int64))
+        return float((stop - first) * one.channels / (end - begin))
+
+    every = sum(rate(carried.sensor) for carried in survey.carried)
+    return every / rate(sensor) - 1

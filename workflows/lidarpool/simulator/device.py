@@ -1,10 +1,10 @@
 """Columns that are made on the CUDA device: only kept values cross the bus, in the types of files.
 
-The formulas are those of `BatchReturns`, with the same bits. If a survey has other columns too, its
+The formulas are those of `BatchPoints`, with the same bits. If a survey has other columns too, its
 kept hits cross the bus as well, and NumPy makes those: energies in haze, azimuths and noise, since
 `exp` and `atan2` of a device differ from those of `elementary` in the last bit. So it does with the
-energies of hits on actors, for which it needs their poses; `World` finds these hits, and the device
-merges them with its own.
+energies of hits on actors, for which it needs their poses; `SceneCaster` finds these hits,
+and the device merges them with its own.
 """
 
 from __future__ import annotations
@@ -25,12 +25,12 @@ from ..columns.table import AXES, CHANNEL, OBJECT, TABLE, Column
 from ..scene.scene import Scene
 from ..sensor import ScanSpec, Survey
 from ..sensor.materials import NEAREST_M, REFERENCE_M, RETRO_GAIN
-from .echoes import Echoes
-from .hits import SURFACE
 from .motion import Poses
-from .returns import BatchReturns
+from .points import BatchPoints
+from .pulses import Scanned
+from .returns import SURFACE, PulseReturns
+from .scene_caster import SceneCaster
 from .surfaces import Surfaces
-from .world import World
 
 OPTIONS = "-std=c++17", "-fmad=false"  # of the compiler
 _BLOCK = 128  # threads
@@ -64,8 +64,8 @@ def needs_hits(survey: Survey) -> bool:
 
 
 @dataclass(frozen=True, eq=False)
-class DeviceReturns:
-    """Columns of some consecutive scans of one station, see `BatchReturns`."""
+class DevicePoints:
+    """Columns of some consecutive scans of one station, see `BatchPoints`."""
 
     scene: Scene
     survey: Survey
@@ -74,7 +74,7 @@ class DeviceReturns:
     hits: Ints  # of each scan, kept or not
     tally: tuple[Indices, Ints]
     columns: dict[str, AnyArray]  # by name
-    returns: BatchReturns | None  # on the host, if there are columns that NumPy makes
+    returns: BatchPoints | None  # on the host, if there are columns that NumPy makes
 
     def __len__(self) -> int:
         return int(self.counts.sum())
@@ -99,8 +99,10 @@ class DeviceReturns:
 class DeviceColumns:
     """Casts surveys whose rays have one return each, and makes their columns on the device."""
 
-    def __init__(self, world: World, scene: Scene, survey: Survey, surfaces: Surfaces) -> None:
-        self._world, self._scene, self._surfaces = world, scene, surfaces
+    def __init__(
+        self, caster: SceneCaster, scene: Scene, survey: Survey, surfaces: Surfaces
+    ) -> None:
+        self._caster, self._scene, self._surfaces = caster, scene, surfaces
         self.survey = survey
         wanted, able = {column.name for column in survey.stored_columns}, _able(survey)
         self.all_hits = needs_hits(survey)
@@ -111,7 +113,7 @@ class DeviceColumns:
         # Whether NumPy needs hits on actors.
         self.some_hits = bool(scene.actors and self.energies)
         self.bodies, _ = surfaces.bodies()
-        self._counters = world.counters()
+        self._counters = caster.counters()
         self._sent: tuple[Any, ...] | None = None
         self._turns: Any = None
 
@@ -128,7 +130,7 @@ class DeviceColumns:
         poses: Poses,
         window: tuple[int, int],
         groups: Ints,
-    ) -> DeviceReturns:
+    ) -> DevicePoints:
         """Cast scans, see `Rig.returns`."""
         survey, sensor = self.survey, self.survey.carried[specs[0].sensor].sensor
         every, reach = survey.keep_every, (sensor.min_range_m, sensor.max_range_m)
@@ -136,28 +138,24 @@ class DeviceColumns:
             pattern, **poses.given, window=window, t_min=reach[0], t_max=reach[1],
             keep_every=every, groups=groups, tally=True,
         )  # fmt: skip
-        others = self._world.on_actors(scan, poses) if poses.ways else None
+        others = self._caster.on_actors(scan, poses) if poses.ways else None
         if others is not None:  # rows of the actors' body
             others = replace(others, triangle=others.triangle - np.int32(self.bodies[-1, 0]))
         making = _Making(self, specs, groups, most=-(-len(scan) // every) + len(groups))
         try:
-            hits, tally = self._world.caster.visit(scan, making.make, self._counters, others)
+            hits, tally = self._caster.caster.visit(scan, making.make, self._counters, others)
         finally:  # else the device would write to memory that goes back to the pool
             columns, (ray, distance, triangle) = making.done()
         assert tally is not None
-        one, none = np.ones(len(ray), np.uint8), np.zeros(len(ray), np.int32)
-        found = Echoes(
-            ray, distance, triangle, hits, None, none,
-            energy=None, number=one, returns=one, reported=distance,
-        )  # fmt: skip
-        returns = BatchReturns(
+        found = Scanned(PulseReturns.one_each(ray, distance, triangle), hits, None)
+        returns = BatchPoints(
             self._scene, survey, self._surfaces, specs, found, pattern, window[0], poses
         )
         if self.some_hits:
             for column in self.energies:
                 columns[column.name][making.rows] = column.make(returns)
         counts, on_host = -(-hits // every), returns if self.all_hits else None
-        return DeviceReturns(self._scene, survey, specs, counts, hits, tally, columns, on_host)
+        return DevicePoints(self._scene, survey, specs, counts, hits, tally, columns, on_host)
 
     def tables(self, cupy: Any) -> tuple[Any, ...]:
         """Tables of the surfaces for columns.cu, on the caster's device; see there."""

@@ -25,11 +25,11 @@ from ..scene.scene import Scene
 from ..sensor.leaves import brightness, projection
 from ..sensor.materials import MaterialTable, fresnel
 from ..sensor.noise import Purpose
-from .hits import selected
 from .motion import Clock, Poses
+from .returns import selected
+from .scene_caster import SceneCaster
 from .surfaces import Surfaces
 from .ways import Ways
-from .world import World
 
 DEPTH = 8  # media around a place that are known at most
 PROBES_MOST = 256  # surfaces that a search for media around a place passes
@@ -49,20 +49,20 @@ class Rays(NamedTuple):
 
 
 @dataclass
-class Around:
+class MediaStack:
     """Media around the light of sub-rays, the innermost first: (n, DEPTH) each; -1 for none."""
 
     objects: Ints32
     triangles: Ints32  # where light came in
 
     @classmethod
-    def none(cls, count: int) -> Around:
+    def none(cls, count: int) -> MediaStack:
         """Make them for light in the air."""
         return cls(*(np.full((count, DEPTH), -1, np.int32) for _ in range(2)))
 
-    def __getitem__(self, rows: Integers) -> Around:
+    def __getitem__(self, rows: Integers) -> MediaStack:
         """Select those of some sub-rays."""
-        return Around(self.objects[rows], self.triangles[rows])
+        return MediaStack(self.objects[rows], self.triangles[rows])
 
     def enter(self, rows: Indices, objects: Ints32, triangles: Ints32) -> None:
         """Enter a medium each."""
@@ -91,7 +91,7 @@ class Around:
 
 
 @dataclass
-class Bundle:
+class RayDifferentials:
     """How the light of sub-rays has been bent and weakened: arrays (n, …)."""
 
     index: Floats  # (n,): refractive index where it is
@@ -101,15 +101,15 @@ class Bundle:
     ways: Floats  # (n, 2, 3): and of where it goes
 
     @classmethod
-    def of(cls, directions: Floats, index: Floats) -> Bundle:
+    def of(cls, directions: Floats, index: Floats) -> RayDifferentials:
         """Make those of light that begins."""
         ways = np.stack([axis.T for axis in any_axes(directions.T)], axis=1)
         none = np.zeros(len(ways))
         return cls(index.copy(), index, none, np.zeros_like(ways), ways)
 
-    def __getitem__(self, rows: Integers) -> Bundle:
+    def __getitem__(self, rows: Integers) -> RayDifferentials:
         """Select those of some sub-rays."""
-        return Bundle(*selected(vars(self).values(), rows))
+        return RayDifferentials(*selected(vars(self).values(), rows))
 
     def go(self, step: Floats, attenuation: Floats) -> None:
         """Go straight on so many metres (n,), where so much is lost, 1/m (n,)."""
@@ -138,7 +138,7 @@ class Bundle:
     ) -> None:
         """Turn it at flat surfaces, from directions (n, 3) to others, into another index (n,)."""
         along, behind = (_aside(_dots(way, normals)) for way in (before, after))
-        # Each ray of a bundle arrives where it meets the plane.
+        # Each ray of a differentials arrives where it meets the plane.
         shift = _dots(self.places, normals[:, None]) / along[:, None]
         self.places = self.places - shift[..., None] * before[:, None]
         ratio = np.where(mirrored, 1.0, self.index / index)
@@ -188,9 +188,9 @@ class Media:
         """Whether light enters objects, whose normals have the cosines `along` with it: (n,)."""
         return np.asarray((along < 0) != self._inwards[objects])
 
-    def around(self, world: World, light: Rays) -> Around:
+    def around(self, caster: SceneCaster, light: Rays) -> MediaStack:
         """Find the media around the origins of light."""
-        found = Around.none(len(light.origins))
+        found = MediaStack.none(len(light.origins))
         within = np.zeros(len(light.origins), np.bool_)
         if not len(within):
             return found
@@ -205,29 +205,29 @@ class Media:
         origins, times = light.origins[rows], light.times[rows]
         new = np.ones(len(rows), np.bool_)
         new[1:] = (np.diff(origins, axis=0) != 0).any(axis=1) | (np.diff(times) != 0)
-        there = self._search(world, origins[new], times[new], light.ways)
+        there = self._search(caster, origins[new], times[new], light.ways)
         which = np.cumsum(new) - 1
         found.objects[rows], found.triangles[rows] = there.objects[which], there.triangles[which]
         return found
 
     def _search(
         self,
-        world: World,
+        caster: SceneCaster,
         origins: Floats,
         times: Floats,
         ways: Ways,
-    ) -> Around:
+    ) -> MediaStack:
         """Look upwards: a medium that light leaves without having entered it is around it."""
         surfaces = self._surfaces
-        around, entered = Around.none(len(origins)), Around.none(len(origins))
+        around, entered = MediaStack.none(len(origins)), MediaStack.none(len(origins))
         up = UPWARDS / np.sqrt((UPWARDS**2).sum())
-        rows, away = np.arange(len(origins)), world.clear_m / up[2]
+        rows, away = np.arange(len(origins)), caster.clear_m / up[2]
         for _ in range(PROBES_MOST):
             if not len(rows):
                 break
             light = Pattern(np.broadcast_to(up, origins.shape), origins)
             now = Poses(np.zeros(3), clock=Clock(times, np.zeros(1), ways))
-            hits = world.scan(light, now)
+            hits = caster.scan(light, now)
             rows, times = rows[hits.ray], times[hits.ray]
             origins = origins[hits.ray] + (hits.distance[:, None] + away) * up
             objects = surfaces.objects(hits.triangle)
@@ -241,23 +241,27 @@ class Media:
             around.surround(rows[goes], objects[goes], hits.triangle[goes])
         return around
 
-    def within(self, world: World, light: Rays, depths: Floats | None) -> Within:
+    def within(self, caster: SceneCaster, light: Rays, depths: Floats | None) -> LightInMedia:
         """Return the state of light that begins; `depths` (n,) are those until a leaf."""
-        around = self.around(world, light)
-        bundle = Bundle.of(light.directions, self.index(around)) if self.bends else None
-        return Within(self, around, bundle, depths)
+        around = self.around(caster, light)
+        differentials = (
+            RayDifferentials.of(light.directions, self.index(around)) if self.bends else None
+        )
+        return LightInMedia(self, around, differentials, depths)
 
-    def index(self, around: Around) -> Floats:
+    def index(self, around: MediaStack) -> Floats:
         """Refractive indices of the innermost media that have one: (n,)."""
         indices = self._index[around.objects]
         return _first(indices, indices > 0, 1.0)
 
-    def attenuation(self, around: Around) -> Floats:
+    def attenuation(self, around: MediaStack) -> Floats:
         """Extinction there, 1/m: (n,); outside of what refracts that of the air."""
         refracts = self._index[around.objects] > 0
         return _first(self._attenuation[around.objects], refracts, self.air)
 
-    def behind(self, around: Around, objects: Ints32, triangles: Ints32, along: Floats) -> Around:
+    def behind(
+        self, around: MediaStack, objects: Ints32, triangles: Ints32, along: Floats
+    ) -> MediaStack:
         """Media behind surfaces (n,), which light meets at the cosines `along`."""
         behind = around[np.arange(len(objects))]
         enters, filled = self.sides(objects, along), self.filled[objects]
@@ -266,7 +270,7 @@ class Media:
         behind.leave(goes, objects[goes])
         return behind
 
-    def density(self, around: Around, upright: Floats) -> Floats:
+    def density(self, around: MediaStack, upright: Floats) -> Floats:
         """Optical depth of leaves for each metre, in each medium around light: (n, DEPTH)."""
         density = self._area[around.objects]
         if density.any():
@@ -293,26 +297,28 @@ class Leaves(NamedTuple):
 
 
 @dataclass
-class Within:
+class LightInMedia:
     """Light on its way through media: those around it, and what they do to it."""
 
     media: Media
-    around: Around
-    bundle: Bundle | None  # None if nothing refracts
+    around: MediaStack
+    differentials: RayDifferentials | None  # None if nothing refracts
     left: Floats | None  # (n,): optical depth until a leaf; None if there are none
 
-    def __getitem__(self, rows: Integers) -> Within:
+    def __getitem__(self, rows: Integers) -> LightInMedia:
         """Select that of some sub-rays."""
-        return Within(self.media, *selected((self.around, self.bundle, self.left), rows))
+        return LightInMedia(
+            self.media, *selected((self.around, self.differentials, self.left), rows)
+        )
 
     @property
     def index(self) -> Floats | float:
         """Refractive index where it is."""
-        return 1.0 if self.bundle is None else self.bundle.index
+        return 1.0 if self.differentials is None else self.differentials.index
 
     def optical(self, step: Floats) -> Floats:
         """Optical paths of so many metres (n,)."""
-        return step if self.bundle is None else step * self.bundle.index
+        return step if self.differentials is None else step * self.differentials.index
 
     def meet(
         self,
@@ -381,14 +387,14 @@ class Within:
 
     def go(self, step: Floats) -> None:
         """Go straight on so many metres (n,)."""
-        if self.bundle is not None:
-            self.bundle.go(step, self.media.attenuation(self.around))
+        if self.differentials is not None:
+            self.differentials.go(step, self.media.attenuation(self.around))
 
     def factor(self, directions: Floats, distance: Floats) -> Floats | float:
         """Energy relative to that of light that went as far, straight through the air: (n,)."""
-        if self.bundle is None:
+        if self.differentials is None:
             return 1.0
-        return self.bundle.factor(directions, distance, self.media.air)
+        return self.differentials.factor(directions, distance, self.media.air)
 
     def cross(
         self, objects: Ints32, triangles: Ints32, directions: Floats, normals: Floats, along: Floats
@@ -401,9 +407,9 @@ class Within:
         with directions and shares as if there were no surface.
         """
         before, self.around = self.around, self.media.behind(self.around, objects, triangles, along)
-        if self.bundle is None:
+        if self.differentials is None:
             return directions, 1.0, np.zeros(len(objects), np.bool_)
-        ratio = self.media.index(self.around) / self.bundle.index
+        ratio = self.media.index(self.around) / self.differentials.index
         ahead, passes, whole = refracted(directions, normals, along, ratio)
         self.around.objects[whole] = before.objects[whole]
         self.around.triangles[whole] = before.triangles[whole]
@@ -411,8 +417,8 @@ class Within:
 
     def turn(self, before: Floats, after: Floats, normals: Floats, mirrored: Bools) -> None:
         """Turn the bundles at flat surfaces, from directions (n, 3) to others."""
-        if self.bundle is not None:
-            self.bundle.turn(before, after, normals, mirrored, self.media.index(self.around))
+        if self.differentials is not None:
+            self.differentials.turn(before, after, normals, mirrored, self.media.index(self.around))
 
 
 def refracted(

@@ -11,16 +11,15 @@ from raybeam import Pattern
 
 from ..base.arrays import Floats, Integers, Ints, Ints32, UInts32
 from ..base.vectors import into_axes, products
-from ..columns.table import COLOURS, VELOCITY
-from ..scene.scene import Scene
-from ..sensor import Sensor, Survey
+from ..columns.table import COLOURS
 from ..sensor.noise import Purpose, raw
 from .doppler import BLOCK_HITS, approach
-from .hits import Hits, Keys, Planes, joined, selected
-from .media import Media, Rays, Within, depths
+from .media import LightInMedia, Media, Rays, depths
 from .motion import Clock, Poses
+from .returns import Keys, Planes, PulseReturns, joined, selected
+from .scene_caster import SceneCaster
+from .step import Memory, PulseBatch, PulseStep, Setup, Sizes
 from .surfaces import Surfaces, light_of
-from .world import World
 
 PASSES_MOST = 16  # surfaces that light passes before it is dropped
 LEAFY_PASSES_MOST = 64  # where there are crowns, whose surfaces it passes twice
@@ -38,38 +37,50 @@ class _Light:
     before: Floats  # optical path up to the origin
     # What mirrors did to the directions so far, (n, 3, 3), if there are any.
     turns: Floats | None = None
-    within: Within | None = None  # if there are media
+    within: LightInMedia | None = None  # if there are media
     # How fast its optical path grows, m/s, but for the motion of its end, if that is asked for.
-    growth: Floats | None = None
+    range_rate: Floats | None = None
 
     def on(self, rows: Integers) -> _Light:
         """Select that of some sub-rays."""
         return _Light(*selected(vars(self).values(), rows))
 
 
-class Paths:
-    """Finds where the light of a sensor returns from."""
+class CastStep(PulseStep):
+    """Finds where the light of sub-rays returns from."""
 
-    def __init__(
-        self,
-        world: World,
-        scene: Scene,
-        survey: Survey,
-        sensor: Sensor,
-        surfaces: Surfaces,
-        seed: int = 0,
-    ) -> None:
-        self._world, self._sensor, self._surfaces = world, sensor, surfaces
-        self._light, self._seed = light_of(survey, sensor), seed
+    effects = "Gaussian and oval beams", "Refraction", "Vegetation", "Rays without a return"
+    writes = "ray", "distance", "triangle", "energy", "colour", "velocity"
+    purposes = Purpose.LEAF, Purpose.WHICH
+
+    def __init__(self, setup: Setup, caster: SceneCaster, surfaces: Surfaces) -> None:
+        super().__init__(setup, caster, surfaces)
+        survey, sensor = setup.survey, setup.sensor
+        self._light, self._seed = light_of(survey, sensor), setup.noise.seed
         table = surfaces.at(sensor.optics.wavelength_nm)
         filled = table.leafy.any() or table.refracts.any()
         air = self._light.extinction
-        self._media = Media(scene, surfaces, table, air) if filled else None
+        self._media = Media(setup.scene, surfaces, table, air) if filled else None
         shown = any(column.name in COLOURS for column in survey.stored_columns)
         self._coloured = shown or surfaces.materials.textured
-        # Whether hits have radial velocities.
-        self.moving = any(column.name == VELOCITY for column in survey.stored_columns)
-        self._clear_m = world.clear_m
+
+    @staticmethod
+    def applies(setup: Setup) -> bool:
+        """See `PulseStep.applies`."""
+        return setup.several
+
+    @staticmethod
+    def memory(setup: Setup, sizes: Sizes) -> Memory:
+        """See `PulseStep.memory`."""
+        subray = 200 if not setup.passing else 1350 if setup.refracting else 650
+        casting = (subray + 200 * setup.moving) * sizes.subrays + 30 * sizes.returns
+        return Memory(casting=casting, counting=110 * sizes.returns + 40 * sizes.points)
+
+    def apply(self, returns: PulseReturns, batch: PulseBatch) -> PulseReturns:
+        """See `PulseStep.apply`."""
+        given = batch.beams, batch.here, batch.window, batch.keys, batch.start, batch.each
+        batch.hits, batch.planes = self.hits(*given)
+        return batch.hits
 
     def energy(
         self,
@@ -79,7 +90,7 @@ class Paths:
         colour: UInts32 | None,
     ) -> Floats:
         """Return the received energy of hits (n,), see `Surfaces.energy`."""
-        return self._surfaces.energy(triangle, cosine, distance, self._light, colour)
+        return self.surfaces.energy(triangle, cosine, distance, self._light, colour)
 
     def hits(
         self,
@@ -89,19 +100,19 @@ class Paths:
         keys: Keys,
         first: int = 0,
         each: int = 1,
-    ) -> tuple[Hits, Planes | None]:
+    ) -> tuple[PulseReturns, Planes | None]:
         """Cast the sub-rays of a window, and follow the light through glass and off mirrors.
 
         There are `each` of a beam, and the first beam has the number `first` for its keys.
         """
-        surfaces, media = self._surfaces, self._media
+        surfaces, media = self.surfaces, self._media
         materials = surfaces.at(self._light.wavelength_nm)
-        nearest, farthest = self._sensor.min_range_m, self._sensor.max_range_m
+        nearest, farthest = self.setup.sensor.min_range_m, self.setup.sensor.max_range_m
         leafy = media is not None and media.leafy
         # How far light goes in a crown depends on its other side, however far that is.
         reach = np.inf if leafy else farthest
         rays = np.empty((6, window[1] - window[0]))
-        found = self._world.scan(
+        found = self.caster.scan(
             beams, poses, window=window, t_min=nearest, t_max=reach, rays_out=rays
         )
         ray = found.ray.astype(np.int64)
@@ -116,16 +127,16 @@ class Paths:
             scan, number = keys.of(first + ray // each)
             return raw(self._seed, purpose, scan, number, ray % each)
 
-        if self.moving:
-            light.growth = approach(poses, ray, origins, directions)
+        if self.setup.moving:
+            light.range_rate = approach(poses, ray, origins, directions)
         if materials.mirrors.any() or (media is not None and media.bends):
             light.turns = np.broadcast_to(np.eye(3), (len(ray), 3, 3))
         if media is not None:
             left = depths(draw(Purpose.LEAF, ray)) if leafy else None
             given = Rays(origins, directions, light.times, poses.ways)
-            light.within = media.within(self._world, given, left)
+            light.within = media.within(self.caster, given, left)
         step, triangle = found.distance, found.triangle
-        parts: list[Hits] = []
+        parts: list[PulseReturns] = []
         seen: list[Floats] = []  # normals as the sensor sees them
         clear = np.full(len(ray), nearest)  # where light is first, metres from the origin
         for _ in range(LEAFY_PASSES_MOST if leafy else PASSES_MOST):
@@ -151,11 +162,11 @@ class Paths:
                 within.go(step)
                 energy *= within.factor(light.directions, distance)
             velocity, moved = None, np.zeros((0, 3))
-            if light.growth is not None:
+            if light.range_rate is not None:
                 moved = self._velocities(light, step, triangle, poses)
                 index = 1.0 if within is None else within.index
-                velocity = light.growth + index * products(moved.T, light.directions.T)
-            hits = Hits(light.ray, distance, triangle, energy, colour, velocity=velocity)
+                velocity = light.range_rate + index * products(moved.T, light.directions.T)
+            hits = PulseReturns(light.ray, distance, triangle, energy, colour, velocity=velocity)
             turns = light.turns
             looks = normals if turns is None else into_axes(normals, turns)
             goes = materials.passes[rows] | materials.mirrors[rows]
@@ -173,11 +184,11 @@ class Paths:
                 break
             ends = step[on], distance[on], triangle[on], normals[on], along[on]
             light, clear = self._behind(
-                light.on(on), *ends, None if light.growth is None else moved[on]
+                light.on(on), *ends, None if light.range_rate is None else moved[on]
             )
             # Light takes no time: it travels 300 m in a microsecond.
             now = Poses(np.zeros(3), clock=Clock(light.times, np.zeros(1), poses.ways))
-            found = self._world.scan(Pattern(light.directions, light.origins), now, t_max=reach)
+            found = self.caster.scan(Pattern(light.directions, light.origins), now, t_max=reach)
             which, step, triangle = found.ray, found.distance, found.triangle
             light, clear = light.on(which), clear[which]
             if not leafy:
@@ -211,8 +222,8 @@ class Paths:
         Returns it behind them, and where the surfaces are from there, metres, at or below 0.
         `moved` (n, 3) are the velocities of the surfaces: where one bends light, its path grows.
         """
-        materials = self._surfaces.at(self._light.wavelength_nm)
-        rows = self._surfaces.objects(triangle)
+        materials = self.surfaces.at(self._light.wavelength_nm)
+        rows = self.surfaces.objects(triangle)
         cosine, within = np.abs(along), light.within
         share = light.share * materials.goes_on(rows, cosine) ** 2  # and back again
         ahead, mirrors = light.directions, materials.mirrors[rows]
@@ -230,19 +241,21 @@ class Paths:
         if within is not None:
             within.turn(light.directions, ahead, normals, mirrors)
             cosine = np.abs(products(normals.T, ahead.T))
-        away = self._clear_m / np.maximum(cosine, 1e-3)
+        away = self.caster.clear_m / np.maximum(cosine, 1e-3)
         ends = light.origins + step[:, None] * light.directions
         path = Pattern(ahead, ends + away[:, None] * ahead)
         assert path.origins is not None  # it was given some
         before = distance + (away if within is None else within.optical(away))
         if within is not None:
             within.go(away)
-        growth = light.growth
-        if growth is not None and moved is not None:  # a mirror that moves makes it longer, too
+        range_rate = light.range_rate
+        if range_rate is not None and moved is not None:  # a mirror that moves makes it longer, too
             there, back = products(moved.T, light.directions.T), products(moved.T, ahead.T)
-            growth = growth + index * there - (1.0 if within is None else within.index) * back
+            range_rate = (
+                range_rate + index * there - (1.0 if within is None else within.index) * back
+            )
         own = light.ray, light.times, path.origins, path.directions, share, before
-        return _Light(*own, turns, within, growth), -away
+        return _Light(*own, turns, within, range_rate), -away
 
     def _velocities(self, light: _Light, step: Floats, triangle: Ints32, poses: Poses) -> Floats:
         """Velocities of where light ends after so many metres, m/s: (n, 3)."""
@@ -250,7 +263,7 @@ class Paths:
         for begin in range(0, len(triangle), BLOCK_HITS):
             block = slice(begin, begin + BLOCK_HITS)
             points = light.origins[block] + step[block, None] * light.directions[block]
-            out[block] = self._surfaces.velocities(
+            out[block] = self.surfaces.velocities(
                 triangle[block], points, light.times[block], poses.ways
             )
         return out

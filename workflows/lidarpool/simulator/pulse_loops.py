@@ -133,7 +133,7 @@ def _joined(
     Two neighbouring sub-rays hit one surface if the planes through the two hits meet half-way
     between them, within the gap or half of the distance between the hits. The inverse range of a
     plane is linear in the ray's direction, so two hits on one plane always meet, whatever the
-    angle; half of the distance allows for rough ground. Hits are in the order of distances.
+    angle; half of the distance allows for rough ground. Returns are in the order of distances.
     """
     count = stop - begin
     panes = 0

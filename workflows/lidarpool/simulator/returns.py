@@ -1,382 +1,169 @@
-"""The returns of a batch: the sources of columns."""
+"""What comes back of pulses, and the keys of random numbers."""
 
 from __future__ import annotations
 
-from dataclasses import replace
-from functools import cached_property
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
-from raybeam import Pattern
+from ..base.arrays import (
+    AnyArray,
+    Bools,
+    Bytes,
+    Floats,
+    Indices,
+    Integers,
+    Ints,
+    Ints32,
+    Records,
+    UInts32,
+)
+from ..columns.table import CAUSES
+from ..scene.colours import GREY, packed
 
-from ..base.arrays import AnyArray, Bytes, Floats, Ints, Ints32, Records, UInts32
-from ..base.elementary import arcsin, arctan2
-from ..base.vectors import turned
-from ..columns.table import Column
-from ..columns.waveforms import column_type
-from ..scene.colours import unpacked
-from ..scene.scene import Scene
-from ..sensor import ScanSpec, Survey
-from ..sensor.materials import at_right_angles
-from ..sensor.optics import LIGHT_M_NS
-from .doppler import radial_velocities
-from .echoes import Echoes
-from .hits import FALSE_ALARM, NO_SURFACE
-from .motion import Poses
-from .surfaces import Surfaces, light_of
+T = TypeVar("T")
 
-BLOCK_HITS = 1 << 16  # that are looked at a time
-LEAST_LEFT = 1e-30  # of the light, so that what is divided by it is finite in single precision
+NO_SURFACE = -1  # triangle and object of what is no surface
+SURFACE, AIR, FALSE_ALARM, CROSSTALK, BLOOMING = range(len(CAUSES))
 
 
-class BatchReturns:
-    """Kept returns of some consecutive scans of one station, in (scan, ray) order.
+def selected(columns: Iterable[Any], rows: Any) -> Iterator[Any]:
+    """Yield some rows of each column; None for one that is not there."""
+    return (None if column is None else column[rows] for column in columns)
 
-    Its attributes are arrays (n,) with a value for each return, computed on first use: the
-    sources of columns (`lidarpool.columns.table`).
+
+# Columns of whatever comes back.
+OF_RETURNS = "ray", "distance", "triangle", "energy", "colour", "cause"
+
+
+class PulseReturns(NamedTuple):
+    """What comes back of pulses, in the order of rays and distances: arrays (n,).
+
+    Columns that no step of a survey makes are None. Before hits become returns, a ray is a sub-ray.
+    What is no surface has the triangle `NO_SURFACE`.
     """
 
-    def __init__(
-        self,
-        scene: Scene,
-        survey: Survey,
-        surfaces: Surfaces,
-        specs: list[ScanSpec],  # the firings of each follow those of the one before
-        found: Echoes,  # rays are numbered from 0 at the first firing
-        pattern: Pattern,
-        start: int,  # number of ray 0 within the pattern
-        poses: Poses,
-    ) -> None:
-        self.scene, self.survey = scene, survey
-        self.carried = survey.carried[specs[0].sensor]
-        self.sensor = self.carried.sensor
-        self.specs = specs
-        # Triangles that were hit and their hits, (k,) each: a count for every triangle of the scene
-        # would be kept for each station of a batch.
-        hits = np.zeros(0, np.int64) if found.tally is None else found.tally
-        triangles = np.flatnonzero(hits)
-        self.tally = triangles, hits[triangles]
-        self.found = replace(found, tally=None)
-        self._surfaces = surfaces
-        self._pattern, self._start = pattern, start
-        self._poses = poses
+    ray: Integers
+    distance: Floats  # metres, without noise
+    triangle: Ints32
+    # Received, see `Surfaces.energy`; None if it is that of the rays as reported.
+    energy: Floats | None = None
+    # Packed, see `Surfaces.colours`; None if they are those of the rays' ends, or not needed.
+    colour: UInts32 | None = None
+    cause: Bytes | None = None  # why they are there; None if all are surfaces
+    # Radial, m/s, if a column has it; NaN if unknown.
+    velocity: Floats | None = None
+    # Full width at half maximum in the waveform, ns, and height; None if returns are made without.
+    width: Floats | None = None
+    amplitude: Floats | None = None
+    waveform: Records | None = None  # recorded, but for the location
+    number: Bytes | None = None  # among the reported returns of its pulse, from 1
+    returns: Bytes | None = None  # how many these are
+    reported: Floats | None = None  # distance with noise
 
-    def __len__(self) -> int:
-        return len(self.found.ray)
+    @classmethod
+    def none(cls) -> PulseReturns:
+        """Make none."""
+        return cls(np.zeros(0, np.int64), np.zeros(0), np.zeros(0, np.int32))
 
-    @property
-    def hits(self) -> Ints:
-        """Returns of each scan, kept or not: (scans,)."""
-        return self.found.hits
+    @classmethod
+    def one_each(cls, ray: Integers, distance: Floats, triangle: Ints32) -> PulseReturns:
+        """Make the only return of each ray, without noise."""
+        one = np.ones(len(ray), np.uint8)
+        return cls(ray, distance, triangle, number=one, returns=one, reported=distance)
 
-    def column(self, column: Column) -> AnyArray:
-        """Values of a column."""
-        return column.make(self)
-
-    def ends(self, rows: Ints) -> Floats:
-        """Positions of some returns (k,): (k, 3)."""
-        return self.positions[rows]
-
-    # -- the ray -----------------------------------------------------------------------------
-
-    @cached_property
-    def _first_rays(self) -> Ints:
-        """Number of the first ray of each scan."""
-        begin = self.specs[0].firings[0]
-        firsts = [spec.firings[0] - begin for spec in self.specs]
-        return np.array(firsts, np.int64) * self.sensor.channels
-
-    @cached_property
-    def counts(self) -> Ints:
-        """Returns of each scan: (scans,)."""
-        cuts = np.searchsorted(self.found.ray, self._first_rays)
-        return np.diff(np.append(cuts, len(self))).astype(np.int64)
-
-    @cached_property
-    def scan(self) -> Ints32:
-        """Number of the scan."""
-        first = self.specs[0].scan
-        return np.repeat(np.arange(first, first + len(self.specs), dtype=np.int32), self.counts)
-
-    @cached_property
-    def ray(self) -> Ints:
-        """Number of the ray within its scan."""
-        return self.found.ray.astype(np.int64) - np.repeat(self._first_rays, self.counts)
-
-    @cached_property
-    def channel(self) -> UInts32:
-        """Beam of the sensor."""
-        return np.asarray(self.found.ray % np.uint32(self.sensor.channels), np.uint32)
-
-    @cached_property
-    def firing(self) -> Ints:
-        """Number of the firing, from the beginning of the station."""
-        return self.specs[0].firings[0] + self._number
+    def take(self, rows: Bools | Indices) -> PulseReturns:
+        """Select some of them."""
+        if rows.dtype == np.bool_:  # of each column it would be counted again
+            rows = np.flatnonzero(rows)
+        return PulseReturns(*selected(self, rows))
 
     @property
-    def sensor_number(self) -> Bytes:
-        """Number of the sensor."""
-        return np.full(len(self), self.specs[0].sensor, np.uint8)
+    def height(self) -> Floats:
+        """Heights of echoes; without waveforms their energies."""
+        return made(self.energy if self.amplitude is None else self.amplitude)
 
-    @cached_property
-    def time(self) -> Ints:
-        """Firing time of the ray, nanoseconds since the survey's start."""
-        times = self.sensor.begins_ns(self._firings).take(self._number)
-        times += self.sensor.beams.time_ns.take(self.channel)
-        return self.specs[0].start_ns + np.rint(times, out=times).astype(np.int64)
 
-    @property
-    def _times(self) -> Ints:
-        """Firing times, where they matter, for actors."""
-        return self.time if self._poses.ways else np.zeros(len(self), np.int64)
+# Normals of the surfaces of hits, as they are seen in mirrors, and directions of their rays:
+# (n, 3) each.
+Planes = tuple[Floats, Floats]
 
-    @property
-    def _firings(self) -> Ints:
-        """All rays of the scans, with and without returns."""
-        return np.arange(self.specs[0].firings[0], self.specs[-1].firings[1])
 
-    @cached_property
-    def _number(self) -> Ints:
-        """Number of the firing, from that of the first scan."""
-        return self.found.ray // np.int64(self.sensor.channels)
+def made(column: T | None) -> T:
+    """Return a column that an earlier step has made."""
+    assert column is not None
+    return column
 
-    # -- positions ---------------------------------------------------------------------------
 
-    @cached_property
-    def _rays(self) -> tuple[Floats, Floats]:
-        return self._poses.rays(self._pattern, self.found.ray, self._start)
+# Values of a column where some have it, and others do not.
+_LACKING: dict[str, Any] = {"cause": np.uint8(SURFACE), "velocity": np.nan, "width": 0.0}
 
-    @property
-    def origins(self) -> Floats:
-        """Starts of the rays, metres, the scene's local coordinates: (n, 3)."""
-        return np.broadcast_to(self._rays[0], (len(self), 3))
 
-    @property
-    def directions(self) -> Floats:
-        """Unit directions in the scene's axes: (n, 3)."""
-        return self._rays[1]
+def joined(parts: list[PulseReturns]) -> PulseReturns:
+    """Concatenate hits. Other columns than `_LACKING` are in all parts, or in none."""
+    if len(parts) == 1:
+        return parts[0]
+    return PulseReturns._make(_column(name, parts) for name in PulseReturns._fields)
 
-    @property
-    def range(self) -> Floats:
-        """Distance from the start of the ray, metres, with noise."""
-        return self.found.reported
 
-    @cached_property
-    def positions(self) -> Floats:
-        """Ends of the rays, metres, the scene's local coordinates: (n, 3)."""
-        origins, directions = self._rays
-        out = directions * self.range[:, None]
-        return np.add(out, origins, out=out)
+def _column(name: str, parts: list[PulseReturns]) -> AnyArray | None:
+    """Concatenate a column; None if all parts lack it."""
+    columns = [getattr(part, name) for part in parts]
+    if all(column is None for column in columns):
+        return None
+    return np.concatenate(
+        [
+            np.full(len(part.ray), _LACKING[name]) if column is None else column
+            for part, column in zip(parts, columns, strict=True)
+        ]
+    )
 
-    @cached_property
-    def cells(self) -> Ints32:
-        """Positions as whole multiples of the survey's precision: (3, n)."""
-        world = self.survey.coordinates == "world"
-        scaled = (self.positions if world else self.sensor_positions) / self.survey.precision_m
-        cells = np.empty((3, len(self)), np.int32)
-        cells[:] = np.rint(scaled, out=scaled).T
-        return cells
 
-    @property
-    def cell_x(self) -> Ints32:
-        """Quantised x of each return, multiples of the precision from the local origin."""
-        return self.cells[0]
+def unreal(
+    returns: PulseReturns, ray: Ints, distance: Floats, energy: Floats, cause: int
+) -> PulseReturns:
+    """Make returns that are from no surface, with the columns that others have."""
+    count = len(ray)
+    return PulseReturns(
+        ray,
+        distance,
+        np.full(count, NO_SURFACE, np.int32),
+        energy,
+        None if returns.colour is None else np.full(count, packed(GREY[0])[0]),
+        np.full(count, cause, np.uint8),
+        amplitude=None if returns.amplitude is None else energy,
+    )
 
-    @property
-    def cell_y(self) -> Ints32:
-        """Quantised y of each return, multiples of the precision from the local origin."""
-        return self.cells[1]
 
-    @property
-    def cell_z(self) -> Ints32:
-        """Quantised z of each return, multiples of the precision from the local origin."""
-        return self.cells[2]
+def merged(returns: PulseReturns, more: PulseReturns) -> PulseReturns:
+    """Add returns to others; the result is in the order of rays and distances."""
+    if not len(more.ray):
+        return returns
+    hits = joined([returns, more])
+    return hits.take(np.lexsort((hits.distance, hits.ray)))
 
-    @cached_property
-    def _rows(self) -> Ints:
-        """Of the pattern."""
-        return (self._start + self.found.ray.astype(np.int64)) % len(self._pattern)
 
-    @cached_property
-    def _sensor_directions(self) -> Floats:
-        return self._to_sensor(self._pattern.directions[self._rows])
+@dataclass(frozen=True)
+class Keys:
+    """Keys of the random numbers of rays."""
 
-    @cached_property
-    def sensor_positions(self) -> Floats:
-        """Ends of the rays in the axes of the sensor at their firing, metres: (n, 3)."""
-        origins = self._pattern.origins
-        ends = self._pattern.directions[self._rows] * self.range[:, None]
-        if origins is not None:
-            ends += origins[self._rows]
-        if not self._poses.by_head:
-            ends -= self.carried.mount.position
-        elif self.sensor.centre is not None:
-            ends += self.sensor.centre
-        return self._to_sensor(ends)
+    scan: int  # number of the first scan
+    begins: Ints  # rays at which scans begin
 
-    def _to_sensor(self, vectors: Floats) -> Floats:
-        """Turn vectors (n, 3) in the axes of the carrier, or the head, to those of the sensor."""
-        if self._poses.by_head:
-            spins = self.sensor.spins(self._firings)
-            assert spins is not None  # or the rig would not cast by head
-            (cos, sin), (x, y, z) = (a.take(self._number) for a in spins), vectors.T
-            looks = np.stack([x * cos - y * sin, x * sin + y * cos, z], axis=1)
-            return turned(looks, self.sensor.axes)
-        mount = self.carried.mount.rotation
-        return turned(vectors, None if mount is None else mount.T)
+    def of(self, ray: Integers) -> tuple[Ints, Ints]:
+        """Return the scans of rays, and their numbers within them."""
+        number = np.searchsorted(self.begins, ray, side="right") - 1
+        return self.scan + number, ray - self.begins[number]
 
-    @cached_property
-    def azimuth(self) -> Floats:
-        """Angle of the ray about the sensor's z axis, degrees, from 0 to 360."""
-        x, y, _ = self._sensor_directions.T
-        return np.degrees(arctan2(y, x)) % 360
 
-    @cached_property
-    def elevation(self) -> Floats:
-        """Angle of the ray above the sensor's xy plane, degrees."""
-        return np.degrees(arcsin(np.clip(self._sensor_directions[:, 2], -1, 1)))
+def numbers(ray: Integers) -> Ints:
+    """Count the entries of each ray, which are consecutive, from 0: (n,)."""
+    return np.arange(len(ray)) - np.repeat(*runs(ray))
 
-    # -- the surface -------------------------------------------------------------------------
 
-    @property
-    def triangle(self) -> Ints32:
-        """Triangle of the scene."""
-        return self.found.triangle
-
-    @cached_property
-    def object(self) -> Ints32:
-        """Object of the scene."""
-        return self._surfaces.objects(self.found.triangle)
-
-    @cached_property
-    def cosine(self) -> Floats:
-        """Cosine of the angle between the ray and the normal of its triangle, 0 to 1.
-
-        It means nothing where there is no surface.
-        """
-        return np.abs(self._lit[0])
-
-    @cached_property
-    def _lit(self) -> tuple[Floats, Floats]:
-        """Cosines of incidence, of either sign, and energies; in blocks, for normals take room."""
-        light, (along, energy) = light_of(self.survey, self.sensor), np.empty((2, len(self)))
-        colours = self._colours if self._surfaces.materials.textured else None
-        for begin in range(0, len(self), BLOCK_HITS):
-            some = slice(begin, begin + BLOCK_HITS)
-            found = self.found.triangle[some], self.directions[some], self.found.distance[some]
-            more = None if colours is None else colours[some]
-            lit = self._surfaces.lit(*found, light, self._times[some], self._poses.ways, more)
-            along[some], energy[some] = lit.along, lit.energy
-        return along, energy
-
-    @cached_property
-    def intensity(self) -> Floats:
-        """Received energy, see `Surfaces.energy`."""
-        if self.found.energy is not None:
-            return self.found.energy
-        return self._lit[1]
-
-    @cached_property
-    def _colours(self) -> UInts32:
-        """Packed colours."""
-        if self.found.colour is not None:
-            return self.found.colour
-        points = self.positions
-        if self.found.reported is not self.found.distance:
-            points = self.directions * self.found.distance[:, None] + self._rays[0]
-        return self._surfaces.colours(self.found.triangle, points, self._times, self._poses.ways)
-
-    @property
-    def red(self) -> Bytes:
-        """Red of the surface, sRGB."""
-        return unpacked(self._colours)[:, 0]
-
-    @property
-    def green(self) -> Bytes:
-        """Green of the surface, sRGB."""
-        return unpacked(self._colours)[:, 1]
-
-    @property
-    def blue(self) -> Bytes:
-        """Blue of the surface, sRGB."""
-        return unpacked(self._colours)[:, 2]
-
-    @property
-    def reflectivity(self) -> Floats:
-        """Intensity without the loss by distance and air."""
-        lost = at_right_angles(self.found.distance, self.survey.extinction(self.sensor))
-        # In thick fog or dust nothing is left of the light from where a false alarm seems to be.
-        return np.asarray(self.intensity / np.maximum(lost, LEAST_LEFT))
-
-    @cached_property
-    def radial_velocity(self) -> Floats:
-        """How fast the range grows, m/s, with noise; NaN of what no light returned from."""
-        found, velocity = self.found, self.found.velocity
-        if velocity is None:
-            velocity = radial_velocities(
-                self._surfaces,
-                self._poses,
-                found.ray.astype(np.int64),
-                self._rays,
-                found.distance,
-                found.triangle,
-                self._times,
-            )
-            if found.cause is not None:
-                no_light = (found.cause >= FALSE_ALARM) & (found.triangle == NO_SURFACE)
-                velocity[no_light] = np.nan
-        noise = self.survey.noise_each[self.specs[0].sensor]
-        if noise.velocity_m_s:
-            scan = self.scan.astype(np.int64) + self.specs[0].ahead
-            velocity = noise.velocities(velocity, scan, self.ray, self.return_number)
-        return velocity
-
-    @property
-    def amplitude(self) -> Floats:
-        """Height of the echo in the waveform; without waveforms its energy."""
-        return self.intensity if self.found.amplitude is None else self.found.amplitude
-
-    @property
-    def pulse_width(self) -> Floats:
-        """Full width at half maximum of the echo in the waveform, nanoseconds."""
-        if self.found.width is None:
-            returns = self.survey.returns_each[self.specs[0].sensor]
-            return np.full(len(self), returns.length_ns(self.sensor.optics))
-        return self.found.width
-
-    @property
-    def waveform(self) -> Records:
-        """Recorded waveform, see `lidarpool.columns.waveforms.record`."""
-        made = self.found.waveform
-        assert made is not None  # or there would be no such column
-        made = made.copy()
-        begin_ps = made["begin"] * made["sample_ps"].astype(np.float64)
-        made["location_ps"] = self.range * (2000 / LIGHT_M_NS) - begin_ps
-        world = self.survey.coordinates == "world"
-        ahead = self.directions if world else self._sensor_directions
-        made["toward"] = -ahead * (LIGHT_M_NS / 2000)
-        return made.view(column_type(made.dtype["samples"].shape[0]))
-
-    @property
-    def return_number(self) -> Bytes:
-        """Number among the reported returns of its pulse."""
-        return self.found.number
-
-    @property
-    def returns(self) -> Bytes:
-        """Number of reported returns of its pulse."""
-        return self.found.returns
-
-    @property
-    def cause(self) -> Bytes:
-        """Why the return is there, see `CAUSES` of the table of columns."""
-        if self.found.cause is None:
-            return np.zeros(len(self), np.uint8)
-        return self.found.cause
-
-    @property
-    def semantic_class(self) -> NDArray[np.uint16]:
-        """Class of the material."""
-        classes, owners = self._surfaces.materials.semantic_class[self.object], self.object
-        return classes if self.found.cause is None else np.where(owners < 0, 0, classes)
+def runs(ray: Integers) -> tuple[Ints, Ints]:
+    """Find starts and lengths of runs of equal numbers."""
+    begins = np.flatnonzero(np.diff(ray, prepend=-1))
+    return begins, np.diff(begins, append=len(ray))

@@ -17,13 +17,13 @@ from ..base.vectors import turned
 from ..scene.actors import Actor
 from ..scene.scene import Scene
 from ..sensor import Pose, ScanSpec, Sensor, Survey, Trajectory
-from .device import DeviceColumns, DeviceReturns
-from .echoes import EchoCaster
+from .device import DeviceColumns, DevicePoints
 from .motion import Clock, Poses, check_trajectory, poses_of_firings
-from .returns import BatchReturns
+from .points import BatchPoints
+from .pulses import PulseCaster
+from .scene_caster import SceneCaster
 from .surfaces import Surfaces
 from .ways import Ways
-from .world import World
 
 PATTERN_RAYS = 20_000_000  # rays of a head's period that are kept; 24 bytes each
 IMAGE_RAYS = 1 << 20  # rays of images that are cast at a time
@@ -65,13 +65,13 @@ class Rig:
         self._assemble(scene, survey, options, None)
 
     def _assemble(
-        self, scene: Scene, survey: Survey, options: dict[str, Any], like: World | None
+        self, scene: Scene, survey: Survey, options: dict[str, Any], like: SceneCaster | None
     ) -> None:
         self.scene, self.survey, self._options = scene, survey, options
         self._ways = Ways(actor.trajectory for actor in scene.actors)
         wavelengths = {carried.sensor.optics.wavelength_nm for carried in survey.carried}
         self._surfaces = Surfaces(scene, tuple(survey.materials), sorted(wavelengths))
-        self._world = World(scene, self._surfaces, like, **options)
+        self._caster = SceneCaster(scene, self._surfaces, like, **options)
         self._device: DeviceColumns | None = None
         self._see()
         check_trajectory(survey.path)
@@ -90,7 +90,7 @@ class Rig:
             if by_head:
                 origin = sensor.beams.origin if sensor.centre is None else None
                 pattern = Pattern(sensor.ahead, origin)
-                subrays = self._echoes[number].divided(pattern, by_head=True)
+                subrays = self._pulses[number].emitter.repeated(pattern, by_head=True)
                 made = _Rays(pattern, subrays, by_head=True)
             elif repeats:
                 made = self._rays_of(number, 0, sensor.period or 0)
@@ -103,7 +103,7 @@ class Rig:
         The tree of all that stands still is shared.
         """
         rig = copy(self)
-        rig._assemble(scene, survey, self._options, self._world)
+        rig._assemble(scene, survey, self._options, self._caster)
         return rig
 
     def with_actors(self, actors: tuple[Actor, ...]) -> Rig:
@@ -135,23 +135,23 @@ class Rig:
         assert shared is not None
         rows = np.flatnonzero(shared.owner == owner)
         rig._surfaces = self._surfaces.moved(rig.scene, rows)
-        rig._world.place(rig._surfaces, shared, rows)
+        rig._caster.place(rig._surfaces, shared, rows)
         rig._see()
         return rig
 
     def _see(self) -> None:
         """Make what depends on where the surfaces are."""
-        given = self._world, self.scene, self.survey, self._surfaces
-        self._echoes = [EchoCaster(number, *given) for number in range(len(self.survey.carried))]
+        given = self._caster, self.scene, self.survey, self._surfaces
+        self._pulses = [PulseCaster(number, *given) for number in range(len(self.survey.carried))]
         if self._device is not None:
             self._device = self._device.moved(self.scene, self._surfaces)
-        elif all(echoes.plain for echoes in self._echoes) and self._world.caster.on_device:
+        elif self._caster.caster.on_device and not any(pulses.steps for pulses in self._pulses):
             self._device = DeviceColumns(*given)
 
     @property
     def backend(self) -> str:
         """Name of the ray-casting backend in use."""
-        return self._world.backend
+        return self._caster.backend
 
     def pattern(self, number: int, first: int, stop: int) -> Pattern:
         """Rays of firings `first` to `stop` of a sensor, in the axes of its carrier."""
@@ -165,7 +165,7 @@ class Rig:
             origins = np.add(np.zeros(3) if origins is None else origins, mount.position)
         return Pattern(directions, origins)
 
-    def cast(self, first: int, stop: int) -> Iterator[BatchReturns | DeviceReturns]:
+    def cast(self, first: int, stop: int) -> Iterator[BatchPoints | DevicePoints]:
         """Cast scans `first` to `stop` of the survey; yields the returns for each station."""
         run: list[ScanSpec] = []
         for spec in map(self.survey.scan, range(first, stop)):
@@ -184,7 +184,7 @@ class Rig:
         late_ns: float = 0.0,
         *,
         tally: bool = True,
-    ) -> BatchReturns | DeviceReturns:
+    ) -> BatchPoints | DevicePoints:
         """Cast scans of one station, the firings of each following those of the one before.
 
         The carrier is `late_ns` further on its path than the firings' own times say. Hits of each
@@ -214,10 +214,11 @@ class Rig:
         groups = np.array([spec.firings[0] - first for spec in specs]) * channels
         if self._device is not None:
             return self._device.returns(specs, pattern, poses, window, groups)
-        echoes = self._echoes[number]
         scan = specs[0].scan + specs[0].ahead
-        found = echoes.scan(scan, pattern, subrays, poses, window, groups, tally=tally)
-        return BatchReturns(self.scene, survey, self._surfaces, specs, found, pattern, start, poses)
+        found = self._pulses[number].scan(
+            scan, pattern, subrays, poses, window, groups, tally=tally
+        )
+        return BatchPoints(self.scene, survey, self._surfaces, specs, found, pattern, start, poses)
 
     def _timed(self, poses: Poses, specs: list[ScanSpec], times: int = 1) -> Poses:
         """Return poses of scans, so many times in turn, with the times that actors need."""
@@ -258,8 +259,9 @@ class Rig:
             groups = (rays * np.arange(count)[:, None] + begin_rays).reshape(-1)
             scan = specs[0].scan + specs[0].ahead + begin * len(specs)
             window = (0, len(image))
-            echoes = self._echoes[number]
-            found = echoes.scan(scan, pattern, subrays, poses, window, groups, tally=False)
+            caster = self._pulses[number]
+            found = caster.scan(scan, pattern, subrays, poses, window, groups, tally=False).returns
+            assert found.reported is not None  # of kept returns
             nearest = found.number == 1
             image[found.ray[nearest]] = found.reported[nearest]
         return out.reshape(len(positions), -1, sensor.channels)
@@ -274,6 +276,6 @@ class Rig:
             pattern = self.pattern(number, first, stop)
             if len(self._firings) >= KEPT:
                 self._firings.clear()
-            rays = _Rays(pattern, self._echoes[number].divided(pattern))
+            rays = _Rays(pattern, self._pulses[number].emitter.repeated(pattern))
             made = self._firings[number, first, stop] = rays
         return made

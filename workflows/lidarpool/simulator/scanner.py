@@ -38,8 +38,8 @@ from ..sensor.trajectory import CENTRE, pose_of
 from .batch import columns_of
 from .motion import check_trajectory
 from .rig import Rig
+from .scene_caster import check_backend_here
 from .surfaces import warn_of_grey
-from .world import check_backend_here
 
 SCANS_MOST = 1 << 31  # the type of the column `scan`
 Number = Annotated[int, Field(ge=0)]

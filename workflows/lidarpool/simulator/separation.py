@@ -6,24 +6,16 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..base.arrays import AnyArray, Bools, Floats, Ints, owned
+from ..base.arrays import AnyArray, owned
 from ..scene.colours import GREY, packed
 from ..sensor.disc import neighbours
 from ..sensor.noise import THRESHOLD_SIGMAS, Noise, Purpose, quantiles, starts
 from ..sensor.optics import Mode
-from .hits import AIR, NO_SURFACE, SURFACE, Hits, Keys, Planes
+from .returns import AIR, NO_SURFACE, OF_RETURNS, SURFACE, Keys, Planes, PulseReturns, made
+from .selection import MODES
+from .step import PulseBatch, PulseStep, Setup
 
-_MODES: tuple[Mode, ...] = "all", "first", "last", "strongest", "dual"  # as of `pulse_loops`
 _NONE = np.zeros(0)
-
-
-class AirHits(NamedTuple):
-    """Hits in the air, in the order of sub-rays: arrays (k,)."""
-
-    ray: Ints
-    distance: Floats
-    energy: Floats
-    velocity: Floats = _NONE  # if hits have velocities
 
 
 class Report(NamedTuple):
@@ -36,13 +28,13 @@ class Report(NamedTuple):
 
 
 def separated(
-    hits: Hits,
+    hits: PulseReturns,
     gap_m: float,
     each: int = 1,
     planes: Planes | None = None,
-    air: AirHits | None = None,
+    air: PulseReturns | None = None,
     report: Report | None = None,
-) -> Hits:
+) -> PulseReturns:
     """Make returns of hits: those of a beam within a distance of the next are one return.
 
     So are hits of neighbouring sub-rays on one surface, however far apart they are: a beam that
@@ -55,7 +47,7 @@ def separated(
     """
     from . import pulse_loops  # not before: numba takes half a second to import
 
-    air = air or AirHits(np.zeros(0, np.int64), _NONE, _NONE)
+    flies = PulseReturns.none()._replace(energy=_NONE) if air is None else air
     mode, noise, keys, first = report or Report()
     begun, table, limits = np.zeros(0, np.uint64), _NONE, (0.0, 0.0, THRESHOLD_SIGMAS)
     if noise is not None and noise.loses:
@@ -63,27 +55,28 @@ def separated(
         limits = noise.dropout, noise.threshold, THRESHOLD_SIGMAS
     speeds = _NONE if hits.velocity is None else hits.velocity
     begins, scan = (np.zeros(1), 0) if keys is None else (keys.begins, keys.scan)
-    most = len(hits.ray) + len(air.ray)
+    most = len(hits.ray) + len(flies.ray)
+    winds = _NONE if hits.velocity is None or flies.velocity is None else flies.velocity
     whole, real = np.empty((2, most), np.int64), np.empty((3, most))
     count = pulse_loops.returns(
-        each, gap_m, _MODES.index(mode),
-        owned(hits.ray, np.int64), owned(hits.distance), owned(hits.energy),
+        each, gap_m, MODES.index(mode),
+        owned(hits.ray, np.int64), owned(hits.distance), owned(made(hits.energy)),
         hits.triangle != NO_SURFACE, owned(speeds),
-        owned(air.ray, np.int64), owned(air.distance), owned(air.energy), owned(air.velocity),
+        owned(flies.ray, np.int64), owned(flies.distance), owned(made(flies.energy)), owned(winds),
         *surfaces_of(each, planes), *map(float, limits), begun, table, scan,
         owned(begins, np.int64), first, whole, real,
     )  # fmt: skip
     beam, row = whole[:, :count].copy()
     distance, energy, velocity = real[:, :count].copy()
-    made = hits.take(np.maximum(row, 0)) if len(hits.ray) else _unknown(hits, count)
-    if len(air.ray):
-        flies = np.flatnonzero(row < 0)
-        cause = np.full(count, SURFACE, np.uint8) if made.cause is None else made.cause
-        cause[flies], made.triangle[flies] = AIR, NO_SURFACE
-        if made.colour is not None:
-            made.colour[flies] = packed(GREY[0])[0]
-        made = made._replace(cause=cause)
-    return made._replace(
+    found = hits.take(np.maximum(row, 0)) if len(hits.ray) else _unknown(hits, count)
+    if len(flies.ray):
+        some = np.flatnonzero(row < 0)
+        cause = np.full(count, SURFACE, np.uint8) if found.cause is None else found.cause
+        cause[some], found.triangle[some] = AIR, NO_SURFACE
+        if found.colour is not None:
+            found.colour[some] = packed(GREY[0])[0]
+        found = found._replace(cause=cause)
+    return found._replace(
         ray=beam + first,
         distance=distance,
         energy=energy,
@@ -91,10 +84,10 @@ def separated(
     )
 
 
-def _unknown(hits: Hits, count: int) -> Hits:
+def _unknown(hits: PulseReturns, count: int) -> PulseReturns:
     """Make the columns of hits for some returns, none of which is of a surface."""
     columns = (None if one is None else np.zeros(count, one.dtype) for one in hits)
-    return Hits._make(columns)
+    return PulseReturns._make(columns)
 
 
 def surfaces_of(each: int, planes: Planes | None) -> tuple[AnyArray, ...]:
@@ -105,10 +98,21 @@ def surfaces_of(each: int, planes: Planes | None) -> tuple[AnyArray, ...]:
     return owned(pairs, np.int64), owned(normals.T), owned(directions.T)
 
 
-def chosen(returns: Hits, mode: Mode) -> Bools:
-    """Whether a mode reports each return: (n,)."""
-    from . import pulse_loops
+class SeparationStep(PulseStep):
+    """Makes returns of hits by their distances; one loop detects and reports them as well."""
 
-    there, number = np.empty(len(returns.ray), np.bool_), _MODES.index(mode)
-    pulse_loops.reported(owned(returns.ray, np.int64), owned(returns.energy), number, there)
-    return there
+    reads = "ray", "distance", "triangle", "energy", "velocity"
+    writes = *OF_RETURNS, "velocity"
+    purposes = Purpose.LOSS, Purpose.DETECTION
+
+    @staticmethod
+    def applies(setup: Setup) -> bool:
+        """See `PulseStep.applies`."""
+        return setup.several and not setup.in_waveforms
+
+    def apply(self, returns: PulseReturns, batch: PulseBatch) -> PulseReturns:
+        """See `PulseStep.apply`."""
+        setup = self.setup
+        shown = "all" if setup.adds else setup.reporting.mode  # more come before `SelectionStep`
+        report = Report(shown, setup.noise, batch.keys, batch.start)
+        return separated(returns, setup.gap_m, batch.each, batch.planes, batch.air, report)

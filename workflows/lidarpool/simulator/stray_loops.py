@@ -1,4 +1,4 @@
-"""Loops over rays beside retro-reflectors, whose light they receive: see receiver.py."""
+"""Loops over rays beside retro-reflectors, whose light they receive: see stray_light.py."""
 
 # mypy: disable-error-code="no-untyped-def"
 

@@ -263,7 +263,7 @@ class Surfaces:
         return Lookup(colours, corners)
 
     def bodies(self) -> tuple[Ints, Floats]:
-        """Return what bodies the triangles belong to, in the order of a world's ray caster.
+        """Return what bodies the triangles belong to, in the order of `SceneCaster`.
 
         Returns
         -------

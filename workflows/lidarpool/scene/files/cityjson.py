@@ -272,7 +272,7 @@ class _CityFile:
         if self._unscaled:
             content.notes.append("lacks its transform: its coordinates are taken as metres")
         if epsg:
-            content.notes.append(f"is in EPSG:{epsg}: cloud.epsg {epsg} writes that to LAS")
+            content.notes.append(f"is in EPSG:{epsg}: <cloud.epsg={epsg}> writes that to LAS")
         if len(levels) > 1:
             content.notes.append(f"has {', '.join(levels)}, which is the highest of each")
         if self._left:

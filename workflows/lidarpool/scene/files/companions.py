@@ -62,5 +62,5 @@ def outside(name: str) -> str:
     """Say that a file may not be read, as a clause."""
     return (
         f"takes data from {name[-80:]!r}, but only files in its own folder are read: name a folder "
-        "that holds that file by assets in scene.files"
+        "that holds that file as assets"
     )

@@ -19,7 +19,7 @@ from ...base.errors import LidarpoolError, prefixed
 from ...base.validation import checked
 from ...base.vectors import determinant, matmul, turned
 from ...base.vocabulary import UNITS_M
-from ...base.words import did_you_mean, plural, printable
+from ...base.words import as_python, did_you_mean, plural, printable
 from ...sensor import Track
 from ...sensor.trajectory import quaternions_of
 from ..actors import Actor, one_mesh
@@ -70,6 +70,11 @@ OpacityMode = Literal["mask", "ignore"]
 _log = logging.getLogger(__name__)
 
 
+def warn(note: str) -> None:
+    """Log a note in the words of Python."""
+    _log.warning(as_python(note))
+
+
 class Objects(NamedTuple):
     """Objects of a mesh file, in world coordinates."""
 
@@ -100,7 +105,7 @@ def load_objects(
     window: Window | None = None,
     epsg: int | None = None,
     assets: str | Path | None = None,
-    tell: Callable[[str], None] = _log.warning,
+    tell: Callable[[str], None] = warn,
     axes: Callable[[str], None] | None = None,
 ) -> Objects:
     """Read all objects of a mesh file.
@@ -186,7 +191,7 @@ def load_objects(
 
 
 def load_meshes(
-    path: str | Path, *, tell: Callable[[str], None] = _log.warning, **options: Any
+    path: str | Path, *, tell: Callable[[str], None] = warn, **options: Any
 ) -> tuple[SceneMesh | SceneInstance, ...]:
     """Read all objects of a mesh file, as `load_objects`, and let them stand."""
     found = load_objects(path, tell=tell, **options)
@@ -238,9 +243,9 @@ def _tell_axes(
         done, why, other = "states no axes and is taken as Z-up", "", "y"
     else:
         return
-    (axes or (_log.warning if why else _log.info))(
-        f"{path.name} {done}; if it lies on its side, set up_axis: {other} in scene.files "
-        f"(lidarpool init --mesh FILE --up-axis {other}); any up_axis ends this note"
+    (axes or (warn if why else lambda note: _log.info(as_python(note))))(
+        f'{path.name} {done}; if it lies on its side, give <scene.files.up_axis="{other}">; any '
+        "up_axis ends this note"
     )
 
 

@@ -440,8 +440,8 @@ def _unit_m(stated: str | None, own: Any, up_m: float | None, notes: list[str]) 
     if own is not None and own.is_projected and own.linear_units_factor[1] != 1:
         name, metre = own.linear_units_factor
         notes.append(
-            f"states no unit of heights: taken in {name}, as its coordinates are; unit: m in "
-            "scene.files takes them in metres"
+            f"states no unit of heights: taken in {name}, as its coordinates are; "
+            '<scene.files.unit="m"> takes them in metres'
         )
         return float(metre)
     return 1.0

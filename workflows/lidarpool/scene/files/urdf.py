@@ -8,7 +8,6 @@ attributes.
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass, field
 from graphlib import CycleError, TopologicalSorter
@@ -32,7 +31,7 @@ from ..robot import HELD, MOVING, Joint, Robot
 from ..scene_instances import SceneInstance
 from ..scene_mesh import SceneMesh
 from ..shapes import capsule, cylinder
-from .meshfile import OpacityMode, load_meshes
+from .meshfile import OpacityMode, load_meshes, warn
 
 SUFFIXES = (".urdf", ".xacro")  # the latter are refused, with what to do
 
@@ -42,16 +41,13 @@ _UP = 5  # folders above a robot's file in which its packages are looked for
 _FARTHEST = 1e8  # of any number in a file
 
 
-_log = logging.getLogger(__name__)
-
-
 @checked
 def load_robot(
     path: str | Path,
     *,
     opacity: OpacityMode = "mask",
     colours: bool = False,
-    tell: Callable[[str], None] = _log.warning,
+    tell: Callable[[str], None] = warn,
 ) -> Robot:
     """Read a robot from a URDF file, with the visual meshes of its links.
 

@@ -469,7 +469,7 @@ class Looks:
         elif not os.path.isfile(outer):  # noqa: PTH113 - or a pipe, which would wait for ever
             frame["unread"] = "is not there"
         elif not outer.startswith(self._folders):
-            frame["unread"] = "is not in the scene's folder, see assets in scene.files"
+            frame["unread"] = "is not in the scene's folder, name one that holds it as assets"
         elif asset := Ar.GetResolver().OpenAsset(Ar.ResolvedPath(path)):
             data = asset.GetBuffer()
         self._write(frame, np.frombuffer(data, np.uint8))

@@ -1,4 +1,4 @@
-"""The ray caster of a whole world: the static scene, its instances, and moving actors.
+"""The ray caster of a whole scene: the static scene, its instances, and moving actors.
 
 Each ray is transformed to an actor's axes at its own time, so that no tree is ever rebuilt: see
 `raybeam.moving`.
@@ -56,17 +56,17 @@ def check_backend_here(wanted: str, advice: str = AUTO_TAKES) -> None:
         )
 
 
-class World:
+class SceneCaster:
     """Casts scans like `RayCaster.scan`, including hits on actors.
 
     Triangles of instances are numbered after those of the scene, and those of actors after both.
     Rays that touch no actor give the same bits as without actors. Where the actors are, the poses
     of a scan say. A tally is by the counters of `surfaces`. `options` are those of `RayCaster`. The
-    caster of another world `like` this one, of the same scene but for actors, is shared.
+    caster of another `like` this one, of the same scene but for actors, is shared.
     """
 
     def __init__(
-        self, scene: Scene, surfaces: Surfaces, like: World | None = None, **options: Any
+        self, scene: Scene, surfaces: Surfaces, like: SceneCaster | None = None, **options: Any
     ) -> None:
         self._surfaces, self._shared = surfaces, scene.instances
         self._begins: Ints32 | None = None  # of each body of the caster

@@ -1,0 +1,374 @@
+"""The returns of a batch: the sources of columns."""
+
+from __future__ import annotations
+
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from raybeam import Pattern
+
+from ..base.arrays import AnyArray, Bytes, Floats, Ints, Ints32, Records, UInts32
+from ..base.elementary import arcsin, arctan2
+from ..base.vectors import turned
+from ..columns.table import Column
+from ..columns.waveforms import column_type
+from ..scene.colours import unpacked
+from ..scene.scene import Scene
+from ..sensor import ScanSpec, Survey
+from ..sensor.materials import at_right_angles
+from ..sensor.optics import LIGHT_M_NS
+from .doppler import radial_velocities
+from .motion import Poses
+from .pulses import Scanned
+from .returns import FALSE_ALARM, NO_SURFACE, made
+from .surfaces import Surfaces, light_of
+
+BLOCK_HITS = 1 << 16  # that are looked at a time
+LEAST_LEFT = 1e-30  # of the light, so that what is divided by it is finite in single precision
+
+
+class BatchPoints:
+    """Kept returns of some consecutive scans of one station, in (scan, ray) order.
+
+    Its attributes are arrays (n,) with a value for each return, computed on first use: the
+    sources of columns (`lidarpool.columns.table`).
+    """
+
+    def __init__(
+        self,
+        scene: Scene,
+        survey: Survey,
+        surfaces: Surfaces,
+        specs: list[ScanSpec],  # the firings of each follow those of the one before
+        found: Scanned,  # rays are numbered from 0 at the first firing
+        pattern: Pattern,
+        start: int,  # number of ray 0 within the pattern
+        poses: Poses,
+    ) -> None:
+        self.scene, self.survey = scene, survey
+        self.carried = survey.carried[specs[0].sensor]
+        self.sensor = self.carried.sensor
+        self.specs = specs
+        # Triangles that were hit and their hits, (k,) each: a count for every triangle of the scene
+        # would be kept for each station of a batch.
+        hits = np.zeros(0, np.int64) if found.tally is None else found.tally
+        triangles = np.flatnonzero(hits)
+        self.tally = triangles, hits[triangles]
+        self.found, self.hits = found.returns, found.hits  # (scans,): of each, kept or not
+        self._surfaces = surfaces
+        self._pattern, self._start = pattern, start
+        self._poses = poses
+
+    def __len__(self) -> int:
+        return len(self.found.ray)
+
+    def column(self, column: Column) -> AnyArray:
+        """Values of a column."""
+        return column.make(self)
+
+    def ends(self, rows: Ints) -> Floats:
+        """Positions of some returns (k,): (k, 3)."""
+        return self.positions[rows]
+
+    # -- the ray -----------------------------------------------------------------------------
+
+    @cached_property
+    def _first_rays(self) -> Ints:
+        """Number of the first ray of each scan."""
+        begin = self.specs[0].firings[0]
+        firsts = [spec.firings[0] - begin for spec in self.specs]
+        return np.array(firsts, np.int64) * self.sensor.channels
+
+    @cached_property
+    def counts(self) -> Ints:
+        """Returns of each scan: (scans,)."""
+        cuts = np.searchsorted(self.found.ray, self._first_rays)
+        return np.diff(np.append(cuts, len(self))).astype(np.int64)
+
+    @cached_property
+    def scan(self) -> Ints32:
+        """Number of the scan."""
+        first = self.specs[0].scan
+        return np.repeat(np.arange(first, first + len(self.specs), dtype=np.int32), self.counts)
+
+    @cached_property
+    def ray(self) -> Ints:
+        """Number of the ray within its scan."""
+        return self.found.ray.astype(np.int64) - np.repeat(self._first_rays, self.counts)
+
+    @cached_property
+    def channel(self) -> UInts32:
+        """Beam of the sensor."""
+        return np.asarray(self.found.ray % np.uint32(self.sensor.channels), np.uint32)
+
+    @cached_property
+    def firing(self) -> Ints:
+        """Number of the firing, from the beginning of the station."""
+        return self.specs[0].firings[0] + self._number
+
+    @property
+    def sensor_number(self) -> Bytes:
+        """Number of the sensor."""
+        return np.full(len(self), self.specs[0].sensor, np.uint8)
+
+    @cached_property
+    def time(self) -> Ints:
+        """Firing time of the ray, nanoseconds since the survey's start."""
+        times = self.sensor.begins_ns(self._firings).take(self._number)
+        times += self.sensor.beams.time_ns.take(self.channel)
+        return self.specs[0].start_ns + np.rint(times, out=times).astype(np.int64)
+
+    @property
+    def _times(self) -> Ints:
+        """Firing times, where they matter, for actors."""
+        return self.time if self._poses.ways else np.zeros(len(self), np.int64)
+
+    @property
+    def _firings(self) -> Ints:
+        """All rays of the scans, with and without returns."""
+        return np.arange(self.specs[0].firings[0], self.specs[-1].firings[1])
+
+    @cached_property
+    def _number(self) -> Ints:
+        """Number of the firing, from that of the first scan."""
+        return self.found.ray // np.int64(self.sensor.channels)
+
+    # -- positions ---------------------------------------------------------------------------
+
+    @cached_property
+    def _rays(self) -> tuple[Floats, Floats]:
+        return self._poses.rays(self._pattern, self.found.ray, self._start)
+
+    @property
+    def origins(self) -> Floats:
+        """Starts of the rays, metres, the scene's local coordinates: (n, 3)."""
+        return np.broadcast_to(self._rays[0], (len(self), 3))
+
+    @property
+    def directions(self) -> Floats:
+        """Unit directions in the scene's axes: (n, 3)."""
+        return self._rays[1]
+
+    @property
+    def range(self) -> Floats:
+        """Distance from the start of the ray, metres, with noise."""
+        return made(self.found.reported)
+
+    @cached_property
+    def positions(self) -> Floats:
+        """Ends of the rays, metres, the scene's local coordinates: (n, 3)."""
+        origins, directions = self._rays
+        out = directions * self.range[:, None]
+        return np.add(out, origins, out=out)
+
+    @cached_property
+    def cells(self) -> Ints32:
+        """Positions as whole multiples of the survey's precision: (3, n)."""
+        world = self.survey.coordinates == "world"
+        scaled = (self.positions if world else self.sensor_positions) / self.survey.precision_m
+        cells = np.empty((3, len(self)), np.int32)
+        cells[:] = np.rint(scaled, out=scaled).T
+        return cells
+
+    @property
+    def cell_x(self) -> Ints32:
+        """Quantised x of each return, multiples of the precision from the local origin."""
+        return self.cells[0]
+
+    @property
+    def cell_y(self) -> Ints32:
+        """Quantised y of each return, multiples of the precision from the local origin."""
+        return self.cells[1]
+
+    @property
+    def cell_z(self) -> Ints32:
+        """Quantised z of each return, multiples of the precision from the local origin."""
+        return self.cells[2]
+
+    @cached_property
+    def _rows(self) -> Ints:
+        """Of the pattern."""
+        return (self._start + self.found.ray.astype(np.int64)) % len(self._pattern)
+
+    @cached_property
+    def _sensor_directions(self) -> Floats:
+        return self._to_sensor(self._pattern.directions[self._rows])
+
+    @cached_property
+    def sensor_positions(self) -> Floats:
+        """Ends of the rays in the axes of the sensor at their firing, metres: (n, 3)."""
+        origins = self._pattern.origins
+        ends = self._pattern.directions[self._rows] * self.range[:, None]
+        if origins is not None:
+            ends += origins[self._rows]
+        if not self._poses.by_head:
+            ends -= self.carried.mount.position
+        elif self.sensor.centre is not None:
+            ends += self.sensor.centre
+        return self._to_sensor(ends)
+
+    def _to_sensor(self, vectors: Floats) -> Floats:
+        """Turn vectors (n, 3) in the axes of the carrier, or the head, to those of the sensor."""
+        if self._poses.by_head:
+            spins = self.sensor.spins(self._firings)
+            assert spins is not None  # or the rig would not cast by head
+            (cos, sin), (x, y, z) = (a.take(self._number) for a in spins), vectors.T
+            looks = np.stack([x * cos - y * sin, x * sin + y * cos, z], axis=1)
+            return turned(looks, self.sensor.axes)
+        mount = self.carried.mount.rotation
+        return turned(vectors, None if mount is None else mount.T)
+
+    @cached_property
+    def azimuth(self) -> Floats:
+        """Angle of the ray about the sensor's z axis, degrees, from 0 to 360."""
+        x, y, _ = self._sensor_directions.T
+        return np.degrees(arctan2(y, x)) % 360
+
+    @cached_property
+    def elevation(self) -> Floats:
+        """Angle of the ray above the sensor's xy plane, degrees."""
+        return np.degrees(arcsin(np.clip(self._sensor_directions[:, 2], -1, 1)))
+
+    # -- the surface -------------------------------------------------------------------------
+
+    @property
+    def triangle(self) -> Ints32:
+        """Triangle of the scene."""
+        return self.found.triangle
+
+    @cached_property
+    def object(self) -> Ints32:
+        """Object of the scene."""
+        return self._surfaces.objects(self.found.triangle)
+
+    @cached_property
+    def cosine(self) -> Floats:
+        """Cosine of the angle between the ray and the normal of its triangle, 0 to 1.
+
+        It means nothing where there is no surface.
+        """
+        return np.abs(self._lit[0])
+
+    @cached_property
+    def _lit(self) -> tuple[Floats, Floats]:
+        """Cosines of incidence, of either sign, and energies; in blocks, for normals take room."""
+        light, (along, energy) = light_of(self.survey, self.sensor), np.empty((2, len(self)))
+        colours = self._colours if self._surfaces.materials.textured else None
+        for begin in range(0, len(self), BLOCK_HITS):
+            some = slice(begin, begin + BLOCK_HITS)
+            found = self.found.triangle[some], self.directions[some], self.found.distance[some]
+            more = None if colours is None else colours[some]
+            lit = self._surfaces.lit(*found, light, self._times[some], self._poses.ways, more)
+            along[some], energy[some] = lit.along, lit.energy
+        return along, energy
+
+    @cached_property
+    def intensity(self) -> Floats:
+        """Received energy, see `Surfaces.energy`."""
+        if self.found.energy is not None:
+            return self.found.energy
+        return self._lit[1]
+
+    @cached_property
+    def _colours(self) -> UInts32:
+        """Packed colours."""
+        if self.found.colour is not None:
+            return self.found.colour
+        points = self.positions
+        if self.found.reported is not self.found.distance:
+            points = self.directions * self.found.distance[:, None] + self._rays[0]
+        return self._surfaces.colours(self.found.triangle, points, self._times, self._poses.ways)
+
+    @property
+    def red(self) -> Bytes:
+        """Red of the surface, sRGB."""
+        return unpacked(self._colours)[:, 0]
+
+    @property
+    def green(self) -> Bytes:
+        """Green of the surface, sRGB."""
+        return unpacked(self._colours)[:, 1]
+
+    @property
+    def blue(self) -> Bytes:
+        """Blue of the surface, sRGB."""
+        return unpacked(self._colours)[:, 2]
+
+    @property
+    def reflectivity(self) -> Floats:
+        """Intensity without the loss by distance and air."""
+        lost = at_right_angles(self.found.distance, self.survey.extinction(self.sensor))
+        # In thick fog or dust nothing is left of the light from where a false alarm seems to be.
+        return np.asarray(self.intensity / np.maximum(lost, LEAST_LEFT))
+
+    @cached_property
+    def radial_velocity(self) -> Floats:
+        """How fast the range grows, m/s, with noise; NaN of what no light returned from."""
+        found, velocity = self.found, self.found.velocity
+        if velocity is None:
+            velocity = radial_velocities(
+                self._surfaces,
+                self._poses,
+                found.ray.astype(np.int64),
+                self._rays,
+                found.distance,
+                found.triangle,
+                self._times,
+            )
+            if found.cause is not None:
+                no_light = (found.cause >= FALSE_ALARM) & (found.triangle == NO_SURFACE)
+                velocity[no_light] = np.nan
+        noise = self.survey.noise_each[self.specs[0].sensor]
+        if noise.velocity_m_s:
+            scan = self.scan.astype(np.int64) + self.specs[0].ahead
+            velocity = noise.velocities(velocity, scan, self.ray, self.return_number)
+        return velocity
+
+    @property
+    def amplitude(self) -> Floats:
+        """Height of the echo in the waveform; without waveforms its energy."""
+        return self.intensity if self.found.amplitude is None else self.found.amplitude
+
+    @property
+    def pulse_width(self) -> Floats:
+        """Full width at half maximum of the echo in the waveform, nanoseconds."""
+        if self.found.width is None:
+            returns = self.survey.returns_each[self.specs[0].sensor]
+            return np.full(len(self), returns.length_ns(self.sensor.optics))
+        return self.found.width
+
+    @property
+    def waveform(self) -> Records:
+        """Recorded waveform, see `lidarpool.columns.waveforms.record`."""
+        table = made(self.found.waveform).copy()
+        begin_ps = table["begin"] * table["sample_ps"].astype(np.float64)
+        table["location_ps"] = self.range * (2000 / LIGHT_M_NS) - begin_ps
+        world = self.survey.coordinates == "world"
+        ahead = self.directions if world else self._sensor_directions
+        table["toward"] = -ahead * (LIGHT_M_NS / 2000)
+        return table.view(column_type(table.dtype["samples"].shape[0]))
+
+    @property
+    def return_number(self) -> Bytes:
+        """Number among the reported returns of its pulse."""
+        return made(self.found.number)
+
+    @property
+    def returns(self) -> Bytes:
+        """Number of reported returns of its pulse."""
+        return made(self.found.returns)
+
+    @property
+    def cause(self) -> Bytes:
+        """Why the return is there, see `CAUSES` of the table of columns."""
+        if self.found.cause is None:
+            return np.zeros(len(self), np.uint8)
+        return self.found.cause
+
+    @property
+    def semantic_class(self) -> NDArray[np.uint16]:
+        """Class of the material."""
+        classes, owners = self._surfaces.materials.semantic_class[self.object], self.object
+        return classes if self.found.cause is None else np.where(owners < 0, 0, classes)

@@ -1,0 +1,159 @@
+"""Returns of the pulses of one sensor: casts its scans, and applies the steps to what is hit.
+
+Random numbers depend only on scan, ray and return, so the batches do not matter.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from raybeam import Pattern
+
+from ..base.arrays import Ints, Ints32
+from ..base.vectors import products
+from ..scene.scene import Scene
+from ..sensor import Survey
+from .doppler import radial_velocities
+from .motion import Poses
+from .returns import NO_SURFACE, Keys, PulseReturns, joined, numbers
+from .scene_caster import SceneCaster
+from .step import Emitter, PulseBatch, PulseStep, Setup
+from .steps import steps_of
+from .surfaces import Surfaces, light_of
+
+CHUNK_RAYS = 1 << 17  # sub-rays that are cast at a time
+
+
+@dataclass(frozen=True)
+class Scanned:
+    """What scans give: kept returns, and counts of all."""
+
+    returns: PulseReturns
+    hits: Ints  # (scans,): returns of each, kept or not
+    tally: Ints | None  # (counters,): hits by `Surfaces.counter`, kept or not, if asked for
+
+
+class PulseCaster:
+    """Casts the scans of one sensor."""
+
+    def __init__(
+        self, number: int, caster: SceneCaster, scene: Scene, survey: Survey, surfaces: Surfaces
+    ) -> None:
+        self._setup = setup = Setup(scene, survey, number)
+        self._caster, self._surfaces = caster, surfaces
+        self.emitter = Emitter(setup)
+        self.steps: list[PulseStep] = [step(setup, caster, surfaces) for step in steps_of(setup)]
+
+    def scan(
+        self,
+        scan: int,
+        pattern: Pattern,
+        divided: Pattern | None,
+        poses: Poses,
+        window: tuple[int, int],
+        groups: Ints,
+        *,
+        tally: bool = True,
+    ) -> Scanned:
+        """Cast scans from number `scan` on: hits in the sensor's range, counted and thinned out.
+
+        `divided` are sub-rays of the pattern, if they were made before; the others are arguments
+        of `RayCaster.scan`, where each group is a scan.
+        """
+        first, rays = window[0], window[1] - window[0]
+        if len(self.emitter) == 1 and not self._setup.noise.angle_deg:
+            divided = pattern
+
+        def batch(start: int, stop: int) -> PulseBatch:
+            keys = Keys(scan, groups)
+            return PulseBatch(keys, start, stop, pattern, first, poses, self.emitter, divided)
+
+        whole = batch(0, rays)
+        if self._setup.several:
+            unit = poses.rays_per_pose or self._setup.sensor.channels
+            size = max(1, CHUNK_RAYS // (len(self.emitter) * unit)) * unit
+            begins = range(0, rays, size)
+            chunks = [self._pulses(batch(k, min(k + size, rays))) for k in begins]
+            found = self._kept(joined(chunks), groups, tally)
+        else:
+            found = self._once(whole, groups, tally)
+        returns = found.returns
+        for step in self.steps:
+            if step.of_kept:
+                returns = step.apply(returns, whole)
+        return Scanned(returns, found.hits, found.tally)
+
+    def _pulses(self, batch: PulseBatch) -> PulseReturns:
+        """Take the pulses of a batch through all steps."""
+        returns = PulseReturns.none()
+        for step in self.steps:
+            if not step.of_kept:
+                returns = step.apply(returns, batch)
+        return returns
+
+    def _once(self, batch: PulseBatch, groups: Ints, tally: bool) -> Scanned:
+        """Cast rays with one return each; compute energies only for kept ones, and if needed."""
+        setup, poses = self._setup, batch.poses
+        for step in self.steps:
+            if not step.of_kept:  # noise of angles
+                step.apply(PulseReturns.none(), batch)
+        found = self._caster.scan(
+            batch.beams,
+            poses,
+            window=batch.window,
+            t_min=setup.sensor.min_range_m,
+            t_max=setup.sensor.max_range_m,
+            keep_every=setup.survey.keep_every,
+            groups=groups,
+            tally=tally,
+        )
+        returns = PulseReturns.one_each(found.ray, found.distance, found.triangle)
+        if batch.offsets is not None:  # else it is made of the reported directions, if it is needed
+            returns = self._lit(returns, batch)
+        return Scanned(returns, found.hits, found.tally)
+
+    def _lit(self, returns: PulseReturns, batch: PulseBatch) -> PulseReturns:
+        """Make what depends on the directions in which rays were cast."""
+        surfaces, setup, poses = self._surfaces, self._setup, batch.poses
+        origins, directions = rays = poses.rays(batch.beams, returns.ray, batch.window[0])
+        times, distance, triangle = poses.times(returns.ray), returns.distance, returns.triangle
+        colour = velocity = None
+        if setup.moving:
+            given = returns.ray, rays, distance, triangle, times
+            velocity = radial_velocities(surfaces, poses, *given)
+        if surfaces.materials.textured:
+            ends = directions * distance[:, None]
+            ends += origins
+            colour = surfaces.colours(triangle, ends, times, poses.ways)
+            del ends  # which takes as much memory as the normals
+        normals = surfaces.normals(triangle, times, poses.ways)
+        cosine, light = (
+            np.abs(products(normals.T, directions.T)),
+            light_of(setup.survey, setup.sensor),
+        )
+        energy = surfaces.energy(triangle, cosine, distance, light, colour)
+        return returns._replace(energy=energy, colour=colour, velocity=velocity)
+
+    def _tally(self, triangle: Ints32) -> Ints:
+        surfaces = self._surfaces
+        some = triangle[triangle != NO_SURFACE]
+        return np.bincount(surfaces.counter(some), minlength=surfaces.counters)
+
+    def _kept(self, returns: PulseReturns, groups: Ints, tally: bool) -> Scanned:
+        """Count the returns of each scan and thin them out."""
+        ray = returns.ray
+        cuts = np.searchsorted(ray, np.append(groups, np.iinfo(np.int64).max))
+        number = numbers(ray)
+        each = number + numbers(ray[::-1])[::-1] + 1
+        place = np.arange(len(ray)) - np.repeat(cuts[:-1], np.diff(cuts))
+        kept = place % self._setup.survey.keep_every == 0
+        thinned = returns.take(kept)
+        thinned = thinned._replace(
+            ray=thinned.ray.astype(np.uint32),
+            number=np.minimum(number[kept] + 1, 255).astype(np.uint8),
+            returns=np.minimum(each[kept], 255).astype(np.uint8),
+            reported=thinned.distance,
+        )
+        return Scanned(thinned, np.diff(cuts), self._tally(returns.triangle) if tally else None)

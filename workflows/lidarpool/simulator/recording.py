@@ -1,0 +1,148 @@
+"""Recorded waveforms: the samples around each return."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..base.arrays import Floats, Ints, Records
+from ..base.elementary import exp
+from ..columns.waveforms import SILENT, ZERO, record
+from ..sensor.noise import THRESHOLD_SIGMAS, Purpose, normal, raw
+from .returns import Keys, PulseReturns, made, numbers
+from .step import Memory, PulseBatch, PulseStep, Setup, Sizes
+from .waveform import CUT, Digitizer
+
+BLOCK_SAMPLES = 1 << 20  # that are made at a time
+
+
+class RecordingStep(PulseStep):
+    """Records the waveforms of returns, with the noise of the receiver."""
+
+    effects = ("Waveforms",)
+    reads = "ray", "distance"
+    writes = ("waveform",)
+    purposes = Purpose.SAMPLES, Purpose.SAMPLE
+
+    @staticmethod
+    def applies(setup: Setup) -> bool:
+        """See `PulseStep.applies`."""
+        return setup.recorded > 0
+
+    @staticmethod
+    def memory(setup: Setup, sizes: Sizes) -> Memory:
+        """See `PulseStep.memory`."""
+        recorded = record(setup.recorded).itemsize * sizes.returns
+        made = 40 * min(sizes.subrays * setup.recorded, BLOCK_SAMPLES)
+        return Memory(casting=made + recorded, counting=2.3 * recorded)
+
+    def apply(self, returns: PulseReturns, batch: PulseBatch) -> PulseReturns:
+        """See `PulseStep.apply`."""
+        assert batch.hits is not None  # as there are sub-rays
+        noise, given = None, returns._replace(ray=returns.ray - batch.start)
+        if self.setup.noise.threshold:
+            sigma = self.setup.noise.threshold / THRESHOLD_SIGMAS
+            here = Keys(batch.keys.scan, batch.keys.begins - batch.start)
+            noise = sigma, self.setup.noise.seed, here
+        digitizer, count = Digitizer.of(self.setup), self.setup.recorded
+        waveform = recorded(batch.hits, given, digitizer, batch.each, count, noise)
+        return returns._replace(waveform=waveform)
+
+
+def first_samples(when: Floats, sigma: float) -> tuple[Ints, int]:
+    """First sample of each echo that is not 0, and how many there are, from the times (n,)."""
+    return np.ceil(when - CUT * sigma).astype(np.int64), int(2 * CUT * sigma) + 1
+
+
+def recorded(
+    hits: PulseReturns,
+    returns: PulseReturns,
+    digitizer: Digitizer,
+    each: int,
+    count: int,
+    noise: tuple[float, int, Keys] | None = None,
+) -> Records:
+    """Record the waveform around each return, `count` samples: (n,), see `record`.
+
+    A window begins where the echo of its first return does, and returns of the same pulse share it
+    as long as their echoes end within. Windows of a pulse that overlap hold the same samples.
+
+    Parameters
+    ----------
+    hits
+        Of all sub-rays, `each` of a beam, in the order of rays.
+    returns
+        Their `ray` is the beam, in order.
+    noise
+        Standard deviation of a sample, the seed, and the keys of beams.
+    """
+    out = np.zeros(len(returns.ray), record(count))
+    out["sample_ps"] = round(1000 * digitizer.sample_ns)
+    when = digitizer.samples(returns.distance)
+    first = np.maximum(np.floor(when).astype(np.int64) - digitizer.reach, 0)
+    last = np.ceil(when).astype(np.int64) + digitizer.reach
+    place = numbers(returns.ray)
+    begin = first.copy()
+    for number in range(1, int(place.max(initial=0)) + 1):
+        rows = np.flatnonzero(place == number)
+        shared = (last[rows] < begin[rows - 1] + count) & (first[rows] >= begin[rows - 1])
+        begin[rows] = np.where(shared, begin[rows - 1], first[rows])
+    new = (place == 0) | (np.diff(begin, prepend=-1) != 0)
+    window = np.cumsum(new) - 1
+    beam, begins = returns.ray[new], begin[new]
+    low, high = (np.searchsorted(hits.ray, (beam + step) * each) for step in (0, 1))
+    unit = max(count, each * (2 * digitizer.reach + 1))
+    size = max(1, BLOCK_SAMPLES // unit)
+    out["begin"] = begin
+    for start in range(0, len(beam), size):
+        block = slice(start, start + size)
+        samples = _window(hits, digitizer, each, begins[block], low[block], high[block], count)
+        if noise is not None:
+            sigma, seed, keys = noise
+            scan, ray = keys.of(beam[block])
+            stream = raw(seed, Purpose.SAMPLES, scan, ray)[:, None]
+            number = begins[block, None] + np.arange(count)
+            samples += sigma * normal(seed, Purpose.SAMPLE, stream, number >> 8, number & 255)
+        steps, exponents = digitised(samples)
+        low_row, high_row = np.searchsorted(window, [start, start + size])
+        mine = window[low_row:high_row] - start
+        out["samples"][low_row:high_row] = steps[mine]
+        out["exponent"][low_row:high_row] = exponents[mine]
+    return out
+
+
+def _window(
+    hits: PulseReturns,
+    digitizer: Digitizer,
+    each: int,
+    begins: Ints,
+    low: Ints,
+    high: Ints,
+    count: int,
+) -> Floats:
+    """Sample the waveforms of some windows, of the hits from `low` to `high`: (windows, count)."""
+    sizes = high - low
+    mine = np.repeat(np.arange(len(begins)), sizes)
+    rows = np.arange(len(mine)) + np.repeat(low - np.cumsum(sizes) + sizes, sizes)
+    when = digitizer.samples(hits.distance[rows])
+    first, many = first_samples(when, digitizer.sigma)
+    time = first[:, None] + np.arange(many)
+    height = exp(-0.5 * ((time - when[:, None]) / digitizer.sigma) ** 2)
+    height *= made(hits.energy)[rows, None] / each
+    place = time - begins[mine, None]
+    inside = (place >= 0) & (place < count)
+    place += count * mine[:, None]
+    samples = np.bincount(place[inside], height[inside], minlength=len(begins) * count)
+    return samples.reshape(len(begins), count).astype(np.float64)
+
+
+def digitised(samples: Floats) -> tuple[NDArray[np.uint16], NDArray[np.int8]]:
+    """Round samples (n, k) to whole numbers from `ZERO`, of a power of two that holds all of each.
+
+    Returns them, uint16 (n, k), and the exponents (n,).
+    """
+    most = np.maximum(samples.max(axis=1) / (65_535 - ZERO), -samples.min(axis=1) / ZERO)
+    _, exponents = np.frexp(most)
+    exponents = np.clip(np.where(most > 0, exponents, SILENT), SILENT, 127)
+    steps = np.rint(np.ldexp(samples, -exponents[:, None])) + ZERO
+    return np.clip(steps, 0, 65_535).astype(np.uint16), exponents.astype(np.int8)

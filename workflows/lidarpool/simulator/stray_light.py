@@ -1,0 +1,151 @@
+"""Stray light: retro-reflectors beside a beam, of which its receiver gets a little."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cached_property
+from itertools import groupby
+
+import numpy as np
+
+from ..base.arrays import Bools, Floats, Integers, Ints, Ints32, owned
+from ..base.vectors import into_axes, length, products, turned
+from ..scene.scene import Scene
+from ..sensor.noise import Purpose
+from .returns import BLOOMING, OF_RETURNS, PulseReturns, merged, unreal
+from .scene_caster import SceneCaster
+from .step import Memory, PulseBatch, PulseStep, Setup, Sizes
+from .surfaces import Surfaces, light_of
+
+CLUSTER_M = 1.0  # triangles of retro-reflectors so near to each other are looked for at a time
+FAINTEST = 0.1  # of the threshold: less is never detected, see `Noise.detected`
+
+
+class StrayLightStep(PulseStep):
+    """Adds the light of retro-reflectors that beams beside them receive."""
+
+    effects = ("Blooming",)
+    reads = "ray", "distance"
+    writes = OF_RETURNS
+    purposes = (Purpose.STRAY,)
+
+    def __init__(self, setup: Setup, caster: SceneCaster, surfaces: Surfaces) -> None:
+        super().__init__(setup, caster, surfaces)
+        self._light = light_of(setup.survey, setup.sensor)
+        self._retros = [*_retros(setup.scene, surfaces)]
+
+    @staticmethod
+    def applies(setup: Setup) -> bool:
+        """See `PulseStep.applies`."""
+        return setup.noise.stray_light > 0
+
+    @staticmethod
+    def memory(setup: Setup, sizes: Sizes) -> Memory:
+        """See `PulseStep.memory`."""
+        return Memory(kept=10 * sizes.returns, casting=120 * sizes.beams)
+
+    def apply(self, returns: PulseReturns, batch: PulseBatch) -> PulseReturns:
+        """See `PulseStep.apply`."""
+        if not self._retros:
+            return returns
+        from . import stray_loops  # not before: numba takes half a second to import
+
+        rays, poses = np.arange(batch.start, batch.stop), batch.here
+        origins, directions = batch.middles
+        times = poses.times((rays - batch.start) * batch.each)
+        best, ends = np.zeros(len(rays)), np.zeros((len(rays), 3))  # seen from the origins
+        noise, sensor, extinction = self.setup.noise, self.setup.sensor, self._light.extinction
+        low, high, faintest = sensor.min_range_m, sensor.max_range_m, FAINTEST * noise.threshold
+        limits = low, noise.stray_light, faintest, extinction
+        for actor, retros in groupby(self._retros, key=lambda retro: retro.actor):
+            turns, places = None, np.zeros(3)
+            if actor is not None:
+                places, turns = poses.ways[actor].poses(0, times)
+            seen = into_axes(origins - places, turns), into_axes(directions, turns)
+            beams = [owned(vectors.T) for vectors in seen]
+            cells = np.empty((-(-len(rays) // stray_loops.CELL_RAYS), 5))
+            stray_loops.cones(*beams, cells)
+            new = np.zeros(len(rays), np.bool_)
+            for retro in retros:
+                given = retro.corners, retro.middle, retro.radius, self._back(retro.triangles)
+                stray_loops.leaks(*beams, cells, *given, *limits, best, ends, new)
+            if turns is not None:  # back to the axes of the scene
+                rows = np.flatnonzero(new)
+                ends[rows] = into_axes(ends[rows], turns[rows].transpose(0, 2, 1))
+        row = np.flatnonzero(best > faintest)
+        row = row[noise.passes(Purpose.STRAY, best[row], *batch.keys.of(rays[row]))]
+        distance = np.sqrt(products(ends[row].T, ends[row].T))
+        within = (distance >= low) & (distance <= high)
+        row, distance = row[within], distance[within]
+        free = self.caster.free(origins[row], ends[row], distance, times[row], poses.ways)
+        free &= ~self._beside(returns, rays[row], distance)
+        row = row[free]
+        return merged(returns, unreal(returns, rays[row], distance[free], best[row], BLOOMING))
+
+    def _back(self, triangle: Ints32) -> Floats:
+        """Return what retro-reflectors return of a beam that hits them at a distance of 10 m."""
+        surfaces, count = self.surfaces, len(triangle)
+        table = surfaces.at(self._light.wavelength_nm)
+        return table.scattered(surfaces.objects(triangle), np.ones(count), np.ones(count))
+
+    def _beside(self, returns: PulseReturns, ray: Ints, distance: Floats) -> Bools:
+        """Whether a ray (n,) has a return of its own that cannot be told from one so far away."""
+        first = np.searchsorted(returns.ray, ray, side="left")
+        last = np.searchsorted(returns.ray, ray, side="right")
+        beside = np.zeros(len(ray), np.bool_)
+        for number in range(int((last - first).max(initial=0))):
+            some = np.flatnonzero(first + number < last)
+            own = returns.distance[first[some] + number]
+            beside[some] |= np.abs(own - distance[some]) <= self.setup.gap_m
+        return beside
+
+
+@dataclass(frozen=True)
+class _Retro:
+    """Triangles of retro-reflectors that are near to each other."""
+
+    triangles: Ints32  # (k,): their numbers
+    corners: Floats  # (k, 3, 3): in the scene's axes, or those of an actor
+    actor: int | None = None
+
+    @cached_property
+    def middle(self) -> Floats:
+        return np.asarray(self.corners.reshape(-1, 3).mean(axis=0))
+
+    @cached_property
+    def radius(self) -> float:
+        return float(length(self.corners.reshape(-1, 3) - self.middle).max())
+
+
+def _retros(scene: Scene, surfaces: Surfaces) -> Iterator[_Retro]:
+    """Retro-reflectors of a scene, its instances and actors."""
+    retro = surfaces.materials.retro
+    own = np.flatnonzero(retro[scene.face_object]) if len(scene.faces) else np.zeros(0, np.intp)
+    yield from _clusters(own, scene.vertices[scene.faces[own]])
+    begin = len(scene.faces)
+    shared = scene.instances
+    if shared is not None:
+        for part, matrix, owner in zip(shared.part, shared.transforms, shared.owner, strict=True):
+            mesh = shared.parts[part]
+            if retro[owner]:
+                vertices = turned(mesh.vertices, matrix[:, :3]) + matrix[:, 3]
+                yield from _clusters(begin + np.arange(len(mesh.faces)), vertices[mesh.faces])
+            begin += len(mesh.faces)
+    for number, actor in enumerate(scene.actors):
+        faces = actor.mesh.faces
+        if retro[len(scene.names) + number]:
+            corners = actor.mesh.vertices[faces]
+            yield from _clusters(begin + np.arange(len(faces)), corners, number)
+        begin += len(faces)
+
+
+def _clusters(triangles: Integers, corners: Floats, actor: int | None = None) -> Iterator[_Retro]:
+    """Divide triangles into some that are near to each other."""
+    if not len(triangles):
+        return
+    cells = np.floor(corners.mean(axis=1) / CLUSTER_M).astype(np.int64)
+    which = np.unique(cells, axis=0, return_inverse=True)[1].reshape(-1)
+    for number in range(int(which.max()) + 1):
+        some = np.flatnonzero(which == number)
+        yield _Retro(triangles[some].astype(np.int32), corners[some], actor)
