@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -49,7 +50,7 @@ def _size(text: str) -> tuple[int, int]:
     help="Column to colour the points of the cloud by; rgb for red, green and blue.",
 )
 def plot(result: Path | Storage, out: Path | Storage | None, **given: Any) -> None:
-    """Draw the pictures of a result again.
+    """Draw the pictures of a result, also into its report.html.
 
     \b
     Examples:
@@ -58,21 +59,24 @@ def plot(result: Path | Storage, out: Path | Storage | None, **given: Any) -> No
     """  # noqa: D301 - click wants the character, not its name
     from ..base.fork_server import keep_freed_memory
     from ..export.folder import local_folder, local_result, send
+    from ..report.output import CLOUD, PAGE
     from ..report.result_pictures import draw_pictures
     from ..run.picture_file import PICTURE_FILE, PictureContent
 
     place = result if out is None else out
-    with local_result(result, (PICTURE_FILE, "cloud.ply")) as made:
+    with local_result(result, (PICTURE_FILE, CLOUD, PAGE)) as made:
         if not (made / PICTURE_FILE).exists():
             raise LidarpoolError(
                 f"{result} holds no {PICTURE_FILE}, the data of the pictures: give the "
                 "folder of a finished run (its --out)."
             )
         keep_freed_memory()
-        shown, cloud = PictureContent.load(made / PICTURE_FILE), made / "cloud.ply"
-        with local_folder(place) as folder:
-            for path in draw_pictures(shown, cloud, folder, **given):
+        shown = PictureContent.load(made / PICTURE_FILE)
+        with nullcontext(made) if out is None else local_folder(out) as folder:
+            for path in draw_pictures(shown, made, folder, **given):
                 click.echo(click.format_filename(send(path, place)))
+            if out is None and (made / PAGE).exists():
+                send(made / PAGE, place)
 
 
 @click.command()

@@ -9,14 +9,14 @@ import numpy as np
 from matplotlib.colors import LogNorm, Normalize
 
 from ..base.arrays import AnyArray, AnyFloats, Floats, Floats32, Ints, UInts32
-from ..base.words import plural
+from ..base.words import plural, without_common_prefix
 from ..columns.cloud import Cloud
 from ..columns.table import Column, Z
 from ..scene.scene import Scene
 from . import theme
 from .colouring import TURBO, colours_of, values_of
 from .hit_density import HITS_TITLE, hit_colours
-from .picture_page import LEGEND_ROWS, Page, whole_of, without_common_prefix
+from .picture_page import LEGEND_ROWS, Page, whole_of
 from .shot import SurfaceView
 
 MOST_POINTS = 1_000_000  # of a cloud are drawn; a picture has a few more pixels
