@@ -162,13 +162,29 @@ def export(
     help="Port on 127.0.0.1, or the next free one; 0 for any.",
 )
 @options.flag("--no-browser", help="Only print the address.")
-def view(result: Path | Storage, port: int, no_browser: bool) -> None:
-    """Show a result or a cloud in the browser.
+@click.option(
+    "--film",
+    type=click.Path(dir_okay=False, path_type=Path),
+    metavar="FILE.gif|.webp",
+    help="Instead, write a film: behind the carrier, or around what stands.",
+)
+@click.option(
+    "--export",
+    "page",
+    type=click.Path(dir_okay=False, path_type=Path),
+    metavar="FILE.html",
+    help="Instead, write the page as one file, for a browser alone; at most 25 MB.",
+)
+def view(
+    result: Path | Storage, port: int, no_browser: bool, film: Path | None, page: Path | None
+) -> None:
+    """Show a result or a cloud in the browser, or write it as a file to share.
 
     \b
     Examples:
       lidarpool view lidarpool-out
       lidarpool view lidarpool-out/cloud.ply --no-browser
+      lidarpool view drive --film drive.gif --export drive.html
     """  # noqa: D301 - click wants the character, not its name
     from ..export.folder import local_result
     from ..export.sweeps import SWEEPS_FILE
@@ -176,7 +192,12 @@ def view(result: Path | Storage, port: int, no_browser: bool) -> None:
     from ..run.picture_file import PICTURE_FILE
 
     with local_result(result, (CLOUD, PICTURE_FILE, SWEEPS_FILE)) as made:
-        view_result(made, port=port, browser=not no_browser)
+        if film is None and page is None:
+            view_result(made, port=port, browser=not no_browser)
+            return
+        from ..live.sharing import share
+
+        share(made, film, page)
 
 
 @click.command()
