@@ -134,7 +134,8 @@ class View:
         return ways
 
     @property
-    def _actors(self) -> Sequence[Actor]:
+    def actors(self) -> Sequence[Actor]:
+        """What moves through the scene."""
         return () if self.pictured is None else self.pictured.scene.actors
 
     @property
@@ -190,21 +191,21 @@ class View:
 
     def _state(self) -> Answer:
         """Tell all but points and surfaces."""
-        near = around_ways(self._bounds, ways_of(self.sensors, self._actors, self.duration_ns))
+        near = around_ways(self._bounds, ways_of(self.sensors, self.actors, self.duration_ns))
         box = self._bounds if near is None else near
         corners = self._held if near is None else corners_of(near)
         arrays: dict[str, AnyArray] = {"rays": self.rays_shown, "corners": corners}
         for number, way in enumerate(self.sensors):
             arrays[f"sensor{number}_times"] = way.times_ns / _NS
             arrays[f"sensor{number}_places"] = way.positions
-        meshes, shapes = shapes_of(self._actors)
+        meshes, shapes = shapes_of(self.actors)
         arrays["actor_mesh"] = shapes.astype(np.int32)  # browsers have no arrays of int64
         for number, mesh in enumerate(meshes):
             arrays[f"mesh{number}_corners"] = mesh.vertices[mesh.faces].astype(np.float32)
             if mesh.colours is not None:  # at the corners
                 arrays[f"mesh{number}_colours"] = mesh.colours.means().repeat(3, axis=0)
-        each = samples_each(self._actors, PLACES_MOST)
-        for number, actor in enumerate(self._actors):
+        each = samples_each(self.actors, PLACES_MOST)
+        for number, actor in enumerate(self.actors):
             times, places, turns = actor.samples(self.duration_ns, each)
             arrays[f"actor{number}_times"] = times / _NS
             arrays |= {f"actor{number}_places": places, f"actor{number}_turns": turns}
@@ -231,11 +232,11 @@ class View:
             "sensors": [
                 {"name": way.name, "model": way.model, "moves": way.moves} for way in self.sensors
             ],
-            "actors": [{"name": actor.name} for actor in self._actors],
+            "actors": [{"name": actor.name} for actor in self.actors],
             "actor_colours": as_bytes(object_colours(objects))[
-                objects - len(self._actors) :
+                objects - len(self.actors) :
             ].tolist(),
-            "statics": objects - len(self._actors),
+            "statics": objects - len(self.actors),
             "duration": self.duration_ns / _NS,
             "path": self.planned,
             "note": self.note,

@@ -3,174 +3,148 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from PIL import Image, ImageDraw
 
-from ..base.arrays import AnyFloats, Bytes, Floats, Floats32
-from ..scene.scene import Scene
-from ..scene.scene_mesh import stacked
+from raybeam import RayCaster
+
+from ..base.arrays import AnyFloats, Bytes, Floats
+from ..scene.actors import Actor
 from .camera import Camera
 from .pictures import splat
-from .surface import Surface, dot, unit
+from .surface import dot, unit
 from .theme import rgb
 
 SIZE = (960, 540)  # pixels
-BACK, SURFACE, ACTOR, WAY, LIGHT = map(rgb, ("#0e1116", "#5b6570", "#eac9a0", "#ff4d5e", "#ffffff"))
+_COLOURS = ("#0e1116", "#5b6570", "#eac9a0", "#ff4d5e", "#ffffff")
+BACK, SURFACE, ACTOR, WAY, LIGHT = (np.append(rgb(colour), 1.0) for colour in _COLOURS)
 _FOCAL = 922.0  # pixels: 55 degrees across
-_BEHIND, _ABOVE, _AHEAD = 1.7, 0.95, 1.6  # of the range: the camera, and what it looks at
+_BEHIND, _ABOVE, _AHEAD = 1.7, 0.95, 1.6  # times the range: the camera, and what it looks at
 _HEADING = 0.12  # of the film, before and after, tells where the carrier is heading
-_AWAY, _UP_DEG = 1.25, 32.0  # of a camera that circles: times the size, and elevation
-_NEAR, _HAZE = 0.3, 6.0  # of the focus: nearer surfaces are left out, farther ones vanish
+_AWAY, _SLOPE = 1.25, 0.62  # of a camera that circles: times the size, and up for a metre away
+_NEAR, _HAZE = 0.3, 6.0  # times the focus: nearer surfaces are left out, farther ones vanish
 _OLD, _FADES = 0.42, 3.0  # brightness of old points; frames in which new ones come near it
-_NEW_RADIUS, _OLD_RADIUS, _SPARSE = 2.3, 1.5, 50_000  # half pixels; more new points are smaller
+_SIZES, _SPARSE = (1.5, 2.3), 100_000  # half pixels; more points are smaller
 _NOISE = 0.02  # of the distance, that a point may lie beside its surface
+
+_Shape = tuple[RayCaster, Floats, Floats]  # of triangles: their normals (f, 3) and colour (4,)
 
 
 @dataclass(frozen=True, eq=False)
-class Viewpoint:
-    """Where a frame is seen from."""
+class Film:
+    """What a film shows; local coordinates in metres, times since the survey's start."""
 
-    camera: Camera
-    focus: float  # metres to what it looks at
-    way: Floats  # (k, 3): where the carrier was up to now; none if nothing is followed
+    moments_ns: Floats  # (k,) of the frames
+    parts: Iterable[tuple[Floats, Floats]]  # points (n, 3) each adds, colours (n, 4) in 0 to 1
+    kept: float  # share of the points that later frames show, too
+    still: AnyFloats  # (f, 3, 3): triangles of the scene
+    top: float  # height above which the scene is cut open
+    actors: Sequence[Actor]
+    box: Floats  # (2, 3), that the camera circles around if it follows nothing
+    way: tuple[Floats, Floats] | None = None  # times (w,), ns, and places (w, 3) of the carrier
+    range_m: float = 1.0  # at which the carrier sees most
 
+    def frames(self) -> Iterator[Bytes]:
+        """Draw the frames, (height, width, 3) each.
 
-def following(
-    times_ns: Floats, places: Floats, moments_ns: Floats, range_m: float
-) -> list[Viewpoint]:
-    """Look from behind and above a carrier at moments (f,).
+        New points are bright, older ones darker. Old ones in front of all surfaces are left out:
+        there was an actor that has moved on.
+        """
+        random, born = np.random.default_rng(0), np.empty(0)
+        points, paint = np.empty((0, 3)), np.empty((0, 4))
+        still = [_shape(self.still, SURFACE)] if len(self.still) else []
+        eyes, targets, places, focus = self._sights()
+        for number, (moment, part) in enumerate(zip(self.moments_ns, self.parts, strict=True)):
+            camera = _looking(eyes[number], targets[number])
+            meshes = [actor.placed(moment) for actor in self.actors]
+            there = [mesh.vertices[mesh.faces] for mesh in meshes if np.ptp(mesh.vertices)]
+            moving = [_shape(np.concatenate(there), ACTOR)] if there else []
+            image, depth = _surfaces([*still, *moving], camera, focus, self.top)
+            points, paint = (np.vstack(each) for each in zip((points, paint), part, strict=True))
+            born = np.append(born, np.full(len(points) - len(born), number))
+            pixels, distance = camera.project(points)
+            surface = camera.look_up(depth, pixels, -np.inf)  # there is none outside
+            slack = _NOISE * distance + 2 * camera.footprint(distance)
+            shown = (distance <= surface + slack) & (distance >= _NEAR * focus)
+            shown &= (born == number) | (distance >= surface - slack) | np.isinf(surface)
+            rows = np.flatnonzero(shown)
+            rows = rows[np.argsort(-distance[rows], kind="stable")]
+            fade = _OLD + (1 - _OLD) * np.exp((born[rows] - number) / _FADES)
+            size = np.clip(_SIZES[1] * (_SPARSE / (len(rows) + 1)) ** 0.5, *_SIZES)
+            image = splat(image, pixels[rows], BACK + (paint[rows] - BACK) * fade[:, None], size)
+            yield _with_way(image, camera, places[: number + 1], _NEAR * focus)
+            kept = (born < number) | (random.random(len(born)) < self.kept)
+            points, paint, born = points[kept], paint[kept], born[kept]
 
-    It is at `places` (k, 3) at times (k,); how near the camera is depends on its sensors' range.
-    """
-
-    def at(when: Floats) -> Floats:
-        return np.stack([np.interp(when, times_ns, axis) for axis in places.T], axis=1)
-
-    reach, made = _HEADING * float(moments_ns[-1]), []
-    ahead = unit((at(moments_ns + reach) - at(moments_ns - reach)) * [1.0, 1.0, 0.0])
-    ahead[~ahead.any(axis=1)] = [1.0, 0.0, 0.0]  # it stands, or rises
-    for moment, place, way in zip(moments_ns, at(moments_ns), ahead * range_m, strict=True):
-        eye = place - _BEHIND * way + [0.0, 0.0, _ABOVE * range_m]
-        until_now = at(np.linspace(0, moment, 4000))
-        made.append(_looking(eye, place + _AHEAD * way, _BEHIND * range_m, until_now))
-    return made
-
-
-def circling(box: Floats, frames: int) -> list[Viewpoint]:
-    """Look at a box (2, 3) from all around."""
-    far, up = _AWAY * float(np.linalg.norm(box[1] - box[0])), np.radians(_UP_DEG)
-    turn = np.linspace(0, 2 * np.pi, frames, endpoint=False) - 1.1
-    away = np.stack([np.cos(turn) * np.cos(up), np.sin(turn) * np.cos(up), 0 * turn + np.sin(up)])
-    middle = box.mean(axis=0)
-    return [_looking(middle + far * way, middle, far, np.empty((0, 3))) for way in away.T]
-
-
-def _looking(eye: Floats, target: Floats, focus: float, way: Floats) -> Viewpoint:
-    ahead = unit((target - eye)[None])[0]
-    right = unit(np.cross(ahead, [0.0, 0.0, 1.0])[None])[0]
-    axes = np.stack([right, np.cross(right, ahead), ahead])
-    return Viewpoint(Camera(eye, axes, _FOCAL, np.array(SIZE) / 2, SIZE), focus, way)
-
-
-def film(
-    views: Sequence[Viewpoint],
-    moments_ns: Floats,
-    parts: Iterable[tuple[Floats32, Floats32]],
-    scene: Scene | None,
-    kept: float,
-) -> Iterator[Bytes]:
-    """Draw a frame, (height, width, 3), of each view at its moment.
-
-    `parts` are the points (n, 3) that each frame adds, local metres, and their colours (n, 3) in 0
-    to 1. They are bright in that frame; a share of them, `kept`, stays and becomes darker. Old
-    points in front of all surfaces are not drawn: they were on actors that have moved on.
-    """
-    still = [] if scene is None or not len(scene.faces) else [(Surface.of(scene), SURFACE)]
-    random, old, shades, born = (
-        np.random.default_rng(0),
-        *np.zeros((2, 0, 3), np.float32),
-        np.zeros(0),
-    )
-    for number, (view, moment, (new, paint)) in enumerate(
-        zip(views, moments_ns, parts, strict=True)
-    ):
-        solids = still
-        if scene is not None and scene.actors:
-            meshes = [actor.placed(moment) for actor in scene.actors]
-            vertices, faces = stacked([(mesh.vertices, mesh.faces) for mesh in meshes])
-            moving = replace(
-                scene,
-                vertices=vertices,
-                faces=faces,
-                face_object=faces[:, 0] * 0,
-                actors=(),
-                colours=None,
-            )
-            solids = [*still, (Surface.of(moving), ACTOR)]
-        frame = _Frame(view, solids)
-        fade = _OLD + (1 - _OLD) * np.exp((born - number) / _FADES)
-        frame.draw(old, BACK + (shades - BACK) * fade[:, None], _OLD_RADIUS, behind=True)
-        radius = np.clip(_NEW_RADIUS * np.sqrt(_SPARSE / (len(new) + 1)), _OLD_RADIUS, _NEW_RADIUS)
-        red = np.tile(WAY, (len(view.way), 1))
-        frame.draw(np.vstack([new, view.way]), np.vstack([paint, red]), float(radius))
-        yield frame.finished()
-        some = random.random(len(new)) < kept
-        old, shades = np.vstack([old, new[some]]), np.vstack([shades, paint[some]])
-        born = np.append(born, np.full(int(some.sum()), number))
-
-
-class _Frame:
-    """One picture: surfaces in the dark, and points over them."""
-
-    def __init__(self, view: Viewpoint, solids: Sequence[tuple[Surface, Floats]]) -> None:
-        self.view, camera, (width, height) = view, view.camera, SIZE
-        grid = np.stack(np.meshgrid(np.arange(width), np.arange(height)), axis=-1)
-        rays = camera.rays(grid.reshape(-1, 2) + 0.5)
-        forward = rays @ camera.axes[2]
-        start = _NEAR * view.focus / forward
-        depth, image = np.full(len(rays), np.inf), np.tile(BACK, (len(rays), 1))
-        for surface, colour in solids:
-            hits = surface.caster.cast(camera.eye + start[:, None] * rays, rays)
-            found = np.flatnonzero(hits.distance + start < depth)
-            depth[found] = (hits.distance + start)[found]
-            normal = surface.face_normals[hits.triangle[found]]
-            light = 0.2 + 0.4 * np.abs(dot(normal, rays[found])) + 0.4 * np.abs(normal[:, 2])
-            light *= np.exp(-depth[found] / (_HAZE * view.focus))
-            image[found] = BACK + light[:, None] * (colour - BACK)
-        # The inverse of depth is linear in the picture of a plane: less of it is behind an edge.
-        near = np.pad((1 / (depth * forward)).reshape(height, width), 1, mode="edge")
-        sides = np.maximum(near[:-2, 1:-1] + near[2:, 1:-1], near[1:-1, :-2] + near[1:-1, 2:]) / 2
-        edge = np.clip(4 * (sides / np.maximum(near[1:-1, 1:-1], 1e-9) - 1), 0, 0.5)
-        self.depth, self.image = (
-            depth.reshape(height, width),
-            np.ones((height, width, 4), np.float32),
+    def _sights(self) -> tuple[Floats, Floats, Floats, float]:
+        """Of each frame: eye, target and carrier, if any, (k, 3); metres to what is looked at."""
+        count = len(self.moments_ns)
+        if self.way is None:
+            turn = 2 * np.pi * np.arange(count) / count - 1.1
+            away = unit(np.stack([np.cos(turn), np.sin(turn), np.full(count, _SLOPE)], axis=1))
+            far, middle = _AWAY * float(np.linalg.norm(np.ptp(self.box, 0))), self.box.mean(axis=0)
+            return middle + far * away, np.tile(middle, (count, 1)), np.empty((0, 3)), far
+        reach = _HEADING * self.moments_ns[-1]
+        early, now, late = (
+            np.stack([np.interp(self.moments_ns + by, self.way[0], x) for x in self.way[1].T], 1)
+            for by in (-reach, 0, reach)
         )
-        self.image[..., :3] = BACK + (image.reshape(height, width, 3) - BACK) * (
-            1 - edge[..., None]
-        )
+        ahead = unit((late - early) * [1.0, 1.0, 0.0])
+        ahead[~ahead.any(axis=1)] = [1.0, 0.0, 0.0]  # it stands, or rises
+        eye = now - _BEHIND * self.range_m * ahead + [0.0, 0.0, _ABOVE * self.range_m]
+        return eye, now + _AHEAD * self.range_m * ahead, now, _BEHIND * self.range_m
 
-    def draw(
-        self, places: AnyFloats, colours: AnyFloats, radius: float, behind: bool = False
-    ) -> None:
-        """Draw points (n, 3) that no surface hides; with `behind`, only those on a surface."""
-        camera = self.view.camera
-        pixels, distance = camera.project(places)
-        surface = camera.look_up(self.depth, pixels, -np.inf)  # no points outside
-        slack = _NOISE * distance + 2 * camera.footprint(distance)
-        shown = (distance <= surface + slack) & (distance >= _NEAR * self.view.focus)
-        if behind:
-            shown &= (distance >= surface - slack) | np.isinf(surface)
-        order = np.flatnonzero(shown)
-        order = order[np.argsort(-distance[order], kind="stable")]
-        self.image = splat(self.image, pixels[order], colours[order].astype(np.float32), radius)
 
-    def finished(self) -> Bytes:
-        """Return it, (height, width, 3), with a dot where the carrier is."""
-        image = Image.fromarray(np.round(255 * self.image[..., :3]).astype(np.uint8))
-        for x, y in self.view.camera.project(self.view.way[-1:])[0]:
-            for radius, colour in ((6.5, LIGHT), (5.0, WAY)):
-                box = (x - radius, y - radius, x + radius, y + radius)
-                ImageDraw.Draw(image).ellipse(box, fill=tuple(np.round(255 * colour).astype(int)))
-        return np.asarray(image)
+def _looking(eye: Floats, target: Floats) -> Camera:
+    ahead = unit((target - eye)[None])
+    right = unit(np.cross(ahead, [0.0, 0.0, 1.0]))
+    axes = np.concatenate([right, np.cross(right, ahead), ahead])
+    return Camera(eye, axes, _FOCAL, np.array(SIZE) / 2, SIZE)
+
+
+def _shape(corners: AnyFloats, colour: Floats) -> _Shape:
+    normals = unit(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]))
+    faces = np.arange(3 * len(corners)).reshape(-1, 3)
+    return RayCaster(corners.reshape(-1, 3), faces), normals, colour
+
+
+def _surfaces(
+    shapes: Sequence[_Shape], camera: Camera, focus: float, top: float
+) -> tuple[AnyFloats, Floats]:
+    """Draw surfaces: (height, width, 4), and metres (height, width) from the eye to them."""
+    width, height = SIZE
+    grid = np.stack(np.meshgrid(np.arange(width), np.arange(height)), axis=-1)
+    rays = camera.rays(grid.reshape(-1, 2) + 0.5)
+    forward = rays @ camera.axes[2]
+    start = _NEAR * focus / forward
+    if camera.eye[2] > top:  # rays begin where the scene is cut
+        start = np.maximum(start, (top - camera.eye[2]) / np.minimum(rays[:, 2], -1e-6))
+    depth, image = np.full(len(rays), np.inf), np.tile(BACK, (len(rays), 1))
+    for caster, normals, colour in shapes:
+        hits = caster.cast(camera.eye + start[:, None] * rays, rays)
+        found = np.flatnonzero(hits.distance + start < depth)
+        depth[found] = (hits.distance + start)[found]
+        normal = normals[hits.triangle[found]]
+        light = 0.2 + 0.4 * np.abs(dot(normal, rays[found])) + 0.4 * np.abs(normal[:, 2])
+        light *= np.exp(-depth[found] / (_HAZE * focus))
+        image[found] = BACK + light[:, None] * (colour - BACK)
+    # The inverse of depth is linear in the picture of a plane: less of it is behind an edge.
+    near = np.pad((1 / (depth * forward)).reshape(height, width), 1, mode="edge")
+    sides = np.maximum(near[:-2, 1:-1] + near[2:, 1:-1], near[1:-1, :-2] + near[1:-1, 2:]) / 2
+    edge = np.clip(4 * (sides / np.maximum(near[1:-1, 1:-1], 1e-9) - 1), 0, 0.5)[..., None]
+    image = BACK + (image.reshape(height, width, 4) - BACK) * (1 - edge)
+    return image.astype(np.float32), depth.reshape(height, width)
+
+
+def _with_way(image: AnyFloats, camera: Camera, places: Floats, near: float) -> Bytes:
+    """Make bytes of an image, with a line through places (k, 3) and a dot at the last."""
+    frame = Image.fromarray(np.round(255 * image[..., :3]).astype(np.uint8))
+    pen, (pixels, distance) = ImageDraw.Draw(frame), camera.project(places)
+    line = [(float(x), float(y)) for x, y in pixels[distance >= near]]
+    red, white = (tuple(np.round(255 * c[:3]).astype(int).tolist()) for c in (WAY, LIGHT))
+    pen.line(line, red, 3)
+    for x, y in line[-1:]:
+        pen.ellipse((x - 5, y - 5, x + 5, y + 5), red, white, 2)
+    return np.asarray(frame)

@@ -183,21 +183,23 @@ def with_points(
     order = order[np.argsort(-distance[order])]
     pixels = pixels[order]
     light = shot.camera.look_up(shot.whole.light.reshape(shot.depth.shape), pixels, 1.0)
-    shaded = colours[order] * (0.5 + 0.5 * light)[:, None].clip(0, 1)
-    radius = max(min(320 / np.sqrt(len(points) + 1), 5.2) * shot.camera.size[0] / 1600, 1.5)
+    shaded = np.ones((len(order), 4), np.float32)
+    shaded[:, :3] = colours[order] * (0.5 + 0.5 * light)[:, None].clip(0, 1)
+    width, height = shot.camera.size
+    radius = max(min(320 / np.sqrt(len(points) + 1), 5.2) * width / 1600, 1.5)
     if solid:
-        radius = max(radius, SOLID * shot.camera.size[0] / 1600)
+        radius = max(radius, SOLID * width / 1600)
     drawn = splat(image, pixels, shaded, radius)
     if solid:  # surfaces keep their outlines
-        bare = shot.whole.triangle.reshape(shot.depth.shape) < 0
+        bare = shot.whole.triangle.reshape(height, width) < 0
         drawn[bare] = image[bare]
     return drawn
 
 
-def splat(image: Floats32, pixels: Floats, colours: Floats32, radius: float) -> Floats32:
-    """Draw discs at pixel coordinates (n, 2) over an image (height, width, 4), the last in front.
+def splat(image: Floats32, pixels: Floats, colours: AnyFloats, radius: float) -> Floats32:
+    """Draw discs at pixels (n, 2) over an image (height, width, 4), the last in front.
 
-    Their colours are (n, 3) in 0 to 1; `radius` is in half pixels.
+    Their colours are (n, 4) in 0 to 1, and their radius is in half pixels.
     """
     # Discs are drawn at twice the resolution and averaged down, so that their edges are smooth.
     height, width, _ = image.shape
@@ -208,9 +210,7 @@ def splat(image: Floats32, pixels: Floats, colours: Floats32, radius: float) -> 
     inner = fine[margin : margin + 2 * height, margin : margin + 2 * width]
     inner[:] = _packed(image).repeat(2, axis=0).repeat(2, axis=1)
     column, row = (2 * pixels.T).astype(np.int64) + margin
-    opaque = np.ones((len(colours), 4), np.float32)
-    opaque[:, :3] = colours
-    middle, colour = row * wide + column, _packed(opaque)
+    middle, colour = row * wide + column, _packed(colours)
     disc = [
         (dx * dx + dy * dy, dy * wide + dx)
         for dy in range(-reach, reach + 1)

@@ -37,9 +37,7 @@ async function read(question) {
   const place = inFile(question);
   if (!place) throw new Error(`${question}: not in this file`);
   const bytes = Uint8Array.from(atob(place.textContent), (letter) => letter.charCodeAt(0));
-  const told = unpacked(await new Response(new Blob([bytes]).stream().pipeThrough(new DecompressionStream("deflate"))).arrayBuffer());
-  if (!told.like) return told;
-  return { ...told, arrays: { ...(await held("surface?colour=grey")).arrays, ...told.arrays } }; // only others
+  return unpacked(await new Response(new Blob([bytes]).stream().pipeThrough(new DecompressionStream("deflate"))).arrayBuffer());
 }
 
 async function pointsOf({ colour, filter = "", scans, most }) {
