@@ -42,7 +42,6 @@ _PORTS_TRIED = 100
 
 _HUB = "JUPYTERHUB_SERVICE_PREFIX"  # in the environment of kernels of a hub: where its user's is
 
-ARRAY_TYPES = ("float32", "float64", "uint8", "uint16", "uint32", "int32")  # that browsers have
 _ALIGNED = 8  # bytes, that arrays begin at multiples of
 _PIECE = 1 << 20  # bytes that are written at a time
 

@@ -23,7 +23,7 @@ from ..export.sweeps import Sweeps
 from ..render.colouring import TURBO
 from ..render.film import Film
 from .point_selection import HeldPoints, PointFinder, ScanRanges, even_shares, positions
-from .server import ARRAY_TYPES, VIEWER, Answer, bundle
+from .server import VIEWER, Answer, bundle
 from .view import MOST_POINTS, View, open_result
 
 _FILMS = {".gif": (30, 64), ".webp": (40, 40)}  # {suffix: most frames, colours or quality}
@@ -31,15 +31,13 @@ _FEWEST, _FRAME_MS, _FILM_BYTES = 30, 100, 3_000_000
 _WIDTHS = (960, 800, 640, 480, 320)  # pixels
 _FILM_POINTS, _FRAME_POINTS = 800_000, 200_000  # that stay, and that one frame adds
 _PAGE_BYTES, _PAGE_POINTS, _PAGE_TRIANGLES = 25_000_000, 1_000_000, 60_000
-_CHOSEN_FROM = 5_000_000  # points
-_CELLS = 300  # along the diagonal, within which points are dense or not
+_CHOSEN_FROM, _CELLS = 5_000_000, 300  # points; cells along the diagonal, which tell where many are
 
 
 def share(path: Path, film: Path | None, page: Path | None) -> None:
     """Write a result's folder, or a cloud, as a film, a page or both; files are replaced.
 
-    LidarpoolError if there are no points, or if a file has another suffix, cannot be written or
-    would be too large.
+    LidarpoolError if there are no points, or a file has another suffix or cannot be written.
     """
     for file, suffixes in (film, tuple(_FILMS)), (page, (".html",)):
         if file and file.suffix not in suffixes:
@@ -57,10 +55,7 @@ def share(path: Path, film: Path | None, page: Path | None) -> None:
 
 
 def film_of(view: View, suffix: str) -> bytes:
-    """Return a film of a result, ".gif" or ".webp", as wide as some 3 MB allow.
-
-    If a sensor moves, the camera follows it; else it circles around the points.
-    """
+    """Return a film, ".gif" or ".webp", as wide as some 3 MB allow; see `Film`."""
     most, quality = _FILMS[suffix]
     frames = [Image.fromarray(frame) for frame in _film(view, most).frames()]
 
@@ -122,36 +117,38 @@ def _scans_between(sweeps: Sweeps, begin_ns: float, end_ns: float) -> ScanRanges
 
 
 def page_of(view: View) -> bytes:
-    """Return a page that shows a result without a server, of at most 25 MB.
-
-    It holds answers to what the page asks for, and as many points as there is room for.
-    """
-    view.triangles, page = _PAGE_TRIANGLES, _page()
+    """Return a page of at most 25 MB that holds the answers to all that it asks for."""
+    folder, modules = files(__package__) / "page", {}
+    page = (folder / VIEWER).read_text("utf-8")
+    for file in folder.iterdir():
+        text, link = file.read_text("utf-8"), f'<link rel="stylesheet" href="{file.name}">'
+        page = page.replace(link, f"<style>\n{text}</style>")
+        if file.name.endswith(".js"):  # modules in data: cannot name others by their paths
+            code = base64.b64encode(text.replace('from "./', 'from "').encode()).decode()
+            modules[file.name] = f"data:text/javascript;base64,{code}"
+    inside = f'<script type="importmap">{json.dumps({"imports": modules}, sort_keys=True)}</script>'
+    inside += '\n<script type="module">import "page.js";</script>'
+    page = page.replace('<script type="module" src="page.js"></script>', inside)
+    view, most = replace(view, triangles=_PAGE_TRIANGLES), _PAGE_POINTS
     told, arrays = view.answer("state", {}, bool)
     held = {"state?": _packed(told | {"offline": True}, arrays)}
-    for asked in [{"colour": colour} for colour in told["scene"] or ()]:
-        held[f"surface?colour={asked['colour']}"] = _packed(*view.answer("surface", asked, bool))
-    for name in view.columns:
-        held[f"column?name={name}"] = _packed(*view.answer("column", {"name": name}, bool))
-    room, most = (
-        _PAGE_BYTES - len(page) - sum(len(text) + 99 for text in held.values()),
-        _PAGE_POINTS,
-    )
+    for what, word, values in (
+        ("surface", "colour", told["scene"]),
+        ("column", "name", view.columns),
+    ):
+        for value in values or ():
+            held[f"{what}?{word}={value}"] = _packed(*view.answer(what, {word: value}, bool))
+    room = _PAGE_BYTES - len(page) - sum(len(text) + 99 for text in held.values())
     while len(cloud := _packed(*_thinned(view, most))) > room:
         most = int(most * min(0.9, 0.95 * max(room, 0) / len(cloud)))
         if most < 1000:
-            raise LidarpoolError(
-                "Without its points, the page has 25 MB: use lidarpool view alone."
-            )
+            raise LidarpoolError("Even without points the page has 25 MB: use lidarpool view only.")
     script = '<script type="text/plain" data-question="{}">{}</script>\n'
     texts = [script.format(*each) for each in (held | {"cloud?": cloud}).items()]
     return page.replace("</body>", "".join([*texts, "</body>"])).encode()
 
 
 def _packed(told: dict[str, Any], arrays: dict[str, AnyArray]) -> str:
-    for name, array in arrays.items():
-        if array.dtype.name not in ARRAY_TYPES:
-            arrays[name] = array.astype(np.float64)
     return base64.b64encode(zlib.compress(b"".join(bundle(told, arrays)))).decode()
 
 
@@ -163,9 +160,10 @@ def _thinned(view: View, most: int) -> Answer:
     cells = ((places - places.min(axis=0)) / cell).astype(np.int64) @ [1 << 20, 1 << 10, 1]
     _, which, counts = np.unique(cells, return_inverse=True, return_counts=True)
     some = np.random.default_rng(0).random(len(rows)) < even_shares(counts, most)[which]
-    arrays = {c.name: view.points.values(c.name, rows[some]) for c in view.points.table}
-    cloud, legends = Cloud(places[some], dict(arrays), view.points.table), {}
-    thin = replace(view, points=HeldPoints(cloud))
+    columns = {c.name: view.points.values(c.name, rows[some]) for c in view.points.table}
+    thin = replace(view, points=HeldPoints(Cloud(places[some], columns, view.points.table)))
+    legends = dict[str, Any]()
+    arrays: dict[str, AnyArray] = {n: values.astype(np.float64) for n, values in columns.items()}
     for name in thin.answer("state", {}, bool)[0]["colours"]:
         told, found = thin.answer("points", {"colour": name, "most": str(MOST_POINTS)}, bool)
         palette, shades = np.unique(found["colours"].view(np.uint32), return_inverse=True)
@@ -173,18 +171,3 @@ def _thinned(view: View, most: int) -> Answer:
         arrays |= {f"{name} palette": palette, f"{name} shades": shades.ravel().astype(kind)}
         legends[name], arrays["positions"] = told["legend"], found["positions"]
     return {"legends": legends, "origin": view.origin.tolist()}, arrays
-
-
-def _page() -> str:
-    """Return the page of the viewer with its styles and modules in it."""
-    folder, modules = files(__package__) / "page", {}
-    page = (folder / VIEWER).read_text("utf-8")
-    for file in folder.iterdir():
-        text, link = file.read_text("utf-8"), f'<link rel="stylesheet" href="{file.name}">'
-        page = page.replace(link, f"<style>\n{text}</style>")
-        if file.name.endswith(".js"):  # modules in data: cannot name others by their paths
-            code = base64.b64encode(text.replace('from "./', 'from "').encode()).decode()
-            modules[file.name] = f"data:text/javascript;base64,{code}"
-    inside = f'<script type="importmap">{json.dumps({"imports": modules}, sort_keys=True)}</script>'
-    inside += '\n<script type="module">import "page.js";</script>'
-    return page.replace('<script type="module" src="page.js"></script>', inside)

@@ -18,8 +18,8 @@ from .surface import dot, unit
 from .theme import rgb
 
 SIZE = (960, 540)  # pixels
-_COLOURS = ("#0e1116", "#5b6570", "#eac9a0", "#ff4d5e", "#ffffff")
-BACK, SURFACE, ACTOR, WAY, LIGHT = (np.append(rgb(colour), 1.0) for colour in _COLOURS)
+BACK, SURFACE, ACTOR = (np.append(rgb(c), 1.0) for c in ("#0e1116", "#5b6570", "#eac9a0"))
+_RED, _WHITE = "#ff4d5e", "#ffffff"  # the way, and around the carrier
 _FOCAL = 922.0  # pixels: 55 degrees across
 _BEHIND, _ABOVE, _AHEAD = 1.7, 0.95, 1.6  # times the range: the camera, and what it looks at
 _HEADING = 0.12  # of the film, before and after, tells where the carrier is heading
@@ -47,17 +47,19 @@ class Film:
     range_m: float = 1.0  # at which the carrier sees most
 
     def frames(self) -> Iterator[Bytes]:
-        """Draw the frames, (height, width, 3) each.
+        """Draw the frames, (height, width, 3) each; new points are bright, older ones darker.
 
-        New points are bright, older ones darker. Old ones in front of all surfaces are left out:
-        there was an actor that has moved on.
+        Old points in front of all surfaces are left out: there was an actor that has moved on.
         """
         random, born = np.random.default_rng(0), np.empty(0)
         points, paint = np.empty((0, 3)), np.empty((0, 4))
         still = [_shape(self.still, SURFACE)] if len(self.still) else []
         eyes, targets, places, focus = self._sights()
         for number, (moment, part) in enumerate(zip(self.moments_ns, self.parts, strict=True)):
-            camera = _looking(eyes[number], targets[number])
+            ahead = unit((targets - eyes)[number, None])
+            right = unit(np.cross(ahead, [0.0, 0.0, 1.0]))
+            axes = np.concatenate([right, np.cross(right, ahead), ahead])
+            camera = Camera(eyes[number], axes, _FOCAL, np.array(SIZE) / 2, SIZE)
             meshes = [actor.placed(moment) for actor in self.actors]
             there = [mesh.vertices[mesh.faces] for mesh in meshes if np.ptp(mesh.vertices)]
             moving = [_shape(np.concatenate(there), ACTOR)] if there else []
@@ -74,7 +76,13 @@ class Film:
             fade = _OLD + (1 - _OLD) * np.exp((born[rows] - number) / _FADES)
             size = np.clip(_SIZES[1] * (_SPARSE / (len(rows) + 1)) ** 0.5, *_SIZES)
             image = splat(image, pixels[rows], BACK + (paint[rows] - BACK) * fade[:, None], size)
-            yield _with_way(image, camera, places[: number + 1], _NEAR * focus)
+            frame = Image.fromarray(np.round(255 * image[..., :3]).astype(np.uint8))
+            pen, (pixels, distance) = ImageDraw.Draw(frame), camera.project(places[: number + 1])
+            line = [(float(x), float(y)) for x, y in pixels[distance >= _NEAR * focus]]
+            pen.line(line, _RED, 3)
+            for x, y in line[-1:]:
+                pen.ellipse((x - 5, y - 5, x + 5, y + 5), _RED, _WHITE, 2)
+            yield np.asarray(frame)
             kept = (born < number) | (random.random(len(born)) < self.kept)
             points, paint, born = points[kept], paint[kept], born[kept]
 
@@ -95,13 +103,6 @@ class Film:
         ahead[~ahead.any(axis=1)] = [1.0, 0.0, 0.0]  # it stands, or rises
         eye = now - _BEHIND * self.range_m * ahead + [0.0, 0.0, _ABOVE * self.range_m]
         return eye, now + _AHEAD * self.range_m * ahead, now, _BEHIND * self.range_m
-
-
-def _looking(eye: Floats, target: Floats) -> Camera:
-    ahead = unit((target - eye)[None])
-    right = unit(np.cross(ahead, [0.0, 0.0, 1.0]))
-    axes = np.concatenate([right, np.cross(right, ahead), ahead])
-    return Camera(eye, axes, _FOCAL, np.array(SIZE) / 2, SIZE)
 
 
 def _shape(corners: AnyFloats, colour: Floats) -> _Shape:
@@ -136,15 +137,3 @@ def _surfaces(
     edge = np.clip(4 * (sides / np.maximum(near[1:-1, 1:-1], 1e-9) - 1), 0, 0.5)[..., None]
     image = BACK + (image.reshape(height, width, 4) - BACK) * (1 - edge)
     return image.astype(np.float32), depth.reshape(height, width)
-
-
-def _with_way(image: AnyFloats, camera: Camera, places: Floats, near: float) -> Bytes:
-    """Make bytes of an image, with a line through places (k, 3) and a dot at the last."""
-    frame = Image.fromarray(np.round(255 * image[..., :3]).astype(np.uint8))
-    pen, (pixels, distance) = ImageDraw.Draw(frame), camera.project(places)
-    line = [(float(x), float(y)) for x, y in pixels[distance >= near]]
-    red, white = (tuple(np.round(255 * c[:3]).astype(int).tolist()) for c in (WAY, LIGHT))
-    pen.line(line, red, 3)
-    for x, y in line[-1:]:
-        pen.ellipse((x - 5, y - 5, x + 5, y + 5), red, white, 2)
-    return np.asarray(frame)

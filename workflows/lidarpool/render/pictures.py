@@ -197,10 +197,7 @@ def with_points(
 
 
 def splat(image: Floats32, pixels: Floats, colours: AnyFloats, radius: float) -> Floats32:
-    """Draw discs at pixels (n, 2) over an image (height, width, 4), the last in front.
-
-    Their colours are (n, 4) in 0 to 1, and their radius is in half pixels.
-    """
+    """Draw discs of a radius in half pixels at pixels (n, 2), in colours (n, 4) in 0 to 1."""
     # Discs are drawn at twice the resolution and averaged down, so that their edges are smooth.
     height, width, _ = image.shape
     reach = int(radius)
