@@ -26,10 +26,9 @@ from .point_selection import HeldPoints, PointFinder, ScanRanges, even_shares, p
 from .server import VIEWER, Answer, bundle
 from .view import MOST_POINTS, View, open_result
 
-_FILMS = {".gif": (30, 64), ".webp": (40, 40)}  # {suffix: most frames, colours or quality}
-_FEWEST, _FRAME_MS, _FILM_BYTES = 30, 100, 3_000_000
-_WIDTHS = (960, 800, 640, 480, 320)  # pixels
-_FILM_POINTS, _FRAME_POINTS = 800_000, 200_000  # that stay, and that one frame adds
+_FILMS = {".gif": (30, 96), ".webp": (40, 40)}  # {suffix: most frames, colours or quality}
+_FEWEST, _FRAME_MS, _FILM_BYTES, _WIDTHS = 30, 100, 3_000_000, range(960, 320, -80)
+_FILM_TRIANGLES, _FILM_POINTS, _FRAME_POINTS = 3_000_000, 800_000, 200_000  # one frame adds
 _PAGE_BYTES, _PAGE_POINTS, _PAGE_TRIANGLES = 25_000_000, 1_000_000, 60_000
 _CHOSEN_FROM, _CELLS = 5_000_000, 300  # points; cells along the diagonal, which tell where many are
 
@@ -56,14 +55,14 @@ def share(path: Path, film: Path | None, page: Path | None) -> None:
 
 def film_of(view: View, suffix: str) -> bytes:
     """Return a film, ".gif" or ".webp", as wide as some 3 MB allow; see `Film`."""
-    most, quality = _FILMS[suffix]
+    (most, quality), view = _FILMS[suffix], replace(view, triangles=_FILM_TRIANGLES)
     frames = [Image.fromarray(frame) for frame in _film(view, most).frames()]
 
     def encoded(frames: list[Image.Image], width: int) -> bytes:
         small = [f.resize((width, width * 9 // 16), Image.Resampling.LANCZOS) for f in frames]
         if suffix == ".gif":  # with a palette for each frame, colours would flicker
             every = np.concatenate([np.asarray(frame)[::2, ::2] for frame in small])
-            palette = Image.fromarray(every).quantize(quality)
+            palette = Image.fromarray(every).quantize(quality, Image.Quantize.FASTOCTREE)
             small = [f.quantize(palette=palette, dither=Image.Dither.NONE) for f in small]
         given = {"save_all": True, "duration": _FRAME_MS, "loop": 0, "quality": quality}
         small[0].save(memory := io.BytesIO(), suffix[1:], append_images=small[1:], **given)

@@ -19,7 +19,7 @@ from .theme import rgb
 
 SIZE = (960, 540)  # pixels
 BACK, SURFACE, ACTOR = (np.append(rgb(c), 1.0) for c in ("#0e1116", "#5b6570", "#eac9a0"))
-_RED, _WHITE = "#ff4d5e", "#ffffff"  # the way, and around the carrier
+_RED, _WHITE, _FAR_OUT = "#ff4d5e", "#ffffff", 4000  # the way; Pillow draws no endless lines
 _FOCAL = 922.0  # pixels: 55 degrees across
 _BEHIND, _ABOVE, _AHEAD = 1.7, 0.95, 1.6  # times the range: the camera, and what it looks at
 _HEADING = 0.12  # of the film, before and after, tells where the carrier is heading
@@ -77,8 +77,8 @@ class Film:
             size = np.clip(_SIZES[1] * (_SPARSE / (len(rows) + 1)) ** 0.5, *_SIZES)
             image = splat(image, pixels[rows], BACK + (paint[rows] - BACK) * fade[:, None], size)
             frame = Image.fromarray(np.round(255 * image[..., :3]).astype(np.uint8))
-            pen, (pixels, distance) = ImageDraw.Draw(frame), camera.project(places[: number + 1])
-            line = [(float(x), float(y)) for x, y in pixels[distance >= _NEAR * focus]]
+            pen, (way, _) = ImageDraw.Draw(frame), camera.project(places[: number + 1])
+            line = [(float(x), float(y)) for x, y in way if max(abs(x), abs(y)) < _FAR_OUT]
             pen.line(line, _RED, 3)
             for x, y in line[-1:]:
                 pen.ellipse((x - 5, y - 5, x + 5, y + 5), _RED, _WHITE, 2)
