@@ -42,7 +42,7 @@ def share(path: Path, film: Path | None, page: Path | None) -> None:
         if file and file.suffix not in suffixes:
             raise LidarpoolError(f"{file} does not end with {' or '.join(suffixes)}: rename it.")
     view = open_result(path)
-    if not len(view.points):
+    if not len(PointFinder(view.points, view.origin).find(1000)[0]):
         raise LidarpoolError(f"{path} has no points to show: its rays hit nothing.")
     if view.note:
         click.echo(f"note: {view.note}", err=True)

@@ -61,7 +61,7 @@ class Film:
             axes = np.concatenate([right, np.cross(right, ahead), ahead])
             camera = Camera(eyes[number], axes, _FOCAL, np.array(SIZE) / 2, SIZE)
             meshes = [actor.placed(moment) for actor in self.actors]
-            there = [mesh.vertices[mesh.faces] for mesh in meshes if np.ptp(mesh.vertices)]
+            there = [mesh.vertices[mesh.faces] for mesh in meshes if np.ptp(mesh.vertices, 0).any()]
             moving = [_shape(np.concatenate(there), ACTOR)] if there else []
             image, depth = _surfaces([*still, *moving], camera, focus, self.top)
             points, paint = (np.vstack(each) for each in zip((points, paint), part, strict=True))
