@@ -65,11 +65,11 @@ def drive(tmp_path):
     return write(tmp_path, moves=True)
 
 
-def one_frame(points, colours, **given):
+def seen(points, actors, **given):
     """Frames of points that come one part after the other, seen from the south."""
     parts = [(np.array(p, float).reshape(-1, 3), np.tile(c, (len(p), 1))) for p, c in points]
     film = Film(
-        np.linspace(0, 1e9, len(parts)), parts, 1.0, FLOOR, np.inf, colours,
+        np.linspace(0, 1e9, len(parts)), parts, 1.0, FLOOR, np.inf, actors,
         np.array([[-10, -10, 0], [10, 10, 0.0]]), **given,
     )  # fmt: skip
     return [frame.astype(int) for frame in film.frames()]
@@ -82,35 +82,48 @@ def reds(frame):
 def test_new_points_are_bright_and_old_ones_darker_unless_they_are_where_an_actor_was():
     floor = [(x, y, 0.0) for x in range(-3, 4) for y in range(-3, 4)]
     none = ([], RED)
-    on, *_, later = one_frame([(floor, RED), none, none, none, none, none], ())
+    on, *_, later = seen([(floor, RED), none, none, none, none, none], ())
     assert reds(on) > reds(later) > 0.1 * reds(on)
     above = [(x, y, 4.0) for x, y, _ in floor]
-    on, later = one_frame([(above, RED), none], ())
+    on, later = seen([(above, RED), none], ())
     assert reds(on) > 0 and reds(later) == 0
     below = [(x, y, -4.0) for x, y, _ in floor]
-    assert reds(*one_frame([(below, RED)], ())) == 0  # the floor hides them
+    assert reds(*seen([(below, RED)], ())) == 0  # the floor hides them
 
 
 def test_actors_are_where_they_are_at_the_time_of_a_frame():
     way = Track([0, 1], [[-8, 0, 0], [8, 0, 0.0]])
     none = ([], RED)
-    seen = one_frame([none, none], [Actor(box("Van", (4, 4, 4)), way)], way=None)
-    warm = [frame[..., 0] - frame[..., 2] > 10 for frame in seen]
+    frames = seen([none, none], [Actor(box("Van", (4, 4, 4)), way)], way=None)
+    warm = [frame[..., 0] - frame[..., 2] > 10 for frame in frames]
     assert all(mask.sum() > 30 for mask in warm) and not (warm[0] & warm[1]).all()
     absent = Track([5, 6], [[-8, 0, 0], [8, 0, 0.0]], start_s=0.0, beyond="absent")
-    nobody = one_frame([none], [Actor(box("Van", (4, 4, 4)), absent)])
+    nobody = seen([none], [Actor(box("Van", (4, 4, 4)), absent)])
     assert not (nobody[0][..., 0] - nobody[0][..., 2] > 10).any()
     assert ACTOR[0] > ACTOR[2] and SURFACE[0] < SURFACE[2]
 
 
 def test_the_camera_follows_a_carrier_whose_way_is_red():
     way = np.array([0, 1e9]), np.array([[0, -20, 2], [0, 20, 2.0]])
-    frames = one_frame([([], RED)] * 3, (), way=way, range_m=8.0)
+    frames = seen([([], RED)] * 3, (), way=way, range_m=8.0)
     dot = rgb("#ff4d5e") * 255
     for frame in frames:  # in the middle, below
         row, column = (np.abs(frame - dot).sum(axis=2) < 60).nonzero()
         assert 40 < column.mean() < 56 and row.min() > 27
     assert not np.array_equal(frames[0], frames[2])
+
+
+def test_a_room_is_cut_open_at_its_top():
+    room = box("Room", (12, 12, 6))
+    points = np.array([(x, y, 0.1) for x in range(-3, 4) for y in range(-3, 4)])
+    parts = [(points, np.tile(RED, (len(points), 1)))]
+    box_ = np.array([[-6, -6, 0], [6, 6, 6.0]])
+    closed, opened = (
+        Film(np.ones(1), parts, 0.0, room.vertices[room.faces], top, (), box_)
+        for top in (np.inf, 2.0)
+    )
+    assert reds(next(closed.frames()).astype(int)) == 0
+    assert reds(next(opened.frames()).astype(int)) > 1000
 
 
 @pytest.mark.parametrize("suffix", [".gif", ".webp"])
