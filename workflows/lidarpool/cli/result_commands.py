@@ -166,21 +166,30 @@ def export(
     help="Port on 127.0.0.1, or the next free one; 0 for any.",
 )
 @options.flag("--no-browser", help="Only print the address.")
-def view(result: Path | Storage, port: int, no_browser: bool) -> None:
-    """Show a result or a cloud in the browser.
+@options.new_file("--film", help="Write a .gif or .webp instead: along a drive, or all around.")
+@options.new_file("--export", help="Write the page as one .html instead, of at most 25 MB.")
+def view(
+    result: Path | Storage, port: int, no_browser: bool, film: Path | None, export: Path | None
+) -> None:
+    """Show a result or a cloud in the browser, or write it as a file to share.
 
     \b
     Examples:
       lidarpool view lidarpool-out
       lidarpool view lidarpool-out/cloud.ply --no-browser
+      lidarpool view drive --film drive.gif --export drive.html
     """  # noqa: D301 - click wants the character, not its name
     from ..export.folder import local_result
     from ..export.sweeps import SWEEPS_FILE
+    from ..live.sharing import share
     from ..live.view import CLOUD, view_result
     from ..run.picture_file import PICTURE_FILE
 
     with local_result(result, (CLOUD, PICTURE_FILE, SWEEPS_FILE)) as made:
-        view_result(made, port=port, browser=not no_browser)
+        if film or export:
+            share(made, film, export)
+        else:
+            view_result(made, port=port, browser=not no_browser)
 
 
 @click.command()
