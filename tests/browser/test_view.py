@@ -2,6 +2,7 @@
 
 import re
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -12,6 +13,7 @@ from lidarpool.columns.ply_format import header, row_type
 from lidarpool.columns.table import SCAN, TABLE
 from lidarpool.export.sweeps import Sweeps
 from lidarpool.live.server import page_server
+from lidarpool.live.sharing import page_of
 from lidarpool.live.view import View, open_results
 from lidarpool.run.picture_file import PictureContent, sensor_ways
 from lidarpool.scene.actors import Actor, box
@@ -390,3 +392,30 @@ def test_no_page_of_another_server_frames_it(served, view, new_tab):
         frame = "Object.assign(document.createElement('iframe'), {src: '" + served.url + "'})"
         tab.value(f"document.body.append({frame})")
         tab.wait_for(lambda _: any("frame-ancestors" in error for error in tab.errors))
+
+
+def test_an_exported_page_opens_from_disk_and_asks_nobody(view, new_tab, tmp_path):
+    path = tmp_path / "page.html"
+    path.write_bytes(page_of(view))
+    file = SimpleNamespace(url=path.as_uri())
+    tab = opened(new_tab, file)
+    tab.wait_for(lambda text: "30,000 points" in text and "z, m" in text)
+    assert tab.value("lidarpool.state.actors[0].name") == "Van"
+    tab.wait_for(lambda _: colourful(tab.picture(tmp_path / "a.png")) > 3000)
+    own = (file.url, "data:", "blob:")
+    assert [request for request in tab.requests if not request.startswith(own)] == []
+    tab.key("ArrowRight")  # one sweep of ten
+    tab.wait_for(lambda _: drawn(tab) == COUNT / 10)
+    tab.key(" ")
+    tab.wait_for(lambda _: tab.value("lidarpool.chosen.time") > 0.5)
+    assert "Range image" not in tab.text
+    link = "#filter=scan,100,149;z,2,2.5&colour=wetness&scene=hits"
+    other = opened(new_tab, file, link)
+    kept = "1,21[56] points of 30,000"  # from z, 2 m to 2.5 m; the scans begin at 2.2 m
+    other.wait_for(lambda text: re.search(kept, text) and "wetness, %" in text)
+    other.wait_for(lambda _: other.value(f"{PICTURE}.surface?.material.vertexColors === true"))
+    found = f"{PICTURE}.layers.base.told.arrays"
+    other.value(f"{PICTURE}.pick = () => ({{ row: {found}.rows[0], place: [0, 0, 0] }})")
+    other.press(400, 300)
+    other.wait_for(lambda text: re.search(r"wetness\s\d+\.\d+ %", text) and "scan\t1" in text)
+    assert tab.errors == other.errors == []

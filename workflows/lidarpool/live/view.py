@@ -101,6 +101,7 @@ class View:
     results: Sequence[str] = ()  # names, if the points are of several results
     # Returns those of each triangle, those of actors after the others; by default as pictured.
     hits: Callable[[], AnyArray] | None = None
+    triangles: int = MOST_TRIANGLES  # of the scene, that are shown
 
     def __post_init__(self) -> None:
         self.version = 0  # of the points
@@ -150,11 +151,13 @@ class View:
         return ways
 
     @property
-    def _actors(self) -> Sequence[Actor]:
+    def actors(self) -> Sequence[Actor]:
+        """What moves through the scene."""
         return () if self.pictured is None else self.pictured.scene.actors
 
     @property
-    def _duration_ns(self) -> float:
+    def duration_ns(self) -> float:
+        """How long the survey takes, by its own clock; 0 if that is unknown."""
         if self.pictured is not None and self.pictured.duration_ns:
             return self.pictured.duration_ns
         if self.sweeps is None or not len(self.sweeps):
@@ -207,22 +210,22 @@ class View:
 
     def _state(self) -> Answer:
         """Tell all but points and surfaces."""
-        near = around_ways(self._bounds, ways_of(self.sensors, self._actors, self._duration_ns))
+        near = around_ways(self._bounds, ways_of(self.sensors, self.actors, self.duration_ns))
         box = self._bounds if near is None else near
         corners = self._held if near is None else corners_of(near)
         arrays: dict[str, AnyArray] = {"rays": self.rays_shown, "corners": corners}
         for number, way in enumerate(self.sensors):
             arrays[f"sensor{number}_times"] = way.times_ns / _NS
             arrays[f"sensor{number}_places"] = way.positions
-        meshes, shapes = shapes_of(self._actors)
+        meshes, shapes = shapes_of(self.actors)
         arrays["actor_mesh"] = shapes.astype(np.int32)  # browsers have no arrays of int64
         for number, mesh in enumerate(meshes):
             arrays[f"mesh{number}_corners"] = mesh.vertices[mesh.faces].astype(np.float32)
             if mesh.colours is not None:  # at the corners
                 arrays[f"mesh{number}_colours"] = mesh.colours.means().repeat(3, axis=0)
-        each = samples_each(self._actors, PLACES_MOST)
-        for number, actor in enumerate(self._actors):
-            times, places, turns = actor.samples(self._duration_ns, each)
+        each = samples_each(self.actors, PLACES_MOST)
+        for number, actor in enumerate(self.actors):
+            times, places, turns = actor.samples(self.duration_ns, each)
             arrays[f"actor{number}_times"] = times / _NS
             arrays |= {f"actor{number}_places": places, f"actor{number}_turns": turns}
             arrays[f"actor{number}_there"] = np.array(presence_ns(actor.trajectory)) / _NS
@@ -251,16 +254,16 @@ class View:
             ],
             "actors": [
                 {"name": actor.name, "class": classes.get(objects + number)}
-                for number, actor in enumerate(self._actors, -len(self._actors))
+                for number, actor in enumerate(self.actors, -len(self.actors))
             ],
             "classes": {str(k): name for k, name in enumerate(self._names("class")) if name},
             "results": legend_of(colours_of(several, RESULT, self.results))["labels"],
             "exports": () if isinstance(self.points, HeldPoints) else EXPORTS,
             "actor_colours": as_bytes(object_colours(objects))[
-                objects - len(self._actors) :
+                objects - len(self.actors) :
             ].tolist(),
-            "statics": objects - len(self._actors),
-            "duration": self._duration_ns / _NS,
+            "statics": objects - len(self.actors),
+            "duration": self.duration_ns / _NS,
             "path": self.planned,
             "note": self.note,
         }  # fmt: skip
@@ -400,7 +403,7 @@ class View:
             raise KeyError("surface")
         with self._lock:  # one browser after the other: it may take long, once
             surface = self._surface = self._surface or ShownSurface(
-                pictured.scene, pictured.reflectance
+                pictured.scene, pictured.reflectance, self.triangles
             )
         counts, places = pictured.hit_counts, np.zeros((0, 3), np.float32)
         if colour == "hits":
@@ -412,7 +415,6 @@ class View:
                 rows = rows[(owners >= 0) & (owners < len(pictured.scene.names))]
             places = (positions(self._finder.points, rows) - self.origin).astype(np.float32)
         arrays, legend = surface.coloured(colour, counts, places)
-        arrays["objects"] = arrays["objects"].astype(np.int32)
         return {"legend": legend} | self._look_around, arrays
 
     @cached_property
@@ -522,7 +524,7 @@ class ShownSurface:
         self._stands = np.arange(len(scene.faces))
         if len(scene.faces) > most:
             self.coarse, self._stands = simplified(scene, most)
-        self._objects = self.coarse.face_object
+        self._objects = self.coarse.face_object.astype(np.int32)  # as browsers have them
         size = float(np.linalg.norm(np.ptp(scene.bounds, axis=0)))
         moved = apart(self.coarse, self._objects, _INWARDS * min(size, _MOST_INWARDS_OF))
         self.corners = moved.vertices[moved.faces].astype(np.float32)  # (f, 3, 3)

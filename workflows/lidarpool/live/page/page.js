@@ -526,6 +526,7 @@ function buildTime() {
   clock.follow.title = "Move the camera with the carrier";
   clock.follow.hidden = !picture.sensors.some((sensor) => sensor.moves);
   clock.images = button("Range image", () => { chosen.images = !chosen.images; showToggles(); showImages(); });
+  clock.images.hidden = Boolean(state.offline); // a file does not hold them
   $("time").replaceChildren(
     element("div", { className: "line" }, clock.slider, clock.ticks),
     element("div", { className: "transport" },
@@ -641,7 +642,7 @@ const MOST_IMAGES = 3;
 
 function showImages() {
   const box = $("images");
-  const on = chosen.images && chosen.show !== "all" && sweeps.length > 0 && picture.sensors.some((sensor) => sensor.shown);
+  const on = chosen.images && !state.offline && chosen.show !== "all" && sweeps.length > 0 && picture.sensors.some((sensor) => sensor.shown);
   box.hidden = !on;
   if (!on) return;
   const shown = [...picture.sensors.entries()].filter(([, sensor]) => sensor.shown && sensor.sweeps.length).slice(0, MOST_IMAGES);
