@@ -440,7 +440,7 @@ WRONG = {
         {"actors.0.box.0": {"uniform": [1, 2]}, "actors.Van.box.0": {"uniform": [1, 2]}},
         "actors.0.box.0 and actors.Van.box.0 lead to the same field",
     ),
-    "other section": ({"performance": {"choice": ["ideal"]}}, "performance is a field of sensor"),
+    "other section": ({"performance": {"choice": ["ideal"]}}, "It is a field of sensor"),
     "within": (
         {"scene": {"choice": ["hall.glb"]}, "scene.files.0.file": {"choice": ["hall.glb"]}},
         "scene is chosen as a whole",
@@ -456,6 +456,17 @@ WRONG = {
         "traffic.csv, line 3: trajectory is not a field.",
     ),
 }
+
+
+def test_a_missing_file_of_a_table_is_named_with_its_line(campaign, folder):
+    (folder / "cars.csv").write_text(
+        "# van.obj\nname,file,trajectory\nCar,hall.glb,\nVan,van.obj,\n"
+    )
+    vary = {"actors": {"sample": {"from": "cars.csv", "count": 1}}}
+    with pytest.raises(LidarpoolError) as raised:
+        campaign(vary).check_files()
+    where = f"actors: {folder / 'cars.csv'}, line 4: {str(folder / 'van.obj')!r} does not exist"
+    assert where in str(raised.value)
 
 
 @pytest.mark.parametrize("name", WRONG)

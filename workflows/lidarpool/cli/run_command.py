@@ -48,7 +48,7 @@ def run_scenario(
     backend: str | None = None,
     *,
     no_plan: bool = False,
-    only: str | None = None,
+    extent: str | None = None,
 ) -> None:
     """Run a scenario, write the result and print a summary.
 
@@ -60,7 +60,7 @@ def run_scenario(
     with terminal.status("reading the scene", logged=False):
         built = build(scenario, plans=not no_plan)
         job = built.job()
-    _run_survey(built, job, options, terminal, only)
+    _run_survey(built, job, options, terminal, extent)
 
 
 def _run_survey(
@@ -68,7 +68,7 @@ def _run_survey(
     job: Job,
     options: RunOptions,
     terminal: Terminal,
-    only: str | None,
+    extent: str | None,
     judge: Callable[[RunResult], str] = lambda result: "",
 ) -> None:
     """Run a job, and write it as the result of a survey; `judge` returns a note on it."""
@@ -76,9 +76,8 @@ def _run_survey(
     for note in advice(built):
         terminal.tell(note)
     jobs = OneJob(job)
-    output = SurveyOutput(
-        options.out, job.survey, job.outputs, only == "cloud", built.scenario, judge
-    )
+    extent = extent or "page"
+    output = SurveyOutput(options.out, job.survey, job.outputs, extent, built.scenario, judge)
     with page_of(jobs, options.live) as page:
         result, report = Conductor(jobs, options, output, terminal, page)()
         lines = _of_result(options.out, result, job, report)
@@ -120,7 +119,7 @@ def run_job(
     terminal: Terminal,
     options: RunOptions,
     backend: str | None,
-    only: str | None,
+    extent: str | None,
 ) -> None:
     """Run one job of a campaign again, and write it as the result of a survey.
 
@@ -154,7 +153,7 @@ def run_job(
         return f"the points are those of job {name} in {place}, bit for bit"
 
     options = options.with_pool(scenario.pool, backend)
-    _run_survey(built, replace(job, number=0), options, terminal, only, compare)
+    _run_survey(built, replace(job, number=0), options, terminal, extent, compare)
 
 
 def no_hits(job: Job) -> str:

@@ -9,7 +9,7 @@ import os
 import threading
 from bisect import bisect_right
 from collections import OrderedDict, deque
-from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -55,8 +55,11 @@ class SavedSweeps:
     """A sequence of the sweeps of a data set in an order; see `sweeps`.
 
     An item is read when it is asked for; a loop reads ahead in threads. Several threads may ask,
-    and processes that this one forks or that get a pickled copy.
+    and processes that this one forks or that get a pickled copy. `classes` are names of semantic
+    classes, {number: name}.
     """
+
+    classes: Mapping[int, str]
 
     def __init__(
         self, place: Storage, written: Format, runs: Sequence[_Run], shuffle: int | None
@@ -268,7 +271,9 @@ def sweeps(
             if count and (sensors is None or name in sensors):
                 runs.append(_Run(job, first, count))
             first += count
-    return SavedSweeps(storage, written, runs, shuffle)
+    saved = SavedSweeps(storage, written, runs, shuffle)
+    saved.classes = {int(number): name for number, name in head.get("classes", {}).items()}
+    return saved
 
 
 def read_index(place: Storage) -> dict[str, Any]:

@@ -133,7 +133,7 @@ class DataSetOutput(Output[CampaignRun]):
         seconds = time.monotonic() - conductor.started
         more = {"stages": cast.stages if cast else (), "notes": tuple(store.notes)}
         run = CampaignRun.of(store.rows(), seconds, store.resumed, sensors=store.sensors, **more)
-        self._write_shared(store, run)
+        run = self._write_shared(store, run)
         if run.failed:
             store.save(now=True)
             store.db.close()
@@ -142,8 +142,8 @@ class DataSetOutput(Output[CampaignRun]):
         conductor.page.finish(run.seconds)
         return run
 
-    def _write_shared(self, store: RunStore, run: CampaignRun) -> None:
-        """Write what all jobs share, and last what says that the data set is complete."""
+    def _write_shared(self, store: RunStore, run: CampaignRun) -> CampaignRun:
+        """Write what all jobs share, and last what says that; return the run with class names."""
         # Matplotlib takes as long as all other imports.
         from .campaign_report import write_card
         from .charts import draw_sweep
@@ -156,8 +156,10 @@ class DataSetOutput(Output[CampaignRun]):
         write_table(place, campaign.names, store.rows)
         self.dataset.finish(store.rows())
         saved = sweeps(place.url)
-        picture = draw_sweep(next(iter(saved))) if len(saved) else None
+        picture = draw_sweep(next(iter(saved)), saved.classes) if len(saved) else None
+        run = replace(run, classes=saved.classes)
         write_card(place, campaign, run, store.rows(), store.casting or software(), picture)
+        return run
 
 
 def _look(

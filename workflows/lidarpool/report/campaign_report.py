@@ -78,10 +78,6 @@ def write_card(
             "report": report,
             "captions": _CAPTIONS,
             "command": campaign.command,
-            "points_by_class": {
-                name if name != "0" else "0 none": one["points"]
-                for name, one in report["classes"].items()
-            },
             "VALUES_SHOWN": VALUES_SHOWN,
         }
         page = rendered(
@@ -146,6 +142,7 @@ def campaign_report(
             for name, counts in figures.splits.items()
         },
         "classes": {str(number): {**counts} for number, counts in sorted(figures.classes.items())},
+        **({"class_names": dict(run.classes)} if run.classes else {}),
         "varied": list(figures.described()),
         "failed": [_job_entry(row, "error") for row in figures.failed],
         "slowest": [_job_entry(row, "seconds") for row in figures.slowest],

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import platform
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from contextlib import suppress
 from dataclasses import asdict
 from importlib.metadata import PackageNotFoundError, version
@@ -56,19 +56,24 @@ _PLANNING = ("trials", "best_length", "shortest_possible", "collision_free")
 class CountedCloud:
     """A cloud that computes its statistics while its points are read for something else.
 
-    `by_object` are the points of each object, `no_surface` those of none, `limits`
-    are {column: minimum and maximum}, and `bounds` (2, 3) the lowest and highest coordinates in the
-    world.
+    `by_object` and `by_class` are the points of each, `no_surface` those of no object, `limits`
+    are {column: minimum and maximum}, `bounds` (2, 3) the lowest and highest coordinates in the
+    world, and `above` (rows, columns) points seen from above, the first row in the south.
     """
 
     def __init__(self, cloud: CloudLike, objects: int) -> None:
         self._cloud = cloud
         self.by_object, self.no_surface = np.zeros(objects, np.int64), 0
+        self.by_class = np.zeros(1 << 16, np.int64)
         self.limits: dict[str, tuple[float, float]] = {}
         self.bounds: Floats = np.asarray(cloud.bounds, dtype=np.float64)
         # A cell that a surface crosses has about the square of its side of that surface.
         self._side = float(np.ptp(self.bounds, axis=0).max()) / _CELLS or 1.0
         self._cells = np.zeros(_CELLS**3, np.int64)
+        # The more points, the finer.
+        across = np.ptp(self.bounds[:, :2], axis=0)
+        self._pixel = float(across.max() / np.clip(len(cloud) ** 0.5, 50, 800)) or 1.0
+        self.above = np.zeros((across[::-1] / self._pixel).astype(np.int64) + 1, np.int64)
         self.table: tuple[Column, ...] = cloud.table
         self.row_of = cloud.row_of
 
@@ -83,6 +88,8 @@ class CountedCloud:
                 owners = owners[owners >= 0]
                 self.no_surface += len(chunk) - len(owners)
             self.by_object += np.bincount(owners, minlength=len(self.by_object))
+            if "class" in chunk.columns:
+                self.by_class += np.bincount(chunk["class"], minlength=len(self.by_class))
             for name in (column.name for column in chunk.table):
                 values = chunk[name]
                 low, high = self.limits.get(name, (np.inf, -np.inf))
@@ -94,6 +101,10 @@ class CountedCloud:
             x, y, z = cell.clip(0, _CELLS - 1).T
             cell = (x * _CELLS + y) * _CELLS + z  # a product of whole numbers by `@` is slow
             self._cells += np.bincount(cell, minlength=len(self._cells))
+            pixel = (chunk.positions[:, :2] - self.bounds[0, :2]) / self._pixel
+            rows, columns = self.above.shape
+            x, y = pixel.astype(np.int64).clip(0, (columns - 1, rows - 1)).T
+            self.above += np.bincount(y * columns + x, minlength=rows * columns).reshape(rows, -1)
             yield chunk
 
     @property
@@ -117,7 +128,7 @@ def versions() -> dict[str, str]:
     return found
 
 
-def make_report(result: RunResult, files: Sequence[str], cloud: CountedCloud) -> dict[str, Any]:
+def make_report(result: RunResult, cloud: CountedCloud) -> dict[str, Any]:
     """Report of a run, ready for JSON.
 
     Lengths are in metres, times in seconds; infinite and unknown values are None.
@@ -144,6 +155,8 @@ def make_report(result: RunResult, files: Sequence[str], cloud: CountedCloud) ->
             name: int(count) for name, count in zip(scene.all_names, cloud.by_object, strict=True)
         }
         | ({NO_SURFACE: cloud.no_surface} if cloud.no_surface else {}),
+        "classes": {str(n): {"points": k} for n, k in enumerate(cloud.by_class.tolist()) if k},
+        **({"class_names": dict(survey.classes)} if survey.classes else {}),
         "points_per_m2": cloud.density if survey.coordinates == "world" else None,
         "columns": _columns(cloud),
         "seconds": {
@@ -159,7 +172,6 @@ def make_report(result: RunResult, files: Sequence[str], cloud: CountedCloud) ->
         "replayed": result.replayed,
         "resumed_scans": result.resumed,
         "planning": _planning(result),
-        "files": list(files),
     }
 
 

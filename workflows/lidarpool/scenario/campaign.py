@@ -35,6 +35,7 @@ from ..base.words import did_you_mean, plural
 from ..base.yamlfile import read_yaml
 from ..datasets.job_table import Value
 from ..export.format_table import check_whole
+from ..sensor.calibrations import text_of
 from .build import Job, build
 from .campaign_sections import (
     COUNT_MOST,
@@ -249,7 +250,11 @@ class CampaignSpec:
         mistakes = Mistakes()
         # `Path.exists` fails at names that no file can have.
         lost = [path for path in self.files if not os.path.exists(path)]  # noqa: PTH110
-        mistakes.lines += [f"{self.command}: {str(path)!r} does not exist." for path in lost]
+        mistakes.lines += [
+            f"{self.command}: {self._jobs.named_in(path)}{str(path)!r} does not exist: check the "
+            "name and the folder."
+            for path in lost
+        ]
         mistakes.tell()
 
     @cached_property
@@ -301,6 +306,10 @@ class _JobSource:
 
     def scenario(self, number: int) -> Scenario | None:
         return None
+
+    def named_in(self, file: Path) -> str:
+        """Where a file is named, for messages: a table and its line; empty if in none."""
+        return ""
 
     def job(self, number: int, cache: SceneCache | None, columns: Sequence[str], own: Any) -> Job:
         scenario = self.scenario(number)
@@ -464,6 +473,14 @@ class _Varied(_JobSource):
             "tables": fingerprint(to_json([base.tables for base in self._bases])),
         }
 
+    def named_in(self, file: Path) -> str:
+        tables = {path: text for base in self._bases for text, path in base.table_files.items()}
+        for table, text in tables.items():
+            for number, line in enumerate(text_of(table).splitlines(), 1):
+                if file.name in line and not line.lstrip().startswith("#"):
+                    return f"{text}: {table}, line {number}: "
+        return ""
+
     def values(self, number: int) -> dict[str, Value]:
         return self._drawn(number)[0]
 
@@ -509,6 +526,7 @@ class _Base:
         self._vary, (self._noise, _) = vary, find_field(self.scenario, _NOISE)
         self._steps: dict[str, FieldSteps] = {}
         self.tables: dict[str, list[Any]] = {}
+        self.table_files: dict[str, Path] = {}
         self.files: set[Path] = set()  # that a job may read
         mistakes = Mistakes()
         for text, choice in vary.items():
@@ -516,7 +534,7 @@ class _Base:
                 self._steps[text], kind = find_field(self.scenario, text)
                 if choice.sample is None:
                     continue
-                table = self.scenario.path(choice.sample.file)
+                self.table_files[text] = table = self.scenario.path(choice.sample.file)
                 with prefixed(text):
                     if (key := (table, repr(kind))) not in tables:
                         tables[key] = read_rows(table, kind)
@@ -665,8 +683,9 @@ def find_field(scenario: Scenario, text: str) -> tuple[FieldSteps, Any]:
             key, node, kind = _field(node, rest[0], at)
             used = 1
         elif isinstance(node, dict):
-            key, used = _named(list(node), rest, at)
-            node = node[key]
+            keys = {str(key): key for key in node}  # of classes, numbers
+            name, used = _named([*keys], rest, at)
+            node = node[key := keys[name]]
         elif isinstance(node, (tuple, list)):
             key, used = _entry(node, rest, at)
             node = node[key]
