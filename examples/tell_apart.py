@@ -1,8 +1,9 @@
 """Tells ground, buildings and cars apart: a campaign of cities, and a network in NumPy.
 
-    python tell_apart.py [FOLDER]
+    python tell_apart.py [FOLDER | stream]
 
-It makes a data set of 30 cities, learns from some, and draws what it says of another."""
+It makes a data set of 30 cities, or streams them from their workers, learns from some, and draws
+what it says of another."""
 
 import sys
 from itertools import pairwise
@@ -74,10 +75,20 @@ def features(sweep):
     return np.stack(known, axis=1, dtype=np.float32)
 
 
+def sweeps_of(place, split):
+    """Sweeps of a split: of the data set, which is made first, or just as they are cast."""
+    campaign = lp.Campaign(street, 30, seed=1, splits={"train": 0.7, "test": 0.3})
+    if place == "stream":
+        return campaign.stream(split=split)
+    if not Path(place, "dataset.json").exists():
+        campaign.run(place)
+    return lp.sweeps(place, split=split)
+
+
 def read(place, split, share):
     """Features and classes of a random share of the points of a split."""
     known, classes = [], []
-    for sweep in lp.sweeps(place, split=split):
+    for sweep in sweeps_of(place, split):
         some = RNG.random(len(sweep)) < share
         known.append(features(sweep)[some])
         classes.append(sweep.classes[some] - 1)
@@ -122,8 +133,6 @@ class Network:
 
 
 def main(place="cities"):
-    if not Path(place, "dataset.json").exists():
-        lp.Campaign(street, 30, seed=1, splits={"train": 0.7, "test": 0.3}).run(place)
     known, classes = read(place, "train", 0.4)
     network = Network(known)
     rare = 1 / np.sqrt(np.bincount(classes))  # else it would learn nothing but ground and walls
@@ -136,7 +145,7 @@ def main(place="cities"):
     print(f"{table.trace() / table.sum():.1%} of {len(known):,} points are right.")
     for name, row in zip(CLASSES, table / table.sum(axis=1, keepdims=True), strict=True):
         print(f"{name:>14} is", *(f"{n:6.1%} {one}" for one, n in zip(CLASSES, row, strict=True)))
-    sweep = lp.sweeps(place, split="test")[0]
+    sweep = next(iter(sweeps_of(place, "test")))
     figure = Figure((14, 7.4), layout="constrained")
     shown = {"What it is": sweep.classes - 1, "What it says": network.says(features(sweep))}
     for axes, (title, some) in zip(figure.subplots(1, 2), shown.items(), strict=True):

@@ -307,7 +307,7 @@ def test_webdataset_is_read_by_its_own_library(written, sweeps, job):
     _, place = written("webdataset")
     shards = sorted(map(str, (place / "shards").glob("*.tar")))
     samples = list(wds.WebDataset(shards, shardshuffle=False).decode())
-    assert [sample["json"]["job"] for sample in samples] == [
+    assert [sample["json"]["name"] for sample in samples] == [
         name for name in ("000", "001", "007") for _ in range(len(sweeps))
     ]
     points = [len(sample["points.npy"]) for sample in samples[: len(sweeps)]]

@@ -634,7 +634,7 @@ def test_documentation_and_installation_follow_the_table_of_formats():
         assert re.search(rf"\| `{layout}` \|.*\| {', '.join(needed)} \|", text), layout
 
 
-@pytest.mark.parametrize("name", ["kitti", "nuscenes", "parquet", "pcd", "images"])
+@pytest.mark.parametrize("name", ["kitti", "nuscenes", "webdataset", "parquet", "pcd", "images"])
 def test_workers_and_threads_write_the_same_files(sweeps, cloud, tmp_path, name, monkeypatch):
     """What workers do not see is written here."""
     monkeypatch.setattr(parquet, "CHUNK_POINTS", 1000)

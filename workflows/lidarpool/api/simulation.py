@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated
 
@@ -10,9 +10,11 @@ from distributed import Client
 from pydantic import Field
 
 from ..base.declared import declared
+from ..base.errors import LidarpoolError
 from ..base.storage import Storage
 from ..base.validation import checked
 from ..base.vocabulary import PATIENCE_S, WAIT_S
+from ..base.words import did_you_mean
 from ..export.folder import output_place
 from ..live import page_of
 from ..pipeline.messages import ScanFrame
@@ -250,52 +252,29 @@ class Campaign(described.CampaignSpec):  # noqa: D101 - as there
         client: Client | None = None,
         ahead: Annotated[int, Field(ge=1)] = 8,
         *,
-        split: str | Sequence[str] | None = None,
+        split: str | None = None,
         backend: str | None = None,
         gpu_workers: int | None = None,
-        wait_s: float = WAIT_S,
-        patience_s: float = PATIENCE_S,
     ) -> SweepStream:
         """Stream the sweeps of the jobs while they are cast, without a data set.
 
-        The sweeps are those of a data set of the campaign, with all columns, in the order of jobs,
-        sensors and time. The points go from the workers to this process, past the scheduler and
-        without files. If a worker dies, its sweeps are cast again. A job that fails is left out,
-        and the log says why.
+        They are those of a data set of the campaign, with all columns, in the order of jobs,
+        sensors and time. Points go from the workers to this process, past the scheduler. The sweeps
+        of a worker that dies are cast again. A job that fails is left out, and the log says why.
 
-        Parameters
-        ----------
-        client
-            Client of a cluster whose workers declare the resource GPU. Without one, each iteration
-            starts a local cluster and stops it in the end.
-        ahead
-            Most sweeps that are being cast or wait to be read: it bounds the memory, and says how
-            many casting workers have something to do.
-        split
-            Only the jobs of this split, or these.
-        backend, gpu_workers
-            As of `run`.
-        wait_s, patience_s
-            As for `simulate`.
+        At most `ahead` sweeps are being cast or wait to be read, which bounds the memory: give
+        twice as many as there are casting workers, or more. `client` is of a cluster whose workers
+        declare the resource GPU; without one, each loop starts a local cluster, and stops it.
+        `split` chooses jobs. The others are as of `run`.
 
-        Returns
-        -------
-        SweepStream
-            It begins when a loop begins, and anew with each. Its `torch` gives a dataset for
-            PyTorch.
-
-        Raises
-        ------
-        LidarpoolError
-            If there is no such split; while it is read, if the cluster lacks something, is lost,
-            or has no casting worker for `patience_s`.
-
-        Examples
-        --------
-        >>> for sweep in Campaign.load("campaign.yaml").stream():    # doctest: +SKIP
-        ...     print(sweep.job, sweep.points.shape)
+        LidarpoolError if there is no such split; in the loop, if the cluster lacks something or is
+        lost.
         """
-        options = RunOptions(
-            client=client, gpu_workers=gpu_workers, wait_s=wait_s, patience_s=patience_s
-        ).with_pool(self.pool, backend)
-        return SweepStream(self, self.of_splits(split), ahead, options)
+        if split is not None and split not in self.splits:
+            known = (
+                did_you_mean(split, self.splits) or f" It has {', '.join(self.splits) or 'none'}."
+            )
+            raise LidarpoolError(f"The campaign has no split {split!r}.{known}")
+        numbers = [n for n in range(self.count) if split in (None, self.split(n))]
+        options = RunOptions(client=client, gpu_workers=gpu_workers).with_pool(self.pool, backend)
+        return SweepStream(self, numbers, ahead, options)

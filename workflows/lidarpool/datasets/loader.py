@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import json
 import operator
 import os
@@ -37,8 +36,7 @@ from .dataset import BOXES_FILE, INDEX_FILE, VERSION, job_file
 from .job_table import JobRow, read_table
 from .sweep_data import Sweep
 
-_THREADS, _REQUESTS = 1, 8  # that read ahead: Python runs one at a time, but for requests at a URL
-_TOGETHER = 4  # sweeps of a job that a thread reads at a time
+_REQUESTS = 8  # threads that read ahead at a URL
 _OPEN_JOBS = 16  # jobs whose poses, boxes and opened files a thread keeps
 
 
@@ -87,47 +85,29 @@ class SavedSweeps:
         return self.ahead(range(len(self)))
 
     def ahead(self, indices: Iterable[int]) -> Generator[Sweep]:
-        """Give some sweeps in this order; threads read the next ones meanwhile.
-
-        In memory are at most eight sweeps for each thread, beside the last ones that were given.
-        """
-        threads = _THREADS if self._place.is_local else _REQUESTS
-        # Neighbouring sweeps share what is kept of an open job. But at a URL, where each request
-        # takes long, several threads fetch single sweeps that have files of their own.
-        apart = itertools.count() if self._written.row.boxes and not self._place.is_local else None
-
-        def lane_of(index: int) -> int:
-            return self._find(index)[0].job.number if apart is None else next(apart)
-
-        lanes = [ThreadPoolExecutor(1, "sweeps") for _ in range(threads)]
-        coming: deque[Future[list[Sweep]]] = deque()
-        try:
-            for lane, group in itertools.groupby(indices, lane_of):
-                while some := [*itertools.islice(group, _TOGETHER)]:
-                    sweeps_of = map(self.__getitem__, some)  # they are read in the thread
-                    coming.append(lanes[lane % threads].submit(list, sweeps_of))
+        """Give some sweeps in this order; threads read the next ones meanwhile, two each."""
+        # At a URL each request takes long. A job that is one file for all sweeps is opened once.
+        threads = 1 if self._place.is_local or not self._written.row.boxes else _REQUESTS
+        coming: deque[Future[Sweep]] = deque()
+        with ThreadPoolExecutor(threads, "sweeps") as pool:
+            try:
+                for index in indices:
+                    coming.append(pool.submit(self.__getitem__, index))
                     if len(coming) > 2 * threads:
-                        yield from coming.popleft().result()
-            while coming:
-                yield from coming.popleft().result()
-        finally:
-            for task in coming:
-                task.cancel()
-            for one in lanes:
+                        yield coming.popleft().result()
+                while coming:
+                    yield coming.popleft().result()
+            finally:
+                for task in coming:
+                    task.cancel()
                 with suppress(RuntimeError):  # as the program ends, threads take nothing more
-                    one.submit(self._close)
-                one.shutdown()
+                    pool.submit(self._close)
 
     def __getitem__(self, index: int) -> Sweep:
         """Read a sweep.
 
         LidarpoolError if a file is missing or damaged; IndexError if there is no such sweep.
         """
-        run, number = self._find(index)
-        return self._opened(run.job).read(number)
-
-    def _find(self, index: int) -> tuple[_Run, int]:
-        """Find out where a sweep is; IndexError if there is none."""
         at = operator.index(index)
         at += len(self) if at < 0 else 0
         if not 0 <= at < len(self):
@@ -136,7 +116,8 @@ class SavedSweeps:
             at = int(self._order[at])
         which = bisect_right(self._ends, at)
         run = self._runs[which]
-        return run, run.first + at - (int(self._ends[which]) - run.count)
+        number = run.first + at - (int(self._ends[which]) - run.count)
+        return self._opened(run.job).read(number)
 
     def torch(self, transform: Callable[[Sweep], Any] | None = None, *, even: bool = True) -> Any:
         """Return a `torch.utils.data.IterableDataset` of the sweeps.

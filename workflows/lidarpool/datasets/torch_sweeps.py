@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Generator, Iterator
+from collections.abc import Callable, Iterator
 from contextlib import closing
-from typing import TYPE_CHECKING, Any, Protocol
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -46,20 +47,10 @@ class TorchSweeps(torch.utils.data.IterableDataset):
         yield from map(self.transform, self.sweeps.ahead(self._share()[first::step]))
 
 
-class Stream(Protocol):
-    """Sweeps that ranks share; a generator gives them."""
-
-    def __iter__(self) -> Generator[Sweep]:
-        """Give all sweeps, or those of the rank."""
-
-    def of_rank(self, rank: int, ranks: int) -> Stream:
-        """Return the stream of a rank."""
-
-
 class TorchStream(torch.utils.data.IterableDataset):
-    """Items made of the sweeps of a stream, whose jobs are divided between ranks."""
+    """Items made of the sweeps of a `SweepStream`, whose jobs are divided between ranks."""
 
-    def __init__(self, stream: Stream, transform: Callable[[Sweep], Any] | None) -> None:
+    def __init__(self, stream: Any, transform: Callable[[Sweep], Any] | None) -> None:
         self.stream, self.transform = stream, transform or tensors
 
     def __iter__(self) -> Iterator[Any]:
@@ -68,7 +59,9 @@ class TorchStream(torch.utils.data.IterableDataset):
                 "A stream is read by the process that trains, since the cluster works ahead: give "
                 "the DataLoader num_workers=0."
             )
-        with closing(iter(self.stream.of_rank(*_ranks()))) as sweeps:
+        (rank, ranks), jobs = _ranks(), self.stream.numbers
+        own = replace(self.stream, numbers=jobs[rank : len(jobs) - len(jobs) % ranks : ranks])
+        with closing(iter(own)) as sweeps:
             yield from map(self.transform, sweeps)
 
 

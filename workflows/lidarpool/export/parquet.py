@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 import pyarrow as pa
+import pyarrow.dataset
 import pyarrow.parquet as pq
 
 from ..columns.cloud import CHUNK_POINTS, Cloud, CloudLike
@@ -20,7 +21,6 @@ from .pieces import Entry
 from .sweeps import Sweeps
 
 _GROUP_ROWS = 65_536
-_GROUPS_HELD = 2  # of each open job
 
 
 class Pieces(pieces.Pieces):
@@ -75,60 +75,41 @@ class Pieces(pieces.Pieces):
 class Reader(reading.Reader):
     """Reads sweeps of a data set: all columns of each point, by their names in clouds."""
 
-    _held: Mapping[tuple[int, int], Any] = MappingProxyType({})  # {(file, group): rows}
+    _held: Mapping[tuple[str, int], Any] = MappingProxyType({})  # {(file, group): rows}
 
     def file(self, sweep: int) -> str:
         """Return the name of the job's partition."""
         return self.entry.place("parquet")
 
     @cached_property
-    def _groups(self) -> list[tuple[int, int, int, int]]:
-        """First and last scan of each group of rows, its file, and its number there."""
-        groups = []
-        for number, file in enumerate(self._files):
-            column = file.schema_arrow.get_field_index("scan")
-            for group in range(file.metadata.num_row_groups):
-                scans = file.metadata.row_group(group).column(column).statistics
-                if scans is not None and scans.has_min_max:
-                    groups.append((scans.min, scans.max, number, group))
-        return groups
+    def _table(self) -> Any:
+        if self.place.is_local:
+            return pyarrow.dataset.dataset(self.place.path(self.file(0)), format="parquet")
+        system, folder = self.place.file_system()
+        return pyarrow.dataset.dataset(
+            f"{folder}/{self.file(0)}", format="parquet", filesystem=system
+        )
 
-    @cached_property
-    def _files(self) -> list[pq.ParquetFile]:
-        folder = self.place.below(self.file(0))
-        names = sorted(name for name in folder.sizes() if name.endswith(".parquet"))
-        if not names:
-            raise FileNotFoundError(2, "it has no file")
-        if folder.is_local:
-            return [pq.ParquetFile(folder.local(name)) for name in names]
-        system, path = folder.file_system()
-        return [pq.ParquetFile(f"{path}/{name}", filesystem=system) for name in names]
-
-    def _read(self, file: int, group: int) -> Any:
+    def _group(self, fragment: Any) -> Any:
         """Read a group of rows; neighbouring sweeps share some."""
-        if (file, group) not in self._held:
-            # Threads of its own would be many beside those of the workers that load data.
-            rows = self._files[file].read_row_group(group, use_threads=False)
-            self._held = dict([*self._held.items()][1 - _GROUPS_HELD :]) | {(file, group): rows}
-        return self._held[file, group]
+        key = fragment.path, fragment.row_groups[0].id
+        if key not in self._held:
+            # Threads of their own would be many beside those of the workers that load data.
+            rows = fragment.to_table(use_threads=False)
+            self._held = dict([*self._held.items()][-1:]) | {key: rows}
+        return self._held[key]
 
     def read(self, sweep: int) -> reading.PointColumns:
         """Return the points of a sweep, of which only groups of rows with its scans are read."""
         first, stop = self.sweeps.scans[sweep : sweep + 2].tolist()
-        there = [where for low, high, *where in self._groups if low < stop and high >= first]
-        tables = [self._read(*where) for where in there] or [
-            self._files[0].schema_arrow.empty_table()
-        ]
-        rows = pa.concat_tables(tables)
+        scan = pyarrow.dataset.field("scan")
+        near = (scan >= first) & (scan < stop)
+        files = self._table.get_fragments(near)
+        groups = [self._group(one) for file in files for one in file.split_by_row_group(near)]
+        rows = pa.concat_tables(groups or [self._table.schema.empty_table()])
         begin, end = np.searchsorted(rows["scan"].to_numpy(), (first, stop))
         rows = rows.slice(begin, end - begin)
         names = {column.in_files: column.name for column in TABLE.values()}
         columns = {names.get(name, name): rows[name].to_numpy() for name in rows.column_names}
         positions = np.stack([columns.pop(axis) for axis in "xyz"], axis=1)
         return self.inside(sweep, Cloud(positions, columns))
-
-    def close(self) -> None:
-        """Close the files."""
-        for file in self.__dict__.get("_files", ()):
-            file.close()
-        super().close()

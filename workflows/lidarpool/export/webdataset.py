@@ -5,9 +5,9 @@ from __future__ import annotations
 import io
 import json
 import tarfile
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict
 from functools import cached_property, partial
-from typing import Any
 
 import numpy as np
 
@@ -26,16 +26,14 @@ _OWN = ("points", "pose", "boxes")  # arrays that are no columns
 
 
 class Pieces(pieces.Pieces):
-    """A tar file for each hundred sweeps or million points, such as `shards/000000.tar`.
+    """A tar file for a hundred sweeps or a million points each, such as `shards/000000.tar`.
 
-    Each sweep is a sample, SENSOR-000000, with `points.npy` (float32 n x 3, metres in the sensor's
-    axes when the sweep began), a file for each column, such as `intensity.npy`, `pose.npy` (4 x 4),
-    from these axes to the world's, `boxes.npy` (float32 k x 7: centre, length, width, height and
-    yaw in the sensor's axes), and `json`, which says what the sweep and the boxes are.
-
-    In a data set, the files are `shards/SPLIT/JOB-000000.tar`, the samples JOB/SENSOR-000000, and
-    `json` has what was varied, too. `offsets/JOB.npz` says where each sweep is, int64 (sweeps, 3):
-    the first sweep of its tar file, the sample's first byte there, and its end.
+    A sweep is a sample SENSOR-000000: `points.npy` (float32 n x 3, metres in the sensor's axes when
+    it began), a file for each column, such as `intensity.npy`, `pose.npy` (4 x 4, from these axes
+    to the world's), `boxes.npy` (float32 k x 7: `SweepBoxes.rows`), and `json`, about sweep and
+    boxes. In a data set it is JOB/SENSOR-000000 in `shards/SPLIT/JOB-000000.tar`; `json` has what
+    was varied, too, and `offsets/JOB.npz`, int64 (sweeps, 3), the first sweep of the tar file of
+    each, the sample's first byte there, and its end.
 
     Aizman et al., High performance I/O for large scale deep learning, 2019.
     """
@@ -74,7 +72,9 @@ class Pieces(pieces.Pieces):
 
     def others(self, made: Sequence[Boxes | None]) -> dict[str, bytes]:
         """Return where the sweeps of a job are."""
-        return {} if self.entry is None else {_index(self.entry): packed({"at": self.offsets})}
+        if self.entry is None:
+            return {}
+        return {f"offsets/{self.entry.name}.npz": packed({"at": self.offsets})}
 
     def _put(self, place: Storage, start: int, tar: io.BytesIO) -> None:
         tar.write(bytes(tarfile.RECORDSIZE - tar.tell() % tarfile.RECORDSIZE))  # two blocks end it
@@ -92,24 +92,21 @@ class Pieces(pieces.Pieces):
             "pose": sweeps.pose.matrix(number),
             "boxes": there.rows,
         }
-        about: dict[str, Any] = {}
-        if entry is not None:
-            about = {"job": entry.name, "job_number": entry.number, "split": entry.split}
-            about["values"] = dict(entry.values)
-        about |= {
+        folder, job = ([], {}) if entry is None else ([entry.name], asdict(entry))
+        about = job | {
             "sensor": sweeps.sensors[sweeps.sensor[number]],
-            "number": int(sweeps.numbers[number]),
+            "sweep": int(sweeps.numbers[number]),
             "time_ns": round(sweeps.begins_ns[number]),
             "box_names": there.names,
             "box_types": there.types,
             "box_objects": there.objects.tolist(),
             "box_points": there.points.tolist(),
         }
-        files: Mapping[str, bytes] = {f"{name}.npy": _npy(array) for name, array in arrays.items()}
+        files = {f"{name}.npy": _npy(array) for name, array in arrays.items()}
+        files["json"] = json.dumps(about).encode()
         key = f"{self.names[sweeps.sensor[number]]}-{sweeps.numbers[number]:06}"
-        key = key if entry is None else f"{entry.name}/{key}"
-        for name, data in {**files, "json": json.dumps(about).encode()}.items():
-            head = tarfile.TarInfo(f"{key}.{name}")  # of 1970, and of nobody
+        for name, data in files.items():
+            head = tarfile.TarInfo("/".join([*folder, f"{key}.{name}"]))  # of 1970, and of nobody
             head.size = len(data)
             yield head.tobuf() + data + bytes(-len(data) % tarfile.BLOCKSIZE)
 
@@ -119,7 +116,7 @@ class Reader(reading.Reader):
 
     @cached_property
     def _offsets(self) -> Ints:
-        name = _index(self.entry)
+        name = f"offsets/{self.entry.name}.npz"
         with open_archive(self.place.path(name), partial(self.place.read, name)) as arrays:
             return arrays["at"]
 
@@ -137,12 +134,10 @@ class Reader(reading.Reader):
         arrays: dict[str, AnyArray] = {}
         with tarfile.open(fileobj=data, mode="r:") as tar:
             for member in tar:
-                name = member.name.rpartition("/")[2].partition(".")[2]
-                if name.endswith(".npy") and name != "boxes.npy":
+                name, _, ending = member.name.rpartition("/")[2].partition(".")[2].rpartition(".")
+                if ending == "npy" and name not in ("pose", "boxes"):
                     data.seek(member.offset_data)
-                    part = io.BytesIO(data.read(member.size))
-                    arrays[name.removesuffix(".npy")] = read_npy(part, name)
-        del arrays["pose"]
+                    arrays[name] = read_npy(io.BytesIO(data.read(member.size)), name)
         return arrays.pop("points"), arrays
 
 
@@ -157,7 +152,3 @@ def _shard(entry: Entry | None, start: int) -> str:
     if entry is None:
         return f"shards/{start:06}.tar"
     return "/".join(filter(None, ("shards", entry.split, f"{entry.name}-{start:06}.tar")))
-
-
-def _index(entry: Entry) -> str:
-    return f"offsets/{entry.name}.npz"

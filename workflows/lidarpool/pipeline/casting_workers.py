@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pickle
 import time
 import warnings
 from collections.abc import Callable, Iterable, Mapping
@@ -23,6 +24,7 @@ from poolpart import (
 from ..base.errors import LidarpoolError
 from ..base.software import difference, software_there
 from ..scene.scene import Scene
+from ..sensor import Survey
 from .failures import JobError, error_of, raise_if_failed, was_killed, words_on_memory
 from .job_state import Outcome
 from .messages import BatchRange
@@ -30,6 +32,7 @@ from .names import INTERSECT
 from .rigs import CastWork, RigFailed, RigMissing, drop_all, intersect
 
 LOOK_EVERY_S = 1.0
+_UNSENT = pickle.PicklingError, TypeError, AttributeError, ValueError, RecursionError
 SETUP_DEATHS = 4  # workers in a row that may die while they are checked
 ANSWER_S = 1.0  # longest wait for a checked worker's answer without a sign of life
 RELEASE_S = 3.0  # for workers to drop their rigs
@@ -120,8 +123,18 @@ class CastingWorkers:
 
     # -- jobs ------------------------------------------------------------------------------
 
-    def add(self, job: int, scene: Scene, survey: bytes) -> str:
-        """Let a job be cast, its survey pickled; returns a name that jobs of one scene share."""
+    def add(self, job: int, scene: Scene, survey: Survey) -> tuple[bytes, str]:
+        """Let a job be cast; returns its survey, pickled, and a name that jobs of one scene share.
+
+        JobError if it cannot be pickled.
+        """
+        try:
+            packed = _pickled(survey)
+            return packed, self._add(job, scene, packed)
+        except _UNSENT as error:  # of pickling what a user has defined
+            raise JobError(f"The survey cannot be sent to the workers: {error}") from error
+
+    def _add(self, job: int, scene: Scene, survey: bytes) -> str:
         # What identifies its still part while it exists: jobs of it share their trees.
         key = tuple(id(getattr(scene, f.name)) for f in fields(scene) if f.name != "actors")
         still = self._scenes.pop(key, None)

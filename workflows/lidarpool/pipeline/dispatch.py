@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import time
 from collections import deque
-from collections.abc import Collection, Iterable, Mapping, Sequence
-from typing import Protocol
+from collections.abc import Collection, Iterable, Mapping
 
 from poolpart import TaskLocations, TaskRecord
 
@@ -14,30 +13,12 @@ from . import policies
 from .casting_workers import CastingWorkers
 from .failures import JobError
 from .job_state import Batch, BatchState, JobState, Outcome
+from .long_stages import LongStages
 from .messages import CollectOrder, ColumnsLost, Receipt, scans_in_words
 from .names import COLLECT, GENERATE, GPU, INTERSECT, LIDAR
 
 ADVISED_AGAIN = 0.2  # change of the scans in an item of stage 1 that is worth a request
 PIECES = 16  # a failing batch is divided into so many
-
-
-class Collectors(Protocol):
-    """Stages 1 and 4, as far as a dispatcher asks them; `LongStages` describes the methods."""
-
-    collector_count: int
-
-    @property
-    def collectors(self) -> Mapping[str, str]:
-        """{name: address of the worker} of those that run."""
-
-    def advise(self, scans: int) -> None:
-        """Tell stage 1 how many scans an item should have."""
-
-    def send(self, name: str, messages: Sequence[CollectOrder], /) -> None:
-        """Send orders to a collector."""
-
-    def store_held(self, receipt: Receipt) -> bool:
-        """Store a part that its worker holds; False if it is lost."""
 
 
 class Dispatcher:
@@ -47,7 +28,7 @@ class Dispatcher:
     dropped.
     """
 
-    def __init__(self, workers: CastingWorkers, stages: Collectors, mark: str) -> None:
+    def __init__(self, workers: CastingWorkers, stages: LongStages, mark: str) -> None:
         self.batches: dict[tuple[int, int], Batch] = {}  # {(job, first scan): batch}
         self.failed: dict[JobState, JobError] = {}
         self.advice = 1  # scans that stage 1 was told to put into an item

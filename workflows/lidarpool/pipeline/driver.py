@@ -10,12 +10,9 @@ and workers.
 
 from __future__ import annotations
 
-import pickle
 import time
 from collections.abc import Callable, Iterable, Sequence
 from itertools import chain
-
-import cloudpickle
 
 from ..columns.cloud import Cloud
 from ..scene.scene import Scene
@@ -44,7 +41,6 @@ WAIT_S = 0.05  # for news, where there is nothing else to do
 LINGER_S, MOST_LINGERING = 0.004, 6  # of a wait, for more news, for each of so many jobs at most
 CLOSING_S = 0.001  # longest wait while the stages end
 ANNOUNCED = 2  # jobs that stage 1 should have before it, however large they are
-_UNSENT = pickle.PicklingError, TypeError, AttributeError, ValueError, RecursionError
 
 
 class RunDriver:
@@ -86,7 +82,7 @@ class RunDriver:
         is committed. Frames read their points with `read`. `on_parts` is called with parts that
         were committed.
         """
-        packed, scene_name = send_job(self.workers, number, scene, survey)
+        packed, scene_name = self.workers.add(number, scene, survey)
         parts = self._db.job(number, survey.scan_count)
         parts.has_frames = on_frame is not None
         job = self.jobs[number] = JobState(
@@ -302,17 +298,3 @@ class RunDriver:
                 self.book.add(record)
         finally:
             self.workers.release()
-
-
-def send_job(
-    workers: CastingWorkers, number: int, scene: Scene, survey: Survey
-) -> tuple[bytes, str]:
-    """Let workers cast a job; returns its survey, pickled, and what jobs of its scene share.
-
-    JobError if it cannot be sent to workers.
-    """
-    try:
-        packed: bytes = cloudpickle.dumps(survey, protocol=5)
-        return packed, workers.add(number, scene, packed)
-    except _UNSENT as error:  # of pickling what a user has defined
-        raise JobError(f"The survey cannot be sent to the workers: {error}") from error

@@ -27,7 +27,7 @@ from .watch import Waiting, Watch
 LOST_S = 0.5  # for a client to notice that its scheduler is gone
 
 # Errors that Dask raises once the scheduler is gone; those of connections are OSErrors.
-CLUSTER_LOST = (OSError, FutureCancelledError, PipeClosed, PipeFailed)
+_CLUSTER_LOST = (OSError, FutureCancelledError, PipeClosed, PipeFailed)
 
 
 def client_of(
@@ -44,14 +44,6 @@ def client_of(
     workers = options.gpu_workers, options.other_workers
     local = local_client(needed, *workers, tls=options.tls)
     return screen.starting(local, "starting the workers", own=True)
-
-
-def lost_error(address: str) -> LidarpoolError:
-    """Return the error of a run whose cluster was lost."""
-    return LidarpoolError(
-        f"The cluster at {address} cannot be reached any more, or somebody cancelled "
-        "the tasks of this run; it has ended without a result."
-    )
 
 
 class Cluster:
@@ -105,7 +97,7 @@ class Cluster:
             raise
         except Exception as error:  # the kind depends on the request
             if client.status != "running" or isinstance(error, CommClosedError):
-                raise lost_error(self.address) from error
+                raise self._lost_error() from error
             raise
         names = sorted({name for worker in self._pool for name in worker.partitions})
         self.partitions = {name: Partition(name, client) for name in names}
@@ -121,6 +113,12 @@ class Cluster:
             with suppress(PoolError, OSError):
                 for partition in self.partitions.values():
                     partition.want(0)
+
+    def _lost_error(self) -> LidarpoolError:
+        return LidarpoolError(
+            f"The cluster at {self.address} cannot be reached any more, or somebody cancelled "
+            "the tasks of this run; it has ended without a result."
+        )
 
     def tasks(self, name: str) -> Tasks[Any]:
         """Tasks for a partition, none yet."""
@@ -157,7 +155,7 @@ class Cluster:
             yield
         finally:
             if self.client.status == "running":
-                with suppress(PoolError, *CLUSTER_LOST):
+                with suppress(PoolError, *_CLUSTER_LOST):
                     self._pool.leave_page()
 
     @contextmanager
@@ -177,8 +175,8 @@ class Cluster:
                 raise
             if isinstance(error, PoolError) and not lost:
                 raise LidarpoolError(str(error)) from error
-            if isinstance(error, CLUSTER_LOST) or (lost and isinstance(error, Exception)):
-                raise lost_error(self.address) from error
+            if isinstance(error, _CLUSTER_LOST) or (lost and isinstance(error, Exception)):
+                raise self._lost_error() from error
             raise
         finally:
             self._want_nothing()
@@ -188,7 +186,7 @@ class Cluster:
         until = time.monotonic() + LOST_S
         while (
             self.client.status == "running"
-            and isinstance(error, CLUSTER_LOST)
+            and isinstance(error, _CLUSTER_LOST)
             and time.monotonic() < until
         ):
             time.sleep(0.01)

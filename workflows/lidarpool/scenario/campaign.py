@@ -192,21 +192,6 @@ class CampaignSpec:
         """Return the name of a job's split; empty without splits."""
         return self._splits(self._known(number))
 
-    def of_splits(self, split: str | Sequence[str] | None) -> Sequence[int]:
-        """Return the numbers of the jobs of a split or some, of all for None.
-
-        LidarpoolError if there is no such split.
-        """
-        if split is None:
-            return range(self.count)
-        wanted = [split] if isinstance(split, str) else list(split)
-        for name in wanted:
-            if name not in self.splits:
-                known = f" It has {', '.join(self.splits)}." if self.splits else " It has none."
-                hint = did_you_mean(name, list(self.splits)) or known
-                raise LidarpoolError(f"The campaign has no split {name!r}.{hint}")
-        return [number for number in range(self.count) if self.split(number) in wanted]
-
     def scenario(self, number: int) -> Scenario | None:
         """Return what a job is built of; None if a function makes it.
 
