@@ -72,7 +72,7 @@ class Workers:
 
     def add(self, job, scene, survey):
         self.jobs[job] = scene
-        return str(id(scene))
+        return b"", str(id(scene))
 
     def remove(self, job):
         del self.jobs[job]

@@ -638,8 +638,8 @@ def test_documentation_and_installation_follow_the_table_of_formats():
 def test_workers_and_threads_write_the_same_files(sweeps, cloud, tmp_path, name, monkeypatch):
     """What workers do not see is written here."""
     monkeypatch.setattr(parquet, "CHUNK_POINTS", 1000)
-    Format(name).write(tmp_path / "threads", cloud, sweeps)
     monkeypatch.setattr(pieces, "RANGE_PIECES", 1)
+    Format(name).write(tmp_path / "threads", cloud, sweeps)
     ranges, sent = [], []
 
     def workers(writer, spans):

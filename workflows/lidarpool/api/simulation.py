@@ -255,6 +255,8 @@ class Campaign(described.CampaignSpec):  # noqa: D101 - as there
         split: str | None = None,
         backend: str | None = None,
         gpu_workers: int | None = None,
+        wait_s: float = WAIT_S,
+        patience_s: float = PATIENCE_S,
     ) -> SweepStream:
         """Stream the sweeps of the jobs while they are cast, without a data set.
 
@@ -276,5 +278,7 @@ class Campaign(described.CampaignSpec):  # noqa: D101 - as there
             )
             raise LidarpoolError(f"The campaign has no split {split!r}.{known}")
         numbers = [n for n in range(self.count) if split in (None, self.split(n))]
-        options = RunOptions(client=client, gpu_workers=gpu_workers).with_pool(self.pool, backend)
-        return SweepStream(self, numbers, ahead, options)
+        options = RunOptions(
+            client=client, gpu_workers=gpu_workers, wait_s=wait_s, patience_s=patience_s
+        )
+        return SweepStream(self, numbers, ahead, options.with_pool(self.pool, backend))
