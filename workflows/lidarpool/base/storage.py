@@ -235,7 +235,7 @@ class Storage:
                 file.seek(first)
                 return file.read(-1 if stop is None else stop - first)
         with self._remote() as (system, folder):
-            return bytes(system.cat_file(f"{folder}/{name}", first or None, stop))
+            return bytes(system.cat_file(f"{folder}/{name}", start=first or None, end=stop))
 
     def checksum(self, name: str) -> list[int]:
         """Bytes of a file and their CRC-32, read a piece at a time."""
