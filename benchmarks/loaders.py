@@ -2,8 +2,7 @@
 
     python -m benchmarks.loaders [FORMAT ...]
 
-Both read the same files, which are in memory, in order and in one process. It needs the packages
-webdataset, pykitti, nuscenes-devkit and pyarrow; formats without theirs are left out.
+Both read the same files in order. Formats whose package is not installed are left out.
 """
 
 import sys
@@ -29,8 +28,7 @@ POINTS, TURNS, JOBS, ROUNDS = 30_000, 20, 6, 7
 def webdataset(place):
     import webdataset as wds
 
-    shards = sorted(map(str, place.rglob("*.tar")))
-    yield from wds.WebDataset(shards, shardshuffle=False).decode()
+    yield from wds.WebDataset([*map(str, place.rglob("*.tar"))], shardshuffle=False).decode()
 
 
 def kitti(place):
@@ -38,8 +36,7 @@ def kitti(place):
 
     for folder in (place / "sequences").iterdir():
         drive = pykitti.odometry(str(place), folder.name)
-        for number, points in enumerate(drive.velo):
-            # It reads no labels: this is what semantic-kitti-api does.
+        for number, points in enumerate(drive.velo):  # the labels as semantic-kitti-api reads them
             labels = np.fromfile(folder / f"labels/{number:06}.label", np.uint32)
             yield points, labels & 0xFFFF, labels >> 16, drive.poses[number]
 

@@ -224,3 +224,10 @@ def test_others_are_refused_in_a_line(tmp_path, monkeypatch, data, words):
         with pytest.raises(LidarpoolError, match=words) as told:
             Sweeps.load(path, read)
         assert re.match(rf"{path}\b[^\n]*\.$", str(told.value))
+
+
+def test_a_range_of_a_file_is_read(tmp_path):
+    for storage in (Storage.at(tmp_path), Storage.at(tmp_path.as_uri())):
+        storage.write("x", b"0123456789")
+        assert (storage.read("x"), storage.read("x", 3, 6)) == (b"0123456789", b"345")
+        assert (storage.read("x", 8, 20), storage.read("x", 0, 2)) == (b"89", b"01")
