@@ -52,11 +52,11 @@ PARTS_FOLDER = re.compile("run-[0-9a-f]{16}")  # names of `parts_folder`
 class JobParts:
     """What is committed of a job under way; only its `RunDatabase` adds and removes parts.
 
-    `read` reads the summaries of a part.
+    `scans` are all that are to be done, and `read` reads the summaries of a part.
     """
 
-    def __init__(self, number: int, scan_count: int, read: Callable[[Receipt], bytes]) -> None:
-        self.number, self.scan_count, self._read = number, scan_count, read
+    def __init__(self, number: int, scans: range, read: Callable[[Receipt], bytes]) -> None:
+        self.number, self.scans, self._read = number, scans, read
         self.has_frames = False  # whether scans are handed out as frames, too
         self.clear()
 
@@ -65,15 +65,16 @@ class JobParts:
         self.ordered: list[Receipt] = []  # the parts in scan order, without summaries
         self.trials: list[Trial] = []
         self.scans_done = self.point_count = self.hits = 0
-        self.frames = self.frames_written = 0  # scans handed out as frames, from the first on
+        # One past the last scan that was handed out as a frame, from the first on.
+        self.frames = self.frames_written = self.scans.start
 
     # -- reading -------------------------------------------------------------------------
 
     @property
     def complete(self) -> bool:
         """Whether all scans are committed, and were handed out if there are frames."""
-        framed = not self.has_frames or self.frames == self.scan_count
-        return framed and self.scans_done == self.scan_count
+        framed = not self.has_frames or self.frames == self.scans.stop
+        return framed and self.scans_done == len(self.scans)
 
     @property
     def cells(self) -> Ints | None:
@@ -195,11 +196,14 @@ class RunDatabase:
 
     # -- reading -------------------------------------------------------------------------
 
-    def job(self, number: int, scan_count: int) -> JobParts:
-        """Return what is committed of a job that has not ended; kept until it has."""
+    def job(self, number: int, stop: int, first: int = 0) -> JobParts:
+        """Return what is committed of a job that has not ended; kept until it has.
+
+        Its scans from `first` to `stop`, half-open, are to be done.
+        """
         if (found := self.under_way.get(number)) is not None:
             return found
-        job = JobParts(number, scan_count, self._summaries)
+        job = JobParts(number, range(first, stop), self._summaries)
         if number in self.begun:
             with _explained(self.path):
                 self._read(job)
@@ -207,18 +211,16 @@ class RunDatabase:
         return job
 
     def _read(self, job: JobParts) -> None:
-        number, scan_count = job.number, job.scan_count
+        number, scans = job.number, job.scans
         query = "SELECT first, stop, rows, size, hits, cells FROM parts WHERE job = ?"
         for first, stop, *counts, cells in self._rows(query, number):
-            if not 0 <= first < stop <= scan_count:
-                raise ValueError(f"a part has scans {first} to {stop} of {scan_count}")
+            if not scans.start <= first < stop <= scans.stop:
+                raise ValueError(f"a part has scans {first} to {stop} of {scans}")
             name, box = part_name(self.meta["mark"], number, first, stop), json.loads(cells)
             rows, size, hits = counts
             job.enter(Receipt(number, first, stop, name, rows, size, hits, tuple(box), b""))
         query = "SELECT data FROM trials WHERE job = ? ORDER BY trial"
-        for data in (json.loads(text) for (text,) in self._rows(query, number)):
-            waypoints = np.array(data.pop("waypoints"), np.float64).reshape(-1, 2)
-            job.trials.append(Trial(waypoints=waypoints, **data))
+        job.trials += [unpack_trial(text) for (text,) in self._rows(query, number)]
         for (count,) in self._rows("SELECT count FROM frames WHERE job = ?", number):
             job.frames = job.frames_written = int(count)
 
@@ -311,8 +313,7 @@ class RunDatabase:
         with self._transaction():
             self._sql.executemany(
                 "INSERT OR IGNORE INTO trials VALUES (?, ?, ?)",
-                # To the bit: a float is written with the digits that identify it.
-                [(number, t.trial, json.dumps(vars(t), default=np.ndarray.tolist)) for t in trials],
+                [(number, trial.trial, pack_trial(trial)) for trial in trials],
             )
         self.begun.add(number)
         self.under_way[number].trials += trials
@@ -415,6 +416,18 @@ def _explained(path: Path) -> Iterator[None]:
         raise LidarpoolError(
             f"{path} cannot be written ({words}): make room on its disk, or give another folder."
         ) from error
+
+
+def pack_trial(trial: Trial) -> str:
+    """Write a trial as JSON, to the bit: a float has the digits that identify it."""
+    return json.dumps(vars(trial), default=np.ndarray.tolist)
+
+
+def unpack_trial(text: str) -> Trial:
+    """Inverse of `pack_trial`."""
+    data = json.loads(text)
+    waypoints = np.array(data.pop("waypoints"), np.float64).reshape(-1, 2)
+    return Trial(waypoints=waypoints, **data)
 
 
 def parts_folder(mark: str) -> str:

@@ -5,13 +5,14 @@ from __future__ import annotations
 import json
 import re
 import time
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 from ..base.errors import LidarpoolError, explained
+from ..base.shard import Shard
 from ..base.software import difference, software
 from ..base.storage import Storage
 from ..base.words import plural
@@ -24,11 +25,12 @@ from ..run.conductor import Conductor, Output
 from ..run.job_points import listed
 from ..run.run_result import CampaignRun
 from ..run.store import RUN_FOLDER, RunStore, remove_run
-from ..scenario.campaign import CampaignSpec, hashes
+from ..scenario.campaign import CampaignSpec, Described, hashes
+from ..scenario.campaign_sections import Keep
 
 CAMPAIGN_FILE = "campaign.json"  # whose data set this is, and the software that made it
 
-# With what `_write_shared` writes, CAMPAIGN_FILE first.
+# With what `write_shared` writes, CAMPAIGN_FILE first.
 _FINISHED = re.compile(
     OF_JOBS.pattern + r"|(campaign|dataset|report)\.json|README\.md|report\.html|pictures/\w+\.png|"
     r"jobs\.(csv|parquet)|splits/[^/]+\.txt"
@@ -78,8 +80,14 @@ class DataSetOutput(Output[CampaignRun]):
         if not conductor.resume or CAMPAIGN_FILE not in there or unfinished:
             return None
         self._made = check_same(out, self.campaign)
+        if (there := self._made["shards"]) != (here := shards_of(self.campaign.shard)):
+            raise LidarpoolError(
+                f"{out} holds {_shards_in_words(there)}, and {_shards_in_words(here)} cannot be "
+                "added by a run: give another folder with --out."
+            )
         whole, self._wrong = _look(self.dataset, read_table(out), options.verify, self.campaign)
-        if whole != self.campaign.count or self._wrong or not _is_indexed(out, whole):
+        there = whole == len(self.campaign.numbers) and _is_indexed(out, whole)
+        if not there or self._wrong:
             return None
         if RUN_FOLDER in there:  # a killed run has not removed all of itself
             remove_run(kept)
@@ -94,7 +102,7 @@ class DataSetOutput(Output[CampaignRun]):
         """Compare what is there with what the store says is done; take over what it lacks."""
         store, options, out = conductor.store, conductor.options, self.dataset.place
         if self._made is not None:
-            rows = [row for row in read_table(out) if row.number < self.campaign.count]
+            rows = [row for row in read_table(out) if row.number in self.campaign.numbers]
             store.cast_with(self._made["backend"], self._made["casting"])
             store.adopt(rows, sensors=json.dumps(self._made["sensors"]))
         elif conductor.resume:
@@ -133,7 +141,10 @@ class DataSetOutput(Output[CampaignRun]):
         seconds = time.monotonic() - conductor.started
         more = {"stages": cast.stages if cast else (), "notes": tuple(store.notes)}
         run = CampaignRun.of(store.rows(), seconds, store.resumed, sensors=store.sensors, **more)
-        self._write_shared(store, run)
+        record: dict[str, Any] = {"identity": dict(store.identity), "casting": store.casting}
+        record |= {"backend": store.backend, "sensors": run.sensors}
+        record |= {"files": hashes(self.campaign.files), "campaign": asdict(self.campaign.described)}
+        write_shared(self.dataset, record | {"shards": shards_of(self.campaign.shard)}, run, store.rows)
         if run.failed:
             store.save(now=True)
             store.db.close()
@@ -142,22 +153,53 @@ class DataSetOutput(Output[CampaignRun]):
         conductor.page.finish(run.seconds)
         return run
 
-    def _write_shared(self, store: RunStore, run: CampaignRun) -> None:
-        """Write what all jobs share, and last what says that the data set is complete."""
-        # Matplotlib takes as long as all other imports.
-        from .campaign_report import write_card
-        from .charts import draw_sweep
 
-        campaign, place = self.campaign, self.dataset.place
-        made: dict[str, Any] = {"identity": dict(store.identity), "casting": store.casting}
-        made |= {"backend": store.backend, "sensors": run.sensors}
-        with explained(f"{place} cannot be written"):
-            place.write(CAMPAIGN_FILE, (json.dumps(made, indent=1) + "\n").encode())
-        write_table(place, campaign.names, store.rows)
-        self.dataset.finish(store.rows())
-        saved = sweeps(place.url)
-        picture = draw_sweep(next(iter(saved))) if len(saved) else None
-        write_card(place, campaign, run, store.rows(), store.casting or software(), picture)
+def write_shared(
+    dataset: DataSet,
+    record: Mapping[str, Any],
+    run: CampaignRun,
+    rows: Callable[[], Iterator[JobRow]],
+) -> dict[str, Any]:
+    """Write what all jobs share, and last what says that the data set is complete.
+
+    `record` is the content of CAMPAIGN_FILE. Returns that of report.json.
+    """
+    # Matplotlib takes as long as all other imports.
+    from .campaign_report import write_card
+    from .charts import draw_sweep
+
+    campaign, place = described(record), dataset.place
+    write_record(place, record)
+    write_table(place, campaign.names, rows)
+    dataset.finish(rows())
+    saved = sweeps(place.url)
+    picture = draw_sweep(next(iter(saved))) if len(saved) else None
+    return write_card(place, campaign, run, rows(), record["casting"] or software(), picture)
+
+
+def described(record: Mapping[str, Any]) -> Described:
+    """Return what a data set's record says of its campaign."""
+    told = record["campaign"]
+    own = {"keep": Keep(**told["keep"]), "names": tuple(told["names"])}
+    return Described(**{**told, **own})
+
+
+def write_record(place: Storage, record: Mapping[str, Any]) -> None:
+    """Write CAMPAIGN_FILE."""
+    with explained(f"{place} cannot be written"):
+        place.write(CAMPAIGN_FILE, (json.dumps(record, indent=1) + "\n").encode())
+
+
+def shards_of(shard: Shard) -> dict[str, Any] | None:
+    """Return what a record says of the shards that are there; None if it is all of them."""
+    return None if shard.of == 1 else {"of": shard.of, "there": [shard.number]}
+
+
+def _shards_in_words(shards: Mapping[str, Any] | None) -> str:
+    if shards is None:
+        return "all jobs"
+    there = listed([f"{number}/{shards['of']}" for number in shards["there"]])
+    return f"{'shard' if len(shards['there']) == 1 else 'shards'} {there}"
 
 
 def _look(
@@ -178,6 +220,11 @@ def _look(
                 raise LidarpoolError(
                     f"{dataset.place} has job {row.name}, and count is {campaign.count:,}: a "
                     "campaign can only grow. Give another folder with --out."
+                )
+            if campaign is not None and row.number not in campaign.numbers:
+                raise LidarpoolError(
+                    f"{dataset.place} has job {row.name}, which is not of shard {campaign.shard}: "
+                    "give another folder with --out."
                 )
             if difference:
                 wrong[row.number] = f"job {row.name} ({difference})"
@@ -251,7 +298,7 @@ def check_same(place: Storage, campaign: CampaignSpec) -> Mapping[str, Any]:
 def _own_files(out: Storage, *, begun: bool) -> list[str]:
     """Name the files of a data set, which has begun or is empty.
 
-    LidarpoolError if there is a link, or a file that neither jobs nor `_write_shared` write.
+    LidarpoolError if there is a link, or a file that neither jobs nor `write_shared` write.
     """
     files = [name for name in out.tree() if not _BESIDE.fullmatch(name)]
     own = _FINISHED if CAMPAIGN_FILE in files else OF_JOBS

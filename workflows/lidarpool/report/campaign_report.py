@@ -16,7 +16,7 @@ from ..datasets.job_table import JobRow
 from ..export.folder import LAST_FILE
 from ..render.picture_page import Page
 from ..run.run_result import CampaignRun
-from ..scenario.campaign import CampaignSpec
+from ..scenario.campaign import Described
 from .charts import draw_results, draw_varied
 from .page.rendering import rendered
 from .report import stage_figures
@@ -32,7 +32,7 @@ _CAPTIONS = {
 
 def write_card(
     place: Storage,
-    campaign: CampaignSpec,
+    campaign: Described,
     run: CampaignRun,
     jobs: Iterable[JobRow],
     versions: Mapping[str, str],
@@ -118,7 +118,7 @@ def _with_splits(place: Storage, jobs: Iterable[JobRow]) -> Iterator[JobRow]:
 
 
 def campaign_report(
-    campaign: CampaignSpec, run: CampaignRun, versions: Mapping[str, str], figures: Figures
+    campaign: Described, run: CampaignRun, versions: Mapping[str, str], figures: Figures
 ) -> dict[str, Any]:
     """Return the figures of a data set, as in report.json."""
     return {

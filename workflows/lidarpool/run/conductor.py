@@ -31,6 +31,7 @@ class Output(Generic[R]):
     """Where what a run makes goes."""
 
     dataset: DataSet | None = None  # that jobs are written into; else the only job's parts stay
+    casts = True  # whether scans that are missing are cast
 
     def held(self) -> AbstractContextManager[object]:
         """Lock the place while the body runs."""
@@ -132,10 +133,10 @@ class Conductor(Generic[R]):
     def _first_job(self) -> MadeJob | None:
         """Wait for a job that can be made; None if nothing is left to be cast."""
         if (only := self.store.only) is not None:
-            return None if only.complete else MadeJob(only.job)
+            return None if only.complete or not self.output.casts else MadeJob(only.job)
         jobs, dataset, db = self.jobs, self.output.dataset, self.store.db
         assert not isinstance(jobs, OneJob) and dataset is not None, "it is a campaign"
-        left = (number for number in range(jobs.count) if not db.ended(number))
+        left = (number for number in jobs.numbers if not db.ended(number))
         self._maker = JobMaker(jobs, left, dataset.columns)
         self.stack.callback(self._maker.close)
         while isinstance(found := self._maker.take(wait=True), JobRow):

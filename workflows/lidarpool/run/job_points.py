@@ -37,8 +37,11 @@ class JobPoints:
 
     def __init__(self, store: RunStore, job: Job) -> None:
         self.job, self._store = job, store
-        self.parts: JobParts = store.db.job(job.number, job.survey.scan_count)
         only = isinstance(store.jobs, OneJob)
+        scans = range(job.survey.scan_count)
+        if only:
+            scans = store.jobs.shard.scans(job.survey.scan_count)
+        self.parts: JobParts = store.db.job(job.number, scans.stop, scans.start)
         self.parts.has_frames = only
         self.identified = only  # whether it is kept what the job is made of
         self.sweeps: Sweeps | None = None  # of a job for a data set, once it was made
@@ -105,7 +108,7 @@ class JobPoints:
     def kept(self) -> str:
         """Committed scans and trials in words; empty for none."""
         if self.parts.scans_done:
-            return f"{self.parts.scans_done:,} of {self.job.survey.scan_count:,} scans"
+            return f"{self.parts.scans_done:,} of {len(self.parts.scans):,} scans"
         if self.parts.trials:
             return f"{len(self.parts.trials):,} of {self.job.trials:,} planning trials"
         return ""
@@ -119,10 +122,10 @@ class JobPoints:
         """Progress of a resumed run at its start."""
         parts = self.parts
         return Progress(
-            scans=self.job.survey.scan_count,
-            generated=parts.frames,
+            scans=len(parts.scans),
+            generated=parts.frames - parts.scans.start,
             cast=parts.scans_done,
-            framed=parts.frames,
+            framed=parts.frames - parts.scans.start,
             collected=parts.scans_done,
             points=parts.point_count,
             trials=self.job.trials,
@@ -170,7 +173,8 @@ class JobPoints:
         kind = summary_type(samples)
         every = max(1, samples * survey.scan_count // SAMPLE_RAYS)
         rays = [np.empty((0, 2, 3), np.float32)]
-        wanted = dict.fromkeys(range(0, survey.scan_count, every))
+        every_nth = range(0, survey.scan_count, every)
+        wanted = dict.fromkeys(n for n in every_nth if not self.parts.missing(n, n + 1))
         for first, data in self.parts.summaries_of(list(wanted)):
             for scan, summary in enumerate(np.frombuffer(data, kind), first):
                 ends = summary["samples"][~np.isnan(summary["samples"][:, 0])]

@@ -38,6 +38,7 @@ from .remote import OWNER, RemoteRun, fetch_database
 PARTS = "parts"  # the folder of the parts, in the run's folder
 RUN_FOLDER = "run"  # the run's folder in the output folder, until the result is complete
 SENSORS_TOLD = 8  # kinds of a sensor that are named
+_OTHERS = "and others"
 
 # On the command line, and in Python.
 _RESUME = "--resume (in Python resume=True)"
@@ -90,6 +91,7 @@ class RunStore:
         self.begun = False  # whether it goes on with an earlier run
         self._gone = False
         self.identity = software() | dict(jobs.identity)
+        self._whose = self.identity | {"shard": str(jobs.shard)}
         self._remote = None
         kept = Storage.at(tempfile.mkdtemp(prefix="lidarpool-") if place is None else place)
         self.place = self._folder = kept  # that of the run, and that of its database
@@ -151,7 +153,7 @@ class RunStore:
         if new is None:
             mark = secrets.token_hex(8)
             shared = Storage.at(parts).path(parts_folder(mark)) if parts is not None else ""
-            new = {"mark": mark, "identity": json.dumps(self.identity), "parts": shared}
+            new = {"mark": mark, "identity": json.dumps(self._whose), "parts": shared}
         try:
             return RunDatabase(path, durable=durable, **new)
         except LidarpoolError:
@@ -219,8 +221,10 @@ class RunStore:
     def _other(self, identity: str) -> str:
         """Describe the difference of an earlier run in a clause; empty if there is none."""
         there = json.loads(identity)
-        for name, value in self.identity.items():
+        for name, value in self._whose.items():
             if there.get(name) != value:
+                if name == "shard":
+                    return f"it is shard {there.get(name)}, not {value}"
                 if name in CONTENT:
                     return f"it is of another {name}"
                 if name != "lidarpool":
@@ -267,7 +271,7 @@ class RunStore:
         """What is committed, in words; empty for nothing."""
         if self.only is not None:
             return self.only.kept
-        return f"{self.db.ended_count:,} of {self.jobs.count:,} jobs" if self.db.used else ""
+        return f"{self.db.ended_count:,} of {len(self.jobs.numbers):,} jobs" if self.db.used else ""
 
     @property
     def advice(self) -> str:
@@ -330,12 +334,7 @@ class RunStore:
 
     def name_sensors(self, sensors: Iterable[tuple[str, str]]) -> None:
         """Keep names of sensors with model and rate, for the card of the data set."""
-        kept = self.sensors
-        for name, words in sensors:
-            told = kept.setdefault(name, words).split("; ")
-            if words not in told and len(told) <= SENSORS_TOLD:
-                more = words if len(told) < SENSORS_TOLD else "and others"
-                kept[name] = "; ".join([*told, more])
+        kept = with_sensors(self.sensors, sensors)
         if kept != self.sensors:
             self.db.set(sensors=json.dumps(kept))
 
@@ -398,6 +397,17 @@ class RunStore:
             with suppress(OSError, LidarpoolError):
                 _remove(self.place, self.storage, self.db.meta["mark"])
             self._folder.remove([FILE])  # where the place of the parts failed
+
+
+def with_sensors(known: Mapping[str, str], more: Iterable[tuple[str, str]]) -> dict[str, str]:
+    """Return {name of a sensor: its kinds in words} with more: the same in whatever order."""
+    found = dict(known)
+    for name, words in more:
+        kinds = {*found.get(name, words).split("; "), *words.split("; ")}
+        told = sorted(kinds - {_OTHERS})
+        others = [_OTHERS] * (_OTHERS in kinds or len(told) > SENSORS_TOLD)
+        found[name] = "; ".join([*told[:SENSORS_TOLD], *others])
+    return dict(sorted(found.items()))
 
 
 def _hash_of(job: Job) -> str:

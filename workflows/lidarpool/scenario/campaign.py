@@ -7,12 +7,13 @@ import os
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence, Set
 from contextlib import suppress
-from dataclasses import replace
+from copy import copy
+from dataclasses import dataclass, fields, replace
 from functools import cache, cached_property, partial
 from itertools import chain, combinations, count, islice
 from pathlib import Path
 from types import MappingProxyType
-from typing import Annotated, Any
+from typing import Annotated, Any, Self
 
 import numpy as np
 from pydantic import BaseModel, Field
@@ -21,6 +22,7 @@ from pydantic_core import to_json
 from ..base.declared import Seed
 from ..base.errors import LidarpoolError, Mistakes, prefixed
 from ..base.fingerprint import fingerprint
+from ..base.shard import Shard
 from ..base.validation import (
     checked,
     dotted,
@@ -55,6 +57,20 @@ SHOWN_MOST = 5  # files of a command that are named
 _NOISE = "noise.seed"  # where a job's own seed goes
 _KEYS = re.compile(r"""^(?:["']?(?:base|vary)["']?\s*:|\{)""", re.MULTILINE)  # or one mapping {…}
 _UNSAFE = re.compile(r"[^\w.-]+", re.ASCII)  # in a name of files
+
+
+@dataclass(frozen=True)
+class Described:
+    """What the card of a data set says of its campaign; the fields are those of the campaign."""
+
+    title: str
+    license: str
+    command: str
+    description: str
+    seed: int
+    count: int
+    names: tuple[str, ...]
+    keep: Keep
 
 
 class CampaignSpec:
@@ -101,6 +117,7 @@ class CampaignSpec:
     description: str = ""  # the file's text, where there is one
     files: Set[Path]  # that its jobs may be made of; some may be missing
     choices: Mapping[str, str]  # {name: how its value is chosen, «0.2 to 20, log_uniform»}
+    shard = Shard()  # whose jobs a run does, by default all
 
     @checked
     def __init__(
@@ -167,6 +184,22 @@ class CampaignSpec:
         self.command = " ".join(path.name for path in jobs.paths[:SHOWN_MOST])
         self.command += " …" * (jobs.count > SHOWN_MOST)
         return self
+
+    def of_shard(self, shard: Shard) -> Self:
+        """Return the same campaign, of which a run does the jobs of a shard."""
+        made = copy(self)
+        made.shard = shard
+        return made
+
+    @property
+    def described(self) -> Described:
+        """What the card of its data set says."""
+        return Described(**{one.name: getattr(self, one.name) for one in fields(Described)})
+
+    @property
+    def numbers(self) -> range:
+        """Numbers of the jobs that a run does."""
+        return self.shard.jobs(self.count)
 
     @property
     def names(self) -> tuple[str, ...]:
