@@ -74,9 +74,12 @@ class Shard:
         return cls(number + 1, count)
 
     def jobs(self, count: int) -> range:
-        """Jobs of the share, of so many: neighbouring jobs are in different shares."""
+        """Return the jobs of the share, of so many: neighbouring jobs are in different shares."""
         return range(self.number - 1, count, self.of)
 
     def scans(self, count: int) -> range:
-        """Scans of the share, of so many: they are consecutive."""
+        """Return the scans of the share, of so many: they are consecutive."""
         return range(count * (self.number - 1) // self.of, count * self.number // self.of)
+
+
+ALL = Shard()  # of which there is one

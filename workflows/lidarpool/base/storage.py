@@ -258,6 +258,30 @@ class Storage:
         with self._remote() as (system, folder):
             system.get_file(f"{folder}/{name}", str(path))
 
+    def take(self, place: Storage, name: str, own: str = "") -> None:
+        """Have a file of another storage here, completely or not at all, perhaps by its `own` name.
+
+        It is linked (a hard link), or an object store copies it, where that is possible.
+        """
+        own = own or name
+        if self.is_local and place.is_local:
+            target, path = self._target(own), place.local(name)
+            with suppress(FileNotFoundError):
+                if target.samefile(path):  # renaming one link to the other would do nothing
+                    return
+            temporary = target.with_name(f"{TEMPORARY}{target.name}-{secrets.token_hex(4)}")
+            with suppress(OSError):  # another disk, or one without links: it is copied
+                os.link(path, temporary)
+                temporary.replace(target)
+                return
+        with place._remote() as (other, folder):
+            if not self.is_local and self._opened[0] is other:
+                with self._remote() as (system, own_folder):
+                    system.cp_file(f"{folder}/{name}", f"{own_folder}/{own}")
+                return
+            with other.open(f"{folder}/{name}", "rb") as source, self.writing(own) as file:
+                shutil.copyfileobj(source, file, _PIECE)
+
     def sees(self, name: str, data: bytes) -> bool:
         """Whether a file has this content, so that this process sees the same place."""
         try:

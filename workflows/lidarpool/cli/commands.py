@@ -24,6 +24,8 @@ from ..base.interrupts import (
     deferred_interrupts,
     interrupt_on_signals,
 )
+from ..base.shard import ALL, Shard
+from ..base.storage import Storage
 from ..base.vocabulary import PATIENCE_S, QUEUE_S, WAIT_S
 from ..base.words import plural
 from . import shared_options as shared
@@ -148,6 +150,7 @@ def demo(terminal: Terminal, options: RunOptions, only: str | None) -> None:
 @shared.flag("--retry-failed", help="Of a campaign: do the jobs that have failed again.")
 @shared.flag("--verify", help="Compare every byte of a data set, or of the jobs to resume from.")
 @shared.job
+@shared.shard
 @click.option(
     "--parts",
     metavar="PLACE",
@@ -179,6 +182,7 @@ def run(
     no_plan: bool,
     only: str | None,
     number: int | None,
+    shard: Shard | None,
     backend: str | None,
 ) -> None:
     """Run the survey of a scenario or mesh file, or a campaign of many.
@@ -196,9 +200,9 @@ def run(
       lidarpool run part.stl --unit mm --sensor ouster/os1-64 --pose 0,0,1.9 --format las
       lidarpool run examples/seed.yaml --cluster examples/clusters/slurm.yaml
       lidarpool run examples/campaign.yaml --out dataset
+      lidarpool run examples/campaign.yaml --shard 3/10 --out part-3
       lidarpool run --verify dataset
     """  # noqa: D301 - click wants the character, not its name
-    from ..base.storage import Storage
     from ..report.campaign_output import verify
     from ..run.store import RUN_FOLDER
     from ..scenario.campaign import CampaignSpec, is_campaign
@@ -222,17 +226,57 @@ def run(
         )
     if several or (not of_mesh and is_campaign(paths[0])):
         campaign = CampaignSpec.of_scenarios(paths) if several else CampaignSpec.load(paths[0])
+        if number is not None and shard is not None:
+            raise click.UsageError("--job does one job, and --shard a share: give one of them.")
         if number is not None:
             run_job(campaign, number, terminal, options, backend, only)
         elif only is not None:
             raise click.UsageError("--only is for one survey: a data set is written as a whole.")
         else:
-            run_campaign(campaign, terminal, options, backend)
+            run_campaign(campaign.of_shard(shard or ALL), terminal, options, backend)
     elif options.retry_failed or options.verify or number is not None:
         raise click.UsageError("--job, --retry-failed and --verify are for campaigns.")
     else:
         scenario = Scenario.load(paths[0], of_mesh)
-        run_scenario(scenario, terminal, options, backend, no_plan=no_plan, only=only)
+        made_of = {"path": str(paths[0].absolute()), "options": of_mesh, "plans": not no_plan}
+        more: dict[str, Any] = {"no_plan": no_plan, "only": only, "shard": shard}
+        run_scenario(scenario, terminal, options, backend, made_of=made_of, **more)
+
+
+@cli.command()
+@click.argument("shards", metavar="SHARD...", nargs=-1, required=True, type=shared.StoragePath())
+@click.option("--partial", is_flag=True, help="Merge what there is, and say what is missing.")
+@click.option(
+    "--scenario",
+    type=click.Path(path_type=Path),
+    metavar="FILE",
+    help="Of a survey: its scenario or mesh file, if that is not where it was.",
+)
+@shared.out
+@shared.flag("--quiet", "-q", help="No progress, only the result.")
+@shared.as_json
+def merge(
+    shards: tuple[Path | Storage, ...],
+    partial: bool,
+    scenario: Path | None,
+    out: Path | Storage,
+    quiet: bool,
+    as_json: bool,
+) -> None:
+    """Make one data set or result of the folders of shards.
+
+    After a kill, the same command goes on. Shards of a campaign can be added later.
+
+    \b
+    Examples:
+      lidarpool merge part-* --out dataset
+      lidarpool merge s3://bucket/part-1 s3://bucket/part-2 --out s3://bucket/dataset
+    """  # noqa: D301 - click wants the character, not its name
+    from .run_command import run_merge
+    from .terminal import Terminal
+
+    places = [Storage.at(one) for one in shards]
+    run_merge(places, Terminal(quiet, False, as_json), out, partial, scenario)
 
 
 @cli.command()

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import click
 
 from ..base.errors import LidarpoolError
+from ..base.shard import Shard
 from ..base.storage import Storage
 from ..base.words import plural
 from ..datasets.dataset import DataSet
@@ -24,6 +26,7 @@ from ..report.campaign_output import (
     failures,
     verify,
 )
+from ..report.merging import ShardOutput, merge_shards
 from ..report.output import CLOUD, SurveyOutput
 from ..report.report import summary
 from ..run.conductor import Conductor
@@ -49,10 +52,12 @@ def run_scenario(
     *,
     no_plan: bool = False,
     only: str | None = None,
+    shard: Shard | None = None,
+    made_of: Mapping[str, Any] = MappingProxyType({}),
 ) -> None:
     """Run a scenario, write the result and print a summary.
 
-    LidarpoolError if the run fails; notes of the error say what was kept.
+    Of a `shard`, the parts stay, and say what they are `made_of`. LidarpoolError if the run fails; notes of the error say what was kept.
     """
     options = options.with_pool(scenario.pool, backend)
     if options.own:  # before reading the scene, which may take long
@@ -60,7 +65,55 @@ def run_scenario(
     with terminal.status("reading the scene", logged=False):
         built = build(scenario, plans=not no_plan)
         job = built.job()
-    _run_survey(built, job, options, terminal, only)
+    if shard is None:
+        _run_survey(built, job, options, terminal, only)
+    else:
+        _run_shard(job, shard, made_of, options, terminal)
+
+
+def _run_shard(
+    job: Job,
+    shard: Shard,
+    made_of: Mapping[str, Any],
+    options: RunOptions,
+    terminal: Terminal,
+) -> None:
+    """Run the scans of a shard, and leave their parts to be merged."""
+    assert options.out is not None, "commands write"
+    jobs = OneJob(job, shard)
+    with page_of(jobs, options.live) as page:
+        result = Conductor(jobs, options, ShardOutput(options.out, made_of), terminal, page)()
+    scans, points = len(shard.scans(job.survey.scan_count)), len(result.points)
+    told = {"folder": str(options.out), "shard": str(shard), "scans": scans, "points": points}
+    out = click.format_filename(str(options.out))
+    lines = [
+        *(f"note: {note}" for note in result.notes),
+        f"shard {shard}: {plural(scans, 'scan')}, {plural(points, 'point')} "
+        f"({result.backend}, {result.survey_seconds:.1f} s)",
+        f"parts in {out}: lidarpool merge makes the result of all shards",
+    ]
+    show(told, lines, terminal.as_json)
+
+
+def run_merge(
+    places: Sequence[Storage],
+    terminal: Terminal,
+    out: Path | Storage,
+    partial: bool,
+    scenario: Path | None,
+) -> None:
+    """Merge shards, and print a summary; LidarpoolError names what cannot be merged."""
+    report = merge_shards(places, out, partial, scenario, terminal)
+    lines = [f"note: {note}" for note in report["notes"]]
+    if "jobs" in report:
+        done, failed = report["jobs"]["done"], report["jobs"]["failed"]
+        lines += [f"note: {plural(failed, 'job')} failed, see jobs.csv"] * bool(failed)
+        points = plural(report["totals"]["points"], "point")
+        lines.append(f"{plural(done, 'job')}, {points} in the data set in {out}")
+    else:
+        points = plural(report["points"], "point")
+        lines.append(f"{plural(report['scans'], 'scan')}, {points} in the result in {out}")
+    show({"folder": str(out), **report}, lines, terminal.as_json)
 
 
 def _run_survey(

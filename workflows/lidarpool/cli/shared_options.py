@@ -14,6 +14,7 @@ from typing import Any
 
 import click
 
+from ..base.shard import Shard
 from ..base.storage import Storage, is_url
 from ..base.vocabulary import BACKENDS, UNITS_M
 
@@ -31,6 +32,10 @@ class StoragePath(click.Path):
         return Storage.at(value) if is_url(value) else super().convert(value, param, ctx)
 
 
+def _shard(text: str) -> Shard:
+    return Shard.parse(text)
+
+
 flag = partial(click.option, is_flag=True)
 out = click.option(
     "--out",
@@ -46,6 +51,13 @@ backend = click.option(
 )
 job = click.option(
     "--job", "number", type=click.IntRange(0), metavar="N", help="Of a campaign: this job alone."
+)
+shard = click.option(
+    "--shard",
+    metavar="N/OF",
+    type=_shard,
+    help="Do one of several equal shares, such as 3/10, for lidarpool merge; auto: the task of a "
+    "Slurm array; auto/10: the index of a Kubernetes job.",
 )
 no_plan = flag("--no-plan", help="Leave out path planning.")
 cluster = click.option(

@@ -227,11 +227,16 @@ class DataSet:
         The last is a clause, or empty; then the manifest may be, too. Sizes are compared, and with
         `contents` every byte is read. OSError if the place cannot be read.
         """
+        look_at = self._looker(contents)
+        yield from _ahead(lambda job: look_at(job.name), (job for job in jobs if job.done))
+
+    def _looker(self, contents: bool = False) -> Callable[[str], tuple[dict[str, Any], str]]:
+        """Return what looks at a job by its name, see `look`."""
         sizes = lru_cache(_LISTED)(lambda folder: self.place.below(folder).sizes())
 
-        def look_at(job: JobRow) -> tuple[dict[str, Any], str]:
-            if not (manifest := self._manifest(job.name)):
-                return {}, f"{_manifest_file(job.name)} is missing or damaged"
+        def look_at(job: str) -> tuple[dict[str, Any], str]:
+            if not (manifest := self._manifest(job)):
+                return {}, f"{_manifest_file(job)} is missing or damaged"
             for name, (size, crc) in manifest["files"].items():
                 folder, _, file = name.rpartition("/")
                 same = sizes(folder).get(file) == size
@@ -239,8 +244,38 @@ class DataSet:
                     return manifest, f"{name} is missing or damaged"
             return manifest, ""
 
-        done = (job for job in jobs if job.done)
-        yield from _ahead(look_at, done)
+        return look_at
+
+    def take(self, place: Storage, jobs: Iterable[JobRow]) -> Iterator[tuple[JobRow, str]]:
+        """Have the files of jobs here that another data set of this format has in its `place`.
+
+        Those that are here are not read again. Yields every job, and what is wrong with its files
+        there, a clause or empty: then they are not taken. OSError if a place cannot be read or
+        written to.
+        """
+        here, there = self._looker(), replace(self, place=place)
+
+        def take(job: JobRow) -> str:
+            manifest = there._manifest(job.name)
+            if not job.done or (manifest and here(job.name) == (manifest, "")):
+                return ""
+            if not manifest or manifest["row"]["sha256"] != job.sha256:
+                return f"{place.path(_manifest_file(job.name))} is missing or damaged"
+            for name, checksum in manifest["files"].items():
+                self.place.prepare(Path(name).parent)
+                try:
+                    self.place.take(place, name)
+                    same = self.place.checksum(name) == checksum
+                except FileNotFoundError:
+                    same = False
+                if not same:
+                    self.place.remove([name])
+                    return f"{place.path(name)} is missing or damaged"
+            self.place.prepare(_MANIFESTS)
+            self.place.take(place, _manifest_file(job.name))
+            return ""
+
+        yield from _ahead(take, iter(jobs))
 
     def _manifest(self, name: str) -> dict[str, Any]:
         """Read the manifest of a job; empty if it is missing or damaged."""

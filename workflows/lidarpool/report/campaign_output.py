@@ -80,14 +80,14 @@ class DataSetOutput(Output[CampaignRun]):
         if not conductor.resume or CAMPAIGN_FILE not in there or unfinished:
             return None
         self._made = check_same(out, self.campaign)
-        if (there := self._made["shards"]) != (here := shards_of(self.campaign.shard)):
+        if (holds := self._made["shards"]) != (wanted := shards_of(self.campaign.shard)):
             raise LidarpoolError(
-                f"{out} holds {_shards_in_words(there)}, and {_shards_in_words(here)} cannot be "
-                "added by a run: give another folder with --out."
+                f"{out} holds {_shards_in_words(holds)}, and {_shards_in_words(wanted)} needs a "
+                "folder of its own: give another with --out."
             )
         whole, self._wrong = _look(self.dataset, read_table(out), options.verify, self.campaign)
-        there = whole == len(self.campaign.numbers) and _is_indexed(out, whole)
-        if not there or self._wrong:
+        done = whole == len(self.campaign.numbers) and _is_indexed(out, whole)
+        if not done or self._wrong:
             return None
         if RUN_FOLDER in there:  # a killed run has not removed all of itself
             remove_run(kept)
@@ -107,7 +107,7 @@ class DataSetOutput(Output[CampaignRun]):
             store.adopt(rows, sensors=json.dumps(self._made["sensors"]))
         elif conductor.resume:
             self._take_over(store)
-        _own_files(out, begun=store.begun or bool(store.kept))  # some were perhaps taken over
+        dataset_files(out, begun=store.begun or bool(store.kept))  # some were perhaps taken over
         if self._made is None:
             _, self._wrong = _look(self.dataset, store.rows(), options.verify, self.campaign)
         if not store.kept:
@@ -143,8 +143,13 @@ class DataSetOutput(Output[CampaignRun]):
         run = CampaignRun.of(store.rows(), seconds, store.resumed, sensors=store.sensors, **more)
         record: dict[str, Any] = {"identity": dict(store.identity), "casting": store.casting}
         record |= {"backend": store.backend, "sensors": run.sensors}
-        record |= {"files": hashes(self.campaign.files), "campaign": asdict(self.campaign.described)}
-        write_shared(self.dataset, record | {"shards": shards_of(self.campaign.shard)}, run, store.rows)
+        record |= {
+            "files": hashes(self.campaign.files),
+            "campaign": asdict(self.campaign.described),
+        }
+        write_shared(
+            self.dataset, record | {"shards": shards_of(self.campaign.shard)}, run, store.rows
+        )
         if run.failed:
             store.save(now=True)
             store.db.close()
@@ -295,7 +300,7 @@ def check_same(place: Storage, campaign: CampaignSpec) -> Mapping[str, Any]:
     return made
 
 
-def _own_files(out: Storage, *, begun: bool) -> list[str]:
+def dataset_files(out: Storage, *, begun: bool) -> list[str]:
     """Name the files of a data set, which has begun or is empty.
 
     LidarpoolError if there is a link, or a file that neither jobs nor `write_shared` write.
@@ -314,7 +319,7 @@ def _own_files(out: Storage, *, begun: bool) -> list[str]:
 def _remove_dataset(out: Storage, kept: Storage) -> None:
     """Remove a data set and its run; LidarpoolError, and nothing is removed, if there is more."""
     begun = CAMPAIGN_FILE in out.sizes() or FILE in kept.sizes()
-    own = _own_files(out, begun=begun)
+    own = dataset_files(out, begun=begun)
     with explained(f"{out} cannot be removed"):
         out.tidy()
         # First what says that it is finished, and last what says that it is a data set.

@@ -65,7 +65,7 @@ class JobPoints:
             for what, parts in lost.items():
                 if parts:
                     self._drop(what, parts)
-            for receipt in filter(None, pool.map(self._receipt, unknown)):
+            for receipt in filter(None, pool.map(self.receipt, unknown)):
                 self._store.db.commit([receipt])
         finally:
             pool.shutdown(cancel_futures=True)
@@ -86,10 +86,10 @@ class JobPoints:
             return "missing"
         if sizes[part.name] != part.size:
             return "damaged"
-        found = self._receipt(part.name)
+        found = self.receipt(part.name)
         return "" if found is not None and _SAID(found) == _SAID(part) else "damaged"
 
-    def _receipt(self, name: str) -> Receipt | None:
+    def receipt(self, name: str) -> Receipt | None:
         """Receipt of a part in storage; None if it is damaged."""
         storage = self._store.storage
         try:
@@ -185,7 +185,7 @@ class JobPoints:
         return np.concatenate(rays)
 
 
-def listed(names: Sequence[str]) -> str:
+def listed(names: Sequence[str], most: int = NAMED) -> str:
     """Return the first names, and how many more there are."""
-    more = len(names) - NAMED
-    return ", ".join(names[:NAMED]) + (f" and {more:,} more" if more > 0 else "")
+    more = len(names) - most
+    return ", ".join(names[:most]) + (f" and {more:,} more" if more > 0 else "")

@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 from ..base.errors import LidarpoolError
 from ..base.fingerprint import fingerprint
-from ..base.shard import Shard
+from ..base.shard import ALL, Shard
 from ..datasets.job_table import JobRow, Value
 from ..export.sweeps import Sweeps
 from ..pipeline.failures import JobError
@@ -43,7 +43,7 @@ class OneJob:
     """A survey, as the only job of its run, which does the scans of a shard of it."""
 
     job: Job
-    shard: Shard = Shard()
+    shard: Shard = ALL
     numbers: range = range(1)
     title: str = ""
     names: tuple[str, ...] = ()

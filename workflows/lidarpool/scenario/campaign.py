@@ -22,7 +22,7 @@ from pydantic_core import to_json
 from ..base.declared import Seed
 from ..base.errors import LidarpoolError, Mistakes, prefixed
 from ..base.fingerprint import fingerprint
-from ..base.shard import Shard
+from ..base.shard import ALL, Shard
 from ..base.validation import (
     checked,
     dotted,
@@ -117,7 +117,7 @@ class CampaignSpec:
     description: str = ""  # the file's text, where there is one
     files: Set[Path]  # that its jobs may be made of; some may be missing
     choices: Mapping[str, str]  # {name: how its value is chosen, «0.2 to 20, log_uniform»}
-    shard = Shard()  # whose jobs a run does, by default all
+    shard = ALL  # whose jobs a run does
 
     @checked
     def __init__(
