@@ -10,14 +10,12 @@ from dataclasses import dataclass
 from .errors import LidarpoolError
 
 _SLURM = [f"SLURM_ARRAY_TASK_{name}" for name in ("ID", "MIN", "STEP", "COUNT")]
-_KUBERNETES = "JOB_COMPLETION_INDEX"
+_KUBERNETES = ["JOB_COMPLETION_INDEX"]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, order=True)
 class Shard:
-    """Share `number` of `of` shares, counted from 1; by default all.
-
-    LidarpoolError if there is no such share.
+    """Share `number` of `of` shares, counted from 1; LidarpoolError if there is no such share.
 
     Examples
     --------
@@ -25,13 +23,13 @@ class Shard:
     ([2, 12, 22], [5, 6])
     """
 
-    number: int = 1
-    of: int = 1
+    number: int
+    of: int
 
     def __post_init__(self) -> None:
         if not 1 <= self.number <= self.of:
             raise LidarpoolError(
-                f"there is no shard {self}: shards are counted from 1, as 1/10 to 10/10."
+                f"there is no shard {self}: of 10 the first is 1/10, the last 10/10."
             )
 
     def __str__(self) -> str:
@@ -41,10 +39,7 @@ class Shard:
     def parse(cls, text: str, environment: Mapping[str, str] = os.environ) -> Shard:
         """Read ``3/10``; ``auto``, the task of a Slurm array; or ``auto/10``, a pod's index.
 
-        Raises
-        ------
-        LidarpoolError
-            If it is none of them, there is no such shard, or no such array or index.
+        LidarpoolError if it is none of them, or there is no such shard, array or index.
 
         Examples
         --------
@@ -53,25 +48,18 @@ class Shard:
         """
         if not (found := re.fullmatch(r"(?:(\d+)|auto)/(\d+)|auto", text, re.ASCII)):
             raise LidarpoolError(f"{text!r} is no shard: give 3/10, auto/10 or auto.")
-        number, of = found[1], found[2]
-        if number:
-            return cls(int(number), int(of))
-        wanted = [_KUBERNETES] if of else _SLURM
+        if found[1]:
+            return cls(int(found[1]), int(found[2]))
+        names = _KUBERNETES if found[2] else _SLURM
         try:
-            index, *array = (int(environment[name]) for name in wanted)
-        except (KeyError, ValueError) as error:
-            what = "the index of a Kubernetes job" if of else "the task of a Slurm array"
-            raise LidarpoolError(
-                f"--shard {text} takes {what} from {', '.join(wanted)}, which are not all set to "
-                "whole numbers: give the shard as 3/10."
-            ) from error
-        if of:
-            return cls(index + 1, int(of))
-        first, step, count = array
-        number, rest = divmod(index - first, max(1, step))
-        if rest:
-            raise LidarpoolError(f"the tasks of the Slurm array are not {step} apart: give 3/10.")
-        return cls(number + 1, count)
+            index, *array = (int(environment[name]) for name in names)
+            first, step, count = array or (0, 1, int(found[2]))
+            if (index - first) % step:
+                raise ValueError("it is between two tasks")
+        except (LookupError, ValueError, ZeroDivisionError) as error:
+            told = ", ".join(f"{name}={environment.get(name, '')}" for name in names)
+            raise LidarpoolError(f"{text!r} finds no shard in {told}: give 3/10.") from error
+        return cls((index - first) // step + 1, count)
 
     def jobs(self, count: int) -> range:
         """Return the jobs of the share, of so many: neighbouring jobs are in different shares."""
@@ -82,4 +70,4 @@ class Shard:
         return range(count * (self.number - 1) // self.of, count * self.number // self.of)
 
 
-ALL = Shard()  # of which there is one
+ALL = Shard(1, 1)

@@ -26,10 +26,10 @@ from ..report.campaign_output import (
     failures,
     verify,
 )
-from ..report.merging import ShardOutput, merge_shards
+from ..report.merging import merge
 from ..report.output import CLOUD, SurveyOutput
 from ..report.report import summary
-from ..run.conductor import Conductor
+from ..run.conductor import Conductor, Kept
 from ..run.job_source import OneJob
 from ..run.options import RunOptions
 from ..run.run_result import RunResult
@@ -80,9 +80,9 @@ def _run_shard(
 ) -> None:
     """Run the scans of a shard, and leave their parts to be merged."""
     assert options.out is not None, "commands write"
-    jobs = OneJob(job, shard)
+    jobs, made_of = OneJob(job, shard), {**made_of, "scans": job.survey.scan_count}
     with page_of(jobs, options.live) as page:
-        result = Conductor(jobs, options, ShardOutput(options.out, made_of), terminal, page)()
+        result = Conductor(jobs, options, Kept(made_of), terminal, page)()
     scans, points = len(shard.scans(job.survey.scan_count)), len(result.points)
     told = {"folder": str(options.out), "shard": str(shard), "scans": scans, "points": points}
     out = click.format_filename(str(options.out))
@@ -103,7 +103,7 @@ def run_merge(
     scenario: Path | None,
 ) -> None:
     """Merge shards, and print a summary; LidarpoolError names what cannot be merged."""
-    report = merge_shards(places, out, partial, scenario, terminal)
+    report = merge(places, out, partial=partial, scenario=scenario, screen=terminal)
     lines = [f"note: {note}" for note in report["notes"]]
     if "jobs" in report:
         done, failed = report["jobs"]["done"], report["jobs"]["failed"]

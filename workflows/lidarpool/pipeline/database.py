@@ -220,7 +220,9 @@ class RunDatabase:
             rows, size, hits = counts
             job.enter(Receipt(number, first, stop, name, rows, size, hits, tuple(box), b""))
         query = "SELECT data FROM trials WHERE job = ? ORDER BY trial"
-        job.trials += [unpack_trial(text) for (text,) in self._rows(query, number)]
+        for data in (json.loads(text) for (text,) in self._rows(query, number)):
+            waypoints = np.array(data.pop("waypoints"), np.float64).reshape(-1, 2)
+            job.trials.append(Trial(waypoints=waypoints, **data))
         for (count,) in self._rows("SELECT count FROM frames WHERE job = ?", number):
             job.frames = job.frames_written = int(count)
 
@@ -313,7 +315,8 @@ class RunDatabase:
         with self._transaction():
             self._sql.executemany(
                 "INSERT OR IGNORE INTO trials VALUES (?, ?, ?)",
-                [(number, trial.trial, pack_trial(trial)) for trial in trials],
+                # To the bit: a float is written with the digits that identify it.
+                [(number, t.trial, json.dumps(vars(t), default=np.ndarray.tolist)) for t in trials],
             )
         self.begun.add(number)
         self.under_way[number].trials += trials
@@ -416,18 +419,6 @@ def _explained(path: Path) -> Iterator[None]:
         raise LidarpoolError(
             f"{path} cannot be written ({words}): make room on its disk, or give another folder."
         ) from error
-
-
-def pack_trial(trial: Trial) -> str:
-    """Write a trial as JSON, to the bit: a float has the digits that identify it."""
-    return json.dumps(vars(trial), default=np.ndarray.tolist)
-
-
-def unpack_trial(text: str) -> Trial:
-    """Inverse of `pack_trial`."""
-    data = json.loads(text)
-    waypoints = np.array(data.pop("waypoints"), np.float64).reshape(-1, 2)
-    return Trial(waypoints=waypoints, **data)
 
 
 def parts_folder(mark: str) -> str:

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from ..base.errors import LidarpoolError, explained
-from ..base.shard import Shard
+from ..base.shard import ALL, Shard
 from ..base.software import difference, software
 from ..base.storage import Storage
 from ..base.words import plural
@@ -80,10 +80,10 @@ class DataSetOutput(Output[CampaignRun]):
         if not conductor.resume or CAMPAIGN_FILE not in there or unfinished:
             return None
         self._made = check_same(out, self.campaign)
-        if (holds := self._made["shards"]) != (wanted := shards_of(self.campaign.shard)):
+        if (holds := self._made["shards"]) != shards_of(self.campaign.shard):
             raise LidarpoolError(
-                f"{out} holds {_shards_in_words(holds)}, and {_shards_in_words(wanted)} needs a "
-                "folder of its own: give another with --out."
+                f"{out} holds {'all jobs' if holds is None else f'of shards {listed(holds)}'}, and "
+                f"this run does shard {self.campaign.shard}: give another folder with --out."
             )
         whole, self._wrong = _look(self.dataset, read_table(out), options.verify, self.campaign)
         done = whole == len(self.campaign.numbers) and _is_indexed(out, whole)
@@ -182,29 +182,21 @@ def write_shared(
     return write_card(place, campaign, run, rows(), record["casting"] or software(), picture)
 
 
-def described(record: Mapping[str, Any]) -> Described:
-    """Return what a data set's record says of its campaign."""
-    told = record["campaign"]
-    own = {"keep": Keep(**told["keep"]), "names": tuple(told["names"])}
-    return Described(**{**told, **own})
-
-
 def write_record(place: Storage, record: Mapping[str, Any]) -> None:
     """Write CAMPAIGN_FILE."""
     with explained(f"{place} cannot be written"):
         place.write(CAMPAIGN_FILE, (json.dumps(record, indent=1) + "\n").encode())
 
 
-def shards_of(shard: Shard) -> dict[str, Any] | None:
-    """Return what a record says of the shards that are there; None if it is all of them."""
-    return None if shard.of == 1 else {"of": shard.of, "there": [shard.number]}
+def described(record: Mapping[str, Any]) -> Described:
+    """Return what the content of CAMPAIGN_FILE says of the campaign."""
+    told = record["campaign"]
+    return Described(**(told | {"keep": Keep(**told["keep"])}))
 
 
-def _shards_in_words(shards: Mapping[str, Any] | None) -> str:
-    if shards is None:
-        return "all jobs"
-    there = listed([f"{number}/{shards['of']}" for number in shards["there"]])
-    return f"{'shard' if len(shards['there']) == 1 else 'shards'} {there}"
+def shards_of(shard: Shard) -> list[str] | None:
+    """Return what CAMPAIGN_FILE says of the shards that are there; None if all are."""
+    return None if shard == ALL else [str(shard)]
 
 
 def _look(

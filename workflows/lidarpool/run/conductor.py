@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import json
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager, ExitStack, nullcontext
-from typing import Generic, TypeVar
+from dataclasses import dataclass
+from typing import Any, Generic, TypeVar
 
 from ..base.errors import LidarpoolError
 from ..base.storage import Storage
@@ -49,12 +51,19 @@ class Output(Generic[R]):
         raise NotImplementedError
 
 
+@dataclass(frozen=True, eq=False)
 class Kept(Output[RunResult]):
-    """Nothing is written: the points stay in the run's store."""
+    """Nothing is written: the points stay in the run's store, which says what they are `made_of`."""
+
+    made_of: Mapping[str, Any] | None = None
 
     def finish(self, conductor: Conductor[RunResult]) -> RunResult:
         """Return the result of the only job."""
         result = conductor.result()
+        if self.made_of is not None:
+            told = {"made_of": self.made_of, "notes": result.notes}
+            conductor.store.db.set(**{name: json.dumps(value) for name, value in told.items()})
+            conductor.store.save(now=True)
         conductor.page.finish(result.seconds, result)
         conductor.store.db.close()
         return result

@@ -147,7 +147,7 @@ class RunStore:
             told = str(damage).replace(self._folder.url, self.place.url)
             raise LidarpoolError(told) from damage
         elif self.lasting:
-            _remove(self.place, _parts_of(self.place, earlier), mark)
+            _remove(self.place, parts_of(self.place, earlier), mark)
         path.unlink(missing_ok=True)
         self._folder.prepare()
         if new is None:
@@ -178,7 +178,7 @@ class RunStore:
 
     def _claim(self, resume: bool) -> None:
         """Find the parts, and mark their folder as this run's."""
-        self.storage = replace(_parts_of(self.place, self.db.meta["parts"]), durable=self.lasting)
+        self.storage = replace(parts_of(self.place, self.db.meta["parts"]), durable=self.lasting)
         with explained(f"{self.storage.url} cannot be looked at"):
             self._sizes = self.storage.sizes()  # also an error if the place cannot be opened
         self._strays: dict[int, list[str]] = {}  # {number: parts that an earlier run has left}
@@ -424,7 +424,7 @@ def _database(folder: Storage) -> Path:
     return folder.local(FILE)
 
 
-def _parts_of(place: Storage, parts: str) -> Storage:
+def parts_of(place: Storage, parts: str) -> Storage:
     """Where the parts of a run are: below the run's place, or in a place that was named."""
     named, _, name = parts.rpartition("/")
     return Storage.at(named or "/").below(name) if parts else place.below(PARTS)
@@ -457,7 +457,7 @@ def remove_run(folder: str | Path | Storage) -> None:
         except LidarpoolError as error:
             raise LidarpoolError(str(error).replace(temporary, place.url)) from error
         mark, parts = found or (None, "")
-        _remove(place, _parts_of(place, parts), mark)
+        _remove(place, parts_of(place, parts), mark)
 
 
 def _remove(place: Storage, parts: Storage, mark: str | None) -> None:

@@ -69,7 +69,7 @@ class Described:
     description: str
     seed: int
     count: int
-    names: tuple[str, ...]
+    names: Sequence[str]
     keep: Keep
 
 
