@@ -38,7 +38,7 @@ def street(number, rng):
             lp.Material(["Saloon*", "Estate*", "Panel van*"], 0.5, semantic_class=3),
         ],
         noise=lp.Noise(range_m=0.015, detection_range_m=90), visibility_km=values["visibility_km"],
-        keep_every=1, columns=["intensity", "class"],
+        keep_every=1, columns=["intensity", "class"], classes=dict(enumerate(CLASSES, 1)),
     )  # fmt: skip
     return lp.Job(scene, survey, values=values)
 

@@ -458,6 +458,17 @@ WRONG = {
 }
 
 
+def test_a_missing_file_of_a_table_is_named_with_its_line(campaign, folder):
+    (folder / "cars.csv").write_text(
+        "# van.obj\nname,file,trajectory\nCar,hall.glb,\nVan,van.obj,\n"
+    )
+    vary = {"actors": {"sample": {"from": "cars.csv", "count": 1}}}
+    with pytest.raises(LidarpoolError) as raised:
+        campaign(vary).check_files()
+    where = f"actors: {folder / 'cars.csv'}, line 4: {str(folder / 'van.obj')!r} does not exist"
+    assert where in str(raised.value)
+
+
 @pytest.mark.parametrize("name", WRONG)
 def test_it_is_told_what_is_wrong(campaign, name):
     vary, says = WRONG[name]

@@ -44,7 +44,7 @@ def write(place, rows, picture=None, versions=None, **given):
         "title": "Drives", "count": 31, "seed": 7, "names": NAMES, "license": "CC-BY-4.0",
         "command": "campaign.yaml", "description": "", "keep": SimpleNamespace(format="kitti"),
         "sensors": {"roof": "velodyne/vlp16, 10 Hz"}, "seconds": 0.0, "resumed": 0, "notes": (),
-        "stages": (),
+        "stages": (), "classes": {},
     } | given)  # fmt: skip
     versions = versions or {"lidarpool": "1.2 (sources 01234567)"}
     return write_card(place, of, of, rows, versions, picture)
@@ -97,6 +97,18 @@ def test_card_says_how_to_read_and_repeat(card):
     pictures = re.findall(r"!\[.*?\]\((.*?)\)", text)
     assert pictures == ["pictures/job.png", "pictures/varied.png", "pictures/results.png"]
     assert all((folder / path).is_file() for path in pictures)
+
+
+def test_classes_have_their_names(tmp_path):
+    place = Storage.at(tmp_path, durable=False)
+    write(place, [row(1, classes={0: 5, 6: 10, 7: 20})], classes={6: "building & yard", 9: "water"})
+    report = json.loads((tmp_path / "report.json").read_text())
+    assert report["class_names"] == {"6": "building & yard", "9": "water"}
+    card, page = ((tmp_path / name).read_text() for name in ("README.md", "report.html"))
+    for label in ("0 none", "6 building & yard", "7"):
+        assert f"| {label} |" in card.replace("\\", "")
+        assert f'title="{html.escape(label)}"' in page
+    assert "water" not in card
 
 
 def test_page_shows_what_failed_and_why(card):

@@ -156,10 +156,14 @@ def test_surfaces_that_are_not_there_and_colours(tmp_path):
     assert (shown == 188).all(axis=1).sum() == 2, "one without a material"
 
 
-def table_of(tmp_path, objects, materials=()):
+def built_of(tmp_path, objects, **more):
     write(tmp_path / "a.city.json", city(objects))
-    data = {"scene": {"files": ["a.city.json"]}, "materials": list(materials)}
-    built = build(Scenario.from_data(data, folder=tmp_path))
+    data = {"scene": {"files": ["a.city.json"]}, **more}
+    return build(Scenario.from_data(data, folder=tmp_path))
+
+
+def table_of(tmp_path, objects, materials=()):
+    built = built_of(tmp_path, objects, materials=list(materials))
     table = MaterialTable.of(built.survey.materials, built.scene.all_names)
     found = zip(built.scene.names, table.semantic_class, table.reflectance, strict=True)
     return {name: (number, reflectance) for name, number, reflectance in found}
@@ -182,6 +186,20 @@ def test_types_are_classes_unless_a_material_has_one(tmp_path):
     assert own["Building Building2"] == (6, 0.8)
     assert own["Road Road1"] == own["Bridge Bridge1"] == (99, 0.1)
     assert own["Bridge Bridge2"] == (17, 0.3)
+
+
+def test_classes_of_types_have_names_unless_the_scenario_gives_others(tmp_path):
+    kinds = ("Building", "Road", "WaterBody")
+    objects = {kind: thing(geometry(), kind=kind) for kind in kinds}
+    assert built_of(tmp_path, objects).survey.classes == {}, "nobody asked for the column"
+    cloud = {"columns": ["class"]}
+    plain = built_of(tmp_path, objects, cloud=cloud).survey
+    assert plain.classes == {6: "building", 9: "water", 11: "road surface"}
+    materials = [{"objects": "*"}, {"objects": "WaterBody *", "class": 6}]
+    given = built_of(tmp_path, objects, cloud=cloud, materials=materials).survey
+    assert given.classes == {11: "road surface"}, "6 is no building here"
+    names = {6: "house", 20: "road surface"}
+    assert built_of(tmp_path, objects, classes=names).survey.classes == {9: "water", **names}
 
 
 def test_reference_systems(tmp_path):
@@ -237,3 +255,29 @@ def test_memory_is_refused_before_it_is_taken(tmp_path, monkeypatch):
     monkeypatch.setattr("lidarpool.base.allowance.memory", lambda: 100_000_000)
     with pytest.raises(LidarpoolError, match=r"would unpack to .* CityJSONSeq"):
         load(tmp_path, '{"type": "CityJSON", "x": [' + "[]," * 300_000 + "[]]}")
+
+
+def block(x, y, side, z0=0):
+    """Corners, in units of half a metre, and boundaries of a solid around x, y."""
+    corners = (np.array(CUBE) - [1, 1, 0]) * [side, side, 8] + [x, y, z0]
+    return corners.tolist()
+
+
+@pytest.mark.parametrize(("ground", "side"), [(False, 10), (True, 10), (True, 60)])
+def test_the_sensor_stands_beside_buildings_or_around_them(tmp_path, ground, side):
+    vertices = [*block(0, 0, side), *block(3 * side, 0, side)]
+    second = [[[[8 + corner for corner in ring]] for [ring] in SOLID[0]]]
+    objects = {"a": thing(geometry()), "b": thing(geometry(boundaries=second))}
+    if ground:
+        far = 6 * side
+        vertices += [[-far, -far, 0], [far, -far, 0], [far, far, 0], [-far, far, 0]]
+        flat = geometry("CompositeSurface", [[[16, 17, 18, 19]]], "1")
+        objects["g"] = thing(flat, kind="TINRelief")
+    write(tmp_path / "a.city.json", city(objects, vertices))
+    built = build(Scenario.load(tmp_path / "a.city.json"))
+    assert built.placing.around is not ground
+    for pose in built.placing.poses:
+        x, y, z = np.subtract(pose.position, TRANSFORM["translate"]) * 2
+        inside = [max(abs(x - at), abs(y)) < side and z < 16 for at in (0, 3 * side)]
+        assert not any(inside)
+        assert not ground or z in (2, 4, 6)

@@ -83,6 +83,50 @@ def test_an_object_is_seen_from_around_it_and_only_from_outside(name, far):
     assert not Surroundings(scene).views(poses).back.any()
 
 
+LONG = creation.cylinder(0.01, 6.0)
+LONG.apply_transform(trimesh.transformations.rotation_matrix(np.pi / 2, [0, 1, 0]))
+
+
+@pytest.mark.parametrize(
+    ("mesh", "points", "rays"),
+    [
+        (creation.torus(1, 0.3), 100_000, 300_000),
+        (creation.box((2, 1.2, 0.005)), 100_000, 300_000),
+        (LONG, 40_000, 5_000_000),
+    ],
+    ids=["torus", "plate", "rod"],
+)
+def test_the_default_grid_is_narrowed_to_an_object(tmp_path, mesh, points, rays):
+    mesh.export(tmp_path / "a.stl")
+    built = build(Scenario.load(tmp_path / "a.stl"))
+    survey = built.survey
+    assert 0.6 * rays < survey.ray_count <= rays
+    rig = Rig(built.scene, survey, "auto")
+    hits = [sum(map(len, rig.cast(36 * n, 36 * (n + 1)))) for n in range(5)]
+    assert sum(hits) == pytest.approx(points, rel=0.2)
+    assert "as no sensor is given, a grid of" in advice(built)[-1]
+    # The whole object is seen: no pose sees more of it without the narrow field of view.
+    grid = built.placing.grid
+    wide = {"vertical_fov_deg": 90, "horizontal_fov_deg": 90}
+    share = {name: 90 / grid[name] for name in wide}
+    counts = {
+        "layers": int(grid["layers"] * share["vertical_fov_deg"]),
+        "rays_per_revolution": int(grid["rays_per_revolution"] * share["horizontal_fov_deg"]),
+    }
+    rig = Rig(built.scene, replace(survey, sensor=Sensor.grid(**wide, **counts)), "auto")
+    seen = sum(map(len, rig.cast(0, 180)))
+    assert seen == pytest.approx(sum(hits), rel=0.1)
+
+
+def test_a_sensor_of_the_users_stays_as_it_is(tmp_path):
+    creation.torus(1, 0.3).export(tmp_path / "a.stl")
+    for data in ({"sensor": {"layers": 40}}, {"mount": {"pitch_deg": 5}}):
+        scenario = Scenario.from_data({"scene": "a.stl", **data}, folder=tmp_path)
+        built = build(scenario)
+        assert built.placing.around and not built.placing.grid
+        assert built.survey.ray_count == 200_000
+
+
 BOX = (8, 6, 2.5)
 PLACES = {
     "room": lambda: scene_of(inverted(creation.box(BOX))),

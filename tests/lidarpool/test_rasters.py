@@ -5,6 +5,7 @@ from importlib.util import find_spec
 
 import numpy as np
 import pytest
+import yaml
 from click.testing import CliRunner
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
@@ -231,6 +232,24 @@ def test_too_large_ones_are_refused_with_what_fits(tmp_path, monkeypatch):
     for options in ({"window": tuple(window)}, {"step_m": step}):
         mesh, *_ = read(path, **options)
         assert 10_000 < len(mesh.vertices) <= 20_000
+
+
+def test_many_pixels_are_a_choice(tmp_path, monkeypatch):
+    path = write(tmp_path / "m.tif", np.zeros((300, 500)))
+    monkeypatch.setattr(rasters, "_UNASKED", 20_000)
+    with pytest.raises(LidarpoolError, match="500 x 300 pixels, 0 million triangles") as refused:
+        read(path)
+    told = str(refused.value)
+    step = yaml.safe_load(re.search(r"scene: (\[\{.*?\}\])", told)[1])[0]
+    middle, whole = (yaml.safe_load(one) for one in re.findall(r"window: (\[.*?\])", told))
+    assert step.pop("file") == "m.tif" and told.count("\n") == 1
+    for options, least, most in (
+        (step, 10_000, 20_000),
+        ({"window": tuple(middle)}, 10_000, 20_000),
+        ({"window": tuple(whole)}, 150_000, 150_000),
+    ):
+        mesh, *_ = read(path, **options)
+        assert least <= len(mesh.vertices) <= most
 
 
 def test_small_files_that_claim_much(tmp_path):

@@ -247,6 +247,25 @@ def test_points_by_object_are_all_accounted_for(write):
     assert int(more[1]) + 25 + (int(missed[1]) if missed else 0) == 300
 
 
+def test_points_by_class_have_the_names_of_classes(write):
+    assert "Points by class" not in write()[0]
+    cloud = cloud_of(500, 2, 120, 16)
+    cloud.columns["class"] = np.repeat(np.array([40, 0, 7], np.uint16), [300, 150, 50])
+    survey = Survey(Sensor.grid(layers=16), [(0, 0, 1)], classes={40: "<road>", 9: "pole"})
+    text, report = write(cloud=cloud, survey=survey)
+    assert report["classes"] == {
+        "0": {"points": 150}, "7": {"points": 50}, "40": {"points": 300},
+    }  # fmt: skip
+    assert report["class_names"] == {9: "pole", 40: "<road>"}
+    rows = html.fromstring(text).xpath("//h3[.='Points by class']/following-sibling::table[1]//tr")
+    told = [[cell.text_content() for cell in row.iter("th", "td")] for row in rows]
+    assert [(row[0], row[2]) for row in told] == [
+        ("40 <road>", "300"),
+        ("0 none", "150"),
+        ("7", "50"),
+    ]
+
+
 @pytest.mark.parametrize("each", [4, 400])
 def test_the_density_is_that_of_the_surfaces(each):
     """Of a floor and a wall, sparser than a cell has or denser, wherever they are."""
@@ -318,6 +337,7 @@ def test_the_scenario_on_the_page_is_the_scenario(write):
                 "copies": [{"name": "A", "box": [1, 2, 3], "at": [[1, 2]], "class": 3}],
             },
             "materials": [{"objects": "*", "class": 2}],
+            "classes": {2: "metal", 3: "box"},
             "poses": [{"position": [1, 2, 3], "yaw_deg": 5}],
             "planning": {"start": [0, 0], "target": [9, 9], "obstacles": []},
         }

@@ -543,6 +543,46 @@ def test_a_robot_that_leaves_needs_joints_for_its_stay_only(folder):
         assert actor.trajectory.presence_ns == pytest.approx((0.2e9, 0.6e9))
 
 
-def test_a_robot_as_a_scene_is_told_where_it_belongs(folder):
-    with pytest.raises(LidarpoolError, match=r"rover\.urdf is a robot: name it as the file of one"):
-        build(Scenario.from_data({"scene": "rover.urdf"}, folder=folder))
+def test_a_robot_alone_stands_still_with_its_joints_at_zero(folder):
+    alone = build(Scenario.load(folder / "rover.urdf"))
+    robot = load_robot(folder / "rover.urdf")
+    assert alone.placing.around and not alone.scene.actors
+    assert alone.scene.names == tuple(actor.name for actor in robot.actors())
+    assert "has its joints at zero" in advice(alone)[0]
+    entry = {"file": "rover.urdf", "rotation_deg": [0, 0, 90], "translation": [5, 0, 0]}
+    placed = build(Scenario.from_data({"scene": [entry]}, folder=folder)).scene
+    at_zero, turned = (scene.bounds + scene.origin for scene in (alone.scene, placed))
+    np.testing.assert_allclose(turned[:, 0], 5 - at_zero[::-1, 1], atol=1e-6)
+    np.testing.assert_allclose(turned[:, 1:], at_zero[:, [0, 2]], atol=1e-6)
+    with pytest.raises(LidarpoolError, match="is a robot, which is in metres and Z-up: leave out"):
+        build(Scenario.from_data({"scene": [entry | {"unit": "mm"}]}, folder=folder))
+    with pytest.raises(LidarpoolError, match="is a robot: read it with load_robot"):
+        Scene.load(folder / "rover.urdf")
+
+
+@pytest.mark.parametrize(
+    ("name", "way"),
+    [
+        ("a.sdf", "sdf2usd"),
+        ("a.xml", "mujoco-usd-converter, and lidarpool import"),
+        ("a.mjcf", "mujoco"),
+    ],
+)
+def test_other_robots_are_refused_with_what_becomes_of_them(tmp_path, name, way):
+    (tmp_path / name).write_text("<mujoco/>")
+    for scenario in (
+        Scenario.load(tmp_path / name),
+        Scenario.from_data({"scene": name}, folder=tmp_path),
+    ):
+        with pytest.raises(LidarpoolError, match=f"{name} is not read: .*{way}"):
+            build(scenario)
+
+
+def test_of_a_scale_of_four_numbers_the_first_three_count(tmp_path):
+    (tmp_path / "b.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 1\nf 1 2 3\n")
+    shape = '<mesh filename="b.obj" scale="1 2 3 {}"/>'
+    four, three = (
+        robot_of(tmp_path, link("a", visual(shape.format(more)))).meshes["a"] for more in ("1", "")
+    )
+    np.testing.assert_array_equal(four.vertices, three.vertices)
+    assert three.vertices.max(axis=0).tolist() == [1, 2, 3]

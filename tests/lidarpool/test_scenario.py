@@ -363,7 +363,7 @@ def test_materials_returns_noise_and_weather_become_those_of_the_survey():
     assert survey.returns == Returns("dual", 7)
     assert survey.noise == Noise(0.02, seed=3)
     assert survey.visibility_km == 2
-    assert survey.precision_m == 0.001
+    assert survey.precision_m == 0.001, "the sensor's"
     table = MaterialTable.of(survey.materials, ["Sphere", "Vase", "Bowl", "Van"])
     assert table.semantic_class.tolist() == [7, 0, 0, 9], "an actor's own class"
     assert table.reflectance.tolist() == [0.3, 0, 0, 0], "with the rest of its material"
@@ -391,6 +391,12 @@ def test_a_mesh_alone_is_scanned_below_its_ceiling_and_whole(tmp_path, height, e
     survey = build(made).survey
     assert [pose.position[2] for pose in survey.poses] == pytest.approx(expected)
     assert (survey.keep_every, survey.precision_m) == (1, 0.001)
+    listed = Scenario.from_data({"scene": "hall.stl"}, folder=tmp_path)
+    assert fingerprint(build(listed).survey) == fingerprint(survey)
+    coarse = Scenario.from_data(
+        {"scene": "hall.stl", "sensor": {"model": "velodyne/vlp16"}}, folder=tmp_path
+    )
+    assert build(coarse).survey.precision_m == 0.002, "the sensor's resolution"
     default = build(Scenario()).survey
     assert (default.keep_every, default.precision_m) == (5, 0.01)
 

@@ -427,3 +427,15 @@ def test_beams_cannot_be_changed_in_place():
 def test_values_out_of_range_name_the_field(make, message):
     with pytest.raises(LidarpoolError, match=message):
         make()
+
+
+def test_a_turn_of_a_narrow_grid_sweeps_its_field_of_view():
+    sensor = Sensor.grid(400, 3, 20, horizontal_fov_deg=30)
+    survey = Survey(sensor, poses=[(0, 0, 0)])
+    assert (survey.scan_count, survey.ray_count, sensor.firings(36)[0]) == (36, 1200, 400)
+    x, y, z = sensor.directions(np.arange(400)).reshape(-1, 3).T
+    azimuth = np.degrees(np.arctan2(y, x))[::3]
+    assert azimuth == pytest.approx(np.linspace(-15, 15, 400, endpoint=False))
+    assert np.degrees(np.arcsin(z))[:3] == pytest.approx([-10, 0, 10])
+    with pytest.raises(LidarpoolError, match="horizontal_fov_deg is 361"):
+        Sensor.grid(horizontal_fov_deg=361)

@@ -23,12 +23,23 @@ from tests.rows import quick
 
 import lidarpool.run.cluster
 import lidarpool.run.writer
-from lidarpool import Campaign, Job, LidarpoolError, Scene, Sensor, Survey, simulate
+from lidarpool import (
+    Campaign,
+    Job,
+    LidarpoolError,
+    Material,
+    Scene,
+    Sensor,
+    Survey,
+    simulate,
+    sweeps,
+)
 from lidarpool.base.errors import explained
 from lidarpool.base.storage import Storage
 from lidarpool.datasets.dataset import DataSet
 from lidarpool.datasets.job_table import JobRow
 from lidarpool.export.format_table import DATA_SETS
+from lidarpool.report.campaign_output import verify
 from lidarpool.run.progress import Progress
 
 BASE = """
@@ -106,6 +117,21 @@ def make(number: int, rng: np.random.Generator) -> Job:
 def job(sensor: Sensor, number: int, **survey: Any) -> Job:
     what = Survey(sensor, [(number, 0, 1)], steps=45, keep_every=1, **survey)
     return Job(Scene.seed(), what, values={"x": number})
+
+
+@pytest.mark.parametrize("keep", ["kitti", "nuscenes"])
+def test_names_of_classes_are_in_the_data_set_and_its_card(client, tmp_path, keep):
+    names, sensor = {40: "road", 10: "car"}, Sensor.grid(360, 20, step_deg=4)
+
+    def make_named(number: int, rng: np.random.Generator) -> Job:
+        return job(sensor, number, materials=[Material("*", semantic_class=40)], classes=names)
+
+    run = Campaign(make_named, 2, keep=keep).run(tmp_path / "ds", client=client)
+    assert run.classes == sweeps(tmp_path / "ds").classes == names
+    assert "| 40 road |" in (tmp_path / "ds/README.md").read_text()
+    assert verify(Storage.at(tmp_path / "ds")).endswith("is whole: 2 jobs")
+    again = Campaign(make_named, 2, keep=keep).run(tmp_path / "ds", client=client, overwrite=True)
+    assert again.done == 2, "all files are known as the data set's own"
 
 
 # -- each job alone -------------------------------------------------------------------------------

@@ -61,6 +61,7 @@ def test_what_is_counted_and_needed_is_what_a_run_gives(cluster, tmp_path):
         )
     estimate = {"rays": 24_000, "hits": result.hits, "points": len(result.points)}
     assert made["estimate"] == estimate and result.rays == 24_000
+    assert made["precision_m"] == 0.01
     kept = sum(path.stat().st_size for path in (tmp_path / "run" / "parts").iterdir())
     assert 0.5 * kept < made["disk"]["parts"]
     assert made["disk"]["result"] > len(result.points) * 22
@@ -234,6 +235,7 @@ def test_an_object_is_looked_at_from_around_it_and_no_gpu_is_spoken_of(tmp_path,
     outcome = lidarpool("check", tmp_path / "ball.stl")
     assert outcome.code == 0
     assert "from 5 poses" in outcome.out and "points      about 0 " not in outcome.out
+    assert "hits, rounded to 0.001 m;" in outcome.out
     assert "note: this looks like an object of 1 x 1 x 1 m, not a place to stand in" in outcome.out
     assert "no GPU" not in outcome.out
     backend = next(name for name, missing in available_backends().items() if not missing)

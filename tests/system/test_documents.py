@@ -348,7 +348,10 @@ def test_numbers_of_formats_and_models_are_those_of_the_code():
 @pytest.mark.parametrize(
     ("pages", "suffixes"),
     [
-        (("how-to/meshes", "how-to/terrain", "how-to/cityjson", "how-to/openusd"), meshfile.SUFFIXES),
+        (
+            ("how-to/meshes", "how-to/terrain", "how-to/cityjson", "how-to/openusd"),
+            meshfile.SUFFIXES,
+        ),
         (("how-to/terrain",), rasters.SUFFIXES),
         (("how-to/point-clouds",), points.SUFFIXES),
     ],

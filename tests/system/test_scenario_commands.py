@@ -44,11 +44,11 @@ def test_init_with_meshes_names_them_as_seen_from_the_scenario(tmp_path, lidarpo
     files = [(entry.file, entry.unit) for entry in made.scene.files]
     assert files == [("../../my room.stl", "mm"), ("../../#1: é.glb", "mm")]
     assert len(build(made).scene.names) == 2
-    assert (made.cloud.keep_every, made.cloud.precision_m) == (None, 0.001)
     assert made.poses is not None and len(made.poses) == 5, "around boxes of a millimetre"
     text = Path("a/b/scenario.yaml").read_text()
     assert "# This looks like an object of " in text and len(text.splitlines()) < 22
-    rest = {"scene": {"files", "preset"}, "cloud": True, "poses": True}
+    assert made.sensor.horizontal_fov_deg < 45, "narrowed to them"
+    rest = {"scene": {"files", "preset"}, "sensor": True, "poses": True}
     assert made.model_dump(exclude=rest) == Scenario().model_dump(exclude=rest)
 
 
@@ -92,6 +92,7 @@ def test_init_without_a_mesh_is_short_too(tmp_path, lidarpool):
     [
         (["--mesh", "nowhere.stl"], "nowhere.stl does not exist"),
         (["--mesh", "notes.txt"], "notes.txt has the ending .txt, which is not a mesh format"),
+        (["--mesh", "rover.sdf"], "rover.sdf is not read: convert it to OpenUSD"),
         (["--sensor", "vlp61"], "Did you mean 'vlp16'?"),
         (["--unit", "mm"], "name it with --mesh"),
         (["--mesh", "notes.txt", "--unit", "ells"], "ells"),

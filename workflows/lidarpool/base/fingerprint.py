@@ -1,7 +1,8 @@
 """Fingerprints of content: things with the same fingerprint give the same result.
 
 A fingerprint depends on class and fields, and for classes and functions outside the package also on
-their code, so that a subclass with another method has another fingerprint.
+their code, so that a subclass with another method has another fingerprint. Fields that do not
+compare (`dataclasses.field(compare=False)`) are no part of it.
 """
 
 from __future__ import annotations
@@ -150,8 +151,9 @@ class _Digest:
         if own is None and not state:
             raise _refusal(thing)
         state |= {k: v for k, v in (own or {}).items() if not _is_cached(kind, k)}
+        ignored = {field.name for field in named if not field.compare}
         self._add_class(kind)
-        self.add(state)
+        self.add({name: value for name, value in state.items() if name not in ignored})
 
     def _add_class(self, kind: type) -> None:
         self._mark("class", kind.__module__, kind.__qualname__)

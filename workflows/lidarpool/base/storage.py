@@ -265,19 +265,13 @@ class Storage:
         """
         own = own or name
         if self.is_local and place.is_local:
-            target, path = self._target(own), place.local(name)
-            with suppress(FileNotFoundError):
-                if target.samefile(path):  # renaming one link to the other would do nothing
-                    return
-            temporary = target.with_name(f"{TEMPORARY}{target.name}-{secrets.token_hex(4)}")
+            self.remove([own])
             with suppress(OSError):  # another disk, or one without links: it is copied
-                os.link(path, temporary)
-                temporary.replace(target)
+                os.link(place.local(name), self._target(own))
                 return
-        with place._remote() as (other, folder):
-            if not self.is_local and self._opened[0] is other:
-                with self._remote() as (system, own_folder):
-                    system.cp_file(f"{folder}/{name}", f"{own_folder}/{own}")
+        with place._remote() as (other, folder), self._remote() as (system, own_folder):
+            if other is system and not self.is_local:
+                system.cp_file(f"{folder}/{name}", f"{own_folder}/{own}")
                 return
             with other.open(f"{folder}/{name}", "rb") as source, self.writing(own) as file:
                 shutil.copyfileobj(source, file, _PIECE)

@@ -25,7 +25,6 @@ from ..base.interrupts import (
     interrupt_on_signals,
 )
 from ..base.shard import ALL, Shard
-from ..base.storage import Storage
 from ..base.vocabulary import PATIENCE_S, QUEUE_S, WAIT_S
 from ..base.words import plural
 from . import shared_options as shared
@@ -34,6 +33,7 @@ from .scenario_commands import check, import_, init, scene, schema, sensors, sta
 from .shared_options import set_logs
 
 if TYPE_CHECKING:
+    from ..base.storage import Storage
     from ..run.connection import TlsFiles
     from ..run.options import RunOptions
     from .terminal import Terminal
@@ -190,8 +190,8 @@ def run(
     A campaign file, or several scenarios, make one data set.
 
     A mesh file is scanned from the middle of its floor, below the ceiling, or from around and
-    above if it is an object; every hit is kept, to 1 mm. --sensor, --pose and the like say it
-    otherwise; lidarpool init DIR --mesh FILE writes the same as a scenario to edit.
+    above if it is an object; every hit is kept. --sensor, --pose and the like say it otherwise;
+    lidarpool init DIR --mesh FILE writes the same as a scenario to edit.
 
     \b
     Examples:
@@ -203,6 +203,7 @@ def run(
       lidarpool run examples/campaign.yaml --shard 3/10 --out part-3
       lidarpool run --verify dataset
     """  # noqa: D301 - click wants the character, not its name
+    from ..base.storage import Storage
     from ..report.campaign_output import verify
     from ..run.store import RUN_FOLDER
     from ..scenario.campaign import CampaignSpec, is_campaign
@@ -211,6 +212,8 @@ def run(
 
     if options.fresh and (options.resume or options.verify):
         raise click.UsageError("--resume continues the run that --fresh deletes: give one of them.")
+    if number is not None and shard is not None:
+        raise click.UsageError("--job does one job, and --shard a share: give one of them.")
     if options.retry_failed and (options.fresh or number is not None):
         raise click.UsageError("--retry-failed goes on with a campaign: not with --fresh or --job.")
     paths = [*map(Path, scenarios)]
@@ -226,8 +229,6 @@ def run(
         )
     if several or (not of_mesh and is_campaign(paths[0])):
         campaign = CampaignSpec.of_scenarios(paths) if several else CampaignSpec.load(paths[0])
-        if number is not None and shard is not None:
-            raise click.UsageError("--job does one job, and --shard a share: give one of them.")
         if number is not None:
             run_job(campaign, number, terminal, options, backend, only)
         elif only is not None:
@@ -272,11 +273,15 @@ def merge(
       lidarpool merge part-* --out dataset
       lidarpool merge s3://bucket/part-1 s3://bucket/part-2 --out s3://bucket/dataset
     """  # noqa: D301 - click wants the character, not its name
-    from .run_command import run_merge
+    from ..report.merging import merge as merge_shards
     from .terminal import Terminal
 
-    places = [Storage.at(one) for one in shards]
-    run_merge(places, Terminal(quiet, False, as_json), out, partial, scenario)
+    screen = Terminal(quiet, False, as_json)
+    report = merge_shards(shards, out, partial=partial, scenario=scenario, screen=screen)
+    points = report.get("points", report.get("totals", {}).get("points"))
+    lines = [*(f"note: {note}" for note in report["notes"])]
+    lines.append(f"{plural(points, 'point')} in {out}")
+    shared.show({"folder": str(out), **report}, lines, as_json)
 
 
 @cli.command()

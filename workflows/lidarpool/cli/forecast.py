@@ -189,8 +189,7 @@ def forecast(job: Job, options: RunOptions, client: Client | None = None) -> dic
             f"needs about {format_bytes(least)}: make room, name another folder with "
             f"{'TMPDIR' if stored else '--out'}, or take a larger keep_every."
         )
-    local = options.own and client is None
-    needed = _bytes_needed(job, points, batch, cluster, local=local)
+    needed = _bytes_needed(job, points, batch, cluster, local=options.own and client is None)
     if cluster.memory and cluster.memory < needed:
         mistakes.lines.append(
             f"There are {format_bytes(cluster.memory)} of memory, and the run needs about "
@@ -210,6 +209,7 @@ def forecast(job: Job, options: RunOptions, client: Client | None = None) -> dic
         "scans": job.survey.scan_count,
         "rays": job.survey.ray_count,
         "estimate": estimate,
+        "precision_m": job.survey.precision_m,
         "trials": job.trials,
         "backend": backend,
         "casters": casters,
@@ -530,8 +530,8 @@ def _of_job(job: Job, found: dict[str, Any]) -> Iterator[str]:
         yield f"air         takes {1000 * alpha:.3g}/km: {left}"
     if estimate:
         yield (
-            f"points      about {estimate['points']:,} of {estimate['hits']:,} hits; an estimate "
-            f"from {estimate['rays']:,} rays cast here"
+            f"points      about {estimate['points']:,} of {estimate['hits']:,} hits, rounded to "
+            f"{job.survey.precision_m:g} m; an estimate from {estimate['rays']:,} rays cast here"
         )
     yield f"planning    {f'{job.trials:,} trials' if job.trials else 'none'}"
     backend = found["backend"]

@@ -143,7 +143,7 @@ def export(
                 for one in wanted:
                     one.write(folder / one.row.file, cloud, sweeps, overwrite=overwrite)
                     written.append(click.format_filename(send(folder / one.row.file, place)))
-                    for note in one.notes(cloud):
+                    for note in one.notes(cloud, sweeps):
                         click.echo(f"note: {note}", err=True)
                     click.echo(written[-1])
             except (LidarpoolError, KeyboardInterrupt) as error:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
 from types import MappingProxyType
@@ -26,7 +26,6 @@ from ..report.campaign_output import (
     failures,
     verify,
 )
-from ..report.merging import merge
 from ..report.output import CLOUD, SurveyOutput
 from ..report.report import summary
 from ..run.conductor import Conductor, Kept
@@ -57,7 +56,8 @@ def run_scenario(
 ) -> None:
     """Run a scenario, write the result and print a summary.
 
-    Of a `shard`, the parts stay, and say what they are `made_of`. LidarpoolError if the run fails; notes of the error say what was kept.
+    Of a `shard`, the run stays, and says what it is `made_of`. LidarpoolError if the run fails;
+    notes of the error say what was kept.
     """
     options = options.with_pool(scenario.pool, backend)
     if options.own:  # before reading the scene, which may take long
@@ -67,53 +67,14 @@ def run_scenario(
         job = built.job()
     if shard is None:
         _run_survey(built, job, options, terminal, only)
-    else:
-        _run_shard(job, shard, made_of, options, terminal)
-
-
-def _run_shard(
-    job: Job,
-    shard: Shard,
-    made_of: Mapping[str, Any],
-    options: RunOptions,
-    terminal: Terminal,
-) -> None:
-    """Run the scans of a shard, and leave their parts to be merged."""
-    assert options.out is not None, "commands write"
-    jobs, made_of = OneJob(job, shard), {**made_of, "scans": job.survey.scan_count}
+        return
+    jobs, output = OneJob(job, shard), Kept({**made_of, "scans": job.survey.scan_count})
     with page_of(jobs, options.live) as page:
-        result = Conductor(jobs, options, Kept(made_of), terminal, page)()
-    scans, points = len(shard.scans(job.survey.scan_count)), len(result.points)
-    told = {"folder": str(options.out), "shard": str(shard), "scans": scans, "points": points}
-    out = click.format_filename(str(options.out))
-    lines = [
-        *(f"note: {note}" for note in result.notes),
-        f"shard {shard}: {plural(scans, 'scan')}, {plural(points, 'point')} "
-        f"({result.backend}, {result.survey_seconds:.1f} s)",
-        f"parts in {out}: lidarpool merge makes the result of all shards",
-    ]
-    show(told, lines, terminal.as_json)
-
-
-def run_merge(
-    places: Sequence[Storage],
-    terminal: Terminal,
-    out: Path | Storage,
-    partial: bool,
-    scenario: Path | None,
-) -> None:
-    """Merge shards, and print a summary; LidarpoolError names what cannot be merged."""
-    report = merge(places, out, partial=partial, scenario=scenario, screen=terminal)
-    lines = [f"note: {note}" for note in report["notes"]]
-    if "jobs" in report:
-        done, failed = report["jobs"]["done"], report["jobs"]["failed"]
-        lines += [f"note: {plural(failed, 'job')} failed, see jobs.csv"] * bool(failed)
-        points = plural(report["totals"]["points"], "point")
-        lines.append(f"{plural(done, 'job')}, {points} in the data set in {out}")
-    else:
-        points = plural(report["points"], "point")
-        lines.append(f"{plural(report['scans'], 'scan')}, {points} in the result in {out}")
-    show({"folder": str(out), **report}, lines, terminal.as_json)
+        result = Conductor(jobs, options, output, terminal, page)()
+    points, notes = len(result.points), [f"note: {note}" for note in result.notes]
+    told = {"folder": str(options.out), "shard": str(shard), "points": points}
+    line = f"shard {shard} in {options.out}: {plural(points, 'point')}, for lidarpool merge"
+    show(told, [*notes, line], terminal.as_json)
 
 
 def _run_survey(

@@ -79,6 +79,7 @@ def init(folder: Path, meshes: tuple[Path, ...], of_mesh: dict[str, Any], every:
         notes = advice(built)
         if (placing := built.placing) is not None:
             note, data["poses"] = placing.note, [as_entry(pose) for pose in placing.poses]
+            data |= {"sensor": dict(placing.grid)} if placing.grid else {}
     try:
         folder.mkdir(parents=True, exist_ok=True)
         with target.open("x", encoding="utf-8", newline="\n") as file:
@@ -517,8 +518,6 @@ def _scenario(read: Scenario, folder: Path, model: str, plan: StationPlan) -> st
     """Return the text of a scenario whose poses are the stations."""
     import yaml
 
-    from ..scenario.scenario import MESH_CLOUD
-
     def moved(file: Path) -> str:
         return Path(os.path.relpath(file.resolve(), folder.resolve())).as_posix()
 
@@ -533,7 +532,7 @@ def _scenario(read: Scenario, folder: Path, model: str, plan: StationPlan) -> st
         "sensor": {"model": moved(Path(model)) if own else model},
         "poses": [[round(float(part), 3) for part in place] for place in plan.stations],
         "steps": 36,
-        "cloud": {**MESH_CLOUD, "columns": ["range"]},
+        "cloud": {"columns": ["range"]},
     }
     head = (
         f"# {plural(len(plan.stations), 'station')}, in the order in which they were chosen: "

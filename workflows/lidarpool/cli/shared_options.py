@@ -32,10 +32,6 @@ class StoragePath(click.Path):
         return Storage.at(value) if is_url(value) else super().convert(value, param, ctx)
 
 
-def _shard(text: str) -> Shard:
-    return Shard.parse(text)
-
-
 flag = partial(click.option, is_flag=True)
 out = click.option(
     "--out",
@@ -55,7 +51,7 @@ job = click.option(
 shard = click.option(
     "--shard",
     metavar="N/OF",
-    type=_shard,
+    type=Shard.parse,
     help="Do one of several equal shares, such as 3/10, for lidarpool merge; auto: the task of a "
     "Slurm array; auto/10: the index of a Kubernetes job.",
 )

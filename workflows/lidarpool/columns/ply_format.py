@@ -15,7 +15,7 @@ from .table import Column
 AXES = ("x", "y", "z")
 
 _MAGIC = "ply\nformat binary_little_endian 1.0\n"
-_HEADER_LIMIT = 65_536
+_HEADER_LIMIT, _COMMENTS_LIMIT = 65_536, 1 << 25
 _PLY_TYPES = {
     "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1",
     "short": "<i2", "int16": "<i2", "ushort": "<u2", "uint16": "<u2",
@@ -59,11 +59,11 @@ def row_type(real: np.dtype[np.floating], table: Sequence[Column]) -> np.dtype[n
     return np.dtype([(axis, kind) for axis in AXES] + [(c.in_files, held_type(c)) for c in table])
 
 
-def header(row: np.dtype[np.void], count: int) -> bytes:
-    """Header of a file of `count` points, in the words of Open3D."""
+def header(row: np.dtype[np.void], count: int, comments: str = "") -> bytes:
+    """Header of a file of `count` points, in the words of Open3D; `comments` are whole lines."""
     lines = [f"property {_NAMES[row[name].str]} {name}" for name in row.names or ()]
-    lines = ["comment Created by Open3D", f"element vertex {count}", *lines, "end_header\n"]
-    return (_MAGIC + "\n".join(lines)).encode("ascii")
+    lines = ["comment Created by Open3D", f"{comments}element vertex {count}", *lines]
+    return (_MAGIC + "\n".join([*lines, "end_header\n"])).encode()
 
 
 def layout(path: Path) -> tuple[int, int, np.dtype[np.void]]:
@@ -79,7 +79,10 @@ def layout(path: Path) -> tuple[int, int, np.dtype[np.void]]:
     if path.is_fifo():  # would wait for a writer, and has no random access
         raise ValueError("it is a pipe")
     with path.open("rb") as file:
-        head, found, _ = file.read(_HEADER_LIMIT).partition(b"end_header\n")
+        data = file.read(_HEADER_LIMIT)
+        if b"end_header\n" not in data:  # names of many classes, perhaps
+            data += file.read(_COMMENTS_LIMIT)
+    head, found, _ = data.partition(b"end_header\n")
     text = head.decode("ascii", errors="replace")
     if not found or not text.startswith(_MAGIC):
         raise ValueError("it has no header of a binary little-endian PLY file")

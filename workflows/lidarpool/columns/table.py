@@ -6,7 +6,7 @@ nothing else lists columns. Your own columns are `Column` objects in `Survey.col
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -239,6 +239,11 @@ def check_names(columns: Iterable[Column]) -> None:
         if name in taken:
             raise LidarpoolError(f"Two columns have the name {name!r} in files: rename one.")
         taken.add(name)
+
+
+def by_value(names: Mapping[int, str]) -> list[str]:
+    """Names of the values 0, 1, 2, … of a column; empty for those that are not in `names`."""
+    return [names.get(value, "") for value in range(max(names, default=-1) + 1)]
 
 
 def waveform_column(samples: int) -> Column:

@@ -26,6 +26,7 @@ from ..export.boxes import Boxes
 from ..export.folder import local_folder
 from ..export.format_table import DATA_SETS, FORMATS, LAYOUTS, FormatRow
 from ..export.formats import Format
+from ..export.kitti import NAMES_FILE, labels_file
 from ..export.nuscenes import merge
 from ..export.pieces import Entry, Pieces, pieces_of
 from ..export.sweeps import SWEEPS_FILE, Sweeps
@@ -174,6 +175,7 @@ class DataSet:
                 place.write(file, data)
             of_sensors = np.bincount(sweeps.sensor, minlength=len(sweeps.sensors)).tolist()
             manifest |= {"sensors": [*zip(sweeps.sensors, of_sensors, strict=True)]}
+            manifest |= {"classes": dict(sweeps.classes)} if sweeps.classes else {}
             manifest |= {"made_of": made_of, "files": dict(sorted(place.files.items()))}
             # Of its row, what every run gives.
             row_ = asdict(replace(row, seconds=0.0))
@@ -205,11 +207,10 @@ class DataSet:
                     merge(self.place, manifests)
                 else:
                     deque(manifests, maxlen=0)
-                file.write(b"\n]}\n")
 
     def _indexed(self, jobs: Iterable[JobRow], index: IO[bytes]) -> Iterator[dict[str, Any]]:
-        """Yield the manifest of each job that is done, and add it to the index."""
-        comma = ""
+        """Yield the manifest of each job that is done, and add it to the index, with names."""
+        comma, named = "", dict[int, dict[str, None]]()  # {class: names that jobs have for it}
         for job, (manifest, wrong) in self.look(jobs):
             if wrong:
                 told = f"Job {job.name} of {self.place} is not whole: its {wrong}."
@@ -217,7 +218,14 @@ class DataSet:
             row = {"number": job.number, "name": job.name, "sensors": manifest["sensors"]}
             index.write(f"{comma}\n{json.dumps(row)}".encode())
             comma = ","
+            for number, name in manifest.get("classes", {}).items():
+                named.setdefault(int(number), {})[name] = None
             yield manifest
+        classes = {number: "; ".join(names) for number, names in named.items()}
+        if classes and self.format == "kitti":
+            self.place.write(NAMES_FILE, labels_file(classes))
+        more = f', "classes": {json.dumps(classes)}' if classes else ""
+        index.write(f"\n]{more}}}\n".encode())
 
     def look(
         self, jobs: Iterable[JobRow], *, contents: bool = False

@@ -8,7 +8,7 @@ import os
 import threading
 from bisect import bisect_right
 from collections import OrderedDict
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from importlib.util import find_spec
@@ -51,8 +51,10 @@ class SavedSweeps:
     """A sequence of the sweeps of a data set in an order; see `sweeps`.
 
     An item is read when it is asked for. Several threads may ask, and processes that this one
-    forks or that get a pickled copy.
+    forks or that get a pickled copy. `classes` are names of semantic classes, {number: name}.
     """
+
+    classes: Mapping[int, str]
 
     def __init__(
         self, place: Storage, written: Format, runs: Sequence[_Run], shuffle: int | None
@@ -242,7 +244,9 @@ def sweeps(
             if count and (sensors is None or name in sensors):
                 runs.append(_Run(job, first, count))
             first += count
-    return SavedSweeps(storage, written, runs, shuffle)
+    saved = SavedSweeps(storage, written, runs, shuffle)
+    saved.classes = {int(number): name for number, name in head.get("classes", {}).items()}
+    return saved
 
 
 def read_index(place: Storage) -> dict[str, Any]:

@@ -26,6 +26,7 @@ class FormatRow:
     packages: tuple[str, ...] = ()
     needs: tuple[str, ...] = ()  # columns; formats that need `scan` store single sweeps
     holds: tuple[str, ...] | None = None  # columns; None for all
+    named: tuple[str, ...] = ()  # columns that it holds beside those if classes have names
     # {layout: columns that it needs and holds beside those}, where there are layouts
     layouts: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     inside: str = ""  # of a folder: pattern of the names of its files
@@ -55,15 +56,17 @@ _BAG = (
     ("rosbags",),
     ("scan", "object", "channel"),
     ("channel", *_COLOURS, "radial_velocity"),
+    ("class",),
     LAYOUTS,
 )
 
 _KITTI = (
-    r"poses/[^/]+\.txt|"
+    r"semantic-kitti\.yaml|poses/[^/]+\.txt|"
     r"sequences/[^/]+/((poses|times|calib)\.txt|(velodyne|labels|label_2)/\d+\.(bin|label|txt))"
 )
 _NUSCENES = (
-    r"(samples|sweeps)/[^/]+/([^/]+/)?\d+\.pcd\.bin|v1\.0-lidarpool/\w+\.json|maps/none\.png"
+    r"(samples|sweeps)/[^/]+/([^/]+/)?\d+\.pcd\.bin|v1\.0-lidarpool/\w+\.json|maps/none\.png|"
+    r"lidarseg/v1\.0-lidarpool/[^/]+\.pcd\.bin"
 )
 _PARTS = r"part-\d+\.parquet"
 
@@ -88,8 +91,8 @@ FORMATS = {
         boxes=True,
     ),
     "nuscenes": FormatRow(
-        "nuscenes", "nuscenes", True, (), ("scan", "object", *_RINGS), _RINGS, inside=_NUSCENES,
-        data_set="nuscenes", boxes=True,
+        "nuscenes", "nuscenes", True, (), ("scan", "object", *_RINGS), _RINGS, ("class",),
+        inside=_NUSCENES, data_set="nuscenes", boxes=True,
     ),
     "mcap": FormatRow(
         "cloud.mcap", "ros", *_BAG, data_set="mcap", of_job="bags/{name}.mcap"

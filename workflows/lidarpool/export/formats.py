@@ -65,14 +65,15 @@ class Format:
         """Names of the columns that a cloud must have."""
         return self.row.needs + self._laid_out
 
-    def left_out(self, cloud: CloudLike) -> list[str]:
+    def left_out(self, cloud: CloudLike, sweeps: Sweeps) -> list[str]:
         """Names of the cloud's columns that it cannot hold."""
         held, there = self.row.holds, (column.name for column in cloud.table)
-        return [] if held is None else [n for n in there if n not in held + self._laid_out]
+        more = self._laid_out + (self.row.named if sweeps.classes else ())
+        return [] if held is None else [name for name in there if name not in held + more]
 
-    def notes(self, cloud: CloudLike) -> list[str]:
+    def notes(self, cloud: CloudLike, sweeps: Sweeps) -> list[str]:
         """Return a note for the user on the cloud in this format, or none."""
-        left = ", ".join(self.left_out(cloud))
+        left = ", ".join(self.left_out(cloud, sweeps))
         return [f"{self.format} does not hold {left}"] if left else []
 
     def check_installed(self) -> None:
@@ -228,4 +229,4 @@ def save_cloud(
             "Result, or one that was read from the folder of a result."
         )
     one.write(path, cloud, sweeps, overwrite=True)
-    return one.left_out(cloud)
+    return one.left_out(cloud, sweeps)

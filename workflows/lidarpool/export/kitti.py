@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
+import yaml
 
 from ..base.arrays import Floats
 from ..base.errors import LidarpoolError
@@ -17,6 +18,7 @@ from .pieces import Data, Entry, as_data
 from .sweeps import Sweeps, plain_names
 
 INSTANCES_MOST = 65_535
+NAMES_FILE = "semantic-kitti.yaml"
 # From axes of a level sensor to KITTI's of a camera: x to the right, y down, z ahead.
 _CAMERA = np.array([[0.0, -1, 0], [0, 0, -1], [1, 0, 0]])
 
@@ -82,6 +84,8 @@ class Pieces(pieces.Pieces):
             files[f"{folder}/times.txt"] = _table(sweeps.begins_ns[own] / 1e9)
             lines = [f"P{number}: {_row(np.eye(3))}\n" for number in range(4)]
             files[f"{folder}/calib.txt"] = "".join([*lines, f"Tr: {_row(camera)}\n"]).encode()
+        if sweeps.classes and self.entry is None:  # else all jobs share a file
+            files[NAMES_FILE] = labels_file(sweeps.classes)
         return files
 
 
@@ -108,6 +112,13 @@ class Reader(reading.Reader):
     def _file(self, sweep: int, folder: str, ending: str) -> str:
         name = _names(self.sweeps, self.entry)[self.sweeps.sensor[sweep]]
         return f"sequences/{name}/{folder}/{self.sweeps.numbers[sweep]:06}.{ending}"
+
+
+def labels_file(classes: Mapping[int, str]) -> bytes:
+    """Return names of classes, and colours (blue, green, red), as semantic-kitti-api reads them."""
+    labels = {0: "unlabeled", **classes}
+    colours = {number: [number * step % 256 for step in (37, 91, 151)] for number in labels}
+    return yaml.safe_dump({"labels": labels, "color_map": colours}, allow_unicode=True).encode()
 
 
 def _names(sweeps: Sweeps, entry: Entry | None) -> list[str]:

@@ -53,15 +53,14 @@ def _write(path: Path, cloud: CloudLike, sweeps: Sweeps, *, compress: bool) -> N
     `azimuth` (-180 to 180 degrees) is the scan angle, `sensor` + 1 the point source. With `red`,
     `green` and `blue` the point format is 7, and colours are 257 times these, 16 bits. Intensity is
     the column `intensity` times 65,535, at most that, and classification `class` if it is below
-    256; because of these limits, both columns are in the extra bytes as well. Return numbers are
-    15 at most, and angles in steps of 0.006 degrees. Recorded waveforms make the point format 9, or
-    10 with colours; see `_Packets`.
+    256; because of these limits, both columns are in the extra bytes as well. Of these classes, the
+    lookup has 15 letters of the names, ASCII. Return numbers are 15 at most, and angles in steps of
+    0.006 degrees. Recorded waveforms make the point format 9, or 10 with colours; see `_Packets`.
     """
     coloured = {*COLOURS} <= {column.name for column in cloud.table}
     packets = _Packets.of(cloud)
-    header = laspy.LasHeader(
-        version="1.4", point_format=(6 if packets is None else 9) + (1 if coloured else 0)
-    )
+    point_format = (6 if packets is None else 9) + int(coloured)
+    header = laspy.LasHeader(version="1.4", point_format=point_format)
     header.generating_software = "lidarpool"
     header.creation_date = date(1980, 1, 6)  # of GPS time 0, at which surveys without a date begin
     begins_s = 0.0
@@ -74,6 +73,10 @@ def _write(path: Path, cloud: CloudLike, sweeps: Sweeps, *, compress: bool) -> N
     # LAS 1.4 wants it of formats 6 and above, with a coordinate system or without; PDAL before
     # 2.7.2, and what reads through it, opens no others (PDAL's issue 4412).
     header.global_encoding.wkt = True
+    if sweeps.classes:
+        header.vlrs.append(lookup := laspy.vlrs.known.ClassificationLookupVlr())
+        for number in range(256):  # the record has them all
+            lookup[number] = sweeps.classes.get(number, "").encode("ascii", "replace")[:15].decode()
     if packets is not None:
         header.vlrs.extend(packets.descriptors)
         header.global_encoding.waveform_data_packets_internal = True

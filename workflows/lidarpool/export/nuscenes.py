@@ -31,6 +31,7 @@ _TABLES = (
     "attribute", "calibrated_sensor", "category", "ego_pose", "instance", "log", "map", "sample",
     "sample_annotation", "sample_data", "scene", "sensor", "visibility",
 )  # fmt: skip
+_LABELS = f"lidarseg/{VERSION}/"
 _SHARED = ("category", "log", "map", "sensor")  # tables whose rows the jobs of a data set share
 
 
@@ -42,7 +43,7 @@ class Pieces(pieces.Pieces):
     first sensor's sweeps are the samples; of another sensor, the first sweep that begins in a
     sample is its key frame, and more are in `sweeps/NAME`. The ego vehicle's pose is the
     sensor's, at each sweep. Actors are annotated in each sample, where they are at the mean time of
-    their points in its key frames.
+    their points in its key frames. Classes with names, below 256, are labels of nuScenes-lidarseg.
 
     In a data set each job is a scene with its name, on a day of its own, its files are in folders
     of that name in `samples/NAME` and `sweeps/NAME`, and `merge` makes the tables of all jobs.
@@ -56,6 +57,9 @@ class Pieces(pieces.Pieces):
         self.sample, self.first = _samples(sweeps)
         self.names = _files(sweeps, self.channels, self.first, entry)
         self.folders = [name.rpartition("/")[0] for name in self.names]
+        named = sweeps.classes and any(column.name == "class" for column in cloud.table)
+        self.labels = [_LABELS + name.replace("/", "-") for name in self.names] if named else []
+        self.folders += [_LABELS] if named else []
 
     def files(self, number: int, points: Cloud) -> tuple[dict[str, Data], Boxes]:
         """Return the file of a sweep, and its boxes."""
@@ -63,7 +67,12 @@ class Pieces(pieces.Pieces):
         light = np.clip(points["intensity"], 0, 1) * 255
         rows = np.empty((len(points), 5), "<f4")
         rows[:, :3], rows[:, 3], rows[:, 4] = inside, light, points["channel"]
-        return {self.names[number]: as_data(rows)}, Boxes.of(self.sweeps, number, points)
+        files = {self.names[number]: as_data(rows)}
+        if self.labels:
+            named = np.isin(points["class"], [n for n in self.sweeps.classes if n < 256])
+            labels = np.where(named, points["class"], 0).astype("u1")
+            files[self.labels[number]] = as_data(labels)
+        return files, Boxes.of(self.sweeps, number, points)
 
     def others(self, made: Sequence[Boxes]) -> dict[str, bytes]:
         """Return the tables of a survey by itself, and its map."""
@@ -86,11 +95,19 @@ class Pieces(pieces.Pieces):
         for sweep in np.flatnonzero(self.first):
             keys[self.sample[sweep]].append(made[int(sweep)])
         tables.add_actors(keys)
+        if self.labels:
+            tokens = [row["token"] for row in tables.rows["sample_data"]]
+            tables.rows["lidarseg"] = [
+                {"token": one, "sample_data_token": one, "filename": file}
+                for one, file in zip(tokens, self.labels, strict=True)
+            ]
+        if self.labels and self.entry is None:  # else `merge` knows all
+            tables.rows["category"] = _categories(tables.rows["category"], self.sweeps.classes)
         return tables.rows
 
 
 class Reader(reading.Reader):
-    """Reads sweeps of a data set: intensity and channel of each point."""
+    """Reads sweeps of a data set: intensity, channel and, with names, class of each point."""
 
     @cached_property
     def _files(self) -> list[str]:
@@ -105,6 +122,9 @@ class Reader(reading.Reader):
         """Return the points of a sweep."""
         rows = self.rows(self.file(sweep), np.dtype("<f4")).reshape(-1, 5)
         columns = {"intensity": rows[:, 3] / np.float32(255), "channel": rows[:, 4].astype("u2")}
+        if self.sweeps.classes:
+            labels = self.rows(_LABELS + self.file(sweep).replace("/", "-"), np.dtype("u1"))
+            columns["class"] = labels.astype("u2")
         return np.ascontiguousarray(rows[:, :3]), columns
 
 
@@ -124,6 +144,17 @@ def _files(sweeps: Sweeps, channels: Sequence[str], first: Bools, entry: Entry |
     ]
 
 
+def _categories(kinds: Iterable[Any], classes: Mapping[int, str]) -> list[dict[str, Any]]:
+    """Rows of all classes and of kinds of actors, numbered without gaps as lidarseg needs it."""
+    known = {row["name"]: row for row in kinds}
+    last = max((number for number in classes if number < 256), default=0)
+    names = [classes.get(n, f"class {n}" if n else "none") for n in range(last + 1)]
+    return [
+        {"token": name, "name": name, "description": "", **known.get(name, {}), "index": n}
+        for n, name in enumerate([*names, *(name for name in known if name not in names)])
+    ]
+
+
 def merge(place: Storage, jobs: Iterable[Mapping[str, Any]]) -> None:
     """Write the tables of a data set, from the summaries of its jobs in turn."""
     shared: set[str] = set()  # tokens of rows that several jobs have
@@ -131,18 +162,29 @@ def merge(place: Storage, jobs: Iterable[Mapping[str, Any]]) -> None:
         files = {
             name: stack.enter_context(place.writing(f"{VERSION}/{name}.json")) for name in _TABLES
         }
-        before = dict.fromkeys(files, b"[\n")  # what comes before the next row
-        for job in jobs:
-            for name, rows in job["tables"].items():
+        before: dict[str, bytes] = {}  # what comes before the next row
+        kinds, classes = dict[str, dict[str, Any]](), dict[int, str]()
+
+        def write(tables: Mapping[str, Iterable[dict[str, Any]]]) -> None:
+            for name, rows in tables.items():
                 for row in rows:
                     if name in _SHARED:
                         if row["token"] in shared:
                             continue
                         shared.add(row["token"])
-                    files[name].write(before[name] + json.dumps(row).encode())
+                    if name not in files:  # lidarseg
+                        files[name] = stack.enter_context(place.writing(f"{VERSION}/{name}.json"))
+                    files[name].write(before.get(name, b"[\n") + json.dumps(row).encode())
                     before[name] = b",\n"
+
+        for job in jobs:
+            kinds |= {row["token"]: row for row in job["tables"].pop("category")}
+            classes |= {int(number): name for number, name in job.get("classes", {}).items()}
+            write(job["tables"])
+        rows = kinds.values()
+        write({"category": _categories(rows, classes) if "lidarseg" in files else rows})
         for name, file in files.items():
-            file.write(b"[]\n" if before[name] == b"[\n" else b"\n]\n")
+            file.write(b"\n]\n" if name in before else b"[]\n")
     with place.writing(_MAP) as file:
         file.write(_no_map())
 

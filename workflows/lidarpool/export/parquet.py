@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterator, Sequence
 from functools import cached_property
 from itertools import islice
@@ -42,6 +43,7 @@ class Pieces(pieces.Pieces):
         ]
         objects = "\n".join((*sweeps.objects, *sweeps.actors))  # that the column `object` counts
         words = {"coordinates": sweeps.coordinates, "objects": objects}
+        words |= {"classes": json.dumps(dict(sweeps.classes))} if sweeps.classes else {}
         self.schema = pa.schema(fields, words)
 
     def __len__(self) -> int:

@@ -31,12 +31,13 @@ def write_ply(path: Path, cloud: CloudLike, sweeps: Sweeps) -> None:
     their own, whose rows and header show its layout, and the others follow as such rows. The
     bytes are the same as if Open3D wrote all points at once, which would need memory for all.
     float64 positions are stored in single precision if the error is below a twentieth of the
-    precision of the sweeps, else in double.
+    precision of the sweeps, else in double. Names of classes are comments: `class 40 road`.
     """
     check_names((*POSITION, *cloud.table))
     real = real_type(cloud.bounds, sweeps.precision_m)
     row = row_type(real, cloud.table)
-    _check_room(path, header(row, len(cloud)), len(cloud), row.itemsize)
+    comments = "".join(f"comment class {n} {name}\n" for n, name in sweeps.classes.items())
+    _check_room(path, header(row, len(cloud), comments), len(cloud), row.itemsize)
     with path.open("xb") as file:
         for chunk in cloud.chunks():
             if file.tell():
@@ -47,11 +48,12 @@ def write_ply(path: Path, cloud: CloudLike, sweeps: Sweeps) -> None:
             start, row = _layout(piece, path, len(chunk))
             written = piece.read_bytes()
             own = b"element vertex %d\n" % len(chunk)
-            file.write(written[:start].replace(own, b"element vertex %d\n" % len(cloud)))
+            all_points = f"{comments}element vertex {len(cloud)}\n".encode()
+            file.write(written[:start].replace(own, all_points))
             file.write(memoryview(written)[start:])
             piece.unlink()
         if not file.tell():  # which Open3D refuses to write
-            file.write(header(row, 0))
+            file.write(header(row, 0, comments))
 
 
 @checked

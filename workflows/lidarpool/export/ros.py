@@ -20,7 +20,7 @@ from rosbags.interfaces import (
 )
 from rosbags.rosbag2 import Reader as Bag
 from rosbags.rosbag2 import StoragePlugin, Writer
-from rosbags.typesys import Stores, get_typestore
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 
 from ..base.arrays import AnyArray, Floats32, Records
@@ -61,19 +61,23 @@ _LAYOUTS = {
 }  # fmt: skip
 _LAYOUTS["images"] = _LAYOUTS["velodyne"]
 # Fields behind those of a layout: {name: type, columns that it needs}.
-_EXTRA = {"rgb": ("<f4", {*COLOURS}), VELOCITY: ("<f4", {VELOCITY})}
+_EXTRA = {"rgb": ("<f4", {*COLOURS}), VELOCITY: ("<f4", {VELOCITY}), "label": ("<u4", {"class"})}
+# Of vision_msgs, which rosbags lacks.
+_LABEL_INFO = "std_msgs/Header header\nvision_msgs/VisionClass[] class_map\nfloat32 threshold\n"
+_LABEL_INFO += f"{80 * '='}\nMSG: vision_msgs/VisionClass\nuint16 class_id\nstring class_name\n"
 
 
 def write_rosbag2(path: Path, cloud: CloudLike, sweeps: Sweeps, layout: str) -> None:
     """Write a bag, a folder for `ros2 bag play`; see `write_mcap`."""
     store = get_typestore(Stores.ROS2_HUMBLE)
+    store.register(get_types_from_msg(_LABEL_INFO, "vision_msgs/msg/LabelInfo"))
     # Readers of Humble take no later version: from 9 on, its profiles are lists.
     with Writer(path, version=8, storage_plugin=StoragePlugin.MCAP) as bag:
         topics: dict[str, Any] = {}
         for topic, message, time_ns in _messages(cloud, sweeps, layout, store.types):
             kind = message.__msgtype__
             if topic not in topics:
-                latched = (_LATCHED,) if topic == "/tf_static" else ()
+                latched = (_LATCHED,) if topic in ("/tf_static", "/label_info") else ()
                 topics[topic] = bag.add_connection(
                     topic, kind, typestore=store, offered_qos_profiles=latched
                 )
@@ -86,8 +90,9 @@ def write_mcap(path: Path, cloud: CloudLike, sweeps: Sweeps, layout: str) -> Non
     Each sweep is a PointCloud2 on `/NAME/points`, NAME that of its sensor, or on `/points`. Points
     are in the sensor's axes when the sweep began. `/tf` has the frames of the carrier (`base_link`)
     and of actors in `map`, and `/clock` the time, both at each sweep; `/tf_static` has the sensors
-    on the carrier. The survey begins at its start, or at `START_NS` without one. `/actors` has
-    a MarkerArray of the boxes of actors where their points of the sweep are.
+    on the carrier, and `/label_info` names of classes (LabelInfo of vision_msgs). The survey begins
+    at its start, or at `START_NS` without one. `/actors` has a MarkerArray of the boxes of actors
+    where their points of the sweep are.
 
     Instruments of the carrier are frames `imu` and `gnss` on it. `/imu/data_raw` has Imu, without
     orientations, and `/gnss/fix` NavSatFix or, where latitudes are not known, `/gnss/position`
@@ -97,8 +102,8 @@ def write_mcap(path: Path, cloud: CloudLike, sweeps: Sweeps, layout: str) -> Non
     `autoware` (PointXYZIRCAEDT, 32 bytes; angles in radians, time_stamp in ns since the sweep
     began) and `ouster` (48 bytes; range in mm, t in ns since the sweep began). Whole numbers of
     intensity and reflectivity are 255 and 65,535 at 1 and above. Where the cloud has red, green and
-    blue, a field `rgb` follows, and where it has radial velocities, `radial_velocity`; each makes
-    points of `velodyne` and `autoware` 4 bytes longer.
+    blue, a field `rgb` follows, where it has radial velocities, `radial_velocity`, and where its
+    classes have names, `label`; each makes points of `velodyne` and `autoware` 4 bytes longer.
     """
     folder = path.with_name(f"{path.name}.bag")
     try:
@@ -111,7 +116,7 @@ def write_mcap(path: Path, cloud: CloudLike, sweeps: Sweeps, layout: str) -> Non
 
 def _messages(cloud: CloudLike, sweeps: Sweeps, layout: str, types: Any) -> Iterator[Sent]:
     """Messages of a cloud, sweep by sweep."""
-    held = {column.name for column in cloud.table}
+    held = {column.name for column in cloud.table if column.name != "class" or sweeps.classes}
     row = _row(layout, [name for name, (_, needs) in _EXTRA.items() if needs <= held])
     field = types["sensor_msgs/msg/PointField"]
     fields = [
@@ -131,6 +136,10 @@ def _messages(cloud: CloudLike, sweeps: Sweeps, layout: str, types: Any) -> Iter
     ]
     on_carrier += _instruments(sweeps)
     yield "/tf_static", make.transforms(on_carrier, start_ns), start_ns
+    if sweeps.classes:
+        info, named = make.kinds("vision_msgs", "LabelInfo", "VisionClass")
+        told = [named(number, name) for number, name in sweeps.classes.items()]
+        yield "/label_info", info(make.header("", start_ns), told, 0.0), start_ns
     for sweep, points in enumerate(sweeps.points(cloud)):
         time_ns = start_ns + round(sweeps.begins_ns[sweep])
         while waiting is not None and waiting[2] <= time_ns:
@@ -181,7 +190,7 @@ def _instruments(sweeps: Sweeps) -> list[tuple[str, str, Placed, int]]:
 
 
 class Reader(reading.Reader):
-    """Reads sweeps of a data set: intensity (0 to 1 with autoware) and channel of each point."""
+    """Reads sweeps of a data set: intensity (0 to 1 with autoware), channel and named class."""
 
     def file(self, sweep: int) -> str:
         """Return the name of the job's bag."""
@@ -215,6 +224,8 @@ class Reader(reading.Reader):
             "intensity": light / 255 if self.layout == "autoware" else light,
             "channel": rows["channel" if self.layout == "autoware" else "ring"].astype(np.uint16),
         }
+        if "label" in held:
+            columns["class"] = rows["label"].astype(np.uint16)
         return np.stack([rows[axis] for axis in "xyz"], axis=1), columns
 
     def close(self) -> None:
@@ -313,8 +324,9 @@ def _rows(
         }
     if "rgb" in (row.names or ()):
         values["rgb"] = as_float(*(there[name] for name in COLOURS))
-    if VELOCITY in (row.names or ()):
-        values[VELOCITY] = there[VELOCITY]
+    for name, column in ((VELOCITY, VELOCITY), ("label", "class")):
+        if name in (row.names or ()):
+            values[name] = there[column]
     rows = np.zeros(len(points), row)
     for name, column in values.items():
         rows[name] = column
@@ -327,7 +339,8 @@ class _Messages:
     def __init__(self, types: Any) -> None:
         self._types = types
 
-    def _kinds(self, package: str, *names: str) -> list[Any]:
+    def kinds(self, package: str, *names: str) -> list[Any]:
+        """Types of messages of a package."""
         return [self._types[f"{package}/msg/{name}"] for name in names]
 
     def stamp(self, time_ns: int) -> Any:
@@ -340,8 +353,8 @@ class _Messages:
 
     def transforms(self, frames: list[tuple[str, str, Placed, int]], time_ns: int) -> Any:
         """Frames in others: parent, name, poses, and which of them."""
-        vector, turn = self._kinds("geometry_msgs", "Vector3", "Quaternion")
-        transform, stamped = self._kinds("geometry_msgs", "Transform", "TransformStamped")
+        vector, turn = self.kinds("geometry_msgs", "Vector3", "Quaternion")
+        transform, stamped = self.kinds("geometry_msgs", "Transform", "TransformStamped")
         return self._types["tf2_msgs/msg/TFMessage"]([
             stamped(
                 self.header(parent, time_ns), name,
@@ -363,8 +376,8 @@ class _Messages:
         return merge(*both, key=lambda one: one[2])
 
     def _imu(self, there: Instruments, frame: str, start_ns: int) -> Iterator[Sent]:
-        vector, turn = self._kinds("geometry_msgs", "Vector3", "Quaternion")
-        (imu,) = self._kinds("sensor_msgs", "Imu")
+        vector, turn = self.kinds("geometry_msgs", "Vector3", "Quaternion")
+        (imu,) = self.kinds("sensor_msgs", "Imu")
         unknown = np.zeros(9)
         unknown[0] = -1  # there is no orientation
         rate, force = (
@@ -381,8 +394,8 @@ class _Messages:
             yield "/imu/data_raw", message, time_ns
 
     def _gnss(self, there: Instruments, frame: str, start_ns: int) -> Iterator[Sent]:
-        point, stamped = self._kinds("geometry_msgs", "Point", "PointStamped")
-        fix, status = self._kinds("sensor_msgs", "NavSatFix", "NavSatStatus")
+        point, stamped = self.kinds("geometry_msgs", "Point", "PointStamped")
+        fix, status = self.kinds("sensor_msgs", "NavSatFix", "NavSatStatus")
         variances = np.zeros(3) if there.gnss is None else np.array(there.gnss.variances)
         known = fix.COVARIANCE_TYPE_DIAGONAL_KNOWN if variances.any() else 0
         for time, x, y, z, *place in there.rows(GNSS_FILE):
@@ -409,8 +422,8 @@ class _Messages:
     def markers(self, boxes: Boxes, actors: list[str], time_ns: int) -> Any:
         """Boxes of actors as a sensor saw them, in place of those that another saw before."""
         types, names = self._types, ("Point", "Quaternion", "Pose", "Vector3")
-        point, turn, pose, vector = self._kinds("geometry_msgs", *names)
-        marker, mesh = self._kinds("visualization_msgs", "Marker", "MeshFile")
+        point, turn, pose, vector = self.kinds("geometry_msgs", *names)
+        marker, mesh = self.kinds("visualization_msgs", "Marker", "MeshFile")
         image = types["sensor_msgs/msg/CompressedImage"]
         header, none = self.header(WORLD, time_ns), np.empty(0, np.uint8)
         orange = types["std_msgs/msg/ColorRGBA"](1, 0.6, 0, 0.4)

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass, field
 from functools import cached_property
 from itertools import pairwise
 from pathlib import Path
@@ -88,6 +88,7 @@ class Sweeps:
     start_ns: int | None = None  # from 1970-01-01 UTC to the survey's start
     instruments: Instruments | None = None  # of the carrier, with files beside it
     fired: Fired | None = None  # all rays, if the survey keeps every return with its ray
+    classes: Mapping[int, str] = field(default_factory=dict, compare=False)  # their names
 
     def __len__(self) -> int:
         return len(self.begins_ns)
@@ -178,6 +179,7 @@ class Sweeps:
             None if survey.start is None else nanoseconds(survey.start),
             instruments=Instruments.of(survey),
             fired=fired,
+            classes=survey.classes,
         )
 
     def points(self, cloud: CloudLike, first: int = 0, stop: int | None = None) -> Iterator[Cloud]:
@@ -217,6 +219,7 @@ class Sweeps:
         words = {"format": _FORMAT, **{name: getattr(self, name) for name in _WORDS}}
         if self.instruments is not None:
             words["instruments"] = self.instruments.words()
+        words |= {"classes": dict(self.classes)} if self.classes else {}
         arrays: dict[str, Any] = {"words": np.frombuffer(json.dumps(words).encode(), np.uint8)}
         arrays |= {name: getattr(self, name) for name in _ARRAYS}
         placed = {"": self.pose, "mount_": self.mounts}
@@ -260,6 +263,7 @@ class Sweeps:
                 mounts=mounts,
                 actor_poses=tuple(actors),
                 instruments=instruments and Instruments.from_words(instruments, Path(path).parent),
+                classes={int(number): name for number, name in words.get("classes", {}).items()},
                 **{name: arrays[name] for name in _ARRAYS},
                 **{name: words[name] for name in _WORDS},
             )

@@ -24,7 +24,7 @@ from ..base.words import plural
 from ..columns.cloud_file import CloudFile
 from ..columns.ply_format import AXES
 from ..columns.table import AXES as POSITION
-from ..columns.table import CAUSES, NO_SURFACE, OBJECT, TABLE, Column, X, Y, Z
+from ..columns.table import CAUSES, NO_SURFACE, OBJECT, TABLE, Column, X, Y, Z, by_value
 from ..export.sweeps import SWEEPS_FILE, Sweeps
 from ..pipeline.database import FILE
 from ..render.closeup import around_ways, floor_and_cut
@@ -149,10 +149,9 @@ class View:
         """Names of the values 0, 1, 2, … of a column, if any."""
         if self.pictured is not None and column in self.columns:
             return self.pictured.names_of(self.columns[column])
-        if self.sweeps is not None and column == "sensor":
-            return self.sweeps.sensors
-        if self.sweeps is not None and column == "object":
-            return (*self.sweeps.objects, *self.sweeps.actors)
+        if (known := self.sweeps) is not None and column in ("sensor", "object", "class"):
+            objects, classes = (*known.objects, *known.actors), by_value(known.classes)
+            return {"sensor": known.sensors, "object": objects, "class": classes}[column]
         return CAUSES if self.columns.get(column) == TABLE["cause"] else ()
 
     def _around(self) -> tuple[Floats, Floats, Floats]:

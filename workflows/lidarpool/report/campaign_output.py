@@ -7,7 +7,7 @@ import re
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -25,8 +25,7 @@ from ..run.conductor import Conductor, Output
 from ..run.job_points import listed
 from ..run.run_result import CampaignRun
 from ..run.store import RUN_FOLDER, RunStore, remove_run
-from ..scenario.campaign import CampaignSpec, Described, hashes
-from ..scenario.campaign_sections import Keep
+from ..scenario.campaign import CampaignSpec, hashes
 
 CAMPAIGN_FILE = "campaign.json"  # whose data set this is, and the software that made it
 
@@ -143,13 +142,9 @@ class DataSetOutput(Output[CampaignRun]):
         run = CampaignRun.of(store.rows(), seconds, store.resumed, sensors=store.sensors, **more)
         record: dict[str, Any] = {"identity": dict(store.identity), "casting": store.casting}
         record |= {"backend": store.backend, "sensors": run.sensors}
-        record |= {
-            "files": hashes(self.campaign.files),
-            "campaign": asdict(self.campaign.described),
-        }
-        write_shared(
-            self.dataset, record | {"shards": shards_of(self.campaign.shard)}, run, store.rows
-        )
+        record |= {"files": hashes(self.campaign.files), "campaign": self.campaign.described}
+        record["shards"] = shards_of(self.campaign.shard)
+        run, _ = write_shared(self.dataset, record, run, store.rows)
         if run.failed:
             store.save(now=True)
             store.db.close()
@@ -159,39 +154,34 @@ class DataSetOutput(Output[CampaignRun]):
         return run
 
 
-def write_shared(
-    dataset: DataSet,
-    record: Mapping[str, Any],
-    run: CampaignRun,
-    rows: Callable[[], Iterator[JobRow]],
-) -> dict[str, Any]:
-    """Write what all jobs share, and last what says that the data set is complete.
-
-    `record` is the content of CAMPAIGN_FILE. Returns that of report.json.
-    """
-    # Matplotlib takes as long as all other imports.
-    from .campaign_report import write_card
-    from .charts import draw_sweep
-
-    campaign, place = described(record), dataset.place
-    write_record(place, record)
-    write_table(place, campaign.names, rows)
-    dataset.finish(rows())
-    saved = sweeps(place.url)
-    picture = draw_sweep(next(iter(saved))) if len(saved) else None
-    return write_card(place, campaign, run, rows(), record["casting"] or software(), picture)
-
-
 def write_record(place: Storage, record: Mapping[str, Any]) -> None:
     """Write CAMPAIGN_FILE."""
     with explained(f"{place} cannot be written"):
         place.write(CAMPAIGN_FILE, (json.dumps(record, indent=1) + "\n").encode())
 
 
-def described(record: Mapping[str, Any]) -> Described:
-    """Return what the content of CAMPAIGN_FILE says of the campaign."""
-    told = record["campaign"]
-    return Described(**(told | {"keep": Keep(**told["keep"])}))
+def write_shared(
+    dataset: DataSet,
+    record: Mapping[str, Any],
+    run: CampaignRun,
+    rows: Callable[[], Iterator[JobRow]],
+) -> tuple[CampaignRun, dict[str, Any]]:
+    """Write what all jobs share, and last what says that the data set is complete.
+
+    `record` is for CAMPAIGN_FILE. Returns the run with class names, and the content of report.json.
+    """
+    # Matplotlib takes as long as all other imports.
+    from .campaign_report import write_card
+    from .charts import draw_sweep
+
+    campaign, place = record["campaign"], dataset.place
+    write_record(place, record)
+    write_table(place, campaign["names"], rows)
+    dataset.finish(rows())
+    saved = sweeps(place.url)
+    picture = draw_sweep(next(iter(saved)), saved.classes) if len(saved) else None
+    run, versions = replace(run, classes=saved.classes), record["casting"] or software()
+    return run, write_card(place, campaign, run, rows(), versions, picture)
 
 
 def shards_of(shard: Shard) -> list[str] | None:

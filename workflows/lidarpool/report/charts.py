@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from itertools import cycle
 from typing import Any
 
@@ -13,7 +13,7 @@ from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter
 from ..base.arrays import Bools, Floats
 from ..base.sampling import even_indices
 from ..base.words import plural
-from ..columns.table import TABLE, Z
+from ..columns.table import TABLE, Z, by_value
 from ..datasets.figures import Figures, Varied
 from ..datasets.sweep_data import Sweep
 from ..render import theme
@@ -251,7 +251,7 @@ def _set_labels(page: Page, axes: Axes, scale: Varied, wide: float) -> None:
     axis.set_major_formatter(_tick)
 
 
-def draw_sweep(sweep: Sweep) -> Page:
+def draw_sweep(sweep: Sweep, names: Mapping[int, str]) -> Page:
     """Draw the points of a sweep in the sensor's axes, coloured by class, or else by height."""
     page = Page(SWEEP_SIZE)
     frame = np.divide(SWEEP_FRAME, SWEEP_SIZE * 2)
@@ -269,8 +269,7 @@ def draw_sweep(sweep: Sweep) -> Page:
         ", ".join(values),
     )
     if classes is not None and len(np.unique(classes)) > 1:
-        names = ["none", *(f"class {one}" for one in range(1, int(classes.max()) + 1))]
-        colouring = colours_of(classes, TABLE["class"], names)
+        colouring = colours_of(classes, TABLE["class"], by_value({0: "none", **names}))
         page.legend(colouring.labels, "sensor")
         painted = colouring.paint(classes)
     else:

@@ -7,7 +7,7 @@ import tempfile
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import closing
+from contextlib import closing, contextmanager, suppress
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from itertools import islice
@@ -35,10 +35,10 @@ from ..run.progress import Screen
 from ..run.remote import fetch_database
 from ..run.run_page import RunPage
 from ..run.run_result import CampaignRun, RunResult
-from ..run.store import RUN_FOLDER, parts_of, with_sensors
+from ..run.store import RUN_FOLDER, RunStore, parts_of, with_sensors
 from ..scenario.build import build
 from ..scenario.scenario import Scenario
-from .campaign_output import CAMPAIGN_FILE, dataset_files, described, write_record, write_shared
+from .campaign_output import CAMPAIGN_FILE, dataset_files, write_record, write_shared
 from .output import SurveyOutput
 
 ROWS = 1_000  # of jobs in memory at a time
@@ -74,7 +74,7 @@ class _Part:
         found |= {f"the file {name}": digest for name, digest in record["files"]}
         if record["casting"]:  # else it has cast nothing
             found |= {f"{name} of workers": value for name, value in record["casting"].items()}
-        return found | {"the number of shards": shard.of for shard in self.shards[:1]}
+        return found | ({"the number of shards": self.shards[0].of} if self.shards else {})
 
 
 @checked
@@ -88,9 +88,7 @@ def merge(
 ) -> dict[str, Any]:
     """Merge shards into the data set or result that one run would have made.
 
-    Files are linked (hard links) or copied by the object store, where that is possible, else
-    copied. Every byte is compared with what its shard says of it. After a kill, the same call goes
-    on.
+    Every byte is compared with what its shard says of it. After a kill, the same call goes on.
 
     Parameters
     ----------
@@ -112,8 +110,8 @@ def merge(
     Raises
     ------
     LidarpoolError
-        If shards are missing, damaged, given twice, unfinished, of other runs or of other software;
-        the message names them.
+        If shards are missing, damaged, given twice, unfinished, of another run or other software:
+        it names them.
     """
     place, screen = output_place(str(out)), screen or Screen()
     places = {one.url: one for one in map(Storage.at, shards) if one.url != Storage.at(place).url}
@@ -135,13 +133,11 @@ def _read(place: Storage) -> _Part:
     """Read a finished shard, or data set of several; LidarpoolError if it is none."""
     with explained(f"{place} cannot be read"):
         there, run = place.sizes(), place.below(RUN_FOLDER)
-        try:
+        with suppress(LidarpoolError, LookupError, TypeError, ValueError):
             if {CAMPAIGN_FILE, INDEX_FILE, LAST_FILE} <= there.keys():
                 return _of_dataset(place, json.loads(place.read(LAST_FILE))["notes"])
             if FILE in run.sizes():
                 return _of_survey(place, run)
-        except (LidarpoolError, LookupError, TypeError, ValueError):
-            pass
     raise LidarpoolError(
         f"{place} holds no finished shard: give a folder of lidarpool run --shard; --resume "
         "finishes an unfinished one."
@@ -159,21 +155,27 @@ def _of_dataset(place: Storage, notes: Sequence[str] = (), of: int = 1) -> _Part
 
 
 def _of_survey(place: Storage, run: Storage) -> _Part:
-    """Read a shard of a survey; LookupError if it is none."""
+    """Read a shard of a survey; LookupError if it is none, or not finished."""
+    with _database(run) as db:
+        names = ("identity", "casting", "made_of", "notes")
+        record = dict(db.meta) | {name: json.loads(db.meta[name]) for name in names}
+        shard, whole = Shard.parse(record["identity"].pop("shard")), record["made_of"]["scans"]
+        kept = db.job(0, shard.scans(whole).stop, shard.scans(whole).start)
+        if not kept.complete:
+            raise LookupError("scans are missing")
+        record |= {"files": []}
+        return _Part(place, record, [shard], whole, record["notes"], kept.ordered, kept.trials)
+
+
+@contextmanager
+def _database(run: Storage | None = None) -> Iterator[RunDatabase]:
+    """Open a copy of the database of a run, or an empty one."""
     with tempfile.TemporaryDirectory(prefix="lidarpool-") as folder:
-        fetch_database(run, Path(folder, FILE))
-        with closing(RunDatabase(Path(folder, FILE), durable=False)) as db:
-            meta = db.meta
-            record = {name: json.loads(meta[name]) for name in ("identity", "casting", "made_of")}
-            shard = Shard.parse(record["identity"].pop("shard"))
-            whole = record["made_of"]["scans"]
-            scans = shard.scans(whole)
-            kept = db.job(0, scans.stop, scans.start)
-            if kept.scans_done < len(scans):
-                raise LookupError("scans are missing")
-            record |= {"backend": meta["backend"], "parts": meta["parts"], "files": []}
-            notes = json.loads(meta["notes"])
-            return _Part(place, record, [shard], whole, notes, kept.ordered, kept.trials)
+        path = Path(folder, FILE)
+        if run is not None:
+            fetch_database(run, path)
+        with closing(RunDatabase(path, durable=False)) as db:
+            yield db
 
 
 def _check(parts: Sequence[_Part], partial: bool, own: _Part | None = None) -> list[str]:
@@ -232,25 +234,22 @@ def _merge_dataset(parts: Sequence[_Part], out: Storage, partial: bool) -> dict[
     for part in known:
         sensors = with_sensors(sensors, part.record["sensors"].items())
     record = {**cast.record, "sensors": sensors, "campaign": campaign}
-    keep = described(record).keep
-    dataset = DataSet(replace(out, durable=False), keep.format, keep.layout)
+    dataset = DataSet(replace(out, durable=False), **campaign["keep"])
     dataset.check_installed()
     if own is None:  # from now on it is known whose files these are
         write_record(out, record | {"shards": []})
-    with tempfile.TemporaryDirectory(prefix="lidarpool-") as folder:
-        with closing(RunDatabase(Path(folder, FILE), durable=False)) as db:
-            _take_jobs(dataset, known, own, db)
-            lacking = _missing(known)
-            there = {str(shard) for part in known for shard in part.shards} - {*map(str, lacking)}
-            record["shards"] = sorted(there, key=Shard.parse) if lacking else None
+    with _database() as db:
+        _take_jobs(dataset, known, own, db)
 
-            def rows() -> Iterator[JobRow]:
-                return map(JobRow.of, db.job_rows())
+        def rows() -> Iterator[JobRow]:
+            return map(JobRow.of, db.job_rows())
 
-            notes = [*dict.fromkeys(note for part in parts for note in part.notes), *missing]
-            more = {"sensors": sensors, "notes": tuple(notes)}
-            run = CampaignRun.of(rows(), time.monotonic() - began, 0, **more)
-            return write_shared(dataset, record, run, rows)
+        lacking, there = _missing(known), {shard for part in known for shard in part.shards}
+        record["shards"] = [*map(str, sorted(there.difference(lacking)))] if lacking else None
+        notes = [*dict.fromkeys(note for part in parts for note in part.notes), *missing]
+        more = {"sensors": sensors, "notes": tuple(notes)}
+        run = CampaignRun.of(rows(), time.monotonic() - began, 0, **more)
+        return write_shared(dataset, record, run, rows)[1]
 
 
 def _take_jobs(

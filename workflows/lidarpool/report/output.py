@@ -175,7 +175,7 @@ class SurveyOutput(Output[tuple[RunResult, dict[str, Any]]]):
             if workers:
                 result = workers.recorded(result)
             report = make_report(result, files, cloud)
-            report["notes"] += [note for one in formats for note in one.notes(points)]
+            report["notes"] += [note for one in formats for note in one.notes(points, sweeps)]
             if pictures:
                 from .page.rendering import write_page  # as slow to import as the pictures
 

@@ -56,7 +56,7 @@ _PLANNING = ("trials", "best_length", "shortest_possible", "collision_free")
 class CountedCloud:
     """A cloud that computes its statistics while its points are read for something else.
 
-    `by_object` are the points of each object, `no_surface` those of none, `limits`
+    `by_object` and `by_class` are the points of each, `no_surface` those of no object, `limits`
     are {column: minimum and maximum}, and `bounds` (2, 3) the lowest and highest coordinates in the
     world.
     """
@@ -64,6 +64,7 @@ class CountedCloud:
     def __init__(self, cloud: CloudLike, objects: int) -> None:
         self._cloud = cloud
         self.by_object, self.no_surface = np.zeros(objects, np.int64), 0
+        self.by_class = np.zeros(1 << 16, np.int64)
         self.limits: dict[str, tuple[float, float]] = {}
         self.bounds: Floats = np.asarray(cloud.bounds, dtype=np.float64)
         # A cell that a surface crosses has about the square of its side of that surface.
@@ -83,6 +84,8 @@ class CountedCloud:
                 owners = owners[owners >= 0]
                 self.no_surface += len(chunk) - len(owners)
             self.by_object += np.bincount(owners, minlength=len(self.by_object))
+            if "class" in chunk.columns:
+                self.by_class += np.bincount(chunk["class"], minlength=len(self.by_class))
             for name in (column.name for column in chunk.table):
                 values = chunk[name]
                 low, high = self.limits.get(name, (np.inf, -np.inf))
@@ -144,6 +147,8 @@ def make_report(result: RunResult, files: Sequence[str], cloud: CountedCloud) ->
             name: int(count) for name, count in zip(scene.all_names, cloud.by_object, strict=True)
         }
         | ({NO_SURFACE: cloud.no_surface} if cloud.no_surface else {}),
+        "classes": {str(n): {"points": k} for n, k in enumerate(cloud.by_class.tolist()) if k},
+        **({"class_names": dict(survey.classes)} if survey.classes else {}),
         "points_per_m2": cloud.density if survey.coordinates == "world" else None,
         "columns": _columns(cloud),
         "seconds": {

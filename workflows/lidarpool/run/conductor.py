@@ -53,7 +53,7 @@ class Output(Generic[R]):
 
 @dataclass(frozen=True, eq=False)
 class Kept(Output[RunResult]):
-    """Nothing is written: the points stay in the run's store, which says what they are `made_of`."""
+    """Nothing is written: the points stay in the run's store, and what they are `made_of`."""
 
     made_of: Mapping[str, Any] | None = None
 

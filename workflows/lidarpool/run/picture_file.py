@@ -14,7 +14,7 @@ import numpy as np
 from ..base.archives import open_archive
 from ..base.arrays import AnyArray, Floats, Floats32
 from ..base.words import plural
-from ..columns.table import CAUSES, TABLE, Column
+from ..columns.table import CAUSES, TABLE, Column, by_value
 from ..plan import Plan, Planning
 from ..scenario.build import Job
 from ..scene.actors import Actor, samples_each, shapes_of
@@ -73,6 +73,7 @@ class PictureContent:
     reflectance: Floats | None = None
     coordinates: str = "world"  # of the cloud's points, or "sensor": they do not fit the scene
     triangles: int = 0  # of the scene, though simpler instances may be drawn
+    classes: Sequence[str] | None = None  # names of the classes 0, 1, 2, …
 
     @classmethod
     def of(cls, result: RunResult) -> PictureContent:
@@ -109,6 +110,7 @@ class PictureContent:
             materials.reflectance,
             survey.coordinates,
             scene.triangles,
+            by_value(survey.classes),
         )
         return pictured, drawn
 
@@ -138,7 +140,7 @@ class PictureContent:
             return [way.name for way in self.sensors]
         if column == TABLE["cause"]:
             return CAUSES
-        return self.scene.all_names if column.name == "object" else ()
+        return {"object": self.scene.all_names, "class": self.classes}.get(column.name) or ()
 
     def save(self, path: Path) -> None:
         """Write it as a NumPy archive; the same content gives the same bytes."""
@@ -149,6 +151,7 @@ class PictureContent:
             "own": [asdict(column) for column in self.own],
             "coordinates": self.coordinates,
             "triangles": self.triangles,
+            **({"classes": self.classes} if self.classes else {}),
         }
         arrays: dict[str, Any] = {
             "format": _FORMAT,
@@ -239,7 +242,7 @@ class PictureContent:
             plan = Plan(path=arrays["path"], **numbers)
         rays, trials = arrays["sample_rays"], tuple(arrays.get("waypoints", ()))
         duration, own = float(arrays["duration_ns"]), [Column(**one) for one in names["own"]]
-        rest = arrays.get("reflectance"), names["coordinates"], names["triangles"]
+        rest = arrays.get("reflectance"), *map(names.get, ("coordinates", "triangles", "classes"))
         return cls(scene, sensors, counts, rays, planning, plan, trials, duration, own, *rest)
 
 

@@ -110,8 +110,9 @@ class CampaignRun:
         Wall time of this run.
     stages
         Tasks of each stage.
-    notes, sensors
-        Remarks for the user, and the sensors of the jobs that are done, {name: models and rates}.
+    notes, sensors, classes
+        Remarks for the user, the sensors of the jobs that are done, {name: models and rates}, and
+        names of classes, {number: name}.
     """
 
     failed: tuple[JobRow, ...]
@@ -124,6 +125,7 @@ class CampaignRun:
     stages: tuple[StageTotals, ...] = ()
     notes: tuple[str, ...] = ()
     sensors: Mapping[str, str] = field(default_factory=dict)
+    classes: Mapping[int, str] = field(default_factory=dict)
     __repr__ = one_line
 
     @classmethod

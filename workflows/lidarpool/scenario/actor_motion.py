@@ -21,7 +21,7 @@ from ..base.declared import Several, Text, TextOrTexts, Triple, about, by_text, 
 from ..base.errors import LidarpoolError, prefixed
 from ..base.xmlfile import refuse_entity
 from ..scene.actors import Actor
-from ..scene.files.urdf import SUFFIXES as ROBOTS
+from ..scene.files.meshfile import ROBOTS
 from ..scene.scene_mesh import SceneMesh
 from ..sensor import Mounted, Pose, Track, load_trajectory
 from ..sensor.calibrations import said

@@ -22,11 +22,12 @@ from ..export.formats import Format
 from ..plan import Planning
 from ..plan.planning import Search
 from ..scene.actors import Actor
+from ..scene.files.cityjson import CLASS_NAMES as CITY_NAMES
 from ..scene.files.cityjson import CLASSES as CITY_CLASSES
 from ..scene.files.meshfile import CITYJSON
 from ..scene.robot import Robot
 from ..scene.scene import Scene
-from ..sensor import Material, Mounted, Noise, Pose, Returns, Survey, Track
+from ..sensor import Material, Mounted, Noise, Pose, Returns, Sensor, Survey, Track
 from ..sensor.materials import MaterialTable, rows_named, with_class, with_classes
 from ..sensor.survey import CloudOptions
 from ..sensor.trajectory import CENTRE
@@ -55,6 +56,9 @@ SEED_POSES = tuple(Pose((0.0, 0.0, height)) for height in (1.0, 2.0, 3.0))
 
 # Of the hits in a scene with the default objects, every so many are kept.
 SEED_KEPT = 5
+
+# Precision of points in scenes without these, if no sensor states a resolution.
+MESH_PRECISION_M = 0.001
 
 
 @dataclass(frozen=True, eq=False)
@@ -149,7 +153,16 @@ def build(
         sensors = _mounted(shapes)
     placing: Placing | None = None
     if scenario.poses is None and track is None and not scenario.scene.has_seed:
-        placing = place(scene, sensors[0], landscape=bool(found.rasters))
+        alone = scenario.mount is None and not scenario.sensors
+        placing = place(
+            scene,
+            sensors[0],
+            landscape=bool(found.rasters),
+            city=_has_city(scenario),
+            narrow=alone and not scenario.sensor.model_fields_set,
+        )
+        if placing.grid:
+            sensors = [replace(sensors[0], sensor=Sensor.grid(**placing.grid))]
     poses = SEED_POSES if placing is None else placing.poses
     survey_of = partial(_survey, scenario, sensors, track or poses, scene.origin, epsg)
     actors = _actors(shapes, standing, track)
@@ -331,9 +344,13 @@ def _materials(scenario: Scenario, scene: Scene, vehicles: Sequence[int | None])
     for semantic_class in sorted({one for one in vehicles if one is not None}):
         rows = np.array([first + k for k, one in enumerate(vehicles) if one == semantic_class])
         made = with_class(made or [every], semantic_class, rows, scene.all_names)
-    if any(entry.file.lower().endswith(CITYJSON) for entry in scenario.scene.files):
+    if _has_city(scenario):
         made = with_classes(made or [every], CITY_CLASSES, scene.all_names)
     return made
+
+
+def _has_city(scenario: Scenario) -> bool:
+    return any(entry.file.lower().endswith(CITYJSON) for entry in scenario.scene.files)
 
 
 def _survey(
@@ -349,11 +366,20 @@ def _survey(
     needs, cloud = given.output.needs, declared(given.cloud, CloudOptions)
     cloud["columns"] = (*given.cloud.columns, *needs, *columns)
     cloud["epsg"] = given.cloud.epsg or epsg
-    if given.scene.has_seed and cloud["keep_every"] is None:
-        cloud["keep_every"] = 1 if "ray" in needs else SEED_KEPT
+    if given.scene.has_seed:
+        cloud["keep_every"] = cloud["keep_every"] or (1 if "ray" in needs else SEED_KEPT)
+    elif not any(one.sensor.optics.resolution_m for one in carried):
+        cloud["precision_m"] = cloud["precision_m"] or MESH_PRECISION_M
     check_whole((*needs, *columns), cloud["keep_every"] or 1)
     track = way if isinstance(way, Track) else None
     poses = () if isinstance(way, Track) else given.poses or way
+    # City objects have classes by their types; a number or name of the scenario's is its own.
+    placed = (*given.placed, *(given.traffic.vehicles if given.traffic else ()))
+    own = {one.semantic_class for one in (*given.materials, *placed)}
+    asked = given.classes or "class" in cloud["columns"]
+    made = {one.semantic_class for one in materials} - own if asked else ()
+    named = {CITY_NAMES[number]: number for number in made if number in CITY_NAMES}
+    named |= {name: number for number, name in given.classes.items()}
     own_noise = all(one.noise is not None for one in carried)
     alone = not given.sensors and given.mount is None and carried[0].noise is None
     return Survey(
@@ -362,6 +388,7 @@ def _survey(
         **({"sensor": carried[0].sensor} if alone else {"sensors": carried}),
         steps=given.steps,
         materials=materials,
+        classes={number: name for name, number in named.items()},
         returns=Returns(**dict(given.returns)),
         noise=Noise() if own_noise else Noise(**dict(given.noise)),
         navigation=given.navigation,

@@ -8,7 +8,7 @@ import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence, Set
 from contextlib import suppress
 from copy import copy
-from dataclasses import dataclass, fields, replace
+from dataclasses import asdict, replace
 from functools import cache, cached_property, partial
 from itertools import chain, combinations, count, islice
 from pathlib import Path
@@ -37,6 +37,7 @@ from ..base.words import did_you_mean, plural
 from ..base.yamlfile import read_yaml
 from ..datasets.job_table import Value
 from ..export.format_table import check_whole
+from ..sensor.calibrations import text_of
 from .build import Job, build
 from .campaign_sections import (
     COUNT_MOST,
@@ -57,20 +58,6 @@ SHOWN_MOST = 5  # files of a command that are named
 _NOISE = "noise.seed"  # where a job's own seed goes
 _KEYS = re.compile(r"""^(?:["']?(?:base|vary)["']?\s*:|\{)""", re.MULTILINE)  # or one mapping {…}
 _UNSAFE = re.compile(r"[^\w.-]+", re.ASCII)  # in a name of files
-
-
-@dataclass(frozen=True)
-class Described:
-    """What the card of a data set says of its campaign; the fields are those of the campaign."""
-
-    title: str
-    license: str
-    command: str
-    description: str
-    seed: int
-    count: int
-    names: Sequence[str]
-    keep: Keep
 
 
 class CampaignSpec:
@@ -192,9 +179,10 @@ class CampaignSpec:
         return made
 
     @property
-    def described(self) -> Described:
-        """What the card of its data set says."""
-        return Described(**{one.name: getattr(self, one.name) for one in fields(Described)})
+    def described(self) -> dict[str, Any]:
+        """What the card of its data set says, as JSON holds it."""
+        names = ("title", "license", "command", "description", "seed", "count", "names")
+        return {name: getattr(self, name) for name in names} | {"keep": asdict(self.keep)}
 
     @property
     def numbers(self) -> range:
@@ -267,7 +255,11 @@ class CampaignSpec:
         mistakes = Mistakes()
         # `Path.exists` fails at names that no file can have.
         lost = [path for path in self.files if not os.path.exists(path)]  # noqa: PTH110
-        mistakes.lines += [f"{self.command}: {str(path)!r} does not exist." for path in lost]
+        mistakes.lines += [
+            f"{self.command}: {self._jobs.named_in(path)}{str(path)!r} does not exist: check the "
+            "name and the folder."
+            for path in lost
+        ]
         mistakes.tell()
 
     @cached_property
@@ -319,6 +311,10 @@ class _JobSource:
 
     def scenario(self, number: int) -> Scenario | None:
         return None
+
+    def named_in(self, file: Path) -> str:
+        """Where a file is named, for messages: a table and its line; empty if in none."""
+        return ""
 
     def job(self, number: int, cache: SceneCache | None, columns: Sequence[str], own: Any) -> Job:
         scenario = self.scenario(number)
@@ -482,6 +478,14 @@ class _Varied(_JobSource):
             "tables": fingerprint(to_json([base.tables for base in self._bases])),
         }
 
+    def named_in(self, file: Path) -> str:
+        tables = {path: text for base in self._bases for text, path in base.table_files.items()}
+        for table, text in tables.items():
+            for number, line in enumerate(text_of(table).splitlines(), 1):
+                if file.name in line and not line.lstrip().startswith("#"):
+                    return f"{text}: {table}, line {number}: "
+        return ""
+
     def values(self, number: int) -> dict[str, Value]:
         return self._drawn(number)[0]
 
@@ -527,6 +531,7 @@ class _Base:
         self._vary, (self._noise, _) = vary, find_field(self.scenario, _NOISE)
         self._steps: dict[str, FieldSteps] = {}
         self.tables: dict[str, list[Any]] = {}
+        self.table_files: dict[str, Path] = {}
         self.files: set[Path] = set()  # that a job may read
         mistakes = Mistakes()
         for text, choice in vary.items():
@@ -534,7 +539,7 @@ class _Base:
                 self._steps[text], kind = find_field(self.scenario, text)
                 if choice.sample is None:
                     continue
-                table = self.scenario.path(choice.sample.file)
+                self.table_files[text] = table = self.scenario.path(choice.sample.file)
                 with prefixed(text):
                     if (key := (table, repr(kind))) not in tables:
                         tables[key] = read_rows(table, kind)
@@ -683,8 +688,9 @@ def find_field(scenario: Scenario, text: str) -> tuple[FieldSteps, Any]:
             key, node, kind = _field(node, rest[0], at)
             used = 1
         elif isinstance(node, dict):
-            key, used = _named(list(node), rest, at)
-            node = node[key]
+            keys = {str(key): key for key in node}  # of classes, numbers
+            name, used = _named([*keys], rest, at)
+            node = node[key := keys[name]]
         elif isinstance(node, (tuple, list)):
             key, used = _entry(node, rest, at)
             node = node[key]

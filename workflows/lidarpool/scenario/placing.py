@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -12,23 +12,29 @@ from numpy.typing import ArrayLike
 
 from ..base.arrays import Floats
 from ..base.words import plural
+from ..scene.files.cityjson import BUILDING, CLASSES
 from ..scene.floor import heights_at, reaching, room_at
 from ..scene.scene import Scene
 from ..scene.simplified import Drawn
 from ..scene.surroundings import Surroundings, in_the_way, is_open
-from ..sensor import Mounted, Pose
+from ..sensor import Mounted, Pose, Sensor
+from ..sensor.materials import rows_named
 
 # Heights above a floor; and the least distance from the ceiling.
 _HEIGHTS_M, _BELOW_M = (1.0, 2.0, 3.0), 0.2
 
-# Distances from the middle that are tried in turn if something is in the way there.
-_ASIDE_M = (2.0, 4.0, 8.0)
+# Distances from the middle that are tried in turn if something is in the way there, or a building.
+_ASIDE_M = (2.0, 4.0, 8.0, 16.0, 32.0, 64.0)
 
 # Poses around an object: azimuths, which see two sides of a box each; degrees above its middle; and
 # distance from its middle, in its diagonals, the least and the most.
 _AZIMUTHS_DEG, _ABOVE_DEG, _FAR = (45, 135, 225, 315), 20.0, (1.5, 3.0)
 _LOOKED_AT = 1000  # firings that tell a sensor's field of view
 _FACING_DEG = 45.0  # rays of that field
+
+# A grid around an object has about so many points, but not more rays; of all poses. Rays that are
+# tried are so many in a row, and the field of view is so much wider than the object.
+_POINTS, _RAYS_MOST, _TRIED, _MARGIN = 100_000, 5_000_000, 64, 1.02
 
 # Larger scenes are not looked at, nor sheets such as terrains of more triangles than the second,
 # and instances have no more: a tree takes 300 bytes and some microseconds a triangle.
@@ -42,14 +48,24 @@ class Placing:
     poses: tuple[Pose, ...]  # in world coordinates
     note: str = ""  # for users, on poses that they may not expect
     around: bool = False  # whether the poses are around an object
+    grid: Mapping[str, Any] = field(default_factory=dict)  # of `Sensor.grid`, if narrowed to it
 
 
-def place(scene: Scene, carried: Mounted, landscape: bool = False) -> Placing:
+def place(
+    scene: Scene,
+    carried: Mounted,
+    *,
+    landscape: bool = False,
+    city: bool = False,
+    narrow: bool = False,
+) -> Placing:
     """Choose poses in a scene from mesh files; a landscape is not taken for an object.
 
     In a room or a landscape they are in the middle, or beside what stands there, such as a tree; 1,
     2 and 3 m above the floor or ground, or at a quarter, half and three quarters of the height of
-    a lower room. Around an object they are on four sides and above it.
+    a lower room. Around an object they are on four sides and above it; a grid to `narrow` is
+    narrowed to it. The buildings of a `city` are not entered: poses are on ground beside them, or
+    around all of them.
     """
     low, high = scene.bounds + scene.origin
     middle = (low + high) / 2
@@ -57,11 +73,15 @@ def place(scene: Scene, carried: Mounted, landscape: bool = False) -> Placing:
     if landscape and not len(heights_at(drawn, middle[0], middle[1])):  # a hole
         ground = drawn.vertices[drawn.faces].mean(axis=1) + drawn.origin
         middle = ground[np.argmin(np.hypot(*(ground - middle)[:, :2].T))]
-    standing = _standing(drawn, middle)
-    looker = None if landscape else _looker(drawn)
-    if looker is None or not looker.is_object(looker.views(_local(standing, scene))):
+    standing, looker = _standing(drawn, middle), None if landscape else _looker(drawn)
+    if city and len(heights_at(_buildings(drawn), middle[0], middle[1])):
+        standing = _aside(drawn, middle, outdoors=True)
+        is_object = not standing
+    else:
+        is_object = looker is not None and looker.is_object(looker.views(_local(standing, scene)))
+    if not is_object:
         if in_the_way(drawn, _local(standing, scene)):
-            standing = _aside(drawn, middle) or standing
+            standing = _aside(drawn, middle, outdoors=city) or standing
         return Placing(standing, _inside(looker, _local(standing, scene), scene, carried))
     poses = poses_around(scene, carried)
     far = np.linalg.norm(poses[-1].position - (low + high) / 2)
@@ -70,7 +90,38 @@ def place(scene: Scene, carried: Mounted, landscape: bool = False) -> Placing:
         f"this looks like an object of {sides} m, not a place to stand in: "
         f"{plural(len(poses), 'pose')} around and above it, {far:,.3g} m from its middle"
     )
-    return Placing(poses, note, around=True)
+    grid = _narrowed(drawn, looker, poses) if narrow and looker else {}
+    if grid:
+        width, height = grid["horizontal_fov_deg"], grid["vertical_fov_deg"]
+        note += (
+            f"; as no sensor is given, a grid of {grid['rays_per_revolution']:,} x "
+            f"{grid['layers']:,} rays from each, over {width:g} x {height:g} degrees around it"
+        )
+    return Placing(poses, note, around=True, grid=grid)
+
+
+def _narrowed(scene: Scene, looker: Surroundings, poses: Sequence[Pose]) -> dict[str, Any]:
+    """Return what `Sensor.grid` takes to see an object from poses, with about `_POINTS` points."""
+    turns = [np.eye(3) if pose.rotation is None else pose.rotation for pose in poses]
+    placed = [*zip(_local(poses, scene), turns, strict=True)]
+    sides = np.zeros(2)  # the widest angles to either side, and up or down
+    for at, turn in placed:
+        x, y, z = ((scene.vertices - at) @ turn).T
+        angles = np.abs([np.arctan2(y, x), np.arctan2(z, np.hypot(x, y))])
+        sides = np.maximum(sides, angles.max(axis=1))
+    width, height = np.clip(np.ceil(np.degrees(sides) * 20 * _MARGIN) / 10, 0.1, 179.0).tolist()
+    tried = Sensor.grid(_TRIED, _TRIED, height, horizontal_fov_deg=width)
+    rays = tried.directions(np.arange(_TRIED)).reshape(-1, 3)
+    met = [looker.cast(np.tile(at, (len(rays), 1)), rays @ turn.T).distance for at, turn in placed]
+    count = min(_POINTS / max(np.mean(np.isfinite(met)).item(), 1e-6), _RAYS_MOST)
+    a_degree = (count / (len(poses) * width * height)) ** 0.5
+    azimuths, layers = (int(side * a_degree / 10) * 10 for side in (width, height))
+    return {
+        "rays_per_revolution": max(40, azimuths),  # a time step has one at least
+        "layers": max(10, layers),
+        "vertical_fov_deg": height,
+        "horizontal_fov_deg": width,
+    }
 
 
 def _standing(scene: Scene, at: Floats) -> tuple[Pose, ...]:
@@ -83,20 +134,31 @@ def _standing(scene: Scene, at: Floats) -> tuple[Pose, ...]:
     return tuple(Pose((x, y, float(floor + height))) for height in heights)
 
 
-def _aside(scene: Scene, middle: Floats) -> tuple[Pose, ...]:
+def _buildings(scene: Scene) -> Scene:
+    """Return the triangles of a city's buildings."""
+    rows = [rows_named(pattern, scene.names) for pattern in CLASSES[BUILDING]]
+    own = np.isin(scene.face_object, np.concatenate(rows))
+    return replace(scene, faces=scene.faces[own], face_object=scene.face_object[own])
+
+
+def _aside(scene: Scene, middle: Floats, *, outdoors: bool = False) -> tuple[Pose, ...]:
     """Poses beside the middle (3,) of a scene where nothing is in the way; none if there are none.
 
-    World coordinates.
+    World coordinates. Those `outdoors` are on something, and neither in a building nor on one.
     """
     half = np.ptp(scene.bounds, axis=0) / 2
     reach = np.minimum(half, [max(_ASIDE_M) + 1.0] * 2 + [np.inf])
     local = middle - scene.origin
     near = reaching(scene, local - reach, local + reach)
     around = replace(scene, faces=scene.faces[near], face_object=scene.face_object[near])
+    built = _buildings(around) if outdoors else None
     for far in _ASIDE_M:
         for angle in np.arange(8) * np.pi / 4:
             step = far * np.array([np.cos(angle), np.sin(angle), 0.0])
             if (np.abs(step[:2]) < half[:2]).all():
+                x, y, _ = middle + step
+                if built and (len(heights_at(built, x, y)) or not len(heights_at(around, x, y))):
+                    continue
                 poses = _standing(around, middle + step)
                 if not in_the_way(around, _local(poses, scene)):
                     return poses
@@ -157,7 +219,8 @@ def poses_around(scene: Scene, carried: Mounted) -> tuple[Pose, ...]:
     far = max(far, carried.sensor.min_range_m + diagonal)
     digits = max(0, 3 - int(np.floor(np.log10(diagonal))))
     poses = []
-    for azimuth, above in (*((a, _ABOVE_DEG) for a in _AZIMUTHS_DEG), (180, 90.0)):
+    wide = high[0] - low[0] > high[1] - low[1]  # a turn sweeps the longer side, seen from above
+    for azimuth, above in (*((a, _ABOVE_DEG) for a in _AZIMUTHS_DEG), (270 if wide else 180, 90.0)):
         angles = np.radians([azimuth, above])
         (ca, ce), (sa, se) = np.cos(angles), np.sin(angles)
         at = np.round(middle + far * np.array([ca * ce, sa * ce, se]), digits) + 0.0

@@ -16,8 +16,9 @@ from ..base.errors import LidarpoolError, Mistakes, prefixed
 from ..base.validation import sentences
 from ..base.yamlfile import read_yaml
 from ..columns.table import COLOURS
-from ..scene.files.meshfile import SUFFIXES
+from ..scene.files.meshfile import CONVERTED, ROBOTS, SUFFIXES
 from ..sensor import Material, Navigation
+from ..sensor.materials import ClassNames
 from ..sensor.survey import SENSORS_MOST, CloudOptions, StepCount
 from ..sensor.trajectory import CENTRE
 from ..sensor.weather import Weather
@@ -43,9 +44,6 @@ from .sections import (
     scene_in_short,
 )
 
-# The cloud of a mesh file without a scenario.
-MESH_CLOUD = {"precision_m": 0.001}
-
 # Options of a mesh file without a scenario, and where a scenario has them.
 MESH_OPTIONS = {
     "sensor": "sensor",
@@ -69,13 +67,12 @@ def mesh_data(files: Sequence[Path], folder: Path, options: Mapping[str, Any]) -
 
     read = {name: options[name] for name in ("unit", "up_axis") if name in options}
     entries = [{"file": name} | read if read else name for name in map(moved, files)]
-    cloud = (MESH_CLOUD if files else {}) | {k: options[k] for k in ("columns",) if k in options}
     model = options.get("sensor")
     data = {
         "scene": {"files": entries} if files else None,
         "sensor": moved(model) if model and model.endswith((".yaml", ".yml")) else model,
         "poses": options.get("pose"),
-        "cloud": cloud or None,
+        "cloud": {"columns": options["columns"]} if "columns" in options else None,
         "output": {"write": options["format"]} if "format" in options else None,
     }
     return {name: value for name, value in data.items() if value is not None}
@@ -94,8 +91,8 @@ class Scenario(Section):
         Poses of the sensor, in world coordinates. By default it stands at the origin (default
         objects), 1, 2 and 3 metres above the ground; in mesh files where `place` puts it: in the
         middle of a room or landscape, or around an object.
-    steps
-        Time steps from each pose.
+    steps, classes
+        Time steps from each pose, and names of semantic classes, {number: name}.
 
     Raises
     ------
@@ -174,6 +171,10 @@ class Scenario(Section):
             max_length=100_000,
         ),
     ] = ()
+    classes: Annotated[
+        ClassNames,
+        about("names of classes, for reports and files; they add the column class", {40: "road"}),
+    ] = {}  # noqa: RUF012 - of a frozen model
     returns: Annotated[ReturnsSection, may_be_empty(ReturnsSection)] = ReturnsSection()
     noise: Annotated[NoiseSection, may_be_empty(NoiseSection)] = NoiseSection()
     weather: Annotated[Weather, may_be_empty(Weather)] = Weather()
@@ -202,7 +203,7 @@ class Scenario(Section):
             With the file, the field, what was given and what is allowed.
         """
         path = Path(path)
-        mesh = path.suffix.lower() in SUFFIXES
+        mesh = path.suffix.lower() in (*SUFFIXES, *ROBOTS, *CONVERTED)
         data = mesh_data([path], path.parent, options) if mesh else read_yaml(path)
         if options and not mesh:
             name = next(iter(options))

@@ -117,7 +117,7 @@ def scenario_template(data: Mapping[str, Any], note: str) -> str:
     `data` is what `mesh_data` returns, in place of some of them, `note` a remark on its poses.
     """
     lines, given = [_EVERY], dict(data)
-    if "sensor" in given:
+    if isinstance(given.get("sensor"), str):
         given["sensor"] = {"model": given["sensor"]}
     for name, field in Scenario.model_fields.items():
         lines.append("")

@@ -46,7 +46,7 @@ from ..sensor import Mounted, Noise, Pose, Returns, Sensor
 from ..sensor.beams import Rate, Step
 from ..sensor.materials import SemanticClass
 from ..sensor.models import datasheet, load_sensor
-from ..sensor.sensor import Fov, Layers, MaxRange, MinRange, RaysPerRevolution
+from ..sensor.sensor import Fov, Layers, MaxRange, MinRange, RaysPerRevolution, Sector
 
 COPIES_MOST = 1_000_000  # of one entry
 PathOf = Callable[[str], Path]  # of a file that a scenario names
@@ -94,8 +94,8 @@ class MeshFile(Section):
         str,
         about(
             ".glb .gltf .obj .stl .ply .off .dae .3mf .usd, CityJSON (.city.json), voxels of "
-            "AMAPVox (.vox), or a raster of heights: .tif .asc .hgt .img .dem .dt2; from the "
-            "scenario's folder",
+            "AMAPVox (.vox), a robot that stands still (.urdf), or a raster of heights: .tif .asc "
+            ".hgt .img .dem .dt2; from the scenario's folder",
             min_length=1,
             max_length=4096,
         ),
@@ -341,6 +341,7 @@ class SensorSection(Section):
     rays_per_revolution: RaysPerRevolution = 1000
     layers: Layers = 40
     vertical_fov_deg: Fov = 60.0
+    horizontal_fov_deg: Sector = 360.0
     step_deg: Step = 10.0
     rate_hz: Annotated[
         Rate | None, about("turns, lines or frames a second; by default the model's, or 10", 20.0)
@@ -366,7 +367,7 @@ class SensorSection(Section):
         own = [name for name in ("model", "calibration") if getattr(self, name) is not None]
         # Defaults are allowed, because `lidarpool init --all` writes them.
         known = SensorSection.model_fields
-        names = ("rays_per_revolution", "layers", "vertical_fov_deg")
+        names = ("rays_per_revolution", "layers", "vertical_fov_deg", "horizontal_fov_deg")
         grid = [name for name in names if getattr(self, name) != known[name].default]
         if own and grid:
             raise ValueError(f"a {own[0]} defines the beams: leave out {grid[0]}.")
@@ -400,8 +401,9 @@ class SensorSection(Section):
         model = path(self.model) if self.model and self.has_own_model else self.model
         unit = None if self.calibration is None else path(self.calibration)
         if model is None and unit is None:
+            grid = {"layers", "vertical_fov_deg", "horizontal_fov_deg", "step_deg"}
             azimuths = self.columns or self.rays_per_revolution
-            sensor = _grid(azimuths, self.layers, self.vertical_fov_deg, self.step_deg, **limits)
+            sensor = _grid(azimuths, **self.model_dump(include=grid), **limits)
         else:
             states = file_states(file for file in (model, unit) if isinstance(file, Path))
             given = {"calibration": unit, "columns": self.columns, "step_deg": self.step_deg}

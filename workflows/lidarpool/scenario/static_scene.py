@@ -13,7 +13,7 @@ from ..base.arrays import Floats
 from ..base.errors import LidarpoolError, Mistakes, prefixed
 from ..base.words import plural
 from ..scene.actors import Actor, box, one_mesh
-from ..scene.files.meshfile import Objects, load_objects
+from ..scene.files.meshfile import ROBOTS, Objects, load_objects
 from ..scene.files.scene_graph import Raster
 from ..scene.files.urdf import load_robot
 from ..scene.robot import Robot
@@ -21,6 +21,7 @@ from ..scene.scene import Scene
 from ..scene.scene_instances import SceneInstance
 from ..scene.scene_mesh import SceneMesh
 from ..scene.shapes import seed_objects
+from ..scene.transform import Transform
 from ..sensor.calibrations import said, text_of
 from ..sensor.trajectory import rotations_of
 from ..sensor.trajectory_files import columns_of_table
@@ -36,6 +37,9 @@ from .sections import (
     ShapeSection,
     file_states,
 )
+
+# Fields of a mesh file that a robot that stands still has.
+_OF_ROBOTS = {"file", "opacity", "translation", "rotation_deg", "scale", "matrix"}
 
 
 @dataclass
@@ -151,6 +155,8 @@ class Shapes:
         scenario, found = self.scenario, self.found
         with prefixed(scenario.source):
             transform = entry.transform()
+        if entry.file.lower().endswith(ROBOTS):
+            return self._still_robot(entry, transform)
         objects = load_objects(
             scenario.path(entry.file),
             **entry.model_dump(include={"unit", "up_axis", "opacity", "step_m", "window"}),
@@ -165,6 +171,19 @@ class Shapes:
         if objects.raster is not None:
             found.rasters.append((entry, objects.raster))
         return objects
+
+    def _still_robot(self, entry: MeshFile, transform: Transform) -> Objects:
+        """Return a robot with its joints at zero."""
+        if other := sorted(entry.model_fields_set - _OF_ROBOTS):
+            raise LidarpoolError(
+                f"{self.scenario.path(entry.file)} is a robot, which is in metres and Z-up: leave "
+                f"out {' and '.join(other)}."
+            )
+        robot, tell = self.robot(entry), self.found.notes.append
+        if robot.moving:
+            tell(f"{entry.file} has its joints at zero; joints of an actor move them")
+        links = Objects((), robot.actors(tell=tell)).still(lambda _: None)
+        return Objects(tuple(o.moved(o.name, transform.linear, transform.offset) for o in links))
 
 
 def _copies(shapes: Shapes, base: list[SceneMesh | SceneInstance]) -> list[SceneInstance]:

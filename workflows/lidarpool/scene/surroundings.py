@@ -76,7 +76,7 @@ class Surroundings:
         """Look in all directions from local positions (k, 3)."""
         at = np.asarray(positions, np.float64).reshape(-1, 3)
         around = directions_around(RAYS)
-        return self._cast(np.repeat(at, RAYS, axis=0), np.tile(around, (len(at), 1)))
+        return self.cast(np.repeat(at, RAYS, axis=0), np.tile(around, (len(at), 1)))
 
     def outside(self) -> Views:
         """Look at the scene from all around it."""
@@ -85,7 +85,7 @@ class Surroundings:
         towards = -directions_around(RAYS)
         # Parallel rays would meet thin things seldom: aim at a grid of points in the box.
         shares = np.stack([np.arange(RAYS) * step % 1.0 for step in (0.755, 0.57, 0.431)], axis=1)
-        return self._cast(low + shares * (high - low) - 2 * across * towards, towards)
+        return self.cast(low + shares * (high - low) - 2 * across * towards, towards)
 
     def is_object(self, seen: Views) -> bool:
         """Whether a scene is an object, judged by the views from where a sensor would stand in it.
@@ -121,7 +121,8 @@ class Surroundings:
         fits = sides[:2].min() >= _WIDE_M and sides[2] <= _HIGH_M
         return bool(fits and np.mean(_is_level(seen) | upright) >= _UPRIGHT)
 
-    def _cast(self, origins: Floats, directions: Floats) -> Views:
+    def cast(self, origins: Floats, directions: Floats) -> Views:
+        """See what rays from local origins (n, 3) along unit directions (n, 3) meet."""
         hits = self._caster.cast(origins, directions)
         a, b, c = self._scene.vertices[self._scene.faces[hits.triangle]].transpose(1, 0, 2)
         normals = np.cross(b - a, c - a)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import csv
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from fnmatch import fnmatchcase, translate
 from functools import cache
@@ -14,13 +14,13 @@ from typing import Annotated, Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field
+from pydantic import Field, WrapValidator
 
 from ..base.arrays import Bools, Floats, Indices, Integers
 from ..base.declared import TextOrTexts, UnitShare, about, allowed, written_as
 from ..base.elementary import exp, power
 from ..base.errors import LidarpoolError
-from ..base.validation import checked_fields
+from ..base.validation import checked_fields, shown
 from ..base.words import did_you_mean
 from .leaves import LeafAngle
 
@@ -36,6 +36,22 @@ DARKEST = 1e-3  # least reflectance of a colour, so that every hit is a return
 
 SemanticClass = Annotated[int, Field(ge=0, le=65_535)]
 Transparent = Literal["none", "pass", "mirror"]
+
+
+def _checked_names(given: Any, handler: Callable[[Any], Any]) -> Any:
+    """Refuse names of classes that files cannot hold, or that two classes share."""
+    for number, name in given.items() if isinstance(given, Mapping) else ():
+        known = type(number) is int and 0 <= number <= 65_535 and isinstance(name, str)
+        alone = [*given.values()].count(name) == 1
+        if not (known and alone and 0 < len(name) < 100 and name.isprintable()):
+            raise ValueError(
+                f"{shown({number: name})} is no class with a name of its own: give whole numbers "
+                "of 0 to 65535 and a different text for each, such as {10: car}."
+            )
+    return handler(given)
+
+
+ClassNames = Annotated[Mapping[SemanticClass, str], WrapValidator(_checked_names)]
 
 
 class Measured(NamedTuple):

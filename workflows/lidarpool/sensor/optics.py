@@ -51,8 +51,9 @@ class Optics:
     ] = None
     pulse_ns: Annotated[Pulse, about("length of a pulse")] = 5.0
     resolution_m: Annotated[
-        Precision, about("of reported ranges: default step for rounding positions")
-    ] = 0.01
+        Precision | None,
+        about("of reported ranges: default step for rounding positions; None if no source has it"),
+    ] = None
     beam_profile: Annotated[
         Profile, about("how light is spread over the beam, where it has sub-rays")
     ] = "even"

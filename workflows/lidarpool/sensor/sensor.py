@@ -17,12 +17,15 @@ from ..base.elementary import sin_cos
 from ..base.errors import LidarpoolError
 from ..base.validation import checked, checked_fields
 from ..base.vectors import turned
-from .beams import CHANNELS_MOST, Beams, Head, Rate, Spin, Step
+from .beams import CHANNELS_MOST, Beams, Head, Mirror, Rate, Spin, Step
 from .optics import LIGHT_M_NS, Optics
 
 RaysPerRevolution = Annotated[int, about("for a grid: azimuths in one turn", ge=1, le=10_000_000)]
 Layers = Annotated[int, about("for a grid: elevations (rings)", ge=1, le=CHANNELS_MOST)]
 Fov = Annotated[float, about("for a grid: degrees, half of it below the horizon", gt=0, le=180)]
+Sector = Annotated[
+    float, about("for a grid: degrees that a turn sweeps, half of it left of +x", gt=0, le=360)
+]
 MinRange = Annotated[float, Field(ge=0, le=1e8)]
 MaxRange = Annotated[float, Field(gt=0, allow_inf_nan=True)]
 
@@ -93,6 +96,7 @@ class Sensor:
         min_range_m: MinRange = 0.0,
         max_range_m: MaxRange = float("inf"),
         rate_hz: Rate = 10.0,
+        horizontal_fov_deg: Sector = 360.0,
     ) -> Sensor:
         """Make a spinning sensor with evenly spaced azimuths and elevations.
 
@@ -114,18 +118,19 @@ class Sensor:
             As for every sensor.
         rate_hz
             Turns a second.
+        horizontal_fov_deg
+            Horizontal field of view in degrees, in (0, 360]. Below 360 the azimuths of a turn, and
+            its time steps, sweep this sector only, from right to left, with +x in its middle.
 
         Raises
         ------
         LidarpoolError
             If a value is outside its range, or a time step holds no firing at all.
         """
-        return cls(
-            Beams.even(layers, vertical_fov_deg),
-            Spin(rays_per_revolution, step_deg, rate_hz),
-            min_range_m,
-            max_range_m,
-        )
+        turn = rays_per_revolution, step_deg, rate_hz
+        whole = horizontal_fov_deg == 360
+        head = Spin(*turn) if whole else Mirror(*turn, False, 0, "sawtooth", horizontal_fov_deg)
+        return cls(Beams.even(layers, vertical_fov_deg), head, min_range_m, max_range_m)
 
     @property
     def gate_s(self) -> float:

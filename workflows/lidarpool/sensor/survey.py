@@ -25,7 +25,7 @@ from ..columns.table import (
     stored,
     waveform_column,
 )
-from .materials import Material
+from .materials import ClassNames, Material
 from .navigation import Navigation, check_navigation
 from .noise import ALARMS_MOST, Noise
 from .optics import WINDOW_SIGMAS, Precision, Returns
@@ -40,6 +40,7 @@ OPTIONAL_NAMES = tuple(column.in_files for column in OPTIONAL)
 SENSORS_MOST = 255  # the type of the column
 PARTICLES_MOST = 100  # that a pulse may return from
 RAYS_MOST = 1 << 32  # of a scan, which is cast in one call
+PRECISION_M = 0.01  # of points, if a sensor states no resolution
 START_FROM = datetime(2017, 1, 1, tzinfo=UTC)  # since when GPS and UTC have been 18 s apart
 LASTS_MOST_NS = 2.0**63  # the type of the column time: 292 years
 
@@ -134,7 +135,11 @@ class CloudOptions:
     precision_m: Annotated[
         Precision,
         FILLED_IN,
-        about("step in metres that points are rounded to; by default the sensor's, or 0.01", 0.01),
+        about(
+            "step in metres that points are rounded to; by default the sensor's resolution of "
+            "ranges; if it states none 0.001, with the default objects and in Python 0.01",
+            0.001,
+        ),
     ] = None  # type: ignore[assignment]
     coordinates: Annotated[
         Literal[COORDINATES],  # type: ignore[valid-type]
@@ -211,6 +216,8 @@ class Survey(CloudOptions, Weather):
         Noise of ranges and angles, and lost returns.
     navigation
         IMU and GNSS receiver of the carrier, whose samples are written beside the cloud.
+    classes
+        Names of semantic classes, {number: name}, for reports and files; they add the column.
     **options
         The fields of `Weather` and `CloudOptions`, such as `rain_mm_h` and `keep_every`.
 
@@ -236,6 +243,7 @@ class Survey(CloudOptions, Weather):
     returns: Returns = field(default_factory=Returns)
     noise: Noise = field(default_factory=Noise)
     navigation: Navigation | None = None
+    classes: ClassNames = field(default_factory=dict, compare=False)
 
     def __post_init__(self) -> None:
         self._set(poses=_poses(self.poses), sensors=tuple(self.sensors))
@@ -243,9 +251,10 @@ class Survey(CloudOptions, Weather):
         self._check_names()
         if self.sensors:
             self._set(sensor=self.sensors[0].sensor)
-        extra = ("sensor",) if len(self.sensors) > 1 else ()
-        self._set(columns=chosen((*self.columns, *extra)))
-        finest = min(carried.sensor.optics.resolution_m for carried in self.carried)
+        extra = {"sensor": len(self.sensors) > 1, "class": self.classes}
+        columns = (*self.columns, *(name for name, needed in extra.items() if needed))
+        self._set(columns=chosen(columns), classes=dict(sorted(self.classes.items())))
+        finest = min(one.sensor.optics.resolution_m or PRECISION_M for one in self.carried)
         for name, default in {"keep_every": 1, "precision_m": finest}.items():
             if getattr(self, name) is None:
                 self._set(**{name: default})

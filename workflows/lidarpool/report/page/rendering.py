@@ -120,6 +120,7 @@ def _template(name: str) -> Template:
 def _written(scenario: Scenario) -> str:
     """Return a scenario as YAML that can be loaded, unless it is so long that it is cut."""
     data = scenario.model_dump(mode="json", exclude_defaults=True, by_alias=True)
+    data |= {"classes": dict(scenario.classes)} if scenario.classes else {}  # JSON has no numbers
     text = yaml.safe_dump(
         data, sort_keys=False, allow_unicode=True, default_flow_style=None, width=96
     )

@@ -25,17 +25,20 @@ from .scene_graph import Content, MeshFileError, Piece, PlacedNode, Wanted, join
 
 # {class of ASPRS LAS 1.4: names of city objects, which begin with their types}; 1 is for what LAS
 # has no class for.
+BUILDING = 6
 CLASSES = {
     1: ("CityFurniture *", "CityObjectGroup *", "GenericCityObject *", "OtherConstruction *",
         "Tunnel* *", "+* *"),
     2: ("LandUse *", "TINRelief *"),
     5: ("PlantCover *", "SolitaryVegetationObject *"),
-    6: ("Building* *",),
+    BUILDING: ("Building* *",),
     9: ("WaterBody *", "Waterway *"),
     10: ("Railway *",),
     11: ("Road *", "Transport*Square *"),
     17: ("Bridge* *",),
 }  # fmt: skip
+CLASS_NAMES = {1: "unclassified", 2: "ground", 5: "high vegetation", 6: "building", 9: "water",
+               10: "rail", 11: "road surface", 17: "bridge deck"}  # fmt: skip
 
 # How deep surfaces are nested in the boundaries of a geometry.
 _DEPTHS = {

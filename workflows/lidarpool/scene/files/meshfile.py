@@ -57,6 +57,13 @@ _READERS: dict[str, Callable[[bytes, Path, Wanted], Content]] = {
     **dict.fromkeys(CITYJSON, read_cityjson),
 }
 SUFFIXES = (*_READERS, *RASTERS)
+ROBOTS = (".urdf", ".xacro")  # of which `urdf` refuses the latter, with what to do
+_MUJOCO = "a model of MuJoCo becomes OpenUSD by mujoco-usd-converter"
+CONVERTED = {  # {ending of scenes that are not read: what to do}
+    ".sdf": "convert it to OpenUSD (sdf2usd of gz-usd) or URDF, or name the meshes that it names",
+    ".mjcf": _MUJOCO,
+    ".xml": f"{_MUJOCO}, and lidarpool import reads a survey of HELIOS++",
+}
 UNITLESS = (".obj", ".stl", ".ply", ".off")  # formats without a unit
 
 GENERATOR = "lidarpool"  # that files of our own name, .glb as Y-up, others as Z-up
@@ -294,9 +301,12 @@ def _read_whole(path: Path, data: bytes, wanted: Wanted, raster: dict[str, Any])
 
 def _bytes_of(path: Path, most: int) -> bytes:
     """Content of a file of a known format, or of its beginning; -1 for all."""
-    if path.suffix.lower() == ".urdf":
-        raise LidarpoolError(f"{path} is a robot: name it as the file of one of the actors.")
-    if path.suffix.lower() not in SUFFIXES:
+    suffix = path.suffix.lower()
+    if suffix in ROBOTS:
+        raise LidarpoolError(f"{path} is a robot: read it with load_robot, or by a scenario.")
+    if suffix in CONVERTED:
+        raise LidarpoolError(f"{path} is not read: {CONVERTED[suffix]}.")
+    if suffix not in SUFFIXES:
         raise LidarpoolError(
             f"{path} has the ending {path.suffix or '(none)'}, which is not a mesh format that "
             f"can be read; these are: {' '.join(SUFFIXES)}."

@@ -40,6 +40,7 @@ _OPTIONS = {"AAIGrid": {"DATATYPE": "Float64"}}  # or a file that begins with in
 
 _AT_ONCE = 100_000  # vertices that are reprojected, through lists
 _PIXEL_BYTES = 100  # of a mesh of pixels: vertices, two triangles, and what makes them
+_UNASKED = 5_000_000  # pixels that are taken without a window and a step; more take long
 _MOST_READ = 1_000_000_000  # pixels of which a coarser grid is made, which takes two minutes
 _WIDEST_DEG = 12.0  # of longitude in a UTM zone, which is 6 wide
 
@@ -87,10 +88,11 @@ def read_raster(
         own, up_m = _systems(source)
         place = _place(source, path)
         grid = _RasterGrid(source, place, own, _target(source, place, own, epsg))
+        chosen = step_m is not None or window is not None
         if step_m is not None:
             grid, window = stack.enter_context(_coarser(grid, step_m, window)), None
         columns, rows = grid.part(window)
-        _check_size(grid, columns, rows)
+        _check_size(grid, columns, rows, path.name, chosen=chosen)
         band = grid.file.read(1, window=(rows, columns), masked=True)
         heights = np.ma.getdata(band).astype(np.float64)
         valid = ~np.ma.getmaskarray(band) & np.isfinite(heights)
@@ -369,11 +371,18 @@ def _coarser(grid: _RasterGrid, step_m: float, window: Window | None) -> Iterato
         yield _RasterGrid(made, place, grid.target, grid.target)
 
 
-def _check_size(grid: _RasterGrid, columns: PixelRange, rows: PixelRange) -> None:
-    """Refuse more pixels than the memory has room for, with a window and a step that fit."""
+def _check_size(
+    grid: _RasterGrid, columns: PixelRange, rows: PixelRange, name: str, *, chosen: bool
+) -> None:
+    """Refuse more pixels than the memory has room for, with a window and a step that fit.
+
+    Fewer are refused if no window or step is `chosen`, for they take long to read and to show.
+    """
     sides = np.array([columns[1] - columns[0], rows[1] - rows[0]])
     count = int(np.prod(sides.astype(object)))
-    most = min(memory_share() // _PIXEL_BYTES, MOST_TRIANGLES // 2)
+    room = most = min(memory_share() // _PIXEL_BYTES, MOST_TRIANGLES // 2)
+    if not chosen:
+        most = min(most, _UNASKED)
     if count <= most:
         return
     low, high = grid.reach
@@ -387,6 +396,13 @@ def _check_size(grid: _RasterGrid, columns: PixelRange, rows: PixelRange) -> Non
         step *= 1.1
     scale = float(f"1e{2 - decade(step)}")
     step = math.ceil(step * scale) / scale
+    if count <= room:
+        whole = [*np.floor(low).tolist(), *np.ceil(high).tolist()]
+        raise MeshFileError(
+            f"has {sides[0]:,} x {sides[1]:,} pixels, {2 * count / 1e6:.0f} million triangles. In "
+            f"a scenario, scene: [{{file: {name}, step_m: {step:g}}}] takes means\nof them; not "
+            f"step_m but window: {window} takes the middle, and window: {whole} all"
+        )
     coarser = f" or step_m: {step:g}" if count <= _MOST_READ else ""
     raise MeshFileError(
         f"has {sides[0]:,} x {sides[1]:,} pixels, a mesh of {bytes_of(count * _PIXEL_BYTES)}, of "

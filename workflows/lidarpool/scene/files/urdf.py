@@ -33,8 +33,6 @@ from ..scene_mesh import SceneMesh
 from ..shapes import capsule, cylinder
 from .meshfile import OpacityMode, load_meshes, warn
 
-SUFFIXES = (".urdf", ".xacro")  # the latter are refused, with what to do
-
 _LINKS_MOST = 1000  # humanoids with hands have 150
 _SIDES = 64  # of a cylinder: its faces are 0.12 % of the radius inside it at most
 _UP = 5  # folders above a robot's file in which its packages are looked for
@@ -295,6 +293,8 @@ class _Looks:
     def _shape(self, shape: Element) -> tuple[Floats, list[SceneMesh]]:
         """Return factors (3,), one of which may be zero, and meshes that are to be scaled."""
         if shape.tag == "mesh":
+            if len(factors := shape.get("scale", "").split()) == 4:  # as public files have it
+                shape.set("scale", " ".join(factors[:3]))
             scale = _numbers(shape, "scale", 3, "1 1 1")
             return scale, self._meshes(shape.get("filename", "")) if scale.all() else []
         if shape.tag == "box":
