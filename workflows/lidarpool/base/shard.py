@@ -15,22 +15,14 @@ _KUBERNETES = ["JOB_COMPLETION_INDEX"]
 
 @dataclass(frozen=True, order=True)
 class Shard:
-    """Share `number` of `of` shares, counted from 1; LidarpoolError if there is no such share.
-
-    Examples
-    --------
-    >>> [*Shard(3, 10).jobs(25)], [*Shard(3, 10).scans(25)]
-    ([2, 12, 22], [5, 6])
-    """
+    """Share `number` of `of` shares, counted from 1; LidarpoolError if there is no such share."""
 
     number: int
     of: int
 
     def __post_init__(self) -> None:
         if not 1 <= self.number <= self.of:
-            raise LidarpoolError(
-                f"there is no shard {self}: of 10 the first is 1/10, the last 10/10."
-            )
+            raise LidarpoolError(f"there is no shard {self}: of ten, 1/10 is the first.")
 
     def __str__(self) -> str:
         return f"{self.number}/{self.of}"
@@ -40,11 +32,6 @@ class Shard:
         """Read ``3/10``; ``auto``, the task of a Slurm array; or ``auto/10``, a pod's index.
 
         LidarpoolError if it is none of them, or there is no such shard, array or index.
-
-        Examples
-        --------
-        >>> Shard.parse("auto/10", {"JOB_COMPLETION_INDEX": "2"})
-        Shard(number=3, of=10)
         """
         if not (found := re.fullmatch(r"(?:(\d+)|auto)/(\d+)|auto", text, re.ASCII)):
             raise LidarpoolError(f"{text!r} is no shard: give 3/10, auto/10 or auto.")

@@ -278,9 +278,8 @@ def merge(
 
     screen = Terminal(quiet, False, as_json)
     report = merge_shards(shards, out, partial=partial, scenario=scenario, screen=screen)
-    points = report.get("points", report.get("totals", {}).get("points"))
-    lines = [*(f"note: {note}" for note in report["notes"])]
-    lines.append(f"{plural(points, 'point')} in {out}")
+    points = report["points"] if "points" in report else report["totals"]["points"]
+    lines = [*(f"note: {note}" for note in report["notes"]), f"{plural(points, 'point')} in {out}"]
     shared.show({"folder": str(out), **report}, lines, as_json)
 
 

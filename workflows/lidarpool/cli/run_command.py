@@ -17,7 +17,7 @@ from ..base.storage import Storage
 from ..base.words import plural
 from ..datasets.dataset import DataSet
 from ..datasets.job_table import Tally, read_table
-from ..export.folder import local_result, output_place
+from ..export.folder import local_result, output_place, result_folder
 from ..live import page_of
 from ..report.campaign_output import (
     CAMPAIGN_FILE,
@@ -68,8 +68,9 @@ def run_scenario(
     if shard is None:
         _run_survey(built, job, options, terminal, only)
         return
+    assert options.out is not None, "commands write"
     jobs, output = OneJob(job, shard), Kept({**made_of, "scans": job.survey.scan_count})
-    with page_of(jobs, options.live) as page:
+    with result_folder(options.out), page_of(jobs, options.live) as page:
         result = Conductor(jobs, options, output, terminal, page)()
     points, notes = len(result.points), [f"note: {note}" for note in result.notes]
     told = {"folder": str(options.out), "shard": str(shard), "points": points}

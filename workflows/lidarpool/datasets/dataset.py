@@ -236,7 +236,7 @@ class DataSet:
         `contents` every byte is read. OSError if the place cannot be read.
         """
         look_at = self._looker(contents)
-        yield from _ahead(lambda job: look_at(job.name), (job for job in jobs if job.done))
+        yield from ahead(lambda job: look_at(job.name), (job for job in jobs if job.done))
 
     def _looker(self, contents: bool = False) -> Callable[[str], tuple[dict[str, Any], str]]:
         """Return what looks at a job by its name, see `look`."""
@@ -283,7 +283,7 @@ class DataSet:
             self.place.take(place, _manifest_file(job.name))
             return ""
 
-        yield from _ahead(take, iter(jobs))
+        yield from ahead(take, iter(jobs))
 
     def _manifest(self, name: str) -> dict[str, Any]:
         """Read the manifest of a job; empty if it is missing or damaged."""
@@ -300,7 +300,7 @@ class DataSet:
         """
         names = (name.removesuffix(".json") for name in self.place.below(_MANIFESTS).sizes())
         unknown = (name for name in names if name not in known)
-        for _, manifest in _ahead(self._manifest, unknown):
+        for _, manifest in ahead(self._manifest, unknown):
             if manifest:
                 yield JobRow.of(manifest["row"]), manifest["made_with"]
 
@@ -322,7 +322,7 @@ class Listing(Storage):
         self.files[name] = [len(data), zlib.crc32(data)]
 
 
-def _ahead(read: Callable[[T], R], things: Iterator[T]) -> Iterator[tuple[T, R]]:
+def ahead(read: Callable[[T], R], things: Iterator[T]) -> Iterator[tuple[T, R]]:
     """Yield each thing with what is read for it; several are read at a time."""
     with ThreadPoolExecutor(_REQUESTS, "read") as pool:
         while some := [*islice(things, _AHEAD)]:

@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Any
 
 from ..base.errors import LidarpoolError, explained
-from ..base.shard import ALL, Shard
 from ..base.software import difference, software
 from ..base.storage import Storage
 from ..base.words import plural
@@ -79,10 +78,10 @@ class DataSetOutput(Output[CampaignRun]):
         if not conductor.resume or CAMPAIGN_FILE not in there or unfinished:
             return None
         self._made = check_same(out, self.campaign)
-        if (holds := self._made["shards"]) != shards_of(self.campaign.shard):
+        if (shards := self._made["shards"]) != [str(self.campaign.shard)]:
             raise LidarpoolError(
-                f"{out} holds {'all jobs' if holds is None else f'of shards {listed(holds)}'}, and "
-                f"this run does shard {self.campaign.shard}: give another folder with --out."
+                f"{out} holds shard {listed(shards) or 'none'}, and this is a run of "
+                f"{self.campaign.shard}: give another folder with --out."
             )
         whole, self._wrong = _look(self.dataset, read_table(out), options.verify, self.campaign)
         done = whole == len(self.campaign.numbers) and _is_indexed(out, whole)
@@ -143,7 +142,7 @@ class DataSetOutput(Output[CampaignRun]):
         record: dict[str, Any] = {"identity": dict(store.identity), "casting": store.casting}
         record |= {"backend": store.backend, "sensors": run.sensors}
         record |= {"files": hashes(self.campaign.files), "campaign": self.campaign.described}
-        record["shards"] = shards_of(self.campaign.shard)
+        record["shards"] = [str(self.campaign.shard)]
         run, _ = write_shared(self.dataset, record, run, store.rows)
         if run.failed:
             store.save(now=True)
@@ -184,11 +183,6 @@ def write_shared(
     return run, write_card(place, campaign, run, rows(), versions, picture)
 
 
-def shards_of(shard: Shard) -> list[str] | None:
-    """Return what CAMPAIGN_FILE says of the shards that are there; None if all are."""
-    return None if shard == ALL else [str(shard)]
-
-
 def _look(
     dataset: DataSet,
     rows: Iterable[JobRow],
@@ -203,15 +197,10 @@ def _look(
     made: dict[tuple[str, str], list[str]] = {}  # {name and hash of a file: jobs made of it}
     with explained(f"{dataset.place} cannot be read"):
         for row, (manifest, difference) in dataset.look(rows, contents=contents):
-            if campaign is not None and row.number >= campaign.count:
-                raise LidarpoolError(
-                    f"{dataset.place} has job {row.name}, and count is {campaign.count:,}: a "
-                    "campaign can only grow. Give another folder with --out."
-                )
             if campaign is not None and row.number not in campaign.numbers:
                 raise LidarpoolError(
-                    f"{dataset.place} has job {row.name}, which is not of shard {campaign.shard}: "
-                    "give another folder with --out."
+                    f"{dataset.place} has job {row.name}, and count is {campaign.count:,}, shard "
+                    f"{campaign.shard}: a campaign can only grow. Give another folder with --out."
                 )
             if difference:
                 wrong[row.number] = f"job {row.name} ({difference})"

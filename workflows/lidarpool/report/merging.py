@@ -2,33 +2,34 @@
 
 from __future__ import annotations
 
+import heapq
 import json
 import tempfile
 import time
 from collections.abc import Iterator, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
-from contextlib import closing, contextmanager, suppress
-from dataclasses import asdict, dataclass, replace
+from contextlib import closing, suppress
+from dataclasses import dataclass, replace
 from functools import partial
-from itertools import islice
+from itertools import chain, groupby
+from operator import attrgetter
 from pathlib import Path
 from typing import Any
 
 from ..base.errors import LidarpoolError, Mistakes, explained
-from ..base.shard import Shard
+from ..base.shard import ALL, Shard
 from ..base.software import software
 from ..base.storage import Storage
 from ..base.validation import checked
 from ..base.words import plural
 from ..columns.parts import part_name
-from ..datasets.dataset import INDEX_FILE, DataSet
+from ..datasets.dataset import INDEX_FILE, DataSet, ahead
 from ..datasets.job_table import JobRow, read_table
 from ..export.folder import LAST_FILE, output_place, result_folder
 from ..pipeline.database import FILE, RunDatabase
 from ..pipeline.messages import Receipt
 from ..plan import Trial
 from ..run.conductor import Conductor
-from ..run.job_points import CHECKERS, listed
+from ..run.job_points import listed
 from ..run.job_source import OneJob
 from ..run.options import RunOptions
 from ..run.progress import Screen
@@ -41,7 +42,6 @@ from ..scenario.scenario import Scenario
 from .campaign_output import CAMPAIGN_FILE, dataset_files, write_record, write_shared
 from .output import SurveyOutput
 
-ROWS = 1_000  # of jobs in memory at a time
 NAMED = 20  # shards or files in a message
 _MISSING = "missing: "  # begins a note
 _AGAIN = "run their shards again with --resume (of a campaign --verify), and merge again"
@@ -145,41 +145,32 @@ def _read(place: Storage) -> _Part:
 
 
 def _of_dataset(place: Storage, notes: Sequence[str] = (), of: int = 1) -> _Part:
-    """Read a data set of some shards, by default of all of so many."""
+    """Read a data set of some shards; one that has all has each of so many."""
     record = json.loads(place.read(CAMPAIGN_FILE))
-    there = record["shards"]
-    every = [f"{number}/{of}" for number in range(1, of + 1)]
-    shards = [Shard.parse(text) for text in (every if there is None else there)]
+    shards = [Shard.parse(text) for text in record["shards"]]
+    if shards == [ALL]:
+        shards = [Shard(number, of) for number in range(1, of + 1)]
     notes = [note for note in notes if not note.startswith(_MISSING)]
     return _Part(place, record, shards, record["campaign"]["count"], notes)
 
 
 def _of_survey(place: Storage, run: Storage) -> _Part:
     """Read a shard of a survey; LookupError if it is none, or not finished."""
-    with _database(run) as db:
-        names = ("identity", "casting", "made_of", "notes")
-        record = dict(db.meta) | {name: json.loads(db.meta[name]) for name in names}
-        shard, whole = Shard.parse(record["identity"].pop("shard")), record["made_of"]["scans"]
-        kept = db.job(0, shard.scans(whole).stop, shard.scans(whole).start)
-        if not kept.complete:
-            raise LookupError("scans are missing")
-        record |= {"files": []}
-        return _Part(place, record, [shard], whole, record["notes"], kept.ordered, kept.trials)
-
-
-@contextmanager
-def _database(run: Storage | None = None) -> Iterator[RunDatabase]:
-    """Open a copy of the database of a run, or an empty one."""
     with tempfile.TemporaryDirectory(prefix="lidarpool-") as folder:
-        path = Path(folder, FILE)
-        if run is not None:
-            fetch_database(run, path)
-        with closing(RunDatabase(path, durable=False)) as db:
-            yield db
+        fetch_database(run, Path(folder, FILE))
+        with closing(RunDatabase(Path(folder, FILE), durable=False)) as db:
+            meta = {"casting": "{}"} | db.meta
+            told = ("identity", "casting", "made_of", "notes")
+            record = {**meta, "files": [], **{name: json.loads(meta[name]) for name in told}}
+            shard, whole = Shard.parse(record["identity"].pop("shard")), record["made_of"]["scans"]
+            kept = db.job(0, shard.scans(whole).stop, shard.scans(whole).start)
+            if not kept.complete:
+                raise LookupError("scans are missing")
+            return _Part(place, record, [shard], whole, record["notes"], kept.ordered, kept.trials)
 
 
 def _check(parts: Sequence[_Part], partial: bool, own: _Part | None = None) -> list[str]:
-    """Check that all are of one run, and none is missing but with `partial`: then a note says so.
+    """Check that all are of one run, and none is missing but with `partial`; returns all notes.
 
     Others may have what the place has as its `own`. LidarpoolError names the parts that are wrong.
     """
@@ -196,16 +187,16 @@ def _check(parts: Sequence[_Part], partial: bool, own: _Part | None = None) -> l
             wanted, first = common, str(part.place)
         for shard in part.shards if part is not own else ():
             if (other := seen.setdefault(shard.number, part)) is not part:
-                mistakes.lines.append(
-                    f"shard {shard} is in {other.place} and in {part.place}: give one of them."
-                )
+                twice = f"shard {shard} is in {other.place} and in {part.place}"
+                mistakes.lines.append(f"{twice}: give one of them.")
     mistakes.tell()
+    notes = [*dict.fromkeys(note for part in parts for note in part.notes)]
     if not (missing := _missing(parts)):
-        return []
+        return notes
     told = f"{_MISSING}{plural(len(missing), 'shard')}, {listed([*map(str, missing)], NAMED)}"
     if not partial:
         raise LidarpoolError(f"{told}: give them, too, or merge what there is with --partial.")
-    return [told]
+    return [*notes, told]
 
 
 def _missing(parts: Sequence[_Part]) -> list[Shard]:
@@ -221,51 +212,40 @@ def _missing(parts: Sequence[_Part]) -> list[Shard]:
 
 def _merge_dataset(parts: Sequence[_Part], out: Storage, partial: bool) -> dict[str, Any]:
     """Take the jobs of all parts into a data set, and write what all jobs share."""
-    began, of = time.monotonic(), parts[0].shards[0].of
+    began = time.monotonic()
     if FILE in out.below(RUN_FOLDER).sizes():
         raise LidarpoolError(f"{out} holds an unfinished run: give another folder with --out.")
     begun = CAMPAIGN_FILE in out.sizes()
     dataset_files(out, begun=begun)
-    own = _of_dataset(out, of=of) if begun else None
-    known = [own, *parts] if own else parts  # later ones have what was done again
-    missing = _check(known, partial, own)
-    cast = next((part for part in known if part.record["casting"]), parts[0])
-    campaign, sensors = max(known, key=lambda part: part.whole).record["campaign"], dict[str, str]()
+    own = _of_dataset(out, of=parts[0].shards[0].of) if begun else None
+    known = [own, *parts] if own else parts
+    notes, sensors = _check(known, partial, own), dict[str, str]()
     for part in known:
         sensors = with_sensors(sensors, part.record["sensors"].items())
+    cast = next((part for part in known if part.record["casting"]), parts[0])
+    campaign = max(known, key=lambda part: part.whole).record["campaign"]
     record = {**cast.record, "sensors": sensors, "campaign": campaign}
     dataset = DataSet(replace(out, durable=False), **campaign["keep"])
     dataset.check_installed()
     if own is None:  # from now on it is known whose files these are
         write_record(out, record | {"shards": []})
-    with _database() as db:
-        _take_jobs(dataset, known, own, db)
-
-        def rows() -> Iterator[JobRow]:
-            return map(JobRow.of, db.job_rows())
-
-        lacking, there = _missing(known), {shard for part in known for shard in part.shards}
-        record["shards"] = [*map(str, sorted(there.difference(lacking)))] if lacking else None
-        notes = [*dict.fromkeys(note for part in parts for note in part.notes), *missing]
-        more = {"sensors": sensors, "notes": tuple(notes)}
-        run = CampaignRun.of(rows(), time.monotonic() - began, 0, **more)
-        return write_shared(dataset, record, run, rows)[1]
+    with explained(f"{out} cannot be merged"):
+        taken = (dataset.take(part.place, read_table(part.place)) for part in parts)
+        if damaged := [wrong for _, wrong in chain.from_iterable(taken) if wrong]:
+            raise LidarpoolError(f"missing or damaged: {listed(damaged, NAMED)}; {_AGAIN}.")
+    lacking, there = _missing(known), {shard for part in known for shard in part.shards}
+    record["shards"] = [*map(str, sorted(there.difference(lacking)) if lacking else [ALL])]
+    more = {"sensors": sensors, "notes": tuple(notes)}
+    run = CampaignRun.of(_rows(known), time.monotonic() - began, 0, **more)
+    return write_shared(dataset, record, run, lambda: _rows(known))[1]
 
 
-def _take_jobs(
-    dataset: DataSet, parts: Sequence[_Part], own: _Part | None, db: RunDatabase
-) -> None:
-    """Have the files of all jobs in a data set, and their rows; an error names damaged files."""
-    damaged: list[str] = []
-    for part in parts:
-        jobs = read_table(part.place) if part.shards else iter(())
-        with explained(f"{dataset.place} cannot be merged"):
-            taken = ((job, "") for job in jobs) if part is own else dataset.take(part.place, jobs)
-            while some := [*islice(taken, ROWS)]:
-                db.end_jobs((job.number, bool(job.error), asdict(job)) for job, _ in some)
-                damaged += [wrong for _, wrong in some if wrong]
-    if damaged:
-        raise LidarpoolError(f"missing or damaged: {listed(damaged, NAMED)}; {_AGAIN}.")
+def _rows(parts: Sequence[_Part]) -> Iterator[JobRow]:
+    """Yield the rows of all jobs by number; of a job of several parts, that of the last one."""
+    number = attrgetter("number")
+    tables = [read_table(part.place) for part in parts if part.shards]
+    for _, rows in groupby(heapq.merge(*tables, key=number), number):
+        yield [*rows][-1]
 
 
 # -- surveys ----------------------------------------------------------------------------------
@@ -279,7 +259,7 @@ def _merge_survey(
     screen: Screen,
 ) -> dict[str, Any]:
     """Make the survey again, and write its result from the points of all parts."""
-    missing, record = _check(parts, partial), parts[0].record
+    notes, record = _check(parts, partial), parts[0].record
     told = record["made_of"]
     path = Path(scenario or told["path"])
     if not path.exists():
@@ -291,18 +271,18 @@ def _merge_survey(
         identity = jobs.identity
     if differs := [name for name in identity if identity[name] != record["identity"][name]]:
         raise LidarpoolError(f"{path} has another {differs[0]} than these shards: give --scenario.")
-    output = _Merged(out, job.survey, job.outputs, scenario=built.scenario)
-    output.parts, output.missing = parts, missing
+    own = {"scenario": built.scenario, "parts": parts, "notes": notes}
+    output = _Merged(out, job.survey, job.outputs, **own)
     options = RunOptions(out=out, folder=Storage.at(out).below(RUN_FOLDER), resume=True)
     return Conductor(jobs, options, output, screen, RunPage())()[1]
 
 
 @dataclass(eq=False)
 class _Merged(SurveyOutput):
-    """The result of a survey whose points are those of parts; a note names `missing` ones."""
+    """The result of a survey whose points are those of parts."""
 
     parts: Sequence[_Part] = ()
-    missing: Sequence[str] = ()
+    notes: Sequence[str] = ()
     casts = False
 
     def look(self, conductor: Conductor[tuple[RunResult, dict[str, Any]]]) -> None:
@@ -311,25 +291,21 @@ class _Merged(SurveyOutput):
         only = store.only
         assert only is not None, "of a survey"
         for part in self.parts:
-            record = part.record
-            store.cast_with(record["backend"], record["casting"])
+            if casting := part.record["casting"]:
+                store.cast_with(part.record["backend"], casting)
             if part.trials and not only.parts.trials:
                 store.db.add_trials(0, part.trials)
-            source = parts_of(part.place.below(RUN_FOLDER), record["parts"])
-            left = [one for one in part.points if only.parts.missing(one.first, one.stop)]
-            with ThreadPoolExecutor(CHECKERS, "take") as pool:
-                taken = pool.map(partial(_take, store, source), left)
-                for one, receipt in zip(left, taken, strict=True):
-                    if receipt is not None and store.db.commit([receipt]):
-                        continue
+            source = parts_of(part.place.below(RUN_FOLDER), part.record["parts"])
+            left = (one for one in part.points if only.parts.missing(one.first, one.stop))
+            for one, receipt in ahead(partial(_take, store, source), left):
+                if receipt is None or not store.db.commit([receipt]):
                     damaged.append(source.path(one.name))
         if damaged:
             raise LidarpoolError(f"missing or damaged: {listed(damaged, NAMED)}; {_AGAIN}.")
         if not only.parts.trials:  # the first shard, which plans, is missing
             only.job = replace(only.job, planning=None)
         only.parts.frames, only.resumed = only.parts.scans.stop, 0
-        notes = (note for part in self.parts for note in part.notes)
-        store.notes = [*dict.fromkeys(notes), *self.missing]
+        store.notes = [*self.notes]
 
 
 def _take(store: RunStore, source: Storage, one: Receipt) -> Receipt | None:

@@ -185,6 +185,8 @@ class RunStore:
         for name in self._sizes if resume else ():
             if (scans := scans_of(name, self.db.meta["mark"])) is not None:
                 self._strays.setdefault(scans[0], []).append(name)
+        if self.db.used:
+            self._check_same(self.db.meta["identity"])
         if isinstance(self.jobs, OneJob):
             self.only = self.under_way[0] = JobPoints(self, self.jobs.only)
         if self.db.used:
@@ -205,8 +207,7 @@ class RunStore:
         self.storage.write(mark_name(told["mark"]), json.dumps(told).encode())
 
     def _go_on(self, resume: bool) -> None:
-        """Check that this run may continue the existing one."""
-        self._check_same(self.db.meta["identity"])
+        """Check that this run may continue the existing one, which is the same."""
         if not resume:
             raise LidarpoolError(
                 f"{self.place} holds an unfinished run, {self.kept}: continue it with "
