@@ -174,7 +174,7 @@ class CampaignSpec:
 
     def of_shard(self, shard: Shard) -> Self:
         """Return the same campaign, of which a run does the jobs of a shard."""
-        made = copy(self)
+        made = self if shard == self.shard else copy(self)
         made.shard = shard
         return made
 
