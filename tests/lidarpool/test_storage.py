@@ -243,7 +243,7 @@ def test_a_file_of_another_storage_is_taken_or_copied(places, tmp_path, monkeypa
         target.take(source, "a", "b")
         assert target.read("b") == b"new" and source.read("a") == b"new"
     with pytest.raises(FileNotFoundError):
-        target.take(source, "c")
+        target.take(source, "c", "c")
 
 
 def test_a_file_is_copied_where_there_are_no_links(tmp_path, monkeypatch):
@@ -255,8 +255,8 @@ def test_a_file_is_copied_where_there_are_no_links(tmp_path, monkeypatch):
         raise OSError(errno.EXDEV, "another disk")
 
     monkeypatch.setattr(os, "link", link)
-    target.take(source, "a")
+    target.take(source, "a", "a")
     assert target.read("a") == b"new" and target.local("a").stat().st_nlink == 1
     (tmp_path / "link").symlink_to(tmp_path / "a")
     with pytest.raises(LidarpoolError, match="link is a link"):
-        target.take(source, "link")
+        target.take(source, "link", "link")

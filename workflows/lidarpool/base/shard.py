@@ -22,7 +22,9 @@ class Shard:
 
     def __post_init__(self) -> None:
         if not 1 <= self.number <= self.of:
-            raise LidarpoolError(f"there is no shard {self}: of ten, 1/10 is the first.")
+            raise LidarpoolError(
+                f"there is no shard {self}: they are 1/{self.of} to {self.of}/{self.of}."
+            )
 
     def __str__(self) -> str:
         return f"{self.number}/{self.of}"
@@ -41,12 +43,10 @@ class Shard:
         try:
             index, *array = (int(environment[name]) for name in names)
             first, step, count = array or (0, 1, int(found[2]))
-            if (index - first) % step:
-                raise ValueError("it is between two tasks")
+            return cls((index - first) // step + 1, count)
         except (LookupError, ValueError, ZeroDivisionError) as error:
             told = ", ".join(f"{name}={environment.get(name, '')}" for name in names)
             raise LidarpoolError(f"{text!r} finds no shard in {told}: give 3/10.") from error
-        return cls((index - first) // step + 1, count)
 
     def jobs(self, count: int) -> range:
         """Return the jobs of the share, of so many: neighbouring jobs are in different shares."""

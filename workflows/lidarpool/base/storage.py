@@ -258,12 +258,11 @@ class Storage:
         with self._remote() as (system, folder):
             system.get_file(f"{folder}/{name}", str(path))
 
-    def take(self, place: Storage, name: str, own: str = "") -> None:
-        """Have a file of another storage here, completely or not at all, perhaps by its `own` name.
+    def take(self, place: Storage, name: str, own: str) -> None:
+        """Have a file of another storage here, completely or not at all, by a name of its `own`.
 
         It is linked (a hard link), or an object store copies it, where that is possible.
         """
-        own = own or name
         if self.is_local and place.is_local:
             self.remove([own])
             with suppress(OSError):  # another disk, or one without links: it is copied

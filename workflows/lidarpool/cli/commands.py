@@ -33,7 +33,6 @@ from .scenario_commands import check, import_, init, scene, schema, sensors, sta
 from .shared_options import set_logs
 
 if TYPE_CHECKING:
-    from ..base.storage import Storage
     from ..run.connection import TlsFiles
     from ..run.options import RunOptions
     from .terminal import Terminal
@@ -256,14 +255,7 @@ def run(
 @shared.out
 @shared.flag("--quiet", "-q", help="No progress, only the result.")
 @shared.as_json
-def merge(
-    shards: tuple[Path | Storage, ...],
-    partial: bool,
-    scenario: Path | None,
-    out: Path | Storage,
-    quiet: bool,
-    as_json: bool,
-) -> None:
+def merge(shards: tuple[Any, ...], out: Any, quiet: bool, as_json: bool, **given: Any) -> None:
     """Make one data set or result of the folders of shards.
 
     After a kill, the same command goes on. Shards of a campaign can be added later.
@@ -271,13 +263,13 @@ def merge(
     \b
     Examples:
       lidarpool merge part-* --out dataset
-      lidarpool merge s3://bucket/part-1 s3://bucket/part-2 --out s3://bucket/dataset
+      lidarpool merge s3://lab/part-1 s3://lab/part-2 --out s3://lab/dataset
     """  # noqa: D301 - click wants the character, not its name
     from ..report.merging import merge as merge_shards
     from .terminal import Terminal
 
     screen = Terminal(quiet, False, as_json)
-    report = merge_shards(shards, out, partial=partial, scenario=scenario, screen=screen)
+    report = merge_shards(shards, out, screen=screen, **given)
     points = report["points"] if "points" in report else report["totals"]["points"]
     lines = [*(f"note: {note}" for note in report["notes"]), f"{plural(points, 'point')} in {out}"]
     shared.show({"folder": str(out), **report}, lines, as_json)

@@ -72,10 +72,10 @@ def run_scenario(
     jobs, output = OneJob(job, shard), Kept({**made_of, "scans": job.survey.scan_count})
     with result_folder(options.out), page_of(jobs, options.live) as page:
         result = Conductor(jobs, options, output, terminal, page)()
-    points, notes = len(result.points), [f"note: {note}" for note in result.notes]
+    points, lines = len(result.points), [f"note: {note}" for note in result.notes]
+    lines.append(f"shard {shard} in {options.out}: {plural(points, 'point')}, for lidarpool merge")
     told = {"folder": str(options.out), "shard": str(shard), "points": points}
-    line = f"shard {shard} in {options.out}: {plural(points, 'point')}, for lidarpool merge"
-    show(told, [*notes, line], terminal.as_json)
+    show(told, lines, terminal.as_json)
 
 
 def _run_survey(

@@ -8,6 +8,7 @@ import zlib
 from collections import deque
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from dataclasses import asdict, dataclass, field, replace
 from functools import lru_cache
 from itertools import islice
@@ -257,30 +258,25 @@ class DataSet:
     def take(self, place: Storage, jobs: Iterable[JobRow]) -> Iterator[tuple[JobRow, str]]:
         """Have the files of jobs here that another data set of this format has in its `place`.
 
-        Those that are here are not read again. Yields every job, and what is wrong with its files
-        there, a clause or empty: then they are not taken. OSError if a place cannot be read or
-        written to.
+        Those that are here are not read again. Yields each job, and its first file there that is
+        missing or damaged, else "". OSError if a place cannot be read or written to.
         """
         here, there = self._looker(), replace(self, place=place)
 
         def take(job: JobRow) -> str:
-            manifest = there._manifest(job.name)
+            manifest, last = there._manifest(job.name), _manifest_file(job.name)
             if not job.done or (manifest and here(job.name) == (manifest, "")):
                 return ""
             if not manifest or manifest["row"]["sha256"] != job.sha256:
-                return f"{place.path(_manifest_file(job.name))} is missing or damaged"
-            for name, checksum in manifest["files"].items():
-                self.place.prepare(Path(name).parent)
-                try:
-                    self.place.take(place, name)
-                    same = self.place.checksum(name) == checksum
-                except FileNotFoundError:
-                    same = False
-                if not same:
+                return place.path(last)
+            for name, checksum in (manifest["files"] | {last: None}).items():
+                with suppress(FileNotFoundError):
+                    self.place.prepare(Path(name).parent)
+                    self.place.take(place, name, name)
+                    if name == last or self.place.checksum(name) == checksum:
+                        continue
                     self.place.remove([name])
-                    return f"{place.path(name)} is missing or damaged"
-            self.place.prepare(_MANIFESTS)
-            self.place.take(place, _manifest_file(job.name))
+                return place.path(name)
             return ""
 
         yield from ahead(take, iter(jobs))

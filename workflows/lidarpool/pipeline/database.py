@@ -197,10 +197,7 @@ class RunDatabase:
     # -- reading -------------------------------------------------------------------------
 
     def job(self, number: int, stop: int, first: int = 0) -> JobParts:
-        """Return what is committed of a job that has not ended; kept until it has.
-
-        Its scans from `first` to `stop`, half-open, are to be done.
-        """
+        """Return what is committed of a job under way, of its scans from `first` to `stop`."""
         if (found := self.under_way.get(number)) is not None:
             return found
         job = JobParts(number, range(first, stop), self._summaries)

@@ -84,8 +84,7 @@ class DataSetOutput(Output[CampaignRun]):
                 f"{self.campaign.shard}: give another folder with --out."
             )
         whole, self._wrong = _look(self.dataset, read_table(out), options.verify, self.campaign)
-        done = whole == len(self.campaign.numbers) and _is_indexed(out, whole)
-        if not done or self._wrong:
+        if whole != len(self.campaign.numbers) or self._wrong or not _is_indexed(out, whole):
             return None
         if RUN_FOLDER in there:  # a killed run has not removed all of itself
             remove_run(kept)

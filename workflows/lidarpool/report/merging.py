@@ -5,7 +5,6 @@ from __future__ import annotations
 import heapq
 import json
 import tempfile
-import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import closing, suppress
 from dataclasses import dataclass, replace
@@ -36,7 +35,7 @@ from ..run.progress import Screen
 from ..run.remote import fetch_database
 from ..run.run_page import RunPage
 from ..run.run_result import CampaignRun, RunResult
-from ..run.store import RUN_FOLDER, RunStore, parts_of, with_sensors
+from ..run.store import RUN_FOLDER, parts_of, with_sensors
 from ..scenario.build import build
 from ..scenario.scenario import Scenario
 from .campaign_output import CAMPAIGN_FILE, dataset_files, write_record, write_shared
@@ -92,10 +91,9 @@ def merge(
 
     Parameters
     ----------
-    shards
-        Folders or URLs of the shards of one campaign or survey.
-    out
-        Folder or URL of the data set or result. Shards can be added to a data set later.
+    shards, out
+        Folders or URLs of the shards of one campaign or survey, and of the data set or result.
+        Shards can be added to a data set later.
     partial
         Merge what there is; a note says what is missing.
     scenario
@@ -119,10 +117,9 @@ def merge(
     for one in places.values():
         with mistakes.noted():
             parts.append(_read(one))
+    mistakes.lines += [] if places else ["there is nothing to merge: give the folders of shards."]
     if not (partial and parts):
         mistakes.tell()
-    if not parts:
-        raise LidarpoolError("there is nothing to merge: give the folders of shards.")
     if "made_of" in parts[0].record:
         return _merge_survey(parts, place, partial, scenario, screen)
     with result_folder(place), screen.status("merging the data set"):
@@ -179,10 +176,8 @@ def _check(parts: Sequence[_Part], partial: bool, own: _Part | None = None) -> l
     for part in sorted(parts, key=lambda part: not part.record["casting"]):
         common = part.common
         if differs := [name for name in wanted if common.get(name, wanted[name]) != wanted[name]]:
-            mistakes.lines.append(
-                f"{part.place} and {first} differ in {differs[0]}: only shards of one run are "
-                "merged, made with the same software."
-            )
+            told = f"{part.place} and {first} differ in {differs[0]}"
+            mistakes.lines.append(f"{told}: merge shards of one run and of the same software.")
         elif len(common) > len(wanted):
             wanted, first = common, str(part.place)
         for shard in part.shards if part is not own else ():
@@ -207,14 +202,8 @@ def _missing(parts: Sequence[_Part]) -> list[Shard]:
     return [shard for shard in every if have.get(shard.number, 0) < len(largest.done(shard))]
 
 
-# -- campaigns --------------------------------------------------------------------------------
-
-
 def _merge_dataset(parts: Sequence[_Part], out: Storage, partial: bool) -> dict[str, Any]:
     """Take the jobs of all parts into a data set, and write what all jobs share."""
-    began = time.monotonic()
-    if FILE in out.below(RUN_FOLDER).sizes():
-        raise LidarpoolError(f"{out} holds an unfinished run: give another folder with --out.")
     begun = CAMPAIGN_FILE in out.sizes()
     dataset_files(out, begun=begun)
     own = _of_dataset(out, of=parts[0].shards[0].of) if begun else None
@@ -236,7 +225,7 @@ def _merge_dataset(parts: Sequence[_Part], out: Storage, partial: bool) -> dict[
     lacking, there = _missing(known), {shard for part in known for shard in part.shards}
     record["shards"] = [*map(str, sorted(there.difference(lacking)) if lacking else [ALL])]
     more = {"sensors": sensors, "notes": tuple(notes)}
-    run = CampaignRun.of(_rows(known), time.monotonic() - began, 0, **more)
+    run = CampaignRun.of(_rows(known), 0.0, 0, **more)
     return write_shared(dataset, record, run, lambda: _rows(known))[1]
 
 
@@ -246,9 +235,6 @@ def _rows(parts: Sequence[_Part]) -> Iterator[JobRow]:
     tables = [read_table(part.place) for part in parts if part.shards]
     for _, rows in groupby(heapq.merge(*tables, key=number), number):
         yield [*rows][-1]
-
-
-# -- surveys ----------------------------------------------------------------------------------
 
 
 def _merge_survey(
@@ -288,8 +274,20 @@ class _Merged(SurveyOutput):
     def look(self, conductor: Conductor[tuple[RunResult, dict[str, Any]]]) -> None:
         """Take all points into the run's store; LidarpoolError names damaged files."""
         store, damaged = conductor.store, list[str]()
-        only = store.only
+        only, mark = store.only, store.db.meta["mark"]
         assert only is not None, "of a survey"
+
+        def take(source: Storage, one: Receipt) -> Receipt | None:
+            """Return the receipt of a file that is taken; None if it is missing or damaged."""
+            own = part_name(mark, 0, one.first, one.stop)
+            with explained(f"{source.path(one.name)} cannot be taken"), suppress(FileNotFoundError):
+                store.storage.take(source, one.name, own)
+                receipt = only.receipt(own)
+                if receipt is not None and replace(receipt, name=one.name, summaries=b"") == one:
+                    return receipt
+                store.storage.remove([own])
+            return None
+
         for part in self.parts:
             if casting := part.record["casting"]:
                 store.cast_with(part.record["backend"], casting)
@@ -297,7 +295,7 @@ class _Merged(SurveyOutput):
                 store.db.add_trials(0, part.trials)
             source = parts_of(part.place.below(RUN_FOLDER), part.record["parts"])
             left = (one for one in part.points if only.parts.missing(one.first, one.stop))
-            for one, receipt in ahead(partial(_take, store, source), left):
+            for one, receipt in ahead(partial(take, source), left):
                 if receipt is None or not store.db.commit([receipt]):
                     damaged.append(source.path(one.name))
         if damaged:
@@ -306,19 +304,3 @@ class _Merged(SurveyOutput):
             only.job = replace(only.job, planning=None)
         only.parts.frames, only.resumed = only.parts.scans.stop, 0
         store.notes = [*self.notes]
-
-
-def _take(store: RunStore, source: Storage, one: Receipt) -> Receipt | None:
-    """Take a file of points into a store; returns its receipt, None if it is not that of `one`."""
-    only, own = store.only, part_name(store.db.meta["mark"], 0, one.first, one.stop)
-    assert only is not None, "of a survey"
-    with explained(f"{source.path(one.name)} cannot be taken"):
-        try:
-            store.storage.take(source, one.name, own)
-        except FileNotFoundError:
-            return None
-    receipt = only.receipt(own)
-    if receipt is None or replace(receipt, name=one.name, summaries=b"") != one:
-        store.storage.remove([own])
-        return None
-    return receipt

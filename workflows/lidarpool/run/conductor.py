@@ -61,8 +61,8 @@ class Kept(Output[RunResult]):
         """Return the result of the only job."""
         result = conductor.result()
         if self.made_of is not None:
-            told = {"made_of": self.made_of, "notes": result.notes}
-            conductor.store.db.set(**{name: json.dumps(value) for name, value in told.items()})
+            made_of, notes = map(json.dumps, (self.made_of, result.notes))
+            conductor.store.db.set(made_of=made_of, notes=notes)
             conductor.store.save(now=True)
         conductor.page.finish(result.seconds, result)
         conductor.store.db.close()

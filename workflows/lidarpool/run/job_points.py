@@ -37,10 +37,8 @@ class JobPoints:
 
     def __init__(self, store: RunStore, job: Job) -> None:
         self.job, self._store = job, store
-        only = isinstance(store.jobs, OneJob)
-        scans = range(job.survey.scan_count)
-        if only:
-            scans = store.jobs.shard.scans(job.survey.scan_count)
+        only, count = isinstance(store.jobs, OneJob), job.survey.scan_count
+        scans = store.jobs.shard.scans(count) if only else range(count)
         self.parts: JobParts = store.db.job(job.number, scans.stop, scans.start)
         self.parts.has_frames = only
         self.identified = only  # whether it is kept what the job is made of

@@ -322,8 +322,8 @@ class Run:
 
     def _progress(self) -> Progress:
         if (points := self._store.only) is None:
-            jobs = len(self._store.jobs.numbers)
-            return Progress(jobs=jobs, jobs_done=self._store.db.ended_count)
+            numbers, ended = self._store.jobs.numbers, self._store.db.ended_count
+            return Progress(jobs=len(numbers), jobs_done=ended)
         progress = points.progress()
         if self._trials is not None:
             progress = replace(progress, trials_done=len(self._trials.trials))
