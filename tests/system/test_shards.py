@@ -175,7 +175,7 @@ def test_damaged_files_are_named_and_the_next_merge_takes_them(
 ):
     DAMAGE[damage](parts[1])
     out, name = tmp_path / "ds", ".jobs/0001.json" if damage == "manifest" else "0001/cloud.ply"
-    with pytest.raises(LidarpoolError, match=f"^missing or damaged: .*part-2/.*{name} "):
+    with pytest.raises(LidarpoolError, match=f"^missing or damaged: .*part-2/.*{name}; run"):
         merge(parts, out)
     assert not (out / "dataset.json").exists() and (out / ".jobs/0000.json").exists()
     with Client(slots, set_as_default=False) as client:
@@ -246,8 +246,9 @@ def test_merge_leaves_other_files_and_runs(parts, tmp_path):
     with pytest.raises(LidarpoolError, match=r"holds thesis\.txt: a data set needs a folder"):
         merge(parts, out)
     assert [*out.iterdir()] == [out / "thesis.txt"]
-    with pytest.raises(LidarpoolError, match="holds no finished shard"):
-        merge([], tmp_path / "none") if parts == [] else merge([tmp_path / "none"], out)
+    for given, told in (([], "nothing to merge"), ([tmp_path / "none"], "none holds no finished")):
+        with pytest.raises(LidarpoolError, match=told):
+            merge(given, tmp_path / "new")
 
 
 # -- some of them, and more later -----------------------------------------------------------------
@@ -290,7 +291,6 @@ def test_failed_jobs_are_in_the_table_until_they_are_done(tmp_path, slots):
         "actors: [{name: Car, box: [4, 2, 1.5]",
         "actors: [{name: Car, file: a.stl",
     )
-    campaign = None
     (tmp_path / "a.stl").write_text("solid a\nendsolid a\n")
     campaign = Campaign.load(tmp_path / "c.yaml")
     with Client(slots, set_as_default=False) as client:
@@ -309,37 +309,35 @@ import os, signal, sys
 from lidarpool import merge
 from lidarpool.base.storage import Storage
 import lidarpool.report.campaign_output as output
-left = [int(sys.argv[1])]
-def before(owner, name):
-    function = getattr(owner, name)
-    def call(*arguments, **options):
-        left[0] -= 1
-        if not left[0]:
-            os.kill(os.getpid(), signal.SIGKILL)
-        return function(*arguments, **options)
-    setattr(owner, name, call)
-before(Storage, "take")
-before(output, "write_table")
-before(output.DataSet, "finish")
-merge(sys.argv[3:], sys.argv[2])
+owners = {"take": Storage, "write_table": output, "finish": output.DataSet}
+name, left = sys.argv[1], [int(sys.argv[2])]
+function = getattr(owners[name], name)
+def call(*arguments, **options):
+    left[0] -= 1
+    if not left[0]:
+        os.kill(os.getpid(), signal.SIGKILL)
+    return function(*arguments, **options)
+setattr(owners[name], name, call)
+merge(sys.argv[4:], sys.argv[3])
 """
 
 
-def killed(out: Path, parts: list[Path], *moments: int) -> None:
+def killed(out: Path, parts: list[Path], *moments: tuple[str, int]) -> None:
     """Merge, killed at some calls."""
-    for moment in moments:
-        code = [sys.executable, "-c", KILLED, str(moment), str(out), *map(str, parts)]
+    for name, number in moments:
+        code = [sys.executable, "-c", KILLED, name, str(number), str(out), *map(str, parts)]
         assert subprocess.run(code, check=False).returncode == -signal.SIGKILL
 
 
 def test_a_killed_merge_goes_on(parts, campaigns, tmp_path):
     out = tmp_path / "ds"
-    killed(out, parts, 5)
-    some = {path: path.stat().st_ctime_ns for path in (out / "jobs").rglob("*.ply")}
-    assert 0 < len(some) < 7
-    killed(out, parts, 22)
+    killed(out, parts, ("take", 5), ("take", 5), ("write_table", 1), ("finish", 1))
+    assert not (out / "dataset.json").exists()
+    times = {path: path.stat().st_ctime_ns for path in (out / "jobs").rglob("*.ply")}
+    assert len(times) == 7
     merge(parts, out)
     assert content(out) == content(campaigns("folder") / "one")
+    assert times == {path: path.stat().st_ctime_ns for path in times}  # they were not taken again
 
 
 # -- surveys --------------------------------------------------------------------------------------
@@ -376,7 +374,7 @@ def _some_of_a_survey(survey: Path, shards: list[Path]) -> None:
         merge(shards[:2], survey / "some")
     report = merge(shards[:2], survey / "some", partial=True)
     assert "missing: 1 shard, 1/3" in report["notes"] and report["planning"] is None
-    killed(survey / "some", shards, 3)
+    killed(survey / "some", shards, ("take", 3))
     merge(shards, survey / "some")
     assert content(survey / "some") == content(survey / "all")
 
@@ -434,7 +432,7 @@ SHARDS = [
     ("3/10", {}, Shard(3, 10)),
     ("auto/10", {"JOB_COMPLETION_INDEX": "2"}, Shard(3, 10)),
     ("auto", {"ID": "14", "MIN": "10", "STEP": "2", "COUNT": "10"}, Shard(3, 10)),
-    ("auto", {"ID": "15", "MIN": "10", "STEP": "2", "COUNT": "10"}, "ID=15, .*give 3/10"),
+    ("auto", {"ID": "9", "MIN": "1", "STEP": "1", "COUNT": "3"}, "no shard 9/3: they are 1/3 to"),
     ("auto", {}, "finds no shard in SLURM_ARRAY_TASK_ID="),
     ("auto/10", {"JOB_COMPLETION_INDEX": "x"}, "finds no shard in JOB_COMPLETION_INDEX=x"),
     ("auto/10", {"JOB_COMPLETION_INDEX": "10"}, "no shard 11/10"),

@@ -142,6 +142,7 @@ class DataSetOutput(Output[CampaignRun]):
         record |= {"backend": store.backend, "sensors": run.sensors}
         record |= {"files": hashes(self.campaign.files), "campaign": self.campaign.described}
         record["shards"] = [str(self.campaign.shard)]
+        write_record(self.dataset.place, record)  # before anything that it tells whose it is
         run, _ = write_shared(self.dataset, record, run, store.rows)
         if run.failed:
             store.save(now=True)
@@ -173,8 +174,8 @@ def write_shared(
     from .charts import draw_sweep
 
     campaign, place = record["campaign"], dataset.place
-    write_record(place, record)
     write_table(place, campaign["names"], rows)
+    write_record(place, record)  # behind the table, which has the jobs of all shards in it
     dataset.finish(rows())
     saved = sweeps(place.url)
     picture = draw_sweep(next(iter(saved)), saved.classes) if len(saved) else None
