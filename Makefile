@@ -17,7 +17,7 @@ demo:  ## the default survey, then a drive through a city; results in $(OUT)/ an
 	$(BIN)/lidarpool demo --out $(OUT)
 	@mkdir -p $(OUT)/drive && cp examples/drive.yaml $(OUT)/drive
 	$(BIN)/lidarpool scene city $(OUT)/drive/city.glb --overwrite
-	$(BIN)/lidarpool run $(OUT)/drive/drive.yaml --out $(OUT)/drive --overwrite
+	$(BIN)/lidarpool run $(OUT)/drive/drive.yaml --out $(OUT)/drive --overwrite --pictures
 
 # Whole runs wait for processes and timers: three processes keep two cores busy. The tests of a
 # file stay together, for they share clusters; files come in the order of testpaths.

@@ -107,6 +107,7 @@ def test_points_grow_until_all_are_there(client, live, new_tab, tmp_path):
         first = tab.wait_for(points_in)
         run.most = first + 1
         tab.wait_for(lambda text: points_in(text) > first)
+        tab.wait_for(lambda text: re.search(r"GPU, slots busy\s+\d+ % of 1", text))
         assert not run.points.complete
     finally:
         run.most = ALL

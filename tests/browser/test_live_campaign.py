@@ -65,6 +65,10 @@ def test_jobs_are_counted_listed_drawn_and_shown(new_tab, tmp_path):
         tab.wait_for(lambda text: "done" in text.split("\n")[1])
         tab.wait_for(lambda _: tab.value("document.querySelectorAll('#charts svg').length") == 2)
         tab.wait_for(lambda _: tab.value(DRAWN))
+        links = "[...document.querySelectorAll('#jobs a')].map(link => link.href)"
+        job = new_tab(tab.value(links)[-1])
+        job.wait_for(lambda text: re.search(r"[1-9][\d,]* points", text))
+        assert len(tab.value(links)) == COUNT - 1 and job.errors == []
         picture = tab.picture(tmp_path / "campaign.png")[60:400, 340:1240]
         assert len(np.unique(picture.reshape(-1, 3), axis=0)) > 100, "points of a job"
         assert tab.errors == []

@@ -10,7 +10,7 @@ pytestmark = [pytest.mark.browser, pytest.mark.slow]
 
 SCENARIO = "sensor: {rays_per_revolution: 100, layers: 8}\n"
 PLACE = """(() => {
-  const figure = document.querySelector('figure'); figure.scrollIntoView();
+  const figure = document.querySelector('figure[data-picture=scene]'); figure.scrollIntoView();
   const box = figure.querySelector('svg').getBoundingClientRect();
   return [box.left, box.top, box.width, box.height].map(Math.round);
 })()"""
@@ -18,7 +18,7 @@ PLACE = """(() => {
 
 def test_pictures_are_dark_where_the_browser_is(new_tab, tmp_path):
     (tmp_path / "small.yaml").write_text(SCENARIO)
-    run = [sys.executable, "-m", "lidarpool", "run", "small.yaml", "--no-plan"]
+    run = [sys.executable, "-m", "lidarpool", "run", "small.yaml", "--no-plan", "--pictures"]
     subprocess.run(run, cwd=tmp_path, check=True, timeout=180, capture_output=True)
     tab = new_tab((tmp_path / "lidarpool-out" / "report.html").as_uri())
     tab.wait_for(lambda text: "Sensor and scene" in text)

@@ -2,6 +2,7 @@
 
 import re
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -9,10 +10,11 @@ import pytest
 from lidarpool import Column, Scene, Sensor, Survey, Track
 from lidarpool.columns.cloud_file import CloudFile
 from lidarpool.columns.ply_format import header, row_type
-from lidarpool.columns.table import SCAN
+from lidarpool.columns.table import SCAN, TABLE
 from lidarpool.export.sweeps import Sweeps
 from lidarpool.live.server import page_server
-from lidarpool.live.view import View
+from lidarpool.live.sharing import page_of
+from lidarpool.live.view import View, open_results
 from lidarpool.run.picture_file import PictureContent, sensor_ways
 from lidarpool.scene.actors import Actor, box
 
@@ -129,8 +131,8 @@ def test_a_look_at_all_fills_the_picture_and_the_sensor_can_be_seen(served, new_
             f" return Math.max(Math.abs(at.x), Math.abs(at.y)); }})))({PICTURE})"
         )
         assert most == pytest.approx(0.9, abs=0.01), key
-    share = tab.value(f"{PICTURE}.sensors[0].marker.scale.x / {PICTURE}.extent")
-    assert share == pytest.approx(0.0036)
+    share = f"{PICTURE}.sensors[0].marker.scale.x / {PICTURE}.extent"
+    tab.wait_for(lambda _: tab.value(share) == pytest.approx(0.0036))
     assert tab.errors == []
 
 
@@ -186,6 +188,7 @@ def test_points_are_clicked_at_measured_filtered_and_linked_to(served, new_tab, 
         " const [x, y, w] = [0, 1, 3].map(r => m[r]*p[0] + m[r+4]*p[1] + m[r+8]*p[2] + m[r+12]);"
         " return [(x / w + 1) / 2 * c.clientWidth, (1 - y / w) / 2 * c.clientHeight]; })"
     )
+    tab.key("a")
     for row, shift, words in ((10_000, False, "wetness"), (12_000, True, "distance")):
         tab.press(*tab.value(f"{place}({row})"), shift=shift)
         tab.wait_for(lambda text, words=words: re.search(rf"\b{words}\s\d", text))
@@ -201,6 +204,146 @@ def test_points_are_clicked_at_measured_filtered_and_linked_to(served, new_tab, 
     both = [one.value(f"{PICTURE}.camera.position.toArray()") for one in (tab, other)]
     assert both[0] == pytest.approx(both[1], abs=1e-2)
     assert tab.errors == other.errors == []
+
+
+def test_a_drive_opens_behind_its_carrier_above_it_and_looks_ahead(served, new_tab):
+    tab = opened(new_tab, served)  # it drives along y, 4 m up
+    x, y, z = tab.value(f"{PICTURE}.camera.position.toArray()")
+    towards = tab.value(f"{PICTURE}.controls.target.toArray()")
+    assert abs(x) < 1e-6 and y < -9 < towards[1] and z > 4
+    assert (tab.value("lidarpool.chosen.time"), tab.value(f"{PICTURE}.carrier.y")) == (0, -9)
+    assert not tab.value(f"{PICTURE}.rays?.visible")
+    tab.key("a")
+    tab.key("c")
+    link = tab.wait_for(lambda _: tab.value("location.hash"))
+    other = opened(new_tab, served, link)
+    both = [one.value(f"{PICTURE}.camera.position.toArray()") for one in (tab, other)]
+    assert both[0] == pytest.approx(both[1], abs=1e-2), "a link has its own camera"
+
+
+def test_walls_before_points_are_faint_until_a_user_wants_otherwise(view, new_tab, tmp_path):
+    wall = Scene.from_meshes([box("Wall", (24, 24, 12))])  # around all points
+    view.pictured = replace(view.pictured, scene=wall, hit_counts=np.zeros(12, np.int64))
+    with page_server(view.answer, port=0) as page:
+        tab = opened(new_tab, page, "#camera=0,-60,30;0,0,4&clip=,;,;,")
+        tab.wait_for(lambda _: colourful(tab.picture(tmp_path / "a.png")) > 3000)
+        set_opacity = (
+            "const row = [...document.querySelectorAll('.row')].find(r =>"
+            " r.firstChild.textContent === 'opacity').querySelector('input');"
+        )
+        tab.value(f"{{ {set_opacity} row.value = 1; row.oninput(); }}")
+        tab.wait_for(lambda _: colourful(tab.picture(tmp_path / "b.png")) < 300)
+        tab.value(f"{{ {set_opacity} row.value = 0; row.oninput(); }}")
+        tab.wait_for(lambda _: colourful(tab.picture(tmp_path / "c.png")) > 3000)
+        assert tab.errors == []
+
+
+def test_in_a_narrow_window_the_panel_is_a_drawer_and_nothing_overlaps(served, new_tab):
+    tab = opened(new_tab, served)
+    hidden = "getComputedStyle(document.getElementById('panel')).display === 'none'"
+    across = "(id => { const b = document.getElementById(id).getBoundingClientRect();"
+    across += " return [b.left, b.right]; })"
+    assert not tab.value(hidden)
+    tab.key("h")
+    assert tab.value(hidden) and tab.value(f"{across}('canvas')") == [0, 1280]
+    tab.value("document.querySelector('#open button').click()")
+    assert not tab.value(hidden) and tab.value(f"{across}('canvas')") == [0, 980]
+    narrow = {"width": 420, "height": 800, "deviceScaleFactor": 1, "mobile": False}
+    tab.call("Emulation.setDeviceMetricsOverride", **narrow)
+    tab.wait_for(lambda _: tab.value(hidden))
+    assert tab.value(f"{across}('time')") == tab.value(f"{across}('canvas')") == [0, 420]
+    wide = "[...document.querySelectorAll('#time *')].every(one =>"
+    assert tab.value(f"{wide} one.getBoundingClientRect().right <= 420)")
+    tab.key("h")
+    assert tab.value(f"{across}('panel')") == [120, 420]
+    top = "document.elementFromPoint(270, 780)"
+    assert tab.value(f"document.getElementById('panel').contains({top})"), "it is above the player"
+    tab.value("document.querySelector('#panel header button[title^=\"Hide\"]').click()")
+    assert tab.value(hidden) and tab.errors == []
+
+
+@pytest.fixture
+def classed(view):
+    """Serve the spiral with classes, of which 1 is known as a car, as is the van."""
+    told = view.answer
+
+    def answer(what, asked, gone):
+        header, arrays = told(what, asked, gone)
+        if what == "state":
+            header["classes"] = {"1": "car"}
+            header["actors"][0]["class"] = 1
+        return header, arrays
+
+    rows = view.points
+    view.columns["class"] = TABLE["class"]
+    view._coloured["class"] = TABLE["class"]
+    values = rows.values
+    rows.values = lambda name, some: (
+        (values("scan", some) > 179).astype(np.uint16) if name == "class" else values(name, some)
+    )
+    with page_server(answer, port=0) as page:
+        yield page
+
+
+def test_a_legend_of_classes_has_names_and_is_used_by_keyboard(classed, new_tab):
+    tab = opened(new_tab, classed, "#colour=class")
+    tab.wait_for(lambda text: re.search(r"class 0\ncar\n", text))
+    tab.value("document.querySelectorAll('.legend button')[1].focus({ focusVisible: true })")
+    press = {"key": "Enter", "code": "Enter", "text": "\r", "windowsVirtualKeyCode": 13}
+    for kind in ("keyDown", "keyUp"):
+        tab.call("Input.dispatchKeyEvent", type=kind, **press)
+    tab.wait_for(lambda text: "15,000 points of 30,000" in text)
+    pressed = "document.querySelectorAll('.legend button[aria-pressed=true]').length"
+    assert tab.wait_for(lambda _: tab.value(pressed)) == 1
+    assert tab.errors == []
+
+
+def test_actors_have_boxes_and_names_at_the_time_until_they_are_switched_off(classed, new_tab):
+    tab = opened(new_tab, classed)
+    tab.key("t")
+    tab.wait_for(lambda text: "Van · car" in text)
+    box_of = f"{PICTURE}.actors[0].box"
+    assert tab.value(f"{box_of}.visible && {box_of}.parent === {PICTURE}.actors[0].mesh")
+    before = tab.value(f"{box_of}.getWorldPosition({PICTURE}.middle.clone()).x")
+    tab.key("ArrowRight")
+    moved = f"{box_of}.getWorldPosition({PICTURE}.middle.clone()).x"
+    assert tab.wait_for(lambda _: tab.value(moved) - before) == pytest.approx(1.8, abs=0.1)
+    tab.tick("boxes and names", on=False)
+    tab.wait_for(lambda text: "Van" not in text)
+    assert not tab.value(f"{box_of}.visible") and tab.errors == []
+
+
+def test_several_results_have_a_switch(cloud, new_tab, tmp_path):
+    (tmp_path / "other.ply").write_bytes(cloud.read_bytes())
+    with page_server(open_results([cloud, tmp_path / "other.ply"]).answer, port=0) as page:
+        tab = opened(new_tab, page)
+        tab.wait_for(lambda text: "60,000 points" in text and "cloud.ply\nother.ply" in text)
+        assert tab.value("lidarpool.chosen.colour") == "result"
+        for pressed in ("[true,false]", "[false,true]"):
+            tab.key("r")
+            tab.wait_for(lambda text: "30,000 points of 60,000" in text)
+            on = "[...document.querySelectorAll('.legend button')].map(b => b.ariaPressed)"
+            assert tab.value(f"JSON.stringify({on})").replace('"', "") == pressed
+        tab.key("r")
+        tab.wait_for(lambda text: "60,000 points" in text)
+        tab.click("other.ply")
+        tab.wait_for(lambda text: "30,000 points of 60,000" in text)
+        assert tab.errors == []
+
+
+def test_the_points_that_are_filtered_and_clipped_are_downloaded(served, new_tab, tmp_path):
+    tab = opened(new_tab, served, "#filter=scan,100,299&clip=,;,;,3&colour=wetness")
+    tab.call("Page.setDownloadBehavior", behavior="allow", downloadPath=str(tmp_path / "kept"))
+    summaries = "[...document.querySelectorAll('summary')]"
+    tab.value(f"{summaries}.find(one => one.textContent === 'Export').click()")
+    tab.choose("format", "ply")
+    tab.click("Download")
+    file = tmp_path / "kept" / "cloud.ply"
+    tab.wait_for(lambda _: file.exists())
+    kept = CloudFile(file, [WET])
+    scans, z = (kept.values(name, slice(None)) for name in ("scan", "z"))
+    assert len(kept) > 1000 and scans.min() == 100 and z.max() <= 3 < z.max() + 0.01
+    assert tab.errors == []
 
 
 def test_what_is_cut_off_is_not_drawn(served, new_tab, tmp_path):
@@ -249,3 +392,30 @@ def test_no_page_of_another_server_frames_it(served, view, new_tab):
         frame = "Object.assign(document.createElement('iframe'), {src: '" + served.url + "'})"
         tab.value(f"document.body.append({frame})")
         tab.wait_for(lambda _: any("frame-ancestors" in error for error in tab.errors))
+
+
+def test_an_exported_page_opens_from_disk_and_asks_nobody(view, new_tab, tmp_path):
+    path = tmp_path / "page.html"
+    path.write_bytes(page_of(view))
+    file = SimpleNamespace(url=path.as_uri())
+    tab = opened(new_tab, file)
+    tab.wait_for(lambda text: "30,000 points" in text and "z, m" in text)
+    assert tab.value("lidarpool.state.actors[0].name") == "Van"
+    tab.wait_for(lambda _: colourful(tab.picture(tmp_path / "a.png")) > 3000)
+    own = (file.url, "data:", "blob:")
+    assert [request for request in tab.requests if not request.startswith(own)] == []
+    tab.key("ArrowRight")  # one sweep of ten
+    tab.wait_for(lambda _: drawn(tab) == COUNT / 10)
+    tab.key(" ")
+    tab.wait_for(lambda _: tab.value("lidarpool.chosen.time") > 0.5)
+    assert "Range image" not in tab.text
+    link = "#filter=scan,100,149;z,2,2.5&colour=wetness&scene=hits"
+    other = opened(new_tab, file, link)
+    kept = "1,21[56] points of 30,000"  # from z, 2 m to 2.5 m; the scans begin at 2.2 m
+    other.wait_for(lambda text: re.search(kept, text) and "wetness, %" in text)
+    other.wait_for(lambda _: other.value(f"{PICTURE}.surface?.material.vertexColors === true"))
+    found = f"{PICTURE}.layers.base.told.arrays"
+    other.value(f"{PICTURE}.pick = () => ({{ row: {found}.rows[0], place: [0, 0, 0] }})")
+    other.press(400, 300)
+    other.wait_for(lambda text: re.search(r"wetness\s\d+\.\d+ %", text) and "scan\t1" in text)
+    assert tab.errors == other.errors == []

@@ -440,7 +440,7 @@ WRONG = {
         {"actors.0.box.0": {"uniform": [1, 2]}, "actors.Van.box.0": {"uniform": [1, 2]}},
         "actors.0.box.0 and actors.Van.box.0 lead to the same field",
     ),
-    "other section": ({"performance": {"choice": ["ideal"]}}, "performance is a field of sensor"),
+    "other section": ({"performance": {"choice": ["ideal"]}}, "It is a field of sensor"),
     "within": (
         {"scene": {"choice": ["hall.glb"]}, "scene.files.0.file": {"choice": ["hall.glb"]}},
         "scene is chosen as a whole",

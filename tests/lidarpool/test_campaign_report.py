@@ -117,7 +117,7 @@ def test_page_shows_what_failed_and_why(card):
     assert page.startswith("<!DOCTYPE html>")
     assert "1 failed job" in page and "no &lt;b&gt;surface&lt;/b&gt; | in range" in page
     assert "1 job of the description is not in the table" in page
-    assert page.count("<figure>") == 2 and "var(--picture-ink" in page
+    assert page.count("<svg viewBox") == 2 and "var(--picture-ink" in page
     assert "campaign.yaml --retry-failed" in page
 
 

@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import math
+import re
 
 import numpy as np
 import pytest
+import yaml
 from click.testing import CliRunner
 from tests.shapes import beam_along_x, cast, wall
 
 from lidarpool import LidarpoolError, Material, Returns, datasheet
 from lidarpool.cli.scenario_commands import sensors
+from lidarpool.scenario.advice import advice
 from lidarpool.scenario.build import build
 from lidarpool.scenario.scenario import Scenario
 from lidarpool.sensor.models import Detection, Performance, model_names, read_model
@@ -117,6 +120,41 @@ def test_each_of_several_sensors_has_its_own():
     (roof, _), (front, returns) = found
     assert (roof.range_m, roof.detection_range_m is not None) == (0.5, True)
     assert (front.range_m, front.detection_range_m, returns) == (0.5, None, Returns())
+
+
+@pytest.mark.parametrize(
+    ("given", "lacks"),
+    [
+        ({}, ["detection range at a reflectance (noise.detection_range_m)", "accuracy of angles "
+              "(noise.angle_deg)", "false alarms (noise.false_alarm_hz)"]),
+        ({"detection_range_m": 60, "angle_deg": 0}, ["false alarms (noise.false_alarm_hz)"]),
+    ],
+)  # fmt: skip
+def test_what_a_data_sheet_lacks_is_told_as_long_as_nobody_gives_it(given, lacks):
+    sheet = {"model": "velodyne/vlp16", "performance": "datasheet"}
+    sensors = {"left": sheet, "right": sheet, "front": {"model": "livox/mid40"}}
+    data = {"poses": [[0, 0, 1]], "sensors": sensors, "noise": given}
+    told = [note for note in advice(build(Scenario.from_data(data))) if "data sheet" in note]
+    assert told == [
+        f"the data sheet of velodyne/vlp16 does not state {', '.join(lacks)}: they have no effect"
+    ]
+
+
+@pytest.mark.parametrize(
+    ("sensor", "lacks", "proposed"),
+    [
+        ({"performance": "datasheet"}, "its data sheet does not state", 65),
+        ({}, "is not given", 65),
+        ({"max_range_m": 40}, "is not given", 20),
+    ],
+)
+def test_rain_without_a_detection_range_proposes_one_that_can_be_written(sensor, lacks, proposed):
+    rain = {"sensor": {"model": "velodyne/vlp16", **sensor}, "weather": {"rain_mm_h": 10}}
+    with pytest.raises(LidarpoolError, match=lacks) as told:
+        carried(**rain)
+    (entry,) = re.findall(r"write .*, (noise: {.*})", str(told.value))
+    assert yaml.safe_load(entry) == {"noise": {"detection_range_m": proposed}}
+    carried(**rain, **yaml.safe_load(entry))
 
 
 @pytest.mark.parametrize(

@@ -14,6 +14,7 @@ from lidarpool.importers.helios import import_survey
 from lidarpool.scenario.build import build
 from lidarpool.sensor.materials import MaterialTable
 from lidarpool.simulator.rig import Rig
+from raybeam import RayCaster
 
 X, Y, Z = np.eye(3)
 SQUARE = "v -1 -1 0\nv 1 -1 0\nv 1 1 0\nv -1 1 0\nf 1 2 3\nf 1 3 4\n"
@@ -135,6 +136,18 @@ def test_a_polygon_fires_the_pulses_of_helios_within_its_angles(imported):
     assert np.allclose(np.diff(times), [1e6] * (len(kept) - 1) + [(35 - len(kept)) * 1e6])
     there = [about(X, angle) for angle in angles[kept]]
     assert np.allclose(fired(of, 0, np.arange(len(kept)))[:, 0], expected(there), atol=1e-9)
+
+
+def test_lines_wider_than_the_scanner_end_where_it_does(imported):
+    """HELIOS++ 2 refuses them, and its first version left their pulses out."""
+    device = scanner("rotating", scanAngleMax_deg=60, scanAngleEffectiveMax_deg=45)
+    wide = 'verticalAngleMin_deg="-50" verticalAngleMax_deg="41"'
+    _, _, of = imported(device, legs(f'pulseFreq_hz="1000" {wide} scanFreq_hz="30"'))
+    angles = np.array([-60 + 3.6 * k for k in range(34)])
+    kept = angles[(angles > -45) & (angles <= 41)]
+    there = [about(X, angle) for angle in kept]
+    assert np.allclose(fired(of, 0, np.arange(len(kept)))[:, 0], expected(there), atol=1e-9)
+    assert of.carried[0].sensor.head.firings_per_turn == len(kept)
 
 
 def test_a_swinging_mirror_and_fibres_are_those_of_helios(imported, tmp_path):
@@ -338,8 +351,9 @@ def test_what_is_not_taken_over_is_named(imported, survey, tmp_path):
     part = GROUND.partition("<part>")[2].partition("</part>")[0]
     scene = GROUND.replace(
         "</scene>",
-        f"""<part><filter type="xyzloader"><param key="filepath" type="string" value="p.xyz"/>
-</filter></part>{f"<part>{part}<swap/></part>" * 30}</scene>""",
+        f"""<part><filter type="detailedvoxels"><param key="filepath" value="c.vox"/>
+<param key="intersectionMode" value="fixed"/></filter></part>
+{f"<part>{part}<swap/></part>" * 30}</scene>""",
     ).replace("</part>", '<dmotion id="m"/></part>', 1)
     device = scanner("rotating", scanAngleMax_deg=60, scanAngleEffectiveMax_deg=60)
     device = device.replace("</scanner>", '<deflectionError expr="1"/></scanner>')
@@ -354,7 +368,7 @@ def test_what_is_not_taken_over_is_named(imported, survey, tmp_path):
         "not supported: <deflectionError> of S/1: errors by a formula",
         "not supported: <dmotion> of part 0: it stands as it is at first",
         "not supported: <swap> of 30 parts, part 2 to part 31: they stand as they are at first",
-        "not supported: part 1, xyzloader of p.xyz: no triangles, left out",
+        "not supported: part 1, detailedvoxels of c.vox: intersectionMode fixed, left out",
     ]
     head = (tmp_path / "out" / "scenario.yaml").read_text().splitlines()
     assert head[1:6] == [f"# N{line[1:]}." for line in told]
@@ -407,6 +421,60 @@ def test_voxels_are_scene_files_where_light_goes_through_them(survey, tmp_path):
     ]
 
 
+@pytest.mark.parametrize(("separator", "ends"), [(None, ""), (" ", "0 0 1 255 0 0"), (",;", "0,1")])
+def test_points_become_surfels_a_cell_of_voxel_size(survey, tmp_path, separator, ends):
+    """A floor of 4 x 3 m and a wall at its end, by columns apart as the separator says."""
+    side = np.arange(0.05, 4, 0.1)
+    floor = [(x, y, 2) for x in side for y in side[:30]]
+    wall = [(4, y, 2 + z) for y in side[:30] for z in side]
+    gap = "," if separator == ",;" else " "
+    rows = [gap.join(map(str, [*point, *ends.split()])) for point in floor + wall]
+    params = '<param key="filepath" value="parts/scan.txt"/><param key="voxelSize" value="0.25"/>'
+    params += f'<param key="separator" value="{separator}"/>' if separator else ""
+    part = f"""<part><filter type="xyzloader">{params}</filter>
+  <filter type="translate"><param key="offset" value="10;20;0"/></filter></part></scene>"""
+    parts = {"scan.txt": "\n".join(["// x y z", *rows])}
+    inside = legs('pulseFreq_hz="1000"', platform='onGround="true"')
+    path = survey(LASER, inside, GROUND.replace("</scene>", part), parts=parts)
+    made = import_survey(path, tmp_path / "out")
+    assert {p.name for p in made.path.parent.glob("*.glb")} == {"scan-1.glb"}
+    scene = build(made.scenario).scene
+    assert scene.names == ("ground", "scan") and not made.left_out
+    low, high = scene.object_bounds[1] + scene.origin
+    assert np.allclose([low, high], [[10, 20, 2], [14, 23, 6]], atol=0.25)
+    here = np.array([[12, 21.5, 4]] * 2) - scene.origin
+    hits = RayCaster(scene.vertices, scene.faces, "numpy").cast(here, np.stack([-Z, X]))
+    assert np.allclose(hits.distance, 2, atol=0.02)
+    faces = (scene.face_object == 1).sum()
+    assert faces / 2 == pytest.approx(16 * 12 + 16 * 12, rel=0.2)  # surfels of cells
+
+
+def test_rasters_of_heights_are_scene_files(imported, tmp_path):
+    rasterio = pytest.importorskip("rasterio")
+    (tmp_path / "helios" / "parts").mkdir(parents=True)
+    place = rasterio.transform.from_origin(0, 30, 10, 10)
+    heights = np.array([[1, 1, 1], [1, 5, 1], [1, 1, -9999]], np.float32)
+    with rasterio.open(
+        tmp_path / "helios" / "parts" / "hill.tif", "w", driver="GTiff", width=3, height=3,
+        count=1, dtype="float32", transform=place, nodata=-9999,
+    ) as file:  # fmt: skip
+        file.write(heights, 1)
+    scene = """<scene id="field"><part><filter type="geotiffloader">
+  <param type="string" key="filepath" value="parts/hill.tif"/>
+  <param type="string" key="matfile" value="parts/g.mtl"/>
+  <param type="string" key="matname" value="soil"/></filter>
+  <filter type="translate"><param type="vec3" key="offset" value="100;0;7"/></filter>
+</part></scene>"""
+    inside = legs('pulseFreq_hz="1000"', (115, 15), (120, 15), platform='onGround="true"')
+    made, built, of = imported(LASER, inside, scene)
+    assert not made.left_out and built.names == ("hill",)
+    bounds = built.object_bounds[0] + built.origin
+    assert np.allclose(bounds, [[105, 5, 8], [125, 25, 12]])  # middles of the pixels
+    assert built.triangles == 6  # of cells whose corners all have heights
+    assert of.pose(0).position[2] + built.origin[2] == pytest.approx(12.5)  # on the ground
+    assert made.scenario.materials[1].reflectance == 0.3
+
+
 @pytest.mark.parametrize(
     ("change", "message"),
     [
@@ -416,7 +484,7 @@ def test_voxels_are_scene_files_where_light_goes_through_them(survey, tmp_path):
         (("devices.xml#s", "lasers.xml#s"), "no file 'lasers.xml'.*--assets"),
         (('scanner="devices.xml#s"', ""), "names no scanner"),
         (("ground.obj", "grund.obj"), "scene 'field', part 0: there is no file .*grund.obj"),
-        (("objloader", "xyzloader"), "has no part that can be read"),
+        (("objloader", "xyzloader"), "part 0: .*ground.obj has rows that are no points"),
         (('x="3"', 'x="three"'), "leg 1: x is 'three'; it must be a number"),
         (('x="3" y="4"', 'x="0" y="0"'), "no two legs are at different places"),
         (('movePerSec_m="10"', 'movePerSec_m="0"'), "leg 0: movePerSec_m is 0; it never ends"),

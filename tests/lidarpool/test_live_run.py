@@ -27,6 +27,7 @@ from lidarpool.live.live_page import (
     UNDER_WAY_MOST,
     LiveJob,
     LivePage,
+    busy_slots,
     live_page,
 )
 from lidarpool.report.campaign_output import DataSetOutput
@@ -36,6 +37,7 @@ from lidarpool.run.options import RunOptions
 from lidarpool.run.progress import Progress, Screen
 from lidarpool.run.run_page import JobNow
 from lidarpool.run.store import RunStore
+from poolpart import PartitionStats
 
 LONG_S = 120.0
 SCENE = Scene.from_meshes([box("Wall", (5, -9, 0), (6, 9, 4))])  # beside the sensor
@@ -269,6 +271,22 @@ def test_the_page_tells_of_jobs_and_keeps_few_of_them():
         assert not told["over"]
 
 
+def load(busy, seconds, slots=2):
+    """What a partition says of itself."""
+    return {"GPU": PartitionStats(name="GPU", busy=busy, slots=slots, seconds=seconds)}
+
+
+def test_busy_slots_are_a_share_over_the_last_seconds():
+    assert busy_slots([]) == []
+    assert busy_slots([(0.0, load(1, 0))]) == [["GPU, slots busy", 0.5, 2]]
+    short = [(float(k), load(0, 1.5 * k)) for k in range(5)]  # none is seen, all are over
+    assert busy_slots(short) == [["GPU, slots busy", 0.75, 2]]
+    long = [(float(k), load(2, 0)) for k in range(5)]
+    assert busy_slots(long) == [["GPU, slots busy", 1.0, 2]]
+    assert busy_slots([(0.0, load(0, 0)), (1.0, load(2, 90))])[0][1] == 1.0, "no more than all"
+    assert busy_slots([(0.0, load(0, 0, 0))])[0][1:] == [0.0, 0]
+
+
 def test_a_campaign_is_watched_to_its_end(tmp_path):
     states = set()
     with (
@@ -298,9 +316,13 @@ def test_a_campaign_is_watched_to_its_end(tmp_path):
         number, name = told["newest"]
         viewer = f"{live.page.url}job/{number}/"
         assert ask(viewer, "state")["title"].startswith(f"job {name}")
-        points = ask(viewer, "points", colour="z", most=1_000_000)["arrays"]["rows"]
-        done = {job["name"]: job["points"] for job in told["ended"]}
-        assert len(points) == done[name]
+        for job in told["ended"]:  # the newest as it was read, the others as they are written
+            assert job["opens"]
+            shown = ask(f"{live.page.url}job/{job['number']}/", "points", colour="z", most=10**6)
+            assert len(shown["arrays"]["rows"]) == job["points"]
+        assert not any(job["opens"] for job in told["failures"])
+        with pytest.raises(urllib.error.HTTPError, match="404"):
+            ask(f"{live.page.url}job/{told['failures'][0]['number']}/", "state")
         for page, script in ((live.page.url, b"jobs.js"), (viewer, b"page.js")):
             with urllib.request.urlopen(page, timeout=LONG_S) as file:
                 assert script in file.read()

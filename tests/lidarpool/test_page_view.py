@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import importlib
 import json
 from dataclasses import replace
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -31,8 +33,9 @@ from lidarpool.live.view import (
     colours_for,
     legend_of,
     open_result,
+    open_results,
     range_image,
-    view_result,
+    show_view,
 )
 from lidarpool.plan import Plan
 from lidarpool.render.colouring import colours_of as colouring_of
@@ -90,7 +93,7 @@ def test_what_is_no_result_is_refused(tmp_path):
         (tmp_path / "run" / "run").mkdir(parents=True, exist_ok=True)
         (tmp_path / "run" / "run" / "run.db").touch()
         with pytest.raises(LidarpoolError, match=words):
-            view_result(tmp_path / name, port=0, browser=False)
+            show_view(open_result(tmp_path / name), port=0, browser=False)
 
 
 @pytest.fixture(scope="module")
@@ -218,7 +221,7 @@ def test_actors_are_told_with_their_poses_and_numbers(cloud):
     scene = replace(scene, actors=(Actor(cart, track),))
     view = View(CloudFile(cloud), seen(scene, [[20, 0, 1]]))
     state, arrays = told(view, "state")
-    assert (state["actors"], state["statics"]) == ([{"name": "Cart"}], 2)
+    assert (state["actors"], state["statics"]) == ([{"name": "Cart", "class": None}], 2)
     assert len(state["actor_colours"]) == 1
     assert arrays["mesh0_colours"].tolist() == [[9, 8, 7]] * 36 and "colour" in state["scene"]
     assert (arrays["actor0_times"][0], arrays["actor0_times"][-1]) == (0, 2)
@@ -261,6 +264,80 @@ def test_without_pictures_sensors_and_sweeps_are_still_shown(tmp_path, spun):
     assert image.shape[0] == 8  # channels
     with pytest.raises(KeyError):
         told(view, "range", sweep=len(spun))
+
+
+def result_in(folder, sweeps):
+    """Write a result without pictures."""
+    folder.mkdir()
+    sweeping(folder / "cloud.ply", sweeps)
+    sweeps.save(folder / SWEEPS_FILE)
+    return folder
+
+
+def test_several_results_are_one_view_with_a_colour_each_and_are_played_together(tmp_path, spun):
+    both = [result_in(tmp_path / name, spun) for name in ("before", "after")]
+    view = open_results(both)
+    state, _ = told(view, "state")
+    assert [name for name, *_ in state["results"]] == ["before", "after"]
+    assert state["title"].startswith("before and after")
+    legend = told(view, "points", colour="result", most=ALL)[0]["legend"]
+    assert legend["labels"] == state["results"]
+    one = open_result(both[0])
+    assert len(view.points) == 2 * len(one.points)
+    for asked in ({}, {"scans": "0-3,40-44"}, {"filter": "x,3,3"}):
+        of_one, of_both = places(one, **asked), places(view, **asked)
+        assert sorted(of_both.tolist()) == sorted(2 * of_one.tolist()), asked
+        (last,) = (f"{asked.get('filter', 'x,-9,9')};result,1,1",)
+        assert places(view, **(asked | {"filter": last})).tolist() == of_one.tolist(), asked
+    rows = told(view, "points", colour="scan", most=ALL)[1]["rows"]
+    again = [one.points.values("scan", slice(None))] * 2
+    assert view.points.values("scan", rows).tolist() == np.concatenate(again).tolist()
+    assert told(view, "point", row=len(view.points) - 1)[0]["columns"][-1] == ["result", "after"]
+    assert not told(one, "state")[0]["results"]
+
+
+def test_results_of_unlike_sweeps_are_not_played_and_those_in_sensor_axes_are_refused(
+    tmp_path, spun
+):
+    later = replace(spun, begins_ns=spun.begins_ns + 1)
+    unlike = [result_in(tmp_path / name, of) for name, of in (("a", spun), ("b", later))]
+    assert open_results(unlike).sweeps is None
+    in_axes = result_in(tmp_path / "c", replace(spun, coordinates="sensor"))
+    with pytest.raises(LidarpoolError, match=r"c has points in the axes of its sensors"):
+        open_results([unlike[0], in_axes])
+
+
+@pytest.mark.parametrize("kind", ["ply", "las", "parquet"])
+def test_the_points_that_are_shown_are_written_to_a_file(tmp_path, spun, kind):
+    pytest.importorskip({"las": "laspy", "parquet": "pyarrow"}.get(kind, "numpy"))
+    view = open_result(result_in(tmp_path / "one", spun))
+    assert kind in told(view, "state")[0]["exports"]
+    asked = {"scans": "0-3,36-71", "filter": "ring,0,4;channel,0,4;x,3,3e38"}
+    told_, arrays = told(view, "export", format=kind, **asked)
+    assert told_ == {"name": f"cloud.{kind}"}
+    file = tmp_path / told_["name"]
+    file.write_bytes(arrays["file"].tobytes())
+    if kind == "ply":
+        x = CloudFile(file).values("x", slice(None))
+    elif kind == "las":
+        x = np.array(importlib.import_module("laspy").read(file).x)
+    else:
+        x = importlib.import_module("pyarrow.parquet").read_table(file)["x"].to_numpy()
+    assert len(x) and sorted(x) == pytest.approx(sorted(places(view, **asked)[:, 0]))
+
+
+def test_what_cannot_be_written_is_told(tmp_path, spun, monkeypatch):
+    view = open_result(result_in(tmp_path / "one", spun))
+    with pytest.raises(ValueError):
+        told(view, "export", format="exe")
+    monkeypatch.setattr("lidarpool.live.view.MOST_POINTS", 3)
+    assert "20 points are more than 3" in told(view, "export", format="ply")[0]["error"]
+    held = View(HeldPoints(Cloud(np.zeros((1, 3)), {})))
+    assert not told(held, "state")[0]["exports"], "of a run, some parts are read"
+    monkeypatch.undo()
+    missing = Mock(side_effect=LidarpoolError("it needs laspy"))
+    monkeypatch.setattr("lidarpool.live.view.save_cloud", missing)
+    assert told(view, "export", format="las")[0] == {"error": "it needs laspy"}
 
 
 def test_a_range_image_has_channels_from_above_and_azimuth_from_left_to_right():
@@ -359,7 +436,7 @@ def test_damaged_pictures_are_noted_and_the_cloud_is_shown(cloud, capsys, monkey
 
     monkeypatch.setattr("lidarpool.live.view.wait_for_interrupt", look)
     (cloud.parent / PICTURE_FILE).write_bytes(b"PK\x03\x04junk")
-    view_result(cloud.parent, port=0, browser=False)
+    show_view(open_result(cloud.parent), port=0, browser=False)
     (said,) = asked
     assert PICTURE_FILE in said.splitlines()[0]
     assert "shows 10,000 points" in said

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import io
 import re
+from base64 import b64decode
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -12,6 +14,7 @@ import numpy as np
 import pytest
 import yaml
 from lxml import html
+from PIL import Image
 
 from lidarpool import (
     Cloud,
@@ -28,7 +31,7 @@ from lidarpool.pipeline.names import COLLECT, GENERATE, INTERSECT, SORT
 from lidarpool.pipeline.task_book import TaskBook
 from lidarpool.plan import best
 from lidarpool.plan.trial import run_trial
-from lidarpool.report.page.rendering import ROWS_MOST, write_page
+from lidarpool.report.page.rendering import ROWS_MOST, put_picture, write_page
 from lidarpool.report.report import CountedCloud, make_report
 from lidarpool.run.trials import TRIAL
 from lidarpool.scenario.scenario import Scenario
@@ -135,12 +138,12 @@ def write(tmp_path: Path) -> Callable[..., tuple[str, dict[str, Any]]]:
             | changes
         )
         drawn = PICTURES if plan else PICTURES[:4]
-        pictures = {name: f'<svg id="{name}"></svg>' for name in drawn}
-        files = [*(f"{name}.png" for name in drawn), "report.html", "report.json"]
-        numbers = counted(result.points, len(scene.names))
-        report = make_report(result, files, numbers)
-        write_page(tmp_path / "report.html", report, result, numbers, pictures, scenario)
-        return (tmp_path / "report.html").read_text(encoding="utf-8"), report
+        page, numbers = tmp_path / "report.html", counted(result.points, len(scene.names))
+        report = make_report(result, numbers)
+        write_page(page, report, result, numbers, scenario)
+        for name in drawn:
+            put_picture(page, name, f'<svg id="{name}"></svg>')
+        return page.read_text(encoding="utf-8"), report
 
     return write
 
@@ -149,11 +152,39 @@ def test_the_page_refers_to_nothing_outside_and_has_its_pictures_within(write):
     text, _ = write()
     page = html.fromstring(text)
     assert not page.xpath("//script | //link | //iframe | //object | //embed | //base")
-    assert not page.xpath("//@href | //@srcset | //@action | //@poster | //@data")
+    assert not page.xpath("//@srcset | //@action | //@poster | //@data")
+    assert all(source.startswith("data:image/png;base64,") for source in page.xpath("//@href"))
     assert not re.search(r"url\(|@import|https?://|\son\w+=", text)
     assert "default-src 'none'" in page.xpath("//meta[@http-equiv]/@content")[0]
     assert not page.xpath("//@src")
     assert page.xpath("//figure/svg/@id") == PICTURES
+    assert page.xpath("//figure[not(@hidden)]/@data-picture") == ["above", *PICTURES]
+
+
+def test_pictures_come_into_the_page_when_they_are_drawn(write, tmp_path):
+    text, _ = write(plan=None)
+    assert html.fromstring(text).xpath("//figure[@hidden]/@data-picture") == ["path"]
+    page = tmp_path / "report.html"
+    for size in (9, 1):
+        put_picture(page, "path", f'<svg class="{size * "x"}">\\1</svg>')
+    assert page.read_text("utf-8") == text.replace(
+        '"path" hidden>\n    \n    <figc', '"path"><svg class="x">\\1</svg><figc'
+    )
+    page.write_text("of another program")
+    put_picture(page, "path", "<svg></svg>")
+    assert page.read_text() == "of another program"
+
+
+def test_the_points_are_shown_from_above(write):
+    places = np.array([(0, 0, 0), (0, 0, 1), (0, 0, 2), (10, 0, 0), (0, 5, 0.0)])
+    places += 1000
+    columns = {name: np.zeros(5, np.int32) for name in ("scan", "channel", "object")}
+    (source,) = html.fromstring(write(cloud=Cloud(places, columns))[0]).xpath("//image/@href")
+    with Image.open(io.BytesIO(b64decode(source.partition(",")[2]))) as image:
+        shade = np.asarray(image)[..., 3]
+    assert shade.shape == (26, 51)  # the north is up
+    assert (shade[25, 0], shade[25, 50], shade[0, 0]) == (255, 127, 127)
+    assert np.count_nonzero(shade) == 3
 
 
 def test_names_are_words_and_never_markup(write):
@@ -221,6 +252,23 @@ def test_what_differs_from_an_ideal_sensor_is_told_of_each(write):
     assert told["Noise of sensor right"] == {"detection_range_m": "50"}
     assert "Returns of sensor left" not in told
     assert "<dt>rain_mm_h</dt><dd>10</dd>" in text and "snow_mm_h" not in text
+
+
+def test_figures_have_the_digits_that_are_read(write):
+    """The VLP-16's firings in a turn are 1,808.4491."""
+    sensor = load_sensor("velodyne/vlp16", max_range_m=1234.5678)
+    survey = Survey(
+        sensors=[Mounted(sensor, name="left", noise=Noise(detection_range_m=100.8767244))],
+        poses=[(0, 0, 1)], steps=60, visibility_km=10 / 3,
+    )  # fmt: skip
+    text, _ = write(survey=survey, origin=(500_000.123456, -0.00004, 1.5), tasks=())
+    told = {
+        dt.text: dt.getnext().text for dt in html.fromstring(text).xpath("//dl[@class='pairs']//dt")
+    }
+    assert told["firings per turn"] == "1,808.4" and told["range"] == "0.4 m to 1,234.6 m"
+    assert (told["detection_range_m"], told["visibility_km"]) == ("100.9", "3.333")
+    assert told["local origin"] == "(500,000.123, 0, 1.5) m"
+    assert told["survey and planning overlap"] == "0 s"
 
 
 def test_hits_on_nothing_are_told_from_those_on_surfaces(write):
@@ -326,7 +374,7 @@ def test_what_is_unusual_is_told(write, changes, words):
 
 def test_without_planning(write):
     text, _ = write(plan=None, tasks=[task for task in records() if task.stage != TRIAL])
-    assert "The path" not in text and "swarm" not in text and text.count("<figure>") == 4
+    assert "The path" not in text and "swarm" not in text and text.count(" hidden>") == 1
 
 
 def test_the_scenario_on_the_page_is_the_scenario(write):
@@ -342,7 +390,7 @@ def test_the_scenario_on_the_page_is_the_scenario(write):
             "planning": {"start": [0, 0], "target": [9, 9], "obstacles": []},
         }
     )
-    (shown,) = html.fromstring(write(scenario=scenario)[0]).xpath("//code/text()")
+    (shown,) = html.fromstring(write(scenario=scenario)[0]).xpath("//pre/code/text()")
     assert Scenario.from_data(yaml.safe_load(shown)).model_dump() == scenario.model_dump()
     many = Scenario.from_data({"poses": [{"position": [k, 0, 1]} for k in range(5000)]})
     assert len(write(scenario=many)[0]) < len(write()[0]) + 60_000

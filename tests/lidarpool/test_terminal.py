@@ -1,12 +1,14 @@
 """What is said of a run: bars as long as there is a terminal, or else lines that come seldom."""
 
 import os
+import re
 import sys
 from contextlib import suppress
 from dataclasses import replace
 from io import StringIO
 
 import pytest
+from rich.console import Console
 
 import lidarpool.cli.commands
 from lidarpool.cli.terminal import PlainLines, Terminal
@@ -39,6 +41,24 @@ def test_a_terminal_that_is_closed_ends_nothing(kind, monkeypatch):
     assert said
     with suppress(OSError):  # what it could not write it tries to write once more
         stream.close()
+
+
+def test_a_terminal_shows_what_is_written_and_how_far(monkeypatch):
+    console = Console(file=StringIO(), force_terminal=True, width=90)
+    monkeypatch.setattr(Terminal, "_console", console)
+    with Terminal().writing("writing the cloud") as show:
+        show("cloud.ply", 6000, 8000, "points")
+        show("cloud.ply", 8000, 8000, "points")
+        show("pictures", 1, 4, "pictures")
+    plain = re.sub(r"\x1b\[[^a-zA-Z]*[a-zA-Z]|[━╸╺]", "", console.file.getvalue())
+    told = [" ".join(line.split()) for line in plain.splitlines()]
+    assert {"cloud.ply 8000/8000 points", "pictures 1/4 pictures"} <= {*told}
+
+
+def test_a_log_has_a_line_on_what_is_written(capsys):
+    with Terminal().writing("writing the cloud") as show:
+        show("cloud.ply", 1, 8000, "points")
+    assert [line[10:] for line in capsys.readouterr().err.splitlines()] == ["writing the cloud"]
 
 
 def test_a_complaint_commands_no_terminal(tmp_path, capsys, monkeypatch):

@@ -34,6 +34,7 @@ import lidarpool.pipeline.long_stages as stages
 stages.LAST_WORDS_S = 120
 stages.fetch_available = partial(stages.fetch_available, patience_s=120)
 """
+DRAWN = {f"{name}.png" for name in ("scene", "hits", "cloud", "path")}
 MADE = [name for name in FILES if name != "intensity.png"]  # the cloud has no such column
 
 
@@ -153,7 +154,7 @@ def test_without_planning_an_earlier_path_is_removed(run, tmp_path):
         (tmp_path / "out" / name).write_text("earlier")
     outcome = run("--no-plan", "--quiet", "--overwrite")
     assert (outcome.code, outcome.err) == (0, "")
-    assert names_in(tmp_path / "out") == {*MADE, "mine.txt"} - {"path.png"}
+    assert names_in(tmp_path / "out") == {*MADE, "mine.txt"} - DRAWN
     assert "path of" not in outcome.out and "path.png" not in outcome.out
     assert json.loads((tmp_path / "out" / "report.json").read_text())["planning"] is None
 
@@ -231,6 +232,29 @@ def test_the_pictures_of_a_run_are_drawn_again_to_the_bit(demo, lidarpool, tmp_p
     assert (again.code, again.err) == (0, "")
     for name in ("scene.png", "path.png"):
         assert (tmp_path / name).read_bytes() == (out / name).read_bytes()
+
+
+def hidden(page: Path) -> list[str]:
+    """Pictures that a page has room for and does not show."""
+    return re.findall(r'data-picture="(\w+)" hidden', page.read_text("utf-8"))
+
+
+def test_pictures_are_drawn_if_they_are_asked_for_or_later(run, lidarpool, tmp_path):
+    out = tmp_path / "out"
+    assert run("--no-plan", "--quiet").code == 0
+    assert names_in(out) == {*MADE} - DRAWN
+    assert hidden(out / "report.html") == ["scene", "hits", "intensity", "cloud", "path"]
+    outcome = lidarpool("plot", out, "--only", "hits", "--only", "cloud")
+    assert outcome.out.split() == [str(out / "hits.png"), str(out / "cloud.png")]
+    assert hidden(out / "report.html") == ["scene", "intensity", "path"]
+    # What was drawn of an earlier run is of the same result, and goes with it.
+    assert run("--no-plan", "--quiet").code == 0
+    assert names_in(out) == {*MADE} - DRAWN
+    assert run("--quiet", "--pictures").code == 0
+    assert json.loads((out / "report.json").read_text())["files"] == MADE
+    assert names_in(out) == {*MADE} and hidden(out / "report.html") == ["intensity"]
+    outcome = run("--pictures", "--only", "cloud")
+    assert outcome.code == 2 and "leaves out what --pictures draws" in outcome.err
 
 
 @pytest.mark.parametrize("words", [["--version"], ["--help"], ["run", "--help"], [None]])

@@ -166,7 +166,8 @@ def commands(block: Block) -> list[list[str]]:
     lines = block.code.replace("\\\n", " ").splitlines()
     if block.language == "console":
         lines = [line.removeprefix("$ ") for line in lines if line.startswith("$ ")]
-    found = (shlex.split(line, comments=True) for line in lines)
+    each = (one for line in lines for one in line.split(" && "))
+    found = (shlex.split(one, comments=True) for one in each)
     bare = (dropwhile(re.compile(r"[A-Z]+=").match, words) for words in found)
     return [words for words in map(list, bare) if words]
 
@@ -180,13 +181,13 @@ def look(words: list[str]) -> bool:
             parse(DASK[kind], kind, arguments)
         case ["make", target, *_]:
             assert re.search(rf"^{target}:", (ROOT / "Makefile").read_text("utf-8"), re.M)
-        case ["python", "-m", module, *_]:
+        case ["python" | "python3", "-m", module, *_]:
             assert importlib.util.find_spec(module), module
         case ["pip", "install", *arguments]:  # pip takes an extra that there is not
             project = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]
             extras = re.findall(r"\[(\w+)\]", " ".join(arguments))
             assert set(extras) <= set(project["optional-dependencies"])
-        case ["pytest", *_]:
+        case ["pytest", *_] | [".", ".venv/bin/activate"]:
             pass
         case _:
             return False

@@ -46,6 +46,7 @@ class Result(RunResult):
         folder: str | Path,
         *,
         only_cloud: bool = False,
+        pictures: bool = False,
         formats: Sequence[str | Mapping[str, str]] = (),
         overwrite: bool = False,
     ) -> None:
@@ -57,7 +58,9 @@ class Result(RunResult):
             Made if it is not there; or a URL that fsspec opens. An earlier result of the same
             survey in it is replaced.
         only_cloud
-            Leave pictures and `report.html` out.
+            Leave `report.html` and `pictures.npz` out.
+        pictures
+            Draw the pictures, too.
         formats
             Other formats to write the cloud in as well, as under `output.write` of a scenario:
             "laz", or {"format": "mcap", "layout": "ouster"}.
@@ -75,7 +78,8 @@ class Result(RunResult):
         from ..report.output import SurveyOutput
 
         wanted = [Format.of(entry) for entry in formats]
-        output = SurveyOutput(output_place(folder), self.survey, wanted, only_cloud)
+        extent = "cloud" if only_cloud else "pictures" if pictures else "page"
+        output = SurveyOutput(output_place(folder), self.survey, wanted, extent)
         with output.held():
             output.refuse(lambda: self.identity, overwrite=overwrite)
             output.write(self)
@@ -113,7 +117,8 @@ class Result(RunResult):
         """
         from ..report.result_pictures import draw_pictures
 
-        return list(draw_pictures(self._pictured, self._cloud_file, folder, only, size, colour))
+        made = self._cloud_file.parent
+        return list(draw_pictures(self._pictured, made, folder, only, size, colour))
 
     @checked
     def view(self, *, port: int = 8080, browser: bool = True) -> None:

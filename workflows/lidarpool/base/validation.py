@@ -391,8 +391,12 @@ def field_hint(name: str, known: Collection[str], root: Any) -> str:
     kinds = {kind for _, kind in owners}
     places = [place for place, kind in owners if kinds.isdisjoint(kind.__mro__[1:])]
     listed = " and ".join(filter(None, [", ".join(places[:-1]), *places[-1:]]))
-    where = f" {name} is a field of {listed}: write it there." if places else ""
-    return did_you_mean(name, known) + where
+    near = did_you_mean(name, known)
+    if not places:
+        return near
+    return (
+        f"{near} Or {name} of {listed}?" if near else f" It is a field of {listed}: write it there."
+    )
 
 
 def _at(place: FieldPath, hint: Any) -> tuple[Any, Fields]:

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import difflib
+import os
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 
 
 def did_you_mean(word: str, known: Iterable[str]) -> str:
@@ -58,3 +59,26 @@ def printable(text: str) -> str:
     """Text from a file as one line of 200 letters at most, without control characters."""
     kept = "".join(c if c.isprintable() else " " for c in text)
     return " ".join(kept.split())[:200]
+
+
+def shortened(name: str, most: int = 18) -> str:
+    """Shorten a name with more letters than `most` in its middle; show control characters."""
+    name = "".join(letter if letter.isprintable() else "\ufffd" for letter in name)
+    tail = (most - 1) // 2
+    return name if len(name) <= most else f"{name[: most - 1 - tail]}…{name[-tail:]}"
+
+
+def without_common_prefix(names: Sequence[str]) -> list[str]:
+    """Remove the common first words of at least three names.
+
+    Examples
+    --------
+    >>> without_common_prefix(["site_a_Wall", "site_a_Floor", "site_a_Lamp_1"])
+    ['Wall', 'Floor', 'Lamp_1']
+    """
+    if len(names) < 3:
+        return list(names)
+    prefix = os.path.commonprefix(list(names))  # noqa: RUF071 - of letters, as is wanted
+    end = max(prefix.rfind(mark) for mark in "_./: -") + 1
+    shorter = [name[end:] for name in names]
+    return shorter if all(shorter) else list(names)

@@ -53,7 +53,7 @@ _shown = shared.together(
     click.option(
         "--only",
         type=click.Choice(["cloud"]),
-        help="Write the cloud and report.json, no pictures and no page.",
+        help="Write the cloud and report.json, no page.",
     ),
     shared.flag("--overwrite", help="Replace the result of another survey, or a data set."),
     shared.flag("--quiet", "-q", help="No progress, only the result."),
@@ -80,8 +80,12 @@ def _runs(command: Callable[..., None]) -> Callable[..., None]:
 
     @wraps(command)
     def prepared(
-        *, quiet: bool, verbose: bool, as_json: bool, cluster: Path | None = None, **given: Any
-    ) -> None:
+        *, quiet: bool, verbose: bool, as_json: bool, cluster: Path | None = None,
+        only: str | None, pictures: bool = False, **given: Any,
+    ) -> None:  # fmt: skip
+        if only and pictures:
+            raise click.UsageError("--only leaves out what --pictures draws: give one of them.")
+        given["extent"] = "pictures" if pictures else only
         from ..base.fork_server import keep_freed_memory, start_fork_server, stop_fork_server
 
         keep_freed_memory()
@@ -122,8 +126,8 @@ def cli() -> None:
 @shared.out
 @_shown
 @_runs
-def demo(terminal: Terminal, options: RunOptions, only: str | None) -> None:
-    """Run the default survey and plan a path, on this machine.
+def demo(terminal: Terminal, options: RunOptions, extent: str | None) -> None:
+    """Run the default survey and plan a path, on this machine, and draw the pictures.
 
     \b
     Examples:
@@ -133,7 +137,7 @@ def demo(terminal: Terminal, options: RunOptions, only: str | None) -> None:
     from ..scenario.scenario import Scenario
     from .run_command import run_scenario
 
-    run_scenario(Scenario(), terminal, options, only=only)
+    run_scenario(Scenario(), terminal, options, extent=extent or "pictures")
 
 
 @cli.command()
@@ -144,6 +148,7 @@ def demo(terminal: Terminal, options: RunOptions, only: str | None) -> None:
 @shared.cluster
 @shared.backend
 @shared.no_plan
+@shared.flag("--pictures", help="Draw the pictures, too, as lidarpool plot does later.")
 @shared.flag("--resume", help="Resume an unfinished run, if there is one.")
 @shared.flag("--fresh", help="Delete an unfinished run.")
 @shared.flag("--retry-failed", help="Of a campaign: do the jobs that have failed again.")
@@ -179,7 +184,7 @@ def run(
     scenarios: tuple[str, ...],
     of_mesh: dict[str, Any],
     no_plan: bool,
-    only: str | None,
+    extent: str | None,
     number: int | None,
     shard: Shard | None,
     backend: str | None,
@@ -229,18 +234,20 @@ def run(
     if several or (not of_mesh and is_campaign(paths[0])):
         campaign = CampaignSpec.of_scenarios(paths) if several else CampaignSpec.load(paths[0])
         if number is not None:
-            run_job(campaign, number, terminal, options, backend, only)
-        elif only is not None:
-            raise click.UsageError("--only is for one survey: a data set is written as a whole.")
+            run_job(campaign, number, terminal, options, backend, extent)
+        elif extent is not None:
+            raise click.UsageError(
+                "--only and --pictures are for one survey: a data set is written as a whole."
+            )
         else:
             run_campaign(campaign.of_shard(shard or ALL), terminal, options, backend)
     elif options.retry_failed or options.verify or number is not None:
         raise click.UsageError("--job, --retry-failed and --verify are for campaigns.")
     else:
         scenario = Scenario.load(paths[0], of_mesh)
-        made_of = {"path": str(paths[0].absolute()), "options": of_mesh, "plans": not no_plan}
-        more: dict[str, Any] = {"no_plan": no_plan, "only": only, "shard": shard}
-        run_scenario(scenario, terminal, options, backend, made_of=made_of, **more)
+        more: dict[str, Any] = {"no_plan": no_plan, "extent": extent, "shard": shard}
+        more["made_of"] = {"path": str(paths[0].absolute()), "options": of_mesh}
+        run_scenario(scenario, terminal, options, backend, **more)
 
 
 @cli.command()

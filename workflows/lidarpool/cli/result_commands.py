@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
+from contextlib import ExitStack, nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -49,7 +51,7 @@ def _size(text: str) -> tuple[int, int]:
     help="Column to colour the points of the cloud by; rgb for red, green and blue.",
 )
 def plot(result: Path | Storage, out: Path | Storage | None, **given: Any) -> None:
-    """Draw the pictures of a result again.
+    """Draw the pictures of a result, also into its report.html.
 
     \b
     Examples:
@@ -58,21 +60,24 @@ def plot(result: Path | Storage, out: Path | Storage | None, **given: Any) -> No
     """  # noqa: D301 - click wants the character, not its name
     from ..base.fork_server import keep_freed_memory
     from ..export.folder import local_folder, local_result, send
+    from ..report.output import CLOUD, PAGE
     from ..report.result_pictures import draw_pictures
     from ..run.picture_file import PICTURE_FILE, PictureContent
 
     place = result if out is None else out
-    with local_result(result, (PICTURE_FILE, "cloud.ply")) as made:
+    with local_result(result, (PICTURE_FILE, CLOUD, PAGE)) as made:
         if not (made / PICTURE_FILE).exists():
             raise LidarpoolError(
                 f"{result} holds no {PICTURE_FILE}, the data of the pictures: give the "
                 "folder of a finished run (its --out)."
             )
         keep_freed_memory()
-        shown, cloud = PictureContent.load(made / PICTURE_FILE), made / "cloud.ply"
-        with local_folder(place) as folder:
-            for path in draw_pictures(shown, cloud, folder, **given):
+        shown = PictureContent.load(made / PICTURE_FILE)
+        with nullcontext(made) if out is None else local_folder(out) as folder:
+            for path in draw_pictures(shown, made, folder, **given):
                 click.echo(click.format_filename(send(path, place)))
+            if out is None and (made / PAGE).exists():
+                send(made / PAGE, place)
 
 
 @click.command()
@@ -153,7 +158,7 @@ def export(
 
 
 @click.command()
-@click.argument("result", type=options.StoragePath())
+@click.argument("results", metavar="RESULT...", type=options.StoragePath(), nargs=-1, required=True)
 @click.option(
     "--port",
     type=click.IntRange(0, 65_535),
@@ -162,21 +167,41 @@ def export(
     help="Port on 127.0.0.1, or the next free one; 0 for any.",
 )
 @options.flag("--no-browser", help="Only print the address.")
-def view(result: Path | Storage, port: int, no_browser: bool) -> None:
-    """Show a result or a cloud in the browser.
+@options.new_file("--film", help="Write a .gif or .webp instead: along a drive, or all around.")
+@options.new_file("--export", help="Write the page as one .html instead, of at most 25 MB.")
+def view(
+    results: Sequence[Path | Storage],
+    port: int,
+    no_browser: bool,
+    film: Path | None,
+    export: Path | None,
+) -> None:
+    """Show a result or a cloud in the browser, or write it as a file to share.
+
+    Several results are shown in one view, with a colour each.
 
     \b
     Examples:
       lidarpool view lidarpool-out
       lidarpool view lidarpool-out/cloud.ply --no-browser
+      lidarpool view before after
+      lidarpool view drive --film drive.gif --export drive.html
     """  # noqa: D301 - click wants the character, not its name
     from ..export.folder import local_result
     from ..export.sweeps import SWEEPS_FILE
-    from ..live.view import CLOUD, view_result
+    from ..live.sharing import share
+    from ..live.view import CLOUD, open_results, show_view
     from ..run.picture_file import PICTURE_FILE
 
-    with local_result(result, (CLOUD, PICTURE_FILE, SWEEPS_FILE)) as made:
-        view_result(made, port=port, browser=not no_browser)
+    if (film or export) and len(results) > 1:
+        raise LidarpoolError("--film and --export take one result: give them one after the other.")
+    with ExitStack() as stack:
+        files = (CLOUD, PICTURE_FILE, SWEEPS_FILE)
+        made = [stack.enter_context(local_result(result, files)) for result in results]
+        if film or export:
+            share(made[0], film, export)
+        else:
+            show_view(open_results(made), port=port, browser=not no_browser)
 
 
 @click.command()

@@ -50,7 +50,7 @@ def run_scenario(
     backend: str | None = None,
     *,
     no_plan: bool = False,
-    only: str | None = None,
+    extent: str | None = None,
     shard: Shard | None = None,
     made_of: Mapping[str, Any] = MappingProxyType({}),
 ) -> None:
@@ -66,10 +66,11 @@ def run_scenario(
         built = build(scenario, plans=not no_plan)
         job = built.job()
     if shard is None:
-        _run_survey(built, job, options, terminal, only)
+        _run_survey(built, job, options, terminal, extent)
         return
     assert options.out is not None, "commands write"
-    jobs, output = OneJob(job, shard), Kept({**made_of, "scans": job.survey.scan_count})
+    told = {"plans": not no_plan, "extent": extent or "page", "scans": job.survey.scan_count}
+    jobs, output = OneJob(job, shard), Kept({**made_of, **told})
     with result_folder(options.out), page_of(jobs, options.live) as page:
         result = Conductor(jobs, options, output, terminal, page)()
     points, lines = len(result.points), [f"note: {note}" for note in result.notes]
@@ -83,7 +84,7 @@ def _run_survey(
     job: Job,
     options: RunOptions,
     terminal: Terminal,
-    only: str | None,
+    extent: str | None,
     judge: Callable[[RunResult], str] = lambda result: "",
 ) -> None:
     """Run a job, and write it as the result of a survey; `judge` returns a note on it."""
@@ -91,9 +92,8 @@ def _run_survey(
     for note in advice(built):
         terminal.tell(note)
     jobs = OneJob(job)
-    output = SurveyOutput(
-        options.out, job.survey, job.outputs, only == "cloud", built.scenario, judge
-    )
+    extent = extent or "page"
+    output = SurveyOutput(options.out, job.survey, job.outputs, extent, built.scenario, judge)
     with page_of(jobs, options.live) as page:
         result, report = Conductor(jobs, options, output, terminal, page)()
         lines = _of_result(options.out, result, job, report)
@@ -135,7 +135,7 @@ def run_job(
     terminal: Terminal,
     options: RunOptions,
     backend: str | None,
-    only: str | None,
+    extent: str | None,
 ) -> None:
     """Run one job of a campaign again, and write it as the result of a survey.
 
@@ -169,7 +169,7 @@ def run_job(
         return f"the points are those of job {name} in {place}, bit for bit"
 
     options = options.with_pool(scenario.pool, backend)
-    _run_survey(built, replace(job, number=0), options, terminal, only, compare)
+    _run_survey(built, replace(job, number=0), options, terminal, extent, compare)
 
 
 def no_hits(job: Job) -> str:

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from ..base.errors import LidarpoolError
-from ..base.words import plural
+from ..base.words import plural, without_common_prefix
 from . import shared_options as options
 from .shared_options import Command, overwrite, together
 
@@ -564,8 +564,6 @@ def _figures(
 
 def _plan_lines(plan: StationPlan, names: tuple[str, ...]) -> Iterator[str]:
     """Print a plan as lines of text: stations, then objects, those with most left first."""
-    from ..render.picture_page import without_common_prefix
-
     yield (
         f"{plural(len(plan.candidates), 'place')} on a grid of {plan.spacing_m:g} m, which see "
         f"{plan.visible_m2.sum():,.0f} m²"

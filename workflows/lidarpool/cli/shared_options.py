@@ -33,6 +33,7 @@ class StoragePath(click.Path):
 
 
 flag = partial(click.option, is_flag=True)
+new_file = partial(click.option, type=click.Path(dir_okay=False, path_type=Path), metavar="FILE")
 out = click.option(
     "--out",
     type=StoragePath(),

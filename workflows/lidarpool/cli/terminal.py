@@ -14,7 +14,7 @@ from distributed import Client
 from rich.console import Console
 
 from ..base.streams import Unheard
-from ..run.progress import STAGES, Pace, Progress, Screen, Show, bars, standing_still
+from ..run.progress import STAGES, Pace, Progress, Screen, Show, Written, bars, rows, standing_still
 from .shared_options import set_logs
 
 # Plain lines come after another tenth of the elapsed time, within these bounds, so that a survey
@@ -54,6 +54,13 @@ class Terminal(Screen):
             _tell(self._stream, words)
         with nullcontext() if console is None else console.status(words):
             yield
+
+    @contextmanager
+    def writing(self, words: str) -> Iterator[Written]:
+        """Show a bar for each output while the body writes them; in a log, `words`."""
+        console = self._console
+        with self.status(words) if console is None else rows(console) as show:
+            yield show or (lambda *_: None)
 
     @contextmanager
     def progress(self) -> Iterator[Show]:

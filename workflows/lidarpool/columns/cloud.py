@@ -95,6 +95,8 @@ class Cloud(Shown):
     own: tuple[Column, ...] = ()
     sweeps: Callable[[], Any] | None = None
 
+    __repr__ = Shown.__repr__  # which `checked_fields` would replace
+
     def __post_init__(self) -> None:
         positions = np.asarray(self.positions)
         if positions.dtype not in (np.float32, np.float64):

@@ -235,9 +235,11 @@ class StoredCloud(Shown):
     origin: Floats  # world position of the scene's local origin, (3,), metres
     keeper: Any = None  # kept alive while the parts can be read
     sweeps: Callable[[], Any] | None = None  # returns the sweeps of the survey for `save_cloud`
+    tell: Callable[[int], object] = abs  # is called with the number of points that were read
 
     def __getstate__(self) -> dict[str, Any]:
-        return self.__dict__ | {"keeper": None, "sweeps": None}  # both hold the scene
+        # Both hold the scene, and nobody hears of other processes.
+        return self.__dict__ | {"keeper": None, "sweeps": None, "tell": abs}
 
     def __array__(self, dtype: DTypeLike | None = None, copy: bool | None = None) -> AnyArray:
         return self.load().__array__(dtype)
@@ -279,6 +281,7 @@ class StoredCloud(Shown):
                 first -= rows
                 continue
             cloud, first = self.cloud_of(read_part(self.storage, name), slice(first, None)), 0
+            self.tell(len(cloud))
             while count + len(cloud) >= points:
                 cut = points - count
                 yield Cloud.joined([*held, cloud[:cut]])

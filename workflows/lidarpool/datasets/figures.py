@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from ..base.arrays import AnyArray, Bools, Floats, Ints
-from ..render.picture_page import shortened, without_common_prefix
+from ..base.words import shortened, without_common_prefix
 from .job_table import JobRow
 
 FAILED_MOST, SLOWEST_MOST = 200, 10  # jobs that are kept whole

@@ -21,16 +21,18 @@ from typing import Any
 import click
 import numpy as np
 
-from poolpart import Partition
+from poolpart import Partition, PartitionStats
 
 from ..base.arrays import Floats, Floats32
 from ..base.errors import LidarpoolError
+from ..base.storage import Storage
 from ..columns.cloud import Cloud
 from ..columns.cloud_file import CloudFile
 from ..columns.parts import read_part
+from ..datasets.dataset import DataSet, job_file
 from ..datasets.figures import Figures
 from ..datasets.job_table import JobRow, Value
-from ..export.sweeps import Sweeps
+from ..export.sweeps import SWEEPS_FILE, Sweeps
 from ..pipeline.messages import Receipt, ScanFrame
 from ..plan import best
 from ..report.charts import draw_results, draw_varied
@@ -41,13 +43,14 @@ from ..run.run_page import JobNow, RunPage
 from ..run.run_result import RunResult
 from .point_selection import HeldPoints
 from .server import PORT, VIEWER, Answer, Arguments, PageServer, announced, page_server
-from .view import View, wait_for_interrupt
+from .view import View, open_result, wait_for_interrupt
 
 DRAWING_SHARE = 0.06  # of a core, for charts: they take half a second to a second
 READING_SHARE = 0.05  # of a core, for points
 LOOK_EVERY_S = 5.0  # at most, for the points of another job
 LIST_EVERY_S = 0.5  # jobs under way
-ASK_EVERY_S = 2.0  # how busy the partitions are
+ASK_EVERY_S = 1.0  # how busy the partitions are
+LOADS_KEPT = 6  # answers to that, over which it is averaged
 WATCHED_S = 10.0  # after a question somebody looks at the page
 ENDED_MOST, FAILED_MOST, UNDER_WAY_MOST = 10, 6, 12  # rows of the table
 VIEWS_KEPT = 4  # jobs whose points are kept: a browser may show, or ask for, an earlier one
@@ -70,7 +73,9 @@ class LivePage(RunPage):
         self._progress: Progress | None = None
         self._pace, self._rate, self._left = Pace(), "", ""  # what is left is a time
         self._partitions: Mapping[str, Partition] = {}
-        self._busy: dict[str, tuple[int, int]] = {}  # {partition: busy slots, all slots}
+        self._loads: deque[tuple[float, dict[str, PartitionStats]]] = deque(maxlen=LOADS_KEPT)
+        self._written: Storage | None = None  # folders of jobs, which can be opened
+        self._results: dict[int, View] = {}  # {number: what its page shows of a written job}
         self._under_way: Sequence[JobNow] = ()
         self._ask_at = self._list_at = 0.0
         self._looked_for = float("-inf")  # when a browser last wanted points of the newest job
@@ -89,9 +94,11 @@ class LivePage(RunPage):
         self._jobs = {0: LiveJob(points)}
         self._state = "starting: workers, each with its own Python"
 
-    def follow(self, partitions: Mapping[str, Partition]) -> None:
-        """Show the jobs under way, and the busy slots of partitions."""
+    def follow(self, partitions: Mapping[str, Partition], dataset: DataSet | None = None) -> None:
+        """Show the jobs under way, the busy slots of partitions, and jobs that were written."""
         self._partitions = partitions
+        if dataset is not None and dataset.format == "folder" and dataset.place.is_local:
+            self._written = dataset.place
         self._state = "starting: workers read the scene and make their trees"
 
     def on_parts(self, receipts: Sequence[Receipt]) -> None:
@@ -126,11 +133,12 @@ class LivePage(RunPage):
             self._ask_at = now + ASK_EVERY_S
             with suppress(OSError, RuntimeError):  # the run itself reports a lost cluster
                 stats = {name: part.stats() for name, part in self._partitions.items()}
-                self._busy = {name: (of.busy, of.slots) for name, of in stats.items()}
+                self._loads.append((now, stats))
 
     def ended(self, row: JobRow) -> None:
         """Count a job, and list it among the last ones."""
         told = {name: getattr(row, name) for name in ("name", "error", "points", "seconds")}
+        told |= {"number": row.number, "opens": row.done and self._written is not None}
         told["values"] = self._words(row.values)
         (self._ended if row.done else self._failures).append(told)
         ended = "done" if row.done else "failed"
@@ -156,7 +164,8 @@ class LivePage(RunPage):
         if self._progress is not None:
             points = self._progress.points if result is None else len(result.points)
             self._progress = replace(self._progress, seconds=seconds, points=points)
-        self._under_way, self._busy, self._left = (), {}, ""
+        self._under_way, self._left = (), ""
+        self._loads.clear()
         self._state, self._over = "done", True
 
     def stay(self, cloud: Path | None = None) -> None:
@@ -185,10 +194,20 @@ class LivePage(RunPage):
         number, question = int(found[1] or 0), found[2]
         if self._count > 1:
             with self._reading.taken():
-                return self._jobs[number].view.answer(question, asked, abandoned)
+                return self._view_of(number).answer(question, asked, abandoned)
         if question == "state" and number not in self._jobs:  # it has not begun
             return self._news(), {}
         return self._of_only(self._jobs[number], question, asked, abandoned)
+
+    def _view_of(self, number: int) -> View:
+        """View of a job that was read, or of a listed one that is written; else KeyError."""
+        if number in self._jobs:
+            return self._jobs[number].view
+        if number not in self._results and self._written is not None:
+            names = {job["number"]: job["name"] for job in list(self._ended)}
+            file = self._written.local(job_file("folder", names[number], SWEEPS_FILE))
+            self._results[number] = open_result(file.parent)
+        return self._results[number]
 
     def _of_only(self, job: LiveJob, question: str, *asked: Any) -> Answer:
         """Answer a question of the viewer of the only job, which is shown while it goes on."""
@@ -227,14 +246,17 @@ class LivePage(RunPage):
                 for label, count, total in STAGES
                 if progress is not None and getattr(progress, total)
             ],
-            "slots": [[f"{name}, slots busy", *slots] for name, slots in self._busy.items()],
+            "slots": busy_slots(list(self._loads)),
             "busy": len(under_way),
             "under_way": [
                 vars(job) | {"values": self._words(job.values)}
                 for job in under_way[:UNDER_WAY_MOST]
             ],
             "failures": [*reversed(list(self._failures))],
-            "ended": [*reversed(list(self._ended))],
+            "ended": [
+                job | {"opens": job["opens"] or job["number"] in jobs}
+                for job in reversed(list(self._ended))
+            ],
             "charts": self._charts.version(self._over),
             "newest": None if newest is None else [newest, jobs[newest].name],
         }
@@ -244,6 +266,22 @@ class LivePage(RunPage):
         shown = (values.get(name, "") for name in self._names)
         words = (f"{one:.4g}" if isinstance(one, float) else one for one in shown)
         return [str(one).lower() if isinstance(one, bool) else str(one) for one in words]
+
+
+def busy_slots(loads: Sequence[tuple[float, Mapping[str, PartitionStats]]]) -> list[Any]:
+    """Share of busy slots of each partition, and its slots, over moments: (seconds, statistics).
+
+    Short tasks end between two moments, long ones after all: of the slots that ended tasks took,
+    and of those that were held at the moments, the larger counts.
+    """
+    (begin, first), *_, (end, last) = [*loads, *loads] or [(0.0, {})] * 2
+    found = []
+    for name, now in last.items():
+        held = sum(of[name].busy for _, of in loads) / len(loads)
+        took = (now.seconds - first[name].seconds) / max(end - begin, ASK_EVERY_S)
+        share = min(max(held, took) / max(now.slots, 1), 1.0)
+        found.append([f"{name}, slots busy", share, now.slots])
+    return found
 
 
 class CpuShare:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -13,7 +14,9 @@ from ..base.sampling import even_indices
 from ..columns.cloud import Cloud
 from ..columns.cloud_file import CloudFile
 from ..columns.ply_format import AXES
+from ..columns.table import Column
 
+RESULT = Column("result", "uint8", "", "result that the point is of", kind="label")
 ScanRanges = tuple[tuple[int, int], ...]  # first and last scan of each range
 
 BLOCK = 1 << 15  # rows that are read at a time
@@ -43,7 +46,32 @@ class HeldPoints:
         return 0, len(self)
 
 
-Points = CloudFile | HeldPoints
+class JoinedPoints:
+    """Points of several results, one after the other, with the columns that all of them have."""
+
+    table: tuple[Column, ...]
+
+    def __init__(self, parts: Sequence[Points]) -> None:
+        self._firsts = np.cumsum([0, *map(len, parts)])  # rows; the last is one past all
+        self.parts = [*zip(self._firsts[:-1].tolist(), parts, strict=True)]
+        shared = set.intersection(*({column.name for column in part.table} for part in parts))
+        self.table = (*(one for one in parts[0].table if one.name in shared), RESULT)
+
+    def __len__(self) -> int:
+        return int(self._firsts[-1])
+
+    def values(self, name: str, rows: Ints | slice) -> AnyArray:
+        """Values of a column, or of x, y or z in world coordinates, in some rows, ascending."""
+        if isinstance(rows, slice):
+            rows = np.arange(*rows.indices(len(self)))
+        ends = np.searchsorted(rows, self._firsts)
+        if name == RESULT.name:
+            return np.repeat(np.arange(len(self.parts), dtype=np.uint8), np.diff(ends))
+        pieces = zip(self.parts, itertools.pairwise(ends), strict=True)
+        return np.concatenate([of.values(name, rows[a:b] - at) for (at, of), (a, b) in pieces])
+
+
+Points = CloudFile | HeldPoints | JoinedPoints
 
 
 @dataclass(frozen=True)
@@ -178,7 +206,12 @@ class PointFinder:
         """
         ranges = [(0, len(self.points))]  # of rows, first and after the last
         if scans is not None:
-            ranges = sorted(map(self.points.rows_of, scans))
+            points = self.points
+            parts: Sequence[tuple[int, Any]] = [(0, points)]
+            if isinstance(points, JoinedPoints):
+                parts = points.parts
+            each = ((first, part.rows_of(one)) for first, part in parts for one in scans)
+            ranges = sorted((first + low, first + high) for first, (low, high) in each)
         whole = sum(high - low for low, high in ranges)
         if not wanted.limits and (eye is None or whole <= most):
             numbers = even_indices(whole, most)

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import math
+import shutil
 import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from threading import Event
 from typing import Any
 
@@ -21,10 +23,12 @@ from ..base.arrays import AnyArray, Bytes, Floats, Floats32, Ints
 from ..base.errors import LidarpoolError
 from ..base.notebook import cell_display
 from ..base.words import plural
+from ..columns.cloud import Cloud
 from ..columns.cloud_file import CloudFile
 from ..columns.ply_format import AXES
 from ..columns.table import AXES as POSITION
 from ..columns.table import CAUSES, NO_SURFACE, OBJECT, TABLE, Column, X, Y, Z, by_value
+from ..export.formats import save_cloud
 from ..export.sweeps import SWEEPS_FILE, Sweeps
 from ..pipeline.database import FILE
 from ..render.closeup import around_ways, floor_and_cut
@@ -46,10 +50,22 @@ from ..scene.actors import Actor, samples_each, shapes_of
 from ..scene.scene import Scene
 from ..scene.simplified import simplified
 from ..sensor.trajectory import presence_ns
-from .point_selection import Eye, Filter, PointFinder, Points, ScanRanges, corners_of, positions
+from .point_selection import (
+    RESULT,
+    Eye,
+    Filter,
+    HeldPoints,
+    JoinedPoints,
+    PointFinder,
+    Points,
+    ScanRanges,
+    corners_of,
+    positions,
+)
 from .server import PORT, Answer, Arguments, PageServer, announced, page_server
 
-MOST_POINTS = 20_000_000  # in an answer
+MOST_POINTS = 20_000_000  # in an answer, and in a download
+EXPORTS = ("ply", "las", "parquet")  # formats of a download
 MOST_RAYS = 150  # more rays would hide the surfaces
 _SAMPLE = 100_000  # points that colour scales and limits are taken from
 _HITS_SAMPLE = 500_000  # points that tell where on large triangles the hits are
@@ -82,8 +98,10 @@ class View:
     sweeps: Sweeps | None = None
     note: str = ""  # a remark on what is shown
     title: str = "lidarpool"
+    results: Sequence[str] = ()  # names, if the points are of several results
     # Returns those of each triangle, those of actors after the others; by default as pictured.
     hits: Callable[[], AnyArray] | None = None
+    triangles: int = MOST_TRIANGLES  # of the scene, that are shown
 
     def __post_init__(self) -> None:
         self.version = 0  # of the points
@@ -133,11 +151,13 @@ class View:
         return ways
 
     @property
-    def _actors(self) -> Sequence[Actor]:
+    def actors(self) -> Sequence[Actor]:
+        """What moves through the scene."""
         return () if self.pictured is None else self.pictured.scene.actors
 
     @property
-    def _duration_ns(self) -> float:
+    def duration_ns(self) -> float:
+        """How long the survey takes, by its own clock; 0 if that is unknown."""
         if self.pictured is not None and self.pictured.duration_ns:
             return self.pictured.duration_ns
         if self.sweeps is None or not len(self.sweeps):
@@ -147,6 +167,8 @@ class View:
 
     def _names(self, column: str) -> Sequence[str]:
         """Names of the values 0, 1, 2, … of a column, if any."""
+        if column == RESULT.name and self.results:
+            return self.results
         if self.pictured is not None and column in self.columns:
             return self.pictured.names_of(self.columns[column])
         if (known := self.sweeps) is not None and column in ("sensor", "object", "class"):
@@ -182,27 +204,28 @@ class View:
             "column": lambda asked, _: self._column(asked["name"]),
             "surface": lambda asked, _: self._scene(asked["colour"]),
             "range": lambda asked, _: self._range(int(asked["sweep"])),
+            "export": self._export,
         }
         return answers[what](asked, abandoned)
 
     def _state(self) -> Answer:
         """Tell all but points and surfaces."""
-        near = around_ways(self._bounds, ways_of(self.sensors, self._actors, self._duration_ns))
+        near = around_ways(self._bounds, ways_of(self.sensors, self.actors, self.duration_ns))
         box = self._bounds if near is None else near
         corners = self._held if near is None else corners_of(near)
         arrays: dict[str, AnyArray] = {"rays": self.rays_shown, "corners": corners}
         for number, way in enumerate(self.sensors):
             arrays[f"sensor{number}_times"] = way.times_ns / _NS
             arrays[f"sensor{number}_places"] = way.positions
-        meshes, shapes = shapes_of(self._actors)
+        meshes, shapes = shapes_of(self.actors)
         arrays["actor_mesh"] = shapes.astype(np.int32)  # browsers have no arrays of int64
         for number, mesh in enumerate(meshes):
             arrays[f"mesh{number}_corners"] = mesh.vertices[mesh.faces].astype(np.float32)
             if mesh.colours is not None:  # at the corners
                 arrays[f"mesh{number}_colours"] = mesh.colours.means().repeat(3, axis=0)
-        each = samples_each(self._actors, PLACES_MOST)
-        for number, actor in enumerate(self._actors):
-            times, places, turns = actor.samples(self._duration_ns, each)
+        each = samples_each(self.actors, PLACES_MOST)
+        for number, actor in enumerate(self.actors):
+            times, places, turns = actor.samples(self.duration_ns, each)
             arrays[f"actor{number}_times"] = times / _NS
             arrays |= {f"actor{number}_places": places, f"actor{number}_turns": turns}
             arrays[f"actor{number}_there"] = np.array(presence_ns(actor.trajectory)) / _NS
@@ -211,6 +234,7 @@ class View:
             arrays["sweep_begins"] = self.sweeps.begins_ns / _NS
             arrays["sweep_sensor"] = self.sweeps.sensor
         pictured, objects = self.pictured, len(self._names("object"))
+        classes, several = self._classes_of_objects(), np.arange(len(self.results))
         header = {
             "title": self.title,
             "version": self.version,
@@ -228,12 +252,18 @@ class View:
             "sensors": [
                 {"name": way.name, "model": way.model, "moves": way.moves} for way in self.sensors
             ],
-            "actors": [{"name": actor.name} for actor in self._actors],
+            "actors": [
+                {"name": actor.name, "class": classes.get(objects + number)}
+                for number, actor in enumerate(self.actors, -len(self.actors))
+            ],
+            "classes": {str(k): name for k, name in enumerate(self._names("class")) if name},
+            "results": legend_of(colours_of(several, RESULT, self.results))["labels"],
+            "exports": () if isinstance(self.points, HeldPoints) else EXPORTS,
             "actor_colours": as_bytes(object_colours(objects))[
-                objects - len(self._actors) :
+                objects - len(self.actors) :
             ].tolist(),
-            "statics": objects - len(self._actors),
-            "duration": self._duration_ns / _NS,
+            "statics": objects - len(self.actors),
+            "duration": self.duration_ns / _NS,
             "path": self.planned,
             "note": self.note,
         }  # fmt: skip
@@ -253,14 +283,50 @@ class View:
         discs = np.column_stack([planning.centres, planning.radii])
         return {"corners": self.path.tolist(), "discs": discs.tolist()}
 
+    def _classes_of_objects(self) -> dict[int, int]:
+        """{object: class} of some points."""
+        if not {"object", "class"} <= self.columns.keys():
+            return {}
+        rows, _ = self._finder.find(_SAMPLE)
+        columns = (self.points.values(name, rows).tolist() for name in ("object", "class"))
+        return dict(zip(*columns, strict=True))
+
+    def _export(self, asked: Arguments, abandoned: Callable[[], bool]) -> Answer:
+        """Write the points for a filter and ranges of scans to a file; of many files, a ZIP."""
+        points, sweeps, kind = self.points, self.sweeps, EXPORTS.index(asked["format"])
+        rows, count = self._finder.find(MOST_POINTS, *self._wanted(asked), None, abandoned)
+        if count > MOST_POINTS:
+            words = f"{count:,} points are more than {MOST_POINTS:,}: filter or clip them, or use"
+            return {"error": f"{words} lidarpool export for all."}, {}
+        columns = {column.name: points.values(column.name, rows) for column in points.table}
+        places = np.stack([points.values(axis, rows) for axis in AXES], axis=1)
+        own = tuple(column for column in points.table if column.name not in TABLE)
+        cloud = Cloud(places, columns, own, None if sweeps is None else lambda: sweeps)
+        with TemporaryDirectory(prefix="lidarpool-") as folder:
+            name = f"cloud.{EXPORTS[kind]}"
+            made = Path(folder) / name
+            try:
+                save_cloud(cloud, made)
+            except LidarpoolError as error:
+                return {"error": str(error)}, {}
+            if made.is_dir():
+                file, *more = made.iterdir()
+                made = Path(shutil.make_archive(str(made), "zip", made)) if more else file
+                name = made.name if more else name
+            return {"name": name}, {"file": np.fromfile(made, np.uint8)}
+
+    def _wanted(self, asked: Arguments) -> tuple[Filter, ScanRanges | None]:
+        """Read the filter and the ranges of scans of a question."""
+        wanted = Filter.read(asked.get("filter", ""), list(self.columns))
+        return wanted, _scans(asked["scans"]) if "scans" in asked else None
+
     def _points(self, asked: Arguments, abandoned: Callable[[], bool]) -> Answer:
         """Points for a filter, ranges of scans and a camera, and their colours."""
         finder, version = self._finder, self.version
-        wanted = Filter.read(asked.get("filter", ""), list(self.columns))
+        wanted, scans = self._wanted(asked)
         name = asked["colour"]
         column = self._coloured[name]
         eye = Eye.read(asked["eye"]) if "eye" in asked else None
-        scans = _scans(asked["scans"]) if "scans" in asked else None
         most = max(1, min(int(asked["most"]), MOST_POINTS))
         rows, count = finder.find(most, wanted, scans, eye, abandoned)
         colouring = self._colouring(finder, name, wanted, abandoned)
@@ -337,7 +403,7 @@ class View:
             raise KeyError("surface")
         with self._lock:  # one browser after the other: it may take long, once
             surface = self._surface = self._surface or ShownSurface(
-                pictured.scene, pictured.reflectance
+                pictured.scene, pictured.reflectance, self.triangles
             )
         counts, places = pictured.hit_counts, np.zeros((0, 3), np.float32)
         if colour == "hits":
@@ -349,7 +415,6 @@ class View:
                 rows = rows[(owners >= 0) & (owners < len(pictured.scene.names))]
             places = (positions(self._finder.points, rows) - self.origin).astype(np.float32)
         arrays, legend = surface.coloured(colour, counts, places)
-        arrays["objects"] = arrays["objects"].astype(np.int32)
         return {"legend": legend} | self._look_around, arrays
 
     @cached_property
@@ -459,7 +524,7 @@ class ShownSurface:
         self._stands = np.arange(len(scene.faces))
         if len(scene.faces) > most:
             self.coarse, self._stands = simplified(scene, most)
-        self._objects = self.coarse.face_object
+        self._objects = self.coarse.face_object.astype(np.int32)  # as browsers have them
         size = float(np.linalg.norm(np.ptp(scene.bounds, axis=0)))
         moved = apart(self.coarse, self._objects, _INWARDS * min(size, _MOST_INWARDS_OF))
         self.corners = moved.vertices[moved.faces].astype(np.float32)  # (f, 3, 3)
@@ -553,13 +618,35 @@ def wait_for_interrupt(stopped: Event | None = None) -> None:
             pass
 
 
-def view_result(path: Path, *, port: int, browser: bool = True) -> None:
-    """Show a folder of a result, or a cloud, until Ctrl-C; see `result_page`."""
-    view = open_result(path)
+def show_view(view: View, *, port: int, browser: bool = True) -> None:
+    """Show a view until Ctrl-C; see `result_page`."""
     if view.note:
         click.echo(f"note: {view.note}", err=True)
     with result_page(view, port=port, browser=browser):
         wait_for_interrupt()
+
+
+def open_results(paths: Sequence[Path]) -> View:
+    """Open results of one place as one view, with the scene, sensors and actors of the first.
+
+    They are played if their sweeps are alike. LidarpoolError as of `open_result`, or if points are
+    in the axes of their sensors.
+    """
+    first, *others = views = [open_result(path) for path in paths]
+    if not others:
+        return first
+    if IN_SENSOR_AXES in (notes := [view.note for view in views]):
+        raise LidarpoolError(
+            f"{paths[notes.index(IN_SENSOR_AXES)]} has points in the axes of its sensors, which "
+            "fit no other result: show it alone, or run it with cloud.coordinates: world."
+        )
+    names = [path.resolve().name for path in paths]
+    names = names if len({*names}) == len(names) else [str(path) for path in paths]
+    begins = [() if view.sweeps is None else view.sweeps.begins_ns for view in views]
+    sweeps = first.sweeps if all(np.array_equal(begins[0], one) for one in begins) else None
+    points = JoinedPoints([view.points for view in views])
+    title = f"{' and '.join(names)} - lidarpool"
+    return View(points, first.pictured, sweeps, " ".join(notes).strip(), title, results=names)
 
 
 def open_result(path: Path) -> View:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import io
 import math
-import os
 import re
 from collections.abc import Sequence
 from pathlib import Path
@@ -25,6 +24,7 @@ from matplotlib.ticker import LogLocator
 from ..base.arrays import AnyFloats, Floats
 from ..base.errors import explained
 from ..base.storage import Storage
+from ..base.words import shortened
 from . import theme
 from .shot import SurfaceView
 
@@ -35,7 +35,6 @@ PATH_PIECES = 200  # of which the way of a sensor is drawn
 MOST_NAMES = 12  # of actors beside what they name
 NAME_ABOVE, NAME_ROOM = 26.0, (150.0, 26.0)  # pixels of a picture 1600 wide
 LEGEND_ROWS = 30
-LEGEND_LETTERS = 18
 # Of the numbers along the axes, in pixels of a picture 1600 wide.
 TICK = 7.0  # length of a tick mark
 BESIDE, BELOW = 14.0, 24.0  # from an edge to the numbers right or left of it, and under it
@@ -337,30 +336,7 @@ def _axis_edges(shot: SurfaceView) -> list[tuple[Floats, Floats, Floats]]:
     return [*out, (foot, top, np.array([-1.0, 0.0]))]
 
 
-def shortened(name: str, most: int = LEGEND_LETTERS) -> str:
-    """Shorten a name with more letters than `most` in its middle; show control characters."""
-    name = "".join(letter if letter.isprintable() else "\ufffd" for letter in name)
-    tail = (most - 1) // 2
-    return name if len(name) <= most else f"{name[: most - 1 - tail]}…{name[-tail:]}"
-
-
 def whole_of(name: str) -> str:
     """Name of the robot of a link, ROBOT/LINK; of another actor its own."""
     # Traffic has names of its files in brackets, with any letters.
     return name if "(" in name else name.partition("/")[0]
-
-
-def without_common_prefix(names: Sequence[str]) -> list[str]:
-    """Remove the common first words of at least three names.
-
-    Examples
-    --------
-    >>> without_common_prefix(["site_a_Wall", "site_a_Floor", "site_a_Lamp_1"])
-    ['Wall', 'Floor', 'Lamp_1']
-    """
-    if len(names) < 3:
-        return list(names)
-    prefix = os.path.commonprefix(list(names))  # noqa: RUF071 - of letters, as is wanted
-    end = max(prefix.rfind(mark) for mark in "_./: -") + 1
-    shorter = [name[end:] for name in names]
-    return shorter if all(shorter) else list(names)

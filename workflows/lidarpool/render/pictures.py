@@ -9,14 +9,14 @@ import numpy as np
 from matplotlib.colors import LogNorm, Normalize
 
 from ..base.arrays import AnyArray, AnyFloats, Floats, Floats32, Ints, UInts32
-from ..base.words import plural
+from ..base.words import plural, without_common_prefix
 from ..columns.cloud import Cloud
 from ..columns.table import Column, Z
 from ..scene.scene import Scene
 from . import theme
 from .colouring import TURBO, colours_of, values_of
 from .hit_density import HITS_TITLE, hit_colours
-from .picture_page import LEGEND_ROWS, Page, whole_of, without_common_prefix
+from .picture_page import LEGEND_ROWS, Page, whole_of
 from .shot import SurfaceView
 
 MOST_POINTS = 1_000_000  # of a cloud are drawn; a picture has a few more pixels
@@ -185,11 +185,21 @@ def with_points(
     light = shot.camera.look_up(shot.whole.light.reshape(shot.depth.shape), pixels, 1.0)
     shaded = np.ones((len(order), 4), np.float32)
     shaded[:, :3] = colours[order] * (0.5 + 0.5 * light)[:, None].clip(0, 1)
-    # Discs are drawn at twice the resolution and averaged down, so that their edges are smooth.
     width, height = shot.camera.size
     radius = max(min(320 / np.sqrt(len(points) + 1), 5.2) * width / 1600, 1.5)
     if solid:
         radius = max(radius, SOLID * width / 1600)
+    drawn = splat(image, pixels, shaded, radius)
+    if solid:  # surfaces keep their outlines
+        bare = shot.whole.triangle.reshape(height, width) < 0
+        drawn[bare] = image[bare]
+    return drawn
+
+
+def splat(image: Floats32, pixels: Floats, colours: AnyFloats, radius: float) -> Floats32:
+    """Draw discs of a radius in half pixels at pixels (n, 2), in colours (n, 4) in 0 to 1."""
+    # Discs are drawn at twice the resolution and averaged down, so that their edges are smooth.
+    height, width, _ = image.shape
     reach = int(radius)
     margin = reach + 2  # for discs of points beside the edge
     wide = 2 * (width + margin)
@@ -197,7 +207,7 @@ def with_points(
     inner = fine[margin : margin + 2 * height, margin : margin + 2 * width]
     inner[:] = _packed(image).repeat(2, axis=0).repeat(2, axis=1)
     column, row = (2 * pixels.T).astype(np.int64) + margin
-    middle, colour = row * wide + column, _packed(shaded)
+    middle, colour = row * wide + column, _packed(colours)
     disc = [
         (dx * dx + dy * dy, dy * wide + dx)
         for dy in range(-reach, reach + 1)
@@ -209,11 +219,8 @@ def with_points(
     for _, offset in sorted(disc, reverse=True):
         fine.ravel()[middle + offset] = colour
     out = np.ascontiguousarray(inner).view(np.uint8).reshape(height, 2, width, 2, 4)
-    drawn = out.mean(axis=(1, 3), dtype=np.float32) / 255
-    if solid:  # surfaces keep their outlines
-        bare = shot.whole.triangle.reshape(height, width) < 0
-        drawn[bare] = image[bare]
-    return drawn
+    four = (out[:, row, :, column].astype(np.uint16) for row in (0, 1) for column in (0, 1))
+    return np.asarray(sum(four) / np.float32(4 * 255))
 
 
 def _packed(colours: AnyFloats) -> UInts32:

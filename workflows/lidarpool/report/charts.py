@@ -12,13 +12,13 @@ from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter
 
 from ..base.arrays import Bools, Floats
 from ..base.sampling import even_indices
-from ..base.words import plural
+from ..base.words import plural, shortened
 from ..columns.table import TABLE, Z, by_value
 from ..datasets.figures import Figures, Varied
 from ..datasets.sweep_data import Sweep
 from ..render import theme
 from ..render.colouring import colours_of
-from ..render.picture_page import FONT, Page, shortened
+from ..render.picture_page import FONT, Page
 from .page.rendering import NARROW
 
 WIDTH = 1600

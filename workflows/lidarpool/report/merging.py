@@ -258,7 +258,7 @@ def _merge_survey(
     if differs := [name for name in identity if identity[name] != record["identity"][name]]:
         raise LidarpoolError(f"{path} has another {differs[0]} than these shards: give --scenario.")
     own: dict[str, Any] = {"scenario": built.scenario, "parts": parts, "notes": notes}
-    output = _Merged(out, job.survey, job.outputs, **own)
+    output = _Merged(out, job.survey, job.outputs, told["extent"], **own)
     options = RunOptions(out=out, folder=Storage.at(out).below(RUN_FOLDER), resume=True)
     return Conductor(jobs, options, output, screen, RunPage())()[1]
 

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import AbstractContextManager, contextmanager, nullcontext
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import cache, partial
 from pathlib import Path
@@ -16,6 +15,7 @@ from ..base.interrupts import deferred_interrupts
 from ..base.open3d_module import load_open3d
 from ..base.storage import Storage, flush
 from ..base.vocabulary import PICTURES
+from ..columns.parts import StoredCloud
 from ..export.folder import LAST_FILE, result_folder, staging
 from ..export.format_table import EXPORTS, FORMATS
 from ..export.formats import Format, refuse_strangers
@@ -24,6 +24,7 @@ from ..export.navigation_files import Instruments, write_instruments
 from ..export.sweeps import SWEEPS_FILE, Sweeps
 from ..run.conductor import Conductor, Output
 from ..run.picture_file import PICTURE_FILE, PictureContent
+from ..run.progress import Written
 from ..run.run_result import RunResult
 from ..run.writer import LidarWorkers
 from ..scenario.scenario import Scenario
@@ -33,8 +34,8 @@ from .report import CountedCloud, make_report
 ROOM_BYTES = 32 << 20  # room for pictures and report
 
 CLOUD, PAGE, REPORT = FORMATS["ply"].file, "report.html", LAST_FILE
-_OF_CLOUD = ("hits", "intensity", "cloud")  # are drawn from the cloud's file
-FILES = (CLOUD, *(f"{name}.png" for name in PICTURES), PICTURE_FILE, SWEEPS_FILE, PAGE, REPORT)
+_DRAWN = tuple(f"{name}.png" for name in PICTURES)
+FILES = (CLOUD, *_DRAWN, PICTURE_FILE, SWEEPS_FILE, PAGE, REPORT)
 _SURVEY = ("scene", "survey")  # what tells one from another
 # What only some results have.
 _FURTHER = (*(FORMATS[name].file for name in EXPORTS), *INSTRUMENT_FILES)
@@ -44,14 +45,14 @@ _FURTHER = (*(FORMATS[name].file for name in EXPORTS), *INSTRUMENT_FILES)
 class SurveyOutput(Output[tuple[RunResult, dict[str, Any]]]):
     """The result of a survey in its folder or storage, `place`; gives it with its report.
 
-    `formats` are written beside the cloud, `only_cloud` leaves out pictures and page, and `judge`
-    returns a note on the result.
+    `formats` are written beside the cloud. `extent` is how much: the "cloud", the "page", too, with
+    what pictures are drawn from, or "pictures", too. `judge` returns a note on the result.
     """
 
     place: Path | Storage
     survey: Survey
     formats: Sequence[Format]
-    only_cloud: bool = False
+    extent: str = "page"
     scenario: Scenario | None = None
     judge: Callable[[RunResult], str] = lambda result: ""
 
@@ -119,22 +120,24 @@ class SurveyOutput(Output[tuple[RunResult, dict[str, Any]]]):
             conductor.result_is_in(self.place)
             conductor.store.remove()
 
-        what = "the cloud" if self.only_cloud else "the cloud, the pictures and the report"
-        with conductor.screen.status(f"writing {what}"):
-            return result, self.write(result, in_place, workers)
+        more = {"cloud": "", "page": " and the report", "pictures": ", the report and the pictures"}
+        with conductor.screen.writing(f"writing the cloud{more[self.extent]}") as show:
+            return result, self.write(result, in_place, workers, show)
 
     def write(
         self,
         result: RunResult,
         then: Callable[[], object] = lambda: None,
         workers: LidarWorkers | None = None,
+        show: Written = lambda *_: None,
     ) -> dict[str, Any]:
         """Write cloud, pictures and report into the held place, and return the report.
 
         They are made in a temporary folder within the folder and moved into place once all are on
         the disk, so that an earlier result stays whole if one cannot be written. Pictures of an
         earlier result that this one does not make are removed. `then` is called when all are in
-        place, before a pending interrupt is raised. `workers` write formats of many files.
+        place, before a pending interrupt is raised. `workers` write formats of many files, and
+        `show` is told what is being written, and how far it is.
 
         Where `place` is a storage, all is put into it, report.json last. Files of workers go there
         directly, and an earlier result is removed before.
@@ -145,46 +148,54 @@ class SurveyOutput(Output[tuple[RunResult, dict[str, Any]]]):
         storage = place if isinstance(place, Storage) else None
         target = Storage.at(storage or folder)
         _, earlier = _earlier(target)
-        points, sweeps = result.points, Sweeps.of(result.survey, result.scene)
-        cloud = CountedCloud(points, len(result.scene.all_names))
+        further = _further_files(result.survey, formats)
+        sweeps = Sweeps.of(result.survey, result.scene)
+
+        def points(file: str) -> StoredCloud:
+            """Return the points, which tell how far a file is while they are read."""
+            count, done = len(result.points), 0
+
+            def tell(more: int) -> None:
+                nonlocal done
+                done = min(done + more, count)  # some may be read twice
+                show(file, done, count, "points")
+
+            tell(0)
+            return replace(result.points, tell=tell)
+
         advice = "make room or give another folder with --out"
         with (
             explained(f"The result cannot be written to {place}", advice),
             staging(folder, place) as staged,
-            nullcontext() if self.only_cloud else _Pictures(result, staged) as pictures,
         ):
-            drawn, page = (pictures.files, [PAGE]) if pictures else ([], [])
-            further = _further_files(result.survey, formats)
-            files = [CLOUD, *further, *drawn, SWEEPS_FILE, *page, REPORT]
             refuse_strangers(target, {*further, *earlier})
-
-            clear = cache(partial(_clear, target, files, earlier))  # once
+            clear = cache(partial(_clear, target, further, earlier))  # once
             sweeps.save(staged / SWEEPS_FILE)
             if (instruments := sweeps.instruments) is not None:
                 write_instruments(staged, result.survey, result.scene.origin)
                 sweeps = replace(sweeps, instruments=replace(instruments, folder=staged))
+            cloud = CountedCloud(points(CLOUD), len(result.scene.all_names))
             Format("ply").write(staged / CLOUD, cloud, sweeps)
             for one in sorted(formats, key=lambda one: one.row.in_pieces):
+                file = one.row.file
                 if storage and workers and one.row.in_pieces:
                     clear()
-                    one.put(storage, points, sweeps, workers)
+                    one.put(storage, points(file), sweeps, workers)
                 else:
-                    one.write(
-                        staged / one.row.file, points, sweeps, workers=None if storage else workers
-                    )
+                    there = None if storage else workers
+                    one.write(staged / file, points(file), sweeps, workers=there)
             if workers:
                 result = workers.recorded(result)
-            report = make_report(result, files, cloud)
-            report["notes"] += [note for one in formats for note in one.notes(points, sweeps)]
-            if pictures:
-                from .page.rendering import write_page  # as slow to import as the pictures
-
-                images = pictures.finish()
-                write_page(staged / PAGE, report, result, cloud, images, self.scenario)
+            report = make_report(result, cloud)
+            report["notes"] += [n for one in formats for n in one.notes(result.points, sweeps)]
+            if self.extent != "cloud":
+                self._report(result, report, cloud, staged, show)
+            made = [name for name in FILES[1:] if name == REPORT or (staged / name).exists()]
+            report["files"] = [CLOUD, *further, *made]
             text = json.dumps(report, indent=1, allow_nan=False) + "\n"
             (staged / REPORT).write_text(text, encoding="utf-8")
             if storage is None:
-                _move(staged, folder, files, earlier, then)
+                _move(staged, folder, report["files"], earlier, then)
             else:
                 clear()
                 for name in (*_FURTHER, *FILES):
@@ -193,6 +204,21 @@ class SurveyOutput(Output[tuple[RunResult, dict[str, Any]]]):
                 with deferred_interrupts():
                     then()
         return report
+
+    def _report(
+        self, result: RunResult, report: dict[str, Any], cloud: CountedCloud, staged: Path,
+        show: Written,
+    ) -> None:  # fmt: skip
+        """Write the page, what pictures are drawn of, and the pictures if they are wanted."""
+        from .page.rendering import write_page  # jinja2
+
+        shown = PictureContent.of(result)
+        shown.save(staged / PICTURE_FILE)
+        write_page(staged / PAGE, report, result, cloud, self.scenario)
+        if self.extent == "pictures":
+            from .result_pictures import draw_pictures  # Matplotlib, and seconds for each picture
+
+            list(draw_pictures(shown, staged, staged, show=show))
 
 
 def _further_files(survey: Survey, formats: Sequence[Format]) -> list[str]:
@@ -210,7 +236,8 @@ def _earlier(storage: Storage) -> tuple[dict[str, str], frozenset[str]]:
     try:
         report = json.loads(storage.read(REPORT))
         identity = {name: report["identity"][name] for name in _SURVEY}
-        return identity, frozenset(report["files"])
+        files = frozenset(report["files"])
+        return identity, files | {*_DRAWN} if PICTURE_FILE in files else files  # drawn since then
     except (OSError, ValueError, TypeError, LookupError):
         return {}, frozenset()
 
@@ -249,38 +276,3 @@ def _clear(target: Storage, files: Collection[str], earlier: Collection[str]) ->
         target.discard(name)
         if name == PAGE and target.is_local:
             flush(target.local())
-
-
-class _Pictures(AbstractContextManager["_Pictures"]):
-    """Pictures of a result, drawn in a thread while the cloud is written.
-
-    They are drawn from the file of the cloud, as by `lidarpool plot`, so that both draw the same.
-    """
-
-    def __init__(self, result: RunResult, staged: Path) -> None:
-        from .result_pictures import picture_makers  # Matplotlib takes as long as all other imports
-
-        self._staged, self._thread = staged, ThreadPoolExecutor(1, "pictures")
-        self._pictured = PictureContent.of(result)
-        columns = [column.name for column in result.survey.stored_columns]
-        self._makers = picture_makers(self._pictured, staged / CLOUD, columns)
-        self.files = [*(f"{name}.png" for name in self._makers), PICTURE_FILE]
-        self._drawn: dict[str, Future[str]] = {}
-        self._begin(name for name in self._makers if name not in _OF_CLOUD)
-
-    def __exit__(self, *_: object) -> None:
-        self._thread.shutdown(cancel_futures=True)
-
-    def _begin(self, names: Iterable[str]) -> None:
-        self._drawn |= {name: self._thread.submit(self._draw, name) for name in names}
-
-    def _draw(self, name: str) -> str:
-        page = self._makers[name]()
-        page.save(self._staged / f"{name}.png")
-        return page.svg()
-
-    def finish(self) -> dict[str, str]:
-        """Draw those of the cloud, whose file is there by now; returns all as SVG, by name."""
-        self._begin(name for name in _OF_CLOUD if name in self._makers)
-        self._pictured.save(self._staged / PICTURE_FILE)
-        return {name: self._drawn[name].result() for name in self._makers}

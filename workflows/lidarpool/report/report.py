@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import platform
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from contextlib import suppress
 from dataclasses import asdict
 from importlib.metadata import PackageNotFoundError, version
@@ -57,8 +57,8 @@ class CountedCloud:
     """A cloud that computes its statistics while its points are read for something else.
 
     `by_object` and `by_class` are the points of each, `no_surface` those of no object, `limits`
-    are {column: minimum and maximum}, and `bounds` (2, 3) the lowest and highest coordinates in the
-    world.
+    are {column: minimum and maximum}, `bounds` (2, 3) the lowest and highest coordinates in the
+    world, and `above` (rows, columns) points seen from above, the first row in the south.
     """
 
     def __init__(self, cloud: CloudLike, objects: int) -> None:
@@ -70,6 +70,10 @@ class CountedCloud:
         # A cell that a surface crosses has about the square of its side of that surface.
         self._side = float(np.ptp(self.bounds, axis=0).max()) / _CELLS or 1.0
         self._cells = np.zeros(_CELLS**3, np.int64)
+        # The more points, the finer.
+        across = np.ptp(self.bounds[:, :2], axis=0)
+        self._pixel = float(across.max() / np.clip(len(cloud) ** 0.5, 50, 800)) or 1.0
+        self.above = np.zeros((across[::-1] / self._pixel).astype(np.int64) + 1, np.int64)
         self.table: tuple[Column, ...] = cloud.table
         self.row_of = cloud.row_of
 
@@ -97,6 +101,10 @@ class CountedCloud:
             x, y, z = cell.clip(0, _CELLS - 1).T
             cell = (x * _CELLS + y) * _CELLS + z  # a product of whole numbers by `@` is slow
             self._cells += np.bincount(cell, minlength=len(self._cells))
+            pixel = (chunk.positions[:, :2] - self.bounds[0, :2]) / self._pixel
+            rows, columns = self.above.shape
+            x, y = pixel.astype(np.int64).clip(0, (columns - 1, rows - 1)).T
+            self.above += np.bincount(y * columns + x, minlength=rows * columns).reshape(rows, -1)
             yield chunk
 
     @property
@@ -120,7 +128,7 @@ def versions() -> dict[str, str]:
     return found
 
 
-def make_report(result: RunResult, files: Sequence[str], cloud: CountedCloud) -> dict[str, Any]:
+def make_report(result: RunResult, cloud: CountedCloud) -> dict[str, Any]:
     """Report of a run, ready for JSON.
 
     Lengths are in metres, times in seconds; infinite and unknown values are None.
@@ -164,7 +172,6 @@ def make_report(result: RunResult, files: Sequence[str], cloud: CountedCloud) ->
         "replayed": result.replayed,
         "resumed_scans": result.resumed,
         "planning": _planning(result),
-        "files": list(files),
     }
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -32,7 +32,9 @@ from ..render.pictures import MOST_POINTS, draw_cloud, draw_hits, draw_scene
 from ..render.shot import SIZE, Samples, SurfaceView, take_shot
 from ..render.stage import make_axis, nice_step
 from ..run.picture_file import PictureContent, ways_of
+from ..run.progress import Written
 from ..scene.scene import Scene
+from .page.rendering import put_picture
 
 SIDE_LEAST, SIDE_MOST = 480, 4096  # letters need some pixels; a pixel takes 0.4 kB of memory
 _LIGHT = ("reflectivity", "intensity")  # columns for the picture of intensity, the better first
@@ -47,21 +49,26 @@ _BLOCK = 4  # pixels a side
 
 def draw_pictures(
     shown: PictureContent,
-    cloud: Path,
+    result: Path,
     folder: str | Path,
     only: Sequence[str] = (),
     size: tuple[int, int] = SIZE,
     colour: str = Z.name,
+    show: Written = lambda *_: None,
 ) -> Iterator[Path]:
-    """Draw pictures, those in `only`, into a folder, which is made; see `picture_makers`."""
+    """Draw pictures of a result, those in `only`, into a folder, which is made, and into its page.
+
+    All have the same viewpoint, and the cloud the colours of the column `colour`. There is none of
+    a path that was not planned, nor of points in the axes of their sensors: the scene is in others.
+    """
+    cloud, page = result / "cloud.ply", Path(folder) / "report.html"
     least, most = min(size), max(size)
     if least < SIDE_LEAST or most > SIDE_MOST or most > SIDES_RATIO * least:
         raise LidarpoolError(
             f"A picture cannot be {size[0]} x {size[1]} pixels: give width and height of "
             f"{SIDE_LEAST} to {SIDE_MOST} each, one at most twice the other, such as 1600 x 1000."
         )
-    columns = [column.name for column in CloudFile(cloud).table] if cloud.exists() else []
-    makers = picture_makers(shown, cloud, columns, size, colour)
+    makers = _picture_makers(shown, cloud, size, colour)
     for name in only:
         if name not in PICTURES:
             there = did_you_mean(name, PICTURES) or f" There are {', '.join(PICTURES)}."
@@ -75,25 +82,22 @@ def draw_pictures(
             raise LidarpoolError(f"There is no picture {name!r}: {why}.")
     with explained(f"The folder {folder} cannot be made", "give another"):
         Path(folder).mkdir(parents=True, exist_ok=True)
-    for name in only or makers:
-        path = Path(folder) / f"{name}.png"
-        makers[name]().save(path)
+    names = only or [*makers]
+    for number, name in enumerate(names):
+        show("pictures", number, len(names), "pictures")
+        path, picture = Path(folder) / f"{name}.png", makers[name]()
+        picture.save(path)
+        if page.exists():
+            put_picture(page, name, picture.svg())
         yield path
+    show("pictures", len(names), len(names), "pictures")
 
 
-def picture_makers(
-    shown: PictureContent,
-    cloud: Path,
-    columns: Collection[str],
-    size: tuple[int, int] = SIZE,
-    colour: str = Z.name,
+def _picture_makers(
+    shown: PictureContent, cloud: Path, size: tuple[int, int], colour: str
 ) -> dict[str, Callable[[], Page]]:
-    """Return functions that draw pictures, all from the same viewpoint.
-
-    Without planning there is no picture of the path; and none of points in the axes of their
-    sensors, which do not fit the scene. The file `cloud` is read when it is drawn, and coloured by
-    the column `colour`; its `columns` tell whether there is a picture of intensity.
-    """
+    """Return functions that draw pictures; the file `cloud` is read when it is drawn."""
+    columns = [column.name for column in CloudFile(cloud).table] if cloud.exists() else []
     alone = shown.coordinates == "sensor"
     middle = shown.duration_ns / 2
 

@@ -159,8 +159,8 @@ class Conductor(Generic[R]):
         if options.own:
             check_backend_here(store.backend or options.backend, store.advice)
         self.cluster = Cluster(first.job, store, options, self.screen, enter)
-        self.page.follow(self.cluster.partitions)
         dataset = self.output.dataset
+        self.page.follow(self.cluster.partitions, dataset)
         self.run = Run(self.cluster, store, self.page, self._maker, dataset, self._frame)
         with self.screen.progress() as show:
             self.run.cast(first, show)

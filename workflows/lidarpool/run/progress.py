@@ -49,6 +49,7 @@ class Progress:
 
 
 Show = Callable[[Progress], None]
+Written = Callable[[str, int, int, str], None]  # name of an output, items that are done, all, unit
 
 
 def in_words(rate: float) -> str:
@@ -94,8 +95,8 @@ def standing_still(progress: Progress) -> str:
 
 
 @contextmanager
-def bars(console: Console) -> Iterator[Show]:
-    """Bars by stage with rates and time left; yields the function that moves them."""
+def rows(console: Console) -> Iterator[Callable[..., None]]:
+    """Bars that appear when they are first moved; yields the function that moves one."""
     columns = (
         TextColumn("{task.description:<11}"),
         BarColumn(bar_width=None),
@@ -105,19 +106,29 @@ def bars(console: Console) -> Iterator[Show]:
     )
     with Bars(*columns, console=console) as shown:
         lines: dict[str, TaskID] = {}
-        paces = {label: Pace() for label, _, _ in STAGES}
+
+        def move(label: str, done: int, total: int, unit: str, pace: str = "") -> None:
+            if label not in lines:
+                lines[label] = shown.add_task(label, total=total, unit=unit, pace="")
+            shown.update(lines[label], completed=done, pace=pace)
+
+        yield move
+
+
+@contextmanager
+def bars(console: Console) -> Iterator[Show]:
+    """Bars by stage with rates and time left; yields the function that moves them."""
+    paces = {label: Pace() for label, _, _ in STAGES}
+    with rows(console) as move:
 
         def show(progress: Progress) -> None:
-            """Move the bars; one appears when its total is known."""
             for label, count, unit in STAGES:
                 done, total = getattr(progress, count), getattr(progress, unit)
-                if total and label not in lines:
-                    lines[label] = shown.add_task(label, total=total, unit=unit, pace="")
-                if label in lines:
+                if total:
                     pace = paces[label].told(progress.seconds, done, total)
                     if unit == "scans" and done < total:
                         pace = standing_still(progress) or pace
-                    shown.update(lines[label], completed=done, pace=pace)
+                    move(label, done, total, unit, pace)
 
         yield show
 
@@ -152,6 +163,10 @@ class Screen:
     def status(self, words: str) -> AbstractContextManager[None]:
         """Show what is going on while the body runs."""
         return nullcontext()
+
+    def writing(self, words: str) -> AbstractContextManager[Written]:
+        """Show what is being written while the body runs; gives the function that is told."""
+        return nullcontext(lambda *_: None)
 
     def progress(self) -> AbstractContextManager[Show]:
         """Show the progress while the body runs; gives the function that does."""

@@ -8,6 +8,7 @@ from pathlib import Path
 
 from poolpart import Partition
 
+from ..datasets.dataset import DataSet
 from ..datasets.job_table import JobRow, Value
 from ..pipeline.messages import Receipt, ScanFrame
 from .job_points import JobPoints
@@ -41,8 +42,8 @@ class RunPage:
     def begun(self, points: JobPoints) -> None:
         """Show a job from now on, the only one of its run, and what an earlier run has left."""
 
-    def follow(self, partitions: Mapping[str, Partition]) -> None:
-        """Show what goes on from now on, on these partitions."""
+    def follow(self, partitions: Mapping[str, Partition], dataset: DataSet | None = None) -> None:
+        """Show what goes on from now on, on these partitions; jobs are written to the data set."""
 
     def on_parts(self, receipts: Sequence[Receipt]) -> None:
         """Show parts of the only job that were committed."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 
 import numpy as np
 
@@ -10,9 +10,11 @@ from ..base.words import as_scenario, plural
 from ..columns.table import VELOCITY
 from ..scene.files.meshfile import CITYJSON, UNITLESS, wrote_it
 from ..sensor.materials import MaterialTable
+from ..sensor.models import STATED
 from .build import Built
 from .placing import inside_note
 from .scenario import Scenario
+from .sections import SensorSection
 
 # Sizes of scenes in metres are between these. An .stl is mostly a part, in millimetres; an object
 # to look at from outside is rarely longer than a bus. glTF is in metres, and some exporters write
@@ -26,14 +28,15 @@ def advice(built: Built) -> list[str]:
     """Return notes on likely mistakes, such as a size that suggests another unit.
 
     Also on objects that were left out, on files whose axes were guessed, on where the sensor is,
-    and on settings without effect.
+    on figures that data sheets lack, and on settings without effect.
     """
     notes, remarks = built.found.notes, built.found.remarks
     axes = [f"{remark} (--up-axis AXIS with a mesh file)" for remark in remarks[:1]]
     if remarks[1:]:
         axes = [f"{axes[0]}; {plural(len(remarks) - 1, 'more file')}, too"]
     likely = filter(None, (_of_size(built), _of_poses(built), _of_colours(built)))
-    lines = (*notes, *axes, *likely, *_without_effect(built.scenario))
+    unstated = dict.fromkeys(_of_datasheets(built))
+    lines = (*notes, *axes, *likely, *unstated, *_without_effect(built.scenario))
     return [as_scenario(line) for line in lines]
 
 
@@ -91,6 +94,17 @@ def _of_colours(built: Built) -> str:
         f"{len(grey):,} of {plural(int(textured.sum()), 'object')} with reflectance: texture "
         f"have no colours and are grey: {shown}"
     )
+
+
+def _of_datasheets(built: Built) -> Iterator[str]:
+    """Name what the data sheets of sensors do not state, and the scenario does not give."""
+    scenario, given = built.scenario, built.scenario.noise.model_fields_set
+    sections: Mapping[str, SensorSection] = scenario.sensors or {"": scenario.sensor}
+    for section, noise in zip(sections.values(), built.survey.noise_each, strict=True):
+        left = [name for name in STATED if name not in given and not getattr(noise, name)]
+        if section.performance == "datasheet" and left:
+            lacks = ", ".join(f"{STATED[name]} (noise.{name})" for name in left)
+            yield f"the data sheet of {section.model} does not state {lacks}: they have no effect"
 
 
 def _without_effect(scenario: Scenario) -> Iterator[str]:

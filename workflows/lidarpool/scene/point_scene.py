@@ -68,10 +68,14 @@ def scene_of_points(path: str | Path, *, voxel_m: float | None = None, size: flo
     for name, value in (("voxel_m", voxel_m), ("size", size)):
         if value is not None and not 0 < value < np.inf:
             raise LidarpoolError(f"{name} is {value}; it must be a positive number.")
-    points = _read(path)
+    return Scene.from_meshes([surfels(path, _read(path), voxel_m, size)])
+
+
+def surfels(path: Path, points: Floats, voxel_m: float | None, size: float = 1.0) -> SceneMesh:
+    """Return the surfels of the points (n, 3) of a file, as `scene_of_points` makes them."""
     # Open3D's covariances lose the digits of points far from zero.
     origin = np.round((points.min(axis=0) + points.max(axis=0)) / 2)
-    points -= origin
+    points = points - origin
     o3d = load_open3d()
     voxel_m = voxel_m or _spacing(o3d, points)
     cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points))
@@ -98,9 +102,7 @@ def scene_of_points(path: str | Path, *, voxel_m: float | None = None, size: flo
     cloud.estimate_covariances(o3d.geometry.KDTreeSearchParamKNN(_NEIGHBOURS))
     corners = _corners(np.asarray(cloud.points), np.asarray(cloud.covariances), voxel_m, size)
     faces = 4 * np.arange(count)[:, None, None] + np.array([[0, 1, 2], [0, 2, 3]])
-    return Scene.from_meshes(
-        [SceneMesh(path.stem, corners.reshape(-1, 3) + origin, faces.reshape(-1, 3))]
-    )
+    return SceneMesh(path.stem, corners.reshape(-1, 3) + origin, faces.reshape(-1, 3))
 
 
 def _corners(points: Floats, covariances: Floats, voxel_m: float, size: float) -> Floats:

@@ -116,6 +116,15 @@ class Detection(_ModelSection):
         return float(same * math.sqrt(max(needed, 0.0)))
 
 
+# What a data sheet may state: {field of its noise: words}.
+STATED = {
+    "range_m": "precision of ranges",
+    "detection_range_m": "detection range at a reflectance",
+    "angle_deg": "accuracy of angles",
+    "false_alarm_hz": "false alarms",
+}
+
+
 class Performance(_ModelSection):
     """What a data sheet says of a sensor's noise and returns; see `datasheet`.
 
@@ -140,17 +149,6 @@ class Performance(_ModelSection):
         if self.false_alarms is not None and self.detection is None:
             raise ValueError("false_alarms needs detection")
         return self
-
-    @property
-    def missing(self) -> tuple[str, ...]:
-        """What no source that could be read states."""
-        stated = {
-            "precision of ranges": self.range_m is not None or self.precision is not None,
-            "detection range at a reflectance": self.detection is not None,
-            "accuracy of angles": self.angle_deg is not None,
-            "false alarms": self.false_alarms is not None,
-        }
-        return tuple(name for name, there in stated.items() if not there)
 
     def noise(self, gate_s: float, seed: int) -> Noise:
         """Return the noise of a sensor whose receiver waits so many seconds for returns."""
@@ -335,7 +333,8 @@ def datasheet(model: str | Path, *, seed: int = 0) -> Datasheet:
     low, high = described.range_m or (0.0, float("inf"))
     noise = stated.noise(2e-9 * (high - low) / LIGHT_M_NS, seed)
     subrays = 1 if described.optics.divergence_mrad is None else 7
-    return Datasheet(noise, Returns(stated.mode, subrays=subrays), stated.missing)
+    missing = tuple(words for name, words in STATED.items() if not getattr(noise, name))
+    return Datasheet(noise, Returns(stated.mode, subrays=subrays), missing)
 
 
 def shown_noise(noise: Noise) -> str:

@@ -340,9 +340,12 @@ class Survey(CloudOptions, Weather):
         carried = self.carried[number]
         sensor, name = carried.sensor, f" of {carried.name}" if carried.name else ""
         if self.noise_each[number].detection_range_m is None:
+            lacks = "is not given" if carried.noise is None else "its data sheet does not state"
+            guess = sensor.max_range_m / 2 if sensor.max_range_m < np.inf else 100
             raise LidarpoolError(
-                f"Rain, snow, dust and fog that return light need noise.detection_range_m{name}: "
-                "it says what the sensor detects. A data sheet has it as the range at 10 %."
+                f"Rain, snow, dust and fog that return light need noise.detection_range_m{name}, "
+                f"the range at 10 % reflectance, which {lacks}: write what is known of it, or "
+                f"half of the sensor's range, noise: {{detection_range_m: {guess:.3g}}}."
             )
         wide = (self.returns_each[number].divergence_mrad, sensor.optics.divergence_mrad)
         if self.particles and wide == (None, None):

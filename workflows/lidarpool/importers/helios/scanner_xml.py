@@ -209,11 +209,8 @@ class _Line:
         half = min(wide, _half(scanner, settings))
         low = number(settings, "verticalAngleMin_deg", -half)
         high = number(settings, "verticalAngleMax_deg", half)
-        if high - low > 2 * wide + _SLACK:
-            raise LidarpoolError(
-                f"lines of {scanner.name} from {low:g} to {high:g} degrees are wider than its "
-                f"scanAngleEffectiveMax_deg allows, {2 * wide:g}."
-            )
+        if high - low > 2 * wide + _SLACK:  # HELIOS++ 1 leaves such pulses out, 2 refuses them
+            low, high = max(low, -wide), min(high, wide)
         step, of_all = 2 * most * scan_hz / pulse_hz, ceil(pulse_hz / scan_hz - _SLACK)
         # Angles above `low`, up to `high`; a line begins anew before it is all round.
         first = floor((low + most) / step + _SLACK) + 1

@@ -6,6 +6,7 @@ import re
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import cached_property, partial
+from itertools import cycle
 from pathlib import Path
 from typing import Any
 from xml.etree.ElementTree import Element
@@ -17,17 +18,16 @@ from ...base.errors import LidarpoolError, prefixed
 from ...scene.actors import one_mesh
 from ...scene.files.meshfile import load_meshes
 from ...scene.floor import heights_at
+from ...scene.point_scene import surfels
 from ...scene.scene import Scene, unique_names
 from ...scene.scene_instances import SceneInstance
 from ...scene.scene_mesh import SceneMesh
 from ...scene.simplified import Drawn
 from ...scene.transform import Transform
 from ...sensor import Pose
-from .files import Assets, clean, number, rotation
+from .files import Assets, clean, number, read, rotation
 
-# Loaders whose files hold no triangles.
-_UNREAD = ("geotiffloader", "xyzloader")
-_LOADERS = ("objloader", "detailedvoxels")
+_LOADERS = ("objloader", "detailedvoxels", "geotiffloader", "xyzloader")
 
 
 @dataclass
@@ -40,13 +40,14 @@ class HeliosPart:
     scale: float
     offset: Floats
     falls: bool  # until it stands on the ground
-    library: Path | None = None  # of the material of voxels, and its name there
+    library: Path | None = None  # of the material of what is no .obj, and its name there
     material: str = ""
+    surfels: SceneMesh | None = None  # of a file of points
 
     @cached_property
     def materials(self) -> list[dict[str, str]]:
         """Material values that HELIOS++ reads for its faces."""
-        text = _text(self.file)
+        text = _text(self.file) if self.file.suffix.lower() == ".obj" else ""
         used = {self.material, *re.findall(r"^\s*usemtl\s+(\S+)", text, re.MULTILINE)}
         found: dict[str, dict[str, str]] = {}
         named = re.findall(r"^\s*mtllib\s+(.+?)\s*$", text, re.MULTILINE)
@@ -81,12 +82,16 @@ class HeliosPart:
 
     @property
     def is_ground(self) -> bool:
-        """Whether platforms and parts can stand on it."""
+        """Whether platforms and parts can stand on it; on points if they have no material."""
+        if self.surfels is not None and self.library is None:
+            return True
         return any(values.get("isGround", "").lower() in ("true", "1") for values in self.materials)
 
     def meshes(self) -> tuple[SceneMesh | SceneInstance, ...]:
         """Read it, in the world."""
         placed = Transform(self.turn * self.scale, self.offset)
+        if (points := self.surfels) is not None:
+            return (points.moved(points.name, placed.linear, placed.offset),)
         return load_meshes(self.file, up_axis=self.up_axis, transform=placed, tell=lambda _: None)
 
     def entry(self, name: str) -> dict[str, Any]:
@@ -104,10 +109,10 @@ class HeliosPart:
 
 
 class HeliosScene:
-    """The parts of a scene, and the ground among them."""
+    """The parts of a scene, and the ground among them; in a folder `out` surfels of points."""
 
-    def __init__(self, element: Element, assets: Assets) -> None:
-        self._assets = assets
+    def __init__(self, element: Element, assets: Assets, out: Path) -> None:
+        self._assets, self._out = assets, out
         self.unread: list[str] = []
         self._missing: set[str] = set()
         self._moving: dict[str, list[str]] = {"dmotion": [], "swap": []}  # parts by their motion
@@ -131,25 +136,28 @@ class HeliosScene:
         files: list[Path] = []
         up, turn, scale, offset, falls = None, np.eye(3), 1.0, np.zeros(3), False
         library, material = None, ""
+        points: list[SceneMesh | None] = [None]
         for step in part.findall("filter"):
             kind = step.get("type", "").lower()
             given = {param.get("key", ""): param for param in step.findall("param")}
             text = {key: param.get("value", "") for key, param in given.items()}
             mode = text.get("intersectionMode", "transmittive").lower()
-            why = "no triangles" if kind in _UNREAD else ""
             if kind == "detailedvoxels" and mode != "transmittive":
-                why = f"intersectionMode {mode}"
-            if why:
                 what = text.get("filepath") or text.get("efilepath", "")
-                self.unread.append(f"{name}, {kind} of {what}: {why}, left out")
+                self.unread.append(f"{name}, {kind} of {what}: intersectionMode {mode}, left out")
                 return
             if kind in _LOADERS:
-                files, up = _files(text, assets), text.get("up")
-                if kind == "detailedvoxels":
-                    up, material = None, text.get("matname", "")
+                files = _files(text, assets)
+                if kind == "objloader":
+                    up = text.get("up")
+                else:
+                    material = text.get("matname", "")
                     library = assets.file(text["matfile"]) if "matfile" in text else None
-                    if "ladlut" in text:
-                        self.unread.append(f"{name}, ladlut: leaf angles are spherical")
+                if kind == "xyzloader":
+                    points = [_surfels(file, text) for file in files]
+                    files = [self._out / f"{file.stem}-{name.split()[-1]}.glb" for file in files]
+                if "ladlut" in text:
+                    self.unread.append(f"{name}, ladlut: leaf angles are spherical")
             elif kind == "rotate":
                 turn = rotation(given.get("rotation")) @ turn
             elif kind == "scale":
@@ -161,13 +169,14 @@ class HeliosScene:
             else:
                 raise LidarpoolError(
                     f"the filter {kind!r} is not known; there are {', '.join(_LOADERS)}, rotate, "
-                    f"scale, translate, {', '.join(_UNREAD)}."
+                    "scale, translate."
                 )
         if not files:
             raise LidarpoolError("no filter loads a file.")
         up = up if up in ("y", "z") else None
-        for file in files:
-            yield HeliosPart(file, up, turn, float(scale), offset.copy(), falls, library, material)
+        place = up, turn, float(scale)
+        for file, mesh in zip(files, cycle(points)):
+            yield HeliosPart(file, *place, offset.copy(), falls, library, material, mesh)
 
     @cached_property
     def _ground(self) -> Scene | None:
@@ -245,6 +254,17 @@ def _files(text: dict[str, str], assets: Assets) -> list[Path]:
             if found:
                 return found
     raise LidarpoolError(f"no file fits the efilepath {text['efilepath']!r}.")
+
+
+def _surfels(path: Path, given: dict[str, str]) -> SceneMesh:
+    """Return the surfels of a file of points, of which a cell of `voxelSize` has one."""
+    separators = dict.fromkeys(map(ord, given.get("separator") or " "), " ")
+    lines = read(path).decode("utf-8", "replace").translate(separators).splitlines()
+    try:
+        points = np.loadtxt(lines, comments="//", usecols=(0, 1, 2), ndmin=2)
+        return surfels(path, points, number(given, "voxelSize", 1.0) or 1.0)
+    except ValueError as error:
+        raise LidarpoolError(f"{path} has rows that are no points: {error}.") from error
 
 
 def _text(path: Path) -> str:

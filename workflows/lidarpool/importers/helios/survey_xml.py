@@ -19,6 +19,8 @@ from ...base.arrays import Floats
 from ...base.errors import LidarpoolError, prefixed
 from ...scenario.build import build
 from ...scenario.scenario import Scenario
+from ...scene.scene import Scene
+from ...scene.scene_file import write_scene
 from ...scene.transform import rotation_about
 from ...sensor import Pose
 from ...sensor.disc import SUBRAYS
@@ -68,7 +70,7 @@ def import_survey(
     if out.exists():
         raise LidarpoolError(f"{out} exists: name another folder, --out DIR.")
     try:
-        made = _Import(survey, [Path(folder) for folder in assets])
+        made = _Import(survey, [Path(folder) for folder in assets], out)
     except LidarpoolError as error:
         told = str(error)
         told = told if told.startswith(str(survey)) else f"{survey}: {told}"
@@ -78,6 +80,9 @@ def import_survey(
     try:
         for name, text in made.files(out).items():
             (partial / name).write_text(text, encoding="utf-8", newline="\n")
+        for part in made.scene.parts:
+            if part.surfels is not None:
+                write_scene(partial / part.file.name, Scene.from_meshes([part.surfels]))
         scenario = Scenario.load(partial / SCENARIO_FILE)
         build(scenario)  # with whatever is wrong about it
         partial.chmod(0o755)  # temporary folders are their owner's alone
@@ -93,7 +98,7 @@ def import_survey(
 class _Import:
     """A survey that was read whole."""
 
-    def __init__(self, survey: Path, folders: Sequence[Path]) -> None:
+    def __init__(self, survey: Path, folders: Sequence[Path], out: Path) -> None:
         self._home, self._assets = survey, Assets(survey, folders)
         element = self._assets.root(survey).find("survey")
         if element is None:
@@ -101,7 +106,7 @@ class _Import:
         self._element, self._name = element, element.get("name") or survey.stem
         self._scanners = channels(self._asset("scanner"))
         self._first = next(iter(self._scanners.values()))
-        self._scene = HeliosScene(self._asset("scene"), self._assets)
+        self.scene = HeliosScene(self._asset("scene"), self._assets, out)
         self._notes: list[str] = []
         self._files: dict[str, dict[str, Any]] = {}  # {name: data of a sensor}
         self._sensors: dict[str, dict[str, Any]] = {}
@@ -113,7 +118,7 @@ class _Import:
                 f"{len(self._sensors)} legs and channels scan; a scenario has {SENSORS_MOST} "
                 "sensors at most."
             )
-        self._materials = self._scene.materials(self._first.number("wavelength_nm", 1064))
+        self._materials = self.scene.materials(self._first.number("wavelength_nm", 1064))
         if element.get("legRandomOffset", "false") in ("true", "1"):
             self._notes.append("legRandomOffset: legs are where they say")
         if number(element, "numRuns", 1) > 1:
@@ -121,7 +126,7 @@ class _Import:
         if number(self._full_waveform(), "maxFullwaveRange_ns", 0) > 0:
             self._notes.append("maxFullwaveRange_ns: waveforms are as long as their echoes")
         unsupported = (line for scanner in self._scanners.values() for line in unread(scanner))
-        self.left_out = list(dict.fromkeys([*self._notes, *unsupported, *self._scene.left_out()]))
+        self.left_out = list(dict.fromkeys([*self._notes, *unsupported, *self.scene.left_out()]))
 
     def _asset(self, kind: str) -> Element:
         if not (reference := self._element.get(kind)):
@@ -131,7 +136,7 @@ class _Import:
     def _carry(self) -> Way:
         """Read the legs and the platform; make the trajectory, and sensors on it."""
         survey, assets = self._element, self._assets
-        legs = read_legs(survey, assets, self._home, self._scene.height)
+        legs = read_legs(survey, assets, self._home, self.scene.height)
         mount, kind, way = survey.find("scannerMount"), "interpolated", None
         if survey.get("platform") == kind:
             base = survey.get("basePlatform")
@@ -206,8 +211,8 @@ class _Import:
         """Return what goes into the folder `out`: {name: text}."""
         trajectory, files = self._way.written()
         light, range_m = self._light()
-        names = [os.path.relpath(part.file.resolve(), out.resolve()) for part in self._scene.parts]
-        entries = zip(self._scene.parts, names, strict=True)
+        names = [os.path.relpath(part.file.resolve(), out.resolve()) for part in self.scene.parts]
+        entries = zip(self.scene.parts, names, strict=True)
         data = {
             "scene": {"files": [part.entry(Path(name).as_posix()) for part, name in entries]},
             "trajectory": trajectory,

@@ -9,6 +9,12 @@ export function element(tag, properties = {}, ...children) {
   return made;
 }
 
+export function saveFile(file, name) {
+  const link = element("a", { href: URL.createObjectURL(file), download: name });
+  link.click();
+  setTimeout(() => URL.revokeObjectURL(link.href), 60_000);
+}
+
 const ICONS = {
   play: '<path class="full" d="M4 2.5v11l9-5.5z"/>',
   pause: '<path class="full" d="M4 3h3v10H4zM9 3h3v10H9z"/>',
@@ -17,6 +23,7 @@ const ICONS = {
   loop: '<path d="M3 8a5 5 0 0 1 8.5-3.5L13 6M13 3v3h-3M13 8a5 5 0 0 1-8.5 3.5L3 10M3 13v-3h3"/>',
   link: '<path d="M6.5 9.5l3-3M7 5l1.5-1.5a2.8 2.8 0 0 1 4 4L11 9M9 11l-1.5 1.5a2.8 2.8 0 0 1-4-4L5 7"/>',
   picture: '<path d="M2 5h3l1-2h4l1 2h3v8H2z"/><circle cx="8" cy="8.7" r="2.3"/>',
+  panel: '<path d="M2.5 4h11M2.5 8h11M2.5 12h11"/>',
   theme: '<circle cx="8" cy="8" r="5.5"/><path class="full" d="M8 2.5a5.5 5.5 0 0 1 0 11z"/>',
 };
 
@@ -84,7 +91,9 @@ export function slider(title, low, high, step, value, words, act) {
     type: "range", min: low, max: high, step, value,
     oninput: () => { shown.textContent = words(+made.value); act(+made.value); },
   });
-  return row(title, made, shown);
+  const line = row(title, made, shown);
+  line.set = (set) => { made.value = set; made.oninput(); };
+  return line;
 }
 
 export function tick(title, checked, act) {
@@ -124,8 +133,9 @@ export function dual(title, low, high, step, ends, words, act) {
   return element("div", {}, line, element("div", { className: "ends" }, first, last));
 }
 
-// only: value of the label that is shown alone, or null; act(value) when a label is clicked.
-export function legend(told, only, act) {
+// only: value of the label that is shown alone, or null; act(value) when a label is pressed; names:
+// {value: name} of those that the server knows by their numbers only.
+export function legend(told, only, act, names = {}) {
   const box = element("div", { className: "legend" });
   if (!told) return box;
   if (!told.labels) {
@@ -139,11 +149,13 @@ export function legend(told, only, act) {
   }
   const list = element("ul");
   for (const [name, colour, value] of told.labels) {
-    const line = element(
-      "li", { title: `${name}: click to show only this`, className: value === only ? "only" : "", onclick: () => act(value) },
-      element("i", { style: { background: `rgb(${colour})` } }), element("span", { textContent: name || `${value}` }),
+    const shown = names[value] ?? (name || `${value}`);
+    const press = element(
+      "button", { type: "button", title: value === only ? "Show all again" : `Show only ${shown}`, onclick: () => act(value) },
+      element("i", { style: { background: `rgb(${colour})` } }), element("span", { textContent: shown }),
     );
-    list.append(line);
+    press.setAttribute("aria-pressed", value === only);
+    list.append(element("li", {}, press));
   }
   if (told.more) list.append(element("li", { textContent: `and ${told.more.toLocaleString("en")} more` }));
   box.append(list);

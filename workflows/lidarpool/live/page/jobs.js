@@ -1,7 +1,7 @@
 // The list of jobs: how many are done, a table of some, points of one, and charts.
 import { ask } from "./ask.js";
 import { element, themeButton } from "./controls.js";
-import { count, follow, meter, replace, stop } from "./run.js";
+import { follow, meter, replace, slots, stop } from "./run.js";
 
 const NEWS_MS = 1000;
 const SETTLED_MS = 1500; // after its page is loaded, the viewer of a job has drawn
@@ -37,11 +37,16 @@ function showRun(told) {
     const mark = className ? [element("i", { className })] : [];
     return element("div", { className: bad ? "bad" : "" }, element("dt", {}, ...mark, name), element("dd", { textContent: value }));
   }));
-  $("slots").replaceChildren(...told.slots.map(count));
+  $("slots").replaceChildren(...told.slots.map(slots));
 }
 
 // -- the table ---------------------------------------------------------------------------
 
+// The name of a job leads to its page, if its points can be shown.
+function nameOf(job) {
+  if (!job.opens) return cell(job.name);
+  return element("td", {}, element("a", { href: `job/${job.number}/`, target: "_blank", title: "Open its points", textContent: job.name }));
+}
 const cell = (text, className = "") => element("td", { textContent: text, className });
 
 // A path may be broken after its dots.
@@ -56,7 +61,7 @@ function group(title, remark, width, rows) {
 function showJobs(told) {
   const width = told.names.length + 4;
   const line = (job, state, points, seconds) => element(
-    "tr", {}, cell(job.name), state, cell(points), cell(seconds), ...job.values.map((value) => cell(value)),
+    "tr", {}, nameOf(job), state, cell(points), cell(seconds), ...job.values.map((value) => cell(value)),
   );
   const underWay = told.under_way.map((job) => {
     const state = cell(job.writing ? "writing" : "casting", "text");

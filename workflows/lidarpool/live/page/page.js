@@ -1,8 +1,8 @@
 // The page: what is asked of the server, the controls, and the time that is played.
 import { ask } from "./ask.js";
-import { button, dual, element, iconButton, legend, menu, number, section, setIcon, slider, stepFor, themeButton, tick } from "./controls.js";
+import { button, dual, element, iconButton, legend, menu, number, saveFile, section, setIcon, slider, stepFor, themeButton, tick } from "./controls.js";
 import { Picture, lastNotAbove } from "./picture.js";
-import { count, follow, replace, stop } from "./run.js";
+import { count, follow, replace, slots, stop } from "./run.js";
 
 const FIRST_LOOK = 200_000; // points that are asked for first
 const REST_MS = 250; // for which the camera stands still before points are asked for
@@ -14,6 +14,9 @@ const SPEEDS = [0.1, 0.25, 0.5, 1, 2, 5, 10];
 const BUDGETS = [0.2, 0.5, 1, 2, 5, 10, 20].map((millions) => millions * 1e6);
 const SHOWS = [["all", "all points"], ["sweep", "one sweep"], [0.5, "last 0.5 s"], [2, "last 2 s"], [10, "last 10 s"], ["now", "all until now"]];
 const HIDDEN = "not shown";
+const OPEN = 3e38; // an end of a range that limits nothing; float32 holds it
+const FAINT = 0.2; // opacity of grey surfaces before points, so that these come first
+const NARROW = matchMedia("(max-width: 799px)"); // there the panel is a drawer
 
 const $ = (id) => document.getElementById(id);
 const picture = new Picture($("canvas"), $("labels"), $("axes"), $("scale"), () => moved());
@@ -22,11 +25,12 @@ const theme = themeButton((chosenOne) => picture.setTheme(chosenOne));
 // What users have chosen; a link holds it.
 const chosen = {
   colour: "z", scene: "grey", filter: [], off: new Set(), show: "all", time: 0, speed: 1, loop: true, images: true,
-  budget: 2e6, size: 1, shading: true, clip: [[null, null], [null, null], [null, null]], rays: true, follow: false,
+  budget: 2e6, size: 1, shading: true, opacity: FAINT, boxes: true, clip: [[null, null], [null, null], [null, null]], rays: true, follow: false,
 };
 let state = null; // of the server: {…, arrays}
 let sweeps = []; // [{first, last, begin, sensor, index}] in order of their beginnings
 let playing = false;
+let drives = false; // a result with a carrier that moves
 let picked = []; // points: {place, local, columns}
 
 // -- the server --------------------------------------------------------------------------
@@ -73,7 +77,7 @@ function rangesAt(time) {
   return words.join(",");
 }
 
-const filterText = () => chosen.filter.map(([name, low, high]) => `${name},${low},${high}`).join(";");
+const filterText = () => chosen.filter.map(String).join(";");
 
 function questionAt(time) {
   const asked = { colour: chosen.colour === HIDDEN ? "z" : chosen.colour };
@@ -212,9 +216,15 @@ function showLegend(told) {
   if (text === legendText) return;
   legendText = text;
   const column = told?.column;
-  panel.legend.replaceChildren(legend(chosen.colour === HIDDEN ? null : told, onlyObject(column), (value) => {
-    setLimits(column, onlyObject(column) === value ? null : [value, value]);
-  }));
+  panel.legend.replaceChildren(labels([HIDDEN, "result"].includes(chosen.colour) ? null : told, column));
+}
+
+// A legend whose labels choose values of a column.
+const labels = (told, column) => legend(
+  told, onlyObject(column), (value) => toggle(column, value), column === "class" ? state.classes : {});
+
+function toggle(column, value) {
+  setLimits(column, onlyObject(column) === value ? null : [value, value]);
 }
 
 function tellFacts() {
@@ -236,7 +246,18 @@ function setLimits(name, limits) {
   if (name === "object") picture.showObjects(limits);
   legendText = "";
   tellFilter();
+  tellResults();
   refresh();
+}
+
+// The switch between several results.
+function tellResults() {
+  if (state.results.length) panel.results.replaceChildren(labels({ labels: state.results }, "result"));
+}
+
+function nextResult() {
+  const now = onlyObject("result"), next = now === null ? 0 : now + 1;
+  if (state.results.length) setLimits("result", next < state.results.length ? [next, next] : null);
 }
 
 function tellFilter() {
@@ -247,6 +268,7 @@ function tellFilter() {
       picture.showObjects(null);
       legendText = "";
       tellFilter();
+      tellResults();
       showFilterInput(panel.filterBy.menu.value).catch(failed);
       refresh();
     })] : []),
@@ -258,7 +280,7 @@ function limitWords(name, low, high) {
   const names = filterNames[name] ?? {};
   if (low === high) return `${name}: only ${names[low] ?? number(low)}`;
   const column = state.columns.find((one) => one.name === name), size = column?.unit === "s" ? 1e9 : 1;
-  const [a, b] = [low, high].map((value) => (Math.abs(value) > 1e300 ? null : number(value / size)));
+  const [a, b] = [low, high].map((value) => (Math.abs(value) >= OPEN ? null : number(value / size)));
   return `${name}: ${a === null ? `up to ${b}` : b === null ? `from ${a}` : `${a} to ${b}`} ${column?.unit ?? ""}`;
 }
 
@@ -267,7 +289,8 @@ async function showFilterInput(name) {
   const limits = chosen.filter.find(([column]) => column === name);
   if (told.labels) {
     filterNames[name] = Object.fromEntries(told.labels.map(([text, value]) => [value, text]));
-    const options = [["", "all"], ...told.labels.map(([text, value]) => [value, text])];
+    if (name === "class") Object.assign(filterNames[name], state.classes);
+    const options = [["", "all"], ...told.labels.map(([, value]) => [value, filterNames[name][value]])];
     const only = limits && limits[1] === limits[2] ? limits[1] : "";
     panel.filterInput.replaceChildren(menu("only", options, only, (value) => setLimits(name, value === "" ? null : [+value, +value])));
     return;
@@ -276,7 +299,7 @@ async function showFilterInput(name) {
   const low = Math.floor(told.low / step) * step, high = Math.max(Math.ceil(told.high / step) * step, low + step);
   const ends = limits ? [limits[1] / told.unit, limits[2] / told.unit] : [null, null];
   const apply = later((some) => setLimits(name, some.every((one) => one === null) ? null :
-    [some[0] === null ? -1.7e308 : some[0] * told.unit, some[1] === null ? 1.7e308 : some[1] * told.unit]));
+    [some[0] === null ? -OPEN : some[0] * told.unit, some[1] === null ? OPEN : some[1] * told.unit]));
   panel.filterInput.replaceChildren(dual("range", low, high, step, ends, (value) => number(value, step), apply));
 }
 
@@ -295,7 +318,7 @@ function buildPanel() {
     "header", {}, element("h1", { textContent: document.title, title: document.title }),
     iconButton("link", "Copy the link to this view", copyLink),
     iconButton("picture", "Save the picture", () => picture.save(`${document.title}.png`)),
-    theme,
+    theme, iconButton("panel", "Hide the panel (H)", () => showPanel(false)),
   );
   panel.legend = element("div");
   const points = section("Points", true,
@@ -308,13 +331,24 @@ function buildPanel() {
     menu("at most", BUDGETS.map((count) => [count, `${(count / 1e6).toLocaleString("en")} million`]), chosen.budget, (value) => { chosen.budget = +value; shownKey = null; refresh(); }),
     tick("shade by depth", chosen.shading, (on) => { chosen.shading = on; picture.strength = on ? 1 : 0; picture.dirty = true; }),
   );
-  const parts = [head, panel.progress, panel.facts, points];
+  const parts = [head, panel.progress, panel.facts];
+  if (state.results.length) parts.push(section("Results", true, (panel.results = element("div"))));
+  parts.push(points);
   if (state.scene) {
     panel.sceneLegend = element("div");
     parts.push(section("Scene", true,
-      menu("colour", [...state.scene, HIDDEN], chosen.scene, (value) => { chosen.scene = value; loadSurface().catch(failed); }),
+      menu("colour", [...state.scene, HIDDEN], chosen.scene, (value) => {
+        chosen.scene = value;
+        panel.opacity.set(value === "grey" ? FAINT : 1); // a colour is to be seen
+        loadSurface().catch(failed);
+      }),
       panel.sceneLegend,
+      (panel.opacity = slider("opacity", 0, 1, 0.05, chosen.opacity, (value) => `${Math.round(100 * value)} %`, (value) => {
+        chosen.opacity = picture.opacity = value;
+        picture.dirty = true;
+      })),
       tick("sample rays", chosen.rays, (on) => { chosen.rays = on; showRays(); }),
+      ...(picture.actors.length ? [tick("boxes and names", chosen.boxes, (on) => { chosen.boxes = on; picture.showBoxes(on); })] : []),
     ));
   }
   if (picture.sensors.length) {
@@ -341,13 +375,35 @@ function buildPanel() {
   filter.addEventListener("toggle", () => { if (filter.open) showFilterInput(panel.filterBy.menu.value).catch(failed); });
   panel.clip = element("div");
   parts.push(filter, section("Clip box", false, panel.clip, button("Show all", () => setClip([[null, null], [null, null], [null, null]]))));
+  if (state.exports.length) {
+    const format = menu("format", state.exports, state.exports[0], () => {});
+    parts.push(section("Export", false, format, button("Download", () => download(format.menu.value).catch(failed)),
+      element("div", { className: "note", textContent: "The points that are shown: filtered, clipped, at this time." })));
+  }
   parts.push(section("Keys", false, element("dl", { className: "keys", innerHTML: [
     ["space", "play or pause"], ["← →", "one sweep back or on; ten with Shift"], ["Home End", "first or last sweep"],
     ["A T S F", "all, from the top, side, front"], ["P", "parallel or perspective"], ["C", "copy the link"],
+    ["H", "hide or show the panel"], ...(state.results.length ? [["R", "the next result, or all"]] : []),
   ].map(([keys, words]) => `<dt>${keys.split(" ").map((key) => `<kbd>${key}</kbd>`).join(" ")}</dt><dd>${words}</dd>`).join("") })));
   $("panel").replaceChildren(...parts.flatMap((part) => (part === panel.facts && state.note ? [part, element("div", { className: "note", style: { padding: "0 12px 8px" }, textContent: state.note })] : [part])));
   buildClip();
   tellFilter();
+  tellResults();
+}
+
+function showPanel(on) {
+  document.documentElement.classList.toggle("no-panel", !on);
+}
+
+// Has the server write the points that are shown, and saves its file.
+async function download(format) {
+  const cut = chosen.clip.flatMap(([low, high], axis) => (low === null && high === null ? [] :
+    [["xyz"[axis], low === null ? -OPEN : low + state.origin[axis], high === null ? OPEN : high + state.origin[axis]]]));
+  const asked = { ...questionAt(chosen.time), format, filter: [...chosen.filter, ...cut].map(String).join(";") };
+  say("Writing …");
+  const told = await ask("export", asked);
+  say(told.error ?? "", Boolean(told.error));
+  if (!told.error) saveFile(new Blob([told.arrays.file]), told.name);
 }
 
 function look(side) {
@@ -384,12 +440,16 @@ async function loadSurface() {
   if (hidden !== (chosen.scene === HIDDEN)) return;
   picture.setSurface(told);
   picture.showObjects(picture.onlyObjects);
-  panel.sceneLegend.replaceChildren(legend(told?.legend, onlyObject("object"), (value) => setLimits("object", onlyObject("object") === value ? null : [value, value])));
+  panel.sceneLegend.replaceChildren(labels(told?.legend, "object"));
   if (told && !loadSurface.looked) {
     loadSurface.looked = true;
     loadSurface.floor = told.floor;
     const cut = Math.min(told.roof_cut ?? Infinity, state.cut ?? Infinity);
     if (Number.isFinite(cut) && !loadSurface.linked) setClip([[null, null], [null, null], [null, cut]]);
+    if (told.roof_cut !== null) {
+      picture.roofed = true; // seen from higher up, no wall is in the way
+      if (!drives && !new URLSearchParams(location.hash.slice(1)).has("camera")) look("all");
+    }
     showPath();
   }
 }
@@ -466,6 +526,7 @@ function buildTime() {
   clock.follow.title = "Move the camera with the carrier";
   clock.follow.hidden = !picture.sensors.some((sensor) => sensor.moves);
   clock.images = button("Range image", () => { chosen.images = !chosen.images; showToggles(); showImages(); });
+  clock.images.hidden = Boolean(state.offline); // a file does not hold them
   $("time").replaceChildren(
     element("div", { className: "line" }, clock.slider, clock.ticks),
     element("div", { className: "transport" },
@@ -581,7 +642,7 @@ const MOST_IMAGES = 3;
 
 function showImages() {
   const box = $("images");
-  const on = chosen.images && chosen.show !== "all" && sweeps.length > 0 && picture.sensors.some((sensor) => sensor.shown);
+  const on = chosen.images && !state.offline && chosen.show !== "all" && sweeps.length > 0 && picture.sensors.some((sensor) => sensor.shown);
   box.hidden = !on;
   if (!on) return;
   const shown = [...picture.sensors.entries()].filter(([, sensor]) => sensor.shown && sensor.sweeps.length).slice(0, MOST_IMAGES);
@@ -625,7 +686,7 @@ function linkText() {
   const { position } = picture.camera, { target } = picture.controls;
   const three = (place) => place.toArray().map((value) => +value.toPrecision(7)).join(",");
   const words = {
-    camera: `${three(position)};${three(target)}`, colour: chosen.colour, scene: chosen.scene, show: chosen.show, time: chosen.time.toFixed(6),
+    camera: `${three(position)};${three(target)}`, colour: chosen.colour, scene: chosen.scene, show: chosen.show, opacity: chosen.opacity, time: chosen.time.toFixed(6),
     clip: chosen.clip.map((pair) => pair.map((value) => value ?? "").join(",")).join(";"), size: chosen.size.toFixed(3),
   };
   if (picture.isParallel) words.parallel = picture.viewHeight.toPrecision(7);
@@ -652,6 +713,7 @@ function readLink() {
   if ([...(state.scene ?? []), HIDDEN].includes(get("scene"))) chosen.scene = get("scene");
   if (SHOWS.some(([value]) => `${value}` === get("show"))) { chosen.show = get("show"); clock.own = true; }
   if (get("size")) chosen.size = picture.pointScale = Math.min(10, Math.max(0.1, +get("size") || 1));
+  chosen.opacity = words.has("opacity") ? Math.min(1, Math.max(0, +get("opacity") || 0)) : chosen.scene === "grey" ? FAINT : 1;
   chosen.time = Math.min(Math.max(+get("time") || 0, 0), state.duration);
   for (const entry of get("filter").split(";").filter(Boolean)) {
     const [name, low, high] = entry.split(",");
@@ -699,7 +761,7 @@ function takeState(told) {
   }
   picture.setSensors(own);
   picture.setActors(state.actors.map((actor, k) => ({
-    ...actor, object: state.statics + k, colour: state.actor_colours[k],
+    label: [actor.name, state.classes[actor.class] ?? ""].filter(Boolean).join(" · "), object: state.statics + k, colour: state.actor_colours[k],
     corners: arrays[`mesh${arrays.actor_mesh[k]}_corners`], own: arrays[`mesh${arrays.actor_mesh[k]}_colours`],
     times: arrays[`actor${k}_times`], places: arrays[`actor${k}_places`], turns: arrays[`actor${k}_turns`],
     there: arrays[`actor${k}_there`],
@@ -746,8 +808,9 @@ async function news(told) {
 function tellRun(told) {
   const since = told.seconds === null ? "" : `, ${number(told.seconds, 1)} s`;
   const pace = told.rate && !told.over ? `, ${told.rate}  ${told.left && `${told.left} left`}` : "";
+  if (NARROW.matches && !lost) say(told.over ? "" : told.state);
   const head = element("div", {}, element("b", { textContent: told.state }), since, pace);
-  replace(panel.progress, head, ...(told.over ? [] : told.stages.map(count)), ...told.slots.map(count));
+  replace(panel.progress, head, ...(told.over ? [] : told.stages.map(count)), ...told.slots.map(slots));
 }
 
 function keys(event) {
@@ -759,7 +822,7 @@ function keys(event) {
   const acts = {
     " ": () => setPlaying(!playing), ArrowLeft: () => stepBy(event.shiftKey ? -10 : -1), ArrowRight: () => stepBy(event.shiftKey ? 10 : 1),
     Home: () => stepBy(-1e9), End: () => stepBy(1e9), a: () => look("all"), t: () => look("top"), s: () => look("side"), f: () => look("front"),
-    p: () => { picture.useParallel(!picture.isParallel); panel.parallel.box.checked = picture.isParallel; }, c: copyLink,
+    h: () => showPanel(document.documentElement.classList.contains("no-panel")), r: nextResult, p: () => { picture.useParallel(!picture.isParallel); panel.parallel.box.checked = picture.isParallel; }, c: copyLink,
   };
   const timed = [" ", "ArrowLeft", "ArrowRight", "Home", "End"];
   const act = acts[letter ? key.toLowerCase() : key];
@@ -780,24 +843,34 @@ function mouse() {
 }
 
 async function begin() {
-  document.documentElement.classList.toggle("plain", new URLSearchParams(location.search).has("plain"));
+  const plain = new URLSearchParams(location.search).has("plain");
+  document.documentElement.classList.toggle("plain", plain);
+  $("open").append(iconButton("panel", "Show the panel (H)", () => showPanel(true)));
+  const fit = () => showPanel(!plain && !NARROW.matches);
+  NARROW.addEventListener("change", fit);
+  fit();
   const told = await follow("state", () => ({}), NEWS_MS, (it) => {
     if (it.columns) return true;
     $("panel").replaceChildren(panel.progress, stop); // its only job has not begun
     tellRun(it);
-    say(it.failures[0]?.error ?? "", true);
+    if (it.failures[0]) say(it.failures[0].error, true);
     return false;
   });
   say("Reading …");
   picture.resize();
   picture.frame(told.box, told.arrays.corners, told.bounds); // the size of sensors depends on it
+  drives = !told.live && told.sensors.some((sensor) => sensor.moves);
+  chosen.rays = !drives; // they would hide the road
+  if (told.results.length) chosen.colour = "result";
   takeState(told);
   const words = readLink();
+  picture.opacity = chosen.opacity;
   buildPanel();
   picture.setTheme(document.documentElement.dataset.theme);
   buildSteps();
   buildTime();
   picture.setTime(chosen.time);
+  if (drives) look("sensor");
   if (!$("time").hidden) tellTime();
   setClip(chosen.clip);
   showRays();

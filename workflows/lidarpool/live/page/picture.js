@@ -1,6 +1,6 @@
 // The 3D picture: points with eye-dome lighting, surfaces, sensors, actors, path, camera.
 import * as THREE from "./three.min.js";
-import { element } from "./controls.js";
+import { element, saveFile } from "./controls.js";
 
 THREE.ColorManagement.enabled = false; // colours are those of the legends
 
@@ -10,7 +10,7 @@ const THEMES = {
 };
 const RED = 0xe0182d, GREEN = 0x149650, DISC = 0x78828f, MARK = 0xff00a0;
 const FOV = 45; // degrees, from the upper to the lower edge
-const SIDES = { all: [0.55, -1, 0.62], top: [0, 0, 1], side: [1, 0, 0], front: [0, -1, 0] };
+const SIDES = { all: [0.55, -1, 0.62], inside: [0.3, -0.6, 1], top: [0, 0, 1], side: [1, 0, 0], front: [0, -1, 0] };
 const PICKED_WITHIN = 6; // pixels
 const SAME_SURFACE = 1.03; // times the distance of the nearest
 const AS_POINTS = 0.25; // alpha of pixels that are points: only these get eye-dome lighting
@@ -38,24 +38,25 @@ const POINT_FRAGMENT = `
   }`;
 
 // Eye-dome lighting: Boucheny, "Visualisation scientifique de grands volumes de données" (2009).
-// A pixel is darker the more its neighbours lie before it.
+// A pixel is darker the more its neighbours lie before it. Surfaces are a picture of their own,
+// which is laid over: lightly where it is before something, so that walls do not hide the points.
 const SHADE_VERTEX = `
   varying vec2 at;
   void main() { at = uv; gl_Position = vec4(position.xy, 0.0, 1.0); }`;
 const SHADE_FRAGMENT = `
-  uniform sampler2D picture, depths;
+  uniform sampler2D picture, depths, surface, surfaceDepths;
   uniform vec2 pixel;
-  uniform float near, far, strength;
+  uniform float near, far, strength, opacity;
   uniform bool flat_;
   varying vec2 at;
   const float NOTHING = -1e9;
+  float scaled(float d) { return flat_ ? d * (far - near) : log2(near * far / (far - d * (far - near))); }
   float depth(vec2 where_) {
     float d = texture2D(depths, where_).x;
-    if (d >= 1.0) return NOTHING;
-    return flat_ ? d * (far - near) : log2(near * far / (far - d * (far - near)));
+    return d >= 1.0 ? NOTHING : scaled(d);
   }
   void main() {
-    vec4 found = texture2D(picture, at);
+    vec4 found = texture2D(picture, at), wall = texture2D(surface, at);
     float own = depth(at), sum = 0.0;
     if (strength > 0.0 && found.a > 0.1 && found.a < 0.6 && own > NOTHING) {
       for (int k = 0; k < 8; k++) {
@@ -64,7 +65,11 @@ const SHADE_FRAGMENT = `
         if (other > NOTHING) sum += min(strength * max(0.0, own - other), 1.2);
       }
     }
-    gl_FragColor = vec4(found.rgb * exp(-sum / 8.0), 1.0);
+    vec3 shown = found.rgb * exp(-sum / 8.0);
+    float before = own - scaled(texture2D(surfaceDepths, at).x);
+    if (own == NOTHING) shown = mix(shown, wall.rgb, wall.a * mix(opacity, 1.0, 0.4));
+    else if (before > (flat_ ? 0.1 : 0.03)) shown = mix(shown, wall.rgb, wall.a * opacity);
+    gl_FragColor = vec4(shown, 1.0);
   }`;
 
 const lerp = (a, b, share) => a + (b - a) * share;
@@ -78,6 +83,12 @@ export function lastNotAbove(numbers, value) {
     else high = middle;
   }
   return low - 1;
+}
+
+// Ends of the twelve edges of a box.
+function edgesOf({ min, max }) {
+  const corner = (k) => [k & 1 ? max.x : min.x, k & 2 ? max.y : min.y, k & 4 ? max.z : min.z];
+  return [1, 2, 4].flatMap((side) => [0, 1, 2, 3, 4, 5, 6, 7].filter((k) => !(k & side)).flatMap((k) => [...corner(k), ...corner(k + side)]));
 }
 
 // Position at a time of something that was at places (k, 3) at ascending times.
@@ -96,10 +107,12 @@ export class Picture {
     this.renderer.outputColorSpace = THREE.LinearSRGBColorSpace;
     this.renderer.localClippingEnabled = true;
     this.scene = new THREE.Scene();
-    this.scene.add(new THREE.HemisphereLight(0xffffff, 0xb9bdc4, 2.1));
-    const sun = new THREE.DirectionalLight(0xffffff, 1.4);
-    sun.position.set(0.15, -0.75, 1.2);
-    this.scene.add(sun);
+    this.solid = new THREE.Scene(); // the surfaces, and the grid below them
+    for (const lit of [this.scene, this.solid]) {
+      const sun = new THREE.DirectionalLight(0xffffff, 1.4);
+      sun.position.set(0.15, -0.75, 1.2);
+      lit.add(new THREE.HemisphereLight(0xffffff, 0xb9bdc4, 2.1), sun);
+    }
     this.perspective = new THREE.PerspectiveCamera(FOV, 1, 0.1, 1000);
     this.parallel = new THREE.OrthographicCamera(-1, 1, 1, -1, 0, 1000);
     for (const camera of [this.perspective, this.parallel]) camera.up.set(0, 0, 1);
@@ -126,6 +139,8 @@ export class Picture {
     this.extent = 1;
     this.pointScale = 1;
     this.strength = 1;
+    this.opacity = 0.2;
+    this.boxes = true;
     this.dirty = true;
     this.theme = "light";
     new ResizeObserver(() => this.resize()).observe(canvas);
@@ -133,12 +148,14 @@ export class Picture {
   }
 
   makePasses() {
-    this.target = new THREE.WebGLRenderTarget(4, 4, { samples: 4, depthTexture: new THREE.DepthTexture(4, 4, THREE.FloatType) });
+    [this.target, this.solidTarget] = [0, 1].map(() =>
+      new THREE.WebGLRenderTarget(4, 4, { samples: 4, depthTexture: new THREE.DepthTexture(4, 4, THREE.FloatType) }));
     this.shading = new THREE.ShaderMaterial({
       vertexShader: SHADE_VERTEX, fragmentShader: SHADE_FRAGMENT, depthTest: false, depthWrite: false,
       uniforms: {
         picture: { value: this.target.texture }, depths: { value: this.target.depthTexture }, pixel: { value: new THREE.Vector2() },
-        near: { value: 1 }, far: { value: 2 }, strength: { value: 0 }, flat_: { value: false },
+        surface: { value: this.solidTarget.texture }, surfaceDepths: { value: this.solidTarget.depthTexture },
+        near: { value: 1 }, far: { value: 2 }, strength: { value: 0 }, opacity: { value: 1 }, flat_: { value: false },
       },
     });
     this.screen = new THREE.Scene();
@@ -152,7 +169,7 @@ export class Picture {
     const ratio = Math.min(window.devicePixelRatio, 2);
     this.renderer.setPixelRatio(ratio);
     this.renderer.setSize(width, height, false);
-    this.target.setSize(Math.round(width * ratio), Math.round(height * ratio));
+    for (const target of [this.target, this.solidTarget]) target.setSize(Math.round(width * ratio), Math.round(height * ratio));
     this.perspective.aspect = width / height;
     this.perspective.updateProjectionMatrix();
     const half = this.parallel.top;
@@ -180,7 +197,7 @@ export class Picture {
   }
 
   addGrid() {
-    if (this.grid) this.scene.remove(this.grid);
+    if (this.grid) this.solid.remove(this.grid);
     const [low, high] = this.box;
     const step = 10 ** Math.floor(Math.log10(this.extent / 4));
     const lines = [];
@@ -194,7 +211,7 @@ export class Picture {
     for (let y = ends[1][0]; y <= ends[1][1]; y++) lines.push(x0, y * step, z, x1, y * step, z);
     this.gridStep = step;
     this.grid = this.thinLines(lines, THEMES[this.theme].grid);
-    this.scene.add(this.grid);
+    this.solid.add(this.grid);
   }
 
   thinLines(numbers, color) {
@@ -252,15 +269,15 @@ export class Picture {
     const count = Math.max(1, this.drawn);
     const { size, least, most } = this.pointMaterial.uniforms;
     const ratio = this.renderer.getPixelRatio();
-    size.value = this.pointScale * this.extent * Math.min(0.0035, 0.9 / Math.sqrt(count));
-    least.value = ratio * (count < 20_000 ? 3.5 : count < 200_000 ? 2.2 : 1.5) * Math.sqrt(this.pointScale);
+    size.value = this.pointScale * this.extent * Math.min(0.0035, 1.2 / Math.sqrt(count));
+    least.value = ratio * (count < 20_000 ? 3.5 : count < 3_000_000 ? 2.2 : 1.5) * Math.sqrt(this.pointScale);
     most.value = ratio * Math.max(2, 7 * this.pointScale);
     this.dirty = true;
   }
 
   setSurface(told) {
     if (this.surface) {
-      this.scene.remove(this.surface);
+      this.solid.remove(this.surface);
       this.surface.geometry.dispose();
       this.surface = null;
     }
@@ -276,7 +293,7 @@ export class Picture {
     this.surface = new THREE.Mesh(geometry, this.surfaceMaterial);
     this.surface.frustumCulled = false;
     this.surface.objects = told.arrays.objects;
-    this.scene.add(this.surface);
+    this.solid.add(this.surface);
     this.showObjects(this.onlyObjects);
   }
 
@@ -314,8 +331,17 @@ export class Picture {
       actor.mesh.frustumCulled = false;
       geometry.computeBoundingBox();
       actor.top = geometry.boundingBox.max.z;
+      actor.box = this.thickLines(edgesOf(geometry.boundingBox), new THREE.Color(...actor.colour.map((byte) => byte / 255)), 2);
+      actor.box.visible = this.boxes;
+      actor.mesh.add(actor.box);
       this.scene.add(actor.mesh);
     }
+  }
+
+  showBoxes(on) {
+    this.boxes = on;
+    for (const actor of this.actors) actor.box.visible = on;
+    this.dirty = true;
   }
 
   // by: "object" for a colour each, "colour" for those of their files
@@ -424,7 +450,7 @@ export class Picture {
     for (const sensor of this.sensors)
       if (!sensor.moves && sensor.shown && sensor.at) names.push([sensor.name || "sensor", sensor.at]);
     for (const actor of this.actors)
-      if (actor.mesh.visible && actor.at) names.push([actor.name, [actor.at[0], actor.at[1], actor.at[2] + actor.top]]);
+      if (this.boxes && actor.mesh.visible && actor.at) names.push([actor.label, [actor.at[0], actor.at[1], actor.at[2] + actor.top]]);
     return [...names, ...(this.path?.ends ?? [])].slice(0, 100);
   }
 
@@ -445,7 +471,7 @@ export class Picture {
 
   // So far away that all corners are within 0.9 of the picture.
   look(side) {
-    const away = new THREE.Vector3(...SIDES[side]).normalize();
+    const away = new THREE.Vector3(...SIDES[side === "all" && this.roofed ? "inside" : side]).normalize();
     const up = new THREE.Vector3(0, side === "top" ? 1 : 0, side === "top" ? 0 : 1);
     const right = up.clone().cross(away).normalize(), tall = away.clone().cross(right);
     const slope = 0.9 * Math.tan((FOV * Math.PI) / 360);
@@ -476,8 +502,8 @@ export class Picture {
       const way = b.sub(a).setZ(0);
       if (way.length() > 1e-6) ahead.copy(way.normalize());
     }
-    const back = 0.045 * this.extent, target = this.carrier.clone().addScaledVector(ahead, 0.1 * this.extent);
-    const eye = this.carrier.clone().addScaledVector(ahead, -back).add(new THREE.Vector3(0, 0, back / 2));
+    const back = 0.14 * this.extent, target = this.carrier.clone().addScaledVector(ahead, 0.3 * this.extent);
+    const eye = this.carrier.clone().addScaledVector(ahead, -back).add(new THREE.Vector3(0, 0, 0.6 * back));
     if (moving && this.carrier.z - this.middle.z > 0.1 * this.extent) target.z = this.middle.z; // the ground is far below
     this.useParallel(false);
     this.place(eye, target);
@@ -555,9 +581,13 @@ export class Picture {
     shade.far.value = this.camera.far;
     shade.flat_.value = this.isParallel;
     shade.strength.value = this.strength * (this.isParallel ? 144 / this.viewHeight : 120);
-    this.renderer.setRenderTarget(this.target);
-    this.renderer.clear();
-    this.renderer.render(this.scene, this.camera);
+    shade.opacity.value = this.opacity;
+    this.renderer.setClearColor(0, 0);
+    for (const [target, scene] of [[this.target, this.scene], [this.solidTarget, this.solid]]) {
+      this.renderer.setRenderTarget(target);
+      this.renderer.clear();
+      this.renderer.render(scene, this.camera);
+    }
     this.renderer.setRenderTarget(null);
     this.renderer.render(this.screen, this.screenCamera);
     this.drawLabels();
@@ -673,10 +703,6 @@ export class Picture {
   save(name) {
     this.dirty = true;
     this.draw();
-    this.canvas.toBlob((file) => {
-      const link = element("a", { href: URL.createObjectURL(file), download: name });
-      link.click();
-      URL.revokeObjectURL(link.href);
-    });
+    this.canvas.toBlob((file) => saveFile(file, name));
   }
 }

@@ -11,6 +11,11 @@ export const count = ([label, done, whole]) => element(
   element("span", { textContent: `${done.toLocaleString("en")} / ${whole.toLocaleString("en")}` }), meter(whole ? done / whole : 0),
 );
 
+export const slots = ([label, share, whole]) => element(
+  "div", { className: "count" }, element("span", { textContent: label }),
+  element("span", { textContent: `${Math.round(100 * share)} % of ${whole}`, title: "over the last seconds" }), meter(share),
+);
+
 // Leaves alone what shows this already.
 export function replace(box, ...children) {
   const made = element("div", {}, ...children);

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import io
 import math
 import re
+from base64 import b64encode
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Mapping, Sequence
 from datetime import UTC, datetime
@@ -16,13 +18,16 @@ import numpy as np
 import yaml
 from jinja2 import Environment, PackageLoader, StrictUndefined, Template
 from markupsafe import Markup
+from PIL import Image
 
 from poolpart import TaskRecord
 
+from ...base.arrays import Ints
 from ...base.declared import declared
-from ...base.words import natural, plural
+from ...base.errors import explained
+from ...base.storage import Storage
+from ...base.words import natural, plural, shortened, without_common_prefix
 from ...pipeline.task_book import StageTotals, union
-from ...render.picture_page import shortened, without_common_prefix
 from ...render.stage import nice_step
 from ...run.run_result import RunResult
 from ...scenario.scenario import Scenario
@@ -47,12 +52,11 @@ def write_page(
     report: Mapping[str, Any],
     result: RunResult,
     cloud: CountedCloud,
-    pictures: Mapping[str, str],
     scenario: Scenario | None = None,
 ) -> None:
     """Write a report as one HTML file that needs no other files and no network.
 
-    Most numbers are those of `report`, from `make_report`; `pictures` are SVG elements by name.
+    Most numbers are those of `report`, from `make_report`. `put_picture` adds pictures.
 
     Raises
     ------
@@ -63,13 +67,37 @@ def write_page(
         "page.html",
         report=report,
         cloud=cloud,
-        pictures=pictures,
+        pictures={"above": from_above(cloud.above)},
         changed=_changed,
         kinds={"returns": Returns, "noise": Noise, "weather": Weather},
         scenario=_written(scenario) if scenario else "",
         stages=result.stages,
     )
     path.write_text(text, encoding="utf-8")
+
+
+def put_picture(page: Path, name: str, svg: str) -> None:
+    """Put a picture in its place in a page that `write_page` wrote; other pages stay as they are.
+
+    LidarpoolError if it cannot be written.
+    """
+    place = re.compile(rf'(<figure data-picture="{name}").*?(?=<figcaption>)', re.DOTALL)
+    with explained(f"{page} cannot be written"):
+        text = place.sub(lambda found: f"{found[1]}>{svg}", page.read_text(encoding="utf-8"))
+        Storage.at(page.parent, durable=False).write(page.name, text.encode())
+
+
+def from_above(counts: Ints) -> str:
+    """Draw numbers of points (rows, columns), the first row in the south, as SVG."""
+    rows, columns = counts.shape
+    pixels = np.full((rows, columns, 4), (53, 105, 176, 0), np.uint8)
+    shade = np.log1p(counts[::-1])
+    pixels[..., 3] = 255 * shade / max(shade.max(), 1)
+    data = io.BytesIO()
+    Image.fromarray(pixels).save(data, "PNG")
+    source = f"data:image/png;base64,{b64encode(data.getvalue()).decode()}"
+    size = f'width="{columns}" height="{rows}" style="image-rendering: pixelated"'
+    return f'<svg viewBox="0 0 {columns} {rows}"><image {size} href="{source}"/></svg>'
 
 
 def rendered(
@@ -220,9 +248,9 @@ def code(text: str) -> Markup:
 
 def duration(seconds: float) -> str:
     """Return a time in the unit that suits it."""
-    if seconds < 0.001:
+    if 0 < seconds < 0.001:
         return f"{1e6 * seconds:.0f} µs"
-    if seconds < 0.9995:
+    if 0 < seconds < 0.9995:
         return f"{1e3 * seconds:.3g} ms"
     if seconds < 99.95:
         return f"{seconds:.3g} s"
@@ -258,20 +286,21 @@ def excess(fraction: float) -> str:
     return f"{fraction:+.2%}".replace("-", MINUS)
 
 
-def formatted(value: Any, digits: int = 6) -> str:
-    """Return a number, whole ones with all their digits; text, true or false, or several."""
+def formatted(value: Any) -> str:
+    """Return a number of four digits, or to a tenth, whole ones with all; text, or several."""
     if isinstance(value, bool):
         return "yes" if value else "no"
     if isinstance(value, list | tuple):
-        return " × ".join(formatted(one, digits) for one in value)
+        return " × ".join(map(formatted, value))
     if isinstance(value, float):
-        return f"{value:,.{digits}g}"
+        digits = ".1f" if 1000 <= abs(value) < 1e9 else ".4g"
+        return f"{value:,{digits}}".removesuffix(".0")
     return f"{value:,}" if isinstance(value, int) else str(value)
 
 
 def numbers(values: Sequence[float]) -> str:
-    """Coordinates, short."""
-    return ", ".join(f"{value:,.10g}" for value in values).replace("-", MINUS)
+    """Coordinates in metres, to the millimetre."""
+    return ", ".join(f"{round(value, 3) + 0.0:,.10g}" for value in values).replace("-", MINUS)
 
 
 def millimetres(value: float | None) -> str:
