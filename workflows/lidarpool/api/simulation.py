@@ -212,8 +212,7 @@ class Campaign(described.CampaignSpec):  # noqa: D101 - as there
         wait_s, patience_s
             As for `simulate`.
         shard
-            (3, 10): do the third of ten equal shares of the jobs, for `lidarpool.merge`. Job n is
-            of share n % 10 + 1.
+            (3, 10): do the third of ten equal shares of the jobs, for `lidarpool.merge`.
 
         Returns
         -------

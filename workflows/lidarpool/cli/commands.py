@@ -24,7 +24,7 @@ from ..base.interrupts import (
     deferred_interrupts,
     interrupt_on_signals,
 )
-from ..base.shard import ALL, Shard
+from ..base.shard import ALL
 from ..base.vocabulary import PATIENCE_S, QUEUE_S, WAIT_S
 from ..base.words import plural
 from . import shared_options as shared
@@ -183,11 +183,10 @@ def run(
     options: RunOptions,
     scenarios: tuple[str, ...],
     of_mesh: dict[str, Any],
-    no_plan: bool,
     extent: str | None,
     number: int | None,
-    shard: Shard | None,
     backend: str | None,
+    **given: Any,
 ) -> None:
     """Run the survey of a scenario or mesh file, or a campaign of many.
 
@@ -216,7 +215,7 @@ def run(
 
     if options.fresh and (options.resume or options.verify):
         raise click.UsageError("--resume continues the run that --fresh deletes: give one of them.")
-    if number is not None and shard is not None:
+    if number is not None and given["shard"] is not None:
         raise click.UsageError("--job does one job, and --shard a share: give one of them.")
     if options.retry_failed and (options.fresh or number is not None):
         raise click.UsageError("--retry-failed goes on with a campaign: not with --fresh or --job.")
@@ -240,14 +239,13 @@ def run(
                 "--only and --pictures are for one survey: a data set is written as a whole."
             )
         else:
-            run_campaign(campaign.of_shard(shard or ALL), terminal, options, backend)
+            run_campaign(campaign.of_shard(given["shard"] or ALL), terminal, options, backend)
     elif options.retry_failed or options.verify or number is not None:
         raise click.UsageError("--job, --retry-failed and --verify are for campaigns.")
     else:
         scenario = Scenario.load(paths[0], of_mesh)
-        more: dict[str, Any] = {"no_plan": no_plan, "extent": extent, "shard": shard}
-        more["made_of"] = {"path": str(paths[0].absolute()), "options": of_mesh}
-        run_scenario(scenario, terminal, options, backend, **more)
+        given["made_of"] = {"path": str(paths[0].absolute()), "options": of_mesh}
+        run_scenario(scenario, terminal, options, backend, extent=extent, **given)
 
 
 @cli.command()
@@ -263,9 +261,7 @@ def run(
 @shared.flag("--quiet", "-q", help="No progress, only the result.")
 @shared.as_json
 def merge(shards: tuple[Any, ...], out: Any, quiet: bool, as_json: bool, **given: Any) -> None:
-    """Make one data set or result of the folders of shards.
-
-    After a kill, the same command goes on. Shards of a campaign can be added later.
+    """Make one data set or result of shards; after a kill, the same command goes on.
 
     \b
     Examples:

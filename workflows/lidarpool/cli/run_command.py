@@ -69,8 +69,8 @@ def run_scenario(
         _run_survey(built, job, options, terminal, extent)
         return
     assert options.out is not None, "commands write"
-    told = {"plans": not no_plan, "extent": extent or "page", "scans": job.survey.scan_count}
-    jobs, output = OneJob(job, shard), Kept({**made_of, **told})
+    more = {"plans": not no_plan, "extent": extent or "page", "scans": job.survey.scan_count}
+    jobs, output = OneJob(job, shard), Kept({**made_of, **more})
     with result_folder(options.out), page_of(jobs, options.live) as page:
         result = Conductor(jobs, options, output, terminal, page)()
     points, lines = len(result.points), [f"note: {note}" for note in result.notes]

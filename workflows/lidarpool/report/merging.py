@@ -169,7 +169,7 @@ def _of_survey(place: Storage, run: Storage) -> _Part:
 def _check(parts: Sequence[_Part], partial: bool, own: _Part | None = None) -> list[str]:
     """Check that all are of one run, and none is missing but with `partial`; returns all notes.
 
-    Others may have what the place has as its `own`. LidarpoolError names the parts that are wrong.
+    Others may have what is in `own`, too. LidarpoolError names the parts that are wrong.
     """
     mistakes, wanted = Mistakes(), software()
     first, seen = "the software here", dict[int, _Part]()

@@ -40,7 +40,7 @@ def identity_of(job: Job) -> dict[str, str]:
 
 @dataclass(frozen=True, eq=False)
 class OneJob:
-    """A survey, as the only job of its run, which does the scans of a shard of it."""
+    """A survey, as the only job of its run, which does the scans of a shard."""
 
     job: Job
     shard: Shard = ALL
