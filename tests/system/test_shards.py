@@ -14,6 +14,7 @@ import pyarrow.parquet
 import pytest
 from distributed import Client
 from tests.clusters import thread_cluster
+from tests.killed_drivers import drive
 from tests.rows import quick
 
 from lidarpool import Campaign, LidarpoolError, merge
@@ -412,6 +413,18 @@ def _another_shard_in_the_folder(survey: Path, lidarpool: Callable[..., Any], sl
             assert refused.code == 2 and "it is shard 2/3, not" in refused.err, refused
     assert lidarpool(*run, "--shard", "2/3", "--resume").code == 0
     assert content(survey / "part-2").keys() == before.keys()
+
+
+def test_killed_drivers_of_a_shard_leave_the_same_points(tmp_path, slots):
+    (tmp_path / "s.yaml").write_text(SURVEY)
+    run = ["s.yaml", "-q", "--scheduler", slots]
+    kills = [("COMMIT", 2), ("COMMIT", 1), ("", 1)]
+    shard = [*run, "--resume", "--shard"]
+    assert drive(tmp_path, kills, *shard, "1/2", "--out", "part-1") == [-9, -9, 0]
+    for command in ([*shard, "2/2", "--out", "part-2"], [*run, "--out", "one"]):
+        assert drive(tmp_path, [("", 1)], *command) == [0]
+    merge([tmp_path / "part-1", tmp_path / "part-2"], tmp_path / "all")
+    assert content(tmp_path / "all") == content(tmp_path / "one")
 
 
 # -- shards ---------------------------------------------------------------------------------------

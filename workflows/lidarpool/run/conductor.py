@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from typing import Any, Generic, TypeVar
 
 from ..base.errors import LidarpoolError
+from ..base.shard import ALL
 from ..base.storage import Storage
 from ..datasets.dataset import DataSet
 from ..datasets.job_table import JobRow
@@ -131,7 +132,8 @@ class Conductor(Generic[R]):
         with self.screen.status(checking) if self.goes_on else nullcontext():
             place = options.folder, options.parts
             self.store = RunStore(self.jobs, options.backend, *place, resume=self.resume)
-        if options.resume and self.store.only and not (self.store.kept or self.store.notes):
+        told = self.store.kept or self.store.notes or self.jobs.shard != ALL  # of a queue's task
+        if options.resume and self.store.only and not told:
             self.store.notes.append(f"there was nothing to resume in {options.out or place[0]}")
         self.stack.enter_context(self.store.kept_on_error())
         if self.store.only is not None:
