@@ -43,8 +43,7 @@ def footprint(returns: Returns, distance: float) -> NDArray[np.float64]:
     """Where the sub-rays of a beam hit a wall: (k, 2), metres across and up."""
     scene = Scene.from_meshes([wall("Wall", distance)])
     rig = Rig(scene, Survey(SENSOR, poses=[(0, 0, 0)], steps=1, returns=returns), "numpy")
-    beams = rig._pulses[0].emitter.repeated(rig.pattern(0, 0, 1))
-    assert beams is not None
+    beams = rig._pulses[0].emitter.divided(rig.pattern(0, 0, 1))
     starts, directions = beams.rays(np.arange(len(beams)), (0, 0, 0))
     hits = rig._caster.caster.cast(starts, directions)
     ends = starts + hits.distance[:, None] * directions

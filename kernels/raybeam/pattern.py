@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from copy import copy
 from functools import cache, cached_property
 from importlib.util import find_spec
 from operator import index
@@ -71,6 +72,22 @@ class Pattern:
         self.offsets: Floats | None = None  # (2, n)
         if sub_rays is not None and offsets is not None:
             self.offsets = np.ascontiguousarray(np.asarray(offsets, np.float64).T)
+
+    def divided(
+        self, sub_rays: SubRays, offsets: Floats | None = None, rows: Ints | None = None
+    ) -> Pattern:
+        """Return the beams, or those of some rows (m,), with sub-rays; they are not checked again.
+
+        `offsets` (m, 2) are as of `Pattern`.
+        """
+        _ = self.step  # which the copies keep: it takes as long as 10,000 rays
+        made = copy(self)
+        if rows is not None:
+            made._directions = self._directions[:, rows]
+            made._origins = None if self._origins is None else self._origins[:, rows]
+        made.sub_rays = sub_rays
+        made.offsets = None if offsets is None else np.ascontiguousarray(offsets.T)
+        return made
 
     def __len__(self) -> int:
         return self._directions.shape[1] * self.each

@@ -50,7 +50,6 @@ class PulseCaster:
         self,
         scan: int,
         pattern: Pattern,
-        divided: Pattern | None,
         poses: Poses,
         window: tuple[int, int],
         groups: Ints,
@@ -59,16 +58,13 @@ class PulseCaster:
     ) -> Scanned:
         """Cast scans from number `scan` on: hits in the sensor's range, counted and thinned out.
 
-        `divided` are sub-rays of the pattern, if they were made before; the others are arguments
-        of `RayCaster.scan`, where each group is a scan.
+        The others are arguments of `RayCaster.scan`, where each group is a scan.
         """
         first, rays = window[0], window[1] - window[0]
-        if len(self.emitter) == 1 and not self._setup.noise.angle_deg:
-            divided = pattern
 
         def batch(start: int, stop: int) -> PulseBatch:
             keys = Keys(scan, groups)
-            return PulseBatch(keys, start, stop, pattern, first, poses, self.emitter, divided)
+            return PulseBatch(keys, start, stop, pattern, first, poses, self.emitter)
 
         whole = batch(0, rays)
         if self._setup.several:

@@ -34,7 +34,6 @@ class _Rays(NamedTuple):
     """Rays of a sensor that are made once."""
 
     pattern: Pattern | None  # some firings, or one period of the head; None if that is too long
-    subrays: Pattern | None  # of the pattern, if they are few
     # Whether they are one firing in the axes of the head, each firing with a pose of its own; else
     # they are in the axes of the carrier.
     by_head: bool = False
@@ -76,7 +75,7 @@ class Rig:
         self._see()
         check_trajectory(survey.path)
         self._made: dict[tuple[int, bool], _Rays] = {}  # {(sensor, whether it moves): rays}
-        self._firings: dict[tuple[int, int, int], _Rays] = {}  # {(sensor, first, stop): rays}
+        self._firings: dict[tuple[int, int, int], Pattern] = {}  # {(sensor, first, stop): rays}
         for number in range(len(survey.carried)):
             self._repeated(number, survey.path.moves)
 
@@ -86,14 +85,13 @@ class Rig:
         if made is None:
             sensor = self.survey.carried[number].sensor
             repeats, by_head = rays_repeat(sensor, moves)
-            made = _Rays(None, None)
+            made = _Rays(None)
             if by_head:
                 origin = sensor.beams.origin if sensor.centre is None else None
                 pattern = Pattern(sensor.ahead, origin)
-                subrays = self._pulses[number].emitter.repeated(pattern, by_head=True)
-                made = _Rays(pattern, subrays, by_head=True)
+                made = _Rays(pattern, by_head=True)
             elif repeats:
-                made = self._rays_of(number, 0, sensor.period or 0)
+                made = _Rays(self._rays_of(number, 0, sensor.period or 0))
             self._made[number, moves] = made
         return made
 
@@ -191,7 +189,7 @@ class Rig:
         triangle are counted if `tally`.
         """
         number, survey = specs[0].sensor, self.survey
-        whole, subrays, by_head = self._repeated(number, path.moves)
+        whole, by_head = self._repeated(number, path.moves)
         carried = survey.carried[number]
         channels = carried.sensor.channels
         first, stop = specs[0].firings[0], specs[-1].firings[1]
@@ -215,9 +213,7 @@ class Rig:
         if self._device is not None:
             return self._device.returns(specs, pattern, poses, window, groups)
         scan = specs[0].scan + specs[0].ahead
-        found = self._pulses[number].scan(
-            scan, pattern, subrays, poses, window, groups, tally=tally
-        )
+        found = self._pulses[number].scan(scan, pattern, poses, window, groups, tally=tally)
         return BatchPoints(self.scene, survey, self._surfaces, specs, found, pattern, start, poses)
 
     def _timed(self, poses: Poses, specs: list[ScanSpec], times: int = 1) -> Poses:
@@ -244,8 +240,7 @@ class Rig:
         number = specs[0].sensor
         sensor = self.survey.carried[number].sensor
         first, stop = specs[0].firings[0], specs[-1].firings[1]
-        pattern, subrays, _ = self._rays_of(number, first, stop)
-        assert pattern is not None  # however long it is
+        pattern = self._rays_of(number, first, stop)
         begin_rays = np.array([spec.firings[0] - first for spec in specs]) * sensor.channels
         rays = len(pattern)
         out = np.full((len(positions), rays), np.inf, np.float32)
@@ -260,22 +255,20 @@ class Rig:
             scan = specs[0].scan + specs[0].ahead + begin * len(specs)
             window = (0, len(image))
             caster = self._pulses[number]
-            found = caster.scan(scan, pattern, subrays, poses, window, groups, tally=False).returns
+            found = caster.scan(scan, pattern, poses, window, groups, tally=False).returns
             assert found.reported is not None  # of kept returns
             nearest = found.number == 1
             image[found.ray[nearest]] = found.reported[nearest]
         return out.reshape(len(positions), -1, sensor.channels)
 
-    def _rays_of(self, number: int, first: int, stop: int) -> _Rays:
-        """Rays of some firings in the axes of the carrier, and their sub-rays, if they are few."""
+    def _rays_of(self, number: int, first: int, stop: int) -> Pattern:
+        """Rays of some firings in the axes of the carrier."""
         sensor = self.survey.carried[number].sensor
         if sensor.period:
             first, stop = first % sensor.period, first % sensor.period + stop - first
         made = self._firings.get((number, first, stop))
         if made is None:
-            pattern = self.pattern(number, first, stop)
             if len(self._firings) >= KEPT:
                 self._firings.clear()
-            rays = _Rays(pattern, self._pulses[number].emitter.repeated(pattern))
-            made = self._firings[number, first, stop] = rays
+            made = self._firings[number, first, stop] = self.pattern(number, first, stop)
         return made

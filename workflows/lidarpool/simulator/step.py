@@ -15,7 +15,7 @@ import numpy as np
 
 from raybeam import Pattern, SubRays
 
-from ..base.arrays import Floats
+from ..base.arrays import Floats, Ints
 from ..base.vectors import turned
 from ..columns.table import VELOCITY
 from ..scene.scene import Scene
@@ -127,7 +127,6 @@ class Emitter:
 
     def __init__(self, setup: Setup) -> None:
         self.beam = setup.reporting.beam(setup.sensor.optics)
-        self._noisy = setup.noise.angle_deg > 0
         carried = setup.survey.carried[setup.number]
         # The axis that the head turns about, in the carrier's axes: of an oval beam, sub-rays lie
         # across it and towards it.
@@ -139,27 +138,21 @@ class Emitter:
 
     def divided(
         self,
-        directions: Floats,
-        origins: Floats | None,
+        pattern: Pattern,
         offsets: Floats | None = None,
+        rows: Ints | None = None,
         *,
         by_head: bool = False,
     ) -> Pattern:
-        """Give beams sub-rays, with offsets (n, 2) of their angles, radians.
+        """Give beams sub-rays, or those of some rows, with offsets of their angles, radians.
 
         `by_head` says that they are in the axes of the head, and not in those of the carrier.
         """
+        if len(self) == 1 and offsets is None:
+            return pattern
         axis = np.array([0.0, 0, 1]) if by_head else self._axis
         sub_rays = SubRays(self.beam.angles, self.beam.starts, axis if self.beam.oval else None)
-        return Pattern(directions, origins, sub_rays, offsets)
-
-    def repeated(self, pattern: Pattern, *, by_head: bool = False) -> Pattern | None:
-        """Give beams that are cast again and again their sub-rays, if those are always the same."""
-        if self._noisy:
-            return None
-        if len(self) == 1:
-            return pattern
-        return self.divided(pattern.directions, pattern.origins, by_head=by_head)
+        return pattern.divided(sub_rays, offsets, rows)
 
 
 @dataclass(eq=False)
@@ -173,7 +166,6 @@ class PulseBatch:
     first: int  # row of the first of them in it
     poses: Poses  # of all beams of the keys
     emitter: Emitter
-    divided: Pattern | None  # the pattern's sub-rays, if they are always the same
     offsets: Floats | None = None  # of the beams' angles, (n, 2), radians
     hits: PulseReturns | None = None  # of all sub-rays
     planes: Planes | None = None  # of these
@@ -187,19 +179,14 @@ class PulseBatch:
     @cached_property
     def beams(self) -> Pattern:
         """Sub-rays of the beams, and maybe those of others."""
-        if self.divided is not None and self.offsets is None:
-            return self.divided
         rows = (self.first + np.arange(self.start, self.stop)) % len(self.pattern)
-        given, by_head = self.pattern.origins, self.poses.by_head
-        origins = None if given is None else given[rows]
-        ahead = self.pattern.directions[rows]
-        return self.emitter.divided(ahead, origins, self.offsets, by_head=by_head)
+        some = None if self.offsets is None else rows
+        return self.emitter.divided(self.pattern, self.offsets, some, by_head=self.poses.by_head)
 
     @property
     def window(self) -> tuple[int, int]:
         """The first of the sub-rays in `beams`, and behind the last."""
-        own = self.divided is None or self.offsets is not None
-        row = 0 if own else (self.first + self.start) * self.each
+        row = 0 if self.offsets is not None else (self.first + self.start) * self.each
         return row, row + (self.stop - self.start) * self.each
 
     @cached_property
