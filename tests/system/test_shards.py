@@ -427,6 +427,20 @@ def test_killed_drivers_of_a_shard_leave_the_same_points(tmp_path, slots):
     assert content(tmp_path / "all") == content(tmp_path / "one")
 
 
+def test_the_first_shard_plans_though_it_has_no_scans(tmp_path, lidarpool, slots):
+    (tmp_path / "s.yaml").write_text(SURVEY.replace("steps: 25", "steps: 1"))  # two scans
+    run = ["run", tmp_path / "s.yaml", "-q", "--scheduler", slots, "--only", "cloud"]
+    parts = [tmp_path / f"part-{number}" for number in (1, 2, 3)]
+    for number, part in enumerate(parts, 1):
+        assert lidarpool(*run, "--shard", f"{number}/3", "--out", part).code == 0
+    with pytest.raises(LidarpoolError, match=r"^missing: 1 shard, 1/3: give"):
+        merge(parts[1:], tmp_path / "all")
+    report = merge(parts, tmp_path / "all")
+    assert report["planning"]["trials"] == 3 and "report.html" not in report["files"]
+    assert lidarpool(*run, "--out", tmp_path / "one").code == 0
+    assert content(tmp_path / "all") == content(tmp_path / "one")
+
+
 # -- shards ---------------------------------------------------------------------------------------
 
 

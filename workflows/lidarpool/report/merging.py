@@ -198,6 +198,7 @@ def _missing(parts: Sequence[_Part]) -> list[Shard]:
     """List the shards that are not there, or lack jobs by which the campaign has grown."""
     largest, of = max(parts, key=lambda part: part.whole), parts[-1].shards[0].of
     have = {shard.number: len(part.done(shard)) for part in parts for shard in part.shards}
+    have.setdefault(1, -1)  # which plans the path, even if it has no scans
     every = (Shard(number, of) for number in range(1, of + 1))
     return [shard for shard in every if have.get(shard.number, 0) < len(largest.done(shard))]
 
