@@ -40,6 +40,7 @@ from lidarpool import (
     load_robot,
     load_sensor,
     load_trajectory,
+    merge,
     read_cloud,
     remove_run,
     save_cloud,
@@ -126,6 +127,11 @@ WRONG = {
     load_sensor: [(3, "model is 3"), ([1], "text or a path")],
     load_trajectory: [(3, "path is 3"), ([AT], "text or a path")],
     read_cloud: [(3, "path is 3"), (["a.ply"], "text or a path")],
+    merge: [
+        ("part-1", "ds", "shards is 'part-1'"),
+        (["a"], 3, "out is 3"),
+        ([], "ds", "nothing to"),
+    ],
     remove_run: [(3, "folder is 3"), ([], "text or a path")],
     save_cloud: [
         (Cloud(POINTS, {}), 3, "path is 3"),

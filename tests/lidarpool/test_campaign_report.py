@@ -42,12 +42,12 @@ def write(place, rows, picture=None, versions=None, **given):
     """Write the card of a campaign and its run, of which some may be given."""
     of = SimpleNamespace(**{
         "title": "Drives", "count": 31, "seed": 7, "names": NAMES, "license": "CC-BY-4.0",
-        "command": "campaign.yaml", "description": "", "keep": SimpleNamespace(format="kitti"),
+        "command": "campaign.yaml", "description": "", "keep": {"format": "kitti"},
         "sensors": {"roof": "velodyne/vlp16, 10 Hz"}, "seconds": 0.0, "resumed": 0, "notes": (),
         "stages": (), "classes": {},
     } | given)  # fmt: skip
     versions = versions or {"lidarpool": "1.2 (sources 01234567)"}
-    return write_card(place, of, of, rows, versions, picture)
+    return write_card(place, vars(of), of, rows, versions, picture)
 
 
 @pytest.fixture(scope="module")
@@ -140,7 +140,7 @@ def test_letters_of_users_are_escaped(tmp_path):
     write(
         Storage.at(tmp_path, durable=False), rows, title=EVIL, names=names, sensors={EVIL: EVIL},
         license=EVIL, notes=[EVIL], versions={EVIL: EVIL, "lidarpool": EVIL}, command=EVIL,
-        description=EVIL, keep=SimpleNamespace(format=EVIL),
+        description=EVIL, keep={"format": EVIL},
     )  # fmt: skip
     page = (tmp_path / "report.html").read_text()
     assert "<script" not in page and "\u202e" not in page

@@ -188,9 +188,9 @@ class Stages:
         """Describe some scans of the first survey that is left."""
         if self.wanted and self.described:
             one = self.described.popleft()
-            stop = min(one.scan_count, one.first + self.advice)
+            stop = min(one.stop, one.first + self.advice)
             self.inbox.append(ScanRange(one.job, one.first, stop))
-            if stop < one.scan_count:
+            if stop < one.stop:
                 self.described.appendleft(replace(one, first=stop))
 
     def collect(self, order, held_at=""):
@@ -297,7 +297,7 @@ class Run:
         done = [number for number, error in self.ended.items() if error is None]
         for number in done:
             parts = self.db.under_way[number]
-            scans = list(range(parts.scan_count))
+            scans = list(parts.scans)
             if parts.has_frames:
                 assert [frame.scan for frame in self.frames[number]] == scans
                 assert [frame.hits for frame in self.frames[number]] == scans

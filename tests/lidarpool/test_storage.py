@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import errno
 import io
+import os
 import pickle
 import re
 import sys
@@ -231,3 +233,37 @@ def test_a_range_of_a_file_is_read(tmp_path):
         storage.write("x", b"0123456789")
         assert (storage.read("x"), storage.read("x", 3, 6)) == (b"0123456789", b"345")
         assert (storage.read("x", 8, 20), storage.read("x", 0, 2)) == (b"89", b"01")
+
+
+@pytest.mark.parametrize("places", [("here", "there"), ("memory", "memory"), ("memory", "here")])
+def test_a_file_of_another_storage_is_taken_or_copied(places, tmp_path, monkeypatch):
+    urls = [f"memory://{n}-{tmp_path.name}" if one == "memory" else tmp_path / one
+            for n, one in enumerate(places)]  # fmt: skip
+    source, target = map(Storage.at, urls)
+    for place in (source, target):
+        place.prepare()
+    source.write("a", b"new")
+    target.write("b", b"of before")
+    if places[0] != "memory" or places[1] == "memory":  # by a link, and by the store itself
+        monkeypatch.setattr(Storage, "writing", None)
+    for _ in range(2):
+        target.take(source, "a", "b")
+        assert target.read("b") == b"new" and source.read("a") == b"new"
+    with pytest.raises(FileNotFoundError):
+        target.take(source, "c", "c")
+
+
+def test_a_file_is_copied_where_there_are_no_links(tmp_path, monkeypatch):
+    source, target = Storage.at(tmp_path), Storage.at(tmp_path / "there")
+    source.write("a", b"new")
+    target.prepare()
+
+    def link(*_):
+        raise OSError(errno.EXDEV, "another disk")
+
+    monkeypatch.setattr(os, "link", link)
+    target.take(source, "a", "a")
+    assert target.read("a") == b"new" and target.local("a").stat().st_nlink == 1
+    (tmp_path / "link").symlink_to(tmp_path / "a")
+    with pytest.raises(LidarpoolError, match="link is a link"):
+        target.take(source, "link", "link")

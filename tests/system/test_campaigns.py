@@ -308,8 +308,8 @@ def test_failed_jobs_are_done_again_and_no_others(client, tmp_path):
     made.clear()
     again = campaign.run(tmp_path / "ds", client=client, retry_failed=True)
     assert (again.done, again.failed, again.resumed) == (4, (), 3)
-    assert again.sensors == {"lidar": "old model, 10 Hz; new model, 10 Hz"}
-    assert "old model, 10 Hz; new model, 10 Hz" in (tmp_path / "ds" / "README.md").read_text()
+    assert again.sensors == {"lidar": "new model, 10 Hz; old model, 10 Hz"}
+    assert "new model, 10 Hz; old model, 10 Hz" in (tmp_path / "ds" / "README.md").read_text()
     assert set(made) <= {0, 2}  # the first says which values there are
     after = bytes_of(tmp_path / "ds")
     assert before.items() <= after.items() and len(after) > len(before)

@@ -276,3 +276,29 @@ def test_a_campaign_goes_to_the_bucket_though_its_driver_is_killed(
     jobs = {n: data for n, data in found.items() if n.startswith(("jobs/", ".jobs/"))}
     assert jobs == bytes_of(tmp_path / "here")
     assert not any(name.startswith("run/") or name.endswith("-dataset") for name in found)
+
+
+@pytest.mark.slow
+def test_shards_in_the_bucket_are_merged_there_and_here(environment, lidarpool, tmp_path):
+    (tmp_path / "base.yaml").write_text(BASE)
+    (tmp_path / "c.yaml").write_text(CAMPAIGN.replace("count: 6", "count: 2"))
+    (tmp_path / "s.yaml").write_text(BASE)
+    with thread_cluster({"GPU": 1}, {"LIDAR": 5}) as cluster:
+        for name, file in (("campaign", "c.yaml"), ("survey", "s.yaml")):
+            run = ["run", tmp_path / file, "-q", "--scheduler", cluster.scheduler_address]
+            assert lidarpool(*run, "--out", tmp_path / name).code == 0
+            shards = [f"{BUCKET}/{name}/part-1", tmp_path / f"{name}-2"]
+            for number, place in enumerate(shards, 1):
+                assert lidarpool(*run, "--shard", f"{number}/2", "--out", place).code == 0
+            for out in (f"{BUCKET}/{name}/all", tmp_path / f"{name}-all"):
+                done = lidarpool("merge", *shards, "--out", out, "-q")
+                assert (done.code, done.err) == (0, ""), done
+    system, folder = fsspec.url_to_fs(f"{BUCKET}/campaign/all")
+    system.invalidate_cache()
+    found = {name.removeprefix(f"{folder}/"): system.cat(name) for name in system.find(folder)}
+    jobs = {n: data for n, data in found.items() if n.startswith(("jobs/", ".jobs/"))}
+    whole = bytes_of(tmp_path / "campaign")
+    assert jobs == bytes_of(tmp_path / "campaign-all") == whole
+    cloud = (tmp_path / "survey/cloud.ply").read_bytes()
+    assert Storage.at(f"{BUCKET}/survey/all").read("cloud.ply") == cloud
+    assert (tmp_path / "survey-all/cloud.ply").read_bytes() == cloud

@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from .export.ply import read_cloud
     from .pipeline.messages import ScanFrame
     from .plan import Plan, Planning
+    from .report.merging import merge
     from .run.run_result import CampaignRun
     from .run.store import remove_run
     from .scenario.build import Job
@@ -88,6 +89,7 @@ __all__ = [
     "load_robot",
     "load_sensor",
     "load_trajectory",
+    "merge",
     "read_cloud",
     "remove_run",
     "save_cloud",
@@ -109,6 +111,7 @@ _MODULES = {
     "export.ply": ("read_cloud",),
     "pipeline.messages": ("ScanFrame",),
     "plan": ("Plan", "Planning"),
+    "report.merging": ("merge",),
     "compare.comparison": ("Comparison", "compare"),
     "run.run_result": ("CampaignRun",),
     "run.store": ("remove_run",),

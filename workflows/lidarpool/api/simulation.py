@@ -11,6 +11,7 @@ from pydantic import Field
 
 from ..base.declared import declared
 from ..base.errors import LidarpoolError
+from ..base.shard import Shard
 from ..base.storage import Storage
 from ..base.validation import checked
 from ..base.vocabulary import PATIENCE_S, WAIT_S
@@ -177,6 +178,7 @@ class Campaign(described.CampaignSpec):  # noqa: D101 - as there
         live: bool = False,
         wait_s: float = WAIT_S,
         patience_s: float = PATIENCE_S,
+        shard: tuple[int, int] = (1, 1),
     ) -> CampaignRun:
         """Do the jobs, several at a time, and write the data set.
 
@@ -214,6 +216,8 @@ class Campaign(described.CampaignSpec):  # noqa: D101 - as there
             in the cell.
         wait_s, patience_s
             As for `simulate`.
+        shard
+            (3, 10): do the third of ten equal shares of the jobs, for `lidarpool.merge`.
 
         Returns
         -------
@@ -242,9 +246,10 @@ class Campaign(described.CampaignSpec):  # noqa: D101 - as there
             wait_s=wait_s,
             patience_s=patience_s,
         ).with_pool(self.pool, backend)
-        with page_of(self, live) as page:
-            output = DataSetOutput(place, self)
-            return Conductor(self, options, output, Screen(on_progress), page)()
+        jobs = self.of_shard(Shard(*shard))
+        with page_of(jobs, live) as page:
+            output = DataSetOutput(place, jobs)
+            return Conductor(jobs, options, output, Screen(on_progress), page)()
 
     @checked
     def stream(

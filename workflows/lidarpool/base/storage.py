@@ -260,6 +260,23 @@ class Storage:
         with self._remote() as (system, folder):
             system.get_file(f"{folder}/{name}", str(path))
 
+    def take(self, place: Storage, name: str, own: str) -> None:
+        """Have a file of another storage here, completely or not at all, by a name of its `own`.
+
+        It is linked (a hard link), or an object store copies it, where that is possible.
+        """
+        if self.is_local and place.is_local:
+            self.remove([own])
+            with suppress(OSError):  # another disk, or one without links: it is copied
+                os.link(place.local(name), self._target(own))
+                return
+        with place._remote() as (other, folder), self._remote() as (system, own_folder):
+            if other is system and not self.is_local:
+                system.cp_file(f"{folder}/{name}", f"{own_folder}/{own}")
+                return
+            with other.open(f"{folder}/{name}", "rb") as source, self.writing(own) as file:
+                shutil.copyfileobj(source, file, _PIECE)
+
     def sees(self, name: str, data: bytes) -> bool:
         """Whether a file has this content, so that this process sees the same place."""
         try:

@@ -24,6 +24,7 @@ from ..base.interrupts import (
     deferred_interrupts,
     interrupt_on_signals,
 )
+from ..base.shard import ALL
 from ..base.vocabulary import PATIENCE_S, QUEUE_S, WAIT_S
 from ..base.words import plural
 from . import shared_options as shared
@@ -153,6 +154,7 @@ def demo(terminal: Terminal, options: RunOptions, extent: str | None) -> None:
 @shared.flag("--retry-failed", help="Of a campaign: do the jobs that have failed again.")
 @shared.flag("--verify", help="Compare every byte of a data set, or of the jobs to resume from.")
 @shared.job
+@shared.shard
 @click.option(
     "--parts",
     metavar="PLACE",
@@ -181,10 +183,10 @@ def run(
     options: RunOptions,
     scenarios: tuple[str, ...],
     of_mesh: dict[str, Any],
-    no_plan: bool,
     extent: str | None,
     number: int | None,
     backend: str | None,
+    **given: Any,
 ) -> None:
     """Run the survey of a scenario or mesh file, or a campaign of many.
 
@@ -201,6 +203,7 @@ def run(
       lidarpool run part.stl --unit mm --sensor ouster/os1-64 --pose 0,0,1.9 --format las
       lidarpool run examples/seed.yaml --cluster examples/clusters/slurm.yaml
       lidarpool run examples/campaign.yaml --out dataset
+      lidarpool run examples/campaign.yaml --shard 3/10 --out part-3
       lidarpool run --verify dataset
     """  # noqa: D301 - click wants the character, not its name
     from ..base.storage import Storage
@@ -212,6 +215,8 @@ def run(
 
     if options.fresh and (options.resume or options.verify):
         raise click.UsageError("--resume continues the run that --fresh deletes: give one of them.")
+    if number is not None and given["shard"] is not None:
+        raise click.UsageError("--job does one job, and --shard a share: give one of them.")
     if options.retry_failed and (options.fresh or number is not None):
         raise click.UsageError("--retry-failed goes on with a campaign: not with --fresh or --job.")
     paths = [*map(Path, scenarios)]
@@ -234,12 +239,43 @@ def run(
                 "--only and --pictures are for one survey: a data set is written as a whole."
             )
         else:
-            run_campaign(campaign, terminal, options, backend)
+            run_campaign(campaign.of_shard(given["shard"] or ALL), terminal, options, backend)
     elif options.retry_failed or options.verify or number is not None:
         raise click.UsageError("--job, --retry-failed and --verify are for campaigns.")
     else:
         scenario = Scenario.load(paths[0], of_mesh)
-        run_scenario(scenario, terminal, options, backend, no_plan=no_plan, extent=extent)
+        given["made_of"] = {"path": str(paths[0].absolute()), "options": of_mesh}
+        run_scenario(scenario, terminal, options, backend, extent=extent, **given)
+
+
+@cli.command()
+@click.argument("shards", metavar="SHARD...", nargs=-1, required=True, type=shared.StoragePath())
+@click.option("--partial", is_flag=True, help="Merge what there is, and say what is missing.")
+@click.option(
+    "--scenario",
+    type=click.Path(path_type=Path),
+    metavar="FILE",
+    help="Of a survey: its scenario or mesh file, if that is not where it was.",
+)
+@shared.out
+@shared.flag("--quiet", "-q", help="No progress, only the result.")
+@shared.as_json
+def merge(shards: tuple[Any, ...], out: Any, quiet: bool, as_json: bool, **given: Any) -> None:
+    """Make one data set or result of shards; after a kill, the same command goes on.
+
+    \b
+    Examples:
+      lidarpool merge part-* --out dataset
+      lidarpool merge s3://lab/part-1 s3://lab/part-2 --out s3://lab/dataset
+    """  # noqa: D301 - click wants the character, not its name
+    from ..report.merging import merge as merge_shards
+    from .terminal import Terminal
+
+    screen = Terminal(quiet, False, as_json)
+    report = merge_shards(shards, out, screen=screen, **given)
+    points = report["points"] if "points" in report else report["totals"]["points"]
+    lines = [*(f"note: {note}" for note in report["notes"]), f"{plural(points, 'point')} in {out}"]
+    shared.show({"folder": str(out), **report}, lines, as_json)
 
 
 @cli.command()

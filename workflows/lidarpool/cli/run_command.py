@@ -3,19 +3,21 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import click
 
 from ..base.errors import LidarpoolError
+from ..base.shard import Shard
 from ..base.storage import Storage
 from ..base.words import plural
 from ..datasets.dataset import DataSet
 from ..datasets.job_table import Tally, read_table
-from ..export.folder import local_result, output_place
+from ..export.folder import local_result, output_place, result_folder
 from ..live import page_of
 from ..report.campaign_output import (
     CAMPAIGN_FILE,
@@ -26,7 +28,7 @@ from ..report.campaign_output import (
 )
 from ..report.output import CLOUD, SurveyOutput
 from ..report.report import summary
-from ..run.conductor import Conductor
+from ..run.conductor import Conductor, Kept
 from ..run.job_source import OneJob
 from ..run.options import RunOptions
 from ..run.run_result import RunResult
@@ -49,10 +51,13 @@ def run_scenario(
     *,
     no_plan: bool = False,
     extent: str | None = None,
+    shard: Shard | None = None,
+    made_of: Mapping[str, Any] = MappingProxyType({}),
 ) -> None:
     """Run a scenario, write the result and print a summary.
 
-    LidarpoolError if the run fails; notes of the error say what was kept.
+    Of a `shard`, the run stays, and says what it is `made_of`. LidarpoolError if the run fails;
+    notes of the error say what was kept.
     """
     options = options.with_pool(scenario.pool, backend)
     if options.own:  # before reading the scene, which may take long
@@ -60,7 +65,18 @@ def run_scenario(
     with terminal.status("reading the scene", logged=False):
         built = build(scenario, plans=not no_plan)
         job = built.job()
-    _run_survey(built, job, options, terminal, extent)
+    if shard is None:
+        _run_survey(built, job, options, terminal, extent)
+        return
+    assert options.out is not None, "commands write"
+    more = {"plans": not no_plan, "extent": extent or "page", "scans": job.survey.scan_count}
+    jobs, output = OneJob(job, shard), Kept({**made_of, **more})
+    with result_folder(options.out), page_of(jobs, options.live) as page:
+        result = Conductor(jobs, options, output, terminal, page)()
+    points, lines = len(result.points), [f"note: {note}" for note in result.notes]
+    lines.append(f"shard {shard} in {options.out}: {plural(points, 'point')}, for lidarpool merge")
+    told = {"folder": str(options.out), "shard": str(shard), "points": points}
+    show(told, lines, terminal.as_json)
 
 
 def _run_survey(

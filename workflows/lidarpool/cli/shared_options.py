@@ -14,6 +14,7 @@ from typing import Any
 
 import click
 
+from ..base.shard import Shard
 from ..base.storage import Storage, is_url
 from ..base.vocabulary import BACKENDS, UNITS_M
 
@@ -47,6 +48,13 @@ backend = click.option(
 )
 job = click.option(
     "--job", "number", type=click.IntRange(0), metavar="N", help="Of a campaign: this job alone."
+)
+shard = click.option(
+    "--shard",
+    metavar="N/OF",
+    type=Shard.parse,
+    help="Do one of several equal shares, such as 3/10, for lidarpool merge; auto: the task of a "
+    "Slurm array; auto/10: the index of a Kubernetes job.",
 )
 no_plan = flag("--no-plan", help="Leave out path planning.")
 cluster = click.option(

@@ -8,6 +8,7 @@ import zlib
 from collections import deque
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from dataclasses import asdict, dataclass, field, replace
 from functools import lru_cache
 from itertools import islice
@@ -237,11 +238,16 @@ class DataSet:
         The last is a clause, or empty; then the manifest may be, too. Sizes are compared, and with
         `contents` every byte is read. OSError if the place cannot be read.
         """
+        look_at = self._looker(contents)
+        yield from ahead(lambda job: look_at(job.name), (job for job in jobs if job.done))
+
+    def _looker(self, contents: bool = False) -> Callable[[str], tuple[dict[str, Any], str]]:
+        """Return what looks at a job by its name, see `look`."""
         sizes = lru_cache(_LISTED)(lambda folder: self.place.below(folder).sizes())
 
-        def look_at(job: JobRow) -> tuple[dict[str, Any], str]:
-            if not (manifest := self._manifest(job.name)):
-                return {}, f"{_manifest_file(job.name)} is missing or damaged"
+        def look_at(job: str) -> tuple[dict[str, Any], str]:
+            if not (manifest := self._manifest(job)):
+                return {}, f"{_manifest_file(job)} is missing or damaged"
             for name, (size, crc) in manifest["files"].items():
                 folder, _, file = name.rpartition("/")
                 same = sizes(folder).get(file) == size
@@ -249,8 +255,35 @@ class DataSet:
                     return manifest, f"{name} is missing or damaged"
             return manifest, ""
 
-        done = (job for job in jobs if job.done)
-        yield from _ahead(look_at, done)
+        return look_at
+
+    def take(self, place: Storage, jobs: Iterable[JobRow]) -> Iterator[tuple[JobRow, str]]:
+        """Have the files of jobs here that another data set of this format has in its `place`.
+
+        Those that are here are not read again. Yields each job, and its first file there that is
+        missing or damaged, else "". OSError if a place cannot be read or written to.
+        """
+        here, there = self._looker(), replace(self, place=place)
+
+        def take(job: JobRow) -> str:
+            manifest, last = there._manifest(job.name), _manifest_file(job.name)
+            if not job.done or (manifest and here(job.name) == (manifest, "")):
+                return ""
+            if not manifest or manifest["row"]["sha256"] != job.sha256:
+                return place.path(last)
+            for name, checksum in (manifest["files"] | {last: None}).items():
+                if ".." in Path(name).parts or Path(name).is_absolute():  # of somebody else
+                    return place.path(last)
+                with suppress(FileNotFoundError):
+                    self.place.prepare(Path(name).parent)
+                    self.place.take(place, name, name)
+                    if name == last or self.place.checksum(name) == checksum:
+                        continue
+                    self.place.remove([name])
+                return place.path(name)
+            return ""
+
+        yield from ahead(take, iter(jobs))
 
     def _manifest(self, name: str) -> dict[str, Any]:
         """Read the manifest of a job; empty if it is missing or damaged."""
@@ -267,7 +300,7 @@ class DataSet:
         """
         names = (name.removesuffix(".json") for name in self.place.below(_MANIFESTS).sizes())
         unknown = (name for name in names if name not in known)
-        for _, manifest in _ahead(self._manifest, unknown):
+        for _, manifest in ahead(self._manifest, unknown):
             if manifest:
                 yield JobRow.of(manifest["row"]), manifest["made_with"]
 
@@ -289,7 +322,7 @@ class Listing(Storage):
         self.files[name] = [len(data), zlib.crc32(data)]
 
 
-def _ahead(read: Callable[[T], R], things: Iterator[T]) -> Iterator[tuple[T, R]]:
+def ahead(read: Callable[[T], R], things: Iterator[T]) -> Iterator[tuple[T, R]]:
     """Yield each thing with what is read for it; several are read at a time."""
     with ThreadPoolExecutor(_REQUESTS, "read") as pool:
         while some := [*islice(things, _AHEAD)]:

@@ -12,4 +12,4 @@ def page_of(jobs: Jobs, wanted: bool) -> AbstractContextManager[RunPage]:
         return nullcontext(RunPage())
     from .live_page import live_page
 
-    return live_page(jobs.count, jobs.names, jobs.title or "lidarpool")
+    return live_page(len(jobs.numbers), jobs.names, jobs.title or "lidarpool")

@@ -52,11 +52,11 @@ PARTS_FOLDER = re.compile("run-[0-9a-f]{16}")  # names of `parts_folder`
 class JobParts:
     """What is committed of a job under way; only its `RunDatabase` adds and removes parts.
 
-    `read` reads the summaries of a part.
+    `scans` are all that are to be done, and `read` reads the summaries of a part.
     """
 
-    def __init__(self, number: int, scan_count: int, read: Callable[[Receipt], bytes]) -> None:
-        self.number, self.scan_count, self._read = number, scan_count, read
+    def __init__(self, number: int, scans: range, read: Callable[[Receipt], bytes]) -> None:
+        self.number, self.scans, self._read = number, scans, read
         self.has_frames = False  # whether scans are handed out as frames, too
         self.clear()
 
@@ -65,15 +65,16 @@ class JobParts:
         self.ordered: list[Receipt] = []  # the parts in scan order, without summaries
         self.trials: list[Trial] = []
         self.scans_done = self.point_count = self.hits = 0
-        self.frames = self.frames_written = 0  # scans handed out as frames, from the first on
+        # One past the last scan that was handed out as a frame, from the first on.
+        self.frames = self.frames_written = self.scans.start
 
     # -- reading -------------------------------------------------------------------------
 
     @property
     def complete(self) -> bool:
         """Whether all scans are committed, and were handed out if there are frames."""
-        framed = not self.has_frames or self.frames == self.scan_count
-        return framed and self.scans_done == self.scan_count
+        framed = not self.has_frames or self.frames == self.scans.stop
+        return framed and self.scans_done == len(self.scans)
 
     @property
     def cells(self) -> Ints | None:
@@ -195,11 +196,11 @@ class RunDatabase:
 
     # -- reading -------------------------------------------------------------------------
 
-    def job(self, number: int, scan_count: int) -> JobParts:
-        """Return what is committed of a job that has not ended; kept until it has."""
+    def job(self, number: int, stop: int, first: int = 0) -> JobParts:
+        """Return what is committed of a job under way, of its scans from `first` to `stop`."""
         if (found := self.under_way.get(number)) is not None:
             return found
-        job = JobParts(number, scan_count, self._summaries)
+        job = JobParts(number, range(first, stop), self._summaries)
         if number in self.begun:
             with _explained(self.path):
                 self._read(job)
@@ -207,11 +208,11 @@ class RunDatabase:
         return job
 
     def _read(self, job: JobParts) -> None:
-        number, scan_count = job.number, job.scan_count
+        number, scans = job.number, job.scans
         query = "SELECT first, stop, rows, size, hits, cells FROM parts WHERE job = ?"
         for first, stop, *counts, cells in self._rows(query, number):
-            if not 0 <= first < stop <= scan_count:
-                raise ValueError(f"a part has scans {first} to {stop} of {scan_count}")
+            if not scans.start <= first < stop <= scans.stop:
+                raise ValueError(f"a part has scans {first} to {stop} of {scans}")
             name, box = part_name(self.meta["mark"], number, first, stop), json.loads(cells)
             rows, size, hits = counts
             job.enter(Receipt(number, first, stop, name, rows, size, hits, tuple(box), b""))

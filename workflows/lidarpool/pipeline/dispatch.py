@@ -90,7 +90,7 @@ class Dispatcher:
         self.per_task = policies.batches_per_task(self._seconds)
         for job, stop, last in records[-1:]:
             seconds, scans, slots = last.seconds, last.items, self._workers.slot_count
-            if stop == job.survey.scan_count and scans < self.advice:
+            if stop == job.parts.scans.stop and scans < self.advice:
                 # The rest of a job says how fast it was cast, and nothing about larger ones.
                 seconds, scans = seconds * self.advice / scans, self.advice
             wanted = policies.scans_per_batch(seconds, scans, job.fit, job.in_all, slots)

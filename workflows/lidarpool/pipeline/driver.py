@@ -93,13 +93,14 @@ class RunDriver:
             packed,
             scene_name,
             fit,
-            max(in_all, survey.scan_count),
+            max(in_all, len(parts.scans)),
             on_frame,
             read,
             on_parts,
+            generated=parts.scans.start,
         )
         if not job.left:  # stage 1 need not describe what is committed
-            job.generated = survey.scan_count
+            job.generated = parts.scans.stop
         self._describe([job])
         self._sort_again([job])
         self._end_complete([job])
@@ -114,7 +115,7 @@ class RunDriver:
         if len(self._announced) < ANNOUNCED:
             return True
         jobs = [self.jobs[number] for number in self._announced if number in self.jobs]
-        to_come = sum(-(-(j.survey.scan_count - j.generated) // min(advice, j.fit)) for j in jobs)
+        to_come = sum(-(-(j.parts.scans.stop - j.generated) // min(advice, j.fit)) for j in jobs)
         return len(self.dispatcher.batches) + to_come < most
 
     def take_ended(self) -> list[tuple[JobState, JobError | None]]:
@@ -128,7 +129,7 @@ class RunDriver:
         self.workers.remove(job.number)
         del self.jobs[job.number]
         if error is not None and job.parts.has_frames:  # the sorter forgets what it has of it
-            self.stages.send(SORT, [Summaries(job.number, 0, 0, b"", framed=1, scan_count=1)])
+            self.stages.send(SORT, [Summaries(job.number, 0, 0, b"", framed=1, until=1)])
         self._ended.append((job, error))
 
     def _end_complete(self, jobs: Iterable[JobState]) -> None:
@@ -244,11 +245,11 @@ class RunDriver:
     def _describe(self, jobs: Iterable[JobState]) -> None:
         """Have stage 1 describe what is left of jobs; an absent one is told when it is started."""
         orders = [
-            Description(job.number, job.packed, job.generated, job.survey.scan_count)
+            Description(job.number, job.packed, job.generated, job.parts.scans.stop)
             for job in jobs
-            if job.generated < job.survey.scan_count
+            if job.generated < job.parts.scans.stop
         ]
-        self._announced |= {one.job: one.scan_count for one in orders}
+        self._announced |= {one.job: one.stop for one in orders}
         if orders:
             self.stages.send(GENERATE, orders)
 
@@ -266,7 +267,7 @@ class RunDriver:
     def _sort(self, job: JobState, parts: Sequence[Receipt]) -> None:
         """Send parts to the sorter if they have frames; an absent one gets them when it starts."""
         if parts and job.parts.has_frames:
-            so_far = job.parts.frames, job.survey.scan_count
+            so_far = job.parts.frames, job.parts.scans.stop
             messages = [Summaries(job.number, p.first, p.stop, p.summaries, *so_far) for p in parts]
             job.trace("handon", SORT, chain.from_iterable(m.scans for m in messages))
             self.stages.send(SORT, messages)

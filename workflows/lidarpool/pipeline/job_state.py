@@ -38,7 +38,7 @@ class JobState:
     on_frame: Callable[[ScanFrame], None] | None
     read: Callable[[int], Cloud] | None
     on_parts: Callable[[list[Receipt]], None] | None
-    generated: int = 0  # scans taken from stage 1, from the first on
+    generated: int = 0  # one past the last scan that was taken from stage 1
     cast: int = 0  # scans that stage 2 has finished
     offered_again: int = 0  # batches
     seconds: float = 0.0  # casting time of committed batches
@@ -48,7 +48,7 @@ class JobState:
     @property
     def left(self) -> int:
         """Scans that are not committed."""
-        return self.survey.scan_count - self.parts.scans_done
+        return len(self.parts.scans) - self.parts.scans_done
 
     def trace(self, event: str, stage: str, scans: Iterable[int], **more: str) -> None:
         """Report that the driver has reached a point with some scans."""

@@ -60,12 +60,12 @@ class StageStart:
 
 @dataclass(frozen=True, slots=True)
 class Description:
-    """To stage 1: describe the scans of a survey from `first` on."""
+    """To stage 1: describe the scans of a survey from `first` to `stop`."""
 
     job: int
     survey: bytes  # pickled: if a worker cannot unpickle it, others can be described
     first: int
-    scan_count: int
+    stop: int
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,8 +93,8 @@ class Summaries(Scans):
     """To stage 3, and from it in scan order: the summaries of a committed part."""
 
     data: bytes  # of an array of `summary_type`
-    framed: int  # scans that had been handed out when it was sent, from the first on
-    scan_count: int  # of the survey
+    framed: int  # one past the last scan that had been handed out when it was sent
+    until: int  # one past the last scan of the job
 
 
 @dataclass(frozen=True, slots=True)

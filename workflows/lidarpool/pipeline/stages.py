@@ -109,8 +109,8 @@ def _described(
         try:
             with naming_scans(sent, sent + 1):
                 survey: Survey = pickle.loads(one.survey)  # noqa: S301 - of the run's own driver
-            while sent < survey.scan_count:
-                item = ScanRange(one.job, sent, min(sent + outlet.advice, survey.scan_count))
+            while sent < one.stop:
+                item = ScanRange(one.job, sent, min(sent + outlet.advice, one.stop))
                 with naming_scans(item.first, item.stop):
                     survey.scan(item.stop - 1)  # raises here if a scan cannot be described
                 me.trace("put", item.scans)
@@ -136,7 +136,7 @@ def sort_frames(me: StageStart, inlet: Pipe, outlet: Pipe) -> TaskRecord:
             me.trace("get", item.scans)
             order = orders.setdefault(item.job, _Order())
             ready += order.take(item)
-            if order.following >= item.scan_count:
+            if order.following >= item.until:
                 del orders[item.job]
         if ready:
             scans = [*chain.from_iterable(item.scans for item in ready)]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import re
 import time
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -28,7 +28,7 @@ from ..scenario.campaign import CampaignSpec, hashes
 
 CAMPAIGN_FILE = "campaign.json"  # whose data set this is, and the software that made it
 
-# With what `_write_shared` writes, CAMPAIGN_FILE first.
+# With what `write_shared` writes, CAMPAIGN_FILE first.
 _FINISHED = re.compile(
     OF_JOBS.pattern + r"|(campaign|dataset|report)\.json|README\.md|report\.html|pictures/\w+\.png|"
     r"jobs\.(csv|parquet)|splits/[^/]+\.txt"
@@ -78,8 +78,13 @@ class DataSetOutput(Output[CampaignRun]):
         if not conductor.resume or CAMPAIGN_FILE not in there or unfinished:
             return None
         self._made = check_same(out, self.campaign)
+        if (shards := self._made["shards"]) != [str(self.campaign.shard)]:
+            raise LidarpoolError(
+                f"{out} holds shard {listed(shards) or 'none'}, and this is a run of "
+                f"{self.campaign.shard}: give another folder with --out."
+            )
         whole, self._wrong = _look(self.dataset, read_table(out), options.verify, self.campaign)
-        if whole != self.campaign.count or self._wrong or not _is_indexed(out, whole):
+        if whole != len(self.campaign.numbers) or self._wrong or not _is_indexed(out, whole):
             return None
         if RUN_FOLDER in there:  # a killed run has not removed all of itself
             remove_run(kept)
@@ -94,12 +99,12 @@ class DataSetOutput(Output[CampaignRun]):
         """Compare what is there with what the store says is done; take over what it lacks."""
         store, options, out = conductor.store, conductor.options, self.dataset.place
         if self._made is not None:
-            rows = [row for row in read_table(out) if row.number < self.campaign.count]
+            rows = [row for row in read_table(out) if row.number in self.campaign.numbers]
             store.cast_with(self._made["backend"], self._made["casting"])
             store.adopt(rows, sensors=json.dumps(self._made["sensors"]))
         elif conductor.resume:
             self._take_over(store)
-        _own_files(out, begun=store.begun or bool(store.kept))  # some were perhaps taken over
+        dataset_files(out, begun=store.begun or bool(store.kept))  # some were perhaps taken over
         if self._made is None:
             _, self._wrong = _look(self.dataset, store.rows(), options.verify, self.campaign)
         if not store.kept:
@@ -133,7 +138,12 @@ class DataSetOutput(Output[CampaignRun]):
         seconds = time.monotonic() - conductor.started
         more = {"stages": cast.stages if cast else (), "notes": tuple(store.notes)}
         run = CampaignRun.of(store.rows(), seconds, store.resumed, sensors=store.sensors, **more)
-        run = self._write_shared(store, run)
+        record: dict[str, Any] = {"identity": dict(store.identity), "casting": store.casting}
+        record |= {"backend": store.backend, "sensors": run.sensors}
+        record |= {"files": hashes(self.campaign.files), "campaign": self.campaign.described}
+        record["shards"] = [str(self.campaign.shard)]
+        write_record(self.dataset.place, record)  # before anything that it tells whose it is
+        run, _ = write_shared(self.dataset, record, run, store.rows)
         if run.failed:
             store.save(now=True)
             store.db.close()
@@ -142,24 +152,35 @@ class DataSetOutput(Output[CampaignRun]):
         conductor.page.finish(run.seconds)
         return run
 
-    def _write_shared(self, store: RunStore, run: CampaignRun) -> CampaignRun:
-        """Write what all jobs share, and last what says that; return the run with class names."""
-        # Matplotlib takes as long as all other imports.
-        from .campaign_report import write_card
-        from .charts import draw_sweep
 
-        campaign, place = self.campaign, self.dataset.place
-        made: dict[str, Any] = {"identity": dict(store.identity), "casting": store.casting}
-        made |= {"backend": store.backend, "sensors": run.sensors}
-        with explained(f"{place} cannot be written"):
-            place.write(CAMPAIGN_FILE, (json.dumps(made, indent=1) + "\n").encode())
-        write_table(place, campaign.names, store.rows)
-        self.dataset.finish(store.rows())
-        saved = sweeps(place.url)
-        picture = draw_sweep(next(iter(saved)), saved.classes) if len(saved) else None
-        run = replace(run, classes=saved.classes)
-        write_card(place, campaign, run, store.rows(), store.casting or software(), picture)
-        return run
+def write_record(place: Storage, record: Mapping[str, Any]) -> None:
+    """Write CAMPAIGN_FILE."""
+    with explained(f"{place} cannot be written"):
+        place.write(CAMPAIGN_FILE, (json.dumps(record, indent=1) + "\n").encode())
+
+
+def write_shared(
+    dataset: DataSet,
+    record: Mapping[str, Any],
+    run: CampaignRun,
+    rows: Callable[[], Iterator[JobRow]],
+) -> tuple[CampaignRun, dict[str, Any]]:
+    """Write what all jobs share, and last what says that the data set is complete.
+
+    `record` is for CAMPAIGN_FILE. Returns the run with class names, and the content of report.json.
+    """
+    # Matplotlib takes as long as all other imports.
+    from .campaign_report import write_card
+    from .charts import draw_sweep
+
+    campaign, place = record["campaign"], dataset.place
+    write_table(place, campaign["names"], rows)
+    write_record(place, record)  # behind the table, which has the jobs of all shards in it
+    dataset.finish(rows())
+    saved = sweeps(place.url)
+    picture = draw_sweep(next(iter(saved)), saved.classes) if len(saved) else None
+    run, versions = replace(run, classes=saved.classes), record["casting"] or software()
+    return run, write_card(place, campaign, run, rows(), versions, picture)
 
 
 def _look(
@@ -176,10 +197,10 @@ def _look(
     made: dict[tuple[str, str], list[str]] = {}  # {name and hash of a file: jobs made of it}
     with explained(f"{dataset.place} cannot be read"):
         for row, (manifest, difference) in dataset.look(rows, contents=contents):
-            if campaign is not None and row.number >= campaign.count:
+            if campaign is not None and row.number not in campaign.numbers:
                 raise LidarpoolError(
-                    f"{dataset.place} has job {row.name}, and count is {campaign.count:,}: a "
-                    "campaign can only grow. Give another folder with --out."
+                    f"{dataset.place} has job {row.name}, and count is {campaign.count:,}, shard "
+                    f"{campaign.shard}: a campaign can only grow. Give another folder with --out."
                 )
             if difference:
                 wrong[row.number] = f"job {row.name} ({difference})"
@@ -250,10 +271,10 @@ def check_same(place: Storage, campaign: CampaignSpec) -> Mapping[str, Any]:
     return made
 
 
-def _own_files(out: Storage, *, begun: bool) -> list[str]:
+def dataset_files(out: Storage, *, begun: bool) -> list[str]:
     """Name the files of a data set, which has begun or is empty.
 
-    LidarpoolError if there is a link, or a file that neither jobs nor `_write_shared` write.
+    LidarpoolError if there is a link, or a file that neither jobs nor `write_shared` write.
     """
     files = [name for name in out.tree() if not _BESIDE.fullmatch(name)]
     own = _FINISHED if CAMPAIGN_FILE in files else OF_JOBS
@@ -269,7 +290,7 @@ def _own_files(out: Storage, *, begun: bool) -> list[str]:
 def _remove_dataset(out: Storage, kept: Storage) -> None:
     """Remove a data set and its run; LidarpoolError, and nothing is removed, if there is more."""
     begun = CAMPAIGN_FILE in out.sizes() or FILE in kept.sizes()
-    own = _own_files(out, begun=begun)
+    own = dataset_files(out, begun=begun)
     with explained(f"{out} cannot be removed"):
         out.tidy()
         # First what says that it is finished, and last what says that it is a data set.

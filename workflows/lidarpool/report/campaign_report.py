@@ -16,7 +16,6 @@ from ..datasets.job_table import JobRow
 from ..export.folder import LAST_FILE
 from ..render.picture_page import Page
 from ..run.run_result import CampaignRun
-from ..scenario.campaign import CampaignSpec
 from .charts import draw_results, draw_varied
 from .page.rendering import rendered
 from .report import stage_figures
@@ -32,7 +31,7 @@ _CAPTIONS = {
 
 def write_card(
     place: Storage,
-    campaign: CampaignSpec,
+    campaign: Mapping[str, Any],
     run: CampaignRun,
     jobs: Iterable[JobRow],
     versions: Mapping[str, str],
@@ -47,7 +46,7 @@ def write_card(
     place
         Folder of the data set, which must exist.
     campaign, run
-        What the jobs are of.
+        What the jobs are of; the first as `CampaignSpec.described` has it.
     jobs
         Rows in order, such as `lidarpool.datasets.job_table.read_table` gives.
     versions
@@ -66,7 +65,7 @@ def write_card(
     """
     with explained(f"The data set's card cannot be written to {place}", "make room"):
         place.remove([LAST_FILE])
-        figures = Figures(campaign.names, _with_splits(place, jobs))
+        figures = Figures(campaign["names"], _with_splits(place, jobs))
         pages = {"job": picture, "varied": draw_varied(figures), "results": draw_results(figures)}
         drawn = {name: page for name, page in pages.items() if page is not None}
         for name, drawing in drawn.items():
@@ -77,14 +76,14 @@ def write_card(
         values: dict[str, Any] = {
             "report": report,
             "captions": _CAPTIONS,
-            "command": campaign.command,
+            "command": campaign["command"],
             "VALUES_SHOWN": VALUES_SHOWN,
         }
         page = rendered(
             "campaign.html",
             pictures={name: drawn[name].svg() for name in ("varied", "results") if name in drawn},
             slowest=figures.slowest,
-            description=campaign.description,
+            description=campaign["description"],
             **values,
             stages=run.stages,
         )
@@ -114,19 +113,19 @@ def _with_splits(place: Storage, jobs: Iterable[JobRow]) -> Iterator[JobRow]:
 
 
 def campaign_report(
-    campaign: CampaignSpec, run: CampaignRun, versions: Mapping[str, str], figures: Figures
+    campaign: Mapping[str, Any], run: CampaignRun, versions: Mapping[str, str], figures: Figures
 ) -> dict[str, Any]:
     """Return the figures of a data set, as in report.json."""
     return {
-        "title": campaign.title,
-        "format": campaign.keep.format,
-        "license": campaign.license,
-        "seed": campaign.seed,
+        "title": campaign["title"],
+        "format": campaign["keep"]["format"],
+        "license": campaign["license"],
+        "seed": campaign["seed"],
         "versions": dict(versions),
         "sensors": dict(run.sensors),
         "notes": list(run.notes),
         "jobs": {
-            "described": campaign.count,
+            "described": campaign["count"],
             "done": figures.done,
             "failed": figures.jobs - figures.done,
             "resumed": run.resumed,

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import json
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager, ExitStack, nullcontext
-from typing import Generic, TypeVar
+from dataclasses import dataclass
+from typing import Any, Generic, TypeVar
 
 from ..base.errors import LidarpoolError
+from ..base.shard import ALL
 from ..base.storage import Storage
 from ..datasets.dataset import DataSet
 from ..datasets.job_table import JobRow
@@ -31,6 +34,7 @@ class Output(Generic[R]):
     """Where what a run makes goes."""
 
     dataset: DataSet | None = None  # that jobs are written into; else the only job's parts stay
+    casts = True  # whether scans that are missing are cast
 
     def held(self) -> AbstractContextManager[object]:
         """Lock the place while the body runs."""
@@ -48,12 +52,19 @@ class Output(Generic[R]):
         raise NotImplementedError
 
 
+@dataclass(frozen=True, eq=False)
 class Kept(Output[RunResult]):
-    """Nothing is written: the points stay in the run's store."""
+    """Nothing is written: the points stay in the run's store, and what they are `made_of`."""
+
+    made_of: Mapping[str, Any] | None = None
 
     def finish(self, conductor: Conductor[RunResult]) -> RunResult:
         """Return the result of the only job."""
         result = conductor.result()
+        if self.made_of is not None:
+            made_of, notes = map(json.dumps, (self.made_of, result.notes))
+            conductor.store.db.set(made_of=made_of, notes=notes)
+            conductor.store.save(now=True)
         conductor.page.finish(result.seconds, result)
         conductor.store.db.close()
         return result
@@ -121,7 +132,8 @@ class Conductor(Generic[R]):
         with self.screen.status(checking) if self.goes_on else nullcontext():
             place = options.folder, options.parts
             self.store = RunStore(self.jobs, options.backend, *place, resume=self.resume)
-        if options.resume and self.store.only and not (self.store.kept or self.store.notes):
+        told = self.store.kept or self.store.notes or self.jobs.shard != ALL  # of a queue's task
+        if options.resume and self.store.only and not told:
             self.store.notes.append(f"there was nothing to resume in {options.out or place[0]}")
         self.stack.enter_context(self.store.kept_on_error())
         if self.store.only is not None:
@@ -132,10 +144,10 @@ class Conductor(Generic[R]):
     def _first_job(self) -> MadeJob | None:
         """Wait for a job that can be made; None if nothing is left to be cast."""
         if (only := self.store.only) is not None:
-            return None if only.complete else MadeJob(only.job)
+            return None if only.complete or not self.output.casts else MadeJob(only.job)
         jobs, dataset, db = self.jobs, self.output.dataset, self.store.db
         assert not isinstance(jobs, OneJob) and dataset is not None, "it is a campaign"
-        left = (number for number in range(jobs.count) if not db.ended(number))
+        left = (number for number in jobs.numbers if not db.ended(number))
         self._maker = JobMaker(jobs, left, dataset.columns)
         self.stack.callback(self._maker.close)
         while isinstance(found := self._maker.take(wait=True), JobRow):

@@ -37,8 +37,9 @@ class JobPoints:
 
     def __init__(self, store: RunStore, job: Job) -> None:
         self.job, self._store = job, store
-        self.parts: JobParts = store.db.job(job.number, job.survey.scan_count)
-        only = isinstance(store.jobs, OneJob)
+        only, count = isinstance(store.jobs, OneJob), job.survey.scan_count
+        scans = store.jobs.shard.scans(count) if only else range(count)
+        self.parts: JobParts = store.db.job(job.number, scans.stop, scans.start)
         self.parts.has_frames = only
         self.identified = only  # whether it is kept what the job is made of
         self.sweeps: Sweeps | None = None  # of a job for a data set, once it was made
@@ -62,7 +63,7 @@ class JobPoints:
             for what, parts in lost.items():
                 if parts:
                     self._drop(what, parts)
-            for receipt in filter(None, pool.map(self._receipt, unknown)):
+            for receipt in filter(None, pool.map(self.receipt, unknown)):
                 self._store.db.commit([receipt])
         finally:
             pool.shutdown(cancel_futures=True)
@@ -83,10 +84,10 @@ class JobPoints:
             return "missing"
         if sizes[part.name] != part.size:
             return "damaged"
-        found = self._receipt(part.name)
+        found = self.receipt(part.name)
         return "" if found is not None and _SAID(found) == _SAID(part) else "damaged"
 
-    def _receipt(self, name: str) -> Receipt | None:
+    def receipt(self, name: str) -> Receipt | None:
         """Receipt of a part in storage; None if it is damaged."""
         storage = self._store.storage
         try:
@@ -105,7 +106,7 @@ class JobPoints:
     def kept(self) -> str:
         """Committed scans and trials in words; empty for none."""
         if self.parts.scans_done:
-            return f"{self.parts.scans_done:,} of {self.job.survey.scan_count:,} scans"
+            return f"{self.parts.scans_done:,} of {len(self.parts.scans):,} scans"
         if self.parts.trials:
             return f"{len(self.parts.trials):,} of {self.job.trials:,} planning trials"
         return ""
@@ -119,10 +120,10 @@ class JobPoints:
         """Progress of a resumed run at its start."""
         parts = self.parts
         return Progress(
-            scans=self.job.survey.scan_count,
-            generated=parts.frames,
+            scans=len(parts.scans),
+            generated=parts.frames - parts.scans.start,
             cast=parts.scans_done,
-            framed=parts.frames,
+            framed=parts.frames - parts.scans.start,
             collected=parts.scans_done,
             points=parts.point_count,
             trials=self.job.trials,
@@ -170,7 +171,8 @@ class JobPoints:
         kind = summary_type(samples)
         every = max(1, samples * survey.scan_count // SAMPLE_RAYS)
         rays = [np.empty((0, 2, 3), np.float32)]
-        wanted = dict.fromkeys(range(0, survey.scan_count, every))
+        every_nth = range(0, survey.scan_count, every)
+        wanted = dict.fromkeys(n for n in every_nth if not self.parts.missing(n, n + 1))
         for first, data in self.parts.summaries_of(list(wanted)):
             for scan, summary in enumerate(np.frombuffer(data, kind), first):
                 ends = summary["samples"][~np.isnan(summary["samples"][:, 0])]
@@ -181,7 +183,7 @@ class JobPoints:
         return np.concatenate(rays)
 
 
-def listed(names: Sequence[str]) -> str:
+def listed(names: Sequence[str], most: int = NAMED) -> str:
     """Return the first names, and how many more there are."""
-    more = len(names) - NAMED
-    return ", ".join(names[:NAMED]) + (f" and {more:,} more" if more > 0 else "")
+    more = len(names) - most
+    return ", ".join(names[:most]) + (f" and {more:,} more" if more > 0 else "")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from queue import Empty, Full, Queue
 from threading import Event, Thread
@@ -13,6 +13,7 @@ from typing import NamedTuple
 
 from ..base.errors import LidarpoolError
 from ..base.fingerprint import fingerprint
+from ..base.shard import ALL, Shard
 from ..datasets.job_table import JobRow, Value
 from ..export.sweeps import Sweeps
 from ..pipeline.failures import JobError
@@ -39,17 +40,23 @@ def identity_of(job: Job) -> dict[str, str]:
 
 @dataclass(frozen=True, eq=False)
 class OneJob:
-    """A survey, as the only job of its run."""
+    """A survey, as the only job of its run, which does the scans of a shard."""
 
-    only: Job
-    count: int = 1
+    job: Job
+    shard: Shard = ALL
+    numbers: range = range(1)
     title: str = ""
     names: tuple[str, ...] = ()
 
     @cached_property
+    def only(self) -> Job:
+        """The job as this shard does it: the first one alone plans the path."""
+        return self.job if self.shard.number == 1 else replace(self.job, planning=None)
+
+    @cached_property
     def identity(self) -> Mapping[str, str]:
         """Fingerprints of scene, survey and planning."""
-        return identity_of(self.only)
+        return identity_of(self.job)
 
 
 Jobs = OneJob | CampaignSpec  # what a run does

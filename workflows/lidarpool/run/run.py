@@ -157,7 +157,7 @@ class Run:
             self._trials.step()  # first: no slot of OTHER waits for the survey
             self._trials.tasks.partition.want(0)  # from now on its trials wait for workers
         # Of a campaign's job many follow, so that its batches need not be divided among all.
-        left = self._store.jobs.count - self._store.db.ended_count
+        left = len(self._store.jobs.numbers) - self._store.db.ended_count
         self._driver.begin(
             job.number,
             job.scene,
@@ -168,13 +168,13 @@ class Run:
                 cluster.options.batch_mb * MB,
                 on_device=cluster.backend == "cuda",
             ),
-            in_all=job.survey.scan_count * left,
+            in_all=len(points.parts.scans) * left,
             on_frame=partial(cluster.call, self._on_frame) if kept else None,
             read=points.points_of_scan,
             on_parts=self._page.on_parts if kept else None,
         )
         self._jobs_begun += 1
-        self._scans_begun += job.survey.scan_count
+        self._scans_begun += len(points.parts.scans)
         to_come = max(0, left - len(self._store.under_way))
         self._driver.later = to_come * self._scans_begun // self._jobs_begun
 
@@ -237,7 +237,7 @@ class Run:
                 name=points.job.name,
                 values=points.job.values,
                 stored=points.parts.scans_done,
-                scans=points.job.survey.scan_count,
+                scans=len(points.parts.scans),
                 points=points.parts.point_count,
                 seconds=0.0 if state is None else state.seconds,
                 writing=number in writing,
@@ -322,7 +322,8 @@ class Run:
 
     def _progress(self) -> Progress:
         if (points := self._store.only) is None:
-            return Progress(jobs=self._store.jobs.count, jobs_done=self._store.db.ended_count)
+            numbers, ended = self._store.jobs.numbers, self._store.db.ended_count
+            return Progress(jobs=len(numbers), jobs_done=ended)
         progress = points.progress()
         if self._trials is not None:
             progress = replace(progress, trials_done=len(self._trials.trials))
@@ -330,7 +331,8 @@ class Run:
             return progress
         cast = min(points.resumed + state.cast, progress.scans)
         replayed = state.offered_again
-        return replace(progress, generated=state.generated, cast=cast, replayed=replayed)
+        generated = state.generated - state.parts.scans.start
+        return replace(progress, generated=generated, cast=cast, replayed=replayed)
 
     def _stop(self, reason: str) -> None:
         """Stop everything, as far as the cluster can be reached."""

@@ -38,6 +38,7 @@ from .remote import OWNER, RemoteRun, fetch_database
 PARTS = "parts"  # the folder of the parts, in the run's folder
 RUN_FOLDER = "run"  # the run's folder in the output folder, until the result is complete
 SENSORS_TOLD = 8  # kinds of a sensor that are named
+_OTHERS = "and others"
 
 # On the command line, and in Python.
 _RESUME = "--resume (in Python resume=True)"
@@ -90,6 +91,7 @@ class RunStore:
         self.begun = False  # whether it goes on with an earlier run
         self._gone = False
         self.identity = software() | dict(jobs.identity)
+        self._whose = self.identity | {"shard": str(jobs.shard)}
         self._remote = None
         kept = Storage.at(tempfile.mkdtemp(prefix="lidarpool-") if place is None else place)
         self.place = self._folder = kept  # that of the run, and that of its database
@@ -145,13 +147,13 @@ class RunStore:
             told = str(damage).replace(self._folder.url, self.place.url)
             raise LidarpoolError(told) from damage
         elif self.lasting:
-            _remove(self.place, _parts_of(self.place, earlier), mark)
+            _remove(self.place, parts_of(self.place, earlier), mark)
         path.unlink(missing_ok=True)
         self._folder.prepare()
         if new is None:
             mark = secrets.token_hex(8)
             shared = Storage.at(parts).path(parts_folder(mark)) if parts is not None else ""
-            new = {"mark": mark, "identity": json.dumps(self.identity), "parts": shared}
+            new = {"mark": mark, "identity": json.dumps(self._whose), "parts": shared}
         try:
             return RunDatabase(path, durable=durable, **new)
         except LidarpoolError:
@@ -176,13 +178,15 @@ class RunStore:
 
     def _claim(self, resume: bool) -> None:
         """Find the parts, and mark their folder as this run's."""
-        self.storage = replace(_parts_of(self.place, self.db.meta["parts"]), durable=self.lasting)
+        self.storage = replace(parts_of(self.place, self.db.meta["parts"]), durable=self.lasting)
         with explained(f"{self.storage.url} cannot be looked at"):
             self._sizes = self.storage.sizes()  # also an error if the place cannot be opened
         self._strays: dict[int, list[str]] = {}  # {number: parts that an earlier run has left}
         for name in self._sizes if resume else ():
             if (scans := scans_of(name, self.db.meta["mark"])) is not None:
                 self._strays.setdefault(scans[0], []).append(name)
+        if self.db.used:
+            self._check_same(self.db.meta["identity"])
         if isinstance(self.jobs, OneJob):
             self.only = self.under_way[0] = JobPoints(self, self.jobs.only)
         if self.db.used:
@@ -203,8 +207,7 @@ class RunStore:
         self.storage.write(mark_name(told["mark"]), json.dumps(told).encode())
 
     def _go_on(self, resume: bool) -> None:
-        """Check that this run may continue the existing one."""
-        self._check_same(self.db.meta["identity"])
+        """Check that this run may continue the existing one, which is the same."""
         if not resume:
             raise LidarpoolError(
                 f"{self.place} holds an unfinished run, {self.kept}: continue it with "
@@ -219,8 +222,10 @@ class RunStore:
     def _other(self, identity: str) -> str:
         """Describe the difference of an earlier run in a clause; empty if there is none."""
         there = json.loads(identity)
-        for name, value in self.identity.items():
+        for name, value in self._whose.items():
             if there.get(name) != value:
+                if name == "shard":
+                    return f"it is shard {there.get(name)}, not {value}"
                 if name in CONTENT:
                     return f"it is of another {name}"
                 if name != "lidarpool":
@@ -267,7 +272,7 @@ class RunStore:
         """What is committed, in words; empty for nothing."""
         if self.only is not None:
             return self.only.kept
-        return f"{self.db.ended_count:,} of {self.jobs.count:,} jobs" if self.db.used else ""
+        return f"{self.db.ended_count:,} of {len(self.jobs.numbers):,} jobs" if self.db.used else ""
 
     @property
     def advice(self) -> str:
@@ -330,12 +335,7 @@ class RunStore:
 
     def name_sensors(self, sensors: Iterable[tuple[str, str]]) -> None:
         """Keep names of sensors with model and rate, for the card of the data set."""
-        kept = self.sensors
-        for name, words in sensors:
-            told = kept.setdefault(name, words).split("; ")
-            if words not in told and len(told) <= SENSORS_TOLD:
-                more = words if len(told) < SENSORS_TOLD else "and others"
-                kept[name] = "; ".join([*told, more])
+        kept = with_sensors(self.sensors, sensors)
         if kept != self.sensors:
             self.db.set(sensors=json.dumps(kept))
 
@@ -400,6 +400,17 @@ class RunStore:
             self._folder.remove([FILE])  # where the place of the parts failed
 
 
+def with_sensors(known: Mapping[str, str], more: Iterable[tuple[str, str]]) -> dict[str, str]:
+    """Return {name of a sensor: its kinds in words} with more: the same in whatever order."""
+    found = dict(known)
+    for name, words in more:
+        kinds = {*found.get(name, words).split("; "), *words.split("; ")}
+        told = sorted(kinds - {_OTHERS})
+        others = [_OTHERS] * (_OTHERS in kinds or len(told) > SENSORS_TOLD)
+        found[name] = "; ".join([*told[:SENSORS_TOLD], *others])
+    return dict(sorted(found.items()))
+
+
 def _hash_of(job: Job) -> str:
     """Hash of what a job is made of; empty if that cannot be told: then it is not resumed."""
     try:
@@ -414,7 +425,7 @@ def _database(folder: Storage) -> Path:
     return folder.local(FILE)
 
 
-def _parts_of(place: Storage, parts: str) -> Storage:
+def parts_of(place: Storage, parts: str) -> Storage:
     """Where the parts of a run are: below the run's place, or in a place that was named."""
     named, _, name = parts.rpartition("/")
     return Storage.at(named or "/").below(name) if parts else place.below(PARTS)
@@ -447,7 +458,7 @@ def remove_run(folder: str | Path | Storage) -> None:
         except LidarpoolError as error:
             raise LidarpoolError(str(error).replace(temporary, place.url)) from error
         mark, parts = found or (None, "")
-        _remove(place, _parts_of(place, parts), mark)
+        _remove(place, parts_of(place, parts), mark)
 
 
 def _remove(place: Storage, parts: Storage, mark: str | None) -> None:

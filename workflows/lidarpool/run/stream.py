@@ -234,7 +234,7 @@ class _Casting:
             return True
         limit, on_device = options.batch_mb * MB, self._backend == "cuda"
         fit = scans_that_fit(job.scene, survey, limit, on_device=on_device)
-        parts = JobParts(number, survey.scan_count, lambda receipt: b"")  # none is kept
+        parts = JobParts(number, range(survey.scan_count), lambda receipt: b"")  # none is kept
         run, count = self._casting.run, survey.scan_count
         named = (run, number, survey, parts, packed, scene, fit, count)
         assert sweeps is not None, "of a campaign"

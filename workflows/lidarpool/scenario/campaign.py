@@ -7,12 +7,13 @@ import os
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence, Set
 from contextlib import suppress
-from dataclasses import replace
+from copy import copy
+from dataclasses import asdict, replace
 from functools import cache, cached_property, partial
 from itertools import chain, combinations, count, islice
 from pathlib import Path
 from types import MappingProxyType
-from typing import Annotated, Any
+from typing import Annotated, Any, Self
 
 import numpy as np
 from pydantic import BaseModel, Field
@@ -21,6 +22,7 @@ from pydantic_core import to_json
 from ..base.declared import Seed
 from ..base.errors import LidarpoolError, Mistakes, prefixed
 from ..base.fingerprint import fingerprint
+from ..base.shard import ALL, Shard
 from ..base.validation import (
     checked,
     dotted,
@@ -102,6 +104,7 @@ class CampaignSpec:
     description: str = ""  # the file's text, where there is one
     files: Set[Path]  # that its jobs may be made of; some may be missing
     choices: Mapping[str, str]  # {name: how its value is chosen, «0.2 to 20, log_uniform»}
+    shard = ALL  # whose jobs a run does
 
     @checked
     def __init__(
@@ -168,6 +171,23 @@ class CampaignSpec:
         self.command = " ".join(path.name for path in jobs.paths[:SHOWN_MOST])
         self.command += " …" * (jobs.count > SHOWN_MOST)
         return self
+
+    def of_shard(self, shard: Shard) -> Self:
+        """Return the same campaign, of which a run does the jobs of a shard."""
+        made = self if shard == self.shard else copy(self)
+        made.shard = shard
+        return made
+
+    @property
+    def described(self) -> dict[str, Any]:
+        """What the card of its data set says, as JSON holds it."""
+        names = ("title", "license", "command", "description", "seed", "count", "names")
+        return {name: getattr(self, name) for name in names} | {"keep": asdict(self.keep)}
+
+    @property
+    def numbers(self) -> range:
+        """Numbers of the jobs that a run does."""
+        return self.shard.jobs(self.count)
 
     @property
     def names(self) -> tuple[str, ...]:

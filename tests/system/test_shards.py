@@ -1,0 +1,491 @@
+"""Shards of campaigns and surveys, and what is merged of them."""
+
+import json
+import re
+import shutil
+import signal
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pyarrow.parquet
+import pytest
+from distributed import Client
+from tests.clusters import thread_cluster
+from tests.killed_drivers import drive
+from tests.rows import quick
+
+from lidarpool import Campaign, LidarpoolError, merge
+from lidarpool.base.shard import Shard
+from lidarpool.export.format_table import DATA_SETS
+
+CAMPAIGN = """
+base: base.yaml
+count: 7
+seed: 3
+vary:
+  noise.range_m: {uniform: [0.001, 0.05]}
+  sensor.model: {choice: [velodyne/vlp16, velodyne/hdl32e]}
+keep: FORMAT
+splits: {train: 0.6, val: 0.4}
+license: CC0
+"""
+BASE = """
+poses: [[0, 0, 1]]
+steps: 20
+sensor: {model: velodyne/vlp16}
+actors: [{name: Car, box: [4, 2, 1.5], at: {position: [6, 0, 0]}}]
+cloud: {keep_every: 1}
+planning: {enabled: false}
+pool: {backend: numpy, gpu: 1}
+"""
+SURVEY = """
+sensor: {rays_per_revolution: 90, layers: 8, step_deg: 4}
+poses: [[0, 0, 1], [1, 0, 1]]
+steps: 25
+cloud: {keep_every: 1}
+planning: {trials: 3, iterations: 20}
+output: {write: [las, kitti]}
+pool: {backend: numpy, gpu: 1}
+"""
+
+
+@pytest.fixture(scope="module")
+def slots() -> Iterator[str]:
+    """Address of a cluster with the slots of a campaign and a survey."""
+    with thread_cluster({"GPU": 1}, {"LIDAR": 5}, {"OTHER": 1}) as cluster:
+        yield cluster.scheduler_address
+
+
+@pytest.fixture(scope="module")
+def campaigns(slots, tmp_path_factory) -> Callable[[str], Path]:
+    """Return a folder with a campaign in a format as one run, `one`, and as `part-1` to 3."""
+    made: dict[str, Path] = {}
+
+    def folder_of(kept: str) -> Path:
+        if kept not in made:
+            folder = made[kept] = tmp_path_factory.mktemp(kept)
+            (folder / "base.yaml").write_text(BASE)
+            (folder / "c.yaml").write_text(CAMPAIGN.replace("FORMAT", kept))
+            campaign = Campaign.load(folder / "c.yaml")
+            with Client(slots, set_as_default=False) as client:
+                assert campaign.run(folder / "one", client=client).done == 7
+                for number in (1, 2, 3):
+                    out = folder / f"part-{number}"
+                    assert not campaign.run(out, client=client, shard=(number, 3)).failed
+        return made[kept]
+
+    return folder_of
+
+
+@pytest.fixture
+def parts(campaigns, tmp_path) -> list[Path]:
+    """Copies of the three shards of a campaign, whose files a test may change."""
+    folder = tmp_path / "shards"
+    shutil.copytree(campaigns("folder"), folder)
+    return [folder / f"part-{number}" for number in (1, 2, 3)]
+
+
+def without_times(found: Any) -> Any:
+    """Content of report.json but for times and figures of tasks."""
+    if isinstance(found, list):
+        return [without_times(one) for one in found]
+    if not isinstance(found, dict):
+        return found
+    of_run = {"seconds", "slowest", "stages", "tasks"}
+    return {name: without_times(one) for name, one in found.items() if name not in of_run}
+
+
+def content(folder: Path) -> dict[str, Any]:
+    """Content of a result or data set: bytes of each file, but of what depends on time."""
+    found: dict[str, Any] = {}
+    for path in sorted(path for path in folder.rglob("*") if path.is_file()):
+        assert not path.is_symlink()
+        name, data = path.relative_to(folder).as_posix(), path.read_bytes()
+        if name == "report.json":
+            found[name] = without_times(json.loads(data))
+        elif name == "jobs.csv":
+            found[name] = [
+                re.sub(r",[\d.e-]+,(\w{64})", r",\1", row) for row in data.decode().split()
+            ]
+        elif name == "jobs.parquet":
+            found[name] = pyarrow.parquet.read_table(path).drop_columns("seconds")
+        elif name not in ("report.html", "pictures/results.png"):
+            found[name] = data
+    return found
+
+
+@pytest.mark.parametrize("kept", quick(("folder", "nuscenes"), DATA_SETS))
+def test_shards_of_a_campaign_have_the_files_of_one_run(campaigns, tmp_path, kept):
+    folder, out = campaigns(kept), tmp_path / "ds"
+    report = merge([folder / f"part-{number}" for number in (3, 1, 2)], out)
+    assert content(out) == content(folder / "one")
+    assert report["jobs"] == {"described": 7, "done": 7, "failed": 0, "resumed": 0}
+    neighbours = [row.split(",")[0] for row in (folder / "part-2/jobs.csv").read_text().split()[1:]]
+    assert neighbours == ["1", "4"]
+    some = next((out / ".jobs").iterdir())
+    assert some.stat().st_nlink == 2  # a hard link
+
+
+@pytest.mark.usefixtures("pictures")
+def test_shards_of_a_campaign_have_the_pictures_of_one_run(slots, tmp_path):
+    (tmp_path / "base.yaml").write_text(BASE)
+    (tmp_path / "c.yaml").write_text(CAMPAIGN.replace("FORMAT", "folder").replace("7", "2"))
+    campaign = Campaign.load(tmp_path / "c.yaml")
+    with Client(slots, set_as_default=False) as client:
+        campaign.run(tmp_path / "one", client=client)
+        for number in (1, 2, 3):  # the last is empty
+            campaign.run(tmp_path / f"part-{number}", client=client, shard=(number, 3))
+    merge([tmp_path / f"part-{number}" for number in (1, 2, 3)], tmp_path / "all")
+    merge([tmp_path / "part-1", tmp_path / "part-2"], tmp_path / "two")
+    one = content(tmp_path / "one")
+    assert "pictures/job.png" in one and one == content(tmp_path / "all")
+    assert one == content(tmp_path / "two")
+
+
+# -- what is wrong --------------------------------------------------------------------------------
+
+
+def cut(path: Path) -> None:
+    path.write_bytes(path.read_bytes()[:-1])
+
+
+def flip(path: Path) -> None:
+    data = bytearray(path.read_bytes())
+    data[-1] ^= 1
+    path.write_bytes(data)
+
+
+def change(path: Path, old: str, new: str) -> None:
+    path.write_text(path.read_text().replace(old, new))
+
+
+DAMAGE = {
+    "cut": lambda part: cut(part / "jobs/0001/cloud.ply"),
+    "changed": lambda part: flip(part / "jobs/0001/cloud.ply"),
+    "lost": lambda part: (part / "jobs/0001/cloud.ply").unlink(),
+    "manifest": lambda part: flip(part / ".jobs/0001.json"),
+}
+
+
+@pytest.mark.parametrize("damage", DAMAGE)
+def test_damaged_files_are_named_and_the_next_merge_takes_them(
+    parts, campaigns, tmp_path, damage, slots
+):
+    DAMAGE[damage](parts[1])
+    out, name = tmp_path / "ds", ".jobs/0001.json" if damage == "manifest" else "0001/cloud.ply"
+    with pytest.raises(LidarpoolError, match=f"^missing or damaged: .*part-2/.*{name}; run"):
+        merge(parts, out)
+    assert not (out / "dataset.json").exists() and (out / ".jobs/0000.json").exists()
+    with Client(slots, set_as_default=False) as client:
+        campaign = Campaign.load(parts[0].parent / "c.yaml")
+        campaign.run(parts[1], client=client, verify=True, shard=(2, 3))
+    merge(parts, out)
+    made, whole = content(out), content(campaigns("folder") / "one")
+    assert made.pop("report.json")["notes"][0].startswith("made again: job 0001")
+    assert made == {name: data for name, data in whole.items() if name in made}
+
+
+def doubled(parts: list[Path]) -> list[Path]:
+    shutil.copytree(parts[0], parts[0].with_name("again"))
+    return [*parts, parts[0].with_name("again")]
+
+
+def foreign(old: str, new: str) -> Callable[[list[Path]], list[Path]]:
+    def make(parts: list[Path]) -> list[Path]:
+        change(parts[1] / "campaign.json", old, new)
+        return parts
+
+    return make
+
+
+def unfinished(parts: list[Path]) -> list[Path]:
+    (parts[2] / "report.json").unlink()
+    return parts
+
+
+WRONG = {
+    "missing": (lambda parts: parts[:2], "^missing: 1 shard, 3/3: give"),
+    "twice": (doubled, "^shard 1/3 is in .*part-1 and in .*again: give one"),
+    "no shard": (lambda parts: [*parts, parts[0].parent], "shards holds no finished shard"),
+    "unfinished": (unfinished, "^.*part-3 holds no finished shard"),
+    "division": (foreign('"2/3"', '"2/4"'), "part-2 and .* differ in the number of shards"),
+    "campaign": (foreign('"vary": "', '"vary": "0'), "part-2 and .*part-1 differ in vary:"),
+    "file": (foreign('"files": []', '"files": [["a.glb", "1"]]'), ""),
+    "software": (foreign("(sources ", "(sources x"), "part-2 and .*part-1 differ in lidarpool:"),
+    "workers": (foreign('"numpy": "', '"numpy": "0'), "part-2 and .*part-1 differ in numpy of wo"),
+    "count": (foreign('"count": 7', '"count": 11'), "^missing: 2 shards, 1/3, 3/3: give"),
+}
+
+
+@pytest.mark.parametrize("wrong", WRONG)
+def test_shards_that_do_not_fit_together_are_named(parts, tmp_path, wrong, lidarpool):
+    make, told = WRONG[wrong]
+    given = make(parts)
+    if not told:  # a file that only one has seen
+        merge(given, tmp_path / "ds")
+        return
+    done = lidarpool("merge", *given, "--out", tmp_path / "ds", "-q")
+    assert done.code == 2 and done.err.count("\n") == 1
+    assert re.search(told, done.err.removeprefix("lidarpool: ")), done.err
+    assert not (tmp_path / "ds").exists()
+
+
+def test_meshes_of_all_shards_are_the_same(parts, tmp_path):
+    for part, digest in zip(parts, "112", strict=True):
+        change(part / "campaign.json", '"files": []', f'"files": [["a.glb", "{digest}"]]')
+    with pytest.raises(LidarpoolError, match=r"part-3 and .*part-1 differ in the file a\.glb:"):
+        merge(parts, tmp_path / "ds")
+
+
+def test_merge_leaves_other_files_and_runs(parts, tmp_path):
+    out = tmp_path / "ds"
+    out.mkdir()
+    (out / "thesis.txt").write_text("mine")
+    with pytest.raises(LidarpoolError, match=r"holds thesis\.txt: a data set needs a folder"):
+        merge(parts, out)
+    assert [*out.iterdir()] == [out / "thesis.txt"]
+    for given, told in (([], "nothing to merge"), ([tmp_path / "none"], "none holds no finished")):
+        with pytest.raises(LidarpoolError, match=told):
+            merge(given, tmp_path / "new")
+
+
+# -- some of them, and more later -----------------------------------------------------------------
+
+
+def test_shards_are_added_later(parts, campaigns, tmp_path):
+    out = tmp_path / "ds"
+    report = merge([parts[0], parts[2], tmp_path / "none"], out, partial=True)
+    assert report["notes"] == ["missing: 1 shard, 2/3"] and report["jobs"]["done"] == 5
+    assert json.loads((out / "campaign.json").read_text())["shards"] == ["1/3", "3/3"]
+    shutil.rmtree(parts[0])
+    assert merge([parts[1]], out)["notes"] == []
+    whole = content(campaigns("folder") / "one")
+    assert content(out) == whole
+    merge([parts[1], parts[2]], out)  # again
+    assert content(out) == whole
+
+
+def test_a_campaign_that_has_grown_is_merged_into_the_same_place(parts, tmp_path, slots):
+    out, file = tmp_path / "ds", parts[0].parent / "c.yaml"
+    merge(parts, out)
+    change(file, "count: 7", "count: 9")
+    campaign = Campaign.load(file)
+    with Client(slots, set_as_default=False) as client:
+        campaign.run(tmp_path / "one", client=client)
+        for number in (2, 3):  # jobs 7 and 8; the first shard has none of them
+            run = campaign.run(parts[number - 1], client=client, resume=True, shard=(number, 3))
+            assert run.done == 3
+    with pytest.raises(LidarpoolError, match=r"^missing: 1 shard, 3/3"):
+        merge([parts[1]], out)
+    merge([parts[1], parts[2]], out)
+    assert content(out) == content(tmp_path / "one")
+
+
+def test_failed_jobs_are_in_the_table_until_they_are_done(tmp_path, slots):
+    (tmp_path / "base.yaml").write_text(BASE)
+    (tmp_path / "c.yaml").write_text(CAMPAIGN.replace("FORMAT", "folder").replace("7", "2"))
+    change(
+        tmp_path / "base.yaml",
+        "actors: [{name: Car, box: [4, 2, 1.5]",
+        "actors: [{name: Car, file: a.stl",
+    )
+    (tmp_path / "a.stl").write_text("solid a\nendsolid a\n")
+    campaign = Campaign.load(tmp_path / "c.yaml")
+    with Client(slots, set_as_default=False) as client:
+        for number in (1, 2):
+            run = campaign.run(tmp_path / f"part-{number}", client=client, shard=(number, 2))
+            assert len(run.failed) == 1
+    report = merge([tmp_path / "part-1", tmp_path / "part-2"], tmp_path / "ds")
+    assert (report["jobs"]["done"], report["jobs"]["failed"]) == (0, 2)
+    assert "0001" in (tmp_path / "ds" / "jobs.csv").read_text()
+
+
+# -- kills ----------------------------------------------------------------------------------------
+
+KILLED = """
+import os, signal, sys
+from lidarpool import merge
+from lidarpool.base.storage import Storage
+import lidarpool.report.campaign_output as output
+owners = {"take": Storage, "write_table": output, "finish": output.DataSet}
+name, left = sys.argv[1], [int(sys.argv[2])]
+function = getattr(owners[name], name)
+def call(*arguments, **options):
+    left[0] -= 1
+    if not left[0]:
+        os.kill(os.getpid(), signal.SIGKILL)
+    return function(*arguments, **options)
+setattr(owners[name], name, call)
+merge(sys.argv[4:], sys.argv[3])
+"""
+
+
+def killed(out: Path, parts: list[Path], *moments: tuple[str, int]) -> None:
+    """Merge, killed at some calls."""
+    for name, number in moments:
+        code = [sys.executable, "-c", KILLED, name, str(number), str(out), *map(str, parts)]
+        assert subprocess.run(code, check=False).returncode == -signal.SIGKILL
+
+
+def test_a_killed_merge_goes_on(parts, campaigns, tmp_path):
+    out = tmp_path / "ds"
+    killed(out, parts, ("take", 5), ("take", 5), ("write_table", 1), ("finish", 1))
+    assert not (out / "dataset.json").exists()
+    times = {path: path.stat().st_ctime_ns for path in (out / "jobs").rglob("*.ply")}
+    assert len(times) == 7
+    merge(parts, out)
+    assert content(out) == content(campaigns("folder") / "one")
+    assert times == {path: path.stat().st_ctime_ns for path in times}  # they were not taken again
+
+
+# -- surveys --------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def survey(slots, tmp_path_factory) -> Path:
+    """A folder with a survey."""
+    folder = tmp_path_factory.mktemp("survey")
+    (folder / "s.yaml").write_text(SURVEY)
+    return folder
+
+
+def test_shards_of_a_survey_have_the_files_of_one_run(survey, lidarpool, slots, small_batches):
+    run = ["run", survey / "s.yaml", "-q", "--scheduler", slots, "--out"]
+    assert lidarpool(*run, survey / "one").code == 0
+    for number in (1, 2, 3):
+        done = lidarpool(*run, survey / f"part-{number}", "--shard", f"{number}/3", "--json")
+        assert done.code == 0 and json.loads(done.out)["shard"] == f"{number}/3"
+        assert {path.name for path in (survey / f"part-{number}").iterdir()} == {"run"}
+    shards = [survey / f"part-{number}" for number in (2, 3, 1)]
+    done = lidarpool("merge", *shards, "--out", survey / "all", "-q", "--json")
+    assert (done.code, done.err) == (0, "")
+    one = content(survey / "one")
+    assert content(survey / "all") == one and {"cloud.ply", "cloud.las"} < one.keys()
+    assert one["report.json"]["planning"]["trials"] == 3
+    _some_of_a_survey(survey, shards)
+    _a_damaged_shard_of_a_survey(survey, shards, one)
+    _another_shard_in_the_folder(survey, lidarpool, slots)
+
+
+def _some_of_a_survey(survey: Path, shards: list[Path]) -> None:
+    with pytest.raises(LidarpoolError, match=r"^missing: 1 shard, 1/3: give them"):
+        merge(shards[:2], survey / "some")
+    report = merge(shards[:2], survey / "some", partial=True)
+    assert "missing: 1 shard, 1/3" in report["notes"] and report["planning"] is None
+    killed(survey / "some", shards, ("take", 3))
+    merge(shards, survey / "some")
+    assert content(survey / "some") == content(survey / "all")
+
+
+def _a_damaged_shard_of_a_survey(survey: Path, shards: list[Path], one: dict[str, Any]) -> None:
+    part = min((shards[0] / "run/parts").glob("*.npz"))
+    whole = part.read_bytes()
+    for data in (whole[:-1], whole[:200] + bytes([whole[200] ^ 1]) + whole[201:]):
+        part.unlink()
+        part.write_bytes(data)
+        with pytest.raises(LidarpoolError, match=f"^missing or damaged: .*{part.name}; run their"):
+            merge(shards, survey / "repaired")
+    part.unlink()
+    part.write_bytes(whole)
+    merge(shards, survey / "repaired")
+    assert content(survey / "repaired") == one
+    (survey / "elsewhere").mkdir()
+    (survey / "s.yaml").rename(survey / "elsewhere/s.yaml")
+    with pytest.raises(LidarpoolError, match=r"s\.yaml, of which these shards are, does not exist"):
+        merge(shards, survey / "moved")
+    merge(shards, survey / "moved", scenario=survey / "elsewhere/s.yaml")
+    change(survey / "elsewhere/s.yaml", "steps: 25", "steps: 26")
+    with pytest.raises(LidarpoolError, match=r"s\.yaml has another survey than these shards"):
+        merge(shards, survey / "none", scenario=survey / "elsewhere/s.yaml")
+    change(survey / "elsewhere/s.yaml", "steps: 26", "steps: 25")
+    (survey / "elsewhere/s.yaml").rename(survey / "s.yaml")
+
+
+def _another_shard_in_the_folder(survey: Path, lidarpool: Callable[..., Any], slots: str) -> None:
+    before = content(survey / "part-2")
+    run = ["run", survey / "s.yaml", "-q", "--scheduler", slots, "--out", survey / "part-2"]
+    for shard in (["--shard", "3/3"], ["--shard", "2/4"], []):
+        for more in ([], ["--resume"]):
+            refused = lidarpool(*run, *shard, *more)
+            assert refused.code == 2 and "it is shard 2/3, not" in refused.err, refused
+    assert lidarpool(*run, "--shard", "2/3", "--resume").code == 0
+    assert content(survey / "part-2").keys() == before.keys()
+
+
+def test_killed_drivers_of_a_shard_leave_the_same_points(tmp_path, slots):
+    (tmp_path / "s.yaml").write_text(SURVEY)
+    run = ["s.yaml", "-q", "--scheduler", slots]
+    kills = [("COMMIT", 2), ("COMMIT", 1), ("", 1)]
+    shard = [*run, "--resume", "--shard"]
+    assert drive(tmp_path, kills, *shard, "1/2", "--out", "part-1") == [-9, -9, 0]
+    for command in ([*shard, "2/2", "--out", "part-2"], [*run, "--out", "one"]):
+        assert drive(tmp_path, [("", 1)], *command) == [0]
+    merge([tmp_path / "part-1", tmp_path / "part-2"], tmp_path / "all")
+    assert content(tmp_path / "all") == content(tmp_path / "one")
+
+
+def test_the_first_shard_plans_though_it_has_no_scans(tmp_path, lidarpool, slots):
+    (tmp_path / "s.yaml").write_text(SURVEY.replace("steps: 25", "steps: 1"))  # two scans
+    run = ["run", tmp_path / "s.yaml", "-q", "--scheduler", slots, "--only", "cloud"]
+    parts = [tmp_path / f"part-{number}" for number in (1, 2, 3)]
+    for number, part in enumerate(parts, 1):
+        assert lidarpool(*run, "--shard", f"{number}/3", "--out", part).code == 0
+    with pytest.raises(LidarpoolError, match=r"^missing: 1 shard, 1/3: give"):
+        merge(parts[1:], tmp_path / "all")
+    report = merge(parts, tmp_path / "all")
+    assert report["planning"]["trials"] == 3 and "report.html" not in report["files"]
+    assert lidarpool(*run, "--out", tmp_path / "one").code == 0
+    assert content(tmp_path / "all") == content(tmp_path / "one")
+
+
+# -- shards ---------------------------------------------------------------------------------------
+
+
+def test_a_folder_keeps_its_shard(parts, lidarpool, slots):
+    before = content(parts[1])
+    run = ["run", parts[0].parent / "c.yaml", "-q", "--scheduler", slots, "--out", parts[1]]
+    for shard in (["--shard", "3/3"], ["--shard", "2/4"], []):
+        refused = lidarpool(*run, "--resume", *shard)
+        assert refused.code == 2 and "holds shard 2/3, and this is a run of" in refused.err
+        assert "holds a finished data set" in lidarpool(*run, *shard).err
+    assert lidarpool(*run, "--shard", "2/3", "--resume").code == 0
+    assert content(parts[1]) == before
+
+
+SHARDS = [
+    ("3/10", {}, Shard(3, 10)),
+    ("auto/10", {"JOB_COMPLETION_INDEX": "2"}, Shard(3, 10)),
+    ("auto", {"ID": "14", "MIN": "10", "STEP": "2", "COUNT": "10"}, Shard(3, 10)),
+    ("auto", {"ID": "9", "MIN": "1", "STEP": "1", "COUNT": "3"}, "no shard 9/3: they are 1/3 to"),
+    ("auto", {}, "finds no shard in SLURM_ARRAY_TASK_ID="),
+    ("auto/10", {"JOB_COMPLETION_INDEX": "x"}, "finds no shard in JOB_COMPLETION_INDEX=x"),
+    ("auto/10", {"JOB_COMPLETION_INDEX": "10"}, "no shard 11/10"),
+    ("0/10", {}, "no shard 0/10"),
+    ("11/10", {}, "no shard 11/10"),
+    ("3", {}, "'3' is no shard"),
+]
+
+
+@pytest.mark.parametrize(("text", "environment", "wanted"), SHARDS, ids=str)
+def test_a_shard_is_given_or_found(text, environment, wanted):
+    names = {
+        n if n.isupper() and "_" in n else f"SLURM_ARRAY_TASK_{n}": v
+        for n, v in environment.items()
+    }
+    if isinstance(wanted, Shard):
+        assert Shard.parse(text, names) == wanted
+    else:
+        with pytest.raises(LidarpoolError, match=wanted):
+            Shard.parse(text, names)
+
+
+@pytest.mark.parametrize("count", [0, 1, 7, 10, 101])
+def test_shards_are_all_of_it(count):
+    every = [Shard(number, 10) for number in range(1, 11)]
+    scans = [scan for shard in every for scan in shard.scans(count)]
+    assert scans == [*range(count)]
+    assert sorted(job for shard in every for job in shard.jobs(count)) == scans
+    assert {len(shard.scans(count)) for shard in every} <= {count // 10, count // 10 + 1}

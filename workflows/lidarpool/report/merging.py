@@ -1,0 +1,307 @@
+"""Merges shards, done by several clusters, into the data set or result of one run."""
+
+from __future__ import annotations
+
+import heapq
+import json
+import tempfile
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import closing, suppress
+from dataclasses import dataclass, replace
+from functools import partial
+from itertools import chain, groupby
+from operator import attrgetter
+from pathlib import Path
+from typing import Any
+
+from ..base.errors import LidarpoolError, Mistakes, explained
+from ..base.shard import ALL, Shard
+from ..base.software import software
+from ..base.storage import Storage
+from ..base.validation import checked
+from ..base.words import plural
+from ..columns.parts import part_name
+from ..datasets.dataset import INDEX_FILE, DataSet, ahead
+from ..datasets.job_table import JobRow, read_table
+from ..export.folder import LAST_FILE, output_place, result_folder
+from ..pipeline.database import FILE, RunDatabase
+from ..pipeline.messages import Receipt
+from ..plan import Trial
+from ..run.conductor import Conductor
+from ..run.job_points import listed
+from ..run.job_source import OneJob
+from ..run.options import RunOptions
+from ..run.progress import Screen
+from ..run.remote import fetch_database
+from ..run.run_page import RunPage
+from ..run.run_result import CampaignRun, RunResult
+from ..run.store import RUN_FOLDER, parts_of, with_sensors
+from ..scenario.build import build
+from ..scenario.scenario import Scenario
+from .campaign_output import CAMPAIGN_FILE, dataset_files, write_record, write_shared
+from .output import SurveyOutput
+
+NAMED = 20  # shards or files in a message
+_MISSING = "missing: "  # begins a note
+_AGAIN = "run their shards again with --resume (of a campaign --verify), and merge again"
+
+
+@dataclass(frozen=True)
+class _Part:
+    """Some shards of a run, in one place; `record` has what is in CAMPAIGN_FILE of a data set.
+
+    `whole` are the jobs or scans of the run in all; parts and trials are of a survey.
+    """
+
+    place: Storage
+    record: Mapping[str, Any]
+    shards: Sequence[Shard]
+    whole: int
+    notes: Sequence[str] = ()
+    points: Sequence[Receipt] = ()
+    trials: Sequence[Trial] = ()
+
+    def done(self, shard: Shard) -> range:
+        """Return the numbers of the jobs or scans of a shard."""
+        return (shard.jobs if "campaign" in self.record else shard.scans)(self.whole)
+
+    @property
+    def common(self) -> dict[str, Any]:
+        """What all parts must have in common."""
+        record = self.record
+        found = {"kind": [*record["identity"]]} | record["identity"]
+        found |= {f"the file {name}": digest for name, digest in record["files"]}
+        if record["casting"]:  # else it has cast nothing
+            found |= {f"{name} of workers": value for name, value in record["casting"].items()}
+        return found | ({"the number of shards": self.shards[0].of} if self.shards else {})
+
+
+@checked
+def merge(
+    shards: Sequence[str | Path | Storage],
+    out: str | Path | Storage,
+    *,
+    partial: bool = False,
+    scenario: str | Path | None = None,
+    screen: Screen | None = None,
+) -> dict[str, Any]:
+    """Merge shards into the data set or result that one run would have made.
+
+    Every byte is compared with what its shard says of it. After a kill, the same call goes on.
+
+    Parameters
+    ----------
+    shards, out
+        Folders or URLs of the shards of one campaign or survey, and of the data set or result.
+        Shards can be added to a data set later.
+    partial
+        Merge what there is; a note says what is missing.
+    scenario
+        Of a survey: its scenario or mesh file, if that is not where it was when the shards ran.
+    screen
+        To be told what goes on; by default the log.
+
+    Returns
+    -------
+    The content of report.json.
+
+    Raises
+    ------
+    LidarpoolError
+        If shards are missing, damaged, given twice, unfinished, of another run or other software:
+        it names them.
+    """
+    place, screen = output_place(str(out)), screen or Screen()
+    places = {one.url: one for one in map(Storage.at, shards) if one.url != Storage.at(place).url}
+    parts, mistakes = list[_Part](), Mistakes()
+    for one in places.values():
+        with mistakes.noted():
+            parts.append(_read(one))
+    mistakes.lines += [] if places else ["there is nothing to merge: give the folders of shards."]
+    if not (partial and parts):
+        mistakes.tell()
+    if "made_of" in parts[0].record:
+        return _merge_survey(parts, place, partial, scenario, screen)
+    with result_folder(place), screen.status("merging the data set"):
+        return _merge_dataset(parts, Storage.at(place), partial)
+
+
+def _read(place: Storage) -> _Part:
+    """Read a finished shard, or data set of several; LidarpoolError if it is none."""
+    with explained(f"{place} cannot be read"):
+        there, run = place.sizes(), place.below(RUN_FOLDER)
+        with suppress(LidarpoolError, LookupError, TypeError, ValueError):
+            if {CAMPAIGN_FILE, INDEX_FILE, LAST_FILE} <= there.keys():
+                return _of_dataset(place, json.loads(place.read(LAST_FILE))["notes"])
+            if FILE in run.sizes():
+                return _of_survey(place, run)
+    raise LidarpoolError(
+        f"{place} holds no finished shard: give a folder of lidarpool run --shard; --resume "
+        "finishes an unfinished one."
+    )
+
+
+def _of_dataset(place: Storage, notes: Sequence[str] = (), of: int = 1) -> _Part:
+    """Read a data set of some shards; one that has all has each of so many."""
+    record = json.loads(place.read(CAMPAIGN_FILE))
+    shards = [Shard.parse(text) for text in record["shards"]]
+    if shards == [ALL]:
+        shards = [Shard(number, of) for number in range(1, of + 1)]
+    notes = [note for note in notes if not note.startswith(_MISSING)]
+    return _Part(place, record, shards, record["campaign"]["count"], notes)
+
+
+def _of_survey(place: Storage, run: Storage) -> _Part:
+    """Read a shard of a survey; LookupError if it is none, or not finished."""
+    with tempfile.TemporaryDirectory(prefix="lidarpool-") as folder:
+        fetch_database(run, Path(folder, FILE))
+        with closing(RunDatabase(Path(folder, FILE), durable=False)) as db:
+            meta = {"casting": "{}"} | db.meta
+            told = ("identity", "casting", "made_of", "notes")
+            record = {**meta, "files": [], **{name: json.loads(meta[name]) for name in told}}
+            shard, whole = Shard.parse(record["identity"].pop("shard")), record["made_of"]["scans"]
+            kept = db.job(0, shard.scans(whole).stop, shard.scans(whole).start)
+            if not kept.complete:
+                raise LookupError("scans are missing")
+            return _Part(place, record, [shard], whole, record["notes"], kept.ordered, kept.trials)
+
+
+def _check(parts: Sequence[_Part], partial: bool, own: _Part | None = None) -> list[str]:
+    """Check that all are of one run, and none is missing but with `partial`; returns all notes.
+
+    Others may have what is in `own`, too. LidarpoolError names the parts that are wrong.
+    """
+    mistakes, wanted = Mistakes(), software()
+    first, seen = "the software here", dict[int, _Part]()
+    for part in sorted(parts, key=lambda part: not part.record["casting"]):
+        common = part.common
+        if differs := [name for name in wanted if common.get(name, wanted[name]) != wanted[name]]:
+            told = f"{part.place} and {first} differ in {differs[0]}"
+            mistakes.lines.append(f"{told}: merge shards of one run and of the same software.")
+        elif len(common) > len(wanted):
+            wanted, first = common, str(part.place)
+        for shard in part.shards if part is not own else ():
+            if (other := seen.setdefault(shard.number, part)) is not part:
+                twice = f"shard {shard} is in {other.place} and in {part.place}"
+                mistakes.lines.append(f"{twice}: give one of them.")
+    mistakes.tell()
+    notes = [*dict.fromkeys(note for part in parts for note in part.notes)]
+    if not (missing := _missing(parts)):
+        return notes
+    told = f"{_MISSING}{plural(len(missing), 'shard')}, {listed([*map(str, missing)], NAMED)}"
+    if not partial:
+        raise LidarpoolError(f"{told}: give them, too, or merge what there is with --partial.")
+    return [*notes, told]
+
+
+def _missing(parts: Sequence[_Part]) -> list[Shard]:
+    """List the shards that are not there, or lack jobs by which the campaign has grown."""
+    largest, of = max(parts, key=lambda part: part.whole), parts[-1].shards[0].of
+    have = {shard.number: len(part.done(shard)) for part in parts for shard in part.shards}
+    have.setdefault(1, -1)  # which plans the path, even if it has no scans
+    every = (Shard(number, of) for number in range(1, of + 1))
+    return [shard for shard in every if have.get(shard.number, 0) < len(largest.done(shard))]
+
+
+def _merge_dataset(parts: Sequence[_Part], out: Storage, partial: bool) -> dict[str, Any]:
+    """Take the jobs of all parts into a data set, and write what all jobs share."""
+    begun = CAMPAIGN_FILE in out.sizes()
+    dataset_files(out, begun=begun)
+    own = _of_dataset(out, of=parts[0].shards[0].of) if begun else None
+    known = [own, *parts] if own else parts
+    notes, sensors = _check(known, partial, own), dict[str, str]()
+    for part in known:
+        sensors = with_sensors(sensors, part.record["sensors"].items())
+    cast = next((part for part in known if part.record["casting"]), parts[0])
+    campaign = max(known, key=lambda part: part.whole).record["campaign"]
+    record = {**cast.record, "sensors": sensors, "campaign": campaign}
+    dataset = DataSet(replace(out, durable=False), **campaign["keep"])
+    dataset.check_installed()
+    if own is None:  # from now on it is known whose files these are
+        write_record(out, record | {"shards": []})
+    with explained(f"{out} cannot be merged"):
+        taken = (dataset.take(part.place, read_table(part.place)) for part in parts)
+        if damaged := [wrong for _, wrong in chain.from_iterable(taken) if wrong]:
+            raise LidarpoolError(f"missing or damaged: {listed(damaged, NAMED)}; {_AGAIN}.")
+    lacking, there = _missing(known), {shard for part in known for shard in part.shards}
+    record["shards"] = [*map(str, sorted(there.difference(lacking)) if lacking else [ALL])]
+    more = {"sensors": sensors, "notes": tuple(notes)}
+    run = CampaignRun.of(_rows(known), 0.0, 0, **more)
+    return write_shared(dataset, record, run, lambda: _rows(known))[1]
+
+
+def _rows(parts: Sequence[_Part]) -> Iterator[JobRow]:
+    """Yield the rows of all jobs by number; of a job of several parts, that of the last one."""
+    number = attrgetter("number")
+    tables = [read_table(part.place) for part in parts if part.shards]
+    for _, rows in groupby(heapq.merge(*tables, key=number), number):
+        yield [*rows][-1]
+
+
+def _merge_survey(
+    parts: Sequence[_Part],
+    out: Path | Storage,
+    partial: bool,
+    scenario: str | Path | None,
+    screen: Screen,
+) -> dict[str, Any]:
+    """Make the survey again, and write its result from the points of all parts."""
+    notes, record = _check(parts, partial), parts[0].record
+    told = record["made_of"]
+    path = Path(scenario or told["path"])
+    if not path.exists():
+        raise LidarpoolError(f"{path}, of which these shards are, does not exist: give --scenario.")
+    with screen.status("reading the scene"):
+        built = build(Scenario.load(path, told["options"]), plans=told["plans"])
+        job = built.job()
+        jobs = OneJob(job)
+        identity = jobs.identity
+    if differs := [name for name in identity if identity[name] != record["identity"][name]]:
+        raise LidarpoolError(f"{path} has another {differs[0]} than these shards: give --scenario.")
+    own: dict[str, Any] = {"scenario": built.scenario, "parts": parts, "notes": notes}
+    output = _Merged(out, job.survey, job.outputs, told["extent"], **own)
+    options = RunOptions(out=out, folder=Storage.at(out).below(RUN_FOLDER), resume=True)
+    return Conductor(jobs, options, output, screen, RunPage())()[1]
+
+
+@dataclass(eq=False)
+class _Merged(SurveyOutput):
+    """The result of a survey whose points are those of parts."""
+
+    parts: Sequence[_Part] = ()
+    notes: Sequence[str] = ()
+    casts = False
+
+    def look(self, conductor: Conductor[tuple[RunResult, dict[str, Any]]]) -> None:
+        """Take all points into the run's store; LidarpoolError names damaged files."""
+        store, damaged = conductor.store, list[str]()
+        only, mark = store.only, store.db.meta["mark"]
+        assert only is not None, "of a survey"
+
+        def take(source: Storage, one: Receipt) -> Receipt | None:
+            """Return the receipt of a file that is taken; None if it is missing or damaged."""
+            own = part_name(mark, 0, one.first, one.stop)
+            with explained(f"{source.path(one.name)} cannot be taken"), suppress(FileNotFoundError):
+                store.storage.take(source, one.name, own)
+                receipt = only.receipt(own)
+                if receipt is not None and replace(receipt, name=one.name, summaries=b"") == one:
+                    return receipt
+                store.storage.remove([own])
+            return None
+
+        for part in self.parts:
+            if casting := part.record["casting"]:
+                store.cast_with(part.record["backend"], casting)
+            if part.trials and not only.parts.trials:
+                store.db.add_trials(0, part.trials)
+            source = parts_of(part.place.below(RUN_FOLDER), part.record["parts"])
+            left = (one for one in part.points if only.parts.missing(one.first, one.stop))
+            for one, receipt in ahead(partial(take, source), left):
+                if receipt is None or not store.db.commit([receipt]):
+                    damaged.append(source.path(one.name))
+        if damaged:
+            raise LidarpoolError(f"missing or damaged: {listed(damaged, NAMED)}; {_AGAIN}.")
+        if not only.parts.trials:  # the first shard, which plans, is missing
+            only.job = replace(only.job, planning=None)
+        only.parts.frames, only.resumed = only.parts.scans.stop, 0
+        store.notes = [*self.notes]
