@@ -6,6 +6,7 @@ import shutil
 import signal
 import subprocess
 import sys
+import zlib
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -186,6 +187,19 @@ def test_damaged_files_are_named_and_the_next_merge_takes_them(
     made, whole = content(out), content(campaigns("folder") / "one")
     assert made.pop("report.json")["notes"][0].startswith("made again: job 0001")
     assert made == {name: data for name, data in whole.items() if name in made}
+
+
+def test_a_manifest_that_names_files_elsewhere_is_damaged(parts, tmp_path):
+    path, out = parts[1] / ".jobs/0001.json", tmp_path / "below/ds"
+    (parts[1].parent / "stranger").write_text("of others")
+    manifest = json.loads(path.read_text())
+    del manifest["crc"]
+    manifest["files"] = {"../stranger": 0} | manifest["files"]
+    crc = zlib.crc32(json.dumps(manifest).encode())
+    path.write_text(json.dumps(manifest | {"crc": crc}))
+    with pytest.raises(LidarpoolError, match=r"^missing or damaged: .*part-2/\.jobs/0001\.json"):
+        merge(parts, out)
+    assert not (out.parent / "stranger").exists()
 
 
 def doubled(parts: list[Path]) -> list[Path]:

@@ -94,7 +94,7 @@ class WeatherStep(PulseStep):
 
     @staticmethod
     def memory(setup: Setup, sizes: Sizes) -> Memory:
-        """See `PulseStep.memory`."""
+        """See `PulseStep.memory`: of sub-rays, and of hits in the air."""
         return Memory(casting=110 * sizes.subrays + 170 * WeatherStep.added(setup) * sizes.beams)
 
     def apply(self, returns: PulseReturns, batch: PulseBatch) -> PulseReturns:

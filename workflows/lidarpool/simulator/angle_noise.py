@@ -24,7 +24,7 @@ class AngleNoiseStep(PulseStep):
         """See `PulseStep.memory`."""
         if setup.several:  # then some beams are turned at a time
             return Memory()
-        return Memory(kept=32 * sizes.rays, casting=20 * sizes.rays)
+        return Memory(kept=32 * sizes.rays, casting=20 * sizes.rays)  # a direction each
 
     def apply(self, returns: PulseReturns, batch: PulseBatch) -> PulseReturns:
         """See `PulseStep.apply`."""

@@ -71,7 +71,7 @@ class CrosstalkStep(PulseStep):
 
     @staticmethod
     def memory(setup: Setup, sizes: Sizes) -> Memory:
-        """See `PulseStep.memory`."""
+        """See `PulseStep.memory`: a cause of each return, rays, and pulses of others."""
         others = _pulses_meanwhile(setup.survey, setup.sensor)
         return Memory(kept=10 * sizes.returns, casting=(120 + 370 * others) * sizes.beams)
 

@@ -30,7 +30,7 @@ class FalseAlarmStep(PulseStep):
 
     @staticmethod
     def memory(setup: Setup, sizes: Sizes) -> Memory:
-        """See `PulseStep.memory`."""
+        """See `PulseStep.memory`: a cause of each return, and rays."""
         return Memory(kept=10 * sizes.returns, casting=120 * sizes.beams)
 
     def apply(self, returns: PulseReturns, batch: PulseBatch) -> PulseReturns:

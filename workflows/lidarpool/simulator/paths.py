@@ -71,7 +71,7 @@ class CastStep(PulseStep):
 
     @staticmethod
     def memory(setup: Setup, sizes: Sizes) -> Memory:
-        """See `PulseStep.memory`."""
+        """See `PulseStep.memory`: sub-rays, more where light goes on or is bent, and returns."""
         subray = 200 if not setup.passing else 1350 if setup.refracting else 650
         casting = (subray + 200 * setup.moving) * sizes.subrays + 30 * sizes.returns
         return Memory(casting=casting, counting=110 * sizes.returns + 40 * sizes.points)

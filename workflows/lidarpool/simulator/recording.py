@@ -31,7 +31,7 @@ class RecordingStep(PulseStep):
 
     @staticmethod
     def memory(setup: Setup, sizes: Sizes) -> Memory:
-        """See `PulseStep.memory`."""
+        """See `PulseStep.memory`: samples that are made at a time, and the records."""
         recorded = record(setup.recorded).itemsize * sizes.returns
         made = 40 * min(sizes.subrays * setup.recorded, BLOCK_SAMPLES)
         return Memory(casting=made + recorded, counting=2.3 * recorded)
