@@ -52,14 +52,16 @@ def cars(count: int, mesh: SceneMesh, seed: int) -> list[Actor]:
     for k in range(count):
         begin = radius[k] * np.array([np.cos(angle[k]), np.sin(angle[k]), 0])
         ahead = 10 * np.array([np.cos(heading[k]), np.sin(heading[k]), 0])
-        yaw = heading[k] + turns[k] * np.array([0, 1])
+        yaw = heading[k] + turns[k] * np.array([0, 1, 1])
         quaternions = np.stack([0 * yaw, 0 * yaw, np.sin(yaw / 2), np.cos(yaw / 2)], axis=1)
-        made.append(Actor(mesh, Track([0, 1], [begin, begin + ahead], quaternions)))
+        made.append(
+            Actor(mesh, Track([0, 1, 10], [begin, begin + ahead, begin + 10 * ahead], quaternions))
+        )
     return made
 
 
 def cases(scene: Scene, backend: str, counts: tuple[int, ...], sensor: str) -> dict[str, Any]:
-    """Make a function of the round for each row, which gives its number of points."""
+    """Make a function of the round for each row, which gives its sweep."""
     lidar = load_sensor(sensor)
     weather = {"rain": {"rain_mm_h": 10.0}, "snow": {"snow_mm_h": 2.0}}
     weather["fog"] = {"visibility_km": 0.2, "fog_lidar_ratio_sr": 20.0}
@@ -75,7 +77,7 @@ def cases(scene: Scene, backend: str, counts: tuple[int, ...], sensor: str) -> d
             threads=1,
             **options,
         )
-        return lambda number: len(scanner.sweep(where, number=number))
+        return lambda number: scanner.sweep(where, number=number)
 
     rows = {"bare": case([])}
     for count in counts:
@@ -109,7 +111,7 @@ def measure(rows: dict[str, Any], rounds: int) -> dict[str, dict[str, float]]:
     for number in range(rounds + 1):
         for row in np.random.default_rng(number).permutation(list(rows)).tolist():
             start = time.process_time()
-            points[row] = rows[row](number % 5)
+            points[row] = len(rows[row](number % 5))
             if number:
                 seconds[row].append(time.process_time() - start)
     bare = float(np.median(seconds["bare"]))
