@@ -24,7 +24,7 @@ from lidarpool.render.pictures import splat
 from lidarpool.render.surface import unit
 from lidarpool.scene.generated.city import city
 
-from .realism import PLACE, TURN_S, cases
+from .realism import TURN_S, cases
 
 SIZE, BACK = (960, 540), np.array([14, 17, 22, 255]) / 255
 EYE, TARGET = np.array([-38.0, -30.0, 34.0]), np.array([4.0, 4.0, 0.0])
