@@ -101,7 +101,7 @@ def write_mcap(path: Path, cloud: CloudLike, sweeps: Sweeps, layout: str) -> Non
     Layouts of a point: `velodyne` (22 bytes; its time in seconds since the sweep began),
     `autoware` (PointXYZIRCAEDT, 32 bytes; angles in radians, time_stamp in ns since the sweep
     began) and `ouster` (48 bytes; range in mm, t in ns since the sweep began). Whole numbers of
-    intensity and reflectivity are 255 and 65,535 at 1 and above. Where the cloud has red, green and
+    intensity are 255 at 1 and above. Where the cloud has red, green and
     blue, a field `rgb` follows, where it has radial velocities, `radial_velocity`, and where its
     classes have names, `label`; each makes points of `velodyne` and `autoware` 4 bytes longer.
     """
@@ -318,7 +318,7 @@ def _rows(
         values |= {
             "intensity": there["intensity"],
             "t": np.clip(since, 0, None),
-            "reflectivity": np.round(np.clip(there["reflectivity"], 0, 1) * 65_535),
+            "reflectivity": there["reflectivity"],
             "ring": there["channel"],
             "range": np.round(there["range"] * 1000),
         }
