@@ -95,7 +95,7 @@ def cloud(survey) -> Cloud:
         "object": rng.integers(0, 7, count),
         "time": begins.astype(np.int64) + rng.integers(0, 2_000_000, count),
         "intensity": rng.uniform(0, 1, count).astype(np.float32),
-        "reflectivity": rng.uniform(0, 1, count).astype(np.float32),
+        "reflectivity": rng.integers(0, 256, count).astype(np.uint8),
         "range": rng.uniform(1, 50, count).astype(np.float32),
         "azimuth": rng.uniform(0, 360, count).astype(np.float32),
         "elevation": rng.uniform(-30, 30, count).astype(np.float32),
@@ -286,6 +286,7 @@ def test_bags_have_points_frames_and_a_clock(written, cloud, sweeps, name, layou
         np.testing.assert_array_equal(rows["intensity"], np.round(points.intensity * 255))
     if layout == "ouster":
         np.testing.assert_array_equal(rows["range"], np.round(points.range * 1000))
+        np.testing.assert_array_equal(rows["reflectivity"], points.reflectivity)
 
 
 @pytest.mark.parametrize(("layout", "step"), [("velodyne", 26), ("autoware", 36), ("ouster", 48)])
