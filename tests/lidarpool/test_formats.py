@@ -53,7 +53,7 @@ from lidarpool.scene.actors import Actor, box
 from lidarpool.sensor.trajectory import matrices
 
 COLUMNS = ("time", "intensity", "reflectivity", "range", "azimuth", "elevation", "class",
-           "return_number", "returns", "sensor", "ray")  # fmt: skip
+           "return_number", "returns", "sensor", "ray", "signal")  # fmt: skip
 
 
 @pytest.fixture(scope="module")
@@ -96,6 +96,7 @@ def cloud(survey) -> Cloud:
         "time": begins.astype(np.int64) + rng.integers(0, 2_000_000, count),
         "intensity": rng.uniform(0, 1, count).astype(np.float32),
         "reflectivity": rng.integers(0, 256, count).astype(np.uint8),
+        "signal": rng.integers(0, 65_536, count).astype(np.uint16),
         "range": rng.uniform(1, 50, count).astype(np.float32),
         "azimuth": rng.uniform(0, 360, count).astype(np.float32),
         "elevation": rng.uniform(-30, 30, count).astype(np.float32),
@@ -155,7 +156,9 @@ def test_las_has_fields_of_its_own_and_the_rest_in_extra_bytes(written, cloud, n
     np.testing.assert_array_equal(
         las.classification, np.where(cloud["class"] < 256, cloud["class"], 0)
     )
-    for column in ("scan", "object", "class", "range", "elevation", "sensor"):
+    for column in (
+        "scan", "object", "class", "range", "elevation", "sensor", "reflectivity", "signal",
+    ):  # fmt: skip
         np.testing.assert_array_equal(las[column], cloud[column])
     np.testing.assert_array_equal(las["ring"], cloud.channel)
     np.testing.assert_array_equal(las["energy"], cloud.intensity)

@@ -158,7 +158,7 @@ def test_saturation_is_that_of_the_twin(full, waves):
     expected = {k: twin.saturated(own, full, length, waves) for k, own in given.items()}
     found = found._replace(width=found.width / width_ns, velocity=None)
     same_returns(found, expected, 1e-9)
-    assert len(found.ray) < 0.97 * len(returns.ray) and found.amplitude.max() == full
+    assert len(found.ray) < len(returns.ray) - 20 and found.amplitude.max() == full
     assert (found.amplitude == full).mean() > 0.1
 
 
