@@ -290,6 +290,7 @@ def test_bags_have_points_frames_and_a_clock(written, cloud, sweeps, name, layou
     if layout == "ouster":
         np.testing.assert_array_equal(rows["range"], np.round(points.range * 1000))
         np.testing.assert_array_equal(rows["reflectivity"], points.reflectivity)
+        np.testing.assert_array_equal(rows["intensity"], points.signal)
 
 
 @pytest.mark.parametrize(("layout", "step"), [("velodyne", 26), ("autoware", 36), ("ouster", 48)])
@@ -371,7 +372,7 @@ def test_what_cannot_be_written_is_one_line_and_leaves_nothing(
     bare = Cloud(cloud.positions, {name: cloud[name] for name in ("scan", "channel", "object")})
     with pytest.raises(LidarpoolError, match=r"kitti needs intensity, class, .*output\.write"):
         Format("kitti").write(tmp_path / "kitti", bare, sweeps)
-    with pytest.raises(LidarpoolError, match="mcap with the layout ouster needs intensity, time"):
+    with pytest.raises(LidarpoolError, match="mcap with the layout ouster needs signal, time"):
         Format("mcap", "ouster").write(tmp_path / "cloud.mcap", bare, sweeps)
     (tmp_path / "cloud.laz").write_text("mine")
     with pytest.raises(LidarpoolError, match=r"exists: .* --overwrite"):
