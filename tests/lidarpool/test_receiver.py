@@ -180,8 +180,10 @@ def test_recorded_samples_are_clipped():
     waves = part.cloud(table, survey.precision_m, np.zeros(3)).waveforms
     samples, full_at = waves.samples[0], 50 * THRESHOLD
     assert samples.max() == pytest.approx(full_at, rel=1e-3)
-    above = np.count_nonzero(samples > full_at / 2)
-    assert abs(above - width_ns(1 / full_at)) < 1.5, "samples are 1 ns apart"
+    above = np.flatnonzero(samples > full_at / 2)
+    assert abs(len(above) - width_ns(1 / full_at)) < 1.5, "samples are 1 ns apart"
+    edge = waves.times_ns[0][above[0]] * LIGHT_M_S / 2e9
+    assert part.columns["range"] == pytest.approx([edge + 5 * QUARTER], abs=0.15), "calibrated"
     assert np.count_nonzero(samples > 0.99 * full_at) >= 8, "a plateau, with noise below"
 
 
