@@ -13,7 +13,7 @@ from .materials import RETRO_GAIN
 _BEST = 8 * RETRO_GAIN  # reflectance of the best retro-reflective sheets
 
 
-class Scale(NamedTuple):
+class ByteScale(NamedTuple):
     """Codes of reflectances: linear up to `code`, which has a `reflectance`, then logarithmic."""
 
     code: int
@@ -40,8 +40,8 @@ class Scale(NamedTuple):
 # Of the makers' manuals. Only Hesai publishes all of its scale: the others say that it is
 # logarithmic above white, or ends with an ideal retro-reflector.
 SCALES = {
-    "velodyne": Scale(100, 1.0, _BEST),
-    "vls128": Scale(110, 1.0, _BEST),
-    "ouster": Scale(100, 1.0, _BEST),
-    "hesai": Scale(255, 2.55, 2.55),
+    "velodyne": ByteScale(100, 1.0, _BEST),
+    "vls128": ByteScale(110, 1.0, _BEST),
+    "ouster": ByteScale(100, 1.0, _BEST),
+    "hesai": ByteScale(255, 2.55, 2.55),
 }
