@@ -1,9 +1,9 @@
 """What is real, beside what is bare: `python -m benchmarks.realism [--rounds N] [--json]`.
 
 One sweep of an OS1-64 in a city of 100,000 triangles, one thread: bare, with cars that move (boxes,
-and meshes of 1,000 triangles), from a sensor that moves too, with sub-rays, with noise, in rain,
-fog and snow; cars, sub-rays, noise and rain together (`real`), and all of it. Each figure is the
-median of the rounds, and a multiple of the bare sweep's.
+and meshes of 1,000 triangles), from a sensor that moves too, with sub-rays, with noise, with lost
+returns, with saturation, in rain, fog and snow; cars, sub-rays, noise and rain together (`real`),
+and all of it. Each figure is the median of the rounds, and a multiple of the bare sweep's.
 """
 
 from __future__ import annotations
@@ -90,6 +90,8 @@ def cases(scene: Scene, backend: str, counts: tuple[int, ...], sensor: str) -> d
         rows[f"{subrays} sub-rays"] = case([], returns=beam)
     rows["noise"] = case([], noise=Noise(range_m=0.02))
     noise = Noise(detection_range_m=90)  # without which no weather returns light
+    rows["detection"] = case([], noise=noise)
+    rows["saturation"] = case([], noise=Noise(detection_range_m=90, saturation=100))
     rows |= {name: case([], noise=noise, **options) for name, options in weather.items()}
     beam = Returns(subrays=7, divergence_mrad=3)
     real = {"noise": Noise(detection_range_m=90, range_m=0.02), "returns": beam}

@@ -29,6 +29,7 @@ NOISE = Noise(
     false_alarm_hz=1e5,
     stray_light=1e-4,
     crosstalk=True,
+    saturation=100,
 )
 LIDAR = load_sensor("velodyne/vlp16")
 COMMON = {

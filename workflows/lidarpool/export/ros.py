@@ -100,8 +100,8 @@ def write_mcap(path: Path, cloud: CloudLike, sweeps: Sweeps, layout: str) -> Non
 
     Layouts of a point: `velodyne` (22 bytes; its time in seconds since the sweep began),
     `autoware` (PointXYZIRCAEDT, 32 bytes; angles in radians, time_stamp in ns since the sweep
-    began) and `ouster` (48 bytes; range in mm, t in ns since the sweep began). Whole numbers of
-    intensity and reflectivity are 255 and 65,535 at 1 and above. Where the cloud has red, green and
+    began) and `ouster` (48 bytes; range in mm, t in ns since the sweep began, intensity: signal).
+    Whole numbers of intensity are 255 at 1 and above. Where the cloud has red, green and
     blue, a field `rgb` follows, where it has radial velocities, `radial_velocity`, and where its
     classes have names, `label`; each makes points of `velodyne` and `autoware` 4 bytes longer.
     """
@@ -300,13 +300,12 @@ def _rows(
 ) -> Records:
     """Points of a sweep in a layout, of the type of `_row`."""
     there, since = points.columns, points["time"] - sweeps.begins_ns[sweep]
-    light = np.clip(there["intensity"], 0, 1)
     values = dict(zip("xyz", sweeps.in_sensor(sweep, points.positions).T, strict=True))
     if layout in ("velodyne", "images"):
         values |= {"intensity": there["intensity"], "ring": there["channel"], "time": since / 1e9}
     elif layout == "autoware":
         values |= {
-            "intensity": np.round(light * 255),
+            "intensity": np.round(np.clip(there["intensity"], 0, 1) * 255),
             "return_type": np.ones(len(points)),
             "channel": there["channel"],
             "azimuth": np.radians(there["azimuth"]),
@@ -316,9 +315,9 @@ def _rows(
         }
     else:
         values |= {
-            "intensity": there["intensity"],
+            "intensity": there["signal"],
             "t": np.clip(since, 0, None),
-            "reflectivity": np.round(np.clip(there["reflectivity"], 0, 1) * 65_535),
+            "reflectivity": there["reflectivity"],
             "ring": there["channel"],
             "range": np.round(there["range"] * 1000),
         }

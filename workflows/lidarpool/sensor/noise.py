@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 from enum import Enum, unique
 from functools import cache
 from hashlib import sha256
+from math import inf
 from statistics import NormalDist
 from typing import Annotated
 
@@ -154,12 +155,22 @@ class Noise:
     velocity_m_s: Annotated[
         float, about("standard deviation of radial velocities, m/s", ge=0, le=1000)
     ] = 0.0
+    saturation: Annotated[
+        float | None,
+        about(
+            "signal that fills the receiver, in thresholds of detection: stronger pulses are "
+            "clipped and wider, and hide what is close; by default none",
+            100.0,
+            ge=1,
+            le=1e12,
+        ),
+    ] = None
 
     def __post_init__(self) -> None:
-        needs = ("range_at_threshold_m", "walk_m", "false_alarm_hz", "stray_light", "crosstalk")
+        needs = "range_at_threshold_m", "walk_m", "false_alarm_hz", "stray_light", "crosstalk"
         if self.detection_range_m is None:
-            for name in needs:
-                if getattr(self, name) > 0:
+            for name in (*needs, "saturation"):
+                if getattr(self, name):
                     raise LidarpoolError(
                         f"noise.{name} is measured by the threshold of detection: give "
                         "noise.detection_range_m as well."
@@ -171,6 +182,11 @@ class Noise:
         if self.detection_range_m is None:
             return 0.0
         return float(TARGET_REFLECTANCE * at_right_angles(self.detection_range_m))
+
+    @property
+    def full(self) -> float:
+        """Signal that fills the receiver: no recorded pulse is higher."""
+        return inf if self.saturation is None else self.saturation * self.threshold
 
     @property
     def loses(self) -> bool:

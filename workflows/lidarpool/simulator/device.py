@@ -34,7 +34,7 @@ from .surfaces import Surfaces
 
 OPTIONS = "-std=c++17", "-fmad=false"  # of the compiler
 _BLOCK = 128  # threads
-_ENERGIES = "intensity", "reflectivity"
+_ENERGIES = "intensity", "reflectance"
 _TRIANGLE = TABLE["triangle"]
 # In the order of columns.cu.
 _MADE = (

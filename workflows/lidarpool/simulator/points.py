@@ -19,6 +19,7 @@ from ..scene.scene import Scene
 from ..sensor import ScanSpec, Survey
 from ..sensor.materials import at_right_angles
 from ..sensor.optics import LIGHT_M_NS
+from ..sensor.reflectivity import SCALES
 from .doppler import radial_velocities
 from .motion import Poses
 from .pulses import Scanned
@@ -26,6 +27,7 @@ from .returns import FALSE_ALARM, NO_SURFACE, made
 from .surfaces import Surfaces, light_of
 
 BLOCK_HITS = 1 << 16  # that are looked at a time
+COUNTS = 10_000  # of an intensity of 1: the makers publish no such figure
 LEAST_LEFT = 1e-30  # of the light, so that what is divided by it is finite in single precision
 
 
@@ -297,7 +299,23 @@ class BatchPoints:
         return unpacked(self._colours)[:, 2]
 
     @property
-    def reflectivity(self) -> Floats:
+    def _recorded(self) -> Floats:
+        """Received energy, at most what fills the receiver."""
+        return np.minimum(self.intensity, self.survey.noise_each[self.specs[0].sensor].full)
+
+    @property
+    def signal(self) -> NDArray[np.uint16]:
+        """Counts in proportion to the recorded energy."""
+        return np.minimum(np.rint(self._recorded * COUNTS), 65_535).astype(np.uint16)
+
+    @property
+    def reflectivity(self) -> Bytes:
+        """Recorded energy without the loss by distance, on the scale of the sensor's maker."""
+        lost = at_right_angles(self.found.distance)
+        return SCALES[self.sensor.optics.reflectivity].codes(self._recorded / lost)
+
+    @property
+    def reflectance(self) -> Floats:
         """Intensity without the loss by distance and air."""
         lost = at_right_angles(self.found.distance, self.survey.extinction(self.sensor))
         # In thick fog or dust nothing is left of the light from where a false alarm seems to be.

@@ -23,6 +23,7 @@ class RangeNoiseStep(PulseStep):
 
     def apply(self, returns: PulseReturns, batch: PulseBatch) -> PulseReturns:
         """See `PulseStep.apply`."""
-        height = returns.energy if returns.amplitude is None else returns.amplitude
+        # The leading edge of a clipped pulse is that of the whole pulse.
+        height = returns.height if self.setup.in_waveforms else returns.energy
         key = *batch.keys.of(returns.ray), made(returns.number)
         return returns._replace(reported=self.setup.noise.ranges(returns.distance, height, *key))

@@ -95,9 +95,11 @@ class Setup:
         return beam or noise.loses or self.passing or dark
 
     @property
-    def adds(self) -> bool:
-        """Whether the receiver reports what is no return of its pulse."""
-        return bool(self.noise.false_alarm_hz or self.noise.stray_light or self.noise.crosstalk)
+    def receives_more(self) -> bool:
+        """Whether the receiver adds to the returns of a pulse or joins some, before it selects."""
+        noise = self.noise
+        adds = noise.false_alarm_hz or noise.stray_light or noise.crosstalk
+        return bool(adds or noise.saturation)
 
 
 class Sizes(NamedTuple):

@@ -10,6 +10,7 @@ from .false_alarms import FalseAlarmStep
 from .paths import CastStep
 from .range_noise import RangeNoiseStep
 from .recording import RecordingStep
+from .saturation import SaturationStep
 from .selection import SelectionStep
 from .separation import SeparationStep
 from .step import PulseStep, Setup
@@ -27,6 +28,7 @@ STEPS: tuple[type[PulseStep], ...] = (
     StrayLightStep,
     FalseAlarmStep,
     CrosstalkStep,
+    SaturationStep,
     SelectionStep,
     RecordingStep,
     RangeNoiseStep,
