@@ -30,6 +30,8 @@ if TYPE_CHECKING:
     from .scene.scene_mesh import SceneMesh
     from .sensor import (
         Beams,
+        EncoderRipple,
+        Fault,
         Gnss,
         Imu,
         Material,
@@ -43,6 +45,7 @@ if TYPE_CHECKING:
         Sensor,
         Spin,
         Survey,
+        WarmUp,
     )
     from .sensor.models import datasheet, load_sensor
     from .sensor.trajectory import Track
@@ -57,6 +60,8 @@ __all__ = [
     "Cloud",
     "Column",
     "Comparison",
+    "EncoderRipple",
+    "Fault",
     "Gnss",
     "Imu",
     "Job",
@@ -83,6 +88,7 @@ __all__ = [
     "Survey",
     "Sweep",
     "Track",
+    "WarmUp",
     "__version__",
     "compare",
     "datasheet",
@@ -125,6 +131,8 @@ _MODULES = {
     "sensor.models": ("datasheet", "load_sensor"),
     "sensor": (
         "Beams",
+        "EncoderRipple",
+        "Fault",
         "Gnss",
         "Imu",
         "Material",
@@ -138,6 +146,7 @@ _MODULES = {
         "Sensor",
         "Spin",
         "Survey",
+        "WarmUp",
     ),
     "sensor.trajectory": ("Track",),
     "sensor.trajectory_files": ("load_trajectory",),

@@ -1,9 +1,10 @@
 """Sensors: beams, heads, trajectories, and surveys."""
 
 from .beams import Beams, Head, Mirror, Spin
+from .faults import Fault
 from .materials import Material
 from .navigation import Gnss, Imu, Navigation
-from .noise import Noise
+from .noise import EncoderRipple, Noise, WarmUp
 from .optics import Optics, Returns
 from .ray_sensors import ListedSensor, Prism, PrismSensor
 from .sensor import LineSensor, Sensor
@@ -13,6 +14,8 @@ from .trajectory_files import load_trajectory
 
 __all__ = [
     "Beams",
+    "EncoderRipple",
+    "Fault",
     "Gnss",
     "Head",
     "Imu",
@@ -35,5 +38,6 @@ __all__ = [
     "Survey",
     "Track",
     "Trajectory",
+    "WarmUp",
     "load_trajectory",
 ]

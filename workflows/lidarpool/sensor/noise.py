@@ -17,9 +17,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pydantic import Field
 
-from ..base.arrays import Bools, Floats, Indices, Integers
-from ..base.declared import Seed, UnitShare, about
-from ..base.elementary import exp, log
+from ..base.arrays import Bools, Floats, Indices, Integers, Ints
+from ..base.declared import AngleDeg, Seed, Several, UnitShare, about, allowed
+from ..base.elementary import exp, log, sin_cos
 from ..base.errors import LidarpoolError
 from ..base.validation import checked_fields
 from .materials import at_right_angles
@@ -30,6 +30,7 @@ TARGET_REFLECTANCE = 0.1  # reflectance of stated ranges
 ALARMS_MOST = 20  # false alarms of a pulse on average: a ray has numbers for 255
 
 Metres = Annotated[float, Field(ge=0, le=1000)]
+Bias = Annotated[float, Field(ge=-1000, le=1000)]
 
 _GAMMA = 0x9E3779B97F4A7C15
 _NUMBERS = 256  # of one ray
@@ -66,6 +67,46 @@ class Purpose(Enum):
     WALK = 43  # steps of its random walk
     SAMPLES = 50  # stream of the samples of a waveform
     SAMPLE = 51  # noise of a sample
+    CHANNEL = 60  # a channel's error of range
+    PACKET = 61  # whether a packet is lost
+
+
+@dataclass(frozen=True)
+@checked_fields
+class WarmUp:
+    """Drift of ranges while a sensor warms up, from its start on.
+
+    Raises
+    ------
+    LidarpoolError
+        If a number is outside its range.
+    """
+
+    drift_m: Annotated[float, about("error of ranges at the start, metres", ge=-100, le=100)]
+    time_constant_s: Annotated[
+        float, about("time after which 37 % of it are left, seconds", gt=0, le=1e7)
+    ]
+
+
+@dataclass(frozen=True)
+@checked_fields
+class EncoderRipple:
+    """Error of an encoder that repeats in each turn of the head, such as of an eccentric one.
+
+    Raises
+    ------
+    LidarpoolError
+        If a number is outside its range.
+    """
+
+    amplitude_deg: Annotated[float, about("greatest error of azimuths, degrees", ge=0, le=10)]
+    cycles: Annotated[int, about("how often it repeats in a turn", ge=1, le=100_000)] = 1
+    phase_deg: Annotated[AngleDeg, about("its phase at azimuth 0, degrees")] = 0.0
+
+    def at(self, azimuth: Floats) -> Floats:
+        """How far beams are beside the azimuths (n,) of the encoder, both in radians."""
+        sin, _ = sin_cos(self.cycles * azimuth + np.radians(self.phase_deg))
+        return np.asarray(np.radians(self.amplitude_deg) * sin)
 
 
 @dataclass(frozen=True)
@@ -154,6 +195,29 @@ class Noise:
     velocity_m_s: Annotated[
         float, about("standard deviation of radial velocities, m/s", ge=0, le=1000)
     ] = 0.0
+    channel_bias_m: Annotated[
+        Metres | Several[Bias],
+        allowed("a number of 0 to 1000, or a list of numbers, one for each channel"),
+        about(
+            "constant errors of the channels' ranges, metres: their standard deviation, or a list, "
+            "the lowest channel first",
+            0.01,
+        ),
+    ] = 0.0
+    warm_up: Annotated[
+        WarmUp | None,
+        about(
+            "error of ranges that decays after the start",
+            {"drift_m": 0.02, "time_constant_s": 600},
+        ),
+    ] = None
+    encoder_ripple: Annotated[
+        EncoderRipple | None,
+        about(
+            "error of azimuths that repeats in each turn",
+            {"amplitude_deg": 0.02, "cycles": 2, "phase_deg": 0},
+        ),
+    ] = None
 
     def __post_init__(self) -> None:
         needs = ("range_at_threshold_m", "walk_m", "false_alarm_hz", "stray_light", "crosstalk")
@@ -180,12 +244,18 @@ class Noise:
     @property
     def displaces(self) -> bool:
         """Whether directions or ranges deviate."""
-        return self.angle_deg > 0 or self.moves_ranges
+        return self.moves_beams or self.moves_ranges
+
+    @property
+    def moves_beams(self) -> bool:
+        """Whether directions deviate."""
+        return self.angle_deg > 0 or self.encoder_ripple is not None
 
     @property
     def moves_ranges(self) -> bool:
         """Whether ranges deviate."""
-        return any((self.range_m, self.range_per_m, self.range_at_threshold_m, self.walk_m))
+        random = self.range_m, self.range_per_m, self.range_at_threshold_m
+        return any((*random, self.walk_m, self.channel_bias_m, self.warm_up))
 
     def named(self, name: str) -> Noise:
         """Return the noise of a sensor, whose name is part of all its random numbers."""
@@ -198,10 +268,11 @@ class Noise:
         scan: Integers,
         ray: Integers,
         number: Integers,
+        offset: Floats | float = 0.0,
     ) -> Floats:
         """Return the reported ranges of returns (n,), metres, at least 0.
 
-        The energies are needed where noise or walk depend on them.
+        The energies are needed where noise or walk depend on them; an offset is added.
         """
         sigma = self.range_m + self.range_per_m * distance
         if self.range_at_threshold_m and energy is not None:
@@ -209,7 +280,19 @@ class Noise:
             sigma = np.sqrt(sigma * sigma + weak * weak)
         if self.walk_m and energy is not None:
             distance = distance - self.walk(energy)
+        distance = distance + offset
         return np.maximum(distance + sigma * normal(self.seed, Purpose.RANGE, scan, ray, number), 0)
+
+    def offsets(self, channel: Integers, times_ns: Ints) -> Floats:
+        """Return errors of range that last: of channels (n,) at times since the start, metres."""
+        if isinstance(self.channel_bias_m, (int, float)):
+            out = self.channel_bias_m * normal(self.seed, Purpose.CHANNEL, 0, channel)
+        else:
+            out = np.array(self.channel_bias_m, np.float64)[channel]
+        if self.warm_up is not None:
+            decayed = exp(times_ns * (-1e-9 / self.warm_up.time_constant_s))
+            out = out + self.warm_up.drift_m * decayed
+        return out
 
     def velocities(
         self, velocity: Floats, scan: Integers, ray: Integers, number: Integers

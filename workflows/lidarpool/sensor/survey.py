@@ -14,6 +14,7 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import AwareDatetime, Field, Strict
 
+from ..base.arrays import Floats, Ints
 from ..base.declared import FILLED_IN, Several, about, written_as
 from ..base.errors import LidarpoolError
 from ..base.validation import checked_fields, shown
@@ -25,6 +26,7 @@ from ..columns.table import (
     stored,
     waveform_column,
 )
+from .faults import Fault, check_faults
 from .materials import ClassNames, Material
 from .navigation import Navigation, check_navigation
 from .noise import ALARMS_MOST, Noise
@@ -97,6 +99,8 @@ class ScanSpec:
         Of that.
     ahead
         By how many scans its random numbers are ahead of its number.
+    repeats
+        Of a frozen sensor: the first scan of the sweep that it sends again, and of its own.
     """
 
     scan: int
@@ -106,6 +110,7 @@ class ScanSpec:
     sensor: int = 0
     channels: int = 1
     ahead: int = 0
+    repeats: tuple[int, int] | None = None
 
     @property
     def ray_count(self) -> int:
@@ -216,6 +221,8 @@ class Survey(CloudOptions, Weather):
         Noise of ranges and angles, and lost returns.
     navigation
         IMU and GNSS receiver of the carrier, whose samples are written beside the cloud.
+    faults
+        Faults of sensors, such as dirt or lost packets.
     classes
         Names of semantic classes, {number: name}, for reports and files; they add the column.
     **options
@@ -243,6 +250,7 @@ class Survey(CloudOptions, Weather):
     returns: Returns = field(default_factory=Returns)
     noise: Noise = field(default_factory=Noise)
     navigation: Navigation | None = None
+    faults: Sequence[Fault] = ()
     classes: ClassNames = field(default_factory=dict, compare=False)
 
     def __post_init__(self) -> None:
@@ -310,11 +318,13 @@ class Survey(CloudOptions, Weather):
                 )
         for number, noise in enumerate(self.noise_each):
             _check_alarms(noise, self.carried[number].sensor)
+            _check_memory(noise, self.carried[number].sensor)
             if noise.crosstalk:
                 self._check_crosstalk(number)
         if self.returns_light:
             for number in range(len(self.carried)):
                 self._check_air(number)
+        check_faults(self)
 
     def _check_crosstalk(self, number: int) -> None:
         """Check that there are other sensors, and that what a sensor sees ends."""
@@ -462,6 +472,23 @@ class Survey(CloudOptions, Weather):
         """Number of scans."""
         return self._firsts[-1]
 
+    @cached_property
+    def sweeps_each(self) -> tuple[tuple[Ints, Floats, Floats], ...]:
+        """First scans of the sweeps of each sensor, and one past the last, and their times.
+
+        These are when the first and last firing of each begin, nanoseconds since the survey's
+        start.
+        """
+        out = []
+        for number, carried in enumerate(self.carried):
+            first, steps = self._firsts[number], self.steps_each[number]
+            stations = np.arange(self.path.stations)[:, None]
+            firsts, begins, ends = carried.sensor.sweeps(steps)
+            scans = np.append(first + stations * steps + firsts, self._firsts[number + 1])
+            late = stations * self.station_ns
+            out.append((scans, (late + begins).ravel(), (late + ends).ravel()))
+        return tuple(out)
+
     @property
     def ray_count(self) -> int:
         """Number of rays in all scans."""
@@ -509,6 +536,21 @@ class Survey(CloudOptions, Weather):
         spec = self.scan(index)
         sensor = self.carried[spec.sensor].sensor
         return spec.start_ns + begin_ns(sensor, spec.firings[0]) + sensor.lead_ns
+
+
+def _check_memory(noise: Noise, sensor: Sensor) -> None:
+    """Check that errors that last fit a sensor's channels and head."""
+    biases = noise.channel_bias_m
+    if isinstance(biases, Sequence) and len(biases) != sensor.channels:
+        raise LidarpoolError(
+            f"noise.channel_bias_m lists {len(biases)} numbers, and {sensor.model} has "
+            f"{sensor.channels} channels: give one for each."
+        )
+    if noise.encoder_ripple is not None and sensor.spins(np.zeros(1, np.int64)) is None:
+        raise LidarpoolError(
+            f"noise.encoder_ripple is of a head that turns or swings its beams, and that of "
+            f"{sensor.model} does not: leave it out."
+        )
 
 
 def _check_alarms(noise: Noise, sensor: Sensor) -> None:

@@ -1,4 +1,4 @@
-"""Noise of ranges, of weak returns too, and range walk."""
+"""Errors of ranges: noise, of weak returns too, range walk, and errors that last."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ from .step import PulseBatch, PulseStep, Setup
 class RangeNoiseStep(PulseStep):
     """Moves the ranges of the returns that are kept."""
 
-    effects = ("Weak returns and range walk",)
+    effects = "Weak returns and range walk", "Errors that last"
     reads = "ray", "distance", "energy", "amplitude", "number"
     writes = ("reported",)
-    purposes = (Purpose.RANGE,)
+    purposes = Purpose.RANGE, Purpose.CHANNEL
     of_kept = True
 
     @staticmethod
@@ -25,4 +25,8 @@ class RangeNoiseStep(PulseStep):
         """See `PulseStep.apply`."""
         height = returns.energy if returns.amplitude is None else returns.amplitude
         key = *batch.keys.of(returns.ray), made(returns.number)
-        return returns._replace(reported=self.setup.noise.ranges(returns.distance, height, *key))
+        noise, firings, offset = self.setup.noise, batch.firings, 0.0
+        if noise.channel_bias_m or noise.warm_up is not None:
+            channel = returns.ray % firings.sensor.channels
+            offset = noise.offsets(channel, firings.times(returns.ray))
+        return returns._replace(reported=noise.ranges(returns.distance, height, *key, offset))

@@ -17,8 +17,9 @@ from ..base.vectors import turned
 from ..scene.actors import Actor
 from ..scene.scene import Scene
 from ..sensor import Pose, ScanSpec, Sensor, Survey, Trajectory
+from ..sensor.faults import sent
 from .device import DeviceColumns, DevicePoints
-from .motion import Clock, Poses, check_trajectory, poses_of_firings
+from .motion import Clock, Firings, Poses, check_trajectory, poses_of_firings
 from .points import BatchPoints
 from .pulses import PulseCaster
 from .scene_caster import SceneCaster
@@ -166,9 +167,10 @@ class Rig:
     def cast(self, first: int, stop: int) -> Iterator[BatchPoints | DevicePoints]:
         """Cast scans `first` to `stop` of the survey; yields the returns for each station."""
         run: list[ScanSpec] = []
-        for spec in map(self.survey.scan, range(first, stop)):
-            here = (spec.sensor, spec.station, spec.firings[0])
-            if run and here != (run[-1].sensor, run[-1].station, run[-1].firings[1]):
+        for spec in (sent(self.survey, index) for index in range(first, stop)):
+            here = (spec.sensor, spec.station, spec.firings[0], spec.repeats)
+            last = run[-1] if run else spec
+            if run and here != (last.sensor, last.station, last.firings[1], last.repeats):
                 yield self.returns(run, self.survey.path)
                 run = []
             run.append(spec)
@@ -213,7 +215,8 @@ class Rig:
         if self._device is not None:
             return self._device.returns(specs, pattern, poses, window, groups)
         scan = specs[0].scan + specs[0].ahead
-        found = self._pulses[number].scan(scan, pattern, poses, window, groups, tally=tally)
+        fired = Firings.of(carried.sensor, specs)
+        found = self._pulses[number].scan(scan, pattern, poses, window, groups, fired, tally=tally)
         return BatchPoints(self.scene, survey, self._surfaces, specs, found, pattern, start, poses)
 
     def _timed(self, poses: Poses, specs: list[ScanSpec], times: int = 1) -> Poses:
@@ -255,7 +258,8 @@ class Rig:
             scan = specs[0].scan + specs[0].ahead + begin * len(specs)
             window = (0, len(image))
             caster = self._pulses[number]
-            found = caster.scan(scan, pattern, poses, window, groups, tally=False).returns
+            fired = Firings.of(sensor, specs, count)
+            found = caster.scan(scan, pattern, poses, window, groups, fired, tally=False).returns
             assert found.reported is not None  # of kept returns
             nearest = found.number == 1
             image[found.ray[nearest]] = found.reported[nearest]

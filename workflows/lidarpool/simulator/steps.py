@@ -6,6 +6,7 @@ from .air import WeatherStep
 from .angle_noise import AngleNoiseStep
 from .crosstalk import CrosstalkStep
 from .detection import DetectionStep
+from .faults import DirtStep, LossStep, StampStep
 from .false_alarms import FalseAlarmStep
 from .paths import CastStep
 from .range_noise import RangeNoiseStep
@@ -21,15 +22,18 @@ STEPS: tuple[type[PulseStep], ...] = (
     AngleNoiseStep,
     CastStep,  # with mirrors, glass, water and leaves
     WeatherStep,  # rain, snow, fog and dust
+    DirtStep,  # on the window
     SeparationStep,  # hits to returns; or
     WaveformStep,
     DetectionStep,
     StrayLightStep,
     FalseAlarmStep,
     CrosstalkStep,
+    LossStep,  # dead channels and lost packets
     SelectionStep,
     RecordingStep,
     RangeNoiseStep,
+    StampStep,
 )
 
 
