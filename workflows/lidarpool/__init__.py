@@ -30,7 +30,6 @@ if TYPE_CHECKING:
     from .scene.scene_mesh import SceneMesh
     from .sensor import (
         Beams,
-        EncoderRipple,
         Fault,
         Gnss,
         Imu,
@@ -45,7 +44,6 @@ if TYPE_CHECKING:
         Sensor,
         Spin,
         Survey,
-        WarmUp,
     )
     from .sensor.models import datasheet, load_sensor
     from .sensor.trajectory import Track
@@ -60,7 +58,6 @@ __all__ = [
     "Cloud",
     "Column",
     "Comparison",
-    "EncoderRipple",
     "Fault",
     "Gnss",
     "Imu",
@@ -88,7 +85,6 @@ __all__ = [
     "Survey",
     "Sweep",
     "Track",
-    "WarmUp",
     "__version__",
     "compare",
     "datasheet",
@@ -131,7 +127,6 @@ _MODULES = {
     "sensor.models": ("datasheet", "load_sensor"),
     "sensor": (
         "Beams",
-        "EncoderRipple",
         "Fault",
         "Gnss",
         "Imu",
@@ -146,7 +141,6 @@ _MODULES = {
         "Sensor",
         "Spin",
         "Survey",
-        "WarmUp",
     ),
     "sensor.trajectory": ("Track",),
     "sensor.trajectory_files": ("load_trajectory",),

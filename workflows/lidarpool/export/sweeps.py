@@ -19,7 +19,7 @@ from ..base.errors import LidarpoolError
 from ..columns.cloud import Cloud, CloudLike
 from ..scene.scene import Scene
 from ..sensor import Fault, Sensor, Survey
-from ..sensor.faults import shown_from
+from ..sensor.faults import sent
 from ..sensor.plain_data import described, remade
 from ..sensor.survey import nanoseconds
 from ..sensor.trajectory import matrices, presence_ns, quaternions_of
@@ -147,7 +147,9 @@ class Sweeps:
                 places.append(positions + rotations @ np.array(mount.position))
                 turns.append(rotations @ turned)
             sensors.append(np.full(len(since) * path.stations, number, np.uint8))
-            first_steps.append(shown_from(survey, number) % steps)
+            shown = [sent(survey, scan) for scan in survey.sweeps_each[number][0][:-1].tolist()]
+            begun = survey.sweeps_each[number][0][0]
+            first_steps.append([(one.scan + one.ahead - begun) % steps for one in shown])
         each = survey.sweeps_each
         when, end = (np.concatenate([one[k] for one in each]) for k in (1, 2))
         actor_poses, there = [], []
@@ -198,7 +200,9 @@ class Sweeps:
     def stamp_ns(self, sweep: int) -> int:
         """Return when the sensor says that a sweep began, nanoseconds since the survey's start."""
         name, begin = self.sensors[self.sensor[sweep]], self.begins_ns[sweep]
-        return round(begin) + sum(one.jump_ns(begin) for one in self.faults if one.is_of(name))
+        return round(begin) + sum(
+            int(one.jumps_ns(begin)) for one in self.faults if one.is_of(name)
+        )
 
     def points(self, cloud: CloudLike, first: int = 0, stop: int | None = None) -> Iterator[Cloud]:
         """Yield the points of each sweep from `first` to `stop` in order, also of empty ones.

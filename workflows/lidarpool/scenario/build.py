@@ -28,7 +28,6 @@ from ..scene.files.meshfile import CITYJSON
 from ..scene.robot import Robot
 from ..scene.scene import Scene
 from ..sensor import Material, Mounted, Noise, Pose, Returns, Sensor, Survey, Track
-from ..sensor.faults import check_within
 from ..sensor.materials import MaterialTable, rows_named, with_class, with_classes
 from ..sensor.survey import CloudOptions
 from ..sensor.trajectory import CENTRE
@@ -103,7 +102,6 @@ class Job:
 
     def __post_init__(self) -> None:
         scene, survey = self.scene, self.survey
-        check_within(survey)
         MaterialTable.of(survey.materials, scene.all_names, voxels=scene.has_voxels)
         # The cells of the cloud's precision that the scene spans have numbers of 32 bits.
         reach = float(np.abs(scene.bounds).max(initial=0.0))

@@ -412,7 +412,7 @@ class SensorSection(Section):
             return Mounted(sensor, mount, name)
         sheet = datasheet(model)
         own_returns = replace(sheet.returns, **returns.model_dump(exclude_unset=True))
-        own_noise = replace(sheet.noise, **{n: getattr(noise, n) for n in noise.model_fields_set})
+        own_noise = replace(sheet.noise, **noise.model_dump(exclude_unset=True))
         return Mounted(sensor, mount, name, returns=own_returns, noise=own_noise)
 
 

@@ -4,7 +4,7 @@ from .beams import Beams, Head, Mirror, Spin
 from .faults import Fault
 from .materials import Material
 from .navigation import Gnss, Imu, Navigation
-from .noise import EncoderRipple, Noise, WarmUp
+from .noise import Noise
 from .optics import Optics, Returns
 from .ray_sensors import ListedSensor, Prism, PrismSensor
 from .sensor import LineSensor, Sensor
@@ -14,7 +14,6 @@ from .trajectory_files import load_trajectory
 
 __all__ = [
     "Beams",
-    "EncoderRipple",
     "Fault",
     "Gnss",
     "Head",
@@ -38,6 +37,5 @@ __all__ = [
     "Survey",
     "Track",
     "Trajectory",
-    "WarmUp",
     "load_trajectory",
 ]

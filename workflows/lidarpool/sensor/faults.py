@@ -18,89 +18,62 @@ if TYPE_CHECKING:
     from .survey import ScanSpec, Survey
 
 FaultKind = Literal["dirt", "dead_channels", "dropped_packets", "frozen", "time_jump"]
-ChannelNumber = Annotated[int, Field(ge=0)]
+Time = Annotated[float, Field(ge=0, le=1e9)]  # seconds since the survey's start
+Sector = Two[AngleDeg]
+Channels = Annotated[Several[Annotated[int, Field(ge=0)]], Field(min_length=1)]
+Count = Annotated[int, Field(ge=1, le=1_000_000)]
+Shift = Annotated[float, Field(ge=-1e6, le=1e6)]
 
-# {kind: fields that it needs, and fields that it may have beside those of every kind}
-_OWN: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
-    "dirt": (("transmission",), ("azimuth_deg", "elevation_deg")),
-    "dead_channels": (("channels",), ()),
-    "dropped_packets": (("share", "packet"), ()),
-    "frozen": ((), ()),
-    "time_jump": (("by_s",), ()),
+# {kind: its own fields}; sectors may be left out
+_OWN: dict[str, tuple[str, ...]] = {
+    "dirt": ("transmission", "azimuth_deg", "elevation_deg"),
+    "dead_channels": ("channels",),
+    "dropped_packets": ("share", "packet"),
+    "frozen": (),
+    "time_jump": ("by_s",),
 }
 
 
 @dataclass(frozen=True)
 @checked_fields
 class Fault:
-    """A fault of a sensor from one time to another; labels keep the truth.
+    """A fault of a sensor for some time; labels keep the truth, and list it.
 
     Raises
     ------
     LidarpoolError
-        If a number is outside its range, it ends before it begins, or has fields of another kind.
-
-    Examples
-    --------
-    >>> Fault("dirt", 1.0, 2.0, transmission=0.3, azimuth_deg=(-20, 20))
-    Fault(kind='dirt', from_s=1.0, to_s=2.0, transmission=0.3, azimuth_deg=(-20, 20))
+        If a number is outside its range, or its fields do not fit together.
     """
 
-    kind: Annotated[
-        FaultKind,
-        about("dirt on the window, dead channels, lost packets, repeated sweeps, shifted stamps"),
-    ]
-    from_s: Annotated[
-        float, about("when it begins, seconds since the survey's start", ge=0, le=1e9)
-    ] = 0.0
-    to_s: Annotated[
-        float | None, about("when it ends; by default with the survey", 20.0, gt=0, le=1e9)
-    ] = None
-    sensor: Annotated[Text | None, about("its sensor's name; by default all have it", "roof")] = (
-        None
-    )
-    transmission: Annotated[
-        UnitShare | None, about("of dirt: share of the energy that passes it, out and back", 0.3)
-    ] = None
-    azimuth_deg: Annotated[
-        Two[AngleDeg] | None,
-        about("of dirt: from one azimuth counter-clockwise to another; by default all", [-20, 20]),
-    ] = None
-    elevation_deg: Annotated[
-        Two[AngleDeg] | None, about("of dirt: lowest and highest; by default all", [-90, 0])
-    ] = None
-    channels: Annotated[
-        Several[ChannelNumber] | None, about("dead channels, the lowest is 0", [3, 17])
-    ] = None
-    share: Annotated[UnitShare | None, about("of packets: share that is lost", 0.05)] = None
-    packet: Annotated[
-        int | None, about("of packets: consecutive firings in each", 12, ge=1, le=1_000_000)
-    ] = None
-    by_s: Annotated[
-        float | None, about("of a time jump: added to stamps, seconds", -0.05, ge=-1e6, le=1e6)
-    ] = None
+    kind: Annotated[FaultKind, about("what happens")]
+    from_s: Annotated[Time, about("when it begins, seconds since the survey's start")] = 0.0
+    to_s: Annotated[Time | None, about("when it ends; by default with the survey")] = None
+    sensor: Annotated[Text | None, about("its sensor's name; by default all have it")] = None
+    transmission: Annotated[UnitShare | None, about("of dirt: of energy, out and back")] = None
+    azimuth_deg: Annotated[Sector | None, about("of dirt: counter-clockwise from and to")] = None
+    elevation_deg: Annotated[Sector | None, about("of dirt: lowest and highest")] = None
+    channels: Annotated[Channels | None, about("dead ones; 0 is the lowest")] = None
+    share: Annotated[UnitShare | None, about("of packets that are lost")] = None
+    packet: Annotated[Count | None, about("consecutive firings in a packet")] = None
+    by_s: Annotated[Shift | None, about("of a time jump: added to stamps, seconds")] = None
 
     def __post_init__(self) -> None:
-        needed, further = _OWN[self.kind]
-        given = set(self.words()) - {"kind", "from_s", "to_s", "sensor"}
-        if lacking := [name for name in needed if name not in given]:
-            raise LidarpoolError(f"{self.kind} needs {lacking[0]}: give it.")
-        if extra := sorted(given.difference(needed, further)):
-            owner = next(kind for kind, both in _OWN.items() if extra[0] in sum(both, ()))
-            raise LidarpoolError(f"{extra[0]} is for {owner}, and this is {self.kind}.")
+        own, given = _OWN[self.kind], self.words().keys() - {"kind", "from_s", "to_s", "sensor"}
+        lacking = [one for one in own if one not in given and not one.endswith("_deg")]
+        if wrong := [*lacking, *sorted(given - {*own})]:
+            told = "needs" if lacking else "has no"
+            fit = f": it has {', '.join(own)}" if own and not lacking else ""
+            raise LidarpoolError(f"{self.kind} {told} {wrong[0]}{fit}.")
         if self.to_s is not None and self.to_s <= self.from_s:
             raise LidarpoolError(
-                f"to_s is {self.to_s:g} and from_s {self.from_s:g}: a fault ends after it begins."
+                f"to_s is {self.to_s:g}; it must be above from_s, {self.from_s:g}."
             )
         low, high = self.elevation_deg or (0, 0)
         if low > high:
-            raise LidarpoolError(f"elevation_deg is {[low, high]}: give the lowest first.")
-        for name in ("azimuth_deg", "elevation_deg", "channels"):
-            if getattr(self, name) is not None:  # of JSON and YAML, lists
-                object.__setattr__(self, name, tuple(getattr(self, name)))
+            raise LidarpoolError(f"elevation_deg is {[low, high]}; give the lowest first.")
 
     def words(self) -> dict[str, Any]:
-        """Return what is given, for JSON and labels: {field: value}."""
+        """Return what is given, for labels: {field: value}."""
         both = ((one.name, getattr(self, one.name)) for one in fields(self))
         return {name: value for name, value in both if value is not None}
 
@@ -108,90 +81,60 @@ class Fault:
         """Whether a sensor has it."""
         return self.sensor in (None, sensor)
 
-    def during(self, times_ns: Floats | Ints, ends_ns: Floats | Ints | None = None) -> Bools:
-        """Whether there is a fault at times, or between them and others: (n,)."""
-        last = times_ns if ends_ns is None else ends_ns
-        until = np.inf if self.to_s is None else self.to_s * 1e9
-        return np.asarray((last >= self.from_s * 1e9) & (times_ns < until))
+    def during(self, begins_ns: Floats | Ints, ends_ns: Floats | Ints | None = None) -> Bools:
+        """Whether it is there at times (n,), or between them and others."""
+        ends_ns = begins_ns if ends_ns is None else ends_ns
+        until_s = np.inf if self.to_s is None else self.to_s
+        return np.asarray((ends_ns >= self.from_s * 1e9) & (begins_ns < until_s * 1e9))
 
-    def jump_ns(self, time_ns: Any) -> Any:
-        """By how much it shifts stamps at times, nanoseconds: a whole number, or (n,)."""
-        return np.where(self.during(time_ns), round((self.by_s or 0.0) * 1e9), 0)[()]
+    def jumps_ns(self, times_ns: Floats | Ints) -> Ints:
+        """By how much it shifts stamps at times (n,), nanoseconds."""
+        return self.during(times_ns) * np.int64(round((self.by_s or 0) * 1e9))
 
-    def covers(self, azimuth_deg: Floats, elevation_deg: Floats) -> Bools:
-        """Whether dirt is where beams (n,) pass the window, by their angles in sensor axes."""
-        covered = np.ones(len(azimuth_deg), np.bool_)
-        if self.azimuth_deg is not None:
-            begin, end = self.azimuth_deg
-            covered &= (azimuth_deg - begin) % 360 <= (end - begin) % 360
-        if self.elevation_deg is not None:
-            low, high = self.elevation_deg
-            covered &= (elevation_deg >= low) & (elevation_deg <= high)
-        return covered
+    def covers(self, azimuth: Floats, elevation: Floats) -> Bools:
+        """Whether dirt is before beams (n,), by their angles in sensor axes, degrees."""
+        (begin, end), (low, high) = self.azimuth_deg or (0, 360), self.elevation_deg or (-90, 90)
+        within = (azimuth - begin) % 360 <= ((end - begin) % 360 or 360)
+        return np.asarray(within & (elevation >= low) & (elevation <= high))
 
 
-def faults_of(survey: Survey, number: int, *kinds: FaultKind) -> list[tuple[int, Fault]]:
-    """Faults of some kinds that a sensor has, and their places in the survey's list."""
-    name = survey.carried[number].name
-    numbered = enumerate(survey.faults)
-    return [(k, one) for k, one in numbered if one.kind in kinds and one.is_of(name)]
+def faults_of(survey: Survey, number: int, *kinds: FaultKind) -> dict[int, Fault]:
+    """Faults of some kinds that a sensor has, by their places in the survey's list."""
+    name, every = survey.carried[number].name, enumerate(survey.faults)
+    return {place: one for place, one in every if one.kind in kinds and one.is_of(name)}
 
 
 def check_faults(survey: Survey) -> None:
-    """Check that faults are of sensors and channels that are there; LidarpoolError if not."""
-    names = [carried.name for carried in survey.carried]
-    for number, fault in enumerate(survey.faults):
-        with prefixed(f"faults[{number}]"):
-            if fault.sensor is not None and fault.sensor not in names:
-                hint = did_you_mean(fault.sensor, names) or f" There are {', '.join(names[:10])}."
-                one = "The only sensor has no name: leave sensor out." if names == [""] else hint
-                raise LidarpoolError(f"there is no sensor {fault.sensor!r}. {one.strip()}")
-            for carried in survey.carried:
-                last, model = carried.sensor.channels - 1, carried.name or carried.sensor.model
-                if fault.is_of(carried.name) and max(fault.channels or [0]) > last:
-                    raise LidarpoolError(
-                        f"there is no channel {max(fault.channels or [0])}: {model} has 0 to {last}."
-                    )
-                begins_s = (carried.sensor.sweeps(1)[1][0]) / 1e9
-                if (
-                    fault.is_of(carried.name)
-                    and fault.kind == "frozen"
-                    and fault.from_s <= begins_s
-                ):
-                    raise LidarpoolError(
-                        f"from_s is {fault.from_s:g}, and a frozen sensor repeats the sweep before: "
-                        f"the first begins at {begins_s:g} s, so give a later time."
-                    )
-
-
-def check_within(survey: Survey) -> None:
-    """Check that faults begin within a survey; LidarpoolError if not."""
-    lasts_s = survey.duration_ns / 1e9
-    for number, fault in enumerate(survey.faults):
-        if fault.from_s > lasts_s:
-            raise LidarpoolError(
-                f"faults[{number}] begins at {fault.from_s:g} s, and the survey lasts "
-                f"{lasts_s:.6g} s: make from_s smaller, or steps more."
-            )
-
-
-def shown_from(survey: Survey, number: int) -> Ints:
-    """First scans of what a sensor sends as each sweep, counted from its own first: (k,)."""
-    firsts, _, _ = survey.sweeps_each[number]
-    found = firsts[:-1]
-    if faults_of(survey, number, "frozen"):
-        found = np.array([one.scan + one.ahead for one in (sent(survey, int(k)) for k in found)])
-    return np.asarray(found - firsts[0])
+    """Check that faults fit sensors and times of a survey; LidarpoolError if not."""
+    names, lasts_s = [carried.name for carried in survey.carried], survey.duration_ns / 1e9
+    for place, fault in enumerate(survey.faults):
+        with prefixed(f"faults[{place}]"):
+            lidars = [one.sensor for one in survey.carried if fault.is_of(one.name)]
+            if not lidars:
+                known = f" There are {', '.join(names)}." if any(names) else " Leave it out."
+                hint = did_you_mean(str(fault.sensor), names) or known
+                raise LidarpoolError(f"there is no sensor {fault.sensor!r}.{hint}")
+            first_s = max(one.begins_ns(np.zeros(1, np.int64))[0] + one.lead_ns for one in lidars)
+            if fault.kind == "frozen" and fault.from_s <= first_s / 1e9:
+                raise LidarpoolError("a frozen sensor repeats a sweep: give a later from_s.")
+            if fault.from_s > lasts_s:
+                raise LidarpoolError(
+                    f"from_s is {fault.from_s:g}, and the survey lasts {lasts_s:.6g} s: give an "
+                    "earlier one, or more steps."
+                )
+            least, last = min(one.channels for one in lidars), max(fault.channels or (0,))
+            if last >= least:
+                raise LidarpoolError(f"there is no channel {last}, but 0 to {least - 1}.")
 
 
 def sent(survey: Survey, index: int) -> ScanSpec:
     """Describe what a sensor sends as a scan: the scan itself, or if it is frozen, an older one.
 
-    A sweep that begins while a sensor is frozen repeats the last one that began before. Which that
-    is follows from the times alone, so it does not matter which scans were cast.
+    A sweep that begins while it is frozen repeats the last that began before. Which that is follows
+    from times alone, so it does not matter which scans are cast where.
     """
     spec = survey.scan(index)
-    frozen = [fault for _, fault in faults_of(survey, spec.sensor, "frozen")]
+    frozen = faults_of(survey, spec.sensor, "frozen").values()
     if not frozen:
         return spec
     firsts, begins, _ = survey.sweeps_each[spec.sensor]
@@ -200,8 +143,7 @@ def sent(survey: Survey, index: int) -> ScanSpec:
         source = int(np.searchsorted(begins, now[0].from_s * 1e9)) - 1
     if source == own:
         return spec
-    # The last sweep at a pose may have fewer scans than the one that repeats it: the others are
-    # lost, see `LossStep`.
+    # The last sweep at a pose may have fewer scans: then the others are lost, see `LossStep`.
     older = int(min(firsts[source] + index - firsts[own], firsts[source + 1] - 1))
     repeats = int(firsts[source]), int(firsts[own])
     return replace(survey.scan(older), scan=index, ahead=older - index, repeats=repeats)

@@ -73,44 +73,6 @@ class Purpose(Enum):
 
 @dataclass(frozen=True)
 @checked_fields
-class WarmUp:
-    """Drift of ranges while a sensor warms up, from its start on.
-
-    Raises
-    ------
-    LidarpoolError
-        If a number is outside its range.
-    """
-
-    drift_m: Annotated[float, about("error of ranges at the start, metres", ge=-100, le=100)]
-    time_constant_s: Annotated[
-        float, about("time after which 37 % of it are left, seconds", gt=0, le=1e7)
-    ]
-
-
-@dataclass(frozen=True)
-@checked_fields
-class EncoderRipple:
-    """Error of an encoder that repeats in each turn of the head, such as of an eccentric one.
-
-    Raises
-    ------
-    LidarpoolError
-        If a number is outside its range.
-    """
-
-    amplitude_deg: Annotated[float, about("greatest error of azimuths, degrees", ge=0, le=10)]
-    cycles: Annotated[int, about("how often it repeats in a turn", ge=1, le=100_000)] = 1
-    phase_deg: Annotated[AngleDeg, about("its phase at azimuth 0, degrees")] = 0.0
-
-    def at(self, azimuth: Floats) -> Floats:
-        """How far beams are beside the azimuths (n,) of the encoder, both in radians."""
-        sin, _ = sin_cos(self.cycles * azimuth + np.radians(self.phase_deg))
-        return np.asarray(np.radians(self.amplitude_deg) * sin)
-
-
-@dataclass(frozen=True)
-@checked_fields
 class Noise:
     """Noise of ranges and angles, lost returns and false ones; without arguments there is none.
 
@@ -204,20 +166,15 @@ class Noise:
             0.01,
         ),
     ] = 0.0
-    warm_up: Annotated[
-        WarmUp | None,
-        about(
-            "error of ranges that decays after the start",
-            {"drift_m": 0.02, "time_constant_s": 600},
-        ),
-    ] = None
-    encoder_ripple: Annotated[
-        EncoderRipple | None,
-        about(
-            "error of azimuths that repeats in each turn",
-            {"amplitude_deg": 0.02, "cycles": 2, "phase_deg": 0},
-        ),
-    ] = None
+    warm_up_m: Annotated[Bias, about("error of ranges at the start, which decays, metres")] = 0.0
+    warm_up_s: Annotated[float, about("time in which it falls to 37 %, seconds", gt=0, le=1e7)] = (
+        600.0
+    )
+    ripple_deg: Annotated[
+        float, about("greatest error of azimuths that repeats as the head turns", ge=0, le=10)
+    ] = 0.0
+    ripple_cycles: Annotated[int, about("how often in a turn", ge=1, le=100_000)] = 1
+    ripple_phase_deg: Annotated[AngleDeg, about("its phase where the head is at azimuth 0")] = 0.0
 
     def __post_init__(self) -> None:
         needs = ("range_at_threshold_m", "walk_m", "false_alarm_hz", "stray_light", "crosstalk")
@@ -242,20 +199,20 @@ class Noise:
         return self.dropout > 0 or self.detection_range_m is not None
 
     @property
-    def displaces(self) -> bool:
-        """Whether directions or ranges deviate."""
-        return self.moves_beams or self.moves_ranges
-
-    @property
     def moves_beams(self) -> bool:
         """Whether directions deviate."""
-        return self.angle_deg > 0 or self.encoder_ripple is not None
+        return self.angle_deg > 0 or self.ripple_deg > 0
 
     @property
     def moves_ranges(self) -> bool:
         """Whether ranges deviate."""
         random = self.range_m, self.range_per_m, self.range_at_threshold_m
-        return any((*random, self.walk_m, self.channel_bias_m, self.warm_up))
+        return any((*random, self.walk_m, self.lasts))
+
+    @property
+    def lasts(self) -> bool:
+        """Whether ranges have errors that last."""
+        return bool(self.channel_bias_m or self.warm_up_m)
 
     def named(self, name: str) -> Noise:
         """Return the noise of a sensor, whose name is part of all its random numbers."""
@@ -289,10 +246,14 @@ class Noise:
             out = self.channel_bias_m * normal(self.seed, Purpose.CHANNEL, 0, channel)
         else:
             out = np.array(self.channel_bias_m, np.float64)[channel]
-        if self.warm_up is not None:
-            decayed = exp(times_ns * (-1e-9 / self.warm_up.time_constant_s))
-            out = out + self.warm_up.drift_m * decayed
+        if self.warm_up_m:
+            out = out + self.warm_up_m * exp(times_ns * (-1e-9 / self.warm_up_s))
         return out
+
+    def ripple(self, azimuth: Floats) -> Floats:
+        """How far beams are beyond the azimuths (n,) of the encoder, both in radians."""
+        sin, _ = sin_cos(self.ripple_cycles * azimuth + np.radians(self.ripple_phase_deg))
+        return np.asarray(np.radians(self.ripple_deg) * sin)
 
     def velocities(
         self, velocity: Floats, scan: Integers, ray: Integers, number: Integers

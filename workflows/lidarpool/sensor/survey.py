@@ -271,6 +271,7 @@ class Survey(CloudOptions, Weather):
             self._set(steps=STEPS)
         for carried, steps in zip(self.carried, self.steps_each, strict=True):
             self._check_duration(carried.sensor, steps)
+        check_faults(self)
 
     def _set(self, **fields: Any) -> None:
         for name, value in fields.items():
@@ -318,13 +319,12 @@ class Survey(CloudOptions, Weather):
                 )
         for number, noise in enumerate(self.noise_each):
             _check_alarms(noise, self.carried[number].sensor)
-            _check_memory(noise, self.carried[number].sensor)
+            _check_lasting(noise, self.carried[number].sensor)
             if noise.crosstalk:
                 self._check_crosstalk(number)
         if self.returns_light:
             for number in range(len(self.carried)):
                 self._check_air(number)
-        check_faults(self)
 
     def _check_crosstalk(self, number: int) -> None:
         """Check that there are other sensors, and that what a sensor sees ends."""
@@ -474,10 +474,9 @@ class Survey(CloudOptions, Weather):
 
     @cached_property
     def sweeps_each(self) -> tuple[tuple[Ints, Floats, Floats], ...]:
-        """First scans of the sweeps of each sensor, and one past the last, and their times.
+        """First scans of each sensor's sweeps and one past the last, and their first and last times.
 
-        These are when the first and last firing of each begin, nanoseconds since the survey's
-        start.
+        Nanoseconds since the survey's start.
         """
         out = []
         for number, carried in enumerate(self.carried):
@@ -538,19 +537,15 @@ class Survey(CloudOptions, Weather):
         return spec.start_ns + begin_ns(sensor, spec.firings[0]) + sensor.lead_ns
 
 
-def _check_memory(noise: Noise, sensor: Sensor) -> None:
+def _check_lasting(noise: Noise, sensor: Sensor) -> None:
     """Check that errors that last fit a sensor's channels and head."""
-    biases = noise.channel_bias_m
-    if isinstance(biases, Sequence) and len(biases) != sensor.channels:
+    biases, channels = noise.channel_bias_m, sensor.channels
+    if isinstance(biases, Sequence) and len(biases) != channels:
         raise LidarpoolError(
-            f"noise.channel_bias_m lists {len(biases)} numbers, and {sensor.model} has "
-            f"{sensor.channels} channels: give one for each."
+            f"noise.channel_bias_m has {len(biases)} numbers; {sensor.model} needs {channels}."
         )
-    if noise.encoder_ripple is not None and sensor.spins(np.zeros(1, np.int64)) is None:
-        raise LidarpoolError(
-            f"noise.encoder_ripple is of a head that turns or swings its beams, and that of "
-            f"{sensor.model} does not: leave it out."
-        )
+    if noise.ripple_deg and sensor.spins(np.zeros(1, np.int64)) is None:
+        raise LidarpoolError(f"noise.ripple_deg needs a head that turns, unlike {sensor.model}'s.")
 
 
 def _check_alarms(noise: Noise, sensor: Sensor) -> None:

@@ -30,14 +30,16 @@ class AngleNoiseStep(PulseStep):
 
     def apply(self, returns: PulseReturns, batch: PulseBatch) -> PulseReturns:
         """See `PulseStep.apply`."""
-        rays, ripple = np.arange(batch.start, batch.stop), self.setup.noise.encoder_ripple
-        across, up = self.setup.noise.angles(*batch.keys.of(rays))
-        if ripple is not None:
-            sensor = batch.firings.sensor
+        rays, noise, sensor = (
+            np.arange(batch.start, batch.stop),
+            self.setup.noise,
+            batch.firings.sensor,
+        )
+        across, up = noise.angles(*batch.keys.of(rays))
+        if noise.ripple_deg:
             firing, channel = np.divmod(rays, sensor.channels)
-            beside = ripple.at(sensor.head.azimuths(batch.firings.numbers)).take(firing)
-            # A degree of azimuth moves a beam by less, the steeper it looks.
-            x, y, _ = sensor.ahead.T
-            across = across + beside * hypot(x, y).take(channel)
+            beside = noise.ripple(sensor.head.azimuths(batch.firings.numbers))
+            # A degree of azimuth is less across a beam, the steeper it looks.
+            across += beside.take(firing) * hypot(*sensor.ahead.T[:2]).take(channel)
         batch.offsets = np.stack([across, up], axis=1)
         return returns

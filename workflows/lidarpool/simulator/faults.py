@@ -10,7 +10,7 @@ from .step import Memory, PulseBatch, PulseStep, Setup, Sizes
 
 
 class DirtStep(PulseStep):
-    """Takes energy from the light that passes a dirty part of the window, out and back."""
+    """Takes energy from light that passes a dirty part of the window."""
 
     effects = ("Faults",)
     reads = "ray", "energy"
@@ -28,26 +28,22 @@ class DirtStep(PulseStep):
 
     def apply(self, returns: PulseReturns, batch: PulseBatch) -> PulseReturns:
         """See `PulseStep.apply`."""
-        beams = np.arange(batch.start, batch.stop)
-        times, share = batch.firings.times(beams), np.ones(len(beams))
-        active = [one for _, one in self.setup.faults("dirt") if one.during(times).any()]
-        if not active:
-            return returns
-        azimuth, elevation = batch.firings.angles(beams)
-        for one in active:
-            share[one.during(times) & one.covers(azimuth, elevation)] *= one.transmission or 0.0
-
-        def dimmed(hits: PulseReturns) -> PulseReturns:
-            return hits._replace(energy=made(hits.energy) * share[hits.ray // batch.each])
-
-        if batch.air is not None:
-            batch.air = dimmed(batch.air)
-        batch.hits = dimmed(returns)
-        return batch.hits
+        beams, firings = np.arange(batch.start, batch.stop), batch.firings
+        times, share = firings.times(beams), np.ones(len(beams))
+        some = [one for one in self.setup.faults("dirt").values() if one.during(times).any()]
+        angles = firings.angles(beams) if some else None
+        for one in some:
+            share[one.during(times) & one.covers(*made(angles))] *= made(one.transmission)
+        hits, air = (
+            one and one._replace(energy=made(one.energy) * share[one.ray // batch.each])
+            for one in (returns, batch.air)
+        )
+        batch.hits, batch.air = hits, air
+        return made(hits)
 
 
 class LossStep(PulseStep):
-    """Loses returns of dead channels, of packets that do not arrive, and of scans without older."""
+    """Loses returns of dead channels and lost packets, and of scans that a frozen sensor lacks."""
 
     effects = ("Faults",)
     reads = ("ray",)
@@ -60,24 +56,22 @@ class LossStep(PulseStep):
 
     def apply(self, returns: PulseReturns, batch: PulseBatch) -> PulseReturns:
         """See `PulseStep.apply`."""
-        ray, firings, spec = returns.ray, batch.firings, batch.firings.spec
-        before, now = spec.repeats or (0, -spec.ahead)
-        if spec.scan - now > spec.scan + spec.ahead - before:  # the older sweep has fewer scans
-            return returns.take(np.zeros(0, np.intp))
-        times, lost = firings.times(ray), np.zeros(len(ray), np.bool_)
-        for _, fault in self.setup.faults("dead_channels"):
-            dead = np.isin(ray % firings.sensor.channels, fault.channels or ())
-            lost |= dead & fault.during(times)
-        seed, station = self.setup.noise.seed, spec.station
-        for number, fault in self.setup.faults("dropped_packets"):
-            packet = firings.numbers[ray // firings.sensor.channels] // (fault.packet or 1)
-            drawn = uniform(seed, Purpose.PACKET, station, packet, number % 256)
-            lost |= (drawn < (fault.share or 0.0)) & fault.during(times)
+        firings, spec = batch.firings, batch.firings.spec
+        firing, channel = np.divmod(returns.ray, firings.sensor.channels)
+        before, now = spec.repeats or (spec.ahead, 0)
+        lost = np.full(len(firing), spec.ahead != before - now)
+        times, seed = firings.times(returns.ray), self.setup.noise.seed
+        for fault in self.setup.faults("dead_channels").values():
+            lost |= np.isin(channel, fault.channels) & fault.during(times)
+        for place, fault in self.setup.faults("dropped_packets").items():
+            packet = firings.numbers[firing] // fault.packet
+            drawn = uniform(seed, Purpose.PACKET, spec.station, packet, place)
+            lost |= (drawn < fault.share) & fault.during(times)
         return returns.take(~lost)
 
 
 class StampStep(PulseStep):
-    """Stamps returns as a sensor does whose clock jumps, or that sends old points as new ones."""
+    """Stamps returns as a sensor does whose clock jumps, or which sends old ones as new."""
 
     effects = ("Faults",)
     reads = ("ray",)
@@ -89,16 +83,11 @@ class StampStep(PulseStep):
         """See `PulseStep.applies`."""
         return bool(setup.faults("frozen", "time_jump"))
 
-    @staticmethod
-    def memory(setup: Setup, sizes: Sizes) -> Memory:
-        """See `PulseStep.memory`."""
-        return Memory(kept=8 * sizes.points)
-
     def apply(self, returns: PulseReturns, batch: PulseBatch) -> PulseReturns:
         """See `PulseStep.apply`."""
         stamp, repeats = batch.firings.times(returns.ray), batch.firings.spec.repeats
         if repeats is not None:
             before, now = map(self.setup.survey.begins_ns, repeats)
             stamp += round(now - before)
-        jumps = [one.jump_ns(stamp) for _, one in self.setup.faults("time_jump")]
-        return returns._replace(stamp=stamp + np.sum(jumps, axis=0, dtype=np.int64))
+        jumps = [one.jumps_ns(stamp) for one in self.setup.faults("time_jump").values()]
+        return returns._replace(stamp=sum(jumps, stamp))

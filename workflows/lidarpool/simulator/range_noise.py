@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import numpy as np
+
 from ..sensor.noise import Purpose
 from .returns import PulseReturns, made
 from .step import PulseBatch, PulseStep, Setup
@@ -25,8 +27,8 @@ class RangeNoiseStep(PulseStep):
         """See `PulseStep.apply`."""
         height = returns.energy if returns.amplitude is None else returns.amplitude
         key = *batch.keys.of(returns.ray), made(returns.number)
-        noise, firings, offset = self.setup.noise, batch.firings, 0.0
-        if noise.channel_bias_m or noise.warm_up is not None:
+        noise, firings, offset = self.setup.noise, batch.firings, np.zeros(1)
+        if noise.lasts:
             channel = returns.ray % firings.sensor.channels
             offset = noise.offsets(channel, firings.times(returns.ray))
         return returns._replace(reported=noise.ranges(returns.distance, height, *key, offset))

@@ -23,7 +23,6 @@ from ..columns.cloud import Cloud
 from ..columns.table import AXES, SCAN, Column
 from ..scene.scene import Scene
 from ..sensor import (
-    Fault,
     Material,
     Mounted,
     Noise,
@@ -65,7 +64,7 @@ class Scanner:
         Name of the sensor, which is part of all random numbers: give each sensor of a robot its
         own. A `Mounted` has a name already.
     columns, precision_m, coordinates, materials, returns, noise, visibility_km, \
-    fog_lidar_ratio_sr, rain_mm_h, snow_mm_h, dust_mg_m3, faults
+    fog_lidar_ratio_sr, rain_mm_h, snow_mm_h, dust_mg_m3
         As of `Survey`.
     backend
         "cuda", "embree", "numpy", or "auto" for the first of these that can be used.
@@ -107,7 +106,6 @@ class Scanner:
         rain_mm_h: float = 0.0,
         snow_mm_h: float = 0.0,
         dust_mg_m3: float = 0.0,
-        faults: Sequence[Fault] = (),
         backend: str = "auto",
         threads: int | None = None,
         device: int | None = None,
@@ -132,12 +130,7 @@ class Scanner:
             rain_mm_h=rain_mm_h,
             snow_mm_h=snow_mm_h,
             dust_mg_m3=dust_mg_m3,
-            faults=faults,
         )
-        if any(one.kind == "frozen" for one in faults):
-            raise LidarpoolError(
-                "A Scanner does not freeze, for it keeps no sweeps: use the last cloud again."
-            )
         check_backend_here(backend)
         warn_of_grey(scene, survey)
         try:

@@ -93,17 +93,15 @@ class Setup:
         noise, reporting = self.noise, self.reporting
         dark = any(m.reflectance == 0 for m in self.survey.materials)
         beam = reporting.subrays > 1 or self.in_waveforms or self.recorded > 0
-        lost = noise.loses or bool(
-            self.faults("dirt", "dead_channels", "dropped_packets", "frozen")
-        )
-        return beam or lost or self.passing or dark
+        lost = bool(self.faults("dirt", "dead_channels", "dropped_packets", "frozen"))
+        return beam or lost or noise.loses or self.passing or dark
 
     @property
     def adds(self) -> bool:
         """Whether the receiver reports what is no return of its pulse."""
         return bool(self.noise.false_alarm_hz or self.noise.stray_light or self.noise.crosstalk)
 
-    def faults(self, *kinds: FaultKind) -> list[tuple[int, Fault]]:
+    def faults(self, *kinds: FaultKind) -> dict[int, Fault]:
         """Return its faults of some kinds, see `faults_of`."""
         return faults_of(self.survey, self.number, *kinds)
 
@@ -140,7 +138,7 @@ class Emitter:
         # across it and towards it.
         axis = turned(np.array([[0.0, 0, 1]]), setup.sensor.axes)
         self._axis = turned(axis, carried.mount.rotation)[0]
-        self._about_axis = self.beam.oval or setup.noise.encoder_ripple is not None
+        self._about_axis = self.beam.oval or setup.noise.ripple_deg > 0
 
     def __len__(self) -> int:
         return len(self.beam)

@@ -6,8 +6,8 @@ from .air import WeatherStep
 from .angle_noise import AngleNoiseStep
 from .crosstalk import CrosstalkStep
 from .detection import DetectionStep
-from .faults import DirtStep, LossStep, StampStep
 from .false_alarms import FalseAlarmStep
+from .faults import DirtStep, LossStep, StampStep
 from .paths import CastStep
 from .range_noise import RangeNoiseStep
 from .recording import RecordingStep
