@@ -136,9 +136,10 @@ class Sweeps:
         """Return the sweeps of a survey of a scene."""
         path = survey.path
         sensors, places, turns, mounts, first_steps = [], [], [], [], []
+        each = survey.sweeps_each
         for number, carried in enumerate(survey.carried):
-            steps, mount = survey.steps_each[number], carried.mount
-            _, since, _ = carried.sensor.sweeps(steps)
+            (firsts, begins, _), mount = each[number], carried.mount
+            since = begins[: len(begins) // path.stations]
             turned = np.eye(3) if mount.rotation is None else mount.rotation
             mounts.append((mount.position, turned))
             for station in range(path.stations):
@@ -147,10 +148,9 @@ class Sweeps:
                 places.append(positions + rotations @ np.array(mount.position))
                 turns.append(rotations @ turned)
             sensors.append(np.full(len(since) * path.stations, number, np.uint8))
-            shown = [sent(survey, scan) for scan in survey.sweeps_each[number][0][:-1].tolist()]
-            begun = survey.sweeps_each[number][0][0]
-            first_steps.append([(one.scan + one.ahead - begun) % steps for one in shown])
-        each = survey.sweeps_each
+            shown = [sent(survey, scan) for scan in firsts.tolist()]
+            older = np.array([one.scan + one.ahead for one in shown])
+            first_steps.append((older - firsts[0]) % survey.steps_each[number])
         when, end = (np.concatenate([one[k] for one in each]) for k in (1, 2))
         actor_poses, there = [], []
         for actor in scene.actors:
@@ -168,7 +168,7 @@ class Sweeps:
             lidars = tuple(carried.sensor for carried in survey.carried)
             fired = Fired(lidars, most, np.concatenate(first_steps))
         return cls(
-            np.append(np.concatenate([firsts[:-1] for firsts, _, _ in each]), survey.scan_count),
+            np.append(np.concatenate([firsts for firsts, _, _ in each]), survey.scan_count),
             when,
             end,
             np.concatenate(sensors),

@@ -188,12 +188,7 @@ class Scenario(Section):
     ] = None
     faults: Annotated[
         Several[Fault],
-        about(
-            "faults of sensors, each from one time to another",
-            [{"kind": "dirt", "azimuth_deg": [-20, 20], "transmission": 0.3}],
-            [{"kind": "frozen", "from_s": 2, "to_s": 3, "sensor": "roof"}],
-            max_length=256,
-        ),
+        about("faults of sensors", [{"kind": "dirt", "transmission": 0.3}], max_length=256),
     ] = ()
     cloud: Annotated[CloudOptions, may_be_empty(CloudOptions)] = CloudOptions()
     output: Annotated[OutputSection, may_be_empty(OutputSection)] = OutputSection()

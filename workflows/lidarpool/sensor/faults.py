@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
 from pydantic import Field
 
 from ..base.arrays import Bools, Floats, Ints
-from ..base.declared import AngleDeg, Several, Text, Two, UnitShare, about
+from ..base.declared import AngleDeg, Ends, Several, Text, Two, UnitShare, about
 from ..base.errors import LidarpoolError, prefixed
 from ..base.validation import checked_fields
 from ..base.words import did_you_mean
@@ -51,7 +51,7 @@ class Fault:
     sensor: Annotated[Text | None, about("its sensor's name; by default all have it")] = None
     transmission: Annotated[UnitShare | None, about("of dirt: of energy, out and back")] = None
     azimuth_deg: Annotated[Sector | None, about("of dirt: counter-clockwise from and to")] = None
-    elevation_deg: Annotated[Sector | None, about("of dirt: lowest and highest")] = None
+    elevation_deg: Annotated[Ends[AngleDeg] | None, about("of dirt: lowest and highest")] = None
     channels: Annotated[Channels | None, about("dead ones; 0 is the lowest")] = None
     share: Annotated[UnitShare | None, about("of packets that are lost")] = None
     packet: Annotated[Count | None, about("consecutive firings in a packet")] = None
@@ -68,14 +68,10 @@ class Fault:
             raise LidarpoolError(
                 f"to_s is {self.to_s:g}; it must be above from_s, {self.from_s:g}."
             )
-        low, high = self.elevation_deg or (0, 0)
-        if low > high:
-            raise LidarpoolError(f"elevation_deg is {[low, high]}; give the lowest first.")
 
     def words(self) -> dict[str, Any]:
         """Return what is given, for labels: {field: value}."""
-        both = ((one.name, getattr(self, one.name)) for one in fields(self))
-        return {name: value for name, value in both if value is not None}
+        return {name: value for name, value in vars(self).items() if value is not None}
 
     def is_of(self, sensor: str) -> bool:
         """Whether a sensor has it."""
@@ -90,12 +86,6 @@ class Fault:
     def jumps_ns(self, times_ns: Floats | Ints) -> Ints:
         """By how much it shifts stamps at times (n,), nanoseconds."""
         return self.during(times_ns) * np.int64(round((self.by_s or 0) * 1e9))
-
-    def covers(self, azimuth: Floats, elevation: Floats) -> Bools:
-        """Whether dirt is before beams (n,), by their angles in sensor axes, degrees."""
-        (begin, end), (low, high) = self.azimuth_deg or (0, 360), self.elevation_deg or (-90, 90)
-        within = (azimuth - begin) % 360 <= ((end - begin) % 360 or 360)
-        return np.asarray(within & (elevation >= low) & (elevation <= high))
 
 
 def faults_of(survey: Survey, number: int, *kinds: FaultKind) -> dict[int, Fault]:
@@ -144,6 +134,6 @@ def sent(survey: Survey, index: int) -> ScanSpec:
     if source == own:
         return spec
     # The last sweep at a pose may have fewer scans: then the others are lost, see `LossStep`.
-    older = int(min(firsts[source] + index - firsts[own], firsts[source + 1] - 1))
+    older = min(int(firsts[source] + index - firsts[own]), int(firsts[source + 1]) - 1)
     repeats = int(firsts[source]), int(firsts[own])
     return replace(survey.scan(older), scan=index, ahead=older - index, repeats=repeats)

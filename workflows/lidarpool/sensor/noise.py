@@ -65,6 +65,8 @@ class Purpose(Enum):
     WHITE = 41  # white noise of an instrument
     DRIVEN = 42  # steps of its bias
     WALK = 43  # steps of its random walk
+    SKEW = 44  # scale factors of its axes, and angles between them
+    OUTAGE = 45  # how it drifts where there is no GNSS
     SAMPLES = 50  # stream of the samples of a waveform
     SAMPLE = 51  # noise of a sample
     CHANNEL = 60  # a channel's error of range
@@ -207,12 +209,7 @@ class Noise:
     def moves_ranges(self) -> bool:
         """Whether ranges deviate."""
         random = self.range_m, self.range_per_m, self.range_at_threshold_m
-        return any((*random, self.walk_m, self.lasts))
-
-    @property
-    def lasts(self) -> bool:
-        """Whether ranges have errors that last."""
-        return bool(self.channel_bias_m or self.warm_up_m)
+        return any((*random, self.walk_m, self.channel_bias_m, self.warm_up_m))
 
     def named(self, name: str) -> Noise:
         """Return the noise of a sensor, whose name is part of all its random numbers."""

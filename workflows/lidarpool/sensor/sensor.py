@@ -174,21 +174,6 @@ class Sensor:
             return float(number * 1e9 / rate_hz)
         return float(self.head.times_ns(np.array([self.firings(number)[0]]))[0])
 
-    def sweeps(self, steps: int) -> tuple[Ints, Floats, Floats]:
-        """Find the sweeps, a turn or frame each, in so many time steps from the start: k of them.
-
-        Returns
-        -------
-        The first time step of each, and when its first and its last firing begin, nanoseconds since
-        the station's start: (k,) each.
-        """
-        firsts = np.flatnonzero(np.diff(self.turns(np.arange(steps)), prepend=-1))
-        lasts = np.append(firsts[1:], steps) - 1
-        firings = [[self.firings(step)[0] for step in firsts.tolist()]]
-        firings += [[self.firings(step)[1] - 1 for step in lasts.tolist()]]
-        begins, ends = (self.begins_ns(np.array(each)) + self.lead_ns for each in firings)
-        return firsts, begins, ends
-
     def steps_of_turn(self, number: int) -> range:
         """Time steps of a turn, or frame.
 

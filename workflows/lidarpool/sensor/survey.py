@@ -474,18 +474,18 @@ class Survey(CloudOptions, Weather):
 
     @cached_property
     def sweeps_each(self) -> tuple[tuple[Ints, Floats, Floats], ...]:
-        """First scans of each sensor's sweeps and one past the last, and their first and last times.
-
-        Nanoseconds since the survey's start.
-        """
-        out = []
-        for number, carried in enumerate(self.carried):
-            first, steps = self._firsts[number], self.steps_each[number]
-            stations = np.arange(self.path.stations)[:, None]
-            firsts, begins, ends = carried.sensor.sweeps(steps)
-            scans = np.append(first + stations * steps + firsts, self._firsts[number + 1])
-            late = stations * self.station_ns
-            out.append((scans, (late + begins).ravel(), (late + ends).ravel()))
+        """First scans of each sensor's sweeps, and when their first and last firings begin, ns."""
+        out, stations = [], np.arange(self.path.stations)[:, None]
+        for carried, steps, base in zip(
+            self.carried, self.steps_each, self._firsts[:-1], strict=True
+        ):
+            sensor = carried.sensor
+            firsts = np.flatnonzero(np.diff(sensor.turns(np.arange(steps)), prepend=-1))
+            begins = [sensor.firings(step)[0] for step in firsts.tolist()]
+            ends = [sensor.firings(step - 1)[1] - 1 for step in [*firsts[1:].tolist(), steps]]
+            times = (sensor.begins_ns(np.array(each)) + sensor.lead_ns for each in (begins, ends))
+            begin, end = ((stations * self.station_ns + each).ravel() for each in times)
+            out.append(((base + stations * steps + firsts).ravel(), begin, end))
         return tuple(out)
 
     @property

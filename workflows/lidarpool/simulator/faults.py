@@ -6,7 +6,7 @@ import numpy as np
 
 from ..sensor.noise import Purpose, uniform
 from .returns import PulseReturns, made
-from .step import Memory, PulseBatch, PulseStep, Setup, Sizes
+from .step import PulseBatch, PulseStep, Setup
 
 
 class DirtStep(PulseStep):
@@ -21,19 +21,17 @@ class DirtStep(PulseStep):
         """See `PulseStep.applies`."""
         return bool(setup.faults("dirt"))
 
-    @staticmethod
-    def memory(setup: Setup, sizes: Sizes) -> Memory:
-        """See `PulseStep.memory`: directions, angles and shares of beams."""
-        return Memory(casting=80 * sizes.beams)
-
     def apply(self, returns: PulseReturns, batch: PulseBatch) -> PulseReturns:
         """See `PulseStep.apply`."""
         beams, firings = np.arange(batch.start, batch.stop), batch.firings
         times, share = firings.times(beams), np.ones(len(beams))
-        some = [one for one in self.setup.faults("dirt").values() if one.during(times).any()]
-        angles = firings.angles(beams) if some else None
-        for one in some:
-            share[one.during(times) & one.covers(*made(angles))] *= made(one.transmission)
+        azimuth, elevation = firings.angles(beams)
+        for one in self.setup.faults("dirt").values():
+            begin, end = one.azimuth_deg or (0, 360)
+            low, high = one.elevation_deg or (-90, 90)
+            there = (azimuth - begin) % 360 <= ((end - begin) % 360 or 360)
+            there &= (elevation >= low) & (elevation <= high) & one.during(times)
+            share[there] *= made(one.transmission)
         hits, air = (
             one and one._replace(energy=made(one.energy) * share[one.ray // batch.each])
             for one in (returns, batch.air)

@@ -27,8 +27,8 @@ class RangeNoiseStep(PulseStep):
         """See `PulseStep.apply`."""
         height = returns.energy if returns.amplitude is None else returns.amplitude
         key = *batch.keys.of(returns.ray), made(returns.number)
-        noise, firings, offset = self.setup.noise, batch.firings, np.zeros(1)
-        if noise.lasts:
-            channel = returns.ray % firings.sensor.channels
-            offset = noise.offsets(channel, firings.times(returns.ray))
+        noise, offset = self.setup.noise, np.zeros(1)
+        if noise.channel_bias_m or noise.warm_up_m:
+            channel = returns.ray % self.setup.sensor.channels
+            offset = noise.offsets(channel, batch.firings.times(returns.ray))
         return returns._replace(reported=noise.ranges(returns.distance, height, *key, offset))
