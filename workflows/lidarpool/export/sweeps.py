@@ -192,17 +192,14 @@ class Sweeps:
 
     def faults_in(self, sweep: int) -> tuple[Fault, ...]:
         """Return the faults that its sensor has at some time of a sweep."""
-        name, begin, end = self.sensors[self.sensor[sweep]], self.begins_ns, self.ends_ns
-        return tuple(
-            one for one in self.faults if one.is_of(name) and one.during(begin[sweep], end[sweep])
-        )
+        sensors, span = (None, self.sensors[self.sensor[sweep]]), (self.begins_ns, self.ends_ns)
+        own = (one for one in self.faults if one.sensor in sensors)
+        return tuple(one for one in own if one.during(*(times[sweep] for times in span)))
 
     def stamp_ns(self, sweep: int) -> int:
         """Return when the sensor says that a sweep began, nanoseconds since the survey's start."""
-        name, begin = self.sensors[self.sensor[sweep]], self.begins_ns[sweep]
-        return round(begin) + sum(
-            int(one.jumps_ns(begin)) for one in self.faults if one.is_of(name)
-        )
+        begin = self.begins_ns[sweep]
+        return round(begin) + sum(int(one.jumps_ns(begin)) for one in self.faults_in(sweep))
 
     def points(self, cloud: CloudLike, first: int = 0, stop: int | None = None) -> Iterator[Cloud]:
         """Yield the points of each sweep from `first` to `stop` in order, also of empty ones.

@@ -59,11 +59,10 @@ class Fault:
 
     def __post_init__(self) -> None:
         own, given = _OWN[self.kind], self.words().keys() - {"kind", "from_s", "to_s", "sensor"}
-        lacking = [one for one in own if one not in given and not one.endswith("_deg")]
-        if wrong := [*lacking, *sorted(given - {*own})]:
-            told = "needs" if lacking else "has no"
-            fit = f": it has {', '.join(own)}" if own and not lacking else ""
-            raise LidarpoolError(f"{self.kind} {told} {wrong[0]}{fit}.")
+        for name in sorted((given ^ {*own}) - {one for one in own if one.endswith("_deg")}):
+            advice = f"leave {name} out" if name in given else f"give {name}"
+            takes = f"takes {', '.join(own)}" if own else "has times only"
+            raise LidarpoolError(f"{self.kind} {takes}: {advice}.")
         if self.to_s is not None and self.to_s <= self.from_s:
             raise LidarpoolError(
                 f"to_s is {self.to_s:g}; it must be above from_s, {self.from_s:g}."
@@ -72,10 +71,6 @@ class Fault:
     def words(self) -> dict[str, Any]:
         """Return what is given, for labels: {field: value}."""
         return {name: value for name, value in vars(self).items() if value is not None}
-
-    def is_of(self, sensor: str) -> bool:
-        """Whether a sensor has it."""
-        return self.sensor in (None, sensor)
 
     def during(self, begins_ns: Floats | Ints, ends_ns: Floats | Ints | None = None) -> Bools:
         """Whether it is there at times (n,), or between them and others."""
@@ -91,7 +86,7 @@ class Fault:
 def faults_of(survey: Survey, number: int, *kinds: FaultKind) -> dict[int, Fault]:
     """Faults of some kinds that a sensor has, by their places in the survey's list."""
     name, every = survey.carried[number].name, enumerate(survey.faults)
-    return {place: one for place, one in every if one.kind in kinds and one.is_of(name)}
+    return {place: one for place, one in every if one.kind in kinds and one.sensor in (None, name)}
 
 
 def check_faults(survey: Survey) -> None:
@@ -99,7 +94,7 @@ def check_faults(survey: Survey) -> None:
     names, lasts_s = [carried.name for carried in survey.carried], survey.duration_ns / 1e9
     for place, fault in enumerate(survey.faults):
         with prefixed(f"faults[{place}]"):
-            lidars = [one.sensor for one in survey.carried if fault.is_of(one.name)]
+            lidars = [one.sensor for one in survey.carried if fault.sensor in (None, one.name)]
             if not lidars:
                 known = f" There are {', '.join(names)}." if any(names) else " Leave it out."
                 hint = did_you_mean(str(fault.sensor), names) or known
@@ -108,10 +103,8 @@ def check_faults(survey: Survey) -> None:
             if fault.kind == "frozen" and fault.from_s <= first_s / 1e9:
                 raise LidarpoolError("a frozen sensor repeats a sweep: give a later from_s.")
             if fault.from_s > lasts_s:
-                raise LidarpoolError(
-                    f"from_s is {fault.from_s:g}, and the survey lasts {lasts_s:.6g} s: give an "
-                    "earlier one, or more steps."
-                )
+                told = f"from_s is {fault.from_s:g}, and the survey lasts {lasts_s:.6g} s"
+                raise LidarpoolError(f"{told}: make from_s smaller.")
             least, last = min(one.channels for one in lidars), max(fault.channels or (0,))
             if last >= least:
                 raise LidarpoolError(f"there is no channel {last}, but 0 to {least - 1}.")

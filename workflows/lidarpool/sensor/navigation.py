@@ -272,18 +272,16 @@ def fixes(survey: Survey, block: int = BLOCK) -> Iterator[Fixes]:
 
 
 def _bridged(imu: Imu, seed: int, number: int, since: Floats, lasts: float) -> Floats:
-    """Errors of positions while an IMU bridges an outage, seconds since it began, and after: (k, 3).
+    """Errors of positions (k, 3) while an IMU bridges an outage, and after: seconds since it began.
 
     A bias b grows to b t^2 / 2, a velocity random walk N to N sqrt(t^3 / 3) (Groves 2013).
     """
     grown = np.clip(since, 0, lasts)
     left = exp(np.minimum(lasts - since, 0) / RETURNS_IN_S)
     bias, walk = (normal(seed, Purpose.OUTAGE, number, np.arange(3), k) for k in range(2))
-    by_bias = left * grown * grown / 2
-    by_walk = left * grown * np.sqrt(grown / 3)
-    return np.outer(by_bias, imu.accelerometer_bias * bias) + np.outer(
-        by_walk, imu.accelerometer_noise_density * walk
-    )
+    by_bias = np.outer(grown / 2, imu.accelerometer_bias * bias)
+    by_walk = np.outer(np.sqrt(grown / 3), imu.accelerometer_noise_density * walk)
+    return (left * grown)[:, None] * (by_bias + by_walk)
 
 
 def _moved(path: Trajectory, mount: Pose, times_ns: Floats) -> tuple[Floats, Floats, Floats]:

@@ -19,7 +19,7 @@ from pydantic import Field
 
 from ..base.arrays import Bools, Floats, Indices, Integers, Ints
 from ..base.declared import AngleDeg, Seed, Several, UnitShare, about, allowed
-from ..base.elementary import exp, log, sin_cos
+from ..base.elementary import exp, log
 from ..base.errors import LidarpoolError
 from ..base.validation import checked_fields
 from .materials import at_right_angles
@@ -201,11 +201,6 @@ class Noise:
         return self.dropout > 0 or self.detection_range_m is not None
 
     @property
-    def moves_beams(self) -> bool:
-        """Whether directions deviate."""
-        return self.angle_deg > 0 or self.ripple_deg > 0
-
-    @property
     def moves_ranges(self) -> bool:
         """Whether ranges deviate."""
         random = self.range_m, self.range_per_m, self.range_at_threshold_m
@@ -246,11 +241,6 @@ class Noise:
         if self.warm_up_m:
             out = out + self.warm_up_m * exp(times_ns * (-1e-9 / self.warm_up_s))
         return out
-
-    def ripple(self, azimuth: Floats) -> Floats:
-        """How far beams are beyond the azimuths (n,) of the encoder, both in radians."""
-        sin, _ = sin_cos(self.ripple_cycles * azimuth + np.radians(self.ripple_phase_deg))
-        return np.asarray(np.radians(self.ripple_deg) * sin)
 
     def velocities(
         self, velocity: Floats, scan: Integers, ray: Integers, number: Integers

@@ -318,8 +318,7 @@ class Survey(CloudOptions, Weather):
                     f"picoseconds: with waveform_samples, give {round(returns.sample_ns, 3):g}."
                 )
         for number, noise in enumerate(self.noise_each):
-            _check_alarms(noise, self.carried[number].sensor)
-            _check_lasting(noise, self.carried[number].sensor)
+            _check_noise(noise, self.carried[number].sensor)
             if noise.crosstalk:
                 self._check_crosstalk(number)
         if self.returns_light:
@@ -537,8 +536,8 @@ class Survey(CloudOptions, Weather):
         return spec.start_ns + begin_ns(sensor, spec.firings[0]) + sensor.lead_ns
 
 
-def _check_lasting(noise: Noise, sensor: Sensor) -> None:
-    """Check that errors that last fit a sensor's channels and head."""
+def _check_noise(noise: Noise, sensor: Sensor) -> None:
+    """Check that a sensor can have its noise, and that false alarms are not too many."""
     biases, channels = noise.channel_bias_m, sensor.channels
     if isinstance(biases, Sequence) and len(biases) != channels:
         raise LidarpoolError(
@@ -546,10 +545,6 @@ def _check_lasting(noise: Noise, sensor: Sensor) -> None:
         )
     if noise.ripple_deg and sensor.spins(np.zeros(1, np.int64)) is None:
         raise LidarpoolError(f"noise.ripple_deg needs a head that turns, unlike {sensor.model}'s.")
-
-
-def _check_alarms(noise: Noise, sensor: Sensor) -> None:
-    """Check that false alarms end, and are not too many."""
     if noise.false_alarm_hz and not sensor.gate_s < float("inf"):
         raise LidarpoolError(
             f"noise.false_alarm_hz needs a sensor with a greatest range, and {sensor.model} has "

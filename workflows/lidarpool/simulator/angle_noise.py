@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from ..base.elementary import sin_cos
 from ..base.vectors import hypot
 from ..sensor.noise import Purpose
 from .returns import PulseReturns
@@ -19,7 +20,7 @@ class AngleNoiseStep(PulseStep):
     @staticmethod
     def applies(setup: Setup) -> bool:
         """See `PulseStep.applies`."""
-        return setup.noise.moves_beams
+        return setup.noise.angle_deg > 0 or setup.noise.ripple_deg > 0
 
     @staticmethod
     def memory(setup: Setup, sizes: Sizes) -> Memory:
@@ -30,16 +31,14 @@ class AngleNoiseStep(PulseStep):
 
     def apply(self, returns: PulseReturns, batch: PulseBatch) -> PulseReturns:
         """See `PulseStep.apply`."""
-        rays, noise, sensor = (
-            np.arange(batch.start, batch.stop),
-            self.setup.noise,
-            batch.firings.sensor,
-        )
+        rays, noise = np.arange(batch.start, batch.stop), self.setup.noise
         across, up = noise.angles(*batch.keys.of(rays))
         if noise.ripple_deg:
-            firing, channel = np.divmod(rays, sensor.channels)
-            beside = noise.ripple(sensor.head.azimuths(batch.firings.numbers))
+            firing, channel = np.divmod(rays, self.setup.sensor.channels)
+            azimuth = self.setup.sensor.head.azimuths(batch.firings.numbers)
+            sin, _ = sin_cos(noise.ripple_cycles * azimuth + np.radians(noise.ripple_phase_deg))
             # A degree of azimuth is less across a beam, the steeper it looks.
-            across += beside.take(firing) * hypot(*sensor.ahead.T[:2]).take(channel)
+            level = hypot(*self.setup.sensor.ahead.T[:2])
+            across += np.radians(noise.ripple_deg) * sin.take(firing) * level.take(channel)
         batch.offsets = np.stack([across, up], axis=1)
         return returns

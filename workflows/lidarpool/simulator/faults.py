@@ -1,9 +1,10 @@
-"""Faults of sensors: dirt, channels and packets without returns, stamps that are not the time."""
+"""Faults of sensors: dirt on the window, and channels, packets and scans without returns."""
 
 from __future__ import annotations
 
 import numpy as np
 
+from ..base.elementary import arcsin, arctan2
 from ..sensor.noise import Purpose, uniform
 from .returns import PulseReturns, made
 from .step import PulseBatch, PulseStep, Setup
@@ -23,9 +24,11 @@ class DirtStep(PulseStep):
 
     def apply(self, returns: PulseReturns, batch: PulseBatch) -> PulseReturns:
         """See `PulseStep.apply`."""
-        beams, firings = np.arange(batch.start, batch.stop), batch.firings
-        times, share = firings.times(beams), np.ones(len(beams))
-        azimuth, elevation = firings.angles(beams)
+        sensor, beams = self.setup.sensor, np.arange(batch.start, batch.stop)
+        times, share = batch.firings.times(beams), np.ones(len(beams))
+        rows = slice(batch.start // sensor.channels, batch.stop // sensor.channels)
+        x, y, z = sensor.directions(batch.firings.numbers[rows]).reshape(-1, 3).T
+        azimuth, elevation = np.degrees(arctan2(y, x)), np.degrees(arcsin(np.clip(z, -1, 1)))
         for one in self.setup.faults("dirt").values():
             begin, end = one.azimuth_deg or (0, 360)
             low, high = one.elevation_deg or (-90, 90)
@@ -60,32 +63,9 @@ class LossStep(PulseStep):
         lost = np.full(len(firing), spec.ahead != before - now)
         times, seed = firings.times(returns.ray), self.setup.noise.seed
         for fault in self.setup.faults("dead_channels").values():
-            lost |= np.isin(channel, fault.channels) & fault.during(times)
+            lost |= np.isin(channel, made(fault.channels)) & fault.during(times)
         for place, fault in self.setup.faults("dropped_packets").items():
-            packet = firings.numbers[firing] // fault.packet
+            packet = firings.numbers[firing] // made(fault.packet)
             drawn = uniform(seed, Purpose.PACKET, spec.station, packet, place)
-            lost |= (drawn < fault.share) & fault.during(times)
+            lost |= (drawn < made(fault.share)) & fault.during(times)
         return returns.take(~lost)
-
-
-class StampStep(PulseStep):
-    """Stamps returns as a sensor does whose clock jumps, or which sends old ones as new."""
-
-    effects = ("Faults",)
-    reads = ("ray",)
-    writes = ("stamp",)
-    of_kept = True
-
-    @staticmethod
-    def applies(setup: Setup) -> bool:
-        """See `PulseStep.applies`."""
-        return bool(setup.faults("frozen", "time_jump"))
-
-    def apply(self, returns: PulseReturns, batch: PulseBatch) -> PulseReturns:
-        """See `PulseStep.apply`."""
-        stamp, repeats = batch.firings.times(returns.ray), batch.firings.spec.repeats
-        if repeats is not None:
-            before, now = map(self.setup.survey.begins_ns, repeats)
-            stamp += round(now - before)
-        jumps = [one.jumps_ns(stamp) for one in self.setup.faults("time_jump").values()]
-        return returns._replace(stamp=sum(jumps, stamp))

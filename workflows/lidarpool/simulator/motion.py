@@ -13,7 +13,6 @@ import raybeam.poses
 from raybeam import Motion, Pattern
 
 from ..base.arrays import Floats, Integers, Ints, owned
-from ..base.elementary import arcsin, arctan2
 from ..base.vectors import into_axes, matmul
 from ..sensor import Mounted, ScanSpec, Sensor, Trajectory
 from ..sensor.trajectory import velocities
@@ -62,13 +61,6 @@ class Firings:
         times = self.sensor.begins_ns(self.numbers).take(number)
         times += self.sensor.beams.time_ns.take(channel)
         return self.spec.start_ns + np.rint(times, out=times).astype(np.int64)
-
-    def angles(self, ray: Ints) -> tuple[Floats, Floats]:
-        """Return azimuths, 0 to 360, and elevations of consecutive rays, sensor axes, degrees."""
-        first, stop = ray[0] // self.sensor.channels, ray[-1] // self.sensor.channels + 1
-        ahead = self.sensor.directions(self.numbers[first:stop]).reshape(-1, 3)
-        x, y, z = ahead[ray - first * self.sensor.channels].T
-        return np.degrees(arctan2(y, x)) % 360, np.degrees(arcsin(np.clip(z, -1, 1)))
 
 
 @dataclass(frozen=True)

@@ -17,6 +17,7 @@ from ..columns.waveforms import column_type
 from ..scene.colours import unpacked
 from ..scene.scene import Scene
 from ..sensor import ScanSpec, Survey
+from ..sensor.faults import faults_of
 from ..sensor.materials import at_right_angles
 from ..sensor.optics import LIGHT_M_NS
 from .doppler import radial_velocities
@@ -118,10 +119,15 @@ class BatchPoints:
     def _fired_ns(self) -> Ints:
         return self._fired.times(self.found.ray)
 
-    @property
+    @cached_property
     def time(self) -> Ints:
         """Time of the ray as the sensor states it, nanoseconds since the survey's start."""
-        return self._fired_ns if self.found.stamp is None else self.found.stamp
+        spec, stamp = self.specs[0], self._fired_ns
+        if spec.repeats is not None:
+            before, now = map(self.survey.begins_ns, spec.repeats)
+            stamp = stamp + round(now - before)
+        jumps = faults_of(self.survey, spec.sensor, "time_jump").values()
+        return sum((one.jumps_ns(stamp) for one in jumps), stamp)
 
     @property
     def _times(self) -> Ints:

@@ -62,8 +62,6 @@ class PulseReturns(NamedTuple):
     number: Bytes | None = None  # among the reported returns of its pulse, from 1
     returns: Bytes | None = None  # how many these are
     reported: Floats | None = None  # distance with noise
-    # Nanoseconds since the survey's start; None if it is the time of the firing.
-    stamp: Ints | None = None
 
     @classmethod
     def none(cls) -> PulseReturns:
