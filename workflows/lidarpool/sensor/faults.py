@@ -64,9 +64,7 @@ class Fault:
             takes = f"takes {', '.join(own)}" if own else "has times only"
             raise LidarpoolError(f"{self.kind} {takes}: {advice}.")
         if self.to_s is not None and self.to_s <= self.from_s:
-            raise LidarpoolError(
-                f"to_s is {self.to_s:g}; it must be above from_s, {self.from_s:g}."
-            )
+            raise LidarpoolError(f"to_s is {self.to_s:g}; give more than from_s, {self.from_s:g}.")
 
     def words(self) -> dict[str, Any]:
         """Return what is given, for labels: {field: value}."""

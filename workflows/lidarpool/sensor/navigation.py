@@ -46,6 +46,7 @@ TurnNoise = Annotated[float, Field(ge=0, le=100)]  # of a gyroscope
 SpeedNoise = Annotated[float, Field(ge=0, le=1000)]  # of an accelerometer
 Deviation = Annotated[float, Field(ge=0, le=1e6)]  # metres
 Correlation = Annotated[float, Field(ge=0.001, le=1e9)]  # seconds
+Skew = Annotated[float, Field(ge=0, le=10)]  # degrees
 Span = Annotated[float, Field(ge=0, le=1e9)]  # seconds
 
 
@@ -86,9 +87,7 @@ class Imu:
     accelerometer_bias_time_s: Annotated[Correlation, about("its correlation time")] = 300.0
     accelerometer_random_walk: Annotated[SpeedNoise, about("of the bias, m/s^3/sqrt(Hz)")] = 0.0
     scale: Annotated[UnitShare, about("standard deviation of each axis's scale factor")] = 0.0
-    misalignment_deg: Annotated[
-        float, about("of the angles between axes, standard deviation", ge=0, le=10)
-    ] = 0.0
+    misalignment_deg: Annotated[Skew, about("of angles between axes, standard deviation")] = 0.0
 
 
 @dataclass(frozen=True)

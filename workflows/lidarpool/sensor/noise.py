@@ -31,6 +31,8 @@ ALARMS_MOST = 20  # false alarms of a pulse on average: a ray has numbers for 25
 
 Metres = Annotated[float, Field(ge=0, le=1000)]
 Bias = Annotated[float, Field(ge=-1000, le=1000)]
+Seconds = Annotated[float, Field(gt=0, le=1e7)]
+Deviation = Annotated[float, Field(ge=0, le=10)]  # degrees
 
 _GAMMA = 0x9E3779B97F4A7C15
 _NUMBERS = 256  # of one ray
@@ -94,7 +96,7 @@ class Noise:
         float, about("standard deviation added for each metre of range", 0.0002, ge=0, le=1)
     ] = 0.0
     angle_deg: Annotated[
-        float, about("standard deviation of beam directions, in both axes", 0.05, ge=0, le=10)
+        Deviation, about("standard deviation of beam directions, in both axes", 0.05)
     ] = 0.0
     dropout: Annotated[
         UnitShare, about("share of returns that are lost, whatever their energy")
@@ -162,20 +164,12 @@ class Noise:
     channel_bias_m: Annotated[
         Metres | Several[Bias],
         allowed("a number of 0 to 1000, or a list of numbers, one for each channel"),
-        about(
-            "constant errors of the channels' ranges, metres: their standard deviation, or a list, "
-            "the lowest channel first",
-            0.01,
-        ),
+        about("constant errors of channels' ranges, metres: standard deviation, or one for each"),
     ] = 0.0
     warm_up_m: Annotated[Bias, about("error of ranges at the start, which decays, metres")] = 0.0
-    warm_up_s: Annotated[float, about("time in which it falls to 37 %, seconds", gt=0, le=1e7)] = (
-        600.0
-    )
-    ripple_deg: Annotated[
-        float, about("greatest error of azimuths that repeats as the head turns", ge=0, le=10)
-    ] = 0.0
-    ripple_cycles: Annotated[int, about("how often in a turn", ge=1, le=100_000)] = 1
+    warm_up_s: Annotated[Seconds, about("time in which it falls to 37 %, seconds")] = 600.0
+    ripple_deg: Annotated[Deviation, about("greatest error of azimuths, as the head turns")] = 0.0
+    ripple_cycles: Annotated[int, about("how often it repeats in a turn", ge=1, le=100_000)] = 1
     ripple_phase_deg: Annotated[AngleDeg, about("its phase where the head is at azimuth 0")] = 0.0
 
     def __post_init__(self) -> None:
@@ -217,11 +211,10 @@ class Noise:
         scan: Integers,
         ray: Integers,
         number: Integers,
-        offset: Floats | float = 0.0,
     ) -> Floats:
         """Return the reported ranges of returns (n,), metres, at least 0.
 
-        The energies are needed where noise or walk depend on them; an offset is added.
+        The energies are needed where noise or walk depend on them.
         """
         sigma = self.range_m + self.range_per_m * distance
         if self.range_at_threshold_m and energy is not None:
@@ -229,7 +222,6 @@ class Noise:
             sigma = np.sqrt(sigma * sigma + weak * weak)
         if self.walk_m and energy is not None:
             distance = distance - self.walk(energy)
-        distance = distance + offset
         return np.maximum(distance + sigma * normal(self.seed, Purpose.RANGE, scan, ray, number), 0)
 
     def offsets(self, channel: Integers, times_ns: Ints) -> Floats:

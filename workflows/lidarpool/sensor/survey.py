@@ -475,10 +475,8 @@ class Survey(CloudOptions, Weather):
     def sweeps_each(self) -> tuple[tuple[Ints, Floats, Floats], ...]:
         """First scans of each sensor's sweeps, and when their first and last firings begin, ns."""
         out, stations = [], np.arange(self.path.stations)[:, None]
-        for carried, steps, base in zip(
-            self.carried, self.steps_each, self._firsts[:-1], strict=True
-        ):
-            sensor = carried.sensor
+        for number, carried in enumerate(self.carried):
+            sensor, steps, base = carried.sensor, self.steps_each[number], self._firsts[number]
             firsts = np.flatnonzero(np.diff(sensor.turns(np.arange(steps)), prepend=-1))
             begins = [sensor.firings(step)[0] for step in firsts.tolist()]
             ends = [sensor.firings(step - 1)[1] - 1 for step in [*firsts[1:].tolist(), steps]]

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import numpy as np
-
 from ..sensor.noise import Purpose
 from .returns import PulseReturns, made
 from .step import PulseBatch, PulseStep, Setup
@@ -27,8 +25,8 @@ class RangeNoiseStep(PulseStep):
         """See `PulseStep.apply`."""
         height = returns.energy if returns.amplitude is None else returns.amplitude
         key = *batch.keys.of(returns.ray), made(returns.number)
-        noise, offset = self.setup.noise, np.zeros(1)
+        noise, distance = self.setup.noise, returns.distance
         if noise.channel_bias_m or noise.warm_up_m:
             channel = returns.ray % self.setup.sensor.channels
-            offset = noise.offsets(channel, batch.firings.times(returns.ray))
-        return returns._replace(reported=noise.ranges(returns.distance, height, *key, offset))
+            distance = distance + noise.offsets(channel, batch.firings.times(returns.ray))
+        return returns._replace(reported=noise.ranges(distance, height, *key))
