@@ -275,12 +275,12 @@ def _bridged(imu: Imu, seed: int, number: int, since: Floats, lasts: float) -> F
 
     A bias b grows to b t^2 / 2, a velocity random walk N to N sqrt(t^3 / 3) (Groves 2013).
     """
-    grown = np.clip(since, 0, lasts)
-    left = exp(np.minimum(lasts - since, 0) / RETURNS_IN_S)
+    grown = np.clip(since, 0, lasts)[:, None]
+    left = exp(np.minimum(lasts - since, 0) / RETURNS_IN_S)[:, None]
     bias, walk = (normal(seed, Purpose.OUTAGE, number, np.arange(3), k) for k in range(2))
-    by_bias = np.outer(grown / 2, imu.accelerometer_bias * bias)
-    by_walk = np.outer(np.sqrt(grown / 3), imu.accelerometer_noise_density * walk)
-    return (left * grown)[:, None] * (by_bias + by_walk)
+    by_bias = imu.accelerometer_bias * bias * (grown * grown / 2)
+    by_walk = imu.accelerometer_noise_density * walk * (grown * np.sqrt(grown / 3))
+    return np.asarray(left * (by_bias + by_walk))
 
 
 def _moved(path: Trajectory, mount: Pose, times_ns: Floats) -> tuple[Floats, Floats, Floats]:

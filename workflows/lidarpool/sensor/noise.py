@@ -226,10 +226,11 @@ class Noise:
 
     def offsets(self, channel: Integers, times_ns: Ints) -> Floats:
         """Return errors of range that last: of channels (n,) at times since the start, metres."""
-        if isinstance(self.channel_bias_m, (int, float)):
-            out = self.channel_bias_m * normal(self.seed, Purpose.CHANNEL, 0, channel)
-        else:
-            out = np.array(self.channel_bias_m, np.float64)[channel]
+        biases: ArrayLike = self.channel_bias_m
+        if isinstance(biases, (int, float)):
+            each = np.arange(channel.max(initial=0) + 1)
+            biases = biases * normal(self.seed, Purpose.CHANNEL, 0, each)
+        out = np.asarray(biases, np.float64)[channel]
         if self.warm_up_m:
             out = out + self.warm_up_m * exp(times_ns * (-1e-9 / self.warm_up_s))
         return out
