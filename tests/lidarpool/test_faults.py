@@ -135,8 +135,8 @@ def test_dirt_shortens_the_range_of_detection():
 def test_dirt_is_before_all_light(waveform):
     """With sub-rays, rain and echoes: returns of the air are weaker, too."""
     survey = replace(
-        STANDING, noise=Noise(detection_range_m=90), returns=Returns("all", 7, 3, waveform=waveform),
-        rain_mm_h=30, steps=10, columns=(*COLUMNS, "cause"),
+        STANDING, returns=Returns("all", 7, 3, waveform=waveform), rain_mm_h=30, steps=10,
+        noise=Noise(detection_range_m=90), columns=(*COLUMNS, "cause"),
     )  # fmt: skip
     clear = cast(survey)
     thin, shut = (
@@ -299,15 +299,18 @@ def test_what_does_not_fit_the_survey(words):
     assert str(caught.value).startswith("faults[1]: ")
 
 
+PACKETS = {"share": 0.1, "packet": 9}
+
+
 @pytest.mark.parametrize(
     ("words", "fields"),
     [
         ("kind is 'dirrt'.*Did you mean 'dirt'", {"kind": "dirrt"}),
         ("give transmission", {"kind": "dirt"}),
         ("leave share out", {"kind": "frozen", "share": 0.5}),
-        ("takes share, packet: leave by_s out", {"kind": "dropped_packets", "share": 0.1, "packet": 9, "by_s": 1}),
+        ("share, packet: leave by_s out", {"kind": "dropped_packets", **PACKETS, "by_s": 1}),
         ("to_s is 1; give more than from_s, 2", {"kind": "frozen", "from_s": 2, "to_s": 1}),
-        ("elevation_deg.*least, largest", {"kind": "dirt", "transmission": 1, "elevation_deg": [2, 1]}),
+        ("least, largest", {"kind": "dirt", "transmission": 1, "elevation_deg": [2, 1]}),
         ("transmission is 2; it must be 0 to 1", {"kind": "dirt", "transmission": 2}),
     ],
 )  # fmt: skip
@@ -322,14 +325,16 @@ def test_scenarios_and_campaigns(tmp_path):
     base = tmp_path / "base.yaml"
     base.write_text(
         "poses: [[0, 0, 1]]\nsensor: velodyne/vlp16\n"
-        "faults: [{kind: dirt, azimuth_deg: [-20, 20], transmission: 0.3}, {kind: frozen, from_s: 0.05}]"
+        "faults:\n  - {kind: dirt, azimuth_deg: [-20, 20], transmission: 0.3}\n"
+        "  - {kind: frozen, from_s: 0.05}\n"
     )
     given = build(Scenario.load(base)).survey.faults
     assert given[0] == Fault("dirt", transmission=0.3, azimuth_deg=(-20, 20))
     campaign = tmp_path / "campaign.yaml"
     campaign.write_text(
         "base: base.yaml\ncount: 3\nseed: 1\nkeep: kitti\nvary:\n"
-        "  faults.0.transmission: {uniform: [0.1, 0.9]}\n  faults.1.from_s: {choice: [0.02, 0.05]}\n"
+        "  faults.0.transmission: {uniform: [0.1, 0.9]}\n"
+        "  faults.1.from_s: {choice: [0.02, 0.05]}\n"
     )
     spec = CampaignSpec.load(campaign)
     faults = [spec.job(number).survey.faults for number in range(3)]

@@ -63,7 +63,7 @@ def everything():
         columns=["range", "cause", "radial_velocity"],
         waveform_samples=200,
         navigation=Navigation(imu=IMU, gnss=GNSS, seed=3),
-        faults=[Fault("dropped_packets", share=0.1, packet=12)],
+        faults=[Fault("dropped_packets", share=0, packet=12)],
         fog_lidar_ratio_sr=18.8,
         visibility_km=0.5,
         snow_mm_h=1.0,
