@@ -31,7 +31,7 @@ def errors(sensor: Sensor, noise: Noise, **options: object) -> dict[str, np.ndar
         survey = Survey(sensor, poses=[(0, 0, 0)], noise=own, columns=["range", "time"], **options)
         rig = Rig(Scene.from_meshes([wall("W", 10)]), survey)
         found.append([*rig.cast(0, survey.scan_count)])
-    true, seen = ([np.concatenate([one.range for one in each]) for each in found])
+    true, seen = [np.concatenate([one.range for one in each]) for each in found]
     return {
         "error": seen - true,
         "channel": np.concatenate([one.channel for one in found[0]]),
@@ -43,7 +43,9 @@ def picture(path: Path) -> None:
     """Draw errors by channel, by time and by azimuth, beside the closed forms."""
     figure = Figure((11, 3.6), layout="constrained", dpi=100)
     left, middle, right = figure.subplots(1, 3)
-    turn = errors(load_sensor("ouster/os1-64"), replace(NOISE, warm_up_m=0.0, ripple_deg=0.0), steps=36)
+    turn = errors(
+        load_sensor("ouster/os1-64"), replace(NOISE, warm_up_m=0.0, ripple_deg=0.0), steps=36
+    )
     left.plot(turn["channel"], 100 * turn["error"], ".", ms=1, color=GREY, label="returns")
     each = [turn["error"][turn["channel"] == k].mean() for k in range(64)]
     left.plot(100 * np.array(each), "o", ms=3.5, color=BLUE, label="mean of a channel")

@@ -19,7 +19,6 @@ if TYPE_CHECKING:
 
 FaultKind = Literal["dirt", "dead_channels", "dropped_packets", "frozen", "time_jump"]
 Time = Annotated[float, Field(ge=0, le=1e9)]  # seconds since the survey's start
-Sector = Two[AngleDeg]
 Channels = Annotated[Several[Annotated[int, Field(ge=0)]], Field(min_length=1)]
 Count = Annotated[int, Field(ge=1, le=1_000_000)]
 Shift = Annotated[float, Field(ge=-1e6, le=1e6)]
@@ -50,7 +49,7 @@ class Fault:
     to_s: Annotated[Time | None, about("when it ends; by default with the survey")] = None
     sensor: Annotated[Text | None, about("its sensor's name; by default all have it")] = None
     transmission: Annotated[UnitShare | None, about("of dirt: of energy, out and back")] = None
-    azimuth_deg: Annotated[Sector | None, about("of dirt: counter-clockwise from and to")] = None
+    azimuth_deg: Annotated[Two[AngleDeg] | None, about("of dirt: counter-clockwise")] = None
     elevation_deg: Annotated[Ends[AngleDeg] | None, about("of dirt: lowest and highest")] = None
     channels: Annotated[Channels | None, about("dead ones; 0 is the lowest")] = None
     share: Annotated[UnitShare | None, about("of packets that are lost")] = None

@@ -31,8 +31,8 @@ ALARMS_MOST = 20  # false alarms of a pulse on average: a ray has numbers for 25
 
 Metres = Annotated[float, Field(ge=0, le=1000)]
 Bias = Annotated[float, Field(ge=-1000, le=1000)]
-Seconds = Annotated[float, Field(gt=0, le=1e7)]
-Deviation = Annotated[float, Field(ge=0, le=10)]  # degrees
+DecayTime = Annotated[float, Field(gt=0, le=1e7)]
+AngleSigma = Annotated[float, Field(ge=0, le=10)]  # degrees
 
 _GAMMA = 0x9E3779B97F4A7C15
 _NUMBERS = 256  # of one ray
@@ -96,7 +96,7 @@ class Noise:
         float, about("standard deviation added for each metre of range", 0.0002, ge=0, le=1)
     ] = 0.0
     angle_deg: Annotated[
-        Deviation, about("standard deviation of beam directions, in both axes", 0.05)
+        AngleSigma, about("standard deviation of beam directions, in both axes", 0.05)
     ] = 0.0
     dropout: Annotated[
         UnitShare, about("share of returns that are lost, whatever their energy")
@@ -167,8 +167,8 @@ class Noise:
         about("constant errors of channels' ranges, metres: standard deviation, or one for each"),
     ] = 0.0
     warm_up_m: Annotated[Bias, about("error of ranges at the start, which decays, metres")] = 0.0
-    warm_up_s: Annotated[Seconds, about("time in which it falls to 37 %, seconds")] = 600.0
-    ripple_deg: Annotated[Deviation, about("greatest error of azimuths, as the head turns")] = 0.0
+    warm_up_s: Annotated[DecayTime, about("time in which it falls to 37 %, seconds")] = 600.0
+    ripple_deg: Annotated[AngleSigma, about("greatest error of azimuths, as the head turns")] = 0.0
     ripple_cycles: Annotated[int, about("how often it repeats in a turn", ge=1, le=100_000)] = 1
     ripple_phase_deg: Annotated[AngleDeg, about("its phase where the head is at azimuth 0")] = 0.0
 
@@ -226,11 +226,11 @@ class Noise:
 
     def offsets(self, channel: Integers, times_ns: Ints) -> Floats:
         """Return errors of range that last: of channels (n,) at times since the start, metres."""
-        biases: ArrayLike = self.channel_bias_m
-        if isinstance(biases, (int, float)):
+        biases = np.asarray(self.channel_bias_m, np.float64)
+        if not biases.ndim:
             each = np.arange(channel.max(initial=0) + 1)
             biases = biases * normal(self.seed, Purpose.CHANNEL, 0, each)
-        out = np.asarray(biases, np.float64)[channel]
+        out = biases[channel]
         if self.warm_up_m:
             out = out + self.warm_up_m * exp(times_ns * (-1e-9 / self.warm_up_s))
         return out

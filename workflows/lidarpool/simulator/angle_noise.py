@@ -32,7 +32,8 @@ class AngleNoiseStep(PulseStep):
     def apply(self, returns: PulseReturns, batch: PulseBatch) -> PulseReturns:
         """See `PulseStep.apply`."""
         rays, noise = np.arange(batch.start, batch.stop), self.setup.noise
-        across, up = noise.angles(*batch.keys.of(rays))
+        keys, none = batch.keys.of(rays), np.zeros((2, len(rays)))
+        across, up = noise.angles(*keys) if noise.angle_deg else none
         if noise.ripple_deg:
             firing, channel = np.divmod(rays, self.setup.sensor.channels)
             azimuth = self.setup.sensor.head.azimuths(batch.firings.numbers)

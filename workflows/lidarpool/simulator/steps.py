@@ -7,7 +7,7 @@ from .angle_noise import AngleNoiseStep
 from .crosstalk import CrosstalkStep
 from .detection import DetectionStep
 from .false_alarms import FalseAlarmStep
-from .faults import DirtStep, LossStep
+from .losses import DirtStep, LossStep
 from .paths import CastStep
 from .range_noise import RangeNoiseStep
 from .recording import RecordingStep

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from ..base.elementary import arcsin, arctan2
+from ..base.elementary import sin_cos
+from ..base.vectors import hypot
 from ..sensor.noise import Purpose, uniform
 from .returns import PulseReturns, made
 from .step import PulseBatch, PulseStep, Setup
@@ -28,19 +29,20 @@ class DirtStep(PulseStep):
         times, share = batch.firings.times(beams), np.ones(len(beams))
         rows = slice(batch.start // sensor.channels, batch.stop // sensor.channels)
         x, y, z = sensor.directions(batch.firings.numbers[rows]).reshape(-1, 3).T
-        azimuth, elevation = np.degrees(arctan2(y, x)), np.degrees(arcsin(np.clip(z, -1, 1)))
         for one in self.setup.faults("dirt").values():
             begin, end = one.azimuth_deg or (0, 360)
-            low, high = one.elevation_deg or (-90, 90)
-            there = (azimuth - begin) % 360 <= ((end - begin) % 360 or 360)
-            there &= (elevation >= low) & (elevation <= high) & one.during(times)
+            half = ((end - begin) % 360 or 360) / 2
+            ends = begin + half, half, *(one.elevation_deg or (-90, 90))
+            sin, cos = sin_cos(np.radians(ends))
+            # Without angles of beams, which take long; a whole circle's sines are not exact.
+            there = x * cos[0] + y * sin[0] >= cos[1] * hypot(x, y) - 1e-12
+            there &= (z >= sin[2] - 1e-12) & (z <= sin[3] + 1e-12) & one.during(times)
             share[there] *= made(one.transmission)
-        hits, air = (
+        batch.hits, batch.air = (
             one and one._replace(energy=made(one.energy) * share[one.ray // batch.each])
             for one in (returns, batch.air)
         )
-        batch.hits, batch.air = hits, air
-        return made(hits)
+        return made(batch.hits)
 
 
 class LossStep(PulseStep):
