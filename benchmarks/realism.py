@@ -1,9 +1,10 @@
 """What is real, beside what is bare: `python -m benchmarks.realism [--rounds N] [--json]`.
 
 One sweep of an OS1-64 in a city of 100,000 triangles, one thread: bare, with cars that move (boxes,
-and meshes of 1,000 triangles), from a sensor that moves too, with sub-rays, with noise, with lost
-returns, with saturation, in rain, fog and snow; cars, sub-rays, noise and rain together (`real`),
-and all of it. Each figure is the median of the rounds, and a multiple of the bare sweep's.
+and meshes of 1,000 triangles), from a sensor that moves too, with sub-rays, with noise, with errors
+that last, with lost returns, with saturation, in rain, fog and snow; cars, sub-rays, noise and rain
+together (`real`), and all of it; and as turns of a survey, with all kinds of faults and without.
+Each figure is the median of the rounds, and a multiple of the bare sweep's.
 """
 
 from __future__ import annotations
@@ -15,10 +16,12 @@ from typing import Any
 
 import numpy as np
 
-from lidarpool import Actor, Noise, Returns, Scanner, Scene, Track, load_sensor
+from lidarpool import Actor, Fault, Noise, Returns, Scanner, Scene, Survey, Track, load_sensor
 from lidarpool.scene.actors import box
 from lidarpool.scene.generated.city import city
 from lidarpool.scene.scene_mesh import SceneMesh
+from lidarpool.simulator.batch import columns_of
+from lidarpool.simulator.rig import Rig
 from raybeam import available_backends
 
 from .raycast import environment
@@ -27,6 +30,14 @@ PLACE = (0.0, 0.0, 1.9)
 SPEED_M_S, TURN_S, FIELD_M = 20.0, 0.1, (5.0, 60.0)
 COLUMNS = ("time", "range", "intensity", "class", "sensor")
 COUNTS = (10, 100, 300)
+SURVEY: dict[str, Any] = {"poses": [PLACE], "steps": 5 * 36, "columns": COLUMNS}
+FAULTS = (
+    Fault("dirt", azimuth_deg=(-20, 20), transmission=0.3),
+    Fault("dead_channels", channels=[3, 17]),
+    Fault("dropped_packets", share=0.05, packet=16),
+    Fault("frozen", 0.35),
+    Fault("time_jump", 0.2, by_s=0.05),
+)
 
 
 def fine_box(triangles: int) -> SceneMesh:
@@ -89,6 +100,10 @@ def cases(scene: Scene, backend: str, counts: tuple[int, ...], sensor: str) -> d
         beam = Returns(subrays=subrays, divergence_mrad=3, mode=mode)
         rows[f"{subrays} sub-rays"] = case([], returns=beam)
     rows["noise"] = case([], noise=Noise(range_m=0.02))
+    lasting = Noise(channel_bias_m=0.01, warm_up_m=0.02, ripple_deg=0.02)
+    rows["errors that last"] = case([], noise=lasting)
+    for name, faults in (("whole survey", ()), ("faults", FAULTS)):
+        rows[name] = turns(scene, Survey(lidar, faults=faults, **SURVEY), backend)
     noise = Noise(detection_range_m=90)  # without which no weather returns light
     rows["detection"] = case([], noise=noise)
     rows["saturation"] = case([], noise=Noise(detection_range_m=90, saturation=100))
@@ -104,6 +119,17 @@ def cases(scene: Scene, backend: str, counts: tuple[int, ...], sensor: str) -> d
         **together,
     )
     return rows
+
+
+def turns(scene: Scene, survey: Survey, backend: str) -> Any:
+    """Make a function that casts a turn of a survey, of five, and makes its columns."""
+    rig, scans = Rig(scene, survey, backend, threads=1), survey.scan_count // 5
+
+    def turn(number: int) -> int:
+        part = columns_of([*rig.cast(number * scans, (number + 1) * scans)])
+        return int(part.counts.sum())
+
+    return turn
 
 
 def measure(rows: dict[str, Any], rounds: int) -> dict[str, dict[str, float]]:

@@ -12,6 +12,7 @@ from ..base.arrays import AnyArray, Floats, Floats32, Ints32
 from ..export.boxes import Boxes, SweepBoxes
 from ..export.reading import PointColumns
 from ..export.sweeps import Sweeps
+from ..sensor import Fault
 from .job_table import JobRow, Value
 
 
@@ -35,6 +36,7 @@ class Sweep:
     pose: Floats  # (4, 4): from the sensor's axes to the world's
     boxes: SweepBoxes
     object_names: tuple[str, ...]  # what the column `object` counts
+    faults: tuple[Fault, ...] = ()  # that the sensor has at some time of the sweep
 
     @classmethod
     def of(
@@ -46,6 +48,7 @@ class Sweep:
             sweeps.sensors[sweeps.sensor[number]], int(sweeps.numbers[number]),
             round(sweeps.begins_ns[number]), *points, sweeps.pose.matrix(number),
             SweepBoxes.of(sweeps, number, boxes), (*sweeps.objects, *sweeps.actors),
+            sweeps.faults_in(number),
         )  # fmt: skip
 
     def __len__(self) -> int:

@@ -142,6 +142,7 @@ def _messages(cloud: CloudLike, sweeps: Sweeps, layout: str, types: Any) -> Iter
         yield "/label_info", info(make.header("", start_ns), told, 0.0), start_ns
     for sweep, points in enumerate(sweeps.points(cloud)):
         time_ns = start_ns + round(sweeps.begins_ns[sweep])
+        stamp_ns = start_ns + sweeps.stamp_ns(sweep)
         while waiting is not None and waiting[2] <= time_ns:
             yield waiting
             waiting = next(measured, None)
@@ -158,7 +159,7 @@ def _messages(cloud: CloudLike, sweeps: Sweeps, layout: str, types: Any) -> Iter
         yield "/clock", types["rosgraph_msgs/msg/Clock"](make.stamp(time_ns)), time_ns
         yield "/tf", make.transforms(in_world, time_ns), time_ns
         message = types["sensor_msgs/msg/PointCloud2"](
-            make.header(frame, time_ns), 1, len(rows), fields, False, row.itemsize,
+            make.header(frame, stamp_ns), 1, len(rows), fields, False, row.itemsize,
             rows.nbytes, rows.view(np.uint8).ravel(), True,
         )  # fmt: skip
         yield topic, message, time_ns
@@ -167,7 +168,7 @@ def _messages(cloud: CloudLike, sweeps: Sweeps, layout: str, types: Any) -> Iter
             ranges[np.isnan(ranges)] = np.inf  # REP 117: nothing was detected
             for plane, image in enumerate(ranges, 1):
                 name = f"{topic.removesuffix('points')}range_image{plane if plane > 1 else ''}"
-                yield name, make.image(image[::-1], frame, time_ns), time_ns
+                yield name, make.image(image[::-1], frame, stamp_ns), time_ns
         if actors:
             boxes = Boxes.of(sweeps, sweep, points)
             yield "/actors", make.markers(boxes, actors, time_ns), time_ns
@@ -299,7 +300,8 @@ def _rows(
     layout: str, row: np.dtype[np.void], points: Cloud, sweeps: Sweeps, sweep: int
 ) -> Records:
     """Points of a sweep in a layout, of the type of `_row`."""
-    there, since = points.columns, points["time"] - sweeps.begins_ns[sweep]
+    begin_ns = sweeps.begins_ns[sweep] + (sweeps.stamp_ns(sweep) - round(sweeps.begins_ns[sweep]))
+    there, since = points.columns, points["time"] - begin_ns
     values = dict(zip("xyz", sweeps.in_sensor(sweep, points.positions).T, strict=True))
     if layout in ("velodyne", "images"):
         values |= {"intensity": there["intensity"], "ring": there["channel"], "time": since / 1e9}
@@ -311,12 +313,12 @@ def _rows(
             "azimuth": np.radians(there["azimuth"]),
             "elevation": np.radians(there["elevation"]),
             "distance": there["range"],
-            "time_stamp": np.clip(since, 0, None),
+            "time_stamp": np.clip(since, 0, 2**32 - 1),
         }
     else:
         values |= {
             "intensity": there["signal"],
-            "t": np.clip(since, 0, None),
+            "t": np.clip(since, 0, 2**32 - 1),
             "reflectivity": there["reflectivity"],
             "ring": there["channel"],
             "range": np.round(there["range"] * 1000),

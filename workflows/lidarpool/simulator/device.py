@@ -55,6 +55,7 @@ def _able(survey: Survey) -> set[str]:
         for m in survey.materials
     )
     able = {column.name for column in _MADE} - {*(_ENERGIES if hazy or shining else ())}
+    able -= {"time"} if any(fault.by_s for fault in survey.faults) else set()
     return able - {axis.name for axis in AXES if survey.coordinates == "sensor"}
 
 

@@ -7,6 +7,7 @@ from .angle_noise import AngleNoiseStep
 from .crosstalk import CrosstalkStep
 from .detection import DetectionStep
 from .false_alarms import FalseAlarmStep
+from .losses import DirtStep, LossStep
 from .paths import CastStep
 from .range_noise import RangeNoiseStep
 from .recording import RecordingStep
@@ -22,6 +23,7 @@ STEPS: tuple[type[PulseStep], ...] = (
     AngleNoiseStep,
     CastStep,  # with mirrors, glass, water and leaves
     WeatherStep,  # rain, snow, fog and dust
+    DirtStep,  # on the window
     SeparationStep,  # hits to returns; or
     WaveformStep,
     DetectionStep,
@@ -29,6 +31,7 @@ STEPS: tuple[type[PulseStep], ...] = (
     FalseAlarmStep,
     CrosstalkStep,
     SaturationStep,
+    LossStep,  # dead channels and lost packets
     SelectionStep,
     RecordingStep,
     RangeNoiseStep,
