@@ -33,7 +33,7 @@ COUNTS = (10, 100, 300)
 SURVEY: dict[str, Any] = {"poses": [PLACE], "steps": 5 * 36, "columns": COLUMNS}
 FAULTS = (
     Fault("dirt", azimuth_deg=(-20, 20), transmission=0.3),
-    Fault("dead_channels", channels=[3, 17]),
+    Fault("dead_channels", channels=[3]),
     Fault("dropped_packets", share=0.05, packet=16),
     Fault("frozen", 0.35),
     Fault("time_jump", 0.2, by_s=0.05),

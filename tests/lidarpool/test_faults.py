@@ -246,6 +246,8 @@ def test_labels_list_the_faults_of_each_sweep(tmp_path):
     again = Sweeps.load(tmp_path / "sweeps.npz")
     kinds = [[one.kind for one in again.faults_in(k)] for k in range(3)]
     assert kinds == [["dead_channels"], ["dead_channels"], ["time_jump"]]
+    frozen = Sweeps.of(replace(STANDING, faults=[FAULTS["frozen"]]), ROOM)
+    assert [len(frozen.faults_in(k)) for k in range(3)] == [0, 0, 1]  # those that repeat another
     job = JobRow(0, "0", "", {}, {})
     assert Sweep.of(job, again, 2, (None, {}), None).faults[0].by_s == -0.5
     pieces = Pieces(cloud, sweeps)

@@ -191,10 +191,11 @@ class Sweeps:
         )
 
     def faults_in(self, sweep: int) -> tuple[Fault, ...]:
-        """Return the faults that its sensor has at some time of a sweep."""
-        sensors, span = (None, self.sensors[self.sensor[sweep]]), (self.begins_ns, self.ends_ns)
+        """Return the faults that are in a sweep: at some time of it, or if frozen, as it begins."""
+        sensors = None, self.sensors[self.sensor[sweep]]
+        begin, end = self.begins_ns[sweep], self.ends_ns[sweep]
         own = (one for one in self.faults if one.sensor in sensors)
-        return tuple(one for one in own if one.during(*(times[sweep] for times in span)))
+        return tuple(one for one in own if one.during(begin, None if one.kind == "frozen" else end))
 
     def stamp_ns(self, sweep: int) -> int:
         """Return when the sensor says that a sweep began, nanoseconds since the survey's start."""
