@@ -27,6 +27,7 @@ from lidarpool.sensor.noise import Purpose, named_seed, raw, starts
 from lidarpool.sensor.weather import Weather, rain, snow
 from lidarpool.simulator import pulse_loops
 from lidarpool.simulator.rig import Rig
+from raybeam.compiled import compiled
 
 SENSOR = Sensor.grid(60, 8, step_deg=90, min_range_m=0.5, max_range_m=60)
 NOISE = Noise(
@@ -67,7 +68,7 @@ def everything():
 
 def test_no_random_number_is_used_twice(monkeypatch):
     """With three kinds of particles: keys that differ have hashes that differ."""
-    drawn, purposes, compiled_bits = {}, {}, pulse_loops._bits
+    drawn, purposes, compiled_bits = {}, {}, compiled()(pulse_loops._bits.py_func)
 
     def recorded(seed, purpose, *key):
         bits = raw(seed, purpose, *key)
