@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from raybeam import Pattern
 
-from ..base.arrays import Floats, Integers, Ints, Ints32, UInts32
+from ..base.arrays import Floats, Integers, Ints, Ints32
 from ..base.vectors import into_axes, products
 from ..columns.table import COLOURS
 from ..sensor.noise import Purpose, raw
@@ -82,16 +82,6 @@ class CastStep(PulseStep):
         batch.hits, batch.planes = self.hits(*given)
         return batch.hits
 
-    def energy(
-        self,
-        triangle: Ints32,
-        cosine: Floats,
-        distance: Floats,
-        colour: UInts32 | None,
-    ) -> Floats:
-        """Return the received energy of hits (n,), see `Surfaces.energy`."""
-        return self.surfaces.energy(triangle, cosine, distance, self._light, colour)
-
     def hits(
         self,
         beams: Pattern,
@@ -156,7 +146,8 @@ class CastStep(PulseStep):
             if len(leaves):
                 normals[leaves] = light.directions[leaves]  # no leaf continues another
                 own = None if colour is None else colour[leaves]
-                energy[leaves] = self.energy(triangle[leaves], met.cosines, distance[leaves], own)
+                given = triangle[leaves], met.cosines, distance[leaves]
+                energy[leaves] = surfaces.energy(*given, self._light, own)
             energy *= light.share
             if within is not None:
                 within.go(step)
