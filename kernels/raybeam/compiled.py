@@ -147,7 +147,10 @@ def stage(function: Any) -> Any:
 
 
 def _inner(function: Any, **options: Any) -> Any:
-    """Compile a function that only compiled ones call, once for 0 and other whole numbers."""
+    """Compile a function that only compiled ones may call: from Python, call its `py_func`.
+
+    Wrappers for Python would take long to compile, and so would a version for each literal number.
+    """
     if njit is None:
         return function
     wrappers = {"no_cfunc_wrapper": True, "no_cpython_wrapper": True}
