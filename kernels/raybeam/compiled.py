@@ -19,7 +19,7 @@ try:
     from numba import njit
     from numba.core.ccallback import CFunc
     from numba.core.compiler_lock import global_compiler_lock
-    from numba.core.types import unliteral
+    from numba.core.types.misc import unliteral
     from numba.types import ExternalFunction
 except ImportError:
     njit = None

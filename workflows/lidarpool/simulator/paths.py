@@ -146,8 +146,9 @@ class CastStep(PulseStep):
             if len(leaves):
                 normals[leaves] = light.directions[leaves]  # no leaf continues another
                 own = None if colour is None else colour[leaves]
-                given = triangle[leaves], met.cosines, distance[leaves]
-                energy[leaves] = surfaces.energy(*given, self._light, own)
+                energy[leaves] = surfaces.energy(
+                    triangle[leaves], met.cosines, distance[leaves], self._light, own
+                )
             energy *= light.share
             if within is not None:
                 within.go(step)

@@ -1,4 +1,4 @@
-"""Loops over rays beside retro-reflectors, whose light they receive: see stray_light.py."""
+"""Loops over rays that receive other light: see stray_light.py and crosstalk.py."""
 
 # mypy: disable-error-code="no-untyped-def"
 
@@ -13,6 +13,7 @@ from raybeam.embree_rays import any_axes
 
 from ..base.elementary_loops import arctan2, exp, sin_cos
 from ..sensor.materials import NEAREST_M, REFERENCE_M
+from ..sensor.optics import LIGHT_M_NS
 
 CELL_RAYS = 1 << 8  # consecutive rays that are compared with retro-reflectors at a time
 STRAY_MOST = math.radians(30.0)  # no stray light comes from farther aside
@@ -148,3 +149,27 @@ def leaks(starts, ahead, cells, corners, middles, middle, radius, back, few, nea
                 if energy > best[k]:
                     best[k], new[k] = energy, True
                     ends[k, 0], ends[k, 1], ends[k, 2] = x, y, z
+
+
+@compiled()
+def received(spots, low, high, order, fired, starts, ahead, times, places, cosine, nearest_m,
+             farthest_m, row, spot, distance, far):  # fmt: skip
+    """Write rays that receive the light of spots, from where it seems to come; returns how many.
+
+    Rays `order[low]` to `order[high]` may see each of `spots` (k,). Starts, directions and places
+    are (n, 3); times are nanoseconds, of firing and of when the spots are lit.
+    """
+    count = 0
+    for pair in range(len(spots)):
+        s = spots[pair]
+        for k in range(low[pair], high[pair]):
+            r = order[k]
+            x, y = places[s, 0] - starts[r, 0], places[s, 1] - starts[r, 1]
+            z = places[s, 2] - starts[r, 2]
+            away = math.sqrt((x * x + y * y) + z * z)
+            along = (x * ahead[r, 0] + y * ahead[r, 1]) + z * ahead[r, 2]
+            seems = (times[s] + away / LIGHT_M_NS - fired[r]) * (LIGHT_M_NS / 2)
+            if away > 0 and along >= cosine * away and nearest_m <= seems <= farthest_m:
+                row[count], spot[count], distance[count], far[count] = r, s, seems, away
+                count += 1
+    return count

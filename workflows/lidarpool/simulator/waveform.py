@@ -96,11 +96,11 @@ def returns_in(
     """
     from . import wave_loops  # not before: numba takes half a second to import
 
-    given = owned(hits.ray, np.int64), owned(hits.distance), owned(made(hits.energy))
+    columns = owned(hits.ray, np.int64), owned(hits.distance), owned(made(hits.energy))
     row = np.empty((len(hits.ray), 2), np.int64)
-    count, many = wave_loops.ordered(each, *given, row)
+    count, many = wave_loops.ordered(each, *columns, row)
     order = (row := row[:count])[:, 0]
-    sub, far, light = (column[order] for column in given)
+    sub, far, light = (column[order] for column in columns)
     speed = np.zeros(0) if hits.velocity is None else hits.velocity[order]
     beam, hard = sub // each, hits.triangle[order] != NO_SURFACE
     new, still, some = np.empty((3, count), np.bool_)
@@ -114,10 +114,12 @@ def returns_in(
     if len(parts):
         longest = float((far[parts[:, 1] - 1] - far[parts[:, 0]]).max()) * digitizer.per_m
         room = wave_loops.room_for(int(longest) + 2 * digitizer.reach + 8)
-        given = far * digitizer.per_m, light / each, parts, (digitizer.sigma, digitizer.decomposes)
-        wave_loops.search(*given, new, echo, found, room)
-    given = beam, digitizer.sigma_m, digitizer.per_m, mine, surfaces, new
-    count = wave_loops.returns(*given, light, owned(speed), echo, found, whole, real)
+        digits, when = (digitizer.sigma, digitizer.decomposes), far * digitizer.per_m
+        wave_loops.search(when, light / each, parts, digits, new, echo, found, room)
+    sizes = digitizer.sigma_m, digitizer.per_m
+    count = wave_loops.returns(
+        beam, *sizes, mine, surfaces, new, light, owned(speed), echo, found, whole, real
+    )
     beam, row = whole[:, :count].copy()
     distance, energy, velocity, width = real[:, :count].copy()
     return hits.take(row)._replace(
