@@ -19,6 +19,7 @@ try:
     from numba import njit
     from numba.core.ccallback import CFunc
     from numba.core.compiler_lock import global_compiler_lock
+    from numba.core.types.misc import unliteral
     from numba.types import ExternalFunction
 except ImportError:
     njit = None
@@ -104,7 +105,9 @@ def compiled(*signature: Any) -> Callable[[Any], Any]:
         return lambda function: function
 
     def make(function: Any) -> Any:
-        made = _kept(njit(nogil=True, error_model="numpy")(function), function)
+        made = _kept(
+            njit(nogil=True, error_model="numpy", no_cfunc_wrapper=True)(function), function
+        )
         for one in signature:
             made.compile(one)
         return made
@@ -132,9 +135,7 @@ def external(name: str, made: Any) -> Any:
 
 def inlined(function: Any) -> Any:
     """Let a function become part of compiled ones."""
-    if njit is None:
-        return function
-    return njit(forceinline=True, error_model="numpy", no_cfunc_wrapper=True)(function)
+    return _inner(function, forceinline=True)
 
 
 def stage(function: Any) -> Any:
@@ -142,4 +143,18 @@ def stage(function: Any) -> Any:
 
     As a part of a longer function they do not.
     """
-    return function if njit is None else njit(error_model="numpy", no_cfunc_wrapper=True)(function)
+    return _inner(function)
+
+
+def _inner(function: Any, **options: Any) -> Any:
+    """Compile a function that only compiled ones may call: from Python, call its `py_func`.
+
+    Wrappers for Python would take long to compile, and so would a version for each literal number.
+    """
+    if njit is None:
+        return function
+    wrappers = {"no_cfunc_wrapper": True, "no_cpython_wrapper": True}
+    made = njit(error_model="numpy", **wrappers, **options)(function)
+    found = made.get_call_template
+    made.get_call_template = lambda args, more: found(tuple(map(unliteral, args)), more)
+    return made

@@ -463,14 +463,11 @@ def begun(o, d, entry):  # type: ignore[no-untyped-def]
 
 
 @stage
-def single(scene, scratch, lane, reach, aside=0.0, up=0.0):  # type: ignore[no-untyped-def]
-    """Cast one ray of a group by itself; or what Embree sees of one along an axis, moved."""
+def single(scene, scratch, lane, reach, aside, up):  # type: ignore[no-untyped-def]
+    """Cast one ray of a group by itself; Embree sees one along an axis moved, aside and up."""
     numbers, floats = int64s(scratch), float64s(scratch)
-    ray, whole, entry = (
-        float32s(scratch + _SINGLE_AT),
-        int32s(scratch + _SINGLE_AT),
-        floats[_ENTRY + lane],
-    )
+    ray, whole = float32s(scratch + _SINGLE_AT), int32s(scratch + _SINGLE_AT)
+    entry = floats[_ENTRY + lane]
     ox, oy, oz, dx, dy, dz = given(floats, lane)
     ray[0], ray[1], ray[2] = begun(ox, dx, entry), begun(oy, dy, entry), begun(oz, dz, entry)
     ray[3] = np.float32(max(floats[_T_MIN] - entry - MARGIN, 0.0))
@@ -496,13 +493,12 @@ def decided(scene, scratch, lane, reach):  # type: ignore[no-untyped-def]
     flags = int32s(scratch + _ARGUMENTS_AT)
     floats[_T + lane], numbers[_KEY + lane] = np.inf, -1
     flags[0] = CALL_FILTER
-    single(scene, scratch, lane, reach)
-    if along(floats, lane):
-        for k in range(8):
-            one = MARGIN if k & 1 else -MARGIN
-            other = 0.4 * (MARGIN if k & 2 else -MARGIN)
-            aside, up = (one, other) if k & 4 else (other, one)
-            single(scene, scratch, lane, reach, aside, up)
+    aside, up = 0.0, 0.0
+    for k in range(9 if along(floats, lane) else 1):
+        single(scene, scratch, lane, reach, aside, up)
+        one = MARGIN if k & 1 else -MARGIN
+        other = 0.4 * (MARGIN if k & 2 else -MARGIN)
+        aside, up = (one, other) if k & 4 else (other, one)
     flags[0] = CALL_FILTER | COHERENT
 
 

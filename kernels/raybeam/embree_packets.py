@@ -160,7 +160,7 @@ def _one_by_one(scene, scratch, proposer, t_max):  # type: ignore[no-untyped-def
     flags[0], numbers[_FILTER] = exact.CALL_FILTER, proposer
     for lane in range(LANES):
         if numbers[_REAL + lane]:
-            exact.single(scene, scratch, lane, t_max)
+            exact.single(scene, scratch, lane, t_max, 0.0, 0.0)
     flags[0] = exact.CALL_FILTER | exact.COHERENT
 
 

@@ -131,7 +131,7 @@ class _Chunk:
         order = np.argsort((way**2).sum(axis=1), kind="stable")
         reach = float(self._nearest.distance.max())
         cell, which = loops.meet(wide, cells, number, looks[order], sizes[order], reach)
-        body, spans = bodies[order][which], cells[:, [loops.BEGIN, loops.END]]
+        body, spans = bodies[order][which], cells[:, loops.BEGIN : loops.END + 1]
         for start in range(0, len(cell), _PAIRS):
             some = slice(start, start + _PAIRS)
             self._cast_at(cell[some], spans[cell[some]].T, body[some])
@@ -179,7 +179,7 @@ class _Chunk:
         first, last = cells[:, loops.BEGIN].min(), cells[:, loops.END].max()
         steps = max(1, len(cells) // _LOOKS)
         step = (last - first) / steps
-        spans = (cells[:, [loops.BEGIN, loops.END]] - first) / (step or 1)
+        spans = (cells[:, loops.BEGIN : loops.END + 1] - first) / (step or 1)
         number = spans.astype(np.int64).clip(0, steps)
         at = np.clip(np.linspace(first, last, steps + 1), *moving.there[bodies].T[:, :, None])
         many = np.repeat(bodies, steps + 1)

@@ -19,7 +19,6 @@ _TINY = 1e-300
 @compiled("f8[:, ::1](f8[:, ::1], f8[::1], i8)")
 def cells_of(rays, times, size):  # type: ignore[no-untyped-def]
     """Cells of so many rays (6, n) at times (n,): (c, 15)."""
-    origins, directions = rays[:3], rays[3:]
     count = -(-len(times) // size)
     out = np.empty((count, 15))
     for c in range(count):
@@ -27,25 +26,25 @@ def cells_of(rays, times, size):  # type: ignore[no-untyped-def]
         ax = ay = az = px = py = pz = 0.0
         first = last = times[begin]
         for k in range(begin, end):
-            ax, ay, az = ax + directions[0, k], ay + directions[1, k], az + directions[2, k]
-            px, py, pz = px + origins[0, k], py + origins[1, k], pz + origins[2, k]
+            ax, ay, az = ax + rays[3, k], ay + rays[4, k], az + rays[5, k]
+            px, py, pz = px + rays[0, k], py + rays[1, k], pz + rays[2, k]
             first, last = min(first, times[k]), max(last, times[k])
         length = max(np.sqrt(ax * ax + ay * ay + az * az), _TINY)
         ax, ay, az = ax / length, ay / length, az / length
         n = end - begin
         px, py, pz = px / n, py / n, pz / n
-        x, y, z = directions[0, begin], directions[1, begin], directions[2, begin]
-        dx, dy, dz = directions[0, end - 1], directions[1, end - 1], directions[2, end - 1]
+        x, y, z = rays[3, begin], rays[4, begin], rays[5, begin]
+        dx, dy, dz = rays[3, end - 1], rays[4, end - 1], rays[5, end - 1]
         nx, ny, nz = y * dz - z * dy, z * dx - x * dz, x * dy - y * dx
         length = max(np.sqrt(nx * nx + ny * ny + nz * nz), _TINY)
         nx, ny, nz = nx / length, ny / length, nz / length
         cosine, far, off = 1.0, 0.0, 0.0
         for k in range(begin, end):
-            side = nx * directions[0, k] + ny * directions[1, k] + nz * directions[2, k]
+            side = nx * rays[3, k] + ny * rays[4, k] + nz * rays[5, k]
             off = max(off, abs(side))
-            along = ax * directions[0, k] + ay * directions[1, k] + az * directions[2, k]
+            along = ax * rays[3, k] + ay * rays[4, k] + az * rays[5, k]
             cosine = min(cosine, along)
-            x, y, z = origins[0, k] - px, origins[1, k] - py, origins[2, k] - pz
+            x, y, z = rays[0, k] - px, rays[1, k] - py, rays[2, k] - pz
             far = max(far, x * x + y * y + z * z)
         cosine = max(cosine, -1.0)
         out[c, 0], out[c, 1], out[c, 2] = ax, ay, az

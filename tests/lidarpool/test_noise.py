@@ -28,6 +28,7 @@ from lidarpool.sensor.noise import Purpose, named_seed, raw, starts
 from lidarpool.sensor.weather import Weather, rain, snow
 from lidarpool.simulator import pulse_loops
 from lidarpool.simulator.rig import Rig
+from raybeam.compiled import compiled
 
 SENSOR = Sensor.grid(60, 8, step_deg=90, min_range_m=0.5, max_range_m=60)
 NOISE = Noise(
@@ -72,7 +73,7 @@ def everything():
 
 def test_no_random_number_is_used_twice(monkeypatch):
     """With three kinds of particles: keys that differ have hashes that differ."""
-    drawn, purposes, compiled_bits = {}, {}, pulse_loops._bits
+    drawn, purposes, compiled_bits = {}, {}, compiled()(pulse_loops._bits.py_func)
 
     def recorded(seed, purpose, *key):
         bits = raw(seed, purpose, *key)
@@ -93,7 +94,7 @@ def test_no_random_number_is_used_twice(monkeypatch):
         for known, other in ((raw, recorded), (starts, begun)):
             if name.startswith("lidarpool") and getattr(module, known.__name__, None) is known:
                 monkeypatch.setattr(module, known.__name__, other)
-    for name in ("_uniform", "particles", "fog"):  # not compiled, to see what they draw
+    for name in ("_uniform", "_scan_of", "particles", "fog"):  # not compiled, to see what they draw
         monkeypatch.setattr(pulse_loops, name, getattr(pulse_loops, name).py_func)
     monkeypatch.setattr(pulse_loops, "_bits", hashed)
     kinds = rain(20.0), snow(1.0), rain(5.0)

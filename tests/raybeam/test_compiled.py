@@ -59,3 +59,20 @@ def test_processes_that_start_together_compile_once(run, tmp_path):
     ]
     printed = sorted(one.communicate()[0].split() for one in started)
     assert printed == [["3.0", "0"]] * 7 + [["3.0", "1"]]
+
+
+def test_an_inner_function_is_compiled_once_for_all_whole_numbers():
+    """Numba would compile it for 0, and again for what the loop counts."""
+
+    @compiled.stage
+    def more(number):
+        return number + 1
+
+    @compiled.compiled()
+    def count(to):
+        number = 0
+        while number < to:
+            number = more(number)
+        return number
+
+    assert count(3) == 3 and len(more.overloads) == 1

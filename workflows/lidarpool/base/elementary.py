@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from .arrays import Floats
+from .arrays import Floats, owned
 
 _FEW = 1 << 12  # numbers: some 20 ms
 _TWO = np.ldexp(1.0, np.arange(-539, 514))  # powers of 2
@@ -251,5 +251,5 @@ def _each(
     else:
         from . import elementary_loops
 
-        getattr(elementary_loops, name + "_each")(*map(np.ravel, arrays), *out)
+        getattr(elementary_loops, name + "_each")(*map(owned, map(np.ravel, arrays)), *out)
     return tuple(row.reshape(shape)[()] for row in out)

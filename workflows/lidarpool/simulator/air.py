@@ -190,13 +190,7 @@ def _met(
     """Yield sub-rays, distances and energies of particles of a kind."""
     from . import pulse_loops  # not before: numba takes half a second to import
 
-    begun = starts(
-        seed,
-        Purpose.PARTICLES,
-        Purpose.PARTICLE_RANGE,
-        Purpose.PARTICLE_SUBRAY,
-        Purpose.PARTICLE_DIAMETER,
-    )
+    begun = starts(seed, *WeatherStep.purposes[2:])
     beam, room = 0, 2 * beams + len(seen.counts)
     while beam < beams:
         out = np.empty(room, np.int64), *np.empty((2, room))
@@ -211,7 +205,7 @@ def _in_fog(
     """Sub-rays, distances and energies of the peaks of fog."""
     from . import pulse_loops
 
-    begun = starts(seed, Purpose.FOG_CELL, Purpose.FOG_PLACE)
+    begun = starts(seed, *WeatherStep.purposes[:2])
     out = np.empty(beams, np.int64), *np.empty((2, beams))
     table = fog.begins, FARTHEST_M, fog.cell, fog.energy, fog.peaks
     count = pulse_loops.fog(each, *table, begun, *given, reach, *out)

@@ -10,7 +10,7 @@ import numpy as np
 
 from raybeam import Pattern
 
-from ..base.arrays import Floats, Indices, Ints, Ints32
+from ..base.arrays import Floats, Indices, Ints, Ints32, owned
 from ..base.elementary import arccos, exp, sin_cos_of
 from ..base.vectors import into_axes, length, products, turned
 from ..sensor import Sensor, Survey
@@ -97,6 +97,8 @@ class CrosstalkStep(PulseStep):
         -------
         Rows of the rays, distances at which they seem to be, metres, and energies: (k,) each.
         """
+        from . import stray_loops  # not before: numba takes half a second to import
+
         spec, sensor = self._survey.scan(scan), self._sensor
         firing, channel = np.divmod(rays, sensor.channels)
         firing = firing + spec.firings[0]
@@ -109,19 +111,18 @@ class CrosstalkStep(PulseStep):
             reach = (lidar.max_range_m + sensor.max_range_m) / LIGHT_M_NS
             span = fired[order[0]] - reach, fired[order[-1]] + gate[1]
             spots = self._spots(other, spec.station, spec.start_ns, span, poses)
-            row, spot = self._open(fired, order, origins, directions, spots, gate)
+            pairs = self._open(fired, order, origins, directions, spots, gate)
+            most = int(np.maximum(pairs[2] - pairs[1], 0).sum())
+            (row, spot), (distance, far) = np.empty((2, most), np.int64), np.empty((2, most))
+            limits = self._cosine, sensor.min_range_m, sensor.max_range_m
+            given = *map(owned, (fired, origins, directions, spots.time, spots.place)), *limits
+            count = stray_loops.received(*pairs, order, *given, row, spot, distance, far)
+            row, spot, distance, far = row[:count], spot[:count], distance[:count], far[:count]
             towards = spots.place[spot] - origins[row]
-            far = np.sqrt(products(towards.T, towards.T))
-            arrives = spots.time[spot] + far / LIGHT_M_NS
-            distance = (arrives - fired[row]) * (LIGHT_M_NS / 2)
-            seen = products(towards.T, directions[row].T) >= self._cosine * far
-            seen &= (distance >= sensor.min_range_m) & (distance <= sensor.max_range_m)
-            some = np.flatnonzero(seen & (far > 0))
-            when = fired[row[some]] + spec.start_ns
-            given = origins[row[some]], towards[some], far[some], when, poses.ways
-            some = some[self.caster.free(*given)]
-            energy = self._energy(spots, spot[some], towards[some], far[some])
-            found.append((row[some], distance[some], energy))
+            when = fired[row] + spec.start_ns
+            free = self.caster.free(origins[row], towards, far, when, poses.ways)
+            energy = self._energy(spots, spot[free], towards[free], far[free])
+            found.append((row[free], distance[free], energy))
         if not found:
             return np.zeros(0, np.intp), np.zeros(0), np.zeros(0)
         rows, distances, energies = map(np.concatenate, zip(*found, strict=True))
@@ -135,8 +136,8 @@ class CrosstalkStep(PulseStep):
         directions: Floats,
         spots: _Spots,
         gate: Floats,
-    ) -> tuple[Indices, Indices]:
-        """Pairs of a ray and a spot that it may see, whose light arrives while it waits."""
+    ) -> tuple[Indices, Indices, Indices]:
+        """Spots, and from which row of `order` to which rays may see them, while they wait."""
         times = fired[order]
         about = np.minimum(np.searchsorted(times, spots.time), len(times) - 1)
         away = spots.place - origins[order[about]]
@@ -160,9 +161,7 @@ class CrosstalkStep(PulseStep):
         seen = ~(off > opening[cell] + opening_m[spot])
         spot, cell = spot[seen], cell[seen]
         low = np.maximum(first[spot], cell * CELL_RAYS)
-        high = np.minimum(stop[spot], (cell + 1) * CELL_RAYS)
-        pair, place = _expanded(low, high)
-        return order[place], spot[pair]
+        return spot, low, np.minimum(stop[spot], (cell + 1) * CELL_RAYS)
 
     def _spots(
         self, other: int, station: int, start_ns: int, span: tuple[float, float], poses: Poses

@@ -13,6 +13,7 @@ from ..base.arrays import Floats, Integers, Ints, Ints32
 from ..base.vectors import products
 from .motion import Poses
 from .surfaces import Surfaces
+from .ways import Ways
 
 BLOCK_HITS = 1 << 13  # hits that are looked at a time, to fit a cache
 
@@ -57,13 +58,21 @@ def radial_velocities(
     """
     origins, directions = rays
     out = approach(poses, ray, origins, directions)
-    if not poses.ways:
-        return out
-    origins = np.broadcast_to(origins, directions.shape)
-    for begin in range(0, len(ray), BLOCK_HITS):
+    if poses.ways:
+        velocity = velocities_of_ends(surfaces, poses.ways, rays, distance, triangle, times)
+        out += products(velocity.T, directions.T)
+    return out
+
+
+def velocities_of_ends(
+    surfaces: Surfaces, ways: Ways, rays: tuple[Floats, Floats], distance: Floats,
+    triangle: Ints32, times: Floats | Ints,
+) -> Floats:  # fmt: skip
+    """Return the velocities of where rays end, m/s: (n, 3); arguments as of `radial_velocities`."""
+    directions, out = rays[1], np.empty(rays[1].shape)
+    origins = np.broadcast_to(rays[0], out.shape)
+    for begin in range(0, len(out), BLOCK_HITS):
         block = slice(begin, begin + BLOCK_HITS)
-        ahead = directions[block]
-        points = origins[block] + distance[block, None] * ahead
-        velocity = surfaces.velocities(triangle[block], points, times[block], poses.ways)
-        out[block] += products(velocity.T, ahead.T)
+        points = origins[block] + distance[block, None] * directions[block]
+        out[block] = surfaces.velocities(triangle[block], points, times[block], ways)
     return out

@@ -211,11 +211,7 @@ class Media:
         return found
 
     def _search(
-        self,
-        caster: SceneCaster,
-        origins: Floats,
-        times: Floats,
-        ways: Ways,
+        self, caster: SceneCaster, origins: Floats, times: Floats, ways: Ways
     ) -> MediaStack:
         """Look upwards: a medium that light leaves without having entered it is around it."""
         surfaces = self._surfaces

@@ -9,11 +9,11 @@ from numpy.typing import NDArray
 
 from raybeam import Pattern
 
-from ..base.arrays import Floats, Integers, Ints, Ints32, UInts32
+from ..base.arrays import Floats, Integers, Ints, Ints32
 from ..base.vectors import into_axes, products
 from ..columns.table import COLOURS
 from ..sensor.noise import Purpose, raw
-from .doppler import BLOCK_HITS, approach
+from .doppler import approach, velocities_of_ends
 from .media import LightInMedia, Media, Rays, depths
 from .motion import Clock, Poses
 from .returns import Keys, Planes, PulseReturns, joined, selected
@@ -82,16 +82,6 @@ class CastStep(PulseStep):
         batch.hits, batch.planes = self.hits(*given)
         return batch.hits
 
-    def energy(
-        self,
-        triangle: Ints32,
-        cosine: Floats,
-        distance: Floats,
-        colour: UInts32 | None,
-    ) -> Floats:
-        """Return the received energy of hits (n,), see `Surfaces.energy`."""
-        return self.surfaces.energy(triangle, cosine, distance, self._light, colour)
-
     def hits(
         self,
         beams: Pattern,
@@ -156,14 +146,17 @@ class CastStep(PulseStep):
             if len(leaves):
                 normals[leaves] = light.directions[leaves]  # no leaf continues another
                 own = None if colour is None else colour[leaves]
-                energy[leaves] = self.energy(triangle[leaves], met.cosines, distance[leaves], own)
+                energy[leaves] = surfaces.energy(
+                    triangle[leaves], met.cosines, distance[leaves], self._light, own
+                )
             energy *= light.share
             if within is not None:
                 within.go(step)
                 energy *= within.factor(light.directions, distance)
             velocity, moved = None, np.zeros((0, 3))
             if light.range_rate is not None:
-                moved = self._velocities(light, step, triangle, poses)
+                way = light.origins, light.directions
+                moved = velocities_of_ends(surfaces, poses.ways, way, step, triangle, light.times)
                 index = 1.0 if within is None else within.index
                 velocity = light.range_rate + index * products(moved.T, light.directions.T)
             hits = PulseReturns(light.ray, distance, triangle, energy, colour, velocity=velocity)
@@ -256,14 +249,3 @@ class CastStep(PulseStep):
             )
         own = light.ray, light.times, path.origins, path.directions, share, before
         return _Light(*own, turns, within, range_rate), -away
-
-    def _velocities(self, light: _Light, step: Floats, triangle: Ints32, poses: Poses) -> Floats:
-        """Velocities of where light ends after so many metres, m/s: (n, 3)."""
-        out = np.empty_like(light.directions)
-        for begin in range(0, len(triangle), BLOCK_HITS):
-            block = slice(begin, begin + BLOCK_HITS)
-            points = light.origins[block] + step[block, None] * light.directions[block]
-            out[block] = self.surfaces.velocities(
-                triangle[block], points, light.times[block], poses.ways
-            )
-        return out

@@ -250,6 +250,14 @@ def _room(size, each):
     )  # fmt: skip
 
 
+@inlined
+def _kept(whole, real, k, count):
+    """Keep a return as the last of so many; returns how many there are then."""
+    whole[0, count], whole[1, count] = whole[0, k], whole[1, k]
+    real[0, count], real[1, count], real[2, count] = real[0, k], real[1, k], real[2, k]
+    return count + 1
+
+
 @compiled()
 def returns(
     each, gap_m, mode, ray, distance, energy, solid,
@@ -301,59 +309,40 @@ def returns(
             n, least, most = 0, np.inf, -np.inf
             while i < last or j < last_air:  # what is in the air first
                 if j < last_air and (i == last or air_ray[j] <= ray[i]):
-                    sub[n], far[n], light[n], hard[n] = (
-                        air_ray[j],
-                        air_distance[j],
-                        air_energy[j],
-                        False,
-                    )
-                    own[n, 0] = -1 - j
-                    if moves:
-                        speed[n] = air_velocity[j]
+                    own[n, 0], far[n], light[n] = -1 - j, air_distance[j], air_energy[j]
                     j += 1
                 else:
-                    sub[n], far[n], light[n], hard[n] = ray[i], distance[i], energy[i], solid[i]
-                    own[n, 0] = i
-                    if moves:
-                        speed[n] = velocity[i]
+                    own[n, 0], far[n], light[n] = i, distance[i], energy[i]
                     i += 1
                 if light[n] > 0:
                     least, most = min(least, far[n]), max(most, far[n])
                     n += 1
             if n == 0:
                 continue
-            new[0], several = True, False
-            if most - least > gap_m:  # few beams hit an edge or graze a surface
-                for k in range(1, n):
-                    a, b, c, d, e, f = sub[k], far[k], light[k], hard[k], own[k, 0], speed[k]
-                    place = k
-                    while place > 0 and far[place - 1] > b:
-                        sub[place], far[place], light[place] = (
-                            sub[place - 1],
-                            far[place - 1],
-                            light[place - 1],
-                        )
-                        hard[place], own[place, 0] = hard[place - 1], own[place - 1, 0]
-                        speed[place] = speed[place - 1]
-                        place -= 1
-                    sub[place], far[place], light[place], hard[place] = a, b, c, d
-                    own[place, 0], speed[place] = e, f
-                surface, number = -1, 0
-                for k in range(n):
-                    if k:
-                        new[k] = far[k] - far[k - 1] > gap_m
-                        number += int(new[k])
-                    if hard[k]:  # surfaces can only continue if they are in several returns
-                        several |= surface >= 0 and surface != number
-                        surface = number
-                if several and len(pairs):
-                    _joined(
-                        0, n, new, new, sub, far, hard, own, gap_m, each, pairs, normals,
-                        directions, table, changes,
-                    )  # fmt: skip
-            else:
-                for k in range(1, n):
-                    new[k] = False
+            apart, several, surface, number = most - least > gap_m, False, -1, 0
+            for k in range(1, n if apart else 0):  # few beams hit an edge or graze a surface
+                a, b, place = own[k, 0], far[k], k
+                while place > 0 and far[place - 1] > b:
+                    own[place, 0], far[place] = own[place - 1, 0], far[place - 1]
+                    place -= 1
+                own[place, 0], far[place] = a, b
+            for k in range(n):
+                row = own[k, 0]
+                hard[k] = row >= 0 and solid[row]
+                sub[k] = ray[row] if row >= 0 else air_ray[-1 - row]
+                light[k] = energy[row] if row >= 0 else air_energy[-1 - row]
+                if moves:
+                    speed[k] = velocity[row] if row >= 0 else air_velocity[-1 - row]
+                new[k] = k == 0 or (apart and far[k] - far[k - 1] > gap_m)
+                number += int(new[k])
+                if hard[k]:  # surfaces can only continue if they are in several returns
+                    several |= surface >= 0 and surface != number
+                    surface = number
+            if several and len(pairs):
+                _joined(
+                    0, n, new, new, sub, far, hard, own, gap_m, each, pairs, normals, directions,
+                    table, changes,
+                )  # fmt: skip
             k = 0
             while k < n:  # a return
                 best, sum_, mean, drift = k, 0.0, 0.0, 0.0
@@ -384,11 +373,7 @@ def returns(
                     drawn = np.int64(_bits(starts[1], key, at, k - begin) >> _48)
                     seen = above + quantiles[drawn] > 0
                 if seen:
-                    for row in range(2):
-                        whole[row, count] = whole[row, k]
-                    for row in range(3):
-                        real[row, count] = real[row, k]
-                    count += 1
+                    count = _kept(whole, real, k, count)
             stop = count
         if mode != ALL and stop - begin > 1:
             for k in range(begin, stop):
@@ -397,9 +382,5 @@ def returns(
             count = begin
             for k in range(begin, stop):
                 if there[k - begin]:
-                    for row in range(2):
-                        whole[row, count] = whole[row, k]
-                    for row in range(3):
-                        real[row, count] = real[row, k]
-                    count += 1
+                    count = _kept(whole, real, k, count)
     return count

@@ -12,7 +12,6 @@ import numpy as np
 from raybeam import Pattern
 
 from ..base.arrays import Ints, Ints32
-from ..base.vectors import products
 from ..scene.scene import Scene
 from ..sensor import Survey
 from .doppler import radial_velocities
@@ -125,13 +124,9 @@ class PulseCaster:
             ends += origins
             colour = surfaces.colours(triangle, ends, times, poses.ways)
             del ends  # which takes as much memory as the normals
-        normals = surfaces.normals(triangle, times, poses.ways)
-        cosine, light = (
-            np.abs(products(normals.T, directions.T)),
-            light_of(setup.survey, setup.sensor),
-        )
-        energy = surfaces.energy(triangle, cosine, distance, light, colour)
-        return returns._replace(energy=energy, colour=colour, velocity=velocity)
+        light = light_of(setup.survey, setup.sensor)
+        lit = surfaces.lit(triangle, directions, distance, light, times, poses.ways, colour)
+        return returns._replace(energy=lit.energy, colour=colour, velocity=velocity)
 
     def _tally(self, triangle: Ints32) -> Ints:
         surfaces = self._surfaces

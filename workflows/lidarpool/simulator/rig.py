@@ -178,12 +178,7 @@ class Rig:
             yield self.returns(run, self.survey.path)
 
     def returns(
-        self,
-        specs: list[ScanSpec],
-        path: Trajectory,
-        late_ns: float = 0.0,
-        *,
-        tally: bool = True,
+        self, specs: list[ScanSpec], path: Trajectory, late_ns: float = 0.0, *, tally: bool = True
     ) -> BatchPoints | DevicePoints:
         """Cast scans of one station, the firings of each following those of the one before.
 
@@ -226,10 +221,7 @@ class Rig:
         return replace(poses, clock=Clock(begins, fired.sensor.beams.time_ns, self._ways))
 
     def ranges(
-        self,
-        specs: list[ScanSpec],
-        positions: Floats,
-        rotations: Floats | None,
+        self, specs: list[ScanSpec], positions: Floats, rotations: Floats | None
     ) -> Floats32:
         """Cast the same firings from many poses of a carrier that stands.
 

@@ -155,12 +155,7 @@ class SceneCaster:
         return ScanReturns(ray.astype(np.uint32), distance, triangle, counts, counted, none)
 
     def free(
-        self,
-        origins: Floats,
-        towards: Floats,
-        distance: Floats,
-        times: Floats,
-        ways: Ways,
+        self, origins: Floats, towards: Floats, distance: Floats, times: Floats, ways: Ways
     ) -> Bools:
         """Whether nothing stands before points (n, 3), seen from origins, at times (n,)."""
         free = np.ones(len(distance), np.bool_)

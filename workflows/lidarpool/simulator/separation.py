@@ -11,7 +11,7 @@ from ..scene.colours import GREY, packed
 from ..sensor.disc import neighbours
 from ..sensor.noise import THRESHOLD_SIGMAS, Noise, Purpose, quantiles, starts
 from ..sensor.optics import Mode
-from .returns import AIR, NO_SURFACE, OF_RETURNS, SURFACE, Keys, Planes, PulseReturns, made
+from .returns import AIR, NO_SURFACE, OF_RETURNS, SURFACE, Keys, Planes, PulseReturns, made, unreal
 from .selection import MODES
 from .step import PulseBatch, PulseStep, Setup
 
@@ -68,7 +68,10 @@ def separated(
     )  # fmt: skip
     beam, row = whole[:, :count].copy()
     distance, energy, velocity = real[:, :count].copy()
-    found = hits.take(np.maximum(row, 0)) if len(hits.ray) else _unknown(hits, count)
+    if len(hits.ray):
+        found = hits.take(np.maximum(row, 0))
+    else:
+        found = unreal(hits, beam, distance, energy, AIR)
     if len(flies.ray):
         some = np.flatnonzero(row < 0)
         cause = np.full(count, SURFACE, np.uint8) if found.cause is None else found.cause
@@ -82,12 +85,6 @@ def separated(
         energy=energy,
         velocity=None if hits.velocity is None else velocity,
     )
-
-
-def _unknown(hits: PulseReturns, count: int) -> PulseReturns:
-    """Make the columns of hits for some returns, none of which is of a surface."""
-    columns = (None if one is None else np.zeros(count, one.dtype) for one in hits)
-    return PulseReturns._make(columns)
 
 
 def surfaces_of(each: int, planes: Planes | None) -> tuple[AnyArray, ...]:

@@ -18,6 +18,7 @@ from .scene_caster import SceneCaster
 from .step import Memory, PulseBatch, PulseStep, Setup, Sizes
 from .surfaces import Surfaces, light_of
 
+TRIANGLES_NEAR = 4  # of a cluster are asked where a ray is nearest to them
 CLUSTER_M = 1.0  # triangles of retro-reflectors so near to each other are looked for at a time
 FAINTEST = 0.1  # of the threshold: less is never detected, see `Noise.detected`
 
@@ -57,7 +58,10 @@ class StrayLightStep(PulseStep):
         best, ends = np.zeros(len(rays)), np.zeros((len(rays), 3))  # seen from the origins
         noise, sensor, extinction = self.setup.noise, self.setup.sensor, self._light.extinction
         low, high, faintest = sensor.min_range_m, sensor.max_range_m, FAINTEST * noise.threshold
-        limits = low, noise.stray_light, faintest, extinction
+        limits, few = (
+            (low, noise.stray_light, faintest, extinction),
+            np.zeros(TRIANGLES_NEAR, np.int64),
+        )
         for actor, retros in groupby(self._retros, key=lambda retro: retro.actor):
             turns, places = None, np.zeros(3)
             if actor is not None:
@@ -68,8 +72,8 @@ class StrayLightStep(PulseStep):
             stray_loops.cones(*beams, cells)
             new = np.zeros(len(rays), np.bool_)
             for retro in retros:
-                given = retro.corners, retro.middle, retro.radius, self._back(retro.triangles)
-                stray_loops.leaks(*beams, cells, *given, *limits, best, ends, new)
+                given = *retro.places, self._back(retro.triangles), few, *limits
+                stray_loops.leaks(*beams, cells, *given, best, ends, new)
             if turns is not None:  # back to the axes of the scene
                 rows = np.flatnonzero(new)
                 ends[rows] = into_axes(ends[rows], turns[rows].transpose(0, 2, 1))
@@ -110,12 +114,12 @@ class _Retro:
     actor: int | None = None
 
     @cached_property
-    def middle(self) -> Floats:
-        return np.asarray(self.corners.reshape(-1, 3).mean(axis=0))
-
-    @cached_property
-    def radius(self) -> float:
-        return float(length(self.corners.reshape(-1, 3) - self.middle).max())
+    def places(self) -> tuple[Floats, Floats, Floats, float]:
+        """Return corners, middles, and the middle and the radius of a ball around them."""
+        a, b, c = self.corners.transpose(1, 0, 2)
+        middle = self.corners.reshape(-1, 3).mean(axis=0)
+        radius = float(length(self.corners.reshape(-1, 3) - middle).max())
+        return self.corners, ((a + b) + c) / 3, middle, radius
 
 
 def _retros(scene: Scene, surfaces: Surfaces) -> Iterator[_Retro]:

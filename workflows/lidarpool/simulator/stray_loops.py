@@ -1,4 +1,4 @@
-"""Loops over rays beside retro-reflectors, whose light they receive: see stray_light.py."""
+"""Loops over rays that receive other light: see stray_light.py and crosstalk.py."""
 
 # mypy: disable-error-code="no-untyped-def"
 
@@ -13,9 +13,9 @@ from raybeam.embree_rays import any_axes
 
 from ..base.elementary_loops import arctan2, exp, sin_cos
 from ..sensor.materials import NEAREST_M, REFERENCE_M
+from ..sensor.optics import LIGHT_M_NS
 
 CELL_RAYS = 1 << 8  # consecutive rays that are compared with retro-reflectors at a time
-TRIANGLES_NEAR = 4  # of a cluster are asked where a ray is nearest to them
 STRAY_MOST = math.radians(30.0)  # no stray light comes from farther aside
 INWARDS = 0.02  # of the way to the middle of a triangle: rays to its edge end there, to hit it
 
@@ -57,13 +57,13 @@ def cones(starts, ahead, out):
 
 
 @stage
-def _nearest(corners, t, ray, point):
-    """Write where a triangle is nearest to a ray by angle, seen from its start; its tangent.
+def _nearest(corners, t, ray):
+    """Find where a triangle is nearest to a ray by angle, seen from its start, and its tangent.
 
-    -1 if the triangle is not in front of the ray.
+    That is -1 if the triangle is not in front of the ray.
     """
     ox, oy, oz, dx, dy, dz = ray
-    (a, b, c, d, e, f), best = any_axes(dx, dy, dz), np.inf
+    (a, b, c, d, e, f), best, place = any_axes(dx, dy, dz), np.inf, (0.0, 0.0, 0.0)
     left = right = True
     for one in range(3):
         other = one + 1 if one < 2 else 0
@@ -72,7 +72,7 @@ def _nearest(corners, t, ray, point):
         qx, qy, qz = corners[t, other, 0] - ox, corners[t, other, 1] - oy, corners[t, other, 2] - oz
         p, q = (px * dx + py * dy) + pz * dz, (qx * dx + qy * dy) + qz * dz
         if not (p > 0 and q > 0):
-            return -1.0
+            return -1.0, place
         x, y = ((px * a + py * b) + pz * c) / p, ((px * d + py * e) + pz * f) / p
         u, v = ((qx * a + qy * b) + qz * c) / q - x, ((qx * d + qy * e) + qz * f) / q - y
         turn = x * v - y * u
@@ -82,25 +82,21 @@ def _nearest(corners, t, ray, point):
         if off < best:
             # A step on the plane is not the same share of the way between the corners.
             share = along * p / (along * p + (1 - along) * q)
-            point[0], point[1] = px + share * (qx - px), py + share * (qy - py)
-            point[2], best = pz + share * (qz - pz), off
-    return 0.0 if left or right else best
+            place = px + share * (qx - px), py + share * (qy - py), pz + share * (qz - pz)
+            best = off
+    return (0.0 if left or right else best), place
 
 
 @compiled()
-def leaks(starts, ahead, cells, corners, middle, radius, back, nearest_m, share, faintest,
-          extinction, best, ends, new):  # fmt: skip
+def leaks(starts, ahead, cells, corners, middles, middle, radius, back, few, nearest_m, share,
+          faintest, extinction, best, ends, new):  # fmt: skip
     """Keep where rays (3, n) receive more light of near triangles than `best` (n,), and mark them.
 
     `back` (t,) is what triangles at a distance of 10 m return of a beam. The light comes from the
-    point of the triangles that is nearest to a ray by angle, which is written to `ends` (n, 3).
+    point of the triangles that is nearest to a ray by angle, which is written to `ends` (n, 3). Of
+    many triangles, those nearest to a ray are asked, as many as `few` has room for.
     """
     count, triangles = starts.shape[1], len(corners)
-    middles = np.zeros((triangles, 3))
-    for t in range(triangles):
-        for axis in range(3):
-            middles[t, axis] = (corners[t, 0, axis] + corners[t, 1, axis] + corners[t, 2, axis]) / 3
-    point, few = np.zeros(3), np.zeros(TRIANGLES_NEAR, np.int64)
     for c in range(len(cells)):
         begin, end = c * CELL_RAYS, min((c + 1) * CELL_RAYS, count)
         x, y = middle[0] - starts[0, begin], middle[1] - starts[1, begin]
@@ -124,7 +120,7 @@ def leaks(starts, ahead, cells, corners, middle, radius, back, nearest_m, share,
             dx, dy, dz = ahead[0, k], ahead[1, k], ahead[2, k]
             if (x * dx + y * dy) + z * dz < cosine * math.sqrt((x * x + y * y) + z * z):
                 continue
-            chosen = min(triangles, TRIANGLES_NEAR)
+            chosen = min(triangles, len(few))
             for number in range(chosen):
                 few[number] = number
             if triangles > chosen:  # those whose middles are nearest
@@ -141,15 +137,39 @@ def leaks(starts, ahead, cells, corners, middle, radius, back, nearest_m, share,
                             most, few[number] = towards, t
             for number in range(chosen):
                 t = few[number]
-                off = _nearest(corners, t, (ox, oy, oz, dx, dy, dz), point)
+                off, place = _nearest(corners, t, (ox, oy, oz, dx, dy, dz))
                 angle = math.degrees(arctan2(off, 1.0))
                 if not 0 < angle < math.degrees(STRAY_MOST):
                     continue
-                x = point[0] + INWARDS * ((middles[t, 0] - ox) - point[0])
-                y = point[1] + INWARDS * ((middles[t, 1] - oy) - point[1])
-                z = point[2] + INWARDS * ((middles[t, 2] - oz) - point[2])
+                x = place[0] + INWARDS * ((middles[t, 0] - ox) - place[0])
+                y = place[1] + INWARDS * ((middles[t, 1] - oy) - place[1])
+                z = place[2] + INWARDS * ((middles[t, 2] - oz) - place[2])
                 distance = math.sqrt((x * x + y * y) + z * z)
                 energy = min(share / (angle * angle), 1.0) * (back[t] * _lost(distance, extinction))
                 if energy > best[k]:
                     best[k], new[k] = energy, True
                     ends[k, 0], ends[k, 1], ends[k, 2] = x, y, z
+
+
+@compiled()
+def received(spots, low, high, order, fired, starts, ahead, times, places, cosine, nearest_m,
+             farthest_m, row, spot, distance, far):  # fmt: skip
+    """Write rays that receive the light of spots, from where it seems to come; returns how many.
+
+    Rays `order[low]` to `order[high]` may see each of `spots` (k,). Starts, directions and places
+    are (n, 3); times are nanoseconds, of firing and of when the spots are lit.
+    """
+    count = 0
+    for pair in range(len(spots)):
+        s = spots[pair]
+        for k in range(low[pair], high[pair]):
+            r = order[k]
+            x, y = places[s, 0] - starts[r, 0], places[s, 1] - starts[r, 1]
+            z = places[s, 2] - starts[r, 2]
+            away = math.sqrt((x * x + y * y) + z * z)
+            along = (x * ahead[r, 0] + y * ahead[r, 1]) + z * ahead[r, 2]
+            seems = (times[s] + away / LIGHT_M_NS - fired[r]) * (LIGHT_M_NS / 2)
+            if away > 0 and along >= cosine * away and nearest_m <= seems <= farthest_m:
+                row[count], spot[count], distance[count], far[count] = r, s, seems, away
+                count += 1
+    return count

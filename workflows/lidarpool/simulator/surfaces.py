@@ -199,11 +199,7 @@ class Surfaces:
         return rows, self.objects(triangle[rows]) - self._standing
 
     def colours(
-        self,
-        triangle: Integers,
-        points: Floats,
-        times: Floats | Ints,
-        ways: Ways,
+        self, triangle: Integers, points: Floats, times: Floats | Ints, ways: Ways
     ) -> UInts32:
         """Colours of points (n, 3) on triangles (n,), packed; others as for `normals`."""
         if self._lookup is None:
@@ -231,11 +227,7 @@ class Surfaces:
         return self._lookup.at(rows, points)
 
     def velocities(
-        self,
-        triangle: Integers,
-        points: Floats,
-        times: Floats | Ints,
-        ways: Ways,
+        self, triangle: Integers, points: Floats, times: Floats | Ints, ways: Ways
     ) -> Floats:
         """Velocities of points (n, 3) on triangles (n,), m/s: (n, 3); others as for `normals`."""
         out = np.zeros((len(triangle), 3))

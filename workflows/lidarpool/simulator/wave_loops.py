@@ -8,10 +8,10 @@ import math
 
 import numpy as np
 
-from raybeam.compiled import compiled, stage
+from raybeam.compiled import compiled, inlined, stage
 
 from ..base.elementary_loops import exp, log
-from .pulse_loops import _joined, _most
+from .pulse_loops import _joined
 from .waveform import CUT
 
 # All in standard deviations of the system waveform.
@@ -139,14 +139,17 @@ def _step(rest, slopes, samples, count, damping, lower, step):
 
 
 @stage
-def _fitted(x, y, samples, best, count, rest, slopes, new_rest, new_slopes, lower, step):
+def _fitted(x, y, samples, count, memory):
     """Fit a sum of Gaussians by least squares: heights, places and widths (3, count).
 
     The method is that of Levenberg and Marquardt; it ends when a step gains nothing, or after
     `STEPS`. Heights are `HIGHEST` at most, places within `MOVES` of the guess, and widths, standard
-    deviations, at least 1. `best` holds the guess, and receives the fit.
+    deviations, at least 1. The first of `memory` holds the guess, and receives the fit.
     """
-    guess, trial = best.copy(), best.copy()
+    best, guess, trial, lower, slopes, new_slopes, rest, new_rest, step = memory
+    for row in range(3):
+        for k in range(count):
+            guess[row, k] = best[row, k]
     widest, damping = max((x[samples - 1] - x[0]) / (4 * count), 1.5), 1e-3
     cost = _misses(x, y, samples, best, count, rest, slopes)
     for _ in range(STEPS):
@@ -171,13 +174,15 @@ def _fitted(x, y, samples, best, count, rest, slopes, new_rest, new_slopes, lowe
 
 
 @stage
-def _gaussians(w, length, low, top, sigma, until, found):
+def _gaussians(w, length, low, top, sigma, until, found, at, lines, memory):
     """Decompose a waveform into Gaussians; as `_peaks`.
 
     There is one for each minimum of the second derivative (after Hofton et al. 2000, who take the
     points of inflection around them), none narrower than the system waveform.
     """
-    bent, at = np.zeros(length), np.empty(length, np.int64)
+    bent, x, y, time, height, width = lines
+    fit = memory[0]
+    bent[0] = bent[length - 1] = 0.0
     for s in range(1, length - 1):
         bent[s] = w[s - 1] - 2 * w[s] + w[s + 1]
     count = 0
@@ -186,11 +191,6 @@ def _gaussians(w, length, low, top, sigma, until, found):
         if low_point and w[s] >= FAINT * top and -bent[s] * (sigma * sigma) >= CURVED * top:
             at[count] = s
             count += 1
-    time, height, width = np.empty(count), np.empty(count), np.empty(count)
-    x, y, rest, other = np.empty(length), np.empty(length), np.empty(length), np.empty(length)
-    slopes, others = np.empty((3 * TOGETHER, length)), np.empty((3 * TOGETHER, length))
-    fit, lower = np.empty((3, TOGETHER)), np.empty((3 * TOGETHER, 3 * TOGETHER))
-    step = np.empty(3 * TOGETHER)
     begin, first = 0, 0  # of a piece that is fitted by itself: its first Gaussian and sample
     while begin < count:
         stop = begin + 1
@@ -204,8 +204,7 @@ def _gaussians(w, length, low, top, sigma, until, found):
         for k in range(begin, stop):
             fit[0, k - begin] = min(w[at[k]], -bent[at[k]] * (sigma * sigma)) / top
             fit[1, k - begin], fit[2, k - begin] = (at[k] - origin) / sigma, 1.0
-        given = fit, stop - begin, rest, slopes, other, others, lower, step
-        _fitted(x, y, end - first, *given)
+        _fitted(x, y, end - first, stop - begin, memory)
         for k in range(stop - begin):
             whole += fit[0, k] * fit[2, k]
         for k in range(begin, stop):
@@ -245,133 +244,145 @@ def _gaussians(w, length, low, top, sigma, until, found):
     return out
 
 
-@stage
-def _searched(far, light, begin, stop, each, digits, echo, before, found, until):
-    """Find the echoes of hits `begin` to `stop`, after `before` others; returns how many."""
-    sigma, per_m, decomposes = digits
-    when, share = np.empty(stop), np.empty(stop)
-    for k in range(begin, stop):
-        when[k], share[k] = far[k] * per_m, light[k] / each
-    many = np.int64(2 * CUT * sigma) + 1
-    low = np.int64(math.ceil(when[begin] - CUT * sigma)) - 1
-    length = np.int64(math.ceil(when[stop - 1] - CUT * sigma)) + many - low + 1
-    w, rows = np.empty(length), np.empty((3, length))
-    marks = np.empty(length, np.int64)
-    top = _sampled(when, share, begin, stop, sigma, many, low, w, length)
-    if decomposes:
-        count = _gaussians(w, length, low, top, sigma, marks, rows)
-    else:
-        count = _peaks(w, length, low, top, sigma, marks, rows)
-    count = min(count, found.shape[1] - before)
-    for row in range(3):
-        for k in range(count):
-            found[row, before + k] = rows[row, k]
-    for k in range(begin, stop):
-        key, number = np.int64(np.rint(when[k] * 1024)) - 1024 * low, 0
-        while number < count - 1 and marks[number] < key:
-            number += 1
-        echo[k] = before + number if count else -1
-    return count
+@compiled()
+def ordered(each, ray, distance, energy, row):
+    """Write rows of hits that have energy, by beam, then by distance; returns how many.
+
+    The second number is that of the hits of a beam, at most.
+    """
+    count, begin, most, beam = 0, 0, 0, -1
+    for k in range(len(ray)):
+        if not energy[k] > 0:
+            continue
+        if ray[k] // each != beam:
+            begin, beam = count, ray[k] // each
+        place = count
+        while place > begin and distance[row[place - 1, 0]] > distance[k]:
+            row[place, 0] = row[place - 1, 0]
+            place -= 1
+        row[place, 0] = k
+        count += 1
+        most = max(most, count - begin)
+    return count, most
+
+
+@inlined
+def _end(beam, begin):
+    """Where the hits of a beam end that begin at a row."""
+    end = begin + 1
+    while end < len(beam) and beam[end] == beam[begin]:
+        end += 1
+    return end
 
 
 @compiled()
-def returns(
-    each, sigma_m, digits, ray, distance, energy, solid, velocity, pairs, normals, directions,
-    whole, real,
-):  # fmt: skip
+def divide(beam, sigma_m, hits, planes, new, parts):
+    """Mark where waveforms begin, and write those to be searched to `parts` (k, 2); how many.
+
+    Hits that are together, and yet not narrow, are searched unless they are on one surface.
+    """
+    sub, far, hard, row, still, some, every = hits
+    each, pairs, normals, directions, table, changes = planes
+    count, begin = 0, 0
+    while begin < len(beam):
+        end, before, first = _end(beam, begin), count, begin
+        for k in range(begin, end):
+            new[k] = k == begin or far[k] - far[k - 1] > 2 * CUT * sigma_m
+            still[k], some[k] = True, False
+        for k in range(begin + 1, end + 1):
+            if k < end and not new[k]:
+                continue
+            if far[k - 1] - far[first] > NARROW * sigma_m:
+                parts[count, 0], parts[count, 1] = first, k
+                count += 1
+                for one in range(first, k):
+                    some[one] = hard[one]
+            first = k
+        if count > before and len(pairs):
+            _joined(
+                begin, end, every, still, sub, far, some, row, MEET * sigma_m, each, pairs,
+                normals, directions, table, changes,
+            )  # fmt: skip
+        last, count = count, before
+        for part in range(before, last):
+            first, end_of = parts[part, 0], parts[part, 1]
+            for k in range(first + 1, end_of):
+                if still[k]:
+                    parts[count, 0], parts[count, 1] = first, end_of
+                    count += 1
+                    break
+        begin = end
+    return count
+
+
+def room_for(length):
+    """Make scratch memory for waveforms of so many samples, see `search`."""
+    fits, size = np.empty((3, 3, TOGETHER)), 3 * TOGETHER
+    slopes, rest = np.empty((2, size, length)), np.empty((2, length))
+    memory = *fits, np.empty((size, size)), *slopes, *rest, np.empty(size)
+    marks, lines = np.empty((2, length), np.int64), np.empty((7, length))
+    return lines[0], np.empty((3, length)), *marks, (*lines[1:],), memory
+
+
+@compiled()
+def search(when, share, parts, digits, new, echo, found, room):
+    """Find the echoes of hits in waveforms, from `parts[k, 0]` to `parts[k, 1]` in each.
+
+    `digits` are the standard deviation of the system waveform in samples, and whether waveforms are
+    decomposed into Gaussians. Writes which echo each hit is part of, or -1, and its row of `found`,
+    time, energy and width (3, n), and marks hits that begin one.
+    """
+    sigma, decomposes = digits
+    before, many = 0, np.int64(2 * CUT * sigma) + 1
+    w, rows, until, at, lines, memory = room
+    for part in range(len(parts)):
+        begin, stop = parts[part, 0], parts[part, 1]
+        low = np.int64(math.ceil(when[begin] - CUT * sigma)) - 1
+        length = np.int64(math.ceil(when[stop - 1] - CUT * sigma)) + many - low + 1
+        top = _sampled(when, share, begin, stop, sigma, many, low, w, length)
+        if decomposes:
+            count = _gaussians(w, length, low, top, sigma, until, rows, at, lines, memory)
+        else:
+            count = _peaks(w, length, low, top, sigma, until, rows)
+        for k in range(begin, stop):
+            key, number = np.int64(np.rint(when[k] * 1024)) - 1024 * low, 0
+            while number < count - 1 and until[number] < key:
+                number += 1
+            echo[k] = before + number if count else -1
+            for row in range(3):
+                found[row, k] = rows[row, number]
+            if k > begin:
+                new[k] = echo[k] != echo[k - 1]
+        before += count
+
+
+@compiled()
+def returns(beam, sigma_m, per_m, hits, planes, new, light, speed, echo, found, whole, real):
     """Make the returns of waveforms of beams, see `waveform.returns_in`; returns how many.
 
-    `digits` are the standard deviation of the system waveform in samples, samples a metre, and
-    whether waveforms are decomposed into Gaussians. Writes beams and rows of the strongest hits to
-    `whole` (2, k); distances, energies, velocities, and widths, of the system waveform's, to `real`
-    (4, k).
+    Writes beams and rows of the strongest hits to `whole` (2, k); distances, energies, velocities,
+    and widths, of the system waveform's, to `real` (4, k).
     """
-    i, count, moves, narrow = 0, 0, len(velocity) > 0, NARROW * sigma_m
-    size = _most(ray, each)
-    far, light, speed = np.empty(size), np.empty(size), np.zeros(size)
-    hard, new, still = np.empty(size, np.bool_), np.empty(size, np.bool_), np.empty(size, np.bool_)
-    sub, echo, own = (
-        np.empty(size, np.int64),
-        np.empty(size, np.int64),
-        np.empty((size, 2), np.int64),
-    )
-    part = np.empty(size, np.int64)
-    part_sub, part_own = np.empty(size, np.int64), np.empty((size, 2), np.int64)
-    part_far, part_hard = np.empty(size), np.empty(size, np.bool_)
-    every = np.ones(size, np.bool_)
-    table, changes = np.empty(size * each, np.int64), np.empty(size + 1, np.int64)
-    found, until = np.empty((3, 8 * size)), np.empty(8 * size, np.int64)
-    while i < len(ray):
-        beam, n = ray[i] // each, 0
-        end = (beam + 1) * each
-        while i < len(ray) and ray[i] < end:  # in the order of distances
-            if energy[i] > 0:
-                place = n
-                while place > 0 and far[place - 1] > distance[i]:
-                    far[place], light[place] = far[place - 1], light[place - 1]
-                    speed[place], hard[place] = speed[place - 1], hard[place - 1]
-                    sub[place], own[place, 0] = sub[place - 1], own[place - 1, 0]
-                    place -= 1
-                far[place], light[place], hard[place] = distance[i], energy[i], solid[i]
-                sub[place], own[place, 0] = ray[i], i
-                if moves:
-                    speed[place] = velocity[i]
-                n += 1
-            i += 1
-        if n == 0:
-            continue
-        for k in range(n):
-            new[k] = k == 0 or far[k] - far[k - 1] > 2 * CUT * sigma_m
-            echo[k] = -1
-        if far[n - 1] - far[0] > narrow:
-            chosen, begin = 0, 0  # hits that are together, and yet not narrow
-            for k in range(1, n + 1):
-                if k < n and not new[k]:
-                    continue
-                if far[k - 1] - far[begin] > narrow:
-                    for number in range(begin, k):
-                        part[chosen], still[chosen] = number, True
-                        part_sub[chosen], part_own[chosen, 0] = sub[number], own[number, 0]
-                        part_far[chosen], part_hard[chosen] = far[number], hard[number]
-                        chosen += 1
-                begin = k
-            if chosen and len(pairs):
-                _joined(
-                    0, chosen, every, still, part_sub, part_far, part_hard, part_own,
-                    MEET * sigma_m, each, pairs, normals, directions, table, changes,
-                )  # fmt: skip
-            echoes, begin = 0, 0
-            while begin < chosen:
-                stop, apart = begin + 1, False
-                while stop < chosen and not new[part[stop]]:
-                    apart |= still[stop]
-                    stop += 1
-                if apart:  # no single surface
-                    echoes += _searched(
-                        far, light, part[begin], part[stop - 1] + 1, each, digits, echo, echoes,
-                        found, until,
-                    )  # fmt: skip
-                    for k in range(begin + 1, stop):
-                        new[part[k]] = echo[part[k]] != echo[part[k] - 1]
-                begin = stop
-            if len(pairs):
-                several = False
-                for k in range(1, n):
-                    several |= new[k]
-                if several:
-                    _joined(
-                        0, n, new, new, sub, far, hard, own, MEET * sigma_m, each, pairs, normals,
-                        directions, table, changes,
-                    )  # fmt: skip
-        begin = 0
-        for k in range(1, n + 1):
-            if k < n and not new[k]:
+    sub, far, hard, row, _, _, _ = hits
+    each, pairs, normals, directions, table, changes = planes
+    count, begin = 0, 0
+    while begin < len(beam):
+        end, several = _end(beam, begin), False
+        for k in range(begin + 1, end):
+            several |= new[k]
+        if several and len(pairs):
+            _joined(
+                begin, end, new, new, sub, far, hard, row, MEET * sigma_m, each, pairs, normals,
+                directions, table, changes,
+            )  # fmt: skip
+        for k in range(begin + 1, end + 1):
+            if k < end and not new[k]:
                 continue
             best, sum_, mean, drift, spread = begin, 0.0, 0.0, 0.0, 0.0
             for number in range(begin, k):
                 sum_ += light[number]
                 mean += light[number] * far[number]
-                if moves:
+                if len(speed):
                     drift += light[number] * speed[number]
                 if light[number] > light[best]:
                     best = number
@@ -379,13 +390,12 @@ def returns(
             for number in range(begin, k):
                 off = (far[number] - mean) / sigma_m
                 spread += light[number] * (off * off)
-            whole[0, count], whole[1, count] = beam, own[best, 0]
+            whole[0, count], whole[1, count] = beam[begin], row[best, 0]
             real[0, count], real[1, count], real[2, count] = mean, sum_ / each, drift / sum_
             real[3, count] = math.sqrt(1 + spread / sum_)
-            what = echo[begin]
-            if what >= 0 and what == echo[k - 1]:  # no surface joins it with anything else
-                real[0, count] = found[0, what] / digits[1]
-                real[1, count], real[3, count] = found[1, what], found[2, what]
+            if echo[begin] >= 0 and echo[begin] == echo[k - 1]:  # nothing else is on its surface
+                real[0, count] = found[0, begin] / per_m
+                real[1, count], real[3, count] = found[1, begin], found[2, begin]
             count += 1
             begin = k
     return count

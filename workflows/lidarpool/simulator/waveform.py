@@ -96,15 +96,30 @@ def returns_in(
     """
     from . import wave_loops  # not before: numba takes half a second to import
 
-    speeds = np.zeros(0) if hits.velocity is None else hits.velocity
-    most = len(hits.ray)
-    whole, real = np.empty((2, most), np.int64), np.empty((4, most))
+    columns = owned(hits.ray, np.int64), owned(hits.distance), owned(made(hits.energy))
+    row = np.empty((len(hits.ray), 2), np.int64)
+    count, many = wave_loops.ordered(each, *columns, row)
+    order = (row := row[:count])[:, 0]
+    sub, far, light = (column[order] for column in columns)
+    speed = np.zeros(0) if hits.velocity is None else hits.velocity[order]
+    beam, hard = sub // each, hits.triangle[order] != NO_SURFACE
+    new, still, some = np.empty((3, count), np.bool_)
+    echo, found = np.full(count, -1), np.empty((3, count))
+    whole, real = np.empty((2, count), np.int64), np.empty((4, count))
+    scratch = np.empty(many * each, np.int64), np.empty(many + 1, np.int64)
+    surfaces = each, *surfaces_of(each, planes), *scratch
+    mine = sub, far, hard, row, still, some, np.ones(count, np.bool_)
+    parts = np.empty((count, 2), np.int64)
+    parts = parts[: wave_loops.divide(beam, digitizer.sigma_m, mine, surfaces, new, parts)]
+    if len(parts):
+        longest = float((far[parts[:, 1] - 1] - far[parts[:, 0]]).max()) * digitizer.per_m
+        room = wave_loops.room_for(int(longest) + 2 * digitizer.reach + 8)
+        digits, when = (digitizer.sigma, digitizer.decomposes), far * digitizer.per_m
+        wave_loops.search(when, light / each, parts, digits, new, echo, found, room)
+    sizes = digitizer.sigma_m, digitizer.per_m
     count = wave_loops.returns(
-        each, digitizer.sigma_m, (digitizer.sigma, digitizer.per_m, digitizer.decomposes),
-        owned(hits.ray, np.int64), owned(hits.distance), owned(made(hits.energy)),
-        hits.triangle != NO_SURFACE, owned(speeds),
-        *surfaces_of(each, planes), whole, real,
-    )  # fmt: skip
+        beam, *sizes, mine, surfaces, new, light, owned(speed), echo, found, whole, real
+    )
     beam, row = whole[:, :count].copy()
     distance, energy, velocity, width = real[:, :count].copy()
     return hits.take(row)._replace(
