@@ -195,14 +195,14 @@ def test_a_mirror_shows_what_is_reflected_at_the_unfolded_range(subrays, backend
     """A mirror at 45 degrees turns the beam up, to a ceiling 3 m above."""
     mirror = quad("Mirror", (2, -9, -2), (2, 9, -2), (6, 9, 2), (6, -9, 2))
     meshes = [mirror, level("Ceiling", 3, 9)]
-    materials = [Material("*"), Material("Mirror", transparent="mirror")]
+    materials = [Material("*"), Material("Mirror", specular_reflectance=1)]
     beam = Returns(subrays=subrays, divergence_mrad=1)
     found = cast(meshes, materials=materials, returns=beam, backend=backend)
     assert found["object"].tolist() == [1]
     assert found["range"] == pytest.approx([7], abs=1e-4)
     assert found["reflectivity"] == pytest.approx([0.5], rel=1e-4)
     assert np.allclose(found["batch"].positions, [[7, 0, 0]], atol=1e-4), "behind the mirror"
-    everywhere = [Material("*", transparent="mirror")]
+    everywhere = [Material("*", specular_reflectance=1)]
     assert not len(cast([wall("A", 4), wall("B", -4)], materials=everywhere)["range"]), "given up"
 
 
@@ -258,7 +258,7 @@ ALL_ON = {
     "materials": [
         Material("*", 0.4, semantic_class=1),
         Material("V*", 0.1, transparent="pass"),
-        Material("Sphere", transparent="mirror"),
+        Material("Sphere", specular_reflectance=1),
     ],
     "returns": Returns("dual", subrays=7, divergence_mrad=20, pulse_ns=2),
     "noise": Noise(0.02, 0.001, 0.05, 0.1, 40, seed=5),

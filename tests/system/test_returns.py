@@ -33,7 +33,7 @@ SURVEY = Survey(
     materials=[
         Material("*", 0.4, semantic_class=300),
         Material(["V*", "S*"], 0.1, transparent="pass"),
-        Material("Bowl", transparent="mirror"),
+        Material("Bowl", specular_reflectance=1),
     ],
     returns=Returns("dual", subrays=7, divergence_mrad=20, pulse_ns=2),
     noise=Noise(0.02, 0.001, 0.05, dropout=0.1, detection_range_m=80, seed=5),

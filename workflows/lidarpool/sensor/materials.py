@@ -35,7 +35,7 @@ POLISHED = 0.04  # share that plastics, paints and wet surfaces reflect at right
 DARKEST = 1e-3  # least reflectance of a colour, so that every hit is a return
 
 SemanticClass = Annotated[int, Field(ge=0, le=65_535)]
-Transparent = Literal["none", "pass", "mirror"]
+Transparent = Literal["none", "pass"]
 
 
 def _checked_names(given: Any, handler: Callable[[Any], Any]) -> Any:
@@ -80,7 +80,7 @@ class Material:
     """Material of objects; the last entry for an object counts.
 
     Reflectance is that at the sensor's wavelength, in all directions but for a gloss. Of light that
-    is not scattered, "pass" reflects what glass reflects; with "none" it is lost.
+    is not scattered, a share is mirrored; the rest passes, or is lost with "none".
 
     Raises
     ------
@@ -98,7 +98,7 @@ class Material:
         UnitShare | Literal["texture"] | None,
         allowed("0 to 1, or texture"),
         about(
-            "share of light that is scattered; by default 0.5, for glass and mirrors "
+            "share of light that is scattered; by default 0.5, for glass and whole mirrors "
             "0; texture: the luminance of the colour that was hit"
         ),
     ] = None
@@ -107,8 +107,17 @@ class Material:
         bool, about("whether light returns in its own direction, as from traffic signs")
     ] = False
     transparent: Annotated[
-        Transparent, about("the rest of the light passes through (pass), or is reflected (mirror)")
+        Transparent, about("pass: the rest of the light passes through")
     ] = "none"
+    specular_reflectance: Annotated[
+        UnitShare | Literal["fresnel"] | None,
+        allowed("0 to 1, or fresnel"),
+        about(
+            "share of the rest that is mirrored at right angles, and shows ghosts; grows towards "
+            "grazing angles. 1 for a mirror, 0.04 for paint; fresnel for what light passes",
+            0.04,
+        ),
+    ] = None
     scale: Annotated[
         float, about("with reflectance: texture, a factor of the luminance", gt=0, le=100)
     ] = 1.0
@@ -178,7 +187,22 @@ class Material:
             raise LidarpoolError("metalness needs a roughness: give 0.1 (polished) to 1 (matt).")
         if self.roughness is not None and (self.retro or self.transparent != "none"):
             raise LidarpoolError("roughness is for opaque surfaces that are not retro-reflective.")
+        self._check_specular()
         self._check_within()
+
+    def _check_specular(self) -> None:
+        """Refuse mirrors that other values contradict."""
+        if self.specular_reflectance is None:
+            return
+        if (self.transparent == "pass") != (self.specular_reflectance == "fresnel"):
+            raise LidarpoolError(
+                f"specular_reflectance is {self.specular_reflectance!r} with transparent: "
+                f"{self.transparent}; give fresnel for what light passes, else 0 to 1."
+            )
+        if self.roughness is not None:
+            raise LidarpoolError(
+                "roughness and specular_reflectance are two kinds of gloss: give one of them."
+            )
 
     def _check_within(self) -> None:
         """Refuse what contradicts the medium within a surface."""
@@ -192,14 +216,14 @@ class Material:
             return
         if not self._suits_leaves:
             raise LidarpoolError(
-                "leaf_area_density is for leaves that scatter light: leave out transparent, retro "
-                "and roughness, and give reflectance as a number, or a material."
+                "leaf_area_density is for leaves that scatter light: leave out transparent, retro, "
+                "roughness and specular_reflectance, and give reflectance as a number, or a material."
             )
 
     @property
     def _suits_leaves(self) -> bool:
         other = self.transparent != "none" or self.retro or self.roughness is not None
-        return not other and self.reflectance != "texture"
+        return not (other or self.specular_reflectance) and self.reflectance != "texture"
 
     def check_leaves(self, name: str, voxels: bool) -> None:
         """Check that it suits an object, by whether that has voxels; LidarpoolError if not."""
@@ -223,8 +247,15 @@ class Material:
         if self.reflectance == "texture":
             return min(1.0, self.scale * REFLECTANCE)
         if self.reflectance is None:
-            return REFLECTANCE if self.transparent == "none" else 0.0
+            return 0.0 if self.transparent == "pass" or self.specular_reflectance == 1 else REFLECTANCE
         return float(self.reflectance)
+
+    @property
+    def specular(self) -> float:
+        """Share of what is not scattered that is mirrored at right angles."""
+        if self.specular_reflectance == "fresnel":
+            return float(fresnel(np.ones(1), self.refractive_index or GLASS_INDEX)[0])
+        return self.specular_reflectance or 0.0
 
     def named(self, name: str) -> bool:
         """Whether this material applies to an object."""
@@ -309,7 +340,7 @@ class MaterialTable:
     metalness: Floats
     retro: Bools
     passes: Bools
-    mirrors: Bools
+    specular: Floats  # share of what is not scattered that is mirrored at right angles
     semantic_class: NDArray[np.uint16]
     refractive_index: Floats  # within; 0 where light goes straight on
     attenuation: Floats  # within, 1/m
@@ -359,7 +390,7 @@ class MaterialTable:
             np.array([m.metalness for m in found])[last],
             np.array([m.retro for m in found], np.bool_)[last],
             np.array([m.transparent == "pass" for m in found], np.bool_)[last],
-            np.array([m.transparent == "mirror" for m in found], np.bool_)[last],
+            np.array([m.specular for m in found], np.float64)[last],
             np.array([m.semantic_class for m in found], np.uint16)[last],
             np.array([m.refractive_index or 0.0 for m in found])[last],
             np.array([m.attenuation_per_m for m in found], np.float64)[last],
@@ -367,12 +398,6 @@ class MaterialTable:
             np.array([angles.index(m.leaf_angle) for m in found], np.intp)[last],
             angles,
         )
-
-    @property
-    def plain(self) -> bool:
-        """Whether each ray ends at its first hit, with a return."""
-        through = self.passes | self.mirrors | self.leafy
-        return bool((self.reflectance > 0).all() and not through.any())
 
     @property
     def leafy(self) -> Bools:
@@ -389,6 +414,15 @@ class MaterialTable:
         """Whether the colours of an object are its reflectance."""
         return bool(self.scale.any())
 
+    def shares(self, rows: Integers, luminance: Floats | None) -> Floats:
+        """Share of light that objects (n,) scatter; `luminance` as of `scattered`."""
+        shares = self.reflectance[rows]
+        if luminance is not None:
+            scale = self.scale[rows]
+            bright = np.minimum(np.maximum(scale * luminance, DARKEST), 1.0)
+            shares = bright if self.scale.all() else np.where(scale > 0, bright, shares)
+        return shares
+
     def scattered(
         self,
         rows: Integers,
@@ -399,11 +433,7 @@ class MaterialTable:
 
         `luminance` (n,) is that of the colours that were hit, if the table is `textured`.
         """
-        shares = self.reflectance[rows]
-        if luminance is not None:
-            scale = self.scale[rows]
-            bright = np.minimum(np.maximum(scale * luminance, DARKEST), 1.0)
-            shares = bright if self.scale.all() else np.where(scale > 0, bright, shares)
+        shares = self.shares(rows, luminance)
         back = shares * np.where(self.retro[rows], RETRO_GAIN, cosine)
         if self.roughness.any():
             on = np.flatnonzero(self.roughness[rows])
@@ -413,14 +443,22 @@ class MaterialTable:
             back[on] += front * gloss(cosine[on], self.roughness[rows[on]])
         return back
 
-    def goes_on(self, rows: Integers, cosine: Floats) -> Floats:
-        """Share of the light that continues at glass or mirrors (n,).
+    def goes_on(
+        self, rows: Integers, cosine: Floats, mirrored: Bools, luminance: Floats | None = None
+    ) -> Floats:
+        """Share of the light that passes through objects (n,), or is mirrored by them.
 
-        Where it is refracted, what the surface reflects is not taken off.
+        Where it is refracted, what the surface mirrors is neither taken off nor alone.
         """
-        glass = self.passes[rows] & ~self.refracts[rows]
-        through = np.where(glass, 1 - fresnel(cosine), 1.0)
-        return np.asarray(np.where(self.leafy[rows], 1, 1 - self.reflectance[rows]) * through)
+        smooth = np.flatnonzero(mirrored | (self.passes & ~self.refracts)[rows])
+        share, off = np.ones(len(rows)), mirrored[smooth]
+        of, steep = rows[smooth], cosine[smooth]
+        first = self.specular[of]
+        grazing = 1 - np.minimum(steep, 1.0)
+        grazing *= np.square(np.square(grazing))
+        mirrors = np.where(self.passes[of], fresnel(steep), first + (1 - first) * grazing)
+        share[smooth] = np.where(self.refracts[of], 1.0, np.where(off, mirrors, 1 - mirrors))
+        return np.asarray(np.where(self.leafy[rows], 1, 1 - self.shares(rows, luminance)) * share)
 
 
 def gloss(cosine: Floats, roughness: Floats) -> Floats:

@@ -19,7 +19,7 @@ from ..sensor.noise import THRESHOLD_SIGMAS, Purpose, named_seed, starts
 from ..sensor.weather import FAINTEST, FARTHEST_M, NODES, Air, Particles
 from ..sensor.weather import reach as reach_of
 from .doppler import approach
-from .returns import AIR, OF_RETURNS, Keys, Planes, PulseReturns, joined, numbers, unreal
+from .returns import AIR, GHOST, OF_RETURNS, Keys, Planes, PulseReturns, joined, numbers, unreal
 from .scene_caster import SceneCaster
 from .step import Memory, PulseBatch, PulseStep, Setup, Sizes
 from .surfaces import Surfaces
@@ -62,7 +62,7 @@ class WeatherStep(PulseStep):
     """
 
     effects = "Rain", "Snow", "Fog", "Dust"
-    reads = "ray", "distance", "triangle", "velocity"
+    reads = "ray", "distance", "triangle", "cause", "velocity"
     writes = *OF_RETURNS, "velocity"
     purposes = (
         Purpose.FOG_CELL, Purpose.FOG_PLACE, Purpose.PARTICLES, Purpose.PARTICLE_RANGE,
@@ -142,13 +142,14 @@ class WeatherStep(PulseStep):
 
     def _reach(self, hits: PulseReturns, count: int) -> Floats:
         """How far the light of sub-rays gets, (count,): inf if no surface ends it."""
-        materials = self.surfaces.at(self._wavelength_nm)
-        ends = hits.distance
-        on = materials.passes | materials.mirrors
+        ray, ends, on = hits.ray, hits.distance, self.surfaces.at(self._wavelength_nm).passes
         if on.any():
             ends = np.where(on[self.surfaces.objects(hits.triangle)], np.inf, ends)
+        if hits.cause is not None:
+            rows = np.flatnonzero(hits.cause != GHOST)
+            ray, ends = ray[rows], ends[rows]
         reach = np.full(count, np.inf)
-        reach[hits.ray] = ends  # of several, the last
+        reach[ray] = ends  # of several, the last
         return reach
 
     def _bent(self, hits: PulseReturns) -> Indices:
@@ -156,7 +157,8 @@ class WeatherStep(PulseStep):
         refracts = self.surfaces.at(self._wavelength_nm).refracts
         if not refracts.any():
             return np.zeros(0, np.intp)
-        return np.flatnonzero(refracts[self.surfaces.objects(hits.triangle)])
+        bent = refracts[self.surfaces.objects(hits.triangle)]
+        return np.flatnonzero(bent if hits.cause is None else bent & (hits.cause != GHOST))
 
     def _within(self, hits: PulseReturns, ray: Ints, distance: Floats) -> Bools:
         """Whether places on rays are within water or glass, where nothing falls: (n,)."""

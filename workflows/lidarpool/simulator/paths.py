@@ -1,4 +1,7 @@
-"""Paths of light: casts sub-rays, and follows their light through glass and off mirrors."""
+"""Paths of light: casts sub-rays, and follows their light through glass and off mirrors.
+
+Where a surface does both, or scatters light as well, the light is divided, and each part goes on.
+"""
 
 from __future__ import annotations
 
@@ -9,20 +12,24 @@ from numpy.typing import NDArray
 
 from raybeam import Pattern
 
-from ..base.arrays import Floats, Integers, Ints, Ints32, UInts32
+from ..base.arrays import Bools, Bytes, Floats, Integers, Ints, Ints32, UInts32
 from ..base.vectors import into_axes, products
 from ..columns.table import COLOURS
+from ..scene.colours import luminance
+from ..sensor.materials import fresnel
 from ..sensor.noise import Purpose, raw
+from ..sensor.weather import WATER_INDEX
 from .doppler import BLOCK_HITS, approach
 from .media import LightInMedia, Media, Rays, depths
 from .motion import Clock, Poses
-from .returns import Keys, Planes, PulseReturns, joined, selected
+from .returns import GHOST, OF_RETURNS, SURFACE, Keys, Planes, PulseReturns, joined, selected
 from .scene_caster import SceneCaster
 from .step import Memory, PulseBatch, PulseStep, Setup, Sizes
 from .surfaces import Surfaces, light_of
 
 PASSES_MOST = 16  # surfaces that light passes before it is dropped
 LEAFY_PASSES_MOST = 64  # where there are crowns, whose surfaces it passes twice
+MIRRORED_MOST = 2  # times that light is mirrored, of which each may divide it
 
 
 @dataclass
@@ -37,6 +44,7 @@ class _Light:
     before: Floats  # optical path up to the origin
     # What mirrors did to the directions so far, (n, 3, 3), if there are any.
     turns: Floats | None = None
+    mirrored: Bytes | None = None  # how many times it was, if there are mirrors
     within: LightInMedia | None = None  # if there are media
     # How fast its optical path grows, m/s, but for the motion of its end, if that is asked for.
     range_rate: Floats | None = None
@@ -49,8 +57,11 @@ class _Light:
 class CastStep(PulseStep):
     """Finds where the light of sub-rays returns from."""
 
-    effects = "Gaussian and oval beams", "Refraction", "Vegetation", "Rays without a return"
-    writes = "ray", "distance", "triangle", "energy", "colour", "velocity"
+    effects = (
+        "Ghosts", "Wet ground", "Gaussian and oval beams", "Refraction", "Vegetation",
+        "Rays without a return",
+    )  # fmt: skip
+    writes = *OF_RETURNS, "velocity"
     purposes = Purpose.LEAF, Purpose.WHICH
 
     def __init__(self, setup: Setup, caster: SceneCaster, surfaces: Surfaces) -> None:
@@ -129,7 +140,9 @@ class CastStep(PulseStep):
 
         if self.setup.moving:
             light.range_rate = approach(poses, ray, origins, directions)
-        if materials.mirrors.any() or (media is not None and media.bends):
+        if self.setup.mirroring:
+            light.mirrored = np.zeros(len(ray), np.uint8)
+        if self.setup.mirroring or (media is not None and media.bends):
             light.turns = np.broadcast_to(np.eye(3), (len(ray), 3, 3))
         if media is not None:
             left = depths(draw(Purpose.LEAF, ray)) if leafy else None
@@ -150,7 +163,7 @@ class CastStep(PulseStep):
             if self._coloured:
                 points = light.origins + step[:, None] * light.directions
                 colour = surfaces.colours(triangle, points, light.times, poses.ways)
-            normals, along, rows, energy = surfaces.lit(
+            normals, along, rows, energy, film = surfaces.lit(
                 triangle, light.directions, distance, self._light, light.times, poses.ways, colour
             )
             if len(leaves):
@@ -166,26 +179,41 @@ class CastStep(PulseStep):
                 moved = self._velocities(light, step, triangle, poses)
                 index = 1.0 if within is None else within.index
                 velocity = light.range_rate + index * products(moved.T, light.directions.T)
-            hits = PulseReturns(light.ray, distance, triangle, energy, colour, velocity=velocity)
+            cause, mirrored = None, light.mirrored
+            if mirrored is not None:
+                cause = np.where(mirrored > 0, GHOST, SURFACE).astype(np.uint8)
+            hits = PulseReturns(light.ray, distance, triangle, energy, colour, cause, velocity)
             turns = light.turns
             looks = normals if turns is None else into_axes(normals, turns)
-            goes = materials.passes[rows] | materials.mirrors[rows]
+            goes, off = materials.passes[rows], np.zeros(len(rows), np.bool_)
+            if mirrored is not None:
+                smooth = materials.specular[rows] > 0
+                smooth = smooth if film is None else smooth | film
+                off = smooth & (mirrored < MIRRORED_MOST)
             if within is not None:  # optical paths are longer than what was cast
                 crowns = materials.leafy[rows]  # whose surfaces send nothing back
                 crowns[leaves] = False
                 near = distance <= farthest
-                goes = (goes | crowns) & near
+                goes, off = (goes | crowns) & near, off & near
                 there = np.flatnonzero(near & ~crowns)
                 hits, looks = hits.take(there), looks[there]
             parts.append(hits)
             seen.append(looks)
-            on = np.flatnonzero(goes)
+            through, off = np.flatnonzero(goes), np.flatnonzero(off)
+            on = np.concatenate([through, off])
             if not len(on):
                 break
-            ends = step[on], distance[on], triangle[on], normals[on], along[on]
+            away = np.arange(len(on)) >= len(through)
+            share = self._goes_on(rows[on], np.abs(along[on]), away, *selected((colour, film), on))
+            light = light.on(on)
+            light.share = light.share * share**2  # and back again
+            ends = step[on], distance[on], triangle[on], normals[on], along[on], away
             light, clear = self._behind(
-                light.on(on), *ends, None if light.range_rate is None else moved[on]
+                light, *ends, None if light.range_rate is None else moved[on]
             )
+            if mirrored is not None:  # nothing passes where all is mirrored
+                some = np.flatnonzero(light.share)
+                light, clear = light.on(some), clear[some]
             # Light takes no time: it travels 300 m in a microsecond.
             now = Poses(np.zeros(3), clock=Clock(light.times, np.zeros(1), poses.ways))
             found = self.caster.scan(Pattern(light.directions, light.origins), now, t_max=reach)
@@ -207,6 +235,22 @@ class CastStep(PulseStep):
             directions = rays[3:].take(hits.ray, axis=1).T
         return hits, (normals, directions)
 
+    def _goes_on(
+        self,
+        rows: Integers,
+        cosine: Floats,
+        off: Bools,
+        colour: UInts32 | None,
+        film: Bools | None,
+    ) -> Floats:
+        """Share of light that passes objects (n,), or goes off them; see `MaterialTable.goes_on`."""
+        materials, wet = self.surfaces.at(self._light.wavelength_nm), self._light.wet
+        bright = luminance(colour) if materials.textured and colour is not None else None
+        share = materials.goes_on(rows, cosine, off, bright)
+        if film is None:
+            return share
+        return np.where(film, (1 - wet) * share + wet * fresnel(cosine, WATER_INDEX), share)
+
     def _behind(
         self,
         light: _Light,
@@ -215,22 +259,21 @@ class CastStep(PulseStep):
         triangle: Ints32,
         normals: Floats,
         along: Floats,
+        off: Bools,
         moved: Floats | None,
     ) -> tuple[_Light, Floats]:
-        """Take light (n,) through the surfaces at its end, or off them.
+        """Take light (n,) through the surfaces at its end, or `off` them.
 
         Returns it behind them, and where the surfaces are from there, metres, at or below 0.
         `moved` (n, 3) are the velocities of the surfaces: where one bends light, its path grows.
         """
-        materials = self.surfaces.at(self._light.wavelength_nm)
-        rows = self.surfaces.objects(triangle)
         cosine, within = np.abs(along), light.within
-        share = light.share * materials.goes_on(rows, cosine) ** 2  # and back again
-        ahead, mirrors = light.directions, materials.mirrors[rows]
+        share, ahead, mirrors = light.share, light.directions, off
         index = 1.0 if within is None else within.index
         if within is not None:
-            ahead, passes, whole = within.cross(rows, triangle, ahead, normals, along)
-            share *= passes**2
+            rows = self.surfaces.objects(triangle)
+            ahead, passes, whole = within.cross(rows, triangle, ahead, normals, along, off)
+            share = share * passes**2
             mirrors = mirrors | whole
         mirrored = 2 * mirrors[:, None] * normals
         ahead = ahead - along[:, None] * mirrored
@@ -255,7 +298,8 @@ class CastStep(PulseStep):
                 range_rate + index * there - (1.0 if within is None else within.index) * back
             )
         own = light.ray, light.times, path.origins, path.directions, share, before
-        return _Light(*own, turns, within, range_rate), -away
+        mirrored = None if light.mirrored is None else light.mirrored + off
+        return _Light(*own, turns, mirrored, within, range_rate), -away
 
     def _velocities(self, light: _Light, step: Floats, triangle: Ints32, poses: Poses) -> Floats:
         """Velocities of where light ends after so many metres, m/s: (n, 3)."""

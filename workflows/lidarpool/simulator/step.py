@@ -69,7 +69,12 @@ class Setup:
     @property
     def passing(self) -> bool:
         """Whether light goes on behind a surface, or off it."""
-        return self.leafy or any(m.transparent != "none" for m in self.survey.materials)
+        return self.mirroring or self.leafy or any(m.transparent == "pass" for m in self.survey.materials)
+
+    @property
+    def mirroring(self) -> bool:
+        """Whether surfaces mirror light."""
+        return self.survey.wet > 0 or any(m.specular for m in self.survey.materials)
 
     @property
     def refracting(self) -> bool:
