@@ -456,7 +456,8 @@ class MaterialTable:
         first = self.specular[of]
         grazing = 1 - np.minimum(steep, 1.0)
         grazing *= np.square(np.square(grazing))
-        mirrors = np.where(self.passes[of], fresnel(steep), first + (1 - first) * grazing)
+        schlick = np.where(first > 0, first + (1 - first) * grazing, 0.0)
+        mirrors = np.where(self.passes[of], fresnel(steep), schlick)
         share[smooth] = np.where(self.refracts[of], 1.0, np.where(off, mirrors, 1 - mirrors))
         return np.asarray(np.where(self.leafy[rows], 1, 1 - self.shares(rows, luminance)) * share)
 

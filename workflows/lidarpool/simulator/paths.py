@@ -81,6 +81,11 @@ class CastStep(PulseStep):
         return setup.several
 
     @staticmethod
+    def added(setup: Setup) -> float:
+        """See `PulseStep.added`: ghosts, if all around is there to be mirrored."""
+        return MIRRORED_MOST * setup.mirroring
+
+    @staticmethod
     def memory(setup: Setup, sizes: Sizes) -> Memory:
         """See `PulseStep.memory`: sub-rays, more where light goes on or is bent, and returns."""
         subray = 200 if not setup.passing else 1350 if setup.refracting else 650
