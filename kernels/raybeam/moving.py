@@ -103,6 +103,34 @@ def hits_on(
     return found
 
 
+def near_boxes(
+    rays: Floats, times: Floats, boxes: Floats, there: Floats, reach: float
+) -> tuple[Indices, Indices, int]:
+    """Find cells of rays (6, n) at times (n,) that may meet boxes that stand: by box, then cell.
+
+    Parameters
+    ----------
+    boxes
+        float64 (b, 12): middles, and halves of their sides as vectors.
+    there
+        float64 (b, 2): first and last time when each is there.
+    reach
+        Rays end before.
+
+    Returns
+    -------
+    Numbers of cells and of boxes, (k,) each, and how many rays a cell has.
+    """
+    from . import moving_loops as loops
+
+    cells = loops.cells_of(rays, times, loops.CELL)
+    wide = loops.cells_of(rays, times, loops.CELL * loops.WIDE)
+    radius = np.sqrt((boxes[:, 3:] ** 2).sum(axis=1))
+    sizes = np.column_stack([radius, np.full(len(boxes), loops.PADS_M), there])
+    number = np.zeros((len(cells), 2), np.int64)
+    return *loops.meet(wide, cells, number, boxes[:, None].copy(), sizes, reach), loops.CELL
+
+
 class _Chunk:
     """Some rays of a scan, their times, and what they hit."""
 

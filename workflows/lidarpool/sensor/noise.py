@@ -64,6 +64,9 @@ class Purpose(Enum):
     WHITE = 41  # white noise of an instrument
     DRIVEN = 42  # steps of its bias
     WALK = 43  # steps of its random walk
+    SPRAY = 16  # depth of spray until its next clump
+    SPRAY_SUBRAY = 17
+    SPRAY_DIAMETER = 18
     SAMPLES = 50  # stream of the samples of a waveform
     SAMPLE = 51  # noise of a sample
 

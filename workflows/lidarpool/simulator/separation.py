@@ -11,7 +11,7 @@ from ..scene.colours import GREY, packed
 from ..sensor.disc import neighbours
 from ..sensor.noise import THRESHOLD_SIGMAS, Noise, Purpose, quantiles, starts
 from ..sensor.optics import Mode
-from .returns import AIR, NO_SURFACE, OF_RETURNS, SURFACE, Keys, Planes, PulseReturns, made
+from .returns import NO_SURFACE, OF_RETURNS, SURFACE, Keys, Planes, PulseReturns, made
 from .selection import MODES
 from .step import PulseBatch, PulseStep, Setup
 
@@ -72,7 +72,7 @@ def separated(
     if len(flies.ray):
         some = np.flatnonzero(row < 0)
         cause = np.full(count, SURFACE, np.uint8) if found.cause is None else found.cause
-        cause[some], found.triangle[some] = AIR, NO_SURFACE
+        cause[some], found.triangle[some] = made(flies.cause)[-1 - row[some]], NO_SURFACE
         if found.colour is not None:
             found.colour[some] = packed(GREY[0])[0]
         found = found._replace(cause=cause)

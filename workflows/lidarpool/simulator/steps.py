@@ -12,6 +12,7 @@ from .range_noise import RangeNoiseStep
 from .recording import RecordingStep
 from .selection import SelectionStep
 from .separation import SeparationStep
+from .spray import SprayStep
 from .step import PulseStep, Setup
 from .stray_light import StrayLightStep
 from .waveform import WaveformStep
@@ -21,6 +22,7 @@ STEPS: tuple[type[PulseStep], ...] = (
     AngleNoiseStep,
     CastStep,  # with mirrors, glass, water and leaves
     WeatherStep,  # rain, snow, fog and dust
+    SprayStep,
     SeparationStep,  # hits to returns; or
     WaveformStep,
     DetectionStep,
