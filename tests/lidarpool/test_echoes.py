@@ -24,6 +24,7 @@ from tests.shapes import (
 )
 
 from lidarpool import (
+    Actor,
     Beams,
     LidarpoolError,
     Material,
@@ -34,7 +35,9 @@ from lidarpool import (
     Sensor,
     Spin,
     Survey,
+    Track,
 )
+from lidarpool.scene.actors import box as cuboid
 from lidarpool.scene.scene_mesh import SceneMesh
 from lidarpool.scene.shapes import seed_objects
 from lidarpool.sensor.materials import extinction, fresnel
@@ -265,6 +268,7 @@ ALL_ON = {
     "returns": Returns("dual", subrays=7, divergence_mrad=20, pulse_ns=2),
     "noise": Noise(0.02, 0.001, 0.05, 0.1, 40, seed=5),
     "visibility_km": 0.5,
+    "spray_g_m3": 500,
 }
 NOISE_ONLY = {"noise": Noise(0.02, 0.001, 0.05, seed=5)}
 BEAMS = Beams(
@@ -281,7 +285,9 @@ TURNED = {"poses": (Pose((0, 0, 1), 10, 5, -3), Pose((3, -2, 2)))}
 def test_batches_and_chunks_leave_no_trace(options, path, per_turn, monkeypatch):
     sensor = Sensor(BEAMS, Spin(per_turn, step_deg=30, rate_hz=10), 0.5, 40)
     survey = Survey(sensor, steps=14, keep_every=3, columns=COLUMNS, **options, **path)
-    scene = Scene.from_meshes(seed_objects(rings=8, segments=12))
+    way = Track([-1, 9], [(-12, 2, 0), (88, 2, 0)], start_s=0, beyond="hold")
+    car = Actor(cuboid("Car", (1, 1, 1)), way)
+    scene = Scene.from_meshes(seed_objects(rings=8, segments=12)).with_actors([car])
     rig = Rig(scene, survey, "numpy")
     whole = cast_between(rig, survey, [0, 28])
     assert len(whole[0]["x"]) > 200

@@ -34,7 +34,9 @@ def across(name, angle, by=7.0, middle=4.0):
     ahead = np.array([-math.cos(2 * angle), math.sin(2 * angle), 0])
     aside, up = np.array([-ahead[1], ahead[0], 0]), np.array([0, 0, 1.0])
     place = np.array([middle, 0, 0]) + by * ahead
-    return quad(name, *(place + 0.3 * (a * aside + b * up) for a, b in ((-1, -1), (1, -1), (1, 1), (-1, 1))))
+    return quad(
+        name, *(place + 0.3 * (a * aside + b * up) for a, b in ((-1, -1), (1, -1), (1, 1), (-1, 1)))
+    )
 
 
 def fan(low, high, channels=2, firings=1):

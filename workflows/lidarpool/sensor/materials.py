@@ -106,9 +106,9 @@ class Material:
     retro: Annotated[
         bool, about("whether light returns in its own direction, as from traffic signs")
     ] = False
-    transparent: Annotated[
-        Transparent, about("pass: the rest of the light passes through")
-    ] = "none"
+    transparent: Annotated[Transparent, about("pass: the rest of the light passes through")] = (
+        "none"
+    )
     specular_reflectance: Annotated[
         UnitShare | Literal["fresnel"] | None,
         allowed("0 to 1, or fresnel"),
@@ -247,7 +247,9 @@ class Material:
         if self.reflectance == "texture":
             return min(1.0, self.scale * REFLECTANCE)
         if self.reflectance is None:
-            return 0.0 if self.transparent == "pass" or self.specular_reflectance == 1 else REFLECTANCE
+            return (
+                0.0 if self.transparent == "pass" or self.specular_reflectance == 1 else REFLECTANCE
+            )
         return float(self.reflectance)
 
     @property
@@ -450,15 +452,11 @@ class MaterialTable:
 
         Where it is refracted, what the surface mirrors is neither taken off nor alone.
         """
-        smooth = np.flatnonzero(mirrored | (self.passes & ~self.refracts)[rows])
-        share, off = np.ones(len(rows)), mirrored[smooth]
-        of, steep = rows[smooth], cosine[smooth]
-        first = self.specular[of]
-        grazing = 1 - np.minimum(steep, 1.0)
-        grazing *= np.square(np.square(grazing))
-        schlick = np.where(first > 0, first + (1 - first) * grazing, 0.0)
-        mirrors = np.where(self.passes[of], fresnel(steep), schlick)
-        share[smooth] = np.where(self.refracts[of], 1.0, np.where(off, mirrors, 1 - mirrors))
+        first, grazing = self.specular[rows], 1 - np.minimum(cosine, 1.0)
+        schlick = first + (first > 0) * (1 - first) * (grazing * np.square(np.square(grazing)))
+        mirrors = np.where(self.passes[rows], fresnel(cosine), schlick)
+        share = np.where(mirrored, mirrors, np.where(self.passes[rows], 1 - mirrors, 1.0))
+        share = np.where(self.refracts[rows], 1.0, share)
         return np.asarray(np.where(self.leafy[rows], 1, 1 - self.shares(rows, luminance)) * share)
 
 

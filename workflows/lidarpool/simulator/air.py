@@ -166,9 +166,7 @@ class WeatherStep(PulseStep):
         return reach
 
 
-def reached(
-    materials: MaterialTable, surfaces: Surfaces, hits: PulseReturns, count: int
-) -> Floats:
+def reached(materials: MaterialTable, surfaces: Surfaces, hits: PulseReturns, count: int) -> Floats:
     """How far the light of sub-rays gets, (count,): inf if no surface ends it."""
     ray, ends, on = hits.ray, hits.distance, materials.passes
     if on.any():

@@ -13,7 +13,7 @@ import numpy as np
 from raybeam.moving import near_boxes
 
 from ..base.arrays import Floats, Ints
-from ..base.vectors import length, products
+from ..base.vectors import into_axes, length
 from ..scene.actors import check_spray
 from ..sensor.noise import Purpose, starts
 from ..sensor.trajectory import presence_ns, velocities
@@ -88,19 +88,16 @@ class SprayStep(PulseStep):
         beam, crossed = self._crossings(batch)
         if not len(beam):
             return returns
-        each, hits = batch.each, batch.stop - batch.start
-        far = reached(self._materials, self.surfaces, returns, hits * each)
+        keys, each, parts, row = batch.keys, batch.each, list[PulseReturns](), 0
+        count = (batch.stop - batch.start) * each
+        far = reached(self._materials, self.surfaces, returns, count)
         energy, ray = made(returns.energy).copy(), returns.ray.astype(np.int64)
-        behind = each, self._extinction, far, ray, returns.distance, energy
-        pulse_loops.veil(beam, crossed, *behind)
-        returns = returns._replace(energy=energy)
-        batch.hits = returns
-        keys, parts, row = batch.keys, list[PulseReturns](), 0
+        pulse_loops.veil(beam, crossed, each, self._extinction, far, ray, returns.distance, energy)
+        batch.hits = returns = returns._replace(energy=energy)
         given = self._begun, keys.scan, np.array(keys.begins, np.int64), batch.start, far
         tables = each, self._seen[0], self._step, self._seen[1], exponential()
         while row < len(beam):
-            room = 1024 + len(beam) - row
-            out = np.empty(room, np.int64), *np.empty((2, room))
+            out = np.empty(1024 + len(beam), np.int64), *np.empty((2, 1024 + len(beam)))
             row, count = pulse_loops.spray(row, beam, crossed, *tables, *given, *out)
             parts.append(unreal(returns, *(one[:count] for one in out), SPRAY))
         drawn = joined(parts)
@@ -146,19 +143,15 @@ class SprayStep(PulseStep):
             places, turns = way.poses(0, at)
             speed, _ = velocities(way, 0, at)
             metres = length(speed)
-            turns = np.broadcast_to(np.eye(3) if turns is None else turns, (len(at), 3, 3))
-            half = np.broadcast_to((high - low) / 2, (len(at), 3)).copy()
+            half = np.tile((high - low) / 2, (len(at), 1))
             half[:, 0] = metres * (BOX_NS / 2e9)
-            middle = np.broadcast_to((low + high) / 2, half.shape).copy()
-            middle[:, 0] = low[0] + half[:, 0]
-            box = np.empty((len(at), 12))
-            for axis in range(3):
-                box[:, axis] = products(turns[:, axis].T, middle.T)
-            box[:, :3] += places + speed * ((born - at) / 1e9)[:, None]
-            box[:, 3:] = (turns.transpose(0, 2, 1) * half[:, :, None]).reshape(-1, 9)
-            some = metres >= LEAST_M_S
-            boxes.append(box[some])
-            spans.append(np.stack([np.maximum(born, since), born + LASTS_NS], axis=1)[some])
+            sides = np.broadcast_to(np.eye(3) if turns is None else turns, (len(at), 3, 3))
+            sides = sides.transpose(0, 2, 1)
+            middle = places + speed * ((born - at) / 1e9)[:, None] + into_axes(low + half, sides)
+            some = np.flatnonzero(metres >= LEAST_M_S)
+            sides = (sides * half[:, :, None]).reshape(-1, 9)
+            boxes.append(np.concatenate([middle, sides], axis=1)[some])
+            spans.append(np.stack([at, born + LASTS_NS], axis=1)[some])
             speeds.append(metres[some])
         density = self.setup.survey.wet * np.square(np.concatenate(speeds) / FULL_M_S)
         return np.concatenate(boxes), np.concatenate(spans), density

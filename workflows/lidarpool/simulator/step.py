@@ -69,7 +69,11 @@ class Setup:
     @property
     def passing(self) -> bool:
         """Whether light goes on behind a surface, or off it."""
-        return self.mirroring or self.leafy or any(m.transparent == "pass" for m in self.survey.materials)
+        return (
+            self.mirroring
+            or self.leafy
+            or any(m.transparent == "pass" for m in self.survey.materials)
+        )
 
     @property
     def mirroring(self) -> bool:
