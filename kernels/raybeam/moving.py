@@ -106,20 +106,11 @@ def hits_on(
 def near_boxes(
     rays: Floats, times: Floats, boxes: Floats, there: Floats, reach: float
 ) -> tuple[Indices, Indices, int]:
-    """Find cells of rays (6, n) at times (n,) that may meet boxes that stand: by box, then cell.
+    """Find cells of rays (6, n) at times (n,) that may meet boxes that stand, before `reach`.
 
-    Parameters
-    ----------
-    boxes
-        float64 (b, 12): middles, and halves of their sides as vectors.
-    there
-        float64 (b, 2): first and last time when each is there.
-    reach
-        Rays end before.
-
-    Returns
-    -------
-    Numbers of cells and of boxes, (k,) each, and how many rays a cell has.
+    Boxes (b, 12) are middles, and halves of their sides as vectors; each is there from a time to
+    another, (b, 2). Returns numbers of cells and boxes, (k,) each, by box, then cell, and how many
+    rays a cell has.
     """
     from . import moving_loops as loops
 

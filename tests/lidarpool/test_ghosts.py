@@ -10,8 +10,7 @@ from tests.shapes import CPU, beam_along_x, cast, level, made, quad, wall
 from lidarpool import Beams, LidarpoolError, Material, Noise, Returns, Scene, Sensor, Spin, Survey
 from lidarpool.columns.table import CAUSES
 from lidarpool.scene.colours import Colours
-from lidarpool.sensor.materials import fresnel
-from lidarpool.sensor.weather import WATER_INDEX, below_water
+from lidarpool.sensor.materials import WATER_INDEX, below_water, fresnel
 
 COLUMNS = ("range", "reflectivity", "class", "cause", "return_number")
 GHOST = CAUSES.index("ghost")

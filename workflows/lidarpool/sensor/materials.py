@@ -29,6 +29,11 @@ REFLECTANCE = 0.5  # default reflectance: between asphalt (0.1 to 0.2) and white
 # Engineer grade sheeting, ASTM D4956 type I white: 70 cd/lx/m², of a white diffuser 1/π.
 RETRO_GAIN = 220.0
 GLASS_INDEX = 1.5
+# Of water, from 905 to 1550 nm (Hale and Querry 1973: 1.328 to 1.318).
+WATER_INDEX = 1.328
+# Share of diffuse light in water that its surface sends back, 1 - (1 - r) / n², where r is the mean
+# of Fresnel's reflection outside, over a half space (Lekner and Dorf 1988).
+WATER_INWARDS = 0.4702
 NEAREST_M = 1e-3  # energies do not grow below this distance
 NEAR_NM, FAR_NM = 905.0, 1550.0  # wavelengths of the table of reflectances
 POLISHED = 0.04  # share that plastics, paints and wet surfaces reflect at right angles, n = 1.5
@@ -216,8 +221,9 @@ class Material:
             return
         if not self._suits_leaves:
             raise LidarpoolError(
-                "leaf_area_density is for leaves that scatter light: leave out transparent, retro, "
-                "roughness and specular_reflectance, and give reflectance as a number, or a material."
+                "leaf_area_density is for leaves that scatter light: leave out transparent, "
+                "retro, roughness and specular_reflectance, and give reflectance as a number, or a "
+                "material."
             )
 
     @property
@@ -446,18 +452,25 @@ class MaterialTable:
         return back
 
     def goes_on(
-        self, rows: Integers, cosine: Floats, mirrored: Bools, luminance: Floats | None = None
+        self,
+        rows: Integers,
+        cosine: Floats,
+        mirrored: Bools,
+        luminance: Floats | None = None,
+        film: Floats | float = 0.0,
     ) -> Floats:
         """Share of the light that passes through objects (n,), or is mirrored by them.
 
-        Where it is refracted, what the surface mirrors is neither taken off nor alone.
+        Where it is refracted, what the surface mirrors is neither taken off nor alone. A share
+        `film` (n,) of what mirrors is below water.
         """
         first, grazing = self.specular[rows], 1 - np.minimum(cosine, 1.0)
         schlick = first + (first > 0) * (1 - first) * (grazing * np.square(np.square(grazing)))
         mirrors = np.where(self.passes[rows], fresnel(cosine), schlick)
         share = np.where(mirrored, mirrors, np.where(self.passes[rows], 1 - mirrors, 1.0))
         share = np.where(self.refracts[rows], 1.0, share)
-        return np.asarray(np.where(self.leafy[rows], 1, 1 - self.shares(rows, luminance)) * share)
+        share = np.where(self.leafy[rows], 1, 1 - self.shares(rows, luminance)) * share
+        return np.asarray((1 - film) * share + film * fresnel(cosine, WATER_INDEX))
 
 
 def gloss(cosine: Floats, roughness: Floats) -> Floats:
@@ -482,6 +495,17 @@ def fresnel(cosine: Floats, index: float | Floats = GLASS_INDEX) -> Floats:
     across = (cosine - index * inside) / (cosine + index * inside)
     along = (inside - index * cosine) / (inside + index * cosine)
     return np.asarray((across**2 + along**2) / 2)
+
+
+def below_water(cosine: Floats, reflectance: Floats) -> Floats:
+    """Light that matt surfaces below a film of water return, relative to dry ones: (n,).
+
+    ``T² / (n² (1 - p ρ))``: light passes the film's surface twice, with Fresnel's transmittance T;
+    in the water it is spread by n², and the share p is sent back to the ground (Lekner and Dorf
+    1988, Ångström 1925).
+    """
+    through = np.square((1 - fresnel(cosine, WATER_INDEX)) / WATER_INDEX)
+    return np.asarray(through / (1 - WATER_INWARDS * reflectance))
 
 
 def at_right_angles(distance: Any, extinction: float = 0.0) -> Any:

@@ -18,13 +18,8 @@ from ..base.declared import UnitShare, about
 from ..base.elementary import exp, exp_of, geomspace, power
 from ..base.validation import checked_fields
 from ..base.vectors import hypot
-from .materials import REFERENCE_M, extinction, fresnel
+from .materials import REFERENCE_M, WATER_INDEX, extinction
 
-# Index of refraction of water, from 905 to 1550 nm (Hale and Querry 1973: 1.328 to 1.318).
-WATER_INDEX = 1.328
-# Share of diffuse light in water that its surface sends back, 1 - (1 - r) / n², where r is the mean
-# of Fresnel's reflection outside, over a half space (Lekner and Dorf 1988).
-WATER_INWARDS = 0.4702
 RAIN_LARGEST_MM = 6.0  # larger drops break up (Pruppacher and Klett 1997)
 SNOW_DENSITY = 0.1  # of water's: dry snow, between 0.01 and 0.2 (Hahner et al. 2022)
 SNOW_LARGEST_MM = 20.0  # Hahner et al. 2022
@@ -191,11 +186,6 @@ def spray(g_m3: float) -> Particles:
     Drops of 0.2 mm take light from twice their cross-sections. They are in clumps, of which those
     that light meets are taken to be opaque; from an opaque cloud of drops half of the inverse lidar
     ratio returns.
-
-    Examples
-    --------
-    >>> f"{spray(5.0).extinction / LARGE:.3f}"  # 1/m
-    '0.075'
     """
     alpha = LARGE * 1.5e-3 * g_m3 / SPRAY_DROP_MM
     one = Particles(1.0, 1 / CLUMP_MM, CLUMP_LARGEST_MM, math.pi / (2 * DROPS_LIDAR_RATIO_SR))
@@ -213,17 +203,6 @@ def dust(mg_m3: float) -> tuple[float, float]:
     """
     alpha = DUST_M2_G * mg_m3 / 1000
     return alpha, alpha / DUST_LIDAR_RATIO_SR
-
-
-def below_water(cosine: Floats, reflectance: Floats) -> Floats:
-    """What a matt surface below a film of water returns, relative to the dry one: (n,).
-
-    ``T² / (n² (1 - p ρ))``: light passes the film's surface twice, with Fresnel's transmittance T;
-    in the water it is spread by n², and the share p is sent back to the ground (Lekner and Dorf
-    1988, Ångström 1925).
-    """
-    through = np.square((1 - fresnel(cosine, WATER_INDEX)) / WATER_INDEX)
-    return np.asarray(through / (1 - WATER_INWARDS * reflectance))
 
 
 def reach(min_range_m: float, max_range_m: float) -> tuple[float, float]:

@@ -16,9 +16,7 @@ from ..base.arrays import Bools, Bytes, Floats, Integers, Ints, Ints32, UInts32
 from ..base.vectors import into_axes, products
 from ..columns.table import COLOURS
 from ..scene.colours import luminance
-from ..sensor.materials import fresnel
 from ..sensor.noise import Purpose, raw
-from ..sensor.weather import WATER_INDEX
 from .doppler import BLOCK_HITS, approach
 from .media import LightInMedia, Media, Rays, depths
 from .motion import Clock, Poses
@@ -190,29 +188,30 @@ class CastStep(PulseStep):
             hits = PulseReturns(light.ray, distance, triangle, energy, colour, cause, velocity)
             turns = light.turns
             looks = normals if turns is None else into_axes(normals, turns)
-            goes, off = materials.passes[rows], np.zeros(len(rows), np.bool_)
+            goes, mirrors = materials.passes[rows], np.zeros(len(rows), np.bool_)
             if mirrored is not None:
                 smooth = materials.specular[rows] > 0
                 smooth = smooth if film is None else smooth | film
-                off = smooth & (mirrored < MIRRORED_MOST)
+                mirrors = smooth & (mirrored < MIRRORED_MOST)
             if within is not None:  # optical paths are longer than what was cast
                 crowns = materials.leafy[rows]  # whose surfaces send nothing back
                 crowns[leaves] = False
                 near = distance <= farthest
-                goes, off = (goes | crowns) & near, off & near
+                goes, mirrors = (goes | crowns) & near, mirrors & near
                 there = np.flatnonzero(near & ~crowns)
                 hits, looks = hits.take(there), looks[there]
             parts.append(hits)
             seen.append(looks)
-            through, off = np.flatnonzero(goes), np.flatnonzero(off)
-            on = np.concatenate([through, off])
+            through = np.flatnonzero(goes)
+            on = np.concatenate([through, np.flatnonzero(mirrors)])
             if not len(on):
                 break
-            away = np.arange(len(on)) >= len(through)
-            share = self._goes_on(rows[on], np.abs(along[on]), away, *selected((colour, film), on))
-            light = light.on(on)
+            off, light = np.arange(len(on)) >= len(through), light.on(on)
+            bright = luminance(colour[on]) if materials.textured and colour is not None else None
+            water = 0.0 if film is None else self._light.wet * film[on]
+            share = materials.goes_on(rows[on], np.abs(along[on]), off, bright, water)
             light.share = light.share * share**2  # and back again
-            ends = step[on], distance[on], triangle[on], normals[on], along[on], away
+            ends = step[on], distance[on], triangle[on], normals[on], along[on], off
             light, clear = self._behind(
                 light, *ends, None if light.range_rate is None else moved[on]
             )
@@ -239,22 +238,6 @@ class CastStep(PulseStep):
         if parts[1:] or len(hits.ray) != len(ray):  # some light ends beyond the range
             directions = rays[3:].take(hits.ray, axis=1).T
         return hits, (normals, directions)
-
-    def _goes_on(
-        self,
-        rows: Integers,
-        cosine: Floats,
-        off: Bools,
-        colour: UInts32 | None,
-        film: Bools | None,
-    ) -> Floats:
-        """Share of light that passes objects (n,), or goes off them; see `MaterialTable.goes_on`."""
-        materials, wet = self.surfaces.at(self._light.wavelength_nm), self._light.wet
-        bright = luminance(colour) if materials.textured and colour is not None else None
-        share = materials.goes_on(rows, cosine, off, bright)
-        if film is None:
-            return share
-        return np.where(film, (1 - wet) * share + wet * fresnel(cosine, WATER_INDEX), share)
 
     def _behind(
         self,
@@ -303,8 +286,8 @@ class CastStep(PulseStep):
                 range_rate + index * there - (1.0 if within is None else within.index) * back
             )
         own = light.ray, light.times, path.origins, path.directions, share, before
-        mirrored = None if light.mirrored is None else light.mirrored + off
-        return _Light(*own, turns, mirrored, within, range_rate), -away
+        bounces = None if light.mirrored is None else light.mirrored + off
+        return _Light(*own, turns, bounces, within, range_rate), -away
 
     def _velocities(self, light: _Light, step: Floats, triangle: Ints32, poses: Poses) -> Floats:
         """Velocities of where light ends after so many metres, m/s: (n, 3)."""

@@ -1,4 +1,4 @@
-"""Loops over pulses: particles and spray that a beam meets, and the returns that a receiver reports.
+"""Loops over pulses: particles and spray that they meet, and the returns that a receiver reports.
 
 Each is compiled when it is first called. Random numbers are those of `lidarpool.sensor.noise.raw`,
 of which `starts` are the beginnings.
@@ -121,7 +121,8 @@ def crossings(
     """Write beams, and where each enters and leaves a box and the density in it, (3, k).
 
     Cells of `size` rays (6, n) and boxes are as of `raybeam.moving.near_boxes`; boxes last so long,
-    and densities decay by their age over `decay`. Returns how many there are, of which it writes what there is room for.
+    and densities decay by their age over `decay`. Returns how many
+    there are, of which it writes what there is room for.
     """
     count = 0
     for pair in range(len(cell)):
@@ -150,19 +151,6 @@ def crossings(
     return count
 
 
-@inlined
-def _place(places, distance):
-    """Row of the first place that is not before a distance, by halves."""
-    low, high = 0, len(places)
-    while low < high:
-        middle = (low + high) // 2
-        if places[middle] < distance:
-            low = middle + 1
-        else:
-            high = middle
-    return low
-
-
 @compiled()
 def spray(
     k, beam, crossed, each, mean, step, tables, exponential,
@@ -174,26 +162,26 @@ def spray(
     `mean` is how many a beam would meet at a density of 1, of which each row of `tables` has an
     equal share. Writes as `particles` does; returns the first crossing left, and how many.
     """
-    count, row, share, most = 0, 0, mean / tables.shape[1], _CLUMPS
-    while k < len(beam) and count + most <= len(ray):
+    count, row, places = 0, 0, tables[0]
+    while k < len(beam) and count + _CLUMPS <= len(ray):
         this = beam[k]
         row = _scan_of(begins, first + this, row)
         own, number, clump = scan + row, first + this - begins[row], 0
         left = exponential[np.int64(_bits(starts[0], own, number, 0) >> _48)]
         while k < len(beam) and beam[k] == this:
-            rate = crossed[2, k] * share
-            at, end = _place(tables[0], crossed[0, k]), _place(tables[0], crossed[1, k])
-            place = np.float64(at)
-            while rate > 0 and left < (end - place) * rate and clump < most:
+            rate = crossed[2, k] * (mean / len(places))
+            place = np.float64(np.searchsorted(places, crossed[0, k]))
+            end = np.searchsorted(places, crossed[1, k])
+            while left < (end - place) * rate and clump < _CLUMPS:
                 place += left / rate
                 at = np.int64(place)
                 where = this * each
                 if each > 1:
                     where += np.int64(_bits(starts[1], own, number, clump) % np.uint64(each))
-                if tables[0, at] < reach[where]:
+                if places[at] < reach[where]:
                     rank = _uniform(starts[2], own, number, clump) * tables[2, at]
                     diameter = tables[1, at] + step * exponential[np.int64(rank * len(exponential))]
-                    ray[count], distance[count] = where, tables[0, at]
+                    ray[count], distance[count] = where, places[at]
                     energy[count] = each * min(tables[3, at] * diameter * diameter, tables[4, at])
                     count += 1
                 clump += 1

@@ -1,7 +1,7 @@
 """Spray: clumps of drops that vehicles leave behind them on wet ground.
 
-Each vehicle leaves a box of spray in every tenth of a second, as wide and high as itself and as long
-as its way. It stays where it is, and what is in it falls to the ground.
+Each vehicle leaves a box of spray in every tenth of a second, as wide and high as itself, and as
+long as its way. It stays where it is, and what is in it falls to the ground.
 """
 
 from __future__ import annotations
@@ -99,7 +99,7 @@ class SprayStep(PulseStep):
         while row < len(beam):
             out = np.empty(1024 + len(beam), np.int64), *np.empty((2, 1024 + len(beam)))
             row, count = pulse_loops.spray(row, beam, crossed, *tables, *given, *out)
-            parts.append(unreal(returns, *(one[:count] for one in out), SPRAY))
+            parts.append(unreal(returns, out[0][:count], out[1][:count], out[2][:count], SPRAY))
         drawn = joined(parts)
         drawn = drawn.take(np.argsort(drawn.ray, kind="stable"))
         return in_the_air(self.setup, returns, batch, drawn)

@@ -17,9 +17,8 @@ from ..scene.actors import shapes_of
 from ..scene.colours import GREY, Colours, Lookup, joined, luminance, packed
 from ..scene.scene import Scene
 from ..sensor import Sensor, Survey
-from ..sensor.materials import NEAR_NM, Material, MaterialTable, at_right_angles
+from ..sensor.materials import NEAR_NM, Material, MaterialTable, at_right_angles, below_water
 from ..sensor.trajectory import velocities
-from ..sensor.weather import below_water
 from .motion import carried_at
 from .voxels import Grids
 from .ways import Ways
