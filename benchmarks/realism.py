@@ -90,9 +90,10 @@ def cases(scene: Scene, backend: str, counts: tuple[int, ...], sensor: str) -> d
     rows["noise"] = case([], noise=Noise(range_m=0.02))
     noise = Noise(detection_range_m=90)  # without which no weather returns light
     rows |= {name: case([], noise=noise, **options) for name, options in weather.items()}
-    rows["ghosts"] = case([], materials=[Material("*", 0.5, specular_reflectance=0.04)])
-    rows["wet"] = case([], wet=1.0)
     wet = {"noise": noise, "wet": 1.0}
+    paint = [Material("*", 0.5), Material("car-*", 0.5, specular_reflectance=0.04)]
+    rows |= {"ghosts": case([], noise=noise, materials=paint), "wet": case([], **wet)}
+    rows["detection"] = case([], noise=noise)
     rows[f"{some} boxes, wet"] = case(cars(some, plain, some), **wet)
     rows[f"{some} boxes, spray"] = case(cars(some, plain, some), **wet, spray_g_m3=5.0)
     beam = Returns(subrays=7, divergence_mrad=3)

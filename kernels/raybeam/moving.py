@@ -28,6 +28,7 @@ from .scan import Scan
 _CHUNK = 1 << 17  # rays at a time
 _PAIRS = 1 << 14  # of cells and bodies at a time
 _POSES = 1 << 18  # on a device: 25 MB
+_BOXES = 128  # that stand, at a time
 _LOOKS = 128  # cells for each look at the bodies
 
 
@@ -118,8 +119,14 @@ def near_boxes(
     wide = loops.cells_of(rays, times, loops.CELL * loops.WIDE)
     radius = np.sqrt((boxes[:, 3:] ** 2).sum(axis=1))
     sizes = np.column_stack([radius, np.full(len(boxes), loops.PADS_M), there])
-    number = np.zeros((len(cells), 2), np.int64)
-    return *loops.meet(wide, cells, number, boxes[:, None].copy(), sizes, reach), loops.CELL
+    number, looks = np.zeros((len(cells), 2), np.int64), boxes[:, None].copy()
+    parts = [np.zeros((2, 0), np.int64)]
+    for first in range(0, len(boxes), _BOXES):
+        some = slice(first, first + _BOXES)
+        cell, box = loops.meet(wide, cells, number, looks[some], sizes[some], reach)
+        parts.append(np.stack([cell, box + first]))
+    cell, box = np.concatenate(parts, axis=1)
+    return cell, box, loops.CELL
 
 
 class _Chunk:

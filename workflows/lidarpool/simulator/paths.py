@@ -16,7 +16,9 @@ from ..base.arrays import Bools, Bytes, Floats, Integers, Ints, Ints32, UInts32
 from ..base.vectors import into_axes, products
 from ..columns.table import COLOURS
 from ..scene.colours import luminance
+from ..sensor.materials import at_right_angles
 from ..sensor.noise import Purpose, raw
+from ..sensor.weather import FAINTEST
 from .doppler import BLOCK_HITS, approach
 from .media import LightInMedia, Media, Rays, depths
 from .motion import Clock, Poses
@@ -70,6 +72,13 @@ class CastStep(PulseStep):
         filled = table.leafy.any() or table.refracts.any()
         air = self._light.extinction
         self._media = Media(setup.scene, surfaces, table, air) if filled else None
+        # Ghosts that can return less are left out.
+        self._faintest = FAINTEST * setup.noise.threshold
+        every = np.arange(len(table.reflectance))
+        white = np.ones(len(every))
+        self._brightest = float(
+            table.scattered(every, white, white if table.textured else None).max()
+        )
         shown = any(column.name in COLOURS for column in survey.stored_columns)
         self._coloured = shown or surfaces.materials.textured
 
@@ -145,7 +154,7 @@ class CastStep(PulseStep):
             light.range_rate = approach(poses, ray, origins, directions)
         if self.setup.mirroring:
             light.mirrored = np.zeros(len(ray), np.uint8)
-        if self.setup.mirroring or (media is not None and media.bends):
+        if each > 1 and (self.setup.mirroring or (media is not None and media.bends)):
             light.turns = np.broadcast_to(np.eye(3), (len(ray), 3, 3))
         if media is not None:
             left = depths(draw(Purpose.LEAF, ray)) if leafy else None
@@ -206,16 +215,22 @@ class CastStep(PulseStep):
             on = np.concatenate([through, np.flatnonzero(mirrors)])
             if not len(on):
                 break
-            off, light = np.arange(len(on)) >= len(through), light.on(on)
+            off = np.arange(len(on)) >= len(through)
             bright = luminance(colour[on]) if materials.textured and colour is not None else None
             water = 0.0 if film is None else self._light.wet * film[on]
             share = materials.goes_on(rows[on], np.abs(along[on]), off, bright, water)
-            light.share = light.share * share**2  # and back again
+            share = light.share[on] * share**2  # and back again
+            if mirrored is not None and not (within is not None and within.differentials):
+                most = self._brightest * at_right_angles(distance[on], self._light.extinction)
+                some = np.flatnonzero(share * most > self._faintest)
+                on, off, share = on[some], off[some], share[some]
+            light = light.on(on)
+            light.share = share
             ends = step[on], distance[on], triangle[on], normals[on], along[on], off
             light, clear = self._behind(
                 light, *ends, None if light.range_rate is None else moved[on]
             )
-            if mirrored is not None:  # nothing passes where all is mirrored
+            if mirrored is not None and within is not None:  # nothing passes where all is mirrored
                 some = np.flatnonzero(light.share)
                 light, clear = light.on(some), clear[some]
             # Light takes no time: it travels 300 m in a microsecond.
@@ -223,7 +238,7 @@ class CastStep(PulseStep):
             found = self.caster.scan(Pattern(light.directions, light.origins), now, t_max=reach)
             which, step, triangle = found.ray, found.distance, found.triangle
             light, clear = light.on(which), clear[which]
-            if not leafy:
+            if not leafy and farthest < np.inf:
                 within = light.within
                 end = light.before + (step if within is None else within.optical(step))
                 here = np.flatnonzero(end <= farthest)

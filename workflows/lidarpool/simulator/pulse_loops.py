@@ -116,28 +116,33 @@ def fog(
 
 @compiled()
 def crossings(
-    rays, times, size, cell, which, boxes, there, density, lasts, decay, end_m, beam, found
+    rays, times, far, size, cell, which, boxes, there, density, lasts, decay, beam, found
 ):
     """Write beams, and where each enters and leaves a box and the density in it, (3, k).
 
-    Cells of `size` rays (6, n) and boxes are as of `raybeam.moving.near_boxes`; boxes last so long,
-    and densities decay by their age over `decay`. Returns how many
-    there are, of which it writes what there is room for.
+    Beams end at `far` (n,). Cells of `size` rays (6, n) and boxes are as of
+    `raybeam.moving.near_boxes`; boxes last so long, and densities decay by their age over `decay`.
+    Returns how many there are, of which it writes what there is room for.
     """
     count = 0
     for pair in range(len(cell)):
-        b = which[pair]
+        b, radius = which[pair], 0.0
+        for side in range(3, 12):
+            radius += boxes[b, side] * boxes[b, side]
+        begin, end, reach = there[b, 0], there[b, 1], 1.001 * np.sqrt(radius)
+        a, c, d = boxes[b, 0], boxes[b, 1], boxes[b, 2]
         for k in range(cell[pair] * size, min((cell[pair] + 1) * size, len(times))):
-            if not there[b, 0] <= times[k] <= there[b, 1]:
-                continue
-            low, high = 0.0, end_m
+            p, q, r = a - rays[0, k], c - rays[1, k], d - rays[2, k]
+            along = (p * rays[3, k] + q * rays[4, k]) + r * rays[5, k]
+            off = (p * p + q * q) + r * r - along * along
+            if off > reach * reach or along > far[k] + reach or not begin <= times[k] <= end:
+                continue  # it misses the ball around the box
+            low, high = 0.0, far[k]
             for side in range(3, 12, 3):
                 x, y, z = boxes[b, side], boxes[b, side + 1], boxes[b, side + 2]
                 half = (x * x + y * y) + z * z
                 along = (x * rays[3, k] + y * rays[4, k]) + z * rays[5, k]
-                off = (x * (boxes[b, 0] - rays[0, k]) + y * (boxes[b, 1] - rays[1, k])) + z * (
-                    boxes[b, 2] - rays[2, k]
-                )
+                off = (x * p + y * q) + z * r
                 if along != 0:
                     one, other = (off - half) / along, (off + half) / along
                     low, high = max(low, min(one, other)), min(high, max(one, other))
@@ -151,16 +156,26 @@ def crossings(
     return count
 
 
+@inlined
+def _column(coarse, distance):
+    """Column of a place, between those of every 16th."""
+    k = np.searchsorted(coarse, distance)
+    if k == 0 or k == len(coarse):
+        return 16.0 * (k - (k > 0))
+    return 16 * (k - (coarse[k] - distance) / (coarse[k] - coarse[k - 1]))
+
+
 @compiled()
 def spray(
-    k, beam, crossed, each, mean, step, tables, exponential,
+    k, beam, crossed, each, mean, step, tables, coarse, exponential,
     starts, scan, begins, first, reach, ray, distance, energy,
 ):  # fmt: skip
     """Draw the clumps of spray that beams meet in boxes, from crossing `k` on, while there is room.
 
     Crossings (3, k) are in the order of beams. Depths between clumps are exponentially distributed;
-    `mean` is how many a beam would meet at a density of 1, of which each row of `tables` has an
-    equal share. Writes as `particles` does; returns the first crossing left, and how many.
+    `mean` is how many a beam would meet at a density of 1, of which each column of `tables` has an
+    equal share, and `coarse` every 16th of their places. Writes as `particles` does; returns the
+    first crossing left, and how many.
     """
     count, row, places = 0, 0, tables[0]
     while k < len(beam) and count + _CLUMPS <= len(ray):
@@ -170,8 +185,7 @@ def spray(
         left = exponential[np.int64(_bits(starts[0], own, number, 0) >> _48)]
         while k < len(beam) and beam[k] == this:
             rate = crossed[2, k] * (mean / len(places))
-            place = np.float64(np.searchsorted(places, crossed[0, k]))
-            end = np.searchsorted(places, crossed[1, k])
+            place, end = _column(coarse, crossed[0, k]), _column(coarse, crossed[1, k])
             while left < (end - place) * rate and clump < _CLUMPS:
                 place += left / rate
                 at = np.int64(place)
