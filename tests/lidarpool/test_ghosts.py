@@ -129,7 +129,7 @@ def test_ghosts_of_textures_take_what_the_colours_leave():
         ({"specular_reflectance": 1.5}, "0 to 1, or fresnel"),
         ({"specular_reflectance": "fresnel"}, "give fresnel for what light passes, else 0 to 1"),
         ({"specular_reflectance": 0.1, "transparent": "pass"}, "give fresnel for what light"),
-        ({"specular_reflectance": 0.1, "roughness": 0.5}, "give one of them"),
+        ({"specular_reflectance": 0.1, "roughness": 0.5}, "without retro and specular_reflectance"),
         ({"specular_reflectance": 0.1, "leaf_area_density": 1.0}, "leave out"),
         ({"transparent": "mirror"}, "transparent"),
     ],

@@ -256,7 +256,7 @@ def test_clumps_of_spray_are_those_of_the_twin(each):
     begun = starts(9, Purpose.SPRAY, Purpose.SPRAY_SUBRAY, Purpose.SPRAY_DIAMETER)
     given = begun, KEYS.scan, KEYS.begins, FIRST, far
     out, clumps, left = (np.empty(4000, np.int64), *np.empty((2, 4000))), [], []
-    table = each, mean, 1 / kind.slope, tables, tables[0, ::16].copy(), exponential()
+    table = each, mean, 1 / kind.slope, tables, exponential()
     stop, many = pulse_loops.spray(0, beam, crossed, *table, *given, *out)
     assert stop == len(beam) and many > 300
     for pulse in range(count):

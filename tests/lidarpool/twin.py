@@ -232,14 +232,6 @@ def particle(kind: Particles, air: Air, threshold: float, distance: float, rank:
 Boxes = list[tuple[float, ...]]  # of spray: where a beam enters and leaves each, and its density
 
 
-def column(coarse: Floats, distance: float) -> float:
-    """Column of a range in a table, of which every 16th range is given."""
-    k = int((coarse < distance).sum())
-    if k in (0, len(coarse)):
-        return float(16 * max(k - 1, 0))
-    return float(16 * (k - (coarse[k] - distance) / (coarse[k] - coarse[k - 1])))
-
-
 def clumps(
     kind: Particles, air: Air, threshold: float, seed: int, key: Key, reach: list[float],
     boxes: Boxes, table: tuple[float, Floats],
@@ -257,7 +249,7 @@ def clumps(
     left = depth()
     for low, high, density in boxes:
         rate = density * (mean / len(ranges))
-        place, end = (column(ranges[::16], one) for one in (low, high))
+        place, end = (float((ranges < one).sum()) for one in (low, high))
         while left < (end - place) * rate:
             place += left / rate
             distance = float(ranges[int(place)])

@@ -190,27 +190,21 @@ class Material:
 
         if self.roughness is None and self.metalness:
             raise LidarpoolError("metalness needs a roughness: give 0.1 (polished) to 1 (matt).")
-        if self.roughness is not None and (self.retro or self.transparent != "none"):
-            raise LidarpoolError("roughness is for opaque surfaces that are not retro-reflective.")
-        self._check_specular()
+        smooth = self.transparent != "none" or self.specular_reflectance is not None
+        if self.roughness is not None and (self.retro or smooth):
+            raise LidarpoolError(
+                "roughness is for opaque surfaces without retro and specular_reflectance."
+            )
         self._check_within()
 
-    def _check_specular(self) -> None:
-        """Refuse mirrors that other values contradict."""
-        if self.specular_reflectance is None:
-            return
-        if (self.transparent == "pass") != (self.specular_reflectance == "fresnel"):
-            raise LidarpoolError(
-                f"specular_reflectance is {self.specular_reflectance!r} with transparent: "
-                f"{self.transparent}; give fresnel for what light passes, else 0 to 1."
-            )
-        if self.roughness is not None:
-            raise LidarpoolError(
-                "roughness and specular_reflectance are two kinds of gloss: give one of them."
-            )
-
     def _check_within(self) -> None:
-        """Refuse what contradicts the medium within a surface."""
+        """Refuse what contradicts the medium within a surface, or the light that passes it."""
+        mirrors = self.specular_reflectance
+        if mirrors is not None and (mirrors == "fresnel") != (self.transparent == "pass"):
+            raise LidarpoolError(
+                f"specular_reflectance is {mirrors!r} with transparent: {self.transparent}; give "
+                "fresnel for what light passes, else 0 to 1."
+            )
         if self.refractive_index is not None and self.transparent != "pass":
             raise LidarpoolError(
                 "refractive_index is for light that passes: add transparent: pass."
@@ -260,10 +254,8 @@ class Material:
 
     @property
     def specular(self) -> float:
-        """Share of what is not scattered that is mirrored at right angles."""
-        if self.specular_reflectance == "fresnel":
-            return float(fresnel(np.ones(1), self.refractive_index or GLASS_INDEX)[0])
-        return self.specular_reflectance or 0.0
+        """Share of what is not scattered that is mirrored at right angles; 1 for "fresnel"."""
+        return float(self.specular_reflectance == "fresnel" or self.specular_reflectance or 0)
 
     def named(self, name: str) -> bool:
         """Whether this material applies to an object."""
@@ -455,21 +447,21 @@ class MaterialTable:
         self,
         rows: Integers,
         cosine: Floats,
-        mirrored: Bools,
-        luminance: Floats | None = None,
-        film: Floats | float = 0.0,
+        off: Bools,
+        bright: Floats | None,
+        film: Floats | float,
     ) -> Floats:
-        """Share of the light that passes through objects (n,), or is mirrored by them.
+        """Share of the light that passes through objects (n,), or goes `off` them.
 
         Where it is refracted, what the surface mirrors is neither taken off nor alone. A share
-        `film` (n,) of what mirrors is below water.
+        `film` (n,) is below water; `bright` is the luminance, see `scattered`.
         """
         first, grazing = self.specular[rows], 1 - np.minimum(cosine, 1.0)
         schlick = first + (first > 0) * (1 - first) * (grazing * np.square(np.square(grazing)))
         mirrors = np.where(self.passes[rows], fresnel(cosine), schlick)
-        share = np.where(mirrored, mirrors, np.where(self.passes[rows], 1 - mirrors, 1.0))
+        share = np.where(off, mirrors, np.where(self.passes[rows], 1 - mirrors, 1.0))
         share = np.where(self.refracts[rows], 1.0, share)
-        share = np.where(self.leafy[rows], 1, 1 - self.shares(rows, luminance)) * share
+        share = np.where(self.leafy[rows], 1, 1 - self.shares(rows, bright)) * share
         return np.asarray((1 - film) * share + film * fresnel(cosine, WATER_INDEX))
 
 

@@ -183,9 +183,8 @@ def snow(mm_h: float) -> Particles:
 def spray(g_m3: float) -> Particles:
     """Make clumps of drops behind a vehicle, by the mass of the water.
 
-    Drops of 0.2 mm take light from twice their cross-sections. They are in clumps, of which those
-    that light meets are taken to be opaque; from an opaque cloud of drops half of the inverse lidar
-    ratio returns.
+    Drops take light from twice their cross-sections. They are in clumps that are taken to be
+    opaque; from an opaque cloud of drops half of the inverse lidar ratio returns.
     """
     alpha = LARGE * 1.5e-3 * g_m3 / SPRAY_DROP_MM
     one = Particles(1.0, 1 / CLUMP_MM, CLUMP_LARGEST_MM, math.pi / (2 * DROPS_LIDAR_RATIO_SR))

@@ -411,8 +411,7 @@ class LightInMedia:
         Returns
         -------
         Directions behind them (n, 3), shares of light that pass, or are mirrored where light is
-        refracted (n,), and whether all is reflected. Of what is reflected, directions are as if
-        there were no surface; where all is, without a mirror, so are shares.
+        refracted (n,), and whether all is reflected, with directions as if there were no surface.
         """
         before, self.around = self.around, self.media.behind(self.around, objects, triangles, along)
         if self.differentials is None:

@@ -74,11 +74,8 @@ class CastStep(PulseStep):
         self._media = Media(setup.scene, surfaces, table, air) if filled else None
         # Ghosts that can return less are left out.
         self._faintest = FAINTEST * setup.noise.threshold
-        every = np.arange(len(table.reflectance))
-        white = np.ones(len(every))
-        self._brightest = float(
-            table.scattered(every, white, white if table.textured else None).max()
-        )
+        white = np.ones(len(table.reflectance))
+        self._brightest = float(table.scattered(np.arange(len(white)), white, white).max())
         shown = any(column.name in COLOURS for column in survey.stored_columns)
         self._coloured = shown or surfaces.materials.textured
 
@@ -199,8 +196,7 @@ class CastStep(PulseStep):
             looks = normals if turns is None else into_axes(normals, turns)
             goes, mirrors = materials.passes[rows], np.zeros(len(rows), np.bool_)
             if mirrored is not None:
-                smooth = materials.specular[rows] > 0
-                smooth = smooth if film is None else smooth | film
+                smooth = (materials.specular[rows] > 0) | (False if film is None else film)
                 mirrors = smooth & (mirrored < MIRRORED_MOST)
             if within is not None:  # optical paths are longer than what was cast
                 crowns = materials.leafy[rows]  # whose surfaces send nothing back
@@ -230,9 +226,6 @@ class CastStep(PulseStep):
             light, clear = self._behind(
                 light, *ends, None if light.range_rate is None else moved[on]
             )
-            if mirrored is not None and within is not None:  # nothing passes where all is mirrored
-                some = np.flatnonzero(light.share)
-                light, clear = light.on(some), clear[some]
             # Light takes no time: it travels 300 m in a microsecond.
             now = Poses(np.zeros(3), clock=Clock(light.times, np.zeros(1), poses.ways))
             found = self.caster.scan(Pattern(light.directions, light.origins), now, t_max=reach)

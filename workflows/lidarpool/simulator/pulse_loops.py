@@ -156,26 +156,16 @@ def crossings(
     return count
 
 
-@inlined
-def _column(coarse, distance):
-    """Column of a place, between those of every 16th."""
-    k = np.searchsorted(coarse, distance)
-    if k == 0 or k == len(coarse):
-        return 16.0 * (k - (k > 0))
-    return 16 * (k - (coarse[k] - distance) / (coarse[k] - coarse[k - 1]))
-
-
 @compiled()
 def spray(
-    k, beam, crossed, each, mean, step, tables, coarse, exponential,
+    k, beam, crossed, each, mean, step, tables, exponential,
     starts, scan, begins, first, reach, ray, distance, energy,
 ):  # fmt: skip
     """Draw the clumps of spray that beams meet in boxes, from crossing `k` on, while there is room.
 
     Crossings (3, k) are in the order of beams. Depths between clumps are exponentially distributed;
     `mean` is how many a beam would meet at a density of 1, of which each column of `tables` has an
-    equal share, and `coarse` every 16th of their places. Writes as `particles` does; returns the
-    first crossing left, and how many.
+    equal share. Writes as `particles` does; returns the first crossing left, and how many.
     """
     count, row, places = 0, 0, tables[0]
     while k < len(beam) and count + _CLUMPS <= len(ray):
@@ -185,7 +175,8 @@ def spray(
         left = exponential[np.int64(_bits(starts[0], own, number, 0) >> _48)]
         while k < len(beam) and beam[k] == this:
             rate = crossed[2, k] * (mean / len(places))
-            place, end = _column(coarse, crossed[0, k]), _column(coarse, crossed[1, k])
+            place = np.float64(np.searchsorted(places, crossed[0, k]))
+            end = np.searchsorted(places, crossed[1, k])
             while left < (end - place) * rate and clump < _CLUMPS:
                 place += left / rate
                 at = np.int64(place)

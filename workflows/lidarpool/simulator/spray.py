@@ -56,12 +56,8 @@ class SprayStep(PulseStep):
         self._materials = surfaces.at(sensor.optics.wavelength_nm)
         self._begun = starts(noise.seed, *self.purposes)
         # Of each actor the lowest corner of its mesh, and halves of its sides: (a, 2, 3).
-        corners = [
-            (mesh.min(axis=0), mesh.max(axis=0))
-            for mesh in (actor.mesh.vertices for actor in setup.scene.actors)
-        ]
-        low, high = np.array(corners).transpose(1, 0, 2)
-        self._sizes = np.stack([low, (high - low) / 2], axis=1)
+        meshes = [actor.mesh.vertices for actor in setup.scene.actors]
+        self._sizes = np.array([(one.min(axis=0), np.ptp(one, axis=0) / 2) for one in meshes])
         self._raising = [n for n, actor in enumerate(setup.scene.actors) if actor.spray]
 
     @staticmethod
@@ -96,8 +92,7 @@ class SprayStep(PulseStep):
         pulse_loops.veil(beam, crossed, each, self._extinction, far, ray, returns.distance, energy)
         batch.hits = returns = returns._replace(energy=energy)
         given = self._begun, keys.scan, np.array(keys.begins, np.int64), batch.start, far
-        mean, table = self._seen
-        tables = each, mean, self._step, table, table[0, ::16].copy(), exponential()
+        tables = each, self._seen[0], self._step, self._seen[1], exponential()
         while row < len(beam):
             out = np.empty(1024 + len(beam), np.int64), *np.empty((2, 1024 + len(beam)))
             row, count = pulse_loops.spray(row, beam, crossed, *tables, *given, *out)

@@ -69,11 +69,8 @@ class Setup:
     @property
     def passing(self) -> bool:
         """Whether light goes on behind a surface, or off it."""
-        return (
-            self.mirroring
-            or self.leafy
-            or any(m.transparent == "pass" for m in self.survey.materials)
-        )
+        glass = any(m.transparent == "pass" for m in self.survey.materials)
+        return glass or self.mirroring or self.leafy
 
     @property
     def mirroring(self) -> bool:
