@@ -225,6 +225,7 @@ def test_drops_in_an_open_sky_have_a_velocity():
     """Where no ray of all that are cast together hits a surface."""
     drops = np.full(5, -1, np.int32)
     air = PulseReturns(np.arange(5), np.full(5, 3.0), drops, np.ones(5), velocity=np.full(5, -2.0))
+    air = air._replace(cause=np.full(5, AIR, np.uint8))
     none = np.zeros(0)
     hits = PulseReturns(np.zeros(0, int), none, np.zeros(0, np.int32), none, velocity=none)
     assert separated(hits, 0.5, air=air).velocity.tolist() == [-2.0] * 5
