@@ -2,9 +2,10 @@
 
 One sweep of an OS1-64 in a city of 100,000 triangles, one thread: bare, with cars that move (boxes,
 and meshes of 1,000 triangles), from a sensor that moves too, with sub-rays, with noise, with errors
-that last, with lost returns, with saturation, in rain, fog and snow; cars, sub-rays, noise and rain
-together (`real`), and all of it; and as turns of a survey, with all kinds of faults and without.
-Each figure is the median of the rounds, and a multiple of the bare sweep's.
+that last, with lost returns, with saturation, in rain, fog and snow, with ghosts, on wet ground,
+with spray; cars, sub-rays, noise and rain together (`real`), and all of it; and as turns of a
+survey, with all kinds of faults and without. Each figure is the median of the rounds, and a
+multiple of the bare sweep's.
 """
 
 from __future__ import annotations
@@ -16,7 +17,18 @@ from typing import Any
 
 import numpy as np
 
-from lidarpool import Actor, Fault, Noise, Returns, Scanner, Scene, Survey, Track, load_sensor
+from lidarpool import (
+    Actor,
+    Fault,
+    Material,
+    Noise,
+    Returns,
+    Scanner,
+    Scene,
+    Survey,
+    Track,
+    load_sensor,
+)
 from lidarpool.scene.actors import box
 from lidarpool.scene.generated.city import city
 from lidarpool.scene.scene_mesh import SceneMesh
@@ -108,6 +120,11 @@ def cases(scene: Scene, backend: str, counts: tuple[int, ...], sensor: str) -> d
     rows["detection"] = case([], noise=noise)
     rows["saturation"] = case([], noise=Noise(detection_range_m=90, saturation=100))
     rows |= {name: case([], noise=noise, **options) for name, options in weather.items()}
+    wet = {"noise": noise, "wet": 1.0}
+    paint = [Material("*", 0.5), Material("car-*", 0.5, specular_reflectance=0.04)]
+    rows |= {"ghosts": case([], noise=noise, materials=paint), "wet": case([], **wet)}
+    rows[f"{some} boxes, wet"] = case(cars(some, plain, some), **wet)
+    rows[f"{some} boxes, spray"] = case(cars(some, plain, some), **wet, spray_g_m3=5.0)
     beam = Returns(subrays=7, divergence_mrad=3)
     real = {"noise": Noise(detection_range_m=90, range_m=0.02), "returns": beam}
     rows["real"] = case(cars(some, plain, some), **real, **weather["rain"])

@@ -1,7 +1,8 @@
 """Draws the pictures of docs/effects.md, and measures what each effect costs.
 
 Each module beside this one has `DRAWS`, the name of its picture, `picture(path)`, which draws it,
-and `on(survey)`, the same survey with the effect. The survey stands in a street; the time of stage
+and `on(survey)`, the same survey with the effect, and maybe `of(scene)`, which adds what moves
+with and without it. The survey stands in a street; the time of stage
 2 with the effect is compared with the time without, in turns.
 
     python -m benchmarks.effects [--only rain] [--pictures docs/images] [--json out.json]
@@ -55,13 +56,15 @@ def seconds(rig: Rig, scans: int) -> float:
 def costs(found: dict[str, ModuleType], rounds: int = ROUNDS) -> dict[str, float]:
     """Time of stage 2 with each effect, relative to that without: the median of some rounds."""
     scene, without = city(20_000), survey_without()
-    surveys = {name: module.on(without) for name, module in found.items()}
-    plain = Rig(scene, without)
-    rigs = {name: Rig(scene, survey) for name, survey in surveys.items()}
+    plain, rigs = Rig(scene, without), {}
+    for name, module in found.items():
+        moving = module.of(scene) if hasattr(module, "of") else None
+        bare = plain if moving is None else Rig(moving, without)
+        rigs[name] = Rig(moving or scene, module.on(without)), bare
     ratios: dict[str, list[float]] = {name: [] for name in rigs}
     for number in range(rounds + 1):
-        for name, rig in rigs.items():
-            ratio = seconds(rig, rig.survey.scan_count) / seconds(plain, without.scan_count)
+        for name, (rig, bare) in rigs.items():
+            ratio = seconds(rig, rig.survey.scan_count) / seconds(bare, without.scan_count)
             if number:  # the first compiles and fills caches
                 ratios[name].append(ratio)
     return {name: statistics.median(some) for name, some in ratios.items()}

@@ -44,6 +44,14 @@ def turning(firings: int, rate_hz: float = 10.0, clockwise: bool = False) -> Sen
     return Sensor(Beams(np.zeros(1)), head, 0.5, 150.0, optics=optics)
 
 
+def cloud(scene: Scene, survey: Survey) -> dict[str, NDArray[Any]]:
+    """Causes and positions of all points of a survey."""
+    found = list(Rig(scene, survey).cast(0, survey.scan_count))
+    causes = [np.zeros(len(b)) if b.found.cause is None else b.found.cause for b in found]
+    places = np.concatenate([b.positions for b in found])
+    return {"cause": np.concatenate(causes), **dict(zip("xyz", places.T, strict=True))}
+
+
 def points(meshes: list[SceneMesh], survey: Survey) -> dict[str, NDArray[Any]]:
     """Cast all scans of a survey: {column: values}."""
     rig = Rig(Scene.from_meshes(meshes), survey, "numpy")

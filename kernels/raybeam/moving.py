@@ -28,6 +28,7 @@ from .scan import Scan
 _CHUNK = 1 << 17  # rays at a time
 _PAIRS = 1 << 14  # of cells and bodies at a time
 _POSES = 1 << 18  # on a device: 25 MB
+_BOXES = 128  # that stand, at a time
 _LOOKS = 128  # cells for each look at the bodies
 
 
@@ -101,6 +102,31 @@ def hits_on(
             rays = np.ascontiguousarray(scan.rays_out[:, start:stop])
         _Chunk(loops, moving, scan, rays, times(ray), found.part(start, stop)).cast()
     return found
+
+
+def near_boxes(
+    rays: Floats, times: Floats, boxes: Floats, there: Floats, reach: float
+) -> tuple[Indices, Indices, int]:
+    """Find cells of rays (6, n) at times (n,) that may meet boxes that stand, before `reach`.
+
+    Boxes (b, 12) are middles, and halves of their sides as vectors; each is there from a time to
+    another, (b, 2). Returns numbers of cells and boxes, (k,) each, by box, then cell, and how many
+    rays a cell has.
+    """
+    from . import moving_loops as loops
+
+    cells = loops.cells_of(rays, times, loops.CELL)
+    wide = loops.cells_of(rays, times, loops.CELL * loops.WIDE)
+    radius = np.sqrt((boxes[:, 3:] ** 2).sum(axis=1))
+    sizes = np.column_stack([radius, np.full(len(boxes), loops.PADS_M), there])
+    number, looks = np.zeros((len(cells), 2), np.int64), boxes[:, None].copy()
+    parts = [np.zeros((2, 0), np.int64)]
+    for first in range(0, len(boxes), _BOXES):
+        some = slice(first, first + _BOXES)
+        cell, box = loops.meet(wide, cells, number, looks[some], sizes[some], reach)
+        parts.append(np.stack([cell, box + first]))
+    cell, box = np.concatenate(parts, axis=1)
+    return cell, box, loops.CELL
 
 
 class _Chunk:

@@ -10,6 +10,7 @@ import pytest
 from tests.shapes import box, made, quad, wall
 
 from lidarpool import (
+    Actor,
     Beams,
     LidarpoolError,
     Material,
@@ -21,11 +22,13 @@ from lidarpool import (
     Sensor,
     Spin,
     Survey,
+    Track,
 )
 from lidarpool.columns.table import CAUSES
+from lidarpool.scene.actors import box as cuboid
 from lidarpool.scene.scene_mesh import SceneMesh
 from lidarpool.sensor.materials import extinction
-from lidarpool.sensor.weather import EXIT_M, dust, rain, snow
+from lidarpool.sensor.weather import EXIT_M, dust, rain, snow, spray
 from lidarpool.simulator.air import highest
 from lidarpool.simulator.rig import Rig
 
@@ -38,6 +41,7 @@ NOTHING = SceneMesh(
 )
 COLUMNS = ("ray", "range", "intensity", "reflectance", "return_number", "cause", "class")
 AIR = CAUSES.index("air")
+OPTICS = Optics(divergence_mrad=1000 * DIVERGENCE)
 
 
 def beams(rays=20_000, max_range_m=200.0, min_range_m=0.5, **optics):
@@ -209,6 +213,83 @@ def test_a_road_in_the_snow_is_one_return_of_a_beam_that_grazes_it():
     assert len(on_road) == len(np.unique(on_road))
 
 
+# -- spray -----------------------------------------------------------------------------------------
+
+SPRAY = CAUSES.index("spray")
+WET = {"wet": 0.5, "spray_g_m3": 200.0}
+SPEED = 20.0
+
+
+def car(way=None, spray=True, place=(8.0, 5.0, -0.7), speed=SPEED, size=(4, 2, 1.5)):
+    """A car whose rear is 3 m to the left of the sensor's beams, and that drives to the left."""
+    if way is None:
+        turn = [0, 0, math.sqrt(0.5), math.sqrt(0.5)]
+        ends = [place, (place[0], place[1] + 2 * speed, place[2])]
+        way = Track([0, 2], ends, [turn, turn], beyond="hold")
+    return Actor(cuboid("Car", size), way, spray)
+
+
+def sprayed(actor, meshes=(NOTHING,), backend="numpy", sensor=None, **options):
+    scene = Scene.from_meshes(meshes).with_actors([actor])
+    return made(survey_of(sensor, **{**WET, **options}), scene, backend)
+
+
+def test_numbers_of_returns_from_spray():
+    """Two boxes of a tenth of a second behind the car, 2 m wide, are crossed in one of them."""
+    count = 50_000
+    found = sprayed(car(), sensor=beams(count))
+    assert (found["cause"] == SPRAY).all() and (found["object"] == -1).all()
+    kind = spray(200.0)
+    dense = 0.5 * (SPEED / 25) ** 2 * math.exp(-0.2 / 0.4)  # it left what is 3 m behind 0.2 s ago
+    edges = np.linspace(7, 9, 5)
+    given = kind.number * dense, kind.slope, kind.largest, kind.reflectance
+    means = count * expected(*given, 0, edges)
+    counts, _ = np.histogram(found["range"], edges)
+    assert counts.sum() > len(found["range"]) - 20, "in the box, but for rounding"
+    assert (np.abs(counts - means) <= 4 * np.sqrt(means)).all(), (counts, means)
+    assert means.sum() > 1000
+    each = np.bincount(found["ray"], minlength=count)
+    assert each.var() == pytest.approx(each.mean(), rel=0.05), "Poisson's"
+
+
+def test_spray_takes_light_from_what_is_behind_it():
+    dense = 0.5 * (SPEED / 25) ** 2 * math.exp(-0.2 / 0.4)
+    with_spray, without = (sprayed(car(spray=on), [wall("W", 20)]) for on in (True, False))
+    behind = with_spray["intensity"][with_spray["cause"] == 0]
+    alpha = 3 * 0.2 / 0.2 * dense  # 3 M / (1000 kg/m³ d), 0.2 kg/m³, d in mm
+    assert behind / without["intensity"][0] == pytest.approx(math.exp(-2 * alpha * 2), rel=1e-5)
+    assert (without["cause"] == 0).all()
+    before = sprayed(car(), [wall("W", 6)])
+    assert same(before, sprayed(car(spray=False), [wall("W", 6)])), "nor does any return"
+
+
+def test_spray_lies_where_the_car_was():
+    """On a circle of 10 m around the sensor, behind the car and within its width."""
+    turns = np.radians(np.arange(0, 181, 3.0))
+    places = 10 * np.column_stack([np.cos(turns), np.sin(turns), 0 * turns - 0.07])
+    facing = [[0, 0, math.sin(a / 2), math.cos(a / 2)] for a in turns + math.pi / 2]
+    way = Track(turns, places, facing, smooth=True, beyond="hold")  # 10 m/s
+    around = Sensor(
+        Beams(np.radians([0, 3])), Spin(3600, 360), 0.5, 60, optics=OPTICS, start_ns=1.5e9
+    )
+    found = sprayed(car(way), sensor=around, spray_g_m3=1000.0, columns=(*COLUMNS, "azimuth"))
+    some = found["cause"] == SPRAY
+    angle, far = np.radians(found["azimuth"][some]), found["range"][some]
+    assert some.sum() > 100 and (np.abs(far - 10) < 1.2).all()
+    assert angle.max() < 1.5 and angle.min() < 0.8, "the car is at 1.5 rad and later"
+
+
+@pytest.mark.parametrize("options", [{"speed": 2.0}, {"spray": False}])
+def test_no_spray_behind_who_walks_or_raises_none(options):
+    dry = sprayed(car(**options), [wall("W", 20)], spray_g_m3=0.0)
+    assert same(sprayed(car(**options), [wall("W", 20)]), dry)
+
+
+def test_a_flat_actor_raises_no_spray():
+    with pytest.raises(LidarpoolError, match="is flat: give it a mesh"):
+        sprayed(car(size=(4, 2, 0)))
+
+
 # -- fog and dust ----------------------------------------------------------------------------------
 
 
@@ -325,6 +406,9 @@ def test_what_is_no_surface_is_grey_and_of_no_class():
         ({"rain_mm_h": 5, "noise": Noise()}, r"need noise\.detection_range_m"),
         ({"dust_mg_m3": 5, "noise": Noise()}, r"need noise\.detection_range_m"),
         ({"snow_mm_h": -1}, "snow_mm_h"),
+        ({"spray_g_m3": 5}, "give wet as well"),
+        ({**WET, "noise": Noise()}, r"need noise\.detection_range_m"),
+        ({"wet": 2}, "wet"),
         (
             {"rain_mm_h": 5, "sensor": beams(divergence_mrad=None), "returns": Returns()},
             r"returns\.divergence_mrad",

@@ -155,7 +155,7 @@ def test_a_mirror_that_moves_counts_twice():
     sensor = Sensor.grid(180, 3, 20.0, step_deg=360)
     survey = Survey(
         sensor, poses=[(0, 0, 0)], steps=1, columns=["radial_velocity"],
-        materials=[Material("*"), Material("Mirror", transparent="mirror", reflectance=0.0)],
+        materials=[Material("*"), Material("Mirror", specular_reflectance=1)],
     )  # fmt: skip
     scene = Scene.from_meshes([behind]).with_actors([mirror])
     returns = found_of(Rig(scene, survey, "numpy"))
@@ -225,6 +225,7 @@ def test_drops_in_an_open_sky_have_a_velocity():
     """Where no ray of all that are cast together hits a surface."""
     drops = np.full(5, -1, np.int32)
     air = PulseReturns(np.arange(5), np.full(5, 3.0), drops, np.ones(5), velocity=np.full(5, -2.0))
+    air = air._replace(cause=np.full(5, AIR, np.uint8))
     none = np.zeros(0)
     hits = PulseReturns(np.zeros(0, int), none, np.zeros(0, np.int32), none, velocity=none)
     assert separated(hits, 0.5, air=air).velocity.tolist() == [-2.0] * 5

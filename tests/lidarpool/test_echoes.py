@@ -24,6 +24,7 @@ from tests.shapes import (
 )
 
 from lidarpool import (
+    Actor,
     Beams,
     LidarpoolError,
     Material,
@@ -34,7 +35,9 @@ from lidarpool import (
     Sensor,
     Spin,
     Survey,
+    Track,
 )
+from lidarpool.scene.actors import box as cuboid
 from lidarpool.scene.scene_mesh import SceneMesh
 from lidarpool.scene.shapes import seed_objects
 from lidarpool.sensor.materials import extinction, fresnel
@@ -195,14 +198,14 @@ def test_a_mirror_shows_what_is_reflected_at_the_unfolded_range(subrays, backend
     """A mirror at 45 degrees turns the beam up, to a ceiling 3 m above."""
     mirror = quad("Mirror", (2, -9, -2), (2, 9, -2), (6, 9, 2), (6, -9, 2))
     meshes = [mirror, level("Ceiling", 3, 9)]
-    materials = [Material("*"), Material("Mirror", transparent="mirror")]
+    materials = [Material("*"), Material("Mirror", specular_reflectance=1)]
     beam = Returns(subrays=subrays, divergence_mrad=1)
     found = cast(meshes, materials=materials, returns=beam, backend=backend)
     assert found["object"].tolist() == [1]
     assert found["range"] == pytest.approx([7], abs=1e-4)
     assert found["reflectance"] == pytest.approx([0.5], rel=1e-4)
     assert np.allclose(found["batch"].positions, [[7, 0, 0]], atol=1e-4), "behind the mirror"
-    everywhere = [Material("*", transparent="mirror")]
+    everywhere = [Material("*", specular_reflectance=1)]
     assert not len(cast([wall("A", 4), wall("B", -4)], materials=everywhere)["range"]), "given up"
 
 
@@ -258,11 +261,14 @@ ALL_ON = {
     "materials": [
         Material("*", 0.4, semantic_class=1),
         Material("V*", 0.1, transparent="pass"),
-        Material("Sphere", transparent="mirror"),
+        Material("Sphere", specular_reflectance=1),
+        Material("Bowl", 0.3, specular_reflectance=0.3),
     ],
+    "wet": 0.6,
     "returns": Returns("dual", subrays=7, divergence_mrad=20, pulse_ns=2),
     "noise": Noise(0.02, 0.001, 0.05, 0.1, 40, seed=5),
     "visibility_km": 0.5,
+    "spray_g_m3": 500,
 }
 NOISE_ONLY = {"noise": Noise(0.02, 0.001, 0.05, seed=5)}
 BEAMS = Beams(
@@ -279,7 +285,9 @@ TURNED = {"poses": (Pose((0, 0, 1), 10, 5, -3), Pose((3, -2, 2)))}
 def test_batches_and_chunks_leave_no_trace(options, path, per_turn, monkeypatch):
     sensor = Sensor(BEAMS, Spin(per_turn, step_deg=30, rate_hz=10), 0.5, 40)
     survey = Survey(sensor, steps=14, keep_every=3, columns=COLUMNS, **options, **path)
-    scene = Scene.from_meshes(seed_objects(rings=8, segments=12))
+    way = Track([-1, 9], [(-12, 2, 0), (88, 2, 0)], start_s=0, beyond="hold")
+    car = Actor(cuboid("Car", (1, 1, 1)), way)
+    scene = Scene.from_meshes(seed_objects(rings=8, segments=12)).with_actors([car])
     rig = Rig(scene, survey, "numpy")
     whole = cast_between(rig, survey, [0, 28])
     assert len(whole[0]["x"]) > 200

@@ -80,6 +80,9 @@ SURVEYS = {
         **STILL,
         materials=[*HALF, Material("Ball", 0.5, transparent="pass", refractive_index=1.33)],
     ),
+    "ghosts": Survey(
+        MANY, **STILL, **EVERY, materials=[Material("*", 0.5, specular_reflectance=0.3)]
+    ),
     "false alarms": Survey(ALERT, **STILL, noise=Noise(**FAINT, false_alarm_hz=1e6), **EVERY),
     "stray light": Survey(ALERT, **WAY, noise=Noise(**FAINT, stray_light=1e-5), **SIGN),
     "saturation": Survey(MANY, **STILL, noise=Noise(**FAINT, saturation=10), materials=HALF),

@@ -179,7 +179,7 @@ def test_no_ray_meets_an_actor_that_is_not_asked_about_it(street, monkeypatch, n
         "noise": {"trajectory": DRIVE, "noise": Noise(angle_deg=1)},
         "mirror": {
             **TURNED,
-            "materials": [Material("*", 0.5), Material("Mirror", transparent="mirror")],
+            "materials": [Material("*", 0.5), Material("Mirror", specular_reflectance=1)],
         },
     }
     scene = replace(Scene.from_meshes([*street.meshes(), MIRROR]), actors=(CAR,))

@@ -118,9 +118,9 @@ def survey():
     scene = Scene.from_meshes(walls).with_actors([Actor(capsule(0.9, 0.6, 24, "Car"), way)])
     materials = [
         Material("*", 0.3, roughness=0.4),
-        Material("Mirror", 0.9, transparent="mirror"),
+        Material("Mirror", 0.9, specular_reflectance=1),
         Material("Water", 0.1, transparent="pass", refractive_index=1.33, attenuation_per_m=0.3),
-        Material("Pane", 0.1, transparent="pass"),
+        Material("Pane", 0.1, transparent="pass", specular_reflectance="fresnel"),
         Material("Tree", 0.4, leaf_area_density=1.2, leaf_angle=1.7),
         Material("Sign", 0.9, retro=True),
     ]
@@ -143,7 +143,8 @@ def survey():
         scanner = Scanner(
             scene, load_sensor(model), columns=[*names, *precise], precision_m=1e-6,
             materials=materials, returns=returns, noise=noise, visibility_km=0.5,
-            fog_lidar_ratio_sr=18.8, rain_mm_h=20.0, snow_mm_h=2.0, threads=1,
+            fog_lidar_ratio_sr=18.8, rain_mm_h=20.0, snow_mm_h=2.0, wet=0.7,
+            threads=1,
         )  # fmt: skip
         cloud = scanner.sweep(path)
         for name in sorted(cloud.columns):

@@ -47,7 +47,7 @@ PHYSICS = [
     {
         "materials": [
             Material("*", 0.5, semantic_class=2),
-            Material("Sphere*", transparent="mirror"),
+            Material("Sphere*", specular_reflectance=1),
             Material(["Crate", "Bush.?"], transparent="pass"),
         ],
         "returns": Returns("dual"),

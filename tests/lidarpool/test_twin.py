@@ -12,9 +12,11 @@ from tests.shapes import quad
 
 from lidarpool import Beams, Material, Noise, Optics, Returns, Scene, Sensor, Spin, Survey
 from lidarpool.sensor.disc import Beam
-from lidarpool.sensor.noise import Purpose, named_seed, raw
+from lidarpool.sensor.noise import Purpose, named_seed, raw, starts
 from lidarpool.sensor.optics import FWHM, LIGHT_M_NS
-from lidarpool.simulator.air import WeatherStep
+from lidarpool.sensor.weather import Air, spray
+from lidarpool.simulator import pulse_loops
+from lidarpool.simulator.air import WeatherStep, exponential, seen_by_range
 from lidarpool.simulator.returns import AIR, NO_SURFACE, Keys, PulseReturns
 from lidarpool.simulator.saturation import saturated
 from lidarpool.simulator.separation import Report, separated
@@ -128,7 +130,7 @@ def test_returns_are_those_of_the_twin(each, airy, planes):
     solid = hits.triangle != NO_SURFACE
     ground, flies = hits.take(solid), hits.take(~solid)
     given = tuple(one[solid] for one in normals) if planes else None
-    air = flies if airy else None
+    air = flies._replace(cause=np.full(len(flies.ray), AIR)) if airy else None
     found = separated(ground, GAP, each, given, air)
     expected = {k: twin.separated(own, GAP, each, planes) for k, own in pulses.items()}
     counts = same_returns(found, expected)
@@ -260,6 +262,38 @@ def test_what_the_air_returns_is_as_in_the_twin(weather, each):
     assert np.array_equal(found.ray, ray) and len(ray) > 200
     assert np.array_equal(found.distance, distance)
     assert np.allclose(found.energy, energy, 1e-5, 0)
+
+
+@pytest.mark.parametrize("each", [1, 7])
+def test_clumps_of_spray_are_those_of_the_twin(each):
+    """Sub-rays and ranges to the bit, energies as those of drops; and what spray takes."""
+    rng, count, noise = np.random.default_rng(8), 300, Noise(detection_range_m=100.0, seed=9)
+    kind, air = spray(50.0), Air(0.0, 0.01, 0.003, 10.0)
+    mean, tables = seen_by_range(air, kind, noise.threshold / 2, 0.5, 150.0)
+    beam = np.sort(rng.integers(0, count, 500))
+    low = rng.uniform(0, 30, 500)
+    crossed = np.stack([low, low + rng.uniform(0, 4, 500), rng.uniform(0, 2, 500)])
+    far = np.where(rng.random(count * each) < 0.5, rng.uniform(1, 40, count * each), np.inf)
+    hits = np.flatnonzero(far < np.inf)
+    place, light = far[hits], np.ones(len(hits))
+    pulse_loops.veil(beam, crossed, each, 0.1, far, hits, place, light)
+    begun = starts(9, Purpose.SPRAY, Purpose.SPRAY_SUBRAY, Purpose.SPRAY_DIAMETER)
+    given = begun, KEYS.scan, KEYS.begins, FIRST, far
+    out, clumps, left = (np.empty(4000, np.int64), *np.empty((2, 4000))), [], []
+    table = each, mean, 1 / kind.slope, tables, exponential()
+    stop, many = pulse_loops.spray(0, beam, crossed, *table, *given, *out)
+    assert stop == len(beam) and many > 300
+    for pulse in range(count):
+        boxes = [tuple(one) for one in crossed[:, beam == pulse].T.tolist()]
+        own = far[pulse * each : (pulse + 1) * each].tolist()
+        seen = twin.clumps(kind, air, noise.threshold, 9, key_of(FIRST + pulse), own, boxes,
+                           (mean, tables[0]))  # fmt: skip
+        clumps += [(pulse * each + one.subray, one.distance, one.energy) for one in seen]
+        left += [twin.veiled(end, boxes, 0.1) for end in own if end < np.inf]
+    ray, distance, energy = map(np.array, zip(*clumps, strict=True))
+    assert np.array_equal(out[0][:many], ray) and np.array_equal(out[1][:many], distance)
+    assert np.allclose(out[2][:many], energy, 1e-5, 0)
+    assert np.allclose(light, left, 1e-14, 0) and min(left) < 0.9
 
 
 @pytest.mark.parametrize("planes", [False, True])

@@ -240,17 +240,62 @@ def particles(
     for number in range(sum(counts <= uniform(seed, Purpose.PARTICLES, key))):
         distance = float(ranges[bits(seed, Purpose.PARTICLE_RANGE, key, number) >> 48])
         subray = bits(seed, Purpose.PARTICLE_SUBRAY, key, number) % len(reach)
-        if distance >= reach[subray]:
-            continue
-        # The least diameter has half of the threshold; diameters above are exponential.
-        full = kind.reflectance * white(distance, air)
-        wide_mm = 1000 * math.hypot(air.exit_m, air.divergence * distance)
-        least = min(wide_mm * math.sqrt(threshold / 2 / full), kind.largest)
-        share = np.float32(-math.expm1(-kind.slope * (kind.largest - least)))
-        rank = uniform(seed, Purpose.PARTICLE_DIAMETER, key, number) * float(share)
-        rank = (math.floor(rank * 65_536) + 0.5) / 65_536
-        diameter = least - math.log1p(-rank) / kind.slope
-        yield Hit(subray, distance, len(reach) * full * min(1, diameter / wide_mm) ** 2, None)
+        if distance < reach[subray]:
+            rank = uniform(seed, Purpose.PARTICLE_DIAMETER, key, number)
+            energy = len(reach) * particle(kind, air, threshold, distance, rank)
+            yield Hit(subray, distance, energy, None)
+
+
+def particle(kind: Particles, air: Air, threshold: float, distance: float, rank: float) -> float:
+    """Energy of a particle, by its rank among the larger ones that may be detected."""
+    # The least diameter has half of the threshold; diameters above are exponential.
+    full = kind.reflectance * white(distance, air)
+    wide_mm = 1000 * math.hypot(air.exit_m, air.divergence * distance)
+    least = min(wide_mm * math.sqrt(threshold / 2 / full), kind.largest)
+    rank *= float(np.float32(-math.expm1(-kind.slope * (kind.largest - least))))
+    rank = (math.floor(rank * 65_536) + 0.5) / 65_536
+    diameter = least - math.log1p(-rank) / kind.slope
+    return full * min(1, diameter / wide_mm) ** 2
+
+
+Boxes = list[tuple[float, ...]]  # of spray: where a beam enters and leaves each, and its density
+
+
+def clumps(
+    kind: Particles, air: Air, threshold: float, seed: int, key: Key, reach: list[float],
+    boxes: Boxes, table: tuple[float, Floats],
+) -> Iterator[Hit]:  # fmt: skip
+    """Draw the clumps that a beam meets in boxes of spray, whose sub-rays reach so far.
+
+    The table says how many it would meet at a density of 1, and has quantiles of their ranges.
+    """
+    (mean, ranges), number = table, 0
+
+    def depth() -> float:
+        place = ((bits(seed, Purpose.SPRAY, key, number) >> 48) + 0.5) / 65_536
+        return float(np.float32(-math.log1p(-place)))
+
+    left = depth()
+    for low, high, density in boxes:
+        rate = density * (mean / len(ranges))
+        place, end = (float((ranges < one).sum()) for one in (low, high))
+        while left < (end - place) * rate:
+            place += left / rate
+            distance = float(ranges[int(place)])
+            subray = bits(seed, Purpose.SPRAY_SUBRAY, key, number) % len(reach)
+            rank = uniform(seed, Purpose.SPRAY_DIAMETER, key, number)
+            if distance < reach[subray]:
+                energy = len(reach) * particle(kind, air, threshold, distance, rank)
+                yield Hit(subray, distance, energy, None)
+            number += 1
+            left = depth()
+        left -= (end - place) * rate
+
+
+def veiled(distance: float, boxes: Boxes, extinction: float) -> float:
+    """Share of light that boxes of spray leave on the way to a surface and back."""
+    depth = sum(dense * max(min(high, distance) - low, 0) for low, high, dense in boxes)
+    return math.exp(-2 * extinction * depth)
 
 
 def fog(

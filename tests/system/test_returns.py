@@ -33,7 +33,7 @@ SURVEY = Survey(
     materials=[
         Material("*", 0.4, semantic_class=300),
         Material(["V*", "S*"], 0.1, transparent="pass"),
-        Material("Bowl", transparent="mirror"),
+        Material("Bowl", specular_reflectance=1),
     ],
     returns=Returns("dual", subrays=7, divergence_mrad=20, pulse_ns=2),
     noise=Noise(0.02, 0.001, 0.05, dropout=0.1, detection_range_m=80, seed=5),
@@ -59,7 +59,7 @@ EVERY_EFFECT = Survey(
         Material("*", 0.4, semantic_class=300),
         Material("Vase", 0.5, leaf_area_density=0.5),
         Material("Sphere", 0.1, transparent="pass", refractive_index=1.33, attenuation_per_m=0.1),
-        Material("Bowl", 0.5, retro=True),
+        Material("Bowl", 0.5, retro=True, specular_reflectance=0.3),
     ],
     returns=Returns(
         "all",
@@ -90,6 +90,7 @@ EVERY_EFFECT = Survey(
     rain_mm_h=20,
     snow_mm_h=1,
     dust_mg_m3=20,
+    wet=0.5,
     waveform_samples=32,
 )
 

@@ -21,7 +21,7 @@ from .waveforms import WAVEFORM, column_type
 Kind = Literal["number", "label"]  # a colour scale, or one colour for each value
 
 NO_SURFACE = "no surface"  # instead of an object's name
-CAUSES = ("surface", "air", "false alarm", "crosstalk", "blooming")  # of a return
+CAUSES = ("surface", "air", "false alarm", "crosstalk", "blooming", "ghost", "spray")  # of a return
 VELOCITY = "radial_velocity"
 COORDINATES = ("world", "sensor")  # coordinate systems of points
 _OPEN3D = ("positions", "normals", "colors")  # Open3D, which writes the files

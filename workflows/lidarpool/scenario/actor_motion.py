@@ -216,6 +216,9 @@ class ActorSection(ShapeSection):
         PoseEntry | None,
         about("instead of a trajectory: where it stands, [x, y, z] or with angles", [4, 5, 0]),
     ] = None
+    spray: Annotated[
+        bool, about("whether its wheels raise spray, with weather.spray_g_m3; robots raise none")
+    ] = True
     joints: Annotated[
         Text | None,
         about(

@@ -117,6 +117,8 @@ def _without_effect(scenario: Scenario) -> Iterator[str]:
         )
     if scenario.weather.fog_lidar_ratio_sr is not None and scenario.weather.visibility_km is None:
         yield "weather.fog_lidar_ratio_sr without weather.visibility_km is no fog"
+    if scenario.weather.spray_g_m3 and not (scenario.actors or scenario.traffic):
+        yield "weather.spray_g_m3 needs actors or traffic that move, and there are none"
     if scenario.noise.stray_light and not any(entry.retro for entry in scenario.materials):
         yield "noise.stray_light needs materials with retro: true, and there are none"
     way, imu = scenario.trajectory, scenario.navigation and scenario.navigation.imu

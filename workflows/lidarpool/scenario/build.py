@@ -21,7 +21,7 @@ from ..export.format_table import check_whole
 from ..export.formats import Format
 from ..plan import Planning
 from ..plan.planning import Search
-from ..scene.actors import Actor
+from ..scene.actors import Actor, check_spray
 from ..scene.files.cityjson import CLASS_NAMES as CITY_NAMES
 from ..scene.files.cityjson import CLASSES as CITY_CLASSES
 from ..scene.files.meshfile import CITYJSON
@@ -105,6 +105,8 @@ class Job:
         MaterialTable.of(survey.materials, scene.all_names, voxels=scene.has_voxels)
         # The cells of the cloud's precision that the scene spans have numbers of 32 bits.
         reach = float(np.abs(scene.bounds).max(initial=0.0))
+        if survey.spray_g_m3:
+            check_spray(scene.actors)
         for actor in scene.actors:
             actor.check(0.0, survey.duration_ns)
             ways, _ = actor.trajectory.poses(0, np.linspace(0, survey.duration_ns, 100))
@@ -282,7 +284,7 @@ def _actors(shapes: Shapes, standing: Standing, track: Track | None) -> list[Act
             with prefixed(f"{scenario.source}: actor {entry.name!r}"):
                 out += _links(entry, shapes.robot(entry.robot), way, shapes)
         else:
-            out.append(Actor(replace(shapes.of(entry), name=entry.name), way))
+            out.append(Actor(replace(shapes.of(entry), name=entry.name), way, entry.spray))
     return out
 
 

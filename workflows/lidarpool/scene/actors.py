@@ -33,6 +33,8 @@ class Actor:
     trajectory
         Poses of its axes, in the scene's local coordinates; its only station begins with the
         survey. By default it stands at zero, until `Scanner.move` moves it.
+    spray
+        Whether it raises spray where the weather has some, and it moves.
 
     Raises
     ------
@@ -42,6 +44,7 @@ class Actor:
 
     mesh: SceneMesh
     trajectory: Trajectory = AT_ZERO
+    spray: bool = True
 
     def __post_init__(self) -> None:
         if self.mesh.voxels is not None:
@@ -87,6 +90,16 @@ class Actor:
                 f"Actor {self.name!r}: {words}: let its trajectory begin before the first scan and "
                 "end after the last."
             ) from error
+
+
+def check_spray(actors: Iterable[Actor]) -> None:
+    """Check that actors that raise spray have a size; LidarpoolError if not."""
+    for actor in actors:
+        if actor.spray and not (np.ptp(actor.mesh.vertices, axis=0) > 0).all():
+            raise LidarpoolError(
+                f"Actor {actor.name!r} raises spray as wide and high as it is, and is flat: give "
+                "it a mesh with a length, width and height, or spray: false."
+            )
 
 
 def samples_each(actors: Sequence[Actor], most: int) -> int:

@@ -171,6 +171,7 @@ class Robot:
             Actor(
                 replace(mesh, name=f"{called}/{mesh.name}"),
                 self._path(body, trajectory, times_s, values),
+                spray=False,
             )
             for body, mesh in self._bodies(frozenset(without)).items()
         )

@@ -29,13 +29,18 @@ REFLECTANCE = 0.5  # default reflectance: between asphalt (0.1 to 0.2) and white
 # Engineer grade sheeting, ASTM D4956 type I white: 70 cd/lx/m², of a white diffuser 1/π.
 RETRO_GAIN = 220.0
 GLASS_INDEX = 1.5
+# Of water, from 905 to 1550 nm (Hale and Querry 1973: 1.328 to 1.318).
+WATER_INDEX = 1.328
+# Share of diffuse light in water that its surface sends back, 1 - (1 - r) / n², where r is the mean
+# of Fresnel's reflection outside, over a half space (Lekner and Dorf 1988).
+WATER_INWARDS = 0.4702
 NEAREST_M = 1e-3  # energies do not grow below this distance
 NEAR_NM, FAR_NM = 905.0, 1550.0  # wavelengths of the table of reflectances
 POLISHED = 0.04  # share that plastics, paints and wet surfaces reflect at right angles, n = 1.5
 DARKEST = 1e-3  # least reflectance of a colour, so that every hit is a return
 
 SemanticClass = Annotated[int, Field(ge=0, le=65_535)]
-Transparent = Literal["none", "pass", "mirror"]
+Transparent = Literal["none", "pass"]
 
 
 def _checked_names(given: Any, handler: Callable[[Any], Any]) -> Any:
@@ -80,7 +85,7 @@ class Material:
     """Material of objects; the last entry for an object counts.
 
     Reflectance is that at the sensor's wavelength, in all directions but for a gloss. Of light that
-    is not scattered, "pass" reflects what glass reflects; with "none" it is lost.
+    is not scattered, a share is mirrored; the rest passes, or is lost with "none".
 
     Raises
     ------
@@ -98,7 +103,7 @@ class Material:
         UnitShare | Literal["texture"] | None,
         allowed("0 to 1, or texture"),
         about(
-            "share of light that is scattered; by default 0.5, for glass and mirrors "
+            "share of light that is scattered; by default 0.5, for glass and whole mirrors "
             "0; texture: the luminance of the colour that was hit"
         ),
     ] = None
@@ -106,9 +111,18 @@ class Material:
     retro: Annotated[
         bool, about("whether light returns in its own direction, as from traffic signs")
     ] = False
-    transparent: Annotated[
-        Transparent, about("the rest of the light passes through (pass), or is reflected (mirror)")
-    ] = "none"
+    transparent: Annotated[Transparent, about("pass: the rest of the light passes through")] = (
+        "none"
+    )
+    specular_reflectance: Annotated[
+        UnitShare | Literal["fresnel"] | None,
+        allowed("0 to 1, or fresnel"),
+        about(
+            "share of the rest that is mirrored at right angles, and shows ghosts; grows towards "
+            "grazing angles. 1 for a mirror, 0.04 for paint; fresnel for what light passes",
+            0.04,
+        ),
+    ] = None
     scale: Annotated[
         float, about("with reflectance: texture, a factor of the luminance", gt=0, le=100)
     ] = 1.0
@@ -176,12 +190,21 @@ class Material:
 
         if self.roughness is None and self.metalness:
             raise LidarpoolError("metalness needs a roughness: give 0.1 (polished) to 1 (matt).")
-        if self.roughness is not None and (self.retro or self.transparent != "none"):
-            raise LidarpoolError("roughness is for opaque surfaces that are not retro-reflective.")
+        smooth = self.transparent != "none" or self.specular_reflectance is not None
+        if self.roughness is not None and (self.retro or smooth):
+            raise LidarpoolError(
+                "roughness is for opaque surfaces without retro and specular_reflectance."
+            )
         self._check_within()
 
     def _check_within(self) -> None:
-        """Refuse what contradicts the medium within a surface."""
+        """Refuse what contradicts the medium within a surface, or the light that passes it."""
+        mirrors = self.specular_reflectance
+        if mirrors is not None and (mirrors == "fresnel") != (self.transparent == "pass"):
+            raise LidarpoolError(
+                f"specular_reflectance is {mirrors!r} with transparent: {self.transparent}; give "
+                "fresnel for what light passes, else 0 to 1."
+            )
         if self.refractive_index is not None and self.transparent != "pass":
             raise LidarpoolError(
                 "refractive_index is for light that passes: add transparent: pass."
@@ -192,14 +215,15 @@ class Material:
             return
         if not self._suits_leaves:
             raise LidarpoolError(
-                "leaf_area_density is for leaves that scatter light: leave out transparent, retro "
-                "and roughness, and give reflectance as a number, or a material."
+                "leaf_area_density is for leaves that scatter light: leave out transparent, "
+                "retro, roughness and specular_reflectance, and give reflectance as a number, or a "
+                "material."
             )
 
     @property
     def _suits_leaves(self) -> bool:
         other = self.transparent != "none" or self.retro or self.roughness is not None
-        return not other and self.reflectance != "texture"
+        return not (other or self.specular_reflectance) and self.reflectance != "texture"
 
     def check_leaves(self, name: str, voxels: bool) -> None:
         """Check that it suits an object, by whether that has voxels; LidarpoolError if not."""
@@ -223,8 +247,15 @@ class Material:
         if self.reflectance == "texture":
             return min(1.0, self.scale * REFLECTANCE)
         if self.reflectance is None:
-            return REFLECTANCE if self.transparent == "none" else 0.0
+            return (
+                0.0 if self.transparent == "pass" or self.specular_reflectance == 1 else REFLECTANCE
+            )
         return float(self.reflectance)
+
+    @property
+    def specular(self) -> float:
+        """Share of what is not scattered that is mirrored at right angles; 1 for "fresnel"."""
+        return float(self.specular_reflectance == "fresnel" or self.specular_reflectance or 0)
 
     def named(self, name: str) -> bool:
         """Whether this material applies to an object."""
@@ -309,7 +340,7 @@ class MaterialTable:
     metalness: Floats
     retro: Bools
     passes: Bools
-    mirrors: Bools
+    specular: Floats  # share of what is not scattered that is mirrored at right angles
     semantic_class: NDArray[np.uint16]
     refractive_index: Floats  # within; 0 where light goes straight on
     attenuation: Floats  # within, 1/m
@@ -359,7 +390,7 @@ class MaterialTable:
             np.array([m.metalness for m in found])[last],
             np.array([m.retro for m in found], np.bool_)[last],
             np.array([m.transparent == "pass" for m in found], np.bool_)[last],
-            np.array([m.transparent == "mirror" for m in found], np.bool_)[last],
+            np.array([m.specular for m in found], np.float64)[last],
             np.array([m.semantic_class for m in found], np.uint16)[last],
             np.array([m.refractive_index or 0.0 for m in found])[last],
             np.array([m.attenuation_per_m for m in found], np.float64)[last],
@@ -367,12 +398,6 @@ class MaterialTable:
             np.array([angles.index(m.leaf_angle) for m in found], np.intp)[last],
             angles,
         )
-
-    @property
-    def plain(self) -> bool:
-        """Whether each ray ends at its first hit, with a return."""
-        through = self.passes | self.mirrors | self.leafy
-        return bool((self.reflectance > 0).all() and not through.any())
 
     @property
     def leafy(self) -> Bools:
@@ -389,6 +414,15 @@ class MaterialTable:
         """Whether the colours of an object are its reflectance."""
         return bool(self.scale.any())
 
+    def shares(self, rows: Integers, luminance: Floats | None) -> Floats:
+        """Share of light that objects (n,) scatter; `luminance` as of `scattered`."""
+        shares = self.reflectance[rows]
+        if luminance is not None:
+            scale = self.scale[rows]
+            bright = np.minimum(np.maximum(scale * luminance, DARKEST), 1.0)
+            shares = bright if self.scale.all() else np.where(scale > 0, bright, shares)
+        return shares
+
     def scattered(
         self,
         rows: Integers,
@@ -399,11 +433,7 @@ class MaterialTable:
 
         `luminance` (n,) is that of the colours that were hit, if the table is `textured`.
         """
-        shares = self.reflectance[rows]
-        if luminance is not None:
-            scale = self.scale[rows]
-            bright = np.minimum(np.maximum(scale * luminance, DARKEST), 1.0)
-            shares = bright if self.scale.all() else np.where(scale > 0, bright, shares)
+        shares = self.shares(rows, luminance)
         back = shares * np.where(self.retro[rows], RETRO_GAIN, cosine)
         if self.roughness.any():
             on = np.flatnonzero(self.roughness[rows])
@@ -413,14 +443,26 @@ class MaterialTable:
             back[on] += front * gloss(cosine[on], self.roughness[rows[on]])
         return back
 
-    def goes_on(self, rows: Integers, cosine: Floats) -> Floats:
-        """Share of the light that continues at glass or mirrors (n,).
+    def goes_on(
+        self,
+        rows: Integers,
+        cosine: Floats,
+        off: Bools,
+        bright: Floats | None,
+        film: Floats | float,
+    ) -> Floats:
+        """Share of the light that passes through objects (n,), or goes `off` them.
 
-        Where it is refracted, what the surface reflects is not taken off.
+        Where it is refracted, what the surface mirrors is neither taken off nor alone. A share
+        `film` (n,) is below water; `bright` is the luminance, see `scattered`.
         """
-        glass = self.passes[rows] & ~self.refracts[rows]
-        through = np.where(glass, 1 - fresnel(cosine), 1.0)
-        return np.asarray(np.where(self.leafy[rows], 1, 1 - self.reflectance[rows]) * through)
+        first, grazing = self.specular[rows], 1 - np.minimum(cosine, 1.0)
+        schlick = first + (first > 0) * (1 - first) * (grazing * np.square(np.square(grazing)))
+        mirrors = np.where(self.passes[rows], fresnel(cosine), schlick)
+        share = np.where(off, mirrors, np.where(self.passes[rows], 1 - mirrors, 1.0))
+        share = np.where(self.refracts[rows], 1.0, share)
+        share = np.where(self.leafy[rows], 1, 1 - self.shares(rows, bright)) * share
+        return np.asarray((1 - film) * share + film * fresnel(cosine, WATER_INDEX))
 
 
 def gloss(cosine: Floats, roughness: Floats) -> Floats:
@@ -445,6 +487,17 @@ def fresnel(cosine: Floats, index: float | Floats = GLASS_INDEX) -> Floats:
     across = (cosine - index * inside) / (cosine + index * inside)
     along = (inside - index * cosine) / (inside + index * cosine)
     return np.asarray((across**2 + along**2) / 2)
+
+
+def below_water(cosine: Floats, reflectance: Floats) -> Floats:
+    """Light that matt surfaces below a film of water return, relative to dry ones: (n,).
+
+    ``T² / (n² (1 - p ρ))``: light passes the film's surface twice, with Fresnel's transmittance T;
+    in the water it is spread by n², and the share p is sent back to the ground (Lekner and Dorf
+    1988, Ångström 1925).
+    """
+    through = np.square((1 - fresnel(cosine, WATER_INDEX)) / WATER_INDEX)
+    return np.asarray(through / (1 - WATER_INWARDS * reflectance))
 
 
 def at_right_angles(distance: Any, extinction: float = 0.0) -> Any:

@@ -58,6 +58,9 @@ class Purpose(Enum):
     PARTICLE_RANGE = 13
     PARTICLE_DIAMETER = 14
     PARTICLE_SUBRAY = 15  # which it is in
+    SPRAY = 16  # depth of spray until its next clump
+    SPRAY_SUBRAY = 17
+    SPRAY_DIAMETER = 18
     ALARM = 20  # time until the next false alarm
     PEAK = 21  # energy of a false alarm
     STRAY = 22  # noise of stray light's energy

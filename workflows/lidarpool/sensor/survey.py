@@ -321,7 +321,11 @@ class Survey(CloudOptions, Weather):
             _check_noise(noise, self.carried[number].sensor)
             if noise.crosstalk:
                 self._check_crosstalk(number)
-        if self.returns_light:
+        if self.spray_g_m3 and not self.wet:
+            raise LidarpoolError(
+                "spray_g_m3 is of wheels on wet ground, and none is: give wet as well, 0 to 1."
+            )
+        if self.returns_light or self.spray_g_m3:
             for number in range(len(self.carried)):
                 self._check_air(number)
 
@@ -352,14 +356,15 @@ class Survey(CloudOptions, Weather):
             lacks = "is not given" if carried.noise is None else "its data sheet does not state"
             guess = sensor.max_range_m / 2 if sensor.max_range_m < np.inf else 100
             raise LidarpoolError(
-                f"Rain, snow, dust and fog that return light need noise.detection_range_m{name}, "
+                f"Returns from rain, snow, spray, dust or fog need noise.detection_range_m{name}, "
                 f"the range at 10 % reflectance, which {lacks}: write what is known of it, or "
                 f"half of the sensor's range, noise: {{detection_range_m: {guess:.3g}}}."
             )
         wide = (self.returns_each[number].divergence_mrad, sensor.optics.divergence_mrad)
-        if self.particles and wide == (None, None):
+        if (self.particles or self.spray_g_m3) and wide == (None, None):
             raise LidarpoolError(
-                f"Rain and snow need the width of the beam{name}: give returns.divergence_mrad."
+                f"Rain, snow and spray need the width of the beam{name}: give "
+                "returns.divergence_mrad."
             )
         if (met := self.met(number)) > PARTICLES_MOST:
             raise LidarpoolError(

@@ -14,20 +14,20 @@ from typing import Annotated, Any, NamedTuple
 import numpy as np
 
 from ..base.arrays import Floats
-from ..base.declared import about
+from ..base.declared import UnitShare, about
 from ..base.elementary import exp, exp_of, geomspace, power
 from ..base.validation import checked_fields
 from ..base.vectors import hypot
-from .materials import REFERENCE_M, extinction
+from .materials import REFERENCE_M, WATER_INDEX, extinction
 
-# Index of refraction of water, from 905 to 1550 nm (Hale and Querry 1973: 1.328 to 1.318).
-WATER_INDEX = 1.328
 RAIN_LARGEST_MM = 6.0  # larger drops break up (Pruppacher and Klett 1997)
 SNOW_DENSITY = 0.1  # of water's: dry snow, between 0.01 and 0.2 (Hahner et al. 2022)
 SNOW_LARGEST_MM = 20.0  # Hahner et al. 2022
 SNOW_LIDAR_RATIO_SR = 25.0  # of ice clouds (Young and Vaughan 2009)
 DUST_M2_G = 0.6  # mass extinction of mineral dust (Ansmann et al. 2019: 0.57 to 0.63)
 DUST_LIDAR_RATIO_SR = 60.0  # Haarig et al. 2022: 46 to 50 at 532 nm, 57 to 69 at 1064 nm
+DROPS_LIDAR_RATIO_SR = 18.8  # of clean droplets (O'Connor et al. 2004)
+SPRAY_DROP_MM, CLUMP_MM, CLUMP_LARGEST_MM = 0.2, 20.0, 100.0  # diameters, of clumps the mean
 EXIT_M = 0.01  # the beam's diameter at the sensor, if it is unknown: 5 to 13 mm
 NODES = 4096  # ranges at which tables and integrals are made
 # Share of the detection threshold below which particles are left out: 0.6 % of those that return
@@ -74,6 +74,22 @@ class Weather:
     ] = 0.0
     dust_mg_m3: Annotated[
         float, about("mineral dust; it returns light, and takes some", ge=0, le=1e5)
+    ] = 0.0
+
+    wet: Annotated[
+        UnitShare,
+        about("share of surfaces that face up, such as roads, that is below a film of water"),
+    ] = 0.0
+
+    spray_g_m3: Annotated[
+        float,
+        about(
+            "water in the air behind vehicles at 90 km/h on ground that is all wet: 1 behind a "
+            "car, 20 behind a lorry; they have to move, and the ground to be wet",
+            5.0,
+            ge=0,
+            le=1000,
+        ),
     ] = 0.0
 
     @property
@@ -162,6 +178,17 @@ def snow(mm_h: float) -> Particles:
     number, slope = (a * float(power(mm_h, b)) for a, b in ((3800.0, -0.87), (2.55, -0.48)))
     reflectance = LARGE * math.pi / SNOW_LIDAR_RATIO_SR
     return Particles(number / wider, slope / wider, SNOW_LARGEST_MM, reflectance)
+
+
+def spray(g_m3: float) -> Particles:
+    """Make clumps of drops behind a vehicle, by the mass of the water.
+
+    Drops take light from twice their cross-sections. They are in clumps that are taken to be
+    opaque; from an opaque cloud of drops half of the inverse lidar ratio returns.
+    """
+    alpha = LARGE * 1.5e-3 * g_m3 / SPRAY_DROP_MM
+    one = Particles(1.0, 1 / CLUMP_MM, CLUMP_LARGEST_MM, math.pi / (2 * DROPS_LIDAR_RATIO_SR))
+    return one._replace(number=alpha * LARGE / one.extinction)
 
 
 def dust(mg_m3: float) -> tuple[float, float]:

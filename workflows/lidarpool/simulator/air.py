@@ -15,11 +15,12 @@ import numpy as np
 
 from ..base.arrays import Bools, Floats, Indices, Ints
 from ..base.elementary import exp, exp_of, expm1, geomspace, interp, log1p
+from ..sensor.materials import MaterialTable
 from ..sensor.noise import THRESHOLD_SIGMAS, Purpose, named_seed, starts
 from ..sensor.weather import FAINTEST, FARTHEST_M, NODES, Air, Particles
 from ..sensor.weather import reach as reach_of
 from .doppler import approach
-from .returns import AIR, OF_RETURNS, Keys, Planes, PulseReturns, joined, numbers, unreal
+from .returns import AIR, OF_RETURNS, SURFACE, Keys, Planes, PulseReturns, joined, numbers, unreal
 from .scene_caster import SceneCaster
 from .step import Memory, PulseBatch, PulseStep, Setup, Sizes
 from .surfaces import Surfaces
@@ -62,7 +63,7 @@ class WeatherStep(PulseStep):
     """
 
     effects = "Rain", "Snow", "Fog", "Dust"
-    reads = "ray", "distance", "triangle", "velocity"
+    reads = "ray", "distance", "triangle", "cause", "velocity"
     writes = *OF_RETURNS, "velocity"
     purposes = (
         Purpose.FOG_CELL, Purpose.FOG_PLACE, Purpose.PARTICLES, Purpose.PARTICLE_RANGE,
@@ -98,18 +99,9 @@ class WeatherStep(PulseStep):
         return Memory(casting=110 * sizes.subrays + 170 * WeatherStep.added(setup) * sizes.beams)
 
     def apply(self, returns: PulseReturns, batch: PulseBatch) -> PulseReturns:
-        """Leave hits in the air for `SeparationStep`, or insert them for waveforms."""
+        """See `PulseStep.apply`."""
         drawn = self.found(returns, (batch.start, batch.stop), batch.keys, batch.each)
-        if drawn is None:
-            return returns
-        if returns.velocity is not None:  # the air is at rest
-            rays = batch.here.rays(batch.beams, drawn.ray, batch.window[0])
-            drawn = drawn._replace(velocity=approach(batch.here, drawn.ray, *rays))
-        if not (self.setup.in_waveforms or self.setup.recorded):
-            batch.air = drawn
-            return returns
-        batch.hits, batch.planes = inserted(returns, batch.planes, drawn)
-        return batch.hits
+        return returns if drawn is None else in_the_air(self.setup, returns, batch, drawn)
 
     def found(
         self, hits: PulseReturns, rays: tuple[int, int], keys: Keys, each: int
@@ -120,7 +112,7 @@ class WeatherStep(PulseStep):
         """
         count = rays[1] - rays[0]
         given = keys.scan, np.array(keys.begins, np.int64), rays[0]
-        reach = self._reach(hits, count * each)
+        reach = reached(self.surfaces.at(self._wavelength_nm), self.surfaces, hits, count * each)
         parts = [
             part
             for seen, seed in zip(self._seen, self._seeds, strict=True)
@@ -140,23 +132,13 @@ class WeatherStep(PulseStep):
             drawn = drawn.take(np.argsort(drawn.ray, kind="stable"))
         return drawn
 
-    def _reach(self, hits: PulseReturns, count: int) -> Floats:
-        """How far the light of sub-rays gets, (count,): inf if no surface ends it."""
-        materials = self.surfaces.at(self._wavelength_nm)
-        ends = hits.distance
-        on = materials.passes | materials.mirrors
-        if on.any():
-            ends = np.where(on[self.surfaces.objects(hits.triangle)], np.inf, ends)
-        reach = np.full(count, np.inf)
-        reach[hits.ray] = ends  # of several, the last
-        return reach
-
     def _bent(self, hits: PulseReturns) -> Indices:
         """Rows of hits where light is refracted; of each ray the first, third, … are entries."""
         refracts = self.surfaces.at(self._wavelength_nm).refracts
         if not refracts.any():
             return np.zeros(0, np.intp)
-        return np.flatnonzero(refracts[self.surfaces.objects(hits.triangle)])
+        bent = refracts[self.surfaces.objects(hits.triangle)]
+        return np.flatnonzero(bent if hits.cause is None else bent & (hits.cause == SURFACE))
 
     def _within(self, hits: PulseReturns, ray: Ints, distance: Floats) -> Bools:
         """Whether places on rays are within water or glass, where nothing falls: (n,)."""
@@ -184,6 +166,36 @@ class WeatherStep(PulseStep):
         return reach
 
 
+def reached(materials: MaterialTable, surfaces: Surfaces, hits: PulseReturns, count: int) -> Floats:
+    """How far the light of sub-rays gets, (count,): inf if no surface ends it."""
+    ray, ends, on = hits.ray, hits.distance, materials.passes
+    if on.any():
+        ends = np.where(on[surfaces.objects(hits.triangle)], np.inf, ends)
+    if hits.cause is not None:
+        rows = np.flatnonzero(hits.cause == SURFACE)
+        ray, ends = ray[rows], ends[rows]
+    reach = np.full(count, np.inf)
+    reach[ray] = ends  # of several, the last
+    return reach
+
+
+def in_the_air(
+    setup: Setup, returns: PulseReturns, batch: PulseBatch, drawn: PulseReturns
+) -> PulseReturns:
+    """Leave hits in the air for `SeparationStep`, or insert them for waveforms."""
+    if returns.velocity is not None:  # the air is at rest
+        rays = batch.here.rays(batch.beams, drawn.ray, batch.window[0])
+        drawn = drawn._replace(velocity=approach(batch.here, drawn.ray, *rays))
+    if setup.in_waveforms or setup.recorded:
+        batch.hits, batch.planes = inserted(returns, batch.planes, drawn)
+        return batch.hits
+    if batch.air is not None:
+        drawn = joined([batch.air, drawn])
+        drawn = drawn.take(np.argsort(drawn.ray, kind="stable"))
+    batch.air = drawn
+    return returns
+
+
 def _met(
     seen: _Seen, seed: int, beams: int, each: int, given: tuple[int, Ints, int], reach: Floats
 ) -> Iterator[tuple[Ints, Floats, Floats]]:
@@ -194,7 +206,7 @@ def _met(
     beam, room = 0, 2 * beams + len(seen.counts)
     while beam < beams:
         out = np.empty(room, np.int64), *np.empty((2, room))
-        table = seen.step, seen.counts, seen.tables, _exponential()
+        table = seen.step, seen.counts, seen.tables, exponential()
         beam, count = pulse_loops.particles(beam, beams, each, *table, begun, *given, reach, *out)
         yield out[0][:count], out[1][:count], out[2][:count]
 
@@ -227,6 +239,15 @@ def inserted(
 @lru_cache(TABLES_KEPT)
 def _seen(air: Air, kind: Particles, energy: float, begins: float, ends: float) -> _Seen | None:
     """Make the tables of particles that return at least an energy; None if there are none."""
+    found = seen_by_range(air, kind, energy, begins, ends)
+    return found and _Seen(_poisson(found[0]), found[1], 1 / kind.slope)
+
+
+@lru_cache(TABLES_KEPT)
+def seen_by_range(
+    air: Air, kind: Particles, energy: float, begins: float, ends: float
+) -> tuple[float, Floats] | None:
+    """How many particles in a beam return at least an energy, and the tables of `_Seen`."""
     distance = geomspace(begins, max(ends, begins * 1.001), NODES)
     some = np.flatnonzero(air.rate(kind, energy, distance) > 0)
     if not len(some):
@@ -243,7 +264,7 @@ def _seen(air: Air, kind: Particles, energy: float, begins: float, ends: float) 
     most = kind.reflectance * air.white(distance)
     one = most / (1000 * air.width(distance)) ** 2
     tables = distance, single(smallest), single(larger), single(one), single(most)
-    return _Seen(_poisson(float(sums[-1])), np.stack(tables), 1 / kind.slope)
+    return float(sums[-1]), np.stack(tables)
 
 
 def _poisson(mean: float) -> Floats:
@@ -301,7 +322,7 @@ def single(table: Floats) -> Floats:
 
 
 @cache
-def _exponential() -> Floats:
+def exponential() -> Floats:
     """Quantiles of the exponential distribution, of equal shares."""
     shares = (np.arange(QUANTILES) + 0.5) / QUANTILES
     return single(-log1p(-shares))

@@ -158,6 +158,7 @@ class Media:
         self.filled = table.leafy | table.refracts  # whether objects hold a medium
         self.leafy = bool(table.leafy.any())
         self.bends = bool(table.refracts.any())
+        self.mirrors = table.refracts & (table.specular > 0)  # and where it is refracted
         self.grids, self.instances = surfaces.grids, surfaces.instances
         self.gridded = np.append(scene.has_voxels, False)  # objects
         self._angles = table.leaf_angles
@@ -393,23 +394,33 @@ class LightInMedia:
         return self.differentials.factor(directions, distance, self.media.air)
 
     def cross(
-        self, objects: Ints32, triangles: Ints32, directions: Floats, normals: Floats, along: Floats
+        self,
+        objects: Ints32,
+        triangles: Ints32,
+        directions: Floats,
+        normals: Floats,
+        along: Floats,
+        off: Bools,
     ) -> tuple[Floats, Floats | float, Bools]:
-        """Take light through surfaces (n,), which it meets at the cosines `along`.
+        """Take light through surfaces (n,), which it meets at the cosines `along`, or `off` them.
 
         Returns
         -------
-        Directions behind them (n, 3), shares of light that pass (n,), and whether all is reflected,
-        with directions and shares as if there were no surface.
+        Directions behind them (n, 3), shares of light that pass, or are mirrored where light is
+        refracted (n,), and whether all is reflected, with directions as if there were no surface.
         """
         before, self.around = self.around, self.media.behind(self.around, objects, triangles, along)
         if self.differentials is None:
             return directions, 1.0, np.zeros(len(objects), np.bool_)
         ratio = self.media.index(self.around) / self.differentials.index
         ahead, passes, whole = refracted(directions, normals, along, ratio)
-        self.around.objects[whole] = before.objects[whole]
-        self.around.triangles[whole] = before.triangles[whole]
-        return ahead, passes, whole
+        stays = whole | off
+        self.around.objects[stays] = before.objects[stays]
+        self.around.triangles[stays] = before.triangles[stays]
+        bends = self.media.mirrors[objects]
+        passes = np.where(whole & bends, 0.0, passes)
+        passes = np.where(off, np.where(bends, 1 - passes, 1.0), passes)
+        return np.where(off[:, None], directions, ahead), passes, whole
 
     def turn(self, before: Floats, after: Floats, normals: Floats, mirrored: Bools) -> None:
         """Turn the bundles at flat surfaces, from directions (n, 3) to others."""

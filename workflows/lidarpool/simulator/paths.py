@@ -1,4 +1,7 @@
-"""Paths of light: casts sub-rays, and follows their light through glass and off mirrors."""
+"""Paths of light: casts sub-rays, and follows their light through glass and off mirrors.
+
+Where a surface does both, or scatters light as well, the light is divided, and each part goes on.
+"""
 
 from __future__ import annotations
 
@@ -9,20 +12,24 @@ from numpy.typing import NDArray
 
 from raybeam import Pattern
 
-from ..base.arrays import Floats, Integers, Ints, Ints32
+from ..base.arrays import Bools, Bytes, Floats, Integers, Ints, Ints32
 from ..base.vectors import into_axes, products
 from ..columns.table import COLOURS
+from ..scene.colours import luminance
+from ..sensor.materials import at_right_angles
 from ..sensor.noise import Purpose, raw
+from ..sensor.weather import FAINTEST
 from .doppler import approach, velocities_of_ends
 from .media import LightInMedia, Media, Rays, depths
 from .motion import Clock, Poses
-from .returns import Keys, Planes, PulseReturns, joined, selected
+from .returns import GHOST, OF_RETURNS, SURFACE, Keys, Planes, PulseReturns, joined, selected
 from .scene_caster import SceneCaster
 from .step import Memory, PulseBatch, PulseStep, Setup, Sizes
 from .surfaces import Surfaces, light_of
 
 PASSES_MOST = 16  # surfaces that light passes before it is dropped
 LEAFY_PASSES_MOST = 64  # where there are crowns, whose surfaces it passes twice
+MIRRORED_MOST = 2  # times that light is mirrored, of which each may divide it
 
 
 @dataclass
@@ -37,6 +44,7 @@ class _Light:
     before: Floats  # optical path up to the origin
     # What mirrors did to the directions so far, (n, 3, 3), if there are any.
     turns: Floats | None = None
+    mirrored: Bytes | None = None  # how many times it was, if there are mirrors
     within: LightInMedia | None = None  # if there are media
     # How fast its optical path grows, m/s, but for the motion of its end, if that is asked for.
     range_rate: Floats | None = None
@@ -49,8 +57,11 @@ class _Light:
 class CastStep(PulseStep):
     """Finds where the light of sub-rays returns from."""
 
-    effects = "Gaussian and oval beams", "Refraction", "Vegetation", "Rays without a return"
-    writes = "ray", "distance", "triangle", "energy", "colour", "velocity"
+    effects = (
+        "Ghosts", "Wet ground", "Gaussian and oval beams", "Refraction", "Vegetation",
+        "Rays without a return",
+    )  # fmt: skip
+    writes = *OF_RETURNS, "velocity"
     purposes = Purpose.LEAF, Purpose.WHICH
 
     def __init__(self, setup: Setup, caster: SceneCaster, surfaces: Surfaces) -> None:
@@ -61,6 +72,10 @@ class CastStep(PulseStep):
         filled = table.leafy.any() or table.refracts.any()
         air = self._light.extinction
         self._media = Media(setup.scene, surfaces, table, air) if filled else None
+        # Ghosts that can return less are left out.
+        self._faintest = FAINTEST * setup.noise.threshold
+        white = np.ones(len(table.reflectance))
+        self._brightest = float(table.scattered(np.arange(len(white)), white, white).max())
         shown = any(column.name in COLOURS for column in survey.stored_columns)
         self._coloured = shown or surfaces.materials.textured
 
@@ -68,6 +83,11 @@ class CastStep(PulseStep):
     def applies(setup: Setup) -> bool:
         """See `PulseStep.applies`."""
         return setup.several
+
+    @staticmethod
+    def added(setup: Setup) -> float:
+        """See `PulseStep.added`: ghosts, if all around is there to be mirrored."""
+        return MIRRORED_MOST * setup.mirroring
 
     @staticmethod
     def memory(setup: Setup, sizes: Sizes) -> Memory:
@@ -119,7 +139,9 @@ class CastStep(PulseStep):
 
         if self.setup.moving:
             light.range_rate = approach(poses, ray, origins, directions)
-        if materials.mirrors.any() or (media is not None and media.bends):
+        if self.setup.mirroring:
+            light.mirrored = np.zeros(len(ray), np.uint8)
+        if each > 1 and (self.setup.mirroring or (media is not None and media.bends)):
             light.turns = np.broadcast_to(np.eye(3), (len(ray), 3, 3))
         if media is not None:
             left = depths(draw(Purpose.LEAF, ray)) if leafy else None
@@ -140,7 +162,7 @@ class CastStep(PulseStep):
             if self._coloured:
                 points = light.origins + step[:, None] * light.directions
                 colour = surfaces.colours(triangle, points, light.times, poses.ways)
-            normals, along, rows, energy = surfaces.lit(
+            normals, along, rows, energy, film = surfaces.lit(
                 triangle, light.directions, distance, self._light, light.times, poses.ways, colour
             )
             if len(leaves):
@@ -159,32 +181,50 @@ class CastStep(PulseStep):
                 moved = velocities_of_ends(surfaces, poses.ways, way, step, triangle, light.times)
                 index = 1.0 if within is None else within.index
                 velocity = light.range_rate + index * products(moved.T, light.directions.T)
-            hits = PulseReturns(light.ray, distance, triangle, energy, colour, velocity=velocity)
+            cause, mirrored = None, light.mirrored
+            if mirrored is not None:
+                cause = np.where(mirrored > 0, GHOST, SURFACE).astype(np.uint8)
+            hits = PulseReturns(light.ray, distance, triangle, energy, colour, cause, velocity)
             turns = light.turns
             looks = normals if turns is None else into_axes(normals, turns)
-            goes = materials.passes[rows] | materials.mirrors[rows]
+            goes, mirrors = materials.passes[rows], np.zeros(len(rows), np.bool_)
+            if mirrored is not None:
+                smooth = (materials.specular[rows] > 0) | (False if film is None else film)
+                mirrors = smooth & (mirrored < MIRRORED_MOST)
             if within is not None:  # optical paths are longer than what was cast
                 crowns = materials.leafy[rows]  # whose surfaces send nothing back
                 crowns[leaves] = False
                 near = distance <= farthest
-                goes = (goes | crowns) & near
+                goes, mirrors = (goes | crowns) & near, mirrors & near
                 there = np.flatnonzero(near & ~crowns)
                 hits, looks = hits.take(there), looks[there]
             parts.append(hits)
             seen.append(looks)
-            on = np.flatnonzero(goes)
+            through = np.flatnonzero(goes)
+            on = np.concatenate([through, np.flatnonzero(mirrors)])
             if not len(on):
                 break
-            ends = step[on], distance[on], triangle[on], normals[on], along[on]
+            off = np.arange(len(on)) >= len(through)
+            bright = luminance(colour[on]) if materials.textured and colour is not None else None
+            water = 0.0 if film is None else self._light.wet * film[on]
+            share = materials.goes_on(rows[on], np.abs(along[on]), off, bright, water)
+            share = light.share[on] * share**2  # and back again
+            if mirrored is not None and not (within is not None and within.differentials):
+                most = self._brightest * at_right_angles(distance[on], self._light.extinction)
+                some = np.flatnonzero(share * most > self._faintest)
+                on, off, share = on[some], off[some], share[some]
+            light = light.on(on)
+            light.share = share
+            ends = step[on], distance[on], triangle[on], normals[on], along[on], off
             light, clear = self._behind(
-                light.on(on), *ends, None if light.range_rate is None else moved[on]
+                light, *ends, None if light.range_rate is None else moved[on]
             )
             # Light takes no time: it travels 300 m in a microsecond.
             now = Poses(np.zeros(3), clock=Clock(light.times, np.zeros(1), poses.ways))
             found = self.caster.scan(Pattern(light.directions, light.origins), now, t_max=reach)
             which, step, triangle = found.ray, found.distance, found.triangle
             light, clear = light.on(which), clear[which]
-            if not leafy:
+            if not leafy and farthest < np.inf:
                 within = light.within
                 end = light.before + (step if within is None else within.optical(step))
                 here = np.flatnonzero(end <= farthest)
@@ -208,22 +248,21 @@ class CastStep(PulseStep):
         triangle: Ints32,
         normals: Floats,
         along: Floats,
+        off: Bools,
         moved: Floats | None,
     ) -> tuple[_Light, Floats]:
-        """Take light (n,) through the surfaces at its end, or off them.
+        """Take light (n,) through the surfaces at its end, or `off` them.
 
         Returns it behind them, and where the surfaces are from there, metres, at or below 0.
         `moved` (n, 3) are the velocities of the surfaces: where one bends light, its path grows.
         """
-        materials = self.surfaces.at(self._light.wavelength_nm)
-        rows = self.surfaces.objects(triangle)
         cosine, within = np.abs(along), light.within
-        share = light.share * materials.goes_on(rows, cosine) ** 2  # and back again
-        ahead, mirrors = light.directions, materials.mirrors[rows]
+        share, ahead, mirrors = light.share, light.directions, off
         index = 1.0 if within is None else within.index
         if within is not None:
-            ahead, passes, whole = within.cross(rows, triangle, ahead, normals, along)
-            share *= passes**2
+            rows = self.surfaces.objects(triangle)
+            ahead, passes, whole = within.cross(rows, triangle, ahead, normals, along, off)
+            share = share * passes**2
             mirrors = mirrors | whole
         mirrored = 2 * mirrors[:, None] * normals
         ahead = ahead - along[:, None] * mirrored
@@ -248,4 +287,5 @@ class CastStep(PulseStep):
                 range_rate + index * there - (1.0 if within is None else within.index) * back
             )
         own = light.ray, light.times, path.origins, path.directions, share, before
-        return _Light(*own, turns, within, range_rate), -away
+        bounces = None if light.mirrored is None else light.mirrored + off
+        return _Light(*own, turns, bounces, within, range_rate), -away

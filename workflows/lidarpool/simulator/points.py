@@ -24,7 +24,7 @@ from ..sensor.reflectivity import SCALES
 from .doppler import radial_velocities
 from .motion import Firings, Poses
 from .pulses import Scanned
-from .returns import FALSE_ALARM, NO_SURFACE, made
+from .returns import BLOOMING, CROSSTALK, FALSE_ALARM, made
 from .surfaces import Surfaces, light_of
 
 BLOCK_HITS = 1 << 16  # that are looked at a time
@@ -353,8 +353,7 @@ class BatchPoints:
                 self._times,
             )
             if found.cause is not None:
-                no_light = (found.cause >= FALSE_ALARM) & (found.triangle == NO_SURFACE)
-                velocity[no_light] = np.nan
+                velocity[np.isin(found.cause, (FALSE_ALARM, CROSSTALK, BLOOMING))] = np.nan
         noise = self.survey.noise_each[self.specs[0].sensor]
         if noise.velocity_m_s:
             scan = self.scan.astype(np.int64) + self.specs[0].ahead

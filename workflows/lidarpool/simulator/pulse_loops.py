@@ -1,4 +1,4 @@
-"""Loops over pulses: particles that a beam meets, and the returns that a receiver reports.
+"""Loops over pulses: particles and spray that they meet, and the returns that a receiver reports.
 
 Each is compiled when it is first called. Random numbers are those of `lidarpool.sensor.noise.raw`,
 of which `starts` are the beginnings.
@@ -12,7 +12,10 @@ import numpy as np
 
 from raybeam.compiled import compiled, inlined, stage
 
+from ..base.elementary_loops import exp
+
 ALL, FIRST, LAST, STRONGEST, DUAL = range(5)  # modes
+_CLUMPS = 255  # of spray that a beam meets at most: a ray has so many random numbers
 SLOPE = 0.5  # of the distance between neighbouring hits: what the slopes of one surface may miss
 
 _30, _27, _31, _11, _48 = (np.uint64(shift) for shift in (30, 27, 31, 11, 48))
@@ -109,6 +112,104 @@ def fog(
         energy[count] = each * energies[low]
         count += 1
     return count
+
+
+@compiled()
+def crossings(
+    rays, times, far, size, cell, which, boxes, there, density, lasts, decay, beam, found
+):
+    """Write beams, and where each enters and leaves a box and the density in it, (3, k).
+
+    Beams end at `far` (n,). Cells of `size` rays (6, n) and boxes are as of
+    `raybeam.moving.near_boxes`; boxes last so long, and densities decay by their age over `decay`.
+    Returns how many there are, of which it writes what there is room for.
+    """
+    count = 0
+    for pair in range(len(cell)):
+        b, radius = which[pair], 0.0
+        for side in range(3, 12):
+            radius += boxes[b, side] * boxes[b, side]
+        begin, end, reach = there[b, 0], there[b, 1], 1.001 * np.sqrt(radius)
+        a, c, d = boxes[b, 0], boxes[b, 1], boxes[b, 2]
+        for k in range(cell[pair] * size, min((cell[pair] + 1) * size, len(times))):
+            p, q, r = a - rays[0, k], c - rays[1, k], d - rays[2, k]
+            along = (p * rays[3, k] + q * rays[4, k]) + r * rays[5, k]
+            off = (p * p + q * q) + r * r - along * along
+            if off > reach * reach or along > far[k] + reach or not begin <= times[k] <= end:
+                continue  # it misses the ball around the box
+            low, high = 0.0, far[k]
+            for side in range(3, 12, 3):
+                x, y, z = boxes[b, side], boxes[b, side + 1], boxes[b, side + 2]
+                half = (x * x + y * y) + z * z
+                along = (x * rays[3, k] + y * rays[4, k]) + z * rays[5, k]
+                off = (x * p + y * q) + z * r
+                if along != 0:
+                    one, other = (off - half) / along, (off + half) / along
+                    low, high = max(low, min(one, other)), min(high, max(one, other))
+                elif abs(off) > half:
+                    high = -1.0
+            if low < high:
+                if count < len(beam):
+                    beam[count], found[0, count], found[1, count] = k, low, high
+                    found[2, count] = density[b] * exp((there[b, 1] - lasts - times[k]) / decay)
+                count += 1
+    return count
+
+
+@compiled()
+def spray(
+    k, beam, crossed, each, mean, step, tables, exponential,
+    starts, scan, begins, first, reach, ray, distance, energy,
+):  # fmt: skip
+    """Draw the clumps of spray that beams meet in boxes, from crossing `k` on, while there is room.
+
+    Crossings (3, k) are in the order of beams. Depths between clumps are exponentially distributed;
+    `mean` is how many a beam would meet at a density of 1, of which each column of `tables` has an
+    equal share. Writes as `particles` does; returns the first crossing left, and how many.
+    """
+    count, row, places = 0, 0, tables[0]
+    while k < len(beam) and count + _CLUMPS <= len(ray):
+        this = beam[k]
+        row = _scan_of(begins, first + this, row)
+        own, number, clump = scan + row, first + this - begins[row], 0
+        left = exponential[np.int64(_bits(starts[0], own, number, 0) >> _48)]
+        while k < len(beam) and beam[k] == this:
+            rate = crossed[2, k] * (mean / len(places))
+            place = np.float64(np.searchsorted(places, crossed[0, k]))
+            end = np.searchsorted(places, crossed[1, k])
+            while left < (end - place) * rate and clump < _CLUMPS:
+                place += left / rate
+                at = np.int64(place)
+                where = this * each
+                if each > 1:
+                    where += np.int64(_bits(starts[1], own, number, clump) % np.uint64(each))
+                if places[at] < reach[where]:
+                    rank = _uniform(starts[2], own, number, clump) * tables[2, at]
+                    diameter = tables[1, at] + step * exponential[np.int64(rank * len(exponential))]
+                    ray[count], distance[count] = where, places[at]
+                    energy[count] = each * min(tables[3, at] * diameter * diameter, tables[4, at])
+                    count += 1
+                clump += 1
+                left = exponential[np.int64(_bits(starts[0], own, number, clump) >> _48)]
+            left -= (end - place) * rate
+            k += 1
+    return k, count
+
+
+@compiled()
+def veil(beam, crossed, each, extinction, reach, ray, distance, energy):
+    """Multiply energies of hits by what spray before them leaves."""
+    first = 0
+    for k in range(len(ray)):
+        while first < len(beam) and beam[first] < ray[k] // each:
+            first += 1
+        depth, c = 0.0, first
+        while c < len(beam) and beam[c] == ray[k] // each:
+            end = min(min(distance[k], reach[ray[k]]), crossed[1, c])
+            depth += crossed[2, c] * max(end - crossed[0, c], 0.0)
+            c += 1
+        if depth > 0:
+            energy[k] *= exp(-2 * extinction * depth)
 
 
 @inlined

@@ -64,7 +64,8 @@ class Scanner:
         Name of the sensor, which is part of all random numbers: give each sensor of a robot its
         own. A `Mounted` has a name already.
     columns, precision_m, coordinates, materials, returns, noise, visibility_km, \
-    fog_lidar_ratio_sr, rain_mm_h, snow_mm_h, dust_mg_m3
+    fog_lidar_ratio_sr, rain_mm_h, snow_mm_h, dust_mg_m3, wet, \
+    spray_g_m3
         As of `Survey`.
     backend
         "cuda", "embree", "numpy", or "auto" for the first of these that can be used.
@@ -106,6 +107,8 @@ class Scanner:
         rain_mm_h: float = 0.0,
         snow_mm_h: float = 0.0,
         dust_mg_m3: float = 0.0,
+        wet: float = 0.0,
+        spray_g_m3: float = 0.0,
         backend: str = "auto",
         threads: int | None = None,
         device: int | None = None,
@@ -130,6 +133,8 @@ class Scanner:
             rain_mm_h=rain_mm_h,
             snow_mm_h=snow_mm_h,
             dust_mg_m3=dust_mg_m3,
+            wet=wet,
+            spray_g_m3=spray_g_m3,
         )
         check_backend_here(backend)
         warn_of_grey(scene, survey)

@@ -75,7 +75,7 @@ def separated(
     if len(flies.ray):
         some = np.flatnonzero(row < 0)
         cause = np.full(count, SURFACE, np.uint8) if found.cause is None else found.cause
-        cause[some], found.triangle[some] = AIR, NO_SURFACE
+        cause[some], found.triangle[some] = made(flies.cause)[-1 - row[some]], NO_SURFACE
         if found.colour is not None:
             found.colour[some] = packed(GREY[0])[0]
         found = found._replace(cause=cause)

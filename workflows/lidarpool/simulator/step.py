@@ -70,7 +70,13 @@ class Setup:
     @property
     def passing(self) -> bool:
         """Whether light goes on behind a surface, or off it."""
-        return self.leafy or any(m.transparent != "none" for m in self.survey.materials)
+        glass = any(m.transparent == "pass" for m in self.survey.materials)
+        return glass or self.mirroring or self.leafy
+
+    @property
+    def mirroring(self) -> bool:
+        """Whether surfaces mirror light."""
+        return self.survey.wet > 0 or any(m.specular for m in self.survey.materials)
 
     @property
     def refracting(self) -> bool:

@@ -14,6 +14,7 @@ from .recording import RecordingStep
 from .saturation import SaturationStep
 from .selection import SelectionStep
 from .separation import SeparationStep
+from .spray import SprayStep
 from .step import PulseStep, Setup
 from .stray_light import StrayLightStep
 from .waveform import WaveformStep
@@ -23,6 +24,7 @@ STEPS: tuple[type[PulseStep], ...] = (
     AngleNoiseStep,
     CastStep,  # with mirrors, glass, water and leaves
     WeatherStep,  # rain, snow, fog and dust
+    SprayStep,
     DirtStep,  # on the window
     SeparationStep,  # hits to returns; or
     WaveformStep,

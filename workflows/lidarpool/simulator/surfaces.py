@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 from collections.abc import Iterable
 from copy import copy
 from functools import cached_property
@@ -16,7 +17,7 @@ from ..scene.actors import shapes_of
 from ..scene.colours import GREY, Colours, Lookup, joined, luminance, packed
 from ..scene.scene import Scene
 from ..sensor import Sensor, Survey
-from ..sensor.materials import NEAR_NM, Material, MaterialTable, at_right_angles
+from ..sensor.materials import NEAR_NM, Material, MaterialTable, at_right_angles, below_water
 from ..sensor.trajectory import velocities
 from .motion import carried_at
 from .voxels import Grids
@@ -24,6 +25,7 @@ from .ways import Ways
 
 _log = logging.getLogger(__name__)
 
+LEVEL = math.sqrt(0.75)  # z of the normals of surfaces that water stays on, up to 30 degrees
 BLOCK_FACES = 1 << 18  # triangles whose normals are made at a time
 BLOCK_HITS = 1 << 14  # hits whose colours are looked up at a time, to fit a cache
 
@@ -36,6 +38,7 @@ class Light(NamedTuple):
 
     wavelength_nm: float
     extinction: float  # 1/m
+    wet: float = 0.0  # share of what faces up that is below a film of water
 
 
 class Lit(NamedTuple):
@@ -45,11 +48,12 @@ class Lit(NamedTuple):
     along: Floats  # (n,): cosines of the angles between normals and directions, of either sign
     objects: Ints32  # (n,)
     energy: Floats  # (n,): see `Surfaces.energy`
+    film: Bools | None = None  # (n,): whether there may be a film of water
 
 
 def light_of(survey: Survey, sensor: Sensor) -> Light:
     """Light of a sensor in the air of a survey."""
-    return Light(sensor.optics.wavelength_nm, survey.extinction(sensor))
+    return Light(sensor.optics.wavelength_nm, survey.extinction(sensor), survey.wet)
 
 
 def warn_of_grey(scene: Scene, survey: Survey) -> None:
@@ -185,11 +189,18 @@ class Surfaces:
 
         table = self.at(light.wavelength_nm)
         normals, along, objects, back = self._met(triangle, directions, table, times, ways)
+        bright = luminance(colours) if table.textured and colours is not None else None
         if table.textured or table.roughness.any():
-            bright = luminance(colours) if table.textured and colours is not None else None
             back = table.scattered(objects, np.abs(along), bright)
+        film = None
+        if light.wet:
+            up = np.where(along < 0, normals[2], -normals[2])  # of the side that is seen
+            film = (up >= LEVEL) & ~(table.passes | table.leafy)[objects]
+            rows = np.flatnonzero(film)
+            shares = table.shares(objects[rows], None if bright is None else bright[rows])
+            back[rows] *= 1 - light.wet * (1 - below_water(np.abs(along[rows]), shares))
         surface_loops.fade(owned(distance), light.extinction, back)
-        return Lit(normals.T, along, objects, back)
+        return Lit(normals.T, along, objects, back, film)
 
     def _on_actors(self, triangle: Integers, ways: Ways) -> tuple[Indices, Integers]:
         """Rows of triangles (n,) that belong to actors, and to which; none without `ways`."""

@@ -1,0 +1,96 @@
+"""Ghosts: what panes and paint mirror."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from benchmarks.effects._receiver import BLUE, GREY, RED, cloud, shot
+from lidarpool import Beams, Material, Noise, Returns, Scene, SceneMesh, Sensor, Spin, Survey
+from lidarpool.scene.actors import box
+from lidarpool.sensor.materials import fresnel
+
+DRAWS = "effect-ghosts.png"
+PAINT, DIRT = 0.04, 0.1
+
+
+def on(survey: Survey) -> Survey:
+    """Switch it on, in a street whose cars and buildings mirror a little."""
+    materials = [
+        Material("*", reflectance=0.3),
+        Material(["car-*", "building-*"], reflectance=0.3, specular_reflectance=PAINT),
+    ]
+    return replace(survey, materials=materials)
+
+
+def upright(name: str, one: tuple[float, float], other: tuple[float, float]) -> SceneMesh:
+    """Return a wall between two places, 3 m below the sensor and 3 m above."""
+    low, high = ([[*place, z] for place in (one, other)] for z in (-3.0, 3.0))
+    return SceneMesh(name, np.array([*low, *high]), np.array([[0, 1, 3], [0, 3, 2]]))
+
+
+def picture(path: Path) -> None:
+    """Draw a shop window from above, and energies against the angle of incidence."""
+    figure = Figure((12, 4.4), layout="constrained", dpi=100)
+    above, right = figure.subplots(1, 2, width_ratios=[1.5, 1])
+    car, van = (
+        replace(box(name, size), vertices=box(name, size).vertices + place)
+        for name, size, place in (("Car", (4.4, 1.8, 3), (4.0, -3.5, -1.5)),
+                                  ("Van", (2.0, 2.0, 3), (-4.5, 3.5, -1.5)))
+    )  # fmt: skip
+    meshes = [
+        upright("Window", (-8, 7.5), (8, 7.5)), upright("Shop", (-8, 11), (8, 11)),
+        upright("Street", (-9, -6), (9, -6)), car, van,
+    ]  # fmt: skip
+    glass = Material("Window", DIRT, transparent="pass", specular_reflectance="fresnel")
+    turning = Sensor(Beams(np.radians([-4, 0, 4])), Spin(1800, 360), 0.5, 60.0)
+    survey = Survey(
+        turning, poses=[(0, 0, 0)], steps=1, materials=[Material("*", 0.5), glass],
+        returns=Returns("all"), columns=("cause",), keep_every=1, precision_m=0.001,
+    )  # fmt: skip
+    found = cloud(Scene.from_meshes(meshes), survey)
+    ghost = found["cause"] == 5
+    for which, colour, label in ((~ghost, GREY, "surfaces"), (ghost, RED, "ghosts")):
+        name = f"{label}: {which.sum():,}"
+        above.plot(found["y"][which], -found["x"][which], ".", ms=3, color=colour, label=name)
+    above.plot(0, 0, ">", color=BLUE, ms=8, label="sensor")
+    labels = {
+        (6.6, 8.3): "window", (11.3, 7): "shop", (-5.7, 6.5): "street", (-4.2, -5): "car",
+        (2.6, 5.7): "van", (11.7, 3.9): "its ghost", (18, -5): "its ghost",
+        (16.4, 6.2): "ghost of the street",
+    }  # fmt: skip
+    for place, name in labels.items():
+        above.annotate(name, place, fontsize=8)
+    above.set(aspect="equal", xlim=(-7, 22), ylim=(-9, 9.5), xlabel="ahead (m)", ylabel="left (m)")
+    above.legend(fontsize=8, loc="lower left", framealpha=0.9, markerscale=1.5)
+    above.set_title("a shop window from above, all returns", fontsize=10)
+    degrees = np.arange(8, 88, 4)
+    for angle in np.radians(degrees):
+        off = np.array([-np.cos(2 * angle), np.sin(2 * angle)])
+        side, off = 0.3 * np.array([-off[1], off[0]]), np.array([10, 0]) + 6 * off
+        edge = 3 * np.array([np.sin(angle), np.cos(angle)])
+        glazing = upright("Window", (10 + edge[0], edge[1]), (10 - edge[0], -edge[1]))
+        beside = upright("Beside", tuple(off + side), tuple(off - side))
+        room = [glazing, beside, upright("Behind", (40, 1), (40, -1))]
+        one = shot(
+            room, Sensor(Beams(np.zeros(1)), Spin(1, 360), 0), Noise(), returns=Returns("all"),
+            materials=[Material("*", 1.0), glass], columns=("object", "reflectivity"),
+        )  # fmt: skip
+        for number, colour in ((0, GREY), (1, RED), (2, BLUE)):
+            own = one["reflectivity"][one["object"] == number]
+            right.plot([np.degrees(angle)] * len(own), own, "o", ms=4, color=colour)
+    angle = np.radians(np.linspace(0, 89, 300))
+    mirrored = (1 - DIRT) * fresnel(np.cos(angle))
+    right.plot(np.degrees(angle), DIRT * np.cos(angle), color=GREY, label="dirt: ρ cos θ")
+    right.plot(np.degrees(angle), mirrored**2, color=RED, label="ghost: ((1 − ρ) F)²")
+    behind = (1 - DIRT - mirrored) ** 2
+    right.plot(np.degrees(angle), behind, color=BLUE, label="behind: ((1 − ρ)(1 − F))²")
+    right.set(yscale="log", ylim=(5e-4, 1.5), xlabel="angle of incidence, degrees")
+    right.set_ylabel("reflectivity of white walls")
+    right.set_title("dirty glass; dots simulated, lines closed form", fontsize=10)
+    right.legend(fontsize=8, frameon=False)
+    right.grid(alpha=0.25)
+    figure.savefig(path)

@@ -1,0 +1,105 @@
+"""Spray behind vehicles on wet ground."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from benchmarks.effects._receiver import BLUE, GREY, RED, cloud
+from lidarpool import (
+    Actor,
+    Beams,
+    Noise,
+    Optics,
+    Returns,
+    Scene,
+    SceneMesh,
+    Sensor,
+    Spin,
+    Survey,
+    Track,
+    load_sensor,
+)  # fmt: skip
+from lidarpool.scene.actors import box
+from lidarpool.sensor.weather import spray
+
+DRAWS = "effect-spray.png"
+WEATHER = {"wet": 1.0, "spray_g_m3": 20.0}
+NOISE, SPEED, SPRAY = Noise(detection_range_m=90), 25.0, 6
+
+
+def on(survey: Survey) -> Survey:
+    """Switch it on."""
+    return replace(survey, noise=NOISE, **WEATHER)
+
+
+def of(scene: Scene) -> Scene:
+    """Add two lorries to a street, which drive at 90 km/h."""
+    return scene.with_actors([lorry("Near", (-20, 3.5)), lorry("Far", (-10, -3.5))])
+
+
+def lorry(name: str, place: tuple[float, float], height: float = 0.0) -> Actor:
+    """Make a lorry that drives along x."""
+    way = Track([0, 2], [[*place, height], [place[0] + 2 * SPEED, place[1], height]], beyond="hold")
+    return Actor(box(name, (9, 2.5, 3)), way)
+
+
+def picture(path: Path) -> None:
+    """Draw a lorry from above and from the side, and how spray falls off behind it."""
+    figure = Figure((12, 4.4), layout="constrained", dpi=100)
+    views = figure.subplot_mosaic([["above", "right"], ["aside", "right"]], width_ratios=[1.5, 1])
+    road = SceneMesh("Road", 80.0 * np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]]),
+                     np.array([[0, 1, 2], [0, 2, 3]]))  # fmt: skip
+    scene = Scene.from_meshes([road]).with_actors([lorry("Lorry", (8, -3.5))])
+    sensor = load_sensor("ouster/os1-128", max_range_m=120)
+    survey = Survey(sensor, poses=[(-8, 0, 1.9)], steps=36, keep_every=1, precision_m=0.001)
+    found = cloud(scene, replace(survey, noise=NOISE, **WEATHER))
+    wet = found["cause"] == SPRAY
+    for name, axis in (("above", "y"), ("aside", "z")):
+        for which, colour, label in ((~wet, GREY, "surfaces"), (wet, RED, "spray")):
+            views[name].plot(
+                found["x"][which], found[axis][which], ".", ms=2.5, mew=0, color=colour,
+                label=f"{label}: {which.sum():,}",
+            )  # fmt: skip
+        views[name].plot(-8, 0 if axis == "y" else 1.9, "^", color=BLUE, ms=7)
+        limits = (-8, 3) if axis == "y" else (-0.3, 4)
+        views[name].set(xlim=(-25, 18), ylim=limits, xlabel="x (m)", ylabel=f"{axis} (m)")
+        views[name].set_aspect("equal")
+    views["above"].legend(fontsize=8, loc="upper left", framealpha=0.9, markerscale=4)
+    views["above"].set_title("a lorry at 90 km/h, 20 g/m³, from above", fontsize=10)
+    views["aside"].set_title("from the side", fontsize=10)
+    # Beams across the way, 8 m from its middle, at places behind the lorry.
+    count, behind, shares = 4000, np.arange(0.5, 28, 0.75), []
+    ahead = Sensor(Beams(np.zeros(count), np.full(count, math.pi / 2)), Spin(1, 360), 0.5, 60.0,
+                   optics=Optics(divergence_mrad=3.0))  # fmt: skip
+    rear = replace(scene, actors=(lorry("Lorry", (4.5, 8), -1.5),))
+    for x in behind:
+        one = Survey(
+            ahead,
+            poses=[(-x, 0, 0)],
+            steps=1,
+            keep_every=1,
+            noise=NOISE,
+            returns=Returns("all", pulse_ns=0),
+            **WEATHER,
+        )
+        shares.append((cloud(rear, one)["cause"] == SPRAY).sum() / count)
+    axes = views["right"]
+    axes.plot(behind, shares, "o", ms=4, color=BLUE, label="simulated")
+    kind, air = spray(20.0), one.air(0)
+    span = np.linspace(8 - 1.25, 8 + 1.25, 200)
+    most = float(np.trapezoid(air.rate(kind, NOISE.threshold, span), span))
+    along = np.linspace(0, 28, 1000)
+    age = np.ceil(along / (SPEED / 10)) / 10
+    curve = most * np.exp(-age / 0.4) * (age <= 1.3)
+    axes.plot(along, curve, color=GREY, label="Poisson's mean, boxes of 0.1 s")
+    axes.plot(along, most * np.exp(-along / SPEED / 0.4), ":", color=GREY, label="exp(−x / 10 m)")
+    axes.set(xlabel="behind the lorry (m)", ylabel="returns of a beam across", xlim=(0, 28))
+    axes.set_title("a beam from 8 m beside it", fontsize=10)
+    axes.legend(fontsize=8, frameon=False)
+    axes.grid(alpha=0.25)
+    figure.savefig(path)

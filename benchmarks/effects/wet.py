@@ -1,0 +1,65 @@
+"""Wet ground: a film of water on what faces up."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from benchmarks.effects._receiver import BLUE, GREY, RED, cloud, points, wall
+from lidarpool import Beams, Material, Noise, Returns, Scene, SceneMesh, Sensor, Spin, Survey
+from lidarpool.sensor.materials import WATER_INDEX, below_water, fresnel
+
+DRAWS = "effect-wet.png"
+ROAD = 0.2
+
+
+def on(survey: Survey) -> Survey:
+    """Switch it on."""
+    return replace(survey, wet=1.0)
+
+
+def picture(path: Path) -> None:
+    """Draw a road from the side, dry and wet, and what returns against the angle."""
+    figure = Figure((12, 4.4), layout="constrained", dpi=100)
+    views = figure.subplot_mosaic([["dry", "right"], ["wet", "right"]], width_ratios=[1.5, 1])
+    corners = np.array([[-90, -90, -2], [90, -90, -2], [90, 90, -2], [-90, 90, -2.0]])
+    road = SceneMesh("Road", corners, np.array([[0, 1, 2], [0, 2, 3]]))
+    sign, house = wall("Sign", 9, (-0.6, 0.6), (0.3, 1.3)), wall("House", 30, z=(-2, 3))
+    scene = Scene.from_meshes([road, sign, house])
+    beams = Beams(np.radians(np.arange(-60, 8.5, 0.2)))
+    survey = Survey(
+        Sensor(beams, Spin(3600, 1), 0.5, 90.0), poses=[(0, 0, 0)], steps=1,
+        materials=[Material("*", 0.8), Material("Road", ROAD)], noise=Noise(detection_range_m=100),
+        returns=Returns("all"), columns=("cause", "reflectivity", "elevation"), keep_every=1,
+        precision_m=0.001,
+    )  # fmt: skip
+    for name, share in (("dry", 0.0), ("wet", 1.0)):
+        found, axes = cloud(scene, replace(survey, wet=share)), views[name]
+        x, z = found["x"], found["z"] + 2
+        ghost = found["cause"] == 5
+        for which, colour, label in ((~ghost, GREY, "surfaces"), (ghost, RED, "ghosts")):
+            shown = f"{label}: {which.sum():,}"
+            axes.plot(x[which], z[which], ".", ms=3, mew=0, color=colour, label=shown)
+        axes.plot(0, 2, "^", color=BLUE, ms=7)
+        axes.set(xlim=(-1, 34), ylim=(-6, 6), xlabel="x (m)", ylabel="z (m)", title=name)
+        axes.legend(fontsize=8, loc="lower left", framealpha=0.9, markerscale=4)
+        if name == "wet":
+            once = points([road], replace(survey, wet=share))
+            steep = 90 + once["elevation"][:: len(x) // 400]
+            shown = once["reflectivity"][:: len(x) // 400]
+            views["right"].plot(steep, shown, "o", ms=4, color=BLUE)
+    angle = np.radians(np.linspace(0, 89.5, 400))
+    dry, axes = ROAD * np.cos(angle), views["right"]
+    axes.plot(np.degrees(angle), dry, color=GREY, label="dry: ρ cos θ")
+    wet = dry * below_water(np.cos(angle), np.full(len(angle), ROAD))
+    axes.plot(np.degrees(angle), wet, color=BLUE, label="wet: ρ cos θ T² / (n² (1 − p ρ))")
+    mirrored = fresnel(np.cos(angle), WATER_INDEX) ** 2
+    axes.plot(np.degrees(angle), mirrored, color=RED, label="ghost of a white wall: F²")
+    axes.set(yscale="log", ylim=(3e-4, 1), xlabel="angle of incidence, degrees")
+    axes.set(ylabel="reflectivity", title="asphalt; dots simulated, lines closed form")
+    axes.legend(fontsize=8, frameon=False)
+    axes.grid(alpha=0.25)
+    figure.savefig(path)
