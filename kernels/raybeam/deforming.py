@@ -1,0 +1,77 @@
+"""Meshes whose vertices move: each ray meets the mesh as it is at the ray's own time.
+
+A tree over the triangles, made once, serves for all times: between two frames each vertex moves
+straight, so the boxes around the triangles at both hold them in between, too. All backends cast
+these meshes in one loop on the CPU (deforming_loops.py), with the test of triangle.py.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, ClassVar
+
+import numpy as np
+
+from .arrays import Floats, Ints
+from .crossing import Crossing, Nearest
+from .tree import build_tree
+
+_PAD = 1e-6  # of the mesh's size, around boxes: far more than rounding to float32
+_LEAF_SIZE = 4
+
+
+@dataclass(frozen=True, eq=False)
+class Deforming:
+    """A mesh whose vertices move straight from frame to frame: a shape of `Moving`.
+
+    Attributes
+    ----------
+    vertices
+        float64 (f, v, 3), metres: at least two frames.
+    faces
+        int64 (t, 3).
+    """
+
+    vertices: Floats
+    faces: Ints
+    on_device: ClassVar[bool] = False  # as of `RayCaster`
+
+    @property
+    def box(self) -> Floats:
+        """Low and high corner of all frames: (2, 3)."""
+        return np.stack([self.vertices.min(axis=(0, 1)), self.vertices.max(axis=(0, 1))])
+
+    def at(self, frames: Floats) -> Floats:
+        """Return the vertices at frames (n,), of which 1.5 is half way from the second: (n, v, 3).
+
+        Before the first and after the last they stay as they are there.
+        """
+        begin = frames.astype(np.int64).clip(0, len(self.vertices) - 2)
+        share = (frames - begin).clip(0, 1)[:, None, None]
+        return np.asarray((1 - share) * self.vertices[begin] + share * self.vertices[begin + 1])
+
+    def strike(self, crossing: Crossing, nearest: Nearest) -> None:
+        """See `RayCaster.strike`; of equally close triangles the lowest is hit."""
+        from . import deforming_loops as loops
+
+        columns = crossing.row, crossing.body, crossing.number
+        given = map(np.ascontiguousarray, columns)
+        limits = np.array(crossing.limits, np.float64)
+        loops.strike(crossing.rays, *given, crossing.poses, crossing.frame, limits, *self._tables,
+                     *nearest)  # fmt: skip
+
+    @cached_property
+    def _tables(self) -> tuple[Any, ...]:
+        """Vertices, faces and the tree, see `deforming_loops.strike`."""
+        from . import deforming_loops as loops
+
+        vertices, faces = np.ascontiguousarray(self.vertices), np.ascontiguousarray(self.faces)
+        low, high = self.box
+        size = max(float(np.ptp(self.box, axis=0).max()), 1e-300)
+        local = (vertices[0] - (low + high) / 2) / size
+        tree = build_tree(local[faces], loops.WIDTH, _LEAF_SIZE)
+        boxes = np.empty((len(vertices) - 1, len(tree.child), 6, loops.WIDTH), np.float32)
+        pad = _PAD * float(np.abs(self.box).max())
+        loops.fit(vertices, faces, tree.order, tree.child, pad, boxes)
+        return vertices, faces, tree.order, tree.child, boxes
