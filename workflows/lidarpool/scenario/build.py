@@ -108,7 +108,8 @@ class Job:
         for actor in scene.actors:
             actor.check(0.0, survey.duration_ns)
             ways, _ = actor.trajectory.poses(0, np.linspace(0, survey.duration_ns, 100))
-            reach = max(reach, float(np.abs(ways).max() + np.abs(actor.mesh.vertices).max()))
+            own = (actor.mesh.animation or actor.mesh).bounds
+            reach = max(reach, float(np.abs(ways).max() + np.abs(own).max()))
         if reach / survey.precision_m >= 2**31 - 1:
             raise LidarpoolError(
                 f"precision_m {survey.precision_m} is too fine for a scene that reaches "

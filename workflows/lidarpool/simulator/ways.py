@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
 
-from ..base.arrays import Floats, Integers, Ints, owned
+from ..base.arrays import Floats, Indices, Integers, Ints, owned
+from ..scene.actors import Actor
 from ..sensor import Track, Trajectory
 from ..sensor.trajectory import Stations, presence_ns
+
+_NONE = np.zeros(0, np.intp)
 
 
 class _Tracks(NamedTuple):
@@ -51,6 +55,32 @@ def _pieces_of(way: Trajectory) -> _Pieces | None:
 
 class Ways(tuple[Trajectory, ...]):
     """Trajectories of actors."""
+
+    animated: dict[int, Actor] = {}  # {its number: an actor whose mesh has an animation}
+
+    @classmethod
+    def of(cls, actors: Iterable[Actor]) -> Ways:
+        """Return those of actors, and how these deform."""
+        found = list(actors)
+        made = cls(actor.trajectory for actor in found)
+        made.animated = {k: actor for k, actor in enumerate(found) if actor.mesh.animation}
+        return made
+
+    def deforming(self, number: Integers) -> Indices:
+        """Rows of `number` (n,) that are actors whose mesh has an animation."""
+        return np.flatnonzero(np.isin(number, list(self.animated))) if self.animated else _NONE
+
+    def frames(self, number: Integers, times_ns: Floats) -> Floats:
+        """Frames of the animations of actors `number` (n,) at times (n,), see `Actor.played`."""
+        return self.played(number, times_ns)[0]
+
+    def played(self, number: Integers, times_ns: Floats) -> Floats:
+        """Frames as of `frames`, and how many a second pass then: (2, n)."""
+        out = np.zeros((2, len(number)))
+        for one in np.unique(number).tolist():
+            rows = np.flatnonzero(number == one)
+            out[:, rows] = self.animated[one].played(times_ns[rows])
+        return out
 
     @cached_property
     def presence_ns(self) -> Floats:
