@@ -22,6 +22,7 @@ from .sections import SensorSection
 LARGE_M, LARGE_STL_M, LARGE_OBJECT_M, LARGE_STATED_M, SMALL_M = 500.0, 20.0, 10.0, 100.0, 0.2
 
 _LOOKED_FROM = 8  # positions, if poses or a trajectory are given
+_MOMENTS = 1001  # of a survey
 
 
 def advice(built: Built) -> list[str]:
@@ -36,7 +37,7 @@ def advice(built: Built) -> list[str]:
         axes = [f"{axes[0]}; {plural(len(remarks) - 1, 'more file')}, too"]
     likely = filter(None, (_of_size(built), _of_poses(built), _of_colours(built)))
     unstated = dict.fromkeys(_of_datasheets(built))
-    lines = (*notes, *axes, *likely, *unstated, *_without_effect(built.scenario))
+    lines = (*notes, *axes, *likely, *unstated, *_without_effect(built.scenario), *_ended(built))
     return [as_scenario(line) for line in lines]
 
 
@@ -124,3 +125,17 @@ def _without_effect(scenario: Scenario) -> Iterator[str]:
         yield "navigation.imu has jumps at linear poses: give trajectory.interpolation: smooth"
     if scenario.noise.velocity_m_s and VELOCITY not in scenario.cloud.columns:
         yield f"noise.velocity_m_s is that of the column {VELOCITY}: add it to cloud.columns"
+
+
+def _ended(built: Built) -> Iterator[str]:
+    """Tell of actors whose animation ends before the survey does."""
+    duration_ns = built.survey.duration_ns
+    for actor in built.scene.actors:
+        if (animation := actor.mesh.animation) is not None and not animation.repeat:
+            times = np.linspace(0, duration_ns, _MOMENTS)
+            after = np.flatnonzero(actor.seconds(times)[0] >= animation.duration_s)
+            if len(after) and after[0] < _MOMENTS - 1:
+                yield (
+                    f"{actor.name}: its animation ends after {times[after[0]] / 1e9:.3g} s of "
+                    f"{duration_ns / 1e9:.3g} s, and its last pose remains: give repeat: true"
+                )

@@ -283,7 +283,8 @@ def _actors(shapes: Shapes, standing: Standing, track: Track | None) -> list[Act
             with prefixed(f"{scenario.source}: actor {entry.name!r}"):
                 out += _links(entry, shapes.robot(entry.robot), way, shapes)
         else:
-            out.append(Actor(replace(shapes.of(entry), name=entry.name), way))
+            offset_s = 0.0 if entry.animation is None else entry.animation.offset_s
+            out.append(Actor(replace(shapes.of(entry), name=entry.name), way, offset_s))
     return out
 
 

@@ -13,6 +13,7 @@ from ..base.arrays import Floats
 from ..base.errors import LidarpoolError, Mistakes, prefixed
 from ..base.words import plural
 from ..scene.actors import Actor, box, one_mesh
+from ..scene.baking import animated, rolling
 from ..scene.files.meshfile import ROBOTS, Objects, load_objects
 from ..scene.files.scene_graph import Raster
 from ..scene.files.urdf import load_robot
@@ -131,15 +132,30 @@ class Shapes:
     def of(self, entry: ShapeSection) -> SceneMesh:
         """Return the mesh of a copy, an actor or vehicles, under any name."""
         shape, made = entry.file or entry.box or (1.0, 1.0, 1.0), self._made
-        if shape not in made:
+        animation, wheels = (getattr(entry, name, None) for name in ("animation", "wheels"))
+        played = animation and (animation.name, animation.speed_m_s, animation.repeat)
+        key = shape, played, wheels
+        if key not in made:
             name = entry.name or "vehicle"
-            if isinstance(shape, MeshFile):
-                read, lost = self.read(shape), f"{self.scenario.path(shape.file)} moves "
-                still = read.still(lambda line: self.found.notes.append(lost + line))
-                made[shape] = one_mesh(name, still)
+            if not isinstance(shape, MeshFile):
+                made[key] = box(name, shape)
+                return made[key]
+            read = self.read(shape, animation and (animation.name or ""))
+            path = self.scenario.path(shape.file)
+            still = read.still(lambda line: self.found.notes.append(f"{path} moves {line}"))
+            if animation is None and wheels is None:
+                made[key] = one_mesh(name, still)
+                return made[key]
+            if any(one.cutouts for one in still if isinstance(one, SceneMesh)):
+                self.found.notes.append(f"{path} deforms: it is solid where images are transparent")
+            poses, step_s, speed_m_s, repeat = read.poses, read.step_s, 1.0, True
+            if animation is not None:
+                speed_m_s, repeat = animation.speed_m_s, animation.repeat
             else:
-                made[shape] = box(name, shape)
-        return made[shape]
+                with prefixed(path):
+                    poses, step_s = rolling(still, wheels, self.found.notes.append)
+            made[key] = animated(name, still, poses, (step_s, speed_m_s, repeat))
+        return made[key]
 
     def robot(self, entry: MeshFile) -> Robot:
         """Return the robot of a file; LidarpoolError if it cannot be used."""
@@ -150,8 +166,8 @@ class Shapes:
             self._robots[entry], self.found.sources[entry.file] = made, made.summary
         return self._robots[entry]
 
-    def read(self, entry: MeshFile) -> Objects:
-        """Read the objects of a file; LidarpoolError if it cannot be used."""
+    def read(self, entry: MeshFile, animation: str | None = None) -> Objects:
+        """Read the objects of a file, perhaps with an animation; LidarpoolError if it cannot be used."""
         scenario, found = self.scenario, self.found
         with prefixed(scenario.source):
             transform = entry.transform()
@@ -164,6 +180,7 @@ class Shapes:
             colours=scenario.coloured,
             epsg=scenario.cloud.epsg,
             assets=None if entry.assets is None else scenario.path(entry.assets),
+            animation=animation,
             tell=found.notes.append,
             axes=found.remarks.append,
         )

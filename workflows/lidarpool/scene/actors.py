@@ -78,7 +78,7 @@ class Actor:
         """Return frames of its animation at times (k,), nanoseconds, and frames a second then."""
         animation = self.mesh.animation
         assert animation is not None, "of a mesh that has one"
-        seconds, rates = self._seconds(times_ns)
+        seconds, rates = self.seconds(times_ns)
         if not animation.repeat:
             rates = rates * ((0 <= seconds) & (seconds < animation.duration_s))
         return animation.frames(seconds), rates / animation.step_s
@@ -89,10 +89,10 @@ class Actor:
             return self.mesh.bounds[None].repeat(len(begins_ns), axis=0)
         # Some in between: it may go there and back.
         times = np.linspace(begins_ns, ends_ns, 5)
-        seconds = self._seconds(times.reshape(-1))[0].reshape(times.shape)
+        seconds = self.seconds(times.reshape(-1))[0].reshape(times.shape)
         return animation.bounds_between(seconds.min(axis=0), seconds.max(axis=0))
 
-    def _seconds(self, times_ns: Floats) -> tuple[Floats, Floats]:
+    def seconds(self, times_ns: Floats) -> tuple[Floats, Floats]:
         """Seconds of its animation at times (k,), nanoseconds, and how many a second pass then."""
         animation = self.mesh.animation
         assert animation is not None

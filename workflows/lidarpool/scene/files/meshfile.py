@@ -64,6 +64,7 @@ CONVERTED = {  # {ending of scenes that are not read: what to do}
     ".mjcf": _MUJOCO,
     ".xml": f"{_MUJOCO}, and lidarpool import reads a survey of HELIOS++",
 }
+ANIMATED = (".glb", ".gltf")
 UNITLESS = (".obj", ".stl", ".ply", ".off")  # formats without a unit
 
 GENERATOR = "lidarpool"  # that files of our own name, .glb as Y-up, others as Z-up
@@ -89,6 +90,9 @@ class Objects(NamedTuple):
     moving: tuple[Actor, ...] = ()  # each along a `Track`
     summary: str = ""  # objects, triangles, unit, axes and colours
     raster: Raster | None = None  # what was taken of one
+    # Of an animation: vertices (f, v, 3) of each object that stands, in poses `step_s` apart.
+    poses: tuple[Floats, ...] = ()
+    step_s: float = 0.0
 
     def still(self, tell: Callable[[str], None]) -> tuple[SceneMesh | SceneInstance, ...]:
         """Return all of them where they are at first; `tell` is called if that is a loss."""
@@ -112,6 +116,7 @@ def load_objects(
     window: Window | None = None,
     epsg: int | None = None,
     assets: str | Path | None = None,
+    animation: str | None = None,
     tell: Callable[[str], None] = warn,
     axes: Callable[[str], None] | None = None,
 ) -> Objects:
@@ -134,6 +139,9 @@ def load_objects(
     epsg
         Code of the coordinate system that a raster is brought to, one in metres. None keeps its
         own if it is in metres, else takes the UTM zone of its middle.
+    animation
+        Of a .glb or .gltf: name of the animation that `Objects.poses` are of, or its number if it
+        has none; "" for the first. None leaves all as it stands.
     tell
         Called with a line on objects left out, on images that cannot be read, on materials that
         may be glass, or on a reference system; by default this module's logger warns.
@@ -165,8 +173,13 @@ def load_objects(
             f"{path} is no raster: leave out {' and '.join(given)}, or give a raster "
             f"({' '.join(RASTERS)})."
         )
+    if animation is not None and path.suffix.lower() not in ANIMATED:
+        raise LidarpoolError(
+            f"{path} has no animations that are read: give a {' or '.join(ANIMATED)}, or leave out "
+            "animation."
+        )
     folders = tuple(Path(one).resolve() for one in (path.parent, assets) if one is not None)
-    wanted = Wanted(opacity == "mask", colours, folders)
+    wanted = Wanted(opacity == "mask", colours, folders, animation)
     # Of broken numbers in files: infinite and NaN values are refused.
     with np.errstate(all="ignore"):
         try:
@@ -181,7 +194,8 @@ def load_objects(
         with prefixed(path):
             standing = tuple(_placed(mesh, path.stem, places) for mesh in content.meshes)
             moving = tuple(_actor(one, path.stem, upright, placed) for one in content.moving)
-    objects = Objects(standing, moving)
+        poses = tuple(_placed_poses(one, places) for one in content.poses)
+    objects = Objects(standing, moving, poses=poses, step_s=content.step_s)
     if content.skipped:
         names = ", ".join(content.skipped[:3]) + ", …" * (len(content.skipped) > 3)
         tell(f"{path} scales {names} to zero: left out")
@@ -376,6 +390,16 @@ def _placed(
             "on Earth: check its unit and placement."
         )
     return one
+
+
+def _placed_poses(poses: Floats, places: Sequence[Transform]) -> Floats:
+    """Return vertices (f, v, 3) in the world."""
+    points = poses.reshape(-1, 3)
+    for place in places:
+        points = turned(points, place.linear) + place.offset
+    if not np.isfinite(points).all():
+        raise LidarpoolError("An animation moves vertices to where no number is: export it again.")
+    return points.reshape(poses.shape)
 
 
 def _actor(one: RigidPart, stem: str, upright: Transform, placed: Transform) -> Actor:
