@@ -1,8 +1,8 @@
 """What is real, beside what is bare: `python -m benchmarks.realism [--rounds N] [--json]`.
 
 One sweep of an OS1-64 in a city of 100,000 triangles, one thread: bare, with cars that move (boxes,
-and meshes of 1,000 triangles), from a sensor that moves too, with sub-rays, with noise, in rain,
-fog and snow; cars, sub-rays, noise and rain together (`real`), and all of it. Each figure is the
+and meshes of 1,000 triangles), with 20 people of 2,320 triangles, rigid and walking, from a sensor
+that moves too, with sub-rays, with noise, in rain, fog and snow; cars, sub-rays, noise and rain together (`real`), and all of it. Each figure is the
 median of the rounds, and a multiple of the bare sweep's.
 """
 
@@ -11,12 +11,16 @@ from __future__ import annotations
 import argparse
 import json
 import time
+from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from lidarpool import Actor, Noise, Returns, Scanner, Scene, Track, load_sensor
 from lidarpool.scene.actors import box
+from lidarpool.scene.baking import animated
+from lidarpool.scene.files.meshfile import load_objects
 from lidarpool.scene.generated.city import city
 from lidarpool.scene.scene_mesh import SceneMesh
 from raybeam import available_backends
@@ -27,6 +31,7 @@ PLACE = (0.0, 0.0, 1.9)
 SPEED_M_S, TURN_S, FIELD_M = 20.0, 0.1, (5.0, 60.0)
 COLUMNS = ("time", "range", "intensity", "class", "sensor")
 COUNTS = (10, 100, 300)
+PERSON, PEOPLE_M = Path(__file__).parents[1] / "examples" / "pedestrian.glb", (4.0, 30.0)
 
 
 def fine_box(triangles: int) -> SceneMesh:
@@ -58,6 +63,21 @@ def cars(count: int, mesh: SceneMesh, seed: int) -> list[Actor]:
     return made
 
 
+def people(count: int, seed: int, *, walking: bool) -> list[Actor]:
+    """Make copies of one person around the sensor, at 1.4 m/s, each in another phase."""
+    found = load_objects(PERSON, animation="Walk")
+    mesh = animated("Person", found.standing, found.poses, (found.step_s, 1.4, True))
+    if not walking:
+        mesh = replace(mesh, animation=None)
+    random = np.random.default_rng(seed)
+    angle, heading = random.uniform(0, 2 * np.pi, (2, count))
+    begin = random.uniform(*PEOPLE_M, count) * [np.cos(angle), np.sin(angle), 0 * angle]
+    ahead = 1.4 * np.array([np.cos(heading), np.sin(heading), 0 * heading])
+    offsets = random.uniform(0, 1, count).tolist()
+    ways = [Track([0, 1], [a, a + b]) for a, b in zip(begin.T, ahead.T, strict=True)]
+    return [Actor(mesh, way, offset) for way, offset in zip(ways, offsets, strict=True)]
+
+
 def cases(scene: Scene, backend: str, counts: tuple[int, ...], sensor: str) -> dict[str, Any]:
     """Make a function of the round for each row, which gives its number of points."""
     lidar = load_sensor(sensor)
@@ -81,6 +101,8 @@ def cases(scene: Scene, backend: str, counts: tuple[int, ...], sensor: str) -> d
     for count in counts:
         rows[f"{count} boxes"] = case(cars(count, plain, count))
         rows[f"{count} meshes"] = case(cars(count, fine, count))
+    rows["20 people, rigid"] = case(people(20, 20, walking=False))
+    rows["20 people, walking"] = case(people(20, 20, walking=True))
     some = counts[len(counts) // 2]
     rows[f"{some} boxes, moving"] = case(cars(some, plain, some), way)
     for subrays, mode in ((7, "strongest"), (19, "all")):

@@ -22,10 +22,10 @@ def chosen(animations: list[dict[str, Any]], name: str) -> dict[str, Any]:
     """Return the animation of a name, or of a number for those without names; "" for the first."""
     names = [str(one.get("name") or number) for number, one in enumerate(animations)]
     if not names:
-        raise MeshFileError(f"has no animation {name!r}: leave out animation, or export with it")
+        raise MeshFileError("has no animations: export it with them, or leave out animation")
     if name and name not in names:
-        hint = did_you_mean(name, names) or f" There are {', '.join(names[:8])}."
-        raise MeshFileError(f"has no animation {name!r}.{hint}".rstrip("."))
+        near = did_you_mean(name, names).strip() or f"there are {', '.join(names[:8])}"
+        raise MeshFileError(f"has no animation {name!r} ({near})")
     return animations[names.index(name) if name else 0]
 
 
