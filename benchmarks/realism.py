@@ -2,8 +2,9 @@
 
 One sweep of an OS1-64 in a city of 100,000 triangles, one thread: bare, with cars that move (boxes,
 and meshes of 1,000 triangles), with 20 people of 2,320 triangles, rigid and walking, from a sensor
-that moves too, with sub-rays, with noise, in rain, fog and snow; cars, sub-rays, noise and rain together (`real`), and all of it. Each figure is the
-median of the rounds, and a multiple of the bare sweep's.
+that moves too, with sub-rays, with noise, in rain, fog and snow; cars, sub-rays, noise and rain
+together (`real`), and all of it. Each figure is the median of the rounds, and a multiple of the
+bare sweep's.
 """
 
 from __future__ import annotations
@@ -18,8 +19,7 @@ from typing import Any
 import numpy as np
 
 from lidarpool import Actor, Noise, Returns, Scanner, Scene, Track, load_sensor
-from lidarpool.scene.actors import box
-from lidarpool.scene.baking import animated
+from lidarpool.scene.actors import box, one_mesh
 from lidarpool.scene.files.meshfile import load_objects
 from lidarpool.scene.generated.city import city
 from lidarpool.scene.scene_mesh import SceneMesh
@@ -65,10 +65,9 @@ def cars(count: int, mesh: SceneMesh, seed: int) -> list[Actor]:
 
 def people(count: int, seed: int, *, walking: bool) -> list[Actor]:
     """Make copies of one person around the sensor, at 1.4 m/s, each in another phase."""
-    found = load_objects(PERSON, animation="Walk")
-    mesh = animated("Person", found.standing, found.poses, (found.step_s, 1.4, True))
-    if not walking:
-        mesh = replace(mesh, animation=None)
+    mesh = one_mesh("Person", load_objects(PERSON, animation="Walk").standing)
+    assert mesh.animation is not None
+    mesh = replace(mesh, animation=replace(mesh.animation, speed_m_s=1.4) if walking else None)
     random = np.random.default_rng(seed)
     angle, heading = random.uniform(0, 2 * np.pi, (2, count))
     begin = random.uniform(*PEOPLE_M, count) * [np.cos(angle), np.sin(angle), 0 * angle]

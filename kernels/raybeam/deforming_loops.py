@@ -98,9 +98,9 @@ def strike(  # type: ignore[no-untyped-def]
         axis, a, b, c, d, e, f = shear(x, y, z, u, v, w)
         ray = a, b, c, d, e, f
         frame = min(max(np.int64(frames[n]), 0), len(vertices) - 2)
-        share = min(max(frames[n] - frame, 0.0), 1.0)
+        share = np.float64(min(max(frames[n] - frame, 0.0), 1.0))
         at = boxes.ctypes.data + _BOX * len(child) * frame
-        best, found, top = min(distance[k], t_max), -1, 1
+        best, found, top = min(distance[k], t_max), np.int64(-1), 1
         stack[0], waits[0] = 0, 0.0
         while top:
             top -= 1

@@ -16,9 +16,9 @@ from raybeam import (
     RayCaster,
     check_scan,
     hits_on,
+    triangle,
 )
 from raybeam import moving as module
-from raybeam import triangle
 
 RAYS, PERIOD = 3_000, 0.1
 FLAT = np.array([[-1.0, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]]), [[0, 1, 2], [0, 2, 3]]
@@ -255,8 +255,7 @@ def test_bodies_that_deform_are_hit_where_they_are_at_the_time_of_each_ray():
         turns = pose[3:].reshape(3, 3, -1).transpose(1, 0, 2)
         start, ahead = np.array([[-9], [0.2], [0]]) - pose[:3], directions[own].T
         start, ahead = (
-            np.stack([(x * a + y * b) + z * c for a, b, c in turns]).T
-            for x, y, z in (start, ahead)
+            np.stack([(x * a + y * b) + z * c for a, b, c in turns]).T for x, y, z in (start, ahead)
         )
         for number, ray in enumerate(own.tolist()):
             corners = shape.at(frame(np.array([body]), times[[ray]]))[0][doubled]

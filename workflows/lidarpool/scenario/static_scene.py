@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -13,7 +13,6 @@ from ..base.arrays import Floats
 from ..base.errors import LidarpoolError, Mistakes, prefixed
 from ..base.words import plural
 from ..scene.actors import Actor, box, one_mesh
-from ..scene.baking import animated, rolling
 from ..scene.files.meshfile import ROBOTS, Objects, load_objects
 from ..scene.files.scene_graph import Raster
 from ..scene.files.urdf import load_robot
@@ -23,6 +22,7 @@ from ..scene.scene_instances import SceneInstance
 from ..scene.scene_mesh import SceneMesh
 from ..scene.shapes import seed_objects
 from ..scene.transform import Transform
+from ..scene.wheels import rolling
 from ..sensor.calibrations import said, text_of
 from ..sensor.trajectory import rotations_of
 from ..sensor.trajectory_files import columns_of_table
@@ -143,18 +143,13 @@ class Shapes:
             read = self.read(shape, animation and (animation.name or ""))
             path = self.scenario.path(shape.file)
             still = read.still(lambda line: self.found.notes.append(f"{path} moves {line}"))
-            if animation is None and wheels is None:
-                made[key] = one_mesh(name, still)
-                return made[key]
-            if any(one.cutouts for one in still if isinstance(one, SceneMesh)):
-                self.found.notes.append(f"{path} deforms: it is solid where images are transparent")
-            poses, step_s, speed_m_s, repeat = read.poses, read.step_s, 1.0, True
-            if animation is not None:
-                speed_m_s, repeat = animation.speed_m_s, animation.repeat
-            else:
+            if wheels is not None:
                 with prefixed(path):
-                    poses, step_s = rolling(still, wheels, self.found.notes.append)
-            made[key] = animated(name, still, poses, (step_s, speed_m_s, repeat))
+                    still = rolling(still, wheels, self.found.notes.append)
+            mesh = made[key] = one_mesh(name, still)
+            if animation is not None and mesh.animation is not None:
+                own = {"speed_m_s": animation.speed_m_s, "repeat": animation.repeat}
+                made[key] = replace(mesh, animation=replace(mesh.animation, **own))
         return made[key]
 
     def robot(self, entry: MeshFile) -> Robot:
@@ -167,7 +162,7 @@ class Shapes:
         return self._robots[entry]
 
     def read(self, entry: MeshFile, animation: str | None = None) -> Objects:
-        """Read the objects of a file, perhaps with an animation; LidarpoolError if it cannot be used."""
+        """Read the objects of a file, with an animation; LidarpoolError if it cannot be used."""
         scenario, found = self.scenario, self.found
         with prefixed(scenario.source):
             transform = entry.transform()

@@ -80,7 +80,7 @@ class Actor:
         assert animation is not None, "of a mesh that has one"
         seconds, rates = self.seconds(times_ns)
         if not animation.repeat:
-            rates = rates * ((0 <= seconds) & (seconds < animation.duration_s))
+            rates = rates * ((seconds >= 0) & (seconds < animation.duration_s))
         return animation.frames(seconds), rates / animation.step_s
 
     def bounds_between(self, begins_ns: Floats, ends_ns: Floats) -> Floats:
@@ -172,18 +172,31 @@ def shapes_of(actors: Iterable[Actor]) -> tuple[list[SceneMesh], Indices]:
 
 
 def one_mesh(name: str, objects: Iterable[SceneMesh | SceneInstance]) -> SceneMesh:
-    """Join objects to one; masks are kept."""
+    """Join objects to one; masks are kept, and the animation of some, without the masks."""
     flat = [one.flat() if isinstance(one, SceneInstance) else one for one in objects]
     if any(part.voxels is not None for part in flat):
         if flat[1:]:
             raise LidarpoolError(f"{name!r} has voxels, and cannot be joined to other objects.")
         return replace(flat[0], name=name)
+    if any(mesh.animation for mesh in flat):
+        return _one_animated(name, flat)
     parts = [part for mesh in flat for part in parts_of(mesh)]
     parts.sort(key=lambda part: part.mask is not None)  # those with masks last
     vertices, faces = stacked((part.vertices, part.faces) for part in parts)
     cutouts = [cut for mesh in flat for cut in mesh.cutouts]
     colours = joined([part.colours for part in parts], [len(part.faces) for part in parts])
     return SceneMesh(name, vertices, faces, tuple(cutouts), colours)
+
+
+def _one_animated(name: str, meshes: Sequence[SceneMesh]) -> SceneMesh:
+    """Join meshes of which some have poses of one animation."""
+    first = next(mesh.animation for mesh in meshes if mesh.animation)
+    still = (len(first.vertices), 1, 1)
+    poses = [m.animation.vertices if m.animation else np.tile(m.vertices, still) for m in meshes]
+    animation = replace(first, vertices=np.concatenate(poses, axis=1))
+    colours = joined([mesh.colours for mesh in meshes], [len(mesh.faces) for mesh in meshes])
+    parts = stacked((mesh.vertices, mesh.faces) for mesh in meshes)
+    return SceneMesh(name, *parts, colours=colours, animation=animation)
 
 
 def box(name: str, size_m: tuple[float, float, float]) -> SceneMesh:

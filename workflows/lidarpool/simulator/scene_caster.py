@@ -192,7 +192,8 @@ class SceneCaster:
         assert self._shapes is not None
         casters, boxes, parts, shape = self._shapes
         ways = poses.ways
-        moving = Moving(casters, boxes, shape, ways.presence_ns, ways.table, ways.frames)
+        frames = lambda body, times: ways.played(body, times)[0]  # noqa: E731
+        moving = Moving(casters, boxes, shape, ways.presence_ns, ways.table, frames)
         hits = hits_on(moving, scan, poses.times, before)
         ray = np.flatnonzero(hits.body >= 0)
         body, triangle = hits.body[ray], hits.triangle[ray]

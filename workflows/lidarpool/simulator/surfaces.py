@@ -477,7 +477,7 @@ def _turns(transforms: Floats) -> Floats:
 
 
 def _normals(corners: Floats) -> Floats32:
-    """Unit normals (n, 3) of triangles (n, 3, 3), in single precision."""
+    """Return unit normals (n, 3) of triangles (n, 3, 3), in single precision."""
     a, b, c = corners.transpose(1, 0, 2)
     normals = np.cross(b - a, c - a)
     return (normals / np.maximum(length(normals)[:, None], 1e-300)).astype(np.float32)
@@ -496,7 +496,7 @@ def _weights(corners: Floats, points: Floats) -> Floats:
 
 
 def _blended(corners: Floats, weights: Floats) -> Floats:
-    """Sums (n, 3) of rows of corners (n, 3, 3) with weights (n, 3)."""
+    """Add up rows of corners (n, 3, 3) with weights (n, 3): (n, 3)."""
     return applied(corners.transpose(0, 2, 1), weights)
 
 

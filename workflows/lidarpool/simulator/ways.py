@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from functools import cached_property
+from types import MappingProxyType
 from typing import NamedTuple
 
 import numpy as np
@@ -56,7 +57,7 @@ def _pieces_of(way: Trajectory) -> _Pieces | None:
 class Ways(tuple[Trajectory, ...]):
     """Trajectories of actors."""
 
-    animated: dict[int, Actor] = {}  # {its number: an actor whose mesh has an animation}
+    animated: Mapping[int, Actor] = MappingProxyType({})  # {number: actor that deforms}
 
     @classmethod
     def of(cls, actors: Iterable[Actor]) -> Ways:
@@ -70,16 +71,12 @@ class Ways(tuple[Trajectory, ...]):
         """Rows of `number` (n,) that are actors whose mesh has an animation."""
         return np.flatnonzero(np.isin(number, list(self.animated))) if self.animated else _NONE
 
-    def frames(self, number: Integers, times_ns: Floats) -> Floats:
-        """Frames of the animations of actors `number` (n,) at times (n,), see `Actor.played`."""
-        return self.played(number, times_ns)[0]
-
-    def played(self, number: Integers, times_ns: Floats) -> Floats:
-        """Frames as of `frames`, and how many a second pass then: (2, n)."""
+    def played(self, number: Integers, times_ns: Floats | Ints) -> Floats:
+        """Frames of actors `number` (n,) at times (n,), and how many a second pass: (2, n)."""
         out = np.zeros((2, len(number)))
         for one in np.unique(number).tolist():
             rows = np.flatnonzero(number == one)
-            out[:, rows] = self.animated[one].played(times_ns[rows])
+            out[:, rows] = self.animated[one].played(times_ns[rows].astype(np.float64))
         return out
 
     @cached_property

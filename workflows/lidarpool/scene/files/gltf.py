@@ -28,7 +28,7 @@ from ...base.elementary import sin_cos_of
 from ...base.vectors import applied, inverse, length, matmul
 from ...base.words import plural
 from ...sensor.trajectory import matrices
-from ..animation import RATE_HZ
+from ..animation import RATE_HZ, Animation
 from ..colours import LINEAR, Colours, as_srgb
 from ..masks import (
     FACE_BYTES,
@@ -68,6 +68,7 @@ _GLOSSY = "KHR_materials_pbrSpecularGlossiness"  # materials of older files
 
 _TYPES = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 _WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT4": 16}
+_CUT = ("MASK", "BLEND")  # modes of materials that are transparent somewhere
 V = TypeVar("V")
 _WRAPS: dict[Any, Wrap] = {33071: "clamp", 33648: "mirror"}
 
@@ -165,6 +166,7 @@ class _Reader:
         self.notes = MaskNotes()
         self._channels: Channels = {}
         self._frame = 0
+        self._local, self._joints = cache(self._read_local), cache(self._read_joints)
 
     def baked(self, name: str) -> Content:
         """Read the scene with an animation, from its first key to its last."""
@@ -175,24 +177,27 @@ class _Reader:
         count = max(1, math.ceil((last - first) * RATE_HZ))
         self._channels = played(animation, np.linspace(first, last, count + 1), self._accessor)
         roots, content = _roots(self._header), Content(())
-        for frame in range(count + 1):
-            taken, self._frame = self._allowance.taken, frame
-            self._bent.cache_clear()
+        poses: list[Floats] = []
+        for self._frame in range(count + 1):
+            taken = self._allowance.taken
+            for kept in (self._local, self._joints, self._bent):  # of the frame before
+                kept.cache_clear()
             made = settled(instances(roots, self.node, self._path.stem), copy_all=True)
-            vertices = [mesh.vertices for mesh in made.meshes if isinstance(mesh, SceneMesh)]
-            if not frame:
-                self._allowance.take(sum(v.nbytes for v in vertices) * (count + 1))
-                content = made
-                content.poses = [np.empty((count + 1, *v.shape)) for v in vertices]
-                self._wanted = self._wanted._replace(colours=False)  # which are those of the first
+            if not poses:
+                content, self._wanted = made, self._wanted._replace(colours=False)
+                size = sum(mesh.vertices.nbytes for mesh in _flat(made)) * (count + 1)
+                self._allowance.take(size)
+                poses = [np.empty((count + 1, *m.vertices.shape)) for m in _flat(made)]
             else:
                 self._allowance.taken = taken
-            for poses, now in zip(content.poses, vertices, strict=True):
-                poses[frame] = now
-        content.step_s = (last - first) / count
+            for out, mesh in zip(poses, _flat(made), strict=True):
+                out[self._frame] = mesh.vertices
+        step_s = (last - first) / count
+        pairs = zip(_flat(content), poses, strict=True)
+        content.meshes = [replace(mesh, animation=Animation(own, step_s)) for mesh, own in pairs]
         return content
 
-    def _local(self, index: int) -> Floats:
+    def _read_local(self, index: int) -> Floats:
         """Matrix (4, 4) of a node, at the frame of the animation if there is one."""
         node = self._part("nodes", index)
         moved = {
@@ -253,7 +258,10 @@ class _Reader:
         """Return a note on what moves in the file, and stands still here."""
         bent, found = self._bent.cache_info().currsize, len(self._header.get("animations", ()))
         meshes = f", of {plural(bent, 'bent mesh', 'bent meshes')}" * bool(bent)
-        if not found or self._channels:
+        if self._channels:
+            cut = any(m.get("alphaMode") in _CUT for m in self._header.get("materials", ()))
+            return ["is animated, so it is solid where its images are transparent"] * cut
+        if not found:
             return []
         told = "all stands still; actors move by animation: NAME"
         return [f"has {plural(found, 'animation')}{meshes}: {told}"]
@@ -307,7 +315,7 @@ class _Reader:
 
         return joined(name, map(piece, surfaces), self._allowance)
 
-    def _joints(self, skin: int) -> Floats:
+    def _read_joints(self, skin: int) -> Floats:
         """Matrices (j, 4, 4) of a skin's joints, from its mesh to the scene; glTF 2.0, 3.7.3."""
         found = self._part("skins", skin)
         if not found.get("joints"):
@@ -436,7 +444,7 @@ class _Reader:
         """Texture of a material, and its use of it; None if the material is solid."""
         material = self._part("materials", number)
         mode = material.get("alphaMode", "OPAQUE")
-        if mode not in ("MASK", "BLEND"):
+        if mode not in _CUT:
             if _extension(material, _TRANSMISSION).get("transmissionFactor", 0) > 0:
                 self.notes.glass[self._material_name(number)] = None
             return None
@@ -577,6 +585,11 @@ class _Reader:
             )
         self._allowance.add_file(target)
         return target.read_bytes()
+
+
+def _flat(content: Content) -> list[SceneMesh]:
+    """Return its meshes, none of which is an instance."""
+    return [mesh for mesh in content.meshes if isinstance(mesh, SceneMesh)]
 
 
 def _inline(uri: str) -> bytes:

@@ -1,4 +1,4 @@
-"""Animations of glTF 2.0: what its samplers say at a time (3.11 of the specification, appendix C)."""
+"""Animations of glTF 2.0: what samplers say at a time (3.11 and appendix C of its specification)."""
 
 from __future__ import annotations
 
@@ -35,9 +35,7 @@ def keys_of(animation: Mapping[str, Any], read: Callable[[Any], AnyArray]) -> tu
     return min(float(t.min()) for t in times), max(float(t.max()) for t in times)
 
 
-def played(
-    animation: Mapping[str, Any], at_s: Floats, read: Callable[[Any], AnyArray]
-) -> Channels:
+def played(animation: Mapping[str, Any], at_s: Floats, read: Callable[[Any], AnyArray]) -> Channels:
     """Return what an animation moves, at times (t,); `read` gives the numbers of an accessor."""
     found: Channels = {}
     for channel in animation["channels"]:

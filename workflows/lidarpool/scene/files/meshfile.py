@@ -90,9 +90,6 @@ class Objects(NamedTuple):
     moving: tuple[Actor, ...] = ()  # each along a `Track`
     summary: str = ""  # objects, triangles, unit, axes and colours
     raster: Raster | None = None  # what was taken of one
-    # Of an animation: vertices (f, v, 3) of each object that stands, in poses `step_s` apart.
-    poses: tuple[Floats, ...] = ()
-    step_s: float = 0.0
 
     def still(self, tell: Callable[[str], None]) -> tuple[SceneMesh | SceneInstance, ...]:
         """Return all of them where they are at first; `tell` is called if that is a loss."""
@@ -140,8 +137,8 @@ def load_objects(
         Code of the coordinate system that a raster is brought to, one in metres. None keeps its
         own if it is in metres, else takes the UTM zone of its middle.
     animation
-        Of a .glb or .gltf: name of the animation that `Objects.poses` are of, or its number if it
-        has none; "" for the first. None leaves all as it stands.
+        Of a .glb or .gltf: name of the animation that its meshes have, or its number if it has
+        none; "" for the first. Such meshes have no masks. None leaves all as it stands.
     tell
         Called with a line on objects left out, on images that cannot be read, on materials that
         may be glass, or on a reference system; by default this module's logger warns.
@@ -179,7 +176,7 @@ def load_objects(
             "animation."
         )
     folders = tuple(Path(one).resolve() for one in (path.parent, assets) if one is not None)
-    wanted = Wanted(opacity == "mask", colours, folders, animation)
+    wanted = Wanted(opacity == "mask" and animation is None, colours, folders, animation)
     # Of broken numbers in files: infinite and NaN values are refused.
     with np.errstate(all="ignore"):
         try:
@@ -194,8 +191,7 @@ def load_objects(
         with prefixed(path):
             standing = tuple(_placed(mesh, path.stem, places) for mesh in content.meshes)
             moving = tuple(_actor(one, path.stem, upright, placed) for one in content.moving)
-        poses = tuple(_placed_poses(one, places) for one in content.poses)
-    objects = Objects(standing, moving, poses=poses, step_s=content.step_s)
+    objects = Objects(standing, moving)
     if content.skipped:
         names = ", ".join(content.skipped[:3]) + ", …" * (len(content.skipped) > 3)
         tell(f"{path} scales {names} to zero: left out")
@@ -390,16 +386,6 @@ def _placed(
             "on Earth: check its unit and placement."
         )
     return one
-
-
-def _placed_poses(poses: Floats, places: Sequence[Transform]) -> Floats:
-    """Return vertices (f, v, 3) in the world."""
-    points = poses.reshape(-1, 3)
-    for place in places:
-        points = turned(points, place.linear) + place.offset
-    if not np.isfinite(points).all():
-        raise LidarpoolError("An animation moves vertices to where no number is: export it again.")
-    return points.reshape(poses.shape)
 
 
 def _actor(one: RigidPart, stem: str, upright: Transform, placed: Transform) -> Actor:

@@ -75,9 +75,6 @@ class Content:
 
     meshes: Sequence[SceneMesh | SceneInstance]
     moving: list[RigidPart] = field(default_factory=list)
-    # Of an animation: vertices (f, v, 3) of each mesh in its poses, `step_s` apart.
-    poses: Sequence[Floats] = ()
-    step_s: float = 0.0
     unit_m: float | None = None  # metres in its unit; None if unknown
     up_axis: str | None = None  # 'x', 'y' or 'z'; None if neither it nor its format states one
     generator: str = ""  # the program that wrote it, if known
@@ -162,8 +159,7 @@ def settled(placed: Sequence[PlacedNode], *, copy_all: bool = False) -> Content:
     shared = {
         mesh
         for mesh, n in uses.items()
-        if not copy_all
-        and (n - 1) * len(mesh.faces) >= (1 if mesh.cutouts else SHARED_TRIANGLES)
+        if not copy_all and (n - 1) * len(mesh.faces) >= (1 if mesh.cutouts else SHARED_TRIANGLES)
     }
     own = [mesh.vertices.nbytes + mesh.faces.nbytes for mesh, *_ in placed if mesh not in shared]
     if sum(own) > memory_share():
