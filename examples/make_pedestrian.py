@@ -192,8 +192,11 @@ def ankle(phase):
     out = (leaves - standing(STANCE - step)) / step * air
     into = (standing(step) - strikes) / step * air
     out[1:], into[1:] = 0, 0
-    path = [(2 * u**3 - 3 * u**2 + 1) * p + (u**3 - 2 * u**2 + u) * v + (3 * u**2 - 2 * u**3) * q
-            + (u**3 - u**2) * w for p, v, q, w in zip(leaves, out, strikes, into, strict=True)]  # fmt: skip
+    one, other = (2 * u**3 - 3 * u**2 + 1, 3 * u**2 - 2 * u**3), (u**3 - 2 * u**2 + u, u**3 - u**2)
+    path = [
+        one[0] * p + one[1] * q + other[0] * v + other[1] * w
+        for p, v, q, w in zip(leaves, out, strikes, into, strict=True)
+    ]
     path[1] = path[1] + LIFT_M * np.sin(np.pi * u) ** 2
     return np.where(phase < STANCE, standing(phase), path)
 

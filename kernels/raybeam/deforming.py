@@ -25,6 +25,8 @@ _LEAF_SIZE = 4
 class Deforming:
     """A mesh whose vertices move straight from frame to frame: a shape of `Moving`.
 
+    Frame 1.5 is half way from the second. Before the first and after the last it stays as it is.
+
     Attributes
     ----------
     vertices
@@ -42,24 +44,13 @@ class Deforming:
         """Low and high corner of all frames: (2, 3)."""
         return np.stack([self.vertices.min(axis=(0, 1)), self.vertices.max(axis=(0, 1))])
 
-    def at(self, frames: Floats) -> Floats:
-        """Return the vertices at frames (n,), of which 1.5 is half way from the second: (n, v, 3).
-
-        Before the first and after the last they stay as they are there.
-        """
-        begin = frames.astype(np.int64).clip(0, len(self.vertices) - 2)
-        share = (frames - begin).clip(0, 1)[:, None, None]
-        return np.asarray((1 - share) * self.vertices[begin] + share * self.vertices[begin + 1])
-
     def strike(self, crossing: Crossing, nearest: Nearest) -> None:
         """See `RayCaster.strike`; of equally close triangles the lowest is hit."""
         from . import deforming_loops as loops
 
-        columns = crossing.row, crossing.body, crossing.number
-        given = map(np.ascontiguousarray, columns)
-        limits = np.array(crossing.limits, np.float64)
-        loops.strike(crossing.rays, *given, crossing.poses, crossing.frame, limits, *self._tables,
-                     *nearest)  # fmt: skip
+        given = map(np.ascontiguousarray, (crossing.row, crossing.body, crossing.number))
+        frames = crossing.poses, crossing.frame, np.array(crossing.limits, np.float64)
+        loops.strike(crossing.rays, *given, *frames, *self._tables, *nearest)
 
     @cached_property
     def _tables(self) -> tuple[Any, ...]:

@@ -87,7 +87,7 @@ def strike(  # type: ignore[no-untyped-def]
     The tree is one of tree.py, whose `boxes` are those of `fit`.
     """
     stack, waits, enters = np.empty(_STACK, np.int64), np.empty(_STACK), np.empty(WIDTH)
-    t_min, t_max = limits[0], limits[1]
+    t_min, t_max, last = limits[0], limits[1], np.int64(len(vertices) - 2)
     for n in range(len(row)):
         k, p = row[n], number[n]
         turn = turn_of(poses, p)
@@ -97,8 +97,9 @@ def strike(  # type: ignore[no-untyped-def]
         i, j, h = _inverse(u), _inverse(v), _inverse(w)
         axis, a, b, c, d, e, f = shear(x, y, z, u, v, w)
         ray = a, b, c, d, e, f
-        frame = min(max(np.int64(frames[n]), 0), len(vertices) - 2)
-        share = np.float64(min(max(frames[n] - frame, 0.0), 1.0))
+        frame = np.int64(max(frames[n], 0.0))
+        frame = frame if frame < last else last
+        share = min(max(frames[n] - frame, 0.0), 1.0)
         at = boxes.ctypes.data + _BOX * len(child) * frame
         best, found, top = min(distance[k], t_max), np.int64(-1), 1
         stack[0], waits[0] = 0, 0.0

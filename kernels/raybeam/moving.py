@@ -50,7 +50,7 @@ class Moving:
         Called with numbers of bodies (m,) and times (m,); gives (12, m): positions, metres, and
         rotations from the body's axes, by rows.
     frames
-        Of bodies that deform, called as `poses`: gives their frames (m,), see `Deforming.at`.
+        Of bodies that deform, called as `poses`: gives their frames (m,), see `Deforming`.
     """
 
     shapes: tuple[RayCaster | Deforming, ...]

@@ -258,7 +258,9 @@ def test_bodies_that_deform_are_hit_where_they_are_at_the_time_of_each_ray():
             np.stack([(x * a + y * b) + z * c for a, b, c in turns]).T for x, y, z in (start, ahead)
         )
         for number, ray in enumerate(own.tolist()):
-            corners = shape.at(frame(np.array([body]), times[[ray]]))[0][doubled]
+            at = frame(body, times[ray])
+            share = at - int(at)
+            corners = ((1 - share) * frames[int(at)] + share * frames[int(at) + 1])[doubled]
             sheared = triangle.shear(start[[number]], ahead[[number]])
             count = len(doubled)
             a, b, c, det, t = triangle.intersect(
@@ -274,8 +276,3 @@ def test_bodies_that_deform_are_hit_where_they_are_at_the_time_of_each_ray():
     assert np.array_equal(found.body, expected[1])
     assert np.array_equal(found.distance[hit], expected[0][hit])
     assert np.array_equal(found.triangle[hit], expected[2][hit])
-
-
-def test_before_the_first_and_after_the_last_frame_a_body_stays_as_it_is():
-    frames = np.stack([FLAT[0] + [0, 0, z] for z in (0.0, 1.0)])
-    assert np.array_equal(Deforming(frames, np.array(FLAT[1])).at(np.array([-1.0, 7])), frames)

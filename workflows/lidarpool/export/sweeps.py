@@ -84,8 +84,7 @@ class Sweeps:
     objects: tuple[str, ...]
     actors: tuple[str, ...]  # they follow the objects in the column `object`
     actor_poses: tuple[Placed, ...]  # of each actor (2n,): at starts of sweeps, then at their ends
-    # (a, 2, 3): corners of each actor's box in its own axes, metres; (a, n, 2, 3), that of each
-    # sweep, if any has an animation.
+    # (a, 2, 3): corners of each actor's box in its own axes, metres; (a, n, 2, 3) if any deforms.
     actor_bounds: Floats
     actor_there: Bools  # (a, n): whether each actor is in the scene
     coordinates: str  # of the cloud's points, "world" or "sensor"

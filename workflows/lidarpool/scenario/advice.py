@@ -22,7 +22,6 @@ from .sections import SensorSection
 LARGE_M, LARGE_STL_M, LARGE_OBJECT_M, LARGE_STATED_M, SMALL_M = 500.0, 20.0, 10.0, 100.0, 0.2
 
 _LOOKED_FROM = 8  # positions, if poses or a trajectory are given
-_MOMENTS = 1001  # of a survey
 
 
 def advice(built: Built) -> list[str]:
@@ -129,13 +128,11 @@ def _without_effect(scenario: Scenario) -> Iterator[str]:
 
 def _ended(built: Built) -> Iterator[str]:
     """Tell of actors whose animation ends before the survey does."""
-    duration_ns = built.survey.duration_ns
+    end = np.array([built.survey.duration_ns])
     for actor in built.scene.actors:
-        if (animation := actor.mesh.animation) is not None and not animation.repeat:
-            times = np.linspace(0, duration_ns, _MOMENTS)
-            after = np.flatnonzero(actor.seconds(times)[0] >= animation.duration_s)
-            if len(after) and after[0] < _MOMENTS - 1:
-                yield (
-                    f"{actor.name}: its animation ends after {times[after[0]] / 1e9:.3g} s of "
-                    f"{duration_ns / 1e9:.3g} s, and its last pose remains: give repeat: true"
-                )
+        own = actor.mesh.animation
+        if own and not own.repeat and actor.seconds(end)[0][0] > own.duration_s:
+            yield (
+                f"{actor.name}: its animation of {own.duration_s:.3g} s ends before the survey "
+                "does, and its last pose remains: give repeat: true"
+            )

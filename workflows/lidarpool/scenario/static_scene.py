@@ -145,7 +145,7 @@ class Shapes:
             still = read.still(lambda line: self.found.notes.append(f"{path} moves {line}"))
             if wheels is not None:
                 with prefixed(path):
-                    still = rolling(still, wheels, self.found.notes.append)
+                    still = (*rolling(still, wheels, self.found.notes.append),)
             mesh = made[key] = one_mesh(name, still)
             if animation is not None and mesh.animation is not None:
                 own = {"speed_m_s": animation.speed_m_s, "repeat": animation.repeat}

@@ -87,8 +87,7 @@ class Actor:
         """Boxes of all its poses between times (k,), nanoseconds, in its own axes: (k, 2, 3)."""
         if (animation := self.mesh.animation) is None:
             return self.mesh.bounds[None].repeat(len(begins_ns), axis=0)
-        # Some in between: it may go there and back.
-        times = np.linspace(begins_ns, ends_ns, 5)
+        times = np.linspace(begins_ns, ends_ns, 5)  # it may go there and back
         seconds = self.seconds(times.reshape(-1))[0].reshape(times.shape)
         return animation.bounds_between(seconds.min(axis=0), seconds.max(axis=0))
 

@@ -44,15 +44,13 @@ class Animation:
     repeat: bool = True
 
     def __post_init__(self) -> None:
-        shape = np.shape(self.vertices)
-        if len(shape) != 3 or shape[0] < 2 or shape[2] != 3 or not np.isfinite(self.vertices).all():
+        shape, speed = np.shape(self.vertices), self.speed_m_s
+        good = len(shape) == 3 and shape[0] > 1 and shape[2] == 3
+        good = good and self.step_s > 0 and (speed is None or speed > 0)
+        if not good or not np.isfinite(self.vertices).all():
             raise LidarpoolError(
-                f"An animation has finite vertices of two poses at least, (f, v, 3), not {shape}."
-            )
-        if not self.step_s > 0 or not (self.speed_m_s is None or self.speed_m_s > 0):
-            raise LidarpoolError(
-                f"step_s and speed_m_s of an animation must be above 0, not {self.step_s} and "
-                f"{self.speed_m_s}."
+                "An animation has finite vertices (f, v, 3) of two poses at least, and a step and "
+                f"speed above 0; given: {shape}, {self.step_s} s, {speed} m/s."
             )
 
     @property
@@ -67,16 +65,11 @@ class Animation:
         return np.mod(frames, last) if self.repeat else np.clip(frames, 0, last)
 
     def at(self, frames: Floats, vertex: Indices | slice = slice(None)) -> tuple[Floats, Floats]:
-        """Return vertices at frames (n,), and how far they move in a frame.
-
-        All of them, (n, v, 3) each, or those of numbers (n, ...): (n, ..., 3).
-        """
+        """Return vertices of numbers (n, k), or all, at frames (n,), and their steps: (n, k, 3)."""
         begin = frames.astype(np.int64).clip(0, len(self.vertices) - 2)
-        share = frames - begin
-        if not isinstance(vertex, slice):
-            begin = begin.reshape(-1, *[1] * (vertex.ndim - 1))
+        share = (frames - begin)[:, None, None]
+        begin = begin if isinstance(vertex, slice) else begin[:, None]
         here, then = self.vertices[begin, vertex], self.vertices[begin + 1, vertex]
-        share = share.reshape(-1, *[1] * (here.ndim - 1))
         return (1 - share) * here + share * then, then - here
 
     @cached_property

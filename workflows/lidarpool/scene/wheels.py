@@ -59,8 +59,7 @@ def rolling(
             else:
                 radii[number] = height / 2
     if not radii:
-        names = [one.name for one in flat]
-        hint = did_you_mean(wheels[0], names) or f" There are {', '.join(names[:8])}."
+        hint = did_you_mean(wheels[0], [one.name for one in flat])
         raise LidarpoolError(f"no object that wheels names ({', '.join(wheels)}) can turn.{hint}")
     largest = max(radii.values())
     turns = {number: round(largest / radius) for number, radius in radii.items()}

@@ -183,18 +183,21 @@ class _Reader:
             for kept in (self._local, self._joints, self._bent):  # of the frame before
                 kept.cache_clear()
             made = settled(instances(roots, self.node, self._path.stem), copy_all=True)
+            now = [mesh.vertices for mesh in made.meshes if isinstance(mesh, SceneMesh)]
             if not poses:
                 content, self._wanted = made, self._wanted._replace(colours=False)
-                size = sum(mesh.vertices.nbytes for mesh in _flat(made)) * (count + 1)
-                self._allowance.take(size)
-                poses = [np.empty((count + 1, *m.vertices.shape)) for m in _flat(made)]
+                self._allowance.take((count + 1) * sum(vertices.nbytes for vertices in now))
+                poses = [np.empty((count + 1, *vertices.shape)) for vertices in now]
             else:
                 self._allowance.taken = taken
-            for out, mesh in zip(poses, _flat(made), strict=True):
-                out[self._frame] = mesh.vertices
-        step_s = (last - first) / count
-        pairs = zip(_flat(content), poses, strict=True)
-        content.meshes = [replace(mesh, animation=Animation(own, step_s)) for mesh, own in pairs]
+            for out, vertices in zip(poses, now, strict=True):
+                out[self._frame] = vertices
+        moves = iter([Animation(own, (last - first) / count) for own in poses])
+        content.meshes = [
+            replace(mesh, animation=next(moves))
+            for mesh in content.meshes
+            if isinstance(mesh, SceneMesh)
+        ]
         return content
 
     def _read_local(self, index: int) -> Floats:
@@ -585,11 +588,6 @@ class _Reader:
             )
         self._allowance.add_file(target)
         return target.read_bytes()
-
-
-def _flat(content: Content) -> list[SceneMesh]:
-    """Return its meshes, none of which is an instance."""
-    return [mesh for mesh in content.meshes if isinstance(mesh, SceneMesh)]
 
 
 def _inline(uri: str) -> bytes:
