@@ -58,11 +58,10 @@ class Deforming:
         from . import deforming_loops as loops
 
         vertices, faces = np.ascontiguousarray(self.vertices), np.ascontiguousarray(self.faces)
-        low, high = self.box
-        size = max(float(np.ptp(self.box, axis=0).max()), 1e-300)
-        local = (vertices[0] - (low + high) / 2) / size
+        box = self.box
+        local = (vertices[0] - box.mean(axis=0)) / max(float(np.ptp(box, axis=0).max()), 1e-300)
         tree = build_tree(local[faces], loops.WIDTH, _LEAF_SIZE)
         boxes = np.empty((len(vertices) - 1, len(tree.child), 6, loops.WIDTH), np.float32)
-        pad = _PAD * float(np.abs(self.box).max())
+        pad = _PAD * float(np.abs(box).max())
         loops.fit(vertices, faces, tree.order, tree.child, pad, boxes)
         return vertices, faces, tree.order, tree.child, boxes

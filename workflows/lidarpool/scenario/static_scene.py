@@ -138,8 +138,7 @@ class Shapes:
         if key not in made:
             name = entry.name or "vehicle"
             if not isinstance(shape, MeshFile):
-                made[key] = box(name, shape)
-                return made[key]
+                return made.setdefault(key, box(name, shape))
             read = self.read(shape, animation and (animation.name or ""))
             path = self.scenario.path(shape.file)
             still = read.still(lambda line: self.found.notes.append(f"{path} moves {line}"))

@@ -76,9 +76,9 @@ class Actor:
 
     def played(self, times_ns: Floats) -> tuple[Floats, Floats]:
         """Return frames of its animation at times (k,), nanoseconds, and frames a second then."""
-        animation = self.mesh.animation
-        assert animation is not None, "of a mesh that has one"
         seconds, rates = self.seconds(times_ns)
+        animation = self.mesh.animation
+        assert animation is not None
         if not animation.repeat:
             rates = rates * ((seconds >= 0) & (seconds < animation.duration_s))
         return animation.frames(seconds), rates / animation.step_s

@@ -73,29 +73,23 @@ class Animation:
         return (1 - share) * here + share * then, then - here
 
     @cached_property
-    def _boxes(self) -> Floats:
-        """Corners of the boxes of all poses: (f, 2, 3)."""
-        return np.stack([self.vertices.min(axis=1), self.vertices.max(axis=1)], axis=1)
-
-    @property
     def bounds(self) -> Floats:
         """Corners of the box of all poses: (2, 3)."""
-        return np.stack([self._boxes[:, 0].min(axis=0), self._boxes[:, 1].max(axis=0)])
+        return np.stack([self.vertices.min(axis=(0, 1)), self.vertices.max(axis=(0, 1))])
 
     def bounds_between(self, first_s: Floats, last_s: Floats) -> Floats:
         """Boxes of all poses between seconds (n,) since the first pose: (n, 2, 3)."""
         last = len(self.vertices) - 1
         first = np.floor(first_s / self.step_s).astype(np.int64)
         count = np.ceil(last_s / self.step_s).astype(np.int64) - first
-        boxes = self._boxes
+        lows, highs = self.vertices.min(axis=1), self.vertices.max(axis=1)
         if self.repeat:  # the last pose and the first one are at the same time
-            pair = boxes[[0, last]]
-            boxes = np.concatenate([[[pair[:, 0].min(axis=0), pair[:, 1].max(axis=0)]], boxes[1:]])
+            lows[0], highs[0] = lows[[0, last]].min(axis=0), highs[[0, last]].max(axis=0)
         low, high = np.full((len(first), 3), np.inf), np.full((len(first), 3), -np.inf)
         for step in range(min(int(count.max(initial=0)), last) + 1):
             frame = first + np.minimum(count, step)
-            box = boxes[frame % last if self.repeat else frame.clip(0, last)]
-            low, high = np.minimum(low, box[:, 0]), np.maximum(high, box[:, 1])
+            frame = frame % last if self.repeat else frame.clip(0, last)
+            low, high = np.minimum(low, lows[frame]), np.maximum(high, highs[frame])
         return np.stack([low, high], axis=1)
 
     def moved(self, linear: Floats, offset: Floats) -> Animation:

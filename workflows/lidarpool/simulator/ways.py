@@ -14,8 +14,6 @@ from ..scene.actors import Actor
 from ..sensor import Track, Trajectory
 from ..sensor.trajectory import Stations, presence_ns
 
-_NONE = np.zeros(0, np.intp)
-
 
 class _Tracks(NamedTuple):
     """The straight tracks among trajectories, their segments one behind the other."""
@@ -69,7 +67,8 @@ class Ways(tuple[Trajectory, ...]):
 
     def deforming(self, number: Integers) -> Indices:
         """Rows of `number` (n,) that are actors whose mesh has an animation."""
-        return np.flatnonzero(np.isin(number, list(self.animated))) if self.animated else _NONE
+        own = list(self.animated)
+        return np.flatnonzero(np.isin(number, own)) if own else np.zeros(0, np.intp)
 
     def played(self, number: Integers, times_ns: Floats | Ints) -> Floats:
         """Frames of actors `number` (n,) at times (n,), and how many a second pass: (2, n)."""
