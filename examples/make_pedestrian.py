@@ -273,7 +273,7 @@ def glb(made: Figure) -> bytes:
         target = {"node": node, "path": path}
         channels.append({"sampler": len(samplers) - 1, "target": target})
     header = {
-        "asset": {"version": "2.0", "generator": "make_pedestrian.py"},
+        "asset": {"version": "2.0", "generator": "lidarpool"},
         "scene": 0, "scenes": [{"nodes": [0]}], "nodes": nodes,
         "meshes": [{"name": "Body", "primitives": [{"attributes": attributes, "indices": faces}]}],
         "skins": [{"joints": list(range(2, 2 + len(JOINTS))), "inverseBindMatrices": inverse}],
