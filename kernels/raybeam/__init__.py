@@ -1,8 +1,8 @@
 """Closest hits of rays with triangle meshes, on CUDA, Embree or NumPy."""
 
 from .backend import BackendUnavailable
-from .bending import Bending
 from .caster import RayCaster
+from .deforming import Deforming
 from .device import DeviceHits, OtherHits, Outbox
 from .hits import Hits, ScanReturns
 from .instances import Instance, Mesh
@@ -16,7 +16,7 @@ from .sub_rays import SubRays, any_axes
 
 __all__ = [
     "BackendUnavailable",
-    "Bending",
+    "Deforming",
     "DeviceHits",
     "Hits",
     "Instance",

@@ -97,7 +97,7 @@ class Backend(ABC):
 
     def strike(self, crossing: Crossing, nearest: Nearest) -> None:
         """Note where rays hit bodies of this shape, if that is nearer."""
-        strike(lambda rays, times: self.nearest(rays), crossing, nearest)
+        strike(self.nearest, crossing, nearest)
 
     def sweep(self, sweep: Swept, nearest: Nearest) -> None:
         """Note where rays hit bodies of this shape, if that is nearer, on the device."""

@@ -16,13 +16,13 @@ class Crossing(NamedTuple):
     """Rays that pass through the boxes of bodies of one shape."""
 
     rays: Floats  # (6, n): origins and directions of all rays that are cast together, in metres
-    times: Floats  # (n,)
     row: Ints  # (m,): rays that pass, one after the other for each body,
     body: Ints  # (m,): the bodies,
     number: Ints  # (m,): and which of the poses these have then
     poses: Floats  # (12, p): positions, and rotations from the body's axes by rows
     box: Floats  # (6,): low and high corner of the shape
     limits: tuple[float, float]  # t_min and t_max
+    frame: Floats  # (m,): of a shape that deforms, its frame then; (0,) of others
 
 
 class Swept(NamedTuple):
@@ -64,15 +64,15 @@ class Nearest(NamedTuple):
         return Nearest(distance[some], body[some], instance[some], triangle[some])
 
 
-def strike(cast: Callable[[Rays, Floats], Part], crossing: Crossing, nearest: Nearest) -> None:
-    """Take rays to the axes of bodies, `cast` them there at their times, and note nearer hits."""
+def strike(cast: Callable[[Rays], Part], crossing: Crossing, nearest: Nearest) -> None:
+    """Take rays to the axes of bodies, `cast` them there, and note nearer hits."""
     row, poses = crossing.row, crossing.poses[:, crossing.number]
     starts, ways = crossing.rays[:3, row] - poses[:3], crossing.rays[3:, row]
     turns = poses[3:].reshape(3, 3, -1).transpose(1, 0, 2)
     starts, ways = (
         np.stack([(x * a + y * b) + z * c for a, b, c in turns]) for x, y, z in (starts, ways)
     )
-    met = cast(Rays(starts.T, ways.T, *crossing.limits), crossing.times[row])
+    met = cast(Rays(starts.T, ways.T, *crossing.limits))
     ray, distance, triangle, instance = met
     # Directions of a sensor that turns during a pose are not quite of unit length.
     x, y, z = ways[:, ray]

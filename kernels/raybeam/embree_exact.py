@@ -31,6 +31,7 @@ from .compiled import callback, inlined, stage
 from .embree_library import find
 from .embree_memory import LANES, NUMBER, at, float32s, float64s, int32s, int64s, offset, uint8s
 from .mesh import NEAR
+from .triangle_loops import areas, shear, within
 
 llvmlite.binding.load_library_permanently(str(find()))  # compiled code names its functions
 
@@ -67,21 +68,6 @@ _intersect_1 = types.ExternalFunction(
 _point_query = types.ExternalFunction(
     "rtcPointQuery", types.boolean(types.intp, types.intp, types.intp, types.intp, types.intp)
 )
-
-
-@inlined
-def shear(ox, oy, oz, dx, dy, dz):  # type: ignore[no-untyped-def]
-    """Longest axis of a ray, origin with that axis last, and shear, as in triangle.py."""
-    ax, ay, az = abs(dx), abs(dy), abs(dz)
-    first = ax >= ay and ax >= az
-    second = not first and ay >= az
-    along = dx if first else (dy if second else dz)
-    p = dy if first else (dz if second else dx)
-    q = dz if first else (dx if second else dy)
-    u = oy if first else (oz if second else ox)
-    v = oz if first else (ox if second else oy)
-    w = ox if first else (oy if second else oz)
-    return 0 if first else (1 if second else 2), u, v, w, p / along, q / along, 1.0 / along
 
 
 @stage
@@ -149,30 +135,9 @@ def corners_of(table, place, axis):  # type: ignore[no-untyped-def]
 
 
 @inlined
-def areas(corners, ray):  # type: ignore[no-untyped-def]
-    """Signed areas, their sum, and the distance, as in triangle.py."""
-    u, v, w, sx, sy, sz = ray
-    (px, py, pz), (qx, qy, qz), (rx, ry, rz) = corners
-    z0, z1, z2 = pz - w, qz - w, rz - w
-    x0, y0 = (px - u) - sx * z0, (py - v) - sy * z0
-    x1, y1 = (qx - u) - sx * z1, (qy - v) - sy * z1
-    x2, y2 = (rx - u) - sx * z2, (ry - v) - sy * z2
-    a = x2 * y1 - y2 * x1
-    b = x0 * y2 - y0 * x2
-    c = x1 * y0 - y1 * x0
-    det = (a + b) + c
-    return a, b, c, det, (((a * z0 + b * z1) + c * z2) / det) * sz
-
-
-@inlined
 def _sheared(floats, lane):  # type: ignore[no-untyped-def]
     u, v, w = floats[_U + lane], floats[_V + lane], floats[_W + lane]
     return u, v, w, floats[_SX + lane], floats[_SY + lane], floats[_SZ + lane]
-
-
-@inlined
-def _within(a, b, c):  # type: ignore[no-untyped-def]
-    return ((a >= 0) & (b >= 0) & (c >= 0)) | ((a <= 0) & (b <= 0) & (c <= 0))
 
 
 @inlined
@@ -296,7 +261,7 @@ def _consider(scratch, lane, key):  # type: ignore[no-untyped-def]
     nearest = floats[_T + lane]
     if (
         det != 0
-        and _within(a, b, c)
+        and within(a, b, c)
         and floats[_T_MIN] <= t <= floats[_T_MAX]
         and (t < nearest or (t == nearest and key < numbers[_KEY + lane]))
         and not (numbers[_MASKED] and _transparent(mesh, instances, numbers, floats, lane, key))

@@ -17,6 +17,7 @@ from . import embree_memory as memory
 from .compiled import callback, compiled, external, inlined, stage
 from .embree_memory import LANES, NUMBER, at, casts_at, float32s, float64s, int32s, int64s, offset
 from .embree_rays import begin, hand_out, make, set_out
+from .triangle_loops import areas, shear
 
 _ARGUMENTS, _ARGUMENTS_AT, _FILTER = at("arguments"), offset("arguments"), at("arguments") + 2
 _VALID_AT, _PACKET, _PACKET_AT = offset("valid"), at("packet"), offset("packet")
@@ -290,9 +291,9 @@ def weigh(casts, origins, directions, place, instance, u, v):  # type: ignore[no
             record = int64s(address)
             mesh_at, at = record[_MESH_OF], at - record[FIRST_PLACE]
             ox, oy, oz, dx, dy, dz, _ = exact.entered(float64s(address), ox, oy, oz, dx, dy, dz)
-        axis, p, q, r, sx, sy, sz = exact.shear(ox, oy, oz, dx, dy, dz)
+        axis, p, q, r, sx, sy, sz = shear(ox, oy, oz, dx, dy, dz)
         triangle = exact.corners_of(float64s(int64s(mesh_at)[0]), at, axis)
-        a, b, c, det, _ = exact.areas(triangle, (p, q, r, sx, sy, sz))
+        a, b, c, det, _ = areas(triangle, (p, q, r, sx, sy, sz))
         sign = -1.0 if det < 0 else 1.0  # outside by float32's rounding: at the edge
         a, b, c = max(sign * a, 0.0), max(sign * b, 0.0), max(sign * c, 0.0)
         total = (a + b) + c

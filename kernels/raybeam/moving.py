@@ -20,9 +20,9 @@ from typing import Any
 import numpy as np
 
 from .arrays import Floats, Indices, Ints
-from .bending import Bending
 from .caster import RayCaster
 from .crossing import SPAN, Crossing, Nearest, Swept
+from .deforming import Deforming
 from .scan import Scan
 
 _CHUNK = 1 << 17  # rays at a time
@@ -30,6 +30,7 @@ _PAIRS = 1 << 14  # of cells and bodies at a time
 _POSES = 1 << 18  # on a device: 25 MB
 _BOXES = 128  # that stand, at a time
 _LOOKS = 128  # cells for each look at the bodies
+_NONE = np.zeros(0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,9 +40,9 @@ class Moving:
     Attributes
     ----------
     shapes
-        Casters of the shapes, each in its own axes, and meshes whose vertices move.
+        Casters of the shapes, each in its own axes, and meshes that deform.
     boxes
-        float64 (s, 2, 3): low and high corners of the shapes.
+        float64 (s, 2, 3): low and high corners of the shapes, in all frames.
     shape
         intp (b,): which one each body has.
     there
@@ -49,13 +50,16 @@ class Moving:
     poses
         Called with numbers of bodies (m,) and times (m,); gives (12, m): positions, metres, and
         rotations from the body's axes, by rows.
+    frames
+        Of bodies that deform, called as `poses`: gives their frames (m,), see `Deforming`.
     """
 
-    shapes: tuple[RayCaster | Bending, ...]
+    shapes: tuple[RayCaster | Deforming, ...]
     boxes: Floats
     shape: Indices
     there: Floats
     poses: Callable[[Ints, Floats], Floats]
+    frames: Callable[[Ints, Floats], Floats] | None = None
 
     @cached_property
     def middle(self) -> Floats:
@@ -250,8 +254,12 @@ class _Chunk:
         for one in np.unique(shape).tolist() if several else [0]:
             own = shape == one if several else slice(None)
             which = row[own], body[own], number[own]
-            crossing = Crossing(rays, times, *which, poses, boxes[one], limits)
-            moving.shapes[one].strike(crossing, self._nearest)
+            cast, frame = moving.shapes[one], _NONE
+            if isinstance(cast, Deforming):
+                assert moving.frames is not None, "of bodies that deform"
+                frame = moving.frames(which[1], times[which[0]])
+            crossing = Crossing(rays, *which, poses, boxes[one], limits, frame)
+            cast.strike(crossing, self._nearest)
 
 
 def _rotations(poses: Floats) -> Floats:

@@ -193,7 +193,9 @@ def test_skins_are_bent_by_their_joints_as_they_stand(tmp_path):
     upper = np.array([0, 2, 5]), np.array([0, 3, 5])
     expected = [[0, 0, 5], [1, 0, 5], upper[0], (upper[1] + [1, 2, 5]) / 2]
     np.testing.assert_allclose(bar.vertices, expected, atol=1e-6)
-    assert notes == [f"{path} has 1 animation, of 1 bent mesh: all stands still"]
+    assert notes == [
+        f"{path} has 1 animation, of 1 bent mesh: all stands still; actors move by animation: NAME"
+    ]
     header["nodes"][3]["children"] = [2]
     with pytest.raises(LidarpoolError, match="nodes contain each other"):
         load(tmp_path, header, body)

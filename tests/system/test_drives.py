@@ -74,7 +74,7 @@ def test_what_check_says_of_a_drive(town, lidarpool):
 
 def test_the_drive_of_three_sensors_and_ten_actors_can_be_made(tmp_path):
     write_scene(tmp_path / "city.glb", city(20_000))
-    for name in ("city-drive.yaml", "car.obj", "pedestrian.obj"):
+    for name in ("city-drive.yaml", "car.obj", "pedestrian.glb"):
         (tmp_path / name).write_bytes((ROOT / "examples" / name).read_bytes())
     built = build(Scenario.load(tmp_path / "city-drive.yaml"))
     scene, survey = built.scene, built.survey

@@ -41,6 +41,7 @@ from ..scenario.advice import advice
 from ..scenario.build import Job, build
 from ..scenario.campaign import CampaignSpec, is_campaign
 from ..scenario.scenario import Scenario
+from ..scene.actors import shapes_of
 from ..scene.scene import Scene
 from ..scene.simplified import DRAWN_TRIANGLES
 from ..sensor import Sensor, Survey
@@ -58,6 +59,7 @@ TRIANGLE_BYTES = 360
 SCENE_BYTES = 80  # of a triangle, in every process that knows the scene
 COLOURED_BYTES = 160  # of a triangle with colours, and four times the bytes of images
 COPY_BYTES = 2000  # of an instance, likewise
+POSE_BYTES = 40  # of a triangle in each pose of an animation: boxes of a tree; vertices have 24
 RAY_BYTES = 48  # of a turn, and of the pattern made of it
 PARTICLE_BYTES = 140  # of a swarm, for each corner of its path
 PART_BYTES = 2500  # its head, and its row in the database
@@ -430,7 +432,13 @@ def _worker_bytes(job: Job) -> int:
     images = {id(one): one.nbytes for each in job.scene.coloured for one in each.images}
     copies = COPY_BYTES * len(job.scene.instances or ())
     coloured = COLOURED_BYTES * sum(map(len, job.scene.coloured)) + 4 * sum(images.values())
-    return PROCESS_BYTES + triangles + coloured + copies + patterns
+    meshes, _ = shapes_of(job.scene.actors)
+    poses = sum(
+        mesh.animation.vertices.nbytes + POSE_BYTES * len(mesh.animation.vertices) * len(mesh.faces)
+        for mesh in meshes
+        if mesh.animation
+    )
+    return PROCESS_BYTES + triangles + coloured + copies + patterns + poses
 
 
 def _rest_bytes(job: Job, points: int, slots: dict[str, dict[str, int]]) -> int:

@@ -179,7 +179,6 @@ class _OpenJob:
             name = job_file(row.data_set, job.name, BOXES_FILE)
             with open_archive(place.path(name), partial(place.read, name)) as arrays:
                 self.boxes = arrays
-        self.sizes = self.sweeps.actor_bounds[:, 1] - self.sweeps.actor_bounds[:, 0]
         entry = Entry(job.number, job.name, job.split)
         self.reader: Reader = row.load().Reader(place, self.sweeps, entry, written.layout)
 
@@ -194,7 +193,8 @@ class _OpenJob:
         boxes = None
         if self.boxes:
             own = {name: of[sweep] for name, of in self.boxes.items()}
-            boxes = Boxes(sizes=self.sizes, **own)
+            low, high = sweeps.bounds(sweep).transpose(1, 0, 2)
+            boxes = Boxes(sizes=high - low, **own)
         return Sweep.of(job, sweeps, sweep, points, boxes)
 
 

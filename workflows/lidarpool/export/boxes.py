@@ -18,6 +18,8 @@ class Boxes:
 
     An actor moves during a sweep. Its box is at its pose at the mean time of its points, by their
     scans if the cloud has no times or a fault shifts some, or at the sweep's start if it has none.
+    One that deforms has the box that holds it, in its own axes, from the start of the sweep to its
+    end.
     """
 
     centres: Floats  # (a, 3): metres, world coordinates
@@ -48,7 +50,7 @@ class Boxes:
         turns[(turns[:, 0] * turns[:, 1]).sum(axis=1) < 0, 1] *= -1
         place, turn = ((p[:, 0] + share * (p[:, 1] - p[:, 0])) for p in (places, turns))
         turn /= np.linalg.norm(turn, axis=1, keepdims=True)
-        low, high = sweeps.actor_bounds[:, 0], sweeps.actor_bounds[:, 1]
+        low, high = sweeps.bounds(sweep).transpose(1, 0, 2)
         middle = (matrices(turn) @ ((low + high) / 2)[..., None])[..., 0]
         return cls(
             place + middle, turn, high - low, counts, sweeps.actor_there[:, sweep] | (counts > 0)

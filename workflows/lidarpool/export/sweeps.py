@@ -85,7 +85,8 @@ class Sweeps:
     objects: tuple[str, ...]
     actors: tuple[str, ...]  # they follow the objects in the column `object`
     actor_poses: tuple[Placed, ...]  # of each actor (2n,): at starts of sweeps, then at their ends
-    actor_bounds: Floats  # (a, 2, 3): corners of each actor's box in its own axes, metres
+    # (a, 2, 3): corners of each actor's box in its own axes, metres; (a, n, 2, 3) if any deforms.
+    actor_bounds: Floats
     actor_there: Bools  # (a, n): whether each actor is in the scene
     coordinates: str  # of the cloud's points, "world" or "sensor"
     precision_m: float  # step to which positions were rounded
@@ -103,6 +104,10 @@ class Sweeps:
         """Points (k, 3) of a sweep in its sensor's axes: at its start, or as stored."""
         exact = points.astype(np.float64)
         return exact if self.coordinates == "sensor" else self.pose.inward(sweep, exact)
+
+    def bounds(self, sweep: int) -> Floats:
+        """Corners of each actor's box during a sweep, in its own axes: (a, 2, 3), metres."""
+        return self.actor_bounds if self.actor_bounds.ndim == 3 else self.actor_bounds[:, sweep]
 
     @cached_property
     def carrier(self) -> Placed:
@@ -158,10 +163,8 @@ class Sweeps:
             actor_poses.append(_placed(at + scene.origin, _full(turned_by, len(at))))
             appears, leaves = presence_ns(actor.trajectory)
             there.append((appears <= when) & (when <= leaves))
-        bounds = [
-            np.stack([a.mesh.vertices.min(axis=0), a.mesh.vertices.max(axis=0)])
-            for a in scene.actors
-        ]
+        deform = any(actor.mesh.animation for actor in scene.actors)
+        bounds = [a.bounds_between(when, end) if deform else a.mesh.bounds for a in scene.actors]
         fired = None
         if survey.keep_every == 1 and any(c.name == "ray" for c in survey.stored_columns):
             most = tuple(2 if each.mode == "dual" else 1 for each in survey.returns_each)
@@ -178,7 +181,7 @@ class Sweeps:
             tuple(scene.names),
             tuple(actor.name for actor in scene.actors),
             tuple(actor_poses),
-            np.array(bounds).reshape(-1, 2, 3),
+            np.array(bounds) if bounds else np.empty((0, 2, 3)),
             np.array(there, bool).reshape(-1, len(when)),
             survey.coordinates,
             survey.precision_m,

@@ -30,13 +30,13 @@ from ..sensor.trajectory import CLOCK_S, Beyond, InstrumentPose, quaternions_of,
 from ..sensor.trajectory_files import Duration, Seconds, TrajectoryFormat, quaternions_from_degrees
 from .ground import Standing, following
 from .sections import (
+    DeformingSection,
     MeshEntry,
     MeshFile,
     PathOf,
     PoseEntry,
     Section,
     SensorSection,
-    ShapeSection,
     by_position,
 )
 
@@ -196,7 +196,7 @@ class TrajectorySection(Section):
 TrajectoryEntry = Annotated[TrajectorySection, by_text("file", TrajectorySection)]
 
 
-class ActorSection(ShapeSection):
+class ActorSection(DeformingSection):
     """An object or robot that moves or stands; its axes have x ahead and z up."""
 
     name: Annotated[Text, about("name of the object")]
@@ -235,6 +235,8 @@ class ActorSection(ShapeSection):
             raise ValueError("an actor starts with the survey: give offset_s, not start_s.")
         if not self.robot and self.joints is not None:
             raise ValueError("joints are those of a robot: give a .urdf as its file.")
+        if self.robot and (self.animation or self.wheels):
+            raise ValueError("a robot has joints: leave out animation and wheels.")
         if self.robot and self.robot.model_fields_set - _OF_ROBOTS:
             raise ValueError("a robot is in metres and in its own axes: give just its file.")
         return self
@@ -271,7 +273,7 @@ _MOVING = ("vehicle", "person", "container")
 _ROW = ("x", "y", "angle", "z", "slope")
 
 
-class VehicleSection(ShapeSection):
+class VehicleSection(DeformingSection):
     """What vehicles and persons of some types look like."""
 
     types: Annotated[
@@ -440,7 +442,10 @@ def actors_of(
         way = Track(times, places, quaternions_of(turns), smooth, start_s, beyond="absent")
         ways = following(way, follows) if follows else [way]
         named = replace(mesh, name=f"{entry.name or one.kind} ({one.name})")
-        actors += [(Actor(named, way), entry) for way in ways]
+        # Those of one entry do not walk in step.
+        share = zlib.crc32(one.name.encode()) / 2**32
+        offset_s = 0.0 if mesh.animation is None else share * mesh.animation.duration_s
+        actors += [(Actor(named, way, offset_s), entry) for way in ways]
         if len(actors) > ACTORS_MOST:
             raise LidarpoolError(
                 f"{section.file} has more than {ACTORS_MOST:,} vehicles and persons during the "

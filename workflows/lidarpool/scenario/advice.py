@@ -36,7 +36,7 @@ def advice(built: Built) -> list[str]:
         axes = [f"{axes[0]}; {plural(len(remarks) - 1, 'more file')}, too"]
     likely = filter(None, (_of_size(built), _of_poses(built), _of_colours(built)))
     unstated = dict.fromkeys(_of_datasheets(built))
-    lines = (*notes, *axes, *likely, *unstated, *_without_effect(built.scenario))
+    lines = (*notes, *axes, *likely, *unstated, *_without_effect(built.scenario), *_ended(built))
     return [as_scenario(line) for line in lines]
 
 
@@ -126,3 +126,15 @@ def _without_effect(scenario: Scenario) -> Iterator[str]:
         yield "navigation.imu has jumps at linear poses: give trajectory.interpolation: smooth"
     if scenario.noise.velocity_m_s and VELOCITY not in scenario.cloud.columns:
         yield f"noise.velocity_m_s is that of the column {VELOCITY}: add it to cloud.columns"
+
+
+def _ended(built: Built) -> Iterator[str]:
+    """Tell of actors whose animation ends before the survey does."""
+    end = np.array([built.survey.duration_ns])
+    for actor in built.scene.actors:
+        own = actor.mesh.animation
+        if own and not own.repeat and actor.seconds(end)[0][0] > own.duration_s:
+            yield (
+                f"{actor.name}: its animation of {own.duration_s:.3g} s ends before the survey "
+                "does, and its last pose remains: give repeat: true"
+            )

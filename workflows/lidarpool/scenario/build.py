@@ -110,7 +110,8 @@ class Job:
         for actor in scene.actors:
             actor.check(0.0, survey.duration_ns)
             ways, _ = actor.trajectory.poses(0, np.linspace(0, survey.duration_ns, 100))
-            reach = max(reach, float(np.abs(ways).max() + np.abs(actor.mesh.vertices).max()))
+            own = (actor.mesh.animation or actor.mesh).bounds
+            reach = max(reach, float(np.abs(ways).max() + np.abs(own).max()))
         if reach / survey.precision_m >= 2**31 - 1:
             raise LidarpoolError(
                 f"precision_m {survey.precision_m} is too fine for a scene that reaches "
@@ -284,7 +285,9 @@ def _actors(shapes: Shapes, standing: Standing, track: Track | None) -> list[Act
             with prefixed(f"{scenario.source}: actor {entry.name!r}"):
                 out += _links(entry, shapes.robot(entry.robot), way, shapes)
         else:
-            out.append(Actor(replace(shapes.of(entry), name=entry.name), way, entry.spray))
+            offset_s = 0.0 if entry.animation is None else entry.animation.offset_s
+            mesh = replace(shapes.of(entry), name=entry.name)
+            out.append(Actor(mesh, way, offset_s, entry.spray))
     return out
 
 

@@ -231,6 +231,52 @@ class ShapeSection(Section):
     _one_shape = one_of("file", "box")
 
 
+class AnimationSection(Section):
+    """An animation of an actor's .glb or .gltf; in YAML also just its name."""
+
+    name: Annotated[Text | None, about("its name in the file; by default the first", "Walk")] = None
+    speed_m_s: Annotated[
+        float | None,
+        about(
+            "speed of an actor that plays it as it was made; the rate follows the actor's speed, "
+            "and who stands stays as it is; by default it is played by time",
+            1.4,
+            gt=0,
+            le=1000,
+        ),
+    ] = None
+    repeat: Annotated[bool, about("begin again at its end; else the last pose remains")] = True
+    offset_s: Annotated[float, about("where in it the survey begins, seconds", ge=-1e9, le=1e9)] = (
+        0.0
+    )
+
+
+class DeformingSection(ShapeSection):
+    """A shape that may deform while it moves."""
+
+    animation: Annotated[
+        Annotated[AnimationSection, by_text("name", AnimationSection)] | None,
+        about("how it moves by itself: an animation of its file", {"name": "Walk"}),
+    ] = None
+    wheels: Annotated[
+        TextOrTexts | None,
+        about(
+            "names of its file's objects that are wheels, with * and ?: they turn as it drives",
+            "wheel*",
+            min_length=1,
+        ),
+    ] = None
+
+    @model_validator(mode="after")
+    def _of_file(self) -> DeformingSection:
+        given = [name for name in ("animation", "wheels") if getattr(self, name) is not None]
+        if given and self.file is None:
+            raise ValueError(f"{given[0]} is of a mesh file: give its file.")
+        if len(given) > 1:
+            raise ValueError("give either animation or wheels, not both.")
+        return self
+
+
 class CopiesSection(ShapeSection):
     """An object that stands in many places, its mesh kept once; each copy is an object."""
 

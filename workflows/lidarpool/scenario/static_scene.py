@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -22,6 +22,7 @@ from ..scene.scene_instances import SceneInstance
 from ..scene.scene_mesh import SceneMesh
 from ..scene.shapes import seed_objects
 from ..scene.transform import Transform
+from ..scene.wheels import rolling
 from ..sensor.calibrations import said, text_of
 from ..sensor.trajectory import rotations_of
 from ..sensor.trajectory_files import columns_of_table
@@ -131,15 +132,24 @@ class Shapes:
     def of(self, entry: ShapeSection) -> SceneMesh:
         """Return the mesh of a copy, an actor or vehicles, under any name."""
         shape, made = entry.file or entry.box or (1.0, 1.0, 1.0), self._made
-        if shape not in made:
+        animation, wheels = (getattr(entry, name, None) for name in ("animation", "wheels"))
+        played = animation and (animation.name, animation.speed_m_s, animation.repeat)
+        key = shape, played, wheels
+        if key not in made:
             name = entry.name or "vehicle"
-            if isinstance(shape, MeshFile):
-                read, lost = self.read(shape), f"{self.scenario.path(shape.file)} moves "
-                still = read.still(lambda line: self.found.notes.append(lost + line))
-                made[shape] = one_mesh(name, still)
-            else:
-                made[shape] = box(name, shape)
-        return made[shape]
+            if not isinstance(shape, MeshFile):
+                return made.setdefault(key, box(name, shape))
+            read = self.read(shape, animation and (animation.name or ""))
+            path = self.scenario.path(shape.file)
+            still = read.still(lambda line: self.found.notes.append(f"{path} moves {line}"))
+            if wheels is not None:
+                with prefixed(path):
+                    still = (*rolling(still, wheels, self.found.notes.append),)
+            mesh = made[key] = one_mesh(name, still)
+            if animation is not None and mesh.animation is not None:
+                own = {"speed_m_s": animation.speed_m_s, "repeat": animation.repeat}
+                made[key] = replace(mesh, animation=replace(mesh.animation, **own))
+        return made[key]
 
     def robot(self, entry: MeshFile) -> Robot:
         """Return the robot of a file; LidarpoolError if it cannot be used."""
@@ -150,8 +160,8 @@ class Shapes:
             self._robots[entry], self.found.sources[entry.file] = made, made.summary
         return self._robots[entry]
 
-    def read(self, entry: MeshFile) -> Objects:
-        """Read the objects of a file; LidarpoolError if it cannot be used."""
+    def read(self, entry: MeshFile, animation: str | None = None) -> Objects:
+        """Read the objects of a file, with an animation; LidarpoolError if it cannot be used."""
         scenario, found = self.scenario, self.found
         with prefixed(scenario.source):
             transform = entry.transform()
@@ -164,6 +174,7 @@ class Shapes:
             colours=scenario.coloured,
             epsg=scenario.cloud.epsg,
             assets=None if entry.assets is None else scenario.path(entry.assets),
+            animation=animation,
             tell=found.notes.append,
             axes=found.remarks.append,
         )

@@ -4,20 +4,23 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
 from ..base.arrays import Floats, Indices
+from ..base.elementary import interp
 from ..base.errors import LidarpoolError
 from ..base.validation import checked_fields
-from ..base.vectors import turned
-from ..sensor import Stations, Trajectory
+from ..base.vectors import length, products, turned
+from ..sensor import Stations, Track, Trajectory
 from ..sensor.trajectory import CENTRE, presence_ns, quaternions_of
 from .colours import joined
 from .scene_instances import SceneInstance, parts_of
 from .scene_mesh import SceneMesh, stacked
 
 SAMPLES_MOST = 200_000  # poses of all actors
+WAY_POSES, LONG_NS = 10_001, 1e12  # by which ways of unknown classes are measured
 AT_ZERO = Stations((CENTRE,))
 
 
@@ -33,6 +36,8 @@ class Actor:
     trajectory
         Poses of its axes, in the scene's local coordinates; its only station begins with the
         survey. By default it stands at zero, until `Scanner.move` moves it.
+    offset_s
+        Where in the mesh's animation, if it has one, it is when the survey begins, seconds.
     spray
         Whether it raises spray where the weather has some, and it moves.
 
@@ -44,6 +49,7 @@ class Actor:
 
     mesh: SceneMesh
     trajectory: Trajectory = AT_ZERO
+    offset_s: float = 0.0
     spray: bool = True
 
     def __post_init__(self) -> None:
@@ -60,13 +66,66 @@ class Actor:
     def placed(self, time_ns: float) -> SceneMesh:
         """Its mesh at a time, in the scene's local coordinates; one point if it is absent."""
         positions, rotations = self.trajectory.poses(0, np.array([time_ns]))
-        vertices = turned(self.mesh.vertices, None if rotations is None else rotations[0])
+        vertices = self.mesh.vertices
+        if (animation := self.mesh.animation) is not None:
+            vertices = animation.at(self.played(np.array([time_ns]))[0])[0][0]
+        vertices = turned(vertices, None if rotations is None else rotations[0])
         first, last = presence_ns(self.trajectory)
         vertices = vertices if first <= time_ns <= last else 0 * vertices
         # Masks do not show.
         return SceneMesh(
             self.name, vertices + positions[0], self.mesh.faces, colours=self.mesh.colours
         )
+
+    def played(self, times_ns: Floats) -> tuple[Floats, Floats]:
+        """Return frames of its animation at times (k,), nanoseconds, and frames a second then."""
+        seconds, rates = self.seconds(times_ns)
+        animation = self.mesh.animation
+        assert animation is not None
+        if not animation.repeat:
+            rates = rates * ((seconds >= 0) & (seconds < animation.duration_s))
+        return animation.frames(seconds), rates / animation.step_s
+
+    def bounds_between(self, begins_ns: Floats, ends_ns: Floats) -> Floats:
+        """Boxes of all its poses between times (k,), nanoseconds, in its own axes: (k, 2, 3)."""
+        if (animation := self.mesh.animation) is None:
+            return self.mesh.bounds[None].repeat(len(begins_ns), axis=0)
+        times = np.linspace(begins_ns, ends_ns, 5)  # it may go there and back
+        seconds = self.seconds(times.reshape(-1))[0].reshape(times.shape)
+        return animation.bounds_between(seconds.min(axis=0), seconds.max(axis=0))
+
+    def seconds(self, times_ns: Floats) -> tuple[Floats, Floats]:
+        """Seconds of its animation at times (k,), nanoseconds, and how many a second pass then."""
+        animation = self.mesh.animation
+        assert animation is not None
+        if (speed := animation.speed_m_s) is None:
+            return times_ns / 1e9 + self.offset_s, np.ones(len(times_ns))
+        at, metres = self._way
+        speeds = np.diff(metres, prepend=metres[0], append=metres[-1])
+        speeds[1:-1] /= np.diff(at) / 1e9
+        passing = speeds[np.searchsorted(at, times_ns, "right")]
+        return interp(times_ns, at, metres) / speed + self.offset_s, passing / speed
+
+    @cached_property
+    def _way(self) -> tuple[Floats, Floats]:
+        """Times (k,), nanoseconds, and how far it has gone by then, metres; back is negative.
+
+        Before and after it stands.
+        """
+        way = self.trajectory
+        if not way.moves:
+            return np.zeros(1), np.zeros(1)
+        if isinstance(way, Track):
+            times = (way.times_s - (way.start_s or 0.0)) * 1e9
+        else:
+            times = np.linspace(0, min(way.duration_ns, LONG_NS), WAY_POSES)
+        positions, rotations = way.poses(0, times.clip(*presence_ns(way)))
+        steps = np.diff(positions, axis=0)
+        metres = length(steps)
+        if rotations is not None:
+            back = products(steps.T, rotations[:-1, :, 0].T) < 0
+            metres = np.where(back, -metres, metres)
+        return times, np.append(0.0, np.cumsum(metres))
 
     def samples(self, duration_ns: float, count: int) -> tuple[Floats, Floats, Floats]:
         """Return times (k,), nanoseconds, positions (k, 3) and quaternions (k, 4), for drawings.
@@ -116,7 +175,7 @@ def shapes_of(actors: Iterable[Actor]) -> tuple[list[SceneMesh], Indices]:
     meshes: list[SceneMesh] = []
     which = []
     for mesh in (actor.mesh for actor in actors):
-        parts = (mesh.vertices, mesh.faces, mesh.colours, *mesh.cutouts)
+        parts = (mesh.vertices, mesh.faces, mesh.colours, mesh.animation, *mesh.cutouts)
         number = numbers.setdefault(tuple(map(id, parts)), len(meshes))
         if number == len(meshes):
             meshes.append(mesh)
@@ -125,18 +184,31 @@ def shapes_of(actors: Iterable[Actor]) -> tuple[list[SceneMesh], Indices]:
 
 
 def one_mesh(name: str, objects: Iterable[SceneMesh | SceneInstance]) -> SceneMesh:
-    """Join objects to one; masks are kept."""
+    """Join objects to one; masks are kept, and the animation of some, without the masks."""
     flat = [one.flat() if isinstance(one, SceneInstance) else one for one in objects]
     if any(part.voxels is not None for part in flat):
         if flat[1:]:
             raise LidarpoolError(f"{name!r} has voxels, and cannot be joined to other objects.")
         return replace(flat[0], name=name)
+    if any(mesh.animation for mesh in flat):
+        return _one_animated(name, flat)
     parts = [part for mesh in flat for part in parts_of(mesh)]
     parts.sort(key=lambda part: part.mask is not None)  # those with masks last
     vertices, faces = stacked((part.vertices, part.faces) for part in parts)
     cutouts = [cut for mesh in flat for cut in mesh.cutouts]
     colours = joined([part.colours for part in parts], [len(part.faces) for part in parts])
     return SceneMesh(name, vertices, faces, tuple(cutouts), colours)
+
+
+def _one_animated(name: str, meshes: Sequence[SceneMesh]) -> SceneMesh:
+    """Join meshes of which some have poses of one animation."""
+    first = next(mesh.animation for mesh in meshes if mesh.animation)
+    still = (len(first.vertices), 1, 1)
+    poses = [m.animation.vertices if m.animation else np.tile(m.vertices, still) for m in meshes]
+    animation = replace(first, vertices=np.concatenate(poses, axis=1))
+    colours = joined([mesh.colours for mesh in meshes], [len(mesh.faces) for mesh in meshes])
+    parts = stacked((mesh.vertices, mesh.faces) for mesh in meshes)
+    return SceneMesh(name, *parts, colours=colours, animation=animation)
 
 
 def box(name: str, size_m: tuple[float, float, float]) -> SceneMesh:

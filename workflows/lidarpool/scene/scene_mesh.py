@@ -13,6 +13,7 @@ from ..base.arrays import AnyArray, AnyFloats, Bools, Floats, Floats32, Integers
 from ..base.errors import LidarpoolError
 from ..base.validation import as_array, checked_fields
 from ..base.vectors import determinant, length, matmul, rank, turned
+from .animation import Animation
 from .colours import Colours
 
 UV_MOST = 1 << 30  # texture coordinates beyond this have no digits left
@@ -79,6 +80,8 @@ class SceneMesh:
         Of the faces, see `lidarpool.scene.colours.Colours`; None if it has none.
     voxels
         Densities of leaves within its surface, which is closed then and has no cutouts.
+    animation
+        How its vertices move where an actor has it; elsewhere it stands as `vertices` say.
 
     Raises
     ------
@@ -93,6 +96,7 @@ class SceneMesh:
     cutouts: tuple[Cutout, ...] = ()
     colours: Colours | None = None
     voxels: Voxels | None = None
+    animation: Animation | None = None
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "vertices", points_array(self.name, self.vertices))
@@ -118,6 +122,13 @@ class SceneMesh:
             _check_voxels(self.name, self.voxels)
             if self.cutouts:
                 raise LidarpoolError(f"{self.name!r} has voxels and cutouts: leave out one.")
+        if self.animation is not None:
+            moving = self.animation.vertices.shape[1]
+            if moving != len(self.vertices) or self.cutouts or self.voxels is not None:
+                raise LidarpoolError(
+                    f"{self.name!r} has {len(self.vertices)} vertices, and its animation moves "
+                    f"{moving}: it must move all of them, of a mesh without cutouts and voxels."
+                )
 
     @cached_property
     def bounds(self) -> Floats:
@@ -132,9 +143,9 @@ class SceneMesh:
             cutouts = tuple(replace(cut, uv=cut.uv[:, ::-1]) for cut in cutouts)
             colours = colours and colours.mirrored()
         voxels = self.voxels and self.voxels.moved(linear, offset)
-        return SceneMesh(
-            name, turned(self.vertices, linear) + offset, faces, cutouts, colours, voxels
-        )
+        animation = self.animation and self.animation.moved(linear, offset)
+        vertices = turned(self.vertices, linear) + offset
+        return SceneMesh(name, vertices, faces, cutouts, colours, voxels, animation)
 
 
 def _check_voxels(name: str, voxels: Voxels) -> None:

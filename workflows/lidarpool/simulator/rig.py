@@ -68,7 +68,7 @@ class Rig:
         self, scene: Scene, survey: Survey, options: dict[str, Any], like: SceneCaster | None
     ) -> None:
         self.scene, self.survey, self._options = scene, survey, options
-        self._ways = Ways(actor.trajectory for actor in scene.actors)
+        self._ways = Ways.of(scene.actors)
         wavelengths = {carried.sensor.optics.wavelength_nm for carried in survey.carried}
         self._surfaces = Surfaces(scene, tuple(survey.materials), sorted(wavelengths))
         self._caster = SceneCaster(scene, self._surfaces, like, **options)
@@ -109,7 +109,7 @@ class Rig:
         """Return the same rig with other trajectories of the actors; the trees are shared."""
         rig = copy(self)
         rig.scene = self.scene.with_actors(actors)
-        rig._ways = Ways(actor.trajectory for actor in actors)
+        rig._ways = Ways.of(actors)
         return rig
 
     def check_actors(self, begin_ns: float, end_ns: float) -> None:

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from raybeam import (
+    Deforming,
     Instance,
     Mesh,
     Moving,
@@ -186,7 +187,8 @@ class SceneCaster:
         assert self._shapes is not None
         casters, boxes, parts, shape = self._shapes
         ways = poses.ways
-        moving = Moving(casters, boxes, shape, ways.presence_ns, ways.table)
+        frames = lambda body, times: ways.played(body, times)[0]  # noqa: E731
+        moving = Moving(casters, boxes, shape, ways.presence_ns, ways.table, frames)
         hits = hits_on(moving, scan, poses.times, before)
         ray = np.flatnonzero(hits.body >= 0)
         body, triangle = hits.body[ray], hits.triangle[ray]
@@ -213,7 +215,7 @@ def _mesh_of(part: MeshPart) -> Mesh:
 
 def _shapes(
     actors: tuple[Actor, ...], options: dict[str, Any]
-) -> tuple[tuple[RayCaster, ...], Floats, Ints32, Indices] | None:
+) -> tuple[tuple[RayCaster | Deforming, ...], Floats, Ints32, Indices] | None:
     """Shapes of actors: casters, boxes (s, 2, 3), first triangles of parts (s, p), and whose (a,).
 
     None without actors.
@@ -225,6 +227,11 @@ def _shapes(
     firsts = np.zeros((len(meshes), max(map(len, parts))), np.int32)
     for row, own in zip(firsts, parts, strict=True):
         row[1 : len(own)] = np.cumsum([len(part.faces) for part in own])[:-1]
-    casters = [RayCaster.of([Instance(_mesh_of(part)) for part in own], **options) for own in parts]
-    boxes = [(mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)) for mesh in meshes]
-    return tuple(casters), np.array(boxes), firsts, shape
+    casters = tuple(
+        Deforming(mesh.animation.vertices, mesh.faces)
+        if mesh.animation
+        else RayCaster.of([Instance(_mesh_of(part)) for part in own], **options)
+        for mesh, own in zip(meshes, parts, strict=True)
+    )
+    boxes = np.array([(mesh.animation or mesh).bounds for mesh in meshes])
+    return casters, boxes, firsts, shape

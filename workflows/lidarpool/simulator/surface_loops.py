@@ -53,18 +53,23 @@ def find(triangle, begins, owners, shared, firsts, to_kept, standing, rows, obje
 
 @compiled()
 def meet(
-    rows, objects, which, directions, turns, table, run, poses, reflectance, retro,
+    rows, objects, which, directions, turns, table, own, run, poses, reflectance, retro,
     normals, along, back,
 ):  # fmt: skip
     """Write unit normals (3, n), their products with directions (3, n), and light sent back.
 
-    Normals in `table` (f, 3) are turned by instances, and by poses (12, m) of each `run`. The light
+    Normals in `table` (f, 3), or `own` at `~row` for rows below 0, are turned by
+    instances, and by poses (12, m) of each `run`. The light
     is what surfaces send back that are neither textured nor rough, at a distance of 10 m. No view
     of an array is made: it would be counted, which takes five times as long as all the rest.
     """
     for k in range(len(rows)):
         row, i, owner = rows[k], which[k], objects[k]
-        x, y, z = np.float64(table[row, 0]), np.float64(table[row, 1]), np.float64(table[row, 2])
+        if row >= 0:
+            x, y, z = table[row, 0], table[row, 1], table[row, 2]
+        else:
+            x, y, z = own[~row, 0], own[~row, 1], own[~row, 2]
+        x, y, z = np.float64(x), np.float64(y), np.float64(z)
         if i >= 0:  # in one order of rounding, that of columns.cu
             a = _product(turns[i, 0, 0], turns[i, 0, 1], turns[i, 0, 2], x, y, z)
             b = _product(turns[i, 1, 0], turns[i, 1, 1], turns[i, 1, 2], x, y, z)

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ..base.arrays import Bools, Floats, Floats32, Indices, Integers, Ints, Ints32, UInts32, owned
-from ..base.vectors import applied, into_axes, inverse, length
+from ..base.vectors import applied, into_axes, inverse, length, products
 from ..scene.actors import shapes_of
 from ..scene.colours import GREY, Colours, Lookup, joined, luminance, packed
 from ..scene.scene import Scene
@@ -30,7 +30,7 @@ BLOCK_FACES = 1 << 18  # triangles whose normals are made at a time
 BLOCK_HITS = 1 << 14  # hits whose colours are looked up at a time, to fit a cache
 
 
-_NONE = np.zeros(0, np.intp)
+_NONE, _NO_NORMALS = np.zeros(0, np.intp), np.zeros((0, 3), np.float32)
 
 
 class Light(NamedTuple):
@@ -97,10 +97,10 @@ class Surfaces:
         # Where the triangles of each instance begin, and those of actors.
         self._begins = plain + np.cumsum([0, *sizes])
         moving = [len(actor.mesh.faces) for actor in scene.actors]
-        self._meshes, which = shapes_of(scene.actors)
-        firsts = plain + np.cumsum([0, *(len(mesh.faces) for mesh in self._meshes)])
+        self._meshes, self._shape = shapes_of(scene.actors)
+        self._firsts = firsts = plain + np.cumsum([0, *(len(mesh.faces) for mesh in self._meshes)])
         # What leads from a triangle of an actor to its row among those that are kept once.
-        self._to_kept = firsts[which] - self._begins[-1] - np.cumsum([0, *moving])[:-1]
+        self._to_kept = firsts[self._shape] - self._begins[-1] - np.cumsum([0, *moving])[:-1]
         self._parts_begin = int(firsts[-1])
         owners = np.arange(self._standing, self._standing + len(moving), dtype=np.int32)
         # Objects of the triangles of faces and of actors; the last is of no triangle.
@@ -166,10 +166,15 @@ class Surfaces:
 
         poses, run = np.zeros((12, 0)), np.zeros(0, np.int64)
         rows, objects, which = self._find(triangle)
+        own = _NO_NORMALS
         if ways:
-            poses, run = ways.runs(objects - np.int64(self._standing), owned(times))
+            actors = objects - np.int64(self._standing)
+            poses, run = ways.runs(actors, owned(times))
+            if len(on := ways.deforming(actors)):
+                corners, *_ = self._bent(rows[on], actors[on], times[on], ways)
+                own, rows[on] = _normals(corners), ~np.arange(len(on))
         normals, (along, back) = np.empty((3, len(rows))), np.empty((2, len(rows)))
-        given = self._turns, self.unit_normals, run, poses, table.reflectance, table.retro
+        given = self._turns, self.unit_normals, own, run, poses, table.reflectance, table.retro
         hits = rows, objects, which, owned(directions.T)
         surface_loops.meet(*hits, *given, normals, along, back)
         return normals, along, objects, back
@@ -201,6 +206,24 @@ class Surfaces:
             back[rows] *= 1 - light.wet * (1 - below_water(np.abs(along[rows]), shares))
         surface_loops.fade(owned(distance), light.extinction, back)
         return Lit(normals.T, along, objects, back, film)
+
+    def _bent(
+        self, rows: Indices, actors: Integers, times: Floats | Ints, ways: Ways
+    ) -> tuple[Floats, Floats, Floats]:
+        """Corners of triangles of actors that deform, at times, their velocities, and at rest.
+
+        Each is (n, 3, 3), in the axes of the actors; triangles are rows of those kept once.
+        """
+        corners, speeds, rest = np.empty((3, len(rows), 3, 3))
+        frames, rates = ways.played(actors, times)
+        shapes = self._shape[actors]
+        for one in np.unique(shapes).tolist():
+            mesh, own = self._meshes[one], np.flatnonzero(shapes == one)
+            assert mesh.animation is not None
+            vertex = mesh.faces[rows[own] - self._firsts[one]]
+            corners[own], moves = mesh.animation.at(frames[own], vertex)
+            speeds[own], rest[own] = moves * rates[own, None, None], mesh.vertices[vertex]
+        return corners, speeds, rest
 
     def _on_actors(self, triangle: Integers, ways: Ways) -> tuple[Indices, Integers]:
         """Rows of triangles (n,) that belong to actors, and to which; none without `ways`."""
@@ -235,6 +258,10 @@ class Surfaces:
         if len(moving):
             places, rotations = ways.poses(actor, times[moving].astype(np.float64))
             points[moving] = into_axes(points[moving] - places, rotations)
+            if len(bent := ways.deforming(actor)):  # to where they are on the mesh at rest
+                on = moving[bent]
+                corners, _, rest = self._bent(rows[on], actor[bent], times[on], ways)
+                points[on] = _blended(rest, _weights(corners, points[on]))
         return self._lookup.at(rows, points)
 
     def velocities(
@@ -249,6 +276,13 @@ class Surfaces:
                 at = times[rows].astype(np.float64)
                 places, _ = way.poses(0, at)
                 out[rows] = carried_at(*velocities(way, 0, at), points[rows] - places)
+        if len(bent := ways.deforming(actor)):
+            rows, own = moving[bent], actor[bent]
+            at = times[rows].astype(np.float64)
+            places, turns = ways.poses(own, at)
+            corners, speeds, _ = self._bent(self._find(triangle[rows])[0], own, at, ways)
+            weights = _weights(corners, into_axes(points[rows] - places, turns))
+            out[rows] += applied(turns, _blended(speeds, weights))
         return out
 
     @cached_property
@@ -428,10 +462,7 @@ class Surfaces:
         for vertices, faces, _ in bodies:
             for begin in range(0, len(faces), BLOCK_FACES):
                 block = faces[begin : begin + BLOCK_FACES]
-                a, b, c = vertices[block].transpose(1, 0, 2)
-                normals = np.cross(b - a, c - a)
-                lengths = length(normals)[:, None]
-                out[at : at + len(block)] = normals / np.maximum(lengths, 1e-300)
+                out[at : at + len(block)] = _normals(vertices[block])
                 at += len(block)
         return out
 
@@ -446,6 +477,30 @@ class Surfaces:
 def _turns(transforms: Floats) -> Floats:
     """Matrices (n, 3, 3) that take normals of parts to those of instances, but for their length."""
     return np.ascontiguousarray(inverse(transforms[:, :, :3]).transpose(0, 2, 1))
+
+
+def _normals(corners: Floats) -> Floats32:
+    """Return unit normals (n, 3) of triangles (n, 3, 3), in single precision."""
+    a, b, c = corners.transpose(1, 0, 2)
+    normals = np.cross(b - a, c - a)
+    return (normals / np.maximum(length(normals)[:, None], 1e-300)).astype(np.float32)
+
+
+def _weights(corners: Floats, points: Floats) -> Floats:
+    """Weights (n, 3) of the corners (n, 3, 3) of triangles at points (n, 3) on them."""
+    a, b, c = corners.transpose(1, 2, 0)
+    one, other, to = b - a, c - a, points.T - a
+    square, both, square_2 = products(one, one), products(one, other), products(other, other)
+    along, along_2 = products(to, one), products(to, other)
+    area = np.maximum(square * square_2 - both * both, 1e-300)
+    v = (square_2 * along - both * along_2) / area
+    w = (square * along_2 - both * along) / area
+    return np.stack([1 - v - w, v, w], axis=1)
+
+
+def _blended(corners: Floats, weights: Floats) -> Floats:
+    """Add up rows of corners (n, 3, 3) with weights (n, 3): (n, 3)."""
+    return applied(corners.transpose(0, 2, 1), weights)
 
 
 def _closed(vertices: Floats, faces: Integers) -> bool:

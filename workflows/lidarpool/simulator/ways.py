@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Mapping
 from functools import cached_property
+from types import MappingProxyType
 from typing import NamedTuple
 
 import numpy as np
 
-from ..base.arrays import Floats, Integers, Ints, owned
+from ..base.arrays import Floats, Indices, Integers, Ints, owned
+from ..scene.actors import Actor
 from ..sensor import Track, Trajectory
 from ..sensor.trajectory import Stations, presence_ns
 
@@ -51,6 +54,29 @@ def _pieces_of(way: Trajectory) -> _Pieces | None:
 
 class Ways(tuple[Trajectory, ...]):
     """Trajectories of actors."""
+
+    animated: Mapping[int, Actor] = MappingProxyType({})  # {number: actor that deforms}
+
+    @classmethod
+    def of(cls, actors: Iterable[Actor]) -> Ways:
+        """Return those of actors, and how these deform."""
+        found = list(actors)
+        made = cls(actor.trajectory for actor in found)
+        made.animated = {k: actor for k, actor in enumerate(found) if actor.mesh.animation}
+        return made
+
+    def deforming(self, number: Integers) -> Indices:
+        """Rows of `number` (n,) that are actors whose mesh has an animation."""
+        own = list(self.animated)
+        return np.flatnonzero(np.isin(number, own)) if own else np.zeros(0, np.intp)
+
+    def played(self, number: Integers, times_ns: Floats | Ints) -> Floats:
+        """Frames of actors `number` (n,) at times (n,), and how many a second pass: (2, n)."""
+        out = np.zeros((2, len(number)))
+        for one in np.unique(number).tolist():
+            rows = np.flatnonzero(number == one)
+            out[:, rows] = self.animated[one].played(times_ns[rows].astype(np.float64))
+        return out
 
     @cached_property
     def presence_ns(self) -> Floats:

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import base64
 import json
+import math
 import re
 import struct
 from collections.abc import Callable, Sequence
@@ -27,6 +28,7 @@ from ...base.elementary import sin_cos_of
 from ...base.vectors import applied, inverse, length, matmul
 from ...base.words import plural
 from ...sensor.trajectory import matrices
+from ..animation import RATE_HZ, Animation
 from ..colours import LINEAR, Colours, as_srgb
 from ..masks import (
     FACE_BYTES,
@@ -40,6 +42,7 @@ from ..masks import (
 )
 from ..scene_mesh import SceneMesh
 from .companions import image_file, named_file
+from .gltf_animation import WIDTHS, Channels, chosen, keys_of, played
 from .polygons import check_corners, fanned, unrolled
 from .scene_graph import (
     MOST_NODES,
@@ -65,6 +68,7 @@ _GLOSSY = "KHR_materials_pbrSpecularGlossiness"  # materials of older files
 
 _TYPES = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 _WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT4": 16}
+_CUT = ("MASK", "BLEND")  # modes of materials that are transparent somewhere
 V = TypeVar("V")
 _WRAPS: dict[Any, Wrap] = {33071: "clamp", 33648: "mirror"}
 
@@ -77,7 +81,10 @@ def read_gltf(data: bytes, path: Path, wanted: Wanted) -> Content:
     header, body = _chunks(data)
     _check(header)
     reader = _Reader(header, body, path, len(data), wanted)
-    content = settled(instances(_roots(header), reader.node, path.stem))
+    if wanted.animation is None:
+        content = settled(instances(_roots(header), reader.node, path.stem))
+    else:
+        content = reader.baked(wanted.animation)
     content.unit_m, content.up_axis, content.turned = 1.0, "y", "as glTF asks"
     content.notes = [*reader.notes.lines(), *reader.still()]
     content.generator = str(header.get("asset", {}).get("generator", ""))
@@ -157,6 +164,53 @@ class _Reader:
         self._mask = remembered(self._read_mask)
         self._base, self._shades = remembered(self._read_base), remembered(self._read_shades)
         self.notes = MaskNotes()
+        self._channels: Channels = {}
+        self._frame = 0
+        self._local, self._joints = cache(self._read_local), cache(self._read_joints)
+
+    def baked(self, name: str) -> Content:
+        """Read the scene with an animation, from its first key to its last."""
+        animation = chosen(self._header.get("animations", []), name)
+        first, last = keys_of(animation, self._accessor)
+        if not last > first:
+            raise MeshFileError(f"has an animation {name!r} without a duration: export it again")
+        count = max(1, math.ceil((last - first) * RATE_HZ))
+        self._channels = played(animation, np.linspace(first, last, count + 1), self._accessor)
+        roots, content = _roots(self._header), Content(())
+        poses: list[Floats] = []
+        for self._frame in range(count + 1):
+            taken = self._allowance.taken
+            for kept in (self._local, self._joints, self._bent):  # of the frame before
+                kept.cache_clear()
+            made = settled(instances(roots, self.node, self._path.stem), copy_all=True)
+            now = [mesh.vertices for mesh in made.meshes if isinstance(mesh, SceneMesh)]
+            if not poses:
+                content, self._wanted = made, self._wanted._replace(colours=False)
+                self._allowance.take((count + 1) * sum(vertices.nbytes for vertices in now))
+                poses = [np.empty((count + 1, *vertices.shape)) for vertices in now]
+            else:
+                self._allowance.taken = taken
+            for out, vertices in zip(poses, now, strict=True):
+                out[self._frame] = vertices
+        moves = iter([Animation(own, (last - first) / count) for own in poses])
+        content.meshes = [
+            replace(mesh, animation=next(moves))
+            for mesh in content.meshes
+            if isinstance(mesh, SceneMesh)
+        ]
+        return content
+
+    def _read_local(self, index: int) -> Floats:
+        """Matrix (4, 4) of a node, at the frame of the animation if there is one."""
+        node = self._part("nodes", index)
+        moved = {
+            what: self._channels[index, what][self._frame]
+            for what in WIDTHS
+            if (index, what) in self._channels
+        }
+        if moved and "matrix" in node:
+            raise ValueError(f"node {index} is animated, and has a matrix")
+        return _matrix({**node, **moved})
 
     def _part(self, kind: str, index: Any) -> dict[str, Any]:
         """Part of the file by its number; a negative one would count from the end."""
@@ -171,7 +225,7 @@ class _Reader:
             name = name or str(self._part("meshes", found["mesh"]).get("name") or "")
             # Some programs write a mesh for each node, all of the same accessors.
             content = json.dumps(self._part("meshes", found["mesh"])["primitives"], sort_keys=True)
-            skin, weights = found.get("skin"), self._weights(found)
+            skin, weights = found.get("skin"), self._weights(index, found)
             if skin is None and not any(weights):
                 meshes = self._mesh(self._same.setdefault(content, found["mesh"]))
             else:
@@ -183,7 +237,7 @@ class _Reader:
                 copies = back[None]
             if instancing := found.get("extensions", {}).get(_INSTANCING):
                 copies = self._copies(instancing.get("attributes", {}))
-        return Node(name, _matrix(found), meshes, found.get("children", ()), copies)
+        return Node(name, self._local(index), meshes, found.get("children", ()), copies)
 
     def _copies(self, attributes: dict[str, Any]) -> Floats | None:
         """Matrices (k, 4, 4) of the copies of a node's mesh; None if it has one place."""
@@ -207,13 +261,21 @@ class _Reader:
         """Return a note on what moves in the file, and stands still here."""
         bent, found = self._bent.cache_info().currsize, len(self._header.get("animations", ()))
         meshes = f", of {plural(bent, 'bent mesh', 'bent meshes')}" * bool(bent)
-        return [f"has {plural(found, 'animation')}{meshes}: all stands still"] * bool(found)
+        if self._channels:
+            cut = any(m.get("alphaMode") in _CUT for m in self._header.get("materials", ()))
+            return ["is animated, so it is solid where its images are transparent"] * cut
+        if not found:
+            return []
+        told = "all stands still; actors move by animation: NAME"
+        return [f"has {plural(found, 'animation')}{meshes}: {told}"]
 
-    def _weights(self, node: dict[str, Any]) -> tuple[float, ...]:
+    def _weights(self, index: int, node: dict[str, Any]) -> tuple[float, ...]:
         """Weights of the morph targets of a node's mesh."""
         mesh = self._part("meshes", node["mesh"])
         if not any("targets" in primitive for primitive in mesh["primitives"]):
             return ()
+        if (moved := self._channels.get((index, "weights"))) is not None:
+            return tuple(moved[self._frame].tolist())
         return tuple(map(float, node.get("weights", mesh.get("weights", ()))))
 
     def _world(self, index: int) -> Floats:
@@ -224,7 +286,7 @@ class _Reader:
             if at in seen:
                 raise ValueError("nodes contain each other")
             seen.add(at)
-            matrix, at = matmul(_matrix(self._part("nodes", at)), matrix), self._parents.get(at)
+            matrix, at = matmul(self._local(at), matrix), self._parents.get(at)
         return matrix
 
     def _read_bent(
@@ -256,9 +318,11 @@ class _Reader:
 
         return joined(name, map(piece, surfaces), self._allowance)
 
-    def _joints(self, skin: int) -> Floats:
+    def _read_joints(self, skin: int) -> Floats:
         """Matrices (j, 4, 4) of a skin's joints, from its mesh to the scene; glTF 2.0, 3.7.3."""
         found = self._part("skins", skin)
+        if not found.get("joints"):
+            raise MeshFileError("has a skin without joints: export it again, or without the skin")
         worlds = np.array([self._world(joint) for joint in found["joints"]])
         if (bound := found.get("inverseBindMatrices")) is not None:
             columns = self._accessor(bound).astype(np.float64)[: len(worlds)]
@@ -383,7 +447,7 @@ class _Reader:
         """Texture of a material, and its use of it; None if the material is solid."""
         material = self._part("materials", number)
         mode = material.get("alphaMode", "OPAQUE")
-        if mode not in ("MASK", "BLEND"):
+        if mode not in _CUT:
             if _extension(material, _TRANSMISSION).get("transmissionFactor", 0) > 0:
                 self.notes.glass[self._material_name(number)] = None
             return None

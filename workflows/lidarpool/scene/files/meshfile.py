@@ -64,6 +64,7 @@ CONVERTED = {  # {ending of scenes that are not read: what to do}
     ".mjcf": _MUJOCO,
     ".xml": f"{_MUJOCO}, and lidarpool import reads a survey of HELIOS++",
 }
+ANIMATED = (".glb", ".gltf")
 UNITLESS = (".obj", ".stl", ".ply", ".off")  # formats without a unit
 
 GENERATOR = "lidarpool"  # that files of our own name, .glb as Y-up, others as Z-up
@@ -112,6 +113,7 @@ def load_objects(
     window: Window | None = None,
     epsg: int | None = None,
     assets: str | Path | None = None,
+    animation: str | None = None,
     tell: Callable[[str], None] = warn,
     axes: Callable[[str], None] | None = None,
 ) -> Objects:
@@ -134,6 +136,9 @@ def load_objects(
     epsg
         Code of the coordinate system that a raster is brought to, one in metres. None keeps its
         own if it is in metres, else takes the UTM zone of its middle.
+    animation
+        Of a .glb or .gltf: name of the animation that its meshes have, or its number if it has
+        none; "" for the first. Such meshes have no masks. None leaves all as it stands.
     tell
         Called with a line on objects left out, on images that cannot be read, on materials that
         may be glass, or on a reference system; by default this module's logger warns.
@@ -165,8 +170,13 @@ def load_objects(
             f"{path} is no raster: leave out {' and '.join(given)}, or give a raster "
             f"({' '.join(RASTERS)})."
         )
+    if animation is not None and path.suffix.lower() not in ANIMATED:
+        raise LidarpoolError(
+            f"{path} has no animations that are read: give a {' or '.join(ANIMATED)}, or leave out "
+            "animation."
+        )
     folders = tuple(Path(one).resolve() for one in (path.parent, assets) if one is not None)
-    wanted = Wanted(opacity == "mask", colours, folders)
+    wanted = Wanted(opacity == "mask" and animation is None, colours, folders, animation)
     # Of broken numbers in files: infinite and NaN values are refused.
     with np.errstate(all="ignore"):
         try:

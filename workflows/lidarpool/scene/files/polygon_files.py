@@ -63,7 +63,7 @@ def read_obj(data: bytes, path: Path, wanted: Wanted) -> Content:
     Objects are in order of their first face; materials do not divide them. Without masks,
     triangles are solid; without these and colours, neither materials nor images are read.
     """
-    masks, colours, _ = wanted
+    masks, colours = wanted.masks, wanted.colours
     text = data.replace(b"\r\n", b"\n").replace(b"\r", b"\n")
     text = text.replace(b"\\\n", b" ").replace(b"\t", b" ")
     divider = b"o" if re.search(rb"^ *o ", text, re.MULTILINE) else b"g"

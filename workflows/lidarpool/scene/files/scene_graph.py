@@ -48,6 +48,7 @@ class Wanted(NamedTuple):
     masks: bool
     colours: bool
     folders: tuple[Path, ...]  # resolved; files that it names are read only from these and below
+    animation: str | None = None  # to bake, by its name; "" for the first
 
     def allows(self, file: Path) -> bool:
         """Whether a file that is named may be read."""
@@ -141,10 +142,11 @@ def instances(roots: Iterable[Any], node_of: Callable[[Any], Node], stem: str) -
     return placed
 
 
-def settled(placed: Sequence[PlacedNode]) -> Content:
+def settled(placed: Sequence[PlacedNode], *, copy_all: bool = False) -> Content:
     """Make instances of meshes that many places share, and copy the others to their places.
 
-    Meshes with masks are not copied either, since each copy would have a part of its own.
+    Meshes with masks are not copied either, since each copy would have a part of its own. With
+    `copy_all` there is a copy for each place, even of what is scaled to zero.
 
     Raises
     ------
@@ -157,7 +159,7 @@ def settled(placed: Sequence[PlacedNode]) -> Content:
     shared = {
         mesh
         for mesh, n in uses.items()
-        if (n - 1) * len(mesh.faces) >= (1 if mesh.cutouts else SHARED_TRIANGLES)
+        if not copy_all and (n - 1) * len(mesh.faces) >= (1 if mesh.cutouts else SHARED_TRIANGLES)
     }
     own = [mesh.vertices.nbytes + mesh.faces.nbytes for mesh, *_ in placed if mesh not in shared]
     if sum(own) > memory_share():
@@ -180,7 +182,7 @@ def settled(placed: Sequence[PlacedNode]) -> Content:
         )
     ranks = rank(matrices[:, :3, :3]).tolist()
     for (mesh, matrix, name, _), dimensions in zip(placed, ranks, strict=True):
-        if dimensions < 2:
+        if dimensions < 2 and not copy_all:
             content.skipped.append(name)
         elif mesh in shared and dimensions == 3:
             objects.append(SceneInstance(mesh, matrix, name))

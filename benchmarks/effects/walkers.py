@@ -1,0 +1,69 @@
+"""People who walk: one from aside at four moments, and the velocities of arms and legs."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from lidarpool import Actor, Scanner, Scene, Sensor, Survey, Track
+from lidarpool.render.colouring import DIVERGING
+from lidarpool.scene.actors import box, one_mesh
+from lidarpool.scene.files.meshfile import load_objects
+
+DRAWS = "effect-walkers.png"
+PERSON = Path(__file__).parents[2] / "examples" / "pedestrian.glb"
+AWAY, SPEED, SECONDS, RATE_HZ = 9.0, 1.4, 2.2, 25  # m at first, m/s towards the sensor
+DARK = "#3a3f47"
+
+
+def on(survey: Survey) -> Survey:
+    """Return the survey with radial velocities, in which walking shows."""
+    return replace(survey, columns=(*survey.columns, "radial_velocity"))
+
+
+def picture(path: Path) -> None:
+    """Draw points of sweeps from aside, and their velocities over time."""
+    from matplotlib.colors import ListedColormap
+    from matplotlib.figure import Figure
+
+    mesh = one_mesh("Person", load_objects(PERSON, animation="Walk").standing)
+    assert mesh.animation is not None
+    mesh = replace(mesh, animation=replace(mesh.animation, speed_m_s=SPEED))
+    way = Track([0, SECONDS + 1], [[AWAY, 0, 0], [AWAY - SPEED * (SECONDS + 1), 0, 0]])
+    floor = box("Floor", (60, 60, 0.1))
+    scene = Scene.from_meshes([replace(floor, vertices=floor.vertices - [0, 0, 0.1])])
+    scene = scene.with_actors([Actor(mesh, way)])
+    sensor = Sensor.grid(1800, 64, vertical_fov_deg=24, horizontal_fov_deg=14, rate_hz=RATE_HZ)
+    columns = ["radial_velocity", "object", "time"]
+    scanner = Scanner(scene, sensor, columns=columns, precision_m=1e-3)
+    sweeps = []
+    for number in range(int(SECONDS * RATE_HZ)):
+        found = scanner.sweep((0, 0, 1), number=number)
+        own = found["object"] == 1
+        columns_of = (found["time"][own] / 1e9, found["radial_velocity"][own])
+        sweeps.append((found.positions[own], *columns_of))
+    figure = Figure(figsize=(10.4, 4.2), dpi=90, layout="constrained")
+    left, right = figure.subplots(1, 2, width_ratios=(1.3, 1))
+    scale = {"cmap": ListedColormap(DIVERGING), "vmin": -5, "vmax": 5, "linewidths": 0}
+    for k, number in enumerate((5, 11, 18, 24)):
+        where, _, velocity = sweeps[number]
+        ahead = where[:, 0] - (AWAY - SPEED * number / RATE_HZ)
+        points = left.scatter(1.5 * k + ahead, where[:, 2], c=velocity, s=3, **scale)
+        left.text(1.5 * k, -0.16, f"{number / RATE_HZ:.2f} s", color="white", ha="center", size=8)
+    left.set_facecolor(DARK)
+    left.set(
+        aspect="equal", xlabel="m; the sensor is on the left", ylabel="z, m", ylim=(-0.25, 1.9)
+    )
+    label = "radial velocity, m/s: blue comes nearer"
+    figure.colorbar(points, ax=left, label=label, location="bottom", shrink=0.85, aspect=40)
+    places, seconds, velocities = map(np.concatenate, zip(*sweeps, strict=True))
+    light = {"s": 0.6, "cmap": "viridis", "linewidths": 0}
+    shown = right.scatter(seconds, velocities, c=places[:, 2], **light)
+    right.axhline(-SPEED, color="black", lw=0.8, ls="--")
+    right.set(xlabel="time, s", ylabel="radial velocity, m/s", xlim=(0, SECONDS))
+    figure.colorbar(shown, ax=right, label="height, m", location="bottom", shrink=0.85, aspect=40)
+    left.set_title("one person in four sweeps, from aside", fontsize=8.5)
+    right.set_title(f"all points; dashed: the person's own {SPEED} m/s", fontsize=8.5)
+    figure.savefig(path)

@@ -1,0 +1,532 @@
+"""Meshes that deform: animations of glTF files, wheels, and how actors play them."""
+
+import json
+from base64 import b64encode
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from tests.meshes import write
+from tests.shapes import made
+
+from lidarpool import (
+    Actor,
+    LidarpoolError,
+    Material,
+    Scanner,
+    Scene,
+    Sensor,
+    Survey,
+    Track,
+    save_cloud,
+)
+from lidarpool.columns.cloud import Cloud
+from lidarpool.export.boxes import Boxes
+from lidarpool.export.sweeps import Sweeps
+from lidarpool.scenario.advice import advice
+from lidarpool.scenario.build import build
+from lidarpool.scenario.scenario import Scenario
+from lidarpool.scene.actors import box, one_mesh, shapes_of
+from lidarpool.scene.animation import Animation
+from lidarpool.scene.files.meshfile import load_objects
+from lidarpool.scene.scene_mesh import SceneMesh
+from lidarpool.scene.wheels import rolling
+from lidarpool.sensor.trajectory import matrices
+
+KINDS = {"f": 5126, "B": 5121, "H": 5123}
+SHAPES = {1: "SCALAR", 3: "VEC3", 4: "VEC4", 16: "MAT4"}
+
+
+class File:
+    """A .gltf in the making."""
+
+    def __init__(self):
+        self.body = b""
+        self.header = {
+            "asset": {"version": "2.0"}, "nodes": [], "meshes": [], "accessors": [],
+            "bufferViews": [], "animations": [{"name": "Move", "channels": [], "samplers": []}],
+        }  # fmt: skip
+
+    def stored(self, numbers, kind="f", width=1, **more):
+        array = np.array(numbers, kind)
+        views, accessors = self.header["bufferViews"], self.header["accessors"]
+        views.append({"buffer": 0, "byteOffset": len(self.body), "byteLength": array.nbytes})
+        self.body += array.tobytes() + bytes(-array.nbytes % 4)
+        accessors.append({"bufferView": len(views) - 1, "componentType": KINDS[kind],
+                          "type": SHAPES[width], "count": array.size // width, **more})  # fmt: skip
+        return len(accessors) - 1
+
+    def moved(self, node, path, keys, values, how="LINEAR"):
+        found, width = self.header["animations"][0], {"weights": 1, "rotation": 4}.get(path, 3)
+        sampler = {"input": self.stored(keys), "output": self.stored(values, width=width)}
+        found["samplers"].append(sampler | {"interpolation": how})
+        target = {"node": node, "path": path}
+        found["channels"].append({"sampler": len(found["samplers"]) - 1, "target": target})
+
+    def write(self, path):
+        self.header["buffers"] = [
+            {"byteLength": len(self.body), "uri": "data:;base64," + b64encode(self.body).decode()}
+        ]
+        return write(path, json.dumps(self.header))
+
+
+CORNERS = np.array([[0, 0, 0], [1, 0, 0.2], [0, 2, 0], [1, 2.5, 0], [0.5, 4, 1]], "f")
+FACES = [0, 1, 2, 1, 3, 2, 2, 3, 4]
+JOINTS = [[0, 1, 0, 0], [0, 1, 0, 0], [1, 0, 0, 0], [1, 0, 0, 0], [1, 0, 0, 0]]
+WEIGHTS = [[1, 0, 0, 0], [0.75, 0.25, 0, 0], [0.5, 0.5, 0, 0], [0.6, 0.6, 0, 0], [1, 0, 0, 0]]
+KEYS = [0.25, 0.5, 1.0, 1.25]
+TURNS = [[0, 0, 0, 1], [0, 0, 0.6, 0.8], [0.48, 0.6, 0, 0.64], [0, 0, 0, -1]]
+MOVES = [[0, 1, 0], [0.5, 1, 0], [0.5, 1, 2], [0, 1, 0]]
+TARGET = np.array([[0, 0, 1], [0, 0, 0], [0.5, 0, 0], [0, 0, 0], [0, 1, 0]], "f")
+
+
+def skinned():
+    """A strip with two joints, the second of which turns, moves and is scaled; two targets."""
+    made = File()
+    header = made.header
+    bound = np.tile(np.eye(4), (2, 1, 1))
+    bound[1, 3, :3] = 0, -1, 0  # columns
+    attributes = {
+        "POSITION": made.stored(CORNERS, width=3),
+        "JOINTS_0": made.stored(JOINTS, "B", 4),
+        "WEIGHTS_0": made.stored(WEIGHTS, width=4),
+    }
+    primitive = {"attributes": attributes, "indices": made.stored(FACES, "H")}
+    primitive["targets"] = [{"POSITION": made.stored(t, width=3)} for t in (TARGET, -2 * TARGET)]
+    header["meshes"] = [{"primitives": [primitive], "weights": [0.5, 0]}]
+    header["skins"] = [{"joints": [1, 2], "inverseBindMatrices": made.stored(bound, width=16)}]
+    header["nodes"] = [
+        {"name": "Strip", "mesh": 0, "skin": 0, "translation": [9, 9, 9]},  # does not count
+        {"children": [2], "translation": [3, 0, 0], "rotation": [0.6, 0, 0, 0.8]},
+        {"translation": [0, 1, 0]},
+    ]
+    header["scenes"], header["scene"] = [{"nodes": [0, 1]}], 0
+    return made
+
+
+def quaternion(x, y, z, w):
+    """Matrix of a unit quaternion, by products of it and a vector."""
+    out = np.zeros((3, 3))
+    for column, unit in enumerate(np.eye(3)):
+        axis = np.array([x, y, z])
+        out[:, column] = unit + 2 * np.cross(axis, np.cross(axis, unit) + w * unit)
+    return out
+
+
+def between(keys, values, at, how):
+    """Value at a time of the specification's three interpolations, written out for one number."""
+    values = np.array(values, float)
+    k = max(0, min(len(keys) - 2, sum(key <= at for key in keys) - 1))
+    u = min(max((at - keys[k]) / (keys[k + 1] - keys[k]), 0.0), 1.0)
+    if how == "STEP":
+        return values[k + 1] if u == 1 else values[k]
+    if how == "CUBICSPLINE":
+        long = keys[k + 1] - keys[k]
+        (_, p, out), (into, q, _) = values[3 * k : 3 * k + 3], values[3 * k + 3 : 3 * k + 6]
+        return ((2 * u**3 - 3 * u**2 + 1) * p + long * (u**3 - 2 * u**2 + u) * out
+                + (3 * u**2 - 2 * u**3) * q + long * (u**3 - u**2) * into)  # fmt: skip
+    if values.shape[1] == 4:
+        p, q = values[k], values[k + 1]
+        q = q if p @ q >= 0 else -q
+        angle = np.arccos(min(p @ q, 1.0))
+        if angle < 1e-6:
+            return p
+        return (np.sin((1 - u) * angle) * p + np.sin(u * angle) * q) / np.sin(angle)
+    return (1 - u) * values[k] + u * values[k + 1]
+
+
+def expected(at, how, turns, moves, scales, weights):
+    """Vertices of `skinned` at a time, one by one."""
+    turn = between(KEYS, turns, at, how)
+    inner = np.eye(4)
+    inner[:3, :3] = quaternion(*turn / np.linalg.norm(turn)) * between(KEYS, scales, at, how)
+    inner[:3, 3] = between(KEYS, moves, at, how)
+    outer = np.eye(4)
+    outer[:3, :3], outer[:3, 3] = quaternion(0.6, 0, 0, 0.8), [3, 0, 0]
+    back = np.eye(4)
+    back[1, 3] = -1
+    joints = outer, outer @ inner @ back
+    first, second = between(KEYS, weights, at, how)
+    out = []
+    for corner, target, own, shares in zip(CORNERS, TARGET, JOINTS, WEIGHTS, strict=True):
+        point = np.append(corner + first * target - 2 * second * target, 1)
+        moved = sum(share * joints[joint] @ point for joint, share in zip(own, shares, strict=True))
+        out.append(moved[:3] / sum(shares))
+    return np.array(out)
+
+
+@pytest.mark.parametrize("how", ["LINEAR", "STEP", "CUBICSPLINE"])
+def test_skins_targets_and_nodes_are_where_the_specification_says(tmp_path, how):
+    """At five times, by an evaluation of one vertex at a time."""
+    made, random = skinned(), np.random.default_rng(1)
+    scales, weights = (
+        [[1, 1, 1], [1, 2, 1], [0.5, 1, 1], [1, 1, 1]],
+        [[0, 1], [1, 0], [0, 0], [1, 1]],
+    )
+    given = {"rotation": TURNS, "translation": MOVES, "scale": scales, "weights": weights}
+    if how == "CUBICSPLINE":  # with tangents before and after each
+        for path, v in given.items():
+            before, after = random.normal(0, 0.3, (2, *np.shape(v)))
+            given[path] = np.stack([before, v, after], axis=1).reshape(-1, np.shape(v)[1])
+        given = {path: values.astype("f") for path, values in given.items()}
+    for path, values in given.items():
+        made.moved(
+            2 if path != "weights" else 0, path, KEYS, np.array(values, "f").reshape(-1), how
+        )
+    found = load_objects(made.write(tmp_path / "m.gltf"), animation="Move", up_axis="z")
+    mesh = one_mesh("Strip", found.standing)
+    poses = mesh.animation.vertices
+    assert poses.shape == (61, 5, 3) and mesh.animation.step_s == pytest.approx(1 / 60)
+    for frame in (0, 7, 30, 52, 60):
+        at = 0.25 + frame / 60
+        own = (given[path] for path in ("rotation", "translation", "scale", "weights"))
+        np.testing.assert_allclose(poses[frame], expected(at, how, *own), atol=2e-6)
+    np.testing.assert_array_equal(mesh.vertices, poses[0])
+
+
+def test_a_wheel_of_a_file_turns_as_animated_even_if_it_shrinks_to_nothing(tmp_path):
+    made = skinned()
+    del made.header["skins"], made.header["nodes"][0]["skin"]
+    made.moved(0, "rotation", [0, 1], [0, 0, 0, 1, 0, 0, 1, 0])
+    made.moved(0, "scale", [0, 0.5, 1], [1, 1, 1, 0, 0, 0, 1, 1, 1])
+    found = load_objects(made.write(tmp_path / "m.gltf"), animation="", up_axis="z")
+    poses = found.standing[0].animation.vertices
+    start = poses[0] - 9
+    np.testing.assert_allclose(poses[30], 9 + 0 * start, atol=1e-6)
+    np.testing.assert_allclose(poses[60], 9 + start * [-1, -1, 1], atol=1e-5)
+    root = 0.5**0.5
+    turned = start @ np.array([[-root, root, 0], [-root, -root, 0], [0, 0, 1]])
+    np.testing.assert_allclose(poses[45], 9 + turned / 2, atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("edit", "name", "message"),
+    [
+        (lambda h: None, "Moev", r"m.gltf has no animation 'Moev' \(Did you mean 'Move'\?\)\.$"),
+        (lambda h: None, "Walk", r"has no animation 'Walk' \(there are Move\)\.$"),
+        (lambda h: h.pop("animations"), "", "has no animations: export it with them, or leave out"),
+        (lambda h: h["skins"][0].update(joints=[]), "Move", "has a skin without joints"),
+        (lambda h: h["accessors"][-2].update(count=1), "Move", "without a duration"),
+        (lambda h: h["nodes"][2].update(matrix=np.eye(4).ravel().tolist()), "Move",
+         "node 2 is animated, and has a matrix"),
+        (lambda h: h["animations"][0]["samplers"][0].update(input=0), "Move", "do not ascend"),
+    ],
+)  # fmt: skip
+def test_unusable_animations_are_refused_in_a_line(tmp_path, edit, name, message):
+    made = skinned()
+    made.moved(2, "translation", KEYS, np.reshape(MOVES, -1))
+    edit(made.header)
+    path = made.write(tmp_path / "m.gltf")
+    with pytest.raises(LidarpoolError, match=message) as told:
+        load_objects(path, animation=name)
+    assert "\n" not in str(told.value)
+
+
+def test_only_gltf_has_animations(tmp_path):
+    path = write(tmp_path / "m.obj", "v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n")
+    with pytest.raises(LidarpoolError, match=r"has no animations that are read: give a .glb"):
+        load_objects(path, animation="Walk")
+
+
+PERSON = Path(__file__).parents[2] / "examples" / "pedestrian.glb"
+FLOOR = replace(
+    box("Floor", (90, 90, 0.1)), vertices=box("Floor", (90, 90, 0.1)).vertices - [0, 0, 0.1]
+)
+
+
+@pytest.fixture(scope="module")
+def walker():
+    """The example's person, whose animation is made for 1.4 m/s."""
+    mesh = one_mesh("Walker", load_objects(PERSON, animation="Walk").standing)
+    return replace(mesh, animation=replace(mesh.animation, speed_m_s=1.4))
+
+
+def moving_box(velocity, seconds=1.0):
+    """A box of 1 m whose vertices move evenly, by its own axes."""
+    mesh = box("Piston", (1, 1, 1))
+    poses = np.stack([mesh.vertices, mesh.vertices + np.multiply(velocity, seconds)])
+    return replace(mesh, animation=Animation(poses, seconds))
+
+
+@pytest.mark.parametrize("backend", ["embree", "numpy"])
+def test_radial_velocities_are_of_the_triangle_and_its_actor(backend):
+    """2 m/s along the axes of an actor that is turned by a quarter and drives at 3 m/s."""
+    way = Track([0, 1], [[6, 0, -0.5], [6, 0, 2.5]], [[0, 0, 0.5**0.5, 0.5**0.5]] * 2)
+    scene = Scene.from_meshes([FLOOR]).with_actors([Actor(moving_box((2, 0.5, 0)), way)])
+    columns = ["radial_velocity", "object", "time", "range"]
+    scanner = Scanner(
+        scene, Sensor.grid(720, 40), columns=columns, backend=backend, precision_m=1e-6
+    )
+    found = scanner.sweep((0, 0, 1), start_s=0.3)
+    own = found["object"] == 1
+    assert own.sum() > 50
+    ways = found.positions[own] - [0, 0, 1]
+    ways /= np.linalg.norm(ways, axis=1)[:, None]
+    expected = ways @ [-0.5, 2, 3]
+    # Its side is where it is then.
+    np.testing.assert_allclose(found["radial_velocity"][own], expected, atol=1e-5)
+    seconds = found["time"][own] / 1e9
+    low = 6 - 0.5 - 0.5 * seconds
+    assert np.abs(found.positions[own, 0] - low).min() < 1e-3
+
+
+def test_normals_are_those_of_the_moment():
+    """A door that opens: its light fades with the cosine."""
+    flat = SceneMesh("Door", np.array([[0, 0, -1], [0, 1, -1], [0, 1, 1.0], [0, 0, 1]]),
+                     np.array([[0, 1, 2], [0, 2, 3]]))  # fmt: skip
+    angles = np.radians(np.linspace(0, 60, 61))
+    poses = np.stack([flat.vertices] * 61)
+    poses[:, :, 0], poses[:, :, 1] = (
+        f(angles)[:, None] * flat.vertices[:, 1] for f in (np.sin, np.cos)
+    )
+    actor = Actor(
+        replace(flat, animation=Animation(poses, 0.01)),
+        Track([0, 9], [[5, 0, 0], [5, 0, 0.0]], [[0, 0, 0, 1]] * 2),
+    )
+    scene = Scene.from_meshes([FLOOR]).with_actors([actor])
+    columns, grey = ["reflectivity", "object", "time"], Material("*", reflectance=0.5)
+    scanner = Scanner(scene, Sensor.grid(720, 3), columns=columns, materials=[grey])
+    for start in (0.05, 0.3, 0.55):
+        found = scanner.sweep((0, 0, 0), start_s=start)
+        own = found["object"] == 1
+        assert own.sum() > 5
+        ways = found.positions[own] / np.linalg.norm(found.positions[own], axis=1)[:, None]
+        angle = np.radians(found["time"][own] / 1e9 * 100)
+        cosine = np.abs(ways[:, 0] * np.cos(angle) - ways[:, 1] * np.sin(angle))
+        np.testing.assert_allclose(found["reflectivity"][own], 0.5 * cosine, atol=1e-3)
+
+
+def test_the_rate_follows_the_way_and_who_stands_keeps_the_pose(walker):
+    """0.7 m/s for a second, then none, then back."""
+    way = Track([0, 1, 2, 3], [[0, 0, 0], [0.7, 0, 0], [0.7, 0, 0], [0, 0, 0]],
+                [[0, 0, 0, 1]] * 4, beyond="hold")  # fmt: skip
+    actor = Actor(walker, way, offset_s=0.1)
+    times = np.array([-1, 0, 0.5, 1, 1.5, 2, 2.5, 5]) * 1e9
+    seconds, rates = actor.seconds(times)
+    np.testing.assert_allclose(seconds, [0.1, 0.1, 0.35, 0.6, 0.6, 0.6, 0.35, 0.1])
+    np.testing.assert_allclose(rates, [0, 0.5, 0.5, 0, 0, -0.5, -0.5, 0])
+    frames, passing = actor.played(times)
+    duration, step = walker.animation.duration_s, walker.animation.step_s
+    np.testing.assert_allclose(frames * step, np.mod(seconds, duration))
+    np.testing.assert_allclose(passing * step, rates)
+    by_time = replace(walker, animation=replace(walker.animation, speed_m_s=None, repeat=False))
+    frames, passing = Actor(by_time, way).played(np.array([-1, 0.5, 2]) * 1e9)
+    np.testing.assert_allclose(frames * step, [0, 0.5, duration])
+    np.testing.assert_allclose(passing * step, [0, 1, 0])
+
+
+def test_the_person_of_the_examples_walks_without_sliding(walker):
+    """1.75 m tall; where a foot is flat on the ground, it goes back by 1.4 m/s."""
+    poses, step = walker.animation.vertices, walker.animation.step_s
+    assert 1_500 < len(walker.faces) < 4_000 and 1.0 < walker.animation.duration_s < 1.2
+    assert np.abs(poses[:, :, 2].min(axis=1)).max() < 0.01
+    assert (np.abs(poses[:, :, 2].max(axis=1) - 1.71) < 0.03).all()
+    np.testing.assert_allclose(poses[0], poses[-1], atol=1e-5)
+    speeds = np.diff(poses, axis=0) / step
+    low = poses[:-1, :, 2] < 0.012
+    assert np.median(speeds[..., 0][low]) == pytest.approx(-1.4, abs=0.05)
+    assert np.abs(speeds).max() > 2.8  # a foot in the air
+
+
+def test_copies_share_their_poses_and_backends_agree(walker):
+    ways = [Track([0, 1], [[x, y, 0], [x, y + 1.4, 0]]) for x, y in ((4, 0), (-5, 2), (3, -6))]
+    actors = [Actor(replace(walker, name=f"W{k}"), way, k / 3) for k, way in enumerate(ways)]
+    meshes, which = shapes_of(actors)
+    assert len(meshes) == 1 and which.tolist() == [0, 0, 0]
+    scene = Scene.from_meshes([FLOOR]).with_actors(actors)
+    survey = Survey(Sensor.grid(500, 24), [(0, 0, 1)], steps=36, keep_every=1,
+                    columns=["radial_velocity", "time", "intensity"])  # fmt: skip
+    one, other = made(survey, scene, "embree"), made(survey, scene, "numpy")
+    for name, values in one.items():
+        assert np.array_equal(values, other[name]), name
+    own = one["object"] > 0
+    assert own.sum() > 60 and np.ptp(one["radial_velocity"][own]) > 2
+    still = [replace(actor, mesh=replace(actor.mesh, animation=None)) for actor in actors]
+    rigid = made(survey, scene.with_actors(still), "embree")
+    assert not np.array_equal(rigid["x"], one["x"])
+
+
+def points_in(boxes, actor, points, slack):
+    """Whether points are within the box of an actor."""
+    turn = matrices(boxes.quaternions[[actor]])[0]
+    local = (points - boxes.centres[actor]) @ turn
+    return (np.abs(local) <= boxes.sizes[actor] / 2 + slack).all(axis=1)
+
+
+def test_boxes_hold_the_points_of_people_who_walk(walker, tmp_path):
+    """By boxes of sweeps, and in the files of three exports."""
+    fast = replace(walker, animation=replace(walker.animation, speed_m_s=0.7))  # twice the rate
+    way = Track([0, 9], [[3, -1, 0], [3, 8, 0]])
+    scene = Scene.from_meshes([FLOOR]).with_actors(
+        [Actor(replace(fast, name="Person 1"), way), Actor(box("Car 1", (4, 2, 1.5)), way)]
+    )
+    scene = scene.with_actors(
+        [
+            scene.actors[0],
+            replace(scene.actors[1], trajectory=Track([0, 9], [[-9, 0, 0], [-9, 1, 0]])),
+        ]
+    )
+    survey = Survey(Sensor.grid(900, 40), [(0, 0, 1)], steps=36 * 4, keep_every=1,
+                    columns=["time", "intensity", "class"],
+                    materials=[Material("*"), Material("Person*", semantic_class=7)])  # fmt: skip
+    sweeps, found = Sweeps.of(survey, scene), made(survey, scene, "embree")
+    assert sweeps.actor_bounds.shape == (2, 4, 2, 3)
+    positions = np.stack([found.pop(axis) for axis in "xyz"], axis=1) * survey.precision_m
+    begins = [survey.begins_ns(scan) for scan in range(survey.scan_count)]
+    found["scan"] = np.searchsorted(begins, found["time"], "right") - 1
+    cloud = Cloud(positions, found, sweeps=lambda: sweeps)
+    sizes = []
+    for number, points in enumerate(sweeps.points(cloud)):
+        boxes, own = Boxes.of(sweeps, number, points), points["object"] == 1
+        assert own.sum() > 50 and set(points["class"][own]) == {7}
+        # An actor's way in half a sweep, as of others, and the rounding of points.
+        assert points_in(boxes, 0, points.positions[own], np.array([0.06, 0.01, 0.01])).all()
+        sizes.append(boxes.sizes[0])
+    assert np.ptp(sizes, axis=0)[0] > 0.1  # a stride is longer than what it passes through
+    loaded = Sweeps.load(_saved(sweeps, tmp_path / "sweeps.npz"))
+    assert np.array_equal(loaded.bounds(2), sweeps.bounds(2))
+
+    save_cloud(cloud, tmp_path / "kitti", format="kitti")
+    lines = (tmp_path / "kitti/sequences/00/label_2/000001.txt").read_text().splitlines()
+    assert [line.split()[0] for line in lines] == ["Person", "Car"]
+    height, width, length = map(float, lines[0].split()[8:11])
+    np.testing.assert_allclose([length, width, height], sizes[1], atol=0.006)
+    save_cloud(cloud, tmp_path / "nu", format="nuscenes")
+    (table,) = (tmp_path / "nu").glob("v1.0-*/sample_annotation.json")
+    rows = [row for row in json.loads(table.read_text()) if row["size"][2] > 1.6]
+    np.testing.assert_allclose([row["size"] for row in rows], np.array(sizes)[:, [1, 0, 2]])
+
+    rosbags = pytest.importorskip("rosbags.highlevel")
+    from rosbags.typesys import Stores, get_typestore
+
+    save_cloud(cloud, tmp_path / "a.mcap", layout="velodyne")
+    store, scales = get_typestore(Stores.ROS2_HUMBLE), []
+    with rosbags.AnyReader([tmp_path / "a.mcap"], default_typestore=store) as bag:
+        for connection, _, data in bag.messages():
+            if connection.topic == "/actors":
+                scale = bag.deserialize(data, connection.msgtype).markers[0].scale
+                scales.append([scale.x, scale.y, scale.z])
+    np.testing.assert_allclose(scales, sizes)
+
+
+def _saved(sweeps, path):
+    sweeps.save(path)
+    return path
+
+
+def ring(name, radius, at):
+    """A wheel of 24 corners, 0.2 m wide, about an axle along y."""
+    angle = np.linspace(0, 2 * np.pi, 24, endpoint=False)
+    rim = [
+        np.stack([radius * np.cos(angle), 0 * angle + y, radius * np.sin(angle)], 1)
+        for y in (-0.1, 0.1)
+    ]
+    k = np.arange(24)
+    after = (k + 1) % 24
+    faces = np.concatenate(
+        [np.stack([k, after, k + 24], 1), np.stack([after, after + 24, k + 24], 1)]
+    )
+    return SceneMesh(name, np.concatenate(rim) + at, faces)
+
+
+def test_wheels_turn_by_speed_over_radius():
+    """Of a car at 5 m/s: the top goes twice as fast, and the ground does not slip."""
+    parts = [box("Body", (4, 1.6, 1)), ring("wheel_front", 0.3, [1.2, 0.8, 0.3]),
+             ring("wheel_rear", 0.6, [-1.2, 0.8, 0.6])]  # fmt: skip
+    notes = []
+    mesh = one_mesh("Car", rolling(parts, ["wheel*"], notes.append))
+    assert not notes and mesh.animation.duration_s == pytest.approx(2 * np.pi * 0.6)
+    actor = Actor(mesh, Track([0, 10], [[0, 0, 0], [50, 0, 0]]))
+    frames, rates = actor.played(np.array([0.1, 0.37]) * 1e9)
+    places, moves = mesh.animation.at(frames)
+    velocity = moves * rates[:, None, None] + [5, 0, 0]
+    assert np.array_equal(velocity[:, :8], np.full((2, 8, 3), [5.0, 0, 0]))
+    for wheel, radius, middle in ((slice(8, 56), 0.3, 1.2), (slice(56, 104), 0.6, -1.2)):
+        from_axle = places[:, wheel] - [middle, 0.8, radius]
+        np.testing.assert_allclose(np.hypot(*from_axle[..., [0, 2]].T), radius, rtol=2.5e-3)
+        expected = 5 / radius * np.stack([from_axle[..., 2], -from_axle[..., 0]], axis=-1)
+        np.testing.assert_allclose(velocity[:, wheel][..., [0, 2]] - [5, 0], expected, atol=0.3)
+    flat = replace(parts[1], name="wheel_flat", vertices=parts[1].vertices * [1, 1, 0.5])
+    rolling([*parts, flat], ["wheel*"], notes.append)
+    assert notes == [
+        "wheel_flat has no axle, and does not turn: it is 0.6 m long and 0.3 m high, not round "
+        "about y"
+    ]
+    with pytest.raises(LidarpoolError, match=r"no object that wheels names \(whel\*\) can turn"):
+        rolling(parts, ["whel*"], notes.append)
+
+
+def scenario(folder, *actors, **sections):
+    (folder / "pedestrian.glb").write_bytes(PERSON.read_bytes())
+    post = {"name": "Post", "box": [1, 1, 3], "at": [[0, 9, 0]]}
+    data = {"scene": {"ground": {"margin_m": 30}, "copies": [post]},
+            "poses": [[0, 0, 1.5]], "sensor": {"model": "velodyne/vlp16"}, "steps": 36 * 9,
+            "actors": list(actors), "cloud": {"keep_every": 1}}  # fmt: skip
+    return Scenario.from_data(data | sections, folder=folder)
+
+
+WAY = {"points": [{"time_s": 0, "position": [4, 0, 0]}, {"time_s": 1, "position": [5.4, 0, 0]}]}
+
+
+def test_scenarios_name_animations(tmp_path):
+    one = {"name": "A", "file": "pedestrian.glb", "animation": "Walk", "trajectory": WAY}
+    walk = {"name": "Walk", "speed_m_s": 1.4, "repeat": False, "offset_s": 0.5}
+    other = one | {"name": "B", "animation": walk}
+    built = build(scenario(tmp_path, one, one | {"name": "C"}, other))
+    a, c, b = built.scene.actors
+    assert a.mesh.animation is c.mesh.animation and a.mesh.animation.speed_m_s is None
+    assert (b.mesh.animation.speed_m_s, b.mesh.animation.repeat, b.offset_s) == (1.4, False, 0.5)
+    (told,) = [line for line in advice(built) if "animation" in line]
+    assert told.startswith("B: its animation of 1.05 s ends before the survey does, and its last")
+    still = build(scenario(tmp_path, {k: v for k, v in one.items() if k != "animation"}))
+    assert still.scene.actors[0].mesh.animation is None
+    assert any("actors move by animation: NAME" in line for line in advice(still))
+
+
+@pytest.mark.parametrize(
+    ("entry", "message"),
+    [
+        ({"box": [1, 1, 1], "animation": "Walk"}, "animation is of a mesh file: give its file"),
+        (
+            {"file": "pedestrian.glb", "animation": "Walk", "wheels": "w"},
+            "give either animation or",
+        ),
+        ({"file": "robot.urdf", "animation": "Walk"}, "a robot has joints: leave out animation"),
+        (
+            {"file": "pedestrian.glb", "animation": "Wlak"},
+            r"no animation 'Wlak' .Did you mean 'Walk'",
+        ),
+        ({"file": "pedestrian.glb", "wheels": "Boby"}, r"can turn\. Did you mean 'Body'"),
+    ],
+)
+def test_what_is_wrong_with_a_scenario_is_a_line(tmp_path, entry, message):
+    with pytest.raises(LidarpoolError, match=message):
+        build(scenario(tmp_path, {"name": "A", "trajectory": WAY} | entry))
+
+
+def test_people_of_traffic_walk_at_their_own_speed_and_out_of_step(tmp_path):
+    steps = "".join(
+        f"""<timestep time="{t}.00"><person id="p" x="0" y="{t}" angle="0" type="ped"/>
+        <person id="q" x="3" y="1" angle="0" type="ped"/></timestep>"""
+        for t in range(4)
+    )
+    (tmp_path / "fcd.xml").write_text(f"<fcd-export>{steps}</fcd-export>")
+    shape = {"file": "pedestrian.glb", "animation": {"name": "Walk", "speed_m_s": 1.4}}
+    traffic = {"file": "fcd.xml", "vehicles": [{"types": "*", **shape}]}
+    built = build(scenario(tmp_path, traffic=traffic, steps=36 * 20))
+    walks, stands = built.scene.actors
+    assert walks.mesh.animation is stands.mesh.animation and walks.offset_s != stands.offset_s
+    times = np.array([0.0, 1.5e9])
+    np.testing.assert_allclose(np.diff(walks.seconds(times)[0]), 1.5 / 1.4)
+    np.testing.assert_allclose(np.diff(stands.seconds(times)[0]), 0)
+
+
+def test_bad_animations_are_refused():
+    mesh = box("Box", (1, 1, 1))
+    with pytest.raises(LidarpoolError, match=r"of two poses at least.*given: \(1, 8, 3\), 0.1 s"):
+        Animation(mesh.vertices[None], 0.1)
+    with pytest.raises(LidarpoolError, match=r"above 0; given.* 0 s, None"):
+        Animation(np.stack([mesh.vertices] * 2), 0)
+    with pytest.raises(LidarpoolError, match="has 8 vertices, and its animation moves 7"):
+        replace(mesh, animation=Animation(np.stack([mesh.vertices[1:]] * 2), 0.1))
