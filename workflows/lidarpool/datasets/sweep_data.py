@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,8 +35,8 @@ class Sweep:
     points: Floats32  # (n, 3): metres, in the sensor's axes
     columns: Mapping[str, AnyArray]  # {name: (n,)}: what the format holds beside
     pose: Floats  # (4, 4): from the sensor's axes to the world's
-    boxes: SweepBoxes
     object_names: tuple[str, ...]  # what the column `object` counts
+    _boxes: SweepBoxes | tuple[Sweeps, int, Boxes | None]  # or what they are made of
 
     @classmethod
     def of(
@@ -45,8 +47,11 @@ class Sweep:
             job.name, job.number, job.split, job.values,
             sweeps.sensors[sweeps.sensor[number]], int(sweeps.numbers[number]),
             round(sweeps.begins_ns[number]), *points, sweeps.pose.matrix(number),
-            SweepBoxes.of(sweeps, number, boxes), (*sweeps.objects, *sweeps.actors),
+            sweeps.all_names, (sweeps, number, boxes),
         )  # fmt: skip
+
+    def __getstate__(self) -> dict[str, Any]:
+        return self.__dict__ | {"_boxes": self.boxes}  # without those of all other sweeps
 
     def __len__(self) -> int:
         return len(self.points)
@@ -54,6 +59,11 @@ class Sweep:
     def __repr__(self) -> str:
         sensor = f" of {self.sensor}" if self.sensor else ""
         return f"<Sweep {self.number}{sensor} in job {self.job}: {len(self):,} points>"
+
+    @cached_property
+    def boxes(self) -> SweepBoxes:
+        """Boxes of the actors that are in the scene, in the sensor's axes."""
+        return SweepBoxes.of(*self._boxes) if isinstance(self._boxes, tuple) else self._boxes
 
     @property
     def intensity(self) -> Floats32 | None:

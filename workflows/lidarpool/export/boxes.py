@@ -42,8 +42,7 @@ class Boxes:
         share = (np.bincount(actor[rows], share, count) / np.maximum(counts, 1))[:, None]
         pair = [sweep, sweep + len(sweeps)]  # poses at its start and end
         places, turns = (
-            np.array([getattr(pose, what)[pair] for pose in sweeps.actor_poses]).reshape(-1, 2, n)
-            for what, n in (("positions", 3), ("quaternions", 4))
+            of[:, pair] for of in (sweeps.actor_poses.positions, sweeps.actor_poses.quaternions)
         )
         turns[(turns[:, 0] * turns[:, 1]).sum(axis=1) < 0, 1] *= -1
         place, turn = ((p[:, 0] + share * (p[:, 1] - p[:, 0])) for p in (places, turns))
