@@ -214,10 +214,8 @@ def read_tally(storage: Storage, name: str) -> tuple[Ints32, Ints]:
         return part.triangles, part.hits
     try:
         with zipfile.ZipFile(storage.local(name)) as archive:
-            triangles, hits = (
-                read_npy(archive.read(f".{name}.npy"), name) for name in ("triangles", "hits")
-            )
-            return triangles, hits
+            triangles = read_npy(archive.read(".triangles.npy"), "triangles")
+            return triangles, read_npy(archive.read(".hits.npy"), "hits")
     except Exception as error:  # as above
         raise LidarpoolError(
             f"The part {storage.path(name)} cannot be used ({error}). {_AGAIN}"

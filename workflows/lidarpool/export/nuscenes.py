@@ -125,7 +125,9 @@ class Reader(reading.Reader):
         """Return the points of a sweep."""
         file, *labels = self.files(sweep)
         rows = self.rows(file, np.dtype("<f4")).reshape(-1, 5)
-        columns = {"intensity": rows[:, 3] / np.float32(255), "channel": rows[:, 4].astype("u2")}
+        light, channel = np.ascontiguousarray(rows[:, 3:].T)
+        light /= 255
+        columns = {"intensity": light, "channel": channel.astype("u2")}
         if labels:
             columns["class"] = self.rows(labels[0], np.dtype("u1")).astype("u2")
         return rows[:, :3], columns
