@@ -22,7 +22,6 @@ import numpy as np
 from pydantic import Field
 
 from ..base.archives import open_archive
-from ..base.arrays import AnyArray
 from ..base.errors import LidarpoolError
 from ..base.storage import Storage
 from ..base.validation import checked
@@ -87,7 +86,7 @@ class SavedSweeps:
 
     def ahead(self, indices: Iterable[int]) -> Generator[Sweep]:
         """Give some sweeps in this order; the next ones are read meanwhile."""
-        if self._place.is_local and self._written.row.load().Reader.raw:
+        if self._place.is_local and self._written.row.raw:
             # To hand such a sweep from thread to thread takes as long as to read it.
             soon, now = tee(map(self._at, indices))
             for job, number in islice(soon, _REQUESTS):
@@ -190,28 +189,24 @@ class _OpenJob:
         self.place, self.job, row = place, job, written.row
         name = job_file(row.data_set, job.name, SWEEPS_FILE)
         self.sweeps = Sweeps.load(place.path(name), partial(place.read, name))
-        self.boxes: dict[str, AnyArray] = {}
+        self.boxes: Boxes | None = None
         if self.sweeps.actors:
             name = job_file(row.data_set, job.name, BOXES_FILE)
             with open_archive(place.path(name), partial(place.read, name)) as arrays:
-                self.boxes = arrays
-        self.sizes = self.sweeps.actor_bounds[:, 1] - self.sweeps.actor_bounds[:, 0]
+                sizes = self.sweeps.actor_bounds[:, 1] - self.sweeps.actor_bounds[:, 0]
+                boxes = Boxes(sizes=sizes, **arrays)
+                self.boxes = boxes.inward(self.sweeps.pose, slice(None))
         entry = Entry(job.number, job.name, job.split)
         self.reader: Reader = row.load().Reader(place, self.sweeps, entry, written.layout)
 
     def read(self, sweep: int) -> Sweep:
         """Read a sweep."""
-        job, sweeps = self.job, self.sweeps
         try:
             points = self.reader.read(sweep)
         except Exception as error:  # libraries of five formats have many kinds
             file = self.place.path(self.reader.files(sweep)[0])
             raise _unreadable(file, error) from error
-        boxes = None
-        if self.boxes:
-            own = {name: of[sweep] for name, of in self.boxes.items()}
-            boxes = Boxes(sizes=self.sizes, **own)
-        return Sweep.of(job, sweeps, sweep, points, boxes)
+        return Sweep.of(self.job, self.sweeps, sweep, points, self.boxes, sweep)
 
 
 @checked

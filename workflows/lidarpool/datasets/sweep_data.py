@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
+from types import EllipsisType
 from typing import Any
 
 import numpy as np
@@ -36,18 +37,19 @@ class Sweep:
     columns: Mapping[str, AnyArray]  # {name: (n,)}: what the format holds beside
     pose: Floats  # (4, 4): from the sensor's axes to the world's
     object_names: tuple[str, ...]  # what the column `object` counts
-    _boxes: SweepBoxes | tuple[Sweeps, int, Boxes | None]  # or what they are made of
+    _boxes: SweepBoxes | tuple[Sweeps, Boxes | None, int | EllipsisType]  # or what they are made of
 
     @classmethod
     def of(
-        cls, job: JobRow, sweeps: Sweeps, number: int, points: PointColumns, boxes: Boxes | None
-    ) -> Sweep:
-        """Make the sweep of a number among all of a job, with boxes if there are actors."""
+        cls, job: JobRow, sweeps: Sweeps, number: int, points: PointColumns,
+        boxes: Boxes | None, which: int | EllipsisType = ...,
+    ) -> Sweep:  # fmt: skip
+        """Make the sweep of a number among all of a job; boxes are as of `SweepBoxes.of`."""
         return cls(
             job.name, job.number, job.split, job.values,
             sweeps.sensors[sweeps.sensor[number]], int(sweeps.numbers[number]),
             round(sweeps.begins_ns[number]), *points, sweeps.pose.matrix(number),
-            sweeps.all_names, (sweeps, number, boxes),
+            sweeps.all_names, (sweeps, boxes, which),
         )  # fmt: skip
 
     def __getstate__(self) -> dict[str, Any]:

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from types import EllipsisType
 
 import numpy as np
 
 from ..base.arrays import Bools, Floats, Floats32, Ints, Ints32
 from ..columns.cloud import Cloud
 from ..sensor.trajectory import matrices
-from .sweeps import Sweeps
+from .sweeps import Placed, Sweeps
 
 
 @dataclass(frozen=True, eq=False)
@@ -20,8 +21,8 @@ class Boxes:
     scans if the cloud has no times, or at the start of the sweep if it has none.
     """
 
-    centres: Floats  # (a, 3): metres, world coordinates
-    quaternions: Floats  # (a, 4): x, y, z, w of the rotation from the actor's axes to the world's
+    centres: Floats  # (a, 3): metres, world coordinates, or the sensor's after `inward`
+    quaternions: Floats  # (a, 4): x, y, z, w of the rotation from the actor's axes to those
     sizes: Floats  # (a, 3): length, width and height, metres, along the actor's axes
     points: Ints  # (a,): how many points of the sweep are the actor's
     there: Bools  # (a,): whether it is in the scene
@@ -53,6 +54,13 @@ class Boxes:
             place + middle, turn, high - low, counts, sweeps.actor_there[:, sweep] | (counts > 0)
         )
 
+    def inward(self, pose: Placed, which: int | slice) -> Boxes:
+        """Return boxes of a sweep, or of some, (n, a), in axes of the sensor as each begins."""
+        turned = self.quaternions @ pose.products[which]
+        turned *= np.where(turned[..., 3:] < 0, -1, 1)  # w is at least 0
+        centres = (self.centres - pose.positions[which][..., None, :]) @ pose.turns[which]
+        return Boxes(centres, turned, self.sizes, self.points, self.there)
+
 
 @dataclass(frozen=True, eq=False)
 class SweepBoxes:
@@ -70,9 +78,9 @@ class SweepBoxes:
     points: Ints  # (k,): how many points of the sweep are the actor's
 
     @classmethod
-    def of(cls, sweeps: Sweeps, sweep: int, boxes: Boxes | None) -> SweepBoxes:
-        """Take those of a sweep's boxes that are in the scene."""
-        there = np.empty(0, np.intp) if boxes is None else boxes.there.nonzero()[0]
+    def of(cls, sweeps: Sweeps, boxes: Boxes | None, which: int | EllipsisType = ...) -> SweepBoxes:
+        """Take those of a sweep, or of which of some, that are in the scene; in a sensor's axes."""
+        there = np.empty(0, np.intp) if boxes is None else boxes.there[which].nonzero()[0]
         if boxes is None or not len(there):
             none = np.empty(0, np.int32)
             place = np.empty((0, 3))
@@ -82,10 +90,10 @@ class SweepBoxes:
             tuple(sweeps.actors[actor] for actor in actors),
             tuple(sweeps.actor_types[actor] for actor in actors),
             (len(sweeps.objects) + there).astype(np.int32),
-            sweeps.pose.inward(sweep, boxes.centres[there]),
-            _turned(sweeps.pose.quaternions[sweep], boxes.quaternions[there]),
+            boxes.centres[which][there],
+            boxes.quaternions[which][there],
             boxes.sizes[there],
-            boxes.points[there],
+            boxes.points[which][there],
         )
 
     def __len__(self) -> int:
@@ -102,13 +110,3 @@ class SweepBoxes:
     def rows(self) -> Floats32:
         """float32 (k, 7): centre, length, width, height, yaw."""
         return np.column_stack([self.centres, self.sizes, self.yaw]).astype(np.float32)
-
-
-def _turned(pose: Floats, quaternions: Floats) -> Floats:
-    """Convert quaternions (k, 4) to the axes of a pose, whose own is (4,); w is at least 0."""
-    # By matrices this took longer than reading the points of a sweep.
-    x, y, z, w = pose.tolist()
-    product = [[w, z, -y, -x], [-z, w, x, -y], [y, -x, w, -z], [x, y, z, w]]
-    turned: Floats = quaternions @ np.array(product).T
-    turned[turned[:, 3] < 0] *= -1
-    return turned

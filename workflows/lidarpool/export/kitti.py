@@ -93,8 +93,6 @@ class Pieces(pieces.Pieces):
 class Reader(reading.Reader):
     """Reads sweeps of a data set: intensity, class and object of each point."""
 
-    raw = True
-
     def files(self, sweep: int) -> list[str]:
         """Return the names of the files of points and labels."""
         folder = f"sequences/{self._names[self.sweeps.sensor[sweep]]}"

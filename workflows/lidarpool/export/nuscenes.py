@@ -114,8 +114,6 @@ class Reader(reading.Reader):
         channels = plain_names(name or "LIDAR_TOP" for name in self.sweeps.sensors)
         return _files(self.sweeps, channels, _samples(self.sweeps)[1], self.entry)
 
-    raw = True
-
     def files(self, sweep: int) -> list[str]:
         """Return the names of the files of points and, with names, classes."""
         file = self._names[sweep]

@@ -26,8 +26,6 @@ PointColumns = tuple[Floats32, dict[str, AnyArray]]
 class Reader:
     """Reads the points of a job's sweeps in any order, in one thread."""
 
-    raw = False  # whether a sweep has files of its own, which hold rows of numbers
-
     def __init__(self, place: Storage, sweeps: Sweeps, entry: Entry, layout: str) -> None:
         self.place, self.sweeps, self.entry, self.layout = place, sweeps, entry, layout
         self._copies: Path | None = None

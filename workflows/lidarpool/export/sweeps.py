@@ -48,6 +48,13 @@ class Placed:
         """float64 (n, 3, 3): rotations from its own axes to the world's."""
         return matrices(self.quaternions)
 
+    @cached_property
+    def products(self) -> Floats:
+        """float64 (n, 4, 4): matrices by which quaternions (k, 4) are brought to its own axes."""
+        x, y, z, w = self.quaternions.T  # by rotation matrices it would take far longer
+        rows = [[w, -z, y, x], [z, w, -x, y], [-y, x, w, z], [-x, -y, -z, w]]
+        return np.moveaxis(np.array(rows), -1, 0)
+
     def matrix(self, sweep: int) -> Floats:
         """Matrix (4, 4) from its own axes at the start of a sweep to the world's."""
         pose = np.eye(4)

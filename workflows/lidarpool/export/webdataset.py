@@ -85,7 +85,7 @@ class Pieces(pieces.Pieces):
     def _members(self, number: int, points: Cloud, boxes: Boxes | None) -> Iterator[bytes]:
         """Yield the files of a sample, each behind its header."""
         sweeps, entry = self.sweeps, self.entry
-        there = SweepBoxes.of(sweeps, number, boxes)
+        there = SweepBoxes.of(sweeps, boxes and boxes.inward(sweeps.pose, number))
         arrays = {
             "points": sweeps.in_sensor(number, points.positions).astype(np.float32),
             **{column.name: points[column.name] for column in self.cloud.table},
