@@ -172,10 +172,8 @@ class Sweeps:
             actor_poses.append(_placed(at + scene.origin, _full(turned_by, len(at))))
             appears, leaves = presence_ns(actor.trajectory)
             there.append((appears <= when) & (when <= leaves))
-        bounds = [
-            np.stack([a.mesh.vertices.min(axis=0), a.mesh.vertices.max(axis=0)])
-            for a in scene.actors
-        ]
+        corners = [actor.mesh.vertices for actor in scene.actors]
+        bounds = [(places.min(axis=0), places.max(axis=0)) for places in corners]
         fired = None
         if survey.keep_every == 1 and any(c.name == "ray" for c in survey.stored_columns):
             most = tuple(2 if each.mode == "dual" else 1 for each in survey.returns_each)
