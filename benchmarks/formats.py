@@ -28,7 +28,7 @@ from lidarpool.columns.ply_format import layout
 from lidarpool.export.formats import Format
 from lidarpool.export.sweeps import Sweeps
 
-COLUMNS = ("time", "class", "intensity", "reflectivity", "range", "azimuth", "elevation")
+COLUMNS = ("time", "class", "intensity", "reflectance", "range", "azimuth", "elevation")
 TURNS = 100
 
 

@@ -1,9 +1,10 @@
 """What is real, beside what is bare: `python -m benchmarks.realism [--rounds N] [--json]`.
 
 One sweep of an OS1-64 in a city of 100,000 triangles, one thread: bare, with cars that move (boxes,
-and meshes of 1,000 triangles), from a sensor that moves too, with sub-rays, with noise, in rain,
-fog and snow; cars, sub-rays, noise and rain together (`real`), and all of it. Each figure is the
-median of the rounds, and a multiple of the bare sweep's.
+and meshes of 1,000 triangles), from a sensor that moves too, with sub-rays, with noise, with errors
+that last, with lost returns, with saturation, in rain, fog and snow; cars, sub-rays, noise and rain
+together (`real`), and all of it; and as turns of a survey, with all kinds of faults and without.
+Each figure is the median of the rounds, and a multiple of the bare sweep's.
 """
 
 from __future__ import annotations
@@ -15,10 +16,12 @@ from typing import Any
 
 import numpy as np
 
-from lidarpool import Actor, Noise, Returns, Scanner, Scene, Track, load_sensor
+from lidarpool import Actor, Fault, Noise, Returns, Scanner, Scene, Survey, Track, load_sensor
 from lidarpool.scene.actors import box
 from lidarpool.scene.generated.city import city
 from lidarpool.scene.scene_mesh import SceneMesh
+from lidarpool.simulator.batch import columns_of
+from lidarpool.simulator.rig import Rig
 from raybeam import available_backends
 
 from .raycast import environment
@@ -27,6 +30,14 @@ PLACE = (0.0, 0.0, 1.9)
 SPEED_M_S, TURN_S, FIELD_M = 20.0, 0.1, (5.0, 60.0)
 COLUMNS = ("time", "range", "intensity", "class", "sensor")
 COUNTS = (10, 100, 300)
+SURVEY: dict[str, Any] = {"poses": [PLACE], "steps": 5 * 36, "columns": COLUMNS}
+FAULTS = (
+    Fault("dirt", azimuth_deg=(-20, 20), transmission=0.3),
+    Fault("dead_channels", channels=[3]),
+    Fault("dropped_packets", share=0.05, packet=16),
+    Fault("frozen", 0.35),
+    Fault("time_jump", 0.2, by_s=0.05),
+)
 
 
 def fine_box(triangles: int) -> SceneMesh:
@@ -52,14 +63,16 @@ def cars(count: int, mesh: SceneMesh, seed: int) -> list[Actor]:
     for k in range(count):
         begin = radius[k] * np.array([np.cos(angle[k]), np.sin(angle[k]), 0])
         ahead = 10 * np.array([np.cos(heading[k]), np.sin(heading[k]), 0])
-        yaw = heading[k] + turns[k] * np.array([0, 1])
+        yaw = heading[k] + turns[k] * np.array([0, 1, 1])
         quaternions = np.stack([0 * yaw, 0 * yaw, np.sin(yaw / 2), np.cos(yaw / 2)], axis=1)
-        made.append(Actor(mesh, Track([0, 1], [begin, begin + ahead], quaternions)))
+        made.append(
+            Actor(mesh, Track([0, 1, 10], [begin, begin + ahead, begin + 10 * ahead], quaternions))
+        )
     return made
 
 
 def cases(scene: Scene, backend: str, counts: tuple[int, ...], sensor: str) -> dict[str, Any]:
-    """Make a function of the round for each row, which gives its number of points."""
+    """Make a function of the round for each row, which gives its sweep."""
     lidar = load_sensor(sensor)
     weather = {"rain": {"rain_mm_h": 10.0}, "snow": {"snow_mm_h": 2.0}}
     weather["fog"] = {"visibility_km": 0.2, "fog_lidar_ratio_sr": 20.0}
@@ -75,7 +88,7 @@ def cases(scene: Scene, backend: str, counts: tuple[int, ...], sensor: str) -> d
             threads=1,
             **options,
         )
-        return lambda number: len(scanner.sweep(where, number=number))
+        return lambda number: scanner.sweep(where, number=number)
 
     rows = {"bare": case([])}
     for count in counts:
@@ -87,7 +100,13 @@ def cases(scene: Scene, backend: str, counts: tuple[int, ...], sensor: str) -> d
         beam = Returns(subrays=subrays, divergence_mrad=3, mode=mode)
         rows[f"{subrays} sub-rays"] = case([], returns=beam)
     rows["noise"] = case([], noise=Noise(range_m=0.02))
+    lasting = Noise(channel_bias_m=0.01, warm_up_m=0.02, ripple_deg=0.02)
+    rows["errors that last"] = case([], noise=lasting)
+    for name, faults in (("whole survey", ()), ("faults", FAULTS)):
+        rows[name] = turns(scene, Survey(lidar, faults=faults, **SURVEY), backend)
     noise = Noise(detection_range_m=90)  # without which no weather returns light
+    rows["detection"] = case([], noise=noise)
+    rows["saturation"] = case([], noise=Noise(detection_range_m=90, saturation=100))
     rows |= {name: case([], noise=noise, **options) for name, options in weather.items()}
     beam = Returns(subrays=7, divergence_mrad=3)
     real = {"noise": Noise(detection_range_m=90, range_m=0.02), "returns": beam}
@@ -102,6 +121,17 @@ def cases(scene: Scene, backend: str, counts: tuple[int, ...], sensor: str) -> d
     return rows
 
 
+def turns(scene: Scene, survey: Survey, backend: str) -> Any:
+    """Make a function that casts a turn of a survey, of five, and makes its columns."""
+    rig, scans = Rig(scene, survey, backend, threads=1), survey.scan_count // 5
+
+    def turn(number: int) -> int:
+        part = columns_of([*rig.cast(number * scans, (number + 1) * scans)])
+        return int(part.counts.sum())
+
+    return turn
+
+
 def measure(rows: dict[str, Any], rounds: int) -> dict[str, dict[str, float]]:
     """Time all rows, in another order each round; the first round warms up."""
     seconds: dict[str, list[float]] = {row: [] for row in rows}
@@ -109,7 +139,7 @@ def measure(rows: dict[str, Any], rounds: int) -> dict[str, dict[str, float]]:
     for number in range(rounds + 1):
         for row in np.random.default_rng(number).permutation(list(rows)).tolist():
             start = time.process_time()
-            points[row] = rows[row](number % 5)
+            points[row] = len(rows[row](number % 5))
             if number:
                 seconds[row].append(time.process_time() - start)
     bare = float(np.median(seconds["bare"]))

@@ -14,7 +14,7 @@ from lidarpool.simulator.rig import Rig
 from raybeam import available_backends
 
 CPU = [name for name in ("numpy", "embree") if not available_backends()[name]]
-COLUMNS = ("ray", "range", "intensity", "reflectivity", "return_number", "returns", "class")
+COLUMNS = ("ray", "range", "intensity", "reflectance", "return_number", "returns", "class")
 
 
 def quad(name, *corners):

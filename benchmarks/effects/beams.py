@@ -54,11 +54,11 @@ def share(returns: Returns, edge_m: float) -> float:
     """Share of a pulse's light on a wall at 50 m that ends at an edge, in front of another."""
     meshes = [wall("Near", 50, (-50, edge_m)), wall("Far", 60)]
     survey = Survey(
-        SENSOR, poses=[(0, 0, 0)], steps=1, returns=returns, columns=["reflectivity", "range"]
+        SENSOR, poses=[(0, 0, 0)], steps=1, returns=returns, columns=["reflectance", "range"]
     )
     (batch,) = Rig(Scene.from_meshes(meshes), survey, "numpy").cast(0, 1)
     assert not hasattr(batch, "columns")
-    bright: Any = batch.reflectivity  # type: ignore[union-attr]
+    bright: Any = batch.reflectance  # type: ignore[union-attr]
     return float(bright[batch.object == 0].sum() / bright.sum())  # type: ignore[union-attr]
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 
@@ -52,6 +53,24 @@ def parts(tau: np.ndarray) -> dict[str, np.ndarray]:
     }
 
 
+def outage(axes: Any, still: SimpleNamespace) -> None:
+    """Draw errors of positions that an IMU bridges for 15 s, of many seeds, on the closed form."""
+    imu = Imu(accelerometer_bias=0.01, accelerometer_noise_density=0.02)
+    gnss = Gnss(rate_hz=10, outages=[(10, 25)])
+    for seed in range(40):
+        given = Navigation(imu=imu, gnss=gnss, seed=seed)
+        run = SimpleNamespace(**vars(still) | {"navigation": given, "duration_ns": 35e9})
+        (found,) = fixes(run)
+        axes.plot(found.times_ns / 1e9, found.positions[:, 0], color=theme.SENSOR, lw=0.5)
+    t = np.clip(np.linspace(0, 35, 701) - 10, 0, 15)
+    sigma = np.hypot(0.01 * t**2 / 2, 0.02 * np.sqrt(t**3 / 3))
+    sigma *= np.exp(-np.clip(np.linspace(0, 35, 701) - 25, 0, None))
+    for sign in (-1, 1):
+        axes.plot(np.linspace(0, 35, 701), sign * sigma, color=theme.INK, lw=1.2)
+    axes.set(xlabel="time, s", ylabel="error of position, east, m", xlim=(5, 35))
+    axes.set_title("40 outages from 10 to 25 s; black: one σ", fontsize=9)
+
+
 def picture(path: Path) -> None:
     """Draw Allan deviations, and the errors of positions over the hours."""
     from matplotlib.figure import Figure
@@ -62,13 +81,15 @@ def picture(path: Path) -> None:
         navigation=Navigation(imu=IMU, gnss=GNSS, seed=2),
         path=Stations((CENTRE,)),
         duration_ns=HOURS * 3600e9,
+        carrier="",
     )
     rates = np.concatenate([block.rates for block in imu_samples(still)])
     sizes = np.unique(np.geomspace(1, len(rates) / 9, 40).astype(int))
     tau = sizes / IMU.rate_hz
     found, clusters = np.array([allan(rates, size) for size in sizes.tolist()]).T
-    figure = Figure(figsize=(10.4, 4.3), dpi=90, layout="constrained")
-    left, right = figure.subplots(1, 2)
+    figure = Figure(figsize=(13.4, 4.3), dpi=90, layout="constrained")
+    left, right, last = figure.subplots(1, 3, width_ratios=[1.2, 1.1, 1])
+    outage(last, still)
     to_hour = np.degrees(1) * 3600
     known = parts(tau)
     total = np.sqrt(sum(one**2 for one in known.values()))
@@ -95,7 +116,7 @@ def picture(path: Path) -> None:
         right.axhline(sign * GNSS.drift_horizontal_m, color="#4477aa", lw=0.8, ls=":")
     right.set(xlabel="time, h", ylabel="error of position, m", xlim=(0, HOURS))
     right.set_title("GNSS of the same carrier; dotted: one σ of the drift", fontsize=9)
-    for axes in (left, right):
+    for axes in (left, right, last):
         axes.grid(color=theme.LINE, lw=0.5)
     left.legend(fontsize=7.5, frameon=False, loc="upper right")
     for line in right.legend(fontsize=7.5, frameon=False, loc="lower right").get_lines():

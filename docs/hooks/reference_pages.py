@@ -44,6 +44,7 @@ _SECTIONS = {
     "navigation: imu": "Imu",
     "navigation: gnss": "Gnss",
     "navigation: mount": "InstrumentPose",
+    "faults": "Fault",
     "cloud": "CloudOptions",
     "output": "OutputSection",
     "output: write": "Format",

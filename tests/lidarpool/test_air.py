@@ -36,7 +36,7 @@ ALL = Returns("all", divergence_mrad=1000 * DIVERGENCE, pulse_ns=0)
 NOTHING = SceneMesh(
     "Nothing", np.array([[0, 0, -9], [1, 0, -9], [0, 1, -9.0]]), np.array([[0, 1, 2]])
 )
-COLUMNS = ("ray", "range", "intensity", "reflectivity", "return_number", "cause", "class")
+COLUMNS = ("ray", "range", "intensity", "reflectance", "return_number", "cause", "class")
 AIR = CAUSES.index("air")
 
 
@@ -91,14 +91,14 @@ def test_dust_takes_and_returns_in_proportion_to_its_mass():
     assert found["intensity"][0] == pytest.approx(0.5 / 36 * math.exp(-2 * 0.0012 * 60))
 
 
-def test_what_the_air_takes_is_not_in_the_reflectivity():
+def test_what_the_air_takes_is_not_in_the_reflectance():
     weather = {"visibility_km": 0.5, "rain_mm_h": 10, "snow_mm_h": 0.1, "dust_mg_m3": 1}
     # What returns from less than half of the range is too little to be detected.
     noise = Noise(detection_range_m=20)
     clear, dull = (cast([wall("W", 12)], noise=noise, **some) for some in ({}, weather))
     wet = [one.extinction for one in (rain(10), snow(0.1))]
     alpha = extinction(0.5, 905) + sum(wet) + dust(1)[0]
-    assert dull["reflectivity"][0] == pytest.approx(clear["reflectivity"][0])
+    assert dull["reflectance"][0] == pytest.approx(clear["reflectance"][0])
     assert clear["intensity"][0] * math.exp(-24 * alpha) == pytest.approx(dull["intensity"][0])
 
 
@@ -299,7 +299,7 @@ def test_reflectivities_in_the_thickest_dust_are_finite():
     with np.errstate(all="raise", under="ignore"):
         found = cast([wall("W", 9)], beams(200), dust_mg_m3=1e5, noise=noise)
     assert len(found["range"]) > 100
-    assert np.isfinite(found["reflectivity"]).all()
+    assert np.isfinite(found["reflectance"]).all()
 
 
 # -- bytes -----------------------------------------------------------------------------------------

@@ -199,12 +199,12 @@ def rig_of(meshes, survey):
 def nearer(meshes, sensor=None, at=(0, 0, 0), **options):
     """Share of the light of one pulse that the nearer of two returns has, as on one surface."""
     sensor = sensor or Sensor(Beams(np.zeros(1)), Spin(1, 360))
-    options = {"returns": WIDE, "columns": ["range", "reflectivity"], **options}
+    options = {"returns": WIDE, "columns": ["range", "reflectance"], **options}
     if "trajectory" not in options and "sensors" not in options:
         options["poses"] = [at]
     survey = Survey(sensor, steps=1, **options)
     (batch,) = rig_of(meshes, survey).cast(0, 1)
-    share = batch.reflectivity / 0.5
+    share = batch.reflectance / 0.5
     return float(share[batch.object == 0].sum() / share.sum())
 
 
@@ -299,7 +299,7 @@ def test_the_oval_turns_with_the_head_and_with_a_carrier_that_moves():
         trajectory=Cart(speed=0.01, height=0.0, stations=1),
         steps=1,
         returns=WIDE,
-        columns=["range", "reflectivity"],
+        columns=["range", "reflectance"],
     )
     tubes = []
     for name, radius, low in (("Near", 10.0, 10e-3), ("Far", 20.0, -20.0)):
@@ -314,7 +314,7 @@ def test_the_oval_turns_with_the_head_and_with_a_carrier_that_moves():
     near = batch.object == 0
     assert near.sum() == (~near).sum() == 16
     # 1 mrad above the axis, half of the deviation up, which is 4 / 4 mrad.
-    share = batch.reflectivity[near] / (batch.reflectivity[near] + batch.reflectivity[~near])
+    share = batch.reflectance[near] / (batch.reflectance[near] + batch.reflectance[~near])
     assert share == pytest.approx(1 - normal_share(1), abs=0.03)
 
 

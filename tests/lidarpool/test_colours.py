@@ -353,11 +353,11 @@ def test_textures_are_the_reflectance(caplog):
     bare = SceneMesh("Bare", *hills()[:2]).moved("Bare", np.eye(3), np.array([0, 9, 0]))
     scene = Scene.from_meshes([textured(), bare])
     materials = [Material("*", 0.4), Material("Hills", "texture", scale=0.8)]
-    cloud, found = sweep(scene, "reflectivity", "intensity", materials=materials)
-    plain, _ = sweep(scene, "reflectivity", materials=[Material("*", 1.0)])
+    cloud, found = sweep(scene, "reflectance", "intensity", materials=materials)
+    plain, _ = sweep(scene, "reflectance", materials=[Material("*", 1.0)])
     share = np.clip(0.8 * LINEAR[found] @ WEIGHTS, DARKEST, 1)
     share[cloud["object"] == 1] = 0.4
-    np.testing.assert_allclose(cloud["reflectivity"], share * plain["reflectivity"], rtol=1e-5)
+    np.testing.assert_allclose(cloud["reflectance"], share * plain["reflectance"], rtol=1e-5)
     # What has no colour has the luminance of the default.
     grey, found = sweep(Scene.from_meshes([SceneMesh("Bare", *hills()[:2])]), "intensity",
                         materials=[Material("*", "texture")])  # fmt: skip
@@ -377,15 +377,15 @@ def test_each_sub_ray_has_the_light_of_its_own_hit():
     scene = Scene.from_meshes([SceneMesh("Ground", corners, faces, colours=colours)])
     materials = [Material("*", "texture")]
     options = {"materials": materials, "pose": Pose((0.05, 0.1, 3.0))}
-    one, _ = sweep(scene, "reflectivity", **options)
+    one, _ = sweep(scene, "reflectance", **options)
     wide = Returns("strongest", 61, divergence_mrad=200.0)
-    many, colour = sweep(scene, "reflectivity", returns=wide, **options)
+    many, colour = sweep(scene, "reflectance", returns=wide, **options)
     assert np.isin(colour, [0, 255]).all()
-    spread = [np.std(cloud["reflectivity"][cloud["reflectivity"] > 0.0]) for cloud in (one, many)]
+    spread = [np.std(cloud["reflectance"][cloud["reflectance"] > 0.0]) for cloud in (one, many)]
     assert spread[1] < 0.4 * spread[0]
     # Noise of angles, and of ranges, moves hits and points.
-    noisy, _ = sweep(scene, "reflectivity", noise=Noise(0.05, angle_deg=0.01), **options)
-    assert np.std(noisy["reflectivity"]) == pytest.approx(spread[0], rel=0.1)
+    noisy, _ = sweep(scene, "reflectance", noise=Noise(0.05, angle_deg=0.01), **options)
+    assert np.std(noisy["reflectance"]) == pytest.approx(spread[0], rel=0.1)
 
 
 def test_colours_that_do_not_fit_are_refused():
@@ -423,11 +423,11 @@ def test_a_material_has_the_reflectance_of_the_nearer_wavelength():
 
 def test_a_gloss_adds_to_diffuse_light_and_replaces_that_of_metals():
     scene = Scene.from_meshes([SceneMesh("Ground", *hills()[:2])])
-    columns = "reflectivity", Column("cosine", "float64", "", "of incidence", "cosine")
+    columns = "reflectance", Column("cosine", "float64", "", "of incidence", "cosine")
 
     def returned(**arguments):
         cloud, _ = sweep(scene, *columns, materials=[Material("*", **arguments)])
-        return cloud["cosine"], cloud["reflectivity"]
+        return cloud["cosine"], cloud["reflectance"]
 
     cosine, matt = returned(reflectance=0.3)
     np.testing.assert_allclose(matt, 0.3 * cosine, rtol=1e-5)

@@ -47,7 +47,7 @@ from lidarpool.simulator.rig import Rig
 from raybeam import registry
 
 COLUMNS = (
-    "ray", "time", "range", "intensity", "reflectivity", "class", "triangle", "sensor", "returns",
+    "ray", "time", "range", "intensity", "reflectance", "class", "triangle", "sensor", "returns",
     "return_number",
 )  # fmt: skip
 MATERIALS = (

@@ -65,16 +65,16 @@ def test_random_numbers_follow_from_what_they_are_for_alone():
 def test_energy_falls_with_distance_angle_and_reflectance():
     near = cast([wall("W", 5)], materials=[Material("*", reflectance=1.0)])
     assert near["intensity"] == pytest.approx([4.0])
-    assert near["reflectivity"] == pytest.approx([1.0])
+    assert near["reflectance"] == pytest.approx([1.0])
     assert cast([wall("W", 20)])["intensity"] == pytest.approx([0.5 / 4]), "half is scattered"
     slanted = SceneMesh(
         "S", np.array([[4, -9, 9], [4, 9, 9], [22, -9, -9.0]]), np.array([[0, 1, 2]])
     )
     found = cast([slanted], materials=[Material("S", reflectance=0.8, semantic_class=65_535)])
-    assert found["reflectivity"] == pytest.approx([0.8 * math.sqrt(0.5)], rel=1e-6)
+    assert found["reflectance"] == pytest.approx([0.8 * math.sqrt(0.5)], rel=1e-6)
     assert found["class"].tolist() == [65_535]
     retro = cast([slanted], materials=[Material("S", reflectance=0.8, retro=True)])
-    assert retro["reflectivity"] == pytest.approx([0.8 * 220], rel=1e-6), "from all angles"
+    assert retro["reflectance"] == pytest.approx([0.8 * 220], rel=1e-6), "from all angles"
 
 
 @pytest.mark.parametrize(
@@ -93,7 +93,7 @@ def test_weather_takes_light_by_kruse(visibility_km, nm, per_km):
     clear, dull = (cast([wall("W", 40)], sensor, visibility_km=v) for v in (None, visibility_km))
     lost = math.exp(-2 * per_km * 0.040)
     assert dull["intensity"] / clear["intensity"] == pytest.approx([lost], rel=1e-6)
-    assert dull["reflectivity"] == pytest.approx(clear["reflectivity"], rel=1e-6)
+    assert dull["reflectance"] == pytest.approx(clear["reflectance"], rel=1e-6)
 
 
 def test_the_last_material_that_names_an_object_counts():
@@ -103,7 +103,7 @@ def test_the_last_material_that_names_an_object_counts():
     found = cast(walls, up, materials=materials)
     assert found["object"].tolist() == [0, 1, 2]
     cosines = np.cos(np.radians([6, 6, 16]))
-    assert found["reflectivity"] == pytest.approx([0.1, 0.2, 0.3] * cosines, rel=1e-6)
+    assert found["reflectance"] == pytest.approx([0.1, 0.2, 0.3] * cosines, rel=1e-6)
 
 
 # -- beams ---------------------------------------------------------------------------------------
@@ -158,11 +158,11 @@ def test_light_passes_glass(backend):
     found = cast(meshes, materials=materials, backend=backend)
     assert found["object"].tolist() == [1]
     assert found["range"] == pytest.approx([9], abs=1e-9)
-    assert found["reflectivity"] == pytest.approx([0.5 * 0.96**2], rel=1e-6), "4 % each way"
+    assert found["reflectance"] == pytest.approx([0.5 * 0.96**2], rel=1e-6), "4 % each way"
     dirty = [*materials[:1], Material("Pane", 0.1, transparent="pass")]
     found = cast(meshes, materials=dirty, returns=Returns("all"), backend=backend)
     assert found["object"].tolist() == [0, 1]
-    assert found["reflectivity"] == pytest.approx([0.1, 0.5 * (0.9 * 0.96) ** 2], rel=1e-6)
+    assert found["reflectance"] == pytest.approx([0.1, 0.5 * (0.9 * 0.96) ** 2], rel=1e-6)
     assert not len(cast(meshes, beam_along_x(max_range_m=8), materials=materials)["range"])
 
 
@@ -179,7 +179,7 @@ def test_a_pane_has_two_surfaces_from_whatever_side(backend, away_m, angle_deg):
     found = cast(meshes, at=(away_m, 0.01, 0.02), backend=backend, materials=materials)
     through = (1 - fresnel(np.array([math.cos(angle)]))) ** 4  # two surfaces, there and back
     assert found["range"] == pytest.approx([60], abs=1e-3)
-    assert found["reflectivity"] == pytest.approx(0.5 * through, rel=1e-4)
+    assert found["reflectance"] == pytest.approx(0.5 * through, rel=1e-4)
 
 
 def test_glass_reflects_by_fresnel():
@@ -200,7 +200,7 @@ def test_a_mirror_shows_what_is_reflected_at_the_unfolded_range(subrays, backend
     found = cast(meshes, materials=materials, returns=beam, backend=backend)
     assert found["object"].tolist() == [1]
     assert found["range"] == pytest.approx([7], abs=1e-4)
-    assert found["reflectivity"] == pytest.approx([0.5], rel=1e-4)
+    assert found["reflectance"] == pytest.approx([0.5], rel=1e-4)
     assert np.allclose(found["batch"].positions, [[7, 0, 0]], atol=1e-4), "behind the mirror"
     everywhere = [Material("*", transparent="mirror")]
     assert not len(cast([wall("A", 4), wall("B", -4)], materials=everywhere)["range"]), "given up"

@@ -53,7 +53,7 @@ from lidarpool.scene.actors import Actor, box
 from lidarpool.sensor.trajectory import matrices
 
 COLUMNS = ("time", "intensity", "reflectivity", "range", "azimuth", "elevation", "class",
-           "return_number", "returns", "sensor", "ray")  # fmt: skip
+           "return_number", "returns", "sensor", "ray", "signal")  # fmt: skip
 
 
 @pytest.fixture(scope="module")
@@ -95,7 +95,8 @@ def cloud(survey) -> Cloud:
         "object": rng.integers(0, 7, count),
         "time": begins.astype(np.int64) + rng.integers(0, 2_000_000, count),
         "intensity": rng.uniform(0, 1, count).astype(np.float32),
-        "reflectivity": rng.uniform(0, 1, count).astype(np.float32),
+        "reflectivity": rng.integers(0, 256, count).astype(np.uint8),
+        "signal": rng.integers(0, 65_536, count).astype(np.uint16),
         "range": rng.uniform(1, 50, count).astype(np.float32),
         "azimuth": rng.uniform(0, 360, count).astype(np.float32),
         "elevation": rng.uniform(-30, 30, count).astype(np.float32),
@@ -155,7 +156,9 @@ def test_las_has_fields_of_its_own_and_the_rest_in_extra_bytes(written, cloud, n
     np.testing.assert_array_equal(
         las.classification, np.where(cloud["class"] < 256, cloud["class"], 0)
     )
-    for column in ("scan", "object", "class", "range", "elevation", "sensor"):
+    for column in (
+        "scan", "object", "class", "range", "elevation", "sensor", "reflectivity", "signal",
+    ):  # fmt: skip
         np.testing.assert_array_equal(las[column], cloud[column])
     np.testing.assert_array_equal(las["ring"], cloud.channel)
     np.testing.assert_array_equal(las["energy"], cloud.intensity)
@@ -286,6 +289,8 @@ def test_bags_have_points_frames_and_a_clock(written, cloud, sweeps, name, layou
         np.testing.assert_array_equal(rows["intensity"], np.round(points.intensity * 255))
     if layout == "ouster":
         np.testing.assert_array_equal(rows["range"], np.round(points.range * 1000))
+        np.testing.assert_array_equal(rows["reflectivity"], points.reflectivity)
+        np.testing.assert_array_equal(rows["intensity"], points.signal)
 
 
 @pytest.mark.parametrize(("layout", "step"), [("velodyne", 26), ("autoware", 36), ("ouster", 48)])
@@ -367,7 +372,7 @@ def test_what_cannot_be_written_is_one_line_and_leaves_nothing(
     bare = Cloud(cloud.positions, {name: cloud[name] for name in ("scan", "channel", "object")})
     with pytest.raises(LidarpoolError, match=r"kitti needs intensity, class, .*output\.write"):
         Format("kitti").write(tmp_path / "kitti", bare, sweeps)
-    with pytest.raises(LidarpoolError, match="mcap with the layout ouster needs intensity, time"):
+    with pytest.raises(LidarpoolError, match="mcap with the layout ouster needs signal, time"):
         Format("mcap", "ouster").write(tmp_path / "cloud.mcap", bare, sweeps)
     (tmp_path / "cloud.laz").write_text("mine")
     with pytest.raises(LidarpoolError, match=r"exists: .* --overwrite"):

@@ -82,6 +82,7 @@ SURVEYS = {
     ),
     "false alarms": Survey(ALERT, **STILL, noise=Noise(**FAINT, false_alarm_hz=1e6), **EVERY),
     "stray light": Survey(ALERT, **WAY, noise=Noise(**FAINT, stray_light=1e-5), **SIGN),
+    "saturation": Survey(MANY, **STILL, noise=Noise(**FAINT, saturation=10), materials=HALF),
     "crosstalk": Survey(sensors=BOTH, **STILL, noise=Noise(**FAINT, crosstalk=True)),
     "sub-rays": Survey(MANY, **STILL, **ALL, returns=Returns("strongest", 7, 3.0)),
     "rain": Survey(MANY, **STILL, **SEEN, rain_mm_h=20),

@@ -158,6 +158,56 @@ def test_errors_of_positions():
             assert abs(variances.mean() / expected - 1) < room, (axes, size)
 
 
+def test_axes_have_constant_scales_and_angles():
+    """Of many units: a rotation about z shows the scale of one gyroscope and two angles."""
+    half = np.linspace(0, 0.5, 11)
+    turns = np.stack([0 * half, 0 * half, np.sin(half), np.cos(half)], axis=1)
+    path, found = Track(np.linspace(0, 1, 11), np.zeros((11, 3)), turns), []
+    imu = Imu(rate_hz=10, scale=0.01, misalignment_deg=0.3)
+    for seed in range(400):
+        moving = Moving(Navigation(imu=imu, seed=seed), path, path.duration_ns)
+        rates = joined(imu_samples(moving), "rates")
+        np.testing.assert_allclose(rates, np.tile(rates[0], (10, 1)), atol=1e-9)
+        found.append(rates[0])
+    expected = np.array([np.radians(0.3), np.radians(0.3), 0.01])
+    errors = np.array(found) - [0, 0, 1]
+    assert (np.abs(errors.mean(axis=0)) < 4.5 * expected / np.sqrt(400)).all()
+    assert (np.abs(errors.std(axis=0) / expected - 1) < 4.5 / np.sqrt(800)).all()
+    assert np.abs(np.corrcoef(errors.T)[np.triu_indices(3, 1)]).max() < 4.5 / np.sqrt(400)
+
+
+def test_positions_drift_during_outages_and_return():
+    """By many seeds: a bias alone grows as t^2, a random walk alone as t^1.5."""
+    gnss = Gnss(rate_hz=2, outages=[(10, 25)])
+    for imu in (
+        Imu(accelerometer_bias=0.02),
+        Imu(accelerometer_noise_density=0.05),
+        Imu(accelerometer_bias=0.02, accelerometer_noise_density=0.05),
+    ):
+        runs = [standing(40, imu=imu, gnss=gnss, seed=seed) for seed in range(500)]
+        errors = np.concatenate([joined(fixes(run), "positions") for run in runs], axis=1)
+        t = np.clip(np.arange(81) / 2 - 10, 0, 15)
+        bias, walk = imu.accelerometer_bias, imu.accelerometer_noise_density
+        expected = np.hypot(bias * t**2 / 2, walk * np.sqrt(t**3 / 3))
+        expected *= np.exp(-np.clip(np.arange(81) / 2 - 25, 0, None))
+        assert not errors[:21].any() and expected[50] > 1
+        room = 4.5 / np.sqrt(2 * 1500)
+        assert np.abs(errors[21:].std(axis=1) / expected[21:] - 1).max() < room
+        assert np.abs(errors[21:].mean(axis=1) / expected[21:]).max() < 4.5 / np.sqrt(1500)
+        assert np.abs(np.diff(errors, axis=0)).max() < 6  # it does not jump
+
+
+def test_without_an_imu_outages_have_no_positions():
+    times = joined(
+        fixes(standing(40, gnss=Gnss(rate_hz=2, outages=[(10, 25), (30, 31)]))), "times_ns"
+    )
+    seconds = np.arange(81) / 2
+    out = ((seconds >= 10) & (seconds < 25)) | ((seconds >= 30) & (seconds < 31))
+    assert np.array_equal(times, (seconds[~out] * 1e9).astype(int))
+    with pytest.raises(LidarpoolError, match="least, largest"):
+        Gnss(outages=[(25, 10)])
+
+
 def tumbling(smooth):
     """A way with turns about all axes."""
     rng = np.random.default_rng(3)
@@ -214,8 +264,8 @@ def test_pieces_do_not_matter():
         rate_hz=100, gyroscope_noise_density=1e-3, gyroscope_bias=1e-3, gyroscope_random_walk=1e-4,
         accelerometer_noise_density=0.01, accelerometer_bias=0.1, accelerometer_random_walk=0.01,
     )  # fmt: skip
-    gnss = Gnss(rate_hz=20, horizontal_m=1, drift_vertical_m=2)
-    path = tumbling(True)
+    gnss = Gnss(rate_hz=20, horizontal_m=1, drift_vertical_m=2, outages=[(2, 4), (5, 6)])
+    path, imu = tumbling(True), replace(imu, scale=1e-3, misalignment_deg=0.1)
     survey = Moving(Navigation(imu=imu, gnss=gnss, seed=9), path, path.duration_ns)
     for samples in (imu_samples, fixes):
         whole, pieces = [*samples(survey)], [*samples(survey, 7)]

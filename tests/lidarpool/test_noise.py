@@ -9,6 +9,7 @@ import numpy as np
 from tests.shapes import block, level
 
 from lidarpool import (
+    Fault,
     Gnss,
     Imu,
     Material,
@@ -32,11 +33,14 @@ SENSOR = Sensor.grid(60, 8, step_deg=90, min_range_m=0.5, max_range_m=60)
 NOISE = Noise(
     0.02, angle_deg=0.05, dropout=0.05, detection_range_m=150, range_at_threshold_m=0.05,
     walk_m=0.02, false_alarm_hz=2e6, stray_light=0.1, crosstalk=True, velocity_m_s=0.1, seed=3,
+    channel_bias_m=0.01,
 )  # fmt: skip
 IMU = Imu(
     rate_hz=100, gyroscope_noise_density=1e-3, gyroscope_bias=1e-3, gyroscope_random_walk=1e-4,
     accelerometer_noise_density=0.01, accelerometer_bias=0.1, accelerometer_random_walk=0.01,
+    scale=1e-3,
 )  # fmt: skip
+GNSS = Gnss(horizontal_m=1, drift_vertical_m=2, outages=[(0.1, 0.2)])
 
 
 def everything():
@@ -58,7 +62,8 @@ def everything():
         noise=NOISE,
         columns=["range", "cause", "radial_velocity"],
         waveform_samples=200,
-        navigation=Navigation(imu=IMU, gnss=Gnss(horizontal_m=1, drift_vertical_m=2), seed=3),
+        navigation=Navigation(imu=IMU, gnss=GNSS, seed=3),
+        faults=[Fault("dropped_packets", share=0, packet=12)],
         fog_lidar_ratio_sr=18.8,
         visibility_km=0.5,
         snow_mm_h=1.0,
@@ -99,7 +104,9 @@ def test_no_random_number_is_used_twice(monkeypatch):
     assert len([*imu_samples(survey), *fixes(survey)]) == 2
     assert {*Purpose} == drawn.keys(), "all are tried"
     each = {purpose: np.concatenate(bits) for purpose, bits in drawn.items()}
-    for again in (Purpose.SAMPLES, Purpose.SAMPLE):  # windows of one waveform share samples
+    # Windows of one waveform share samples, returns of a channel its error, those of a packet its
+    # fate.
+    for again in (Purpose.SAMPLES, Purpose.SAMPLE, Purpose.CHANNEL, Purpose.PACKET):
         each[again] = np.unique(each[again])
     for purpose, bits in each.items():
         assert len(np.unique(bits)) == len(bits), purpose

@@ -13,6 +13,7 @@ from lidarpool import (
     CampaignRun,
     Cloud,
     Column,
+    Fault,
     Gnss,
     Imu,
     Job,
@@ -80,6 +81,7 @@ SMALL = [
     Spin(),
     Material("x"),
     Noise(),
+    Fault("dirt", transmission=0.3),
 ]
 
 

@@ -27,8 +27,11 @@ from lidarpool import (
     Spin,
     Survey,
 )
+from lidarpool.columns.table import AXES, SCAN
+from lidarpool.columns.waveforms import WAVEFORM
 from lidarpool.scene.scene_mesh import SceneMesh
 from lidarpool.sensor.noise import THRESHOLD_SIGMAS
+from lidarpool.simulator.batch import columns_of
 from lidarpool.simulator.returns import BLOOMING, CROSSTALK, FALSE_ALARM, SURFACE
 from lidarpool.simulator.rig import Rig
 from raybeam import available_backends
@@ -81,11 +84,107 @@ def test_strong_returns_appear_nearer_as_of_a_gaussian_pulse_over_a_threshold():
 
 
 @pytest.mark.parametrize(
-    "field", ["range_at_threshold_m", "walk_m", "false_alarm_hz", "stray_light"]
+    "field", ["range_at_threshold_m", "walk_m", "false_alarm_hz", "stray_light", "saturation"]
 )
 def test_what_is_measured_by_the_threshold_needs_one(field):
     with pytest.raises(LidarpoolError, match=rf"noise\.{field} .*give noise\.detection_range_m"):
-        Noise(**{field: 0.1})
+        Noise(**{field: 1 if field == "saturation" else 0.1})
+
+
+# -- saturation ----------------------------------------------------------------------------------
+
+FULL = Noise(detection_range_m=FAR, saturation=50)  # as by a white wall at 44.7 m
+QUARTER = LIGHT_M_S * 1e-9 / 4  # metres of range by which an edge is off, for each ns of width
+PULSES = ("ray", "range", "intensity", "amplitude", "pulse_width", "object")
+
+
+def width_ns(over):
+    """Width of a Gaussian pulse of 5 ns that is so many times as high as what is recorded."""
+    sigma = 5 / math.sqrt(8 * math.log(2))
+    return 2 * sigma * math.sqrt(2 * math.log(2 * over))  # over · exp(-t² / 2σ²) = 1 / 2
+
+
+def full(meshes, noise=FULL, retro="none", **options):
+    """Returns of one pulse; an object may be retro-reflective."""
+    materials = [*WHITE, Material(retro, 1.0, retro=True)] if retro != "none" else WHITE
+    return cast(meshes, noise=noise, materials=materials, columns=PULSES, **options)
+
+
+@pytest.mark.parametrize("waveform", ["none", "peaks", "gaussian"])
+@pytest.mark.parametrize("distance", [2.0, 10.0, 40.0, 44.8, 90.0])
+def test_a_full_receiver_clips_and_widens(distance, waveform):
+    found = full([wall("W", distance)], returns=Returns(waveform=waveform))
+    energy = (10 / distance) ** 2
+    over = max(energy / (50 * THRESHOLD), 1)
+    assert found["intensity"] == pytest.approx([energy])
+    assert found["amplitude"] == pytest.approx([min(energy, 50 * THRESHOLD)])
+    assert found["pulse_width"] == pytest.approx([width_ns(over)])
+    early = 0 if waveform == "none" else QUARTER * (width_ns(over) - 5)  # leading edge
+    assert found["range"] == pytest.approx([distance - early])
+
+
+@pytest.mark.parametrize("apart", [0.99, 1.01])
+@pytest.mark.parametrize("waveform", ["none", "peaks"])
+def test_returns_within_a_full_pulse_are_one(apart, waveform):
+    """Half of a beam hits each wall: twice as far apart as without saturation, and farther."""
+    over = [0.5 * (10 / distance) ** 2 / 0.05 for distance in (10, 11.4)]
+    gap = QUARTER * sum(map(width_ns, over))
+    assert gap > 1.4
+    meshes = [wall("Near", 10, y=(0, 50)), wall("Far", 10 + apart * gap)]
+    beam = Returns("all", subrays=217, divergence_mrad=1, waveform=waveform)
+    found = full(meshes, returns=beam, precision_m=1e-4)
+    plain = full(meshes, Noise(detection_range_m=FAR), returns=beam)
+    assert len(plain["range"]) == 2
+    assert found["intensity"].sum() == pytest.approx(plain["intensity"].sum())
+    if apart > 1:
+        assert len(found["range"]) == 2
+        return
+    early = 0 if waveform == "none" else QUARTER * (width_ns(over[0]) - 5)
+    assert found["object"].tolist() == [0], "the stronger is reported"
+    assert found["range"] == pytest.approx([10 - early], abs=0.01)
+    assert found["pulse_width"] == pytest.approx([gap / QUARTER], rel=0.02)
+
+
+def test_a_sign_hides_what_is_weak_before_and_behind():
+    """A wire, and a wall, 1.5 m from a sign; where the sign is a plain board, both are there."""
+    meshes = [
+        wall("Wire", 18.5, y=(-0.001, 0.001)), wall("Sign", 20, y=(-50, 0.003)), wall("W", 21.5),
+    ]  # fmt: skip
+    beam = Returns("all", subrays=217, divergence_mrad=1)
+    assert full(meshes, returns=beam)["object"].tolist() == [0, 1, 2]
+    assert full(meshes, retro="Sign", returns=beam)["object"].tolist() == [1]
+    far = replace(FULL, saturation=1e9)
+    assert full(meshes, far, retro="Sign", returns=beam)["object"].tolist() == [0, 1, 2]
+
+
+def test_of_two_clipped_returns_the_nearest_is_the_strongest():
+    meshes = [wall("Near", 10, y=(0.002, 50)), wall("Far", 20)]
+    beam = Returns("strongest", subrays=217, divergence_mrad=1)
+    assert full(meshes, Noise(detection_range_m=FAR), returns=beam, retro="Far")["object"] == [1]
+    assert full(meshes, returns=beam, retro="Far")["object"] == [0]
+
+
+def test_walk_is_that_of_the_whole_pulse():
+    walks = replace(FULL, walk_m=0.1)
+    plain = replace(walks, saturation=None)
+    ranges = [full([wall("W", 2)], noise)["range"] for noise in (walks, plain)]
+    assert np.array_equal(*ranges) and ranges[0] < 1.7
+
+
+def test_recorded_samples_are_clipped():
+    options = {"columns": PULSES, "waveform_samples": 60, "materials": WHITE, "poses": [(0, 0, 0)]}
+    scene, beam = Scene.from_meshes([wall("W", 10)]), Returns(waveform="peaks")
+    survey = Survey(beam_along_x(), noise=FULL, returns=beam, steps=1, **options)
+    part = columns_of(list(Rig(scene, survey, "numpy").cast(0, 1)))
+    table = (SCAN, *(c for c in survey.stored_columns if c not in AXES and c.name != WAVEFORM))
+    waves = part.cloud(table, survey.precision_m, np.zeros(3)).waveforms
+    samples, full_at = waves.samples[0], 50 * THRESHOLD
+    assert samples.max() == pytest.approx(full_at, rel=1e-3)
+    above = np.flatnonzero(samples > full_at / 2)
+    assert abs(len(above) - width_ns(1 / full_at)) < 1.5, "samples are 1 ns apart"
+    edge = waves.times_ns[0][above[0]] * LIGHT_M_S / 2e9
+    assert part.columns["range"] == pytest.approx([edge + 5 * QUARTER], abs=0.15), "calibrated"
+    assert np.count_nonzero(samples > 0.99 * full_at) >= 8, "a plateau, with noise below"
 
 
 # -- false alarms --------------------------------------------------------------------------------

@@ -127,13 +127,13 @@ def survey():
     noise = Noise(
         range_m=0.02, range_per_m=1e-4, angle_deg=0.02, dropout=0.01, detection_range_m=80.0,
         overlap_m=3.0, range_at_threshold_m=0.05, walk_m=0.02, false_alarm_hz=1e4,
-        stray_light=1e-5, velocity_m_s=0.1,
+        stray_light=1e-5, velocity_m_s=0.1, saturation=50.0,
     )  # fmt: skip
     precise = [
         Column(f"{name}_64", "float64", "", "in double precision", name)
         for name in ("azimuth", "elevation", "range", "intensity", "radial_velocity")
     ]
-    names = ("time", "return_number", "cause", "object", "pulse_width")
+    names = ("time", "return_number", "cause", "object", "pulse_width", "reflectivity")
     path = Track([0, 1], [[0, 0, 0.3], [1.5, 0.4, 0.5]], [[0, 0, 0, 1], [0.1, 0.1, 0.1, 0.985]])
     digest = hashlib.sha256()
     for model, returns in (

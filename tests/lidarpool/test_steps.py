@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from lidarpool import Material, Mounted, Noise, Returns, Scene, Survey, load_sensor
+from lidarpool import Fault, Material, Mounted, Noise, Returns, Scene, Survey, load_sensor
 from lidarpool.sensor.noise import Purpose
 from lidarpool.sensor.survey import OPTIONAL_NAMES
 from lidarpool.simulator.returns import PulseReturns
@@ -18,7 +18,9 @@ from lidarpool.simulator.steps import STEPS
 EFFECTS = Path(__file__).parents[2] / "docs/effects.md"
 # What is no step: figures for steps, a column, and files.
 OTHERS = {"Data sheets", "Radial velocity", "Navigation"}
-OF_OTHERS = {Purpose.VELOCITY, Purpose.WHITE, Purpose.DRIVEN, Purpose.WALK}
+OF_OTHERS = {
+    *(Purpose.VELOCITY, Purpose.WHITE, Purpose.DRIVEN, Purpose.WALK, Purpose.SKEW, Purpose.OUTAGE)
+}
 
 NOISE = Noise(
     range_m=0.02,
@@ -29,7 +31,15 @@ NOISE = Noise(
     false_alarm_hz=1e5,
     stray_light=1e-4,
     crosstalk=True,
+    saturation=100,
+    channel_bias_m=0.01,
+    ripple_deg=0.02,
 )
+FAULTS = [
+    Fault("dirt", transmission=0.5),
+    Fault("dead_channels", channels=[3]),
+    Fault("dropped_packets", share=0.1, packet=12),
+]
 LIDAR = load_sensor("velodyne/vlp16")
 COMMON = {
     "sensors": [Mounted(LIDAR, name="one"), Mounted(LIDAR, name="other")],
@@ -38,6 +48,7 @@ COMMON = {
     "materials": [Material("*", 0.4), Material("Sphere", 0.9, retro=True)],
     "noise": NOISE,
     "rain_mm_h": 20,
+    "faults": FAULTS,
 }
 SURVEYS = {
     "hits": Survey(**COMMON, returns=Returns("dual", 7)),

@@ -13,9 +13,10 @@ from tests.shapes import quad
 from lidarpool import Beams, Material, Noise, Optics, Returns, Scene, Sensor, Spin, Survey
 from lidarpool.sensor.disc import Beam
 from lidarpool.sensor.noise import Purpose, named_seed, raw
-from lidarpool.sensor.optics import FWHM
+from lidarpool.sensor.optics import FWHM, LIGHT_M_NS
 from lidarpool.simulator.air import WeatherStep
 from lidarpool.simulator.returns import AIR, NO_SURFACE, Keys, PulseReturns
+from lidarpool.simulator.saturation import saturated
 from lidarpool.simulator.separation import Report, separated
 from lidarpool.simulator.step import Setup
 from lidarpool.simulator.surfaces import Light, Surfaces
@@ -136,6 +137,29 @@ def test_returns_are_those_of_the_twin(each, airy, planes):
         assert counts.sum() < 0.95 * len(separated(ground, GAP, each, None, air).ray)
     if airy:
         assert np.array_equal(found.cause == AIR, found.triangle == NO_SURFACE)
+
+
+@pytest.mark.parametrize("waves", [False, True])
+@pytest.mark.parametrize("full", [0.01, 0.1])
+def test_saturation_is_that_of_the_twin(full, waves):
+    """Within 1e-9: logarithms round. Most pulses are clipped, and some returns joined."""
+    pulses, digitizer = pulses_of(30, 7, airy=True), Digitizer(2.0, 1.0, decomposes=False)
+    hits, planes = columns_of(pulses, 7)
+    if waves:
+        returns, width_ns = returns_in(hits, digitizer, 7, planes), FWHM * digitizer.sigma_ns
+        given = {k: twin.waveform_returns(own, digitizer, 7, True) for k, own in pulses.items()}
+    else:
+        solid, width_ns = hits.triangle != NO_SURFACE, 2 * GAP / LIGHT_M_NS
+        ground = tuple(one[solid] for one in planes)
+        returns = separated(hits.take(solid), GAP, 7, ground, hits.take(~solid))
+        given = {k: twin.separated(own, GAP, 7, True) for k, own in pulses.items()}
+    found = saturated(returns, full, width_ns)
+    length = width_ns * LIGHT_M_NS / 2
+    expected = {k: twin.saturated(own, full, length, waves) for k, own in given.items()}
+    found = found._replace(width=found.width / width_ns, velocity=None)
+    same_returns(found, expected, 1e-9)
+    assert len(found.ray) < len(returns.ray) - 20 and found.amplitude.max() == full
+    assert (found.amplitude == full).mean() > 0.1
 
 
 @pytest.mark.parametrize("mode", ["all", "first", "last", "strongest", "dual"])

@@ -155,6 +155,35 @@ def separated(hits: list[Hit], gap: float, subrays: int, planes: bool) -> list[R
     return [one_return(group, subrays) for group in divided(hits, begins)]
 
 
+def saturated(returns: list[Return], full: float, pulse_m: float, waves: bool) -> list[Return]:
+    """Clip returns of a pulse, and join those whose pulses, so long in range, overlap.
+
+    Of joined returns the highest is left, with the edges and the least range of those clipped.
+    """
+    heights = [one.energy / one.width for one in returns]
+    left: dict[int, tuple[Return, float, float]] = {}  # {its number: with its edges}
+    for last, one in enumerate(returns):
+        usual = one.width * pulse_m / 2
+        half = usual * math.sqrt(1 + math.log2(max(heights[last] / full, 1)))
+        front, back = one.distance - half, one.distance + half
+        before = [*left][::-1]
+        left[last] = replace(one, distance=front + usual) if waves else one, front, back
+        for j in before:
+            if max(heights[j], heights[last]) <= full or left[j][2] < left[last][1]:
+                continue
+            high, low = (j, last) if heights[j] >= heights[last] else (last, j)
+            (whole, front, back), (more, nearer, farther) = left[high], left.pop(low)
+            if heights[low] > full:
+                whole = replace(whole, distance=min(whole.distance, more.distance))
+                front, back = min(front, nearer), max(back, farther)
+            left[high] = replace(whole, energy=whole.energy + more.energy), front, back
+            last = high
+    return [
+        replace(one, width=(back - front) / pulse_m) if heights[k] > full else one
+        for k, (one, front, back) in left.items()
+    ]
+
+
 def detected(energy: float, number: int, key: Key, noise: Noise) -> bool:
     """Whether a return is neither lost nor too faint; `number` counts those of its pulse."""
     if uniform(noise.seed, Purpose.LOSS, key, number) < noise.dropout:

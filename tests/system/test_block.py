@@ -65,7 +65,7 @@ def test_lane_markings_stand_out_and_cars_have_their_class(scanned):
     white = street & (columns["red"] > 200)
     asphalt = street & (columns["red"] < 110)
     assert white.sum() > 100 < asphalt.sum()
-    ratio = np.median(columns["reflectivity"][white]) / np.median(columns["reflectivity"][asphalt])
+    ratio = np.median(columns["reflectance"][white]) / np.median(columns["reflectance"][asphalt])
     assert ratio > 4
     names = np.array([name.split(" (")[0] for name in job.scene.all_names])
     kinds = names[columns["object"]]

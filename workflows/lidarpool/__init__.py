@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     from .scene.scene_mesh import SceneMesh
     from .sensor import (
         Beams,
+        Fault,
         Gnss,
         Imu,
         Material,
@@ -57,6 +58,7 @@ __all__ = [
     "Cloud",
     "Column",
     "Comparison",
+    "Fault",
     "Gnss",
     "Imu",
     "Job",
@@ -125,6 +127,7 @@ _MODULES = {
     "sensor.models": ("datasheet", "load_sensor"),
     "sensor": (
         "Beams",
+        "Fault",
         "Gnss",
         "Imu",
         "Material",

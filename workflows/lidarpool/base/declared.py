@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import fields
+from math import inf
 from typing import Annotated, Any, TypeVar
 
 from pydantic import (
@@ -36,6 +37,16 @@ Two = Annotated[tuple[T, T], Strict(False)]
 Three = Annotated[tuple[T, T, T], Strict(False)]
 Four = Annotated[tuple[T, T, T, T], Strict(False)]
 Triple = Three[Coordinate]
+
+
+def _in_order(value: Any, handler: Callable[[Any], Any]) -> Any:
+    ends = handler(value)
+    if not 0 <= ends[1] - ends[0] < inf:
+        raise must_be("[least, largest]")
+    return ends
+
+
+Ends = Annotated[Two[T], WrapValidator(_in_order)]  # least and largest number
 
 # A field that may be empty in a scenario, because lidarpool then fills it in.
 FILLED_IN = GetPydanticSchema(lambda kind, handler: handler(kind | None))

@@ -139,11 +139,13 @@ OPTIONAL = (
         "energy received; 1 is a white surface 10 m away at right angles in clear air",
     ),
     Column(
-        "reflectivity",
+        "reflectance",
         "float32",
         "",
-        "intensity without the loss by distance and air: reflectance times cosine of incidence",
+        "intensity without the loss by distance and air: the surface's times cosine of incidence",
     ),
+    Column("reflectivity", "uint8", "", "reflectance on the scale of the sensor's maker"),
+    Column("signal", "uint16", "", "counts: 10,000 for an intensity of 1, 65,535 at most"),
     Column(
         VELOCITY,
         "float32",
@@ -154,7 +156,8 @@ OPTIONAL = (
         "amplitude",
         "float32",
         "",
-        "height of the echo in the waveform; of one as narrow as the pulse its intensity",
+        "height of the echo in the waveform, clipped at the saturation of the receiver; of one as "
+        "narrow as the pulse its intensity",
     ),
     Column(
         "pulse_width",

@@ -15,6 +15,7 @@ from ..base.arrays import AnyArray, Floats, Floats32, Ints32
 from ..export.boxes import Boxes, SweepBoxes
 from ..export.reading import PointColumns
 from ..export.sweeps import Sweeps
+from ..sensor import Fault
 from .job_table import JobRow, Value
 
 
@@ -37,6 +38,7 @@ class Sweep:
     columns: Mapping[str, AnyArray]  # {name: (n,)}: what the format holds beside
     pose: Floats  # (4, 4): from the sensor's axes to the world's
     object_names: tuple[str, ...]  # what the column `object` counts
+    faults: tuple[Fault, ...]  # that the sensor has at some time of the sweep
     _boxes: SweepBoxes | tuple[Sweeps, Boxes | None, int | EllipsisType]  # or what they are made of
 
     @classmethod
@@ -49,7 +51,7 @@ class Sweep:
             job.name, job.number, job.split, job.values,
             sweeps.sensors[sweeps.sensor[number]], int(sweeps.numbers[number]),
             round(sweeps.begins_ns[number]), *points, sweeps.pose.matrix(number),
-            sweeps.all_names, (sweeps, boxes, which),
+            sweeps.all_names, sweeps.faults_in(number), (sweeps, boxes, which),
         )  # fmt: skip
 
     def __getstate__(self) -> dict[str, Any]:

@@ -18,7 +18,7 @@ class Boxes:
     """Boxes of all actors in a sweep, at the time of their points.
 
     An actor moves during a sweep. Its box is at its pose at the mean time of its points, by their
-    scans if the cloud has no times, or at the start of the sweep if it has none.
+    scans if the cloud has no times or a fault shifts some, or at the sweep's start if it has none.
     """
 
     centres: Floats  # (a, 3): metres, world coordinates, or the sensor's after `inward`
@@ -35,7 +35,7 @@ class Boxes:
         rows = np.flatnonzero(actor >= 0)
         counts = np.bincount(actor[rows], minlength=count)
         begin, end = sweeps.begins_ns[sweep], sweeps.ends_ns[sweep]
-        if "time" in points.columns:
+        if "time" in points.columns and not any(fault.by_s for fault in sweeps.faults):
             share = (points["time"][rows] - begin) / max(end - begin, 1.0)
         else:
             first, stop = sweeps.scans[sweep : sweep + 2]

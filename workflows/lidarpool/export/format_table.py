@@ -44,7 +44,7 @@ _ALL_RAYS = ("ray", "range")  # and every return: see `check_whole`
 LAYOUTS = {
     "velodyne": ("intensity", "time"),
     "autoware": ("intensity", "time", "azimuth", "elevation", "range"),
-    "ouster": ("intensity", "time", "reflectivity", "range"),
+    "ouster": ("signal", "time", "reflectivity", "range"),
     "images": ("intensity", "time", *_ALL_RAYS),
 }
 _COLOURS = ("red", "green", "blue")

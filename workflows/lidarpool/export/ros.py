@@ -100,8 +100,8 @@ def write_mcap(path: Path, cloud: CloudLike, sweeps: Sweeps, layout: str) -> Non
 
     Layouts of a point: `velodyne` (22 bytes; its time in seconds since the sweep began),
     `autoware` (PointXYZIRCAEDT, 32 bytes; angles in radians, time_stamp in ns since the sweep
-    began) and `ouster` (48 bytes; range in mm, t in ns since the sweep began). Whole numbers of
-    intensity and reflectivity are 255 and 65,535 at 1 and above. Where the cloud has red, green and
+    began) and `ouster` (48 bytes; range in mm, t in ns since the sweep began, intensity: signal).
+    Whole numbers of intensity are 255 at 1 and above. Where the cloud has red, green and
     blue, a field `rgb` follows, where it has radial velocities, `radial_velocity`, and where its
     classes have names, `label`; each makes points of `velodyne` and `autoware` 4 bytes longer.
     """
@@ -143,6 +143,7 @@ def _messages(cloud: CloudLike, sweeps: Sweeps, layout: str, types: Any) -> Iter
         yield "/label_info", info(make.header("", start_ns), told, 0.0), start_ns
     for sweep, points in enumerate(sweeps.points(cloud)):
         time_ns = start_ns + round(sweeps.begins_ns[sweep])
+        stamp_ns = start_ns + sweeps.stamp_ns(sweep)
         while waiting is not None and waiting[2] <= time_ns:
             yield waiting
             waiting = next(measured, None)
@@ -159,7 +160,7 @@ def _messages(cloud: CloudLike, sweeps: Sweeps, layout: str, types: Any) -> Iter
         yield "/clock", types["rosgraph_msgs/msg/Clock"](make.stamp(time_ns)), time_ns
         yield "/tf", make.transforms(in_world, time_ns), time_ns
         message = types["sensor_msgs/msg/PointCloud2"](
-            make.header(frame, time_ns), 1, len(rows), fields, False, row.itemsize,
+            make.header(frame, stamp_ns), 1, len(rows), fields, False, row.itemsize,
             rows.nbytes, rows.view(np.uint8).ravel(), True,
         )  # fmt: skip
         yield topic, message, time_ns
@@ -168,7 +169,7 @@ def _messages(cloud: CloudLike, sweeps: Sweeps, layout: str, types: Any) -> Iter
             ranges[np.isnan(ranges)] = np.inf  # REP 117: nothing was detected
             for plane, image in enumerate(ranges, 1):
                 name = f"{topic.removesuffix('points')}range_image{plane if plane > 1 else ''}"
-                yield name, make.image(image[::-1], frame, time_ns), time_ns
+                yield name, make.image(image[::-1], frame, stamp_ns), time_ns
         if actors:
             boxes = Boxes.of(sweeps, sweep, points)
             yield "/actors", make.markers(boxes, actors, time_ns), time_ns
@@ -300,26 +301,26 @@ def _rows(
     layout: str, row: np.dtype[np.void], points: Cloud, sweeps: Sweeps, sweep: int
 ) -> Records:
     """Points of a sweep in a layout, of the type of `_row`."""
-    there, since = points.columns, points["time"] - sweeps.begins_ns[sweep]
-    light = np.clip(there["intensity"], 0, 1)
+    begin_ns = sweeps.begins_ns[sweep] + (sweeps.stamp_ns(sweep) - round(sweeps.begins_ns[sweep]))
+    there, since = points.columns, points["time"] - begin_ns
     values = dict(zip("xyz", sweeps.in_sensor(sweep, points.positions).T, strict=True))
     if layout in ("velodyne", "images"):
         values |= {"intensity": there["intensity"], "ring": there["channel"], "time": since / 1e9}
     elif layout == "autoware":
         values |= {
-            "intensity": np.round(light * 255),
+            "intensity": np.round(np.clip(there["intensity"], 0, 1) * 255),
             "return_type": np.ones(len(points)),
             "channel": there["channel"],
             "azimuth": np.radians(there["azimuth"]),
             "elevation": np.radians(there["elevation"]),
             "distance": there["range"],
-            "time_stamp": np.clip(since, 0, None),
+            "time_stamp": np.clip(since, 0, 2**32 - 1),
         }
     else:
         values |= {
-            "intensity": there["intensity"],
-            "t": np.clip(since, 0, None),
-            "reflectivity": np.round(np.clip(there["reflectivity"], 0, 1) * 65_535),
+            "intensity": there["signal"],
+            "t": np.clip(since, 0, 2**32 - 1),
+            "reflectivity": there["reflectivity"],
             "ring": there["channel"],
             "range": np.round(there["range"] * 1000),
         }

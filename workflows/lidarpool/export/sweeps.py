@@ -18,7 +18,8 @@ from ..base.arrays import AnyFloats, Bools, Bytes, Floats, Ints
 from ..base.errors import LidarpoolError
 from ..columns.cloud import Cloud, CloudLike
 from ..scene.scene import Scene
-from ..sensor import Sensor, Survey
+from ..sensor import Fault, Sensor, Survey
+from ..sensor.faults import sent
 from ..sensor.plain_data import described, remade
 from ..sensor.survey import nanoseconds
 from ..sensor.trajectory import matrices, presence_ns, quaternions_of
@@ -100,6 +101,7 @@ class Sweeps:
     instruments: Instruments | None = None  # of the carrier, with files beside it
     fired: Fired | None = None  # all rays, if the survey keeps every return with its ray
     classes: Mapping[int, str] = field(default_factory=dict, compare=False)  # their names
+    faults: tuple[Fault, ...] = ()  # of all sensors
 
     def __len__(self) -> int:
         return len(self.begins_ns)
@@ -145,13 +147,11 @@ class Sweeps:
     def of(cls, survey: Survey, scene: Scene) -> Sweeps:
         """Return the sweeps of a survey of a scene."""
         path = survey.path
-        scans, begins, sensors, places, turns, mounts, done = [], [], [], [], [], [], 0
-        first_steps, ends = [], []
-        for number, (carried, steps) in enumerate(
-            zip(survey.carried, survey.steps_each, strict=True)
-        ):
-            firsts, since, until = _of_head(carried.sensor, steps)
-            mount = carried.mount
+        sensors, places, turns, mounts, first_steps = [], [], [], [], []
+        each = survey.sweeps_each
+        for number, carried in enumerate(survey.carried):
+            (firsts, begins, _), mount = each[number], carried.mount
+            since = begins[: len(begins) // path.stations]
             turned = np.eye(3) if mount.rotation is None else mount.rotation
             mounts.append((mount.position, turned))
             for station in range(path.stations):
@@ -159,13 +159,11 @@ class Sweeps:
                 rotations = _full(found, len(since))
                 places.append(positions + rotations @ np.array(mount.position))
                 turns.append(rotations @ turned)
-                begins.append(station * survey.station_ns + since)
-                ends.append(station * survey.station_ns + until)
-                scans.append(done + firsts)
-                first_steps.append(firsts)
-                done += steps
             sensors.append(np.full(len(since) * path.stations, number, np.uint8))
-        when, end = np.concatenate(begins), np.concatenate(ends)
+            shown = [sent(survey, scan) for scan in firsts.tolist()]
+            older = np.array([one.scan + one.ahead for one in shown])
+            first_steps.append((older - firsts[0]) % survey.steps_each[number])
+        when, end = (np.concatenate([one[k] for one in each]) for k in (1, 2))
         actor_poses, there = [], []
         for actor in scene.actors:
             at, turned_by = actor.trajectory.poses(0, np.append(when, end))
@@ -180,7 +178,7 @@ class Sweeps:
             lidars = tuple(carried.sensor for carried in survey.carried)
             fired = Fired(lidars, most, np.concatenate(first_steps))
         return cls(
-            np.append(np.concatenate(scans), done),
+            np.append(np.concatenate([firsts for firsts, _, _ in each]), survey.scan_count),
             when,
             end,
             np.concatenate(sensors),
@@ -202,7 +200,20 @@ class Sweeps:
             instruments=Instruments.of(survey),
             fired=fired,
             classes=survey.classes,
+            faults=tuple(survey.faults),
         )
+
+    def faults_in(self, sweep: int) -> tuple[Fault, ...]:
+        """Return the faults that are in a sweep: at some time of it, or if frozen, as it begins."""
+        sensors = None, self.sensors[self.sensor[sweep]]
+        begin, end = self.begins_ns[sweep], self.ends_ns[sweep]
+        own = (one for one in self.faults if one.sensor in sensors)
+        return tuple(one for one in own if one.during(begin, None if one.kind == "frozen" else end))
+
+    def stamp_ns(self, sweep: int) -> int:
+        """Return when the sensor says that a sweep began, nanoseconds since the survey's start."""
+        begin = self.begins_ns[sweep]
+        return round(begin) + sum(int(one.jumps_ns(begin)) for one in self.faults_in(sweep))
 
     def points(self, cloud: CloudLike, first: int = 0, stop: int | None = None) -> Iterator[Cloud]:
         """Yield the points of each sweep from `first` to `stop` in order, also of empty ones.
@@ -242,6 +253,7 @@ class Sweeps:
         if self.instruments is not None:
             words["instruments"] = self.instruments.words()
         words |= {"classes": dict(self.classes)} if self.classes else {}
+        words |= {"faults": [one.words() for one in self.faults]} if self.faults else {}
         arrays: dict[str, Any] = {"words": np.frombuffer(json.dumps(words).encode(), np.uint8)}
         arrays |= {name: getattr(self, name) for name in _ARRAYS}
         placed = {"": self.pose, "mount_": self.mounts, "actor_": self.actor_poses}
@@ -285,6 +297,7 @@ class Sweeps:
                 actor_poses=actor_poses,
                 instruments=instruments and Instruments.from_words(instruments, Path(path).parent),
                 classes={int(number): name for number, name in words.get("classes", {}).items()},
+                faults=tuple(Fault(**one) for one in words.get("faults", ())),
                 **{name: arrays[name] for name in _ARRAYS},
                 **{name: words[name] for name in _WORDS},
             )
@@ -319,16 +332,6 @@ def plain_names(names: Iterable[str]) -> list[str]:
             plain = f"{allowed}_{number}"
         out.append(plain)
     return out
-
-
-def _of_head(sensor: Sensor, steps: int) -> tuple[Ints, Floats, Floats]:
-    """First time step of each of so many sweeps, their starts and ends since the station's."""
-    firsts = np.flatnonzero(np.diff(sensor.turns(np.arange(steps)), prepend=-1))
-    lasts = np.append(firsts[1:], steps) - 1
-    firings = [[sensor.firings(step)[0] for step in firsts.tolist()]]
-    firings += [[sensor.firings(step)[1] - 1 for step in lasts.tolist()]]
-    begins, ends = (sensor.begins_ns(np.array(each)) + sensor.lead_ns for each in firings)
-    return firsts, begins, ends
 
 
 def _full(rotations: Floats | None, count: int) -> Floats:

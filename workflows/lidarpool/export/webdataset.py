@@ -102,6 +102,8 @@ class Pieces(pieces.Pieces):
             "box_objects": there.objects.tolist(),
             "box_points": there.points.tolist(),
         }
+        if faults := sweeps.faults_in(number):
+            about["faults"] = [one.words() for one in faults]
         files = {f"{name}.npy": _npy(array) for name, array in arrays.items()}
         files["json"] = json.dumps(about).encode()
         key = f"{self.names[sweeps.sensor[number]]}-{sweeps.numbers[number]:06}"

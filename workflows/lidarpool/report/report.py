@@ -211,6 +211,7 @@ def _parameters(scene: Scene, survey: Survey) -> dict[str, Any]:
         "steps": survey.steps_each[0],
         "materials": len(survey.materials),
         "navigation": None if survey.navigation is None else asdict(survey.navigation),
+        **({"faults": [one.words() for one in survey.faults]} if survey.faults else {}),
         **options,
         "start": None if survey.start is None else survey.start.isoformat(),
     }

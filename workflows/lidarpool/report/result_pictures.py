@@ -37,7 +37,7 @@ from ..scene.scene import Scene
 from .page.rendering import put_picture
 
 SIDE_LEAST, SIDE_MOST = 480, 4096  # letters need some pixels; a pixel takes 0.4 kB of memory
-_LIGHT = ("reflectivity", "intensity")  # columns for the picture of intensity, the better first
+_LIGHT = ("reflectance", "intensity")  # columns for the picture of intensity, the better first
 SIDES_RATIO = 2  # longer side to shorter, at most, or legends do not fit
 FRAME = (0.085, 0.115, 0.70, 0.755)  # left, bottom, width, height of the plot on the page
 MOST_TRIALS = 1000

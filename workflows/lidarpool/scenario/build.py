@@ -392,6 +392,7 @@ def _survey(
         returns=Returns(**dict(given.returns)),
         noise=Noise() if own_noise else Noise(**dict(given.noise)),
         navigation=given.navigation,
+        faults=given.faults,
         **declared(given.weather, Weather),
         **cloud,
     )

@@ -30,6 +30,7 @@ from pydantic import (
 )
 
 from ..base.declared import (
+    Ends,
     Seed,
     Several,
     Text,
@@ -48,7 +49,7 @@ from ..base.yamlfile import load_yaml
 from ..datasets.job_table import Value
 from ..export.format_table import DATA_SETS, LAYOUTS
 from ..sensor.calibrations import said, text_of
-from .sections import Ends, Section, may_be_empty
+from .sections import Section, may_be_empty
 
 SIGMAS = 6.0  # normal numbers are drawn again beyond, one of 500 million
 SHARE_LEAST = 0.01  # of a normal distribution that lies within limits

@@ -17,7 +17,7 @@ from ..base.validation import sentences
 from ..base.yamlfile import read_yaml
 from ..columns.table import COLOURS
 from ..scene.files.meshfile import CONVERTED, ROBOTS, SUFFIXES
-from ..sensor import Material, Navigation
+from ..sensor import Fault, Material, Navigation
 from ..sensor.materials import ClassNames
 from ..sensor.survey import SENSORS_MOST, CloudOptions, StepCount
 from ..sensor.trajectory import CENTRE
@@ -85,7 +85,8 @@ class Scenario(Section):
 
     Parameters
     ----------
-    scene, sensor, materials, returns, noise, weather, navigation, cloud, output, planning, pool
+    scene, sensor, materials, returns, noise, weather, navigation, faults, cloud, output, \
+    planning, pool
         See `lidarpool.scenario.sections`.
     poses
         Poses of the sensor, in world coordinates. By default it stands at the origin (default
@@ -185,6 +186,10 @@ class Scenario(Section):
             {"imu": {"rate_hz": 200}, "gnss": {"rate_hz": 10}},
         ),
     ] = None
+    faults: Annotated[
+        Several[Fault],
+        about("faults of sensors", [{"kind": "dirt", "transmission": 0.3}], max_length=256),
+    ] = ()
     cloud: Annotated[CloudOptions, may_be_empty(CloudOptions)] = CloudOptions()
     output: Annotated[OutputSection, may_be_empty(OutputSection)] = OutputSection()
     planning: Annotated[PlanningSection, may_be_empty(PlanningSection)] = PlanningSection()

@@ -6,9 +6,8 @@ from collections.abc import Callable, Iterable
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from math import inf
 from pathlib import Path
-from typing import Annotated, Any, Literal, TypeVar
+from typing import Annotated, Any, Literal
 
 from pydantic import (
     AfterValidator,
@@ -22,6 +21,7 @@ from pydantic import (
 from ..base.declared import (
     AngleDeg,
     Coordinate,
+    Ends,
     Four,
     Seed,
     Several,
@@ -61,14 +61,6 @@ def _upright(sides: tuple[float, float, float, float]) -> tuple[float, float, fl
     return sides
 
 
-def _in_order(ends: tuple[float, float]) -> tuple[float, float]:
-    if not 0 <= ends[1] - ends[0] < inf:
-        raise must_be("[least, largest]")
-    return ends
-
-
-T = TypeVar("T")
-Ends = Annotated[Two[T], AfterValidator(_in_order)]  # least and largest number
 Rectangle = Annotated[Four[Coordinate], AfterValidator(_upright)]
 Factors = Three[Factor]
 Scale = Annotated[

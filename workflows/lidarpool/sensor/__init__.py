@@ -1,6 +1,7 @@
 """Sensors: beams, heads, trajectories, and surveys."""
 
 from .beams import Beams, Head, Mirror, Spin
+from .faults import Fault
 from .materials import Material
 from .navigation import Gnss, Imu, Navigation
 from .noise import Noise
@@ -13,6 +14,7 @@ from .trajectory_files import load_trajectory
 
 __all__ = [
     "Beams",
+    "Fault",
     "Gnss",
     "Head",
     "Imu",

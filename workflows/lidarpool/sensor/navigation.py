@@ -23,11 +23,11 @@ import numpy as np
 from pydantic import Field, Strict
 
 from ..base.arrays import Floats, Ints
-from ..base.declared import Seed, about
-from ..base.elementary import arctan2, exp_of, sin_cos, sin_cos_of
+from ..base.declared import Ends, Seed, Several, UnitShare, about
+from ..base.elementary import arctan2, exp, exp_of, sin_cos, sin_cos_of
 from ..base.errors import LidarpoolError
 from ..base.validation import checked_fields
-from ..base.vectors import applied, hypot, into_axes, length, matmul
+from ..base.vectors import applied, hypot, into_axes, length, matmul, turned
 from .noise import Purpose, named_seed, normal
 from .trajectory import AT_CENTRE, CENTRE, Pose, Trajectory, velocities
 
@@ -35,6 +35,7 @@ if TYPE_CHECKING:
     from .survey import Survey
 
 BLOCK = 1 << 14  # samples that are made at a time
+RETURNS_IN_S = 1.0  # after an outage, 37 % of its error are left
 
 Latitude = Annotated[float, Field(ge=-90, le=90)]
 Longitude = Annotated[float, Field(ge=-360, le=360)]
@@ -45,6 +46,8 @@ TurnNoise = Annotated[float, Field(ge=0, le=100)]  # of a gyroscope
 SpeedNoise = Annotated[float, Field(ge=0, le=1000)]  # of an accelerometer
 Deviation = Annotated[float, Field(ge=0, le=1e6)]  # metres
 Correlation = Annotated[float, Field(ge=0.001, le=1e9)]  # seconds
+Skew = Annotated[float, Field(ge=0, le=10)]  # degrees
+Span = Annotated[float, Field(ge=0, le=1e9)]  # seconds
 
 
 @dataclass(frozen=True)
@@ -83,6 +86,8 @@ class Imu:
     ] = 0.0
     accelerometer_bias_time_s: Annotated[Correlation, about("its correlation time")] = 300.0
     accelerometer_random_walk: Annotated[SpeedNoise, about("of the bias, m/s^3/sqrt(Hz)")] = 0.0
+    scale: Annotated[UnitShare, about("standard deviation of each axis's scale factor")] = 0.0
+    misalignment_deg: Annotated[Skew, about("of angles between axes, standard deviation")] = 0.0
 
 
 @dataclass(frozen=True)
@@ -113,6 +118,10 @@ class Gnss:
     ] = 0.0
     drift_vertical_m: Annotated[Deviation, about("the same, up")] = 0.0
     drift_time_s: Annotated[Correlation, about("correlation time of the drift")] = 600.0
+    outages: Annotated[
+        Several[Ends[Span]],
+        about("begins and ends, seconds; the IMU bridges them, without one no positions are there"),
+    ] = ()
     origin: Annotated[
         GeodeticPosition | None,
         about(
@@ -199,23 +208,8 @@ def imu_samples(survey: Survey, block: int = BLOCK) -> Iterator[ImuSamples]:
     if navigation is None or navigation.imu is None:
         return
     imu, seed = navigation.imu, named_seed(navigation.seed, survey.carrier)
-    step_s, three = 1 / imu.rate_hz, np.ones(3)
-    gyroscope = _Errors(
-        named_seed(seed, "gyroscope"),
-        step_s,
-        three * imu.gyroscope_noise_density * math.sqrt(imu.rate_hz),
-        three * imu.gyroscope_bias,
-        imu.gyroscope_bias_time_s,
-        three * imu.gyroscope_random_walk,
-    )
-    accelerometer = _Errors(
-        named_seed(seed, "accelerometer"),
-        step_s,
-        three * imu.accelerometer_noise_density * math.sqrt(imu.rate_hz),
-        three * imu.accelerometer_bias,
-        imu.accelerometer_bias_time_s,
-        three * imu.accelerometer_random_walk,
-    )
+    gyroscope, turn_skew = _of_axes(imu, "gyroscope", seed)
+    accelerometer, speed_skew = _of_axes(imu, "accelerometer", seed)
     gravity = np.array([0.0, 0.0, -navigation.gravity_m_s2])
     count = math.floor(survey.duration_ns * imu.rate_hz / 1e9 + 1e-6)
     for first in range(0, count, block):
@@ -228,9 +222,22 @@ def imu_samples(survey: Survey, block: int = BLOCK) -> Iterator[ImuSamples]:
         rates = _rotation_vectors(turns[:-1], turns[1:]) * imu.rate_hz
         yield ImuSamples(
             np.rint(ends[1:]).astype(np.int64),
-            rates + gyroscope.of(samples),
-            into_axes(forces, halfway) + accelerometer.of(samples),
+            turned(rates, turn_skew) + gyroscope.of(samples),
+            turned(into_axes(forces, halfway), speed_skew) + accelerometer.of(samples),
         )
+
+
+def _of_axes(imu: Imu, name: str, seed: int) -> tuple[_Errors, Floats | None]:
+    """Return the errors of an IMU's three gyroscopes, or the like, and their axes (3, 3)."""
+    names, seed = ("noise_density", "bias", "bias_time_s", "random_walk"), named_seed(seed, name)
+    density, bias, time_s, walk = (getattr(imu, f"{name}_{one}") for one in names)
+    white, three = density * math.sqrt(imu.rate_hz), np.ones(3)
+    errors = _Errors(seed, 1 / imu.rate_hz, three * white, three * bias, time_s, three * walk)
+    if not (imu.scale or imu.misalignment_deg):
+        return errors, None
+    sigma = np.where(np.eye(3, dtype=bool), imu.scale, math.radians(imu.misalignment_deg))
+    drawn = normal(seed, Purpose.SKEW, 0, np.arange(9)).reshape(3, 3)
+    return errors, np.eye(3) + sigma * drawn
 
 
 def fixes(survey: Survey, block: int = BLOCK) -> Iterator[Fixes]:
@@ -252,7 +259,28 @@ def fixes(survey: Survey, block: int = BLOCK) -> Iterator[Fixes]:
         samples = np.arange(first, min(first + block, count))
         times = np.asarray(samples * 1e9 / gnss.rate_hz, np.float64)
         places, _, _ = _moved(path, gnss.mount, times)
-        yield Fixes(np.rint(times).astype(np.int64), places + errors.of(samples))
+        places = places + errors.of(samples)
+        for number, (begin, end) in enumerate(gnss.outages):
+            if navigation.imu is None:
+                there = (times < begin * 1e9) | (times >= end * 1e9)
+                times, places = times[there], places[there]
+            else:
+                ends = times / 1e9 - begin, end - begin
+                places += _bridged(navigation.imu, errors.seed, number, *ends)
+        yield Fixes(np.rint(times).astype(np.int64), places)
+
+
+def _bridged(imu: Imu, seed: int, number: int, since: Floats, lasts: float) -> Floats:
+    """Errors of positions (k, 3) while an IMU bridges an outage, and after: seconds since it began.
+
+    A bias b grows to b t^2 / 2, a velocity random walk N to N sqrt(t^3 / 3) (Groves 2013).
+    """
+    grown = np.clip(since, 0, lasts)[:, None]
+    left = exp(np.minimum(lasts - since, 0) / RETURNS_IN_S)[:, None]
+    bias, walk = (normal(seed, Purpose.OUTAGE, number, np.arange(3), k) for k in range(2))
+    by_bias = imu.accelerometer_bias * bias * (grown * grown / 2)
+    by_walk = imu.accelerometer_noise_density * walk * (grown * np.sqrt(grown / 3))
+    return np.asarray(left * (by_bias + by_walk))
 
 
 def _moved(path: Trajectory, mount: Pose, times_ns: Floats) -> tuple[Floats, Floats, Floats]:
@@ -293,7 +321,7 @@ class _Errors:
         bias_time_s: float,
         walk: Floats,  # (3,): of the random walk in a second
     ) -> None:
-        self._seed = seed
+        self.seed = seed
         self._white, self._bias, self._walk = white, bias, walk * math.sqrt(step_s)
         self._kept = exp_of(-step_s / bias_time_s)
         self._driven = bias * math.sqrt(1 - self._kept * self._kept)
@@ -329,7 +357,7 @@ class _Errors:
     def _normal(self, purpose: Purpose, samples: Ints) -> Floats:
         """Make normal deviates for samples (k,) along each axis: (k, 3)."""
         high, low = np.divmod(samples, 1 << 32)
-        return np.stack([normal(self._seed, purpose, high, low, axis) for axis in range(3)], axis=1)
+        return np.stack([normal(self.seed, purpose, high, low, axis) for axis in range(3)], axis=1)
 
 
 def geodetic(positions: Floats, origin: tuple[float, float, float]) -> Floats:

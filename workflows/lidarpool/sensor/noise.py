@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 from enum import Enum, unique
 from functools import cache
 from hashlib import sha256
+from math import inf
 from statistics import NormalDist
 from typing import Annotated
 
@@ -17,8 +18,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pydantic import Field
 
-from ..base.arrays import Bools, Floats, Indices, Integers
-from ..base.declared import Seed, UnitShare, about
+from ..base.arrays import Bools, Floats, Indices, Integers, Ints
+from ..base.declared import AngleDeg, Seed, Several, UnitShare, about, allowed
 from ..base.elementary import exp, log
 from ..base.errors import LidarpoolError
 from ..base.validation import checked_fields
@@ -30,6 +31,9 @@ TARGET_REFLECTANCE = 0.1  # reflectance of stated ranges
 ALARMS_MOST = 20  # false alarms of a pulse on average: a ray has numbers for 255
 
 Metres = Annotated[float, Field(ge=0, le=1000)]
+Bias = Annotated[float, Field(ge=-1000, le=1000)]
+DecayTime = Annotated[float, Field(gt=0, le=1e7)]
+AngleSigma = Annotated[float, Field(ge=0, le=10)]  # degrees
 
 _GAMMA = 0x9E3779B97F4A7C15
 _NUMBERS = 256  # of one ray
@@ -64,8 +68,12 @@ class Purpose(Enum):
     WHITE = 41  # white noise of an instrument
     DRIVEN = 42  # steps of its bias
     WALK = 43  # steps of its random walk
+    SKEW = 44  # scale factors of its axes, and angles between them
+    OUTAGE = 45  # how it drifts where there is no GNSS
     SAMPLES = 50  # stream of the samples of a waveform
     SAMPLE = 51  # noise of a sample
+    CHANNEL = 60  # a channel's error of range
+    PACKET = 61  # whether a packet is lost
 
 
 @dataclass(frozen=True)
@@ -89,7 +97,7 @@ class Noise:
         float, about("standard deviation added for each metre of range", 0.0002, ge=0, le=1)
     ] = 0.0
     angle_deg: Annotated[
-        float, about("standard deviation of beam directions, in both axes", 0.05, ge=0, le=10)
+        AngleSigma, about("standard deviation of beam directions, in both axes", 0.05)
     ] = 0.0
     dropout: Annotated[
         UnitShare, about("share of returns that are lost, whatever their energy")
@@ -154,12 +162,32 @@ class Noise:
     velocity_m_s: Annotated[
         float, about("standard deviation of radial velocities, m/s", ge=0, le=1000)
     ] = 0.0
+    saturation: Annotated[
+        float | None,
+        about(
+            "signal that fills the receiver, in thresholds of detection: stronger pulses are "
+            "clipped and wider, and hide what is close; by default none",
+            100.0,
+            ge=1,
+            le=1e12,
+        ),
+    ] = None
+    channel_bias_m: Annotated[
+        Metres | Several[Bias],
+        allowed("a number of 0 to 1000, or a list of numbers, one for each channel"),
+        about("constant errors of channels' ranges, metres: standard deviation, or one for each"),
+    ] = 0.0
+    warm_up_m: Annotated[Bias, about("error of ranges at the start, which decays, metres")] = 0.0
+    warm_up_s: Annotated[DecayTime, about("time in which it falls to 37 %, seconds")] = 600.0
+    ripple_deg: Annotated[AngleSigma, about("greatest error of azimuths, as the head turns")] = 0.0
+    ripple_cycles: Annotated[int, about("how often it repeats in a turn", ge=1, le=100_000)] = 1
+    ripple_phase_deg: Annotated[AngleDeg, about("its phase where the head is at azimuth 0")] = 0.0
 
     def __post_init__(self) -> None:
-        needs = ("range_at_threshold_m", "walk_m", "false_alarm_hz", "stray_light", "crosstalk")
+        needs = "range_at_threshold_m", "walk_m", "false_alarm_hz", "stray_light", "crosstalk"
         if self.detection_range_m is None:
-            for name in needs:
-                if getattr(self, name) > 0:
+            for name in (*needs, "saturation"):
+                if getattr(self, name):
                     raise LidarpoolError(
                         f"noise.{name} is measured by the threshold of detection: give "
                         "noise.detection_range_m as well."
@@ -173,19 +201,20 @@ class Noise:
         return float(TARGET_REFLECTANCE * at_right_angles(self.detection_range_m))
 
     @property
+    def full(self) -> float:
+        """Signal that fills the receiver: no recorded pulse is higher."""
+        return inf if self.saturation is None else self.saturation * self.threshold
+
+    @property
     def loses(self) -> bool:
         """Whether returns can be lost."""
         return self.dropout > 0 or self.detection_range_m is not None
 
     @property
-    def displaces(self) -> bool:
-        """Whether directions or ranges deviate."""
-        return self.angle_deg > 0 or self.moves_ranges
-
-    @property
     def moves_ranges(self) -> bool:
         """Whether ranges deviate."""
-        return any((self.range_m, self.range_per_m, self.range_at_threshold_m, self.walk_m))
+        random = self.range_m, self.range_per_m, self.range_at_threshold_m
+        return any((*random, self.walk_m, self.channel_bias_m, self.warm_up_m))
 
     def named(self, name: str) -> Noise:
         """Return the noise of a sensor, whose name is part of all its random numbers."""
@@ -210,6 +239,17 @@ class Noise:
         if self.walk_m and energy is not None:
             distance = distance - self.walk(energy)
         return np.maximum(distance + sigma * normal(self.seed, Purpose.RANGE, scan, ray, number), 0)
+
+    def offsets(self, channel: Integers, times_ns: Ints) -> Floats:
+        """Return errors of range that last: of channels (n,) at times since the start, metres."""
+        biases = np.asarray(self.channel_bias_m, np.float64)
+        if not biases.ndim:
+            each = np.arange(channel.max(initial=0) + 1)
+            biases = biases * normal(self.seed, Purpose.CHANNEL, 0, each)
+        out = biases[channel]
+        if self.warm_up_m:
+            out = out + self.warm_up_m * exp(times_ns * (-1e-9 / self.warm_up_s))
+        return out
 
     def velocities(
         self, velocity: Floats, scan: Integers, ray: Integers, number: Integers

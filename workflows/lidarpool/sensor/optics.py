@@ -16,6 +16,7 @@ from ..base.errors import LidarpoolError
 from ..base.validation import checked_fields
 from ..base.vectors import hypot
 from .disc import SUBRAYS, Beam, Profile
+from .reflectivity import SCALES
 
 LIGHT_M_NS = 0.299792458  # in vacuum; in air it is slower by 0.03 %
 FWHM = sqrt(8 * log_of(2.0))  # full width at half maximum of a Gaussian, in standard deviations
@@ -60,6 +61,10 @@ class Optics:
     exit_diameter_m: Annotated[Diameter, about("width of the beam where it leaves the sensor")] = (
         0.0
     )
+    reflectivity: Annotated[
+        Literal[tuple(SCALES)],  # type: ignore[valid-type]
+        about("whose scale the column reflectivity has; Velodyne's if no source states it"),
+    ] = "velodyne"
 
     def __post_init__(self) -> None:
         if isinstance(self.divergence_mrad, (Sequence, np.ndarray)):

@@ -14,6 +14,7 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import AwareDatetime, Field, Strict
 
+from ..base.arrays import Floats, Ints
 from ..base.declared import FILLED_IN, Several, about, written_as
 from ..base.errors import LidarpoolError
 from ..base.validation import checked_fields, shown
@@ -25,6 +26,7 @@ from ..columns.table import (
     stored,
     waveform_column,
 )
+from .faults import Fault, check_faults
 from .materials import ClassNames, Material
 from .navigation import Navigation, check_navigation
 from .noise import ALARMS_MOST, Noise
@@ -97,6 +99,8 @@ class ScanSpec:
         Of that.
     ahead
         By how many scans its random numbers are ahead of its number.
+    repeats
+        Of a frozen sensor: the first scan of the sweep that it sends again, and of its own.
     """
 
     scan: int
@@ -106,6 +110,7 @@ class ScanSpec:
     sensor: int = 0
     channels: int = 1
     ahead: int = 0
+    repeats: tuple[int, int] | None = None
 
     @property
     def ray_count(self) -> int:
@@ -216,6 +221,8 @@ class Survey(CloudOptions, Weather):
         Noise of ranges and angles, and lost returns.
     navigation
         IMU and GNSS receiver of the carrier, whose samples are written beside the cloud.
+    faults
+        Faults of sensors, such as dirt or lost packets.
     classes
         Names of semantic classes, {number: name}, for reports and files; they add the column.
     **options
@@ -243,6 +250,7 @@ class Survey(CloudOptions, Weather):
     returns: Returns = field(default_factory=Returns)
     noise: Noise = field(default_factory=Noise)
     navigation: Navigation | None = None
+    faults: Sequence[Fault] = ()
     classes: ClassNames = field(default_factory=dict, compare=False)
 
     def __post_init__(self) -> None:
@@ -263,6 +271,7 @@ class Survey(CloudOptions, Weather):
             self._set(steps=STEPS)
         for carried, steps in zip(self.carried, self.steps_each, strict=True):
             self._check_duration(carried.sensor, steps)
+        check_faults(self)
 
     def _set(self, **fields: Any) -> None:
         for name, value in fields.items():
@@ -309,7 +318,7 @@ class Survey(CloudOptions, Weather):
                     f"picoseconds: with waveform_samples, give {round(returns.sample_ns, 3):g}."
                 )
         for number, noise in enumerate(self.noise_each):
-            _check_alarms(noise, self.carried[number].sensor)
+            _check_noise(noise, self.carried[number].sensor)
             if noise.crosstalk:
                 self._check_crosstalk(number)
         if self.returns_light:
@@ -462,6 +471,20 @@ class Survey(CloudOptions, Weather):
         """Number of scans."""
         return self._firsts[-1]
 
+    @cached_property
+    def sweeps_each(self) -> tuple[tuple[Ints, Floats, Floats], ...]:
+        """First scans of each sensor's sweeps, and when their first and last firings begin, ns."""
+        out, stations = [], np.arange(self.path.stations)[:, None]
+        for number, carried in enumerate(self.carried):
+            sensor, steps, base = carried.sensor, self.steps_each[number], self._firsts[number]
+            firsts = np.flatnonzero(np.diff(sensor.turns(np.arange(steps)), prepend=-1))
+            begins = [sensor.firings(step)[0] for step in firsts.tolist()]
+            ends = [sensor.firings(step - 1)[1] - 1 for step in [*firsts[1:].tolist(), steps]]
+            times = (sensor.begins_ns(np.array(each)) + sensor.lead_ns for each in (begins, ends))
+            begin, end = ((stations * self.station_ns + each).ravel() for each in times)
+            out.append(((base + stations * steps + firsts).ravel(), begin, end))
+        return tuple(out)
+
     @property
     def ray_count(self) -> int:
         """Number of rays in all scans."""
@@ -511,8 +534,15 @@ class Survey(CloudOptions, Weather):
         return spec.start_ns + begin_ns(sensor, spec.firings[0]) + sensor.lead_ns
 
 
-def _check_alarms(noise: Noise, sensor: Sensor) -> None:
-    """Check that false alarms end, and are not too many."""
+def _check_noise(noise: Noise, sensor: Sensor) -> None:
+    """Check that a sensor can have its noise, and that false alarms are not too many."""
+    biases, channels = noise.channel_bias_m, sensor.channels
+    if isinstance(biases, Sequence) and len(biases) != channels:
+        raise LidarpoolError(
+            f"noise.channel_bias_m has {len(biases)} numbers; {sensor.model} needs {channels}."
+        )
+    if noise.ripple_deg and sensor.spins(np.zeros(1, np.int64)) is None:
+        raise LidarpoolError(f"noise.ripple_deg needs a head that turns, unlike {sensor.model}'s.")
     if noise.false_alarm_hz and not sensor.gate_s < float("inf"):
         raise LidarpoolError(
             f"noise.false_alarm_hz needs a sensor with a greatest range, and {sensor.model} has "

@@ -1,23 +1,26 @@
-"""Noise of the directions in which beams are sent."""
+"""Errors of the directions in which beams are sent."""
 
 from __future__ import annotations
 
 import numpy as np
 
+from ..base.elementary import sin_cos
+from ..base.vectors import hypot
 from ..sensor.noise import Purpose
 from .returns import PulseReturns
 from .step import Memory, PulseBatch, PulseStep, Setup, Sizes
 
 
 class AngleNoiseStep(PulseStep):
-    """Casts beams in directions with noise; their reported directions have none."""
+    """Casts beams in directions with errors; their reported directions have none."""
 
+    effects = ("Errors that last",)
     purposes = Purpose.ACROSS, Purpose.UP
 
     @staticmethod
     def applies(setup: Setup) -> bool:
         """See `PulseStep.applies`."""
-        return setup.noise.angle_deg > 0
+        return setup.noise.angle_deg > 0 or setup.noise.ripple_deg > 0
 
     @staticmethod
     def memory(setup: Setup, sizes: Sizes) -> Memory:
@@ -28,6 +31,15 @@ class AngleNoiseStep(PulseStep):
 
     def apply(self, returns: PulseReturns, batch: PulseBatch) -> PulseReturns:
         """See `PulseStep.apply`."""
-        rays = np.arange(batch.start, batch.stop)
-        batch.offsets = np.stack(self.setup.noise.angles(*batch.keys.of(rays)), axis=1)
+        rays, noise = np.arange(batch.start, batch.stop), self.setup.noise
+        keys, none = batch.keys.of(rays), np.zeros((2, len(rays)))
+        across, up = noise.angles(*keys) if noise.angle_deg else none
+        if noise.ripple_deg:
+            firing, channel = np.divmod(rays, self.setup.sensor.channels)
+            azimuth = self.setup.sensor.head.azimuths(batch.firings.numbers)
+            sin, _ = sin_cos(noise.ripple_cycles * azimuth + np.radians(noise.ripple_phase_deg))
+            # A degree of azimuth is less across a beam, the steeper it looks.
+            level = hypot(*self.setup.sensor.ahead.T[:2])
+            across += np.radians(noise.ripple_deg) * sin.take(firing) * level.take(channel)
+        batch.offsets = np.stack([across, up], axis=1)
         return returns

@@ -9,7 +9,7 @@ typedef long long Count;
 #define KERNEL extern "C" __global__ void
 #define WANTED(column) (wanted >> column & 1)
 
-enum { X, Y, Z, CHANNEL, OBJECT, RAY, TIME, RANGE, INTENSITY, REFLECTIVITY, CLASS, TRIANGLE };
+enum { X, Y, Z, CHANNEL, OBJECT, RAY, TIME, RANGE, INTENSITY, REFLECTANCE, CLASS, TRIANGLE };
 
 // Cosine of the angle between a ray and a normal, which `turn` takes to the scene's axes, if it is
 // not 0.
@@ -49,7 +49,7 @@ KERNEL columns(
     int* __restrict__ x, int* __restrict__ y, int* __restrict__ z,
     unsigned short* __restrict__ channel, int* __restrict__ object,
     unsigned int* __restrict__ ray_of_scan, Count* __restrict__ time, float* __restrict__ range,
-    float* __restrict__ intensity, float* __restrict__ reflectivity,
+    float* __restrict__ intensity, float* __restrict__ share_back,
     unsigned short* __restrict__ semantic, int* __restrict__ triangle_of_scene)
 {
     const Count k = blockIdx.x * (Count)blockDim.x + threadIdx.x;
@@ -82,13 +82,13 @@ KERNEL columns(
     object[k] = owner;
     if (WANTED(TRIANGLE)) triangle_of_scene[k] = (int)(body[0] + face);
     if (WANTED(CLASS)) semantic[k] = classes[owner];
-    if (body[2] >= 0 && (WANTED(INTENSITY) || WANTED(REFLECTIVITY))) {
+    if (body[2] >= 0 && (WANTED(INTENSITY) || WANTED(REFLECTANCE))) {
         const double* turn = body[1] < 0 ? 0 : turns + 9 * (Count)instance[k];
         const double along = cosine(normals + 3 * (body[2] + face), turn, directions + k, count);
         const double scattered = reflectance[owner] * (retro[owner] ? retro_gain : along);
         const double share = reference / fmax(metres, nearest);
         const double lost = share * share;
         if (WANTED(INTENSITY)) intensity[k] = (float)(scattered * lost);
-        if (WANTED(REFLECTIVITY)) reflectivity[k] = (float)(scattered * lost / lost);
+        if (WANTED(REFLECTANCE)) share_back[k] = (float)(scattered * lost / lost);
     }
 }

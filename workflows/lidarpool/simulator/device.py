@@ -34,7 +34,7 @@ from .surfaces import Surfaces
 
 OPTIONS = "-std=c++17", "-fmad=false"  # of the compiler
 _BLOCK = 128  # threads
-_ENERGIES = "intensity", "reflectivity"
+_ENERGIES = "intensity", "reflectance"
 _TRIANGLE = TABLE["triangle"]
 # In the order of columns.cu.
 _MADE = (
@@ -55,6 +55,7 @@ def _able(survey: Survey) -> set[str]:
         for m in survey.materials
     )
     able = {column.name for column in _MADE} - {*(_ENERGIES if hazy or shining else ())}
+    able -= {"time"} if any(fault.by_s for fault in survey.faults) else set()
     return able - {axis.name for axis in AXES if survey.coordinates == "sensor"}
 
 

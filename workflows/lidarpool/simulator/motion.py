@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -11,9 +12,9 @@ import numpy as np
 import raybeam.poses
 from raybeam import Motion, Pattern
 
-from ..base.arrays import Floats, Integers, owned
+from ..base.arrays import Floats, Integers, Ints, owned
 from ..base.vectors import into_axes, matmul
-from ..sensor import Mounted, Trajectory
+from ..sensor import Mounted, ScanSpec, Sensor, Trajectory
 from ..sensor.trajectory import velocities
 from .ways import Ways
 
@@ -38,6 +39,28 @@ class Clock:
         out, tables = np.empty(len(ray)), (owned(self.begins), owned(self.delays))
         surface_loops.times(owned(ray, np.int64), self.start, self.subrays, *tables, out)
         return out
+
+
+@dataclass(frozen=True, eq=False)
+class Firings:
+    """Consecutive firings of a sensor at a station, maybe several times; rays are numbered so."""
+
+    sensor: Sensor
+    numbers: Ints  # (f,): from the start of the station
+    spec: ScanSpec  # of the first of them
+
+    @classmethod
+    def of(cls, sensor: Sensor, specs: Sequence[ScanSpec], times: int = 1) -> Firings:
+        """Return the firings of consecutive scans, so many times in turn."""
+        numbers = np.arange(specs[0].firings[0], specs[-1].firings[1], dtype=np.int64)
+        return cls(sensor, np.tile(numbers, times), specs[0])
+
+    def times(self, ray: Integers) -> Ints:
+        """Return the firing times of rays (n,), nanoseconds since the survey's start: (n,)."""
+        number, channel = np.divmod(ray, ray.dtype.type(self.sensor.channels))
+        times = self.sensor.begins_ns(self.numbers).take(number)
+        times += self.sensor.beams.time_ns.take(channel)
+        return self.spec.start_ns + np.rint(times, out=times).astype(np.int64)
 
 
 @dataclass(frozen=True)

@@ -17,15 +17,18 @@ from ..columns.waveforms import column_type
 from ..scene.colours import unpacked
 from ..scene.scene import Scene
 from ..sensor import ScanSpec, Survey
+from ..sensor.faults import faults_of
 from ..sensor.materials import at_right_angles
 from ..sensor.optics import LIGHT_M_NS
+from ..sensor.reflectivity import SCALES
 from .doppler import radial_velocities
-from .motion import Poses
+from .motion import Firings, Poses
 from .pulses import Scanned
 from .returns import FALSE_ALARM, NO_SURFACE, made
 from .surfaces import Surfaces, light_of
 
 BLOCK_HITS = 1 << 16  # that are looked at a time
+COUNTS = 10_000  # of an intensity of 1: the makers publish no such figure
 LEAST_LEFT = 1e-30  # of the light, so that what is divided by it is finite in single precision
 
 
@@ -60,6 +63,7 @@ class BatchPoints:
         self._surfaces = surfaces
         self._pattern, self._start = pattern, start
         self._poses = poses
+        self._fired = Firings.of(self.sensor, specs)
 
     def __len__(self) -> int:
         return len(self.found.ray)
@@ -114,21 +118,23 @@ class BatchPoints:
         return np.full(len(self), self.specs[0].sensor, np.uint8)
 
     @cached_property
+    def _fired_ns(self) -> Ints:
+        return self._fired.times(self.found.ray)
+
+    @cached_property
     def time(self) -> Ints:
-        """Firing time of the ray, nanoseconds since the survey's start."""
-        times = self.sensor.begins_ns(self._firings).take(self._number)
-        times += self.sensor.beams.time_ns.take(self.channel)
-        return self.specs[0].start_ns + np.rint(times, out=times).astype(np.int64)
+        """Time of the ray as the sensor states it, nanoseconds since the survey's start."""
+        spec, stamp = self.specs[0], self._fired_ns
+        if spec.repeats is not None:
+            before, now = map(self.survey.begins_ns, spec.repeats)
+            stamp = stamp + round(now - before)
+        jumps = faults_of(self.survey, spec.sensor, "time_jump").values()
+        return sum((one.jumps_ns(stamp) for one in jumps), stamp)
 
     @property
     def _times(self) -> Ints:
         """Firing times, where they matter, for actors."""
-        return self.time if self._poses.ways else np.zeros(len(self), np.int64)
-
-    @property
-    def _firings(self) -> Ints:
-        """All rays of the scans, with and without returns."""
-        return np.arange(self.specs[0].firings[0], self.specs[-1].firings[1])
+        return self._fired_ns if self._poses.ways else np.zeros(len(self), np.int64)
 
     @cached_property
     def _number(self) -> Ints:
@@ -158,7 +164,20 @@ class BatchPoints:
 
     @cached_property
     def positions(self) -> Floats:
-        """Ends of the rays, metres, the scene's local coordinates: (n, 3)."""
+        """Ends of the rays, metres, the scene's local coordinates: (n, 3).
+
+        A frozen sensor's points stay in its axes, and move with it.
+        """
+        if self.specs[0].repeats is None:
+            return self._ends
+        before, now = map(self.survey.pose, self.specs[0].repeats)
+        if before == now:
+            return self._ends
+        inside = turned(np.subtract(self._ends, before.position), before.turn.T)
+        return turned(inside, now.turn) + now.position
+
+    @cached_property
+    def _ends(self) -> Floats:
         origins, directions = self._rays
         out = directions * self.range[:, None]
         return np.add(out, origins, out=out)
@@ -212,7 +231,7 @@ class BatchPoints:
     def _to_sensor(self, vectors: Floats) -> Floats:
         """Turn vectors (n, 3) in the axes of the carrier, or the head, to those of the sensor."""
         if self._poses.by_head:
-            spins = self.sensor.spins(self._firings)
+            spins = self.sensor.spins(self._fired.numbers)
             assert spins is not None  # or the rig would not cast by head
             (cos, sin), (x, y, z) = (a.take(self._number) for a in spins), vectors.T
             looks = np.stack([x * cos - y * sin, x * sin + y * cos, z], axis=1)
@@ -276,7 +295,7 @@ class BatchPoints:
         """Packed colours."""
         if self.found.colour is not None:
             return self.found.colour
-        points = self.positions
+        points = self._ends
         if self.found.reported is not self.found.distance:
             points = self.directions * self.found.distance[:, None] + self._rays[0]
         return self._surfaces.colours(self.found.triangle, points, self._times, self._poses.ways)
@@ -297,7 +316,23 @@ class BatchPoints:
         return unpacked(self._colours)[:, 2]
 
     @property
-    def reflectivity(self) -> Floats:
+    def _recorded(self) -> Floats:
+        """Received energy, at most what fills the receiver."""
+        return np.minimum(self.intensity, self.survey.noise_each[self.specs[0].sensor].full)
+
+    @property
+    def signal(self) -> NDArray[np.uint16]:
+        """Counts in proportion to the recorded energy."""
+        return np.minimum(np.rint(self._recorded * COUNTS), 65_535).astype(np.uint16)
+
+    @property
+    def reflectivity(self) -> Bytes:
+        """Recorded energy without the loss by distance, on the scale of the sensor's maker."""
+        lost = at_right_angles(self.found.distance)
+        return SCALES[self.sensor.optics.reflectivity].codes(self._recorded / lost)
+
+    @property
+    def reflectance(self) -> Floats:
         """Intensity without the loss by distance and air."""
         lost = at_right_angles(self.found.distance, self.survey.extinction(self.sensor))
         # In thick fog or dust nothing is left of the light from where a false alarm seems to be.

@@ -203,6 +203,30 @@ def reported(ray, energy, mode, there):
         begin = stop
 
 
+@compiled()
+def filled(ray, full, height, front, back, distance, energy, there):
+    """Join the returns of a pulse that overlap if one of them is full; marks those that are left.
+
+    `front` and `back` (n,) are edges of pulses. Of joined returns the highest is left, with the
+    energy of all, and with the edges and the least distance of the full ones, which are written.
+    """
+    begin = 0
+    for k in range(len(ray)):
+        if ray[k] != ray[begin]:
+            begin = k
+        there[k], last = True, k
+        for j in range(k - 1, begin - 1, -1):
+            if not (there[j] and (full[j] or full[last]) and back[j] >= front[last]):
+                continue
+            last, gone = (j, last) if height[j] >= height[last] else (last, j)
+            there[gone] = False
+            energy[last] += energy[gone]
+            if full[gone]:
+                front[last] = min(front[last], front[gone])
+                back[last] = max(back[last], back[gone])
+                distance[last] = min(distance[last], distance[gone])
+
+
 @stage
 def _most(ray, each):
     """Return how many hits a beam has at most."""

@@ -16,7 +16,7 @@ from ..base.vectors import products
 from ..scene.scene import Scene
 from ..sensor import Survey
 from .doppler import radial_velocities
-from .motion import Poses
+from .motion import Firings, Poses
 from .returns import NO_SURFACE, Keys, PulseReturns, joined, numbers
 from .scene_caster import SceneCaster
 from .step import Emitter, PulseBatch, PulseStep, Setup
@@ -53,6 +53,7 @@ class PulseCaster:
         poses: Poses,
         window: tuple[int, int],
         groups: Ints,
+        firings: Firings,
         *,
         tally: bool = True,
     ) -> Scanned:
@@ -64,7 +65,7 @@ class PulseCaster:
 
         def batch(start: int, stop: int) -> PulseBatch:
             keys = Keys(scan, groups)
-            return PulseBatch(keys, start, stop, pattern, first, poses, self.emitter)
+            return PulseBatch(keys, start, stop, pattern, first, poses, firings, self.emitter)
 
         whole = batch(0, rays)
         if self._setup.several:

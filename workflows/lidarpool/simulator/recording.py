@@ -45,7 +45,8 @@ class RecordingStep(PulseStep):
             here = Keys(batch.keys.scan, batch.keys.begins - batch.start)
             noise = sigma, self.setup.noise.seed, here
         digitizer, count = Digitizer.of(self.setup), self.setup.recorded
-        waveform = recorded(batch.hits, given, digitizer, batch.each, count, noise)
+        full = self.setup.noise.full
+        waveform = recorded(batch.hits, given, digitizer, batch.each, count, noise, full)
         return returns._replace(waveform=waveform)
 
 
@@ -61,6 +62,7 @@ def recorded(
     each: int,
     count: int,
     noise: tuple[float, int, Keys] | None = None,
+    full: float = np.inf,
 ) -> Records:
     """Record the waveform around each return, `count` samples: (n,), see `record`.
 
@@ -75,6 +77,8 @@ def recorded(
         Their `ray` is the beam, in order.
     noise
         Standard deviation of a sample, the seed, and the keys of beams.
+    full
+        Samples are no higher.
     """
     out = np.zeros(len(returns.ray), record(count))
     out["sample_ps"] = round(1000 * digitizer.sample_ns)
@@ -103,7 +107,7 @@ def recorded(
             stream = raw(seed, Purpose.SAMPLES, scan, ray)[:, None]
             number = begins[block, None] + np.arange(count)
             samples += sigma * normal(seed, Purpose.SAMPLE, stream, number >> 8, number & 255)
-        steps, exponents = digitised(samples)
+        steps, exponents = digitised(np.minimum(samples, full))
         low_row, high_row = np.searchsorted(window, [start, start + size])
         mine = window[low_row:high_row] - start
         out["samples"][low_row:high_row] = steps[mine]

@@ -17,8 +17,9 @@ from ..base.vectors import turned
 from ..scene.actors import Actor
 from ..scene.scene import Scene
 from ..sensor import Pose, ScanSpec, Sensor, Survey, Trajectory
+from ..sensor.faults import sent
 from .device import DeviceColumns, DevicePoints
-from .motion import Clock, Poses, check_trajectory, poses_of_firings
+from .motion import Clock, Firings, Poses, check_trajectory, poses_of_firings
 from .points import BatchPoints
 from .pulses import PulseCaster
 from .scene_caster import SceneCaster
@@ -166,9 +167,10 @@ class Rig:
     def cast(self, first: int, stop: int) -> Iterator[BatchPoints | DevicePoints]:
         """Cast scans `first` to `stop` of the survey; yields the returns for each station."""
         run: list[ScanSpec] = []
-        for spec in map(self.survey.scan, range(first, stop)):
-            here = (spec.sensor, spec.station, spec.firings[0])
-            if run and here != (run[-1].sensor, run[-1].station, run[-1].firings[1]):
+        for spec in (sent(self.survey, index) for index in range(first, stop)):
+            here = (spec.sensor, spec.station, spec.firings[0], spec.repeats)
+            last = run[-1] if run else spec
+            if run and here != (last.sensor, last.station, last.firings[1], last.repeats):
                 yield self.returns(run, self.survey.path)
                 run = []
             run.append(spec)
@@ -198,10 +200,10 @@ class Rig:
         else:
             pose = path.pose(specs[0].station)
             poses = Poses(np.array(pose.position), pose.rotation)
-        poses = self._timed(poses, specs)
+        fired = Firings.of(carried.sensor, specs)
+        poses = self._timed(poses, fired)
         if path.moves:
-            firings = np.arange(first, stop, dtype=np.int64)
-            begins = carried.sensor.begins_ns(firings) + late_ns
+            begins = carried.sensor.begins_ns(fired.numbers) + late_ns
             carrier = Clock(begins, carried.sensor.beams.time_ns, Ways((path,)))
             poses = replace(poses, carrier=carrier, station=specs[0].station)
         if whole is not None:
@@ -213,17 +215,15 @@ class Rig:
         if self._device is not None:
             return self._device.returns(specs, pattern, poses, window, groups)
         scan = specs[0].scan + specs[0].ahead
-        found = self._pulses[number].scan(scan, pattern, poses, window, groups, tally=tally)
+        found = self._pulses[number].scan(scan, pattern, poses, window, groups, fired, tally=tally)
         return BatchPoints(self.scene, survey, self._surfaces, specs, found, pattern, start, poses)
 
-    def _timed(self, poses: Poses, specs: list[ScanSpec], times: int = 1) -> Poses:
-        """Return poses of scans, so many times in turn, with the times that actors need."""
+    def _timed(self, poses: Poses, fired: Firings) -> Poses:
+        """Return poses of firings with the times that actors need."""
         if not self.scene.actors:
             return poses
-        sensor = self.survey.carried[specs[0].sensor].sensor
-        firings = np.arange(specs[0].firings[0], specs[-1].firings[1], dtype=np.int64)
-        begins = np.tile(sensor.begins_ns(firings) + specs[0].start_ns, times)
-        return replace(poses, clock=Clock(begins, sensor.beams.time_ns, self._ways))
+        begins = fired.sensor.begins_ns(fired.numbers) + fired.spec.start_ns
+        return replace(poses, clock=Clock(begins, fired.sensor.beams.time_ns, self._ways))
 
     def ranges(
         self,
@@ -250,12 +250,13 @@ class Rig:
             image = out[block].reshape(-1)
             count = len(image) // rays
             poses = Poses(positions[block], None if rotations is None else rotations[block], rays)
-            poses = self._timed(poses, specs, count)
+            fired = Firings.of(sensor, specs, count)
+            poses = self._timed(poses, fired)
             groups = (rays * np.arange(count)[:, None] + begin_rays).reshape(-1)
             scan = specs[0].scan + specs[0].ahead + begin * len(specs)
             window = (0, len(image))
             caster = self._pulses[number]
-            found = caster.scan(scan, pattern, poses, window, groups, tally=False).returns
+            found = caster.scan(scan, pattern, poses, window, groups, fired, tally=False).returns
             assert found.reported is not None  # of kept returns
             nearest = found.number == 1
             image[found.ray[nearest]] = found.reported[nearest]

@@ -20,7 +20,7 @@ class SelectionStep(PulseStep):
     @staticmethod
     def applies(setup: Setup) -> bool:
         """See `PulseStep.applies`."""
-        return setup.in_waveforms or setup.adds
+        return setup.in_waveforms or setup.receives_more
 
     def apply(self, returns: PulseReturns, batch: PulseBatch) -> PulseReturns:
         """See `PulseStep.apply`."""

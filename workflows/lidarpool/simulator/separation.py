@@ -113,6 +113,6 @@ class SeparationStep(PulseStep):
     def apply(self, returns: PulseReturns, batch: PulseBatch) -> PulseReturns:
         """See `PulseStep.apply`."""
         setup = self.setup
-        shown = "all" if setup.adds else setup.reporting.mode  # more come before `SelectionStep`
+        shown = "all" if setup.receives_more else setup.reporting.mode  # then `SelectionStep`
         report = Report(shown, setup.noise, batch.keys, batch.start)
         return separated(returns, setup.gap_m, batch.each, batch.planes, batch.air, report)

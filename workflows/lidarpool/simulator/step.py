@@ -19,9 +19,10 @@ from ..base.arrays import Floats, Ints
 from ..base.vectors import turned
 from ..columns.table import VELOCITY
 from ..scene.scene import Scene
-from ..sensor import Noise, Returns, Sensor, Survey
+from ..sensor import Fault, Noise, Returns, Sensor, Survey
+from ..sensor.faults import FaultKind, faults_of
 from ..sensor.noise import Purpose
-from .motion import Poses
+from .motion import Firings, Poses
 from .returns import Keys, Planes, PulseReturns
 from .scene_caster import SceneCaster
 from .surfaces import Surfaces
@@ -92,12 +93,19 @@ class Setup:
         noise, reporting = self.noise, self.reporting
         dark = any(m.reflectance == 0 for m in self.survey.materials)
         beam = reporting.subrays > 1 or self.in_waveforms or self.recorded > 0
-        return beam or noise.loses or self.passing or dark
+        lost = bool(self.faults("dirt", "dead_channels", "dropped_packets", "frozen"))
+        return beam or lost or noise.loses or self.passing or dark
 
     @property
-    def adds(self) -> bool:
-        """Whether the receiver reports what is no return of its pulse."""
-        return bool(self.noise.false_alarm_hz or self.noise.stray_light or self.noise.crosstalk)
+    def receives_more(self) -> bool:
+        """Whether the receiver adds to the returns of a pulse or joins some, before it selects."""
+        noise = self.noise
+        adds = noise.false_alarm_hz or noise.stray_light or noise.crosstalk
+        return bool(adds or noise.saturation)
+
+    def faults(self, *kinds: FaultKind) -> dict[int, Fault]:
+        """Return its faults of some kinds, see `faults_of`."""
+        return faults_of(self.survey, self.number, *kinds)
 
 
 class Sizes(NamedTuple):
@@ -132,6 +140,7 @@ class Emitter:
         # across it and towards it.
         axis = turned(np.array([[0.0, 0, 1]]), setup.sensor.axes)
         self._axis = turned(axis, carried.mount.rotation)[0]
+        self._about_axis = self.beam.oval or setup.noise.ripple_deg > 0
 
     def __len__(self) -> int:
         return len(self.beam)
@@ -151,7 +160,7 @@ class Emitter:
         if len(self) == 1 and offsets is None:
             return pattern
         axis = np.array([0.0, 0, 1]) if by_head else self._axis
-        sub_rays = SubRays(self.beam.angles, self.beam.starts, axis if self.beam.oval else None)
+        sub_rays = SubRays(self.beam.angles, self.beam.starts, axis if self._about_axis else None)
         return pattern.divided(sub_rays, offsets, rows)
 
 
@@ -165,6 +174,7 @@ class PulseBatch:
     pattern: Pattern  # of the beams
     first: int  # row of the first of them in it
     poses: Poses  # of all beams of the keys
+    firings: Firings  # of these
     emitter: Emitter
     offsets: Floats | None = None  # of the beams' angles, (n, 2), radians
     hits: PulseReturns | None = None  # of all sub-rays

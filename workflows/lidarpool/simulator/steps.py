@@ -7,9 +7,11 @@ from .angle_noise import AngleNoiseStep
 from .crosstalk import CrosstalkStep
 from .detection import DetectionStep
 from .false_alarms import FalseAlarmStep
+from .losses import DirtStep, LossStep
 from .paths import CastStep
 from .range_noise import RangeNoiseStep
 from .recording import RecordingStep
+from .saturation import SaturationStep
 from .selection import SelectionStep
 from .separation import SeparationStep
 from .step import PulseStep, Setup
@@ -21,12 +23,15 @@ STEPS: tuple[type[PulseStep], ...] = (
     AngleNoiseStep,
     CastStep,  # with mirrors, glass, water and leaves
     WeatherStep,  # rain, snow, fog and dust
+    DirtStep,  # on the window
     SeparationStep,  # hits to returns; or
     WaveformStep,
     DetectionStep,
     StrayLightStep,
     FalseAlarmStep,
     CrosstalkStep,
+    SaturationStep,
+    LossStep,  # dead channels and lost packets
     SelectionStep,
     RecordingStep,
     RangeNoiseStep,

@@ -1,0 +1,84 @@
+"""Faults of a sensor: range images of a street, and a wall that a carrier approaches."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from benchmarks.effects.__main__ import survey_without
+from benchmarks.effects._air import save
+from benchmarks.effects._receiver import BLUE, GREY, RED, wall
+from lidarpool import Fault, Scene, Sensor, Survey, Track
+from lidarpool.scene.generated.city import city
+from lidarpool.simulator.rig import Rig
+
+DRAWS = "effect-faults.png"
+DIRT = Fault("dirt", azimuth_deg=(60, 130), elevation_deg=(-25, 5), transmission=0.3)
+DEAD = Fault("dead_channels", channels=[20, 21, 40])
+LOST = Fault("dropped_packets", share=0.1, packet=16)
+SPEED_M_S, SECONDS = 5.0, 4.0
+
+
+def on(survey: Survey) -> Survey:
+    """Return the survey with all that changes points of single sweeps."""
+    return replace(survey, faults=[DIRT, DEAD, LOST, Fault("time_jump", by_s=-0.5)])
+
+
+def image(survey: Survey) -> np.ndarray:
+    """Intensities of a turn, channels by firings; NaN without a return."""
+    first, stop = survey.scan(0).firings[0], survey.scan(survey.scan_count - 1).firings[1]
+    out = np.full((survey.sensor.channels, stop - first), np.nan)
+    for found in Rig(city(20_000), survey).cast(0, survey.scan_count):
+        out[found.channel, found.firing - first] = found.intensity
+    return out
+
+
+def approach(*faults: Fault) -> tuple[np.ndarray, np.ndarray]:
+    """Stamps in seconds and ranges of a beam ahead, of a carrier that drives towards a wall."""
+    sensor = Sensor.grid(10, 1, 1, step_deg=360, horizontal_fov_deg=1)
+    track = Track([0, SECONDS], [(0, 0, 0), (SPEED_M_S * SECONDS, 0, 0)])
+    survey = Survey(sensor, trajectory=track, columns=["time"], faults=faults)
+    found = [*Rig(Scene.from_meshes([wall("W", 30)]), survey).cast(0, survey.scan_count)]
+    return (
+        np.concatenate([one.time for one in found]) / 1e9,
+        np.concatenate([one.range for one in found]),
+    )
+
+
+def picture(path: Path) -> None:
+    """Draw what faults do to images and to ranges over time."""
+    figure = Figure((11, 5.2), layout="constrained", dpi=100)
+    left, right = figure.subfigures(1, 2, width_ratios=[1.7, 1])
+    bare = survey_without()
+    shown = {
+        "without faults": (),
+        "dirt: 30 % of the energy return, from 60° to 130°, below 5°": [DIRT],
+        "dead channels 20, 21 and 40": [DEAD],
+        "10 % of the packets of 16 firings are lost": [LOST],
+    }
+    for axes, (title, faults) in zip(left.subplots(4, 1, sharex=True), shown.items(), strict=True):
+        values = image(replace(bare, faults=faults))
+        axes.imshow(
+            np.log10(values), cmap="viridis", vmin=-2.5, vmax=0.5, aspect="auto", origin="lower",
+            interpolation="nearest",
+        )  # fmt: skip
+        axes.set_title(title, fontsize=9, loc="left")
+        axes.set_yticks([0, 32, 63])
+        axes.tick_params(labelsize=7)
+    axes.set_xlabel("firing of a turn", fontsize=8)
+    (axes,) = right.subplots(1, 1, squeeze=False)[0]
+    frozen = Fault("frozen", 1, 2)
+    for faults, colour, words in (
+        ((), GREY, "without faults"),
+        ((frozen,), BLUE, "frozen from 1 to 2 s"),
+        ((Fault("time_jump", 2.5, by_s=0.5),), RED, "time jump by 0.5 s at 2.5 s"),
+    ):
+        axes.plot(*approach(*faults), ".", ms=2 if faults else 5, color=colour, label=words)
+    axes.set(xlabel="stamp, s", ylabel="range of a wall ahead, m")
+    axes.set_title(f"a carrier at {SPEED_M_S:g} m/s", fontsize=9)
+    axes.legend(frameon=False, fontsize=8, markerscale=4)
+    axes.grid(alpha=0.25)
+    save(figure, path)

@@ -1,0 +1,93 @@
+"""A film of what is real, in the sensor's own time: `python -m benchmarks.film OUT.webp`.
+
+Sweeps of an OS1-64 amid moving cars, with sub-rays, noise and rain (`real` of
+`benchmarks.realism`), are cast on one core while another draws them, a frame for each. It prints
+the seconds that the sensor scans, and those that the film took.
+"""
+
+from __future__ import annotations
+
+import argparse
+import io
+import time
+from multiprocessing import get_context
+from multiprocessing.connection import Connection
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from PIL import Image
+
+from lidarpool.render.camera import Camera
+from lidarpool.render.colouring import TURBO
+from lidarpool.render.pictures import splat
+from lidarpool.render.surface import unit
+from lidarpool.scene.generated.city import city
+
+from .realism import TURN_S, cases
+
+SIZE, BACK = (960, 540), np.array([14, 17, 22, 255]) / 255
+EYE, TARGET = np.array([-38.0, -30.0, 34.0]), np.array([4.0, 4.0, 0.0])
+RAISED = 12.0  # metres above the ground with the last colour
+
+
+def cast(sweeps: int, triangles: int, sent: Connection) -> None:
+    """Send the points of sweep after sweep, after one that is only there to compile."""
+    sweep = cases(city(triangles), "embree", (100,), "ouster/os1-64")["real"]
+    sent.send(len(sweep(0)))
+    sent.recv()
+    for number in range(sweeps):
+        sent.send_bytes(sweep(number).positions.astype(np.float32).tobytes())
+
+
+def frame(camera: Camera, points: Any) -> Image.Image:
+    """Draw the points of a sweep, by height."""
+    pixels, distance = camera.project(points)
+    inside = np.flatnonzero(((pixels >= 0) & (pixels < SIZE)).all(axis=1))
+    rows = inside[np.argsort(-distance[inside])]
+    share = np.clip(points[rows, 2] / RAISED, 0, 1)
+    paint = np.pad(TURBO[(24 + 231 * np.sqrt(share)).astype(int)], ((0, 0), (0, 1)), mode="edge")
+    paint[:, 3] = 1
+    empty = np.tile(BACK.astype(np.float32), (*SIZE[::-1], 1))
+    image = splat(empty, pixels[rows], paint, 1.6)
+    return Image.fromarray(np.round(255 * image[..., :3]).astype(np.uint8))
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Make the film, and return the exit status."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("film", type=Path, help="a .webp file")
+    parser.add_argument("--sweeps", type=int, default=100)
+    parser.add_argument("--triangles", type=int, default=100_000)
+    options = parser.parse_args(arguments)
+    ahead = unit((TARGET - EYE)[None])
+    right = unit(np.cross(ahead, [0.0, 0.0, 1.0]))
+    axes = np.concatenate([right, np.cross(right, ahead), ahead])
+    camera = Camera(EYE, axes, 800.0, np.array(SIZE) / 2, SIZE)
+    context = get_context("spawn")
+    here, there = context.Pipe()
+    caster = context.Process(
+        target=cast, args=(options.sweeps, options.triangles, there), daemon=True
+    )
+    caster.start()
+    here.recv()
+    start, frames = time.perf_counter(), []
+    here.send("go")
+    for _ in range(options.sweeps):
+        points = np.frombuffer(here.recv_bytes(), np.float32).reshape(-1, 3)
+        frames.append(frame(camera, points.astype(np.float64)))
+    cast_s = time.perf_counter() - start
+    caster.join()
+    kept = {"save_all": True, "duration": round(1e3 * TURN_S), "loop": 0}
+    frames[0].save(memory := io.BytesIO(), "webp", append_images=frames[1:], method=0, **kept)
+    options.film.write_bytes(memory.getvalue())
+    took = time.perf_counter() - start
+    print(
+        f"{options.sweeps * TURN_S:.1f} s of scanning: cast and drawn in {cast_s:.1f} s,", end=" "
+    )
+    print(f"written after {took:.1f} s")
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
