@@ -135,7 +135,7 @@ def test_a_sweep_is_a_turn_and_has_the_pose_of_its_first_ray(survey, sweeps):
         np.testing.assert_allclose(sweeps.pose.positions[sweep], pose.position, atol=1e-12)
         turn = matrices(sweeps.pose.quaternions[sweep, None])[0]
         np.testing.assert_allclose(turn, pose.rotation, atol=1e-12)
-    np.testing.assert_allclose(sweeps.actor_poses[0].positions[4], [5.8, 5, 0])
+    np.testing.assert_allclose(sweeps.actor_poses.positions[0, 4], [5.8, 5, 0])
 
 
 @pytest.mark.parametrize("name", ["las", "laz"])

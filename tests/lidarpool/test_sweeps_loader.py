@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import json
 import multiprocessing
+import os
 import pickle
+import pydoc
 import shutil
 import threading
 import types
 from collections.abc import Callable
+from dataclasses import replace
 from itertools import chain, pairwise
 from pathlib import Path
 from typing import Any
@@ -242,7 +245,9 @@ def test_threads_and_forks_read_beside_each_other(written, name):
 
 @pytest.mark.parametrize("url", [False, True])
 def test_a_loop_reads_a_few_sweeps_ahead(written, monkeypatch, url):
-    read = lidarpool.export.kitti.Reader.read
+    name = "kitti" if url else "webdataset"
+    reader = f"lidarpool.export.{name}.Reader.read"
+    read = pydoc.locate(reader)
     threads: list[str] = []
 
     def noted(self: Any, sweep: int) -> Any:
@@ -250,8 +255,8 @@ def test_a_loop_reads_a_few_sweeps_ahead(written, monkeypatch, url):
             threads.append(threading.current_thread().name)
         return read(self, sweep)
 
-    monkeypatch.setattr("lidarpool.export.kitti.Reader.read", noted)
-    place = written("kitti")
+    monkeypatch.setattr(reader, noted)
+    place = written(name)
     data = lidarpool.sweeps(place.as_uri() if url else place, shuffle=1)
     loop = iter(data)
     assert identity(next(loop)) == identity(data[0])
@@ -262,6 +267,39 @@ def test_a_loop_reads_a_few_sweeps_ahead(written, monkeypatch, url):
     loop.close()
     assert not any(one.name.startswith("sweeps") for one in threading.enumerate())
     assert [*map(identity, data.ahead([3, 1]))] == [identity(data[3]), identity(data[1])]
+
+
+@pytest.mark.parametrize("name", ["kitti", "nuscenes"])
+def test_the_system_reads_files_that_are_not_in_memory_ahead(written, monkeypatch, name):
+    expected: list[int] = []  # bytes of files
+    monkeypatch.setattr(
+        "os.posix_fadvise", lambda file, *_: expected.append(os.fstat(file).st_size)
+    )
+    data = lidarpool.sweeps(written(name), shuffle=1)
+    plain = list(data)
+    assert not expected  # they have just been written
+
+    def fail(*_: Any) -> None:
+        raise BlockingIOError
+
+    monkeypatch.setattr("os.preadv", fail)
+    loop = iter(data)
+    row, files = (16, 2) if name == "kitti" else (20, 1)  # with labels
+    for number in range(3):
+        assert identity(next(loop)) == identity(plain[number])
+        assert expected[::files] == [row * len(sweep) for sweep in plain[: 9 + number]]
+        assert len(expected) == files * (9 + number)
+    assert len(list(loop)) == len(plain) - 3
+
+
+def test_a_sweep_is_sent_without_the_others_of_its_job(written):
+    sweep = lidarpool.sweeps(written("kitti"))[0]
+    sent = pickle.dumps(sweep)
+    assert len(sent) < sum(array.nbytes for array in (sweep.points, *sweep.columns.values())) + 3000
+    again = pickle.loads(sent)
+    for one in (again, replace(again, split="x")):
+        np.testing.assert_array_equal(one.boxes.rows, sweep.boxes.rows)
+        np.testing.assert_array_equal(one.points, sweep.points)
 
 
 # -- PyTorch ---------------------------------------------------------------------------------------

@@ -60,7 +60,7 @@ def expected(local_client: Client) -> list[Sweep]:
 
 
 @pytest.mark.parametrize("keep", ["parquet", "kitti", "webdataset"])
-def test_the_sweeps_are_those_of_the_data_set(cluster_client, client, tmp_path, keep):
+def test_the_sweeps_are_those_of_the_data_set(cluster_client, client, tmp_path, torch, keep):
     splits = {"train": 0.5, "test": 0.5}
     varied = campaign(keep=keep, splits=splits)
     with (
@@ -78,6 +78,11 @@ def test_the_sweeps_are_those_of_the_data_set(cluster_client, client, tmp_path, 
     saved = list(lp.sweeps(tmp_path / "ds", split="test"))
     assert [one.job for one in chosen] == [one.job for one in saved] != []
     assert all(same(one, two, {*one.columns}) for one, two in zip(saved, chosen, strict=True))
+    for _ in range(2):  # epochs of a network
+        items = lp.sweeps(tmp_path / "ds").torch(), varied.stream(client).torch()
+        for one, two in zip(*items, strict=True):
+            assert {"points", "intensity", "class", "boxes", "pose"} <= one.keys() <= two.keys()
+            assert all(np.array_equal(one[name], two[name]) for name in one)
 
 
 def test_sweeps_of_a_killed_worker_are_cast_again(client, sabotage, expected):

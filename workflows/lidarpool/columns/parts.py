@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import DTypeLike
 
-from ..base.archives import read_array, read_arrays
+from ..base.archives import read_arrays, read_npy
 from ..base.arrays import AnyArray, Floats, Floats32, Integers, Ints, Ints32, UInts32
 from ..base.elementary import decade
 from ..base.errors import LidarpoolError
@@ -214,7 +214,8 @@ def read_tally(storage: Storage, name: str) -> tuple[Ints32, Ints]:
         return part.triangles, part.hits
     try:
         with zipfile.ZipFile(storage.local(name)) as archive:
-            return read_array(archive, ".triangles.npy"), read_array(archive, ".hits.npy")
+            triangles = read_npy(archive.read(".triangles.npy"), "triangles")
+            return triangles, read_npy(archive.read(".hits.npy"), "hits")
     except Exception as error:  # as above
         raise LidarpoolError(
             f"The part {storage.path(name)} cannot be used ({error}). {_AGAIN}"

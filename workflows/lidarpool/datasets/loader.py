@@ -14,6 +14,7 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from importlib.util import find_spec
+from itertools import islice, tee
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -21,7 +22,6 @@ import numpy as np
 from pydantic import Field
 
 from ..base.archives import open_archive
-from ..base.arrays import AnyArray
 from ..base.errors import LidarpoolError
 from ..base.storage import Storage
 from ..base.validation import checked
@@ -36,7 +36,7 @@ from .dataset import BOXES_FILE, INDEX_FILE, VERSION, job_file
 from .job_table import JobRow, read_table
 from .sweep_data import Sweep
 
-_REQUESTS = 8  # threads that read ahead at a URL
+_REQUESTS = 8  # sweeps that are read at a time, from a URL or a disk
 _OPEN_JOBS = 16  # jobs whose poses, boxes and opened files a thread keeps
 
 
@@ -85,7 +85,17 @@ class SavedSweeps:
         return self.ahead(range(len(self)))
 
     def ahead(self, indices: Iterable[int]) -> Generator[Sweep]:
-        """Give some sweeps in this order; threads read the next ones meanwhile, two each."""
+        """Give some sweeps in this order; the next ones are read meanwhile."""
+        if self._place.is_local and self._written.row.raw:
+            # To hand such a sweep from thread to thread takes as long as to read it.
+            soon, now = tee(map(self._at, indices))
+            for job, number in islice(soon, _REQUESTS):
+                job.reader.expect(number)
+            for job, number in now:
+                for later, sweep in islice(soon, 1):
+                    later.reader.expect(sweep)
+                yield job.read(number)
+            return
         # At a URL each request takes long. A job that is one file for all sweeps is opened once.
         threads = 1 if self._place.is_local or not self._written.row.boxes else _REQUESTS
         coming: deque[Future[Sweep]] = deque()
@@ -108,6 +118,11 @@ class SavedSweeps:
 
         LidarpoolError if a file is missing or damaged; IndexError if there is no such sweep.
         """
+        job, number = self._at(index)
+        return job.read(number)
+
+    def _at(self, index: int) -> tuple[_OpenJob, int]:
+        """Return the job of a sweep, opened, and the sweep's number there."""
         at = operator.index(index)
         at += len(self) if at < 0 else 0
         if not 0 <= at < len(self):
@@ -117,7 +132,7 @@ class SavedSweeps:
         which = bisect_right(self._ends, at)
         run = self._runs[which]
         number = run.first + at - (int(self._ends[which]) - run.count)
-        return self._opened(run.job).read(number)
+        return self._opened(run.job), number
 
     def torch(self, transform: Callable[[Sweep], Any] | None = None, *, even: bool = True) -> Any:
         """Return a `torch.utils.data.IterableDataset` of the sweeps.
@@ -174,28 +189,27 @@ class _OpenJob:
         self.place, self.job, row = place, job, written.row
         name = job_file(row.data_set, job.name, SWEEPS_FILE)
         self.sweeps = Sweeps.load(place.path(name), partial(place.read, name))
-        self.boxes: dict[str, AnyArray] = {}
+        self.boxes: Boxes | None = None
         if self.sweeps.actors:
             name = job_file(row.data_set, job.name, BOXES_FILE)
             with open_archive(place.path(name), partial(place.read, name)) as arrays:
-                self.boxes = arrays
+                # (a, 3), or (a, n, 3) if any deforms: of each sweep
+                sizes = np.diff(self.sweeps.actor_bounds, axis=-2)[..., 0, :]
+                sizes = sizes if sizes.ndim == 2 else sizes.swapaxes(0, 1)
+                sizes = np.broadcast_to(sizes, arrays["centres"].shape)
+                boxes = Boxes(sizes=sizes, **arrays)
+                self.boxes = boxes.inward(self.sweeps.pose, slice(None))
         entry = Entry(job.number, job.name, job.split)
         self.reader: Reader = row.load().Reader(place, self.sweeps, entry, written.layout)
 
     def read(self, sweep: int) -> Sweep:
         """Read a sweep."""
-        job, sweeps = self.job, self.sweeps
-        file = self.place.path(self.reader.file(sweep))
         try:
             points = self.reader.read(sweep)
         except Exception as error:  # libraries of five formats have many kinds
+            file = self.place.path(self.reader.files(sweep)[0])
             raise _unreadable(file, error) from error
-        boxes = None
-        if self.boxes:
-            own = {name: of[sweep] for name, of in self.boxes.items()}
-            low, high = sweeps.bounds(sweep).transpose(1, 0, 2)
-            boxes = Boxes(sizes=high - low, **own)
-        return Sweep.of(job, sweeps, sweep, points, boxes)
+        return Sweep.of(self.job, self.sweeps, sweep, points, self.boxes, sweep)
 
 
 @checked

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cached_property
+from types import EllipsisType
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,22 +37,25 @@ class Sweep:
     points: Floats32  # (n, 3): metres, in the sensor's axes
     columns: Mapping[str, AnyArray]  # {name: (n,)}: what the format holds beside
     pose: Floats  # (4, 4): from the sensor's axes to the world's
-    boxes: SweepBoxes
     object_names: tuple[str, ...]  # what the column `object` counts
-    faults: tuple[Fault, ...] = ()  # that the sensor has at some time of the sweep
+    faults: tuple[Fault, ...]  # that the sensor has at some time of the sweep
+    _boxes: SweepBoxes | tuple[Sweeps, Boxes | None, int | EllipsisType]  # or what they are made of
 
     @classmethod
     def of(
-        cls, job: JobRow, sweeps: Sweeps, number: int, points: PointColumns, boxes: Boxes | None
-    ) -> Sweep:
-        """Make the sweep of a number among all of a job, with boxes if there are actors."""
+        cls, job: JobRow, sweeps: Sweeps, number: int, points: PointColumns,
+        boxes: Boxes | None, which: int | EllipsisType = ...,
+    ) -> Sweep:  # fmt: skip
+        """Make the sweep of a number among all of a job; boxes are as of `SweepBoxes.of`."""
         return cls(
             job.name, job.number, job.split, job.values,
             sweeps.sensors[sweeps.sensor[number]], int(sweeps.numbers[number]),
             round(sweeps.begins_ns[number]), *points, sweeps.pose.matrix(number),
-            SweepBoxes.of(sweeps, number, boxes), (*sweeps.objects, *sweeps.actors),
-            sweeps.faults_in(number),
+            sweeps.all_names, sweeps.faults_in(number), (sweeps, boxes, which),
         )  # fmt: skip
+
+    def __getstate__(self) -> dict[str, Any]:
+        return self.__dict__ | {"_boxes": self.boxes}  # without those of all other sweeps
 
     def __len__(self) -> int:
         return len(self.points)
@@ -57,6 +63,11 @@ class Sweep:
     def __repr__(self) -> str:
         sensor = f" of {self.sensor}" if self.sensor else ""
         return f"<Sweep {self.number}{sensor} in job {self.job}: {len(self):,} points>"
+
+    @cached_property
+    def boxes(self) -> SweepBoxes:
+        """Boxes of the actors that are in the scene, in the sensor's axes."""
+        return SweepBoxes.of(*self._boxes) if isinstance(self._boxes, tuple) else self._boxes
 
     @property
     def intensity(self) -> Floats32 | None:

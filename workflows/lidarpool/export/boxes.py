@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from types import EllipsisType
 
 import numpy as np
 
 from ..base.arrays import Bools, Floats, Floats32, Ints, Ints32
 from ..columns.cloud import Cloud
 from ..sensor.trajectory import matrices
-from .sweeps import Sweeps
+from .sweeps import Placed, Sweeps
 
 
 @dataclass(frozen=True, eq=False)
@@ -22,8 +23,8 @@ class Boxes:
     end.
     """
 
-    centres: Floats  # (a, 3): metres, world coordinates
-    quaternions: Floats  # (a, 4): x, y, z, w of the rotation from the actor's axes to the world's
+    centres: Floats  # (a, 3): metres, world coordinates, or the sensor's after `inward`
+    quaternions: Floats  # (a, 4): x, y, z, w of the rotation from the actor's axes to those
     sizes: Floats  # (a, 3): length, width and height, metres, along the actor's axes
     points: Ints  # (a,): how many points of the sweep are the actor's
     there: Bools  # (a,): whether it is in the scene
@@ -44,8 +45,7 @@ class Boxes:
         share = (np.bincount(actor[rows], share, count) / np.maximum(counts, 1))[:, None]
         pair = [sweep, sweep + len(sweeps)]  # poses at its start and end
         places, turns = (
-            np.array([getattr(pose, what)[pair] for pose in sweeps.actor_poses]).reshape(-1, 2, n)
-            for what, n in (("positions", 3), ("quaternions", 4))
+            of[:, pair] for of in (sweeps.actor_poses.positions, sweeps.actor_poses.quaternions)
         )
         turns[(turns[:, 0] * turns[:, 1]).sum(axis=1) < 0, 1] *= -1
         place, turn = ((p[:, 0] + share * (p[:, 1] - p[:, 0])) for p in (places, turns))
@@ -55,6 +55,13 @@ class Boxes:
         return cls(
             place + middle, turn, high - low, counts, sweeps.actor_there[:, sweep] | (counts > 0)
         )
+
+    def inward(self, pose: Placed, which: int | slice) -> Boxes:
+        """Return boxes of a sweep, or of some, (n, a), in axes of the sensor as each begins."""
+        turned = self.quaternions @ pose.products[which]
+        turned *= np.where(turned[..., 3:] < 0, -1, 1)  # w is at least 0
+        centres = (self.centres - pose.positions[which][..., None, :]) @ pose.turns[which]
+        return Boxes(centres, turned, self.sizes, self.points, self.there)
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,9 +80,9 @@ class SweepBoxes:
     points: Ints  # (k,): how many points of the sweep are the actor's
 
     @classmethod
-    def of(cls, sweeps: Sweeps, sweep: int, boxes: Boxes | None) -> SweepBoxes:
-        """Take those of a sweep's boxes that are in the scene."""
-        there = np.empty(0, np.intp) if boxes is None else boxes.there.nonzero()[0]
+    def of(cls, sweeps: Sweeps, boxes: Boxes | None, which: int | EllipsisType = ...) -> SweepBoxes:
+        """Take those of a sweep, or of which of some, that are in the scene; in a sensor's axes."""
+        there = np.empty(0, np.intp) if boxes is None else boxes.there[which].nonzero()[0]
         if boxes is None or not len(there):
             none = np.empty(0, np.int32)
             place = np.empty((0, 3))
@@ -85,10 +92,10 @@ class SweepBoxes:
             tuple(sweeps.actors[actor] for actor in actors),
             tuple(sweeps.actor_types[actor] for actor in actors),
             (len(sweeps.objects) + there).astype(np.int32),
-            sweeps.pose.inward(sweep, boxes.centres[there]),
-            _turned(sweeps.pose.quaternions[sweep], boxes.quaternions[there]),
-            boxes.sizes[there],
-            boxes.points[there],
+            boxes.centres[which][there],
+            boxes.quaternions[which][there],
+            boxes.sizes[which][there],
+            boxes.points[which][there],
         )
 
     def __len__(self) -> int:
@@ -105,13 +112,3 @@ class SweepBoxes:
     def rows(self) -> Floats32:
         """float32 (k, 7): centre, length, width, height, yaw."""
         return np.column_stack([self.centres, self.sizes, self.yaw]).astype(np.float32)
-
-
-def _turned(pose: Floats, quaternions: Floats) -> Floats:
-    """Convert quaternions (k, 4) to the axes of a pose, whose own is (4,); w is at least 0."""
-    # By matrices this took longer than reading the points of a sweep.
-    x, y, z, w = pose.tolist()
-    product = [[w, z, -y, -x], [-z, w, x, -y], [y, -x, w, -z], [x, y, z, w]]
-    turned: Floats = quaternions @ np.array(product).T
-    turned[turned[:, 3] < 0] *= -1
-    return turned

@@ -33,6 +33,7 @@ class FormatRow:
     data_set: str = ""  # name of the data sets whose jobs are written in it, if there are such
     of_job: str = ""  # there: place of a job's file or folder, if it has one, by `Entry`
     boxes: bool = False  # there: its pieces are sweeps, and each comes with its boxes of actors
+    raw: bool = False  # there: a sweep has files of its own, which hold rows of numbers
 
     def load(self) -> Any:
         """Import the module."""
@@ -89,11 +90,11 @@ FORMATS = {
     "e57": FormatRow("cloud.e57", "e57", False, ("pye57",), ("scan",), _E57),
     "kitti": FormatRow(
         "kitti", "kitti", True, (), ("scan", *_LABELS), _LABELS, inside=_KITTI, data_set="kitti",
-        boxes=True,
+        boxes=True, raw=True,
     ),
     "nuscenes": FormatRow(
         "nuscenes", "nuscenes", True, (), ("scan", "object", *_RINGS), _RINGS, ("class",),
-        inside=_NUSCENES, data_set="nuscenes", boxes=True,
+        inside=_NUSCENES, data_set="nuscenes", boxes=True, raw=True,
     ),
     "webdataset": FormatRow(
         "webdataset", "webdataset", True, (), ("scan", *_LABELS), inside=_SHARDS,

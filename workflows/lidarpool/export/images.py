@@ -134,13 +134,13 @@ class Pieces(pieces.Pieces):
 class Reader(reading.Reader):
     """Reads sweeps of a data set: all columns of each point, with time and angles of its ray."""
 
-    def file(self, sweep: int) -> str:
+    def files(self, sweep: int) -> list[str]:
         """Return the name of the file of the images."""
-        return _file(self.sweeps, _folders(self.sweeps, self.entry), sweep)
+        return [_file(self.sweeps, _folders(self.sweeps, self.entry), sweep)]
 
     def read(self, sweep: int) -> reading.PointColumns:
         """Return the points of a sweep, in the order of their rays."""
-        file = self.file(sweep)
+        file = self.files(sweep)[0]
         with open_archive(self.place.path(file), partial(self.place.read, file)) as images:
             del images["pose"], images["scan"]
         planes = next(n for n in count(1) if _key("range", n) not in images)

@@ -93,33 +93,27 @@ class Pieces(pieces.Pieces):
 class Reader(reading.Reader):
     """Reads sweeps of a data set: intensity, class and object of each point."""
 
-    def file(self, sweep: int) -> str:
-        """Return the name of the file of points."""
-        return self._file(sweep, "velodyne", "bin")
+    def files(self, sweep: int) -> list[str]:
+        """Return the names of the files of points and labels."""
+        folder = f"sequences/{self._names[self.sweeps.sensor[sweep]]}"
+        number = f"{self.sweeps.numbers[sweep]:06}"
+        return [f"{folder}/velodyne/{number}.bin", f"{folder}/labels/{number}.label"]
 
     def read(self, sweep: int) -> reading.PointColumns:
         """Return the points of a sweep."""
-        rows = self.rows(self.file(sweep), np.dtype("<f4")).reshape(-1, 4)
-        file = self._file(sweep, "labels", "label")
-        labels = self.rows(file, np.dtype("<u4"))
+        file, labels_file = self.files(sweep)
+        rows = self.rows(file, np.dtype("<f4")).reshape(-1, 4)
+        labels = self.rows(labels_file, np.dtype("<u4"))
         if len(labels) != len(rows):
-            raise ValueError(f"{file} has {len(labels):,} points, not {len(rows):,}")
-        halves = labels.view("<u2").reshape(-1, 2)
-        instances = halves[:, 1].astype(np.int32)
+            raise ValueError(f"{labels_file} has {len(labels):,} points, not {len(rows):,}")
+        instances = (labels >> 16).view("<i4")
         instances -= 1
-        return rows[:, :3], {
-            "intensity": rows[:, 3],
-            "class": halves[:, 0],
-            "object": instances,
-        }
+        classes = labels.view("<u2")[::2]
+        return rows[:, :3], {"intensity": rows[:, 3], "class": classes, "object": instances}
 
     @cached_property
     def _names(self) -> list[str]:
         return _names(self.sweeps, self.entry)
-
-    def _file(self, sweep: int, folder: str, ending: str) -> str:
-        name = self._names[self.sweeps.sensor[sweep]]
-        return f"sequences/{name}/{folder}/{self.sweeps.numbers[sweep]:06}.{ending}"
 
 
 def labels_file(classes: Mapping[int, str]) -> bytes:

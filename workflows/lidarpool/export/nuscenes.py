@@ -110,21 +110,24 @@ class Reader(reading.Reader):
     """Reads sweeps of a data set: intensity, channel and, with names, class of each point."""
 
     @cached_property
-    def _files(self) -> list[str]:
+    def _names(self) -> list[str]:
         channels = plain_names(name or "LIDAR_TOP" for name in self.sweeps.sensors)
         return _files(self.sweeps, channels, _samples(self.sweeps)[1], self.entry)
 
-    def file(self, sweep: int) -> str:
-        """Return the name of its file."""
-        return self._files[sweep]
+    def files(self, sweep: int) -> list[str]:
+        """Return the names of the files of points and, with names, classes."""
+        file = self._names[sweep]
+        return [file, _LABELS + file.replace("/", "-")] if self.sweeps.classes else [file]
 
     def read(self, sweep: int) -> reading.PointColumns:
         """Return the points of a sweep."""
-        rows = self.rows(self.file(sweep), np.dtype("<f4")).reshape(-1, 5)
-        columns = {"intensity": rows[:, 3] / np.float32(255), "channel": rows[:, 4].astype("u2")}
-        if self.sweeps.classes:
-            labels = self.rows(_LABELS + self.file(sweep).replace("/", "-"), np.dtype("u1"))
-            columns["class"] = labels.astype("u2")
+        file, *labels = self.files(sweep)
+        rows = self.rows(file, np.dtype("<f4")).reshape(-1, 5)
+        light, channel = np.ascontiguousarray(rows[:, 3:].T)
+        light /= 255
+        columns = {"intensity": light, "channel": channel.astype("u2")}
+        if labels:
+            columns["class"] = self.rows(labels[0], np.dtype("u1")).astype("u2")
         return rows[:, :3], columns
 
 

@@ -42,7 +42,7 @@ class Pieces(pieces.Pieces):
                 *((column, np.dtype(column.dtype)) for column in cloud.table),
             )
         ]
-        objects = "\n".join((*sweeps.objects, *sweeps.actors))  # that the column `object` counts
+        objects = "\n".join(sweeps.all_names)  # that the column `object` counts
         words = {"coordinates": sweeps.coordinates, "objects": objects}
         words |= {"classes": json.dumps(dict(sweeps.classes))} if sweeps.classes else {}
         self.schema = pa.schema(fields, words)
@@ -77,17 +77,17 @@ class Reader(reading.Reader):
 
     _held: Mapping[tuple[str, int], Any] = MappingProxyType({})  # {(file, group): rows}
 
-    def file(self, sweep: int) -> str:
+    def files(self, sweep: int) -> list[str]:
         """Return the name of the job's partition."""
-        return self.entry.place("parquet")
+        return [self.entry.place("parquet")]
 
     @cached_property
     def _table(self) -> Any:
         if self.place.is_local:
-            return pyarrow.dataset.dataset(self.place.path(self.file(0)), format="parquet")
+            return pyarrow.dataset.dataset(self.place.path(self.files(0)[0]), format="parquet")
         system, folder = self.place.file_system()
         return pyarrow.dataset.dataset(
-            f"{folder}/{self.file(0)}", format="parquet", filesystem=system
+            f"{folder}/{self.files(0)[0]}", format="parquet", filesystem=system
         )
 
     def _group(self, fragment: Any) -> Any:

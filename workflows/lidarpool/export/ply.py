@@ -81,13 +81,13 @@ def read_cloud(path: str | Path) -> Cloud:
 class Reader(reading.Reader):
     """Reads sweeps of a data set: all columns of each point."""
 
-    def file(self, sweep: int) -> str:
+    def files(self, sweep: int) -> list[str]:
         """Return the name of the job's cloud."""
-        return self.entry.place("ply")
+        return [self.entry.place("ply")]
 
     @cached_property
     def _cloud(self) -> CloudFile:
-        return CloudFile(self.local(self.file(0)))
+        return CloudFile(self.local(self.files(0)[0]))
 
     def read(self, sweep: int) -> reading.PointColumns:
         """Return the points of a sweep."""

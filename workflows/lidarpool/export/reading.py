@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import io
 import os
 import shutil
 import tempfile
 import weakref
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -28,13 +30,24 @@ class Reader:
         self.place, self.sweeps, self.entry, self.layout = place, sweeps, entry, layout
         self._copies: Path | None = None
 
-    def file(self, sweep: int) -> str:
-        """Return the name of the file that has the points of a sweep."""
+    def files(self, sweep: int) -> list[str]:
+        """Return the names of the files that a sweep is read from, that of its points first."""
         raise NotImplementedError
 
     def read(self, sweep: int) -> PointColumns:
         """Return the points of a sweep; any exception if they cannot be read."""
         raise NotImplementedError
+
+    def expect(self, sweep: int) -> None:
+        """Have the system read the files of a sweep that are not in its memory, for `read` soon."""
+        with suppress(OSError, AttributeError):  # `read` will raise it; Linux alone has all of it
+            for name in self.files(sweep):
+                with io.FileIO(self.place.path(name)) as file:
+                    try:
+                        os.preadv(file.fileno(), [bytearray(1)], 0, os.RWF_NOWAIT)
+                        return
+                    except OSError:
+                        os.posix_fadvise(file.fileno(), 0, 0, os.POSIX_FADV_WILLNEED)
 
     def close(self) -> None:
         """Close and remove what the reader has opened."""
@@ -55,7 +68,9 @@ class Reader:
     def rows(self, name: str, row: np.dtype[Any]) -> AnyArray:
         """Read a file of rows; ValueError if it ends within one."""
         if self.place.is_local:
-            data = np.fromfile(self.place.local(name), np.uint8)
+            with io.FileIO(self.place.path(name)) as file:
+                data = np.empty(os.fstat(file.fileno()).st_size, np.uint8)
+                data = data[: file.readinto(data.data)]
         else:
             data = np.frombuffer(bytearray(self.place.read(name)), np.uint8)
         if len(data) % row.itemsize:

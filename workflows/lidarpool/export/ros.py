@@ -126,7 +126,8 @@ def _messages(cloud: CloudLike, sweeps: Sweeps, layout: str, types: Any) -> Iter
     make = _Messages(types)
     frames = _frames(sweeps)
     actors = frames[len(sweeps.sensors) :]
-    moving = [(CARRIER, sweeps.carrier), *zip(actors, sweeps.actor_poses, strict=True)]
+    poses = map(Placed, sweeps.actor_poses.positions, sweeps.actor_poses.quaternions)
+    moving = [(CARRIER, sweeps.carrier), *zip(actors, poses, strict=True)]
     start_ns = _start_ns(sweeps)
     measured = make.measured(sweeps, start_ns)
     waiting = next(measured, None)
@@ -193,14 +194,14 @@ def _instruments(sweeps: Sweeps) -> list[tuple[str, str, Placed, int]]:
 class Reader(reading.Reader):
     """Reads sweeps of a data set: intensity (0 to 1 with autoware), channel and named class."""
 
-    def file(self, sweep: int) -> str:
+    def files(self, sweep: int) -> list[str]:
         """Return the name of the job's bag."""
-        return self.entry.place("mcap")
+        return [self.entry.place("mcap")]
 
     @cached_property
     def _bag(self) -> Bag:
         # AnyReader would parse the definitions of messages, which takes longer than a sweep.
-        bag = Bag(self.local(self.file(0)))
+        bag = Bag(self.local(self.files(0)[0]))
         bag.open()
         return bag
 

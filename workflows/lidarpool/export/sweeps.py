@@ -31,7 +31,7 @@ MIXED_UP = (
     f"({SWEEPS_FILE}): give both of one run, and keep the order."
 )
 _PIECE = 250_000  # points that are read at a time: several threads or tasks have so many
-_FORMAT = 4
+_FORMAT = 5
 # Fields of `Sweeps` that a file holds under their names: as an array each, and as JSON.
 _ARRAYS = ("scans", "begins_ns", "ends_ns", "sensor", "actor_bounds", "actor_there")
 _WORDS = ("sensors", "objects", "actors", "coordinates", "precision_m", "epsg", "start_ns")
@@ -48,6 +48,13 @@ class Placed:
     def turns(self) -> Floats:
         """float64 (n, 3, 3): rotations from its own axes to the world's."""
         return matrices(self.quaternions)
+
+    @cached_property
+    def products(self) -> Floats:
+        """float64 (n, 4, 4): matrices by which quaternions (k, 4) are brought to its own axes."""
+        x, y, z, w = self.quaternions.T  # by rotation matrices it would take far longer
+        rows = [[w, -z, y, x], [z, w, -x, y], [-y, x, w, z], [-x, -y, -z, w]]
+        return np.moveaxis(np.array(rows), -1, 0)
 
     def matrix(self, sweep: int) -> Floats:
         """Matrix (4, 4) from its own axes at the start of a sweep to the world's."""
@@ -84,7 +91,7 @@ class Sweeps:
     sensors: tuple[str, ...]  # names
     objects: tuple[str, ...]
     actors: tuple[str, ...]  # they follow the objects in the column `object`
-    actor_poses: tuple[Placed, ...]  # of each actor (2n,): at starts of sweeps, then at their ends
+    actor_poses: Placed  # of the actors (a, 2n): at starts of sweeps, then at their ends
     # (a, 2, 3): corners of each actor's box in its own axes, metres; (a, n, 2, 3) if any deforms.
     actor_bounds: Floats
     actor_there: Bools  # (a, n): whether each actor is in the scene
@@ -118,6 +125,11 @@ class Sweeps:
         return _placed(self.pose.positions - levers, turns)
 
     @cached_property
+    def all_names(self) -> tuple[str, ...]:
+        """Names that the column `object` counts: of objects, then of actors."""
+        return (*self.objects, *self.actors)
+
+    @cached_property
     def actor_types(self) -> list[str]:
         """Types of the actors."""
         return [type_of(actor) for actor in self.actors]
@@ -133,7 +145,7 @@ class Sweeps:
         none = Placed(np.empty((0, 3)), np.empty((0, 4)))
         return cls(
             np.zeros(1, np.int64), np.empty(0), np.empty(0), np.empty(0, np.uint8), none, none,
-            (), (), (), (), np.empty((0, 2, 3)), np.empty((0, 0), bool), "world", 0.001,
+            (), (), (), none, np.empty((0, 2, 3)), np.empty((0, 0), bool), "world", 0.001,
         )  # fmt: skip
 
     @classmethod
@@ -180,7 +192,10 @@ class Sweeps:
             tuple(carried.name for carried in survey.carried),
             tuple(scene.names),
             tuple(actor.name for actor in scene.actors),
-            tuple(actor_poses),
+            Placed(
+                np.reshape([each.positions for each in actor_poses], (-1, 2 * len(when), 3)),
+                np.reshape([each.quaternions for each in actor_poses], (-1, 2 * len(when), 4)),
+            ),
             np.array(bounds) if bounds else np.empty((0, 2, 3)),
             np.array(there, bool).reshape(-1, len(when)),
             survey.coordinates,
@@ -246,8 +261,7 @@ class Sweeps:
         words |= {"faults": [one.words() for one in self.faults]} if self.faults else {}
         arrays: dict[str, Any] = {"words": np.frombuffer(json.dumps(words).encode(), np.uint8)}
         arrays |= {name: getattr(self, name) for name in _ARRAYS}
-        placed = {"": self.pose, "mount_": self.mounts}
-        placed |= {f"actor{number}_": poses for number, poses in enumerate(self.actor_poses)}
+        placed = {"": self.pose, "mount_": self.mounts, "actor_": self.actor_poses}
         for prefix, poses in placed.items():
             arrays[f"{prefix}positions"] = poses.positions
             arrays[f"{prefix}quaternions"] = poses.quaternions
@@ -271,9 +285,9 @@ class Sweeps:
             if words["format"] != _FORMAT:
                 raise ValueError(f"it is of format {words['format']}, not {_FORMAT}")
             words |= {name: tuple(words[name]) for name in ("sensors", "objects", "actors")}
-            pose, mounts, *actors = (
+            pose, mounts, actor_poses = (
                 Placed(arrays[f"{prefix}positions"], arrays[f"{prefix}quaternions"])
-                for prefix in ("", "mount_", *(f"actor{k}_" for k in range(len(words["actors"]))))
+                for prefix in ("", "mount_", "actor_")
             )
             instruments = words.get("instruments")
             fired = None
@@ -285,7 +299,7 @@ class Sweeps:
                 fired=fired,
                 pose=pose,
                 mounts=mounts,
-                actor_poses=tuple(actors),
+                actor_poses=actor_poses,
                 instruments=instruments and Instruments.from_words(instruments, Path(path).parent),
                 classes={int(number): name for number, name in words.get("classes", {}).items()},
                 faults=tuple(Fault(**one) for one in words.get("faults", ())),

@@ -85,7 +85,7 @@ class Pieces(pieces.Pieces):
     def _members(self, number: int, points: Cloud, boxes: Boxes | None) -> Iterator[bytes]:
         """Yield the files of a sample, each behind its header."""
         sweeps, entry = self.sweeps, self.entry
-        there = SweepBoxes.of(sweeps, number, boxes)
+        there = SweepBoxes.of(sweeps, boxes and boxes.inward(sweeps.pose, number))
         arrays = {
             "points": sweeps.in_sensor(number, points.positions).astype(np.float32),
             **{column.name: points[column.name] for column in self.cloud.table},
@@ -122,14 +122,14 @@ class Reader(reading.Reader):
         with open_archive(self.place.path(name), partial(self.place.read, name)) as arrays:
             return arrays["at"]
 
-    def file(self, sweep: int) -> str:
+    def files(self, sweep: int) -> list[str]:
         """Return the name of the tar file."""
-        return _shard(self.entry, int(self._offsets[sweep, 0]))
+        return [_shard(self.entry, int(self._offsets[sweep, 0]))]
 
     def read(self, sweep: int) -> reading.PointColumns:
         """Return the points of a sweep, of which alone bytes are read."""
         _, first, stop = self._offsets[sweep].tolist()
-        sample = self.place.read(self.file(sweep), first, stop)
+        sample = self.place.read(self.files(sweep)[0], first, stop)
         if len(sample) < stop - first:
             raise ValueError(f"it ends {stop - first - len(sample)} bytes before the sweep does")
         data = io.BytesIO(sample)
@@ -139,7 +139,7 @@ class Reader(reading.Reader):
                 name, _, ending = member.name.rpartition("/")[2].partition(".")[2].rpartition(".")
                 if ending == "npy" and name not in ("pose", "boxes"):
                     data.seek(member.offset_data)
-                    arrays[name] = read_npy(io.BytesIO(data.read(member.size)), name)
+                    arrays[name] = read_npy(data.read(member.size), name)
         return arrays.pop("points"), arrays
 
 

@@ -128,6 +128,7 @@ class _Streamed:
         places = sweeps.in_sensor(number, cloud.positions).astype(np.float32)
         columns = {column.name: np.array(cloud[column.name]) for column in table}
         boxes = Boxes.of(sweeps, number, cloud) if sweeps.actors else None
+        boxes = boxes and boxes.inward(sweeps.pose, number)
         row = JobRow(job.number, job.name, job.split, job.values)
         return Sweep.of(row, sweeps, number, (places, columns), boxes)
 
