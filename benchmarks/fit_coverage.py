@@ -20,10 +20,10 @@ SWEEPS, COLUMNS, LAYERS, FARTHEST_M = 12, 360, 16, 120.0
 
 
 def street() -> Scene:
-    """The ground, a wall on either side and one at the end; above them is sky."""
+    """Make the ground, a wall on either side and one at the end; above them is sky."""
     corners = {
         "ground": [(-80, -60, -1.7), (80, -60, -1.7), (80, 60, -1.7), (-80, 60, -1.7)],
-        "left": [(-80, 4, -1.7), (80, 4, -1.7), (80, 4, 4), (-80, 4, 4)],
+        "left": [(-80, 4, -1.7), (80, 4, -1.7), (80, 4, 6), (-80, 4, 6)],
         "right": [(-80, -9, -1.7), (80, -9, -1.7), (80, -9, 3), (-80, -9, 3)],
         "end": [(30, -9, -1.7), (30, 4, -1.7), (30, 4, 3), (30, -9, 3)],
     }
@@ -44,7 +44,7 @@ def recorded(noise: Noise, bias: Any = 0.0, sweeps: int = SWEEPS) -> Recording:
         cloud = made[number]
         points, ranges = cloud.positions, np.linalg.norm(cloud.positions, axis=1)
         errors = np.broadcast_to(bias, LAYERS)[cloud["channel"]]
-        return points * (1 + errors / ranges)[:, None], cloud.columns, None
+        return points * (1 + errors / np.maximum(ranges, 1e-6))[:, None], cloud.columns, None
 
     return Recording("simulated", sweeps, read, energies=True)
 

@@ -115,8 +115,9 @@ def _runs(command: Callable[..., None]) -> Callable[..., None]:
 
 @click.group(
     commands=[
-        init, import_, check, schema, scene, sensors, stations, view, plot, export, compare, fit
-    ],  # fmt: skip
+        *(init, import_, check, schema, scene, sensors, stations),
+        *(view, plot, export, compare, fit),
+    ],
     context_settings={"max_content_width": 100, "help_option_names": ["-h", "--help"]},
 )
 @click.version_option(__version__, prog_name=PROGRAM)

@@ -15,14 +15,11 @@ from .repeats import Rays, Repeats
 
 _Z = 1.959964  # of 95 %
 _REJECTED = 1e-6  # chance of a variance above which a ray is left out
-_SPAN = 2.0  # least quotient of far and near ranges that tells how noise grows
-_TILT = 0.3  # least tangent of incidence of a tenth of the rays that tells noise of directions
-_WEAK_RAYS = 30  # rays with partial losses that a threshold needs
-_SKY = (5, 15)  # rows and columns of which no ray returns twice, around a ray into the sky
+_SPAN, _TILT = 2.0, 0.3  # least quotient of ranges, and tangent of incidence, that tell noise
+_WEAK_RAYS, _RING_RAYS = 30, 20  # rays with losses that a threshold needs; that of a ring's bias
+_SKY = (7, 31)  # rows and columns of which no ray returns twice, around a ray into the sky
 _PLANES, _PLANE_M, _PLANE_RAYS, _PLANE_POINTS = 8, 0.05, 300, 20_000
-_NO_SCALE = "it needs the intensity of a white surface, if it is the same at all ranges (--white)"
-_NOT_WEAK = "no surface is so weak that it loses half its pulses"
-_RING_RAYS = 20  # rays on planes that the bias of a ring needs
+_STEP = 1e-3  # of logarithms, for derivatives
 
 
 class Estimate(NamedTuple):
@@ -39,19 +36,15 @@ class Estimate(NamedTuple):
         return cls(float(value), float(value) - half, float(value) + half)
 
     @classmethod
-    def mean(cls, values: Floats) -> Estimate:
-        """Make one of the mean of values."""
-        return cls.of(values.mean(), values.var() / len(values))
+    def mean(cls, values: Floats, power: float = 1.0) -> Estimate:
+        """Make one of a power of the mean of values; a root of what is below 0 is 0."""
+        made = cls.of(values.mean(), values.var() / len(values))
+        return made if power == 1 else made.mapped(lambda x: max(x, 0.0) ** power)
 
     def mapped(self, function: Callable[[float], Any]) -> Estimate:
         """Return the estimate of a function of the figure, which rises or falls."""
         value, *ends = (float(function(one)) for one in self)
         return Estimate(value, min(ends), max(ends))
-
-
-def root(value: float) -> float:
-    """Square root; 0 of what is negative."""
-    return float(np.sqrt(max(value, 0.0)))
 
 
 class Scatter(NamedTuple):
@@ -66,48 +59,34 @@ class Scatter(NamedTuple):
 
 def fit_performance(
     repeats: Repeats, rays: Rays, energy: Floats | None
-) -> tuple[dict[str, Estimate], list[str], Scatter]:
+) -> tuple[dict[str, Estimate | None], Scatter]:
     """Estimate what repeated sweeps tell, with the energies of rays (k,) if they are known.
 
-    Returns figures by the names of `Noise`; in words those that are unknown; and the noise of
-    ranges, by range or by energy, whichever is likelier.
+    Returns figures by the names of `Noise`, None if unknown; and the noise of ranges, by range or
+    by energy, whichever is likelier.
     """
-    known, unknown, sweeps = dict[str, Estimate](), list[str](), repeats.sweeps
-    light = np.nan_to_num(rays.light) if energy is None else energy
+    sweeps, light = len(repeats.ranges), np.nan_to_num(rays.light) if energy is None else energy
     strong, threshold = light >= np.median(light), None
-    for _ in range(3):  # the threshold says which rays lose nothing for their energy
-        known["dropout"] = loss_share(sweeps - rays.count[strong], sweeps)
+    for _ in range(1 if energy is None else 3):  # the threshold tells what loses nothing by energy
+        dropout = Estimate.mean(1 - rays.returns[strong] / sweeps)
         if energy is not None:
-            threshold = fit_threshold(energy, rays.count, sweeps, known["dropout"].value)
-        if energy is None or threshold is None:
-            break
-        strong = energy > 2 * threshold.value
-    found = fit_scatter(rays)
-    if threshold is None:
-        unknown.append(f"the detection range: {_NO_SCALE if energy is None else _NOT_WEAK}")
-    else:
-        known["detection_range_m"] = threshold.mapped(
-            lambda one: 10 * np.sqrt(TARGET_REFLECTANCE / one)
-        )
+            threshold = fit_threshold(energy, rays.returns, sweeps, dropout.value)
+            strong = energy > 2 * threshold.value if threshold else strong
+    found, weak = fit_scatter(rays), None
+    if threshold is not None:
         other = fit_scatter(rays, energy)
         if other.growth is not None and other.deviance < found.deviance:
-            found = other
-            known["range_at_threshold_m"] = other.growth.mapped(lambda one: one / threshold.value)
-    known["range_m"] = found.near
-    if found.growth is None:
-        unknown.append("how noise grows with the range: surfaces are about as far")
-    elif "range_at_threshold_m" not in known:
-        known["range_per_m"] = found.growth
-    if found.aim is not None and found.aim.low > 0:
-        known["angle_deg"] = found.aim.mapped(np.degrees)
-    else:
-        why = f"it is below {np.degrees(found.aim.high):.2g}°" if found.aim else "none is inclined"
-        unknown.append(f"noise of directions, which shows on inclined surfaces: {why}")
-    if (alarms := alarm_share(repeats)) is None:
-        unknown.append("false alarms: no sky, or fewer than three sweeps")
-    else:
-        known["false_alarms"] = alarms
-    return known, unknown, found
+            found, weak = other, other.growth.mapped(lambda one: one / threshold.value)
+    return {
+        "range_m": found.near,
+        "range_per_m": None if weak else found.growth,
+        "range_at_threshold_m": weak,
+        "angle_deg": found.aim and found.aim.mapped(np.degrees),
+        "detection_range_m": threshold
+        and threshold.mapped(lambda one: 10 * np.sqrt(TARGET_REFLECTANCE / one)),
+        "false_alarms": alarm_share(repeats),
+        "dropout": dropout,
+    }, found
 
 
 def fit_scatter(rays: Rays, energy: Floats | None = None) -> Scatter:
@@ -124,8 +103,7 @@ def fit_scatter(rays: Rays, energy: Floats | None = None) -> Scatter:
     tilted = np.quantile(rays.slope / rays.distance, 0.9) > _TILT
     known = np.array([True, high > _SPAN * low, tilted])
     kept, steep = rays.freedom > 0, np.median(rays.slope)
-    usual = np.median(rays.variance[kept])
-    power = 1 if energy is None else 2  # of the parameters of ranges; that of directions is squared
+    usual, power = np.median(rays.variance[kept]), 1 if energy is None else 2
 
     def model(some: Floats) -> Floats:
         theta = np.zeros(3)
@@ -143,25 +121,22 @@ def fit_scatter(rays: Rays, energy: Floats | None = None) -> Scatter:
         theta, expected = found.x, model(found.x)
         ratio = rays.variance / expected * rays.freedom
         kept = (rays.freedom > 0) & (ratio < chi2.isf(_REJECTED, np.maximum(rays.freedom, 1)))
-    inverse, score = np.linalg.pinv(found.jac.T @ found.jac), found.jac * found.fun[:, None]
-    spreads = np.diag(inverse @ (score.T @ score) @ inverse)
-    of: list[Estimate | None] = [None] * 3
-    units = (root(usual), root(usual) / unit, root(usual) / steep)
-    for k, value, variance in zip(np.flatnonzero(known), theta, spreads, strict=True):
-        squared = k == 2 or power == 2
-        one = Estimate.of(value, variance).mapped(root if squared else lambda x: max(x, 0.0))
-        of[k] = one.mapped(lambda x, unit=units[k]: x * unit)
-    deviance = (rays.freedom * (np.log(expected) + rays.variance / expected))[rays.freedom > 0]
-    near, growth, aim = of
-    assert near is not None
-    return Scatter(near, growth, aim, float(deviance.sum()), np.sqrt(expected))
+    spreads = np.diag(_sandwich(found.jac, found.fun))
+    of: list[Any] = [None] * 3
+    for k, *one in zip(np.flatnonzero(known), theta, spreads, strict=True):
+        scale = np.sqrt(usual) / (1.0, unit, steep)[k]
+        of[k] = Estimate.of(*one).mapped(
+            lambda x, k=k, scale=scale: scale * max(x, 0) ** (0.5 if k == 2 else 1 / power)
+        )
+    deviance = rays.freedom * (np.log(expected) + rays.variance / expected)
+    return Scatter(*of, float(deviance[rays.freedom > 0].sum()), np.sqrt(expected))
 
 
-def loss_share(lost: Ints, sweeps: int) -> Estimate:
-    """Share of the pulses of rays, each of which loses so many of its `sweeps`, (k,)."""
-    if not lost.any():
-        return Estimate(0.0, 0.0, 3 / (len(lost) * sweeps))  # the rule of three
-    return Estimate.mean(lost / sweeps).mapped(lambda one: max(one, 0.0))
+def _sandwich(design: Floats, off: Floats) -> Floats:
+    """Covariance of a least-squares fit whose residuals are of unequal size."""
+    inverse, score = np.linalg.pinv(design.T @ design, hermitian=True), design * off[:, None]
+    covariance: Floats = inverse @ (score.T @ score) @ inverse
+    return covariance
 
 
 def fit_threshold(energy: Floats, count: Ints, sweeps: int, dropout: float) -> Estimate | None:
@@ -173,29 +148,26 @@ def fit_threshold(energy: Floats, count: Ints, sweeps: int, dropout: float) -> E
     from scipy.optimize import minimize_scalar
     from scipy.special import ndtr
 
-    def share(log_threshold: float) -> Floats:
-        seen = ndtr(THRESHOLD_SIGMAS * (energy / np.exp(log_threshold) - 1))
-        return np.clip((1 - dropout) * seen, 1e-9, 1 - 1e-9)
+    def seen(log_threshold: float) -> Floats:
+        share = ndtr(THRESHOLD_SIGMAS * (energy / np.exp(log_threshold) - 1))
+        return np.clip((1 - dropout) * share, 1e-9, 1 - 1e-9)
 
-    def unlikely(log_threshold: float) -> float:
-        p = share(log_threshold)
-        some = np.log1p(-((1 - p) ** sweeps))
-        return -float((count * np.log(p) + (sweeps - count) * np.log1p(-p) - some).sum())
+    def unlikely(log_threshold: float) -> Floats:
+        p = seen(log_threshold)
+        there = np.log1p(-((1 - p) ** sweeps))
+        return there - count * np.log(p) - (sweeps - count) * np.log1p(-p)
 
     low, high = np.log(np.quantile(energy, (0.001, 0.999)))
     grid = np.linspace(low - 2, high, 60)
-    best = int(np.argmin([unlikely(one) for one in grid]))
+    best = int(np.argmin([unlikely(one).sum() for one in grid]))
     ends = grid[max(best - 1, 0)], grid[min(best + 1, 59)]
-    found = minimize_scalar(unlikely, bounds=ends, method="bounded", options={"xatol": 1e-7}).x
-    p, step = share(found), 1e-3
-    if (p < 0.9 * (1 - dropout)).sum() < _WEAK_RAYS:
+    found = minimize_scalar(lambda one: unlikely(one).sum(), bounds=ends, method="bounded").x
+    if (seen(found) < 0.9 * (1 - dropout)).sum() < _WEAK_RAYS:
         return None
-    # The score of each ray, whose counts have this mean; rays of unequal loss widen the interval.
-    slope = (share(found + step) - share(found - step)) / (2 * step) / (p * (1 - p))
-    mean = sweeps * p / (1 - (1 - p) ** sweeps)
-    information = (slope**2 * (mean * (1 - p + sweeps * p) - mean**2)).sum()
-    score = (slope**2 * (count - mean) ** 2).sum()
-    return Estimate.of(found, max(score, information) / information**2).mapped(np.exp)
+    before, at, after = (unlikely(found + by) for by in (-_STEP, 0, _STEP))
+    information = (after - 2 * at + before).sum() / _STEP**2
+    score = (((after - before) / (2 * _STEP)) ** 2).sum()
+    return Estimate.of(found, score / information**2).mapped(np.exp)
 
 
 def alarm_share(repeats: Repeats) -> Estimate | None:
@@ -210,8 +182,8 @@ def alarm_share(repeats: Repeats) -> Estimate | None:
     # Weak surfaces, which return seldom, are beside those that return more often.
     sky = maximum_filter(count, size=_SKY, mode=("nearest", "wrap")) <= 1
     alarms = int((count[sky] == 1).sum())
-    trials = repeats.sweeps * int((count[sky] == 0).sum()) + alarms
-    if not trials or repeats.sweeps < 3:
+    trials = len(repeats.ranges) * int((count[sky] == 0).sum()) + alarms
+    if not trials or len(repeats.ranges) < 3:
         return None
     found = binomtest(alarms, trials).proportion_ci(method="exact")
     return Estimate(alarms / trials, float(found.low), float(found.high))
@@ -223,13 +195,13 @@ def channel_bias(rays: Rays, directions: Floats, blur: Floats) -> dict[int, Esti
     Planes u · x = 1 and offsets b are fitted at once: 1 / r = u · d − b / r², times r². Ranges have
     standard deviations `blur` (k,), metres.
     """
-    some = even_indices(len(rays), _PLANE_POINTS)
+    some = even_indices(len(rays.row), _PLANE_POINTS)
     plane = _planes(rays.distance[some, None] * directions[some])
-    some, plane = some[plane >= 0], plane[plane >= 0]
-    rows, place, many = np.unique(rays.row[some], return_inverse=True, return_counts=True)
+    many = np.bincount(rays.row[some[plane >= 0]], minlength=rays.row.max() + 1)[rays.row[some]]
+    some, plane = (one[(plane >= 0) & (many >= _RING_RAYS)] for one in (some, plane))
+    rows, place = np.unique(rays.row[some], return_inverse=True)
     distance, way, blur = rays.distance[some], directions[some], blur[some]
-    enough = many >= _RING_RAYS
-    if enough.sum() < 3:
+    if len(rows) < 3:
         return {}
     first, numbers = 3 * (plane.max() + 1), np.arange(len(some))
     design = np.zeros((len(some), first + len(rows)))
@@ -242,32 +214,24 @@ def channel_bias(rays: Rays, directions: Floats, blur: Floats) -> dict[int, Esti
         used = design[kept]
         solved = np.linalg.lstsq(used, (distance / blur)[kept], rcond=None)[0]
         off = distance / blur - design @ solved
-    inverse, score = np.linalg.pinv(used.T @ used, hermitian=True), used * off[kept][:, None]
-    covariance = inverse @ (score.T @ score) @ inverse
+    covariance = _sandwich(used, off[kept])
     # One offset of all is nearly the same as other planes: the mean of the rings is 0.
-    centred = np.eye(len(rows)) - enough / enough.sum()
+    centred = np.eye(len(rows)) - 1 / len(rows)
     bias = centred @ solved[first:]
     spread = np.diag(centred @ covariance[first:, first:] @ centred.T)
-    return {
-        row: Estimate.of(*one)
-        for row, *one, good in zip(rows.tolist(), bias, spread, enough, strict=True)
-        if good
-    }
+    return {row: Estimate.of(*one) for row, *one in zip(rows.tolist(), bias, spread, strict=True)}
 
 
 def _planes(points: Floats) -> Ints:
-    """Number of the large plane that each point (n, 3) lies in, -1 for none."""
+    """Tell the number of the large plane that each point (n, 3) lies in; -1 for none."""
     o3d = load_open3d()
     o3d.utility.random.seed(0)
-    number, left = np.full(len(points), -1), np.arange(len(points))
-    for plane in range(_PLANES):
-        if len(left) < _PLANE_RAYS:
-            break
+    number, left, plane = np.full(len(points), -1), np.arange(len(points)), 0
+    while len(left) >= _PLANE_RAYS and plane < _PLANES:
         cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points[left]))
         (*normal, off), _ = cloud.segment_plane(_PLANE_M, 3, 400)
         inside = np.abs(points[left] @ normal + off) < _PLANE_M  # of the plane of all inliers
         if inside.sum() < _PLANE_RAYS:
             break
-        number[left[inside]] = plane
-        left = left[~inside]
+        number[left[inside]], left, plane = plane, left[~inside], plane + 1
     return number

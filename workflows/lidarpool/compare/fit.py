@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
@@ -20,17 +20,30 @@ from ..base.validation import checked
 from ..base.words import plural
 from ..columns.cloud import Cloud
 from ..columns.parts import StoredCloud
+from ..render import theme
+from ..render.picture_page import Page
 from ..report.page.rendering import rendered
 from ..scene.scene import Scene
 from ..sensor import Pose, Spin
 from ..sensor.models import SensorModel, read_model
 from ..sensor.ray_sensors import ListedSensor
 from ..simulator import Scanner
-from .estimates import Estimate, channel_bias, fit_performance, root
-from .fit_picture import draw_fit
+from .estimates import Estimate, channel_bias, fit_performance
 from .recordings import Recording, open_recording
-from .repeats import Rays, Repeats, Surroundings
+from .repeats import Rays, Repeats, smooth_rays, surroundings
 
+# {curve, or column of channels: (title, label of x, label of y, factor)}
+_CHARTS = {
+    "noise_by_range": ("Noise of ranges", "range, m", "noise, mm", 1000),
+    "noise_by_light": ("", "intensity, or energy", "noise, mm", 1000),
+    "noise_by_tilt": ("", "incidence, °", "noise with that of directions, mm", 1000),
+    "returned_by_light": ("Returns", "intensity, or energy", "pulses that return, %", 100),
+    "lost_by_range": ("", "range of the scene, m", "pulses lost, %", 100),
+    "light_by_range": ("", "range, m", "mean intensity", 1),
+    "noise_m": ("Rings", "elevation, °", "noise, mm", 1000),
+    "bias_m": ("", "elevation, °", "bias, mm", 1000),
+    "uneven_deg": ("", "elevation, °", "spread of azimuths, °", 1),
+}
 _FEW = 30  # rays that a figure or a point of a curve needs
 _POINTS = 14  # of a curve
 _AIM = 0.002  # scatter of directions that does not make outliers before it is known, radians
@@ -62,7 +75,7 @@ class Fit:
         told = self.model.model_dump(mode="json", exclude_defaults=True)
         text = "".join(f"# {line}\n" for line in repr(self).splitlines())
         text += yaml.safe_dump(told, sort_keys=False, allow_unicode=True, default_flow_style=None)
-        picture = {"fit": draw_fit(self.figures).svg()}
+        picture = {"fit": _drawn(self.figures).svg()}
         page = rendered("fit.html", report=self.figures, pictures=picture)
         written = {place: text, place.with_suffix(".html"): page}
         with explained(f"{place} cannot be written", "choose a folder that exists and has room"):
@@ -111,83 +124,72 @@ def fit(
         recording = open_recording(recording, sensor, intensity, name="the recording")
     whole = Repeats.read(recording)
     repeats = whole.first() if whole.moves else whole
-    middle, sigma = repeats.middle(), repeats.rough_sigma()
+    middle, sigma, count = repeats.middle(), repeats.rough_sigma(), len(repeats.ranges)
     there = np.isfinite(repeats.ranges).sum(axis=0)
-    around = Surroundings.of(repeats, middle, sigma / np.sqrt(np.maximum(there, 1)))
+    around = surroundings(repeats, middle, sigma / np.sqrt(np.maximum(there, 1)))
     curves, expected = {}, None
     if scene is not None:
         expected = _cast(repeats, scene if isinstance(scene, Scene) else Scene.load(scene), pose)
-        known = Surroundings.of(repeats, expected, 0 * sigma)
+        known = surroundings(repeats, expected, 0 * sigma)
         near = around.smooth & (np.abs(middle - expected) < _BESIDE_M)
-        around = Surroundings(middle, around.turn, known.slope, near)
-        lost = 1 - there[known.smooth] / repeats.sweeps
-        curves["lost_by_range"] = _curve(expected[known.smooth], lost)
-    estimates, unknown, aim = dict[str, Estimate](), list[str](), 0.0
+        around = around._replace(slope=known.slope, smooth=near)
+        curves["lost_by_range"] = _curve(expected[known.smooth], 1 - there[known.smooth] / count)
+    estimates, aim = dict[str, Estimate | None](), 0.0
     for _ in range(2):  # the first finds what the second leaves out
-        rays = Rays.of(repeats, around, sigma, 0.0 if estimates else _AIM)
-        if len(rays) < _FEW:
+        rays = smooth_rays(repeats, around, sigma, 0.0 if estimates else _AIM)
+        if len(rays.row) < _FEW:
             raise LidarpoolError(
-                f"{recording.name} has {len(rays)} rays on smooth surfaces, and {_FEW} are needed: "
+                f"{recording.name} has {len(rays.row)} rays on smooth surfaces, and {_FEW} are needed: "
                 "record a place with walls or a floor."
             )
-        energy = _energies(rays, recording, white or recording.white)
-        if repeats.sweeps > 1:
-            estimates, unknown, scatter = fit_performance(repeats, rays, energy)
+        energy = rays.light if recording.energies else None
+        if white := white or recording.white:
+            energy = np.maximum(rays.light / white, _DARKEST) * (10 / rays.distance) ** 2
+        if energy is not None and not np.isfinite(energy).all():
+            energy = None
+        if count > 1:
+            estimates, scatter = fit_performance(repeats, rays, energy)
             sigma[rays.row, rays.column] = scatter.sigma
             aim = scatter.aim.value if scatter.aim else 0.0
-    if repeats.sweeps < 2:
-        why = "the sensor moves, or most around it" if whole.moves else "there is a single sweep"
-        unknown = [f"noise, lost returns and false alarms: {why}"]
     own = np.where(rays.freedom > 0, rays.variance - (aim * rays.slope) ** 2, np.nan)
     light = rays.light if energy is None else energy
     tilt = np.degrees(np.arctan(rays.slope / rays.distance))
-    curves["noise_by_range"] = _curve(rays.distance, own, root)
-    curves["noise_by_light"] = _curve(light, own, root)
-    curves["noise_by_tilt"] = _curve(tilt, own + (aim * rays.slope) ** 2, root)
-    curves["returned_by_light"] = _curve(light, rays.count / repeats.sweeps)
+    curves["noise_by_range"] = _curve(rays.distance, own, 0.5)
+    curves["noise_by_light"] = _curve(light, own, 0.5)
+    curves["noise_by_tilt"] = _curve(tilt, own + (aim * rays.slope) ** 2, 0.5)
+    curves["returned_by_light"] = _curve(light, rays.returns / count)
     curves["light_by_range"] = _curve(rays.distance, rays.light)
-    base = _recorded(repeats) if model is None else read_model(model)
-    name, sweeps = Path(recording.name).name, plural(whole.sweeps, "sweep")
-    if estimates:
-        base = _with(base, estimates, f"fitted by lidarpool {__version__} to {name}, {sweeps}")
+    found = {key: one for key, one in estimates.items() if one}
+    base, name = read_model(model) if model else _recorded(repeats), Path(recording.name).name
     figures = {
         "versions": {"lidarpool": __version__}, "name": name, "model": base.name,
-        "sweeps": whole.sweeps, "rays": len(rays), "by_energy": energy is not None,
-        "figures": {key: one._asdict() for key, one in estimates.items()}, "unknown": unknown,
+        "sweeps": len(whole.ranges), "moves": whole.moves, "rays": len(rays.row),
+        "figures": {key: one._asdict() for key, one in found.items()}, "notes": whole.notes,
         "channels": _channels(repeats, rays, own, sigma, expected), "curves": curves,
-        "notes": whole.notes,
     }  # fmt: skip
-    return Fit(figures, base)
-
-
-def _energies(rays: Rays, recording: Recording, white: float | None) -> Floats | None:
-    """Energies of the returns of rays, (k,); None if unknown."""
-    if not np.isfinite(rays.light).all() or (white is None and not recording.energies):
-        return None
-    if recording.energies:
-        return rays.light
-    return np.maximum(rays.light / white, _DARKEST) * (10 / rays.distance) ** 2
+    source = f"fitted by lidarpool {__version__} to {name}, {plural(len(whole.ranges), 'sweep')}"
+    return Fit(figures, _with(base, found, source) if found else base)
 
 
 def _with(base: SensorModel, known: Mapping[str, Estimate], source: str) -> SensorModel:
     """Return a sensor with what was fitted in its performance; the rest stays."""
-    found = {name: float(f"{one.value:.4g}") for name, one in known.items()}
+    found = {name: round(float(f"{one.value:.4g}"), 9) for name, one in known.items()}
     stated = base.performance.model_dump(exclude_defaults=True) if base.performance else {}
     for name in ("precision", "range_m", "range_per_m"):  # one excludes the others
         stated.pop(name, None)
-    if "detection_range_m" in found:
-        far = found["detection_range_m"]
+    if far := found.get("detection_range_m"):
         stated["detection"] = {"range_m": far, "reflectance": 0.1, "probability": 0.5}
-    if "range_at_threshold_m" in found:
+    if weak := found.get("range_at_threshold_m"):
+        sigma = {part: float(np.hypot(found["range_m"], weak * part**2)) for part in (0.5, 1)}
         stated["precision"] = [
-            {"sigma_m": float(np.hypot(found["range_m"], found["range_at_threshold_m"] * x * x)),
-             "range_m": x * far, "reflectance": 0.1} for x in (0.5, 1.0)
-        ]  # fmt: skip
-    names = {"range_m", "range_per_m"} if "precision" not in stated else set()
-    names |= {"angle_deg"}
-    if "detection" in stated and "false_alarms" in known and known["false_alarms"].low > 0:
-        names |= {"false_alarms"}
-    stated |= {name: found[name] for name in sorted(names & found.keys())}
+            {"sigma_m": one, "range_m": part * far, "reflectance": 0.1}
+            for part, one in sigma.items()
+        ]
+    else:
+        stated |= {"range_m": found["range_m"], "range_per_m": found.get("range_per_m", 0.0)}
+    for name, needed in (("angle_deg", True), ("false_alarms", "detection" in stated)):
+        if needed and name in known and known[name].low > 0:
+            stated[name] = found[name]
     data = base.model_dump() | {"performance": stated}
     return SensorModel.model_validate(data | {"sources": {**base.sources, "performance": source}})
 
@@ -218,36 +220,61 @@ def _channels(
 ) -> list[dict[str, Any]]:
     """Noise, bias and spread of azimuths of each ring."""
     flat = rays.take(rays.slope < _FLAT * rays.distance)
-    cell = flat.row, flat.column
+    cell, elevations = (flat.row, flat.column), np.degrees(repeats.elevation)
     if expected is not None:
         off = flat.distance - expected[cell]
         bias = {row: Estimate.mean(off[flat.row == row]) for row in set(flat.row.tolist())}
     else:
-        blur = sigma[cell] / np.sqrt(flat.count) + _LEAST_M
+        blur = sigma[cell] / np.sqrt(flat.returns) + _LEAST_M
         bias = channel_bias(flat, repeats.directions()[cell], blur)
     rows = []
     for row, ring in enumerate(repeats.rings.tolist()):
         noise = own[(rays.row == row) & np.isfinite(own)]
-        steps = np.diff(repeats.aside[:, row], axis=1) / np.sqrt(2)
-        rows.append({
-            "ring": ring, "elevation_deg": float(np.degrees(repeats.elevation[row])),
-            "rays": len(noise),
-            "noise_m": Estimate.mean(noise).mapped(root)._asdict() if len(noise) >= _FEW else None,
-            "bias_m": bias[row]._asdict() if row in bias else None,
-            "uneven_deg": float(np.degrees(np.nan_to_num(steps).std())),
-        })  # fmt: skip
+        steps = np.degrees(np.diff(repeats.aside[:, row], axis=1) / np.sqrt(2))
+        uneven = np.square(steps[np.isfinite(steps)])
+        found = {
+            "noise_m": Estimate.mean(noise, 0.5) if len(noise) >= _FEW else None,
+            "bias_m": bias.get(row),
+            "uneven_deg": Estimate.mean(uneven, 0.5) if len(uneven) >= _FEW else None,
+        }
+        shown = {name: one and one._asdict() for name, one in found.items()}
+        rows.append(
+            {"ring": ring, "elevation_deg": float(elevations[row]), "rays": len(noise)} | shown
+        )
     return rows
 
 
-def _curve(
-    x: Floats, values: Floats, function: Callable[[float], float] = float
-) -> list[dict[str, float]]:
-    """Functions of the means of values (k,) in parts of x that have about as many each."""
+def _curve(x: Floats, values: Floats, power: float = 1.0) -> list[dict[str, float]]:
+    """Means of values (k,), or their roots, in parts of x that have about as many each."""
     known = np.isfinite(values) & np.isfinite(x)
     x, values = x[known], values[known]
     if not len(x):
         return []
     place = np.digitize(x, np.unique(np.quantile(x, np.linspace(0, 1, _POINTS + 1)[1:-1])))
     parts = [place == k for k in range(place.max() + 1) if (place == k).sum() >= _FEW]
-    means = [Estimate.mean(values[part]).mapped(function)._asdict() for part in parts]
-    return [{"x": float(np.median(x[part])), **one} for part, one in zip(parts, means, strict=True)]
+    return [
+        {"x": float(np.median(x[part]))} | Estimate.mean(values[part], power)._asdict()
+        for part in parts
+    ]
+
+
+def _drawn(figures: Mapping[str, Any]) -> Page:
+    """Draw the curves and rings, with their intervals."""
+    page = Page((1600, 1750))
+    page.title(figures["model"], f"fitted to {figures['name']}; bars are intervals of 95 %")
+    for number, (name, (title, x, y, unit)) in enumerate(_CHARTS.items()):
+        row, column = divmod(number, 3)
+        axes = page.chart((0.075 + 0.32 * column, 0.67 - 0.305 * row, 0.235, 0.205))
+        axes.set(xlabel=x, ylabel=y)
+        points = figures["curves"].get(name, [])
+        if row == 2:
+            rings = (one for one in figures["channels"] if one[name])
+            points = [{"x": one["elevation_deg"], **one[name]} for one in rings]
+        at, *values = (np.array([one[key] for one in points]) for key in ("x", *Estimate._fields))
+        value, low, high = (unit * one for one in values)
+        axes.vlines(at, low, high, color=theme.UNSEEN, lw=1.8 * page.unit)
+        axes.plot(at, value, "o", color=theme.OBJECT_COLOURS[0], ms=3.2 * page.unit, mew=0)
+        page.heading(axes, title if points else f"{title}  not known".strip(), fontweight="bold")
+        if points and name.endswith("light") and at[0] > 0:
+            axes.set_xscale("log")
+    return page
