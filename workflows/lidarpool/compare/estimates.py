@@ -47,7 +47,7 @@ class Estimate(NamedTuple):
         return Estimate(value, min(ends), max(ends))
 
 
-class Scatter(NamedTuple):
+class RangeScatter(NamedTuple):
     """Noise of ranges, as `Noise` has it by range or by energy, and of directions."""
 
     near: Estimate  # standard deviation at range 0, or of the strongest returns, metres
@@ -59,7 +59,7 @@ class Scatter(NamedTuple):
 
 def fit_performance(
     repeats: Repeats, rays: Rays, energy: Floats | None
-) -> tuple[dict[str, Estimate | None], Scatter]:
+) -> tuple[dict[str, Estimate | None], RangeScatter]:
     """Estimate what repeated sweeps tell, with the energies of rays (k,) if they are known.
 
     Returns figures by the names of `Noise`, None if unknown; and the noise of ranges, by range or
@@ -89,7 +89,7 @@ def fit_performance(
     }, found
 
 
-def fit_scatter(rays: Rays, energy: Floats | None = None) -> Scatter:
+def fit_scatter(rays: Rays, energy: Floats | None = None) -> RangeScatter:
     """Fit noise of ranges and directions to the variances of rays, by their likelihood.
 
     What they do not tell, for want of ranges, energies or inclined surfaces, is None. Sandwich
@@ -124,16 +124,17 @@ def fit_scatter(rays: Rays, energy: Floats | None = None) -> Scatter:
     spreads = np.diag(_sandwich(found.jac, found.fun))
     of: list[Any] = [None] * 3
     for k, *one in zip(np.flatnonzero(known), theta, spreads, strict=True):
-        scale = np.sqrt(usual) / (1.0, unit, steep)[k]
-        of[k] = Estimate.of(*one).mapped(
-            lambda x, k=k, scale=scale: scale * max(x, 0) ** (0.5 if k == 2 else 1 / power)
-        )
-    deviance = rays.freedom * (np.log(expected) + rays.variance / expected)
-    return Scatter(*of, float(deviance[rays.freedom > 0].sum()), np.sqrt(expected))
+        root = 0.5 if k == 2 else 1 / power
+        scale = float(np.sqrt(usual)) / (1.0, unit, steep)[k]
+        of[k] = Estimate(*(scale * max(x, 0.0) ** root for x in Estimate.of(*one)))
+    likelihood = rays.freedom * (np.log(expected) + rays.variance / expected)
+    near, growth, aim = of
+    deviance = float(likelihood[rays.freedom > 0].sum())
+    return RangeScatter(near, growth, aim, deviance, np.sqrt(expected))
 
 
 def _sandwich(design: Floats, off: Floats) -> Floats:
-    """Covariance of a least-squares fit whose residuals are of unequal size."""
+    """Estimate the covariance of a least-squares fit whose residuals are of unequal size."""
     inverse, score = np.linalg.pinv(design.T @ design, hermitian=True), design * off[:, None]
     covariance: Floats = inverse @ (score.T @ score) @ inverse
     return covariance
@@ -153,8 +154,8 @@ def fit_threshold(energy: Floats, count: Ints, sweeps: int, dropout: float) -> E
         return np.clip((1 - dropout) * share, 1e-9, 1 - 1e-9)
 
     def unlikely(log_threshold: float) -> Floats:
-        p = seen(log_threshold)
-        there = np.log1p(-((1 - p) ** sweeps))
+        p: Floats = seen(log_threshold)
+        there: Floats = np.log1p(-((1 - p) ** sweeps))
         return there - count * np.log(p) - (sweeps - count) * np.log1p(-p)
 
     low, high = np.log(np.quantile(energy, (0.001, 0.999)))

@@ -139,7 +139,7 @@ def fit(
         rays = smooth_rays(repeats, around, sigma, 0.0 if estimates else _AIM)
         if len(rays.row) < _FEW:
             raise LidarpoolError(
-                f"{recording.name} has {len(rays.row)} rays on smooth surfaces, and {_FEW} are needed: "
+                f"{recording.name} has {len(rays.row)} rays on smooth surfaces, of at least {_FEW}: "
                 "record a place with walls or a floor."
             )
         energy = rays.light if recording.energies else None
@@ -177,7 +177,8 @@ def _with(base: SensorModel, known: Mapping[str, Estimate], source: str) -> Sens
     stated = base.performance.model_dump(exclude_defaults=True) if base.performance else {}
     for name in ("precision", "range_m", "range_per_m"):  # one excludes the others
         stated.pop(name, None)
-    if far := found.get("detection_range_m"):
+    far = found.get("detection_range_m", 0.0)
+    if far:
         stated["detection"] = {"range_m": far, "reflectance": 0.1, "probability": 0.5}
     if weak := found.get("range_at_threshold_m"):
         sigma = {part: float(np.hypot(found["range_m"], weak * part**2)) for part in (0.5, 1)}

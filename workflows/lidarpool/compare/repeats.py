@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -63,7 +63,9 @@ class Repeats:
                 continue
             with prefixed(name):
                 found = range_images(turn, own, (f"sweep {number}", "an earlier one"))
-                if found.step_deg != cells.step_deg or found.hidden[0] > cells.hidden[0] + 0.25:
+                other = len(found.rings) > 1.2 * len(cells.rings)
+                other |= found.step_deg != cells.step_deg
+                if other or found.hidden[0] > cells.hidden[0] + 0.25:
                     raise LidarpoolError(f"sweep {number} is of another sensor, or another mode.")
             _, rows, there = np.intersect1d(found.rings, cells.rings, return_indices=True)
             columns = round(found.begin_deg / found.step_deg) + np.arange(found.ranges.shape[2])
@@ -91,8 +93,7 @@ class Repeats:
 
     def first(self) -> Repeats:
         """Return the first sweep alone."""
-        images = (one[:1] for one in (self.ranges, self.light, self.aside))
-        return Repeats(self.rings, self.elevation, self.azimuth, *images, self.notes)
+        return replace(self, ranges=self.ranges[:1], light=self.light[:1], aside=self.aside[:1])
 
     def middle(self) -> Floats:
         """Return the medians of the ranges, (r, c)."""
@@ -119,7 +120,7 @@ def _quiet(values: Floats32, axis: int | tuple[int, ...]) -> Any:
         return np.nanmedian(values, axis=axis).astype(np.float64)
 
 
-class Surroundings(NamedTuple):
+class Neighbourhood(NamedTuple):
     """What the rays of a standing sensor meet, (r, c) each; NaN where nothing is."""
 
     distance: Floats  # metres
@@ -128,7 +129,7 @@ class Surroundings(NamedTuple):
     smooth: Bools  # whether the neighbours lie in one plane with it
 
 
-def surroundings(repeats: Repeats, distance: Floats, blur: Floats) -> Surroundings:
+def surroundings(repeats: Repeats, distance: Floats, blur: Floats) -> Neighbourhood:
     """Find slopes and edges of a range image, whose ranges have errors of `blur` metres.
 
     The inverse of the range to a plane is linear over small angles.
@@ -155,7 +156,7 @@ def surroundings(repeats: Repeats, distance: Floats, blur: Floats) -> Surroundin
             off -= rise * (beams[other] - beams)[:, None]
             smooth &= np.abs(square * off) < 2 * allowed
         smooth &= slope < _STEEPEST * distance
-    return Surroundings(distance, -square * across, slope, smooth)
+    return Neighbourhood(distance, -square * across, slope, smooth)
 
 
 class Rays(NamedTuple):
@@ -172,18 +173,18 @@ class Rays(NamedTuple):
 
     def take(self, rows: Bools) -> Rays:
         """Select rays."""
-        return Rays(*(one[rows] for one in self))
+        return Rays._make(one[rows] for one in self)
 
 
-def smooth_rays(repeats: Repeats, around: Surroundings, sigma: Floats, aim: float) -> Rays:
+def smooth_rays(repeats: Repeats, around: Neighbourhood, sigma: Floats, aim: float) -> Rays:
     """Choose rays without edges beside them, with the scatter of their ranges over the sweeps.
 
     Returns that noise of `sigma` (r, c) and directions that scatter by `aim` radians do not
     explain are left out, and rays with many of them.
     """
-    cell = np.nonzero(around.smooth)
+    row, column = cell = np.nonzero(around.smooth)
     images = repeats.ranges, repeats.light, repeats.aside
-    ranges, light, aside = (one[:, *cell].astype(np.float64) for one in images)
+    ranges, light, aside = (one[:, row, column].astype(np.float64) for one in images)
     ranges -= around.turn[cell] * aside
     slope, returns = around.slope[cell], np.isfinite(ranges).sum(axis=0)
     limit = np.where(returns > 1, _SIGMAS * np.hypot(sigma[cell], aim * slope), np.inf)
@@ -192,5 +193,5 @@ def smooth_rays(repeats: Repeats, around: Surroundings, sigma: Floats, aim: floa
     mean = np.where(kept, ranges, 0).sum(axis=0) / np.maximum(used, 1)
     variance = np.where(kept, (ranges - mean) ** 2, 0).sum(axis=0) / np.maximum(used - 1, 1)
     bright = np.where(kept, light, 0).sum(axis=0) / np.maximum(used, 1)
-    rays = Rays(*cell, mean, slope, bright, returns, variance, used - 1)
+    rays = Rays(row, column, mean, slope, bright, returns, variance, used - 1)
     return rays.take((used > 0) & (used >= _WHOLE * returns))
