@@ -37,7 +37,7 @@ def simulated(noise: Noise, rays: Any, energy: Any, sweeps: int) -> Any:
     keys = np.arange(len(rays.row))
     out = np.full((sweeps, len(keys)), np.nan)
     for scan in range(sweeps):
-        across, up = noise.angles(np.full(len(keys), scan), keys)
+        across, _ = noise.angles(np.full(len(keys), scan), keys)
         ranges = rays.distance + rays.slope * across  # along the steepest slope
         moved = noise.ranges(ranges, energy, np.full(len(keys), scan), keys, 0 * keys)
         seen = noise.detected(energy, np.full(len(keys), scan), keys, 0 * keys)
@@ -100,8 +100,10 @@ def main() -> None:
             seen = f"{100 * spread[name]:.1f} %" if name in spread else "0"
             print(f"| {Path(path).name} | {name} | {low:.1f}, {middle:.1f}, {high:.1f} "
                   f"| {100 * lost[name]:.2f} % | {seen} |")  # fmt: skip
-            axes.hist(np.clip(values, -limit, limit), 61, histtype="step", density=True,
-                      color=COLOURS[name], label=name)  # fmt: skip
+            if values.any():  # without noise there is nothing to draw
+                share = np.full(len(values), 1 / len(values))
+                axes.hist(values, 61, (-limit, limit), weights=share, histtype="step",
+                          color=COLOURS[name], label=name)  # fmt: skip
         axes.set(title=f"{Path(path).name}\n{model}", xlabel="deviation, mm", yticks=[])
     figure.axes[0].legend(fontsize=7, frameon=False)
     if given.picture:

@@ -103,7 +103,7 @@ def fit_scatter(rays: Rays, energy: Floats | None = None) -> RangeScatter:
     tilted = np.quantile(rays.slope / rays.distance, 0.9) > _TILT
     known = np.array([True, high > _SPAN * low, tilted])
     kept, steep = rays.freedom > 0, np.median(rays.slope)
-    usual, power = np.median(rays.variance[kept]), 1 if energy is None else 2
+    power, usual = 1 if energy is None else 2, max(float(np.median(rays.variance[kept])), 1e-12)
 
     def model(some: Floats) -> Floats:
         theta = np.zeros(3)

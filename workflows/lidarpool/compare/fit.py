@@ -139,7 +139,7 @@ def fit(
         rays = smooth_rays(repeats, around, sigma, 0.0 if estimates else _AIM)
         if len(rays.row) < _FEW:
             raise LidarpoolError(
-                f"{recording.name} has {len(rays.row)} rays on smooth surfaces, of at least {_FEW}: "
+                f"{recording.name} has {len(rays.row)} rays on smooth surfaces, not {_FEW}: "
                 "record a place with walls or a floor."
             )
         energy = rays.light if recording.energies else None
