@@ -102,7 +102,7 @@ def main() -> None:
                   f"| {100 * lost[name]:.2f} % | {seen} |")  # fmt: skip
             if values.any():  # without noise there is nothing to draw
                 share = np.full(len(values), 1 / len(values))
-                axes.hist(values, 61, (-limit, limit), weights=share, histtype="step",
+                axes.hist(values, 61, range=(-limit, limit), weights=share, histtype="step",
                           color=COLOURS[name], label=name)  # fmt: skip
         axes.set(title=f"{Path(path).name}\n{model}", xlabel="deviation, mm", yticks=[])
     figure.axes[0].legend(fontsize=7, frameon=False)

@@ -62,9 +62,9 @@ class Repeats:
             if not len(turn := recording.turn(number)):
                 continue
             with prefixed(name):
-                found = range_images(turn, own, (f"sweep {number}", "an earlier one"))
+                names = f"sweep {number}", "an earlier one"
+                found = range_images(turn, own, names, cells.step_deg)
                 other = len(found.rings) > 1.2 * len(cells.rings)
-                other |= found.step_deg != cells.step_deg
                 if other or found.hidden[0] > cells.hidden[0] + 0.25:
                     raise LidarpoolError(f"sweep {number} is of another sensor, or another mode.")
             _, rows, there = np.intersect1d(found.rings, cells.rings, return_indices=True)
