@@ -37,7 +37,7 @@ def test_the_sensor_that_is_written_runs(sweeps, tmp_path, lidarpool, cluster):
     done = lidarpool("run", tmp_path / "survey.yaml", "--out", tmp_path / "out", *arguments)
     assert done.code == 0, done.err
     report = json.loads((tmp_path / "out/report.json").read_text())
-    noise = report["parameters"]["noise"]
+    noise = report["parameters"]["sensor"]["noise"]
     assert noise["range_m"] == pytest.approx(figures["figures"]["range_m"]["value"], rel=1e-3)
     (tmp_path / "campaign.yaml").write_text(
         "base: survey.yaml\njobs: 2\nvary: {noise.dropout: {uniform: [0, 0.1]}}\n"
