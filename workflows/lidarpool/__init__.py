@@ -12,6 +12,7 @@ if TYPE_CHECKING:
     from .columns.cloud import Cloud
     from .columns.table import Column
     from .compare.comparison import Comparison, compare
+    from .compare.fit import Fit, fit
     from .datasets.loader import sweeps
     from .datasets.sweep_data import Sweep
     from .export.formats import save_cloud
@@ -59,6 +60,7 @@ __all__ = [
     "Column",
     "Comparison",
     "Fault",
+    "Fit",
     "Gnss",
     "Imu",
     "Job",
@@ -88,6 +90,7 @@ __all__ = [
     "__version__",
     "compare",
     "datasheet",
+    "fit",
     "load_robot",
     "load_sensor",
     "load_trajectory",
@@ -115,6 +118,7 @@ _MODULES = {
     "plan": ("Plan", "Planning"),
     "report.merging": ("merge",),
     "compare.comparison": ("Comparison", "compare"),
+    "compare.fit": ("Fit", "fit"),
     "run.run_result": ("CampaignRun",),
     "run.store": ("remove_run",),
     "scenario.build": ("Job",),

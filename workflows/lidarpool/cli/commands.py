@@ -28,7 +28,7 @@ from ..base.shard import ALL
 from ..base.vocabulary import PATIENCE_S, QUEUE_S, WAIT_S
 from ..base.words import plural
 from . import shared_options as shared
-from .result_commands import compare, export, plot, view
+from .result_commands import compare, export, fit, plot, view
 from .scenario_commands import check, import_, init, scene, schema, sensors, stations
 from .shared_options import set_logs
 
@@ -114,7 +114,10 @@ def _runs(command: Callable[..., None]) -> Callable[..., None]:
 
 
 @click.group(
-    commands=[init, import_, check, schema, scene, sensors, stations, view, plot, export, compare],
+    commands=[
+        *(init, import_, check, schema, scene, sensors, stations),
+        *(view, plot, export, compare, fit),
+    ],
     context_settings={"max_content_width": 100, "help_option_names": ["-h", "--help"]},
 )
 @click.version_option(__version__, prog_name=PROGRAM)

@@ -1,4 +1,4 @@
-"""The commands for finished results: `lidarpool plot`, `export`, `view` and `compare`."""
+"""The commands for results and recordings: `plot`, `export`, `view`, `compare` and `fit`."""
 
 from __future__ import annotations
 
@@ -277,4 +277,41 @@ def compare(a: Path, b: Path, out: Path, as_json: bool, **given: Any) -> None:
     found = compared(a, b, **given)
     page = next(path for path in found.save(out) if path.suffix == ".html")
     words = [repr(found), f"page     {click.format_filename(page)}"]
+    options.show(found.figures, words, as_json)
+
+
+@click.command()
+@click.argument("recording", metavar="RECORDING", type=click.Path(path_type=Path))
+@options.new_file("--out", required=True, help="Sensor file, .yaml; its page is a .html beside it.")
+@click.option(
+    "--model", metavar="MODEL|FILE", help="The sensor; what is not told keeps its figures."
+)
+@click.option("--scene", metavar="FILE", type=click.Path(path_type=Path), help="The place, a mesh.")
+@options.pose
+@click.option("--sensor", metavar="NAME", help="Sensor of the recording, or topic of a bag.")
+@click.option("--intensity", metavar="COLUMN", help="Column of the intensity.")
+@click.option(
+    "--white",
+    type=click.FloatRange(0, min_open=True),
+    metavar="VALUE",
+    help="Intensity of a white surface, if it is the same at all ranges.",
+)
+@options.as_json
+def fit(recording: Path, out: Path, as_json: bool, **given: Any) -> None:
+    """Fit a sensor to a recording of a unit that stands: noise, lost returns, false alarms.
+
+    RECORDING is one that `lidarpool compare` reads, with sweeps and rings.
+
+    \b
+    Examples:
+      lidarpool fit recording.pcap --model velodyne/vlp16 --out my-vlp16.yaml
+      lidarpool fit sweeps --white 255 --out mine.yaml
+      lidarpool fit recording.mcap --scene hall.glb --pose 2,0,1.5 --out mine.yaml
+    """  # noqa: D301 - click wants the character, not its name
+    from ..base.fork_server import keep_freed_memory
+    from ..compare.fit import fit as fitted
+
+    keep_freed_memory()
+    found = fitted(recording, **given)
+    words = [repr(found), *map(click.format_filename, found.save(out))]
     options.show(found.figures, words, as_json)

@@ -97,6 +97,8 @@ def _of_mesh(name: str, what: str, **more: Any) -> Callable[[Command], Command]:
 
 
 _list_of_mesh = partial(_of_mesh, metavar="NAME,…", type=_names, multiple=True)
+pose = click.option("--pose", metavar="X,Y,Z", type=_position, default="0,0,0",
+                    help="Place of the sensor in the scene, metres.")  # fmt: skip
 _mesh_options = together(
     _of_mesh("sensor", "sensor, one of lidarpool sensors or a file", metavar="MODEL|FILE.yaml"),
     _of_mesh("unit", "length unit; by default its own, or m", type=click.Choice([*UNITS_M])),

@@ -38,6 +38,7 @@ class RangeImages:
     notes: tuple[str, ...]
     row: Ints  # (k,): of all cells, or of all rays that have a return
     compared: Floats  # (2, 2, k): range and intensity of these in A and in B, NaN where unknown
+    azimuth_deg: Floats  # (r, c): of the returns of A, NaN without one
     paired_by: str = "cells"  # or "rays"
 
     @property
@@ -122,7 +123,7 @@ class _Polar:
     def image(
         self, rows: Ints, phases: Floats, step: float, shape: tuple[int, int]
     ) -> tuple[Floats, float]:
-        """Ranges and lights of cells (2, *shape), and the share of points that others there hide.
+        """Ranges, lights and azimuths of cells (3, *shape), and the share of points hidden there.
 
         `rows` (r,) are those of its rings, `phases` as the method gives them. Of several points in
         a cell, the one nearest to the middle is taken, and of several returns of a pulse the
@@ -134,11 +135,11 @@ class _Polar:
         cell = rows[self.ring] * shape[1] + column.astype(np.int64) % shape[1]
         order = np.lexsort((self.ranges, off, cell))
         chosen = order[np.diff(cell[order], prepend=-1) > 0]
-        image = np.full((2, shape[0] * shape[1]), np.nan)
-        image[0, cell[chosen]] = self.ranges[chosen]
+        image = np.full((3, shape[0] * shape[1]), np.nan)
+        image[0, cell[chosen]], image[2, cell[chosen]] = self.ranges[chosen], self.azimuth[chosen]
         if self.light is not None:
             image[1, cell[chosen]] = self.light[chosen]
-        return image.reshape(2, *shape), 1 - len(chosen) / len(cell)
+        return image.reshape(3, *shape), 1 - len(chosen) / len(cell)
 
 
 def range_images(
@@ -187,7 +188,8 @@ def range_images(
     images = images[..., order]
     return RangeImages(
         rings, elevation, step, begin, images[:, 0], (hidden_a, hidden_b),
-        notes, np.repeat(np.arange(count), len(order)), images.reshape(2, 2, -1),
+        notes, np.repeat(np.arange(count), len(order)), images[:, :2].reshape(2, 2, -1),
+        images[0, 2],
     )  # fmt: skip
 
 

@@ -30,14 +30,16 @@ from ..export.sweeps import SWEEPS_FILE, Placed, Sweeps
 from ..scene.files.polygon_files import read_ply_columns
 
 KINDS = (
-    "the folder of a result or data set, a .ply, a .pcd or a folder of them, a .las or .laz, or a "
-    "bag of ROS 2 (.mcap or its folder)"
+    "the folder of a result or data set, a .ply, a .pcd or a folder of them, a .las or .laz, a bag "
+    "of ROS 2 (.mcap or its folder), a .pcap of Velodyne, or a .pcap or .osf of Ouster"
 )
 # What programs call the number of a beam, and the light that came back; the first there is.
 _RINGS = ("ring", "channel", "laser_id", "laser_number", "line", "beam")
 _LIGHTS = ("intensity", "reflectivity", "i")
 _POINT_CLOUD = "sensor_msgs/msg/PointCloud2"
 _RECORD = 54  # least bytes of a variable-length record of .las
+_WHITE = 100.0  # what Velodyne and Ouster report of a white surface, whatever its range
+_VELODYNE = (1248, 554)  # bytes of the first frame of a Velodyne's .pcap: points, or a position
 
 Columns = Mapping[str, AnyArray]
 # Positions (n, 3), columns, and the pose of their axes in the world (4, 4); None if unknown.
@@ -85,6 +87,8 @@ class Recording:
     times: Callable[[], Iterable[float]] | None = None  # start of each sweep, ns
     notes: tuple[str, ...] = ()
     thinned: bool = False  # whether hits were left out, so that gaps say nothing
+    white: float | None = None  # intensity of a white surface, if it is the same at all ranges
+    energies: bool = False  # whether intensities are energies, as those of results
     firings: str = ""  # recordings with the same have the same rays; "" for unknown
 
     def turn(self, number: int, *, in_world: bool = False) -> Turn:
@@ -166,6 +170,12 @@ def open_recording(
         return _of_las(path, name, light)
     elif kind == ".mcap":
         return _of_bag(path, name, sensor, light)
+    elif kind in (".osf", ".pcap"):
+        with _reading(name), path.open("rb") as file:
+            first = int.from_bytes(file.read(36)[32:], "little")
+        if kind == ".pcap" and first in _VELODYNE:
+            return _of_velodyne(path, name, light)
+        return _of_ouster(path, name, sensor, light)
     raise LidarpoolError(f"{name} cannot be compared: give {KINDS}.")
 
 
@@ -192,6 +202,7 @@ def _of_cloud(
         return there.in_sensor(at, points.positions), points.columns, there.pose.matrix(at)
 
     times = there.begins_ns[numbers] + (there.start_ns or 0)
+    more["energies"] = light in (None, "intensity")
     columns = {column.name for column in cloud.table}
     if told := columns & {"time", "ray"}:
         poses = there.pose.positions[numbers], there.pose.quaternions[numbers]
@@ -303,21 +314,84 @@ def _of_bag(path: Path, name: str, topic: str | None, light: str | None) -> Reco
         bag.open()
     there = {one.topic: one for one in bag.connections if one.msgtype == _POINT_CLOUD}
     connection = there[_chosen(name, "topics of PointCloud2", there, topic)]
-    coming: tuple[int, Iterator[Any]] = 0, iter(())  # the next sweep, and messages from there on
+    message = _in_order(lambda: bag.messages([connection]))
 
     def read(number: int) -> Read:
-        nonlocal coming
-        if not 0 < coming[0] <= number:
-            coming = 0, bag.messages([connection])
-        _, _, data = next(islice(coming[1], number - coming[0], None))
-        coming = number + 1, coming[1]
-        columns = columns_of(data)
+        columns = columns_of(message(number)[2])
         return _places(columns), columns, None
 
     def times() -> Iterator[float]:
         return (time for _, time, _ in bag.messages([connection]))
 
     return Recording(name, connection.msgcount, read, light, times=times)
+
+
+def _of_ouster(path: Path, name: str, sensor: str | None, light: str | None) -> Recording:
+    """Open scans of ouster-sdk; a .pcap has its metadata in a .json beside it."""
+    if find_spec("ouster") is None:  # it wants old versions of what it does not need to read
+        raise LidarpoolError(f"{name} is read by ouster-sdk: pip install --no-deps ouster-sdk.")
+    sdk: Any = import_module("ouster.sdk")
+    core: Any = import_module("ouster.sdk.core")
+    with _reading(name):
+        infos = sdk.open_source(str(path)).sensor_info
+        known = [f"{one.prod_line} {one.sn}".strip() for one in infos]
+    which = known.index(_chosen(name, "sensors", known, sensor))
+    place = core.XYZLut(infos[which], False)
+
+    def scans() -> Iterator[Any]:
+        frames = (frame[which] for frame in sdk.open_source(str(path)))
+        return (frame for frame in frames if frame is not None)
+
+    def points(scan: Any) -> Read:
+        ring, column = np.nonzero(scan.field("RANGE"))
+        columns = {"ring": ring}
+        for one in {"REFLECTIVITY", "SIGNAL", "NEAR_IR"}.intersection(scan.fields):
+            columns[one.lower()] = scan.field(one)[ring, column]
+        return place(scan)[ring, column], columns, None
+
+    white = _WHITE if light in (None, "reflectivity") else None
+    return _streamed(name, scans, points, light, white)
+
+
+def _of_velodyne(path: Path, name: str, light: str | None) -> Recording:
+    """Open packets of a Velodyne, which say the model."""
+    _need("velodyne_decoder", "fit", name)
+    decoder: Any = import_module("velodyne_decoder")
+
+    def points(sweep: Any) -> Read:
+        columns = {name: sweep.points[name] for name in sweep.points.dtype.names}
+        return _places(columns), columns, None
+
+    def sweeps_there() -> Iterator[Any]:
+        return iter(decoder.read_pcap(str(path), as_pcl_structs=True))
+
+    return _streamed(name, sweeps_there, points, light, None if light else _WHITE)
+
+
+def _streamed(
+    name: str, begin: Callable[[], Iterator[Any]], points: Callable[[Any], Read],
+    light: str | None, white: float | None,
+) -> Recording:  # fmt: skip
+    """Open what has to be read from its beginning to know how many sweeps there are."""
+    with _reading(name):
+        count = sum(1 for _ in begin())
+    item = _in_order(begin)
+    return Recording(name, count, lambda number: points(item(number)), light, white=white)
+
+
+def _in_order(begin: Callable[[], Iterator[Any]]) -> Callable[[int], Any]:
+    """Return what gives the item of a number, where reading can only begin at the first."""
+    coming: tuple[int, Iterator[Any]] = 0, iter(())  # number of the next item, and all from there
+
+    def item(number: int) -> Any:
+        nonlocal coming
+        if not 0 < coming[0] <= number:
+            coming = 0, begin()
+        found = next(islice(coming[1], number - coming[0], None))
+        coming = number + 1, coming[1]
+        return found
+
+    return item
 
 
 @contextmanager

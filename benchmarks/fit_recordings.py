@@ -1,0 +1,114 @@
+"""Fits half of the sweeps of recordings, and compares noise and losses with the other half.
+
+python -m benchmarks.fit_recordings [--picture FILE.png] RECORDING=MODEL[,WHITE] …
+
+The simulator's noise is drawn at the ranges, energies and slopes of the other half's rays: by the
+model's data sheet, and as fitted.
+"""
+
+from __future__ import annotations
+
+import argparse
+from dataclasses import replace
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from lidarpool import LidarpoolError, Noise, datasheet, fit
+from lidarpool.compare.recordings import Recording, open_recording
+from lidarpool.compare.repeats import Repeats, smooth_rays, surroundings
+
+COLOURS = {"recorded": "#1c2430", "data sheet": "#ee7733", "fitted": "#4477aa"}
+
+
+def half(recording: Recording, first: int) -> Recording:
+    """Every second sweep of a recording."""
+    numbers = range(first, recording.count, 2)
+    return replace(
+        recording, count=len(numbers), read=lambda number: recording.read(numbers[number])
+    )
+
+
+def simulated(noise: Noise, rays: Any, energy: Any, sweeps: int) -> Any:
+    """Ranges of rays in sweeps, (s, k), NaN where lost."""
+    keys = np.arange(len(rays.row))
+    out = np.full((sweeps, len(keys)), np.nan)
+    for scan in range(sweeps):
+        across, _ = noise.angles(np.full(len(keys), scan), keys)
+        ranges = rays.distance + rays.slope * across  # along the steepest slope
+        moved = noise.ranges(ranges, energy, np.full(len(keys), scan), keys, 0 * keys)
+        seen = noise.detected(energy, np.full(len(keys), scan), keys, 0 * keys)
+        out[scan] = np.where(seen, moved, np.nan)
+    return out
+
+
+def deviations(ranges: Any) -> Any:
+    """Differences of sweeps in turn, over the root of two, millimetres."""
+    steps = np.diff(ranges, axis=0) / np.sqrt(2)
+    return 1000 * steps[np.isfinite(steps)]
+
+
+def compared(recording: Recording, model: str, white: float | None) -> tuple[dict[str, Any], ...]:
+    """Deviations (n,) and shares of lost pulses, recorded and simulated; scatter of intensity."""
+    found = fit(half(recording, 0), model=model, white=white)
+    other = Repeats.read(half(recording, 1))
+    sigma = other.rough_sigma()
+    around = surroundings(other, other.middle(), sigma / np.sqrt(len(other.ranges)))
+    rays = smooth_rays(other, around, sigma, 0.002)
+    energy = np.maximum(rays.light / (white or recording.white or 100), 1 / 400)
+    energy = energy * (10 / rays.distance) ** 2
+    with TemporaryDirectory() as folder:
+        fitted = datasheet(found.save(Path(folder) / "fitted.yaml")[0]).noise
+    fitted = replace(fitted, dropout=found.figures["figures"]["dropout"]["value"])
+    try:
+        sheet = datasheet(model).noise
+    except LidarpoolError:
+        sheet = Noise()
+    cell = rays.row, rays.column
+    recorded = other.ranges[:, *cell].astype(float)
+    recorded -= around.turn[cell] * np.nan_to_num(other.aside[:, *cell])
+    sweeps = len(recorded)
+    ranges = {"recorded": recorded, "data sheet": simulated(sheet, rays, energy, sweeps),
+              "fitted": simulated(fitted, rays, energy, sweeps)}  # fmt: skip
+    light = other.light[:, *cell].astype(float)
+    steps = np.abs(np.diff(light, axis=0)) / np.sqrt(2) / np.maximum(rays.light, 1)
+    spread = {"recorded": float(np.nanmedian(steps) / 0.6745)}
+    lost = {name: float(np.isnan(one).mean()) for name, one in ranges.items()}
+    return {name: deviations(one) for name, one in ranges.items()}, lost, spread
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("recordings", nargs="+", metavar="RECORDING=MODEL[,WHITE]")
+    parser.add_argument("--picture", type=Path)
+    given = parser.parse_args()
+    figure = Figure(figsize=(3.2 * len(given.recordings), 2.8), layout="constrained")
+    print("| recording | | noise: 50 %, 95 %, 99 % of deviations, mm | pulses lost | intensity |")
+    print("|---|---|--:|--:|--:|")
+    for number, text in enumerate(given.recordings):
+        path, _, model = text.partition("=")
+        model, _, white = model.partition(",")
+        recording = open_recording(path)
+        off, lost, spread = compared(recording, model, float(white) if white else None)
+        axes = figure.add_subplot(1, len(given.recordings), number + 1)
+        limit = 1.5 * np.quantile(np.abs(off["recorded"]), 0.98)
+        for name, values in off.items():
+            low, middle, high = np.quantile(np.abs(values), (0.5, 0.95, 0.99))
+            seen = f"{100 * spread[name]:.1f} %" if name in spread else "0"
+            print(f"| {Path(path).name} | {name} | {low:.1f}, {middle:.1f}, {high:.1f} "
+                  f"| {100 * lost[name]:.2f} % | {seen} |")  # fmt: skip
+            if values.any():  # without noise there is nothing to draw
+                share = np.full(len(values), 1 / len(values))
+                axes.hist(values, 61, range=(-limit, limit), weights=share, histtype="step",
+                          color=COLOURS[name], label=name)  # fmt: skip
+        axes.set(title=f"{Path(path).name}\n{model}", xlabel="deviation, mm", yticks=[])
+    figure.axes[0].legend(fontsize=7, frameon=False)
+    if given.picture:
+        figure.savefig(given.picture, dpi=110)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,198 @@
+"""Sensors fitted to recordings: figures that were put in, what cannot be told, files and errors."""
+
+from __future__ import annotations
+
+import struct
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import yaml
+from benchmarks.fit_coverage import recorded, street, trial
+
+from lidarpool import LidarpoolError, Noise, Scanner, Sensor, datasheet, fit, load_sensor
+from lidarpool.compare.recordings import Recording, open_recording
+from lidarpool.export.formats import Format
+from lidarpool.export.sweeps import Sweeps
+
+pytest.importorskip("scipy", reason="the extra fit is not installed")
+
+NOISE = Noise(range_m=0.02, range_per_m=0.0005, angle_deg=0.08, dropout=0.02, seed=3)
+
+
+@pytest.fixture(scope="module")
+def recording():
+    return recorded(NOISE)
+
+
+@pytest.fixture(scope="module")
+def fitted(recording):
+    return fit(recording)
+
+
+def test_intervals_hold_what_was_put_in():
+    """The table of docs/fidelity.md with ten trials: of 55 intervals about three miss."""
+    held = []
+    for number in range(10):
+        truth, found = trial(number)
+        for name, true in truth.items():
+            one = found[name]
+            held.append(one["low"] <= true <= one["high"])
+            assert abs(one["value"] - true) < 5 * max(one["high"] - one["low"], 1e-6) / 2, name
+    assert len(held) == 55 and np.mean(held) > 0.8
+
+
+def test_the_file_is_a_sensor_with_these_figures(fitted, tmp_path):
+    written = fitted.save(tmp_path / "mine.yaml")
+    assert [path.name for path in written] == ["mine.yaml", "mine.html"]
+    stated = yaml.safe_load(written[0].read_text())
+    noise = datasheet(written[0]).noise
+    figures = fitted.figures["figures"]
+    for name in ("range_m", "range_per_m", "angle_deg"):
+        assert getattr(noise, name) == pytest.approx(figures[name]["value"], rel=1e-3)
+    sensor = load_sensor(written[0])
+    assert sensor.channels == 16 and sensor.period == 360
+    assert "12 sweeps" in stated["sources"]["performance"]
+    again = fitted.save(tmp_path / "again.yaml")
+    assert [one.read_bytes() for one in again] == [one.read_bytes() for one in written]
+    with pytest.raises(LidarpoolError, match="no sensor file: give a name such as mine"):
+        fitted.save(tmp_path / "mine.json")
+
+
+def test_the_page_has_all_figures_and_says_what_is_unknown(fitted, tmp_path):
+    page = fitted.save(tmp_path / "mine.yaml")[1].read_text()
+    assert page.count("data-figure=") == len(fitted.figures["figures"])
+    assert page.count("data-ring=") == 16 and page.count("<svg") == 1
+    assert "loses half its pulses" in page and "<script" not in page
+    text = repr(fitted)
+    assert "unknown: detection_range_m" in text and "range_per_m" in text
+
+
+def test_noise_by_energy_becomes_the_two_statements_of_a_data_sheet(tmp_path):
+    truth = {"range_m": 0.015, "range_at_threshold_m": 0.07, "detection_range_m": 10}
+    made = fit(recorded(Noise(**truth, dropout=0.01, angle_deg=0.05, seed=1)))
+    noise = datasheet(made.save(tmp_path / "mine.yaml")[0]).noise
+    for name, true in truth.items():
+        assert getattr(noise, name) == pytest.approx(true, rel=0.1), name
+
+
+def test_a_model_keeps_what_the_recording_does_not_tell():
+    flat = fit(recorded(NOISE), model="ouster/os1-64")
+    stated = flat.model.performance
+    assert stated.detection.range_m == 90 and stated.precision is None
+    assert flat.model.firings_per_turn == 1024
+
+
+def test_bias_of_channels_against_planes_and_against_the_scene():
+    bias = 0.005 * (-1.0) ** np.arange(16)
+    made = recorded(Noise(range_m=0.01, seed=2), bias)
+    for scene in (None, street()):
+        rows = fit(made, scene=scene).figures["channels"]
+        for row in rows:
+            one, true = row["bias_m"], bias[row["ring"]]
+            assert abs(one["value"] - true) < max(one["high"] - one["low"], 0.002), row
+    found = fit(made, scene=street()).figures["curves"]
+    assert len(found["lost_by_range"]) > 3 and found["lost_by_range"][0]["value"] < 0.01
+
+
+def test_a_single_sweep_and_a_moving_sensor_tell_bias_alone(recording):
+    single = fit(replace(recording, count=1))
+    assert not single.figures["figures"] and "there is a single sweep" in repr(single)
+    assert single.model.performance is None
+    sensor = Sensor.grid(360, 16, vertical_fov_deg=40, max_range_m=120)
+    scanner = Scanner(street(), sensor, coordinates="sensor")
+    drive = [scanner.sweep((0, k, 0.3 * k), number=k) for k in range(4)]
+    moving = Recording("drive", 4, lambda k: (drive[k].positions, drive[k].columns, None))
+    found = fit(moving)
+    assert not found.figures["figures"] and "the sensor moves" in repr(found)
+    assert sum(row["bias_m"] is not None for row in found.figures["channels"]) > 10
+
+
+def test_intensities_of_unknown_scale_need_the_white_one():
+    made = replace(recorded(Noise(range_m=0.01, detection_range_m=10, seed=4)), energies=False)
+    found = fit(made)
+    assert "detection_range_m" not in found.figures["figures"] and "--white" in repr(found)
+
+    def calibrated(number):
+        points, columns, pose = made.read(number)
+        square = (points**2).sum(axis=1)
+        return points, {**columns, "intensity": columns["intensity"] * square / 100 * 255}, pose
+
+    found = fit(replace(made, read=calibrated), white=255)
+    assert found.figures["figures"]["detection_range_m"]["value"] == pytest.approx(10, rel=0.03)
+
+
+def test_cut_and_mixed_recordings_are_told_in_a_line(recording, tmp_path):
+    def cut(number):
+        points, columns, pose = recording.read(number)
+        some = len(points) // 3 if number == 5 else len(points)
+        return points[:some], {name: one[:some] for name, one in columns.items()}, pose
+
+    assert "1 sweep cut short, left out" in repr(fit(replace(recording, read=cut)))
+    other = Scanner(street(), Sensor.grid(360, 40, vertical_fov_deg=80), coordinates="sensor")
+    sweep = other.sweep((0, 0, 0))
+
+    def mixed(number):
+        return (sweep.positions, sweep.columns, None) if number == 5 else recording.read(number)
+
+    nothing = np.zeros((0, 3)), {"channel": np.zeros(0, int)}, None
+    for made, says in (
+        (replace(recording, read=mixed), "not of the same sensor|of another sensor"),
+        (replace(recording, read=lambda number: nothing), "has no points: there is nothing to fit"),
+        (replace(recording, count=0), "has no sweeps"),
+        (replace(recording, read=lambda k: (*recording.read(k)[:1], {}, None)), "has no rings"),
+    ):
+        with pytest.raises(LidarpoolError, match=says) as raised:
+            fit(made)
+        assert len(str(raised.value).splitlines()) == 1
+
+
+@pytest.mark.parametrize("name", ["empty.pcap", "cut.pcap", "text.osf"])
+def test_broken_files_are_told_in_a_line(tmp_path, name):
+    pytest.importorskip("velodyne_decoder")
+    frame = b"\0" * 600
+    head = struct.pack("<IHHiIII", 0xA1B2C3D4, 2, 4, 0, 0, 65535, 1)
+    record = struct.pack("<IIII", 1, 0, 1248, 1248)
+    content = {"empty.pcap": b"", "cut.pcap": head + record + frame, "text.osf": b"no scans"}
+    (tmp_path / name).write_bytes(content[name])
+    with pytest.raises(LidarpoolError) as raised:
+        fit(tmp_path / name)
+    assert name in str(raised.value) and len(str(raised.value).splitlines()) == 1
+
+
+def test_packets_of_a_velodyne_are_sweeps(tmp_path):
+    """A VLP-16 in the middle of a round room of 5 m, whose channels report 50 of 100."""
+    pytest.importorskip("velodyne_decoder")
+    head = struct.pack("<IHHiIII", 0xA1B2C3D4, 2, 4, 0, 0, 65535, 1)
+    blocks, frames = 12, [head]
+    for number in range(76 * 4):
+        data = b""
+        for block in range(blocks):
+            azimuth = round((number * blocks + block) * 39.8133) % 36000
+            data += struct.pack("<HH", 0xEEFF, azimuth) + struct.pack("<HB", 2500, 50) * 32
+        micros = round(number * blocks * 110.592)
+        data += struct.pack("<IBB", micros, 0x37, 0x22)
+        frame = b"\0" * 12 + b"\x08\x00" + b"\x45" + b"\0" * 8 + b"\x11" + b"\0" * 10
+        frame += struct.pack(">HHHH", 2368, 2368, 8 + len(data), 0) + data
+        stamp = divmod(micros, 1_000_000)
+        frames.append(struct.pack("<IIII", *stamp, len(frame), len(frame)) + frame)
+    (tmp_path / "room.pcap").write_bytes(b"".join(frames))
+    opened = open_recording(tmp_path / "room.pcap")
+    turn = opened.turn(1)
+    assert opened.count >= 3 and opened.white == 100 and set(turn.light) == {50.0}
+    assert len(np.unique(turn.rings)) == 16
+    assert np.linalg.norm(turn.points, axis=1) == pytest.approx(5, abs=0.05)
+
+
+def test_a_result_is_fitted_as_a_cloud_and_as_files(tmp_path):
+    from lidarpool import Scene, Survey, simulate
+
+    survey = Survey(
+        Sensor.grid(360, 16, vertical_fov_deg=40, max_range_m=120), poses=[(0, 0, 0)] * 4,
+        steps=36, columns=["intensity"], noise=NOISE, precision_m=1e-4,
+    )  # fmt: skip
+    cloud = simulate(street(), survey).cloud
+    Format("pcd").write(tmp_path / "sweeps", cloud, Sweeps.of(survey, Scene.seed()))
+    for found in (fit(cloud), fit(tmp_path / "sweeps", white=1.0)):
+        one = found.figures["figures"]["range_m"]
+        assert one["low"] - 0.001 < 0.02 < one["high"] + 0.001
