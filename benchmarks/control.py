@@ -147,7 +147,7 @@ def count_bytes(scans: int) -> None:
 
 def single_scans() -> Any:
     """Make the batches of runs so small that each has one scan; tasks still have several."""
-    return patch.object(lidarpool.pipeline.policies, "most_scans", lambda *_: 1)
+    return patch.object(lidarpool.pipeline.policies, "scans_per_batch", lambda *_: 1)
 
 
 def count_batches(batches: int) -> None:

@@ -46,18 +46,27 @@ from .messages import (
 from .names import COLLECT, GENERATE, LIDAR
 from .rigs import CastBatch
 
-TELL_EVERY_S = 0.02  # messages that follow each other so fast travel together
+TELL_EVERY_S = 0.05  # messages that follow each other so fast travel together
+LINGER_S = 0.02  # the sorter waits so long for more
 FETCH_PATIENCE_S = 2.0  # longest wait for a sign of life of a batch's worker
 
 
-def _work(me: StageStart, inlet: Pipe, do: Callable[[Iterator[Any]], Iterable[int]]) -> TaskRecord:
-    """Do what the driver sends until a pipe is closed; `do` yields how many scans are done."""
+def _work(
+    me: StageStart,
+    inlet: Pipe,
+    do: Callable[[Iterator[Any]], Iterable[int]],
+    linger_s: float = 0.0,
+) -> TaskRecord:
+    """Do what the driver sends until a pipe is closed; `do` yields how many scans are done.
+
+    Once there is something, it waits `linger_s` for more.
+    """
     recorder = Recorder(me.stage, LIDAR)
     scans = 0
     me.trace("start")
     with suppress(PipeClosed, PipeFailed):
         while True:
-            for count in do(chain.from_iterable(inlet.get_all())):
+            for count in do(chain.from_iterable(inlet.get_all(linger_s=linger_s))):
                 scans += count
     return recorder.done(scans)
 
@@ -145,7 +154,8 @@ def sort_frames(me: StageStart, inlet: Pipe, outlet: Pipe) -> TaskRecord:
             me.trace("sent", scans)
             yield len(scans)
 
-    return _work(me, inlet, sort)
+    # Each answer wakes the driver.
+    return _work(me, inlet, sort, linger_s=LINGER_S)
 
 
 @dataclass(eq=False)
