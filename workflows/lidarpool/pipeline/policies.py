@@ -76,7 +76,7 @@ def weight(batches: Iterable[Batch], per_task: int) -> float:
     All of a task's batches are in a worker's memory at a time: one that takes half of what is there
     counts as half a task.
     """
-    return sum(max(1.0, per_task * len(batch) / batch.job.fit) for batch in batches)
+    return sum([max(1.0, per_task * batch.share) for batch in batches])
 
 
 def most_under_way(slots: int, collectors: int, per_task: int = 1) -> int:
@@ -107,7 +107,7 @@ def kills(batch: Batch, stage: str) -> int:
 
 def suspect(batch: Batch, stage: str) -> bool:
     """Whether a batch may be what kills the workers of a stage: then it is tried alone."""
-    return kills(batch, stage) >= 0
+    return bool(batch.deaths) and kills(batch, stage) >= 0
 
 
 def offers(

@@ -14,7 +14,7 @@ from dataclasses import dataclass, field, replace
 from itertools import chain
 from typing import Any
 
-from distributed import secede
+from distributed import Client, secede
 
 from poolpart import (
     Pipe,
@@ -24,7 +24,6 @@ from poolpart import (
     TaskRecord,
     fetch_available,
     hold_for_driver,
-    own_client,
     telling_departure,
 )
 
@@ -191,16 +190,18 @@ def collect(
     there = storage if storage.sees(*probe) else None
 
     def store(orders: Iterator[CollectOrder]) -> Iterator[int]:
-        return _tell(me, outlet, chain.from_iterable(_collected(me, there, o) for o in orders))
+        # The pipe's client: `own_client` makes a message to the scheduler each time.
+        news = (_collected(me, there, order, inlet.client) for order in orders)
+        return _tell(me, outlet, chain.from_iterable(news))
 
     return _work(me, inlet, store)
 
 
 def _collected(
-    me: StageStart, storage: Storage | None, order: CollectOrder
+    me: StageStart, storage: Storage | None, order: CollectOrder, client: Client
 ) -> Iterator[Receipt | ColumnsLost | Failed]:
     """Make the parts of a casting task; gives the messages to the driver."""
-    found = fetch_available(own_client(), [order.key], FETCH_PATIENCE_S, at=order.worker)
+    found = fetch_available(client, [order.key], FETCH_PATIENCE_S, at=order.worker)
     if order.key not in found:
         yield ColumnsLost(order.key)
         return
