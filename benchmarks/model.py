@@ -3,8 +3,8 @@
 Batches go round, as many as the driver has under way: it offers one, the scheduler sends it, the
 next free GPU worker casts it, a collector stores it, scheduler and driver take the receipt. Each of
 them does one thing at a time. What driver, scheduler and collectors take is read with
-`benchmarks.scale`; `--read` compares the model with other runs of it, and `--picture` draws how many
-GPUs one scheduler keeps busy.
+`benchmarks.scale`; `--read` compares the model with other runs of it, and `--picture` draws how
+busy the GPUs of one scheduler are.
 """
 
 from __future__ import annotations

@@ -227,7 +227,7 @@ class Counts:
             self._seen.append((done, time.perf_counter(), took))
 
     def figures(self) -> dict[str, float]:
-        """A second, and milliseconds for each; those of the scheduler without its heartbeats."""
+        """Return what was done a second, and milliseconds for each without heartbeats."""
         (least, start, before), *_, (most, end, after) = self._seen
         took = {name: after[name] - before[name] for name in after}
         took["scheduler"] -= self._idle * (end - start)

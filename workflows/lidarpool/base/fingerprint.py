@@ -61,7 +61,7 @@ def fingerprint(*things: Any) -> str:
 
 @lru_cache(1024)
 def _of_word(word: str) -> str:
-    """Fingerprint of the name of a field: there are few, and they are asked for with each object."""
+    """Fingerprint of the name of a field: there are few, and each object asks for its own."""
     return fingerprint(word)
 
 
