@@ -19,9 +19,9 @@ from pathlib import Path
 from random import Random
 from typing import Any
 
+from benchmarks.scale import GPUS_EACH
 from lidarpool.pipeline.policies import most_under_way
 
-COLLECTORS = 2
 GPUS = (10, 20, 50, 100, 200, 500, 1_000, 2_000, 5_000, 10_000)
 HEARTBEATS = 0.07  # share of the scheduler's core; Dask has 200 a second at most
 VARY = 0.1  # share by which the times of tasks differ, so that they do not end together
@@ -45,6 +45,11 @@ class Costs:
         return (self.scheduler + gpus * self.member) / (1 - HEARTBEATS)
 
 
+def collectors_of(gpus: int) -> range:
+    """Give the collectors of so many GPU workers, as `benchmarks.scale` starts them."""
+    return range(max(2, gpus // GPUS_EACH))
+
+
 def tasks_a_second(gpus: int, seconds: float, costs: Costs, lasts: float = 60.0) -> float:
     """Casting tasks of so many seconds that one scheduler's cluster does in a second."""
     at_scheduler, vary = costs.at_scheduler(gpus) / 2, Random(1).uniform
@@ -55,9 +60,10 @@ def tasks_a_second(gpus: int, seconds: float, costs: Costs, lasts: float = 60.0)
         free[process] = max(free[process], now) + takes
         return free[process]
 
+    collectors = collectors_of(gpus)
     begin = 2 * seconds + lasts / 4  # the first tasks all come at a time
     number, done = count(), 0
-    events = [(0.0, next(number), "offer") for _ in range(most_under_way(gpus, COLLECTORS))]
+    events = [(0.0, next(number), "offer") for _ in range(most_under_way(gpus, len(collectors)))]
     while events[0][0] < begin + lasts:
         now, _, what = heapq.heappop(events)
         if what == "offer":
@@ -68,7 +74,7 @@ def tasks_a_second(gpus: int, seconds: float, costs: Costs, lasts: float = 60.0)
             now += seconds * vary(1 - VARY, 1 + VARY)
             heapq.heappush(slots, now)
         elif what == "collect":
-            collector = min(range(COLLECTORS), key=free.__getitem__)
+            collector = min(collectors, key=free.__getitem__)
             now, following = serve(collector, now, costs.collector), "receipt"
         else:
             now = serve("scheduler", now, at_scheduler)
@@ -89,7 +95,7 @@ def limit(gpus: int, seconds: float, costs: Costs) -> str:
         "GPUs": gpus / seconds,
         "driver": 1 / costs.driver,
         "scheduler": 1 / costs.at_scheduler(gpus),
-        "collectors": COLLECTORS / costs.collector,
+        "collectors": len(collectors_of(gpus)) / costs.collector,
     }
     return min(load, key=load.__getitem__)
 

@@ -197,6 +197,7 @@ def measure(workers: int, tasks: int) -> dict[str, Any]:
 
 
 MINUTE_S = 60.0
+GPUS_EACH = 20  # GPU workers for a collector
 ROOM = Scene.from_meshes([box("Room", (8, 6, 3))])
 
 
@@ -210,10 +211,8 @@ class Counts:
     """Processor time of driver and scheduler for each receipt, or job, from a fifth of them on."""
 
     def __init__(self, all_of_them: int, scheduler: psutil.Process) -> None:
-        self._all, self._processes = (
-            all_of_them,
-            {"driver": psutil.Process(), "scheduler": scheduler},
-        )
+        self._all = all_of_them
+        self._processes = {"driver": psutil.Process(), "scheduler": scheduler}
         before = cpu_s(scheduler)
         time.sleep(2)
         self._idle = (cpu_s(scheduler) - before) / 2
@@ -242,7 +241,7 @@ def casting_cluster(gpus: int, seconds: float) -> Iterator[tuple[Client, psutil.
     with (
         process(_scheduler) as (scheduler, address),
         process(_workers, address, gpus, ("GPU", 1), seconds),
-        process(_workers, address, 1, ("LIDAR", 8)),
+        process(_workers, address, 1, ("LIDAR", 8 + gpus // GPUS_EACH)),
         Client(address) as client,
     ):
         yield client, scheduler
@@ -257,6 +256,7 @@ def measure_receipts(gpus: int, seconds: float, scans: int) -> dict[str, float]:
             result = simulate(
                 ROOM, small_survey(scans), client=client, backend="numpy",
                 folder=Path(folder) / "run", on_progress=counts,
+                collectors=max(2, gpus // GPUS_EACH),
             )  # fmt: skip
     casting = next(stage for stage in result.stages if stage.stage == "intersect")
     lasts = min(MINUTE_S, casting.stop - casting.start)
