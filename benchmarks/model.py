@@ -143,7 +143,8 @@ def main(arguments: list[str] | None = None) -> dict[str, Any]:
     chosen = parser.parse_args(arguments)
     three = (chosen.driver / 1e3, chosen.scheduler / 1e3, chosen.collector / 1e3)
     costs = Costs(*three, chosen.member / 1e6)
-    read = {name: row for file in chosen.read for name, row in json.loads(file.read_text()).items()}
+    rows = [row for file in chosen.read for row in json.loads(file.read_text()).items()]
+    read = {name: row for name, row in rows if "busy" in row}
     for name, row in read.items():
         share = busy(int(row["gpus"]), row["seconds"], costs)
         print(f"{name}: busy {row['busy']:.1%}, by the model {share:.1%}")

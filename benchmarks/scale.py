@@ -30,7 +30,7 @@ import multiprocessing
 import tempfile
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
@@ -63,8 +63,12 @@ async def _workers(
     count: int,
     slots: tuple[str, int] | None = None,
     seconds: float = 0.0,
+    first: int = 0,
 ) -> None:
-    """Run workers, perhaps each with slots of a partition; batches take `seconds` to cast."""
+    """Run workers, perhaps each with slots of a partition; batches take `seconds` to cast.
+
+    Their names count from `first` on.
+    """
     options = {"nthreads": 1, "dashboard": False, "memory_limit": 0, "host": "127.0.0.1"}
     kind = ""
     if slots is not None:
@@ -77,7 +81,9 @@ async def _workers(
         return columns_of(found)
 
     lidarpool.pipeline.rigs.columns_of = slowly
-    workers = [Worker(address, name=f"{kind}{number}", **options) for number in range(count)]
+    workers = [
+        Worker(address, name=f"{kind}{number}", **options) for number in range(first, first + count)
+    ]
     await asyncio.gather(*workers)
     connection.send(address)
     await asyncio.to_thread(connection.recv)
@@ -197,7 +203,7 @@ def measure(workers: int, tasks: int) -> dict[str, Any]:
 
 
 MINUTE_S = 60.0
-GPUS_EACH = 20  # GPU workers for a collector
+GPUS_EACH, TOGETHER = 20, 25  # GPU workers for a collector, and in a process
 ROOM = Scene.from_meshes([box("Room", (8, 6, 3))])
 
 
@@ -238,13 +244,14 @@ class Counts:
 @contextmanager
 def casting_cluster(gpus: int, seconds: float) -> Iterator[tuple[Client, psutil.Process]]:
     """Start workers that cast slowly, and a worker of LIDAR; gives the scheduler's process."""
-    with (
-        process(_scheduler) as (scheduler, address),
-        process(_workers, address, gpus, ("GPU", 1), seconds),
-        process(_workers, address, 1, ("LIDAR", 8 + gpus // GPUS_EACH)),
-        Client(address) as client,
-    ):
-        yield client, scheduler
+    with ExitStack() as stack:
+        scheduler, address = stack.enter_context(process(_scheduler))
+        slots = ("LIDAR", 8 + gpus // GPUS_EACH)
+        stack.enter_context(process(_workers, address, 1, slots))
+        for first in range(0, gpus, TOGETHER):
+            count = min(TOGETHER, gpus - first)
+            stack.enter_context(process(_workers, address, count, ("GPU", 1), seconds, first))
+        yield stack.enter_context(Client(address)), scheduler
 
 
 def measure_receipts(gpus: int, seconds: float, scans: int) -> dict[str, float]:

@@ -345,7 +345,9 @@ def test_the_driver_waits_for_more_news_only_while_much_is_under_way(empty):
         empty.begin(number, TINY)
     empty.driver.wait(0.0)
     alone = empty.stages.linger_s
-    empty.until(lambda: empty.driver.dispatcher.busy, idle="cast")
+    dispatcher = empty.driver.dispatcher
+    empty.until(lambda: 2 * len(dispatcher.batches) > dispatcher.most, idle="cast")
+    empty.driver.wait(0.0)
     assert alone == driver.LINGER_S < empty.stages.linger_s <= 10 * driver.LINGER_S
     empty.end()
 

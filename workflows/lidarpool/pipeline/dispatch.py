@@ -65,11 +65,6 @@ class Dispatcher:
         slots, collectors = self._workers.slot_count, self._stages.collector_count
         return policies.most_under_way(slots, collectors, self.per_task)
 
-    @property
-    def busy(self) -> bool:
-        """Whether half of the batches that may be under way are: then no slot waits for news."""
-        return 2 * len(self.batches) > self.most
-
     def room(self, job: JobState) -> float:
         """Batches that may be taken of a job, by weight; none far ahead of its oldest."""
         # How many batches the newest of all is ahead of the oldest of the job.

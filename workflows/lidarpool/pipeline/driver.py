@@ -177,7 +177,8 @@ class RunDriver:
             # Small jobs and batches come in dozens, and while there are many of them nobody waits
             # for one. Each step costs a millisecond or two, whatever has come.
             small = max(len(self.jobs), self.dispatcher.per_task)
-            linger_s = LINGER_S * min(small, MOST_LINGERING if self.dispatcher.busy else 1)
+            many = 2 * len(self.dispatcher.batches) > self.dispatcher.most
+            linger_s = LINGER_S * min(small, MOST_LINGERING if many else 1)
             self.stages.wait(seconds, keys, scans=self._wants_scans, linger_s=linger_s)
 
     def _take(self, message: Message) -> None:
