@@ -25,6 +25,7 @@ from lidarpool.pipeline.policies import most_under_way
 GPUS = (10, 20, 50, 100, 200, 500, 1_000, 2_000, 5_000, 10_000)
 HEARTBEATS = 0.07  # share of the scheduler's core; Dask has 200 a second at most
 VARY = 0.1  # share by which the times of tasks differ, so that they do not end together
+STEPS = ("driver", "scheduler", "cast", "collect", "scheduler", "driver")  # of a task
 SECONDS = (0.2, 1.0, 4.0)  # of a casting task
 
 
@@ -52,34 +53,23 @@ def collectors_of(gpus: int) -> range:
 
 def tasks_a_second(gpus: int, seconds: float, costs: Costs, lasts: float = 60.0) -> float:
     """Casting tasks of so many seconds that one scheduler's cluster does in a second."""
-    at_scheduler, vary = costs.at_scheduler(gpus) / 2, Random(1).uniform
+    takes = {"driver": costs.driver / 2, "scheduler": costs.at_scheduler(gpus) / 2}
     free: Counter[Any] = Counter()  # {process: when it is free}
-    slots = [0.0] * gpus  # when each is free: a heap
-
-    def serve(process: Any, now: float, takes: float) -> float:
-        free[process] = max(free[process], now) + takes
-        return free[process]
-
-    collectors = collectors_of(gpus)
+    slots, vary = [0.0] * gpus, Random(1).uniform  # when each slot is free: a heap
+    collectors, number, done = collectors_of(gpus), count(), 0
     begin = 2 * seconds + lasts / 4  # the first tasks all come at a time
-    number, done = count(), 0
-    events = [(0.0, next(number), "offer") for _ in range(most_under_way(gpus, len(collectors)))]
+    events = [(0.0, next(number), 0) for _ in range(most_under_way(gpus, len(collectors)))]
     while events[0][0] < begin + lasts:
-        now, _, what = heapq.heappop(events)
-        if what == "offer":
-            now = serve("driver", now, costs.driver / 2)
-            now, following = serve("scheduler", now, at_scheduler), "cast"
-        elif what == "cast":
-            now, following = max(now, heapq.heappop(slots)), "collect"
-            now += seconds * vary(1 - VARY, 1 + VARY)
+        now, _, step = heapq.heappop(events)
+        if STEPS[step] == "cast":
+            now = max(now, heapq.heappop(slots)) + seconds * vary(1 - VARY, 1 + VARY)
             heapq.heappush(slots, now)
-        elif what == "collect":
-            collector = min(collectors, key=free.__getitem__)
-            now, following = serve(collector, now, costs.collector), "receipt"
         else:
-            now = serve("scheduler", now, at_scheduler)
-            now, following = serve("driver", now, costs.driver / 2), "offer"
-            done += now >= begin
+            stores = STEPS[step] == "collect"
+            process = min(collectors, key=free.__getitem__) if stores else STEPS[step]
+            now = free[process] = max(free[process], now) + takes.get(process, costs.collector)
+        following = (step + 1) % len(STEPS)
+        done += not following and now >= begin
         heapq.heappush(events, (now, next(number), following))
     return done / lasts
 
