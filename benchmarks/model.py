@@ -25,6 +25,7 @@ from lidarpool.pipeline.policies import most_under_way
 GPUS = (10, 20, 50, 100, 200, 500, 1_000, 2_000, 5_000, 10_000)
 HEARTBEATS = 0.07  # share of the scheduler's core; Dask has 200 a second at most
 VARY = 0.1  # share by which the times of tasks differ, so that they do not end together
+ROUNDS = 6  # of all tasks that are under way; the first does not count
 STEPS = ("driver", "scheduler", "cast", "collect", "scheduler", "driver")  # of a task
 SECONDS = (0.2, 1.0, 4.0)  # of a casting task
 
@@ -51,15 +52,15 @@ def collectors_of(gpus: int) -> range:
     return range(max(2, gpus // GPUS_EACH))
 
 
-def tasks_a_second(gpus: int, seconds: float, costs: Costs, lasts: float = 60.0) -> float:
+def tasks_a_second(gpus: int, seconds: float, costs: Costs) -> float:
     """Casting tasks of so many seconds that one scheduler's cluster does in a second."""
     takes = {"driver": costs.driver / 2, "scheduler": costs.at_scheduler(gpus) / 2}
     free: Counter[Any] = Counter()  # {process: when it is free}
     slots, vary = [0.0] * gpus, Random(1).uniform  # when each slot is free: a heap
     collectors, number, done = collectors_of(gpus), count(), 0
-    begin = 2 * seconds + lasts / 4  # the first tasks all come at a time
-    events = [(0.0, next(number), 0) for _ in range(most_under_way(gpus, len(collectors)))]
-    while events[0][0] < begin + lasts:
+    most, begin = most_under_way(gpus, len(collectors)), 0.0
+    events = [(0.0, next(number), 0) for _ in range(most)]
+    while done < ROUNDS * most:
         now, _, step = heapq.heappop(events)
         if STEPS[step] == "cast":
             now = max(now, heapq.heappop(slots)) + seconds * vary(1 - VARY, 1 + VARY)
@@ -69,9 +70,11 @@ def tasks_a_second(gpus: int, seconds: float, costs: Costs, lasts: float = 60.0)
             process = min(collectors, key=free.__getitem__) if stores else STEPS[step]
             now = free[process] = max(free[process], now) + takes.get(process, costs.collector)
         following = (step + 1) % len(STEPS)
-        done += not following and now >= begin
+        done += not following
+        if done == most and not following:  # the first tasks all came at a time
+            begin = now
         heapq.heappush(events, (now, next(number), following))
-    return done / lasts
+    return (done - most) / (now - begin)
 
 
 def busy(gpus: int, seconds: float, costs: Costs) -> float:
