@@ -269,7 +269,8 @@ def measure_receipts(gpus: int, seconds: float, scans: int) -> dict[str, float]:
     lasts = min(MINUTE_S, casting.stop - casting.start)
     until = casting.start + lasts
     spans = [max(0.0, min(one.stop, until) - one.start) for one in casting.records]
-    return {**counts.figures(), "busy": round(sum(spans) / (lasts * gpus), 3)}
+    kept = len(casting.records) / casting.tasks  # of thousands, every second one
+    return {**counts.figures(), "busy": round(sum(spans) / kept / (lasts * gpus), 3)}
 
 
 def measure_jobs(jobs: int) -> dict[str, float]:
