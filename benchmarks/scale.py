@@ -227,7 +227,9 @@ class Counts:
     def __call__(self, progress: Progress) -> None:
         """Look how much is done, and what it took."""
         done = progress.jobs_done if progress.jobs else progress.collected
-        if done >= self._all // 5 and (not self._seen or done > self._seen[-1][0]):
+        if not self._seen or done > self._seen[-1][0]:
+            if done <= self._all // 5:
+                self._seen.clear()
             took = {name: cpu_s(process) for name, process in self._processes.items()}
             self._seen.append((done, time.perf_counter(), took))
 
