@@ -1,40 +1,28 @@
-"""The control road: what passes scheduler and driver, and how much one driver sustains.
+"""The control road: what passes scheduler and driver.
 
 Bytes: a survey on a cluster of this machine, whose scheduler is in the driver's process, so that
 all that either sends or receives passes here and is counted by kind of message. It is run with
 every fifth point kept and with all of them: what grows with points would show. And it is run in
 batches of one scan: what comes with each batch.
 
-Receipts: scheduler, driver and workers in processes of their own, and batches of one scan with four
-rays: what is left is what each takes for a part.
-
-Run: ``python -m benchmarks.control [--scans 20000] [--parts 2000]``
+Run: ``python -m benchmarks.control [--scans 20000]``
 """
 
 from __future__ import annotations
 
 import argparse
-import os
-import socket
-import subprocess
-import sys
-import tempfile
 from collections import Counter
 from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import contextmanager
 from contextvars import ContextVar
-from pathlib import Path
 from typing import Any
 from unittest.mock import patch
 
 import distributed.comm.tcp as tcp
 import numpy as np
-import psutil
-from distributed import Client
 
 import lidarpool.pipeline.policies
 from lidarpool import Scene, Sensor, Survey, simulate
-from lidarpool.scene.actors import box
 
 # Messages that come with time and with workers, not with work.
 UPKEEP = {"heartbeat", "setup", "transfers"}
@@ -147,7 +135,7 @@ def count_bytes(scans: int) -> None:
 
 def single_scans() -> Any:
     """Make the batches of runs so small that each has one scan; tasks still have several."""
-    return patch.object(lidarpool.pipeline.policies, "most_scans", lambda *_: 1)
+    return patch.object(lidarpool.pipeline.policies, "scans_per_batch", lambda *_: 1)
 
 
 def count_batches(batches: int) -> None:
@@ -164,70 +152,13 @@ def count_batches(batches: int) -> None:
     )
 
 
-def sustain(parts: int) -> None:
-    """Print what one driver sustains: four rays and one scan a batch, each process by itself."""
-    sensor = Sensor.grid(rays_per_revolution=4, layers=1, step_deg=360)
-    room = Scene.from_meshes([box("Room", (8, 6, 3))])
-    what, first = (Survey(sensor, [(0.0, 0.0, 1.0)] * count, steps=1) for count in (parts, 20))
-    with (
-        tempfile.TemporaryDirectory() as folder,
-        cluster_in_processes({"GPU": 4, "LIDAR": 8}) as (client, processes),
-        single_scans(),
-    ):
-        simulate(room, first, client=client, backend="numpy")
-        before = processor_seconds(processes)
-        result = simulate(room, what, client=client, backend="numpy", folder=Path(folder) / "run")
-        after = processor_seconds(processes)
-    rate = parts / result.survey_seconds
-    spent = (f"{name} {1000 * (after[name] - before[name]) / parts:.2f}" for name in before)
-    print(
-        f"{parts:,} parts in {result.survey_seconds:.1f} s: {rate:.0f} receipts/s; milliseconds of "
-        f"processor time for each: {', '.join(spent)}"
-    )
-
-
-@contextmanager
-def cluster_in_processes(slots: dict[str, int]) -> Iterator[tuple[Client, dict[str, int]]]:
-    """Start a scheduler and a worker for each partition, in processes of their own.
-
-    Gives a client, and the number of each process by name; the client's process is the driver.
-    """
-    with socket.create_server(("127.0.0.1", 0)) as server:
-        address = f"tcp://127.0.0.1:{server.getsockname()[1]}"
-    quiet = ["--no-dashboard"]
-    host, port = address.removeprefix("tcp://").split(":")
-    commands = {"scheduler": ["scheduler", "--host", host, "--port", port]}
-    for name, count in slots.items():
-        resources = ["--nthreads", str(count), "--resources", f"{name}={count}"]
-        commands[name] = ["worker", address, "--no-nanny", *resources]
-    with ExitStack() as stack:
-        started = {}
-        for name, command in commands.items():
-            process = subprocess.Popen(
-                [sys.executable, "-m", "dask", *command, *quiet], stderr=subprocess.DEVNULL
-            )
-            stack.callback(process.wait)
-            stack.callback(process.terminate)
-            started[name] = process.pid
-        client = stack.enter_context(Client(address))
-        client.wait_for_workers(len(slots))
-        yield client, {**started, "driver": os.getpid()}
-
-
-def processor_seconds(processes: dict[str, int]) -> dict[str, float]:
-    """Processor time that processes have taken, by name."""
-    return {name: sum(psutil.Process(n).cpu_times()[:2]) for name, n in processes.items()}
-
-
 def main() -> None:
-    """Run both."""
+    """Count both."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--scans", type=int, default=20_000)
-    parser.add_argument("--parts", type=int, default=2_000)
     given = parser.parse_args()
     count_bytes(given.scans)
     count_batches(min(360, given.scans))
-    sustain(given.parts)
 
 
 if __name__ == "__main__":

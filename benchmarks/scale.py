@@ -1,4 +1,4 @@
-"""What a task costs as the cluster grows: `python -m benchmarks.scale`.
+"""What a task, a receipt and a job cost as the cluster grows: `python -m benchmarks.scale`.
 
 Scheduler, driver and workers are three processes, so that what each takes can be told apart:
 all the workers are threads of one process, and the tasks do nothing. The workers are divided
@@ -11,6 +11,12 @@ into four partitions.
 - The scheduler's time is CPU time, less what it takes in as long a time with nothing to do
   (heartbeats), which is given by itself; the driver's is CPU time of its process.
 - Growth is that of driver and scheduler together, from the smallest cluster to the largest.
+
+`--receipts SECONDS` has surveys cast by so many GPU workers whose batches, of one scan with four
+rays, take so long: casting ends with a sleep, all else is the product's own. The figures are a
+receipt's, and how busy the workers are in a minute. `--jobs N` runs the tiny jobs of
+`benchmarks.campaign`. Both count from a fifth of the work on: what a run takes to start and to
+finish is no part of them.
 """
 
 from __future__ import annotations
@@ -21,16 +27,24 @@ import json
 import logging
 import math
 import multiprocessing
+import tempfile
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
 
+import dask
 import psutil
 from distributed import Client, Scheduler, Worker, get_worker
 
+import lidarpool.pipeline.rigs
+from benchmarks.campaign import BASE, CAMPAIGN
+from benchmarks.control import single_scans
+from lidarpool import Campaign, Scene, Sensor, Survey, simulate
+from lidarpool.run.progress import Progress
+from lidarpool.scene.actors import box
 from poolpart import Partition, Pool
 
 NAMES = ("A", "B", "C", "D")
@@ -43,9 +57,33 @@ async def _scheduler(connection: Connection) -> None:
         await asyncio.to_thread(connection.recv)
 
 
-async def _workers(connection: Connection, address: str, count: int) -> None:
+async def _workers(
+    connection: Connection,
+    address: str,
+    count: int,
+    slots: tuple[str, int] | None = None,
+    seconds: float = 0.0,
+    first: int = 0,
+) -> None:
+    """Run workers, perhaps each with slots of a partition; batches take `seconds` to cast.
+
+    Their names count from `first` on.
+    """
     options = {"nthreads": 1, "dashboard": False, "memory_limit": 0, "host": "127.0.0.1"}
-    workers = [Worker(address, name=str(number), **options) for number in range(count)]
+    kind = ""
+    if slots is not None:
+        kind, threads = slots
+        options |= {"resources": {kind: threads}, "nthreads": threads}
+    columns_of = lidarpool.pipeline.rigs.columns_of
+
+    def slowly(found: Any) -> Any:
+        time.sleep(seconds)
+        return columns_of(found)
+
+    lidarpool.pipeline.rigs.columns_of = slowly
+    workers = [
+        Worker(address, name=f"{kind}{number}", **options) for number in range(first, first + count)
+    ]
     await asyncio.gather(*workers)
     connection.send(address)
     await asyncio.to_thread(connection.recv)
@@ -54,6 +92,10 @@ async def _workers(connection: Connection, address: str, count: int) -> None:
 
 def _serve(main: Callable[..., Any], connection: Connection, *arguments: Any) -> None:
     logging.getLogger("distributed").setLevel(logging.CRITICAL)
+    # What 200 workers measure of themselves takes more than a core, where they share a process.
+    rarely = {"admin.tick.interval": "10s", "admin.system-monitor.interval": "10s"}
+    rarely |= {"worker.profile.enabled": False}
+    dask.config.set({f"distributed.{name}": value for name, value in rarely.items()})
     asyncio.run(main(connection, *arguments))
 
 
@@ -160,6 +202,92 @@ def measure(workers: int, tasks: int) -> dict[str, Any]:
         return figures
 
 
+MINUTE_S = 60.0
+GPUS_EACH, TOGETHER = 20, 25  # GPU workers for a collector, and in a process
+ROOM = Scene.from_meshes([box("Room", (8, 6, 3))])
+
+
+def small_survey(scans: int) -> Survey:
+    """Describe scans of four rays."""
+    sensor = Sensor.grid(rays_per_revolution=4, layers=1, step_deg=360)
+    return Survey(sensor, [(0.0, 0.0, 1.0)] * scans, steps=1)
+
+
+class Counts:
+    """Processor time of driver and scheduler for each receipt, or job, from a fifth of them on."""
+
+    def __init__(self, all_of_them: int, scheduler: psutil.Process) -> None:
+        self._all = all_of_them
+        self._processes = {"driver": psutil.Process(), "scheduler": scheduler}
+        before = cpu_s(scheduler)
+        time.sleep(2)
+        self._idle = (cpu_s(scheduler) - before) / 2
+        self._seen: list[tuple[int, float, dict[str, float]]] = []
+
+    def __call__(self, progress: Progress) -> None:
+        """Look how much is done, and what it took."""
+        done = progress.jobs_done if progress.jobs else progress.collected
+        if not self._seen or done > self._seen[-1][0]:
+            if done <= self._all // 5:
+                self._seen.clear()
+            took = {name: cpu_s(process) for name, process in self._processes.items()}
+            self._seen.append((done, time.perf_counter(), took))
+
+    def figures(self) -> dict[str, float]:
+        """Return what was done a second, and milliseconds for each without heartbeats."""
+        (least, start, before), *_, (most, end, after) = self._seen
+        took = {name: after[name] - before[name] for name in after}
+        took["scheduler"] -= self._idle * (end - start)
+        each = {f"{name}_ms": round(1e3 * s / (most - least), 3) for name, s in took.items()}
+        idle = round(100 * self._idle, 1)
+        return {"a_second": round((most - least) / (end - start), 1), **each, "idle_percent": idle}
+
+
+@contextmanager
+def casting_cluster(gpus: int, seconds: float) -> Iterator[tuple[Client, psutil.Process]]:
+    """Start workers that cast slowly, and a worker of LIDAR; gives the scheduler's process."""
+    with ExitStack() as stack:
+        scheduler, address = stack.enter_context(process(_scheduler))
+        slots = ("LIDAR", 8 + gpus // GPUS_EACH)
+        stack.enter_context(process(_workers, address, 1, slots))
+        for first in range(0, gpus, TOGETHER):
+            count = min(TOGETHER, gpus - first)
+            stack.enter_context(process(_workers, address, count, ("GPU", 1), seconds, first))
+        yield stack.enter_context(Client(address)), scheduler
+
+
+def measure_receipts(gpus: int, seconds: float, scans: int) -> dict[str, float]:
+    """Run a survey with batches of one scan; its figures, and the share of a minute of casting."""
+    with casting_cluster(gpus, seconds) as (client, scheduler), single_scans():
+        simulate(ROOM, small_survey(gpus), client=client, backend="numpy")
+        counts = Counts(scans, scheduler)
+        with tempfile.TemporaryDirectory() as folder:
+            result = simulate(
+                ROOM, small_survey(scans), client=client, backend="numpy",
+                folder=Path(folder) / "run", on_progress=counts,
+                collectors=max(2, gpus // GPUS_EACH),
+            )  # fmt: skip
+    casting = next(stage for stage in result.stages if stage.stage == "intersect")
+    lasts = min(MINUTE_S, casting.stop - casting.start)
+    until = casting.start + lasts
+    spans = [max(0.0, min(one.stop, until) - one.start) for one in casting.records]
+    kept = len(casting.records) / casting.tasks  # of thousands, every second one
+    return {**counts.figures(), "busy": round(sum(spans) / kept / (lasts * gpus), 3)}
+
+
+def measure_jobs(jobs: int) -> dict[str, float]:
+    """Run a campaign of tiny jobs; its figures."""
+    with casting_cluster(4, 0.0) as (client, scheduler), tempfile.TemporaryDirectory() as folder:
+        file, data = Path(folder) / "campaign.yaml", Path(folder) / "data"
+        file.with_name("base.yaml").write_text(BASE % (100, 10))
+        file.write_text(CAMPAIGN % 20)
+        Campaign.load(file).run(Path(folder) / "first", client=client)
+        file.write_text(CAMPAIGN % jobs)
+        counts = Counts(jobs, scheduler)
+        Campaign.load(file).run(data, client=client, on_progress=counts)
+    return counts.figures()
+
+
 def growth(smallest: dict[str, float], largest: dict[str, float]) -> float | None:
     """Of driver and scheduler together; None where the smallest took no time to speak of."""
     least, most = (
@@ -172,9 +300,29 @@ def main(arguments: list[str] | None = None) -> dict[str, Any]:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--workers", type=int, nargs="+", default=[10, 50, 200])
     parser.add_argument("--tasks", type=int, default=20_000, help="of each way to submit them")
+    parser.add_argument("--receipts", type=float, help="seconds that a batch of one scan takes")
+    parser.add_argument("--scans", type=int, default=3_000, help="of a survey for --receipts")
+    parser.add_argument("--jobs", type=int, help="number of tiny jobs")
     parser.add_argument("--json", type=Path, help="also write the figures to this file")
     options = parser.parse_args(arguments)
 
+    rows: dict[str, Any] = {}
+    if options.receipts is not None:
+        for count in options.workers:
+            of = f"{count} workers, batches of {options.receipts:g} s"
+            rows[of] = measure_receipts(count, options.receipts, options.scans)
+            rows[of] |= {"gpus": count, "seconds": options.receipts}
+    if options.jobs:
+        rows[f"{options.jobs} tiny jobs"] = measure_jobs(options.jobs)
+    for of, figures in rows.items():
+        print(f"{of}: {', '.join(f'{name} {value:g}' for name, value in figures.items())}")
+    if options.json and rows:
+        options.json.write_text(json.dumps(rows, indent=1) + "\n")
+    return rows or measure_tasks(options)
+
+
+def measure_tasks(options: argparse.Namespace) -> dict[str, Any]:
+    """Measure the cost of tasks that do nothing, in clusters of growing size."""
     clusters = {}
     for count in options.workers:
         clusters[count] = figures = measure(count, options.tasks)

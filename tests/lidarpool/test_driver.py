@@ -158,7 +158,7 @@ class Stages:
         return changes
 
     def wait(self, seconds, keys, *, scans, linger_s=0.0):
-        self.wanted = scans
+        self.wanted, self.linger_s = scans, linger_s
 
     def send(self, name, messages):
         known = {"generate": self.described, "sort": self.unsorted}
@@ -338,6 +338,18 @@ def clock(monkeypatch):
     for module in (driver, dispatch, jobs):
         monkeypatch.setattr(module, "time", SimpleNamespace(monotonic=lambda: clock.now))
     return clock
+
+
+def test_the_driver_waits_for_more_news_only_while_much_is_under_way(empty):
+    for number in range(10):
+        empty.begin(number, TINY)
+    empty.driver.wait(0.0)
+    alone = empty.stages.linger_s
+    dispatcher = empty.driver.dispatcher
+    empty.until(lambda: 2 * len(dispatcher.batches) > dispatcher.most, idle="cast")
+    empty.driver.wait(0.0)
+    assert alone == driver.LINGER_S < empty.stages.linger_s <= 10 * driver.LINGER_S
+    empty.end()
 
 
 def test_undisturbed_each_batch_is_cast_once(run):

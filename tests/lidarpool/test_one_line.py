@@ -60,7 +60,7 @@ THINGS = [
     Navigation(imu=Imu(gyroscope_noise_density=1e-4), gnss=Gnss(horizontal_m=0.02)),
     Plan(np.zeros((90, 2)), 1.2345, 1.2, 0.3, 3, 100),
     PLANNING,
-    ScanFrame(0, "", POSES[0], 1, 1, 1, np.zeros((90, 3), np.float32), lambda scan: None),
+    ScanFrame(0, "", 1, 1, 1, np.zeros((90, 3), np.float32), SURVEY, lambda scan: None),
     Scanner(Scene.seed(), SENSOR),
     SceneInstance(MESH, np.eye(4)),
     MESH,

@@ -15,6 +15,7 @@ from lidarpool.pipeline.policies import (
     LATE_FACTOR,
     LATE_S,
     SUSPECT_DEATHS,
+    batches_per_task,
     handovers,
     late_after_s,
     loss,
@@ -59,21 +60,31 @@ def numbers(chosen):
 
 
 @pytest.mark.parametrize(
-    ("seconds", "scans", "fit", "count", "slots", "wanted"),
+    ("last", "fit", "count", "slots", "wanted"),
     [
-        (0.1, 10, 1000, 10**6, 2, 20),  # twice as long
-        (0.4, 10, 1000, 10**6, 2, 5),  # half
-        (0.001, 10, 1000, 10**6, 2, 20),  # at most twice as many as the last
-        (0.0, 1, 1000, 10**6, 2, 2),
-        (9.0, 1, 1000, 10**6, 2, 1),  # a scan at least
-        (0.001, 10**5, 1000, 10**9, 1, 1000),  # as many as fit into memory
-        (0.001, 10**5, 1, 10**9, 1, 1),
-        (0.001, 10**5, 1000, 3200, 2, 100),  # so many that all slots are busy to the end
-        (0.001, 10**5, 1000, 5, 2, 1),
+        ([(0.1, 10)], 1000, 10**6, 2, 20),  # twice as long
+        ([(0.4, 10)], 1000, 10**6, 2, 5),  # half
+        ([(0.001, 10)], 1000, 10**6, 2, 80),  # at most eight times as many as the last
+        ([(0.0, 1)], 1000, 10**6, 2, 8),
+        ([(3.0, 1), (0.1, 10), (0.1, 10)], 1000, 10**6, 2, 20),  # the first one has compiled
+        ([(0.1, 10), (0.1, 10), (0.001, 2)], 1000, 10**6, 2, 20),  # the last is a rest
+        ([(9.0, 1)], 1000, 10**6, 2, 1),  # a scan at least
+        ([(0.001, 10**5)], 1000, 10**9, 1, 1000),  # as many as fit into memory
+        ([(0.001, 10**5)], 1, 10**9, 1, 1),
+        ([(1.0, 3000)], 1000, 3200, 2, 150),  # small ones are not divided
+        ([(1.0, 300)], 1000, 800, 2, 25),  # so many that all slots are busy to the end
+        ([(1.0, 3)], 1000, 5, 2, 1),
     ],
 )
-def test_scans_of_a_batch(seconds, scans, fit, count, slots, wanted):
-    assert scans_per_batch(seconds, scans, fit, count, slots) == wanted
+def test_scans_of_a_batch(last, fit, count, slots, wanted):
+    assert scans_per_batch(last, fit, count, slots) == wanted
+
+
+def test_tasks_are_longer_where_there_are_more_slots():
+    assert batches_per_task([], 4) == 1
+    assert batches_per_task([(0.1, 1)] * 3, 4) == batches_per_task([(0.1, 1)] * 3, 50) == 4
+    assert batches_per_task([(0.1, 1)] * 3, 100) == 8  # one driver has so many tasks a second
+    assert batches_per_task([(2.0, 1)], 100) == 1
 
 
 def test_slots_are_wanted_for_what_is_left():
@@ -197,5 +208,7 @@ def test_tasks_elsewhere_are_counted_and_the_first_are_kept():
 
 
 def test_batches_are_late_by_what_others_took():
-    assert late_after_s([]) == float("inf") and late_after_s([0.1, 0.2, 99.0]) == LATE_S
-    assert late_after_s([10.0, 20.0, 30.0]) == LATE_FACTOR * 20
+    assert (
+        late_after_s([]) == float("inf") and late_after_s([(0.1, 1), (0.2, 1), (99.0, 1)]) == LATE_S
+    )
+    assert late_after_s([(10.0, 1), (20.0, 1), (30.0, 1)]) == LATE_FACTOR * 20

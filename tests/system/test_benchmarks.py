@@ -4,7 +4,7 @@ import json
 from contextlib import contextmanager
 
 import pytest
-from benchmarks import control, formats, gpu, live, pipeline, scale
+from benchmarks import control, formats, gpu, live, model, pipeline, scale
 from distributed import Client
 from tests.clusters import import_jobqueue, thread_cluster
 from tests.cuda_on_host import played_cuda, source_backend  # noqa: F401 - fixtures
@@ -42,6 +42,22 @@ def test_scale(tmp_path, capsys):
         assert cluster["misplaced"] == 0
         assert all(cluster[way]["tasks_per_second"] > 0 for way in scale.WAYS)
     assert "growth from 4 to 4 workers" in capsys.readouterr().out
+
+
+def test_scale_of_receipts_and_jobs(tmp_path, capsys):
+    path = tmp_path / "figures.json"
+    sizes = ["--workers", "3", "--receipts", "0.05", "--scans", "40", "--jobs", "10"]
+    rows = scale.main([*sizes, "--json", str(path)])
+    assert json.loads(path.read_text()) == rows
+    assert all(row["driver_ms"] > 0 and row["a_second"] > 0 for row in rows.values())
+    assert 0 < rows["3 workers, batches of 0.05 s"]["busy"] <= 1
+    costs = ["--driver", "2", "--scheduler", "2", "--collector", "4"]
+    picture = tmp_path / "model.png"
+    rates = model.main([*costs, "--read", str(path), "--picture", str(picture)])
+    rate, by, shards = rates["200 GPUs, tasks of 4 s"]
+    assert rate == pytest.approx(50, rel=0.05) and by == "GPUs" and shards == 1
+    assert picture.stat().st_size > 10_000
+    assert "by the model" in capsys.readouterr().out
 
 
 def test_live(tmp_path, capsys):

@@ -15,7 +15,7 @@ import weakref
 from collections.abc import Mapping, Set
 from datetime import datetime
 from fractions import Fraction
-from functools import cached_property, partial
+from functools import cached_property, lru_cache, partial
 from pathlib import PurePath
 from typing import Any
 
@@ -57,6 +57,16 @@ def fingerprint(*things: Any) -> str:
     for thing in things:
         digest.add(thing)
     return digest.hexdigest()
+
+
+@lru_cache(1024)
+def _of_word(word: str) -> str:
+    """Fingerprint of the name of a field: there are few, and each object asks for its own."""
+    return fingerprint(word)
+
+
+def _of_key(key: Any) -> str:
+    return _of_word(key) if type(key) is str else fingerprint(key)
 
 
 # {id of a read-only array: (it, its hash)}: jobs of a campaign share large scenes.
@@ -122,7 +132,7 @@ class _Digest:
                 self.add(item)
         elif isinstance(thing, Mapping):
             self._mark("mapping", len(thing))
-            for key in sorted(thing, key=fingerprint):
+            for key in sorted(thing, key=_of_key):
                 self.add(key)
                 self.add(thing[key])
         elif isinstance(thing, Set):

@@ -270,16 +270,22 @@ class CastingWorkers:
 
     def _check(self) -> None:
         """Record the workers that may cast."""
-        answered = []
+        answered = {}
         for address, future in self._setups.items():
             if future.status == "finished" and address in self.seen.free:
-                answered.append(address)
+                answered[future.key] = address
             elif future.status == "error" and not was_killed(future):
                 raise_if_failed(future, CHECKING)
-        identities = worker_identities(self._client) if answered else {}
-        for address in answered:
+        if not answered:
+            return
+        # All at a time: one by one, 200 workers on a busy machine took minutes. A worker that has
+        # stopped since is asked again.
+        found = fetch_available(self._client, answered, ANSWER_S)
+        identities = worker_identities(self._client)
+        for key, software in found.items():
+            address = answered[key]
             if address in identities:  # else it has left
-                self._take(address, self._setups[address], identities[address])
+                self._take(address, software, identities[address])
 
     def want(self, slots: int) -> None:
         """Want so many slots of a partition that grows with its work; 0 when there is no more.
@@ -312,13 +318,10 @@ class CastingWorkers:
                     callback_timeout=RELEASE_S,
                 )
 
-    def _take(self, address: str, future: Future, identity: Mapping[str, Any]) -> None:
-        """Record a worker that has answered; one that has stopped since is asked again."""
-        found = fetch_available(self._client, [future.key], ANSWER_S, at=address)
-        if future.key not in found:
-            return
+    def _take(self, address: str, software: Mapping[str, str], identity: Mapping[str, Any]) -> None:
+        """Record a worker that has answered, with the software that it has."""
         del self._setups[address]
-        if differs := difference(found[future.key], self._software):
+        if differs := difference(software, self._software):
             self._refused[address] = differs
             self.notes.append(
                 f"worker {identity['name']} at {address} has {differs}: it cast nothing"

@@ -35,7 +35,7 @@ class Dispatcher:
         self._workers, self._stages, self._mark = workers, stages, mark
         self._tasks: dict[str, list[Batch]] = {}  # {key of a casting task: its batches left}
         self._count = 0  # of batches so far
-        self._seconds: deque[float] = deque(maxlen=64)  # casting times of batches
+        self._last: deque[tuple[float, int]] = deque(maxlen=64)  # casting time and scans of batches
         self._total = (0.0, 0)  # casting time of scans, and their number
         self.per_task = 1  # small batches of a task
         # {job: batches that were tried alone before any was cast, each with a worker that died}
@@ -78,22 +78,16 @@ class Dispatcher:
         seconds, scans = self._total
         return max(1, policies.slots_wanted(left, seconds / scans if scans else None))
 
-    def _learn(self, records: list[tuple[JobState, int, TaskRecord]]) -> None:
-        """Take account of casting times, and advise stage 1 on the scans in one item.
-
-        Of each task there is the job, and one past its last scan.
-        """
-        for job, _, record in records:
+    def _learn(self, records: list[tuple[JobState, TaskRecord]]) -> None:
+        """Take account of casting times, and advise stage 1 on the scans in one item."""
+        for job, record in records:
             job.seconds += record.seconds
-            self._seconds.append(record.seconds)
+            self._last.append((record.seconds, record.items))
             self._total = (self._total[0] + record.seconds, self._total[1] + record.items)
-        self.per_task = policies.batches_per_task(self._seconds)
-        for job, stop, last in records[-1:]:
-            seconds, scans, slots = last.seconds, last.items, self._workers.slot_count
-            if stop == job.parts.scans.stop and scans < self.advice:
-                # The rest of a job says how fast it was cast, and nothing about larger ones.
-                seconds, scans = seconds * self.advice / scans, self.advice
-            wanted = policies.scans_per_batch(seconds, scans, job.fit, job.in_all, slots)
+        slots = self._workers.slot_count
+        self.per_task = policies.batches_per_task(self._last, slots)
+        for job, _ in records[-1:]:
+            wanted = policies.scans_per_batch(self._last, job.fit, job.in_all, slots)
             if abs(wanted - self.advice) > ADVISED_AGAIN * self.advice:  # it is a request
                 self.advice = wanted
                 self._stages.advise(wanted)
@@ -152,7 +146,7 @@ class Dispatcher:
 
     def leave_workers(self, seen: TaskLocations) -> None:
         """Offer batches again whose workers died, are silent, late, or take no tasks."""
-        prepared, late_s = len(self._workers.slots), policies.late_after_s(self._seconds)
+        prepared, late_s = len(self._workers.slots), policies.late_after_s(self._last)
         for batch in [*self.batches.values()]:
             if why := policies.loss(batch, seen, prepared, time.monotonic(), late_s):
                 self._again(batch, why.value)
@@ -287,7 +281,7 @@ class Dispatcher:
                 self._remove(batch)
             self._judge(job)
             if receipt.record is not None:
-                records.append((job, receipt.stop, receipt.record))
+                records.append((job, receipt.record))
         for other in self.at(BatchState.COLLECTING) if waited else ():
             # Those behind them had to wait.
             if other.collector in waited and other.since >= waited[other.collector]:

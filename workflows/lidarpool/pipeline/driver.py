@@ -38,7 +38,7 @@ from .task_book import TaskBook
 
 STALL_S = 60.0  # without news from the sorter; then it gets its summaries again
 WAIT_S = 0.05  # for news, where there is nothing else to do
-LINGER_S, MOST_LINGERING = 0.004, 6  # of a wait, for more news, for each of so many jobs at most
+LINGER_S, MOST_LINGERING = 0.004, 25  # of a wait, for more news: for each job or batch of a task
 CLOSING_S = 0.001  # longest wait while the stages end
 ANNOUNCED = 2  # jobs that stage 1 should have before it, however large they are
 
@@ -174,8 +174,11 @@ class RunDriver:
             self.stages.wait(min(seconds, CLOSING_S), [], scans=False)
         else:
             seconds, keys = max(seconds, WAIT_S), [*self.workers.pending, *keys]
-            # Small jobs come in dozens, and nobody waits for any of them.
-            linger_s = LINGER_S * min(len(self.jobs), MOST_LINGERING)
+            # Small jobs and batches come in dozens, and while there are many of them nobody waits
+            # for one. Each step costs a millisecond or two, whatever has come.
+            small = max(len(self.jobs), self.dispatcher.per_task)
+            many = 2 * len(self.dispatcher.batches) > self.dispatcher.most
+            linger_s = LINGER_S * min(small, MOST_LINGERING if many else 1)
             self.stages.wait(seconds, keys, scans=self._wants_scans, linger_s=linger_s)
 
     def _take(self, message: Message) -> None:

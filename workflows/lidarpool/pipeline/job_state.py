@@ -67,11 +67,11 @@ class JobState:
             frame = ScanFrame(
                 scan,
                 survey.carried[spec.sensor].name,
-                survey.pose(scan),
                 spec.ray_count,
                 int(summary["hits"]),
                 int(summary["points"]),
                 samples[~np.isnan(samples[:, 0])],
+                survey,
                 self.read,
             )
             self.trace("frame", SORT, [scan])
@@ -120,6 +120,9 @@ class Batch:
     collector: str = ""  # name of the task of stage 4
     deaths: Counter[str] = field(default_factory=Counter)  # {stage: workers that died with it}
     divided: bool = False  # not to be cast with batches of other jobs
+
+    def __post_init__(self) -> None:
+        self.share = len(self) / self.job.fit  # of the memory of a task
 
     def __len__(self) -> int:
         return self.stop - self.first

@@ -18,7 +18,7 @@ from ..base.tracing import trace
 from ..base.validation import one_line
 from ..columns.cloud import Cloud
 from ..columns.parts import PartColumns
-from ..sensor import Pose
+from ..sensor import Pose, Survey
 
 BatchRange = tuple[int, int]  # the first scan of a batch, and its end
 
@@ -167,8 +167,6 @@ class ScanFrame:
         Its number.
     sensor
         Name of its sensor; "" for a single one without a name.
-    pose
-        Pose of the sensor at its beginning, in the scene's local coordinates.
     rays, hits, count
         Rays fired, those that hit something, and points of the cloud.
     samples
@@ -177,13 +175,18 @@ class ScanFrame:
 
     scan: int
     sensor: str
-    pose: Pose
     rays: int
     hits: int
     count: int
     samples: Floats32
+    _survey: Survey = field(repr=False, compare=False)
     _read: Callable[[int], Cloud] = field(repr=False, compare=False)
     __repr__ = one_line
+
+    @property
+    def pose(self) -> Pose:
+        """Pose of the sensor at its beginning, in the scene's local coordinates."""
+        return self._survey.pose(self.scan)
 
     def points(self) -> Cloud:
         """Points of this scan, read from its part.

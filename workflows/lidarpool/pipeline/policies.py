@@ -16,8 +16,11 @@ from .job_state import Batch, BatchState, Outcome
 from .names import COLLECT, INTERSECT
 
 BATCH_SECONDS = 0.2  # casting time that makes a batch worth its overhead
+SMALL_SECONDS = 0.05  # casting time of a batch that no slot idles for at the end
 BATCHES_LEAST = 16  # batches for each slot, so that none idles for long at the end
-TASK_SECONDS = 0.1  # casting time that makes a task worth its overhead
+GROWTH = 8  # times as many scans as the largest of the last batches that the next may have
+TASK_SECONDS = 0.4  # casting time that makes a task worth its overhead, and
+SLOT_SECONDS = 0.008  # more of it with each slot: a driver has some 125 tasks a second
 TASK_BATCHES = 32  # batches of one task, at most
 AHEAD = 2  # tasks offered to a worker for each of its slots, so that it need not wait
 COLLECTING = 3  # tasks whose batches a collector is given at a time
@@ -40,25 +43,31 @@ def most_scans(fit: int, scan_count: int, slots: int) -> int:
     return max(1, min(fit, scan_count // (BATCHES_LEAST * slots)))
 
 
-def scans_per_batch(seconds: float, scans: int, fit: int, scan_count: int, slots: int) -> int:
-    """Choose how many scans a batch should have, at most twice as many as the last.
+def scans_per_batch(
+    last: Sequence[tuple[float, int]], fit: int, scan_count: int, slots: int
+) -> int:
+    """Choose how many scans a batch should have, from casting times and scans of the last ones.
 
-    The last had so many `scans`, and took so many `seconds` to cast; the others see `most_scans`.
+    Several, because those of one vary: what a campaign had learned of one batch went up and down
+    fourfold. For the others see `most_scans`; a small batch is not divided further.
     """
-    wanted = int(BATCH_SECONDS * scans / max(seconds, 1e-6))
-    return max(1, min(wanted, 2 * scans, most_scans(fit, scan_count, slots)))
+    a_second = statistics.median(scans / max(seconds, 1e-6) for seconds, scans in last)
+    wanted = min(int(BATCH_SECONDS * a_second), GROWTH * max(scans for _, scans in last))
+    most = max(most_scans(fit, scan_count, slots), int(SMALL_SECONDS * a_second))
+    return max(1, min(wanted, most, fit))
 
 
-def batches_per_task(seconds: Sequence[float]) -> int:
-    """Choose how many small batches a casting task has, from casting times of others.
+def batches_per_task(last: Sequence[tuple[float, int]], slots: int) -> int:
+    """Choose how many small batches a casting task has, from casting times of the last ones.
 
     A task takes the scheduler 0.5 to 1 ms. With one batch in each, a receipt took 2.5 ms of the
     scheduler's processor time; with several, it takes 0.4 to 0.9 ms.
     """
-    if not seconds:
+    if not last:
         return 1
-    typical = max(statistics.median(seconds), 1e-6)
-    return max(1, min(int(TASK_SECONDS / typical), TASK_BATCHES))
+    typical = max(statistics.median(seconds for seconds, _ in last), 1e-6)
+    worth_s = max(TASK_SECONDS, SLOT_SECONDS * slots)
+    return max(1, min(int(worth_s / typical), TASK_BATCHES))
 
 
 def weight(batches: Iterable[Batch], per_task: int) -> float:
@@ -67,7 +76,7 @@ def weight(batches: Iterable[Batch], per_task: int) -> float:
     All of a task's batches are in a worker's memory at a time: one that takes half of what is there
     counts as half a task.
     """
-    return sum(max(1.0, per_task * len(batch) / batch.job.fit) for batch in batches)
+    return sum([max(1.0, per_task * batch.share) for batch in batches])
 
 
 def most_under_way(slots: int, collectors: int, per_task: int = 1) -> int:
@@ -98,7 +107,7 @@ def kills(batch: Batch, stage: str) -> int:
 
 def suspect(batch: Batch, stage: str) -> bool:
     """Whether a batch may be what kills the workers of a stage: then it is tried alone."""
-    return kills(batch, stage) >= 0
+    return bool(batch.deaths) and kills(batch, stage) >= 0
 
 
 def offers(
@@ -210,11 +219,11 @@ def _host(address: str) -> str:
 # -- when a batch is tried again -------------------------------------------------------------
 
 
-def late_after_s(seconds: Sequence[float]) -> float:
-    """Seconds after which a batch is late, from the casting times of others; inf without any."""
-    if not seconds:
+def late_after_s(last: Sequence[tuple[float, int]]) -> float:
+    """Seconds after which a batch is late, from casting times of the last; inf without any."""
+    if not last:
         return float("inf")
-    return max(LATE_S, LATE_FACTOR * statistics.median(seconds))
+    return max(LATE_S, LATE_FACTOR * statistics.median(seconds for seconds, _ in last))
 
 
 def loss(

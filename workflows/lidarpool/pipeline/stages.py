@@ -14,7 +14,7 @@ from dataclasses import dataclass, field, replace
 from itertools import chain
 from typing import Any
 
-from distributed import secede
+from distributed import Client, secede
 
 from poolpart import (
     Pipe,
@@ -24,7 +24,6 @@ from poolpart import (
     TaskRecord,
     fetch_available,
     hold_for_driver,
-    own_client,
     telling_departure,
 )
 
@@ -46,18 +45,27 @@ from .messages import (
 from .names import COLLECT, GENERATE, LIDAR
 from .rigs import CastBatch
 
-TELL_EVERY_S = 0.02  # messages that follow each other so fast travel together
+TELL_EVERY_S = 0.05  # messages that follow each other so fast travel together
+LINGER_S = 0.02  # the sorter waits so long for more
 FETCH_PATIENCE_S = 2.0  # longest wait for a sign of life of a batch's worker
 
 
-def _work(me: StageStart, inlet: Pipe, do: Callable[[Iterator[Any]], Iterable[int]]) -> TaskRecord:
-    """Do what the driver sends until a pipe is closed; `do` yields how many scans are done."""
+def _work(
+    me: StageStart,
+    inlet: Pipe,
+    do: Callable[[Iterator[Any]], Iterable[int]],
+    linger_s: float = 0.0,
+) -> TaskRecord:
+    """Do what the driver sends until a pipe is closed; `do` yields how many scans are done.
+
+    Once there is something, it waits `linger_s` for more.
+    """
     recorder = Recorder(me.stage, LIDAR)
     scans = 0
     me.trace("start")
     with suppress(PipeClosed, PipeFailed):
         while True:
-            for count in do(chain.from_iterable(inlet.get_all())):
+            for count in do(chain.from_iterable(inlet.get_all(linger_s=linger_s))):
                 scans += count
     return recorder.done(scans)
 
@@ -145,7 +153,8 @@ def sort_frames(me: StageStart, inlet: Pipe, outlet: Pipe) -> TaskRecord:
             me.trace("sent", scans)
             yield len(scans)
 
-    return _work(me, inlet, sort)
+    # Each answer wakes the driver.
+    return _work(me, inlet, sort, linger_s=LINGER_S)
 
 
 @dataclass(eq=False)
@@ -181,16 +190,18 @@ def collect(
     there = storage if storage.sees(*probe) else None
 
     def store(orders: Iterator[CollectOrder]) -> Iterator[int]:
-        return _tell(me, outlet, chain.from_iterable(_collected(me, there, o) for o in orders))
+        # The pipe's client: `own_client` makes a message to the scheduler each time.
+        news = (_collected(me, there, order, inlet.client) for order in orders)
+        return _tell(me, outlet, chain.from_iterable(news))
 
     return _work(me, inlet, store)
 
 
 def _collected(
-    me: StageStart, storage: Storage | None, order: CollectOrder
+    me: StageStart, storage: Storage | None, order: CollectOrder, client: Client
 ) -> Iterator[Receipt | ColumnsLost | Failed]:
     """Make the parts of a casting task; gives the messages to the driver."""
-    found = fetch_available(own_client(), [order.key], FETCH_PATIENCE_S, at=order.worker)
+    found = fetch_available(client, [order.key], FETCH_PATIENCE_S, at=order.worker)
     if order.key not in found:
         yield ColumnsLost(order.key)
         return

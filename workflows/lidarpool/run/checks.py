@@ -92,7 +92,9 @@ def check_memory(job: Job, tasks: TaskOptions, backend: str, room: float, worker
     JobError: another job may fit.
     """
     takes = partial(cast_bytes, job.scene, job.survey, on_device=backend == "cuda")
-    scan, all_scans = map(takes, (1, job.survey.scan_count))
+    if (all_scans := takes(job.survey.scan_count)) <= room:
+        return
+    scan = takes(1)
     limit = f"more than the {room / MB:,.0f} MB that {worker} has for each slot"
     if scan > room:
         raise JobError(
@@ -110,10 +112,10 @@ def check_workers(
     job: Job, tasks: TaskOptions, backend: str, casting: Iterable[WorkerInfo]
 ) -> None:
     """Check that casting workers have memory for a job; JobError if not."""
-    for worker in casting:
-        if worker.memory:
-            each = worker.memory / max(1, worker.resources[GPU])
-            check_memory(job, tasks, backend, each, f"the GPU worker at {worker.address}")
+    each = {w.address: w.memory / max(1, w.resources[GPU]) for w in casting if w.memory}
+    if each:  # the least alone: a campaign of tiny jobs cannot look at hundreds of workers for each
+        address = min(each, key=each.__getitem__)
+        check_memory(job, tasks, backend, each[address], f"the GPU worker at {address}")
 
 
 def _survey_pool(client: Client, needed: Mapping[str, int], writing: bool) -> Pool:

@@ -37,7 +37,7 @@ from .writer import JobFiles, JobWriter
 PROGRESS_EVERY_S = 0.1
 SAVE_EVERY_S = 1.0  # stores the number of frames handed out
 LONGEST_PAUSE_S = 0.05  # while nothing moves
-SPARE = 32  # jobs under way beside two for each GPU slot
+SPARE = 64  # jobs under way beside two for each GPU slot
 
 
 class Run:
@@ -106,11 +106,12 @@ class Run:
             elif self._writer is None:
                 self.kept = state
             else:
-                self._writer.waiting.append(self._files_of(state))
+                self._writer.add(self._files_of(state))
         for_all: LidarpoolError | None = None
         # A stage whose worker has died gets its slot first.
         slots = 0 if self._driver.stages.lacks_slot else self._cluster.spare
-        for files, made in () if self._writer is None else self._writer.step(slots):
+        more = bool(self._driver.jobs)
+        for files, made in () if self._writer is None else self._writer.step(slots, more=more):
             moved = True
             if isinstance(made, JobError):
                 self._fail(files.row.number, made)

@@ -33,6 +33,7 @@ from .tasks import Tasks
 
 WRITING = 2  # tasks that wait to be done, for each free slot of LIDAR
 TOGETHER, TOGETHER_POINTS = 32, 1_000_000  # jobs that one task writes, and their points
+GATHER_S = 0.25  # that a job waits for others to be written with
 BEGIN_S = 10.0  # for any job to begin to be written; then the driver writes one
 
 
@@ -100,7 +101,8 @@ class JobWriter:
         with explained(f"{place} cannot be written"):
             place.prepare()
             place.write(*probe)
-        self.waiting = deque[JobFiles]()
+        self._waiting = deque[JobFiles]()
+        self._due_at = 0.0  # when those that wait are to be written
         self._here: dict[Future[JobOutcome], JobFiles] = {}
         self._thread = ThreadPoolExecutor(1, "write")
         self._moved_at = time.monotonic()
@@ -110,14 +112,22 @@ class JobWriter:
     def jobs(self) -> Iterator[JobRow]:
         """Jobs that wait or are being written."""
         yield from (job.row for jobs in self.tasks.running.values() for job in jobs)
-        yield from (job.row for job in (*self._here.values(), *self.waiting))
+        yield from (job.row for job in (*self._here.values(), *self._waiting))
 
-    def step(self, slots: int) -> list[tuple[JobFiles, JobOutcome]]:
+    def add(self, files: JobFiles) -> None:
+        """Have a job written soon."""
+        if not self._waiting:
+            self._due_at = time.monotonic() + GATHER_S
+        self._waiting.append(files)
+
+    def step(self, slots: int, *, more: bool) -> list[tuple[JobFiles, JobOutcome]]:
         """Submit what there is room for; returns the rows of jobs, or why they were not written.
 
-        Errors of single jobs are JobErrors; others are of the place, or of a worker's software.
+        Jobs wait a moment for others if there are `more` to come. Errors of single jobs are
+        JobErrors; others are of the place, or of a worker's software.
         """
-        while self.waiting and len(self.tasks.running) < WRITING * slots:
+        due = not more or len(self._waiting) >= TOGETHER or time.monotonic() >= self._due_at
+        while due and self._waiting and len(self.tasks.running) < WRITING * slots:
             jobs = self._next()
             arguments = self.dataset, self._probes, jobs
             self.tasks.submit(jobs, write_jobs, *arguments, priority=5)
@@ -143,13 +153,13 @@ class JobWriter:
 
     def _next(self) -> list[JobFiles]:
         """Take the jobs of the next task."""
-        jobs = [self.waiting.popleft()]
+        jobs = [self._waiting.popleft()]
         points = len(jobs[0].cloud)
-        while self.waiting and len(jobs) < TOGETHER:
-            points += len(self.waiting[0].cloud)
+        while self._waiting and len(jobs) < TOGETHER:
+            points += len(self._waiting[0].cloud)
             if points > TOGETHER_POINTS:
                 break
-            jobs.append(self.waiting.popleft())
+            jobs.append(self._waiting.popleft())
         return jobs
 
     def _relieve(self, moved: bool) -> None:
