@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from lidarpool import Mounted, Pose, Scene, Sensor, Survey, Track, read_cloud, simulate
+from lidarpool import Campaign, Mounted, Pose, Scene, Sensor, Survey, Track, read_cloud, simulate
 from lidarpool.scenario.build import build
 from lidarpool.scenario.scenario import Scenario
 from lidarpool.scene.generated.city import city
@@ -83,6 +83,21 @@ def test_the_drive_of_three_sensors_and_ten_actors_can_be_made(tmp_path):
     assert 15e6 < survey.ray_count < 15.2e6
     for actor in scene.actors:
         actor.check(0.0, survey.duration_ns)
+
+
+def test_the_crossing_by_day_and_wet_by_night_can_be_made(tmp_path):
+    write_scene(tmp_path / "city.glb", city(20_000))
+    for name in ("crossing.yaml", "crossing-night.yaml", "car.obj", "pedestrian.glb"):
+        (tmp_path / name).write_bytes((ROOT / "examples" / name).read_bytes())
+    day = build(Scenario.load(tmp_path / "crossing.yaml"))
+    night = Campaign.load(tmp_path / "crossing-night.yaml").job(0)
+    for scene, survey in ((day.scene, day.survey), (night.scene, night.survey)):
+        people = [actor for actor in scene.actors if actor.name.startswith("Person")]
+        assert len(people) == 20
+        assert len({id(actor.mesh.animation) for actor in people}) == 1
+        for actor in scene.actors:
+            actor.check(0.0, survey.duration_ns)
+    assert (day.survey.wet, night.survey.wet) == (0, 0.9)
 
 
 def test_a_frame_says_whose_it_is(cluster_client):
