@@ -162,9 +162,9 @@ def turns(scene: Scene, survey: Survey, backend: str) -> Any:
     """Make a function that casts a turn of a survey, of five, and makes its columns."""
     rig, scans = Rig(scene, survey, backend, threads=1), survey.scan_count // 5
 
-    def turn(number: int) -> int:
+    def turn(number: int) -> range:
         part = columns_of([*rig.cast(number * scans, (number + 1) * scans)])
-        return int(part.counts.sum())
+        return range(int(part.counts.sum()))  # as long as its points
 
     return turn
 

@@ -55,6 +55,7 @@ def points_of(scene: Scene, number: int) -> Cloud:
         "time": scan * 1000,
         **dict.fromkeys(("range", "azimuth", "elevation", "reflectivity"), np.ones(count)),
     }
+    columns["signal"] = np.rint(10_000 * columns["intensity"]).astype(np.uint16)
     places = scene.origin + rng.uniform(-60, 60, (count, 3))
     return Cloud(np.round(places, 3), columns)
 

@@ -77,10 +77,10 @@ def picture(path: Path) -> None:
         room = [glazing, beside, upright("Behind", (40, 1), (40, -1))]
         one = shot(
             room, Sensor(Beams(np.zeros(1)), Spin(1, 360), 0), Noise(), returns=Returns("all"),
-            materials=[Material("*", 1.0), glass], columns=("object", "reflectivity"),
+            materials=[Material("*", 1.0), glass], columns=("object", "reflectance"),
         )  # fmt: skip
         for number, colour in ((0, GREY), (1, RED), (2, BLUE)):
-            own = one["reflectivity"][one["object"] == number]
+            own = one["reflectance"][one["object"] == number]
             right.plot([np.degrees(angle)] * len(own), own, "o", ms=4, color=colour)
     angle = np.radians(np.linspace(0, 89, 300))
     mirrored = (1 - DIRT) * fresnel(np.cos(angle))
@@ -89,7 +89,7 @@ def picture(path: Path) -> None:
     behind = (1 - DIRT - mirrored) ** 2
     right.plot(np.degrees(angle), behind, color=BLUE, label="behind: ((1 − ρ)(1 − F))²")
     right.set(yscale="log", ylim=(5e-4, 1.5), xlabel="angle of incidence, degrees")
-    right.set_ylabel("reflectivity of white walls")
+    right.set_ylabel("reflectance of white walls")
     right.set_title("dirty glass; dots simulated, lines closed form", fontsize=10)
     right.legend(fontsize=8, frameon=False)
     right.grid(alpha=0.25)

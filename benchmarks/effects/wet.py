@@ -33,7 +33,7 @@ def picture(path: Path) -> None:
     survey = Survey(
         Sensor(beams, Spin(3600, 1), 0.5, 90.0), poses=[(0, 0, 0)], steps=1,
         materials=[Material("*", 0.8), Material("Road", ROAD)], noise=Noise(detection_range_m=100),
-        returns=Returns("all"), columns=("cause", "reflectivity", "elevation"), keep_every=1,
+        returns=Returns("all"), columns=("cause", "reflectance", "elevation"), keep_every=1,
         precision_m=0.001,
     )  # fmt: skip
     for name, share in (("dry", 0.0), ("wet", 1.0)):
@@ -49,7 +49,7 @@ def picture(path: Path) -> None:
         if name == "wet":
             once = points([road], replace(survey, wet=share))
             steep = 90 + once["elevation"][:: len(x) // 400]
-            shown = once["reflectivity"][:: len(x) // 400]
+            shown = once["reflectance"][:: len(x) // 400]
             views["right"].plot(steep, shown, "o", ms=4, color=BLUE)
     angle = np.radians(np.linspace(0, 89.5, 400))
     dry, axes = ROAD * np.cos(angle), views["right"]
@@ -59,7 +59,7 @@ def picture(path: Path) -> None:
     mirrored = fresnel(np.cos(angle), WATER_INDEX) ** 2
     axes.plot(np.degrees(angle), mirrored, color=RED, label="ghost of a white wall: F²")
     axes.set(yscale="log", ylim=(3e-4, 1), xlabel="angle of incidence, degrees")
-    axes.set(ylabel="reflectivity", title="asphalt; dots simulated, lines closed form")
+    axes.set(ylabel="reflectance", title="asphalt; dots simulated, lines closed form")
     axes.legend(fontsize=8, frameon=False)
     axes.grid(alpha=0.25)
     figure.savefig(path)

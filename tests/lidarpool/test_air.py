@@ -226,7 +226,7 @@ def car(way=None, spray=True, place=(8.0, 5.0, -0.7), speed=SPEED, size=(4, 2, 1
         turn = [0, 0, math.sqrt(0.5), math.sqrt(0.5)]
         ends = [place, (place[0], place[1] + 2 * speed, place[2])]
         way = Track([0, 2], ends, [turn, turn], beyond="hold")
-    return Actor(cuboid("Car", size), way, spray)
+    return Actor(cuboid("Car", size), way, spray=spray)
 
 
 def sprayed(actor, meshes=(NOTHING,), backend="numpy", sensor=None, **options):

@@ -285,7 +285,7 @@ def test_normals_are_those_of_the_moment():
         Track([0, 9], [[5, 0, 0], [5, 0, 0.0]], [[0, 0, 0, 1]] * 2),
     )
     scene = Scene.from_meshes([FLOOR]).with_actors([actor])
-    columns, grey = ["reflectivity", "object", "time"], Material("*", reflectance=0.5)
+    columns, grey = ["reflectance", "object", "time"], Material("*", reflectance=0.5)
     scanner = Scanner(scene, Sensor.grid(720, 3), columns=columns, materials=[grey])
     for start in (0.05, 0.3, 0.55):
         found = scanner.sweep((0, 0, 0), start_s=start)
@@ -294,7 +294,7 @@ def test_normals_are_those_of_the_moment():
         ways = found.positions[own] / np.linalg.norm(found.positions[own], axis=1)[:, None]
         angle = np.radians(found["time"][own] / 1e9 * 100)
         cosine = np.abs(ways[:, 0] * np.cos(angle) - ways[:, 1] * np.sin(angle))
-        np.testing.assert_allclose(found["reflectivity"][own], 0.5 * cosine, atol=1e-3)
+        np.testing.assert_allclose(found["reflectance"][own], 0.5 * cosine, atol=1e-3)
 
 
 def test_the_rate_follows_the_way_and_who_stands_keeps_the_pose(walker):

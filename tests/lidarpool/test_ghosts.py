@@ -12,7 +12,7 @@ from lidarpool.columns.table import CAUSES
 from lidarpool.scene.colours import Colours
 from lidarpool.sensor.materials import WATER_INDEX, below_water, fresnel
 
-COLUMNS = ("range", "reflectivity", "class", "cause", "return_number")
+COLUMNS = ("range", "reflectance", "class", "cause", "return_number")
 GHOST = CAUSES.index("ghost")
 ALL = {"returns": Returns("all"), "columns": COLUMNS}
 WATER = {"transparent": "pass", "refractive_index": 1.33}
@@ -64,7 +64,7 @@ def test_paint_returns_itself_and_what_it_mirrors(backend, subrays):
     assert np.allclose(found["batch"].positions, [[4, 0, 0], [7, 0, 0]], atol=1e-4), "straight on"
     mirrored = 0.7 * schlick(0.2, math.pi / 4)
     steep = math.sqrt(0.5)
-    assert found["reflectivity"] == pytest.approx([0.3 * steep, 0.8 * mirrored**2], rel=1e-3)
+    assert found["reflectance"] == pytest.approx([0.3 * steep, 0.8 * mirrored**2], rel=1e-3)
     alone = cast([SLANTED, CEILING], **{**options, "returns": Returns("strongest", subrays, 1.0)})
     assert alone["cause"].tolist() == [0], "the paint is brighter"
 
@@ -77,7 +77,7 @@ def test_no_light_is_lost_or_made_at_glass(degrees, dirt):
     glass = Material("Pane", dirt, transparent="pass", specular_reflectance="fresnel")
     meshes = [turned("Pane", angle), across("Beside", angle), wall("Behind", 20)]
     found = cast(meshes, materials=[Material("*", 1.0), glass], **ALL)
-    light = dict(zip(found["object"].tolist(), found["reflectivity"].tolist(), strict=True))
+    light = dict(zip(found["object"].tolist(), found["reflectance"].tolist(), strict=True))
     shares = dirt, math.sqrt(light[1]), math.sqrt(light[2])
     assert sum(shares) == pytest.approx(1, abs=1e-6)
     assert shares[1] == pytest.approx((1 - dirt) * fresnel(np.array([math.cos(angle)]))[0])
@@ -94,7 +94,7 @@ def test_water_is_passed_and_mirrors():
         found = cast(pool, materials=[Material("*", 1.0), Material("Pool", **WATER, **more)], **ALL)
         assert len(found["range"]) == count
     share = fresnel(np.array([math.cos(angle)]), 1.33)[0]
-    assert found["reflectivity"][0] == pytest.approx(share**2, rel=1e-6)
+    assert found["reflectance"][0] == pytest.approx(share**2, rel=1e-6)
     floor = [level("Pool", 1.0), level("Floor", -2.0)]
     water = Material("Pool", **WATER, specular_reflectance="fresnel")
     found = cast(floor, fan(30, 31), materials=[Material("*", 1.0), water], at=(0, 0, 0), **ALL)
@@ -108,7 +108,7 @@ def test_light_is_mirrored_twice_and_not_three_times():
     assert found["range"].tolist() == [4, 14, 24], "A, B in A, and A in B in A"
     assert found["object"].tolist() == [0, 1, 0]
     assert found["cause"].tolist() == [0, GHOST, GHOST]
-    assert found["reflectivity"] == pytest.approx([0.5, 0.5 / 4**2, 0.5 / 4**4])
+    assert found["reflectance"] == pytest.approx([0.5, 0.5 / 4**2, 0.5 / 4**4])
 
 
 def test_ghosts_of_textures_take_what_the_colours_leave():
@@ -118,7 +118,7 @@ def test_ghosts_of_textures_take_what_the_colours_leave():
         slanted = replace(SLANTED, colours=colours)
         paint = Material("Slanted", "texture", specular_reflectance=0.2)
         found = cast([slanted, CEILING], materials=[Material("*", 1.0), paint], **ALL)
-        ghosts = found["reflectivity"][found["cause"] == GHOST]
+        ghosts = found["reflectance"][found["cause"] == GHOST]
         expected = [(share * schlick(0.2, math.pi / 4)) ** 2] if share else []
         assert ghosts == pytest.approx(expected, rel=1e-5)
 
@@ -174,14 +174,14 @@ def test_a_wet_road_is_darker_and_mirrors(backend, wet, down_deg):
     steep = np.array([math.sin(math.radians(down_deg))])
     darker = 1 - wet + wet * below_water(steep, np.full(1, 0.2))[0]
     own = found["cause"] == 0
-    assert found["reflectivity"][own] == pytest.approx(darker * dry["reflectivity"], rel=1e-3)
+    assert found["reflectance"][own] == pytest.approx(darker * dry["reflectance"], rel=1e-3)
     ghosts = np.flatnonzero(~own)
     assert len(ghosts) == 2 and (found["object"][ghosts] == 1).all()
     aside = math.cos(math.radians(down_deg))
     assert found["range"][ghosts] == pytest.approx([40 / aside] * 2, rel=1e-3)
     assert (found["batch"].positions[ghosts, 2] < -2).all(), "below the road"
     share = (wet * fresnel(steep, WATER_INDEX)[0]) ** 2
-    assert found["reflectivity"][ghosts] == pytest.approx(0.2 * aside * share, rel=1e-3)
+    assert found["reflectance"][ghosts] == pytest.approx(0.2 * aside * share, rel=1e-3)
 
 
 def test_wet_roads_vanish_at_grazing_angles_before_dry_ones():
@@ -203,7 +203,7 @@ def test_wet_roads_vanish_at_grazing_angles_before_dry_ones():
     ],
 )
 def test_a_film_stays_on_what_faces_up(mesh, ratio):
-    dry, wet = (cast([mesh], beam_along_x(), wet=wet, **ALL)["reflectivity"][0] for wet in (0, 1))
+    dry, wet = (cast([mesh], beam_along_x(), wet=wet, **ALL)["reflectance"][0] for wet in (0, 1))
     steep = np.array([3 / math.hypot(3, 6)])
     share = below_water(steep, np.full(1, 0.5))[0] if ratio else 1
     assert wet / dry == pytest.approx(share)

@@ -9,6 +9,7 @@ import numpy as np
 from tests.shapes import block, level
 
 from lidarpool import (
+    Actor,
     Fault,
     Gnss,
     Imu,
@@ -50,7 +51,9 @@ def everything():
     for name, x in (("Crown 1", 5.0), ("Crown 2", 6.0), ("Sign", -4.0)):
         meshes.append(block(name, (3, 3, 3), (x, 0.3, 1.7)))
     other = Mounted(replace(SENSOR, start_ns=100.0), Pose((0, 0.5, 0)), name="right")
-    return Scene.from_meshes(meshes), Survey(
+    way = Track([0, 0.5], [[5.0, -3, 0.7], [17, -3, 0.7]])
+    van = Actor(block("Van", (4, 2, 1.4), (0, 0, 0)), way)
+    return Scene.from_meshes(meshes).with_actors((van,)), Survey(
         sensors=[Mounted(SENSOR, name="left"), other],
         trajectory=Track([0, 0.5], [[0, 0, 1.2], [0.5, 0, 1.2]]),
         steps=4,
@@ -68,6 +71,8 @@ def everything():
         fog_lidar_ratio_sr=18.8,
         visibility_km=0.5,
         snow_mm_h=1.0,
+        wet=1.0,
+        spray_g_m3=20.0,
     )
 
 
@@ -94,7 +99,7 @@ def test_no_random_number_is_used_twice(monkeypatch):
         for known, other in ((raw, recorded), (starts, begun)):
             if name.startswith("lidarpool") and getattr(module, known.__name__, None) is known:
                 monkeypatch.setattr(module, known.__name__, other)
-    for name in ("_uniform", "_scan_of", "particles", "fog"):  # not compiled, to see what they draw
+    for name in ("_uniform", "_scan_of", "particles", "fog", "spray"):  # not compiled
         monkeypatch.setattr(pulse_loops, name, getattr(pulse_loops, name).py_func)
     monkeypatch.setattr(pulse_loops, "_bits", hashed)
     kinds = rain(20.0), snow(1.0), rain(5.0)

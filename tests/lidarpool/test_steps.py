@@ -17,7 +17,7 @@ from lidarpool.simulator.steps import STEPS
 
 EFFECTS = Path(__file__).parents[2] / "docs/effects.md"
 # What is no step: figures for steps, a column, and files.
-OTHERS = {"Data sheets", "Radial velocity", "Navigation"}
+OTHERS = {"Data sheets", "Radial velocity", "People who walk", "Navigation"}
 OF_OTHERS = {
     *(Purpose.VELOCITY, Purpose.WHITE, Purpose.DRIVEN, Purpose.WALK, Purpose.SKEW, Purpose.OUTAGE)
 }

@@ -153,7 +153,9 @@ def test_saturation_is_that_of_the_twin(full, waves):
     else:
         solid, width_ns = hits.triangle != NO_SURFACE, 2 * GAP / LIGHT_M_NS
         ground = tuple(one[solid] for one in planes)
-        returns = separated(hits.take(solid), GAP, 7, ground, hits.take(~solid))
+        flies = hits.take(~solid)
+        flies = flies._replace(cause=np.full(len(flies.ray), AIR))
+        returns = separated(hits.take(solid), GAP, 7, ground, flies)
         given = {k: twin.separated(own, GAP, 7, True) for k, own in pulses.items()}
     found = saturated(returns, full, width_ns)
     length = width_ns * LIGHT_M_NS / 2

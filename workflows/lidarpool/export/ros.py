@@ -27,6 +27,7 @@ from ..base.arrays import AnyArray, Floats32, Records
 from ..columns.cloud import Cloud, CloudLike
 from ..columns.table import COLOURS, VELOCITY
 from ..scene.colours import as_float
+from ..sensor.reflectivity import COUNTS
 from . import reading
 from .boxes import Boxes
 from .images import Image
@@ -191,8 +192,11 @@ def _instruments(sweeps: Sweeps) -> list[tuple[str, str, Placed, int]]:
     ]
 
 
+_FULL = {"autoware": 255, "ouster": COUNTS}  # of an intensity of 1
+
+
 class Reader(reading.Reader):
-    """Reads sweeps of a data set: intensity (0 to 1 with autoware), channel and named class."""
+    """Reads sweeps of a data set: intensity, as far as it is kept, channel and named class."""
 
     def files(self, sweep: int) -> list[str]:
         """Return the name of the job's bag."""
@@ -221,9 +225,9 @@ class Reader(reading.Reader):
         held = {field.name for field in message.fields}
         extra = [name for name in _EXTRA if name in held]
         rows = message.data.view(_row(self.layout, extra))
-        light = rows["intensity"].astype(np.float32)
+        light = rows["intensity"].astype(np.float32) / _FULL.get(self.layout, 1)
         columns = {
-            "intensity": light / 255 if self.layout == "autoware" else light,
+            "intensity": light,
             "channel": rows["channel" if self.layout == "autoware" else "ring"].astype(np.uint16),
         }
         if "label" in held:

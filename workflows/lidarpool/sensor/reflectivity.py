@@ -39,6 +39,7 @@ class ByteScale(NamedTuple):
 
 # Of the makers' manuals. Only Hesai publishes all of its scale: the others say that it is
 # logarithmic above white, or ends with an ideal retro-reflector.
+COUNTS = 10_000  # of an intensity of 1 in the column signal: makers publish no such figure
 SCALES = {
     "velodyne": ByteScale(100, 1.0, _BEST),
     "vls128": ByteScale(110, 1.0, _BEST),

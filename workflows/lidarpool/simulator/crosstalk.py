@@ -73,7 +73,7 @@ class CrosstalkStep(PulseStep):
     def memory(setup: Setup, sizes: Sizes) -> Memory:
         """See `PulseStep.memory`: a cause of each return, rays, and pulses of others."""
         others = _pulses_meanwhile(setup.survey, setup.sensor)
-        return Memory(kept=10 * sizes.returns, casting=(120 + 370 * others) * sizes.beams)
+        return Memory(kept=10 * sizes.returns, casting=(120 + 200 * others) * sizes.beams)
 
     def apply(self, returns: PulseReturns, batch: PulseBatch) -> PulseReturns:
         """See `PulseStep.apply`."""

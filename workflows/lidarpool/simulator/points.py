@@ -20,7 +20,7 @@ from ..sensor import ScanSpec, Survey
 from ..sensor.faults import faults_of
 from ..sensor.materials import at_right_angles
 from ..sensor.optics import LIGHT_M_NS
-from ..sensor.reflectivity import SCALES
+from ..sensor.reflectivity import COUNTS, SCALES
 from .doppler import radial_velocities
 from .motion import Firings, Poses
 from .pulses import Scanned
@@ -28,7 +28,6 @@ from .returns import BLOOMING, CROSSTALK, FALSE_ALARM, made
 from .surfaces import Surfaces, light_of
 
 BLOCK_HITS = 1 << 16  # that are looked at a time
-COUNTS = 10_000  # of an intensity of 1: the makers publish no such figure
 LEAST_LEFT = 1e-30  # of the light, so that what is divided by it is finite in single precision
 
 
