@@ -283,19 +283,12 @@ def compare(a: Path, b: Path, out: Path, as_json: bool, **given: Any) -> None:
 @click.command()
 @click.argument("recording", metavar="RECORDING", type=click.Path(path_type=Path))
 @options.new_file("--out", required=True, help="Sensor file, .yaml; its page is a .html beside it.")
-@click.option(
-    "--model", metavar="MODEL|FILE", help="The sensor; what is not told keeps its figures."
-)
+@click.option("--model", metavar="MODEL|FILE", help="The sensor, for what the recording hides.")
 @click.option("--scene", metavar="FILE", type=click.Path(path_type=Path), help="The place, a mesh.")
 @options.pose
 @click.option("--sensor", metavar="NAME", help="Sensor of the recording, or topic of a bag.")
 @click.option("--intensity", metavar="COLUMN", help="Column of the intensity.")
-@click.option(
-    "--white",
-    type=click.FloatRange(0, min_open=True),
-    metavar="VALUE",
-    help="Intensity of a white surface, if it is the same at all ranges.",
-)
+@click.option("--white", type=float, help="Intensity of white, if it is the same at all ranges.")
 @options.as_json
 def fit(recording: Path, out: Path, as_json: bool, **given: Any) -> None:
     """Fit a sensor to a recording of a unit that stands: noise, lost returns, false alarms.

@@ -28,28 +28,26 @@ from ..sensor import Pose, Spin
 from ..sensor.models import SensorModel, read_model
 from ..sensor.ray_sensors import ListedSensor
 from ..simulator import Scanner
-from .estimates import Estimate, channel_bias, fit_performance
+from .estimates import Estimate, Rays, Repeats, fit_performance, ring_bias, smooth_rays, surfaces
 from .recordings import Recording, open_recording
-from .repeats import Rays, Repeats, smooth_rays, surroundings
 
-# {curve, or column of channels: (title, label of x, label of y, factor)}
+# {curve, or column of channels: (label of x, label of y, factor)}, three a row
 _CHARTS = {
-    "noise_by_range": ("Noise of ranges", "range, m", "noise, mm", 1000),
-    "noise_by_light": ("", "intensity, or energy", "noise, mm", 1000),
-    "noise_by_tilt": ("", "incidence, °", "noise with that of directions, mm", 1000),
-    "returned_by_light": ("Returns", "intensity, or energy", "pulses that return, %", 100),
-    "lost_by_range": ("", "range of the scene, m", "pulses lost, %", 100),
-    "light_by_range": ("", "range, m", "mean intensity", 1),
-    "noise_m": ("Rings", "elevation, °", "noise, mm", 1000),
-    "bias_m": ("", "elevation, °", "bias, mm", 1000),
-    "uneven_deg": ("", "elevation, °", "spread of azimuths, °", 1),
+    "noise_by_range": ("range, m", "noise, mm", 1000),
+    "noise_by_light": ("intensity, or energy", "noise, mm", 1000),
+    "noise_by_tilt": ("incidence, °", "noise with that of directions, mm", 1000),
+    "returned_by_light": ("intensity, or energy", "pulses that return, %", 100),
+    "lost_by_range": ("range of the scene, m", "pulses lost, %", 100),
+    "light_by_range": ("range, m", "mean intensity", 1),
+    "noise_m": ("elevation, °", "noise, mm", 1000),
+    "bias_m": ("elevation, °", "bias, mm", 1000),
+    "uneven_deg": ("elevation, °", "spread of azimuths, °", 1),
 }
 _FEW = 30  # rays that a figure or a point of a curve needs
 _POINTS = 14  # of a curve
 _AIM = 0.002  # scatter of directions that does not make outliers before it is known, radians
 _LEAST_M = 0.001  # error of the mean range of a ray, however often it is measured
 _FLAT = 1.7  # tangent of incidence: beyond, noise of directions makes mean ranges longer
-_BESIDE_M = 0.3  # how far a recorded surface may be from the scene's
 _DARKEST = 1 / 400  # reflectance of what is reported as 0
 
 
@@ -122,21 +120,16 @@ def fit(
         raise LidarpoolError('Figures are fitted by scipy: pip install "lidarpool[fit]".')
     if not isinstance(recording, Recording):
         recording = open_recording(recording, sensor, intensity, name="the recording")
-    whole = Repeats.read(recording)
-    repeats = whole.first() if whole.moves else whole
-    middle, sigma, count = repeats.middle(), repeats.rough_sigma(), len(repeats.ranges)
-    there = np.isfinite(repeats.ranges).sum(axis=0)
-    around = surroundings(repeats, middle, sigma / np.sqrt(np.maximum(there, 1)))
-    curves, expected = {}, None
+    repeats = Repeats.read(recording)
+    sigma, count, curves, expected = repeats.sigma.copy(), len(repeats.ranges), {}, None
     if scene is not None:
         expected = _cast(repeats, scene if isinstance(scene, Scene) else Scene.load(scene), pose)
-        known = surroundings(repeats, expected, 0 * sigma)
-        near = around.smooth & (np.abs(middle - expected) < _BESIDE_M)
-        around = around._replace(slope=known.slope, smooth=near)
-        curves["lost_by_range"] = _curve(expected[known.smooth], 1 - there[known.smooth] / count)
-    estimates, aim = dict[str, Estimate | None](), 0.0
+        *_, known = surfaces(repeats, expected, 0 * sigma)
+        lost = np.isnan(repeats.ranges).mean(axis=0)
+        curves["lost_by_range"] = _curve(expected[known], lost[known])
+    found = dict[str, Estimate]()
     for _ in range(2):  # the first finds what the second leaves out
-        rays = smooth_rays(repeats, around, sigma, 0.0 if estimates else _AIM)
+        rays = smooth_rays(repeats, sigma, 0.0 if found else _AIM, expected)
         if len(rays.row) < _FEW:
             raise LidarpoolError(
                 f"{recording.name} has {len(rays.row)} rays on smooth surfaces, not {_FEW}: "
@@ -148,26 +141,24 @@ def fit(
         if energy is not None and not np.isfinite(energy).all():
             energy = None
         if count > 1:
-            estimates, scatter = fit_performance(repeats, rays, energy)
-            sigma[rays.row, rays.column] = scatter.sigma
-            aim = scatter.aim.value if scatter.aim else 0.0
-    own = np.where(rays.freedom > 0, rays.variance - (aim * rays.slope) ** 2, np.nan)
-    light = rays.light if energy is None else energy
-    tilt = np.degrees(np.arctan(rays.slope / rays.distance))
+            found, sigma[rays.row, rays.column] = fit_performance(repeats, rays, energy)
+    aim = np.radians(found["angle_deg"].value) if "angle_deg" in found else 0.0
+    tilted = np.where(rays.freedom > 0, rays.variance, np.nan)
+    own, light = tilted - (aim * rays.slope) ** 2, rays.light if energy is None else energy
     curves["noise_by_range"] = _curve(rays.distance, own, 0.5)
     curves["noise_by_light"] = _curve(light, own, 0.5)
-    curves["noise_by_tilt"] = _curve(tilt, own + (aim * rays.slope) ** 2, 0.5)
+    tilt = np.degrees(np.arctan(rays.slope / rays.distance))
+    curves["noise_by_tilt"] = _curve(tilt, tilted, 0.5)
     curves["returned_by_light"] = _curve(light, rays.returns / count)
     curves["light_by_range"] = _curve(rays.distance, rays.light)
-    found = {key: one for key, one in estimates.items() if one}
     base, name = read_model(model) if model else _recorded(repeats), Path(recording.name).name
     figures = {
         "versions": {"lidarpool": __version__}, "name": name, "model": base.name,
-        "sweeps": len(whole.ranges), "moves": whole.moves, "rays": len(rays.row),
-        "figures": {key: one._asdict() for key, one in found.items()}, "notes": whole.notes,
+        "sweeps": repeats.sweeps, "moves": repeats.moves, "rays": len(rays.row),
+        "figures": {key: one._asdict() for key, one in found.items()}, "notes": repeats.notes,
         "channels": _channels(repeats, rays, own, sigma, expected), "curves": curves,
     }  # fmt: skip
-    source = f"fitted by lidarpool {__version__} to {name}, {plural(len(whole.ranges), 'sweep')}"
+    source = f"fitted by lidarpool {__version__} to {name}, {plural(repeats.sweeps, 'sweep')}"
     return Fit(figures, _with(base, found, source) if found else base)
 
 
@@ -177,22 +168,23 @@ def _with(base: SensorModel, known: Mapping[str, Estimate], source: str) -> Sens
     stated = base.performance.model_dump(exclude_defaults=True) if base.performance else {}
     for name in ("precision", "range_m", "range_per_m"):  # one excludes the others
         stated.pop(name, None)
-    far = found.get("detection_range_m", 0.0)
+    far, weak = (found.get(name, 0.0) for name in ("detection_range_m", "range_at_threshold_m"))
     if far:
         stated["detection"] = {"range_m": far, "reflectance": 0.1, "probability": 0.5}
-    if weak := found.get("range_at_threshold_m"):
-        sigma = {part: float(np.hypot(found["range_m"], weak * part**2)) for part in (0.5, 1)}
+    if weak:
         stated["precision"] = [
-            {"sigma_m": one, "range_m": part * far, "reflectance": 0.1}
-            for part, one in sigma.items()
+            {"sigma_m": float(sigma), "range_m": share * far, "reflectance": 0.1}
+            for share, sigma in ((k, np.hypot(found["range_m"], weak * k**2)) for k in (0.5, 1))
         ]
     else:
-        stated |= {"range_m": found["range_m"], "range_per_m": found.get("range_per_m", 0.0)}
-    for name, needed in (("angle_deg", True), ("false_alarms", "detection" in stated)):
-        if needed and name in known and known[name].low > 0:
+        stated |= {name: found[name] for name in ("range_m", "range_per_m") if name in found}
+    for name in ("angle_deg", *["false_alarms"] * ("detection" in stated)):
+        if name in known and known[name].low > 0:
             stated[name] = found[name]
-    data = base.model_dump() | {"performance": stated}
-    return SensorModel.model_validate(data | {"sources": {**base.sources, "performance": source}})
+    sources = {**base.sources, "performance": source}
+    return SensorModel.model_validate(
+        base.model_dump() | {"performance": stated, "sources": sources}
+    )
 
 
 def _recorded(repeats: Repeats) -> SensorModel:
@@ -200,20 +192,20 @@ def _recorded(repeats: Repeats) -> SensorModel:
     return SensorModel(
         name="Recorded sensor",
         sources={"angles": "medians of the recorded points"},
-        firings_per_turn=repeats.azimuth.shape[1],
+        firings_per_turn=repeats.ranges.shape[2],
         range_m=(0.0, float(np.ceil(1.1 * np.nanmax(repeats.ranges)))),
-        beams={"elevation_deg": np.degrees(np.sort(repeats.elevation)).round(3).tolist()},
+        beams={"elevation_deg": np.sort(repeats.elevation_deg).round(3).tolist()},
     )
 
 
 def _cast(repeats: Repeats, scene: Scene, pose: Pose | Sequence[float]) -> Floats:
     """Ranges of a scene in the cells, (r, c); NaN where it has nothing."""
-    ways = repeats.directions().reshape(-1, 3)
+    ways = repeats.directions.reshape(-1, 3)
     sensor = ListedSensor(head=Spin(len(ways), 360), rays=ways, shot_ns=np.zeros(len(ways)))
     hits = Scanner(scene, sensor, columns=("ray", "range")).sweep(pose, number=0)
     found = np.full(len(ways), np.nan)
     found[hits["ray"]] = hits["range"]
-    return found.reshape(repeats.azimuth.shape)
+    return found.reshape(repeats.sigma.shape)
 
 
 def _channels(
@@ -221,41 +213,42 @@ def _channels(
 ) -> list[dict[str, Any]]:
     """Noise, bias and spread of azimuths of each ring."""
     flat = rays.take(rays.slope < _FLAT * rays.distance)
-    cell, elevations = (flat.row, flat.column), np.degrees(repeats.elevation)
+    cell = flat.row, flat.column
     if expected is not None:
         off = flat.distance - expected[cell]
         bias = {row: Estimate.mean(off[flat.row == row]) for row in set(flat.row.tolist())}
     else:
         blur = sigma[cell] / np.sqrt(flat.returns) + _LEAST_M
-        bias = channel_bias(flat, repeats.directions()[cell], blur)
-    rows = []
-    for row, ring in enumerate(repeats.rings.tolist()):
-        noise = own[(rays.row == row) & np.isfinite(own)]
-        steps = np.degrees(np.diff(repeats.aside[:, row], axis=1) / np.sqrt(2))
-        uneven = np.square(steps[np.isfinite(steps)])
-        found = {
-            "noise_m": Estimate.mean(noise, 0.5) if len(noise) >= _FEW else None,
-            "bias_m": bias.get(row),
-            "uneven_deg": Estimate.mean(uneven, 0.5) if len(uneven) >= _FEW else None,
+        bias = ring_bias(flat, repeats.directions[cell], blur)
+    uneven = np.degrees(np.diff(repeats.aside, axis=2)) ** 2 / 2
+    return [
+        {
+            "ring": int(ring),
+            "elevation_deg": float(repeats.elevation_deg[row]),
+            "rays": int(np.isfinite(own[rays.row == row]).sum()),
+            "noise_m": _noise(own[rays.row == row]),
+            "bias_m": bias[row]._asdict() if row in bias else None,
+            "uneven_deg": _noise(uneven[:, row]),
         }
-        shown = {name: one and one._asdict() for name, one in found.items()}
-        rows.append(
-            {"ring": ring, "elevation_deg": float(elevations[row]), "rays": len(noise)} | shown
-        )
-    return rows
+        for row, ring in enumerate(repeats.rings)
+    ]
+
+
+def _noise(variances: Floats) -> dict[str, float] | None:
+    """Root of the mean of the variances that are known, if they are enough."""
+    known = variances[np.isfinite(variances)]
+    return Estimate.mean(known).power(0.5)._asdict() if len(known) >= _FEW else None
 
 
 def _curve(x: Floats, values: Floats, power: float = 1.0) -> list[dict[str, float]]:
-    """Means of values (k,), or their roots, in parts of x that have about as many each."""
-    known = np.isfinite(values) & np.isfinite(x)
-    x, values = x[known], values[known]
-    if not len(x):
-        return []
-    place = np.digitize(x, np.unique(np.quantile(x, np.linspace(0, 1, _POINTS + 1)[1:-1])))
-    parts = [place == k for k in range(place.max() + 1) if (place == k).sum() >= _FEW]
+    """Means of values (k,), or their roots, in parts of x of the same size."""
+    known = np.flatnonzero(np.isfinite(values) & np.isfinite(x))
+    order = known[np.argsort(x[known], kind="stable")]
+    parts = np.array_split(order, min(_POINTS, len(order) // _FEW) or 1)
     return [
-        {"x": float(np.median(x[part]))} | Estimate.mean(values[part], power)._asdict()
+        {"x": float(np.median(x[part]))} | Estimate.mean(values[part]).power(power)._asdict()
         for part in parts
+        if len(part) >= _FEW
     ]
 
 
@@ -263,19 +256,20 @@ def _drawn(figures: Mapping[str, Any]) -> Page:
     """Draw the curves and rings, with their intervals."""
     page = Page((1600, 1750))
     page.title(figures["model"], f"fitted to {figures['name']}; bars are intervals of 95 %")
-    for number, (name, (title, x, y, unit)) in enumerate(_CHARTS.items()):
+    for number, (name, (x, y, unit)) in enumerate(_CHARTS.items()):
         row, column = divmod(number, 3)
         axes = page.chart((0.075 + 0.32 * column, 0.67 - 0.305 * row, 0.235, 0.205))
         axes.set(xlabel=x, ylabel=y)
-        points = figures["curves"].get(name, [])
-        if row == 2:
-            rings = (one for one in figures["channels"] if one[name])
-            points = [{"x": one["elevation_deg"], **one[name]} for one in rings]
+        points = figures["curves"].get(name) or [
+            {"x": one["elevation_deg"], **one[name]} for one in figures["channels"] if one.get(name)
+        ]
+        if not points:
+            page.heading(axes, "not known")
+            continue
         at, *values = (np.array([one[key] for one in points]) for key in ("x", *Estimate._fields))
         value, low, high = (unit * one for one in values)
         axes.vlines(at, low, high, color=theme.UNSEEN, lw=1.8 * page.unit)
         axes.plot(at, value, "o", color=theme.OBJECT_COLOURS[0], ms=3.2 * page.unit, mew=0)
-        page.heading(axes, title if points else f"{title}  not known".strip(), fontweight="bold")
-        if points and name.endswith("light") and at[0] > 0:
+        if name.endswith("light") and at[0] > 0:
             axes.set_xscale("log")
     return page

@@ -314,16 +314,18 @@ def _of_bag(path: Path, name: str, topic: str | None, light: str | None) -> Reco
         bag.open()
     there = {one.topic: one for one in bag.connections if one.msgtype == _POINT_CLOUD}
     connection = there[_chosen(name, "topics of PointCloud2", there, topic)]
-    message = _in_order(lambda: bag.messages([connection]))
 
-    def read(number: int) -> Read:
-        columns = columns_of(message(number)[2])
+    def points(message: Any) -> Read:
+        columns = columns_of(message[2])
         return _places(columns), columns, None
 
-    def times() -> Iterator[float]:
-        return (time for _, time, _ in bag.messages([connection]))
+    def messages() -> Iterator[Any]:
+        return bag.messages([connection])
 
-    return Recording(name, connection.msgcount, read, light, times=times)
+    def times() -> Iterator[float]:
+        return (time for _, time, _ in messages())
+
+    return _streamed(name, messages, points, light, connection.msgcount, times=times)
 
 
 def _of_ouster(path: Path, name: str, sensor: str | None, light: str | None) -> Recording:
@@ -331,16 +333,14 @@ def _of_ouster(path: Path, name: str, sensor: str | None, light: str | None) -> 
     if find_spec("ouster") is None:  # it wants old versions of what it does not need to read
         raise LidarpoolError(f"{name} is read by ouster-sdk: pip install --no-deps ouster-sdk.")
     sdk: Any = import_module("ouster.sdk")
-    core: Any = import_module("ouster.sdk.core")
     with _reading(name):
         infos = sdk.open_source(str(path)).sensor_info
         known = [f"{one.prod_line} {one.sn}".strip() for one in infos]
     which = known.index(_chosen(name, "sensors", known, sensor))
-    place = core.XYZLut(infos[which], False)
+    place = import_module("ouster.sdk.core").XYZLut(infos[which], False)
 
     def scans() -> Iterator[Any]:
-        frames = (frame[which] for frame in sdk.open_source(str(path)))
-        return (frame for frame in frames if frame is not None)
+        return (one[which] for one in sdk.open_source(str(path)) if one[which] is not None)
 
     def points(scan: Any) -> Read:
         ring, column = np.nonzero(scan.field("RANGE"))
@@ -350,7 +350,7 @@ def _of_ouster(path: Path, name: str, sensor: str | None, light: str | None) -> 
         return place(scan)[ring, column], columns, None
 
     white = _WHITE if light in (None, "reflectivity") else None
-    return _streamed(name, scans, points, light, white)
+    return _streamed(name, scans, points, light, white=white)
 
 
 def _of_velodyne(path: Path, name: str, light: str | None) -> Recording:
@@ -362,36 +362,29 @@ def _of_velodyne(path: Path, name: str, light: str | None) -> Recording:
         columns = {name: sweep.points[name] for name in sweep.points.dtype.names}
         return _places(columns), columns, None
 
-    def sweeps_there() -> Iterator[Any]:
-        return iter(decoder.read_pcap(str(path), as_pcl_structs=True))
-
-    return _streamed(name, sweeps_there, points, light, None if light else _WHITE)
+    packets = partial(decoder.read_pcap, str(path), as_pcl_structs=True)
+    return _streamed(name, packets, points, light, white=None if light else _WHITE)
 
 
 def _streamed(
-    name: str, begin: Callable[[], Iterator[Any]], points: Callable[[Any], Read],
-    light: str | None, white: float | None,
+    name: str, begin: Callable[[], Iterable[Any]], points: Callable[[Any], Read],
+    light: str | None, count: int | None = None, **more: Any,
 ) -> Recording:  # fmt: skip
-    """Open what has to be read from its beginning to know how many sweeps there are."""
-    with _reading(name):
-        count = sum(1 for _ in begin())
-    item = _in_order(begin)
-    return Recording(name, count, lambda number: points(item(number)), light, white=white)
+    """Open what can be read from its beginning only; also to count sweeps, if that is needed."""
+    if count is None:
+        with _reading(name):
+            count = sum(1 for _ in begin())
+    coming: tuple[int, Iterator[Any]] = 0, iter(())  # number of the next sweep, and all from there
 
-
-def _in_order(begin: Callable[[], Iterator[Any]]) -> Callable[[int], Any]:
-    """Return what gives the item of a number, where reading can only begin at the first."""
-    coming: tuple[int, Iterator[Any]] = 0, iter(())  # number of the next item, and all from there
-
-    def item(number: int) -> Any:
+    def read(number: int) -> Read:
         nonlocal coming
         if not 0 < coming[0] <= number:
-            coming = 0, begin()
-        found = next(islice(coming[1], number - coming[0], None))
+            coming = 0, iter(begin())
+        sweep = next(islice(coming[1], number - coming[0], None))
         coming = number + 1, coming[1]
-        return found
+        return points(sweep)
 
-    return item
+    return Recording(name, count, read, light, **more)
 
 
 @contextmanager
