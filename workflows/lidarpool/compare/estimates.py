@@ -1,8 +1,4 @@
-"""What the sweeps of a standing sensor tell of its performance; intervals are of 95 %.
-
-The same rays are measured in all sweeps. Of those on smooth surfaces, the scatter of ranges is
-noise, and what is missing is lost.
-"""
+"""What the sweeps of a standing sensor tell of its performance; intervals are of 95 %."""
 
 from __future__ import annotations
 
@@ -174,10 +170,6 @@ class Rays(NamedTuple):
     variance: Floats  # of the range over the sweeps, square metres
     freedom: Ints  # returns of which it is, less one
 
-    def take(self, rows: Bools) -> Rays:
-        """Select rays."""
-        return Rays._make(one[rows] for one in self)
-
 
 def smooth_rays(
     repeats: Repeats, sigma: Floats, aim: float, expected: Floats | None = None
@@ -206,8 +198,9 @@ def smooth_rays(
         np.where(kept, one, 0).sum(axis=0) / np.maximum(used, 1) for one in (ranges, light)
     )
     variance = np.where(kept, (ranges - mean) ** 2, 0).sum(axis=0) / np.maximum(used - 1, 1)
-    rays = Rays(row, column, mean, slope, bright, returns, variance, used - 1)
-    return rays.take((used > 0) & (used >= _WHOLE * returns))
+    some = np.flatnonzero((used > 0) & (used >= _WHOLE * returns))
+    rays = row, column, mean, slope, bright, returns, variance, used - 1
+    return Rays._make(one[some] for one in rays)
 
 
 def fit_performance(

@@ -165,9 +165,9 @@ def fit(
 def _with(base: SensorModel, known: Mapping[str, Estimate], source: str) -> SensorModel:
     """Return a sensor with what was fitted in its performance; the rest stays."""
     found = {name: round(float(f"{one.value:.4g}"), 9) for name, one in known.items()}
-    stated = base.performance.model_dump(exclude_defaults=True) if base.performance else {}
-    for name in ("precision", "range_m", "range_per_m"):  # one excludes the others
-        stated.pop(name, None)
+    fitted = {"precision", "range_m", "range_per_m"}  # one excludes the others
+    old = base.performance
+    stated = old.model_dump(exclude_defaults=True, exclude=fitted) if old else {}
     far, weak = (found.get(name, 0.0) for name in ("detection_range_m", "range_at_threshold_m"))
     if far:
         stated["detection"] = {"range_m": far, "reflectance": 0.1, "probability": 0.5}
@@ -212,7 +212,7 @@ def _channels(
     repeats: Repeats, rays: Rays, own: Floats, sigma: Floats, expected: Floats | None
 ) -> list[dict[str, Any]]:
     """Noise, bias and spread of azimuths of each ring."""
-    flat = rays.take(rays.slope < _FLAT * rays.distance)
+    flat = Rays._make(one[rays.slope < _FLAT * rays.distance] for one in rays)
     cell = flat.row, flat.column
     if expected is not None:
         off = flat.distance - expected[cell]
@@ -263,13 +263,11 @@ def _drawn(figures: Mapping[str, Any]) -> Page:
         points = figures["curves"].get(name) or [
             {"x": one["elevation_deg"], **one[name]} for one in figures["channels"] if one.get(name)
         ]
-        if not points:
-            page.heading(axes, "not known")
-            continue
+        page.heading(axes, "" if points else "not known")
         at, *values = (np.array([one[key] for one in points]) for key in ("x", *Estimate._fields))
         value, low, high = (unit * one for one in values)
         axes.vlines(at, low, high, color=theme.UNSEEN, lw=1.8 * page.unit)
         axes.plot(at, value, "o", color=theme.OBJECT_COLOURS[0], ms=3.2 * page.unit, mew=0)
-        if name.endswith("light") and at[0] > 0:
+        if points and name.endswith("light") and at[0] > 0:
             axes.set_xscale("log")
     return page

@@ -156,13 +156,8 @@ def range_images(
     A column is as wide as the step of azimuth from pulse to pulse, the coarser of the two. Each
     ring's cells have their middles where its pulses are, in every 10 degrees, so that
     none falls between two although heads turn unevenly; a pulse of A is in the cell of the pulse of
-    B that is nearest.
-
-    Raises
-    ------
-    LidarpoolError
-        If one has no rings, is not in the axes of its sensor, or they are not of sensors
-        with the same rings; a clause without a full stop.
+    B that is nearest. LidarpoolError if one has no rings, is not in the axes of its sensor, or they
+    are not of sensors with the same rings; a clause without a full stop.
     """
     first, second = _Polar.of(a, names[0]), _Polar.of(b, names[1])
     rings, elevation, rows_a, rows_b, notes = _common(first, second, names)

@@ -130,23 +130,11 @@ def open_recording(
     light: str | None = None,
     name: str = "the cloud",
 ) -> Recording:
-    """Open a cloud or recording: `KINDS`, or a cloud in memory.
+    """Open a cloud or recording: `KINDS`; or a cloud in memory, which has sweeps if of a result.
 
-    Parameters
-    ----------
-    place
-        Its path; or a cloud, which has sweeps if it is of a result.
-    sensor
-        Of several: name of a sensor, or topic of a bag.
-    light
-        Column of the intensity, if it has another name than usual.
-    name
-        Of a cloud in memory, for errors and reports.
-
-    Raises
-    ------
-    LidarpoolError
-        If it is none, or cannot be opened.
+    `sensor` chooses one of several sensors, or the topic of a bag; `light` is the column of the
+    intensity, if it has another name than usual; `name` is that of a cloud in memory.
+    LidarpoolError if it is none, or cannot be opened.
     """
     if isinstance(place, Cloud | StoredCloud):
         return _of_cloud(name, place, place.sweeps, sensor, light)
@@ -172,9 +160,8 @@ def open_recording(
         return _of_bag(path, name, sensor, light)
     elif kind in (".osf", ".pcap"):
         with _reading(name), path.open("rb") as file:
-            first = int.from_bytes(file.read(36)[32:], "little")
-        if kind == ".pcap" and first in _VELODYNE:
-            return _of_velodyne(path, name, light)
+            if int.from_bytes(file.read(36)[32:], "little") in _VELODYNE:
+                return _of_velodyne(path, name, light)
         return _of_ouster(path, name, sensor, light)
     raise LidarpoolError(f"{name} cannot be compared: give {KINDS}.")
 
