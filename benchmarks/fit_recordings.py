@@ -18,7 +18,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from lidarpool import LidarpoolError, Noise, datasheet, fit
-from lidarpool.compare.estimates import Repeats, smooth_rays, surfaces
+from lidarpool.compare.fit import Repeats, smooth_rays, surfaces
 from lidarpool.compare.recordings import Recording, open_recording
 
 COLOURS = {"recorded": "#1c2430", "data sheet": "#ee7733", "fitted": "#4477aa"}

@@ -214,8 +214,7 @@ def view(
     show_default=True,
     help="Folder for compare.html, compare.json and pictures; earlier ones are replaced.",
 )
-@click.option("--sweep", "sweeps", type=int, metavar="N", multiple=True,
-              help="Compare only this pair of sweeps, from 0; may be given several times.")  # fmt: skip
+@click.option("--sweep", "sweeps", type=int, multiple=True, help="Compare only this pair, from 0.")
 @click.option(
     "--match",
     type=click.Choice(["order", "time"]),
@@ -249,9 +248,8 @@ def view(
 def compare(a: Path, b: Path, out: Path, as_json: bool, **given: Any) -> None:
     """Compare two clouds or recordings of the same place; B is the reference.
 
-    A and B: the folder of a result or data set, a .ply, a .pcd or a folder of them, a .las or .laz,
-    a bag of ROS 2 (.mcap, or its folder). Sweeps of one sensor are compared by range images, in
-    the axes of the sensor; clouds without rings by nearest neighbours alone.
+    A and B: results, data sets, .ply, .pcd or folders of them, .las, .laz, bags of ROS 2, .pcap and
+    .osf. Sweeps of one sensor are compared by range images; clouds without rings by distances.
 
     \b
     Examples:

@@ -248,7 +248,7 @@ def _of_data_set(path: Path, name: str, sensor: str | None, light: str | None) -
 
 def _of_pcd(files: list[Path], name: str, light: str | None) -> Recording:
     """Open files of a sweep each; VIEWPOINT says where its sensor was."""
-    _need("pypcd4", "pcd", name)
+    need("pypcd4", "pcd", f"{name} is read")
 
     def read(number: int) -> Read:
         from pypcd4.pypcd4 import PointCloud  # an extra
@@ -266,7 +266,7 @@ def _of_pcd(files: list[Path], name: str, light: str | None) -> Recording:
 
 
 def _of_las(path: Path, name: str, light: str | None) -> Recording:
-    _need("laspy", "las", name)
+    need("laspy", "las", f"{name} is read")
     laspy: Any = import_module("laspy")
     with _reading(name):
         with path.open("rb") as start:
@@ -291,7 +291,7 @@ def _of_las(path: Path, name: str, light: str | None) -> Recording:
 
 def _of_bag(path: Path, name: str, topic: str | None, light: str | None) -> Recording:
     """Open a topic of PointCloud2, a sweep each, in the axes of their frame."""
-    _need("rosbags", "ros", name)
+    need("rosbags", "ros", f"{name} is read")
     from rosbags.rosbag2 import Reader
 
     from ..export.ros import columns_of
@@ -301,13 +301,11 @@ def _of_bag(path: Path, name: str, topic: str | None, light: str | None) -> Reco
         bag.open()
     there = {one.topic: one for one in bag.connections if one.msgtype == _POINT_CLOUD}
     connection = there[_chosen(name, "topics of PointCloud2", there, topic)]
+    messages = partial(bag.messages, [connection])
 
     def points(message: Any) -> Read:
         columns = columns_of(message[2])
         return _places(columns), columns, None
-
-    def messages() -> Iterator[Any]:
-        return bag.messages([connection])
 
     def times() -> Iterator[float]:
         return (time for _, time, _ in messages())
@@ -342,7 +340,7 @@ def _of_ouster(path: Path, name: str, sensor: str | None, light: str | None) -> 
 
 def _of_velodyne(path: Path, name: str, light: str | None) -> Recording:
     """Open packets of a Velodyne, which say the model."""
-    _need("velodyne_decoder", "fit", name)
+    need("velodyne_decoder", "fit", f"{name} is read")
     decoder: Any = import_module("velodyne_decoder")
 
     def points(sweep: Any) -> Read:
@@ -393,9 +391,10 @@ def _places(columns: Columns) -> Floats:
     return np.stack([np.asarray(columns[axis], np.float64) for axis in "xyz"], axis=1)
 
 
-def _need(package: str, extra: str, name: str) -> None:
+def need(package: str, extra: str, what: str) -> None:
+    """LidarpoolError if the package of an extra, which does what is said, is not installed."""
     if find_spec(package) is None:
-        raise LidarpoolError(f'{name} is read by {package}: pip install "lidarpool[{extra}]".')
+        raise LidarpoolError(f'{what} by {package}: pip install "lidarpool[{extra}]".')
 
 
 def _chosen(name: str, what: str, there: Iterable[str], wanted: str | None) -> str:
