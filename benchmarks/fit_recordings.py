@@ -9,6 +9,7 @@ model's data sheet, and as fitted.
 from __future__ import annotations
 
 import argparse
+import warnings
 from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -56,7 +57,9 @@ def compared(recording: Recording, model: str, white: float | None) -> tuple[dic
     found = fit(half(recording, 0), model=model, white=white)
     other = Repeats.read(half(recording, 1))
     rays = smooth_rays(other, other.sigma, 0.002)
-    turn, *_ = surfaces(other, np.nanmedian(other.ranges, axis=0), other.sigma)
+    with warnings.catch_warnings(action="ignore"):  # of cells without a return
+        middle = np.nanmedian(other.ranges, axis=0)
+    turn, *_ = surfaces(other, middle, other.sigma)
     energy = np.maximum(rays.light / (white or recording.white or 100), 1 / 400)
     energy = energy * (10 / rays.distance) ** 2
     with TemporaryDirectory() as folder:
