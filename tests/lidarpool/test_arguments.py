@@ -38,6 +38,7 @@ from lidarpool import (
     Track,
     compare,
     datasheet,
+    fit,
     load_robot,
     load_sensor,
     load_trajectory,
@@ -109,6 +110,10 @@ WRONG = {
     Scanner(Scene.seed(), GRID).move: [
         (3, AT[0], "name is 3"),
         ("Car", AT[0], "no actor or instance 'Car'"),
+    ],
+    fit: [
+        (3, "recording is 3; it must be"),
+        ("nowhere", "nowhere does not exist"),
     ],
     compare: [
         (3, "a.ply", "a is 3"),
