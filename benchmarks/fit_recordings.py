@@ -9,6 +9,7 @@ model's data sheet, and as fitted.
 from __future__ import annotations
 
 import argparse
+import warnings
 from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -18,8 +19,8 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from lidarpool import LidarpoolError, Noise, datasheet, fit
+from lidarpool.compare.fit import Repeats, smooth_rays, surfaces
 from lidarpool.compare.recordings import Recording, open_recording
-from lidarpool.compare.repeats import Repeats, smooth_rays, surroundings
 
 COLOURS = {"recorded": "#1c2430", "data sheet": "#ee7733", "fitted": "#4477aa"}
 
@@ -55,9 +56,10 @@ def compared(recording: Recording, model: str, white: float | None) -> tuple[dic
     """Deviations (n,) and shares of lost pulses, recorded and simulated; scatter of intensity."""
     found = fit(half(recording, 0), model=model, white=white)
     other = Repeats.read(half(recording, 1))
-    sigma = other.rough_sigma()
-    around = surroundings(other, other.middle(), sigma / np.sqrt(len(other.ranges)))
-    rays = smooth_rays(other, around, sigma, 0.002)
+    rays = smooth_rays(other, other.sigma, 0.002)
+    with warnings.catch_warnings(action="ignore"):  # of cells without a return
+        middle = np.nanmedian(other.ranges, axis=0)
+    turn, *_ = surfaces(other, middle, other.sigma)
     energy = np.maximum(rays.light / (white or recording.white or 100), 1 / 400)
     energy = energy * (10 / rays.distance) ** 2
     with TemporaryDirectory() as folder:
@@ -69,7 +71,7 @@ def compared(recording: Recording, model: str, white: float | None) -> tuple[dic
         sheet = Noise()
     cell = rays.row, rays.column
     recorded = other.ranges[:, *cell].astype(float)
-    recorded -= around.turn[cell] * np.nan_to_num(other.aside[:, *cell])
+    recorded -= turn[cell] * np.nan_to_num(other.aside[:, *cell])
     sweeps = len(recorded)
     ranges = {"recorded": recorded, "data sheet": simulated(sheet, rays, energy, sweeps),
               "fitted": simulated(fitted, rays, energy, sweeps)}  # fmt: skip

@@ -59,7 +59,7 @@ def test_the_residual_is_the_noise_that_was_put_in(surveys, lidarpool):
         (["clean", "clean", "--sweep", "3"], "there is no sweep 3: 3 pairs of sweeps, from 0"),
         (["clean", "clean", "--sensor-a", "roof"], "not 'roof'"),
         (["clean", "clean", "--intensity-b", "signal"], "it has no column 'signal'"),
-        (["clean", "clean", "--distance", "0"], "0.0 is not in the range x>0"),
+        (["clean", "clean", "--distance", "0"], "it must be lengths in metres"),
         (["clean", "clean", "--out", "clean.yaml"], "clean.yaml' is a file"),
         (["clean"], "Missing argument 'B'"),
     ],

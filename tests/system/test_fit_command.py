@@ -53,7 +53,7 @@ def test_the_sensor_that_is_written_runs(sweeps, tmp_path, lidarpool, cluster):
         ([".", "--model", "no-such"], "There is no sensor model 'no-such'"),
         ([".", "--scene", "none.glb"], "none.glb"),
         ([".", "--out", "mine.txt"], "no sensor file: give a name such as mine.yaml"),
-        ([".", "--white", "0"], "0.0 is not in the range x>0"),
+        ([".", "--white", "0"], "white is 0.0; it must be above 0"),
     ],
 )
 def test_what_cannot_be_done_is_told_in_a_line(sweeps, lidarpool, monkeypatch, arguments, says):

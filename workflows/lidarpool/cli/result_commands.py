@@ -214,14 +214,7 @@ def view(
     show_default=True,
     help="Folder for compare.html, compare.json and pictures; earlier ones are replaced.",
 )
-@click.option(
-    "--sweep",
-    "sweeps",
-    type=click.IntRange(0),
-    metavar="N",
-    multiple=True,
-    help="Compare only this pair of sweeps, from 0; may be given several times.",
-)
+@click.option("--sweep", "sweeps", type=int, multiple=True, help="Compare only this pair, from 0.")
 @click.option(
     "--match",
     type=click.Choice(["order", "time"]),
@@ -233,22 +226,20 @@ def view(
 @click.option("--sensor-b", metavar="NAME", help="The same of B.")
 @click.option("--intensity-a", metavar="COLUMN", help="Column of A to compare as intensity.")
 @click.option("--intensity-b", metavar="COLUMN", help="The same of B.")
-@click.option(
-    "--azimuth-deg",
-    type=click.FloatRange(0, 90, min_open=True),
-    help="Width of a cell of the range images; by default the step from pulse to pulse.",
-)
+@click.option("--azimuth-deg", type=float, help="Width of a cell; by default the step of pulses.")
 @click.option(
     "--distance",
     "distances_m",
-    type=click.FloatRange(0, min_open=True),
+    type=float,
     metavar="METRES",
     multiple=True,
-    help="Distance for the F-score; may be given several times.  [default: 0.05 0.1 0.2 0.5]",
+    default=(0.05, 0.1, 0.2, 0.5),
+    show_default=True,
+    help="Distance for the F-score; may be given several times.",
 )
 @click.option(
     "--most-points",
-    type=click.IntRange(1000),
+    type=int,
     default=10_000_000,
     show_default=True,
     help="Points of a cloud without sweeps that are held in memory.",
@@ -257,9 +248,8 @@ def view(
 def compare(a: Path, b: Path, out: Path, as_json: bool, **given: Any) -> None:
     """Compare two clouds or recordings of the same place; B is the reference.
 
-    A and B: the folder of a result or data set, a .ply, a .pcd or a folder of them, a .las or .laz,
-    a bag of ROS 2 (.mcap, or its folder). Sweeps of one sensor are compared by range images, in
-    the axes of the sensor; clouds without rings by nearest neighbours alone.
+    A and B: results, data sets, .ply, .pcd or folders of them, .las, .laz, bags of ROS 2, .pcap and
+    .osf. Sweeps of one sensor are compared by range images; clouds without rings by distances.
 
     \b
     Examples:
@@ -268,12 +258,9 @@ def compare(a: Path, b: Path, out: Path, as_json: bool, **given: Any) -> None:
       lidarpool compare scan.laz earlier.laz --distance 0.05
     """  # noqa: D301 - click wants the character, not its name
     from ..base.fork_server import keep_freed_memory
-    from ..compare.comparison import DISTANCES_M
     from ..compare.comparison import compare as compared
 
     keep_freed_memory()
-    given["distances_m"] = given["distances_m"] or DISTANCES_M
-    given["sweeps"] = given["sweeps"] or None
     found = compared(a, b, **given)
     page = next(path for path in found.save(out) if path.suffix == ".html")
     words = [repr(found), f"page     {click.format_filename(page)}"]
@@ -283,19 +270,12 @@ def compare(a: Path, b: Path, out: Path, as_json: bool, **given: Any) -> None:
 @click.command()
 @click.argument("recording", metavar="RECORDING", type=click.Path(path_type=Path))
 @options.new_file("--out", required=True, help="Sensor file, .yaml; its page is a .html beside it.")
-@click.option(
-    "--model", metavar="MODEL|FILE", help="The sensor; what is not told keeps its figures."
-)
+@click.option("--model", metavar="MODEL|FILE", help="The sensor, for what the recording hides.")
 @click.option("--scene", metavar="FILE", type=click.Path(path_type=Path), help="The place, a mesh.")
 @options.pose
 @click.option("--sensor", metavar="NAME", help="Sensor of the recording, or topic of a bag.")
 @click.option("--intensity", metavar="COLUMN", help="Column of the intensity.")
-@click.option(
-    "--white",
-    type=click.FloatRange(0, min_open=True),
-    metavar="VALUE",
-    help="Intensity of a white surface, if it is the same at all ranges.",
-)
+@click.option("--white", type=float, help="Intensity of white, if it is the same at all ranges.")
 @options.as_json
 def fit(recording: Path, out: Path, as_json: bool, **given: Any) -> None:
     """Fit a sensor to a recording of a unit that stands: noise, lost returns, false alarms.

@@ -30,7 +30,6 @@ from ..report.page.rendering import millimetres, rendered
 from .range_image import RangeImages, paired_images, range_images
 from .recordings import Recording, Turn, open_recording
 
-DISTANCES_M = (0.05, 0.1, 0.2, 0.5)
 MOST_POINTS = 10_000_000  # of each cloud in memory
 MOST_VALUES = 4_000_000  # cells and points of all sweeps, whose figures are taken
 RESIDUALS = ("bias_m", "rmse_m", "median_m", "mad_m", "p05_m", "p95_m")
@@ -101,7 +100,7 @@ def compare(
     intensity_a: str | None = None,
     intensity_b: str | None = None,
     azimuth_deg: Annotated[float, Field(gt=0, le=90)] | None = None,
-    distances_m: Sequence[float] = DISTANCES_M,
+    distances_m: Sequence[float] = (0.05, 0.1, 0.2, 0.5),
     most_points: Annotated[int, Field(ge=1000)] = MOST_POINTS,
 ) -> Comparison:
     """Compare two clouds or recordings of the same place; B is the reference.

@@ -1,20 +1,22 @@
-"""Fits a sensor's performance to a recording of a unit: a sensor file, and a page about it."""
+"""Fits a sensor to a recording of a unit: a sensor file and its page; intervals are of 95 %."""
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from importlib.util import find_spec
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 import yaml
 from pydantic import Field
 
 from .._version import __version__
-from ..base.arrays import Floats
-from ..base.errors import LidarpoolError, explained
+from ..base.arrays import Bools, Floats, Floats32, Ints
+from ..base.errors import LidarpoolError, explained, prefixed
+from ..base.open3d_module import load_open3d
+from ..base.sampling import even_indices
 from ..base.storage import Storage
 from ..base.validation import checked
 from ..base.words import plural
@@ -26,31 +28,44 @@ from ..report.page.rendering import rendered
 from ..scene.scene import Scene
 from ..sensor import Pose, Spin
 from ..sensor.models import SensorModel, read_model
+from ..sensor.noise import TARGET_REFLECTANCE, THRESHOLD_SIGMAS
 from ..sensor.ray_sensors import ListedSensor
 from ..simulator import Scanner
-from .estimates import Estimate, channel_bias, fit_performance
-from .recordings import Recording, open_recording
-from .repeats import Rays, Repeats, smooth_rays, surroundings
+from .range_image import range_images
+from .recordings import Recording, need, open_recording
 
-# {curve, or column of channels: (title, label of x, label of y, factor)}
+# {curve, or column of channels: (label of x, label of y, factor)}, three a row
 _CHARTS = {
-    "noise_by_range": ("Noise of ranges", "range, m", "noise, mm", 1000),
-    "noise_by_light": ("", "intensity, or energy", "noise, mm", 1000),
-    "noise_by_tilt": ("", "incidence, °", "noise with that of directions, mm", 1000),
-    "returned_by_light": ("Returns", "intensity, or energy", "pulses that return, %", 100),
-    "lost_by_range": ("", "range of the scene, m", "pulses lost, %", 100),
-    "light_by_range": ("", "range, m", "mean intensity", 1),
-    "noise_m": ("Rings", "elevation, °", "noise, mm", 1000),
-    "bias_m": ("", "elevation, °", "bias, mm", 1000),
-    "uneven_deg": ("", "elevation, °", "spread of azimuths, °", 1),
+    "noise_by_range": ("range, m", "noise, mm", 1000),
+    "noise_by_light": ("intensity, or energy", "noise, mm", 1000),
+    "noise_by_tilt": ("incidence, °", "noise with that of directions, mm", 1000),
+    "returned_by_light": ("intensity, or energy", "pulses that return, %", 100),
+    "lost_by_range": ("range of the scene, m", "pulses lost, %", 100),
+    "light_by_range": ("range, m", "mean intensity", 1),
+    "noise_m": ("elevation, °", "noise, mm", 1000),
+    "bias_m": ("elevation, °", "bias, mm", 1000),
+    "uneven_deg": ("elevation, °", "spread of azimuths, °", 1),
 }
 _FEW = 30  # rays that a figure or a point of a curve needs
 _POINTS = 14  # of a curve
 _AIM = 0.002  # scatter of directions that does not make outliers before it is known, radians
 _LEAST_M = 0.001  # error of the mean range of a ray, however often it is measured
 _FLAT = 1.7  # tangent of incidence: beyond, noise of directions makes mean ranges longer
-_BESIDE_M = 0.3  # how far a recorded surface may be from the scene's
 _DARKEST = 1 / 400  # reflectance of what is reported as 0
+MOST_VALUES = 1 << 24  # returns in memory; of more sweeps than these make, some are read
+_WHOLE = 0.8  # a sweep with fewer points than this share of the median is cut
+_STILL_M = 0.1  # a median change of ranges, from sweep to sweep, of a sensor that moves
+_KINK_M, _KINK = 0.01, 0.001  # by how much a surface may leave its plane within four columns
+_SIGMAS = 6.0  # a return beyond these is of something that moves
+_STEEPEST = 5.7  # tangent of incidence: beyond, a beam meets several surfaces
+_BESIDE_M = 0.3  # how far a recorded surface may be from the scene's
+_Z = 1.959964  # of 95 %
+_REJECTED = 1e-6  # chance of a variance above which a ray is left out
+_SPAN, _TILT = 2.0, 0.3  # least quotient of ranges, and tangent of incidence, that tell noise
+_WEAK_RAYS, _RING_RAYS = 30, 20  # rays with losses that a threshold needs; that of a ring's bias
+_SKY = (7, 31)  # rows and columns of which no ray returns twice, around a ray into the sky
+_PLANES, _PLANE_M, _PLANE_RAYS, _PLANE_POINTS = 8, 0.05, 300, 20_000
+_STEP = 1e-3  # of logarithms, for derivatives
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -75,8 +90,9 @@ class Fit:
         told = self.model.model_dump(mode="json", exclude_defaults=True)
         text = "".join(f"# {line}\n" for line in repr(self).splitlines())
         text += yaml.safe_dump(told, sort_keys=False, allow_unicode=True, default_flow_style=None)
-        picture = {"fit": _drawn(self.figures).svg()}
-        page = rendered("fit.html", report=self.figures, pictures=picture)
+        page = rendered(
+            "fit.html", report=self.figures, pictures={"fit": _drawn(self.figures).svg()}
+        )
         written = {place: text, place.with_suffix(".html"): page}
         with explained(f"{place} cannot be written", "choose a folder that exists and has room"):
             for path, content in written.items():
@@ -106,10 +122,8 @@ def fit(
         a sensor with the recorded beams.
     scene, pose
         The place as a scene, and the sensor's pose in it; by default surfaces are the recording's.
-    sensor
-        Of a recording of several: name of the sensor, or topic of a bag.
-    intensity
-        Column of the intensity, if not ``intensity``.
+    sensor, intensity
+        Of several, name of the sensor or topic of a bag; column, if not ``intensity``.
     white
         Intensity of a white surface, if it is the same at all ranges; known of Velodyne and Ouster.
 
@@ -118,81 +132,72 @@ def fit(
     LidarpoolError
         If it cannot be read, has no sweeps or rings, is of several sensors, or scipy is missing.
     """
-    if find_spec("scipy") is None:
-        raise LidarpoolError('Figures are fitted by scipy: pip install "lidarpool[fit]".')
+    need("scipy", "fit", "Figures are fitted")
     if not isinstance(recording, Recording):
         recording = open_recording(recording, sensor, intensity, name="the recording")
-    whole = Repeats.read(recording)
-    repeats = whole.first() if whole.moves else whole
-    middle, sigma, count = repeats.middle(), repeats.rough_sigma(), len(repeats.ranges)
-    there = np.isfinite(repeats.ranges).sum(axis=0)
-    around = surroundings(repeats, middle, sigma / np.sqrt(np.maximum(there, 1)))
-    curves, expected = {}, None
+    repeats = Repeats.read(recording)
+    sigma, count, curves, expected = repeats.sigma.copy(), len(repeats.ranges), {}, None
     if scene is not None:
         expected = _cast(repeats, scene if isinstance(scene, Scene) else Scene.load(scene), pose)
-        known = surroundings(repeats, expected, 0 * sigma)
-        near = around.smooth & (np.abs(middle - expected) < _BESIDE_M)
-        around = around._replace(slope=known.slope, smooth=near)
-        curves["lost_by_range"] = _curve(expected[known.smooth], 1 - there[known.smooth] / count)
-    estimates, aim = dict[str, Estimate | None](), 0.0
+        *_, smooth = surfaces(repeats, expected, 0 * sigma)
+        lost = np.isnan(repeats.ranges).mean(axis=0)
+        curves["lost_by_range"] = _curve(expected[smooth], lost[smooth])
+    found = dict[str, Estimate]()
     for _ in range(2):  # the first finds what the second leaves out
-        rays = smooth_rays(repeats, around, sigma, 0.0 if estimates else _AIM)
+        rays = smooth_rays(repeats, sigma, 0.0 if found else _AIM, expected)
         if len(rays.row) < _FEW:
             raise LidarpoolError(
                 f"{recording.name} has {len(rays.row)} rays on smooth surfaces, not {_FEW}: "
                 "record a place with walls or a floor."
             )
-        energy = rays.light if recording.energies else None
-        if white := white or recording.white:
+        known = np.isfinite(rays.light).all()
+        energy = rays.light if known and recording.energies else None
+        if known and (white := white or recording.white):
             energy = np.maximum(rays.light / white, _DARKEST) * (10 / rays.distance) ** 2
-        if energy is not None and not np.isfinite(energy).all():
-            energy = None
         if count > 1:
-            estimates, scatter = fit_performance(repeats, rays, energy)
-            sigma[rays.row, rays.column] = scatter.sigma
-            aim = scatter.aim.value if scatter.aim else 0.0
-    own = np.where(rays.freedom > 0, rays.variance - (aim * rays.slope) ** 2, np.nan)
-    light = rays.light if energy is None else energy
-    tilt = np.degrees(np.arctan(rays.slope / rays.distance))
+            found, sigma[rays.row, rays.column] = fit_performance(repeats, rays, energy)
+    aim = np.radians(found["angle_deg"].value) if "angle_deg" in found else 0.0
+    tilted = np.where(rays.freedom > 0, rays.variance, np.nan)
+    own, light = tilted - (aim * rays.slope) ** 2, rays.light if energy is None else energy
     curves["noise_by_range"] = _curve(rays.distance, own, 0.5)
     curves["noise_by_light"] = _curve(light, own, 0.5)
-    curves["noise_by_tilt"] = _curve(tilt, own + (aim * rays.slope) ** 2, 0.5)
+    curves["noise_by_tilt"] = _curve(np.degrees(np.arctan(rays.slope / rays.distance)), tilted, 0.5)
     curves["returned_by_light"] = _curve(light, rays.returns / count)
     curves["light_by_range"] = _curve(rays.distance, rays.light)
-    found = {key: one for key, one in estimates.items() if one}
     base, name = read_model(model) if model else _recorded(repeats), Path(recording.name).name
     figures = {
         "versions": {"lidarpool": __version__}, "name": name, "model": base.name,
-        "sweeps": len(whole.ranges), "moves": whole.moves, "rays": len(rays.row),
-        "figures": {key: one._asdict() for key, one in found.items()}, "notes": whole.notes,
+        "sweeps": repeats.sweeps, "moves": repeats.moves, "rays": len(rays.row),
+        "figures": {key: one._asdict() for key, one in found.items()}, "notes": repeats.notes,
         "channels": _channels(repeats, rays, own, sigma, expected), "curves": curves,
     }  # fmt: skip
-    source = f"fitted by lidarpool {__version__} to {name}, {plural(len(whole.ranges), 'sweep')}"
+    source = f"fitted by lidarpool {__version__} to {name}, {plural(repeats.sweeps, 'sweep')}"
     return Fit(figures, _with(base, found, source) if found else base)
 
 
 def _with(base: SensorModel, known: Mapping[str, Estimate], source: str) -> SensorModel:
     """Return a sensor with what was fitted in its performance; the rest stays."""
     found = {name: round(float(f"{one.value:.4g}"), 9) for name, one in known.items()}
-    stated = base.performance.model_dump(exclude_defaults=True) if base.performance else {}
-    for name in ("precision", "range_m", "range_per_m"):  # one excludes the others
-        stated.pop(name, None)
-    far = found.get("detection_range_m", 0.0)
+    fitted = {"precision", "range_m", "range_per_m"}  # one excludes the others
+    old = base.performance
+    stated = old.model_dump(exclude_defaults=True, exclude=fitted) if old else {}
+    far, weak = (found.get(name, 0.0) for name in ("detection_range_m", "range_at_threshold_m"))
     if far:
         stated["detection"] = {"range_m": far, "reflectance": 0.1, "probability": 0.5}
-    if weak := found.get("range_at_threshold_m"):
-        sigma = {part: float(np.hypot(found["range_m"], weak * part**2)) for part in (0.5, 1)}
+    if weak:
         stated["precision"] = [
-            {"sigma_m": one, "range_m": part * far, "reflectance": 0.1}
-            for part, one in sigma.items()
+            {"sigma_m": float(sigma), "range_m": share * far, "reflectance": 0.1}
+            for share, sigma in ((k, np.hypot(found["range_m"], weak * k**2)) for k in (0.5, 1))
         ]
     else:
-        stated |= {"range_m": found["range_m"], "range_per_m": found.get("range_per_m", 0.0)}
-    for name, needed in (("angle_deg", True), ("false_alarms", "detection" in stated)):
-        if needed and name in known and known[name].low > 0:
+        stated |= {name: found[name] for name in ("range_m", "range_per_m") if name in found}
+    for name in ("angle_deg", *["false_alarms"] * ("detection" in stated)):
+        if name in known and known[name].low > 0:
             stated[name] = found[name]
-    data = base.model_dump() | {"performance": stated}
-    return SensorModel.model_validate(data | {"sources": {**base.sources, "performance": source}})
+    sources = {**base.sources, "performance": source}
+    return SensorModel.model_validate(
+        base.model_dump() | {"performance": stated, "sources": sources}
+    )
 
 
 def _recorded(repeats: Repeats) -> SensorModel:
@@ -200,62 +205,397 @@ def _recorded(repeats: Repeats) -> SensorModel:
     return SensorModel(
         name="Recorded sensor",
         sources={"angles": "medians of the recorded points"},
-        firings_per_turn=repeats.azimuth.shape[1],
+        firings_per_turn=repeats.ranges.shape[2],
         range_m=(0.0, float(np.ceil(1.1 * np.nanmax(repeats.ranges)))),
-        beams={"elevation_deg": np.degrees(np.sort(repeats.elevation)).round(3).tolist()},
+        beams={"elevation_deg": np.sort(repeats.elevation_deg).round(3).tolist()},
     )
 
 
 def _cast(repeats: Repeats, scene: Scene, pose: Pose | Sequence[float]) -> Floats:
     """Ranges of a scene in the cells, (r, c); NaN where it has nothing."""
-    ways = repeats.directions().reshape(-1, 3)
+    ways = repeats.directions.reshape(-1, 3)
     sensor = ListedSensor(head=Spin(len(ways), 360), rays=ways, shot_ns=np.zeros(len(ways)))
     hits = Scanner(scene, sensor, columns=("ray", "range")).sweep(pose, number=0)
     found = np.full(len(ways), np.nan)
     found[hits["ray"]] = hits["range"]
-    return found.reshape(repeats.azimuth.shape)
+    return found.reshape(repeats.sigma.shape)
+
+
+class Estimate(NamedTuple):
+    """A figure with its interval."""
+
+    value: float
+    low: float
+    high: float
+
+    @classmethod
+    def of(cls, value: Any, variance: Any) -> Estimate:
+        """Make one of a normally distributed estimate."""
+        return cls(*(float(value + sigmas * np.sqrt(variance)) for sigmas in (0, -_Z, _Z)))
+
+    @classmethod
+    def mean(cls, values: Floats) -> Estimate:
+        """Make one of the mean of values (n,)."""
+        return cls.of(values.mean(), values.var() / len(values))
+
+    def power(self, exponent: float, scale: float = 1.0) -> Estimate:
+        """Return the estimate of a power, times a scale; what is below 0 counts as 0."""
+        value, *ends = (float(scale * max(one, 0.0) ** exponent) for one in self)
+        return Estimate(value, min(ends), max(ends))
+
+
+@dataclass(frozen=True, eq=False)
+class Repeats:
+    """Returns in the same cells of a sensor, the highest ring first; NaN without a return."""
+
+    rings: Ints  # (r,): numbers
+    elevation_deg: Floats  # (r,)
+    directions: Floats  # (r, c, 3): unit vectors
+    ranges: Floats32  # (s, r, c): metres
+    light: Floats32  # (s, r, c): intensities
+    aside: Floats32  # (s, r, c): azimuths beside those of the directions, radians
+    sigma: Floats  # (r, c): rough scatter of ranges from sweep to sweep, as its ring has it, metres
+    sweeps: int  # that are whole
+    moves: bool  # whether the sensor does, or most around it: only the first sweep is here
+    notes: tuple[str, ...]
+
+    @classmethod
+    def read(cls, recording: Recording) -> Repeats:
+        """Put the sweeps of a recording into the same cells, one after the other.
+
+        LidarpoolError if it has no sweeps with points and rings, or they are of several sensors.
+        """
+        name, notes = recording.name, list(recording.notes)
+        if recording.whole or not recording.count:
+            raise LidarpoolError(f"{name} has no sweeps: give a recording of sweeps.")
+        own = max((recording.turn(k) for k in range(min(3, recording.count))), key=len)
+        if not len(own):
+            raise LidarpoolError(f"{name} has no points: there is nothing to fit.")
+        with prefixed(name):
+            cells = range_images(own, own, ("the first", "the first"))
+        shape = len(cells.rings), round(360 / cells.step_deg)
+        numbers = even_indices(recording.count, max(MOST_VALUES // (shape[0] * shape[1]), 2))
+        if len(numbers) < recording.count:
+            notes.append(f"{len(numbers):,} of {recording.count:,} sweeps are used, evenly chosen")
+        values = np.full((3, len(numbers), *shape), np.nan, np.float32)
+        for k, number in enumerate(numbers.tolist()):
+            if not len(turn := recording.turn(number)):
+                continue
+            with prefixed(name):
+                found = range_images(turn, own, (f"sweep {number}", "another"), cells.step_deg)
+                other = len(found.rings) > 1.2 * len(cells.rings)
+                if other or found.hidden[0] > cells.hidden[0] + 0.25:
+                    raise LidarpoolError(f"sweep {number} is of another sensor, or another mode.")
+            _, rows, there = np.intersect1d(found.rings, cells.rings, return_indices=True)
+            columns = round(found.begin_deg / found.step_deg) + np.arange(found.images.shape[-1])
+            values[:, k, there[:, None], columns % shape[1]] = found.images[0][:, rows]
+        counts = np.isfinite(values[0]).sum(axis=(1, 2))
+        whole = counts >= _WHOLE * np.median(counts[counts > 0])
+        if not whole.all():
+            notes.append(f"{plural(int((~whole).sum()), 'sweep')} cut short, left out")
+        values = values[:, whole]
+        # Ranges change by noise from sweep to sweep; or on and on, if the sensor moves.
+        step = _median(np.abs(np.diff(values[0], axis=0)), (0, 1, 2))
+        drift = _median(np.abs(values[0, -1] - values[0, 0]), (0, 1))
+        usual = min(0.6 + 0.4 * (whole.sum() - 1), 3) * step + 0.001
+        if moves := bool(step > _STILL_M or drift > usual):
+            values = values[:, :1]
+        first = np.radians(cells.step_deg * np.arange(shape[1]))
+        aside = (np.radians(values[2]) - first + np.pi) % (2 * np.pi) - np.pi
+        mean = np.nansum(aside, axis=0) / np.maximum(np.isfinite(aside).sum(axis=0), 1)
+        up, turned = np.radians(cells.elevation_deg)[:, None], first + mean
+        level = np.cos(up) * np.cos(turned), np.cos(up) * np.sin(turned)
+        sigma = _median(np.abs(np.diff(values[0], axis=0)), (0, 2)) / (0.6745 * np.sqrt(2))
+        sigma = np.where(np.isnan(sigma), _KINK_M, np.maximum(sigma, 1e-4))
+        return cls(
+            cells.rings, cells.elevation_deg, np.stack([*level, np.sin(up) + 0 * mean], axis=-1),
+            values[0], values[1], aside - mean, np.repeat(sigma[:, None], shape[1], axis=1),
+            int(whole.sum()), moves, tuple(notes),
+        )  # fmt: skip
+
+
+def _median(values: Floats32, axis: int | tuple[int, ...]) -> Any:
+    """Return medians over what is there, float64; of nothing NaN."""
+    with warnings.catch_warnings(action="ignore"):
+        return np.nanmedian(values, axis=axis).astype(np.float64)
+
+
+def surfaces(repeats: Repeats, distance: Floats, blur: Floats) -> tuple[Floats, Floats, Bools]:
+    """Find slopes and edges of a range image (r, c), whose ranges have errors of `blur` metres.
+
+    Returns by how much the range changes with the azimuth, and with the direction where it changes
+    most, metres in a radian; and whether the neighbours lie in one plane with it. (r, c) each.
+    """
+    ways, rows = repeats.directions, np.arange(len(distance))
+    points = distance[..., None] * ways
+    with np.errstate(invalid="ignore", divide="ignore"):
+        ahead, back, far, rear = (np.roll(points, by, axis=1) for by in (-1, 1, -2, 2))
+        above, below = (points[np.clip(rows + by, 0, rows[-1])] for by in (-1, 1))
+        rise = above - below if len(rows) > 2 else np.array([0, 0, 1.0])
+        normal = np.cross(2 * (far - rear) + ahead - back, rise)
+        # The range of a plane n · x = c in the direction d is c / (n · d).
+        normal /= (normal * ways).sum(axis=-1, keepdims=True)
+        change = distance[..., None] * (ways - normal)
+        slope = np.linalg.norm(change, axis=-1)
+        allowed = _KINK_M + _KINK * distance + 5 * blur
+        smooth = slope < _STEEPEST * distance
+        smooth &= np.abs((((ahead + back) / 2 - points) * normal).sum(axis=-1)) < allowed
+        for beside in ((far + rear) / 2, above, below):
+            smooth &= np.abs(((beside - points) * normal).sum(axis=-1)) < 2 * allowed
+    return change[..., 1] * ways[..., 0] - change[..., 0] * ways[..., 1], slope, smooth
+
+
+class Rays(NamedTuple):
+    """Rays that meet smooth surfaces, (k,) each."""
+
+    row: Ints
+    column: Ints
+    distance: Floats  # mean of the ranges, metres
+    slope: Floats  # by how much the range changes with the direction, metres in a radian
+    light: Floats  # mean intensity; NaN if unknown
+    returns: Ints  # sweeps with one
+    variance: Floats  # of the range over the sweeps, square metres
+    freedom: Ints  # returns of which it is, less one
+
+
+def smooth_rays(
+    repeats: Repeats, sigma: Floats, aim: float, expected: Floats | None = None
+) -> Rays:
+    """Choose rays without edges beside them, with the scatter of their ranges over the sweeps.
+
+    Returns that noise of `sigma` (r, c) and directions that scatter by `aim` radians do not
+    explain are left out, and rays with many of them. Slopes are those of a scene's ranges
+    `expected` (r, c), if they are known.
+    """
+    middle, there = _median(repeats.ranges, 0), np.isfinite(repeats.ranges).sum(axis=0)
+    blur = repeats.sigma / np.sqrt(np.maximum(there, 1))
+    turn, slope, smooth = surfaces(repeats, middle, blur)
+    if expected is not None:
+        _, slope, _ = surfaces(repeats, expected, 0 * blur)
+        smooth &= np.abs(middle - expected) < _BESIDE_M
+    row, column = cell = np.nonzero(smooth)
+    images = repeats.ranges, repeats.light, repeats.aside
+    ranges, light, aside = (one[:, row, column].astype(np.float64) for one in images)
+    ranges -= turn[cell] * aside
+    slope, returns = slope[cell], there[cell]
+    limit = np.where(returns > 1, _SIGMAS * np.hypot(sigma[cell], aim * slope), np.inf)
+    kept = np.abs(ranges - middle[cell]) <= limit
+    used = kept.sum(axis=0)
+    mean, bright = (
+        np.where(kept, one, 0).sum(axis=0) / np.maximum(used, 1) for one in (ranges, light)
+    )
+    variance = np.where(kept, (ranges - mean) ** 2, 0).sum(axis=0) / np.maximum(used - 1, 1)
+    some = np.flatnonzero((used > 0) & (used >= _WHOLE * returns))
+    rays = row, column, mean, slope, bright, returns, variance, used - 1
+    return Rays._make(one[some] for one in rays)
+
+
+def fit_performance(
+    repeats: Repeats, rays: Rays, energy: Floats | None
+) -> tuple[dict[str, Estimate], Floats]:
+    """Estimate what repeated sweeps tell, with the energies of rays (k,) if they are known.
+
+    Returns what is known by the names of `Noise`; and the standard deviations of rays (k,), metres,
+    by range or by energy, whichever is likelier.
+    """
+    sweeps, light = len(repeats.ranges), np.nan_to_num(rays.light) if energy is None else energy
+    strong, threshold = light >= np.median(light), None
+    for _ in range(3):  # the threshold tells what loses nothing by energy
+        dropout = Estimate.mean(1 - rays.returns[strong] / sweeps)
+        if energy is not None:
+            threshold = fit_threshold(energy, rays.returns, sweeps, dropout.value)
+            strong = energy > 2 * threshold.value if threshold else strong
+    figures, sigma, deviance = fit_scatter(rays, "range_per_m", rays.distance, 1)
+    if energy is not None and threshold is not None:
+        other = fit_scatter(rays, "range_at_threshold_m", threshold.value / energy, 2)
+        if "range_at_threshold_m" in other[0] and other[2] < deviance:
+            figures, sigma, _ = other
+        figures["detection_range_m"] = threshold.power(-0.5, 10 * np.sqrt(TARGET_REFLECTANCE))
+    if alarms := alarm_share(repeats):
+        figures["false_alarms"] = alarms
+    return figures | {"dropout": dropout}, sigma
+
+
+def fit_scatter(
+    rays: Rays, growth: str, spread: Floats, power: int
+) -> tuple[dict[str, Estimate], Floats, float]:
+    """Fit noise of ranges and directions to the variances of rays, by their likelihood.
+
+    Noise of ranges grows with a power of `spread` (k,). What rays do not tell, for want of spreads
+    or inclined surfaces, is left out. Sandwich estimators give the intervals, which rays of unequal
+    noise do not narrow. Returns figures, noise of ranges (k,) in metres, and the deviance.
+    """
+    from scipy.optimize import least_squares
+    from scipy.stats import chi2
+
+    low, unit, high = np.quantile(spread, (0.05, 0.5, 0.95))
+    tilted = np.quantile(rays.slope / rays.distance, 0.9) > _TILT
+    known = np.array([True, high > _SPAN * low, tilted])
+    kept, steep = rays.freedom > 0, np.median(rays.slope)
+    usual = max(float(np.median(rays.variance[kept])), 1e-12)
+
+    def model(some: Floats) -> Floats:
+        theta = np.zeros(3)
+        theta[known] = some
+        own = theta[0] + theta[1] * (spread / unit) ** power
+        return usual * (own ** (2 / power) + theta[2] * (rays.slope / steep) ** 2)
+
+    theta = np.array([1.0, 0.1, 0.1])[known]
+    for _ in range(10):
+        weight = np.sqrt(rays.freedom / 2) / model(theta)
+        found = least_squares(
+            lambda some: ((rays.variance - model(some)) * weight)[kept],  # noqa: B023
+            theta, bounds=(0, np.inf), x_scale=np.maximum(theta, 0.01),
+        )  # fmt: skip
+        theta, expected = found.x, model(found.x)
+        kept = rays.freedom * rays.variance / expected < chi2.isf(_REJECTED, rays.freedom)
+    names, roots = ("range_m", growth, "angle_deg"), (1 / power, 1 / power, 0.5)
+    scales = np.sqrt(usual) / np.array([1, unit, np.radians(steep)])
+    spreads, figures = np.diag(_sandwich(found.jac, found.fun)), {}
+    for k, *one in zip(np.flatnonzero(known), theta, spreads, strict=True):
+        figures[names[k]] = Estimate.of(*one).power(roots[k], scales[k])
+    deviance = rays.freedom @ (np.log(expected) + rays.variance / expected)
+    return figures, np.sqrt(expected), float(deviance)
+
+
+def _sandwich(design: Floats, off: Floats) -> Floats:
+    """Estimate the covariance of a least-squares fit whose residuals are of unequal size."""
+    inverse, score = np.linalg.pinv(design.T @ design, hermitian=True), design * off[:, None]
+    covariance: Floats = inverse @ (score.T @ score) @ inverse
+    return covariance
+
+
+def fit_threshold(energy: Floats, count: Ints, sweeps: int, dropout: float) -> Estimate | None:
+    """Energy of which half of the pulses return, by the curve of `Noise.detected`.
+
+    A ray is there only if a pulse returned: the likelihood is that of a truncated binomial
+    distribution. None if too few rays lose some of their pulses.
+    """
+    from scipy.optimize import brute
+    from scipy.special import ndtr
+    from scipy.stats import binom
+
+    def seen(log_threshold: Any) -> Floats:
+        share = ndtr(THRESHOLD_SIGMAS * (energy / np.exp(log_threshold) - 1))
+        return np.clip((1 - dropout) * share, 1e-9, 1 - 1e-9)
+
+    def unlikely(log_threshold: Any) -> Floats:
+        p: Floats = seen(log_threshold)
+        return np.log1p(-((1 - p) ** sweeps)) - binom.logpmf(count, sweeps, p)
+
+    low, high = np.log(np.quantile(energy, (0.001, 0.999)))
+    (found,) = brute(lambda one: unlikely(one).sum(), [(low - 2, high)], Ns=60)
+    if (seen(found) < 0.9 * (1 - dropout)).sum() < _WEAK_RAYS:
+        return None
+    before, at, after = (unlikely(found + by) for by in (-_STEP, 0, _STEP))
+    information = (after - 2 * at + before).sum() / _STEP**2
+    score = (((after - before) / (2 * _STEP)) ** 2).sum()
+    return Estimate(*np.exp(Estimate.of(found, score / information**2)).tolist())
+
+
+def alarm_share(repeats: Repeats) -> Estimate | None:
+    """Share of pulses into the sky that return; None without sky, or with two sweeps.
+
+    A pulse is one into the sky if no other of its ray returns, and no ray beside it repeats.
+    """
+    from scipy.ndimage import maximum_filter
+    from scipy.stats import binomtest
+
+    count = np.isfinite(repeats.ranges).sum(axis=0)
+    # Weak surfaces, which return seldom, are beside those that return more often.
+    sky = maximum_filter(count, size=_SKY, mode=("nearest", "wrap")) <= 1
+    alarms = int((count[sky] == 1).sum())
+    trials = len(repeats.ranges) * int((count[sky] == 0).sum()) + alarms
+    if not trials or len(repeats.ranges) < 3:
+        return None
+    return Estimate(alarms / trials, *map(float, binomtest(alarms, trials).proportion_ci()))
+
+
+def ring_bias(rays: Rays, directions: Floats, blur: Floats) -> dict[int, Estimate]:
+    """By how much the ranges of each row differ from those of all, on large planes: {row: metres}.
+
+    Planes u · x = 1 and offsets b are fitted at once: 1 / r = u · d − b / r², times r². Ranges have
+    standard deviations `blur` (k,), metres.
+    """
+    some = even_indices(len(rays.row), _PLANE_POINTS)
+    plane = _planes(rays.distance[some, None] * directions[some])
+    many = np.bincount(rays.row[some[plane >= 0]], minlength=rays.row.max() + 1)[rays.row[some]]
+    some, plane = (one[(plane >= 0) & (many >= _RING_RAYS)] for one in (some, plane))
+    rows, place = np.unique(rays.row[some], return_inverse=True)
+    if len(rows) < 3:
+        return {}
+    distance = rays.distance[some] / blur[some]
+    planes = np.eye(plane.max() + 1)[plane][:, :, None] * directions[some][:, None]
+    planes = planes.reshape(len(some), -1) * rays.distance[some, None] ** 2
+    design = np.hstack([planes, -np.eye(len(rows))[place]]) / blur[some, None]
+    off = np.zeros(len(some))
+    for _ in range(4):
+        kept = np.abs(off) <= 4 * 1.4826 * np.median(np.abs(off))
+        solved = np.linalg.lstsq(design[kept], distance[kept], rcond=None)[0]
+        off, used = distance - design @ solved, design[kept]
+    # One offset of all is nearly the same as other planes: the mean of the rings is 0.
+    centred = np.hstack([np.zeros((len(rows), planes.shape[1])), np.eye(len(rows)) - 1 / len(rows)])
+    spread = np.diag(centred @ _sandwich(used, off[kept]) @ centred.T)
+    found = zip(rows.tolist(), centred @ solved, spread, strict=True)
+    return {row: Estimate.of(*one) for row, *one in found}
+
+
+def _planes(points: Floats) -> Ints:
+    """Tell the number of the large plane that each point (n, 3) lies in; -1 for none."""
+    o3d = load_open3d()
+    o3d.utility.random.seed(0)
+    number, left = np.full(len(points), -1), np.arange(len(points))
+    while len(left) >= _PLANE_RAYS and number.max() < _PLANES - 1:
+        cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points[left]))
+        (*normal, off), _ = cloud.segment_plane(_PLANE_M, 3, 400)
+        inside = np.abs(points[left] @ normal + off) < _PLANE_M  # of the plane of all inliers
+        if inside.sum() < _PLANE_RAYS:
+            break
+        number[left[inside]], left = number.max() + 1, left[~inside]
+    return number
 
 
 def _channels(
     repeats: Repeats, rays: Rays, own: Floats, sigma: Floats, expected: Floats | None
 ) -> list[dict[str, Any]]:
     """Noise, bias and spread of azimuths of each ring."""
-    flat = rays.take(rays.slope < _FLAT * rays.distance)
-    cell, elevations = (flat.row, flat.column), np.degrees(repeats.elevation)
+    flat = Rays._make(one[rays.slope < _FLAT * rays.distance] for one in rays)
+    cell = flat.row, flat.column
     if expected is not None:
         off = flat.distance - expected[cell]
         bias = {row: Estimate.mean(off[flat.row == row]) for row in set(flat.row.tolist())}
     else:
         blur = sigma[cell] / np.sqrt(flat.returns) + _LEAST_M
-        bias = channel_bias(flat, repeats.directions()[cell], blur)
-    rows = []
-    for row, ring in enumerate(repeats.rings.tolist()):
-        noise = own[(rays.row == row) & np.isfinite(own)]
-        steps = np.degrees(np.diff(repeats.aside[:, row], axis=1) / np.sqrt(2))
-        uneven = np.square(steps[np.isfinite(steps)])
-        found = {
-            "noise_m": Estimate.mean(noise, 0.5) if len(noise) >= _FEW else None,
-            "bias_m": bias.get(row),
-            "uneven_deg": Estimate.mean(uneven, 0.5) if len(uneven) >= _FEW else None,
+        bias = ring_bias(flat, repeats.directions[cell], blur)
+    uneven = np.degrees(np.diff(repeats.aside, axis=2)) ** 2 / 2
+    return [
+        {
+            "ring": int(ring),
+            "elevation_deg": float(repeats.elevation_deg[row]),
+            "rays": int(np.isfinite(own[rays.row == row]).sum()),
+            "noise_m": _noise(own[rays.row == row]),
+            "bias_m": bias[row]._asdict() if row in bias else None,
+            "uneven_deg": _noise(uneven[:, row]),
         }
-        shown = {name: one and one._asdict() for name, one in found.items()}
-        rows.append(
-            {"ring": ring, "elevation_deg": float(elevations[row]), "rays": len(noise)} | shown
-        )
-    return rows
+        for row, ring in enumerate(repeats.rings)
+    ]
+
+
+def _noise(variances: Floats) -> dict[str, float] | None:
+    """Root of the mean of the variances that are known, if they are enough."""
+    known = variances[np.isfinite(variances)]
+    return Estimate.mean(known).power(0.5)._asdict() if len(known) >= _FEW else None
 
 
 def _curve(x: Floats, values: Floats, power: float = 1.0) -> list[dict[str, float]]:
-    """Means of values (k,), or their roots, in parts of x that have about as many each."""
-    known = np.isfinite(values) & np.isfinite(x)
-    x, values = x[known], values[known]
-    if not len(x):
-        return []
-    place = np.digitize(x, np.unique(np.quantile(x, np.linspace(0, 1, _POINTS + 1)[1:-1])))
-    parts = [place == k for k in range(place.max() + 1) if (place == k).sum() >= _FEW]
+    """Means of values (k,), or their roots, in parts of x of the same size."""
+    known = np.flatnonzero(np.isfinite(values) & np.isfinite(x))
+    order = known[np.argsort(x[known], kind="stable")]
+    parts = np.array_split(order, min(_POINTS, len(order) // _FEW) or 1)
     return [
-        {"x": float(np.median(x[part]))} | Estimate.mean(values[part], power)._asdict()
+        {"x": float(np.median(x[part]))} | Estimate.mean(values[part]).power(power)._asdict()
         for part in parts
+        if len(part) >= _FEW
     ]
 
 
@@ -263,19 +603,18 @@ def _drawn(figures: Mapping[str, Any]) -> Page:
     """Draw the curves and rings, with their intervals."""
     page = Page((1600, 1750))
     page.title(figures["model"], f"fitted to {figures['name']}; bars are intervals of 95 %")
-    for number, (name, (title, x, y, unit)) in enumerate(_CHARTS.items()):
+    for number, (name, (x, y, unit)) in enumerate(_CHARTS.items()):
         row, column = divmod(number, 3)
         axes = page.chart((0.075 + 0.32 * column, 0.67 - 0.305 * row, 0.235, 0.205))
         axes.set(xlabel=x, ylabel=y)
-        points = figures["curves"].get(name, [])
-        if row == 2:
-            rings = (one for one in figures["channels"] if one[name])
-            points = [{"x": one["elevation_deg"], **one[name]} for one in rings]
+        points = figures["curves"].get(name) or [
+            {"x": one["elevation_deg"], **one[name]} for one in figures["channels"] if one.get(name)
+        ]
+        page.heading(axes, "" if points else "not known")
         at, *values = (np.array([one[key] for one in points]) for key in ("x", *Estimate._fields))
         value, low, high = (unit * one for one in values)
         axes.vlines(at, low, high, color=theme.UNSEEN, lw=1.8 * page.unit)
         axes.plot(at, value, "o", color=theme.OBJECT_COLOURS[0], ms=3.2 * page.unit, mew=0)
-        page.heading(axes, title if points else f"{title}  not known".strip(), fontweight="bold")
         if points and name.endswith("light") and at[0] > 0:
             axes.set_xscale("log")
     return page

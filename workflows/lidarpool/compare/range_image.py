@@ -33,13 +33,19 @@ class RangeImages:
     elevation_deg: Floats  # (r,): medians of the points
     step_deg: float  # width of a column
     begin_deg: float  # azimuth of the first
-    ranges: Floats  # (2, r, c): of A and B, metres; NaN without a return
+    images: (
+        Floats  # (2, 3, r, c): range, intensity and azimuth_deg in A and in B; NaN where unknown
+    )
     hidden: tuple[float, float]  # shares of points of A and B that others in their cells hide
     notes: tuple[str, ...]
     row: Ints  # (k,): of all cells, or of all rays that have a return
     compared: Floats  # (2, 2, k): range and intensity of these in A and in B, NaN where unknown
-    azimuth_deg: Floats  # (r, c): of the returns of A, NaN without one
     paired_by: str = "cells"  # or "rays"
+
+    @property
+    def ranges(self) -> Floats:
+        """Of A and B, (2, r, c) in metres; NaN without a return."""
+        return self.images[:, 0]
 
     @property
     def there(self) -> tuple[Bools, Bools]:
@@ -150,13 +156,8 @@ def range_images(
     A column is as wide as the step of azimuth from pulse to pulse, the coarser of the two. Each
     ring's cells have their middles where its pulses are, in every 10 degrees, so that
     none falls between two although heads turn unevenly; a pulse of A is in the cell of the pulse of
-    B that is nearest.
-
-    Raises
-    ------
-    LidarpoolError
-        If one has no rings, is not in the axes of its sensor, or they are not of sensors
-        with the same rings; a clause without a full stop.
+    B that is nearest. LidarpoolError if one has no rings, is not in the axes of its sensor, or they
+    are not of sensors with the same rings; a clause without a full stop.
     """
     first, second = _Polar.of(a, names[0]), _Polar.of(b, names[1])
     rings, elevation, rows_a, rows_b, notes = _common(first, second, names)
@@ -187,9 +188,8 @@ def range_images(
     order, begin = _field(seen, columns, step)
     images = images[..., order]
     return RangeImages(
-        rings, elevation, step, begin, images[:, 0], (hidden_a, hidden_b),
+        rings, elevation, step, begin, images, (hidden_a, hidden_b),
         notes, np.repeat(np.arange(count), len(order)), images[:, :2].reshape(2, 2, -1),
-        images[0, 2],
     )  # fmt: skip
 
 
@@ -203,17 +203,17 @@ def paired_images(
     assert a.rays is not None and b.rays is not None and a.rings is not None and b.rings is not None
     _common(_Polar.of(a, names[0]), _Polar.of(b, names[1]), names)  # refuses another sensor
     _, first, ray = np.unique(np.append(a.rays, b.rays), return_index=True, return_inverse=True)
-    values = np.full((2, 2, len(first) + 1), np.nan)  # the last is of no ray
+    values = np.full((2, 3, len(first) + 1), np.nan)  # the last is of no ray
     for k, turn, own in ((0, a, ray[: len(a)]), (1, b, ray[len(a) :])):
         values[k, 0, own] = np.linalg.norm(turn.points, axis=1)
         values[k, 1, own] = np.nan if turn.light is None else turn.light
     points, rings = np.concatenate([a.points, b.points])[first], np.append(a.rings, b.rings)[first]
     every = Turn(points, rings, np.arange(len(first), dtype=np.float64))
     found = range_images(every, every, names, azimuth_deg)
-    shown = np.nan_to_num(found.compared[0, 1], nan=-1).astype(int).reshape(found.ranges[0].shape)
+    shown = np.nan_to_num(found.images[0, 1], nan=-1).astype(int)
     row = (rings[:, None] == found.rings).argmax(axis=1)
-    ranges, compared = values[:, 0, shown], values[..., :-1]
-    return replace(found, ranges=ranges, row=row, compared=compared, paired_by="rays")
+    images, compared = values[..., shown], values[:, :2, :-1]
+    return replace(found, images=images, row=row, compared=compared, paired_by="rays")
 
 
 def _spacing(elevation: Floats) -> float:

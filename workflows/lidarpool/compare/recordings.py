@@ -130,23 +130,11 @@ def open_recording(
     light: str | None = None,
     name: str = "the cloud",
 ) -> Recording:
-    """Open a cloud or recording: `KINDS`, or a cloud in memory.
+    """Open a cloud or recording: `KINDS`; or a cloud in memory, which has sweeps if of a result.
 
-    Parameters
-    ----------
-    place
-        Its path; or a cloud, which has sweeps if it is of a result.
-    sensor
-        Of several: name of a sensor, or topic of a bag.
-    light
-        Column of the intensity, if it has another name than usual.
-    name
-        Of a cloud in memory, for errors and reports.
-
-    Raises
-    ------
-    LidarpoolError
-        If it is none, or cannot be opened.
+    `sensor` chooses one of several sensors, or the topic of a bag; `light` is the column of the
+    intensity, if it has another name than usual; `name` is that of a cloud in memory.
+    LidarpoolError if it is none, or cannot be opened.
     """
     if isinstance(place, Cloud | StoredCloud):
         return _of_cloud(name, place, place.sweeps, sensor, light)
@@ -172,9 +160,8 @@ def open_recording(
         return _of_bag(path, name, sensor, light)
     elif kind in (".osf", ".pcap"):
         with _reading(name), path.open("rb") as file:
-            first = int.from_bytes(file.read(36)[32:], "little")
-        if kind == ".pcap" and first in _VELODYNE:
-            return _of_velodyne(path, name, light)
+            if int.from_bytes(file.read(36)[32:], "little") in _VELODYNE:
+                return _of_velodyne(path, name, light)
         return _of_ouster(path, name, sensor, light)
     raise LidarpoolError(f"{name} cannot be compared: give {KINDS}.")
 
@@ -261,7 +248,7 @@ def _of_data_set(path: Path, name: str, sensor: str | None, light: str | None) -
 
 def _of_pcd(files: list[Path], name: str, light: str | None) -> Recording:
     """Open files of a sweep each; VIEWPOINT says where its sensor was."""
-    _need("pypcd4", "pcd", name)
+    need("pypcd4", "pcd", f"{name} is read")
 
     def read(number: int) -> Read:
         from pypcd4.pypcd4 import PointCloud  # an extra
@@ -279,7 +266,7 @@ def _of_pcd(files: list[Path], name: str, light: str | None) -> Recording:
 
 
 def _of_las(path: Path, name: str, light: str | None) -> Recording:
-    _need("laspy", "las", name)
+    need("laspy", "las", f"{name} is read")
     laspy: Any = import_module("laspy")
     with _reading(name):
         with path.open("rb") as start:
@@ -304,7 +291,7 @@ def _of_las(path: Path, name: str, light: str | None) -> Recording:
 
 def _of_bag(path: Path, name: str, topic: str | None, light: str | None) -> Recording:
     """Open a topic of PointCloud2, a sweep each, in the axes of their frame."""
-    _need("rosbags", "ros", name)
+    need("rosbags", "ros", f"{name} is read")
     from rosbags.rosbag2 import Reader
 
     from ..export.ros import columns_of
@@ -314,16 +301,16 @@ def _of_bag(path: Path, name: str, topic: str | None, light: str | None) -> Reco
         bag.open()
     there = {one.topic: one for one in bag.connections if one.msgtype == _POINT_CLOUD}
     connection = there[_chosen(name, "topics of PointCloud2", there, topic)]
-    message = _in_order(lambda: bag.messages([connection]))
+    messages = partial(bag.messages, [connection])
 
-    def read(number: int) -> Read:
-        columns = columns_of(message(number)[2])
+    def points(message: Any) -> Read:
+        columns = columns_of(message[2])
         return _places(columns), columns, None
 
     def times() -> Iterator[float]:
-        return (time for _, time, _ in bag.messages([connection]))
+        return (time for _, time, _ in messages())
 
-    return Recording(name, connection.msgcount, read, light, times=times)
+    return _streamed(name, messages, points, light, connection.msgcount, times=times)
 
 
 def _of_ouster(path: Path, name: str, sensor: str | None, light: str | None) -> Recording:
@@ -331,16 +318,14 @@ def _of_ouster(path: Path, name: str, sensor: str | None, light: str | None) -> 
     if find_spec("ouster") is None:  # it wants old versions of what it does not need to read
         raise LidarpoolError(f"{name} is read by ouster-sdk: pip install --no-deps ouster-sdk.")
     sdk: Any = import_module("ouster.sdk")
-    core: Any = import_module("ouster.sdk.core")
     with _reading(name):
         infos = sdk.open_source(str(path)).sensor_info
         known = [f"{one.prod_line} {one.sn}".strip() for one in infos]
     which = known.index(_chosen(name, "sensors", known, sensor))
-    place = core.XYZLut(infos[which], False)
+    place = import_module("ouster.sdk.core").XYZLut(infos[which], False)
 
     def scans() -> Iterator[Any]:
-        frames = (frame[which] for frame in sdk.open_source(str(path)))
-        return (frame for frame in frames if frame is not None)
+        return (one[which] for one in sdk.open_source(str(path)) if one[which] is not None)
 
     def points(scan: Any) -> Read:
         ring, column = np.nonzero(scan.field("RANGE"))
@@ -350,48 +335,41 @@ def _of_ouster(path: Path, name: str, sensor: str | None, light: str | None) -> 
         return place(scan)[ring, column], columns, None
 
     white = _WHITE if light in (None, "reflectivity") else None
-    return _streamed(name, scans, points, light, white)
+    return _streamed(name, scans, points, light, white=white)
 
 
 def _of_velodyne(path: Path, name: str, light: str | None) -> Recording:
     """Open packets of a Velodyne, which say the model."""
-    _need("velodyne_decoder", "fit", name)
+    need("velodyne_decoder", "fit", f"{name} is read")
     decoder: Any = import_module("velodyne_decoder")
 
     def points(sweep: Any) -> Read:
         columns = {name: sweep.points[name] for name in sweep.points.dtype.names}
         return _places(columns), columns, None
 
-    def sweeps_there() -> Iterator[Any]:
-        return iter(decoder.read_pcap(str(path), as_pcl_structs=True))
-
-    return _streamed(name, sweeps_there, points, light, None if light else _WHITE)
+    packets = partial(decoder.read_pcap, str(path), as_pcl_structs=True)
+    return _streamed(name, packets, points, light, white=None if light else _WHITE)
 
 
 def _streamed(
-    name: str, begin: Callable[[], Iterator[Any]], points: Callable[[Any], Read],
-    light: str | None, white: float | None,
+    name: str, begin: Callable[[], Iterable[Any]], points: Callable[[Any], Read],
+    light: str | None, count: int | None = None, **more: Any,
 ) -> Recording:  # fmt: skip
-    """Open what has to be read from its beginning to know how many sweeps there are."""
-    with _reading(name):
-        count = sum(1 for _ in begin())
-    item = _in_order(begin)
-    return Recording(name, count, lambda number: points(item(number)), light, white=white)
+    """Open what can be read from its beginning only; also to count sweeps, if that is needed."""
+    if count is None:
+        with _reading(name):
+            count = sum(1 for _ in begin())
+    coming: tuple[int, Iterator[Any]] = 0, iter(())  # number of the next sweep, and all from there
 
-
-def _in_order(begin: Callable[[], Iterator[Any]]) -> Callable[[int], Any]:
-    """Return what gives the item of a number, where reading can only begin at the first."""
-    coming: tuple[int, Iterator[Any]] = 0, iter(())  # number of the next item, and all from there
-
-    def item(number: int) -> Any:
+    def read(number: int) -> Read:
         nonlocal coming
         if not 0 < coming[0] <= number:
-            coming = 0, begin()
-        found = next(islice(coming[1], number - coming[0], None))
+            coming = 0, iter(begin())
+        sweep = next(islice(coming[1], number - coming[0], None))
         coming = number + 1, coming[1]
-        return found
+        return points(sweep)
 
-    return item
+    return Recording(name, count, read, light, **more)
 
 
 @contextmanager
@@ -413,9 +391,10 @@ def _places(columns: Columns) -> Floats:
     return np.stack([np.asarray(columns[axis], np.float64) for axis in "xyz"], axis=1)
 
 
-def _need(package: str, extra: str, name: str) -> None:
+def need(package: str, extra: str, what: str) -> None:
+    """LidarpoolError if the package of an extra, which does what is said, is not installed."""
     if find_spec(package) is None:
-        raise LidarpoolError(f'{name} is read by {package}: pip install "lidarpool[{extra}]".')
+        raise LidarpoolError(f'{what} by {package}: pip install "lidarpool[{extra}]".')
 
 
 def _chosen(name: str, what: str, there: Iterable[str], wanted: str | None) -> str:

@@ -42,7 +42,7 @@ from ..masks import (
 )
 from ..scene_mesh import SceneMesh
 from .companions import image_file, named_file
-from .gltf_animation import WIDTHS, Channels, chosen, keys_of, played
+from .gltf_animation import WIDTHS, AnimatedNodes, chosen, keys_of, played
 from .polygons import check_corners, fanned, unrolled
 from .scene_graph import (
     MOST_NODES,
@@ -164,7 +164,7 @@ class _Reader:
         self._mask = remembered(self._read_mask)
         self._base, self._shades = remembered(self._read_base), remembered(self._read_shades)
         self.notes = MaskNotes()
-        self._channels: Channels = {}
+        self._channels: AnimatedNodes = {}
         self._frame = 0
         self._local, self._joints = cache(self._read_local), cache(self._read_joints)
 

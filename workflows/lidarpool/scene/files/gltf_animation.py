@@ -15,7 +15,7 @@ from .scene_graph import MeshFileError
 
 WIDTHS = {"translation": 3, "rotation": 4, "scale": 3}  # numbers of a node; the rest are weights
 
-Channels = dict[tuple[int, str], Floats]  # {(node, what): its values at each time, (t, width)}
+AnimatedNodes = dict[tuple[int, str], Floats]  # {(node, what): its values at each time, (t, width)}
 
 
 def chosen(animations: list[dict[str, Any]], name: str) -> dict[str, Any]:
@@ -35,9 +35,11 @@ def keys_of(animation: Mapping[str, Any], read: Callable[[Any], AnyArray]) -> tu
     return min(float(t.min()) for t in times), max(float(t.max()) for t in times)
 
 
-def played(animation: Mapping[str, Any], at_s: Floats, read: Callable[[Any], AnyArray]) -> Channels:
+def played(
+    animation: Mapping[str, Any], at_s: Floats, read: Callable[[Any], AnyArray]
+) -> AnimatedNodes:
     """Return what an animation moves, at times (t,); `read` gives the numbers of an accessor."""
-    found: Channels = {}
+    found: AnimatedNodes = {}
     for channel in animation["channels"]:
         target, sampler = channel["target"], animation["samplers"][channel["sampler"]]
         if "node" not in target or target["path"] not in (*WIDTHS, "weights"):
