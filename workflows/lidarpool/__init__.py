@@ -156,6 +156,10 @@ def __getattr__(name: str) -> Any:
     for module, names in _MODULES.items():
         if name in names:
             found = getattr(import_module(f".{module}", __name__), name)
+            # Importing a module of the folder compare puts the folder in the function's place.
+            if module.startswith("compare."):
+                comparison = import_module(".compare.comparison", __name__)
+                globals()["compare"] = comparison.compare
             globals()[name] = found
             return found
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
