@@ -34,6 +34,7 @@ _SECTIONS = {
     "sensors": "CarriedSection",
     "mount": "MountSection",
     "actors": "ActorSection",
+    "actors: animation": "AnimationSection",
     "traffic": "TrafficSection",
     "traffic: vehicles": "VehicleSection",
     "materials": "Material",
