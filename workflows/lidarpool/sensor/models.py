@@ -131,16 +131,17 @@ STATED = {
 class Performance(_ModelSection):
     """What a data sheet says of a sensor's noise and returns; see `datasheet`.
 
-    The precision of ranges is either `range_m` and `range_per_m`, as of `Noise`, or that of two
-    surfaces, which say how it depends on energy.
+    The precision of ranges is either that of `Noise`, by the same names, or that of two surfaces,
+    which say how it depends on energy.
     """
 
     range_m: Annotated[float, Field(ge=0)] | None = None
     range_per_m: Annotated[float, Field(ge=0)] = 0.0
+    range_at_threshold_m: Annotated[float, Field(ge=0)] = 0.0
     precision: tuple[RangePrecision, RangePrecision] | None = None
     angle_deg: Annotated[float, Field(ge=0)] | None = None
     detection: Detection | None = None
-    false_alarms: Annotated[float, Field(gt=0, lt=0.5)] | None = None  # share of pulses
+    false_alarms: Annotated[float, Field(ge=0, lt=0.5)] | None = None  # share of pulses
     dropout: UnitShare = 0.0  # of returns, whatever their energy
     mode: Mode = "strongest"
 
@@ -156,8 +157,7 @@ class Performance(_ModelSection):
 
     def noise(self, gate_s: float, seed: int) -> Noise:
         """Return the noise of a sensor whose receiver waits so many seconds for returns."""
-        same = {"range_m", "range_per_m", "angle_deg", "dropout"}
-        made = self.model_dump(include=same, exclude_none=True)
+        made = self.model_dump(include={one.name for one in fields(Noise)}, exclude_none=True)
         if self.detection is not None:
             made["detection_range_m"] = self.detection.threshold_m
             if self.precision is not None:
