@@ -44,7 +44,7 @@ _CHARTS = {
     "light_by_range": ("range, m", "mean intensity", 1),
     "noise_m": ("elevation, °", "noise, mm", 1000),
     "bias_m": ("elevation, °", "bias, mm", 1000),
-    "uneven_deg": ("elevation, °", "spread of azimuths, °", 1),
+    "uneven_deg": ("elevation, °", "spread of azimuths, 0.001°", 1000),
 }
 _RANGES = ("range_m", "range_per_m", "range_at_threshold_m")  # noise of ranges
 _FEW, _POINTS = 30, 14  # rays that a figure or a point of a curve needs; points of a curve
@@ -163,7 +163,7 @@ def fit(
     curves["noise_by_range"] = _curve(rays.distance, own, 0.5)
     curves["noise_by_light"] = _curve(light, own, 0.5)
     curves["noise_by_tilt"] = _curve(np.degrees(np.arctan(rays.slope / rays.distance)), tilted, 0.5)
-    curves["returned_by_light"] = _curve(light, rays.returns / count)
+    curves["returned_by_light"] = _curve(light, rays.returns / count) if count > 1 else []
     curves["light_by_range"] = _curve(rays.distance, rays.light)
     base, name = read_model(model) if model else _recorded(repeats), Path(recording.name).name
     source = f"fitted by lidarpool {__version__} to {name}, {plural(repeats.sweeps, 'sweep')}"
@@ -567,7 +567,7 @@ def _channels(
             "rays": int(np.isfinite(own[rays.row == row]).sum()),
             "noise_m": _noise(own[rays.row == row]),
             "bias_m": bias[row]._asdict() if row in bias else None,
-            "uneven_deg": _noise(uneven[:, row]),
+            "uneven_deg": _noise(uneven[:, row]) if len(uneven) > 1 else None,
         }
         for row, ring in enumerate(repeats.rings)
     ]
@@ -593,20 +593,20 @@ def _curve(x: Floats, values: Floats, power: float = 1.0) -> list[dict[str, floa
 
 def _drawn(figures: Mapping[str, Any]) -> Page:
     """Draw the curves and rings, with their intervals."""
-    page = Page((1600, 1750))
+    rows, curves = figures["channels"], dict(figures["curves"])
+    for name in ("noise_m", "bias_m", "uneven_deg"):
+        curves[name] = [{"x": one["elevation_deg"], **one[name]} for one in rows if one[name]]
+    shown = [name for name in _CHARTS if curves.get(name)]
+    tall = 140 + 500 * -(-len(shown) // 3)  # pixels
+    page = Page((1600, tall))
     page.title(figures["model"], f"fitted to {figures['name']}; bars are intervals of 95 %")
-    for number, (name, (x, y, unit)) in enumerate(_CHARTS.items()):
-        row, column = divmod(number, 3)
-        axes = page.chart((0.075 + 0.32 * column, 0.67 - 0.305 * row, 0.235, 0.205))
-        axes.set(xlabel=x, ylabel=y)
-        points = figures["curves"].get(name) or [
-            {"x": one["elevation_deg"], **one[name]} for one in figures["channels"] if one.get(name)
-        ]
-        page.heading(axes, "" if points else "not known")
+    for number, name in enumerate(shown):
+        (row, column), points, (x, y, unit) = divmod(number, 3), curves[name], _CHARTS[name]
         at, *values = (np.array([one[key] for one in points]) for key in ("x", *Estimate._fields))
         value, low, high = (unit * one for one in values)
+        axes = page.chart((0.075 + 0.32 * column, 1 - (530 + 500 * row) / tall, 0.235, 360 / tall))
+        scale = "log" if name.endswith("light") and at[0] > 0 else "linear"
+        axes.set(xlabel=x, ylabel=y, xscale=scale)
         axes.vlines(at, low, high, color=theme.UNSEEN, lw=1.8 * page.unit)
         axes.plot(at, value, "o", color=theme.OBJECT_COLOURS[0], ms=3.2 * page.unit, mew=0)
-        if points and name.endswith("light") and at[0] > 0:
-            axes.set_xscale("log")
     return page
