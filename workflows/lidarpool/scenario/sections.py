@@ -397,7 +397,7 @@ class SensorSection(Section):
         about(
             "datasheet: noise, detection range and beam by the model's data sheet; what noise and "
             "returns say counts more; ideal: none; by default datasheet of a file that states it",
-            "datasheet",
+            "ideal",
         ),
     ] = None
 
