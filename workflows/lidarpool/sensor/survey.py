@@ -257,12 +257,12 @@ class Survey(CloudOptions, Weather):
         self._set(poses=_poses(self.poses), sensors=tuple(self.sensors))
         self._set(trajectory=self._trajectory(), materials=tuple(self.materials))
         self._check_names()
-        for name, none in (("returns", Returns()), ("noise", Noise())):
+        for name, kind in (("returns", Returns), ("noise", Noise)):
             if getattr(self, name) is None:
                 owns = [getattr(one, name) or getattr(one.sensor, name) for one in self.sensors]
                 each = zip(self.sensors, owns, strict=True)
                 self._set(sensors=tuple(replace(one, **{name: own}) for one, own in each))
-                self._set(**{name: (not owns and getattr(self.sensor, name)) or none})
+                self._set(**{name: (not owns and getattr(self.sensor, name)) or kind()})
         if self.sensors:
             self._set(sensor=self.sensors[0].sensor)
         extra = {"sensor": len(self.sensors) > 1, "class": self.classes}
