@@ -12,7 +12,6 @@ import argparse
 import warnings
 from dataclasses import replace
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
@@ -62,9 +61,7 @@ def compared(recording: Recording, model: str, white: float | None) -> tuple[dic
     turn, *_ = surfaces(other, middle, other.sigma)
     energy = np.maximum(rays.light / (white or recording.white or 100), 1 / 400)
     energy = energy * (10 / rays.distance) ** 2
-    with TemporaryDirectory() as folder:
-        fitted = datasheet(found.save(Path(folder) / "fitted.yaml")[0]).noise
-    fitted = replace(fitted, dropout=found.figures["figures"]["dropout"]["value"])
+    fitted = found.model.datasheet().noise
     try:
         sheet = datasheet(model).noise
     except LidarpoolError:

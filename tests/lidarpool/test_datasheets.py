@@ -11,7 +11,16 @@ import yaml
 from click.testing import CliRunner
 from tests.shapes import beam_along_x, cast, wall
 
-from lidarpool import LidarpoolError, Material, Returns, datasheet
+from lidarpool import (
+    LidarpoolError,
+    Material,
+    Mounted,
+    Noise,
+    Returns,
+    Survey,
+    datasheet,
+    load_sensor,
+)  # fmt: skip
 from lidarpool.cli.scenario_commands import sensors
 from lidarpool.scenario.advice import advice
 from lidarpool.scenario.build import build
@@ -107,6 +116,31 @@ def test_a_scenario_takes_the_data_sheet_with_one_word_and_its_own_figures_befor
     assert returns == Returns()
     ((noise, _),) = carried(sensor={"model": "ouster/os1-64"})
     assert not noise.loses
+
+
+def test_a_file_that_states_its_performance_is_used_with_it_unless_it_shall_be_ideal(tmp_path):
+    text = (
+        "{name: Mine, firings_per_turn: 360, range_m: [0, 80], beams: {elevation_deg: [0, 1]}, "
+        "performance: {range_m: 0.02, dropout: 0.1, mode: last}}"
+    )
+    file = tmp_path / "mine.yaml"
+    file.write_text(text)
+    sheet, other, at = datasheet(file), Noise(range_m=0.5), {"poses": [(0, 0, 1)]}
+    assert sheet.noise == Noise(range_m=0.02, dropout=0.1) and sheet.returns.mode == "last"
+    given = {"sensor": str(file), "noise": {"dropout": 0, "seed": 3}}
+    assert carried(**given) == [(Noise(range_m=0.02, seed=3), sheet.returns)]
+    ideal = {"sensor": {"model": str(file), "performance": "ideal"}}
+    assert carried(**ideal) == [(Noise(), Returns())]
+    sensor, named = load_sensor(file), load_sensor("ouster/os1-64")
+    for survey in (Survey(sensor, **at), Survey(sensors=[Mounted(sensor)], **at)):
+        assert (survey.noise_each, survey.returns_each) == ((sheet.noise,), (sheet.returns,))
+    both = Survey(sensors=[Mounted(sensor, name="a"), Mounted(named, name="b")], **at)
+    assert both.noise_each == (sheet.noise.named("a"), Noise().named("b"))
+    for given in ({"sensor": sensor}, {"sensors": [Mounted(sensor)]}):
+        assert Survey(**given, **at, noise=other).noise_each == (other,)
+    assert load_sensor(file, performance="ideal").noise is None and named.noise is None
+    stated = load_sensor("ouster/os1-64", performance="datasheet")
+    assert stated.noise == datasheet("ouster/os1-64").noise
 
 
 def test_each_of_several_sensors_has_its_own():
