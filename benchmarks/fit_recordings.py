@@ -17,9 +17,10 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from lidarpool import LidarpoolError, Noise, datasheet, fit
+from lidarpool import LidarpoolError, Noise, fit
 from lidarpool.compare.fit import Repeats, smooth_rays, surfaces
 from lidarpool.compare.recordings import Recording, open_recording
+from lidarpool.sensor.models import read_model
 
 COLOURS = {"recorded": "#1c2430", "data sheet": "#ee7733", "fitted": "#4477aa"}
 
@@ -63,7 +64,7 @@ def compared(recording: Recording, model: str, white: float | None) -> tuple[dic
     energy = energy * (10 / rays.distance) ** 2
     fitted = found.model.datasheet().noise
     try:
-        sheet = datasheet(model).noise
+        sheet = read_model(model).datasheet().noise
     except LidarpoolError:
         sheet = Noise()
     cell = rays.row, rays.column

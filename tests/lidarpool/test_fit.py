@@ -10,10 +10,11 @@ import pytest
 import yaml
 from benchmarks.fit_coverage import recorded, street, trial
 
-from lidarpool import LidarpoolError, Noise, Scanner, Sensor, datasheet, fit, load_sensor
+from lidarpool import LidarpoolError, Noise, Scanner, Sensor, fit, load_sensor
 from lidarpool.compare.recordings import Recording, open_recording
 from lidarpool.export.formats import Format
 from lidarpool.export.sweeps import Sweeps
+from lidarpool.sensor.models import read_model
 
 pytest.importorskip("scipy", reason="the extra fit is not installed")
 
@@ -46,7 +47,7 @@ def test_the_file_is_a_sensor_with_these_figures(fitted, tmp_path):
     written = fitted.save(tmp_path / "mine.yaml")
     assert [path.name for path in written] == ["mine.yaml", "mine.html"]
     stated = yaml.safe_load(written[0].read_text())
-    noise = datasheet(written[0]).noise
+    noise = read_model(written[0]).datasheet().noise
     figures = fitted.figures["figures"]
     for name in ("range_m", "range_per_m", "angle_deg"):
         assert getattr(noise, name) == pytest.approx(figures[name]["value"], rel=1e-3)
@@ -71,7 +72,7 @@ def test_the_page_has_all_figures_and_says_what_is_unknown(fitted, tmp_path):
 def test_noise_by_energy_is_in_the_file(tmp_path):
     truth = {"range_m": 0.015, "range_at_threshold_m": 0.07, "detection_range_m": 10}
     made = fit(recorded(Noise(**truth, dropout=0.01, angle_deg=0.05, seed=1)))
-    noise = datasheet(made.save(tmp_path / "mine.yaml")[0]).noise
+    noise = read_model(made.save(tmp_path / "mine.yaml")[0]).datasheet().noise
     for name, true in {**truth, "dropout": 0.01}.items():
         assert getattr(noise, name) == pytest.approx(true, rel=0.1), name
 

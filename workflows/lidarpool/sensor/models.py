@@ -129,7 +129,7 @@ STATED = {
 
 
 class Performance(_ModelSection):
-    """What a data sheet says of a sensor's noise and returns; see `datasheet`.
+    """What a data sheet says of a sensor's noise and returns; see `SensorModel.datasheet`.
 
     The precision of ranges is either that of `Noise`, by the same names, or that of two surfaces,
     which say how it depends on energy.
@@ -155,7 +155,7 @@ class Performance(_ModelSection):
             raise ValueError("false_alarms needs detection")
         return self
 
-    def noise(self, gate_s: float, seed: int) -> Noise:
+    def noise(self, gate_s: float) -> Noise:
         """Return the noise of a sensor whose receiver waits so many seconds for returns."""
         made = self.model_dump(include={one.name for one in fields(Noise)}, exclude_none=True)
         if self.detection is not None:
@@ -165,7 +165,7 @@ class Performance(_ModelSection):
                 made |= {"range_m": near, "range_at_threshold_m": far}
         if self.false_alarms is not None:
             made["false_alarm_hz"] = -float(log1p(-self.false_alarms)) / gate_s
-        return Noise(**made, seed=seed)
+        return Noise(**made)
 
     def _by_energy(self, threshold_m: float) -> tuple[float, float]:
         """Fit the standard deviations of strong returns, and of those at the threshold."""
@@ -229,7 +229,7 @@ class SensorModel(_ModelSection):
                 "read states it: give noise yourself."
             )
         low, high = self.range_m or (0.0, float("inf"))
-        noise = stated.noise(2e-9 * (high - low) / LIGHT_M_NS, seed)
+        noise = stated.noise(2e-9 * (high - low) / LIGHT_M_NS)
         subrays = 1 if self.optics.divergence_mrad is None else 7
         missing = tuple(words for name, words in STATED.items() if not getattr(noise, name))
         return Datasheet(noise, Returns(stated.mode, subrays=subrays), missing)
@@ -312,35 +312,6 @@ class Datasheet(NamedTuple):
     noise: Noise
     returns: Returns
     missing: tuple[str, ...]
-
-
-@checked
-def datasheet(model: str | Path, *, seed: int = 0) -> Datasheet:
-    """Noise and returns of a sensor model, by its data sheet.
-
-    Stated ranges of detection become the range at which half of the pulses on 10 % reflectance
-    return, and stated shares of false alarms a rate. A beam whose divergence is known has 7
-    sub-rays.
-
-    Parameters
-    ----------
-    model
-        Name, such as "ouster/os1-64", or your own data file (.yaml).
-    seed
-        Of the noise.
-
-    Raises
-    ------
-    LidarpoolError
-        If there is no such model, or no data sheet of it could be read.
-
-    Examples
-    --------
-    >>> sheet = datasheet("livox/mid70")
-    >>> sheet.noise.range_m, round(sheet.noise.detection_range_m), sheet.returns.subrays
-    (0.02, 101, 7)
-    """
-    return read_model(model).datasheet(seed)
 
 
 def shown_noise(noise: Noise) -> str:
