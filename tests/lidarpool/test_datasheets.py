@@ -96,7 +96,7 @@ def test_two_precisions_of_one_energy_are_refused():
     far = {"sigma_m": 0.04, "range_m": 50, "reflectance": 0.1}
     stated = Performance(precision=(near, far), detection={"range_m": 100, "probability": 0.5})
     with pytest.raises(LidarpoolError, match="does not fall as the energy grows"):
-        stated.noise(1e-6, 0)
+        stated.noise(1e-6)
 
 
 def carried(**sections):
