@@ -217,18 +217,7 @@ class View:
         for number, way in enumerate(self.sensors):
             arrays[f"sensor{number}_times"] = way.times_ns / _NS
             arrays[f"sensor{number}_places"] = way.positions
-        meshes, shapes = shapes_of(self.actors)
-        arrays["actor_mesh"] = shapes.astype(np.int32)  # browsers have no arrays of int64
-        for number, mesh in enumerate(meshes):
-            arrays[f"mesh{number}_corners"] = mesh.vertices[mesh.faces].astype(np.float32)
-            if mesh.colours is not None:  # at the corners
-                arrays[f"mesh{number}_colours"] = mesh.colours.means().repeat(3, axis=0)
-        each = samples_each(self.actors, PLACES_MOST)
-        for number, actor in enumerate(self.actors):
-            times, places, turns = actor.samples(self.duration_ns, each)
-            arrays[f"actor{number}_times"] = times / _NS
-            arrays |= {f"actor{number}_places": places, f"actor{number}_turns": turns}
-            arrays[f"actor{number}_there"] = np.array(presence_ns(actor.trajectory)) / _NS
+        arrays |= self._moving()
         if self.sweeps is not None:
             arrays["sweep_scans"] = self.sweeps.scans.astype(np.float64)
             arrays["sweep_begins"] = self.sweeps.begins_ns / _NS
@@ -268,6 +257,32 @@ class View:
             "note": self.note,
         }  # fmt: skip
         return header, arrays
+
+    def _moving(self) -> dict[str, AnyArray]:
+        """Meshes of actors, where they are over time, and which of its poses a mesh has then."""
+        meshes, shapes = shapes_of(self.actors)
+        arrays: dict[str, AnyArray] = {
+            "actor_mesh": shapes.astype(np.int32)
+        }  # no int64 in browsers
+        for number, mesh in enumerate(meshes):
+            arrays[f"mesh{number}_corners"] = mesh.vertices[mesh.faces].astype(np.float32)
+            if mesh.colours is not None:  # at the corners
+                arrays[f"mesh{number}_colours"] = mesh.colours.means().repeat(3, axis=0)
+            if (own := mesh.animation) is not None:
+                arrays[f"mesh{number}_poses"] = own.vertices.astype(np.float32)
+                arrays[f"mesh{number}_faces"] = mesh.faces.astype(np.int32)
+        each = samples_each(self.actors, PLACES_MOST)
+        for number, actor in enumerate(self.actors):
+            times, places, turns = actor.samples(self.duration_ns, each)
+            arrays[f"actor{number}_times"] = times / _NS
+            arrays |= {f"actor{number}_places": places, f"actor{number}_turns": turns}
+            arrays[f"actor{number}_there"] = np.array(presence_ns(actor.trajectory)) / _NS
+            if (own := actor.mesh.animation) is not None:  # the page begins again after the last
+                frames, last = actor.seconds(times)[0] / own.step_s, len(own.vertices) - 1
+                arrays[f"actor{number}_frames"] = (
+                    frames if own.repeat else frames.clip(0, last * (1 - 1e-9))
+                )
+        return arrays
 
     @property
     def rays_shown(self) -> Floats32:

@@ -18,6 +18,7 @@ from ..columns.table import CAUSES, TABLE, Column, by_value
 from ..plan import Plan, Planning
 from ..scenario.build import Job
 from ..scene.actors import Actor, samples_each, shapes_of
+from ..scene.animation import Animation
 from ..scene.colours import Colours
 from ..scene.scene import Scene
 from ..scene.scene_mesh import SceneMesh
@@ -31,6 +32,7 @@ PICTURE_FILE = "pictures.npz"
 
 MODELS_MOST = 4  # sensors named in a picture
 PLACES_MOST = 1000  # positions of a moving sensor or actor
+POSED_MOST = 2_000_000  # vertices in all poses of all meshes: 1.4 bytes each of a walk
 _FORMAT = 6
 # {name in the file: field of an actor's track}
 _TRACK = {"times": "times_s", "positions": "positions", "quaternions": "quaternions"}
@@ -59,7 +61,7 @@ class SensorWay:
 class PictureContent:
     """Content of a result's pictures, except the points."""
 
-    scene: Scene  # trajectories of its actors have a thousand poses at most
+    scene: Scene  # its actors have a thousand places, and few poses if these are of many vertices
     sensors: Sequence[SensorWay]
     hit_counts: AnyArray  # (f,): of each triangle, those of actors after the others
     sample_rays: Floats32  # (k, 2, 3): ends of some rays, metres, local coordinates
@@ -92,7 +94,14 @@ class PictureContent:
         """Return what is pictured before there is a result, and which counters its hits have."""
         scene, survey = job.scene, job.survey
         each = samples_each(scene.actors, PLACES_MOST)
-        actors = tuple(_sampled(actor, survey.duration_ns, each) for actor in scene.actors)
+        meshes, which = shapes_of(scene.actors)
+        posed = sum(len(mesh.vertices) for mesh in meshes if mesh.animation)
+        most = POSED_MOST // max(posed, 1)
+        thin = [mesh.animation and mesh.animation.thinned(most) for mesh in meshes]
+        actors = tuple(
+            _sampled(actor, survey.duration_ns, each, thin[number])
+            for actor, number in zip(scene.actors, which, strict=True)
+        )
         ways = sensor_ways(survey)
         drawn = Drawn.of(cut(scene), near=[way.positions for way in ways])
         light = survey.carried[0].sensor.optics.wavelength_nm  # of the first sensor
@@ -177,11 +186,16 @@ class PictureContent:
                 raise TypeError(f"the trajectory of actor {actor.name!r} is not sampled")
             arrays |= {f"actor{number}_{n}": getattr(track, field) for n, field in _TRACK.items()}
             arrays[f"actor{number}_absent"] = track.beyond == "absent"
+        arrays["actor_offset"] = [actor.offset_s for actor in self.scene.actors]
         meshes, arrays["actor_mesh"] = shapes_of(self.scene.actors)
         for number, mesh in enumerate(meshes):
             arrays |= {f"mesh{number}_vertices": mesh.vertices, f"mesh{number}_faces": mesh.faces}
             if mesh.colours is not None:
                 arrays[f"mesh{number}_colours"] = mesh.colours.means()
+            if (own := mesh.animation) is not None:  # what changes packs to a seventh, exactly
+                steps = np.diff(own.vertices, axis=0, prepend=0)
+                arrays[f"mesh{number}_steps"] = steps.astype(np.float32)
+                arrays[f"mesh{number}_played"] = [own.step_s, own.speed_m_s or 0, own.repeat]
         if self.planning is not None and self.plan is not None:
             arrays |= {
                 "ends": [self.planning.start, self.planning.target],
@@ -208,16 +222,18 @@ class PictureContent:
             raise ValueError(f"it is of format {made}, not {_FORMAT}")
         names = json.loads(arrays["names"].tobytes())
         actors, which = [], arrays["actor_mesh"].tolist()
+        offsets = arrays.get("actor_offset", np.zeros(len(which)))
         meshes = [
             SceneMesh("", arrays[f"{mesh}_vertices"], arrays[f"{mesh}_faces"],
-                 colours=_colours(arrays, f"{mesh}_colours"))
+                 colours=_colours(arrays, f"{mesh}_colours"), animation=_animation(arrays, mesh))
             for mesh in (f"mesh{number}" for number in range(max(which, default=-1) + 1))
         ]  # fmt: skip
         for number, name in enumerate(names["actors"]):
             times, places, turns = (arrays[f"actor{number}_{part}"] for part in _TRACK)
             beyond: Beyond = "absent" if arrays[f"actor{number}_absent"] else "hold"
             way = Track(times, places, turns, start_s=0.0, beyond=beyond)
-            actors.append(Actor(replace(meshes[which[number]], name=name), way))
+            mesh = replace(meshes[which[number]], name=name)
+            actors.append(Actor(mesh, way, float(offsets[number])))
         scene = Scene(
             arrays["vertices"],
             arrays["faces"],
@@ -251,6 +267,15 @@ def _colours(arrays: Mapping[str, Any], name: str) -> Colours | None:
     return Colours.of_faces(arrays[name]) if name in arrays else None
 
 
+def _animation(arrays: Mapping[str, Any], mesh: str) -> Animation | None:
+    """Poses of a mesh, if it has some."""
+    if f"{mesh}_steps" not in arrays:
+        return None
+    step_s, speed, repeat = arrays[f"{mesh}_played"].tolist()
+    poses = arrays[f"{mesh}_steps"].cumsum(axis=0, dtype=np.float64)
+    return Animation(poses, step_s, speed or None, bool(repeat))
+
+
 def sensor_ways(survey: Survey) -> list[SensorWay]:
     """Positions of each sensor: at each station, or samples of its trajectory."""
     path, ways, first = survey.path, [], 0
@@ -281,8 +306,15 @@ def ways_of(
     return [*(way.positions for way in sensors), *ways]
 
 
-def _sampled(actor: Actor, duration_ns: float, count: int) -> Actor:
-    """Return an actor with poses of a survey, whatever its trajectory is."""
+def _sampled(actor: Actor, duration_ns: float, count: int, animation: Animation | None) -> Actor:
+    """Return an actor with places of a survey, whatever its trajectory is, and thinned poses."""
     times, places, turns = actor.samples(duration_ns, count)
     beyond: Beyond = "hold" if presence_ns(actor.trajectory) == ALWAYS else "absent"
-    return replace(actor, trajectory=Track(times / 1e9, places, turns, start_s=0.0, beyond=beyond))
+    way = Track(times / 1e9, places, turns, start_s=0.0, beyond=beyond)
+    sampled = replace(actor, trajectory=way)
+    if animation is None:
+        return sampled
+    # The animation may follow the way, and the samples lack the part before the survey.
+    missing_s = actor.seconds(times[:1])[0] - sampled.seconds(times[:1])[0]
+    mesh = replace(actor.mesh, animation=animation)
+    return replace(sampled, mesh=mesh, offset_s=actor.offset_s + float(missing_s[0]))

@@ -72,6 +72,13 @@ class Animation:
         here, then = self.vertices[begin, vertex], self.vertices[begin + 1, vertex]
         return (1 - share) * here + share * then, then - here
 
+    def thinned(self, most: int) -> Animation:
+        """Return it for pictures: at most so many poses, in steps of 1/1024 m, which pack well."""
+        count = min(len(self.vertices), max(most, 2))
+        poses, _ = self.at(np.linspace(0, len(self.vertices) - 1, count))
+        step_s = self.duration_s / (count - 1)
+        return replace(self, vertices=np.round(1024 * poses) / 1024, step_s=step_s)
+
     @cached_property
     def bounds(self) -> Floats:
         """Corners of the box of all poses: (2, 3)."""
