@@ -24,12 +24,12 @@ from lidarpool import (
 from lidarpool.columns.cloud import Cloud
 from lidarpool.export.boxes import Boxes
 from lidarpool.export.sweeps import Sweeps
-from lidarpool.run.picture_file import POSED_MOST, PictureContent
+from lidarpool.run.picture_file import PictureContent
 from lidarpool.scenario.advice import advice
 from lidarpool.scenario.build import Job, build
 from lidarpool.scenario.scenario import Scenario
 from lidarpool.scene.actors import box, one_mesh, shapes_of
-from lidarpool.scene.animation import Animation
+from lidarpool.scene.animation import PICTURED, Animation
 from lidarpool.scene.files.meshfile import load_objects
 from lidarpool.scene.scene_mesh import SceneMesh
 from lidarpool.scene.wheels import rolling
@@ -454,7 +454,7 @@ def test_poses_of_many_vertices_are_fewer_in_pictures(tmp_path):
     faces = np.stack([np.arange(2), np.arange(2) + 1, np.arange(2) + 2], axis=1)
     mesh = SceneMesh("Ring", points, faces, animation=Animation(poses, 1 / 60, repeat=False))
     (ring,) = drawn_again([Actor(mesh)], tmp_path / "p.npz")
-    assert ring.mesh.animation.vertices.shape == (POSED_MOST // 50_000, 50_000, 3)
+    assert ring.mesh.animation.vertices.shape == (PICTURED // 50_000, 50_000, 3)
     for time_ns in (0, 0.77e9, 2e9, 2.5e9):
         want = points * (1 + min(time_ns / 2e9, 1))
         np.testing.assert_allclose(ring.placed(time_ns).vertices, want, atol=1e-3)

@@ -32,7 +32,6 @@ PICTURE_FILE = "pictures.npz"
 
 MODELS_MOST = 4  # sensors named in a picture
 PLACES_MOST = 1000  # positions of a moving sensor or actor
-POSED_MOST = 2_000_000  # vertices in all poses of all meshes: 1.4 bytes each of a walk
 _FORMAT = 6
 # {name in the file: field of an actor's track}
 _TRACK = {"times": "times_s", "positions": "positions", "quaternions": "quaternions"}
@@ -61,7 +60,7 @@ class SensorWay:
 class PictureContent:
     """Content of a result's pictures, except the points."""
 
-    scene: Scene  # its actors have a thousand places, and few poses if these are of many vertices
+    scene: Scene  # its actors have a thousand places at most, and poses for pictures
     sensors: Sequence[SensorWay]
     hit_counts: AnyArray  # (f,): of each triangle, those of actors after the others
     sample_rays: Floats32  # (k, 2, 3): ends of some rays, metres, local coordinates
@@ -94,14 +93,7 @@ class PictureContent:
         """Return what is pictured before there is a result, and which counters its hits have."""
         scene, survey = job.scene, job.survey
         each = samples_each(scene.actors, PLACES_MOST)
-        meshes, which = shapes_of(scene.actors)
-        posed = sum(len(mesh.vertices) for mesh in meshes if mesh.animation)
-        most = POSED_MOST // max(posed, 1)
-        thin = [mesh.animation and mesh.animation.thinned(most) for mesh in meshes]
-        actors = tuple(
-            _sampled(actor, survey.duration_ns, each, thin[number])
-            for actor, number in zip(scene.actors, which, strict=True)
-        )
+        actors = tuple(_sampled(actor, survey.duration_ns, each) for actor in scene.actors)
         ways = sensor_ways(survey)
         drawn = Drawn.of(cut(scene), near=[way.positions for way in ways])
         light = survey.carried[0].sensor.optics.wavelength_nm  # of the first sensor
@@ -192,7 +184,7 @@ class PictureContent:
             arrays |= {f"mesh{number}_vertices": mesh.vertices, f"mesh{number}_faces": mesh.faces}
             if mesh.colours is not None:
                 arrays[f"mesh{number}_colours"] = mesh.colours.means()
-            if (own := mesh.animation) is not None:  # what changes packs to a seventh, exactly
+            if (own := mesh.animation) is not None:  # what changes packs to a third
                 steps = np.diff(own.vertices, axis=0, prepend=0)
                 arrays[f"mesh{number}_steps"] = steps.astype(np.float32)
                 arrays[f"mesh{number}_played"] = [own.step_s, own.speed_m_s or 0, own.repeat]
@@ -222,7 +214,7 @@ class PictureContent:
             raise ValueError(f"it is of format {made}, not {_FORMAT}")
         names = json.loads(arrays["names"].tobytes())
         actors, which = [], arrays["actor_mesh"].tolist()
-        offsets = arrays.get("actor_offset", np.zeros(len(which)))
+        offsets = arrays.get("actor_offset", np.zeros(len(which))).tolist()
         meshes = [
             SceneMesh("", arrays[f"{mesh}_vertices"], arrays[f"{mesh}_faces"],
                  colours=_colours(arrays, f"{mesh}_colours"), animation=_animation(arrays, mesh))
@@ -232,8 +224,7 @@ class PictureContent:
             times, places, turns = (arrays[f"actor{number}_{part}"] for part in _TRACK)
             beyond: Beyond = "absent" if arrays[f"actor{number}_absent"] else "hold"
             way = Track(times, places, turns, start_s=0.0, beyond=beyond)
-            mesh = replace(meshes[which[number]], name=name)
-            actors.append(Actor(mesh, way, float(offsets[number])))
+            actors.append(Actor(replace(meshes[which[number]], name=name), way, offsets[number]))
         scene = Scene(
             arrays["vertices"],
             arrays["faces"],
@@ -269,11 +260,10 @@ def _colours(arrays: Mapping[str, Any], name: str) -> Colours | None:
 
 def _animation(arrays: Mapping[str, Any], mesh: str) -> Animation | None:
     """Poses of a mesh, if it has some."""
-    if f"{mesh}_steps" not in arrays:
+    if (steps := arrays.get(f"{mesh}_steps")) is None:
         return None
     step_s, speed, repeat = arrays[f"{mesh}_played"].tolist()
-    poses = arrays[f"{mesh}_steps"].cumsum(axis=0, dtype=np.float64)
-    return Animation(poses, step_s, speed or None, bool(repeat))
+    return Animation(steps.cumsum(0, np.float64), step_s, speed or None, bool(repeat))
 
 
 def sensor_ways(survey: Survey) -> list[SensorWay]:
@@ -306,15 +296,15 @@ def ways_of(
     return [*(way.positions for way in sensors), *ways]
 
 
-def _sampled(actor: Actor, duration_ns: float, count: int, animation: Animation | None) -> Actor:
-    """Return an actor with places of a survey, whatever its trajectory is, and thinned poses."""
+def _sampled(actor: Actor, duration_ns: float, count: int) -> Actor:
+    """Return an actor with poses of a survey, whatever its trajectory is."""
     times, places, turns = actor.samples(duration_ns, count)
     beyond: Beyond = "hold" if presence_ns(actor.trajectory) == ALWAYS else "absent"
     way = Track(times / 1e9, places, turns, start_s=0.0, beyond=beyond)
     sampled = replace(actor, trajectory=way)
-    if animation is None:
+    if (own := actor.mesh.animation) is None:
         return sampled
     # The animation may follow the way, and the samples lack the part before the survey.
     missing_s = actor.seconds(times[:1])[0] - sampled.seconds(times[:1])[0]
-    mesh = replace(actor.mesh, animation=animation)
+    mesh = replace(actor.mesh, animation=own.pictured)
     return replace(sampled, mesh=mesh, offset_s=actor.offset_s + float(missing_s[0]))

@@ -103,11 +103,9 @@ function placeAt(times, places, time, moves, width = 3) {
 // Bends the mesh of an actor as it is at a frame: at 1.5 half way from its second pose to the third.
 function bend({ mesh, poses, faces }, frame) {
   const [count, vertices] = poses.shape, at = frame - (count - 1) * Math.floor(frame / (count - 1));
-  const first = 3 * vertices * Math.floor(at), corners = mesh.geometry.attributes.position;
-  for (let k = 0; k < corners.array.length; k++) {
-    const here = first + 3 * faces[Math.floor(k / 3)] + (k % 3);
-    corners.array[k] = lerp(poses[here], poses[here + 3 * vertices], at % 1);
-  }
+  const corners = mesh.geometry.attributes.position;
+  const here = (k) => 3 * (vertices * Math.floor(at) + faces[Math.floor(k / 3)]) + (k % 3);
+  corners.array.forEach((_, k, all) => { all[k] = lerp(poses[here(k)], poses[here(k) + 3 * vertices], at % 1); });
   corners.needsUpdate = true;
 }
 
