@@ -178,13 +178,14 @@ class PictureContent:
                 raise TypeError(f"the trajectory of actor {actor.name!r} is not sampled")
             arrays |= {f"actor{number}_{n}": getattr(track, field) for n, field in _TRACK.items()}
             arrays[f"actor{number}_absent"] = track.beyond == "absent"
-        arrays["actor_offset"] = [actor.offset_s for actor in self.scene.actors]
+            if actor.mesh.animation is not None:
+                arrays[f"actor{number}_offset"] = actor.offset_s
         meshes, arrays["actor_mesh"] = shapes_of(self.scene.actors)
         for number, mesh in enumerate(meshes):
             arrays |= {f"mesh{number}_vertices": mesh.vertices, f"mesh{number}_faces": mesh.faces}
             if mesh.colours is not None:
                 arrays[f"mesh{number}_colours"] = mesh.colours.means()
-            if (own := mesh.animation) is not None:  # what changes packs to a third
+            if (own := mesh.animation) is not None:  # differences compress to a third of the size
                 steps = np.diff(own.vertices, axis=0, prepend=0)
                 arrays[f"mesh{number}_steps"] = steps.astype(np.float32)
                 arrays[f"mesh{number}_played"] = [own.step_s, own.speed_m_s or 0, own.repeat]
@@ -214,7 +215,6 @@ class PictureContent:
             raise ValueError(f"it is of format {made}, not {_FORMAT}")
         names = json.loads(arrays["names"].tobytes())
         actors, which = [], arrays["actor_mesh"].tolist()
-        offsets = arrays.get("actor_offset", np.zeros(len(which))).tolist()
         meshes = [
             SceneMesh("", arrays[f"{mesh}_vertices"], arrays[f"{mesh}_faces"],
                  colours=_colours(arrays, f"{mesh}_colours"), animation=_animation(arrays, mesh))
@@ -224,7 +224,8 @@ class PictureContent:
             times, places, turns = (arrays[f"actor{number}_{part}"] for part in _TRACK)
             beyond: Beyond = "absent" if arrays[f"actor{number}_absent"] else "hold"
             way = Track(times, places, turns, start_s=0.0, beyond=beyond)
-            actors.append(Actor(replace(meshes[which[number]], name=name), way, offsets[number]))
+            offset_s = float(arrays.get(f"actor{number}_offset", 0))  # without poses, there is none
+            actors.append(Actor(replace(meshes[which[number]], name=name), way, offset_s))
         scene = Scene(
             arrays["vertices"],
             arrays["faces"],
@@ -300,11 +301,10 @@ def _sampled(actor: Actor, duration_ns: float, count: int) -> Actor:
     """Return an actor with poses of a survey, whatever its trajectory is."""
     times, places, turns = actor.samples(duration_ns, count)
     beyond: Beyond = "hold" if presence_ns(actor.trajectory) == ALWAYS else "absent"
-    way = Track(times / 1e9, places, turns, start_s=0.0, beyond=beyond)
-    sampled = replace(actor, trajectory=way)
+    shown = replace(actor, trajectory=Track(times / 1e9, places, turns, start_s=0.0, beyond=beyond))
     if (own := actor.mesh.animation) is None:
-        return sampled
-    # The animation may follow the way, and the samples lack the part before the survey.
-    missing_s = actor.seconds(times[:1])[0] - sampled.seconds(times[:1])[0]
+        return shown
+    # The animation may follow the way, of which the samples lack the part before the survey.
+    missing_s = actor.seconds(times[:1])[0] - shown.seconds(times[:1])[0]
     mesh = replace(actor.mesh, animation=own.pictured)
-    return replace(sampled, mesh=mesh, offset_s=actor.offset_s + float(missing_s[0]))
+    return replace(shown, mesh=mesh, offset_s=actor.offset_s + float(missing_s[0]))

@@ -12,7 +12,7 @@ from ..base.errors import LidarpoolError
 from ..base.vectors import turned
 
 RATE_HZ = 60.0  # of poses that are baked, at least
-PICTURED = 500_000  # vertices in all poses of a mesh in pictures: 1.4 bytes each of a walk
+PICTURED = 500_000  # most vertices in all poses of a mesh in pictures; a walk's compress to 1.4 B
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,7 +75,7 @@ class Animation:
 
     @cached_property
     def pictured(self) -> Animation:
-        """It for pictures: fewer poses of many vertices, in steps of 1/1024 m, which pack well."""
+        """The same for pictures: fewer poses if they have many vertices, rounded to 1/1024 m."""
         steps = min(len(self.vertices), max(PICTURED // self.vertices.shape[1], 2)) - 1
         poses, _ = self.at(np.linspace(0, len(self.vertices) - 1, steps + 1))
         return replace(self, vertices=np.round(1024 * poses) / 1024, step_s=self.duration_s / steps)
