@@ -211,6 +211,15 @@ def test_a_wheel_of_a_file_turns_as_animated_even_if_it_shrinks_to_nothing(tmp_p
         (lambda h: h["nodes"][2].update(matrix=np.eye(4).ravel().tolist()), "Move",
          "node 2 is animated, and has a matrix"),
         (lambda h: h["animations"][0]["samplers"][0].update(input=0), "Move", "do not ascend"),
+        (lambda h: h["animations"][0]["channels"][0]["target"].update(node=9), "Move", "index out"),
+        (lambda h: h["animations"][0].update(channels=[]), "Move", "animation that moves no node"),
+        (lambda h: h["animations"][0].update(samplers=[]), "Move", "without a duration"),
+        (lambda h: h["animations"][0]["samplers"][0].update(interpolation="EASE"), "", "'EASE'"),
+        (lambda h: (h["animations"][0]["samplers"][0].update(interpolation="CUBICSPLINE"),
+                    h["accessors"][-1].update(type="SCALAR", count=12)), "Move",
+         "keys of a translation have 1 numbers, not 3"),
+        (lambda h: h["animations"][0]["channels"][0]["target"].update(node=0, path="weights"),
+         "Move", "node 0 has 3 animated weights"),
     ],
 )  # fmt: skip
 def test_unusable_animations_are_refused_in_a_line(tmp_path, edit, name, message):
@@ -221,6 +230,59 @@ def test_unusable_animations_are_refused_in_a_line(tmp_path, edit, name, message
     with pytest.raises(LidarpoolError, match=message) as told:
         load_objects(path, animation=name)
     assert "\n" not in str(told.value)
+
+
+@pytest.mark.parametrize(
+    ("keys", "way", "message"),
+    [([0, 1e9], 1, "would unpack to .*: shorten its animation"),
+     ([0, 1], 1e30, "farther than anything on Earth")],
+)  # fmt: skip
+def test_endless_animations_and_ways_are_refused(tmp_path, keys, way, message):
+    made = skinned()
+    made.moved(2, "translation", keys, [0, 1, 0, way, 1, 0])
+    with pytest.raises(LidarpoolError, match=message):
+        load_objects(made.write(tmp_path / "m.gltf"), animation="Move")
+
+
+def test_where_the_node_of_a_skin_is_does_not_matter(tmp_path):
+    """Even if it has no size meanwhile."""
+    poses = []
+    for shrinks in (False, True):
+        made = skinned()
+        made.moved(2, "translation", KEYS, np.reshape(MOVES, -1))
+        if shrinks:
+            made.moved(0, "scale", [0.25, 0.75, 1.25], [1, 1, 1, 0, 0, 0, 1, 1, 1])
+        found = load_objects(made.write(tmp_path / "m.gltf"), animation="Move")
+        poses.append(found.standing[0].animation.vertices)
+    assert np.array_equal(*poses)
+
+
+def test_a_chain_of_five_hundred_joints(tmp_path):
+    """Each turns by 90° in 500 parts: the last one goes around a circle's quarter."""
+    made, count = skinned(), 500
+    first = np.eye(4)[None].repeat(count, axis=0)
+    first[:, 3, 1] = -np.arange(count) / count  # columns
+    attributes = made.header["meshes"][0]["primitives"][0]["attributes"]
+    attributes["JOINTS_0"] = made.stored([[count - 1, 0, 0, 0]] * 5, "H", 4)
+    attributes["WEIGHTS_0"] = made.stored([[1, 0, 0, 0]] * 5, width=4)
+    made.header["skins"] = [
+        {"joints": list(range(1, count + 1)), "inverseBindMatrices": made.stored(first, width=16)}
+    ]
+    made.header["nodes"] = [
+        {"mesh": 0, "skin": 0, "weights": [0, 0]}, {"children": [2]},
+        *({"translation": [0, 1 / count, 0], "children": [k]} for k in range(3, count + 1)),
+        {"translation": [0, 1 / count, 0]},
+    ]  # fmt: skip
+    half = np.pi / 4 / count
+    for joint in range(1, count + 1):
+        made.moved(joint, "rotation", [0, 1], [0, 0, 0, 1, 0, 0, np.sin(half), np.cos(half)])
+    found = load_objects(made.write(tmp_path / "m.gltf"), animation="Move", up_axis="z")
+    poses = found.standing[0].animation.vertices
+    np.testing.assert_allclose(poses[0], CORNERS, atol=1e-4)
+    tip = np.array([0, (count - 1) / count, 0])
+    x, y, z = (CORNERS - tip).T
+    arc = 2 / np.pi * np.array([-1, 1, 0])
+    np.testing.assert_allclose(poses[60], np.stack([-y, x, z], axis=1) + arc, atol=3e-3)
 
 
 def test_only_gltf_has_animations(tmp_path):
