@@ -515,8 +515,15 @@ def test_wheels_turn_by_speed_over_radius():
         "wheel_flat has no axle, and does not turn: it is 0.6 m long and 0.3 m high, not round "
         "about y"
     ]
-    with pytest.raises(LidarpoolError, match=r"no object that wheels names \(whel\*\) can turn"):
-        rolling(parts, ["whel*"], notes.append)
+    nut = ring("wheel_nut", 0.01, [1.2, 0.9, 0.3])
+    rolling([*parts, nut], ["wheel*"], notes.append)
+    assert notes[1:] == ["wheel_nut is 60 times smaller than the largest, and does not turn"]
+    with pytest.raises(
+        LidarpoolError, match=r"no object that wheels names \(axle\) can turn\. There"
+    ):
+        rolling(parts, ["axle"], notes.append)
+    with pytest.raises(LidarpoolError, match=r"can turn: wheel_flat has no axle, .* about y\.$"):
+        rolling([*parts, flat], ["wheel_flat"], notes.append)
 
 
 def scenario(folder, *actors, **sections):
