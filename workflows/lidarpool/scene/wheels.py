@@ -45,9 +45,14 @@ def rolling(
     Raises
     ------
     LidarpoolError
-        If no object has such a name, or none of them is round.
+        If no object has one of the names, or none of them is round.
     """
     flat = [one.flat() if isinstance(one, SceneInstance) else one for one in objects]
+    names = [one.name for one in flat]
+    for wheel in wheels:
+        if not any(fnmatchcase(name, wheel) for name in names):
+            hint = did_you_mean(wheel, names) or f" There are {', '.join(names[:5])}."
+            raise LidarpoolError(f"wheels names {wheel!r}, but no object has that name.{hint}")
     radii: dict[int, float] = {}
     still: list[str] = []  # notes on wheels that are not round
     for number, one in enumerate(flat):
@@ -61,10 +66,7 @@ def rolling(
             else:
                 radii[number] = height / 2
     if not radii:
-        names = [one.name for one in flat]
-        hint = did_you_mean(wheels[0], names) or f" There are {', '.join(names[:5])}."
-        why = f": {still[0]}." if still else f".{hint}"
-        raise LidarpoolError(f"no object that wheels names ({', '.join(wheels)}) can turn{why}")
+        raise LidarpoolError(f"no object that wheels names can turn: {still[0]}.")
     largest = max(radii.values())
     turns = {number: round(largest / radius) for number, radius in radii.items()}
     for number in [number for number, own in turns.items() if own > _TURNS_MOST]:
