@@ -591,6 +591,12 @@ def test_people_of_traffic_walk_at_their_own_speed_and_out_of_step(tmp_path):
 
 def test_bad_animations_are_refused():
     mesh = box("Box", (1, 1, 1))
+    poses = np.stack([mesh.vertices] * 2)
+    assert np.array_equal(Animation(poses.astype("f").tolist(), 1).vertices, poses)
+    with pytest.raises(LidarpoolError, match="step_s is inf; it must be a finite number"):
+        Animation(poses, np.inf)
+    with pytest.raises(LidarpoolError, match=r"vertices of an animation is 'abc'; it must be an a"):
+        Animation("abc", 1)
     with pytest.raises(LidarpoolError, match=r"of two poses at least.*given: \(1, 8, 3\), 0.1 s"):
         Animation(mesh.vertices[None], 0.1)
     with pytest.raises(LidarpoolError, match=r"above 0; given.* 0 s, None"):

@@ -9,12 +9,14 @@ import numpy as np
 
 from ..base.arrays import Floats, Indices
 from ..base.errors import LidarpoolError
+from ..base.validation import as_array, checked_fields
 from ..base.vectors import turned
 
 RATE_HZ = 60.0  # of poses that are baked, at least
 
 
 @dataclass(frozen=True, eq=False)
+@checked_fields
 class Animation:
     """Poses of a mesh, evenly spaced, between which its vertices move straight.
 
@@ -44,6 +46,8 @@ class Animation:
     repeat: bool = True
 
     def __post_init__(self) -> None:
+        poses = as_array("vertices of an animation", self.vertices)
+        object.__setattr__(self, "vertices", np.ascontiguousarray(poses))
         shape, speed = np.shape(self.vertices), self.speed_m_s
         good = len(shape) == 3 and shape[0] > 1 and shape[2] == 3
         good = good and self.step_s > 0 and (speed is None or speed > 0)
