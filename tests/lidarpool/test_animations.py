@@ -472,6 +472,25 @@ def test_boxes_hold_the_points_of_people_who_walk(walker, tmp_path):
     np.testing.assert_allclose(scales, sizes)
 
 
+@pytest.mark.parametrize("repeat", [True, False])
+def test_boxes_are_as_large_as_the_poses_between_two_times(repeat):
+    """Also where an animation begins again elsewhere than it ends, and before and after it."""
+    random = np.random.default_rng(5)
+    animation = Animation(random.normal(size=(7, 4, 3)), 0.25, repeat=repeat)
+    begins = np.append(random.uniform(-2, 4, 200), [0, 1.25, 1.5, -1, 9])
+    ends = begins + np.append(random.uniform(0, 1, 200), [0, 0.25, 0.25, 0.5, 0])
+    for begin, end, found in zip(begins, ends, animation.bounds_between(begins, ends), strict=True):
+        inner = np.arange(np.ceil(begin / 0.25), np.floor(end / 0.25) + 1) * 0.25
+        times = np.unique([begin, *inner, end])
+        ways = np.append(times[:-1] + 1e-9, times[1:] - 1e-9) if len(times) > 1 else times
+        frames = animation.frames(ways)
+        shown = animation.at(frames)[0]
+        kept = animation.vertices[np.append(np.floor(frames), np.ceil(frames)).astype(int)]
+        for poses, sign in ((shown, 1), (kept, -1)):  # it holds the first, and no more than these
+            corners = np.stack([poses.min(axis=(0, 1)), poses.max(axis=(0, 1))])
+            assert (sign * (found - corners) * [[-1], [1]] >= -1e-6).all(), (begin, end)
+
+
 def _saved(sweeps, path):
     sweeps.save(path)
     return path

@@ -9,7 +9,7 @@ import tempfile
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, NamedTuple
 
 import numpy as np
 from dask.system import CPU_COUNT
@@ -44,7 +44,7 @@ from ..scenario.scenario import Scenario
 from ..scene.actors import shapes_of
 from ..scene.scene import Scene
 from ..scene.simplified import DRAWN_TRIANGLES
-from ..sensor import Noise, Sensor, Survey
+from ..sensor import Sensor, Survey
 from ..sensor.beams import Beams
 from ..simulator.memory import MB, cast_bytes, scans_that_fit
 from ..simulator.rig import PATTERN_RAYS, Rig
@@ -72,7 +72,6 @@ _FINE = 1e-6  # edges below this share of a mesh's size are beyond float32
 
 LOOKED_AT = 5  # jobs of a campaign
 # Rays that are sampled, parts of the survey, and consecutive scans of each part, at most.
-N = TypeVar("N", Noise, Noise | None)
 SAMPLE_RAYS, SAMPLE_PARTS, SAMPLE_SCANS = 500_000, 500, 40
 GOLDEN = (5**0.5 - 1) / 2
 
@@ -331,16 +330,18 @@ def sample_survey(scene: Scene, survey: Survey, backend: str = "auto") -> dict[s
     rays = survey.ray_count * subrays * int((stops - firsts).sum()) // survey.scan_count
     sampled = survey
     if (every := -(-rays // SAMPLE_RAYS)) > 1:
+        # Faults and errors of certain channels do not fit one beam, and change few hits.
+        other: dict[str, Any] = {"channel_bias_m": 0.0, "ripple_deg": 0.0}
         carried = [
             replace(
                 one,
                 sensor=_FewRays.of(one.sensor, every),
                 steps=steps,
-                noise=_of_any_beam(one.noise),
+                noise=one.noise and replace(one.noise, **other),
             )
             for one, steps in zip(survey.carried, survey.steps_each, strict=True)
         ]
-        noise = _of_any_beam(survey.noise)
+        noise = replace(survey.noise, **other)
         sampled = replace(survey, sensors=carried, noise=noise, faults=())
     rig = Rig(scene, sampled, backend)
     cast = whole = hits = points = 0
@@ -353,11 +354,6 @@ def sample_survey(scene: Scene, survey: Survey, backend: str = "auto") -> dict[s
             points += int(np.ceil(found.hits * every / survey.keep_every).sum())
     share = survey.ray_count / whole
     return {"rays": cast, "hits": round(hits * share), "points": round(points * share)}
-
-
-def _of_any_beam(noise: N) -> N:
-    """Return noise without errors of certain channels and angles, which change few hits."""
-    return noise and replace(noise, channel_bias_m=0.0, ripple_deg=0.0)
 
 
 @dataclass(frozen=True, eq=False)

@@ -293,8 +293,7 @@ class _Reader:
                 raise ValueError("nodes contain each other")
         for at in reversed(path):
             if at not in worlds:
-                above = self._parents.get(at)
-                own = self._local(at)
+                own, above = self._local(at), self._parents.get(at)
                 worlds[at] = own if above is None else matmul(worlds[above], own)
         return worlds[index]
 
