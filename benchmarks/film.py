@@ -26,7 +26,7 @@ from lidarpool.scene.generated.city import city
 
 from .realism import TURN_S, cases
 
-SIZE, BACK = (960, 540), np.array([14, 17, 22, 255]) / 255
+SIZE, BACK = (720, 405), np.array([14, 17, 22, 255]) / 255
 EYE, TARGET = np.array([-38.0, -30.0, 34.0]), np.array([4.0, 4.0, 0.0])
 RAISED = 12.0  # metres above the ground with the last colour
 
@@ -63,7 +63,7 @@ def main(arguments: list[str] | None = None) -> int:
     ahead = unit((TARGET - EYE)[None])
     right = unit(np.cross(ahead, [0.0, 0.0, 1.0]))
     axes = np.concatenate([right, np.cross(right, ahead), ahead])
-    camera = Camera(EYE, axes, 800.0, np.array(SIZE) / 2, SIZE)
+    camera = Camera(EYE, axes, 600.0, np.array(SIZE) / 2, SIZE)
     context = get_context("spawn")
     here, there = context.Pipe()
     caster = context.Process(

@@ -12,15 +12,15 @@ import argparse
 import warnings
 from dataclasses import replace
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
 
-from lidarpool import LidarpoolError, Noise, datasheet, fit
+from lidarpool import LidarpoolError, Noise, fit
 from lidarpool.compare.fit import Repeats, smooth_rays, surfaces
 from lidarpool.compare.recordings import Recording, open_recording
+from lidarpool.sensor.models import read_model
 
 COLOURS = {"recorded": "#1c2430", "data sheet": "#ee7733", "fitted": "#4477aa"}
 
@@ -62,11 +62,9 @@ def compared(recording: Recording, model: str, white: float | None) -> tuple[dic
     turn, *_ = surfaces(other, middle, other.sigma)
     energy = np.maximum(rays.light / (white or recording.white or 100), 1 / 400)
     energy = energy * (10 / rays.distance) ** 2
-    with TemporaryDirectory() as folder:
-        fitted = datasheet(found.save(Path(folder) / "fitted.yaml")[0]).noise
-    fitted = replace(fitted, dropout=found.figures["figures"]["dropout"]["value"])
+    fitted = found.model.datasheet().noise
     try:
-        sheet = datasheet(model).noise
+        sheet = read_model(model).datasheet().noise
     except LidarpoolError:
         sheet = Noise()
     cell = rays.row, rays.column

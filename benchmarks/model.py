@@ -1,10 +1,10 @@
 """A small model of a run, for clusters that nobody here has: `python -m benchmarks.model`.
 
-Batches go round, as many as the driver has under way: it offers one, the scheduler sends it, the
-next free GPU worker casts it, a collector stores it, scheduler and driver take the receipt. Each of
-them does one thing at a time. What driver, scheduler and collectors take is read with
-`benchmarks.scale`; `--read` compares the model with other runs of it, and `--picture` draws how
-busy the GPUs of one scheduler are.
+Tasks go round, as many as the driver has under way: it offers one, the scheduler sends it, the
+next free GPU worker casts its batches, a collector stores them, scheduler and driver take the
+receipts. Each of them does one thing at a time. What they take, for a task and for each receipt in
+it, is read with `benchmarks.scale`; `--read` compares the model with other runs of it, whose
+processes share `--cores`, and `--picture` draws how busy the GPUs of one scheduler are.
 """
 
 from __future__ import annotations
@@ -14,83 +14,103 @@ import heapq
 import json
 from collections import Counter
 from dataclasses import dataclass
-from itertools import count
+from itertools import count, product
 from pathlib import Path
 from random import Random
 from typing import Any
 
 from benchmarks.scale import GPUS_EACH
-from lidarpool.pipeline.policies import most_under_way
+from lidarpool.pipeline.policies import batches_per_task, most_under_way
 
 GPUS = (10, 20, 50, 100, 200, 500, 1_000, 2_000, 5_000, 10_000)
 HEARTBEATS = 0.07  # share of the scheduler's core; Dask has 200 a second at most
 VARY = 0.1  # share by which the times of tasks differ, so that they do not end together
 ROUNDS = 6  # of all tasks that are under way; the first does not count
-STEPS = ("driver", "scheduler", "cast", "collect", "scheduler", "driver")  # of a task
-SECONDS = (0.2, 1.0, 4.0)  # of a casting task
+STEPS = ("driver", "scheduler", "casting", "collectors", "scheduler", "driver")  # of a task
+RECEIPT = 3  # the first of the steps that take longer with each receipt
+SECONDS = (0.05, 0.2, 1.0)  # of casting a batch
 
 
 @dataclass(frozen=True)
 class Costs:
-    """Seconds of each process for a task with one batch.
+    """Seconds of processor time of each process: {name: (for a task, for each receipt in it)}.
 
     Of the scheduler's, `member` comes with each GPU worker, for Dask looks at all of them.
     """
 
-    driver: float
-    scheduler: float
-    collector: float
+    each: dict[str, tuple[float, float]]
     member: float
 
-    def at_scheduler(self, gpus: int) -> float:
-        """Seconds of the scheduler for a task, in a cluster of so many GPU workers."""
-        return (self.scheduler + gpus * self.member) / (1 - HEARTBEATS)
+    def step(self, number: int, gpus: int, batches: int) -> float:
+        """Seconds of a step of a task with so many batches."""
+        name = STEPS[number]
+        task, receipt = self.each[name]
+        task += gpus * self.member if name == "scheduler" else 0
+        seconds = task / STEPS.count(name) + (batches * receipt if number >= RECEIPT - 1 else 0)
+        return seconds / (1 - HEARTBEATS) if name == "scheduler" else seconds
 
 
-def collectors_of(gpus: int) -> range:
-    """Give the collectors of so many GPU workers, as `benchmarks.scale` starts them."""
-    return range(max(2, gpus // GPUS_EACH))
+def collectors_of(gpus: int) -> int:
+    """Give the number of collectors of so many GPU workers, as `benchmarks.scale` starts them."""
+    return max(2, gpus // GPUS_EACH)
 
 
-def tasks_a_second(gpus: int, seconds: float, costs: Costs) -> float:
-    """Casting tasks of so many seconds that one scheduler's cluster does in a second."""
-    takes = {"driver": costs.driver / 2, "scheduler": costs.at_scheduler(gpus) / 2}
+def batches_a_second(
+    gpus: int, seconds: float, costs: Costs, cores: int | None = None, shards: int = 1
+) -> float:
+    """Batches of so many seconds that clusters with a scheduler each cast in a second, together.
+
+    Their processes share `cores`; None: each has its own.
+    """
+    batches = batches_per_task([(seconds, 1)], gpus)
+    takes = [costs.step(number, gpus, batches) for number in range(len(STEPS))]
     free: Counter[Any] = Counter()  # {process: when it is free}
-    slots, vary = [0.0] * gpus, Random(1).uniform  # when each slot is free: a heap
-    collectors, number, done = collectors_of(gpus), count(), 0
-    most, begin = most_under_way(gpus, len(collectors)), 0.0
-    events = [(0.0, next(number), 0) for _ in range(most)]
+    idle = [0.0] * (cores or 0)  # when each core is free: a heap
+    slots = [[0.0] * gpus for _ in range(shards)]  # when each slot is free: heaps
+    vary, number, done = Random(1).uniform, count(), 0
+    most, begin = shards * most_under_way(gpus, collectors_of(gpus)), 0.0
+    events = [(0.0, next(number), n % shards, 0) for n in range(most)]
     while done < ROUNDS * most:
-        now, _, step = heapq.heappop(events)
-        if STEPS[step] == "cast":
-            now = max(now, heapq.heappop(slots)) + seconds * vary(1 - VARY, 1 + VARY)
-            heapq.heappush(slots, now)
+        now, _, shard, step = heapq.heappop(events)
+        process: Any = STEPS[step], shard
+        if process[0] == "casting":
+            now = max(now, heapq.heappop(slots[shard]))
         else:
-            stores = STEPS[step] == "collect"
-            process = min(collectors, key=free.__getitem__) if stores else STEPS[step]
-            now = free[process] = max(free[process], now) + takes.get(process, costs.collector)
+            if process[0] == "collectors":
+                those = product([process], range(collectors_of(gpus)))
+                process = min(those, key=free.__getitem__)
+            now = max(now, free[process])
+        if cores:
+            now = max(now, heapq.heappop(idle))
+            heapq.heappush(idle, now + takes[step])
+        now += takes[step]
+        if process[0] == "casting":
+            now += batches * seconds * vary(1 - VARY, 1 + VARY)
+            heapq.heappush(slots[shard], now)
+        else:
+            free[process] = now
         following = (step + 1) % len(STEPS)
         done += not following
         if done == most and not following:  # the first tasks all came at a time
             begin = now
-        heapq.heappush(events, (now, next(number), following))
-    return (done - most) / (now - begin)
+        heapq.heappush(events, (now, next(number), shard, following))
+    return batches * (done - most) / (now - begin)
 
 
 def busy(gpus: int, seconds: float, costs: Costs) -> float:
     """Share of the time that the GPU workers cast."""
-    return min(1.0, tasks_a_second(gpus, seconds, costs) * seconds / gpus)
+    return min(1.0, batches_a_second(gpus, seconds, costs) * seconds / gpus)
 
 
 def limit(gpus: int, seconds: float, costs: Costs) -> str:
     """Name what is busiest: the process that the others wait for."""
-    load = {
-        "GPUs": gpus / seconds,
-        "driver": 1 / costs.driver,
-        "scheduler": 1 / costs.at_scheduler(gpus),
-        "collectors": len(collectors_of(gpus)) / costs.collector,
-    }
-    return min(load, key=load.__getitem__)
+    batches = batches_per_task([(seconds, 1)], gpus)
+    load: Counter[str] = Counter()
+    for number, name in enumerate(STEPS):
+        load[name] += costs.step(number, gpus, batches)
+    load["collectors"] /= collectors_of(gpus)
+    load["casting"] = batches * seconds / gpus
+    return load.most_common(1)[0][0]
 
 
 def schedulers(gpus: int, seconds: float, costs: Costs, least: float = 0.9) -> int:
@@ -109,8 +129,8 @@ def draw(costs: Costs, read: dict[str, dict[str, float]], path: Path) -> None:
     axes = figure.subplots()
     for seconds, colour in zip(SECONDS, ("#e4752e", "#2a6fb0", "#3b8f5a"), strict=True):
         shares = [100 * busy(gpus, seconds, costs) for gpus in GPUS]
-        axes.plot(GPUS, shares, color=colour, label=f"tasks of {seconds:g} s")
-        there = [run for run in read.values() if run["seconds"] == seconds]
+        axes.plot(GPUS, shares, color=colour, label=f"batches of {seconds:g} s")
+        there = [run for run in read.values() if run["seconds"] == seconds and run["shards"] == 1]
         places = [run["gpus"] for run in there], [100 * run["busy"] for run in there]
         axes.plot(*places, "o", color=colour)
     axes.plot([], [], "o", color="0.4", label="read")
@@ -126,28 +146,32 @@ def draw(costs: Costs, read: dict[str, dict[str, float]], path: Path) -> None:
 def main(arguments: list[str] | None = None) -> dict[str, Any]:
     """Run from the command line."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
-    for name in ("driver", "scheduler", "collector"):
-        parser.add_argument(f"--{name}", type=float, required=True, help="ms of it for a task")
-    parser.add_argument(
-        "--member", type=float, default=3.5, help="µs of the scheduler for a worker"
-    )
+    for name in dict.fromkeys(STEPS):
+        words = "ms of it for a task, and for each receipt in it"
+        parser.add_argument(f"--{name}", type=float, nargs=2, required=True, help=words)
+    words = "µs of the scheduler for a worker"
+    parser.add_argument("--member", type=float, default=3.5, help=words)
     parser.add_argument("--read", type=Path, nargs="*", default=[], help="--json of the scale")
+    parser.add_argument("--cores", type=int, help="of the machine of those")
     parser.add_argument("--picture", type=Path, help="draw the busy share here")
     chosen = parser.parse_args(arguments)
-    three = (chosen.driver / 1e3, chosen.scheduler / 1e3, chosen.collector / 1e3)
-    costs = Costs(*three, chosen.member / 1e6)
+    each = {name: tuple(ms / 1e3 for ms in getattr(chosen, name)) for name in STEPS}
+    costs = Costs(each, chosen.member / 1e6)
     rows = [row for file in chosen.read for row in json.loads(file.read_text()).items()]
     read = {name: row for name, row in rows if "busy" in row}
     for name, row in read.items():
-        share = busy(int(row["gpus"]), row["seconds"], costs)
-        print(f"{name}: busy {row['busy']:.1%}, by the model {share:.1%}")
+        gpus, shards = int(row["gpus"]), int(row["shards"])
+        rate = batches_a_second(gpus, row["seconds"], costs, chosen.cores, shards)
+        print(f"{name}: {row['a_second']:.0f} a second, by the model {rate:.0f}")
     figures = {}
     for gpus in (200, 1_000, 10_000):
         for seconds in SECONDS:
-            rate = tasks_a_second(gpus, seconds, costs)
+            rate = batches_a_second(gpus, seconds, costs)
             by, shards = limit(gpus, seconds, costs), schedulers(gpus, seconds, costs)
-            figures[f"{gpus} GPUs, tasks of {seconds:g} s"] = rate, by, shards
-            print(f"{gpus:6,} GPUs, {seconds:3g} s: {rate:7.1f} tasks/s, {by}; {shards} schedulers")
+            figures[f"{gpus} GPUs, batches of {seconds:g} s"] = rate, by, shards
+            print(
+                f"{gpus:6,} GPUs, {seconds:3g} s: {rate:7.1f} batches/s, {by}; {shards} schedulers"
+            )
     if chosen.picture:
         draw(costs, read, chosen.picture)
     return figures

@@ -14,9 +14,9 @@ into four partitions.
 
 `--receipts SECONDS` has surveys cast by so many GPU workers whose batches, of one scan with four
 rays, take so long: casting ends with a sleep, all else is the product's own. The figures are a
-receipt's, and how busy the workers are in a minute. `--jobs N` runs the tiny jobs of
-`benchmarks.campaign`. Both count from a fifth of the work on: what a run takes to start and to
-finish is no part of them.
+receipt's, and how busy the workers are in a minute; `--shards N` has so many of these clusters run
+at a time. `--jobs N` runs the tiny jobs of `benchmarks.campaign`. Both count from a fifth of the
+work on: what a run takes to start and to finish is no part of them.
 """
 
 from __future__ import annotations
@@ -30,6 +30,7 @@ import multiprocessing
 import tempfile
 import time
 from collections.abc import Callable, Iterator
+from concurrent.futures import ProcessPoolExecutor
 from contextlib import ExitStack, contextmanager
 from multiprocessing.connection import Connection
 from pathlib import Path
@@ -214,15 +215,17 @@ def small_survey(scans: int) -> Survey:
 
 
 class Counts:
-    """Processor time of driver and scheduler for each receipt, or job, from a fifth of them on."""
+    """Processor time of each kind of process for a receipt, or job, from a fifth of them on."""
 
-    def __init__(self, all_of_them: int, scheduler: psutil.Process) -> None:
-        self._all = all_of_them
-        self._processes = {"driver": psutil.Process(), "scheduler": scheduler}
-        before = cpu_s(scheduler)
+    def __init__(self, all_of_them: int, processes: dict[str, list[psutil.Process]]) -> None:
+        self._all, self._processes = all_of_them, {"driver": [psutil.Process()], **processes}
+        before = self._cpu_s()
         time.sleep(2)
-        self._idle = (cpu_s(scheduler) - before) / 2
+        self._idle = {name: (s - before[name]) / 2 for name, s in self._cpu_s().items()}
         self._seen: list[tuple[int, float, dict[str, float]]] = []
+
+    def _cpu_s(self) -> dict[str, float]:
+        return {name: sum(map(cpu_s, those)) for name, those in self._processes.items()}
 
     def __call__(self, progress: Progress) -> None:
         """Look how much is done, and what it took."""
@@ -230,37 +233,44 @@ class Counts:
         if not self._seen or done > self._seen[-1][0]:
             if done <= self._all // 5:
                 self._seen.clear()
-            took = {name: cpu_s(process) for name, process in self._processes.items()}
-            self._seen.append((done, time.perf_counter(), took))
+            self._seen.append((done, time.perf_counter(), self._cpu_s()))
 
     def figures(self) -> dict[str, float]:
         """Return what was done a second, and milliseconds for each without heartbeats."""
         (least, start, before), *_, (most, end, after) = self._seen
-        took = {name: after[name] - before[name] for name in after}
-        took["scheduler"] -= self._idle * (end - start)
+        took = {
+            name: after[name] - before[name] - self._idle[name] * (end - start) for name in after
+        }
         each = {f"{name}_ms": round(1e3 * s / (most - least), 3) for name, s in took.items()}
-        idle = round(100 * self._idle, 1)
+        idle = round(100 * self._idle["scheduler"], 1)
         return {"a_second": round((most - least) / (end - start), 1), **each, "idle_percent": idle}
 
 
 @contextmanager
-def casting_cluster(gpus: int, seconds: float) -> Iterator[tuple[Client, psutil.Process]]:
-    """Start workers that cast slowly, and a worker of LIDAR; gives the scheduler's process."""
+def casting_cluster(
+    gpus: int, seconds: float
+) -> Iterator[tuple[Client, dict[str, list[psutil.Process]]]]:
+    """Start workers that cast slowly, and a worker of LIDAR; gives the processes of each kind."""
     with ExitStack() as stack:
-        scheduler, address = stack.enter_context(process(_scheduler))
-        slots = ("LIDAR", 8 + gpus // GPUS_EACH)
-        stack.enter_context(process(_workers, address, 1, slots))
-        for first in range(0, gpus, TOGETHER):
-            count = min(TOGETHER, gpus - first)
-            stack.enter_context(process(_workers, address, count, ("GPU", 1), seconds, first))
-        yield stack.enter_context(Client(address)), scheduler
+
+        def start(main: Callable[..., Any], *arguments: Any) -> tuple[psutil.Process, str]:
+            return stack.enter_context(process(main, *arguments))
+
+        scheduler, address = start(_scheduler)
+        lidar, _ = start(_workers, address, 1, ("LIDAR", 8 + gpus // GPUS_EACH))
+        casting = [
+            start(_workers, address, min(TOGETHER, gpus - n), ("GPU", 1), seconds, n)[0]
+            for n in range(0, gpus, TOGETHER)
+        ]
+        processes = {"scheduler": [scheduler], "collectors": [lidar], "casting": casting}
+        yield stack.enter_context(Client(address)), processes
 
 
 def measure_receipts(gpus: int, seconds: float, scans: int) -> dict[str, float]:
     """Run a survey with batches of one scan; its figures, and the share of a minute of casting."""
-    with casting_cluster(gpus, seconds) as (client, scheduler), single_scans():
+    with casting_cluster(gpus, seconds) as (client, processes), single_scans():
         simulate(ROOM, small_survey(gpus), client=client, backend="numpy")
-        counts = Counts(scans, scheduler)
+        counts = Counts(scans, processes)
         with tempfile.TemporaryDirectory() as folder:
             result = simulate(
                 ROOM, small_survey(scans), client=client, backend="numpy",
@@ -272,18 +282,28 @@ def measure_receipts(gpus: int, seconds: float, scans: int) -> dict[str, float]:
     until = casting.start + lasts
     spans = [max(0.0, min(one.stop, until) - one.start) for one in casting.records]
     kept = len(casting.records) / casting.tasks  # of thousands, every second one
-    return {**counts.figures(), "busy": round(sum(spans) / kept / (lasts * gpus), 3)}
+    share = round(sum(spans) / kept / (lasts * gpus), 3)
+    return {**counts.figures(), "busy": share, "gpus": gpus, "seconds": seconds}
+
+
+def measure_shards(shards: int, *of_each: Any) -> dict[str, float]:
+    """Run `measure_receipts` in several clusters at a time; the sum of rates, means of the rest."""
+    spawn = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(shards, mp_context=spawn) as pool:
+        rows = list(pool.map(measure_receipts, *([value] * shards for value in of_each)))
+    mean = {name: round(sum(row[name] for row in rows) / shards, 3) for name in rows[0]}
+    return mean | {"a_second": sum(row["a_second"] for row in rows), "shards": shards}
 
 
 def measure_jobs(jobs: int) -> dict[str, float]:
     """Run a campaign of tiny jobs; its figures."""
-    with casting_cluster(4, 0.0) as (client, scheduler), tempfile.TemporaryDirectory() as folder:
+    with casting_cluster(4, 0.0) as (client, processes), tempfile.TemporaryDirectory() as folder:
         file, data = Path(folder) / "campaign.yaml", Path(folder) / "data"
         file.with_name("base.yaml").write_text(BASE % (100, 10))
         file.write_text(CAMPAIGN % 20)
         Campaign.load(file).run(Path(folder) / "first", client=client)
         file.write_text(CAMPAIGN % jobs)
-        counts = Counts(jobs, scheduler)
+        counts = Counts(jobs, processes)
         Campaign.load(file).run(data, client=client, on_progress=counts)
     return counts.figures()
 
@@ -302,6 +322,7 @@ def main(arguments: list[str] | None = None) -> dict[str, Any]:
     parser.add_argument("--tasks", type=int, default=20_000, help="of each way to submit them")
     parser.add_argument("--receipts", type=float, help="seconds that a batch of one scan takes")
     parser.add_argument("--scans", type=int, default=3_000, help="of a survey for --receipts")
+    parser.add_argument("--shards", type=int, default=1, help="clusters at a time, for --receipts")
     parser.add_argument("--jobs", type=int, help="number of tiny jobs")
     parser.add_argument("--json", type=Path, help="also write the figures to this file")
     options = parser.parse_args(arguments)
@@ -309,9 +330,8 @@ def main(arguments: list[str] | None = None) -> dict[str, Any]:
     rows: dict[str, Any] = {}
     if options.receipts is not None:
         for count in options.workers:
-            of = f"{count} workers, batches of {options.receipts:g} s"
-            rows[of] = measure_receipts(count, options.receipts, options.scans)
-            rows[of] |= {"gpus": count, "seconds": options.receipts}
+            of = f"{options.shards} x {count} workers, batches of {options.receipts:g} s"
+            rows[of] = measure_shards(options.shards, count, options.receipts, options.scans)
     if options.jobs:
         rows[f"{options.jobs} tiny jobs"] = measure_jobs(options.jobs)
     for of, figures in rows.items():

@@ -9,7 +9,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from benchmarks.effects._receiver import BLUE, GREY, RED, ahead, shot, wall
-from lidarpool import Material, Survey, datasheet
+from lidarpool import Material, Survey
 from lidarpool.sensor.models import read_model
 
 DRAWS = "effect-datasheet.png"
@@ -25,7 +25,7 @@ RAYS = 2000
 
 def on(survey: Survey) -> Survey:
     """Switch it on: noise and 7 sub-rays."""
-    sheet = datasheet("ouster/os1-64")
+    sheet = read_model("ouster/os1-64").datasheet()
     return replace(survey, noise=sheet.noise, returns=sheet.returns)
 
 
@@ -36,7 +36,7 @@ def picture(path: Path) -> None:
     dark = [Material("*", 0.1)]
     for name, colour in SHOWN.items():
         stated = read_model(name).performance.detection
-        noise = datasheet(name).noise
+        noise = read_model(name).datasheet().noise
         places = np.linspace(0.4, 1.5, 23) * stated.range_m
         made = [len(shot([wall("W", x)], ahead(RAYS), noise, materials=dark)["range"])
                 for x in places]  # fmt: skip
@@ -51,7 +51,7 @@ def picture(path: Path) -> None:
     shares.legend(frameon=False, fontsize=7.5, loc="lower left", title="stated", title_fontsize=8)
     shares.set_title("detection", fontsize=10)
     name = "livox/tele15"
-    noise = datasheet(name).noise
+    noise = read_model(name).datasheet().noise
     for reflectance, colour, limits, stated_at in (
         (0.1, GREY, (20, 180), [(70, 2), (120, 4)]),
         (0.8, BLUE, (40, 450), [(220, 2), (380, 4)]),

@@ -96,7 +96,7 @@ def _relinked(text: str, file: str, page: str, files: Files, config: Any) -> str
 
 
 def _page_of(path: str, files: Files, config: Any) -> str:
-    """Where the site has a file of the repository; one of the sources gets a page."""
+    """Where the site has a file of the repository; a source gets a page, a mesh is copied."""
     if shown := (_ELSEWHERE | _SHOWN).get(path):
         return shown
     if path.startswith("docs/"):
@@ -104,8 +104,11 @@ def _page_of(path: str, files: Files, config: Any) -> str:
     source = ROOT / path
     if not source.is_file():
         return path  # MkDocs warns of it
-    page = f"sources/{path}.md"
-    if files.get_file_from_path(page) is None:
+    mesh = source.suffix == ".glb"
+    page = f"sources/{path}" if mesh else f"sources/{path}.md"
+    if files.get_file_from_path(page) is None and mesh:
+        files.append(File.generated(config, page, abs_src_path=str(source)))
+    elif files.get_file_from_path(page) is None:
         kind = {".py": "python", ".yaml": "yaml", ".sh": "sh"}.get(source.suffix, "text")
         fence = "`" * 4
         content = f"# {path}\n\n{fence}{kind}\n{source.read_text('utf-8')}\n{fence}\n"

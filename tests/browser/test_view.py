@@ -10,13 +10,14 @@ import pytest
 from lidarpool import Column, Scene, Sensor, Survey, Track
 from lidarpool.columns.cloud_file import CloudFile
 from lidarpool.columns.ply_format import header, row_type
-from lidarpool.columns.table import SCAN, TABLE
+from lidarpool.columns.table import OBJECT, SCAN, TABLE
 from lidarpool.export.sweeps import Sweeps
 from lidarpool.live.server import page_server
 from lidarpool.live.sharing import page_of
 from lidarpool.live.view import View, open_results
 from lidarpool.run.picture_file import PictureContent, sensor_ways
 from lidarpool.scene.actors import Actor, box
+from lidarpool.scene.animation import Animation
 
 pytestmark = [pytest.mark.browser, pytest.mark.slow]
 
@@ -25,17 +26,20 @@ PICTURE = "lidarpool.picture"
 WET = Column("wetness", "float32", "%", "how wet it is", source="wetness")
 
 
-@pytest.fixture
-def cloud(tmp_path):
-    """Return a file with a spiral of 30,000 points in 360 scans."""
+def spiral(path, column):
+    """Write a file with a spiral of 30,000 points in 360 scans, and a column from 0 to 100."""
     turn = np.linspace(0, 20 * np.pi, COUNT)
-    rows = np.zeros(COUNT, row_type(np.dtype(np.float32), (SCAN, WET)))
-    rows["wetness"] = np.linspace(0, 100, COUNT)
+    rows = np.zeros(COUNT, row_type(np.dtype(np.float32), (SCAN, column)))
+    rows[column.name] = np.linspace(0, 100, COUNT)
     rows["x"], rows["y"], rows["z"] = 9 * np.cos(turn), 9 * np.sin(turn), turn / 8
     rows["scan"] = np.arange(COUNT) * SCANS // COUNT
-    path = tmp_path / "cloud.ply"
     path.write_bytes(header(rows.dtype, COUNT) + rows.tobytes())
     return path
+
+
+@pytest.fixture
+def cloud(tmp_path):
+    return spiral(tmp_path / "cloud.ply", WET)
 
 
 @pytest.fixture
@@ -378,6 +382,37 @@ def test_the_page_says_that_its_server_has_ended(view, new_tab):
         tab.wait_for(lambda _: drawn(tab) == COUNT)
     tab.key("ArrowRight")
     tab.wait_for(lambda text: "server of this page has ended" in text)
+
+
+def test_actors_deform_with_the_time(view, new_tab, tmp_path):
+    """Two of one mesh, each in its pose: of the server's page and of an exported one."""
+    bar = box("Bar", (1, 1, 1))
+    tall = np.stack([bar.vertices * [1, 1, high] for high in (1, 3, 2, 1)])
+    animations = [Animation(tall, 0.2, repeat=repeat) for repeat in (True, True, False)]
+    animations[1] = animations[0]
+    ways = [Track([0, 2], [[x, 0, 0], [x + 4, 0, 0.0]]) for x in (-5, 0, 5)]
+    actors = tuple(
+        Actor(replace(bar, animation=animation), way, offset)
+        for animation, way, offset in zip(animations, ways, (0, 0.25, 0), strict=True)
+    )
+    scene = replace(view.pictured.scene, actors=actors)
+    cloud = CloudFile(spiral(tmp_path / "objects.ply", OBJECT))
+    view = replace(view, points=cloud, pictured=replace(view.pictured, scene=scene))
+    (tmp_path / "page.html").write_bytes(page_of(view))
+    with page_server(view.answer, port=0) as page:
+        for url in (page.url, (tmp_path / "page.html").as_uri()):
+            tab = opened(new_tab, SimpleNamespace(url=url))
+            for seconds in (0.1, 0.3, 0.65, 0.95):
+                tab.value(f"{PICTURE}.setTime({seconds})")
+                for number, actor in enumerate(actors):
+                    mesh = f"{PICTURE}.actors[{number}].mesh"
+                    found = tab.value(f"[...{mesh}.geometry.attributes.position.array]")
+                    placed = np.reshape(found, (-1, 3)) + tab.value(f"{mesh}.position.toArray()")
+                    shown = actor.placed(1e9 * seconds)
+                    np.testing.assert_allclose(
+                        placed, shown.vertices[shown.faces].reshape(-1, 3), atol=1e-5
+                    )
+            assert tab.errors == []
 
 
 def colourful(picture):

@@ -24,11 +24,12 @@ from lidarpool import (
 from lidarpool.columns.cloud import Cloud
 from lidarpool.export.boxes import Boxes
 from lidarpool.export.sweeps import Sweeps
+from lidarpool.run.picture_file import PictureContent
 from lidarpool.scenario.advice import advice
-from lidarpool.scenario.build import build
+from lidarpool.scenario.build import Job, build
 from lidarpool.scenario.scenario import Scenario
 from lidarpool.scene.actors import box, one_mesh, shapes_of
-from lidarpool.scene.animation import Animation
+from lidarpool.scene.animation import PICTURED, Animation
 from lidarpool.scene.files.meshfile import load_objects
 from lidarpool.scene.scene_mesh import SceneMesh
 from lidarpool.scene.wheels import rolling
@@ -489,6 +490,66 @@ def test_boxes_are_as_large_as_the_poses_between_two_times(repeat):
         for poses, sign in ((shown, 1), (kept, -1)):  # it holds the first, and no more than these
             corners = np.stack([poses.min(axis=(0, 1)), poses.max(axis=(0, 1))])
             assert (sign * (found - corners) * [[-1], [1]] >= -1e-6).all(), (begin, end)
+
+
+def drawn_again(actors, path, seconds=3):
+    """Actors of a survey of some seconds, of its file of pictures."""
+    scene = Scene.from_meshes([FLOOR]).with_actors(actors)
+    stands = Track([0, seconds], [[0, 0, 1], [0, 0, 1.0]])
+    pictured, _ = PictureContent.before(Job(scene, Survey(Sensor.grid(), trajectory=stands)))
+    full = replace(pictured, hit_counts=np.zeros(pictured.scene.triangles, np.int64))
+    full.save(path)
+    return PictureContent.load(path).scene.actors
+
+
+def test_pictures_of_a_saved_result_show_people_as_they_walk(walker, tmp_path):
+    """By speed or time, with a way before the survey, and who appears, ends or stands."""
+    early = Track([-2, 4], [[-2, 3, 0], [3, 3, 0.0]], start_s=0.0)
+    passes = Track([-1, 1, 2], [[0, 5, 0], [2, 5, 0], [2, 6, 0.0]], start_s=0.0, beyond="absent")
+    appears = Track([1.5, 2.5], [[9, 0, 0], [8, 0, 0.0]], start_s=0.0, beyond="absent")
+    timed = replace(walker, animation=replace(walker.animation, speed_m_s=None, repeat=False))
+    actors = [
+        Actor(walker, early, offset_s=0.4),
+        Actor(replace(walker, name="P"), passes),
+        Actor(walker, appears, offset_s=0.2),
+        Actor(timed, appears, offset_s=-1.2),
+        Actor(walker),
+        Actor(box("Car", (4, 2, 1)), early),
+    ]
+    again = drawn_again(actors, tmp_path / "p.npz")
+    assert len({id(actor.mesh.animation) for actor in again}) == 3, "copies share their poses"
+    for time_ns in (0, 0.7e9, 1.49e9, 1.7e9, 2.4e9, 2.9e9):
+        for one, other in zip(actors, again, strict=True):
+            want, found = one.placed(time_ns).vertices, other.placed(time_ns).vertices
+            there = np.ptp(want, axis=0).any()
+            assert there == np.ptp(found, axis=0).any()
+            # The pose is within 1/1024 m; halves of it, and a way between a thousand places.
+            assert not there or np.abs(want - found).max() < 2e-3
+    assert (tmp_path / "p.npz").stat().st_size < 450_000
+
+
+def test_poses_of_many_vertices_are_fewer_in_pictures(tmp_path):
+    around = np.linspace(0, 2 * np.pi, 50_000, endpoint=False)
+    points = np.stack([np.cos(around), np.sin(around), 0 * around], axis=1)
+    poses = points * (1 + np.linspace(0, 1, 121))[:, None, None]
+    faces = np.stack([np.arange(2), np.arange(2) + 1, np.arange(2) + 2], axis=1)
+    mesh = SceneMesh("Ring", points, faces, animation=Animation(poses, 1 / 60, repeat=False))
+    (ring,) = drawn_again([Actor(mesh)], tmp_path / "p.npz")
+    assert ring.mesh.animation.vertices.shape == (PICTURED // 50_000, 50_000, 3)
+    for time_ns in (0, 0.77e9, 2e9, 2.5e9):
+        want = points * (1 + min(time_ns / 2e9, 1))
+        np.testing.assert_allclose(ring.placed(time_ns).vertices, want, atol=1e-3)
+
+
+def test_damaged_poses_in_a_file_of_pictures_are_told(walker, tmp_path):
+    path = tmp_path / "p.npz"
+    drawn_again([Actor(walker)], path)
+    with np.load(path) as archive:
+        arrays = dict(archive)
+    for name, value in (("mesh0_steps", arrays["mesh0_steps"][:, 1:]), ("mesh0_played", [0])):
+        np.savez_compressed(path, **(arrays | {name: value}))
+        with pytest.raises(LidarpoolError, match=r"p\.npz.*(its animation moves|run the survey)"):
+            PictureContent.load(path)
 
 
 def _saved(sweeps, path):

@@ -11,7 +11,15 @@ import yaml
 from click.testing import CliRunner
 from tests.shapes import beam_along_x, cast, wall
 
-from lidarpool import LidarpoolError, Material, Returns, datasheet
+from lidarpool import (
+    LidarpoolError,
+    Material,
+    Mounted,
+    Noise,
+    Returns,
+    Survey,
+    load_sensor,
+)  # fmt: skip
 from lidarpool.cli.scenario_commands import sensors
 from lidarpool.scenario.advice import advice
 from lidarpool.scenario.build import build
@@ -25,7 +33,7 @@ DETECTED = [name for name in STATED if read_model(name).performance.detection]
 
 def returned(name, distance, reflectance):
     """Ranges of the returns of a wall, one ray to a pulse, with a data sheet's noise."""
-    noise = datasheet(name).noise
+    noise = read_model(name).datasheet().noise
     sensor = beam_along_x(RAYS, 1e4)
     materials = [Material("*", reflectance=reflectance)]
     columns = ("range", "cause")
@@ -39,11 +47,10 @@ def test_each_model_says_where_its_figures_are_from_or_that_none_were_found(name
     if model.performance is None:
         assert model.sources["performance"].startswith("none that could be read")
         with pytest.raises(LidarpoolError, match="give noise yourself"):
-            datasheet(name)
+            model.datasheet()
         return
-    sheet = datasheet(name, seed=5)
+    sheet = model.datasheet()
     assert model.sources["performance"]
-    assert sheet.noise.seed == 5
     assert len(sheet.missing) < 4
     assert sheet.returns.subrays == (1 if model.optics.divergence_mrad is None else 7)
 
@@ -56,7 +63,9 @@ def test_a_wall_at_the_stated_range_returns_the_stated_share(name):
     assert abs(count - RAYS * stated.probability) < 4 * math.sqrt(spread)
 
 
-@pytest.mark.parametrize("name", [name for name in STATED if datasheet(name).noise.range_m])
+@pytest.mark.parametrize(
+    "name", [name for name in STATED if read_model(name).datasheet().noise.range_m]
+)
 def test_a_wall_has_the_stated_scatter(name):
     stated = read_model(name).performance
     places = [(20.0, 0.8, (stated.range_m or 0) + 20 * stated.range_per_m)]
@@ -77,7 +86,7 @@ def test_a_stated_range_becomes_that_of_half_the_pulses_on_ten_per_cent():
 
 
 def test_stated_false_alarms_are_a_share_of_the_pulses():
-    noise = datasheet("livox/mid40").noise
+    noise = read_model("livox/mid40").datasheet().noise
     gate_s = 2 * (260 - 1) / 299_792_458
     assert -math.expm1(-noise.false_alarm_hz * gate_s) == pytest.approx(1e-4)
 
@@ -87,7 +96,7 @@ def test_two_precisions_of_one_energy_are_refused():
     far = {"sigma_m": 0.04, "range_m": 50, "reflectance": 0.1}
     stated = Performance(precision=(near, far), detection={"range_m": 100, "probability": 0.5})
     with pytest.raises(LidarpoolError, match="does not fall as the energy grows"):
-        stated.noise(1e-6, 0)
+        stated.noise(1e-6)
 
 
 def carried(**sections):
@@ -97,7 +106,7 @@ def carried(**sections):
 
 def test_a_scenario_takes_the_data_sheet_with_one_word_and_its_own_figures_before_it():
     sensor = {"model": "ouster/os1-64", "performance": "datasheet"}
-    sheet = datasheet("ouster/os1-64")
+    sheet = read_model("ouster/os1-64").datasheet()
     assert carried(sensor=sensor) == [(sheet.noise, sheet.returns)]
     ((noise, returns),) = carried(
         sensor=sensor, noise={"range_m": 0.0, "walk_m": 0.05, "seed": 3}, returns={"subrays": 1}
@@ -107,6 +116,31 @@ def test_a_scenario_takes_the_data_sheet_with_one_word_and_its_own_figures_befor
     assert returns == Returns()
     ((noise, _),) = carried(sensor={"model": "ouster/os1-64"})
     assert not noise.loses
+
+
+def test_a_file_that_states_its_performance_is_used_with_it_unless_it_shall_be_ideal(tmp_path):
+    text = (
+        "{name: Mine, firings_per_turn: 360, range_m: [0, 80], beams: {elevation_deg: [0, 1]}, "
+        "performance: {range_m: 0.02, dropout: 0.1, mode: last}}"
+    )
+    file = tmp_path / "mine.yaml"
+    file.write_text(text)
+    sheet, other, at = read_model(file).datasheet(), Noise(range_m=0.5), {"poses": [(0, 0, 1)]}
+    assert sheet.noise == Noise(range_m=0.02, dropout=0.1) and sheet.returns.mode == "last"
+    given = {"sensor": str(file), "noise": {"dropout": 0, "seed": 3}}
+    assert carried(**given) == [(Noise(range_m=0.02, seed=3), sheet.returns)]
+    ideal = {"sensor": {"model": str(file), "performance": "ideal"}}
+    assert carried(**ideal) == [(Noise(), Returns())]
+    sensor, named = load_sensor(file), load_sensor("ouster/os1-64")
+    for survey in (Survey(sensor, **at), Survey(sensors=[Mounted(sensor)], **at)):
+        assert (survey.noise_each, survey.returns_each) == ((sheet.noise,), (sheet.returns,))
+    both = Survey(sensors=[Mounted(sensor, name="a"), Mounted(named, name="b")], **at)
+    assert both.noise_each == (sheet.noise.named("a"), Noise().named("b"))
+    for given in ({"sensor": sensor}, {"sensors": [Mounted(sensor)]}):
+        assert Survey(**given, **at, noise=other).noise_each == (other,)
+    assert load_sensor(file, performance="ideal").noise is None and named.noise is None
+    stated = load_sensor("ouster/os1-64", performance="datasheet")
+    assert stated.noise == read_model("ouster/os1-64").datasheet().noise
 
 
 def test_each_of_several_sensors_has_its_own():

@@ -10,10 +10,11 @@ import pytest
 import yaml
 from benchmarks.fit_coverage import recorded, street, trial
 
-from lidarpool import LidarpoolError, Noise, Scanner, Sensor, datasheet, fit, load_sensor
+from lidarpool import LidarpoolError, Noise, Scanner, Sensor, fit, load_sensor
 from lidarpool.compare.recordings import Recording, open_recording
 from lidarpool.export.formats import Format
 from lidarpool.export.sweeps import Sweeps
+from lidarpool.sensor.models import read_model
 
 pytest.importorskip("scipy", reason="the extra fit is not installed")
 
@@ -46,7 +47,7 @@ def test_the_file_is_a_sensor_with_these_figures(fitted, tmp_path):
     written = fitted.save(tmp_path / "mine.yaml")
     assert [path.name for path in written] == ["mine.yaml", "mine.html"]
     stated = yaml.safe_load(written[0].read_text())
-    noise = datasheet(written[0]).noise
+    noise = read_model(written[0]).datasheet().noise
     figures = fitted.figures["figures"]
     for name in ("range_m", "range_per_m", "angle_deg"):
         assert getattr(noise, name) == pytest.approx(figures[name]["value"], rel=1e-3)
@@ -68,11 +69,11 @@ def test_the_page_has_all_figures_and_says_what_is_unknown(fitted, tmp_path):
     assert "unknown: detection_range_m" in text and "range_per_m" in text
 
 
-def test_noise_by_energy_becomes_the_two_statements_of_a_data_sheet(tmp_path):
+def test_noise_by_energy_is_in_the_file(tmp_path):
     truth = {"range_m": 0.015, "range_at_threshold_m": 0.07, "detection_range_m": 10}
     made = fit(recorded(Noise(**truth, dropout=0.01, angle_deg=0.05, seed=1)))
-    noise = datasheet(made.save(tmp_path / "mine.yaml")[0]).noise
-    for name, true in truth.items():
+    noise = read_model(made.save(tmp_path / "mine.yaml")[0]).datasheet().noise
+    for name, true in {**truth, "dropout": 0.01}.items():
         assert getattr(noise, name) == pytest.approx(true, rel=0.1), name
 
 
@@ -81,6 +82,9 @@ def test_a_model_keeps_what_the_recording_does_not_tell():
     stated = flat.model.performance
     assert stated.detection.range_m == 90 and stated.precision is None
     assert flat.model.firings_per_turn == 1024
+    assert "note: the recorded rings are not those of Livox Mid-40: check --model" in repr(
+        fit(recorded(NOISE), model="mid40")
+    )
 
 
 def test_bias_of_channels_against_planes_and_against_the_scene():
@@ -93,6 +97,8 @@ def test_bias_of_channels_against_planes_and_against_the_scene():
             assert abs(one["value"] - true) < max(one["high"] - one["low"], 0.002), row
     found = fit(made, scene=street()).figures["curves"]
     assert len(found["lost_by_range"]) > 3 and found["lost_by_range"][0]["value"] < 0.01
+    with pytest.raises(LidarpoolError, match="less than half of simulated is within"):
+        fit(made, scene=street(), pose=(3, 1, 0))
 
 
 def test_a_single_sweep_and_a_moving_sensor_tell_bias_alone(recording):
@@ -140,6 +146,7 @@ def test_cut_and_mixed_recordings_are_told_in_a_line(recording, tmp_path):
         (replace(recording, read=mixed), "not of the same sensor|of another sensor"),
         (replace(recording, read=lambda number: nothing), "has no points: there is nothing to fit"),
         (replace(recording, count=0), "has no sweeps"),
+        (replace(recording, thinned=True, notes=("one of 5 hits",)), "one of 5 hits"),
         (replace(recording, read=lambda k: (*recording.read(k)[:1], {}, None)), "has no rings"),
     ):
         with pytest.raises(LidarpoolError, match=says) as raised:
@@ -182,6 +189,11 @@ def test_packets_of_a_velodyne_are_sweeps(tmp_path):
     assert opened.count >= 3 and opened.white == 100 and set(turn.light) == {50.0}
     assert len(np.unique(turn.rings)) == 16
     assert np.linalg.norm(turn.points, axis=1) == pytest.approx(5, abs=0.05)
+    frame = bytearray(frames[-1])
+    frame[16 + 29] = 7  # the end of the sender's address
+    (tmp_path / "room.pcap").write_bytes(b"".join([*frames, frame]))
+    with pytest.raises(LidarpoolError, match=r"2 units: keep one, tcpdump .* src 0\.0\.0\.0 and"):
+        open_recording(tmp_path / "room.pcap")
 
 
 def test_a_result_is_fitted_as_a_cloud_and_as_files(tmp_path):

@@ -35,7 +35,6 @@ from lidarpool import (
     Spin,
     Survey,
     Track,
-    datasheet,
     load_sensor,
 )
 from lidarpool.columns.table import TABLE
@@ -72,7 +71,7 @@ THINGS = [
     Survey(sensors=[Mounted(SENSOR, name="a"), Mounted(SENSOR, name="b")], trajectory=TRACK),
     SURVEY.trajectory,
     TRACK,
-    datasheet("ouster/os1-64").noise,
+    load_sensor("ouster/os1-64", performance="datasheet").noise,
 ]  # fmt: skip
 SMALL = [
     Pose((0, 0, 1)),

@@ -46,16 +46,29 @@ def test_scale(tmp_path, capsys):
 
 def test_scale_of_receipts_and_jobs(tmp_path, capsys):
     path = tmp_path / "figures.json"
-    sizes = ["--workers", "3", "--receipts", "0.05", "--scans", "40", "--jobs", "10"]
+    sizes = [
+        "--workers",
+        "3",
+        "--receipts",
+        "0.05",
+        "--scans",
+        "40",
+        "--jobs",
+        "10",
+        "--shards",
+        "2",
+    ]
     rows = scale.main([*sizes, "--json", str(path)])
     assert json.loads(path.read_text()) == rows
     assert all(row["driver_ms"] > 0 and row["a_second"] > 0 for row in rows.values())
-    assert 0 < rows["3 workers, batches of 0.05 s"]["busy"] <= 1
-    costs = ["--driver", "2", "--scheduler", "2", "--collector", "4"]
+    assert 0 < rows["2 x 3 workers, batches of 0.05 s"]["busy"] <= 1
+    names = ("driver", "scheduler", "collectors", "casting")
+    costs = [word for name in names for word in (f"--{name}", "1.5", "0.5")]
     picture = tmp_path / "model.png"
-    rates = model.main([*costs, "--read", str(path), "--picture", str(picture)])
-    rate, by, shards = rates["200 GPUs, tasks of 4 s"]
-    assert rate == pytest.approx(50, rel=0.05) and by == "GPUs" and shards == 1
+    read = ["--read", str(path), "--cores", "2"]
+    rates = model.main([*costs, *read, "--picture", str(picture)])
+    rate, by, shards = rates["200 GPUs, batches of 1 s"]
+    assert rate == pytest.approx(200, rel=0.05) and by == "casting" and shards == 1
     assert picture.stat().st_size > 10_000
     assert "by the model" in capsys.readouterr().out
 

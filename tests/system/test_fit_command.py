@@ -2,20 +2,25 @@
 
 import json
 
+import numpy as np
 import pytest
-from benchmarks.fit_coverage import recorded
+from benchmarks.fit_coverage import recorded, street
 from pypcd4 import PointCloud
 
 from lidarpool import Noise
+from lidarpool.scene.files.polygon_files import read_ply_columns
+from lidarpool.scene.scene_file import write_scene
 
 pytest.importorskip("scipy", reason="the extra fit is not installed")
+
+SWEEPS = 4
 
 
 @pytest.fixture(scope="module")
 def sweeps(tmp_path_factory):
     folder = tmp_path_factory.mktemp("sweeps")
-    recording = recorded(Noise(range_m=0.02, dropout=0.02, seed=1), sweeps=4)
-    for number in range(4):
+    recording = recorded(Noise(range_m=0.02, dropout=0.05, seed=1), sweeps=SWEEPS)
+    for number in range(SWEEPS):
         points, columns, _ = recording.read(number)
         arrays = [*points.T.astype("f4"), columns["channel"].astype("u2")]
         made = PointCloud.from_points(arrays, ("x", "y", "z", "ring"), [a.dtype for a in arrays])
@@ -23,33 +28,45 @@ def sweeps(tmp_path_factory):
     return folder
 
 
-def test_the_sensor_that_is_written_runs(sweeps, tmp_path, lidarpool, cluster):
+def test_the_sensor_that_is_written_has_the_noise_of_the_recording(
+    sweeps, tmp_path, lidarpool, cluster
+):
     done = lidarpool("fit", sweeps, "--out", tmp_path / "mine.yaml", "--json")
     assert done.code == 0
     figures = json.loads(done.out)
     assert figures["figures"]["range_m"]["value"] == pytest.approx(0.02, rel=0.1)
     assert (tmp_path / "mine.html").exists()
-    (tmp_path / "survey.yaml").write_text(
-        "sensor: {model: mine.yaml, performance: datasheet}\n"
-        "cloud: {keep_every: 1, columns: [range]}\nplanning: {enabled: false}\n"
-    )
-    arguments = ["--scheduler", cluster, "--only", "cloud", "-q"]
-    done = lidarpool("run", tmp_path / "survey.yaml", "--out", tmp_path / "out", *arguments)
+    write_scene(tmp_path / "street.glb", street())
+    options = ["--sensor", tmp_path / "mine.yaml", "--columns", "range,ray"]
+    options += ["--pose", "0,0,0"] * SWEEPS
+    arguments = [tmp_path / "street.glb", *options, "--out", tmp_path / "out", "-q"]
+    done = lidarpool("run", *arguments, "--scheduler", cluster)
     assert done.code == 0, done.err
-    report = json.loads((tmp_path / "out/report.json").read_text())
-    noise = report["parameters"]["sensor"]["noise"]
-    assert noise["range_m"] == pytest.approx(figures["figures"]["range_m"]["value"], rel=1e-3)
+    cloud = read_ply_columns((tmp_path / "out/cloud.ply").read_bytes())
+    sweep, step = np.divmod(cloud["scan"].astype(int), 36)
+    _, ray = np.unique(np.stack([step, cloud["ray"]]), axis=1, return_inverse=True)
+    ranges = np.full((SWEEPS, ray.max() + 1), np.nan)
+    ranges[sweep, ray] = cloud["range"]
+    whole = ranges[:, np.isfinite(ranges).all(axis=0)]
+    assert np.sqrt(whole.var(axis=0, ddof=1).mean()) == pytest.approx(0.02, rel=0.1)
+    assert np.isnan(ranges).mean() == pytest.approx(0.05, abs=0.01)
+    (tmp_path / "survey.yaml").write_text(
+        "{scene: street.glb, sensor: mine.yaml, cloud: {columns: [intensity]}, poses: [[0, 0, 0]]}"
+    )
     (tmp_path / "campaign.yaml").write_text(
-        "base: survey.yaml\nvary: {noise.dropout: {each: [0, 0.1]}}\n"
+        "base: survey.yaml\nkeep: kitti\nvary: {sensor.performance: {each: [null, ideal]}}\n"
     )
     done = lidarpool("run", tmp_path / "campaign.yaml", "--out", tmp_path / "set", "-q")
     assert done.code == 0, done.err
+    files = sorted((tmp_path / "set/sequences").glob("*/velodyne/*.bin"))
+    fitted, ideal = (file.stat().st_size // 16 for file in files)
+    assert fitted / ideal == pytest.approx(0.95, abs=0.01)
 
 
 @pytest.mark.parametrize(
     ("arguments", "says"),
     [
-        (["nowhere"], "nowhere does not exist: give the folder of a result"),
+        (["nowhere"], "nowhere does not exist, or is empty: give the folder of a result"),
         ([".", "--model", "no-such"], "There is no sensor model 'no-such'"),
         ([".", "--scene", "none.glb"], "none.glb"),
         ([".", "--out", "mine.txt"], "no sensor file: give a name such as mine.yaml"),

@@ -46,7 +46,7 @@ if TYPE_CHECKING:
         Spin,
         Survey,
     )
-    from .sensor.models import datasheet, load_sensor
+    from .sensor.models import load_sensor
     from .sensor.trajectory import Track
     from .sensor.trajectory_files import load_trajectory
     from .simulator import Scanner
@@ -89,7 +89,6 @@ __all__ = [
     "Track",
     "__version__",
     "compare",
-    "datasheet",
     "fit",
     "load_robot",
     "load_sensor",
@@ -128,7 +127,7 @@ _MODULES = {
     "scene.robot": ("Robot",),
     "scene.scene": ("Scene",),
     "scene.files.urdf": ("load_robot",),
-    "sensor.models": ("datasheet", "load_sensor"),
+    "sensor.models": ("load_sensor",),
     "sensor": (
         "Beams",
         "Fault",

@@ -351,7 +351,7 @@ def sensors(model: str | None, out: Path | None) -> None:
       lidarpool sensors velodyne/vlp16
       lidarpool sensors velodyne/vlp16 --out vlp16.png
     """  # noqa: D301 - click wants the character, not its name
-    from ..sensor.models import datasheet, load_sensor, model_names, read_model, shown_noise
+    from ..sensor.models import load_sensor, model_names, read_model, shown_noise
 
     if model is None:
         heads = ("model", "channels", "field of view", "range", "turns a second", "points a second")
@@ -366,7 +366,7 @@ def sensors(model: str | None, out: Path | None) -> None:
     click.echo(described.name)
     lines = [*described.sources.items()]
     if described.performance is not None:
-        sheet = datasheet(model)
+        sheet = described.datasheet()
         lines.append(("noise", shown_noise(sheet.noise)))
         lines.append(("returns", f"mode: {sheet.returns.mode}, subrays: {sheet.returns.subrays}"))
         lines += [("unknown", ", ".join(sheet.missing))] if sheet.missing else []

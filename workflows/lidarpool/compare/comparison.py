@@ -237,9 +237,7 @@ class _Comparing:
         """Compare two sweeps or clouds, of each at most so many cells and points."""
         self.points += len(a), len(b)
         if max(len(a), len(b)) > budget:
-            self.note(
-                f"of each sweep, {budget:,} points and cells are compared at most, chosen evenly"
-            )
+            self.note(f"of each sweep, {budget:,} points and cells are compared, chosen evenly")
         if not len(a) or not len(b):
             self.note("pairs of which one has no points are left out")
             return
@@ -300,6 +298,7 @@ class _Comparing:
         known = np.isfinite(mine) & np.isfinite(theirs)
         lights = mine[known], theirs[known]
         correlation = rank_correlation(*lights)
+        light = {"rank_correlation": correlation, "pairs": len(lights[0]), "of": of}
         figures: dict[str, Any] = {
             "versions": {"lidarpool": __version__},
             **{
@@ -309,9 +308,7 @@ class _Comparing:
             "pairs": pairs,
             "notes": self.notes,
             "range_image": image,
-            "intensity": None
-            if correlation is None
-            else {"rank_correlation": correlation, "pairs": len(lights[0]), "of": of},
+            "intensity": None if correlation is None else light,
             "distances": {
                 "a_to_b": _distances(to_b),
                 "b_to_a": _distances(to_a),

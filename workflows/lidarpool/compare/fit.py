@@ -27,7 +27,7 @@ from ..render.picture_page import Page
 from ..report.page.rendering import rendered
 from ..scene.scene import Scene
 from ..sensor import Pose, Spin
-from ..sensor.models import SensorModel, read_model
+from ..sensor.models import MODEL_FILES, Performance, SensorModel, read_model
 from ..sensor.noise import TARGET_REFLECTANCE, THRESHOLD_SIGMAS
 from ..sensor.ray_sensors import ListedSensor
 from ..simulator import Scanner
@@ -44,10 +44,10 @@ _CHARTS = {
     "light_by_range": ("range, m", "mean intensity", 1),
     "noise_m": ("elevation, °", "noise, mm", 1000),
     "bias_m": ("elevation, °", "bias, mm", 1000),
-    "uneven_deg": ("elevation, °", "spread of azimuths, °", 1),
+    "uneven_deg": ("elevation, °", "spread of azimuths, 0.001°", 1000),
 }
-_FEW = 30  # rays that a figure or a point of a curve needs
-_POINTS = 14  # of a curve
+_RANGES = ("range_m", "range_per_m", "range_at_threshold_m")  # noise of ranges
+_FEW, _POINTS = 30, 14  # rays that a figure or a point of a curve needs; points of a curve
 _AIM = 0.002  # scatter of directions that does not make outliers before it is known, radians
 _LEAST_M = 0.001  # error of the mean range of a ray, however often it is measured
 _FLAT = 1.7  # tangent of incidence: beyond, noise of directions makes mean ranges longer
@@ -58,14 +58,14 @@ _STILL_M = 0.1  # a median change of ranges, from sweep to sweep, of a sensor th
 _KINK_M, _KINK = 0.01, 0.001  # by how much a surface may leave its plane within four columns
 _SIGMAS = 6.0  # a return beyond these is of something that moves
 _STEEPEST = 5.7  # tangent of incidence: beyond, a beam meets several surfaces
-_BESIDE_M = 0.3  # how far a recorded surface may be from the scene's
-_Z = 1.959964  # of 95 %
+_BESIDE_M, _BESIDE = 0.3, 0.5  # how far surfaces may be from the scene's, and share of these
+_OTHER_DEG = 2.0  # a ring that is farther from all beams of a model is not one of them
+_Z, _STEP = 1.959964, 1e-3  # of 95 %; of logarithms, for derivatives
 _REJECTED = 1e-6  # chance of a variance above which a ray is left out
 _SPAN, _TILT = 2.0, 0.3  # least quotient of ranges, and tangent of incidence, that tell noise
 _WEAK_RAYS, _RING_RAYS = 30, 20  # rays with losses that a threshold needs; that of a ring's bias
 _SKY = (7, 31)  # rows and columns of which no ray returns twice, around a ray into the sky
 _PLANES, _PLANE_M, _PLANE_RAYS, _PLANE_POINTS = 8, 0.05, 300, 20_000
-_STEP = 1e-3  # of logarithms, for derivatives
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -85,14 +85,13 @@ class Fit:
         LidarpoolError if the file is no .yaml, or cannot be written.
         """
         place = Path(file)
-        if place.suffix not in (".yaml", ".yml"):
+        if place.suffix not in MODEL_FILES:
             raise LidarpoolError(f"{place} is no sensor file: give a name such as mine.yaml.")
         told = self.model.model_dump(mode="json", exclude_defaults=True)
         text = "".join(f"# {line}\n" for line in repr(self).splitlines())
         text += yaml.safe_dump(told, sort_keys=False, allow_unicode=True, default_flow_style=None)
-        page = rendered(
-            "fit.html", report=self.figures, pictures={"fit": _drawn(self.figures).svg()}
-        )
+        drawn = {"fit": _drawn(self.figures).svg()}
+        page = rendered("fit.html", report=self.figures, pictures=drawn)
         written = {place: text, place.with_suffix(".html"): page}
         with explained(f"{place} cannot be written", "choose a folder that exists and has room"):
             for path, content in written.items():
@@ -139,6 +138,10 @@ def fit(
     sigma, count, curves, expected = repeats.sigma.copy(), len(repeats.ranges), {}, None
     if scene is not None:
         expected = _cast(repeats, scene if isinstance(scene, Scene) else Scene.load(scene), pose)
+        off = np.abs(_median(repeats.ranges, 0) - expected)
+        if not (off < _BESIDE_M).sum() > _BESIDE * np.isfinite(off).sum():
+            told = f"less than half of {recording.name} is within {_BESIDE_M} m of the scene"
+            raise LidarpoolError(f"{told}: give the sensor's --pose in it, or no scene.")
         *_, smooth = surfaces(repeats, expected, 0 * sigma)
         lost = np.isnan(repeats.ranges).mean(axis=0)
         curves["lost_by_range"] = _curve(expected[smooth], lost[smooth])
@@ -146,10 +149,8 @@ def fit(
     for _ in range(2):  # the first finds what the second leaves out
         rays = smooth_rays(repeats, sigma, 0.0 if found else _AIM, expected)
         if len(rays.row) < _FEW:
-            raise LidarpoolError(
-                f"{recording.name} has {len(rays.row)} rays on smooth surfaces, not {_FEW}: "
-                "record a place with walls or a floor."
-            )
+            told = f"{recording.name} has {len(rays.row)} rays on smooth surfaces, not {_FEW}"
+            raise LidarpoolError(f"{told}: record a place with walls or a floor.")
         known = np.isfinite(rays.light).all()
         energy = rays.light if known and recording.energies else None
         if known and (white := white or recording.white):
@@ -162,42 +163,34 @@ def fit(
     curves["noise_by_range"] = _curve(rays.distance, own, 0.5)
     curves["noise_by_light"] = _curve(light, own, 0.5)
     curves["noise_by_tilt"] = _curve(np.degrees(np.arctan(rays.slope / rays.distance)), tilted, 0.5)
-    curves["returned_by_light"] = _curve(light, rays.returns / count)
+    curves["returned_by_light"] = _curve(light, rays.returns / count) if count > 1 else []
     curves["light_by_range"] = _curve(rays.distance, rays.light)
     base, name = read_model(model) if model else _recorded(repeats), Path(recording.name).name
+    source = f"fitted by lidarpool {__version__} to {name}, {plural(repeats.sweeps, 'sweep')}"
+    fitted, notes = _with(base, found, source) if found else base, list(repeats.notes)
+    off = np.abs(repeats.elevation_deg[:, None] - (base.beams.elevation_deg or np.inf))
+    if not base.needs_calibration and off.min(axis=1).max() > _OTHER_DEG:
+        notes.append(f"the recorded rings are not those of {base.name}: check --model")
     figures = {
         "versions": {"lidarpool": __version__}, "name": name, "model": base.name,
         "sweeps": repeats.sweeps, "moves": repeats.moves, "rays": len(rays.row),
-        "figures": {key: one._asdict() for key, one in found.items()}, "notes": repeats.notes,
+        "figures": {key: one._asdict() for key, one in found.items()}, "notes": notes,
         "channels": _channels(repeats, rays, own, sigma, expected), "curves": curves,
     }  # fmt: skip
-    source = f"fitted by lidarpool {__version__} to {name}, {plural(repeats.sweeps, 'sweep')}"
-    return Fit(figures, _with(base, found, source) if found else base)
+    return Fit(figures, fitted)
 
 
 def _with(base: SensorModel, known: Mapping[str, Estimate], source: str) -> SensorModel:
     """Return a sensor with what was fitted in its performance; the rest stays."""
-    found = {name: round(float(f"{one.value:.4g}"), 9) for name, one in known.items()}
-    fitted = {"precision", "range_m", "range_per_m"}  # one excludes the others
-    old = base.performance
-    stated = old.model_dump(exclude_defaults=True, exclude=fitted) if old else {}
-    far, weak = (found.get(name, 0.0) for name in ("detection_range_m", "range_at_threshold_m"))
-    if far:
+    found = {name: float(f"{one.value:.4g}") for name, one in known.items()}
+    old = base.performance or Performance()
+    stated = old.model_dump(exclude_defaults=True, exclude={"precision", *_RANGES})
+    if far := found.get("detection_range_m"):
         stated["detection"] = {"range_m": far, "reflectance": 0.1, "probability": 0.5}
-    if weak:
-        stated["precision"] = [
-            {"sigma_m": float(sigma), "range_m": share * far, "reflectance": 0.1}
-            for share, sigma in ((k, np.hypot(found["range_m"], weak * k**2)) for k in (0.5, 1))
-        ]
-    else:
-        stated |= {name: found[name] for name in ("range_m", "range_per_m") if name in found}
-    for name in ("angle_deg", *["false_alarms"] * ("detection" in stated)):
-        if name in known and known[name].low > 0:
-            stated[name] = found[name]
-    sources = {**base.sources, "performance": source}
-    return SensorModel.model_validate(
-        base.model_dump() | {"performance": stated, "sources": sources}
-    )
+    names = *_RANGES, "angle_deg", "dropout", *["false_alarms"] * ("detection" in stated)
+    stated |= {name: found[name] for name in names if name in found}
+    own = {"performance": stated, "sources": {**base.sources, "performance": source}}
+    return SensorModel.model_validate(base.model_dump() | own)
 
 
 def _recorded(repeats: Repeats) -> SensorModel:
@@ -211,14 +204,12 @@ def _recorded(repeats: Repeats) -> SensorModel:
     )
 
 
-def _cast(repeats: Repeats, scene: Scene, pose: Pose | Sequence[float]) -> Floats:
+def _cast(repeats: Repeats, scene: Scene, pose: Any) -> Floats:
     """Ranges of a scene in the cells, (r, c); NaN where it has nothing."""
     ways = repeats.directions.reshape(-1, 3)
     sensor = ListedSensor(head=Spin(len(ways), 360), rays=ways, shot_ns=np.zeros(len(ways)))
-    hits = Scanner(scene, sensor, columns=("ray", "range")).sweep(pose, number=0)
-    found = np.full(len(ways), np.nan)
-    found[hits["ray"]] = hits["range"]
-    return found.reshape(repeats.sigma.shape)
+    found = Scanner(scene, sensor).ranges([pose], number=0).reshape(repeats.sigma.shape)
+    return np.where(np.isfinite(found), found, np.nan).astype(np.float64)
 
 
 class Estimate(NamedTuple):
@@ -240,7 +231,7 @@ class Estimate(NamedTuple):
 
     def power(self, exponent: float, scale: float = 1.0) -> Estimate:
         """Return the estimate of a power, times a scale; what is below 0 counts as 0."""
-        value, *ends = (float(scale * max(one, 0.0) ** exponent) for one in self)
+        value, *ends = (round(float(scale * max(one, 0.0) ** exponent), 9) for one in self)
         return Estimate(value, min(ends), max(ends))
 
 
@@ -266,13 +257,15 @@ class Repeats:
         LidarpoolError if it has no sweeps with points and rings, or they are of several sensors.
         """
         name, notes = recording.name, list(recording.notes)
+        if recording.thinned:
+            raise LidarpoolError(f"{notes[0]}.")
         if recording.whole or not recording.count:
             raise LidarpoolError(f"{name} has no sweeps: give a recording of sweeps.")
         own = max((recording.turn(k) for k in range(min(3, recording.count))), key=len)
         if not len(own):
             raise LidarpoolError(f"{name} has no points: there is nothing to fit.")
         with prefixed(name):
-            cells = range_images(own, own, ("the first", "the first"))
+            cells = range_images(own, own, ("a sweep", "a sweep"))
         shape = len(cells.rings), round(360 / cells.step_deg)
         numbers = even_indices(recording.count, max(MOST_VALUES // (shape[0] * shape[1]), 2))
         if len(numbers) < recording.count:
@@ -339,9 +332,9 @@ def surfaces(repeats: Repeats, distance: Floats, blur: Floats) -> tuple[Floats, 
         slope = np.linalg.norm(change, axis=-1)
         allowed = _KINK_M + _KINK * distance + 5 * blur
         smooth = slope < _STEEPEST * distance
-        smooth &= np.abs((((ahead + back) / 2 - points) * normal).sum(axis=-1)) < allowed
-        for beside in ((far + rear) / 2, above, below):
-            smooth &= np.abs(((beside - points) * normal).sum(axis=-1)) < 2 * allowed
+        near, wide = (ahead + back) / 2, (far + rear) / 2
+        for beside, times in ((near, 1), (wide, 2), (above, 2), (below, 2)):
+            smooth &= np.abs(((beside - points) * normal).sum(axis=-1)) < times * allowed
     return change[..., 1] * ways[..., 0] - change[..., 0] * ways[..., 1], slope, smooth
 
 
@@ -381,9 +374,8 @@ def smooth_rays(
     limit = np.where(returns > 1, _SIGMAS * np.hypot(sigma[cell], aim * slope), np.inf)
     kept = np.abs(ranges - middle[cell]) <= limit
     used = kept.sum(axis=0)
-    mean, bright = (
-        np.where(kept, one, 0).sum(axis=0) / np.maximum(used, 1) for one in (ranges, light)
-    )
+    count = np.maximum(used, 1)
+    mean, bright = (np.where(kept, one, 0).sum(axis=0) / count for one in (ranges, light))
     variance = np.where(kept, (ranges - mean) ** 2, 0).sum(axis=0) / np.maximum(used - 1, 1)
     some = np.flatnonzero((used > 0) & (used >= _WHOLE * returns))
     rays = row, column, mean, slope, bright, returns, variance, used - 1
@@ -575,7 +567,7 @@ def _channels(
             "rays": int(np.isfinite(own[rays.row == row]).sum()),
             "noise_m": _noise(own[rays.row == row]),
             "bias_m": bias[row]._asdict() if row in bias else None,
-            "uneven_deg": _noise(uneven[:, row]),
+            "uneven_deg": _noise(uneven[:, row]) if len(uneven) > 1 else None,
         }
         for row, ring in enumerate(repeats.rings)
     ]
@@ -601,20 +593,20 @@ def _curve(x: Floats, values: Floats, power: float = 1.0) -> list[dict[str, floa
 
 def _drawn(figures: Mapping[str, Any]) -> Page:
     """Draw the curves and rings, with their intervals."""
-    page = Page((1600, 1750))
+    rows, curves = figures["channels"], dict(figures["curves"])
+    for name in ("noise_m", "bias_m", "uneven_deg"):
+        curves[name] = [{"x": one["elevation_deg"], **one[name]} for one in rows if one[name]]
+    shown = [name for name in _CHARTS if curves.get(name)]
+    tall = 140 + 500 * -(-len(shown) // 3)  # pixels
+    page = Page((1600, tall))
     page.title(figures["model"], f"fitted to {figures['name']}; bars are intervals of 95 %")
-    for number, (name, (x, y, unit)) in enumerate(_CHARTS.items()):
-        row, column = divmod(number, 3)
-        axes = page.chart((0.075 + 0.32 * column, 0.67 - 0.305 * row, 0.235, 0.205))
-        axes.set(xlabel=x, ylabel=y)
-        points = figures["curves"].get(name) or [
-            {"x": one["elevation_deg"], **one[name]} for one in figures["channels"] if one.get(name)
-        ]
-        page.heading(axes, "" if points else "not known")
+    for number, name in enumerate(shown):
+        (row, column), points, (x, y, unit) = divmod(number, 3), curves[name], _CHARTS[name]
         at, *values = (np.array([one[key] for one in points]) for key in ("x", *Estimate._fields))
         value, low, high = (unit * one for one in values)
+        axes = page.chart((0.075 + 0.32 * column, 1 - (530 + 500 * row) / tall, 0.235, 360 / tall))
+        scale = "log" if name.endswith("light") and at[0] > 0 else "linear"
+        axes.set(xlabel=x, ylabel=y, xscale=scale)
         axes.vlines(at, low, high, color=theme.UNSEEN, lw=1.8 * page.unit)
         axes.plot(at, value, "o", color=theme.OBJECT_COLOURS[0], ms=3.2 * page.unit, mew=0)
-        if points and name.endswith("light") and at[0] > 0:
-            axes.set_xscale("log")
     return page

@@ -139,8 +139,8 @@ def open_recording(
     if isinstance(place, Cloud | StoredCloud):
         return _of_cloud(name, place, place.sweeps, sensor, light)
     path, name, kind = Path(place), str(place), Path(place).suffix.lower()
-    if not path.exists():
-        raise LidarpoolError(f"{name} does not exist: give {KINDS}.")
+    if not path.exists() or (path.is_file() and not path.stat().st_size):
+        raise LidarpoolError(f"{name} does not exist, or is empty: give {KINDS}.")
     if path.is_dir():
         if (path / "cloud.ply").exists():
             return _of_ply(path / "cloud.ply", name, sensor, light)
@@ -160,8 +160,9 @@ def open_recording(
         return _of_bag(path, name, sensor, light)
     elif kind in (".osf", ".pcap"):
         with _reading(name), path.open("rb") as file:
-            if int.from_bytes(file.read(36)[32:], "little") in _VELODYNE:
-                return _of_velodyne(path, name, light)
+            first = int.from_bytes(file.read(36)[32:], "little")
+        if first in _VELODYNE:
+            return _of_velodyne(path, name, light)
         return _of_ouster(path, name, sensor, light)
     raise LidarpoolError(f"{name} cannot be compared: give {KINDS}.")
 
@@ -342,6 +343,16 @@ def _of_velodyne(path: Path, name: str, light: str | None) -> Recording:
     """Open packets of a Velodyne, which say the model."""
     need("velodyne_decoder", "fit", f"{name} is read")
     decoder: Any = import_module("velodyne_decoder")
+    with _reading(name), path.open("rb") as file:
+        file.seek(24)
+        heads = iter(partial(file.read, 16), b"")
+        frames = (file.read(int.from_bytes(head[8:12], "little")) for head in heads)
+        sent = (frame for frame in frames if len(frame) == _VELODYNE[0])
+        units = {(*one[26:30], int.from_bytes(one[36:38])) for one in sent}
+    if len(units) > 1:
+        a, b, c, d, port = min(units)
+        one = f"tcpdump -r {name} -w one.pcap src {a}.{b}.{c}.{d} and dst port {port}"
+        raise LidarpoolError(f"{name} is of {len(units)} units: keep one, {one}.")
 
     def points(sweep: Any) -> Read:
         columns = {name: sweep.points[name] for name in sweep.points.dtype.names}
@@ -406,6 +417,6 @@ def _chosen(name: str, what: str, there: Iterable[str], wanted: str | None) -> s
         return wanted
     listed = f"{name} has the {what} {', '.join(known)}" if known else f"{name} has no {what}"
     if wanted is None:
-        advice = "choose one (--sensor-a, --sensor-b)" if known else "record one"
+        advice = "choose one (--sensor-a, --sensor-b; of fit --sensor)" if known else "record one"
         raise LidarpoolError(f"{listed}: {advice}.")
     raise LidarpoolError(f"{listed}, not {wanted!r}." + did_you_mean(wanted, known))

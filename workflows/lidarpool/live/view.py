@@ -217,23 +217,13 @@ class View:
         for number, way in enumerate(self.sensors):
             arrays[f"sensor{number}_times"] = way.times_ns / _NS
             arrays[f"sensor{number}_places"] = way.positions
-        meshes, shapes = shapes_of(self.actors)
-        arrays["actor_mesh"] = shapes.astype(np.int32)  # browsers have no arrays of int64
-        for number, mesh in enumerate(meshes):
-            arrays[f"mesh{number}_corners"] = mesh.vertices[mesh.faces].astype(np.float32)
-            if mesh.colours is not None:  # at the corners
-                arrays[f"mesh{number}_colours"] = mesh.colours.means().repeat(3, axis=0)
-        each = samples_each(self.actors, PLACES_MOST)
-        for number, actor in enumerate(self.actors):
-            times, places, turns = actor.samples(self.duration_ns, each)
-            arrays[f"actor{number}_times"] = times / _NS
-            arrays |= {f"actor{number}_places": places, f"actor{number}_turns": turns}
-            arrays[f"actor{number}_there"] = np.array(presence_ns(actor.trajectory)) / _NS
+        arrays |= self._actor_arrays()
         if self.sweeps is not None:
             arrays["sweep_scans"] = self.sweeps.scans.astype(np.float64)
             arrays["sweep_begins"] = self.sweeps.begins_ns / _NS
             arrays["sweep_sensor"] = self.sweeps.sensor
         pictured, objects = self.pictured, len(self._names("object"))
+        statics = objects - len(self.actors)
         classes, several = self._classes_of_objects(), np.arange(len(self.results))
         header = {
             "title": self.title,
@@ -253,21 +243,41 @@ class View:
                 {"name": way.name, "model": way.model, "moves": way.moves} for way in self.sensors
             ],
             "actors": [
-                {"name": actor.name, "class": classes.get(objects + number)}
-                for number, actor in enumerate(self.actors, -len(self.actors))
+                {"name": actor.name, "class": classes.get(number)}
+                for number, actor in enumerate(self.actors, statics)
             ],
             "classes": {str(k): name for k, name in enumerate(self._names("class")) if name},
             "results": legend_of(colours_of(several, RESULT, self.results))["labels"],
             "exports": () if isinstance(self.points, HeldPoints) else EXPORTS,
-            "actor_colours": as_bytes(object_colours(objects))[
-                objects - len(self.actors) :
-            ].tolist(),
-            "statics": objects - len(self.actors),
+            "actor_colours": as_bytes(object_colours(objects))[statics:].tolist(),
+            "statics": statics,
             "duration": self.duration_ns / _NS,
             "path": self.planned,
             "note": self.note,
         }  # fmt: skip
         return header, arrays
+
+    def _actor_arrays(self) -> dict[str, AnyArray]:
+        """Meshes, with their poses if they deform, and where and in which pose each actor is."""
+        meshes, shapes = shapes_of(self.actors)
+        arrays: dict[str, AnyArray] = {"actor_mesh": shapes.astype(np.int32)}  # no int64 in pages
+        for k, mesh in enumerate(meshes):
+            arrays[f"mesh{k}_corners"] = mesh.vertices[mesh.faces].astype(np.float32)
+            if mesh.colours is not None:  # at the corners
+                arrays[f"mesh{k}_colours"] = mesh.colours.means().repeat(3, axis=0)
+            if mesh.animation is not None:
+                arrays[f"mesh{k}_poses"] = mesh.animation.vertices.astype(np.float32)
+                arrays[f"mesh{k}_faces"] = mesh.faces.astype(np.int32)
+        each = samples_each(self.actors, PLACES_MOST)
+        for k, actor in enumerate(self.actors):
+            times, places, turns = actor.samples(self.duration_ns, each)
+            arrays |= {f"actor{k}_times": times / _NS, f"actor{k}_places": places}
+            arrays[f"actor{k}_turns"] = turns
+            arrays[f"actor{k}_there"] = np.array(presence_ns(actor.trajectory)) / _NS
+            if (own := actor.mesh.animation) is not None:  # after the last pose, pages begin again
+                frames, last = actor.seconds(times)[0] / own.step_s, len(own.vertices) - 1 - 1e-6
+                arrays[f"actor{k}_frames"] = frames if own.repeat else frames.clip(0, last)
+        return arrays
 
     @property
     def rays_shown(self) -> Floats32:

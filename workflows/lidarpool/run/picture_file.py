@@ -18,6 +18,7 @@ from ..columns.table import CAUSES, TABLE, Column, by_value
 from ..plan import Plan, Planning
 from ..scenario.build import Job
 from ..scene.actors import Actor, samples_each, shapes_of
+from ..scene.animation import Animation
 from ..scene.colours import Colours
 from ..scene.scene import Scene
 from ..scene.scene_mesh import SceneMesh
@@ -59,7 +60,7 @@ class SensorWay:
 class PictureContent:
     """Content of a result's pictures, except the points."""
 
-    scene: Scene  # trajectories of its actors have a thousand poses at most
+    scene: Scene  # its actors have a thousand places at most, and poses for pictures
     sensors: Sequence[SensorWay]
     hit_counts: AnyArray  # (f,): of each triangle, those of actors after the others
     sample_rays: Floats32  # (k, 2, 3): ends of some rays, metres, local coordinates
@@ -177,11 +178,17 @@ class PictureContent:
                 raise TypeError(f"the trajectory of actor {actor.name!r} is not sampled")
             arrays |= {f"actor{number}_{n}": getattr(track, field) for n, field in _TRACK.items()}
             arrays[f"actor{number}_absent"] = track.beyond == "absent"
+            if actor.mesh.animation is not None:
+                arrays[f"actor{number}_offset"] = actor.offset_s
         meshes, arrays["actor_mesh"] = shapes_of(self.scene.actors)
         for number, mesh in enumerate(meshes):
             arrays |= {f"mesh{number}_vertices": mesh.vertices, f"mesh{number}_faces": mesh.faces}
             if mesh.colours is not None:
                 arrays[f"mesh{number}_colours"] = mesh.colours.means()
+            if (own := mesh.animation) is not None:  # differences compress to a third of the size
+                steps = np.diff(own.vertices, axis=0, prepend=0)
+                arrays[f"mesh{number}_steps"] = steps.astype(np.float32)
+                arrays[f"mesh{number}_played"] = [own.step_s, own.speed_m_s or 0, own.repeat]
         if self.planning is not None and self.plan is not None:
             arrays |= {
                 "ends": [self.planning.start, self.planning.target],
@@ -210,14 +217,15 @@ class PictureContent:
         actors, which = [], arrays["actor_mesh"].tolist()
         meshes = [
             SceneMesh("", arrays[f"{mesh}_vertices"], arrays[f"{mesh}_faces"],
-                 colours=_colours(arrays, f"{mesh}_colours"))
+                 colours=_colours(arrays, f"{mesh}_colours"), animation=_animation(arrays, mesh))
             for mesh in (f"mesh{number}" for number in range(max(which, default=-1) + 1))
         ]  # fmt: skip
         for number, name in enumerate(names["actors"]):
             times, places, turns = (arrays[f"actor{number}_{part}"] for part in _TRACK)
             beyond: Beyond = "absent" if arrays[f"actor{number}_absent"] else "hold"
             way = Track(times, places, turns, start_s=0.0, beyond=beyond)
-            actors.append(Actor(replace(meshes[which[number]], name=name), way))
+            offset_s = float(arrays.get(f"actor{number}_offset", 0))  # without poses, there is none
+            actors.append(Actor(replace(meshes[which[number]], name=name), way, offset_s))
         scene = Scene(
             arrays["vertices"],
             arrays["faces"],
@@ -249,6 +257,14 @@ class PictureContent:
 def _colours(arrays: Mapping[str, Any], name: str) -> Colours | None:
     """Colours of faces, if there are some."""
     return Colours.of_faces(arrays[name]) if name in arrays else None
+
+
+def _animation(arrays: Mapping[str, Any], mesh: str) -> Animation | None:
+    """Poses of a mesh, if it has some."""
+    if (steps := arrays.get(f"{mesh}_steps")) is None:
+        return None
+    step_s, speed, repeat = arrays[f"{mesh}_played"].tolist()
+    return Animation(steps.cumsum(0, np.float64), step_s, speed or None, bool(repeat))
 
 
 def sensor_ways(survey: Survey) -> list[SensorWay]:
@@ -285,4 +301,10 @@ def _sampled(actor: Actor, duration_ns: float, count: int) -> Actor:
     """Return an actor with poses of a survey, whatever its trajectory is."""
     times, places, turns = actor.samples(duration_ns, count)
     beyond: Beyond = "hold" if presence_ns(actor.trajectory) == ALWAYS else "absent"
-    return replace(actor, trajectory=Track(times / 1e9, places, turns, start_s=0.0, beyond=beyond))
+    shown = replace(actor, trajectory=Track(times / 1e9, places, turns, start_s=0.0, beyond=beyond))
+    if (own := actor.mesh.animation) is None:
+        return shown
+    # The animation may follow the way, of which the samples lack the part before the survey.
+    missing_s = actor.seconds(times[:1])[0] - shown.seconds(times[:1])[0]
+    mesh = replace(actor.mesh, animation=own.pictured)
+    return replace(shown, mesh=mesh, offset_s=actor.offset_s + float(missing_s[0]))

@@ -100,9 +100,9 @@ def _of_datasheets(built: Built) -> Iterator[str]:
     """Name what the data sheets of sensors do not state, and the scenario does not give."""
     scenario, given = built.scenario, built.scenario.noise.model_fields_set
     sections: Mapping[str, SensorSection] = scenario.sensors or {"": scenario.sensor}
-    for section, noise in zip(sections.values(), built.survey.noise_each, strict=True):
-        left = [name for name in STATED if name not in given and not getattr(noise, name)]
-        if section.performance == "datasheet" and left:
+    for section, carried in zip(sections.values(), built.survey.carried, strict=True):
+        lacking = (name for name in STATED if not getattr(carried.noise, name, True))
+        if left := [name for name in lacking if name not in given]:
             lacks = ", ".join(f"{STATED[name]} (noise.{name})" for name in left)
             yield f"the data sheet of {section.model} does not state {lacks}: they have no effect"
 

@@ -45,7 +45,7 @@ from ..scene.transform import Transform
 from ..sensor import Mounted, Noise, Pose, Returns, Sensor
 from ..sensor.beams import Rate, Step
 from ..sensor.materials import SemanticClass
-from ..sensor.models import datasheet, load_sensor
+from ..sensor.models import MODEL_FILES, Sheet, load_sensor
 from ..sensor.sensor import Fov, Layers, MaxRange, MinRange, RaysPerRevolution, Sector
 
 COPIES_MOST = 1_000_000  # of one entry
@@ -393,12 +393,13 @@ class SensorSection(Section):
     ] = None
 
     performance: Annotated[
-        Literal["ideal", "datasheet"],
+        Sheet | None,
         about(
             "datasheet: noise, detection range and beam by the model's data sheet; what noise and "
-            "returns say counts more"
+            "returns say counts more; ideal: none; by default datasheet of a file that states it",
+            "ideal",
         ),
-    ] = "ideal"
+    ] = None
 
     @model_validator(mode="after")
     def _one_source(self) -> SensorSection:
@@ -418,7 +419,7 @@ class SensorSection(Section):
     @property
     def has_own_model(self) -> bool:
         """Whether its model is a file of the user's."""
-        return self.model is not None and self.model.endswith((".yaml", ".yml"))
+        return self.model is not None and self.model.endswith(MODEL_FILES)
 
     def mounted(
         self,
@@ -431,8 +432,8 @@ class SensorSection(Section):
         """Return the lidar on its carrier; LidarpoolError if its files cannot be used.
 
         `path` returns those of files. Equal sections have the same sensor, unless their files have
-        changed. With `performance: datasheet` it has noise and returns of its own: those of the
-        data sheet, but for the fields that the sections give.
+        changed. A sensor with a data sheet has noise and returns of its own: those of the sheet,
+        but for the fields that the sections give.
         """
         own = {"rate_hz", "min_range_m", "max_range_m"}
         limits = self.model_dump(include=own, exclude_none=True)
@@ -444,13 +445,12 @@ class SensorSection(Section):
             sensor = _grid(azimuths, **self.model_dump(include=grid), **limits)
         else:
             states = file_states(file for file in (model, unit) if isinstance(file, Path))
-            given = {"calibration": unit, "columns": self.columns, "step_deg": self.step_deg}
-            sensor = _loaded(states, model=model, **given, **limits)
-        if self.performance == "ideal" or model is None:
+            given = self.model_dump(include={"columns", "step_deg", "performance"})
+            sensor = _loaded(states, model=model, calibration=unit, **given, **limits)
+        if sensor.noise is None or sensor.returns is None:
             return Mounted(sensor, mount, name)
-        sheet = datasheet(model)
-        own_returns = replace(sheet.returns, **returns.model_dump(exclude_unset=True))
-        own_noise = replace(sheet.noise, **noise.model_dump(exclude_unset=True))
+        own_returns = replace(sensor.returns, **returns.model_dump(exclude_unset=True))
+        own_noise = replace(sensor.noise, **noise.model_dump(exclude_unset=True))
         return Mounted(sensor, mount, name, returns=own_returns, noise=own_noise)
 
 

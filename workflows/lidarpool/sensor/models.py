@@ -17,6 +17,7 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, model_valida
 
 from ..base.allowance import check_fits
 from ..base.arrays import Floats
+from ..base.declared import UnitShare
 from ..base.elementary import log1p
 from ..base.errors import LidarpoolError
 from ..base.validation import checked, sentences
@@ -30,6 +31,8 @@ from .ray_sensors import ListedSensor, Prism, PrismSensor
 from .sensor import LineSensor, MaxRange, MinRange, Sensor
 
 _BUILT_IN = files("lidarpool.sensor") / "data"
+MODEL_FILES = (".yaml", ".yml")
+Sheet = Literal["ideal", "datasheet"]
 
 
 class _ModelSection(BaseModel):
@@ -126,18 +129,20 @@ STATED = {
 
 
 class Performance(_ModelSection):
-    """What a data sheet says of a sensor's noise and returns; see `datasheet`.
+    """What a data sheet says of a sensor's noise and returns; see `SensorModel.datasheet`.
 
-    The precision of ranges is either `range_m` and `range_per_m`, as of `Noise`, or that of two
-    surfaces, which say how it depends on energy.
+    The precision of ranges is either that of `Noise`, by the same names, or that of two surfaces,
+    which say how it depends on energy.
     """
 
     range_m: Annotated[float, Field(ge=0)] | None = None
     range_per_m: Annotated[float, Field(ge=0)] = 0.0
+    range_at_threshold_m: Annotated[float, Field(ge=0)] = 0.0
     precision: tuple[RangePrecision, RangePrecision] | None = None
     angle_deg: Annotated[float, Field(ge=0)] | None = None
     detection: Detection | None = None
-    false_alarms: Annotated[float, Field(gt=0, lt=0.5)] | None = None  # share of pulses
+    false_alarms: Annotated[float, Field(ge=0, lt=0.5)] | None = None  # share of pulses
+    dropout: UnitShare = 0.0  # of returns, whatever their energy
     mode: Mode = "strongest"
 
     @model_validator(mode="after")
@@ -150,11 +155,9 @@ class Performance(_ModelSection):
             raise ValueError("false_alarms needs detection")
         return self
 
-    def noise(self, gate_s: float, seed: int) -> Noise:
+    def noise(self, gate_s: float) -> Noise:
         """Return the noise of a sensor whose receiver waits so many seconds for returns."""
-        made: dict[str, Any] = {"range_m": self.range_m or 0.0, "range_per_m": self.range_per_m}
-        if self.angle_deg is not None:
-            made["angle_deg"] = self.angle_deg
+        made = self.model_dump(include={one.name for one in fields(Noise)}, exclude_none=True)
         if self.detection is not None:
             made["detection_range_m"] = self.detection.threshold_m
             if self.precision is not None:
@@ -162,7 +165,7 @@ class Performance(_ModelSection):
                 made |= {"range_m": near, "range_at_threshold_m": far}
         if self.false_alarms is not None:
             made["false_alarm_hz"] = -float(log1p(-self.false_alarms)) / gate_s
-        return Noise(**made, seed=seed)
+        return Noise(**made)
 
     def _by_energy(self, threshold_m: float) -> tuple[float, float]:
         """Fit the standard deviations of strong returns, and of those at the threshold."""
@@ -217,6 +220,20 @@ class SensorModel(_ModelSection):
         """Whether its rays need a calibration file."""
         return not (self.beams.elevation_deg or self.mirror or self.prisms)
 
+    def datasheet(self, seed: int = 0) -> Datasheet:
+        """Return its noise and returns; LidarpoolError if its file states no performance."""
+        stated = self.performance
+        if stated is None:
+            raise LidarpoolError(
+                f"{self.name} has no performance in its data file, since no source that could be "
+                "read states it: give noise yourself."
+            )
+        low, high = self.range_m or (0.0, float("inf"))
+        noise = stated.noise(2e-9 * (high - low) / LIGHT_M_NS)
+        subrays = 1 if self.optics.divergence_mrad is None else 7
+        missing = tuple(words for name, words in STATED.items() if not getattr(noise, name))
+        return Datasheet(noise, Returns(stated.mode, subrays=subrays), missing)
+
     def turn(self, rate_hz: float | None, columns: int | None) -> tuple[float, float]:
         """Return the firings in a turn, and turns a second."""
         rate = self.rate_hz if rate_hz is None else rate_hz
@@ -255,7 +272,7 @@ def read_model(name: str | Path) -> SensorModel:
     LidarpoolError
         If there is none of that name, or the file is not one of a sensor.
     """
-    if str(name).endswith((".yaml", ".yml")):
+    if str(name).endswith(MODEL_FILES):
         return _read(Path(name))
     known, name = model_names(), full_name(str(name))
     if name not in known:
@@ -297,46 +314,6 @@ class Datasheet(NamedTuple):
     missing: tuple[str, ...]
 
 
-@checked
-def datasheet(model: str | Path, *, seed: int = 0) -> Datasheet:
-    """Noise and returns of a sensor model, by its data sheet.
-
-    Stated ranges of detection become the range at which half of the pulses on 10 % reflectance
-    return, and stated shares of false alarms a rate. A beam whose divergence is known has 7
-    sub-rays.
-
-    Parameters
-    ----------
-    model
-        Name, such as "ouster/os1-64", or your own data file (.yaml).
-    seed
-        Of the noise.
-
-    Raises
-    ------
-    LidarpoolError
-        If there is no such model, or no data sheet of it could be read.
-
-    Examples
-    --------
-    >>> sheet = datasheet("livox/mid70")
-    >>> sheet.noise.range_m, round(sheet.noise.detection_range_m), sheet.returns.subrays
-    (0.02, 101, 7)
-    """
-    described = read_model(model)
-    stated = described.performance
-    if stated is None:
-        raise LidarpoolError(
-            f"{described.name} has no performance in its data file, since no source that could be "
-            "read states it: give noise yourself."
-        )
-    low, high = described.range_m or (0.0, float("inf"))
-    noise = stated.noise(2e-9 * (high - low) / LIGHT_M_NS, seed)
-    subrays = 1 if described.optics.divergence_mrad is None else 7
-    missing = tuple(words for name, words in STATED.items() if not getattr(noise, name))
-    return Datasheet(noise, Returns(stated.mode, subrays=subrays), missing)
-
-
 def shown_noise(noise: Noise) -> str:
     """Fields of noise that are not their defaults, as in a scenario."""
     shown = (
@@ -357,6 +334,7 @@ def load_sensor(
     step_deg: Step = 10.0,
     min_range_m: MinRange | None = None,
     max_range_m: MaxRange | None = None,
+    performance: Sheet | None = None,
 ) -> Sensor:
     """Make a sensor from a model, or from the calibration of a unit.
 
@@ -378,6 +356,9 @@ def load_sensor(
         several workers can share a turn.
     min_range_m, max_range_m
         Instead of the model's.
+    performance
+        "datasheet": with noise and returns of its data sheet, for surveys that give none. By
+        default "ideal" of a model by name, and of a file that states no performance.
 
     Raises
     ------
@@ -412,6 +393,10 @@ def load_sensor(
         "name": described.name if unit is None else f"{described.name}, {unit.file}",
         "optics": described.optics,
     }
+    own = described.performance is not None and str(model).endswith(MODEL_FILES)
+    if performance == "datasheet" or (performance is None and own):
+        sheet = described.datasheet()
+        common |= {"noise": sheet.noise, "returns": sheet.returns}
     head = Spin(firings, step_deg, rate, described.clockwise, described.zero_deg)
     if unit is not None and (unit.rays is not None or described.listed or described.prisms):
         return _listed(described, unit, head, common)

@@ -18,7 +18,7 @@ _KINDS = {
     kind.__name__: kind
     for kind in (Sensor, LineSensor, PrismSensor, ListedSensor, Beams, Spin, Mirror, Prism)
 }
-_LEFT_OUT = ("optics",)
+_LEFT_OUT = ("optics", "noise", "returns")
 
 
 def described(thing: Any, arrays: MutableMapping[str, AnyArray]) -> Any:

@@ -18,7 +18,8 @@ from ..base.errors import LidarpoolError
 from ..base.validation import checked, checked_fields
 from ..base.vectors import turned
 from .beams import CHANNELS_MOST, Beams, Head, Mirror, Rate, Spin, Step
-from .optics import LIGHT_M_NS, Optics
+from .noise import Noise
+from .optics import LIGHT_M_NS, Optics, Returns
 
 RaysPerRevolution = Annotated[int, about("for a grid: azimuths in one turn", ge=1, le=10_000_000)]
 Layers = Annotated[int, about("for a grid: elevations (rings)", ge=1, le=CHANNELS_MOST)]
@@ -52,6 +53,8 @@ class Sensor:
         Its light and resolution.
     start_ns
         Start of its head, nanoseconds after the start of the survey or station.
+    noise, returns
+        Those of surveys with this sensor that give none; no part of its fingerprint.
 
     Raises
     ------
@@ -72,6 +75,8 @@ class Sensor:
     name: str = ""
     optics: Optics = field(default_factory=Optics)
     start_ns: Annotated[float, Field(ge=0)] = 0.0
+    noise: Noise | None = field(default=None, kw_only=True, compare=False)
+    returns: Returns | None = field(default=None, kw_only=True, compare=False)
     cycle: ClassVar[str] = "turn"  # name of a cycle
 
     def __post_init__(self) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from bisect import bisect_right
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime, timedelta
 from functools import cached_property, partial
 from itertools import accumulate
@@ -68,7 +68,7 @@ class Mounted:
     steps
         Time steps from each station; by default those of the survey.
     returns, noise
-        Its own; by default those of the survey.
+        Its own; by default those of the survey, if it gives them, else those of the sensor.
     """
 
     sensor: Sensor
@@ -216,9 +216,9 @@ class Survey(CloudOptions, Weather):
     materials
         Materials of objects by name; the last entry for an object counts.
     returns
-        Sub-rays of a beam, and which returns of a pulse are reported.
+        Sub-rays of a beam, and which returns of a pulse are reported; by default the sensor's.
     noise
-        Noise of ranges and angles, and lost returns.
+        Noise of ranges and angles, and lost returns; by default the sensor's.
     navigation
         IMU and GNSS receiver of the carrier, whose samples are written beside the cloud.
     faults
@@ -247,8 +247,8 @@ class Survey(CloudOptions, Weather):
     trajectory: Trajectory | None = None
     sensors: Sequence[Mounted] = ()
     materials: Sequence[Material] = ()
-    returns: Returns = field(default_factory=Returns)
-    noise: Noise = field(default_factory=Noise)
+    returns: Annotated[Returns, FILLED_IN] = None  # type: ignore[assignment]
+    noise: Annotated[Noise, FILLED_IN] = None  # type: ignore[assignment]
     navigation: Navigation | None = None
     faults: Sequence[Fault] = ()
     classes: ClassNames = field(default_factory=dict, compare=False)
@@ -257,6 +257,12 @@ class Survey(CloudOptions, Weather):
         self._set(poses=_poses(self.poses), sensors=tuple(self.sensors))
         self._set(trajectory=self._trajectory(), materials=tuple(self.materials))
         self._check_names()
+        for name, kind in (("returns", Returns), ("noise", Noise)):
+            if getattr(self, name) is None:
+                owns = [getattr(one, name) or getattr(one.sensor, name) for one in self.sensors]
+                each = zip(self.sensors, owns, strict=True)
+                self._set(sensors=tuple(replace(one, **{name: own}) for one, own in each))
+                self._set(**{name: (not owns and getattr(self.sensor, name)) or kind()})
         if self.sensors:
             self._set(sensor=self.sensors[0].sensor)
         extra = {"sensor": len(self.sensors) > 1, "class": self.classes}

@@ -122,12 +122,12 @@ class Scanner:
             sensors=[sensor if isinstance(sensor, Mounted) else Mounted(sensor, name=name)],
             poses=[CENTRE],
             steps=1,
-            precision_m=precision_m,  # type: ignore[arg-type]  # None for the sensor's
+            precision_m=precision_m,  # type: ignore[arg-type]  # None for the sensor's, as below
             columns=columns,
             coordinates=coordinates,
             materials=materials,
-            returns=returns or Returns(),
-            noise=noise or Noise(),
+            returns=returns,  # type: ignore[arg-type]
+            noise=noise,  # type: ignore[arg-type]
             visibility_km=visibility_km,
             fog_lidar_ratio_sr=fog_lidar_ratio_sr,
             rain_mm_h=rain_mm_h,

@@ -764,7 +764,8 @@ function takeState(told) {
     label: [actor.name, state.classes[actor.class] ?? ""].filter(Boolean).join(" · "), object: state.statics + k, colour: state.actor_colours[k],
     corners: arrays[`mesh${arrays.actor_mesh[k]}_corners`], own: arrays[`mesh${arrays.actor_mesh[k]}_colours`],
     times: arrays[`actor${k}_times`], places: arrays[`actor${k}_places`], turns: arrays[`actor${k}_turns`],
-    there: arrays[`actor${k}_there`],
+    there: arrays[`actor${k}_there`], frames: arrays[`actor${k}_frames`],
+    poses: arrays[`mesh${arrays.actor_mesh[k]}_poses`], faces: arrays[`mesh${arrays.actor_mesh[k]}_faces`],
   })));
   picture.setRays(arrays.rays);
   document.title = state.title;

@@ -92,12 +92,21 @@ function edgesOf({ min, max }) {
 }
 
 // Position at a time of something that was at places (k, 3) at ascending times.
-function placeAt(times, places, time, moves) {
+function placeAt(times, places, time, moves, width = 3) {
   const before = Math.max(0, lastNotAbove(times, time));
   const after = Math.min(before + 1, times.length - 1);
   const span = times[after] - times[before];
   const share = moves && span > 0 ? Math.min(1, Math.max(0, (time - times[before]) / span)) : 0;
-  return [0, 1, 2].map((axis) => lerp(places[3 * before + axis], places[3 * after + axis], share));
+  return Array.from({ length: width }, (_, axis) => lerp(places[width * before + axis], places[width * after + axis], share));
+}
+
+// Bends the mesh of an actor as it is at a frame: at 1.5 half way from its second pose to the third.
+function bend({ mesh, poses, faces }, frame) {
+  const [count, vertices] = poses.shape, at = frame - (count - 1) * Math.floor(frame / (count - 1));
+  const corners = mesh.geometry.attributes.position;
+  const here = (k) => 3 * (vertices * Math.floor(at) + faces[Math.floor(k / 3)]) + (k % 3);
+  corners.array.forEach((_, k, all) => { all[k] = lerp(poses[here(k)], poses[here(k) + 3 * vertices], at % 1); });
+  corners.needsUpdate = true;
 }
 
 export class Picture {
@@ -321,6 +330,7 @@ export class Picture {
     this.actors = actors;
     const made = new Map(); // {corners: geometry that actors share}
     for (const actor of actors) {
+      if (actor.poses) actor.corners = actor.corners.slice(); // each is in another pose
       const geometry = made.get(actor.corners) ?? new THREE.BufferGeometry();
       made.set(actor.corners, geometry);
       actor.shown = !this.actorsHidden;
@@ -330,6 +340,7 @@ export class Picture {
       actor.mesh = new THREE.Mesh(geometry, material);
       actor.mesh.frustumCulled = false;
       geometry.computeBoundingBox();
+      if (actor.poses) geometry.boundingBox.setFromArray(actor.poses);
       actor.top = geometry.boundingBox.max.z;
       actor.box = this.thickLines(edgesOf(geometry.boundingBox), new THREE.Color(...actor.colour.map((byte) => byte / 255)), 2);
       actor.box.visible = this.boxes;
@@ -432,6 +443,7 @@ export class Picture {
       actor.mesh.position.set(...actor.at);
       const k = Math.max(0, lastNotAbove(actor.times, time));
       actor.mesh.quaternion.set(...actor.turns.subarray(4 * k, 4 * k + 4)).normalize();
+      if (actor.poses && actor.mesh.visible) bend(actor, placeAt(actor.times, actor.frames, time, true, 1)[0]);
     }
     const moving = this.sensors.find((sensor) => sensor.moves) ?? this.sensors[0];
     this.carrier = moving ? new THREE.Vector3(...moving.at) : null;
