@@ -212,6 +212,15 @@ def test_a_wheel_of_a_file_turns_as_animated_even_if_it_shrinks_to_nothing(tmp_p
         (lambda h: h["nodes"][2].update(matrix=np.eye(4).ravel().tolist()), "Move",
          "node 2 is animated, and has a matrix"),
         (lambda h: h["animations"][0]["samplers"][0].update(input=0), "Move", "do not ascend"),
+        (lambda h: h["animations"][0]["channels"][0]["target"].update(node=9), "Move", "index out"),
+        (lambda h: h["animations"][0].update(channels=[]), "Move", "animation that moves no node"),
+        (lambda h: h["animations"][0].update(samplers=[]), "Move", "without a duration"),
+        (lambda h: h["animations"][0]["samplers"][0].update(interpolation="EASE"), "", "'EASE'"),
+        (lambda h: (h["animations"][0]["samplers"][0].update(interpolation="CUBICSPLINE"),
+                    h["accessors"][-1].update(type="SCALAR", count=12)), "Move",
+         "keys of a translation have 1 numbers, not 3"),
+        (lambda h: h["animations"][0]["channels"][0]["target"].update(node=0, path="weights"),
+         "Move", "node 0 has 3 animated weights"),
     ],
 )  # fmt: skip
 def test_unusable_animations_are_refused_in_a_line(tmp_path, edit, name, message):
@@ -222,6 +231,59 @@ def test_unusable_animations_are_refused_in_a_line(tmp_path, edit, name, message
     with pytest.raises(LidarpoolError, match=message) as told:
         load_objects(path, animation=name)
     assert "\n" not in str(told.value)
+
+
+@pytest.mark.parametrize(
+    ("keys", "way", "message"),
+    [([0, 1e9], 1, "would unpack to .*: shorten its animation"),
+     ([0, 1], 1e30, "farther than anything on Earth")],
+)  # fmt: skip
+def test_endless_animations_and_ways_are_refused(tmp_path, keys, way, message):
+    made = skinned()
+    made.moved(2, "translation", keys, [0, 1, 0, way, 1, 0])
+    with pytest.raises(LidarpoolError, match=message):
+        load_objects(made.write(tmp_path / "m.gltf"), animation="Move")
+
+
+def test_where_the_node_of_a_skin_is_does_not_matter(tmp_path):
+    """Even if it has no size meanwhile."""
+    poses = []
+    for shrinks in (False, True):
+        made = skinned()
+        made.moved(2, "translation", KEYS, np.reshape(MOVES, -1))
+        if shrinks:
+            made.moved(0, "scale", [0.25, 0.75, 1.25], [1, 1, 1, 0, 0, 0, 1, 1, 1])
+        found = load_objects(made.write(tmp_path / "m.gltf"), animation="Move")
+        poses.append(found.standing[0].animation.vertices)
+    assert np.array_equal(*poses)
+
+
+def test_a_chain_of_five_hundred_joints(tmp_path):
+    """Each turns by 90° in 500 parts: the last one goes around a circle's quarter."""
+    made, count = skinned(), 500
+    first = np.eye(4)[None].repeat(count, axis=0)
+    first[:, 3, 1] = -np.arange(count) / count  # columns
+    attributes = made.header["meshes"][0]["primitives"][0]["attributes"]
+    attributes["JOINTS_0"] = made.stored([[count - 1, 0, 0, 0]] * 5, "H", 4)
+    attributes["WEIGHTS_0"] = made.stored([[1, 0, 0, 0]] * 5, width=4)
+    made.header["skins"] = [
+        {"joints": list(range(1, count + 1)), "inverseBindMatrices": made.stored(first, width=16)}
+    ]
+    made.header["nodes"] = [
+        {"mesh": 0, "skin": 0, "weights": [0, 0]}, {"children": [2]},
+        *({"translation": [0, 1 / count, 0], "children": [k]} for k in range(3, count + 1)),
+        {"translation": [0, 1 / count, 0]},
+    ]  # fmt: skip
+    half = np.pi / 4 / count
+    for joint in range(1, count + 1):
+        made.moved(joint, "rotation", [0, 1], [0, 0, 0, 1, 0, 0, np.sin(half), np.cos(half)])
+    found = load_objects(made.write(tmp_path / "m.gltf"), animation="Move", up_axis="z")
+    poses = found.standing[0].animation.vertices
+    np.testing.assert_allclose(poses[0], CORNERS, atol=1e-4)
+    tip = np.array([0, (count - 1) / count, 0])
+    x, y, z = (CORNERS - tip).T
+    arc = 2 / np.pi * np.array([-1, 1, 0])
+    np.testing.assert_allclose(poses[60], np.stack([-y, x, z], axis=1) + arc, atol=3e-3)
 
 
 def test_only_gltf_has_animations(tmp_path):
@@ -411,6 +473,25 @@ def test_boxes_hold_the_points_of_people_who_walk(walker, tmp_path):
     np.testing.assert_allclose(scales, sizes)
 
 
+@pytest.mark.parametrize("repeat", [True, False])
+def test_boxes_are_as_large_as_the_poses_between_two_times(repeat):
+    """Also where an animation begins again elsewhere than it ends, and before and after it."""
+    random = np.random.default_rng(5)
+    animation = Animation(random.normal(size=(7, 4, 3)), 0.25, repeat=repeat)
+    begins = np.append(random.uniform(-2, 4, 200), [0, 1.25, 1.5, -1, 9])
+    ends = begins + np.append(random.uniform(0, 1, 200), [0, 0.25, 0.25, 0.5, 0])
+    for begin, end, found in zip(begins, ends, animation.bounds_between(begins, ends), strict=True):
+        inner = np.arange(np.ceil(begin / 0.25), np.floor(end / 0.25) + 1) * 0.25
+        times = np.unique([begin, *inner, end])
+        ways = np.append(times[:-1] + 1e-9, times[1:] - 1e-9) if len(times) > 1 else times
+        frames = animation.frames(ways)
+        shown = animation.at(frames)[0]
+        kept = animation.vertices[np.append(np.floor(frames), np.ceil(frames)).astype(int)]
+        for poses, sign in ((shown, 1), (kept, -1)):  # it holds the first, and no more than these
+            corners = np.stack([poses.min(axis=(0, 1)), poses.max(axis=(0, 1))])
+            assert (sign * (found - corners) * [[-1], [1]] >= -1e-6).all(), (begin, end)
+
+
 def drawn_again(actors, path, seconds=3):
     """Actors of a survey of some seconds, of its file of pictures."""
     scene = Scene.from_meshes([FLOOR]).with_actors(actors)
@@ -514,8 +595,13 @@ def test_wheels_turn_by_speed_over_radius():
         "wheel_flat has no axle, and does not turn: it is 0.6 m long and 0.3 m high, not round "
         "about y"
     ]
-    with pytest.raises(LidarpoolError, match=r"no object that wheels names \(whel\*\) can turn"):
-        rolling(parts, ["whel*"], notes.append)
+    nut = ring("wheel_nut", 0.01, [1.2, 0.9, 0.3])
+    rolling([*parts, nut], ["wheel*"], notes.append)
+    assert notes[1:] == ["wheel_nut is 60 times smaller than the largest, and does not turn"]
+    with pytest.raises(LidarpoolError, match=r"'axle', but no object has that name\. There are Bo"):
+        rolling(parts, ["wheel*", "axle"], notes.append)
+    with pytest.raises(LidarpoolError, match=r"can turn: wheel_flat has no axle, .* about y\.$"):
+        rolling([*parts, flat], ["wheel_flat"], notes.append)
 
 
 def scenario(folder, *actors, **sections):
@@ -558,7 +644,7 @@ def test_scenarios_name_animations(tmp_path):
             {"file": "pedestrian.glb", "animation": "Wlak"},
             r"no animation 'Wlak' .Did you mean 'Walk'",
         ),
-        ({"file": "pedestrian.glb", "wheels": "Boby"}, r"can turn\. Did you mean 'Body'"),
+        ({"file": "pedestrian.glb", "wheels": "Boby"}, r"has that name\. Did you mean 'Body'"),
     ],
 )
 def test_what_is_wrong_with_a_scenario_is_a_line(tmp_path, entry, message):
@@ -585,6 +671,12 @@ def test_people_of_traffic_walk_at_their_own_speed_and_out_of_step(tmp_path):
 
 def test_bad_animations_are_refused():
     mesh = box("Box", (1, 1, 1))
+    poses = np.stack([mesh.vertices] * 2)
+    assert np.array_equal(Animation(poses.astype("f").tolist(), 1).vertices, poses)
+    with pytest.raises(LidarpoolError, match="step_s is inf; it must be a finite number"):
+        Animation(poses, np.inf)
+    with pytest.raises(LidarpoolError, match=r"vertices of an animation is 'abc'; it must be an a"):
+        Animation("abc", 1)
     with pytest.raises(LidarpoolError, match=r"of two poses at least.*given: \(1, 8, 3\), 0.1 s"):
         Animation(mesh.vertices[None], 0.1)
     with pytest.raises(LidarpoolError, match=r"above 0; given.* 0 s, None"):

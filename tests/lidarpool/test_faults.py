@@ -301,6 +301,19 @@ def test_what_does_not_fit_the_survey(words):
     assert str(caught.value).startswith("faults[1]: ")
 
 
+def test_numbers_of_numpy_and_sets_are_as_good(tmp_path):
+    """In labels as well, which are JSON."""
+    faults = [
+        Fault("dead_channels", np.float32(0.25), channels=np.arange(2)),
+        Fault("dead_channels", channels={1}),
+        Fault("dropped_packets", share=np.float32(0.5), packet=np.int64(3)),
+        Fault("dirt", transmission=1, azimuth_deg=np.array([1, 2])),
+    ]
+    Sweeps.of(replace(STANDING, faults=faults), ROOM).save(tmp_path / "sweeps.npz")
+    assert [*Sweeps.load(tmp_path / "sweeps.npz").faults] == faults
+    assert faults[0].channels == (0, 1)
+
+
 PACKETS = {"share": 0.1, "packet": 9}
 
 

@@ -54,7 +54,7 @@ def test_a_channels_error_is_constant_and_its_own():
 
 def test_biases_may_be_those_of_a_calibration():
     biases = np.linspace(-0.1, 0.2, CHANNELS)
-    found = errors(Noise(channel_bias_m=biases.tolist()))
+    found = errors(Noise(channel_bias_m=biases))
     np.testing.assert_allclose(found, biases[TRUE["channel"]], atol=1e-5)
 
 

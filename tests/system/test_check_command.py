@@ -18,7 +18,7 @@ from tests.clusters import thread_cluster
 from tests.meshes import PLY
 
 import lidarpool.cli.forecast
-from lidarpool import Mounted, Returns, Sensor, Survey, Track, read_cloud, simulate
+from lidarpool import Fault, Mounted, Noise, Returns, Sensor, Survey, Track, read_cloud, simulate
 from lidarpool.cli.forecast import forecast, sample_survey
 from lidarpool.run.options import RunOptions
 from lidarpool.scenario.build import build
@@ -84,8 +84,14 @@ DRIVE = Track([0, 4], [(-4, -3, 0), (5, -3, 0)])
         Survey(Sensor.grid(200, layers=2), poses=AROUND * 40, keep_every=7),
         Survey(sensors=TWO, trajectory=DRIVE),
         Survey(Sensor.grid(100, layers=40, rate_hz=500), trajectory=DRIVE),
+        Survey(
+            Sensor.grid(10_000, layers=200),
+            poses=AROUND[:2],
+            noise=Noise(channel_bias_m=[0.01] * 200, ripple_deg=0.01),
+            faults=[Fault("dead_channels", channels=[199])],
+        ),
     ],
-    ids=["sub-rays", "dense", "many stations", "two sensors", "many scans"],
+    ids=["sub-rays", "dense", "many stations", "two sensors", "many scans", "of channels"],
 )
 def test_an_estimate_is_near_what_a_run_gives(survey):
     """Of a thing that fills some scans and is in few of them."""

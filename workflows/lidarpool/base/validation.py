@@ -175,18 +175,18 @@ def _check(thing: Any, given: Mapping[str, Any]) -> None:
         validator.validate_python(given)
     except ValidationError:
         try:
-            validator.validate_python(_without_numpy(given))
+            validator.validate_python(without_numpy(given))
         except ValidationError as error:
             raise LidarpoolError(_argument_error(error, hints)) from None
 
 
-def _without_numpy(value: Any) -> Any:
+def without_numpy(value: Any) -> Any:
     """Return numbers and lists of Python in place of those of NumPy, which will do as well."""
     if isinstance(value, (np.generic, np.ndarray)) and value.ndim < 2:
         return value.tolist()
     if isinstance(value, dict):
-        return {key: _without_numpy(one) for key, one in value.items()}
-    return type(value)(map(_without_numpy, value)) if type(value) in (list, tuple) else value
+        return {key: without_numpy(one) for key, one in value.items()}
+    return type(value)(map(without_numpy, value)) if type(value) in (list, tuple) else value
 
 
 @cache

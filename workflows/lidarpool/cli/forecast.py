@@ -330,11 +330,19 @@ def sample_survey(scene: Scene, survey: Survey, backend: str = "auto") -> dict[s
     rays = survey.ray_count * subrays * int((stops - firsts).sum()) // survey.scan_count
     sampled = survey
     if (every := -(-rays // SAMPLE_RAYS)) > 1:
+        # Faults and errors of certain channels do not fit one beam, and change few hits.
+        other: dict[str, Any] = {"channel_bias_m": 0.0, "ripple_deg": 0.0}
         carried = [
-            replace(one, sensor=_FewRays.of(one.sensor, every), steps=steps)
+            replace(
+                one,
+                sensor=_FewRays.of(one.sensor, every),
+                steps=steps,
+                noise=one.noise and replace(one.noise, **other),
+            )
             for one, steps in zip(survey.carried, survey.steps_each, strict=True)
         ]
-        sampled = replace(survey, sensors=carried)
+        noise = replace(survey.noise, **other)
+        sampled = replace(survey, sensors=carried, noise=noise, faults=())
     rig = Rig(scene, sampled, backend)
     cast = whole = hits = points = 0
     for first, stop in zip(firsts.tolist(), stops.tolist(), strict=True):

@@ -9,6 +9,7 @@ import numpy as np
 
 from ..base.arrays import Floats, Indices
 from ..base.errors import LidarpoolError
+from ..base.validation import as_array, checked_fields
 from ..base.vectors import turned
 
 RATE_HZ = 60.0  # of poses that are baked, at least
@@ -16,6 +17,7 @@ PICTURED = 500_000  # most vertices in all poses of a mesh in pictures; a walk's
 
 
 @dataclass(frozen=True, eq=False)
+@checked_fields
 class Animation:
     """Poses of a mesh, evenly spaced, between which its vertices move straight.
 
@@ -45,6 +47,8 @@ class Animation:
     repeat: bool = True
 
     def __post_init__(self) -> None:
+        poses = as_array("vertices of an animation", self.vertices)
+        object.__setattr__(self, "vertices", np.ascontiguousarray(poses))
         shape, speed = np.shape(self.vertices), self.speed_m_s
         good = len(shape) == 3 and shape[0] > 1 and shape[2] == 3
         good = good and self.step_s > 0 and (speed is None or speed > 0)
@@ -88,16 +92,17 @@ class Animation:
     def bounds_between(self, first_s: Floats, last_s: Floats) -> Floats:
         """Boxes of all poses between seconds (n,) since the first pose: (n, 2, 3)."""
         last = len(self.vertices) - 1
-        first = np.floor(first_s / self.step_s).astype(np.int64)
-        count = np.ceil(last_s / self.step_s).astype(np.int64) - first
+        ends = np.stack([first_s, last_s]) / self.step_s
+        ends = ends if self.repeat else ends.clip(0, last)
+        first = np.floor(ends[0]).astype(np.int64)
+        steps = np.ceil(ends[1]).astype(np.int64) - first  # 0 while it keeps a pose
         lows, highs = self.vertices.min(axis=1), self.vertices.max(axis=1)
-        if self.repeat:  # the last pose and the first one are at the same time
-            lows[0], highs[0] = lows[[0, last]].min(axis=0), highs[[0, last]].max(axis=0)
         low, high = np.full((len(first), 3), np.inf), np.full((len(first), 3), -np.inf)
-        for step in range(min(int(count.max(initial=0)), last) + 1):
-            frame = first + np.minimum(count, step)
-            frame = frame % last if self.repeat else frame.clip(0, last)
-            low, high = np.minimum(low, lows[frame]), np.maximum(high, highs[frame])
+        for step in range(max(1, min(int(steps.max(initial=0)), last))):
+            begin = first + np.minimum(step, (steps - 1).clip(0))
+            begin = begin % last if self.repeat else begin
+            for frame in (begin, begin + (steps > 0)):
+                low, high = np.minimum(low, lows[frame]), np.maximum(high, highs[frame])
         return np.stack([low, high], axis=1)
 
     def moved(self, linear: Floats, offset: Floats) -> Animation:

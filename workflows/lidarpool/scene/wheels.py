@@ -16,6 +16,7 @@ from .scene_instances import SceneInstance
 from .scene_mesh import SceneMesh
 
 _TURN = 64  # poses of a wheel: between two of them it is 0.12 % smaller
+_TURNS_MOST = 10  # of the smallest one in a turn of the largest: poses of all are kept as often
 _ROUND = 0.05  # how much length and height of a wheel may differ
 
 
@@ -35,7 +36,7 @@ def rolling(
     wheels
         Names of the objects that are wheels, with * and ?.
     tell
-        Called with a line on wheels that are not round.
+        Called with a line on wheels that are not round, or small beside others.
 
     Returns
     -------
@@ -44,25 +45,35 @@ def rolling(
     Raises
     ------
     LidarpoolError
-        If no object has such a name, or none of them is round.
+        If no object has one of the names, or none of them is round.
     """
     flat = [one.flat() if isinstance(one, SceneInstance) else one for one in objects]
+    names = [one.name for one in flat]
+    for wheel in wheels:
+        if not any(fnmatchcase(name, wheel) for name in names):
+            hint = did_you_mean(wheel, names) or f" There are {', '.join(names[:5])}."
+            raise LidarpoolError(f"wheels names {wheel!r}, but no object has that name.{hint}")
     radii: dict[int, float] = {}
+    still: list[str] = []  # notes on wheels that are not round
     for number, one in enumerate(flat):
         if any(fnmatchcase(one.name, wheel) for wheel in wheels):
             length, _, height = np.ptp(one.bounds, axis=0).tolist()
-            if abs(length - height) > _ROUND * height:
-                tell(
+            if abs(length - height) > _ROUND * height or not height:
+                still.append(
                     f"{one.name} has no axle, and does not turn: it is {length:.3g} m long and "
                     f"{height:.3g} m high, not round about y"
                 )
             else:
                 radii[number] = height / 2
     if not radii:
-        hint = did_you_mean(wheels[0], [one.name for one in flat])
-        raise LidarpoolError(f"no object that wheels names ({', '.join(wheels)}) can turn.{hint}")
+        raise LidarpoolError(f"no object that wheels names can turn: {still[0]}.")
     largest = max(radii.values())
     turns = {number: round(largest / radius) for number, radius in radii.items()}
+    for number in [number for number, own in turns.items() if own > _TURNS_MOST]:
+        smaller = f"{turns.pop(number)} times smaller than the largest"
+        still.append(f"{flat[number].name} is {smaller}, and does not turn")
+    for line in still:
+        tell(line)
     count = _TURN * max(turns.values())
     for number, own in turns.items():
         middle = flat[number].bounds.mean(axis=0)

@@ -11,7 +11,7 @@ from pydantic import Field
 from ..base.arrays import Bools, Floats, Ints
 from ..base.declared import AngleDeg, Ends, Several, Text, Two, UnitShare, about
 from ..base.errors import LidarpoolError, prefixed
-from ..base.validation import checked_fields
+from ..base.validation import checked_fields, without_numpy
 from ..base.words import did_you_mean
 
 if TYPE_CHECKING:
@@ -57,6 +57,9 @@ class Fault:
     by_s: Annotated[Shift | None, about("of a time jump: added to stamps, seconds")] = None
 
     def __post_init__(self) -> None:
+        for name, value in self.words().items():  # labels have them as JSON
+            listed = np.iterable(value) and not isinstance(value, str)
+            object.__setattr__(self, name, without_numpy(tuple(value) if listed else value))
         own, given = _OWN[self.kind], self.words().keys() - {"kind", "from_s", "to_s", "sensor"}
         for name in sorted((given ^ {*own}) - {one for one in own if one.endswith("_deg")}):
             advice = f"leave {name} out" if name in given else f"give {name}"

@@ -187,6 +187,9 @@ class Noise:
     ripple_phase_deg: Annotated[AngleDeg, about("its phase where the head is at azimuth 0")] = 0.0
 
     def __post_init__(self) -> None:
+        if np.ndim(self.channel_bias_m):
+            biases = tuple(np.asarray(self.channel_bias_m, np.float64).tolist())
+            object.__setattr__(self, "channel_bias_m", biases)
         needs = "range_at_threshold_m", "walk_m", "false_alarm_hz", "stray_light", "crosstalk"
         if self.detection_range_m is None:
             for name in (*needs, "saturation"):

@@ -50,9 +50,9 @@ class Scanner:
     """A sensor in a scene, which scans when it is called: no cluster, no files.
 
     It gives the bytes that a survey gives for the same scans: sweep `number` is the turn (or frame)
-    of that number of a survey along the same trajectory, with the same random numbers. Scanners of
-    equal names and equal seeds of their noise repeat each other's random numbers. Threads may share
-    a scanner.
+    of that number of a survey along the same trajectory, with the same random numbers if the sensor
+    is the survey's first. Scanners of equal names and equal seeds of their noise repeat the random
+    numbers of each other. Threads may share a scanner.
 
     Parameters
     ----------

@@ -25,7 +25,7 @@ import numpy as np
 from ...base.allowance import Allowance
 from ...base.arrays import AnyArray, Bytes, Floats, Ints
 from ...base.elementary import sin_cos_of
-from ...base.vectors import applied, inverse, length, matmul
+from ...base.vectors import applied, length, matmul
 from ...base.words import plural
 from ...sensor.trajectory import matrices
 from ..animation import RATE_HZ, Animation
@@ -150,7 +150,8 @@ class _Reader:
     ) -> None:
         self._header, self._body, self._path = header, body, path
         self._wanted = wanted
-        self._allowance = Allowance(size, SMALLER)
+        still = wanted.animation is None
+        self._allowance = Allowance(size, SMALLER if still else "shorten its animation")
         self._same: dict[str, int] = {}  # {primitives of a mesh: the first with these}
         nodes = header.get("nodes", ())
         self._parents = {
@@ -167,21 +168,28 @@ class _Reader:
         self._channels: AnimatedNodes = {}
         self._frame = 0
         self._local, self._joints = cache(self._read_local), cache(self._read_joints)
+        self._worlds: dict[int, Floats] = {}  # {node: matrix to the scene}, of a frame
 
     def baked(self, name: str) -> Content:
         """Read the scene with an animation, from its first key to its last."""
         animation = chosen(self._header.get("animations", []), name)
         first, last = keys_of(animation, self._accessor)
         if not last > first:
-            raise MeshFileError(f"has an animation {name!r} without a duration: export it again")
+            raise MeshFileError("has an animation without a duration: export it again")
         count = max(1, math.ceil((last - first) * RATE_HZ))
+        self._allowance.take(32 * (count + 1) * (1 + len(animation["channels"])))
         self._channels = played(animation, np.linspace(first, last, count + 1), self._accessor)
+        if not self._channels:
+            raise MeshFileError("has an animation that moves no node: choose another")
+        for index, _ in self._channels:
+            self._part("nodes", index)
         roots, content = _roots(self._header), Content(())
         poses: list[Floats] = []
         for self._frame in range(count + 1):
             taken = self._allowance.taken
             for kept in (self._local, self._joints, self._bent):  # of the frame before
                 kept.cache_clear()
+            self._worlds.clear()
             made = settled(instances(roots, self.node, self._path.stem), copy_all=True)
             now = [mesh.vertices for mesh in made.meshes if isinstance(mesh, SceneMesh)]
             if not poses:
@@ -220,7 +228,7 @@ class _Reader:
     def node(self, index: int) -> Node:
         """Node `index`; without a name it gets that of its mesh."""
         found = self._part("nodes", index)
-        name, meshes, copies = str(found.get("name") or ""), [], None
+        name, meshes, copies = str(found.get("name") or ""), list[SceneMesh](), None
         if "mesh" in found:
             name = name or str(self._part("meshes", found["mesh"]).get("name") or "")
             # Some programs write a mesh for each node, all of the same accessors.
@@ -230,14 +238,10 @@ class _Reader:
                 meshes = self._mesh(self._same.setdefault(content, found["mesh"]))
             else:
                 meshes = self._bent(found["mesh"], weights, skin)
-            if skin is not None:  # its joints place it, not the node
-                world, back = self._world(index), np.eye(4)
-                back[:3, :3] = inverse(world[:3, :3])
-                back[:3, 3] = -applied(back[:3, :3], world[:3, 3])
-                copies = back[None]
             if instancing := found.get("extensions", {}).get(_INSTANCING):
                 copies = self._copies(instancing.get("attributes", {}))
-        return Node(name, self._local(index), meshes, found.get("children", ()), copies)
+        children, skinned = found.get("children", ()), "skin" in found
+        return Node(name, self._local(index), meshes, children, copies, skinned)
 
     def _copies(self, attributes: dict[str, Any]) -> Floats | None:
         """Matrices (k, 4, 4) of the copies of a node's mesh; None if it has one place."""
@@ -275,19 +279,23 @@ class _Reader:
         if not any("targets" in primitive for primitive in mesh["primitives"]):
             return ()
         if (moved := self._channels.get((index, "weights"))) is not None:
+            if moved.shape[1] not in [len(one.get("targets", ())) for one in mesh["primitives"]]:
+                raise ValueError(f"node {index} has {moved.shape[1]} animated weights")
             return tuple(moved[self._frame].tolist())
         return tuple(map(float, node.get("weights", mesh.get("weights", ()))))
 
     def _world(self, index: int) -> Floats:
         """Matrix (4, 4) from a node's coordinates to those of the scene."""
-        matrix, seen = np.eye(4), set()
-        at: int | None = index
-        while at is not None:
-            if at in seen:
+        path, worlds = [index], self._worlds
+        while path[-1] not in worlds and path[-1] in self._parents:
+            path.append(self._parents[path[-1]])
+            if len(path) > len(self._parents) + 1:
                 raise ValueError("nodes contain each other")
-            seen.add(at)
-            matrix, at = matmul(self._local(at), matrix), self._parents.get(at)
-        return matrix
+        for at in reversed(path):
+            if at not in worlds:
+                own, above = self._local(at), self._parents.get(at)
+                worlds[at] = own if above is None else matmul(worlds[above], own)
+        return worlds[index]
 
     def _read_bent(
         self, index: int, weights: tuple[float, ...], skin: int | None

@@ -14,6 +14,7 @@ from ...base.words import did_you_mean
 from .scene_graph import MeshFileError
 
 WIDTHS = {"translation": 3, "rotation": 4, "scale": 3}  # numbers of a node; the rest are weights
+_VALUES = {"LINEAR": 1, "STEP": 1, "CUBICSPLINE": 3}  # {interpolation: values of a key}
 
 AnimatedNodes = dict[tuple[int, str], Floats]  # {(node, what): its values at each time, (t, width)}
 
@@ -31,8 +32,10 @@ def chosen(animations: list[dict[str, Any]], name: str) -> dict[str, Any]:
 
 def keys_of(animation: Mapping[str, Any], read: Callable[[Any], AnyArray]) -> tuple[float, float]:
     """Return the first and last time of all keys; `read` gives the numbers of an accessor."""
-    times = [read(sampler["input"]).astype(np.float64) for sampler in animation["samplers"]]
-    return min(float(t.min()) for t in times), max(float(t.max()) for t in times)
+    times = [read(sampler["input"])[:, 0].astype(np.float64) for sampler in animation["samplers"]]
+    if any((np.diff(t) <= 0).any() or not np.isfinite(t).all() for t in times):
+        raise ValueError("times of an animation do not ascend")
+    return min((t[0] for t in times), default=0.0), max((t[-1] for t in times), default=0.0)
 
 
 def played(
@@ -45,15 +48,12 @@ def played(
         if "node" not in target or target["path"] not in (*WIDTHS, "weights"):
             continue  # of extensions, which move nothing that reflects light
         keys = read(sampler["input"])[:, 0].astype(np.float64)
-        if (np.diff(keys) <= 0).any() or not np.isfinite(keys).all():
-            raise ValueError("times of an animation do not ascend")
-        cubic = sampler.get("interpolation") == "CUBICSPLINE"
+        kind, path = sampler.get("interpolation", "LINEAR"), target["path"]
         values = read(sampler["output"]).astype(np.float64)
-        values = values.reshape(len(keys), 3 if cubic else 1, -1)
-        turns = target["path"] == "rotation"
-        found[target["node"], target["path"]] = _sampled(
-            keys, values, at_s, sampler.get("interpolation", "LINEAR"), turns
-        )
+        values = values.reshape(len(keys), _VALUES[kind], -1)
+        if values.shape[2] != WIDTHS.get(path, values.shape[2]):
+            raise ValueError(f"keys of a {path} have {values.shape[2]} numbers, not {WIDTHS[path]}")
+        found[target["node"], path] = _sampled(keys, values, at_s, kind, path == "rotation")
     return found
 
 

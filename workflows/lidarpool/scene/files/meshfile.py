@@ -420,6 +420,6 @@ def _at_first(actor: Actor) -> SceneMesh:
 def _corners(one: SceneMesh | SceneInstance) -> Floats:
     """Points that an object lies between, in the world."""
     if isinstance(one, SceneMesh):
-        return one.bounds
+        return (one.animation or one).bounds
     box = np.array(list(product(*one.mesh.bounds.T)))
     return np.asarray(turned(box, one.matrix[:3, :3]) + one.matrix[:3, 3])

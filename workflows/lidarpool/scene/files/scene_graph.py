@@ -95,6 +95,7 @@ class Node:
     children: Iterable[Hashable] = ()  # keys of the nodes in it
     # (k, 4, 4), to its coordinates: its meshes are in all these places; None for one
     copies: Floats | None = None
+    skinned: bool = False  # its joints place its meshes, which are in coordinates of the file
 
 
 class PlacedNode(NamedTuple):
@@ -133,6 +134,7 @@ def instances(roots: Iterable[Any], node_of: Callable[[Any], Node], stem: str) -
         matrix = matmul(above, node.matrix)
         path = (*path[1 - _NAMES :], node.name) if node.name else path
         places = [matrix] if node.copies is None else matmul(matrix, node.copies)
+        places = [np.eye(4)] if node.skinned else places
         placed += [
             PlacedNode(mesh, place, path[-1] if path else mesh.name or stem, path)
             for place in places
