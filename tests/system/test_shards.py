@@ -469,11 +469,16 @@ def test_a_folder_keeps_its_shard(parts, lidarpool, slots):
     assert content(parts[1]) == before
 
 
+def slurm(*values: int) -> dict[str, str]:
+    return dict(zip(("ID", "MIN", "MAX", "STEP", "COUNT"), map(str, values), strict=True))
+
+
 SHARDS = [
     ("3/10", {}, Shard(3, 10)),
     ("auto/10", {"JOB_COMPLETION_INDEX": "2"}, Shard(3, 10)),
-    ("auto", {"ID": "14", "MIN": "10", "STEP": "2", "COUNT": "10"}, Shard(3, 10)),
-    ("auto", {"ID": "9", "MIN": "1", "STEP": "1", "COUNT": "3"}, "no shard 9/3: they are 1/3 to"),
+    ("auto", slurm(14, 10, 28, 2, 10), Shard(3, 10)),
+    ("auto", slurm(9, 1, 3, 1, 3), "no shard 9/3: they are 1/3 to"),
+    ("auto", slurm(2, 1, 9, 2, 6), "finds no shard in SLURM_ARRAY_TASK_ID=2, "),  # 1-3,5-9:2
     ("auto", {}, "finds no shard in SLURM_ARRAY_TASK_ID="),
     ("auto/10", {"JOB_COMPLETION_INDEX": "x"}, "finds no shard in JOB_COMPLETION_INDEX=x"),
     ("auto/10", {"JOB_COMPLETION_INDEX": "10"}, "no shard 11/10"),
