@@ -305,6 +305,7 @@ def test_shards_are_added_later(parts, campaigns, tmp_path):
 def test_a_campaign_that_has_grown_is_merged_into_the_same_place(parts, tmp_path, slots):
     out, file = tmp_path / "ds", parts[0].parent / "c.yaml"
     merge(parts, out)
+    shutil.copytree(parts[1], tmp_path / "earlier")
     change(file, "count: 7", "count: 9")
     campaign = Campaign.load(file)
     with Client(slots, set_as_default=False) as client:
@@ -315,6 +316,8 @@ def test_a_campaign_that_has_grown_is_merged_into_the_same_place(parts, tmp_path
     with pytest.raises(LidarpoolError, match=r"^missing: 1 shard, 3/3"):
         merge([parts[1]], out)
     merge([parts[1], parts[2]], out)
+    assert content(out) == content(tmp_path / "one")
+    merge([tmp_path / "earlier"], out)  # which has not grown
     assert content(out) == content(tmp_path / "one")
 
 
@@ -353,10 +356,38 @@ def test_jobs_that_shards_have_retried_stay_done_in_the_data_set(tmp_path, slots
         assert merge(parts, out)["jobs"]["failed"] == 2
         assert len(campaign.run(out, retry_failed=True, **some).failed) == 2
         (tmp_path / "open").touch()
-        for number, part in enumerate(parts, 1):
-            assert not campaign.run(part, shard=(number, 2), retry_failed=True, **some).failed
-        assert merge(parts, out)["jobs"]["done"] == 2
-        assert campaign.run(out, resume=True, **some).done == 2
+        assert not campaign.run(parts[0], shard=(1, 2), retry_failed=True, **some).failed
+        assert merge(parts, out)["jobs"]["done"] == 1
+        assert campaign.run(out, resume=True, **some).done == 1
+        assert campaign.run(out, retry_failed=True, **some).done == 2
+    assert merge(parts, out)["jobs"]["done"] == 2  # the second shard still has a failed job
+
+
+TRIANGLE = (
+    "solid a\nfacet normal 0 0 1\nouter loop\nvertex 0 0 1\nvertex 4 0 1\nvertex 0 4 2\n"
+    "endloop\nendfacet\nendsolid a\n"
+)
+
+
+def test_shards_fit_together_after_a_mesh_was_repaired(tmp_path, slots):
+    (tmp_path / "base.yaml").write_text(BASE.replace("box: [4, 2, 1.5]", "file: a.stl"))
+    vary = "base: base.yaml\nvary: {actors.Car.file: {each: [a.stl, b.stl]}}\nkeep: kitti\n"
+    (tmp_path / "c.yaml").write_text(vary)
+    for name in "ab":
+        (tmp_path / f"{name}.stl").write_text(TRIANGLE)
+    change(tmp_path / "b.stl", TRIANGLE, "solid b\nendsolid b\n")
+    campaign = Campaign.load(tmp_path / "c.yaml")
+    parts = [tmp_path / "part-1", tmp_path / "part-2"]
+    with Client(slots, set_as_default=False) as client:
+        for number, failed in ((1, 0), (2, 1)):
+            run = campaign.run(parts[number - 1], client=client, shard=(number, 2))
+            assert len(run.failed) == failed
+        (tmp_path / "b.stl").write_text(TRIANGLE)
+        assert campaign.run(parts[1], client=client, shard=(2, 2), retry_failed=True).done == 1
+        with pytest.raises(LidarpoolError, match=r"differ in the file b\.stl:"):
+            merge(parts, tmp_path / "ds")
+        assert campaign.run(parts[0], client=client, shard=(1, 2), resume=True).done == 1
+        assert merge(parts, tmp_path / "ds")["jobs"]["done"] == 2
 
 
 # -- kills ----------------------------------------------------------------------------------------

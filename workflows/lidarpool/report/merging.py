@@ -202,11 +202,11 @@ def _check(parts: Sequence[_Part], partial: bool, own: _Part | None = None) -> l
 
 def _missing(parts: Sequence[_Part]) -> list[Shard]:
     """List the shards that are not there, or lack jobs by which the campaign has grown."""
-    largest, of = max(parts, key=lambda part: part.whole), parts[-1].shards[0].of
+    of, parts = parts[-1].shards[0].of, sorted(parts, key=lambda part: part.whole)
     have = {shard.number: len(part.done(shard)) for part in parts for shard in part.shards}
     have.setdefault(1, -1)  # which plans the path, even if it has no scans
     every = (Shard(number, of) for number in range(1, of + 1))
-    return [shard for shard in every if have.get(shard.number, 0) < len(largest.done(shard))]
+    return [shard for shard in every if have.get(shard.number, 0) < len(parts[-1].done(shard))]
 
 
 def _merge_dataset(parts: Sequence[_Part], out: Storage, partial: bool) -> dict[str, Any]:
@@ -246,11 +246,11 @@ def _merge_dataset(parts: Sequence[_Part], out: Storage, partial: bool) -> dict[
 
 
 def _rows(parts: Sequence[_Part]) -> Iterator[JobRow]:
-    """Yield the rows of all jobs by number; of a job of several parts, that of the last one."""
+    """Yield the rows of all jobs by number; of a job of several parts, the last one that is done."""
     number = attrgetter("number")
     tables = [read_table(part.place) for part in parts if part.shards]
     for _, rows in groupby(heapq.merge(*tables, key=number), number):
-        yield [*rows][-1]
+        yield max(reversed([*rows]), key=attrgetter("done"))  # the first of equals
 
 
 def _merge_survey(
