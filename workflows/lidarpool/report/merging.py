@@ -246,7 +246,7 @@ def _merge_dataset(parts: Sequence[_Part], out: Storage, partial: bool) -> dict[
 
 
 def _rows(parts: Sequence[_Part]) -> Iterator[JobRow]:
-    """Yield the rows of all jobs by number; of a job of several parts, the last one that is done."""
+    """Yield the rows of all jobs by number; of a job of several parts, one that is done."""
     number = attrgetter("number")
     tables = [read_table(part.place) for part in parts if part.shards]
     for _, rows in groupby(heapq.merge(*tables, key=number), number):
