@@ -18,6 +18,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from fsspec.implementations.memory import MemoryFileSystem
 from tests.daemons import wait_until
 from tests.drives import SCANS, SPLITS, TURNS, points_of, the_scene, the_sweeps, write_set
 from tests.rows import quick
@@ -25,6 +26,7 @@ from tests.rows import quick
 import lidarpool
 import lidarpool.export.kitti
 from lidarpool import LidarpoolError, Scene, Sweep
+from lidarpool.base.storage import Storage
 from lidarpool.datasets.dataset import INDEX_FILE
 from lidarpool.export.boxes import Boxes
 from lidarpool.export.format_table import DATA_SETS
@@ -155,6 +157,25 @@ def test_sweeps_are_chosen_by_split_job_and_sensor(written):
         with pytest.raises(LidarpoolError, match=words) as told:
             lidarpool.sweeps(place, **options)
         assert "\n" not in str(told.value)
+
+
+def test_a_store_that_does_not_answer_is_not_taken_for_a_damaged_file(
+    written, tmp_path, monkeypatch
+):
+    url = f"memory://{tmp_path.name}/set"
+    for path in written("kitti").rglob("*"):
+        if path.is_file():
+            name = path.relative_to(written("kitti")).as_posix()
+            Storage.at(url).write(name, path.read_bytes())
+    data = lidarpool.sweeps(url)
+    assert len(data[0])
+
+    def unreachable(*_: object, **__: object) -> None:
+        raise RuntimeError("Could not connect")  # libraries have errors of their own
+
+    monkeypatch.setattr(MemoryFileSystem, "cat_file", unreachable)
+    with pytest.raises(LidarpoolError, match=r"01\.bin cannot be read: RuntimeError: Could not"):
+        data[1]
 
 
 def test_what_is_no_data_set_is_told_in_a_line(written, tmp_path, monkeypatch):

@@ -1,6 +1,7 @@
 """Parts, runs and results in an object store that speaks S3."""
 
 import json
+import multiprocessing
 import sys
 from collections.abc import Callable, Iterator
 from hashlib import sha256
@@ -186,6 +187,25 @@ def test_a_data_set_is_written_and_read_in_the_bucket(environment, tmp_path, for
     system.rm(f"{folder}/dataset.json")
     with pytest.raises(package.LidarpoolError, match="is an unfinished data set"):
         package.sweeps(url)
+
+
+@pytest.mark.parametrize("format", ["kitti", "parquet"])  # which pyarrow reads
+def test_forks_read_a_data_set_that_their_parent_has_opened(environment, format):  # noqa: A002
+    scene, url = the_scene(), f"{BUCKET}/forks/{format}"
+    write_set(url, format, scene, the_sweeps(scene))
+    data = package.sweeps(url, shuffle=2)
+    alone = [sweep.points.tobytes() for sweep in data]
+    context = multiprocessing.get_context("fork")  # as of workers of a DataLoader
+    queue = context.Queue()
+
+    def read() -> None:
+        queue.put([sweep.points.tobytes() for sweep in data])
+
+    forks = [context.Process(target=read, daemon=True) for _ in range(2)]
+    for fork in forks:
+        fork.start()
+    assert [queue.get(timeout=60) for _ in forks] == [alone] * 2
+    assert data[0].points.tobytes() == alone[0]
 
 
 @pytest.mark.parametrize(

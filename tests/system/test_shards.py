@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pyarrow.parquet
 import pytest
 from distributed import Client
@@ -18,9 +19,10 @@ from tests.clusters import thread_cluster
 from tests.killed_drivers import drive
 from tests.rows import quick
 
-from lidarpool import Campaign, LidarpoolError, merge
+from lidarpool import Campaign, Job, LidarpoolError, Noise, Scene, Sensor, Survey, merge
 from lidarpool.base.shard import Shard
 from lidarpool.export.format_table import DATA_SETS
+from lidarpool.scene.actors import box
 
 CAMPAIGN = """
 base: base.yaml
@@ -153,6 +155,10 @@ def cut(path: Path) -> None:
     path.write_bytes(path.read_bytes()[:-1])
 
 
+def cut_rows(path: Path) -> None:
+    path.write_text("".join(path.read_text().splitlines(keepends=True)[:-1]))
+
+
 def flip(path: Path) -> None:
     data = bytearray(path.read_bytes())
     data[-1] ^= 1
@@ -168,7 +174,9 @@ DAMAGE = {
     "changed": lambda part: flip(part / "jobs/0001/cloud.ply"),
     "lost": lambda part: (part / "jobs/0001/cloud.ply").unlink(),
     "manifest": lambda part: flip(part / ".jobs/0001.json"),
+    "row": lambda part: cut_rows(part / "jobs.csv"),
 }
+NAMED = {"manifest": ".jobs/0001.json", "row": "jobs.csv"}
 
 
 @pytest.mark.parametrize("damage", DAMAGE)
@@ -176,7 +184,7 @@ def test_damaged_files_are_named_and_the_next_merge_takes_them(
     parts, campaigns, tmp_path, damage, slots
 ):
     DAMAGE[damage](parts[1])
-    out, name = tmp_path / "ds", ".jobs/0001.json" if damage == "manifest" else "0001/cloud.ply"
+    out, name = tmp_path / "ds", NAMED.get(damage, "0001/cloud.ply")
     with pytest.raises(LidarpoolError, match=f"^missing or damaged: .*part-2/.*{name}; run"):
         merge(parts, out)
     assert not (out / "dataset.json").exists() and (out / ".jobs/0000.json").exists()
@@ -185,8 +193,20 @@ def test_damaged_files_are_named_and_the_next_merge_takes_them(
         campaign.run(parts[1], client=client, verify=True, shard=(2, 3))
     merge(parts, out)
     made, whole = content(out), content(campaigns("folder") / "one")
-    assert made.pop("report.json")["notes"][0].startswith("made again: job 0001")
+    notes = made.pop("report.json")["notes"]
+    assert damage == "row" or notes[0].startswith("made again: job 0001")
     assert made == {name: data for name, data in whole.items() if name in made}
+
+
+def test_a_data_set_that_is_given_by_another_name_keeps_its_files(parts, tmp_path):
+    out = tmp_path / "ds"
+    merge(parts, out)
+    change(out / ".jobs/0001.json", "crc", "cRc")
+    before = content(out)
+    (tmp_path / "link").symlink_to(out)
+    with pytest.raises(LidarpoolError, match="there is nothing to merge"):
+        merge([out / ".." / "ds", tmp_path / "link"], out)
+    assert content(out) == before
 
 
 def test_a_manifest_that_names_files_elsewhere_is_damaged(parts, tmp_path):
@@ -285,6 +305,7 @@ def test_shards_are_added_later(parts, campaigns, tmp_path):
 def test_a_campaign_that_has_grown_is_merged_into_the_same_place(parts, tmp_path, slots):
     out, file = tmp_path / "ds", parts[0].parent / "c.yaml"
     merge(parts, out)
+    shutil.copytree(parts[1], tmp_path / "earlier")
     change(file, "count: 7", "count: 9")
     campaign = Campaign.load(file)
     with Client(slots, set_as_default=False) as client:
@@ -295,6 +316,8 @@ def test_a_campaign_that_has_grown_is_merged_into_the_same_place(parts, tmp_path
     with pytest.raises(LidarpoolError, match=r"^missing: 1 shard, 3/3"):
         merge([parts[1]], out)
     merge([parts[1], parts[2]], out)
+    assert content(out) == content(tmp_path / "one")
+    merge([tmp_path / "earlier"], out)  # which has not grown
     assert content(out) == content(tmp_path / "one")
 
 
@@ -315,6 +338,56 @@ def test_failed_jobs_are_in_the_table_until_they_are_done(tmp_path, slots):
     report = merge([tmp_path / "part-1", tmp_path / "part-2"], tmp_path / "ds")
     assert (report["jobs"]["done"], report["jobs"]["failed"]) == (0, 2)
     assert "0001" in (tmp_path / "ds" / "jobs.csv").read_text()
+
+
+def test_jobs_that_shards_have_retried_stay_done_in_the_data_set(tmp_path, slots):
+    def make(number: int, rng: np.random.Generator) -> Job:
+        if not (tmp_path / "open").exists():
+            raise RuntimeError("the street is closed")
+        survey = Survey(Sensor.grid(36, 4), poses=[(0, 0, 1)], noise=Noise(range_m=0.02))
+        return Job(Scene.from_meshes([box("Car", (4, 2, 3))]), survey)
+
+    campaign, out = Campaign(make, 2), tmp_path / "ds"
+    parts = [tmp_path / "part-1", tmp_path / "part-2"]
+    with Client(slots, set_as_default=False) as client:
+        some = {"client": client, "backend": "numpy"}
+        for number, part in enumerate(parts, 1):
+            assert len(campaign.run(part, shard=(number, 2), **some).failed) == 1
+        assert merge(parts, out)["jobs"]["failed"] == 2
+        assert len(campaign.run(out, retry_failed=True, **some).failed) == 2
+        (tmp_path / "open").touch()
+        assert not campaign.run(parts[0], shard=(1, 2), retry_failed=True, **some).failed
+        assert merge(parts, out)["jobs"]["done"] == 1
+        assert campaign.run(out, resume=True, **some).done == 1
+        assert campaign.run(out, retry_failed=True, **some).done == 2
+    assert merge(parts, out)["jobs"]["done"] == 2  # the second shard still has a failed job
+
+
+TRIANGLE = (
+    "solid a\nfacet normal 0 0 1\nouter loop\nvertex 0 0 1\nvertex 4 0 1\nvertex 0 4 2\n"
+    "endloop\nendfacet\nendsolid a\n"
+)
+
+
+def test_shards_fit_together_after_a_mesh_was_repaired(tmp_path, slots):
+    (tmp_path / "base.yaml").write_text(BASE.replace("box: [4, 2, 1.5]", "file: a.stl"))
+    vary = "base: base.yaml\nvary: {actors.Car.file: {each: [a.stl, b.stl]}}\nkeep: kitti\n"
+    (tmp_path / "c.yaml").write_text(vary)
+    for name in "ab":
+        (tmp_path / f"{name}.stl").write_text(TRIANGLE)
+    change(tmp_path / "b.stl", TRIANGLE, "solid b\nendsolid b\n")
+    campaign = Campaign.load(tmp_path / "c.yaml")
+    parts = [tmp_path / "part-1", tmp_path / "part-2"]
+    with Client(slots, set_as_default=False) as client:
+        for number, failed in ((1, 0), (2, 1)):
+            run = campaign.run(parts[number - 1], client=client, shard=(number, 2))
+            assert len(run.failed) == failed
+        (tmp_path / "b.stl").write_text(TRIANGLE)
+        assert campaign.run(parts[1], client=client, shard=(2, 2), retry_failed=True).done == 1
+        with pytest.raises(LidarpoolError, match=r"differ in the file b\.stl:"):
+            merge(parts, tmp_path / "ds")
+        assert campaign.run(parts[0], client=client, shard=(1, 2), resume=True).done == 1
+        assert merge(parts, tmp_path / "ds")["jobs"]["done"] == 2
 
 
 # -- kills ----------------------------------------------------------------------------------------
@@ -469,11 +542,16 @@ def test_a_folder_keeps_its_shard(parts, lidarpool, slots):
     assert content(parts[1]) == before
 
 
+def slurm(*values: int) -> dict[str, str]:
+    return dict(zip(("ID", "MIN", "MAX", "STEP", "COUNT"), map(str, values), strict=True))
+
+
 SHARDS = [
     ("3/10", {}, Shard(3, 10)),
     ("auto/10", {"JOB_COMPLETION_INDEX": "2"}, Shard(3, 10)),
-    ("auto", {"ID": "14", "MIN": "10", "STEP": "2", "COUNT": "10"}, Shard(3, 10)),
-    ("auto", {"ID": "9", "MIN": "1", "STEP": "1", "COUNT": "3"}, "no shard 9/3: they are 1/3 to"),
+    ("auto", slurm(14, 10, 28, 2, 10), Shard(3, 10)),
+    ("auto", slurm(9, 1, 3, 1, 3), "no shard 9/3: they are 1/3 to"),
+    ("auto", slurm(2, 1, 9, 2, 6), "finds no shard in SLURM_ARRAY_TASK_ID=2, "),  # 1-3,5-9:2
     ("auto", {}, "finds no shard in SLURM_ARRAY_TASK_ID="),
     ("auto/10", {"JOB_COMPLETION_INDEX": "x"}, "finds no shard in JOB_COMPLETION_INDEX=x"),
     ("auto/10", {"JOB_COMPLETION_INDEX": "10"}, "no shard 11/10"),

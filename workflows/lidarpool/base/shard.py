@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 from .errors import LidarpoolError
 
-_SLURM = [f"SLURM_ARRAY_TASK_{name}" for name in ("ID", "MIN", "STEP", "COUNT")]
+_SLURM = [f"SLURM_ARRAY_TASK_{name}" for name in ("ID", "MIN", "MAX", "STEP", "COUNT")]
 _KUBERNETES = ["JOB_COMPLETION_INDEX"]
 
 
@@ -42,7 +42,9 @@ class Shard:
         names = _KUBERNETES if found[2] else _SLURM
         try:
             index, *array = (int(environment[name]) for name in names)
-            first, step, count = array or (0, 1, int(found[2]))
+            first, last, step, count = array or (0, int(found[2]) - 1, 1, int(found[2]))
+            if last != first + step * (count - 1):
+                raise ValueError("the tasks of the array are not evenly spaced")
             return cls((index - first) // step + 1, count)
         except (LookupError, ValueError, ZeroDivisionError) as error:
             told = ", ".join(f"{name}={environment.get(name, '')}" for name in names)

@@ -124,7 +124,9 @@ class Storage:
     def _remote(self) -> Iterator[tuple[Any, str]]:
         """File system and folder of a URL; any error of its library becomes an OSError."""
         try:
-            system, folder = self._opened
+            if self._opened[0] != os.getpid():  # a fork cannot use its parent's connections
+                self.__dict__.pop("_opened", None)
+            _, system, folder = self._opened
             system.invalidate_cache()  # other processes write there, too
             yield system, folder
         except (OSError, LidarpoolError):
@@ -133,7 +135,8 @@ class Storage:
             raise OSError(f"{type(error).__name__}: {error}") from error
 
     @cached_property
-    def _opened(self) -> tuple[Any, str]:
+    def _opened(self) -> tuple[int, Any, str]:
+        """The process that has opened it, file system and folder."""
         import fsspec
 
         try:
@@ -142,7 +145,7 @@ class Storage:
             extra = 'pip install "lidarpool[s3]"' if self.url.startswith("s3://") else ""
             hint = f": {extra}" if extra and isinstance(error, ImportError) else ""
             raise LidarpoolError(f"{self.url} cannot be opened: {error}{hint}.") from error
-        return system, folder
+        return os.getpid(), system, folder
 
     def file_system(self) -> tuple[Any, str]:
         """Return the file system of fsspec and the folder, for libraries that open files."""

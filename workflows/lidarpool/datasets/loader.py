@@ -338,8 +338,8 @@ def _unreadable(file: str, error: Exception) -> LidarpoolError:
     """Return the error of a file that is missing or damaged, in a line."""
     if isinstance(error, LidarpoolError):
         return error
-    if isinstance(error, OSError) and error.strerror:
-        return LidarpoolError(f"{file} cannot be read: {error.strerror}.")
+    if isinstance(error, OSError) and (error.strerror or error.__cause__):  # the latter of a URL
+        return LidarpoolError(f"{file} cannot be read: {error.strerror or error}.")
     reason = (str(error).splitlines() or [type(error).__name__])[0].rstrip(". ")[:120]
     return LidarpoolError(
         f"{file} is missing or damaged ({reason}): get it again, or remove its job from the data "

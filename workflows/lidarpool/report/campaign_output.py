@@ -88,6 +88,8 @@ class DataSetOutput(Output[CampaignRun]):
             return None
         if RUN_FOLDER in there:  # a killed run has not removed all of itself
             remove_run(kept)
+        if (files := hashes(self.campaign.files)) != [*map(tuple, self._made["files"])]:
+            write_record(out, {**self._made, "files": files})  # `_look`: no job has an older one
         conductor.screen.tell(f"{out} is complete: nothing is left to do")
         for row in read_table(out):
             conductor.page.ended(row)

@@ -9,7 +9,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import closing, suppress
 from dataclasses import dataclass, replace
 from functools import partial
-from itertools import chain, groupby
+from itertools import groupby
 from operator import attrgetter
 from pathlib import Path
 from typing import Any
@@ -22,7 +22,7 @@ from ..base.validation import checked
 from ..base.words import plural
 from ..columns.parts import part_name
 from ..datasets.dataset import INDEX_FILE, DataSet, ahead
-from ..datasets.job_table import JobRow, read_table
+from ..datasets.job_table import TABLE_FILE, JobRow, read_table
 from ..export.folder import LAST_FILE, output_place, result_folder
 from ..pipeline.database import FILE, RunDatabase
 from ..pipeline.messages import Receipt
@@ -35,7 +35,7 @@ from ..run.progress import Screen
 from ..run.remote import fetch_database
 from ..run.run_page import RunPage
 from ..run.run_result import CampaignRun, RunResult
-from ..run.store import RUN_FOLDER, parts_of, with_sensors
+from ..run.store import RUN_FOLDER, parts_of, remove_run, with_sensors
 from ..scenario.build import build
 from ..scenario.scenario import Scenario
 from .campaign_output import CAMPAIGN_FILE, dataset_files, write_record, write_shared
@@ -112,7 +112,8 @@ def merge(
         it names them.
     """
     place, screen = output_place(str(out)), screen or Screen()
-    places = {one.url: one for one in map(Storage.at, shards) if one.url != Storage.at(place).url}
+    places = {_real(one): one for one in map(Storage.at, shards)}
+    places.pop(_real(Storage.at(place)), None)  # `part-*` may have it
     parts, mistakes = list[_Part](), Mistakes()
     for one in places.values():
         with mistakes.noted():
@@ -124,6 +125,11 @@ def merge(
         return _merge_survey(parts, place, partial, scenario, screen)
     with result_folder(place), screen.status("merging the data set"):
         return _merge_dataset(parts, Storage.at(place), partial)
+
+
+def _real(place: Storage) -> str:
+    """Return the same for a folder by whatever path, which may lead through links."""
+    return str(Path(place.url).resolve()) if place.is_local else place.url
 
 
 def _read(place: Storage) -> _Part:
@@ -196,11 +202,11 @@ def _check(parts: Sequence[_Part], partial: bool, own: _Part | None = None) -> l
 
 def _missing(parts: Sequence[_Part]) -> list[Shard]:
     """List the shards that are not there, or lack jobs by which the campaign has grown."""
-    largest, of = max(parts, key=lambda part: part.whole), parts[-1].shards[0].of
+    of, parts = parts[-1].shards[0].of, sorted(parts, key=lambda part: part.whole)
     have = {shard.number: len(part.done(shard)) for part in parts for shard in part.shards}
     have.setdefault(1, -1)  # which plans the path, even if it has no scans
     every = (Shard(number, of) for number in range(1, of + 1))
-    return [shard for shard in every if have.get(shard.number, 0) < len(largest.done(shard))]
+    return [shard for shard in every if have.get(shard.number, 0) < len(parts[-1].done(shard))]
 
 
 def _merge_dataset(parts: Sequence[_Part], out: Storage, partial: bool) -> dict[str, Any]:
@@ -219,23 +225,32 @@ def _merge_dataset(parts: Sequence[_Part], out: Storage, partial: bool) -> dict[
     dataset.check_installed()
     if own is None:  # from now on it is known whose files these are
         write_record(out, record | {"shards": []})
+    damaged = list[str]()
     with explained(f"{out} cannot be merged"):
-        taken = (dataset.take(part.place, read_table(part.place)) for part in parts)
-        if damaged := [wrong for _, wrong in chain.from_iterable(taken) if wrong]:
-            raise LidarpoolError(f"missing or damaged: {listed(damaged, NAMED)}; {_AGAIN}.")
+        for part in parts:
+            left = sum(len(part.done(shard)) for shard in part.shards)
+            for _, wrong in dataset.take(part.place, read_table(part.place)):
+                damaged += [wrong] if wrong else []
+                left -= 1
+            damaged += [part.place.path(TABLE_FILE)] if left > 0 else []
+    if damaged:
+        raise LidarpoolError(f"missing or damaged: {listed(damaged, NAMED)}; {_AGAIN}.")
     lacking, there = _missing(known), {shard for part in known for shard in part.shards}
     record["shards"] = [*map(str, sorted(there.difference(lacking)) if lacking else [ALL])]
     more = {"sensors": sensors, "notes": tuple(notes)}
     run = CampaignRun.of(_rows(known), 0.0, 0, **more)
-    return write_shared(dataset, record, run, lambda: _rows(known))[1]
+    report = write_shared(dataset, record, run, lambda: _rows(known))[1]
+    if own:  # a run with failed jobs, which would go on with what it knows of them
+        remove_run(out.below(RUN_FOLDER))
+    return report
 
 
 def _rows(parts: Sequence[_Part]) -> Iterator[JobRow]:
-    """Yield the rows of all jobs by number; of a job of several parts, that of the last one."""
+    """Yield the rows of all jobs by number; of a job of several parts, one that is done."""
     number = attrgetter("number")
     tables = [read_table(part.place) for part in parts if part.shards]
     for _, rows in groupby(heapq.merge(*tables, key=number), number):
-        yield [*rows][-1]
+        yield max(reversed([*rows]), key=attrgetter("done"))  # the first of equals
 
 
 def _merge_survey(

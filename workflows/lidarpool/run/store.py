@@ -213,7 +213,7 @@ class RunStore:
                 f"{self.place} holds an unfinished run, {self.kept}: continue it with "
                 f"{_RESUME}, or drop it with {_DROP}."
             )
-        if self._wanted not in ("auto", self.backend):
+        if self.backend and self._wanted not in ("auto", self.backend):
             raise LidarpoolError(
                 f"Backend {self._wanted!r} is asked for, and the scans in {self.place} were "
                 f"cast with {self.backend!r}: continue with that, or drop them with {_DROP}."
