@@ -57,9 +57,9 @@ class Firings:
 
     def times(self, ray: Integers) -> Ints:
         """Return the firing times of rays (n,), nanoseconds since the survey's start: (n,)."""
-        number, channel = np.divmod(ray, ray.dtype.type(self.sensor.channels))
-        times = self.sensor.begins_ns(self.numbers).take(number)
-        times += self.sensor.beams.time_ns.take(channel)
+        times = Clock(self.sensor.begins_ns(self.numbers), self.sensor.beams.time_ns, Ways()).of(
+            ray
+        )
         return self.spec.start_ns + np.rint(times, out=times).astype(np.int64)
 
 

@@ -328,13 +328,39 @@ def filled(ray, full, height, front, back, distance, energy, there):
                 distance[last] = min(distance[last], distance[gone])
 
 
+@compiled()
+def counted(ray, begins, every, counts, rows, number, returns):
+    """Count the returns of scans, which begin at some rays, and write those that are kept.
+
+    Of these it writes the rows, the numbers in their pulses from 1, and how many a pulse has, at
+    most 255; returns how many are kept.
+    """
+    count, scan, begin, stop = 0, 0, 0, 0
+    for k in range(len(ray)):
+        if k == stop:
+            begin, scan = k, _scan_of(begins, ray[k], scan)
+            while stop < len(ray) and ray[stop] == ray[begin]:
+                stop += 1
+        if every == 1 or counts[scan] % every == 0:
+            rows[count], number[count] = k, min(k + 1 - begin, 255)
+            returns[count] = min(stop - begin, 255)
+            count += 1
+        counts[scan] += 1
+    return count
+
+
+@inlined
+def _beam(ray, each):
+    return ray if each == 1 else ray // each  # a division takes as long as all else
+
+
 @stage
 def _most(ray, each):
     """Return how many hits a beam has at most."""
-    most, begin = 0, 0
+    most, begin, end = 0, 0, -1
     for k in range(len(ray)):
-        if ray[k] // each != ray[begin] // each:
-            begin = k
+        if ray[k] >= end:
+            begin, end = k, (_beam(ray[k], each) + 1) * each
         most = max(most, k + 1 - begin)
     return most
 
@@ -376,9 +402,9 @@ def returns(
     size = _most(ray, each) + _most(air_ray, each)
     own, sub, far, light, speed, hard, new, there, table, changes = _room(size, each)
     while i < len(ray) or j < len(air_ray):
-        beam = ray[i] // each if i < len(ray) else air_ray[j] // each
+        beam = _beam(ray[i] if i < len(ray) else air_ray[j], each)
         if j < len(air_ray):
-            beam = min(beam, air_ray[j] // each)
+            beam = min(beam, _beam(air_ray[j], each))
         end = (beam + 1) * each
         last, last_air = i, j
         while last < len(ray) and ray[last] < end:
@@ -471,8 +497,10 @@ def returns(
                 seen = dropout == 0 or _uniform(starts[0], key, at, k - begin) >= dropout
                 if seen and threshold > 0:
                     above = sigmas * (real[1, k] / threshold - 1)
-                    drawn = np.int64(_bits(starts[1], key, at, k - begin) >> _48)
-                    seen = above + quantiles[drawn] > 0
+                    seen = above + quantiles[0] > 0  # whatever is drawn
+                    if not seen and above + quantiles[-1] > 0:
+                        drawn = np.int64(_bits(starts[1], key, at, k - begin) >> _48)
+                        seen = above + quantiles[drawn] > 0
                 if seen:
                     count = _kept(whole, real, k, count)
             stop = count
