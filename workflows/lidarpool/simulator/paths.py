@@ -200,6 +200,8 @@ class CastStep(PulseStep):
                 hits, looks = hits.take(there), looks[there]
             parts.append(hits)
             seen.append(looks)
+            if not self.setup.passing:
+                break
             through = np.flatnonzero(goes)
             on = np.concatenate([through, np.flatnonzero(mirrors)])
             if not len(on):
@@ -216,12 +218,11 @@ class CastStep(PulseStep):
             light = light.on(on)
             light.share = share
             ends = step[on], distance[on], triangle[on], normals[on], along[on], off
-            light, clear = self._behind(
-                light, *ends, None if light.range_rate is None else moved[on]
-            )
+            rate = None if light.range_rate is None else moved[on]
+            light, clear, path = self._behind(light, *ends, rate)
             # Light takes no time: it travels 300 m in a microsecond.
             now = Poses(np.zeros(3), clock=Clock(light.times, np.zeros(1), poses.ways))
-            found = self.caster.scan(Pattern(light.directions, light.origins), now, t_max=reach)
+            found = self.caster.scan(path, now, t_max=reach)
             which, step, triangle = found.ray, found.distance, found.triangle
             light, clear = light.on(which), clear[which]
             if not leafy and farthest < np.inf:
@@ -250,10 +251,11 @@ class CastStep(PulseStep):
         along: Floats,
         off: Bools,
         moved: Floats | None,
-    ) -> tuple[_Light, Floats]:
+    ) -> tuple[_Light, Floats, Pattern]:
         """Take light (n,) through the surfaces at its end, or `off` them.
 
-        Returns it behind them, and where the surfaces are from there, metres, at or below 0.
+        Returns it behind them, where the surfaces are from there, metres, at or below 0, and its
+        rays.
         `moved` (n, 3) are the velocities of the surfaces: where one bends light, its path grows.
         """
         cosine, within = np.abs(along), light.within
@@ -288,4 +290,4 @@ class CastStep(PulseStep):
             )
         own = light.ray, light.times, path.origins, path.directions, share, before
         bounces = None if light.mirrored is None else light.mirrored + off
-        return _Light(*own, turns, bounces, within, range_rate), -away
+        return _Light(*own, turns, bounces, within, range_rate), -away, path

@@ -349,6 +349,25 @@ def counted(ray, begins, every, counts, rows, number, returns):
     return count
 
 
+@compiled()
+def left(ray, times, spans, firing, channel, rows):
+    """Write rows of returns that no fault takes, of firings or channels; returns how many.
+
+    Faults are there for `spans` (f, 2) of times. They take returns of some firings, (f, firings),
+    and channels, (f, channels).
+    """
+    count, number, begin, each = 0, 0, 0, channel.shape[1]
+    for k in range(len(ray)):
+        while ray[k] >= begin + each:  # they follow each other
+            number, begin = number + 1, begin + each
+        rows[count], gone = k, False
+        for f in range(len(spans)):
+            if spans[f, 0] <= times[k] < spans[f, 1]:
+                gone |= firing[f, number] or channel[f, ray[k] - begin]
+        count += int(not gone)
+    return count
+
+
 @inlined
 def _beam(ray, each):
     return ray if each == 1 else ray // each  # a division takes as long as all else
