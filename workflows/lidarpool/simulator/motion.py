@@ -88,11 +88,6 @@ class Poses:
             )
         }
 
-    def start_at_once(self, pattern: Pattern) -> bool:
-        """Whether all rays of a pattern start at one position."""
-        starts = None if pattern.sub_rays is None else pattern.sub_rays.starts
-        return self.rays_per_pose is None and pattern.origins is None and starts is None
-
     @property
     def ways(self) -> Ways:
         """Trajectories of the actors."""

@@ -121,13 +121,9 @@ class CastStep(PulseStep):
         leafy = media is not None and media.leafy
         # How far light goes in a crown depends on its other side, however far that is.
         reach = np.inf if leafy else farthest
-        rays = np.empty((6, window[1] - window[0]))
-        found = self.caster.scan(
-            beams, poses, window=window, t_min=nearest, t_max=reach, rays_out=rays
-        )
+        found = self.caster.scan(beams, poses, window=window, t_min=nearest, t_max=reach)
         ray = found.ray.astype(np.int64)
-        directions, one = rays[3:].take(ray, axis=1).T, poses.start_at_once(beams)
-        origins = rays[:3].take(ray[:1] if one else ray, axis=1).T
+        origins, directions = poses.rays(beams, ray, window[0])
         origins = np.broadcast_to(origins, directions.shape)
         light = _Light(
             ray, poses.times(ray), origins, directions, np.ones(len(ray)), np.zeros(len(ray))
@@ -238,7 +234,7 @@ class CastStep(PulseStep):
         if each == 1:
             return hits, None
         if parts[1:] or len(hits.ray) != len(ray):  # some light ends beyond the range
-            directions = rays[3:].take(hits.ray, axis=1).T
+            directions = poses.rays(beams, hits.ray, window[0])[1]
         return hits, (normals, directions)
 
     def _behind(

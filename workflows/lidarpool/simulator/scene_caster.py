@@ -119,11 +119,11 @@ class SceneCaster:
         keep_every: int = 1,
         groups: Ints | None = None,
         tally: bool = False,
-        rays_out: Floats | None = None,
     ) -> ScanReturns:
         """See `RayCaster.scan`; the poses have a clock if there are actors."""
         start, stop = (0, len(pattern)) if window is None else window
-        if self._shapes is not None and rays_out is None and stop - start <= RAYS_KEPT:
+        rays_out = None
+        if self._shapes is not None and stop - start <= RAYS_KEPT:
             rays_out = np.empty((6, stop - start))  # which actors need
         common: dict[str, Any] = {
             **poses.given, "window": (start, stop), "t_min": t_min, "t_max": t_max,
