@@ -16,7 +16,6 @@ from ..base.arrays import Bools, Bytes, Floats, Integers, Ints, Ints32
 from ..base.vectors import into_axes, products
 from ..columns.table import COLOURS
 from ..scene.colours import luminance
-from ..sensor.materials import at_right_angles
 from ..sensor.noise import Purpose, raw
 from ..sensor.weather import FAINTEST
 from .doppler import approach, velocities_of_ends
@@ -29,6 +28,7 @@ from .surfaces import Surfaces, light_of
 
 PASSES_MOST = 16  # surfaces that light passes before it is dropped
 LEAFY_PASSES_MOST = 64  # where there are crowns, whose surfaces it passes twice
+RING = 16  # neighbours along a ring whose light goes on together: it is cast twice as fast
 MIRRORED_MOST = 2  # times that light is mirrored, of which each may divide it
 
 
@@ -115,6 +115,8 @@ class CastStep(PulseStep):
 
         There are `each` of a beam, and the first beam has the number `first` for its keys.
         """
+        from . import surface_loops  # not before: numba takes half a second to import
+
         surfaces, media = self.surfaces, self._media
         materials = surfaces.at(self._light.wavelength_nm)
         nearest, farthest = self.setup.sensor.min_range_m, self.setup.sensor.max_range_m
@@ -203,14 +205,20 @@ class CastStep(PulseStep):
             if not len(on):
                 break
             off = np.arange(len(on)) >= len(through)
+            beam, channels = light.ray[on] // each, self.setup.sensor.channels
+            ring = beam // (RING * channels) * channels + beam % channels
+            order = np.argsort(ring.astype(np.uint16), kind="stable")
+            on, off = on[order], off[order]
             bright = luminance(colour[on]) if materials.textured and colour is not None else None
-            water = 0.0 if film is None else self._light.wet * film[on]
-            share = materials.goes_on(rows[on], np.abs(along[on]), off, bright, water)
-            share = light.share[on] * share**2  # and back again
-            if mirrored is not None and not (within is not None and within.differentials):
-                most = self._brightest * at_right_angles(distance[on], self._light.extinction)
-                some = np.flatnonzero(share * most > self._faintest)
-                on, off, share = on[some], off[some], share[some]
+            seeks = mirrored is not None and not (within is not None and within.differentials)
+            share, water = np.empty(len(on)), np.zeros(0, np.bool_) if film is None else film
+            count = surface_loops.onward(
+                on, off, rows, along, materials.shares(rows[on], bright), self._light.wet, water,
+                light.share, distance, materials.specular, materials.passes, ~materials.refracts,
+                materials.leafy, self._brightest, self._light.extinction,
+                self._faintest if seeks else -1.0, share,
+            )  # fmt: skip
+            on, off, share = on[:count], off[:count], share[:count]
             light = light.on(on)
             light.share = share
             ends = step[on], distance[on], triangle[on], normals[on], along[on], off
