@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from raybeam import Pattern
 
-from ..base.arrays import Bools, Bytes, Floats, Integers, Ints, Ints32
+from ..base.arrays import Bools, Bytes, Floats, Integers, Ints, Ints32, owned
 from ..base.vectors import into_axes, products
 from ..columns.table import COLOURS
 from ..scene.colours import luminance
@@ -233,14 +233,16 @@ class CastStep(PulseStep):
                 within = light.within
                 end = light.before + (step if within is None else within.optical(step))
                 here = np.flatnonzero(end <= farthest)
-                light, clear = light.on(here), clear[here]
-                step, triangle = step[here], triangle[here]
-        hits, normals = joined(parts), seen[0]
+                if len(here) < len(end):
+                    light, clear = light.on(here), clear[here]
+                    step, triangle = step[here], triangle[here]
+        hits, order = joined(parts), slice(None)
         if parts[1:]:
             order = np.argsort(hits.ray, kind="stable")
-            hits, normals = hits.take(order), np.concatenate(seen)[order]
+            hits = hits.take(order)
         if each == 1:
             return hits, None
+        normals = np.concatenate(seen)[order]
         if parts[1:] or len(hits.ray) != len(ray):  # some light ends beyond the range
             directions = poses.rays(beams, hits.ray, window[0])[1]
         return hits, (normals, directions)
@@ -279,19 +281,22 @@ class CastStep(PulseStep):
         if within is not None:
             within.turn(light.directions, ahead, normals, mirrors)
             cosine = np.abs(products(normals.T, ahead.T))
-        away = self.caster.clear_m / np.maximum(cosine, 1e-3)
-        ends = light.origins + step[:, None] * light.directions
-        path = Pattern(ahead, ends + away[:, None] * ahead)
-        assert path.origins is not None  # it was given some
-        before = distance + (away if within is None else within.optical(away))
-        if within is not None:
-            within.go(away)
         range_rate = light.range_rate
         if range_rate is not None and moved is not None:  # a mirror that moves makes it longer, too
             there, back = products(moved.T, light.directions.T), products(moved.T, ahead.T)
             range_rate = (
                 range_rate + index * there - (1.0 if within is None else within.index) * back
             )
-        own = light.ray, light.times, path.origins, path.directions, share, before
+        from . import surface_loops
+
+        away = self.caster.clear_m / np.maximum(cosine, 1e-3)
+        starts, ahead = np.empty((3, len(away))), owned(ahead.T)
+        given = owned(light.origins.T), owned(light.directions.T), owned(step)
+        surface_loops.set_off(*given, away, starts, ahead)
+        path = Pattern(ahead.T, starts.T)
+        before = distance + (away if within is None else within.optical(away))
+        if within is not None:
+            within.go(away)
+        own = light.ray, light.times, starts.T, path.directions, share, before
         bounces = None if light.mirrored is None else light.mirrored + off
         return _Light(*own, turns, bounces, within, range_rate), -away, path

@@ -121,38 +121,50 @@ def crossings(
     """Write beams, and where each enters and leaves a box and the density in it, (3, k).
 
     Beams end at `far` (n,). Cells of `size` rays (6, n) and boxes are as of
-    `raybeam.moving.near_boxes`; boxes last so long, and densities decay by their age over `decay`.
-    Returns how many there are, of which it writes what there is room for.
+    `raybeam.moving.near_boxes`, in the order of cells; boxes last so long, and densities decay by
+    their age over `decay`. Returns how many there are, of which it writes what there is room for.
     """
-    count = 0
-    for pair in range(len(cell)):
-        b, radius = which[pair], 0.0
+    count, begin, radii = 0, 0, np.zeros(len(boxes))
+    for b in range(len(boxes)):
         for side in range(3, 12):
-            radius += boxes[b, side] * boxes[b, side]
-        begin, end, reach = there[b, 0], there[b, 1], 1.001 * np.sqrt(radius)
-        a, c, d = boxes[b, 0], boxes[b, 1], boxes[b, 2]
-        for k in range(cell[pair] * size, min((cell[pair] + 1) * size, len(times))):
-            p, q, r = a - rays[0, k], c - rays[1, k], d - rays[2, k]
-            along = (p * rays[3, k] + q * rays[4, k]) + r * rays[5, k]
-            off = (p * p + q * q) + r * r - along * along
-            if off > reach * reach or along > far[k] + reach or not begin <= times[k] <= end:
-                continue  # it misses the ball around the box
-            low, high = 0.0, far[k]
-            for side in range(3, 12, 3):
-                x, y, z = boxes[b, side], boxes[b, side + 1], boxes[b, side + 2]
-                half = (x * x + y * y) + z * z
-                along = (x * rays[3, k] + y * rays[4, k]) + z * rays[5, k]
-                off = (x * p + y * q) + z * r
-                if along != 0:
-                    one, other = (off - half) / along, (off + half) / along
-                    low, high = max(low, min(one, other)), min(high, max(one, other))
-                elif abs(off) > half:
-                    high = -1.0
-            if low < high:
-                if count < len(beam):
-                    beam[count], found[0, count], found[1, count] = k, low, high
-                    found[2, count] = density[b] * exp((there[b, 1] - lasts - times[k]) / decay)
-                count += 1
+            radii[b] += boxes[b, side] * boxes[b, side]
+        radii[b] = 1.001 * np.sqrt(radii[b])
+    while begin < len(cell):
+        end = begin
+        while end < len(cell) and cell[end] == cell[begin]:
+            end += 1
+        for k in range(cell[begin] * size, min((cell[begin] + 1) * size, len(times))):
+            u, v, w, time = rays[3, k], rays[4, k], rays[5, k], times[k]
+            for pair in range(begin, end):
+                b = which[pair]
+                p, q, r = (
+                    boxes[b, 0] - rays[0, k],
+                    boxes[b, 1] - rays[1, k],
+                    boxes[b, 2] - rays[2, k],
+                )
+                along, reach = (p * u + q * v) + r * w, radii[b]
+                off = (p * p + q * q) + r * r - along * along
+                if off > reach * reach or along > far[k] + reach:
+                    continue  # it misses the ball around the box
+                if not there[b, 0] <= time <= there[b, 1]:
+                    continue
+                low, high = 0.0, far[k]
+                for side in range(3, 12, 3):
+                    x, y, z = boxes[b, side], boxes[b, side + 1], boxes[b, side + 2]
+                    half = (x * x + y * y) + z * z
+                    along = (x * u + y * v) + z * w
+                    off = (x * p + y * q) + z * r
+                    if along != 0:
+                        one, other = (off - half) / along, (off + half) / along
+                        low, high = max(low, min(one, other)), min(high, max(one, other))
+                    elif abs(off) > half:
+                        high = -1.0
+                if low < high:
+                    if count < len(beam):
+                        beam[count], found[0, count], found[1, count] = k, low, high
+                        found[2, count] = density[b] * exp((there[b, 1] - lasts - time) / decay)
+                    count += 1
+        begin = end
     return count
 
 

@@ -114,13 +114,13 @@ class SprayStep(PulseStep):
         rays = np.ascontiguousarray(np.concatenate([one.T for one in batch.middles]))
         far = np.minimum(far, self._seen[1][0, -1])
         cell, which, size = near_boxes(rays, times, boxes, there, float(far.max()))
-        given = rays, times, far, size, cell, which, boxes, there, density, LASTS_NS, DECAY_NS
-        room, count = 0, 1 + len(cell)
+        order = np.argsort(cell, kind="stable")
+        pairs = cell[order], which[order], boxes, there, density, LASTS_NS, DECAY_NS
+        room, count = 0, 1 + 2 * len(cell)
         while room < count:  # mostly, few rays of a cell meet a box
             room, beam, found = count, np.empty(count, np.int64), np.empty((3, count))
-            count = pulse_loops.crossings(*given, beam, found)
-        order = np.argsort(beam[:count], kind="stable")
-        return beam[order], np.ascontiguousarray(found[:, order])
+            count = pulse_loops.crossings(rays, times, far, size, *pairs, beam, found)
+        return beam[:count], found[:, :count]
 
     def _boxes(self, ways: Ways, begin: float, end: float) -> tuple[Floats, Floats, Floats]:
         """Boxes of spray, and when they are there, as of `near_boxes`; their densities (b,)."""

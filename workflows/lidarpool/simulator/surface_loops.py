@@ -7,6 +7,7 @@ from __future__ import annotations
 import numpy as np
 
 from raybeam.compiled import compiled, inlined
+from raybeam.rays import UNIT_SLACK
 
 from ..base.elementary_loops import exp, sin_cos
 from ..sensor import materials
@@ -154,6 +155,21 @@ def onward(
             on[count], off[count], share[count] = k, off[j], goes
             count += 1
     return count
+
+
+@compiled()
+def set_off(origins, directions, step, away, starts, ahead):
+    """Write where light starts `away` from its ends, and make its directions units; all (3, n)."""
+    for k in range(len(step)):
+        for axis in range(3):
+            end = origins[axis, k] + step[k] * directions[axis, k]
+            starts[axis, k] = end + away[k] * ahead[axis, k]
+        x, y, z = ahead[0, k], ahead[1, k], ahead[2, k]
+        if abs((x * x + y * y) + z * z - 1) > UNIT_SLACK:  # as `Pattern` does, for all at a time
+            most = max(max(abs(x), abs(y)), abs(z))
+            x, y, z = x / most, y / most, z / most
+            length = np.sqrt((x * x + y * y) + z * z)
+            ahead[0, k], ahead[1, k], ahead[2, k] = x / length, y / length, z / length
 
 
 @compiled()
