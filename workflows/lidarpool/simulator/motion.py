@@ -12,11 +12,13 @@ import numpy as np
 import raybeam.poses
 from raybeam import Motion, Pattern
 
-from ..base.arrays import Floats, Integers, Ints, owned
+from ..base.arrays import Floats, Indices, Integers, Ints, owned
 from ..base.vectors import into_axes, matmul
 from ..sensor import Mounted, ScanSpec, Sensor, Trajectory
 from ..sensor.trajectory import velocities
 from .ways import Ways
+
+RING = 16  # neighbours along a ring
 
 
 @dataclass(frozen=True)
@@ -137,6 +139,12 @@ class Poses:
     def rays(self, pattern: Pattern, ray: Integers, start: int = 0) -> tuple[Floats, Floats]:
         """Origins and directions of rays of a pattern, see `Pattern.rays`."""
         return pattern.rays(ray, start=start, **self.given)
+
+
+def along_rings(beam: Ints, channels: int) -> Indices:
+    """Order in which a few neighbours along rings of beams follow each other: they are as one."""
+    ring = beam // (RING * channels) * channels + beam % channels
+    return np.argsort(ring.astype(np.uint16), kind="stable")  # which takes a tenth of the time
 
 
 def check_trajectory(path: Trajectory) -> None:

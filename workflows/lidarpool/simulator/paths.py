@@ -20,7 +20,7 @@ from ..sensor.noise import Purpose, raw
 from ..sensor.weather import FAINTEST
 from .doppler import approach, velocities_of_ends
 from .media import LightInMedia, Media, Rays, depths
-from .motion import Clock, Poses
+from .motion import Clock, Poses, along_rings
 from .returns import GHOST, OF_RETURNS, SURFACE, Keys, Planes, PulseReturns, joined, selected
 from .scene_caster import SceneCaster
 from .step import Memory, PulseBatch, PulseStep, Setup, Sizes
@@ -28,7 +28,6 @@ from .surfaces import Surfaces, light_of
 
 PASSES_MOST = 16  # surfaces that light passes before it is dropped
 LEAFY_PASSES_MOST = 64  # where there are crowns, whose surfaces it passes twice
-RING = 16  # neighbours along a ring whose light goes on together: it is cast twice as fast
 MIRRORED_MOST = 2  # times that light is mirrored, of which each may divide it
 
 
@@ -205,9 +204,7 @@ class CastStep(PulseStep):
             if not len(on):
                 break
             off = np.arange(len(on)) >= len(through)
-            beam, channels = light.ray[on] // each, self.setup.sensor.channels
-            ring = beam // (RING * channels) * channels + beam % channels
-            order = np.argsort(ring.astype(np.uint16), kind="stable")
+            order = along_rings(light.ray[on] // each, self.setup.sensor.channels)
             on, off = on[order], off[order]
             bright = luminance(colour[on]) if materials.textured and colour is not None else None
             seeks = mirrored is not None and not (within is not None and within.differentials)

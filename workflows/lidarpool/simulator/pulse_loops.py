@@ -44,6 +44,11 @@ def _uniform(start, scan, ray, number):
 
 
 @inlined
+def _beam(ray, each):
+    return ray if each == 1 else ray // each  # a division takes as long as all else
+
+
+@inlined
 def _scan_of(begins, ray, scan):
     """Row of the scan of a ray, from that of a ray before."""
     while scan + 1 < len(begins) and begins[scan + 1] <= ray:
@@ -170,21 +175,31 @@ def crossings(
 
 @compiled()
 def spray(
-    k, beam, crossed, each, mean, step, tables, exponential,
+    k, beam, crossed, each, mean, step, tables, guide, width, exponential,
     starts, scan, begins, first, reach, ray, distance, energy,
 ):  # fmt: skip
     """Draw the clumps of spray that beams meet in boxes, from crossing `k` on, while there is room.
 
-    Crossings (3, k) are in the order of beams. Depths between clumps are exponentially distributed;
-    `mean` is how many a beam would meet at a density of 1, of which each column of `tables` has an
-    equal share. Writes as `particles` does; returns the first crossing left, and how many.
+    Crossings (3, k) of a beam follow each other. Depths between clumps are exponentially
+    distributed; `mean` is how many a beam would meet at a density of 1, of which each column of
+    `tables` has an equal share. How many columns are nearer than multiples of a `width`, from -1
+    on, `guide` says: most beams have too little spray to be looked at more closely. Writes as
+    `particles` does; returns the first crossing left, and how many.
     """
     count, row, places = 0, 0, tables[0]
     while k < len(beam) and count + _CLUMPS <= len(ray):
         this = beam[k]
-        row = _scan_of(begins, first + this, row)
+        row = _scan_of(begins, first + this, row if begins[row] <= first + this else 0)
         own, number, clump = scan + row, first + this - begins[row], 0
         left = exponential[np.int64(_bits(starts[0], own, number, 0) >> _48)]
+        begin, most = k, 0.0
+        while k < len(beam) and beam[k] == this:
+            near, ends = np.int64(crossed[0, k] / width), np.int64(crossed[1, k] / width) + 3
+            most += crossed[2, k] * (guide[ends] - guide[near])
+            k += 1
+        if left > 1.001 * most * (mean / len(places)):
+            continue
+        k = begin
         while k < len(beam) and beam[k] == this:
             rate = crossed[2, k] * (mean / len(places))
             place = np.float64(np.searchsorted(places, crossed[0, k]))
@@ -211,12 +226,13 @@ def spray(
 @compiled()
 def veil(beam, crossed, each, extinction, reach, ray, distance, energy):
     """Multiply energies of hits by what spray before them leaves."""
-    first = 0
+    first = np.full(len(reach) // each, len(beam))  # of each beam
+    for c in range(len(beam)):
+        first[beam[c]] = min(c, first[beam[c]])
     for k in range(len(ray)):
-        while first < len(beam) and beam[first] < ray[k] // each:
-            first += 1
-        depth, c = 0.0, first
-        while c < len(beam) and beam[c] == ray[k] // each:
+        this, depth = _beam(ray[k], each), 0.0
+        c = first[this]
+        while c < len(beam) and beam[c] == this:
             end = min(min(distance[k], reach[ray[k]]), crossed[1, c])
             depth += crossed[2, c] * max(end - crossed[0, c], 0.0)
             c += 1
@@ -378,11 +394,6 @@ def left(ray, times, spans, firing, channel, rows):
                 gone |= firing[f, number] or channel[f, ray[k] - begin]
         count += int(not gone)
     return count
-
-
-@inlined
-def _beam(ray, each):
-    return ray if each == 1 else ray // each  # a division takes as long as all else
 
 
 @stage
