@@ -40,6 +40,6 @@ class AngleNoiseStep(PulseStep):
             sin, _ = sin_cos(noise.ripple_cycles * azimuth + np.radians(noise.ripple_phase_deg))
             # A degree of azimuth is less across a beam, the steeper it looks.
             level = hypot(*sensor.ahead.T[:2])
-            across += np.outer(np.radians(noise.ripple_deg) * sin, level).reshape(-1)
+            across += ((np.radians(noise.ripple_deg) * sin)[:, None] * level).reshape(-1)
         batch.offsets = offsets.T
         return returns

@@ -93,7 +93,7 @@ class CastStep(PulseStep):
         """See `PulseStep.memory`: sub-rays, more where light goes on or is bent, and returns."""
         subray = 200 if not setup.passing else 1350 if setup.refracting else 650
         casting = (subray + 200 * setup.moving) * sizes.subrays + 30 * sizes.returns
-        return Memory(casting=casting, counting=110 * sizes.returns + 40 * sizes.points)
+        return Memory(casting=casting, counting=75 * sizes.returns + 40 * sizes.points)
 
     def apply(self, returns: PulseReturns, batch: PulseBatch) -> PulseReturns:
         """See `PulseStep.apply`."""
@@ -233,13 +233,13 @@ class CastStep(PulseStep):
                 if len(here) < len(end):
                     light, clear = light.on(here), clear[here]
                     step, triangle = step[here], triangle[here]
-        hits, order = joined(parts), slice(None)
+        hits, normals = joined(parts), seen[0]
         if parts[1:]:
             order = np.argsort(hits.ray, kind="stable")
             hits = hits.take(order)
+            normals = normals if each == 1 else np.concatenate(seen)[order]
         if each == 1:
             return hits, None
-        normals = np.concatenate(seen)[order]
         if parts[1:] or len(hits.ray) != len(ray):  # some light ends beyond the range
             directions = poses.rays(beams, hits.ray, window[0])[1]
         return hits, (normals, directions)

@@ -16,6 +16,7 @@ from ..base.elementary_loops import exp
 
 ALL, FIRST, LAST, STRONGEST, DUAL = range(5)  # modes
 _CLUMPS = 255  # of spray that a beam meets at most: a ray has so many random numbers
+_GUIDE = 1024  # parts of the way through it
 SLOPE = 0.5  # of the distance between neighbouring hits: what the slopes of one surface may miss
 
 _30, _27, _31, _11, _48 = (np.uint64(shift) for shift in (30, 27, 31, 11, 48))
@@ -175,18 +176,20 @@ def crossings(
 
 @compiled()
 def spray(
-    k, beam, crossed, each, mean, step, tables, guide, width, exponential,
+    k, beam, crossed, each, mean, step, tables, exponential,
     starts, scan, begins, first, reach, ray, distance, energy,
 ):  # fmt: skip
     """Draw the clumps of spray that beams meet in boxes, from crossing `k` on, while there is room.
 
     Crossings (3, k) of a beam follow each other. Depths between clumps are exponentially
     distributed; `mean` is how many a beam would meet at a density of 1, of which each column of
-    `tables` has an equal share. How many columns are nearer than multiples of a `width`, from -1
-    on, `guide` says: most beams have too little spray to be looked at more closely. Writes as
-    `particles` does; returns the first crossing left, and how many.
+    `tables` has an equal share. Writes as `particles` does; returns the first crossing left, and
+    how many.
     """
-    count, row, places = 0, 0, tables[0]
+    count, row, places, guide = 0, 0, tables[0], np.empty(_GUIDE + 4, np.int64)
+    width = places[-1] / _GUIDE
+    for part in range(len(guide)):  # to bound how much spray a beam meets: most meet too little
+        guide[part] = np.searchsorted(places, width * (part - 1))
     while k < len(beam) and count + _CLUMPS <= len(ray):
         this = beam[k]
         row = _scan_of(begins, first + this, row if begins[row] <= first + this else 0)
@@ -194,8 +197,8 @@ def spray(
         left = exponential[np.int64(_bits(starts[0], own, number, 0) >> _48)]
         begin, most = k, 0.0
         while k < len(beam) and beam[k] == this:
-            near, ends = np.int64(crossed[0, k] / width), np.int64(crossed[1, k] / width) + 3
-            most += crossed[2, k] * (guide[ends] - guide[near])
+            near, ends = min(crossed[0, k] / width, _GUIDE), min(crossed[1, k] / width, _GUIDE)
+            most += crossed[2, k] * (guide[np.int64(ends) + 3] - guide[np.int64(near)])
             k += 1
         if left > 1.001 * most * (mean / len(places)):
             continue

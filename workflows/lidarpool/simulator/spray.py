@@ -29,7 +29,6 @@ BOX_NS, BOXES = 1e8, 10  # time between boxes of a vehicle, and how many are the
 # For how long, and when exp(-1) of it is left, as drops of a few tenths of a millimetre fall.
 LASTS_NS, DECAY_NS = BOXES * BOX_NS, 4e8
 FULL_M_S, LEAST_M_S = 25.0, 3.0  # speeds: of the stated density, and below which there is none
-GUIDE = 1024  # parts of the reach, to bound how much spray a beam meets
 STEP_NS = 5e5  # for velocities
 
 
@@ -55,9 +54,6 @@ class SprayStep(PulseStep):
         kind = spray(survey.spray_g_m3)
         self._extinction, self._step = kind.extinction / LARGE, 1 / kind.slope
         self._seen = seen_by_range(air, kind, FAINTEST * noise.threshold, *span)
-        places = np.zeros(1) if self._seen is None else self._seen[1][0]
-        self._width = places[-1] / GUIDE
-        self._guide = np.searchsorted(places, self._width * np.arange(-1, GUIDE + 3))
         self._materials = surfaces.at(sensor.optics.wavelength_nm)
         self._begun = starts(noise.seed, *self.purposes)
         # Of each actor the lowest corner of its mesh, and halves of its sides: (a, 2, 3).
@@ -97,12 +93,10 @@ class SprayStep(PulseStep):
         pulse_loops.veil(beam, crossed, each, self._extinction, far, ray, returns.distance, energy)
         batch.hits = returns = returns._replace(energy=energy)
         given = self._begun, keys.scan, np.array(keys.begins, np.int64), batch.start, far
-        tables = each, self._seen[0], self._step, self._seen[1]
+        tables = each, self._seen[0], self._step, self._seen[1], exponential()
         while row < len(beam):
             out = np.empty(1024 + len(beam), np.int64), *np.empty((2, 1024 + len(beam)))
-            row, count = pulse_loops.spray(
-                row, beam, crossed, *tables, self._guide, self._width, exponential(), *given, *out
-            )
+            row, count = pulse_loops.spray(row, beam, crossed, *tables, *given, *out)
             parts.append(unreal(returns, out[0][:count], out[1][:count], out[2][:count], SPRAY))
         drawn = joined(parts)
         drawn = drawn.take(np.argsort(drawn.ray, kind="stable"))
@@ -124,8 +118,8 @@ class SprayStep(PulseStep):
         cell, which, size = near_boxes(rays, times, boxes, there, float(far.max()))
         order = np.argsort(cell, kind="stable")
         pairs = cell[order], which[order], boxes, there, density, LASTS_NS, DECAY_NS
-        room, count = 0, 1 + 2 * len(cell)
-        while room < count:  # mostly, few rays of a cell meet a box
+        room, count = 0, 1 + size * len(cell) // 4
+        while room < count:  # mostly, some rays of a cell meet a box
             room, beam, found = count, np.empty(count, np.int64), np.empty((3, count))
             count = pulse_loops.crossings(rays, times, far, size, *pairs, beam, found)
         return place[beam[:count]], found[:, :count]
