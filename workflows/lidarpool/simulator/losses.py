@@ -38,8 +38,9 @@ class DirtStep(PulseStep):
             there = x * cos[0] + y * sin[0] >= cos[1] * hypot(x, y) - 1e-12
             there &= (z >= sin[2] - 1e-12) & (z <= sin[3] + 1e-12) & one.during(times)
             share[there] *= made(one.transmission)
+        share = share.repeat(batch.each)
         batch.hits, batch.air = (
-            one and one._replace(energy=made(one.energy) * share[one.ray // batch.each])
+            one and one._replace(energy=made(one.energy) * share.take(one.ray))
             for one in (returns, batch.air)
         )
         return made(batch.hits)

@@ -180,13 +180,13 @@ class CastStep(PulseStep):
                 velocity = light.range_rate + index * products(moved.T, light.directions.T)
             cause, mirrored = None, light.mirrored
             if mirrored is not None:
-                cause = np.where(mirrored > 0, GHOST, SURFACE).astype(np.uint8)
+                cause = np.array([SURFACE, *[GHOST] * MIRRORED_MOST], np.uint8)[mirrored]
             hits = PulseReturns(light.ray, distance, triangle, energy, colour, cause, velocity)
             turns = light.turns
             looks = normals if turns is None else into_axes(normals, turns)
             goes, mirrors = materials.passes[rows], np.zeros(len(rows), np.bool_)
             if mirrored is not None:
-                smooth = (materials.specular[rows] > 0) | (False if film is None else film)
+                smooth = (materials.specular > 0)[rows] | (False if film is None else film)
                 mirrors = smooth & (mirrored < MIRRORED_MOST)
             if within is not None:  # optical paths are longer than what was cast
                 crowns = materials.leafy[rows]  # whose surfaces send nothing back
@@ -261,6 +261,8 @@ class CastStep(PulseStep):
         rays.
         `moved` (n, 3) are the velocities of the surfaces: where one bends light, its path grows.
         """
+        from . import surface_loops
+
         cosine, within = np.abs(along), light.within
         share, ahead, mirrors = light.share, light.directions, off
         index = 1.0 if within is None else within.index
@@ -284,8 +286,6 @@ class CastStep(PulseStep):
             range_rate = (
                 range_rate + index * there - (1.0 if within is None else within.index) * back
             )
-        from . import surface_loops
-
         away = self.caster.clear_m / np.maximum(cosine, 1e-3)
         starts, ahead = np.empty((3, len(away))), owned(ahead.T)
         given = owned(light.origins.T), owned(light.directions.T), owned(step)
