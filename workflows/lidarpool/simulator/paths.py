@@ -180,7 +180,7 @@ class CastStep(PulseStep):
                 velocity = light.range_rate + index * products(moved.T, light.directions.T)
             cause, mirrored = None, light.mirrored
             if mirrored is not None:
-                cause = np.array([SURFACE, *[GHOST] * MIRRORED_MOST], np.uint8)[mirrored]
+                cause = np.where(mirrored > 0, np.uint8(GHOST), np.uint8(SURFACE))
             hits = PulseReturns(light.ray, distance, triangle, energy, colour, cause, velocity)
             turns = light.turns
             looks = normals if turns is None else into_axes(normals, turns)
@@ -218,9 +218,9 @@ class CastStep(PulseStep):
             on, off, share = on[:count], off[:count], share[:count]
             light = light.on(on)
             light.share = share
-            ends = step[on], distance[on], triangle[on], normals[on], along[on], off
             rate = None if light.range_rate is None else moved[on]
-            light, clear, path = self._behind(light, *ends, rate)
+            ends = selected((step, distance, triangle, normals, along), on)
+            light, clear, path = self._behind(light, *ends, off, rate)
             # Light takes no time: it travels 300 m in a microsecond.
             now = Poses(np.zeros(3), clock=Clock(light.times, np.zeros(1), poses.ways))
             found = self.caster.scan(path, now, t_max=reach)
