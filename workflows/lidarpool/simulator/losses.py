@@ -27,7 +27,7 @@ class DirtStep(PulseStep):
     def apply(self, returns: PulseReturns, batch: PulseBatch) -> PulseReturns:
         """See `PulseStep.apply`."""
         sensor, beams = self.setup.sensor, np.arange(batch.start, batch.stop)
-        times, share = batch.firings.times(beams), np.ones(len(beams))
+        share = np.ones(len(beams))
         x, y, z = sensor.directions(batch.firings.numbers[batch.rows]).reshape(-1, 3).T
         for one in self.setup.faults("dirt").values():
             begin, end = one.azimuth_deg or (0, 360)
@@ -36,7 +36,9 @@ class DirtStep(PulseStep):
             sin, cos = sin_cos(np.radians(ends))
             # Without angles of beams, which take long; a whole circle's sines are not exact.
             there = x * cos[0] + y * sin[0] >= cos[1] * hypot(x, y) - 1e-12
-            there &= (z >= sin[2] - 1e-12) & (z <= sin[3] + 1e-12) & one.during(times)
+            there &= (z >= sin[2] - 1e-12) & (z <= sin[3] + 1e-12)
+            if one.from_s or one.to_s is not None:
+                there &= one.during(batch.firings.times(beams))
             share[there] *= made(one.transmission)
         share = share.repeat(batch.each)
         batch.hits, batch.air = (
