@@ -219,8 +219,8 @@ class CastStep(PulseStep):
             light = light.on(on)
             light.share = share
             rate = None if light.range_rate is None else moved[on]
-            ends = selected((step, distance, triangle, normals, along), on)
-            light, clear, path = self._behind(light, *ends, off, rate)
+            ends = (*selected((step, distance, triangle, normals, along), on), off, rate)
+            light, clear, path = self._behind(light, *ends)
             # Light takes no time: it travels 300 m in a microsecond.
             now = Poses(np.zeros(3), clock=Clock(light.times, np.zeros(1), poses.ways))
             found = self.caster.scan(path, now, t_max=reach)
