@@ -142,7 +142,7 @@ class Poses:
 
 
 def along_rings(beam: Ints, channels: int) -> Indices:
-    """Order in which a few neighbours along rings of beams follow each other: they are as one."""
+    """Order beams so that some neighbours along a ring follow each other, in narrow groups."""
     ring = beam // (RING * channels) * channels + beam % channels
     return np.argsort(ring.astype(np.uint16), kind="stable")  # which takes a tenth of the time
 
