@@ -9,7 +9,7 @@ from operator import index
 import numpy as np
 from numpy.typing import ArrayLike
 
-from .arrays import Floats, Ints
+from .arrays import Ints
 from .backend import Backend
 from .crossing import Crossing, Nearest, Swept
 from .device import DeviceHits, OtherHits
@@ -242,7 +242,6 @@ class RayCaster:
         groups: ArrayLike | None = None,
         tally: bool = False,
         motion: Motion | None = None,
-        rays_out: Floats | None = None,
     ) -> ScanReturns:
         """Cast a pattern of rays from one pose or from many: the fastest way for a lidar.
 
@@ -274,9 +273,6 @@ class RayCaster:
             Count the hits of each triangle, including those that are not kept.
         motion
             How the lidar moves within each pose, if its rays have different delays.
-        rays_out
-            float64 (6, n), contiguous: origins and directions of all n rays, in the mesh's axes,
-            are written here, with the bits of `Pattern.rays`.
 
         Raises
         ------
@@ -308,7 +304,6 @@ class RayCaster:
                 groups=groups,
                 tally=tally,
                 motion=motion,
-                rays_out=rays_out,
             )
         )
 

@@ -186,8 +186,6 @@ class EmbreeBackend(Backend):
         pattern, cast = scan.pattern, self._memory.Cast(self._base)
         aside = cast.take_pattern(pattern, scan.poses, scan.first)
         self._reach(cast, scan.poses, pattern.origins, (scan.t_min, scan.t_max), aside)
-        if scan.rays_out is not None:
-            cast.record["rays"], cast.record["count"] = scan.rays_out.ctypes.data, len(scan)
         return cast
 
     def _reach(

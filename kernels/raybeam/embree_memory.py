@@ -61,9 +61,7 @@ CAST = np.dtype(
         ("index", "i8"),  # int32: the caller's triangle of each place; if 0, places are written
         ("room", "i8"),  # float64, then twice int32: for the rays of a block
         ("before", "i8"),  # the ray whose number is written as 0
-        ("rays", "i8"),  # what is written, of all rays: float64 (6, count), or 0
-        ("count", "i8"),
-        ("ray", "i8"),  # and of hits: uint32
+        ("ray", "i8"),  # what is written of hits: uint32
         ("distance", "i8"),  # float64, metres
         ("triangle", "i8"),  # int32
         ("instance", "i8"),  # int32
@@ -122,7 +120,6 @@ SCRATCH = np.dtype(
         ("row", "i8", LANES), ("pose", "i8", LANES), ("within", "i8", LANES),
         ("straight", "f8", LANES), ("across", "f8", LANES), ("up", "f8", LANES),
         ("aside", "f8", LANES), ("above", "f8", LANES),  # starts of sub-rays
-        ("px", "f8", LANES), ("py", "f8", LANES), ("pz", "f8", LANES),  # origins in metres
     ]
 )  # fmt: skip
 

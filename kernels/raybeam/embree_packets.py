@@ -16,7 +16,7 @@ from . import embree_exact as exact
 from . import embree_memory as memory
 from .compiled import callback, compiled, external, inlined, stage
 from .embree_memory import LANES, NUMBER, at, casts_at, float32s, float64s, int32s, int64s, offset
-from .embree_rays import begin, hand_out, make, set_out
+from .embree_rays import begin, make, set_out
 from .triangle_loops import areas, shear
 
 _ARGUMENTS, _ARGUMENTS_AT, _FILTER = at("arguments"), offset("arguments"), at("arguments") + 2
@@ -249,8 +249,6 @@ def trace(casts, start, stop):  # type: ignore[no-untyped-def]
         for column in range(0, min(step, count), wide):
             real = _reals(scratch, column, wide, step, count)
             make(cast, scratch, begins)
-            if cast.rays != 0:
-                hand_out(scratch, cast.rays, cast.count, block)
             if not cast_group(address, real, fixed):
                 for lane in range(LANES):
                     places[numbers[_RAY + lane]] = -1

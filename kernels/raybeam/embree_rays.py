@@ -20,7 +20,6 @@ _OX, _OY, _OZ, _DX, _DY, _DZ = map(at, ("ox", "oy", "oz", "dx", "dy", "dz"))
 _RAY, _ROW, _POSE, _WITHIN = map(at, ("ray", "row", "pose", "within"))
 _STRAIGHT, _ACROSS, _UP = at("straight"), at("across"), at("up")
 _ASIDE, _ABOVE, _ENTRY = at("aside"), at("above"), at("entry")
-_PX, _PY, _PZ = map(at, ("px", "py", "pz"))
 _TINY = 2.0**-60  # replaces a direction component of zero, to avoid 0 * inf
 
 
@@ -223,17 +222,6 @@ def make(cast, scratch, block):  # type: ignore[no-untyped-def]
             floats[_ENTRY + lane] = entered_at(low, high, o, d)
 
 
-@stage
-def hand_out(scratch, rays, count, first):  # type: ignore[no-untyped-def]
-    """Write origins and directions of a group to (6, count); `first` is the block's first ray."""
-    numbers, floats, out = int64s(scratch), float64s(scratch), float64s(rays + 8 * first)
-    for lane in range(LANES):
-        to = numbers[_RAY + lane]
-        out[to], out[to + count] = floats[_PX + lane], floats[_PY + lane]
-        out[to + 2 * count], out[to + 3 * count] = floats[_PZ + lane], floats[_DX + lane]
-        out[to + 4 * count], out[to + 5 * count] = floats[_DY + lane], floats[_DZ + lane]
-
-
 @inlined
 def begin(cast, block):  # type: ignore[no-untyped-def]
     """Row, pose and number within the pose of a ray."""
@@ -280,8 +268,6 @@ def _localise(scratch, x, y, z, scale):  # type: ignore[no-untyped-def]
     """Take the starts of rays to local coordinates."""
     floats = float64s(scratch)
     for lane in range(LANES):
-        floats[_PX + lane], floats[_PY + lane] = floats[_OX + lane], floats[_OY + lane]
-        floats[_PZ + lane] = floats[_OZ + lane]
         floats[_OX + lane] = (floats[_OX + lane] - x) * scale
         floats[_OY + lane] = (floats[_OY + lane] - y) * scale
         floats[_OZ + lane] = (floats[_OZ + lane] - z) * scale

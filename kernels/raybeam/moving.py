@@ -85,7 +85,7 @@ def hits_on(
     Parameters
     ----------
     moving, scan
-        Bodies and rays, which are made unless a cast has written the scan's `rays_out`.
+        Bodies and rays.
     times
         Gives the times of rays (m,).
     before
@@ -98,12 +98,9 @@ def hits_on(
         np.minimum(found.distance, before, out=found.distance)
     for start, stop in scan.chunks(_CHUNK):
         ray = np.arange(start, stop, dtype=np.int64)
-        if scan.rays_out is None:
-            rays = np.empty((6, len(ray)))
-            origins, directions = scan.pattern.made(scan.first, ray, scan.poses)
-            rays[:3], rays[3:] = origins.T, directions.T
-        else:
-            rays = np.ascontiguousarray(scan.rays_out[:, start:stop])
+        rays = np.empty((6, len(ray)))
+        origins, directions = scan.pattern.made(scan.first, ray, scan.poses)
+        rays[:3], rays[3:] = origins.T, directions.T
         _Chunk(loops, moving, scan, rays, times(ray), found.part(start, stop)).cast()
     return found
 

@@ -78,13 +78,15 @@ class Pattern:
     ) -> Pattern:
         """Return the beams, or those of some rows (m,), with sub-rays; they are not checked again.
 
+        After its last row the pattern repeats.
         `offsets` (m, 2) are as of `Pattern`.
         """
         _ = self.step  # which the copies keep: it takes as long as 10,000 rays
         made = copy(self)
         if rows is not None:
-            made._directions = self._directions[:, rows]
-            made._origins = None if self._origins is None else self._origins[:, rows]
+            made._directions = self._directions.take(rows, axis=1, mode="wrap")
+            if self._origins is not None:
+                made._origins = self._origins.take(rows, axis=1, mode="wrap")
         made.sub_rays = sub_rays
         made.offsets = None if offsets is None else np.ascontiguousarray(offsets.T)
         return made

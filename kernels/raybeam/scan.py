@@ -40,9 +40,6 @@ class Scan:
         int64 (g,): numbers of the rays at which groups begin; ascending, the first is 0.
     tally
         Whether to count hits by triangle.
-    rays_out
-        float64 (6, n): origins and directions of the rays, in the mesh's axes, are written here;
-        or None.
     """
 
     pattern: Pattern
@@ -54,7 +51,6 @@ class Scan:
     keep_every: int
     groups: Ints
     tally: bool
-    rays_out: Floats | None = None
 
     def __len__(self) -> int:
         return self.count
@@ -68,8 +64,6 @@ class Scan:
         """Rays `start` to `stop`, with the bits of `Pattern.rays`."""
         ray = np.arange(start, stop, dtype=np.int64)
         origins, directions = self.pattern.made(self.first, ray, self.poses)
-        if self.rays_out is not None:
-            self.rays_out[:3, start:stop], self.rays_out[3:, start:stop] = origins.T, directions.T
         return Rays(origins, directions, self.t_min, self.t_max)
 
 
@@ -86,7 +80,6 @@ def check_scan(
     groups: ArrayLike | None = None,
     tally: bool = False,
     motion: Motion | None = None,
-    rays_out: Floats | None = None,
 ) -> Scan:
     """Check the arguments of `RayCaster.scan`, which describes them and the errors."""
     start, stop = (0, len(pattern)) if window is None else map(index, window)
@@ -101,16 +94,6 @@ def check_scan(
             f"{count:,} rays are more than the {_MOST_RAYS:,} that one call can number: "
             "scan smaller windows."
         )
-    if rays_out is not None and not (
-        rays_out.shape == (6, count)
-        and rays_out.dtype == np.float64
-        and rays_out.flags.c_contiguous
-        and rays_out.flags.writeable
-    ):
-        raise ValueError(
-            f"rays_out must be a contiguous array of float64 (6, {count}) that can be written to; "
-            f"given: {rays_out.dtype} {rays_out.shape}."
-        )
     if index(keep_every) < 1:
         raise ValueError(f"keep_every is {keep_every}: it must be at least 1, to keep all hits.")
     return Scan(
@@ -122,7 +105,6 @@ def check_scan(
         index(keep_every),
         np.zeros(1, np.int64) if groups is None else np.asarray(groups, np.int64),
         tally,
-        rays_out,
     )
 
 

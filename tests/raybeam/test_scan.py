@@ -307,20 +307,3 @@ def test_pattern_refused():
 def test_rays_refused(change, error, words):
     with pytest.raises(error, match=words):
         Pattern(np.eye(3)).rays(**{"numbers": [0, 1], "positions": [0, 0, 0], **change})
-
-
-@pytest.mark.parametrize("shape, kind", [((6, 9), np.float64), ((6, 10), np.float32)])
-def test_room_for_rays_must_fit(shapes, shape, kind):
-    """Engines write to its memory."""
-    caster = RayCaster(*shapes["vase"](), backend="numpy")
-    with pytest.raises(ValueError, match=r"rays_out must be a contiguous .* \(6, 10\)"):
-        caster.scan(Pattern([[0, 0, 1]] * 10), [0, 0, 0], rays_out=np.empty(shape, kind))
-
-
-def test_a_scan_hands_out_its_rays(caster, shapes):
-    """They have the bits of `Pattern.rays`."""
-    pattern = Pattern(np.random.default_rng(4).normal(size=(500, 3)), [0.1, 0, 0])
-    rays = np.full((6, 500), np.nan)
-    caster(*shapes["vase"]()).scan(pattern, [1.0, 2, 3], rays_out=rays)
-    expected = pattern.rays(np.arange(500), [1.0, 2, 3])
-    assert all(map(np.array_equal, (rays[:3].T, rays[3:].T), map(np.asarray, expected)))

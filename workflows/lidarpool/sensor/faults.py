@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from math import inf
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
@@ -72,11 +73,16 @@ class Fault:
         """Return what is given, for labels: {field: value}."""
         return {name: value for name, value in vars(self).items() if value is not None}
 
+    @property
+    def span_ns(self) -> tuple[float, float]:
+        """When it begins and ends, nanoseconds since the survey's start."""
+        return self.from_s * 1e9, inf if self.to_s is None else self.to_s * 1e9
+
     def during(self, begins_ns: Floats | Ints, ends_ns: Floats | Ints | None = None) -> Bools:
         """Whether it is there at times (n,), or between them and others."""
         ends_ns = begins_ns if ends_ns is None else ends_ns
-        until_s = np.inf if self.to_s is None else self.to_s
-        return np.asarray((ends_ns >= self.from_s * 1e9) & (begins_ns < until_s * 1e9))
+        begin, end = self.span_ns
+        return np.asarray((ends_ns >= begin) & (begins_ns < end))
 
     def jumps_ns(self, times_ns: Floats | Ints) -> Ints:
         """By how much it shifts stamps at times (n,), nanoseconds."""

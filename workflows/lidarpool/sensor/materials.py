@@ -443,27 +443,6 @@ class MaterialTable:
             back[on] += front * gloss(cosine[on], self.roughness[rows[on]])
         return back
 
-    def goes_on(
-        self,
-        rows: Integers,
-        cosine: Floats,
-        off: Bools,
-        bright: Floats | None,
-        film: Floats | float,
-    ) -> Floats:
-        """Share of the light that passes through objects (n,), or goes `off` them.
-
-        Where it is refracted, what the surface mirrors is neither taken off nor alone. A share
-        `film` (n,) is below water; `bright` is the luminance, see `scattered`.
-        """
-        first, grazing = self.specular[rows], 1 - np.minimum(cosine, 1.0)
-        schlick = first + (first > 0) * (1 - first) * (grazing * np.square(np.square(grazing)))
-        mirrors = np.where(self.passes[rows], fresnel(cosine), schlick)
-        share = np.where(off, mirrors, np.where(self.passes[rows], 1 - mirrors, 1.0))
-        share = np.where(self.refracts[rows], 1.0, share)
-        share = np.where(self.leafy[rows], 1, 1 - self.shares(rows, bright)) * share
-        return np.asarray((1 - film) * share + film * fresnel(cosine, WATER_INDEX))
-
 
 def gloss(cosine: Floats, roughness: Floats) -> Floats:
     """Light that facets of a rough surface mirror back to where it came from, of a white diffuser.
@@ -477,7 +456,7 @@ def gloss(cosine: Floats, roughness: Floats) -> Floats:
     return np.asarray(width / (4 * spread**2 * np.sqrt(square + width * (1 - square))))
 
 
-def fresnel(cosine: Floats, index: float | Floats = GLASS_INDEX) -> Floats:
+def fresnel(cosine: Any, index: Any = GLASS_INDEX) -> Any:
     """Share of unpolarised light that a surface reflects (Fresnel's equations).
 
     `index` is the refractive index behind the surface over that before it; all light is reflected
@@ -486,18 +465,23 @@ def fresnel(cosine: Floats, index: float | Floats = GLASS_INDEX) -> Floats:
     inside = np.sqrt(np.maximum(1 - (1 - cosine**2) / (index * index), 0.0))
     across = (cosine - index * inside) / (cosine + index * inside)
     along = (inside - index * cosine) / (inside + index * cosine)
-    return np.asarray((across**2 + along**2) / 2)
+    return (across**2 + along**2) / 2
 
 
-def below_water(cosine: Floats, reflectance: Floats) -> Floats:
+def below_water(cosine: Any, reflectance: Any) -> Any:
     """Light that matt surfaces below a film of water return, relative to dry ones: (n,).
 
     ``T² / (n² (1 - p ρ))``: light passes the film's surface twice, with Fresnel's transmittance T;
     in the water it is spread by n², and the share p is sent back to the ground (Lekner and Dorf
     1988, Ångström 1925).
     """
-    through = np.square((1 - fresnel(cosine, WATER_INDEX)) / WATER_INDEX)
-    return np.asarray(through / (1 - WATER_INWARDS * reflectance))
+    return within_water(fresnel(cosine, WATER_INDEX), reflectance)
+
+
+def within_water(mirrored: Any, reflectance: Any) -> Any:
+    """See `below_water`; of light of which the film mirrors a share."""
+    through = (1 - mirrored) / WATER_INDEX
+    return through * through / (1 - WATER_INWARDS * reflectance)
 
 
 def at_right_angles(distance: Any, extinction: float = 0.0) -> Any:

@@ -244,7 +244,9 @@ class Noise:
             sigma = np.sqrt(sigma * sigma + weak * weak)
         if self.walk_m and energy is not None:
             distance = distance - self.walk(energy)
-        return np.maximum(distance + sigma * normal(self.seed, Purpose.RANGE, scan, ray, number), 0)
+        if sigma.any():  # else they would be drawn in vain
+            distance = distance + sigma * normal(self.seed, Purpose.RANGE, scan, ray, number)
+        return np.maximum(distance, 0)
 
     def offsets(self, channel: Integers, times_ns: Ints) -> Floats:
         """Return errors of range that last: of channels (n,) at times since the start, metres."""

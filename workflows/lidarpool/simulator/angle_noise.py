@@ -31,15 +31,15 @@ class AngleNoiseStep(PulseStep):
 
     def apply(self, returns: PulseReturns, batch: PulseBatch) -> PulseReturns:
         """See `PulseStep.apply`."""
-        rays, noise = np.arange(batch.start, batch.stop), self.setup.noise
-        keys, none = batch.keys.of(rays), np.zeros((2, len(rays)))
-        across, up = noise.angles(*keys) if noise.angle_deg else none
+        noise, sensor = self.setup.noise, self.setup.sensor
+        across, up = offsets = np.zeros((2, batch.stop - batch.start))
+        if noise.angle_deg:
+            across[:], up[:] = noise.angles(*batch.keys.of(np.arange(batch.start, batch.stop)))
         if noise.ripple_deg:
-            firing, channel = np.divmod(rays, self.setup.sensor.channels)
-            azimuth = self.setup.sensor.head.azimuths(batch.firings.numbers)
+            azimuth = sensor.head.azimuths(batch.firings.numbers[batch.rows])
             sin, _ = sin_cos(noise.ripple_cycles * azimuth + np.radians(noise.ripple_phase_deg))
             # A degree of azimuth is less across a beam, the steeper it looks.
-            level = hypot(*self.setup.sensor.ahead.T[:2])
-            across += np.radians(noise.ripple_deg) * sin.take(firing) * level.take(channel)
-        batch.offsets = np.stack([across, up], axis=1)
+            level = hypot(*sensor.ahead.T[:2])
+            across += ((np.radians(noise.ripple_deg) * sin)[:, None] * level).reshape(-1)
+        batch.offsets = offsets.T
         return returns

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from ..base.arrays import owned
 from ..base.elementary import sin_cos
 from ..base.vectors import hypot
 from ..sensor.noise import Purpose, uniform
@@ -26,9 +27,8 @@ class DirtStep(PulseStep):
     def apply(self, returns: PulseReturns, batch: PulseBatch) -> PulseReturns:
         """See `PulseStep.apply`."""
         sensor, beams = self.setup.sensor, np.arange(batch.start, batch.stop)
-        times, share = batch.firings.times(beams), np.ones(len(beams))
-        rows = slice(batch.start // sensor.channels, batch.stop // sensor.channels)
-        x, y, z = sensor.directions(batch.firings.numbers[rows]).reshape(-1, 3).T
+        share = np.ones(len(beams))
+        x, y, z = sensor.directions(batch.firings.numbers[batch.rows]).reshape(-1, 3).T
         for one in self.setup.faults("dirt").values():
             begin, end = one.azimuth_deg or (0, 360)
             half = ((end - begin) % 360 or 360) / 2
@@ -36,10 +36,13 @@ class DirtStep(PulseStep):
             sin, cos = sin_cos(np.radians(ends))
             # Without angles of beams, which take long; a whole circle's sines are not exact.
             there = x * cos[0] + y * sin[0] >= cos[1] * hypot(x, y) - 1e-12
-            there &= (z >= sin[2] - 1e-12) & (z <= sin[3] + 1e-12) & one.during(times)
+            there &= (z >= sin[2] - 1e-12) & (z <= sin[3] + 1e-12)
+            if one.from_s or one.to_s is not None:
+                there &= one.during(batch.firings.times(beams))
             share[there] *= made(one.transmission)
+        share = share.repeat(batch.each)
         batch.hits, batch.air = (
-            one and one._replace(energy=made(one.energy) * share[one.ray // batch.each])
+            one and one._replace(energy=made(one.energy) * share.take(one.ray))
             for one in (returns, batch.air)
         )
         return made(batch.hits)
@@ -59,15 +62,23 @@ class LossStep(PulseStep):
 
     def apply(self, returns: PulseReturns, batch: PulseBatch) -> PulseReturns:
         """See `PulseStep.apply`."""
-        firings, spec = batch.firings, batch.firings.spec
-        firing, channel = np.divmod(returns.ray, firings.sensor.channels)
+        from . import pulse_loops  # not before: numba takes half a second to import
+
+        firings, spec, seed = batch.firings, batch.firings.spec, self.setup.noise.seed
         before, now = spec.repeats or (spec.ahead, 0)
-        lost = np.full(len(firing), spec.ahead != before - now)
-        times, seed = firings.times(returns.ray), self.setup.noise.seed
-        for fault in self.setup.faults("dead_channels").values():
-            lost |= np.isin(channel, made(fault.channels)) & fault.during(times)
-        for place, fault in self.setup.faults("dropped_packets").items():
-            packet = firings.numbers[firing] // made(fault.packet)
-            drawn = uniform(seed, Purpose.PACKET, spec.station, packet, place)
-            lost |= (drawn < made(fault.share)) & fault.during(times)
-        return returns.take(~lost)
+        if spec.ahead != before - now:
+            return returns.take(np.zeros(0, np.intp))
+        faults = self.setup.faults("dead_channels", "dropped_packets")
+        spans = np.array([fault.span_ns for fault in faults.values()]).reshape(-1, 2)
+        channel = np.zeros((len(faults), firings.sensor.channels), np.bool_)
+        firing = np.zeros((len(faults), len(firings.numbers)), np.bool_)
+        for row, (place, fault) in enumerate(faults.items()):
+            if fault.packet is None:
+                channel[row, made(fault.channels)] = True
+            else:
+                packet = firings.numbers // fault.packet
+                drawn = uniform(seed, Purpose.PACKET, spec.station, packet, place)
+                firing[row] = drawn < made(fault.share)
+        rows, ray = np.empty(len(returns.ray), np.int64), owned(returns.ray, np.int64)
+        count = pulse_loops.left(ray, firings.times(ray), spans, firing, channel, rows)
+        return returns if count == len(rows) else returns.take(rows[:count])

@@ -29,7 +29,7 @@ RAY_MADE, RAY_MADE_KEPT = 92, 32  # if it is not repeated: while it is made, and
 RAY_AMONG_BODIES = 70  # in a scene with instances or actors
 POSE, POSE_KEPT = 140, 100  # of a firing that has its own: while it is made, and after that
 RETURNS = 1.5  # of a pulse, where all or two are reported; 1.1 to 1.6 in generated woods
-RETURNS_LEAFY = 4  # where all are, and each sub-ray meets a leaf by itself; 3.3 in a high canopy
+RETURNS_LEAFY = 3.8  # where all are, and each sub-ray meets a leaf by itself; 3.3 in a high canopy
 POINT, POINT_BYTE = 64, 3.2  # a point, and each byte of its columns: their sources are float64
 COLOUR = 16  # of a ray, where its colour is its reflectance
 # Copies of what a device has made: CuPy rounds page-locked memory up to powers of two, and columns

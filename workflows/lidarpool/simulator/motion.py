@@ -12,11 +12,13 @@ import numpy as np
 import raybeam.poses
 from raybeam import Motion, Pattern
 
-from ..base.arrays import Floats, Integers, Ints, owned
+from ..base.arrays import Floats, Indices, Integers, Ints, owned
 from ..base.vectors import into_axes, matmul
 from ..sensor import Mounted, ScanSpec, Sensor, Trajectory
 from ..sensor.trajectory import velocities
 from .ways import Ways
+
+RING = 16  # neighbours along a ring
 
 
 @dataclass(frozen=True)
@@ -57,9 +59,9 @@ class Firings:
 
     def times(self, ray: Integers) -> Ints:
         """Return the firing times of rays (n,), nanoseconds since the survey's start: (n,)."""
-        number, channel = np.divmod(ray, ray.dtype.type(self.sensor.channels))
-        times = self.sensor.begins_ns(self.numbers).take(number)
-        times += self.sensor.beams.time_ns.take(channel)
+        times = Clock(self.sensor.begins_ns(self.numbers), self.sensor.beams.time_ns, Ways()).of(
+            ray
+        )
         return self.spec.start_ns + np.rint(times, out=times).astype(np.int64)
 
 
@@ -87,11 +89,6 @@ class Poses:
                 self.positions, self.rotations, self.rays_per_pose, self.motion
             )
         }
-
-    def start_at_once(self, pattern: Pattern) -> bool:
-        """Whether all rays of a pattern start at one position."""
-        starts = None if pattern.sub_rays is None else pattern.sub_rays.starts
-        return self.rays_per_pose is None and pattern.origins is None and starts is None
 
     @property
     def ways(self) -> Ways:
@@ -142,6 +139,12 @@ class Poses:
     def rays(self, pattern: Pattern, ray: Integers, start: int = 0) -> tuple[Floats, Floats]:
         """Origins and directions of rays of a pattern, see `Pattern.rays`."""
         return pattern.rays(ray, start=start, **self.given)
+
+
+def along_rings(beam: Ints, channels: int) -> Indices:
+    """Order beams so that some neighbours along a ring follow each other, in narrow groups."""
+    ring = beam // (RING * channels) * channels + beam % channels
+    return np.argsort(ring.astype(np.uint16), kind="stable")  # which takes a tenth of the time
 
 
 def check_trajectory(path: Trajectory) -> None:

@@ -12,16 +12,15 @@ from numpy.typing import NDArray
 
 from raybeam import Pattern
 
-from ..base.arrays import Bools, Bytes, Floats, Integers, Ints, Ints32
+from ..base.arrays import Bools, Bytes, Floats, Integers, Ints, Ints32, owned
 from ..base.vectors import into_axes, products
 from ..columns.table import COLOURS
 from ..scene.colours import luminance
-from ..sensor.materials import at_right_angles
 from ..sensor.noise import Purpose, raw
 from ..sensor.weather import FAINTEST
 from .doppler import approach, velocities_of_ends
 from .media import LightInMedia, Media, Rays, depths
-from .motion import Clock, Poses
+from .motion import Clock, Poses, along_rings
 from .returns import GHOST, OF_RETURNS, SURFACE, Keys, Planes, PulseReturns, joined, selected
 from .scene_caster import SceneCaster
 from .step import Memory, PulseBatch, PulseStep, Setup, Sizes
@@ -94,7 +93,7 @@ class CastStep(PulseStep):
         """See `PulseStep.memory`: sub-rays, more where light goes on or is bent, and returns."""
         subray = 200 if not setup.passing else 1350 if setup.refracting else 650
         casting = (subray + 200 * setup.moving) * sizes.subrays + 30 * sizes.returns
-        return Memory(casting=casting, counting=110 * sizes.returns + 40 * sizes.points)
+        return Memory(casting=casting, counting=75 * sizes.returns + 40 * sizes.points)
 
     def apply(self, returns: PulseReturns, batch: PulseBatch) -> PulseReturns:
         """See `PulseStep.apply`."""
@@ -115,19 +114,17 @@ class CastStep(PulseStep):
 
         There are `each` of a beam, and the first beam has the number `first` for its keys.
         """
+        from . import surface_loops  # not before: numba takes half a second to import
+
         surfaces, media = self.surfaces, self._media
         materials = surfaces.at(self._light.wavelength_nm)
         nearest, farthest = self.setup.sensor.min_range_m, self.setup.sensor.max_range_m
         leafy = media is not None and media.leafy
         # How far light goes in a crown depends on its other side, however far that is.
         reach = np.inf if leafy else farthest
-        rays = np.empty((6, window[1] - window[0]))
-        found = self.caster.scan(
-            beams, poses, window=window, t_min=nearest, t_max=reach, rays_out=rays
-        )
+        found = self.caster.scan(beams, poses, window=window, t_min=nearest, t_max=reach)
         ray = found.ray.astype(np.int64)
-        directions, one = rays[3:].take(ray, axis=1).T, poses.start_at_once(beams)
-        origins = rays[:3].take(ray[:1] if one else ray, axis=1).T
+        origins, directions = poses.rays(beams, ray, window[0])
         origins = np.broadcast_to(origins, directions.shape)
         light = _Light(
             ray, poses.times(ray), origins, directions, np.ones(len(ray)), np.zeros(len(ray))
@@ -183,13 +180,13 @@ class CastStep(PulseStep):
                 velocity = light.range_rate + index * products(moved.T, light.directions.T)
             cause, mirrored = None, light.mirrored
             if mirrored is not None:
-                cause = np.where(mirrored > 0, GHOST, SURFACE).astype(np.uint8)
+                cause = np.where(mirrored > 0, np.uint8(GHOST), np.uint8(SURFACE))
             hits = PulseReturns(light.ray, distance, triangle, energy, colour, cause, velocity)
             turns = light.turns
             looks = normals if turns is None else into_axes(normals, turns)
             goes, mirrors = materials.passes[rows], np.zeros(len(rows), np.bool_)
             if mirrored is not None:
-                smooth = (materials.specular[rows] > 0) | (False if film is None else film)
+                smooth = (materials.specular > 0)[rows] | (False if film is None else film)
                 mirrors = smooth & (mirrored < MIRRORED_MOST)
             if within is not None:  # optical paths are longer than what was cast
                 crowns = materials.leafy[rows]  # whose surfaces send nothing back
@@ -200,44 +197,51 @@ class CastStep(PulseStep):
                 hits, looks = hits.take(there), looks[there]
             parts.append(hits)
             seen.append(looks)
+            if not self.setup.passing:
+                break
             through = np.flatnonzero(goes)
             on = np.concatenate([through, np.flatnonzero(mirrors)])
             if not len(on):
                 break
             off = np.arange(len(on)) >= len(through)
+            order = along_rings(light.ray[on] // each, self.setup.sensor.channels)
+            on, off = on[order], off[order]
             bright = luminance(colour[on]) if materials.textured and colour is not None else None
-            water = 0.0 if film is None else self._light.wet * film[on]
-            share = materials.goes_on(rows[on], np.abs(along[on]), off, bright, water)
-            share = light.share[on] * share**2  # and back again
-            if mirrored is not None and not (within is not None and within.differentials):
-                most = self._brightest * at_right_angles(distance[on], self._light.extinction)
-                some = np.flatnonzero(share * most > self._faintest)
-                on, off, share = on[some], off[some], share[some]
+            seeks = mirrored is not None and not (within is not None and within.differentials)
+            share, water = np.empty(len(on)), np.zeros(0, np.bool_) if film is None else film
+            count = surface_loops.onward(
+                on, off, rows, along, materials.shares(rows[on], bright), self._light.wet, water,
+                light.share, distance, materials.specular, materials.passes, ~materials.refracts,
+                materials.leafy, self._brightest, self._light.extinction,
+                self._faintest if seeks else -1.0, share,
+            )  # fmt: skip
+            on, off, share = on[:count], off[:count], share[:count]
             light = light.on(on)
             light.share = share
-            ends = step[on], distance[on], triangle[on], normals[on], along[on], off
-            light, clear = self._behind(
-                light, *ends, None if light.range_rate is None else moved[on]
-            )
+            rate = None if light.range_rate is None else moved[on]
+            ends = (*selected((step, distance, triangle, normals, along), on), off, rate)
+            light, clear, path = self._behind(light, *ends)
             # Light takes no time: it travels 300 m in a microsecond.
             now = Poses(np.zeros(3), clock=Clock(light.times, np.zeros(1), poses.ways))
-            found = self.caster.scan(Pattern(light.directions, light.origins), now, t_max=reach)
+            found = self.caster.scan(path, now, t_max=reach)
             which, step, triangle = found.ray, found.distance, found.triangle
             light, clear = light.on(which), clear[which]
             if not leafy and farthest < np.inf:
                 within = light.within
                 end = light.before + (step if within is None else within.optical(step))
                 here = np.flatnonzero(end <= farthest)
-                light, clear = light.on(here), clear[here]
-                step, triangle = step[here], triangle[here]
+                if len(here) < len(end):
+                    light, clear = light.on(here), clear[here]
+                    step, triangle = step[here], triangle[here]
         hits, normals = joined(parts), seen[0]
         if parts[1:]:
             order = np.argsort(hits.ray, kind="stable")
-            hits, normals = hits.take(order), np.concatenate(seen)[order]
+            hits = hits.take(order)
+            normals = normals if each == 1 else np.concatenate(seen)[order]
         if each == 1:
             return hits, None
         if parts[1:] or len(hits.ray) != len(ray):  # some light ends beyond the range
-            directions = rays[3:].take(hits.ray, axis=1).T
+            directions = poses.rays(beams, hits.ray, window[0])[1]
         return hits, (normals, directions)
 
     def _behind(
@@ -250,12 +254,15 @@ class CastStep(PulseStep):
         along: Floats,
         off: Bools,
         moved: Floats | None,
-    ) -> tuple[_Light, Floats]:
+    ) -> tuple[_Light, Floats, Pattern]:
         """Take light (n,) through the surfaces at its end, or `off` them.
 
-        Returns it behind them, and where the surfaces are from there, metres, at or below 0.
+        Returns it behind them, where the surfaces are from there, metres, at or below 0, and its
+        rays.
         `moved` (n, 3) are the velocities of the surfaces: where one bends light, its path grows.
         """
+        from . import surface_loops
+
         cosine, within = np.abs(along), light.within
         share, ahead, mirrors = light.share, light.directions, off
         index = 1.0 if within is None else within.index
@@ -273,19 +280,20 @@ class CastStep(PulseStep):
         if within is not None:
             within.turn(light.directions, ahead, normals, mirrors)
             cosine = np.abs(products(normals.T, ahead.T))
-        away = self.caster.clear_m / np.maximum(cosine, 1e-3)
-        ends = light.origins + step[:, None] * light.directions
-        path = Pattern(ahead, ends + away[:, None] * ahead)
-        assert path.origins is not None  # it was given some
-        before = distance + (away if within is None else within.optical(away))
-        if within is not None:
-            within.go(away)
         range_rate = light.range_rate
         if range_rate is not None and moved is not None:  # a mirror that moves makes it longer, too
             there, back = products(moved.T, light.directions.T), products(moved.T, ahead.T)
             range_rate = (
                 range_rate + index * there - (1.0 if within is None else within.index) * back
             )
-        own = light.ray, light.times, path.origins, path.directions, share, before
+        away = self.caster.clear_m / np.maximum(cosine, 1e-3)
+        starts, ahead = np.empty((3, len(away))), owned(ahead.T)
+        given = owned(light.origins.T), owned(light.directions.T), owned(step)
+        surface_loops.set_off(*given, away, starts, ahead)
+        path = Pattern(ahead.T, starts.T)
+        before = distance + (away if within is None else within.optical(away))
+        if within is not None:
+            within.go(away)
+        own = light.ray, light.times, starts.T, path.directions, share, before
         bounces = None if light.mirrored is None else light.mirrored + off
-        return _Light(*own, turns, bounces, within, range_rate), -away
+        return _Light(*own, turns, bounces, within, range_rate), -away, path

@@ -16,6 +16,7 @@ from ..base.elementary_loops import exp
 
 ALL, FIRST, LAST, STRONGEST, DUAL = range(5)  # modes
 _CLUMPS = 255  # of spray that a beam meets at most: a ray has so many random numbers
+_GUIDE = 1024  # parts of the way through it
 SLOPE = 0.5  # of the distance between neighbouring hits: what the slopes of one surface may miss
 
 _30, _27, _31, _11, _48 = (np.uint64(shift) for shift in (30, 27, 31, 11, 48))
@@ -41,6 +42,11 @@ def _bits(start, scan, ray, number):
 @inlined
 def _uniform(start, scan, ray, number):
     return np.float64(_bits(start, scan, ray, number) >> _11) * 2.0**-53
+
+
+@inlined
+def _beam(ray, each):
+    return ray if each == 1 else ray // each  # a division takes as long as all else
 
 
 @inlined
@@ -121,38 +127,50 @@ def crossings(
     """Write beams, and where each enters and leaves a box and the density in it, (3, k).
 
     Beams end at `far` (n,). Cells of `size` rays (6, n) and boxes are as of
-    `raybeam.moving.near_boxes`; boxes last so long, and densities decay by their age over `decay`.
-    Returns how many there are, of which it writes what there is room for.
+    `raybeam.moving.near_boxes`, in the order of cells; boxes last so long, and densities decay by
+    their age over `decay`. Returns how many there are, of which it writes what there is room for.
     """
-    count = 0
-    for pair in range(len(cell)):
-        b, radius = which[pair], 0.0
+    count, begin, radii = 0, 0, np.zeros(len(boxes))
+    for b in range(len(boxes)):
         for side in range(3, 12):
-            radius += boxes[b, side] * boxes[b, side]
-        begin, end, reach = there[b, 0], there[b, 1], 1.001 * np.sqrt(radius)
-        a, c, d = boxes[b, 0], boxes[b, 1], boxes[b, 2]
-        for k in range(cell[pair] * size, min((cell[pair] + 1) * size, len(times))):
-            p, q, r = a - rays[0, k], c - rays[1, k], d - rays[2, k]
-            along = (p * rays[3, k] + q * rays[4, k]) + r * rays[5, k]
-            off = (p * p + q * q) + r * r - along * along
-            if off > reach * reach or along > far[k] + reach or not begin <= times[k] <= end:
-                continue  # it misses the ball around the box
-            low, high = 0.0, far[k]
-            for side in range(3, 12, 3):
-                x, y, z = boxes[b, side], boxes[b, side + 1], boxes[b, side + 2]
-                half = (x * x + y * y) + z * z
-                along = (x * rays[3, k] + y * rays[4, k]) + z * rays[5, k]
-                off = (x * p + y * q) + z * r
-                if along != 0:
-                    one, other = (off - half) / along, (off + half) / along
-                    low, high = max(low, min(one, other)), min(high, max(one, other))
-                elif abs(off) > half:
-                    high = -1.0
-            if low < high:
-                if count < len(beam):
-                    beam[count], found[0, count], found[1, count] = k, low, high
-                    found[2, count] = density[b] * exp((there[b, 1] - lasts - times[k]) / decay)
-                count += 1
+            radii[b] += boxes[b, side] * boxes[b, side]
+        radii[b] = 1.001 * np.sqrt(radii[b])
+    while begin < len(cell):
+        end = begin
+        while end < len(cell) and cell[end] == cell[begin]:
+            end += 1
+        for k in range(cell[begin] * size, min((cell[begin] + 1) * size, len(times))):
+            u, v, w, time = rays[3, k], rays[4, k], rays[5, k], times[k]
+            for pair in range(begin, end):
+                b = which[pair]
+                p, q, r = (
+                    boxes[b, 0] - rays[0, k],
+                    boxes[b, 1] - rays[1, k],
+                    boxes[b, 2] - rays[2, k],
+                )
+                along, reach = (p * u + q * v) + r * w, radii[b]
+                off = (p * p + q * q) + r * r - along * along
+                if off > reach * reach or along > far[k] + reach:
+                    continue  # it misses the ball around the box
+                if not there[b, 0] <= time <= there[b, 1]:
+                    continue
+                low, high = 0.0, far[k]
+                for side in range(3, 12, 3):
+                    x, y, z = boxes[b, side], boxes[b, side + 1], boxes[b, side + 2]
+                    half = (x * x + y * y) + z * z
+                    along = (x * u + y * v) + z * w
+                    off = (x * p + y * q) + z * r
+                    if along != 0:
+                        one, other = (off - half) / along, (off + half) / along
+                        low, high = max(low, min(one, other)), min(high, max(one, other))
+                    elif abs(off) > half:
+                        high = -1.0
+                if low < high:
+                    if count < len(beam):
+                        beam[count], found[0, count], found[1, count] = k, low, high
+                        found[2, count] = density[b] * exp((there[b, 1] - lasts - time) / decay)
+                    count += 1
+        begin = end
     return count
 
 
@@ -163,16 +181,28 @@ def spray(
 ):  # fmt: skip
     """Draw the clumps of spray that beams meet in boxes, from crossing `k` on, while there is room.
 
-    Crossings (3, k) are in the order of beams. Depths between clumps are exponentially distributed;
-    `mean` is how many a beam would meet at a density of 1, of which each column of `tables` has an
-    equal share. Writes as `particles` does; returns the first crossing left, and how many.
+    Crossings (3, k) of a beam follow each other. Depths between clumps are exponentially
+    distributed; `mean` is how many a beam would meet at a density of 1, of which each column of
+    `tables` has an equal share. Writes as `particles` does; returns the first crossing left, and
+    how many.
     """
-    count, row, places = 0, 0, tables[0]
+    count, row, places, guide = 0, 0, tables[0], np.empty(_GUIDE + 4, np.int64)
+    width = places[-1] / _GUIDE
+    for part in range(len(guide)):  # to bound how much spray a beam meets: most meet too little
+        guide[part] = np.searchsorted(places, width * (part - 1))
     while k < len(beam) and count + _CLUMPS <= len(ray):
         this = beam[k]
-        row = _scan_of(begins, first + this, row)
+        row = _scan_of(begins, first + this, row if begins[row] <= first + this else 0)
         own, number, clump = scan + row, first + this - begins[row], 0
         left = exponential[np.int64(_bits(starts[0], own, number, 0) >> _48)]
+        begin, most = k, 0.0
+        while k < len(beam) and beam[k] == this:
+            near, ends = min(crossed[0, k] / width, _GUIDE), min(crossed[1, k] / width, _GUIDE)
+            most += crossed[2, k] * (guide[np.int64(ends) + 3] - guide[np.int64(near)])
+            k += 1
+        if left > 1.001 * most * (mean / len(places)):
+            continue
+        k = begin
         while k < len(beam) and beam[k] == this:
             rate = crossed[2, k] * (mean / len(places))
             place = np.float64(np.searchsorted(places, crossed[0, k]))
@@ -199,12 +229,13 @@ def spray(
 @compiled()
 def veil(beam, crossed, each, extinction, reach, ray, distance, energy):
     """Multiply energies of hits by what spray before them leaves."""
-    first = 0
+    first = np.full(len(reach) // each, len(beam))  # of each beam
+    for c in range(len(beam)):
+        first[beam[c]] = min(c, first[beam[c]])
     for k in range(len(ray)):
-        while first < len(beam) and beam[first] < ray[k] // each:
-            first += 1
-        depth, c = 0.0, first
-        while c < len(beam) and beam[c] == ray[k] // each:
+        this, depth = _beam(ray[k], each), 0.0
+        c = first[this]
+        while c < len(beam) and beam[c] == this:
             end = min(min(distance[k], reach[ray[k]]), crossed[1, c])
             depth += crossed[2, c] * max(end - crossed[0, c], 0.0)
             c += 1
@@ -328,13 +359,53 @@ def filled(ray, full, height, front, back, distance, energy, there):
                 distance[last] = min(distance[last], distance[gone])
 
 
+@compiled()
+def counted(ray, begins, every, counts, rows, number, returns):
+    """Count the returns of scans, which begin at some rays, and write those that are kept.
+
+    Of these it writes the rows, the numbers in their pulses from 1, and how many a pulse has, at
+    most 255; returns how many are kept.
+    """
+    count, scan, begin, stop = 0, 0, 0, 0
+    for k in range(len(ray)):
+        if k == stop:
+            begin, scan = k, _scan_of(begins, ray[k], scan)
+            while stop < len(ray) and ray[stop] == ray[begin]:
+                stop += 1
+        if every == 1 or counts[scan] % every == 0:
+            rows[count], number[count] = k, min(k + 1 - begin, 255)
+            returns[count] = min(stop - begin, 255)
+            count += 1
+        counts[scan] += 1
+    return count
+
+
+@compiled()
+def left(ray, times, spans, firing, channel, rows):
+    """Write rows of returns that no fault takes, of firings or channels; returns how many.
+
+    Faults are there for `spans` (f, 2) of times. They take returns of some firings, (f, firings),
+    and channels, (f, channels).
+    """
+    count, number, begin, each = 0, 0, 0, channel.shape[1]
+    for k in range(len(ray)):
+        while ray[k] >= begin + each:  # they follow each other
+            number, begin = number + 1, begin + each
+        rows[count], gone = k, False
+        for f in range(len(spans)):
+            if spans[f, 0] <= times[k] < spans[f, 1]:
+                gone |= firing[f, number] or channel[f, ray[k] - begin]
+        count += int(not gone)
+    return count
+
+
 @stage
 def _most(ray, each):
     """Return how many hits a beam has at most."""
-    most, begin = 0, 0
+    most, begin, end = 0, 0, -1
     for k in range(len(ray)):
-        if ray[k] // each != ray[begin] // each:
-            begin = k
+        if ray[k] >= end:
+            begin, end = k, (_beam(ray[k], each) + 1) * each
         most = max(most, k + 1 - begin)
     return most
 
@@ -376,9 +447,9 @@ def returns(
     size = _most(ray, each) + _most(air_ray, each)
     own, sub, far, light, speed, hard, new, there, table, changes = _room(size, each)
     while i < len(ray) or j < len(air_ray):
-        beam = ray[i] // each if i < len(ray) else air_ray[j] // each
+        beam = _beam(ray[i] if i < len(ray) else air_ray[j], each)
         if j < len(air_ray):
-            beam = min(beam, air_ray[j] // each)
+            beam = min(beam, _beam(air_ray[j], each))
         end = (beam + 1) * each
         last, last_air = i, j
         while last < len(ray) and ray[last] < end:
@@ -471,8 +542,10 @@ def returns(
                 seen = dropout == 0 or _uniform(starts[0], key, at, k - begin) >= dropout
                 if seen and threshold > 0:
                     above = sigmas * (real[1, k] / threshold - 1)
-                    drawn = np.int64(_bits(starts[1], key, at, k - begin) >> _48)
-                    seen = above + quantiles[drawn] > 0
+                    seen = above + quantiles[0] > 0  # whatever is drawn
+                    if not seen and above + quantiles[-1] > 0:
+                        drawn = np.int64(_bits(starts[1], key, at, k - begin) >> _48)
+                        seen = above + quantiles[drawn] > 0
                 if seen:
                     count = _kept(whole, real, k, count)
             stop = count

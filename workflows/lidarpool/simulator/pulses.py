@@ -11,12 +11,12 @@ import numpy as np
 
 from raybeam import Pattern
 
-from ..base.arrays import Ints, Ints32
+from ..base.arrays import Ints, Ints32, owned
 from ..scene.scene import Scene
 from ..sensor import Survey
 from .doppler import radial_velocities
 from .motion import Firings, Poses
-from .returns import NO_SURFACE, Keys, PulseReturns, joined, numbers
+from .returns import NO_SURFACE, Keys, PulseReturns, joined
 from .scene_caster import SceneCaster
 from .step import Emitter, PulseBatch, PulseStep, Setup
 from .steps import steps_of
@@ -135,17 +135,18 @@ class PulseCaster:
 
     def _kept(self, returns: PulseReturns, groups: Ints, tally: bool) -> Scanned:
         """Count the returns of each scan and thin them out."""
-        ray = returns.ray
-        cuts = np.searchsorted(ray, np.append(groups, np.iinfo(np.int64).max))
-        number = numbers(ray)
-        each = number + numbers(ray[::-1])[::-1] + 1
-        place = np.arange(len(ray)) - np.repeat(cuts[:-1], np.diff(cuts))
-        kept = place % self._setup.survey.keep_every == 0
-        thinned = returns.take(kept)
+        from . import pulse_loops  # not before: numba takes half a second to import
+
+        every, most = self._setup.survey.keep_every, len(returns.ray)
+        hits, rows = np.zeros(len(groups), np.int64), np.empty(most, np.int64)
+        number, each = np.empty((2, most), np.uint8)
+        given = owned(returns.ray, np.int64), owned(groups, np.int64), every
+        count = pulse_loops.counted(*given, hits, rows, number, each)
+        thinned = returns if count == most else returns.take(rows[:count])
         thinned = thinned._replace(
             ray=thinned.ray.astype(np.uint32),
-            number=np.minimum(number[kept] + 1, 255).astype(np.uint8),
-            returns=np.minimum(each[kept], 255).astype(np.uint8),
+            number=number[:count],
+            returns=each[:count],
             reported=thinned.distance,
         )
-        return Scanned(thinned, np.diff(cuts), self._tally(returns.triangle) if tally else None)
+        return Scanned(thinned, hits, self._tally(returns.triangle) if tally else None)

@@ -31,7 +31,11 @@ SURFACE, AIR, FALSE_ALARM, CROSSTALK, BLOOMING, GHOST, SPRAY = range(len(CAUSES)
 
 def selected(columns: Iterable[Any], rows: Any) -> Iterator[Any]:
     """Yield some rows of each column; None for one that is not there."""
-    return (None if column is None else column[rows] for column in columns)
+    for column in columns:
+        if isinstance(column, np.ndarray) and column.flags.f_contiguous:  # twice as fast
+            yield column.T.take(rows, axis=-1).T
+        else:
+            yield None if column is None else column[rows]
 
 
 # Columns of whatever comes back.

@@ -39,7 +39,6 @@ from .surfaces import Surfaces
 from .ways import Ways
 
 AUTO_TAKES = "Backend 'auto' takes one that works."
-RAYS_KEPT = 1 << 17  # of one cast; those of a longer one are made again, part by part
 SHORT = 1e-3  # of the distance: a ray that ends so much before a point has reached it
 
 
@@ -119,15 +118,11 @@ class SceneCaster:
         keep_every: int = 1,
         groups: Ints | None = None,
         tally: bool = False,
-        rays_out: Floats | None = None,
     ) -> ScanReturns:
         """See `RayCaster.scan`; the poses have a clock if there are actors."""
         start, stop = (0, len(pattern)) if window is None else window
-        if self._shapes is not None and rays_out is None and stop - start <= RAYS_KEPT:
-            rays_out = np.empty((6, stop - start))  # which actors need
         common: dict[str, Any] = {
             **poses.given, "window": (start, stop), "t_min": t_min, "t_max": t_max,
-            "rays_out": rays_out,
         }  # fmt: skip
         if self._begins is None and self._shapes is None:
             return self.caster.scan(

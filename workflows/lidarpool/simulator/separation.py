@@ -11,7 +11,18 @@ from ..scene.colours import GREY, packed
 from ..sensor.disc import neighbours
 from ..sensor.noise import THRESHOLD_SIGMAS, Noise, Purpose, quantiles, starts
 from ..sensor.optics import Mode
-from .returns import AIR, NO_SURFACE, OF_RETURNS, SURFACE, Keys, Planes, PulseReturns, made, unreal
+from .returns import (
+    AIR,
+    NO_SURFACE,
+    OF_RETURNS,
+    SURFACE,
+    Keys,
+    Planes,
+    PulseReturns,
+    made,
+    selected,
+    unreal,
+)  # fmt: skip
 from .selection import MODES
 from .step import PulseBatch, PulseStep, Setup
 
@@ -69,7 +80,9 @@ def separated(
     beam, row = whole[:, :count].copy()
     distance, energy, velocity = real[:, :count].copy()
     if len(hits.ray):
-        found = hits.take(np.maximum(row, 0))
+        columns = hits.triangle, hits.colour, hits.cause
+        triangle, *more = selected(columns, np.maximum(row, 0))
+        found = PulseReturns(beam, distance, triangle, energy, *more)
     else:
         found = unreal(hits, beam, distance, energy, AIR)
     if len(flies.ray):
@@ -81,8 +94,6 @@ def separated(
         found = found._replace(cause=cause)
     return found._replace(
         ray=beam + first,
-        distance=distance,
-        energy=energy,
         velocity=None if hits.velocity is None else velocity,
     )
 

@@ -18,6 +18,7 @@ from ..scene.actors import check_spray
 from ..sensor.noise import Purpose, starts
 from ..sensor.weather import FAINTEST, LARGE, reach, spray
 from .air import exponential, in_the_air, reached, seen_by_range
+from .motion import along_rings
 from .returns import OF_RETURNS, SPRAY, PulseReturns, joined, made, unreal
 from .scene_caster import SceneCaster
 from .step import Memory, PulseBatch, PulseStep, Setup, Sizes
@@ -104,23 +105,24 @@ class SprayStep(PulseStep):
     def _crossings(self, batch: PulseBatch, far: Floats) -> tuple[Ints, Floats]:
         """Where beams, which get so far (n,), cross boxes: see `pulse_loops.crossings`.
 
-        They are in the order of beams, and of each in that of vehicles and times.
+        Those of a beam follow each other, in the order of vehicles and times.
         """
         from . import pulse_loops
 
         assert self._seen is not None
-        times = batch.here.times(np.arange(batch.stop - batch.start) * batch.each)
+        place = along_rings(np.arange(batch.stop - batch.start), self.setup.sensor.channels)
+        times = batch.here.times(place * batch.each)
         boxes, there, density = self._boxes(batch.here.ways, times.min(), times.max())
-        rays = np.ascontiguousarray(np.concatenate([one.T for one in batch.middles]))
-        far = np.minimum(far, self._seen[1][0, -1])
+        rays = np.concatenate([one.T.take(place, axis=1) for one in batch.middles])
+        far = np.minimum(far[place], self._seen[1][0, -1])
         cell, which, size = near_boxes(rays, times, boxes, there, float(far.max()))
-        given = rays, times, far, size, cell, which, boxes, there, density, LASTS_NS, DECAY_NS
-        room, count = 0, 1 + len(cell)
-        while room < count:  # mostly, few rays of a cell meet a box
+        order = np.argsort(cell, kind="stable")
+        pairs = cell[order], which[order], boxes, there, density, LASTS_NS, DECAY_NS
+        room, count = 0, 1 + size * len(cell) // 4
+        while room < count:  # mostly, some rays of a cell meet a box
             room, beam, found = count, np.empty(count, np.int64), np.empty((3, count))
-            count = pulse_loops.crossings(*given, beam, found)
-        order = np.argsort(beam[:count], kind="stable")
-        return beam[order], np.ascontiguousarray(found[:, order])
+            count = pulse_loops.crossings(rays, times, far, size, *pairs, beam, found)
+        return place[beam[:count]], found[:, :count]
 
     def _boxes(self, ways: Ways, begin: float, end: float) -> tuple[Floats, Floats, Floats]:
         """Boxes of spray, and when they are there, as of `near_boxes`; their densities (b,)."""

@@ -195,9 +195,15 @@ class PulseBatch:
     @cached_property
     def beams(self) -> Pattern:
         """Sub-rays of the beams, and maybe those of others."""
-        rows = (self.first + np.arange(self.start, self.stop)) % len(self.pattern)
+        rows = np.arange(self.first + self.start, self.first + self.stop)
         some = None if self.offsets is None else rows
         return self.emitter.divided(self.pattern, self.offsets, some, by_head=self.poses.by_head)
+
+    @property
+    def rows(self) -> slice:
+        """Rows of the beams' firings; a batch begins and ends with one."""
+        each = self.firings.sensor.channels
+        return slice(self.start // each, self.stop // each)
 
     @property
     def window(self) -> tuple[int, int]:

@@ -7,9 +7,13 @@ from __future__ import annotations
 import numpy as np
 
 from raybeam.compiled import compiled, inlined
+from raybeam.rays import UNIT_SLACK
 
 from ..base.elementary_loops import exp, sin_cos
-from ..sensor.materials import NEAREST_M, REFERENCE_M, RETRO_GAIN
+from ..sensor import materials
+from ..sensor.materials import NEAREST_M, REFERENCE_M, RETRO_GAIN, WATER_INDEX
+
+fresnel, within_water = map(inlined, (materials.fresnel, materials.within_water))
 
 
 @inlined
@@ -89,14 +93,83 @@ def meet(
         back[k] = reflectance[owner] * (RETRO_GAIN if retro[owner] else abs(cosine))
 
 
+@inlined
+def _at_right_angles(distance, extinction):
+    """As `materials.at_right_angles`, of one distance."""
+    far = max(distance, NEAREST_M)
+    nearer = REFERENCE_M / far
+    nearer = nearer * nearer
+    return nearer * exp(-2 * extinction * far) if extinction else nearer
+
+
 @compiled()
 def fade(distance, extinction, energy):
     """Multiply energies by what `at_right_angles` says of distances."""
     for k in range(len(energy)):
-        far = max(distance[k], NEAREST_M)
-        nearer = REFERENCE_M / far
-        nearer = nearer * nearer
-        energy[k] *= nearer * exp(-2 * extinction * far) if extinction else nearer
+        energy[k] *= _at_right_angles(distance[k], extinction)
+
+
+@compiled()
+def soak(up, along, objects, dry, shares, level, wet, film, back):
+    """Mark where there may be water, and multiply the light sent back by what is below it.
+
+    It is where z of the normals `up`, of the side that is seen, is at least `level`, but on objects
+    that are `dry`; `shares` of light are scattered.
+    """
+    for k in range(len(up)):
+        upright = up[k] if along[k] < 0 else -up[k]
+        film[k] = upright >= level and not dry[objects[k]]
+        if film[k]:
+            mirrored = fresnel(abs(along[k]), WATER_INDEX)
+            back[k] *= 1 - wet * (1 - within_water(mirrored, shares[k]))
+
+
+@compiled()
+def onward(
+    on, off, objects, along, shares, wet, film, before, distance, specular, passes, straight, leafy,
+    brightest, extinction, faintest, share,
+):  # fmt: skip
+    """Find what light goes on from rows `on` of hits, through objects or `off` them.
+
+    Where light is not `straight`, it is refracted: what a surface mirrors is then neither taken off
+    nor alone. A share `wet` of what has a `film` is below water. Light that can return no more than
+    `faintest` is dropped: writes the other rows, and the `share` that is left of that `before`, out
+    and back; returns how many.
+    """
+    count = 0
+    for j in range(len(on)):
+        k = on[j]
+        owner, cosine = objects[k], abs(along[k])
+        first, grazing = specular[owner], 1 - min(cosine, 1.0)
+        square = grazing * grazing
+        mirrors = first + (1 - first) * (grazing * (square * square)) if first > 0 else 0.0
+        if passes[owner]:
+            mirrors = fresnel(cosine, materials.GLASS_INDEX)
+        goes = mirrors if off[j] else 1 - mirrors if passes[owner] else 1.0
+        goes = goes if straight[owner] else 1.0
+        goes *= 1.0 if leafy[owner] else 1 - shares[j]
+        if len(film) and film[k]:
+            goes = (1 - wet) * goes + wet * fresnel(cosine, WATER_INDEX)
+        goes = before[k] * (goes * goes)
+        if goes * (brightest * _at_right_angles(distance[k], extinction)) > faintest:
+            on[count], off[count], share[count] = k, off[j], goes
+            count += 1
+    return count
+
+
+@compiled()
+def set_off(origins, directions, step, away, starts, ahead):
+    """Write where light starts `away` from its ends, and make its directions units; all (3, n)."""
+    for k in range(len(step)):
+        for axis in range(3):
+            end = origins[axis, k] + step[k] * directions[axis, k]
+            starts[axis, k] = end + away[k] * ahead[axis, k]
+        x, y, z = ahead[0, k], ahead[1, k], ahead[2, k]
+        if abs((x * x + y * y) + z * z - 1) > UNIT_SLACK:  # as `Pattern` does, for all at a time
+            most = max(max(abs(x), abs(y)), abs(z))
+            x, y, z = x / most, y / most, z / most
+            length = np.sqrt((x * x + y * y) + z * z)
+            ahead[0, k], ahead[1, k], ahead[2, k] = x / length, y / length, z / length
 
 
 @compiled()

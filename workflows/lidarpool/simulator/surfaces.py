@@ -17,7 +17,7 @@ from ..scene.actors import shapes_of
 from ..scene.colours import GREY, Colours, Lookup, joined, luminance, packed
 from ..scene.scene import Scene
 from ..sensor import Sensor, Survey
-from ..sensor.materials import NEAR_NM, Material, MaterialTable, at_right_angles, below_water
+from ..sensor.materials import NEAR_NM, Material, MaterialTable, at_right_angles
 from ..sensor.trajectory import velocities
 from .motion import carried_at
 from .voxels import Grids
@@ -199,11 +199,9 @@ class Surfaces:
             back = table.scattered(objects, np.abs(along), bright)
         film = None
         if light.wet:
-            up = np.where(along < 0, normals[2], -normals[2])  # of the side that is seen
-            film = (up >= LEVEL) & ~(table.passes | table.leafy)[objects]
-            rows = np.flatnonzero(film)
-            shares = table.shares(objects[rows], None if bright is None else bright[rows])
-            back[rows] *= 1 - light.wet * (1 - below_water(np.abs(along[rows]), shares))
+            film, dry = np.empty(len(along), np.bool_), table.passes | table.leafy
+            given = normals[2], along, objects, dry, table.shares(objects, bright), LEVEL, light.wet
+            surface_loops.soak(*given, film, back)
         surface_loops.fade(owned(distance), light.extinction, back)
         return Lit(normals.T, along, objects, back, film)
 
