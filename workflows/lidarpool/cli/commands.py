@@ -254,7 +254,7 @@ def run(
 @cli.command()
 @click.argument("shards", metavar="SHARD...", nargs=-1, required=True, type=shared.StoragePath())
 @click.option("--partial", is_flag=True, help="Merge what there is, and say what is missing.")
-@shared.file(
+@shared.path(
     "--scenario", help="Of a survey: its scenario or mesh file, if that is not where it was."
 )
 @shared.out

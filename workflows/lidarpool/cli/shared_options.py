@@ -33,7 +33,7 @@ class StoragePath(click.Path):
 
 
 flag = partial(click.option, is_flag=True)
-file = partial(click.option, type=click.Path(path_type=Path), metavar="FILE")
+path = partial(click.option, type=click.Path(path_type=Path), metavar="FILE")
 new_file = partial(click.option, type=click.Path(dir_okay=False, path_type=Path), metavar="FILE")
 out = click.option(
     "--out",
@@ -58,11 +58,9 @@ shard = click.option(
     "Slurm array; auto/10: the index of a Kubernetes job.",
 )
 no_plan = flag("--no-plan", help="Leave out path planning.")
-cluster = file(
+cluster = path(
     "--cluster", help="Start this cluster for the run: Slurm, PBS, SSH; see docs/how-to/queues.md."
 )
-
-
 overwrite = flag("--overwrite", help="Replace existing files.")
 as_json = flag("--json", "as_json", help="Print the figures as one JSON document.")
 result = click.argument("result", metavar="FOLDER", type=StoragePath())
