@@ -79,8 +79,7 @@ def _in_turn(folder: str) -> Iterator[None]:
             yield
         finally:
             _held[0] -= 1
-            if collects:
-                gc.enable()
+            (gc.enable if collects else gc.disable)()
             if file is not None:
                 with suppress(OSError):
                     fcntl.flock(file, fcntl.LOCK_UN)  # also of a child that was forked meanwhile

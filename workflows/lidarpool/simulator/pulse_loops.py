@@ -163,30 +163,29 @@ def spray(
 ):  # fmt: skip
     """Draw the clumps of spray that beams meet in boxes, from crossing `k` on, while there is room.
 
-    Crossings (3, k) are in the order of beams. Depths between clumps are exponentially distributed;
-    `mean` is how many a beam would meet at a density of 1, of which each column of `tables` has an
-    equal share. Writes as `particles` does; returns the first crossing left, and how many.
+    Crossings (3, k), in the order of beams, are columns of `tables` and densities. Depths between
+    clumps are exponential; `mean` is how many a beam would meet at a density of 1, of which each
+    column has an equal share. Writes as `particles`; returns the first crossing left, and how many.
     """
-    count, row, places = 0, 0, tables[0]
+    count, row = 0, 0
     while k < len(beam) and count + _CLUMPS <= len(ray):
         this = beam[k]
         row = _scan_of(begins, first + this, row)
         own, number, clump = scan + row, first + this - begins[row], 0
         left = exponential[np.int64(_bits(starts[0], own, number, 0) >> _48)]
         while k < len(beam) and beam[k] == this:
-            rate = crossed[2, k] * (mean / len(places))
-            place = np.float64(np.searchsorted(places, crossed[0, k]))
-            end = np.searchsorted(places, crossed[1, k])
+            place, end, rate = crossed[0, k], crossed[1, k], crossed[2, k]
+            rate *= mean / tables.shape[1]
             while left < (end - place) * rate and clump < _CLUMPS:
                 place += left / rate
                 at = np.int64(place)
                 where = this * each
                 if each > 1:
                     where += np.int64(_bits(starts[1], own, number, clump) % np.uint64(each))
-                if places[at] < reach[where]:
+                if tables[0, at] < reach[where]:
                     rank = _uniform(starts[2], own, number, clump) * tables[2, at]
                     diameter = tables[1, at] + step * exponential[np.int64(rank * len(exponential))]
-                    ray[count], distance[count] = where, places[at]
+                    ray[count], distance[count] = where, tables[0, at]
                     energy[count] = each * min(tables[3, at] * diameter * diameter, tables[4, at])
                     count += 1
                 clump += 1
@@ -345,7 +344,7 @@ def _room(size, each):
     numbers, flags = np.int64, np.bool_
     return (
         np.empty((size, 2), numbers), np.empty(size, numbers),
-        np.empty(size), np.empty(size), np.zeros(size),
+        np.empty(size), np.empty(size), np.empty(size),
         np.empty(size, flags), np.empty(size, flags), np.empty(size, flags),
         np.empty(size * each, numbers), np.empty(size + 1, numbers),
     )  # fmt: skip
