@@ -254,7 +254,7 @@ class _Plan:
     """
 
     def __init__(self, scan: Scan, each: int) -> None:
-        self._pattern = ref(scan.pattern)
+        self._beams = ref(np.asarray(scan.pattern.directions.base))  # which its copies share
         many = scan.pattern.each
         steps = {1, scan.pattern.step * many, each} - {0}
         spreads = {step: _spread(scan, _Way(step, 16, 1)) for step in steps}
@@ -274,7 +274,7 @@ class _Plan:
 
     def fits(self, scan: Scan) -> bool:
         """Whether the rays of a scan are as close together as those for which this was made."""
-        if self._pattern() is scan.pattern:
+        if self._beams() is scan.pattern.directions.base:
             return True
         return abs(_spread(scan, _Way(self._step, 16, 1)) - self._spread) < _LIKE
 

@@ -330,10 +330,10 @@ def filled(ray, full, height, front, back, distance, energy, there):
 @stage
 def _most(ray, each):
     """Return how many hits a beam has at most."""
-    most, begin = 0, 0
+    most, begin, end = 0, 0, 0
     for k in range(len(ray)):
-        if ray[k] // each != ray[begin] // each:
-            begin = k
+        if ray[k] >= end:  # dividing each would take as long as making returns of all
+            begin, end = k, (ray[k] // each + 1) * each
         most = max(most, k + 1 - begin)
     return most
 
