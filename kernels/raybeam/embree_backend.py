@@ -246,13 +246,12 @@ class EmbreeBackend(Backend):
 class _Plan:
     """Ways to group the rays of a pattern, of which the fastest is found while they are cast.
 
-    Rays of a group are those of a ring that differ least, or some of a ring and their neighbours,
-    or each is cast by itself: what is fastest depends on the scene. All are tried on the same
-    blocks, of different places in the pattern. No way changes a result.
+    Rays of a group are of a ring, or of some neighbouring rings, or each is cast by itself: what is
+    fastest depends on the scene. All are tried on the same parts. No way changes a result.
     """
 
     def __init__(self, scan: Scan, each: int) -> None:
-        self._pattern = ref(scan.pattern)
+        self._beams = ref(np.asarray(scan.pattern.directions.base))  # which its copies share
         many = scan.pattern.each
         steps = {1, scan.pattern.step * many, each} - {0}
         spreads = {step: _spread(scan, _Way(step, 16, 1)) for step in steps}
@@ -261,7 +260,8 @@ class _Plan:
         self.ways = [_IN_TURN]
         if self._spread > _COHERENCE:
             ways = {_Way(self._step, high, wide) for high, wide in _SHAPES if wide <= self._step}
-            ways |= {_IN_TURN} if many > 1 else set()
+            if many > 1:  # those of a beam, which differ least, go together
+                ways = {_IN_TURN} | {_Way(step, *_SHAPES[-1]) for step in steps if step > 4}
             self.ways = [
                 way
                 for way in sorted(ways)
@@ -272,7 +272,7 @@ class _Plan:
 
     def fits(self, scan: Scan) -> bool:
         """Whether the rays of a scan are as close together as those for which this was made."""
-        if self._pattern() is scan.pattern:
+        if self._beams() is scan.pattern.directions.base:
             return True
         return abs(_spread(scan, _Way(self._step, 16, 1)) - self._spread) < _LIKE
 

@@ -7,14 +7,15 @@ from numba import types
 
 from . import embree_memory as memory
 from .compiled import compiled, inlined
-from .embree_memory import LANES, NUMBER, at, float64s, int32s, int64s, offset
-from .embree_packets import FIRST_PLACE, RECORD, cast_group, prepare
+from .embree_memory import FIRST_PLACE, LANES, NUMBER, RECORD, at, float64s, int32s, int64s, offset
+from .embree_packets import cast_group, prepare
 from .embree_rays import entered_at
 from .moving_loops import PADS_M, passes, sides_of, taken, turn_of
 from .rays import UNIT_SLACK
 
 _OX, _OY, _OZ, _DX, _DY, _DZ = map(at, ("ox", "oy", "oz", "dx", "dy", "dz"))
 _ENTRY, _REAL, _T, _KEY = map(at, ("entry", "real", "t", "key"))
+_ROW, _FULL = at("row"), at("straight")  # row in the `Crossing`, length of the direction
 _VALID_AT = offset("valid")
 _f64_1, _f64_2 = types.float64[::1], types.float64[:, ::1]
 _i64_1, _i32_1 = types.int64[::1], types.int32[::1]
@@ -62,7 +63,6 @@ def strike(  # type: ignore[no-untyped-def]
     cast = casts[0]
     scratch, t_max, metre = cast.scratch, cast.t_max, 1.0 / cast.scale
     numbers, floats, index = int64s(scratch), float64s(scratch), int32s(cast.index)
-    which, lengths = np.empty(LANES, np.int64), np.empty(LANES)
     sides = sides_of(float64s(box.ctypes.data))
     prepare(cast)
     done = 0
@@ -75,16 +75,16 @@ def strike(  # type: ignore[no-untyped-def]
             x, y, z = taken(turn, x, y, z)
             u, v, w = taken(turn, rays[3, k], rays[4, k], rays[5, k])
             if passes(sides, PADS_M, distance[k], x, y, z, u, v, w):
-                lengths[filled] = _put(cast, floats, filled, x, y, z, u, v, w)
-                which[filled] = done
+                floats[_FULL + filled] = _put(cast, floats, filled, x, y, z, u, v, w)
+                numbers[_ROW + filled] = done
                 filled += 1
             done += 1
         _fill_up(scratch, filled)
         if filled == 0 or not cast_group(casts.ctypes.data, filled, 0):
             continue
         for lane in range(filled):
-            t, key, n = floats[_T + lane], numbers[_KEY + lane], which[lane]
-            k, own, far = row[n], body[n], t * metre / lengths[lane]
+            t, key, n = floats[_T + lane], numbers[_KEY + lane], numbers[_ROW + lane]
+            k, own, far = row[n], body[n], t * metre / floats[_FULL + lane]
             nearer = far < distance[k] or (far == distance[k] and own < bodies[k])
             if key < 0 or t > t_max or not nearer:
                 continue

@@ -48,9 +48,6 @@ _ROUGH, _ONE, _OTHER = at("rough"), at("one"), at("other")
 _ROUGH_32, _ONE_32, _OTHER_32 = at("rough_32"), at("one_32"), at("other_32")
 _T, _KEY, _SURE, _CORNERS = at("t"), at("key"), at("sure"), at("corners")
 
-_MESH_OF = memory.INSTANCE.fields["mesh"][1] // 8  # type: ignore[index]
-_RECORD = memory.INSTANCE.itemsize
-
 COHERENT, CALL_FILTER = 1 << 16, 1 << 1  # RTCRayQueryFlags
 
 # Local units. Ten times the error of a float32 distance, unless the ray grazes: so much farther
@@ -113,12 +110,12 @@ def _mesh_of(mesh, instances, numbers, floats, lane, key):  # type: ignore[no-un
     if instances == 0:
         return mesh
     number = key // NUMBER
-    address = instances + _RECORD * number
+    address = instances + memory.RECORD * number
     if numbers[_INSIDE + lane] != number:
         ox, oy, oz, dx, dy, dz, length = entered(float64s(address), *given(floats, lane))
         keep_sheared(numbers, floats, lane, ox, oy, oz, dx, dy, dz)
         floats[_LENGTH + lane], numbers[_INSIDE + lane] = length, number
-    return int64s(address)[_MESH_OF]
+    return int64s(address)[memory.MESH_OF]
 
 
 @inlined

@@ -78,6 +78,7 @@ INSTANCE = np.dtype(
         ("first", "i8"),  # the mesh's first place in `index`
     ]
 )
+MESH_OF, FIRST_PLACE, RECORD = 12, 13, INSTANCE.itemsize  # of these: numbers before, and bytes
 
 SCRATCH = np.dtype(
     [

@@ -30,8 +30,6 @@ _ROUGH_32, _ONE_32, _OTHER_32 = at("rough_32"), at("one_32"), at("other_32")
 _T, _KEY, _SURE, _POSE = at("t"), at("key"), at("sure"), at("pose")
 f64_1, f64_2, i32_1 = types.float64[::1], types.float64[:, ::1], types.int32[::1]
 _FIELDS = 22  # numbers of a ray of a packet
-_MESH_OF = memory.INSTANCE.fields["mesh"][1] // 8  # type: ignore[index]
-FIRST_PLACE, RECORD = _MESH_OF + 1, memory.INSTANCE.itemsize
 
 _intersect_4, _intersect_8, _intersect_16 = (
     types.ExternalFunction(
@@ -264,8 +262,8 @@ def trace(casts, start, stop):  # type: ignore[no-untyped-def]
             if place < 0:
                 continue
             if instances != 0:
-                record = int64s(instances + RECORD * numbered[k])
-                place = (place & (NUMBER - 1)) + record[FIRST_PLACE]
+                record = int64s(instances + memory.RECORD * numbered[k])
+                place = (place & (NUMBER - 1)) + record[memory.FIRST_PLACE]
                 out_instance[kept] = numbered[k]
             out_ray[kept], out_metres[kept] = block - before + k, distances[k] * metre
             out_triangle[kept] = index[place] if indexed else place
@@ -285,9 +283,9 @@ def weigh(casts, origins, directions, place, instance, u, v):  # type: ignore[no
         ox, oy, oz, dx, dy, dz = o[0], o[1], o[2], to[0], to[1], to[2]
         at, mesh_at = np.int64(place[k]), mesh
         if instances != 0:
-            address = instances + RECORD * np.int64(instance[k])
+            address = instances + memory.RECORD * np.int64(instance[k])
             record = int64s(address)
-            mesh_at, at = record[_MESH_OF], at - record[FIRST_PLACE]
+            mesh_at, at = record[memory.MESH_OF], at - record[memory.FIRST_PLACE]
             ox, oy, oz, dx, dy, dz, _ = exact.entered(float64s(address), ox, oy, oz, dx, dy, dz)
         axis, p, q, r, sx, sy, sz = shear(ox, oy, oz, dx, dy, dz)
         triangle = exact.corners_of(float64s(int64s(mesh_at)[0]), at, axis)

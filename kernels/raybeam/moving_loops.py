@@ -190,11 +190,11 @@ def _near(rays, n, x, y, z, radius, near):  # type: ignore[no-untyped-def]
 
 
 @compiled(
-    "i8(f8[:, ::1], f8[::1], i8[::1], i8[::1], f8[:, ::1], f8[:, ::1], i8[::1], f8[::1], "
+    "i8(f8[:, ::1], f8[::1], i8[::1], i8[::1], f8[:, ::1], f8[:, ::1], i8[::1], f8[::1], f8[::1], "
     "i8[:, ::1])"
 )
-def _through(rays, ends, cell, number, poses, boxes, shape, pads, out):  # type: ignore[no-untyped-def]
-    found, near, count = 0, np.empty(CELL), rays.shape[1]
+def _through(rays, ends, cell, number, poses, boxes, shape, pads, near, out):  # type: ignore[no-untyped-def]
+    found, count = 0, rays.shape[1]
     for pair in range(len(cell)):
         begin, end = cell[pair] * CELL, min((cell[pair] + 1) * CELL, len(ends))
         sides = sides_of(float64s(boxes.ctypes.data + 48 * shape[pair]))
@@ -236,5 +236,5 @@ def through(
     pairs = np.empty((2, len(cell) * CELL), np.int64)
     if len(ends) < CELL:  # the loop over a cell has a constant length
         rays = np.concatenate([rays, np.zeros((6, CELL - len(ends)))], axis=1)
-    found = _through(rays, ends, cell, number, poses, boxes, shape, pads, pairs)
+    found = _through(rays, ends, cell, number, poses, boxes, shape, pads, np.empty(CELL), pairs)
     return pairs[0, :found], pairs[1, :found]

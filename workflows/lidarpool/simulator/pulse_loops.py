@@ -16,7 +16,6 @@ from ..base.elementary_loops import exp
 
 ALL, FIRST, LAST, STRONGEST, DUAL = range(5)  # modes
 _CLUMPS = 255  # of spray that a beam meets at most: a ray has so many random numbers
-_GUIDE = 1024  # parts of the way through it
 SLOPE = 0.5  # of the distance between neighbouring hits: what the slopes of one surface may miss
 
 _30, _27, _31, _11, _48 = (np.uint64(shift) for shift in (30, 27, 31, 11, 48))
@@ -181,15 +180,11 @@ def spray(
 ):  # fmt: skip
     """Draw the clumps of spray that beams meet in boxes, from crossing `k` on, while there is room.
 
-    Crossings (3, k) of a beam follow each other. Depths between clumps are exponentially
-    distributed; `mean` is how many a beam would meet at a density of 1, of which each column of
-    `tables` has an equal share. Writes as `particles` does; returns the first crossing left, and
-    how many.
+    Crossings (3, k), in the order of beams, are columns of `tables` and densities. Depths between
+    clumps are exponential; `mean` is how many a beam would meet at a density of 1, of which each
+    column has an equal share. Writes as `particles`; returns the first crossing left, and how many.
     """
-    count, row, places, guide = 0, 0, tables[0], np.empty(_GUIDE + 4, np.int64)
-    width = places[-1] / _GUIDE
-    for part in range(len(guide)):  # to bound how much spray a beam meets: most meet too little
-        guide[part] = np.searchsorted(places, width * (part - 1))
+    count, row, share = 0, 0, mean / tables.shape[1]
     while k < len(beam) and count + _CLUMPS <= len(ray):
         this = beam[k]
         row = _scan_of(begins, first + this, row if begins[row] <= first + this else 0)
@@ -197,26 +192,23 @@ def spray(
         left = exponential[np.int64(_bits(starts[0], own, number, 0) >> _48)]
         begin, most = k, 0.0
         while k < len(beam) and beam[k] == this:
-            near, ends = min(crossed[0, k] / width, _GUIDE), min(crossed[1, k] / width, _GUIDE)
-            most += crossed[2, k] * (guide[np.int64(ends) + 3] - guide[np.int64(near)])
+            most += crossed[2, k] * (crossed[1, k] - crossed[0, k])
             k += 1
-        if left > 1.001 * most * (mean / len(places)):
+        if left > 1.001 * most * share:  # as of most beams
             continue
         k = begin
         while k < len(beam) and beam[k] == this:
-            rate = crossed[2, k] * (mean / len(places))
-            place = np.float64(np.searchsorted(places, crossed[0, k]))
-            end = np.searchsorted(places, crossed[1, k])
+            place, end, rate = crossed[0, k], crossed[1, k], crossed[2, k] * share
             while left < (end - place) * rate and clump < _CLUMPS:
                 place += left / rate
                 at = np.int64(place)
                 where = this * each
                 if each > 1:
                     where += np.int64(_bits(starts[1], own, number, clump) % np.uint64(each))
-                if places[at] < reach[where]:
+                if tables[0, at] < reach[where]:
                     rank = _uniform(starts[2], own, number, clump) * tables[2, at]
                     diameter = tables[1, at] + step * exponential[np.int64(rank * len(exponential))]
-                    ray[count], distance[count] = where, places[at]
+                    ray[count], distance[count] = where, tables[0, at]
                     energy[count] = each * min(tables[3, at] * diameter * diameter, tables[4, at])
                     count += 1
                 clump += 1
@@ -416,7 +408,7 @@ def _room(size, each):
     numbers, flags = np.int64, np.bool_
     return (
         np.empty((size, 2), numbers), np.empty(size, numbers),
-        np.empty(size), np.empty(size), np.zeros(size),
+        np.empty(size), np.empty(size), np.empty(size),
         np.empty(size, flags), np.empty(size, flags), np.empty(size, flags),
         np.empty(size * each, numbers), np.empty(size + 1, numbers),
     )  # fmt: skip
