@@ -15,6 +15,7 @@ from raybeam.compiled import compiled, inlined, stage
 from ..base.elementary_loops import exp
 
 ALL, FIRST, LAST, STRONGEST, DUAL = range(5)  # modes
+_GUIDE = 1024  # parts of a table in which a column is looked up
 _CLUMPS = 255  # of spray that a beam meets at most: a ray has so many random numbers
 SLOPE = 0.5  # of the distance between neighbouring hits: what the slopes of one surface may miss
 
@@ -173,6 +174,15 @@ def crossings(
     return count
 
 
+@stage
+def _column(places, guide, width, place):
+    """Find the first column that is not below a place; numba's search takes long to compile."""
+    column = guide[np.int64(min(place / width, _GUIDE))]
+    while column < len(places) and places[column] < place:
+        column += 1
+    return column
+
+
 @compiled()
 def spray(
     k, beam, crossed, each, mean, step, tables, exponential,
@@ -180,35 +190,40 @@ def spray(
 ):  # fmt: skip
     """Draw the clumps of spray that beams meet in boxes, from crossing `k` on, while there is room.
 
-    Crossings (3, k), in the order of beams, are columns of `tables` and densities. Depths between
-    clumps are exponential; `mean` is how many a beam would meet at a density of 1, of which each
-    column has an equal share. Writes as `particles`; returns the first crossing left, and how many.
+    Crossings (3, k) of a beam follow each other. Depths between clumps are exponential; `mean` is
+    how many a beam would meet at a density of 1, of which each column of `tables` has an equal
+    share. Writes as `particles` does; returns the first crossing left, and how many.
     """
-    count, row, share = 0, 0, mean / tables.shape[1]
+    count, row, places, guide = 0, 0, tables[0], np.zeros(_GUIDE + 4, np.int64)
+    width, share = places[-1] / _GUIDE, mean / len(places)
+    for part in range(1, len(guide)):
+        guide[part] = _column(places, guide[part - 1 :], np.inf, width * (part - 1))
     while k < len(beam) and count + _CLUMPS <= len(ray):
         this = beam[k]
         row = _scan_of(begins, first + this, row if begins[row] <= first + this else 0)
         own, number, clump = scan + row, first + this - begins[row], 0
         left = exponential[np.int64(_bits(starts[0], own, number, 0) >> _48)]
         begin, most = k, 0.0
-        while k < len(beam) and beam[k] == this:
-            most += crossed[2, k] * (crossed[1, k] - crossed[0, k])
+        while k < len(beam) and beam[k] == this:  # most beams meet too little, by a rough bound
+            near, ends = min(crossed[0, k] / width, _GUIDE), min(crossed[1, k] / width, _GUIDE)
+            most += crossed[2, k] * (guide[np.int64(ends) + 3] - guide[np.int64(near)])
             k += 1
-        if left > 1.001 * most * share:  # as of most beams
+        if left > 1.001 * most * share:
             continue
         k = begin
         while k < len(beam) and beam[k] == this:
-            place, end, rate = crossed[0, k], crossed[1, k], crossed[2, k] * share
+            rate, end = crossed[2, k] * share, _column(places, guide, width, crossed[1, k])
+            place = np.float64(_column(places, guide, width, crossed[0, k]))
             while left < (end - place) * rate and clump < _CLUMPS:
                 place += left / rate
                 at = np.int64(place)
                 where = this * each
                 if each > 1:
                     where += np.int64(_bits(starts[1], own, number, clump) % np.uint64(each))
-                if tables[0, at] < reach[where]:
+                if places[at] < reach[where]:
                     rank = _uniform(starts[2], own, number, clump) * tables[2, at]
                     diameter = tables[1, at] + step * exponential[np.int64(rank * len(exponential))]
-                    ray[count], distance[count] = where, tables[0, at]
+                    ray[count], distance[count] = where, places[at]
                     energy[count] = each * min(tables[3, at] * diameter * diameter, tables[4, at])
                     count += 1
                 clump += 1

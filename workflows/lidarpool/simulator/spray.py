@@ -92,7 +92,6 @@ class SprayStep(PulseStep):
         energy, ray = made(returns.energy).copy(), returns.ray.astype(np.int64)
         pulse_loops.veil(beam, crossed, each, self._extinction, far, ray, returns.distance, energy)
         batch.hits = returns = returns._replace(energy=energy)
-        crossed[:2] = np.searchsorted(self._seen[1][0], crossed[:2])
         given = self._begun, keys.scan, np.array(keys.begins, np.int64), batch.start, far
         tables = each, self._seen[0], self._step, self._seen[1], exponential()
         while row < len(beam):
