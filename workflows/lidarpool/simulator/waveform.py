@@ -75,10 +75,6 @@ class Digitizer:
         """Samples in a metre of range."""
         return 2 / LIGHT_M_NS / self.sample_ns
 
-    def samples(self, distance: Floats) -> Floats:
-        """Return when light comes back, samples after the pulse."""
-        return distance * self.per_m
-
     def amplitude(self, energy: Floats, width: Floats) -> Floats:
         """Heights of echoes (n,) by energy and full width at half maximum, ns; 0 is unknown."""
         system_ns = FWHM * self.sigma_ns
