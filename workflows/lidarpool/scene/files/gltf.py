@@ -178,17 +178,17 @@ class _Reader:
         count = max(1, math.ceil((last - first) * RATE_HZ))
         self._allowance.take(32 * (count + 1) * (1 + len(animation["channels"])))
         times_s = np.linspace(first, last, count + 1)
+        return baked(self._poses(animation, times_s), times_s.tolist(), self._allowance)
+
+    def _poses(self, animation: dict[str, Any], times_s: Floats) -> Generator[Content]:
+        """Content at each time of an animation, in colours at the first."""
         self._channels = played(animation, times_s, self._accessor)
         if not self._channels:
             raise MeshFileError("has an animation that moves no node: choose another")
         for index, _ in self._channels:
             self._part("nodes", index)
-        return baked(self._poses(count + 1), times_s.tolist(), self._allowance)
-
-    def _poses(self, count: int) -> Generator[Content]:
-        """Content at each time of the animation, in colours at the first."""
         roots = _roots(self._header)
-        for self._frame in range(count):
+        for self._frame in range(len(times_s)):
             for kept in (self._local, self._joints, self._bent):  # of the frame before
                 kept.cache_clear()
             self._worlds.clear()

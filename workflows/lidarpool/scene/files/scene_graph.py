@@ -207,7 +207,7 @@ def baked(poses: Iterable[Content], times_s: Sequence[float], allowance: Allowan
             moves = [np.empty((count, *vertices.shape)) for vertices in now]
         allowance.taken = taken
         if list(map(len, now)) != [len(own[0]) for own in moves]:
-            raise MeshFileError(f"has other meshes in pose {number} than in the first: split it")
+            raise MeshFileError(f"has other vertices in pose {number}: leave out animation")
         for own, vertices in zip(moves, now, strict=True):
             own[number] = vertices
     animations = iter([Animation(own, (times_s[-1] - times_s[0]) / (count - 1)) for own in moves])

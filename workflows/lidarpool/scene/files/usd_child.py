@@ -516,10 +516,9 @@ def _played(stage: Any, asked: dict[str, Any]) -> tuple[list[Any], list[Any], li
     # Where time stands still, usd-core would look for samples for ever.
     attributes = [one for prim in prims if rate_hz > 0 for one in prim.GetAuthoredAttributes()]
     moved = [one for one in attributes if one.ValueMightBeTimeVarying()]
-    clips = {one.GetName(): one for one in prims if moved and one.IsA(UsdSkel.Animation)}
+    clips = {one.GetName(): one.GetPath() for one in prims if moved and one.IsA(UsdSkel.Animation)}
     for prim in [one for one in prims if name in clips and one.IsA(UsdSkel.Skeleton)]:
-        source = UsdSkel.BindingAPI.Apply(prim).CreateAnimationSourceRel()
-        source.SetTargets([clips[name].GetPath()])
+        UsdSkel.BindingAPI.Apply(prim).CreateAnimationSourceRel().SetTargets([clips[name]])
     times = [Usd.TimeCode.EarliestTime().GetValue()]
     codes = [code for one in moved for code in one.GetTimeSamples()]
     if stage.HasAuthoredTimeCodeRange():
@@ -593,7 +592,8 @@ def main(path: str, asked: dict[str, Any]) -> None:
             stage.SetEditTarget(stage.GetSessionLayer())
             for attribute in moved:
                 attribute.Set(attribute.Get(code))
-            UsdSkel.BakeSkinning(stage.Traverse())  # bends at samples only, or if all stands
+            # It bends at samples only, or what stands.
+            UsdSkel.BakeSkinning(stage.Traverse(), Gf.Interval(code, code))
             looks.time = Usd.TimeCode(code)
             scene = StageNodes(stage, asked["most"].copy(), looks, write)
             scene.read()
