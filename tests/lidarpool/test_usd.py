@@ -395,6 +395,10 @@ def test_what_stands_is_bent_at_the_first_time_also_between_samples(tmp_path):
     assert lines == [
         "m.usda has skeletons that move: they stand still; actors move by animation: NAME"
     ]
+    text = path.read_text()
+    (tmp_path / "blocked.usda").write_text(text.replace("13: [", "6: None, 13: ["))
+    blocked, _ = told(tmp_path / "blocked.usda")
+    assert not np.allclose(blocked[0].vertices, objects[0].vertices)
     own = load_objects(path, animation="").standing[0].animation
     assert own.duration_s == pytest.approx(11.7 / 24)
     np.testing.assert_allclose(own.vertices[-1], evaluated(path, 19), atol=2e-6)

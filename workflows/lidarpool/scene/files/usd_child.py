@@ -591,7 +591,7 @@ def main(path: str, asked: dict[str, Any]) -> None:
             stage.GetSessionLayer().Clear()  # of the pose before
             stage.SetEditTarget(stage.GetSessionLayer())
             for attribute in moved:
-                attribute.Set(attribute.Get(code))
+                attribute.Set(Sdf.ValueBlock() if (value := attribute.Get(code)) is None else value)
             # It bends at samples only, or what stands.
             UsdSkel.BakeSkinning(stage.Traverse(), Gf.Interval(code, code))
             looks.time = Usd.TimeCode(code)
