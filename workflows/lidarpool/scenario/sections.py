@@ -232,7 +232,7 @@ class ShapeSection(Section):
 
 
 class AnimationSection(Section):
-    """An animation of an actor's .glb or .gltf; in YAML also just its name."""
+    """An animation of an actor's .glb, .gltf or .usd; in YAML also just its name."""
 
     name: Annotated[Text | None, about("its name in the file; by default the first", "Walk")] = None
     speed_m_s: Annotated[
