@@ -27,7 +27,7 @@ from ..sensor import Mounted, Pose, Track, load_trajectory
 from ..sensor.calibrations import said
 from ..sensor.survey import StepCount
 from ..sensor.trajectory import CLOCK_S, Beyond, InstrumentPose, quaternions_of, rotations_of
-from ..sensor.trajectory_files import Duration, Seconds, TrajectoryFormat, quaternions_from_degrees
+from ..sensor.trajectory_files import Duration, Seconds, TrajectoryFormat
 from .ground import Standing, following
 from .sections import (
     DeformingSection,
@@ -188,7 +188,7 @@ class TrajectorySection(Section):
         return Track(
             np.array([p.time_s + self.offset_s for p in self.points]),
             np.array([p.position for p in self.points]) - origin,
-            quaternions_from_degrees(np.array(angles)) if turned else None,
+            quaternions_of(rotations_of(np.array(angles))) if turned else None,
             **own,
         )
 
