@@ -47,6 +47,7 @@ from ..render.theme import mapped, object_colours
 from ..run.picture_file import PICTURE_FILE, PLACES_MOST, PictureContent, SensorWay, ways_of
 from ..run.store import RUN_FOLDER
 from ..scene.actors import Actor, samples_each, shapes_of
+from ..scene.colours import as_bytes
 from ..scene.scene import Scene
 from ..scene.simplified import simplified
 from ..sensor.trajectory import presence_ns
@@ -604,11 +605,6 @@ def legend_of(colouring: Colouring) -> Legend:
 def scale_legend(title: str, marks: Sequence[str], colours: Floats = TURBO[::15]) -> Legend:
     """Legend of a scale of colours (n, 3), with evenly spread marks."""
     return {"title": title, "marks": list(marks), "colours": as_bytes(colours).tolist()}
-
-
-def as_bytes(colours: Floats) -> Bytes:
-    """Colours of 0 to 1 as bytes."""
-    return np.round(255 * colours).astype(np.uint8)
 
 
 @contextmanager
