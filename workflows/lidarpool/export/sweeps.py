@@ -157,7 +157,7 @@ class Sweeps:
         for number, carried in enumerate(survey.carried):
             (firsts, begins, _), mount = each[number], carried.mount
             since = begins[: len(begins) // path.stations]
-            turned = np.eye(3) if mount.rotation is None else mount.rotation
+            turned = mount.turn
             mounts.append((mount.position, turned))
             for station in range(path.stations):
                 positions, found = path.poses(station, since)

@@ -102,8 +102,7 @@ def place(
 
 def _narrowed(scene: Scene, looker: Surroundings, poses: Sequence[Pose]) -> dict[str, Any]:
     """Return what `Sensor.grid` takes to see an object from poses, with about `_POINTS` points."""
-    turns = [np.eye(3) if pose.rotation is None else pose.rotation for pose in poses]
-    placed = [*zip(_local(poses, scene), turns, strict=True)]
+    placed = [*zip(_local(poses, scene), [pose.turn for pose in poses], strict=True)]
     sides = np.zeros(2)  # the widest angles to either side, and up or down
     for at, turn in placed:
         x, y, z = ((scene.vertices - at) @ turn).T
