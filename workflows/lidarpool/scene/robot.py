@@ -410,7 +410,7 @@ class LinkPath:
             place, turn = _then(place, turn, hinge.before)
             value = interp(at, self.times_s, hinge.values)
             if moving:
-                start, velocity = place, velocity + _cross(rate, place - start)
+                start, velocity = place, velocity + np.cross(rate, place - start, axis=0)
                 along = _times(turn, hinge.axis[:, None, None] * self._slopes(hinge, at))[:, 0]
             if hinge.slides:
                 place = place + _times(turn, hinge.axis[:, None, None] * value)[:, 0]
@@ -426,7 +426,7 @@ class LinkPath:
                     rate = rate + along
         place, turn = _then(place, turn, self.last)
         if moving:
-            velocity = (velocity + _cross(rate, place - start)) * within
+            velocity = (velocity + np.cross(rate, place - start, axis=0)) * within
         return place, turn, velocity, rate * within
 
     def _slopes(self, hinge: Hinge, at: Floats) -> Floats:
@@ -444,11 +444,6 @@ def _times(one: Floats, other: Floats) -> Floats:
     return np.asarray(
         (one[:, 0, None] * other[0] + one[:, 1, None] * other[1]) + one[:, 2, None] * other[2]
     )
-
-
-def _cross(one: Floats, other: Floats) -> Floats:
-    """Cross products of vectors (3, k)."""
-    return np.cross(one, other, axis=0)
 
 
 def _then(place: Floats, turn: Floats, matrix: Floats) -> tuple[Floats, Floats]:
