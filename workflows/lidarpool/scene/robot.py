@@ -19,7 +19,7 @@ from ..base.validation import as_array, checked
 from ..base.vectors import applied, matmul
 from ..base.words import did_you_mean, plural, printable
 from ..sensor import Pose, Stations, Trajectory
-from ..sensor.calibrations import text_of
+from ..sensor.calibrations import said, text_of
 from ..sensor.trajectory import presence_ns, velocities
 from ..sensor.trajectory_files import columns_of_table, head_of_table
 from .actors import AT_ZERO, Actor, one_mesh
@@ -285,7 +285,7 @@ class Robot:
             names = head_of_table(text.splitlines())[2]
         except (OSError, ValueError, LidarpoolError) as error:
             raise LidarpoolError(
-                f"{path} is not a usable table of joints: {str(error).rstrip('.')}."
+                f"{path} is not a usable table of joints: {said(error)}"
             ) from error
         if "time_ns" in table:
             table["time_s"] = table.pop("time_ns") / 1e9
