@@ -204,12 +204,11 @@ class Instances:
             out[rows] = np.sqrt((x * x + y * y).max(axis=1))
         return out
 
-    def moved(self, owner: int, position: Floats, rotation: Floats | None) -> Instances:
+    def moved(self, owner: int, position: Floats, turn: Floats) -> Instances:
         """Return them with those of an object in another place, at their present scale."""
         check_near(position)
         rows = np.flatnonzero(self.owner == owner)
         transforms = self.transforms.copy()
-        turn = np.eye(3) if rotation is None else rotation
         for row in rows:
             transforms[row] = np.column_stack(
                 [matmul(turn, scale_of(transforms[row, :, :3])), position]
