@@ -327,9 +327,12 @@ class View:
             return {"name": name}, {"file": np.fromfile(made, np.uint8)}
 
     def _wanted(self, asked: Arguments) -> tuple[Filter, ScanRanges | None]:
-        """Read the filter and the ranges of scans of a question."""
+        """Read the filter and the ranges of scans, ``first-last,first-last``, of a question."""
         wanted = Filter.read(asked.get("filter", ""), list(self.columns))
-        return wanted, _scans(asked["scans"]) if "scans" in asked else None
+        if "scans" not in asked:
+            return wanted, None
+        pairs = (entry.split("-") for entry in asked["scans"].split(",") if entry)
+        return wanted, tuple((int(first), int(last)) for first, last in pairs)
 
     def _points(self, asked: Arguments, abandoned: Callable[[], bool]) -> Answer:
         """Points for a filter, ranges of scans and a camera, and their colours."""
@@ -508,12 +511,6 @@ def _of_points(points: Points) -> tuple[Floats, Floats]:
     box = np.percentile(places, [0.5, 99.5], axis=0)
     origin = np.where(np.abs(box[0]) > 10_000, np.round(box[0]), 0.0)
     return origin, box - origin
-
-
-def _scans(text: str) -> ScanRanges:
-    """Read ranges of scans, ``first-last,first-last``."""
-    pairs = (entry.split("-") for entry in text.split(",") if entry)
-    return tuple((int(first), int(last)) for first, last in pairs)
 
 
 class ShownSurface:
