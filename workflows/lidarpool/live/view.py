@@ -522,10 +522,7 @@ class ShownSurface:
     """
 
     def __init__(
-        self,
-        scene: Scene,
-        reflectance: Floats | None = None,
-        most: int = MOST_TRIANGLES,
+        self, scene: Scene, reflectance: Floats | None = None, most: int = MOST_TRIANGLES
     ) -> None:
         self.coarse, self._reflectance = scene, reflectance
         # (f,): which triangle stands for each of the scene; -1 where nothing is left.

@@ -129,11 +129,7 @@ class _Writer:
         return out
 
     def _corners(
-        self,
-        mesh: SceneMesh,
-        rows: Indices,
-        uv: AnyArray | None,
-        tints: Bytes | None,
+        self, mesh: SceneMesh, rows: Indices, uv: AnyArray | None, tints: Bytes | None
     ) -> dict[str, int]:
         """Attributes of some triangles (k,), whose corners have their own (k, 3, …)."""
         corners = turned(mesh.vertices[mesh.faces[rows]].reshape(-1, 3), UP_AXES["y"].T)

@@ -332,11 +332,7 @@ class _Looks:
             # (AI_CONFIG_IMPORT_COLLADA_IGNORE_UP_DIRECTION in rviz_rendering's assimp_loader.cpp),
             # and not its unit. assimp turns no other format.
             found = load_meshes(
-                path,
-                up_axis="z",
-                opacity=self.opacity,
-                colours=self.colours,
-                tell=self.tell,
+                path, up_axis="z", opacity=self.opacity, colours=self.colours, tell=self.tell
             )
             self._allowance.add_file(path)
             self._files[path] = [
