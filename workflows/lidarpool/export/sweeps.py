@@ -18,6 +18,7 @@ from ..base.arrays import AnyFloats, Bools, Bytes, Floats, Ints
 from ..base.errors import LidarpoolError
 from ..columns.cloud import Cloud, CloudLike
 from ..scene.scene import Scene
+from ..scene.transform import affine
 from ..sensor import Fault, Sensor, Survey
 from ..sensor.faults import sent
 from ..sensor.plain_data import described, remade
@@ -58,10 +59,7 @@ class Placed:
 
     def matrix(self, sweep: int) -> Floats:
         """Matrix (4, 4) from its own axes at the start of a sweep to the world's."""
-        pose = np.eye(4)
-        pose[:3, :3] = self.turns[sweep]
-        pose[:3, 3] = self.positions[sweep]
-        return pose
+        return affine(self.turns[sweep], self.positions[sweep])
 
     def inward(self, sweep: int, points: Floats) -> Floats:
         """Convert points (k, 3) of the world to its axes at the start of a sweep."""

@@ -22,7 +22,7 @@ from .files.meshfile import GENERATOR
 from .scene import Scene
 from .scene_instances import SceneInstance
 from .scene_mesh import SceneMesh
-from .transform import UP_AXES
+from .transform import UP_AXES, affine
 
 _MOST_BYTES = 2**32 - 1
 _NEAREST = 9728
@@ -86,8 +86,7 @@ class _Writer:
             self._meshes[key] = self._put("meshes", {"name": name, "primitives": primitives})
         node: dict[str, Any] = {"name": name, "mesh": self._meshes[key]}
         if isinstance(parts[0], SceneInstance):
-            turn = np.eye(4)
-            turn[:3, :3] = UP_AXES["y"].T
+            turn = affine(UP_AXES["y"].T, np.zeros(3))
             node["matrix"] = matmul(matmul(turn, parts[0].matrix), turn.T).T.ravel().tolist()
         elif far:
             node["translation"] = applied(UP_AXES["y"].T, self._origin).tolist()
