@@ -23,7 +23,7 @@ from ..sensor import Fault, Sensor, Survey
 from ..sensor.faults import sent
 from ..sensor.plain_data import described, remade
 from ..sensor.survey import nanoseconds
-from ..sensor.trajectory import matrices, presence_ns, quaternions_of
+from ..sensor.trajectory import full_poses, matrices, presence_ns, quaternions_of
 from .navigation_files import Instruments
 
 SWEEPS_FILE = "sweeps.npz"
@@ -158,8 +158,7 @@ class Sweeps:
             turned = mount.turn
             mounts.append((mount.position, turned))
             for station in range(path.stations):
-                positions, found = path.poses(station, since)
-                rotations = _full(found, len(since))
+                positions, rotations = full_poses(path, station, since)
                 places.append(positions + rotations @ np.array(mount.position))
                 turns.append(rotations @ turned)
             sensors.append(np.full(len(since) * path.stations, number, np.uint8))
@@ -169,8 +168,8 @@ class Sweeps:
         when, end = (np.concatenate([one[k] for one in each]) for k in (1, 2))
         actor_poses, there = [], []
         for actor in scene.actors:
-            at, turned_by = actor.trajectory.poses(0, np.append(when, end))
-            actor_poses.append(_placed(at + scene.origin, _full(turned_by, len(at))))
+            at, turned_by = full_poses(actor.trajectory, 0, np.append(when, end))
+            actor_poses.append(_placed(at + scene.origin, turned_by))
             appears, leaves = presence_ns(actor.trajectory)
             there.append((appears <= when) & (when <= leaves))
         deform = any(actor.mesh.animation for actor in scene.actors)
@@ -335,10 +334,6 @@ def plain_names(names: Iterable[str]) -> list[str]:
             plain = f"{allowed}_{number}"
         out.append(plain)
     return out
-
-
-def _full(rotations: Floats | None, count: int) -> Floats:
-    return np.broadcast_to(np.eye(3), (count, 3, 3)) if rotations is None else rotations
 
 
 def _placed(positions: Floats, rotations: Floats) -> Placed:

@@ -20,7 +20,7 @@ from ..base.vectors import applied, matmul
 from ..base.words import did_you_mean, plural, printable
 from ..sensor import Pose, Stations, Trajectory
 from ..sensor.calibrations import said, text_of
-from ..sensor.trajectory import presence_ns, velocities
+from ..sensor.trajectory import full_poses, presence_ns, velocities
 from ..sensor.trajectory_files import columns_of_table, head_of_table
 from .actors import AT_ZERO, Actor, one_mesh
 from .scene_mesh import SceneMesh
@@ -389,12 +389,9 @@ class LinkPath:
         appears, leaves = self.presence_ns
         within = (appears <= times_ns) & (times_ns <= leaves)
         times_ns = np.clip(times_ns, *self.presence_ns)  # elsewhere poses do not count
-        positions, rotations = self.base.poses(station, times_ns)
-        place, count = positions.T, len(times_ns)
-        turn = np.broadcast_to(np.eye(3)[..., None], (3, 3, count))
-        if rotations is not None:
-            turn = rotations.transpose(1, 2, 0)
-        velocity = rate = np.zeros((3, count))
+        positions, rotations = full_poses(self.base, station, times_ns)
+        place, turn = positions.T, rotations.transpose(1, 2, 0)
+        velocity = rate = np.zeros((3, len(times_ns)))
         if moving:
             velocity, rate = (part.T for part in velocities(self.base, station, times_ns))
         at = times_ns / 1e9 + self.start_s
