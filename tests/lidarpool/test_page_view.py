@@ -29,7 +29,6 @@ from lidarpool.live.point_selection import (
 from lidarpool.live.view import (
     ShownSurface,
     View,
-    as_bytes,
     colours_for,
     legend_of,
     open_result,
@@ -41,7 +40,7 @@ from lidarpool.plan import Plan
 from lidarpool.render.colouring import colours_of as colouring_of
 from lidarpool.run.picture_file import PICTURE_FILE, PictureContent, SensorWay
 from lidarpool.scene.actors import Actor, box
-from lidarpool.scene.colours import Colours
+from lidarpool.scene.colours import Colours, as_bytes
 
 POSES = 25
 NOWHERE = np.zeros((0, 3), np.float32)

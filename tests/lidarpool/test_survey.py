@@ -26,8 +26,7 @@ from lidarpool import (
     load_trajectory,
 )
 from lidarpool.base.fingerprint import fingerprint
-from lidarpool.sensor.trajectory import matrices, velocities
-from lidarpool.sensor.trajectory_files import quaternions_from_degrees
+from lidarpool.sensor.trajectory import matrices, quaternions_of, rotations_of, velocities
 
 RNG = np.random.default_rng(5)
 TIMES = np.cumsum(RNG.uniform(0.05, 0.4, 12)) + 1.4e9
@@ -125,12 +124,11 @@ def test_pieces_and_the_signs_of_quaternions_do_not_matter():
 def test_a_smooth_carrier_spins_and_turns_by_large_angles(degrees):
     angles = np.zeros((30, 3))
     angles[:, 0] = degrees * np.arange(30)
-    spin = Track(np.arange(30) * 0.1, PLACES[[0] * 30], quaternions_from_degrees(angles), True)
+    turns = quaternions_of(rotations_of(angles))
+    spin = Track(np.arange(30) * 0.1, PLACES[[0] * 30], turns, True)
     _, rates = spin.velocities(0, np.linspace(1e9, 2e9, 500))
     assert np.abs(rates[:, 2] / np.radians(10 * degrees) - 1).max() < 0.04
-    turn = Track(
-        [0, 1, 2, 3], PLACES[[0] * 4], quaternions_from_degrees(angles[[0, 0, 1, 1]]), True
-    )
+    turn = Track([0, 1, 2, 3], PLACES[[0] * 4], turns[[0, 0, 1, 1]], True)
     _, rates = turn.velocities(0, np.linspace(0, 3e9, 500))
     assert rates[:, 2].min() == 0
     assert np.isclose(rates[:, 2].mean() * 3, np.radians(degrees), rtol=0.01)

@@ -26,7 +26,7 @@ from lidarpool.scenario.scenario import Scenario
 from lidarpool.scene.colours import LINEAR, as_srgb
 from lidarpool.scene.files import scene_graph as nodes
 from lidarpool.scene.files import usd
-from lidarpool.scene.files.meshfile import load_meshes
+from lidarpool.scene.files.meshfile import load_meshes, load_objects
 from lidarpool.scene.scene_instances import SceneInstance
 from lidarpool.scene.transform import Transform
 
@@ -286,6 +286,200 @@ def test_skeletons_bend_their_meshes_but_in_instances(tmp_path):
     placed = prim("A", "", "", "references = @man.usda@\ninstanceable = true")
     objects, [line] = told(write(tmp_path / "m.usda", placed))
     assert bounds(objects)[:, 2].tolist() == [0, 0] and "in instances" in line
+
+
+STRIP = """
+    uniform token subdivisionScheme = "none"
+    int[] faceVertexCounts = [4, 4]
+    int[] faceVertexIndices = [0, 1, 3, 2, 2, 3, 5, 4]
+    point3f[] points = [(0, -1, 0), (0, 1, 0), (0, -1, 1), (0, 1, 1), (0, -1, 2), (0, 1, 2)]
+    rel skel:skeleton = </Man/Bones>
+    int[] primvars:skel:jointIndices = [0, 1, 0, 1, 0, 1, 0, 1, 0, 1, 0, 1] (
+        elementSize = 2
+        interpolation = "vertex")
+    float[] primvars:skel:jointWeights = [1, 0, 1, 0, 0.5, 0.5, 0.7, 0.3, 0, 1, 0, 1] (
+        elementSize = 2
+        interpolation = "vertex")
+    uniform token[] skel:blendShapes = ["fat"]
+    rel skel:blendShapeTargets = </Man/Skin/Fat>
+    def BlendShape "Fat"
+    {
+        uniform vector3f[] offsets = [(1, 0, 0), (1, 1, 0)]
+        uniform int[] pointIndices = [3, 5]
+    }
+"""
+BOUND = 'prepend apiSchemas = ["SkelBindingAPI"]'
+
+
+def clip(name, turn):
+    """An animation of two joints, the second of which turns, and of a blend shape."""
+    return prim(name, "SkelAnimation", f"""
+    uniform token[] joints = ["a", "a/b"]
+    float3[] translations.timeSamples = {{
+        1: [(0, 0, 0), (0, 0, 1)], 25: [(0, 0, 0), (0, 1, 1)]}}
+    quatf[] rotations.timeSamples = {{
+        1: [(1, 0, 0, 0), (1, 0, 0, 0)], 13: [(1, 0, 0, 0), {turn}],
+        25: [(0.8, 0, 0, 0.6), (1, 0, 0, 0)]}}
+    half3[] scales = [(1, 1, 1), (1, 1, 2)]
+    uniform token[] blendShapes = ["fat"]
+    float[] blendShapeWeights.timeSamples = {{1: [0], 20: [1]}}
+    """)  # fmt: skip
+
+
+def person(path, extra="", stage=METRES + "\ntimeCodesPerSecond = 24", bones="", skin=""):
+    still = "((1,0,0,0), (0,1,0,0), (0,0,1,0), (0,0,{},1))".format
+    rest = f"""uniform token[] joints = ["a", "a/b"]
+    uniform matrix4d[] bindTransforms = [{still(0)}, {still(1)}]
+    uniform matrix4d[] restTransforms = [{still(0)}, {still(1)}]
+    """
+    clips = clip("Walk", "(0.8, 0.6, 0, 0)") + clip("Run", "(0.6, 0, 0.8, 0)")
+    man = "rel skel:animationSource = </Man/Walk>\n" + prim("Bones", "Skeleton", rest + bones)
+    man += clips + prim("Skin", text=STRIP + skin, meta=BOUND)
+    return write(
+        path, prim("Man", "SkelRoot", man, BOUND), extra, stage=stage + '\ndefaultPrim = "Man"'
+    )
+
+
+def evaluated(path, code, animation=None):
+    """Points of the skin of a person in the world at a time code, by UsdSkel's own evaluation."""
+    from pxr import Usd, UsdGeom, UsdSkel
+
+    stage = Usd.Stage.Open(str(path))
+    root, bones, skin = (stage.GetPrimAtPath(f"/Man{at}") for at in ("", "/Bones", "/Skin"))
+    if animation:
+        source = UsdSkel.BindingAPI(root).GetAnimationSourceRel()
+        source.SetTargets([f"/Man/{animation}"])
+    cache = UsdSkel.Cache()
+    cache.Populate(UsdSkel.Root(root), Usd.PrimDefaultPredicate)
+    skeleton = cache.GetSkelQuery(UsdSkel.Skeleton(bones))
+    points = UsdGeom.Mesh(skin).GetPointsAttr().Get()
+    shapes = UsdSkel.BlendShapeQuery(UsdSkel.BindingAPI(skin))
+    weights = skeleton.GetAnimQuery().ComputeBlendShapeWeights(code)
+    given = shapes.ComputeSubShapeWeights(weights)
+    shapes.ComputeDeformedPoints(*given, shapes.ComputeBlendShapePointIndices(),
+                                 shapes.ComputeSubShapePointOffsets(), points)  # fmt: skip
+    query = cache.GetSkinningQuery(skin)
+    query.ComputeSkinnedPoints(skeleton.ComputeSkinningTransforms(code), points, code)
+    place = UsdGeom.Imageable(bones).ComputeLocalToWorldTransform(code)
+    return np.array([place.Transform(point) for point in map(tuple, points)])
+
+
+def played(path, name, code, first=1, rate_hz=24):
+    """Vertices of the first object at a time code of an animation."""
+    own = load_objects(path, animation=name).standing[0].animation
+    return own.at(np.atleast_1d((code - first) / rate_hz / own.step_s))[0]
+
+
+@pytest.mark.parametrize("name", ["", "Walk", "Run"])
+def test_actors_play_animations_as_usdskel_evaluates_them(tmp_path, name):
+    """At poses, and at random times between, where they move straight within 2 mm."""
+    turns = sampled("rotateZ", t1=0, t40=90) + order("rotateZ")
+    moves = sampled("translate", t1="(1, 0, 0)", t30="(0, 2, 0)") + order("translate")
+    path = person(tmp_path / "m.usda", bones=moves, skin=turns)
+    own = load_objects(path, animation=name).standing[0].animation
+    assert own.vertices.shape == (99, 6, 3) and own.duration_s == pytest.approx(39 / 24)
+    for frame in (0, 1, 47, 98):
+        expected = evaluated(path, 1 + 39 * frame / 98, name)
+        np.testing.assert_allclose(own.vertices[frame], expected, atol=2e-6)
+    assert np.ptp(own.vertices, axis=0).max() > 1
+    codes = np.random.default_rng(3).uniform(1, 40, 12)
+    found = played(path, name, codes)
+    for code, points in zip(codes, found, strict=True):
+        np.testing.assert_allclose(points, evaluated(path, code, name), atol=2e-3)
+
+
+def test_what_stands_is_bent_at_the_first_time_also_between_samples(tmp_path):
+    path = person(tmp_path / "m.usda", stage=METRES + "\nstartTimeCode = 7.3\nendTimeCode = 19")
+    objects, lines = told(path)
+    np.testing.assert_allclose(objects[0].vertices, evaluated(path, 7.3), atol=1e-6)
+    assert lines == [
+        "m.usda has skeletons that move: they stand still; actors move by animation: NAME"
+    ]
+    text = path.read_text()
+    (tmp_path / "blocked.usda").write_text(text.replace("13: [", "6: None, 13: ["))
+    blocked, _ = told(tmp_path / "blocked.usda")
+    assert not np.allclose(blocked[0].vertices, objects[0].vertices)
+    own = load_objects(path, animation="").standing[0].animation
+    assert own.duration_s == pytest.approx(11.7 / 24)
+    np.testing.assert_allclose(own.vertices[-1], evaluated(path, 19), atol=2e-6)
+
+
+def test_instances_prims_and_points_that_move_are_in_animations(tmp_path):
+    person(tmp_path / "man.usda")
+    meta = "references = @./man.usda@\ninstanceable = true"
+    text = QUAD.replace(
+        "points = [(0, 0, 0), (2, 0, 0), (2, 3, 0), (0, 3, 0)]",
+        "points.timeSamples = {1: [(0, 0, 0), (1, 0, 0), (1, 1, 0), (0, 1, 0)],"
+        "25: [(0, 0, 0), (1, 0, 0), (1, 1, 4), (0, 1, 2)]}",
+    )
+    wheel = prim("Wheel", text=QUAD + sampled("rotateZ", t1=0, t25=360) + order("rotateZ"))
+    men = [prim(f"M{x}", "", MOVED.format((x, 0, 0)), meta) for x in (0, 5)]
+    stage = METRES + "\ntimeCodesPerSecond = 24"
+    path = write(tmp_path / "m.usda", prim("Flag", text=text), wheel, *men, stage=stage)
+    found = load_objects(path, animation="Walk")
+    assert not found.moving
+    flag, wheel, *both = (one.animation.vertices for one in found.standing)
+    np.testing.assert_allclose(flag[45], [(0, 0, 0), (1, 0, 0), (1, 1, 3), (0, 1, 1.5)])
+    np.testing.assert_allclose(wheel[15, 1], [0, 2, 0], atol=1e-9)
+    for x, one in zip((0, 5), both, strict=True):
+        want = evaluated(tmp_path / "man.usda", 1 + 24 * 0.4) + np.array([x, 0, 0])
+        np.testing.assert_allclose(one[24], want, atol=2e-6)
+    # Without skeletons it has no name.
+    path = write(tmp_path / "flag.usda", prim("Flag", text=text), stage=stage)
+    assert load_objects(path, animation="").standing[0].animation.vertices.shape == (61, 4, 3)
+
+
+@pytest.mark.parametrize(
+    ("stage", "text", "name", "message"),
+    [
+        ("", None, "Wlak", r"m.usda has no animation 'Wlak' \(Did you mean 'Walk'\?\)\.$"),
+        ("", None, "Fly", r"has no animation 'Fly' \(there are Walk, Run\)\.$"),
+        ("startTimeCode = 3\nendTimeCode = 3", None, "", "an animation without a duration"),
+        ("startTimeCode = 3\nendTimeCode = 3e9", None, "", "Unable to allocate|would unpack to"),
+        ("timeCodesPerSecond = 0", None, "", "has no animations: export it with them, or leave"),
+        ("", QUAD, "", "has no animations: export it with them, or leave out animation"),
+        ("", QUAD + 'token visibility.timeSamples = {0: "inherited", 24: "invisible"}', "",
+         "m.usda has other vertices in pose 60: leave out animation"),
+    ],
+)  # fmt: skip
+def test_unusable_animations_are_refused_in_a_line(tmp_path, stage, text, name, message):
+    path, stage = tmp_path / "m.usda", f"{METRES}\n{stage}"
+    if text is None:
+        person(path, stage=stage)
+    else:
+        write(path, prim("A", text=QUAD), prim("B", text=text), stage=stage)
+    with pytest.raises(LidarpoolError, match=message) as refused:
+        load_objects(path, animation=name)
+    assert "\n" not in str(refused.value)
+
+
+def test_a_person_of_a_scenario_moves(tmp_path):
+    """Each point is on the surface that UsdSkel gives at its time."""
+    path = person(tmp_path / "man.usda")
+    man = {"name": "Man", "file": "man.usda", "at": [4, 0, 0], "animation": "Walk"}
+    data = {"scene": {"ground": {"margin_m": 30}}, "poses": [[0, 0, 1]], "steps": 36,
+            "sensor": {"model": "velodyne/vlp16"}, "actors": [man]}  # fmt: skip
+    scene = build(Scenario.from_data(data, folder=tmp_path)).scene
+    scanner = Scanner(scene, Sensor.grid(720, 60), columns=["object", "time"])
+    middles = []
+    for start in (0.1, 0.5):
+        found = scanner.sweep((0, 0, 1), start_s=start)
+        own = np.flatnonzero(found["object"] == len(scene.names))
+        assert len(own) > 50
+        for row in own[::20]:
+            points = evaluated(path, 1 + 24 * found["time"][row] / 1e9) + np.array([4, 0, 0])
+            assert distance(found.positions[row], points[scene.actors[0].mesh.faces]) < 0.02
+        middles.append(found.positions[own].mean(axis=0))
+    assert np.linalg.norm(middles[1] - middles[0]) > 0.1
+
+
+def distance(point, triangles):
+    """How far a point is off the nearest triangle, along its sides or normal."""
+    a, b, c = np.moveaxis(triangles - point, 1, 0)
+    normals = np.cross(b - a, c - a)
+    normals /= np.linalg.norm(normals, axis=1)[:, None]
+    u, v, off = np.linalg.solve(np.stack([b - a, c - a, normals], axis=2), -a[..., None]).T[0]
+    return np.max([-u, -v, u + v - 1, np.abs(off)], axis=0).min()
 
 
 def copied(count, extra=""):

@@ -51,9 +51,7 @@ _shown = shared.together(
         help="With --live: end the page with the run.",
     ),
     click.option(
-        "--only",
-        type=click.Choice(["cloud"]),
-        help="Write the cloud and report.json, no page.",
+        "--only", type=click.Choice(["cloud"]), help="Write the cloud and report.json, no page."
     ),
     shared.flag("--overwrite", help="Replace the result of another survey, or a data set."),
     shared.flag("--quiet", "-q", help="No progress, only the result."),

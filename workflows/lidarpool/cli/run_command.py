@@ -19,13 +19,7 @@ from ..datasets.dataset import DataSet
 from ..datasets.job_table import Tally, read_table
 from ..export.folder import local_result, output_place, result_folder
 from ..live import page_of
-from ..report.campaign_output import (
-    CAMPAIGN_FILE,
-    DataSetOutput,
-    check_same,
-    failures,
-    verify,
-)
+from ..report.campaign_output import CAMPAIGN_FILE, DataSetOutput, check_same, failures, verify
 from ..report.output import CLOUD, SurveyOutput
 from ..report.report import summary
 from ..run.conductor import Conductor, Kept

@@ -23,10 +23,7 @@ class TorchSweeps(torch.utils.data.IterableDataset):
     """Items made of sweeps, divided between ranks, then between the workers of each."""
 
     def __init__(
-        self,
-        sweeps: SavedSweeps,
-        transform: Callable[[Sweep], Any] | None,
-        even: bool,
+        self, sweeps: SavedSweeps, transform: Callable[[Sweep], Any] | None, even: bool
     ) -> None:
         self.sweeps, self.transform, self.even = sweeps, transform or tensors, even
         self._rank: tuple[int, int] | None = None

@@ -45,20 +45,17 @@ def result_folder(place: Path | Storage) -> Iterator[Path]:
     if folder.exists() and not folder.is_dir():
         raise LidarpoolError(f"{folder} is a file: give a folder with --out.")
     made = [path for path in (folder, *folder.parents) if not path.exists()]  # innermost first
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryFile(dir=folder):
-            lock = _lock(folder)
-        Storage.at(folder).tidy(deep=False)
-    except BlockingIOError as error:
-        raise LidarpoolError(
-            f"Another run or export is using the folder {folder}: wait for it, or give another "
-            "with --out."
-        ) from error
-    except OSError as error:
-        raise LidarpoolError(
-            f"Cannot write to the folder {folder} ({error.strerror}): give another with --out."
-        ) from error
+    with explained(f"Cannot write to the folder {folder}", "give another with --out"):
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            with tempfile.TemporaryFile(dir=folder):
+                lock = _lock(folder)
+            Storage.at(folder).tidy(deep=False)
+        except BlockingIOError as error:
+            raise LidarpoolError(
+                f"Another run or export is using the folder {folder}: wait for it, or give another "
+                "with --out."
+            ) from error
     try:
         yield folder
     finally:

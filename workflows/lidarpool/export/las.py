@@ -19,7 +19,6 @@ import lazrs
 import numpy as np
 from laspy.vlrs.known import WaveformPacketStruct, WaveformPacketVlr, WktCoordinateSystemVlr
 
-from ..base.arrays import AnyArray, Bytes
 from ..base.errors import LidarpoolError
 from ..base.interrupts import deferred_interrupts
 from ..columns.cloud import Cloud, CloudLike
@@ -192,8 +191,8 @@ def _points(chunk: Cloud, header: laspy.LasHeader, extra: list[str], begins_s: f
     record.x, record.y, record.z = chunk.positions.T.astype(np.float64)
     there = chunk.columns
     one = np.ones(len(chunk), np.uint8)
-    record.return_number = _at_most(there.get("return_number", one), 15)
-    record.number_of_returns = _at_most(there.get("returns", one), 15)
+    record.return_number = np.minimum(there.get("return_number", one), 15)
+    record.number_of_returns = np.minimum(there.get("returns", one), 15)
     if "time" in there:
         record.gps_time = there["time"] / 1e9 + begins_s
     if "intensity" in there:
@@ -217,10 +216,6 @@ def _points(chunk: Cloud, header: laspy.LasHeader, extra: list[str], begins_s: f
 def _name(name: str) -> str:
     """Name of a column in the extra bytes, where one of a field of the format is taken."""
     return "energy" if name == "intensity" else name[:32]
-
-
-def _at_most(values: AnyArray, most: int) -> Bytes:
-    return np.minimum(values, most).astype(np.uint8)
 
 
 def wkt(epsg: int) -> str:

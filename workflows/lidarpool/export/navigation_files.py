@@ -163,7 +163,6 @@ def _to_geodetic(survey: Survey) -> Callable[[Floats], Floats] | None:
 
 
 def _instrument(mount: Pose, variances: list[float]) -> Instrument:
-    turn = np.eye(3) if mount.rotation is None else mount.rotation
-    quaternion = quaternions_of(turn[None])[0]
+    quaternion = quaternions_of(mount.turn[None])[0]
     quaternion *= -1 if quaternion[3] < 0 else 1
     return Instrument([*mount.position], quaternion.tolist(), variances)

@@ -126,7 +126,7 @@ def _messages(cloud: CloudLike, sweeps: Sweeps, layout: str, types: Any) -> Iter
     ]
     make = _Messages(types)
     frames = _frames(sweeps)
-    actors = frames[len(sweeps.sensors) :]
+    actors = frames[len(sweeps.sensors) : -len(_INSTRUMENTS)]
     poses = map(Placed, sweeps.actor_poses.positions, sweeps.actor_poses.quaternions)
     moving = [(CARRIER, sweeps.carrier), *zip(actors, poses, strict=True)]
     start_ns = _start_ns(sweeps)
@@ -184,7 +184,7 @@ def _instruments(sweeps: Sweeps) -> list[tuple[str, str, Placed, int]]:
     there = sweeps.instruments
     if there is None or there.folder is None:
         return []
-    found = zip(_instrument_frames(sweeps), (there.imu, there.gnss), strict=True)
+    found = zip(_frames(sweeps)[-2:], (there.imu, there.gnss), strict=True)
     return [
         (CARRIER, frame, Placed(np.array([one.position]), np.array([one.quaternion])), 0)
         for frame, one in found
@@ -266,14 +266,9 @@ def _types() -> Typestore:
 
 
 def _frames(sweeps: Sweeps) -> list[str]:
-    """Frames of the sensors, then of the actors."""
+    """Frames of the sensors, then of the actors, the IMU and the GNSS receiver."""
     named = (*(name or "lidar" for name in sweeps.sensors), *sweeps.actors)
-    return plain_names((WORLD, CARRIER, *named, *_INSTRUMENTS))[2 : -len(_INSTRUMENTS)]
-
-
-def _instrument_frames(sweeps: Sweeps) -> list[str]:
-    """Frames of the IMU and the GNSS receiver."""
-    return plain_names((WORLD, CARRIER, *_frames(sweeps), *_INSTRUMENTS))[-len(_INSTRUMENTS) :]
+    return plain_names((WORLD, CARRIER, *named, *_INSTRUMENTS))[2:]
 
 
 def _topic(sweeps: Sweeps, frames: list[str], sweep: int) -> str:
@@ -377,7 +372,7 @@ class _Messages:
         there = sweeps.instruments
         if there is None:
             return iter(())
-        imu, gnss = _instrument_frames(sweeps)
+        *_, imu, gnss = _frames(sweeps)
         both = self._imu(there, imu, start_ns), self._gnss(there, gnss, start_ns)
         return merge(*both, key=lambda one: one[2])
 

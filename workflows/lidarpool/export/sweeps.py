@@ -18,11 +18,12 @@ from ..base.arrays import AnyFloats, Bools, Bytes, Floats, Ints
 from ..base.errors import LidarpoolError
 from ..columns.cloud import Cloud, CloudLike
 from ..scene.scene import Scene
+from ..scene.transform import affine
 from ..sensor import Fault, Sensor, Survey
 from ..sensor.faults import sent
 from ..sensor.plain_data import described, remade
 from ..sensor.survey import nanoseconds
-from ..sensor.trajectory import matrices, presence_ns, quaternions_of
+from ..sensor.trajectory import full_poses, matrices, presence_ns, quaternions_of
 from .navigation_files import Instruments
 
 SWEEPS_FILE = "sweeps.npz"
@@ -58,10 +59,7 @@ class Placed:
 
     def matrix(self, sweep: int) -> Floats:
         """Matrix (4, 4) from its own axes at the start of a sweep to the world's."""
-        pose = np.eye(4)
-        pose[:3, :3] = self.turns[sweep]
-        pose[:3, 3] = self.positions[sweep]
-        return pose
+        return affine(self.turns[sweep], self.positions[sweep])
 
     def inward(self, sweep: int, points: Floats) -> Floats:
         """Convert points (k, 3) of the world to its axes at the start of a sweep."""
@@ -157,11 +155,10 @@ class Sweeps:
         for number, carried in enumerate(survey.carried):
             (firsts, begins, _), mount = each[number], carried.mount
             since = begins[: len(begins) // path.stations]
-            turned = np.eye(3) if mount.rotation is None else mount.rotation
+            turned = mount.turn
             mounts.append((mount.position, turned))
             for station in range(path.stations):
-                positions, found = path.poses(station, since)
-                rotations = _full(found, len(since))
+                positions, rotations = full_poses(path, station, since)
                 places.append(positions + rotations @ np.array(mount.position))
                 turns.append(rotations @ turned)
             sensors.append(np.full(len(since) * path.stations, number, np.uint8))
@@ -171,8 +168,8 @@ class Sweeps:
         when, end = (np.concatenate([one[k] for one in each]) for k in (1, 2))
         actor_poses, there = [], []
         for actor in scene.actors:
-            at, turned_by = actor.trajectory.poses(0, np.append(when, end))
-            actor_poses.append(_placed(at + scene.origin, _full(turned_by, len(at))))
+            at, turned_by = full_poses(actor.trajectory, 0, np.append(when, end))
+            actor_poses.append(_placed(at + scene.origin, turned_by))
             appears, leaves = presence_ns(actor.trajectory)
             there.append((appears <= when) & (when <= leaves))
         deform = any(actor.mesh.animation for actor in scene.actors)
@@ -337,10 +334,6 @@ def plain_names(names: Iterable[str]) -> list[str]:
             plain = f"{allowed}_{number}"
         out.append(plain)
     return out
-
-
-def _full(rotations: Floats | None, count: int) -> Floats:
-    return np.broadcast_to(np.eye(3), (count, 3, 3)) if rotations is None else rotations
 
 
 def _placed(positions: Floats, rotations: Floats) -> Placed:

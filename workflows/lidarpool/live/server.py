@@ -165,11 +165,7 @@ class PageServer:
 
 @contextmanager
 def page_server(
-    source: Source,
-    port: int = PORT,
-    stop: Callable[[], None] | None = None,
-    *,
-    index: str = VIEWER,
+    source: Source, port: int = PORT, stop: Callable[[], None] | None = None, *, index: str = VIEWER
 ) -> Iterator[PageServer]:
     """Serve a page while the body runs, in a thread of its own, on a port or the next free one.
 

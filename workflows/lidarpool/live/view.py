@@ -47,6 +47,7 @@ from ..render.theme import mapped, object_colours
 from ..run.picture_file import PICTURE_FILE, PLACES_MOST, PictureContent, SensorWay, ways_of
 from ..run.store import RUN_FOLDER
 from ..scene.actors import Actor, samples_each, shapes_of
+from ..scene.colours import as_bytes
 from ..scene.scene import Scene
 from ..scene.simplified import simplified
 from ..sensor.trajectory import presence_ns
@@ -326,9 +327,12 @@ class View:
             return {"name": name}, {"file": np.fromfile(made, np.uint8)}
 
     def _wanted(self, asked: Arguments) -> tuple[Filter, ScanRanges | None]:
-        """Read the filter and the ranges of scans of a question."""
+        """Read the filter and the ranges of scans, ``first-last,first-last``, of a question."""
         wanted = Filter.read(asked.get("filter", ""), list(self.columns))
-        return wanted, _scans(asked["scans"]) if "scans" in asked else None
+        if "scans" not in asked:
+            return wanted, None
+        pairs = (entry.split("-") for entry in asked["scans"].split(",") if entry)
+        return wanted, tuple((int(first), int(last)) for first, last in pairs)
 
     def _points(self, asked: Arguments, abandoned: Callable[[], bool]) -> Answer:
         """Points for a filter, ranges of scans and a camera, and their colours."""
@@ -509,12 +513,6 @@ def _of_points(points: Points) -> tuple[Floats, Floats]:
     return origin, box - origin
 
 
-def _scans(text: str) -> ScanRanges:
-    """Read ranges of scans, ``first-last,first-last``."""
-    pairs = (entry.split("-") for entry in text.split(",") if entry)
-    return tuple((int(first), int(last)) for first, last in pairs)
-
-
 class ShownSurface:
     """A scene's triangles, or a simplified mesh of at most so many, in the chosen colours.
 
@@ -524,10 +522,7 @@ class ShownSurface:
     """
 
     def __init__(
-        self,
-        scene: Scene,
-        reflectance: Floats | None = None,
-        most: int = MOST_TRIANGLES,
+        self, scene: Scene, reflectance: Floats | None = None, most: int = MOST_TRIANGLES
     ) -> None:
         self.coarse, self._reflectance = scene, reflectance
         # (f,): which triangle stands for each of the scene; -1 where nothing is left.
@@ -604,11 +599,6 @@ def legend_of(colouring: Colouring) -> Legend:
 def scale_legend(title: str, marks: Sequence[str], colours: Floats = TURBO[::15]) -> Legend:
     """Legend of a scale of colours (n, 3), with evenly spread marks."""
     return {"title": title, "marks": list(marks), "colours": as_bytes(colours).tolist()}
-
-
-def as_bytes(colours: Floats) -> Bytes:
-    """Colours of 0 to 1 as bytes."""
-    return np.round(255 * colours).astype(np.uint8)
 
 
 @contextmanager

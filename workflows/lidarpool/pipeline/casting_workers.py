@@ -13,13 +13,7 @@ from typing import Any
 import cloudpickle
 from distributed import Future
 
-from poolpart import (
-    Partition,
-    TaskLocations,
-    fetch_available,
-    look_for_tasks,
-    worker_identities,
-)
+from poolpart import Partition, TaskLocations, fetch_available, look_for_tasks, worker_identities
 
 from ..base.errors import LidarpoolError
 from ..base.software import difference, software_there

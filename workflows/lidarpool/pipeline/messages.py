@@ -128,12 +128,7 @@ class Receipt(Scans):
 
     @classmethod
     def of_part(
-        cls,
-        part: PartColumns,
-        job: int,
-        name: str,
-        size: int,
-        record: TaskRecord | None = None,
+        cls, part: PartColumns, job: int, name: str, size: int, record: TaskRecord | None = None
     ) -> Receipt:
         """Make the receipt of a part, from what the part itself says."""
         summaries = np.zeros(len(part.counts), summary_type(part.samples.shape[1]))

@@ -51,10 +51,7 @@ FETCH_PATIENCE_S = 2.0  # longest wait for a sign of life of a batch's worker
 
 
 def _work(
-    me: StageStart,
-    inlet: Pipe,
-    do: Callable[[Iterator[Any]], Iterable[int]],
-    linger_s: float = 0.0,
+    me: StageStart, inlet: Pipe, do: Callable[[Iterator[Any]], Iterable[int]], linger_s: float = 0.0
 ) -> TaskRecord:
     """Do what the driver sends until a pipe is closed; `do` yields how many scans are done.
 

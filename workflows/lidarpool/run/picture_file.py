@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import json
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
@@ -11,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from ..base.archives import open_archive
+from ..base.archives import open_archive, packed
 from ..base.arrays import AnyArray, Floats, Floats32
 from ..base.words import plural
 from ..columns.table import CAUSES, TABLE, Column, by_value
@@ -198,10 +197,7 @@ class PictureContent:
                 "waypoints": np.array(self.trials),
             }
             arrays |= {name: getattr(self.plan, name) for name in _PLAN_NUMBERS}
-        # On a full disk, an archive that is written directly would leave an open handle.
-        memory = io.BytesIO()
-        np.savez_compressed(memory, **arrays)
-        path.write_bytes(memory.getbuffer())
+        path.write_bytes(packed(arrays))
 
     @classmethod
     def load(cls, path: Path) -> PictureContent:

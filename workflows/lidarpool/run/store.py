@@ -251,8 +251,7 @@ class RunStore:
     @property
     def casting(self) -> dict[str, str]:
         """Software of the workers that cast the scans, see `software`; empty until known."""
-        found: dict[str, str] = json.loads(self.db.meta.get("casting", "{}"))
-        return found
+        return dict(json.loads(self.db.meta.get("casting", "{}")))
 
     def cast_with(self, backend: str, casting: Mapping[str, str]) -> None:
         """Keep with which backend and software all scans are cast."""
@@ -292,8 +291,7 @@ class RunStore:
     @property
     def sensors(self) -> dict[str, str]:
         """Sensors of the jobs that are done, {name: models and rates}."""
-        found: dict[str, str] = json.loads(self.db.meta.get("sensors", "{}"))
-        return found
+        return dict(json.loads(self.db.meta.get("sensors", "{}")))
 
     # -- jobs --------------------------------------------------------------------------------
 

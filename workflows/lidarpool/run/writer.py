@@ -259,10 +259,6 @@ def _fetched(key: str) -> RangeWriter:
 def _write_range(key: str, span: PieceRange) -> tuple[Range | None, TaskRecord]:
     """Write a range on a worker."""
     recorder = Recorder(EXPORT, LIDAR)
-    try:
+    with explained(f"the worker {recorder.done().worker} cannot write there"):
         made = _fetched(key)(span)
-    except OSError as error:
-        raise LidarpoolError(
-            f"the worker {recorder.done().worker} cannot write there: {error.strerror or error}."
-        ) from None
     return made, recorder.done(span[1] - span[0])

@@ -27,7 +27,7 @@ from ..sensor import Mounted, Pose, Track, load_trajectory
 from ..sensor.calibrations import said
 from ..sensor.survey import StepCount
 from ..sensor.trajectory import CLOCK_S, Beyond, InstrumentPose, quaternions_of, rotations_of
-from ..sensor.trajectory_files import Duration, Seconds, TrajectoryFormat, quaternions_from_degrees
+from ..sensor.trajectory_files import Duration, Seconds, TrajectoryFormat
 from .ground import Standing, following
 from .sections import (
     DeformingSection,
@@ -71,8 +71,7 @@ class CarriedSection(SensorSection):
         float, about("start, in seconds after that of the survey or station", ge=0, le=1e9)
     ] = 0.0
     steps: Annotated[
-        StepCount | None,
-        about("its time steps (scans), instead of the survey's", 120),
+        StepCount | None, about("its time steps (scans), instead of the survey's", 120)
     ] = None
 
     def mounted(self, *given: Any) -> Mounted:
@@ -113,8 +112,7 @@ class TrajectorySection(Section):
         about("whether poses have camera axes (z ahead); by default those of KITTI have"),
     ] = None
     points: Annotated[
-        Several[TimedPose],
-        about("instead of a file: time_s, position and angles, world metres"),
+        Several[TimedPose], about("instead of a file: time_s, position and angles, world metres")
     ] = ()
     interpolation: Annotated[
         Literal["linear", "smooth"], about("of positions and rotations; IMUs need smooth")
@@ -188,7 +186,7 @@ class TrajectorySection(Section):
         return Track(
             np.array([p.time_s + self.offset_s for p in self.points]),
             np.array([p.position for p in self.points]) - origin,
-            quaternions_from_degrees(np.array(angles)) if turned else None,
+            quaternions_of(rotations_of(np.array(angles))) if turned else None,
             **own,
         )
 
@@ -290,8 +288,7 @@ class TrafficSection(Section):
 
     file: Annotated[Text, about("what sumo --fcd-output writes, .xml or .xml.gz")]
     vehicles: Annotated[
-        Several[VehicleSection],
-        about("shapes of vehicles and persons, by type", min_length=1),
+        Several[VehicleSection], about("shapes of vehicles and persons, by type", min_length=1)
     ]
     offset_s: Annotated[Seconds, about("added to all times")] = 0.0
     translation: Annotated[Triple, about("added to all positions, metres")] = (0, 0, 0)

@@ -102,8 +102,7 @@ def place(
 
 def _narrowed(scene: Scene, looker: Surroundings, poses: Sequence[Pose]) -> dict[str, Any]:
     """Return what `Sensor.grid` takes to see an object from poses, with about `_POINTS` points."""
-    turns = [np.eye(3) if pose.rotation is None else pose.rotation for pose in poses]
-    placed = [*zip(_local(poses, scene), turns, strict=True)]
+    placed = [*zip(_local(poses, scene), [pose.turn for pose in poses], strict=True)]
     sides = np.zeros(2)  # the widest angles to either side, and up or down
     for at, turn in placed:
         x, y, z = ((scene.vertices - at) @ turn).T
@@ -232,11 +231,10 @@ def poses_around(scene: Scene, carried: Mounted) -> tuple[Pose, ...]:
 
 def _field_deg(carried: Mounted) -> tuple[float, float]:
     """Lowest and highest elevation of the rays that go forward, in the carrier's axes."""
-    sensor, turn = carried.sensor, carried.mount.rotation
+    sensor = carried.sensor
     count = min(sensor.period or _LOOKED_AT, _LOOKED_AT)
     firings = np.linspace(0, sensor.period or count, count, endpoint=False).astype(np.int64)
-    rays: Floats = sensor.directions(firings).reshape(-1, 3)
-    rays = rays if turn is None else rays @ turn.T
+    rays: Floats = sensor.directions(firings).reshape(-1, 3) @ carried.mount.turn.T
     facing = np.abs(np.degrees(np.arctan2(rays[:, 1], rays[:, 0]))) <= _FACING_DEG
     if not facing.any():
         return -90.0, -90.0  # an airborne scanner, which looks down

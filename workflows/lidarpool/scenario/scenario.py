@@ -22,13 +22,7 @@ from ..sensor.materials import ClassNames
 from ..sensor.survey import SENSORS_MOST, CloudOptions, StepCount
 from ..sensor.trajectory import CENTRE
 from ..sensor.weather import Weather
-from .actor_motion import (
-    ActorSection,
-    CarriedEntry,
-    MountEntry,
-    TrafficSection,
-    TrajectoryEntry,
-)
+from .actor_motion import ActorSection, CarriedEntry, MountEntry, TrafficSection, TrajectoryEntry
 from .sections import (
     CopiesSection,
     NoiseSection,

@@ -9,14 +9,7 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import (
-    AfterValidator,
-    BaseModel,
-    BeforeValidator,
-    ConfigDict,
-    Field,
-    model_validator,
-)
+from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, model_validator
 
 from ..base.declared import (
     AngleDeg,
@@ -200,8 +193,7 @@ class Scatter(Section):
         about("names of the objects to stand on, with * and ?; by default all", min_length=1),
     ] = ("*",)
     within: Annotated[
-        Rectangle | None,
-        about("a rectangle, lowest and highest x and y: [x0, y0, x1, y1]"),
+        Rectangle | None, about("a rectangle, lowest and highest x and y: [x0, y0, x1, y1]")
     ] = None
     spacing_m: Annotated[
         float, about("least distance between two, seen from above, metres", ge=0, le=1e6)
@@ -232,7 +224,7 @@ class ShapeSection(Section):
 
 
 class AnimationSection(Section):
-    """An animation of an actor's .glb or .gltf; in YAML also just its name."""
+    """An animation of an actor's .glb, .gltf or .usd; in YAML also just its name."""
 
     name: Annotated[Text | None, about("its name in the file; by default the first", "Walk")] = None
     speed_m_s: Annotated[
@@ -531,8 +523,7 @@ class _Route:
     """Fields of a planning that a scenario has in other words than `Planning`; they come first."""
 
     enabled: Annotated[
-        bool | None,
-        about("by default true if start and target are given", True),
+        bool | None, about("by default true if start and target are given", True)
     ] = None
     start: Annotated[
         Pair | None, about("x and y, metres; the default objects have one", [25, 25])

@@ -21,7 +21,7 @@ from ..scene.scene import Scene
 from ..scene.scene_instances import SceneInstance
 from ..scene.scene_mesh import SceneMesh
 from ..scene.shapes import seed_objects
-from ..scene.transform import Transform
+from ..scene.transform import Transform, affine
 from ..scene.wheels import rolling
 from ..sensor.calibrations import said, text_of
 from ..sensor.trajectory import rotations_of
@@ -283,9 +283,7 @@ def copies_of(
                 f"a scale of {scales.flat[np.abs(scales).argmin()]:g} would flatten the mesh: give "
                 f"at least {SCALE_LEAST:g}."
             )
-    matrices = np.tile(np.eye(4), (len(places), 1, 1))
-    matrices[:, :3, :3] = rotations_of(angles) * scales[:, None]
-    matrices[:, :3, 3] = places
+    matrices = affine(rotations_of(angles) * scales[:, None], places)
     return SceneInstance.several(mesh, matrices, entry.name)
 
 

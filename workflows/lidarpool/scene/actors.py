@@ -14,7 +14,7 @@ from ..base.errors import LidarpoolError
 from ..base.validation import checked_fields
 from ..base.vectors import length, products, turned
 from ..sensor import Stations, Track, Trajectory
-from ..sensor.trajectory import CENTRE, presence_ns, quaternions_of
+from ..sensor.trajectory import CENTRE, full_poses, presence_ns, quaternions_of
 from .colours import joined
 from .scene_instances import SceneInstance, parts_of
 from .scene_mesh import SceneMesh, stacked
@@ -135,9 +135,8 @@ class Actor:
         appears, leaves = presence_ns(self.trajectory)
         first = max(appears, 0.0)
         times = np.linspace(first, max(min(leaves, duration_ns), first + 1e6), count)
-        positions, rotations = self.trajectory.poses(0, times)
-        turns = np.eye(3)[None].repeat(count, axis=0) if rotations is None else rotations
-        return times, positions, quaternions_of(turns)
+        positions, rotations = full_poses(self.trajectory, 0, times)
+        return times, positions, quaternions_of(rotations)
 
     def check(self, begin_ns: float, end_ns: float) -> None:
         """Check that its trajectory covers a time; LidarpoolError if not."""

@@ -22,7 +22,7 @@ from .files.meshfile import GENERATOR
 from .scene import Scene
 from .scene_instances import SceneInstance
 from .scene_mesh import SceneMesh
-from .transform import UP_AXES
+from .transform import UP_AXES, affine
 
 _MOST_BYTES = 2**32 - 1
 _NEAREST = 9728
@@ -86,8 +86,7 @@ class _Writer:
             self._meshes[key] = self._put("meshes", {"name": name, "primitives": primitives})
         node: dict[str, Any] = {"name": name, "mesh": self._meshes[key]}
         if isinstance(parts[0], SceneInstance):
-            turn = np.eye(4)
-            turn[:3, :3] = UP_AXES["y"].T
+            turn = affine(UP_AXES["y"].T, np.zeros(3))
             node["matrix"] = matmul(matmul(turn, parts[0].matrix), turn.T).T.ravel().tolist()
         elif far:
             node["translation"] = applied(UP_AXES["y"].T, self._origin).tolist()
@@ -129,11 +128,7 @@ class _Writer:
         return out
 
     def _corners(
-        self,
-        mesh: SceneMesh,
-        rows: Indices,
-        uv: AnyArray | None,
-        tints: Bytes | None,
+        self, mesh: SceneMesh, rows: Indices, uv: AnyArray | None, tints: Bytes | None
     ) -> dict[str, int]:
         """Attributes of some triangles (k,), whose corners have their own (k, 3, …)."""
         corners = turned(mesh.vertices[mesh.faces[rows]].reshape(-1, 3), UP_AXES["y"].T)

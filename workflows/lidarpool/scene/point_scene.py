@@ -18,7 +18,7 @@ import numpy as np
 
 from ..base.allowance import bytes_of, check_fits, memory
 from ..base.arrays import Floats
-from ..base.errors import LidarpoolError, prefixed
+from ..base.errors import LidarpoolError, explained, prefixed
 from ..base.open3d_module import load_open3d
 from ..base.validation import checked
 from ..base.words import printable
@@ -137,13 +137,11 @@ def _read(path: Path) -> Floats:
             f"{' '.join(SUFFIXES)}."
         )
     try:
-        with prefixed(path):
+        with explained(f"{path} cannot be read"), prefixed(path):
             check_fits(path)
             points = _READERS[suffix](path)
     except LidarpoolError:
         raise
-    except OSError as error:
-        raise LidarpoolError(f"{path} cannot be read: {error.strerror or error}.") from error
     except Exception as error:  # readers raise whatever they stumble over
         reason = printable(str(error))[:200] or type(error).__name__
         raise LidarpoolError(f"{path} is broken or cut short ({reason}).") from error

@@ -19,8 +19,8 @@ from ..base.validation import as_array, checked
 from ..base.vectors import applied, matmul
 from ..base.words import did_you_mean, plural, printable
 from ..sensor import Pose, Stations, Trajectory
-from ..sensor.calibrations import text_of
-from ..sensor.trajectory import presence_ns, velocities
+from ..sensor.calibrations import said, text_of
+from ..sensor.trajectory import full_poses, presence_ns, velocities
 from ..sensor.trajectory_files import columns_of_table, head_of_table
 from .actors import AT_ZERO, Actor, one_mesh
 from .scene_mesh import SceneMesh
@@ -285,7 +285,7 @@ class Robot:
             names = head_of_table(text.splitlines())[2]
         except (OSError, ValueError, LidarpoolError) as error:
             raise LidarpoolError(
-                f"{path} is not a usable table of joints: {str(error).rstrip('.')}."
+                f"{path} is not a usable table of joints: {said(error)}"
             ) from error
         if "time_ns" in table:
             table["time_s"] = table.pop("time_ns") / 1e9
@@ -389,12 +389,9 @@ class LinkPath:
         appears, leaves = self.presence_ns
         within = (appears <= times_ns) & (times_ns <= leaves)
         times_ns = np.clip(times_ns, *self.presence_ns)  # elsewhere poses do not count
-        positions, rotations = self.base.poses(station, times_ns)
-        place, count = positions.T, len(times_ns)
-        turn = np.broadcast_to(np.eye(3)[..., None], (3, 3, count))
-        if rotations is not None:
-            turn = rotations.transpose(1, 2, 0)
-        velocity = rate = np.zeros((3, count))
+        positions, rotations = full_poses(self.base, station, times_ns)
+        place, turn = positions.T, rotations.transpose(1, 2, 0)
+        velocity = rate = np.zeros((3, len(times_ns)))
         if moving:
             velocity, rate = (part.T for part in velocities(self.base, station, times_ns))
         at = times_ns / 1e9 + self.start_s
@@ -410,7 +407,7 @@ class LinkPath:
             place, turn = _then(place, turn, hinge.before)
             value = interp(at, self.times_s, hinge.values)
             if moving:
-                start, velocity = place, velocity + _cross(rate, place - start)
+                start, velocity = place, velocity + np.cross(rate, place - start, axis=0)
                 along = _times(turn, hinge.axis[:, None, None] * self._slopes(hinge, at))[:, 0]
             if hinge.slides:
                 place = place + _times(turn, hinge.axis[:, None, None] * value)[:, 0]
@@ -426,7 +423,7 @@ class LinkPath:
                     rate = rate + along
         place, turn = _then(place, turn, self.last)
         if moving:
-            velocity = (velocity + _cross(rate, place - start)) * within
+            velocity = (velocity + np.cross(rate, place - start, axis=0)) * within
         return place, turn, velocity, rate * within
 
     def _slopes(self, hinge: Hinge, at: Floats) -> Floats:
@@ -444,11 +441,6 @@ def _times(one: Floats, other: Floats) -> Floats:
     return np.asarray(
         (one[:, 0, None] * other[0] + one[:, 1, None] * other[1]) + one[:, 2, None] * other[2]
     )
-
-
-def _cross(one: Floats, other: Floats) -> Floats:
-    """Cross products of vectors (3, k)."""
-    return np.cross(one, other, axis=0)
 
 
 def _then(place: Floats, turn: Floats, matrix: Floats) -> tuple[Floats, Floats]:

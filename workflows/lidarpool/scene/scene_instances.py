@@ -19,7 +19,7 @@ from ..base.vectors import applied, determinant, inverse, matmul, rank
 from ..sensor import Pose
 from .colours import Colours
 from .scene_mesh import SceneMesh, Voxels, compacted
-from .transform import Transform
+from .transform import Transform, affine
 
 # Nothing on Earth is farther from the origin of its map; see also `sections.Coordinate`.
 FARTHEST_M = 1e8
@@ -58,10 +58,8 @@ class SceneInstance:
         if isinstance(given, Pose):
             given = Transform(given.turn, np.array(given.position))
         placed = given if isinstance(given, Transform) else Transform.from_matrix(given)
-        matrix = np.eye(4)
-        matrix[:3, :3], matrix[:3, 3] = placed.linear, placed.offset
-        check_near(matrix[:3, 3])
-        object.__setattr__(self, "transform", matrix)
+        check_near(placed.offset)
+        object.__setattr__(self, "transform", affine(placed.linear, placed.offset))
         object.__setattr__(self, "name", self.name or self.mesh.name)
 
     @classmethod
@@ -84,10 +82,8 @@ class SceneInstance:
 
     def moved(self, name: str, linear: Floats, offset: Floats) -> SceneInstance:
         """Return it under a name, its place taken through p -> linear @ p + offset."""
-        matrix = np.eye(4)
-        matrix[:3, :3] = matmul(linear, self.matrix[:3, :3])
-        matrix[:3, 3] = applied(linear, self.matrix[:3, 3]) + offset
-        return SceneInstance(self.mesh, matrix, name)
+        place = applied(linear, self.matrix[:3, 3]) + offset
+        return SceneInstance(self.mesh, affine(matmul(linear, self.matrix[:3, :3]), place), name)
 
     def flat(self) -> SceneMesh:
         """Its triangles where they are."""
@@ -204,12 +200,11 @@ class Instances:
             out[rows] = np.sqrt((x * x + y * y).max(axis=1))
         return out
 
-    def moved(self, owner: int, position: Floats, rotation: Floats | None) -> Instances:
+    def moved(self, owner: int, position: Floats, turn: Floats) -> Instances:
         """Return them with those of an object in another place, at their present scale."""
         check_near(position)
         rows = np.flatnonzero(self.owner == owner)
         transforms = self.transforms.copy()
-        turn = np.eye(3) if rotation is None else rotation
         for row in rows:
             transforms[row] = np.column_stack(
                 [matmul(turn, scale_of(transforms[row, :, :3])), position]

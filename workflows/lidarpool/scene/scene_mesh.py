@@ -175,9 +175,7 @@ def _check_cutouts(name: str, cutouts: tuple[Cutout, ...], faces: int) -> None:
         raise LidarpoolError(f"{name!r} has {faces} faces, and cutouts of {cut_out}.")
 
 
-def stacked(
-    parts: Iterable[tuple[AnyArray, AnyArray]],
-) -> tuple[AnyArray, AnyArray]:
+def stacked(parts: Iterable[tuple[AnyArray, AnyArray]]) -> tuple[AnyArray, AnyArray]:
     """Vertices and faces of several (vertices, faces), one after the other."""
     vertices, faces, first = [], [], 0
     for points, corners in parts:

@@ -24,6 +24,13 @@ UP_AXES = {
 }
 
 
+def affine(linear: Floats, offset: Floats) -> Floats:
+    """Matrices (..., 4, 4) of p -> linear @ p + offset: (..., 3, 3) and (..., 3)."""
+    out = np.zeros((*np.shape(offset)[:-1], 4, 4))
+    out[..., :3, :3], out[..., :3, 3], out[..., 3, 3] = linear, offset, 1
+    return out
+
+
 def rotation_about(axis: ArrayLike, degrees: float) -> Floats:
     """Rotation (3, 3) about an axis, which has a length (Rodrigues 1840)."""
     cross = np.cross(np.eye(3), np.array(axis) / length(np.array(axis, np.float64)))

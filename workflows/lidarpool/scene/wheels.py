@@ -21,9 +21,7 @@ _ROUND = 0.05  # how much length and height of a wheel may differ
 
 
 def rolling(
-    objects: Sequence[SceneMesh | SceneInstance],
-    wheels: Sequence[str],
-    tell: Callable[[str], None],
+    objects: Sequence[SceneMesh | SceneInstance], wheels: Sequence[str], tell: Callable[[str], None]
 ) -> list[SceneMesh]:
     """Turn wheels about their middles, once while an actor drives their circumference.
 

@@ -423,12 +423,7 @@ class MaterialTable:
             shares = bright if self.scale.all() else np.where(scale > 0, bright, shares)
         return shares
 
-    def scattered(
-        self,
-        rows: Integers,
-        cosine: Floats,
-        luminance: Floats | None = None,
-    ) -> Floats:
+    def scattered(self, rows: Integers, cosine: Floats, luminance: Floats | None = None) -> Floats:
         """Share of the light returned by objects (n,): 1 for white at right angles.
 
         `luminance` (n,) is that of the colours that were hit, if the table is `textured`.

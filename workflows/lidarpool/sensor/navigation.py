@@ -29,7 +29,7 @@ from ..base.errors import LidarpoolError
 from ..base.validation import checked_fields
 from ..base.vectors import applied, hypot, into_axes, length, matmul, turned
 from .noise import Purpose, named_seed, normal
-from .trajectory import AT_CENTRE, CENTRE, Pose, Trajectory, velocities
+from .trajectory import AT_CENTRE, CENTRE, Pose, Trajectory, full_poses, velocities
 
 if TYPE_CHECKING:
     from .survey import Survey
@@ -286,9 +286,7 @@ def _bridged(imu: Imu, seed: int, number: int, since: Floats, lasts: float) -> F
 def _moved(path: Trajectory, mount: Pose, times_ns: Floats) -> tuple[Floats, Floats, Floats]:
     """Positions (k, 3), rotations (k, 3, 3) and velocities (k, 3) of something on a carrier."""
     times_ns = np.minimum(times_ns, path.duration_ns)
-    places, turns = path.poses(0, times_ns)
-    if turns is None:
-        turns = np.broadcast_to(np.eye(3), (len(times_ns), 3, 3))
+    places, turns = full_poses(path, 0, times_ns)
     speeds, rates = velocities(path, 0, times_ns)
     levers = applied(turns, mount.position)
     return places + levers, matmul(turns, mount.turn), speeds + np.cross(rates, levers)

@@ -18,14 +18,7 @@ from ..base.arrays import Floats, Ints
 from ..base.declared import FILLED_IN, Several, about, written_as
 from ..base.errors import LidarpoolError
 from ..base.validation import checked_fields, shown
-from ..columns.table import (
-    COORDINATES,
-    OPTIONAL,
-    Column,
-    chosen,
-    stored,
-    waveform_column,
-)
+from ..columns.table import COORDINATES, OPTIONAL, Column, chosen, stored, waveform_column
 from .faults import Fault, check_faults
 from .materials import ClassNames, Material
 from .navigation import Navigation, check_navigation

@@ -163,6 +163,14 @@ def presence_ns(path: Trajectory) -> tuple[float, float]:
     return float(first), float(last)
 
 
+def full_poses(path: Trajectory, station: int, times_ns: Floats) -> tuple[Floats, Floats]:
+    """Return poses as `Trajectory.poses` does; rotations are identities where it has none."""
+    positions, rotations = path.poses(station, times_ns)
+    if rotations is None:
+        rotations = np.broadcast_to(np.eye(3), (len(times_ns), 3, 3))
+    return positions, rotations
+
+
 def velocities(path: Trajectory, station: int, times_ns: Floats) -> tuple[Floats, Floats]:
     """Return velocities and angular velocities on a trajectory, derivatives of its poses.
 

@@ -132,7 +132,7 @@ def _table(text: str, names: dict[str, str]) -> tuple[Any, Any, Any]:
     if not any(name in at for name in _TURNS[1]):
         return seconds, places, None
     angles = [at.get(name, np.zeros(len(seconds))) for name in _TURNS[1]]
-    return seconds, places, quaternions_from_degrees(np.stack(angles, axis=1))
+    return seconds, places, quaternions_of(rotations_of(np.stack(angles, axis=1)))
 
 
 def columns_of_table(
@@ -209,11 +209,6 @@ def _is_finite(cell: str) -> bool:
         return bool(np.isfinite(float(cell)))
     except ValueError:
         return False
-
-
-def quaternions_from_degrees(angles: Floats) -> Floats:
-    """Quaternions (k, 4) of yaw, pitch and roll in degrees (k, 3), as of `Pose`."""
-    return quaternions_of(rotations_of(angles))
 
 
 def _from_camera(track: Track) -> Track:

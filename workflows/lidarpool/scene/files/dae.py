@@ -25,7 +25,7 @@ from ...base.xmlfile import xml_root
 from ..colours import Colours, as_bytes
 from ..masks import MaskError, MaskNotes, Texture, Wrap, read_colours, remembered
 from ..scene_mesh import SceneMesh
-from ..transform import rotation_about
+from ..transform import affine, rotation_about
 from .companions import image_file
 from .polygons import check_corners, fanned, triangulated, unrolled, with_holes
 from .scene_graph import (
@@ -301,32 +301,21 @@ def _numbers(element: Element) -> Floats:
     return np.array((element.text or "").split(), np.float64)
 
 
-def _translate(numbers: Floats) -> Floats:
-    out = np.eye(4)
-    out[:3, 3] = numbers
-    return out
-
-
 def _rotate(numbers: Floats) -> Floats:
     """Rotation about an axis, in degrees; some programs write no axis."""
     *axis, degrees = numbers
-    out = np.eye(4)
-    if np.any(axis):
-        out[:3, :3] = rotation_about(axis, degrees)
-    return out
+    return affine(rotation_about(axis, degrees) if np.any(axis) else np.eye(3), np.zeros(3))
 
 
 def _look_at(numbers: Floats) -> Floats:
     eye, target, up = numbers.reshape(3, 3)
     z = (eye - target) / length(eye - target)
     x = np.cross(up, z) / length(np.cross(up, z))
-    out = np.eye(4)
-    out[:3] = np.stack([x, np.cross(z, x), z, eye], axis=1)
-    return out
+    return affine(np.stack([x, np.cross(z, x), z], axis=1), eye)
 
 
 _STEPS = {
-    "translate": _translate,
+    "translate": lambda numbers: affine(np.eye(3), numbers),
     "rotate": _rotate,
     "scale": lambda numbers: np.diag([*numbers, 1.0]),
     "matrix": lambda numbers: numbers.reshape(4, 4),

@@ -13,7 +13,7 @@ import json
 import math
 import re
 import struct
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Generator, Sequence
 from dataclasses import replace
 from functools import cache, partial
 from pathlib import Path
@@ -28,7 +28,7 @@ from ...base.elementary import sin_cos_of
 from ...base.vectors import applied, length, matmul
 from ...base.words import plural
 from ...sensor.trajectory import matrices
-from ..animation import RATE_HZ, Animation
+from ..animation import RATE_HZ
 from ..colours import LINEAR, Colours, as_srgb
 from ..masks import (
     FACE_BYTES,
@@ -52,6 +52,7 @@ from .scene_graph import (
     Node,
     Piece,
     Wanted,
+    baked,
     instances,
     joined,
     settled,
@@ -174,39 +175,25 @@ class _Reader:
         """Read the scene with an animation, from its first key to its last."""
         animation = chosen(self._header.get("animations", []), name)
         first, last = keys_of(animation, self._accessor)
-        if not last > first:
-            raise MeshFileError("has an animation without a duration: export it again")
         count = max(1, math.ceil((last - first) * RATE_HZ))
         self._allowance.take(32 * (count + 1) * (1 + len(animation["channels"])))
-        self._channels = played(animation, np.linspace(first, last, count + 1), self._accessor)
+        times_s = np.linspace(first, last, count + 1)
+        return baked(self._poses(animation, times_s), times_s.tolist(), self._allowance)
+
+    def _poses(self, animation: dict[str, Any], times_s: Floats) -> Generator[Content]:
+        """Content at each time of an animation, in colours at the first."""
+        self._channels = played(animation, times_s, self._accessor)
         if not self._channels:
             raise MeshFileError("has an animation that moves no node: choose another")
         for index, _ in self._channels:
             self._part("nodes", index)
-        roots, content = _roots(self._header), Content(())
-        poses: list[Floats] = []
-        for self._frame in range(count + 1):
-            taken = self._allowance.taken
+        roots = _roots(self._header)
+        for self._frame in range(len(times_s)):
             for kept in (self._local, self._joints, self._bent):  # of the frame before
                 kept.cache_clear()
             self._worlds.clear()
-            made = settled(instances(roots, self.node, self._path.stem), copy_all=True)
-            now = [mesh.vertices for mesh in made.meshes if isinstance(mesh, SceneMesh)]
-            if not poses:
-                content, self._wanted = made, self._wanted._replace(colours=False)
-                self._allowance.take((count + 1) * sum(vertices.nbytes for vertices in now))
-                poses = [np.empty((count + 1, *vertices.shape)) for vertices in now]
-            else:
-                self._allowance.taken = taken
-            for out, vertices in zip(poses, now, strict=True):
-                out[self._frame] = vertices
-        moves = iter([Animation(own, (last - first) / count) for own in poses])
-        content.meshes = [
-            replace(mesh, animation=next(moves))
-            for mesh in content.meshes
-            if isinstance(mesh, SceneMesh)
-        ]
-        return content
+            yield settled(instances(roots, self.node, self._path.stem), copy_all=True)
+            self._wanted = self._wanted._replace(colours=False)
 
     def _read_local(self, index: int) -> Floats:
         """Matrix (4, 4) of a node, at the frame of the animation if there is one."""

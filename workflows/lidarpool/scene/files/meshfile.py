@@ -64,7 +64,7 @@ CONVERTED = {  # {ending of scenes that are not read: what to do}
     ".mjcf": _MUJOCO,
     ".xml": f"{_MUJOCO}, and lidarpool import reads a survey of HELIOS++",
 }
-ANIMATED = (".glb", ".gltf")
+ANIMATED = (".glb", ".gltf", ".usd", ".usda", ".usdc", ".usdz")
 UNITLESS = (".obj", ".stl", ".ply", ".off")  # formats without a unit
 
 GENERATOR = "lidarpool"  # that files of our own name, .glb as Y-up, others as Z-up
@@ -137,8 +137,8 @@ def load_objects(
         Code of the coordinate system that a raster is brought to, one in metres. None keeps its
         own if it is in metres, else takes the UTM zone of its middle.
     animation
-        Of a .glb or .gltf: name of the animation that its meshes have, or its number if it has
-        none; "" for the first. Such meshes have no masks. None leaves all as it stands.
+        Name of the animation that its meshes have, or its number if it has none; "" for the first,
+        in .usd for what is bound. Such meshes have no masks. None leaves all as it stands.
     tell
         Called with a line on objects left out, on images that cannot be read, on materials that
         may be glass, or on a reference system; by default this module's logger warns.

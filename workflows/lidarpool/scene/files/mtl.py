@@ -15,15 +15,7 @@ from ...base.allowance import Allowance
 from ...base.arrays import Bytes, Floats, Ints
 from ...base.words import as_text
 from ..colours import Colours, as_bytes
-from ..masks import (
-    HALF,
-    MaskNotes,
-    Texture,
-    Wrap,
-    read_colours,
-    read_opacity,
-    remembered,
-)
+from ..masks import HALF, MaskNotes, Texture, Wrap, read_colours, read_opacity, remembered
 from ..scene_mesh import Cutout
 from .companions import image_file, named_file
 from .scene_graph import SMALLER, MeshFileError, Wanted

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Hashable, Iterable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cache
 from itertools import chain
 from pathlib import Path
@@ -16,6 +16,7 @@ from ...base.allowance import Allowance, bytes_of, memory_share
 from ...base.arrays import AnyArray, Floats, Ints
 from ...base.vectors import matmul, rank
 from .. import colours
+from ..animation import Animation
 from ..colours import Colours
 from ..scene_instances import SceneInstance
 from ..scene_mesh import Cutout, SceneMesh, compacted, stacked
@@ -190,6 +191,28 @@ def settled(placed: Sequence[PlacedNode], *, copy_all: bool = False) -> Content:
             objects.append(SceneInstance(mesh, matrix, name))
         else:
             objects.append(mesh.moved(name, matrix[:3, :3], matrix[:3, 3]))
+    return content
+
+
+def baked(poses: Iterable[Content], times_s: Sequence[float], allowance: Allowance) -> Content:
+    """Join poses of the same meshes, at times that are even, to one content that is animated."""
+    if not times_s[-1] > times_s[0]:
+        raise MeshFileError("has an animation without a duration: export it again")
+    content, moves, count, taken = Content(()), list[Floats](), len(times_s), 0
+    for number, pose in zip(range(count), poses, strict=False):
+        now = [mesh.vertices for mesh in pose.meshes if isinstance(mesh, SceneMesh)]
+        if not number:
+            allowance.take(count * sum(vertices.nbytes for vertices in now))
+            content, taken = pose, allowance.taken
+            moves = [np.empty((count, *vertices.shape)) for vertices in now]
+        allowance.taken = taken
+        if list(map(len, now)) != [len(own[0]) for own in moves]:
+            raise MeshFileError(f"has other vertices in pose {number}: leave out animation")
+        for own, vertices in zip(moves, now, strict=True):
+            own[number] = vertices
+    animations = iter([Animation(own, (times_s[-1] - times_s[0]) / (count - 1)) for own in moves])
+    meshes = [mesh for mesh in content.meshes if isinstance(mesh, SceneMesh)]
+    content.meshes = [replace(mesh, animation=next(animations)) for mesh in meshes]
     return content
 
 

@@ -31,6 +31,7 @@ from ..robot import HELD, MOVING, Joint, Robot
 from ..scene_instances import SceneInstance
 from ..scene_mesh import SceneMesh
 from ..shapes import capsule, cylinder
+from ..transform import affine
 from .meshfile import OpacityMode, load_meshes, warn
 
 _LINKS_MOST = 1000  # humanoids with hands have 150
@@ -152,12 +153,9 @@ def _numbers(element: Element | None, name: str, count: int, default: str) -> Fl
 
 def _place(element: Element) -> Floats:
     """Matrix (4, 4) of an <origin>: rotated about the fixed x, y and z axes, then moved."""
-    origin, out = element.find("origin"), np.eye(4)
-    out[:3, 3] = _numbers(origin, "xyz", 3, "0 0 0")
-    angles = _numbers(origin, "rpy", 3, "0 0 0")
-    if angles.any():
-        out[:3, :3] = rotations_of(np.degrees(angles[::-1]))
-    return out
+    origin = element.find("origin")
+    place, angles = (_numbers(origin, name, 3, "0 0 0") for name in ("xyz", "rpy"))
+    return affine(rotations_of(np.degrees(angles[::-1])) if angles.any() else np.eye(3), place)
 
 
 def _joint(element: Element, links: Collection[str]) -> tuple[str, Joint]:
@@ -332,11 +330,7 @@ class _Looks:
             # (AI_CONFIG_IMPORT_COLLADA_IGNORE_UP_DIRECTION in rviz_rendering's assimp_loader.cpp),
             # and not its unit. assimp turns no other format.
             found = load_meshes(
-                path,
-                up_axis="z",
-                opacity=self.opacity,
-                colours=self.colours,
-                tell=self.tell,
+                path, up_axis="z", opacity=self.opacity, colours=self.colours, tell=self.tell
             )
             self._allowance.add_file(path)
             self._files[path] = [

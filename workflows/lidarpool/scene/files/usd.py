@@ -14,7 +14,7 @@ import signal
 import subprocess
 import sys
 from collections import Counter
-from collections.abc import Generator
+from collections.abc import Generator, Iterator
 from contextlib import closing
 from dataclasses import replace
 from importlib.util import find_spec
@@ -28,11 +28,13 @@ from ...base.arrays import AnyArray
 from ...base.vectors import inverse, matmul
 from ...base.words import plural
 from ..actors import box
+from ..animation import RATE_HZ
 from ..scene_instances import SceneInstance, scale_of
 from ..scene_mesh import SceneMesh
 from ..shapes import capsule, cylinder, revolve
 from ..transform import UP_AXES
 from .companions import outside
+from .gltf_animation import chosen
 from .polygons import triangulated
 from .scene_graph import (
     MOST_NODES,
@@ -44,6 +46,7 @@ from .scene_graph import (
     PlacedNode,
     RigidPart,
     Wanted,
+    baked,
     instances,
     joined,
     settled,
@@ -65,34 +68,34 @@ def read_usd(data: bytes, path: Path, wanted: Wanted) -> Content:
     if sys.platform == "win32":  # which has no limits of memory for a process
         raise MeshFileError("is OpenUSD, which is not read on Windows: export it as .glb")
     allowance = Allowance(0, SMALLER)  # grows by all files of the scene
+    with closing(_frames(path, wanted, allowance)) as frames:
+        stage, _ = next(frames)
+        contents = _contents(frames, stage, path.stem, wanted, allowance)
+        if wanted.animation is None:
+            return next(contents)
+        chosen(stage["animations"], wanted.animation)
+        return baked(contents, stage["times_s"], allowance)
+
+
+def _contents(
+    frames: Iterator[_Frame], stage: dict[str, Any], stem: str, wanted: Wanted, allowance: Allowance
+) -> Iterator[Content]:
+    """Yield the content of each pose."""
     materials = UsdMaterials(allowance, wanted.colours)
     meshes: dict[int, list[SceneMesh]] = {}
-    stage: dict[str, Any] = {}
-    with closing(_frames(path, wanted, allowance)) as frames:
-        for frame, arrays in frames:
-            _check_files(frame.get("files", ()), wanted, path)
-            match frame["what"]:
-                case "stage":
-                    stage = frame
-                    for file in frame["files"]:
-                        allowance.add_file(Path(file))
-                case "image" | "material":
-                    materials.add(frame, arrays)
-                case "mesh":
-                    meshes[frame["number"]] = _mesh(frame, arrays, allowance, materials)
-                case "shape":
-                    meshes[frame["number"]] = _shape(frame, arrays, materials)
-                case "error":
-                    raise ValueError(frame["reason"])
-                case "too many":
-                    raise MeshFileError(
-                        f"has more than {_MOST[frame['of']]:,} {frame['of']}: export it in parts"
-                    )
-                case "nodes":
-                    content = _content(frame, arrays, meshes, path.stem, allowance)
-                    content.notes += materials.notes.lines()
-                    return _with_notes(content, stage, frame["counts"])
-    raise ValueError("usd-core read no part of it")
+    for frame, arrays in frames:
+        match frame["what"]:
+            case "image" | "material":
+                materials.add(frame, arrays)
+            case "mesh":
+                meshes[frame["number"]] = _mesh(frame, arrays, allowance, materials)
+            case "shape":
+                meshes[frame["number"]] = _shape(frame, arrays, materials)
+            case "nodes":
+                content = _content(stage | frame, arrays, meshes, stem, allowance)
+                content.notes += materials.notes.lines()
+                yield _with_notes(content, stage, frame["counts"])
+                materials.coloured = False  # all poses have the colours of the first
 
 
 def _frames(path: Path, wanted: Wanted, allowance: Allowance) -> Generator[_Frame]:
@@ -104,11 +107,10 @@ def _frames(path: Path, wanted: Wanted, allowance: Allowance) -> Generator[_Fram
     # A thread that is refused for the memory limit would be waited for until the alarm. One thread
     # takes a sixth longer for 100 layers.
     environment |= {"PXR_WORK_THREAD_LIMIT": "1", "OPENBLAS_NUM_THREADS": "1"}
-    asked: dict[str, Any] = {"most": _MOST, "masks": wanted.masks, "colours": wanted.colours}
-    asked |= {"memory": memory, "folders": [str(folder) for folder in wanted.folders]}
+    asked = wanted._asdict() | {"most": _MOST, "memory": memory, "rate_hz": RATE_HZ}
     with subprocess.Popen(
         # -P: our modules must not take the place of the library's.
-        [sys.executable, "-P", script, path.absolute(), json.dumps(asked)],
+        [sys.executable, "-P", script, path.absolute(), json.dumps(asked, default=str)],
         stdin=subprocess.DEVNULL,
         stdout=subprocess.PIPE,
         stderr=subprocess.DEVNULL,
@@ -125,6 +127,16 @@ def _frames(path: Path, wanted: Wanted, allowance: Allowance) -> Generator[_Fram
                         allowance.grow(size)
                     allowance.take(size)
                     arrays.append(np.frombuffer(child.stdout.read(size), kind).reshape(shape))
+                match frame["what"]:
+                    case "error":
+                        raise ValueError(frame["reason"])
+                    case "too many":
+                        what = f"{_MOST[frame['of']]:,} {frame['of']}"
+                        raise MeshFileError(f"has more than {what}: export it in parts")
+                for file in map(Path, frame.get("files", ())):
+                    if not (wanted.allows(file) or file.samefile(path)):
+                        raise MeshFileError(outside(os.path.relpath(file, path.resolve().parent)))
+                    allowance.add_file(file)
                 yield frame, arrays
             code = child.wait()
         finally:
@@ -133,14 +145,6 @@ def _frames(path: Path, wanted: Wanted, allowance: Allowance) -> Generator[_Fram
         raise ValueError("usd-core takes too long for it")
     why = signal.Signals(-code).name if code < 0 else f"status {code}"
     raise ValueError(f"usd-core ended with {why}, or needs more than {bytes_of(memory)} of memory")
-
-
-def _check_files(files: list[str], wanted: Wanted, path: Path) -> None:
-    """Check that all files that a scene was read from may be read."""
-    own = path.resolve()
-    for file in (Path(name).resolve() for name in files):
-        if file != own and not wanted.allows(file):
-            raise MeshFileError(outside(os.path.relpath(file, own.parent)))
 
 
 def _mesh(
@@ -236,7 +240,8 @@ def _content(
             children += [(copied, places, row) for row in rows]
         return Node(name, matrices[key], meshes.get(mesh, ()), children)
 
-    content = settled(_named(instances(frame["roots"], node, stem)))
+    placed = _named(instances(frame["roots"], node, stem))
+    content = settled(placed, copy_all=len(frame["times_s"]) > 1)
     for number, motion in zip(moving, motions, strict=True):
         # Its mesh has the scale, since actors have none.
         matrices[number] = np.eye(4)
@@ -317,6 +322,8 @@ def _with_notes(content: Content, stage: dict[str, Any], counts: dict[str, int])
             f"moves {plural(moving, 'object')} otherwise than as a whole, or in copies: taken at "
             "the first time, and still"
         )
+    if stage["animations"] and len(stage["times_s"]) == 1:
+        notes.append("has skeletons that move: they stand still; actors move by animation: NAME")
     if skinned:
         bent = plural(skinned, "mesh", "meshes")
         notes.append(f"bends {bent} by skeletons in instances, which is not read: taken unbent")

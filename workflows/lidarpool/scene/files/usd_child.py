@@ -4,7 +4,7 @@ usd-core ends its process on some broken files, and takes any amount of memory f
 end this process only. It imports nothing of lidarpool, to start fast. Standard output gets frames,
 each a line of JSON and the bytes of arrays: first of the stage, then of each mesh, after the images
 and materials that it is the first to use, last of the nodes. What several prims hold alike is
-written once.
+written once. Of an animation, meshes and nodes come again for each pose.
 """
 
 from __future__ import annotations
@@ -57,11 +57,7 @@ class StageNodes:
 
     def __init__(self, stage: Any, most: dict[str, int], looks: Looks, write: Any) -> None:
         self._stage, self._left, self._looks, self._write = stage, most, looks, write
-        timed = stage.HasAuthoredTimeCodeRange()
-        self._time = (
-            Usd.TimeCode(stage.GetStartTimeCode()) if timed else Usd.TimeCode.EarliestTime()
-        )
-        looks.time = self._time
+        self._time = looks.time
         self._numbers: dict[tuple[Any, ...], int] = {}  # {key: number}
         self._todo: list[tuple[Any, ...]] = []
         self._known: dict[Any, bool] = {}  # {prototype and test: whether a prim passes}
@@ -83,20 +79,11 @@ class StageNodes:
 
     def read(self) -> None:
         """Find all nodes, and write their meshes."""
-        self._bend()
         # Where time stands still, usd-core would look for samples for ever.
         still = not self._stage.GetTimeCodesPerSecond() > 0
         self.roots.append(self._number(self._stage.GetPseudoRoot(), False, still, None))
         for key in self._todo:  # grows meanwhile
             self.nodes.append(self._node(*key))
-
-    def _bend(self) -> None:
-        """Move the points of skinned meshes to the pose of their skeletons, but in prototypes."""
-        everything = self._stage.Traverse()
-        if any(prim.IsA(UsdSkel.Root) for prim in everything):
-            time = self._time.GetValue()
-            self._stage.SetEditTarget(self._stage.GetSessionLayer())
-            UsdSkel.BakeSkinning(everything, Gf.Interval(time, time))
 
     def _number(self, prim: Any, *inherited: Any) -> int:
         key = _shared(prim).GetPath(), *inherited
@@ -519,6 +506,30 @@ def _has_surface(prim: Any) -> bool:
     return bool(prim.IsA(UsdGeom.Gprim) or prim.IsA(UsdGeom.PointInstancer))
 
 
+def _played(stage: Any, asked: dict[str, Any]) -> tuple[list[Any], list[Any], list[float]]:
+    """Animations, attributes that move, and time codes of poses: one if no animation is asked."""
+    name, rate_hz = asked["animation"], stage.GetTimeCodesPerSecond()
+    while name is not None and (found := [one for one in stage.Traverse() if one.IsInstance()]):
+        for prim in found:
+            prim.SetInstanceable(False)  # nothing bends what is in them
+    prims = [one for one in stage.Traverse() if name is not None or one.IsA(UsdSkel.Animation)]
+    # Where time stands still, usd-core would look for samples for ever.
+    attributes = [one for prim in prims if rate_hz > 0 for one in prim.GetAuthoredAttributes()]
+    moved = [one for one in attributes if one.ValueMightBeTimeVarying()]
+    clips = {one.GetName(): one.GetPath() for one in prims if moved and one.IsA(UsdSkel.Animation)}
+    for prim in [one for one in prims if name in clips and one.IsA(UsdSkel.Skeleton)]:
+        UsdSkel.BindingAPI.Apply(prim).CreateAnimationSourceRel().SetTargets([clips[name]])
+    times = [Usd.TimeCode.EarliestTime().GetValue()]
+    codes = [code for one in moved for code in one.GetTimeSamples()]
+    if stage.HasAuthoredTimeCodeRange():
+        times = [stage.GetStartTimeCode()]
+        codes = [*times, stage.GetEndTimeCode()]
+    if name is not None and moved:
+        count = math.ceil((max(codes) - min(codes)) / rate_hz * asked["rate_hz"]) or 1
+        times = np.linspace(min(codes), max(codes), count + 1).tolist()
+    return [{"name": one} for one in clips] or [{}] * bool(moved), moved, times
+
+
 def _files(stage: Any) -> list[str]:
     """List files that a stage was read from; those within a .usdz count as this."""
     layers = [layer.realPath for layer in stage.GetUsedLayers() if not layer.anonymous]
@@ -562,6 +573,7 @@ def main(path: str, asked: dict[str, Any]) -> None:
     try:
         stage = Usd.Stage.Open(path)
         missing = _missing(stage)
+        animations, moved, times = _played(stage, asked)
         write({
             "what": "stage",
             "files": _files(stage),
@@ -571,19 +583,30 @@ def main(path: str, asked: dict[str, Any]) -> None:
             "unit_stated": UsdGeom.StageHasAuthoredMetersPerUnit(stage),
             "up_axis": UsdGeom.GetStageUpAxis(stage).lower(),
             "up_stated": stage.HasAuthoredMetadata("upAxis"),
+            "animations": animations,
+            "times_s": (np.array(times) / stage.GetTimeCodesPerSecond()).tolist(),
         })  # fmt: skip
-        scene = StageNodes(stage, asked["most"], Looks(asked, write), write)
-        scene.read()
-        write({
-            "what": "nodes",
-            "files": _files(stage),  # with those of value clips
-            "roots": scene.roots,
-            "nodes": scene.nodes,
-            "counts": scene.counts,
-            "moving": scene.moving,
-            "start": scene.start,
-            "rate_hz": stage.GetTimeCodesPerSecond(),
-        }, np.array(scene.matrices), *scene.motions, *scene.copies)  # fmt: skip
+        looks = Looks(asked, write)
+        for code in times:
+            stage.GetSessionLayer().Clear()  # of the pose before
+            stage.SetEditTarget(stage.GetSessionLayer())
+            for attribute in moved:
+                attribute.Set(Sdf.ValueBlock() if (value := attribute.Get(code)) is None else value)
+            # It bends at samples only, or what stands.
+            UsdSkel.BakeSkinning(stage.Traverse(), Gf.Interval(code, code))
+            looks.time = Usd.TimeCode(code)
+            scene = StageNodes(stage, asked["most"].copy(), looks, write)
+            scene.read()
+            write({
+                "what": "nodes",
+                "files": _files(stage),  # with those of value clips
+                "roots": scene.roots,
+                "nodes": scene.nodes,
+                "counts": scene.counts,
+                "moving": scene.moving,
+                "start": scene.start,
+                "rate_hz": stage.GetTimeCodesPerSecond(),
+            }, np.array(scene.matrices), *scene.motions, *scene.copies)  # fmt: skip
     except TooManyError as error:
         write({"what": "too many", "of": str(error)})
     except Exception as error:  # of any type, as readers of broken files are

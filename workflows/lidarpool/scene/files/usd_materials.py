@@ -108,7 +108,7 @@ class UsdMaterials:
     """Images and materials by their numbers, and what they make of triangles."""
 
     def __init__(self, allowance: Allowance, colours: bool) -> None:
-        self._allowance, self._colours = allowance, colours
+        self._allowance, self.coloured = allowance, colours
         self._images: dict[int, tuple[str, bytes]] = {}  # {number: (why it is not read, content)}
         self._materials: dict[int | None, dict[str, Any]] = {None: {"name": "displayColor"}}
         self._shades, self._mask = remembered(self._read_shades), remembered(self._read_mask)
@@ -124,7 +124,7 @@ class UsdMaterials:
 
     def colours(self, number: int | None, look: Look, rows: Ints) -> Colours | None:
         """Colours that a material gives triangles; None if they have none."""
-        if not self._colours:
+        if not self.coloured:
             return None
         material = self._materials[number]
         source = material.get("colour", _DISPLAY)
