@@ -51,17 +51,13 @@ def own_device() -> int | None:
     """
     address = get_worker().address
     if address not in _own:
-        _own[address] = _ask(address)
+        device: int | None = None
+        if gpus := probe.visible_gpus():
+            device = on_scheduler(own_client(), _assign, address=address, gpus=gpus)
+            if device is None:
+                raise WorkerLeft(f"the scheduler has given up the worker at {address}")
+        _own[address] = device
     return _own[address]
-
-
-def _ask(address: str) -> int | None:
-    if not (gpus := probe.visible_gpus()):
-        return None
-    device: int | None = on_scheduler(own_client(), _assign, address=address, gpus=gpus)
-    if device is None:
-        raise WorkerLeft(f"the scheduler has given up the worker at {address}")
-    return device
 
 
 # -- on the scheduler ------------------------------------------------------------------

@@ -44,8 +44,7 @@ from lidarpool.sensor.materials import extinction, fresnel
 from lidarpool.sensor.noise import Purpose, raw
 from lidarpool.simulator.returns import PulseReturns
 from lidarpool.simulator.rig import Rig
-from lidarpool.simulator.selection import chosen
-from lidarpool.simulator.separation import separated
+from lidarpool.simulator.separation import chosen, separated
 
 # -- random numbers ------------------------------------------------------------------------------
 

@@ -101,8 +101,8 @@ __all__ = [
     "sweeps",
 ]
 
-# Where the names above are. They are imported when they are asked for, which takes a second:
-# the command has to see to its signals before (`__main__.py`).
+# Where the names above are, but for those of `sensor`. They are imported when they are asked for,
+# which takes a second: the command has to see to its signals before (`__main__.py`).
 _MODULES = {
     "api.result": ("Result",),
     "api.simulation": ("Campaign", "simulate"),
@@ -128,23 +128,6 @@ _MODULES = {
     "scene.scene": ("Scene",),
     "scene.files.urdf": ("load_robot",),
     "sensor.models": ("load_sensor",),
-    "sensor": (
-        "Beams",
-        "Fault",
-        "Gnss",
-        "Imu",
-        "Material",
-        "Mounted",
-        "Navigation",
-        "Noise",
-        "Optics",
-        "Pose",
-        "Returns",
-        "ScanSpec",
-        "Sensor",
-        "Spin",
-        "Survey",
-    ),
     "sensor.trajectory": ("Track",),
     "sensor.trajectory_files": ("load_trajectory",),
     "simulator": ("Scanner",),
@@ -152,16 +135,16 @@ _MODULES = {
 
 
 def __getattr__(name: str) -> Any:
-    for module, names in _MODULES.items():
-        if name in names:
-            found = getattr(import_module(f".{module}", __name__), name)
-            # Importing a module of the folder compare puts the folder in the function's place.
-            if module.startswith("compare."):
-                comparison = import_module(".compare.comparison", __name__)
-                globals()["compare"] = comparison.compare
-            globals()[name] = found
-            return found
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    if name not in __all__:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    module = next((module for module, names in _MODULES.items() if name in names), "sensor")
+    found = getattr(import_module(f".{module}", __name__), name)
+    # Importing a module of the folder compare puts the folder in the function's place.
+    if module.startswith("compare."):
+        comparison = import_module(".compare.comparison", __name__)
+        globals()["compare"] = comparison.compare
+    globals()[name] = found
+    return found
 
 
 def __dir__() -> list[str]:

@@ -252,11 +252,8 @@ def run(
 @cli.command()
 @click.argument("shards", metavar="SHARD...", nargs=-1, required=True, type=shared.StoragePath())
 @click.option("--partial", is_flag=True, help="Merge what there is, and say what is missing.")
-@click.option(
-    "--scenario",
-    type=click.Path(path_type=Path),
-    metavar="FILE",
-    help="Of a survey: its scenario or mesh file, if that is not where it was.",
+@shared.path(
+    "--scenario", help="Of a survey: its scenario or mesh file, if that is not where it was."
 )
 @shared.out
 @shared.flag("--quiet", "-q", help="No progress, only the result.")

@@ -271,7 +271,7 @@ def compare(a: Path, b: Path, out: Path, as_json: bool, **given: Any) -> None:
 @click.argument("recording", metavar="RECORDING", type=click.Path(path_type=Path))
 @options.new_file("--out", required=True, help="Sensor file, .yaml; its page is a .html beside it.")
 @click.option("--model", metavar="MODEL|FILE", help="The sensor, for what the recording hides.")
-@click.option("--scene", metavar="FILE", type=click.Path(path_type=Path), help="The place, a mesh.")
+@options.path("--scene", help="The place, a mesh.")
 @options.pose
 @click.option("--sensor", metavar="NAME", help="Sensor of the recording, or topic of a bag.")
 @click.option("--intensity", metavar="COLUMN", help="Column of the intensity.")

@@ -33,13 +33,8 @@ _OBJECTS_TOLD = 12
 @click.argument(
     "folder", metavar="[DIR]", type=click.Path(path_type=Path), default=Path(), required=False
 )
-@click.option(
-    "--mesh",
-    "meshes",
-    metavar="FILE",
-    type=click.Path(path_type=Path),
-    multiple=True,
-    help="Mesh file to survey; may be given several times.",
+@options.path(
+    "--mesh", "meshes", multiple=True, help="Mesh file to survey; may be given several times."
 )
 @options.mesh_options
 @options.flag("--all", "every", help="Write every field with its default and a description.")
@@ -114,12 +109,8 @@ def init(folder: Path, meshes: tuple[Path, ...], of_mesh: dict[str, Any], every:
     help="Folder where references in the survey start; may be given several times.  "
     "[default: the survey's, and those above it]",
 )
-@click.option(
-    "--out",
-    "-o",
-    metavar="DIR",
-    type=click.Path(path_type=Path),
-    help="Folder for the scenario.  [default: named after the survey]",
+@options.path(
+    "--out", "-o", metavar="DIR", help="Folder for the scenario.  [default: named after the survey]"
 )
 def import_(survey: Path, assets: tuple[Path, ...], out: Path | None) -> None:
     """Write a HELIOS++ survey as a scenario.
@@ -336,12 +327,7 @@ def _write(out: Path, make: Callable[[], Scene], overwrite: bool) -> None:
 
 @click.command()
 @click.argument("model", required=False, metavar="[MODEL|FILE.yaml]")
-@click.option(
-    "--out",
-    type=click.Path(path_type=Path),
-    metavar="FILE.png",
-    help="Draw the model's beams into this file.",
-)
+@options.path("--out", metavar="FILE.png", help="Draw the model's beams into this file.")
 def sensors(model: str | None, out: Path | None) -> None:
     """List sensor models, or show the figures of one and draw its beams.
 

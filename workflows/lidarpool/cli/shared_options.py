@@ -33,6 +33,7 @@ class StoragePath(click.Path):
 
 
 flag = partial(click.option, is_flag=True)
+path = partial(click.option, type=click.Path(path_type=Path), metavar="FILE")
 new_file = partial(click.option, type=click.Path(dir_okay=False, path_type=Path), metavar="FILE")
 out = click.option(
     "--out",
@@ -57,14 +58,9 @@ shard = click.option(
     "Slurm array; auto/10: the index of a Kubernetes job.",
 )
 no_plan = flag("--no-plan", help="Leave out path planning.")
-cluster = click.option(
-    "--cluster",
-    metavar="FILE",
-    type=click.Path(path_type=Path),
-    help="Start this cluster for the run: Slurm, PBS, SSH; see docs/how-to/queues.md.",
+cluster = path(
+    "--cluster", help="Start this cluster for the run: Slurm, PBS, SSH; see docs/how-to/queues.md."
 )
-
-
 overwrite = flag("--overwrite", help="Replace existing files.")
 as_json = flag("--json", "as_json", help="Print the figures as one JSON document.")
 result = click.argument("result", metavar="FOLDER", type=StoragePath())
@@ -154,13 +150,13 @@ def scheduler(command: Command) -> Command:
             )
         command(*arguments, files=files, **given)
 
-    file = click.Path(exists=True, dir_okay=False, path_type=Path)
+    pem = click.Path(exists=True, dir_okay=False, path_type=Path)
     for name, what in (
         ("key", "Private key of that certificate, if its file does not hold it."),
         ("cert", "Own certificate for an encrypted cluster, a PEM file."),
         ("ca", "Certificate of the authority of an encrypted cluster, a PEM file."),
     ):
-        click.option(f"--tls-{name}", type=file, help=what)(with_files)
+        click.option(f"--tls-{name}", type=pem, help=what)(with_files)
     return click.option(
         "--scheduler", metavar="ADDRESS", help="Use this Dask cluster, tcp://host:8786."
     )(with_files)

@@ -124,21 +124,17 @@ class CastingWorkers:
         """
         try:
             packed = _pickled(survey)
-            return packed, self._add(job, scene, packed)
+            # What identifies its still part while it exists: jobs of it share their trees.
+            key = tuple(id(getattr(scene, f.name)) for f in fields(scene) if f.name != "actors")
+            still = self._scenes.pop(key, None)
+            if still is None:
+                still = self._packed("scene", lambda: _pickled(scene.with_actors(())))
+            self._scenes[key] = still  # the last used
+            plan = still.name, scene.actors, packed, self._backend
+            self._jobs[job] = self._packed(str(job), lambda: _pickled(plan)), still
         except _UNSENT as error:  # of pickling what a user has defined
             raise JobError(f"The survey cannot be sent to the workers: {error}") from error
-
-    def _add(self, job: int, scene: Scene, survey: bytes) -> str:
-        # What identifies its still part while it exists: jobs of it share their trees.
-        key = tuple(id(getattr(scene, f.name)) for f in fields(scene) if f.name != "actors")
-        still = self._scenes.pop(key, None)
-        if still is None:
-            still = self._packed("scene", lambda: _pickled(scene.with_actors(())))
-        self._scenes[key] = still  # the last used
-        plan = still.name, scene.actors, survey, self._backend
-        rig = self._packed(str(job), lambda: _pickled(plan))
-        self._jobs[job] = rig, still
-        return still.name
+        return packed, still.name
 
     def remove(self, job: int) -> None:
         """Cast nothing more of a job.

@@ -301,7 +301,10 @@ class Run:
             watch.look()
             if now - told >= PROGRESS_EVERY_S or self.finished:
                 told = now
-                self._tell_progress(show, now - started)
+                waits_for = LIDAR if driver.stages.waiting else ""
+                at = replace(self._progress(), seconds=now - started, waits_for=waits_for)
+                self._cluster.call(show, at)
+                self._cluster.call(self._page.on_progress, at, self.under_way)
             pause_s = 0.0 if moved else min(max(0.001, 2 * pause_s), LONGEST_PAUSE_S)
             if driver.stages.ended:
                 time.sleep(pause_s)
@@ -314,12 +317,6 @@ class Run:
             done = len(only.parts.trials)
             self._store.db.add_trials(only.job.number, self._trials.trials[done:])
         self._store.save()
-
-    def _tell_progress(self, show: Show, seconds: float) -> None:
-        waits_for = LIDAR if self._driver.stages.waiting else ""
-        now = replace(self._progress(), seconds=seconds, waits_for=waits_for)
-        self._cluster.call(show, now)
-        self._cluster.call(self._page.on_progress, now, self.under_way)
 
     def _progress(self) -> Progress:
         if (points := self._store.only) is None:

@@ -20,7 +20,7 @@ from raybeam import Pattern, any_axes
 from ..base.arrays import AnyArray, Bools, Floats, Indices, Integers, Ints, Ints32
 from ..base.elementary import exp, log, log_of
 from ..base.errors import LidarpoolError
-from ..base.vectors import products
+from ..base.vectors import applied, products
 from ..scene.scene import Scene
 from ..sensor.leaves import brightness, projection
 from ..sensor.materials import MaterialTable, fresnel
@@ -137,13 +137,13 @@ class RayDifferentials:
         self, before: Floats, after: Floats, normals: Floats, mirrored: Bools, index: Floats
     ) -> None:
         """Turn it at flat surfaces, from directions (n, 3) to others, into another index (n,)."""
-        along, behind = (_aside(_dots(way, normals)) for way in (before, after))
+        along, behind = (_aside(products(way.T, normals.T)) for way in (before, after))
         # Each ray of a differentials arrives where it meets the plane.
-        shift = _dots(self.places, normals[:, None]) / along[:, None]
+        shift = applied(self.places, normals) / along[:, None]
         self.places = self.places - shift[..., None] * before[:, None]
         ratio = np.where(mirrored, 1.0, self.index / index)
         bend = np.where(mirrored, 2.0, ratio - ratio**2 * along / behind)
-        slope = bend[:, None] * _dots(self.ways, normals[:, None])
+        slope = bend[:, None] * applied(self.ways, normals)
         self.ways = ratio[:, None, None] * self.ways - slope[..., None] * normals[:, None]
         self.index = np.where(mirrored, self.index, index)
 
@@ -466,13 +466,6 @@ def _logs() -> Floats:
     """Logarithms of equal steps from 1/2 to 1, with the sign changed, in single precision."""
     steps = (np.arange(1 << 15) + 0.5) / (1 << 16) + 0.5
     return -log(steps).astype(np.float32).astype(np.float64)
-
-
-def _dots(one: Floats, other: Floats) -> Floats:
-    """Scalar products along the last axis, in one order of rounding."""
-    return np.asarray(
-        (one[..., 0] * other[..., 0] + one[..., 1] * other[..., 1]) + one[..., 2] * other[..., 2]
-    )
 
 
 def _aside(cosine: Floats) -> Floats:

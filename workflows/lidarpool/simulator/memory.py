@@ -69,9 +69,8 @@ def _bytes(setup: Setup, scans: int, on_device: bool) -> float:
     made = 0 if repeats else rays
     textured = any(material.reflectance == "texture" for material in survey.materials)
     bodies = RAY_AMONG_BODIES * bool(scene.actors or scene.instances)
-    total = Memory(kept=(RAY + COLOUR * textured) * here + POSE_KEPT * poses + RAY_MADE_KEPT * made)
-    for step in steps:
-        total = total.plus(step.memory(setup, sizes))
+    own = Memory(kept=(RAY + COLOUR * textured) * here + POSE_KEPT * poses + RAY_MADE_KEPT * made)
+    total = Memory(*map(sum, zip(own, *(step.memory(setup, sizes) for step in steps), strict=True)))
     casting: float = POSE * poses + RAY_MADE * made + bodies * (rays if scene.actors else here)
     casting += max(total.casting, total.counting)
     if on_device and not needs_hits(survey):

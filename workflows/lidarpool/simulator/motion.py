@@ -59,9 +59,8 @@ class Firings:
 
     def times(self, ray: Integers) -> Ints:
         """Return the firing times of rays (n,), nanoseconds since the survey's start: (n,)."""
-        times = Clock(self.sensor.begins_ns(self.numbers), self.sensor.beams.time_ns, Ways()).of(
-            ray
-        )
+        clock = Clock(self.sensor.begins_ns(self.numbers), self.sensor.beams.time_ns, Ways())
+        times = clock.of(ray)
         return self.spec.start_ns + np.rint(times, out=times).astype(np.int64)
 
 
@@ -134,7 +133,7 @@ class Poses:
         (path,), times = self.carrier.ways, self.carrier.of(ray)
         velocity, rate = velocities(path, self.station, times)
         places, _ = path.poses(self.station, times)
-        return carried_at(velocity, rate, origins - places)
+        return velocity + np.cross(rate, origins - places)
 
     def rays(self, pattern: Pattern, ray: Integers, start: int = 0) -> tuple[Floats, Floats]:
         """Origins and directions of rays of a pattern, see `Pattern.rays`."""
@@ -204,11 +203,6 @@ def poses_of_firings(
     rates = _turned_by(turns[:-1], turns[1:]) / seconds
     motion = Motion(delays, velocities, rates)
     return Poses(places, rotations, sensor.channels, motion, by_head=spins is not None)
-
-
-def carried_at(velocity: Floats, rate: Floats, lever: Floats) -> Floats:
-    """Velocities of points of bodies: of their origins, their rates, and levers, (n, 3) each."""
-    return velocity + np.cross(rate, lever)
 
 
 def spun(rotations: Floats, spins: Floats) -> Floats:

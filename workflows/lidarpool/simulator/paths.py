@@ -21,7 +21,7 @@ from ..sensor.weather import FAINTEST
 from .doppler import approach, velocities_of_ends
 from .media import LightInMedia, Media, Rays, depths
 from .motion import Clock, Poses, along_rings
-from .returns import GHOST, OF_RETURNS, SURFACE, Keys, Planes, PulseReturns, joined, selected
+from .returns import GHOST, OF_RETURNS, SURFACE, PulseReturns, joined, selected
 from .scene_caster import SceneCaster
 from .step import Memory, PulseBatch, PulseStep, Setup, Sizes
 from .surfaces import Surfaces, light_of
@@ -97,25 +97,9 @@ class CastStep(PulseStep):
 
     def apply(self, returns: PulseReturns, batch: PulseBatch) -> PulseReturns:
         """See `PulseStep.apply`."""
-        given = batch.beams, batch.here, batch.window, batch.keys, batch.start, batch.each
-        batch.hits, batch.planes = self.hits(*given)
-        return batch.hits
-
-    def hits(
-        self,
-        beams: Pattern,
-        poses: Poses,
-        window: tuple[int, int],
-        keys: Keys,
-        first: int = 0,
-        each: int = 1,
-    ) -> tuple[PulseReturns, Planes | None]:
-        """Cast the sub-rays of a window, and follow the light through glass and off mirrors.
-
-        There are `each` of a beam, and the first beam has the number `first` for its keys.
-        """
         from . import surface_loops  # not before: numba takes half a second to import
 
+        beams, poses, window, each = batch.beams, batch.here, batch.window, batch.each
         surfaces, media = self.surfaces, self._media
         materials = surfaces.at(self._light.wavelength_nm)
         nearest, farthest = self.setup.sensor.min_range_m, self.setup.sensor.max_range_m
@@ -131,7 +115,7 @@ class CastStep(PulseStep):
         )
 
         def draw(purpose: Purpose, ray: Ints) -> NDArray[np.uint64]:
-            scan, number = keys.of(first + ray // each)
+            scan, number = batch.keys.of(batch.start + ray // each)
             return raw(self._seed, purpose, scan, number, ray % each)
 
         if self.setup.moving:
@@ -238,11 +222,12 @@ class CastStep(PulseStep):
             order = np.argsort(hits.ray, kind="stable")
             hits = hits.take(order)
             normals = normals if each == 1 else np.concatenate(seen)[order]
-        if each == 1:
-            return hits, None
-        if parts[1:] or len(hits.ray) != len(ray):  # some light ends beyond the range
-            directions = poses.rays(beams, hits.ray, window[0])[1]
-        return hits, (normals, directions)
+        batch.hits = hits
+        if each > 1:
+            if parts[1:] or len(hits.ray) != len(ray):  # some light ends beyond the range
+                directions = poses.rays(beams, hits.ray, window[0])[1]
+            batch.planes = normals, directions
+        return hits
 
     def _behind(
         self,

@@ -11,7 +11,7 @@ import numpy as np
 
 from raybeam import Pattern
 
-from ..base.arrays import Ints, Ints32, owned
+from ..base.arrays import Ints, owned
 from ..scene.scene import Scene
 from ..sensor import Survey
 from .doppler import radial_velocities
@@ -128,11 +128,6 @@ class PulseCaster:
         lit = surfaces.lit(triangle, directions, distance, light, times, poses.ways, colour)
         return returns._replace(energy=lit.energy, colour=colour, velocity=velocity)
 
-    def _tally(self, triangle: Ints32) -> Ints:
-        surfaces = self._surfaces
-        some = triangle[triangle != NO_SURFACE]
-        return np.bincount(surfaces.counter(some), minlength=surfaces.counters)
-
     def _kept(self, returns: PulseReturns, groups: Ints, tally: bool) -> Scanned:
         """Count the returns of each scan and thin them out."""
         from . import pulse_loops  # not before: numba takes half a second to import
@@ -149,4 +144,8 @@ class PulseCaster:
             returns=each[:count],
             reported=thinned.distance,
         )
-        return Scanned(thinned, hits, self._tally(returns.triangle) if tally else None)
+        if not tally:
+            return Scanned(thinned, hits, None)
+        surfaces, some = self._surfaces, returns.triangle[returns.triangle != NO_SURFACE]
+        counted = np.bincount(surfaces.counter(some), minlength=surfaces.counters)
+        return Scanned(thinned, hits, counted)

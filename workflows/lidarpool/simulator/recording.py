@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from ..base.arrays import Floats, Ints, Records
+from ..base.arrays import Floats, Ints
 from ..base.elementary import exp
 from ..columns.waveforms import SILENT, ZERO, record
 from ..sensor.noise import THRESHOLD_SIGMAS, Purpose, normal, raw
@@ -37,82 +37,50 @@ class RecordingStep(PulseStep):
         return Memory(casting=made + recorded, counting=2.3 * recorded)
 
     def apply(self, returns: PulseReturns, batch: PulseBatch) -> PulseReturns:
-        """See `PulseStep.apply`."""
+        """See `PulseStep.apply`.
+
+        A window begins where the echo of its first return does, and returns of the same pulse share
+        it as long as their echoes end within. Windows of a pulse that overlap hold the same
+        samples.
+        """
         assert batch.hits is not None  # as there are sub-rays
-        noise, given = None, returns._replace(ray=returns.ray - batch.start)
-        if self.setup.noise.threshold:
-            sigma = self.setup.noise.threshold / THRESHOLD_SIGMAS
-            here = Keys(batch.keys.scan, batch.keys.begins - batch.start)
-            noise = sigma, self.setup.noise.seed, here
+        hits, each, noise = batch.hits, batch.each, self.setup.noise
         digitizer, count = Digitizer.of(self.setup), self.setup.recorded
-        full = self.setup.noise.full
-        waveform = recorded(batch.hits, given, digitizer, batch.each, count, noise, full)
-        return returns._replace(waveform=waveform)
-
-
-def first_samples(when: Floats, sigma: float) -> tuple[Ints, int]:
-    """First sample of each echo that is not 0, and how many there are, from the times (n,)."""
-    return np.ceil(when - CUT * sigma).astype(np.int64), int(2 * CUT * sigma) + 1
-
-
-def recorded(
-    hits: PulseReturns,
-    returns: PulseReturns,
-    digitizer: Digitizer,
-    each: int,
-    count: int,
-    noise: tuple[float, int, Keys] | None = None,
-    full: float = np.inf,
-) -> Records:
-    """Record the waveform around each return, `count` samples: (n,), see `record`.
-
-    A window begins where the echo of its first return does, and returns of the same pulse share it
-    as long as their echoes end within. Windows of a pulse that overlap hold the same samples.
-
-    Parameters
-    ----------
-    hits
-        Of all sub-rays, `each` of a beam, in the order of rays.
-    returns
-        Their `ray` is the beam, in order.
-    noise
-        Standard deviation of a sample, the seed, and the keys of beams.
-    full
-        Samples are no higher.
-    """
-    out = np.zeros(len(returns.ray), record(count))
-    out["sample_ps"] = round(1000 * digitizer.sample_ns)
-    when = digitizer.samples(returns.distance)
-    first = np.maximum(np.floor(when).astype(np.int64) - digitizer.reach, 0)
-    last = np.ceil(when).astype(np.int64) + digitizer.reach
-    place = numbers(returns.ray)
-    begin = first.copy()
-    for number in range(1, int(place.max(initial=0)) + 1):
-        rows = np.flatnonzero(place == number)
-        shared = (last[rows] < begin[rows - 1] + count) & (first[rows] >= begin[rows - 1])
-        begin[rows] = np.where(shared, begin[rows - 1], first[rows])
-    new = (place == 0) | (np.diff(begin, prepend=-1) != 0)
-    window = np.cumsum(new) - 1
-    beam, begins = returns.ray[new], begin[new]
-    low, high = (np.searchsorted(hits.ray, (beam + step) * each) for step in (0, 1))
-    unit = max(count, each * (2 * digitizer.reach + 1))
-    size = max(1, BLOCK_SAMPLES // unit)
-    out["begin"] = begin
-    for start in range(0, len(beam), size):
-        block = slice(start, start + size)
-        samples = _window(hits, digitizer, each, begins[block], low[block], high[block], count)
-        if noise is not None:
-            sigma, seed, keys = noise
-            scan, ray = keys.of(beam[block])
-            stream = raw(seed, Purpose.SAMPLES, scan, ray)[:, None]
-            number = begins[block, None] + np.arange(count)
-            samples += sigma * normal(seed, Purpose.SAMPLE, stream, number >> 8, number & 255)
-        steps, exponents = digitised(np.minimum(samples, full))
-        low_row, high_row = np.searchsorted(window, [start, start + size])
-        mine = window[low_row:high_row] - start
-        out["samples"][low_row:high_row] = steps[mine]
-        out["exponent"][low_row:high_row] = exponents[mine]
-    return out
+        beams, keys = returns.ray - batch.start, batch.keys
+        here = Keys(keys.scan, keys.begins - batch.start)
+        out = np.zeros(len(beams), record(count))
+        out["sample_ps"] = round(1000 * digitizer.sample_ns)
+        when = returns.distance * digitizer.per_m
+        first = np.maximum(np.floor(when).astype(np.int64) - digitizer.reach, 0)
+        last = np.ceil(when).astype(np.int64) + digitizer.reach
+        place = numbers(beams)
+        begin = first.copy()
+        for number in range(1, int(place.max(initial=0)) + 1):
+            rows = np.flatnonzero(place == number)
+            shared = (last[rows] < begin[rows - 1] + count) & (first[rows] >= begin[rows - 1])
+            begin[rows] = np.where(shared, begin[rows - 1], first[rows])
+        new = (place == 0) | (np.diff(begin, prepend=-1) != 0)
+        window = np.cumsum(new) - 1
+        beam, begins = beams[new], begin[new]
+        low, high = (np.searchsorted(hits.ray, (beam + step) * each) for step in (0, 1))
+        unit = max(count, each * (2 * digitizer.reach + 1))
+        size = max(1, BLOCK_SAMPLES // unit)
+        out["begin"] = begin
+        for start in range(0, len(beam), size):
+            block = slice(start, start + size)
+            samples = _window(hits, digitizer, each, begins[block], low[block], high[block], count)
+            if noise.threshold:
+                scan, ray = here.of(beam[block])
+                stream = raw(noise.seed, Purpose.SAMPLES, scan, ray)[:, None]
+                number = begins[block, None] + np.arange(count)
+                drawn = normal(noise.seed, Purpose.SAMPLE, stream, number >> 8, number & 255)
+                samples += (noise.threshold / THRESHOLD_SIGMAS) * drawn
+            steps, exponents = digitised(np.minimum(samples, noise.full))
+            low_row, high_row = np.searchsorted(window, [start, start + size])
+            mine = window[low_row:high_row] - start
+            out["samples"][low_row:high_row] = steps[mine]
+            out["exponent"][low_row:high_row] = exponents[mine]
+        return returns._replace(waveform=out)
 
 
 def _window(
@@ -128,9 +96,9 @@ def _window(
     sizes = high - low
     mine = np.repeat(np.arange(len(begins)), sizes)
     rows = np.arange(len(mine)) + np.repeat(low - np.cumsum(sizes) + sizes, sizes)
-    when = digitizer.samples(hits.distance[rows])
-    first, many = first_samples(when, digitizer.sigma)
-    time = first[:, None] + np.arange(many)
+    when = hits.distance[rows] * digitizer.per_m
+    first = np.ceil(when - CUT * digitizer.sigma).astype(np.int64)  # that is not 0
+    time = first[:, None] + np.arange(int(2 * CUT * digitizer.sigma) + 1)
     height = exp(-0.5 * ((time - when[:, None]) / digitizer.sigma) ** 2)
     height *= made(hits.energy)[rows, None] / each
     place = time - begins[mine, None]

@@ -1,4 +1,4 @@
-"""Returns of pulses: hits that a receiver cannot tell apart are one return."""
+"""Returns of pulses: hits that a receiver cannot tell apart are one, and which are reported."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..base.arrays import AnyArray, owned
+from ..base.arrays import AnyArray, Bools, owned
 from ..scene.colours import GREY, packed
 from ..sensor.disc import neighbours
 from ..sensor.noise import THRESHOLD_SIGMAS, Noise, Purpose, quantiles, starts
@@ -23,9 +23,9 @@ from .returns import (
     selected,
     unreal,
 )  # fmt: skip
-from .selection import MODES
 from .step import PulseBatch, PulseStep, Setup
 
+MODES: tuple[Mode, ...] = "all", "first", "last", "strongest", "dual"  # as of `pulse_loops`
 _NONE = np.zeros(0)
 
 
@@ -124,3 +124,27 @@ class SeparationStep(PulseStep):
         shown = "all" if setup.receives_more else setup.reporting.mode  # then `SelectionStep`
         report = Report(shown, setup.noise, batch.keys, batch.start)
         return separated(returns, setup.gap_m, batch.each, batch.planes, batch.air, report)
+
+
+class SelectionStep(PulseStep):
+    """Reports some of a pulse's returns, after those that waveforms and receivers made."""
+
+    reads = "ray", "energy", "amplitude"
+
+    @staticmethod
+    def applies(setup: Setup) -> bool:
+        """See `PulseStep.applies`."""
+        return setup.in_waveforms or setup.receives_more
+
+    def apply(self, returns: PulseReturns, batch: PulseBatch) -> PulseReturns:
+        """See `PulseStep.apply`."""
+        return returns.take(chosen(returns, self.setup.reporting.mode))
+
+
+def chosen(returns: PulseReturns, mode: Mode) -> Bools:
+    """Whether a mode reports each return: (n,)."""
+    from . import pulse_loops
+
+    there, number = np.empty(len(returns.ray), np.bool_), MODES.index(mode)
+    pulse_loops.reported(owned(returns.ray, np.int64), owned(returns.height), number, there)
+    return there

@@ -131,10 +131,6 @@ class Memory(NamedTuple):
     casting: float = 0.0  # while some beams are cast
     counting: float = 0.0  # and then, while all returns are counted and thinned out
 
-    def plus(self, other: Memory) -> Memory:
-        """Add that of another step."""
-        return Memory(*(one + more for one, more in zip(self, other, strict=True)))
-
 
 class Emitter:
     """Gives beams of a sensor their sub-rays."""

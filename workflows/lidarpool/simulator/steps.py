@@ -5,19 +5,17 @@ from __future__ import annotations
 from .air import WeatherStep
 from .angle_noise import AngleNoiseStep
 from .crosstalk import CrosstalkStep
-from .detection import DetectionStep
 from .false_alarms import FalseAlarmStep
 from .losses import DirtStep, LossStep
 from .paths import CastStep
 from .range_noise import RangeNoiseStep
 from .recording import RecordingStep
 from .saturation import SaturationStep
-from .selection import SelectionStep
-from .separation import SeparationStep
+from .separation import SelectionStep, SeparationStep
 from .spray import SprayStep
 from .step import PulseStep, Setup
 from .stray_light import StrayLightStep
-from .waveform import WaveformStep
+from .waveform import DetectionStep, WaveformStep
 
 # Where none applies, each ray has one return, its hit.
 STEPS: tuple[type[PulseStep], ...] = (

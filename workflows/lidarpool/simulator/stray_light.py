@@ -58,10 +58,9 @@ class StrayLightStep(PulseStep):
         best, ends = np.zeros(len(rays)), np.zeros((len(rays), 3))  # seen from the origins
         noise, sensor, extinction = self.setup.noise, self.setup.sensor, self._light.extinction
         low, high, faintest = sensor.min_range_m, sensor.max_range_m, FAINTEST * noise.threshold
-        limits, few = (
-            (low, noise.stray_light, faintest, extinction),
-            np.zeros(TRIANGLES_NEAR, np.int64),
-        )
+        limits = low, noise.stray_light, faintest, extinction
+        few = np.zeros(TRIANGLES_NEAR, np.int64)
+        table = self.surfaces.at(self._light.wavelength_nm)
         for actor, retros in groupby(self._retros, key=lambda retro: retro.actor):
             turns, places = None, np.zeros(3)
             if actor is not None:
@@ -72,7 +71,10 @@ class StrayLightStep(PulseStep):
             stray_loops.cones(*beams, cells)
             new = np.zeros(len(rays), np.bool_)
             for retro in retros:
-                given = *retro.places, self._back(retro.triangles), few, *limits
+                one = np.ones(len(retro.triangles))
+                # What they return of a beam that hits them at a distance of 10 m.
+                back = table.scattered(self.surfaces.objects(retro.triangles), one, one)
+                given = *retro.places, back, few, *limits
                 stray_loops.leaks(*beams, cells, *given, best, ends, new)
             if turns is not None:  # back to the axes of the scene
                 rows = np.flatnonzero(new)
@@ -86,12 +88,6 @@ class StrayLightStep(PulseStep):
         free &= ~self._beside(returns, rays[row], distance)
         row = row[free]
         return merged(returns, unreal(returns, rays[row], distance[free], best[row], BLOOMING))
-
-    def _back(self, triangle: Ints32) -> Floats:
-        """Return what retro-reflectors return of a beam that hits them at a distance of 10 m."""
-        surfaces, count = self.surfaces, len(triangle)
-        table = surfaces.at(self._light.wavelength_nm)
-        return table.scattered(surfaces.objects(triangle), np.ones(count), np.ones(count))
 
     def _beside(self, returns: PulseReturns, ray: Ints, distance: Floats) -> Bools:
         """Whether a ray (n,) has a return of its own that cannot be told from one so far away."""

@@ -19,7 +19,6 @@ from ..scene.scene import Scene
 from ..sensor import Sensor, Survey
 from ..sensor.materials import NEAR_NM, Material, MaterialTable, at_right_angles
 from ..sensor.trajectory import velocities
-from .motion import carried_at
 from .voxels import Grids
 from .ways import Ways
 
@@ -259,7 +258,7 @@ class Surfaces:
             if len(bent := ways.deforming(actor)):  # to where they are on the mesh at rest
                 on = moving[bent]
                 corners, _, rest = self._bent(rows[on], actor[bent], times[on], ways)
-                points[on] = _blended(rest, _weights(corners, points[on]))
+                points[on] = applied(rest.transpose(0, 2, 1), _weights(corners, points[on]))
         return self._lookup.at(rows, points)
 
     def velocities(
@@ -273,14 +272,15 @@ class Surfaces:
             if way.moves:
                 at = times[rows].astype(np.float64)
                 places, _ = way.poses(0, at)
-                out[rows] = carried_at(*velocities(way, 0, at), points[rows] - places)
+                velocity, rate = velocities(way, 0, at)
+                out[rows] = velocity + np.cross(rate, points[rows] - places)
         if len(bent := ways.deforming(actor)):
             rows, own = moving[bent], actor[bent]
             at = times[rows].astype(np.float64)
             places, turns = ways.poses(own, at)
             corners, speeds, _ = self._bent(self._find(triangle[rows])[0], own, at, ways)
             weights = _weights(corners, into_axes(points[rows] - places, turns))
-            out[rows] += applied(turns, _blended(speeds, weights))
+            out[rows] += applied(turns, applied(speeds.transpose(0, 2, 1), weights))
         return out
 
     @cached_property
@@ -494,11 +494,6 @@ def _weights(corners: Floats, points: Floats) -> Floats:
     v = (square_2 * along - both * along_2) / area
     w = (square * along_2 - both * along) / area
     return np.stack([1 - v - w, v, w], axis=1)
-
-
-def _blended(corners: Floats, weights: Floats) -> Floats:
-    """Add up rows of corners (n, 3, 3) with weights (n, 3): (n, 3)."""
-    return applied(corners.transpose(0, 2, 1), weights)
 
 
 def _closed(vertices: Floats, faces: Integers) -> bool:

@@ -14,8 +14,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..base.arrays import Floats, owned
+from ..sensor.noise import Purpose
 from ..sensor.optics import FWHM, LIGHT_M_NS, WINDOW_SIGMAS
-from .returns import NO_SURFACE, OF_RETURNS, Planes, PulseReturns, made
+from .returns import NO_SURFACE, OF_RETURNS, Planes, PulseReturns, made, numbers
 from .separation import surfaces_of
 from .step import PulseBatch, PulseStep, Setup
 
@@ -38,6 +39,23 @@ class WaveformStep(PulseStep):
         """See `PulseStep.apply`."""
         found = returns_in(returns, Digitizer.of(self.setup), batch.each, batch.planes)
         return found._replace(ray=batch.start + found.ray)
+
+
+class DetectionStep(PulseStep):
+    """Loses weak returns of waveforms, and a share of all; `SeparationStep` does that itself."""
+
+    reads = "ray", "amplitude"
+    purposes = Purpose.LOSS, Purpose.DETECTION
+
+    @staticmethod
+    def applies(setup: Setup) -> bool:
+        """See `PulseStep.applies`."""
+        return setup.noise.loses and setup.in_waveforms
+
+    def apply(self, returns: PulseReturns, batch: PulseBatch) -> PulseReturns:
+        """See `PulseStep.apply`."""
+        key = *batch.keys.of(returns.ray), numbers(returns.ray)
+        return returns.take(self.setup.noise.detected(returns.height, *key))
 
 
 @dataclass(frozen=True)
@@ -74,10 +92,6 @@ class Digitizer:
     def per_m(self) -> float:
         """Samples in a metre of range."""
         return 2 / LIGHT_M_NS / self.sample_ns
-
-    def samples(self, distance: Floats) -> Floats:
-        """Return when light comes back, samples after the pulse."""
-        return distance * self.per_m
 
     def amplitude(self, energy: Floats, width: Floats) -> Floats:
         """Heights of echoes (n,) by energy and full width at half maximum, ns; 0 is unknown."""
