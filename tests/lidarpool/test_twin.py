@@ -283,8 +283,7 @@ def test_clumps_of_spray_are_those_of_the_twin(each):
     given = begun, KEYS.scan, KEYS.begins, FIRST, far
     out, clumps, left = (np.empty(4000, np.int64), *np.empty((2, 4000))), [], []
     table = each, mean, 1 / kind.slope, tables, exponential()
-    columns = np.concatenate([np.searchsorted(tables[0], crossed[:2]), crossed[2:]])
-    stop, many = pulse_loops.spray(0, beam, columns, *table, *given, *out)
+    stop, many = pulse_loops.spray(0, beam, crossed, *table, *given, *out)
     assert stop == len(beam) and many > 300
     for pulse in range(count):
         boxes = [tuple(one) for one in crossed[:, beam == pulse].T.tolist()]
