@@ -99,7 +99,7 @@ def test_no_random_number_is_used_twice(monkeypatch):
         for known, other in ((raw, recorded), (starts, begun)):
             if name.startswith("lidarpool") and getattr(module, known.__name__, None) is known:
                 monkeypatch.setattr(module, known.__name__, other)
-    for name in ("_uniform", "_scan_of", "particles", "fog", "spray"):  # not compiled
+    for name in ("_uniform", "_scan_of", "_column", "particles", "fog", "spray"):  # not compiled
         monkeypatch.setattr(pulse_loops, name, getattr(pulse_loops, name).py_func)
     monkeypatch.setattr(pulse_loops, "_bits", hashed)
     kinds = rain(20.0), snow(1.0), rain(5.0)
