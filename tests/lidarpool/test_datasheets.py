@@ -24,7 +24,7 @@ from lidarpool.cli.scenario_commands import sensors
 from lidarpool.scenario.advice import advice
 from lidarpool.scenario.build import build
 from lidarpool.scenario.scenario import Scenario
-from lidarpool.sensor.models import Detection, Performance, model_names, read_model
+from lidarpool.sensor.models import Detection, model_names, read_model
 
 RAYS = 20_000
 STATED = [name for name in model_names() if read_model(name).performance]
@@ -89,14 +89,6 @@ def test_stated_false_alarms_are_a_share_of_the_pulses():
     noise = read_model("livox/mid40").datasheet().noise
     gate_s = 2 * (260 - 1) / 299_792_458
     assert -math.expm1(-noise.false_alarm_hz * gate_s) == pytest.approx(1e-4)
-
-
-def test_two_precisions_of_one_energy_are_refused():
-    near = {"sigma_m": 0.02, "range_m": 100, "reflectance": 0.1}
-    far = {"sigma_m": 0.04, "range_m": 50, "reflectance": 0.1}
-    stated = Performance(precision=(near, far), detection={"range_m": 100, "probability": 0.5})
-    with pytest.raises(LidarpoolError, match="does not fall as the energy grows"):
-        stated.noise(1e-6)
 
 
 def carried(**sections):

@@ -286,19 +286,24 @@ def test_a_sensor_is_added_by_one_file(tmp_path):
 LIVOX = "Time/s,Azimuth/deg,Zenith/deg\n"
 GOOD = "name: A\nsources: {}\n"
 VELODYNE = "num_lasers: 2\nlasers: [{laser_id: 0, vert_correction: 0.1, rot_correction: 0.2}"
-OWN = "name: Own\nsources: {}\n"
+NOISY = GOOD + "firing_us: 5\nperformance: {"
+FIRST, SECOND = (f"{{sigma_m: {m}, range_m: 9, reflectance: {m}}}" for m in (0.1, 0.2))
+TWICE = f"detection: {{range_m: 9, probability: 0.5}}, precision: [{FIRST}, {SECOND}]"
 BAD = {
     "field.yaml": (GOOD + "firing_us: 5\nrage_m: [0, 1]", "rage_m is not a field"),
     "light.yaml": (GOOD + "firing_us: 5\noptics: {wavelength_nm: 0.9}", "wavelength_nm.*200"),
     "mirror.yaml": (GOOD + "firing_us: 5\nmirror: {motion: x, width_deg: 9}", "mirror.motion is"),
     "zero.yaml": (GOOD + "firing_us: 0\nbeams: {elevation_deg: [0]}", "firing_us is .* above 0"),
     "short.yaml": (GOOD + "firing_us: 5\nbeams: {elevation_deg: [0, 1], time_us: [0]}", "Beams"),
+    "weak.yaml": (NOISY + "range_at_threshold_m: 1}", "range_at_threshold_m needs detection"),
+    "both.yaml": (NOISY + TWICE + ", range_per_m: 0.1}", "precision takes the place of the other"),
+    "falls.yaml": (NOISY + TWICE + "}", "precision does not fall as the energy grows"),
     "even.yaml": (GOOD + "firing_us: 5\nbeams: {elevation_deg: {first: 1}}", "first, last and"),
     "other.json": ('{"format": 3}', "no beam_altitude_angles"),
     "twice.yml": (VELODYNE.replace("2", "1", 1) + ", {laser_id: 0}]", "must have lasers 0 to 0"),
     "yaml.yaml": ("name: [", "not a usable model: while parsing"),
     "empty.csv": ("\n", "it is empty"),
-    "many.yaml": (OWN + "beams: {elevation_deg: {first: 0, last: 1, count: 99999999999}}", "most"),
+    "many.yaml": (GOOD + "beams: {elevation_deg: {first: 0, last: 1, count: 99999999999}}", "most"),
     "prose.csv": ("dear reader\n1,2", "'dear reader', has no known format"),
     "prose.json": ("{", "Expecting property name"),
     "mode.json": (json.dumps({**OLD, "lidar_mode": 7}), "not enough values"),

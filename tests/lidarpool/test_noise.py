@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from dataclasses import replace
+from types import FunctionType
 
 import numpy as np
 from tests.shapes import block, level
@@ -99,9 +100,11 @@ def test_no_random_number_is_used_twice(monkeypatch):
         for known, other in ((raw, recorded), (starts, begun)):
             if name.startswith("lidarpool") and getattr(module, known.__name__, None) is known:
                 monkeypatch.setattr(module, known.__name__, other)
-    for name in ("_uniform", "_scan_of", "_column", "particles", "fog", "spray"):  # not compiled
-        monkeypatch.setattr(pulse_loops, name, getattr(pulse_loops, name).py_func)
-    monkeypatch.setattr(pulse_loops, "_bits", hashed)
+    plain = vars(pulse_loops) | {"_bits": hashed}  # others are compiled without these
+    for name in ("_uniform", "_scan_of", "_column", "particles", "fog", "spray"):
+        plain[name] = FunctionType(getattr(pulse_loops, name).py_func.__code__, plain)
+    for name in ("particles", "fog", "spray"):
+        monkeypatch.setattr(pulse_loops, name, plain[name])
     kinds = rain(20.0), snow(1.0), rain(5.0)
     monkeypatch.setattr(Weather, "particles", property(lambda _: kinds))
     scene, survey = everything()

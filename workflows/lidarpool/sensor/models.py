@@ -146,13 +146,13 @@ class Performance(_ModelSection):
     mode: Mode = "strongest"
 
     @model_validator(mode="after")
-    def _one_precision(self) -> Performance:
-        if self.precision is not None and (self.range_m is not None or self.detection is None):
-            raise ValueError(
-                "precision needs detection, and takes the place of range_m and range_per_m"
-            )
-        if self.false_alarms is not None and self.detection is None:
-            raise ValueError("false_alarms needs detection")
+    def _whole(self) -> Performance:
+        if self.precision and (self.range_m or self.range_per_m or self.range_at_threshold_m):
+            raise ValueError("precision takes the place of the other figures of ranges")
+        for name in ("precision", "false_alarms", "range_at_threshold_m"):
+            if getattr(self, name) and self.detection is None:
+                raise ValueError(f"{name} needs detection")
+        self.noise(1.0)  # LidarpoolError if it cannot be made
         return self
 
     def noise(self, gate_s: float) -> Noise:
@@ -220,7 +220,7 @@ class SensorModel(_ModelSection):
         """Whether its rays need a calibration file."""
         return not (self.beams.elevation_deg or self.mirror or self.prisms)
 
-    def datasheet(self, seed: int = 0) -> Datasheet:
+    def datasheet(self) -> Datasheet:
         """Return its noise and returns; LidarpoolError if its file states no performance."""
         stated = self.performance
         if stated is None:

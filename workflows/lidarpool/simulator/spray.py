@@ -12,7 +12,7 @@ import numpy as np
 
 from raybeam.moving import near_boxes
 
-from ..base.arrays import Floats, Ints
+from ..base.arrays import Floats, Ints, owned
 from ..base.vectors import into_axes, length
 from ..scene.actors import check_spray
 from ..sensor.noise import Purpose, starts
@@ -122,7 +122,7 @@ class SprayStep(PulseStep):
         while room < count:  # mostly, some rays of a cell meet a box
             room, beam, found = count, np.empty(count, np.int64), np.empty((3, count))
             count = pulse_loops.crossings(rays, times, far, size, *pairs, beam, found)
-        return place[beam[:count]], found[:, :count]
+        return place[beam[:count]], owned(found[:, :count])
 
     def _boxes(self, ways: Ways, begin: float, end: float) -> tuple[Floats, Floats, Floats]:
         """Boxes of spray, and when they are there, as of `near_boxes`; their densities (b,)."""

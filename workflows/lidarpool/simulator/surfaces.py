@@ -51,8 +51,8 @@ class Lit(NamedTuple):
 
 
 def light_of(survey: Survey, sensor: Sensor) -> Light:
-    """Light of a sensor in the air of a survey."""
-    return Light(sensor.optics.wavelength_nm, survey.extinction(sensor), survey.wet)
+    """Light of a sensor in the air of a survey, in floats: of an int, loops compile once more."""
+    return Light(sensor.optics.wavelength_nm, survey.extinction(sensor), float(survey.wet))
 
 
 def warn_of_grey(scene: Scene, survey: Survey) -> None:
