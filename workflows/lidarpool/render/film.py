@@ -26,7 +26,7 @@ _HEADING = 0.12  # of the film, before and after, tells where the carrier is hea
 _AWAY, _SLOPE = 1.25, 0.62  # of a camera that circles: times the size, and up for a metre away
 _NEAR, _HAZE = 0.3, 6.0  # times the focus: nearer surfaces are left out, farther ones vanish
 _OLD, _FADES = 0.42, 3.0  # brightness of old points; frames in which new ones come near it
-_SIZES, _SPARSE = (1.5, 2.3), 100_000  # half pixels; more points are smaller
+_DOT = 2.3  # half pixels: the radius of points
 _NOISE = 0.02  # of the distance, that a point may lie beside its surface
 
 _Shape = tuple[RayCaster, Floats, Floats]  # of triangles: their normals (f, 3) and colour (4,)
@@ -71,11 +71,10 @@ class Film:
             slack = _NOISE * distance + 2 * camera.footprint(distance)
             shown = (distance <= surface + slack) & (distance >= _NEAR * focus)
             shown &= (born == number) | (distance >= surface - slack) | np.isinf(surface)
-            rows = np.flatnonzero(shown)
-            rows = rows[np.argsort(-distance[rows], kind="stable")]
-            fade = _OLD + (1 - _OLD) * np.exp((born[rows] - number) / _FADES)
-            size = np.clip(_SIZES[1] * (_SPARSE / (len(rows) + 1)) ** 0.5, *_SIZES)
-            image = splat(image, pixels[rows], BACK + (paint[rows] - BACK) * fade[:, None], size)
+            fade = _OLD + (1 - _OLD) * np.exp((born - number) / _FADES)
+            rows = np.flatnonzero(shown)  # of points on one surface, the newest are drawn last
+            rows = rows[np.argsort((fade * slack - distance)[rows], kind="stable")]
+            image = splat(image, pixels[rows], BACK + (paint[rows] - BACK) * fade[rows, None], _DOT)
             frame = Image.fromarray(np.round(255 * image[..., :3]).astype(np.uint8))
             pen, (way, _) = ImageDraw.Draw(frame), camera.project(places[: number + 1])
             line = [(float(x), float(y)) for x, y in way if max(abs(x), abs(y)) < _FAR_OUT]

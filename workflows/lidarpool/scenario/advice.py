@@ -104,7 +104,7 @@ def _of_datasheets(built: Built) -> Iterator[str]:
         lacking = (name for name in STATED if not getattr(carried.noise, name, True))
         if left := [name for name in lacking if name not in given]:
             lacks = ", ".join(f"{STATED[name]} (noise.{name})" for name in left)
-            yield f"the data sheet of {section.model} does not state {lacks}: they have no effect"
+            yield f"{section.model} gives no {lacks}: they have no effect"
 
 
 def _without_effect(scenario: Scenario) -> Iterator[str]:
