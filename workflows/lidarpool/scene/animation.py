@@ -50,7 +50,7 @@ class Animation:
         poses = as_array("vertices of an animation", self.vertices)
         object.__setattr__(self, "vertices", np.ascontiguousarray(poses))
         shape, speed = np.shape(self.vertices), self.speed_m_s
-        good = len(shape) == 3 and shape[0] > 1 and shape[2] == 3
+        good = len(shape) == 3 and shape[0] > 1 and shape[1] > 0 and shape[2] == 3
         good = good and self.step_s > 0 and (speed is None or speed > 0)
         if not good or not np.isfinite(self.vertices).all():
             raise LidarpoolError(

@@ -13,7 +13,7 @@ from raybeam.embree_rays import any_axes
 
 from ..base.elementary_loops import arctan2, sin_cos
 from ..sensor.optics import LIGHT_M_NS
-from .surface_loops import _at_right_angles
+from .surface_loops import at_right_angles
 
 CELL_RAYS = 1 << 8  # consecutive rays that are compared with retro-reflectors at a time
 STRAY_MOST = math.radians(30.0)  # no stray light comes from farther aside
@@ -99,7 +99,7 @@ def leaks(starts, ahead, cells, corners, middles, middle, radius, back, few, nea
             wide = arctan2(sine, math.sqrt((1 - sine) * (1 + sine)))
             off = _angle(((cells[c, 0] * x + cells[c, 1] * y) + cells[c, 2] * z) / far)
         # The angle at which the light becomes too faint.
-        whole = back[0] * _at_right_angles(max(far - size, max(nearest_m, 1e-3)), extinction)
+        whole = back[0] * at_right_angles(max(far - size, max(nearest_m, 1e-3)), extinction)
         reach = math.radians(math.sqrt(share / (faintest / max(whole, 1e-300))))
         reach = min(reach, STRAY_MOST) + wide
         if off > cells[c, 3] + reach:
@@ -137,7 +137,7 @@ def leaks(starts, ahead, cells, corners, middles, middle, radius, back, few, nea
                 z = place[2] + INWARDS * ((middles[t, 2] - oz) - place[2])
                 distance = math.sqrt((x * x + y * y) + z * z)
                 energy = min(share / (angle * angle), 1.0) * (
-                    back[t] * _at_right_angles(distance, extinction)
+                    back[t] * at_right_angles(distance, extinction)
                 )
                 if energy > best[k]:
                     best[k], new[k] = energy, True

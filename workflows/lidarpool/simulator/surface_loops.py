@@ -94,7 +94,7 @@ def meet(
 
 
 @inlined
-def _at_right_angles(distance, extinction):
+def at_right_angles(distance, extinction):
     """As `materials.at_right_angles`, of one distance."""
     far = max(distance, NEAREST_M)
     nearer = REFERENCE_M / far
@@ -106,7 +106,7 @@ def _at_right_angles(distance, extinction):
 def fade(distance, extinction, energy):
     """Multiply energies by what `at_right_angles` says of distances."""
     for k in range(len(energy)):
-        energy[k] *= _at_right_angles(distance[k], extinction)
+        energy[k] *= at_right_angles(distance[k], extinction)
 
 
 @compiled()
@@ -151,7 +151,7 @@ def onward(
         if len(film) and film[k]:
             goes = (1 - wet) * goes + wet * fresnel(cosine, WATER_INDEX)
         goes = before[k] * (goes * goes)
-        if goes * (brightest * _at_right_angles(distance[k], extinction)) > faintest:
+        if goes * (brightest * at_right_angles(distance[k], extinction)) > faintest:
             on[count], off[count], share[count] = k, off[j], goes
             count += 1
     return count
