@@ -659,11 +659,13 @@ def test_people_of_traffic_walk_at_their_own_speed_and_out_of_step(tmp_path):
         for t in range(4)
     )
     (tmp_path / "fcd.xml").write_text(f"<fcd-export>{steps}</fcd-export>")
-    shape = {"file": "pedestrian.glb", "animation": {"name": "Walk", "speed_m_s": 1.4}}
+    walk = {"name": "Walk", "speed_m_s": 1.4, "offset_s": 50}
+    shape = {"file": "pedestrian.glb", "animation": walk}
     traffic = {"file": "fcd.xml", "vehicles": [{"types": "*", **shape}]}
     built = build(scenario(tmp_path, traffic=traffic, steps=36 * 20))
     walks, stands = built.scene.actors
     assert walks.mesh.animation is stands.mesh.animation and walks.offset_s != stands.offset_s
+    assert min(walks.offset_s, stands.offset_s) >= 50
     times = np.array([0.0, 1.5e9])
     np.testing.assert_allclose(np.diff(walks.seconds(times)[0]), 1.5 / 1.4)
     np.testing.assert_allclose(np.diff(stands.seconds(times)[0]), 0)

@@ -105,7 +105,7 @@ def _chunks(data: bytes) -> tuple[dict[str, Any], bytes]:
         if len(data) < total:
             raise MeshFileError(f"is cut short: {total} bytes announced, {len(data)} there")
         body = data[28 + size : total]
-        data = data[20 : 20 + size]
+        data = data[20 : 20 + size].rstrip(b"\0")  # with which some programs pad it
     elif data[:1] not in b"{[ \t\r\n":
         raise MeshFileError("is not glTF")
     try:
