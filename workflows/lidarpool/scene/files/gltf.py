@@ -46,7 +46,6 @@ from .gltf_animation import WIDTHS, AnimatedNodes, chosen, keys_of, played
 from .polygons import check_corners, fanned, unrolled
 from .scene_graph import (
     MOST_NODES,
-    SMALLER,
     Content,
     MeshFileError,
     Node,
@@ -151,8 +150,7 @@ class _Reader:
     ) -> None:
         self._header, self._body, self._path = header, body, path
         self._wanted = wanted
-        still = wanted.animation is None
-        self._allowance = Allowance(size, SMALLER if still else "shorten its animation")
+        self._allowance = Allowance(size, wanted.advice)
         self._same: dict[str, int] = {}  # {primitives of a mesh: the first with these}
         nodes = header.get("nodes", ())
         self._parents = {

@@ -51,6 +51,12 @@ class Wanted(NamedTuple):
     folders: tuple[Path, ...]  # resolved; files that it names are read only from these and below
     animation: str | None = None  # to bake, by its name; "" for the first
 
+    @property
+    def advice(self) -> str:
+        """What helps if a file unpacks to too much."""
+        shorter = "shorten its animation, or take a mesh of fewer vertices"
+        return SMALLER if self.animation is None else shorter
+
     def allows(self, file: Path) -> bool:
         """Whether a file that is named may be read."""
         return any(file.resolve().is_relative_to(folder) for folder in self.folders)
