@@ -208,6 +208,8 @@ def test_a_wheel_of_a_file_turns_as_animated_even_if_it_shrinks_to_nothing(tmp_p
         (lambda h: None, "Walk", r"has no animation 'Walk' \(there are Move\)\.$"),
         (lambda h: h.pop("animations"), "", "has no animations: export it with them, or leave out"),
         (lambda h: h["skins"][0].update(joints=[]), "Move", "has a skin without joints"),
+        (lambda h: h["accessors"][h["skins"][0]["inverseBindMatrices"]].update(count=1), "Move",
+         "cannot reshape"),
         (lambda h: h["accessors"][-2].update(count=1), "Move", "without a duration"),
         (lambda h: h["nodes"][2].update(matrix=np.eye(4).ravel().tolist()), "Move",
          "node 2 is animated, and has a matrix"),

@@ -319,7 +319,7 @@ class _Reader:
         worlds = np.array([self._world(joint) for joint in found["joints"]])
         if (bound := found.get("inverseBindMatrices")) is not None:
             columns = self._accessor(bound).astype(np.float64)[: len(worlds)]
-            worlds = matmul(worlds, columns.reshape(-1, 4, 4).transpose(0, 2, 1))
+            worlds = matmul(worlds, columns.reshape(len(worlds), 4, 4).transpose(0, 2, 1))
         return worlds
 
     def _skinned(self, vertices: Floats, at: dict[str, Any], joints: Floats) -> Floats:

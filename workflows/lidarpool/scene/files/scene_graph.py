@@ -203,7 +203,7 @@ def settled(placed: Sequence[PlacedNode], *, copy_all: bool = False) -> Content:
 def baked(poses: Iterable[Content], times_s: Sequence[float], allowance: Allowance) -> Content:
     """Join poses of the same meshes, at times that are even, to one content that is animated."""
     if not times_s[-1] > times_s[0]:
-        raise MeshFileError("has an animation without a duration: export it again")
+        raise MeshFileError("has an animation without a duration: give it two keys, or choose another")
     content, moves, count, taken = Content(()), list[Floats](), len(times_s), 0
     for number, pose in zip(range(count), poses, strict=False):
         now = [mesh.vertices for mesh in pose.meshes if isinstance(mesh, SceneMesh)]
