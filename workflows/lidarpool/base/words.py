@@ -33,8 +33,7 @@ def as_python(note: str) -> str:
 
 def as_scenario(note: str) -> str:
     """Return a note with its settings as in a scenario: {file: …, up_axis: z}, also of an actor."""
-    note = re.sub(r"<file\.(\w+)=\W?(\w+)\W?>", r"{file: …, \1: \2}", note)
-    return _SETTING.sub(r"\2: \4 in \1", note)
+    return _SETTING.sub(r"\2: \4 in \1", re.sub(r"<file.(.+)=.(\w+).>", r"{file: …, \1: \2}", note))
 
 
 def plural(number: float, what: str, several: str = "") -> str:

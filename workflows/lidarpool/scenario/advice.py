@@ -133,11 +133,11 @@ def _without_effect(scenario: Scenario) -> Iterator[str]:
 def _ended(built: Built) -> Iterator[str]:
     """Tell of frozen sensors without sweeps, and of actors that are not there, or end early."""
     survey, end = built.survey, np.array([built.survey.duration_ns])
-    for place, fault in enumerate(survey.faults):
-        numbers = (n for n in range(len(survey.carried)) if place in faults_of(survey, n, "frozen"))
-        begins = [survey.sweeps_each[number][1] for number in numbers]
-        if begins and not fault.during(np.concatenate(begins)).any():
-            yield f"faults[{place}] has no effect: no sweep begins while the sensor is frozen"
+    for number, (_, begins, _) in enumerate(survey.sweeps_each):
+        for place, fault in faults_of(survey, number, "frozen").items():
+            if not fault.during(begins).any():
+                sensor = survey.carried[number].name or "the sensor"
+                yield f"faults[{place}] does not freeze {sensor}: no sweep begins meanwhile"
     for actor in built.scene.actors:
         first, last = presence_ns(actor.trajectory)
         if first > end[0] or last < 0:

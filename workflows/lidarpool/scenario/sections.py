@@ -238,10 +238,9 @@ class AnimationSection(Section):
         ),
     ] = None
     repeat: Annotated[bool, about("begin again at its end; else the last pose remains")] = True
-    offset_s: Annotated[
-        float,
-        about("where in it the survey begins, or with speed_m_s the way, seconds", ge=-1e9, le=1e9),
-    ] = 0.0
+    offset_s: Annotated[float, about("where in it the survey begins, seconds", ge=-1e9, le=1e9)] = (
+        0.0
+    )
 
 
 class DeformingSection(ShapeSection):

@@ -547,8 +547,7 @@ def _check_noise(noise: Noise, sensor: Sensor) -> None:
             "give one for each channel, or their standard deviation."
         )
     if noise.ripple_deg and sensor.spins(np.zeros(1, np.int64)) is None:
-        told = f"noise.ripple_deg needs a head that turns, unlike {sensor.model}'s"
-        raise LidarpoolError(f"{told}: leave it out.")
+        raise LidarpoolError(f"noise.ripple_deg needs a head that turns, unlike {sensor.model}'s.")
     if noise.false_alarm_hz and not sensor.gate_s < float("inf"):
         raise LidarpoolError(
             f"noise.false_alarm_hz needs a sensor with a greatest range, and {sensor.model} has "

@@ -46,6 +46,8 @@ from .gltf_animation import WIDTHS, AnimatedNodes, chosen, keys_of, played
 from .polygons import check_corners, fanned, unrolled
 from .scene_graph import (
     MOST_NODES,
+    SHORTER,
+    SMALLER,
     Content,
     MeshFileError,
     Node,
@@ -150,7 +152,7 @@ class _Reader:
     ) -> None:
         self._header, self._body, self._path = header, body, path
         self._wanted = wanted
-        self._allowance = Allowance(size, wanted.advice)
+        self._allowance = Allowance(size, SMALLER if wanted.animation is None else SHORTER)
         self._same: dict[str, int] = {}  # {primitives of a mesh: the first with these}
         nodes = header.get("nodes", ())
         self._parents = {

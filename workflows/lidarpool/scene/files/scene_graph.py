@@ -22,7 +22,8 @@ from ..scene_instances import SceneInstance
 from ..scene_mesh import Cutout, SceneMesh, compacted, stacked
 from .polygons import check_corners
 
-SMALLER = "export it in parts, or as .ply"  # what helps if a file unpacks to too much
+# What helps if a file unpacks to too much, without and with an animation.
+SMALLER, SHORTER = "export it in parts, or as .ply", "shorten its animation or simplify its mesh"
 # A mesh becomes one of instances if that saves so many triangles; single triangles are cast faster.
 SHARED_TRIANGLES = 100_000
 MOST_NODES = 200_000  # most nodes of a scene, counting every instance
@@ -50,12 +51,6 @@ class Wanted(NamedTuple):
     colours: bool
     folders: tuple[Path, ...]  # resolved; files that it names are read only from these and below
     animation: str | None = None  # to bake, by its name; "" for the first
-
-    @property
-    def advice(self) -> str:
-        """What helps if a file unpacks to too much."""
-        shorter = "shorten its animation, or take a mesh of fewer vertices"
-        return SMALLER if self.animation is None else shorter
 
     def allows(self, file: Path) -> bool:
         """Whether a file that is named may be read."""
@@ -203,7 +198,7 @@ def settled(placed: Sequence[PlacedNode], *, copy_all: bool = False) -> Content:
 def baked(poses: Iterable[Content], times_s: Sequence[float], allowance: Allowance) -> Content:
     """Join poses of the same meshes, at times that are even, to one content that is animated."""
     if not times_s[-1] > times_s[0]:
-        raise MeshFileError("has an animation without a duration: give it two keys, or choose another")
+        raise MeshFileError("has an animation without a duration: give it two keys")
     content, moves, count, taken = Content(()), list[Floats](), len(times_s), 0
     for number, pose in zip(range(count), poses, strict=False):
         now = [mesh.vertices for mesh in pose.meshes if isinstance(mesh, SceneMesh)]
