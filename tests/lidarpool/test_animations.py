@@ -208,6 +208,8 @@ def test_a_wheel_of_a_file_turns_as_animated_even_if_it_shrinks_to_nothing(tmp_p
         (lambda h: None, "Walk", r"has no animation 'Walk' \(there are Move\)\.$"),
         (lambda h: h.pop("animations"), "", "has no animations: export it with them, or leave out"),
         (lambda h: h["skins"][0].update(joints=[]), "Move", "has a skin without joints"),
+        (lambda h: h["accessors"][h["skins"][0]["inverseBindMatrices"]].update(count=1), "Move",
+         "cannot reshape"),
         (lambda h: h["accessors"][-2].update(count=1), "Move", "without a duration"),
         (lambda h: h["nodes"][2].update(matrix=np.eye(4).ravel().tolist()), "Move",
          "node 2 is animated, and has a matrix"),
@@ -659,11 +661,13 @@ def test_people_of_traffic_walk_at_their_own_speed_and_out_of_step(tmp_path):
         for t in range(4)
     )
     (tmp_path / "fcd.xml").write_text(f"<fcd-export>{steps}</fcd-export>")
-    shape = {"file": "pedestrian.glb", "animation": {"name": "Walk", "speed_m_s": 1.4}}
+    walk = {"name": "Walk", "speed_m_s": 1.4, "offset_s": 50}
+    shape = {"file": "pedestrian.glb", "animation": walk}
     traffic = {"file": "fcd.xml", "vehicles": [{"types": "*", **shape}]}
     built = build(scenario(tmp_path, traffic=traffic, steps=36 * 20))
     walks, stands = built.scene.actors
     assert walks.mesh.animation is stands.mesh.animation and walks.offset_s != stands.offset_s
+    assert min(walks.offset_s, stands.offset_s) >= 50
     times = np.array([0.0, 1.5e9])
     np.testing.assert_allclose(np.diff(walks.seconds(times)[0]), 1.5 / 1.4)
     np.testing.assert_allclose(np.diff(stands.seconds(times)[0]), 0)

@@ -16,7 +16,7 @@ CORNERS = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]], "<f4").tobytes()
 
 def glb(header, body=b""):
     text = json.dumps(header).encode()
-    text += b" " * (-len(text) % 4)
+    text += b"\0" * (-len(text) % 4)  # as some programs have it; the standard has spaces
     chunks = struct.pack("<II", len(text), 0x4E4F534A) + text
     if body:
         chunks += struct.pack("<II", len(body), 0x004E4942) + body

@@ -22,8 +22,8 @@ def did_you_mean(word: str, known: Iterable[str]) -> str:
 
 
 # In a note, a setting; and the calls of Python that take those of a section.
-_SETTING = re.compile(r'<(scene\.files|cloud|materials)\.(\w+)=("?)(\w+)\3>')
-_CALLS = {"scene.files": "Scene.load(path", "cloud": "Survey(…", "materials": "Material(…"}
+_SETTING = re.compile(r'<(file|cloud|materials)\.(\w+)=("?)(\w+)\3>')
+_CALLS = {"file": "Scene.load(path", "cloud": "Survey(…", "materials": "Material(…"}
 
 
 def as_python(note: str) -> str:
@@ -32,8 +32,8 @@ def as_python(note: str) -> str:
 
 
 def as_scenario(note: str) -> str:
-    """Return a note with its settings as in a scenario: up_axis: z in scene.files."""
-    return _SETTING.sub(r"\2: \4 in \1", note)
+    """Return a note with its settings as in a scenario: {file: …, up_axis: z}, also of an actor."""
+    return _SETTING.sub(r"\2: \4 in \1", re.sub(r"<file.(.+)=.(\w+).>", r"{file: …, \1: \2}", note))
 
 
 def plural(number: float, what: str, several: str = "") -> str:

@@ -330,7 +330,7 @@ def sample_survey(scene: Scene, survey: Survey, backend: str = "auto") -> dict[s
     rays = survey.ray_count * subrays * int((stops - firsts).sum()) // survey.scan_count
     sampled = survey
     if (every := -(-rays // SAMPLE_RAYS)) > 1:
-        # Faults and errors of certain channels do not fit one beam, and change few hits.
+        # Faults and errors of certain channels do not fit one beam.
         other: dict[str, Any] = {"channel_bias_m": 0.0, "ripple_deg": 0.0}
         carried = [
             replace(
@@ -545,9 +545,11 @@ def _of_job(job: Job, found: dict[str, Any]) -> Iterator[str]:
         left = f"{100 * math.exp(-100 * alpha):.2g} % of the light from 50 m is left"
         yield f"air         takes {1000 * alpha:.3g}/km: {left}"
     if estimate:
+        without = job.survey.faults and 2 * estimate["rays"] < job.survey.ray_count
         yield (
             f"points      about {estimate['points']:,} of {estimate['hits']:,} hits, rounded to "
             f"{job.survey.precision_m:g} m; an estimate from {estimate['rays']:,} rays cast here"
+            f"{', without faults' if without else ''}"
         )
     yield f"planning    {f'{job.trials:,} trials' if job.trials else 'none'}"
     backend = found["backend"]

@@ -171,7 +171,8 @@ def no_hits(job: Job) -> str:
     (x, y, z) = job.survey.pose(0).position + job.scene.origin
     where = f"the sensor begins at ({x:,.3f}, {y:,.3f}, {z:,.3f})"
     seen = seen_from(job.scene, job.survey.carried[0])
-    return f"no ray hit anything: check poses, ranges and units; {where}; {seen}"
+    faults = "faults, " * bool(job.survey.faults)
+    return f"no ray hit anything: check {faults}poses, ranges and units; {where}; {seen}"
 
 
 def _of_result(

@@ -441,7 +441,8 @@ def actors_of(
         named = replace(mesh, name=f"{entry.name or one.kind} ({one.name})")
         # Those of one entry do not walk in step.
         share = zlib.crc32(one.name.encode()) / 2**32
-        offset_s = 0.0 if mesh.animation is None else share * mesh.animation.duration_s
+        offset_s = 0.0 if entry.animation is None else entry.animation.offset_s
+        offset_s += 0.0 if mesh.animation is None else share * mesh.animation.duration_s
         actors += [(Actor(named, way, offset_s), entry) for way in ways]
         if len(actors) > ACTORS_MOST:
             raise LidarpoolError(

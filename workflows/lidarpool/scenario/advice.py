@@ -9,8 +9,10 @@ import numpy as np
 from ..base.words import as_scenario, plural
 from ..columns.table import VELOCITY
 from ..scene.files.meshfile import CITYJSON, UNITLESS, wrote_it
+from ..sensor.faults import faults_of
 from ..sensor.materials import MaterialTable
 from ..sensor.models import STATED
+from ..sensor.trajectory import presence_ns
 from .build import Built
 from .placing import inside_note
 from .scenario import Scenario
@@ -129,9 +131,17 @@ def _without_effect(scenario: Scenario) -> Iterator[str]:
 
 
 def _ended(built: Built) -> Iterator[str]:
-    """Tell of actors whose animation ends before the survey does."""
-    end = np.array([built.survey.duration_ns])
+    """Tell of frozen sensors without sweeps, and of actors that are not there, or end early."""
+    survey, end = built.survey, np.array([built.survey.duration_ns])
+    for number, (_, begins, _) in enumerate(survey.sweeps_each):
+        for place, fault in faults_of(survey, number, "frozen").items():
+            if not fault.during(begins).any():
+                sensor = survey.carried[number].name or "the sensor"
+                yield f"faults[{place}] does not freeze {sensor}: no sweep begins meanwhile"
     for actor in built.scene.actors:
+        first, last = presence_ns(actor.trajectory)
+        if first > end[0] or last < 0:
+            yield f"{actor.name} is not in the scene during the survey: check its times"
         own = actor.mesh.animation
         if own and not own.repeat and actor.seconds(end)[0][0] > own.duration_s:
             yield (

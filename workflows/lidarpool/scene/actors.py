@@ -37,7 +37,7 @@ class Actor:
         Poses of its axes, in the scene's local coordinates; its only station begins with the
         survey. By default it stands at zero, until `Scanner.move` moves it.
     offset_s
-        Where in the mesh's animation, if it has one, it is when the survey begins, seconds.
+        Where in the mesh's animation it is as the survey, or by speed the way, begins, seconds.
     spray
         Whether it raises spray where the weather has some, and it moves.
 

@@ -543,7 +543,8 @@ def _check_noise(noise: Noise, sensor: Sensor) -> None:
     biases, channels = noise.channel_bias_m, sensor.channels
     if isinstance(biases, Sequence) and len(biases) != channels:
         raise LidarpoolError(
-            f"noise.channel_bias_m has {len(biases)} numbers; {sensor.model} needs {channels}."
+            f"noise.channel_bias_m has {len(biases)} numbers; {sensor.model} needs {channels}: "
+            "give one for each channel, or their standard deviation."
         )
     if noise.ripple_deg and sensor.spins(np.zeros(1, np.int64)) is None:
         raise LidarpoolError(f"noise.ripple_deg needs a head that turns, unlike {sensor.model}'s.")

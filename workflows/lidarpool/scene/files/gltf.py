@@ -46,6 +46,7 @@ from .gltf_animation import WIDTHS, AnimatedNodes, chosen, keys_of, played
 from .polygons import check_corners, fanned, unrolled
 from .scene_graph import (
     MOST_NODES,
+    SHORTER,
     SMALLER,
     Content,
     MeshFileError,
@@ -105,7 +106,7 @@ def _chunks(data: bytes) -> tuple[dict[str, Any], bytes]:
         if len(data) < total:
             raise MeshFileError(f"is cut short: {total} bytes announced, {len(data)} there")
         body = data[28 + size : total]
-        data = data[20 : 20 + size]
+        data = data[20 : 20 + size].rstrip(b"\0")  # with which some programs pad it
     elif data[:1] not in b"{[ \t\r\n":
         raise MeshFileError("is not glTF")
     try:
@@ -151,8 +152,7 @@ class _Reader:
     ) -> None:
         self._header, self._body, self._path = header, body, path
         self._wanted = wanted
-        still = wanted.animation is None
-        self._allowance = Allowance(size, SMALLER if still else "shorten its animation")
+        self._allowance = Allowance(size, SMALLER if wanted.animation is None else SHORTER)
         self._same: dict[str, int] = {}  # {primitives of a mesh: the first with these}
         nodes = header.get("nodes", ())
         self._parents = {
@@ -321,7 +321,7 @@ class _Reader:
         worlds = np.array([self._world(joint) for joint in found["joints"]])
         if (bound := found.get("inverseBindMatrices")) is not None:
             columns = self._accessor(bound).astype(np.float64)[: len(worlds)]
-            worlds = matmul(worlds, columns.reshape(-1, 4, 4).transpose(0, 2, 1))
+            worlds = matmul(worlds, columns.reshape(len(worlds), 4, 4).transpose(0, 2, 1))
         return worlds
 
     def _skinned(self, vertices: Floats, at: dict[str, Any], joints: Floats) -> Floats:

@@ -261,7 +261,7 @@ def _tell_axes(
     else:
         return
     (axes or (warn if why else lambda note: _log.info(as_python(note))))(
-        f'{path.name} {done}; if it lies on its side, give <scene.files.up_axis="{other}">; any '
+        f'{path.name} {done}; if it lies on its side, give <file.up_axis="{other}">; any '
         "up_axis ends this note"
     )
 

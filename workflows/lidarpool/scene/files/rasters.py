@@ -457,7 +457,7 @@ def _unit_m(stated: str | None, own: Any, up_m: float | None, notes: list[str]) 
         name, metre = own.linear_units_factor
         notes.append(
             f"states no unit of heights: taken in {name}, as its coordinates are; "
-            '<scene.files.unit="m"> takes them in metres'
+            '<file.unit="m"> takes them in metres'
         )
         return float(metre)
     return 1.0

@@ -22,7 +22,8 @@ from ..scene_instances import SceneInstance
 from ..scene_mesh import Cutout, SceneMesh, compacted, stacked
 from .polygons import check_corners
 
-SMALLER = "export it in parts, or as .ply"  # what helps if a file unpacks to too much
+# What helps if a file unpacks to too much, without and with an animation.
+SMALLER, SHORTER = "export it in parts, or as .ply", "shorten its animation or simplify its mesh"
 # A mesh becomes one of instances if that saves so many triangles; single triangles are cast faster.
 SHARED_TRIANGLES = 100_000
 MOST_NODES = 200_000  # most nodes of a scene, counting every instance
@@ -197,7 +198,7 @@ def settled(placed: Sequence[PlacedNode], *, copy_all: bool = False) -> Content:
 def baked(poses: Iterable[Content], times_s: Sequence[float], allowance: Allowance) -> Content:
     """Join poses of the same meshes, at times that are even, to one content that is animated."""
     if not times_s[-1] > times_s[0]:
-        raise MeshFileError("has an animation without a duration: export it again")
+        raise MeshFileError("has an animation without a duration: give it two keys")
     content, moves, count, taken = Content(()), list[Floats](), len(times_s), 0
     for number, pose in zip(range(count), poses, strict=False):
         now = [mesh.vertices for mesh in pose.meshes if isinstance(mesh, SceneMesh)]

@@ -38,6 +38,7 @@ from .gltf_animation import chosen
 from .polygons import triangulated
 from .scene_graph import (
     MOST_NODES,
+    SHORTER,
     SMALLER,
     Content,
     MeshFileError,
@@ -67,7 +68,7 @@ def read_usd(data: bytes, path: Path, wanted: Wanted) -> Content:
         raise MeshFileError('is OpenUSD, which usd-core reads: pip install "lidarpool[usd]"')
     if sys.platform == "win32":  # which has no limits of memory for a process
         raise MeshFileError("is OpenUSD, which is not read on Windows: export it as .glb")
-    allowance = Allowance(0, SMALLER)  # grows by all files of the scene
+    allowance = Allowance(0, SMALLER if wanted.animation is None else SHORTER)  # of all its files
     with closing(_frames(path, wanted, allowance)) as frames:
         stage, _ = next(frames)
         contents = _contents(frames, stage, path.stem, wanted, allowance)
