@@ -66,7 +66,9 @@ CONVERTED = {  # {ending of scenes that are not read: what to do}
     ),
     ".sdf": "convert it to OpenUSD (sdf2usd of gz-usd) or URDF, or name the meshes that it names",
     ".mjcf": _MUJOCO,
-    ".xml": f"{_MUJOCO}, and lidarpool import reads a survey of HELIOS++",
+    ".xml": f"{_MUJOCO}, lidarpool import reads a survey of HELIOS++, and traffic.file of a "
+    "scenario names floating car data of SUMO",
+    ".xodr": "make a mesh of its roads, for example by libOpenDRIVE",
 }
 ANIMATED = (".glb", ".gltf", ".usd", ".usda", ".usdc", ".usdz")
 UNITLESS = (".obj", ".stl", ".ply", ".off")  # formats without a unit
@@ -325,7 +327,7 @@ def _bytes_of(path: Path, most: int) -> bytes:
     if suffix not in SUFFIXES:
         raise LidarpoolError(
             f"{path} has the ending {path.suffix or '(none)'}, which is not a mesh format that "
-            f"can be read; these are: {' '.join(SUFFIXES)}."
+            f"can be read; these are: {' '.join(SUFFIXES)} (a scenario has the ending .yaml)."
         )
     try:
         if most < 0:
