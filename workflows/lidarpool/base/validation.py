@@ -460,7 +460,7 @@ def shown(value: object) -> str:
     short = reprlib.Repr()
     short.maxstring = short.maxother = short.maxlong = 60
     short.maxlevel = 3  # YAML aliases make deeply nested lists of a few letters
-    text = short.repr(value)
+    text = " ".join(short.repr(value).split())  # arrays in it have lines
     return text if len(text) <= _LETTERS else f"{text[:_LETTERS]}…"
 
 
