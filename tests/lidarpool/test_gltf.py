@@ -88,9 +88,9 @@ def test_a_node_scaled_to_nothing_is_skipped_and_said(tmp_path, caplog):
     header["scenes"][0]["nodes"] = [0, 1]
     path = write(tmp_path / "m.glb", glb(header, CORNERS))
     assert [mesh.name for mesh in load_meshes(path)] == ["Sign"]
-    assert "scales Hidden to zero: left out" in caplog.text
+    assert "without an area, which are left out: Hidden" in caplog.text
     header["scenes"][0]["nodes"] = [1]
-    with pytest.raises(LidarpoolError, match="no triangles that are not scaled to zero"):
+    with pytest.raises(LidarpoolError, match="no triangle with an area"):
         load(tmp_path, header)
 
 
@@ -117,15 +117,15 @@ def test_normalised_and_interleaved_positions(tmp_path):
 
 @pytest.mark.parametrize("base", [True, False])
 def test_sparse_positions(tmp_path, base):
-    body = CORNERS + struct.pack("<H2x3f", 1, 9, 8, 7)
+    body = CORNERS + struct.pack("<2H6f", 0, 1, 1, 2, 3, 9, 8, 7)
     header = triangle(body)
     header["bufferViews"] = [
         {"buffer": 0, "byteLength": 36},
-        {"buffer": 0, "byteOffset": 36, "byteLength": 2},
-        {"buffer": 0, "byteOffset": 40, "byteLength": 12},
+        {"buffer": 0, "byteOffset": 36, "byteLength": 4},
+        {"buffer": 0, "byteOffset": 40, "byteLength": 24},
     ]
     header["accessors"][0]["sparse"] = {
-        "count": 1,
+        "count": 2,
         "indices": {"bufferView": 1, "componentType": 5123},
         "values": {"bufferView": 2},
     }
@@ -133,7 +133,7 @@ def test_sparse_positions(tmp_path, base):
         del header["accessors"][0]["bufferView"]
     (mesh,) = load(tmp_path, header, body)
     np.testing.assert_array_equal(
-        mesh.vertices[:3], [[0, 0, 0], [9, 8, 7], [0, 1, 0] if base else [0, 0, 0]]
+        mesh.vertices[:3], [[1, 2, 3], [9, 8, 7], [0, 1, 0] if base else [0, 0, 0]]
     )
 
 

@@ -195,6 +195,7 @@ def test_cuts_and_damage_end_in_meshes_or_in_one_clear_line(tmp_path, two_object
         ("m.obj", "v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 9\n", "broken"),
         ("m.obj", "v 0 0 0\nv 1 0 0\nv 0 nan 0\nf 1 2 3\n", "1 of the 3 vertices .* NaN"),
         ("m.obj", "v 0 0 0\nv 1 0 0\nv 0 1 0\nf -1 -2 -4\nv 5 5 5\n", "f -1 -2 -4.*missing"),
+        ("m.obj", "v 0 0 0\nv 1 0 0\nv 2 0 0\nf 1 2 3\n", "no triangle with an area"),
         ("m.obj", "v 1 2\nf 1 1 1\n", "a vertex has 2 numbers, 'v 1 2'"),
         ("m.off", "OFF\n3 1 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1 7\n", "broken"),
         ("m.off", "OFF\n3 2 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n", "2 faces announced"),
@@ -210,7 +211,7 @@ def test_cuts_and_damage_end_in_meshes_or_in_one_clear_line(tmp_path, two_object
         ("m.ply", PLY.replace("3 0 2 3", "3 0 2 9"), "0 to 9"),
         ("m.ply", PLY.replace("element face", "element tristrips"), "triangle strips"),
         ("m.ply", PLY.partition("end_header")[0], "no PLY header"),
-        ("m.las", "LASF", "has the ending .las"),
+        ("m.step", "LASF", "has the ending .step"),
         ("m.gltf", "[" * 100_000, "no valid JSON"),
         *[
             (

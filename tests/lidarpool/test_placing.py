@@ -285,6 +285,9 @@ def test_on_the_ground_of_a_terrain():
     assert floor > scene.bounds[0, 2] + 0.1
     nearest = np.hypot(*scene.vertices[:, :2].T).argmin()
     assert floor == pytest.approx(scene.vertices[nearest, 2], abs=5)
+    # Half of its triangles face down, as surfels of a cloud do.
+    mixed = np.concatenate([scene.faces[::2], scene.faces[1::2, ::-1]])
+    assert not place(Scene.from_meshes([SceneMesh("m", scene.vertices, mixed)]), GRID).around
 
 
 def test_on_a_slab_and_not_on_the_roof():

@@ -28,10 +28,11 @@ def load_open3d() -> Any:
         try:
             return _extension("open3d.pybind")
         except (ImportError, OSError) as error:
+            advice = "apt-get install libegl1 libgl1 libgomp1 libusb-1.0-0 (on Debian and Ubuntu)"
+            if isinstance(error, ModuleNotFoundError):
+                advice = "pip install open3d-cpu (Linux x86_64) or open3d"
             raise LidarpoolError(
-                f"Clouds are written through Open3D, which does not load ({error}): install "
-                "open3d-cpu (Linux x86_64) or open3d; on Debian and Ubuntu it needs the packages "
-                "libegl1 libgl1 libgomp1 libusb-1.0-0, too."
+                f"Clouds are written through Open3D, which does not load ({error}): {advice}."
             ) from error
 
 

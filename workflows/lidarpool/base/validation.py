@@ -325,7 +325,7 @@ def _sentence(
         return f"{at} is not a field.{near}"
     if kind == "missing":
         return f"{at} is missing; it must be given."
-    allowed = dict.fromkeys(_allowed(detail, hint) for detail in details)
+    allowed = dict.fromkeys(_allowed(detail, hint, show is not _in_file) for detail in details)
     near = ""
     if kind == "literal_error" and isinstance(given, str):
         near = did_you_mean(given, re.findall(r"'([^']*)'", details[0]["ctx"]["expected"]))
@@ -334,8 +334,8 @@ def _sentence(
     )
 
 
-def _allowed(detail: ErrorDetails, hint: Any) -> str:
-    """Return what a value must do: «be 1 to 10»."""
+def _allowed(detail: ErrorDetails, hint: Any, in_python: bool) -> str:
+    """Return what a value must do: «be 1 to 10»; examples are Python."""
     kind, context = detail["type"], detail.get("ctx", {})
     if kind == "is_instance_of":
         name = str(context["class"]).rpartition(".")[2]
@@ -345,7 +345,8 @@ def _allowed(detail: ErrorDetails, hint: Any) -> str:
         inner = [*classes_in(hint)]
         of = next((f" of {_ITEMS[one]}" for one in inner if one in _ITEMS), "")
         examples = [_EXAMPLES[one.__name__] for one in inner if one.__name__ in _EXAMPLES]
-        return f"be a list{of}" + (f", such as [{examples[0]}]" if examples and not of else "")
+        such = f", such as [{examples[0]}]" if examples and not of and in_python else ""
+        return f"be a list{of}{such}"
     if not _LIMITS.keys().isdisjoint(context):
         limits = _limits(hint)
         return f"be {_range(limits if context.items() <= limits.items() else context)}"
@@ -459,7 +460,7 @@ def shown(value: object) -> str:
     short = reprlib.Repr()
     short.maxstring = short.maxother = short.maxlong = 60
     short.maxlevel = 3  # YAML aliases make deeply nested lists of a few letters
-    text = short.repr(value)
+    text = " ".join(short.repr(value).split())  # arrays in it have lines
     return text if len(text) <= _LETTERS else f"{text[:_LETTERS]}…"
 
 

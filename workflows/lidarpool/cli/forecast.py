@@ -515,7 +515,7 @@ def _of_job(job: Job, found: dict[str, Any]) -> Iterator[str]:
         turn = f"{len(job.survey.carried)} sensors"
     elif sensor.period is not None and sensor.cycle != "frame":
         turn = f"{sensor.period:,} x {sensor.channels:,} a {sensor.cycle}"
-    yield f"scene       {plural(found['objects'], 'object')}, {found['triangles']:,} triangles"
+    yield f"scene       {', '.join(plural(found[f'{n}s'], n) for n in ('object', 'triangle'))}"
     for file, taken in found["sources"].items():
         yield f"file        {file}: {taken}"
     sides = list(zip("xyz", *found["bounds"], strict=True))

@@ -7,6 +7,7 @@ import os
 import shlex
 from collections.abc import Callable, Iterator
 from contextlib import nullcontext
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -462,6 +463,7 @@ def stations(
     from ..report.result_pictures import draw_stations
     from ..scenario.advice import advice
     from ..scenario.build import build
+    from ..scenario.placing import Placing
     from ..scenario.scenario import Scenario
     from ..sensor.models import full_name, load_sensor
     from .terminal import Terminal
@@ -483,7 +485,7 @@ def stations(
     file = folder / PLAN_FILE
     file.write_text(_scenario(read, folder, model, plan), "utf-8", newline="\n")
     page.save(folder / PICTURE_FILE)
-    notes = advice(built)
+    notes = advice(replace(built, placing=Placing(())))  # stations take the place of its poses
     reached = float(plan.coverage[-1])
     if coverage is not None and reached < coverage:
         notes.append(

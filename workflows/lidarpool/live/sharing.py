@@ -18,6 +18,7 @@ from PIL import Image
 
 from ..base.arrays import AnyArray, Floats
 from ..base.errors import LidarpoolError, explained
+from ..base.storage import Storage
 from ..columns.cloud import Cloud
 from ..export.sweeps import Sweeps
 from ..render.colouring import TURBO
@@ -49,7 +50,7 @@ def share(path: Path, film: Path | None, page: Path | None) -> None:
     for file in filter(None, (film, page)):
         made = page_of(view) if file == page else film_of(view, file.suffix)
         with explained(f"{file} cannot be written", "give another place"):
-            file.write_bytes(made)
+            Storage.at(file.parent, durable=False).write(file.name, made)
         click.echo(click.format_filename(file))
 
 

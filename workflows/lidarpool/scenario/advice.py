@@ -22,6 +22,7 @@ from .sections import SensorSection
 # to look at from outside is rarely longer than a bus. glTF is in metres, and some exporters write
 # millimetres.
 LARGE_M, LARGE_STL_M, LARGE_OBJECT_M, LARGE_STATED_M, SMALL_M = 500.0, 20.0, 10.0, 100.0, 0.2
+FINE = 100  # a scene is at least so many steps of the precision long
 
 _LOOKED_FROM = 8  # positions, if poses or a trajectory are given
 
@@ -36,18 +37,23 @@ def advice(built: Built) -> list[str]:
     axes = [f"{remark} (--up-axis AXIS with a mesh file)" for remark in remarks[:1]]
     if remarks[1:]:
         axes = [f"{axes[0]}; {plural(len(remarks) - 1, 'more file')}, too"]
-    likely = filter(None, (_of_size(built), _of_poses(built), _of_colours(built)))
+    side, step = float(np.ptp(built.scene.bounds, axis=0).max()), built.survey.precision_m
+    likely = filter(None, (_of_size(built, side), _of_poses(built), _of_colours(built)))
     unstated = dict.fromkeys(_of_datasheets(built))
-    lines = (*notes, *axes, *likely, *unstated, *_without_effect(built.scenario), *_ended(built))
+    coarse = [
+        f"points are rounded to {step:g} m, and the scene is {side:.3g} m long: give a smaller "
+        "cloud.precision_m in a scenario"
+    ] * (side < FINE * step)
+    settings = (*coarse, *_without_effect(built.scenario))
+    lines = (*notes, *axes, *likely, *unstated, *settings, *_ended(built))
     return [as_scenario(line) for line in lines]
 
 
-def _of_size(built: Built) -> str:
+def _of_size(built: Built, side: float) -> str:
     scenario, placing = built.scenario, built.placing
     files = [entry.file for entry in scenario.scene.files if entry.unit is None]
     files = [file for file in files if not file.lower().endswith(CITYJSON)]  # towns are large
     unitless = [f for f in files if f.lower().endswith(UNITLESS) and not wrote_it(scenario.path(f))]
-    side = float(np.ptp(built.scene.bounds, axis=0).max())
     parts = any(file.lower().endswith(".stl") for file in unitless)
     least, large = SMALL_M, LARGE_STL_M if parts else LARGE_M
     if around := placing is not None and placing.around:

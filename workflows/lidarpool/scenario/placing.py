@@ -85,10 +85,10 @@ def place(
         return Placing(standing, _inside(looker, _local(standing, scene), scene, carried))
     poses = poses_around(scene, carried)
     far = np.linalg.norm(poses[-1].position - (low + high) / 2)
-    sides = " x ".join(f"{side:,.3g}" for side in high - low)
+    *sides, away = (f"{float(f'{length:.3g}'):,g}" for length in (*(high - low), far))
     note = (
-        f"this looks like an object of {sides} m, not a place to stand in: "
-        f"{plural(len(poses), 'pose')} around and above it, {far:,.3g} m from its middle"
+        f"this looks like an object of {' x '.join(sides)} m, not a place to stand in: "
+        f"{plural(len(poses), 'pose')} around and above it, {away} m from its middle"
     )
     grid = _narrowed(drawn, looker, poses) if narrow and looker else {}
     if grid:

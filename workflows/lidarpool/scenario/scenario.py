@@ -16,7 +16,6 @@ from ..base.errors import LidarpoolError, Mistakes, prefixed
 from ..base.validation import sentences
 from ..base.yamlfile import read_yaml
 from ..columns.table import COLOURS
-from ..scene.files.meshfile import CONVERTED, ROBOTS, SUFFIXES
 from ..sensor import Fault, Material, Navigation
 from ..sensor.materials import ClassNames
 from ..sensor.survey import SENSORS_MOST, CloudOptions, StepCount
@@ -202,7 +201,7 @@ class Scenario(Section):
             With the file, the field, what was given and what is allowed.
         """
         path = Path(path)
-        mesh = path.suffix.lower() in (*SUFFIXES, *ROBOTS, *CONVERTED)
+        mesh = path.suffix.lower() not in ("", ".yaml", ".yml")
         data = mesh_data([path], path.parent, options) if mesh else read_yaml(path)
         if options and not mesh:
             name = next(iter(options))

@@ -12,6 +12,7 @@ from trimesh.exchange.obj import export_obj
 from trimesh.exchange.ply import export_ply
 
 from ..base.errors import LidarpoolError, explained
+from ..base.storage import Storage
 from .files.meshfile import OWN
 from .glb_file import glb_of
 from .scene import Scene
@@ -40,13 +41,8 @@ def write_scene(path: str | Path, scene: Scene) -> Path:
     path = Path(path)
     check_target(path)
     data = _encoded(path.suffix.lower(), scene)
-    partial = path.with_name(f".{path.name}.partial")
-    try:
-        with explained(f"{path} cannot be written"):
-            partial.write_bytes(data)
-            partial.replace(path)
-    finally:
-        partial.unlink(missing_ok=True)
+    with explained(f"{path} cannot be written"):
+        Storage.at(path.parent, durable=False).write(path.name, data)
     return path
 
 

@@ -135,6 +135,15 @@ class SceneMesh:
         """Lowest and highest corner of its vertices, (2, 3)."""
         return np.stack([self.vertices.min(axis=0), self.vertices.max(axis=0)])
 
+    @cached_property
+    def has_area(self) -> bool:
+        """Whether rays can hit a triangle of it, in some pose if it is animated."""
+        blocks = (
+            self.vertices[self.faces[i : i + 65536]] for i in range(0, len(self.faces), 65536)
+        )
+        edges = (block[:, 1:] - block[:, :1] for block in blocks)
+        return self.animation is not None or any(np.cross(*e.swapaxes(0, 1)).any() for e in edges)
+
     def moved(self, name: str, linear: Floats, offset: Floats) -> SceneMesh:
         """Return a renamed copy at p -> linear @ p + offset, with faces still outward."""
         faces, cutouts, colours = self.faces, self.cutouts, self.colours

@@ -100,10 +100,10 @@ class Surroundings:
         outside = self.outside()
         back = np.mean(outside.back[outside.hit])
         if back > 1 - _CLOSED:
-            # A terrain from below, or the walls of a room. Of leaves, half are seen from behind.
-            return bool(
-                back < _CLOSED and _openness(self._scene) < _LEAVES and not _has_floor(seen)
-            )
+            # A terrain from below, or the walls of a room. Of leaves and surfels, half are seen
+            # from behind; ground of surfels is below the sensor only.
+            leaves = back < _CLOSED and _openness(self._scene) < _LEAVES and above >= _SKY
+            return bool(leaves and not _has_floor(seen))
         if np.mean(np.isfinite(seen.distance)) < _ENCLOSED:
             ground = np.mean((seen.hit & ~seen.back)[down]) >= _GROUND
             # Of a machine with openings there is something above the sensor, too.

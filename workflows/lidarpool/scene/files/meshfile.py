@@ -60,9 +60,15 @@ SUFFIXES = (*_READERS, *RASTERS)
 ROBOTS = (".urdf", ".xacro")  # of which `urdf` refuses the latter, with what to do
 _MUJOCO = "a model of MuJoCo becomes OpenUSD by mujoco-usd-converter"
 CONVERTED = {  # {ending of scenes that are not read: what to do}
+    **dict.fromkeys((".fbx", ".blend", ".3ds"), "export it as .glb, for example from Blender"),
+    **dict.fromkeys(
+        (".las", ".laz", ".pcd", ".xyz"), "make a mesh of it by lidarpool scene points"
+    ),
     ".sdf": "convert it to OpenUSD (sdf2usd of gz-usd) or URDF, or name the meshes that it names",
     ".mjcf": _MUJOCO,
-    ".xml": f"{_MUJOCO}, and lidarpool import reads a survey of HELIOS++",
+    ".xml": f"{_MUJOCO}, lidarpool import reads a survey of HELIOS++, and traffic.file of a "
+    "scenario names floating car data of SUMO",
+    ".xodr": "make a mesh of its roads, for example by libOpenDRIVE",
 }
 ANIMATED = (".glb", ".gltf", ".usd", ".usda", ".usdc", ".usdz")
 UNITLESS = (".obj", ".stl", ".ply", ".off")  # formats without a unit
@@ -121,7 +127,7 @@ def load_objects(
 
     Every place of a mesh in a scene graph is an object, named by its node; large meshes with many
     places are instances. Files without names give one object named by the file. Objects that their
-    nodes scale to zero are left out.
+    nodes scale to zero, and instances of meshes without an area, are left out.
 
     Parameters
     ----------
@@ -194,10 +200,12 @@ def load_objects(
     objects = Objects(standing, moving)
     if content.skipped:
         names = ", ".join(content.skipped[:3]) + ", …" * (len(content.skipped) > 3)
-        tell(f"{path} scales {names} to zero: left out")
+        tell(f"{path} has objects without an area, which are left out: {names}")
     for note in (*content.notes, *(() if unit else filter(None, [content.unit_note]))):
         tell(f"{path} {note}")
     all_of_it = objects.still(lambda _: None)
+    if not any((one.mesh if isinstance(one, SceneInstance) else one).has_area for one in all_of_it):
+        raise LidarpoolError(f"{path} has no triangle with an area.")
     if content.raster is not None:
         summary = content.raster.told
     else:
@@ -288,7 +296,7 @@ def _read_whole(path: Path, data: bytes, wanted: Wanted, raster: dict[str, Any])
         content = read_raster(path, **raster) if is_raster else _READERS[suffix](data, path, wanted)
         if not (content.meshes or content.moving):
             if content.skipped:
-                raise MeshFileError("has no triangles that are not scaled to zero")
+                raise MeshFileError("has no triangle with an area")
             raise MeshFileError(
                 "holds no triangles: it is empty, or has only points, lines or other things that "
                 "reflect no light"
@@ -319,7 +327,7 @@ def _bytes_of(path: Path, most: int) -> bytes:
     if suffix not in SUFFIXES:
         raise LidarpoolError(
             f"{path} has the ending {path.suffix or '(none)'}, which is not a mesh format that "
-            f"can be read; these are: {' '.join(SUFFIXES)}."
+            f"can be read; these are: {' '.join(SUFFIXES)} (a scenario has the ending .yaml)."
         )
     try:
         if most < 0:

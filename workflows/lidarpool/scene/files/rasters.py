@@ -48,6 +48,7 @@ Window = tuple[float, float, float, float]  # lowest x and y, highest x and y
 PixelRange = tuple[int, int]  # half-open
 
 _LOWEST_M, _HIGHEST_M = -12_000.0, 9_000.0  # of the Earth's surface
+_NO_DATA = -9999.0  # which many programs write without saying so in the file
 _FOOT_M, _US_FOOT_M = 0.3048, 1200 / 3937
 _UNIT_NAMES = {  # of heights, as files have them
     **dict.fromkeys(("m", "metre", "meter", "metres", "meters"), 1.0),
@@ -103,7 +104,7 @@ def read_raster(
         mesh = _mesh(path.stem, grid, columns, rows, heights, valid)
         told = _raster_summary(source, own, grid, step_m, valid)
     low, high = mesh.bounds[:, 2]
-    if not _LOWEST_M <= low <= high <= _HIGHEST_M:
+    if not _LOWEST_M <= low <= high <= _HIGHEST_M or low == _NO_DATA * metre:
         notes.append(
             f"has heights from {low:,.6g} to {high:,.6g} m: if one of them stands for no data, say "
             "so in the file (rio edit-info --nodata VALUE FILE)"

@@ -82,7 +82,7 @@ class Content:
     generator: str = ""  # the program that wrote it, if known
     turned: str = ""  # why a Y-up file is turned, if to be told
     unit_note: str = ""  # clause on a unit that it does not state
-    skipped: list[str] = field(default_factory=list)  # names of objects that nodes scale to zero
+    skipped: list[str] = field(default_factory=list)  # names of objects without an area
     notes: list[str] = field(default_factory=list)  # clauses that follow the file's name
     raster: Raster | None = None
 
@@ -186,7 +186,7 @@ def settled(placed: Sequence[PlacedNode], *, copy_all: bool = False) -> Content:
         )
     ranks = rank(matrices[:, :3, :3]).tolist()
     for (mesh, matrix, name, _), dimensions in zip(placed, ranks, strict=True):
-        if dimensions < 2 and not copy_all:
+        if (dimensions < 2 or (mesh in shared and not mesh.has_area)) and not copy_all:
             content.skipped.append(name)
         elif mesh in shared and dimensions == 3:
             objects.append(SceneInstance(mesh, matrix, name))
