@@ -33,7 +33,7 @@ from ..export.pieces import Entry
 from ..export.reading import Reader
 from ..export.sweeps import SWEEPS_FILE, Sweeps
 from .dataset import BOXES_FILE, INDEX_FILE, VERSION, job_file
-from .job_table import JobRow, read_table
+from .job_table import AGAIN, TABLE_FILE, JobRow, read_table
 from .sweep_data import Sweep
 
 _REQUESTS = 8  # sweeps that are read at a time, from a URL or a disk
@@ -207,7 +207,7 @@ class _OpenJob:
         try:
             points = self.reader.read(sweep)
         except Exception as error:  # libraries of five formats have many kinds
-            file = self.place.path(self.reader.files(sweep)[0])
+            file = self.place.path(self.reader.last or self.reader.files(sweep)[0])
             raise _unreadable(file, error) from error
         return Sweep.of(self.job, self.sweeps, sweep, points, self.boxes, sweep)
 
@@ -253,8 +253,10 @@ def sweeps(
     head = read_index(storage)
     written = Format(DATA_SETS[head["format"]], head["layout"])
     written.check_installed()
-    of_sensors = {row["number"]: row["sensors"] for row in head["jobs"]}
+    of_sensors = head["jobs"]
     rows = [job for job in read_table(storage) if job.number in of_sensors]
+    if len(rows) < len(of_sensors):
+        raise LidarpoolError(f"{storage.path(TABLE_FILE)} lacks jobs that are done: {AGAIN}.")
     rows = _chosen(rows, split, jobs, storage)
     there = list(dict.fromkeys(name for job in rows for name, _ in of_sensors[job.number]))
     if sensors is not None:
@@ -272,13 +274,20 @@ def sweeps(
 
 
 def read_index(place: Storage) -> dict[str, Any]:
-    """Read the index of a finished data set; LidarpoolError if there is none."""
+    """Read the index of a finished data set; LidarpoolError if there is none.
+
+    Its entry `jobs` is {number: [(sensor, sweeps), ...]}.
+    """
     try:
         head: dict[str, Any] = json.loads(place.read(INDEX_FILE))
         if head["version"] != VERSION:
             raise ValueError(f"it is of version {head['version']}, not {VERSION}")
         if head["format"] not in DATA_SETS:
             raise ValueError(f"its format is {head['format']!r}")
+        head["jobs"] = {
+            row["number"]: [(name, operator.index(count)) for name, count in row["sensors"]]
+            for row in head["jobs"]
+        }
     except FileNotFoundError as error:
         if ".jobs" in place.entries():
             raise LidarpoolError(

@@ -122,6 +122,8 @@ def merge(
     if not (partial and parts):
         mistakes.tell()
     if "made_of" in parts[0].record:
+        if _is_shard(Storage.at(place)):
+            raise LidarpoolError(f"{place} holds a shard of a survey: give another with --out.")
         return _merge_survey(parts, place, partial, scenario, screen)
     with result_folder(place), screen.status("merging the data set"):
         return _merge_dataset(parts, Storage.at(place), partial)
@@ -130,6 +132,13 @@ def merge(
 def _real(place: Storage) -> str:
     """Return the same for a folder by whatever path, which may lead through links."""
     return str(Path(place.url).resolve()) if place.is_local else place.url
+
+
+def _is_shard(place: Storage) -> bool:
+    """Whether a place holds a finished shard of a survey."""
+    with suppress(LidarpoolError):
+        return "made_of" in _read(place).record
+    return False
 
 
 def _read(place: Storage) -> _Part:
