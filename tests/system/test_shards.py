@@ -243,6 +243,7 @@ def unfinished(parts: list[Path]) -> list[Path]:
 
 WRONG = {
     "missing": (lambda parts: parts[:2], "^missing: 1 shard, 3/3: give"),
+    "whole": (foreign('"2/3"', '"1/1"'), "part-2 is a whole run: give it alone, or"),
     "twice": (doubled, "^shard 1/3 is in .*part-1 and in .*again: give one"),
     "no shard": (lambda parts: [*parts, parts[0].parent], "shards holds no finished shard"),
     "unfinished": (unfinished, "^.*part-3 holds no finished shard"),
@@ -251,7 +252,10 @@ WRONG = {
     "file": (foreign('"files": []', '"files": [["a.glb", "1"]]'), ""),
     "software": (foreign("(sources ", "(sources x"), "part-2 and .*part-1 differ in lidarpool:"),
     "workers": (foreign('"numpy": "', '"numpy": "0'), "part-2 and .*part-1 differ in numpy of wo"),
-    "count": (foreign('"count": 7', '"count": 11'), "^missing: 2 shards, 1/3, 3/3: give"),
+    "count": (
+        foreign('"count": 7', '"count": 11'),
+        "^missing: 2 shards, 1/3, 3/3: .* larger count",
+    ),
 }
 
 

@@ -258,13 +258,13 @@ def sweeps(
     if len(rows) < len(of_sensors):
         raise LidarpoolError(f"{storage.path(TABLE_FILE)} lacks jobs that are done: {AGAIN}.")
     rows = _chosen(rows, split, jobs, storage)
-    there = list(dict.fromkeys(name for job in rows for name, _ in of_sensors[job.number]))
+    there = list(dict.fromkeys(name for job in rows for name in of_sensors[job.number]))
     if sensors is not None:
         _check_known("sensor", sensors, there, storage)
     runs = []
     for job in rows:
         first = 0
-        for name, count in of_sensors[job.number]:
+        for name, count in of_sensors[job.number].items():
             if count and (sensors is None or name in sensors):
                 runs.append(_Run(job, first, count))
             first += count
@@ -274,20 +274,14 @@ def sweeps(
 
 
 def read_index(place: Storage) -> dict[str, Any]:
-    """Read the index of a finished data set; LidarpoolError if there is none.
-
-    Its entry `jobs` is {number: [(sensor, sweeps), ...]}.
-    """
+    """Read the index, with jobs by number, of a data set; LidarpoolError if it is not finished."""
     try:
         head: dict[str, Any] = json.loads(place.read(INDEX_FILE))
         if head["version"] != VERSION:
             raise ValueError(f"it is of version {head['version']}, not {VERSION}")
         if head["format"] not in DATA_SETS:
             raise ValueError(f"its format is {head['format']!r}")
-        head["jobs"] = {
-            row["number"]: [(name, operator.index(count)) for name, count in row["sensors"]]
-            for row in head["jobs"]
-        }
+        head["jobs"] = {row["number"]: dict(row["sensors"]) for row in head["jobs"]}
     except FileNotFoundError as error:
         if ".jobs" in place.entries():
             raise LidarpoolError(

@@ -77,10 +77,10 @@ class Reader:
             data = np.frombuffer(bytearray(self.place.read(name)), np.uint8)
         if len(data) % row.itemsize:
             raise ValueError(f"{len(data)} bytes are no whole rows of {row.itemsize}")
-        if count not in (None, len(data) // row.itemsize):
-            told = f"{len(data) // row.itemsize:,} points, and {before} {count:,}"
-            raise ValueError(f"it has {told}")
-        return data.view(row)  # PyTorch wants arrays that it may write to
+        rows = data.view(row)
+        if count not in (None, len(rows)):
+            raise ValueError(f"it has {len(rows):,} points, and {before} {count:,}")
+        return rows  # PyTorch wants arrays that it may write to
 
     def inside(self, sweep: int, cloud: Cloud) -> PointColumns:
         """Return points of the cloud's coordinates and all their columns."""
