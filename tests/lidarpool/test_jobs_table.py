@@ -113,7 +113,7 @@ def test_damaged_tables_are_refused(tmp_path, text):
 
 
 def test_a_missing_table_is_named(place):
-    with pytest.raises(LidarpoolError, match=r"jobs\.csv cannot be read.*give the folder"):
+    with pytest.raises(LidarpoolError, match=r"jobs\.csv cannot be read.*--resume"):
         list(read_table(place))
 
 

@@ -175,8 +175,9 @@ DAMAGE = {
     "lost": lambda part: (part / "jobs/0001/cloud.ply").unlink(),
     "manifest": lambda part: flip(part / ".jobs/0001.json"),
     "row": lambda part: cut_rows(part / "jobs.csv"),
+    "table": lambda part: change(part / "jobs.csv", ",", ";"),
 }
-NAMED = {"manifest": ".jobs/0001.json", "row": "jobs.csv"}
+NAMED = {"manifest": ".jobs/0001.json", "row": "jobs.csv", "table": "jobs.csv"}
 
 
 @pytest.mark.parametrize("damage", DAMAGE)
@@ -185,7 +186,7 @@ def test_damaged_files_are_named_and_the_next_merge_takes_them(
 ):
     DAMAGE[damage](parts[1])
     out, name = tmp_path / "ds", NAMED.get(damage, "0001/cloud.ply")
-    with pytest.raises(LidarpoolError, match=f"^missing or damaged: .*part-2/.*{name}; run"):
+    with pytest.raises(LidarpoolError, match=f"damaged.*part-2/.*{name}; run|{name} is damaged"):
         merge(parts, out)
     assert not (out / "dataset.json").exists() and (out / ".jobs/0000.json").exists()
     with Client(slots, set_as_default=False) as client:
@@ -194,7 +195,7 @@ def test_damaged_files_are_named_and_the_next_merge_takes_them(
     merge(parts, out)
     made, whole = content(out), content(campaigns("folder") / "one")
     notes = made.pop("report.json")["notes"]
-    assert damage == "row" or notes[0].startswith("made again: job 0001")
+    assert name == "jobs.csv" or notes[0].startswith("made again: job 0001")
     assert made == {name: data for name, data in whole.items() if name in made}
 
 
@@ -242,6 +243,7 @@ def unfinished(parts: list[Path]) -> list[Path]:
 
 WRONG = {
     "missing": (lambda parts: parts[:2], "^missing: 1 shard, 3/3: give"),
+    "whole": (foreign('"2/3"', '"1/1"'), "part-2 is a whole run: give it alone, or"),
     "twice": (doubled, "^shard 1/3 is in .*part-1 and in .*again: give one"),
     "no shard": (lambda parts: [*parts, parts[0].parent], "shards holds no finished shard"),
     "unfinished": (unfinished, "^.*part-3 holds no finished shard"),
@@ -250,7 +252,10 @@ WRONG = {
     "file": (foreign('"files": []', '"files": [["a.glb", "1"]]'), ""),
     "software": (foreign("(sources ", "(sources x"), "part-2 and .*part-1 differ in lidarpool:"),
     "workers": (foreign('"numpy": "', '"numpy": "0'), "part-2 and .*part-1 differ in numpy of wo"),
-    "count": (foreign('"count": 7', '"count": 11'), "^missing: 2 shards, 1/3, 3/3: give"),
+    "count": (
+        foreign('"count": 7', '"count": 11'),
+        "^missing: 2 shards, 1/3, 3/3: .* larger count",
+    ),
 }
 
 
@@ -460,6 +465,8 @@ def test_shards_of_a_survey_have_the_files_of_one_run(survey, lidarpool, slots, 
 def _some_of_a_survey(survey: Path, shards: list[Path]) -> None:
     with pytest.raises(LidarpoolError, match=r"^missing: 1 shard, 1/3: give them"):
         merge(shards[:2], survey / "some")
+    with pytest.raises(LidarpoolError, match="part-2 holds a shard of a survey: give another"):
+        merge(shards, shards[0])
     report = merge(shards[:2], survey / "some", partial=True)
     assert "missing: 1 shard, 1/3" in report["notes"] and report["planning"] is None
     killed(survey / "some", shards, ("take", 3))

@@ -32,6 +32,7 @@ from ..columns.cloud import Cloud, CloudLike
 Value = bool | int | float | str
 
 TABLE_FILE, PARQUET_FILE = "jobs.csv", "jobs.parquet"
+AGAIN = "run the campaign again with --resume, which writes it anew"
 ROW_GROUP = 2_000  # rows of jobs.parquet in memory at a time
 ERROR_MOST = 4_000  # letters of an error in the table: csv.reader refuses cells of 131,072
 
@@ -218,7 +219,7 @@ def read_table(place: Storage) -> Iterator[JobRow]:
         If there is no such table, or it is damaged.
     """
     with ExitStack() as stack:
-        with explained(f"{place.path(TABLE_FILE)} cannot be read", "give the folder of a data set"):
+        with explained(f"{place.path(TABLE_FILE)} cannot be read", AGAIN):
             if place.is_local:
                 path = place.local(TABLE_FILE)
             else:
@@ -239,8 +240,7 @@ def read_table(place: Storage) -> Iterator[JobRow]:
         except (ValueError, csv.Error) as error:
             raise LidarpoolError(
                 f"{place.path(TABLE_FILE)} is damaged near line {reader.line_num} ({error}): "
-                "--resume writes that of an unfinished campaign anew; --overwrite makes a finished "
-                "one again."
+                f"{AGAIN}."
             ) from error
 
 

@@ -33,7 +33,7 @@ from ..export.pieces import Entry
 from ..export.reading import Reader
 from ..export.sweeps import SWEEPS_FILE, Sweeps
 from .dataset import BOXES_FILE, INDEX_FILE, VERSION, job_file
-from .job_table import JobRow, read_table
+from .job_table import AGAIN, TABLE_FILE, JobRow, read_table
 from .sweep_data import Sweep
 
 _REQUESTS = 8  # sweeps that are read at a time, from a URL or a disk
@@ -207,7 +207,7 @@ class _OpenJob:
         try:
             points = self.reader.read(sweep)
         except Exception as error:  # libraries of five formats have many kinds
-            file = self.place.path(self.reader.files(sweep)[0])
+            file = self.place.path(self.reader.last or self.reader.files(sweep)[0])
             raise _unreadable(file, error) from error
         return Sweep.of(self.job, self.sweeps, sweep, points, self.boxes, sweep)
 
@@ -253,16 +253,18 @@ def sweeps(
     head = read_index(storage)
     written = Format(DATA_SETS[head["format"]], head["layout"])
     written.check_installed()
-    of_sensors = {row["number"]: row["sensors"] for row in head["jobs"]}
+    of_sensors = head["jobs"]
     rows = [job for job in read_table(storage) if job.number in of_sensors]
+    if len(rows) < len(of_sensors):
+        raise LidarpoolError(f"{storage.path(TABLE_FILE)} lacks jobs that are done: {AGAIN}.")
     rows = _chosen(rows, split, jobs, storage)
-    there = list(dict.fromkeys(name for job in rows for name, _ in of_sensors[job.number]))
+    there = list(dict.fromkeys(name for job in rows for name in of_sensors[job.number]))
     if sensors is not None:
         _check_known("sensor", sensors, there, storage)
     runs = []
     for job in rows:
         first = 0
-        for name, count in of_sensors[job.number]:
+        for name, count in of_sensors[job.number].items():
             if count and (sensors is None or name in sensors):
                 runs.append(_Run(job, first, count))
             first += count
@@ -272,13 +274,14 @@ def sweeps(
 
 
 def read_index(place: Storage) -> dict[str, Any]:
-    """Read the index of a finished data set; LidarpoolError if there is none."""
+    """Read the index, with jobs by number, of a data set; LidarpoolError if it is not finished."""
     try:
         head: dict[str, Any] = json.loads(place.read(INDEX_FILE))
         if head["version"] != VERSION:
             raise ValueError(f"it is of version {head['version']}, not {VERSION}")
         if head["format"] not in DATA_SETS:
             raise ValueError(f"its format is {head['format']!r}")
+        head["jobs"] = {row["number"]: dict(row["sensors"]) for row in head["jobs"]}
     except FileNotFoundError as error:
         if ".jobs" in place.entries():
             raise LidarpoolError(

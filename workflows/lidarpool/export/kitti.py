@@ -103,9 +103,7 @@ class Reader(reading.Reader):
         """Return the points of a sweep."""
         file, labels_file = self.files(sweep)
         rows = self.rows(file, np.dtype("<f4")).reshape(-1, 4)
-        labels = self.rows(labels_file, np.dtype("<u4"))
-        if len(labels) != len(rows):
-            raise ValueError(f"{labels_file} has {len(labels):,} points, not {len(rows):,}")
+        labels = self.rows(labels_file, np.dtype("<u4"), len(rows))
         instances = (labels >> 16).view("<i4")
         instances -= 1
         classes = labels.view("<u2")[::2]

@@ -127,7 +127,7 @@ class Reader(reading.Reader):
         light /= 255
         columns = {"intensity": light, "channel": channel.astype("u2")}
         if labels:
-            columns["class"] = self.rows(labels[0], np.dtype("u1")).astype("u2")
+            columns["class"] = self.rows(labels[0], np.dtype("u1"), len(rows)).astype("u2")
         return rows[:, :3], columns
 
 

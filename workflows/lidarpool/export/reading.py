@@ -29,6 +29,7 @@ class Reader:
     def __init__(self, place: Storage, sweeps: Sweeps, entry: Entry, layout: str) -> None:
         self.place, self.sweeps, self.entry, self.layout = place, sweeps, entry, layout
         self._copies: Path | None = None
+        self.last = ""  # file of rows that was read last, for errors
 
     def files(self, sweep: int) -> list[str]:
         """Return the names of the files that a sweep is read from, that of its points first."""
@@ -65,8 +66,9 @@ class Reader:
         self.place.get(name, path)
         return path
 
-    def rows(self, name: str, row: np.dtype[Any]) -> AnyArray:
-        """Read a file of rows; ValueError if it ends within one."""
+    def rows(self, name: str, row: np.dtype[Any], count: int | None = None) -> AnyArray:
+        """Read a file of rows; ValueError if it ends within one, or has not `count`."""
+        before, self.last = self.last, name
         if self.place.is_local:
             with io.FileIO(self.place.path(name)) as file:
                 data = np.empty(os.fstat(file.fileno()).st_size, np.uint8)
@@ -75,7 +77,10 @@ class Reader:
             data = np.frombuffer(bytearray(self.place.read(name)), np.uint8)
         if len(data) % row.itemsize:
             raise ValueError(f"{len(data)} bytes are no whole rows of {row.itemsize}")
-        return data.view(row)  # PyTorch wants arrays that it may write to
+        rows = data.view(row)
+        if count not in (None, len(rows)):
+            raise ValueError(f"it has {len(rows):,} points, and {before} {count:,}")
+        return rows  # PyTorch wants arrays that it may write to
 
     def inside(self, sweep: int, cloud: Cloud) -> PointColumns:
         """Return points of the cloud's coordinates and all their columns."""

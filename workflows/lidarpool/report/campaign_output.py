@@ -48,8 +48,9 @@ class DataSetOutput(Output[CampaignRun]):
     def __post_init__(self) -> None:
         out = replace(Storage.at(self.place), durable=False)
         self.dataset = DataSet(out, self.campaign.keep.format, self.campaign.keep.layout)
-        # Of a finished data set: its record, and what is wrong with jobs, {number: a clause}.
+        # Of a finished data set: its record, rows, and what is wrong with jobs, {number: a clause}.
         self._made: Mapping[str, Any] | None = None
+        self._rows: list[JobRow] = []
         self._wrong: dict[int, str] = {}
 
     @contextmanager
@@ -83,17 +84,22 @@ class DataSetOutput(Output[CampaignRun]):
                 f"{out} holds shard {listed(shards) or 'none'}, and this is a run of "
                 f"{self.campaign.shard}: give another folder with --out."
             )
-        whole, self._wrong = _look(self.dataset, read_table(out), options.verify, self.campaign)
-        if whole != len(self.campaign.numbers) or self._wrong or not _is_indexed(out, whole):
+        with suppress(LidarpoolError):
+            self._rows.extend(read_table(out))
+        told = len(self._rows)  # manifests have the rows that a damaged table lacks
+        with explained(f"{out} cannot be read"):
+            self._rows += [row for row, _ in self.dataset.rows({row.name for row in self._rows})]
+        whole, self._wrong = _look(self.dataset, self._rows, options.verify, self.campaign)
+        if len({told, whole, len(self.campaign.numbers)}) > 1 or not _is_indexed(out, whole):
             return None
         if RUN_FOLDER in there:  # a killed run has not removed all of itself
             remove_run(kept)
         if (files := hashes(self.campaign.files)) != [*map(tuple, self._made["files"])]:
             write_record(out, {**self._made, "files": files})  # `_look`: no job has an older one
         conductor.screen.tell(f"{out} is complete: nothing is left to do")
-        for row in read_table(out):
+        for row in self._rows:
             conductor.page.ended(row)
-        run = CampaignRun.of(read_table(out), time.monotonic() - conductor.started)
+        run = CampaignRun.of(self._rows, time.monotonic() - conductor.started)
         conductor.page.finish(run.seconds)
         return run
 
@@ -101,8 +107,8 @@ class DataSetOutput(Output[CampaignRun]):
         """Compare what is there with what the store says is done; take over what it lacks."""
         store, options, out = conductor.store, conductor.options, self.dataset.place
         if self._made is not None:
-            rows = [row for row in read_table(out) if row.number in self.campaign.numbers]
             store.cast_with(self._made["backend"], self._made["casting"])
+            rows = [row for row in self._rows if row.number in self.campaign.numbers]
             store.adopt(rows, sensors=json.dumps(self._made["sensors"]))
         elif conductor.resume:
             self._take_over(store)

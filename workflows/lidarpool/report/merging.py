@@ -119,6 +119,10 @@ def merge(
         with mistakes.noted():
             parts.append(_read(one))
     mistakes.lines += [] if places else ["there is nothing to merge: give the folders of shards."]
+    with suppress(LidarpoolError):  # the result would have the place of the shard's points
+        if "made_of" in _read(Storage.at(place)).record:
+            told = f"{place} holds a shard of a survey: give another folder with --out."
+            parts, mistakes.lines = [], [told]
     if not (partial and parts):
         mistakes.tell()
     if "made_of" in parts[0].record:
@@ -181,6 +185,9 @@ def _check(parts: Sequence[_Part], partial: bool, own: _Part | None = None) -> l
     first, seen = "the software here", dict[int, _Part]()
     for part in sorted(parts, key=lambda part: not part.record["casting"]):
         common = part.common
+        if part.shards == [ALL] and part is not own and len(parts) > 1 + bool(own):
+            mistakes.lines.append(f"{part.place} is a whole run: give it alone, or leave it out.")
+            continue
         if differs := [name for name in wanted if common.get(name, wanted[name]) != wanted[name]]:
             told = f"{part.place} and {first} differ in {differs[0]}"
             mistakes.lines.append(f"{told}: merge shards of one run and of the same software.")
@@ -196,7 +203,9 @@ def _check(parts: Sequence[_Part], partial: bool, own: _Part | None = None) -> l
         return notes
     told = f"{_MISSING}{plural(len(missing), 'shard')}, {listed([*map(str, missing)], NAMED)}"
     if not partial:
-        raise LidarpoolError(f"{told}: give them, too, or merge what there is with --partial.")
+        grown = any(shard in part.shards for part in parts for shard in missing)
+        give = f"give them, too{', run again with the larger count and --resume' * grown}"
+        raise LidarpoolError(f"{told}: {give}, or merge what there is with --partial.")
     return [*notes, told]
 
 

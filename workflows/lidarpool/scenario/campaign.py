@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import os
 import re
+import shlex
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence, Set
 from contextlib import suppress
 from copy import copy
@@ -144,7 +145,7 @@ class CampaignSpec:
         jobs = _Varied(section, path)
         self = cls.__new__(cls)
         self._begin(jobs, section.model_copy(update={"title": section.title or path.stem}))
-        self.command, self.description = path.name, path.read_text("utf-8-sig")
+        self.command, self.description = shlex.quote(path.name), path.read_text("utf-8-sig")
         return self
 
     @classmethod
@@ -168,7 +169,7 @@ class CampaignSpec:
         """
         jobs, self = _Given([Path(path) for path in paths]), cls.__new__(cls)
         self._begin(jobs, _head(keep=keep, splits=splits, seed=seed, license=license, title=title))
-        self.command = " ".join(path.name for path in jobs.paths[:SHOWN_MOST])
+        self.command = shlex.join(path.name for path in jobs.paths[:SHOWN_MOST])
         self.command += " …" * (jobs.count > SHOWN_MOST)
         return self
 

@@ -419,7 +419,7 @@ class CampaignSection(Section):
         for name in self.splits:
             if not re.fullmatch(r"[A-Za-z0-9_-]+", name):
                 raise ValueError(
-                    f"the split {name!r} gets a file of its name: take letters, digits, - and _."
+                    f"the split {name!r} gets a file of its name: take a-z, A-Z, 0-9, - and _."
                 )
         if self.splits and not isclose(sum(self.splits.values()), 1, abs_tol=1e-6):
             raise ValueError(
