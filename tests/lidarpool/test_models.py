@@ -315,6 +315,7 @@ BAD = {
     "plain.csv": ("elevation_deg\n1", "give model:, or columns: .* as well"),
     "back.csv": (LIVOX + "0,1,2\n2e-5,1,2\n1e-5,1,2\n", "times go back in line 4"),
     "count.csv": (LIVOX + "1,1,2\n2,1,2\n", "has no firing times: give model: as well"),
+    "still.csv": (LIVOX + "0,1,2\n0,1,3\n", "has no firing times: give model: as well"),
     "few.csv": (hesai(count=7), "fits no known model.* give model: as well"),
     "binary.csv": (b"\xff\xfe\x00", "codec can't decode"),
 }  # fmt: skip
