@@ -281,6 +281,9 @@ def test_a_sensor_is_added_by_one_file(tmp_path):
     sensor = load_sensor(write(tmp_path, "mine.yaml", text))
     assert (sensor.name, sensor.channels, sensor.period) == ("Mine", 5, 1000)
     assert sensor.origins(np.array([250]))[0, 0] == pytest.approx([0, 0.1, 0.2])
+    line = "clockwise: true\nfirings_per_turn: 40\nmirror: {motion: sawtooth, width_deg: 40}"
+    sensor = load_sensor(write(tmp_path, "line.yaml", GOOD + line))
+    assert np.degrees(sensor.head.azimuths(np.arange(3))) == pytest.approx([20, 19, 18])
 
 
 LIVOX = "Time/s,Azimuth/deg,Zenith/deg\n"

@@ -405,7 +405,7 @@ def load_sensor(
         return PrismSensor(beams, head, prisms=described.prisms, **common)
     if described.mirror is not None:
         mirror = described.mirror.model_dump()
-        head = Mirror(firings, step_deg, rate, zero_deg=described.zero_deg, **mirror)
+        head = Mirror(firings, step_deg, rate, head.clockwise, head.zero_deg, **mirror)
     else:
         beams = beams.turning(head.radians_per_ns)
     kind = LineSensor if described.axis == "x" else Sensor
