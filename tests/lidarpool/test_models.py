@@ -295,6 +295,7 @@ TWICE = f"detection: {{range_m: 9, probability: 0.5}}, precision: [{FIRST}, {SEC
 BAD = {
     "field.yaml": (GOOD + "firing_us: 5\nrage_m: [0, 1]", "rage_m is not a field"),
     "light.yaml": (GOOD + "firing_us: 5\noptics: {wavelength_nm: 0.9}", "wavelength_nm.*200"),
+    "x.yaml": (GOOD + "firing_us: 5\naxis: x\nprisms: [{wedge_deg: 9, index: 2, rpm: 9}]", "axis"),
     "mirror.yaml": (GOOD + "firing_us: 5\nmirror: {motion: x, width_deg: 9}", "mirror.motion is"),
     "zero.yaml": (GOOD + "firing_us: 0\nbeams: {elevation_deg: [0]}", "firing_us is .* above 0"),
     "short.yaml": (GOOD + "firing_us: 5\nbeams: {elevation_deg: [0, 1], time_us: [0]}", "Beams"),
