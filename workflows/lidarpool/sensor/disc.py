@@ -133,7 +133,7 @@ class Beam:
             starts = exit_m / 2 * np.stack([places[:, 1], -places[:, 0]], axis=1)
             if across != up:
                 # All to one side, sub-rays would turn the oval on its way; of one sixth, skew it.
-                starts[1:] *= (-1.0) ** np.add.outer(range(6), range(count // 6)).reshape(-1, 1)
+                starts[1:] *= 1 - np.add.outer(range(6), range(count // 6)).reshape(-1, 1) % 2 * 2
         return cls(np.array([across, up]) / 2 * places, starts, across != up and count > 1)
 
 
