@@ -238,6 +238,13 @@ def test_light_on_an_edge(profile, share, offset):
     assert nearer(meshes, returns=beam) == pytest.approx(exact, abs=0.025)
 
 
+@pytest.mark.parametrize("wide", [0, 0.01, 0.03, 0.1])
+def test_light_of_an_oval_beam_on_an_edge_in_its_middle(wide):
+    beam = Returns("all", 217, (4.0, 2.0), exit_diameter_m=wide, pulse_ns=1.0)
+    meshes = [wall("Near", 10, y=(-50, 0)), wall("Far", 20)]
+    assert nearer(meshes, returns=beam) == pytest.approx(0.5, abs=0.03)
+
+
 @pytest.mark.parametrize("distance", [0.5, 2.0, 5.0, 50.0])
 def test_a_beam_that_is_wide_at_its_start(distance):
     """A strip as wide as the beam's radius there, in front of a wall: 2 Φ(1) - 1 of the light."""

@@ -281,6 +281,9 @@ def test_a_sensor_is_added_by_one_file(tmp_path):
     sensor = load_sensor(write(tmp_path, "mine.yaml", text))
     assert (sensor.name, sensor.channels, sensor.period) == ("Mine", 5, 1000)
     assert sensor.origins(np.array([250]))[0, 0] == pytest.approx([0, 0.1, 0.2])
+    line = "clockwise: true\nfirings_per_turn: 40\nmirror: {motion: sawtooth, width_deg: 40}"
+    sensor = load_sensor(write(tmp_path, "line.yaml", GOOD + line))
+    assert np.degrees(sensor.head.azimuths(np.arange(3))) == pytest.approx([20, 19, 18])
 
 
 LIVOX = "Time/s,Azimuth/deg,Zenith/deg\n"
@@ -292,6 +295,7 @@ TWICE = f"detection: {{range_m: 9, probability: 0.5}}, precision: [{FIRST}, {SEC
 BAD = {
     "field.yaml": (GOOD + "firing_us: 5\nrage_m: [0, 1]", "rage_m is not a field"),
     "light.yaml": (GOOD + "firing_us: 5\noptics: {wavelength_nm: 0.9}", "wavelength_nm.*200"),
+    "x.yaml": (GOOD + "firing_us: 5\naxis: x\nprisms: [{wedge_deg: 9, index: 2, rpm: 9}]", "axis"),
     "mirror.yaml": (GOOD + "firing_us: 5\nmirror: {motion: x, width_deg: 9}", "mirror.motion is"),
     "zero.yaml": (GOOD + "firing_us: 0\nbeams: {elevation_deg: [0]}", "firing_us is .* above 0"),
     "short.yaml": (GOOD + "firing_us: 5\nbeams: {elevation_deg: [0, 1], time_us: [0]}", "Beams"),
@@ -315,6 +319,7 @@ BAD = {
     "plain.csv": ("elevation_deg\n1", "give model:, or columns: .* as well"),
     "back.csv": (LIVOX + "0,1,2\n2e-5,1,2\n1e-5,1,2\n", "times go back in line 4"),
     "count.csv": (LIVOX + "1,1,2\n2,1,2\n", "has no firing times: give model: as well"),
+    "still.csv": (LIVOX + "0,1,2\n0,1,3\n", "has no firing times: give model: as well"),
     "few.csv": (hesai(count=7), "fits no known model.* give model: as well"),
     "binary.csv": (b"\xff\xfe\x00", "codec can't decode"),
 }  # fmt: skip

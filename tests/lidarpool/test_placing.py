@@ -201,6 +201,9 @@ def test_a_narrow_sensor_is_farther_away_and_tilted():
         assert (x > 0).all()
         elevations = np.degrees(np.arcsin(z))
         assert elevations.min() > -25 and elevations.max() < 15
+    ship, short = scene_of(creation.box((90, 14, 20))), Mounted(load_sensor("ouster/os0-32"))
+    far = [np.linalg.norm(pose.position) for pose in poses_around(ship, short)]
+    assert min(far) > 56 and max(far) < short.sensor.max_range_m
 
 
 def test_poses_within_a_closed_body_are_told_of_with_some_that_see_it(tmp_path):

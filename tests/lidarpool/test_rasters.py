@@ -211,6 +211,8 @@ def test_a_coarser_grid_has_means_without_holes_of_the_finer(tmp_path):
     assert by_place(read(path, window=window)[0]) == part and len(part) == 400 - 9
     cut, *_ = read(path, window=window, step_m=5)
     assert cut.bounds[:, :2].tolist() == [[X0 + 22.5, Y0 - 57.5], [X0 + 57.5, Y0 - 22.5]]
+    x, _, z = read(write(path, np.tile(np.arange(40.0), (40, 1))), step_m=7)[0].vertices.T
+    np.testing.assert_allclose(z, (x - X0 - 1) / 2, atol=0.1)  # at the edge, too
     with pytest.raises(LidarpoolError, match="has pixels of 2 m: step_m must not be less"):
         read(path, step_m=1)
     with pytest.raises(LidarpoolError, match=r"reaches from x 500,000 to 500,080 and from y 5,"):

@@ -375,6 +375,7 @@ def test_positions_are_those_of_the_world_or_of_the_sensor(scene):
     assert np.allclose(own @ HERE.rotation.T + HERE.position, local, atol=0.02)
 
 
+FAR = Scene.seed().with_actors([Actor(box("Car", (9, 9, 9)), Track([0, 1], [[3000, 0, 0]] * 2))])
 WRONG = {
     "number": (lambda s: s.sweep((0, 0, 1), number=-1), "number is -1"),
     "large": (lambda s: s.sweep((0, 0, 1), number=10**9), "counted up to"),
@@ -388,6 +389,10 @@ WRONG = {
     "turned": (lambda s: s.ranges(np.full((2, 4, 4), [0, 0, 0, 1])), "orthonormal rows"),
     "row": (lambda s: s.ranges(np.ones((1, 4, 4))), "last row"),
     "backend": (lambda s: Scanner(Scene.seed(), GRID, backend="embre"), "'embre'. Did you mean"),
+    "fine": (
+        lambda s: Scanner(FAR, GRID, precision_m=1e-6).sweep((2990, 0, 1)),
+        "precision_m 1e-06 is too fine for points 2",
+    ),
     "threads": (lambda s: Scanner(Scene.seed(), GRID, threads=0), "threads is 0"),
     "names": (
         lambda s: Scanner(Scene.seed(), Mounted(GRID, name="left"), name="right"),

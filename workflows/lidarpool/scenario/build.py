@@ -115,7 +115,7 @@ class Job:
         if reach / survey.precision_m >= 2**31 - 1:
             raise LidarpoolError(
                 f"precision_m {survey.precision_m} is too fine for a scene that reaches "
-                f"{reach:.0f} m from its origin: use at least {reach / 2**31:.2g}."
+                f"{reach:.0f} m from its origin: use at least {reach / 2e9:.2g}."
             )
         warn_of_grey(scene, survey)
 

@@ -208,14 +208,14 @@ def poses_around(scene: Scene, carried: Mounted) -> tuple[Pose, ...]:
     """Poses on four sides of a scene and above it that look at its middle, world coordinates.
 
     They are at 1.5 times the diagonal from the middle, farther if the sensor's field of view is
-    too narrow for the whole scene.
+    too narrow for the whole scene, nearer if that is out of its range.
     """
     low, high = scene.bounds + scene.origin
     middle, diagonal = (low + high) / 2, float(np.linalg.norm(high - low))
-    down, up = _field_deg(carried)
+    sensor, (down, up) = carried.sensor, _field_deg(carried)
     half = np.radians(max(up - down, 1e-3) / 2)
-    far = diagonal * float(np.clip(0.5 / np.sin(half), *_FAR))
-    far = max(far, carried.sensor.min_range_m + diagonal)
+    far = max(diagonal * float(np.clip(0.5 / np.sin(half), *_FAR)), sensor.min_range_m + diagonal)
+    far = min(far, max(0.9 * sensor.max_range_m, 0.6 * diagonal))  # outside, and in range
     digits = max(0, 3 - int(np.floor(np.log10(diagonal))))
     poses = []
     wide = high[0] - low[0] > high[1] - low[1]  # a turn sweeps the longer side, seen from above

@@ -85,8 +85,7 @@ class Beams:
         no time later.
         """
         angle = radians_per_ns * self.time_ns
-        x, y, z = self.origin.T
-        sin, cos = sin_cos(angle)
+        (x, y, z), (sin, cos) = self.origin.T, sin_cos(angle)
         origin = np.column_stack([cos * x - sin * y, sin * x + cos * y, z])
         return Beams(self.elevation, self.azimuth + angle, self.time_ns, origin)
 
@@ -235,7 +234,8 @@ class Mirror(Spin):
             place = 0.5 - np.abs(2 * phase - 1)
         else:
             place = phase - 0.5
-        return np.radians(self.zero_deg) + np.radians(self.width_deg) * place
+        turned = np.radians(self.width_deg) * place
+        return np.radians(self.zero_deg) + (-turned if self.clockwise else turned)
 
 
 def _table(name: str, values: ArrayLike, shape: tuple[int, ...]) -> Floats:

@@ -216,7 +216,7 @@ def _livox(name: str, rows: Floats) -> Calibration:
         raise ValueError(f"times go back in line {back[0] + 3}")
     (level, up), (sin, cos) = sin_cos(zenith), sin_cos(azimuth)
     rays = np.column_stack([level * cos, level * sin, up])
-    if len(times) < 2 or (np.diff(times) == 1).all():
+    if times[-1] == times[0] or (np.diff(times) == 1).all():  # or it is filled with one number
         return Calibration(name, "livox", rays=rays)
     shot_ns = (times - times[0]) * 1e9
     every_us = Fraction(float(shot_ns[-1]) / (len(times) - 1) / 1000).limit_denominator(1000)

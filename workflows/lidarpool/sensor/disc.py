@@ -132,8 +132,8 @@ class Beam:
         if exit_m and count > 1:
             starts = exit_m / 2 * np.stack([places[:, 1], -places[:, 0]], axis=1)
             if across != up:
-                # All to one side, sub-rays would turn the oval on its way.
-                starts[1:] *= np.repeat([1, -1] * 3, (count - 1) // 6)[:, None]
+                # All to one side, sub-rays would turn the oval on its way; of one sixth, skew it.
+                starts[1:] *= 1 - np.add.outer(range(6), range(count // 6)).reshape(-1, 1) % 2 * 2
         return cls(np.array([across, up]) / 2 * places, starts, across != up and count > 1)
 
 

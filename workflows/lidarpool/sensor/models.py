@@ -212,6 +212,9 @@ class SensorModel(_ModelSection):
             )
         if any(abs(angle) > 90 for angle in self.beams.elevation_deg):
             raise ValueError("beams.elevation_deg goes beyond 90 degrees")
+        unused = self.model_fields_set & {"axis", "clockwise", "mirror", "zero_deg"}
+        if self.prisms and unused:
+            raise ValueError(f"prisms turn about x: leave {min(unused)} out, and turn the sensor")
         self.beams.beams()  # LidarpoolError if it cannot be made
         return self
 
@@ -405,7 +408,7 @@ def load_sensor(
         return PrismSensor(beams, head, prisms=described.prisms, **common)
     if described.mirror is not None:
         mirror = described.mirror.model_dump()
-        head = Mirror(firings, step_deg, rate, zero_deg=described.zero_deg, **mirror)
+        head = Mirror(firings, step_deg, rate, head.clockwise, head.zero_deg, **mirror)
     else:
         beams = beams.turning(head.radians_per_ns)
     kind = LineSensor if described.axis == "x" else Sensor

@@ -11,6 +11,7 @@ from raybeam import Pattern
 
 from ..base.arrays import AnyArray, Bytes, Floats, Ints, Ints32, Records, UInts32
 from ..base.elementary import arcsin, arctan2
+from ..base.errors import LidarpoolError
 from ..base.vectors import turned
 from ..columns.table import Column
 from ..columns.waveforms import column_type
@@ -187,7 +188,15 @@ class BatchPoints:
         world = self.survey.coordinates == "world"
         scaled = (self.positions if world else self.sensor_positions) / self.survey.precision_m
         cells = np.empty((3, len(self)), np.int32)
-        cells[:] = np.rint(scaled, out=scaled).T
+        try:
+            with np.errstate(invalid="raise"):
+                cells[:] = np.rint(scaled, out=scaled).T
+        except FloatingPointError:
+            far, step = np.abs(scaled).max() * self.survey.precision_m, self.survey.precision_m
+            raise LidarpoolError(
+                f"precision_m {step} is too fine for points {far:.0f} m from the "
+                f"origin: use at least {far / 2e9:.2g}."
+            ) from None
         return cells
 
     @property

@@ -325,9 +325,7 @@ class Scanner:
             with self._lock:
                 ahead = self._unnumbered * len(steps)
                 self._unnumbered += count
-        late_ns = 0
-        if start_s is not None:
-            late_ns = round(start_s * 1e9 - sensor.turn_ns(number or 0))
+        late_ns = 0 if start_s is None else round(start_s * 1e9 - sensor.turn_ns(number or 0))
         specs = [
             ScanSpec(step, 0, sensor.firings(step), late_ns, 0, sensor.channels, ahead)
             for step in steps

@@ -352,7 +352,8 @@ def _coarser(grid: _RasterGrid, step_m: float, window: Window | None) -> Iterato
     columns, rows = np.ceil((high - low) / step_m - 1e-6).astype(int).tolist()
     if min(columns, rows) < 2:
         raise MeshFileError("has fewer than 2 x 2 steps of step_m: give a smaller one")
-    place = Affine(step_m, 0, low[0], 0, -step_m, high[1])
+    wide, deep = (high - low) / (columns, rows)  # whole cells have their middle at their mean
+    place = Affine(wide, 0, low[0], 0, -deep, high[1])
     plane = grid.target or CRS.from_epsg(32631)  # any: GDAL wants one, the same on both sides
     options: dict[str, Any] = {"src_crs": grid.own or plane, "crs": plane}
     if grid.file.nodata is None and grid.file.dtypes[0].startswith("float"):
@@ -404,11 +405,10 @@ def _check_size(
             f"a scenario, scene: [{{file: {name}, step_m: {step:g}}}] takes means\nof them; not "
             f"step_m but window: {window} takes the middle, and window: {whole} all"
         )
-    coarser = f" or step_m: {step:g}" if count <= _MOST_READ else ""
     raise MeshFileError(
         f"has {sides[0]:,} x {sides[1]:,} pixels, a mesh of {bytes_of(count * _PIXEL_BYTES)}, of "
         f"at most {bytes_of(memory_share())}, a quarter of the memory: give window: {window}"
-        f"{coarser} in scene.files"
+        f"{f' or step_m: {step:g}' * (count <= _MOST_READ)} in scene.files"
     )
 
 
