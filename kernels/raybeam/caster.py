@@ -9,7 +9,7 @@ from operator import index
 import numpy as np
 from numpy.typing import ArrayLike
 
-from .arrays import Ints
+from .arrays import Floats, Ints
 from .backend import Backend
 from .crossing import Crossing, Nearest, Swept
 from .device import DeviceHits, OtherHits
@@ -242,6 +242,7 @@ class RayCaster:
         groups: ArrayLike | None = None,
         tally: bool = False,
         motion: Motion | None = None,
+        room: Floats | None = None,
     ) -> ScanReturns:
         """Cast a pattern of rays from one pose or from many: the fastest way for a lidar.
 
@@ -273,6 +274,9 @@ class RayCaster:
             Count the hits of each triangle, including those that are not kept.
         motion
             How the lidar moves within each pose, if its rays have different delays.
+        room
+            float64 (6, rays), contiguous: origins and directions of all rays are written there, as
+            `Pattern.rays` makes them; (3, rays) for directions alone. None for nowhere.
 
         Raises
         ------
@@ -304,6 +308,7 @@ class RayCaster:
                 groups=groups,
                 tally=tally,
                 motion=motion,
+                room=room,
             )
         )
 

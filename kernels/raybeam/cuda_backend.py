@@ -135,6 +135,8 @@ class CudaBackend(Backend):
         """See `Backend.scan`."""
         if scan.pattern.sub_rays is not None:  # which the kernel does not make
             return super().scan(scan)
+        if scan.room is not None:
+            scan.rays(0, len(scan))  # which writes them
         kept: list[Part] = []
         hits, counted = self.visit(scan, lambda found: kept.append(found.get()))
         ray, distance, triangle, instance = joined(kept)

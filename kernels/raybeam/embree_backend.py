@@ -157,7 +157,9 @@ class EmbreeBackend(Backend):
         # Threads may time calls at the same time: each list has enough, whatever the order.
         packets, single = self._strikes
         tried = min(len(packets), len(single)) >= _TRIALS
-        alone = np.median(single) < np.median(packets) if tried else len(single) < len(packets)
+        alone = len(single) < len(packets)
+        if tried:  # by the medians
+            alone = sorted(single)[_TRIALS // 2] < sorted(packets)[_TRIALS // 2]
         own["coherence"], start = 2.0 if alone else _COHERENCE, time.perf_counter()
         strike(own, crossing.rays, row, body, number, crossing.poses, crossing.box, *nearest)
         if not tried and len(row) >= _TRIED:
@@ -185,6 +187,12 @@ class EmbreeBackend(Backend):
         """Prepare to cast a scan."""
         pattern, cast = scan.pattern, self._memory.Cast(self._base)
         aside = cast.take_pattern(pattern, scan.poses, scan.first)
+        if scan.room is not None:
+            cast.record["ways"], cast.record["all"] = scan.room[-3:].ctypes.data, len(scan)
+            if len(scan.room) > 3:
+                cast.record["starts"] = scan.room.ctypes.data
+                if cast.record["still"]:
+                    scan.room[:3] = scan.poses.positions.T
         self._reach(cast, scan.poses, pattern.origins, (scan.t_min, scan.t_max), aside)
         return cast
 

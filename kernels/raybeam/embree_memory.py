@@ -65,6 +65,9 @@ CAST = np.dtype(
         ("distance", "i8"),  # float64, metres
         ("triangle", "i8"),  # int32
         ("instance", "i8"),  # int32
+        ("starts", "i8"),  # float64 (3, all) of all rays, if they are wanted: origins, metres
+        ("ways", "i8"),  # and directions
+        ("all", "i8"),
     ]
 )  # fmt: skip
 

@@ -16,7 +16,7 @@ from . import embree_exact as exact
 from . import embree_memory as memory
 from .compiled import callback, compiled, external, inlined, stage
 from .embree_memory import LANES, NUMBER, at, casts_at, float32s, float64s, int32s, int64s, offset
-from .embree_rays import begin, make, set_out
+from .embree_rays import begin, localise, make, set_out
 from .triangle_loops import areas, shear
 
 _ARGUMENTS, _ARGUMENTS_AT, _FILTER = at("arguments"), offset("arguments"), at("arguments") + 2
@@ -238,6 +238,7 @@ def trace(casts, start, stop):  # type: ignore[no-untyped-def]
         numbers[_POSE + lane], floats[_ENTRY + lane] = 0, 0.0
     if still:
         set_out(cast, scratch)
+        localise(cast, scratch)
         if cast.width > 1:
             _fill(scratch, cast.width, cast.t_min, t_max, np.int64(0))
     kept = 0

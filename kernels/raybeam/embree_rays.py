@@ -198,7 +198,7 @@ def _drift(scratch, poses, delays, rates, x, y, z):  # type: ignore[no-untyped-d
 def make(cast, scratch, block):  # type: ignore[no-untyped-def]
     """Make the rays of a group, whose numbers in the block are in its memory.
 
-    `block` is the row, the pose and the number within it of the block's first ray.
+    `block` is what `begin` says of the block's first ray.
     """
     floats = float64s(scratch)
     _rows(scratch, block[0], cast.rows * cast.subrays)
@@ -212,8 +212,13 @@ def make(cast, scratch, block):  # type: ignore[no-untyped-def]
         _turn(cast, scratch, _DX, _DY, _DZ)
     if cast.delays != 0:
         _drift(scratch, cast.poses, cast.delays, cast.rates, _DX, _DY, _DZ)
+    if cast.ways != 0:
+        _note(scratch, cast.ways + 8 * block[3], cast.all, _DX)
     if cast.still == 0:
         set_out(cast, scratch)
+        if cast.starts != 0:
+            _note(scratch, cast.starts + 8 * block[3], cast.all, _OX)
+        localise(cast, scratch)
     if cast.near == 0:
         low, high = cast.low, cast.upper
         for lane in range(LANES):
@@ -224,10 +229,20 @@ def make(cast, scratch, block):  # type: ignore[no-untyped-def]
 
 @inlined
 def begin(cast, block):  # type: ignore[no-untyped-def]
-    """Row, pose and number within the pose of a ray."""
+    """Row, pose, number within the pose, and number of a ray."""
     total, each = cast.rows * cast.subrays, cast.each
     pose = block // each
-    return (cast.first + block) % total, pose, block - pose * each
+    return (cast.first + block) % total, pose, block - pose * each, block
+
+
+@stage
+def _note(scratch, to, count, x):  # type: ignore[no-untyped-def]
+    """Write the vectors of a group, whose columns begin at x, among those of all rays."""
+    numbers, floats, out = int64s(scratch), float64s(scratch), float64s(to)
+    for lane in range(LANES):
+        k = numbers[_RAY + lane]
+        out[k], out[k + count] = floats[x + lane], floats[x + LANES + lane]
+        out[k + 2 * count] = floats[x + 2 * LANES + lane]
 
 
 @stage
@@ -274,8 +289,14 @@ def _localise(scratch, x, y, z, scale):  # type: ignore[no-untyped-def]
 
 
 @inlined
+def localise(cast, scratch):  # type: ignore[no-untyped-def]
+    """Take the starts of a group's rays to local coordinates."""
+    _localise(scratch, cast.centre[0], cast.centre[1], cast.centre[2], cast.scale)
+
+
+@inlined
 def set_out(cast, scratch):  # type: ignore[no-untyped-def]
-    """Write the local origins of a group's rays; sub-rays may have starts already."""
+    """Write where a group's rays start, metres; sub-rays may have starts already."""
     floats, begins = float64s(scratch), cast.shares != 0 and cast.begins != 0
     if not begins:
         for lane in range(LANES):
@@ -290,7 +311,6 @@ def set_out(cast, scratch):  # type: ignore[no-untyped-def]
     _add(scratch, cast.positions, cast.poses, _POSE)
     if cast.delays != 0:
         _move(scratch, cast.delays, cast.velocities, cast.poses)
-    _localise(scratch, cast.centre[0], cast.centre[1], cast.centre[2], cast.scale)
 
 
 @inlined

@@ -29,7 +29,7 @@ _CHUNK = 1 << 17  # rays at a time
 _PAIRS = 1 << 14  # of cells and bodies at a time
 _POSES = 1 << 18  # on a device: 25 MB
 _BOXES = 128  # that stand, at a time
-_LOOKS = 128  # cells for each look at the bodies
+_LOOKS = 256  # cells for each look at the bodies
 _NONE = np.zeros(0)
 
 
@@ -93,14 +93,15 @@ def hits_on(
     """
     from . import moving_loops as loops  # not before: numba takes half a second to import
 
-    found = Nearest.of(np.full(len(scan), np.nextafter(scan.t_max, np.inf)))  # which counts
-    if before is not None:
-        np.minimum(found.distance, before, out=found.distance)
+    end = float(np.nextafter(scan.t_max, np.inf))  # t_max counts
+    found = Nearest.of(np.full(len(scan), end) if before is None else np.minimum(before, end))
     for start, stop in scan.chunks(_CHUNK):
         ray = np.arange(start, stop, dtype=np.int64)
-        rays = np.empty((6, len(ray)))
-        origins, directions = scan.pattern.made(scan.first, ray, scan.poses)
-        rays[:3], rays[3:] = origins.T, directions.T
+        if scan.room is None:
+            made, rays = scan.rays(start, stop), np.empty((6, len(ray)))
+            rays[:3], rays[3:] = made.origins.T, made.directions.T
+        else:  # where the caster has written them
+            rays = np.ascontiguousarray(scan.room[:, start:stop])
         _Chunk(loops, moving, scan, rays, times(ray), found.part(start, stop)).cast()
     return found
 

@@ -6,7 +6,7 @@ import numpy as np
 
 from .arrays import Floats, Indices, Ints
 from .compiled import compiled, inlined, stage
-from .embree_memory import float64s
+from .embree_memory import float64s, int64s
 
 CELL, WIDE = 64, 16  # rays, and cells of a wide one
 PADS_M = 1e-3  # around a box, and 2e-6 of how far away it is: far more than rounding
@@ -176,50 +176,35 @@ def passes(sides, pad, end, x, y, z, dx, dy, dz):  # type: ignore[no-untyped-def
 
 
 @stage
-def _near(rays, n, x, y, z, radius, near):  # type: ignore[no-untyped-def]
-    """Write what is not positive for rays that come near a ball, of that squared radius.
+def _passing(rays, n, ends, place, turn, sides, pad, out):  # type: ignore[no-untyped-def]
+    """Write whether the rays of a cell pass through a box at a place.
 
-    `rays` is the address of a cell of (6, n), `near` that of float64 (`CELL`,).
+    `rays` is their address in (6, n), `ends` and `out` are those of float64 and int64 (`CELL`,).
     """
-    ray, out = float64s(rays), float64s(near)
+    ray, end, found = float64s(rays), float64s(ends), int64s(out)
+    px, py, pz = place
     for k in range(CELL):
-        u, v, w = x - ray[k], y - ray[n + k], z - ray[2 * n + k]
-        far = u * u + v * v + w * w
-        along = u * ray[3 * n + k] + v * ray[4 * n + k] + w * ray[5 * n + k]
-        out[k] = far - along * along - radius * (1 + 1e-6) - 1e-5 * far
+        x, y, z = taken(turn, ray[k] - px, ray[n + k] - py, ray[2 * n + k] - pz)
+        u, v, w = taken(turn, ray[3 * n + k], ray[4 * n + k], ray[5 * n + k])
+        found[k] = np.int64(passes(sides, pad, end[k], x, y, z, u, v, w))
 
 
 @compiled(
-    "i8(f8[:, ::1], f8[::1], i8[::1], i8[::1], f8[:, ::1], f8[:, ::1], i8[::1], f8[::1], f8[::1], "
+    "i8(f8[:, ::1], f8[::1], i8[::1], i8[::1], f8[:, ::1], f8[:, ::1], i8[::1], f8[::1], i8[::1], "
     "i8[:, ::1])"
 )
-def _through(rays, ends, cell, number, poses, boxes, shape, pads, near, out):  # type: ignore[no-untyped-def]
+def _through(rays, ends, cell, number, poses, boxes, shape, pads, passed, out):  # type: ignore[no-untyped-def]
     found, count = 0, rays.shape[1]
     for pair in range(len(cell)):
         begin, end = cell[pair] * CELL, min((cell[pair] + 1) * CELL, len(ends))
-        sides = sides_of(float64s(boxes.ctypes.data + 48 * shape[pair]))
-        (a, b, c), (d, e, f) = sides
-        pad, pose = pads[pair], number[pair]
-        turn = turn_of(poses, pose)
-        x, y, z = (a + d) / 2, (b + e) / 2, (c + f) / 2
-        ball = (d - x + pad) ** 2 + (e - y + pad) ** 2 + (f - z + pad) ** 2
-        px, py, pz = poses[0, pose], poses[1, pose], poses[2, pose]
-        (a, b, c), (d, e, f), (g, h, i) = turn
-        x, y, z = (
-            px + (a * x + b * y + c * z),
-            py + (d * x + e * y + f * z),
-            pz + (g * x + h * y + i * z),
-        )
+        sides, pose = sides_of(float64s(boxes.ctypes.data + 48 * shape[pair])), number[pair]
         first = min(begin, count - CELL)
-        _near(rays.ctypes.data + 8 * first, count, x, y, z, ball, near.ctypes.data)
+        place, turn = (poses[0, pose], poses[1, pose], poses[2, pose]), turn_of(poses, pose)
+        ray, own = rays.ctypes.data + 8 * first, ends.ctypes.data + 8 * first
+        _passing(ray, count, own, place, turn, sides, pads[pair], passed.ctypes.data)
         for k in range(begin, end):
-            if near[k - first] > 0:
-                continue
-            x, y, z = taken(turn, rays[0, k] - px, rays[1, k] - py, rays[2, k] - pz)
-            u, v, w = taken(turn, rays[3, k], rays[4, k], rays[5, k])
-            if passes(sides, pad, ends[k], x, y, z, u, v, w):
-                out[0, found], out[1, found] = k, pair
-                found += 1
+            out[0, found], out[1, found] = k, pair
+            found += passed[k - first]
     return found
 
 
@@ -236,5 +221,7 @@ def through(
     pairs = np.empty((2, len(cell) * CELL), np.int64)
     if len(ends) < CELL:  # the loop over a cell has a constant length
         rays = np.concatenate([rays, np.zeros((6, CELL - len(ends)))], axis=1)
-    found = _through(rays, ends, cell, number, poses, boxes, shape, pads, np.empty(CELL), pairs)
+        ends = np.concatenate([ends, np.full(CELL - len(ends), np.nan)])  # nothing is before
+    passed = np.empty(CELL, np.int64)
+    found = _through(rays, ends, cell, number, poses, boxes, shape, pads, passed, pairs)
     return pairs[0, :found], pairs[1, :found]

@@ -40,6 +40,9 @@ class Scan:
         int64 (g,): numbers of the rays at which groups begin; ascending, the first is 0.
     tally
         Whether to count hits by triangle.
+    room
+        float64 (6, count): where origins and directions of all rays are written; (3, count) for
+        directions alone, None for nowhere.
     """
 
     pattern: Pattern
@@ -51,6 +54,7 @@ class Scan:
     keep_every: int
     groups: Ints
     tally: bool
+    room: Floats | None = None
 
     def __len__(self) -> int:
         return self.count
@@ -64,6 +68,10 @@ class Scan:
         """Rays `start` to `stop`, with the bits of `Pattern.rays`."""
         ray = np.arange(start, stop, dtype=np.int64)
         origins, directions = self.pattern.made(self.first, ray, self.poses)
+        if self.room is not None:
+            self.room[-3:, start:stop] = directions.T
+            if len(self.room) > 3:
+                self.room[:3, start:stop] = origins.T
         return Rays(origins, directions, self.t_min, self.t_max)
 
 
@@ -80,6 +88,7 @@ def check_scan(
     groups: ArrayLike | None = None,
     tally: bool = False,
     motion: Motion | None = None,
+    room: Floats | None = None,
 ) -> Scan:
     """Check the arguments of `RayCaster.scan`, which describes them and the errors."""
     start, stop = (0, len(pattern)) if window is None else map(index, window)
@@ -105,6 +114,7 @@ def check_scan(
         index(keep_every),
         np.zeros(1, np.int64) if groups is None else np.asarray(groups, np.int64),
         tally,
+        room,
     )
 
 

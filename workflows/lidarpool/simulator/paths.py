@@ -77,6 +77,8 @@ class CastStep(PulseStep):
         self._brightest = float(table.scattered(np.arange(len(white)), white, white).max())
         shown = any(column.name in COLOURS for column in survey.stored_columns)
         self._coloured = shown or surfaces.materials.textured
+        # Whether it matters where rays start, and not only where they go.
+        self._placed = self._coloured or setup.moving or setup.passing or self._media is not None
 
     @staticmethod
     def applies(setup: Setup) -> bool:
@@ -106,10 +108,13 @@ class CastStep(PulseStep):
         leafy = media is not None and media.leafy
         # How far light goes in a crown depends on its other side, however far that is.
         reach = np.inf if leafy else farthest
-        found = self.caster.scan(beams, poses, window=window, t_min=nearest, t_max=reach)
+        rays = np.empty((6 if self._placed or poses.ways else 3, window[1] - window[0]))
+        found = self.caster.scan(beams, poses, window=window, t_min=nearest, t_max=reach, room=rays)
         ray = found.ray.astype(np.int64)
-        origins, directions = poses.rays(beams, ray, window[0])
-        origins = np.broadcast_to(origins, directions.shape)
+        directions = rays[-3:].take(ray, axis=1).T
+        origins = np.broadcast_to(np.zeros(3), directions.shape)
+        if self._placed:
+            origins = rays[:3].take(ray, axis=1).T
         light = _Light(
             ray, poses.times(ray), origins, directions, np.ones(len(ray)), np.zeros(len(ray))
         )
@@ -225,7 +230,7 @@ class CastStep(PulseStep):
         batch.hits = hits
         if each > 1:
             if parts[1:] or len(hits.ray) != len(ray):  # some light ends beyond the range
-                directions = poses.rays(beams, hits.ray, window[0])[1]
+                directions = rays[3:].take(hits.ray, axis=1).T
             batch.planes = normals, directions
         return hits
 

@@ -26,6 +26,7 @@ from raybeam import (
     check_scan,
     hits_on,
 )
+from raybeam.crossing import Nearest
 
 from ..base.arrays import Bools, Floats, Indices, Ints, Ints32
 from ..base.errors import LidarpoolError
@@ -118,11 +119,12 @@ class SceneCaster:
         keep_every: int = 1,
         groups: Ints | None = None,
         tally: bool = False,
+        room: Floats | None = None,
     ) -> ScanReturns:
         """See `RayCaster.scan`; the poses have a clock if there are actors."""
         start, stop = (0, len(pattern)) if window is None else window
         common: dict[str, Any] = {
-            **poses.given, "window": (start, stop), "t_min": t_min, "t_max": t_max,
+            **poses.given, "window": (start, stop), "t_min": t_min, "t_max": t_max, "room": room,
         }  # fmt: skip
         if self._begins is None and self._shapes is None:
             return self.caster.scan(
@@ -169,26 +171,34 @@ class SceneCaster:
 
         before = np.full(len(scan), np.inf)
         before[found.ray] = found.distance
-        on = self.on_actors(scan, poses, before)
-        most = len(found.ray) + len(on.ray)
-        ray, distance = np.empty(most, np.int64), np.empty(most)
-        triangle = np.empty(most, np.int32)
-        hits = found.ray, found.distance, found.triangle, on.ray, on.distance, on.triangle
-        count = surface_loops.merge(*hits, ray, distance, triangle)
+        on, numbers = self._nearest(scan, poses, before)
+        ray, distance = np.empty(len(scan), np.int64), np.empty(len(scan))
+        triangle = np.empty(len(scan), np.int32)
+        given = found.ray, found.triangle, *on, *numbers
+        count = surface_loops.merge(*given, ray, distance, triangle)
         return ray[:count], distance[:count], triangle[:count]
 
-    def on_actors(self, scan: Scan, poses: Poses, before: Floats | None = None) -> OtherHits:
-        """Find the nearest hits of rays on actors, at less than distances `before` (n,)."""
+    def on_actors(self, scan: Scan, poses: Poses) -> OtherHits:
+        """Find the nearest hits of rays on actors."""
+        hits, (parts, shape, firsts) = self._nearest(scan, poses)
+        ray = np.flatnonzero(hits.body >= 0)
+        body, triangle = hits.body[ray], hits.triangle[ray]
+        triangle = triangle + parts[shape[body], hits.instance[ray]] + firsts[body]
+        return OtherHits(ray.astype(np.uint32), hits.distance[ray], triangle)
+
+    def _nearest(
+        self, scan: Scan, poses: Poses, before: Floats | None = None
+    ) -> tuple[Nearest, tuple[Ints32, Indices, Ints32]]:
+        """Nearest hits on actors, before distances (n,), and what makes their triangles' numbers.
+
+        First triangles of parts, (s, p), shapes (a,) and first triangles (a,) of actors.
+        """
         assert self._shapes is not None
         casters, boxes, parts, shape = self._shapes
         ways = poses.ways
         frames = lambda body, times: ways.played(body, times)[0]  # noqa: E731
         moving = Moving(casters, boxes, shape, ways.presence_ns, ways.table, frames)
-        hits = hits_on(moving, scan, poses.times, before)
-        ray = np.flatnonzero(hits.body >= 0)
-        body, triangle = hits.body[ray], hits.triangle[ray]
-        triangle = triangle + parts[shape[body], hits.instance[ray]] + self._firsts[body]
-        return OtherHits(ray.astype(np.uint32), hits.distance[ray], triangle)
+        return hits_on(moving, scan, poses.times, before), (parts, shape, self._firsts)
 
 
 def _caster_of(scene: Scene, vertices: Floats, options: dict[str, Any]) -> RayCaster:

@@ -186,20 +186,24 @@ def times(ray, start, subrays, begins, delays, out):
 
 @compiled()
 def merge(
-    ray, distance, triangle, other_ray, other_distance, other_triangle, out, out_m, out_triangle
+    ray, triangle, nearest, body, instance, on_body, parts, shape, firsts, out, out_m, out_triangle
 ):
-    """Write hits in the order of rays, the others in place of those of their rays; how many."""
-    i, j, count = 0, 0, 0
-    while i < len(ray) or j < len(other_ray):
-        if j == len(other_ray) or (i < len(ray) and ray[i] < other_ray[j]):
-            out[count], out_m[count], out_triangle[count] = ray[i], distance[i], triangle[i]
-            i += 1
-        else:
-            i += int(i < len(ray) and ray[i] == other_ray[j])
-            out[count], out_m[count] = other_ray[j], other_distance[j]
-            out_triangle[count] = other_triangle[j]
-            j += 1
-        count += 1
+    """Write hits in the order of rays, those on bodies in place of others; returns how many.
+
+    `nearest` and those after it are as of `raybeam.crossing.Nearest`, of all rays; triangles of
+    bodies begin at `firsts`, and those of their `parts` from there, by `shape`.
+    """
+    i, count = 0, 0
+    for k in range(len(body)):
+        own, hit = body[k], i < len(ray) and ray[i] == k
+        if own >= 0:
+            out_triangle[count] = on_body[k] + parts[shape[own], instance[k]] + firsts[own]
+        elif hit:
+            out_triangle[count] = triangle[i]
+        i += int(hit)
+        if hit or own >= 0:
+            out[count], out_m[count] = k, nearest[k]
+            count += 1
     return count
 
 
