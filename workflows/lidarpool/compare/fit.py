@@ -65,7 +65,7 @@ _REJECTED = 1e-6  # chance of a variance above which a ray is left out
 _SPAN, _TILT = 2.0, 0.3  # least quotient of ranges, and tangent of incidence, that tell noise
 _WEAK_RAYS, _RING_RAYS = 30, 20  # rays with losses that a threshold needs; that of a ring's bias
 _SKY = (7, 31)  # rows and columns of which no ray returns twice, around a ray into the sky
-_PLANES, _PLANE_M, _PLANE_RAYS, _PLANE_POINTS = 8, 0.05, 300, 20_000
+_PLANES, _PLANE_M, _PLANE_RAYS, _PLANE_POINTS, _EVEN, _GAP = 8, 0.05, 300, 20_000, 0.4, 0.1
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -537,13 +537,22 @@ def _planes(points: Floats) -> Ints:
     o3d = load_open3d()
     o3d.utility.random.seed(0)
     number, left = np.full(len(points), -1), np.arange(len(points))
-    while len(left) >= _PLANE_RAYS and number.max() < _PLANES - 1:
-        cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points[left]))
-        (*normal, off), _ = cloud.segment_plane(_PLANE_M, 3, 400)
-        inside = np.abs(points[left] @ normal + off) < _PLANE_M  # of the plane of all inliers
-        if inside.sum() < _PLANE_RAYS:
+    for _ in range(_PLANES):
+        if len(left) < _PLANE_RAYS:
             break
-        number[left[inside]], left = number.max() + 1, left[~inside]
+        cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points[left]))
+        (*normal, above), _ = cloud.segment_plane(_PLANE_M, 3, 400)
+        off = np.abs(points[left] @ normal + above)  # from the plane of all inliers
+        inside = np.flatnonzero(off < _PLANE_M)
+        ways = points[left[inside]] / np.linalg.norm(points[left[inside]], axis=1)[:, None]
+        cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(ways))
+        # Walls in a line are not quite one plane: the largest piece is.
+        piece = np.asarray(cloud.cluster_dbscan(_GAP, 3))
+        inside = inside[piece == np.bincount(piece + 1)[1:].argmax()]
+        # What fills the slab evenly is cut out of other surfaces.
+        if len(inside) >= _PLANE_RAYS and np.median(off[inside]) < _EVEN * _PLANE_M:
+            number[left[inside]] = number.max() + 1
+        left = np.delete(left, inside)
     return number
 
 
