@@ -101,6 +101,16 @@ def test_bias_of_channels_against_planes_and_against_the_scene():
         fit(made, scene=street(), pose=(3, 1, 0))
 
 
+def test_beams_that_begin_beside_zero_bias_no_ring():
+    sensor = load_sensor("ouster/os1-32", columns=512)
+    quiet = {"noise": Noise(range_m=0.003), "precision_m": 1e-4, "coordinates": "sensor"}
+    scanner = Scanner(street(), sensor, **quiet)
+    made = [scanner.sweep((0, 0, 0), number=k) for k in range(4)]
+    found = fit(Recording("os1", 4, lambda k: (made[k].positions, made[k].columns, None)))
+    bias = [row["bias_m"]["value"] for row in found.figures["channels"] if row["bias_m"]]
+    assert len(bias) > 20 and np.abs(bias).max() < 0.001
+
+
 def test_a_single_sweep_and_a_moving_sensor_tell_bias_alone(recording):
     single = fit(replace(recording, count=1))
     assert not single.figures["figures"] and "there is a single sweep" in repr(single)

@@ -23,7 +23,7 @@ from ..base.words import plural
 from ..columns.cloud import Cloud
 from ..columns.parts import StoredCloud
 from ..render import theme
-from ..render.picture_page import Page
+from ..render.picture_page import Page, label_logarithms
 from ..report.page.rendering import rendered
 from ..scene.scene import Scene
 from ..sensor import Pose, Spin
@@ -50,6 +50,7 @@ _RANGES = ("range_m", "range_per_m", "range_at_threshold_m")  # noise of ranges
 _FEW, _POINTS = 30, 14  # rays that a figure or a point of a curve needs; points of a curve
 _AIM = 0.002  # scatter of directions that does not make outliers before it is known, radians
 _LEAST_M = 0.001  # error of the mean range of a ray, however often it is measured
+_HEAD_M = 0.1  # how far from zero the beams of a head may meet
 _FLAT = 1.7  # tangent of incidence: beyond, noise of directions makes mean ranges longer
 _DARKEST = 1 / 400  # reflectance of what is reported as 0
 MOST_VALUES = 1 << 24  # returns in memory; of more sweeps than these make, some are read
@@ -61,11 +62,11 @@ _STEEPEST = 5.7  # tangent of incidence: beyond, a beam meets several surfaces
 _BESIDE_M, _BESIDE = 0.3, 0.5  # how far surfaces may be from the scene's, and share of these
 _OTHER_DEG = 2.0  # a ring that is farther from all beams of a model is not one of them
 _Z, _STEP = 1.959964, 1e-3  # of 95 %; of logarithms, for derivatives
-_REJECTED = 1e-6  # chance of a variance above which a ray is left out
+_REJECTED = 1e-4  # chance of a variance above which a ray is left out
 _SPAN, _TILT = 2.0, 0.3  # least quotient of ranges, and tangent of incidence, that tell noise
 _WEAK_RAYS, _RING_RAYS = 30, 20  # rays with losses that a threshold needs; that of a ring's bias
 _SKY = (7, 31)  # rows and columns of which no ray returns twice, around a ray into the sky
-_PLANES, _PLANE_M, _PLANE_RAYS, _PLANE_POINTS = 8, 0.05, 300, 20_000
+_PLANES, _PLANE_M, _PLANE_RAYS, _PLANE_POINTS, _EVEN, _GAP = 8, 0.05, 300, 20_000, 0.4, 0.1
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -150,7 +151,7 @@ def fit(
         rays = smooth_rays(repeats, sigma, 0.0 if found else _AIM, expected)
         if len(rays.row) < _FEW:
             told = f"{recording.name} has {len(rays.row)} rays on smooth surfaces, not {_FEW}"
-            raise LidarpoolError(f"{told}: record a place with walls or a floor.")
+            raise LidarpoolError(f"{told}: record walls or a floor, in the sensor's axes.")
         known = np.isfinite(rays.light).all()
         energy = rays.light if known and recording.energies else None
         if known and (white := white or recording.white):
@@ -174,6 +175,7 @@ def fit(
     figures = {
         "versions": {"lidarpool": __version__}, "name": name, "model": base.name,
         "sweeps": repeats.sweeps, "moves": repeats.moves, "rays": len(rays.row),
+        "intensity": bool(known), "energy": energy is not None,
         "figures": {key: one._asdict() for key, one in found.items()}, "notes": notes,
         "channels": _channels(repeats, rays, own, sigma, expected), "curves": curves,
     }  # fmt: skip
@@ -270,7 +272,7 @@ class Repeats:
         numbers = even_indices(recording.count, max(MOST_VALUES // (shape[0] * shape[1]), 2))
         if len(numbers) < recording.count:
             notes.append(f"{len(numbers):,} of {recording.count:,} sweeps are used, evenly chosen")
-        values = np.full((3, len(numbers), *shape), np.nan, np.float32)
+        values = np.full((4, len(numbers), *shape), np.nan, np.float32)
         for k, number in enumerate(numbers.tolist()):
             if not len(turn := recording.turn(number)):
                 continue
@@ -293,15 +295,22 @@ class Repeats:
         usual = min(0.6 + 0.4 * (whole.sum() - 1), 3) * step + 0.001
         if moves := bool(step > _STILL_M or drift > usual):
             values = values[:, :1]
-        first = np.radians(cells.step_deg * np.arange(shape[1]))
+        first, level = (
+            np.radians(cells.step_deg * np.arange(shape[1])),
+            cells.elevation_deg[:, None],
+        )
         aside = (np.radians(values[2]) - first + np.pi) % (2 * np.pi) - np.pi
-        mean = np.nansum(aside, axis=0) / np.maximum(np.isfinite(aside).sum(axis=0), 1)
-        up, turned = np.radians(cells.elevation_deg)[:, None], first + mean
-        level = np.cos(up) * np.cos(turned), np.cos(up) * np.sin(turned)
+        risen = np.radians(values[3] - level)
+        mean, rise = (
+            np.nansum(one, axis=0) / np.maximum(np.isfinite(one).sum(axis=0), 1)
+            for one in (aside, risen)
+        )
+        turned, up = first + mean, np.radians(level) + rise
+        ways = [np.cos(up) * np.cos(turned), np.cos(up) * np.sin(turned), np.sin(up)]
         sigma = _median(np.abs(np.diff(values[0], axis=0)), (0, 2)) / (0.6745 * np.sqrt(2))
         sigma = np.where(np.isnan(sigma), _KINK_M, np.maximum(sigma, 1e-4))
         return cls(
-            cells.rings, cells.elevation_deg, np.stack([*level, np.sin(up) + 0 * mean], axis=-1),
+            cells.rings, cells.elevation_deg, np.stack(ways, axis=-1),
             values[0], values[1], aside - mean, np.repeat(sigma[:, None], shape[1], axis=1),
             int(whole.sum()), moves, tuple(notes),
         )  # fmt: skip
@@ -319,16 +328,18 @@ def surfaces(repeats: Repeats, distance: Floats, blur: Floats) -> tuple[Floats, 
     Returns by how much the range changes with the azimuth, and with the direction where it changes
     most, metres in a radian; and whether the neighbours lie in one plane with it. (r, c) each.
     """
-    ways, rows = repeats.directions, np.arange(len(distance))
-    points = distance[..., None] * ways
+    points, rows = distance[..., None] * repeats.directions, np.arange(len(distance))
     with np.errstate(invalid="ignore", divide="ignore"):
+        beams = points - _meeting(points)
+        length = np.linalg.norm(beams, axis=-1, keepdims=True)
+        ways = beams / length
         ahead, back, far, rear = (np.roll(points, by, axis=1) for by in (-1, 1, -2, 2))
         above, below = (points[np.clip(rows + by, 0, rows[-1])] for by in (-1, 1))
         rise = above - below if len(rows) > 2 else np.array([0, 0, 1.0])
         normal = np.cross(2 * (far - rear) + ahead - back, rise)
         # The range of a plane n · x = c in the direction d is c / (n · d).
         normal /= (normal * ways).sum(axis=-1, keepdims=True)
-        change = distance[..., None] * (ways - normal)
+        change = length * (ways - normal)
         slope = np.linalg.norm(change, axis=-1)
         allowed = _KINK_M + _KINK * distance + 5 * blur
         smooth = slope < _STEEPEST * distance
@@ -336,6 +347,17 @@ def surfaces(repeats: Repeats, distance: Floats, blur: Floats) -> tuple[Floats, 
         for beside, times in ((near, 1), (wide, 2), (above, 2), (below, 2)):
             smooth &= np.abs(((beside - points) * normal).sum(axis=-1)) < times * allowed
     return change[..., 1] * ways[..., 0] - change[..., 0] * ways[..., 1], slope, smooth
+
+
+def _meeting(points: Floats) -> Floats:
+    """Where the beams of each row of points (r, c, 3) meet, (r, 1, 3): on the axis, near zero."""
+    with warnings.catch_warnings(action="ignore"):
+        far, up = np.hypot(points[..., 0], points[..., 1]), points[..., 2]
+        middle, off = np.nanmean(far, axis=1), far - np.nanmean(far, axis=1, keepdims=True)
+        tangent = np.nansum(off * up, axis=1) / np.nansum(off**2, axis=1)
+        height = np.nanmean(up, axis=1) - tangent * middle
+    known = np.abs(height) < _HEAD_M  # also false of NaN
+    return np.where(known, height, 0)[:, None, None] * np.array([0, 0, 1.0])
 
 
 class Rays(NamedTuple):
@@ -537,13 +559,22 @@ def _planes(points: Floats) -> Ints:
     o3d = load_open3d()
     o3d.utility.random.seed(0)
     number, left = np.full(len(points), -1), np.arange(len(points))
-    while len(left) >= _PLANE_RAYS and number.max() < _PLANES - 1:
-        cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points[left]))
-        (*normal, off), _ = cloud.segment_plane(_PLANE_M, 3, 400)
-        inside = np.abs(points[left] @ normal + off) < _PLANE_M  # of the plane of all inliers
-        if inside.sum() < _PLANE_RAYS:
+    for _ in range(_PLANES):
+        if len(left) < _PLANE_RAYS:
             break
-        number[left[inside]], left = number.max() + 1, left[~inside]
+        cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points[left]))
+        (*normal, above), _ = cloud.segment_plane(_PLANE_M, 3, 400)
+        off = np.abs(points[left] @ normal + above)  # from the plane of all inliers
+        inside = np.flatnonzero(off < _PLANE_M)
+        ways = points[left[inside]] / np.linalg.norm(points[left[inside]], axis=1)[:, None]
+        cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(ways))
+        # Walls in a line are not quite one plane: the largest piece is.
+        piece = np.asarray(cloud.cluster_dbscan(_GAP, 3))
+        inside = inside[piece == np.bincount(piece + 1)[1:].argmax()]
+        # What fills the slab evenly is cut out of other surfaces.
+        if len(inside) >= _PLANE_RAYS and np.median(off[inside]) < _EVEN * _PLANE_M:
+            number[left[inside]] = number.max() + 1
+        left = np.delete(left, inside)
     return number
 
 
@@ -605,8 +636,14 @@ def _drawn(figures: Mapping[str, Any]) -> Page:
         at, *values = (np.array([one[key] for one in points]) for key in ("x", *Estimate._fields))
         value, low, high = (unit * one for one in values)
         axes = page.chart((0.075 + 0.32 * column, 1 - (530 + 500 * row) / tall, 0.235, 360 / tall))
-        scale = "log" if name.endswith("light") and at[0] > 0 else "linear"
-        axes.set(xlabel=x, ylabel=y, xscale=scale)
+        axes.set(xlabel=x, ylabel=y)
+        if name.endswith("light") and at[0] > 0:
+            axes.set_xscale("log")
+            label_logarithms(axes.xaxis, at[-1] < 1000 * at[0])
+        if share := y.endswith("%"):
+            low, high = np.clip((low, high), 0, 100)
         axes.vlines(at, low, high, color=theme.UNSEEN, lw=1.8 * page.unit)
         axes.plot(at, value, "o", color=theme.OBJECT_COLOURS[0], ms=3.2 * page.unit, mew=0)
+        if share:
+            axes.set_ylim(*np.clip(axes.get_ylim(), -1, 101))
     return page

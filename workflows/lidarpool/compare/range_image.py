@@ -34,7 +34,7 @@ class RangeImages:
     step_deg: float  # width of a column
     begin_deg: float  # azimuth of the first
     images: (
-        Floats  # (2, 3, r, c): range, intensity and azimuth_deg in A and in B; NaN where unknown
+        Floats  # (2, 4, r, c): range, intensity, azimuth and elevation, degrees; NaN where unknown
     )
     hidden: tuple[float, float]  # shares of points of A and B that others in their cells hide
     notes: tuple[str, ...]
@@ -58,6 +58,7 @@ class _Polar:
     """A sweep in polar coordinates."""
 
     azimuth: Floats  # (n,): degrees, 0 to 360
+    up: Floats  # (n,): elevations, degrees
     ranges: Floats
     ring: Ints  # (n,): index into `rings`
     light: Floats | None
@@ -83,12 +84,13 @@ class _Polar:
         )
         if np.median(high - low) > max(_TILT_DEG, _spacing(middle) / 2):
             raise LidarpoolError(
-                f"{name} has rings that are no cones around zero: its points are in the world's "
-                "axes, or of several poses, and the range image needs those of the sensor"
+                f"{name} has rings that are no cones around zero, which the range image needs: its "
+                "points are in the world's axes, or of several poses, or its sensor has no rings, "
+                "as a Livox"
             )
         ranges = np.linalg.norm(turn.points, axis=1)
         azimuth = np.degrees(np.arctan2(y, x)) % 360
-        return cls(azimuth, ranges, index, turn.light, rings, middle)
+        return cls(azimuth, elevation, ranges, index, turn.light, rings, middle)
 
     def step(self) -> float:
         """Typical step from a pulse to the next of its ring, degrees."""
@@ -129,7 +131,7 @@ class _Polar:
     def image(
         self, rows: Ints, phases: Floats, step: float, shape: tuple[int, int]
     ) -> tuple[Floats, float]:
-        """Ranges, lights and azimuths of cells (3, *shape), and the share of points hidden there.
+        """Return `RangeImages.images` of one sweep, and the share of points hidden in cells.
 
         `rows` (r,) are those of its rings, `phases` as the method gives them. Of several points in
         a cell, the one nearest to the middle is taken, and of several returns of a pulse the
@@ -141,11 +143,11 @@ class _Polar:
         cell = rows[self.ring] * shape[1] + column.astype(np.int64) % shape[1]
         order = np.lexsort((self.ranges, off, cell))
         chosen = order[np.diff(cell[order], prepend=-1) > 0]
-        image = np.full((3, shape[0] * shape[1]), np.nan)
-        image[0, cell[chosen]], image[2, cell[chosen]] = self.ranges[chosen], self.azimuth[chosen]
-        if self.light is not None:
-            image[1, cell[chosen]] = self.light[chosen]
-        return image.reshape(3, *shape), 1 - len(chosen) / len(cell)
+        image = np.full((4, shape[0] * shape[1]), np.nan)
+        for row, values in enumerate((self.ranges, self.light, self.azimuth, self.up)):
+            if values is not None:
+                image[row, cell[chosen]] = values[chosen]
+        return image.reshape(4, *shape), 1 - len(chosen) / len(cell)
 
 
 def range_images(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import struct
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
 from functools import partial
 from importlib import import_module
@@ -148,8 +148,9 @@ def open_recording(
             return _of_data_set(path, name, sensor, light)
         if (path / "metadata.yaml").exists():
             return _of_bag(path, name, sensor, light)
-        if files := sorted(path.glob("*.pcd"), key=lambda file: natural(file.name)):
-            return _of_pcd(files, name, light)
+        files = [file for file in path.iterdir() if file.suffix.lower() == ".pcd"]
+        if files:
+            return _of_pcd(sorted(files, key=lambda file: natural(file.name)), name, light)
     elif kind == ".ply":
         return _of_ply(path, name, sensor, light)
     elif kind == ".pcd":
@@ -254,11 +255,13 @@ def _of_pcd(files: list[Path], name: str, light: str | None) -> Recording:
     def read(number: int) -> Read:
         from pypcd4.pypcd4 import PointCloud  # an extra
 
-        check_fits(files[number])
-        file = PointCloud.from_path(files[number])
-        rows, (*place, w, x, y, z) = file.pc_data, file.metadata.viewpoint
-        if len(rows) != file.metadata.points:
-            raise ValueError(f"{file.metadata.points:,} points announced, {len(rows):,} there")
+        path = files[number]
+        check_fits(path)
+        with _reading(path.name) if len(files) > 1 else nullcontext():
+            file = PointCloud.from_path(path)
+            rows, (*place, w, x, y, z) = file.pc_data, file.metadata.viewpoint
+            if len(rows) != file.metadata.points:
+                raise ValueError(f"{file.metadata.points:,} points announced, {len(rows):,} there")
         columns = {name: rows[name] for name in rows.dtype.names or ()}
         pose = Placed(np.array([place]), np.array([[x, y, z, w]])).matrix(0)
         return _places(columns), columns, pose
@@ -392,7 +395,7 @@ def _reading(name: str) -> Iterator[None]:
     except LidarpoolError:
         raise
     except Exception as error:  # libraries raise whatever they stumble over
-        reason = printable(str(error)) or type(error).__name__
+        reason = printable(str(error).partition("\n")[0]) or type(error).__name__
         raise LidarpoolError(f"{name} is broken or cut short ({reason}).") from error
 
 

@@ -13,13 +13,14 @@ import matplotlib
 import numpy as np
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
+from matplotlib.axis import Axis
 from matplotlib.cm import ScalarMappable
 from matplotlib.collections import LineCollection
 from matplotlib.colors import ListedColormap, LogNorm, Normalize
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patheffects import withStroke
-from matplotlib.ticker import LogLocator
+from matplotlib.ticker import LogLocator, NullFormatter
 
 from ..base.arrays import AnyFloats, Floats
 from ..base.errors import explained
@@ -269,9 +270,7 @@ class Page:
         )  # fmt: skip
         if isinstance(norm, LogNorm):
             few = norm.vmax < 1000 * norm.vmin  # type: ignore[operator]  # both are given
-            axes.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5) if few else (1,)))
-            axes.yaxis.set_major_formatter(lambda value, _: f"{value:,.12g}")
-            axes.yaxis.set_minor_formatter(lambda value, _: "")
+            label_logarithms(axes.yaxis, few)
 
     def save(self, path: Path) -> None:
         """Write the page as a PNG, in its light colours; a link in its place goes.
@@ -306,6 +305,13 @@ class Page:
         for colour, name in theme.STYLED.items():
             svg = svg.replace(colour, f"var(--picture-{name}, {colour})")
         return svg
+
+
+def label_logarithms(axis: Axis, few: bool) -> None:
+    """Write numbers such as 1, 2, 5 and 10 at a logarithmic axis, or powers of ten if not few."""
+    axis.set_major_locator(LogLocator(subs=(1, 2, 5) if few else (1,)))
+    axis.set_major_formatter(lambda value, _: f"{value:,.12g}")
+    axis.set_minor_formatter(NullFormatter())
 
 
 def _grid(shot: SurfaceView) -> Floats:

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter
+from matplotlib.ticker import MaxNLocator
 
 from ..base.arrays import Bools, Floats
 from ..base.sampling import even_indices
@@ -18,7 +18,7 @@ from ..datasets.figures import Figures, Varied
 from ..datasets.sweep_data import Sweep
 from ..render import theme
 from ..render.colouring import colours_of
-from ..render.picture_page import FONT, Page
+from ..render.picture_page import FONT, Page, label_logarithms
 from .page.rendering import NARROW
 
 WIDTH = 1600
@@ -241,8 +241,7 @@ def _set_labels(page: Page, axes: Axes, scale: Varied, wide: float) -> None:
     if scale.is_log:
         axes.set_xscale("log")
         axes.set_xlim(low * (low / high) ** 0.02, high * (high / low) ** 0.02)
-        axis.set_major_locator(LogLocator(subs=(1, 2, 5) if high < 1000 * low else (1,)))
-        axis.set_minor_formatter(NullFormatter())
+        label_logarithms(axis, high < 1000 * low)
     else:
         axes.set_xlim(low - 0.02 * (high - low), high + 0.02 * (high - low))
         whole = bool((scale.edges % 1 == 0.5).all())  # bins of whole numbers

@@ -209,7 +209,7 @@ class Scenario(Section):
                 f"--{name.replace('_', '-')} is for a mesh file: in {path}"
                 f"{', or rather its base' * ('base' in data)}, change {MESH_OPTIONS[name]}."
             )
-        return cls.from_data(data, source=str(path), folder=path.parent)
+        return cls.from_data(data, source=f"{'survey of ' * mesh}{path}", folder=path.parent)
 
     @classmethod
     def from_data(

@@ -18,7 +18,7 @@ from ..base.arrays import Floats, Ints
 from ..base.declared import FILLED_IN, Several, about, written_as
 from ..base.errors import LidarpoolError
 from ..base.validation import checked_fields, shown
-from ..columns.table import COORDINATES, OPTIONAL, Column, chosen, stored, waveform_column
+from ..columns.table import COORDINATES, OPTIONAL, TABLE, Column, chosen, stored, waveform_column
 from .faults import Fault, check_faults
 from .materials import ClassNames, Material
 from .navigation import Navigation, check_navigation
@@ -145,7 +145,7 @@ class CloudOptions:
     ] = "world"
     columns: Annotated[
         Sequence[str | Column],
-        written_as(Several[Literal[OPTIONAL_NAMES]]),
+        written_as(Several[Literal[(*OPTIONAL_NAMES, *TABLE)]]),  # those always there, too
         about(
             "columns in addition to x, y, z, scan, channel and object: "
             + ", ".join(OPTIONAL_NAMES),
