@@ -246,6 +246,7 @@ async def dissolve(steward: Steward, names: Collection[str] | None, timeout_s: f
         end_inheritance(scheduler, name)
     if names is None:
         end_inheritance(scheduler, None)
+    if not steward.rules:
         close_page(scheduler)
         forget_statistics(scheduler)
     for seat in seats:

@@ -141,6 +141,7 @@ def test_a_block_dissolves_what_its_pool_has_made(start):
     with pool:
         pool.dissolve()
     assert list(pool.partitions()) == ["OLD"]
+    assert not [name for name in client.cluster.scheduler.plugins if "poolpart" in name]
     with pytest.raises(ZeroDivisionError) as raised, Pool.from_client(client) as pool:
         pool.partition("P", n_workers=1)
         client.close()
