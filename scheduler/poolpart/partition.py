@@ -142,7 +142,7 @@ class Partition:
         PoolError
             If the partition was dissolved, none of its workers has so many slots, or a worker
             belongs to another. Without any workers the task waits for one. The client asks at
-            most once a second, and not within an event loop.
+            most once a second, of names each time, and not within an event loop.
         """
         asks = not self.client.asynchronous  # or it would wait for the answer in its event loop
         resources = self._taking(slots, asks)

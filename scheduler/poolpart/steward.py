@@ -21,6 +21,7 @@ import time
 from collections.abc import Collection, Hashable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Any
 
 from distributed.diagnostics.plugin import SchedulerPlugin
@@ -254,11 +255,13 @@ class Steward(SchedulerPlugin):
             # A running loop checks the seat again before it ends.
             if not seat.away and (seat.reconciler is None or seat.reconciler.done()):
                 seat.reconciler = asyncio.ensure_future(self._settle(seat, seat.info.address))
-                seat.reconciler.add_done_callback(self._ended)
+                seat.reconciler.add_done_callback(partial(self._ended, seat))
 
-    def _ended(self, task: asyncio.Task[None]) -> None:
+    def _ended(self, seat: Seat, task: asyncio.Task[None]) -> None:
         if not task.cancelled() and (error := task.exception()):
-            logger.error("A worker is not in its partition", exc_info=error)
+            logger.error("Worker %s can be in no partition: %r", seat.info.name, error)
+            self.put(seat, None)
+            self._give_up(seat)  # such as one without this package: others may have its place
         self.remove_if_done()
 
     async def _settle(self, seat: Seat, address: str) -> None:
