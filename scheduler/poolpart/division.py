@@ -188,7 +188,8 @@ async def _move(
         await steward.arrive(late, _STAY_S)  # so that they can be moved again at once
         raise PoolError(
             f"{len(late)} of {len(seats)} workers could not be moved within "
-            f"{timeout_s:g} s, because their tasks have not ended: {names_of(late)} stay."
+            f"{timeout_s:g} s, because their tasks have not ended, or they do not answer: "
+            f"{names_of(late)} stay."
         )
     return [seat.info.name for seat in seats if not seat.gone]
 
@@ -231,7 +232,13 @@ async def dissolve(steward: Steward, names: Collection[str] | None, timeout_s: f
     # Until the next await nothing else happens on the scheduler; before, another client may have
     # dissolved the same partitions, or made some.
     gone = those()
-    seats = [seat for seat in steward.seats.values() if seat.partition in gone]
+    seats = [
+        seat
+        for seat in steward.seats.values()
+        # Or it was started with one, and has left it.
+        if seat.partition in gone
+        or (seat.partition is None and not seat.found.keys().isdisjoint(gone))
+    ]
     for name in gone:
         del steward.rules[name]
         # At once, even if the client dies or workers do not answer.
@@ -239,6 +246,7 @@ async def dissolve(steward: Steward, names: Collection[str] | None, timeout_s: f
         end_inheritance(scheduler, name)
     if names is None:
         end_inheritance(scheduler, None)
+    if not steward.rules:
         close_page(scheduler)
         forget_statistics(scheduler)
     for seat in seats:

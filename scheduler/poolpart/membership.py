@@ -97,7 +97,7 @@ def addresses_of(client: Client, name: str, workers: Sequence[str]) -> list[str]
         If there is no such member. An address at which there is no worker at all is left as it is.
     """
     found = membership(client, name)
-    if set(workers) - found.names.keys() - set(found.names.values()):
+    if set(workers) - found.names.keys():  # a name that was known may have another address now
         found = membership(client, name, fresh=True)
     addresses = []
     for worker in workers:

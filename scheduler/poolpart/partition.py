@@ -108,7 +108,7 @@ class Partition:
         priority: int = 0,
         retries: int = 0,
         slots: int = 1,
-        workers: str | Sequence[str] | None = None,
+        workers: str | int | Sequence[str | int] | None = None,
         **kwargs: Any,
     ) -> Future:
         """Submit one task to these workers.
@@ -142,14 +142,15 @@ class Partition:
         PoolError
             If the partition was dissolved, none of its workers has so many slots, or a worker
             belongs to another. Without any workers the task waits for one. The client asks at
-            most once a second, and not within an event loop.
+            most once a second, of names each time, and not within an event loop.
         """
         asks = not self.client.asynchronous  # or it would wait for the answer in its event loop
         resources = self._taking(slots, asks)
         if workers is not None:
-            workers = [workers] if isinstance(workers, str) else list(workers)
+            several = [workers] if isinstance(workers, str | int) else workers
+            workers = names = [str(name) for name in several]  # LocalCluster's are numbers
             if asks:
-                workers = addresses_of(self.client, self.name, workers)
+                workers = addresses_of(self.client, self.name, names)
         return self.client.submit(
             function,
             *args,

@@ -167,11 +167,16 @@ class Pool:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(self, *_: object) -> None:
-        if self._made:  # by now `dissolve` may have undone them
-            ask(self.client, dissolve, names=self._made, timeout_s=30.0)
-            forget_memberships()
-            self._made.clear()
+    def __exit__(self, kind: object, error: BaseException | None, traceback: object) -> None:
+        try:
+            if self._made:  # by now `dissolve` may have undone them
+                ask(self.client, dissolve, names=self._made, timeout_s=30.0)
+                forget_memberships()
+                self._made.clear()
+        except (PoolError, OSError) as failure:
+            if error is None:
+                raise
+            error.add_note(f"poolpart: the partitions stay: {failure}")  # what came first counts
 
     def divide(self, rules: Mapping[str, Rule]) -> dict[str, Partition]:
         """Divide this pool by rules, which stay in force, also when this client has gone.

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from numbers import Integral
 from typing import Any
 
 from .errors import PoolError
@@ -32,6 +33,11 @@ class Rule:
     slots: int | None = None
     minimum: int = 1
     exclusive: bool = False
+
+    def __post_init__(self) -> None:
+        for name, least in (("slots", 1), ("minimum", 0), ("most", 1), ("workers", 0)):
+            if (value := getattr(self, name, None)) is not None:
+                check_count(f"{name} of the rule {type(self).__name__}", value, least)
 
     def choose(self, free: Sequence[WorkerInfo]) -> list[WorkerInfo]:
         """Choose from available workers; the first ones are preferred.
@@ -214,5 +220,5 @@ def check_name(partition: object) -> None:
 
 def check_count(name: str, count: object, least: int = 1) -> None:
     """Check a number; PoolError unless it is whole and large enough."""
-    if not isinstance(count, int) or count < least:
+    if not isinstance(count, Integral) or count < least:
         raise PoolError(f"{name} is {count!r}; give a whole number, {least} or more.")

@@ -21,6 +21,7 @@ import time
 from collections.abc import Collection, Hashable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Any
 
 from distributed.diagnostics.plugin import SchedulerPlugin
@@ -53,7 +54,8 @@ class Seat:
     being_told: bool = False  # a request to declare resources is under way
     partition: str | None = None
     slots: float = 0  # of the partition
-    unplaced: bool = False  # it joined after the division, and no rule has taken it yet
+    unplaced: bool = False  # it joined after the division, and a rule has yet to take it
+    by_rule: bool = False  # it joined after the division, and a rule has taken it
     away: bool = False  # it has left, and its nanny may be restarting it
     gone: bool = False  # it is no longer expected
     reconciler: asyncio.Task[None] | None = None
@@ -103,7 +105,7 @@ class Steward(SchedulerPlugin):
 
     def put(self, seat: Seat, name: str | None, slots: float | None = None) -> None:
         """Put a worker into a partition, or None; slots default to those it was started with."""
-        seat.partition, seat.unplaced, seat.slots = name, False, 0
+        seat.partition, seat.slots, seat.unplaced, seat.by_rule = name, 0, False, False
         if name is not None:
             rule = self.rules[name]
             seat.slots = slots or rule.slots or seat.found.get(name) or rule.slots_of(seat.info)
@@ -184,6 +186,10 @@ class Steward(SchedulerPlugin):
     def _give_up(self, seat: Seat) -> None:
         seat.gone = True
         del self.seats[seat.key]
+        # One that was started in its place has joined before this, and went to the rest.
+        if remainder := self.remainder():
+            for other in self.members(remainder):
+                other.unplaced = other.by_rule
         self._place_soon()
         self.remove_if_done()
 
@@ -215,12 +221,14 @@ class Steward(SchedulerPlugin):
         self.settle([seat for seat in asked if self._place(seat)])
 
     def _place(self, seat: Seat) -> bool:
-        """Find a partition for a worker without one; returns whether there is one."""
+        """Find a partition for a worker that joined; returns whether it moves to another."""
         groups = {name: [member.info for member in self.members(name)] for name in self.rules}
         name = partition_for(seat.info, self.rules, groups)
-        if name is not None:
+        if moves := name not in (None, seat.partition):
             self.put(seat, name)
-        return name is not None
+            seat.by_rule = True
+        seat.unplaced = name is None
+        return moves
 
     async def _ask_for_gpus(self, seat: Seat) -> None:
         if not any(isinstance(rule, per_gpu) for rule in self.rules.values()):
@@ -247,11 +255,13 @@ class Steward(SchedulerPlugin):
             # A running loop checks the seat again before it ends.
             if not seat.away and (seat.reconciler is None or seat.reconciler.done()):
                 seat.reconciler = asyncio.ensure_future(self._settle(seat, seat.info.address))
-                seat.reconciler.add_done_callback(self._ended)
+                seat.reconciler.add_done_callback(partial(self._ended, seat))
 
-    def _ended(self, task: asyncio.Task[None]) -> None:
+    def _ended(self, seat: Seat, task: asyncio.Task[None]) -> None:
         if not task.cancelled() and (error := task.exception()):
-            logger.error("A worker is not in its partition", exc_info=error)
+            logger.error("Worker %s can be in no partition: %r", seat.info.name, error)
+            self.put(seat, None)
+            self._give_up(seat)  # such as one without this package: others may have its place
         self.remove_if_done()
 
     async def _settle(self, seat: Seat, address: str) -> None:

@@ -9,10 +9,7 @@ from typing import Any
 from distributed import Client
 
 from .adapting import jobs_coming, slots_at_most
-from .workers import on_scheduler
-
-SILENT_S = 20.0  # without a heartbeat: stopped, or with its GIL held
-_BEATS = 3  # heartbeats that a worker may miss at least
+from .workers import on_scheduler, silent_workers
 
 
 @dataclass(frozen=True)
@@ -68,9 +65,10 @@ def look_for_tasks(client: Client, partition: str, keys: Collection[str] = ()) -
 
 
 def _look(partition: str, keys: list[str], dask_scheduler: Any = None) -> TaskLocations:
-    members = [ws for ws in dask_scheduler.workers.values() if ws.resources.get(partition)]
+    workers = dask_scheduler.workers.values()
+    members = [ws for ws in workers if ws.resources.get(partition)]
     addresses = frozenset(ws.address for ws in members)
-    silent = addresses & _silent_workers(dask_scheduler)
+    silent = addresses & silent_workers({ws.address: ws.last_seen for ws in workers})
     usable = [ws for ws in members if ws.status.name == "running" and ws.address not in silent]
     places = {key: _place(dask_scheduler.tasks[key]) for key in keys if key in dask_scheduler.tasks}
     slots = sum(int(ws.resources[partition]) for ws in usable)
@@ -83,16 +81,6 @@ def _look(partition: str, keys: list[str], dask_scheduler: Any = None) -> TaskLo
         coming=jobs_coming(dask_scheduler, partition),
         tasks=places,
     )
-
-
-def _silent_workers(scheduler: Any) -> set[str]:
-    """Addresses of workers that have had no heartbeat for long."""
-    # If all workers have been silent, the scheduler itself was stopped or busy, and will hear from
-    # them soon.
-    now = max((ws.last_seen for ws in scheduler.workers.values()), default=0.0)
-    # Dask's interval, which is long in large clusters.
-    patience_s = max(SILENT_S, _BEATS * (1 + len(scheduler.workers) / 100))
-    return {ws.address for ws in scheduler.workers.values() if now - ws.last_seen > patience_s}
 
 
 def _place(task: Any) -> TaskPlace:

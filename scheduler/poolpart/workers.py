@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -11,6 +12,10 @@ from distributed.comm.core import CommClosedError
 
 from .errors import PoolError
 from .internals.client import ask
+
+SILENT_S = 20.0  # without a heartbeat: stopped, or with its GIL held
+_BEATS = 3  # heartbeats that a worker may miss at least
+_LOOK_S = 2.0  # between looks for silent workers
 
 
 @dataclass(frozen=True)
@@ -122,14 +127,40 @@ def ask_workers(
     """Run a function on workers, outside their tasks, by `Client.run`.
 
     Returns, by address, the result, or the exception raised there. Workers that died before they
-    answered are left out.
+    answered, and silent ones, are left out.
     """
-    if not addresses:  # to Client.run that would be all workers
+
+    async def run() -> dict[str, Any]:
+        left, silent = list(addresses), set[str]()
+        # To Client.run, no workers would be all.
+        while left := [address for address in left if address not in silent]:
+            request = client.run(question, workers=left, on_error="return")
+            asking = asyncio.ensure_future(request)
+            try:
+                while silent.isdisjoint(left):
+                    if (await asyncio.wait([asking], timeout=_LOOK_S))[0]:
+                        return dict(asking.result())
+                    here = (await ask(client, None, "identity", n_workers=-1))["workers"]
+                    silent = silent_workers({a: worker["last_seen"] for a, worker in here.items()})
+            finally:
+                asking.cancel()  # the answers of the others are lost with it
         return {}
-    answers = client.run(question, workers=list(addresses), on_error="return")
+
+    answers: dict[str, Any] = client.sync(run)
     if not any(isinstance(answer, OSError) for answer in answers.values()):
-        return dict(answers)
+        return answers
     here = worker_identities(client)
     # A worker that is there still may have raised an OSError itself.
     lost = {a: OSError if a not in here else CommClosedError for a in answers}
     return {a: answer for a, answer in answers.items() if not isinstance(answer, lost[a])}
+
+
+def silent_workers(last_seen: Mapping[str, float]) -> set[str]:
+    """Addresses of workers that have had no heartbeat for long, from the time of each one's last.
+
+    If all have been silent, the scheduler itself was stopped or busy, and will hear from them soon.
+    """
+    now = max(last_seen.values(), default=0.0)
+    # Dask's interval, which is long in large clusters.
+    patience_s = max(SILENT_S, _BEATS * (1 + len(last_seen) / 100))
+    return {address for address, seen in last_seen.items() if now - seen > patience_s}

@@ -92,7 +92,7 @@ def test_given_up_by_the_driver_it_does_no_harm(arena, what, known, monkeypatch,
                 stopped.append(pid)
                 os.kill(pid, signal.SIGSTOP)
                 # Only now: on a busy machine others that are well may be silent for so long.
-                patience.setattr(poolpart.task_locations, "SILENT_S", 2.0)
+                patience.setattr(poolpart.workers, "SILENT_S", 2.0)
         elif not continued and given_up():
             continued.append(frame.scan)
             patience.undo()

@@ -71,6 +71,15 @@ def test_everything_is_as_before(start, wait_until):
     assert known(client) == before
 
 
+def test_a_worker_that_has_left_what_it_was_started_with(start):
+    client = start({name: {"resources": {"GPU": 1}} for name in "ab"})
+    before = known(client)
+    pool = Pool.from_client(client)
+    pool["GPU"].shrink(1)
+    assert pool.dissolve() == ["GPU"]
+    assert known(client) == before
+
+
 def test_a_worker_that_comes_back_after_all_is_as_it_was(nannies, wait_until):
     """There is no partition any more by then."""
     before = known(nannies)

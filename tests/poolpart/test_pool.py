@@ -2,6 +2,8 @@
 
 import logging
 import math
+import os
+import signal
 
 import pytest
 from distributed import Client, LocalCluster
@@ -139,6 +141,23 @@ def test_a_block_dissolves_what_its_pool_has_made(start):
     with pool:
         pool.dissolve()
     assert list(pool.partitions()) == ["OLD"]
+    assert not [name for name in client.cluster.scheduler.plugins if "poolpart" in name]
+    with pytest.raises(ZeroDivisionError) as raised, Pool.from_client(client) as pool:
+        pool.partition("P", n_workers=1)
+        client.close()
+        raise ZeroDivisionError
+    assert "the partitions stay: The client is closed" in raised.value.__notes__[0]
+
+
+def test_a_worker_that_is_stopped_is_left_out(nannies, monkeypatch):
+    monkeypatch.setattr("poolpart.workers.SILENT_S", 1.0)
+    monkeypatch.setattr("poolpart.workers._BEATS", 1)
+    pid = nannies.run(os.getpid).popitem()[1]
+    os.kill(pid, signal.SIGSTOP)
+    try:
+        assert len(Pool.from_client(nannies)) == 1
+    finally:
+        os.kill(pid, signal.SIGCONT)
 
 
 def test_one_worker_for_each_gpu_of_a_host(start, monkeypatch):

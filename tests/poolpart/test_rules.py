@@ -55,6 +55,14 @@ def test_fewer_than_the_minimum():
         divide({"P": rest(minimum=3)}, pool)
 
 
+@pytest.mark.parametrize("number", [{"workers": 1.5}, {"workers": 1, "slots": 0}])
+def test_a_number_that_cannot_be_is_refused_by_name(number):
+    with pytest.raises(
+        PoolError, match=f"{[*number][-1]} of the rule n_workers is .* whole number"
+    ):
+        n_workers(**number)
+
+
 RULES = {"GPU": per_gpu(1), "IO": per_host(2), "OTHER": rest()}
 
 
