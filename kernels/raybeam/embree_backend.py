@@ -7,7 +7,7 @@ import os
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from functools import partial
+from functools import cache, partial
 from typing import TYPE_CHECKING, ClassVar, NamedTuple
 from weakref import ref
 
@@ -82,8 +82,7 @@ class EmbreeBackend(Backend):
         from . import embree_exact, embree_memory, embree_packets
 
         super().__init__(scene, threads, device)
-        count = threads or os.cpu_count() or 1
-        self._threads = ThreadPoolExecutor(count, "embree") if count > 1 else None
+        self._threads = threads or os.cpu_count() or 1
         trees = [embree_library.EmbreeMesh(mesh, threads) for mesh in scene.meshes]
         self._instances = (
             embree_library.EmbreeInstances(scene, trees, threads) if scene.nested else None
@@ -245,10 +244,16 @@ class EmbreeBackend(Backend):
 
         span = way.step * way.high
         share = max(_SHARE // span, 1) * span
-        if self._threads is None or n <= share:
+        if self._threads == 1 or n <= share:
             share = n
             return part(start)
-        return joined(list(self._threads.map(part, range(start, stop, share))))
+        threads = _threads(os.getpid(), self._threads)
+        return joined(list(threads.map(part, range(start, stop, share))))
+
+
+@cache
+def _threads(process: int, count: int) -> ThreadPoolExecutor:
+    return ThreadPoolExecutor(count, "embree")  # of each process, as they do not survive a fork
 
 
 class _Plan:

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
+from multiprocessing import get_context
 
 import numpy as np
 import pytest
@@ -364,6 +366,21 @@ def test_threads_share_a_scanner(scene, backend, sensor):
     scanner = Scanner(scene, sensor, columns=["time"], backend=backend, **PHYSICS)
     with ThreadPoolExecutor(4) as pool:
         assert list(pool.map(scan, [*range(4)] * 2)) == alone * 2
+
+
+def test_a_forked_process_scans_with_the_scanner_of_its_parent(scene):
+    scanner = Scanner(scene, GRID, backend="embree", threads=2)
+    poses = [HERE] * 2000
+    expected = scanner.ranges(poses, number=3).tobytes()  # which starts threads that a fork lacks
+
+    def scan() -> None:
+        os._exit(scanner.ranges(poses, number=3).tobytes() != expected)
+
+    other = get_context("fork").Process(target=scan)
+    other.start()
+    other.join(120)
+    other.kill()
+    assert other.exitcode == 0
 
 
 def test_positions_are_those_of_the_world_or_of_the_sensor(scene):
