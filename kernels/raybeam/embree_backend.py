@@ -7,7 +7,7 @@ import os
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from functools import cache, partial
+from functools import partial
 from typing import TYPE_CHECKING, ClassVar, NamedTuple
 from weakref import ref
 
@@ -82,7 +82,9 @@ class EmbreeBackend(Backend):
         from . import embree_exact, embree_memory, embree_packets
 
         super().__init__(scene, threads, device)
-        self._threads = threads or os.cpu_count() or 1
+        self._count = threads or os.cpu_count() or 1
+        self._threads = ThreadPoolExecutor(self._count, "embree")  # which start when needed
+        self._process = os.getpid()
         trees = [embree_library.EmbreeMesh(mesh, threads) for mesh in scene.meshes]
         self._instances = (
             embree_library.EmbreeInstances(scene, trees, threads) if scene.nested else None
@@ -244,16 +246,12 @@ class EmbreeBackend(Backend):
 
         span = way.step * way.high
         share = max(_SHARE // span, 1) * span
-        if self._threads == 1 or n <= share:
+        if self._count == 1 or n <= share:
             share = n
             return part(start)
-        threads = _threads(os.getpid(), self._threads)
-        return joined(list(threads.map(part, range(start, stop, share))))
-
-
-@cache
-def _threads(process: int, count: int) -> ThreadPoolExecutor:
-    return ThreadPoolExecutor(count, "embree")  # of each process, as they do not survive a fork
+        if self._process != os.getpid():  # a fork, which has none of its parent's threads
+            self._threads, self._process = ThreadPoolExecutor(self._count, "embree"), os.getpid()
+        return joined(list(self._threads.map(part, range(start, stop, share))))
 
 
 class _Plan:

@@ -564,7 +564,7 @@ def test_a_robot_alone_stands_still_with_its_joints_at_zero(folder):
     ("name", "way"),
     [
         ("a.sdf", "sdf2usd"),
-        ("a.xml", "mujoco-usd-converter, and lidarpool import"),
+        ("a.xml", "mujoco-usd-converter, lidarpool import"),
         ("a.mjcf", "mujoco"),
     ],
 )

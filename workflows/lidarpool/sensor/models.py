@@ -212,7 +212,8 @@ class SensorModel(_ModelSection):
             )
         if any(abs(angle) > 90 for angle in self.beams.elevation_deg):
             raise ValueError("beams.elevation_deg goes beyond 90 degrees")
-        unused = self.model_fields_set & {"axis", "clockwise", "mirror", "zero_deg"}
+        others = {"axis", "clockwise", "mirror", "zero_deg"}
+        unused = self.model_dump(include=others, exclude_defaults=True)
         if self.prisms and unused:
             raise ValueError(f"prisms turn about x: leave {min(unused)} out, and turn the sensor")
         self.beams.beams()  # LidarpoolError if it cannot be made
