@@ -258,10 +258,10 @@ class Steward(SchedulerPlugin):
                 seat.reconciler.add_done_callback(partial(self._ended, seat))
 
     def _ended(self, seat: Seat, task: asyncio.Task[None]) -> None:
-        if not task.cancelled() and (error := task.exception()):
+        if not (task.cancelled() or seat.away) and (error := task.exception()):
             logger.error("Worker %s can be in no partition: %r", seat.info.name, error)
             self.put(seat, None)
-            self._give_up(seat)  # such as one without this package: others may have its place
+            self._give_up(seat)  # such as one without this package; an absent one keeps its place
         self.remove_if_done()
 
     async def _settle(self, seat: Seat, address: str) -> None:

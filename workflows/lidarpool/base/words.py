@@ -33,7 +33,8 @@ def as_python(note: str) -> str:
 
 def as_scenario(note: str) -> str:
     """Return a note with its settings as in a scenario: {file: …, up_axis: z}, also of an actor."""
-    return _SETTING.sub(r"\2: \4 in \1", re.sub(r"<file.(.+)=.(\w+).>", r"{file: …, \1: \2}", note))
+    form = {"file": "{{file: …, {}: {}}}"}
+    return _SETTING.sub(lambda m: form.get(m[1], f"{{}}: {{}} in {m[1]}").format(m[2], m[4]), note)
 
 
 def plural(number: float, what: str, several: str = "") -> str:

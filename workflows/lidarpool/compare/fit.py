@@ -295,10 +295,8 @@ class Repeats:
         usual = min(0.6 + 0.4 * (whole.sum() - 1), 3) * step + 0.001
         if moves := bool(step > _STILL_M or drift > usual):
             values = values[:, :1]
-        first, level = (
-            np.radians(cells.step_deg * np.arange(shape[1])),
-            cells.elevation_deg[:, None],
-        )
+        level = cells.elevation_deg[:, None]
+        first = np.radians(cells.step_deg * np.arange(shape[1]))
         aside = (np.radians(values[2]) - first + np.pi) % (2 * np.pi) - np.pi
         risen = np.radians(values[3] - level)
         mean, rise = (

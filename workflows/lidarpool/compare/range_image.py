@@ -33,9 +33,8 @@ class RangeImages:
     elevation_deg: Floats  # (r,): medians of the points
     step_deg: float  # width of a column
     begin_deg: float  # azimuth of the first
-    images: (
-        Floats  # (2, 4, r, c): range, intensity, azimuth and elevation, degrees; NaN where unknown
-    )
+    # (2, 4, r, c): range, intensity, azimuth and elevation, degrees, in A and in B; NaN if unknown
+    images: Floats
     hidden: tuple[float, float]  # shares of points of A and B that others in their cells hide
     notes: tuple[str, ...]
     row: Ints  # (k,): of all cells, or of all rays that have a return
