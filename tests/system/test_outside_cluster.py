@@ -1,6 +1,7 @@
 """The command on a cluster that somebody else started: same bytes, right places."""
 
 import json
+from dataclasses import replace
 from hashlib import sha256
 from pathlib import Path
 
@@ -86,4 +87,5 @@ def test_other_workers_with_other_sources_end_the_run_before_they_change_a_byte(
         Client(cluster.address, set_as_default=False) as client,
         pytest.raises(LidarpoolError, match=r"sources 12345678\), the run .*: install the same"),
     ):
-        simulate(Scene.seed(), SURVEY, planning, client=client, backend="numpy", on_frame=on_frame)
+        long = replace(SURVEY, steps=72 * 1000)  # so that it lasts until the other worker is there
+        simulate(Scene.seed(), long, planning, client=client, backend="numpy", on_frame=on_frame)
