@@ -42,12 +42,12 @@ chaos: dev  ## 200 faults, every kind at every point of a survey; SEED=n plays t
 soak: dev  ## 10,000 scans with a worker killed every few seconds; memory as a picture in $(OUT)/
 	$(BIN)/python -m tests.chaos.soak --picture $(OUT)/soak.png
 
-lint: dev docs  ## format check, lint, types, layer contracts, sizes, documentation
+lint: dev docs  ## format check, lint, types, layer contracts, documentation; prints lines per package
 	$(BIN)/ruff format --check .
 	$(BIN)/ruff check .
 	$(BIN)/mypy
 	$(BIN)/lint-imports
-	$(BIN)/python .ci/sizes.py
+	$(BIN)/python .ci/lines.py
 
 docs: dev  ## the documentation as a site in build/site; a warning is an error
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import gc
 import time
 from collections.abc import Callable, Iterator
@@ -39,12 +40,37 @@ _KEEPS = _keeps()
 
 
 @cache
-def _stamp(folder: Path) -> tuple[int, ...]:
-    """Return what changes with any source of a loop's package, or this one: numba looks at one."""
-    while (folder.parent / "__init__.py").exists():
-        folder = folder.parent
-    found = sorted({*Path(__file__).parent.glob("*.py"), *folder.rglob("*.py")})
-    return tuple(number for f in found for number in (f.stat().st_mtime_ns, f.stat().st_size))
+def _imported(path: Path) -> tuple[Path, ...]:
+    """Return the files that a module names in its relative imports."""
+    files: list[Path] = []
+    for node in ast.walk(ast.parse(path.read_bytes())):
+        if isinstance(node, ast.ImportFrom) and node.level:
+            package = path.parents[node.level - 1]
+            module = package.joinpath(*(node.module or "").split("."))
+            candidates = [module.with_suffix(".py")] if node.module else []
+            candidates += [module / f"{alias.name}.py" for alias in node.names]
+            files += [candidate for candidate in candidates if candidate.is_file()]
+    return tuple(files)
+
+
+@cache
+def _stamp(path: Path) -> tuple[int, ...]:
+    """Return a value that changes with each source file that a loop may depend on.
+
+    Numba itself watches only the file of the loop. Its constants and callees come from the modules
+    that this file imports, directly or not, and from raybeam. The rest of a package does not count:
+    loops of the simulator need not be compiled again when a command changes.
+    """
+    sources: set[Path] = set()
+    unread = [path]
+    while unread:
+        source = unread.pop()
+        if source not in sources:
+            sources.add(source)
+            unread += _imported(source)
+    sources.update(Path(__file__).parent.glob("*.py"))
+    stats = [source.stat() for source in sorted(sources)]
+    return tuple(number for stat in stats for number in (stat.st_mtime_ns, stat.st_size))
 
 
 _WAIT_S, _STEP_S = 60.0, 0.02  # in all, for processes that compile: one may have been stopped
@@ -91,7 +117,7 @@ def _kept(made: Any, function: Any) -> Any:
     if not _KEEPS:
         return made
     made.enable_caching()
-    made._cache._cache_file._source_stamp = _stamp(Path(function.__code__.co_filename).parent)
+    made._cache._cache_file._source_stamp = _stamp(Path(function.__code__.co_filename))
     alone, folder = made.compile, made._cache._cache_path
 
     def compile_in_turn(*signature: Any) -> Any:

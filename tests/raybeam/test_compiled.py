@@ -1,5 +1,6 @@
-"""Loops are compiled once, and again when any file of the package has changed."""
+"""Loops are compiled once, and again when a file that they depend on has changed."""
 
+import os
 import shutil
 import subprocess
 import sys
@@ -48,6 +49,27 @@ def test_a_change_of_another_file_compiles_again(run):
     assert run("2.0") == ["3.0", "1"]
     assert run() == ["3.0", "0"]
     assert run("30.0") == ["31.0", "1"]
+
+
+def test_only_a_change_of_imported_files_compiles_again(tmp_path):
+    """A loop depends on what its file imports, also indirectly, and not on all of its package."""
+    package = tmp_path / "loops"
+    package.mkdir()
+    (package / "__init__.py").touch()
+    (package / "more.py").write_text(LOOP.replace("from .compiled", "from raybeam.compiled"))
+    (package / "numbers.py").write_text("from .constants import MORE\n")
+
+    def run():
+        command = [sys.executable, "-m", "loops.more"]
+        path = {**os.environ, "PYTHONPATH": str(Path(compiled.__file__).parents[1])}
+        return subprocess.check_output(command, cwd=tmp_path, text=True, env=path).split()
+
+    (package / "constants.py").write_text("MORE = 2.0\n")
+    assert run() == ["3.0", "1"]
+    (package / "unrelated.py").write_text("LESS = 1.0\n")
+    assert run() == ["3.0", "0"]
+    (package / "constants.py").write_text("MORE = 30.0\n")
+    assert run() == ["31.0", "1"]
 
 
 def test_processes_that_start_together_compile_once(run, tmp_path):

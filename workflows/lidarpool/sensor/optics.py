@@ -21,6 +21,7 @@ from .reflectivity import SCALES
 LIGHT_M_NS = 0.299792458  # in vacuum; in air it is slower by 0.03 %
 FWHM = sqrt(8 * log_of(2.0))  # full width at half maximum of a Gaussian, in standard deviations
 WINDOW_SIGMAS = 10  # that an echo takes in a waveform, to both sides together
+CUT = WINDOW_SIGMAS / 2  # standard deviations of the system waveform: beyond, an echo is 0 (4e-6)
 # Standard deviation of the response of a Gaussian receiver times its bandwidth at -3 dB.
 _RESPONSE = sqrt(log_of(2.0)) / (2 * pi)
 

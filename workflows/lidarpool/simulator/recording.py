@@ -9,9 +9,10 @@ from ..base.arrays import Floats, Ints
 from ..base.elementary import exp
 from ..columns.waveforms import SILENT, ZERO, record
 from ..sensor.noise import THRESHOLD_SIGMAS, Purpose, normal, raw
+from ..sensor.optics import CUT
 from .returns import Keys, PulseReturns, made, numbers
 from .step import Memory, PulseBatch, PulseStep, Setup, Sizes
-from .waveform import CUT, Digitizer
+from .waveform import Digitizer
 
 BLOCK_SAMPLES = 1 << 20  # that are made at a time
 

@@ -10,10 +10,12 @@ from raybeam.compiled import compiled, inlined
 from raybeam.rays import UNIT_SLACK
 
 from ..base.elementary_loops import exp, sin_cos
-from ..sensor import materials
-from ..sensor.materials import NEAREST_M, REFERENCE_M, RETRO_GAIN, WATER_INDEX
+from ..sensor.materials import GLASS_INDEX, NEAREST_M, REFERENCE_M, RETRO_GAIN, WATER_INDEX
+from ..sensor.materials import fresnel as fresnel_of_arrays
+from ..sensor.materials import within_water as within_water_of_arrays
 
-fresnel, within_water = map(inlined, (materials.fresnel, materials.within_water))
+fresnel = inlined(fresnel_of_arrays)
+within_water = inlined(within_water_of_arrays)
 
 
 @inlined
@@ -144,7 +146,7 @@ def onward(
         square = grazing * grazing
         mirrors = first + (1 - first) * (grazing * (square * square)) if first > 0 else 0.0
         if passes[owner]:
-            mirrors = fresnel(cosine, materials.GLASS_INDEX)
+            mirrors = fresnel(cosine, GLASS_INDEX)
         goes = mirrors if off[j] else 1 - mirrors if passes[owner] else 1.0
         goes = goes if straight[owner] else 1.0
         goes *= 1.0 if leafy[owner] else 1 - shares[j]

@@ -11,8 +11,8 @@ import numpy as np
 from raybeam.compiled import compiled, inlined, stage
 
 from ..base.elementary_loops import exp, log
+from ..sensor.optics import CUT
 from .pulse_loops import _joined
-from .waveform import CUT
 
 # All in standard deviations of the system waveform.
 # Hits within this are one echo in closed form: position and height err by 1e-3 at most.

@@ -15,12 +15,10 @@ import numpy as np
 
 from ..base.arrays import Floats, owned
 from ..sensor.noise import Purpose
-from ..sensor.optics import FWHM, LIGHT_M_NS, WINDOW_SIGMAS
+from ..sensor.optics import CUT, FWHM, LIGHT_M_NS
 from .returns import NO_SURFACE, OF_RETURNS, Planes, PulseReturns, made, numbers
 from .separation import surfaces_of
 from .step import PulseBatch, PulseStep, Setup
-
-CUT = WINDOW_SIGMAS / 2  # standard deviations of the system waveform: beyond, an echo is 0 (4e-6)
 
 
 class WaveformStep(PulseStep):
