@@ -1,13 +1,23 @@
 """Tasks of a partition lend their slots while they wait for other tasks.
 
-A task that waits for tasks which it has submitted to its own partition holds what they need. So
-while it waits in `Future.result`, `Client.gather`, `distributed.wait`, `as_completed`, for a
-collection or for a `Partition.map`, its slots are there for others, and its thread if it has one of
-the worker's. It gets both back before it goes on, also when the wait ends by a time-out; until then
-no waiting task gets the slots. Of several that want slots back on one worker, the first to ask is
-the first to get them.
+A task that waits for tasks which it has submitted to its own partition holds what these need. So
+while it waits, its slots are there for others, and its thread if it has one of the worker's:
 
-That happens in the worker, because only the worker counts free slots. The scheduler knows a task
+- in `Future.result`, `Client.gather`, `distributed.wait`, `as_completed`, for a collection or a
+  `Partition.map`: at once;
+- in every other call of the scheduler that waits, such as `Queue.get`, `Variable.get`,
+  `Event.wait`, `Lock.acquire`, `Pipe.get` and `Pipe.put`: from the moment on that a task which
+  another task has submitted, or a task that wants its slots back, waits for slots of the worker.
+  A long task on a worker without nested tasks keeps its slots.
+
+A loan lasts to the end of the wait. The task gets slots and thread back before it goes on, also
+when the wait ends by a time-out; until then no waiting task gets the slots. Of several tasks that
+want slots back on one worker, the first to ask is the first to get them.
+
+A task that waits in another way, such as a loop over `Future.done`, lends nothing. If a task that
+it has submitted waits for slots meanwhile, all clients get a warning.
+
+Lending happens in the worker, because only the worker counts free slots. The scheduler knows a task
 that has lent its slots as one that runs. Only tasks of partitions lend: other users' tasks that
 hold a resource keep it, as in Dask without poolpart.
 
@@ -16,8 +26,13 @@ Coroutines, and threads that a task starts itself, do not lend.
 
 from __future__ import annotations
 
+import asyncio
+import concurrent.futures
+import logging
+import pickle
 import threading
-from collections import deque
+import time
+from collections import Counter, deque
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
@@ -28,10 +43,21 @@ from distributed.diagnostics.plugin import WorkerPlugin
 from distributed.protocol.pickle import dumps
 
 from .internals.client import let_waits_lend
-from .internals.scheduler import Resources
-from .internals.worker import free_slots, resources_of, slots_here, take_slots, task_of_thread
+from .internals.scheduler import Resources, Submitter, call
+from .internals.worker import (
+    free_slots,
+    is_running,
+    resources_of,
+    slots_here,
+    submitter_of,
+    take_slots,
+    task_of_thread,
+)
 
-_LOOK_S = 1.0  # between looks whether the worker is still there
+logger = logging.getLogger(__name__)
+
+WARN_AFTER_S = 5.0  # that a nested task waits for slots, before clients are warned
+_CHECK_EVERY_S = 1.0  # whether the worker still exists
 
 _lock = threading.Lock()
 _lenders: dict[Any, Lender] = {}  # by worker of this process
@@ -42,8 +68,17 @@ _thread = threading.local()
 class _Loan:
     """Slots that one task has lent, and whether it has them back."""
 
+    key: Any  # of the task
     slots: Resources
-    ended: threading.Event = field(default_factory=threading.Event)
+    returned: threading.Event = field(default_factory=threading.Event)
+
+
+@dataclass(frozen=True)
+class _NestedTask:
+    """A task that waits for slots of this worker, and the task that has submitted it."""
+
+    submitter: Submitter
+    since: float  # time.monotonic()
 
 
 class Lender:
@@ -52,65 +87,190 @@ class Lender:
     def __init__(self, worker: Any) -> None:
         self.worker = worker
         self.names: set[str] = set()  # partitions whose tasks lend
-        self._wanted: deque[_Loan] = deque()  # slots that tasks wait for, in the order of asking
+        self.waiters: set[threading.Event] = set()  # of threads that lend once slots are wanted
+        self._nested: dict[Any, _NestedTask] = {}  # {key: a task that waits for slots}
+        self._lending: Counter[Any] = Counter()  # {key of a task: its loans under way}
+        self._returning: deque[_Loan] = deque()  # loans whose tasks wait for their slots
+        self._warned: set[Any] = set()  # keys of submitting tasks
+        self._next_look: Any = None  # handle of the event loop
+
+    # -- loans -------------------------------------------------------------------------
 
     def lend(self, loan: _Loan) -> None:
         """Let other tasks have the slots."""
+        self._lending[loan.key] += 1
         free_slots(self.worker, loan.slots)
         self.serve()
 
     def take_back(self, loan: _Loan) -> None:
         """Let no other task start in these slots, and say when they are free."""
+        self._lending[loan.key] -= 1
+        if not self._lending[loan.key]:
+            del self._lending[loan.key]
         take_slots(self.worker, loan.slots)
-        self._wanted.append(loan)
+        self._returning.append(loan)
         self.serve()
 
     def serve(self) -> None:
         """Give slots back, as far as they are free."""
-        while self._wanted and (not self.names or self._are_free(self._wanted[0].slots)):
-            self._wanted.popleft().ended.set()
+        while self._returning and (not self.names or self._are_free(self._returning[0].slots)):
+            self._returning.popleft().returned.set()
+        self._notify()
 
     def _are_free(self, slots: Resources) -> bool:
         for name, number in slots.items():
             available, total = slots_here(self.worker, name)
-            free = available + sum(loan.slots.get(name, 0) for loan in self._wanted)
+            free = available + sum(loan.slots.get(name, 0) for loan in self._returning)
             # All that there are may be fewer than before: the partition has changed.
             if free < min(number, total):
                 return False
         return True
 
+    # -- who wants slots ---------------------------------------------------------------
 
-@contextmanager
-def slots_lent(waits: bool = True) -> Iterator[None]:
-    """Lend the slots and the thread of this thread's task, if it waits; elsewhere do nothing."""
-    here = task_of_thread() if waits else None
-    lender = _lenders.get(here[0]) if here else None
-    if here is None or lender is None or getattr(_thread, "lends", False):
-        yield
-        return
-    worker, task = here
+    def slots_wanted(self) -> bool:
+        """Whether nested tasks, or tasks that have lent their slots, wait for slots here."""
+        return bool(self._nested or self._returning)
+
+    def _notify(self) -> None:
+        """Wake the threads that would lend, if slots are wanted."""
+        if self.slots_wanted():
+            for waiter in tuple(self.waiters):
+                waiter.set()
+
+    def transition(self, key: Any, finish: str) -> None:
+        """Follow the tasks of the worker: "constrained" are those that wait for slots."""
+        self._nested.pop(key, None)
+        if finish == "constrained" and (submitter := submitter_of(self.worker, key)) is not None:
+            self._nested[key] = _NestedTask(submitter, time.monotonic())
+            if self._next_look is None:
+                self._look_later()
+        self.serve()
+
+    # -- warnings ----------------------------------------------------------------------
+
+    def _look_later(self) -> None:
+        loop = asyncio.get_running_loop()
+        self._next_look = loop.call_later(WARN_AFTER_S / 2, self._look)
+
+    def _look(self) -> None:
+        """Ask for each task that has waited long whether its submitter holds slots."""
+        self._next_look = None
+        now = time.monotonic()
+        for key, nested in self._nested.items():
+            if now - nested.since >= WARN_AFTER_S and nested.submitter.key not in self._warned:
+                self._warned.add(nested.submitter.key)
+                self.worker.loop.add_callback(self._warn, key, nested.submitter)
+        if self._nested:
+            self._look_later()
+        else:
+            self._warned.clear()
+
+    def holds_slots(self, key: Any) -> bool:
+        """Whether a task runs here and has not lent its slots."""
+        return is_running(self.worker, key) and not self._lending[key]
+
+    async def _warn(self, key: Any, submitter: Submitter) -> None:
+        """Warn all clients if the submitter of a waiting task, on whichever worker, holds slots."""
+        try:
+            holds = await call(self.worker, submitter.worker, _holds_slots, key=submitter.key)
+        except (OSError, ValueError):  # the worker has left, or the submitter's is not known
+            return
+        if not holds or key not in self._nested:
+            self._warned.discard(submitter.key)
+            return
+        wanted = resources_of(self.worker.state.tasks[key])
+        names = " and ".join(repr(name) for name in wanted)
+        message = (
+            f"Task {submitter.key!r} of partition {names} holds a slot while task {key!r}, which "
+            "it has submitted, waits for one. If it polls, as with Future.done in a loop, both "
+            "wait for ever: use Future.result, distributed.wait, as_completed or Pipe.get, which "
+            "lend the slot."
+        )
+        logger.warning(message)
+        self.worker.log_event("warn", {"message": pickle.dumps(message)})
+
+
+def _holds_slots(key: Any, dask_worker: Any = None) -> bool:
+    """Whether a task holds slots of a worker; runs on that worker."""
+    lender = _lenders.get(dask_worker)
+    return lender is not None and lender.holds_slots(key)
+
+
+# -- waits -------------------------------------------------------------------------------
+
+
+def _loan_of_thread() -> tuple[Lender, _Loan] | None:
+    """Return what the task of this thread may lend; None if it has nothing to lend."""
+    running = task_of_thread()
+    if running is None or getattr(_thread, "lends", False):
+        return None
+    worker, task = running
+    lender = _lenders.get(worker)
+    if lender is None:
+        return None
     slots = {name: n for name, n in resources_of(task).items() if name in lender.names}
-    if not slots:
-        yield
-        return
-    loan = _Loan(slots)
-    _thread.lends = True
-    has_thread = False
-    # This thread is none of the worker's after `worker_client`, or in an executor of the user's.
-    with suppress(KeyError, AttributeError):
-        secede()
-        has_thread = True
-    worker.loop.add_callback(lender.lend, loan)
-    try:
-        yield
-    finally:
-        _thread.lends = False
-        worker.loop.add_callback(lender.take_back, loan)
-        while not loan.ended.wait(_LOOK_S) and worker.status is not Status.closed:
-            pass
-        # Not before: those that have the slots need the worker's threads to end.
-        if has_thread and worker.status is not Status.closed:
-            rejoin()
+    return (lender, _Loan(task.key, slots)) if slots else None
+
+
+class _Lending:
+    """How the waits of clients lend."""
+
+    def may_lend(self) -> bool:
+        """Whether the task of this thread has slots that it may lend."""
+        return _loan_of_thread() is not None
+
+    def until_wanted(self, answer: concurrent.futures.Future[Any]) -> None:
+        """Wait until a call has its answer, or other tasks want the slots."""
+        loan = _loan_of_thread()
+        if loan is None:
+            return
+        lender, _ = loan
+        waiter = threading.Event()
+        answer.add_done_callback(lambda _: waiter.set())
+        lender.waiters.add(waiter)
+        try:
+            # Its event loop looks for waiters after it has noted who wants slots.
+            while not (waiter.is_set() or lender.slots_wanted()):
+                waiter.wait(_CHECK_EVERY_S)
+                if lender.worker.status is Status.closed:
+                    return
+        finally:
+            lender.waiters.discard(waiter)
+
+    @contextmanager
+    def lent(self, waits: bool = True) -> Iterator[None]:
+        """Lend the slots and the thread of this thread's task, if it waits.
+
+        At the end of the block the thread waits until the task has them back.
+        """
+        loan_of_task = _loan_of_thread() if waits else None
+        if loan_of_task is None:
+            yield
+            return
+        lender, loan = loan_of_task
+        worker = lender.worker
+        _thread.lends = True
+        has_thread = False
+        # After `worker_client`, or in an executor of the user's, this is no thread of the worker's.
+        with suppress(KeyError, AttributeError):
+            secede()
+            has_thread = True
+        worker.loop.add_callback(lender.lend, loan)
+        try:
+            yield
+        finally:
+            _thread.lends = False
+            worker.loop.add_callback(lender.take_back, loan)
+            while not loan.returned.wait(_CHECK_EVERY_S) and worker.status is not Status.closed:
+                pass
+            # Not before: those that have the slots need the worker's threads to end.
+            if has_thread and worker.status is not Status.closed:
+                rejoin()
+
+
+LENDING = _Lending()
+slots_lent = LENDING.lent
 
 
 # -- on and off --------------------------------------------------------------------------
@@ -119,7 +279,7 @@ def slots_lent(waits: bool = True) -> Iterator[None]:
 def begin_lending(worker: Any, name: str) -> Lender:
     """Have the tasks of a partition lend on this worker; runs in its event loop."""
     with _lock:
-        let_waits_lend(slots_lent)
+        let_waits_lend(LENDING)
         lender = _lenders.setdefault(worker, Lender(worker))
     lender.names.add(name)
     return lender
@@ -158,9 +318,9 @@ def lending_plugin(name: str) -> bytes:
 
                 end_lending(worker, name)
 
-        def transition(self, *args: Any, **kwargs: Any) -> None:
+        def transition(self, key: Any, start: str, finish: str, **kwargs: Any) -> None:
             if self.lender is not None:
-                self.lender.serve()
+                self.lender.transition(key, finish)
 
     plugin: bytes = dumps(Lending())
     return plugin

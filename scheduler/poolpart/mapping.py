@@ -63,6 +63,10 @@ class ChunkResult:
     seconds: float  # from start to end
     nbytes: int  # estimated size of items and results
 
+    def __sizeof__(self) -> int:
+        """Size in bytes that Dask counts and spills by: that of the results."""
+        return int(sizeof(self.results))
+
 
 def run_chunk(
     function: Callable[..., Any],
@@ -409,21 +413,26 @@ class Results(Iterator[Any]):
         return max(CHUNK_S, CHUNK_S_PER_SLOT * max(self._slots))
 
     def _wait(self) -> list[Future]:
-        """Wait until tasks are done."""
+        """Wait until tasks are done; a task of a partition lends its slots meanwhile."""
         done: list[Future] = []
-        while not done:
-            if self._stages[-1].client.status in ("closing", "closed"):
-                raise CancelledError(
-                    f"The client of partition {self._stages[-1].partition!r} was closed."
-                )
-            # Not while there are results: those of a partition that was dissolved are read first.
-            if self._done.empty() and time.monotonic() > self._next_look:
-                self._look()
-            with suppress(queue.Empty), slots_lent(self._done.empty()):
-                done.append(self._done.get(timeout=1))
+        with slots_lent(self._done.empty()):
+            while not done:
+                self._check_while_waiting()
+                with suppress(queue.Empty):
+                    done.append(self._done.get(timeout=1))
         while not self._done.empty():
             done.append(self._done.get())
         return done
+
+    def _check_while_waiting(self) -> None:
+        """Raise if the client was closed, and count the partition's slots from time to time."""
+        if self._stages[-1].client.status in ("closing", "closed"):
+            raise CancelledError(
+                f"The client of partition {self._stages[-1].partition!r} was closed."
+            )
+        # Not while there are results: those of a partition that was dissolved are read first.
+        if self._done.empty() and time.monotonic() > self._next_look:
+            self._look()
 
     def _take_back(self, done: list[Future]) -> None:
         """Fetch the results of finished tasks, all at once."""

@@ -7,10 +7,21 @@ import subprocess
 import sys
 import threading
 import time
+import warnings
 
 import dask
 import pytest
-from distributed import Client, Event, as_completed, get_client, wait, worker_client
+from distributed import (
+    Client,
+    Event,
+    Lock,
+    Queue,
+    Variable,
+    as_completed,
+    get_client,
+    wait,
+    worker_client,
+)
 from tests.poolpart.helpers import LONG_S, addresses, declared, here, join, kill, wait_for
 
 from poolpart import Partition, Pool, PoolError, inherit, rest
@@ -243,7 +254,7 @@ def test_what_another_library_has_wrapped_meanwhile_stays(start, monkeypatch):
         return theirs
 
     for owner, name in wrapped.items():
-        monkeypatch.setattr(owner, name, wrap(vars(owner)[name]))
+        monkeypatch.setattr(owner, name, wrap(getattr(owner, name)))
     before = [vars(owner)[name] for owner, name in wrapped.items()]
     Pool(part.client, []).dissolve()
     assert [vars(owner)[name] for owner, name in wrapped.items()] == before
@@ -320,3 +331,162 @@ def across(part, gate):
     Event(f"{gate}-begun", part.client).set()
     child.result()
     return descend(0)
+
+
+# -- waits for what nested tasks send, rather than for their futures ---------------------------
+
+
+def send(channel, name):
+    if channel == "queue":
+        Queue(name).put(1)
+    elif channel == "variable":
+        Variable(name).set(1)
+    else:
+        Event(name).set()
+
+
+def receive(channel, name):
+    """Wait for what a nested task sends."""
+    future = get_client().submit(send, channel, name, pure=False)
+    if channel == "queue":
+        Queue(name).get(LONG_S)
+    elif channel == "variable":
+        Variable(name).get(LONG_S)
+    else:
+        assert Event(name).wait(LONG_S)
+    return future.result()
+
+
+@pytest.mark.parametrize("channel", ["queue", "variable", "event"])
+def test_a_task_on_the_only_slot_receives_what_its_nested_task_sends(client, b, channel):
+    assert b.submit(receive, channel, f"{channel}-{client.id}").result(LONG_S) is None
+
+
+def answer(name):
+    """Answer each number that a parent sends, until 0."""
+    while number := Queue(f"{name}-down").get(LONG_S):
+        Queue(f"{name}-up").put(number * 10)
+
+
+def converse(name):
+    future = get_client().submit(answer, name, pure=False)
+    answers = []
+    for number in (1, 2, 3):
+        Queue(f"{name}-down").put(number)
+        answers.append(Queue(f"{name}-up").get(LONG_S))
+    Queue(f"{name}-down").put(0)
+    future.result()
+    return answers
+
+
+def test_parent_and_nested_task_lend_the_only_slot_to_each_other(client, b):
+    assert b.submit(converse, f"converse-{client.id}").result(LONG_S) == [10, 20, 30]
+    assert slots_there(b) == [1]
+
+
+def release(name):
+    Event(f"{name}-locked").wait(LONG_S)
+    Lock(name).acquire(timeout=LONG_S)
+    return 1
+
+
+def hold_lock(name):
+    lock = Lock(name)
+    assert lock.acquire()
+    future = get_client().submit(release, name, pure=False)
+    Event(f"{name}-locked").set()
+    Queue(name).get(LONG_S)
+    lock.release()
+    return future.result()
+
+
+def test_a_nested_task_that_waits_for_a_lock_lends_its_slot(client, b, wait_until):
+    name = f"lock-{client.id}"
+    future = b.submit(hold_lock, name)
+    time.sleep(0.3)
+    Queue(name, client).put(1)
+    assert future.result(LONG_S) == 1
+
+
+def poll(stop):
+    future = get_client().submit(here, pure=False)
+    while not future.done() and not Event(stop).is_set():
+        time.sleep(0.01)
+    return future.done()
+
+
+@pytest.fixture
+def warned(monkeypatch):
+    """Texts of warnings at the client; nested tasks wait for a moment before these are given."""
+    monkeypatch.setattr("poolpart.lending.WARN_AFTER_S", 0.2)
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        yield lambda: [str(warning.message) for warning in caught]
+
+
+def test_polling_for_a_nested_task_is_reported_to_the_client(client, b, warned, wait_until):
+    stop = f"stop-{client.id}"
+    future = b.submit(poll, stop)
+    wait_until(lambda: any("distributed.wait" in message for message in warned()))
+    [message] = [message for message in warned() if "distributed.wait" in message]
+    assert future.key in message and "partition 'B'" in message
+    Event(stop, client).set()
+    assert future.result(LONG_S) is False
+
+
+def poll_together(stop, number, count):
+    """Poll when all parents hold their slots, so that each nested task waits on some worker."""
+    Event(f"{stop}-{number}").set()
+    for other in range(count):
+        assert Event(f"{stop}-{other}").wait(LONG_S)
+    return poll(stop)
+
+
+def test_polling_on_several_workers_is_reported(start, warned, wait_until):
+    client = start({name: {"resources": {"A": 1}} for name in "ab"})
+    part = Partition("A", client)
+    stop = f"stop-{client.id}"
+    futures = [part.submit(poll_together, stop, n, 2, workers="ab"[n]) for n in range(2)]
+    wait_until(lambda: any("distributed.wait" in message for message in warned()))
+    Event(stop, client).set()
+    assert client.gather(futures) == [False, False]
+
+
+def wait_alone(name):
+    Event(f"{name}-started").set()
+    return Queue(name).get(LONG_S)
+
+
+def test_a_waiting_task_without_nested_tasks_keeps_its_slot(client, b):
+    name = f"alone-{client.id}"
+    waiting = b.submit(wait_alone, name)
+    assert Event(f"{name}-started", client).wait(LONG_S)
+    later = b.submit(here)
+    time.sleep(0.3)
+    assert not later.done()
+    Queue(name, client).put(1)
+    assert waiting.result(LONG_S) == 1
+    assert later.result(LONG_S) == "B-0"
+
+
+def grow_tree(name, level):
+    """Run a tree of tasks, each of which waits for a message of each task below it."""
+    below = [f"{name}{branch}" for branch in range(2 if level else 0)]
+    futures = [get_client().submit(grow_tree, child, level - 1, pure=False) for child in below]
+    total = 1 + sum(Queue(child).get(LONG_S) for child in below)
+    Queue(name).put(total)
+    return len(futures)
+
+
+def test_a_tree_of_200_waiting_tasks_on_two_slots_ends(start):
+    client = start({"a": {"resources": {"A": 2}, "nthreads": 2}})
+    name = f"tree-{client.id}-"
+    assert Partition("A", client).submit(grow_tree, name, 7).result(LONG_S) == 2
+    assert Queue(name, client).get(LONG_S) == 2**8 - 1
+
+
+def test_a_tree_of_200_waiting_tasks_on_two_workers_ends(start):
+    client = start({name: {"resources": {"A": 1}} for name in "ab"})
+    name = f"tree-{client.id}-"
+    assert Partition("A", client).submit(grow_tree, name, 7).result(LONG_S) == 2
+    assert Queue(name, client).get(LONG_S) == 2**8 - 1

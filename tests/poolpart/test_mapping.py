@@ -339,6 +339,13 @@ def test_a_map_of_an_endless_map_has_a_bounded_number_under_way(a, b, client):
     results.close()
 
 
+def test_dask_counts_the_bytes_of_results(a, client, wait_until):
+    """So that workers spill results that lie in them."""
+    results = a.map(bytes, [10_000_000] * 4, chunk=1)
+    wait_until(lambda: sum(client.nbytes(summary=False).values()) >= 4 * 10_000_000)
+    assert [len(result) for result in results] == [10_000_000] * 4
+
+
 @pytest.mark.parametrize("chunk", [1, 2, None])
 def test_an_error_of_the_inner_map_names_its_item(a, b, chunk):
     results = b.map(twice, a.map(fail_at_3, range(9), chunk=chunk))

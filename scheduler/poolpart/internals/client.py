@@ -2,47 +2,84 @@
 
 from __future__ import annotations
 
+import asyncio
+import concurrent.futures
 from collections.abc import Callable, Collection
 from contextlib import AbstractContextManager
 from functools import cache
-from typing import Any
+from typing import Any, Protocol
 
 import distributed
 from distributed import Client, Future, as_completed, futures_of
 from distributed.protocol import to_serialize
+from distributed.utils import SyncMethodMixin
 
-from .worker import task_of_thread
+REQUEST_S = 0.05  # a call of the scheduler that takes longer waits for something
+_OPTIONS_OF_SYNC = {"asynchronous", "callback_timeout"}  # the others are of the called function
+
+
+class Lending(Protocol):
+    """What a wait needs to know of the slots of the task that waits."""
+
+    def may_lend(self) -> bool:
+        """Whether the task of this thread has slots that it may lend."""
+
+    def until_wanted(self, answer: concurrent.futures.Future[Any]) -> None:
+        """Wait until a call has its answer, or other tasks want the slots."""
+
+    def lent(self, waits: bool = True) -> AbstractContextManager[None]:
+        """Lend the slots within the block, if the task waits."""
 
 
 @cache  # once: another library may have wrapped the same since, and goes on calling this
-def let_waits_lend(context: Callable[[], AbstractContextManager[None]]) -> None:
-    """Have what waits for futures in tasks of this process do it within a context, from now on.
+def let_waits_lend(lending: Lending) -> None:
+    """Wrap the waits of Dask's clients so that tasks of this process lend their slots in them.
 
-    That is `Future.result` and `exception`, `Client.gather`, `wait`, the computing of collections,
-    and `as_completed`, where they are called in the thread of a task and have to wait. All but the
-    last come down to `Client.sync`, which is called for much else.
+    `Future.result` and `exception`, `Client.gather`, `wait`, the computing of collections, and
+    `as_completed` lend at once if they have to wait. All other calls of the scheduler, such as
+    `Queue.get`, `Variable.get`, `Event.wait` and `Lock.acquire`, lend from the moment on that other
+    tasks want the slots, to their end. All but `as_completed` come down to `SyncMethodMixin.sync`.
     """
     of_future = (Future._result, Future._exception, Future._traceback)
-    waits = {*of_future, Client._gather, distributed.client._wait}
-    sync, following = Client.sync, as_completed.__next__
+    waits_for_futures = {*of_future, Client._gather, distributed.client._wait}
+    sync = SyncMethodMixin.sync
+    next_completed = as_completed.__next__
 
-    def sync_within(client: Any, function: Any, *args: Any, **kwargs: Any) -> Any:
-        if getattr(function, "__func__", function) in waits and task_of_thread():
+    def sync_lending(caller: Any, function: Any, *args: Any, **kwargs: Any) -> Any:
+        if not lending.may_lend():
+            return sync(caller, function, *args, **kwargs)
+        if getattr(function, "__func__", function) in waits_for_futures:
             owner = getattr(function, "__self__", None)
             futures = futures_of(owner if isinstance(owner, Future) else [*args])
-            if any(future.status in ("pending", "lost") for future in futures):
-                with context():
-                    return sync(client, function, *args, **kwargs)
-        return sync(client, function, *args, **kwargs)
+            waits = any(future.status in ("pending", "lost") for future in futures)
+            with lending.lent(waits):
+                return sync(caller, function, *args, **kwargs)
+        if caller.asynchronous or not kwargs.keys().isdisjoint(_OPTIONS_OF_SYNC):
+            return sync(caller, function, *args, **kwargs)
+        return sync_until_wanted(caller, function, *args, **kwargs)
 
-    def following_within(done: Any) -> Any:
-        if task_of_thread() and not done.has_ready() and not done.is_empty():
-            with context():
-                return following(done)
-        return following(done)
+    def sync_until_wanted(caller: Any, function: Any, *args: Any, **kwargs: Any) -> Any:
+        async def call() -> Any:
+            return await function(*args, **kwargs)
 
-    Client.sync = sync_within
-    as_completed.__next__ = as_completed.next = following_within
+        answer = asyncio.run_coroutine_threadsafe(call(), caller.loop.asyncio_loop)
+        try:
+            concurrent.futures.wait([answer], REQUEST_S)
+            lending.until_wanted(answer)
+            # One loan to the end of the wait: a task that borrows the slots may wait in turn, and
+            # trees of such tasks hang if each looks again and again whether its slots are wanted.
+            with lending.lent(not answer.done()):
+                return answer.result()
+        finally:
+            answer.cancel()  # after an error in this thread
+
+    def next_lending(completed: Any) -> Any:
+        waits = not completed.has_ready() and not completed.is_empty()
+        with lending.lent(waits):
+            return next_completed(completed)
+
+    SyncMethodMixin.sync = sync_lending
+    as_completed.__next__ = as_completed.next = next_lending
 
 
 def when_done(future: Future, function: Callable[[Future], Any]) -> None:

@@ -10,7 +10,7 @@ from typing import Any
 import distributed
 
 from ..errors import PoolError
-from .scheduler import Resources
+from .scheduler import SUBMITTER, Resources, Submitter
 
 logger = logging.getLogger(__name__)
 
@@ -109,20 +109,26 @@ class Rules:
 def rule_for_graphs(rules: Rules, scheduler: Any, bequeath: Callable[[Any], Resources]) -> None:
     """Give tasks resources that their graph leaves open, by the task that submits the graph.
 
-    `bequeath` returns them, from the state of the submitting task.
+    `bequeath` returns them, from the state of the submitting task. Each task is annotated with the
+    task that submits it, so that workers know which tasks wait for slots of their parents.
     """
 
     def before(graph: dict[str, Any]) -> dict[str, Any]:
         task = scheduler.tasks.get(graph["submitting_task"])
-        given = graph["global_annotations"] or {}
-        legacy = bequeath(task) if task is not None else {}
-        if not legacy or "resources" in given or "workers" in given:
+        inherited = bequeath(task) if task is not None else {}
+        if not inherited:
             return graph
+        address = task.processing_on.address if task.processing_on else ""
+        submitter = Submitter(task.key, address)
+        global_annotations = graph["global_annotations"] or {}
         by_type = graph["annotations_by_type"]  # {"workers": {key: …}, "resources": …}
-        asked = by_type.get("resources", {})
-        otherwise = asked.keys() | by_type.get("workers", {}).keys()
-        heirs = {key: legacy for key in graph["dsk"] if key not in otherwise}
-        return {**graph, "annotations_by_type": {**by_type, "resources": {**asked, **heirs}}}
+        by_type = {**by_type, SUBMITTER: dict.fromkeys(graph["dsk"], submitter)}
+        if "resources" not in global_annotations and "workers" not in global_annotations:
+            stated = by_type.get("resources", {})
+            restricted = stated.keys() | by_type.get("workers", {}).keys()
+            heirs = {key: inherited for key in graph["dsk"] if key not in restricted}
+            by_type["resources"] = {**stated, **heirs}
+        return {**graph, "annotations_by_type": by_type}
 
     rules.before(
         scheduler,

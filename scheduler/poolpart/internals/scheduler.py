@@ -7,7 +7,7 @@ import time
 from collections import Counter, defaultdict
 from collections.abc import Callable, Collection, Iterable
 from contextlib import suppress
-from typing import Any
+from typing import Any, NamedTuple
 
 from distributed import Status
 from distributed.core import clean_exception
@@ -16,6 +16,15 @@ from distributed.protocol.serialize import Serialize, Serialized, deserialize
 from tornado import web
 
 Resources = dict[str, float]
+
+SUBMITTER = "poolpart-submitter"  # annotation of tasks that a task of a partition submits
+
+
+class Submitter(NamedTuple):
+    """A task of a partition that has submitted another: value of the annotation."""
+
+    key: Any
+    worker: str  # address of the worker that it ran on
 
 
 # -- where the scheduler places tasks ----------------------------------------------------

@@ -9,7 +9,7 @@ from typing import Any
 from distributed.worker import thread_state
 from distributed.worker_state_machine import UnpauseEvent
 
-from .scheduler import Resources
+from .scheduler import SUBMITTER, Resources, Submitter
 
 
 def has_running_tasks(dask_worker: Any = None) -> bool:
@@ -73,6 +73,18 @@ def task_of_thread() -> tuple[Any, Any] | None:
     worker = thread_state.execution_state["worker"]
     task = worker.state.tasks.get(key)  # an actor's method is no task
     return None if task is None else (worker, task)
+
+
+def submitter_of(worker: Any, key: Any) -> Submitter | None:
+    """Return the task that has submitted a task of this worker from inside a partition."""
+    task = worker.state.tasks.get(key)
+    submitter = (task.annotations or {}).get(SUBMITTER) if task is not None else None
+    return None if submitter is None else Submitter(*submitter)
+
+
+def is_running(worker: Any, key: Any) -> bool:
+    """Whether a task runs on this worker, also one that has seceded."""
+    return any(task.key == key for task in worker.state.all_running_tasks)
 
 
 def free_slots(worker: Any, slots: Resources) -> None:
