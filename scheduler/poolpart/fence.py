@@ -90,6 +90,7 @@ class Fences(SchedulerPlugin):
         self.scheduler = scheduler
         self.names: set[str] = set()
         self.closed: set[Any] = set()  # states of the workers behind fences
+        self.changes = 0  # how often that set has changed
         self._rules = Rules()
         self._complained_at = float("-inf")
         rule_for_fences(self._rules, scheduler, self.closed, self.stop)
@@ -111,10 +112,12 @@ class Fences(SchedulerPlugin):
         """Enclose or release a worker, by its resources and its future partition."""
         declares = any(worker.resources.get(name) for name in self.names)
         if declares or worker.extra.get(_EXPECTED) in self.names:
+            self.changes += worker not in self.closed
             self.closed.add(worker)
             self.scheduler.idle_task_count.discard(worker)
         elif worker in self.closed:
             self.closed.discard(worker)
+            self.changes += 1
             open_to_all(self.scheduler, worker)
 
     def add_worker(self, scheduler: Any, worker: str) -> None:

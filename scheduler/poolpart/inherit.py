@@ -24,6 +24,7 @@ from typing import Any
 
 from distributed.diagnostics.plugin import SchedulerPlugin
 
+from .choosing import WorkerChoice
 from .errors import PoolError
 from .internals.method_rules import Rules, rule_for_graphs, rule_for_shuffles
 from .internals.scheduler import Resources, tell_of_plugin
@@ -53,6 +54,11 @@ class Inheritance(SchedulerPlugin):
         except PoolError as error:  # partitions are of use without
             self.note = f"tasks from inside tasks may run anywhere: {error}"
             logger.warning("Partitions: %s", self.note)
+        self._choice: WorkerChoice | None = None
+        try:
+            self._choice = WorkerChoice(scheduler, self.names)
+        except PoolError as error:
+            logger.warning("Dask compares all workers for each task of a partition: %s", error)
         scheduler.add_plugin(self)
 
     def _bequeath(self, task: Any) -> Resources:
@@ -70,6 +76,8 @@ class Inheritance(SchedulerPlugin):
     def uninstall(self) -> None:
         """Take the rules back."""
         self._rules.take_back()
+        if self._choice is not None:
+            self._choice.uninstall()
         self.scheduler.remove_plugin(NAME)
 
 

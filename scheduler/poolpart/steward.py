@@ -26,6 +26,7 @@ from typing import Any
 
 from distributed.diagnostics.plugin import SchedulerPlugin
 
+from .choosing import note_change
 from .errors import PoolError
 from .fence import expect
 from .internals.scheduler import Resources, call, hand_off, held_by, recount, show, wake
@@ -310,6 +311,7 @@ class Steward(SchedulerPlugin):
 
     def _show(self, seat: Seat, worker: Any, resources: Resources) -> None:
         show(self.scheduler, worker, resources)
+        note_change(self.scheduler)
         expect(self.scheduler, worker, seat.partition)
 
     async def arrive(self, seats: Collection[Seat], timeout_s: float) -> list[Seat]:

@@ -1,4 +1,4 @@
-"""Rules before and after methods of a running scheduler, since its plugins only observe."""
+"""Rules before, after and in place of methods of a scheduler, since its plugins only observe."""
 
 from __future__ import annotations
 
@@ -19,10 +19,11 @@ logger = logging.getLogger(__name__)
 
 After = Callable[..., Any]  # gets the method's result and its arguments; returns the result
 Before = Callable[[dict[str, Any]], dict[str, Any]]  # gets the keyword arguments; returns them
+Instead = Callable[..., Any]  # gets the method's arguments; NotImplemented: the method is called
 
 
 class _Method:
-    """Replacement of a method: the method itself, with rules before and after it.
+    """Replacement of a method: the method itself, with rules before, after and in place of it.
 
     A rule that raises is skipped, and the log says so once: other users of the cluster get what
     Dask does without it. An error of the method itself reaches its caller unchanged.
@@ -32,6 +33,7 @@ class _Method:
         self.original = original
         self.__name__ = original.__name__  # the server logs the name of the handler
         self.before: list[Before] = []
+        self.instead: list[Instead] = []
         self.after: list[After] = []
         self._said: set[Any] = set()  # rules whose failure has been logged
 
@@ -41,6 +43,14 @@ class _Method:
                 kwargs = before(kwargs)
             except Exception:
                 self._step_aside(before)
+        for instead in self.instead:
+            try:
+                result = instead(*args, **kwargs)
+            except Exception:
+                self._step_aside(instead)
+                continue
+            if result is not NotImplemented:
+                return result
         result = self.original(*args, **kwargs)
         for after in self.after:
             try:
@@ -80,6 +90,11 @@ class Rules:
         self._stand_in(owner, name, {*parameters}).before.append(rule)
         self._places.append((owner, name, rule))
 
+    def instead(self, owner: Any, name: str, rule: Instead, parameter: str) -> None:
+        """Call `rule(…)` in place of a method, unless it returns NotImplemented."""
+        self._stand_in(owner, name, {parameter}).instead.append(rule)
+        self._places.append((owner, name, rule))
+
     def _stand_in(self, owner: Any, name: str, parameters: set[str]) -> _Method:
         method = getattr(type(owner), name, None)
         if method is None or not parameters <= inspect.signature(method).parameters.keys():
@@ -100,9 +115,9 @@ class Rules:
         while self._places:
             owner, name, rule = self._places.pop()
             method = vars(owner)[name]
-            for rules in (method.before, method.after):
+            for rules in (method.before, method.instead, method.after):
                 rules[:] = [other for other in rules if other != rule]
-            if not method.before and not method.after:
+            if not (method.before or method.instead or method.after):
                 delattr(owner, name)
 
 
@@ -195,6 +210,14 @@ def rule_for_fences(
     rules.after(scheduler, "valid_workers", valid_workers, "ts")
     rules.after(scheduler, "decide_worker_rootish_queuing_disabled", rootish, "ts")
     scheduler.idle_task_count = _OpenWorkers(closed, scheduler.idle_task_count)
+
+
+def rule_for_choice(rules: Rules, scheduler: Any, choose: Callable[[Any], Any]) -> None:
+    """Let `choose` choose the workers of tasks, as far as it does not return NotImplemented.
+
+    PoolError if this version of Dask places tasks in another way.
+    """
+    rules.instead(scheduler, "decide_worker_non_rootish", choose, "ts")
 
 
 def take_back_fences(rules: Rules, scheduler: Any) -> None:

@@ -1,0 +1,223 @@
+"""Cost and balance of placing tasks as a cluster grows: `python -m benchmarks.placing`.
+
+A real scheduler with simulated workers, which answer nothing: tasks are placed and ended by the
+scheduler's own transitions. Half of the workers belong to an exclusive partition. Of each cluster:
+
+- microseconds to place a task of the partition, and a task of others, with the rule of poolpart and
+  without it, both behind the same fence;
+- when tasks of random durations end on average, as a multiple of what Dask itself reaches, and the
+  longest queue of a worker.
+"""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import heapq
+import itertools
+import json
+import logging
+import random
+import time
+from collections import defaultdict, deque
+from typing import Any, NamedTuple
+
+from dask._task_spec import Task
+from distributed import Scheduler, Status
+from distributed.scheduler import WorkerState
+
+from poolpart.choosing import NAME as CHOICE
+from poolpart.fence import enclose
+from poolpart.inherit import begin_inheritance
+
+PARTITION = "A"
+_numbers = itertools.count()
+
+
+class _Silence:
+    """Stands for the connection to a worker, which hears nothing."""
+
+    def send(self, *messages: Any) -> None:
+        """Drop messages."""
+
+    async def close(self) -> None:
+        """Do nothing."""
+
+    abort = close
+
+    def closed(self) -> bool:
+        """Return True: nothing is left to close."""
+        return True
+
+
+def add_workers(scheduler: Any, number: int) -> None:
+    """Add simulated workers of one thread; every second one declares the partition."""
+    for index in range(number):
+        address = f"tcp://10.{index >> 16}.{index >> 8 & 255}.{index & 255}:1"
+        worker = WorkerState(
+            address=address, status=Status.running, pid=0, name=index, nthreads=1,
+            memory_limit=0, local_directory="", nanny=None, server_id=address,
+            services={}, versions={}, extra={}, scheduler=scheduler,
+        )  # fmt: skip
+        scheduler.workers[address] = worker
+        scheduler.aliases[index] = address
+        scheduler.running.add(worker)
+        scheduler.total_nthreads += 1
+        scheduler.stream_comms[address] = _Silence()
+        scheduler.host_info.setdefault(worker.host, {"addresses": set(), "nthreads": 0})
+        scheduler.host_info[worker.host]["addresses"].add(address)
+        if index % 2:
+            worker.resources = {PARTITION: 1}
+            worker.used_resources = {PARTITION: 0}
+            scheduler.resources.setdefault(PARTITION, {})[address] = 1
+        scheduler.check_idle_saturated(worker)
+        for plugin in list(scheduler.plugins.values()):
+            plugin.add_worker(scheduler, address)
+
+
+class Tasks:
+    """Places and ends tasks of a partition, or of others."""
+
+    def __init__(self, scheduler: Any, partition: bool) -> None:
+        self.scheduler = scheduler
+        self.partition = partition
+        self.name = f"tasks{next(_numbers)}"
+        self.count = 0
+
+    def place(self, number: int) -> tuple[list[Any], float]:
+        """Place tasks; returns their states and the seconds that it took."""
+        states = []
+        for _ in range(number):
+            self.count += 1
+            # Dask queues tasks of large groups without asking for a worker of each.
+            key = (f"{self.name}-{self.count // 10}", self.count)
+            state = self.scheduler.new_task(key, Task(key, abs, 1), "released")
+            state.priority = (0, self.count)
+            if self.partition:
+                state.resource_restrictions = {PARTITION: 1}
+            states.append(state)
+        start = time.perf_counter()
+        for state in states:
+            self.scheduler.transitions({state.key: "waiting"}, "benchmark")
+        seconds = time.perf_counter() - start
+        assert all(state.processing_on for state in states)
+        return states, seconds
+
+    def end(self, states: list[Any]) -> None:
+        """End tasks, and forget them."""
+        for state in states:
+            self.scheduler.transition(
+                state.key, "memory", "benchmark", worker=state.processing_on.address,
+                nbytes=1, type=b"", typename="int", startstops=[],
+            )  # fmt: skip
+            self.scheduler.transitions({state.key: "forgotten"}, "benchmark")
+
+
+def cost_us(scheduler: Any, partition: bool, number: int) -> float:
+    """Microseconds to place a task, the best of three rounds."""
+    tasks = Tasks(scheduler, partition)
+    rounds = []
+    for _ in range(3):
+        states, seconds = tasks.place(number)
+        tasks.end(states)
+        rounds.append(seconds / number * 1e6)
+    return min(rounds)
+
+
+class Flow(NamedTuple):
+    """How tasks of random durations flow through a cluster."""
+
+    mean_end: float  # when a task ends on average, in mean durations
+    longest_queue: int  # tasks that one worker had at a time
+
+
+def flow(scheduler: Any, partition: bool, tasks_per_worker: int) -> Flow:
+    """Simulate tasks: three for two workers are placed at once, another whenever one ends."""
+    workers = len(scheduler.workers) // 2
+    rng = random.Random(7)
+    durations = [rng.expovariate(1.0) for _ in range(workers * tasks_per_worker)]
+    tasks = Tasks(scheduler, partition)
+    queues: dict[Any, deque[Any]] = defaultdict(deque)  # {worker: states of its tasks}
+    events: list[tuple[float, int, Any]] = []  # heap: end, number of the task, worker
+    numbers: dict[Any, int] = {}  # {state of a task: its number}
+    ends: list[float] = []
+    longest_queue = 0
+
+    def start_next(worker: Any, now: float) -> None:
+        if queues[worker]:
+            number = numbers[queues[worker][0]]
+            heapq.heappush(events, (now + durations[number], number, worker))
+
+    def add(count: int, now: float) -> None:
+        nonlocal longest_queue
+        states, _ = tasks.place(min(count, len(durations) - len(numbers)))
+        for state in states:
+            numbers[state] = len(numbers)
+            queue = queues[state.processing_on]
+            queue.append(state)
+            longest_queue = max(longest_queue, len(queue))
+            if len(queue) == 1:
+                start_next(state.processing_on, now)
+
+    add(workers * 3 // 2, 0.0)
+    while events:
+        now, _, worker = heapq.heappop(events)
+        ends.append(now)
+        tasks.end([queues[worker].popleft()])
+        start_next(worker, now)
+        add(1, now)
+    return Flow(sum(ends) / len(ends), longest_queue)
+
+
+async def measure(number: int, rounds: int, tasks_per_worker: int) -> dict[str, Any]:
+    """Measure one size of cluster, with poolpart's rule and without."""
+    figures: dict[str, Any] = {"workers": number}
+    for label in ("dask", "poolpart"):
+        async with Scheduler(port=0, host="127.0.0.1", dashboard=False) as scheduler:
+            begin_inheritance([PARTITION], scheduler)
+            enclose(scheduler, PARTITION)
+            if label == "dask":
+                scheduler.plugins[CHOICE].uninstall()
+            add_workers(scheduler, number)
+            for name, partition in (("partition", True), ("others", False)):
+                figures[f"{name}_{label}_us"] = cost_us(scheduler, partition, rounds)
+                mean_end, longest_queue = flow(scheduler, partition, tasks_per_worker)
+                figures[f"{name}_{label}_end"] = mean_end
+                figures[f"{name}_{label}_longest"] = longest_queue
+            for address in list(scheduler.workers):
+                scheduler.workers.pop(address)
+                scheduler.stream_comms.pop(address)
+            scheduler.running.clear()
+    return figures
+
+
+def main() -> None:
+    """Print a row for each size of cluster."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--workers", type=int, nargs="+", default=[40, 4000])
+    parser.add_argument("--tasks", type=int, default=400, help="tasks that are placed at a time")
+    parser.add_argument("--per-worker", type=int, default=2, help="tasks of random durations")
+    parser.add_argument("--json", type=argparse.FileType("w"))
+    options = parser.parse_args()
+    logging.getLogger("distributed").setLevel(logging.ERROR)
+    results = []
+    for number in options.workers:
+        figures = asyncio.run(measure(number, options.tasks, options.per_worker))
+        results.append(figures)
+        for name in ("partition", "others"):
+            cost, dask_cost = (figures[f"{name}_{label}_us"] for label in ("poolpart", "dask"))
+            end, dask_end = (figures[f"{name}_{label}_end"] for label in ("poolpart", "dask"))
+            queue, dask_queue = (
+                figures[f"{name}_{label}_longest"] for label in ("poolpart", "dask")
+            )
+            print(
+                f"{number:>6} workers, tasks of {name:<9}: {cost:7.0f} µs, Dask {dask_cost:7.0f};"
+                f" mean end {end / dask_end:.3f} of Dask's,"
+                f" longest queue {queue} and {dask_queue}"
+            )
+    if options.json:
+        json.dump(results, options.json, indent=1)
+
+
+if __name__ == "__main__":
+    main()

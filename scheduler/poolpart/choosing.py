@@ -1,0 +1,167 @@
+"""The worker of a task, chosen in a time that does not grow with the cluster.
+
+For a task with a resource, and for a task that a fence keeps out of a partition, Dask compares all
+workers that may take it: 1.3 ms with 2,000 workers. Here the scheduler compares a few workers of
+the group that may take the task:
+
+- workers that hold inputs of the task;
+- else workers that have free slots, in the order in which they became free;
+- else, all being busy, some workers in turn.
+
+Dask's own objective decides between them. The groups are the partitions and, if there are fences,
+the workers outside all fences. Small groups, tasks that are bound to workers or hosts, actors, and
+tasks whose inputs many workers hold are left to Dask, and so are all tasks if this rule fails.
+"""
+
+from __future__ import annotations
+
+from itertools import islice
+from typing import Any
+
+from distributed.diagnostics.plugin import SchedulerPlugin
+
+from .fence import NAME as FENCES
+from .fence import Fences
+from .internals.method_rules import Rules, rule_for_choice
+from .internals.placing import (
+    free_slots_of,
+    group_of,
+    holders_of_inputs,
+    may_take,
+    number_declaring,
+    start_first,
+    workers_declaring,
+)
+
+NAME = "poolpart-choice"
+COMPARED = 10  # workers that are compared for a task; smaller groups are left to Dask
+_EXAMINED = 50  # workers that are examined for free slots
+_OUTSIDE = ""  # name of the group of the workers outside all fences
+
+
+class _Group:
+    """Workers of which each may take the same tasks."""
+
+    def __init__(self, name: str, version: Any, workers: list[Any]) -> None:
+        self.name = name
+        self.version = version  # of the cluster when the group was made
+        self.workers = workers
+        self.members = set(workers)
+        self.free = dict.fromkeys(workers)  # ordered set: workers that may have free slots
+        self._turn = 0  # index of the worker that is next in turn
+
+    def with_free_slots(self, slots: float) -> list[Any]:
+        """Return some workers with so many free slots; forget workers that have none."""
+        workers: list[Any] = []
+        for worker in list(islice(self.free, _EXAMINED)):
+            free = free_slots_of(worker, self.name)
+            if free >= slots:
+                workers.append(worker)
+            elif free < 1:
+                del self.free[worker]
+            if len(workers) == COMPARED:
+                break
+        return workers
+
+    def in_turn(self) -> list[Any]:
+        """Return some workers, evenly spread, others at each call."""
+        number = len(self.workers)
+        start = self._turn
+        self._turn = (start + 1) % number
+        return [self.workers[(start + n * number // COMPARED) % number] for n in range(COMPARED)]
+
+
+class WorkerChoice(SchedulerPlugin):
+    """The rule: chooses workers for tasks of partitions, and for tasks outside fences."""
+
+    name = NAME
+
+    def __init__(self, scheduler: Any, names: set[str]) -> None:
+        self.scheduler = scheduler
+        self.names = names  # of the partitions; the caller adds and removes names
+        self._changes = 0  # how often workers, or what they declare, have changed
+        self._groups: dict[str, _Group] = {}
+        self._rules = Rules()
+        rule_for_choice(self._rules, scheduler, self.choose)
+        scheduler.add_plugin(self)
+
+    def uninstall(self) -> None:
+        """Take the rule back."""
+        self._rules.take_back()
+        self.scheduler.remove_plugin(NAME)
+
+    # -- groups ------------------------------------------------------------------------
+
+    def note_change(self) -> None:
+        """Note that a worker declares something else than before."""
+        self._changes += 1
+
+    def add_worker(self, scheduler: Any, worker: str) -> None:
+        """Note a worker that joins."""
+        self._changes += 1
+
+    def remove_worker(self, scheduler: Any, worker: str, **kwargs: Any) -> None:
+        """Note a worker that has left, and keep no reference to its state."""
+        self._changes += 1
+        self._groups.clear()
+
+    def transition(
+        self, key: Any, start: str, finish: str, *args: Any, worker: str = "", **kwargs: Any
+    ) -> None:
+        """Note a worker that has ended a task: it may have a free slot."""
+        if start == "processing" and (state := self.scheduler.workers.get(worker)):
+            for group in self._groups.values():
+                if state in group.members:
+                    group.free[state] = None
+
+    def _group(self, name: str) -> _Group | None:
+        """Return the group of the workers that may take tasks, made anew after changes."""
+        fences: Fences | None = self.scheduler.plugins.get(FENCES)
+        if name != _OUTSIDE:
+            version = self._changes, number_declaring(self.scheduler, name)
+        elif fences is not None:
+            version = self._changes, fences.changes
+        else:
+            return None
+        group = self._groups.get(name)
+        if group is None or group.version != version:
+            if name != _OUTSIDE:
+                workers = workers_declaring(self.scheduler, name)
+            else:
+                workers = [w for w in self.scheduler.workers.values() if w not in fences.closed]
+            group = self._groups[name] = _Group(name, version, workers)
+        return group
+
+    # -- the rule ----------------------------------------------------------------------
+
+    def choose(self, task: Any) -> Any:
+        """Return the state of the worker for a task; NotImplemented to leave the choice to Dask."""
+        resource = group_of(task)
+        if resource is None:
+            return NotImplemented
+        name, slots = resource
+        if name != _OUTSIDE and name not in self.names:
+            return NotImplemented
+        group = self._group(name)
+        if group is None or len(group.workers) <= 2 * COMPARED:
+            return NotImplemented
+        holders = holders_of_inputs(task)
+        if len(holders) > _EXAMINED:
+            return NotImplemented
+        workers = [worker for worker in holders if worker in group.members]
+        workers = self._permitted(workers, name, slots)
+        if not workers:
+            workers = self._permitted(group.with_free_slots(slots), name, slots)
+        if not workers:
+            workers = self._permitted(group.in_turn(), name, slots)
+        return start_first(self.scheduler, task, workers) if workers else NotImplemented
+
+    def _permitted(self, workers: list[Any], name: str, slots: float) -> list[Any]:
+        return [worker for worker in workers if may_take(self.scheduler, worker, name, slots)]
+
+
+def note_change(scheduler: Any) -> None:
+    """Note that a worker declares something else than before."""
+    choice: WorkerChoice | None = scheduler.plugins.get(NAME)
+    if choice is not None:
+        choice.note_change()

@@ -1,0 +1,50 @@
+"""What the scheduler knows of tasks and workers when it places a task."""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import Any
+
+
+def group_of(task: Any) -> tuple[str, float] | None:
+    """Return the only resource that a task asks for, with its quantity; ("", 1) for none.
+
+    None for a task that is bound to workers or hosts, asks for several resources, or is an actor.
+    """
+    resources = task.resource_restrictions or {}
+    if task.worker_restrictions or task.host_restrictions or task.actor or len(resources) > 1:
+        return None
+    return next(iter(resources.items()), ("", 1))
+
+
+def workers_declaring(scheduler: Any, name: str) -> list[Any]:
+    """States of the workers that declare a resource."""
+    return [scheduler.workers[address] for address in scheduler.resources.get(name, ())]
+
+
+def number_declaring(scheduler: Any, name: str) -> int:
+    """Return the number of workers that declare a resource."""
+    return len(scheduler.resources.get(name, ()))
+
+
+def free_slots_of(worker: Any, name: str) -> float:
+    """Return the slots of a worker that no task has: of a resource, or threads for ""."""
+    if not name:
+        return float(worker.nthreads - len(worker.processing) + len(worker.long_running))
+    return float(worker.resources.get(name, 0) - worker.used_resources.get(name, 0))
+
+
+def may_take(scheduler: Any, worker: Any, name: str, slots: float) -> bool:
+    """Whether a worker runs, and declares so many slots of a resource; "" is for none."""
+    enough = not name or worker.resources.get(name, 0) >= slots
+    return bool(enough and worker in scheduler.running)
+
+
+def holders_of_inputs(task: Any) -> list[Any]:
+    """Workers that hold inputs of a task, each once for each input."""
+    return [worker for needed in task.dependencies for worker in needed.who_has or ()]
+
+
+def start_first(scheduler: Any, task: Any, workers: list[Any]) -> Any:
+    """Return the worker on which a task is expected to start first, by Dask's own estimate."""
+    return min(workers, key=partial(scheduler.worker_objective, task))

@@ -1,0 +1,116 @@
+"""Workers of large groups are chosen among a few, as evenly as Dask chooses among all."""
+
+import asyncio
+from collections import Counter
+
+import pytest
+from benchmarks import placing
+from distributed import Client, Event, wait
+from tests.poolpart.helpers import LONG_S, here, wait_for
+
+from poolpart import Pool, n_workers, rest
+
+NAMES = [f"{letter}-{number}" for letter in "ab" for number in range(5)]
+
+
+@pytest.fixture
+def client(start, monkeypatch):
+    """Client of ten workers, five of them in an exclusive partition; one worker is compared."""
+    monkeypatch.setattr("poolpart.choosing.COMPARED", 1)
+    client = start({name: {} for name in NAMES})
+    client.cluster.scheduler.validate = True  # Dask checks itself after each step
+    return client
+
+
+@pytest.fixture
+def parts(client):
+    return Pool.from_client(client).divide({"A": n_workers(5, exclusive=True), "B": rest()})
+
+
+def gather_places(client, futures):
+    return Counter(client.gather(futures))
+
+
+def wait_here(event, *_):
+    wait_for(event)
+    return here()
+
+
+def test_each_worker_of_a_partition_gets_as_many_tasks(client, parts):
+    gate = f"gate-{client.id}"
+    futures = [parts["A"].submit(wait_here, gate) for _ in range(20)]
+    Event(gate, client).set()
+    members = {worker.name for worker in parts["A"].workers}
+    assert gather_places(client, futures) == dict.fromkeys(members, 4)
+
+
+def test_tasks_of_others_stay_outside_and_are_spread(client, parts):
+    gate = f"gate-{client.id}"
+    with Client(client.cluster) as stranger:
+        # Other keys: Dask would queue the tasks of a large group.
+        futures = [stranger.submit(wait_here, gate, n, key=f"{n}-work") for n in range(20)]
+        Event(gate, client).set()
+        outside = {worker.name for worker in parts["B"].workers}
+        assert gather_places(stranger, futures) == dict.fromkeys(outside, 4)
+
+
+def test_a_worker_that_is_free_is_chosen_before_busy_workers(client, parts):
+    gate = f"gate-{client.id}"
+    busy = [parts["A"].submit(wait_here, gate) for _ in range(4)]
+    for _ in range(8):
+        assert parts["A"].submit(here).result(LONG_S)
+    Event(gate, client).set()
+    client.gather(busy)
+
+
+def place_of_input(data, *_):
+    return data, here()
+
+
+def test_a_task_runs_where_its_input_is(client, parts):
+    for _ in range(8):
+        data = parts["A"].submit(here)
+        wait(data)
+        place, own = parts["A"].submit(place_of_input, data).result(LONG_S)
+        assert place == own
+
+
+def test_a_task_that_takes_several_slots_goes_to_a_worker_that_has_them(client):
+    rules = {"A": n_workers(5, slots=1), "B": rest(slots=3)}
+    parts = Pool.from_client(client).divide(rules)
+    assert parts["B"].submit(here, slots=3).result(LONG_S).startswith("b")
+
+
+def test_workers_that_join_leave_and_move_are_counted(client, parts):
+    parts["A"].grow(2, source="B")
+    gate = f"gate-{client.id}"
+    futures = [parts["A"].submit(wait_here, gate) for _ in range(14)]
+    Event(gate, client).set()
+    members = {worker.name for worker in parts["A"].workers}
+    places = gather_places(client, futures)
+    assert len(members) == 7
+    assert places.keys() == members
+    assert max(places.values()) <= 3
+
+
+def test_dask_decides_within_the_fence_if_the_rule_fails(client, parts, monkeypatch, caplog):
+    monkeypatch.delattr("poolpart.choosing.free_slots_of")
+    members = {worker.name for worker in parts["A"].workers}
+    assert {parts["A"].submit(here).result(LONG_S) for _ in range(10)} <= members
+    assert not {client.submit(here, n, pure=False).result(LONG_S) for n in range(10)} & members
+    assert "Dask decides without it" in caplog.text
+
+
+def test_nothing_is_left_after_dissolving(client, parts):
+    parts["A"].submit(here).result(LONG_S)
+    Pool.from_client(client).dissolve()
+    scheduler = client.cluster.scheduler
+    assert "poolpart-choice" not in scheduler.plugins
+    assert "decide_worker_non_rootish" not in vars(scheduler)
+
+
+def test_simulated_workers_get_tasks_as_evenly_as_from_dask():
+    figures = asyncio.run(placing.measure(200, rounds=50, tasks_per_worker=3))
+    for name in ("partition", "others"):
+        assert figures[f"{name}_poolpart_end"] < 1.1 * figures[f"{name}_dask_end"]
+        assert figures[f"{name}_poolpart_longest"] == figures[f"{name}_dask_longest"]
