@@ -8,10 +8,13 @@ otherwise: by resources, workers or a partition of their own, or with
 Each takes a slot, as a task that `Partition.submit` submits. The task that submits them lends its
 own while it waits for them (`lending.py`).
 
-Who submits is known by its thread: what a coroutine, or a thread that the task started itself,
-submits is not inherited. Tried and left: running each function under ``dask.annotate`` (the
-annotation is a context variable and does reach `submit`, `map` and collections, but not the
-tasks that *those* submit, and every task is pickled with a wrapper around it).
+Who submits is known by its thread. What a method of an actor submits belongs to the partition that
+the actor was submitted to, unless actors of the same key prefix are in different partitions. What a
+coroutine, or a thread that a task started itself, submits is not inherited.
+
+Tried and left: running each function under ``dask.annotate`` (the annotation is a context variable
+and does reach `submit`, `map` and collections, but not the tasks that *those* submit, and every
+task is pickled with a wrapper around it).
 """
 
 from __future__ import annotations

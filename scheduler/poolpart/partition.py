@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import ExitStack
 from contextvars import ContextVar
 from typing import Any, Self
 
 import dask
+from dask.utils import funcname
 from distributed import Client, Future
 
 from .adapting import IDLE_S, Bounds, adapt, want
@@ -140,10 +142,12 @@ class Partition:
         ValueError
             If `slots` is below 1.
         PoolError
-            If the partition was dissolved, none of its workers has so many slots, or a worker
-            belongs to another. Without any workers the task waits for one. The client asks at
-            most once a second, of names each time, and not within an event loop.
+            If the partition was dissolved, none of its workers has so many slots, a worker belongs
+            to another, or the function is a coroutine function. Without any workers the task waits
+            for one. The client asks at most once a second, of names each time, and not within an
+            event loop.
         """
+        _refuse_coroutine(self.name, function)
         asks = not self.client.asynchronous  # or it would wait for the answer in its event loop
         resources = self._taking(slots, asks)
         if workers is not None:
@@ -235,7 +239,10 @@ class Partition:
         ------
         ValueError
             If the window, the chunk or `slots` is below 1, or `retries` below 0.
+        PoolError
+            If the partition was dissolved, or the function is a coroutine function.
         """
+        _refuse_coroutine(self.name, function)
         self._taking(slots)
         options = (ordered, window, chunk, priority, retries, slots, return_exceptions, kwargs)
         stage = Stage(self.client, self.name, function, *options, by_rule=self._by_rule)
@@ -424,3 +431,17 @@ class Partition:
         """Undo this partition; see `Pool.dissolve`."""
         ask(self.client, dissolve, names=[self.name], timeout_s=timeout_s)
         forget_memberships()
+
+
+def _refuse_coroutine(name: str, function: Callable[..., Any]) -> None:
+    """Raise if a function would run in the event loop of a worker.
+
+    Nobody knows there which task submits something, so that the tasks which a coroutine submits
+    would leave the partition; and a coroutine cannot lend its slot while it waits for them.
+    """
+    if inspect.iscoroutinefunction(function):
+        raise PoolError(
+            f"Partition {name!r} takes plain functions, and {funcname(function)} is a coroutine "
+            "function, whose tasks would leave the partition: give a function that calls "
+            "asyncio.run."
+        )

@@ -7,7 +7,7 @@ import pytest
 from distributed import get_client, secede, worker_client
 from tests.poolpart.helpers import LONG_S, here
 
-from poolpart import Partition, Pool, named
+from poolpart import Partition, Pool, PoolError, named
 
 
 def descend(depth, way):
@@ -76,3 +76,38 @@ def test_unless_they_say_otherwise(client):
     assert anywhere > {"A-0"}
     assert named == ["B-0", "B-0", "plain", "A-0"]
     assert mixed == ("B-0", "A-0")
+
+
+class Foreman:
+    """An actor whose method submits tasks."""
+
+    def places(self, count):
+        client = get_client()
+        return client.gather([client.submit(here, n, pure=False) for n in range(count)])
+
+
+def ask_foreman(foreman):
+    return foreman.places(6).result()
+
+
+def test_what_an_actor_submits_belongs_to_the_partition_of_the_actor(client):
+    foreman = Partition("A", client).submit(Foreman, actor=True).result(LONG_S)
+    assert foreman.places(6).result(LONG_S) == ["A-0"] * 6
+    # A task in the only slot that waits for the actor lends the slot to what the actor submits.
+    assert Partition("A", client).submit(ask_foreman, foreman).result(LONG_S) == ["A-0"] * 6
+    # Two actors of one key prefix in different partitions: which of them submits is not known.
+    other = Partition("B", client).submit(Foreman, actor=True).result(LONG_S)
+    assert len(set(other.places(12).result(LONG_S))) > 1
+    named_actor = Partition("B", client).submit(Foreman, actor=True, key="of-b").result(LONG_S)
+    assert named_actor.places(6).result(LONG_S) == ["B-0"] * 6
+
+
+async def coroutine(number=0):
+    return number
+
+
+@pytest.mark.parametrize("method", ["submit", "map"])
+def test_coroutine_functions_are_refused(client, method):
+    arguments = () if method == "submit" else ([1, 2],)
+    with pytest.raises(PoolError, match="coroutine is a coroutine function"):
+        getattr(Partition("A", client), method)(coroutine, *arguments)

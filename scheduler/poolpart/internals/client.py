@@ -11,6 +11,7 @@ from typing import Any, Protocol
 
 import distributed
 from distributed import Client, Future, as_completed, futures_of
+from distributed.actor import ActorFuture
 from distributed.protocol import to_serialize
 from distributed.utils import SyncMethodMixin
 
@@ -38,12 +39,14 @@ def let_waits_lend(lending: Lending) -> None:
     `Future.result` and `exception`, `Client.gather`, `wait`, the computing of collections, and
     `as_completed` lend at once if they have to wait. All other calls of the scheduler, such as
     `Queue.get`, `Variable.get`, `Event.wait` and `Lock.acquire`, lend from the moment on that other
-    tasks want the slots, to their end. All but `as_completed` come down to `SyncMethodMixin.sync`.
+    tasks want the slots, to their end. All but `as_completed` and the results of actors' methods
+    come down to `SyncMethodMixin.sync`.
     """
     of_future = (Future._result, Future._exception, Future._traceback)
     waits_for_futures = {*of_future, Client._gather, distributed.client._wait}
     sync = SyncMethodMixin.sync
     next_completed = as_completed.__next__
+    result_of_actor = ActorFuture.result
 
     def sync_lending(caller: Any, function: Any, *args: Any, **kwargs: Any) -> Any:
         if not lending.may_lend():
@@ -78,7 +81,12 @@ def let_waits_lend(lending: Lending) -> None:
         with lending.lent(waits):
             return next_completed(completed)
 
+    def result_of_actor_lending(future: Any, *args: Any, **kwargs: Any) -> Any:
+        with lending.lent(not future.done()):
+            return result_of_actor(future, *args, **kwargs)
+
     SyncMethodMixin.sync = sync_lending
+    ActorFuture.result = result_of_actor_lending
     as_completed.__next__ = as_completed.next = next_lending
 
 

@@ -10,7 +10,7 @@ from typing import Any
 import distributed
 
 from ..errors import PoolError
-from .scheduler import SUBMITTER, Resources, Submitter
+from .scheduler import SUBMITTER, Resources, Submitter, actor_of_method
 
 logger = logging.getLogger(__name__)
 
@@ -129,11 +129,12 @@ def rule_for_graphs(rules: Rules, scheduler: Any, bequeath: Callable[[Any], Reso
     """
 
     def before(graph: dict[str, Any]) -> dict[str, Any]:
-        task = scheduler.tasks.get(graph["submitting_task"])
+        name = graph["submitting_task"]
+        task = scheduler.tasks.get(name) or actor_of_method(scheduler, name)
         inherited = bequeath(task) if task is not None else {}
         if not inherited:
             return graph
-        address = task.processing_on.address if task.processing_on else ""
+        address = task.processing_on.address if task.processing_on else ""  # not of an actor
         submitter = Submitter(task.key, address)
         global_annotations = graph["global_annotations"] or {}
         by_type = graph["annotations_by_type"]  # {"workers": {key: …}, "resources": …}

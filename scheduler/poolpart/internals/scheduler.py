@@ -9,6 +9,7 @@ from collections.abc import Callable, Collection, Iterable
 from contextlib import suppress
 from typing import Any, NamedTuple
 
+from dask.utils import key_split
 from distributed import Status
 from distributed.core import clean_exception
 from distributed.protocol.pickle import dumps
@@ -74,6 +75,25 @@ def open_to_all(scheduler: Any, worker: Any) -> None:
     if worker.status is Status.running:
         wake(scheduler, worker)
         scheduler.stimulus_queue_slots_maybe_opened(stimulus_id=f"poolpart-opened-{time.time()}")
+
+
+def actor_of_method(scheduler: Any, name: Any) -> Any:
+    """Return the state of an actor whose method submits tasks, by the name that Dask gives those.
+
+    The name is the prefix of the actor's key, and the method. None if it is no such name, or if
+    actors with that prefix ask for different resources, so that the actor is not certain.
+    """
+    prefix, dot, _ = name.rpartition(".") if isinstance(name, str) else ("", "", "")
+    if not dot:
+        return None
+    actors = [
+        task
+        for worker in scheduler.workers.values()
+        for task in worker.actors
+        if key_split(task.key) == prefix
+    ]
+    resources = [actor.resource_restrictions for actor in actors]
+    return actors[0] if actors and all(asked == resources[0] for asked in resources) else None
 
 
 def asks_for(task: Any, names: Collection[str]) -> bool:
