@@ -8,6 +8,7 @@ request.
 
 from __future__ import annotations
 
+import time
 from collections import Counter, defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -17,9 +18,11 @@ from typing import Any
 from distributed.diagnostics.plugin import SchedulerPlugin
 
 from .fence import fences_of
+from .metrics import PartitionCollector, publish, withdraw
 
 NAME = "poolpart-stats"
 _LOOK_AT_MOST = 1000  # tasks of one worker that are examined for running ones
+_RUNNABLE = {"processing", "queued", "no-worker"}  # states of tasks whose inputs are there
 _WAITING = {"waiting": "waiting", "queued": "queued", "no-worker": "queued", "processing": "given"}
 
 
@@ -30,21 +33,45 @@ class Statistics(SchedulerPlugin):
 
     def __init__(self, scheduler: Any) -> None:
         self.scheduler = scheduler
-        # {(partition, stage): "done", "failed" and "seconds" of its tasks that have ended}
+        # {(partition, stage): sums of its tasks that have ended, by fields of `StageStats`}
         self.ended: dict[tuple[str, str], Counter[str]] = defaultdict(Counter)
+        self._runnable: dict[Any, float] = {}  # {key: time since when a task could run}
+        self._collector: PartitionCollector | None = publish(self._of_all)
 
     def transition(
         self, key: Any, start: str, finish: str, *args: Any, stimulus_id: str = "", **kwargs: Any
     ) -> None:
-        """Count a task that has ended."""
+        """Count a task that has ended, and note when a task could run."""
+        if start == "waiting" and finish in _RUNNABLE:
+            self._runnable[key] = time.time()
+        if finish in _RUNNABLE:
+            return
+        runnable = self._runnable.pop(key, None)
         if start != "processing" or finish not in ("memory", "erred"):
             return
         task = self.scheduler.tasks[key]
         counts: dict[str, Any] = self.ended[partition_of(task), task.prefix.name]
         counts["done" if finish == "memory" else "failed"] += 1
-        for span in kwargs.get("startstops") or ():
-            if span["action"] == "compute":
-                counts["seconds"] += span["stop"] - span["start"]
+        computing = [span for span in kwargs.get("startstops") or () if span["action"] == "compute"]
+        counts["seconds"] += sum(span["stop"] - span["start"] for span in computing)
+        if computing and runnable is not None:  # by the scheduler's clock, as Dask corrects both
+            counts["queued_seconds"] += max(0.0, computing[0]["start"] - runnable)
+
+    def _of_all(self) -> list[PartitionStats]:
+        """Return the statistics of all partitions, and of tasks without one."""
+        names = {name for name, _ in self.ended}
+        for worker in self.scheduler.workers.values():
+            names.update(name for name, slots in worker.resources.items() if slots)
+        return stats_of(sorted(names | {""}), self.scheduler)
+
+    def stop(self) -> None:
+        """Withdraw the figures from ``/metrics``."""
+        withdraw(self._collector)
+        self._collector = None
+
+    async def close(self) -> None:
+        """Stop with the scheduler."""
+        self.stop()
 
 
 def partition_of(task: Any) -> str:
@@ -106,6 +133,8 @@ class StageStats:
         which never ran, do not count.
     seconds
         Running time of tasks, including failed ones, without those lost with their worker.
+    queued_seconds
+        Time that these tasks waited for a worker or for a slot, after all their inputs were there.
     """
 
     waiting: int = 0
@@ -114,6 +143,7 @@ class StageStats:
     done: int = 0
     failed: int = 0
     seconds: float = 0.0
+    queued_seconds: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -156,7 +186,9 @@ def statistics_of(scheduler: Any) -> Statistics:
 
 def forget_statistics(scheduler: Any) -> None:
     """Stop counting, and delete the counts."""
-    if NAME in scheduler.plugins:
+    statistics: Statistics | None = scheduler.plugins.get(NAME)
+    if statistics is not None:
+        statistics.stop()
         scheduler.remove_plugin(NAME)
 
 

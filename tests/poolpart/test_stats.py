@@ -1,10 +1,13 @@
 """Statistics of partitions: each task counted once, whatever happens."""
 
 import threading
+import time
+import urllib.request
 import uuid
 
 import pytest
 from distributed import Client, get_worker, worker_client
+from prometheus_client import parser
 from tests.poolpart.helpers import LONG_S
 
 from poolpart import Partition, StageStats
@@ -62,6 +65,45 @@ def test_tasks_that_wait_run_and_end(client, wait_until):
     dependent = part.submit(after, failing[0])
     wait_until(lambda: dependent.status == "error" and all(task.done() for task in failing))
     assert (part.stats().failed, part.stats().done) == (3, 6)  # the dependent one never ran
+
+
+def metrics_of(client):
+    """Figures of partitions at the scheduler's /metrics: {(name, partition, state): value}."""
+    port = client.cluster.scheduler.http_server.port
+    text = (
+        urllib.request.urlopen(f"http://127.0.0.1:{port}/metrics", timeout=LONG_S).read().decode()
+    )
+    figures = {}
+    for family in parser.text_string_to_metric_families(text):
+        for sample in family.samples:
+            if sample.name.startswith("dask_partition_"):
+                labels = sample.labels
+                name = sample.name.removeprefix("dask_partition_")
+                figures[name, labels["partition"], labels.get("state")] = sample.value
+    return figures
+
+
+def test_prometheus_reads_the_demand_of_each_partition(client, wait_until):
+    part = Partition("A", client)
+    part.stats()  # counts from here on
+    running = [part.submit(held, i) for i in range(5)]
+    last = part.submit(after, running)
+    wait_until(lambda: part.stats().running == 2 and part.stats().waiting == 1)
+    figures = metrics_of(client)
+    assert figures["slots", "A", None] == figures["busy_slots", "A", None] == 2
+    assert figures["workers", "A", None] == figures["workers", "B", None] == 1
+    states = ("running", "queued", "waiting")
+    assert [figures["tasks", "A", state] for state in states] == [2, 3, 1]
+    assert [figures["tasks", "B", state] for state in states] == [0, 0, 0]
+    time.sleep(0.2)
+    go.set()
+    last.result(LONG_S)
+    figures = metrics_of(client)
+    assert figures["tasks_ended_total", "A", "done"] == 6
+    assert figures["running_seconds_total", "A", None] == pytest.approx(part.stats().seconds)
+    waited_s = figures["waiting_seconds_total", "A", None]
+    assert waited_s == pytest.approx(part.stats().queued_seconds)
+    assert waited_s >= 3 * 0.2  # three tasks had to wait for slots
 
 
 def test_partitions_are_counted_apart_and_from_any_client(client):

@@ -1,0 +1,85 @@
+"""Figures of partitions at the scheduler's address ``/metrics``, in the format of Prometheus.
+
+They are there where Dask's own are: the scheduler needs the package prometheus-client. Scaling and
+alerting can go by the demand of each partition, which Dask's figures of the whole cluster hide.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from typing import TYPE_CHECKING, Any
+
+import dask
+
+if TYPE_CHECKING:
+    from .stats import PartitionStats
+
+_LABELS = ["partition"]
+
+
+class PartitionCollector:
+    """Collects the figures of one scheduler's partitions whenever they are requested."""
+
+    def __init__(self, collect_stats: Callable[[], list[PartitionStats]]) -> None:
+        self._collect_stats = collect_stats
+
+    def describe(self) -> Iterator[Any]:
+        """Name no figures before they are requested; the scheduler may just be starting."""
+        return iter(())
+
+    def collect(self) -> Iterator[Any]:
+        """Yield the metric families; tasks without a partition have the label ""."""
+        from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily
+
+        namespace = dask.config.get("distributed.dashboard.prometheus.namespace", "dask")
+        prefix = f"{namespace}_partition"
+        gauges = {
+            "workers": GaugeMetricFamily(f"{prefix}_workers", "Workers", labels=_LABELS),
+            "slots": GaugeMetricFamily(f"{prefix}_slots", "Slots of these workers", labels=_LABELS),
+            "busy": GaugeMetricFamily(
+                f"{prefix}_busy_slots", "Slots that a task holds", labels=_LABELS
+            ),
+        }
+        tasks = GaugeMetricFamily(
+            f"{prefix}_tasks", "Tasks that have not ended", labels=[*_LABELS, "state"]
+        )
+        ended = CounterMetricFamily(
+            f"{prefix}_tasks_ended", "Tasks that have ended", labels=[*_LABELS, "state"]
+        )
+        running = CounterMetricFamily(
+            f"{prefix}_running_seconds", "Time that ended tasks ran", labels=_LABELS
+        )
+        waiting = CounterMetricFamily(
+            f"{prefix}_waiting_seconds",
+            "Time that ended tasks waited for a worker or a slot",
+            labels=_LABELS,
+        )
+        for stats in self._collect_stats():
+            for field, family in gauges.items():
+                family.add_metric([stats.name], getattr(stats, field))
+            for state in ("waiting", "queued", "running"):
+                tasks.add_metric([stats.name, state], getattr(stats, state))
+            for state in ("done", "failed"):
+                ended.add_metric([stats.name, state], getattr(stats, state))
+            running.add_metric([stats.name], stats.seconds)
+            waiting.add_metric([stats.name], stats.queued_seconds)
+        yield from (*gauges.values(), tasks, ended, running, waiting)
+
+
+def publish(collect_stats: Callable[[], list[PartitionStats]]) -> PartitionCollector | None:
+    """Add the figures to ``/metrics``; None where prometheus-client is not installed."""
+    try:
+        from prometheus_client import REGISTRY
+    except ImportError:
+        return None
+    collector = PartitionCollector(collect_stats)
+    REGISTRY.register(collector)
+    return collector
+
+
+def withdraw(collector: PartitionCollector | None) -> None:
+    """Remove the figures."""
+    if collector is not None:
+        from prometheus_client import REGISTRY
+
+        REGISTRY.unregister(collector)
