@@ -23,6 +23,7 @@ from tornado.ioloop import PeriodicCallback
 
 from .adapting import IDLE_S, Bounds, JobKind, begin, look
 from .errors import PoolError
+from .internals.names import ADAPTING, CLUSTERS, require
 from .internals.scheduler import ask_of_cluster
 from .rules import check_count, check_name
 
@@ -84,6 +85,7 @@ def start_partitions(
     ...         },
     ...     )
     """
+    require(CLUSTERS)
     jobqueue = sys.modules.get("dask_jobqueue")
     if jobqueue and isinstance(cluster, jobqueue.JobQueueCluster):
         describe = _job
@@ -132,6 +134,7 @@ class _PartitionJobs:
         check_count(f"The number of slots of partition {name!r}", slots)
         bounds, idle_s = None, own.pop("idle_s", None)
         if (adapt := own.pop("adapt", None)) is not None:
+            require(ADAPTING)
             if "workers" in own or not isinstance(adapt, Sequence) or len(adapt) != 2:
                 raise PoolError(
                     f"adapt of partition {name!r} is {adapt!r}; give the least and the greatest "

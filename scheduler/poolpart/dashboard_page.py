@@ -14,6 +14,7 @@ from tornado.template import Template
 
 from .errors import PoolError
 from .fence import fences_of
+from .internals.names import PAGE, require
 from .internals.scheduler import serve, serve_no_longer
 from .pipe import pipes_of
 from .stats import NAME as STATISTICS
@@ -136,6 +137,7 @@ def partitions_page(client: Client) -> str:
 
 
 async def _open(owner: str, dask_scheduler: Any = None) -> None:
+    require(PAGE)
     if owner not in dask_scheduler.clients:  # killed, and already removed
         return
     if NAME not in dask_scheduler.plugins:

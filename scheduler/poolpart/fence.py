@@ -33,6 +33,7 @@ from typing import Any
 from distributed.diagnostics.plugin import SchedulerPlugin
 
 from .internals.method_rules import Rules, could_take, rule_for_fences, take_back_fences
+from .internals.names import FENCES, require
 from .internals.scheduler import open_to_all
 
 logger = logging.getLogger(__name__)
@@ -50,6 +51,7 @@ def enclose(scheduler: Any, name: str) -> None:
     PoolError
         If this version of Dask places tasks in another way.
     """
+    require(FENCES)
     fences: Fences = scheduler.plugins.get(NAME) or Fences(scheduler)
     fences.names.add(name)
     fences.look_again()

@@ -12,6 +12,7 @@ from typing import Any, TypeVar
 from distributed import Client, get_worker
 
 from .internals.client import as_bytes, ask, take_from_worker
+from .internals.names import FETCHING, require
 from .internals.worker import answer_to
 
 T = TypeVar("T")
@@ -50,6 +51,7 @@ def fetch_available(
     dict
         Results by key, possibly none.
     """
+    require(FETCHING)
 
     async def fetch() -> dict[str, Any]:
         if at is not None:

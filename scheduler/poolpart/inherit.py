@@ -22,7 +22,7 @@ from __future__ import annotations
 import asyncio
 import logging
 from collections import defaultdict
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from typing import Any
 
 from distributed.diagnostics.plugin import SchedulerPlugin
@@ -30,6 +30,7 @@ from distributed.diagnostics.plugin import SchedulerPlugin
 from .choosing import WorkerChoice
 from .errors import PoolError
 from .internals.method_rules import Rules, rule_for_graphs, rule_for_shuffles
+from .internals.names import CHOOSING, NESTED, SHUFFLES, require
 from .internals.scheduler import Resources, tell_of_plugin
 from .lending import lending_plugin
 
@@ -49,20 +50,33 @@ class Inheritance(SchedulerPlugin):
         self.names: set[str] = set()
         # {partition that workers were started with: clients that submit to it, by id}
         self.clients: dict[str, set[str]] = defaultdict(set)
-        self.note = ""  # what a user should know where this version of Dask has no room for it
+        self.note = ""  # for users: what does not work with this version of Dask
         self._rules = Rules()
-        try:
-            rule_for_graphs(self._rules, scheduler, self._bequeath)
-            rule_for_shuffles(self._rules, scheduler)
-        except PoolError as error:  # partitions are of use without
-            self.note = f"tasks from inside tasks may run anywhere: {error}"
-            logger.warning("Partitions: %s", self.note)
         self._choice: WorkerChoice | None = None
-        try:
-            self._choice = WorkerChoice(scheduler, self.names)
-        except PoolError as error:
-            logger.warning("Dask compares all workers for each task of a partition: %s", error)
+        self.lends = self._begin(NESTED, "tasks from inside tasks may run anywhere", self._nest)
+        self._begin(SHUFFLES, "shuffles may leave their partition", self._shuffle)
+        self._begin(CHOOSING, "placing a task takes longer in larger clusters", self._choose)
         scheduler.add_plugin(self)
+
+    def _begin(self, feature: str, without: str, begin: Callable[[], None]) -> bool:
+        """Begin a feature; returns False, and notes what is missing, if Dask lacks its names."""
+        try:
+            require(feature)
+            begin()
+        except PoolError as error:  # partitions are of use without
+            self.note = "; ".join(filter(None, (self.note, f"{without}: {error}")))
+            logger.warning("Partitions: %s: %s", without, error)
+            return False
+        return True
+
+    def _nest(self) -> None:
+        rule_for_graphs(self._rules, self.scheduler, self._bequeath)
+
+    def _shuffle(self) -> None:
+        rule_for_shuffles(self._rules, self.scheduler)
+
+    def _choose(self) -> None:
+        self._choice = WorkerChoice(self.scheduler, self.names)
 
     def _bequeath(self, task: Any) -> Resources:
         """Resources for what a task submits; none if it belongs to no partition."""
@@ -98,7 +112,8 @@ def begin_inheritance(names: Iterable[str], scheduler: Any, client: str | None =
             rule.clients.pop(name, None)
         if name not in rule.names:
             rule.names.add(name)
-            _tell(scheduler, name, lending_plugin(name))
+            if rule.lends:
+                _tell(scheduler, name, lending_plugin(name))
     return rule.note
 
 

@@ -307,10 +307,12 @@ def lending_plugin(name: str) -> bytes:
 
         def setup(self, worker: Any) -> None:
             try:
+                from poolpart.internals.names import NESTED, missing_names
                 from poolpart.lending import begin_lending
             except ImportError:
                 return
-            self.lender = begin_lending(worker, name)
+            if not missing_names(NESTED):  # another version of Dask than the scheduler's
+                self.lender = begin_lending(worker, name)
 
         def teardown(self, worker: Any) -> None:
             if self.lender is not None:

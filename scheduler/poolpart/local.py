@@ -11,6 +11,7 @@ from distributed import Scheduler, Security, SpecCluster
 
 from .errors import PoolError
 from .internals.local_cluster import FixedCluster, OwnNanny
+from .internals.names import CLUSTERS, require
 from .rules import check_count, check_name
 
 LOOPBACK = "127.0.0.1"
@@ -64,6 +65,7 @@ def local_cluster(
     >>> with local_cluster({"GPU": (2, 1), "IO": (1, 8)}) as cluster:    # doctest: +SKIP
     ...     parts = Pool.from_client(Client(cluster)).partitions()
     """
+    require(CLUSTERS)
     for name, (count, slots) in partitions.items():
         check_name(name)
         check_count(f"The number of workers of partition {name!r}", count, least=0)

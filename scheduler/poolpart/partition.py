@@ -15,6 +15,7 @@ from distributed import Client, Future
 from .adapting import IDLE_S, Bounds, adapt, want
 from .division import ask, dissolve, grow, shrink
 from .errors import PoolError
+from .internals.names import MAP, require
 from .mapping import Results, Stage
 from .membership import addresses_of, check_slots, forget_memberships
 from .rules import check_count
@@ -242,6 +243,7 @@ class Partition:
         PoolError
             If the partition was dissolved, or the function is a coroutine function.
         """
+        require(MAP)
         _refuse_coroutine(self.name, function)
         self._taking(slots)
         options = (ordered, window, chunk, priority, retries, slots, return_exceptions, kwargs)

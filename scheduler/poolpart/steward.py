@@ -29,6 +29,7 @@ from distributed.diagnostics.plugin import SchedulerPlugin
 from .choosing import note_change
 from .errors import PoolError
 from .fence import expect
+from .internals.names import DIVIDING, require
 from .internals.scheduler import Resources, call, hand_off, held_by, recount, show, wake
 from .internals.worker import declare_on_worker
 from .probe import worker_gpus
@@ -368,6 +369,7 @@ def names_of(seats: Iterable[Seat]) -> str:
 @contextmanager
 def steward_of(scheduler: Any) -> Iterator[Steward]:
     """Return the scheduler's steward, or a new one; one without partitions leaves at once."""
+    require(DIVIDING)
     steward: Steward | None = scheduler.plugins.get(NAME)
     if steward is None:
         steward = Steward(scheduler)

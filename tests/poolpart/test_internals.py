@@ -6,6 +6,8 @@ import re
 import subprocess
 import sys
 import textwrap
+import warnings
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -14,6 +16,7 @@ from tests.poolpart.helpers import LONG_S, here
 
 import poolpart
 from poolpart import Partition, Pool, PoolError, n_workers, rest
+from poolpart.internals import names
 
 PACKAGE = Path(poolpart.__file__).parent
 
@@ -23,6 +26,14 @@ INSIDE = (
     r"idle_task_count|valid_workers\b|future_refcount|stream_comms|http_application|"
     "transitions|stimulus|bulk_schedule|check_idle|run_spec|gather_from_workers|to_serialize"
 )
+
+
+@pytest.fixture(autouse=True)
+def _look_names_up_again():
+    """Have names looked up anew: tests change Dask, or the list."""
+    names.missing_names.cache_clear()
+    yield
+    names.missing_names.cache_clear()
 
 
 def nested():
@@ -79,7 +90,7 @@ def test_a_fence_that_cannot_be_raised_is_refused(monkeypatch, start):
     rename(monkeypatch, "ts", "task", "decide_worker_rootish_queuing_disabled")
     client = start({name: {} for name in "abc"})
     pool = Pool.from_client(client)
-    with pytest.raises(PoolError, match=r"has no decide_worker_rootish_queuing_disabled\(ts\)"):
+    with pytest.raises(PoolError, match=r"lacks .*rootish_queuing_disabled\(ts\), so exclu"):
         pool.divide({"A": n_workers(1, exclusive=True), "B": rest()})
     assert client.submit(pow, 2, 10).result(LONG_S) == 1024
     parts = pool.divide({"A": n_workers(1), "B": rest()})
@@ -104,3 +115,105 @@ def test_what_fails_while_it_is_asked_does_not_reach_strangers(monkeypatch, star
 def test_it_is_imported_with_any_dask():
     lacking = "import distributed.shuffle._core as core; del core.barrier_key; import poolpart"
     subprocess.run([sys.executable, "-c", lacking], check=True, timeout=LONG_S)
+
+
+# -- private names of Dask that are missing ------------------------------------------------------
+
+
+@pytest.mark.parametrize("row", names.PRIVATE_NAMES, ids=lambda row: row.purpose)
+def test_this_version_has_all_private_names(row):
+    assert names.missing_names(row.feature) == ()
+
+
+def without(name, program):
+    """Run a program in a process whose Dask lacks a private name; returns what it prints."""
+    module, _, path = name.partition(":")
+    owner, _, attribute = path.rpartition(".")
+    lacking = f"""
+        import importlib, sys, warnings
+        warnings.simplefilter("ignore")
+        module = importlib.import_module({module!r})
+        delattr(module{f".{owner}" if owner else ""}, {attribute!r})
+        from distributed import Client
+        from tests.clusters import cluster_of
+        import poolpart
+        from poolpart import Partition, Pool, PoolError, n_workers, rest
+        from tests.poolpart.helpers import here
+        with cluster_of({{"a": {{}}, "b": {{}}}}, {{"protocol": "inproc://"}}) as cluster:
+            with Client(cluster) as client:
+                pool = Pool.from_client(client)
+    """
+    source = textwrap.dedent(lacking) + textwrap.indent(textwrap.dedent(program), " " * 8)
+    command = [sys.executable, "-c", source]
+    root = Path(__file__).parents[2]
+    result = subprocess.run(
+        command, capture_output=True, text=True, timeout=LONG_S, cwd=root, check=False
+    )
+    assert result.returncode == 0, result.stderr
+    return result.stdout
+
+
+DIVIDE = """
+try:
+    parts = pool.divide({"A": n_workers(1), "B": rest()})
+    print(parts["A"].note)
+    print(parts["A"].submit(pow, 2, 10).result(60))
+    print(list(parts["A"].map(abs, [-1, -2])))
+except PoolError as error:
+    print("refused:", error)
+"""
+
+
+def test_without_what_division_needs_it_is_refused_at_once():
+    printed = without("distributed.worker_state_machine:WorkerState.all_running_tasks", DIVIDE)
+    assert re.match(
+        r"refused: distributed .* lacks WorkerState.all_running_tasks, so dividing a pool is off",
+        printed,
+    )
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "distributed.worker_state_machine:UnpauseEvent",
+        "distributed.client:Future._traceback",
+        "distributed.client:Future._exception",
+    ],
+)
+def test_without_what_nested_tasks_need_partitions_work_and_say_so(name):
+    note, *rest = without(name, DIVIDE).splitlines()
+    assert note.startswith("tasks from inside tasks may run anywhere: distributed ")
+    assert f"lacks {name.partition(':')[2]}, so keeping nested tasks in their partition" in note
+    assert rest == ["1024", "[1, 2]"]
+
+
+def test_the_rest_works_where_a_feature_is_off(start, monkeypatch):
+    gone = [
+        replace(row, names=("distributed.client:Future._gone",))
+        if row.feature == names.MAP
+        else row
+        for row in names.PRIVATE_NAMES
+    ]
+    monkeypatch.setattr(names, "PRIVATE_NAMES", tuple(gone))
+    part = Pool.from_client(start({"a": {}})).divide({"A": rest()})["A"]
+    with pytest.raises(PoolError, match=r"lacks Future._gone, so Partition.map is off; versions"):
+        part.map(abs, [1])
+    assert part.submit(here).result(LONG_S) == "a"
+
+
+def test_an_untested_version_is_warned_about(monkeypatch):
+    monkeypatch.setattr("distributed.__version__", "2031.10.0")
+    names._warn_if_untested.cache_clear()
+    with pytest.warns(UserWarning, match="tested with distributed .* and this is 2031.10.0"):
+        names.require(names.MAP)
+    monkeypatch.setattr("distributed.__version__", f"{names.TESTED[1]}+3.gabcdef")
+    names._warn_if_untested.cache_clear()
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        names.require(names.MAP)
+
+
+def test_the_documentation_lists_the_private_names():
+    page = (Path(__file__).parents[2] / "docs/pool-partitions.md").read_text("utf-8")
+    for row in names.PRIVATE_NAMES:
+        assert names.table_row(row) in page

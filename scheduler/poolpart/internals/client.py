@@ -11,9 +11,6 @@ from typing import Any, Protocol
 
 import distributed
 from distributed import Client, Future, as_completed, futures_of
-from distributed.actor import ActorFuture
-from distributed.protocol import to_serialize
-from distributed.utils import SyncMethodMixin
 
 REQUEST_S = 0.05  # a call of the scheduler that takes longer waits for something
 _OPTIONS_OF_SYNC = {"asynchronous", "callback_timeout"}  # the others are of the called function
@@ -42,6 +39,9 @@ def let_waits_lend(lending: Lending) -> None:
     tasks want the slots, to their end. All but `as_completed` and the results of actors' methods
     come down to `SyncMethodMixin.sync`.
     """
+    from distributed.actor import ActorFuture
+    from distributed.utils import SyncMethodMixin
+
     of_future = (Future._result, Future._exception, Future._traceback)
     waits_for_futures = {*of_future, Client._gather, distributed.client._wait}
     sync = SyncMethodMixin.sync
@@ -125,4 +125,6 @@ async def ask(client: Client, address: str | None, question: str, **arguments: A
 
 def as_bytes(data: Any) -> Any:
     """Wrap bytes so that they are sent without copying."""
+    from distributed.protocol import to_serialize
+
     return to_serialize(memoryview(data))

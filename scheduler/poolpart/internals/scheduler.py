@@ -11,9 +11,7 @@ from typing import Any, NamedTuple
 
 from dask.utils import key_split
 from distributed import Status
-from distributed.core import clean_exception
 from distributed.protocol.pickle import dumps
-from distributed.protocol.serialize import Serialize, Serialized, deserialize
 from tornado import web
 
 Resources = dict[str, float]
@@ -209,6 +207,8 @@ def waiting_for_workers(scheduler: Any) -> Collection[Any]:
 
 async def ask_of_cluster(cluster: Any, function: Callable[..., Any], **arguments: Any) -> Any:
     """Call `function(**arguments, dask_scheduler=…)` on a cluster's scheduler, without a client."""
+    from distributed.core import clean_exception
+
     packed = {"function": dumps(function), "args": dumps(()), "kwargs": dumps(arguments)}
     answer = await cluster.scheduler_comm.run_function(**packed, wait=True)
     if answer["status"] != "OK":
@@ -229,6 +229,8 @@ async def call(scheduler: Any, address: str, function: Callable[..., Any], **arg
 
 def _unpacked(result: Any) -> Any:
     """Unpack a reply, which may come as it is: as bytes, or unpacked from the same process."""
+    from distributed.protocol.serialize import Serialize, Serialized, deserialize
+
     if isinstance(result, Serialized):
         return deserialize(result.header, result.frames)
     return result.data if isinstance(result, Serialize) else result

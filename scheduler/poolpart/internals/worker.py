@@ -6,9 +6,6 @@ import time
 from collections.abc import Callable
 from typing import Any
 
-from distributed.worker import thread_state
-from distributed.worker_state_machine import UnpauseEvent
-
 from .scheduler import SUBMITTER, Resources, Submitter
 
 
@@ -68,6 +65,8 @@ def resources_here(worker: Any) -> tuple[str, ...]:
 
 def task_of_thread() -> tuple[Any, Any] | None:
     """Worker and state of the task that runs in this thread; None in any other thread."""
+    from distributed.worker import thread_state
+
     if (key := getattr(thread_state, "key", None)) is None:
         return None
     worker = thread_state.execution_state["worker"]
@@ -89,6 +88,8 @@ def is_running(worker: Any, key: Any) -> bool:
 
 def free_slots(worker: Any, slots: Resources) -> None:
     """Let waiting tasks of a worker have these slots; runs in its event loop."""
+    from distributed.worker_state_machine import UnpauseEvent
+
     for name, number in slots.items():
         worker.state.available_resources[name] += number
     if worker.state.running:  # or it is paused, and starts them when it goes on

@@ -1,0 +1,349 @@
+"""The private names of Dask that poolpart relies on, and a check that this version has them.
+
+Names that Dask's documentation does not mention may change with any release. `require` looks a
+feature's names up before the feature is used: what is missing is a `PoolError` that names it, and
+the other features work. docs/pool-partitions.md has a table of `PRIVATE_NAMES`.
+"""
+
+from __future__ import annotations
+
+import inspect
+import warnings
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cache
+from importlib import import_module
+from typing import Any
+
+import distributed
+
+from ..errors import PoolError
+
+TESTED = "2025.5.0", "2026.8.0"  # oldest and newest version of distributed; see `make compat`
+
+NESTED = "keeping nested tasks in their partition"
+FENCES = "exclusive partitions"
+DIVIDING = "dividing a pool"
+CHOOSING = "choosing workers in constant time"
+SHUFFLES = "shuffles inside a partition"
+MAP = "Partition.map"
+PIPES = "pipes"
+FETCHING = "fetching results straight from workers"
+PAGE = "the page of partitions"
+CLUSTERS = "clusters with several kinds of workers"
+ADAPTING = "adaptive partitions"
+
+
+@dataclass(frozen=True)
+class PrivateNames:
+    """Private names of Dask for one purpose."""
+
+    feature: str  # that does not work without them
+    names: tuple[str, ...]  # "module:object.attribute", with (parameters) of a method
+    purpose: str
+    tests: tuple[str, ...]  # in tests/poolpart unless a folder is given
+
+
+_SCHEDULER = "distributed.scheduler:Scheduler"
+_SCHEDULER_TASK = "distributed.scheduler:TaskState"
+_SCHEDULER_WORKER = "distributed.scheduler:WorkerState"
+_STEALING = "distributed.stealing:WorkStealing"
+_WORKER_STATE = "distributed.worker_state_machine:WorkerState"
+_WORKER_TASK = "distributed.worker_state_machine:TaskState"
+
+PRIVATE_NAMES = (
+    PrivateNames(
+        NESTED,
+        (
+            f"{_SCHEDULER}._create_taskstate_from_graph"
+            "(submitting_task, annotations_by_type, global_annotations, dsk)",
+        ),
+        "nested tasks get their parent's partition",
+        (
+            "test_inherit.py::test_at_any_depth_and_on_a_single_slot",
+            "test_inherit.py::test_what_an_actor_submits_belongs_to_the_partition_of_the_actor",
+        ),
+    ),
+    PrivateNames(
+        NESTED,
+        (
+            "distributed.utils:SyncMethodMixin.sync",
+            "distributed.client:Future._result",
+            "distributed.client:Future._exception",
+            "distributed.client:Future._traceback",
+            "distributed.client:Client._gather",
+            "distributed.client:_wait",
+            "distributed.client:as_completed.__next__",
+            "distributed.actor:ActorFuture.result",
+        ),
+        "a worker notices that a task waits; wrapped once in a process, and for good",
+        ("test_lending.py::test_what_another_library_has_wrapped_meanwhile_stays",),
+    ),
+    PrivateNames(
+        NESTED,
+        (
+            f"{_WORKER_STATE}.tasks",
+            f"{_WORKER_STATE}.all_running_tasks",
+            f"{_WORKER_STATE}.available_resources",
+            f"{_WORKER_TASK}.resource_restrictions",
+            f"{_WORKER_TASK}.annotations",
+            "distributed.worker_state_machine:UnpauseEvent",
+            "distributed.worker:thread_state",
+            f"{_SCHEDULER}.worker_plugins",
+        ),
+        "a waiting task lends its slots; workers lend before they get tasks",
+        (
+            "test_lending.py::test_on_one_slot_nested_tasks_and_their_parent_run_one_at_a_time",
+            "test_lending.py::test_a_tree_of_200_waiting_tasks_on_two_slots_ends",
+            "test_lending.py::test_a_worker_without_this_package_ignores_the_plugin",
+        ),
+    ),
+    PrivateNames(
+        FENCES,
+        (
+            f"{_SCHEDULER}.valid_workers(ts)",
+            f"{_SCHEDULER}.decide_worker_rootish_queuing_disabled(ts)",
+            f"{_SCHEDULER}.decide_worker_non_rootish(ts)",
+            f"{_SCHEDULER}.idle_task_count",
+        ),
+        "other tasks stay out",
+        (
+            "test_fence.py::test_other_tasks_stay_out",
+            "test_fence.py::test_nothing_is_stolen_into_a_partition",
+            "test_fence.py::test_root_tasks_are_held_back_as_before",
+        ),
+    ),
+    PrivateNames(
+        CHOOSING,
+        (
+            f"{_SCHEDULER}.decide_worker_non_rootish(ts)",
+            f"{_SCHEDULER}.worker_objective(ts, ws)",
+            f"{_SCHEDULER_TASK}.host_restrictions",
+            f"{_SCHEDULER_WORKER}.long_running",
+        ),
+        "a few workers are compared for a task, not all",
+        ("test_choosing.py::test_simulated_workers_get_tasks_as_evenly_as_from_dask",),
+    ),
+    PrivateNames(
+        SHUFFLES,
+        (
+            "distributed.shuffle._scheduler_plugin:ShuffleSchedulerPlugin._calculate_worker_for"
+            "(spec)",
+            "distributed.shuffle._core:barrier_key",
+        ),
+        "shuffles stay on permitted workers",
+        (
+            "test_shuffles.py::test_inside_a_task_of_a_partition",
+            "test_shuffles.py::test_of_a_collection_that_a_partition_computes",
+        ),
+    ),
+    PrivateNames(
+        DIVIDING,
+        (
+            f"{_SCHEDULER}.resources",
+            f"{_SCHEDULER_WORKER}.resources",
+            f"{_SCHEDULER_WORKER}.used_resources",
+            f"{_SCHEDULER_WORKER}.extra",
+            f"{_WORKER_STATE}.total_resources",
+            f"{_WORKER_STATE}.available_resources",
+            f"{_WORKER_STATE}.all_running_tasks",
+        ),
+        "what workers declare",
+        (
+            "test_moves.py::test_slots_are_those_of_the_partition",
+            "test_moves.py::test_a_cancelled_task_that_is_on_its_way_when_its_worker_leaves",
+        ),
+    ),
+    PrivateNames(
+        DIVIDING,
+        (
+            f"{_SCHEDULER}.bulk_schedule_unrunnable_after_adding_worker",
+            f"{_SCHEDULER}.transitions",
+            f"{_SCHEDULER}.check_idle_saturated",
+            f"{_SCHEDULER}.stimulus_queue_slots_maybe_opened",
+        ),
+        "tasks that wait for a slot are woken",
+        ("test_fence.py::test_waiting_tasks_go_to_a_worker_that_leaves_the_partition",),
+    ),
+    PrivateNames(
+        DIVIDING,
+        (f"{_STEALING}.move_task_request", f"{_STEALING}.in_flight"),
+        "waiting tasks leave a worker that moves",
+        ("test_moves.py::test_what_has_not_started_is_shared_out_evenly",),
+    ),
+    PrivateNames(
+        DIVIDING,
+        (
+            "distributed.core:clean_exception",
+            "distributed.worker:Worker.run",
+            "distributed.scheduler:Scheduler.identity",
+        ),
+        "requests to single workers",
+        ("test_pool.py::test_more_workers_than_dask_lists_by_default",),
+    ),
+    PrivateNames(
+        MAP,
+        ("distributed.client:Future._state",),
+        "lost results are noticed",
+        ("test_mapping.py::test_results_that_are_lost_before_they_are_fetched",),
+    ),
+    PrivateNames(
+        PIPES,
+        (
+            "distributed.queues:QueueExtension.queues",
+            "distributed.variable:VariableExtension.variables",
+            f"{_SCHEDULER}.extensions",
+            f"{_SCHEDULER}.handlers",
+        ),
+        "a pipe is a Queue and a Variable",
+        (
+            "test_pipe_processes.py::test_deleting_forgets_consumers_that_were_killed",
+            "test_pipe.py::test_using_a_deleted_pipe_says_so_and_does_not_bring_it_back",
+        ),
+    ),
+    PrivateNames(
+        FETCHING,
+        ("distributed.utils_comm:gather_from_workers", "distributed.worker:Worker.handlers"),
+        "a dead worker is not waited for",
+        ("test_fetch.py::test_a_worker_that_is_slow_is_waited_for",),
+    ),
+    PrivateNames(
+        PAGE,
+        (f"{_SCHEDULER}.http_application",),
+        "the page is part of Dask's dashboard",
+        ("test_page.py::test_it_is_served_and_taken_away",),
+    ),
+    PrivateNames(
+        CLUSTERS,
+        (
+            "distributed.deploy.cluster:Cluster._update_worker_status",
+            "distributed.nanny:Nanny.instantiate",
+            "distributed.utils:_forkserver_preload_set",
+            "distributed.deploy.spec:SpecCluster.worker_spec",
+            "distributed.deploy.spec:SpecCluster.new_spec",
+            "distributed.deploy.spec:SpecCluster.scheduler_spec",
+            "distributed.deploy.spec:SpecCluster.workers",
+            "distributed.deploy.spec:SpecCluster.scheduler_comm",
+            "distributed.deploy.ssh:Worker",
+        ),
+        "workers of several kinds, forked from one process, left to their nannies",
+        (
+            "test_local.py::test_a_worker_that_is_slow_to_come_back_is_not_given_up",
+            "test_local.py::test_a_script_needs_no_main_guard_and_what_it_defines_reaches_the_workers",
+            "test_clusters.py::test_a_job_that_was_lost_is_submitted_again",
+        ),
+    ),
+    PrivateNames(
+        ADAPTING,
+        (
+            f"{_SCHEDULER}.handle_worker_status_change",
+            f"{_SCHEDULER}.stream_comms",
+            f"{_SCHEDULER}.retire_workers",
+            f"{_SCHEDULER}.close_worker",
+            f"{_SCHEDULER}.unrunnable",
+            f"{_SCHEDULER_WORKER}.processing",
+            f"{_SCHEDULER_WORKER}.long_running",
+            f"{_SCHEDULER_WORKER}.has_what",
+            f"{_SCHEDULER_WORKER}.actors",
+            f"{_SCHEDULER_TASK}.worker_restrictions",
+            f"{_SCHEDULER_TASK}.host_restrictions",
+            f"{_SCHEDULER_TASK}.loose_restrictions",
+        ),
+        "jobs follow the tasks that wait; idle workers end without losing anything",
+        (
+            "test_adapting.py::test_no_task_is_lost_or_run_again_while_workers_come_and_go",
+            "test_adapting.py::test_a_worker_is_kept_for_what_would_be_lost_with_it",
+            "test_adapting.py::test_a_worker_whose_job_was_cancelled_too_late_gets_no_task",
+        ),
+    ),
+)
+
+
+def require(feature: str) -> None:
+    """Check that this version of Dask has the private names of a feature.
+
+    The first call in a process also warns if that version was not tested.
+
+    Raises
+    ------
+    PoolError
+        If names are missing.
+    """
+    _warn_if_untested()
+    missing = missing_names(feature)
+    if missing:
+        raise PoolError(
+            f"distributed {distributed.__version__} lacks {', '.join(missing)}, so {feature} is "
+            f"off; versions {TESTED[0]} to {TESTED[1]} have it."
+        )
+
+
+@cache
+def missing_names(feature: str) -> tuple[str, ...]:
+    """Return the private names of a feature that this version of Dask lacks."""
+    names = [name for row in PRIVATE_NAMES if row.feature == feature for name in row.names]
+    return tuple(name.partition(":")[2] for name in names if not _exists(name))
+
+
+@cache
+def _warn_if_untested() -> None:
+    oldest, version, newest = map(_numbers, (TESTED[0], distributed.__version__, TESTED[1]))
+    if not oldest <= version <= newest:
+        warnings.warn(
+            f"poolpart was tested with distributed {TESTED[0]} to {TESTED[1]}, and this is "
+            f"{distributed.__version__}.",
+            stacklevel=3,
+        )
+
+
+def table_row(row: PrivateNames) -> str:
+    """Return a row of the table in docs/pool-partitions.md."""
+    short = ", ".join(f"`{name.partition(':')[2]}`" for name in row.names)
+    tests = ", ".join(f"`{test}`" for test in row.tests)
+    return f"| {row.feature} | {short} | {row.purpose} | {tests} |"
+
+
+def _numbers(version: str) -> tuple[int, ...]:
+    """Return the numbers of a version such as 2026.8.0 or 2026.8.0+14.g1234abc."""
+    return tuple(int(number) for number in version.partition("+")[0].split(".") if number.isdigit())
+
+
+def _exists(name: str) -> bool:
+    """Whether an object or an attribute exists, and a method has the parameters."""
+    path, _, parameters = name.removesuffix(")").partition("(")
+    module_name, _, attributes = path.partition(":")
+    try:
+        owner: Any = import_module(module_name)
+    except ImportError:
+        return False
+    *parents, last = attributes.split(".")
+    for parent in parents:
+        owner = getattr(owner, parent, None)
+    if last not in _attributes(owner):
+        return False
+    if not parameters:
+        return True
+    method = getattr(owner, last)
+    return {*parameters.split(", ")} <= inspect.signature(method).parameters.keys()
+
+
+def _attributes(owner: Any) -> set[str]:
+    """Names of attributes of an object, and of those that instances of a class get."""
+    names = set(dir(owner))
+    if isinstance(owner, type):
+        for kind in owner.__mro__:
+            names.update(vars(kind).get("__annotations__", ()), _slots(kind))
+            names.update(_assigned(kind))
+    return names
+
+
+def _slots(kind: type) -> Iterator[str]:
+    slots = vars(kind).get("__slots__", ())
+    yield from (slots,) if isinstance(slots, str) else slots
+
+
+def _assigned(kind: type) -> tuple[str, ...]:
+    """Names that the constructor of a class uses: attributes without annotations are among them."""
+    constructor = vars(kind).get("__init__")
+    code = getattr(inspect.unwrap(constructor), "__code__", None) if constructor else None
+    return code.co_names if code is not None else ()
