@@ -31,7 +31,8 @@ from distributed import Client
 from distributed.deploy.spec import ProcessInterface
 from distributed.diagnostics.plugin import SchedulerPlugin
 
-from poolpart import Partition, TaskRecord, placement_violations, recorded, start_partitions
+from poolpart import Partition, TaskRecord, placement_violations, recorded
+from poolpart.deploy import start_partitions
 
 NAMES = ("A", "B", "C")
 MOST = 3  # workers of a partition

@@ -25,7 +25,8 @@ from tests.daemons import LOOPBACK, Slurm, slurm
 
 from lidarpool.render import theme
 from lidarpool.render.picture_page import FONT, Page
-from poolpart import Partition, start_partitions
+from poolpart import Partition
+from poolpart.deploy import start_partitions
 
 NAMES = ("GPU", "IO")
 MOST = {"GPU": 4, "IO": 3}

@@ -7,7 +7,8 @@ they are jobs of a queue.
 from dask_jobqueue.local import LocalCluster
 from distributed import Client, get_worker
 
-from poolpart import Partition, start_partitions
+from poolpart import Partition
+from poolpart.deploy import start_partitions
 
 
 def where(number: int) -> str:

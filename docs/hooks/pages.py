@@ -51,7 +51,7 @@ def on_files(files: Files, config: Any) -> Files:
     pages["reference/scenario.md"] = scenario_page()
     pages["reference/campaign.md"] = campaign_page()
     pages["reference/columns.md"] = columns_page()
-    for package in ("lidarpool", "poolpart", "raybeam"):
+    for package in ("lidarpool", "poolpart", "poolpart.deploy", "raybeam"):
         pages[f"reference/{package}.md"] = members_page(package)
     # Pages of linked sources must be there before MkDocs reads the first page of docs/.
     for file in list(files.documentation_pages()):

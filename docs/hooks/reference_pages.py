@@ -70,8 +70,9 @@ _FIRST = {
     ),
     "poolpart": (
         *("Pool", "Partition", "Rule", "per_gpu", "per_host", "n_workers", "named", "rest"),
-        *("Results", "PartitionStats", "StageStats", "Pipe", "local_cluster"),
+        *("Results", "PartitionStats", "StageStats", "Pipe"),
     ),
+    "poolpart.deploy": ("local_cluster", "start_partitions"),
     "raybeam": ("RayCaster", "Pattern", "Hits", "ScanReturns"),
 }
 

@@ -1,10 +1,8 @@
 """Pool partitions and pipes for Dask clusters."""
 
-from .clusters import start_partitions
 from .devices import own_device
 from .errors import PipeClosed, PipeFailed, PoolError
 from .fetch import fetch_available, hold_for_driver, take_held
-from .local import local_cluster
 from .mapping import Results
 from .partition import Partition
 from .pipe import Pipe, forget_pipes, take_news
@@ -37,7 +35,6 @@ __all__ = [
     "fetch_available",
     "forget_pipes",
     "hold_for_driver",
-    "local_cluster",
     "look_for_tasks",
     "n_workers",
     "named",
@@ -48,7 +45,6 @@ __all__ = [
     "placement_violations",
     "recorded",
     "rest",
-    "start_partitions",
     "take_held",
     "take_news",
     "telling_departure",

@@ -13,8 +13,9 @@ from tests.clusters import QUIET, cluster_of, import_jobqueue
 from tests.daemons import wait_until
 from tests.poolpart.job_queue import Queue
 
-from poolpart import Partition, Pipe, Pool, local_cluster
-from poolpart.internals.local_cluster import FixedCluster
+from poolpart import Partition, Pipe, Pool
+from poolpart.deploy import local_cluster
+from poolpart.deploy.local_processes import FixedCluster
 
 
 def thread_cluster(workers):
@@ -131,8 +132,8 @@ def queue(monkeypatch):
     jobs, queue = import_jobqueue().slurm.SLURMJob, Queue()
     monkeypatch.setattr(jobs, "_submit_job", lambda job, path: queue.submit(job, path))
     monkeypatch.setattr(jobs, "_close_job", lambda job, *what: queue.close(job, *what))
-    monkeypatch.setattr("poolpart.clusters._ADAPT_EVERY_S", 0.05)
-    monkeypatch.setattr("poolpart.clusters._LOOK_EVERY_S", 0.05)
+    monkeypatch.setattr("poolpart.deploy.clusters._ADAPT_EVERY_S", 0.05)
+    monkeypatch.setattr("poolpart.deploy.clusters._LOOK_EVERY_S", 0.05)
     return queue
 
 

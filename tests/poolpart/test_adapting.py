@@ -18,8 +18,9 @@ from tests.poolpart.helpers import LONG_S, here, twice, wait_for
 from tests.poolpart.job_queue import SCHEDULER
 
 import poolpart.adapting
-import poolpart.clusters
-from poolpart import Partition, Pool, PoolError, n_workers, per_host, rest, start_partitions
+import poolpart.deploy.clusters
+from poolpart import Partition, Pool, PoolError, n_workers, per_host, rest
+from poolpart.deploy import start_partitions
 from poolpart.task_locations import look_for_tasks
 
 IDLE_S = 0.2
@@ -289,7 +290,7 @@ def note(number, partition):
 @pytest.mark.slow
 def test_no_task_is_lost_or_run_again_while_workers_come_and_go(queue, monkeypatch):
     """Idle workers go at once, while tasks come one by one."""
-    monkeypatch.setattr(poolpart.clusters, "_ADAPT_EVERY_S", 0.01)
+    monkeypatch.setattr(poolpart.deploy.clusters, "_ADAPT_EVERY_S", 0.01)
     ran.clear()
     partitions = {name: adaptive(0, 2) | {"idle_s": 0.0} for name in ("A", "B")}
     with cluster_of(partitions) as client:

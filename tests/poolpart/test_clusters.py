@@ -10,7 +10,8 @@ from distributed import Status
 from tests.clusters import import_jobqueue, thread_cluster
 from tests.poolpart.job_queue import SCHEDULER, Queue
 
-from poolpart import PoolError, start_partitions
+from poolpart import PoolError
+from poolpart.deploy import start_partitions
 
 
 @pytest.fixture

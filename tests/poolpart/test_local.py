@@ -11,12 +11,14 @@ import psutil
 import pytest
 from distributed import Client
 
-from poolpart import Pool, PoolError, local_cluster
+from poolpart import Pool, PoolError
+from poolpart.deploy import local_cluster
 
 SCRIPT = """
 import sys, time
 from distributed import Client
-from poolpart import Pool, local_cluster
+from poolpart import Pool
+from poolpart.deploy import local_cluster
 
 def main():
     partitions = {{"GPU": (1, 1), "IO": (1, 4), "OTHER": (1, 1)}}

@@ -11,12 +11,13 @@ from distributed import Client
 from tests.clusters import import_jobqueue
 
 import lidarpool.run.checks
-import poolpart.clusters
+import poolpart.deploy.clusters
 from lidarpool import LidarpoolError, ScanFrame, Scene, Sensor, Survey, simulate
 from lidarpool.pipeline.casting_workers import CastingWorkers
 from lidarpool.pipeline.names import GPU, LIDAR
 from lidarpool.run.checks import common_backend
-from poolpart import Pool, start_partitions, worker_identities
+from poolpart import Pool, worker_identities
+from poolpart.deploy import start_partitions
 
 SURVEY = Survey(Sensor.grid(rays_per_revolution=180, layers=16, step_deg=10), [(0, 0, 1)], steps=36)
 
@@ -145,7 +146,7 @@ def test_jobs_that_die_before_their_workers_connect_end_a_run(monkeypatch, tmp_p
 
     monkeypatch.setattr(jobs, "_submit_job", submit)
     monkeypatch.setattr(jobs, "_close_job", close)
-    monkeypatch.setattr(poolpart.clusters, "_LOOK_EVERY_S", 0.1)
+    monkeypatch.setattr(poolpart.deploy.clusters, "_LOOK_EVERY_S", 0.1)
     options = {"host": "127.0.0.1", "port": 0, "dashboard_address": "127.0.0.1:0"}
     told: list[str] = []
     with import_jobqueue().SLURMCluster(

@@ -21,11 +21,11 @@ from distributed import SpecCluster, Status
 from distributed.deploy import ssh
 from tornado.ioloop import PeriodicCallback
 
-from .adapting import IDLE_S, Bounds, JobKind, begin, look
-from .errors import PoolError
-from .internals.names import ADAPTING, CLUSTERS, require
-from .internals.scheduler import ask_of_cluster
-from .rules import check_count, check_name
+from ..adapting import IDLE_S, Bounds, JobKind, begin, look
+from ..errors import PoolError
+from ..internals.names import ADAPTING, CLUSTERS, require
+from ..internals.scheduler import ask_of_cluster
+from ..rules import check_count, check_name
 
 logger = logging.getLogger(__name__)
 

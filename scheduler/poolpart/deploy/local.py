@@ -9,10 +9,10 @@ from typing import Any
 import dask
 from distributed import Scheduler, Security, SpecCluster
 
-from .errors import PoolError
-from .internals.local_cluster import FixedCluster, OwnNanny
-from .internals.names import CLUSTERS, require
-from .rules import check_count, check_name
+from ..errors import PoolError
+from ..internals.names import CLUSTERS, require
+from ..rules import check_count, check_name
+from .local_processes import FixedCluster, OwnNanny
 
 LOOPBACK = "127.0.0.1"
 

@@ -259,7 +259,7 @@ def _look_at_cluster(
             check_backend_here(options.backend)
             usable = [name for name, reason in available_backends().items() if not reason]
             backend = usable[0] if options.backend == "auto" else options.backend
-            # Dask gives each worker of a local cluster its share, see `poolpart.local_cluster`.
+            # Dask gives each worker of a local cluster its share of the memory.
             each = MEMORY_LIMIT / CPU_COUNT
             check_memory(job, options, backend, each, "a GPU worker of this machine")
     slots = {n: {"needed": least, "there": there.get(n, 0)} for n, least in required.items()}

@@ -12,8 +12,8 @@ from distributed import SpecCluster, SSHCluster
 from distributed.deploy import ssh
 from pydantic import BaseModel, ConfigDict, Field, PrivateAttr
 
-from poolpart import start_partitions
-from poolpart.clusters import INFORMATION
+from poolpart.deploy import start_partitions
+from poolpart.deploy.clusters import INFORMATION
 
 from ..base.errors import LidarpoolError
 from ..base.interrupts import deferred_interrupts

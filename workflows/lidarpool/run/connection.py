@@ -24,8 +24,8 @@ from distributed import Client, Security, SpecCluster
 from distributed.comm import connect
 from distributed.utils import LoopRunner
 
-import poolpart
-from poolpart.internals.local_cluster import forked_workers
+import poolpart.deploy
+from poolpart.deploy import forked_workers
 from poolpart.probe import visible_gpus
 from poolpart.rules import check_count
 
@@ -87,14 +87,14 @@ def local_cluster(
     Workers of GPU and OTHER have one thread each; their default numbers are `default_workers` of
     this machine, and OTHER may have none. The one LIDAR worker has `lidar_slots` threads and slots;
     with 0 there is none.
-    Further options, and the errors, are those of `poolpart.local_cluster`.
+    Further options, and the errors, are those of `poolpart.deploy.local_cluster`.
     """
     defaults = default_workers(CPU_COUNT, len(visible_gpus()))
     gpu_workers = defaults[GPU] if gpu_workers is None else gpu_workers
     other_workers = defaults[OTHER] if other_workers is None else other_workers
     check_count("gpu_workers", gpu_workers)
     lidar = (min(1, lidar_slots), max(1, lidar_slots))
-    return poolpart.local_cluster(
+    return poolpart.deploy.local_cluster(
         {GPU: (gpu_workers, 1), LIDAR: lidar, OTHER: (other_workers, 1)}, **options
     )
 
