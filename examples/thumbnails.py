@@ -7,7 +7,8 @@ from pathlib import Path
 import numpy as np
 from distributed import Client, get_client
 
-from poolpart import Pipe, Pool, fetch_available, n_workers, per_gpu, rest
+from poolpart import Pipe, Pool, n_workers, per_gpu, rest
+from poolpart.fetch import fetch_available
 
 SIZE, WINDOW = 30 * 40 * 3, 8  # bytes of a thumbnail; thumbnails under way
 

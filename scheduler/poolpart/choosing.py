@@ -125,12 +125,15 @@ class WorkerChoice(SchedulerPlugin):
             return None
         group = self._groups.get(name)
         if group is None or group.version != version:
-            if name != _OUTSIDE:
-                workers = workers_declaring(self.scheduler, name)
-            else:
-                workers = [w for w in self.scheduler.workers.values() if w not in fences.closed]
-            group = self._groups[name] = _Group(name, version, workers)
+            group = self._groups[name] = _Group(name, version, self._members(name))
         return group
+
+    def _members(self, name: str) -> list[Any]:
+        """States of the workers that belong to a group now."""
+        if name != _OUTSIDE:
+            return workers_declaring(self.scheduler, name)
+        closed: set[Any] = self.scheduler.plugins[FENCES].closed
+        return [worker for worker in self.scheduler.workers.values() if worker not in closed]
 
     # -- the rule ----------------------------------------------------------------------
 

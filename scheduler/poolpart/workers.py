@@ -12,6 +12,7 @@ from distributed.comm.core import CommClosedError
 
 from .errors import PoolError
 from .internals.client import ask
+from .internals.worker import resources_here as resources_here  # for records of tasks
 
 SILENT_S = 20.0  # without a heartbeat: stopped, or with its GIL held
 _BEATS = 3  # heartbeats that a worker may miss at least

@@ -31,8 +31,9 @@ from lidarpool.pipeline.messages import (
     samples_of_scan,
     summary_type,
 )
+from lidarpool.pipeline.placement import TaskRecord
 from lidarpool.pipeline.policies import LATE_S, SPAN, TASK_SECONDS, most_under_way
-from poolpart import TaskLocations, TaskRecord
+from poolpart.task_locations import TaskLocations
 
 SCANS = 60
 SURVEY = Survey(Sensor.grid(rays_per_revolution=SCANS, layers=1, step_deg=6), [(0, 0, 1)], SCANS)

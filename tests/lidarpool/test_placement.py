@@ -2,7 +2,7 @@
 
 import time
 
-from poolpart import placement_violations, recorded
+from lidarpool.pipeline.placement import placement_violations, recorded
 
 
 def twice(x, *, plus=0):

@@ -9,6 +9,7 @@ import pytest
 
 from lidarpool.pipeline.job_state import Batch, BatchState, Outcome
 from lidarpool.pipeline.names import INTERSECT
+from lidarpool.pipeline.placement import TaskRecord
 from lidarpool.pipeline.policies import (
     AHEAD,
     COLLECTING,
@@ -24,8 +25,7 @@ from lidarpool.pipeline.policies import (
     slots_wanted,
 )
 from lidarpool.pipeline.task_book import MISPLACED_MOST, RECORDS_MOST, StageTotals, TaskBook
-from poolpart import TaskLocations, TaskRecord
-from poolpart.task_locations import TaskPlace
+from poolpart.task_locations import TaskLocations, TaskPlace
 
 A, B = "tcp://a:1", "tcp://b:1"
 

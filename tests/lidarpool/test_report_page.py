@@ -28,6 +28,7 @@ from lidarpool import (
     load_sensor,
 )
 from lidarpool.pipeline.names import COLLECT, GENERATE, INTERSECT, SORT
+from lidarpool.pipeline.placement import TaskRecord
 from lidarpool.pipeline.task_book import TaskBook
 from lidarpool.plan import best
 from lidarpool.plan.trial import run_trial
@@ -37,7 +38,6 @@ from lidarpool.run.trials import TRIAL
 from lidarpool.scenario.scenario import Scenario
 from lidarpool.scene.scene_mesh import SceneMesh
 from lidarpool.sensor import Sensor
-from poolpart import TaskRecord
 
 EVIL = (
     "\"'><script>alert(1)</script><img src=//evil.test/x onerror=y>&amp;{{ 7*7 }}\u202e\x00\udc80"

@@ -19,7 +19,7 @@ from lidarpool.scene.shapes import seed_objects
 from lidarpool.simulator import scene_caster
 from lidarpool.simulator.batch import columns_of
 from lidarpool.simulator.rig import Rig
-from poolpart import WorkerLeft
+from poolpart.task_context import WorkerLeft
 from raybeam import RayCaster
 
 ELEVATIONS = np.radians([-20, -5, 0, 12])

@@ -7,7 +7,7 @@ import pytest
 from lidarpool import LidarpoolError
 from lidarpool.run import watch
 from lidarpool.run.watch import Watch
-from poolpart import TaskLocations
+from poolpart.task_locations import TaskLocations
 
 
 @pytest.fixture

@@ -7,7 +7,7 @@ import time
 from distributed import Event, get_worker
 from distributed.core import Status
 
-from poolpart import worker_identities
+from poolpart.workers import worker_identities
 
 LONG_S = 120.0  # for what happens at once, or the test fails
 

@@ -7,7 +7,8 @@ import pytest
 from distributed import Event
 from tests.poolpart.helpers import LONG_S, declared, here, join, kill, wait_for
 
-from poolpart import Pool, PoolError, n_workers, named, per_host, rest, steward, worker_identities
+from poolpart import Pool, PoolError, n_workers, named, per_host, rest, steward
+from poolpart.workers import worker_identities
 
 
 def known(client):

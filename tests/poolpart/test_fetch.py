@@ -11,14 +11,9 @@ from distributed import Event, wait
 from distributed.comm.addressing import parse_host_port
 from tests.poolpart.helpers import LONG_S, twice, wait_for
 
-from poolpart import (
-    Partition,
-    fetch,
-    fetch_available,
-    hold_for_driver,
-    take_held,
-    worker_identities,
-)
+from poolpart import Partition, fetch
+from poolpart.fetch import fetch_available, hold_for_driver, take_held
+from poolpart.workers import worker_identities
 
 
 def test_only_what_is_finished_comes(client):

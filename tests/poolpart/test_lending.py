@@ -2,12 +2,12 @@
 
 import logging
 import os
+import pickle
 import signal
 import subprocess
 import sys
 import threading
 import time
-import warnings
 
 import dask
 import pytest
@@ -417,19 +417,17 @@ def poll(stop):
 
 @pytest.fixture
 def warned(monkeypatch):
-    """Texts of warnings at the client; nested tasks wait for a moment before these are given."""
+    """Return the texts of warnings to a cluster's clients; nested tasks wait for a moment first."""
     monkeypatch.setattr("poolpart.lending.WARN_AFTER_S", 0.2)
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always")
-        yield lambda: [str(warning.message) for warning in caught]
+    return lambda client: [pickle.loads(event["message"]) for _, event in client.get_events("warn")]
 
 
 def test_polling_for_a_nested_task_is_reported_to_the_client(client, b, warned, wait_until):
     stop = f"stop-{client.id}"
     future = b.submit(poll, stop)
-    wait_until(lambda: any("distributed.wait" in message for message in warned()))
-    [message] = [message for message in warned() if "distributed.wait" in message]
-    assert future.key in message and "partition 'B'" in message
+    wait_until(lambda: any(future.key in message for message in warned(client)))
+    [message] = [message for message in warned(client) if future.key in message]
+    assert "partition 'B'" in message and "use Future.result, distributed.wait" in message
     Event(stop, client).set()
     assert future.result(LONG_S) is False
 
@@ -447,7 +445,8 @@ def test_polling_on_several_workers_is_reported(start, warned, wait_until):
     part = Partition("A", client)
     stop = f"stop-{client.id}"
     futures = [part.submit(poll_together, stop, n, 2, workers="ab"[n]) for n in range(2)]
-    wait_until(lambda: any("distributed.wait" in message for message in warned()))
+    keys = [future.key for future in futures]
+    wait_until(lambda: any(key in message for message in warned(client) for key in keys))
     Event(stop, client).set()
     assert client.gather(futures) == [False, False]
 

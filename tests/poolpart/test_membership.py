@@ -7,7 +7,8 @@ import pytest
 from distributed import Client
 from tests.poolpart.helpers import LONG_S, addresses, here, join, kill, leave, twice
 
-from poolpart import Partition, Pool, PoolError, n_workers, named, rest, worker_identities
+from poolpart import Partition, Pool, PoolError, n_workers, named, rest
+from poolpart.workers import worker_identities
 
 
 def calls(part):

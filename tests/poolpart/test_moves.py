@@ -10,17 +10,9 @@ import pytest
 from distributed import Event, secede
 from tests.poolpart.helpers import LONG_S, declared, declared_by_themselves, here, wait_for
 
-from poolpart import (
-    Partition,
-    Pool,
-    PoolError,
-    n_workers,
-    per_host,
-    recorded,
-    rest,
-    steward,
-    worker_identities,
-)
+from lidarpool.pipeline.placement import recorded
+from poolpart import Partition, Pool, PoolError, n_workers, per_host, rest, steward
+from poolpart.workers import worker_identities
 
 
 def brief(_=None):

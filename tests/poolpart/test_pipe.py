@@ -12,9 +12,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from tests.poolpart.helpers import LONG_S
 
-from poolpart import Pipe, PipeClosed, PipeFailed, take_news
+from poolpart import Pipe, PipeClosed, PipeFailed
 from poolpart import pipe as pipe_module
-from poolpart.pipe import pipes_of
+from poolpart.pipe import pipes_of, take_news
 
 
 def again(pipe):

@@ -7,7 +7,8 @@ import pytest
 from distributed import Status
 from distributed.diagnostics.plugin import SchedulerPlugin
 
-from poolpart import WorkerLeft, own_client, telling_departure, worker_identities
+from poolpart.task_context import WorkerLeft, own_client, telling_departure
+from poolpart.workers import worker_identities
 
 
 def test_a_coroutine_does_not_wait_for_a_thread_that_needs_its_loop(monkeypatch):

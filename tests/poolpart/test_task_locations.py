@@ -2,7 +2,8 @@
 
 from distributed import Event, secede
 
-from poolpart import Partition, Pool, look_for_tasks
+from poolpart import Partition, Pool
+from poolpart.task_locations import look_for_tasks
 
 
 def hold(name):

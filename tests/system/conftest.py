@@ -27,7 +27,7 @@ from lidarpool import Cloud
 from lidarpool.base.tracing import trace_to
 from lidarpool.cli.commands import main
 from lidarpool.run.connection import local_cluster
-from poolpart import fetch_available
+from poolpart.fetch import fetch_available
 from poolpart.pipe import pipes_of
 
 

@@ -9,9 +9,10 @@ from tests.clusters import thread_cluster
 
 from lidarpool import LidarpoolError, Planning, ScanFrame, Scene, Sensor, Survey, simulate
 from lidarpool.pipeline.driver import RunDriver
+from lidarpool.pipeline.placement import placement_violations
 from lidarpool.run.trials import TrialPump
 from lidarpool.run.watch import WATCH_EVERY_S
-from poolpart import placement_violations, worker_identities
+from poolpart.workers import worker_identities
 
 # Enough batches that the run is still under way when something happens to it.
 SURVEY = Survey(

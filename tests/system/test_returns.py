@@ -21,7 +21,7 @@ from lidarpool import (
     simulate,
 )
 from lidarpool.columns.table import TABLE
-from poolpart import worker_identities
+from poolpart.workers import worker_identities
 
 OPTIONAL = [name for name in TABLE if name not in ("scan", "x", "y", "z", "channel", "object")]
 SURVEY = Survey(

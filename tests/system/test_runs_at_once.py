@@ -10,8 +10,9 @@ from tests.chaos.traces import scheduler_state, settled_differences
 from tests.clusters import thread_cluster
 
 from lidarpool import LidarpoolError, Planning, Result, ScanFrame, Scene, Sensor, Survey, simulate
+from lidarpool.pipeline.placement import placement_violations
 from lidarpool.run.progress import Progress
-from poolpart import Pool, placement_violations
+from poolpart import Pool
 
 SURVEY = Survey(Sensor.grid(rays_per_revolution=180, layers=4, step_deg=5), [(0, 0, 1)], steps=72)
 

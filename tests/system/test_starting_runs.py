@@ -16,8 +16,9 @@ from lidarpool import LidarpoolError, ScanFrame, Scene, Sensor, Survey, simulate
 from lidarpool.pipeline.casting_workers import CastingWorkers
 from lidarpool.pipeline.names import GPU, LIDAR
 from lidarpool.run.checks import common_backend
-from poolpart import Pool, worker_identities
+from poolpart import Pool
 from poolpart.deploy import start_partitions
+from poolpart.workers import worker_identities
 
 SURVEY = Survey(Sensor.grid(rays_per_revolution=180, layers=16, step_deg=10), [(0, 0, 1)], steps=36)
 

@@ -13,7 +13,10 @@ from typing import Any
 import cloudpickle
 from distributed import Future
 
-from poolpart import Partition, TaskLocations, fetch_available, look_for_tasks, worker_identities
+from poolpart import Partition
+from poolpart.fetch import fetch_available
+from poolpart.task_locations import TaskLocations, look_for_tasks
+from poolpart.workers import worker_identities
 
 from ..base.errors import LidarpoolError
 from ..base.software import difference, software_there

@@ -6,7 +6,7 @@ import time
 from collections import deque
 from collections.abc import Collection, Iterable, Mapping
 
-from poolpart import TaskLocations, TaskRecord
+from poolpart.task_locations import TaskLocations
 
 from ..columns.parts import part_name
 from . import policies
@@ -16,6 +16,7 @@ from .job_state import Batch, BatchState, JobState, Outcome
 from .long_stages import LongStages
 from .messages import CollectOrder, ColumnsLost, Receipt, scans_in_words
 from .names import COLLECT, GENERATE, GPU, INTERSECT, LIDAR
+from .placement import TaskRecord
 
 ADVISED_AGAIN = 0.2  # change of the scans in an item of stage 1 that is worth a request
 PIECES = 16  # a failing batch is divided into so many

@@ -7,7 +7,7 @@ from contextlib import AbstractContextManager, contextmanager
 
 from distributed import Client, Future, KilledWorker
 
-from poolpart import WorkerLeft
+from poolpart.task_context import WorkerLeft
 
 from ..base.errors import LidarpoolError, explained
 from ..base.storage import Storage

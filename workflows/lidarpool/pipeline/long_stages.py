@@ -11,18 +11,10 @@ from typing import Any
 
 from distributed import Future, Lock
 
-from poolpart import (
-    Partition,
-    Pipe,
-    PipeFailed,
-    TaskLocations,
-    TaskRecord,
-    fetch_available,
-    forget_pipes,
-    look_for_tasks,
-    take_held,
-    take_news,
-)
+from poolpart import Partition, Pipe, PipeFailed
+from poolpart.fetch import fetch_available, take_held
+from poolpart.pipe import forget_pipes, take_news
+from poolpart.task_locations import TaskLocations, look_for_tasks
 
 from ..base.errors import LidarpoolError
 from ..base.software import call_alike
@@ -31,6 +23,7 @@ from ..columns.parts import probe_name
 from .failures import raise_if_failed, storing, was_killed, words_on_memory
 from .messages import CollectOrder, Description, Message, Receipt, StageStart, Summaries
 from .names import COLLECT, GENERATE, SORT
+from .placement import TaskRecord
 from .stages import collect, generate, sort_frames
 
 LOOK_EVERY_S = 0.5

@@ -11,14 +11,13 @@ from dataclasses import asdict, dataclass, field
 
 import numpy as np
 
-from poolpart import TaskRecord
-
 from ..base.arrays import Floats32
 from ..base.tracing import trace
 from ..base.validation import one_line
 from ..columns.cloud import Cloud
 from ..columns.parts import PartColumns
 from ..sensor import Pose, Survey
+from .placement import TaskRecord
 
 BatchRange = tuple[int, int]  # the first scan of a batch, and its end
 

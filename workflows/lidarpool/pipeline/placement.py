@@ -9,7 +9,7 @@ from typing import Any, TypeVar
 
 from distributed import get_worker
 
-from .internals.worker import resources_here
+from poolpart.workers import resources_here
 
 T = TypeVar("T")
 

@@ -10,7 +10,7 @@ import statistics
 from collections import Counter, deque
 from collections.abc import Iterable, Mapping, Sequence
 
-from poolpart import TaskLocations
+from poolpart.task_locations import TaskLocations
 
 from .job_state import Batch, BatchState, Outcome
 from .names import COLLECT, INTERSECT

@@ -18,7 +18,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from distributed import get_worker
 
-from poolpart import Recorder, TaskRecord, own_device
+from poolpart import own_device
 
 from ..base.arrays import Floats32
 from ..base.tracing import trace
@@ -32,6 +32,7 @@ from ..simulator.rig import Rig
 from .failures import naming_scans
 from .messages import BatchRange, samples_of_scan
 from .names import GPU, INTERSECT
+from .placement import Recorder, TaskRecord
 
 UNUSED_S = 600.0  # a rig unused for so long, as of a killed driver, goes when another is made
 

@@ -16,16 +16,9 @@ from typing import Any
 
 from distributed import Client, secede
 
-from poolpart import (
-    Pipe,
-    PipeClosed,
-    PipeFailed,
-    Recorder,
-    TaskRecord,
-    fetch_available,
-    hold_for_driver,
-    telling_departure,
-)
+from poolpart import Pipe, PipeClosed, PipeFailed
+from poolpart.fetch import fetch_available, hold_for_driver
+from poolpart.task_context import telling_departure
 
 from ..base.storage import Storage
 from ..columns.parts import pack
@@ -43,6 +36,7 @@ from .messages import (
     Summaries,
 )
 from .names import COLLECT, GENERATE, LIDAR
+from .placement import Recorder, TaskRecord
 from .rigs import CastBatch
 
 TELL_EVERY_S = 0.05  # messages that follow each other so fast travel together

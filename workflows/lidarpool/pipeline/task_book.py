@@ -6,7 +6,7 @@ from collections import Counter
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 
-from poolpart import TaskRecord
+from .placement import TaskRecord
 
 RECORDS_MOST = 4096  # of one stage; beyond that every second one is dropped, repeatedly
 MISPLACED_MOST = 20  # kept for each stage; all are counted

@@ -11,7 +11,9 @@ from typing import Any
 
 from distributed import Client
 
-from poolpart import Pool, PoolError, WorkerInfo, ask_workers, look_for_tasks, worker_identities
+from poolpart import Pool, PoolError, WorkerInfo
+from poolpart.task_locations import look_for_tasks
+from poolpart.workers import ask_workers, worker_identities
 from raybeam import available_backends
 
 from .._version import __version__

@@ -7,13 +7,12 @@ from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
 
-from poolpart import TaskRecord
-
 from ..base.arrays import Floats32, Ints
 from ..base.validation import one_line
 from ..columns.cloud import Cloud
 from ..columns.parts import StoredCloud
 from ..datasets.job_table import JobRow
+from ..pipeline.placement import TaskRecord
 from ..pipeline.task_book import StageTotals
 from ..plan import Plan, Planning, Trial
 from ..scene.scene import Scene

@@ -19,7 +19,8 @@ from typing import Any
 import numpy as np
 from distributed import Client
 
-from poolpart import Partition, PoolError, fetch_available
+from poolpart import Partition, PoolError
+from poolpart.fetch import fetch_available
 
 from ..base.errors import LidarpoolError
 from ..columns.cloud import Cloud

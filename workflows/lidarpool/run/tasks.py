@@ -7,7 +7,9 @@ from typing import Any, Generic, TypeVar
 
 from distributed import Future
 
-from poolpart import Partition, TaskLocations, fetch_available, look_for_tasks
+from poolpart import Partition
+from poolpart.fetch import fetch_available
+from poolpart.task_locations import TaskLocations, look_for_tasks
 
 from ..base.software import call_alike
 from ..pipeline.task_book import TaskBook

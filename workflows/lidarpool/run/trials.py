@@ -7,9 +7,10 @@ import uuid
 from collections import Counter, deque
 from collections.abc import Sequence
 
-from poolpart import TaskLocations, recorded
+from poolpart.task_locations import TaskLocations
 
 from ..pipeline.failures import raise_if_failed, was_killed
+from ..pipeline.placement import recorded
 from ..plan import Planning, Trial, run_trial
 from .tasks import Tasks
 

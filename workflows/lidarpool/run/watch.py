@@ -10,7 +10,8 @@ from typing import Any
 from dask.utils import format_bytes
 from distributed import Client
 
-from poolpart import look_for_tasks, worker_identities
+from poolpart.task_locations import look_for_tasks
+from poolpart.workers import worker_identities
 
 from ..base.errors import LidarpoolError
 from ..base.vocabulary import PATIENCE_S

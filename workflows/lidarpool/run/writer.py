@@ -13,7 +13,8 @@ from typing import Any, NamedTuple
 
 from distributed import Reschedule
 
-from poolpart import Recorder, TaskRecord, fetch_available, own_client
+from poolpart.fetch import fetch_available
+from poolpart.task_context import own_client
 
 from ..base.errors import LidarpoolError, explained
 from ..base.storage import TEMPORARY
@@ -26,6 +27,7 @@ from ..export.sweeps import Sweeps
 from ..pipeline.casting_workers import share
 from ..pipeline.failures import JobError, raise_if_failed, was_killed
 from ..pipeline.names import EXPORT, LIDAR
+from ..pipeline.placement import Recorder, TaskRecord
 from .cluster import Cluster
 from .run_result import RunResult
 from .store import RunStore

@@ -20,13 +20,12 @@ from jinja2 import Environment, PackageLoader, StrictUndefined, Template
 from markupsafe import Markup
 from PIL import Image
 
-from poolpart import TaskRecord
-
 from ...base.arrays import Ints
 from ...base.declared import declared
 from ...base.errors import explained
 from ...base.storage import Storage
 from ...base.words import natural, plural, shortened, without_common_prefix
+from ...pipeline.placement import TaskRecord
 from ...pipeline.task_book import StageTotals, union
 from ...render.stage import nice_step
 from ...run.run_result import RunResult
