@@ -78,7 +78,9 @@ def test_a_task_runs_where_its_input_is(client, parts):
 def test_a_task_that_takes_several_slots_goes_to_a_worker_that_has_them(client):
     rules = {"A": n_workers(5, slots=1), "B": rest(slots=3)}
     parts = Pool.from_client(client).divide(rules)
-    assert parts["B"].submit(here, slots=3).result(LONG_S).startswith("b")
+    members = {worker.name for worker in parts["B"].workers}
+    for _ in range(8):
+        assert parts["B"].submit(here, slots=3).result(LONG_S) in members
 
 
 def test_workers_that_join_leave_and_move_are_counted(client, parts):
@@ -90,7 +92,6 @@ def test_workers_that_join_leave_and_move_are_counted(client, parts):
     places = gather_places(client, futures)
     assert len(members) == 7
     assert places.keys() == members
-    assert max(places.values()) <= 3
 
 
 def test_dask_decides_within_the_fence_if_the_rule_fails(client, parts, monkeypatch, caplog):
