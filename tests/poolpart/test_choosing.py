@@ -3,6 +3,7 @@
 import asyncio
 from collections import Counter
 
+import dask
 import pytest
 from benchmarks import placing
 from distributed import Client, Event, wait
@@ -15,9 +16,10 @@ NAMES = [f"{letter}-{number}" for letter in "ab" for number in range(5)]
 
 @pytest.fixture
 def client(start, monkeypatch):
-    """Client of ten workers, five of them in an exclusive partition; one worker is compared."""
+    """Client of ten workers; one worker is compared for a task, and none steals."""
     monkeypatch.setattr("poolpart.choosing.COMPARED", 1)
-    client = start({name: {} for name in NAMES})
+    with dask.config.set({"distributed.scheduler.work-stealing": False}):
+        client = start({name: {} for name in NAMES})
     client.cluster.scheduler.validate = True  # Dask checks itself after each step
     return client
 
