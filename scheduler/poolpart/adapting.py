@@ -1,11 +1,14 @@
-"""Partitions that grow with their work: what they lack, and which of their jobs may end.
+"""Partitions that grow with their work: how many slots are missing, and which jobs may end.
 
-A plugin of the scheduler has the record: how many jobs each partition may have, what clients want
-of it, and when its workers last had work. Once a second the process that has the cluster object
-(`clusters.py`) says which jobs there are, and is told how many to start and which have ended. The
-scheduler decides, since only there nothing happens between a look at a worker and its closing: in
-the step in which a worker is found idle it stops getting tasks. A job that still waits in the queue
-is cancelled in the same way: if its worker joins after all, it is sent away before it gets a task.
+A plugin of the scheduler keeps a record of each partition: how many jobs the partition may have,
+how many slots clients request, and when its workers last ran a task. Once a second, the process
+that has the cluster object (`deploy/clusters.py`) reports its jobs, and receives how many to start
+and which have ended.
+
+The scheduler decides, because no task can arrive between the moment when the scheduler finds a
+worker idle and the moment when the worker stops getting tasks. A job that waits in the queue is
+cancelled in the same way: if its worker joins after all, the worker is sent away before it gets a
+task.
 """
 
 from __future__ import annotations
@@ -36,14 +39,14 @@ from .internals.worker import has_running_tasks
 from .rules import check_count
 
 NAME = "poolpart-adapting"
-IDLE_S = 60.0  # a job that is not needed for so long ends
-_ANSWER_S = 5.0  # for an idle worker to say that it runs nothing
-_LOST_S = 120.0  # without a word of the process that starts jobs: it is gone
+IDLE_S = 60.0  # after which a job without work ends, by default
+_ANSWER_S = 5.0  # for an idle worker to confirm that it runs no task
+_LOST_S = 120.0  # without a report, after which the process that starts jobs counts as dead
 
 
 @dataclass(frozen=True)
 class Bounds:
-    """How many jobs a partition may have."""
+    """Number of jobs that a partition may have."""
 
     minimum: int
     maximum: int
@@ -51,7 +54,13 @@ class Bounds:
 
     @classmethod
     def checked(cls, name: str, minimum: Any, maximum: Any, idle_s: Any = IDLE_S) -> Bounds:
-        """Check them; PoolError that says what is wrong."""
+        """Return checked bounds.
+
+        Raises
+        ------
+        PoolError
+            If a number is not possible.
+        """
         check_count(f"The minimum of partition {name!r}", minimum, least=0)
         check_count(f"The maximum of partition {name!r}", maximum, least=max(1, minimum))
         if not isinstance(idle_s, int | float) or not 0 <= idle_s < math.inf:
@@ -63,30 +72,38 @@ class Bounds:
 
 @dataclass(frozen=True)
 class JobKind:
-    """What the jobs of a partition are like."""
+    """Size of the jobs of a partition, and their number."""
 
     slots: int  # of a worker
     workers: int = 1  # of a job
-    bounds: Bounds | None = None  # None: their number is fixed
+    bounds: Bounds | None = None  # None for a fixed number of jobs
 
 
 @dataclass(frozen=True)
 class Advice:
-    """What the process that starts jobs has to do for a partition."""
+    """Jobs of a partition that the cluster's process has to start and to forget."""
 
-    more: int = 0  # jobs to start
-    ended: Sequence[str] = ()  # jobs to forget: workers that have ended, jobs to be cancelled
+    jobs_to_start: int = 0
+    jobs_to_forget: Sequence[str] = ()  # their workers have ended, or they are to be cancelled
+
+
+@dataclass(frozen=True)
+class _Decision:
+    """What happens to the jobs of a partition."""
+
+    advice: Advice
+    idle: dict[str, list[Any]]  # {job: states of its workers, which are to be closed}
 
 
 @dataclass
 class _Record:
-    """One partition."""
+    """State of one partition; times are of `time.monotonic`."""
 
     kind: JobKind
-    coming: int = 0  # jobs whose workers are not here
-    heard: float = 0.0  # when the process that starts jobs said so
-    lacked: float = 0.0  # slots that were missing at the last look
-    needless: dict[str, float] = field(default_factory=dict)  # {coming job: needless since}
+    queued_jobs: int = 0  # jobs whose workers have not joined
+    reported_at: float = 0.0  # when the process that starts jobs reported them
+    missing_slots: float = 0.0  # at the last report
+    superfluous_since: dict[str, float] = field(default_factory=dict)  # {queued job: time}
 
 
 class Adaptation(SchedulerPlugin):
@@ -96,152 +113,185 @@ class Adaptation(SchedulerPlugin):
 
     def __init__(self, scheduler: Any) -> None:
         self.scheduler = scheduler
-        self.records: dict[str, _Record] = {}  # by partition
-        self.wants: dict[tuple[str, str], int] = {}  # {(partition, client): slots}
-        self._used: dict[str, float] = {}  # {address: when the worker last had work}
-        self._cancelled: set[str] = set()  # names of workers whose jobs were; no other has them
+        self.records: dict[str, _Record] = {}  # {partition: its record}
+        self.requested: dict[tuple[str, str], int] = {}  # {(partition, client): slots}
+        self._busy_at: dict[str, float] = {}  # {address of a worker: when it last ran a task}
+        self._cancelled: set[str] = set()  # names of workers of cancelled jobs, which are unique
 
-    # -- what happens on the scheduler -------------------------------------------------
+    # -- hooks of the scheduler --------------------------------------------------------
 
     def add_worker(self, scheduler: Any, worker: str) -> None:
         """Begin to count idle time; send a worker away whose job was cancelled meanwhile."""
-        self._used[worker] = time.monotonic()
+        self._busy_at[worker] = time.monotonic()
         state = scheduler.workers[worker]
         if str(state.name) in self._cancelled:
             turn_away(scheduler, state)
 
     def remove_worker(self, scheduler: Any, worker: str, **kwargs: Any) -> None:
         """Forget a worker."""
-        self._used.pop(worker, None)
+        self._busy_at.pop(worker, None)
 
     def transition(
         self, key: Any, start: str, finish: str, *args: Any, worker: str = "", **kwargs: Any
     ) -> None:
         """Note when a worker last ended a task: looks once a second would miss short ones."""
-        if start == "processing" and worker in self._used:
-            self._used[worker] = time.monotonic()
+        if start == "processing" and worker in self._busy_at:
+            self._busy_at[worker] = time.monotonic()
 
     def remove_client(self, scheduler: Any, client: str) -> None:
-        """Forget what a client wanted."""
-        for partition, other in list(self.wants):
-            if other == client:
-                del self.wants[partition, other]
+        """Forget the requests of a client that has left."""
+        for partition, requester in list(self.requested):
+            if requester == client:
+                del self.requested[partition, requester]
 
-    # -- looks ------------------------------------------------------------------------
+    # -- decisions--------------------------------------------------------------------
 
     def waiting_slots(self) -> dict[str, float]:
-        """Slots that tasks wait for without any worker, by partition."""
+        """Return the slots that tasks without a worker wait for, by partition."""
         waiting: dict[str, float] = {}
         for task in waiting_for_workers(self.scheduler):  # there may be 100,000
-            if (asked := task.resource_restrictions) and not is_bound(task):
-                for name, slots in asked.items():
+            if task.resource_restrictions and not is_bound(task):
+                for name, slots in task.resource_restrictions.items():
                     waiting[name] = waiting.get(name, 0.0) + slots
         return waiting
 
-    def lacking(self, name: str, waiting: float, enough: float) -> float:
-        """Slots that a partition lacks, at most `enough`; below 0 slots that nobody needs.
+    def missing_slots(self, name: str, waiting: float, limit: float) -> float:
+        """Return the slots that a partition lacks; below 0, the slots that no task needs.
 
-        Tasks that are bound to a worker, or run for long there, take its slots; all others may run
-        on any worker of the partition, also a new one.
+        Tasks that are bound to a worker, or run for long there, hold its slots. All other tasks may
+        run on any worker of the partition, also on a new worker.
+
+        Parameters
+        ----------
+        name
+            The partition.
+        waiting
+            Slots that tasks without a worker wait for.
+        limit
+            The result is at most this number of slots.
         """
-        total = free = 0.0
+        members = [
+            worker
+            for worker in self.scheduler.workers.values()
+            if worker.resources.get(name) and takes_tasks(worker)
+        ]
+        total = sum(worker.resources[name] for worker in members)
+        free = 0.0
         movable = waiting
-        everybody = self.scheduler.workers.values()
-        members = [w for w in everybody if w.resources.get(name) and takes_tasks(w)]
-        limit = enough + sum(worker.resources[name] for worker in members)
         for worker in members:
-            slots = worker.resources[name]
             held = 0.0
             for task in worker.processing:
-                if movable >= limit:  # it may have thousands
-                    return enough
-                takes = (task.resource_restrictions or {}).get(name, 0)
+                if movable >= limit + total:  # a worker may have thousands of tasks
+                    return limit
+                slots = (task.resource_restrictions or {}).get(name, 0)
                 if is_bound(task) or task in worker.long_running:
-                    held += takes
+                    held += slots
                 else:
-                    movable += takes
-            total += slots
-            free += max(0.0, slots - held)
-        wanted = sum(n for (partition, _), n in self.wants.items() if partition == name)
-        return min(enough, max(movable - free, wanted - total))
+                    movable += slots
+            free += max(0.0, worker.resources[name] - held)
+        requested = sum(
+            slots for (partition, _), slots in self.requested.items() if partition == name
+        )
+        return min(limit, max(movable - free, requested - total))
 
     def decide(
         self, name: str, jobs: Mapping[str, Sequence[str]], waiting: float
-    ) -> tuple[Advice, dict[str, list[Any]]] | None:
-        """Decide about a partition; returns what to do, and workers to close, by job.
+    ) -> _Decision | None:
+        """Decide which jobs of a partition start and end; None if their number is fixed.
 
-        None if the number of its jobs is fixed. `jobs` are the names of the workers of each job,
-        the newest last.
+        Parameters
+        ----------
+        name
+            The partition.
+        jobs
+            {job: names of its workers}, the newest job last.
+        waiting
+            Slots that tasks without a worker wait for.
         """
-        record, now = self.records[name], time.monotonic()
-        by_name = {str(worker.name): worker for worker in self.scheduler.workers.values()}
-        workers = {job: [by_name[n] for n in names if n in by_name] for job, names in jobs.items()}
-        begun = {job: group for job, group in workers.items() if group}
-        gone = [job for job, names in jobs.items() if self._cancelled.issuperset(names)]
-        queued = [job for job, group in workers.items() if not group and job not in gone]
-        record.coming, record.heard = len(queued), now
+        record = self.records[name]
+        now = time.monotonic()
+        states = {str(worker.name): worker for worker in self.scheduler.workers.values()}
+        present = {
+            job: [states[worker] for worker in names if worker in states]
+            for job, names in jobs.items()
+        }
+        running = {job: workers for job, workers in present.items() if workers}
+        ended = [job for job, names in jobs.items() if self._cancelled.issuperset(names)]
+        queued = [job for job, workers in present.items() if not workers and job not in ended]
+        record.queued_jobs = len(queued)
+        record.reported_at = now
         bounds = record.kind.bounds
         if bounds is None:
             return None
-        each = record.kind.slots * record.kind.workers
-        lacks = self.lacking(name, waiting, float(bounds.maximum * each))
-        # What is still there at the next look: a moment's work is done before a job begins.
-        steady, record.lacked = min(lacks, record.lacked), lacks
+        slots_per_job = record.kind.slots * record.kind.workers
+        missing = self.missing_slots(name, waiting, float(bounds.maximum * slots_per_job))
+        # Work that lasts for less than a second is done before a job begins.
+        lasting = min(missing, record.missing_slots)
+        record.missing_slots = missing
 
-        def needed(slots: float) -> int:
-            jobs = math.ceil(max(0.0, slots) / each)
-            least, most = bounds.minimum - len(begun), bounds.maximum - len(begun)
-            return max(0, min(max(jobs, least), most))
+        def jobs_needed(slots: float) -> int:
+            """Return the number of queued jobs that a number of missing slots asks for."""
+            number = math.ceil(max(0.0, slots) / slots_per_job)
+            lower = bounds.minimum - len(running)
+            upper = bounds.maximum - len(running)
+            return max(0, min(max(number, lower), upper))
 
-        needless = queued[needed(lacks) :]
-        record.needless = {job: record.needless.get(job, now) for job in needless}
-        cancelled = [j for j, since in record.needless.items() if now - since >= bounds.idle_s]
+        superfluous = queued[jobs_needed(missing) :]
+        record.superfluous_since = {
+            job: record.superfluous_since.get(job, now) for job in superfluous
+        }
+        cancelled = [
+            job for job, since in record.superfluous_since.items() if now - since >= bounds.idle_s
+        ]
         self._cancelled.update(worker for job in cancelled for worker in jobs[job])
-        more = max(0, needed(steady) - len(queued))
-        # Also those of which an earlier answer did not arrive.
-        return Advice(more, [*cancelled, *gone]), self._idle(
-            name, begun, -lacks / each, bounds, now
-        )
+        to_start = max(0, jobs_needed(lasting) - len(queued))
+        # Jobs that have ended are named again: an earlier answer may not have arrived.
+        advice = Advice(to_start, [*cancelled, *ended])
+        return _Decision(advice, self._idle(name, running, -missing / slots_per_job, bounds))
 
     def _idle(
-        self,
-        name: str,
-        begun: Mapping[str, Sequence[Any]],
-        spare: float,
-        bounds: Bounds,
-        now: float,
+        self, name: str, running: Mapping[str, Sequence[Any]], spare_jobs: float, bounds: Bounds
     ) -> dict[str, list[Any]]:
-        """Choose workers to close, by job: those idle for longest, at most `spare` jobs."""
-        since: dict[str, float] = {}
-        ours = {j: g for j, g in begun.items() if all(w.resources.get(name) for w in g)}
-        for job, group in ours.items():
-            for worker in group:
+        """Return the workers to close by job: of the jobs that have been idle for longest."""
+        now = time.monotonic()
+        members = {
+            job: workers
+            for job, workers in running.items()
+            if all(worker.resources.get(name) for worker in workers)
+        }
+        busy_at: dict[str, float] = {}
+        for job, workers in members.items():
+            for worker in workers:
                 if not is_idle(self.scheduler, worker):
-                    self._used[worker.address] = now
-            since[job] = max(self._used.setdefault(w.address, now) for w in group)
-        most = max(0, min(len(ours) - bounds.minimum, math.floor(spare)))
-        idle = sorted((j for j in ours if now - since[j] >= bounds.idle_s), key=since.__getitem__)
-        return {job: [*ours[job]] for job in idle[:most]}
+                    self._busy_at[worker.address] = now
+            busy_at[job] = max(self._busy_at.setdefault(worker.address, now) for worker in workers)
+        number = max(0, min(len(members) - bounds.minimum, math.floor(spare_jobs)))
+        idle = [job for job in members if now - busy_at[job] >= bounds.idle_s]
+        idle.sort(key=busy_at.__getitem__)
+        return {job: [*members[job]] for job in idle[:number]}
 
     async def close_idle(self, workers: Sequence[Any]) -> bool:
-        """Close workers that get no more tasks; False if one was busy after all, and all stay."""
+        """Close workers that get no more tasks.
+
+        Returns False, and lets them get tasks again, if a worker was busy after all.
+        """
         addresses = [worker.address for worker in workers]
-        asking = (call(self.scheduler, address, _is_busy) for address in addresses)
+        requests = (call(self.scheduler, address, _is_busy) for address in addresses)
         try:
-            busy = any(await asyncio.wait_for(asyncio.gather(*asking), _ANSWER_S))
+            busy = any(await asyncio.wait_for(asyncio.gather(*requests), _ANSWER_S))
         except (OSError, TimeoutError):  # stopped, or leaving by itself
             busy = True
         if not busy and await retire(self.scheduler, workers):
             return True
         for worker in workers:
             reopen(self.scheduler, worker)
-            if worker.address in self._used:
-                self._used[worker.address] = time.monotonic()
+            if worker.address in self._busy_at:
+                self._busy_at[worker.address] = time.monotonic()
         return False
 
 
 def _is_busy(dask_worker: Any = None) -> bool:
-    """Whether a worker has something that its scheduler does not know of."""
+    """Whether a worker runs a task, or holds data, that its scheduler does not know of."""
     return has_running_tasks(dask_worker) or holds_for_driver()
 
 
@@ -249,7 +299,7 @@ def _is_busy(dask_worker: Any = None) -> bool:
 
 
 def begin(kinds: Mapping[str, JobKind], dask_scheduler: Any = None) -> None:
-    """Make the record of partitions that are started."""
+    """Create the records of partitions whose jobs a process starts."""
     record = _of(dask_scheduler) or Adaptation(dask_scheduler)
     if NAME not in dask_scheduler.plugins:
         dask_scheduler.add_plugin(record)
@@ -260,29 +310,31 @@ def begin(kinds: Mapping[str, JobKind], dask_scheduler: Any = None) -> None:
 async def look(
     jobs: Mapping[str, Mapping[str, Sequence[str]]], dask_scheduler: Any = None
 ) -> dict[str, Advice]:
-    """Advise the process that starts jobs; idle workers have been closed when this returns.
+    """Return which jobs to start and to forget, by partition; close idle workers first.
 
-    `jobs` are the names of each job's workers, by partition. There is no advice on partitions
-    whose number of jobs is fixed.
+    `jobs` is {partition: {job: names of its workers}}. Partitions with a fixed number of jobs have
+    no advice.
     """
-    record = _of(dask_scheduler)
-    if record is None:
+    adaptation = _of(dask_scheduler)
+    if adaptation is None:
         return {}
-    waiting = record.waiting_slots()
+    waiting = adaptation.waiting_slots()
     advice: dict[str, Advice] = {}
     closing: list[tuple[str, str, list[Any]]] = []
-    for name, own in jobs.items():
-        if (decided := record.decide(name, own, waiting.get(name, 0.0))) is None:
+    for name, jobs_of_partition in jobs.items():
+        decision = adaptation.decide(name, jobs_of_partition, waiting.get(name, 0.0))
+        if decision is None:
             continue
-        advice[name], idle = decided
-        for job, workers in idle.items():
-            for worker in workers:  # before anything else can happen
+        advice[name] = decision.advice
+        for job, workers in decision.idle.items():
+            for worker in workers:  # in this step of the event loop: no task can arrive before
                 shut(dask_scheduler, worker)
             closing.append((name, job, workers))
-    closed = await asyncio.gather(*(record.close_idle(workers) for *_, workers in closing))
-    for (name, job, _), done in zip(closing, closed, strict=True):
-        if done:
-            advice[name] = Advice(advice[name].more, [*advice[name].ended, job])
+    results = await asyncio.gather(*(adaptation.close_idle(workers) for *_, workers in closing))
+    for (name, job, _), closed in zip(closing, results, strict=True):
+        if closed:
+            forgotten = [*advice[name].jobs_to_forget, job]
+            advice[name] = replace(advice[name], jobs_to_forget=forgotten)
     return advice
 
 
@@ -290,7 +342,7 @@ async def look(
 
 
 def adapt(name: str, bounds: Bounds, dask_scheduler: Any = None) -> bool:
-    """Let a partition have another number of jobs; False if nobody starts any for it."""
+    """Change the number of jobs of a partition; returns False if no process starts its jobs."""
     record = _record(dask_scheduler, name)
     if record is not None:
         record.kind = replace(record.kind, bounds=bounds)
@@ -298,55 +350,62 @@ def adapt(name: str, bounds: Bounds, dask_scheduler: Any = None) -> bool:
 
 
 def want(name: str, slots: int, asking: str, dask_scheduler: Any = None) -> bool:
-    """Want slots of a partition, for a client; see `Partition.want`."""
+    """Request slots of a partition for a client, by its id; 0 ends the request.
+
+    Returns False if the partition does not adapt.
+    """
     adaptation = _of(dask_scheduler)
     # The last request of a client that was killed may come after it has left.
     if adaptation is None or asking not in dask_scheduler.clients:
         return False
-    adaptation.wants.pop((name, asking), None)
+    adaptation.requested.pop((name, asking), None)
     if slots:
-        adaptation.wants[name, asking] = slots
-    return slots_of_new(dask_scheduler, name) > 0
+        adaptation.requested[name, asking] = slots
+    return slots_of_new_worker(dask_scheduler, name) > 0
 
 
-def running_most(name: str, slots: int, dask_scheduler: Any = None) -> int:
-    """Tasks of so many slots that a partition runs at a time, or will with all its jobs."""
-    members = dask_scheduler.workers.values()
-    here = sum(int(worker.resources.get(name, 0)) // slots for worker in members)
-    workers, each = _at_most(dask_scheduler, name)
-    return max(here, workers * (each // slots))
+def max_running_tasks(name: str, slots: int, dask_scheduler: Any = None) -> int:
+    """Return the number of tasks that a partition runs at a time, now or with all its jobs.
+
+    `slots` is the number of slots that each task takes.
+    """
+    workers = dask_scheduler.workers.values()
+    running = sum(int(worker.resources.get(name, 0)) // slots for worker in workers)
+    max_workers, slots_per_worker = _upper_bound(dask_scheduler, name)
+    return max(running, max_workers * (slots_per_worker // slots))
 
 
 def adaptive_names(dask_scheduler: Any = None) -> set[str]:
-    """Names of the partitions that grow with their work; they may be empty."""
+    """Return the names of adaptive partitions, which may have no workers."""
     adaptation = _of(dask_scheduler)
     records = adaptation.records if adaptation else {}
     return {name for name, record in records.items() if record.kind.bounds is not None}
 
 
-# -- for other requests, on the scheduler ----------------------------------------------------
+# -- for other modules, on the scheduler -----------------------------------------------------
 
 
-def slots_of_new(scheduler: Any, name: str) -> int:
-    """Slots of a worker that a partition may get; 0 if it has a fixed number of them."""
-    return _at_most(scheduler, name)[1]
+def slots_of_new_worker(scheduler: Any, name: str) -> int:
+    """Return the slots of a worker that may join a partition; 0 if the partition is fixed."""
+    return _upper_bound(scheduler, name)[1]
 
 
-def slots_at_most(scheduler: Any, name: str) -> int:
-    """Slots that a partition may come to have; 0 if it has a fixed number of workers."""
-    return math.prod(_at_most(scheduler, name))
+def max_slots(scheduler: Any, name: str) -> int:
+    """Return the slots of a partition with all its jobs; 0 if the partition is fixed."""
+    return math.prod(_upper_bound(scheduler, name))
 
 
-def jobs_coming(scheduler: Any, name: str) -> int:
-    """Jobs of an adaptive partition that wait in the queue, or start; 0 if nobody starts them."""
+def queued_jobs_of(scheduler: Any, name: str) -> int:
+    """Return the number of jobs of an adaptive partition that wait in the queue, or start."""
     record = _record(scheduler, name)
-    if record is None or record.kind.bounds is None or time.monotonic() - record.heard > _LOST_S:
+    if record is None or record.kind.bounds is None:
         return 0
-    return record.coming
+    is_current = time.monotonic() - record.reported_at <= _LOST_S
+    return record.queued_jobs if is_current else 0
 
 
-def _at_most(scheduler: Any, name: str) -> tuple[int, int]:
-    """Workers that an adaptive partition may have, and slots of each; 0 if it has others."""
+def _upper_bound(scheduler: Any, name: str) -> tuple[int, int]:
+    """Return the number of workers with all jobs, and the slots of a worker; (0, 0) if fixed."""
     record = _record(scheduler, name)
     if record is None or record.kind.bounds is None:
         return 0, 0

@@ -25,7 +25,7 @@ from dask.utils import funcname
 from distributed import CancelledError, Client, Future, Reschedule
 from distributed.protocol.pickle import dumps, loads
 
-from .adapting import running_most
+from .adapting import max_running_tasks
 from .internals.client import when_done
 from .lending import slots_lent
 from .membership import check_slots
@@ -196,7 +196,7 @@ class Stage:
         PoolError if the partition was dissolved: the tasks would wait for ever.
         """
         running: int = on_scheduler(
-            self.client, running_most, name=self.partition, slots=self.slots
+            self.client, max_running_tasks, name=self.partition, slots=self.slots
         )
         if not running:
             check_slots(self.client, self.partition, self.slots, self.by_rule)

@@ -10,7 +10,7 @@ from weakref import WeakKeyDictionary
 
 from distributed import Client
 
-from .adapting import slots_of_new
+from .adapting import slots_of_new_worker
 from .errors import PoolError
 from .inherit import begin_inheritance, is_inherited, workers_told
 from .internals.worker import task_of_thread
@@ -118,7 +118,7 @@ async def _look(name: str, asking: str, in_task: bool, dask_scheduler: Any = Non
     here = dask_scheduler.workers
     members = {a: str(w.name) for a, w in here.items() if w.resources.get(name)}
     slots = [here[address].resources[name] for address in members]
-    slots.append(slots_of_new(dask_scheduler, name))
+    slots.append(slots_of_new_worker(dask_scheduler, name))
     if steward is not None:
         slots += [seat.slots for seat in steward.members(name)]
     # The last request of a client that was killed may come after it has left.

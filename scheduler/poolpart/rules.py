@@ -1,4 +1,4 @@
-"""Rules that choose the workers of a partition, now and when more join."""
+"""Rules that choose the workers of a partition, at its division and when workers join later."""
 
 from __future__ import annotations
 
@@ -16,17 +16,17 @@ NO_GPU = "no GPU in the pool: CPU workers instead"
 
 @dataclass(frozen=True, kw_only=True)
 class Rule:
-    """Rule of a partition; every rule takes these by name.
+    """Rule of a partition; every rule takes these parameters by name.
 
     Parameters
     ----------
     slots
         Tasks that each worker takes at a time; its number of threads by default.
     minimum
-        Least number of workers: making it with fewer is an error, and moving workers never
-        leaves it with fewer.
+        Least number of workers: making the partition with fewer is an error, and moving workers
+        never leaves it with fewer.
     exclusive
-        Whether to keep other tasks off its workers: un-annotated ones, collections, those of other
+        Whether to keep other tasks off its workers: un-annotated tasks, collections, tasks of other
         users. Tasks that a worker already has end there.
     """
 
@@ -35,52 +35,54 @@ class Rule:
     exclusive: bool = False
 
     def __post_init__(self) -> None:
-        for name, least in (("slots", 1), ("minimum", 0), ("most", 1), ("workers", 0)):
-            if (value := getattr(self, name, None)) is not None:
+        for name, least in (("slots", 1), ("minimum", 0), ("max_workers", 1), ("workers", 0)):
+            value = getattr(self, name, None)
+            if value is not None:
                 check_count(f"{name} of the rule {type(self).__name__}", value, least)
 
     def choose(self, free: Sequence[WorkerInfo]) -> list[WorkerInfo]:
-        """Choose from available workers; the first ones are preferred.
+        """Choose from available workers; the first workers are preferred.
 
-        Here none: of a partition without a rule, the members were started with its resource.
+        This base class chooses none: the members of a partition without a rule were started with
+        its resource.
         """
         return []
 
     def wants(
         self, worker: WorkerInfo, members: Sequence[WorkerInfo], everyone: Sequence[WorkerInfo]
     ) -> bool:
-        """Whether to add a worker to the members; `everyone` is all workers."""
+        """Whether to add a worker to the members; `everyone` is the list of all workers."""
         return len(self.choose([*members, worker])) > len(self.choose(members))
 
     def slots_of(self, worker: WorkerInfo) -> int:
-        """Slots of a worker as a member."""
+        """Return the slots of a worker as a member."""
         return self.slots or worker.nthreads
 
 
 @dataclass(frozen=True)
-class per_gpu(Rule):  # noqa: N801 - the name of a rule, not of a kind of rules, as of all below
-    """At most so many workers for each GPU; without GPUs so many CPU workers a host.
+class per_gpu(Rule):  # noqa: N801 - reads as a function, like the rules below
+    """At most `max_workers` for each GPU; in a pool without GPUs, CPU workers of each host.
 
     Examples
     --------
     >>> per_gpu(1)
-    per_gpu(slots=None, minimum=1, exclusive=False, most=1)
+    per_gpu(slots=None, minimum=1, exclusive=False, max_workers=1)
     """
 
-    most: int
+    max_workers: int
 
     def choose(self, free: Sequence[WorkerInfo]) -> list[WorkerInfo]:
-        """Workers that share the GPUs evenly."""
+        """Choose workers that share the GPUs evenly."""
         if not any(worker.gpus for worker in free):
-            return per_host(self.most).choose(free)
-        taken: Counter[str] = Counter()  # {GPU: workers chosen for it}
+            return per_host(self.max_workers).choose(free)
+        workers_of_gpu: Counter[str] = Counter()
         chosen = []
-        # Those that see the fewest GPUs first: the others have more choice.
+        # Workers that see the fewest GPUs come first: the others have more choice.
         for worker in sorted(free, key=lambda worker: len(worker.gpus)):
             if worker.gpus:
-                gpu = min(worker.gpus, key=lambda gpu: taken[gpu])
-                if taken[gpu] < self.most:
-                    taken[gpu] += 1
+                gpu = min(worker.gpus, key=lambda gpu: workers_of_gpu[gpu])
+                if workers_of_gpu[gpu] < self.max_workers:
+                    workers_of_gpu[gpu] += 1
                     chosen.append(worker)
         return chosen
 
@@ -88,48 +90,48 @@ class per_gpu(Rule):  # noqa: N801 - the name of a rule, not of a kind of rules,
         self, worker: WorkerInfo, members: Sequence[WorkerInfo], everyone: Sequence[WorkerInfo]
     ) -> bool:
         """Whether the worker has a spare GPU, or no worker has any."""
-        if not worker.gpus and any(other.gpus for other in everyone):
+        if not worker.gpus and any(candidate.gpus for candidate in everyone):
             return False
-        alike = [member for member in members if bool(member.gpus) == bool(worker.gpus)]
-        return super().wants(worker, alike, everyone)
+        same_kind = [member for member in members if bool(member.gpus) == bool(worker.gpus)]
+        return super().wants(worker, same_kind, everyone)
 
 
 @dataclass(frozen=True)
 class per_host(Rule):  # noqa: N801
-    """At most so many workers of each host."""
+    """At most `max_workers` of each host."""
 
-    most: int
+    max_workers: int
 
     def choose(self, free: Sequence[WorkerInfo]) -> list[WorkerInfo]:
-        """Take the first of each host."""
-        taken: Counter[str] = Counter()
+        """Choose the first workers of each host."""
+        workers_of_host: Counter[str] = Counter()
         chosen = []
         for worker in free:
-            if taken[worker.host] < self.most:
-                taken[worker.host] += 1
+            if workers_of_host[worker.host] < self.max_workers:
+                workers_of_host[worker.host] += 1
                 chosen.append(worker)
         return chosen
 
 
 @dataclass(frozen=True)
 class n_workers(Rule):  # noqa: N801
-    """So many workers, wherever they are."""
+    """A number of workers on any host."""
 
     workers: int
 
     def choose(self, free: Sequence[WorkerInfo]) -> list[WorkerInfo]:
-        """Take the first ones."""
+        """Choose the first workers."""
         return list(free[: self.workers])
 
 
 @dataclass(frozen=True)
 class Named(Rule):
-    """The rule that `named` makes."""
+    """The workers of a list of names or addresses, see `named`."""
 
     names: tuple[str, ...]
 
     def choose(self, free: Sequence[WorkerInfo]) -> list[WorkerInfo]:
-        """Choose those of them that are present."""
+        """Choose the named workers that are available."""
         return [worker for worker in free if {worker.name, worker.address} & set(self.names)]
 
 
@@ -140,43 +142,50 @@ class rest(Rule):  # noqa: N801
     minimum: int = field(default=0, kw_only=True)
 
     def choose(self, free: Sequence[WorkerInfo]) -> list[WorkerInfo]:
-        """All of them."""
+        """Choose all available workers."""
         return list(free)
 
 
 def named(*names: str, **common: Any) -> Named:
-    """Workers of these names or addresses, also those that join later."""
+    """Return a rule that takes the workers of these names or addresses, also if they join later."""
     return Named(tuple(map(str, names)), **common)
 
 
 def divide(
     rules: Mapping[str, Rule], pool: Sequence[WorkerInfo]
 ) -> tuple[dict[str, list[WorkerInfo]], dict[str, str]]:
-    """Divide workers by rules, each of which takes from the workers that the others have left.
+    """Divide workers by rules, in order: each rule takes workers that earlier rules have left.
 
-    Workers that a rule names are kept for it. Members of a partition come first, so that
-    repeating the rules gives the same partitions. Workers that declare another resource are not
-    taken. Returns the workers by partition, and notes on the choices. PoolError if a partition
-    would have fewer workers than its minimum.
+    Workers that a rule names are kept for that rule. Present members of a partition come first, so
+    that repeating the rules gives the same partitions. Workers that declare another resource are
+    not taken.
+
+    Returns
+    -------
+    chosen
+        {partition: workers}.
+    notes
+        {partition: what a user should know of the choice}.
+
+    Raises
+    ------
+    PoolError
+        If a partition would have fewer workers than its minimum.
     """
     chosen: dict[str, list[WorkerInfo]] = {}
     notes: dict[str, str] = {}
-    taken: set[str] = set()  # addresses, because names may repeat
-    named_by = {n for rule in rules.values() if isinstance(rule, Named) for n in rule.names}
+    chosen_addresses: set[str] = set()  # not names, which may repeat
+    named_by_rules = {n for rule in rules.values() if isinstance(rule, Named) for n in rule.names}
     for name, rule in rules.items():
         declaring = [worker for worker in pool if worker.partitions == {name}]
-        free = [w for w in pool if not w.partitions and w.address not in taken]
+        free = [w for w in pool if not w.partitions and w.address not in chosen_addresses]
         if not isinstance(rule, Named):
-            free = [worker for worker in free if not named_by & {worker.name, worker.address}]
+            free = [w for w in free if not named_by_rules & {w.name, w.address}]
         free = [*declaring, *free]
         chosen[name] = rule.choose(free)
-        taken |= {worker.address for worker in chosen[name]}
+        chosen_addresses |= {worker.address for worker in chosen[name]}
         if len(chosen[name]) < rule.minimum:
-            advice = f"{len(free)} of {len(pool)} are left for it. Start more, or list it first."
-            if isinstance(rule, Named):
-                names = ", ".join(repr(worker.name) for worker in pool[:9])
-                advice = f"it asks for {', '.join(map(repr, rule.names))}, and there are {names}"
-                advice += ", …." if len(pool) > 9 else "."
+            advice = _advice(rule, free, pool)
             raise PoolError(
                 f"Partition {name!r} would have {len(chosen[name])} of the {rule.minimum} workers "
                 f"that it needs: {advice} Workers that declare another resource are not taken."
@@ -191,18 +200,27 @@ def divide(
     return chosen, notes
 
 
+def _advice(rule: Rule, free: Sequence[WorkerInfo], pool: Sequence[WorkerInfo]) -> str:
+    """Return what to do about a rule that finds too few workers."""
+    if not isinstance(rule, Named):
+        return f"{len(free)} of {len(pool)} are left for it. Start more, or list it first."
+    present = ", ".join(repr(worker.name) for worker in pool[:9])
+    ending = ", …." if len(pool) > 9 else "."
+    return f"it asks for {', '.join(map(repr, rule.names))}, and there are {present}{ending}"
+
+
 def partition_for(
     worker: WorkerInfo,
     rules: Mapping[str, Rule],
     members: Mapping[str, Sequence[WorkerInfo]],
 ) -> str | None:
-    """Partition of a worker that joins; None for none.
+    """Return the partition of a worker that joins, or None.
 
     A rule that names the worker comes first, then partitions with fewer workers than their
     minimum or with none, then the order of the rules.
     """
     everyone = [worker, *(member for group in members.values() for member in group)]
-    willing = [n for n, rule in rules.items() if rule.wants(worker, members[n], everyone)]
+    willing = [name for name, rule in rules.items() if rule.wants(worker, members[name], everyone)]
     short = [
         name
         for name in willing
@@ -213,12 +231,12 @@ def partition_for(
 
 
 def check_name(partition: object) -> None:
-    """Check the name of a partition; PoolError unless it is one."""
+    """Raise a PoolError unless a value can be the name of a partition."""
     if not isinstance(partition, str) or not partition:
         raise PoolError(f"The name of a partition is {partition!r}; give one such as 'GPU'.")
 
 
 def check_count(name: str, count: object, least: int = 1) -> None:
-    """Check a number; PoolError unless it is whole and large enough."""
+    """Raise a PoolError unless a count is a whole number of at least `least`."""
     if not isinstance(count, Integral) or count < least:
         raise PoolError(f"{name} is {count!r}; give a whole number, {least} or more.")

@@ -8,7 +8,7 @@ from typing import Any
 
 from distributed import Client
 
-from .adapting import jobs_coming, slots_at_most
+from .adapting import max_slots, queued_jobs_of
 from .workers import on_scheduler, silent_workers
 
 
@@ -77,8 +77,8 @@ def _look(partition: str, keys: list[str], dask_scheduler: Any = None) -> TaskLo
         silent=silent,
         free={ws.address: int(ws.resources[partition] - _in_use(ws, partition)) for ws in usable},
         slots=slots,
-        most_slots=max(slots, slots_at_most(dask_scheduler, partition)),
-        coming=jobs_coming(dask_scheduler, partition),
+        most_slots=max(slots, max_slots(dask_scheduler, partition)),
+        coming=queued_jobs_of(dask_scheduler, partition),
         tasks=places,
     )
 

@@ -116,66 +116,85 @@ class _PartitionJobs:
     """The jobs of one partition."""
 
     name: str
-    own: Mapping[str, Any]  # options of the cluster's class
-    count: int  # of jobs at first
+    options: Mapping[str, Any]  # of the cluster's class, where this partition differs
+    initial_count: int  # of jobs
     kind: JobKind
     describe: Describe
-    made: int = 0  # jobs so far
-    places: dict[str, int] = field(default_factory=dict)  # {job: its place, that of a host}
+    submitted: int = 0  # jobs so far
+    host_indices: dict[str, int] = field(default_factory=dict)  # {job: index of its host}
 
     @classmethod
     def of(
         cls, cluster: SpecCluster, describe: Describe, name: str, options: Mapping[str, Any]
     ) -> _PartitionJobs:
-        """Read the options of a partition; PoolError if one is wrong. Nothing is started."""
+        """Read the options of a partition; nothing is started.
+
+        Raises
+        ------
+        PoolError
+            If an option is wrong.
+        """
         check_name(name)
-        own = dict(options)
-        slots = own.pop("slots", 1)
+        cluster_options = dict(options)
+        slots = cluster_options.pop("slots", 1)
         check_count(f"The number of slots of partition {name!r}", slots)
-        bounds, idle_s = None, own.pop("idle_s", None)
-        if (adapt := own.pop("adapt", None)) is not None:
-            require(ADAPTING)
-            if "workers" in own or not isinstance(adapt, Sequence) or len(adapt) != 2:
-                raise PoolError(
-                    f"adapt of partition {name!r} is {adapt!r}; give the least and the greatest "
-                    "number of workers, such as [0, 8], and no workers beside it."
-                )
-            least, most = adapt
-            bounds = Bounds.checked(name, least, most, IDLE_S if idle_s is None else idle_s)
-        elif idle_s is not None:
-            raise PoolError(f"Partition {name!r} has idle_s without adapt: give it [0, 8] or so.")
+        bounds = _take_bounds(name, cluster_options)
         try:
-            count = bounds.minimum if bounds else own.pop("workers", len(own.get("hosts", ".")))
+            if bounds is not None:
+                count = bounds.minimum
+            else:
+                hosts = cluster_options.get("hosts", ".")
+                count = cluster_options.pop("workers", len(hosts))
             check_count(f"The number of workers of partition {name!r}", count, least=0)
-            sample = describe(cluster, f"{name}-0", name, slots, 0, own)  # that it can be done
+            # A first description shows that the cluster's class takes the options.
+            sample = describe(cluster, f"{name}-0", name, slots, 0, cluster_options)
         except (TypeError, ValueError) as error:
             raise PoolError(f"Partition {name!r} cannot be started: {error}") from error
         kind = JobKind(slots, len(sample.get("group", ".")), bounds)
-        return cls(name, own, count, kind, describe)
+        return cls(name, cluster_options, count, kind, describe)
 
     def add(self, cluster: SpecCluster, count: int) -> None:
-        """Have the cluster start so many more jobs."""
+        """Let the cluster start a number of further jobs."""
         for _ in range(count):
-            # A new name for each: for some time after a worker was lost, Dask would take another
-            # job of its name for it, and cancel it.
-            job = f"{self.name}-{self.made}"
-            self.made += 1
-            place = next(n for n in range(self.made) if n not in self.places.values())
-            self.places[job] = place
-            spec = self.describe(cluster, job, self.name, self.kind.slots, place, self.own)
+            # Each job has a new name: for some time after a worker was lost, Dask would take a job
+            # of the same name for the lost worker, and cancel the job.
+            job = f"{self.name}-{self.submitted}"
+            self.submitted += 1
+            used = self.host_indices.values()
+            index = next(number for number in range(self.submitted) if number not in used)
+            self.host_indices[job] = index
+            spec = self.describe(cluster, job, self.name, self.kind.slots, index, self.options)
             cluster.worker_spec[job] = spec
 
     def workers(self, cluster: SpecCluster) -> dict[str, list[str]]:
-        """Names of the workers of each job that was submitted, by job."""
+        """Return the names of the workers of each submitted job, by job."""
         return {
             job: [job + suffix for suffix in cluster.worker_spec[job].get("group", [""])]
-            for job in self.places
+            for job in self.host_indices
             if job in cluster.workers
         }
 
 
+def _take_bounds(name: str, options: dict[str, Any]) -> Bounds | None:
+    """Take `adapt` and `idle_s` out of the options of a partition; None if it does not adapt."""
+    adapt = options.pop("adapt", None)
+    idle_s = options.pop("idle_s", None)
+    if adapt is None:
+        if idle_s is not None:
+            raise PoolError(f"Partition {name!r} has idle_s without adapt: give it [0, 8] or so.")
+        return None
+    require(ADAPTING)
+    if "workers" in options or not isinstance(adapt, Sequence) or len(adapt) != 2:
+        raise PoolError(
+            f"adapt of partition {name!r} is {adapt!r}; give the least and the greatest "
+            "number of workers, such as [0, 8], and no workers beside it."
+        )
+    minimum, maximum = adapt
+    return Bounds.checked(name, minimum, maximum, IDLE_S if idle_s is None else idle_s)
+
+
 class _JobStarter:
-    """Starts the jobs of partitions: all that are to be there, and again those that are lost."""
+    """Starts the jobs of partitions, and starts lost jobs again."""
 
     def __init__(
         self,
@@ -183,14 +202,18 @@ class _JobStarter:
         parts: Mapping[str, _PartitionJobs],
         tell: Callable[[str], object],
     ) -> None:
-        self._cluster, self._parts, self._tell = cluster, parts, tell
-        samples = (p.describe(cluster, "", p.name, 1, 0, p.own) for p in parts.values())
+        self._cluster = cluster
+        self._parts = parts
+        self._tell = tell
+        samples = (
+            part.describe(cluster, "", part.name, 1, 0, part.options) for part in parts.values()
+        )
         self._logs = _JobLogs(sample["options"] for sample in samples)
-        self._told: set[str] = set()
-        self._looked = time.monotonic()
+        self._messages: set[str] = set()  # messages so far, without numbers
+        self._logs_read_at = time.monotonic()
 
     async def begin(self) -> None:
-        """Submit the first jobs, and look after all of them as long as the cluster is open."""
+        """Submit the first jobs, and look after all jobs as long as the cluster is open."""
         kinds = {name: part.kind for name, part in self._parts.items()}
         try:
             await ask_of_cluster(self._cluster, begin, kinds=kinds)
@@ -200,27 +223,28 @@ class _JobStarter:
                 "environment as this process."
             ) from error
         for part in self._parts.values():
-            part.add(self._cluster, part.count)
+            part.add(self._cluster, part.initial_count)
         await _start(self._cluster)
-        again = PeriodicCallback(self._look, 1000 * _ADAPT_EVERY_S)
-        self._cluster.periodic_callbacks[_NAME] = again  # ends with the cluster
-        again.start()
+        callback = PeriodicCallback(self._look, 1000 * _ADAPT_EVERY_S)
+        self._cluster.periodic_callbacks[_NAME] = callback  # ends with the cluster
+        callback.start()
 
     async def _look(self) -> None:
+        """Follow the scheduler's advice, start lost workers again, and sometimes read logs."""
         if self._cluster.status != Status.running:
             return
         with suppress(OSError):  # the scheduler is ending
             changed = await self._adapt()
             now = time.monotonic()
-            due = now - self._looked >= _LOOK_EVERY_S
+            due = now - self._logs_read_at >= _LOOK_EVERY_S
             if changed or due:
-                # A SpecCluster lets go of a worker that is lost, and starts another when asked to.
+                # A SpecCluster drops a lost worker, and starts a new worker when it is awaited.
                 try:
                     await _start(self._cluster)
                 except Exception as error:
                     self._say(f"A worker cannot be started: {error}")
             if due:
-                self._looked = now
+                self._logs_read_at = now
                 if self._cluster.plan - self._cluster.observed:  # workers are missing
                     for line in self._logs.endings():
                         self._say(line)
@@ -229,81 +253,93 @@ class _JobStarter:
         """Do what the scheduler advises; returns whether jobs have to be started."""
         jobs = {name: part.workers(self._cluster) for name, part in self._parts.items()}
         advice = await ask_of_cluster(self._cluster, look, jobs=jobs)
-        for name, one in advice.items():
+        for name, advice_of_part in advice.items():
             part = self._parts[name]
-            await asyncio.gather(*(self._end(part, job) for job in one.ended))
+            to_start = advice_of_part.jobs_to_start
+            await asyncio.gather(*(self._end(part, job) for job in advice_of_part.jobs_to_forget))
             if self._cluster.status != Status.running:
                 return False
-            # Lost ones, and those that could not be submitted.
-            again = [job for job in part.places if job not in self._cluster.workers]
-            await asyncio.gather(*(self._end(part, job) for job in again[one.more :]))
-            part.add(self._cluster, one.more - len(again))
-        return any(one.more for one in advice.values())
+            # Jobs that were lost, or could not be submitted, are submitted again first.
+            lost = [job for job in part.host_indices if job not in self._cluster.workers]
+            await asyncio.gather(*(self._end(part, job) for job in lost[to_start:]))
+            part.add(self._cluster, to_start - len(lost))
+        return any(advice_of_part.jobs_to_start for advice_of_part in advice.values())
 
     async def _end(self, part: _PartitionJobs, job: str) -> None:
-        """Let go of a job: its workers have been closed, or will be if they join."""
+        """Forget a job whose workers have been closed, or will be closed if they join."""
         self._cluster.worker_spec.pop(job, None)
-        part.places.pop(job, None)
-        if (worker := self._cluster.workers.get(job)) is not None:
+        part.host_indices.pop(job, None)
+        worker = self._cluster.workers.get(job)
+        if worker is not None:
             worker.status = Status.closing  # else the cluster refuses to close meanwhile
             with suppress(OSError):  # its process has ended
                 await worker.close()
             worker.status = Status.closed
             self._cluster.workers.pop(job, None)
 
-    def _say(self, words: str) -> None:
-        line = " ".join(words.split())[:400]
-        alike = re.sub(r"\d+", "", line)  # but for the numbers of jobs
-        if not any(one in alike for one in self._told):  # also in the log of this program itself
-            self._told.add(alike)
+    def _say(self, message: str) -> None:
+        """Pass a message on, unless a message that differs in numbers alone was passed on."""
+        line = " ".join(message.split())[:400]
+        text = re.sub(r"\d+", "", line)
+        # "in": the same message also stands in the log of this program itself.
+        if not any(earlier in text for earlier in self._messages):
+            self._messages.add(text)
             self._tell(line)
 
 
 async def _start(cluster: SpecCluster) -> None:
-    """Start what the cluster lacks of the workers that it is to have."""
+    """Start the workers of a cluster that its specification asks for and that are missing."""
     try:
         await cluster
     except Exception:
         for name, worker in list(cluster.workers.items()):
-            if worker.status == Status.created:  # it is tried again
+            if worker.status == Status.created:  # the next call tries this worker again
                 del cluster.workers[name]
-            # While it knows of jobs that were not submitted, a cluster refuses to close.
+            # A cluster refuses to close while it knows of jobs that were not submitted.
             worker.status = Status.failed
         raise
 
 
 class _JobLogs:
-    """Logs of jobs: why workers are missing. Dask does not notice jobs that end before."""
+    """Logs of jobs, which say why workers are missing.
+
+    Dask does not notice a job that ends before its worker has connected.
+    """
 
     def __init__(self, jobs: Iterable[Mapping[str, Any]]) -> None:
         self._folders = {Path(job["log_directory"]) for job in jobs if job.get("log_directory")}
-        self._done = self._files()  # logs that are older, or have been read
-        self._last: set[tuple[Path, int]] = set()
+        self._read = self._files()  # logs that are older than this object, or have been read
+        self._previous: set[tuple[Path, int]] = set()
 
     def _files(self) -> set[tuple[Path, int]]:
-        """All files, and when they were written to."""
+        """Return all files with the times when they were written, in nanoseconds."""
         files = (path for folder in self._folders for path in folder.glob("*") if path.is_file())
         return {(path, path.stat().st_mtime_ns) for path in files}
 
     def endings(self) -> Iterator[str]:
-        """Last lines of logs that have not changed since the last look."""
-        now = self._files()
-        still = (now & self._last) - self._done
-        self._done |= still
-        self._last = now
-        for path, _ in sorted(still):
+        """Yield the last lines of new logs that have not changed since the previous call."""
+        files = self._files()
+        unchanged = (files & self._previous) - self._read
+        self._read |= unchanged
+        self._previous = files
+        for path, _ in sorted(unchanged):
             with path.open("rb") as log:
                 log.seek(max(0, path.stat().st_size - 4000))
-                last = log.read().decode(errors="replace").rstrip().rpartition("\n")[2]
-            if last and INFORMATION not in last:
-                yield f"The log {path} ends: {last}"
+                last_line = log.read().decode(errors="replace").rstrip().rpartition("\n")[2]
+            if last_line and INFORMATION not in last_line:
+                yield f"The log {path} ends: {last_line}"
 
 
 def _job(
-    cluster: Any, name: str, partition: str, slots: int, number: int, own: Mapping[str, Any]
+    cluster: Any,
+    name: str,
+    partition: str,
+    slots: int,
+    index: int,
+    partition_options: Mapping[str, Any],
 ) -> dict[str, Any]:
     """Describe a job as a cluster of dask-jobqueue does."""
-    options = {**cluster.new_spec["options"], **own}
+    options = {**cluster.new_spec["options"], **partition_options}
     defaults = {"processes": 1, "worker_extra_args": [], "log_directory": None}
     for option, default in defaults.items():
         if options.get(option) is None:
@@ -311,24 +347,33 @@ def _job(
             options[option] = dask.config.get(key, None) or default
     declared = ["--resources", f"{partition}={slots}"]
     options["worker_extra_args"] = [*options["worker_extra_args"], *declared]
-    cluster.job_cls(cluster.scheduler_address, name=name, **options)  # that it takes them
+    cluster.job_cls(
+        cluster.scheduler_address, name=name, **options
+    )  # raises if it does not take an option
     processes = options["processes"]
     group = {"group": [f"-{process}" for process in range(processes)]} if processes > 1 else {}
     return {**cluster.new_spec, **group, "options": options}
 
 
 def _process(
-    cluster: Any, name: str, partition: str, slots: int, number: int, own: Mapping[str, Any]
+    cluster: Any,
+    name: str,
+    partition: str,
+    slots: int,
+    index: int,
+    partition_options: Mapping[str, Any],
 ) -> dict[str, Any]:
-    """Describe a worker as an SSHCluster does."""
+    """Describe a worker as an SSHCluster does; `index` chooses the host."""
     common = cluster.scheduler_spec["options"]
-    options = {key: common[key] for key in ("connect_options", "remote_python")} | dict(own)
+    options = {key: common[key] for key in ("connect_options", "remote_python")} | dict(
+        partition_options
+    )
     hosts: Sequence[str] = options.pop("hosts", ())
     if isinstance(hosts, str) or not hosts:
         raise ValueError('it needs "hosts", a list of those that its workers are to be on.')
     kwargs = {"name": name, "nthreads": slots, "resources": {partition: slots}}
     kwargs["death_timeout"] = _DEATH_S  # not every SSH server ends processes for its client
     options["kwargs"] = kwargs | options.pop("worker_options", {})
-    options["address"] = hosts[number % len(hosts)]
-    ssh.Worker(cluster.scheduler_address, **options)  # that it takes them
+    options["address"] = hosts[index % len(hosts)]
+    ssh.Worker(cluster.scheduler_address, **options)  # raises if it does not take an option
     return {"cls": ssh.Worker, "options": options}
