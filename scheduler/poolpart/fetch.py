@@ -19,20 +19,20 @@ T = TypeVar("T")
 
 _HANDLER = "poolpart_take_held"  # name of the worker's handler for held bytes
 
-_held: dict[str, Any] = {}  # {name: bytes} of this process
+_held: dict[str, Any] = {}  # {name: bytes that this process holds}
 
 
 def fetch_available(
     client: Client, keys: Collection[str], patience_s: float = 2.0, *, at: str | None = None
 ) -> dict[str, Any]:
-    """Fetch the results that are available now; call it again for the others.
+    """Fetch the results that are available now; a later call fetches further results.
 
     `Client.gather` is the wrong tool for a long-running consumer. When a worker dies, a
     connection to it is tried for half a minute, and nothing else is delivered meanwhile; and
     a future for a released key makes the scheduler wait for ever for a task that nobody
-    submits. This asks where the keys are, fetches them from there, and gives up on a worker
-    that is silent for `patience_s`: the next call asks again, and finds recomputed results
-    elsewhere. It takes no reference to the keys: the submitter must hold one.
+    submits. This function asks where the keys are, fetches them from there, and gives up on a
+    worker that is silent for `patience_s`: the next call asks again, and finds recomputed results
+    elsewhere. The submitter must hold references to the keys.
 
     Parameters
     ----------
@@ -44,7 +44,7 @@ def fetch_available(
         Longest time to wait for an answer of the scheduler, and then for a sign of life of each
         worker, in seconds. A transfer may take longer.
     at
-        Address of a worker that has them: the scheduler is not asked where they are.
+        Address of a worker that has all keys; then the scheduler is not asked where they are.
 
     Returns
     -------
@@ -57,44 +57,44 @@ def fetch_available(
         if at is not None:
             return await _take(client, at, list(keys), patience_s)
         try:
-            found = await wait_for(ask(client, None, "who_has", keys=list(keys)), patience_s)
+            holders = await wait_for(ask(client, None, "who_has", keys=list(keys)), patience_s)
         except TimeoutError:
             return {}
         by_worker: dict[str, list[str]] = defaultdict(list)
-        for key, addresses in found.items():
+        for key, addresses in holders.items():
             if addresses:
                 # Any of the workers: if it does not answer, the next call may ask another.
                 by_worker[random.choice(list(addresses))].append(key)
-        taken = await asyncio.gather(
-            *(_take(client, *worker, patience_s) for worker in by_worker.items())
+        results = await asyncio.gather(
+            *(_take(client, address, held, patience_s) for address, held in by_worker.items())
         )
-        return {key: result for data in taken for key, result in data.items()}
+        return {key: result for part in results for key, result in part.items()}
 
     return client.sync(fetch)
 
 
 async def _take(client: Client, address: str, held: list[str], patience_s: float) -> dict[str, Any]:
-    taking = take_from_worker(client, address, held)
-    return await _unless_silent(client, address, taking, patience_s) or {}
+    request = take_from_worker(client, address, held)
+    return await _unless_silent(client, address, request, patience_s) or {}
 
 
 async def _unless_silent(
     client: Client, address: str, request: Coroutine[Any, Any, T], patience_s: float
 ) -> T | None:
-    """Await a request to a worker; None if the worker is silent for so long."""
-    asking = asyncio.ensure_future(request)
+    """Await a request to a worker; None if the worker is silent for `patience_s`."""
+    answer_task = asyncio.ensure_future(request)
     try:
         # Giving up a worker that answers would discard the data so far, and the next call would be
         # as slow: on a busy machine that never ended. And a worker keeps each message that nobody
         # reads to its end (the error holds its own stream).
-        while not (await asyncio.wait([asking], timeout=patience_s))[0]:
+        while not (await asyncio.wait([answer_task], timeout=patience_s))[0]:
             try:
                 await wait_for(ask(client, address, "ping"), patience_s)
             except (TimeoutError, OSError):
                 return None
-        return asking.result()
+        return answer_task.result()
     finally:
-        asking.cancel()
+        answer_task.cancel()
 
 
 def hold_for_driver(name: str, data: Any) -> str:
@@ -109,15 +109,15 @@ def hold_for_driver(name: str, data: Any) -> str:
 
 
 def holds_for_driver() -> bool:
-    """Whether this process holds bytes that nobody has fetched yet."""
+    """Whether this process holds bytes that no driver has fetched yet."""
     return bool(_held)
 
 
 def take_held(client: Client, address: str, name: str, patience_s: float = 2.0) -> Any:
     """Fetch bytes that a worker holds under a name, and have the worker forget them.
 
-    The address is that which `hold_for_driver` returned. Returns None if they were taken before, or
-    the worker has died, or gives no sign of life for so long; a transfer may take longer.
+    The address is the result of `hold_for_driver`. Returns None if the bytes were taken before, or
+    if the worker has died or is silent for `patience_s`; a transfer may take longer.
     """
 
     async def take() -> Any:
@@ -132,5 +132,6 @@ def take_held(client: Client, address: str, name: str, patience_s: float = 2.0) 
 
 
 def _hand_over(name: str) -> dict[str, Any]:
+    """Return held bytes, and forget them; handler of a worker."""
     data = _held.pop(name, None)
     return {"data": None if data is None else as_bytes(data)}

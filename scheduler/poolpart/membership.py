@@ -1,4 +1,4 @@
-"""What a client knows of a partition when it submits to it, so that nothing waits in vain."""
+"""Members of a partition as a client knows them, so that no task waits in vain."""
 
 from __future__ import annotations
 
@@ -18,20 +18,21 @@ from .steward import NAME as STEWARD
 from .steward import Steward
 from .workers import on_scheduler
 
-KEEP_S = 1.0  # a request for each task would take a millisecond
+KEEP_S = 1.0  # for which an answer is kept: a request for each task would take a millisecond
 
 
 @dataclass(frozen=True)
 class Membership:
     """Members of a partition at one moment."""
 
-    names: Mapping[str, str]  # of the present members, by address
-    most: float  # slots of one member at most, also of one that is starting, or may be started
+    names: Mapping[str, str]  # {address of a present member: its name}
+    max_slots: float  # of one member, including members that are starting or may be started
     has_rule: bool  # the scheduler has a rule for the partition
-    strangers: frozenset[str]  # addresses of all other workers
+    nonmembers: frozenset[str]  # addresses of all other workers
 
 
-_known: WeakKeyDictionary[Client, dict[str, tuple[float, Membership]]] = WeakKeyDictionary()
+# {client: {partition: (time.monotonic() of the request, its answer)}}
+_answers: WeakKeyDictionary[Client, dict[str, tuple[float, Membership]]] = WeakKeyDictionary()
 
 
 def membership(client: Client, name: str, fresh: bool = False) -> Membership:
@@ -45,87 +46,102 @@ def membership(client: Client, name: str, fresh: bool = False) -> Membership:
     PoolError
         If the scheduler lacks this package, or the client is closed or asynchronous.
     """
-    known = _known.setdefault(client, {})
-    when, found = known.get(name, (0.0, None))
-    if found is None or fresh or time.monotonic() - when > KEEP_S:
-        asked = time.monotonic()
-        options = {"asking": client.id, "in_task": task_of_thread() is not None}
-        found = on_scheduler(client, _look, name=name, **options)
-        known[name] = asked, found
-    return found
+    answers = _answers.setdefault(client, {})
+    requested_at, answer = answers.get(name, (0.0, None))
+    if answer is None or fresh or time.monotonic() - requested_at > KEEP_S:
+        requested_at = time.monotonic()
+        in_task = task_of_thread() is not None
+        answer = on_scheduler(client, _look, name=name, client_id=client.id, in_task=in_task)
+        answers[name] = requested_at, answer
+    return answer
 
 
 def forget_memberships() -> None:
-    """Ask again before the next task, because a partition has changed."""
-    _known.clear()
+    """Forget all answers, because a partition has changed."""
+    _answers.clear()
 
 
 def check_slots(client: Client, name: str, slots: int, made_by_rule: bool) -> bool:
-    """Check that a partition may run such a task; returns whether it has a rule, or had.
+    """Check that a partition may run a task; returns whether the partition has a rule, or had one.
 
     Raises
     ------
     PoolError
-        If it was dissolved, or no member has so many slots. Without any members the task waits:
-        the only one may be starting again.
+        If the partition was dissolved, or no member has so many slots. Without any members the task
+        waits: the only member may be starting again.
     """
+    objection = ""
     for fresh in (False, True):
-        found = membership(client, name, fresh)
-        if not (doubt := _doubt(found, name, slots, made_by_rule)):
-            return found.has_rule or made_by_rule
-    raise PoolError(doubt)
+        members = membership(client, name, fresh)
+        objection = _objection(members, name, slots, made_by_rule)
+        if not objection:
+            return members.has_rule or made_by_rule
+    raise PoolError(objection)
 
 
-def _doubt(found: Membership, name: str, slots: int, made_by_rule: bool) -> str:
-    if made_by_rule and not found.has_rule and not found.names:
+def _objection(members: Membership, name: str, slots: int, made_by_rule: bool) -> str:
+    """Return why a partition cannot run a task, or an empty string."""
+    if made_by_rule and not members.has_rule and not members.names:
         return f"Partition {name!r} was dissolved: divide the pool again, or use another partition."
-    if found.most and slots > found.most:
+    if members.max_slots and slots > members.max_slots:
         return (
             f"A task asks for {slots} slots of one worker, and workers of partition {name!r} have "
-            f"{found.most:g} at most: ask for fewer, or give them more, by slots={slots} in its "
-            f'rule or by --resources "{name}={slots}".'
+            f"{members.max_slots:g} at most: ask for fewer, or give them more, by slots={slots} in "
+            f'its rule or by --resources "{name}={slots}".'
         )
     return ""
 
 
 def addresses_of(client: Client, name: str, workers: Sequence[str]) -> list[str]:
-    """Present addresses of members, from names or addresses.
+    """Return the present addresses of members, given by names or addresses.
+
+    An address without any worker is returned as given.
 
     Raises
     ------
     PoolError
-        If there is no such member. An address at which there is no worker at all is left as it is.
+        If a worker does not belong to the partition.
     """
-    found = membership(client, name)
-    if set(workers) - found.names.keys():  # a name that was known may have another address now
-        found = membership(client, name, fresh=True)
-    addresses = []
+    members = membership(client, name)
+    if set(workers) - members.names.keys():  # a member may have another address than before
+        members = membership(client, name, fresh=True)
+    addresses: list[str] = []
     for worker in workers:
-        here = [a for a, its_name in found.names.items() if worker in (a, its_name)]
-        if not here and ("://" not in worker or worker in found.strangers):
-            members = ", ".join(sorted(found.names.values())[:9]) or "none at the moment"
+        matches = [
+            address
+            for address, member_name in members.names.items()
+            if worker in (address, member_name)
+        ]
+        if not matches and ("://" not in worker or worker in members.nonmembers):
+            present = ", ".join(sorted(members.names.values())[:9]) or "none at the moment"
             raise PoolError(
                 f"Worker {worker!r} does not belong to partition {name!r}: give names or "
-                f"addresses of its members ({members})."
+                f"addresses of its members ({present})."
             )
-        addresses += here or [worker]
+        addresses += matches or [worker]
     return addresses
 
 
-async def _look(name: str, asking: str, in_task: bool, dask_scheduler: Any = None) -> Membership:
+async def _look(name: str, client_id: str, in_task: bool, dask_scheduler: Any = None) -> Membership:
+    """Return the members of a partition, and begin inheritance for a client; on the scheduler."""
     steward: Steward | None = dask_scheduler.plugins.get(STEWARD)
     has_rule = steward is not None and name in steward.rules
-    here = dask_scheduler.workers
-    members = {a: str(w.name) for a, w in here.items() if w.resources.get(name)}
-    slots = [here[address].resources[name] for address in members]
+    workers = dask_scheduler.workers
+    members = {
+        address: str(worker.name)
+        for address, worker in workers.items()
+        if worker.resources.get(name)
+    }
+    slots = [workers[address].resources[name] for address in members]
     slots.append(slots_of_new_worker(dask_scheduler, name))
     if steward is not None:
         slots += [seat.slots for seat in steward.members(name)]
     # The last request of a client that was killed may come after it has left.
-    if not has_rule and asking in dask_scheduler.clients:
-        # A worker's client closes only with the worker: it is no reason to keep what others began.
+    if not has_rule and client_id in dask_scheduler.clients:
+        # A worker's client closes only with the worker, so that it must not prolong an inheritance
+        # that other clients have begun.
         if not (in_task and is_inherited(dask_scheduler, name)):
-            begin_inheritance([name], dask_scheduler, asking)
+            begin_inheritance([name], dask_scheduler, client_id)
         await workers_told()
-    strangers = frozenset(here.keys() - members.keys())
-    return Membership(members, max(slots, default=0), has_rule, strangers)
+    nonmembers = frozenset(workers.keys() - members.keys())
+    return Membership(members, max(slots, default=0), has_rule, nonmembers)

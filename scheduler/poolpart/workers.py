@@ -14,8 +14,8 @@ from .errors import PoolError
 from .internals.client import ask
 from .internals.worker import resources_here as resources_here  # for records of tasks
 
-SILENT_S = 20.0  # without a heartbeat: stopped, or with its GIL held
-_BEATS = 3  # heartbeats that a worker may miss at least
+SILENT_S = 20.0  # without a heartbeat, after which a worker counts as stopped or stuck
+_MISSED_BEATS = 3  # heartbeats that a worker may miss at least
 _LOOK_S = 2.0  # between looks for silent workers
 
 
@@ -48,7 +48,7 @@ class WorkerInfo:
 
     @property
     def partitions(self) -> frozenset[str]:
-        """Its partitions: the resources of which it has a slot."""
+        """Names of its partitions: the resources of which it declares a slot."""
         return frozenset(name for name, slots in self.resources.items() if slots)
 
     def with_gpus(self, gpus: Iterable[str]) -> WorkerInfo:
@@ -57,7 +57,7 @@ class WorkerInfo:
 
     @classmethod
     def from_identity(cls, address: str, identity: Mapping[str, Any]) -> WorkerInfo:
-        """Make it from the scheduler's description of a worker."""
+        """Return the description of a worker that the scheduler describes."""
         return cls(
             name=str(identity["name"]),
             address=address,
@@ -132,36 +132,39 @@ def ask_workers(
     """
 
     async def run() -> dict[str, Any]:
-        left, silent = list(addresses), set[str]()
-        # To Client.run, no workers would be all.
-        while left := [address for address in left if address not in silent]:
-            request = client.run(question, workers=left, on_error="return")
-            asking = asyncio.ensure_future(request)
+        silent: set[str] = set()
+        remaining = list(addresses)
+        while remaining:  # an empty list would mean all workers to Client.run
+            request = client.run(question, workers=remaining, on_error="return")
+            answers = asyncio.ensure_future(request)
             try:
-                while silent.isdisjoint(left):
-                    if (await asyncio.wait([asking], timeout=_LOOK_S))[0]:
-                        return dict(asking.result())
-                    here = (await ask(client, None, "identity", n_workers=-1))["workers"]
-                    silent = silent_workers({a: worker["last_seen"] for a, worker in here.items()})
+                while silent.isdisjoint(remaining):
+                    done, _ = await asyncio.wait([answers], timeout=_LOOK_S)
+                    if done:
+                        return dict(answers.result())
+                    present = (await ask(client, None, "identity", n_workers=-1))["workers"]
+                    silent = silent_workers({a: w["last_seen"] for a, w in present.items()})
             finally:
-                asking.cancel()  # the answers of the others are lost with it
+                answers.cancel()  # also the answers of the workers that are not silent
+            remaining = [address for address in remaining if address not in silent]
         return {}
 
     answers: dict[str, Any] = client.sync(run)
     if not any(isinstance(answer, OSError) for answer in answers.values()):
         return answers
-    here = worker_identities(client)
-    # A worker that is there still may have raised an OSError itself.
-    lost = {a: OSError if a not in here else CommClosedError for a in answers}
+    present = worker_identities(client)
+    # A worker that is still present may have raised an OSError itself.
+    lost = {a: CommClosedError if a in present else OSError for a in answers}
     return {a: answer for a, answer in answers.items() if not isinstance(answer, lost[a])}
 
 
 def silent_workers(last_seen: Mapping[str, float]) -> set[str]:
-    """Addresses of workers that have had no heartbeat for long, from the time of each one's last.
+    """Return the addresses of workers without a recent heartbeat.
 
-    If all have been silent, the scheduler itself was stopped or busy, and will hear from them soon.
+    `last_seen` is {address: time of the last heartbeat, seconds}. Times are compared with the
+    latest heartbeat: if all workers have been silent, the scheduler itself was stopped or busy.
     """
     now = max(last_seen.values(), default=0.0)
     # Dask's interval, which is long in large clusters.
-    patience_s = max(SILENT_S, _BEATS * (1 + len(last_seen) / 100))
+    patience_s = max(SILENT_S, _MISSED_BEATS * (1 + len(last_seen) / 100))
     return {address for address, seen in last_seen.items() if now - seen > patience_s}

@@ -134,7 +134,8 @@ async def submit_in_the_loop(part):
 def test_a_coroutine_submits_without_asking(start):
     client = start({"a": {"nthreads": 2}})
     part, _ = Pool.from_client(client).partition("A", n_workers=1, slots=2)
-    assert part.submit(submit_in_the_loop, part).result(LONG_S) == "a"
+    future = client.submit(submit_in_the_loop, part, resources={"A": 1})
+    assert future.result(LONG_S) == "a"
 
 
 def test_fewer_workers_than_a_rule_asks_for_are_noted(start, caplog):
