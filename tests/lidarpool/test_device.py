@@ -175,6 +175,18 @@ MORE = {
     "textures": {"materials": [Material("*", "texture", scale=0.7)]},
     "gloss": {"materials": [Material("*", 0.4, roughness=0.3)]},
     "velocities": {"columns": ("radial_velocity",), "noise": Noise(velocity_m_s=0.1)},
+    "normals and origins": {
+        "columns": (
+            *COLUMNS,
+            "normal_x",
+            "normal_y",
+            "normal_z",
+            "incidence_deg",
+            "origin_x",
+            "origin_y",
+            "origin_z",
+        ),
+    },
     "a measured material": {"materials": [Material("*", material="asphalt, dry")]},
 }
 

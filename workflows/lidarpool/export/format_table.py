@@ -48,6 +48,9 @@ LAYOUTS = {
     "images": ("intensity", "time", *_ALL_RAYS),
 }
 _COLOURS = ("red", "green", "blue")
+_SURFACES = (
+    "normal_x", "normal_y", "normal_z", "incidence_deg", "origin_x", "origin_y", "origin_z",
+)  # fmt: skip
 _E57 = ("intensity", *_COLOURS)
 _LAS = ("laspy", "lazrs")
 _LABELS = ("object", "intensity", "class")
@@ -56,7 +59,7 @@ _BAG = (
     False,
     ("rosbags",),
     ("scan", "object", "channel"),
-    ("channel", *_COLOURS, "radial_velocity"),
+    ("channel", *_COLOURS, "radial_velocity", *_SURFACES),
     ("class",),
     LAYOUTS,
 )

@@ -22,13 +22,19 @@ from laspy.vlrs.known import WaveformPacketStruct, WaveformPacketVlr, WktCoordin
 from ..base.errors import LidarpoolError
 from ..base.interrupts import deferred_interrupts
 from ..columns.cloud import Cloud, CloudLike
-from ..columns.table import COLOURS, TABLE
+from ..columns.table import COLOURS, NORMAL, TABLE
 from ..columns.waveforms import WAVEFORM, ZERO, records
 from .sweeps import Sweeps
 
 ANGLE_DEG = 0.006  # of one step of the format's scan angle
 FULL = 65_535  # the format's intensity for 1 and above
 _OF_FORMAT = ("return_number", "returns", "azimuth")  # stored only in fields of the format
+# Names of columns in the extra bytes: a field of the format is called intensity, and normals have
+# the names of PDAL's dimensions.
+_NAMES = {
+    "intensity": "energy",
+    **{TABLE[name].in_files: f"Normal{name[-1].upper()}" for name in NORMAL},
+}
 _GPS_NS = 315_964_800 * 10**9  # from 1970-01-01 to 1980-01-06, the start of GPS time
 _LEAP_S = 18  # that GPS time is ahead of UTC since 2017, the earliest start
 _ADJUSTED_S = 1e9  # that adjusted standard GPS time is behind GPS time
@@ -214,8 +220,8 @@ def _points(chunk: Cloud, header: laspy.LasHeader, extra: list[str], begins_s: f
 
 
 def _name(name: str) -> str:
-    """Name of a column in the extra bytes, where one of a field of the format is taken."""
-    return "energy" if name == "intensity" else name[:32]
+    """Name in the extra bytes of a column that has a name in files."""
+    return _NAMES.get(name, name[:32])
 
 
 def wkt(epsg: int) -> str:

@@ -16,7 +16,7 @@ from ..columns.cloud import CHUNK_POINTS, Cloud, CloudLike
 from ..columns.cloud_file import CloudFile
 from ..columns.ply_format import AXES, as_held, header, layout, mapped_rows, row_type
 from ..columns.table import AXES as POSITION
-from ..columns.table import TABLE, check_names
+from ..columns.table import NORMAL, TABLE, check_names
 from . import reading
 from .sweeps import SWEEPS_FILE, Sweeps
 
@@ -124,7 +124,13 @@ def _write_open3d(path: Path, cloud: Cloud, real: np.dtype[np.floating]) -> None
     o3d = load_open3d()  # here, because read_cloud does not need it
     points = o3d.t.geometry.PointCloud()
     points.point.positions = o3d.core.Tensor(np.ascontiguousarray(cloud.positions, real))
+    # Readers of Open3D want the axes of normals one after the other, and other columns have no order.
+    normals = NORMAL if {*NORMAL} <= {*cloud.columns} else ()
+    if normals:
+        points.point.normals = o3d.core.Tensor(np.stack([cloud[n] for n in normals], axis=1))
     for column in cloud.table:
+        if column.name in normals:
+            continue
         values = np.ascontiguousarray(as_held(column, cloud[column.name]))
         points.point[column.in_files] = o3d.core.Tensor(values[:, None])
     quiet = o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error)

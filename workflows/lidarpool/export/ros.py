@@ -25,7 +25,7 @@ from rosbags.typesys.store import Typestore
 
 from ..base.arrays import AnyArray, Floats32, Records
 from ..columns.cloud import Cloud, CloudLike
-from ..columns.table import COLOURS, VELOCITY
+from ..columns.table import COLOURS, SURFACE_COLUMNS, VELOCITY
 from ..scene.colours import as_float
 from ..sensor.reflectivity import COUNTS
 from . import reading
@@ -62,7 +62,12 @@ _LAYOUTS = {
 }  # fmt: skip
 _LAYOUTS["images"] = _LAYOUTS["velodyne"]
 # Fields behind those of a layout: {name: type, columns that it needs}.
-_EXTRA = {"rgb": ("<f4", {*COLOURS}), VELOCITY: ("<f4", {VELOCITY}), "label": ("<u4", {"class"})}
+_EXTRA = {
+    "rgb": ("<f4", {*COLOURS}),
+    VELOCITY: ("<f4", {VELOCITY}),
+    "label": ("<u4", {"class"}),
+    **{name: ("<f4", {name}) for name in SURFACE_COLUMNS},
+}
 # Of vision_msgs, which rosbags lacks.
 _LABEL_INFO = "std_msgs/Header header\nvision_msgs/VisionClass[] class_map\nfloat32 threshold\n"
 _LABEL_INFO += f"{80 * '='}\nMSG: vision_msgs/VisionClass\nuint16 class_id\nstring class_name\n"
@@ -103,8 +108,9 @@ def write_mcap(path: Path, cloud: CloudLike, sweeps: Sweeps, layout: str) -> Non
     `autoware` (PointXYZIRCAEDT, 32 bytes; angles in radians, time_stamp in ns since the sweep
     began) and `ouster` (48 bytes; range in mm, t in ns since the sweep began, intensity: signal).
     Whole numbers of intensity are 255 at 1 and above. Where the cloud has red, green and
-    blue, a field `rgb` follows, where it has radial velocities, `radial_velocity`, and where its
-    classes have names, `label`; each makes points of `velodyne` and `autoware` 4 bytes longer.
+    blue, a field `rgb` follows, where it has radial velocities, `radial_velocity`, where its
+    classes have names, `label`, and then normals, `incidence_deg` and origins of rays, of which the
+    cloud has some; each makes points of `velodyne` and `autoware` 4 bytes longer.
     """
     folder = path.with_name(f"{path.name}.bag")
     try:
@@ -301,7 +307,7 @@ def _rows(
 ) -> Records:
     """Points of a sweep in a layout, of the type of `_row`."""
     begin_ns = sweeps.begins_ns[sweep] + (sweeps.stamp_ns(sweep) - round(sweeps.begins_ns[sweep]))
-    there, since = points.columns, points["time"] - begin_ns
+    there, since = sweeps.columns_in_sensor(sweep, points), points["time"] - begin_ns
     values = dict(zip("xyz", sweeps.in_sensor(sweep, points.positions).T, strict=True))
     if layout in ("velodyne", "images"):
         values |= {"intensity": there["intensity"], "ring": there["channel"], "time": since / 1e9}
@@ -325,7 +331,8 @@ def _rows(
         }
     if "rgb" in (row.names or ()):
         values["rgb"] = as_float(*(there[name] for name in COLOURS))
-    for name, column in ((VELOCITY, VELOCITY), ("label", "class")):
+    alike = ((name, name) for name in (VELOCITY, *SURFACE_COLUMNS))
+    for name, column in (*alike, ("label", "class")):
         if name in (row.names or ()):
             values[name] = there[column]
     rows = np.zeros(len(points), row)

@@ -14,9 +14,10 @@ from typing import Any
 import numpy as np
 
 from ..base.archives import open_archive, packed
-from ..base.arrays import AnyFloats, Bools, Bytes, Floats, Ints
+from ..base.arrays import AnyArray, AnyFloats, Bools, Bytes, Floats, Ints
 from ..base.errors import LidarpoolError
 from ..columns.cloud import Cloud, CloudLike
+from ..columns.table import NORMAL, ORIGIN, TABLE
 from ..scene.scene import Scene
 from ..scene.transform import affine
 from ..sensor import Fault, Sensor, Survey
@@ -109,6 +110,23 @@ class Sweeps:
         """Points (k, 3) of a sweep in its sensor's axes: at its start, or as stored."""
         exact = points.astype(np.float64)
         return exact if self.coordinates == "sensor" else self.pose.inward(sweep, exact)
+
+    def columns_in_sensor(self, sweep: int, points: Cloud) -> dict[str, AnyArray]:
+        """Columns of points of a sweep, normals and origins in the axes of `in_sensor`."""
+        columns = dict(points.columns)
+        if self.coordinates == "sensor":
+            return columns
+        for vector in (NORMAL, ORIGIN):
+            if not columns.keys() >= {*vector}:
+                continue
+            values = np.stack([columns[name] for name in vector], axis=1).astype(np.float64)
+            if vector == NORMAL:
+                values = values @ self.pose.turns[sweep]
+            else:
+                values = self.pose.inward(sweep, values)
+            for name, axis in zip(vector, values.T, strict=True):
+                columns[name] = axis.astype(TABLE[name].dtype)
+        return columns
 
     def bounds(self, sweep: int) -> Floats:
         """Corners of each actor's box during a sweep, in its own axes: (a, 2, 3), metres."""
