@@ -309,9 +309,9 @@ def test_parts_turn_grow_move_and_fall_as_in_helios(imported):
     # Up is y: (x, y, z) -> (x, -z, y); then x, then z turn, twice as large, onto the ground at 2.
     assert np.allclose(low[1:], [[1, 2, 2], [1, 2, 2]])
     assert np.allclose(high[1:], [[7, 4, 2], [7, 6, 2]])
-    ground = made.scenario.materials[1]
+    ground = made.scenario.materials[0]
     assert (ground.objects, ground.reflectance, ground.semantic_class) == (("ground",), 0.3, 2)
-    MaterialTable.of(of.materials, built.names)  # every object has one
+    MaterialTable.of(of.materials, built.surface_kinds)  # every object has one
 
 
 @pytest.mark.parametrize("known", [True, False])
@@ -321,7 +321,7 @@ def test_reflectances_are_those_of_spectra_at_the_wavelength(imported, known):
     if known:
         parts["../spectra/loam.txt"] = "Name: loam\n\n1.0\t20.0\n2.0\t40.0 \n"
     made, _, _ = imported(device, legs('pulseFreq_hz="1000"'), parts=parts)
-    assert [m.reflectance for m in made.scenario.materials] == [None, 0.3] * known
+    assert [m.reflectance for m in made.scenario.materials] == [0.3, None] * known
     assert ("the spectrum 'loam', which is not there" in " ".join(made.left_out)) != known
 
 
@@ -413,7 +413,7 @@ def test_voxels_are_scene_files_where_light_goes_through_them(survey, tmp_path):
     assert built.scene.has_voxels.tolist() == [False, True]
     bounds = built.scene.object_bounds[1]
     assert bounds == pytest.approx(np.array([[3, 4, 5], [4, 5, 7]]), abs=0.021)
-    table = MaterialTable.of(built.survey.materials, built.scene.names)
+    table = MaterialTable.of(built.survey.materials, built.scene.surface_kinds)
     assert table.reflectance.tolist() == [0.3, 0.5]
     assert made.left_out[-2:] == [
         "part 1, ladlut: leaf angles are spherical",
@@ -472,7 +472,7 @@ def test_rasters_of_heights_are_scene_files(imported, tmp_path):
     assert np.allclose(bounds, [[105, 5, 8], [125, 25, 12]])  # middles of the pixels
     assert built.triangles == 6  # of cells whose corners all have heights
     assert of.pose(0).position[2] + built.origin[2] == pytest.approx(12.5)  # on the ground
-    assert made.scenario.materials[1].reflectance == 0.3
+    assert made.scenario.materials[0].reflectance == 0.3
 
 
 @pytest.mark.parametrize(

@@ -186,6 +186,14 @@ OPTIONAL = (
         kind="label",
     ),
     Column(
+        "material",
+        "int32",
+        "",
+        "material of the face in the scene's file; -1 for none",
+        "material_number",
+        kind="label",
+    ),
+    Column(
         "cause",
         "uint8",
         "",

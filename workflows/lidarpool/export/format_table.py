@@ -59,7 +59,7 @@ _BAG = (
     False,
     ("rosbags",),
     ("scan", "object", "channel"),
-    ("channel", *_COLOURS, "radial_velocity", *_SURFACES),
+    ("channel", *_COLOURS, "radial_velocity", *_SURFACES, "material"),
     ("class",),
     LAYOUTS,
 )

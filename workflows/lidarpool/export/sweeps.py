@@ -102,6 +102,7 @@ class Sweeps:
     fired: Fired | None = None  # all rays, if the survey keeps every return with its ray
     classes: Mapping[int, str] = field(default_factory=dict, compare=False)  # their names
     faults: tuple[Fault, ...] = ()  # of all sensors
+    materials: tuple[str, ...] = ()  # names that the column `material` counts
 
     def __len__(self) -> int:
         return len(self.begins_ns)
@@ -221,6 +222,7 @@ class Sweeps:
             fired=fired,
             classes=survey.classes,
             faults=tuple(survey.faults),
+            materials=scene.material_names,
         )
 
     def faults_in(self, sweep: int) -> tuple[Fault, ...]:
@@ -273,6 +275,7 @@ class Sweeps:
         if self.instruments is not None:
             words["instruments"] = self.instruments.words()
         words |= {"classes": dict(self.classes)} if self.classes else {}
+        words |= {"materials": self.materials} if self.materials else {}
         words |= {"faults": [one.words() for one in self.faults]} if self.faults else {}
         arrays: dict[str, Any] = {"words": np.frombuffer(json.dumps(words).encode(), np.uint8)}
         arrays |= {name: getattr(self, name) for name in _ARRAYS}
@@ -318,6 +321,7 @@ class Sweeps:
                 instruments=instruments and Instruments.from_words(instruments, Path(path).parent),
                 classes={int(number): name for number, name in words.get("classes", {}).items()},
                 faults=tuple(Fault(**one) for one in words.get("faults", ())),
+                materials=tuple(words.get("materials", ())),
                 **{name: arrays[name] for name in _ARRAYS},
                 **{name: words[name] for name in _WORDS},
             )

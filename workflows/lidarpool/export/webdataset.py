@@ -103,6 +103,8 @@ class Pieces(pieces.Pieces):
             "box_objects": there.objects.tolist(),
             "box_points": there.points.tolist(),
         }
+        if "material" in columns:
+            about["materials"] = sweeps.materials
         if faults := sweeps.faults_in(number):
             about["faults"] = [one.words() for one in faults]
         files = {f"{name}.npy": _npy(array) for name, array in arrays.items()}

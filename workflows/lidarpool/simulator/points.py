@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from raybeam import Pattern
 
-from ..base.arrays import AnyArray, Bytes, Floats, Ints, Ints32, Records, UInts32
+from ..base.arrays import AnyArray, Bytes, Floats, Integers, Ints, Ints32, Records, UInts32
 from ..base.elementary import arccos, arcsin, arctan2
 from ..base.errors import LidarpoolError
 from ..base.vectors import products, turned
@@ -309,6 +309,11 @@ class BatchPoints:
         return self._surfaces.objects(self.found.triangle)
 
     @cached_property
+    def _kinds(self) -> Integers:
+        """Kinds of surfaces, rows of the table of materials."""
+        return self._surfaces.kinds(self.found.triangle)
+
+    @cached_property
     def cosine(self) -> Floats:
         """Cosine of the angle between the ray and the normal of its triangle, 0 to 1.
 
@@ -329,7 +334,7 @@ class BatchPoints:
         if self.found.cause is not None:
             on_surface &= self.found.cause != GHOST
         if surfaces.materials.leafy.any():
-            on_surface &= ~surfaces.materials.leafy[self.object]
+            on_surface &= ~surfaces.materials.leafy[self._kinds]
         rows = np.flatnonzero(on_surface)
         for begin in range(0, len(rows), BLOCK_HITS):
             block = rows[begin : begin + BLOCK_HITS]
@@ -501,5 +506,10 @@ class BatchPoints:
     @property
     def semantic_class(self) -> NDArray[np.uint16]:
         """Class of the material."""
-        classes, owners = self._surfaces.materials.semantic_class[self.object], self.object
-        return classes if self.found.cause is None else np.where(owners < 0, 0, classes)
+        classes = self._surfaces.materials.semantic_class[self._kinds]
+        return classes if self.found.cause is None else np.where(self._kinds < 0, 0, classes)
+
+    @property
+    def material_number(self) -> Ints32:
+        """Number of the material's name among those of the scene; -1 for none."""
+        return self._surfaces.material_numbers(self.found.triangle)

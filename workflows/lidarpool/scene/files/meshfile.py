@@ -115,6 +115,7 @@ def load_objects(
     transform: Transform | None = None,
     opacity: OpacityMode = "mask",
     colours: bool = False,
+    materials: bool = False,
     step_m: float | None = None,
     window: Window | None = None,
     epsg: int | None = None,
@@ -131,7 +132,7 @@ def load_objects(
 
     Parameters
     ----------
-    path, unit, up_axis, transform, opacity, colours, assets
+    path, unit, up_axis, transform, opacity, colours, materials, assets
         As of `Scene.load`, with a path of `SUFFIXES` in any case. The unit of a raster is that of
         its heights.
     step_m
@@ -182,7 +183,8 @@ def load_objects(
             "animation."
         )
     folders = tuple(Path(one).resolve() for one in (path.parent, assets) if one is not None)
-    wanted = Wanted(opacity == "mask" and animation is None, colours, folders, animation)
+    masks = opacity == "mask" and animation is None
+    wanted = Wanted(masks, colours, folders, animation, materials)
     # Of broken numbers in files: infinite and NaN values are refused.
     with np.errstate(all="ignore"):
         try:
