@@ -33,6 +33,7 @@ from lidarpool.scenario.build import build
 from lidarpool.scenario.scenario import Scenario
 from lidarpool.scene.actors import one_mesh
 from lidarpool.scene.face_materials import FaceMaterials
+from lidarpool.scene.scene_file import write_scene
 from lidarpool.scene.scene_mesh import Cutout
 from lidarpool.simulator.batch import columns_of
 from lidarpool.simulator.returns import BLOOMING
@@ -351,6 +352,18 @@ def test_shapes_of_robots_have_the_material_of_their_visual(tmp_path):
     x = mesh.vertices[mesh.faces].mean(axis=1)[:, 0]
     np.testing.assert_array_equal(mesh.materials.index, x > 1)
     assert load_robot(tmp_path / "r.urdf").meshes["body"].materials is None
+
+
+def test_a_glb_that_we_write_keeps_names_of_materials(tmp_path):
+    mask = np.array([[True, False]])
+    corners = np.zeros((2, 3, 2), np.float32)
+    fence = replace(front("Fence", ("Wood", "Wire"), y=3), cutouts=(Cutout(mask, corners),))
+    meshes = [front(), SceneInstance(front("Copy"), np.eye(4)), fence, level("Ground")]
+    write_scene(tmp_path / "a.glb", Scene.from_meshes(meshes))
+    kinds = Scene.load(tmp_path / "a.glb", materials=True).surface_kinds
+    found = {(kinds.names[k], name) for k, name in zip(kinds.object, kinds.material, strict=True)}
+    assert {("House", "Brick"), ("House", "Glass"), ("Copy", "Glass"), ("Ground", "")} <= found
+    assert [name for name in kinds.material if name.startswith("W")] == ["Wood", "Wire"]
 
 
 # -- instances, actors, masks ---------------------------------------------------------------------

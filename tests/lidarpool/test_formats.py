@@ -785,3 +785,18 @@ def test_normals_and_origins_follow_the_points_into_the_sensors_axes(drive, tmp_
         np.testing.assert_allclose(inside @ turn.T + place, np.asarray(second), atol=1e-4)
         np.testing.assert_allclose(start @ turn.T + place, origins[here], atol=1e-4, err_msg=name)
         np.testing.assert_allclose(normal @ turn.T, normals[here], atol=1e-6, err_msg=name)
+
+
+def test_e57_has_normals_in_the_sensors_axes(drive, tmp_path, monkeypatch):
+    lost = save_cloud(drive, tmp_path / "c.e57")
+    assert not {*lost} & {"normal_x", "normal_y", "normal_z"} and "origin_x" in lost
+    assert "nor:normalX" not in pye57.e57.SUPPORTED_POINT_FIELDS
+    for axis in "XYZ":
+        monkeypatch.setitem(pye57.e57.SUPPORTED_POINT_FIELDS, f"nor:normal{axis}", "f")
+    with pye57.E57(str(tmp_path / "c.e57")) as file:
+        assert file.image_file.isElementNameExtended("nor:normalX")
+        found = file.read_scan_raw(1)
+        turn = file.get_header(1).rotation_matrix
+    inside = np.stack([found[f"nor:normal{axis}"] for axis in "XYZ"], axis=1).astype(float)
+    normals = np.stack([drive[f"normal_{axis}"] for axis in "xyz"], axis=1)
+    np.testing.assert_allclose(inside @ turn.T, normals[drive["scan"] >= 36], atol=1e-6)

@@ -314,6 +314,41 @@ def test_parts_turn_grow_move_and_fall_as_in_helios(imported):
     MaterialTable.of(of.materials, built.surface_kinds)  # every object has one
 
 
+def test_classes_and_reflectances_are_those_of_the_faces(imported):
+    # One object of three materials, of which HELIOS++ knows two; another object of one.
+    house = (
+        "mtllib house.mtl\no House\n"
+        + "".join(f"v {x} {y} 0\n" for x in range(4) for y in (0, 1))
+        + "usemtl wall\nf 1 3 4 2\nusemtl roof[1]\nf 3 5 6 4\nusemtl other\nf 5 7 8 6\n"
+        + "o Shed\nusemtl wall\nf 1 5 6\n"
+    )
+    library = (
+        "newmtl wall\nhelios_reflectance 0.2\nhelios_classification 6\n"
+        "newmtl roof[1]\nhelios_reflectance 60\nhelios_classification 7\nnewmtl other\n"
+    )
+    part = """<part><filter type="objloader">
+  <param type="string" key="filepath" value="parts/house.obj"/></filter></part></scene>"""
+    device = scanner("conic", "", scanAngleMax_deg=20, scanFreqMax_Hz=10)
+    made, scene, of = imported(
+        device,
+        legs('pulseFreq_hz="1000"'),
+        GROUND.replace("</scene>", part),
+        parts={"house.obj": house, "house.mtl": library},
+    )
+    assert "class" in made.scenario.cloud.columns
+    assert scene.names == ("ground", "House", "Shed")
+    kinds, table = scene.surface_kinds, MaterialTable.of(of.materials, scene.surface_kinds)
+    rows = zip(kinds.object, kinds.material, table.semantic_class, table.reflectance, strict=True)
+    found = {(kinds.names[owner], name): (int(c), float(share)) for owner, name, c, share in rows}
+    assert found == {
+        ("ground", "soil"): (2, 0.3),
+        ("House", "wall"): (6, 0.2),
+        ("House", "roof[1]"): (7, 0.6),
+        ("House", "other"): (0, 0.5),
+        ("Shed", "wall"): (6, 0.2),
+    }
+
+
 @pytest.mark.parametrize("known", [True, False])
 def test_reflectances_are_those_of_spectra_at_the_wavelength(imported, known):
     device = scanner("conic", "", scanAngleMax_deg=20, scanFreqMax_Hz=10, wavelength_nm=1500)

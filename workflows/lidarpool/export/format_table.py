@@ -51,7 +51,7 @@ _COLOURS = ("red", "green", "blue")
 _SURFACES = (
     "normal_x", "normal_y", "normal_z", "incidence_deg", "origin_x", "origin_y", "origin_z",
 )  # fmt: skip
-_E57 = ("intensity", *_COLOURS)
+_E57 = ("intensity", *_COLOURS, *_SURFACES[:3])
 _LAS = ("laspy", "lazrs")
 _LABELS = ("object", "intensity", "class")
 _RINGS = ("channel", "intensity")

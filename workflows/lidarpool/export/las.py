@@ -86,8 +86,8 @@ def _write(path: Path, cloud: CloudLike, sweeps: Sweeps, *, compress: bool) -> N
         for number in range(256):  # the record has them all
             lookup[number] = sweeps.classes.get(number, "").encode("ascii", "replace")[:15].decode()
     if any(column.name == "material" for column in cloud.table):
-        names = json.dumps(sweeps.materials).encode()[:_VLR_MOST]
-        header.vlrs.append(laspy.VLR("lidarpool", 1, "names of materials, JSON", names))
+        listed = json.dumps(sweeps.materials).encode()[:_VLR_MOST]
+        header.vlrs.append(laspy.VLR("lidarpool", 1, "names of materials, JSON", listed))
     if packets is not None:
         header.vlrs.extend(packets.descriptors)
         header.global_encoding.waveform_data_packets_internal = True

@@ -252,8 +252,13 @@ class Scene:
                 if isinstance(one, SceneMesh) and parts[part].mask is None and one.voxels is None:
                     solid = parts[part]
                     corners = solid.faces.astype(np.int64)
-                    looks = {"colours": solid.colours, "materials": solid.materials}
-                    mesh = SceneMesh(one.name, solid.vertices, corners, **looks)
+                    mesh = SceneMesh(
+                        one.name,
+                        solid.vertices,
+                        corners,
+                        colours=solid.colours,
+                        materials=solid.materials,
+                    )
                     plain.append((number, mesh))
                 else:
                     shared.append((number, part, matrix))
@@ -453,7 +458,7 @@ class Scene:
                 points, faces = compacted(self.vertices, self.faces[rows])
                 own = self.colours and self.colours.take(rows)
                 owner = int(self.face_object[rows[0]])
-                named = self.materials and self.materials.of_object(owner, rows)
+                named = None if self.materials is None else self.materials.of_object(owner, rows)
                 mesh = SceneMesh(name, points + self.origin, faces, colours=own, materials=named)
                 found.append(mesh)
         if (shared := self.instances) is not None:

@@ -120,8 +120,8 @@ def parts_of(mesh: SceneMesh) -> Iterator[MeshPart]:
         some = slice(first, stop)
         return MeshPart(
             *_used(mesh.vertices, mesh.faces[some]),
-            mask=cut and cut.mask,
-            uv=cut and cut.uv,
+            mask=None if cut is None else cut.mask,
+            uv=None if cut is None else cut.uv,
             colours=mesh.colours and mesh.colours.take(some),
             voxels=mesh.voxels,
             materials=mesh.materials and mesh.materials.take(some),

@@ -170,7 +170,7 @@ class Media:
         )  # fmt: skip
         self._angle = np.append(table.leaf_angle, 0)
         closed, self._inwards = surfaces.solids
-        for number in np.flatnonzero(table.leafy):
+        for number in np.flatnonzero(table.leafy).tolist():
             if not closed[number]:
                 raise LidarpoolError(
                     f"materials: {surfaces.material_kinds.describe(number)} has a "

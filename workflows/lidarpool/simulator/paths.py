@@ -199,7 +199,7 @@ class CastStep(PulseStep):
             seeks = mirrored is not None and not (within is not None and within.differentials)
             share, water = np.empty(len(on)), np.zeros(0, np.bool_) if film is None else film
             count = surface_loops.onward(
-                on, off, owned(kinds, np.int32), along, materials.shares(kinds[on], bright),
+                on, off, kinds, along, materials.shares(kinds[on], bright),
                 self._light.wet, water, light.share, distance, materials.specular,
                 materials.passes, ~materials.refracts, materials.leafy, self._brightest,
                 self._light.extinction, self._faintest if seeks else -1.0, share,

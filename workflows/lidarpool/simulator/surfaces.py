@@ -52,7 +52,7 @@ class Lit(NamedTuple):
 
     normals: Floats  # (n, 3)
     along: Floats  # (n,): cosines of the angles between normals and directions, of either sign
-    kinds: Indices  # (n,): rows of the table of materials
+    kinds: Ints32  # (n,): rows of the table of materials
     energy: Floats  # (n,): see `Surfaces.energy`
     film: Bools | None = None  # (n,): whether there may be a film of water
 
@@ -167,7 +167,7 @@ class Surfaces:
         table: MaterialTable,
         times: Floats | Ints,
         ways: Ways,
-    ) -> tuple[Floats, Floats, Indices, Floats]:
+    ) -> tuple[Floats, Floats, Ints32, Floats]:
         """Return normals (3, n), products with directions, kinds of surfaces, light sent back."""
         from . import surface_loops  # not before: numba takes half a second to import
 
@@ -183,7 +183,7 @@ class Surfaces:
                 own, rows[on] = _normals(corners), ~np.arange(len(on))
         normals, (along, back) = np.empty((3, len(rows))), np.empty((2, len(rows)))
         given = self._turns, self.unit_normals, own, run, poses, table.reflectance, table.retro
-        hits = rows, owned(kinds, np.int32), which, owned(directions.T)
+        hits = rows, kinds, which, owned(directions.T)
         surface_loops.meet(*hits, *given, normals, along, back)
         return normals, along, kinds, back
 
@@ -209,7 +209,7 @@ class Surfaces:
         if light.wet:
             film, dry = np.empty(len(along), np.bool_), table.passes | table.leafy
             shares = table.shares(kinds, bright)
-            given = normals[2], along, owned(kinds, np.int32), dry, shares, LEVEL, light.wet
+            given = normals[2], along, kinds, dry, shares, LEVEL, light.wet
             surface_loops.soak(*given, film, back)
         surface_loops.fade(owned(distance), light.extinction, back)
         return Lit(normals.T, along, kinds, back, film)
@@ -339,19 +339,19 @@ class Surfaces:
             return self.owners[triangle]
         return self._find(triangle)[1]
 
-    def kinds(self, triangle: Integers) -> Integers:
+    def kinds(self, triangle: Integers) -> Ints32:
         """Kinds of surfaces of triangles (n,), rows of the table of materials; -1 of no surface."""
         if self._kind_in_object is None:
             return self.objects(triangle)
         rows, objects, _ = self._find(triangle)
         return self._kinds_of(rows, objects)
 
-    def _kinds_of(self, rows: Indices, objects: Ints32) -> Integers:
+    def _kinds_of(self, rows: Indices, objects: Ints32) -> Ints32:
         """Kinds of surfaces of triangles, by rows among those that are kept once, and objects."""
         if self._kind_in_object is None:
             return objects
         kinds = self.material_kinds.first[:-1][objects] + self._kind_in_object[rows]
-        return np.where(objects < 0, -1, self._merged[kinds])
+        return np.where(objects < 0, np.int32(-1), self._merged[kinds])
 
     @cached_property
     def _kind_in_object(self) -> Ints32 | None:
@@ -361,17 +361,16 @@ class Surfaces:
         """
         if len(self.material_kinds.object) == len(self.material_kinds.names):
             return None
-        scene, parts = self._scene, self._scene.instances.parts if self._scene.instances else ()
-        sizes = [len(scene.faces), *(len(mesh.faces) for mesh in self._meshes)]
-        index = [scene.materials and scene.materials.index]
-        index += [mesh.materials and mesh.materials.index for mesh in self._meshes]
-        index += [part.materials and part.materials.index for part in parts]
-        sizes += [len(part.faces) for part in parts]
-        filled = [
-            np.zeros(size, np.int32) if of_faces is None else of_faces
-            for of_faces, size in zip(index, sizes, strict=True)
-        ]
-        return np.concatenate(filled)
+        scene = self._scene
+        parts = () if scene.instances is None else scene.instances.parts
+        meshes = [(len(mesh.faces), mesh.materials) for mesh in self._meshes]
+        meshes += [(len(part.faces), part.materials) for part in parts]
+        plain = None if scene.materials is None else scene.materials.index
+        found = [np.zeros(len(scene.faces), np.int32) if plain is None else plain]
+        for size, materials in meshes:
+            index = None if materials is None else materials.index
+            found.append(np.zeros(size, np.int32) if index is None else index)
+        return np.concatenate(found)
 
     def material_numbers(self, triangle: Integers) -> Ints32:
         """Numbers of the names of triangles' materials, see `Scene.material_names`; -1 for none."""
@@ -388,7 +387,7 @@ class Surfaces:
         return np.array([numbers.get(name, -1) for name in self.material_kinds.material], np.int32)
 
     @cached_property
-    def _merged(self) -> Indices:
+    def _merged(self) -> Ints32:
         """First kind of the same object that has the same material, for each kind.
 
         A surface with several names is one surface where one entry is for all of them: closed, if
@@ -397,7 +396,7 @@ class Surfaces:
         kinds, first = self.material_kinds, first_matches(self._materials, self.material_kinds)
         keys = np.stack([kinds.object, first], axis=1)
         _, rows, which = np.unique(keys, axis=0, return_index=True, return_inverse=True)
-        return rows[which.reshape(-1)]
+        return rows[which.reshape(-1)].astype(np.int32)
 
     def instances(self, triangle: Integers) -> Indices:
         """Instances that triangles (n,) belong to; each belongs to one."""
