@@ -14,7 +14,9 @@ from hypothesis import strategies as st
 from lidarpool import (
     Cloud,
     Column,
+    Fault,
     LidarpoolError,
+    Material,
     Mounted,
     Noise,
     Pose,
@@ -312,6 +314,37 @@ def test_what_is_no_surface_has_neither_normal_nor_incidence():
     for name in SURFACE[:4]:
         np.testing.assert_array_equal(np.isnan(cloud[name]), in_air)
     assert np.isfinite(vectors(cloud, "origin")).all()
+
+
+def test_a_ghost_has_no_normal_and_a_frozen_sensor_takes_normals_along():
+    mirror = SceneMesh("Mirror", [[5, -9, -9], [5, 9, -9], [5, 9, 9.0]], [[0, 1, 2]])
+    behind = SceneMesh("Wall", [[-5, -9, -9], [-5, 9, -9], [-5, 9, 9.0]], [[0, 1, 2]])
+    scene = Scene.from_meshes([mirror, behind])
+    survey = Survey(
+        Sensor.grid(360, 8, step_deg=360), poses=[(0, 0, 0)], steps=1,
+        columns=["cause", *SURFACE], returns=Returns("all"),
+        materials=[Material("Mirror", 0.3, specular_reflectance=1), Material("*")],
+    )  # fmt: skip
+    cloud = simulate(scene, survey).cloud
+    ghosts = cloud["cause"] == 5
+    assert ghosts.sum() > 20
+    np.testing.assert_array_equal(np.isnan(vectors(cloud, "normal")).any(axis=1), ghosts)
+
+    # The sensor turns by 90 degrees in a second, and repeats its first sweep from then on.
+    half = np.sqrt(0.5)
+    track = Track([0, 1], [[0, 0, 0], [0, 0, 0]], [[0, 0, 0, 1], [0, 0, half, half]])
+    frozen = Survey(
+        Sensor.grid(360, 8, step_deg=360), trajectory=track, steps=10, columns=SURFACE,
+        faults=[Fault("frozen", begin_s=0.15, end_s=2)],
+    )  # fmt: skip
+    cloud = simulate(Scene.from_meshes([behind]), frozen).cloud
+    first, last = (cloud[cloud["scan"] == scan] for scan in (1, 9))
+    assert len(first) == len(last) > 20
+    turn = frozen.pose(9).rotation @ frozen.pose(1).rotation.T
+    for columns in ("normal", "origin"):
+        expected = vectors(first, columns) @ turn.T
+        np.testing.assert_allclose(vectors(last, columns), expected, atol=1e-6)
+    assert np.abs(vectors(last, "normal") - vectors(first, "normal")).max() > 0.9
 
 
 def test_a_vector_is_chosen_as_a_whole():

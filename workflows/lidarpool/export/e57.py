@@ -59,7 +59,7 @@ def _write_scan(file: Any, sweeps: Sweeps, sweep: int, points: Cloud) -> None:
     file.write_scan_raw(data, name=f"sweep {sweep}", rotation=turn, translation=place)
 
 
-class _WithNormals(pye57.E57):  # type: ignore[misc]
+class _WithNormals(pye57.E57):
     """A file whose scans have normals; pye57 leaves them out."""
 
     def make_buffers(self, field_names: Sequence[str], *given: Any, **options: Any) -> Any:

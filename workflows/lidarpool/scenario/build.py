@@ -342,15 +342,15 @@ def _materials(scenario: Scenario, scene: Scene, vehicles: Sequence[int | None])
         made = [every]
     for name, names, semantic_class in own:
         # Before those that are for it: an earlier one, for a single copy, counts there.
-        rows = [rows_named(pattern, kinds.names) for pattern in names]
-        of_name = {kinds.material[kind] for kind in kinds.of_rows(np.concatenate(rows)).tolist()}
+        objects = np.concatenate([rows_named(pattern, kinds.names) for pattern in names])
+        of_objects = {kinds.material[kind] for kind in kinds.of_rows(objects).tolist()}
         before = made
         made = []
-        for entry in before:
-            if entry.named(name, of_name):
-                made.append(replace(entry, objects=names, semantic_class=semantic_class))
-            made.append(entry)
-        if not any(entry.material is None and entry.named(name) for entry in before):
+        for material in before:
+            if material.named(name, of_objects):
+                made.append(replace(material, objects=names, semantic_class=semantic_class))
+            made.append(material)
+        if not any(one.material is None and one.named(name) for one in before):
             made.append(replace(every, objects=names, semantic_class=semantic_class))
     first = len(scene.all_names) - len(vehicles)
     for semantic_class in sorted({one for one in vehicles if one is not None}):

@@ -98,7 +98,8 @@ class _Writer:
         first = len(mesh.faces) - sum(len(cut.uv) for cut in mesh.cutouts)
         colours, out = mesh.colours, []
         image = np.full(first, -1) if colours is None else colours.image[:first]
-        names, index = ("",), np.zeros(len(mesh.faces), np.int32)
+        names: tuple[str, ...] = ("",)
+        index = np.zeros(len(mesh.faces), np.int32)
         if mesh.materials is not None:
             names = mesh.materials.names
             index = index if mesh.materials.index is None else mesh.materials.index

@@ -357,6 +357,15 @@ class Scene:
         return SurfaceKinds(names, owners, [name for of_one in materials for name in of_one])
 
     @property
+    def has_mixed_objects(self) -> bool:
+        """Whether an object has faces of several materials."""
+        of_objects = () if self.materials is None else self.materials.names
+        of_actors = (actor.mesh.materials for actor in self.actors)
+        return any(len(names) > 1 for names in of_objects) or any(
+            materials is not None and len(materials.names) > 1 for materials in of_actors
+        )
+
+    @property
     def material_names(self) -> tuple[str, ...]:
         """Names of all materials of faces, each once: what the column `material` counts."""
         return tuple(name for name in dict.fromkeys(self.surface_kinds.material) if name)

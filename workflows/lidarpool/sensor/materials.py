@@ -452,8 +452,8 @@ def with_classes(
                 if len(some) < len(of_pattern):
                     of_some = np.unique(kinds.object[some]).tolist()
                     objects = [escape(kinds.names[row]) for row in of_some]
-                made = replace(entry, objects=objects, semantic_class=semantic_class)
-                before[number].insert(0, made)
+                with_its_class = replace(entry, objects=objects, semantic_class=semantic_class)
+                before[number].insert(0, with_its_class)
     return [
         made for entry, others in zip(materials, before, strict=True) for made in (*others, entry)
     ]

@@ -55,8 +55,7 @@ def _able(scene: Scene, survey: Survey) -> set[str]:
         for m in survey.materials
     )
     able = {column.name for column in _MADE} - {*(_ENERGIES if hazy or shining else ())}
-    kinds = scene.surface_kinds
-    if len(kinds.object) > len(kinds.names):  # faces of an object differ, of which it knows nothing
+    if scene.has_mixed_objects:  # of whose faces a device does not know the materials
         able -= {*_ENERGIES, "class"}
     able -= {"time"} if any(fault.by_s for fault in survey.faults) else set()
     return able - {axis.name for axis in AXES if survey.coordinates == "sensor"}

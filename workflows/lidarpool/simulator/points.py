@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from raybeam import Pattern
 
-from ..base.arrays import AnyArray, Bytes, Floats, Integers, Ints, Ints32, Records, UInts32
+from ..base.arrays import AnyArray, Bytes, Floats, Ints, Ints32, Records, UInts32
 from ..base.elementary import arccos, arcsin, arctan2
 from ..base.errors import LidarpoolError
 from ..base.vectors import products, turned
@@ -309,8 +309,10 @@ class BatchPoints:
         return self._surfaces.objects(self.found.triangle)
 
     @cached_property
-    def _kinds(self) -> Integers:
+    def _kinds(self) -> Ints32:
         """Kinds of surfaces, rows of the table of materials."""
+        if not self.scene.has_mixed_objects:
+            return self.object
         return self._surfaces.kinds(self.found.triangle)
 
     @cached_property

@@ -366,11 +366,11 @@ class Surfaces:
         meshes = [(len(mesh.faces), mesh.materials) for mesh in self._meshes]
         meshes += [(len(part.faces), part.materials) for part in parts]
         plain = None if scene.materials is None else scene.materials.index
-        found = [np.zeros(len(scene.faces), np.int32) if plain is None else plain]
+        numbers = [np.zeros(len(scene.faces), np.int32) if plain is None else plain]
         for size, materials in meshes:
             index = None if materials is None else materials.index
-            found.append(np.zeros(size, np.int32) if index is None else index)
-        return np.concatenate(found)
+            numbers.append(np.zeros(size, np.int32) if index is None else index)
+        return np.concatenate(numbers)
 
     def material_numbers(self, triangle: Integers) -> Ints32:
         """Numbers of the names of triangles' materials, see `Scene.material_names`; -1 for none."""

@@ -250,8 +250,8 @@ def _summary(
         words.append(colours_summary(mesh.colours for mesh in shapes))
     if wanted.materials:
         named = [mesh.materials.names for mesh in shapes if mesh.materials is not None]
-        names = {name for of_mesh in named for name in of_mesh if name}
-        words.append(plural(len(names), "named material"))
+        distinct = {name for of_mesh in named for name in of_mesh if name}
+        words.append(plural(len(distinct), "named material"))
     return ", ".join(words)
 
 
