@@ -335,7 +335,7 @@ def test_a_ghost_has_no_normal_and_a_frozen_sensor_takes_normals_along():
     track = Track([0, 1], [[0, 0, 0], [0, 0, 0]], [[0, 0, 0, 1], [0, 0, half, half]])
     frozen = Survey(
         Sensor.grid(360, 8, step_deg=360), trajectory=track, steps=10, columns=SURFACE,
-        faults=[Fault("frozen", begin_s=0.15, end_s=2)],
+        faults=[Fault("frozen", 0.15)],
     )  # fmt: skip
     cloud = simulate(Scene.from_meshes([behind]), frozen).cloud
     first, last = (cloud[cloud["scan"] == scan] for scan in (1, 9))
