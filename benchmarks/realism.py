@@ -141,7 +141,7 @@ def cases(scene: Scene, backend: str, counts: tuple[int, ...], sensor: str) -> d
     rows["saturation"] = case([], noise=Noise(detection_range_m=90, saturation=100))
     rows |= {name: case([], noise=noise, **options) for name, options in weather.items()}
     wet = {"noise": noise, "wet": 1.0}
-    paint = [Material("*", 0.5), Material("car-*", 0.5, specular_reflectance=0.04)]
+    paint = [Material("car-*", 0.5, specular_reflectance=0.04), Material("*", 0.5)]
     rows |= {"ghosts": case([], noise=noise, materials=paint), "wet": case([], **wet)}
     rows[f"{some} boxes, wet"] = case(cars(some, plain, some), **wet)
     rows[f"{some} boxes, spray"] = case(cars(some, plain, some), **wet, spray_g_m3=5.0)

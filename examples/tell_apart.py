@@ -32,11 +32,11 @@ def street(number, rng):
     survey = lp.Survey(
         sensor=lp.load_sensor("ouster/os1-32"),
         poses=[lp.Pose(tuple(place), yaw_deg=float(rng.uniform(-180, 180))) for place in places],
-        materials=[  # of the entries for an object, the last counts
-            lp.Material("*", 0.45, semantic_class=4),
-            lp.Material(["ground", "pavement"], 0.3, semantic_class=1),
-            lp.Material("building-*", 0.4, semantic_class=2),
+        materials=[  # of the entries for an object, the first counts
             lp.Material(["Saloon*", "Estate*", "Panel van*"], 0.5, semantic_class=3),
+            lp.Material("building-*", 0.4, semantic_class=2),
+            lp.Material(["ground", "pavement"], 0.3, semantic_class=1),
+            lp.Material("*", 0.45, semantic_class=4),
         ],
         noise=lp.Noise(range_m=0.015, detection_range_m=90), visibility_km=values["visibility_km"],
         keep_every=1, columns=["intensity", "class"], classes=dict(enumerate(CLASSES, 1)),

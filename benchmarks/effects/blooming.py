@@ -14,14 +14,14 @@ from lidarpool import Beams, Material, Noise, Sensor, Spin, Survey
 
 DRAWS = "effect-blooming.png"
 NOISE = Noise(detection_range_m=100, stray_light=2e-5)
-SIGNS = [Material("*", reflectance=0.3), Material("S*", reflectance=1.0, retro=True)]
+SIGNS = [Material("S*", reflectance=1.0, retro=True), Material("*", reflectance=0.3)]
 STEP_DEG = 0.1
 
 
 def on(survey: Survey) -> Survey:
     """Switch it on, in a street where five lamp posts are retro-reflectors."""
     posts = [f"lamp-{number}" for number in range(1, 6)]
-    materials = [Material("*", reflectance=0.3), Material(posts, reflectance=1.0, retro=True)]
+    materials = [Material(posts, reflectance=1.0, retro=True), Material("*", reflectance=0.3)]
     return replace(survey, noise=NOISE, materials=materials)
 
 

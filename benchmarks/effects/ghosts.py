@@ -20,8 +20,8 @@ PAINT, DIRT = 0.04, 0.1
 def on(survey: Survey) -> Survey:
     """Switch it on, in a street whose cars and buildings mirror a little."""
     materials = [
-        Material("*", reflectance=0.3),
         Material(["car-*", "building-*"], reflectance=0.3, specular_reflectance=PAINT),
+        Material("*", reflectance=0.3),
     ]
     return replace(survey, materials=materials)
 
@@ -48,7 +48,7 @@ def picture(path: Path) -> None:
     glass = Material("Window", DIRT, transparent="pass", specular_reflectance="fresnel")
     turning = Sensor(Beams(np.radians([-4, 0, 4])), Spin(1800, 360), 0.5, 60.0)
     survey = Survey(
-        turning, poses=[(0, 0, 0)], steps=1, materials=[Material("*", 0.5), glass],
+        turning, poses=[(0, 0, 0)], steps=1, materials=[glass, Material("*", 0.5)],
         returns=Returns("all"), columns=("cause",), keep_every=1, precision_m=0.001,
     )  # fmt: skip
     found = cloud(Scene.from_meshes(meshes), survey)
@@ -77,7 +77,7 @@ def picture(path: Path) -> None:
         room = [glazing, beside, upright("Behind", (40, 1), (40, -1))]
         one = shot(
             room, Sensor(Beams(np.zeros(1)), Spin(1, 360), 0), Noise(), returns=Returns("all"),
-            materials=[Material("*", 1.0), glass], columns=("object", "reflectance"),
+            materials=[glass, Material("*", 1.0)], columns=("object", "reflectance"),
         )  # fmt: skip
         for number, colour in ((0, GREY), (1, RED), (2, BLUE)):
             own = one["reflectance"][one["object"] == number]

@@ -24,9 +24,9 @@ from lidarpool.simulator.rig import Rig
 DRAWS = "effect-range-image.png"
 SKY, LOST = "#dfe5ec", "#e0182d"
 MATERIALS = (
-    Material("*", 0.12), Material("ground", 0.1), Material("pavement", 0.25),
-    Material("building-*", 0.35),
     *(Material(f"{tree}*", 0.45) for tree in ("Birch", "Maple", "Oak", "Pine", "Spruce")),
+    Material("building-*", 0.35),
+    Material("pavement", 0.25), Material("ground", 0.1), Material("*", 0.12),
 )  # fmt: skip
 NOISE = Noise(detection_range_m=45, dropout=0.01)
 

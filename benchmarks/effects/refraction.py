@@ -27,7 +27,7 @@ Real = NDArray[np.float64]
 def on(survey: Survey) -> Survey:
     """Return the survey with cars of glass."""
     glass = Material("car-*", transparent="pass", refractive_index=1.5)
-    return replace(survey, materials=[Material("*"), glass])
+    return replace(survey, materials=[glass, Material("*")])
 
 
 def box(name: str, low: tuple[float, float, float], high: tuple[float, float, float]) -> SceneMesh:
@@ -54,7 +54,7 @@ def cast(meshes: list[SceneMesh], water: Material) -> tuple[Real, Real, Real, Re
     """Places x and z of points, their beams' angles and energies."""
     survey = Survey(
         SCANNER, poses=[(0, 0, HEIGHT)], steps=1, columns=["intensity", "ray"],
-        materials=[Material("*", FLOOR), water],
+        materials=[water, Material("*", FLOOR)],
     )  # fmt: skip
     (batch,) = Rig(Scene.from_meshes(meshes), survey, "numpy").cast(0, 1)
     found = batch  # a survey with water is cast by the host

@@ -22,7 +22,7 @@ NOISE = Noise(detection_range_m=100, saturation=100)  # full by a white wall 31.
 PULSE_NS = 5.0
 MATERIALS = {
     "W": [Material("*", 1.0)],
-    "Sign": [Material("*", 1.0), Material("Sign", 1.0, retro=True)],
+    "Sign": [Material("Sign", 1.0, retro=True), Material("*", 1.0)],
 }
 COLUMNS = ("range", "intensity", "amplitude", "pulse_width", "object")
 

@@ -30,7 +30,7 @@ Real = NDArray[np.float64]
 def on(survey: Survey) -> Survey:
     """Return the survey with leaves in the crowns of all trees."""
     leaves = Material("tree-*", 0.5, leaf_area_density=0.8)
-    return replace(survey, materials=[Material("*"), leaves])
+    return replace(survey, materials=[leaves, Material("*")])
 
 
 def cast(
@@ -57,7 +57,7 @@ def tree() -> list[SceneMesh]:
 def section(axes: Any, leaves: Material, title: str) -> None:
     """Draw a slice of a tree from the side; the sensor is 9 m to the left."""
     head = Beams(np.radians(np.linspace(-14, 50, 160)))
-    scan = cast(tree(), Sensor(head, Spin(2400, 360)), (-9, 0, 2), [Material("*", 0.3), leaves])
+    scan = cast(tree(), Sensor(head, Spin(2400, 360)), (-9, 0, 2), [leaves, Material("*", 0.3)])
     place, which = scan.positions, scan.object
     slice_ = (np.abs(place[:, 1]) < 0.6) & (place[:, 0] < 9)
     for number, colour in ((2, MUTED), (0, GREEN), (1, BROWN)):
@@ -77,7 +77,7 @@ def canopy(kind: str, zenith_deg: float) -> Real:
         box("Soil", (-99, -99, -2), (99, 99, -1)),
     ]
     sensor = Sensor(Beams(np.full(RAYS, math.radians(zenith_deg - 90))), Spin(1, 360))
-    materials = [Material("*"), Material("Leaves", leaf_area_density=DENSITY, leaf_angle=kind)]  # type: ignore[arg-type]
+    materials = [Material("Leaves", leaf_area_density=DENSITY, leaf_angle=kind), Material("*")]  # type: ignore[arg-type]
     seed = round(zenith_deg) + 100 * KINDS[kind]  # trees of their own
     scan = cast(meshes, sensor, (0, 0, HIGH + 5), materials, seed)
     depth = (scan.range * math.cos(math.radians(zenith_deg)) - 5) / HIGH

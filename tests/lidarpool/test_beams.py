@@ -137,11 +137,11 @@ def test_a_road_is_one_return_behind_glass_and_in_a_mirror():
     road = plane((0, 0, -1.8), (0, 0, 1))
     plain = cast([road], down, returns=beam)
     pane = [wall("Pane", 3), road]
-    materials = [Material("*"), Material("Pane", transparent="pass")]
+    materials = [Material("Pane", transparent="pass"), Material("*")]
     behind = cast(pane, down, returns=beam, materials=materials)
     assert behind["range"] == pytest.approx(plain["range"], abs=1e-3)
     mirror = [SceneMesh("Pane", wall("Pane", 3).vertices @ _turn(45), wall("Pane", 3).faces), road]
-    materials = [Material("*"), Material("Pane", specular_reflectance=1)]
+    materials = [Material("Pane", specular_reflectance=1), Material("*")]
     seen = cast(mirror, down, returns=beam, materials=materials)
     assert seen["range"] == pytest.approx(plain["range"], abs=1e-3)
 

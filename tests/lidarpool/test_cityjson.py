@@ -164,7 +164,7 @@ def built_of(tmp_path, objects, **more):
 
 def table_of(tmp_path, objects, materials=()):
     built = built_of(tmp_path, objects, materials=list(materials))
-    table = MaterialTable.of(built.survey.materials, built.scene.all_names)
+    table = MaterialTable.of(built.survey.materials, built.scene.surface_kinds)
     found = zip(built.scene.names, table.semantic_class, table.reflectance, strict=True)
     return {name: (number, reflectance) for name, number, reflectance in found}
 
@@ -177,9 +177,9 @@ def test_types_are_classes_unless_a_material_has_one(tmp_path):
     classes = [plain[f"{kind} {kind}1"][0] for kind in kinds]
     assert classes == [6, 6, 11, 17, 9, 2, 10, 5, 1, 1]
     materials = [
-        {"objects": "*", "reflectance": 0.3},
-        {"objects": "Building Building2", "reflectance": 0.8},
         {"objects": ["Road *", "Bridge Bridge1"], "reflectance": 0.1, "class": 99},
+        {"objects": "Building Building2", "reflectance": 0.8},
+        {"objects": "*", "reflectance": 0.3},
     ]
     own = table_of(tmp_path, objects, materials)
     assert own["Building Building1"] == (6, 0.3)
@@ -195,7 +195,7 @@ def test_classes_of_types_have_names_unless_the_scenario_gives_others(tmp_path):
     cloud = {"columns": ["class"]}
     plain = built_of(tmp_path, objects, cloud=cloud).survey
     assert plain.classes == {6: "building", 9: "water", 11: "road surface"}
-    materials = [{"objects": "*"}, {"objects": "WaterBody *", "class": 6}]
+    materials = [{"objects": "WaterBody *", "class": 6}, {"objects": "*"}]
     given = built_of(tmp_path, objects, cloud=cloud, materials=materials).survey
     assert given.classes == {11: "road surface"}, "6 is no building here"
     names = {6: "house", 20: "road surface"}

@@ -352,7 +352,7 @@ def test_an_image_is_sent_once_whatever_shares_it():
 def test_textures_are_the_reflectance(caplog):
     bare = SceneMesh("Bare", *hills()[:2]).moved("Bare", np.eye(3), np.array([0, 9, 0]))
     scene = Scene.from_meshes([textured(), bare])
-    materials = [Material("*", 0.4), Material("Hills", "texture", scale=0.8)]
+    materials = [Material("Hills", "texture", scale=0.8), Material("*", 0.4)]
     cloud, found = sweep(scene, "reflectance", "intensity", materials=materials)
     plain, _ = sweep(scene, "reflectance", materials=[Material("*", 1.0)])
     share = np.clip(0.8 * LINEAR[found] @ WEIGHTS, DARKEST, 1)
@@ -411,7 +411,7 @@ def test_light_and_bytes_are_one_another(rows):
 
 def test_a_material_has_the_reflectance_of_the_nearer_wavelength():
     scene = Scene.from_meshes([SceneMesh("Ground", *hills()[:2])])
-    snow, white = Material("*", material="snow, melting"), Material("*", 1.0)
+    snow, white = Material("*", spectrum="snow, melting"), Material("*", 1.0)
     for nm, share in ((850.0, 0.70), (1064.0, 0.70), (1550.0, 0.01), (1600.0, 0.01)):
         sensor = replace(SENSOR, optics=replace(SENSOR.optics, wavelength_nm=nm))
         found, full = (
@@ -447,12 +447,12 @@ def test_a_gloss_adds_to_diffuse_light_and_replaces_that_of_metals():
 
 def test_names_of_materials_are_looked_up_and_contradictions_refused():
     for arguments, why in (
-        ({"material": "asfalt, dry"}, "Did you mean 'asphalt, dry'"),
-        ({"material": "Asphalt"}, "There are: asphalt shingle, red; asphalt, dry; asphaltic"),
-        ({"material": "limestone rock"}, "Did you mean 'limestone'"),
-        ({"material": "muddy"}, "There are: water, muddy.$"),
-        ({"material": "tar"}, "There are: aluminium, weathered; asphalt"),
-        ({"material": "asphalt, dry", "reflectance": 0.2}, "either material or reflectance"),
+        ({"spectrum": "asfalt, dry"}, "Did you mean 'asphalt, dry'"),
+        ({"spectrum": "Asphalt"}, "There are: asphalt shingle, red; asphalt, dry; asphaltic"),
+        ({"spectrum": "limestone rock"}, "Did you mean 'limestone'"),
+        ({"spectrum": "muddy"}, "There are: water, muddy.$"),
+        ({"spectrum": "tar"}, "There are: aluminium, weathered; asphalt"),
+        ({"spectrum": "asphalt, dry", "reflectance": 0.2}, "either spectrum or reflectance"),
         ({"reflectance": "texture", "transparent": "pass"}, "give a number"),
         ({"scale": 2.0}, "give reflectance texture"),
         ({"reflectance": "textures"}, "it must be 0 to 1, or texture"),
@@ -461,8 +461,8 @@ def test_names_of_materials_are_looked_up_and_contradictions_refused():
             Material("*", **arguments)
     with pytest.raises(LidarpoolError, match=r"\[0\].reflectance is 'white'; it must"):
         Scenario.from_data({"materials": [{"objects": "*", "reflectance": "white"}]})
-    wrong = {"objects": "*", "material": "asphalt, dry", "reflectance": 0.2}
-    with pytest.raises(LidarpoolError, match=r"^scenario: materials\[1\]: give either material or"):
+    wrong = {"objects": "*", "spectrum": "asphalt, dry", "reflectance": 0.2}
+    with pytest.raises(LidarpoolError, match=r"^scenario: materials\[1\]: give either spectrum or"):
         Scenario.from_data({"materials": [{"objects": "*"}, wrong]})
     table = reflectances()
     assert len(table) >= 30

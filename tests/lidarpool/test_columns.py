@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pickle
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -10,7 +11,24 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from lidarpool import Cloud, Column, LidarpoolError, save_cloud
+from lidarpool import (
+    Cloud,
+    Column,
+    Fault,
+    LidarpoolError,
+    Material,
+    Mounted,
+    Noise,
+    Pose,
+    Returns,
+    Scene,
+    SceneMesh,
+    Sensor,
+    Survey,
+    Track,
+    save_cloud,
+    simulate,
+)
 from lidarpool.columns.table import ALWAYS, OPTIONAL, TABLE, chosen, stored
 from lidarpool.simulator.points import BatchPoints
 
@@ -72,7 +90,7 @@ def test_a_column_holds_numbers(dtype):
         Column("a", dtype, "", "")
 
 
-class Returns(SimpleNamespace):
+class BatchStub(SimpleNamespace):
     def __len__(self):
         return 3
 
@@ -82,7 +100,7 @@ class Returns(SimpleNamespace):
     [("u1", [0, 7, 255]), ("i2", [-5.0, 0.0, 1.0]), ("f4", [np.nan, 0, np.inf]), ("u8", [0, 1, 2])],
 )
 def test_a_column_is_made_of_an_attribute_or_by_a_function(dtype, values):
-    returns = Returns(thing=values)
+    returns = BatchStub(thing=values)
     for source in ("thing", lambda returns: returns.thing):
         made = Column("a", dtype, "", "", source).make(returns)
         assert made.dtype == np.dtype(dtype)
@@ -103,7 +121,7 @@ def test_a_column_is_made_of_an_attribute_or_by_a_function(dtype, values):
 )
 def test_values_that_do_not_fit_their_column(dtype, values, message):
     with pytest.raises(LidarpoolError, match=message):
-        Column("a", dtype, "", "", lambda returns: values).make(Returns())
+        Column("a", dtype, "", "", lambda returns: values).make(BatchStub())
 
 
 # -- clouds ---------------------------------------------------------------------------------------
@@ -211,3 +229,125 @@ def test_chunks_are_the_cloud(count, points):
         assert np.array_equal(joined.positions, cloud.positions)
         for name, values in cloud.columns.items():
             assert np.array_equal(joined[name], values) and joined[name].dtype == values.dtype
+
+
+# -- surfaces and origins -------------------------------------------------------------------------
+
+SURFACE = ["normal_x", "normal_y", "normal_z", "incidence_deg", "origin_x", "origin_y", "origin_z"]
+
+
+def vectors(cloud, name):
+    """Return three columns of a cloud as (n, 3)."""
+    return np.stack([cloud[f"{name}_{axis}"] for axis in "xyz"], axis=1)
+
+
+@pytest.mark.parametrize("far_m", [0.0, 500_000.0])
+def test_normals_incidence_and_origins_of_a_ramp(far_m):
+    # A plane that rises to the east by 30 degrees, and a sensor that drives 3 m above it.
+    slope = np.tan(np.radians(30))
+    x = np.array([-90.0, 90, 90, -90])
+    corners = np.stack([x + far_m, [-90.0, -90, 90, 90], x * slope], axis=1)
+    scene = Scene.from_meshes([SceneMesh("Ramp", corners, [[0, 2, 1], [0, 2, 3]])])
+    assert scene.origin.any() == bool(far_m)
+    track = Track([0, 1], np.array([[far_m, 0, 3], [far_m + 5, 0, 3 + 5 * slope]]) - scene.origin)
+    lever = Pose((0.4, 0, 0))
+    sensor = Sensor.grid(36, 8, 20.0)
+    survey = Survey(
+        sensors=[Mounted(sensor, lever)],
+        trajectory=track,
+        steps=36,
+        columns=["time", *SURFACE],
+        precision_m=1e-4,
+    )
+    cloud = simulate(scene, survey).cloud
+    assert len(cloud) > 30
+    # One triangle winds the other way: normals are on the side that the sensor sees.
+    np.testing.assert_allclose(
+        vectors(cloud, "normal"), np.tile([-0.5, 0, np.sqrt(0.75)], (len(cloud), 1)), atol=1e-6
+    )
+    seconds = cloud["time"] / 1e9
+    start = np.stack([far_m + 5 * seconds, 0 * seconds, 3 + 5 * slope * seconds], axis=1)
+    np.testing.assert_allclose(vectors(cloud, "origin") - start, [lever.position] * len(cloud),
+                               atol=1e-6)  # fmt: skip
+    ahead = np.asarray(cloud) - vectors(cloud, "origin")
+    ahead /= np.linalg.norm(ahead, axis=1)[:, None]
+    expected = np.degrees(np.arccos(-(ahead * vectors(cloud, "normal")).sum(axis=1)))
+    np.testing.assert_allclose(cloud["incidence_deg"], expected, atol=0.05)
+    assert np.ptp(expected) > 30
+
+
+def test_normals_and_origins_in_the_sensors_axes():
+    half = np.sqrt(0.5)
+    track = Track([0, 1], [[0, 0, 1], [2, 1, 1]], [[0, 0, 0, 1], [0, 0, half, half]])
+    mounted = Mounted(Sensor.grid(360, 4), Pose((1, 0, 0.5), 30.0, 10.0), "front")
+    survey = Survey(
+        sensors=[mounted], trajectory=track, steps=72, columns=SURFACE, precision_m=1e-4
+    )
+    world = simulate(Scene.seed(), survey).cloud
+    inside = simulate(Scene.seed(), replace(survey, coordinates="sensor")).cloud
+    # Scalar products of rays and normals, and lengths, are the same in all axes.
+    for axis in "xyz":
+        np.testing.assert_array_equal(inside[f"origin_{axis}"], 0)
+    np.testing.assert_array_equal(inside["incidence_deg"], world["incidence_deg"])
+    products = []
+    for cloud in (world, inside):
+        ahead = np.asarray(cloud, np.float64) - vectors(cloud, "origin")
+        products.append((ahead * vectors(cloud, "normal")).sum(axis=1))
+    np.testing.assert_allclose(*products, atol=0.02)
+    # The poses of the carrier bring them to the world.
+    for row in range(0, len(world), 97):
+        pose = survey.pose(int(world["scan"][row]))
+        np.testing.assert_allclose(
+            pose.rotation @ vectors(inside, "normal")[row], vectors(world, "normal")[row], atol=0.03
+        )
+
+
+def test_what_is_no_surface_has_neither_normal_nor_incidence():
+    survey = Survey(
+        Sensor.grid(720, 16, 30.0, step_deg=360), poses=[(0, 0, 1)], steps=1, rain_mm_h=80,
+        columns=["cause", *SURFACE], noise=Noise(detection_range_m=60),
+        returns=Returns("all", subrays=7, divergence_mrad=3),
+    )  # fmt: skip
+    cloud = simulate(Scene.seed(), survey).cloud
+    in_air = cloud["cause"] > 0
+    assert 10 < in_air.sum() < len(cloud)
+    for name in SURFACE[:4]:
+        np.testing.assert_array_equal(np.isnan(cloud[name]), in_air)
+    assert np.isfinite(vectors(cloud, "origin")).all()
+
+
+def test_a_ghost_has_no_normal_and_a_frozen_sensor_takes_normals_along():
+    mirror = SceneMesh("Mirror", [[5, -9, -9], [5, 9, -9], [5, 9, 9.0]], [[0, 1, 2]])
+    behind = SceneMesh("Wall", [[-5, -9, -9], [-5, 9, -9], [-5, 9, 9.0]], [[0, 1, 2]])
+    scene = Scene.from_meshes([mirror, behind])
+    survey = Survey(
+        Sensor.grid(360, 8, step_deg=360), poses=[(0, 0, 0)], steps=1,
+        columns=["cause", *SURFACE], returns=Returns("all"),
+        materials=[Material("Mirror", 0.3, specular_reflectance=1), Material("*")],
+    )  # fmt: skip
+    cloud = simulate(scene, survey).cloud
+    ghosts = cloud["cause"] == 5
+    assert ghosts.sum() > 20
+    np.testing.assert_array_equal(np.isnan(vectors(cloud, "normal")).any(axis=1), ghosts)
+
+    # The sensor turns by 90 degrees in a second, and repeats its first sweep from then on.
+    half = np.sqrt(0.5)
+    track = Track([0, 1], [[0, 0, 0], [0, 0, 0]], [[0, 0, 0, 1], [0, 0, half, half]])
+    frozen = Survey(
+        Sensor.grid(360, 8, step_deg=360), trajectory=track, steps=10, columns=SURFACE,
+        faults=[Fault("frozen", 0.15)],
+    )  # fmt: skip
+    cloud = simulate(Scene.from_meshes([behind]), frozen).cloud
+    first, last = (cloud[cloud["scan"] == scan] for scan in (1, 9))
+    assert len(first) == len(last) > 20
+    turn = frozen.pose(9).rotation @ frozen.pose(1).rotation.T
+    for columns in ("normal", "origin"):
+        expected = vectors(first, columns) @ turn.T
+        np.testing.assert_allclose(vectors(last, columns), expected, atol=1e-6)
+    assert np.abs(vectors(last, "normal") - vectors(first, "normal")).max() > 0.9
+
+
+def test_a_vector_is_chosen_as_a_whole():
+    with pytest.raises(LidarpoolError, match="normal_x, normal_y, normal_z are one vector"):
+        chosen(["normal_z"])
+    assert len(chosen(SURFACE)) == 7

@@ -164,18 +164,18 @@ FIRST = [[-13.69999781, 0.4128094], [-15.08835127, 4.14431452]]
 def test_materials_and_classes_are_those_of_the_names(made):
     crate = {"name": "Crate", "box": [1, 1, 1], "at": [[0, 0], [3, 0], [6, 0]], "class": 5}
     materials = [
-        {"objects": "*", "reflectance": 0.2, "class": 1},
-        {"objects": "Crate*", "reflectance": 0.9},
         {"objects": "Crate.3", "reflectance": 0.4, "class": 7},
+        {"objects": "Crate*", "reflectance": 0.9},
+        {"objects": "*", "reflectance": 0.2, "class": 1},
     ]
     tree = TREE | {"at": [[9, 0]], "class": 6}
     built = made(crate, tree, materials=materials)
-    table = MaterialTable.of(built.survey.materials, built.scene.names)
+    table = MaterialTable.of(built.survey.materials, built.scene.surface_kinds)
     assert built.scene.names[2:] == ("Crate", "Crate.2", "Crate.3", "Tree")
     assert table.semantic_class.tolist() == [1, 1, 5, 5, 7, 6]
     assert table.reflectance.tolist() == [0.2, 0.2, 0.9, 0.9, 0.4, 0.2]
     built = made(crate)
-    table = MaterialTable.of(built.survey.materials, built.scene.names)
+    table = MaterialTable.of(built.survey.materials, built.scene.surface_kinds)
     assert table.semantic_class.tolist() == [0, 0, 5, 5, 5]
 
 

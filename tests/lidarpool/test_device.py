@@ -51,9 +51,9 @@ COLUMNS = (
     "return_number",
 )  # fmt: skip
 MATERIALS = (
-    Material("*", reflectance=0.3),
-    Material("copy*", reflectance=0.8, semantic_class=300),
     Material("copy 2", retro=True, semantic_class=7),
+    Material("copy*", reflectance=0.8, semantic_class=300),
+    Material("*", reflectance=0.3),
 )
 
 # One drives through the other, and both past what stands.
@@ -175,7 +175,19 @@ MORE = {
     "textures": {"materials": [Material("*", "texture", scale=0.7)]},
     "gloss": {"materials": [Material("*", 0.4, roughness=0.3)]},
     "velocities": {"columns": ("radial_velocity",), "noise": Noise(velocity_m_s=0.1)},
-    "a measured material": {"materials": [Material("*", material="asphalt, dry")]},
+    "normals and origins": {
+        "columns": (
+            *COLUMNS,
+            "normal_x",
+            "normal_y",
+            "normal_z",
+            "incidence_deg",
+            "origin_x",
+            "origin_y",
+            "origin_z",
+        ),
+    },
+    "a measured material": {"materials": [Material("*", spectrum="asphalt, dry")]},
 }
 
 
@@ -201,7 +213,7 @@ def test_pulses_and_noise_are_made_on_the_host(name, scenes, backend):
 @pytest.mark.parametrize("scene", ["plain", "instances", "both"])
 @pytest.mark.parametrize("name", ["beams with offsets", "on the move, mounted", "few columns"])
 def test_columns_of_actors(scene, name, scenes, backend):
-    survey = replace(MADE[name], materials=[*MATERIALS, Material("Car*", 0.7, 40)])
+    survey = replace(MADE[name], materials=[Material("Car*", 0.7, 40), *MATERIALS])
     if scene == "plain":
         survey = replace(survey, materials=())
     same(scenes[scene].with_actors(ACTORS), survey, backend, (0, 3, survey.scan_count))

@@ -155,7 +155,7 @@ def test_a_mirror_that_moves_counts_twice():
     sensor = Sensor.grid(180, 3, 20.0, step_deg=360)
     survey = Survey(
         sensor, poses=[(0, 0, 0)], steps=1, columns=["radial_velocity"],
-        materials=[Material("*"), Material("Mirror", specular_reflectance=1)],
+        materials=[Material("Mirror", specular_reflectance=1), Material("*")],
     )  # fmt: skip
     scene = Scene.from_meshes([behind]).with_actors([mirror])
     returns = found_of(Rig(scene, survey, "numpy"))

@@ -101,7 +101,7 @@ def test_weather_takes_light_by_kruse(visibility_km, nm, per_km):
 def test_the_last_material_that_names_an_object_counts():
     walls = [wall(name, 5, z=(k, k + 1)) for k, name in enumerate(["A", "B[1]", "B1"], -1)]
     up = Sensor(Beams(np.radians([-6, 6, 16])), Spin(1, 360))
-    materials = [Material("*", 0.1), Material(["B[1]", "B1"], 0.2), Material("B?", 0.3)]
+    materials = [Material("B?", 0.3), Material(["B[1]", "B1"], 0.2), Material("*", 0.1)]
     found = cast(walls, up, materials=materials)
     assert found["object"].tolist() == [0, 1, 2]
     cosines = np.cos(np.radians([6, 6, 16]))
@@ -156,12 +156,12 @@ def test_modes(mode):
 @pytest.mark.parametrize("backend", CPU)
 def test_light_passes_glass(backend):
     meshes = [wall("Pane", 4), wall("Behind", 9)]
-    materials = [Material("*", 0.5), Material("Pane", transparent="pass")]
+    materials = [Material("Pane", transparent="pass"), Material("*", 0.5)]
     found = cast(meshes, materials=materials, backend=backend)
     assert found["object"].tolist() == [1]
     assert found["range"] == pytest.approx([9], abs=1e-9)
     assert found["reflectance"] == pytest.approx([0.5 * 0.96**2], rel=1e-6), "4 % each way"
-    dirty = [*materials[:1], Material("Pane", 0.1, transparent="pass")]
+    dirty = [Material("Pane", 0.1, transparent="pass"), *materials[-1:]]
     found = cast(meshes, materials=dirty, returns=Returns("all"), backend=backend)
     assert found["object"].tolist() == [0, 1]
     assert found["reflectance"] == pytest.approx([0.1, 0.5 * (0.9 * 0.96) ** 2], rel=1e-6)
@@ -177,7 +177,7 @@ def test_a_pane_has_two_surfaces_from_whatever_side(backend, away_m, angle_deg):
     angle = math.radians(angle_deg)
     pane.apply_transform(trimesh.transformations.rotation_matrix(angle, (0, 0, 1)))
     meshes = [solid("Pane", pane, (away_m + 30, 0, 0)), wall("Behind", away_m + 60)]
-    materials = [Material("Behind", 0.5), Material("Pane", transparent="pass")]
+    materials = [Material("Pane", transparent="pass"), Material("Behind", 0.5)]
     found = cast(meshes, at=(away_m, 0.01, 0.02), backend=backend, materials=materials)
     through = (1 - fresnel(np.array([math.cos(angle)]))) ** 4  # two surfaces, there and back
     assert found["range"] == pytest.approx([60], abs=1e-3)
@@ -197,7 +197,7 @@ def test_a_mirror_shows_what_is_reflected_at_the_unfolded_range(subrays, backend
     """A mirror at 45 degrees turns the beam up, to a ceiling 3 m above."""
     mirror = quad("Mirror", (2, -9, -2), (2, 9, -2), (6, 9, 2), (6, -9, 2))
     meshes = [mirror, level("Ceiling", 3, 9)]
-    materials = [Material("*"), Material("Mirror", specular_reflectance=1)]
+    materials = [Material("Mirror", specular_reflectance=1), Material("*")]
     beam = Returns(subrays=subrays, divergence_mrad=1)
     found = cast(meshes, materials=materials, returns=beam, backend=backend)
     assert found["object"].tolist() == [1]
@@ -258,10 +258,10 @@ def test_weak_returns_are_lost_by_the_model(distance):
 
 ALL_ON = {
     "materials": [
-        Material("*", 0.4, semantic_class=1),
-        Material("V*", 0.1, transparent="pass"),
-        Material("Sphere", specular_reflectance=1),
         Material("Bowl", 0.3, specular_reflectance=0.3),
+        Material("Sphere", specular_reflectance=1),
+        Material("V*", 0.1, transparent="pass"),
+        Material("*", 0.4, semantic_class=1),
     ],
     "wet": 0.6,
     "returns": Returns("dual", subrays=7, divergence_mrad=20, pulse_ns=2),

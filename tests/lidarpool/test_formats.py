@@ -1,10 +1,12 @@
 """Clouds in other formats, read back by the libraries of those formats."""
 
+import io
 import json
 import pickle
 import re
 import signal
 import sys
+import tarfile
 import threading
 import time
 import tomllib
@@ -35,6 +37,7 @@ from lidarpool import (
     Track,
     read_cloud,
     save_cloud,
+    simulate,
 )
 from lidarpool.base.open3d_module import load_open3d
 from lidarpool.base.storage import Storage
@@ -47,7 +50,7 @@ from lidarpool.export.boxes import Boxes
 from lidarpool.export.format_table import EXPORTS, FORMATS, LAYOUTS
 from lidarpool.export.formats import Format
 from lidarpool.export.las import wkt
-from lidarpool.export.ros import START_NS
+from lidarpool.export.ros import START_NS, columns_of
 from lidarpool.export.sweeps import Sweeps
 from lidarpool.scene.actors import Actor, box
 from lidarpool.sensor.trajectory import matrices
@@ -706,3 +709,94 @@ def test_formats_hold_radial_velocities(cloud, sweeps, tmp_path):
         to, _, data = next(m for m in bag.messages() if m[0].topic == "/front/points")
         fields = bag.deserialize(data, to.msgtype).fields
         assert "radial_velocity" in [field.name for field in fields]
+
+
+SURFACE = ["normal_x", "normal_y", "normal_z", "incidence_deg", "origin_x", "origin_y", "origin_z"]
+
+
+@pytest.fixture(scope="module")
+def drive():
+    """Points of a tilted sensor on a moving and turning carrier among the default objects."""
+    half = np.sqrt(0.5)
+    track = Track([0, 1], [[0, 0, 1], [2, 1, 1]], [[0, 0, 0, 1], [0, 0, half, half]])
+    sensor = Mounted(Sensor.grid(3600, 8), Pose((1, 0, 0.5), 30.0, 10.0), "front")
+    survey = Survey(
+        sensors=[sensor], trajectory=track, steps=72,
+        columns=["time", "range", "ray", "intensity", "class", *SURFACE], precision_m=1e-4,
+    )  # fmt: skip
+    return simulate(Scene.seed(), survey).cloud
+
+
+def test_normals_and_origins_follow_the_points_into_the_sensors_axes(drive, tmp_path):
+    normals, origins = (
+        np.stack([drive[f"{name}_{axis}"] for axis in "xyz"], axis=1).astype(float)
+        for name in ("normal", "origin")
+    )
+    positions = np.asarray(drive)
+    assert len(drive) > 500 and np.abs(np.linalg.norm(normals, axis=1) - 1).max() < 1e-6
+    np.testing.assert_allclose(
+        np.linalg.norm(positions - origins, axis=1), drive["range"], atol=2e-3
+    )
+    ahead = (positions - origins) / drive["range"][:, None]
+    cosine = -(ahead * normals).sum(axis=1)
+    assert cosine.min() > 0  # normals face the sensor
+    np.testing.assert_allclose(np.cos(np.radians(drive["incidence_deg"])), cosine, atol=2e-3)
+
+    files = {"c.ply": None, "c.las": None, "c.parquet": None, "c.mcap": None,
+             "pcd": "pcd", "webdataset": "webdataset"}  # fmt: skip
+    for name, kind in files.items():
+        assert not {*save_cloud(drive, tmp_path / name, format=kind)} & {*SURFACE}, name
+    ply = load_open3d().io.read_point_cloud(str(tmp_path / "c.ply"))
+    np.testing.assert_allclose(np.asarray(ply.normals), normals, atol=1e-7)
+    las, frame = laspy.read(tmp_path / "c.las"), pd.read_parquet(tmp_path / "c.parquet")
+    for column, file, table in zip(
+        SURFACE,
+        ["NormalX", "NormalY", "NormalZ", *SURFACE[3:]],
+        ["nx", "ny", "nz", *SURFACE[3:]],
+        strict=True,
+    ):
+        np.testing.assert_array_equal(las[file], drive[column])
+        np.testing.assert_array_equal(frame[table], drive[column])
+
+    sweeps = drive.sweeps()
+    second = drive[drive["scan"] >= 36]
+    turn, place = sweeps.pose.turns[1], sweeps.pose.positions[1]
+    pcd = PointCloud.from_path(tmp_path / "pcd/000001.pcd")
+    types = get_typestore(Stores.ROS2_HUMBLE)
+    with AnyReader([tmp_path / "c.mcap"], default_typestore=types) as bag:
+        *_, (_, _, data) = (m for m in bag.messages() if m[0].topic == "/front/points")
+    held = {
+        "pcd": {name: pcd.numpy((name,))[:, 0] for name in pcd.fields},
+        "bag": columns_of(bytes(data)),
+    }
+    with tarfile.open(next((tmp_path / "webdataset").rglob("*.tar"))) as tar:
+        sample = {m.name.split(".")[1]: m for m in tar if m.name.startswith("front-000001")}
+        columns = {
+            name: np.load(io.BytesIO(tar.extractfile(sample[name]).read()))
+            for name in ("points", *SURFACE)
+        }
+    held["tar"] = columns | dict(zip("xyz", columns["points"].T, strict=True))
+    for name, points in held.items():
+        inside, start, normal = (
+            np.stack([points[f"{prefix}{axis}"] for axis in "xyz"], axis=1).astype(float)
+            for prefix in ("", "origin_", "normal_")
+        )
+        here = drive["scan"] >= 36
+        np.testing.assert_allclose(inside @ turn.T + place, np.asarray(second), atol=1e-4)
+        np.testing.assert_allclose(start @ turn.T + place, origins[here], atol=1e-4, err_msg=name)
+        np.testing.assert_allclose(normal @ turn.T, normals[here], atol=1e-6, err_msg=name)
+
+
+def test_e57_has_normals_in_the_sensors_axes(drive, tmp_path, monkeypatch):
+    lost = save_cloud(drive, tmp_path / "c.e57")
+    assert not {*lost} & {"normal_x", "normal_y", "normal_z"} and "origin_x" in lost
+    assert "nor:normalX" not in pye57.e57.SUPPORTED_POINT_FIELDS
+    for axis in "XYZ":
+        monkeypatch.setitem(pye57.e57.SUPPORTED_POINT_FIELDS, f"nor:normal{axis}", "f")
+    with pye57.E57(str(tmp_path / "c.e57")) as file:
+        assert file.image_file.isElementNameExtended("nor:normalX")
+        found = file.read_scan_raw(1)
+        turn = file.get_header(1).rotation_matrix
+    inside = np.stack([found[f"nor:normal{axis}"] for axis in "XYZ"], axis=1).astype(float)
+    normals = np.stack([drive[f"normal_{axis}"] for axis in "xyz"], axis=1)
+    np.testing.assert_allclose(inside @ turn.T, normals[drive["scan"] >= 36], atol=1e-6)

@@ -52,8 +52,8 @@ def schlick(first, angle):
 @pytest.mark.parametrize("subrays", [1, 19])
 def test_paint_returns_itself_and_what_it_mirrors(backend, subrays):
     materials = [
-        Material("Ceiling", 0.8, semantic_class=7),
         Material("Slanted", 0.3, specular_reflectance=0.2, semantic_class=1),
+        Material("Ceiling", 0.8, semantic_class=7),
     ]
     beam = Returns("all", subrays, 1.0)
     options = {"columns": COLUMNS, "materials": materials, "backend": backend, "returns": beam}
@@ -76,7 +76,7 @@ def test_no_light_is_lost_or_made_at_glass(degrees, dirt):
     angle = math.radians(degrees)
     glass = Material("Pane", dirt, transparent="pass", specular_reflectance="fresnel")
     meshes = [turned("Pane", angle), across("Beside", angle), wall("Behind", 20)]
-    found = cast(meshes, materials=[Material("*", 1.0), glass], **ALL)
+    found = cast(meshes, materials=[glass, Material("*", 1.0)], **ALL)
     light = dict(zip(found["object"].tolist(), found["reflectance"].tolist(), strict=True))
     shares = dirt, math.sqrt(light[1]), math.sqrt(light[2])
     assert sum(shares) == pytest.approx(1, abs=1e-6)
@@ -91,13 +91,13 @@ def test_water_is_passed_and_mirrors():
     angle = math.radians(45)
     pool = [turned("Pool", angle), across("Beside", angle), wall("Behind", 40)]
     for more, count in (({}, 1), ({"specular_reflectance": "fresnel"}, 2)):
-        found = cast(pool, materials=[Material("*", 1.0), Material("Pool", **WATER, **more)], **ALL)
+        found = cast(pool, materials=[Material("Pool", **WATER, **more), Material("*", 1.0)], **ALL)
         assert len(found["range"]) == count
     share = fresnel(np.array([math.cos(angle)]), 1.33)[0]
     assert found["reflectance"][0] == pytest.approx(share**2, rel=1e-6)
     floor = [level("Pool", 1.0), level("Floor", -2.0)]
     water = Material("Pool", **WATER, specular_reflectance="fresnel")
-    found = cast(floor, fan(30, 31), materials=[Material("*", 1.0), water], at=(0, 0, 0), **ALL)
+    found = cast(floor, fan(30, 31), materials=[water, Material("*", 1.0)], at=(0, 0, 0), **ALL)
     assert found["object"].tolist() == [1, 1] and (found["cause"] == GHOST).all()
     assert found["range"] == pytest.approx(4 * 1.33 / np.sin(np.radians([30, 31])), rel=1e-5)
 
@@ -117,7 +117,7 @@ def test_ghosts_of_textures_take_what_the_colours_leave():
         colours = Colours.of_faces(np.full((2, 3), bright, np.uint8))
         slanted = replace(SLANTED, colours=colours)
         paint = Material("Slanted", "texture", specular_reflectance=0.2)
-        found = cast([slanted, CEILING], materials=[Material("*", 1.0), paint], **ALL)
+        found = cast([slanted, CEILING], materials=[paint, Material("*", 1.0)], **ALL)
         ghosts = found["reflectance"][found["cause"] == GHOST]
         expected = [(share * schlick(0.2, math.pi / 4)) ** 2] if share else []
         assert ghosts == pytest.approx(expected, rel=1e-5)
@@ -213,7 +213,7 @@ def test_a_film_stays_on_what_faces_up(mesh, ratio):
     "options",
     [
         {"wet": 1.0},
-        {"materials": [Material("*", 0.2), Material("Road", specular_reflectance=1)]},
+        {"materials": [Material("Road", specular_reflectance=1), Material("*", 0.2)]},
     ],
 )
 def test_drops_are_before_surfaces_and_not_in_mirrors(options):

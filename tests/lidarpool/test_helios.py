@@ -309,9 +309,44 @@ def test_parts_turn_grow_move_and_fall_as_in_helios(imported):
     # Up is y: (x, y, z) -> (x, -z, y); then x, then z turn, twice as large, onto the ground at 2.
     assert np.allclose(low[1:], [[1, 2, 2], [1, 2, 2]])
     assert np.allclose(high[1:], [[7, 4, 2], [7, 6, 2]])
-    ground = made.scenario.materials[1]
+    ground = made.scenario.materials[0]
     assert (ground.objects, ground.reflectance, ground.semantic_class) == (("ground",), 0.3, 2)
-    MaterialTable.of(of.materials, built.names)  # every object has one
+    MaterialTable.of(of.materials, built.surface_kinds)  # every object has one
+
+
+def test_classes_and_reflectances_are_those_of_the_faces(imported):
+    # One object of three materials, of which HELIOS++ knows two; another object of one.
+    house = (
+        "mtllib house.mtl\no House\n"
+        + "".join(f"v {x} {y} 0\n" for x in range(4) for y in (0, 1))
+        + "usemtl wall\nf 1 3 4 2\nusemtl roof[1]\nf 3 5 6 4\nusemtl other\nf 5 7 8 6\n"
+        + "o Shed\nusemtl wall\nf 1 5 6\n"
+    )
+    library = (
+        "newmtl wall\nhelios_reflectance 0.2\nhelios_classification 6\n"
+        "newmtl roof[1]\nhelios_reflectance 60\nhelios_classification 7\nnewmtl other\n"
+    )
+    part = """<part><filter type="objloader">
+  <param type="string" key="filepath" value="parts/house.obj"/></filter></part></scene>"""
+    device = scanner("conic", "", scanAngleMax_deg=20, scanFreqMax_Hz=10)
+    made, scene, of = imported(
+        device,
+        legs('pulseFreq_hz="1000"'),
+        GROUND.replace("</scene>", part),
+        parts={"house.obj": house, "house.mtl": library},
+    )
+    assert "class" in made.scenario.cloud.columns
+    assert scene.names == ("ground", "House", "Shed")
+    kinds, table = scene.surface_kinds, MaterialTable.of(of.materials, scene.surface_kinds)
+    rows = zip(kinds.object, kinds.material, table.semantic_class, table.reflectance, strict=True)
+    found = {(kinds.names[owner], name): (int(c), float(share)) for owner, name, c, share in rows}
+    assert found == {
+        ("ground", "soil"): (2, 0.3),
+        ("House", "wall"): (6, 0.2),
+        ("House", "roof[1]"): (7, 0.6),
+        ("House", "other"): (0, 0.5),
+        ("Shed", "wall"): (6, 0.2),
+    }
 
 
 @pytest.mark.parametrize("known", [True, False])
@@ -321,7 +356,7 @@ def test_reflectances_are_those_of_spectra_at_the_wavelength(imported, known):
     if known:
         parts["../spectra/loam.txt"] = "Name: loam\n\n1.0\t20.0\n2.0\t40.0 \n"
     made, _, _ = imported(device, legs('pulseFreq_hz="1000"'), parts=parts)
-    assert [m.reflectance for m in made.scenario.materials] == [None, 0.3] * known
+    assert [m.reflectance for m in made.scenario.materials] == [0.3, None] * known
     assert ("the spectrum 'loam', which is not there" in " ".join(made.left_out)) != known
 
 
@@ -413,7 +448,7 @@ def test_voxels_are_scene_files_where_light_goes_through_them(survey, tmp_path):
     assert built.scene.has_voxels.tolist() == [False, True]
     bounds = built.scene.object_bounds[1]
     assert bounds == pytest.approx(np.array([[3, 4, 5], [4, 5, 7]]), abs=0.021)
-    table = MaterialTable.of(built.survey.materials, built.scene.names)
+    table = MaterialTable.of(built.survey.materials, built.scene.surface_kinds)
     assert table.reflectance.tolist() == [0.3, 0.5]
     assert made.left_out[-2:] == [
         "part 1, ladlut: leaf angles are spherical",
@@ -472,7 +507,7 @@ def test_rasters_of_heights_are_scene_files(imported, tmp_path):
     assert np.allclose(bounds, [[105, 5, 8], [125, 25, 12]])  # middles of the pixels
     assert built.triangles == 6  # of cells whose corners all have heights
     assert of.pose(0).position[2] + built.origin[2] == pytest.approx(12.5)  # on the ground
-    assert made.scenario.materials[1].reflectance == 0.3
+    assert made.scenario.materials[0].reflectance == 0.3
 
 
 @pytest.mark.parametrize(

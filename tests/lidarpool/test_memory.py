@@ -55,7 +55,7 @@ ALERT = replace(MANY, max_range_m=150.0, optics=Optics(divergence_mrad=3.0))
 BOTH = [Mounted(ALERT, name="one"), Mounted(ALERT, name="other")]
 FAINT = {"detection_range_m": 500.0}
 EVERY = {"returns": Returns("all")}
-SIGN = {"materials": [Material("*", 0.5), Material("Sign", 1.0, retro=True)]}
+SIGN = {"materials": [Material("Sign", 1.0, retro=True), Material("*", 0.5)]}
 
 QUICK = ("positions", "one beam, on the move", "lost returns", "rain", "crosstalk")
 SURVEYS = {
@@ -73,12 +73,12 @@ SURVEYS = {
         MANY,
         **STILL,
         returns=Returns("all", 7, (3.0, 1.5), exit_diameter_m=0.01),
-        materials=[*HALF, Material("Ball", 0.5, leaf_area_density=0.02)],
+        materials=[Material("Ball", 0.5, leaf_area_density=0.02), *HALF],
     ),
     "water": Survey(
         MANY,
         **STILL,
-        materials=[*HALF, Material("Ball", 0.5, transparent="pass", refractive_index=1.33)],
+        materials=[Material("Ball", 0.5, transparent="pass", refractive_index=1.33), *HALF],
     ),
     "ghosts": Survey(
         MANY, **STILL, **EVERY, materials=[Material("*", 0.5, specular_reflectance=0.3)]

@@ -150,7 +150,7 @@ def test_an_actor_behind_glass_is_where_it_is_without(street, backend):
     found = []
     for meshes in ([], [pane]):
         scene = replace(Scene.from_meshes([*street.meshes(), *meshes]), actors=(CAR,))
-        materials = [Material("*", 0.5)] + [Material("Pane", transparent="pass") for _ in meshes]
+        materials = [Material("Pane", transparent="pass") for _ in meshes] + [Material("*", 0.5)]
         survey = Survey(
             load_sensor("velodyne/vlp16"), materials=materials, columns=COLUMNS, keep_every=1,
             **SURVEYS["standing"],
@@ -179,7 +179,7 @@ def test_no_ray_meets_an_actor_that_is_not_asked_about_it(street, monkeypatch, n
         "noise": {"trajectory": DRIVE, "noise": Noise(angle_deg=1)},
         "mirror": {
             **TURNED,
-            "materials": [Material("*", 0.5), Material("Mirror", specular_reflectance=1)],
+            "materials": [Material("Mirror", specular_reflectance=1), Material("*", 0.5)],
         },
     }
     scene = replace(Scene.from_meshes([*street.meshes(), MIRROR]), actors=(CAR,))

@@ -59,9 +59,9 @@ def everything():
         trajectory=Track([0, 0.5], [[0, 0, 1.2], [0.5, 0, 1.2]]),
         steps=4,
         materials=[
-            Material("*"),
-            Material("Crown*", leaf_area_density=0.5),
             Material("Sign", 0.5, retro=True),
+            Material("Crown*", leaf_area_density=0.5),
+            Material("*"),
         ],
         returns=Returns("all", 7, 20.0, waveform="peaks"),
         noise=NOISE,

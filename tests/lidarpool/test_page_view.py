@@ -381,17 +381,17 @@ def test_points_in_the_axes_of_their_sensor_are_shown_without_the_scene(cloud, p
 
 def test_columns_of_other_programs_can_be_coloured_and_filtered_by(tmp_path):
     """A cloud without scans, far from zero, with columns of one value or none."""
-    rows = np.zeros(20, [*((a, "<f8") for a in "xyz"), ("nx", "<f4"), ("2-a", "|u1"),
+    rows = np.zeros(20, [*((a, "<f8") for a in "xyz"), ("their", "<f4"), ("2-a", "|u1"),
                          ("nothing", "<f4"), ("big", "<f8")])  # fmt: skip
-    rows["x"], rows["nothing"], rows["big"], rows["nx"] = 5e6, np.nan, 1e18, np.arange(20)
-    lines = [*(f"property double {a}" for a in "xyz"), "property float nx", "property uchar 2-a",
+    rows["x"], rows["nothing"], rows["big"], rows["their"] = 5e6, np.nan, 1e18, np.arange(20)
+    lines = [*(f"property double {a}" for a in "xyz"), "property float their", "property uchar 2-a",
              "property float nothing", "property double big"]  # fmt: skip
     head = ["ply", "format binary_little_endian 1.0", "element vertex 20", *lines, "end_header", ""]
     (tmp_path / "theirs.ply").write_bytes("\n".join(head).encode() + rows.tobytes())
     view = open_result(tmp_path / "theirs.ply")
     state, arrays = told(view, "state")
     names = [column["name"] for column in state["columns"]]
-    assert names == ["z", "x", "y", "nx", "nothing", "big"]
+    assert names == ["z", "x", "y", "their", "nothing", "big"]
     assert "sweep_scans" not in arrays
     for name in names:
         limits, _ = told(view, "column", name=name)
@@ -399,7 +399,7 @@ def test_columns_of_other_programs_can_be_coloured_and_filtered_by(tmp_path):
         points, arrays = told(view, "points", colour=name, most=ALL)
         assert (points["count"], len(arrays["positions"])) == (20, 20)
         assert np.abs(arrays["positions"]).max() < 1
-    assert len(places(view, filter="nx,3,5")) == 3
+    assert len(places(view, filter="their,3,5")) == 3
 
 
 def test_causes_and_no_surface_are_told_in_words(tmp_path, pictured):

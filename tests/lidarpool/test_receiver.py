@@ -106,7 +106,7 @@ def width_ns(over):
 
 def full(meshes, noise=FULL, retro="none", **options):
     """Returns of one pulse; an object may be retro-reflective."""
-    materials = [*WHITE, Material(retro, 1.0, retro=True)] if retro != "none" else WHITE
+    materials = [Material(retro, 1.0, retro=True), *WHITE] if retro != "none" else WHITE
     return cast(meshes, noise=noise, materials=materials, columns=PULSES, **options)
 
 
@@ -265,7 +265,7 @@ def test_false_alarms_need_a_greatest_range():
 
 # -- blooming ------------------------------------------------------------------------------------
 
-SIGN = [Material("*", reflectance=0.5), Material("S", reflectance=1.0, retro=True)]
+SIGN = [Material("S", reflectance=1.0, retro=True), Material("*", reflectance=0.5)]
 
 
 def sign(x=20.0, half=0.25, y=0.0):

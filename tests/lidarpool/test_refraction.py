@@ -49,7 +49,7 @@ def pool(nadir_deg):
 def test_the_floor_of_a_pool(nadir_deg, surface, backend):
     """Range and energy in closed form; at right angles, the latter is Guenther's (n H + D)²."""
     floor = box("Floor", (-90, -90, -4), (90, 90, -DEPTH))
-    materials = [Material("*", 0.4), Material("Water", attenuation_per_m=LOSS, **WATER)]
+    materials = [Material("Water", attenuation_per_m=LOSS, **WATER), Material("*", 0.4)]
     found = cast(
         [surface, floor], ray(nadir_deg), (0, 0, HEIGHT), backend,
         materials=materials, visibility_km=0.5,
@@ -75,7 +75,7 @@ def test_light_that_meets_no_water_has_the_same_range_and_energy():
     meshes = [box("Pool", (-3, -3, -3), (-1, 3, -1)), box("Wall", (5, -9, -9), (6, 9, 9))]
     plain = cast(meshes, ray(70), visibility_km=0.3)
     wet = cast(
-        meshes, ray(70), visibility_km=0.3, materials=[Material("*"), Material("Pool", **WATER)]
+        meshes, ray(70), visibility_km=0.3, materials=[Material("Pool", **WATER), Material("*")]
     )
     assert wet["range"] == pytest.approx(plain["range"], rel=1e-12)
     assert wet["intensity"] == pytest.approx(plain["intensity"], rel=1e-6)
@@ -85,14 +85,14 @@ def test_water_of_the_index_of_air_is_not_there():
     meshes = [SURFACE, box("Floor", (-90, -90, -4), (90, 90, -2))]
     air = Material("Water", transparent="pass", refractive_index=1.0)
     plain = cast(meshes[1:], ray(50), (0, 0, 3))
-    found = cast(meshes, ray(50), (0, 0, 3), materials=[Material("*"), air])
+    found = cast(meshes, ray(50), (0, 0, 3), materials=[air, Material("*")])
     assert found["range"] == pytest.approx(plain["range"], rel=1e-6)
     assert found["intensity"] == pytest.approx(plain["intensity"], rel=1e-5)
 
 
 def test_the_surface_of_water_may_scatter_light_too():
     meshes = [SURFACE, box("Floor", (-90, -90, -4), (90, 90, -2))]
-    dull = [Material("*", 0.4), Material("Water", 0.05, **WATER)]
+    dull = [Material("Water", 0.05, **WATER), Material("*", 0.4)]
     found = cast(meshes, ray(0), (0, 0, 4), materials=dull, returns=Returns("all"))
     assert found["range"] == pytest.approx([4, 4 + 1.33 * 2])
     assert found["intensity"][0] == pytest.approx(0.05 * 100 / 16)
@@ -107,7 +107,7 @@ def test_a_sensor_under_water(surface):
         box("Floor", (-90, -90, -9), (90, 90, -4)),
         box("Wall", (30, -90, 5), (31, 90, 90)),
     )
-    materials = [Material("*", 0.5), Material("Water", **WATER)]
+    materials = [Material("Water", **WATER), Material("*", 0.5)]
     found = cast([surface, floor], ray(0), (0, 0, -1), materials=materials)
     assert found["range"] == pytest.approx([1.33 * 3], abs=4e-4)
     assert found["intensity"] == pytest.approx([0.5 * 100 / 9], rel=1e-4), "as 3 m in the air"
@@ -143,7 +143,7 @@ def test_a_thick_pane_shifts_light_and_makes_the_way_longer(turn_deg, backend):
     if shift:
         side.append(box("Step", (59, -90, -90), (61, -0.9 * shift, 90)))
         side.append(box("Other", (59, 0.9 * shift, -90), (61, 90, 90)))
-    materials = [Material("*", 0.5), Material("Pane", transparent="pass", refractive_index=1.5)]
+    materials = [Material("Pane", transparent="pass", refractive_index=1.5), Material("*", 0.5)]
     found = cast([pane, *side], ray(), backend=backend, materials=materials)
     path = thick / math.cos(within)
     air = 60 - path * math.cos(angle - within)
@@ -165,7 +165,7 @@ def test_water_in_a_tank_of_glass():
     )
     wall = box("Wall", (20, -9, -9), (21, 9, 9))
     glass = Material("Tank", transparent="pass", refractive_index=1.5)
-    materials = [Material("*", 0.5), glass, Material("Filling", **WATER)]
+    materials = [Material("Filling", **WATER), glass, Material("*", 0.5)]
     found = cast([tank, water, wall], ray(), materials=materials)
     assert found["range"] == pytest.approx([16 + 1.5 * 0.2 + 1.33 * 3.8], abs=4e-4)
     one = np.ones(1)
@@ -193,7 +193,7 @@ def test_water_may_touch_its_basin(nadir_deg, backend):
         box("Left", (-9, -9, -2), (-3, 9, 0.1)),
         box("Right", (3, -9, -2), (9, 9, 0.1)),
     ]
-    materials = [Material("*"), Material("Water", **WATER)]
+    materials = [Material("Water", **WATER), Material("*")]
     found = cast(meshes, ray(nadir_deg), (0, 0, 3), backend, materials=materials)
     angle = math.radians(abs(nadir_deg))
     below = math.asin(math.sin(angle) / 1.33)
@@ -208,7 +208,7 @@ def test_greatest_ranges_are_optical(max_range_m, count):
     sensor = ray(max_range_m=max_range_m)
     water = box("Water", (-9, -9, -9), (9, 9, 9))
     floor = box("Floor", (-5, -5, -3), (5, 5, -2))
-    materials = [Material("*"), Material("Water", **WATER)]
+    materials = [Material("Water", **WATER), Material("*")]
     down = Pose((0, 0, 0), pitch_deg=90.0)
     found = cast([water, floor], sensor, down, materials=materials)
     assert len(found["range"]) == count
@@ -217,7 +217,7 @@ def test_greatest_ranges_are_optical(max_range_m, count):
 def test_water_in_the_thickest_fog_has_no_energy_that_is_no_number():
     water = box("Water", (-900, -90, -90), (-5, 90, 90))
     floor = box("Floor", (-902, -90, -90), (-899, 90, 90))
-    materials = [Material("*"), Material("Water", **WATER)]
+    materials = [Material("Water", **WATER), Material("*")]
     behind = Pose((0, 0, 0), yaw_deg=180.0)
     with np.errstate(over="raise", invalid="raise"):
         found = cast([water, floor], ray(), behind, materials=materials, visibility_km=0.001)

@@ -467,7 +467,7 @@ def test_a_scenario_has_its_robot_and_its_sensor_on_a_link(folder):
                                        {"time_s": 8, "position": [9, 1, 0]}]}},
         ],
         "mount": {"link": "lidar", "position": [0, 0, 0.036], "yaw_deg": 90},
-        "materials": [{"objects": "*"}, {"objects": "Rover/*wheel", "reflectance": 0.1}],
+        "materials": [{"objects": "Rover/*wheel", "reflectance": 0.1}, {"objects": "*"}],
     }  # fmt: skip
     built = build(Scenario.from_data(data, folder=folder))
     actors = {actor.name: actor for actor in built.scene.actors}
@@ -484,7 +484,7 @@ def test_a_scenario_has_its_robot_and_its_sensor_on_a_link(folder):
     (carried,) = survey.carried
     assert np.allclose(carried.mount.position, (-0.36, 0, 1.076))
     assert carried.mount.yaw_deg == pytest.approx(90)
-    kinds = {name: [m for m in survey.materials if m.named(name)][-1] for name in actors}
+    kinds = {name: next(m for m in survey.materials if m.named(name)) for name in actors}
     assert kinds["Rover/rear_left_wheel"].reflectance == 0.1
     assert {kinds[name].semantic_class == 7 for name in actors if "Rover/" in name} == {True}
     assert kinds["Arm/base_link"].semantic_class != 7

@@ -117,12 +117,12 @@ def survey():
     ]
     scene = Scene.from_meshes(walls).with_actors([Actor(capsule(0.9, 0.6, 24, "Car"), way)])
     materials = [
-        Material("*", 0.3, roughness=0.4),
-        Material("Mirror", 0.9, specular_reflectance=1),
-        Material("Water", 0.1, transparent="pass", refractive_index=1.33, attenuation_per_m=0.3),
-        Material("Pane", 0.1, transparent="pass", specular_reflectance="fresnel"),
-        Material("Tree", 0.4, leaf_area_density=1.2, leaf_angle=1.7),
         Material("Sign", 0.9, retro=True),
+        Material("Tree", 0.4, leaf_area_density=1.2, leaf_angle=1.7),
+        Material("Pane", 0.1, transparent="pass", specular_reflectance="fresnel"),
+        Material("Water", 0.1, transparent="pass", refractive_index=1.33, attenuation_per_m=0.3),
+        Material("Mirror", 0.9, specular_reflectance=1),
+        Material("*", 0.3, roughness=0.4),
     ]
     noise = Noise(
         range_m=0.02, range_per_m=1e-4, angle_deg=0.02, dropout=0.01, detection_range_m=80.0,

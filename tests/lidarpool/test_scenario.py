@@ -19,7 +19,7 @@ from lidarpool.scenario.advice import advice
 from lidarpool.scenario.build import build
 from lidarpool.scenario.scenario import Scenario
 from lidarpool.sensor import Noise, Returns, Sensor, Survey
-from lidarpool.sensor.materials import MaterialTable
+from lidarpool.sensor.materials import MaterialTable, SurfaceKinds
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 DEFAULT = Survey(Sensor.grid(), poses=[(0, 0, 1), (0, 0, 2), (0, 0, 3)], keep_every=5)
@@ -348,8 +348,8 @@ def test_materials_returns_noise_and_weather_become_those_of_the_survey():
         {
             "sensor": {"model": "ouster/os1-64"},
             "materials": [
-                {"objects": "*", "reflectance": 0.3, "class": 7},
                 {"objects": ["V*", "Bowl"], "transparent": "pass"},
+                {"objects": "*", "reflectance": 0.3, "class": 7},
             ],
             "actors": [
                 {"name": "Van", "box": [4, 2, 2], "class": 9, "trajectory": {"points": points}}
@@ -364,7 +364,9 @@ def test_materials_returns_noise_and_weather_become_those_of_the_survey():
     assert survey.noise == Noise(0.02, seed=3)
     assert survey.visibility_km == 2
     assert survey.precision_m == 0.001, "the sensor's"
-    table = MaterialTable.of(survey.materials, ["Sphere", "Vase", "Bowl", "Van"])
+    table = MaterialTable.of(
+        survey.materials, SurfaceKinds.of_objects(["Sphere", "Vase", "Bowl", "Van"])
+    )
     assert table.semantic_class.tolist() == [7, 0, 0, 9], "an actor's own class"
     assert table.reflectance.tolist() == [0.3, 0, 0, 0], "with the rest of its material"
     assert table.passes.tolist() == [False, True, True, True]

@@ -46,9 +46,9 @@ PHYSICS = [
     {"returns": Returns("all", 7, 3.0), "noise": Noise(0.02, angle_deg=0.05, seed=5)},
     {
         "materials": [
-            Material("*", 0.5, semantic_class=2),
-            Material("Sphere*", specular_reflectance=1),
             Material(["Crate", "Bush.?"], transparent="pass"),
+            Material("Sphere*", specular_reflectance=1),
+            Material("*", 0.5, semantic_class=2),
         ],
         "returns": Returns("dual"),
         "visibility_km": 1.0,

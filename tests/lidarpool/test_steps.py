@@ -45,7 +45,7 @@ COMMON = {
     "sensors": [Mounted(LIDAR, name="one"), Mounted(LIDAR, name="other")],
     "poses": [(0, 0, 2)],
     "columns": OPTIONAL_NAMES,
-    "materials": [Material("*", 0.4), Material("Sphere", 0.9, retro=True)],
+    "materials": [Material("Sphere", 0.9, retro=True), Material("*", 0.4)],
     "noise": NOISE,
     "rain_mm_h": 20,
     "faults": FAULTS,

@@ -291,8 +291,8 @@ def test_classes_are_of_vehicles_alone_and_leave_their_materials(tmp_path):
         {"vehicles": [{"types": "walk*", "box": [1, 1, 1]}, {"box": [4, 2, 1.5], "class": 10}]},
         scene={"ground": {}, "copies": [{"name": "House (old)", "box": [1, 1, 1], "at": [[0, 9]]}]},
         materials=[
-            {"objects": "*", "reflectance": 0.3, "class": 2},
             {"objects": "car (a.1)", "reflectance": 0.1},
+            {"objects": "*", "reflectance": 0.3, "class": 2},
         ],
     )
     job = build(read).job()

@@ -216,7 +216,7 @@ def test_energies_are_those_of_the_twin(extinction):
     ahead, normals = (v / np.linalg.norm(v, axis=1)[:, None] for v in (ahead, normals))
     triangle = (2 * wall + rng.integers(0, 2, 1000)).astype(np.int32)
     lit = surfaces.lit(triangle, ahead, distance, light, np.zeros(1000), ())
-    assert lit.objects.tolist() == wall.tolist()
+    assert lit.kinds.tolist() == wall.tolist()
     assert np.allclose(lit.along, (normals[wall] * ahead).sum(axis=1), 0, 1e-6)
     cosine = np.abs(lit.along)
     back = np.where(wall == 1, 0.8 * 220, 0.3 * cosine)
@@ -234,7 +234,7 @@ def test_what_the_air_returns_is_as_in_the_twin(weather, each):
     noise = Noise(detection_range_m=100.0, overlap_m=4.0, seed=9)
     sensor = Sensor(Beams([0.0]), Spin(1, 360), 0.5, 150, optics=Optics(divergence_mrad=3))
     options = {"noise": noise, "returns": Returns("all", subrays=each), **weather}
-    materials = Material("*"), Material("Pane", transparent="pass")
+    materials = Material("Pane", transparent="pass"), Material("*")
     survey = Survey(sensor, poses=[(0, 0, 0)], steps=1, materials=materials, **options)
     corners = (0, 0, 0), (1, 0, 0), (1, 1, 0), (0, 1, 0)
     scene = Scene.from_meshes([quad(name, *corners) for name in ("Wall", "Pane")])

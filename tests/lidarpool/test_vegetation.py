@@ -53,7 +53,7 @@ def test_leaves_that_no_ray_meets_change_nothing():
     options = {"returns": Returns("all", subrays=19, divergence_mrad=20)}
     leaves = Material("Leaves", leaf_area_density=1.0)
     bare = cast(scene[:1], sensor, (0, 0, 0), materials=[GROUND], **options)
-    found = cast(scene, sensor, (0, 0, 0), materials=[GROUND, leaves], **options)
+    found = cast(scene, sensor, (0, 0, 0), materials=[leaves, GROUND], **options)
     assert len(bare["range"]) > 150
     for column in ("range", "intensity", "ray"):
         assert np.array_equal(bare[column], found[column])
@@ -99,7 +99,7 @@ def test_gaps_of_a_canopy_are_those_of_its_leaf_area_index(leaf_angle, nadir_deg
         box("Leaves", (-90, -90, 0), (90, 90, 3)),
         box("F", (-99, -99, -2), (99, 99, -1)),
     )
-    materials = [GROUND, Material("Leaves", leaf_area_density=0.6, leaf_angle=leaf_angle)]
+    materials = [Material("Leaves", leaf_area_density=0.6, leaf_angle=leaf_angle), GROUND]
     found = cast([canopy, floor], rays(nadir_deg=nadir_deg), (0.3, 0.1, 10), materials=materials)
     cosine = math.cos(math.radians(nadir_deg))
     tau = projection(leaf_angle, np.array([cosine]))[0] * 1.8 / cosine
@@ -114,7 +114,7 @@ def test_gaps_of_a_canopy_are_those_of_its_leaf_area_index(leaf_angle, nadir_deg
 def test_leaves_are_as_bright_as_they_face_the_light():
     canopy, floor = box("Leaves", (-9, -9, 0), (9, 9, 3)), box("F", (-9, -9, -2), (9, 9, -1))
     leaves = Material("Leaves", 0.5, leaf_area_density=1.0, leaf_angle="planophile")
-    found = cast([canopy, floor], rays(2000, 0.0), (0, 0, 10), materials=[GROUND, leaves])
+    found = cast([canopy, floor], rays(2000, 0.0), (0, 0, 10), materials=[leaves, GROUND])
     on = found["object"] == 0
     bright = brightness("planophile", np.ones(1))[0]
     expected = 0.5 * bright * (10 / found["range"][on]) ** 2
@@ -122,7 +122,7 @@ def test_leaves_are_as_bright_as_they_face_the_light():
     # Of the whole cone, the mean over sub-rays is the gap's: each meets leaves by itself.
     beam = Returns("all", subrays=37, divergence_mrad=1)
     cone = cast(
-        [canopy, floor], rays(4000, 0.0), (0, 0, 10), materials=[GROUND, leaves], returns=beam
+        [canopy, floor], rays(4000, 0.0), (0, 0, 10), materials=[leaves, GROUND], returns=beam
     )
     tau = projection("planophile", np.ones(1))[0] * 3
     ground = cone["intensity"][cone["object"] == 1].sum() / 4000
@@ -133,7 +133,7 @@ def test_leaves_are_as_bright_as_they_face_the_light():
 def test_moved_and_turned_crowns_hold_the_same_leaves():
     """Instances, mirrored ones too, and actors; and meshes whose triangles wind inwards."""
     crown, wall = ball("Crown", 1.0), box("Wall", (9, -9, -9), (10, 9, 9))
-    materials = [GROUND, Material("Crown", leaf_area_density=0.8)]
+    materials = [Material("Crown", leaf_area_density=0.8), GROUND]
     inwards = SceneMesh("Crown", crown.vertices * 2 + (4, 0, 0), crown.faces[:, ::-1])
     mirrored = np.diag([2.0, -2, 2, 1])
     mirrored[0, 3] = 4
@@ -179,10 +179,10 @@ def test_a_leaf_angle_without_leaves_is_refused():
 
 ALL_ON = {
     "materials": [
-        Material("*", 0.4),
-        Material("Crown", 0.5, leaf_area_density=0.8, leaf_angle=1.7),
-        Material("Bush", 0.5, leaf_area_density=2.0, leaf_angle="erectophile"),
         Material("Window", transparent="pass", refractive_index=1.5, attenuation_per_m=0.3),
+        Material("Bush", 0.5, leaf_area_density=2.0, leaf_angle="erectophile"),
+        Material("Crown", 0.5, leaf_area_density=0.8, leaf_angle=1.7),
+        Material("*", 0.4),
     ],
     "returns": Returns(
         "all", 7, [9.0, 3.0], beam_profile="gaussian", exit_diameter_m=0.02, pulse_ns=2
@@ -199,7 +199,7 @@ def test_layers_that_touch_each_other(backend, order):
     """As voxels do: six of them side by side are one of six metres."""
     layers = [box(f"Voxel{x}", (x, -9, -9), (x + 1, 9, 9)) for x in range(2, 8)][::order]
     wall = box("Wall", (8, -9, -9), (10, 9, 9))
-    materials = [GROUND, Material("Voxel*", leaf_area_density=0.4)]
+    materials = [Material("Voxel*", leaf_area_density=0.4), GROUND]
     found = cast(
         [*layers, wall],
         rays((backend == "embree" and MANY) or 10_000, 91.0),
@@ -216,7 +216,7 @@ def test_a_wood_of_crowns_that_overlap_anyhow():
     """From within and outside, gaps are those of the chords of all ellipsoids, added up."""
     rng = np.random.default_rng(3)
     unit = trimesh.creation.icosphere(4, 1.0007)  # of the volume of the sphere
-    kinds, meshes, materials, crowns = ("spherical", "planophile", 0.5), [], [Material("*")], []
+    kinds, meshes, materials, crowns = ("spherical", "planophile", 0.5), [], [], []
     for number in range(24):
         centre, radii = rng.uniform(-5, 5, 3), rng.uniform(0.8, 3, 3)
         inwards = np.array(unit.faces)[:, :: -1 if number % 4 == 0 else 1]
@@ -227,7 +227,7 @@ def test_a_wood_of_crowns_that_overlap_anyhow():
     meshes.append(ball("Sky", 60.0, fineness=2))
     sensor = Sensor(Beams(np.radians(np.linspace(-75, 75, 30))), Spin(100, 360))
     places = rng.uniform(-6, 6, (8, 3))
-    survey = Survey(sensor, poses=places.tolist(), steps=1, materials=materials)
+    survey = Survey(sensor, poses=places.tolist(), steps=1, materials=[*materials, Material("*")])
     rig = Rig(Scene.from_meshes(meshes), survey, CPU[-1])
     ahead = sensor.directions(np.arange(100)).reshape(-1, 3)
     off, variance = 0.0, 0.0

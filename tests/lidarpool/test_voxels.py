@@ -187,12 +187,12 @@ def test_an_even_grid_is_the_box_with_that_density(tmp_path, nadir_deg):
     whole = box("T", (3, -6, -6), (5.5, 6, 6))
     sensor = rays(nadir_deg=nadir_deg)
     kind = {"leaf_angle": "planophile"}
-    one = cast([grid, wall], sensor, AT, materials=[GROUND, Material("T", **kind)])
+    one = cast([grid, wall], sensor, AT, materials=[Material("T", **kind), GROUND])
     other = cast(
         [whole, wall],
         sensor,
         AT,
-        materials=[GROUND, Material("T", leaf_area_density=0.3, **kind)],
+        materials=[Material("T", leaf_area_density=0.3, **kind), GROUND],
     )
     assert np.array_equal(one["object"], other["object"])
     assert one["range"] == pytest.approx(other["range"], abs=1e-4)
@@ -206,7 +206,7 @@ def test_gaps_and_depths_of_layers_follow_beer_and_lambert(tmp_path, backend):
     density = np.broadcast_to(profile, (40, 40, 6))
     mesh = tree(tmp_path / "T.vox", density, low=(-20, -20, 0))
     floor = box("Floor", (-99, -99, -2), (99, 99, -1))
-    materials = [GROUND, Material("T", leaf_angle="erectophile")]
+    materials = [Material("T", leaf_angle="erectophile"), GROUND]
     sensor, slant = rays(nadir_deg=40.0), 1 / math.cos(math.radians(40))
     found = cast([mesh, floor], sensor, (-5, 0.02, 10), backend=backend, materials=materials)
     crossing = projection("erectophile", np.array([1 / slant]))[0] * slant
@@ -275,7 +275,7 @@ def test_crowns_and_grids_that_overlap_add_up(tmp_path):
     two = tree(tmp_path / "Two.vox", np.full((8, 16, 16), 0.6), low=(7, -4, -4), size=0.5)
     ivy = box("Ivy", (7, -4, -4), (9, 4, 4))
     wall = box("Wall", (20, -9, -9), (21, 9, 9))
-    materials = [GROUND, Material("Ivy", leaf_area_density=0.4)]
+    materials = [Material("Ivy", leaf_area_density=0.4), GROUND]
     found = cast([one, two, ivy, wall], rays(), AT, materials=materials)
     before, among, behind = 0.1 * 2, 0.6 * 2, 0.3 * 2
     stop = math.exp(-before) * (1 - math.exp(-among))
@@ -307,10 +307,10 @@ def test_batches_blocks_and_backends_leave_no_trace(tmp_path, path, monkeypatch)
         box("Ground", (-30, -30, -3), (30, 30, -2)),
     ]
     materials = [
-        Material("*", 0.4),
-        Material("T*", 0.5, leaf_angle=1.7),
-        Material("Bush", 0.5, leaf_area_density=2.0, leaf_angle="erectophile"),
         Material("Window", transparent="pass", refractive_index=1.5, attenuation_per_m=0.3),
+        Material("Bush", 0.5, leaf_area_density=2.0, leaf_angle="erectophile"),
+        Material("T*", 0.5, leaf_angle=1.7),
+        Material("*", 0.4),
     ]
     sensor = Sensor(Beams(np.radians([-20, -5, 0, 12])), Spin(360, step_deg=30), 0.5, 20)
     survey = Survey(sensor, steps=12, keep_every=2, **{**ALL_ON, "materials": materials}, **path)
@@ -366,8 +366,8 @@ scene:
   copies: [{name: Oak, file: oak.vox, at: [{position: [9, 1, 0], yaw_deg: 30}]}]
   ground: {}
 materials:
+  - {objects: ["oak", "Oak*"], spectrum: "leaf, green", leaf_angle: planophile}
   - {objects: "*", reflectance: 0.3}
-  - {objects: ["oak", "Oak*"], material: "leaf, green", leaf_angle: planophile}
 planning: {enabled: false}
 """
     )

@@ -41,7 +41,7 @@ FILES: dict[str, tuple[str, bytes | None, str]] = {
 RETURNS = {
     "materials: [{objects: V*, reflectance: 0.3}]": "no entry names the object",
     "materials: [{objects: ['*', Vace]}]": "no object has that name. Did you mean 'Vase'?",
-    "materials: [{objects: '*'}, {objects: Q*}]": "'Q*', but no object has that name. There are ",
+    "materials: [{objects: Q*}, {objects: '*'}]": "'Q*', but no object has that name. There are ",
     "returns: {subrays: 19}": "the sensor has no divergence: give returns.divergence_mrad",
     "noise: {range_m: -0.01}": "noise.range_m is -0.01",
     "cloud: {columns: [intensities]}": "Did you mean 'intensity'?",

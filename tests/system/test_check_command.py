@@ -153,7 +153,7 @@ def test_each_file_has_a_line_that_says_what_it_gave(check, tmp_path):
     assert "38 triangles, in m, Y-up, 1 texture, 2 plain colours\n" in told
     assert "in cm, Z-up, no colours\n" in told and "are grey" not in told
     scenario["materials"] = [
-        {"objects": "*", "reflectance": "texture"}, {"objects": "m", "reflectance": 0.5}
+        {"objects": "m", "reflectance": 0.5}, {"objects": "*", "reflectance": "texture"}
     ]  # fmt: skip
     told = check("--no-plan", text=json.dumps(scenario)).out
     assert "note: 4 of 8 objects with reflectance: texture have no colours and are grey: " in told

@@ -31,9 +31,9 @@ SURVEY = Survey(
     keep_every=1,
     columns=OPTIONAL,
     materials=[
-        Material("*", 0.4, semantic_class=300),
-        Material(["V*", "S*"], 0.1, transparent="pass"),
         Material("Bowl", specular_reflectance=1),
+        Material(["V*", "S*"], 0.1, transparent="pass"),
+        Material("*", 0.4, semantic_class=300),
     ],
     returns=Returns("dual", subrays=7, divergence_mrad=20, pulse_ns=2),
     noise=Noise(0.02, 0.001, 0.05, dropout=0.1, detection_range_m=80, seed=5),
@@ -56,10 +56,10 @@ EVERY_EFFECT = Survey(
     keep_every=1,
     columns=OPTIONAL,
     materials=[
-        Material("*", 0.4, semantic_class=300),
-        Material("Vase", 0.5, leaf_area_density=0.5),
-        Material("Sphere", 0.1, transparent="pass", refractive_index=1.33, attenuation_per_m=0.1),
         Material("Bowl", 0.5, retro=True, specular_reflectance=0.3),
+        Material("Sphere", 0.1, transparent="pass", refractive_index=1.33, attenuation_per_m=0.1),
+        Material("Vase", 0.5, leaf_area_density=0.5),
+        Material("*", 0.4, semantic_class=300),
     ],
     returns=Returns(
         "all",

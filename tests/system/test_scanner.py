@@ -19,7 +19,7 @@ from lidarpool.scene.actors import box
 
 OPTIONS = {
     "columns": [column.name for column in OPTIONAL],
-    "materials": [Material("*", 0.4, semantic_class=3), Material("Bowl", specular_reflectance=1)],
+    "materials": [Material("Bowl", specular_reflectance=1), Material("*", 0.4, semantic_class=3)],
     "returns": Returns("dual", subrays=7, divergence_mrad=10),
     "noise": Noise(0.02, angle_deg=0.05, dropout=0.1, seed=5),
     "visibility_km": 2.0,

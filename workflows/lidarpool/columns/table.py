@@ -24,6 +24,10 @@ NO_SURFACE = "no surface"  # instead of an object's name
 CAUSES = ("surface", "air", "false alarm", "crosstalk", "blooming", "ghost", "spray")  # of a return
 VELOCITY = "radial_velocity"
 COORDINATES = ("world", "sensor")  # coordinate systems of points
+NORMAL = ("normal_x", "normal_y", "normal_z")
+ORIGIN = ("origin_x", "origin_y", "origin_z")
+VECTORS = (NORMAL, ORIGIN)  # columns that are of use together only
+SURFACE_COLUMNS = (*NORMAL, "incidence_deg", *ORIGIN)
 _OPEN3D = ("positions", "normals", "colors")  # Open3D, which writes the files
 
 
@@ -182,6 +186,14 @@ OPTIONAL = (
         kind="label",
     ),
     Column(
+        "material",
+        "int32",
+        "",
+        "material of the face in the scene's file; -1 for none",
+        "material_number",
+        kind="label",
+    ),
+    Column(
         "cause",
         "uint8",
         "",
@@ -190,6 +202,27 @@ OPTIONAL = (
     ),
     Column("sensor", "uint8", "", "sensor of the carrier, from 0", "sensor_number", kind="label"),
     Column("triangle", "int32", "", "triangle of the scene that was hit"),
+    *(
+        Column(
+            f"normal_{axis}",
+            "float32",
+            "",
+            f"{axis} of the surface's unit normal, on the side that was hit; NaN without a surface",
+            coordinates="world",
+            file_name=f"n{axis}",
+        )
+        for axis in "xyz"
+    ),
+    Column(
+        "incidence_deg",
+        "float32",
+        "deg",
+        "angle between the ray and the surface's normal, 0 to 90; NaN without a surface",
+    ),
+    *(
+        Column(f"origin_{axis}", "float64", "m", f"{axis} of the ray's origin", coordinates="world")
+        for axis in "xyz"
+    ),
     Column("red", "uint8", "", "red of the surface, sRGB; what has no colour is grey, 188"),
     Column("green", "uint8", "", "green of the surface, sRGB"),
     Column("blue", "uint8", "", "blue of the surface, sRGB"),
@@ -202,8 +235,8 @@ TABLE = {column.name: column for column in (SCAN, *ALWAYS, *OPTIONAL)}  # {name:
 def chosen(columns: Iterable[str | Column]) -> tuple[Column, ...]:
     """Columns in addition to `ALWAYS`, each once, with names looked up in `TABLE`.
 
-    LidarpoolError if there is no column of a name, two have the same name, or a name cannot be
-    written.
+    LidarpoolError if there is no column of a name, two have the same name, a vector lacks an axis,
+    or a name cannot be written.
     """
     kept: dict[str, Column] = {}
     names = {column.in_files: column for column in TABLE.values()} | TABLE
@@ -221,6 +254,12 @@ def chosen(columns: Iterable[str | Column]) -> tuple[Column, ...]:
         ):
             raise LidarpoolError(f"Two columns have the name {column.name!r}: rename one.")
         kept[column.name] = column
+    for vector in VECTORS:
+        if 0 < len(kept.keys() & {*vector}) < len(vector):
+            raise LidarpoolError(
+                f"The columns {', '.join(vector)} are one vector, which formats turn to other "
+                "axes: give all three."
+            )
     rest = tuple(column for column in kept.values() if column not in (SCAN, *ALWAYS))
     check_names((SCAN, *ALWAYS, *rest))
     return rest

@@ -179,6 +179,7 @@ class DataSet:
             of_sensors = np.bincount(sweeps.sensor, minlength=len(sweeps.sensors)).tolist()
             manifest |= {"sensors": [*zip(sweeps.sensors, of_sensors, strict=True)]}
             manifest |= {"classes": dict(sweeps.classes)} if sweeps.classes else {}
+            manifest |= {"materials": sweeps.materials} if sweeps.materials else {}
             manifest |= {"made_of": made_of, "files": dict(sorted(place.files.items()))}
             # Of its row, what every run gives.
             row_ = asdict(replace(row, seconds=0.0))

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import uuid
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, nullcontext
 from itertools import count
 from pathlib import Path
 from types import SimpleNamespace
@@ -16,14 +16,24 @@ from pye57 import libe57
 
 from ..base.fingerprint import fingerprint
 from ..columns.cloud import Cloud, CloudLike
-from ..columns.table import COLOURS
+from ..columns.table import COLOURS, NORMAL
 from .sweeps import Sweeps
+
+_NORMALS_URI = "http://www.libe57.org/E57_NOR_surface_normals.txt"
+_FIELDS = {f"nor:normal{name[-1].upper()}": name for name in NORMAL}  # {field: column}
 
 
 def write_e57(path: Path, cloud: CloudLike, sweeps: Sweeps) -> None:
-    """Write each sweep that has points, in the sensor's axes: pose, intensity, colours."""
+    """Write each sweep that has points, in the sensor's axes: pose, intensity, colours, normals.
+
+    Normals are those of the extension for surface normals; 0, 0, 0 without a surface.
+    """
     content = fingerprint(sweeps, len(cloud), np.asarray(cloud.bounds))
-    with _named_by(content), pye57.E57(str(path), mode="w") as file:
+    normals = {*NORMAL} <= {column.name for column in cloud.table}
+    kind, fields = (_WithNormals, _normal_fields) if normals else (pye57.E57, nullcontext)
+    with _named_by(content), fields(), kind(str(path), mode="w") as file:
+        if normals:
+            file.image_file.extensionsAdd("nor", _NORMALS_URI)
         try:
             for sweep, points in enumerate(sweeps.points(cloud)):
                 if len(points):
@@ -41,9 +51,39 @@ def _write_scan(file: Any, sweeps: Sweeps, sweep: int, points: Cloud) -> None:
         data["intensity"] = points["intensity"]
     if {*COLOURS} <= {*points.columns}:
         data |= {f"color{name.capitalize()}": points[name] for name in COLOURS}
+    if {*NORMAL} <= {*points.columns}:
+        columns = sweeps.columns_in_sensor(sweep, points)
+        data |= {field: np.nan_to_num(columns[name]) for field, name in _FIELDS.items()}
     turn = np.roll(sweeps.pose.quaternions[sweep], 1)  # w first
     place = sweeps.pose.positions[sweep]
     file.write_scan_raw(data, name=f"sweep {sweep}", rotation=turn, translation=place)
+
+
+class _WithNormals(pye57.E57):
+    """A file whose scans have normals; pye57 leaves them out."""
+
+    def make_buffers(self, field_names: Sequence[str], *given: Any, **options: Any) -> Any:
+        """Add the buffers of normals."""
+        return super().make_buffers([*field_names, *_FIELDS], *given, **options)
+
+
+@contextmanager
+def _normal_fields() -> Iterator[None]:
+    """Have pye57 write fields of normals."""
+    known, library = pye57.e57.SUPPORTED_POINT_FIELDS, pye57.e57.libe57
+
+    def vector_node(image_file: Any, prototype: Any, codecs: Any) -> Any:
+        for field in _FIELDS:
+            node = libe57.FloatNode(image_file, 0.0, libe57.E57_SINGLE, -1.0, 1.0)
+            prototype.set(field, node)
+        return libe57.CompressedVectorNode(image_file, prototype, codecs)
+
+    pye57.e57.SUPPORTED_POINT_FIELDS = known | dict.fromkeys(_FIELDS, "f")
+    pye57.e57.libe57 = SimpleNamespace(**vars(libe57) | {"CompressedVectorNode": vector_node})
+    try:
+        yield
+    finally:
+        pye57.e57.SUPPORTED_POINT_FIELDS, pye57.e57.libe57 = known, library
 
 
 @contextmanager

@@ -48,7 +48,10 @@ LAYOUTS = {
     "images": ("intensity", "time", *_ALL_RAYS),
 }
 _COLOURS = ("red", "green", "blue")
-_E57 = ("intensity", *_COLOURS)
+_SURFACES = (
+    "normal_x", "normal_y", "normal_z", "incidence_deg", "origin_x", "origin_y", "origin_z",
+)  # fmt: skip
+_E57 = ("intensity", *_COLOURS, *_SURFACES[:3])
 _LAS = ("laspy", "lazrs")
 _LABELS = ("object", "intensity", "class")
 _RINGS = ("channel", "intensity")
@@ -56,7 +59,7 @@ _BAG = (
     False,
     ("rosbags",),
     ("scan", "object", "channel"),
-    ("channel", *_COLOURS, "radial_velocity"),
+    ("channel", *_COLOURS, "radial_velocity", *_SURFACES, "material"),
     ("class",),
     LAYOUTS,
 )

@@ -118,7 +118,8 @@ class Pieces(pieces.Pieces):
         sweeps = self.sweeps
         image = Image.of(sweeps, number, points)
         inside = sweeps.in_sensor(number, points.positions).astype(np.float32)
-        columns = {name: values for name, values in points.columns.items() if name not in _OF_RAYS}
+        columns = sweeps.columns_in_sensor(number, points)
+        columns = {name: values for name, values in columns.items() if name not in _OF_RAYS}
         columns |= dict(zip("xyz", inside.T, strict=True))
         arrays: dict[str, Any] = image.of_rays()
         for name, values in columns.items():

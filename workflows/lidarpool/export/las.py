@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from datetime import UTC, date, datetime
 from functools import partial
 from importlib import import_module
@@ -22,19 +23,26 @@ from laspy.vlrs.known import WaveformPacketStruct, WaveformPacketVlr, WktCoordin
 from ..base.errors import LidarpoolError
 from ..base.interrupts import deferred_interrupts
 from ..columns.cloud import Cloud, CloudLike
-from ..columns.table import COLOURS, TABLE
+from ..columns.table import COLOURS, NORMAL, TABLE
 from ..columns.waveforms import WAVEFORM, ZERO, records
 from .sweeps import Sweeps
 
 ANGLE_DEG = 0.006  # of one step of the format's scan angle
 FULL = 65_535  # the format's intensity for 1 and above
 _OF_FORMAT = ("return_number", "returns", "azimuth")  # stored only in fields of the format
+# Names of columns in the extra bytes: a field of the format is called intensity, and normals have
+# the names of PDAL's dimensions.
+_NAMES = {
+    "intensity": "energy",
+    **{TABLE[name].in_files: f"Normal{name[-1].upper()}" for name in NORMAL},
+}
 _GPS_NS = 315_964_800 * 10**9  # from 1970-01-01 to 1980-01-06, the start of GPS time
 _LEAP_S = 18  # that GPS time is ahead of UTC since 2017, the earliest start
 _ADJUSTED_S = 1e9  # that adjusted standard GPS time is behind GPS time
 _EVLR = Struct("<H16sHQ32s")  # head of an extended variable length record
 # Of the header: where the waveform packets and the first such record begin, and their number.
 _WAVES_AT, _WAVES = 227, Struct("<QQI")
+_VLR_MOST = 65_535  # bytes of a variable length record
 _FAR = 2**31 - 1  # steps from the offset to the farthest point
 # Coordinate systems with UTM zones: name, datum, ellipsoid, 1 / flattening, and their EPSG codes.
 _WGS84 = ("WGS 84", "WGS_1984", "WGS 84", 298.257223563, (4326, 6326, 7030))
@@ -53,7 +61,8 @@ def _write(path: Path, cloud: CloudLike, sweeps: Sweeps, *, compress: bool) -> N
     `green` and `blue` the point format is 7, and colours are 257 times these, 16 bits. Intensity is
     the column `intensity` times 65,535, at most that, and classification `class` if it is below
     256; because of these limits, both columns are in the extra bytes as well. Of these classes, the
-    lookup has 15 letters of the names, ASCII. Return numbers are 15 at most, and angles in steps of
+    lookup has 15 letters of the names, ASCII. Names of materials are a record of lidarpool, a list
+    as JSON. Return numbers are 15 at most, and angles in steps of
     0.006 degrees. Recorded waveforms make the point format 9, or 10 with colours; see `_Packets`.
     """
     coloured = {*COLOURS} <= {column.name for column in cloud.table}
@@ -76,6 +85,9 @@ def _write(path: Path, cloud: CloudLike, sweeps: Sweeps, *, compress: bool) -> N
         header.vlrs.append(lookup := laspy.vlrs.known.ClassificationLookupVlr())
         for number in range(256):  # the record has them all
             lookup[number] = sweeps.classes.get(number, "").encode("ascii", "replace")[:15].decode()
+    if any(column.name == "material" for column in cloud.table):
+        listed = json.dumps(sweeps.materials).encode()[:_VLR_MOST]
+        header.vlrs.append(laspy.VLR("lidarpool", 1, "names of materials, JSON", listed))
     if packets is not None:
         header.vlrs.extend(packets.descriptors)
         header.global_encoding.waveform_data_packets_internal = True
@@ -214,8 +226,8 @@ def _points(chunk: Cloud, header: laspy.LasHeader, extra: list[str], begins_s: f
 
 
 def _name(name: str) -> str:
-    """Name of a column in the extra bytes, where one of a field of the format is taken."""
-    return "energy" if name == "intensity" else name[:32]
+    """Name in the extra bytes of a column that has a name in files."""
+    return _NAMES.get(name, name[:32])
 
 
 def wkt(epsg: int) -> str:

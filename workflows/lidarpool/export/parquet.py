@@ -45,6 +45,8 @@ class Pieces(pieces.Pieces):
         objects = "\n".join(sweeps.all_names)  # that the column `object` counts
         words = {"coordinates": sweeps.coordinates, "objects": objects}
         words |= {"classes": json.dumps(dict(sweeps.classes))} if sweeps.classes else {}
+        if any(column.name == "material" for column in cloud.table):
+            words |= {"materials": json.dumps(sweeps.materials)}
         self.schema = pa.schema(fields, words)
 
     def __len__(self) -> int:

@@ -12,11 +12,12 @@ from ..base.arrays import AnyFloats, Records
 from ..base.errors import LidarpoolError
 from ..base.open3d_module import load_open3d
 from ..base.validation import checked
+from ..base.words import printable
 from ..columns.cloud import CHUNK_POINTS, Cloud, CloudLike
 from ..columns.cloud_file import CloudFile
 from ..columns.ply_format import AXES, as_held, header, layout, mapped_rows, row_type
 from ..columns.table import AXES as POSITION
-from ..columns.table import TABLE, check_names
+from ..columns.table import NORMAL, TABLE, check_names
 from . import reading
 from .sweeps import SWEEPS_FILE, Sweeps
 
@@ -31,12 +32,16 @@ def write_ply(path: Path, cloud: CloudLike, sweeps: Sweeps) -> None:
     their own, whose rows and header show its layout, and the others follow as such rows. The
     bytes are the same as if Open3D wrote all points at once, which would need memory for all.
     float64 positions are stored in single precision if the error is below a twentieth of the
-    precision of the sweeps, else in double. Names of classes are comments: `class 40 road`.
+    precision of the sweeps, else in double. Names of classes and materials are comments: `class 40
+    road`, `material 0 Brick`.
     """
     check_names((*POSITION, *cloud.table))
     real = real_type(cloud.bounds, sweeps.precision_m)
     row = row_type(real, cloud.table)
     comments = "".join(f"comment class {n} {name}\n" for n, name in sweeps.classes.items())
+    if any(column.name == "material" for column in cloud.table):
+        names = enumerate(map(_comment, sweeps.materials))
+        comments += "".join(f"comment material {n} {name}\n" for n, name in names)
     _check_room(path, header(row, len(cloud), comments), len(cloud), row.itemsize)
     with path.open("xb") as file:
         for chunk in cloud.chunks():
@@ -76,6 +81,11 @@ def read_cloud(path: str | Path) -> Cloud:
     beside = path.with_name(SWEEPS_FILE)
     sweeps = partial(Sweeps.load, beside) if beside.exists() else None
     return Cloud(positions, columns, sweeps=sweeps)
+
+
+def _comment(name: str) -> str:
+    """Name for a comment, whose characters are ASCII."""
+    return printable(name).encode("ascii", "backslashreplace").decode()
 
 
 class Reader(reading.Reader):
@@ -124,7 +134,13 @@ def _write_open3d(path: Path, cloud: Cloud, real: np.dtype[np.floating]) -> None
     o3d = load_open3d()  # here, because read_cloud does not need it
     points = o3d.t.geometry.PointCloud()
     points.point.positions = o3d.core.Tensor(np.ascontiguousarray(cloud.positions, real))
+    # Open3D reads the axes of normals one after the other, and writes other columns in any order.
+    normals = NORMAL if {*NORMAL} <= {*cloud.columns} else ()
+    if normals:
+        points.point.normals = o3d.core.Tensor(np.stack([cloud[n] for n in normals], axis=1))
     for column in cloud.table:
+        if column.name in normals:
+            continue
         values = np.ascontiguousarray(as_held(column, cloud[column.name]))
         points.point[column.in_files] = o3d.core.Tensor(values[:, None])
     quiet = o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error)

@@ -85,7 +85,8 @@ class Reader:
     def inside(self, sweep: int, cloud: Cloud) -> PointColumns:
         """Return points of the cloud's coordinates and all their columns."""
         places = self.sweeps.in_sensor(sweep, cloud.positions).astype(np.float32)
-        return places, {name: np.array(array) for name, array in cloud.columns.items()}
+        columns = self.sweeps.columns_in_sensor(sweep, cloud)
+        return places, {name: np.array(array) for name, array in columns.items()}
 
 
 def _remove(folder: Path, process: int) -> None:

@@ -25,7 +25,7 @@ from rosbags.typesys.store import Typestore
 
 from ..base.arrays import AnyArray, Floats32, Records
 from ..columns.cloud import Cloud, CloudLike
-from ..columns.table import COLOURS, VELOCITY
+from ..columns.table import COLOURS, SURFACE_COLUMNS, VELOCITY
 from ..scene.colours import as_float
 from ..sensor.reflectivity import COUNTS
 from . import reading
@@ -61,8 +61,15 @@ _LAYOUTS = {
     }),
 }  # fmt: skip
 _LAYOUTS["images"] = _LAYOUTS["velodyne"]
+_ONCE = ("/tf_static", "/label_info", "/material_info")  # topics of one message, kept for readers
 # Fields behind those of a layout: {name: type, columns that it needs}.
-_EXTRA = {"rgb": ("<f4", {*COLOURS}), VELOCITY: ("<f4", {VELOCITY}), "label": ("<u4", {"class"})}
+_EXTRA = {
+    "rgb": ("<f4", {*COLOURS}),
+    VELOCITY: ("<f4", {VELOCITY}),
+    "label": ("<u4", {"class"}),
+    **{name: ("<f4", {name}) for name in SURFACE_COLUMNS},
+    "material": ("<i4", {"material"}),
+}
 # Of vision_msgs, which rosbags lacks.
 _LABEL_INFO = "std_msgs/Header header\nvision_msgs/VisionClass[] class_map\nfloat32 threshold\n"
 _LABEL_INFO += f"{80 * '='}\nMSG: vision_msgs/VisionClass\nuint16 class_id\nstring class_name\n"
@@ -78,7 +85,7 @@ def write_rosbag2(path: Path, cloud: CloudLike, sweeps: Sweeps, layout: str) -> 
         for topic, message, time_ns in _messages(cloud, sweeps, layout, store.types):
             kind = message.__msgtype__
             if topic not in topics:
-                latched = (_LATCHED,) if topic in ("/tf_static", "/label_info") else ()
+                latched = (_LATCHED,) if topic in _ONCE else ()
                 topics[topic] = bag.add_connection(
                     topic, kind, typestore=store, offered_qos_profiles=latched
                 )
@@ -91,9 +98,9 @@ def write_mcap(path: Path, cloud: CloudLike, sweeps: Sweeps, layout: str) -> Non
     Each sweep is a PointCloud2 on `/NAME/points`, NAME that of its sensor, or on `/points`. Points
     are in the sensor's axes when the sweep began. `/tf` has the frames of the carrier (`base_link`)
     and of actors in `map`, and `/clock` the time, both at each sweep; `/tf_static` has the sensors
-    on the carrier, and `/label_info` names of classes (LabelInfo of vision_msgs). The survey begins
-    at its start, or at `START_NS` without one. `/actors` has a MarkerArray of the boxes of actors
-    where their points of the sweep are.
+    on the carrier, `/label_info` names of classes and `/material_info` those of materials
+    (LabelInfo of vision_msgs). The survey begins at its start, or at `START_NS` without one.
+    `/actors` has a MarkerArray of the boxes of actors where their points of the sweep are.
 
     Instruments of the carrier are frames `imu` and `gnss` on it. `/imu/data_raw` has Imu, without
     orientations, and `/gnss/fix` NavSatFix or, where latitudes are not known, `/gnss/position`
@@ -103,8 +110,9 @@ def write_mcap(path: Path, cloud: CloudLike, sweeps: Sweeps, layout: str) -> Non
     `autoware` (PointXYZIRCAEDT, 32 bytes; angles in radians, time_stamp in ns since the sweep
     began) and `ouster` (48 bytes; range in mm, t in ns since the sweep began, intensity: signal).
     Whole numbers of intensity are 255 at 1 and above. Where the cloud has red, green and
-    blue, a field `rgb` follows, where it has radial velocities, `radial_velocity`, and where its
-    classes have names, `label`; each makes points of `velodyne` and `autoware` 4 bytes longer.
+    blue, a field `rgb` follows, where it has radial velocities, `radial_velocity`, where its
+    classes have names, `label`, and then normals, `incidence_deg` and origins of rays, of which the
+    cloud has some, and `material`; each makes points of `velodyne` and `autoware` 4 bytes longer.
     """
     folder = path.with_name(f"{path.name}.bag")
     try:
@@ -142,6 +150,10 @@ def _messages(cloud: CloudLike, sweeps: Sweeps, layout: str, types: Any) -> Iter
         info, named = make.kinds("vision_msgs", "LabelInfo", "VisionClass")
         told = [named(number, name) for number, name in sweeps.classes.items()]
         yield "/label_info", info(make.header("", start_ns), told, 0.0), start_ns
+    if "material" in held and sweeps.materials:
+        info, named = make.kinds("vision_msgs", "LabelInfo", "VisionClass")
+        listed = [named(number, name) for number, name in enumerate(sweeps.materials)]
+        yield "/material_info", info(make.header("", start_ns), listed, 0.0), start_ns
     for sweep, points in enumerate(sweeps.points(cloud)):
         time_ns = start_ns + round(sweeps.begins_ns[sweep])
         stamp_ns = start_ns + sweeps.stamp_ns(sweep)
@@ -301,7 +313,7 @@ def _rows(
 ) -> Records:
     """Points of a sweep in a layout, of the type of `_row`."""
     begin_ns = sweeps.begins_ns[sweep] + (sweeps.stamp_ns(sweep) - round(sweeps.begins_ns[sweep]))
-    there, since = points.columns, points["time"] - begin_ns
+    there, since = sweeps.columns_in_sensor(sweep, points), points["time"] - begin_ns
     values = dict(zip("xyz", sweeps.in_sensor(sweep, points.positions).T, strict=True))
     if layout in ("velodyne", "images"):
         values |= {"intensity": there["intensity"], "ring": there["channel"], "time": since / 1e9}
@@ -325,7 +337,8 @@ def _rows(
         }
     if "rgb" in (row.names or ()):
         values["rgb"] = as_float(*(there[name] for name in COLOURS))
-    for name, column in ((VELOCITY, VELOCITY), ("label", "class")):
+    alike = ((name, name) for name in (VELOCITY, *SURFACE_COLUMNS, "material"))
+    for name, column in (*alike, ("label", "class")):
         if name in (row.names or ()):
             values[name] = there[column]
     rows = np.zeros(len(points), row)

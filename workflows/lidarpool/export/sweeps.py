@@ -14,9 +14,10 @@ from typing import Any
 import numpy as np
 
 from ..base.archives import open_archive, packed
-from ..base.arrays import AnyFloats, Bools, Bytes, Floats, Ints
+from ..base.arrays import AnyArray, AnyFloats, Bools, Bytes, Floats, Ints
 from ..base.errors import LidarpoolError
 from ..columns.cloud import Cloud, CloudLike
+from ..columns.table import NORMAL, ORIGIN, TABLE
 from ..scene.scene import Scene
 from ..scene.transform import affine
 from ..sensor import Fault, Sensor, Survey
@@ -101,6 +102,7 @@ class Sweeps:
     fired: Fired | None = None  # all rays, if the survey keeps every return with its ray
     classes: Mapping[int, str] = field(default_factory=dict, compare=False)  # their names
     faults: tuple[Fault, ...] = ()  # of all sensors
+    materials: tuple[str, ...] = ()  # names that the column `material` counts
 
     def __len__(self) -> int:
         return len(self.begins_ns)
@@ -109,6 +111,23 @@ class Sweeps:
         """Points (k, 3) of a sweep in its sensor's axes: at its start, or as stored."""
         exact = points.astype(np.float64)
         return exact if self.coordinates == "sensor" else self.pose.inward(sweep, exact)
+
+    def columns_in_sensor(self, sweep: int, points: Cloud) -> dict[str, AnyArray]:
+        """Columns of points of a sweep, normals and origins in the axes of `in_sensor`."""
+        columns = dict(points.columns)
+        if self.coordinates == "sensor":
+            return columns
+        for vector in (NORMAL, ORIGIN):
+            if not columns.keys() >= {*vector}:
+                continue
+            values = np.stack([columns[name] for name in vector], axis=1).astype(np.float64)
+            if vector == NORMAL:
+                values = values @ self.pose.turns[sweep]
+            else:
+                values = self.pose.inward(sweep, values)
+            for name, axis in zip(vector, values.T, strict=True):
+                columns[name] = axis.astype(TABLE[name].dtype)
+        return columns
 
     def bounds(self, sweep: int) -> Floats:
         """Corners of each actor's box during a sweep, in its own axes: (a, 2, 3), metres."""
@@ -203,6 +222,7 @@ class Sweeps:
             fired=fired,
             classes=survey.classes,
             faults=tuple(survey.faults),
+            materials=scene.material_names,
         )
 
     def faults_in(self, sweep: int) -> tuple[Fault, ...]:
@@ -255,6 +275,7 @@ class Sweeps:
         if self.instruments is not None:
             words["instruments"] = self.instruments.words()
         words |= {"classes": dict(self.classes)} if self.classes else {}
+        words |= {"materials": self.materials} if self.materials else {}
         words |= {"faults": [one.words() for one in self.faults]} if self.faults else {}
         arrays: dict[str, Any] = {"words": np.frombuffer(json.dumps(words).encode(), np.uint8)}
         arrays |= {name: getattr(self, name) for name in _ARRAYS}
@@ -300,6 +321,7 @@ class Sweeps:
                 instruments=instruments and Instruments.from_words(instruments, Path(path).parent),
                 classes={int(number): name for number, name in words.get("classes", {}).items()},
                 faults=tuple(Fault(**one) for one in words.get("faults", ())),
+                materials=tuple(words.get("materials", ())),
                 **{name: arrays[name] for name in _ARRAYS},
                 **{name: words[name] for name in _WORDS},
             )

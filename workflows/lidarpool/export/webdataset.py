@@ -86,9 +86,10 @@ class Pieces(pieces.Pieces):
         """Yield the files of a sample, each behind its header."""
         sweeps, entry = self.sweeps, self.entry
         there = SweepBoxes.of(sweeps, boxes and boxes.inward(sweeps.pose, number))
+        columns = sweeps.columns_in_sensor(number, points)
         arrays = {
             "points": sweeps.in_sensor(number, points.positions).astype(np.float32),
-            **{column.name: points[column.name] for column in self.cloud.table},
+            **{column.name: columns[column.name] for column in self.cloud.table},
             "pose": sweeps.pose.matrix(number),
             "boxes": there.rows,
         }
@@ -102,6 +103,8 @@ class Pieces(pieces.Pieces):
             "box_objects": there.objects.tolist(),
             "box_points": there.points.tolist(),
         }
+        if "material" in columns:
+            about["materials"] = sweeps.materials
         if faults := sweeps.faults_in(number):
             about["faults"] = [one.words() for one in faults]
         files = {f"{name}.npy": _npy(array) for name, array in arrays.items()}

@@ -172,9 +172,15 @@ class View:
             return self.results
         if self.pictured is not None and column in self.columns:
             return self.pictured.names_of(self.columns[column])
-        if (known := self.sweeps) is not None and column in ("sensor", "object", "class"):
-            objects, classes = (*known.objects, *known.actors), by_value(known.classes)
-            return {"sensor": known.sensors, "object": objects, "class": classes}[column]
+        if (known := self.sweeps) is not None:
+            names: dict[str, Sequence[str]] = {
+                "sensor": known.sensors,
+                "object": (*known.objects, *known.actors),
+                "class": by_value(known.classes),
+                "material": known.materials,
+            }
+            if column in names:
+                return names[column]
         return CAUSES if self.columns.get(column) == TABLE["cause"] else ()
 
     def _around(self) -> tuple[Floats, Floats, Floats]:

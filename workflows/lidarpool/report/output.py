@@ -174,7 +174,9 @@ class SurveyOutput(Output[tuple[RunResult, dict[str, Any]]]):
             if (instruments := sweeps.instruments) is not None:
                 write_instruments(staged, result.survey, result.scene.origin)
                 sweeps = replace(sweeps, instruments=replace(instruments, folder=staged))
-            cloud = CountedCloud(points(CLOUD), len(result.scene.all_names))
+            scene = result.scene
+            sizes = len(scene.all_names), len(scene.material_names)
+            cloud = CountedCloud(points(CLOUD), *sizes)
             Format("ply").write(staged / CLOUD, cloud, sweeps)
             for one in sorted(formats, key=lambda one: one.row.in_pieces):
                 file = one.row.file

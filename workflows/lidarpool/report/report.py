@@ -56,15 +56,17 @@ _PLANNING = ("trials", "best_length", "shortest_possible", "collision_free")
 class CountedCloud:
     """A cloud that computes its statistics while its points are read for something else.
 
-    `by_object` and `by_class` are the points of each, `no_surface` those of no object, `limits`
-    are {column: minimum and maximum}, `bounds` (2, 3) the lowest and highest coordinates in the
-    world, and `above` (rows, columns) points seen from above, the first row in the south.
+    `by_object`, `by_class` and `by_material` are the points of each, `no_surface` those of no
+    object, `limits` are {column: minimum and maximum}, `bounds` (2, 3) the lowest and highest
+    coordinates in the world, and `above` (rows, columns) points seen from above, the first row in
+    the south.
     """
 
-    def __init__(self, cloud: CloudLike, objects: int) -> None:
+    def __init__(self, cloud: CloudLike, objects: int, materials: int = 0) -> None:
         self._cloud = cloud
         self.by_object, self.no_surface = np.zeros(objects, np.int64), 0
         self.by_class = np.zeros(1 << 16, np.int64)
+        self.by_material = np.zeros(materials, np.int64)
         self.limits: dict[str, tuple[float, float]] = {}
         self.bounds: Floats = np.asarray(cloud.bounds, dtype=np.float64)
         # A cell that a surface crosses has about the square of its side of that surface.
@@ -90,6 +92,10 @@ class CountedCloud:
             self.by_object += np.bincount(owners, minlength=len(self.by_object))
             if "class" in chunk.columns:
                 self.by_class += np.bincount(chunk["class"], minlength=len(self.by_class))
+            if "material" in chunk.columns:
+                numbers = chunk["material"]
+                numbers = numbers[numbers >= 0]
+                self.by_material += np.bincount(numbers, minlength=len(self.by_material))
             for name in (column.name for column in chunk.table):
                 values = chunk[name]
                 low, high = self.limits.get(name, (np.inf, -np.inf))
@@ -157,6 +163,7 @@ def make_report(result: RunResult, cloud: CountedCloud) -> dict[str, Any]:
         | ({NO_SURFACE: cloud.no_surface} if cloud.no_surface else {}),
         "classes": {str(n): {"points": k} for n, k in enumerate(cloud.by_class.tolist()) if k},
         **({"class_names": dict(survey.classes)} if survey.classes else {}),
+        **_points_by_material(scene, cloud),
         "points_per_m2": cloud.density if survey.coordinates == "world" else None,
         "columns": _columns(cloud),
         "seconds": {
@@ -173,6 +180,14 @@ def make_report(result: RunResult, cloud: CountedCloud) -> dict[str, Any]:
         "resumed_scans": result.resumed,
         "planning": _planning(result),
     }
+
+
+def _points_by_material(scene: Scene, cloud: CountedCloud) -> dict[str, Any]:
+    """Points of each material, if the cloud has the column `material`."""
+    if not any(column.name == "material" for column in cloud.table):
+        return {}
+    counts = cloud.by_material.tolist()
+    return {"points_by_material": dict(zip(scene.material_names, counts, strict=True))}
 
 
 def summary(folder: Path | Storage, report: dict[str, Any]) -> dict[str, Any]:

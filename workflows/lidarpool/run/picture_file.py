@@ -74,6 +74,7 @@ class PictureContent:
     coordinates: str = "world"  # of the cloud's points, or "sensor": they do not fit the scene
     triangles: int = 0  # of the scene, though simpler instances may be drawn
     classes: Sequence[str] | None = None  # names of the classes 0, 1, 2, …
+    materials: Sequence[str] | None = None  # names of the materials 0, 1, 2, …
 
     @classmethod
     def of(cls, result: RunResult) -> PictureContent:
@@ -96,7 +97,8 @@ class PictureContent:
         ways = sensor_ways(survey)
         drawn = Drawn.of(cut(scene), near=[way.positions for way in ways])
         light = survey.carried[0].sensor.optics.wavelength_nm  # of the first sensor
-        materials = MaterialTable.of(survey.materials, scene.all_names, light, scene.has_voxels)
+        kinds = scene.surface_kinds
+        materials = MaterialTable.of(survey.materials, kinds, light, scene.has_voxels)
         pictured = cls(
             replace(drawn.scene, actors=actors),
             ways,
@@ -107,10 +109,11 @@ class PictureContent:
             (),
             survey.duration_ns,
             [replace(c, source="") for c in survey.stored_columns if c.name not in TABLE],
-            materials.reflectance,
+            materials.reflectance[kinds.first[:-1]],
             survey.coordinates,
             scene.triangles,
             by_value(survey.classes),
+            scene.material_names,
         )
         return pictured, drawn
 
@@ -140,7 +143,12 @@ class PictureContent:
             return [way.name for way in self.sensors]
         if column == TABLE["cause"]:
             return CAUSES
-        return {"object": self.scene.all_names, "class": self.classes}.get(column.name) or ()
+        names = {
+            "object": self.scene.all_names,
+            "class": self.classes,
+            "material": self.materials,
+        }
+        return names.get(column.name) or ()
 
     def save(self, path: Path) -> None:
         """Write it as a NumPy archive; the same content gives the same bytes."""
@@ -152,6 +160,7 @@ class PictureContent:
             "coordinates": self.coordinates,
             "triangles": self.triangles,
             **({"classes": self.classes} if self.classes else {}),
+            **({"materials": self.materials} if self.materials else {}),
         }
         arrays: dict[str, Any] = {
             "format": _FORMAT,
@@ -246,7 +255,8 @@ class PictureContent:
             plan = Plan(path=arrays["path"], **numbers)
         rays, trials = arrays["sample_rays"], tuple(arrays.get("waypoints", ()))
         duration, own = float(arrays["duration_ns"]), [Column(**one) for one in names["own"]]
-        rest = arrays.get("reflectance"), *map(names.get, ("coordinates", "triangles", "classes"))
+        fields = "coordinates", "triangles", "classes", "materials"
+        rest = arrays.get("reflectance"), *map(names.get, fields)
         return cls(scene, sensors, counts, rays, planning, plan, trials, duration, own, *rest)
 
 

@@ -92,9 +92,10 @@ def _of_colours(built: Built) -> str:
             "a column or reflectance: texture needs colours, but nothing in the scene has any, "
             "so that all is grey"
         )
-    names = scene.all_names
-    table = MaterialTable.of(built.survey.materials, names, voxels=scene.has_voxels)
-    textured = table.scale > 0
+    names, kinds = scene.all_names, scene.surface_kinds
+    table = MaterialTable.of(built.survey.materials, kinds, voxels=scene.has_voxels)
+    textured = np.zeros(len(names), np.bool_)
+    textured[kinds.object[table.scale > 0]] = True
     if not len(grey := np.flatnonzero(textured & ~scene.has_colours)):
         return ""
     shown = ", ".join(names[i] for i in grey[:3]) + ", …" * (len(grey) > 3)

@@ -102,7 +102,7 @@ class Job:
 
     def __post_init__(self) -> None:
         scene, survey = self.scene, self.survey
-        MaterialTable.of(survey.materials, scene.all_names, voxels=scene.has_voxels)
+        MaterialTable.of(survey.materials, scene.surface_kinds, voxels=scene.has_voxels)
         # The cells of the cloud's precision that the scene spans have numbers of 32 bits.
         reach = float(np.abs(scene.bounds).max(initial=0.0))
         if survey.spray_g_m3:
@@ -182,7 +182,7 @@ def build(
         with prefixed(scenario.source):
             classes = [entry.semantic_class for _, entry in vehicles]
             survey = survey_of(_materials(scenario, scene, classes), columns)
-        MaterialTable.of(survey.materials, scene.all_names, voxels=scene.has_voxels)
+        MaterialTable.of(survey.materials, scene.surface_kinds, voxels=scene.has_voxels)
     with mistakes.noted(), prefixed(scenario.source):
         planning = _planning(scenario, scene) if plans else None
     mistakes.tell()
@@ -325,7 +325,7 @@ def _materials(scenario: Scenario, scene: Scene, vehicles: Sequence[int | None])
 
     `vehicles` are the classes of the last actors of the scene.
     """
-    every, made = Material("*"), [*scenario.materials]
+    every, made, kinds = Material("*"), [*scenario.materials], scene.surface_kinds
     own: list[tuple[str, list[str], int]] = []  # an object, names of all, their class
     for entry in scenario.placed:
         if entry.semantic_class is None:
@@ -341,16 +341,23 @@ def _materials(scenario: Scenario, scene: Scene, vehicles: Sequence[int | None])
     if own and not made:
         made = [every]
     for name, names, semantic_class in own:
-        # After the last that is for it: a later one, for a single copy, counts there.
-        after = max((k for k, m in enumerate(made) if m.named(name)), default=-1)
-        of = made[after] if after >= 0 else every
-        made.insert(after + 1, replace(of, objects=names, semantic_class=semantic_class))
+        # Before those that are for it: an earlier one, for a single copy, counts there.
+        objects = np.concatenate([rows_named(pattern, kinds.names) for pattern in names])
+        of_objects = {kinds.material[kind] for kind in kinds.of_rows(objects).tolist()}
+        before = made
+        made = []
+        for material in before:
+            if material.named(name, of_objects):
+                made.append(replace(material, objects=names, semantic_class=semantic_class))
+            made.append(material)
+        if not any(one.material is None and one.named(name) for one in before):
+            made.append(replace(every, objects=names, semantic_class=semantic_class))
     first = len(scene.all_names) - len(vehicles)
     for semantic_class in sorted({one for one in vehicles if one is not None}):
         rows = np.array([first + k for k, one in enumerate(vehicles) if one == semantic_class])
-        made = with_class(made or [every], semantic_class, rows, scene.all_names)
+        made = with_class(made or [every], semantic_class, rows, kinds)
     if _has_city(scenario):
-        made = with_classes(made or [every], CITY_CLASSES, scene.all_names)
+        made = with_classes(made or [every], CITY_CLASSES, kinds)
     return made
 
 

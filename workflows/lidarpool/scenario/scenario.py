@@ -160,8 +160,9 @@ class Scenario(Section):
     materials: Annotated[
         Several[Material],
         about(
-            "materials of objects, by name; the last entry for an object counts",
-            [{"objects": "*", "reflectance": 0.3}, {"objects": "Window*", "transparent": "pass"}],
+            "materials by names of objects and of their materials; the first entry for a face "
+            "counts",
+            [{"objects": "Window*", "transparent": "pass"}, {"objects": "*", "reflectance": 0.3}],
             max_length=100_000,
         ),
     ] = ()
@@ -331,3 +332,9 @@ class Scenario(Section):
         """Whether colours of meshes are read: a column or a material needs them."""
         columns = {*self.cloud.columns, *self.output.needs}
         return bool(columns & {*COLOURS}) or any(m.reflectance == "texture" for m in self.materials)
+
+    @property
+    def names_materials(self) -> bool:
+        """Whether faces keep the names of their materials: a column or an entry needs them."""
+        columns = {*self.cloud.columns, *self.output.needs}
+        return "material" in columns or any(m.material is not None for m in self.materials)

@@ -88,7 +88,7 @@ def _key(scenario: Scenario) -> object:
     for copies in section.copies:
         names += [one.file for one in (copies.file, copies.table) if one is not None]
     states = file_states(map(scenario.path, names))
-    read_by = scenario.path(""), scenario.coloured, scenario.cloud.epsg
+    read_by = scenario.path(""), scenario.coloured, scenario.names_materials, scenario.cloud.epsg
     return section.model_dump_json(), *read_by, states
 
 
@@ -156,7 +156,10 @@ class Shapes:
         if entry not in self._robots:
             path, tell = self.scenario.path(entry.file), self.found.notes.append
             colours = self.scenario.coloured
-            made = load_robot(path, opacity=entry.opacity, colours=colours, tell=tell)
+            named = self.scenario.names_materials
+            made = load_robot(
+                path, opacity=entry.opacity, colours=colours, materials=named, tell=tell
+            )
             self._robots[entry], self.found.sources[entry.file] = made, made.summary
         return self._robots[entry]
 
@@ -172,6 +175,7 @@ class Shapes:
             **entry.model_dump(include={"unit", "up_axis", "opacity", "step_m", "window"}),
             transform=transform,
             colours=scenario.coloured,
+            materials=scenario.names_materials,
             epsg=scenario.cloud.epsg,
             assets=None if entry.assets is None else scenario.path(entry.assets),
             animation=animation,

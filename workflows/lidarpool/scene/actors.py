@@ -15,6 +15,7 @@ from ..base.validation import checked_fields
 from ..base.vectors import length, products, turned
 from ..sensor import Stations, Track, Trajectory
 from ..sensor.trajectory import CENTRE, full_poses, presence_ns, quaternions_of
+from . import face_materials
 from .colours import joined
 from .scene_instances import SceneInstance, parts_of
 from .scene_mesh import SceneMesh, stacked
@@ -174,7 +175,9 @@ def shapes_of(actors: Iterable[Actor]) -> tuple[list[SceneMesh], Indices]:
     meshes: list[SceneMesh] = []
     which = []
     for mesh in (actor.mesh for actor in actors):
-        parts = (mesh.vertices, mesh.faces, mesh.colours, mesh.animation, *mesh.cutouts)
+        parts = (
+            mesh.vertices, mesh.faces, mesh.colours, mesh.materials, mesh.animation, *mesh.cutouts,
+        )  # fmt: skip
         number = numbers.setdefault(tuple(map(id, parts)), len(meshes))
         if number == len(meshes):
             meshes.append(mesh)
@@ -195,8 +198,10 @@ def one_mesh(name: str, objects: Iterable[SceneMesh | SceneInstance]) -> SceneMe
     parts.sort(key=lambda part: part.mask is not None)  # those with masks last
     vertices, faces = stacked((part.vertices, part.faces) for part in parts)
     cutouts = [cut for mesh in flat for cut in mesh.cutouts]
-    colours = joined([part.colours for part in parts], [len(part.faces) for part in parts])
-    return SceneMesh(name, vertices, faces, tuple(cutouts), colours)
+    sizes = [len(part.faces) for part in parts]
+    colours = joined([part.colours for part in parts], sizes)
+    materials = face_materials.joined([part.materials for part in parts], sizes)
+    return SceneMesh(name, vertices, faces, tuple(cutouts), colours, materials=materials)
 
 
 def _one_animated(name: str, meshes: Sequence[SceneMesh]) -> SceneMesh:
@@ -205,9 +210,11 @@ def _one_animated(name: str, meshes: Sequence[SceneMesh]) -> SceneMesh:
     still = (len(first.vertices), 1, 1)
     poses = [m.animation.vertices if m.animation else np.tile(m.vertices, still) for m in meshes]
     animation = replace(first, vertices=np.concatenate(poses, axis=1))
-    colours = joined([mesh.colours for mesh in meshes], [len(mesh.faces) for mesh in meshes])
+    sizes = [len(mesh.faces) for mesh in meshes]
+    colours = joined([mesh.colours for mesh in meshes], sizes)
+    materials = face_materials.joined([mesh.materials for mesh in meshes], sizes)
     parts = stacked((mesh.vertices, mesh.faces) for mesh in meshes)
-    return SceneMesh(name, *parts, colours=colours, animation=animation)
+    return SceneMesh(name, *parts, colours=colours, animation=animation, materials=materials)
 
 
 def box(name: str, size_m: tuple[float, float, float]) -> SceneMesh:

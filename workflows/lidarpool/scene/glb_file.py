@@ -58,7 +58,8 @@ class _Writer:
         self._pieces: list[bytes] = []
         self._size = 0
         self._meshes: dict[tuple[int, ...], int] = {}  # {ids of parts: number of the mesh}
-        self._materials: dict[int, int] = {}  # {id of a mask or image: number of the material}
+        # {(id of a mask or image, name): number of the material}
+        self._materials: dict[tuple[int, str], int] = {}
         self._kept: list[Any] = []  # what has these ids
         self._tree: dict[str, Any] = {
             "asset": {"version": "2.0", "generator": GENERATOR},
@@ -97,9 +98,15 @@ class _Writer:
         first = len(mesh.faces) - sum(len(cut.uv) for cut in mesh.cutouts)
         colours, out = mesh.colours, []
         image = np.full(first, -1) if colours is None else colours.image[:first]
+        names: tuple[str, ...] = ("",)
+        index = np.zeros(len(mesh.faces), np.int32)
+        if mesh.materials is not None:
+            names = mesh.materials.names
+            index = index if mesh.materials.index is None else mesh.materials.index
         points: int | None = None
-        for number in np.unique(image).tolist():
-            rows = np.flatnonzero(image == number)
+        looks = np.unique(np.column_stack([image, index[:first]]), axis=0)
+        for number, of_material in looks.tolist():
+            rows = np.flatnonzero((image == number) & (index[:first] == of_material))
             one = uv = tints = None
             if colours is not None:
                 shown, one = colours.take(rows), colours.images[number]
@@ -115,15 +122,16 @@ class _Writer:
                 primitive: dict[str, Any] = {"attributes": {"POSITION": points}, "indices": faces}
             else:
                 primitive = {"attributes": self._corners(mesh, rows, uv, tints)}
-            if one is not None:
-                primitive["material"] = self._material(one)
+            if one is not None or names[of_material]:
+                primitive["material"] = self._material(one, names[of_material])
             out.append(primitive)
         for cut in mesh.cutouts:
             rows = np.arange(first, first + len(cut.uv))
             # A texture has no room beside a mask, which has coordinates of its own.
             tints = None if colours is None else colours.take(rows).means()[:, None].repeat(3, 1)
             attributes = self._corners(mesh, rows, cut.uv, tints)
-            out.append({"attributes": attributes, "material": self._material(cut.mask)})
+            material = self._material(cut.mask, names[index[first]])
+            out.append({"attributes": attributes, "material": material})
             first += len(cut.uv)
         return out
 
@@ -157,14 +165,17 @@ class _Writer:
         self._size += len(data)
         return self._put("bufferViews", view)
 
-    def _material(self, image: AnyArray) -> int:
-        """Return the number of the material of a mask, bool (h, w), or of an image or colour."""
-        key = id(image)
+    def _material(self, image: AnyArray | None, name: str) -> int:
+        """Return the number of the material of a mask, bool (h, w), an image, colour or name."""
+        key = id(image), name
         if key not in self._materials:
             self._kept.append(image)
             matt: dict[str, Any] = {"metallicFactor": 0, "roughnessFactor": 1}
             material: dict[str, Any] = {"pbrMetallicRoughness": matt}
-            if image.size == 3 and image.ndim == 3:
+            material |= {"name": name} if name else {}
+            if image is None:
+                pass  # a name alone
+            elif image.size == 3 and image.ndim == 3:
                 matt["baseColorFactor"] = [*LINEAR[image.ravel()].round(6).tolist(), 1]
             elif image.ndim == 3:
                 matt["baseColorTexture"] = {"index": self._texture(Image.fromarray(image))}

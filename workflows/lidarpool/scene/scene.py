@@ -17,9 +17,11 @@ from ..base.validation import as_array, checked, checked_fields, shown
 from ..base.vectors import hypot
 from ..base.words import plural
 from ..sensor import Pose, Track
+from ..sensor.materials import SurfaceKinds
 from . import colours as coloured
 from .actors import Actor
 from .colours import Colours, within
+from .face_materials import ObjectMaterials
 from .files.meshfile import Objects, OpacityMode, load_objects
 from .files.rasters import Window
 from .scene_instances import Instances, MeshPart, SceneInstance, parts_of
@@ -61,6 +63,8 @@ class Scene:
         after `faces`, instance by instance. Those of actors follow.
     colours
         Of `faces`; None if they have none.
+    materials
+        Names of the materials of the objects; None if they have none.
 
     Raises
     ------
@@ -76,6 +80,7 @@ class Scene:
     actors: tuple[Actor, ...] = ()
     instances: Instances | None = None
     colours: Colours | None = None
+    materials: ObjectMaterials | None = None
 
     def __repr__(self) -> str:
         sides = " x ".join(f"{side:,.2f}" for side in np.ptp(self.bounds, axis=0))
@@ -128,6 +133,7 @@ class Scene:
         transform: Transform | None = None,
         opacity: OpacityMode = "mask",
         colours: bool = False,
+        materials: bool = False,
         step_m: float | None = None,
         window: Window | None = None,
         epsg: int | None = None,
@@ -154,6 +160,9 @@ class Scene:
         colours
             Whether to read base colours and their images (.glb, .gltf, .obj, .dae, .usd, CityJSON
             without images), and colours of vertices (.glb, .gltf, .obj, .ply, .off, .usd).
+        materials
+            Whether faces keep the names of their materials (.glb, .gltf, .obj, .dae, .3mf, .usd,
+            CityJSON), by which `Material` may choose them.
         step_m, window, epsg
             Of a raster: see `lidarpool.scene.files.meshfile.load_objects`.
         assets
@@ -176,6 +185,7 @@ class Scene:
             transform=transform,
             opacity=opacity,
             colours=colours,
+            materials=materials,
             step_m=step_m,
             window=window,
             epsg=epsg,
@@ -242,7 +252,13 @@ class Scene:
                 if isinstance(one, SceneMesh) and parts[part].mask is None and one.voxels is None:
                     solid = parts[part]
                     corners = solid.faces.astype(np.int64)
-                    mesh = SceneMesh(one.name, solid.vertices, corners, colours=solid.colours)
+                    mesh = SceneMesh(
+                        one.name,
+                        solid.vertices,
+                        corners,
+                        colours=solid.colours,
+                        materials=solid.materials,
+                    )
                     plain.append((number, mesh))
                 else:
                     shared.append((number, part, matrix))
@@ -280,6 +296,11 @@ class Scene:
             origin=origin,
             instances=instances,
             colours=coloured.joined([mesh.colours for _, mesh in plain], sizes),
+            materials=ObjectMaterials.of(
+                [(one if isinstance(one, SceneMesh) else one.mesh).materials for one in objects],
+                [mesh.materials for _, mesh in plain],
+                sizes,
+            ),
         )
 
     def with_actors(self, actors: Iterable[Actor]) -> Scene:
@@ -319,6 +340,35 @@ class Scene:
         if not self.actors:
             return self.names
         return unique_names((*self.names, *(actor.name for actor in self.actors)))
+
+    @property
+    def surface_kinds(self) -> SurfaceKinds:
+        """Kinds of surfaces: objects, actors after the others, by the materials of their faces."""
+        names = self.all_names
+        of_objects = [()] * len(self.names) if self.materials is None else self.materials.names
+        of_actors = [
+            () if actor.mesh.materials is None else actor.mesh.materials.names
+            for actor in self.actors
+        ]
+        materials = [of_one or ("",) for of_one in (*of_objects, *of_actors)]
+        if all(len(of_one) == 1 for of_one in materials):
+            return SurfaceKinds(names, np.arange(len(names)), [name for (name,) in materials])
+        owners = np.repeat(np.arange(len(names)), [len(of_one) for of_one in materials])
+        return SurfaceKinds(names, owners, [name for of_one in materials for name in of_one])
+
+    @property
+    def has_mixed_objects(self) -> bool:
+        """Whether an object has faces of several materials."""
+        of_objects = () if self.materials is None else self.materials.names
+        of_actors = (actor.mesh.materials for actor in self.actors)
+        return any(len(names) > 1 for names in of_objects) or any(
+            materials is not None and len(materials.names) > 1 for materials in of_actors
+        )
+
+    @property
+    def material_names(self) -> tuple[str, ...]:
+        """Names of all materials of faces, each once: what the column `material` counts."""
+        return tuple(name for name in dict.fromkeys(self.surface_kinds.material) if name)
 
     @property
     def masked(self) -> tuple[str, ...]:
@@ -416,7 +466,10 @@ class Scene:
             if len(rows):
                 points, faces = compacted(self.vertices, self.faces[rows])
                 own = self.colours and self.colours.take(rows)
-                found.append(SceneMesh(name, points + self.origin, faces, colours=own))
+                owner = int(self.face_object[rows[0]])
+                named = None if self.materials is None else self.materials.of_object(owner, rows)
+                mesh = SceneMesh(name, points + self.origin, faces, colours=own, materials=named)
+                found.append(mesh)
         if (shared := self.instances) is not None:
             meshes = [
                 SceneMesh(
@@ -426,6 +479,7 @@ class Scene:
                     () if part.mask is None or part.uv is None else (Cutout(part.mask, part.uv),),
                     part.colours,
                     part.voxels,
+                    materials=part.materials,
                 )
                 for number, part in enumerate(shared.parts)
             ]

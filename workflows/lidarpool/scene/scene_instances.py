@@ -18,7 +18,8 @@ from ..base.validation import checked_fields
 from ..base.vectors import applied, determinant, inverse, matmul, rank
 from ..sensor import Pose
 from .colours import Colours
-from .scene_mesh import SceneMesh, Voxels, compacted
+from .face_materials import FaceMaterials
+from .scene_mesh import Cutout, SceneMesh, Voxels, compacted
 from .transform import Transform, affine
 
 # Nothing on Earth is farther from the origin of its map; see also `sections.Coordinate`.
@@ -108,20 +109,29 @@ class MeshPart(NamedTuple):
     uv: Floats32 | None = None  # (f, 3, 2)
     colours: Colours | None = None
     voxels: Voxels | None = None  # leaves within
+    materials: FaceMaterials | None = None  # all names of their mesh
 
 
 def parts_of(mesh: SceneMesh) -> Iterator[MeshPart]:
     """Divide a mesh by its masks; the triangles stay in order."""
     start = len(mesh.faces) - sum(len(cut.uv) for cut in mesh.cutouts)
-    whole = mesh.colours
+
+    def part(first: int, stop: int, cut: Cutout | None = None) -> MeshPart:
+        some = slice(first, stop)
+        return MeshPart(
+            *_used(mesh.vertices, mesh.faces[some]),
+            mask=None if cut is None else cut.mask,
+            uv=None if cut is None else cut.uv,
+            colours=mesh.colours and mesh.colours.take(some),
+            voxels=mesh.voxels,
+            materials=mesh.materials and mesh.materials.take(some),
+        )
+
     if start:
-        own = whole and whole.take(slice(0, start))
-        yield MeshPart(*_used(mesh.vertices, mesh.faces[:start]), colours=own, voxels=mesh.voxels)
+        yield part(0, start)
     for cut in mesh.cutouts:
-        stop = start + len(cut.uv)
-        own = whole and whole.take(slice(start, stop))
-        yield MeshPart(*_used(mesh.vertices, mesh.faces[start:stop]), cut.mask, cut.uv, own)
-        start = stop
+        yield part(start, start + len(cut.uv), cut)
+        start += len(cut.uv)
 
 
 def _used(vertices: Floats, faces: Ints) -> tuple[Floats, Ints32]:

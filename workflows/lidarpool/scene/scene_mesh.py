@@ -15,6 +15,7 @@ from ..base.validation import as_array, checked_fields
 from ..base.vectors import determinant, length, matmul, rank, turned
 from .animation import Animation
 from .colours import Colours
+from .face_materials import FaceMaterials
 
 UV_MOST = 1 << 30  # texture coordinates beyond this have no digits left
 VOXELS_MOST = 10_000  # along each axis: light takes as many steps
@@ -82,6 +83,9 @@ class SceneMesh:
         Densities of leaves within its surface, which is closed then and has no cutouts.
     animation
         How its vertices move where an actor has it; elsewhere it stands as `vertices` say.
+    materials
+        Names of the materials of the faces, see `lidarpool.scene.face_materials.FaceMaterials`;
+        None if they have none.
 
     Raises
     ------
@@ -97,6 +101,7 @@ class SceneMesh:
     colours: Colours | None = None
     voxels: Voxels | None = None
     animation: Animation | None = None
+    materials: FaceMaterials | None = None
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "vertices", points_array(self.name, self.vertices))
@@ -118,6 +123,8 @@ class SceneMesh:
         _check_cutouts(self.name, self.cutouts, len(faces))
         if self.colours is not None:
             self.colours.check(self.name, len(faces))
+        if self.materials is not None:
+            self.materials.check(self.name, len(faces))
         if self.voxels is not None:
             _check_voxels(self.name, self.voxels)
             if self.cutouts:
@@ -154,7 +161,7 @@ class SceneMesh:
         voxels = self.voxels and self.voxels.moved(linear, offset)
         animation = self.animation and self.animation.moved(linear, offset)
         vertices = turned(self.vertices, linear) + offset
-        return SceneMesh(name, vertices, faces, cutouts, colours, voxels, animation)
+        return SceneMesh(name, vertices, faces, cutouts, colours, voxels, animation, self.materials)
 
 
 def _check_voxels(name: str, voxels: Voxels) -> None:

@@ -1,13 +1,13 @@
-"""Materials by the names of objects, energies of returns, weather."""
+"""Materials by the names of objects and of their materials, energies of returns, weather."""
 
 from __future__ import annotations
 
 import csv
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from fnmatch import fnmatchcase, translate
-from functools import cache
+from functools import cache, cached_property
 from glob import escape
 from importlib.resources import files
 from typing import Annotated, Any, Literal, NamedTuple
@@ -82,7 +82,10 @@ def reflectances() -> dict[str, Measured]:
 @dataclass(frozen=True)
 @checked_fields
 class Material:
-    """Material of objects; the last entry for an object counts.
+    """Optical properties and class of surfaces; of several entries for a face, the first counts.
+
+    An entry is for objects by their names, for faces by the names that their materials have in the
+    scene's files, or for the faces of some objects that have some materials.
 
     Reflectance is that at the sensor's wavelength, in all directions but for a gloss. Of light that
     is not scattered, a share is mirrored; the rest passes, or is lost with "none".
@@ -90,15 +93,15 @@ class Material:
     Raises
     ------
     LidarpoolError
-        If a value is outside its range, the table of reflectances has no such material, or two
-        values contradict each other.
+        If it is for nothing, a value is outside its range, the table of reflectances has no such
+        spectrum, or two values contradict each other.
     """
 
     objects: Annotated[
-        str | Sequence[str],
-        written_as(TextOrTexts),
-        about("names of objects, with * and ?", min_length=1),
-    ]
+        str | Sequence[str] | None,
+        written_as(TextOrTexts | None),
+        about("names of objects, with * and ?; by default all", min_length=1),
+    ] = None
     reflectance: Annotated[
         UnitShare | Literal["texture"] | None,
         allowed("0 to 1, or texture"),
@@ -126,7 +129,7 @@ class Material:
     scale: Annotated[
         float, about("with reflectance: texture, a factor of the luminance", gt=0, le=100)
     ] = 1.0
-    material: Annotated[
+    spectrum: Annotated[
         str | None,
         about("instead of reflectance: a material of the table of reflectances", "asphalt, dry"),
     ] = None
@@ -167,18 +170,38 @@ class Material:
             "of axes"
         ),
     ] = "spherical"
+    material: Annotated[
+        str | Sequence[str] | None,
+        written_as(TextOrTexts | None),
+        about(
+            "names that materials have in the scene's files, with * and ?; by default all",
+            "Glass",
+            min_length=1,
+        ),
+    ] = None
 
     def __post_init__(self) -> None:
-        names = (self.objects,) if isinstance(self.objects, str) else tuple(self.objects)
-        if not all(names):
-            raise LidarpoolError(f"objects is {self.objects!r}; it must be names of objects.")
-        object.__setattr__(self, "objects", names)
-        if self.material is not None:
-            if self.material not in (known := reflectances()):
-                there = _materials_like(self.material, [*known])
-                raise LidarpoolError(f"There is no material {self.material!r}.{there}")
+        if self.objects is None and self.material is None:
+            raise LidarpoolError(
+                'a material is for nothing: give objects, such as objects: "*", or material, a '
+                "name of the scene's file."
+            )
+        for field_name in ("objects", "material"):
+            given = getattr(self, field_name)
+            if given is None:
+                continue
+            names = (given,) if isinstance(given, str) else tuple(given)
+            if not names or not all(names):
+                raise LidarpoolError(
+                    f"{field_name} is {given!r}; it must be names of {field_name}."
+                )
+            object.__setattr__(self, field_name, names)
+        if self.spectrum is not None:
+            if self.spectrum not in (known := reflectances()):
+                there = _materials_like(self.spectrum, [*known])
+                raise LidarpoolError(f"There is no spectrum {self.spectrum!r}.{there}")
             if self.reflectance is not None:
-                raise LidarpoolError("give either material or reflectance, not both.")
+                raise LidarpoolError("give either spectrum or reflectance, not both.")
         if self.reflectance == "texture":
             if self.transparent != "none":
                 raise LidarpoolError(
@@ -217,7 +240,7 @@ class Material:
             raise LidarpoolError(
                 "leaf_area_density is for leaves that scatter light: leave out transparent, "
                 "retro, roughness and specular_reflectance, and give reflectance as a number, or a "
-                "material."
+                "spectrum."
             )
 
     @property
@@ -230,7 +253,7 @@ class Material:
         if voxels and (self.leaf_area_density is not None or not self._suits_leaves):
             raise LidarpoolError(
                 f"materials: {name!r} is of voxels, whose file has the leaf area: give it an entry "
-                "with a reflectance, or a material, and perhaps a leaf_angle, but nothing else."
+                "with a reflectance, or a spectrum, and perhaps a leaf_angle, but nothing else."
             )
         if not voxels and self.leaf_angle != "spherical" and self.leaf_area_density is None:
             raise LidarpoolError(
@@ -240,8 +263,8 @@ class Material:
 
     def share(self, wavelength_nm: float) -> float:
         """Share of light that is scattered; of textures, that of what has no colour."""
-        if self.material is not None:
-            near, far = reflectances()[self.material].shares
+        if self.spectrum is not None:
+            near, far = reflectances()[self.spectrum].shares
             # The nearer of the two was measured; between them, leaves absorb more than either says.
             return near if wavelength_nm < (NEAR_NM + FAR_NM) / 2 else far
         if self.reflectance == "texture":
@@ -257,9 +280,19 @@ class Material:
         """Share of what is not scattered that is mirrored at right angles; 1 for "fresnel"."""
         return float(self.specular_reflectance == "fresnel" or self.specular_reflectance or 0)
 
-    def named(self, name: str) -> bool:
-        """Whether this material applies to an object."""
-        return any(name == pattern or fnmatchcase(name, pattern) for pattern in self.objects)
+    def named(self, name: str, materials: Collection[str] = ("",)) -> bool:
+        """Whether this material applies to an object, or some of its faces, of some materials."""
+        return _fits(name, self.objects) and any(_fits(one, self.material) for one in materials)
+
+    @property
+    def for_all(self) -> bool:
+        """Whether this material applies to all faces of all objects."""
+        return self.material is None and self.objects is not None and "*" in self.objects
+
+
+def _fits(name: str, patterns: str | Sequence[str] | None) -> bool:
+    """Whether a name fits one of some patterns, of which None stands for all."""
+    return patterns is None or any(name == one or fnmatchcase(name, one) for one in patterns)
 
 
 def _materials_like(name: str, known: Sequence[str]) -> str:
@@ -278,61 +311,177 @@ def rows_named(pattern: str, names: Sequence[str]) -> Indices:
     return np.array([r for r, name in enumerate(names) if name == pattern or fits(name)], np.intp)
 
 
-def _last_for(materials: Sequence[Material], names: Sequence[str]) -> Indices:
-    """Last material that names each object, -1 for none: (objects,)."""
-    last = np.full(len(names), -1)
-    known = {name: row for row, name in enumerate(names)}
-    for number, material in enumerate(materials):
-        for pattern in material.objects:
-            plain = pattern in known and not any(sign in pattern for sign in "*?[")
-            rows = np.array([known[pattern]]) if plain else rows_named(pattern, names)
-            if not len(rows):
-                raise LidarpoolError(
-                    f"materials names {pattern!r}, but no object has that name."
-                    + (did_you_mean(pattern, names) or f" There are {', '.join(names[:5])}, …")
-                )
-            last[rows] = number
-    return last
+@dataclass(frozen=True, eq=False)
+class SurfaceKinds:
+    """Kinds of surfaces: each object, or of an object of several materials each of these.
+
+    Parameters
+    ----------
+    names
+        Names of all objects.
+    object
+        int (k,), ascending: row of `names` for each kind. Each object has one kind at least.
+    material
+        Names (k,) that the materials have in the scene's files; "" for none.
+    """
+
+    names: Sequence[str]
+    object: Indices
+    material: Sequence[str]
+
+    @classmethod
+    def of_objects(cls, names: Sequence[str]) -> SurfaceKinds:
+        """Return one kind for each object, without a material."""
+        return cls(names, np.arange(len(names)), ("",) * len(names))
+
+    @cached_property
+    def first(self) -> Indices:
+        """First kind of each object, and the number of kinds: (objects + 1,)."""
+        return np.searchsorted(self.object, np.arange(len(self.names) + 1))
+
+    def of_rows(self, rows: Indices) -> Indices:
+        """Kinds of some objects."""
+        if len(self.object) == len(self.names):
+            return rows
+        starts, stops = self.first[rows], self.first[rows + 1]
+        ranges = [np.arange(start, stop) for start, stop in zip(starts, stops, strict=True)]
+        return np.concatenate([np.zeros(0, np.intp), *ranges])
+
+    def describe(self, kind: int) -> str:
+        """Name of a kind for errors: of its object, and of its material."""
+        name = repr(self.names[self.object[kind]])
+        return f"{name}, material {self.material[kind]!r}" if self.material[kind] else name
+
+
+def first_matches(materials: Sequence[Material], kinds: SurfaceKinds) -> Indices:
+    """First material that is for each kind of surface, -1 for none: (k,).
+
+    LidarpoolError if a material is for nothing in the scene, or hides those after it.
+    """
+    first = np.full(len(kinds.object), -1)
+    known = {name: row for row, name in enumerate(kinds.names)}
+    of_material: dict[str, list[int]] = {}  # {name of a material: its kinds}
+    if any(entry.material is not None for entry in materials):
+        for kind, name in enumerate(kinds.material):
+            if name:
+                of_material.setdefault(name, []).append(kind)
+    for number, entry in enumerate(materials):
+        if entry.for_all and number + 1 < len(materials):
+            raise LidarpoolError(
+                f"materials: the first entry for a surface counts, so that none after number "
+                f'{number + 1}, {{objects: "*"}}, would: put it last.'
+            )
+        matches = _matching_kinds(entry, kinds, known, of_material)
+        first[matches[first[matches] < 0]] = number
+    return first
+
+
+def _matching_kinds(
+    entry: Material,
+    kinds: SurfaceKinds,
+    known: Mapping[str, int],
+    of_material: Mapping[str, Sequence[int]],
+) -> Indices:
+    """Kinds that a material is for; LidarpoolError if a name fits nothing in the scene."""
+    matches: Indices | None = None
+    if entry.objects is not None:
+        rows = [_matching_rows(pattern, kinds.names, known) for pattern in entry.objects]
+        matches = kinds.of_rows(np.concatenate(rows))
+    if entry.material is None:
+        assert matches is not None, "a material is for objects, or for materials"
+        return matches
+    names = [*of_material]
+    with_material: list[int] = []
+    for pattern in entry.material:
+        rows_of_pattern = rows_named(pattern, names)
+        if not len(rows_of_pattern):
+            listed = f" There are {', '.join(names[:5])}{', …' * (len(names) > 5)}."
+            measured = f" For a measured reflectance, write spectrum: {pattern!r}."
+            raise LidarpoolError(
+                f"materials names the material {pattern!r}, but no face of the scene has one of "
+                "that name."
+                + (did_you_mean(pattern, names) or (listed if names else " No face has any."))
+                + measured * (pattern in reflectances())
+            )
+        for row in rows_of_pattern.tolist():
+            with_material += of_material[names[row]]
+    some = np.array(with_material, np.intp)
+    if matches is None:
+        return some
+    both = np.intersect1d(matches, some)
+    if not len(both):
+        raise LidarpoolError(
+            f"materials: no face of {', '.join(map(repr, entry.objects or ()))} has the material "
+            f"{', '.join(map(repr, entry.material))}."
+        )
+    return both
+
+
+def _matching_rows(pattern: str, names: Sequence[str], known: Mapping[str, int]) -> Indices:
+    """Rows of objects that a pattern fits; LidarpoolError if there are none."""
+    if pattern in known and not any(sign in pattern for sign in "*?["):
+        return np.array([known[pattern]])
+    rows = rows_named(pattern, names)
+    if not len(rows):
+        raise LidarpoolError(
+            f"materials names {pattern!r}, but no object has that name."
+            + (did_you_mean(pattern, names) or f" There are {', '.join(names[:5])}, …")
+        )
+    return rows
 
 
 def with_classes(
-    materials: Sequence[Material], classes: Mapping[int, Sequence[str]], names: Sequence[str]
+    materials: Sequence[Material], classes: Mapping[int, Sequence[str]], kinds: SurfaceKinds
 ) -> list[Material]:
     """Give objects whose material has no class one by their names: {class: patterns}.
 
-    LidarpoolError if a material is for no object.
+    LidarpoolError if a material is for nothing in the scene.
     """
-    out, last = list(materials), _last_for(materials, names)
+    first = first_matches(materials, kinds)
+    before: list[list[Material]] = [[] for _ in materials]  # what comes before each
     for semantic_class, patterns in classes.items():
         for pattern in patterns:
-            rows = rows_named(pattern, names)
-            for number in np.unique(last[rows]).tolist():
-                of, some = materials[number], rows[last[rows] == number]
-                if number >= 0 and not of.semantic_class:
-                    whole = len(some) == len(rows)
-                    objects = [pattern] if whole else [escape(names[row]) for row in some]
-                    out.append(replace(of, objects=objects, semantic_class=semantic_class))
-    return out
+            rows = rows_named(pattern, kinds.names)
+            of_pattern = kinds.of_rows(rows)
+            for number in np.unique(first[of_pattern]).tolist():
+                entry = materials[number]
+                if number < 0 or entry.semantic_class:
+                    continue
+                some = of_pattern[first[of_pattern] == number]
+                objects = [pattern]
+                if len(some) < len(of_pattern):
+                    of_some = np.unique(kinds.object[some]).tolist()
+                    objects = [escape(kinds.names[row]) for row in of_some]
+                with_its_class = replace(entry, objects=objects, semantic_class=semantic_class)
+                before[number].insert(0, with_its_class)
+    return [
+        made for entry, others in zip(materials, before, strict=True) for made in (*others, entry)
+    ]
 
 
 def with_class(
-    materials: Sequence[Material], semantic_class: int, rows: Indices, names: Sequence[str]
+    materials: Sequence[Material], semantic_class: int, rows: Indices, kinds: SurfaceKinds
 ) -> list[Material]:
     """Give some objects a class, and leave the rest of their materials.
 
-    LidarpoolError if a material is for no object.
+    LidarpoolError if a material is for nothing in the scene.
     """
-    out, last = list(materials), _last_for(materials, names)[rows]
-    for number in np.unique(last).tolist():
-        of = materials[number] if number >= 0 else Material("*")
-        objects = [escape(names[row]) for row in rows[last == number]]
-        out.append(replace(of, objects=objects, semantic_class=semantic_class))
+    first, of_rows = first_matches(materials, kinds), kinds.of_rows(rows)
+    out: list[Material] = []
+    for number in (*range(len(materials)), -1):
+        of_number = np.unique(kinds.object[of_rows[first[of_rows] == number]]).tolist()
+        if of_number:
+            entry = materials[number] if number >= 0 else Material("*")
+            objects = [escape(kinds.names[row]) for row in of_number]
+            out.append(replace(entry, objects=objects, semantic_class=semantic_class))
+        if number >= 0:
+            out.append(materials[number])
     return out
 
 
 @dataclass(frozen=True, eq=False)
 class MaterialTable:
-    """Materials of objects: each array has one value for each."""
+    """Materials of kinds of surfaces: each array has one value for each."""
 
     reflectance: Floats
     scale: Floats  # of the luminance of colours; 0 where the reflectance is a number
@@ -352,70 +501,71 @@ class MaterialTable:
     def of(
         cls,
         materials: Sequence[Material],
-        names: Sequence[str],
+        kinds: SurfaceKinds,
         wavelength_nm: float = NEAR_NM,
         voxels: Bools | None = None,
     ) -> MaterialTable:
-        """Find the materials of objects by name: the last that names an object counts.
+        """Find the materials of kinds of surfaces: the first that is for a kind counts.
 
         `voxels` (objects,) says which have voxels, and so leaves of their own; None for none.
 
         Raises
         ------
         LidarpoolError
-            If a name fits no object, there are materials and an object has none, or one is not for
+            If a name fits nothing, there are materials and a kind has none, or one is not for
             leaves, and its object has some.
         """
-        last = _last_for(materials, names)
-        without = np.flatnonzero(last < 0)
+        first = first_matches(materials, kinds)
+        without = np.flatnonzero(first < 0)
         if len(without) and materials:
             more = f" and {len(without) - 1} more" if without[1:].size else ""
             raise LidarpoolError(
-                f"materials: no entry names the object {names[without[0]]!r}{more}: begin with one "
-                'for all the others, such as {objects: "*"}.'
+                f"materials: no entry names the object {kinds.describe(without[0])}{more}: end "
+                'with one for all the others, such as {objects: "*"}.'
             )
         found = [*materials, Material("*")]  # the last is of all, if there are no materials
         textured = [m.scale * (m.reflectance == "texture") for m in found]
         angles = tuple(dict.fromkeys(m.leaf_angle for m in found))
-        leaf_area = np.array([m.leaf_area_density or 0.0 for m in found])[last]
-        own = np.zeros(len(names), np.bool_) if voxels is None else voxels
-        angled = np.array([m.leaf_angle != "spherical" for m in found])[last]
+        leaf_area = np.array([m.leaf_area_density or 0.0 for m in found])[first]
+        own = np.zeros(len(first), np.bool_) if voxels is None else voxels[kinds.object]
+        angled = np.array([m.leaf_angle != "spherical" for m in found])[first]
         for row in np.flatnonzero(own | angled).tolist():
-            found[last[row]].check_leaves(names[row], bool(own[row]))
+            name = kinds.names[kinds.object[row]]
+            found[first[row]].check_leaves(name, bool(own[row]))
         leaf_area[own] = 1.0
         return cls(
-            np.array([m.share(wavelength_nm) for m in found], np.float64)[last],
-            np.array(textured, np.float64)[last],
-            np.array([m.roughness or 0.0 for m in found])[last],
-            np.array([m.metalness for m in found])[last],
-            np.array([m.retro for m in found], np.bool_)[last],
-            np.array([m.transparent == "pass" for m in found], np.bool_)[last],
-            np.array([m.specular for m in found], np.float64)[last],
-            np.array([m.semantic_class for m in found], np.uint16)[last],
-            np.array([m.refractive_index or 0.0 for m in found])[last],
-            np.array([m.attenuation_per_m for m in found], np.float64)[last],
+            np.array([m.share(wavelength_nm) for m in found], np.float64)[first],
+            np.array(textured, np.float64)[first],
+            np.array([m.roughness or 0.0 for m in found])[first],
+            np.array([m.metalness for m in found])[first],
+            np.array([m.retro for m in found], np.bool_)[first],
+            np.array([m.transparent == "pass" for m in found], np.bool_)[first],
+            np.array([m.specular for m in found], np.float64)[first],
+            np.array([m.semantic_class for m in found], np.uint16)[first],
+            np.array([m.refractive_index or 0.0 for m in found])[first],
+            np.array([m.attenuation_per_m for m in found], np.float64)[first],
             leaf_area,
-            np.array([angles.index(m.leaf_angle) for m in found], np.intp)[last],
+            np.array([angles.index(m.leaf_angle) for m in found], np.intp)[first],
             angles,
         )
 
     @property
     def leafy(self) -> Bools:
-        """Whether objects are full of leaves."""
+        """Whether surfaces are full of leaves."""
         return self.leaf_area > 0
 
     @property
     def refracts(self) -> Bools:
-        """Whether light is refracted at the surfaces of objects."""
+        """Whether light is refracted at surfaces."""
         return self.refractive_index > 0
 
     @property
     def textured(self) -> bool:
-        """Whether the colours of an object are its reflectance."""
+        """Whether the colours of a surface are its reflectance."""
         return bool(self.scale.any())
 
     def shares(self, rows: Integers, luminance: Floats | None) -> Floats:
-        """Share of light that objects (n,) scatter; `luminance` as of `scattered`."""
+        """Share of light that kinds of surfaces (n,) scatter; `luminance` as of `scattered`."""
         shares = self.reflectance[rows]
         if luminance is not None:
             scale = self.scale[rows]
@@ -424,7 +574,7 @@ class MaterialTable:
         return shares
 
     def scattered(self, rows: Integers, cosine: Floats, luminance: Floats | None = None) -> Floats:
-        """Share of the light returned by objects (n,): 1 for white at right angles.
+        """Share of the light returned by kinds of surfaces (n,): 1 for white at right angles.
 
         `luminance` (n,) is that of the colours that were hit, if the table is `textured`.
         """

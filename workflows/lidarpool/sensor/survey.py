@@ -207,7 +207,8 @@ class Survey(CloudOptions, Weather):
     sensors
         Instead of `sensor`: `Mounted`, each with its own name if there are several.
     materials
-        Materials of objects by name; the last entry for an object counts.
+        Materials of objects, and of faces by the names of their materials; the first entry for a
+        face counts.
     returns
         Sub-rays of a beam, and which returns of a pulse are reported; by default the sensor's.
     noise

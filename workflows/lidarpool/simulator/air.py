@@ -137,7 +137,7 @@ class WeatherStep(PulseStep):
         refracts = self.surfaces.at(self._wavelength_nm).refracts
         if not refracts.any():
             return np.zeros(0, np.intp)
-        bent = refracts[self.surfaces.objects(hits.triangle)]
+        bent = refracts[self.surfaces.kinds(hits.triangle)]
         return np.flatnonzero(bent if hits.cause is None else bent & (hits.cause == SURFACE))
 
     def _within(self, hits: PulseReturns, ray: Ints, distance: Floats) -> Bools:
@@ -170,7 +170,7 @@ def reached(materials: MaterialTable, surfaces: Surfaces, hits: PulseReturns, co
     """How far the light of sub-rays gets, (count,): inf if no surface ends it."""
     ray, ends, on = hits.ray, hits.distance, materials.passes
     if on.any():
-        ends = np.where(on[surfaces.objects(hits.triangle)], np.inf, ends)
+        ends = np.where(on[surfaces.kinds(hits.triangle)], np.inf, ends)
     if hits.cause is not None:
         rows = np.flatnonzero(hits.cause == SURFACE)
         ray, ends = ray[rows], ends[rows]

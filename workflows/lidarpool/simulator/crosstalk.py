@@ -202,9 +202,9 @@ class CrosstalkStep(PulseStep):
         cosine = np.abs(products(spots.normal[spot].T, towards.T)) / far
         # The air on the way there and back.
         both = self._survey.extinction(self._sensor) * (spots.distance[spot] + far)
-        owners, table = surfaces.objects(triangle), surfaces.at(nm)
+        kinds, table = surfaces.kinds(triangle), surfaces.at(nm)
         # A retro-reflector sends the light of a sensor back to that one alone.
-        share = table.reflectance[owners] * ~table.retro[owners]
+        share = table.reflectance[kinds] * ~table.retro[kinds]
         return np.asarray(share * cosine * at_right_angles(far) * exp(-both))
 
 

@@ -46,22 +46,25 @@ _HITS = np.uint32, np.float64, np.int32  # rays, distances and triangles of hits
 _NO_HITS = (np.zeros(0, np.int64), *(np.zeros(0, kind) for kind in _HITS))
 
 
-def _able(survey: Survey) -> set[str]:
-    """Names of the columns that a device can make for a survey."""
+def _able(scene: Scene, survey: Survey) -> set[str]:
+    """Names of the columns that a device can make for a survey of a scene."""
     hazy = any(survey.extinction(carried.sensor) for carried in survey.carried)
     several = len({carried.sensor.optics.wavelength_nm for carried in survey.carried}) > 1
     shining = any(
-        m.reflectance == "texture" or m.roughness is not None or (several and m.material)
+        m.reflectance == "texture" or m.roughness is not None or (several and m.spectrum)
         for m in survey.materials
     )
     able = {column.name for column in _MADE} - {*(_ENERGIES if hazy or shining else ())}
+    if scene.has_mixed_objects:  # of whose faces a device does not know the materials
+        able -= {*_ENERGIES, "class"}
     able -= {"time"} if any(fault.by_s for fault in survey.faults) else set()
     return able - {axis.name for axis in AXES if survey.coordinates == "sensor"}
 
 
-def needs_hits(survey: Survey) -> bool:
+def needs_hits(scene: Scene, survey: Survey) -> bool:
     """Whether NumPy makes a column, so that all kept hits leave the device."""
-    return not {column.name for column in survey.stored_columns} <= _able(survey) | {*_EQUAL}
+    names = {column.name for column in survey.stored_columns}
+    return not names <= _able(scene, survey) | {*_EQUAL}
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,8 +108,8 @@ class DeviceColumns:
     ) -> None:
         self._caster, self._scene, self._surfaces = caster, scene, surfaces
         self.survey = survey
-        wanted, able = {column.name for column in survey.stored_columns}, _able(survey)
-        self.all_hits = needs_hits(survey)
+        wanted, able = {column.name for column in survey.stored_columns}, _able(scene, survey)
+        self.all_hits = needs_hits(scene, survey)
         if self.all_hits and scene.actors:
             able -= {*_ENERGIES}
         self.made = [column for column in _MADE if column.name in wanted & able]

@@ -52,7 +52,7 @@ class Rays(NamedTuple):
 class MediaStack:
     """Media around the light of sub-rays, the innermost first: (n, DEPTH) each; -1 for none."""
 
-    objects: Ints32
+    kinds: Ints32  # of their surfaces
     triangles: Ints32  # where light came in
 
     @classmethod
@@ -62,29 +62,29 @@ class MediaStack:
 
     def __getitem__(self, rows: Integers) -> MediaStack:
         """Select those of some sub-rays."""
-        return MediaStack(self.objects[rows], self.triangles[rows])
+        return MediaStack(self.kinds[rows], self.triangles[rows])
 
-    def enter(self, rows: Indices, objects: Ints32, triangles: Ints32) -> None:
+    def enter(self, rows: Indices, kinds: Ints32, triangles: Ints32) -> None:
         """Enter a medium each."""
-        for table, new in ((self.objects, objects), (self.triangles, triangles)):
+        for table, new in ((self.kinds, kinds), (self.triangles, triangles)):
             table[rows, 1:] = table[rows, :-1]
             table[rows, 0] = new
 
-    def surround(self, rows: Indices, objects: Ints32, triangles: Ints32) -> None:
+    def surround(self, rows: Indices, kinds: Ints32, triangles: Ints32) -> None:
         """Add a medium each around those that are known; nothing where there are too many."""
-        place = (self.objects[rows] >= 0).sum(axis=1)
+        place = (self.kinds[rows] >= 0).sum(axis=1)
         free = place < DEPTH
-        self.objects[rows[free], place[free]] = objects[free]
+        self.kinds[rows[free], place[free]] = kinds[free]
         self.triangles[rows[free], place[free]] = triangles[free]
 
-    def leave(self, rows: Indices, objects: Ints32) -> Bools:
+    def leave(self, rows: Indices, kinds: Ints32) -> Bools:
         """Leave a medium each; returns which were known."""
-        same = self.objects[rows] == objects[:, None]
+        same = self.kinds[rows] == kinds[:, None]
         known = same.any(axis=1)
         rows, place = rows[known], same[known].argmax(axis=1)
         column = np.arange(DEPTH)
         column = column + (column >= place[:, None])
-        for table in (self.objects, self.triangles):
+        for table in (self.kinds, self.triangles):
             ended = np.pad(table[rows], ((0, 0), (0, 1)), constant_values=-1)
             table[rows] = np.take_along_axis(ended, column, axis=1)
         return known
@@ -155,39 +155,42 @@ class Media:
         self, scene: Scene, surfaces: Surfaces, table: MaterialTable, air: float = 0.0
     ) -> None:
         self._surfaces, self.air = surfaces, air  # its extinction, 1/m
-        self.filled = table.leafy | table.refracts  # whether objects hold a medium
+        self.filled = table.leafy | table.refracts  # whether surfaces hold a medium
         self.leafy = bool(table.leafy.any())
         self.bends = bool(table.refracts.any())
         self.mirrors = table.refracts & (table.specular > 0)  # and where it is refracted
         self.grids, self.instances = surfaces.grids, surfaces.instances
-        self.gridded = np.append(scene.has_voxels, False)  # objects
+        owners = surfaces.material_kinds.object
+        self.gridded = np.append(scene.has_voxels[owners], False)
         self._angles = table.leaf_angles
-        # Of no object, which has the number -1, nothing.
+        # Of no surface, which has the number -1, nothing.
         self._area, self._index, self._attenuation = (
             np.append(values, 0.0) for values in (table.leaf_area, table.refractive_index,
                                                   table.attenuation)
         )  # fmt: skip
         self._angle = np.append(table.leaf_angle, 0)
         closed, self._inwards = surfaces.solids
-        for number in np.flatnonzero(table.leafy):
+        for number in np.flatnonzero(table.leafy).tolist():
             if not closed[number]:
                 raise LidarpoolError(
-                    f"materials: {scene.all_names[number]!r} has a leaf_area_density, but its "
-                    "surface has gaps: give a closed one, such as a box or a sphere."
+                    f"materials: {surfaces.material_kinds.describe(number)} has a "
+                    "leaf_area_density, but its surface has gaps: give a closed one, such as a box "
+                    "or a sphere."
                 )
         # Where sensors may be within media: an actor may be anywhere, and below a sheet is water.
-        standing = np.flatnonzero(self.filled[: len(scene.object_bounds)])
-        bounds = scene.object_bounds[standing]
+        stands = owners < len(scene.object_bounds)
+        standing = np.flatnonzero(self.filled & stands)
+        bounds = scene.object_bounds[owners[standing]]
         bounds[~closed[standing], 0, 2] = -np.inf
-        if self.filled[len(scene.object_bounds) :].any():
+        if self.filled[~stands].any():
             bounds = np.append(bounds, [[[-np.inf] * 3, [np.inf] * 3]], axis=0)
         self._bounds = bounds
         for angle in self._angles if self.leafy else ():
             projection(angle, np.ones(1))  # makes its table
 
-    def sides(self, objects: Ints32, along: Floats) -> Bools:
-        """Whether light enters objects, whose normals have the cosines `along` with it: (n,)."""
-        return np.asarray((along < 0) != self._inwards[objects])
+    def sides(self, kinds: Ints32, along: Floats) -> Bools:
+        """Whether light enters surfaces, whose normals have the cosines `along` with it: (n,)."""
+        return np.asarray((along < 0) != self._inwards[kinds])
 
     def around(self, caster: SceneCaster, light: Rays) -> MediaStack:
         """Find the media around the origins of light."""
@@ -208,7 +211,7 @@ class Media:
         new[1:] = (np.diff(origins, axis=0) != 0).any(axis=1) | (np.diff(times) != 0)
         there = self._search(caster, origins[new], times[new], light.ways)
         which = np.cumsum(new) - 1
-        found.objects[rows], found.triangles[rows] = there.objects[which], there.triangles[which]
+        found.kinds[rows], found.triangles[rows] = there.kinds[which], there.triangles[which]
         return found
 
     def _search(
@@ -227,15 +230,15 @@ class Media:
             hits = caster.scan(light, now)
             rows, times = rows[hits.ray], times[hits.ray]
             origins = origins[hits.ray] + (hits.distance[:, None] + away) * up
-            objects = surfaces.objects(hits.triangle)
+            kinds = surfaces.kinds(hits.triangle)
             normals = surfaces.normals(hits.triangle, times, ways)
-            media = self.filled[objects]
-            comes = self.sides(objects, products(normals.T, up[:, None])) & media
-            entered.enter(rows[comes], objects[comes], hits.triangle[comes])
+            media = self.filled[kinds]
+            comes = self.sides(kinds, products(normals.T, up[:, None])) & media
+            entered.enter(rows[comes], kinds[comes], hits.triangle[comes])
             goes = np.flatnonzero(media & ~comes)
-            known = entered.leave(rows[goes], objects[goes])
+            known = entered.leave(rows[goes], kinds[goes])
             goes = goes[~known]
-            around.surround(rows[goes], objects[goes], hits.triangle[goes])
+            around.surround(rows[goes], kinds[goes], hits.triangle[goes])
         return around
 
     def within(self, caster: SceneCaster, light: Rays, depths: Floats | None) -> LightInMedia:
@@ -248,39 +251,39 @@ class Media:
 
     def index(self, around: MediaStack) -> Floats:
         """Refractive indices of the innermost media that have one: (n,)."""
-        indices = self._index[around.objects]
+        indices = self._index[around.kinds]
         return _first(indices, indices > 0, 1.0)
 
     def attenuation(self, around: MediaStack) -> Floats:
         """Extinction there, 1/m: (n,); outside of what refracts that of the air."""
-        refracts = self._index[around.objects] > 0
-        return _first(self._attenuation[around.objects], refracts, self.air)
+        refracts = self._index[around.kinds] > 0
+        return _first(self._attenuation[around.kinds], refracts, self.air)
 
     def behind(
-        self, around: MediaStack, objects: Ints32, triangles: Ints32, along: Floats
+        self, around: MediaStack, kinds: Ints32, triangles: Ints32, along: Floats
     ) -> MediaStack:
         """Media behind surfaces (n,), which light meets at the cosines `along`."""
-        behind = around[np.arange(len(objects))]
-        enters, filled = self.sides(objects, along), self.filled[objects]
+        behind = around[np.arange(len(kinds))]
+        enters, filled = self.sides(kinds, along), self.filled[kinds]
         comes, goes = np.flatnonzero(filled & enters), np.flatnonzero(filled & ~enters)
-        behind.enter(comes, objects[comes], triangles[comes])
-        behind.leave(goes, objects[goes])
+        behind.enter(comes, kinds[comes], triangles[comes])
+        behind.leave(goes, kinds[goes])
         return behind
 
     def density(self, around: MediaStack, upright: Floats) -> Floats:
         """Optical depth of leaves for each metre, in each medium around light: (n, DEPTH)."""
-        density = self._area[around.objects]
+        density = self._area[around.kinds]
         if density.any():
             for number, angle in enumerate(self._angles):
                 crossing = projection(angle, upright)[:, None]
-                density *= np.where(self._angle[around.objects] == number, crossing, 1)
+                density *= np.where(self._angle[around.kinds] == number, crossing, 1)
         return density
 
-    def bright(self, objects: Ints32, upright: Floats) -> Floats:
-        """Mean cosine between light and the leaves of objects (n,) that it meets: (n,)."""
-        out = np.ones(len(objects))
+    def bright(self, kinds: Ints32, upright: Floats) -> Floats:
+        """Mean cosine between light and the leaves of surfaces (n,) that it meets: (n,)."""
+        out = np.ones(len(kinds))
         for number, angle in enumerate(self._angles):
-            out = np.where(self._angle[objects] == number, brightness(angle, upright), out)
+            out = np.where(self._angle[kinds] == number, brightness(angle, upright), out)
         return out
 
 
@@ -352,7 +355,7 @@ class LightInMedia:
         # Where crowns overlap, a leaf is of one of them in proportion to its density.
         share = (draw(Purpose.WHICH, ray[rows]) >> np.uint64(11)).astype(np.float64) * 2.0**-53
         place = (sums[rows] <= (share * total[rows])[:, None]).sum(axis=1)
-        cosines = self.media.bright(self.around.objects[rows, place], upright[rows])
+        cosines = self.media.bright(self.around.kinds[rows, place], upright[rows])
         return Leaves(rows, metres, self.around.triangles[rows, place], cosines)
 
     def _among_voxels(
@@ -365,7 +368,7 @@ class LightInMedia:
         """
         grids, around = self.media.grids, self.around
         assert grids is not None and self.left is not None
-        gridded = self.media.gridded[around.objects]
+        gridded = self.media.gridded[around.kinds]
         rows = np.flatnonzero(gridded.any(axis=1))
         gridded = gridded[rows]
         place = np.argsort(~gridded, axis=1, kind="stable")
@@ -395,7 +398,7 @@ class LightInMedia:
 
     def cross(
         self,
-        objects: Ints32,
+        kinds: Ints32,
         triangles: Ints32,
         directions: Floats,
         normals: Floats,
@@ -409,15 +412,15 @@ class LightInMedia:
         Directions behind them (n, 3), shares of light that pass, or are mirrored where light is
         refracted (n,), and whether all is reflected, with directions as if there were no surface.
         """
-        before, self.around = self.around, self.media.behind(self.around, objects, triangles, along)
+        before, self.around = self.around, self.media.behind(self.around, kinds, triangles, along)
         if self.differentials is None:
-            return directions, 1.0, np.zeros(len(objects), np.bool_)
+            return directions, 1.0, np.zeros(len(kinds), np.bool_)
         ratio = self.media.index(self.around) / self.differentials.index
         ahead, passes, whole = refracted(directions, normals, along, ratio)
         stays = whole | off
-        self.around.objects[stays] = before.objects[stays]
+        self.around.kinds[stays] = before.kinds[stays]
         self.around.triangles[stays] = before.triangles[stays]
-        bends = self.media.mirrors[objects]
+        bends = self.media.mirrors[kinds]
         passes = np.where(whole & bends, 0.0, passes)
         passes = np.where(off, np.where(bends, 1 - passes, 1.0), passes)
         return np.where(off[:, None], directions, ahead), passes, whole

@@ -73,7 +73,7 @@ def _bytes(setup: Setup, scans: int, on_device: bool) -> float:
     total = Memory(*map(sum, zip(own, *(step.memory(setup, sizes) for step in steps), strict=True)))
     casting: float = POSE * poses + RAY_MADE * made + bodies * (rays if scene.actors else here)
     casting += max(total.casting, total.counting)
-    if on_device and not needs_hits(survey):
+    if on_device and not needs_hits(scene, survey):
         one_run = scans <= survey.steps_each[setup.number] and len(survey.carried) == 1
         point: float = (PAGE_LOCKED + (0 if one_run else JOINED)) * columns
     else:  # as if NumPy made all columns, and once more those of the device

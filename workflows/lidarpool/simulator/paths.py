@@ -148,7 +148,7 @@ class CastStep(PulseStep):
             if self._coloured:
                 points = light.origins + step[:, None] * light.directions
                 colour = surfaces.colours(triangle, points, light.times, poses.ways)
-            normals, along, rows, energy, film = surfaces.lit(
+            normals, along, kinds, energy, film = surfaces.lit(
                 triangle, light.directions, distance, self._light, light.times, poses.ways, colour
             )
             if len(leaves):
@@ -173,12 +173,12 @@ class CastStep(PulseStep):
             hits = PulseReturns(light.ray, distance, triangle, energy, colour, cause, velocity)
             turns = light.turns
             looks = normals if turns is None else into_axes(normals, turns)
-            goes, mirrors = materials.passes[rows], np.zeros(len(rows), np.bool_)
+            goes, mirrors = materials.passes[kinds], np.zeros(len(kinds), np.bool_)
             if mirrored is not None:
-                smooth = (materials.specular > 0)[rows] | (False if film is None else film)
+                smooth = (materials.specular > 0)[kinds] | (False if film is None else film)
                 mirrors = smooth & (mirrored < MIRRORED_MOST)
             if within is not None:  # optical paths are longer than what was cast
-                crowns = materials.leafy[rows]  # whose surfaces send nothing back
+                crowns = materials.leafy[kinds]  # whose surfaces send nothing back
                 crowns[leaves] = False
                 near = distance <= farthest
                 goes, mirrors = (goes | crowns) & near, mirrors & near
@@ -199,10 +199,10 @@ class CastStep(PulseStep):
             seeks = mirrored is not None and not (within is not None and within.differentials)
             share, water = np.empty(len(on)), np.zeros(0, np.bool_) if film is None else film
             count = surface_loops.onward(
-                on, off, rows, along, materials.shares(rows[on], bright), self._light.wet, water,
-                light.share, distance, materials.specular, materials.passes, ~materials.refracts,
-                materials.leafy, self._brightest, self._light.extinction,
-                self._faintest if seeks else -1.0, share,
+                on, off, kinds, along, materials.shares(kinds[on], bright),
+                self._light.wet, water, light.share, distance, materials.specular,
+                materials.passes, ~materials.refracts, materials.leafy, self._brightest,
+                self._light.extinction, self._faintest if seeks else -1.0, share,
             )  # fmt: skip
             on, off, share = on[:count], off[:count], share[:count]
             light = light.on(on)
@@ -257,8 +257,8 @@ class CastStep(PulseStep):
         share, ahead, mirrors = light.share, light.directions, off
         index = 1.0 if within is None else within.index
         if within is not None:
-            rows = self.surfaces.objects(triangle)
-            ahead, passes, whole = within.cross(rows, triangle, ahead, normals, along, off)
+            kinds = self.surfaces.kinds(triangle)
+            ahead, passes, whole = within.cross(kinds, triangle, ahead, normals, along, off)
             share = share * passes**2
             mirrors = mirrors | whole
         mirrored = 2 * mirrors[:, None] * normals

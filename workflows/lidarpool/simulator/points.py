@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 from raybeam import Pattern
 
 from ..base.arrays import AnyArray, Bytes, Floats, Ints, Ints32, Records, UInts32
-from ..base.elementary import arcsin, arctan2
+from ..base.elementary import arccos, arcsin, arctan2
 from ..base.errors import LidarpoolError
-from ..base.vectors import turned
+from ..base.vectors import products, turned
 from ..columns.table import Column
 from ..columns.waveforms import column_type
 from ..scene.colours import unpacked
@@ -25,7 +25,7 @@ from ..sensor.reflectivity import COUNTS, SCALES
 from .doppler import radial_velocities
 from .motion import Firings, Poses
 from .pulses import Scanned
-from .returns import BLOOMING, CROSSTALK, FALSE_ALARM, made
+from .returns import BLOOMING, CROSSTALK, FALSE_ALARM, GHOST, made
 from .surfaces import Surfaces, light_of
 
 BLOCK_HITS = 1 << 16  # that are looked at a time
@@ -168,13 +168,39 @@ class BatchPoints:
 
         A frozen sensor's points stay in its axes, and move with it.
         """
+        return self._moved(self._ends)
+
+    def _moved(self, points: Floats) -> Floats:
+        """Move points (n, 3) with the axes of a frozen sensor, since the sweep that it repeats."""
         if self.specs[0].repeats is None:
-            return self._ends
+            return points
         before, now = map(self.survey.pose, self.specs[0].repeats)
         if before == now:
-            return self._ends
-        inside = turned(np.subtract(self._ends, before.position), before.turn.T)
+            return points
+        inside = turned(np.subtract(points, before.position), before.turn.T)
         return turned(inside, now.turn) + now.position
+
+    @cached_property
+    def ray_origins(self) -> Floats:
+        """Starts of the rays in the coordinates of the survey's points, metres: (n, 3)."""
+        if self.survey.coordinates == "sensor":
+            return self._in_sensor(np.zeros(len(self)))
+        return self._moved(self.origins) + self.scene.origin
+
+    @property
+    def origin_x(self) -> Floats:
+        """Return x of the starts of the rays, see `ray_origins`."""
+        return self.ray_origins[:, 0]
+
+    @property
+    def origin_y(self) -> Floats:
+        """Return y of the starts of the rays, see `ray_origins`."""
+        return self.ray_origins[:, 1]
+
+    @property
+    def origin_z(self) -> Floats:
+        """Return z of the starts of the rays, see `ray_origins`."""
+        return self.ray_origins[:, 2]
 
     @cached_property
     def _ends(self) -> Floats:
@@ -226,8 +252,12 @@ class BatchPoints:
     @cached_property
     def sensor_positions(self) -> Floats:
         """Ends of the rays in the axes of the sensor at their firing, metres: (n, 3)."""
+        return self._in_sensor(self.range)
+
+    def _in_sensor(self, distance: Floats) -> Floats:
+        """Points of the rays at distances (n,), in the axes of the sensor, metres: (n, 3)."""
         origins = self._pattern.origins
-        ends = self._pattern.directions[self._rows] * self.range[:, None]
+        ends = self._pattern.directions[self._rows] * distance[:, None]
         if origins is not None:
             ends += origins[self._rows]
         if not self._poses.by_head:
@@ -246,6 +276,14 @@ class BatchPoints:
             return turned(looks, self.sensor.axes)
         mount = self.carried.mount.rotation
         return turned(vectors, None if mount is None else mount.T)
+
+    def _world_to_sensor(self, vectors: Floats) -> Floats:
+        """Turn vectors (n, 3) in the scene's axes to those of the sensor at the firing."""
+        inside = np.empty(vectors.shape[::-1])
+        for axis, unit in enumerate(np.eye(3)):
+            _, axes = self._poses.rays(Pattern(unit[None]), self.found.ray, self._start)
+            inside[axis] = products(vectors.T, axes.T)
+        return self._to_sensor(inside.T)
 
     @cached_property
     def azimuth(self) -> Floats:
@@ -271,12 +309,70 @@ class BatchPoints:
         return self._surfaces.objects(self.found.triangle)
 
     @cached_property
+    def _kinds(self) -> Ints32:
+        """Kinds of surfaces, rows of the table of materials."""
+        if not self.scene.has_mixed_objects:
+            return self.object
+        return self._surfaces.kinds(self.found.triangle)
+
+    @cached_property
     def cosine(self) -> Floats:
         """Cosine of the angle between the ray and the normal of its triangle, 0 to 1.
 
         It means nothing where there is no surface.
         """
         return np.abs(self._lit[0])
+
+    @cached_property
+    def _facing(self) -> tuple[Floats, Floats]:
+        """Unit normals (n, 3), scene's axes, on the side that was hit, and cosines of incidence.
+
+        NaN where there is no surface, of leaves within a crown, and of ghosts, whose rays arrive
+        from elsewhere.
+        """
+        triangle, surfaces = self.found.triangle, self._surfaces
+        normals, cosines = np.full((len(self), 3), np.nan), np.full(len(self), np.nan)
+        on_surface = triangle >= 0
+        if self.found.cause is not None:
+            on_surface &= self.found.cause != GHOST
+        if surfaces.materials.leafy.any():
+            on_surface &= ~surfaces.materials.leafy[self._kinds]
+        rows = np.flatnonzero(on_surface)
+        for begin in range(0, len(rows), BLOCK_HITS):
+            block = rows[begin : begin + BLOCK_HITS]
+            facing = surfaces.normals(triangle[block], self._times[block], self._poses.ways)
+            along = products(facing.T, self.directions[block].T)
+            facing[along > 0] *= -1
+            normals[block], cosines[block] = facing, np.abs(along)
+        return normals, cosines
+
+    @cached_property
+    def normals(self) -> Floats:
+        """Unit normals on the side that was hit, in the axes of the survey's points: (n, 3)."""
+        normals, _ = self._facing
+        if self.survey.coordinates == "sensor":
+            return self._world_to_sensor(normals)
+        return self._moved(normals) - self._moved(np.zeros((1, 3)))
+
+    @property
+    def normal_x(self) -> Floats:
+        """Return x of the normals, see `normals`."""
+        return self.normals[:, 0]
+
+    @property
+    def normal_y(self) -> Floats:
+        """Return y of the normals, see `normals`."""
+        return self.normals[:, 1]
+
+    @property
+    def normal_z(self) -> Floats:
+        """Return z of the normals, see `normals`."""
+        return self.normals[:, 2]
+
+    @property
+    def incidence_deg(self) -> Floats:
+        """Angle between the ray and the normal of its surface, degrees; NaN as of `normals`."""
+        return np.degrees(arccos(np.minimum(self._facing[1], 1.0)))
 
     @cached_property
     def _lit(self) -> tuple[Floats, Floats]:
@@ -412,5 +508,10 @@ class BatchPoints:
     @property
     def semantic_class(self) -> NDArray[np.uint16]:
         """Class of the material."""
-        classes, owners = self._surfaces.materials.semantic_class[self.object], self.object
-        return classes if self.found.cause is None else np.where(owners < 0, 0, classes)
+        classes = self._surfaces.materials.semantic_class[self._kinds]
+        return classes if self.found.cause is None else np.where(self._kinds < 0, 0, classes)
+
+    @property
+    def material_number(self) -> Ints32:
+        """Number of the material's name among those of the scene; -1 for none."""
+        return self._surfaces.material_numbers(self.found.triangle)

@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import groupby
+from typing import Any
 
 import numpy as np
 
@@ -73,7 +74,7 @@ class StrayLightStep(PulseStep):
             for retro in retros:
                 one = np.ones(len(retro.triangles))
                 # What they return of a beam that hits them at a distance of 10 m.
-                back = table.scattered(self.surfaces.objects(retro.triangles), one, one)
+                back = table.scattered(self.surfaces.kinds(retro.triangles), one, one)
                 given = *retro.places, back, few, *limits
                 stray_loops.leaks(*beams, cells, *given, best, ends, new)
             if turns is not None:  # back to the axes of the scene
@@ -120,23 +121,30 @@ class _Retro:
 
 def _retros(scene: Scene, surfaces: Surfaces) -> Iterator[_Retro]:
     """Retro-reflectors of a scene, its instances and actors."""
-    retro = surfaces.materials.retro
-    own = np.flatnonzero(retro[scene.face_object]) if len(scene.faces) else np.zeros(0, np.intp)
-    yield from _clusters(own, scene.vertices[scene.faces[own]])
+    retro, owners = surfaces.materials.retro, surfaces.material_kinds.object
+    of_object = np.zeros(len(scene.all_names), np.bool_)  # whether an object has some
+    of_object[owners[retro]] = True
+
+    def those_of(faces: Integers, vertices: Floats, first: int, actor: int | None = None) -> Any:
+        """Clusters of the retro-reflectors among triangles that are numbered from `first` on."""
+        rows = np.flatnonzero(retro[surfaces.kinds(first + np.arange(len(faces)))])
+        return _clusters(first + rows, vertices[faces[rows]], actor)
+
+    if of_object[: len(scene.names)].any():
+        yield from those_of(scene.faces, scene.vertices, 0)
     begin = len(scene.faces)
     shared = scene.instances
     if shared is not None:
         for part, matrix, owner in zip(shared.part, shared.transforms, shared.owner, strict=True):
             mesh = shared.parts[part]
-            if retro[owner]:
+            if of_object[owner]:
                 vertices = turned(mesh.vertices, matrix[:, :3]) + matrix[:, 3]
-                yield from _clusters(begin + np.arange(len(mesh.faces)), vertices[mesh.faces])
+                yield from those_of(mesh.faces, vertices, begin)
             begin += len(mesh.faces)
     for number, actor in enumerate(scene.actors):
         faces = actor.mesh.faces
-        if retro[len(scene.names) + number]:
-            corners = actor.mesh.vertices[faces]
-            yield from _clusters(begin + np.arange(len(faces)), corners, number)
+        if of_object[len(scene.names) + number]:
+            yield from those_of(faces, actor.mesh.vertices, begin, number)
         begin += len(faces)
 
 

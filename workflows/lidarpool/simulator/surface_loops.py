@@ -59,7 +59,7 @@ def find(triangle, begins, owners, shared, firsts, to_kept, standing, rows, obje
 
 @compiled()
 def meet(
-    rows, objects, which, directions, turns, table, own, run, poses, reflectance, retro,
+    rows, kinds, which, directions, turns, table, own, run, poses, reflectance, retro,
     normals, along, back,
 ):  # fmt: skip
     """Write unit normals (3, n), their products with directions (3, n), and light sent back.
@@ -70,7 +70,7 @@ def meet(
     of an array is made: it would be counted, which takes five times as long as all the rest.
     """
     for k in range(len(rows)):
-        row, i, owner = rows[k], which[k], objects[k]
+        row, i, kind = rows[k], which[k], kinds[k]
         if row >= 0:
             x, y, z = table[row, 0], table[row, 1], table[row, 2]
         else:
@@ -92,7 +92,7 @@ def meet(
         cosine = _product(x, y, z, directions[0, k], directions[1, k], directions[2, k])
         normals[0, k], normals[1, k], normals[2, k] = x, y, z
         along[k] = cosine
-        back[k] = reflectance[owner] * (RETRO_GAIN if retro[owner] else abs(cosine))
+        back[k] = reflectance[kind] * (RETRO_GAIN if retro[kind] else abs(cosine))
 
 
 @inlined
@@ -112,15 +112,15 @@ def fade(distance, extinction, energy):
 
 
 @compiled()
-def soak(up, along, objects, dry, shares, level, wet, film, back):
+def soak(up, along, kinds, dry, shares, level, wet, film, back):
     """Mark where there may be water, and multiply the light sent back by what is below it.
 
-    It is where z of the normals `up`, of the side that is seen, is at least `level`, but on objects
-    that are `dry`; `shares` of light are scattered.
+    It is where z of the normals `up`, of the side that is seen, is at least `level`, but on kinds
+    of surfaces that are `dry`; `shares` of light are scattered.
     """
     for k in range(len(up)):
         upright = up[k] if along[k] < 0 else -up[k]
-        film[k] = upright >= level and not dry[objects[k]]
+        film[k] = upright >= level and not dry[kinds[k]]
         if film[k]:
             mirrored = fresnel(abs(along[k]), WATER_INDEX)
             back[k] *= 1 - wet * (1 - within_water(mirrored, shares[k]))
@@ -128,10 +128,10 @@ def soak(up, along, objects, dry, shares, level, wet, film, back):
 
 @compiled()
 def onward(
-    on, off, objects, along, shares, wet, film, before, distance, specular, passes, straight, leafy,
+    on, off, kinds, along, shares, wet, film, before, distance, specular, passes, straight, leafy,
     brightest, extinction, faintest, share,
 ):  # fmt: skip
-    """Find what light goes on from rows `on` of hits, through objects or `off` them.
+    """Find what light goes on from rows `on` of hits, through surfaces or `off` them.
 
     Where light is not `straight`, it is refracted: what a surface mirrors is then neither taken off
     nor alone. A share `wet` of what has a `film` is below water. Light that can return no more than
@@ -141,15 +141,15 @@ def onward(
     count = 0
     for j in range(len(on)):
         k = on[j]
-        owner, cosine = objects[k], abs(along[k])
-        first, grazing = specular[owner], 1 - min(cosine, 1.0)
+        kind, cosine = kinds[k], abs(along[k])
+        first, grazing = specular[kind], 1 - min(cosine, 1.0)
         square = grazing * grazing
         mirrors = first + (1 - first) * (grazing * (square * square)) if first > 0 else 0.0
-        if passes[owner]:
+        if passes[kind]:
             mirrors = fresnel(cosine, GLASS_INDEX)
-        goes = mirrors if off[j] else 1 - mirrors if passes[owner] else 1.0
-        goes = goes if straight[owner] else 1.0
-        goes *= 1.0 if leafy[owner] else 1 - shares[j]
+        goes = mirrors if off[j] else 1 - mirrors if passes[kind] else 1.0
+        goes = goes if straight[kind] else 1.0
+        goes *= 1.0 if leafy[kind] else 1 - shares[j]
         if len(film) and film[k]:
             goes = (1 - wet) * goes + wet * fresnel(cosine, WATER_INDEX)
         goes = before[k] * (goes * goes)

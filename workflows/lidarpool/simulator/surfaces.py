@@ -15,9 +15,16 @@ from ..base.arrays import Bools, Floats, Floats32, Indices, Integers, Ints, Ints
 from ..base.vectors import applied, into_axes, inverse, length, products
 from ..scene.actors import shapes_of
 from ..scene.colours import GREY, Colours, Lookup, joined, luminance, packed
+from ..scene.face_materials import FaceMaterials
 from ..scene.scene import Scene
 from ..sensor import Sensor, Survey
-from ..sensor.materials import NEAR_NM, Material, MaterialTable, at_right_angles
+from ..sensor.materials import (
+    NEAR_NM,
+    Material,
+    MaterialTable,
+    at_right_angles,
+    first_matches,
+)
 from ..sensor.trajectory import velocities
 from .voxels import Grids
 from .ways import Ways
@@ -45,7 +52,7 @@ class Lit(NamedTuple):
 
     normals: Floats  # (n, 3)
     along: Floats  # (n,): cosines of the angles between normals and directions, of either sign
-    objects: Ints32  # (n,)
+    kinds: Ints32  # (n,): rows of the table of materials
     energy: Floats  # (n,): see `Surfaces.energy`
     film: Bools | None = None  # (n,): whether there may be a film of water
 
@@ -82,13 +89,14 @@ class Surfaces:
         materials: tuple[Material, ...],
         wavelengths: Iterable[float] = (NEAR_NM,),
     ) -> None:
-        self._scene = scene
+        self._scene, self._materials = scene, materials
         self._standing = len(scene.names)  # objects
         self.counters = scene.counters
-        names = scene.all_names
+        kinds = scene.surface_kinds
         self._tables = {
-            nm: MaterialTable.of(materials, names, nm, scene.has_voxels) for nm in wavelengths
+            nm: MaterialTable.of(materials, kinds, nm, scene.has_voxels) for nm in wavelengths
         }
+        self.material_kinds = kinds
         self.grids = Grids.of(scene.instances)
         shared = scene.instances
         plain = len(scene.faces)
@@ -109,11 +117,11 @@ class Surfaces:
 
     @property
     def materials(self) -> MaterialTable:
-        """Materials of objects, the same at all wavelengths but for their reflectance."""
+        """Materials of kinds of surfaces, at all wavelengths the same but for reflectance."""
         return next(iter(self._tables.values()))
 
     def at(self, wavelength_nm: float) -> MaterialTable:
-        """Materials of objects at the wavelength of a sensor."""
+        """Materials of kinds of surfaces at the wavelength of a sensor."""
         return self._tables[wavelength_nm]
 
     def moved(self, scene: Scene, rows: Indices) -> Surfaces:
@@ -160,11 +168,12 @@ class Surfaces:
         times: Floats | Ints,
         ways: Ways,
     ) -> tuple[Floats, Floats, Ints32, Floats]:
-        """Return normals (3, n), their products with directions, objects, and light sent back."""
+        """Return normals (3, n), products with directions, kinds of surfaces, light sent back."""
         from . import surface_loops  # not before: numba takes half a second to import
 
         poses, run = np.zeros((12, 0)), np.zeros(0, np.int64)
         rows, objects, which = self._find(triangle)
+        kinds = self._kinds_of(rows, objects)
         own = _NO_NORMALS
         if ways:
             actors = objects - np.int64(self._standing)
@@ -174,9 +183,9 @@ class Surfaces:
                 own, rows[on] = _normals(corners), ~np.arange(len(on))
         normals, (along, back) = np.empty((3, len(rows))), np.empty((2, len(rows)))
         given = self._turns, self.unit_normals, own, run, poses, table.reflectance, table.retro
-        hits = rows, objects, which, owned(directions.T)
+        hits = rows, kinds, which, owned(directions.T)
         surface_loops.meet(*hits, *given, normals, along, back)
-        return normals, along, objects, back
+        return normals, along, kinds, back
 
     def lit(
         self,
@@ -192,17 +201,18 @@ class Surfaces:
         from . import surface_loops
 
         table = self.at(light.wavelength_nm)
-        normals, along, objects, back = self._met(triangle, directions, table, times, ways)
+        normals, along, kinds, back = self._met(triangle, directions, table, times, ways)
         bright = luminance(colours) if table.textured and colours is not None else None
         if table.textured or table.roughness.any():
-            back = table.scattered(objects, np.abs(along), bright)
+            back = table.scattered(kinds, np.abs(along), bright)
         film = None
         if light.wet:
             film, dry = np.empty(len(along), np.bool_), table.passes | table.leafy
-            given = normals[2], along, objects, dry, table.shares(objects, bright), LEVEL, light.wet
+            shares = table.shares(kinds, bright)
+            given = normals[2], along, kinds, dry, shares, LEVEL, light.wet
             surface_loops.soak(*given, film, back)
         surface_loops.fade(owned(distance), light.extinction, back)
-        return Lit(normals.T, along, objects, back, film)
+        return Lit(normals.T, along, kinds, back, film)
 
     def _bent(
         self, rows: Indices, actors: Integers, times: Floats | Ints, ways: Ways
@@ -329,6 +339,65 @@ class Surfaces:
             return self.owners[triangle]
         return self._find(triangle)[1]
 
+    def kinds(self, triangle: Integers) -> Ints32:
+        """Kinds of surfaces of triangles (n,), rows of the table of materials; -1 of no surface."""
+        if self._kind_in_object is None:
+            return self.objects(triangle)
+        rows, objects, _ = self._find(triangle)
+        return self._kinds_of(rows, objects)
+
+    def _kinds_of(self, rows: Indices, objects: Ints32) -> Ints32:
+        """Kinds of surfaces of triangles, by rows among those that are kept once, and objects."""
+        if self._kind_in_object is None:
+            return objects
+        kinds = self.material_kinds.first[:-1][objects] + self._kind_in_object[rows]
+        return np.where(objects < 0, np.int32(-1), self._merged[kinds])
+
+    @cached_property
+    def _kind_in_object(self) -> Ints32 | None:
+        """Number of the kind of each triangle kept once among those of its object, (f,).
+
+        None if each object has one kind, which then has the number of the object.
+        """
+        if len(self.material_kinds.object) == len(self.material_kinds.names):
+            return None
+        scene = self._scene
+        parts = () if scene.instances is None else scene.instances.parts
+        meshes = [(len(mesh.faces), mesh.materials) for mesh in self._meshes]
+        meshes += [(len(part.faces), part.materials) for part in parts]
+        plain = None if scene.materials is None else scene.materials.index
+        numbers = [np.zeros(len(scene.faces), np.int32) if plain is None else plain]
+        for size, materials in meshes:
+            index = None if materials is None else materials.index
+            numbers.append(np.zeros(size, np.int32) if index is None else index)
+        return np.concatenate(numbers)
+
+    def material_numbers(self, triangle: Integers) -> Ints32:
+        """Numbers of the names of triangles' materials, see `Scene.material_names`; -1 for none."""
+        rows, objects, _ = self._find(triangle)
+        kinds = self.material_kinds.first[:-1][objects]
+        if self._kind_in_object is not None:
+            kinds = kinds + self._kind_in_object[rows]
+        return np.where(objects < 0, np.int32(-1), self._number_of_kind[kinds])
+
+    @cached_property
+    def _number_of_kind(self) -> Ints32:
+        """Number of the name of each kind's material; -1 for none."""
+        numbers = {name: number for number, name in enumerate(self._scene.material_names)}
+        return np.array([numbers.get(name, -1) for name in self.material_kinds.material], np.int32)
+
+    @cached_property
+    def _merged(self) -> Ints32:
+        """First kind of the same object that has the same material, for each kind.
+
+        A surface with several names is one surface where one entry is for all of them: closed, if
+        it holds a medium.
+        """
+        kinds, first = self.material_kinds, first_matches(self._materials, self.material_kinds)
+        keys = np.stack([kinds.object, first], axis=1)
+        _, rows, which = np.unique(keys, axis=0, return_index=True, return_inverse=True)
+        return rows[which.reshape(-1)].astype(np.int32)
+
     def instances(self, triangle: Integers) -> Indices:
         """Instances that triangles (n,) belong to; each belongs to one."""
         return np.searchsorted(self._begins, triangle, side="right") - 1
@@ -359,12 +428,12 @@ class Surfaces:
         """
         table = self.at(light.wavelength_nm)
         bright = luminance(colours) if table.textured and colours is not None else None
-        scattered = table.scattered(self.objects(triangle), cosine, bright)
+        scattered = table.scattered(self.kinds(triangle), cosine, bright)
         return np.asarray(scattered * at_right_angles(distance, light.extinction))
 
     @cached_property
     def solids(self) -> tuple[Bools, Bools]:
-        """Whether the surfaces of objects that hold a medium are closed, and point inwards: (n,).
+        """Whether surfaces that hold a medium are closed, and point inwards, by kinds: (k,).
 
         They point inwards if they are closed and have a negative volume.
         """
@@ -373,15 +442,20 @@ class Surfaces:
         volume = np.zeros(len(closed))
         for number in np.flatnonzero(table.leafy | table.refracts).tolist():
             bodies: list[tuple[Floats, Integers]] = []
-            if number >= self._standing:
-                mesh = scene.actors[number - self._standing].mesh
-                bodies.append((mesh.vertices, mesh.faces))
-            elif len(own := self._faces_of(number)):
-                bodies.append((scene.vertices, own))
+            owner = int(self.material_kinds.object[number])
+            if owner >= self._standing:
+                mesh = scene.actors[owner - self._standing].mesh
+                bodies.append((mesh.vertices, self._of_kind(number, mesh.faces, mesh.materials)))
+            else:
+                bodies.append((scene.vertices, self._faces_of(number)))
             if scene.instances is not None:
-                parts = np.unique(scene.instances.part[scene.instances.owner == number])
-                bodies += [scene.instances.parts[part][:2] for part in parts]
+                for row in np.unique(scene.instances.part[scene.instances.owner == owner]):
+                    part = scene.instances.parts[row]
+                    faces = self._of_kind(number, part.faces, part.materials)
+                    bodies.append((part.vertices, faces))
             for vertices, faces in bodies:
+                if not len(faces):
+                    continue
                 closed[number] &= _closed(vertices, faces)
                 volume[number] += _volume(vertices, faces)
         return closed, closed & (volume < 0)
@@ -394,15 +468,31 @@ class Surfaces:
         return order, np.searchsorted(owners[order], np.arange(self._standing + 1))
 
     def _faces_of(self, number: int) -> Integers:
+        """Those of the scene's faces that are of a kind of surface."""
         order, begins = self._by_object
-        return self._scene.faces[order[begins[number] : begins[number + 1]]]
+        owner = int(self.material_kinds.object[number])
+        rows = order[begins[owner] : begins[owner + 1]]
+        if self._scene.materials is None:
+            return self._scene.faces[rows]
+        materials = self._scene.materials.of_object(owner, rows)
+        return self._of_kind(number, self._scene.faces[rows], materials)
+
+    def _of_kind(self, number: int, faces: Integers, materials: FaceMaterials | None) -> Integers:
+        """Those of some faces of an object that are of a kind of surface."""
+        if self._kind_in_object is None:
+            return faces
+        kinds = self.material_kinds
+        index = 0 if materials is None or materials.index is None else materials.index
+        kind = self._merged[kinds.first[kinds.object[number]] + index]
+        return faces[np.broadcast_to(kind == number, len(faces))]
 
     @cached_property
     def media(self) -> tuple[int, ...]:
-        """Objects of the scene's faces that hold a medium within a closed surface."""
+        """Kinds of surfaces of the scene's faces that hold a medium within a closed surface."""
         table, (closed, _) = self.materials, self.solids
         held = (table.leafy | table.refracts) & closed
-        return tuple(np.flatnonzero(held[: self._standing]).tolist())
+        held &= self.material_kinds.object < self._standing
+        return tuple(np.flatnonzero(held).tolist())
 
     def spread_out(self, by_m: float) -> Floats:
         """Vertices of the scene's faces, where surfaces of media are so many metres further out.

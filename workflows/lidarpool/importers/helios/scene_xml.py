@@ -6,6 +6,7 @@ import re
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import cached_property, partial
+from glob import escape
 from itertools import cycle
 from pathlib import Path
 from typing import Any
@@ -45,8 +46,8 @@ class HeliosPart:
     surfels: SceneMesh | None = None  # of a file of points
 
     @cached_property
-    def materials(self) -> list[dict[str, str]]:
-        """Material values that HELIOS++ reads for its faces."""
+    def materials(self) -> dict[str, dict[str, str]]:
+        """Values that HELIOS++ reads of the materials of its faces, {name: values}."""
         text = _text(self.file) if self.file.suffix.lower() == ".obj" else ""
         used = {self.material, *re.findall(r"^\s*usemtl\s+(\S+)", text, re.MULTILINE)}
         found: dict[str, dict[str, str]] = {}
@@ -60,12 +61,12 @@ class HeliosPart:
                     values = found.setdefault(words[1], {})
                 elif len(words) > 1 and words[0].startswith("helios_"):
                     values[words[0].removeprefix("helios_")] = words[1]
-        return [values for name, values in found.items() if name in used]
+        return {name: values for name, values in found.items() if name in used}
 
-    def kind(self, spectra: Callable[[str], float | None]) -> dict[str, Any]:
-        """Reflectance and class, where all its faces have the same."""
-        kinds = []
-        for values in self.materials:
+    def kinds(self, spectra: Callable[[str], float | None]) -> dict[str, dict[str, Any]]:
+        """Reflectance and class of each material of its faces, {name: entries of a scenario}."""
+        kinds: dict[str, dict[str, Any]] = {}
+        for name, values in self.materials.items():
             share = None
             if "reflectance" in values:
                 share = number(values, "reflectance", 0)
@@ -77,22 +78,29 @@ class HeliosPart:
                 kind["reflectance"] = clean(np.clip(share, 0, 1))
             if "classification" in values:
                 kind["class"] = int(number(values, "classification", 0))
-            kinds.append(kind)
-        return kinds[0] if kinds and all(kind == kinds[0] for kind in kinds) else {}
+            kinds[name] = kind
+        return kinds
 
     @property
     def is_ground(self) -> bool:
         """Whether platforms and parts can stand on it; on points if they have no material."""
         if self.surfels is not None and self.library is None:
             return True
-        return any(values.get("isGround", "").lower() in ("true", "1") for values in self.materials)
+        grounds = (values.get("isGround", "").lower() for values in self.materials.values())
+        return any(ground in ("true", "1") for ground in grounds)
 
     def meshes(self) -> tuple[SceneMesh | SceneInstance, ...]:
         """Read it, in the world."""
         placed = Transform(self.turn * self.scale, self.offset)
         if (points := self.surfels) is not None:
             return (points.moved(points.name, placed.linear, placed.offset),)
-        return load_meshes(self.file, up_axis=self.up_axis, transform=placed, tell=lambda _: None)
+        return load_meshes(
+            self.file,
+            up_axis=self.up_axis,
+            transform=placed,
+            materials=True,
+            tell=lambda _: None,
+        )
 
     def entry(self, name: str) -> dict[str, Any]:
         """Entry of `scene.files`, the file under a name."""
@@ -198,18 +206,20 @@ class HeliosScene:
         part.offset[2] += self.height(x, y) - z
 
     def materials(self, wavelength_nm: float) -> list[dict[str, Any]]:
-        """List what objects are made of, where the faces of a file are all of one kind."""
-        kinds = [part.kind(partial(self._reflectance, wavelength_nm)) for part in self.parts]
-        if not any(kinds):
+        """List what objects are made of, or the faces of objects with several materials."""
+        spectra = partial(self._reflectance, wavelength_nm)
+        kinds = [part.kinds(spectra) for part in self.parts]
+        if not any(kind for of_part in kinds for kind in of_part.values()):
             return []
         meshes = [part.meshes() for part in self.parts]
         names = iter(unique_names([mesh.name for of in meshes for mesh in of]))
-        own = [
-            {"objects": next(names), **kind}
-            for of, kind in zip(meshes, kinds, strict=True)
-            for _ in of
+        entries = [
+            entry
+            for of, of_part in zip(meshes, kinds, strict=True)
+            for mesh in of
+            for entry in _entries(next(names), mesh, of_part)
         ]
-        return [{"objects": "*"}, *(entry for entry in own if len(entry) > 1)]
+        return [*entries, {"objects": "*"}]
 
     def _reflectance(self, wavelength_nm: float, name: str) -> float | None:
         """Reflectance at a wavelength, by the spectrum of a name; None where there is none."""
@@ -237,6 +247,25 @@ class HeliosScene:
             places = "; ".join(sorted(self._missing))
             out.append(f"onGround at {places}: no ground there, so z is 0")
         return out
+
+
+def _entries(
+    name: str, mesh: SceneMesh | SceneInstance, kinds: dict[str, dict[str, Any]]
+) -> list[dict[str, Any]]:
+    """Entries of `materials` for an object, of a part with kinds of materials."""
+    shape = mesh.mesh if isinstance(mesh, SceneInstance) else mesh
+    objects = escape(name)
+    if shape.materials is None:  # of a file without materials, to which the part gives one
+        return [{"objects": objects, **kind} for kind in kinds.values() if kind][:1]
+    of_object = {material: kinds.get(material, {}) for material in shape.materials.names}
+    first, *others = of_object.values()
+    if all(kind == first for kind in others):
+        return [{"objects": objects, **first}] if first else []
+    return [
+        {"objects": objects, "material": escape(material), **kind}
+        for material, kind in of_object.items()
+        if kind
+    ]
 
 
 def _files(text: dict[str, str], assets: Assets) -> list[Path]:

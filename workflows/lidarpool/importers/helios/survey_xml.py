@@ -213,6 +213,7 @@ class _Import:
         light, range_m = self._light()
         names = [os.path.relpath(part.file.resolve(), out.resolve()) for part in self.scene.parts]
         entries = zip(self.scene.parts, names, strict=True)
+        classes = ["class"] if any("class" in entry for entry in self._materials) else []
         data = {
             "scene": {"files": [part.entry(Path(name).as_posix()) for part, name in entries]},
             "trajectory": trajectory,
@@ -222,7 +223,7 @@ class _Import:
             "cloud": {
                 "keep_every": 1,
                 "precision_m": 0.001,
-                "columns": ["time", "range", "intensity", "return_number", "returns"],
+                "columns": ["time", "range", "intensity", "return_number", "returns", *classes],
             },
             "planning": {"enabled": False},
         }

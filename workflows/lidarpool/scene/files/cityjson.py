@@ -77,7 +77,7 @@ def read_cityjson(data: bytes, path: Path, wanted: Wanted) -> Content:
                     'is JSON, but not CityJSON: it does not begin with "type": "CityJSON" (a '
                     "scenario has the ending .yaml)"
                 )
-            city = _CityFile(document, allowance, wanted.colours)
+            city = _CityFile(document, allowance, wanted)
         elif kind != "CityJSONFeature":
             raise ValueError(f"a line is of the type {str(kind)[:40]!r}, not CityJSONFeature")
         city.add(document)
@@ -100,8 +100,9 @@ class _CityFile:
         The file, or the first line of a sequence.
     """
 
-    def __init__(self, head: _Json, allowance: Allowance, colours: bool) -> None:
-        self._head, self._allowance, self._colours = head, allowance, colours
+    def __init__(self, head: _Json, allowance: Allowance, wanted: Wanted) -> None:
+        self._head, self._allowance = head, allowance
+        self._colours, self._named = wanted.colours, wanted.materials
         version = str(head.get("version"))
         if not re.match(r"1\.[01]|2\.0", version):
             raise MeshFileError(
@@ -219,12 +220,14 @@ class _CityFile:
         for some, (number, material) in zip(
             np.split(faces, begins[1:]), owner[begins].tolist(), strict=True
         ):
-            painted = None
+            painted, named = None, ""
             if material >= 0:
-                shown = document["appearance"]["materials"][material].get("diffuseColor")
-                colour = as_bytes(shown or (0.8, 0.8, 0.8)).reshape(1, 1, 3)
-                painted = Colours.plain(colour, len(some))
-            pieces[number].append(Piece(points, some, None, painted))
+                entry = document["appearance"]["materials"][material]
+                if self._colours:
+                    colour = as_bytes(entry.get("diffuseColor") or (0.8, 0.8, 0.8))
+                    painted = Colours.plain(colour.reshape(1, 1, 3), len(some))
+                named = str(entry.get("name") or "") if self._named else ""
+            pieces[number].append(Piece(points, some, None, painted, named))
         return [
             joined(name, some, self._allowance)
             for (name, _), some in zip(wanted, pieces, strict=True)
@@ -239,7 +242,7 @@ class _CityFile:
             semantics = geometry.get("semantics") or {}
             kinds = dict(enumerate(one["type"] for one in semantics.get("surfaces") or ()))
             paint: _Json = {}
-            if self._colours:  # of the first theme
+            if self._colours or self._named:  # of the first theme
                 paint = next(iter((geometry.get("material") or {}).values()), {})
             marks = semantics.get("values"), paint.get("values", paint.get("value"))
             if self._colours and geometry.get("texture"):

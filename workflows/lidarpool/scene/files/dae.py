@@ -10,7 +10,7 @@ and animations.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from functools import cache
 from pathlib import Path
 from urllib.parse import unquote
@@ -45,7 +45,7 @@ _SURFACES = ("triangles", "polylist", "polygons", "tristrips", "trifans")
 
 
 def read_dae(data: bytes, path: Path, wanted: Wanted) -> Content:
-    """Read the visual scene of a file; colours are those of its materials."""
+    """Read the visual scene of a file; colours and names are those of its materials."""
     root = xml_root(data)
     for element in root.iter():
         element.tag = element.tag.rpartition("}")[2]
@@ -53,7 +53,7 @@ def read_dae(data: bytes, path: Path, wanted: Wanted) -> Content:
         raise MeshFileError(f"is XML, but not COLLADA: it begins with <{root.tag[:40]}>")
     allowance = Allowance(len(data), SMALLER)
     paint = _Effects(path, wanted, allowance) if wanted.colours else None
-    document = _Document(root, allowance, paint)
+    document = _Document(root, allowance, paint, named=wanted.materials)
     content = settled(instances(document.roots(), document.node, path.stem))
     content.notes = paint.notes.lines() if paint else []
     unit = root.find("asset/unit[@meter]")
@@ -69,8 +69,11 @@ def read_dae(data: bytes, path: Path, wanted: Wanted) -> Content:
 class _Document:
     """Elements by their ids; each geometry is read once."""
 
-    def __init__(self, root: Element, allowance: Allowance, paint: _Effects | None) -> None:
+    def __init__(
+        self, root: Element, allowance: Allowance, paint: _Effects | None, *, named: bool
+    ) -> None:
         self._root, self._allowance, self._paint = root, allowance, paint
+        self._named = named  # whether names of materials are wanted
         # By kind, too: some programs give a scene and a node in it the same id.
         self._ids: dict[tuple[str, str], Element] = {}
         for element in root.iter():
@@ -97,7 +100,7 @@ class _Document:
             elif child.tag == "instance_node":
                 children.append(self._target(child, "node"))
             elif child.tag == "instance_geometry":
-                bound = self._bound(child) if self._paint else ()
+                bound = self._bound(child) if self._paint or self._named else ()
                 meshes += self._geometry(self._target(child, "geometry"), bound)
             elif child.tag == "instance_controller":
                 raise MeshFileError(
@@ -134,11 +137,21 @@ class _Document:
                 raise MeshFileError(f"has a <{kind}>, which is not read: export it as triangles")
         materials = dict(bound)
         pieces = (
-            self._piece(primitive, materials.get(primitive.get("material", "")))
+            self._piece(primitive, materials.get(primitive.get("material", "")))._replace(
+                material=self._material_name(primitive, materials)
+            )
             for primitive in geometry.findall("mesh/*")
             if primitive.tag in _SURFACES
         )
         return joined(name, pieces, self._allowance)
+
+    def _material_name(self, primitive: Element, materials: Mapping[str, Element]) -> str:
+        """Name of the material of a primitive, if names are wanted; else, or for none, empty."""
+        symbol = primitive.get("material", "")
+        if not self._named or not symbol:
+            return ""
+        bound = materials.get(symbol)
+        return symbol if bound is None else bound.get("name") or bound.get("id") or symbol
 
     def _bound(self, instance: Element) -> tuple[tuple[str, Element], ...]:
         """Materials that an instance of a geometry gives to its symbols."""

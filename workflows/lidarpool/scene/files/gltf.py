@@ -368,7 +368,9 @@ class _Reader:
         return self._dressed(Piece(vertices, faces), primitive)
 
     def _dressed(self, piece: Piece, primitive: dict[str, Any], mesh: Any = None) -> Piece:
-        """Return a piece with mask and colours; `mesh` is unpacked by Draco."""
+        """Return a piece with mask, colours and material; `mesh` is unpacked by Draco."""
+        if self._wanted.materials and (number := primitive.get("material")) is not None:
+            piece = piece._replace(material=self._material_name(number))
         if self._wanted.colours and len(piece.faces):
             with self.notes.without_colour(self._material_name(primitive.get("material"))):
                 piece = piece._replace(colours=self._coloured(primitive, piece.faces, mesh))

@@ -115,6 +115,7 @@ def load_objects(
     transform: Transform | None = None,
     opacity: OpacityMode = "mask",
     colours: bool = False,
+    materials: bool = False,
     step_m: float | None = None,
     window: Window | None = None,
     epsg: int | None = None,
@@ -131,7 +132,7 @@ def load_objects(
 
     Parameters
     ----------
-    path, unit, up_axis, transform, opacity, colours, assets
+    path, unit, up_axis, transform, opacity, colours, materials, assets
         As of `Scene.load`, with a path of `SUFFIXES` in any case. The unit of a raster is that of
         its heights.
     step_m
@@ -182,7 +183,8 @@ def load_objects(
             "animation."
         )
     folders = tuple(Path(one).resolve() for one in (path.parent, assets) if one is not None)
-    wanted = Wanted(opacity == "mask" and animation is None, colours, folders, animation)
+    masks = opacity == "mask" and animation is None
+    wanted = Wanted(masks, colours, folders, animation, materials)
     # Of broken numbers in files: infinite and NaN values are refused.
     with np.errstate(all="ignore"):
         try:
@@ -209,7 +211,7 @@ def load_objects(
     if content.raster is not None:
         summary = content.raster.told
     else:
-        summary = _summary(all_of_it, unit_m, up, colours)
+        summary = _summary(all_of_it, unit_m, up, wanted)
     if up_axis is None and content.generator != GENERATOR and OWN.encode() not in data[:_HEAD]:
         _tell_axes(path, content, all_of_it, axes)
     return objects._replace(summary=summary, raster=content.raster)
@@ -224,7 +226,7 @@ def load_meshes(
 
 
 def _summary(
-    meshes: Sequence[SceneMesh | SceneInstance], unit_m: float, up_axis: str, colours: bool
+    meshes: Sequence[SceneMesh | SceneInstance], unit_m: float, up_axis: str, wanted: Wanted
 ) -> str:
     """Say what a file gave: «4 objects, 38 triangles, in m, Y-up, 1 texture»."""
     shapes = [one.mesh if isinstance(one, SceneInstance) else one for one in meshes]
@@ -244,9 +246,13 @@ def _summary(
         f"in {names[0] if names else f'units of {unit_m:g} m'}",
         f"{up_axis.upper()}-up",
     ]
-    return ", ".join(
-        [*words, *([colours_summary(mesh.colours for mesh in shapes)] if colours else [])]
-    )
+    if wanted.colours:
+        words.append(colours_summary(mesh.colours for mesh in shapes))
+    if wanted.materials:
+        named = [mesh.materials.names for mesh in shapes if mesh.materials is not None]
+        distinct = {name for of_mesh in named for name in of_mesh if name}
+        words.append(plural(len(distinct), "named material"))
+    return ", ".join(words)
 
 
 def wrote_it(path: Path) -> bool:

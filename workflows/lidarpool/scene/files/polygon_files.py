@@ -61,7 +61,7 @@ def read_obj(data: bytes, path: Path, wanted: Wanted) -> Content:
     """Read a Wavefront file: an object for each name after 'o', or 'g' without any 'o'.
 
     Objects are in order of their first face; materials do not divide them. Without masks,
-    triangles are solid; without these and colours, neither materials nor images are read.
+    triangles are solid; without these and colours, neither files of materials nor images are read.
     """
     masks, colours = wanted.masks, wanted.colours
     text = data.replace(b"\r\n", b"\n").replace(b"\r", b"\n")
@@ -69,7 +69,7 @@ def read_obj(data: bytes, path: Path, wanted: Wanted) -> Content:
     divider = b"o" if re.search(rb"^ *o ", text, re.MULTILINE) else b"g"
     libraries = _obj_names(b"mtllib", text) if masks or colours else []
     materials = MtlMaterials(path, len(data), libraries, wanted)
-    dressed = materials.has_masks or colours
+    dressed = materials.has_masks or colours or wanted.materials
     numbers, coordinates, tints = array("d"), array("d"), array("d")
     parts = {path.stem: _ObjPolygons()}
     part, kind, kinds = parts[path.stem], 0, {b"": 0}  # {material: its number}
@@ -110,7 +110,8 @@ def read_obj(data: bytes, path: Path, wanted: Wanted) -> Content:
             cutout = materials.cutout(material, uv, at[rows])
             corners_of = None if tinted is None else tinted[faces[rows]]
             shown = materials.colours(material, uv, at[rows], corners_of)
-            pieces.append(Piece(vertices, faces[rows], cutout, shown))
+            named = as_text(material) if wanted.materials else ""
+            pieces.append(Piece(vertices, faces[rows], cutout, shown, named))
         meshes += joined(name, pieces)
     return Content(meshes, notes=materials.notes.lines())
 

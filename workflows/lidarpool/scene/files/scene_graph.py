@@ -15,9 +15,10 @@ import numpy as np
 from ...base.allowance import Allowance, bytes_of, memory_share
 from ...base.arrays import AnyArray, Floats, Ints
 from ...base.vectors import matmul, rank
-from .. import colours
+from .. import colours, face_materials
 from ..animation import Animation
 from ..colours import Colours
+from ..face_materials import FaceMaterials
 from ..scene_instances import SceneInstance
 from ..scene_mesh import Cutout, SceneMesh, compacted, stacked
 from .polygons import check_corners
@@ -51,6 +52,7 @@ class Wanted(NamedTuple):
     colours: bool
     folders: tuple[Path, ...]  # resolved; files that it names are read only from these and below
     animation: str | None = None  # to bake, by its name; "" for the first
+    materials: bool = False  # names of the materials of faces
 
     def allows(self, file: Path) -> bool:
         """Whether a file that is named may be read."""
@@ -224,6 +226,7 @@ class Piece(NamedTuple):
     faces: Ints  # (f, 3)
     cutout: Cutout | None = None
     colours: Colours | None = None
+    material: str = ""  # name of the material of all its faces, if names are wanted
 
 
 def joined(
@@ -252,14 +255,16 @@ def joined(
         cuts = [piece.cutout for piece in some if piece.cutout]
         cutouts.append(Cutout(cuts[0].mask, np.concatenate([cut.uv for cut in cuts])))
     ordered = [*chain(solid, *masked.values())]
-    coloured = colours.joined([one.colours for one in ordered], [len(one.faces) for one in ordered])
+    sizes = [len(one.faces) for one in ordered]
+    coloured = colours.joined([one.colours for one in ordered], sizes)
+    named = face_materials.joined([FaceMaterials.named(one.material) for one in ordered], sizes)
     parts = stacked((one.vertices, one.faces) for one in ordered)
-    return [SceneMesh(name, *parts, tuple(cutouts), coloured)]
+    return [SceneMesh(name, *parts, tuple(cutouts), coloured, materials=named)]
 
 
 def _own(piece: Piece, allowance: Allowance | None) -> Piece:
     """Return a piece without unused vertices; many pieces may share all of them."""
-    vertices, faces, cutout, painted = piece
+    vertices, faces, cutout, painted, material = piece
     check_corners(faces, len(vertices))
     if allowance is not None:
         extra = 0 if cutout is None else cutout.uv.nbytes
@@ -268,4 +273,4 @@ def _own(piece: Piece, allowance: Allowance | None) -> Piece:
     vertices, faces = compacted(vertices, faces)
     if allowance is not None:
         allowance.take(24 * len(vertices))  # in double precision
-    return Piece(vertices, faces, cutout, painted)
+    return Piece(vertices, faces, cutout, painted, material)

@@ -27,6 +27,7 @@ from ...base.arrays import Floats
 from ...base.words import plural
 from ...base.xmlfile import refuse_entity
 from ..colours import GREY, Colours
+from ..face_materials import FaceMaterials
 from ..scene_mesh import SceneMesh
 from .scene_graph import SMALLER, Content, MeshFileError, Node, Wanted, instances, settled
 
@@ -59,6 +60,7 @@ class _MeshObject:
     usual: tuple[str, str] = ("", "0")
     # Of corners, where they are read.
     shades: array[int] = field(default_factory=lambda: array("B"))
+    materials: list[str] = field(default_factory=list)  # of triangles, where names are wanted
 
     @cached_property
     def meshes(self) -> list[SceneMesh]:
@@ -70,7 +72,14 @@ class _MeshObject:
         corners = np.frombuffer(self.shades, np.uint8).reshape(-1, 3, 3)
         if (corners != GREY).any():
             colours = Colours.of_corners(corners)
-        return [SceneMesh(self.name, vertices, faces, colours=colours)]
+        materials = None
+        if self.materials:
+            names = tuple(dict.fromkeys(self.materials))
+            rows = {name: row for row, name in enumerate(names)}
+            index = np.array([rows[name] for name in self.materials], np.int32)
+            materials = FaceMaterials(names, index if names[1:] else None)
+            materials = materials if any(names) else None
+        return [SceneMesh(self.name, vertices, faces, colours=colours, materials=materials)]
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,7 +92,7 @@ class _Placement:
 def read_3mf(data: bytes, path: Path, wanted: Wanted) -> Content:
     """Read the build items of a file, and colours of base materials and colour groups."""
     with zipfile.ZipFile(io.BytesIO(data)) as archive:
-        package = _Package(archive, Allowance(len(data), SMALLER), wanted.colours)
+        package = _Package(archive, Allowance(len(data), SMALLER), wanted)
         root = package.model(package.start())
 
         def node(place: _Placement) -> Node:
@@ -101,8 +110,8 @@ def read_3mf(data: bytes, path: Path, wanted: Wanted) -> Content:
 class _Package:
     """The inner files of an archive, each read when an object of it is placed."""
 
-    def __init__(self, archive: zipfile.ZipFile, allowance: Allowance, colours: bool) -> None:
-        self._archive, self._allowance, self._colours = archive, allowance, colours
+    def __init__(self, archive: zipfile.ZipFile, allowance: Allowance, wanted: Wanted) -> None:
+        self._archive, self._allowance, self._wanted = archive, allowance, wanted
         self.models: dict[str, _Model] = {}
 
     def start(self) -> str:
@@ -124,7 +133,7 @@ class _Package:
         name = name.lstrip("/")
         if name not in self.models:
             pieces = self._pieces(name)
-            self.models[name] = _Model(name, pieces, self._allowance, self._colours)
+            self.models[name] = _Model(name, pieces, self._allowance, self._wanted)
         return self.models[name]
 
     def _pieces(self, name: str) -> Iterator[bytes]:
@@ -151,13 +160,15 @@ class _Model:
     """
 
     def __init__(
-        self, name: str, text: Iterable[bytes], allowance: Allowance, colours: bool
+        self, name: str, text: Iterable[bytes], allowance: Allowance, wanted: Wanted
     ) -> None:
         self.unit = "millimeter"
         self.bare = 0  # triangles whose colours are not here
-        self._colours = colours
+        self._colours, self._named = wanted.colours, wanted.materials
         self._groups: dict[str, list[bytes]] = {}  # {number of a group: its colours}
         self._group: list[bytes] = []
+        self._names: dict[str, list[str]] = {}  # {number of a group: names of its materials}
+        self._names_of_group: list[str] = []
         self.objects: dict[str, _MeshObject] = {}
         self.items: list[_Placement] = []
         self._name, self._allowance = name, allowance
@@ -178,11 +189,15 @@ class _Model:
             self._object.faces.extend([int(attributes[corner]) for corner in ("v1", "v2", "v3")])
             if self._colours:
                 self._shade(attributes)
+            if self._named:
+                self._object.materials.append(self._material(attributes))
         elif tag in ("basematerials", "colorgroup"):
             self._group = self._groups.setdefault(attributes["id"], [])
+            self._names_of_group = self._names.setdefault(attributes["id"], [])
         elif tag in ("base", "color"):
             found = _COLOUR.fullmatch(attributes.get("displaycolor", attributes.get("color", "")))
             self._group.append(bytes.fromhex(found[1]) if found else GREY.tobytes())
+            self._names_of_group.append(attributes.get("name", ""))
         elif tag == "object":
             self._allowance.take(_OBJECT_BYTES)
             self._object = _MeshObject(attributes.get("name", ""))
@@ -200,6 +215,13 @@ class _Model:
                     raise MeshFileError(f"needs {extension[:80]}, which is not supported")
         elif tag in ("beamlattice", "booleanshape", "levelset"):
             raise MeshFileError(f"has a <{tag}>, which is not supported: export it as triangles")
+
+    def _material(self, attributes: dict[str, str]) -> str:
+        """Name of the material of a triangle, that of its first corner; empty for none."""
+        group, number = self._object.usual
+        place = int(attributes.get("p1", number))
+        names = self._names.get(attributes.get("pid", group), [])
+        return names[place] if 0 <= place < len(names) else ""
 
     def _shade(self, attributes: dict[str, str]) -> None:
         """Add the colours of a triangle's corners, grey if it has none."""

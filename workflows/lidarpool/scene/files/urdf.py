@@ -9,7 +9,7 @@ attributes.
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 from urllib.parse import unquote
@@ -27,6 +27,7 @@ from ...base.xmlfile import xml_root
 from ...sensor.trajectory import rotations_of
 from ..actors import box, one_mesh
 from ..colours import Colours, as_bytes
+from ..face_materials import FaceMaterials
 from ..robot import HELD, MOVING, Joint, Robot
 from ..scene_instances import SceneInstance
 from ..scene_mesh import SceneMesh
@@ -46,6 +47,7 @@ def load_robot(
     *,
     opacity: OpacityMode = "mask",
     colours: bool = False,
+    materials: bool = False,
     tell: Callable[[str], None] = warn,
 ) -> Robot:
     """Read a robot from a URDF file, with the visual meshes of its links.
@@ -60,8 +62,9 @@ def load_robot(
     ----------
     path
         A .urdf file; a .xacro has to be expanded before.
-    opacity, colours
-        As of `load_meshes`. A colour of the URDF is for shapes, and meshes without colours.
+    opacity, colours, materials
+        As of `load_meshes`. A material of the URDF is for shapes, and meshes without colours, or
+        without materials.
     tell
         Called with a line on what was left out.
 
@@ -107,7 +110,7 @@ def load_robot(
                 held[child] = joint
         order = _in_order(list(links), held)
         _check_mimics(held)
-        looks = _Looks(path, root, len(data), opacity, colours, tell)
+        looks = _Looks(path, root, len(data), opacity, colours, materials, tell)
         meshes = {}
         for link in order:
             with prefixed(f"link {link!r}"):
@@ -121,6 +124,12 @@ def load_robot(
 
 def _name(element: Element) -> str:
     return printable(element.get("name", ""))
+
+
+def _material(visual: Element) -> FaceMaterials | None:
+    """Material of a visual, by its name; None without."""
+    material = visual.find("material")
+    return None if material is None else FaceMaterials.named(material.get("name", ""))
 
 
 def _named(root: Element, kind: str) -> list[Element]:
@@ -231,6 +240,7 @@ class _Looks:
     size: int
     opacity: OpacityMode
     colours: bool
+    materials: bool
     tell: Callable[[str], None]
     _files: dict[Path, list[SceneMesh]] = field(default_factory=dict)
     _collide: list[str] = field(default_factory=list)  # links with collision shapes only
@@ -263,8 +273,9 @@ class _Looks:
                 self._allowance.take(part.vertices.nbytes + part.faces.nbytes)
                 mesh = part.moved(part.name, place[:3, :3] * scale, place[:3, 3])
                 if colour is not None and mesh.colours is None:
-                    plain = Colours.plain(colour, len(mesh.faces))
-                    mesh = SceneMesh(mesh.name, mesh.vertices, mesh.faces, mesh.cutouts, plain)
+                    mesh = replace(mesh, colours=Colours.plain(colour, len(mesh.faces)))
+                if self.materials and mesh.materials is None:
+                    mesh = replace(mesh, materials=_material(visual))
                 yield mesh
 
     def tell_rest(self) -> None:
@@ -330,7 +341,12 @@ class _Looks:
             # (AI_CONFIG_IMPORT_COLLADA_IGNORE_UP_DIRECTION in rviz_rendering's assimp_loader.cpp),
             # and not its unit. assimp turns no other format.
             found = load_meshes(
-                path, up_axis="z", opacity=self.opacity, colours=self.colours, tell=self.tell
+                path,
+                up_axis="z",
+                opacity=self.opacity,
+                colours=self.colours,
+                materials=self.materials,
+                tell=self.tell,
             )
             self._allowance.add_file(path)
             self._files[path] = [

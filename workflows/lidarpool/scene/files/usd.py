@@ -29,6 +29,7 @@ from ...base.vectors import inverse, matmul
 from ...base.words import plural
 from ..actors import box
 from ..animation import RATE_HZ
+from ..face_materials import FaceMaterials
 from ..scene_instances import SceneInstance, scale_of
 from ..scene_mesh import SceneMesh
 from ..shapes import capsule, cylinder, revolve
@@ -82,7 +83,7 @@ def _contents(
     frames: Iterator[_Frame], stage: dict[str, Any], stem: str, wanted: Wanted, allowance: Allowance
 ) -> Iterator[Content]:
     """Yield the content of each pose."""
-    materials = UsdMaterials(allowance, wanted.colours)
+    materials = UsdMaterials(allowance, wanted)
     meshes: dict[int, list[SceneMesh]] = {}
     for frame, arrays in frames:
         match frame["what"]:
@@ -187,7 +188,8 @@ def _shape(
     number = next((number for number, _ in frame["materials"]), None)
     # Without texture coordinates they have no masks either, and a note says so.
     materials.cutout(number, look, rows)
-    return [replace(made, colours=materials.colours(number, look, rows))]
+    named = FaceMaterials.named(materials.name(number))
+    return [replace(made, colours=materials.colours(number, look, rows), materials=named)]
 
 
 def _outline(frame: dict[str, Any]) -> SceneMesh | None:

@@ -286,6 +286,7 @@ class Looks:
     def __init__(self, asked: dict[str, Any], write: Any) -> None:
         self.time = Usd.TimeCode.Default()
         self._masks, self._colours, self._write = asked["masks"], asked["colours"], write
+        self._named = asked["materials"]
         self._folders = tuple(os.path.join(folder, "") for folder in asked["folders"])  # noqa: PTH118
         self._images: dict[str, int] = {}  # {path: number}
         self._materials: dict[Any, tuple[int | None, list[str]]] = {}  # {path: see `_material`}
@@ -293,7 +294,7 @@ class Looks:
 
     def inherited(self, instance: Any) -> Any:
         """Return what prims in an instance have from it without an own one; None for nothing."""
-        if not (self._masks or self._colours):
+        if not (self._masks or self._colours or self._named):
             return None
         colour = self._values(instance, "displayColor") if self._colours else None
         found = self._bound(instance)[0], colour and (colour[0], colour[1].tobytes())
@@ -304,7 +305,7 @@ class Looks:
 
         Values are at corners, vertices, polygons or one for all, by OpenUSD's interpolation.
         """
-        if not (self._masks or self._colours):
+        if not (self._masks or self._colours or self._named):
             return {}
         whole, needed = self._bound(prim)
         materials: list[Any] = [] if whole is None else [(whole, None)]
@@ -351,10 +352,12 @@ class Looks:
                 kind = str(shader.GetIdAttr().Get() or shader.GetSourceAssetSubIdentifier("mdl"))
                 if kind in _SURFACES:
                     break
-        if not shader:
+        if not shader and not self._named:
             return None, []
         what: dict[str, Any] = {}
-        if kind not in _SURFACES:
+        if not shader:
+            pass  # it has a name alone
+        elif kind not in _SURFACES:
             if self._colours:
                 what["colour"] = {"unread": f"its shader is {kind[:40]}"}
         elif kind == "OmniPBR":
@@ -368,7 +371,7 @@ class Looks:
                 what["opacity"] = opacity
                 threshold = self._source(shader.GetInput("opacityThreshold")) or {}
                 what["threshold"] = threshold.get("value", 0)
-        if not what:
+        if not what and not self._named:
             return None, []
         what["name"] = material.GetPrim().GetName()
         number = self._alike.setdefault(json.dumps(what), len(self._alike))

@@ -23,7 +23,7 @@ from ..masks import (
 )
 from ..scene_mesh import Cutout
 from .polygons import check_corners, triangulated
-from .scene_graph import Piece
+from .scene_graph import Piece, Wanted
 
 _CUT = 0.5  # least opacity that stops light, unless a material states another
 _BYTES = np.arange(256) / 255
@@ -107,8 +107,9 @@ class Look:
 class UsdMaterials:
     """Images and materials by their numbers, and what they make of triangles."""
 
-    def __init__(self, allowance: Allowance, colours: bool) -> None:
-        self._allowance, self.coloured = allowance, colours
+    def __init__(self, allowance: Allowance, wanted: Wanted) -> None:
+        self._allowance, self.coloured = allowance, wanted.colours
+        self._named = wanted.materials
         self._images: dict[int, tuple[str, bytes]] = {}  # {number: (why it is not read, content)}
         self._materials: dict[int | None, dict[str, Any]] = {None: {"name": "displayColor"}}
         self._shades, self._mask = remembered(self._read_shades), remembered(self._read_mask)
@@ -121,6 +122,10 @@ class UsdMaterials:
             return
         why = frame["unread"] and f"its image {frame['name']!r} {frame['unread']}"
         self._images[frame["number"]] = why, arrays[0].tobytes()
+
+    def name(self, number: int | None) -> str:
+        """Name of a material, if names are wanted; else, or for none, empty."""
+        return "" if number is None or not self._named else str(self._materials[number]["name"])
 
     def colours(self, number: int | None, look: Look, rows: Ints) -> Colours | None:
         """Colours that a material gives triangles; None if they have none."""
@@ -229,4 +234,4 @@ def dressed(
         rows = np.flatnonzero(of == one)
         cut = materials.cutout(numbers[one], look, rows)
         colours = materials.colours(numbers[one], look, rows)
-        yield Piece(vertices, corners[faces[rows]], cut, colours)
+        yield Piece(vertices, corners[faces[rows]], cut, colours, materials.name(numbers[one]))
