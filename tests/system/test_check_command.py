@@ -19,7 +19,7 @@ from tests.meshes import PLY
 
 import lidarpool.cli.forecast
 from lidarpool import Fault, Mounted, Noise, Returns, Sensor, Survey, Track, read_cloud, simulate
-from lidarpool.cli.forecast import forecast, sample_survey
+from lidarpool.cli.forecast import forecast
 from lidarpool.run.options import RunOptions
 from lidarpool.scenario.build import build
 from lidarpool.scenario.scenario import Scenario
@@ -28,6 +28,7 @@ from lidarpool.scene.scene import Scene
 from lidarpool.scene.scene_file import write_scene
 from lidarpool.scene.scene_mesh import Cutout, SceneMesh
 from lidarpool.simulator.rig import Rig
+from lidarpool.simulator.sampling import sample_survey
 from raybeam import available_backends
 
 SHORT = {"sensor": {"layers": 8}, "planning": {"trials": 4}, "pool": {"backend": "numpy"}}
@@ -229,9 +230,9 @@ def test_a_backend_that_is_not_here(check, monkeypatch):
 def test_a_survey_that_hits_nothing_is_told_of(check):
     outcome = check("--json", text=json.dumps(SHORT | {"poses": [[0, 0, 1000]]}))
     assert outcome.code == 0
-    note = json.loads(outcome.out)["notes"][0]
-    assert "no ray hit anything" in note
-    poses = yaml.safe_load(note.partition("poses: ")[2])
+    [warning] = json.loads(outcome.out)["warnings"]
+    assert "the cloud has no points: no ray hit anything at any distance" in warning
+    poses = yaml.safe_load(warning.partition("poses: ")[2])
     seen = check("--json", text=json.dumps(SHORT | {"poses": poses}))
     assert json.loads(seen.out)["estimate"]["hits"] > 0
 

@@ -4,18 +4,19 @@ from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 from typing import Any
 
+import click
 from distributed import Client
 from rich.console import Console
 
 from ..base.streams import Unheard
 from ..run.progress import STAGES, Pace, Progress, Screen, Show, Written, bars, rows, standing_still
-from .shared_options import set_logs
+from .shared_options import WARNED, set_logs
 
 # Plain lines come after another tenth of the elapsed time, within these bounds, so that a survey
 # of hours does not fill a log.
@@ -29,6 +30,7 @@ class Terminal(Screen):
     quiet: bool = False
     verbose: bool = False
     as_json: bool = False
+    warnings: list[str] = field(default_factory=list, init=False)  # those that were printed
 
     @property
     def _stream(self) -> Any:
@@ -45,6 +47,21 @@ class Terminal(Screen):
         """Print a note."""
         if self._stream:
             self._stream.write(f"note: {words}\n")
+
+    def warn(self, words: str) -> None:
+        """Print a warning once, also in a quiet command; `warnings` lists it."""
+        if words not in self.warnings:
+            self.warnings.append(words)
+            click.echo(f"warning: {words}", err=True)
+
+    def end(self, *, strict: bool) -> None:
+        """End the process with exit code 1 if it is `strict` and a warning was printed."""
+        if strict and self.warnings:
+            sys.exit(WARNED)
+
+    def notes(self, notes: Iterable[str]) -> Iterator[str]:
+        """Return lines of notes, without those that were printed as warnings."""
+        return (f"note: {note}" for note in notes if note not in self.warnings)
 
     @contextmanager
     def status(self, words: str, *, logged: bool = True) -> Iterator[None]:

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from ..base.errors import LidarpoolError, explained
+from ..base.shard import ALL
 from ..base.software import difference, software
 from ..base.storage import Storage
 from ..base.words import plural
@@ -99,7 +100,8 @@ class DataSetOutput(Output[CampaignRun]):
         conductor.screen.tell(f"{out} is complete: nothing is left to do")
         for row in self._rows:
             conductor.page.ended(row)
-        run = CampaignRun.of(self._rows, time.monotonic() - conductor.started)
+        notes = tuple(conductor.warn_of_empty_jobs(self._rows))
+        run = CampaignRun.of(self._rows, time.monotonic() - conductor.started, notes=notes)
         conductor.page.finish(run.seconds)
         return run
 
@@ -144,7 +146,10 @@ class DataSetOutput(Output[CampaignRun]):
         """Write what all jobs share, and remove the run unless jobs have failed."""
         store, cast = conductor.store, conductor.run
         seconds = time.monotonic() - conductor.started
-        more = {"stages": cast.stages if cast else (), "notes": tuple(store.notes)}
+        more: dict[str, Any] = {"stages": cast.stages if cast else (), "notes": tuple(store.notes)}
+        warnings = conductor.warn_of_empty_jobs(store.rows())
+        if self.campaign.shard == ALL:  # else the merged data set has this note
+            more["notes"] = (*more["notes"], *warnings)
         run = CampaignRun.of(store.rows(), seconds, store.resumed, sensors=store.sensors, **more)
         record: dict[str, Any] = {"identity": dict(store.identity), "casting": store.casting}
         record |= {"backend": store.backend, "sensors": run.sensors}
