@@ -162,7 +162,9 @@ def test_shards_of_a_campaign_and_what_is_merged_of_them(campaign, lidarpool, sl
     outcome = lidarpool("merge", *parts, "--out", tmp_path / "set", "--strict")
     assert outcome.code == 1
     [warning] = warnings(outcome)
-    assert warning.startswith("2 jobs have no points: 0001, 0003; lidarpool check CAMPAIGN --job N says")
+    assert warning.startswith(
+        "2 jobs have no points: 0001, 0003; lidarpool check CAMPAIGN --job N says"
+    )
     assert json.loads((tmp_path / "set" / "report.json").read_text())["notes"] == [warning]
 
 
@@ -175,13 +177,16 @@ def test_python_logs_a_warning(client, caplog, tmp_path):
     campaign = Campaign(lambda number, rng: Job(room(), far), count=2)
     run = campaign.run(tmp_path / "set", client=client)
     [record] = [one for one in caplog.records if one.levelno == logging.WARNING]
-    assert record.message.startswith("2 jobs have no points: 0000, 0001; in job 0000 no ray hit anything")
+    assert record.message.startswith(
+        "2 jobs have no points: 0000, 0001; in job 0000 no ray hit anything"
+    )
     assert run.notes == (record.message,)
     caplog.clear()
     for number in (1, 2):
         campaign.run(tmp_path / f"part-{number}", client=client, shard=(number, 2))
     caplog.clear()
     merge([tmp_path / "part-1", tmp_path / "part-2"], tmp_path / "merged")
-    assert [one.message for one in caplog.records if one.levelno == logging.WARNING] == [
-        "2 jobs have no points: 0000, 0001; lidarpool check CAMPAIGN --job N says the most likely reason"
-    ]
+    [record] = [one for one in caplog.records if one.levelno == logging.WARNING]
+    names, _, advice = record.message.partition("; ")
+    assert names == "2 jobs have no points: 0000, 0001"
+    assert advice == "lidarpool check CAMPAIGN --job N says the most likely reason"

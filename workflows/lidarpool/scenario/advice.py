@@ -8,6 +8,7 @@ import numpy as np
 
 from ..base.words import as_scenario, plural
 from ..columns.table import VELOCITY
+from ..export.laser_scan import has_planar_sensors
 from ..scene.files.meshfile import CITYJSON, UNITLESS, wrote_it
 from ..sensor.faults import faults_of
 from ..sensor.materials import MaterialTable
@@ -35,16 +36,25 @@ def advice(built: Built) -> list[str]:
     if remarks[1:]:
         axes = [f"{axes[0]}; {plural(len(remarks) - 1, 'more file')}, too"]
     side, step = float(np.ptp(built.scene.bounds, axis=0).max()), built.survey.precision_m
+    every = built.survey.keep_every
     placed = "" if built.placing is None else built.placing.note
     likely = filter(None, (_of_size(built, side), placed, _of_colours(built)))
     unstated = dict.fromkeys(_of_datasheets(built))
+    scanners = [
+        "bags have a LaserScan of a 2D scanner only if every return is kept: set cloud.keep_every "
+        "to 1"
+    ] * (_writes_bags(built.scenario) and every > 1 and has_planar_sensors(built.survey))
     coarse = [
         f"points are rounded to {step:g} m, and the scene is {side:.3g} m long: give a smaller "
         "cloud.precision_m in a scenario"
     ] * (side < FINE * step)
-    settings = (*coarse, *_without_effect(built.scenario))
+    settings = (*coarse, *scanners, *_without_effect(built.scenario))
     lines = (*notes, *axes, *likely, *unstated, *settings, *_ended(built))
     return [as_scenario(line) for line in lines]
+
+
+def _writes_bags(scenario: Scenario) -> bool:
+    return any(entry.row.module == "ros" for entry in scenario.output.write)
 
 
 def _of_size(built: Built, side: float) -> str:
