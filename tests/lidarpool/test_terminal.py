@@ -102,7 +102,7 @@ def test_plain_lines_tell_why_nothing_goes_on():
     show(progress(4.1, 40))
     run = [line for line in lines_of(stream) if line.startswith("run")]
     words = "waits for slots of LIDAR, which other runs hold"
-    assert run == [f"run  {words}, 20 scans are done", "run  goes on, 40 scans are done"]
+    assert run == [f"run  {words}, 20 scans are done", "run  continues, 40 scans are done"]
     assert len(lines_of(stream)) - len(run) == 4
 
 

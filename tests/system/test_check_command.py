@@ -224,7 +224,9 @@ def test_a_backend_that_is_not_here(check, monkeypatch):
         pytest.skip("there is a GPU")
     outcome = check("--backend", "cuda")
     assert outcome.code == 2 and "it cannot run. Backend 'cuda' cannot be used" in outcome.err
-    assert re.search(r"^cast by     \d+ workers? \(backend not known yet\)$", outcome.out, re.M)
+    assert re.search(
+        r"^cast by     \d+ casting workers? \(backend not known yet\)$", outcome.out, re.M
+    )
 
 
 def test_a_survey_that_hits_nothing_is_told_of(check):
@@ -247,7 +249,9 @@ def test_an_object_is_looked_at_from_around_it_and_no_gpu_is_spoken_of(tmp_path,
     assert "no GPU" not in outcome.out
     backend = next(name for name, missing in available_backends().items() if not missing)
     kind = "GPU" if backend == "cuda" else "CPU"
-    assert re.search(rf"^cast by     \d+ {kind} workers? \({backend}\)$", outcome.out, re.M)
+    assert re.search(
+        rf"^cast by     \d+ casting workers? \({kind}, {backend}\)$", outcome.out, re.M
+    )
 
 
 def test_options_describe_the_survey_of_a_mesh(cluster, tmp_path, lidarpool):

@@ -131,6 +131,7 @@ def look_at(
     found = {
         "can_run": not mistakes.lines,
         "reasons": list(dict.fromkeys(mistakes.lines)),
+        "occupied": bool(options.out and Storage.at(options.out).entries()),
         "notes": list(dict.fromkeys(notes)),
         "warnings": list(dict.fromkeys(warnings)),
         "count": campaign.count,
@@ -160,10 +161,12 @@ def forecast(job: Job, options: RunOptions, client: Client | None = None) -> dic
     mistakes, notes, warnings = Mistakes(), list[str](), list[str]()
     with mistakes.noted():
         notes += _look_at_folder(out)
+    occupied = FILE in Storage.at(out).below(RUN_FOLDER).sizes()
     try:
         SurveyOutput(out, job.survey, formats).refuse(lambda: identity_of(job))
     except LidarpoolError as error:
         notes.append(str(error).rstrip("."))
+        occupied = True
     for one in formats:
         with mistakes.noted():
             one.check_installed()
@@ -194,12 +197,13 @@ def forecast(job: Job, options: RunOptions, client: Client | None = None) -> dic
     if cluster.memory and cluster.memory < needed:
         mistakes.lines.append(
             f"There are {format_bytes(cluster.memory)} of memory, and the run needs about "
-            f"{format_bytes(needed)}: take a smaller scene, fewer workers (pool.gpu), a smaller "
-            "batch_mb, rays_per_revolution or planning.particles, or a machine with more."
+            f"{format_bytes(needed)}: take a smaller scene, fewer casting workers (pool.gpu), a "
+            "smaller batch_mb, rays_per_revolution or planning.particles, or a machine with more."
         )
     return {
         "can_run": not mistakes.lines,
         "reasons": mistakes.lines,
+        "occupied": occupied,  # whether the place of the result holds another one
         "notes": notes,
         "warnings": warnings,
         "objects": len(job.scene.all_names),
@@ -261,7 +265,7 @@ def _look_at_cluster(
             backend = usable[0] if options.backend == "auto" else options.backend
             # Dask gives each worker of a local cluster its share, see `poolpart.local_cluster`.
             each = MEMORY_LIMIT / CPU_COUNT
-            check_memory(job, options, backend, each, "a GPU worker of this machine")
+            check_memory(job, options, backend, each, "a casting worker of this machine")
     slots = {n: {"needed": least, "there": there.get(n, 0)} for n, least in required.items()}
     casters = slots[GPU]["there"] if casting is None else len(casting)
     return _Cluster(slots, casters, backend, memory)
@@ -410,7 +414,7 @@ def _of_campaign(campaign: CampaignSpec, found: dict[str, Any]) -> Iterator[str]
         points = sum((job["estimate"] or {"points": 0})["points"] for job in found["jobs"])
         yield (
             f"in all      about {scans:,} scans, {rays:,} rays and {round(share * points):,} "
-            f"points, judged by {plural(len(found['jobs']), 'job')}"
+            f"points, estimated from {plural(len(found['jobs']), 'job')}"
         )
     yield from _remarks(found)
 
@@ -478,11 +482,13 @@ def _of_job(job: Job, found: dict[str, Any]) -> Iterator[str]:
         )
     yield f"planning    {f'{job.trials:,} trials' if job.trials else 'none'}"
     backend = found["backend"]
-    kind = {None: "", "cuda": "GPU "}.get(backend, "CPU ")
-    workers = plural(found["casters"], f"{kind}worker")
-    yield f"cast by     {workers} ({backend or 'backend not known yet'})"
+    device = {None: "backend not known yet", "cuda": "GPU, cuda"}.get(backend, f"CPU, {backend}")
+    yield f"cast by     {plural(found['casters'], 'casting worker')} ({device})"
     for name, slots in found["slots"].items():
-        yield f"{name:<10}  {plural(slots['there'], 'slot')}, at least {slots['needed']:,} needed"
+        # The partition is called GPU, also where its workers have none.
+        label, of = ("casting", " of partition GPU") if name == GPU else (name, "")
+        count = plural(slots["there"], "slot")
+        yield f"{label:<10}  {count}{of}, at least {slots['needed']:,} needed"
     there = found["memory"]["there"]
     limit = f" of {format_bytes(there)}" if there else ""
     yield f"memory      about {format_bytes(found['memory']['needed'])}{limit}"

@@ -9,6 +9,7 @@ import sys
 from collections.abc import Callable, Iterator
 from contextlib import nullcontext
 from dataclasses import replace
+from itertools import count
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -199,12 +200,22 @@ def check(
         words = ["lidarpool", "run", str(scenario), *options.as_words(of_mesh)]
         given: dict[str, object] = {"out": out, "scheduler": scheduler, "cluster": cluster}
         given |= {"backend": backend, "job": number}
+        if found["occupied"]:
+            given["out"] = _free_place(out)
         for name, value in given.items():
             if value is not None and str(value) != "lidarpool-out":
                 words += [f"--{name}", str(value)]
         click.echo(f"it can run: {shlex.join([*words, *['--no-plan'] * no_plan])}")
     if strict and found["warnings"]:
         sys.exit(WARNED)
+
+
+def _free_place(out: Path | Storage) -> str:
+    """Name a place beside one that holds another result, in which nothing is."""
+    from ..base.storage import Storage
+
+    names = (f"{str(out).rstrip('/')}-{number}" for number in count(2))
+    return next(name for name in names if not Storage.at(name).entries())
 
 
 @click.command()

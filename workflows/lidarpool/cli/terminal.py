@@ -15,7 +15,7 @@ from distributed import Client
 from rich.console import Console
 
 from ..base.streams import Unheard
-from ..run.progress import STAGES, Pace, Progress, Screen, Show, Written, bars, rows, standing_still
+from ..run.progress import Pace, Progress, Screen, Show, Written, bars, rows, standing_still
 from .shared_options import WARNED, set_logs
 
 # Plain lines come after another tenth of the elapsed time, within these bounds, so that a survey
@@ -74,10 +74,14 @@ class Terminal(Screen):
 
     @contextmanager
     def writing(self, words: str) -> Iterator[Written]:
-        """Show a bar for each output while the body writes them; in a log, `words`."""
+        """Show a bar for each output while the body writes them; in a log, `words` and lines."""
         console = self._console
-        with self.status(words) if console is None else rows(console) as show:
-            yield show or (lambda *_: None)
+        if console is not None:
+            with rows(console) as show:
+                yield show
+        else:
+            with self.status(words):
+                yield WrittenLines(self._stream) if self._stream else lambda *_: None
 
     @contextmanager
     def progress(self) -> Iterator[Show]:
@@ -106,6 +110,23 @@ def _tell(stream: Any, line: str) -> None:
     stream.write(f"{time.strftime('%H:%M:%S')}  {line}\n")
 
 
+class WrittenLines:
+    """Progress of what is written as lines of text in a stream; call it as `Written`."""
+
+    def __init__(self, stream: Any) -> None:
+        self.stream = stream
+        self._started = time.monotonic()
+        self._next = PLAIN_EVERY_S[0]  # seconds since the start of the next line
+
+    def __call__(self, name: str, done: int, total: int, unit: str) -> None:
+        """Write a line, if it is time."""
+        now = time.monotonic() - self._started
+        if now >= self._next and done < total:
+            least, most = PLAIN_EVERY_S
+            self._next = now + min(max(least, now / 10), most)
+            _tell(self.stream, f"{name}  {done:,} of {total:,} {unit}")
+
+
 class PlainLines:
     """Progress as lines of text in a stream; call it with each `Progress`."""
 
@@ -123,20 +144,15 @@ class PlainLines:
             self._standing = standing
             jobs = f"{progress.jobs_done:,} jobs" if progress.jobs else ""
             ready = jobs or f"{progress.collected:,} scans"
-            _tell(self.stream, f"run  {standing or 'goes on'}, {ready} are done")
+            _tell(self.stream, f"run  {standing or 'continues'}, {ready} are done")
         due = now >= self._next
         if due:
             least, most = PLAIN_EVERY_S
             self._next = now + min(max(least, now / 10), most)
-        stages = ", ".join(
-            f"{label} {getattr(progress, count):,}"
-            for label, count, unit in STAGES
-            if unit == "scans"
-        )
         scans, done = progress.scans, min(progress.collected, progress.framed)
         whole, trials = f"{scans:,} scans, {progress.points:,} points", progress.trials
         for what, count, total, unit, all_ in (
-            ("survey", done, scans, f"scans ({stages})", whole),
+            ("survey", done, scans, f"scans, {progress.points:,} points", whole),
             ("planning", progress.trials_done, trials, "trials", f"{trials:,} trials"),
             ("campaign", progress.jobs_done, progress.jobs, "jobs", f"{progress.jobs:,} jobs"),
         ):

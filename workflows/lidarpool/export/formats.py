@@ -80,12 +80,20 @@ class Format:
         left = ", ".join(self.left_out(cloud, sweeps))
         return [f"{self.format} does not hold {left}"] if left else []
 
+    @property
+    def _absent(self) -> list[str]:
+        return [package for package in self.row.packages if find_spec(package) is None]
+
+    @property
+    def installed(self) -> bool:
+        """Whether the packages that write it are installed here."""
+        return not self._absent
+
     def check_installed(self) -> None:
         """Check that it can be written here; LidarpoolError if a package is missing."""
-        absent = [package for package in self.row.packages if find_spec(package) is None]
-        if absent:
+        if self._absent:
             raise LidarpoolError(
-                f"The format {self.format} needs {' and '.join(absent)}: "
+                f"The format {self.format} needs {' and '.join(self._absent)}: "
                 f'pip install "lidarpool[{self.row.module}]".'
             )
 
