@@ -431,7 +431,9 @@ def test_damaged_pictures_are_noted_and_the_cloud_is_shown(cloud, capsys, monkey
     asked = []
 
     def look():
-        asked.append(capsys.readouterr().err)
+        captured = capsys.readouterr()
+        assert captured.out.startswith("http://127.0.0.1:")  # the address is the result
+        asked.append(captured.err + captured.out)
 
     monkeypatch.setattr("lidarpool.live.view.wait_for_interrupt", look)
     (cloud.parent / PICTURE_FILE).write_bytes(b"PK\x03\x04junk")

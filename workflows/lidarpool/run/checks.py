@@ -175,8 +175,8 @@ def common_software(
         address, there = next(iter(answers.items()))
         raise LidarpoolError(
             "The scans of the run were cast with other software than the casting workers have: "
-            f"the worker at {address} has {difference(there, earlier)}. Continue it there, or drop it "
-            "with --fresh (in Python remove_run)."
+            f"the worker at {address} has {difference(there, earlier)}. Continue it there, or drop "
+            "it with --fresh (in Python remove_run)."
         )
     counts = Counter(tuple(answer.items()) for answer in answers.values())
     most = max(counts, key=lambda one: (counts[one], one))
