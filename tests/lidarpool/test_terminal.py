@@ -11,7 +11,7 @@ import pytest
 from rich.console import Console
 
 import lidarpool.cli.commands
-from lidarpool.cli.terminal import PlainLines, Terminal
+from lidarpool.cli.terminal import PlainLines, Terminal, WrittenLines
 from lidarpool.run.progress import Progress, bars_here
 
 
@@ -103,6 +103,17 @@ def test_plain_lines_tell_why_nothing_goes_on():
     words = "waits for slots of LIDAR, which other runs hold"
     assert run == [f"run  {words}, 20 scans are done", "run  continues, 40 scans are done"]
     assert len(lines_of(stream)) - len(run) == 4
+
+
+def test_lines_of_what_is_written_come_seldom(monkeypatch):
+    now = 100.0
+    monkeypatch.setattr("lidarpool.cli.terminal.time.monotonic", lambda: now)
+    stream = StringIO()
+    show = WrittenLines(stream)
+    for frame in range(1, 41):
+        now += 0.25
+        show("film", frame, 40, "frames")
+    assert lines_of(stream) == [f"film  {done} of 40 frames" for done in (8, 16, 24, 32)]
 
 
 @pytest.mark.parametrize("terminal", [True, False])

@@ -297,6 +297,29 @@ def test_an_unfinished_run_is_told_of(check, tmp_path):
     assert "holds an unfinished run: --resume continues it" in outcome.out
 
 
+def test_the_command_that_is_named_runs_where_another_result_is(
+    check, cluster, tmp_path, lidarpool
+):
+    first = SHORT | {"steps": 3}
+    (tmp_path / "s.yaml").write_text(json.dumps(first))
+    given = ("--out", tmp_path / "out", "--only", "cloud", "--no-plan", "--scheduler", cluster)
+    assert lidarpool("run", tmp_path / "s.yaml", *given).code == 0
+    for k, number in enumerate((2, 3), 4):  # a result of another survey is in the way each time
+        outcome = check("--no-plan", "--scheduler", cluster, text=json.dumps(SHORT | {"steps": k}))
+        assert "holds the result of another survey" in outcome.out
+        words = shlex.split(outcome.out.splitlines()[-1].partition("it can run: ")[2])
+        assert str(tmp_path / f"out-{number}") in words
+        assert lidarpool(*words[1:], "--only", "cloud").code == 0
+
+
+def test_workers_that_cast_are_no_gpus_without_any(check):
+    outcome = check()
+    assert re.search(r"^cast by     \d+ casting workers? \(CPU, numpy\)$", outcome.out, re.M)
+    assert re.search(
+        r"^casting     \d+ slots? of partition GPU, at least 1 needed$", outcome.out, re.M
+    )
+
+
 def test_a_cluster_that_can_do_it(check, cluster):
     outcome = check("--scheduler", cluster, "--no-plan")
     assert outcome.code == 0, outcome.err

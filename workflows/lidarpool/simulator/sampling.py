@@ -23,7 +23,7 @@ SAMPLE_RAYS = 500_000  # rays that are cast at most
 SAMPLE_PARTS = 500  # parts of a survey that rays are cast of, at most
 SAMPLE_SCANS = 40  # consecutive scans of a part
 RANGE_RAYS = 20_000  # rays that `sample_ranges` casts, at most
-GOLDEN = (5**0.5 - 1) / 2
+GOLDEN = 0.6180339887498949  # the golden ratio less 1
 
 
 def sample_survey(scene: Scene, survey: Survey, backend: str = "auto") -> dict[str, int]:
