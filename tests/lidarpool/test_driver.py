@@ -613,7 +613,7 @@ def test_a_scene_that_kills_whoever_casts_it_is_told_after_a_few_deaths(run, adv
         return run.ended
 
     run.until(strike)
-    assert run.fails().startswith("GPU workers die whatever they cast first: 3 died, one a")
+    assert run.fails().startswith("Casting workers die whatever they cast first: 3 died, one a")
     assert len(deaths) <= 10
 
 

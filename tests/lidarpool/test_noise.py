@@ -7,7 +7,8 @@ from dataclasses import replace
 from types import FunctionType
 
 import numpy as np
-from tests.shapes import block, level
+import pytest
+from tests.shapes import block, level, wall
 
 from lidarpool import (
     Actor,
@@ -127,3 +128,44 @@ def test_seeds_of_names_are_the_same_on_every_machine():
     assert named_seed(7, "") == 7
     assert named_seed(0, "left") == 1296481425350128941
     assert named_seed(1, "hinten links ü") == 4561067770506489771
+
+
+@pytest.mark.parametrize("keep_every", [1, 3])
+def test_ranges_that_noise_moves_out_of_the_sensors_range_are_no_returns(keep_every):
+    """Of walls at its greatest and near its least range; what is left has the same ranges."""
+    walls = Scene.from_meshes([wall("Far", 60.0), wall("Near", -0.7)])
+    sensor = Sensor.grid(360, 1, 0, step_deg=360, min_range_m=0.5, max_range_m=60.1)
+    unlimited = Sensor.grid(360, 1, 0, step_deg=360, min_range_m=0.0)
+    noise, options = Noise(0.3, seed=3), {"columns": ["range"], "keep_every": keep_every}
+    made = []
+    for lidar in (unlimited, sensor):
+        survey = Survey(lidar, poses=[(0, 0, 0)], steps=1, noise=noise, **options)
+        [batch] = Rig(walls, survey, "numpy").cast(0, 1)
+        made.append((np.asarray(batch.range), np.asarray(batch.ray), batch))
+    (_, _, _), (ranges, rays, batch) = made
+    assert len(ranges) and (ranges >= 0.5).all() and (ranges <= 60.1).all()
+    assert (np.diff(rays) > 0).all() and (batch.return_number == 1).all()
+    if keep_every == 1:
+        everything = made[0][0]
+        inside = (everything >= 0.5) & (everything <= 60.1)
+        within = np.isin(made[0][1], rays)
+        assert (~inside).sum() > 0 and np.array_equal(everything[within], ranges)
+        assert batch.hits.sum() == batch.tally[1].sum() == len(ranges)
+    else:
+        assert batch.hits.sum() >= len(ranges) * keep_every - keep_every
+
+
+def test_numbers_of_returns_count_those_within_the_sensors_range():
+    """Of two returns of a pulse, noise moves the second one beyond the greatest range."""
+    meshes = [wall("Fence", 20.0, z=(-50, 0)), wall("Wall", 30.0)]
+    sensor = Sensor.grid(400, 1, 0, 360, max_range_m=30.3, horizontal_fov_deg=10)
+    survey = Survey(
+        sensor, poses=[(0, 0, 0)], steps=1, returns=Returns("all", 7, 20.0),
+        noise=Noise(0.2, seed=1), columns=["range", "return_number", "returns"],
+    )  # fmt: skip
+    [batch] = Rig(Scene.from_meshes(meshes), survey, "numpy").cast(0, 1)
+    count = np.bincount(batch.ray.astype(np.int64))
+    assert (batch.range <= 30.3).all() and batch.hits.sum() == len(batch)
+    assert np.array_equal(batch.returns, count[batch.ray]) and {*count} == {1, 2}
+    first = np.append(True, np.diff(batch.ray) > 0)
+    assert (batch.return_number[first] == 1).all() and (batch.return_number[~first] == 2).all()

@@ -307,10 +307,13 @@ def test_results_of_unlike_sweeps_are_not_played_and_those_in_sensor_axes_are_re
 
 
 @pytest.mark.parametrize("kind", ["ply", "las", "parquet"])
-def test_the_points_that_are_shown_are_written_to_a_file(tmp_path, spun, kind):
+def test_the_points_that_are_shown_are_written_to_a_file(tmp_path, spun, kind, monkeypatch):
     pytest.importorskip({"las": "laspy", "parquet": "pyarrow"}.get(kind, "numpy"))
     view = open_result(result_in(tmp_path / "one", spun))
     assert kind in told(view, "state")[0]["exports"]
+    with monkeypatch.context() as without:
+        without.setattr("lidarpool.export.formats.find_spec", lambda package: None)
+        assert told(view, "state")[0]["exports"] == ["ply"]  # which needs no extra
     asked = {"scans": "0-3,36-71", "filter": "ring,0,4;channel,0,4;x,3,3e38"}
     told_, arrays = told(view, "export", format=kind, **asked)
     assert told_ == {"name": f"cloud.{kind}"}
@@ -431,7 +434,9 @@ def test_damaged_pictures_are_noted_and_the_cloud_is_shown(cloud, capsys, monkey
     asked = []
 
     def look():
-        asked.append(capsys.readouterr().err)
+        captured = capsys.readouterr()
+        assert captured.out.startswith("http://127.0.0.1:")  # the address is the result
+        asked.append(captured.err + captured.out)
 
     monkeypatch.setattr("lidarpool.live.view.wait_for_interrupt", look)
     (cloud.parent / PICTURE_FILE).write_bytes(b"PK\x03\x04junk")

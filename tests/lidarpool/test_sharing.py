@@ -130,7 +130,8 @@ def test_a_room_is_cut_open_at_its_top():
 def test_a_film_moves_and_is_the_same_each_time(drive, tmp_path, suffix):
     film = tmp_path / f"film{suffix}"
     done = CliRunner().invoke(cli, ["view", str(drive), "--film", str(film)])
-    assert done.output == f"{film}\n"
+    assert done.stdout == f"{film}\n"
+    assert re.match(rf"\d\d:\d\d:\d\d  writing film\{suffix}\n", done.stderr)
     with Image.open(film) as moving:
         moving.seek(29)
         moving.load()

@@ -11,7 +11,7 @@ import pytest
 from rich.console import Console
 
 import lidarpool.cli.commands
-from lidarpool.cli.terminal import PlainLines, Terminal
+from lidarpool.cli.terminal import PlainLines, Terminal, WrittenLines
 from lidarpool.run.progress import Progress, bars_here
 
 
@@ -83,11 +83,10 @@ def test_plain_lines_come_seldom_and_tell_rate_and_time_left():
     show = PlainLines(stream)
     for tenth in range(0, 51):
         show(progress(tenth / 10, 2 * tenth))
-    stages = "(1 generate {0}, 2 intersect {0}, 3 sort {0}, 4 collect {0})"
     assert lines_of(stream) == [
-        f"survey  40 of 100 scans {stages.format(40)}  20/s  3 s left",
+        "survey  40 of 100 scans, 280 points  20/s  3 s left",
         "planning  0 of 10 trials",
-        f"survey  80 of 100 scans {stages.format(80)}  20/s  1 s left",
+        "survey  80 of 100 scans, 560 points  20/s  1 s left",
         "planning  0 of 10 trials",
         "survey  done: 100 scans, 700 points in 5.0 s",
     ]
@@ -102,8 +101,19 @@ def test_plain_lines_tell_why_nothing_goes_on():
     show(progress(4.1, 40))
     run = [line for line in lines_of(stream) if line.startswith("run")]
     words = "waits for slots of LIDAR, which other runs hold"
-    assert run == [f"run  {words}, 20 scans are done", "run  goes on, 40 scans are done"]
+    assert run == [f"run  {words}, 20 scans are done", "run  continues, 40 scans are done"]
     assert len(lines_of(stream)) - len(run) == 4
+
+
+def test_lines_of_what_is_written_come_seldom(monkeypatch):
+    now = 100.0
+    monkeypatch.setattr("lidarpool.cli.terminal.time.monotonic", lambda: now)
+    stream = StringIO()
+    show = WrittenLines(stream)
+    for frame in range(1, 41):
+        now += 0.25
+        show("film", frame, 40, "frames")
+    assert lines_of(stream) == [f"film  {done} of 40 frames" for done in (8, 16, 24, 32)]
 
 
 @pytest.mark.parametrize("terminal", [True, False])

@@ -59,6 +59,6 @@ def test_the_worker_with_the_least_memory_for_a_slot_is_named():
         SimpleNamespace(address=name, memory=memory, resources={"GPU": slots})
         for name, memory, slots in (("large", 10**12, 1), ("small", 10**6, 2), ("fair", 10**6, 1))
     ]
-    with pytest.raises(JobError, match="the GPU worker at small has"):
+    with pytest.raises(JobError, match="the casting worker at small has"):
         check_workers(job, tasks, "numpy", workers)
     check_workers(job, tasks, "numpy", workers[:1])

@@ -286,7 +286,7 @@ def test_a_backend_that_the_workers_lack(cluster, refused):
         pytest.skip("there is a GPU")
     refused(
         ["run", "good.yaml", "--backend", "cuda", "--scheduler", cluster],
-        "Backend 'cuda' cannot be used on the GPU worker at",
+        "Backend 'cuda' cannot be used on the casting worker at",
     )
 
 

@@ -19,7 +19,7 @@ from tests.meshes import PLY
 
 import lidarpool.cli.forecast
 from lidarpool import Fault, Mounted, Noise, Returns, Sensor, Survey, Track, read_cloud, simulate
-from lidarpool.cli.forecast import forecast, sample_survey
+from lidarpool.cli.forecast import forecast
 from lidarpool.run.options import RunOptions
 from lidarpool.scenario.build import build
 from lidarpool.scenario.scenario import Scenario
@@ -28,6 +28,7 @@ from lidarpool.scene.scene import Scene
 from lidarpool.scene.scene_file import write_scene
 from lidarpool.scene.scene_mesh import Cutout, SceneMesh
 from lidarpool.simulator.rig import Rig
+from lidarpool.simulator.sampling import sample_survey
 from raybeam import available_backends
 
 SHORT = {"sensor": {"layers": 8}, "planning": {"trials": 4}, "pool": {"backend": "numpy"}}
@@ -223,15 +224,17 @@ def test_a_backend_that_is_not_here(check, monkeypatch):
         pytest.skip("there is a GPU")
     outcome = check("--backend", "cuda")
     assert outcome.code == 2 and "it cannot run. Backend 'cuda' cannot be used" in outcome.err
-    assert re.search(r"^cast by     \d+ workers? \(backend not known yet\)$", outcome.out, re.M)
+    assert re.search(
+        r"^cast by     \d+ casting workers? \(backend not known yet\)$", outcome.out, re.M
+    )
 
 
 def test_a_survey_that_hits_nothing_is_told_of(check):
     outcome = check("--json", text=json.dumps(SHORT | {"poses": [[0, 0, 1000]]}))
     assert outcome.code == 0
-    note = json.loads(outcome.out)["notes"][0]
-    assert "no ray hit anything" in note
-    poses = yaml.safe_load(note.partition("poses: ")[2])
+    [warning] = json.loads(outcome.out)["warnings"]
+    assert "the cloud has no points: no ray hit anything at any distance" in warning
+    poses = yaml.safe_load(warning.partition("poses: ")[2])
     seen = check("--json", text=json.dumps(SHORT | {"poses": poses}))
     assert json.loads(seen.out)["estimate"]["hits"] > 0
 
@@ -246,7 +249,9 @@ def test_an_object_is_looked_at_from_around_it_and_no_gpu_is_spoken_of(tmp_path,
     assert "no GPU" not in outcome.out
     backend = next(name for name, missing in available_backends().items() if not missing)
     kind = "GPU" if backend == "cuda" else "CPU"
-    assert re.search(rf"^cast by     \d+ {kind} workers? \({backend}\)$", outcome.out, re.M)
+    assert re.search(
+        rf"^cast by     \d+ casting workers? \({kind}, {backend}\)$", outcome.out, re.M
+    )
 
 
 def test_options_describe_the_survey_of_a_mesh(cluster, tmp_path, lidarpool):
@@ -290,6 +295,29 @@ def test_an_unfinished_run_is_told_of(check, tmp_path):
     outcome = check()
     assert outcome.code == 0
     assert "holds an unfinished run: --resume continues it" in outcome.out
+
+
+def test_the_command_that_is_named_runs_where_another_result_is(
+    check, cluster, tmp_path, lidarpool
+):
+    first = SHORT | {"steps": 3}
+    (tmp_path / "s.yaml").write_text(json.dumps(first))
+    given = ("--out", tmp_path / "out", "--only", "cloud", "--no-plan", "--scheduler", cluster)
+    assert lidarpool("run", tmp_path / "s.yaml", *given).code == 0
+    for k, number in enumerate((2, 3), 4):  # a result of another survey is in the way each time
+        outcome = check("--no-plan", "--scheduler", cluster, text=json.dumps(SHORT | {"steps": k}))
+        assert "holds the result of another survey" in outcome.out
+        words = shlex.split(outcome.out.splitlines()[-1].partition("it can run: ")[2])
+        assert str(tmp_path / f"out-{number}") in words
+        assert lidarpool(*words[1:], "--only", "cloud").code == 0
+
+
+def test_workers_that_cast_are_no_gpus_without_any(check):
+    outcome = check()
+    assert re.search(r"^cast by     \d+ casting workers? \(CPU, numpy\)$", outcome.out, re.M)
+    assert re.search(
+        r"^casting     \d+ slots? of partition GPU, at least 1 needed$", outcome.out, re.M
+    )
 
 
 def test_a_cluster_that_can_do_it(check, cluster):

@@ -14,7 +14,7 @@ import subprocess
 import sys
 import tomllib
 from collections.abc import Iterator
-from contextlib import nullcontext
+from contextlib import nullcontext, suppress
 from dataclasses import dataclass
 from functools import partial
 from itertools import dropwhile
@@ -31,11 +31,13 @@ from distributed.cli import dask_scheduler, dask_worker
 from tests.clusters import import_jobqueue
 
 import lidarpool.run.cluster
-from lidarpool import Cloud, save_cloud
+from lidarpool import Cloud, LidarpoolError, save_cloud
 from lidarpool.cli.commands import cli
 from lidarpool.datasets.dataset import DATA_SETS
 from lidarpool.export.format_table import EXPORTS, LAYOUTS
+from lidarpool.scenario.build import build
 from lidarpool.scenario.campaign_sections import CampaignSection
+from lidarpool.scenario.plausibility import implausibilities
 from lidarpool.scenario.scenario import Scenario
 from lidarpool.scene import point_scene as points
 from lidarpool.scene.files import meshfile, rasters
@@ -224,7 +226,34 @@ def test_yaml_is_what_it_is_for(block):
     elif "beams" in data:
         SensorModel.model_validate(data)
     else:
-        Scenario.from_data(data, source=block.where)
+        scenario = Scenario.from_data(data, source=block.where)
+        if all(path.exists() for path in scenario.files):
+            with suppress(LidarpoolError):  # a fragment, such as materials of another scene
+                assert implausibilities(build(scenario, plans=False)) == []
+
+
+# What in code needs an extra of lidarpool, {extra: pattern}.
+EXTRAS = {
+    "las": r"\bla[sz]\b",
+    "parquet": r"\bparquet\b",
+    "pcd": r"\bpcd\b",
+    "e57": r"\be57\b",
+    "ros": r"\bmcap\b|\brosbag2\b",
+    "s3": r"\bs3://",
+    "clusters": r"--cluster\b|\bdask_jobqueue\b",
+    "fit": r"\blidarpool fit\b|\.pcap\b",
+    "usd": r"\.usd[acz]?\b",
+    "geo": r"\.tiff?\b|\bepsg\b",
+}
+
+
+@pytest.mark.parametrize("path", DOCUMENTS, ids=lambda path: path.name)
+def test_pages_name_the_extras_that_their_examples_need(path):
+    code = "\n".join(block.code for block in blocks_of(path))
+    text = path.read_text("utf-8")
+    named = {extra for names in re.findall(r"\[([\w,]+)\]", text) for extra in names.split(",")}
+    needed = {extra for extra, pattern in EXTRAS.items() if re.search(pattern, code)}
+    assert needed - named == set()
 
 
 def leaves(data: dict[str, Any], above: str = "") -> Iterator[str]:
@@ -254,6 +283,7 @@ def test_the_tutorial_from_beginning_to_end(tmp_path, lidarpool):
                 assert words[0] == "lidarpool"
                 outcome = lidarpool(*words[1:])
                 assert outcome.code == 0, outcome.err
+                assert "warning: " not in outcome.out + outcome.err
                 told, ran = outcome.out + outcome.err, ran + 1
     assert ran == 6
     for name in ("cloud.ply", "report.html"):
@@ -274,7 +304,7 @@ def test_a_scene_is_checked_as_shown(lidarpool, page, package):
     [shown] = [block for block in blocks if block.language == "console"]
     [words] = commands(shown)
     outcome = lidarpool(*words[1:])
-    assert outcome.code == 0
+    assert outcome.code == 0 and "warning: " not in outcome.out
     assert {*shown.code.splitlines()[1:]} <= {*outcome.out.splitlines(), *outcome.err.splitlines()}
 
 

@@ -543,7 +543,7 @@ def test_a_folder_keeps_its_shard(parts, lidarpool, slots):
     run = ["run", parts[0].parent / "c.yaml", "-q", "--scheduler", slots, "--out", parts[1]]
     for shard in (["--shard", "3/3"], ["--shard", "2/4"], []):
         refused = lidarpool(*run, "--resume", *shard)
-        assert refused.code == 2 and "holds shard 2/3, and this is a run of" in refused.err
+        assert refused.code == 2 and "holds shard 2/3, and this is " in refused.err
         assert "holds a finished data set" in lidarpool(*run, *shard).err
     assert lidarpool(*run, "--shard", "2/3", "--resume").code == 0
     assert content(parts[1]) == before

@@ -103,7 +103,7 @@ def raise_at(scan: int | str | None, scan_of=None):
         (
             "lidarpool.simulator.scene_caster.RayCaster",
             raise_at(None),
-            "preparing the scene on the GPU workers failed: .*the mirror is loose",
+            "preparing the scene on the casting workers failed: .*the mirror is loose",
         ),
         (
             "lidarpool.pipeline.stages.pack",

@@ -13,6 +13,11 @@ _SLURM = [f"SLURM_ARRAY_TASK_{name}" for name in ("ID", "MIN", "MAX", "STEP", "C
 _KUBERNETES = ["JOB_COMPLETION_INDEX"]
 
 
+def shard_in_words(text: str) -> str:
+    """Return a shard in words, of its text: «shard 3/10», or «the whole run»."""
+    return "the whole run" if text == "1/1" else f"shard {text}"
+
+
 @dataclass(frozen=True, order=True)
 class Shard:
     """Share `number` of `of` shares, counted from 1; LidarpoolError if there is no such share."""

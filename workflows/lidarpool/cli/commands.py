@@ -56,6 +56,7 @@ _shown = shared.together(
     shared.flag("--overwrite", help="Replace the result of another survey, or a data set."),
     shared.flag("--quiet", "-q", help="No progress, only the result."),
     shared.flag("--verbose", "-v", help="Show what Dask and other libraries log, on stderr."),
+    shared.strict,
     shared.as_json,
 )
 
@@ -79,7 +80,7 @@ def _runs(command: Callable[..., None]) -> Callable[..., None]:
     @wraps(command)
     def prepared(
         *, quiet: bool, verbose: bool, as_json: bool, cluster: Path | None = None,
-        only: str | None, pictures: bool = False, **given: Any,
+        only: str | None, strict: bool, pictures: bool = False, **given: Any,
     ) -> None:  # fmt: skip
         if only and pictures:
             raise click.UsageError("--only leaves out what --pictures draws: give one of them.")
@@ -104,7 +105,9 @@ def _runs(command: Callable[..., None]) -> Callable[..., None]:
             names = {field.name for field in fields(RunOptions)} - {"backend"}
             own |= {name: one for name, one in given.items() if name in names and one is not None}
             others = {name: one for name, one in given.items() if name not in names}
-            command(Terminal(quiet, verbose, as_json), RunOptions(**own), **others)
+            terminal = Terminal(quiet, verbose, as_json)
+            command(terminal, RunOptions(**own), **others)
+            terminal.end(strict=strict)
         finally:
             stop_fork_server()
 
@@ -257,8 +260,11 @@ def run(
 )
 @shared.out
 @shared.flag("--quiet", "-q", help="No progress, only the result.")
+@shared.strict
 @shared.as_json
-def merge(shards: tuple[Any, ...], out: Any, quiet: bool, as_json: bool, **given: Any) -> None:
+def merge(
+    shards: tuple[Any, ...], out: Any, quiet: bool, strict: bool, as_json: bool, **given: Any
+) -> None:
     """Make one data set or result of shards; after a kill, the same command goes on.
 
     \b
@@ -272,8 +278,9 @@ def merge(shards: tuple[Any, ...], out: Any, quiet: bool, as_json: bool, **given
     screen = Terminal(quiet, False, as_json)
     report = merge_shards(shards, out, screen=screen, **given)
     points = report["points"] if "points" in report else report["totals"]["points"]
-    lines = [*(f"note: {note}" for note in report["notes"]), f"{plural(points, 'point')} in {out}"]
+    lines = [*screen.notes(report["notes"]), f"{plural(points, 'point')} in {out}"]
     shared.show({"folder": str(out), **report}, lines, as_json)
+    screen.end(strict=strict)
 
 
 @cli.command()
@@ -323,7 +330,7 @@ def info(scheduler: str | None, files: TlsFiles, as_json: bool) -> None:
 
 
 def main(arguments: list[str] | None = None) -> NoReturn:
-    """Run the command and exit: 0 done, 2 an error of the user's, 130 interrupted."""
+    """Run the command and exit: 0 done, 1 --strict, 2 an error of the user's, 130 interrupted."""
     interrupt_on_signals()
     set_logs(shown=False)
     try:

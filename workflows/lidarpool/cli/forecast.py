@@ -7,7 +7,7 @@ import os
 import shutil
 import tempfile
 from collections.abc import Iterator, Mapping
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -21,9 +21,7 @@ from poolpart import Pool
 from poolpart.probe import visible_gpus
 from raybeam import available_backends
 
-from ..base.arrays import Floats, Ints
 from ..base.errors import LidarpoolError, Mistakes
-from ..base.sampling import even_indices
 from ..base.storage import Storage
 from ..base.words import plural
 from ..columns.cloud import CHUNK_POINTS
@@ -40,16 +38,17 @@ from ..run.store import RUN_FOLDER
 from ..scenario.advice import advice
 from ..scenario.build import Job, build
 from ..scenario.campaign import CampaignSpec, is_campaign
+from ..scenario.empty_cloud import EMPTY, empty_cloud_reason
+from ..scenario.plausibility import implausibilities
 from ..scenario.scenario import Scenario
 from ..scene.actors import shapes_of
 from ..scene.scene import Scene
 from ..scene.simplified import DRAWN_TRIANGLES
-from ..sensor import Sensor, Survey
-from ..sensor.beams import Beams
+from ..sensor import Survey
 from ..simulator.memory import MB, cast_bytes, scans_that_fit
-from ..simulator.rig import PATTERN_RAYS, Rig
+from ..simulator.rig import PATTERN_RAYS
+from ..simulator.sampling import sample_survey
 from ..simulator.scene_caster import check_backend_here
-from .run_command import no_hits
 from .terminal import Terminal
 
 # Measured on Linux: a process of ours with Dask loaded, and the most that a triangle takes while a
@@ -71,9 +70,6 @@ FORMAT_BYTES = 30  # of a point in an exported file, beside its columns, at most
 _FINE = 1e-6  # edges below this share of a mesh's size are beyond float32
 
 LOOKED_AT = 5  # jobs of a campaign
-# Rays that are sampled, parts of the survey, and consecutive scans of each part, at most.
-SAMPLE_RAYS, SAMPLE_PARTS, SAMPLE_SCANS = 500_000, 500, 40
-GOLDEN = (5**0.5 - 1) / 2
 
 
 def look_at(
@@ -111,6 +107,7 @@ def look_at(
         with terminal.status("casting some rays"):
             found = forecast(job, options.with_pool(read.pool, backend), client)
         found["notes"] += advice(built)
+        found["warnings"] += implausibilities(built)
         found["sources"] = dict(built.found.sources)
         if campaign is not None:
             own = {"number": one, "name": campaign.name(one), "split": campaign.split(one)}
@@ -123,17 +120,20 @@ def look_at(
         job, found = look(number or 0)
         return found, _of_job(job, found)
     campaign.check_files()
-    jobs, notes, mistakes = [], [], Mistakes()
+    jobs, notes, warnings, mistakes = [], list[str](), list[str](), Mistakes()
     for one in dict.fromkeys((campaign.count - 1) * i // (LOOKED_AT - 1) for i in range(LOOKED_AT)):
         with mistakes.noted():
             _, found = look(one)
             jobs.append(found["job"])
             notes += found["notes"]
+            warnings += found["warnings"]
             mistakes.lines += found["reasons"]
     found = {
         "can_run": not mistakes.lines,
         "reasons": list(dict.fromkeys(mistakes.lines)),
+        "occupied": bool(options.out and Storage.at(options.out).entries()),
         "notes": list(dict.fromkeys(notes)),
+        "warnings": list(dict.fromkeys(warnings)),
         "count": campaign.count,
         "seed": campaign.seed,
         "choices": dict(campaign.choices),
@@ -158,13 +158,15 @@ def forecast(job: Job, options: RunOptions, client: Client | None = None) -> dic
     """
     out, formats = options.out, job.outputs
     assert out is not None, "commands write"
-    mistakes, notes = Mistakes(), []
+    mistakes, notes, warnings = Mistakes(), list[str](), list[str]()
     with mistakes.noted():
         notes += _look_at_folder(out)
+    occupied = FILE in Storage.at(out).below(RUN_FOLDER).sizes()
     try:
         SurveyOutput(out, job.survey, formats).refuse(lambda: identity_of(job))
     except LidarpoolError as error:
         notes.append(str(error).rstrip("."))
+        occupied = True
     for one in formats:
         with mistakes.noted():
             one.check_installed()
@@ -175,7 +177,7 @@ def forecast(job: Job, options: RunOptions, client: Client | None = None) -> dic
     if _worker_bytes(job) + cast_bytes(job.scene, job.survey) <= MEMORY_LIMIT:
         estimate = sample_survey(job.scene, job.survey)
         if not estimate["hits"]:
-            notes.append(no_hits(job))
+            warnings.append(f"{EMPTY}: {empty_cloud_reason(job.scene, job.survey)}")
     if backend == "embree":
         notes += _of_fine_triangles(job.scene)
     # Without an estimate every ray may hit.
@@ -195,13 +197,15 @@ def forecast(job: Job, options: RunOptions, client: Client | None = None) -> dic
     if cluster.memory and cluster.memory < needed:
         mistakes.lines.append(
             f"There are {format_bytes(cluster.memory)} of memory, and the run needs about "
-            f"{format_bytes(needed)}: take a smaller scene, fewer workers (pool.gpu), a smaller "
-            "batch_mb, rays_per_revolution or planning.particles, or a machine with more."
+            f"{format_bytes(needed)}: take a smaller scene, fewer casting workers (pool.gpu), a "
+            "smaller batch_mb, rays_per_revolution or planning.particles, or a machine with more."
         )
     return {
         "can_run": not mistakes.lines,
         "reasons": mistakes.lines,
+        "occupied": occupied,  # whether the place of the result holds another one
         "notes": notes,
+        "warnings": warnings,
         "objects": len(job.scene.all_names),
         "triangles": job.scene.triangles,
         "masked": list(job.scene.masked),
@@ -261,7 +265,7 @@ def _look_at_cluster(
             backend = usable[0] if options.backend == "auto" else options.backend
             # Dask gives each worker of a local cluster its share of the memory.
             each = MEMORY_LIMIT / CPU_COUNT
-            check_memory(job, options, backend, each, "a GPU worker of this machine")
+            check_memory(job, options, backend, each, "a casting worker of this machine")
     slots = {n: {"needed": least, "there": there.get(n, 0)} for n, least in required.items()}
     casters = slots[GPU]["there"] if casting is None else len(casting)
     return _Cluster(slots, casters, backend, memory)
@@ -315,88 +319,6 @@ def _drive(survey: Survey) -> dict[str, Any] | None:
             "metres_a_turn": rate_hz and metres / seconds / rate_hz,
         })  # fmt: skip
     return {"seconds": seconds, "metres": metres, "sensors": sensors}
-
-
-def sample_survey(scene: Scene, survey: Survey, backend: str = "auto") -> dict[str, int]:
-    """Estimate hits and points of a survey by casting some of its rays, all if they are few.
-
-    They are spread evenly over all scans; of many thousand scans, over some of each part. Also
-    returns how many rays were cast.
-    """
-    each = min(*survey.steps_each, SAMPLE_SCANS)  # of at most two stations: a cast of each
-    firsts = each * even_indices(-(-survey.scan_count // each), SAMPLE_PARTS)
-    stops = np.minimum(firsts + each, survey.scan_count)
-    subrays = max(returns.subrays for returns in survey.returns_each)
-    rays = survey.ray_count * subrays * int((stops - firsts).sum()) // survey.scan_count
-    sampled = survey
-    if (every := -(-rays // SAMPLE_RAYS)) > 1:
-        # Faults and errors of certain channels do not fit one beam.
-        other: dict[str, Any] = {"channel_bias_m": 0.0, "ripple_deg": 0.0}
-        carried = [
-            replace(
-                one,
-                sensor=_FewRays.of(one.sensor, every),
-                steps=steps,
-                noise=one.noise and replace(one.noise, **other),
-            )
-            for one, steps in zip(survey.carried, survey.steps_each, strict=True)
-        ]
-        noise = replace(survey.noise, **other)
-        sampled = replace(survey, sensors=carried, noise=noise, faults=())
-    rig = Rig(scene, sampled, backend)
-    cast = whole = hits = points = 0
-    for first, stop in zip(firsts.tolist(), stops.tolist(), strict=True):
-        for found in rig.cast(first, stop):
-            every = getattr(sampled.carried[found.specs[0].sensor].sensor, "every", 1)
-            rays = sum(spec.ray_count for spec in found.specs)
-            cast, whole = cast + rays, whole + rays * every
-            hits += int(found.hits.sum()) * every
-            points += int(np.ceil(found.hits * every / survey.keep_every).sum())
-    share = survey.ray_count / whole
-    return {"rays": cast, "hits": round(hits * share), "points": round(points * share)}
-
-
-@dataclass(frozen=True, eq=False)
-class _FewRays(Sensor):
-    """A sensor of one beam, whose firings are some rays of another: one of each `every`."""
-
-    whole: Sensor = field(default_factory=Sensor)
-    every: int = 1
-    period = None
-
-    @classmethod
-    def of(cls, sensor: Sensor, every: int) -> _FewRays:
-        """Take one of so many rays, but some of each scan, though it may have a firing less."""
-        first, stop = sensor.firings(0)
-        every = max(1, min(every, (stop - first) * sensor.channels // 2))
-        near, far = sensor.min_range_m, sensor.max_range_m
-        beams = Beams(np.zeros(1))
-        return cls(beams, sensor.head, near, far, "", sensor.optics, 0.0, sensor, every)
-
-    def firings(self, step: int) -> tuple[int, int]:
-        first, stop = self.whole.firings(step)
-        channels = self.whole.channels
-        return first * channels // self.every, stop * channels // self.every
-
-    def _rays(self, firings: Ints) -> tuple[Ints, ...]:
-        """Return firings of the other, and which of these and which channel each ray is of."""
-        # Steps of the golden ratio spread the rays evenly over firings and channels.
-        ray = firings * self.every + (firings * GOLDEN % 1 * self.every).astype(np.int64)
-        fired, channel = np.divmod(ray, self.whole.channels)
-        return *np.unique(fired, return_inverse=True), channel
-
-    def directions(self, firings: Ints) -> Floats:
-        some, row, channel = self._rays(firings)
-        return self.whole.directions(some)[row, channel, None]
-
-    def origins(self, firings: Ints) -> Floats | None:
-        some, row, channel = self._rays(firings)
-        starts = self.whole.origins(some)
-        return None if starts is None else starts[row, channel, None]
-
-    def begins_ns(self, firings: Ints) -> Floats:
-        some, row, _ = self._rays(firings)
-        return self.whole.begins_ns(some)[row] + self.whole.lead_ns
 
 
 def _existing(out: Path) -> Path:
@@ -492,10 +414,17 @@ def _of_campaign(campaign: CampaignSpec, found: dict[str, Any]) -> Iterator[str]
         points = sum((job["estimate"] or {"points": 0})["points"] for job in found["jobs"])
         yield (
             f"in all      about {scans:,} scans, {rays:,} rays and {round(share * points):,} "
-            f"points, judged by {plural(len(found['jobs']), 'job')}"
+            f"points, estimated from {plural(len(found['jobs']), 'job')}"
         )
+    yield from _remarks(found)
+
+
+def _remarks(found: dict[str, Any]) -> Iterator[str]:
+    """Print notes and warnings as lines of text."""
     for note in found["notes"]:
         yield f"note: {note}"
+    for warning in found["warnings"]:
+        yield f"warning: {warning}"
 
 
 def _in_words(job: dict[str, Any]) -> str:
@@ -553,15 +482,16 @@ def _of_job(job: Job, found: dict[str, Any]) -> Iterator[str]:
         )
     yield f"planning    {f'{job.trials:,} trials' if job.trials else 'none'}"
     backend = found["backend"]
-    kind = {None: "", "cuda": "GPU "}.get(backend, "CPU ")
-    workers = plural(found["casters"], f"{kind}worker")
-    yield f"cast by     {workers} ({backend or 'backend not known yet'})"
+    device = {None: "backend not known yet", "cuda": "GPU, cuda"}.get(backend, f"CPU, {backend}")
+    yield f"cast by     {plural(found['casters'], 'casting worker')} ({device})"
     for name, slots in found["slots"].items():
-        yield f"{name:<10}  {plural(slots['there'], 'slot')}, at least {slots['needed']:,} needed"
+        # The partition is called GPU, also where its workers have none.
+        label, of = ("casting", " of partition GPU") if name == GPU else (name, "")
+        count = plural(slots["there"], "slot")
+        yield f"{label:<10}  {count}{of}, at least {slots['needed']:,} needed"
     there = found["memory"]["there"]
     limit = f" of {format_bytes(there)}" if there else ""
     yield f"memory      about {format_bytes(found['memory']['needed'])}{limit}"
     parts, result, free = (format_bytes(disk[name]) for name in ("parts", "result", "free"))
     yield f"disk        about {parts} during the run and {result} for the result; {free} free"
-    for note in found["notes"]:
-        yield f"note: {note}"
+    yield from _remarks(found)

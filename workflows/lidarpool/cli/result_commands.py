@@ -192,6 +192,7 @@ def view(
     from ..live.sharing import share
     from ..live.view import CLOUD, open_results, show_view
     from ..run.picture_file import PICTURE_FILE
+    from .terminal import Terminal
 
     if (film or export) and len(results) > 1:
         raise LidarpoolError("--film and --export take one result: give them one after the other.")
@@ -199,7 +200,7 @@ def view(
         files = (CLOUD, PICTURE_FILE, SWEEPS_FILE)
         made = [stack.enter_context(local_result(result, files)) for result in results]
         if film or export:
-            share(made[0], film, export)
+            share(made[0], film, export, Terminal())
         else:
             show_view(open_results(made), port=port, browser=not no_browser)
 

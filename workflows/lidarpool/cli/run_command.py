@@ -30,7 +30,7 @@ from ..run.store import RUN_FOLDER
 from ..scenario.advice import advice
 from ..scenario.build import Built, Job, build
 from ..scenario.campaign import CampaignSpec
-from ..scenario.placing import seen_from
+from ..scenario.plausibility import implausibilities
 from ..scenario.scenario import Scenario
 from ..simulator.scene_caster import check_backend_here
 from .shared_options import show
@@ -67,7 +67,7 @@ def run_scenario(
     jobs, output = OneJob(job, shard), Kept({**made_of, **more})
     with result_folder(options.out), page_of(jobs, options.live) as page:
         result = Conductor(jobs, options, output, terminal, page)()
-    points, lines = len(result.points), [f"note: {note}" for note in result.notes]
+    points, lines = len(result.points), [*terminal.notes(result.notes)]
     lines.append(f"shard {shard} in {options.out}: {plural(points, 'point')}, for lidarpool merge")
     told = {"folder": str(options.out), "shard": str(shard), "points": points}
     show(told, lines, terminal.as_json)
@@ -85,12 +85,14 @@ def _run_survey(
     assert options.out is not None, "commands write"
     for note in advice(built):
         terminal.tell(note)
+    for warning in implausibilities(built):
+        terminal.warn(warning)
     jobs = OneJob(job)
     extent = extent or "page"
     output = SurveyOutput(options.out, job.survey, job.outputs, extent, built.scenario, judge)
     with page_of(jobs, options.live) as page:
         result, report = Conductor(jobs, options, output, terminal, page)()
-        lines = _of_result(options.out, result, job, report)
+        lines = _of_result(options.out, result, job, report, terminal)
         show(summary(options.out, report), lines, terminal.as_json)
         if options.live and options.stay:
             with local_result(options.out, [CLOUD]) as folder:
@@ -111,7 +113,7 @@ def run_campaign(
         told |= {"failed": [row.name for row in run.failed]}
         told |= {name: getattr(run, name) for name in names}
         lines = [
-            *(f"note: {note}" for note in run.notes),
+            *terminal.notes(run.notes),
             f"{plural(run.done, 'job')}, {plural(run.rays, 'ray')}, "
             f"{plural(run.points, 'point')} in the data set ({run.seconds:.1f} s)",
             f"data set in {click.format_filename(str(options.out))}: see README.md there",
@@ -166,23 +168,15 @@ def run_job(
     _run_survey(built, replace(job, number=0), options, terminal, extent, compare)
 
 
-def no_hits(job: Job) -> str:
-    """Return advice for a survey without hits."""
-    (x, y, z) = job.survey.pose(0).position + job.scene.origin
-    where = f"the sensor begins at ({x:,.3f}, {y:,.3f}, {z:,.3f})"
-    seen = seen_from(job.scene, job.survey.carried[0])
-    faults = "faults, " * bool(job.survey.faults)
-    return f"no ray hit anything: check {faults}poses, ranges and units; {where}; {seen}"
-
-
 def _of_result(
-    out: Path | Storage, result: RunResult, job: Job, report: dict[str, Any]
+    out: Path | Storage,
+    result: RunResult,
+    job: Job,
+    report: dict[str, Any],
+    terminal: Terminal,
 ) -> Iterator[str]:
     """Say in lines of text what a survey has given."""
-    for note in report["notes"]:
-        yield f"note: {note}"
-    if not result.hits:
-        yield f"note: {no_hits(job)}"
+    yield from terminal.notes(report["notes"])
     on = report["hits_on_surfaces"]
     yield (
         f"{plural(job.survey.scan_count, 'scan')}, {plural(result.rays, 'ray')}, "

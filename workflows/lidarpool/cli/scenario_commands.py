@@ -5,9 +5,11 @@ from __future__ import annotations
 import math
 import os
 import shlex
+import sys
 from collections.abc import Callable, Iterator
 from contextlib import nullcontext
 from dataclasses import replace
+from itertools import count
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -16,7 +18,7 @@ import click
 from ..base.errors import LidarpoolError
 from ..base.words import plural, without_common_prefix
 from . import shared_options as options
-from .shared_options import Command, overwrite, together
+from .shared_options import WARNED, Command, overwrite, together
 
 if TYPE_CHECKING:
     from ..base.storage import Storage
@@ -143,6 +145,7 @@ def import_(survey: Path, assets: tuple[Path, ...], out: Path | None) -> None:
 @options.backend
 @options.no_plan
 @options.job
+@options.strict
 @options.as_json
 def check(
     scenario: Path,
@@ -154,6 +157,7 @@ def check(
     backend: str | None,
     no_plan: bool,
     number: int | None,
+    strict: bool,
     as_json: bool,
 ) -> None:
     """Show what a run would do and need.
@@ -161,8 +165,9 @@ def check(
     The scenario is checked; nothing is started. Of a campaign, the values that vary, and five of
     its jobs.
 
-    Some rays are cast here to estimate the number of points. The exit code is 0 if it can run,
-    and 2, with the reasons, if it cannot.
+    Some rays are cast here to estimate the number of points. Warnings name poses, trajectories and
+    noise that real surveys do not have. The exit code is 0 if it can run, and 2, with the reasons,
+    if it cannot.
 
     \b
     Examples:
@@ -185,7 +190,8 @@ def check(
             )
     except LidarpoolError as error:
         if as_json:
-            options.show({"can_run": False, "reasons": [str(error)], "notes": []}, (), True)
+            reasons = {"reasons": [str(error)], "notes": [], "warnings": []}
+            options.show({"can_run": False, **reasons}, (), True)
         raise
     options.show(found, lines, as_json)
     if found["reasons"]:
@@ -194,10 +200,22 @@ def check(
         words = ["lidarpool", "run", str(scenario), *options.as_words(of_mesh)]
         given: dict[str, object] = {"out": out, "scheduler": scheduler, "cluster": cluster}
         given |= {"backend": backend, "job": number}
+        if found["occupied"]:
+            given["out"] = _free_place(out)
         for name, value in given.items():
             if value is not None and str(value) != "lidarpool-out":
                 words += [f"--{name}", str(value)]
         click.echo(f"it can run: {shlex.join([*words, *['--no-plan'] * no_plan])}")
+    if strict and found["warnings"]:
+        sys.exit(WARNED)
+
+
+def _free_place(out: Path | Storage) -> str:
+    """Name a place beside one that holds another result, in which nothing is."""
+    from ..base.storage import Storage
+
+    names = (f"{str(out).rstrip('/')}-{number}" for number in count(2))
+    return next(name for name in names if not Storage.at(name).entries())
 
 
 @click.command()

@@ -63,6 +63,8 @@ cluster = path(
 )
 overwrite = flag("--overwrite", help="Replace existing files.")
 as_json = flag("--json", "as_json", help="Print the figures as one JSON document.")
+WARNED = 1  # exit code of --strict
+strict = flag("--strict", help="Exit with code 1 if there was a warning, such as of no points.")
 result = click.argument("result", metavar="FOLDER", type=StoragePath())
 copies = click.option(
     "--out", type=StoragePath(file_okay=False), help="Folder for the files.  [default: FOLDER]"

@@ -4,18 +4,19 @@ from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 from typing import Any
 
+import click
 from distributed import Client
 from rich.console import Console
 
 from ..base.streams import Unheard
-from ..run.progress import STAGES, Pace, Progress, Screen, Show, Written, bars, rows, standing_still
-from .shared_options import set_logs
+from ..run.progress import Pace, Progress, Screen, Show, Written, bars, rows, standing_still
+from .shared_options import WARNED, set_logs
 
 # Plain lines come after another tenth of the elapsed time, within these bounds, so that a survey
 # of hours does not fill a log.
@@ -29,6 +30,7 @@ class Terminal(Screen):
     quiet: bool = False
     verbose: bool = False
     as_json: bool = False
+    warnings: list[str] = field(default_factory=list, init=False)  # those that were printed
 
     @property
     def _stream(self) -> Any:
@@ -46,6 +48,21 @@ class Terminal(Screen):
         if self._stream:
             self._stream.write(f"note: {words}\n")
 
+    def warn(self, words: str) -> None:
+        """Print a warning once, also in a quiet command; `warnings` lists it."""
+        if words not in self.warnings:
+            self.warnings.append(words)
+            click.echo(f"warning: {words}", err=True)
+
+    def end(self, *, strict: bool) -> None:
+        """End the process with exit code 1 if it is `strict` and a warning was printed."""
+        if strict and self.warnings:
+            sys.exit(WARNED)
+
+    def notes(self, notes: Iterable[str]) -> Iterator[str]:
+        """Return lines of notes, without those that were printed as warnings."""
+        return (f"note: {note}" for note in notes if note not in self.warnings)
+
     @contextmanager
     def status(self, words: str, *, logged: bool = True) -> Iterator[None]:
         """Show what is going on while the body runs; in a log, too, if it is `logged`."""
@@ -57,10 +74,14 @@ class Terminal(Screen):
 
     @contextmanager
     def writing(self, words: str) -> Iterator[Written]:
-        """Show a bar for each output while the body writes them; in a log, `words`."""
+        """Show a bar for each output while the body writes them; in a log, `words` and lines."""
         console = self._console
-        with self.status(words) if console is None else rows(console) as show:
-            yield show or (lambda *_: None)
+        if console is not None:
+            with rows(console) as show:
+                yield show
+        else:
+            with self.status(words):
+                yield WrittenLines(self._stream) if self._stream else lambda *_: None
 
     @contextmanager
     def progress(self) -> Iterator[Show]:
@@ -89,6 +110,23 @@ def _tell(stream: Any, line: str) -> None:
     stream.write(f"{time.strftime('%H:%M:%S')}  {line}\n")
 
 
+class WrittenLines:
+    """Progress of what is written as lines of text in a stream; call it as `Written`."""
+
+    def __init__(self, stream: Any) -> None:
+        self.stream = stream
+        self._started = time.monotonic()
+        self._next = PLAIN_EVERY_S[0]  # seconds since the start of the next line
+
+    def __call__(self, name: str, done: int, total: int, unit: str) -> None:
+        """Write a line, if it is time."""
+        now = time.monotonic() - self._started
+        if now >= self._next and done < total:
+            least, most = PLAIN_EVERY_S
+            self._next = now + min(max(least, now / 10), most)
+            _tell(self.stream, f"{name}  {done:,} of {total:,} {unit}")
+
+
 class PlainLines:
     """Progress as lines of text in a stream; call it with each `Progress`."""
 
@@ -106,20 +144,15 @@ class PlainLines:
             self._standing = standing
             jobs = f"{progress.jobs_done:,} jobs" if progress.jobs else ""
             ready = jobs or f"{progress.collected:,} scans"
-            _tell(self.stream, f"run  {standing or 'goes on'}, {ready} are done")
+            _tell(self.stream, f"run  {standing or 'continues'}, {ready} are done")
         due = now >= self._next
         if due:
             least, most = PLAIN_EVERY_S
             self._next = now + min(max(least, now / 10), most)
-        stages = ", ".join(
-            f"{label} {getattr(progress, count):,}"
-            for label, count, unit in STAGES
-            if unit == "scans"
-        )
         scans, done = progress.scans, min(progress.collected, progress.framed)
         whole, trials = f"{scans:,} scans, {progress.points:,} points", progress.trials
         for what, count, total, unit, all_ in (
-            ("survey", done, scans, f"scans ({stages})", whole),
+            ("survey", done, scans, f"scans, {progress.points:,} points", whole),
             ("planning", progress.trials_done, trials, "trials", f"{trials:,} trials"),
             ("campaign", progress.jobs_done, progress.jobs, "jobs", f"{progress.jobs:,} jobs"),
         ):

@@ -20,6 +20,8 @@ from ..columns.cloud import Cloud, CloudLike
 from ..columns.parts import StoredCloud
 from .folder import staging
 from .format_table import EXPORTS, FORMATS, LAYOUTS, FormatRow
+from .laser_scan import COLUMNS as LASER_SCAN_COLUMNS
+from .laser_scan import has_laser_scans
 from .pieces import RangeWorkers, RangeWriter
 from .sweeps import Sweeps
 
@@ -69,6 +71,8 @@ class Format:
         """Names of the cloud's columns that it cannot hold."""
         held, there = self.row.holds, (column.name for column in cloud.table)
         more = self._laid_out + (self.row.named if sweeps.classes else ())
+        if self.row.module == "ros" and has_laser_scans(sweeps):
+            more += LASER_SCAN_COLUMNS
         return [] if held is None else [name for name in there if name not in held + more]
 
     def notes(self, cloud: CloudLike, sweeps: Sweeps) -> list[str]:
@@ -76,12 +80,20 @@ class Format:
         left = ", ".join(self.left_out(cloud, sweeps))
         return [f"{self.format} does not hold {left}"] if left else []
 
+    @property
+    def _absent(self) -> list[str]:
+        return [package for package in self.row.packages if find_spec(package) is None]
+
+    @property
+    def installed(self) -> bool:
+        """Whether the packages that write it are installed here."""
+        return not self._absent
+
     def check_installed(self) -> None:
         """Check that it can be written here; LidarpoolError if a package is missing."""
-        absent = [package for package in self.row.packages if find_spec(package) is None]
-        if absent:
+        if self._absent:
             raise LidarpoolError(
-                f"The format {self.format} needs {' and '.join(absent)}: "
+                f"The format {self.format} needs {' and '.join(self._absent)}: "
                 f'pip install "lidarpool[{self.row.module}]".'
             )
 

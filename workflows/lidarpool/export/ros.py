@@ -31,6 +31,7 @@ from ..sensor.reflectivity import COUNTS
 from . import reading
 from .boxes import Boxes
 from .images import Image
+from .laser_scan import ScanRays
 from .navigation_files import GNSS_FILE, IMU_FILE, Instruments
 from .sweeps import Placed, Sweeps, plain_names
 
@@ -101,6 +102,9 @@ def write_mcap(path: Path, cloud: CloudLike, sweeps: Sweeps, layout: str) -> Non
     on the carrier, `/label_info` names of classes and `/material_info` those of materials
     (LabelInfo of vision_msgs). The survey begins at its start, or at `START_NS` without one.
     `/actors` has a MarkerArray of the boxes of actors where their points of the sweep are.
+
+    Of a 2D scanner (one beam in the plane of its x and y axes) `/NAME/scan`, or `/scan`, also has a
+    LaserScan of each sweep, where the survey keeps every return and has the columns ray and range.
 
     Instruments of the carrier are frames `imu` and `gnss` on it. `/imu/data_raw` has Imu, without
     orientations, and `/gnss/fix` NavSatFix or, where latitudes are not known, `/gnss/position`
@@ -177,6 +181,9 @@ def _messages(cloud: CloudLike, sweeps: Sweeps, layout: str, types: Any) -> Iter
             rows.nbytes, rows.view(np.uint8).ravel(), True,
         )  # fmt: skip
         yield topic, message, time_ns
+        if (rays := ScanRays.of(sweeps, sweep, points)) is not None:
+            name = f"{topic.removesuffix('points')}scan"
+            yield name, make.laser_scan(rays, frame, stamp_ns), time_ns
         if layout == "images":
             ranges = Image.of(sweeps, sweep, points).filled(points["range"])
             ranges[np.isnan(ranges)] = np.inf  # REP 117: nothing was detected
@@ -424,6 +431,16 @@ class _Messages:
             else:
                 message = stamped(self.header(WORLD, time_ns), point(float(x), float(y), float(z)))
                 yield "/gnss/position", message, time_ns
+
+    def laser_scan(self, rays: ScanRays, frame: str, time_ns: int) -> Any:
+        """LaserScan of a sweep of a 2D scanner."""
+        first, last = float(rays.angles[0]), float(rays.angles[-1])
+        (scan,) = self.kinds("sensor_msgs", "LaserScan")
+        return scan(
+            self.header(frame, time_ns), first, last, (last - first) / (len(rays.angles) - 1),
+            rays.time_increment_s, rays.scan_time_s, *rays.range_limits_m, rays.ranges,
+            rays.intensities,
+        )  # fmt: skip
 
     def image(self, values: Floats32, frame: str, time_ns: int) -> Any:
         """Image of numbers (height, width)."""

@@ -215,14 +215,17 @@ def _bound(port: int) -> socket.socket:
 
 
 @contextmanager
-def announced(page: PageServer, words: str, browser: bool) -> Iterator[None]:
-    """Tell a page's address while the body runs, or show the page in the cell of a notebook.
+def announced(
+    page: PageServer, words: str, browser: bool, *, on_stdout: bool = False
+) -> Iterator[None]:
+    """Print a page's address while the body runs, or show the page in the cell of a notebook.
 
+    The address is on stderr, beside the progress of a run, or `on_stdout` where it is the result.
     `browser`: open one where there is a desktop, and no notebook.
     """
     display = cell_display()
     if display is None:
-        click.echo(words, err=True)
+        click.echo(words, err=not on_stdout)
         if browser:
             open_browser(page.once())
         yield

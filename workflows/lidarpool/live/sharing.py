@@ -23,6 +23,7 @@ from ..columns.cloud import Cloud
 from ..export.sweeps import Sweeps
 from ..render.colouring import TURBO
 from ..render.film import Film
+from ..run.progress import Screen, Written
 from .point_selection import HeldPoints, PointFinder, ScanRanges, even_shares, positions
 from .server import VIEWER, Answer, bundle
 from .view import MOST_POINTS, View, open_result
@@ -34,8 +35,10 @@ _PAGE_BYTES, _PAGE_POINTS, _PAGE_TRIANGLES = 25_000_000, 1_000_000, 60_000
 _CHOSEN_FROM, _CELLS = 5_000_000, 300  # points; cells along the diagonal, which tell where many are
 
 
-def share(path: Path, film: Path | None, page: Path | None) -> None:
+def share(path: Path, film: Path | None, page: Path | None, screen: Screen | None = None) -> None:
     """Write a result's folder, or a cloud, as a film, a page or both; files are replaced.
+
+    `screen` shows what is being written; by default the log.
 
     LidarpoolError if there are no points, or a file has another suffix or cannot be written.
     """
@@ -47,17 +50,25 @@ def share(path: Path, film: Path | None, page: Path | None) -> None:
         raise LidarpoolError(f"{path} has no points to show: its rays hit nothing.")
     if view.note:
         click.echo(f"note: {view.note}", err=True)
+    screen = screen or Screen()
     for file in filter(None, (film, page)):
-        made = page_of(view) if file == page else film_of(view, file.suffix)
+        with screen.writing(f"writing {file.name}") as show:
+            made = page_of(view, show) if file == page else film_of(view, file.suffix, show)
         with explained(f"{file} cannot be written", "give another place"):
             Storage.at(file.parent, durable=False).write(file.name, made)
         click.echo(click.format_filename(file))
 
 
-def film_of(view: View, suffix: str) -> bytes:
-    """Return a film, ".gif" or ".webp", as wide as some 3 MB allow; see `Film`."""
+def film_of(view: View, suffix: str, show: Written = lambda *_: None) -> bytes:
+    """Return a film, ".gif" or ".webp", as wide as some 3 MB allow; see `Film`.
+
+    `show` is told how many frames are drawn.
+    """
     (most, quality), view = _FILMS[suffix], replace(view, triangles=_FILM_TRIANGLES)
-    frames = [Image.fromarray(frame) for frame in _film(view, most).frames()]
+    film, frames = _film(view, most), list[Image.Image]()
+    for frame in film.frames():
+        frames.append(Image.fromarray(frame))
+        show("film", len(frames), len(film.moments_ns), "frames")
 
     def encoded(frames: list[Image.Image], width: int) -> bytes:
         small = [f.resize((width, width * 9 // 16), Image.Resampling.LANCZOS) for f in frames]
@@ -116,8 +127,11 @@ def _scans_between(sweeps: Sweeps, begin_ns: float, end_ns: float) -> ScanRanges
     return tuple((a, b - 1) for a, b in zip(low.tolist(), after.tolist(), strict=True) if a < b)
 
 
-def page_of(view: View) -> bytes:
-    """Return a page of at most 25 MB that holds the answers to all that it asks for."""
+def page_of(view: View, show: Written = lambda *_: None) -> bytes:
+    """Return a page of at most 25 MB that holds the answers to all that it asks for.
+
+    `show` is told how many answers are held.
+    """
     folder, modules = files(__package__) / "page", {}
     page = (folder / VIEWER).read_text("utf-8")
     for file in folder.iterdir():
@@ -132,12 +146,11 @@ def page_of(view: View) -> bytes:
     view, most = replace(view, triangles=_PAGE_TRIANGLES), _PAGE_POINTS
     told, arrays = view.answer("state", {}, bool)
     held = {"state?": _packed(told | {"offline": True, "exports": []}, arrays)}
-    for what, word, values in (
-        ("surface", "colour", told["scene"]),
-        ("column", "name", view.columns),
-    ):
-        for value in values or ():
-            held[f"{what}?{word}={value}"] = _packed(*view.answer(what, {word: value}, bool))
+    questions = [("surface", "colour", value) for value in told["scene"] or ()]
+    questions += [("column", "name", value) for value in view.columns]
+    for number, (what, word, value) in enumerate(questions, 1):
+        held[f"{what}?{word}={value}"] = _packed(*view.answer(what, {word: value}, bool))
+        show("page", number, len(questions), "answers")
     room = _PAGE_BYTES - len(page) - sum(len(text) + 99 for text in held.values())
     while len(cloud := _packed(*_thinned(view, most))) > room:
         most = int(most * min(0.9, 0.95 * max(room, 0) / len(cloud)))

@@ -28,7 +28,7 @@ from ..columns.cloud_file import CloudFile
 from ..columns.ply_format import AXES
 from ..columns.table import AXES as POSITION
 from ..columns.table import CAUSES, NO_SURFACE, OBJECT, TABLE, Column, X, Y, Z, by_value
-from ..export.formats import save_cloud
+from ..export.formats import Format, save_cloud
 from ..export.sweeps import SWEEPS_FILE, Sweeps
 from ..pipeline.database import FILE
 from ..render.closeup import around_ways, floor_and_cut
@@ -255,7 +255,7 @@ class View:
             ],
             "classes": {str(k): name for k, name in enumerate(self._names("class")) if name},
             "results": legend_of(colours_of(several, RESULT, self.results))["labels"],
-            "exports": () if isinstance(self.points, HeldPoints) else EXPORTS,
+            "exports": () if isinstance(self.points, HeldPoints) else downloads(),
             "actor_colours": as_bytes(object_colours(objects))[statics:].tolist(),
             "statics": statics,
             "duration": self.duration_ns / _NS,
@@ -612,8 +612,16 @@ def result_page(view: View, *, port: int = PORT, browser: bool = True) -> Iterat
     """Serve the page of a result while the body runs; see `announced`."""
     shows = f"shows {plural(len(view.points), 'point')}"
     shows += "" if cell_display() else "; Ctrl-C ends it"
-    with page_server(view.answer, port) as page, announced(page, f"{page.url} {shows}", browser):
+    with (
+        page_server(view.answer, port) as page,
+        announced(page, f"{page.url} {shows}", browser, on_stdout=True),
+    ):
         yield page
+
+
+def downloads() -> list[str]:
+    """Name the formats of a download whose packages are installed here."""
+    return [name for name in EXPORTS if Format(name).installed]
 
 
 def wait_for_interrupt(stopped: Event | None = None) -> None:

@@ -35,7 +35,8 @@ ANSWER_S = 1.0  # longest wait for a checked worker's answer without a sign of l
 RELEASE_S = 3.0  # for workers to drop their rigs
 SPARE_SCENES = 2  # of which no survey is under way, kept for the next one
 INLINE_BYTES = 1 << 17  # larger things are sent to a worker once, and fetched from there by others
-CHECKING, PREPARING = "checking the GPU workers", "preparing the scene on the GPU workers"
+CHECKING = "checking the casting workers"
+PREPARING = "preparing the scene on the casting workers"
 
 
 @dataclass(eq=False)

@@ -224,7 +224,7 @@ class Dispatcher:
         if len(deaths) >= policies.KILLS_MOST:
             names = ", ".join(scans_in_words(one.first, one.stop) for one in deaths)
             error = JobError(
-                f"GPU workers die whatever they cast first: {len(deaths)} died, one "
+                f"Casting workers die whatever they cast first: {len(deaths)} died, one "
                 f"after the other, with nothing but {names}"
                 f"{self._workers.words_on_memory(worker)}. The scene may need more memory than "
                 "they have: look into their logs, or try another backend."

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from ..base.errors import LidarpoolError, explained
+from ..base.shard import ALL, shard_in_words
 from ..base.software import difference, software
 from ..base.storage import Storage
 from ..base.words import plural
@@ -81,8 +82,8 @@ class DataSetOutput(Output[CampaignRun]):
         self._made = check_same(out, self.campaign)
         if (shards := self._made["shards"]) != [str(self.campaign.shard)]:
             raise LidarpoolError(
-                f"{out} holds shard {listed(shards) or 'none'}, and this is a run of "
-                f"{self.campaign.shard}: give another folder with --out."
+                f"{out} holds {listed([*map(shard_in_words, shards)]) or 'no shard'}, and this is "
+                f"{shard_in_words(str(self.campaign.shard))}: give another folder with --out."
             )
         with suppress(LidarpoolError):
             self._rows.extend(read_table(out))
@@ -99,7 +100,8 @@ class DataSetOutput(Output[CampaignRun]):
         conductor.screen.tell(f"{out} is complete: nothing is left to do")
         for row in self._rows:
             conductor.page.ended(row)
-        run = CampaignRun.of(self._rows, time.monotonic() - conductor.started)
+        notes = tuple(conductor.warn_of_empty_jobs(self._rows))
+        run = CampaignRun.of(self._rows, time.monotonic() - conductor.started, notes=notes)
         conductor.page.finish(run.seconds)
         return run
 
@@ -144,7 +146,10 @@ class DataSetOutput(Output[CampaignRun]):
         """Write what all jobs share, and remove the run unless jobs have failed."""
         store, cast = conductor.store, conductor.run
         seconds = time.monotonic() - conductor.started
-        more = {"stages": cast.stages if cast else (), "notes": tuple(store.notes)}
+        more: dict[str, Any] = {"stages": cast.stages if cast else (), "notes": tuple(store.notes)}
+        warnings = conductor.warn_of_empty_jobs(store.rows())
+        if self.campaign.shard == ALL:  # else the merged data set has this note
+            more["notes"] = (*more["notes"], *warnings)
         run = CampaignRun.of(store.rows(), seconds, store.resumed, sensors=store.sensors, **more)
         record: dict[str, Any] = {"identity": dict(store.identity), "casting": store.casting}
         record |= {"backend": store.backend, "sensors": run.sensors}
@@ -206,9 +211,12 @@ def _look(
     with explained(f"{dataset.place} cannot be read"):
         for row, (manifest, difference) in dataset.look(rows, contents=contents):
             if campaign is not None and row.number not in campaign.numbers:
+                share = (
+                    "" if campaign.shard == ALL else f", of which this is shard {campaign.shard}"
+                )
                 raise LidarpoolError(
-                    f"{dataset.place} has job {row.name}, and count is {campaign.count:,}, shard "
-                    f"{campaign.shard}: a campaign can only grow. Give another folder with --out."
+                    f"{dataset.place} has job {row.name}, and count is {campaign.count:,}{share}: "
+                    "a campaign can only grow. Give another folder with --out."
                 )
             if difference:
                 wrong[row.number] = f"job {row.name} ({difference})"

@@ -37,6 +37,7 @@ from ..run.run_page import RunPage
 from ..run.run_result import CampaignRun, RunResult
 from ..run.store import RUN_FOLDER, parts_of, remove_run, with_sensors
 from ..scenario.build import build
+from ..scenario.empty_cloud import NO_POINTS, empty_jobs_warning
 from ..scenario.scenario import Scenario
 from .campaign_output import CAMPAIGN_FILE, dataset_files, write_record, write_shared
 from .output import SurveyOutput
@@ -128,7 +129,7 @@ def merge(
     if "made_of" in parts[0].record:
         return _merge_survey(parts, place, partial, scenario, screen)
     with result_folder(place), screen.status("merging the data set"):
-        return _merge_dataset(parts, Storage.at(place), partial)
+        return _merge_dataset(parts, Storage.at(place), partial, screen)
 
 
 def _real(place: Storage) -> str:
@@ -157,7 +158,8 @@ def _of_dataset(place: Storage, notes: Sequence[str] = (), of: int = 1) -> _Part
     shards = [Shard.parse(text) for text in record["shards"]]
     if shards == [ALL]:
         shards = [Shard(number, of) for number in range(1, of + 1)]
-    notes = [note for note in notes if not note.startswith(_MISSING)]
+    # Notes of an earlier merge, which this one makes again.
+    notes = [note for note in notes if not note.startswith(_MISSING) and NO_POINTS not in note]
     return _Part(place, record, shards, record["campaign"]["count"], notes)
 
 
@@ -218,7 +220,9 @@ def _missing(parts: Sequence[_Part]) -> list[Shard]:
     return [shard for shard in every if have.get(shard.number, 0) < len(parts[-1].done(shard))]
 
 
-def _merge_dataset(parts: Sequence[_Part], out: Storage, partial: bool) -> dict[str, Any]:
+def _merge_dataset(
+    parts: Sequence[_Part], out: Storage, partial: bool, screen: Screen
+) -> dict[str, Any]:
     """Take the jobs of all parts into a data set, and write what all jobs share."""
     begun = CAMPAIGN_FILE in out.sizes()
     dataset_files(out, begun=begun)
@@ -246,6 +250,9 @@ def _merge_dataset(parts: Sequence[_Part], out: Storage, partial: bool) -> dict[
         raise LidarpoolError(f"missing or damaged: {listed(damaged, NAMED)}; {_AGAIN}.")
     lacking, there = _missing(known), {shard for part in known for shard in part.shards}
     record["shards"] = [*map(str, sorted(there.difference(lacking)) if lacking else [ALL])]
+    if empty := [row for row in _rows(known) if row.done and not row.points]:
+        notes.append(empty_jobs_warning(empty, ""))
+        screen.warn(notes[-1])
     more = {"sensors": sensors, "notes": tuple(notes)}
     run = CampaignRun.of(_rows(known), 0.0, 0, **more)
     report = write_shared(dataset, record, run, lambda: _rows(known))[1]

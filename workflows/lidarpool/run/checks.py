@@ -94,11 +94,11 @@ def check_memory(job: Job, tasks: TaskOptions, backend: str, room: float, worker
     if scan > room:
         raise JobError(
             f"Casting one scan takes about {scan / MB:,.0f} MB, {limit}: take a smaller step_deg, "
-            "fewer rays or columns, or give GPU workers a larger --memory-limit."
+            "fewer rays or columns, or give casting workers a larger --memory-limit."
         )
     if min(tasks.batch_mb * MB, all_scans) > room:
         raise JobError(
-            f"batch_mb is {tasks.batch_mb:,}, {limit}: make it smaller, or give GPU workers a "
+            f"batch_mb is {tasks.batch_mb:,}, {limit}: make it smaller, or give casting workers a "
             "larger --memory-limit."
         )
 
@@ -110,7 +110,7 @@ def check_workers(
     each = {w.address: w.memory / max(1, w.resources[GPU]) for w in casting if w.memory}
     if each:  # the least alone: a campaign of tiny jobs cannot look at hundreds of workers for each
         address = min(each, key=each.__getitem__)
-        check_memory(job, tasks, backend, each[address], f"the GPU worker at {address}")
+        check_memory(job, tasks, backend, each[address], f"the casting worker at {address}")
 
 
 def _survey_pool(client: Client, needed: Mapping[str, int], writing: bool) -> Pool:
@@ -176,9 +176,9 @@ def common_software(
     if earlier and dict(earlier) not in answers.values():
         address, there = next(iter(answers.items()))
         raise LidarpoolError(
-            f"The scans of the run were cast with other software than the GPU workers have: the "
-            f"worker at {address} has {difference(there, earlier)}. Continue it there, or drop it "
-            "with --fresh (in Python remove_run)."
+            "The scans of the run were cast with other software than the casting workers have: "
+            f"the worker at {address} has {difference(there, earlier)}. Continue it there, or drop "
+            "it with --fresh (in Python remove_run)."
         )
     counts = Counter(tuple(answer.items()) for answer in answers.values())
     most = max(counts, key=lambda one: (counts[one], one))
@@ -224,7 +224,7 @@ def common_backend(
     for address, reasons in answers.items():
         if reason := reasons.get(wanted, "there is no backend of that name"):
             raise LidarpoolError(
-                f"Backend {wanted!r} cannot be used on the GPU worker at {address}: "
+                f"Backend {wanted!r} cannot be used on the casting worker at {address}: "
                 f"{reason}. {advice}"
             )
     return wanted

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Callable, Mapping
-from contextlib import AbstractContextManager, ExitStack, nullcontext
+from collections.abc import Callable, Iterable, Mapping
+from contextlib import AbstractContextManager, ExitStack, nullcontext, suppress
 from dataclasses import dataclass
 from typing import Any, Generic, TypeVar
 
@@ -17,6 +17,9 @@ from ..datasets.job_table import JobRow
 from ..pipeline.database import FILE
 from ..pipeline.messages import ScanFrame
 from ..plan import best
+from ..scenario.build import Job
+from ..scenario.campaign import CampaignSpec
+from ..scenario.empty_cloud import EMPTY, empty_cloud_reason, empty_jobs_warning
 from ..simulator.scene_caster import check_backend_here
 from .cluster import Cluster
 from .job_source import JobMaker, Jobs, MadeJob, OneJob
@@ -106,6 +109,19 @@ class Conductor(Generic[R]):
                 self._cast(first)
             return self.output.finish(self)
 
+    def warn_of_empty_jobs(self, rows: Iterable[JobRow]) -> list[str]:
+        """Warn if jobs of a campaign have no points; returns the warning, for notes."""
+        empty = [row for row in rows if row.done and not row.points]
+        if not empty:
+            return []
+        reason = ""
+        with suppress(LidarpoolError):  # a file that the job is made of may be gone
+            job = self.jobs.job(empty[0].number) if isinstance(self.jobs, CampaignSpec) else None
+            reason = empty_cloud_reason(job.scene, job.survey) if job else ""
+        warning = empty_jobs_warning(empty, reason)
+        self.screen.warn(warning)
+        return [warning]
+
     @property
     def goes_on(self) -> bool:
         """Whether this run goes on with an unfinished one."""
@@ -180,12 +196,14 @@ class Conductor(Generic[R]):
         assert only is not None, "there is one"
         job = only.job
         trials = tuple(sorted(only.parts.trials, key=lambda trial: trial.trial))
-        times = run.times if run else {}
+        times, points = run.times if run else {}, only.points()
+        if not len(points):
+            self._warn_of_empty_cloud(job)
         return RunResult(
             scene=job.scene,
             survey=job.survey,
             planning=job.planning,
-            points=only.points(),
+            points=points,
             plan=best(trials, job.planning) if job.planning else None,
             trials=trials,
             backend=self.store.backend,
@@ -202,6 +220,18 @@ class Conductor(Generic[R]):
             planning_seconds=times.get("planning", 0.0),
             replayed=run.kept.offered_again if run and run.kept else 0,
         )
+
+    def _warn_of_empty_cloud(self, job: Job) -> None:
+        """Warn that the only job has no points; a whole survey also has a note."""
+        shard = self.jobs.shard
+        scans = None if shard == ALL else shard.scans(job.survey.scan_count)
+        reason = empty_cloud_reason(job.scene, job.survey, scans)
+        if shard != ALL:
+            self.screen.warn(f"shard {shard} has no points: {reason}")
+            return
+        warning = f"{EMPTY}: {reason}"
+        self.store.notes.append(warning)
+        self.screen.warn(warning)
 
     def result_is_in(self, place: object) -> None:
         """Have any later error or interrupt say that the result is complete."""

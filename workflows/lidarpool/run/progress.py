@@ -160,6 +160,10 @@ class Screen:
         """Tell something that the user should know."""
         logger.info(words)
 
+    def warn(self, words: str) -> None:
+        """Tell something that is probably a mistake."""
+        logger.warning(words)
+
     def status(self, words: str) -> AbstractContextManager[None]:
         """Show what is going on while the body runs."""
         return nullcontext()

@@ -15,6 +15,7 @@ from typing import Any
 
 from ..base.errors import LidarpoolError, explained
 from ..base.fingerprint import fingerprint
+from ..base.shard import shard_in_words
 from ..base.software import software
 from ..base.storage import Storage
 from ..base.validation import checked
@@ -225,7 +226,8 @@ class RunStore:
         for name, value in self._whose.items():
             if there.get(name) != value:
                 if name == "shard":
-                    return f"it is shard {there.get(name)}, not {value}"
+                    earlier, wanted = map(shard_in_words, (str(there.get(name)), str(value)))
+                    return f"it is {earlier}, not {wanted}"
                 if name in CONTENT:
                     return f"it is of another {name}"
                 if name != "lidarpool":

@@ -8,13 +8,13 @@ import numpy as np
 
 from ..base.words import as_scenario, plural
 from ..columns.table import VELOCITY
+from ..export.laser_scan import has_planar_sensors
 from ..scene.files.meshfile import CITYJSON, UNITLESS, wrote_it
 from ..sensor.faults import faults_of
 from ..sensor.materials import MaterialTable
 from ..sensor.models import STATED
 from ..sensor.trajectory import presence_ns
 from .build import Built
-from .placing import inside_note
 from .scenario import Scenario
 from .sections import SensorSection
 
@@ -24,13 +24,11 @@ from .sections import SensorSection
 LARGE_M, LARGE_STL_M, LARGE_OBJECT_M, LARGE_STATED_M, SMALL_M = 500.0, 20.0, 10.0, 100.0, 0.2
 FINE = 100  # a scene is at least so many steps of the precision long
 
-_LOOKED_FROM = 8  # positions, if poses or a trajectory are given
-
 
 def advice(built: Built) -> list[str]:
     """Return notes on likely mistakes, such as a size that suggests another unit.
 
-    Also on objects that were left out, on files whose axes were guessed, on where the sensor is,
+    Also on objects that were left out, on files whose axes were guessed, on poses that were chosen,
     on figures that data sheets lack, and on settings without effect.
     """
     notes, remarks = built.found.notes, built.found.remarks
@@ -38,15 +36,25 @@ def advice(built: Built) -> list[str]:
     if remarks[1:]:
         axes = [f"{axes[0]}; {plural(len(remarks) - 1, 'more file')}, too"]
     side, step = float(np.ptp(built.scene.bounds, axis=0).max()), built.survey.precision_m
-    likely = filter(None, (_of_size(built, side), _of_poses(built), _of_colours(built)))
+    every = built.survey.keep_every
+    placed = "" if built.placing is None else built.placing.note
+    likely = filter(None, (_of_size(built, side), placed, _of_colours(built)))
     unstated = dict.fromkeys(_of_datasheets(built))
+    scanners = [
+        "bags have a LaserScan of a 2D scanner only if every return is kept: set cloud.keep_every "
+        "to 1"
+    ] * (_writes_bags(built.scenario) and every > 1 and has_planar_sensors(built.survey))
     coarse = [
         f"points are rounded to {step:g} m, and the scene is {side:.3g} m long: give a smaller "
         "cloud.precision_m in a scenario"
     ] * (side < FINE * step)
-    settings = (*coarse, *_without_effect(built.scenario))
+    settings = (*coarse, *scanners, *_without_effect(built.scenario))
     lines = (*notes, *axes, *likely, *unstated, *settings, *_ended(built))
     return [as_scenario(line) for line in lines]
+
+
+def _writes_bags(scenario: Scenario) -> bool:
+    return any(entry.row.module == "ros" for entry in scenario.output.write)
 
 
 def _of_size(built: Built, side: float) -> str:
@@ -67,20 +75,6 @@ def _of_size(built: Built, side: float) -> str:
         f"that is wrong, give the file's unit ({unit}?) in scene.files, or --unit {unit} with a "
         "mesh file"
     )
-
-
-def _of_poses(built: Built) -> str:
-    if built.placing is not None:
-        return built.placing.note
-    if built.scenario.scene.has_seed:
-        return ""
-    survey = built.survey
-    if built.scenario.trajectory is not None:
-        at, _ = survey.path.poses(0, np.linspace(0, survey.path.duration_ns, _LOOKED_FROM))
-    else:
-        step = -(-len(survey.poses) // _LOOKED_FROM)
-        at = np.array([pose.position for pose in survey.poses[::step]])
-    return inside_note(built.scene, at, survey.carried[0])
 
 
 def _of_colours(built: Built) -> str:

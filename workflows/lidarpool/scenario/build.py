@@ -19,6 +19,7 @@ from ..base.validation import checked_fields
 from ..base.words import did_you_mean, plural
 from ..export.format_table import check_whole
 from ..export.formats import Format
+from ..export.laser_scan import with_laser_scans
 from ..plan import Planning
 from ..plan.planning import Search
 from ..scene.actors import Actor, check_spray
@@ -394,7 +395,7 @@ def _survey(
     named |= {name: number for number, name in given.classes.items()}
     own_noise = all(one.noise is not None for one in carried)
     alone = not given.sensors and given.mount is None and carried[0].noise is None
-    return Survey(
+    survey = Survey(
         poses=[replace(p, position=tuple(np.subtract(p.position, origin))) for p in poses],
         trajectory=track,
         **({"sensor": carried[0].sensor} if alone else {"sensors": carried}),
@@ -408,6 +409,7 @@ def _survey(
         **declared(given.weather, Weather),
         **cloud,
     )
+    return with_laser_scans(survey, [one.format for one in given.output.write])
 
 
 def _planning(scenario: Scenario, scene: Scene) -> Planning | None:

@@ -38,6 +38,7 @@ from ..base.words import did_you_mean, plural
 from ..base.yamlfile import read_yaml
 from ..datasets.job_table import Value
 from ..export.format_table import check_whole
+from ..export.laser_scan import with_laser_scans
 from ..sensor.calibrations import text_of
 from .build import Job, build
 from .campaign_sections import (
@@ -242,7 +243,8 @@ class CampaignSpec:
                 "navigation is for single surveys, since a data set has no place for its files: "
                 "leave it out of the campaign's base."
             )
-        return job
+        survey = with_laser_scans(job.survey, [self.keep.format])
+        return job if survey is job.survey else replace(job, survey=survey)
 
     def _known(self, number: int) -> int:
         if not 0 <= number < self.count:

@@ -169,9 +169,9 @@ def _local(poses: Sequence[Pose], scene: Scene) -> Floats:
     return np.array([pose.position for pose in poses]) - scene.origin
 
 
-def inside_note(scene: Scene, positions: ArrayLike, carried: Mounted) -> str:
-    """Say that local positions (k, 3) are inside a closed body; else empty."""
-    return _inside(_looker(_simple(scene, positions)), positions, scene, carried)
+def surroundings_of(scene: Scene, positions: ArrayLike) -> Surroundings | None:
+    """Return what looks around from local positions (k, 3); None if the scene is too large."""
+    return _looker(_simple(scene, positions))
 
 
 def _inside(

@@ -26,6 +26,11 @@ _GROUND, _SKY, _ENCLOSED, _CLOSED, _UPRIGHT, _FLOOR = 0.4, 0.3, 0.95, 0.8, 0.9, 
 _OPEN, _LEAVES = 0.1, 0.4
 # A closed body whose inside has a floor and upright walls is a room of these sizes.
 _WIDE_M, _HIGH_M = 2.0, 15.0
+# The room of a scene spans this share of the scene along each axis; smaller bodies are in it.
+_SPANS = 1 / 3
+# Directions by their z: up to 10 degrees above the horizon, within 60 degrees of straight up, and
+# within 30 degrees of straight down. Shares of such rays that meet what covers a position.
+_RAISED, _UPWARD, _DOWNWARD, _COVERED, _WIDELY_COVERED = 0.17, 0.5, -0.87, 0.9, 0.95
 # A body is around a position; a flat surface, however near, takes half of the directions.
 _AROUND = 0.6
 
@@ -109,6 +114,38 @@ class Surroundings:
             # Of a machine with openings there is something above the sensor, too.
             return not (ground and (above < _SKY or _has_floor(seen)))
         return not self._is_room(seen)
+
+    def in_a_body(self, position: ArrayLike) -> bool:
+        """Whether a local position (3,) is inside a closed body, which is not the room of a scene.
+
+        A body that stands on the ground may lack a bottom.
+        """
+        views = self.views(position)
+        spanned = views.distance[:, None] * views.directions
+        spanned = np.ptp(spanned[np.isfinite(views.distance)], axis=0) if views.hit.any() else 0.0
+        spans = bool((spanned >= _SPANS * np.ptp(self._scene.bounds, axis=0)).all())
+        if views.in_a_body:
+            return not (spans and self._is_room(views))
+        raised = views.directions[:, 2] > _RAISED
+        closed = np.isfinite(views.distance[raised]).all() and views.hit[raised].any()
+        return bool(closed and not spans and np.mean(views.back[raised & views.hit]) > 1 - 1 / RAYS)
+
+    def is_covered(self, position: ArrayLike) -> bool:
+        """Whether a local position (3,) is under the scene: with nothing below, and ground above.
+
+        Of ground without a thickness the back is above. Under other things, such as a bridge, the
+        position is lower than the whole scene, and these things are above in almost all directions.
+        """
+        views = self.views(position)
+        up, met = views.directions[:, 2], np.isfinite(views.distance)
+        if met[up < _DOWNWARD].any():
+            return False
+        above = up > _UPWARD
+        backs = views.back[above & met]
+        if np.mean(met[above]) >= _COVERED and np.mean(backs) >= _COVERED:
+            return True
+        lower = np.asarray(position, np.float64).reshape(3)[2] < self._scene.bounds[0, 2]
+        return bool(lower and np.mean(met[up > _RAISED]) >= _WIDELY_COVERED)
 
     def _is_room(self, seen: Views) -> bool:
         """Whether what encloses some positions is a room, though all sides look outward."""

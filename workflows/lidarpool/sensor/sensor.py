@@ -23,7 +23,7 @@ from .optics import LIGHT_M_NS, Optics, Returns
 
 RaysPerRevolution = Annotated[int, about("for a grid: azimuths in one turn", ge=1, le=10_000_000)]
 Layers = Annotated[int, about("for a grid: elevations (rings)", ge=1, le=CHANNELS_MOST)]
-Fov = Annotated[float, about("for a grid: degrees, half of it below the horizon", gt=0, le=180)]
+Fov = Annotated[float, about("for a grid: degrees, half of it below the horizon", ge=0, le=180)]
 Sector = Annotated[
     float, about("for a grid: degrees that a turn sweeps, half of it left of +x", gt=0, le=360)
 ]
@@ -116,7 +116,8 @@ class Sensor:
             Channels, evenly spaced over the vertical field of view, both ends included; one
             channel looks straight ahead.
         vertical_fov_deg
-            Vertical field of view in degrees, half of it below the horizon, in (0, 180].
+            Vertical field of view in degrees, half of it below the horizon, in [0, 180]. 0 is for
+            one layer, the plane of a 2D scanner.
         step_deg
             Degrees turned in one time step, in (0, 360].
         min_range_m, max_range_m
@@ -130,8 +131,14 @@ class Sensor:
         Raises
         ------
         LidarpoolError
-            If a value is outside its range, or a time step holds no firing at all.
+            If a value is outside its range, several layers have no field of view, or a time step
+            holds no firing at all.
         """
+        if layers > 1 and vertical_fov_deg == 0:
+            raise LidarpoolError(
+                f"vertical_fov_deg is 0 with {layers:,} layers, which would be the same: give one "
+                "layer, or a field of view above 0."
+            )
         turn = rays_per_revolution, step_deg, rate_hz
         whole = horizontal_fov_deg == 360
         head = Spin(*turn) if whole else Mirror(*turn, False, 0, "sawtooth", horizontal_fov_deg)

@@ -5,7 +5,7 @@ Random numbers depend only on scan, ray and return, so the batches do not matter
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -16,7 +16,7 @@ from ..scene.scene import Scene
 from ..sensor import Survey
 from .doppler import radial_velocities
 from .motion import Firings, Poses
-from .returns import NO_SURFACE, Keys, PulseReturns, joined
+from .returns import NO_SURFACE, Keys, PulseReturns, joined, made
 from .scene_caster import SceneCaster
 from .step import Emitter, PulseBatch, PulseStep, Setup
 from .steps import steps_of
@@ -25,8 +25,7 @@ from .surfaces import Surfaces, light_of
 CHUNK_RAYS = 1 << 17  # sub-rays that are cast at a time
 
 
-@dataclass(frozen=True)
-class Scanned:
+class Scanned(NamedTuple):
     """What scans give: kept returns, and counts of all."""
 
     returns: PulseReturns
@@ -79,7 +78,37 @@ class PulseCaster:
         for step in self.steps:
             if step.of_kept:
                 returns = step.apply(returns, whole)
-        return Scanned(returns, found.hits, found.tally)
+        return self._in_range(found._replace(returns=returns), groups)
+
+    def _in_range(self, scanned: Scanned, groups: Ints) -> Scanned:
+        """Remove the returns whose ranges, with noise, are beyond those that the sensor reports.
+
+        The counts and the numbers of the other returns are as if the removed ones were undetected.
+        """
+        returns, sensor = scanned.returns, self._setup.sensor
+        if returns.reported is returns.distance or returns.reported is None:  # without noise
+            return scanned
+        in_range = returns.reported >= sensor.min_range_m
+        in_range &= returns.reported <= sensor.max_range_m
+        if in_range.all():
+            return scanned
+        removed = np.flatnonzero(~in_range)
+        group = np.searchsorted(groups, returns.ray[removed], "right") - 1
+        hits = scanned.hits - np.bincount(group, minlength=len(groups))
+        tally = scanned.tally
+        if tally is not None:
+            triangle = returns.triangle[removed]
+            counter = self._surfaces.counter(triangle[triangle != NO_SURFACE])
+            tally = tally - np.bincount(counter, minlength=len(tally))
+        first = np.searchsorted(returns.ray, returns.ray)  # row of the first return of each pulse
+        last = np.searchsorted(returns.ray, returns.ray, "right")
+        before = np.append(0, np.cumsum(~in_range))  # removed returns before each row
+        number = made(returns.number) - (before[:-1] - before[first])
+        count = made(returns.returns) - (before[last] - before[first])
+        renumbered = returns._replace(
+            number=number.astype(np.uint8), returns=count.astype(np.uint8)
+        )
+        return Scanned(renumbered.take(in_range), hits, tally)
 
     def _pulses(self, batch: PulseBatch) -> PulseReturns:
         """Take the pulses of a batch through all steps."""

@@ -1,0 +1,241 @@
+"""Warnings of poses, motions and noise that real surveys do not have."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from trimesh import Trimesh, creation
+from trimesh.transformations import rotation_matrix
+
+from lidarpool.scenario.build import build
+from lidarpool.scenario.campaign import CampaignSpec, is_campaign
+from lidarpool.scenario.plausibility import implausibilities
+from lidarpool.scenario.scenario import Scenario
+from lidarpool.scene.generated.city import city
+from lidarpool.scene.paint import painted
+from lidarpool.scene.scene import Scene
+from lidarpool.scene.scene_file import write_scene
+from lidarpool.scene.scene_mesh import SceneMesh
+
+EXAMPLES = Path(__file__).parents[2] / "examples"
+CITY = {"city-drive", "crossing", "crossing-night", "drive"}
+SQUARE = np.array([[-100.0, -100, 0], [100, -100, 0], [100, 100, 0], [-100, 100, 0]])
+TIMES = np.linspace(0, 10, 101)
+
+
+def sheet(name: str, scale: tuple[float, float, float], height: float = 0.0) -> SceneMesh:
+    return SceneMesh(name, SQUARE * scale + [0, 0, height], np.array([[0, 1, 2], [0, 2, 3]]))
+
+
+def solid(name: str, mesh: Trimesh, at: tuple[float, float, float] = (0, 0, 0)) -> SceneMesh:
+    return SceneMesh(name, np.asarray(mesh.vertices) + at, np.asarray(mesh.faces))
+
+
+def block(name: str, size: tuple[float, float, float], x: float, y: float) -> SceneMesh:
+    return solid(name, creation.box(size), (x, y, size[2] / 2))
+
+
+def without_bottom(mesh: Trimesh) -> Trimesh:
+    mesh.update_faces(mesh.face_normals[:, 2] > -0.5)
+    return mesh
+
+
+def inverted(mesh: Trimesh) -> Trimesh:
+    mesh.invert()
+    return mesh
+
+
+def tube(radius_m: float, length_m: float) -> Trimesh:
+    mesh = creation.cylinder(radius_m, length_m)
+    open_ended = Trimesh(mesh.vertices, mesh.faces[np.abs(mesh.face_normals[:, 2]) < 0.5])
+    return open_ended.apply_transform(rotation_matrix(np.pi / 2, [0, 1, 0]))
+
+
+GROUND = sheet("Ground", (1, 1, 1))
+ROAD = sheet("Road", (1, 0.04, 1), -1.0)
+TOWN = [
+    GROUND,
+    block("House", (10, 8, 6), 20, 0),
+    solid("Shell", without_bottom(creation.box((10, 8, 6))), (-20, 0, 3)),
+    block("Car", (4.5, 1.8, 1.5), 0, 20),
+    block("Wall", (30, 0.4, 3), 0, -30),
+]
+SLAB = [solid("Slab", creation.box((100, 100, 1)), (0, 0, -0.5)), TOWN[1]]
+COURTYARD = [
+    GROUND,
+    *(block(f"East {x}", (2, 22, 12), x, 0) for x in (-10, 10)),
+    *(block(f"North {y}", (22, 2, 12), 0, y) for y in (-10, 10)),
+]
+
+
+def warnings_of(folder: Path, meshes: list[SceneMesh] | None = None, **scenario: Any) -> list[str]:
+    if meshes:
+        write_scene(folder / "scene.glb", Scene.from_meshes(meshes))
+        scenario["scene"] = "scene.glb"
+    return implausibilities(build(Scenario.from_data(scenario, folder=folder), plans=False))
+
+
+@pytest.mark.parametrize(
+    ("meshes", "position", "warning"),
+    [
+        (TOWN, (0, 0, -5), "the sensor is under the scene at (0.000, 0.000, -5.000): check z"),
+        (TOWN, (0, 0, -0.3), "the sensor is under the scene"),
+        (SLAB, (0, 0, -5), "the sensor is under the scene"),
+        (SLAB, (0, 0, -0.5), "the sensor is inside a closed body"),
+        (TOWN, (20, 0, 2), "the sensor is inside a closed body at (20.000, 0.000, 2.000), and"),
+        (TOWN, (-20, 0, 2), "the sensor is inside a closed body"),
+        (TOWN, (0, 20, 1), "the sensor is inside a closed body"),
+        (TOWN, (0, -30, 1), "the sensor is inside a closed body"),
+    ],
+    ids=["below", "just below", "slab", "in slab", "house", "no bottom", "car", "wall"],
+)
+def test_a_sensor_under_the_scene_or_in_a_body(tmp_path, meshes, position, warning):
+    warnings = warnings_of(tmp_path, meshes, poses=[[*position]])
+    assert len(warnings) == 1 and warnings[0].startswith(warning)
+    assert "from outside it is seen by poses: [{position: [" in warnings[0]
+
+
+def test_one_bad_position_of_several_is_counted(tmp_path):
+    [warning] = warnings_of(tmp_path, TOWN, poses=[[0, 0, 2], [0, 20, 1], [5, 5, 1]])
+    assert " at 1 of 3 positions that were tried, first at (0.000, 20.000, 1.000)" in warning
+
+
+@pytest.mark.parametrize(
+    ("meshes", "position"),
+    [
+        (TOWN, (0, 0, 2)),
+        ([solid("Hall", creation.box((8, 6, 3)))], (0, 0, 0)),
+        ([solid("Hall", inverted(creation.box((8, 6, 3))))], (0, 0, 0)),
+        ([ROAD, solid("Tunnel", tube(4, 200))], (0, 0, 1)),
+        ([ROAD, solid("Tunnel", inverted(tube(4, 200)))], (0, 0, 1)),
+        (COURTYARD, (0, 0, 1.5)),
+        ([solid("Part", creation.box((1, 1, 1)), (0, 0, 3))], (0, 0, 0)),
+    ],
+    ids=["town", "hall", "inward hall", "tunnel", "inward tunnel", "courtyard", "part from below"],
+)
+def test_rooms_tunnels_and_courtyards_are_no_faults(tmp_path, meshes, position):
+    assert warnings_of(tmp_path, meshes, poses=[[*position]]) == []
+
+
+def test_a_sensor_in_the_body_of_an_actor(tmp_path):
+    points = [{"time_s": 0, "position": [-20, 5, 0.8]}, {"time_s": 4, "position": [20, 5, 0.8]}]
+    write_scene(tmp_path / "car.glb", Scene.from_meshes([block("Car", (4.5, 1.8, 1.5), 0, 0)]))
+    car = {"name": "Car 1", "file": "car.glb"}
+    drive = {"trajectory": {"points": points}, "steps": 36, "actors": [car]}
+    assert warnings_of(tmp_path, TOWN, **drive, mount=[0, 0, 1.9]) == []
+    points[0]["position"] = [-20, 5, 0.0]
+    points[1]["position"] = [20, 5, 0.0]
+    [warning] = warnings_of(tmp_path, TOWN, **drive, mount=[0, 0, 0.8])
+    assert warning.startswith("the sensor is inside Car 1 at (")
+
+
+@pytest.mark.parametrize("sensor", [{}, {"sensor": "velodyne/vlp16"}], ids=["grid", "vlp16"])
+def test_noise_above_a_tenth_of_the_range(tmp_path, sensor):
+    poses = {"poses": [[0, 0, 2]]}
+    [warning] = warnings_of(tmp_path, TOWN, **sensor, **poses, noise={"range_m": 20})
+    assert warning.startswith("noise.range_m is 20 m, more than a tenth of the range, ")
+    assert warnings_of(tmp_path, TOWN, **sensor, **poses, noise={"range_m": 0.02}) == []
+    [warning] = warnings_of(tmp_path, TOWN, **poses, noise={"range_per_m": 0.2})
+    assert "noise.range_per_m is 0.2" in warning
+    [warning] = warnings_of(tmp_path, noise={"range_m": 20})  # with poses that were chosen
+    assert "noise.range_m is 20 m" in warning
+
+
+def drive(*points: tuple[float, ...]) -> dict[str, Any]:
+    """Return a trajectory of times, x, y, z, and perhaps yaw."""
+    names = ("yaw_deg",)
+    poses = [
+        {"time_s": t, "position": [x, y, z], **dict(zip(names, yaw, strict=False))}
+        for t, x, y, z, *yaw in points
+    ]
+    return {"trajectory": {"points": poses}, "steps": 36}
+
+
+def test_speeds_and_angular_rates_that_carriers_do_not_have(tmp_path):
+    fast = drive((0, -1000, 5, 2), (1, 1000, 5, 2))
+    [warning] = warnings_of(tmp_path, TOWN, **fast)
+    assert warning.startswith("the carrier moves at 2,000 m/s at 0.5 s, and carriers on the ground")
+    assert warnings_of(tmp_path, TOWN, **drive((0, -20, 5, 2), (4, 20, 5, 2))) == []
+    flight = drive((0, -300, 0, 400), (3, 300, 0, 400))  # 200 m/s
+    assert warnings_of(tmp_path, TOWN, **flight) == []
+    low = drive((0, -300, 0, 10), (3, 300, 0, 10))
+    assert "moves at 200 m/s" in warnings_of(tmp_path, TOWN, **low)[0]
+    jump = drive((0, -20, 5, 2, 0), (0.1, -19, 5, 2, 170), (4, 20, 5, 2, 0))
+    assert "the carrier turns at 1,700 degrees a second" in warnings_of(tmp_path, TOWN, **jump)[0]
+
+
+def quaternions(yaw: np.ndarray) -> np.ndarray:
+    """Return x, y, z, w (k, 4) of yaw angles (k,), radians."""
+    zero = np.zeros_like(yaw)
+    return np.stack([zero, zero, np.sin(yaw / 2), np.cos(yaw / 2)], axis=1)
+
+
+STRAIGHT = np.stack([5 * TIMES - 25, 0 * TIMES + 5, 0 * TIMES + 2], axis=1), 0 * TIMES
+CIRCLE = (
+    np.stack([9 * np.cos(TIMES / 3), 9 * np.sin(TIMES / 3), 0 * TIMES + 2], axis=1),
+    TIMES / 3 + np.pi / 2,
+)
+TURNING = np.tile([0.0, 5, 2], (len(TIMES), 1)), TIMES / 3
+
+
+@pytest.mark.parametrize("path", [STRAIGHT, CIRCLE, TURNING], ids=["line", "circle", "standing"])
+def test_quaternions_in_another_order(tmp_path, path):
+    positions, yaw = path
+    scenario = {"trajectory": "way.tum", "steps": 36}
+    right = quaternions(yaw)
+    np.savetxt(tmp_path / "way.tum", np.column_stack([TIMES, positions, right]))
+    assert warnings_of(tmp_path, TOWN, **scenario) == []
+    w_first = right[:, [3, 0, 1, 2]]
+    np.savetxt(tmp_path / "way.tum", np.column_stack([TIMES, positions, w_first]))
+    [warning] = warnings_of(tmp_path, TOWN, **scenario)
+    assert "probably in the order w, x, y, z" in warning
+    assert re.match(r"the carrier's z axis is \d+ degrees from up: ", warning)
+
+
+@pytest.mark.parametrize(("yaw_deg", "side"), [(90, "left"), (-90, "right")])
+def test_a_carrier_that_faces_aside_all_along(tmp_path, yaw_deg, side):
+    aside = drive((0, -20, 5, 2, yaw_deg), (4, 20, 5, 2, yaw_deg))
+    [warning] = warnings_of(tmp_path, TOWN, **aside)
+    assert f"the carrier faces 90 degrees to the {side} of its direction of travel" in warning
+    there_and_back = drive((0, -20, 5, 2, 0), (4, 20, 5, 2, 0), (8, -20, 5, 2, 0))
+    assert warnings_of(tmp_path, TOWN, **there_and_back) == []
+
+
+def test_a_trajectory_with_another_axis_up(tmp_path):
+    positions = CIRCLE[0][::10, [0, 2, 1]] + [0, 0, 20]
+    points = [(t, *p) for t, p in zip(TIMES[::10].tolist(), positions.tolist(), strict=True)]
+    warnings = warnings_of(tmp_path, TOWN, **drive(*points))
+    assert any("is y the up axis of its file?" in warning for warning in warnings)
+    climb = drive((0, 0, 0, 1), (10, 0, 0, 31))
+    assert warnings_of(tmp_path, TOWN, **climb) == []  # of a drone
+
+
+@pytest.fixture(scope="module")
+def with_city(tmp_path_factory) -> Path:
+    """Return a folder with the examples and the city that some of them need."""
+    folder = tmp_path_factory.mktemp("examples")
+    for path in EXAMPLES.iterdir():
+        (folder / path.name).symlink_to(path)
+    write_scene(folder / "city.glb", painted(city(100_000)))
+    return folder
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param(path.stem, marks=[pytest.mark.slow] * (path.stem in {"block", *CITY}))
+        for path in sorted(EXAMPLES.glob("*.yaml"))
+        if path.stem != "warehouse"  # of a file that is not among the examples
+    ],
+)
+def test_examples_have_no_warnings(with_city, name):
+    if name == "block":
+        pytest.importorskip("pxr")
+    path = with_city / f"{name}.yaml"
+    scenario = CampaignSpec.load(path).scenario(0) if is_campaign(path) else Scenario.load(path)
+    assert scenario is not None
+    assert implausibilities(build(scenario, plans=False)) == []

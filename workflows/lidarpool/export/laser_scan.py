@@ -1,0 +1,95 @@
+"""Sweeps of 2D scanners as LaserScan messages of ROS (sensor_msgs)."""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from ..base.arrays import Floats, Floats32
+from ..columns.cloud import Cloud
+from ..sensor import Sensor, Survey
+from .images import Image
+from .sweeps import Sweeps
+
+COLUMNS = "ray", "range"  # that a LaserScan needs, and every return
+_BAGS = frozenset({"mcap", "rosbag2"})
+_UNEVEN = 1e-6  # radians by which steps between rays may differ
+
+
+def is_planar(sensor: Sensor) -> bool:
+    """Whether a sensor is a 2D scanner: one beam, which turns in the plane of its x and y axes.
+
+    Its rays start at its centre, and follow each other in even steps.
+    """
+    if sensor.channels != 1 or sensor.spins(np.zeros(1, np.int64)) is None:
+        return False
+    first, stop = sensor.firings(0)
+    firings = np.arange(first, max(stop, first + 3))
+    rays = sensor.directions(firings)[:, 0]
+    return bool(np.allclose(rays[:, 2], 0.0) and sensor.origins(firings) is None)
+
+
+def with_laser_scans(survey: Survey, formats: Collection[str]) -> Survey:
+    """Return a survey with the columns of LaserScan messages, if bags of it have such messages.
+
+    `formats` are those that its cloud is written in. Surveys that thin out returns have none.
+    """
+    if _BAGS.isdisjoint(formats) or survey.keep_every > 1 or not has_planar_sensors(survey):
+        return survey
+    return replace(survey, columns=(*survey.columns, *COLUMNS))
+
+
+def has_planar_sensors(survey: Survey) -> bool:
+    """Whether a survey has 2D scanners."""
+    return any(is_planar(carried.sensor) for carried in survey.carried)
+
+
+def has_laser_scans(sweeps: Sweeps) -> bool:
+    """Whether bags of a survey have LaserScan messages, if its cloud has ranges."""
+    return sweeps.fired is not None and any(map(is_planar, sweeps.fired.sensors))
+
+
+@dataclass(frozen=True, eq=False)
+class ScanRays:
+    """The rays of a sweep of a 2D scanner, as LaserScan has them."""
+
+    angles: Floats  # (n,): first, last and step make those of the message; radians, continuous
+    time_increment_s: float  # between rays
+    scan_time_s: float  # between sweeps
+    range_limits_m: tuple[float, float]
+    ranges: Floats32  # (n,): of the first return, metres; infinite where there is none (REP 117)
+    intensities: Floats32  # (n,): of the first return; 0 where there is none
+
+    @classmethod
+    def of(cls, sweeps: Sweeps, sweep: int, points: Cloud) -> ScanRays | None:
+        """Return the rays of a sweep; None if its sensor is no 2D scanner, or rays are unknown."""
+        fired = sweeps.fired
+        if fired is None or "range" not in points.columns:
+            return None
+        sensor = fired.sensors[sweeps.sensor[sweep]]
+        if not is_planar(sensor):
+            return None
+        image = Image.of(sweeps, sweep, points)
+        x, y, _ = sensor.directions(image.firings)[:, 0].T
+        angles = np.unwrap(np.arctan2(y, x))
+        steps = np.diff(angles)
+        if len(steps) == 0 or np.ptp(steps) > _UNEVEN:
+            return None
+        begins_ns = sensor.begins_ns(image.firings)
+        time_increment_s = float(begins_ns[-1] - begins_ns[0]) / len(steps) / 1e9
+        rate_hz = getattr(sensor.head, "rate_hz", None)
+        ranges = image.filled(points["range"].astype(np.float32))[0, 0]
+        light = points.columns.get("intensity", points.columns.get("signal"))
+        intensities = np.zeros(len(ranges), np.float32)
+        if light is not None:
+            intensities = np.nan_to_num(image.filled(light.astype(np.float32))[0, 0])
+        return cls(
+            angles,
+            time_increment_s,
+            1 / rate_hz if rate_hz else time_increment_s * len(angles),
+            (sensor.min_range_m, min(sensor.max_range_m, float(np.finfo(np.float32).max))),
+            np.where(np.isnan(ranges), np.float32(np.inf), ranges),
+            intensities,
+        )

@@ -1,0 +1,103 @@
+"""The most likely reason why a survey gives no points."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+
+from ..base.arrays import Floats
+from ..base.words import plural
+from ..datasets.job_table import JobRow
+from ..scene.scene import Scene
+from ..sensor import Survey
+from ..simulator.sampling import sample_ranges
+from .placing import seen_from
+
+EMPTY = "the cloud has no points"
+NO_POINTS = "no points: "  # before the names of jobs
+NAMED_JOBS = 5  # in a warning
+
+# Casters of larger scenes take too long for a warning.
+MAX_TRIANGLES = 2_000_000
+
+
+def empty_cloud_reason(scene: Scene, survey: Survey, scans: range | None = None) -> str:
+    """Return the most likely reason why a survey gives no points, as a clause.
+
+    Some rays are cast without limits of range and without effects: if these rays meet nothing, the
+    reason is the pose, or the unit of the scene; else the range, or an effect. `scans` are those
+    that were cast, by default all.
+    """
+    if survey.scan_count == 0 or (scans is not None and not len(scans)):
+        return "no scan was cast"
+    if scene.triangles > MAX_TRIANGLES:
+        return f"check ranges, poses and units; {_start(scene, survey)}"
+    ranges = sample_ranges(scene, survey, scans)
+    if not len(ranges):
+        faults = "faults, " * bool(survey.faults)
+        seen = seen_from(scene, survey.carried[0])
+        return (
+            f"no ray hit anything at any distance: check {faults}poses and units; "
+            f"{_start(scene, survey)}; {seen}"
+        )
+    limits = [*dict.fromkeys(_limits(survey, ranges))]
+    if not limits:
+        return f"rays meet surfaces at {_span(ranges)}, and no return is reported: check " + (
+            ", ".join(_effects(survey)) or "the surfaces"
+        )
+    return f"{'; '.join(limits)}: check ranges, poses and units; {_start(scene, survey)}"
+
+
+def empty_jobs_warning(empty: Sequence[JobRow], reason: str) -> str:
+    """Return a warning that jobs have no points; `reason` is of the first of them, or empty."""
+    names = ", ".join(row.name for row in empty[:NAMED_JOBS])
+    if more := len(empty) - NAMED_JOBS:
+        names += f" and {more:,} more" * (more > 0)
+    jobs = f"{plural(len(empty), 'job has', 'jobs have')} {NO_POINTS}{names}"
+    advice = "; lidarpool check CAMPAIGN --job N says the most likely reason"
+    return f"{jobs}; in job {empty[0].name} {reason}" if reason else jobs + advice
+
+
+def _limits(survey: Survey, ranges: Floats) -> Iterator[str]:
+    """Say which limits of range exclude the surfaces; nothing if some are within the limits."""
+    lower = [carried.sensor.min_range_m for carried in survey.carried]
+    upper = [carried.sensor.max_range_m for carried in survey.carried]
+    near, far = ranges < min(lower), ranges > max(upper)
+    if not (near | far).all():
+        return
+    if near.any():
+        yield (
+            f"{'all' if near.all() else 'some'} surfaces are nearer than the sensor's minimum "
+            f"range: min_range_m is {min(lower):g}, and they are at {_span(ranges[near])}"
+        )
+    if far.any():
+        yield (
+            f"{'all' if far.all() else 'some'} surfaces are farther than the sensor's maximum "
+            f"range: max_range_m is {max(upper):g}, and they are at {_span(ranges[far])}"
+        )
+
+
+def _effects(survey: Survey) -> Iterator[str]:
+    """Name the settings of a survey that may suppress all returns."""
+    if any(noise.detection_range_m is not None for noise in survey.noise_each):
+        yield "noise.detection_range_m"
+    if any(noise.dropout for noise in survey.noise_each):
+        yield "noise.dropout"
+    if survey.faults:
+        yield "faults"
+    if survey.extinction(survey.carried[0].sensor):
+        yield "weather"
+    if survey.materials:
+        yield "materials"
+    if survey.keep_every > 1:
+        yield "cloud.keep_every"
+
+
+def _span(ranges: Floats) -> str:
+    return f"{np.min(ranges):,.4g} to {np.max(ranges):,.4g} m"
+
+
+def _start(scene: Scene, survey: Survey) -> str:
+    (x, y, z) = survey.pose(0).position + scene.origin
+    return f"the sensor begins at ({x:,.3f}, {y:,.3f}, {z:,.3f})"

@@ -1,0 +1,316 @@
+"""Warnings of what real surveys do not have: poses, motions and noise that are likely mistakes."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import numpy as np
+
+from ..base.arrays import Bools, Floats
+from ..base.sampling import even_indices
+from ..base.words import as_scenario
+from ..scene.actors import Actor
+from ..scene.scene import Scene
+from ..scene.surroundings import Surroundings
+from ..sensor import Survey, Track
+from ..sensor.sensor import LineSensor
+from ..sensor.trajectory import full_poses, matrices, quaternions_of, velocities
+from .build import Built
+from .placing import seen_from, surroundings_of
+
+GROUND_SPEED_M_S = 150.0  # faster than trains, except those on test tracks
+AIR_SPEED_M_S = 350.0  # faster than the aircraft that carry lidars
+AIRBORNE_M = 50.0  # height above the ground from which a carrier flies
+MAX_RATE_DEG_S = 720.0  # two turns a second
+NOISE_SHARE = 0.1  # of the range
+
+# Orientation against the direction of travel: angles of this size are no drift of a vehicle, if
+# they are constant, which is the length of the mean of unit vectors with these angles.
+_ASKEW_DEG, _CONSTANT = 30.0, 0.95
+_MOVES_M_S, _TRAVELS_M = 0.1, 2.0  # below these speeds and lengths directions of travel are noise
+# Cosines of tilt, on the average: a carrier that is level, and one that lies on its side.
+_LEVEL, _TILTED = 0.9, 0.5
+# A path that rises and falls by more than so many metres and this share of its length, while it
+# stays within a share of that height along x or y, has another axis up.
+_RISE_M, _RISE_SHARE, _FLAT = 5.0, 0.3, 0.1
+
+_POSITIONS = 24  # that are looked around from
+_TIMES = 20_000  # of a trajectory that are looked at
+_FAR_PERCENT = 95  # percentile of distances that stands for the range of a sensor without a limit
+
+
+class _Motion(NamedTuple):
+    """A trajectory at the middle of the times between its poses."""
+
+    times_ns: Floats  # (k,)
+    durations_s: Floats  # (k,): between the poses
+    positions: Floats  # (k, 3), metres
+    rotations: Floats  # (k, 3, 3), from the carrier's axes to the scene's
+    velocities: Floats  # (k, 3), m/s
+    rates: Floats  # (k, 3), rad/s
+
+    @property
+    def speeds(self) -> Floats:
+        """Speeds (k,), m/s."""
+        return np.asarray(np.linalg.norm(self.velocities, axis=1))
+
+
+class _Place(NamedTuple):
+    """A position of a sensor at a time."""
+
+    time_ns: float
+    position: Floats  # (3,), local coordinates
+
+
+def implausibilities(built: Built) -> list[str]:
+    """Return warnings of poses, motions and noise that real surveys do not have.
+
+    Poses that were chosen for the user are not judged. Some thousand rays are cast in scenes that
+    are not too large.
+    """
+    scene, survey = built.scene, built.survey
+    chosen = built.scenario.poses is None and built.scenario.trajectory is None
+    places = [] if chosen else _places(survey)
+    positions = np.array([place.position for place in places]).reshape(-1, 3)
+    looker = surroundings_of(scene, positions) if places else None
+    warnings = [*_of_noise(survey, _seen_m(scene, looker, positions))]
+    if not chosen:
+        warnings += _of_positions(scene, survey, looker, places)
+    if survey.path.moves:
+        motion = _motion(survey)
+        warnings += _of_speed(motion, flies=_flies(scene, survey, looker, positions))
+        warnings += _of_up_axis(motion, scene.bounds[0, 2])
+        warnings += _of_orientation(motion)
+    return [as_scenario(warning) for warning in dict.fromkeys(warnings)]
+
+
+# -- positions -------------------------------------------------------------------------------
+
+
+def _places(survey: Survey) -> list[_Place]:
+    """Return some positions of the sensors, in local coordinates."""
+    path, mounts = survey.path, [carried.mount for carried in survey.carried]
+    if path.moves:
+        times = np.linspace(0, min(path.duration_ns, survey.duration_ns), _POSITIONS)
+        stations = [(0, time) for time in times.tolist()]
+    else:
+        stations = [(n, 0.0) for n in even_indices(path.stations, _POSITIONS).tolist()]
+    stations = [stations[i] for i in even_indices(len(stations), max(1, _POSITIONS // len(mounts)))]
+    return [
+        _Place(time, np.array(path.pose(station, time).then(mount).position))
+        for station, time in stations
+        for mount in mounts
+    ]
+
+
+def _of_positions(
+    scene: Scene, survey: Survey, looker: Surroundings | None, places: list[_Place]
+) -> Iterator[str]:
+    """Warn of positions under the scene, or inside its bodies or actors."""
+    if looker is not None:
+        under = np.array([looker.is_covered(place.position) for place in places])
+        inside = np.array([looker.in_a_body(place.position) for place in places])
+        seen = seen_from(scene, survey.carried[0]) if (under | inside).any() else ""
+        if under.any():
+            yield (
+                f"the sensor is under the scene{_where(scene, places, under)}: check z, heights "
+                f"and up_axis; {seen}"
+            )
+        if (inside & ~under).any():
+            yield (
+                f"the sensor is inside a closed body{_where(scene, places, inside & ~under)}, and "
+                f"hits only the backs of its surfaces; {seen}"
+            )
+    for actor in scene.actors:
+        inside = _inside_actor(actor, places)
+        if inside.any():
+            yield (
+                f"the sensor is inside {actor.name}{_where(scene, places, inside)}: check its "
+                "mount, and the trajectories"
+            )
+
+
+def _where(scene: Scene, places: list[_Place], bad: Bools) -> str:
+    """Return the first bad position, and how many there are if there are good ones."""
+    x, y, z = places[int(bad.argmax())].position + scene.origin
+    share = f" at {bad.sum()} of {len(bad)} positions that were tried, first" * (not bad.all())
+    return f"{share} at ({x:,.3f}, {y:,.3f}, {z:,.3f})"
+
+
+def _inside_actor(actor: Actor, places: list[_Place]) -> Bools:
+    """Return at which places the sensor is inside an actor's closed mesh: (k,)."""
+    times = np.array([place.time_ns for place in places])
+    inside = np.zeros(len(places), np.bool_)
+    if not places:
+        return inside
+    positions, rotations = full_poses(actor.trajectory, 0, times)
+    offsets = np.array([place.position for place in places]) - positions
+    local = np.einsum("kji,kj->ki", rotations, offsets)  # in the actor's axes
+    low, high = actor.mesh.bounds
+    near = np.flatnonzero(((local > low) & (local < high)).all(axis=1))
+    if len(near):
+        looker = Surroundings(Scene.from_meshes([actor.mesh]))
+        inside[near] = [looker.views(local[k]).in_a_body for k in near]
+    return inside
+
+
+# -- noise -----------------------------------------------------------------------------------
+
+
+def _seen_m(scene: Scene, looker: Surroundings | None, positions: Floats) -> float:
+    """Return how far a sensor without a limit of range sees, metres."""
+    if looker is not None:
+        distances = looker.views(positions).distance
+        if len(distances := distances[np.isfinite(distances)]):
+            return float(np.percentile(distances, _FAR_PERCENT))
+    return float(np.linalg.norm(np.ptp(scene.bounds, axis=0)))
+
+
+def _of_noise(survey: Survey, seen_m: float) -> Iterator[str]:
+    """Warn of noise above a tenth of the range."""
+    for carried, noise in zip(survey.carried, survey.noise_each, strict=True):
+        range_m = min(carried.sensor.max_range_m, seen_m)
+        name = f" of {carried.name}" * bool(carried.name)
+        for field in ("range_m", "range_at_threshold_m", "channel_bias_m", "warm_up_m"):
+            value = float(np.max(np.abs(getattr(noise, field))))
+            if value > NOISE_SHARE * range_m:
+                yield (
+                    f"noise.{field}{name} is {value:,.4g} m, more than a tenth of the range, "
+                    f"{range_m:,.4g} m: give it in metres"
+                )
+        if noise.range_per_m > NOISE_SHARE:
+            yield (
+                f"noise.range_per_m{name} is {noise.range_per_m:g}, more than a tenth of the "
+                "range: give metres for each metre of range"
+            )
+
+
+# -- motion ----------------------------------------------------------------------------------
+
+
+def _motion(survey: Survey) -> _Motion:
+    """Return the motion of the carrier of a survey that moves, also after the last scan."""
+    path = survey.path
+    end_ns = path.duration_ns if np.isfinite(path.duration_ns) else survey.duration_ns
+    if isinstance(path, Track):
+        assert path.start_s is not None  # of every track
+        knots = (path.times_s - path.start_s) * 1e9
+        knots = np.unique(np.clip(knots, 0.0, end_ns))
+    else:
+        knots = np.linspace(0.0, end_ns, _TIMES)
+    rows = even_indices(len(knots) - 1, _TIMES)
+    times, durations_s = (knots[rows] + knots[rows + 1]) / 2, np.diff(knots)[rows] / 1e9
+    return _Motion(times, durations_s, *full_poses(path, 0, times), *velocities(path, 0, times))
+
+
+def _flies(scene: Scene, survey: Survey, looker: Surroundings | None, positions: Floats) -> bool:
+    """Whether the carrier is airborne, judged by its sensors and its height above the ground."""
+    if any(isinstance(carried.sensor, LineSensor) for carried in survey.carried):
+        return True
+    heights = positions[:, 2] - scene.bounds[1, 2]
+    if looker is not None and len(positions):
+        down = np.broadcast_to([0.0, 0.0, -1.0], positions.shape)
+        below = looker.cast(positions, down).distance
+        heights = np.where(np.isfinite(below), below, heights)
+    return bool(len(heights) and np.median(heights) > AIRBORNE_M)
+
+
+def _of_speed(motion: _Motion, *, flies: bool) -> Iterator[str]:
+    """Warn of speeds and angular rates that carriers do not have."""
+    limit, what = (AIR_SPEED_M_S, "in the air") if flies else (GROUND_SPEED_M_S, "on the ground")
+    speeds, rates = motion.speeds, np.degrees(np.linalg.norm(motion.rates, axis=1))
+    if (speeds > limit).any():
+        fastest = int(speeds.argmax())
+        yield (
+            f"the carrier moves at {speeds[fastest]:,.4g} m/s at {_time(motion, fastest)}, and "
+            f"carriers {what} stay below {limit:g} m/s: check the units of positions and times"
+        )
+    if (rates > MAX_RATE_DEG_S).any():
+        fastest = int(rates.argmax())
+        yield (
+            f"the carrier turns at {rates[fastest]:,.4g} degrees a second at "
+            f"{_time(motion, fastest)}, and carriers stay below {MAX_RATE_DEG_S:g}: check times, "
+            "and the units and the order of angles or quaternions"
+        )
+
+
+def _time(motion: _Motion, row: int) -> str:
+    return f"{motion.times_ns[row] / 1e9:,.4g} s"
+
+
+def _of_up_axis(motion: _Motion, lowest_m: float) -> Iterator[str]:
+    """Warn of a path that rises and falls as roads do not, and is flat along x or y.
+
+    A path straight up is that of a lift or drone, unless it begins below the scene.
+    """
+    across = np.ptp(motion.positions, axis=0)
+    metres = motion.speeds @ motion.durations_s
+    rise = np.abs(motion.velocities[:, 2]) @ motion.durations_s
+    flat = int(across[:2].argmin())
+    if across[:2].max() < _FLAT * across[2] and motion.positions[:, 2].min() >= lowest_m:
+        return
+    if across[2] > _RISE_M and rise > _RISE_SHARE * metres and across[flat] < _FLAT * across[2]:
+        yield (
+            f"the trajectory rises and falls by {across[2]:,.4g} m, and stays within "
+            f"{across[flat]:,.3g} m along {'xy'[flat]}: give positions with z up, in metres "
+            f"(is {'xy'[flat]} the up axis of its file?)"
+        )
+
+
+def _of_orientation(motion: _Motion) -> Iterator[str]:
+    """Warn of carriers that lie on their sides, or face another direction than they travel in."""
+    as_given = _Facing.of(motion, motion.rotations)
+    # Of a file in the order w, x, y, z, w was read as x, x as y, and so on.
+    quaternions = quaternions_of(motion.rotations)
+    w_first = _Facing.of(motion, matrices(quaternions[:, [1, 2, 3, 0]]))
+    tilted = as_given.level <= _TILTED
+    is_w_first = as_given.level <= _LEVEL < w_first.level and not w_first.askew
+    if not (tilted or as_given.askew or is_w_first):
+        return
+    faults = []
+    if tilted or is_w_first:
+        tilt = np.degrees(np.arccos(np.clip(as_given.level, -1, 1)))
+        faults.append(f"the carrier's z axis is {tilt:.0f} degrees from up")
+    if as_given.askew:
+        faults.append(
+            f"the carrier faces {abs(as_given.angle_deg):.0f} degrees to the "
+            f"{'left' if as_given.angle_deg > 0 else 'right'} of its direction of travel, all along"
+        )
+    advice = "check the order of quaternions (x, y, z, w), and the units and axes of angles"
+    if is_w_first:
+        advice = (
+            "its quaternions are probably in the order w, x, y, z, by which it is level and faces "
+            "its direction of travel: give them in the order x, y, z, w"
+        )
+    elif not tilted:
+        advice += "; if the sensor is mounted so, give the angle as its mount"
+    yield f"{' and '.join(faults)}: {advice}"
+
+
+class _Facing(NamedTuple):
+    """How a carrier is oriented along its path."""
+
+    level: float  # mean cosine between its z axis and up
+    angle_deg: float  # mean angle from its direction of travel to its x axis, to the left
+    constancy: float  # of that angle, 0 to 1; 0 if it hardly travels
+
+    @property
+    def askew(self) -> bool:
+        """Whether the carrier faces another direction than the one it travels in, all along."""
+        return self.constancy > _CONSTANT and abs(self.angle_deg) > _ASKEW_DEG
+
+    @classmethod
+    def of(cls, motion: _Motion, rotations: Floats) -> _Facing:
+        """Measure the orientation by rotations (k, 3, 3) along a path."""
+        level = float(np.average(rotations[:, 2, 2], weights=motion.durations_s))
+        ahead, travel = rotations[:, :2, 0], motion.velocities[:, :2]
+        speeds = np.linalg.norm(travel, axis=1)
+        metres = np.where(speeds > _MOVES_M_S, speeds * motion.durations_s, 0.0)
+        if metres.sum() < _TRAVELS_M:
+            return cls(level, 0.0, 0.0)
+        left = travel[:, 0] * ahead[:, 1] - travel[:, 1] * ahead[:, 0]
+        cosines = (travel * ahead).sum(axis=1)
+        angles = np.arctan2(left, cosines)
+        mean = np.average(np.exp(1j * angles), weights=metres)
+        return cls(level, float(np.degrees(np.angle(mean))), float(np.abs(mean)))
