@@ -112,6 +112,8 @@ def content(folder: Path) -> dict[str, Any]:
         name, data = path.relative_to(folder).as_posix(), path.read_bytes()
         if name == "report.json":
             found[name] = without_times(json.loads(data))
+        elif name == "campaign.json":
+            found[name] = unsealed(data)
         elif name == "dataset.json":
             found[name] = unsealed(data) | {"table": None}  # jobs.csv has seconds
         elif name == "jobs.csv":
@@ -203,6 +205,7 @@ def test_damaged_files_are_named_and_the_next_merge_takes_them(
     made, whole = content(out), content(campaigns("folder") / "one")
     notes = made.pop("report.json")["notes"]
     assert notes[0].startswith("made again: job 0001")
+    assert made["campaign.json"].pop("notes") == notes and not whole["campaign.json"].pop("notes")
     assert made == {name: data for name, data in whole.items() if name in made}
 
 
@@ -268,10 +271,13 @@ def test_a_table_of_jobs_is_only_compared(parts, campaigns, tmp_path, edit, slot
 
 def test_a_manifest_of_another_job_is_refused(parts, tmp_path):
     shutil.copy(parts[0] / ".jobs/0003.json", parts[1] / ".jobs/0003.json")
-    with pytest.raises(LidarpoolError, match=r"part-2/\.jobs/0003\.json is of no job of shard 2/3"):
+    with pytest.raises(LidarpoolError, match=r"part-2/\.jobs/0003\.json is of job 3, which is not"):
         merge(parts, tmp_path / "ds")
     (parts[1] / ".jobs/0003.json").rename(parts[1] / ".jobs/0004.json")
     with pytest.raises(LidarpoolError, match=r"damaged: .*part-2/\.jobs/0004\.json; run"):
+        merge(parts, tmp_path / "ds")
+    (parts[1] / ".jobs/0004.json").unlink()
+    with pytest.raises(LidarpoolError, match=r"damaged: the manifest of job 4 in .*part-2; run"):
         merge(parts, tmp_path / "ds")
 
 
@@ -547,8 +553,10 @@ def test_shards_of_a_survey_have_the_files_of_one_run(survey, lidarpool, slots, 
 def _some_of_a_survey(survey: Path, shards: list[Path]) -> None:
     with pytest.raises(LidarpoolError, match=r"^missing: 1 shard, 1/3: give them"):
         merge(shards[:2], survey / "some")
-    with pytest.raises(LidarpoolError, match="part-2 holds a shard of a survey: give another"):
+    with pytest.raises(LidarpoolError, match="part-2 is one of the shards, which stays as it is"):
         merge(shards, shards[0])
+    with pytest.raises(LidarpoolError, match="part-2 holds a shard of a survey: give another"):
+        merge(shards[1:], shards[0])
     report = merge(shards[:2], survey / "some", partial=True)
     assert "missing: 1 shard, 1/3" in report["notes"] and report["planning"] is None
     killed(survey / "some", shards, ("take", 3))

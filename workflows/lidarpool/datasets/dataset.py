@@ -32,7 +32,7 @@ from ..export.kitti import NAMES_FILE, labels_file
 from ..export.nuscenes import merge
 from ..export.pieces import Entry, Pieces, pieces_of
 from ..export.sweeps import SWEEPS_FILE, Sweeps
-from .job_table import TABLE_FILE, JobRow, Tally, job_name
+from .job_table import TABLE_FILE, JobRow, Tally
 
 T = TypeVar("T")
 R = TypeVar("R")
@@ -275,20 +275,17 @@ class DataSet:
 
         return look_at
 
-    def take(
-        self, place: Storage, numbers: Iterable[int], identity: Any
-    ) -> Iterator[tuple[int, JobRow | None, str]]:
+    def take(self, place: Storage, identity: str) -> Iterator[tuple[str, JobRow | None, str]]:
         """Copy the files of jobs from another data set of this format, which is in `place`.
 
         Files that are here already are not read again. A job that has failed there stays as the
-        job is here. Yields the number of each job, the row that the manifest there has, and the
-        first file there that is missing, damaged or of jobs of another `identity`, else "". OSError
-        if a place cannot be read or written to.
+        job is here. Yields the name of each job of which there is a manifest, the row that the
+        manifest has, and the first file there that is missing, damaged or of jobs of another
+        `identity`, else "". OSError if a place cannot be read or written to.
         """
         here, there = self._looker(), replace(self, place=place)
 
-        def take(number: int) -> tuple[JobRow | None, str]:
-            name = job_name(number)
+        def take(name: str) -> tuple[JobRow | None, str]:
             manifest, last = there._manifest(name), manifest_file(name)
             if not manifest or manifest["made_with"].get("identity") != identity:
                 return None, place.path(last)
@@ -307,8 +304,8 @@ class DataSet:
                 return row, place.path(file)
             return row, ""
 
-        for number, (row, wrong) in ahead(take, iter(numbers)):
-            yield number, row, wrong
+        for name, (row, wrong) in ahead(take, iter(there.manifests())):
+            yield name, row, wrong
 
     def _manifest(self, name: str) -> dict[str, Any]:
         """Read the manifest of a job; empty if it is missing, damaged or of another job."""
@@ -320,7 +317,7 @@ class DataSet:
         return manifest if whole else {}
 
     def manifests(self) -> list[str]:
-        """Names of the jobs of which there is a manifest, in the order of their numbers."""
+        """Return the names of the jobs of which there is a manifest, by length and letters."""
         files = self.place.below(_MANIFESTS).sizes()
         names = [file.removesuffix(".json") for file in files if file.endswith(".json")]
         return sorted(names, key=lambda name: (len(name), name))
@@ -328,8 +325,8 @@ class DataSet:
     def rows(self, known: Collection[str] = ()) -> Iterator[tuple[JobRow, Mapping[str, Any]]]:
         """Yield the rows of jobs as their manifests have them, and what the jobs were made with.
 
-        Rows are in the order of numbers, without those of `known` names and damaged manifests.
-        OSError if the place cannot be read.
+        Rows of `known` names and damaged manifests are left out. OSError if the place
+        cannot be read.
         """
         unknown = (name for name in self.manifests() if name not in known)
         for _, manifest in ahead(self._manifest, unknown):

@@ -107,17 +107,6 @@ class JobRow:
         return cls(**{**data, "classes": classes})
 
 
-def job_name(number: int) -> str:
-    """Return the name of a job in files.
-
-    Examples
-    --------
-    >>> job_name(7)
-    '0007'
-    """
-    return f"{number:04}"
-
-
 class Tally:
     """What is counted of the points of a job, a piece at a time and in order.
 

@@ -18,7 +18,7 @@ from ..base.software import difference, software
 from ..base.storage import Storage
 from ..base.words import plural
 from ..datasets.dataset import INDEX_FILE, OF_JOBS, DataSet, manifest_file
-from ..datasets.job_table import TABLE_FILE, JobRow, job_name, read_table, write_table
+from ..datasets.job_table import TABLE_FILE, JobRow, read_table, write_table
 from ..datasets.loader import read_index, sweeps
 from ..export.folder import result_folder
 from ..pipeline.database import FILE
@@ -102,13 +102,14 @@ class DataSetOutput(Output[CampaignRun]):
                 f"{self.campaign.shard}: give another folder with --out."
             )
         with explained(f"{out} cannot be read"):
-            self._rows += [row for row, _ in self.dataset.rows()]
+            rows = (row for row, _ in self.dataset.rows())
+            self._rows += sorted(rows, key=lambda row: row.number)
         told = with_seconds(out, self._rows)
         whole, self._wrong = _look(self.dataset, self._rows, options.verify, self.campaign)
         known = {row.number for row in self._rows}
         for number in self.campaign.shard.jobs(self._made["campaign"]["count"]):
             if number not in known:
-                name = job_name(number)
+                name = self.campaign.name(number)
                 self._wrong[number] = f"job {name} ({manifest_file(name)} is missing or damaged)"
         if not told or whole != len(self.campaign.numbers) or not _is_indexed(out, whole):
             return None

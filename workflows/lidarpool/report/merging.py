@@ -6,7 +6,7 @@ import heapq
 import json
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import ExitStack, closing, suppress
+from contextlib import closing, suppress
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from itertools import groupby
@@ -23,7 +23,7 @@ from ..base.validation import checked
 from ..base.words import plural
 from ..columns.parts import part_name
 from ..datasets.dataset import INDEX_FILE, DataSet, ahead, manifest_file
-from ..datasets.job_table import TABLE_FILE, JobRow, job_name, read_table
+from ..datasets.job_table import TABLE_FILE, JobRow, read_table
 from ..datasets.loader import read_index
 from ..export.folder import LAST_FILE, output_place, result_folder
 from ..pipeline.database import FILE, DamagedError, RunDatabase
@@ -76,11 +76,6 @@ class _Part:
     def done(self, shard: Shard) -> range:
         """Return the numbers of the jobs or scans of a shard."""
         return (shard.jobs if "campaign" in self.record else shard.scans)(self.whole)
-
-    @property
-    def numbers(self) -> Iterator[int]:
-        """Numbers of the jobs of all its shards, in order."""
-        return heapq.merge(*(self.done(shard) for shard in self.shards))
 
     @property
     def common(self) -> dict[str, Any]:
@@ -282,17 +277,15 @@ def _merge_dataset(parts: Sequence[_Part], out: Storage, partial: bool) -> dict[
     if own is None:  # from now on it is known whose files these are
         write_record(out, record | {"shards": []})
     with tempfile.TemporaryDirectory(prefix="lidarpool-") as folder:
-        files = [Path(folder, str(index)) for index in range(len(known))]
+        files = [_RowFile(Path(folder, str(index))) for index in range(len(known))]
         damaged = list[str]()
         with explained(f"{out} cannot be merged"):
             for part, file in zip(parts, files[-len(parts) :], strict=True):
-                _check_foreign(part, dataset)
-                _write_rows(file, _timed(part, _taken(part, dataset, damaged), notes))
+                file.write(part, _taken(part, dataset, damaged), _seconds(part, notes))
             if own:
-                _write_rows(files[0], _timed(own, _rows_of(own, dataset), notes))
-        missing = {number for part in known for number in part.numbers}
-        missing.difference_update(row.number for row in _merged(files))
-        damaged += [out.path(manifest_file(job_name(number))) for number in sorted(missing)]
+                files[0].write(own, _rows_of(own, dataset), _seconds(own, notes))
+        if not damaged:
+            damaged += _lacking(known, _merged(files))
         if damaged:
             raise LidarpoolError(f"missing or damaged: {listed(damaged, NAMED)}; {_AGAIN}.")
         lacking, there = _missing(known), {shard for part in known for shard in part.shards}
@@ -306,26 +299,54 @@ def _merge_dataset(parts: Sequence[_Part], out: Storage, partial: bool) -> dict[
     return report
 
 
-def _check_foreign(part: _Part, dataset: DataSet) -> None:
-    """Check that a part has manifests of its own jobs only; LidarpoolError names one of others."""
-    ranges = [part.done(shard) for shard in part.shards]
-    for name in replace(dataset, place=part.place).manifests():
-        number = int(name) if name.isascii() and name.isdigit() else -1
-        if name != job_name(number) or not any(number in numbers for numbers in ranges):
-            raise LidarpoolError(
-                f"{part.place.path(manifest_file(name))} is of no job of shard "
-                f"{listed([*map(str, part.shards)])} of {part.whole:,} jobs: move it elsewhere, "
-                "and merge again."
-            )
+class _RowFile:
+    """Rows of the jobs of a part in a temporary file: manifests are read once, one at a time."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._offsets: dict[int, int] = {}  # {number of a job: first byte of its row}
+
+    def write(
+        self, part: _Part, rows: Iterator[JobRow], seconds: Mapping[int, tuple[str, float]]
+    ) -> None:
+        """Write rows with their seconds of casting.
+
+        LidarpoolError if the part cannot have such a job, or two manifests are of one job.
+        """
+        ranges = [part.done(shard) for shard in part.shards]
+        with self._path.open("wb") as file:
+            for row in rows:
+                path, number = part.place.path(manifest_file(row.name)), row.number
+                if not any(number in numbers for numbers in ranges):
+                    raise LidarpoolError(
+                        f"{path} is of job {number}, which is not in shard "
+                        f"{listed([*map(str, part.shards)])} of {part.whole:,} jobs: move it "
+                        "elsewhere, and merge again."
+                    )
+                if number in self._offsets:
+                    raise LidarpoolError(
+                        f"{path} is of job {number}, of which there is another manifest: move one "
+                        "of them elsewhere, and merge again."
+                    )
+                sha256, casting_s = seconds.get(number, ("", 0.0))
+                row = replace(row, seconds=casting_s) if sha256 == row.sha256 else row
+                self._offsets[number] = file.tell()
+                file.write(json.dumps(asdict(row)).encode() + b"\n")
+
+    def rows(self) -> Iterator[JobRow]:
+        """Yield the rows in the order of numbers."""
+        if self._offsets:
+            with self._path.open("rb") as file:
+                for _, offset in sorted(self._offsets.items()):
+                    file.seek(offset)
+                    yield JobRow.of(json.loads(file.readline()))
 
 
 def _taken(part: _Part, dataset: DataSet, damaged: list[str]) -> Iterator[JobRow]:
-    """Take the jobs of a part into a data set; yields their rows, adds to `damaged` files."""
-    identity = fingerprint(dict(part.record["identity"]))
-    for _, row, wrong in dataset.take(part.place, part.numbers, identity):
-        if wrong:
-            damaged.append(wrong)
-        elif row is not None:
+    """Take the jobs of a part into a data set; yields their rows, adds files to `damaged`."""
+    for _, row, wrong in dataset.take(part.place, fingerprint(dict(part.record["identity"]))):
+        damaged += [wrong] if wrong else []
+        if row is not None:
             yield row
 
 
@@ -337,50 +358,42 @@ def _rows_of(own: _Part, dataset: DataSet) -> Iterator[JobRow]:
             yield row
 
 
-def _timed(part: _Part, rows: Iterator[JobRow], notes: list[str]) -> Iterator[JobRow]:
-    """Add the seconds of casting, which only the table of jobs has, to rows of manifests.
+def _seconds(part: _Part, notes: list[str]) -> dict[int, tuple[str, float]]:
+    """Return {number: hash of points and seconds of casting}, which only jobs.csv has.
 
-    A note says if the table of the part is damaged.
+    A note says if the table is damaged; then nothing is known.
     """
-    table = _table(part, notes)
-    timed = next(table, None)
-    for row in rows:
-        while timed is not None and timed.number < row.number:
-            timed = next(table, None)
-        same = timed is not None and (timed.number, timed.sha256) == (row.number, row.sha256)
-        yield replace(row, seconds=timed.seconds) if timed is not None and same else row
-
-
-def _table(part: _Part, notes: list[str]) -> Iterator[JobRow]:
-    """Yield the rows of jobs.csv of a part; none if it is damaged."""
+    if not part.shards:
+        return {}
     try:
-        if part.shards:
-            yield from read_table(part.place, read_index(part.place)["table"])
+        table = read_table(part.place, read_index(part.place)["table"])
+        return {row.number: (row.sha256, row.seconds) for row in table}
     except LidarpoolError:
         notes.append(
             f"{part.place.path(TABLE_FILE)} is damaged or edited: the rows of its jobs are those "
             "of their manifests, without seconds"
         )
+    return {}
 
 
-def _write_rows(path: Path, rows: Iterator[JobRow]) -> None:
-    """Write rows to a temporary file: manifests are read once, and not held in memory."""
-    with path.open("w", encoding="ascii") as file:
-        for row in rows:
-            file.write(json.dumps(asdict(row)) + "\n")
+def _lacking(parts: Sequence[_Part], rows: Iterator[JobRow]) -> list[str]:
+    """List the jobs of parts that have no row, as a folder and a number."""
+    numbers = {row.number for row in rows}
+    return [
+        f"the manifest of job {number} in {part.place}"
+        for part in parts
+        for shard in part.shards
+        for number in part.done(shard)
+        if number not in numbers
+    ]
 
 
-def _merged(files: Sequence[Path]) -> Iterator[JobRow]:
+def _merged(files: Sequence[_RowFile]) -> Iterator[JobRow]:
     """Yield the rows of all jobs by number; of a job of several parts, one that is done."""
     number = attrgetter("number")
-    with ExitStack() as stack:
-        tables = [map(_row, stack.enter_context(path.open(encoding="ascii"))) for path in files]
-        for _, rows in groupby(heapq.merge(*tables, key=number), number):
-            yield max(rows, key=attrgetter("done", "seconds"))
-
-
-def _row(line: str) -> JobRow:
-    return JobRow.of(json.loads(line))
+    tables = [file.rows() for file in files]
+    for _, rows in groupby(heapq.merge(*tables, key=number), number):
+        yield max(rows, key=attrgetter("done", "seconds"))
 
 
 def _merge_survey(

@@ -36,7 +36,7 @@ from ..base.validation import (
 )
 from ..base.words import did_you_mean, plural
 from ..base.yamlfile import read_yaml
-from ..datasets.job_table import Value, job_name
+from ..datasets.job_table import Value
 from ..export.format_table import check_whole
 from ..sensor.calibrations import text_of
 from .build import Job, build
@@ -305,7 +305,7 @@ class _JobSource:
     identity: Mapping[str, str]
 
     def name(self, number: int) -> str:
-        return job_name(number)
+        return f"{number:04}"  # however many there are
 
     def values(self, number: int) -> dict[str, Value]:
         return {}
