@@ -11,6 +11,7 @@ import argparse
 import hashlib
 import logging
 import random
+import re
 import shutil
 import sys
 import tempfile
@@ -177,9 +178,13 @@ def damaged(data: bytes, chance: random.Random) -> bytes:
 
 
 def files_of(folder: Path) -> list[Path]:
-    """Files in a folder that have any content, as paths relative to it."""
-    found = (path for path in sorted(folder.rglob("*")) if path.is_file())
-    return [path.relative_to(folder) for path in found if path.stat().st_size]
+    """Files in a folder as paths relative to it, one of those whose names differ in numbers."""
+    kinds: dict[str, Path] = {}
+    for path in sorted(folder.rglob("*")):
+        if path.is_file() and path.stat().st_size:
+            file = path.relative_to(folder)
+            kinds.setdefault(re.sub(r"[0-9a-f]*\d[0-9a-f]*", "0", str(file)), file)
+    return [*kinds.values()]
 
 
 def attempt(reader: Reader, place: Path) -> tuple[str, str]:

@@ -59,6 +59,7 @@ _COLUMNS = {
     "made_of": ("job", "hash"),
     "jobs": ("number", "failed", "data"),
 }
+_OF_DISK = ("locked", "full", "disk i/o", "unable to open", "readonly", "out of memory")
 _OF_JOBS = ("parts", "trials", "frames", "made_of")  # tables about jobs under way
 _FIRST = attrgetter("first")  # the order of parts
 PARTS_FOLDER = re.compile("run-[0-9a-f]{16}")  # names of `parts_folder`
@@ -424,10 +425,11 @@ def _explained(path: Path) -> Iterator[None]:
     """Translate an error of SQLite about the database at a path."""
     try:
         yield
-    except (sqlite3.Error, ValueError, TypeError, KeyError) as error:
+    except (sqlite3.Error, ValueError, LookupError, TypeError, OverflowError) as error:
         words = str(error)
-        # Without a table or column it is not what it was.
-        if not isinstance(error, sqlite3.OperationalError) or "no such" in words:
+        # Other operational errors, such as a missing column or text that is no UTF-8, are damage.
+        of_disk = any(one in words.lower() for one in _OF_DISK)
+        if not isinstance(error, sqlite3.OperationalError) or not of_disk:
             raise DamagedError(
                 f"{path} is damaged ({words}): drop the run with --fresh, or give another folder."
             ) from error
@@ -494,5 +496,5 @@ def read_place(path: Path) -> tuple[str, str] | None:
         if "locked" in str(error):
             raise LidarpoolError(f"Another run is using {path.parent}.") from error
         return None
-    except (ValueError, TypeError, KeyError):
+    except (ValueError, LookupError, TypeError, OverflowError):
         return None
