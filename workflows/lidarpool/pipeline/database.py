@@ -200,6 +200,9 @@ class RunDatabase:
         if (made := self.meta.get("format")) != str(FORMAT):
             raise sqlite3.DatabaseError(f"it is of format {made}, and this version reads {FORMAT}")
         _checked_place(self.meta)
+        (state,) = self._sql.execute("PRAGMA integrity_check(1)").fetchone()  # of pages and indices
+        if state != "ok":
+            raise sqlite3.DatabaseError(" ".join(state.split()))
         for table, columns in _COLUMNS.items():
             query = f"SELECT count(*) FROM {table} WHERE crc IS NOT crc32({', '.join(columns)})"
             if count := self._sql.execute(query).fetchone()[0]:
@@ -274,7 +277,8 @@ class RunDatabase:
 
     def _summaries(self, part: Receipt) -> bytes:
         query = "SELECT summaries FROM parts WHERE job = ? AND first = ?"
-        ((data,),) = self._rows(query, part.job, part.first)
+        with _explained(self.path):
+            ((data,),) = self._rows(query, part.job, part.first)
         return bytes(data)
 
     # -- writing -------------------------------------------------------------------------
