@@ -95,8 +95,8 @@ def write(place, name):
     columns |= {"intensity": rng.random(count, np.float32), "time": columns["scan"] * 1000}
     cloud = lp.Cloud(np.round(rng.uniform(-60, 60, (count, 3)), 3), columns)
     jobs = [data.write_job(JobRow(n, f"{n:04}"), cloud, sweeps) for n in range(JOBS)]
-    data.finish(jobs)
     write_table(data.place, [], lambda: jobs)
+    data.finish(jobs)
 
 
 def main(*names):

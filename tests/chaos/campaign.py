@@ -39,6 +39,7 @@ vary:
 keep: folder
 """
 WORKERS = {"GPU": 1, "LIDAR": 5}  # slots of each of two
+SHARED = ("jobs.csv", "dataset.json", "campaign.json")
 DRIVER = "driver"
 HARMED = 0.5  # of the times that the driver is killed
 HARMS = 4  # runs of a finished data set, each after a file was harmed
@@ -103,17 +104,28 @@ class Arena:
         )
 
     def _harm(self, dataset: Path) -> list[str]:
-        """Delete a file of a job, a manifest or the database, or cut it; returns what was done."""
-        kinds = ("jobs/*/[cs]*", ".jobs/*.json", "run/run.db")
+        """Delete, cut or flip a bit of a file of the data set; returns what was done."""
+        kinds = ("jobs/*/[cs]*", ".jobs/*.json", "run/run.db", *SHARED)
         found = sorted(path for kind in kinds for path in dataset.glob(kind))
         if not found:
             return []
         path = self._chance.choice(found)
-        if self._chance.random() < 0.5:
+        of_points = path.relative_to(dataset).parts[0] == "jobs"  # compared by --verify alone
+        harm = self._chance.choice(
+            ("deleted", "cut") if of_points else ("deleted", "cut", "flipped")
+        )
+        if harm == "deleted" and path.name != "campaign.json":  # whose data set it is
             path.unlink()
-            return ["deleted"]
-        path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
-        return ["cut"]
+            return [harm]
+        data = bytearray(path.read_bytes())
+        if harm == "flipped":
+            data[self._chance.randrange(len(data))] ^= 1 << self._chance.randrange(8)
+        else:
+            del data[len(data) // 2 :]
+            harm = "cut"
+        path.unlink()
+        path.write_bytes(data)
+        return [harm]
 
     def disturb(self, out: str, tally: Tally, faults: int) -> None:
         """Make a data set, with so many faults at most."""

@@ -205,6 +205,22 @@ def test_nothing_public_is_left_out():
     assert all(len(calls) >= 2 for calls in WRONG.values())
 
 
+def test_signatures_can_be_read():
+    """`help` and notebooks show them; annotations hold limits and descriptions as well."""
+    assert str(inspect.signature(Survey)).startswith(
+        "(sensor: Sensor = <factory>, poses: Sequence[Any] = (), steps: StepCount | None = None, "
+        "trajectory: Trajectory | None = None, sensors: Sequence[Mounted] = ()"
+    )
+    for name in lidarpool.__all__:
+        thing = getattr(lidarpool, name)
+        if not callable(thing):
+            continue
+        methods = [getattr(thing, one) for one in dir(thing) if not one.startswith("_")]
+        for one in (thing, *filter(inspect.isroutine, methods)):
+            text = str(inspect.signature(one))
+            assert "Annotated" not in text and "about(" not in text, name
+
+
 def test_what_is_like_it_will_do():
     survey = Survey(poses=np.array([[0, 0, 1.0]]), steps=np.int64(3), keep_every=np.uint8(2))
     assert survey.scan_count == 3

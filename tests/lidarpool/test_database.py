@@ -245,11 +245,15 @@ DAMAGE = {
     "zeros": lambda path: path.write_bytes(bytes(8192)),
     "of something else": lambda path: sql(path, "DROP TABLE parts"),
     "cells": lambda path: sql(path, "UPDATE parts SET cells = '{'"),
-    "trial of nothing": lambda path: sql(path, "INSERT INTO trials VALUES (7, 0, '{}')"),
-    "jobs without numbers": lambda path: sql(path, "INSERT INTO jobs VALUES (-1, 0, '{}')"),
+    "trial of nothing": lambda path: sql(path, "INSERT INTO trials VALUES (7, 0, '{}', 0)"),
+    "jobs without numbers": lambda path: sql(path, "INSERT INTO jobs VALUES (-1, 0, '{}', 0)"),
     "place of another run": lambda path: sql(
-        path, "INSERT INTO meta VALUES ('parts', '/data/run-fedcba9876543210')"
+        path, "INSERT INTO meta VALUES ('parts', '/data/run-fedcba9876543210', 0)"
     ),
+    "a bit of the summaries": lambda path: sql(
+        path, "UPDATE parts SET summaries = x'00' || substr(summaries, 2) WHERE first = 0"
+    ),
+    "rows": lambda path: sql(path, "UPDATE parts SET rows = rows + 1"),
     "no mark": lambda path: sql(path, "UPDATE meta SET value = '' WHERE name = 'mark'"),
     "path for a scan": lambda path: sql(path, "UPDATE parts SET stop = '../../x'"),
     "of another format": lambda path: sql(path, "UPDATE meta SET value = '1' WHERE name='format'"),

@@ -102,7 +102,16 @@ def test_what_does_not_fit_is_refused(tmp_path):
 
 
 @pytest.mark.parametrize(
-    "text", ["", "a,b\n1,2\n", "HEAD7,x\n", "HEADx,,,,0,0,0,0,0,0,\n", 'HEAD"7', "\ud800"]
+    "text",
+    [
+        "",
+        "a,b\n1,2\n",
+        "HEAD7,x\n",
+        "HEADx,,,,0,0,0,0,0,0,\n",
+        'HEAD"7',
+        "\ud800",
+        *(f"HEAD4,,,,0,0,0,0,0,0,\n{n},,,,0,0,0,0,0,0,\n" for n in (4, 3, -1, 10**18)),
+    ],
 )
 def test_damaged_tables_are_refused(tmp_path, text):
     head = "number,name,split,error,scans,sweeps,rays,hits,points,seconds,sha256\n"

@@ -2,6 +2,7 @@
 
 import http.client
 import json
+import socket
 import subprocess
 import sys
 import threading
@@ -9,13 +10,14 @@ import time
 import types
 import urllib.error
 import urllib.request
+from contextlib import ExitStack, contextmanager
 
 import numpy as np
 import pytest
 from tests.pages import ask
 
 from lidarpool.live.point_selection import Abandoned
-from lidarpool.live.server import announced, page_server
+from lidarpool.live.server import SLOW_AT_ONCE, SLOW_WAITING, announced, page_server
 
 # Another user's process: asks for addresses, prints their status and whether it saw anything.
 STRANGER = """
@@ -148,6 +150,76 @@ def test_an_answer_that_nobody_waits_for_is_given_up(served):
     connection.sock.close()
     connection.close()
     assert source.abandoned.wait(120)
+
+
+# -- slow questions --------------------------------------------------------------------------------
+
+
+class Large:
+    """A source of points: each answer waits for `ready`, and has 40 MB."""
+
+    def __init__(self):
+        self.ready, self._lock = threading.Event(), threading.Lock()
+        self.now = self.most = 0  # answers that are being made, and most at a time
+
+    def answer(self, what, asked, abandoned):
+        if what == "state":
+            return {"points": 20_000_000}, {}
+        with self._lock:
+            self.now += 1
+            self.most = max(self.now, self.most)
+        self.ready.wait(60)
+        with self._lock:
+            self.now -= 1
+        return {}, {"positions": np.zeros(10_000_000, np.float32)}
+
+
+@pytest.fixture
+def large():
+    """Return a page and its source of large answers."""
+    source = Large()
+    with page_server(source.answer, port=0) as page:
+        yield page, source
+        source.ready.set()
+
+
+@contextmanager
+def unread(page, count, question):
+    """Ask a question some times without reading the answers."""
+    with ExitStack() as stack:
+        for _ in range(count):
+            connection = stack.enter_context(socket.create_connection(("127.0.0.1", page.port)))
+            connection.sendall(f"GET /{page.token}/{question} HTTP/1.1\r\nHost: a\r\n\r\n".encode())
+        yield
+
+
+@pytest.mark.parametrize(
+    "question", ["points?most=20000000", "points?most=9&filter=z,0,1", "export?format=ply"]
+)
+def test_others_are_answered_while_slow_questions_wait(large, question):
+    page, source = large
+    with unread(page, SLOW_AT_ONCE + SLOW_WAITING + 4, question):
+        while source.now < SLOW_AT_ONCE:
+            time.sleep(0.01)
+        for _ in range(5):
+            started = time.monotonic()
+            assert ask(page.url, "state")["points"] == 20_000_000
+            assert time.monotonic() - started < 1.0
+        assert said(page, "GET", question)[0] == 503
+        assert source.most == SLOW_AT_ONCE
+
+
+def test_an_answer_that_is_not_read_ends(large, monkeypatch):
+    page, source = large
+    source.ready.set()
+    monkeypatch.setattr("lidarpool.live.server.STALL_S", 0.5)
+    with unread(page, 2 * SLOW_AT_ONCE, "points?most=20000000"):
+        time.sleep(0.2)
+        started = time.monotonic()
+        assert ask(page.url, "state")["points"] == 20_000_000
+        assert time.monotonic() - started < 1.0
+        answer = ask(page.url, "points", most=20_000_000)
+        assert len(answer["arrays"]["positions"]) == 10_000_000
 
 
 def test_a_port_that_is_taken_is_no_reason_to_fail(served):

@@ -25,6 +25,7 @@ from lidarpool.live.point_selection import (
     Filter,
     HeldPoints,
     PointFinder,
+    read_scans,
 )
 from lidarpool.live.view import (
     ShownSurface,
@@ -564,6 +565,12 @@ def test_a_filter_keeps_what_is_within_all_limits():
     assert wanted.keeps(held, ALL_ROWS).tolist() == [False, True, False, True]
     assert Filter((("z", 3, 8),)).keeps(held, ALL_ROWS).tolist() == [False, True, True, False]
     assert Filter().keeps(held, np.array([0, 3])).all()
+    text = ";".join(f"range,{n / 1e4},{9 - n / 1e4}" for n in range(5000))
+    assert Filter.read(text, ["range"]).limits == (("range", 0.4999, 8.5001),)
+    for bad in ("range,nan,3", "range,1", "range,x,2"):
+        with pytest.raises(ValueError, match=r"."):
+            Filter.read(bad, ["range"])
+    assert read_scans("4-6,0-1,5-9,,2-2,8-7") == ((0, 2), (4, 9))
 
 
 @pytest.fixture

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import os
+import pickle
 import subprocess
 import sys
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from multiprocessing import get_context
 
+import cloudpickle
 import numpy as np
 import pytest
 from tests.shapes import level
@@ -338,6 +340,25 @@ def test_a_moved_copy_is_like_one_that_was_there_before(scene, physics, backend)
     assert same(moved.sweep(HERE, number=2), new.sweep(HERE, number=2))
 
 
+@pytest.mark.parametrize("dumps", [pickle.dumps, cloudpickle.dumps])
+def test_a_pickled_scanner_gives_the_same_bytes(scene, dumps):
+    """Also of what was moved, and with the random numbers that are next."""
+    options = {"columns": COLUMNS, "backend": "numpy", **PHYSICS}
+    scanner = Scanner(with_copies(scene), GRID, **options)
+    scanner.move("Crate", Pose((6, -2, 0.5), 70, 5))
+    scanner.move("Car", (4, 1, 0))
+    scanner.sweep(HERE)
+    copy = pickle.loads(dumps(scanner))
+    assert repr(copy) == repr(scanner)
+    for number in (None, 3):
+        assert same(scanner.sweep(HERE, number=number), copy.sweep(HERE, number=number))
+        images = [one.ranges([HERE, (0, 0, 1)], number=number) for one in (scanner, copy)]
+        assert np.array_equal(*images)
+    for one in (scanner, copy):
+        one.move("Crate", Pose((5, 2, 0), 10))
+    assert same(scanner.sweep(HERE, number=2), copy.sweep(HERE, number=2))
+
+
 def test_a_copy_waits_for_sweeps_before_it_moves(scene):
     """So each of them sees it in one place."""
     scanner = Scanner(with_copies(scene), VLP16, threads=1)
@@ -396,6 +417,10 @@ FAR = Scene.seed().with_actors([Actor(box("Car", (9, 9, 9)), Track([0, 1], [[300
 WRONG = {
     "number": (lambda s: s.sweep((0, 0, 1), number=-1), "number is -1"),
     "large": (lambda s: s.sweep((0, 0, 1), number=10**9), "counted up to"),
+    "larger": (lambda s: s.ranges((0, 0, 1), number=2**63), "number is 9223372036854775808"),
+    "largest": (lambda s: s.sweep((0, 0, 1), number=2**2000), "below 2147483648"),
+    "remote": (lambda s: s.sweep((0, 0, 1), start_s=1e300), "start_s is 1e+300"),
+    "lost": (lambda s: s.sweep((0, float("nan"), 1)), "pose is (0, nan, 1)"),
     "start": (lambda s: s.ranges((0, 0, 1), start_s=float("nan")), "start_s is nan"),
     "late": (lambda s: s.sweep(DRIVE, start_s=0.45), "from 0.45 to 0.549167 s"),
     "actor": (lambda s: s.move("Cart", (0, 0, 1)), "no actor or instance 'Cart'. Did you mean"),

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import multiprocessing
 import os
 import pickle
@@ -206,14 +205,14 @@ def test_what_is_no_data_set_is_told_in_a_line(written, tmp_path, monkeypatch):
     told(lambda: lidarpool.sweeps(place, jobs=[1])[0], r"sweeps/01\.npz cannot be read")
     index = place / INDEX_FILE
     text = index.read_text()
-    for bad in (text[:50], "[]", *map(text.replace, ('"version": 1', "number"), ("", "numb"))):
+    for bad in (text[:50], "[]", text.replace('"version": 2', '"version": 1')):
         index.write_text(bad)
         told(lambda: lidarpool.sweeps(place), r"dataset\.json is damaged or of another version")
-    index.write_text(json.dumps(json.loads(text)))
+    index.write_text(text)
     assert len(lidarpool.sweeps(place)) == len(first)
     table = place / "jobs.csv"
     table.write_text("".join(table.read_text().splitlines(keepends=True)[:2]))
-    told(lambda: lidarpool.sweeps(place), r"jobs\.csv lacks jobs that are done: .*--resume")
+    told(lambda: lidarpool.sweeps(place), r"jobs\.csv is damaged or edited, .*--resume")
     index.unlink()
     told(lambda: lidarpool.sweeps(place), "is an unfinished data set: .*--resume")
     written("parquet"), written("mcap")

@@ -19,9 +19,12 @@ from tests.clusters import thread_cluster
 from tests.killed_drivers import drive
 from tests.rows import quick
 
-from lidarpool import Campaign, Job, LidarpoolError, Noise, Scene, Sensor, Survey, merge
+from lidarpool import Campaign, Job, LidarpoolError, Noise, Scene, Sensor, Survey, merge, sweeps
+from lidarpool.base.sealed import sealed, unsealed
 from lidarpool.base.shard import Shard
+from lidarpool.base.storage import Storage
 from lidarpool.export.format_table import DATA_SETS
+from lidarpool.report.campaign_output import verify
 from lidarpool.scene.actors import box
 
 CAMPAIGN = """
@@ -109,6 +112,10 @@ def content(folder: Path) -> dict[str, Any]:
         name, data = path.relative_to(folder).as_posix(), path.read_bytes()
         if name == "report.json":
             found[name] = without_times(json.loads(data))
+        elif name == "campaign.json":
+            found[name] = unsealed(data)
+        elif name == "dataset.json":
+            found[name] = unsealed(data) | {"table": None}  # jobs.csv has seconds
         elif name == "jobs.csv":
             found[name] = [
                 re.sub(r",[\d.e-]+,(\w{64})", r",\1", row) for row in data.decode().split()
@@ -155,10 +162,6 @@ def cut(path: Path) -> None:
     path.write_bytes(path.read_bytes()[:-1])
 
 
-def cut_rows(path: Path) -> None:
-    path.write_text("".join(path.read_text().splitlines(keepends=True)[:-1]))
-
-
 def flip(path: Path) -> None:
     data = bytearray(path.read_bytes())
     data[-1] ^= 1
@@ -169,15 +172,21 @@ def change(path: Path, old: str, new: str) -> None:
     path.write_text(path.read_text().replace(old, new))
 
 
+def change_record(part: Path, old: str, new: str) -> None:
+    """Change text of campaign.json, and its checksum."""
+    path = part / "campaign.json"
+    text = json.dumps(unsealed(path.read_bytes()))
+    assert old in text
+    path.write_bytes(sealed(json.loads(text.replace(old, new))))
+
+
 DAMAGE = {
     "cut": lambda part: cut(part / "jobs/0001/cloud.ply"),
     "changed": lambda part: flip(part / "jobs/0001/cloud.ply"),
     "lost": lambda part: (part / "jobs/0001/cloud.ply").unlink(),
     "manifest": lambda part: flip(part / ".jobs/0001.json"),
-    "row": lambda part: cut_rows(part / "jobs.csv"),
-    "table": lambda part: change(part / "jobs.csv", ",", ";"),
 }
-NAMED = {"manifest": ".jobs/0001.json", "row": "jobs.csv", "table": "jobs.csv"}
+NAMED = {"manifest": ".jobs/0001.json"}
 
 
 @pytest.mark.parametrize("damage", DAMAGE)
@@ -186,7 +195,7 @@ def test_damaged_files_are_named_and_the_next_merge_takes_them(
 ):
     DAMAGE[damage](parts[1])
     out, name = tmp_path / "ds", NAMED.get(damage, "0001/cloud.ply")
-    with pytest.raises(LidarpoolError, match=f"damaged.*part-2/.*{name}; run|{name} is damaged"):
+    with pytest.raises(LidarpoolError, match=f"damaged.*part-2/.*{name}; run"):
         merge(parts, out)
     assert not (out / "dataset.json").exists() and (out / ".jobs/0000.json").exists()
     with Client(slots, set_as_default=False) as client:
@@ -195,7 +204,8 @@ def test_damaged_files_are_named_and_the_next_merge_takes_them(
     merge(parts, out)
     made, whole = content(out), content(campaigns("folder") / "one")
     notes = made.pop("report.json")["notes"]
-    assert name == "jobs.csv" or notes[0].startswith("made again: job 0001")
+    assert notes[0].startswith("made again: job 0001")
+    assert made["campaign.json"].pop("notes") == notes and not whole["campaign.json"].pop("notes")
     assert made == {name: data for name, data in whole.items() if name in made}
 
 
@@ -205,9 +215,87 @@ def test_a_data_set_that_is_given_by_another_name_keeps_its_files(parts, tmp_pat
     change(out / ".jobs/0001.json", "crc", "cRc")
     before = content(out)
     (tmp_path / "link").symlink_to(out)
-    with pytest.raises(LidarpoolError, match="there is nothing to merge"):
-        merge([out / ".." / "ds", tmp_path / "link"], out)
+    for given in (out, out / ".." / "ds", tmp_path / "link"):
+        with pytest.raises(LidarpoolError, match="ds is one of the shards, which stays as it is"):
+            merge([*parts, given], out)
     assert content(out) == before
+
+
+def test_a_shard_is_never_made_the_whole(parts):
+    before = content(parts[0].parent)
+    inside, around = parts[0] / "below/ds", parts[0].parent
+    for out, relation in ((parts[0], "is one of"), (inside, "lies in"), (around, "holds")):
+        with pytest.raises(LidarpoolError, match=f"--out {out} {relation} the shard"):
+            merge(parts, out)
+    assert content(parts[0].parent) == before
+
+
+TABLE_EDITS = {
+    "the number of another shard": lambda text: text.replace("\n1,0001,", "\n0,0000,"),
+    "a foreign number": lambda text: text.replace("\n1,", "\n3,"),
+    "a number out of range": lambda text: text.replace("\n4,", f"\n{10**18},"),
+    "the number of another row": lambda text: text.replace("\n4,0004,", "\n1,0001,"),
+    "an error of a finished job": lambda text: re.sub(r",,(\d+,\d+)", r",x,\1", text),
+    "a split": lambda text: text.replace(",train,", ",trazn,").replace(",val,", ",vel,"),
+    "a cut row": lambda text: "".join(text.splitlines(keepends=True)[:-1]),
+    "other commas": lambda text: text.replace(",", ";"),
+    "seconds": lambda text: re.sub(r",[\d.e-]+,(\w{64})", r",9.5,\1", text),
+    "nothing": lambda text: "",
+}
+
+
+@pytest.mark.parametrize("edit", quick(("a foreign number", "seconds", "a split"), TABLE_EDITS))
+def test_a_table_of_jobs_is_only_compared(parts, campaigns, tmp_path, edit, slots):
+    table, out = parts[1] / "jobs.csv", tmp_path / "ds"
+    whole = table.read_text()
+    table.write_text(TABLE_EDITS[edit](whole))
+    assert table.read_text() != whole
+    merge(parts, out)
+    made, expected = content(out), content(campaigns("folder") / "one")
+    notes = json.loads((out / "report.json").read_text())["notes"]
+    assert [note[:50] for note in notes] == [f"{table} is damaged or edited: the rows"[:50]]
+    for name in ("jobs.csv", "jobs.parquet", *(name for name in made if "jobs/" in name)):
+        assert made[name] == expected[name]
+    with pytest.raises(LidarpoolError, match=r"jobs\.csv is damaged.*--resume, which writes"):
+        sweeps(parts[1])
+    with pytest.raises(LidarpoolError, match=r"jobs\.csv is damaged"):
+        verify(Storage.at(parts[1]))
+    with Client(slots, set_as_default=False) as client:
+        campaign = Campaign.load(parts[0].parent / "c.yaml")
+        campaign.run(parts[1], client=client, resume=True, shard=(2, 3))
+    verify(Storage.at(parts[1]))
+    assert [row.split(",")[:3] for row in table.read_text().split()] == [
+        row.split(",")[:3] for row in whole.split()
+    ]
+
+
+def test_a_manifest_of_another_job_is_refused(parts, tmp_path):
+    shutil.copy(parts[0] / ".jobs/0003.json", parts[1] / ".jobs/0003.json")
+    with pytest.raises(LidarpoolError, match=r"part-2/\.jobs/0003\.json is of job 3, which is not"):
+        merge(parts, tmp_path / "ds")
+    (parts[1] / ".jobs/0003.json").rename(parts[1] / ".jobs/0004.json")
+    with pytest.raises(LidarpoolError, match=r"damaged: .*part-2/\.jobs/0004\.json; run"):
+        merge(parts, tmp_path / "ds")
+    (parts[1] / ".jobs/0004.json").unlink()
+    with pytest.raises(LidarpoolError, match=r"damaged: the manifest of job 4 in .*part-2; run"):
+        merge(parts, tmp_path / "ds")
+
+
+def test_a_damaged_record_of_a_campaign_is_named_and_made_again(parts, tmp_path, slots):
+    path = parts[1] / "campaign.json"
+    whole = path.read_bytes()
+    for data in (whole[:-1], whole[:90] + b"x" + whole[91:], b"[]", b""):
+        path.write_bytes(data)
+        with pytest.raises(
+            LidarpoolError, match=r"campaign\.json is damaged or edited \(its .*\):"
+        ):
+            merge(parts, tmp_path / "ds")
+    with Client(slots, set_as_default=False) as client:
+        campaign = Campaign.load(parts[0].parent / "c.yaml")
+        run = campaign.run(parts[1], client=client, resume=True, shard=(2, 3))
+    assert (run.resumed, run.done) == (2, 2)
+    assert run.notes == ("campaign.json was damaged, and is made again",)
+    merge(parts, tmp_path / "ds")
 
 
 def test_a_manifest_that_names_files_elsewhere_is_damaged(parts, tmp_path):
@@ -230,7 +318,7 @@ def doubled(parts: list[Path]) -> list[Path]:
 
 def foreign(old: str, new: str) -> Callable[[list[Path]], list[Path]]:
     def make(parts: list[Path]) -> list[Path]:
-        change(parts[1] / "campaign.json", old, new)
+        change_record(parts[1], old, new)
         return parts
 
     return make
@@ -274,7 +362,7 @@ def test_shards_that_do_not_fit_together_are_named(parts, tmp_path, wrong, lidar
 
 def test_meshes_of_all_shards_are_the_same(parts, tmp_path):
     for part, digest in zip(parts, "112", strict=True):
-        change(part / "campaign.json", '"files": []', f'"files": [["a.glb", "{digest}"]]')
+        change_record(part, '"files": []', f'"files": [["a.glb", "{digest}"]]')
     with pytest.raises(LidarpoolError, match=r"part-3 and .*part-1 differ in the file a\.glb:"):
         merge(parts, tmp_path / "ds")
 
@@ -465,8 +553,10 @@ def test_shards_of_a_survey_have_the_files_of_one_run(survey, lidarpool, slots, 
 def _some_of_a_survey(survey: Path, shards: list[Path]) -> None:
     with pytest.raises(LidarpoolError, match=r"^missing: 1 shard, 1/3: give them"):
         merge(shards[:2], survey / "some")
-    with pytest.raises(LidarpoolError, match="part-2 holds a shard of a survey: give another"):
+    with pytest.raises(LidarpoolError, match="part-2 is one of the shards, which stays as it is"):
         merge(shards, shards[0])
+    with pytest.raises(LidarpoolError, match="part-2 holds a shard of a survey: give another"):
+        merge(shards[1:], shards[0])
     report = merge(shards[:2], survey / "some", partial=True)
     assert "missing: 1 shard, 1/3" in report["notes"] and report["planning"] is None
     killed(survey / "some", shards, ("take", 3))

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import os
+import pickle
 import types
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
+import cloudpickle
 import numpy as np
 import psutil
 import pytest
@@ -99,6 +101,30 @@ def test_sweeps_of_a_killed_worker_are_cast_again(client, sabotage, expected):
         disarmed.result()
     columns = {*expected[0].columns}
     assert all(same(one, two, columns) for one, two in zip(expected, again, strict=True))
+
+
+def test_a_pickled_stream_gives_the_same_sweeps(cluster_client, expected):
+    """Here, and in a task of its cluster."""
+    data = cloudpickle.dumps(campaign(1).stream(cluster_client))
+    columns = {*expected[0].columns}
+
+    def read() -> list[Sweep]:
+        return list(cloudpickle.loads(data))
+
+    in_task = cluster_client.submit(read, resources={"OTHER": 1}, pure=False).result(timeout=300)
+    for again in (read(), in_task):
+        pairs = zip(expected[:SWEEPS], again, strict=True)
+        assert all(same(one, two, columns) for one, two in pairs)
+    assert pickle.loads(pickle.dumps(campaign(1).stream(cluster_client, ahead=3))).ahead == 3
+
+
+def test_no_workers_are_started_in_a_task(cluster_client):
+    def run() -> None:
+        lp.simulate(lp.Scene.seed(), Survey(poses=[(0, 0, 1)]))
+
+    task = cluster_client.submit(run, resources={"OTHER": 1}, pure=False)
+    with pytest.raises(LidarpoolError, match="which in a task of Dask cannot be done: give client"):
+        task.result(timeout=300)
 
 
 def test_one_that_is_left_early_leaves_nothing(client, left_over):

@@ -40,6 +40,7 @@ from pydantic_core import (
 
 from .arrays import AnyArray
 from .errors import LidarpoolError, Mistakes
+from .signatures import ReadableSignature, annotated, readable
 from .words import did_you_mean, plural
 
 P = ParamSpec("P")
@@ -117,13 +118,16 @@ def checked(function: Callable[P, R]) -> Callable[P, R]:
         _check(function, {**dict(zip(_usual(function), args, strict=False)), **kwargs})
         return function(*args, **kwargs)
 
+    if annotated(function):
+        refusing.__signature__ = readable(inspect.signature(function))  # type: ignore[attr-defined]
     return refusing
 
 
 def checked_fields(cls: C) -> C:
     """Let a dataclass refuse values that do not fit their annotations, also in subclasses.
 
-    In a section of a file it is a section itself, of the same fields. Its `repr` is one line.
+    In a section of a file it is a section itself, of the same fields. Its `repr` is one line, and
+    its signature has types without limits.
 
     Apply it before `dataclass`, which calls `__post_init__` only if the class has one.
     """
@@ -134,6 +138,7 @@ def checked_fields(cls: C) -> C:
         after(self)
 
     cls.__post_init__ = __post_init__  # type: ignore[attr-defined]
+    cls.__signature__ = ReadableSignature()  # type: ignore[attr-defined]
     cls.__pydantic_config__ = STRICT  # type: ignore[attr-defined]
     cls.__get_pydantic_core_schema__ = classmethod(_section)  # type: ignore[attr-defined]
     if "__repr__" not in vars(cls):

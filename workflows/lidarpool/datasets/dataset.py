@@ -13,13 +13,14 @@ from dataclasses import asdict, dataclass, field, replace
 from functools import lru_cache
 from itertools import islice
 from pathlib import Path
-from typing import IO, Any, Literal, TypeVar
+from typing import Any, Literal, TypeVar
 
 import numpy as np
 
 from .._version import __version__
 from ..base.archives import packed
 from ..base.errors import LidarpoolError, explained
+from ..base.sealed import SealedWriter
 from ..base.storage import Storage
 from ..base.validation import checked_fields
 from ..columns.cloud import CloudLike
@@ -31,7 +32,7 @@ from ..export.kitti import NAMES_FILE, labels_file
 from ..export.nuscenes import merge
 from ..export.pieces import Entry, Pieces, pieces_of
 from ..export.sweeps import SWEEPS_FILE, Sweeps
-from .job_table import JobRow, Tally
+from .job_table import TABLE_FILE, JobRow, Tally
 
 T = TypeVar("T")
 R = TypeVar("R")
@@ -39,7 +40,7 @@ R = TypeVar("R")
 INDEX_FILE = "dataset.json"  # a data set with this file is finished
 BOXES_FILE = "boxes.npz"
 _MANIFESTS = ".jobs"
-VERSION = 1  # of INDEX_FILE
+VERSION = 2  # of INDEX_FILE
 _REQUESTS = 8  # to an object store at a time
 _AHEAD = 16  # jobs that are looked at ahead
 _LISTED = 32  # folders whose files are known at a time, some of which all jobs share
@@ -88,7 +89,9 @@ class DataSet:
     Beside these are `sweeps/NAME.npz` (`Sweeps`) and, where there are actors, `boxes/NAME.npz`,
     which `lidarpool.sweeps` reads; with `folder` they are in `jobs/NAME`. `.jobs/NAME.json`, the
     job's manifest, is the last file that a job writes: it lists the others with bytes and CRC, and
-    the files that the job was made of, and has what `finish` needs.
+    the files that the job was made of, and has the job's row and what `finish` needs. The manifest
+    of a job that has failed lists no files. Each manifest ends with its own CRC; the table of jobs
+    follows from the manifests.
 
     Parameters
     ----------
@@ -181,12 +184,22 @@ class DataSet:
             manifest |= {"classes": dict(sweeps.classes)} if sweeps.classes else {}
             manifest |= {"materials": sweeps.materials} if sweeps.materials else {}
             manifest |= {"made_of": made_of, "files": dict(sorted(place.files.items()))}
-            # Of its row, what every run gives.
-            row_ = asdict(replace(row, seconds=0.0))
-            manifest |= {"made_with": dict(self.made_with), "row": row_}
-            manifest["crc"] = _crc(manifest)
-            place.write(_manifest_file(name), json.dumps(manifest).encode())
+            self._write_manifest(place, row, manifest)
         return row
+
+    def write_failed(self, rows: Iterable[JobRow]) -> None:
+        """Write the manifests of jobs that have failed; LidarpoolError if that fails."""
+        with explained(f"{self.place} cannot be written"):
+            place = Listing.of(self.place)
+            failed = (row for row in rows if not row.done)
+            deque(ahead(lambda row: self._write_manifest(place, row, {"files": {}}), failed), 0)
+
+    def _write_manifest(self, place: Listing, row: JobRow, manifest: dict[str, Any]) -> None:
+        """Write the manifest of a job, with the part of its row that every run gives."""
+        row_of_all_runs = asdict(replace(row, seconds=0.0))
+        manifest |= {"made_with": dict(self.made_with), "row": row_of_all_runs}
+        manifest["crc"] = _crc(manifest)
+        place.write(manifest_file(row.name), json.dumps(manifest).encode())
 
     def finish(self, jobs: Iterable[JobRow]) -> None:
         """Write the files that hold all jobs, from those that are done, in their order.
@@ -203,16 +216,20 @@ class DataSet:
             self.place.remove([INDEX_FILE])
             self.place.tidy()
             with self.place.writing(INDEX_FILE) as file:
-                head = {"lidarpool": __version__, "version": VERSION}
+                index = SealedWriter(file)
+                head: dict[str, Any] = {"lidarpool": __version__, "version": VERSION}
                 head |= {"format": self.format, "layout": self.layout}
-                file.write(f'{json.dumps(head)[:-1]}, "jobs": ['.encode())
-                manifests = self._indexed(jobs, file)
+                with suppress(FileNotFoundError):
+                    head["table"] = self.place.checksum(TABLE_FILE)
+                index.write(f'{json.dumps(head)[:-1]}, "jobs": [')
+                manifests = self._indexed(jobs, index)
                 if self.format == "nuscenes":
                     merge(self.place, manifests)
                 else:
                     deque(manifests, maxlen=0)
+                index.seal()
 
-    def _indexed(self, jobs: Iterable[JobRow], index: IO[bytes]) -> Iterator[dict[str, Any]]:
+    def _indexed(self, jobs: Iterable[JobRow], index: SealedWriter) -> Iterator[dict[str, Any]]:
         """Yield the manifest of each job that is done, and add it to the index, with names."""
         comma, named = "", dict[int, dict[str, None]]()  # {class: names that jobs have for it}
         for job, (manifest, wrong) in self.look(jobs):
@@ -220,7 +237,7 @@ class DataSet:
                 told = f"Job {job.name} of {self.place} is not whole: its {wrong}."
                 raise LidarpoolError(f"{told} Make it again with --resume.")
             row = {"number": job.number, "name": job.name, "sensors": manifest["sensors"]}
-            index.write(f"{comma}\n{json.dumps(row)}".encode())
+            index.write(f"{comma}\n{json.dumps(row)}")
             comma = ","
             for number, name in manifest.get("classes", {}).items():
                 named.setdefault(int(number), {})[name] = None
@@ -229,7 +246,7 @@ class DataSet:
         if classes and self.format == "kitti":
             self.place.write(NAMES_FILE, labels_file(classes))
         more = f', "classes": {json.dumps(classes)}' if classes else ""
-        index.write(f"\n]{more}}}\n".encode())
+        index.write(f"\n]{more}")
 
     def look(
         self, jobs: Iterable[JobRow], *, contents: bool = False
@@ -247,8 +264,9 @@ class DataSet:
         sizes = lru_cache(_LISTED)(lambda folder: self.place.below(folder).sizes())
 
         def look_at(job: str) -> tuple[dict[str, Any], str]:
-            if not (manifest := self._manifest(job)):
-                return {}, f"{_manifest_file(job)} is missing or damaged"
+            manifest = self._manifest(job)
+            if not manifest or "sensors" not in manifest:  # the latter of a job that has failed
+                return {}, f"{manifest_file(job)} is missing or damaged"
             for name, (size, crc) in manifest["files"].items():
                 folder, _, file = name.rpartition("/")
                 same = sizes(folder).get(file) == size
@@ -258,49 +276,60 @@ class DataSet:
 
         return look_at
 
-    def take(self, place: Storage, jobs: Iterable[JobRow]) -> Iterator[tuple[JobRow, str]]:
-        """Have the files of jobs here that another data set of this format has in its `place`.
+    def take(self, place: Storage, identity: str) -> Iterator[tuple[str, JobRow | None, str]]:
+        """Copy the files of jobs from another data set of this format, which is in `place`.
 
-        Those that are here are not read again. Yields each job, and its first file there that is
-        missing or damaged, else "". OSError if a place cannot be read or written to.
+        Files that are here already are not read again. A job that has failed there stays as the
+        job is here. Yields the name of each job of which there is a manifest, the row that the
+        manifest has, and the first file there that is missing, damaged or of jobs of another
+        `identity`, else "". OSError if a place cannot be read or written to.
         """
         here, there = self._looker(), replace(self, place=place)
 
-        def take(job: JobRow) -> str:
-            manifest, last = there._manifest(job.name), _manifest_file(job.name)
-            if not job.done or (manifest and here(job.name) == (manifest, "")):
-                return ""
-            if not manifest or manifest["row"]["sha256"] != job.sha256:
-                return place.path(last)
-            for name, checksum in (manifest["files"] | {last: None}).items():
-                if ".." in Path(name).parts or Path(name).is_absolute():  # of somebody else
-                    return place.path(last)
+        def take(name: str) -> tuple[JobRow | None, str]:
+            manifest, last = there._manifest(name), manifest_file(name)
+            if not manifest or manifest["made_with"].get("identity") != identity:
+                return None, place.path(last)
+            row = JobRow.of(manifest["row"])
+            if here(name) == (manifest, "") or (not row.done and self._manifest(name)):
+                return row, ""
+            for file, checksum in (manifest["files"] | {last: None}).items():
+                if ".." in Path(file).parts or Path(file).is_absolute():  # of somebody else
+                    return row, place.path(last)
                 with suppress(FileNotFoundError):
-                    self.place.prepare(Path(name).parent)
-                    self.place.take(place, name, name)
-                    if name == last or self.place.checksum(name) == checksum:
+                    self.place.prepare(Path(file).parent)
+                    self.place.take(place, file, file)
+                    if file == last or self.place.checksum(file) == checksum:
                         continue
-                    self.place.remove([name])
-                return place.path(name)
-            return ""
+                    self.place.remove([file])
+                return row, place.path(file)
+            return row, ""
 
-        yield from ahead(take, iter(jobs))
+        for name, (row, wrong) in ahead(take, iter(there.manifests())):
+            yield name, row, wrong
 
     def _manifest(self, name: str) -> dict[str, Any]:
-        """Read the manifest of a job; empty if it is missing or damaged."""
+        """Read the manifest of a job; empty if it is missing, damaged or of another job."""
         try:
-            manifest: dict[str, Any] = json.loads(self.place.read(_manifest_file(name)))
-            return manifest if manifest.pop("crc") == _crc(manifest) else {}
+            manifest: dict[str, Any] = json.loads(self.place.read(manifest_file(name)))
+            whole = manifest.pop("crc") == _crc(manifest) and manifest["row"]["name"] == name
         except (FileNotFoundError, ValueError, LookupError, TypeError, AttributeError):
             return {}
+        return manifest if whole else {}
 
-    def rows(self, known: Collection[str]) -> Iterator[tuple[JobRow, Mapping[str, Any]]]:
-        """Yield the rows of jobs that are there, but for known names, and what made them.
+    def manifests(self) -> list[str]:
+        """Return the names of the jobs of which there is a manifest, by length and letters."""
+        files = self.place.below(_MANIFESTS).sizes()
+        names = [file.removesuffix(".json") for file in files if file.endswith(".json")]
+        return sorted(names, key=lambda name: (len(name), name))
 
-        OSError if the place cannot be read.
+    def rows(self, known: Collection[str] = ()) -> Iterator[tuple[JobRow, Mapping[str, Any]]]:
+        """Yield the rows of jobs as their manifests have them, and what the jobs were made with.
+
+        Rows of `known` names and damaged manifests are left out. OSError if the place
+        cannot be read.
         """
-        names = (name.removesuffix(".json") for name in self.place.below(_MANIFESTS).sizes())
-        unknown = (name for name in names if name not in known)
+        unknown = (name for name in self.manifests() if name not in known)
         for _, manifest in ahead(self._manifest, unknown):
             if manifest:
                 yield JobRow.of(manifest["row"]), manifest["made_with"]
@@ -330,7 +359,8 @@ def ahead(read: Callable[[T], R], things: Iterator[T]) -> Iterator[tuple[T, R]]:
             yield from zip(some, pool.map(read, some), strict=True)
 
 
-def _manifest_file(name: str) -> str:
+def manifest_file(name: str) -> str:
+    """Name of the manifest of a job in a data set."""
     return f"{_MANIFESTS}/{name}.json"
 
 

@@ -34,6 +34,7 @@ Value = bool | int | float | str
 TABLE_FILE, PARQUET_FILE = "jobs.csv", "jobs.parquet"
 AGAIN = "run the campaign again with --resume, which writes it anew"
 ROW_GROUP = 2_000  # rows of jobs.parquet in memory at a time
+JOBS_MOST = 100_000_000  # of a campaign: a larger number is not that of a job
 ERROR_MOST = 4_000  # letters of an error in the table: csv.reader refuses cells of 131,072
 
 _HEAD = {"number": int, "name": str, "split": str}
@@ -100,10 +101,10 @@ class JobRow:
         return not self.error
 
     @classmethod
-    def of(cls, data: dict[str, Any]) -> JobRow:
+    def of(cls, data: Mapping[str, Any]) -> JobRow:
         """Make a row of what JSON gives of one."""
-        classes = {int(number): count for number, count in data.pop("classes").items()}
-        return cls(classes=classes, **data)
+        classes = {int(number): count for number, count in data["classes"].items()}
+        return cls(**{**data, "classes": classes})
 
 
 class Tally:
@@ -210,13 +211,16 @@ def write_table(place: Storage, names: Sequence[str], jobs: Callable[[], Iterabl
                 _write_parquet(file, header, names, kinds, iter(jobs()))
 
 
-def read_table(place: Storage) -> Iterator[JobRow]:
+def read_table(place: Storage, checksum: Sequence[int] | None = None) -> Iterator[JobRow]:
     """Yield the rows of jobs.csv in order.
+
+    `checksum` has the bytes and the CRC-32 that the file must have.
 
     Raises
     ------
     LidarpoolError
-        If there is no such table, or it is damaged.
+        If there is no such table, or it is damaged: no checksum, a number that is not greater
+        than the one before, or no row of a table.
     """
     with ExitStack() as stack:
         with explained(f"{place.path(TABLE_FILE)} cannot be read", AGAIN):
@@ -226,6 +230,11 @@ def read_table(place: Storage) -> Iterator[JobRow]:
                 folder = stack.enter_context(tempfile.TemporaryDirectory(prefix="lidarpool-"))
                 path = Path(folder, TABLE_FILE)
                 place.get(TABLE_FILE, path)
+            if checksum is not None and Storage(str(path.parent)).checksum(path.name) != checksum:
+                raise LidarpoolError(
+                    f"{place.path(TABLE_FILE)} is damaged or edited, its checksum is not that of "
+                    f"the data set: {AGAIN}."
+                )
             file = stack.enter_context(path.open(encoding="utf-8", newline=""))
         reader = csv.reader(file, strict=True)
         try:
@@ -235,8 +244,13 @@ def read_table(place: Storage) -> Iterator[JobRow]:
             if header[:first] != [*_HEAD] or tail != [*_TAIL]:
                 raise ValueError("it is not a table of jobs")
             names = [name.removeprefix(_VARIED) for name in header[first:last]]
+            last_number = -1
             for cells in reader:
-                yield _row(header, names, cells)
+                row = _row(header, names, cells)
+                if not last_number < row.number < JOBS_MOST:
+                    raise ValueError(f"job {row.number} follows job {last_number}")
+                last_number = row.number
+                yield row
         except (ValueError, csv.Error) as error:
             raise LidarpoolError(
                 f"{place.path(TABLE_FILE)} is damaged near line {reader.line_num} ({error}): "

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import operator
 import os
 import threading
@@ -23,6 +22,7 @@ from pydantic import Field
 
 from ..base.archives import open_archive
 from ..base.errors import LidarpoolError
+from ..base.sealed import unsealed
 from ..base.storage import Storage
 from ..base.validation import checked
 from ..base.words import did_you_mean
@@ -254,7 +254,8 @@ def sweeps(
     written = Format(DATA_SETS[head["format"]], head["layout"])
     written.check_installed()
     of_sensors = head["jobs"]
-    rows = [job for job in read_table(storage) if job.number in of_sensors]
+    table = read_table(storage, head["table"])
+    rows = [job for job in table if job.number in of_sensors]
     if len(rows) < len(of_sensors):
         raise LidarpoolError(f"{storage.path(TABLE_FILE)} lacks jobs that are done: {AGAIN}.")
     rows = _chosen(rows, split, jobs, storage)
@@ -276,11 +277,13 @@ def sweeps(
 def read_index(place: Storage) -> dict[str, Any]:
     """Read the index, with jobs by number, of a data set; LidarpoolError if it is not finished."""
     try:
-        head: dict[str, Any] = json.loads(place.read(INDEX_FILE))
+        head = unsealed(place.read(INDEX_FILE))
         if head["version"] != VERSION:
             raise ValueError(f"it is of version {head['version']}, not {VERSION}")
         if head["format"] not in DATA_SETS:
             raise ValueError(f"its format is {head['format']!r}")
+        if "table" not in head:
+            raise ValueError(f"it has no checksum of {TABLE_FILE}")
         head["jobs"] = {row["number"]: dict(row["sensors"]) for row in head["jobs"]}
     except FileNotFoundError as error:
         if ".jobs" in place.entries():
@@ -294,10 +297,10 @@ def read_index(place: Storage) -> dict[str, Any]:
         ) from error
     except OSError as error:
         raise _unreadable(place.path(INDEX_FILE), error) from error
-    except (ValueError, KeyError, TypeError) as error:
+    except (ValueError, LookupError, TypeError, AttributeError) as error:
         raise LidarpoolError(
             f"{place.path(INDEX_FILE)} is damaged or of another version of lidarpool ({error}): "
-            "run the campaign again with --resume."
+            "run the campaign again with --resume, or merge its shards again."
         ) from error
     return head
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -76,7 +77,11 @@ Points = CloudFile | HeldPoints | JoinedPoints
 
 @dataclass(frozen=True)
 class Filter:
-    """Filter: points whose columns are within limits, (column, lowest, highest) each."""
+    """Filter: points whose columns are within limits, (column, lowest, highest) each.
+
+    Limits of one column are joined when a filter is read, so that a long filter takes no longer
+    than one limit of each column.
+    """
 
     limits: tuple[tuple[str, float, float], ...] = ()
 
@@ -84,17 +89,25 @@ class Filter:
     def read(cls, text: str, names: Sequence[str]) -> Filter:
         """Read limits from an address, ``column,lowest,highest;…``; others are left out.
 
+        ValueError if a limit is not a number.
+
         Examples
         --------
         >>> Filter.read("z,0,1.5;what,1,2", ["z"])
         Filter(limits=(('z', 0.0, 1.5),))
+        >>> Filter.read("z,0,1.5;z,1,2", ["z"])
+        Filter(limits=(('z', 1.0, 1.5),))
         """
-        found = []
+        limits = dict[str, tuple[float, float]]()
         for entry in filter(None, text.split(";")):
-            name, low, high = entry.rsplit(",", 2)
+            name, *ends = entry.rsplit(",", 2)
+            low, high = map(float, ends)
+            if math.isnan(low) or math.isnan(high):
+                raise ValueError(f"{entry!r} has a limit that is not a number")
             if name in names:
-                found.append((name, float(low), float(high)))
-        return cls(tuple(found))
+                lowest, highest = limits.get(name, (low, high))
+                limits[name] = max(low, lowest), min(high, highest)
+        return cls(tuple((name, *ends) for name, ends in limits.items()))
 
     def keeps(self, points: Points, rows: Ints | slice) -> Bools:
         """Whether some points, (n,), are within all limits."""
@@ -104,6 +117,26 @@ class Filter:
             values = points.values(name, rows)
             kept &= (values >= low) & (values <= high)  # NaN is not
         return kept
+
+
+def read_scans(text: str) -> ScanRanges:
+    """Read ranges of scans from an address, ``first-last,…``; ranges that touch are joined.
+
+    ValueError if the text is no such list.
+
+    Examples
+    --------
+    >>> read_scans("4-6,0-1,5-9,2-2")
+    ((0, 2), (4, 9))
+    """
+    ranges: list[tuple[int, int]] = []
+    pairs = (entry.split("-") for entry in text.split(",") if entry)
+    for first, last in sorted((int(first), int(last)) for first, last in pairs):
+        if ranges and first <= ranges[-1][1] + 1:
+            ranges[-1] = ranges[-1][0], max(last, ranges[-1][1])
+        elif first <= last:
+            ranges.append((first, last))
+    return tuple(ranges)
 
 
 @dataclass(frozen=True, eq=False)

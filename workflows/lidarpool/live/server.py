@@ -17,9 +17,9 @@ import socket
 import sys
 import threading
 import webbrowser
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import AsyncIterator, Callable, Iterator, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import contextmanager, suppress
+from contextlib import asynccontextmanager, contextmanager, suppress
 from dataclasses import dataclass, field
 from hmac import compare_digest
 from html import escape
@@ -41,6 +41,12 @@ VIEWER = "index.html"
 _PORTS_TRIED = 100
 
 _HUB = "JUPYTERHUB_SERVICE_PREFIX"  # in the environment of kernels of a hub: where its user's is
+
+SLOW_AT_ONCE = 2  # slow answers that are made or sent at a time
+SLOW_WAITING = 16  # slow questions that wait for their turn; further ones get status 503
+LARGE_POINTS = 1_000_000  # a question for more points is slow
+LONG_TEXT = 1_000  # letters: a question for points of longer lists is slow
+STALL_S = 20.0  # without a byte that the browser reads; then its connection is closed
 
 _ALIGNED = 8  # bytes, that arrays begin at multiples of
 _PIECE = 1 << 20  # bytes that are written at a time
@@ -76,6 +82,45 @@ def bundle(header: dict[str, Any], arrays: Mapping[str, AnyArray]) -> list[bytes
     return [len(text).to_bytes(4, "little"), text, *pieces]
 
 
+def is_slow(what: str, asked: Arguments) -> bool:
+    """Whether an answer may take seconds: it searches all points, or has millions of them.
+
+    ValueError if the number of points is no number.
+    """
+    kind = what.rpartition("/")[2]
+    if kind != "points":
+        return kind == "export"
+    long_lists = len(asked.get("scans", "")) > LONG_TEXT
+    return bool(asked.get("filter")) or long_lists or int(asked.get("most", 0)) > LARGE_POINTS
+
+
+class SlowQuestions:
+    """Answers few slow questions at a time, in threads of their own.
+
+    An answer has its turn until the browser has read it, so that few large ones are in memory.
+    """
+
+    def __init__(self) -> None:
+        self.threads = ThreadPoolExecutor(SLOW_AT_ONCE, "lidarpool-page-slow")
+        self._free = asyncio.Semaphore(SLOW_AT_ONCE)
+        self._waiting = 0
+
+    @asynccontextmanager
+    async def turn(self) -> AsyncIterator[None]:
+        """Wait for a turn, which lasts as long as the body; HTTPError if too many wait."""
+        if self._waiting >= SLOW_WAITING:
+            raise HTTPError(503, "too many slow questions wait")
+        self._waiting += 1
+        try:
+            await self._free.acquire()
+        finally:
+            self._waiting -= 1
+        try:
+            yield
+        finally:
+            self._free.release()
+
+
 class _Guarded(RequestHandler):
     """Answers who knows the page's token."""
 
@@ -109,7 +154,10 @@ class _File(_Guarded, StaticFileHandler):
 
 
 class _Question(_Guarded):
-    """Answers one question. `source` may take long: it is asked in a thread of its own."""
+    """Answers one question. `source` may take long: it is asked in a thread of its own.
+
+    Slow questions wait for one another, others are answered meanwhile.
+    """
 
     def initialize(self, source: Source, stop: Callable[[], None] | None) -> None:
         self._source, self._stop = source, stop
@@ -117,20 +165,38 @@ class _Question(_Guarded):
 
     async def get(self, what: str) -> None:
         asked = {name: self.get_query_argument(name) for name in self.request.query_arguments}
+        slow: SlowQuestions = self.settings["slow"]
         try:
-            answer = await asyncio.to_thread(self._source, what, asked, self._gone.is_set)
+            if is_slow(what, asked):
+                async with slow.turn():
+                    await self._answer(slow.threads, what, asked)
+            else:
+                await self._answer(None, what, asked)
         except (KeyError, ValueError) as error:
             raise HTTPError(404, "%s", repr(error)) from error
-        except Abandoned:
+        except (Abandoned, StreamClosedError):
             return
+
+    async def _answer(
+        self, threads: ThreadPoolExecutor | None, what: str, asked: Arguments
+    ) -> None:
+        """Make an answer in a thread and send it; Abandoned if the browser has left."""
+        if self._gone.is_set():
+            raise Abandoned
+
+        def pieces() -> list[bytes]:
+            return bundle(*self._source(what, asked, self._gone.is_set))
+
+        answer = await asyncio.get_running_loop().run_in_executor(threads, pieces)
         self.set_header("Content-Type", "application/octet-stream")
-        try:
-            for piece in bundle(*answer):
-                for at in range(0, len(piece), _PIECE):
-                    self.write(piece[at : at + _PIECE])
-                    await self.flush()
-        except StreamClosedError:
-            return
+        for piece in answer:
+            for at in range(0, len(piece), _PIECE):
+                self.write(piece[at : at + _PIECE])
+                try:
+                    await asyncio.wait_for(self.flush(), STALL_S)
+                except TimeoutError as error:
+                    self.detach().close()
+                    raise Abandoned from error
 
     def post(self, what: str) -> None:
         if what != "stop" or self._stop is None:
@@ -187,7 +253,11 @@ def page_server(
             (r"/[^/]+/(.*)", _Question, {"source": source, "stop": stop}),
         ]
         application = Application(handlers, log_function=lambda _: None)
-        application.settings |= {"page": made, "in_notebook": cell_display() is not None}
+        application.settings |= {
+            "slow": SlowQuestions(),
+            "page": made,
+            "in_notebook": cell_display() is not None,
+        }
         server = HTTPServer(application)
         server.add_socket(bound)
         loop = asyncio.get_running_loop()

@@ -62,6 +62,7 @@ from .point_selection import (
     ScanRanges,
     corners_of,
     positions,
+    read_scans,
 )
 from .server import PORT, Answer, Arguments, PageServer, announced, page_server
 
@@ -69,6 +70,7 @@ MOST_POINTS = 20_000_000  # in an answer, and in a download
 EXPORTS = ("ply", "las", "parquet")  # formats of a download
 MOST_RAYS = 150  # more rays would hide the surfaces
 _SAMPLE = 100_000  # points that colour scales and limits are taken from
+_MOST_COLOURINGS = 64  # colour scales that are kept, of columns and filters
 _HITS_SAMPLE = 500_000  # points that tell where on large triangles the hits are
 _MOST_NAMES = 2000  # in a menu
 _IMAGE_WIDTH, _IMAGE_ROWS = 1024, 128  # most columns; rows of sensors with few or many channels
@@ -335,10 +337,7 @@ class View:
     def _wanted(self, asked: Arguments) -> tuple[Filter, ScanRanges | None]:
         """Read the filter and the ranges of scans, ``first-last,first-last``, of a question."""
         wanted = Filter.read(asked.get("filter", ""), list(self.columns))
-        if "scans" not in asked:
-            return wanted, None
-        pairs = (entry.split("-") for entry in asked["scans"].split(",") if entry)
-        return wanted, tuple((int(first), int(last)) for first, last in pairs)
+        return wanted, read_scans(asked["scans"]) if "scans" in asked else None
 
     def _points(self, asked: Arguments, abandoned: Callable[[], bool]) -> Answer:
         """Points for a filter, ranges of scans and a camera, and their colours."""
@@ -367,12 +366,17 @@ class View:
     ) -> Colouring:
         """Colour scale for all points that a filter keeps, whatever scans are shown."""
         known = self._colourings
-        if (name, wanted) not in known:
+        colouring = known.get((name, wanted))
+        if colouring is None:
             rows, _ = finder.find(_SAMPLE, wanted, None, None, abandoned)
             column = self._coloured[name]
             values = values_of(column, lambda one: finder.points.values(one, rows))
-            known[name, wanted] = colours_of(values, column, self._names(name))
-        return known[name, wanted]
+            colouring = colours_of(values, column, self._names(name))
+            with self._lock:
+                while len(known) >= _MOST_COLOURINGS:
+                    del known[next(iter(known))]  # the oldest
+                known[name, wanted] = colouring
+        return colouring
 
     def _column(self, name: str) -> Answer:
         """Tell what a column can be filtered by: its limits, or its labels."""

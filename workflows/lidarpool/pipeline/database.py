@@ -12,6 +12,7 @@ import json
 import re
 import secrets
 import sqlite3
+import zlib
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import replace
@@ -24,26 +25,41 @@ import numpy as np
 from ..base.arrays import Ints
 from ..base.errors import LidarpoolError
 from ..columns.parts import part_name
+from ..datasets.job_table import JOBS_MOST
 from ..plan import Trial
 from .messages import Receipt
 
-FORMAT = 8
+FORMAT = 9
 FILE = "run.db"
-JOBS_MOST = 100_000_000
 
 _TABLES = """
-CREATE TABLE meta (name TEXT PRIMARY KEY, value TEXT NOT NULL) WITHOUT ROWID;
+CREATE TABLE meta (
+    name TEXT PRIMARY KEY, value TEXT NOT NULL, crc INTEGER NOT NULL
+) WITHOUT ROWID;
 CREATE TABLE parts (
     job INTEGER, first INTEGER, stop INTEGER NOT NULL, rows INTEGER NOT NULL, size INTEGER NOT NULL,
-    hits INTEGER NOT NULL, cells TEXT NOT NULL, summaries BLOB NOT NULL, PRIMARY KEY (job, first)
+    hits INTEGER NOT NULL, cells TEXT NOT NULL, summaries BLOB NOT NULL, crc INTEGER NOT NULL,
+    PRIMARY KEY (job, first)
 );
 CREATE TABLE trials (
-    job INTEGER, trial INTEGER, data TEXT NOT NULL, PRIMARY KEY (job, trial)
+    job INTEGER, trial INTEGER, data TEXT NOT NULL, crc INTEGER NOT NULL, PRIMARY KEY (job, trial)
 );
-CREATE TABLE frames (job INTEGER PRIMARY KEY, count INTEGER NOT NULL);
-CREATE TABLE made_of (job INTEGER PRIMARY KEY, hash TEXT NOT NULL);
-CREATE TABLE jobs (number INTEGER PRIMARY KEY, failed INTEGER NOT NULL, data TEXT NOT NULL);
+CREATE TABLE frames (job INTEGER PRIMARY KEY, count INTEGER NOT NULL, crc INTEGER NOT NULL);
+CREATE TABLE made_of (job INTEGER PRIMARY KEY, hash TEXT NOT NULL, crc INTEGER NOT NULL);
+CREATE TABLE jobs (
+    number INTEGER PRIMARY KEY, failed INTEGER NOT NULL, data TEXT NOT NULL, crc INTEGER NOT NULL
+);
 """
+# Columns of each table but for `crc`, which is the CRC-32 of their values.
+_COLUMNS = {
+    "meta": ("name", "value"),
+    "parts": ("job", "first", "stop", "rows", "size", "hits", "cells", "summaries"),
+    "trials": ("job", "trial", "data"),
+    "frames": ("job", "count"),
+    "made_of": ("job", "hash"),
+    "jobs": ("number", "failed", "data"),
+}
+_OF_DISK = ("locked", "full", "disk i/o", "unable to open", "readonly", "out of memory")
 _OF_JOBS = ("parts", "trials", "frames", "made_of")  # tables about jobs under way
 _FIRST = attrgetter("first")  # the order of parts
 PARTS_FOLDER = re.compile("run-[0-9a-f]{16}")  # names of `parts_folder`
@@ -162,6 +178,7 @@ class RunDatabase:
             self._sql = sqlite3.connect(
                 path, isolation_level=None, timeout=1.0, check_same_thread=False
             )
+            self._sql.create_function("crc32", -1, _crc32, deterministic=True)
             try:
                 self._open({"format": str(FORMAT), "mark": secrets.token_hex(8)} | new)
             except BaseException:
@@ -177,12 +194,19 @@ class RunDatabase:
         if not self._sql.execute("SELECT count(*) FROM sqlite_master").fetchone()[0]:
             for statement in _TABLES.split(";"):
                 self._sql.execute(statement)
-            self._sql.executemany("INSERT INTO meta VALUES (?, ?)", new.items())
+            self._sql.executemany(_insert("meta"), new.items())
         self._sql.execute("COMMIT")
         self.meta = dict(self._sql.execute("SELECT name, value FROM meta"))
         if (made := self.meta.get("format")) != str(FORMAT):
             raise sqlite3.DatabaseError(f"it is of format {made}, and this version reads {FORMAT}")
         _checked_place(self.meta)
+        (state,) = self._sql.execute("PRAGMA integrity_check(1)").fetchone()  # of pages and indices
+        if state != "ok":
+            raise sqlite3.DatabaseError(" ".join(state.split()))
+        for table, columns in _COLUMNS.items():
+            query = f"SELECT count(*) FROM {table} WHERE crc IS NOT crc32({', '.join(columns)})"
+            if count := self._sql.execute(query).fetchone()[0]:
+                raise sqlite3.DatabaseError(f"{count:,} rows of {table} have another checksum")
         # From Python 3.12 on, an unfinished cursor in a traceback keeps a closed file locked.
         with closing(self._sql.execute("SELECT number FROM jobs")) as rows:
             for (number,) in rows:
@@ -253,7 +277,8 @@ class RunDatabase:
 
     def _summaries(self, part: Receipt) -> bytes:
         query = "SELECT summaries FROM parts WHERE job = ? AND first = ?"
-        ((data,),) = self._rows(query, part.job, part.first)
+        with _explained(self.path):
+            ((data,),) = self._rows(query, part.job, part.first)
         return bytes(data)
 
     # -- writing -------------------------------------------------------------------------
@@ -261,7 +286,7 @@ class RunDatabase:
     def set(self, **values: str) -> None:
         """Store some values."""
         with self._transaction():
-            self._sql.executemany("INSERT OR REPLACE INTO meta VALUES (?, ?)", values.items())
+            self._sql.executemany(_insert("meta", "OR REPLACE"), values.items())
         self.meta |= values
 
     def commit(self, receipts: Sequence[Receipt]) -> list[Receipt]:
@@ -283,7 +308,7 @@ class RunDatabase:
         ]
         try:
             with self._transaction():
-                self._sql.executemany("INSERT INTO parts VALUES (?, ?, ?, ?, ?, ?, ?, ?)", rows)
+                self._sql.executemany(_insert("parts"), rows)
                 self._write_frames()
         except BaseException:
             for receipt in new:
@@ -295,7 +320,7 @@ class RunDatabase:
     def set_hash(self, number: int, text: str) -> None:
         """Keep the hash of what a job under way is made of."""
         with self._transaction():
-            self._sql.execute("INSERT OR REPLACE INTO made_of VALUES (?, ?)", (number, text))
+            self._sql.execute(_insert("made_of", "OR REPLACE"), (number, text))
 
     def drop(self, number: int, receipts: Sequence[Receipt]) -> None:
         """Remove parts that are missing in storage, so that their scans are offered again."""
@@ -311,7 +336,7 @@ class RunDatabase:
         """Store planning trials of a job under way."""
         with self._transaction():
             self._sql.executemany(
-                "INSERT OR IGNORE INTO trials VALUES (?, ?, ?)",
+                _insert("trials", "OR IGNORE"),
                 # To the bit: a float is written with the digits that identify it.
                 [(number, t.trial, json.dumps(vars(t), default=np.ndarray.tolist)) for t in trials],
             )
@@ -326,7 +351,7 @@ class RunDatabase:
         ended = {number: (failed, json.dumps(data)) for number, failed, data in jobs}
         rows = [(number, *row) for number, row in ended.items()]
         with self._transaction():
-            self._sql.executemany("INSERT OR REPLACE INTO jobs VALUES (?, ?, ?)", rows)
+            self._sql.executemany(_insert("jobs", "OR REPLACE"), rows)
             self._delete(ended)
         self.begun -= ended.keys()
         for number in ended:
@@ -383,7 +408,7 @@ class RunDatabase:
         for job in self.under_way.values():
             if job.frames != job.frames_written:
                 row = (job.number, job.frames)
-                self._sql.execute("INSERT OR REPLACE INTO frames VALUES (?, ?)", row)
+                self._sql.execute(_insert("frames", "OR REPLACE"), row)
                 job.frames_written = job.frames
 
     @contextmanager
@@ -404,10 +429,11 @@ def _explained(path: Path) -> Iterator[None]:
     """Translate an error of SQLite about the database at a path."""
     try:
         yield
-    except (sqlite3.Error, ValueError, TypeError, KeyError) as error:
+    except (sqlite3.Error, ValueError, LookupError, TypeError, OverflowError) as error:
         words = str(error)
-        # Without a table or column it is not what it was.
-        if not isinstance(error, sqlite3.OperationalError) or "no such" in words:
+        # Other operational errors, such as a missing column or text that is no UTF-8, are damage.
+        of_disk = any(one in words.lower() for one in _OF_DISK)
+        if not isinstance(error, sqlite3.OperationalError) or not of_disk:
             raise DamagedError(
                 f"{path} is damaged ({words}): drop the run with --fresh, or give another folder."
             ) from error
@@ -416,6 +442,20 @@ def _explained(path: Path) -> Iterator[None]:
         raise LidarpoolError(
             f"{path} cannot be written ({words}): make room on its disk, or give another folder."
         ) from error
+
+
+def _crc32(*values: Any) -> int:
+    """Return the CRC-32 of the values of a row, as SQLite has them."""
+    crc = 0
+    for value in values:
+        crc = zlib.crc32(value if isinstance(value, bytes) else f"{value!r},".encode(), crc)
+    return crc
+
+
+def _insert(table: str, conflict: str = "") -> str:
+    """Return the statement that inserts a row of a table and its CRC-32."""
+    places = ", ".join(f"?{number}" for number, _ in enumerate(_COLUMNS[table], 1))
+    return f"INSERT {conflict} INTO {table} VALUES ({places}, crc32({places}))"
 
 
 def parts_folder(mark: str) -> str:
@@ -452,10 +492,13 @@ def read_place(path: Path) -> tuple[str, str] | None:
                     f"{path} is not the database of a run: move it elsewhere, or give another "
                     "folder."
                 )
-            return _checked_place(dict(sql.execute("SELECT name, value FROM meta")))
+            rows = sql.execute("SELECT name, value, crc FROM meta").fetchall()
+            if any(_crc32(name, value) != crc for name, value, crc in rows):
+                return None
+            return _checked_place({name: value for name, value, _ in rows})
     except sqlite3.Error as error:
         if "locked" in str(error):
             raise LidarpoolError(f"Another run is using {path.parent}.") from error
         return None
-    except (ValueError, TypeError, KeyError):
+    except (ValueError, LookupError, TypeError, OverflowError):
         return None

@@ -12,12 +12,13 @@ from pathlib import Path
 from typing import Any
 
 from ..base.errors import LidarpoolError, explained
-from ..base.shard import ALL, shard_in_words
+from ..base.sealed import sealed, unsealed
+from ..base.shard import ALL, Shard, shard_in_words
 from ..base.software import difference, software
 from ..base.storage import Storage
 from ..base.words import plural
-from ..datasets.dataset import INDEX_FILE, OF_JOBS, DataSet
-from ..datasets.job_table import JobRow, read_table, write_table
+from ..datasets.dataset import INDEX_FILE, OF_JOBS, DataSet, manifest_file
+from ..datasets.job_table import TABLE_FILE, JobRow, read_table, write_table
 from ..datasets.loader import read_index, sweeps
 from ..export.folder import result_folder
 from ..pipeline.database import FILE
@@ -28,6 +29,16 @@ from ..run.store import RUN_FOLDER, RunStore, remove_run
 from ..scenario.campaign import CampaignSpec, hashes
 
 CAMPAIGN_FILE = "campaign.json"  # whose data set this is, and the software that made it
+_RECORDED = {
+    "identity",
+    "casting",
+    "backend",
+    "sensors",
+    "files",
+    "campaign",
+    "shards",
+    "notes",
+}  # names of the entries of CAMPAIGN_FILE
 
 # With what `write_shared` writes, CAMPAIGN_FILE first.
 _FINISHED = re.compile(
@@ -53,6 +64,7 @@ class DataSetOutput(Output[CampaignRun]):
         self._made: Mapping[str, Any] | None = None
         self._rows: list[JobRow] = []
         self._wrong: dict[int, str] = {}
+        self._lost_record = ""  # a note, if the record was damaged
 
     @contextmanager
     def held(self) -> Iterator[None]:
@@ -79,19 +91,27 @@ class DataSetOutput(Output[CampaignRun]):
                 _remove_dataset(out, kept)
         if not conductor.resume or CAMPAIGN_FILE not in there or unfinished:
             return None
-        self._made = check_same(out, self.campaign)
+        try:
+            self._made = check_same(out, self.campaign)
+        except DamagedRecordError:  # the manifests say of which campaign the jobs are
+            self._lost_record = f"{CAMPAIGN_FILE} was damaged, and is made again"
+            return None
         if (shards := self._made["shards"]) != [str(self.campaign.shard)]:
             raise LidarpoolError(
                 f"{out} holds {listed([*map(shard_in_words, shards)]) or 'no shard'}, and this is "
                 f"{shard_in_words(str(self.campaign.shard))}: give another folder with --out."
             )
-        with suppress(LidarpoolError):
-            self._rows.extend(read_table(out))
-        told = len(self._rows)  # manifests have the rows that a damaged table lacks
         with explained(f"{out} cannot be read"):
-            self._rows += [row for row, _ in self.dataset.rows({row.name for row in self._rows})]
+            rows = (row for row, _ in self.dataset.rows())
+            self._rows += sorted(rows, key=lambda row: row.number)
+        told = with_seconds(out, self._rows)
         whole, self._wrong = _look(self.dataset, self._rows, options.verify, self.campaign)
-        if len({told, whole, len(self.campaign.numbers)}) > 1 or not _is_indexed(out, whole):
+        known = {row.number for row in self._rows}
+        for number in self.campaign.shard.jobs(self._made["campaign"]["count"]):
+            if number not in known:
+                name = self.campaign.name(number)
+                self._wrong[number] = f"job {name} ({manifest_file(name)} is missing or damaged)"
+        if not told or whole != len(self.campaign.numbers) or not _is_indexed(out, whole):
             return None
         if RUN_FOLDER in there:  # a killed run has not removed all of itself
             remove_run(kept)
@@ -113,6 +133,7 @@ class DataSetOutput(Output[CampaignRun]):
             rows = [row for row in self._rows if row.number in self.campaign.numbers]
             store.adopt(rows, sensors=json.dumps(self._made["sensors"]))
         elif conductor.resume:
+            store.notes += [self._lost_record] * bool(self._lost_record)
             self._take_over(store)
         dataset_files(out, begun=store.begun or bool(store.kept))  # some were perhaps taken over
         if self._made is None:
@@ -154,8 +175,9 @@ class DataSetOutput(Output[CampaignRun]):
         record: dict[str, Any] = {"identity": dict(store.identity), "casting": store.casting}
         record |= {"backend": store.backend, "sensors": run.sensors}
         record |= {"files": hashes(self.campaign.files), "campaign": self.campaign.described}
-        record["shards"] = [str(self.campaign.shard)]
+        record |= {"shards": [str(self.campaign.shard)], "notes": [*run.notes]}
         write_record(self.dataset.place, record)  # before anything that it tells whose it is
+        replace(self.dataset, made_with=store.made_with).write_failed(store.rows())
         run, _ = write_shared(self.dataset, record, run, store.rows)
         if run.failed:
             store.save(now=True)
@@ -166,10 +188,55 @@ class DataSetOutput(Output[CampaignRun]):
         return run
 
 
+class DamagedRecordError(LidarpoolError):
+    """CAMPAIGN_FILE cannot be read any more."""
+
+
 def write_record(place: Storage, record: Mapping[str, Any]) -> None:
     """Write CAMPAIGN_FILE."""
     with explained(f"{place} cannot be written"):
-        place.write(CAMPAIGN_FILE, (json.dumps(record, indent=1) + "\n").encode())
+        place.write(CAMPAIGN_FILE, sealed(record))
+
+
+def read_record(place: Storage) -> dict[str, Any]:
+    """Read CAMPAIGN_FILE.
+
+    DamagedRecordError if the file is damaged or edited; LidarpoolError if there is none.
+    """
+    try:
+        record = unsealed(place.read(CAMPAIGN_FILE))
+        if missing := _RECORDED - record.keys():
+            raise ValueError(f"it has no {min(missing)}")
+        for shard in record["shards"]:
+            Shard.parse(shard)
+    except OSError as error:
+        raise LidarpoolError(
+            f"{place} holds no finished data set, which has a {CAMPAIGN_FILE}: {error}."
+        ) from error
+    except (ValueError, LidarpoolError) as error:
+        raise DamagedRecordError(
+            f"{place.path(CAMPAIGN_FILE)} is damaged or edited ({error}): run the campaign again "
+            "with --resume, which writes it anew."
+        ) from error
+    return record
+
+
+def with_seconds(place: Storage, rows: list[JobRow]) -> bool:
+    """Add the seconds of casting, which only the table of jobs has, to rows of manifests.
+
+    `rows` are in the order of their numbers. Returns whether the table has the checksum that
+    `dataset.json` has of it, and these rows.
+    """
+    with suppress(LidarpoolError):
+        seconds = {row.number: row for row in read_table(place, read_index(place)["table"])}
+        same = seconds.keys() == {row.number for row in rows}
+        for index, row in enumerate(rows):
+            timed = seconds.get(row.number, row)
+            if timed.sha256 == row.sha256:
+                rows[index] = replace(row, seconds=timed.seconds)
+            same &= timed.sha256 == row.sha256
+        return same
+    return False
 
 
 def write_shared(
@@ -248,10 +315,13 @@ def verify(place: Storage, number: int | None = None) -> str:
     """
     index = read_index(place)
     dataset = DataSet(place, index["format"], index["layout"])
-    rows = [row for row in read_table(place) if row.done]
-    whole = len(rows) == len(index["jobs"])
+    rows = [row for row in read_table(place, index["table"]) if row.done]
+    whole = {row.number for row in rows} == index["jobs"].keys()
     rows = [row for row in rows if number in (None, row.number)]
-    wrong = _look(dataset, rows, True)[1] | ({} if whole else {-1: "rows of jobs.csv are missing"})
+    wrong = {} if whole else {-1: f"{TABLE_FILE} has other jobs than {INDEX_FILE}"}
+    if number is None and CAMPAIGN_FILE in place.sizes():
+        read_record(place)
+    wrong |= _look(dataset, rows, True)[1]
     if wrong:
         raise LidarpoolError(
             f"{place} is damaged: {listed([*wrong.values()])}. With the campaign, --verify makes "
@@ -265,12 +335,7 @@ def check_same(place: Storage, campaign: CampaignSpec) -> Mapping[str, Any]:
 
     LidarpoolError names what differs, there and here.
     """
-    try:
-        made: dict[str, Any] = json.loads(place.read(CAMPAIGN_FILE))
-    except (OSError, ValueError) as error:
-        raise LidarpoolError(
-            f"{place} holds no finished data set, which has a {CAMPAIGN_FILE}: {error}."
-        ) from error
+    made = read_record(place)
     here = software(made["backend"])
     there = made["casting"] or {"lidarpool": made["identity"]["lidarpool"]}
     if differs := difference(there, {name: here.get(name, "none") for name in there}):

@@ -7,7 +7,7 @@ import json
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import closing, suppress
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from functools import partial
 from itertools import groupby
 from operator import attrgetter
@@ -15,16 +15,18 @@ from pathlib import Path
 from typing import Any
 
 from ..base.errors import LidarpoolError, Mistakes, explained
+from ..base.fingerprint import fingerprint
 from ..base.shard import ALL, Shard
 from ..base.software import software
 from ..base.storage import Storage
 from ..base.validation import checked
 from ..base.words import plural
 from ..columns.parts import part_name
-from ..datasets.dataset import INDEX_FILE, DataSet, ahead
+from ..datasets.dataset import INDEX_FILE, DataSet, ahead, manifest_file
 from ..datasets.job_table import TABLE_FILE, JobRow, read_table
+from ..datasets.loader import read_index
 from ..export.folder import LAST_FILE, output_place, result_folder
-from ..pipeline.database import FILE, RunDatabase
+from ..pipeline.database import FILE, DamagedError, RunDatabase
 from ..pipeline.messages import Receipt
 from ..plan import Trial
 from ..run.conductor import Conductor
@@ -39,7 +41,13 @@ from ..run.store import RUN_FOLDER, parts_of, remove_run, with_sensors
 from ..scenario.build import build
 from ..scenario.empty_cloud import NO_POINTS, empty_jobs_warning
 from ..scenario.scenario import Scenario
-from .campaign_output import CAMPAIGN_FILE, dataset_files, write_record, write_shared
+from .campaign_output import (
+    CAMPAIGN_FILE,
+    dataset_files,
+    read_record,
+    write_record,
+    write_shared,
+)
 from .output import SurveyOutput
 
 NAMED = 20  # shards or files in a message
@@ -58,9 +66,17 @@ class _Part:
     record: Mapping[str, Any]
     shards: Sequence[Shard]
     whole: int
-    notes: Sequence[str] = ()
     points: Sequence[Receipt] = ()
     trials: Sequence[Trial] = ()
+
+    @property
+    def notes(self) -> list[str]:
+        """Remarks for the user, without that on missing shards."""
+        return [
+            note
+            for note in self.record["notes"]
+            if not note.startswith(_MISSING) and NO_POINTS not in note  # of an earlier merge
+        ]
 
     def done(self, shard: Shard) -> range:
         """Return the numbers of the jobs or scans of a shard."""
@@ -88,13 +104,14 @@ def merge(
 ) -> dict[str, Any]:
     """Merge shards into the data set or result that one run would have made.
 
-    Every byte is compared with what its shard says of it. After a kill, the same call goes on.
+    Every byte is compared with what its shard says of it. The rows of jobs are those of their
+    manifests, which have checksums. After a kill, the same call goes on.
 
     Parameters
     ----------
     shards, out
         Folders or URLs of the shards of one campaign or survey, and of the data set or result.
-        Shards can be added to a data set later.
+        Shards can be added to a data set later. `out` may neither be in a shard nor hold one.
     partial
         Merge what there is; a note says what is missing.
     scenario
@@ -114,7 +131,7 @@ def merge(
     """
     place, screen = output_place(str(out)), screen or Screen()
     places = {_real(one): one for one in map(Storage.at, shards)}
-    places.pop(_real(Storage.at(place)), None)  # `part-*` may have it
+    _check_apart(Storage.at(place), places)
     parts, mistakes = list[_Part](), Mistakes()
     for one in places.values():
         with mistakes.noted():
@@ -137,14 +154,32 @@ def _real(place: Storage) -> str:
     return str(Path(place.url).resolve()) if place.is_local else place.url
 
 
+def _check_apart(out: Storage, places: Mapping[str, Storage]) -> None:
+    """Check that `out` is apart from all places of shards, {as of `_real`: place}."""
+    path = _real(out)
+    for real, place in places.items():
+        relation = ""
+        if path == real:
+            relation = "is one of the shards"
+        elif f"{path}/".startswith(f"{real.rstrip('/')}/"):
+            relation = f"lies in the shard {place}"
+        elif f"{real}/".startswith(f"{path.rstrip('/')}/"):
+            relation = f"holds the shard {place}"
+        if relation:
+            raise LidarpoolError(
+                f"--out {out} {relation}, which stays as it is: give another folder with --out, or "
+                "name the shards without that one."
+            )
+
+
 def _read(place: Storage) -> _Part:
-    """Read a finished shard, or data set of several; LidarpoolError if it is none."""
+    """Read a finished shard, or data set of several; LidarpoolError if it is none, or damaged."""
     with explained(f"{place} cannot be read"):
-        there, run = place.sizes(), place.below(RUN_FOLDER)
-        with suppress(LidarpoolError, LookupError, TypeError, ValueError):
-            if {CAMPAIGN_FILE, INDEX_FILE, LAST_FILE} <= there.keys():
-                return _of_dataset(place, json.loads(place.read(LAST_FILE))["notes"])
-            if FILE in run.sizes():
+        files, run = place.sizes(), place.below(RUN_FOLDER)
+        if {CAMPAIGN_FILE, INDEX_FILE, LAST_FILE} <= files.keys():
+            return _of_dataset(place)
+        if FILE in run.sizes():
+            with suppress(LookupError):
                 return _of_survey(place, run)
     raise LidarpoolError(
         f"{place} holds no finished shard: give a folder of lidarpool run --shard; --resume "
@@ -152,30 +187,40 @@ def _read(place: Storage) -> _Part:
     )
 
 
-def _of_dataset(place: Storage, notes: Sequence[str] = (), of: int = 1) -> _Part:
+def _of_dataset(place: Storage, of: int = 1) -> _Part:
     """Read a data set of some shards; one that has all has each of so many."""
-    record = json.loads(place.read(CAMPAIGN_FILE))
+    record = read_record(place)
     shards = [Shard.parse(text) for text in record["shards"]]
     if shards == [ALL]:
         shards = [Shard(number, of) for number in range(1, of + 1)]
-    # Notes of an earlier merge, which this one makes again.
-    notes = [note for note in notes if not note.startswith(_MISSING) and NO_POINTS not in note]
-    return _Part(place, record, shards, record["campaign"]["count"], notes)
+    return _Part(place, record, shards, record["campaign"]["count"])
 
 
 def _of_survey(place: Storage, run: Storage) -> _Part:
-    """Read a shard of a survey; LookupError if it is none, or not finished."""
+    """Read a shard of a survey; LookupError if it is none or not finished.
+
+    LidarpoolError if its database is damaged.
+    """
     with tempfile.TemporaryDirectory(prefix="lidarpool-") as folder:
-        fetch_database(run, Path(folder, FILE))
-        with closing(RunDatabase(Path(folder, FILE), durable=False)) as db:
-            meta = {"casting": "{}"} | db.meta
-            told = ("identity", "casting", "made_of", "notes")
-            record = {**meta, "files": [], **{name: json.loads(meta[name]) for name in told}}
-            shard, whole = Shard.parse(record["identity"].pop("shard")), record["made_of"]["scans"]
-            kept = db.job(0, shard.scans(whole).stop, shard.scans(whole).start)
-            if not kept.complete:
-                raise LookupError("scans are missing")
-            return _Part(place, record, [shard], whole, record["notes"], kept.ordered, kept.trials)
+        path = Path(folder, FILE)
+        fetch_database(run, path)
+        try:
+            with closing(RunDatabase(path, durable=False)) as db:
+                meta = {"casting": "{}"} | db.meta
+                texts = ("identity", "casting", "made_of", "notes")
+                record = {**meta, "files": [], **{name: json.loads(meta[name]) for name in texts}}
+                shard = Shard.parse(record["identity"].pop("shard"))
+                scan_count = record["made_of"]["scans"]
+                scans = shard.scans(scan_count)
+                kept = db.job(0, scans.stop, scans.start)
+                if not kept.complete:
+                    raise LookupError("scans are missing")
+                return _Part(place, record, [shard], scan_count, kept.ordered, kept.trials)
+        except DamagedError as error:
+            raise LidarpoolError(
+                f"{run.path(FILE)} is damaged: run its shard again with --resume, which makes it "
+                "anew from the points, and merge again."
+            ) from error
 
 
 def _check(parts: Sequence[_Part], partial: bool, own: _Part | None = None) -> list[str]:
@@ -233,40 +278,132 @@ def _merge_dataset(
         sensors = with_sensors(sensors, part.record["sensors"].items())
     cast = next((part for part in known if part.record["casting"]), parts[0])
     campaign = max(known, key=lambda part: part.whole).record["campaign"]
-    record = {**cast.record, "sensors": sensors, "campaign": campaign}
+    record = {**cast.record, "sensors": sensors, "campaign": campaign, "notes": notes}
     dataset = DataSet(replace(out, durable=False), **campaign["keep"])
     dataset.check_installed()
     if own is None:  # from now on it is known whose files these are
         write_record(out, record | {"shards": []})
-    damaged = list[str]()
-    with explained(f"{out} cannot be merged"):
-        for part in parts:
-            left = sum(len(part.done(shard)) for shard in part.shards)
-            for _, wrong in dataset.take(part.place, read_table(part.place)):
-                damaged += [wrong] if wrong else []
-                left -= 1
-            damaged += [part.place.path(TABLE_FILE)] if left > 0 else []
-    if damaged:
-        raise LidarpoolError(f"missing or damaged: {listed(damaged, NAMED)}; {_AGAIN}.")
-    lacking, there = _missing(known), {shard for part in known for shard in part.shards}
-    record["shards"] = [*map(str, sorted(there.difference(lacking)) if lacking else [ALL])]
-    if empty := [row for row in _rows(known) if row.done and not row.points]:
-        notes.append(empty_jobs_warning(empty, ""))
-        screen.warn(notes[-1])
-    more = {"sensors": sensors, "notes": tuple(notes)}
-    run = CampaignRun.of(_rows(known), 0.0, 0, **more)
-    report = write_shared(dataset, record, run, lambda: _rows(known))[1]
+    with tempfile.TemporaryDirectory(prefix="lidarpool-") as folder:
+        files = [_RowFile(Path(folder, str(index))) for index in range(len(known))]
+        damaged = list[str]()
+        with explained(f"{out} cannot be merged"):
+            for part, file in zip(parts, files[-len(parts) :], strict=True):
+                file.write(part, _taken(part, dataset, damaged), _seconds(part, notes))
+            if own:
+                files[0].write(own, _rows_of(own, dataset), _seconds(own, notes))
+        if not damaged:
+            damaged += _lacking(known, _merged(files))
+        if damaged:
+            raise LidarpoolError(f"missing or damaged: {listed(damaged, NAMED)}; {_AGAIN}.")
+        lacking, there = _missing(known), {shard for part in known for shard in part.shards}
+        record["shards"] = [*map(str, sorted(there.difference(lacking)) if lacking else [ALL])]
+        if empty := [row for row in _merged(files) if row.done and not row.points]:
+            notes.append(empty_jobs_warning(empty, ""))
+            screen.warn(notes[-1])
+        record["notes"] = notes
+        more = {"sensors": sensors, "notes": tuple(notes)}
+        run = CampaignRun.of(_merged(files), 0.0, 0, **more)
+        report = write_shared(dataset, record, run, lambda: _merged(files))[1]
     if own:  # a run with failed jobs, which would go on with what it knows of them
         remove_run(out.below(RUN_FOLDER))
     return report
 
 
-def _rows(parts: Sequence[_Part]) -> Iterator[JobRow]:
+class _RowFile:
+    """Rows of the jobs of a part in a temporary file: manifests are read once, one at a time."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._offsets: dict[int, int] = {}  # {number of a job: first byte of its row}
+
+    def write(
+        self, part: _Part, rows: Iterator[JobRow], seconds: Mapping[int, tuple[str, float]]
+    ) -> None:
+        """Write rows with their seconds of casting.
+
+        LidarpoolError if the part cannot have such a job, or two manifests are of one job.
+        """
+        ranges = [part.done(shard) for shard in part.shards]
+        with self._path.open("wb") as file:
+            for row in rows:
+                path, number = part.place.path(manifest_file(row.name)), row.number
+                if not any(number in numbers for numbers in ranges):
+                    raise LidarpoolError(
+                        f"{path} is of job {number}, which is not in shard "
+                        f"{listed([*map(str, part.shards)])} of {part.whole:,} jobs: move it "
+                        "elsewhere, and merge again."
+                    )
+                if number in self._offsets:
+                    raise LidarpoolError(
+                        f"{path} is of job {number}, of which there is another manifest: move one "
+                        "of them elsewhere, and merge again."
+                    )
+                sha256, casting_s = seconds.get(number, ("", 0.0))
+                row = replace(row, seconds=casting_s) if sha256 == row.sha256 else row
+                self._offsets[number] = file.tell()
+                file.write(json.dumps(asdict(row)).encode() + b"\n")
+
+    def rows(self) -> Iterator[JobRow]:
+        """Yield the rows in the order of numbers."""
+        if self._offsets:
+            with self._path.open("rb") as file:
+                for _, offset in sorted(self._offsets.items()):
+                    file.seek(offset)
+                    yield JobRow.of(json.loads(file.readline()))
+
+
+def _taken(part: _Part, dataset: DataSet, damaged: list[str]) -> Iterator[JobRow]:
+    """Take the jobs of a part into a data set; yields their rows, adds files to `damaged`."""
+    for _, row, wrong in dataset.take(part.place, fingerprint(dict(part.record["identity"]))):
+        damaged += [wrong] if wrong else []
+        if row is not None:
+            yield row
+
+
+def _rows_of(own: _Part, dataset: DataSet) -> Iterator[JobRow]:
+    """Yield the rows of the shards that the data set had before."""
+    ranges = [own.done(shard) for shard in own.shards]
+    for row, _ in dataset.rows():
+        if any(row.number in numbers for numbers in ranges):
+            yield row
+
+
+def _seconds(part: _Part, notes: list[str]) -> dict[int, tuple[str, float]]:
+    """Return {number: hash of points and seconds of casting}, which only jobs.csv has.
+
+    A note says if the table is damaged; then nothing is known.
+    """
+    if not part.shards:
+        return {}
+    try:
+        table = read_table(part.place, read_index(part.place)["table"])
+        return {row.number: (row.sha256, row.seconds) for row in table}
+    except LidarpoolError:
+        notes.append(
+            f"{part.place.path(TABLE_FILE)} is damaged or edited: the rows of its jobs are those "
+            "of their manifests, without seconds"
+        )
+    return {}
+
+
+def _lacking(parts: Sequence[_Part], rows: Iterator[JobRow]) -> list[str]:
+    """List the jobs of parts that have no row, as a folder and a number."""
+    numbers = {row.number for row in rows}
+    return [
+        f"the manifest of job {number} in {part.place}"
+        for part in parts
+        for shard in part.shards
+        for number in part.done(shard)
+        if number not in numbers
+    ]
+
+
+def _merged(files: Sequence[_RowFile]) -> Iterator[JobRow]:
     """Yield the rows of all jobs by number; of a job of several parts, one that is done."""
     number = attrgetter("number")
-    tables = [read_table(part.place) for part in parts if part.shards]
+    tables = [file.rows() for file in files]
     for _, rows in groupby(heapq.merge(*tables, key=number), number):
-        yield max(reversed([*rows]), key=attrgetter("done"))  # the first of equals
+        yield max(rows, key=attrgetter("done", "seconds"))
 
 
 def _merge_survey(

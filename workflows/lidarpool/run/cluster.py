@@ -7,17 +7,17 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
 from typing import Any
 
-from distributed import Client
+from distributed import Client, get_worker
 from distributed.client import FutureCancelledError
 from distributed.comm.core import CommClosedError
 
-from poolpart import Partition, PipeClosed, PipeFailed, PoolError
+from poolpart import Partition, PipeClosed, PipeFailed, PoolError, own_client
 
 from ..base.errors import LidarpoolError
 from ..pipeline.names import GPU, LIDAR, OTHER
 from ..scenario.build import Job
 from .checks import check_workers, find_workers, gpu_note, slots_needed
-from .connection import connected, local_client, started_client
+from .connection import check_starts_workers, connected, local_client, started_client
 from .options import RunOptions
 from .progress import Screen
 from .store import RunStore
@@ -37,10 +37,14 @@ def client_of(
     if options.client is not None:
         return nullcontext(options.client)
     if options.scheduler is not None:
+        with suppress(ValueError):  # outside of tasks there is no worker
+            if get_worker().scheduler.address == options.scheduler:
+                return nullcontext(own_client())
         return connected(options.scheduler, options.files, waiting)
     if options.cluster is not None:
         started = started_client(options.cluster, screen.tell)
         return screen.starting(started, f"starting {options.cluster}")
+    check_starts_workers()
     workers = options.gpu_workers, options.other_workers
     local = local_client(needed, *workers, tls=options.tls)
     return screen.starting(local, "starting the workers", own=True)

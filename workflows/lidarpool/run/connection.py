@@ -14,13 +14,14 @@ from contextlib import (
     nullcontext,
     suppress,
 )
+from multiprocessing import current_process
 from pathlib import Path
 from typing import Any, NamedTuple
 from urllib.parse import urlsplit
 
 import dask
 from dask.system import CPU_COUNT
-from distributed import Client, Security, SpecCluster
+from distributed import Client, Security, SpecCluster, get_worker
 from distributed.comm import connect
 from distributed.utils import LoopRunner
 
@@ -96,6 +97,21 @@ def local_cluster(
     lidar = (min(1, lidar_slots), max(1, lidar_slots))
     return poolpart.deploy.local_cluster(
         {GPU: (gpu_workers, 1), LIDAR: lidar, OTHER: (other_workers, 1)}, **options
+    )
+
+
+def check_starts_workers() -> None:
+    """Check that this process may start workers; LidarpoolError in a task of Dask or a daemon."""
+    try:
+        get_worker()
+        place = "in a task of Dask"
+    except ValueError:  # outside of tasks
+        place = "in a daemonic process, such as a worker of a DataLoader,"
+        if not current_process().daemon:
+            return
+    raise LidarpoolError(
+        f"A run without a client starts workers, which {place} cannot be done: give "
+        "client=distributed.get_client() in a task, or call it in a process of its own."
     )
 
 

@@ -26,7 +26,7 @@ class RunResult:
     Parameters
     ----------
     points
-        The points, in parts: read in order a piece at a time, or written with their `save`.
+        The points, in parts: read in order a piece at a time, or written by `save_cloud`.
     plan, trials
         The best path and all trials; None and empty without planning.
     backend

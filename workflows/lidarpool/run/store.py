@@ -171,7 +171,7 @@ class RunStore:
             places = [shared.below(one) for one in shared.entries() if PARTS_FOLDER.fullmatch(one)]
         for place in places:
             for name in place.sizes():
-                with suppress(ValueError, LookupError, TypeError, OSError):
+                with suppress(ValueError, LookupError, TypeError, AttributeError, OSError):
                     told = json.loads(place.read(name)) if name.endswith("-mark") else {}
                     if told.pop("place") == self.place.url and name == mark_name(told["mark"]):
                         return {key: str(value) for key, value in told.items()}

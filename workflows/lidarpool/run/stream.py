@@ -12,7 +12,7 @@ import uuid
 from collections import deque
 from collections.abc import Callable, Generator, Sequence
 from contextlib import closing
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from importlib.util import find_spec
 from typing import Any
 
@@ -61,13 +61,21 @@ class SweepStream:
     """The sweeps of some jobs of a campaign, which are cast while they are read.
 
     Each loop casts all again, with the same result. When it is over or left, its tasks are
-    cancelled and the workers that it has started are stopped.
+    cancelled and the workers that it has started are stopped. A pickled copy connects to the
+    scheduler of the client, and in a task of that cluster takes the client of the task's worker.
     """
 
     campaign: CampaignSpec
     numbers: Sequence[int]  # of the jobs
     ahead: int  # most sweeps that are being cast, or wait to be read
     options: RunOptions
+
+    def __getstate__(self) -> dict[str, Any]:
+        options = self.options
+        if (client := options.client) is not None:
+            address = getattr(client.scheduler, "address", "")
+            options = replace(options, client=None, scheduler=address)
+        return self.__dict__ | {"options": options}
 
     def __iter__(self) -> Generator[Sweep]:
         options, screen = self.options, Screen()

@@ -67,7 +67,7 @@ class Rig:
     def _assemble(
         self, scene: Scene, survey: Survey, options: dict[str, Any], like: SceneCaster | None
     ) -> None:
-        self.scene, self.survey, self._options = scene, survey, options
+        self.scene, self.survey, self.options = scene, survey, options
         self._ways = Ways.of(scene.actors)
         wavelengths = {carried.sensor.optics.wavelength_nm for carried in survey.carried}
         self._surfaces = Surfaces(scene, tuple(survey.materials), sorted(wavelengths))
@@ -102,7 +102,7 @@ class Rig:
         The tree of all that stands still is shared.
         """
         rig = copy(self)
-        rig._assemble(scene, survey, self._options, self._caster)
+        rig._assemble(scene, survey, self.options, self._caster)
         return rig
 
     def with_actors(self, actors: tuple[Actor, ...]) -> Rig:

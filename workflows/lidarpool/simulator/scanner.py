@@ -42,8 +42,9 @@ from .scene_caster import check_backend_here
 from .surfaces import warn_of_grey
 
 SCANS_MOST = 1 << 31  # the type of the column `scan`
-Number = Annotated[int, Field(ge=0)]
-Start = Annotated[float | None, Field(ge=0, lt=float("inf"))]
+START_MOST_S = 9e9  # times are int64, nanoseconds
+Number = Annotated[int, Field(ge=0, lt=SCANS_MOST)]
+Start = Annotated[float | None, Field(ge=0, lt=START_MOST_S)]
 
 
 class Scanner:
@@ -52,7 +53,8 @@ class Scanner:
     It gives the bytes that a survey gives for the same scans: sweep `number` is the turn (or frame)
     of that number of a survey along the same trajectory, with the same random numbers if the sensor
     is the survey's first. Scanners of equal names and equal seeds of their noise repeat the random
-    numbers of each other. Threads may share a scanner.
+    numbers of each other. Threads may share a scanner. A pickled copy gives the same bytes, as in a
+    task of Dask: the copy makes its own trees, and goes on where the scanner was.
 
     Parameters
     ----------
@@ -136,10 +138,14 @@ class Scanner:
             wet=wet,
             spray_g_m3=spray_g_m3,
         )
-        check_backend_here(backend)
         warn_of_grey(scene, survey)
+        self._begin(scene, survey, {"backend": backend, "threads": threads, "device": device})
+
+    def _begin(self, scene: Scene, survey: Survey, options: dict[str, Any]) -> None:
+        """Make the rig; `options` are those of `Rig`."""
+        check_backend_here(options["backend"])
         try:
-            self._rig = Rig(scene, survey, backend, threads, device)
+            self._rig = Rig(scene, survey, **options)
         except ValueError as error:  # of threads or device
             raise LidarpoolError(str(error)) from error
         self._actors = list(scene.actors)
@@ -152,6 +158,16 @@ class Scanner:
         # Sweeps share the caster, and copies are moved in it.
         self._lock, self._casts, self._moves = threading.Condition(), 0, 0
         self._unnumbered = 0  # sweeps and images without a number so far
+
+    def __getstate__(self) -> dict[str, Any]:
+        with self._lock:
+            rig = self._rig
+            made_of = {"scene": rig.scene, "survey": rig.survey, "options": rig.options}
+            return {"made_of": made_of, "unnumbered": self._unnumbered}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self._begin(**state["made_of"])
+        self._unnumbered = state["unnumbered"]
 
     def __repr__(self) -> str:
         rig = self._rig

@@ -1,0 +1,332 @@
+"""Damage files of results and runs, and read them: `python -m tests.chaos.damage`.
+
+Each file of a result, a data set, its shards and a stored run gets flipped bits and is cut, one
+damage at a time. All readers of the file must then give what they gave before, or end with an error
+of a line or two; for files with checksums what they give must be the same. A seed repeats it.
+"""
+
+from __future__ import annotations
+
+import argparse
+import hashlib
+import logging
+import random
+import re
+import shutil
+import sys
+import tempfile
+import time
+import traceback
+import warnings
+from collections import Counter
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, redirect_stderr, redirect_stdout
+from dataclasses import dataclass, field
+from io import StringIO
+from pathlib import Path
+
+import numpy as np
+from distributed import Client
+from tests.clusters import thread_cluster
+
+import lidarpool
+from lidarpool import Campaign, LidarpoolError
+from lidarpool.base.storage import Storage
+from lidarpool.cli.commands import cli
+from lidarpool.report.campaign_output import verify
+from lidarpool.scenario.build import build
+from lidarpool.scenario.scenario import Scenario
+
+BASE = """
+sensor: {rays_per_revolution: 90, layers: 4, step_deg: 4}
+poses: [[0, 0, 1]]
+steps: 25
+actors: [{name: Car, box: [4, 2, 1.5], at: {position: [6, 0, 0]}}]
+cloud: {keep_every: 1}
+planning: {enabled: false}
+pool: {backend: numpy, gpu: 1}
+"""
+CAMPAIGN = """
+base: base.yaml
+count: 4
+seed: 3
+vary: {noise.range_m: {uniform: [0.001, 0.05]}}
+keep: folder
+splits: {train: 0.5, val: 0.5}
+"""
+SLOTS = ({"GPU": 1}, {"LIDAR": 5}, {"OTHER": 1})
+CUTS = 0.25  # share of the damages that cut a file
+LINES_MOST = 3  # of an error, with its advice
+SLOWEST_S = 60.0  # for a reader
+
+Reader = Callable[[Path], str]  # reads what is in a folder; returns a digest of what it read
+
+
+@dataclass
+class Outcome:
+    """What became of damaged files."""
+
+    ends: Counter[str] = field(default_factory=Counter)  # {"right", "refused", …: how often}
+    faults: list[str] = field(default_factory=list)  # what should not have happened
+
+    def __str__(self) -> str:
+        ends = ", ".join(f"{count} {name}" for name, count in sorted(self.ends.items()))
+        return f"damages {self.ends.total()} ({ends}) faults {len(self.faults)}"
+
+
+def digest_of(*arrays: object) -> str:
+    """Return the hash of arrays."""
+    digest = hashlib.sha256()
+    for values in arrays:
+        digest.update(np.ascontiguousarray(values).tobytes())
+    return digest.hexdigest()
+
+
+# -- readers ---------------------------------------------------------------------------------------
+
+
+def read_sweeps(place: Path) -> str:
+    """Read all sweeps of a data set."""
+    saved = lidarpool.sweeps(place)
+    words = [f"{one.job} {one.split} {dict(one.values)}" for one in saved]
+    return f"{words} {digest_of(*(one.points for one in saved))}"
+
+
+def read_verified(place: Path) -> str:
+    """Compare all files of a data set with what is kept of them."""
+    return verify(Storage.at(place))
+
+
+def merged(shards: Path) -> str:
+    """Merge the shards of a campaign or survey; returns all but times and notes."""
+    with tempfile.TemporaryDirectory() as folder:
+        out = Path(folder, "out")
+        lidarpool.merge([shards / "part-1", shards / "part-2"], out)
+        if not (out / "dataset.json").exists():
+            return digest_of(np.fromfile(out / "cloud.ply", np.uint8))
+        return read_sweeps(out) + read_verified(out)
+
+
+class Resumed:
+    """Resumes a data set, or a run, with a cluster of threads."""
+
+    def __init__(self, client: Client, source: Path) -> None:
+        self._client, self._source = client, source
+
+    def campaign(self, place: Path) -> str:
+        """Resume a campaign."""
+        campaign = Campaign.load(self._source / "c.yaml")
+        campaign.run(place, client=self._client, verify=True)
+        return read_sweeps(place) + read_verified(place)
+
+    def survey(self, place: Path) -> str:
+        """Resume a survey."""
+        job = build(Scenario.load(self._source / "base.yaml")).job()
+        result = lidarpool.simulate(
+            job.scene, job.survey, client=self._client, backend="numpy", folder=place / "run",
+            resume=True, batch_mb=1,
+        )  # fmt: skip
+        return digest_of(result.cloud.positions)
+
+
+def shown(place: Path) -> str:
+    """Answer what the page of a result asks."""
+    from lidarpool.live.view import open_result
+
+    view = open_result(place)
+    header, _ = view.answer("state", {}, lambda: False)
+    for column in view.columns:
+        view.answer("points", {"colour": column, "most": "1000"}, lambda: False)
+        view.answer("column", {"name": column}, lambda: False)
+    if view.pictured is not None:
+        view.answer("surface", {"colour": "object"}, lambda: False)
+    if view.sweeps is not None and len(view.sweeps):
+        view.answer("range", {"sweep": "0"}, lambda: False)
+    view.answer("point", {"row": "0"}, lambda: False) if header["points"] else None
+    return ""  # a cloud has no checksum
+
+
+def commanded(*arguments: str) -> Reader:
+    """Return a reader that runs a command on a result and a folder for what it writes."""
+
+    def read(place: Path) -> str:
+        with tempfile.TemporaryDirectory() as out:
+            texts = [one.format(place=place, out=out) for one in arguments]
+            cli.main(texts, standalone_mode=False)
+        return ""
+
+    return read
+
+
+RESULT_READERS = {
+    "view": shown,
+    "compare": commanded("compare", "{place}", "{place}/../whole", "--out", "{out}"),
+    "export": commanded("export", "{place}", "-f", "las", "-f", "kitti", "--out", "{out}"),
+    "plot": commanded("plot", "{place}", "--out", "{out}"),
+}
+
+
+# -- damage ----------------------------------------------------------------------------------------
+
+
+def damaged(data: bytes, chance: random.Random) -> bytes:
+    """Flip a bit of a file's content, or cut it."""
+    at = chance.randrange(len(data))
+    if chance.random() < CUTS:
+        return data[:at]
+    return data[:at] + bytes([data[at] ^ 1 << chance.randrange(8)]) + data[at + 1 :]
+
+
+def files_of(folder: Path) -> list[Path]:
+    """Files in a folder as paths relative to it, one of those whose names differ in numbers."""
+    kinds: dict[str, Path] = {}
+    for path in sorted(folder.rglob("*")):
+        if path.is_file() and path.stat().st_size:
+            file = path.relative_to(folder)
+            kinds.setdefault(re.sub(r"[0-9a-f]*\d[0-9a-f]*", "0", str(file)), file)
+    return [*kinds.values()]
+
+
+def attempt(reader: Reader, place: Path) -> tuple[str, str]:
+    """Read a damaged place; returns how it ended, and what was read or said."""
+    started = time.monotonic()
+    try:
+        with redirect_stdout(StringIO()), redirect_stderr(StringIO()), warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            read = reader(place)
+    except LidarpoolError as error:
+        lines = str(error).count("\n") + 1
+        return ("refused" if lines <= LINES_MOST else "many lines"), str(error)
+    except Exception:
+        return "traceback", traceback.format_exc()
+    return ("read" if time.monotonic() - started < SLOWEST_S else "slow"), read
+
+
+@contextmanager
+def copied(whole: Path) -> Iterator[Path]:
+    """Copy a folder beside `whole`, to be damaged."""
+    copy = whole.with_name("damaged")
+    shutil.copytree(whole, copy)
+    try:
+        yield copy
+    finally:
+        shutil.rmtree(copy)
+
+
+def attack(
+    whole: Path, reader: Reader, file: Path, count: int, chance: random.Random, outcome: Outcome,
+    name: str,
+) -> None:  # fmt: skip
+    """Damage a file some times, and read what it is of each time."""
+    data = (whole / file).read_bytes()
+    with copied(whole) as copy:
+        _, expected = attempt(reader, copy)
+    for _ in range(count):
+        content = damaged(data, chance)
+        with copied(whole) as copy:
+            path = copy / file
+            path.unlink()
+            path.write_bytes(content)
+            end, words = attempt(reader, copy)
+        if end == "read":
+            end = "right" if words == expected else "wrong"
+        outcome.ends[end] += 1
+        if end not in ("right", "refused"):
+            outcome.faults.append(f"{name} of {file}: {end}\n{words}")
+
+
+@dataclass
+class Target:
+    """A folder, who reads it, and which of its files are damaged."""
+
+    whole: Path
+    readers: dict[str, Reader]
+    chosen: Callable[[Path], bool] = lambda file: True
+
+
+def targets(folder: Path, client: Client) -> list[Target]:
+    """Make a result, a data set, shards of both, and an unfinished run."""
+    (folder / "base.yaml").write_text(BASE)
+    (folder / "c.yaml").write_text(CAMPAIGN)
+    wholes = {name: folder / name / "whole" for name in ("result", "set", "shards", "runs", "run")}
+    for whole in wholes.values():
+        whole.mkdir(parents=True)
+    scheduler = ("--scheduler", client.scheduler.address, "-q")
+    run = ["run", str(folder / "base.yaml"), *scheduler]
+    with redirect_stdout(StringIO()), redirect_stderr(StringIO()):
+        cli.main([*run, "--out", str(wholes["result"])], standalone_mode=False)
+        for number in (1, 2):
+            out, shard = wholes["runs"] / f"part-{number}", f"{number}/2"
+            cli.main([*run, "--out", str(out), "--shard", shard], standalone_mode=False)
+    campaign = Campaign.load(folder / "c.yaml")
+    campaign.run(wholes["set"], client=client, overwrite=True)
+    for number in (1, 2):
+        campaign.run(wholes["shards"] / f"part-{number}", client=client, shard=(number, 2))
+    job = build(Scenario.load(folder / "base.yaml")).job()
+    lidarpool.simulate(
+        job.scene, job.survey, client=client, backend="numpy", folder=wholes["run"] / "run",
+        batch_mb=1,
+    )  # fmt: skip
+    resumed = Resumed(client, folder)
+
+    def is_kept(file: Path) -> bool:
+        """Whether the readers of a data set rely on a file."""
+        return file.suffix in (".json", ".csv", ".npz", ".ply") and file.name != "report.json"
+
+    return [
+        Target(wholes["shards"], {"merge": merged}, is_kept),
+        Target(wholes["runs"], {"merge of runs": merged}),
+        Target(wholes["set"], {"sweeps": read_sweeps}, lambda f: is_kept(f) and f.suffix != ".ply"),
+        Target(wholes["set"], {"resume": resumed.campaign}, is_kept),
+        Target(wholes["run"], {"resume of a run": resumed.survey}),
+        Target(wholes["result"], RESULT_READERS),
+    ]
+
+
+def fuzz(count: int, seed: int, seconds: float = float("inf"), tell: bool = False) -> Outcome:
+    """Damage files until each had `count` damages, in an order by chance, or the time is over."""
+    chance, outcome = random.Random(seed), Outcome()
+    with (
+        tempfile.TemporaryDirectory(prefix="damage-") as folder,
+        thread_cluster(*SLOTS) as cluster,
+        Client(cluster, set_as_default=False) as client,
+    ):
+        rounds = [
+            (target, name, reader, file)
+            for target in targets(Path(folder), client)
+            for name, reader in target.readers.items()
+            for file in files_of(target.whole)
+            if target.chosen(file)
+        ]
+        chance.shuffle(rounds)
+        started = time.monotonic()
+        for target, name, reader, file in rounds:
+            if time.monotonic() - started > seconds:
+                break
+            before = len(outcome.faults)
+            attack(target.whole, reader, file, count, chance, outcome, name)
+            if tell:
+                print(
+                    f"{time.monotonic() - started:5.0f} s: {name} of {file}: {outcome}", flush=True
+                )
+                print("\n".join(outcome.faults[before:]), end="", flush=True)
+    return outcome
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Damage files; returns 0 if all readers ended right or with a line."""
+    parser = argparse.ArgumentParser(prog="tests.chaos.damage", description=__doc__)
+    parser.add_argument("--count", type=int, default=200, help="damages of each file and reader")
+    parser.add_argument("--seed", type=int, default=None, help="random by default")
+    parser.add_argument("--seconds", type=float, default=float("inf"), help="begin none later")
+    options = parser.parse_args(arguments)
+    logging.disable(logging.CRITICAL)
+    seed = random.SystemRandom().randrange(10**6) if options.seed is None else options.seed
+    print(f"seed {seed}", flush=True)
+    outcome = fuzz(options.count, seed, options.seconds, tell=True)
+    print(outcome)
+    return 1 if outcome.faults else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

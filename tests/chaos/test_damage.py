@@ -1,0 +1,100 @@
+"""Damaged files of results and runs end in a line, or are read right; the rest in `damage`."""
+
+from __future__ import annotations
+
+import random
+from contextlib import closing
+from pathlib import Path
+
+import pytest
+from tests.chaos.damage import (
+    Outcome,
+    Reader,
+    attack,
+    damaged,
+    files_of,
+    fuzz,
+    read_sweeps,
+    read_verified,
+    shown,
+)
+from tests.drives import the_scene, the_sweeps, write_set
+
+from lidarpool import LidarpoolError
+from lidarpool.columns.parts import part_name
+from lidarpool.pipeline.database import RunDatabase
+from lidarpool.pipeline.messages import Receipt
+
+DAMAGES = 12  # of each file, for each reader
+
+
+@pytest.fixture(scope="module")
+def dataset(tmp_path_factory) -> Path:
+    """Return a data set of six jobs, of which one has failed."""
+    place = tmp_path_factory.mktemp("set") / "whole"
+    scene = the_scene()
+    write_set(place, "folder", scene, the_sweeps(scene))
+    return place
+
+
+def read_all(place: Path) -> str:
+    """Read all sweeps, and compare all files."""
+    return read_verified(place) + read_sweeps(place)
+
+
+READERS = {"sweeps": read_sweeps, "verify": read_all, "view": shown}
+
+
+@pytest.mark.parametrize("name", READERS)
+def test_files_of_a_data_set_are_read_right_or_refused(dataset, name):
+    reader: Reader = READERS[name]
+    whole = dataset / "jobs/00" if name == "view" else dataset
+    outcome, chance = Outcome(), random.Random(7)
+    for file in files_of(whole):
+        if name == "sweeps" and file.suffix == ".ply":  # compared by --verify alone
+            continue
+        if file.suffix != ".parquet":
+            attack(whole, reader, file, DAMAGES, chance, outcome, name)
+    assert not outcome.faults, "\n".join(outcome.faults)
+    assert outcome.ends["refused"] > DAMAGES
+
+
+def test_a_damaged_database_is_refused_or_the_same(tmp_path):
+    """Each flipped bit: SQLite itself does not notice those in values."""
+    path, copy = tmp_path / "run.db", tmp_path / "copy.db"
+
+    def content(database: RunDatabase) -> object:
+        job = database.job(0, 100)
+        rows = [*database.job_rows()]
+        return job.ordered, job.unframed(), job.trials, rows, database.meta
+
+    with closing(RunDatabase(path)) as db:
+        db.job(0, 100)
+        mark = db.meta["mark"]
+        for first in range(0, 100, 5):
+            name = part_name(mark, 0, first, first + 5)
+            box = (0, 0, 0, 9, 9, first)
+            db.commit([Receipt(0, first, first + 5, name, 7, 900, 21, box, b"summary" * 9)])
+        db.end_jobs((number, False, {"name": f"{number:04}"}) for number in range(1, 20))
+    with closing(RunDatabase(path)) as db:
+        expected = content(db)
+    data, chance, refused = path.read_bytes(), random.Random(7), 0
+    for _ in range(300):
+        copy.write_bytes(damaged(data, chance))
+        try:
+            with closing(RunDatabase(copy, durable=False)) as db:
+                found = content(db)
+        except LidarpoolError as error:
+            assert "\n" not in str(error)
+            refused += 1
+            continue
+        lost = set(map(str, found[3])) ^ set(map(str, expected[3]))
+        assert found == expected or not copy.stat().st_size, lost
+    assert refused > 50
+
+
+@pytest.mark.slow
+def test_files_of_results_and_runs_are_read_right_or_refused():
+    outcome = fuzz(3, seed=5, seconds=120)
+    assert not outcome.faults, "\n".join(outcome.faults)
+    assert outcome.ends["right"] and outcome.ends["refused"]
