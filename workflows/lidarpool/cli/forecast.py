@@ -111,6 +111,8 @@ def look_at(
         with terminal.status("casting some rays"):
             found = forecast(job, options.with_pool(read.pool, backend), client)
         found["notes"] += advice(built)
+        if campaign is not None:
+            found["notes"] += campaign.keep.of_jobs.contradictions(read.cloud.coordinates)
         found["sources"] = dict(built.found.sources)
         if campaign is not None:
             own = {"number": one, "name": campaign.name(one), "split": campaign.split(one)}

@@ -35,7 +35,7 @@ def write_e57(path: Path, cloud: CloudLike, sweeps: Sweeps) -> None:
 
 
 def _write_scan(file: Any, sweeps: Sweeps, sweep: int, points: Cloud) -> None:
-    x, y, z = sweeps.in_sensor(sweep, points.positions).T.copy()
+    x, y, z = sweeps.compensated(sweep, points).T.copy()
     data = {"cartesianX": x, "cartesianY": y, "cartesianZ": z}
     if "intensity" in points.columns:
         data["intensity"] = points["intensity"]

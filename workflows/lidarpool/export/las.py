@@ -24,17 +24,20 @@ from ..base.interrupts import deferred_interrupts
 from ..columns.cloud import Cloud, CloudLike
 from ..columns.table import COLOURS, TABLE
 from ..columns.waveforms import WAVEFORM, ZERO, records
-from .sweeps import Sweeps
+from .flight_lines import FlightLines
+from .sweeps import AS_FIRED, IN_WORLD, Sweeps
 
 ANGLE_DEG = 0.006  # of one step of the format's scan angle
 FULL = 65_535  # the format's intensity for 1 and above
-_OF_FORMAT = ("return_number", "returns", "azimuth")  # stored only in fields of the format
+_OF_FORMAT = ("return_number", "returns")  # stored only in fields of the format
 _GPS_NS = 315_964_800 * 10**9  # from 1970-01-01 to 1980-01-06, the start of GPS time
 _LEAP_S = 18  # that GPS time is ahead of UTC since 2017, the earliest start
 _ADJUSTED_S = 1e9  # that adjusted standard GPS time is behind GPS time
 _EVLR = Struct("<H16sHQ32s")  # head of an extended variable length record
 # Of the header: where the waveform packets and the first such record begin, and their number.
 _WAVES_AT, _WAVES = 227, Struct("<QQI")
+_TEXT_AREA = 3  # number of the record with a description in words
+_FRAMES = {"world": IN_WORLD, "sensor": AS_FIRED}
 _FAR = 2**31 - 1  # steps from the offset to the farthest point
 # Coordinate systems with UTM zones: name, datum, ellipsoid, 1 / flattening, and their EPSG codes.
 _WGS84 = ("WGS 84", "WGS_1984", "WGS 84", 298.257223563, (4326, 6326, 7030))
@@ -48,13 +51,14 @@ def _write(path: Path, cloud: CloudLike, sweeps: Sweeps, *, compress: bool) -> N
     """Write a cloud: columns with a field of the format there, the others in extra bytes.
 
     `time` is adjusted standard GPS time of a survey with a start, else seconds since the survey's
-    start. A coordinate system is stored as WKT. `return_number` and `returns` are as they are,
-    `azimuth` (-180 to 180 degrees) is the scan angle, `sensor` + 1 the point source. With `red`,
-    `green` and `blue` the point format is 7, and colours are 257 times these, 16 bits. Intensity is
-    the column `intensity` times 65,535, at most that, and classification `class` if it is below
-    256; because of these limits, both columns are in the extra bytes as well. Of these classes, the
-    lookup has 15 letters of the names, ASCII. Return numbers are 15 at most, and angles in steps of
-    0.006 degrees. Recorded waveforms make the point format 9, or 10 with colours; see `_Packets`.
+    start. A coordinate system is stored as WKT. `return_number` and `returns` are as they are. Scan
+    angle (steps of 0.006 degrees), scan direction, edge of flight line and point source are those
+    of `FlightLines`. With `red`, `green` and `blue` the point format is 7, and colours are 257
+    times these, 16 bits. Intensity is the column `intensity` times 65,535, at most that, and
+    classification `class` if it is below 256; because of these limits, both columns are in the
+    extra bytes as well. Of these classes, the lookup has 15 letters of the names, ASCII. Return
+    numbers are 15 at most. A text area record names the frame of the points. Recorded waveforms
+    make the point format 9, or 10 with colours; see `_Packets`.
     """
     coloured = {*COLOURS} <= {column.name for column in cloud.table}
     packets = _Packets.of(cloud)
@@ -76,6 +80,9 @@ def _write(path: Path, cloud: CloudLike, sweeps: Sweeps, *, compress: bool) -> N
         header.vlrs.append(lookup := laspy.vlrs.known.ClassificationLookupVlr())
         for number in range(256):  # the record has them all
             lookup[number] = sweeps.classes.get(number, "").encode("ascii", "replace")[:15].decode()
+    header.vlrs.append(
+        laspy.VLR("LASF_Spec", _TEXT_AREA, "frame", _FRAMES[sweeps.coordinates].encode() + b"\0")
+    )
     if packets is not None:
         header.vlrs.extend(packets.descriptors)
         header.global_encoding.waveform_data_packets_internal = True
@@ -106,8 +113,12 @@ def _write(path: Path, cloud: CloudLike, sweeps: Sweeps, *, compress: bool) -> N
             with laspy.open(
                 file, "w", header=header, do_compress=compress, closefd=False
             ) as writer:
-                for chunk in cloud.chunks():
+                for chunk, lines in FlightLines(sweeps).of(cloud.chunks()):
                     points = _points(chunk, header, names, begins_s)
+                    points.scan_angle = np.round(lines.scan_angle_deg / ANGLE_DEG).astype(np.int16)
+                    points.scan_direction_flag = lines.direction
+                    points.edge_of_flight_line = lines.edge
+                    points.point_source_id = lines.source
                     if packets is not None:
                         packets.put(points, chunk, beside)
                     with deferred_interrupts():  # lazrs replaces errors raised within it
@@ -197,16 +208,11 @@ def _points(chunk: Cloud, header: laspy.LasHeader, extra: list[str], begins_s: f
         record.gps_time = there["time"] / 1e9 + begins_s
     if "intensity" in there:
         record.intensity = np.round(np.clip(there["intensity"], 0, 1) * FULL).astype(np.uint16)
-    if "azimuth" in there:
-        turned = (there["azimuth"].astype(np.float64) + 180) % 360 - 180
-        record.scan_angle = np.round(turned / ANGLE_DEG).astype(np.int16)
     if "class" in there:
         record.classification = np.where(there["class"] < 256, there["class"], 0).astype(np.uint8)
     if {*COLOURS} <= {*there}:
         for name in COLOURS:
             record[name] = there[name].astype(np.uint16) * 257
-    if "sensor" in there:
-        record.point_source_id = there["sensor"].astype(np.uint16) + 1
     for name in extra:
         column = TABLE.get(name)
         record[_name(column.in_files if column else name)] = there[name]
