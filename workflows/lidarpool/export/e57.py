@@ -43,7 +43,9 @@ def _write_scan(file: Any, sweeps: Sweeps, sweep: int, points: Cloud) -> None:
         data |= {f"color{name.capitalize()}": points[name] for name in COLOURS}
     turn = np.roll(sweeps.pose.quaternions[sweep], 1)  # w first
     place = sweeps.pose.positions[sweep]
-    file.write_scan_raw(data, name=f"sweep {sweep}", rotation=turn, translation=place)
+    file.write_scan_raw(
+        data, name=f"sweep {sweep}, motion compensated", rotation=turn, translation=place
+    )
 
 
 @contextmanager

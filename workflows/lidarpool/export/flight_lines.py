@@ -19,7 +19,7 @@ _MAX_SOURCE = 65_535  # that the format holds
 _TURN_DEG = 20.0
 _STEADY_DEG = 5.0
 _STEADY_NS = 1e9
-_MIN_STEP_M = 1e-6  # between the ends of a sweep, below which a carrier stands
+_MIN_STEP_M = 1e-6  # of a carrier that moves: in 2 ms, or a sweep
 _LINES = 1 << 40  # numbers of lines of a station
 
 
@@ -49,8 +49,8 @@ class LineFields:
 class FlightLines:
     """Finds the fields of the points of a survey.
 
-    The direction of flight is that of the carrier during the sweep, or the x axis of a sensor that
-    stands. Sources are numbered by flight line or station, and with several sensors by sensor.
+    The direction of flight is that in which the sensor moves, or the x axis of one that stands.
+    Sources are numbered by flight line or station, and with several sensors by sensor.
     """
 
     def __init__(self, sweeps: Sweeps) -> None:
@@ -104,10 +104,10 @@ class FlightLines:
         poses = sweeps.firing_poses(sweep, points)
         exact = points.positions.astype(np.float64)
         in_world = poses.outward(exact) if sweeps.coordinates == "sensor" else exact
-        ahead = self._directions[sweep]
-        right = np.array([ahead[1], -ahead[0], 0.0])
+        ahead = _level(poses.moves, sweeps.pose.turns[sweep][:, 0])
         rays = in_world - poses.positions
-        fields.scan_angle_deg[rows] = np.degrees(np.arctan2(rays @ right, -rays[:, 2]))
+        to_right = rays[:, 0] * ahead[:, 1] - rays[:, 1] * ahead[:, 0]
+        fields.scan_angle_deg[rows] = np.degrees(np.arctan2(to_right, -rays[:, 2]))
         source = self._sources[sweep]
         fields.source[rows] = source if source <= _MAX_SOURCE else 0
         sensor = int(sweeps.sensor[sweep])
@@ -117,23 +117,18 @@ class FlightLines:
         station = int(self._stations[sweep])
         begin_ns = sweeps.begins_ns[sweep] - station * sweeps.station_ns
         line = mirror.numbers(begin_ns + sweeps.since_ns(sweep, points))
-        against = sweeps.pose.turns[sweep][:, 0] @ ahead < 0  # the sensor looks backwards
+        # The sensor looks backwards.
+        against = sweeps.pose.turns[sweep][:, 0] @ self._directions[sweep] < 0
         fields.direction[rows] = mirror.leftwards(line) == int(against)
         fields.line[rows] = (sensor * sweeps.stations + station) * _LINES + line
 
     @cached_property
     def _directions(self) -> Floats:
         """Level unit vectors (n, 3) of the direction of flight in each sweep."""
-        sweeps = self.sweeps
-        axes = sweeps.pose.turns[:, :, 0].copy()
-        if len(sweeps.knots):
-            moved = sweeps.knots[:, -1, :3].astype(np.float64)
-            moves = np.hypot(moved[:, 0], moved[:, 1]) > _MIN_STEP_M
-            axes[moves] = moved[moves]
-        axes[:, 2] = 0
-        lengths = np.linalg.norm(axes, axis=1)
-        axes[lengths < 1e-9] = (1, 0, 0)
-        return axes / np.where(lengths < 1e-9, 1, lengths)[:, None]
+        axes = self.sweeps.pose.turns[:, :, 0]
+        knots = self.sweeps.knots
+        moved = knots[:, -1, :3].astype(np.float64) if len(knots) else np.zeros_like(axes)
+        return _level(moved, axes)
 
     @cached_property
     def _stations(self) -> Ints:
@@ -151,6 +146,18 @@ class FlightLines:
             if lidar.lines is not None and len(sweeps.knots) and sweeps.stations == 1:
                 source[rows] = _flight_lines(self._directions[rows], sweeps.begins_ns[rows])
         return source * max(len(sweeps.sensors), 1) + sweeps.sensor + 1
+
+
+def _level(moves: Floats, axes: Floats) -> Floats:
+    """Return level unit vectors (k, 3) along movements (k, 3), or along axes where these are none.
+
+    `axes` are (k, 3) or (3,); where they point straight up or down, the direction is x.
+    """
+    stands = np.hypot(moves[:, 0], moves[:, 1]) < _MIN_STEP_M
+    ahead = np.where(stands[:, None], axes, moves) * (1.0, 1.0, 0.0)
+    lengths = np.linalg.norm(ahead, axis=1)
+    ahead[lengths < 1e-9] = (1.0, 0.0, 0.0)
+    return np.asarray(ahead / np.where(lengths < 1e-9, 1.0, lengths)[:, None])
 
 
 def _flight_lines(directions: Floats, begins_ns: Floats) -> Ints:

@@ -113,8 +113,8 @@ def write_mcap(
     compensated, in the sensor's axes at the start of the sweep, without times. `/tf` has the frames
     of the carrier (`base_link`) and of actors in `map`, and `/clock` the time, both at each sweep;
     `/tf_static` has the sensors on the carrier, and `/label_info` names of classes (LabelInfo of
-    vision_msgs). The survey begins at its start, or at `START_NS` without one. `/actors` has a MarkerArray of the boxes of actors
-    where their points of the sweep are.
+    vision_msgs). The survey begins at its start, or at `START_NS` without one. `/actors` has a
+    MarkerArray of the boxes of actors where their points of the sweep are.
 
     Instruments of the carrier are frames `imu` and `gnss` on it. `/imu/data_raw` has Imu, without
     orientations, and `/gnss/fix` NavSatFix or, where latitudes are not known, `/gnss/position`

@@ -25,6 +25,8 @@ class FiringPoses:
 
     positions: Floats  # (k, 3): metres, world coordinates
     turns: Floats  # (k, 3, 3): rotations from the sensor's axes to the world's
+    # (k, 3): metres that the sensor moves in 2 ms, or a longer part of the sweep, around the firing
+    moves: Floats
 
     def inward(self, points: Floats) -> Floats:
         """Convert points (k, 3) of the world to the sensor's axes at the firing of each."""
@@ -134,14 +136,17 @@ def poses_at(knots: Floats32, position: Floats, turn: Floats, shares: Floats) ->
     if intervals < 1:
         count = len(shares)
         return FiringPoses(
-            np.broadcast_to(position, (count, 3)), np.broadcast_to(turn, (count, 3, 3))
+            np.broadcast_to(position, (count, 3)),
+            np.broadcast_to(turn, (count, 3, 3)),
+            np.zeros((count, 3)),
         )
     at = np.clip(shares, 0, 1) * intervals
     before = np.minimum(at.astype(np.intp), intervals - 1)
     part = (at - before)[:, None]
     exact = knots.astype(np.float64)
     mixed = exact[before] * (1 - part) + exact[before + 1] * part
+    moves = np.diff(exact[:, :3], axis=0)[before]
     quaternions = mixed[:, 3:]
     # Of rotations 2 ms apart: a straight line between two is as good as an arc.
     quaternions /= np.linalg.norm(quaternions, axis=1, keepdims=True)
-    return FiringPoses(position + mixed[:, :3], turn @ matrices(quaternions))
+    return FiringPoses(position + mixed[:, :3], turn @ matrices(quaternions), moves)
