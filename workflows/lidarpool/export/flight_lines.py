@@ -8,7 +8,7 @@ from functools import cached_property
 
 import numpy as np
 
-from ..base.arrays import Bools, Bytes, Floats, Ints
+from ..base.arrays import Bools, Bytes, Floats, Indices, Ints
 from ..base.errors import LidarpoolError
 from ..columns.cloud import Cloud
 from .sweeps import MIXED_UP, Sweeps
@@ -59,10 +59,12 @@ class FlightLines:
     def of(self, chunks: Iterable[Cloud]) -> Iterator[tuple[Cloud, LineFields]]:
         """Yield consecutive points with their fields.
 
+        Points that are not in the order of their scans have no edges of lines.
+
         Raises
         ------
         LidarpoolError
-            If the points are not in the order of their scans, or of another survey.
+            If the points are of another survey.
         """
         held: tuple[Cloud, LineFields] | None = None
         for chunk in chunks:
@@ -81,15 +83,17 @@ class FlightLines:
     def _fields(self, chunk: Cloud) -> LineFields:
         """Return the fields of a chunk, whose end is taken for the end of a line."""
         fields = LineFields.empty(len(chunk))
-        if not len(self.sweeps):
+        if not len(self.sweeps) or "scan" not in chunk.columns:
             return fields
         sweep = np.searchsorted(self.sweeps.scans, chunk["scan"], "right") - 1
-        if sweep[-1] >= len(self.sweeps) or (np.diff(sweep) < 0).any():
+        if sweep.max() >= len(self.sweeps):
             raise LidarpoolError(MIXED_UP)
-        starts = np.flatnonzero(np.diff(sweep, prepend=-1)).tolist()
-        for start, stop in zip(starts, [*starts[1:], len(chunk)], strict=True):
-            self._fill(fields, slice(start, stop), int(sweep[start]), chunk[start:stop])
+        order = np.argsort(sweep, kind="stable")
+        for rows in np.split(order, 1 + np.flatnonzero(np.diff(sweep[order]))):
+            self._fill(fields, rows, int(sweep[rows[0]]), chunk[rows])
         line = fields.line
+        if (np.diff(sweep) < 0).any():
+            return fields
         # Index of the last point of each line; a pulse has one time, or without times one ray.
         ends = np.append(np.flatnonzero(np.diff(line)), len(line) - 1)
         last = ends[np.searchsorted(ends, np.arange(len(line)))]
@@ -98,13 +102,14 @@ class FlightLines:
         fields.edge[:] = (line >= 0) & same_pulse
         return fields
 
-    def _fill(self, fields: LineFields, rows: slice, sweep: int, points: Cloud) -> None:
+    def _fill(self, fields: LineFields, rows: Indices, sweep: int, points: Cloud) -> None:
         """Fill in the fields of the points of a sweep, but for edges."""
         sweeps = self.sweeps
         poses = sweeps.firing_poses(sweep, points)
         exact = points.positions.astype(np.float64)
         in_world = poses.outward(exact) if sweeps.coordinates == "sensor" else exact
-        ahead = _level(poses.moves, sweeps.pose.turns[sweep][:, 0])
+        steps = np.zeros((3, 1)) if poses.steps is None else poses.steps
+        ahead = _level(steps.T, sweeps.pose.turns[sweep][:, 0])
         rays = in_world - poses.positions
         to_right = rays[:, 0] * ahead[:, 1] - rays[:, 1] * ahead[:, 0]
         fields.scan_angle_deg[rows] = np.degrees(np.arctan2(to_right, -rays[:, 2]))

@@ -10,7 +10,7 @@ import numpy as np
 from ..base.arrays import Floats, Floats32, Ints
 from ..sensor import Pose, Survey, Trajectory
 from ..sensor.faults import faults_of, sent
-from ..sensor.trajectory import full_poses, matrices, quaternions_of
+from ..sensor.trajectory import full_poses, quaternions_of
 from .lidar_traits import LidarTraits
 
 KNOT_NS = 2e6  # between poses that are stored: at 10 m/s², 5 µm from a straight line
@@ -21,20 +21,47 @@ STILL = np.zeros((0, 0, 7), np.float32)  # knots of sensors that stand while the
 
 @dataclass(frozen=True, eq=False)
 class FiringPoses:
-    """Poses of a sensor at the firings of some points."""
+    """Poses of a sensor at the firings of some points of a sweep."""
 
-    positions: Floats  # (k, 3): metres, world coordinates
-    turns: Floats  # (k, 3, 3): rotations from the sensor's axes to the world's
-    # (k, 3): metres that the sensor moves in 2 ms, or a longer part of the sweep, around the firing
-    moves: Floats
+    position: Floats  # (3,): at the start of the sweep, metres, world coordinates
+    turn: Floats  # (3, 3): rotation from the sensor's axes at the start to the world's
+    # (3, k): metres from that position, in the world's axes; None if the sensor stands
+    since: Floats | None = None
+    quaternions: Floats | None = None  # (4, k): x, y, z, w of the rotations since the start
+    # (3, k): metres that the sensor moves in 2 ms, or a longer part of the sweep, around the firing
+    steps: Floats | None = None
+
+    @property
+    def positions(self) -> Floats:
+        """Positions (k, 3), or (3,) of a sensor that stands, metres, world coordinates."""
+        return self.position if self.since is None else self.position + self.since.T
 
     def inward(self, points: Floats) -> Floats:
         """Convert points (k, 3) of the world to the sensor's axes at the firing of each."""
-        return np.einsum("nji,nj->ni", self.turns, points - self.positions)
+        inside: Floats = (points - self.positions) @ self.turn
+        return inside if self.quaternions is None else _turned(inside, self.quaternions, -1.0)
 
     def outward(self, points: Floats) -> Floats:
         """Convert points (k, 3) in the sensor's axes at their firings to the world."""
-        return np.einsum("nij,nj->ni", self.turns, points) + self.positions
+        inside = points if self.quaternions is None else _turned(points, self.quaternions, 1.0)
+        outside: Floats = inside @ self.turn.T + self.positions
+        return outside
+
+
+def _turned(vectors: Floats, quaternions: Floats, sign: float) -> Floats:
+    """Rotate vectors (k, 3) by unit quaternions (4, k), or with sign -1 by their inverses: (k, 3).
+
+    v + 2 w (q x v) + 2 q x (q x v), q the vector of the quaternion (Rodrigues, 1840).
+    """
+    (a, b, c), w = sign * quaternions[:3], quaternions[3]
+    x, y, z = vectors.T
+    p, q, r = 2 * (b * z - c * y), 2 * (c * x - a * z), 2 * (a * y - b * x)
+    rows = [
+        x + w * p + (b * r - c * q),
+        y + w * q + (c * p - a * r),
+        z + w * r + (a * q - b * p),
+    ]
+    return np.stack(rows, axis=1)
 
 
 def knots_of(survey: Survey, lidars: Sequence[LidarTraits], turns: Floats) -> Floats32:
@@ -134,19 +161,13 @@ def poses_at(knots: Floats32, position: Floats, turn: Floats, shares: Floats) ->
     """
     intervals = len(knots) - 1
     if intervals < 1:
-        count = len(shares)
-        return FiringPoses(
-            np.broadcast_to(position, (count, 3)),
-            np.broadcast_to(turn, (count, 3, 3)),
-            np.zeros((count, 3)),
-        )
+        return FiringPoses(position, turn)
     at = np.clip(shares, 0, 1) * intervals
     before = np.minimum(at.astype(np.intp), intervals - 1)
-    part = (at - before)[:, None]
-    exact = knots.astype(np.float64)
-    mixed = exact[before] * (1 - part) + exact[before + 1] * part
-    moves = np.diff(exact[:, :3], axis=0)[before]
-    quaternions = mixed[:, 3:]
+    part = at - before
+    starts = np.ascontiguousarray(knots[:-1].T, np.float64)
+    steps = np.diff(np.asarray(knots.T, np.float64), axis=1).take(before, axis=1)
+    mixed = starts.take(before, axis=1) + steps * part
     # Of rotations 2 ms apart: a straight line between two is as good as an arc.
-    quaternions /= np.linalg.norm(quaternions, axis=1, keepdims=True)
-    return FiringPoses(position + mixed[:, :3], turn @ matrices(quaternions), moves)
+    mixed[3:] /= np.sqrt((mixed[3:] ** 2).sum(axis=0))
+    return FiringPoses(position, turn, mixed[:3], mixed[3:], steps[:3])
