@@ -28,7 +28,16 @@ from lidarpool.columns.ply_format import layout
 from lidarpool.export.formats import Format
 from lidarpool.export.sweeps import Sweeps
 
-COLUMNS = ("time", "class", "intensity", "reflectance", "range", "azimuth", "elevation")
+COLUMNS = (
+    "time",
+    "class",
+    "reflectivity",
+    "intensity",
+    "reflectance",
+    "range",
+    "azimuth",
+    "elevation",
+)
 TURNS = 100
 
 
@@ -42,7 +51,8 @@ def make(folder, points):
     places = np.stack([50 * np.cos(around), 50 * np.sin(around), rng.uniform(0, 5, points)], 1)
     columns = {"scan": scan, "channel": rng.integers(0, 64, points), "object": scan // 9 % 7}
     columns |= {"time": scan * 2_777_777, "class": scan // 9 % 5}
-    columns |= {name: rng.random(points, np.float32) for name in COLUMNS[2:]}
+    columns |= {"reflectivity": rng.integers(0, 256, points).astype(np.uint8)}
+    columns |= {name: rng.random(points, np.float32) for name in COLUMNS[3:]}
     save_cloud(Cloud(np.round(places, 3), columns), folder / "cloud.ply")
 
 

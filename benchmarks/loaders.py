@@ -93,6 +93,7 @@ def write(place, name):
     columns |= {"ray": rows % 40, "channel": rows % 4, "class": rng.integers(0, 30, count)}
     columns |= {"object": rng.integers(0, len(scene.all_names), count)}
     columns |= {"intensity": rng.random(count, np.float32), "time": columns["scan"] * 1000}
+    columns["reflectivity"] = rng.integers(0, 256, count).astype(np.uint8)
     cloud = lp.Cloud(np.round(rng.uniform(-60, 60, (count, 3)), 3), columns)
     jobs = [data.write_job(JobRow(n, f"{n:04}"), cloud, sweeps) for n in range(JOBS)]
     write_table(data.place, [], lambda: jobs)

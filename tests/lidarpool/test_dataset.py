@@ -247,7 +247,7 @@ def test_what_cannot_be_written_is_told_in_a_line(job, sweeps, tmp_path, monkeyp
     bare = Cloud(job(0).positions, {"scan": job(0).scan})
     with pytest.raises(LidarpoolError, match="kitti needs object, intensity, class"):
         DataSet(place, "kitti").write_job(JobRow(0, "0"), bare, sweeps)
-    assert DataSet(place, "kitti").columns == ("scan", "object", "intensity", "class")
+    assert DataSet(place, "kitti").columns == ("scan", "object", "reflectivity", "class")
     assert DataSet(place, "folder").columns == ()
     assert "range" in DataSet(place, "mcap", "ouster").columns
     half = replace(sweeps, scans=sweeps.scans[:4], begins_ns=sweeps.begins_ns[:3])

@@ -1,5 +1,6 @@
 """The table of a data set's jobs: what was varied and what came of it, with types kept."""
 
+import csv
 import dataclasses
 import hashlib
 from itertools import pairwise
@@ -79,6 +80,22 @@ def test_values_keep_their_types(tmp_path_factory, rows):
 
 def _sorted(values):
     return dict(sorted(values.items()))
+
+
+FORMULAS = ["=1+1", "+1+1", "-1+1", "@SUM(A1)", "\tx", "'=1", "''@x", "'quoted'", "-5", "-", "="]
+
+
+@pytest.mark.parametrize("text", FORMULAS)
+def test_no_cell_of_text_is_a_formula_for_spreadsheets(tmp_path, text):
+    row = JobRow(0, text, text, {"=varied": text, "+": -0.5}, text)
+    place = Storage.at(tmp_path)
+    write_table(place, ["=varied", "+"], lambda: [row])
+    assert list(read_table(place)) == [row]
+    with (tmp_path / "jobs.csv").open(newline="") as file:
+        header, cells = csv.reader(file)
+    assert (header[3:5], cells[4]) == (["'=varied", "'+"], "-0.5")  # a number is no formula
+    for cell in header + cells[:4] + cells[5:]:
+        assert not cell.startswith(("=", "+", "-", "@", "\t", "\r"))
 
 
 def test_a_table_is_whole_or_not_there(tmp_path):

@@ -108,6 +108,8 @@ def look_at(
             found = forecast(job, options.with_pool(read.pool, backend), client)
         found["notes"] += advice(built)
         found["warnings"] += implausibilities(built)
+        if campaign is not None:
+            found["notes"] += campaign.keep.of_jobs.contradictions(read.cloud.coordinates)
         found["sources"] = dict(built.found.sources)
         if campaign is not None:
             own = {"number": one, "name": campaign.name(one), "split": campaign.split(one)}

@@ -98,12 +98,18 @@ def plot(result: Path | Storage, out: Path | Storage | None, **given: Any) -> No
     show_default=True,
     help="Layout of points in mcap and rosbag2.",
 )
+@click.option(
+    "--compensated",
+    is_flag=True,
+    help="Points of mcap, rosbag2 and pcd at the start of the sweep, without their times.",
+)
 @options.copies
 @options.overwrite
 def export(
     result: Path | Storage,
     formats: tuple[str, ...],
     layout: str,
+    compensated: bool,
     out: Path | Storage | None,
     overwrite: bool,
 ) -> None:
@@ -134,7 +140,7 @@ def export(
                 )
         sweeps = Sweeps.load(made / SWEEPS_FILE)
         cloud = CloudFile(made / "cloud.ply")
-        wanted = [Format(name, layout) for name in dict.fromkeys(formats)]
+        wanted = [Format(name, layout, compensated) for name in dict.fromkeys(formats)]
         written: list[str] = []
         with result_folder(place) as folder:
             for one in wanted:  # before any is written, which may take long

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
@@ -141,7 +141,7 @@ def run_job(
     """
     assert options.out is not None, "commands write"
     place, name = Storage.at(options.out), campaign.name(number)
-    dataset = DataSet(place, campaign.keep.format, campaign.keep.layout)
+    dataset = DataSet(place, **asdict(campaign.keep))
     of_dataset = CAMPAIGN_FILE in place.entries()
     if of_dataset:
         backend = check_same(place, campaign)["backend"]

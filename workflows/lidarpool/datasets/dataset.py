@@ -101,6 +101,9 @@ class DataSet:
         kitti, nuscenes, webdataset, mcap, parquet, images or folder.
     layout
         Of points in mcap: velodyne, autoware, ouster or images.
+    compensated
+        Points in mcap are in the sensor's axes at the start of the sweep, and have no times; else
+        at their firing. `lidarpool.sweeps` gives both at the start of the sweep.
     made_with
         What the bytes of all jobs depend on, for JSON; each manifest says it.
     """
@@ -108,11 +111,12 @@ class DataSet:
     place: Storage
     format: Literal[tuple(DATA_SETS)]  # type: ignore[valid-type]
     layout: Literal[tuple(LAYOUTS)] = "velodyne"  # type: ignore[valid-type]
+    compensated: bool = False
     made_with: Mapping[str, Any] = field(default_factory=dict)
 
     @property
     def _of_jobs(self) -> Format:
-        return Format(DATA_SETS[self.format], self.layout)
+        return Format(DATA_SETS[self.format], self.layout, self.compensated)
 
     @property
     def columns(self) -> tuple[str, ...]:
@@ -219,6 +223,7 @@ class DataSet:
                 index = SealedWriter(file)
                 head: dict[str, Any] = {"lidarpool": __version__, "version": VERSION}
                 head |= {"format": self.format, "layout": self.layout}
+                head |= {"compensated": self.compensated}
                 with suppress(FileNotFoundError):
                     head["table"] = self.place.checksum(TABLE_FILE)
                 index.write(f'{json.dumps(head)[:-1]}, "jobs": [')

@@ -3,7 +3,8 @@
 `jobs.csv` has a row for each job: number, name, split, then what was varied, then what came of it,
 then the points of each class. A varied value is written as JSON writes it, so that it is read with
 its type: ``12``, ``0.5``, ``true``; text stands as it is unless it looks like one of these, as
-``"12"`` does. Nothing stands where a job has no such value.
+``"12"`` does. Nothing stands where a job has no such value. Before text that a spreadsheet would
+run as a formula stands an apostrophe, as OWASP advises against CSV injection.
 """
 
 from __future__ import annotations
@@ -51,6 +52,9 @@ _TAIL = {
 _CLASS = re.compile(r"class_(\d+)", re.ASCII)
 _UTF8 = codecs.getwriter("utf-8")
 _ESCAPED = "backslashreplace"  # of text that may hold parts of names that are no UTF-8
+# Text that begins like this is a formula for spreadsheets, also behind apostrophes, which would
+# else not be read as they were written.
+_FORMULA = re.compile(r"'*[=+\-@\t\r\n\uff1d\uff0b\uff0d\uff20]")
 # Before the name of a varied value that would look like another column.
 _VARIED = "varied."
 
@@ -203,7 +207,7 @@ def write_table(place: Storage, names: Sequence[str], jobs: Callable[[], Iterabl
         header = [*_HEAD, *map(_column_of, names), *_TAIL, *(f"class_{n}" for n in classes)]
         with place.writing(TABLE_FILE) as file:
             writer = csv.writer(_UTF8(file, _ESCAPED), lineterminator="\n")
-            writer.writerow(header)
+            writer.writerow(map(_shielded, header))
             for row in jobs():
                 writer.writerow(_cells(row, names, classes))
         if find_spec("pyarrow") is not None:
@@ -238,7 +242,7 @@ def read_table(place: Storage, checksum: Sequence[int] | None = None) -> Iterato
             file = stack.enter_context(path.open(encoding="utf-8", newline=""))
         reader = csv.reader(file, strict=True)
         try:
-            header = next(reader, [])
+            header = [_unshielded(name) for name in next(reader, [])]
             first, last = len(_HEAD), header.index("error")
             tail = header[last : last + len(_TAIL)]
             if header[:first] != [*_HEAD] or tail != [*_TAIL]:
@@ -290,7 +294,10 @@ def _cells(row: JobRow, names: Sequence[str], classes: Sequence[int]) -> Iterato
                 yield _written(row.values[value]) if value in row.values else ""
         entry = getattr(row, name)
         # Before Python 3.13, csv.writer left a bare carriage return unquoted.
-        yield "\n".join(entry[:ERROR_MOST].splitlines()) if kind is str else json.dumps(entry)
+        if kind is str:
+            yield _shielded("\n".join(entry[:ERROR_MOST].splitlines()))
+        else:
+            yield json.dumps(entry)
     for number in classes:
         yield str(int(row.classes.get(number, 0)))
 
@@ -303,7 +310,10 @@ def _row(header: Sequence[str], names: Sequence[str], cells: Sequence[str]) -> J
     fixed = dict(zip(header[:first], cells, strict=False))
     fixed |= dict(zip(header[stop:], cells[stop:], strict=True))
     kinds = _HEAD | _TAIL
-    given: dict[str, Any] = {name: kind(fixed[name]) for name, kind in kinds.items()}
+    given: dict[str, Any] = {
+        name: _unshielded(fixed[name]) if kind is str else kind(fixed[name])
+        for name, kind in kinds.items()
+    }
     classes = {
         int(found[1]): int(text)
         for name, text in fixed.items()
@@ -337,11 +347,35 @@ def _written(value: Any) -> str:
     if not isinstance(plain, str):
         return json.dumps(plain)
     # Quotes as well for letters that a line of a file cannot show or hold.
-    return plain if plain and plain.isprintable() and _read(plain) == plain else json.dumps(plain)
+    if plain and plain.isprintable() and _parsed(plain) == plain:
+        return _shielded(plain)
+    return json.dumps(plain)
+
+
+def _shielded(text: str) -> str:
+    """Return text that no spreadsheet runs as a formula.
+
+    Examples
+    --------
+    >>> [_shielded(text) for text in ("=1+1", "-5 dB", "'@home", "wet")]
+    ["'=1+1", "'-5 dB", "''@home", 'wet']
+    """
+    return f"'{text}" if _FORMULA.match(text) else text
+
+
+def _unshielded(text: str) -> str:
+    """Return the text that `_shielded` was given."""
+    return text[1:] if text.startswith("'") and _FORMULA.match(text) else text
 
 
 def _read(text: str) -> Value:
     """Read a cell of a varied value."""
+    plain = _unshielded(text)
+    return _parsed(text) if plain == text else plain
+
+
+def _parsed(text: str) -> Value:
+    """Return the value that a text is as JSON, else the text."""
     try:
         value = json.loads(text) if text.lstrip()[:1] not in "[{" else text
     except ValueError:

@@ -251,7 +251,7 @@ def sweeps(
     """
     storage = replace(Storage.at(place), named="")  # links of the user's own are welcome
     head = read_index(storage)
-    written = Format(DATA_SETS[head["format"]], head["layout"])
+    written = Format(DATA_SETS[head["format"]], head["layout"], head["compensated"])
     written.check_installed()
     of_sensors = head["jobs"]
     table = read_table(storage, head["table"])

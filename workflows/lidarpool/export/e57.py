@@ -45,18 +45,20 @@ def write_e57(path: Path, cloud: CloudLike, sweeps: Sweeps) -> None:
 
 
 def _write_scan(file: Any, sweeps: Sweeps, sweep: int, points: Cloud) -> None:
-    x, y, z = sweeps.in_sensor(sweep, points.positions).T.copy()
+    x, y, z = sweeps.compensated(sweep, points).T.copy()
     data = {"cartesianX": x, "cartesianY": y, "cartesianZ": z}
     if "intensity" in points.columns:
         data["intensity"] = points["intensity"]
     if {*COLOURS} <= {*points.columns}:
         data |= {f"color{name.capitalize()}": points[name] for name in COLOURS}
     if {*NORMAL} <= {*points.columns}:
-        columns = sweeps.columns_in_sensor(sweep, points)
+        columns = sweeps.columns_compensated(sweep, points)
         data |= {field: np.nan_to_num(columns[name]) for field, name in _FIELDS.items()}
     turn = np.roll(sweeps.pose.quaternions[sweep], 1)  # w first
     place = sweeps.pose.positions[sweep]
-    file.write_scan_raw(data, name=f"sweep {sweep}", rotation=turn, translation=place)
+    file.write_scan_raw(
+        data, name=f"sweep {sweep}, motion compensated", rotation=turn, translation=place
+    )
 
 
 class _WithNormals(pye57.E57):

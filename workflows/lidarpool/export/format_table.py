@@ -29,6 +29,7 @@ class FormatRow:
     named: tuple[str, ...] = ()  # columns that it holds beside those if classes have names
     # {layout: columns that it needs and holds beside those}, where there are layouts
     layouts: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+    raw_or_compensated: bool = False  # it has an option for points at the start of the sweep
     inside: str = ""  # of a folder: pattern of the names of its files
     data_set: str = ""  # name of the data sets whose jobs are written in it, if there are such
     of_job: str = ""  # there: place of a job's file or folder, if it has one, by `Entry`
@@ -43,7 +44,7 @@ class FormatRow:
 _ALL_RAYS = ("ray", "range")  # and every return: see `check_whole`
 LAYOUTS = {
     "velodyne": ("intensity", "time"),
-    "autoware": ("intensity", "time", "azimuth", "elevation", "range"),
+    "autoware": ("intensity", "time", "return_number", "returns"),
     "ouster": ("signal", "time", "reflectivity", "range"),
     "images": ("intensity", "time", *_ALL_RAYS),
 }
@@ -54,6 +55,7 @@ _SURFACES = (
 _E57 = ("intensity", *_COLOURS, *_SURFACES[:3])
 _LAS = ("laspy", "lazrs")
 _LABELS = ("object", "intensity", "class")
+_KITTI_COLUMNS = ("object", "reflectivity", "class")
 _RINGS = ("channel", "intensity")
 _BAG = (
     False,
@@ -62,6 +64,7 @@ _BAG = (
     ("channel", *_COLOURS, "radial_velocity", *_SURFACES, "material"),
     ("class",),
     LAYOUTS,
+    True,
 )
 
 _KITTI = (
@@ -85,15 +88,17 @@ FORMATS = {
         "cloud.parquet", "parquet", True, ("pyarrow",), inside=_PARTS, data_set="parquet",
         of_job="points/job={number}",
     ),
-    "pcd": FormatRow("pcd", "pcd", True, ("pypcd4",), ("scan",), inside=r"\d+\.pcd"),
+    "pcd": FormatRow(
+        "pcd", "pcd", True, ("pypcd4",), ("scan",), raw_or_compensated=True, inside=r"\d+\.pcd"
+    ),
     "images": FormatRow(
         "images", "images", True, (), ("scan", *_ALL_RAYS), inside=r"[^/]+/\d+\.npz",
         data_set="images", of_job="images/{name}", boxes=True,
     ),
     "e57": FormatRow("cloud.e57", "e57", False, ("pye57",), ("scan",), _E57),
     "kitti": FormatRow(
-        "kitti", "kitti", True, (), ("scan", *_LABELS), _LABELS, inside=_KITTI, data_set="kitti",
-        boxes=True, raw=True,
+        "kitti", "kitti", True, (), ("scan", *_KITTI_COLUMNS), _KITTI_COLUMNS, inside=_KITTI,
+        data_set="kitti", boxes=True, raw=True,
     ),
     "nuscenes": FormatRow(
         "nuscenes", "nuscenes", True, (), ("scan", "object", *_RINGS), _RINGS, ("class",),

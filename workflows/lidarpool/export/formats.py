@@ -8,7 +8,7 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 
@@ -42,6 +42,21 @@ class Format:
         Literal[tuple(LAYOUTS)],  # type: ignore[valid-type]
         about("layout of points in mcap and rosbag2"),
     ] = "velodyne"
+    compensated: Annotated[
+        bool,
+        about(
+            "points of mcap, rosbag2 and pcd in the sensor's axes at the start of the sweep, "
+            "without times of points; by default as drivers publish them, each at its firing"
+        ),
+    ] = False
+
+    def __post_init__(self) -> None:
+        if self.compensated and not self.row.raw_or_compensated:
+            choices = [name for name, row in FORMATS.items() if row.raw_or_compensated]
+            raise LidarpoolError(
+                f"compensated is an option of {', '.join(choices)}, not of {self.format}: leave it "
+                "out."
+            )
 
     @classmethod
     def of(cls, entry: str | Mapping[str, str]) -> Format:
@@ -60,7 +75,8 @@ class Format:
 
     @property
     def _laid_out(self) -> tuple[str, ...]:
-        return self.row.layouts.get(self.layout, ())
+        columns = self.row.layouts.get(self.layout, ())
+        return tuple(name for name in columns if name != "time" or not self.compensated)
 
     @property
     def needs(self) -> tuple[str, ...]:
@@ -78,7 +94,24 @@ class Format:
     def notes(self, cloud: CloudLike, sweeps: Sweeps) -> list[str]:
         """Return a note for the user on the cloud in this format, or none."""
         left = ", ".join(self.left_out(cloud, sweeps))
-        return [f"{self.format} does not hold {left}"] if left else []
+        notes = [f"{self.format} does not hold {left}"] if left else []
+        return [*notes, *self.contradictions(sweeps.coordinates)]
+
+    def contradictions(self, coordinates: str) -> list[str]:
+        """Return a note if the cloud's coordinates are not what readers of the format expect."""
+        if coordinates != "sensor":
+            return []
+        if self.format in ("las", "laz"):
+            return [
+                f"readers of {self.format} expect points in one coordinate system, and with "
+                "cloud.coordinates sensor each is in the sensor's axes at its firing: use world"
+            ]
+        if self.compensated or self.format in ("kitti", "nuscenes", "e57"):
+            return [
+                f"{self.format} holds points compensated for motion, although cloud.coordinates is "
+                "sensor: they are brought to the start of the sweep"
+            ]
+        return []
 
     @property
     def _absent(self) -> list[str]:
@@ -138,14 +171,16 @@ class Format:
         LidarpoolError
             If a package or column is missing, if something is there, or if it cannot be written.
         """
-        more = {"layout": self.layout} if self.row.layouts else {}
+        more: dict[str, Any] = {}
+        if self.row.layouts:
+            more = {"layout": self.layout, "compensated": self.compensated}
         with explained(f"{path} cannot be written"):
             self.check(path, cloud, overwrite=overwrite)
             with staging(path.parent) as beside:
                 staged = beside / path.name  # bags contain the name of their file
                 if self.row.in_pieces:
                     place = Storage(str(staged), durable=False)
-                    RangeWriter(self.format, cloud, sweeps, place).write(workers)
+                    self._range_writer(cloud, sweeps, place).write(workers)
                 else:
                     write = getattr(self.row.load(), f"write_{self.format}")
                     write(staged, cloud, sweeps, **more)
@@ -155,6 +190,9 @@ class Format:
                 staged.replace(path)
                 flush(path.parent)
 
+    def _range_writer(self, cloud: CloudLike, sweeps: Sweeps, place: Storage) -> RangeWriter:
+        return RangeWriter(self.format, cloud, sweeps, place, self.compensated)
+
     def put(
         self, storage: Storage, cloud: CloudLike, sweeps: Sweeps, workers: RangeWorkers | None
     ) -> None:
@@ -162,7 +200,7 @@ class Format:
         place = Storage(storage.path(self.row.file))
         with explained(f"{place} cannot be written"):
             try:
-                RangeWriter(self.format, cloud, sweeps, place).write(workers)
+                self._range_writer(cloud, sweeps, place).write(workers)
             except BaseException:
                 with suppress(OSError):
                     storage.discard(self.row.file)
@@ -188,6 +226,7 @@ def save_cloud(
     *,
     format: str | None = None,  # noqa: A002 - its name in scenarios and in the command
     layout: str = "velodyne",
+    compensated: bool = False,
     precision_m: float | None = None,
 ) -> list[str]:
     """Write points in the format of the path's ending, completely or not at all.
@@ -208,6 +247,9 @@ def save_cloud(
     layout
         Layout of points in mcap and rosbag2: velodyne, autoware, ouster, or images, which is
         velodyne with range images.
+    compensated
+        In mcap, rosbag2 and pcd, points in the sensor's axes at the start of the sweep, without
+        times of points; by default each is in the sensor's axes at its firing, as of drivers.
     precision_m
         Step of stored positions, metres; by default that of the survey, else 0.001.
 
@@ -229,7 +271,7 @@ def save_cloud(
         )
     if precision_m is not None and not 0 < precision_m < np.inf:
         raise LidarpoolError(f"precision_m is {precision_m}; it must be a length in metres.")
-    one = Format(name, layout)
+    one = Format(name, layout, compensated)
     sweeps = Sweeps.unknown() if cloud.sweeps is None else cloud.sweeps()
     sweeps = replace(sweeps, precision_m=precision_m or sweeps.precision_m)
     with explained(f"{path} cannot be written"):

@@ -30,10 +30,11 @@ class Pieces(pieces.Pieces):
     In a data set the first sensor of job 7 has `sequences/07`, others `07_NAME`.
 
     In each are `velodyne/000000.bin` (float32 x, y, z in the sensor's axes when the sweep began,
-    intensity), `labels/000000.label` (uint32: instance << 16 | class; the instance is the object's
-    number + 1), where there are actors `label_2/000000.txt` (boxes of those that have points),
-    `poses.txt` (3 x 4, from the first), `times.txt` in seconds and `calib.txt`. Poses and boxes
-    are in axes of a camera as KITTI's are, which sits where the sensor does; `Tr` leads to them.
+    and reflectivity by 255, 0 to 1), `labels/000000.label` (uint32: instance << 16 | class; the
+    instance is the object's number + 1), where there are actors `label_2/000000.txt` (boxes of
+    those that have points), `poses.txt` (3 x 4, from the first), `times.txt` in seconds and
+    `calib.txt`. Poses and boxes are in axes of a camera as KITTI's are, which sits where the sensor
+    does; `Tr` leads to them.
     The camera is level where the sensor is tilted, in the mean over its sweeps, because KITTI turns
     boxes about its vertical axis alone. KITTI's own tools look for the poses in `poses/00.txt`.
 
@@ -55,8 +56,8 @@ class Pieces(pieces.Pieces):
         sweeps = self.sweeps
         folder, name = self.sequences[sweeps.sensor[number]], f"{sweeps.numbers[number]:06}"
         rows = np.empty((len(points), 4), "<f4")
-        rows[:, :3] = sweeps.in_sensor(number, points.positions)
-        rows[:, 3] = points["intensity"]
+        rows[:, :3] = sweeps.compensated(number, points)
+        rows[:, 3] = points["reflectivity"] / np.float32(255)
         labels = (points["object"].astype("<u4") + 1) << 16 | points["class"]
         files: dict[str, Data] = {
             f"{folder}/velodyne/{name}.bin": as_data(rows),
@@ -91,7 +92,7 @@ class Pieces(pieces.Pieces):
 
 
 class Reader(reading.Reader):
-    """Reads sweeps of a data set: intensity, class and object of each point."""
+    """Reads sweeps of a data set: intensity (reflectivity, 0 to 1), class and object of points."""
 
     def files(self, sweep: int) -> list[str]:
         """Return the names of the files of points and labels."""

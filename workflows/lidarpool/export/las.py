@@ -25,11 +25,12 @@ from ..base.interrupts import deferred_interrupts
 from ..columns.cloud import Cloud, CloudLike
 from ..columns.table import COLOURS, NORMAL, TABLE
 from ..columns.waveforms import WAVEFORM, ZERO, records
-from .sweeps import Sweeps
+from .flight_lines import FlightLines
+from .sweeps import AS_FIRED, IN_WORLD, Sweeps
 
 ANGLE_DEG = 0.006  # of one step of the format's scan angle
 FULL = 65_535  # the format's intensity for 1 and above
-_OF_FORMAT = ("return_number", "returns", "azimuth")  # stored only in fields of the format
+_OF_FORMAT = ("return_number", "returns")  # stored only in fields of the format
 # Names of columns in the extra bytes: a field of the format is called intensity, and normals have
 # the names of PDAL's dimensions.
 _NAMES = {
@@ -43,6 +44,8 @@ _EVLR = Struct("<H16sHQ32s")  # head of an extended variable length record
 # Of the header: where the waveform packets and the first such record begin, and their number.
 _WAVES_AT, _WAVES = 227, Struct("<QQI")
 _VLR_MOST = 65_535  # bytes of a variable length record
+_TEXT_AREA = 3  # number of the record with a description in words
+_FRAMES = {"world": IN_WORLD, "sensor": AS_FIRED}
 _FAR = 2**31 - 1  # steps from the offset to the farthest point
 # Coordinate systems with UTM zones: name, datum, ellipsoid, 1 / flattening, and their EPSG codes.
 _WGS84 = ("WGS 84", "WGS_1984", "WGS 84", 298.257223563, (4326, 6326, 7030))
@@ -56,14 +59,15 @@ def _write(path: Path, cloud: CloudLike, sweeps: Sweeps, *, compress: bool) -> N
     """Write a cloud: columns with a field of the format there, the others in extra bytes.
 
     `time` is adjusted standard GPS time of a survey with a start, else seconds since the survey's
-    start. A coordinate system is stored as WKT. `return_number` and `returns` are as they are,
-    `azimuth` (-180 to 180 degrees) is the scan angle, `sensor` + 1 the point source. With `red`,
-    `green` and `blue` the point format is 7, and colours are 257 times these, 16 bits. Intensity is
-    the column `intensity` times 65,535, at most that, and classification `class` if it is below
-    256; because of these limits, both columns are in the extra bytes as well. Of these classes, the
-    lookup has 15 letters of the names, ASCII. Names of materials are a record of lidarpool, a list
-    as JSON. Return numbers are 15 at most, and angles in steps of
-    0.006 degrees. Recorded waveforms make the point format 9, or 10 with colours; see `_Packets`.
+    start. A coordinate system is stored as WKT. `return_number` and `returns` are as they are. Scan
+    angle (steps of 0.006 degrees), scan direction, edge of flight line and point source are those
+    of `FlightLines`. With `red`, `green` and `blue` the point format is 7, and colours are 257
+    times these, 16 bits. Intensity is the column `intensity` times 65,535, at most that, and
+    classification `class` if it is below 256; because of these limits, both columns are in the
+    extra bytes as well. Of these classes, the lookup has 15 letters of the names, ASCII. Names of
+    materials are a record of lidarpool, a list as JSON. Return numbers are 15 at most. A text area
+    record names the frame of the points. Recorded waveforms make the point format 9, or 10 with
+    colours; see `_Packets`.
     """
     coloured = {*COLOURS} <= {column.name for column in cloud.table}
     packets = _Packets.of(cloud)
@@ -88,6 +92,9 @@ def _write(path: Path, cloud: CloudLike, sweeps: Sweeps, *, compress: bool) -> N
     if any(column.name == "material" for column in cloud.table):
         listed = json.dumps(sweeps.materials).encode()[:_VLR_MOST]
         header.vlrs.append(laspy.VLR("lidarpool", 1, "names of materials, JSON", listed))
+    header.vlrs.append(
+        laspy.VLR("LASF_Spec", _TEXT_AREA, "frame", _FRAMES[sweeps.coordinates].encode() + b"\0")
+    )
     if packets is not None:
         header.vlrs.extend(packets.descriptors)
         header.global_encoding.waveform_data_packets_internal = True
@@ -118,8 +125,12 @@ def _write(path: Path, cloud: CloudLike, sweeps: Sweeps, *, compress: bool) -> N
             with laspy.open(
                 file, "w", header=header, do_compress=compress, closefd=False
             ) as writer:
-                for chunk in cloud.chunks():
+                for chunk, lines in FlightLines(sweeps).of(cloud.chunks()):
                     points = _points(chunk, header, names, begins_s)
+                    points.scan_angle = np.round(lines.scan_angle_deg / ANGLE_DEG).astype(np.int16)
+                    points.scan_direction_flag = lines.direction
+                    points.edge_of_flight_line = lines.edge
+                    points.point_source_id = lines.source
                     if packets is not None:
                         packets.put(points, chunk, beside)
                     with deferred_interrupts():  # lazrs replaces errors raised within it
@@ -209,16 +220,11 @@ def _points(chunk: Cloud, header: laspy.LasHeader, extra: list[str], begins_s: f
         record.gps_time = there["time"] / 1e9 + begins_s
     if "intensity" in there:
         record.intensity = np.round(np.clip(there["intensity"], 0, 1) * FULL).astype(np.uint16)
-    if "azimuth" in there:
-        turned = (there["azimuth"].astype(np.float64) + 180) % 360 - 180
-        record.scan_angle = np.round(turned / ANGLE_DEG).astype(np.int16)
     if "class" in there:
         record.classification = np.where(there["class"] < 256, there["class"], 0).astype(np.uint8)
     if {*COLOURS} <= {*there}:
         for name in COLOURS:
             record[name] = there[name].astype(np.uint16) * 257
-    if "sensor" in there:
-        record.point_source_id = there["sensor"].astype(np.uint16) + 1
     for name in extra:
         column = TABLE.get(name)
         record[_name(column.in_files if column else name)] = there[name]

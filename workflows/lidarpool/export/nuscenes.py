@@ -20,7 +20,7 @@ from ..columns.cloud import Cloud, CloudLike
 from . import pieces, reading
 from .boxes import Boxes
 from .pieces import Data, Entry, as_data
-from .sweeps import Sweeps, plain_names
+from .sweeps import COMPENSATED, Sweeps, plain_names
 
 VERSION = "v1.0-lidarpool"
 _SCENE, _LOG = "scene-0001", "survey"
@@ -63,7 +63,7 @@ class Pieces(pieces.Pieces):
 
     def files(self, number: int, points: Cloud) -> tuple[dict[str, Data], Boxes]:
         """Return the file of a sweep, and its boxes."""
-        inside = self.sweeps.in_sensor(number, points.positions)
+        inside = self.sweeps.compensated(number, points)
         light = np.clip(points["intensity"], 0, 1) * 255
         rows = np.empty((len(points), 5), "<f4")
         rows[:, :3], rows[:, 3], rows[:, 4] = inside, light, points["channel"]
@@ -228,7 +228,7 @@ class _Tables:
         sweeps = self.sweeps
         count = int((sweeps.sensor == 0).sum())
         self._add(
-            "scene", self._scene, name=self._scene, description="", nbr_samples=count,
+            "scene", self._scene, name=self._scene, description=COMPENSATED, nbr_samples=count,
             log_token=self._token("log", _LOG), first_sample_token=self._token("sample", 0),
             last_sample_token=self._token("sample", count - 1),
         )  # fmt: skip

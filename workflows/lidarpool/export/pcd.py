@@ -11,29 +11,34 @@ from ..columns.cloud import Cloud
 from ..columns.table import COLOURS, NORMAL
 from ..scene.colours import as_float
 from . import pieces
+from .sweeps import AS_FIRED, COMPENSATED
 
 
 class Pieces(pieces.Pieces):
     """One file for each sweep, with all columns; red, green and blue are one field `rgb`.
 
-    Normals and origins of rays are in the axes of the points; normals have PCL's names.
-
-    Points are in the sensor's axes as they were when the sweep began; VIEWPOINT says where those
-    were in the world. Times are seconds since the sweep began, as float32.
+    With times, points are in the sensor's axes at their own firing, and times are seconds since the
+    sweep began, as float32. Compensated points, and those of a cloud without times, are in the
+    sensor's axes at the start of the sweep, and have no times. A comment says which. VIEWPOINT is
+    the pose of the sensor in the world at the start of the sweep. Normals and origins of rays are
+    in the axes of the points; normals have PCL's names.
     """
 
     def files(self, number: int, points: Cloud) -> tuple[dict[str, bytes], None]:
         """Return the file of a sweep."""
         sweeps = self.sweeps
-        inside = sweeps.in_sensor(number, points.positions)
+        as_fired = "time" in points.columns and not self.compensated
+        place_points = sweeps.as_fired if as_fired else sweeps.compensated
+        inside = place_points(number, points)
         names, arrays = ["x", "y", "z"], list(inside.T.astype(np.float32))
-        columns = sweeps.columns_in_sensor(number, points)
+        columns_of = sweeps.columns_as_fired if as_fired else sweeps.columns_compensated
+        columns = columns_of(number, points)
         coloured = {*COLOURS} <= {*columns}
         if coloured:
             names.append("rgb")
             arrays.append(as_float(*(points[name] for name in COLOURS)))
         for column in self.cloud.table:
-            if coloured and column.name in COLOURS:
+            if (coloured and column.name in COLOURS) or (column.name == "time" and not as_fired):
                 continue
             values = columns[column.name]
             if column.name == "time":
@@ -48,4 +53,5 @@ class Pieces(pieces.Pieces):
         file.metadata.viewpoint = (*place, w, x, y, z)
         memory = io.BytesIO()
         file.save(memory, Encoding.BINARY)
-        return {f"{number:06}.pcd": memory.getvalue()}, None
+        comment = f"# {AS_FIRED if as_fired else COMPENSATED}\n".encode()
+        return {f"{number:06}.pcd": comment + memory.getvalue()}, None

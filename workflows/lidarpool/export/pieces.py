@@ -53,6 +53,7 @@ class Pieces:
     """
 
     folders: Sequence[str] = ()
+    compensated = False  # by request, where a format also holds points as they were fired
 
     def __init__(self, cloud: CloudLike, sweeps: Sweeps, entry: Entry | None = None) -> None:
         self.cloud, self.sweeps, self.entry = cloud, sweeps, entry
@@ -120,6 +121,7 @@ class RangeWriter:
     cloud: CloudLike
     sweeps: Sweeps
     place: Storage
+    compensated: bool = False
     _mark: bytes = field(default_factory=lambda: secrets.token_hex(8).encode())
 
     def __call__(self, span: PieceRange) -> WrittenRange | None:
@@ -130,12 +132,17 @@ class RangeWriter:
         None if this process does not see the folder, lacks the format's package, or after `stop`.
         """
         try:
-            pieces = pieces_of(self.format, self.cloud, self.sweeps)
+            pieces = self._pieces()
         except ImportError:
             return None
         if not self.place.sees(_MARK, self._mark):
             return None
         return pieces.write(self.place, *span)
+
+    def _pieces(self) -> Pieces:
+        pieces = pieces_of(self.format, self.cloud, self.sweeps)
+        pieces.compensated = self.compensated
+        return pieces
 
     def stop(self) -> None:
         """Let no further range be written."""
@@ -149,7 +156,7 @@ class RangeWriter:
         LidarpoolError
             If the cloud is not of these sweeps, or not in order; or as `workers`.
         """
-        pieces = pieces_of(self.format, self.cloud, self.sweeps)
+        pieces = self._pieces()
         for folder in ("", *pieces.folders):
             self.place.prepare(folder)
         spans = pieces.spans()

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 from functools import cache, cached_property
 from heapq import merge
 from pathlib import Path
@@ -32,10 +33,16 @@ from . import reading
 from .boxes import Boxes
 from .images import Image
 from .laser_scan import ScanRays
+from .lidar_traits import LidarTraits
 from .navigation_files import GNSS_FILE, IMU_FILE, Instruments
-from .sweeps import Placed, Sweeps, plain_names
+from .sweeps import AS_FIRED, COMPENSATED, Placed, Sweeps, plain_names
 
 Sent = tuple[str, Any, int]  # topic, message, time in nanoseconds
+
+# Types of returns of Autoware's sensor drivers.
+UNKNOWN, LAST, FIRST, STRONGEST, FIRST_WEAK, LAST_WEAK = range(6)
+IDENTICAL, SECOND, _, FIRST_STRONGEST, LAST_STRONGEST = range(6, 11)
+_OF_ONE_RETURN = {"strongest": STRONGEST, "first": FIRST, "last": LAST}
 
 WORLD, CARRIER = "map", "base_link"  # frames
 _INSTRUMENTS = "imu", "gnss"
@@ -63,6 +70,13 @@ _LAYOUTS = {
 }  # fmt: skip
 _LAYOUTS["images"] = _LAYOUTS["velodyne"]
 _ONCE = ("/tf_static", "/label_info", "/material_info")  # topics of one message, kept for readers
+# Points that are compensated for motion have no times; Autoware's are then PointXYZIRC.
+_TIMES = ("time", "t", "time_stamp")
+_COMPENSATED = {
+    "velodyne": _LAYOUTS["velodyne"].descr[:-1],
+    "images": _LAYOUTS["images"].descr[:-1],
+    "autoware": _LAYOUTS["autoware"].descr[:6],
+}
 # Fields behind those of a layout: {name: type, columns that it needs}.
 _EXTRA = {
     "rgb": ("<f4", {*COLOURS}),
@@ -76,14 +90,18 @@ _LABEL_INFO = "std_msgs/Header header\nvision_msgs/VisionClass[] class_map\nfloa
 _LABEL_INFO += f"{80 * '='}\nMSG: vision_msgs/VisionClass\nuint16 class_id\nstring class_name\n"
 
 
-def write_rosbag2(path: Path, cloud: CloudLike, sweeps: Sweeps, layout: str) -> None:
+def write_rosbag2(
+    path: Path, cloud: CloudLike, sweeps: Sweeps, layout: str, compensated: bool = False
+) -> None:
     """Write a bag, a folder for `ros2 bag play`; see `write_mcap`."""
     store = get_typestore(Stores.ROS2_HUMBLE)
     store.register(get_types_from_msg(_LABEL_INFO, "vision_msgs/msg/LabelInfo"))
     # Readers of Humble take no later version: from 9 on, its profiles are lists.
     with Writer(path, version=8, storage_plugin=StoragePlugin.MCAP) as bag:
+        bag.set_custom_data("lidarpool", COMPENSATED if compensated else AS_FIRED)
         topics: dict[str, Any] = {}
-        for topic, message, time_ns in _messages(cloud, sweeps, layout, store.types):
+        layout_of_points = PointLayout(layout, compensated)
+        for topic, message, time_ns in _messages(cloud, sweeps, layout_of_points, store.types):
             kind = message.__msgtype__
             if topic not in topics:
                 latched = (_LATCHED,) if topic in _ONCE else ()
@@ -93,15 +111,19 @@ def write_rosbag2(path: Path, cloud: CloudLike, sweeps: Sweeps, layout: str) -> 
             bag.write(topics[topic], time_ns, store.serialize_cdr(message, kind))
 
 
-def write_mcap(path: Path, cloud: CloudLike, sweeps: Sweeps, layout: str) -> None:
+def write_mcap(
+    path: Path, cloud: CloudLike, sweeps: Sweeps, layout: str, compensated: bool = False
+) -> None:
     """Write an MCAP file.
 
     Each sweep is a PointCloud2 on `/NAME/points`, NAME that of its sensor, or on `/points`. Points
-    are in the sensor's axes when the sweep began. `/tf` has the frames of the carrier (`base_link`)
-    and of actors in `map`, and `/clock` the time, both at each sweep; `/tf_static` has the sensors
-    on the carrier, `/label_info` names of classes and `/material_info` those of materials
-    (LabelInfo of vision_msgs). The survey begins at its start, or at `START_NS` without one.
-    `/actors` has a MarkerArray of the boxes of actors where their points of the sweep are.
+    are in the sensor's axes at their own firing, as drivers publish them, and have times; or
+    compensated, in the sensor's axes at the start of the sweep, without times. `/tf` has the frames
+    of the carrier (`base_link`) and of actors in `map`, and `/clock` the time, both at each sweep;
+    `/tf_static` has the sensors on the carrier, `/label_info` names of classes and `/material_info`
+    those of materials (LabelInfo of vision_msgs). The survey begins at its start, or at `START_NS`
+    without one. `/actors` has a MarkerArray of the boxes of actors where their points of the sweep
+    are.
 
     Of a 2D scanner (one beam in the plane of its x and y axes) `/NAME/scan`, or `/scan`, also has a
     LaserScan of each sweep, where the survey keeps every return and has the columns ray and range.
@@ -111,8 +133,10 @@ def write_mcap(path: Path, cloud: CloudLike, sweeps: Sweeps, layout: str) -> Non
     PointStamped in `map`.
 
     Layouts of a point: `velodyne` (22 bytes; its time in seconds since the sweep began),
-    `autoware` (PointXYZIRCAEDT, 32 bytes; angles in radians, time_stamp in ns since the sweep
-    began) and `ouster` (48 bytes; range in mm, t in ns since the sweep began, intensity: signal).
+    `autoware` (PointXYZIRCAEDT, 32 bytes; angles in radians, azimuth clockwise from where the head
+    starts, time_stamp in ns since the sweep began; compensated: PointXYZIRC, 16 bytes) and `ouster`
+    (48 bytes; ring 0 is the highest beam, range in mm, t in ns since the sweep began, intensity:
+    signal).
     Whole numbers of intensity are 255 at 1 and above. Where the cloud has red, green and
     blue, a field `rgb` follows, where it has radial velocities, `radial_velocity`, where its
     classes have names, `label`, and then normals, `incidence_deg` and origins of rays, of which the
@@ -120,17 +144,57 @@ def write_mcap(path: Path, cloud: CloudLike, sweeps: Sweeps, layout: str) -> Non
     """
     folder = path.with_name(f"{path.name}.bag")
     try:
-        write_rosbag2(folder, cloud, sweeps, layout)
+        write_rosbag2(folder, cloud, sweeps, layout, compensated)
         (written,) = folder.glob("*.mcap")
         written.replace(path)
     finally:
         shutil.rmtree(folder, ignore_errors=True)
 
 
-def _messages(cloud: CloudLike, sweeps: Sweeps, layout: str, types: Any) -> Iterator[Sent]:
+@dataclass(frozen=True)
+class PointLayout:
+    """Layout of the points of a PointCloud2."""
+
+    name: str
+    compensated: bool  # points in the sensor's axes at the start of the sweep, without times
+
+    @property
+    def fields(self) -> np.dtype[np.void]:
+        """Type of a point, without columns that may follow."""
+        row = _LAYOUTS[self.name]
+        if not self.compensated:
+            return row
+        if self.name in _COMPENSATED:
+            return np.dtype(_COMPENSATED[self.name])
+        kinds = {name: kind for name, kind in (row.fields or {}).items() if name not in _TIMES}
+        return np.dtype({
+            "names": [*kinds],
+            "formats": [kind for kind, *_ in kinds.values()],
+            "offsets": [offset for _, offset, *_ in kinds.values()],
+            "itemsize": row.itemsize,
+        })  # fmt: skip
+
+    def row(self, extra: Sequence[str]) -> np.dtype[np.void]:
+        """Type of a point in the layout, with fields behind it."""
+        row = self.fields
+        if not extra:
+            return row
+        kinds = {name: (kind, offset) for name, (kind, offset, *_) in (row.fields or {}).items()}
+        end = max(offset + kind.itemsize for kind, offset in kinds.values())
+        for name in extra:
+            kinds[name] = kind, _ = np.dtype(_EXTRA[name][0]), end
+            end += kind.itemsize
+        formats, offsets = map(list, zip(*kinds.values(), strict=True))
+        size = max(row.itemsize, end)
+        return np.dtype(
+            {"names": [*kinds], "formats": formats, "offsets": offsets, "itemsize": size}
+        )
+
+
+def _messages(cloud: CloudLike, sweeps: Sweeps, layout: PointLayout, types: Any) -> Iterator[Sent]:
     """Messages of a cloud, sweep by sweep."""
     held = {column.name for column in cloud.table if column.name != "class" or sweeps.classes}
-    row = _row(layout, [name for name, (_, needs) in _EXTRA.items() if needs <= held])
+    row = layout.row([name for name, (_, needs) in _EXTRA.items() if needs <= held])
     field = types["sensor_msgs/msg/PointField"]
     fields = [
         field(name, offset, _KINDS[kind.str[1:]], 1)
@@ -184,7 +248,7 @@ def _messages(cloud: CloudLike, sweeps: Sweeps, layout: str, types: Any) -> Iter
         if (rays := ScanRays.of(sweeps, sweep, points)) is not None:
             name = f"{topic.removesuffix('points')}scan"
             yield name, make.laser_scan(rays, frame, stamp_ns), time_ns
-        if layout == "images":
+        if layout.name == "images":
             ranges = Image.of(sweeps, sweep, points).filled(points["range"])
             ranges[np.isnan(ranges)] = np.inf  # REP 117: nothing was detected
             for plane, image in enumerate(ranges, 1):
@@ -243,15 +307,29 @@ class Reader(reading.Reader):
         message: Any = _types().deserialize_cdr(data, connection.msgtype)
         held = {field.name for field in message.fields}
         extra = [name for name in _EXTRA if name in held]
-        rows = message.data.view(_row(self.layout, extra))
+        compensated = not held & {*_TIMES}
+        rows = message.data.view(PointLayout(self.layout, compensated).row(extra))
         light = rows["intensity"].astype(np.float32) / _FULL.get(self.layout, 1)
-        columns = {
-            "intensity": light,
-            "channel": rows["channel" if self.layout == "autoware" else "ring"].astype(np.uint16),
-        }
+        channel = rows["channel" if self.layout == "autoware" else "ring"].astype(np.uint16)
+        if self.layout == "ouster":
+            channel = np.uint16(_traits(self.sweeps, sweep).channels - 1) - channel
+        columns = {"intensity": light, "channel": channel}
         if "label" in held:
             columns["class"] = rows["label"].astype(np.uint16)
-        return np.stack([rows[axis] for axis in "xyz"], axis=1), columns
+        points = np.stack([rows[axis] for axis in "xyz"], axis=1)
+        if not compensated and self.sweeps.coordinates == "world":
+            points = self._at_start(sweep, points, rows)
+        return points, columns
+
+    def _at_start(self, sweep: int, points: Floats32, rows: Records) -> Floats32:
+        """Return points (n, 3) as fired in the sensor's axes at the start of the sweep."""
+        (field,) = (name for name in rows.dtype.names or () if name in _TIMES)
+        since_ns = rows[field].astype(np.float64) * (1e9 if field == "time" else 1)
+        stamps = np.rint(since_ns + self.sweeps.stamp_ns(sweep)).astype(np.int64)
+        scans = np.full(len(points), self.sweeps.scans[sweep])
+        sensor_cloud = Cloud(points, {"scan": scans, "time": stamps})
+        fired_in_sensor = replace(self.sweeps, coordinates="sensor")
+        return fired_in_sensor.compensated(sweep, sensor_cloud).astype(np.float32)
 
     def close(self) -> None:
         """Close the bag."""
@@ -300,58 +378,97 @@ def _start_ns(sweeps: Sweeps) -> int:
     return START_NS if sweeps.start_ns is None else sweeps.start_ns
 
 
-def _row(layout: str, extra: list[str]) -> np.dtype[np.void]:
-    """Type of a point in a layout, with fields behind it."""
-    row = _LAYOUTS[layout]
-    if not extra:
-        return row
-    kinds = {name: (kind, offset) for name, (kind, offset, *_) in (row.fields or {}).items()}
-    end = max(offset + kind.itemsize for kind, offset in kinds.values())
-    for name in extra:
-        kinds[name] = kind, _ = np.dtype(_EXTRA[name][0]), end
-        end += kind.itemsize
-    formats, offsets = map(list, zip(*kinds.values(), strict=True))
-    size = max(row.itemsize, end)
-    return np.dtype({"names": [*kinds], "formats": formats, "offsets": offsets, "itemsize": size})
-
-
 def _rows(
-    layout: str, row: np.dtype[np.void], points: Cloud, sweeps: Sweeps, sweep: int
+    layout: PointLayout, row: np.dtype[np.void], points: Cloud, sweeps: Sweeps, sweep: int
 ) -> Records:
-    """Points of a sweep in a layout, of the type of `_row`."""
-    begin_ns = sweeps.begins_ns[sweep] + (sweeps.stamp_ns(sweep) - round(sweeps.begins_ns[sweep]))
-    there, since = sweeps.columns_in_sensor(sweep, points), points["time"] - begin_ns
-    values = dict(zip("xyz", sweeps.in_sensor(sweep, points.positions).T, strict=True))
-    if layout in ("velodyne", "images"):
-        values |= {"intensity": there["intensity"], "ring": there["channel"], "time": since / 1e9}
-    elif layout == "autoware":
+    """Points of a sweep in a layout, of the type of its `row`."""
+    if layout.compensated:
+        positions = sweeps.compensated(sweep, points).astype(np.float32)
+        columns = sweeps.columns_compensated(sweep, points)
+    else:
+        positions = sweeps.as_fired(sweep, points).astype(np.float32)
+        columns = sweeps.columns_as_fired(sweep, points)
+    values: dict[str, AnyArray] = dict(zip("xyz", positions.T, strict=True))
+    if layout.name in ("velodyne", "images"):
+        values |= {"intensity": columns["intensity"], "ring": columns["channel"]}
+    elif layout.name == "autoware":
         values |= {
-            "intensity": np.round(np.clip(there["intensity"], 0, 1) * 255),
-            "return_type": np.ones(len(points)),
-            "channel": there["channel"],
-            "azimuth": np.radians(there["azimuth"]),
-            "elevation": np.radians(there["elevation"]),
-            "distance": there["range"],
-            "time_stamp": np.clip(since, 0, 2**32 - 1),
+            "intensity": np.round(np.clip(columns["intensity"], 0, 1) * 255),
+            "return_type": _return_types(points, _traits(sweeps, sweep).mode),
+            "channel": columns["channel"],
         }
     else:
+        traits = _traits(sweeps, sweep)
         values |= {
-            "intensity": there["signal"],
-            "t": np.clip(since, 0, 2**32 - 1),
-            "reflectivity": there["reflectivity"],
-            "ring": there["channel"],
-            "range": np.round(there["range"] * 1000),
+            "intensity": columns["signal"],
+            "reflectivity": columns["reflectivity"],
+            "ring": np.maximum(traits.channels - 1 - columns["channel"].astype(np.int64), 0),
+            "range": np.round((columns["range"].astype(np.float64) + traits.range_offset_m) * 1000),
         }
+    if not layout.compensated:
+        begin_ns = sweeps.begins_ns[sweep] + sweeps.stamp_ns(sweep) - round(sweeps.begins_ns[sweep])
+        values |= _timed(layout.name, positions, columns["time"] - begin_ns, sweeps, sweep)
     if "rgb" in (row.names or ()):
-        values["rgb"] = as_float(*(there[name] for name in COLOURS))
-    alike = ((name, name) for name in (VELOCITY, *SURFACE_COLUMNS, "material"))
-    for name, column in (*alike, ("label", "class")):
+        values["rgb"] = as_float(*(columns[name] for name in COLOURS))
+    same_names = ((name, name) for name in (VELOCITY, *SURFACE_COLUMNS, "material"))
+    for name, column in (*same_names, ("label", "class")):
         if name in (row.names or ()):
-            values[name] = there[column]
+            values[name] = columns[column]
     rows = np.zeros(len(points), row)
-    for name, column in values.items():
-        rows[name] = column
+    for name, values_of_field in values.items():
+        rows[name] = values_of_field
     return rows
+
+
+def _timed(
+    layout: str, positions: Floats32, since_ns: AnyArray, sweeps: Sweeps, sweep: int
+) -> dict[str, AnyArray]:
+    """Return the fields of points in the sensor's axes at their firings, `since_ns` the stamp."""
+    if layout in ("velodyne", "images"):
+        return {"time": since_ns / 1e9}
+    stamps = np.clip(since_ns, 0, 2**32 - 1)
+    if layout == "ouster":
+        return {"t": stamps}
+    x, y, z = positions.astype(np.float64).T
+    level = np.hypot(x, y)
+    zero = np.radians(_traits(sweeps, sweep).zero_deg)
+    return {
+        "azimuth": (zero - np.arctan2(y, x)) % (2 * np.pi),
+        "elevation": np.arctan2(z, level),
+        "distance": np.hypot(level, z),
+        "time_stamp": stamps,
+    }
+
+
+def _return_types(points: Cloud, mode: str) -> AnyArray:
+    """Return Autoware's types of the returns of a sweep, whose returns follow their pulses: (n,).
+
+    Of two returns of a pulse the nearer is first, and the brighter is strong, the farther of two
+    that are alike. A return that is all of its pulse is each at once.
+    """
+    count = len(points)
+    if mode in _OF_ONE_RETURN:
+        return np.full(count, _OF_ONE_RETURN[mode])
+    number, returns = points["return_number"], points["returns"]
+    types = np.full(count, UNKNOWN)
+    types[number == 2] = SECOND
+    types[number == 1] = FIRST
+    types[number == returns] = LAST
+    types[returns == 1] = IDENTICAL
+    if mode != "dual" or count < 2:
+        return types
+    pairs = (number[:-1] == 1) & (returns[:-1] == 2) & (number[1:] == 2) & (returns[1:] == 2)
+    first = np.flatnonzero(pairs)
+    intensity = points["intensity"]
+    brighter = intensity[first] > intensity[first + 1]
+    types[first] = np.where(brighter, FIRST_STRONGEST, FIRST_WEAK)
+    types[first + 1] = np.where(brighter, LAST_WEAK, LAST_STRONGEST)
+    return types
+
+
+def _traits(sweeps: Sweeps, sweep: int) -> LidarTraits:
+    """Return the traits of the sensor of a sweep."""
+    return sweeps.lidars[sweeps.sensor[sweep]]
 
 
 class _Messages:

@@ -7,14 +7,14 @@ import re
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
-from itertools import pairwise
+from itertools import combinations, pairwise
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from ..base.archives import open_archive, packed
-from ..base.arrays import AnyArray, AnyFloats, Bools, Bytes, Floats, Ints
+from ..base.arrays import AnyArray, AnyFloats, Bools, Bytes, Floats, Floats32, Ints
 from ..base.errors import LidarpoolError
 from ..columns.cloud import Cloud, CloudLike
 from ..columns.table import NORMAL, ORIGIN, TABLE
@@ -25,18 +25,27 @@ from ..sensor.faults import sent
 from ..sensor.plain_data import described, remade
 from ..sensor.survey import nanoseconds
 from ..sensor.trajectory import full_poses, matrices, presence_ns, quaternions_of
+from .lidar_traits import LidarTraits
 from .navigation_files import Instruments
+from .sweep_motion import STILL, FiringPoses, knots_of, poses_at
 
 SWEEPS_FILE = "sweeps.npz"
 MIXED_UP = (
     "The points are not in the order of their scans, or of another survey than the sweeps "
     f"({SWEEPS_FILE}): give both of one run, and keep the order."
 )
+# What files say of the frame of their points.
+COMPENSATED = "points in the sensor's axes at the start of the sweep: motion is compensated"
+AS_FIRED = "points in the sensor's axes at the firing of each: motion is not compensated"
+IN_WORLD = "points in the axes of the world"
 _PIECE = 250_000  # points that are read at a time: several threads or tasks have so many
-_FORMAT = 5
+_FORMAT = 6
 # Fields of `Sweeps` that a file holds under their names: as an array each, and as JSON.
-_ARRAYS = ("scans", "begins_ns", "ends_ns", "sensor", "actor_bounds", "actor_there")
-_WORDS = ("sensors", "objects", "actors", "coordinates", "precision_m", "epsg", "start_ns")
+_ARRAYS = ("scans", "begins_ns", "ends_ns", "sensor", "actor_bounds", "actor_there", "knots")
+_WORDS = (
+    "sensors", "objects", "actors", "coordinates", "precision_m", "epsg", "start_ns", "stations",
+    "station_ns",
+)  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,6 +112,10 @@ class Sweeps:
     classes: Mapping[int, str] = field(default_factory=dict, compare=False)  # their names
     faults: tuple[Fault, ...] = ()  # of all sensors
     materials: tuple[str, ...] = ()  # names that the column `material` counts
+    lidars: tuple[LidarTraits, ...] = ()  # traits of each sensor; none if they are unknown
+    knots: Floats32 = field(default_factory=lambda: STILL)  # (n, m, 7): see `knots_of`
+    stations: int = 1  # of the survey, each with as many sweeps of a sensor
+    station_ns: int = 0  # from the start of a station to that of the next
 
     def __len__(self) -> int:
         return len(self.begins_ns)
@@ -113,21 +126,85 @@ class Sweeps:
         return exact if self.coordinates == "sensor" else self.pose.inward(sweep, exact)
 
     def columns_in_sensor(self, sweep: int, points: Cloud) -> dict[str, AnyArray]:
-        """Columns of points of a sweep, normals and origins in the axes of `in_sensor`."""
-        columns = dict(points.columns)
+        """Return the columns of points of a sweep, vectors in the axes of `in_sensor`."""
         if self.coordinates == "sensor":
-            return columns
-        for vector in (NORMAL, ORIGIN):
-            if not columns.keys() >= {*vector}:
-                continue
-            values = np.stack([columns[name] for name in vector], axis=1).astype(np.float64)
-            if vector == NORMAL:
-                values = values @ self.pose.turns[sweep]
-            else:
-                values = self.pose.inward(sweep, values)
-            for name, axis in zip(vector, values.T, strict=True):
-                columns[name] = axis.astype(TABLE[name].dtype)
-        return columns
+            return dict(points.columns)
+        return _with_vectors(
+            points,
+            lambda normals: normals @ self.pose.turns[sweep],
+            lambda origins: self.pose.inward(sweep, origins),
+        )
+
+    def columns_as_fired(self, sweep: int, points: Cloud) -> dict[str, AnyArray]:
+        """Return the columns of points of a sweep, vectors in the axes of `as_fired`."""
+        if self.coordinates == "sensor":
+            return dict(points.columns)
+        poses = self.firing_poses(sweep, points)
+        return _with_vectors(points, poses.turned_inward, poses.inward)
+
+    def columns_compensated(self, sweep: int, points: Cloud) -> dict[str, AnyArray]:
+        """Return the columns of points of a sweep, vectors in the axes of `compensated`."""
+        if self.coordinates != "sensor":
+            return self.columns_in_sensor(sweep, points)
+        poses = self.firing_poses(sweep, points)
+        return _with_vectors(
+            points,
+            lambda normals: poses.turned_outward(normals) @ self.pose.turns[sweep],
+            lambda origins: self.pose.inward(sweep, poses.outward(origins)),
+        )
+
+    def as_fired(self, sweep: int, points: Cloud) -> Floats:
+        """Return the points (k, 3) of a sweep in the sensor's axes at the firing of each."""
+        exact = points.positions.astype(np.float64)
+        if self.coordinates == "sensor":
+            return exact
+        return self.firing_poses(sweep, points).inward(exact)
+
+    def compensated(self, sweep: int, points: Cloud) -> Floats:
+        """Return the points (k, 3) of a sweep in the sensor's axes at the start of the sweep."""
+        exact = points.positions.astype(np.float64)
+        if self.coordinates == "sensor":
+            exact = self.firing_poses(sweep, points).outward(exact)
+        return self.pose.inward(sweep, exact)
+
+    def firing_poses(self, sweep: int, points: Cloud) -> FiringPoses:
+        """Return the poses of the sensor at the firings of the points of a sweep.
+
+        Points without the column `time` are taken to be fired in the middle of their scans.
+        """
+        since_ns = self.since_ns(sweep, points)
+        firing_ns = self.lidars[self.sensor[sweep]].firing_ns if self.lidars else 0.0
+        span_ns = self.ends_ns[sweep] - self.begins_ns[sweep] + firing_ns
+        knots = self.knots[sweep] if len(self.knots) else np.empty((0, 7), np.float32)
+        place, turn = self.pose.positions[sweep], self.pose.turns[sweep]
+        return poses_at(knots, place, turn, since_ns / max(span_ns, 1.0))
+
+    def since_ns(self, sweep: int, points: Cloud) -> Floats:
+        """Return when the points of a sweep were fired, nanoseconds since the sweep's start: (k,).
+
+        Jumps of the sensor's clock are taken out again.
+        """
+        begin_ns, end_ns = self.begins_ns[sweep], self.ends_ns[sweep]
+        first, stop = self.scans[sweep : sweep + 2]
+        by_scan = (points["scan"] + 0.5 - first) / (stop - first) * (end_ns - begin_ns)
+        if "time" not in points.columns:
+            return np.asarray(by_scan, np.float64)
+        stamps = points["time"].astype(np.int64)
+        sensors = None, self.sensors[self.sensor[sweep]] if self.sensors else None
+        jumps = [one for one in self.faults if one.kind == "time_jump" and one.sensor in sensors]
+        since, gap = stamps - begin_ns, np.full(len(stamps), np.inf)
+        for count in range(1 + len(jumps)) if jumps else ():
+            for faults in combinations(jumps, count):
+                candidate = stamps - sum(round((fault.by_s or 0) * 1e9) for fault in faults)
+                stated = sum((fault.jumps_ns(candidate) for fault in jumps), candidate)
+                # Where several times give a stamp, that in the point's scan counts.
+                distance = np.abs(candidate - begin_ns - by_scan)
+                better = (stated == stamps) & (distance < gap)
+                since, gap = (
+                    np.where(better, new, old)
+                    for new, old in ((candidate - begin_ns, since), (distance, gap))
+                )
+        return np.asarray(since, np.float64)
 
     def bounds(self, sweep: int) -> Floats:
         """Corners of each actor's box during a sweep, in its own axes: (a, 2, 3), metres."""
@@ -198,12 +275,17 @@ class Sweeps:
             most = tuple(2 if each.mode == "dual" else 1 for each in survey.returns_each)
             lidars = tuple(carried.sensor for carried in survey.carried)
             fired = Fired(lidars, most, np.concatenate(first_steps))
+        traits = tuple(
+            LidarTraits.of(carried.sensor, returns.mode)
+            for carried, returns in zip(survey.carried, survey.returns_each, strict=True)
+        )
+        rotations = np.concatenate(turns)
         return cls(
             np.append(np.concatenate([firsts for firsts, _, _ in each]), survey.scan_count),
             when,
             end,
             np.concatenate(sensors),
-            _placed(np.concatenate(places) + scene.origin, np.concatenate(turns)),
+            _placed(np.concatenate(places) + scene.origin, rotations),
             _placed(*(np.array(part) for part in zip(*mounts, strict=True))),
             tuple(carried.name for carried in survey.carried),
             tuple(scene.names),
@@ -223,6 +305,10 @@ class Sweeps:
             classes=survey.classes,
             faults=tuple(survey.faults),
             materials=scene.material_names,
+            lidars=traits,
+            knots=knots_of(survey, traits, rotations),
+            stations=path.stations,
+            station_ns=survey.station_ns,
         )
 
     def faults_in(self, sweep: int) -> tuple[Fault, ...]:
@@ -272,6 +358,7 @@ class Sweeps:
     def packed(self) -> bytes:
         """Return it as a NumPy archive: the same sweeps give the same bytes."""
         words = {"format": _FORMAT, **{name: getattr(self, name) for name in _WORDS}}
+        words["lidars"] = [lidar.words() for lidar in self.lidars]
         if self.instruments is not None:
             words["instruments"] = self.instruments.words()
         words |= {"classes": dict(self.classes)} if self.classes else {}
@@ -320,6 +407,7 @@ class Sweeps:
                 actor_poses=actor_poses,
                 instruments=instruments and Instruments.from_words(instruments, Path(path).parent),
                 classes={int(number): name for number, name in words.get("classes", {}).items()},
+                lidars=tuple(LidarTraits.from_words(lidar) for lidar in words["lidars"]),
                 faults=tuple(Fault(**one) for one in words.get("faults", ())),
                 materials=tuple(words.get("materials", ())),
                 **{name: arrays[name] for name in _ARRAYS},
@@ -362,3 +450,19 @@ def _placed(positions: Floats, rotations: Floats) -> Placed:
     quaternions = quaternions_of(rotations)
     quaternions[quaternions[:, 3] < 0] *= -1  # of the two that mean the same
     return Placed(np.array(positions), quaternions)
+
+
+def _with_vectors(
+    points: Cloud,
+    turn_normals: Callable[[Floats], Floats],
+    move_origins: Callable[[Floats], Floats],
+) -> dict[str, AnyArray]:
+    """Return the columns of points, with normals and origins of rays in other axes."""
+    columns = dict(points.columns)
+    for names, convert in ((NORMAL, turn_normals), (ORIGIN, move_origins)):
+        if not columns.keys() >= {*names}:
+            continue
+        vectors = np.stack([columns[name] for name in names], axis=1).astype(np.float64)
+        for name, axis in zip(names, convert(vectors).T, strict=True):
+            columns[name] = axis.astype(TABLE[name].dtype)
+    return columns

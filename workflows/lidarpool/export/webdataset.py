@@ -19,7 +19,7 @@ from ..columns.cloud import Cloud, CloudLike
 from . import pieces, reading
 from .boxes import Boxes, SweepBoxes
 from .pieces import Entry, PieceRange, WrittenRange
-from .sweeps import Sweeps, plain_names
+from .sweeps import AS_FIRED, COMPENSATED, Sweeps, plain_names
 
 SHARD_MOST = 1_000_000_000  # bytes of a tar file, unless a single sweep has more
 _OWN = ("points", "pose", "boxes")  # arrays that are no columns
@@ -98,6 +98,7 @@ class Pieces(pieces.Pieces):
             "sensor": sweeps.sensors[sweeps.sensor[number]],
             "sweep": int(sweeps.numbers[number]),
             "time_ns": round(sweeps.begins_ns[number]),
+            "frame": AS_FIRED if sweeps.coordinates == "sensor" else COMPENSATED,
             "box_names": there.names,
             "box_types": there.types,
             "box_objects": there.objects.tolist(),

@@ -7,7 +7,7 @@ import re
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -59,7 +59,7 @@ class DataSetOutput(Output[CampaignRun]):
 
     def __post_init__(self) -> None:
         out = replace(Storage.at(self.place), durable=False)
-        self.dataset = DataSet(out, self.campaign.keep.format, self.campaign.keep.layout)
+        self.dataset = DataSet(out, **asdict(self.campaign.keep))
         # Of a finished data set: its record, rows, and what is wrong with jobs, {number: a clause}.
         self._made: Mapping[str, Any] | None = None
         self._rows: list[JobRow] = []
@@ -314,7 +314,7 @@ def verify(place: Storage, number: int | None = None) -> str:
     Returns a line; LidarpoolError names what is damaged, or says that there is no such data set.
     """
     index = read_index(place)
-    dataset = DataSet(place, index["format"], index["layout"])
+    dataset = DataSet(place, index["format"], index["layout"], index["compensated"])
     rows = [row for row in read_table(place, index["table"]) if row.done]
     whole = {row.number for row in rows} == index["jobs"].keys()
     rows = [row for row in rows if number in (None, row.number)]

@@ -30,8 +30,6 @@ from ..columns.waveforms import WAVEFORM
 from ..datasets.job_table import JobRow
 from ..datasets.sweep_data import Sweep
 from ..export.boxes import Boxes
-from ..export.format_table import DATA_SETS
-from ..export.formats import Format
 from ..export.sweeps import Sweeps
 from ..pipeline.casting_workers import CastingWorkers
 from ..pipeline.database import JobParts
@@ -157,8 +155,7 @@ class _Casting:
         self._dispatcher = Dispatcher(self._casting, self, "")  # type: ignore[arg-type]
         self._watch = Watch(client, [GPU], (), options.patience_s)
         self._orders: list[CollectOrder] = []  # of columns to be fetched
-        keep = stream.campaign.keep
-        columns = Format(DATA_SETS[keep.format], keep.layout).needs
+        columns = stream.campaign.keep.of_jobs.needs
         self._maker = JobMaker(stream.campaign, stream.numbers, columns)
         self._jobs: dict[int, _Streamed] = {}  # those that are cast
         self._next: _Streamed | None = None  # the job whose sweeps are cast next

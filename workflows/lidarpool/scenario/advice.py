@@ -111,7 +111,9 @@ def _of_datasheets(built: Built) -> Iterator[str]:
 
 
 def _without_effect(scenario: Scenario) -> Iterator[str]:
-    """Tell of settings that another one keeps from having an effect."""
+    """Tell of settings that another one keeps from having an effect, or contradicts."""
+    for entry in scenario.output.write:
+        yield from entry.contradictions(scenario.cloud.coordinates)
     written = {entry.format for entry in scenario.output.write}
     if scenario.cloud.waveform_samples and not {"las", "laz"} & written:
         yield (

@@ -48,6 +48,7 @@ from ..base.validation import checked_fields, sections_in, sentences
 from ..base.yamlfile import load_yaml
 from ..datasets.job_table import Value
 from ..export.format_table import DATA_SETS, LAYOUTS
+from ..export.formats import Format
 from ..sensor.calibrations import said, text_of
 from .sections import Section, may_be_empty
 
@@ -362,6 +363,20 @@ class Keep:
         Literal[tuple(LAYOUTS)],  # type: ignore[valid-type]
         about("layout of points in mcap"),
     ] = "velodyne"
+    compensated: Annotated[
+        bool,
+        about(
+            "points in mcap at the start of the sweep, without times; by default at their firing"
+        ),
+    ] = False
+
+    def __post_init__(self) -> None:
+        _ = self.of_jobs  # LidarpoolError if its fields do not fit together
+
+    @property
+    def of_jobs(self) -> Format:
+        """Format of the files of a job."""
+        return Format(DATA_SETS[self.format], self.layout, self.compensated)
 
 
 KeepEntry = Annotated[

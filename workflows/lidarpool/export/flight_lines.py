@@ -1,0 +1,185 @@
+"""Scan angles, lines of mirrors and flight lines, as LAS 1.4 (R15) defines them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from ..base.arrays import Bools, Bytes, Floats, Indices, Ints
+from ..base.errors import LidarpoolError
+from ..columns.cloud import Cloud
+from .sweeps import MIXED_UP, Sweeps
+
+_MAX_SOURCE = 65_535  # that the format holds
+# A flight line begins where the direction of flight has changed by so much, and then stays within
+# so much for so long.
+_TURN_DEG = 20.0
+_STEADY_DEG = 5.0
+_STEADY_NS = 1e9
+_MIN_STEP_M = 1e-6  # of a carrier that moves: in 2 ms, or a sweep
+_LINES = 1 << 40  # numbers of lines of a station
+
+
+@dataclass(frozen=True, eq=False)
+class LineFields:
+    """Fields of some points."""
+
+    # (k,): degrees about the direction of flight from straight down, negative to the left.
+    scan_angle_deg: Floats
+    direction: Bytes  # (k,): 1 while a mirror sweeps from left to right, else 0
+    edge: Bools  # (k,): whether the pulse is the last of its line with a return
+    source: Ints  # (k,): number of flight line or station, and sensor, from 1; 0 if beyond
+    line: Ints  # (k,): different numbers for different lines of mirrors; -1 without a mirror
+
+    @classmethod
+    def empty(cls, count: int) -> LineFields:
+        """Return the fields of points of an unknown survey."""
+        return cls(
+            np.zeros(count),
+            np.zeros(count, np.uint8),
+            np.zeros(count, np.bool_),
+            np.zeros(count, np.int64),
+            np.full(count, -1, np.int64),
+        )
+
+
+class FlightLines:
+    """Finds the fields of the points of a survey.
+
+    The direction of flight is that in which the sensor moves, or the x axis of one that stands.
+    Sources are numbered by flight line or station, and with several sensors by sensor.
+    """
+
+    def __init__(self, sweeps: Sweeps) -> None:
+        self.sweeps = sweeps
+
+    def of(self, chunks: Iterable[Cloud]) -> Iterator[tuple[Cloud, LineFields]]:
+        """Yield consecutive points with their fields.
+
+        Points that are not in the order of their scans have no edges of lines.
+
+        Raises
+        ------
+        LidarpoolError
+            If the points are of another survey.
+        """
+        held: tuple[Cloud, LineFields] | None = None
+        for chunk in chunks:
+            if not len(chunk):
+                continue
+            fields = self._fields(chunk)
+            if held is not None:
+                _, known = held
+                if known.line[-1] == fields.line[0]:  # the line goes on in this chunk
+                    known.edge[known.line == known.line[-1]] = False
+                yield held
+            held = chunk, fields
+        if held is not None:
+            yield held
+
+    def _fields(self, chunk: Cloud) -> LineFields:
+        """Return the fields of a chunk, whose end is taken for the end of a line."""
+        fields = LineFields.empty(len(chunk))
+        if not len(self.sweeps) or "scan" not in chunk.columns:
+            return fields
+        sweep = np.searchsorted(self.sweeps.scans, chunk["scan"], "right") - 1
+        if sweep.max() >= len(self.sweeps):
+            raise LidarpoolError(MIXED_UP)
+        order = np.argsort(sweep, kind="stable")
+        for rows in np.split(order, 1 + np.flatnonzero(np.diff(sweep[order]))):
+            self._fill(fields, rows, int(sweep[rows[0]]), chunk[rows])
+        line = fields.line
+        if (np.diff(sweep) < 0).any():
+            return fields
+        # Index of the last point of each line; a pulse has one time, or without times one ray.
+        ends = np.append(np.flatnonzero(np.diff(line)), len(line) - 1)
+        last = ends[np.searchsorted(ends, np.arange(len(line)))]
+        pulse = next((chunk[name] for name in ("time", "ray") if name in chunk.columns), None)
+        same_pulse = np.arange(len(line)) == last if pulse is None else pulse == pulse[last]
+        fields.edge[:] = (line >= 0) & same_pulse
+        return fields
+
+    def _fill(self, fields: LineFields, rows: Indices, sweep: int, points: Cloud) -> None:
+        """Fill in the fields of the points of a sweep, but for edges."""
+        sweeps = self.sweeps
+        poses = sweeps.firing_poses(sweep, points)
+        exact = points.positions.astype(np.float64)
+        in_world = poses.outward(exact) if sweeps.coordinates == "sensor" else exact
+        steps = np.zeros((3, 1)) if poses.steps is None else poses.steps
+        ahead = _level(steps.T, sweeps.pose.turns[sweep][:, 0])
+        rays = in_world - poses.positions
+        to_right = rays[:, 0] * ahead[:, 1] - rays[:, 1] * ahead[:, 0]
+        fields.scan_angle_deg[rows] = np.degrees(np.arctan2(to_right, -rays[:, 2]))
+        source = self._sources[sweep]
+        fields.source[rows] = source if source <= _MAX_SOURCE else 0
+        sensor = int(sweeps.sensor[sweep])
+        mirror = sweeps.lidars[sensor].lines if sweeps.lidars else None
+        if mirror is None:
+            return
+        station = int(self._stations[sweep])
+        begin_ns = sweeps.begins_ns[sweep] - station * sweeps.station_ns
+        line = mirror.numbers(begin_ns + sweeps.since_ns(sweep, points))
+        # The sensor looks backwards.
+        against = sweeps.pose.turns[sweep][:, 0] @ self._directions[sweep] < 0
+        fields.direction[rows] = mirror.leftwards(line) == int(against)
+        fields.line[rows] = (sensor * sweeps.stations + station) * _LINES + line
+
+    @cached_property
+    def _directions(self) -> Floats:
+        """Level unit vectors (n, 3) of the direction of flight in each sweep."""
+        axes = self.sweeps.pose.turns[:, :, 0]
+        knots = self.sweeps.knots
+        moved = knots[:, -1, :3].astype(np.float64) if len(knots) else np.zeros_like(axes)
+        return _level(moved, axes)
+
+    @cached_property
+    def _stations(self) -> Ints:
+        """Station of each sweep: (n,)."""
+        sweeps = self.sweeps
+        per_station = np.bincount(sweeps.sensor) // sweeps.stations
+        return sweeps.numbers // np.maximum(per_station[sweeps.sensor], 1)
+
+    @cached_property
+    def _sources(self) -> Ints:
+        """Number of the source of each sweep, from 1: (n,)."""
+        sweeps, source = self.sweeps, self._stations.copy()
+        for sensor, lidar in enumerate(sweeps.lidars):
+            rows = np.flatnonzero(sweeps.sensor == sensor)
+            if lidar.lines is not None and len(sweeps.knots) and sweeps.stations == 1:
+                source[rows] = _flight_lines(self._directions[rows], sweeps.begins_ns[rows])
+        return source * max(len(sweeps.sensors), 1) + sweeps.sensor + 1
+
+
+def _level(moves: Floats, axes: Floats) -> Floats:
+    """Return level unit vectors (k, 3) along movements (k, 3), or along axes where these are none.
+
+    `axes` are (k, 3) or (3,); where they point straight up or down, the direction is x.
+    """
+    stands = np.hypot(moves[:, 0], moves[:, 1]) < _MIN_STEP_M
+    ahead = np.where(stands[:, None], axes, moves) * (1.0, 1.0, 0.0)
+    lengths = np.linalg.norm(ahead, axis=1)
+    ahead[lengths < 1e-9] = (1.0, 0.0, 0.0)
+    return np.asarray(ahead / np.where(lengths < 1e-9, 1.0, lengths)[:, None])
+
+
+def _flight_lines(directions: Floats, begins_ns: Floats) -> Ints:
+    """Return the flight line of each sweep (n,), from 0; `directions` (n, 3) are of unit length.
+
+    What a carrier measures in a turn belongs to the line before.
+    """
+    heading_deg = np.degrees(np.unwrap(np.arctan2(directions[:, 1], directions[:, 0])))
+    window = np.searchsorted(begins_ns, begins_ns + _STEADY_NS)
+    lines = np.zeros(len(heading_deg), np.int64)
+    start = 0
+    while True:
+        turned = np.abs(heading_deg[start:] - heading_deg[start]) > _TURN_DEG
+        candidates = start + np.flatnonzero(turned)
+        steady = (k for k in candidates if np.ptp(heading_deg[k : window[k]]) < _STEADY_DEG)
+        following = next(steady, None)
+        if following is None:
+            return lines
+        lines[following:] += 1
+        start = int(following)

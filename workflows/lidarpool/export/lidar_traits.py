@@ -1,0 +1,91 @@
+"""What files say of a sensor beside its points: modes, firings and lines of its mirror."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+
+from ..base.arrays import Floats, Ints
+from ..sensor import Sensor
+from ..sensor.beams import Mirror, Spin
+from ..sensor.sensor import LineSensor
+
+_OUSTER = "ouster"  # scale of reflectivity that sensors of this maker have
+
+
+@dataclass(frozen=True)
+class MirrorLines:
+    """Lines that a mirror sweeps across the direction of flight.
+
+    `rate_hz` counts cycles; a swinging mirror sweeps two lines in a cycle, others one. `start_ns`
+    is the start of cycle 0, nanoseconds since the start of the station. `leftward` says whether the
+    first line of a cycle runs from right to left, seen along the sensor's x axis.
+    """
+
+    rate_hz: float
+    start_ns: float
+    swings: bool
+    leftward: bool
+
+    def numbers(self, times_ns: Floats) -> Ints:
+        """Return the line of each time (n,), nanoseconds since the start of the station: (n,)."""
+        per_second = self.rate_hz * (2 if self.swings else 1)
+        # A line begins with the firing that times are rounded to, 1 ns.
+        return np.floor((times_ns - self.start_ns + 1) * (per_second / 1e9)).astype(np.int64)
+
+    def leftwards(self, lines: Ints) -> Ints:
+        """Return 1 for the lines (n,) that run from right to left, else 0: (n,)."""
+        returning = lines % 2 if self.swings else np.zeros(len(lines), np.int64)
+        return returning ^ int(self.leftward)
+
+
+@dataclass(frozen=True)
+class LidarTraits:
+    """Properties of a sensor that fields of files depend on."""
+
+    channels: int
+    mode: str  # of its returns, see `Returns`
+    zero_deg: float = 0.0  # azimuth at which its head starts: counter-clockwise from x
+    firing_ns: float = 0.0  # time from the first beam of a firing to the last
+    # Length that the maker's ranges count beside the distance from the beam's origin, metres.
+    range_offset_m: float = 0.0
+    lines: MirrorLines | None = None  # of sensors that sweep across the direction of flight
+
+    @classmethod
+    def of(cls, sensor: Sensor, mode: str) -> LidarTraits:
+        """Return the traits of a sensor, whose class may be a user's."""
+        head, beams = sensor.head, sensor.beams
+        spins = isinstance(head, Spin) and not isinstance(head, Mirror)
+        delays = beams.time_ns
+        offset_m = 0.0
+        if sensor.optics.reflectivity == _OUSTER and len(beams.origin):
+            offset_m = float(np.hypot(*beams.origin[0, :2]))
+        return cls(
+            sensor.channels,
+            mode,
+            float(head.zero_deg) if isinstance(head, Spin) and spins else 0.0,
+            float(np.ptp(delays)) if len(delays) else 0.0,
+            offset_m,
+            _lines_of(sensor),
+        )
+
+    def words(self) -> dict[str, Any]:
+        """Return the traits as JSON holds them."""
+        return asdict(self)
+
+    @classmethod
+    def from_words(cls, words: dict[str, Any]) -> LidarTraits:
+        """Return the traits that `words` gave."""
+        lines = words.pop("lines")
+        return cls(**words, lines=lines and MirrorLines(**lines))
+
+
+def _lines_of(sensor: Sensor) -> MirrorLines | None:
+    """Return the lines of a sensor that sweeps about its x axis, else None."""
+    head = sensor.head
+    if not isinstance(sensor, LineSensor) or not isinstance(head, Spin):
+        return None
+    swings = isinstance(head, Mirror) and head.motion != "sawtooth"
+    return MirrorLines(head.rate_hz, sensor.start_ns + sensor.lead_ns, swings, not head.clockwise)
