@@ -121,9 +121,11 @@ class Surroundings:
         A body that stands on the ground may lack a bottom.
         """
         views = self.views(position)
-        spanned = views.distance[:, None] * views.directions
-        spanned = np.ptp(spanned[np.isfinite(views.distance)], axis=0) if views.hit.any() else 0.0
-        spans = bool((spanned >= _SPANS * np.ptp(self._scene.bounds, axis=0)).all())
+        extent = np.zeros(3)
+        if views.hit.any():
+            hits = views.distance[:, None] * views.directions
+            extent = np.ptp(hits[np.isfinite(views.distance)], axis=0)
+        spans = bool((extent >= _SPANS * np.ptp(self._scene.bounds, axis=0)).all())
         if views.in_a_body:
             return not (spans and self._is_room(views))
         raised = views.directions[:, 2] > _RAISED
