@@ -11,7 +11,8 @@ from distributed import Client, get_worker
 from distributed.client import FutureCancelledError
 from distributed.comm.core import CommClosedError
 
-from poolpart import Partition, PipeClosed, PipeFailed, PoolError, own_client
+from poolpart import Partition, PipeClosed, PipeFailed, PoolError
+from poolpart.task_context import own_client
 
 from ..base.errors import LidarpoolError
 from ..pipeline.names import GPU, LIDAR, OTHER
