@@ -542,8 +542,9 @@ class _Base:
                     continue
                 self.table_files[text] = table = self.scenario.path(choice.sample.file)
                 with prefixed(text):
-                    if (key := (table, repr(kind))) not in tables:
-                        tables[key] = read_rows(table, kind)
+                    ignore = choice.sample.ignore
+                    if (key := (table, repr(kind), ignore)) not in tables:
+                        tables[key] = read_rows(table, kind, ignore)
                     self.tables[text] = tables[key]
                     if (most := choice.sample.count[1]) > (there := len(tables[key])):
                         has = plural(there, "row")

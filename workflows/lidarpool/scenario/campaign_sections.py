@@ -44,12 +44,13 @@ from ..base.declared import (
     short,
 )
 from ..base.errors import LidarpoolError, Mistakes
+from ..base.tables import ignored_columns
 from ..base.validation import checked_fields, sections_in, sentences
 from ..base.yamlfile import load_yaml
 from ..datasets.job_table import Value
 from ..export.format_table import DATA_SETS, LAYOUTS
 from ..sensor.calibrations import said, text_of
-from .sections import Section, may_be_empty
+from .sections import IgnoredColumns, Section, may_be_empty
 
 SIGMAS = 6.0  # normal numbers are drawn again beyond, one of 500 million
 SHARE_LEAST = 0.01  # of a normal distribution that lies within limits
@@ -224,6 +225,7 @@ class Sample(Section):
         short(lambda v: type(v) is int, lambda v: [v, v], int | list[int]),
         about("how many rows a job has: a number, or [least, largest]"),
     ]
+    ignore: IgnoredColumns = ()
 
 
 _KINDS = ("uniform", "log_uniform", "normal", "integer", "choice", "each", "sample")
@@ -468,7 +470,7 @@ _REAL = re.compile(r"[-+]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][-+]?[0-9]+)?")
 _WORDS = {"true": True, "false": False}
 
 
-def read_rows(path: Path, kind: Any) -> list[Any]:
+def read_rows(path: Path, kind: Any, ignore: Sequence[str] = ()) -> list[Any]:
     """Read entries of a list from a table, whose columns are their fields: box, at.0.position.
 
     A cell is a number, true or false, or a list or mapping as in YAML, else text; an empty one
@@ -478,6 +480,8 @@ def read_rows(path: Path, kind: Any) -> list[Any]:
     ----------
     kind
         Annotation of the list.
+    ignore
+        Names of columns to leave out, with * and ?.
 
     Raises
     ------
@@ -500,7 +504,9 @@ def read_rows(path: Path, kind: Any) -> list[Any]:
         ]
         if not cells:
             raise ValueError("it is empty")
-        (_, head), *cells = cells
+        (_, header), *cells = cells
+        left_out = ignored_columns(header, ignore)
+        head = [name for index, name in enumerate(header) if index not in left_out]
         if twice := next((name for name in head if head.count(name) > 1), None):
             raise ValueError(f"it has the column {twice!r} twice")
     except FileNotFoundError as error:
@@ -513,11 +519,12 @@ def read_rows(path: Path, kind: Any) -> list[Any]:
     for line, row in cells:
         where = f"{path}, line {line}"
         with mistakes.noted(), sentences(model, where):
-            if len(row) > len(head):
+            if len(row) > len(header):
                 raise LidarpoolError(
-                    f"{where}: it has {len(row)} cells, and the header {len(head)}."
+                    f"{where}: it has {len(row)} cells, and the header {len(header)}."
                 )
-            rows.append(_checked(adapter, dict(zip(head, row, strict=False))))
+            read = [cell for index, cell in enumerate(row) if index not in left_out]
+            rows.append(_checked(adapter, dict(zip(head, read, strict=False))))
     mistakes.tell()
     return rows
 

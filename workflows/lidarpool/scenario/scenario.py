@@ -297,7 +297,7 @@ class Scenario(Section):
         files: list[str | None] = [entry.file for entry in entries]
         files += [self.traffic.file] if self.traffic else []
         files += [entry.table.file for entry in self.scene.copies if entry.table]
-        files += [entry.joints for entry in self.actors]
+        files += [entry.joints.file for entry in self.actors if entry.joints]
         for way in (self.trajectory, *(entry.trajectory for entry in self.actors)):
             files += [way.file, way.times] if way else []
         for section in (self.sensor, *self.sensors.values()):

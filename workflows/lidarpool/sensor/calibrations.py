@@ -140,7 +140,10 @@ def _ouster(name: str, data: Any) -> Calibration:
             f"it has {elevation.size} altitude and {azimuth.size} azimuth angles of {rows} beams"
         )
     there = (elevation != 0) | (azimuth != 0)  # older firmware writes zeros for beams it lacks
-    beam_at = np.reshape(beam.get("beam_to_lidar_transform", np.eye(4)), (4, 4))[:3, 3].copy()
+    beam_pose = np.reshape(beam.get("beam_to_lidar_transform", np.eye(4)), (4, 4))
+    if not np.allclose(beam_pose[:3, :3], np.eye(3)):
+        raise ValueError("its beam_to_lidar_transform turns the beams; a translation is expected")
+    beam_at = beam_pose[:3, 3].copy()
     if "lidar_origin_to_beam_origin_mm" in beam:
         beam_at[0] = beam["lidar_origin_to_beam_origin_mm"]
     elif "beam_to_lidar_transform" not in beam:  # firmware before 2.0
@@ -189,6 +192,8 @@ def _table(name: str, text: str) -> Calibration:
         other = [word for word in header if word not in known]
         if other:
             raise ValueError(f"column {other[0]!r} is not one of {', '.join(known)}")
+        if twice := next((word for word in header if header.count(word) > 1), None):
+            raise ValueError(f"it has the column {twice!r} twice")
         columns = dict(zip(header, _rows(text, 1, len(header)).T, strict=True))
         zero = np.zeros(len(columns["elevation_deg"]))
         beams = Beams(
