@@ -203,6 +203,17 @@ def test_tables_may_be_written_in_several_ways(campaign, folder, text):
     assert (crate.name, crate.box, crate.at[0].position) == ("A", (1, 2, 3), (1, 2))
 
 
+def test_columns_of_a_table_are_fields_or_ignored(campaign, folder):
+    (folder / "crates.csv").write_text('name,Wood,box,at,wood\nA,oak,"[1, 2, 3]","[[1, 2]]",5\n')
+    sample = {"from": "crates.csv", "count": 1}
+    with pytest.raises(LidarpoolError, match=r"crates\.csv, line 2: Wood is not a field"):
+        campaign({"scene.copies": {"sample": sample}}).check_files()
+    found = campaign({"scene.copies": {"sample": {**sample, "ignore": "wood"}}})
+    assert found.scenario(0).scene.copies[1].box == (1, 2, 3)
+    with pytest.raises(LidarpoolError, match=r"ignore names 'steel', which is no column"):
+        campaign({"scene.copies": {"sample": {**sample, "ignore": ["wood", "steel"]}}})
+
+
 def test_names_may_be_given_to_values(campaign):
     found = campaign(
         {

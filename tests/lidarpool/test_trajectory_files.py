@@ -264,6 +264,16 @@ def test_other_files_are_named(tmp_path, content, words, name):
     assert "codec" not in str(raised.value)
 
 
+def test_a_trj_of_helios_is_read_with_its_units(tmp_path):
+    text = '#HEADER: "t", "roll", "pitch", "yaw", "x", "y", "z"\n0,0,0,0.5,0,0,9\n1,0,0,0.5,5,0,9\n'
+    (tmp_path / "a.trj").write_text(text)
+    with pytest.raises(LidarpoolError, match=r"'t' has no unit.*lidarpool import` reads a \.trj"):
+        load_trajectory(tmp_path / "a.trj")
+    columns = {"time_s": "t", "yaw_rad": "yaw", "pitch_rad": "pitch", "roll_rad": "roll"}
+    track = load_trajectory(tmp_path / "a.trj", columns=columns)
+    assert np.isclose(track.pose(0).yaw_deg, np.degrees(0.5))
+
+
 def test_options_of_other_formats_are_refused(load, tmp_path):
     for options, words in (
         ({"topic": "/odom"}, "topic is of bags"),

@@ -44,6 +44,7 @@ _BRACKETS = re.compile(r"(.*?)\s*[\[(]\s*([^\])]*?)\s*[\])]")
 # A name of a header that spaces separate, with its unit: q_w []
 _WORD = re.compile(r"[^\s\[(]+(?:\s*[\[(][^\])]*[\])])?")
 _SEPARATORS = ",;\t"
+_HEADER_MARK = re.compile(r"^[#%\s]*(?:HEADER:)?")  # before a header in a remark
 _BETWEEN = re.compile(r"[\s_\-./:]+")  # words of a name
 _SUFFIX = re.compile(r"(.+?)[\s_\-./:]+([^\s_\-./:]+)")
 _CAMEL = re.compile(r"(?<=[a-z])(?=[A-Z])")  # between the words of timeStamp
@@ -166,7 +167,7 @@ def find_header(
         separator = _separator_of(lines[body])
         return Header(_cells(lines[body], separator), separator, body + 1, False)
     for line in reversed(lines[:body]):
-        names = line.strip().lstrip("#%").strip()
+        names = _HEADER_MARK.sub("", line).strip()
         separator = _separator_of(lines[body]) if body < len(lines) else _separator_of(names)
         cells = _cells(names, separator)
         count = len(_cells(lines[body], separator)) if body < len(lines) else len(cells)

@@ -263,8 +263,9 @@ def _mount(section: SensorSection, shapes: Shapes) -> Pose:
     with prefixed(f"actor {entry.name!r}"):
         path = robot.path(mount.link, **_joints(entry, scenario))
     if path.moves:
+        file = None if entry.joints is None else entry.joints.file
         raise LidarpoolError(
-            f"mount.link is {mount.link!r}, which {entry.joints.file} moves, and a mount is rigid: "
+            f"mount.link is {mount.link!r}, which {file} moves, and a mount is rigid: "
             "mount the sensor on a link that does not move, or leave out those joints' columns."
         )
     return path.pose(0).then(mount.pose())

@@ -21,15 +21,20 @@ from .trajectory import quaternions_of, rotations_of
 
 WIDTH = 30  # numbers of a row
 _RADIUS_M = 6378137.0  # of KITTI's Mercator projection
-_TIMES = "timestamps.txt"
+OXTS_TIMES = "timestamps.txt"
 
 
 def find_oxts(path: Path) -> Path | None:
     """Return the folder «oxts» that a path is or holds, or None."""
     for folder in (path, path / "oxts", path.parent if path.name == "data" else path):
-        if (folder / "data").is_dir() and (folder / _TIMES).is_file():
+        if (folder / "data").is_dir() and (folder / OXTS_TIMES).is_file():
             return folder
     return None
+
+
+def oxts_files(folder: Path) -> list[Path]:
+    """Return the files of a folder «oxts», a row each, in the order of their numbers."""
+    return sorted((folder / "data").glob("*.txt"), key=lambda file: natural(file.name))
 
 
 def read_oxts(folder: Path, origin: Sequence[float] | None) -> tuple[Floats, Floats, Floats]:
@@ -39,7 +44,7 @@ def read_oxts(folder: Path, origin: Sequence[float] | None) -> tuple[Floats, Flo
     -------
     seconds since 1970 (k,), and positions (k, 3) and quaternions (k, 4) as of `oxts_poses`.
     """
-    files = sorted((folder / "data").glob("*.txt"), key=lambda file: natural(file.name))
+    files = oxts_files(folder)
     if not files:
         raise ValueError("its folder data has no .txt files")
     rows = []
@@ -49,11 +54,11 @@ def read_oxts(folder: Path, origin: Sequence[float] | None) -> tuple[Floats, Flo
         if len(numbers) != WIDTH:
             raise ValueError(f"data/{file.name} has {len(numbers)} numbers, not {WIDTH}")
         rows.append([float(number) for number in numbers])
-    check_fits(folder / _TIMES)
-    lines = (folder / _TIMES).read_text("utf-8-sig").split("\n")
+    check_fits(folder / OXTS_TIMES)
+    lines = (folder / OXTS_TIMES).read_text("utf-8-sig").split("\n")
     times = np.array([line.strip() for line in lines if line.strip()], "datetime64[ns]")
     if len(times) != len(files):
-        raise ValueError(f"it has {len(files)} files of data, and {_TIMES} {len(times)} times")
+        raise ValueError(f"it has {len(files)} files of data, and {OXTS_TIMES} {len(times)} times")
     return times.astype(np.int64) / 1e9, *oxts_poses(np.array(rows), origin)
 
 

@@ -19,7 +19,7 @@ from ..base.vectors import turned
 from ..columns.bags import is_bag
 from .bag_trajectories import read_bag
 from .calibrations import said, text_of
-from .oxts import WIDTH, find_oxts, oxts_poses, read_oxts
+from .oxts import OXTS_TIMES, WIDTH, find_oxts, oxts_files, oxts_poses, read_oxts
 from .pose_columns import (
     ANGLES,
     POSE_TABLES,
@@ -64,6 +64,8 @@ _BINARY = {
     b"\xfe\xff": "text in UTF-16: save it as UTF-8",
     b"\x93NUMPY": "an array of NumPy: save it as .csv with a header",
 }
+# A .trj of HELIOS++ says neither units nor the order of rotations: its survey does.
+_HELIOS = " `lidarpool import` reads a .trj of HELIOS++ with its survey."
 
 
 class Poses(NamedTuple):
@@ -151,7 +153,18 @@ def load_trajectory(
             track = _from_camera(track)
         return track
     except (OSError, ValueError, LidarpoolError) as error:
-        raise LidarpoolError(f"{path} is not a usable trajectory: {said(error)}") from error
+        more = _HELIOS if path.suffix.lower() == ".trj" else ""
+        raise LidarpoolError(f"{path} is not a usable trajectory: {said(error)}{more}") from error
+
+
+def files_of_trajectory(path: Path) -> list[Path]:
+    """Return the files that a trajectory is read from: of a folder those in it, else the path."""
+    if not path.is_dir():
+        return [path]
+    if is_bag(path):
+        return sorted(file for file in path.iterdir() if file.is_file())
+    folder = find_oxts(path)
+    return [path] if folder is None else [*oxts_files(folder), folder / OXTS_TIMES]
 
 
 def _refuse_topic(topic: str | None) -> None:
