@@ -106,7 +106,7 @@ def check_rotations(rotations: Floats, slack: float = 1e-6) -> None:
     """
     products = matmul(rotations.transpose(0, 2, 1), rotations)
     # Written so that NaN is an error.
-    rigid: Bools = (np.abs(products - np.eye(3)) <= slack).all(axis=(1, 2))
+    rigid = np.asarray((np.abs(products - np.eye(3)) <= slack).all(axis=(1, 2)))
     right_handed = determinant(rotations) > 0
     bad = np.flatnonzero(~(rigid & right_handed))
     if len(bad):
