@@ -120,6 +120,7 @@ def test_columns_that_are_named_or_ignored(load):
         ({"ignore": ["speed"]}, "not known: speed_up"),
         ({"ignore": ["Spede"]}, "ignore names 'Spede', which is no column"),
         ({"columns": {"yaw_deg": "Speeed"}}, "no column 'Speeed'"),
+        ({"columns": {"yaw": "heading"}, "ignore": ["sp*"]}, "'heading' has no unit: call it yaw"),
         ({"columns": {"jaw": "speed"}}, "columns names 'jaw'; possible names are time_s"),
     ):
         with pytest.raises(LidarpoolError, match=words):

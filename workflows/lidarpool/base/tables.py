@@ -320,9 +320,10 @@ class _ColumnReader:
             if len(matches) > 1:
                 raise ValueError(f"it has the column {theirs!r} {len(matches)} times")
             stated = column_name(wanted).unit
-            unit = unit or quantity.bare or next(iter(quantity.units))
-            if stated in quantity.units and stated != unit:
+            if unit is not None and stated in quantity.units and stated != unit:
                 raise ValueError(f"columns reads {theirs!r} as {ours}: the header states {stated}")
+            if unit is None:
+                unit = self._unit(quantity, theirs, stated, {})
             self._add(quantity, matches[0], unit)
 
     def leave_out(self, ignore: Sequence[str]) -> None:

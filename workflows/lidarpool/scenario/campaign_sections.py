@@ -46,6 +46,7 @@ from ..base.declared import (
 from ..base.errors import LidarpoolError, Mistakes
 from ..base.tables import ignored_columns
 from ..base.validation import checked_fields, sections_in, sentences
+from ..base.words import did_you_mean, printable
 from ..base.yamlfile import load_yaml
 from ..datasets.job_table import Value
 from ..export.format_table import DATA_SETS, LAYOUTS
@@ -509,11 +510,12 @@ def read_rows(path: Path, kind: Any, ignore: Sequence[str] = ()) -> list[Any]:
         head = [name for index, name in enumerate(header) if index not in left_out]
         if twice := next((name for name in head if head.count(name) > 1), None):
             raise ValueError(f"it has the column {twice!r} twice")
+        model = next(sections_in(entry), BaseModel)
+        _check_columns(head, model)
     except FileNotFoundError as error:
         raise LidarpoolError(f"{path} does not exist: check the name and the folder.") from error
     except (OSError, ValueError, csv.Error, LidarpoolError) as error:
         raise LidarpoolError(f"{path} is not a usable table: {said(error)}") from error
-    model = next(sections_in(entry), BaseModel)
     adapter = TypeAdapter(entry)
     mistakes, rows = Mistakes(), []
     for line, row in cells:
@@ -527,6 +529,23 @@ def read_rows(path: Path, kind: Any, ignore: Sequence[str] = ()) -> list[Any]:
             rows.append(_checked(adapter, dict(zip(head, read, strict=False))))
     mistakes.tell()
     return rows
+
+
+def _check_columns(names: Sequence[str], model: Any) -> None:
+    """Check that columns are fields of an entry, or numbers of one that is a list."""
+    fields = [field.alias or name for name, field in getattr(model, "model_fields", {}).items()]
+    unknown = [
+        name
+        for name in names
+        if name and fields and (first := name.split(".")[0]) not in fields and not first.isdigit()
+    ]
+    if unknown:
+        verb = "columns are" if unknown[1:] else "column is"
+        raise ValueError(
+            f"its {verb} not known: {', '.join(map(printable, unknown))}."
+            f"{did_you_mean(unknown[0], fields)} Known are {', '.join(fields)}: rename it, or give "
+            f"ignore: [{printable(unknown[0])}] to leave it out"
+        )
 
 
 def _checked(adapter: TypeAdapter[Any], cells: dict[str, str]) -> Any:
