@@ -332,7 +332,7 @@ BAD = {
     "count.csv": (LIVOX + "1,1,2\n2,1,2\n", "has no firing times: give model: as well"),
     "still.csv": (LIVOX + "0,1,2\n0,1,3\n", "has no firing times: give model: as well"),
     "few.csv": (hesai(count=7), "fits no known model.* give model: as well"),
-    "binary.csv": (b"\xff\xfe\x00", "codec can't decode"),
+    "binary.csv": (b"\xff\xfe\x00", "text in UTF-16: save it as UTF-8"),
 }  # fmt: skip
 
 

@@ -249,7 +249,7 @@ def test_oxts_that_are_not_whole(oxts):
         (b"SQLite format 3\x00\xff", "give it the ending .db3"),
         (b"TSCANTRJ\x00\xff", "a trajectory of TerraScan: export it as text"),
         (gzip.compress(b"0 0 0 0 0 0 0 1"), "compressed by gzip: unpack it"),
-        (np.arange(34.0).tobytes(), "binary, of an unknown kind: export it as text"),
+        (np.arange(34.0).tobytes(), "a binary file of an unknown kind"),
         ("time_s,x,y,z".encode("utf-16"), "text in UTF-16: save it as UTF-8"),
         ("# \xe4\n0 0 0 0 0 0 0 1".encode("latin-1"), "no text in UTF-8"),
         (b"0,0,0,0,1,0,0,0\n1,1,0,0,1,0,0,0\n", "it has no header: name its columns"),
@@ -287,3 +287,10 @@ def test_options_of_other_formats_are_refused(load, tmp_path):
     assert isinstance(load_trajectory(tmp_path / "a.tum"), Track)
     with pytest.raises(LidarpoolError, match="columns and ignore are of tables"):
         load_trajectory(tmp_path / "a.tum", ignore=["a"])
+
+
+def test_binary_files_of_times_are_named(tmp_path):
+    np.savetxt(tmp_path / "poses.txt", [np.eye(4)[:3].ravel()] * 2)
+    (tmp_path / "times.txt").write_bytes(gzip.compress(b"0\n1\n"))
+    with pytest.raises(LidarpoolError, match=r"times\.txt has no times: it is compressed by gzip"):
+        load_trajectory(tmp_path / "poses.txt", times=tmp_path / "times.txt")

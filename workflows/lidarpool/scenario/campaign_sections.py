@@ -45,12 +45,13 @@ from ..base.declared import (
 )
 from ..base.errors import LidarpoolError, Mistakes
 from ..base.tables import ignored_columns
+from ..base.textfile import read_text
 from ..base.validation import checked_fields, sections_in, sentences
 from ..base.words import did_you_mean, printable
 from ..base.yamlfile import load_yaml
 from ..datasets.job_table import Value
 from ..export.format_table import DATA_SETS, LAYOUTS
-from ..sensor.calibrations import said, text_of
+from ..sensor.calibrations import said
 from .sections import IgnoredColumns, Section, may_be_empty
 
 SIGMAS = 6.0  # normal numbers are drawn again beyond, one of 500 million
@@ -494,7 +495,7 @@ def read_rows(path: Path, kind: Any, ignore: Sequence[str] = ()) -> list[Any]:
     if entry is None:
         raise LidarpoolError("sample adds entries to a list, such as actors, and this is none.")
     try:
-        lines = text_of(path).splitlines()
+        lines = read_text(path).splitlines()
         first = next((line for line in lines if line.strip() and line.lstrip()[0] != "#"), "")
         mark = max(_MARKS, key=first.count)
         reader = csv.reader(lines, delimiter=mark)

@@ -12,6 +12,7 @@ import numpy as np
 from ..base.arrays import Floats
 from ..base.errors import LidarpoolError, Mistakes, prefixed
 from ..base.tables import NUMBERS, Quantity, read_table
+from ..base.textfile import read_text
 from ..base.words import plural
 from ..scene.actors import Actor, box, one_mesh
 from ..scene.files.meshfile import ROBOTS, Objects, load_objects
@@ -24,7 +25,7 @@ from ..scene.scene_mesh import SceneMesh
 from ..scene.shapes import seed_objects
 from ..scene.transform import Transform, affine
 from ..scene.wheels import rolling
-from ..sensor.calibrations import said, text_of
+from ..sensor.calibrations import said
 from ..sensor.pose_columns import ANGLES, POSITION, REFUSED_COLUMNS, angles_of, with_yaw
 from ..sensor.trajectory import rotations_of
 from .ground import Standing
@@ -299,7 +300,7 @@ def _of_table(path: Path, table: CopyTable) -> tuple[Floats, Floats, Floats]:
     try:
         columns = with_yaw(
             read_table(
-                text_of(path),
+                read_text(path),
                 _COPY_COLUMNS,
                 required=lambda columns: ("x", "y"),
                 columns=table.columns,

@@ -16,11 +16,12 @@ from ..base.arrays import Floats
 from ..base.elementary import interp, sin_cos
 from ..base.errors import LidarpoolError
 from ..base.tables import METRES, RADIANS, Quantity, read_table
+from ..base.textfile import read_text
 from ..base.validation import as_array, checked
 from ..base.vectors import applied, matmul
 from ..base.words import did_you_mean, plural
 from ..sensor import Pose, Stations, Trajectory
-from ..sensor.calibrations import said, text_of
+from ..sensor.calibrations import said
 from ..sensor.pose_columns import TIME
 from ..sensor.trajectory import full_poses, presence_ns, velocities
 from .actors import AT_ZERO, Actor, one_mesh
@@ -303,7 +304,7 @@ class Robot:
         ]
         try:
             table = read_table(
-                text_of(path),
+                read_text(path),
                 [TIME, *quantities],
                 required=lambda columns: ("time_s",),
                 ignore=ignore,

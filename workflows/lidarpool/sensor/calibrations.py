@@ -12,10 +12,10 @@ from typing import Any
 import numpy as np
 import yaml
 
-from ..base.allowance import check_fits
 from ..base.arrays import Floats
 from ..base.elementary import sin_cos
 from ..base.errors import LidarpoolError
+from ..base.textfile import read_text
 from ..base.yamlfile import load_yaml
 from .beams import Beams
 
@@ -56,7 +56,7 @@ def read_calibration(path: Path) -> Calibration:
         If it is none of these, or numbers are missing, not finite or in the wrong order.
     """
     try:
-        text = text_of(path)
+        text = read_text(path)
         if path.suffix.lower() in (".yaml", ".yml"):
             return _velodyne(path.name, load_yaml(text))
         if path.suffix.lower() == ".json":
@@ -64,15 +64,6 @@ def read_calibration(path: Path) -> Calibration:
         return _table(path.name, text)
     except UNUSABLE as error:
         raise LidarpoolError(f"{path} is not a usable calibration: {said(error)}") from error
-
-
-def text_of(path: Path) -> str:
-    """Read a text file; ValueError if it is empty, and as `check_fits`."""
-    check_fits(path)
-    text = path.read_text("utf-8-sig")
-    if not text.strip():
-        raise ValueError("it is empty")
-    return text
 
 
 def said(error: Exception) -> str:

@@ -10,15 +10,15 @@ from typing import Annotated, Literal, NamedTuple
 import numpy as np
 from pydantic import Field
 
-from ..base.allowance import check_fits
 from ..base.arrays import Floats
 from ..base.errors import LidarpoolError
 from ..base.tables import column_name, find_header, read_table
+from ..base.textfile import read_text
 from ..base.validation import checked
 from ..base.vectors import turned
 from ..columns.bags import is_bag
 from .bag_trajectories import read_bag
-from .calibrations import said, text_of
+from .calibrations import said
 from .oxts import OXTS_TIMES, WIDTH, find_oxts, oxts_files, oxts_poses, read_oxts
 from .pose_columns import (
     ANGLES,
@@ -47,23 +47,6 @@ Longitude = Annotated[float, Field(ge=-360, le=360)]
 Height = Annotated[float, Field(ge=-1e5, le=1e6)]
 # Cameras look along z with y down; carriers look along x with z up.
 _CAMERA = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
-# First bytes of files that are no text; what each is, and what to do.
-_BINARY = {
-    b"\x89MCAP0\r\n": "a bag (MCAP): give it the ending .mcap",
-    b"SQLite format 3": "a database (SQLite), as bags of ROS 2 are: give it the ending .db3, or "
-    "give the folder of the bag",
-    b"#ROSBAG V": "a bag of ROS 1: convert it, rosbags-convert --src FILE.bag --dst FOLDER",
-    b"TSCANTRJ": "a trajectory of TerraScan: export it as text",
-    b"\x1f\x8b": "compressed by gzip: unpack it",
-    b"\x28\xb5\x2f\xfd": "compressed by Zstandard: unpack it",
-    b"PK\x03\x04": "a zip archive: unpack it, or save a spreadsheet as .csv",
-    b"\x89HDF": "of HDF5: export its poses as .csv",
-    b"PAR1": "of Parquet: export it as .csv",
-    b"LASF": "a cloud (LAS)",
-    b"\xff\xfe": "text in UTF-16: save it as UTF-8",
-    b"\xfe\xff": "text in UTF-16: save it as UTF-8",
-    b"\x93NUMPY": "an array of NumPy: save it as .csv with a header",
-}
 # A .trj of HELIOS++ says neither units nor the order of rotations: its survey does.
 _HELIOS = " `lidarpool import` reads a .trj of HELIOS++ with its survey."
 
@@ -140,7 +123,7 @@ def load_trajectory(
             kind, poses = _of_container(path, format, times, topic, origin)
         else:
             _refuse_topic(topic)
-            text = _text_of_trajectory(path)
+            text = read_text(path)
             kind, poses = _of_text(text, format, times, columns or {}, ignore, origin)
         if (columns or ignore) and kind != "csv":
             raise ValueError(f"columns and ignore are of tables with a header, and it is {kind}")
@@ -193,27 +176,11 @@ def _of_container(
             raise ValueError("a folder of oxts has times of its own: leave out times")
         return "oxts", Poses(*read_oxts(folder, origin))
     if path.is_file() and kind == "oxts":
-        return _of_text(_text_of_trajectory(path), kind, times, {}, (), origin)
+        return _of_text(read_text(path), kind, times, {}, (), origin)
     raise ValueError(
         "a folder is one of KITTI, with timestamps.txt and data, or a bag of ROS 2, with "
         f"metadata.yaml{'' if kind is None else f'; format says {kind}'}"
     )
-
-
-def _text_of_trajectory(path: Path) -> str:
-    """Read a text file; ValueError that says what a binary one is."""
-    check_fits(path)
-    with path.open("rb") as file:
-        first = file.read(4096)
-    kind = next((kind for magic, kind in _BINARY.items() if first.startswith(magic)), None)
-    if kind is None and b"\0" in first:
-        kind = "binary, of an unknown kind: export it as text, with a header that names its columns"
-    if kind is not None:
-        raise ValueError(f"it is {kind}; trajectories are text (TUM, KITTI, .csv) or bags of ROS 2")
-    try:
-        return text_of(path)
-    except UnicodeDecodeError as error:
-        raise ValueError("it is no text in UTF-8: save it as UTF-8") from error
 
 
 def _of_text(
@@ -246,8 +213,10 @@ def _of_text(
         return kind, Poses(rows[:, 0], rows[:, 1:4], rows[:, 4:])
     if times is None:
         raise ValueError("KITTI's poses have no times: give their file as times")
-    check_fits(Path(times))
-    seconds = _numbers(Path(times).read_text("utf-8-sig"), 1)[:, 0]
+    try:
+        seconds = _numbers(read_text(Path(times)), 1)[:, 0]
+    except ValueError as error:
+        raise ValueError(f"{times} has no times: {said(error)}") from error
     expected = WIDTH if kind == "oxts" else 12
     if width != expected:
         raise ValueError(f"its rows have {width} numbers, not {expected}")
