@@ -6,6 +6,8 @@ import numpy as np
 import pytest
 
 from lidarpool import LidarpoolError, Pose, Track, load_trajectory
+from lidarpool.scenario.build import build
+from lidarpool.scenario.scenario import Scenario
 
 # Of x 0 to 10 m, z 1 m; the values of a case are those of both rows.
 HEAD, ROWS = "time_s,x,y,z", ("0,0,0,1", "1,10,0,1")
@@ -294,3 +296,11 @@ def test_binary_files_of_times_are_named(tmp_path):
     (tmp_path / "times.txt").write_bytes(gzip.compress(b"0\n1\n"))
     with pytest.raises(LidarpoolError, match=r"times\.txt has no times: it is compressed by gzip"):
         load_trajectory(tmp_path / "poses.txt", times=tmp_path / "times.txt")
+
+
+def test_a_scenario_depends_on_the_files_of_a_folder(oxts, tmp_path):
+    path = tmp_path / "drive.yaml"
+    path.write_text(f"trajectory: {{file: {oxts.parent.name}, origin: [49, 8.4, 100]}}\n")
+    names = [file.name for file in Scenario.load(path).files]
+    assert names == [f"{number:010}.txt" for number in range(3)] + ["timestamps.txt"]
+    assert np.isclose(build(Scenario.load(path)).job().survey.pose(0).position[2], 12.8)
