@@ -178,7 +178,7 @@ def _check_motion(motion: Motion, poses: int, rays: int) -> Motion:
 
 
 def _check_rotations(rotations: ArrayLike) -> Floats:
-    """Rotation matrices (k, 3, 3) in float64; raises ValueError for one that is not orthonormal."""
+    """Rotation matrices (k, 3, 3) in float64; ValueError for one that deforms or mirrors."""
     matrices = by_number(real_rows("rotations", rotations, (3, 3)))
     # Written out for all matrices at once: products one by one take longer than casting their rays.
     # NaN compares as false.
@@ -190,7 +190,16 @@ def _check_rotations(rotations: ArrayLike) -> Floats:
                 (a, b, c), (d, e, f) = rows[one], rows[other]
                 product = (a * d + b * e) + c * f
                 good &= np.abs(product - (one == other)) <= _SLACK
+        (a, b, c), (d, e, f), (g, h, i) = rows
+        determinants = (a * (e * i - f * h) - b * (d * i - f * g)) + c * (d * h - e * g)
+        mirrored = good & ~(determinants > 0)
+        good &= ~mirrored
     bad = np.flatnonzero(~good)
+    if len(bad) and mirrored[bad[0]]:
+        raise ValueError(
+            f"Rotation {bad[0]} is {matrices[bad[0]].tolist()}, which mirrors: expected the "
+            f"determinant 1 ({len(bad)} of {len(matrices)} are no rotations)."
+        )
     if len(bad):
         raise ValueError(
             f"Rotation {bad[0]} is {matrices[bad[0]].tolist()}: expected orthonormal rows, which "

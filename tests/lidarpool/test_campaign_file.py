@@ -203,6 +203,19 @@ def test_tables_may_be_written_in_several_ways(campaign, folder, text):
     assert (crate.name, crate.box, crate.at[0].position) == ("A", (1, 2, 3), (1, 2))
 
 
+def test_columns_of_a_table_are_fields_or_ignored(campaign, folder):
+    (folder / "crates.csv").write_text('name,Wood,box,at,wood\nA,oak,"[1, 2, 3]","[[1, 2]]",5\n')
+    sample = {"from": "crates.csv", "count": 1}
+    with pytest.raises(
+        LidarpoolError, match=r"columns are not known: Wood, wood\. Known are name, "
+    ):
+        campaign({"scene.copies": {"sample": sample}}).check_files()
+    found = campaign({"scene.copies": {"sample": {**sample, "ignore": "wood"}}})
+    assert found.scenario(0).scene.copies[1].box == (1, 2, 3)
+    with pytest.raises(LidarpoolError, match=r"ignore names 'steel', which is no column"):
+        campaign({"scene.copies": {"sample": {**sample, "ignore": ["wood", "steel"]}}})
+
+
 def test_names_may_be_given_to_values(campaign):
     found = campaign(
         {
@@ -453,7 +466,7 @@ WRONG = {
     ),
     "other rows": (
         {"scene.copies": {"sample": {"from": "traffic.csv", "count": 1}}},
-        "traffic.csv, line 3: trajectory is not a field.",
+        "traffic.csv is not a usable table: its columns are not known: trajectory",
     ),
 }
 

@@ -83,7 +83,7 @@ def test_a_list_gives_places_turns_and_factors(made):
         ("x,y,z,yaw_deg,scale\n1,2,3,90,2\n4,5,6,0,1\n", {}),
         (
             "# made by hand\nname;x;y;z;yaw_deg;scale\nbig;1;2;3;90;2\n# small\nsmall;4;5;6;0;1\n",
-            {},
+            {"ignore": "Name"},
         ),
         (
             "east\tnorth\tz\tyaw_deg\tscale_z\tscale_x\tscale_y\n1\t2\t3\t90\t2\t2\t2\n"
@@ -215,7 +215,7 @@ WRONG = {
     ),
     "some heights": (
         TREE | {"table": "some.csv"},
-        "its column 'z' has '' in line 5: give a number in every line, or leave the column out.",
+        "its column 'z' has '' in line 5: give a number in every line, or ignore the column.",
     ),
     "angle": (
         TREE | {"table": "yaw.csv"},

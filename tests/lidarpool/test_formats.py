@@ -35,6 +35,7 @@ from lidarpool import (
     Sensor,
     Survey,
     Track,
+    load_trajectory,
     read_cloud,
     save_cloud,
     simulate,
@@ -212,6 +213,19 @@ def test_kitti_poses_bring_the_sweeps_of_a_sensor_together(written, cloud):
         placed = np.concatenate(firsts)
         apart = np.linalg.norm(placed[1:] - placed[:-1], axis=1)
         np.testing.assert_allclose(apart, np.linalg.norm(own[1:] - own[:-1], axis=1), atol=1e-4)
+
+
+@pytest.mark.parametrize("name", ["mcap", "rosbag2"])
+def test_trajectories_of_bags_are_read_again(written, survey, name):
+    path = written(name, "velodyne")
+    track = load_trajectory(path, topic="/tf:base_link", offset_s=-START_NS / 1e9)
+    times = track.times_s * 1e9
+    for one, other in zip(track.poses(0, times), survey.trajectory.poses(0, times), strict=True):
+        np.testing.assert_allclose(one, other, atol=1e-5)
+    mounted = load_trajectory(path, topic="/tf:front").pose(0)
+    np.testing.assert_allclose(mounted.position, survey.pose(0).position, atol=1e-5)
+    assert np.isclose(mounted.yaw_deg, 30)
+    assert load_trajectory(path, topic="/tf:Car").pose(0).position[1] == 5
 
 
 @pytest.mark.parametrize("name", ["mcap", "rosbag2"])

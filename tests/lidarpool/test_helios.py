@@ -382,6 +382,29 @@ def test_a_trajectory_of_its_own_is_followed(imported):
     assert np.allclose(fired(of, 1, [0])[0, 0], platform @ about(X, 20) @ Y)
 
 
+@pytest.mark.parametrize(
+    ("names", "words"),
+    [
+        ('"t", "roll", "pitch", "heading", "x", "y", "z"', "'heading' is not known"),
+        ('"t", "x", "pitch", "yaw", "x", "y", "z"', "a name is there twice"),
+        ('"t", "x", "y", "z"', "7 columns, named t, x, y, z"),
+    ],
+)
+def test_columns_of_a_trajectory_are_known_or_refused(imported, names, words):
+    inside = (
+        '<leg><platformSettings trajectory="parts/way.trj"/>'
+        '<scannerSettings pulseFreq_hz="1000" scanAngle_deg="20"/></leg>'
+    )
+    rows = "".join(f"{t},0,0,90,{10 * t},2,30\n" for t in (5, 6, 7))
+    with pytest.raises(LidarpoolError, match=words):
+        imported(
+            scanner("conic", "", scanAngleMax_deg=20, scanFreqMax_Hz=10),
+            inside,
+            platform="interpolated",
+            parts={"way.trj": f"#HEADER: {names}\n{rows}"},
+        )
+
+
 def test_what_is_not_taken_over_is_named(imported, survey, tmp_path):
     part = GROUND.partition("<part>")[2].partition("</part>")[0]
     scene = GROUND.replace(

@@ -138,6 +138,15 @@ def test_damaged_tables_are_refused(tmp_path, text):
         list(read_table(Storage.at(tmp_path)))
 
 
+@pytest.mark.parametrize("column", ["points", "weight", "class"])
+def test_a_table_with_other_columns_is_refused(tmp_path, column):
+    head = "number,name,split,error,scans,sweeps,rays,hits,points,seconds,sha256"
+    row = "0,a,,,1,1,1,1,1,0.0,,3"
+    (tmp_path / "jobs.csv").write_text(f"{head},{column}\n{row}\n")
+    with pytest.raises(LidarpoolError, match=r"damaged near line 1 .*(not known|twice)"):
+        list(read_table(Storage.at(tmp_path)))
+
+
 def test_a_missing_table_is_named(place):
     with pytest.raises(LidarpoolError, match=r"jobs\.csv cannot be read.*--resume"):
         list(read_table(place))

@@ -229,6 +229,17 @@ def test_ousters_metadata_old_and_new(tmp_path, new):
     assert (quick.period, quick.head.rate_hz, quick.max_range_m) == (1024, 5, 9)
 
 
+def test_beams_of_ouster_that_are_turned_are_refused(tmp_path):
+    mirrored = np.diag([1, -1, 1, 1]).ravel().tolist()
+    data = {
+        "beam_altitude_angles": [10.5, 1.0],
+        "beam_azimuth_angles": [4.0, 0.0],
+        "beam_to_lidar_transform": mirrored,
+    }
+    with pytest.raises(LidarpoolError, match="beam_to_lidar_transform turns the beams"):
+        load_sensor(calibration=write(tmp_path, "os.json", json.dumps(data)))
+
+
 OLD = {"beam_altitude_angles": [10.5, 1.0, -10.25], "beam_azimuth_angles": [4.0, 0.0, -1.5]}
 
 
@@ -321,7 +332,7 @@ BAD = {
     "count.csv": (LIVOX + "1,1,2\n2,1,2\n", "has no firing times: give model: as well"),
     "still.csv": (LIVOX + "0,1,2\n0,1,3\n", "has no firing times: give model: as well"),
     "few.csv": (hesai(count=7), "fits no known model.* give model: as well"),
-    "binary.csv": (b"\xff\xfe\x00", "codec can't decode"),
+    "binary.csv": (b"\xff\xfe\x00", "text in UTF-16: save it as UTF-8"),
 }  # fmt: skip
 
 

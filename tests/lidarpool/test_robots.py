@@ -306,14 +306,19 @@ def test_what_is_left_out_is_told(tmp_path):
 def test_tables_of_joints(tmp_path):
     robot, table, notes = robot_of(tmp_path, *ARM), tmp_path / "joints.csv", []
     table.write_text("time_ns;pan;effort\n0;0;1\n1000000000;1;1\n")
-    (*_, tip) = robot.actors(joints=table, tell=notes.append)
+    (*_, tip) = robot.actors(joints=table, ignore=["effort"], tell=notes.append)
     assert np.allclose(tip.trajectory.pose(0, 5e8).position, tip_at(0.5, 0)[:3, 3])
-    assert notes == [f"{table} has columns of no joint that moves: effort"]
+    assert not notes
+    table.write_text(f"time [s],Pan [deg]\n0,0\n1,{np.degrees(1)}\n")
+    (*_, tip) = robot.actors(joints=table)
+    assert np.allclose(tip.trajectory.pose(0, 5e8).position, tip_at(0.5, 0)[:3, 3])
     with pytest.raises(LidarpoolError, match=r"'r/tip': The joints have values from 0 to 1 s"):
         tip.check(0, 2e9)
     for text, words in (
         ("", "it is empty"),
+        ("time_s,stool\n0,1\n", "not known: stool. .*Known are time_s.*, pan.*, slide, tilt"),
         ("time_s,seat\n0,1\n", "of no joint that moves: name its columns.*pan, slide, tilt"),
+        ("time_s,pan,pan\n0,1,2\n", "has the column 'pan' twice"),
         ("pan,slide\n0,1\n", "no column 'time_s'"),
         ("time_s,pan\n0,nan\n", "has 'nan' in line 2"),
         ("time_s,pan\n1,0\n0,0\n", "must be finite, and ascend"),

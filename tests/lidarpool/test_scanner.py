@@ -413,6 +413,19 @@ def test_positions_are_those_of_the_world_or_of_the_sensor(scene):
     assert np.allclose(own @ HERE.rotation.T + HERE.position, local, atol=0.02)
 
 
+class Mirrored:
+    """A trajectory of a user, whose rotations mirror."""
+
+    stations, moves, duration_ns = 1, True, 1e9
+
+    def pose(self, station, time_ns=0.0):
+        return Pose((0, 0, 1))
+
+    def poses(self, station, times_ns):
+        mirrored = np.broadcast_to(np.diag([1.0, -1.0, 1.0]), (len(times_ns), 3, 3))
+        return np.tile([0.0, 0.0, 1.0], (len(times_ns), 1)), mirrored
+
+
 FAR = Scene.seed().with_actors([Actor(box("Car", (9, 9, 9)), Track([0, 1], [[3000, 0, 0]] * 2))])
 WRONG = {
     "number": (lambda s: s.sweep((0, 0, 1), number=-1), "number is -1"),
@@ -429,6 +442,14 @@ WRONG = {
     "poses": (lambda s: s.ranges([[0, 0]]), "of the shape (1, 2)"),
     "mixed": (lambda s: s.ranges([HERE, "here"]), "a pose is 'here'"),
     "turned": (lambda s: s.ranges(np.full((2, 4, 4), [0, 0, 0, 1])), "orthonormal rows"),
+    "mirrored": (lambda s: s.ranges(np.diag([1, -1, 1, 1])[None]), "which mirrors: expected"),
+    "scaled": (lambda s: s.ranges(np.diag([2, 2, 2, 1])[None]), "orthonormal rows"),
+    "mirrored way": (lambda s: s.sweep(Mirrored()), "which mirrors: expected"),
+    "mirrored actor": (
+        lambda s: s.move("Car", Mirrored()),
+        "Actor 'Car': Matrix 0 of a pose mirrors",
+    ),
+    "an actor": (lambda s: replace(CAR, trajectory=Mirrored()), "Matrix 0 of a pose mirrors"),
     "row": (lambda s: s.ranges(np.ones((1, 4, 4))), "last row"),
     "backend": (lambda s: Scanner(Scene.seed(), GRID, backend="embre"), "'embre'. Did you mean"),
     "fine": (

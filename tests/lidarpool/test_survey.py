@@ -202,14 +202,15 @@ def test_files(files, name, options):
         "time_s,x,y,z\n0,1,2,3\n1,4,5,6\n",
         "# made by hand\n\ntime_s;x;y;z\r\n0;1;2;3\r\n1;4;5;6\r\n",
         '"z"\t"y"\t"x"\t"time_s"\n3\t2\t1\t0\n# a remark\n6\t5\t4\t1\n',
-        "time_s,x,y,z,of,\n0,1,2,3,car,\n1,4,5,6,car,\n",
+        "time_s,x,y,z,\n0,1,2,3,\n1,4,5,6,\n",
+        ",time_s,x,y,z\n0,0,1,2,3\n1,1,4,5,6\n",
+        "time [s], Position X (m), p_y, pos.z[cm]\n0,1,2,300\n1,4,5,600\n",
         "#time_ns,x,y,z\n0,1,2,3\n1000000000,4,5,6\n",
     ],
 )
 def test_tables_as_programs_write_them(tmp_path, text):
     (tmp_path / "way.csv").write_text(text, newline="")
-    columns = {"time_ns": "#time_ns"} if text[1:8] == "time_ns" else {}
-    track = load_trajectory(tmp_path / "way.csv", columns=columns)
+    track = load_trajectory(tmp_path / "way.csv")
     assert track.times_s.tolist() == [0, 1]
     assert track.positions.tolist() == [[1, 2, 3], [4, 5, 6]]
 
@@ -327,6 +328,27 @@ def test_each_sensor_may_start_later_and_take_steps_of_its_own():
 def test_a_pose_that_looks_straight_up_or_down_is_found_again(yaw, pitch):
     turned = Pose((0, 0, 0), yaw, pitch, 20).rotation
     assert np.allclose(Pose.of((1, 2, 3), turned).rotation, turned, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("matrix", "fault"),
+    [
+        (np.diag([1.0, -1.0, 1.0]), "mirrors"),
+        (-np.eye(3), "mirrors"),
+        (2 * np.eye(3), "deforms"),
+        (np.array([[1, 0.1, 0], [0, 1, 0], [0, 0, 1.0]]), "deforms"),
+        (np.full((3, 3), np.nan), "deforms"),
+    ],
+)
+def test_matrices_that_are_no_rotations_are_no_poses(matrix, fault, tmp_path):
+    with pytest.raises(LidarpoolError, match=f"pose {fault}: .* the determinant 1"):
+        Pose.of((1, 2, 3), matrix)
+    rows = np.concatenate([np.eye(3), np.ones((3, 1))], axis=1)
+    other = np.concatenate([matrix, np.ones((3, 1))], axis=1)
+    np.savetxt(tmp_path / "poses.txt", [rows.ravel(), other.ravel()])
+    np.savetxt(tmp_path / "times.txt", [0, 1])
+    with pytest.raises(LidarpoolError, match=f"Matrix 1 of a pose {fault}"):
+        load_trajectory(tmp_path / "poses.txt", times=tmp_path / "times.txt")
 
 
 def test_a_start_needs_a_time_zone_and_a_year_of_known_leap_seconds():

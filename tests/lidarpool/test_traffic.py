@@ -11,6 +11,7 @@ import pytest
 from tests.shapes import cast_between, made
 
 from lidarpool import LidarpoolError, Mounted, Pose, Scene, Survey, Track, load_sensor, save_cloud
+from lidarpool.base.fingerprint import fingerprint
 from lidarpool.columns.cloud import Cloud
 from lidarpool.export.sweeps import Sweeps
 from lidarpool.run.picture_file import PictureContent
@@ -274,6 +275,10 @@ def test_vehicles_of_one_entry_share_a_mesh_also_in_the_file_of_pictures(tmp_pat
         (FCD.replace('time="3.00"', 'time="nan"'), "the time nan does not come after"),
         (FCD.replace('x="40"', 'x="inf"'), "vehicle 'a.1' has no finite position at 3 s"),
         (FCD.replace('x="40"', ""), "'x' is missing"),
+        (
+            FCD.replace('x="40"', 'x="40" heading="3"'),
+            "vehicle has the attribute 'heading', which --fcd-output does not define: give ignore",
+        ),
         (FCD.replace('x="40"', 'x="east"'), "could not convert string to float: 'east'"),
         (FCD.replace('angle="45"', ""), "'angle' is missing"),
         (FCD.replace("?>", '?><!DOCTYPE a [<!ENTITY b "c">]>', 1), "declares an XML entity"),
@@ -282,6 +287,15 @@ def test_vehicles_of_one_entry_share_a_mesh_also_in_the_file_of_pictures(tmp_pat
 def test_unusable_data_is_refused(tmp_path, text, told):
     with pytest.raises(LidarpoolError, match=rf"fcd\.xml is not usable as floating .*{told}"):
         build(scenario(tmp_path, text))
+
+
+def test_attributes_that_sumo_defines_or_the_user_ignores(tmp_path):
+    plain = build(scenario(tmp_path)).scene
+    text = FCD.replace('x="40"', 'x="40" lane="e_0" pos="3" speed="1" odometer="4"')
+    known = build(scenario(tmp_path, text)).scene
+    text = text.replace('x="40"', 'x="40" battery.level="3" batteryMode="1"')
+    ignoring = build(scenario(tmp_path, text, {"ignore": "battery*"})).scene
+    assert fingerprint(plain) == fingerprint(known) == fingerprint(ignoring)
 
 
 def test_classes_are_of_vehicles_alone_and_leave_their_materials(tmp_path):

@@ -258,6 +258,8 @@ def test_nothing_to_scan(caster, shapes):
         ({"pattern": Pattern(np.empty((0, 3))), "window": (0, 2)}, "Rows 0 to 2 of a pattern with"),
         ({"rotations": 2 * np.eye(3)}, r"Rotation 0 is .*orthonormal.*1 of 1"),
         ({"rotations": [np.eye(3), np.eye(3)[::-1] * 1.1]}, r"Rotation 1 is .*orthonormal.*1 of 2"),
+        ({"rotations": np.diag([1, -1, 1])}, r"Rotation 0 is .*mirrors.*determinant 1 \(1 of 1"),
+        ({"rotations": [np.eye(3), -np.eye(3)]}, r"Rotation 1 is .*mirrors.*\(1 of 2"),
         ({"rotations": np.eye(2)}, r"rotations must be .* \(n, 3, 3\), not float64 \(2, 2\)"),
         ({"rotations": np.full((3, 3), np.nan)}, "orthonormal"),
         ({"rotations": np.zeros((0, 3, 3))}, "1 positions and 0 rotations"),

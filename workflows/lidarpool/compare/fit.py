@@ -15,6 +15,7 @@ from pydantic import Field
 from .._version import __version__
 from ..base.arrays import Bools, Floats, Floats32, Ints
 from ..base.errors import LidarpoolError, explained, prefixed
+from ..base.extras import need
 from ..base.open3d_module import load_open3d
 from ..base.sampling import even_indices
 from ..base.storage import Storage
@@ -32,7 +33,7 @@ from ..sensor.noise import TARGET_REFLECTANCE, THRESHOLD_SIGMAS
 from ..sensor.ray_sensors import ListedSensor
 from ..simulator import Scanner
 from .range_image import range_images
-from .recordings import Recording, need, open_recording
+from .recordings import Recording, open_recording
 
 # {curve, or column of channels: (label of x, label of y, factor)}, three a row
 _CHARTS = {

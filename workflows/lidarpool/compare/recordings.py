@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import struct
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from contextlib import contextmanager, nullcontext
+from contextlib import nullcontext
 from dataclasses import dataclass
 from functools import partial
 from importlib import import_module
@@ -18,9 +18,11 @@ import numpy as np
 
 from ..base.allowance import check_fits
 from ..base.arrays import AnyArray, Floats, Indices, Ints
-from ..base.errors import LidarpoolError, explained, prefixed
+from ..base.errors import LidarpoolError
+from ..base.extras import need, reading
 from ..base.fingerprint import fingerprint
-from ..base.words import did_you_mean, natural, printable
+from ..base.words import did_you_mean, natural
+from ..columns.bags import POINT_CLOUD, open_bag, point_columns
 from ..columns.cloud import CHUNK_POINTS, Cloud, CloudLike
 from ..columns.cloud_file import CloudFile
 from ..columns.parts import StoredCloud
@@ -36,7 +38,6 @@ KINDS = (
 # What programs call the number of a beam, and the light that came back; the first there is.
 _RINGS = ("ring", "channel", "laser_id", "laser_number", "line", "beam")
 _LIGHTS = ("intensity", "reflectivity", "i")
-_POINT_CLOUD = "sensor_msgs/msg/PointCloud2"
 _RECORD = 54  # least bytes of a variable-length record of .las
 _WHITE = 100.0  # what Velodyne and Ouster report of a white surface, whatever its range
 _VELODYNE = (1248, 554)  # bytes of the first frame of a Velodyne's .pcap: points, or a position
@@ -93,7 +94,7 @@ class Recording:
 
     def turn(self, number: int, *, in_world: bool = False) -> Turn:
         """Read a sweep in its sensor's axes or the world's; LidarpoolError if it cannot be."""
-        with _reading(self.name):
+        with reading(self.name):
             points, columns, pose = self.read(number)
             if self.light is not None and self.light not in columns:
                 raise LidarpoolError(
@@ -160,7 +161,7 @@ def open_recording(
     elif kind == ".mcap":
         return _of_bag(path, name, sensor, light)
     elif kind in (".osf", ".pcap"):
-        with _reading(name), path.open("rb") as file:
+        with reading(name), path.open("rb") as file:
             first = int.from_bytes(file.read(36)[32:], "little")
         if first in _VELODYNE:
             return _of_velodyne(path, name, light)
@@ -257,7 +258,7 @@ def _of_pcd(files: list[Path], name: str, light: str | None) -> Recording:
 
         path = files[number]
         check_fits(path)
-        with _reading(path.name) if len(files) > 1 else nullcontext():
+        with reading(path.name) if len(files) > 1 else nullcontext():
             file = PointCloud.from_path(path)
             rows, (*place, w, x, y, z) = file.pc_data, file.metadata.viewpoint
             if len(rows) != file.metadata.points:
@@ -272,7 +273,7 @@ def _of_pcd(files: list[Path], name: str, light: str | None) -> Recording:
 def _of_las(path: Path, name: str, light: str | None) -> Recording:
     need("laspy", "las", f"{name} is read")
     laspy: Any = import_module("laspy")
-    with _reading(name):
+    with reading(name):
         with path.open("rb") as start:
             first, records = struct.unpack("<II", start.read(104)[96:])
         if _RECORD * records > first:  # laspy would go through four thousand million of them
@@ -295,20 +296,13 @@ def _of_las(path: Path, name: str, light: str | None) -> Recording:
 
 def _of_bag(path: Path, name: str, topic: str | None, light: str | None) -> Recording:
     """Open a topic of PointCloud2, a sweep each, in the axes of their frame."""
-    need("rosbags", "ros", f"{name} is read")
-    from rosbags.rosbag2 import Reader
-
-    from ..export.ros import columns_of
-
-    with _reading(name):
-        bag = Reader(path)
-        bag.open()
-    there = {one.topic: one for one in bag.connections if one.msgtype == _POINT_CLOUD}
+    bag = open_bag(path, name)
+    there = {one.topic: one for one in bag.connections if one.msgtype == POINT_CLOUD}
     connection = there[_chosen(name, "topics of PointCloud2", there, topic)]
     messages = partial(bag.messages, [connection])
 
     def points(message: Any) -> Read:
-        columns = columns_of(message[2])
+        columns = point_columns(message[2])
         return _places(columns), columns, None
 
     def times() -> Iterator[float]:
@@ -322,7 +316,7 @@ def _of_ouster(path: Path, name: str, sensor: str | None, light: str | None) -> 
     if find_spec("ouster") is None:  # it wants old versions of what it does not need to read
         raise LidarpoolError(f"{name} is read by ouster-sdk: pip install --no-deps ouster-sdk.")
     sdk: Any = import_module("ouster.sdk")
-    with _reading(name):
+    with reading(name):
         infos = sdk.open_source(str(path)).sensor_info
         known = [f"{one.prod_line} {one.sn}".strip() for one in infos]
     which = known.index(_chosen(name, "sensors", known, sensor))
@@ -346,7 +340,7 @@ def _of_velodyne(path: Path, name: str, light: str | None) -> Recording:
     """Open packets of a Velodyne, which say the model."""
     need("velodyne_decoder", "fit", f"{name} is read")
     decoder: Any = import_module("velodyne_decoder")
-    with _reading(name), path.open("rb") as file:
+    with reading(name), path.open("rb") as file:
         file.seek(24)
         heads = iter(partial(file.read, 16), b"")
         frames = (file.read(int.from_bytes(head[8:12], "little")) for head in heads)
@@ -371,7 +365,7 @@ def _streamed(
 ) -> Recording:  # fmt: skip
     """Open what can be read from its beginning only; also to count sweeps, if that is needed."""
     if count is None:
-        with _reading(name):
+        with reading(name):
             count = sum(1 for _ in begin())
     coming: tuple[int, Iterator[Any]] = 0, iter(())  # number of the next sweep, and all from there
 
@@ -386,29 +380,10 @@ def _streamed(
     return Recording(name, count, read, light, **more)
 
 
-@contextmanager
-def _reading(name: str) -> Iterator[None]:
-    """Turn what readers of files raise into a LidarpoolError of a line."""
-    try:
-        with explained(f"{name} cannot be read"), prefixed(name):
-            yield
-    except LidarpoolError:
-        raise
-    except Exception as error:  # libraries raise whatever they stumble over
-        reason = printable(str(error).partition("\n")[0]) or type(error).__name__
-        raise LidarpoolError(f"{name} is broken or cut short ({reason}).") from error
-
-
 def _places(columns: Columns) -> Floats:
     if missing := [axis for axis in "xyz" if axis not in columns]:
         raise ValueError(f"its points have no {', '.join(missing)}")
     return np.stack([np.asarray(columns[axis], np.float64) for axis in "xyz"], axis=1)
-
-
-def need(package: str, extra: str, what: str) -> None:
-    """LidarpoolError if the package of an extra, which does what is said, is not installed."""
-    if find_spec(package) is None:
-        raise LidarpoolError(f'{what} by {package}: pip install "lidarpool[{extra}]".')
 
 
 def _chosen(name: str, what: str, there: Iterable[str], wanted: str | None) -> str:

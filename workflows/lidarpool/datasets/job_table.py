@@ -247,6 +247,11 @@ def read_table(place: Storage, checksum: Sequence[int] | None = None) -> Iterato
             tail = header[last : last + len(_TAIL)]
             if header[:first] != [*_HEAD] or tail != [*_TAIL]:
                 raise ValueError("it is not a table of jobs")
+            counted = header[last + len(_TAIL) :]
+            if unknown := next((name for name in counted if not _CLASS.fullmatch(name)), None):
+                raise ValueError(f"its column {unknown!r} is not known")
+            if len(set(header)) < len(header):
+                raise ValueError("it has a column twice")
             names = [name.removeprefix(_VARIED) for name in header[first:last]]
             last_number = -1
             for cells in reader:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import shutil
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import cache, cached_property
+from functools import cached_property
 from heapq import merge
 from pathlib import Path
 from typing import Any
@@ -22,9 +22,9 @@ from rosbags.interfaces import (
 from rosbags.rosbag2 import Reader as Bag
 from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
-from rosbags.typesys.store import Typestore
 
 from ..base.arrays import AnyArray, Floats32, Records
+from ..columns.bags import POINT_FIELDS, message_types
 from ..columns.cloud import Cloud, CloudLike
 from ..columns.table import COLOURS, SURFACE_COLUMNS, VELOCITY
 from ..scene.colours import as_float
@@ -53,7 +53,6 @@ _LATCHED = Qos(
     QosHistory.KEEP_LAST, 1, QosReliability.RELIABLE, QosDurability.TRANSIENT_LOCAL,
     QosTime(0, 0), QosTime(0, 0), QosLiveliness.AUTOMATIC, QosTime(0, 0), False,
 )  # fmt: skip
-_KINDS = {"i1": 1, "u1": 2, "i2": 3, "u2": 4, "i4": 5, "u4": 6, "f4": 7, "f8": 8}
 _XYZ = [("x", "<f4"), ("y", "<f4"), ("z", "<f4")]
 _LAYOUTS = {
     "velodyne": np.dtype([*_XYZ, ("intensity", "<f4"), ("ring", "<u2"), ("time", "<f4")]),
@@ -197,7 +196,7 @@ def _messages(cloud: CloudLike, sweeps: Sweeps, layout: PointLayout, types: Any)
     row = layout.row([name for name, (_, needs) in _EXTRA.items() if needs <= held])
     field = types["sensor_msgs/msg/PointField"]
     fields = [
-        field(name, offset, _KINDS[kind.str[1:]], 1)
+        field(name, offset, POINT_FIELDS[kind.str[1:]], 1)
         for name, (kind, offset, *_) in (row.fields or {}).items()
     ]
     make = _Messages(types)
@@ -304,7 +303,7 @@ class Reader(reading.Reader):
         if found is None:
             raise ValueError(f"it has no message on {topic} at {time_ns} ns")
         connection, _, data = found
-        message: Any = _types().deserialize_cdr(data, connection.msgtype)
+        message: Any = message_types().deserialize_cdr(data, connection.msgtype)
         held = {field.name for field in message.fields}
         extra = [name for name in _EXTRA if name in held]
         compensated = not held & {*_TIMES}
@@ -336,30 +335,6 @@ class Reader(reading.Reader):
         if "_bag" in self.__dict__:
             self._bag.close()
         super().close()
-
-
-def columns_of(data: bytes) -> dict[str, AnyArray]:
-    """Take the fields of a PointCloud2, {name: (n,)}; ValueError if its lengths disagree."""
-    message: Any = _types().deserialize_cdr(data, "sensor_msgs/msg/PointCloud2")
-    kinds = {number: kind for kind, number in _KINDS.items()}
-    order = ">" if message.is_bigendian else "<"
-    fields = [field for field in message.fields if field.count == 1]
-    row = np.dtype({
-        "names": [field.name for field in fields],
-        "formats": [order + kinds[field.datatype] for field in fields],
-        "offsets": [field.offset for field in fields],
-        "itemsize": message.point_step,
-    })  # fmt: skip
-    lines = message.data.reshape(message.height, message.row_step)
-    used = np.ascontiguousarray(lines[:, : message.width * message.point_step])
-    rows = used.reshape(-1).view(row)
-    return {name: rows[name] for name in row.names or ()}
-
-
-@cache
-def _types() -> Typestore:
-    """Return the types of messages of ROS 2."""
-    return get_typestore(Stores.ROS2_HUMBLE)
 
 
 def _frames(sweeps: Sweeps) -> list[str]:

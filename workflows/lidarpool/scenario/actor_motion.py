@@ -6,7 +6,7 @@ import gzip
 import math
 import zlib
 from array import array
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence, Set
 from dataclasses import dataclass, field, replace
 from fnmatch import fnmatchcase
 from pathlib import Path
@@ -14,11 +14,12 @@ from typing import Annotated, Any, Literal
 from xml.parsers import expat
 
 import numpy as np
-from pydantic import model_validator
+from pydantic import Strict, model_validator
 
 from ..base.arrays import Floats
 from ..base.declared import Several, Text, TextOrTexts, Triple, about, by_text, declared, one_of
 from ..base.errors import LidarpoolError, prefixed
+from ..base.words import printable
 from ..base.xmlfile import refuse_entity
 from ..scene.actors import Actor
 from ..scene.files.meshfile import ROBOTS
@@ -27,10 +28,18 @@ from ..sensor import Mounted, Pose, Track, load_trajectory
 from ..sensor.calibrations import said
 from ..sensor.survey import StepCount
 from ..sensor.trajectory import CLOCK_S, Beyond, InstrumentPose, quaternions_of, rotations_of
-from ..sensor.trajectory_files import Duration, Seconds, TrajectoryFormat
+from ..sensor.trajectory_files import (
+    Duration,
+    Height,
+    Latitude,
+    Longitude,
+    Seconds,
+    TrajectoryFormat,
+)
 from .ground import Standing, following
 from .sections import (
     DeformingSection,
+    IgnoredColumns,
     MeshEntry,
     MeshFile,
     PathOf,
@@ -40,6 +49,7 @@ from .sections import (
     by_position,
 )
 
+_READING = {"format", "columns", "ignore", "topic", "origin", "camera_axes", "offset_s"}
 _OF_ROBOTS = {"file", "opacity"}  # fields of a mesh file that robots have
 
 
@@ -94,10 +104,14 @@ class TrajectorySection(Section):
     """Poses over time, from a file or from points; in YAML also just the file's name."""
 
     file: Annotated[
-        Text | None, about("TUM, KITTI or .csv, from the scenario's folder", "drive.tum")
+        Text | None,
+        about(
+            "TUM, KITTI, .csv, a folder «oxts» or a bag of ROS 2, from the scenario's folder",
+            "drive.tum",
+        ),
     ] = None
     format: Annotated[
-        TrajectoryFormat | None, about("by default kitti with times, csv for a .csv, else tum")
+        TrajectoryFormat | None, about("by default as the content of the file says")
     ] = None
     times: Annotated[Text | None, about("for KITTI poses: the file of times")] = None
     columns: Annotated[
@@ -105,6 +119,20 @@ class TrajectorySection(Section):
         about(
             "for a table: {time_s, x, y, z, qx, …, yaw_deg, …: name in the file}",
             {"time_s": "stamp"},
+        ),
+    ] = None
+    ignore: IgnoredColumns = ()
+    topic: Annotated[
+        Text | None,
+        about("for a bag with several: a topic of poses, or /tf:FRAME", "/odometry"),
+    ] = None
+    origin: Annotated[
+        tuple[Latitude, Longitude, Height] | None,
+        Strict(False),
+        about(
+            "for latitudes and longitudes: those of the world's zero, degrees, and its height, "
+            "metres; by default the first position",
+            [48.7758, 9.1829, 290],
         ),
     ] = None
     camera_axes: Annotated[
@@ -177,7 +205,7 @@ class TrajectorySection(Section):
             track = load_trajectory(
                 path(self.file),
                 times=None if self.times is None else path(self.times),
-                **self.model_dump(include={"format", "columns", "camera_axes", "offset_s"}),
+                **self.model_dump(include=_READING),
                 **own,
             )
             return replace(track, positions=track.positions - origin)
@@ -192,6 +220,13 @@ class TrajectorySection(Section):
 
 
 TrajectoryEntry = Annotated[TrajectorySection, by_text("file", TrajectorySection)]
+
+
+class JointTable(Section):
+    """Values of a robot's joints from a table; in YAML also just the file's name."""
+
+    file: Annotated[Text, about("a table with a header, from the scenario's folder")]
+    ignore: IgnoredColumns = ()
 
 
 class ActorSection(DeformingSection):
@@ -218,7 +253,7 @@ class ActorSection(DeformingSection):
         bool, about("whether its wheels raise spray, with weather.spray_g_m3; robots raise none")
     ] = True
     joints: Annotated[
-        Text | None,
+        Annotated[JointTable, by_text("file", JointTable)] | None,
         about(
             "of a robot: a table of time_s and the values of joints, radians or metres", "arm.csv"
         ),
@@ -269,6 +304,14 @@ ACTORS_MOST = 10_000
 _PIECE = 1 << 20  # bytes of a file that are read at a time
 _MOVING = ("vehicle", "person", "container")
 _ROW = ("x", "y", "angle", "z", "slope")
+# Attributes that SUMO's documentation of --fcd-output defines, and that nothing here uses.
+_UNUSED = frozenset((
+    "acceleration", "accelerationLat", "arrivalDelay", "blockTime", "boardingTime", "delay",
+    "distance", "edge", "entryTime", "eventTime", "lane", "leaderGap", "leaderID", "leaderSpeed",
+    "odometer", "pos", "posLat", "queue", "segment", "signals", "speed", "speedFactor", "speedLat",
+    "stopDelay", "tag", "timeLoss", "vehicle", "waiting",
+))  # fmt: skip
+_KNOWN = _UNUSED.union(_ROW, ("id", "type"))
 
 
 class VehicleSection(DeformingSection):
@@ -290,6 +333,9 @@ class TrafficSection(Section):
     vehicles: Annotated[
         Several[VehicleSection], about("shapes of vehicles and persons, by type", min_length=1)
     ]
+    ignore: Annotated[
+        TextOrTexts, about("names of attributes in the file to leave out, with * and ?", "battery*")
+    ] = ()
     offset_s: Annotated[Seconds, about("added to all times")] = 0.0
     translation: Annotated[Triple, about("added to all positions, metres")] = (0, 0, 0)
     surfaces: Annotated[
@@ -324,10 +370,13 @@ class Passage:
     rows: array[float] = field(default_factory=lambda: array("d"))  # `_ROW` at each time
 
 
-def read_fcd(path: Path, first_s: float, last_s: float) -> tuple[list[Passage], int]:
+def read_fcd(
+    path: Path, first_s: float, last_s: float, ignore: Sequence[str] = ()
+) -> tuple[list[Passage], int]:
     """Read what is there between two times, with the time steps before and after.
 
-    The file may be of any length: only these rows are kept.
+    The file may be of any length: only these rows are kept. `ignore` are names of attributes to
+    leave out, with * and ?.
 
     Returns
     -------
@@ -336,8 +385,9 @@ def read_fcd(path: Path, first_s: float, last_s: float) -> tuple[list[Passage], 
     Raises
     ------
     LidarpoolError
-        If it cannot be read, or is no floating car data.
+        If it cannot be read, is no floating car data, or has attributes that are not known.
     """
+    known_attributes = set(_KNOWN)
     passages: list[Passage] = []
     known: dict[tuple[str, str], tuple[int, Passage]] = {}  # {who: last step, passage}
     step, time = -1, -math.inf
@@ -352,6 +402,8 @@ def read_fcd(path: Path, first_s: float, last_s: float) -> tuple[list[Passage], 
                     break
                 step, vehicle = step + 1, None
             elif tag in _MOVING and step >= 0:
+                if not at.keys() <= known_attributes:
+                    known_attributes |= _ignored(tag, at.keys() - known_attributes, ignore)
                 place = at["x"], at["y"]
                 if tag == "vehicle":
                     vehicle = place
@@ -381,6 +433,17 @@ def read_fcd(path: Path, first_s: float, last_s: float) -> tuple[list[Passage], 
         ) from error
     there = [one for one in passages if len(one.times_s) > 1 and one.times_s[-1] >= first_s]
     return there, len(known)
+
+
+def _ignored(tag: str, names: Set[str], ignore: Sequence[str]) -> Set[str]:
+    """Return names of attributes that are all ignored; ValueError for one that is not."""
+    for name in sorted(names):
+        if not any(fnmatchcase(name, pattern) for pattern in ignore):
+            raise ValueError(
+                f"its {tag} has the attribute {printable(name)!r}, which --fcd-output does not "
+                f"define: give ignore: [{printable(name)}] to leave it out"
+            )
+    return names
 
 
 def _elements(path: Path) -> Iterator[tuple[str, Mapping[str, str]]]:

@@ -7,7 +7,6 @@ from dataclasses import dataclass, field, replace
 from fnmatch import fnmatchcase
 from functools import partial
 from glob import escape
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -263,17 +262,21 @@ def _mount(section: SensorSection, shapes: Shapes) -> Pose:
         )
     ((entry, robot),) = on
     with prefixed(f"actor {entry.name!r}"):
-        path = robot.path(mount.link, joints=_joints(entry, scenario))
+        path = robot.path(mount.link, **_joints(entry, scenario))
     if path.moves:
+        file = None if entry.joints is None else entry.joints.file
         raise LidarpoolError(
-            f"mount.link is {mount.link!r}, which {entry.joints} moves, and a mount is rigid: "
+            f"mount.link is {mount.link!r}, which {file} moves, and a mount is rigid: "
             "mount the sensor on a link that does not move, or leave out those joints' columns."
         )
     return path.pose(0).then(mount.pose())
 
 
-def _joints(entry: ActorSection, scenario: Scenario) -> Path | None:
-    return None if entry.joints is None else scenario.path(entry.joints)
+def _joints(entry: ActorSection, scenario: Scenario) -> dict[str, Any]:
+    """Return the arguments of `Robot.path` and `Robot.actors` that are of a table of joints."""
+    if entry.joints is None:
+        return {}
+    return {"joints": scenario.path(entry.joints.file), "ignore": entry.joints.ignore}
 
 
 def _actors(shapes: Shapes, standing: Standing, track: Track | None) -> list[Actor]:
@@ -299,7 +302,7 @@ def _links(entry: ActorSection, robot: Robot, way: Track, shapes: Shapes) -> Seq
     for link in sorted(without):
         tell(f"{entry.name}: link {link} is left out: a sensor is mounted on it")
     joints = _joints(entry, shapes.scenario)
-    return robot.actors(way, joints, name=entry.name, without=without, tell=tell)
+    return robot.actors(way, name=entry.name, without=without, tell=tell, **joints)
 
 
 def _vehicles(
@@ -307,7 +310,8 @@ def _vehicles(
 ) -> list[tuple[Actor, VehicleSection]]:
     """Vehicles and persons that are there during the survey, each with its entry."""
     begin, found = start_s - section.offset_s, shapes.found
-    passages, count = read_fcd(shapes.scenario.path(section.file), begin, begin + duration_s)
+    file = shapes.scenario.path(section.file)
+    passages, count = read_fcd(file, begin, begin + duration_s, section.ignore)
     made = actors_of(section, passages, shapes.of, standing, start_s)
     if not made:
         found.notes.append(

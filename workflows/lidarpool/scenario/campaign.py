@@ -24,6 +24,7 @@ from ..base.declared import Seed
 from ..base.errors import LidarpoolError, Mistakes, prefixed
 from ..base.fingerprint import fingerprint
 from ..base.shard import ALL, Shard
+from ..base.textfile import read_text
 from ..base.validation import (
     checked,
     dotted,
@@ -39,7 +40,6 @@ from ..base.yamlfile import read_yaml
 from ..datasets.job_table import Value
 from ..export.format_table import check_whole
 from ..export.laser_scan import with_laser_scans
-from ..sensor.calibrations import text_of
 from .build import Job, build
 from .campaign_sections import (
     COUNT_MOST,
@@ -484,7 +484,7 @@ class _Varied(_JobSource):
     def named_in(self, file: Path) -> str:
         tables = {path: text for base in self._bases for text, path in base.table_files.items()}
         for table, text in tables.items():
-            for number, line in enumerate(text_of(table).splitlines(), 1):
+            for number, line in enumerate(read_text(table).splitlines(), 1):
                 if file.name in line and not line.lstrip().startswith("#"):
                     return f"{text}: {table}, line {number}: "
         return ""
@@ -544,8 +544,9 @@ class _Base:
                     continue
                 self.table_files[text] = table = self.scenario.path(choice.sample.file)
                 with prefixed(text):
-                    if (key := (table, repr(kind))) not in tables:
-                        tables[key] = read_rows(table, kind)
+                    ignore = choice.sample.ignore
+                    if (key := (table, repr(kind), ignore)) not in tables:
+                        tables[key] = read_rows(table, kind, ignore)
                     self.tables[text] = tables[key]
                     if (most := choice.sample.count[1]) > (there := len(tables[key])):
                         has = plural(there, "row")

@@ -44,13 +44,16 @@ from ..base.declared import (
     short,
 )
 from ..base.errors import LidarpoolError, Mistakes
+from ..base.tables import ignored_columns
+from ..base.textfile import read_text
 from ..base.validation import checked_fields, sections_in, sentences
+from ..base.words import did_you_mean, printable
 from ..base.yamlfile import load_yaml
 from ..datasets.job_table import Value
 from ..export.format_table import DATA_SETS, LAYOUTS
 from ..export.formats import Format
-from ..sensor.calibrations import said, text_of
-from .sections import Section, may_be_empty
+from ..sensor.calibrations import said
+from .sections import IgnoredColumns, Section, may_be_empty
 
 SIGMAS = 6.0  # normal numbers are drawn again beyond, one of 500 million
 SHARE_LEAST = 0.01  # of a normal distribution that lies within limits
@@ -225,6 +228,7 @@ class Sample(Section):
         short(lambda v: type(v) is int, lambda v: [v, v], int | list[int]),
         about("how many rows a job has: a number, or [least, largest]"),
     ]
+    ignore: IgnoredColumns = ()
 
 
 _KINDS = ("uniform", "log_uniform", "normal", "integer", "choice", "each", "sample")
@@ -483,7 +487,7 @@ _REAL = re.compile(r"[-+]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][-+]?[0-9]+)?")
 _WORDS = {"true": True, "false": False}
 
 
-def read_rows(path: Path, kind: Any) -> list[Any]:
+def read_rows(path: Path, kind: Any, ignore: Sequence[str] = ()) -> list[Any]:
     """Read entries of a list from a table, whose columns are their fields: box, at.0.position.
 
     A cell is a number, true or false, or a list or mapping as in YAML, else text; an empty one
@@ -493,6 +497,8 @@ def read_rows(path: Path, kind: Any) -> list[Any]:
     ----------
     kind
         Annotation of the list.
+    ignore
+        Names of columns to leave out, with * and ?.
 
     Raises
     ------
@@ -504,7 +510,7 @@ def read_rows(path: Path, kind: Any) -> list[Any]:
     if entry is None:
         raise LidarpoolError("sample adds entries to a list, such as actors, and this is none.")
     try:
-        lines = text_of(path).splitlines()
+        lines = read_text(path).splitlines()
         first = next((line for line in lines if line.strip() and line.lstrip()[0] != "#"), "")
         mark = max(_MARKS, key=first.count)
         reader = csv.reader(lines, delimiter=mark)
@@ -515,26 +521,47 @@ def read_rows(path: Path, kind: Any) -> list[Any]:
         ]
         if not cells:
             raise ValueError("it is empty")
-        (_, head), *cells = cells
+        (_, header), *cells = cells
+        left_out = ignored_columns(header, ignore)
+        head = [name for index, name in enumerate(header) if index not in left_out]
         if twice := next((name for name in head if head.count(name) > 1), None):
             raise ValueError(f"it has the column {twice!r} twice")
+        model = next(sections_in(entry), BaseModel)
+        _check_columns(head, model)
     except FileNotFoundError as error:
         raise LidarpoolError(f"{path} does not exist: check the name and the folder.") from error
     except (OSError, ValueError, csv.Error, LidarpoolError) as error:
         raise LidarpoolError(f"{path} is not a usable table: {said(error)}") from error
-    model = next(sections_in(entry), BaseModel)
     adapter = TypeAdapter(entry)
     mistakes, rows = Mistakes(), []
     for line, row in cells:
         where = f"{path}, line {line}"
         with mistakes.noted(), sentences(model, where):
-            if len(row) > len(head):
+            if len(row) > len(header):
                 raise LidarpoolError(
-                    f"{where}: it has {len(row)} cells, and the header {len(head)}."
+                    f"{where}: it has {len(row)} cells, and the header {len(header)}."
                 )
-            rows.append(_checked(adapter, dict(zip(head, row, strict=False))))
+            read = [cell for index, cell in enumerate(row) if index not in left_out]
+            rows.append(_checked(adapter, dict(zip(head, read, strict=False))))
     mistakes.tell()
     return rows
+
+
+def _check_columns(names: Sequence[str], model: Any) -> None:
+    """Check that columns are fields of an entry, or numbers of one that is a list."""
+    fields = [field.alias or name for name, field in getattr(model, "model_fields", {}).items()]
+    unknown = [
+        name
+        for name in names
+        if name and fields and (first := name.split(".")[0]) not in fields and not first.isdigit()
+    ]
+    if unknown:
+        verb = "columns are" if unknown[1:] else "column is"
+        raise ValueError(
+            f"its {verb} not known: {', '.join(map(printable, unknown))}."
+            f"{did_you_mean(unknown[0], fields)} Known are {', '.join(fields)}: rename it, or give "
+            f"ignore: [{printable(unknown[0])}] to leave it out"
+        )
 
 
 def _checked(adapter: TypeAdapter[Any], cells: dict[str, str]) -> Any:

@@ -20,6 +20,7 @@ from ..sensor import Fault, Material, Navigation
 from ..sensor.materials import ClassNames
 from ..sensor.survey import SENSORS_MOST, CloudOptions, StepCount
 from ..sensor.trajectory import CENTRE
+from ..sensor.trajectory_files import files_of_trajectory
 from ..sensor.weather import Weather
 from .actor_motion import ActorSection, CarriedEntry, MountEntry, TrafficSection, TrajectoryEntry
 from .sections import (
@@ -298,13 +299,17 @@ class Scenario(Section):
         files: list[str | None] = [entry.file for entry in entries]
         files += [self.traffic.file] if self.traffic else []
         files += [entry.table.file for entry in self.scene.copies if entry.table]
-        files += [entry.joints for entry in self.actors]
-        for way in (self.trajectory, *(entry.trajectory for entry in self.actors)):
-            files += [way.file, way.times] if way else []
+        files += [entry.joints.file for entry in self.actors if entry.joints]
+        trajectories = [self.trajectory, *(entry.trajectory for entry in self.actors)]
+        files += [trajectory.times for trajectory in trajectories if trajectory]
         for section in (self.sensor, *self.sensors.values()):
             files += [section.calibration]
             files += [section.model] if section.has_own_model else []
-        return tuple(self.path(file) for file in dict.fromkeys(files) if file)
+        paths = [self.path(file) for file in files if file]
+        for trajectory in trajectories:
+            if trajectory and trajectory.file:
+                paths += files_of_trajectory(self.path(trajectory.file))
+        return tuple(dict.fromkeys(paths))
 
     @property
     def placed(self) -> tuple[CopiesSection | ActorSection, ...]:

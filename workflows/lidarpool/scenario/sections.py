@@ -44,6 +44,9 @@ from ..sensor.sensor import Fov, Layers, MaxRange, MinRange, RaysPerRevolution, 
 COPIES_MOST = 1_000_000  # of one entry
 PathOf = Callable[[str], Path]  # of a file that a scenario names
 
+IgnoredColumns = Annotated[
+    TextOrTexts, about("names of columns to leave out, with * and ?", "remarks")
+]
 Factor = Annotated[float, Field(ge=-1e9, le=1e9)]
 Pair = Two[Coordinate]
 
@@ -182,6 +185,7 @@ class CopyTable(Section):
         dict[str, str],
         about("{x, y, z, yaw_deg, pitch_deg, roll_deg, scale, scale_x, …: name in the file}"),
     ] = {}
+    ignore: IgnoredColumns = ()
 
 
 class Scatter(Section):

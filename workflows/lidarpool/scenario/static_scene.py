@@ -11,6 +11,8 @@ import numpy as np
 
 from ..base.arrays import Floats
 from ..base.errors import LidarpoolError, Mistakes, prefixed
+from ..base.tables import NUMBERS, Quantity, read_table
+from ..base.textfile import read_text
 from ..base.words import plural
 from ..scene.actors import Actor, box, one_mesh
 from ..scene.files.meshfile import ROBOTS, Objects, load_objects
@@ -23,14 +25,15 @@ from ..scene.scene_mesh import SceneMesh
 from ..scene.shapes import seed_objects
 from ..scene.transform import Transform, affine
 from ..scene.wheels import rolling
-from ..sensor.calibrations import said, text_of
+from ..sensor.calibrations import said
+from ..sensor.pose_columns import ANGLES, POSITION, REFUSED_COLUMNS, angles_of, with_yaw
 from ..sensor.trajectory import rotations_of
-from ..sensor.trajectory_files import columns_of_table
 from .ground import Standing
 from .scenario import Scenario
 from .sections import (
     COPIES_MOST,
     CopiesSection,
+    CopyTable,
     MeshFile,
     PathOf,
     Scatter,
@@ -252,6 +255,11 @@ DRAWS_LEAST = 1 << 21
 
 _PLACE, _ANGLES = ("x", "y", "z"), ("yaw_deg", "pitch_deg", "roll_deg")
 _SCALES = ("scale_x", "scale_y", "scale_z")
+_COPY_COLUMNS = (
+    *POSITION,
+    *ANGLES,
+    *(Quantity(name, (name,), NUMBERS, "") for name in ("scale", *_SCALES)),
+)
 
 
 def copies_of(
@@ -268,7 +276,7 @@ def copies_of(
         places, angles, scales = _scattered(entry.scatter, entry.name, standing)
     else:
         if entry.table is not None:
-            places, angles, scales = _of_table(path(entry.table.file), entry.table.columns)
+            places, angles, scales = _of_table(path(entry.table.file), entry.table)
         else:
             places = np.array([(*one.position, np.nan)[:3] for one in entry.at])
             angles = np.array([[getattr(one, name) for name in _ANGLES] for one in entry.at])
@@ -291,31 +299,32 @@ def copies_of(
     return SceneInstance.several(mesh, matrices, entry.name)
 
 
-def _of_table(path: Path, columns: dict[str, str]) -> tuple[Floats, Floats, Floats]:
-    """Places, z nan if there is none, angles in degrees, and scales of a table: (n, 3) each."""
+def _of_table(path: Path, table: CopyTable) -> tuple[Floats, Floats, Floats]:
+    """Read positions, z nan if there is none, angles in degrees, and scales: (n, 3) each."""
     try:
-        text = text_of(path)
-        short = [name.removesuffix("_deg") for name in _ANGLES]  # as people write them
-        known = (*_PLACE, *_ANGLES, "scale", *_SCALES, *short)
-        at = columns_of_table(text, columns, known, lambda found: ("x", "y"))
-        if "scale" in at and any(name in at for name in _SCALES):
-            raise ValueError("it has both scale and scales of axes: leave one out in columns")
-        if unread := [name for name in short if name in at and f"{name}_deg" not in at]:
-            raise ValueError(
-                f"its column {unread[0]!r} has no unit: call it {unread[0]}_deg, in degrees, or "
-                f"give columns: {{{unread[0]}_deg: {unread[0]}}}"
+        columns = with_yaw(
+            read_table(
+                read_text(path),
+                _COPY_COLUMNS,
+                required=lambda columns: ("x", "y"),
+                columns=table.columns,
+                ignore=table.ignore,
+                refused=REFUSED_COLUMNS,
             )
+        )
+        if "scale" in columns and any(name in columns for name in _SCALES):
+            raise ValueError("it has both scale and scales of axes: ignore one")
     except (OSError, ValueError, LidarpoolError) as error:
         raise LidarpoolError(f"{path} is not a usable table of copies: {said(error)}") from error
-    count = len(at["x"])
+    count = len(columns["x"])
     if count > COPIES_MOST:
         raise LidarpoolError(f"{path} has {count:,} rows; at most {COPIES_MOST:,} are allowed.")
 
     def some(names: Sequence[str], default: Any) -> Floats:
-        return np.stack([at.get(name, np.full(count, default)) for name in names], axis=1)
+        return np.stack([columns.get(name, np.full(count, default)) for name in names], axis=1)
 
-    scales = some(("scale",) * 3 if "scale" in at else _SCALES, 1.0)
-    return some(_PLACE, np.nan), some(_ANGLES, 0.0), scales
+    scales = some(("scale",) * 3 if "scale" in columns else _SCALES, 1.0)
+    return some(_PLACE, np.nan), angles_of(columns, count), scales
 
 
 def _scattered(given: Scatter, name: str, standing: Standing) -> tuple[Floats, Floats, Floats]:

@@ -10,11 +10,11 @@ import numpy as np
 
 from ..base.arrays import Floats, Indices
 from ..base.elementary import interp
-from ..base.errors import LidarpoolError
+from ..base.errors import LidarpoolError, prefixed
 from ..base.validation import checked_fields
 from ..base.vectors import length, products, turned
 from ..sensor import Stations, Track, Trajectory
-from ..sensor.trajectory import CENTRE, full_poses, presence_ns, quaternions_of
+from ..sensor.trajectory import CENTRE, check_rotations, full_poses, presence_ns, quaternions_of
 from . import face_materials
 from .colours import joined
 from .scene_instances import SceneInstance, parts_of
@@ -45,7 +45,7 @@ class Actor:
     Raises
     ------
     LidarpoolError
-        If the mesh has voxels.
+        If the mesh has voxels, or the first rotation of the trajectory mirrors or deforms.
     """
 
     mesh: SceneMesh
@@ -58,6 +58,18 @@ class Actor:
             raise LidarpoolError(
                 f"{self.name!r} is of voxels, which cannot move: name it in scene.files or copies."
             )
+        if not isinstance(self.trajectory, Track | Stations):
+            self._check_first_pose()
+
+    def _check_first_pose(self) -> None:
+        """Check the first rotation of a trajectory of another class, which may be a user's."""
+        first_ns = max(presence_ns(self.trajectory)[0], 0.0)
+        try:
+            _, rotations = full_poses(self.trajectory, 0, np.array([first_ns]))
+        except LidarpoolError:  # it does not cover this time, which `check` says
+            return
+        with prefixed(f"Actor {self.name!r}"):
+            check_rotations(np.asarray(rotations, np.float64))
 
     @property
     def name(self) -> str:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -15,13 +15,15 @@ from numpy.typing import ArrayLike
 from ..base.arrays import Floats
 from ..base.elementary import interp, sin_cos
 from ..base.errors import LidarpoolError
+from ..base.tables import METRES, RADIANS, Quantity, read_table
+from ..base.textfile import read_text
 from ..base.validation import as_array, checked
 from ..base.vectors import applied, matmul
-from ..base.words import did_you_mean, plural, printable
+from ..base.words import did_you_mean, plural
 from ..sensor import Pose, Stations, Trajectory
-from ..sensor.calibrations import said, text_of
+from ..sensor.calibrations import said
+from ..sensor.pose_columns import TIME
 from ..sensor.trajectory import full_poses, presence_ns, velocities
-from ..sensor.trajectory_files import columns_of_table, head_of_table
 from .actors import AT_ZERO, Actor, one_mesh
 from .scene_mesh import SceneMesh
 from .transform import rotation_about
@@ -120,9 +122,16 @@ class Robot:
         return tuple(joint.name for joint in self.joints.values() if joint.moves)
 
     def path(
-        self, link: str, trajectory: Trajectory = AT_ZERO, joints: Joints | None = None
+        self,
+        link: str,
+        trajectory: Trajectory = AT_ZERO,
+        joints: Joints | None = None,
+        *,
+        ignore: Sequence[str] = (),
     ) -> Trajectory:
         """Trajectory of a link, whose root has a trajectory. It stands if nothing moves it.
+
+        `ignore` are names of columns of a table of joints to leave out, with * and ?.
 
         Raises
         ------
@@ -133,7 +142,7 @@ class Robot:
             raise LidarpoolError(
                 f"{self.name} has no link {link!r}.{did_you_mean(link, self.links)}"
             )
-        return self._path(link, trajectory, *self._values(joints))
+        return self._path(link, trajectory, *self._values(joints, ignore))
 
     @checked
     def actors(
@@ -143,6 +152,7 @@ class Robot:
         *,
         name: str | None = None,
         without: Collection[str] = (),
+        ignore: Sequence[str] = (),
         tell: Callable[[str], None] = _log.warning,
     ) -> tuple[Actor, ...]:
         """Make an actor of each link that a joint moves, with the links that are fixed to it.
@@ -157,15 +167,17 @@ class Robot:
             Of the robot. Actors are called NAME/LINK, by the first link that has triangles.
         without
             Links to leave out.
+        ignore
+            Names of columns of a table of joints to leave out, with * and ?.
         tell
-            Called with a line on columns that are no joints, and on values beyond limits.
+            Called with a line on values beyond limits.
 
         Raises
         ------
         LidarpoolError
             If the joints cannot be used.
         """
-        times_s, values = self._values(joints, tell)
+        times_s, values = self._values(joints, ignore, tell)
         called = self.name if name is None else name
         return tuple(
             Actor(
@@ -230,12 +242,15 @@ class Robot:
         return LinkPath(base, tuple(hinges), place, times_s, getattr(base, "start_s", None) or 0.0)
 
     def _values(
-        self, given: Joints | None, tell: Callable[[str], None] = lambda line: None
+        self,
+        given: Joints | None,
+        ignore: Sequence[str],
+        tell: Callable[[str], None] = lambda line: None,
     ) -> tuple[Floats, dict[str, Floats]]:
         """Return times (k,), and values (k,) of all joints that move."""
         table: dict[str, Any] = {}
         if isinstance(given, (str, Path)):
-            table = self._read_values(Path(given), tell)
+            table = self._read_values(Path(given), ignore)
         elif given is not None:
             table = {name: as_array(name, value).reshape(-1) for name, value in given.items()}
         times = table.pop("time_s", np.zeros(1))
@@ -274,31 +289,35 @@ class Robot:
                 )
         return times, table
 
-    def _read_values(self, path: Path, tell: Callable[[str], None]) -> dict[str, Floats]:
+    def _read_values(self, path: Path, ignore: Sequence[str]) -> dict[str, Floats]:
         """Read a table of values; LidarpoolError if it cannot be used."""
-        try:
-            text = text_of(path)
-            known = ("time_s", "time_ns", *self.moving)
-            table = columns_of_table(
-                text, {}, known, lambda found: ("time_ns" if "time_ns" in found else "time_s",)
+        quantities = [
+            Quantity(
+                joint.name,
+                (),
+                METRES if joint.kind == "prismatic" else RADIANS,
+                "m" if joint.kind == "prismatic" else "rad",
+                exact=True,
             )
-            names = head_of_table(text.splitlines())[2]
+            for joint in self.joints.values()
+            if joint.moves
+        ]
+        try:
+            table = read_table(
+                read_text(path),
+                [TIME, *quantities],
+                required=lambda columns: ("time_s",),
+                ignore=ignore,
+                unused=[joint.name for joint in self.joints.values() if not joint.moves],
+            )
         except (OSError, ValueError, LidarpoolError) as error:
             raise LidarpoolError(
                 f"{path} is not a usable table of joints: {said(error)}"
             ) from error
-        if "time_ns" in table:
-            table["time_s"] = table.pop("time_ns") / 1e9
         if len(table) < 2:
             raise LidarpoolError(
                 f"{path} has values of no joint that moves: name its columns as the joints of "
                 f"{self.name} are, such as {', '.join(self.moving[:3])}."
-            )
-        small = [name.lower() for name in known]
-        if others := [printable(name) for name in names if name.lower() not in small]:
-            tell(
-                f"{path} has columns of no joint that moves: "
-                f"{', '.join(others[:3])}{', …' * (len(others) > 3)}"
             )
         return table
 

@@ -12,10 +12,10 @@ from typing import Any
 import numpy as np
 import yaml
 
-from ..base.allowance import check_fits
 from ..base.arrays import Floats
 from ..base.elementary import sin_cos
 from ..base.errors import LidarpoolError
+from ..base.textfile import read_text
 from ..base.yamlfile import load_yaml
 from .beams import Beams
 
@@ -56,7 +56,7 @@ def read_calibration(path: Path) -> Calibration:
         If it is none of these, or numbers are missing, not finite or in the wrong order.
     """
     try:
-        text = text_of(path)
+        text = read_text(path)
         if path.suffix.lower() in (".yaml", ".yml"):
             return _velodyne(path.name, load_yaml(text))
         if path.suffix.lower() == ".json":
@@ -64,15 +64,6 @@ def read_calibration(path: Path) -> Calibration:
         return _table(path.name, text)
     except UNUSABLE as error:
         raise LidarpoolError(f"{path} is not a usable calibration: {said(error)}") from error
-
-
-def text_of(path: Path) -> str:
-    """Read a text file; ValueError if it is empty, and as `check_fits`."""
-    check_fits(path)
-    text = path.read_text("utf-8-sig")
-    if not text.strip():
-        raise ValueError("it is empty")
-    return text
 
 
 def said(error: Exception) -> str:
@@ -140,7 +131,10 @@ def _ouster(name: str, data: Any) -> Calibration:
             f"it has {elevation.size} altitude and {azimuth.size} azimuth angles of {rows} beams"
         )
     there = (elevation != 0) | (azimuth != 0)  # older firmware writes zeros for beams it lacks
-    beam_at = np.reshape(beam.get("beam_to_lidar_transform", np.eye(4)), (4, 4))[:3, 3].copy()
+    beam_pose = np.reshape(beam.get("beam_to_lidar_transform", np.eye(4)), (4, 4))
+    if not np.allclose(beam_pose[:3, :3], np.eye(3)):
+        raise ValueError("its beam_to_lidar_transform turns the beams; a translation is expected")
+    beam_at = beam_pose[:3, 3].copy()
     if "lidar_origin_to_beam_origin_mm" in beam:
         beam_at[0] = beam["lidar_origin_to_beam_origin_mm"]
     elif "beam_to_lidar_transform" not in beam:  # firmware before 2.0
@@ -189,6 +183,8 @@ def _table(name: str, text: str) -> Calibration:
         other = [word for word in header if word not in known]
         if other:
             raise ValueError(f"column {other[0]!r} is not one of {', '.join(known)}")
+        if twice := next((word for word in header if header.count(word) > 1), None):
+            raise ValueError(f"it has the column {twice!r} twice")
         columns = dict(zip(header, _rows(text, 1, len(header)).T, strict=True))
         zero = np.zeros(len(columns["elevation_deg"]))
         beams = Beams(

@@ -392,5 +392,31 @@ def geodetic(positions: Floats, origin: tuple[float, float, float]) -> Floats:
     return np.column_stack([np.degrees(bow), np.degrees(arctan2(y, x)), height])
 
 
+def local_positions(places: Floats, origin: tuple[float, float, float]) -> Floats:
+    """Return positions east, north and up of an origin (k, 3), metres; inverse of `geodetic`.
+
+    Parameters
+    ----------
+    places
+        (k, 3): latitudes and longitudes, degrees, and ellipsoidal heights, metres.
+    origin
+        Latitude, longitude and height.
+    """
+    (sp, cp), (sl, cl) = (sin_cos_of(math.radians(angle)) for angle in origin[:2])
+    x, y, z = (_cartesian(places) - _cartesian(np.array([origin], np.float64))).T
+    east = cl * y - sl * x
+    outward = cl * x + sl * y
+    return np.column_stack([east, cp * z - sp * outward, cp * outward + sp * z])
+
+
+def _cartesian(places: Floats) -> Floats:
+    """Return geocentric coordinates (k, 3), metres, of latitudes, longitudes and heights (k, 3)."""
+    latitude, longitude, height = places.T
+    (sp, cp), (sl, cl) = sin_cos(np.radians(latitude)), sin_cos(np.radians(longitude))
+    across = _A / np.sqrt(1 - _E2 * sp * sp)
+    level = (across + height) * cp
+    return np.column_stack([level * cl, level * sl, (across * (1 - _E2) + height) * sp])
+
+
 _A, _F = 6378137.0, 1 / 298.257223563  # of WGS 84
 _E2 = _F * (2 - _F)

@@ -14,7 +14,7 @@ from ..base.declared import AngleDeg, Triple, about, short, written_as
 from ..base.elementary import arctan2, sin_cos
 from ..base.errors import LidarpoolError
 from ..base.validation import as_array, checked_fields, one_line, shown
-from ..base.vectors import applied, hypot, length, matmul
+from ..base.vectors import applied, determinant, hypot, length, matmul
 from .spline import knots_of, on_curve
 
 QUATERNION_SLACK = 1e-3  # tolerance of a quaternion's length, which files round
@@ -67,10 +67,14 @@ class Pose:
 
     @classmethod
     def of(cls, position: ArrayLike, rotation: Floats | None) -> Pose:
-        """Make a pose of a position and a rotation matrix (3, 3), or None."""
+        """Make a pose of a position and a rotation matrix (3, 3), or None.
+
+        LidarpoolError if the matrix mirrors or deforms.
+        """
         place = tuple(np.asarray(position, np.float64).tolist())
         if rotation is None:
             return cls(place)
+        check_rotations(np.asarray(rotation, np.float64)[None])
         level = hypot(rotation[0, 0], rotation[1, 0])
         pitch = arctan2(-rotation[2, 0], level)
         if level > 1e-9:
@@ -93,6 +97,26 @@ def rotations_of(angles_deg: Floats) -> Floats:
         ]
     )
     return made if made.ndim == 2 else np.ascontiguousarray(np.moveaxis(made, 2, 0))
+
+
+def check_rotations(rotations: Floats, slack: float = 1e-6) -> None:
+    """Check matrices (k, 3, 3) of poses; LidarpoolError for one that mirrors or deforms.
+
+    Products of their columns may differ by `slack` from those of a rotation.
+    """
+    products = matmul(rotations.transpose(0, 2, 1), rotations)
+    # Written so that NaN is an error.
+    rigid = np.asarray((np.abs(products - np.eye(3)) <= slack).all(axis=(1, 2)))
+    right_handed = determinant(rotations) > 0
+    bad = np.flatnonzero(~(rigid & right_handed))
+    if len(bad):
+        first = int(bad[0])
+        fault = "mirrors" if rigid[first] else "deforms"
+        raise LidarpoolError(
+            f"Matrix {first} of a pose {fault}: {rotations[first].round(6).tolist()}. A pose turns "
+            "and moves: give a matrix with orthonormal rows and the determinant 1 (matrices are "
+            "counted from 0)."
+        )
 
 
 def pose_of(name: str, given: Any) -> Pose:

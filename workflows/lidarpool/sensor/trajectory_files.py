@@ -1,32 +1,62 @@
-"""Trajectories from files: TUM, KITTI, and tables of named columns."""
+"""Trajectories from files: TUM, KITTI, tables of named columns, oxts folders, and bags of ROS 2."""
 
 from __future__ import annotations
 
-import csv
-from collections.abc import Callable, Container, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal, NamedTuple
 
 import numpy as np
 from pydantic import Field
 
-from ..base.allowance import check_fits
 from ..base.arrays import Floats
 from ..base.errors import LidarpoolError
+from ..base.tables import column_name, find_header, read_table
+from ..base.textfile import read_text
 from ..base.validation import checked
-from ..base.vectors import determinant, matmul, turned
-from .calibrations import said, text_of
-from .trajectory import Beyond, Track, quaternions_of, rotations_of
+from ..base.vectors import turned
+from ..columns.bags import is_bag
+from .bag_trajectories import read_bag
+from .calibrations import said
+from .oxts import OXTS_TIMES, WIDTH, find_oxts, oxts_files, oxts_poses, read_oxts
+from .pose_columns import (
+    ANGLES,
+    POSE_TABLES,
+    POSITION,
+    QUATERNION,
+    REFUSED_COLUMNS,
+    TIME,
+    angles_of,
+    with_yaw,
+)
+from .trajectory import (
+    QUATERNION_SLACK,
+    Beyond,
+    Track,
+    check_rotations,
+    quaternions_of,
+    rotations_of,
+)
 
-TrajectoryFormat = Literal["tum", "kitti", "csv"]
+TrajectoryFormat = Literal["tum", "kitti", "csv", "oxts", "bag"]
 Seconds = Annotated[float, Field(ge=-1e11, le=1e11)]
 Duration = Annotated[float, Field(gt=0, le=1e9)]
-_PLACE = ("x", "y", "z")
-_TURNS = (("qx", "qy", "qz", "qw"), ("yaw_deg", "pitch_deg", "roll_deg"))
-_MARKS = ",;\t"  # that separate the columns of a table
+Latitude = Annotated[float, Field(gt=-90, lt=90)]
+Longitude = Annotated[float, Field(ge=-360, le=360)]
+Height = Annotated[float, Field(ge=-1e5, le=1e6)]
 # Cameras look along z with y down; carriers look along x with z up.
 _CAMERA = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
+# A .trj of HELIOS++ says neither units nor the order of rotations: its survey does.
+_HELIOS = " `lidarpool import` reads a .trj of HELIOS++ with its survey."
+
+
+class Poses(NamedTuple):
+    """Poses of a file."""
+
+    seconds: Floats  # (k,)
+    positions: Floats  # (k, 3): metres
+    quaternions: Floats | None  # (k, 4): x, y, z, w; None if the file has no orientations
 
 
 @checked
@@ -36,6 +66,9 @@ def load_trajectory(
     format: TrajectoryFormat | None = None,  # noqa: A002 - its name in scenarios
     times: str | Path | None = None,
     columns: Mapping[str, str] | None = None,
+    ignore: Sequence[str] = (),
+    topic: str | None = None,
+    origin: tuple[Latitude, Longitude, Height] | None = None,
     camera_axes: bool | None = None,
     offset_s: Seconds = 0.0,
     smooth: bool = False,
@@ -48,16 +81,28 @@ def load_trajectory(
     Parameters
     ----------
     path
-        TUM (rows of time, x, y, z, qx, qy, qz, qw), KITTI (rows of a 3 x 4 matrix), or a table
-        with a header, separated by commas, semicolons or tabs: time_s or time_ns, x, y, z, and
-        qx, qy, qz, qw, or any of yaw_deg, pitch_deg, roll_deg; without them the carrier faces its
-        direction of travel.
+        TUM (rows of time, x, y, z, qx, qy, qz, qw); KITTI (rows of a 3 x 4 matrix); a table with
+        a header, separated by commas, semicolons, tabs or spaces, as EuRoC's data.csv; a folder
+        «oxts» of KITTI; or a bag of ROS 2 (.mcap, .db3 or its folder), which needs
+        ``lidarpool[ros]``. A table has time_s (or time_ns), x, y, z, and qx, qy, qz, qw, or
+        yaw_deg (or heading_deg, clockwise from y), and with it pitch_deg and roll_deg; without
+        them the carrier faces its direction of travel.
     format
-        "tum", "kitti" or "csv"; by default kitti with `times`, csv for a .csv, else tum.
+        "tum", "kitti", "csv", "oxts" or "bag"; by default by the content.
     times
-        For a KITTI file: the file with the seconds of its rows.
+        For a KITTI file, or one of rows of oxts: the file with the seconds of its rows.
     columns
         For a table, {name as above: name in the file}, if they differ.
+    ignore
+        For a table, names of columns to leave out, with * and ?; a column that is neither used nor
+        named here is an error.
+    topic
+        For a bag with several: a topic of Odometry, PoseStamped, PoseWithCovarianceStamped,
+        TransformStamped or NavSatFix; "/tf:FRAME" for a frame; or two topics, of NavSatFix and of
+        the Imu with its orientation, separated by a space.
+    origin
+        For latitudes and longitudes: those of the world's zero, degrees, and its height, metres.
+        By default the first position.
     camera_axes
         Whether to convert poses from camera axes (z ahead, y down) to a carrier's (x ahead,
         z up); by default for KITTI.
@@ -69,146 +114,184 @@ def load_trajectory(
     Raises
     ------
     LidarpoolError
-        If it cannot be read, or is invalid; the message names the file.
+        If it cannot be read, has something that is not understood, or is invalid; the message
+        names the file.
     """
     path = Path(path)
-    kind = format or ("kitti" if times else "csv" if path.suffix.lower() == ".csv" else "tum")
     try:
-        text = text_of(path)
-        if times:
-            check_fits(Path(times))
-        if kind == "csv":
-            seconds, places, turns = _table(text, dict(columns or {}))
-        elif kind == "kitti":
-            if times is None:
-                raise ValueError("KITTI's poses have no times: give their file as times")
-            seconds = _numbers(Path(times).read_text("utf-8-sig"), 1)[:, 0]
-            rows = _numbers(text, 12).reshape(-1, 3, 4)
-            if len(rows) != len(seconds):
-                raise ValueError(f"it has {len(rows)} poses and {times} {len(seconds)} times")
-            places, turns = rows[..., 3], quaternions_of(_rotations(rows[..., :3]))
+        if path.is_dir() or is_bag(path) or format in ("oxts", "bag"):
+            kind, poses = _of_container(path, format, times, topic, origin)
         else:
-            rows = _numbers(text, 8)
-            seconds, places, turns = rows[:, 0], rows[:, 1:4], rows[:, 4:]
-        track = Track(seconds + offset_s, places, turns, smooth, start_s, duration_s, beyond)
+            _refuse_topic(topic)
+            text = read_text(path)
+            kind, poses = _of_text(text, format, times, columns or {}, ignore, origin)
+        if (columns or ignore) and kind != "csv":
+            raise ValueError(f"columns and ignore are of tables with a header, and it is {kind}")
+        if origin is not None and kind not in ("oxts", "bag"):
+            raise ValueError(f"origin is of latitudes and longitudes, and it is {kind}")
+        seconds, positions, quaternions = poses
+        seconds = seconds + offset_s
+        track = Track(seconds, positions, quaternions, smooth, start_s, duration_s, beyond)
         if camera_axes or (camera_axes is None and kind == "kitti"):
             track = _from_camera(track)
         return track
     except (OSError, ValueError, LidarpoolError) as error:
-        raise LidarpoolError(f"{path} is not a usable trajectory: {said(error)}") from error
+        more = _HELIOS if path.suffix.lower() == ".trj" else ""
+        raise LidarpoolError(f"{path} is not a usable trajectory: {said(error)}{more}") from error
 
 
-def _numbers(text: str, columns: int | None = None, **options: Any) -> Floats:
+def files_of_trajectory(path: Path) -> list[Path]:
+    """Return the files that a trajectory is read from: of a folder those in it, else the path."""
+    if not path.is_dir():
+        return [path]
+    if is_bag(path):
+        return sorted(file for file in path.iterdir() if file.is_file())
+    folder = find_oxts(path)
+    return [path] if folder is None else [*oxts_files(folder), folder / OXTS_TIMES]
+
+
+def _refuse_topic(topic: str | None) -> None:
+    if topic is not None:
+        raise ValueError("topic is of bags, and it is none")
+
+
+def _of_container(
+    path: Path,
+    kind: TrajectoryFormat | None,
+    times: str | Path | None,
+    topic: str | None,
+    origin: Sequence[float] | None,
+) -> tuple[str, Poses]:
+    """Read a folder or a bag; return its format and its poses."""
+    if not path.exists():
+        raise FileNotFoundError(2, "No such file or directory")
+    if is_bag(path) and kind in (None, "bag"):
+        if times is not None:
+            raise ValueError("a bag has times of its own: leave out times")
+        return "bag", Poses(*read_bag(path, topic, origin))
+    _refuse_topic(topic)
+    folder = find_oxts(path)
+    if folder is not None and kind in (None, "oxts"):
+        if times is not None:
+            raise ValueError("a folder of oxts has times of its own: leave out times")
+        return "oxts", Poses(*read_oxts(folder, origin))
+    if path.is_file() and kind == "oxts":
+        return _of_text(read_text(path), kind, times, {}, (), origin)
+    raise ValueError(
+        "a folder is one of KITTI, with timestamps.txt and data, or a bag of ROS 2, with "
+        f"metadata.yaml{'' if kind is None else f'; format says {kind}'}"
+    )
+
+
+def _of_text(
+    text: str,
+    kind: TrajectoryFormat | None,
+    times: str | Path | None,
+    columns: Mapping[str, str],
+    ignore: Sequence[str],
+    origin: Sequence[float] | None,
+) -> tuple[str, Poses]:
+    """Read a text file; return its format and its poses."""
+    lines = text.splitlines()
+    if times is not None and kind not in (None, "kitti", "oxts"):
+        raise ValueError(f"times are of KITTI's poses, and format says {kind}")
+    header = find_header(lines, _is_pose_column) if times is None else None
+    if kind == "csv" or (kind in (None, "tum") and header is not None):
+        # Rows of TUM are separated by spaces, and may have their header in a remark.
+        tum = header is not None and header.comment and header.separator is None
+        return "csv", _table(text, columns, ignore, tum or kind == "tum")
+    rows = _numbers(text)
+    width = rows.shape[1]
+    if kind is None:
+        kind = "oxts" if width == WIDTH else "kitti" if times or width == 12 else "tum"
+    if kind == "tum":
+        if width != 8:
+            raise ValueError(
+                f"its rows have {width} numbers and no header: rows of TUM have 8, those of KITTI "
+                "12; give a table a header, as in time_s,x,y,z,yaw_deg"
+            )
+        return kind, Poses(rows[:, 0], rows[:, 1:4], rows[:, 4:])
+    if times is None:
+        raise ValueError("KITTI's poses have no times: give their file as times")
+    try:
+        seconds = _numbers(read_text(Path(times)), 1)[:, 0]
+    except ValueError as error:
+        raise ValueError(f"{times} has no times: {said(error)}") from error
+    expected = WIDTH if kind == "oxts" else 12
+    if width != expected:
+        raise ValueError(f"its rows have {width} numbers, not {expected}")
+    if len(rows) != len(seconds):
+        raise ValueError(f"it has {len(rows)} poses and {times} {len(seconds)} times")
+    if kind == "oxts":
+        return kind, Poses(seconds, *oxts_poses(rows, origin))
+    places = rows.reshape(-1, 3, 4)
+    check_rotations(places[..., :3], slack=2 * QUATERNION_SLACK)
+    return kind, Poses(seconds, places[..., 3], quaternions_of(places[..., :3]))
+
+
+def _is_pose_column(cell: str) -> bool:
+    words = column_name(cell).words
+    return any(
+        words in {column_name(name).words for name in quantity.spellings}
+        for quantity in (TIME, *POSITION, *QUATERNION, *ANGLES)
+    )
+
+
+def _numbers(text: str, columns: int | None = None) -> Floats:
     """Rows of numbers, by `np.loadtxt`; lines that begin with # are comments."""
     lines = [line for line in text.splitlines() if line.strip() and line.strip()[0] != "#"]
     if not lines:
         raise ValueError("it has no rows of numbers")
-    rows = np.loadtxt(lines, ndmin=2, **options)
+    try:
+        rows = np.loadtxt(lines, ndmin=2)
+    except ValueError as error:
+        if "," in lines[0] or ";" in lines[0]:
+            raise ValueError(
+                "it has no header: name its columns in the first line, as in "
+                "time_s,x,y,z,qx,qy,qz,qw"
+            ) from error
+        raise
     if columns is not None and rows.shape[1:] != (columns,):
         raise ValueError(f"its rows have {rows.shape[1]} numbers, not {columns}")
     return rows
 
 
-def _rotations(given: Floats) -> Floats:
-    off = np.abs(matmul(given, given.transpose(0, 2, 1)) - np.eye(3)).max(axis=(1, 2))
-    if not (off <= 2e-3).all() or (determinant(given) < 0).any():
-        raise ValueError("it holds matrices that are no rotations")
-    return given
+def _table(text: str, names: Mapping[str, str], ignore: Sequence[str], tum: bool) -> Poses:
+    """Read a table with a header; `tum` says that bare times are seconds."""
+    quaternion = [quantity.name for quantity in QUATERNION]
 
+    def needed(columns: Mapping[str, Floats]) -> tuple[str, ...]:
+        turns = quaternion if any(name in columns for name in quaternion) else ()
+        return ("time_s", "x", "y", "z", *turns)
 
-def _table(text: str, names: dict[str, str]) -> tuple[Any, Any, Any]:
-    """Seconds, positions and quaternions, or None, of a table with a header."""
-
-    def needed(found: Container[str]) -> tuple[str, ...]:
-        clock = "time_ns" if "time_ns" in found and "time_s" not in found else "time_s"
-        return (clock, *_PLACE, *(_TURNS[0] if any(n in found for n in _TURNS[0]) else ()))
-
-    known = ("time_s", "time_ns", *_PLACE, *_TURNS[0], *_TURNS[1])
-    at = columns_of_table(text, names, known, needed)
-    seconds = at["time_s"] if "time_s" in at else at["time_ns"] / 1e9
-    places = np.stack([at[name] for name in _PLACE], axis=1)
-    if _TURNS[0][0] in at:
-        return seconds, places, np.stack([at[name] for name in _TURNS[0]], axis=1)
-    if not any(name in at for name in _TURNS[1]):
-        return seconds, places, None
-    angles = [at.get(name, np.zeros(len(seconds))) for name in _TURNS[1]]
-    return seconds, places, quaternions_of(rotations_of(np.stack(angles, axis=1)))
-
-
-def columns_of_table(
-    text: str,
-    names: Mapping[str, str],
-    known: Sequence[str],
-    needed: Callable[[Container[str]], Sequence[str]],
-) -> dict[str, Floats]:
-    """Columns (k,) of a table with a header, by their names here; others are left out.
-
-    Capital letters count only in `names`.
-
-    Parameters
-    ----------
-    names
-        {name here: name in the file}, where they differ.
-    known
-        All names here.
-    needed
-        Returns those that a table must have which has some columns.
-
-    Raises
-    ------
-    ValueError
-        If a column is missing, or a cell holds no finite number.
-    """
-    lines = text.splitlines()
-    first, mark, head = head_of_table(lines)
-    if unknown := [name for name in names if name not in known]:
-        raise ValueError(f"columns names {unknown[0]!r}; possible names are {', '.join(known)}")
-    small = [name.lower() for name in head]
-    at = {}  # {name here: index}
-    for name in known:
-        if (there := names.get(name, name)) in head:
-            at[name] = head.index(there)
-        elif name not in names and name in small:
-            at[name] = small.index(name)
-    must = {**dict.fromkeys(needed(at)), **names}
-    if missing := [names.get(name, name) for name in must if name not in at]:
-        raise ValueError(f"it has no column {missing[0]!r}; it has {', '.join(head)}")
-    used = list(at.values())  # others may hold text
-    body = lines[first + 1 :]
-    try:
-        rows = _numbers("\n".join(body), delimiter=mark, quotechar='"', usecols=used)
-        if not np.isfinite(rows).all():
-            raise ValueError("it has a nan or inf")
-    except ValueError as error:
-        reader = csv.reader(body, delimiter=mark)
-        for cells in reader:
-            remark = not cells or cells[0].lstrip().startswith("#")
-            for name, index in () if remark else at.items():
-                cell = cells[index] if index < len(cells) else ""
-                if not _is_finite(cell):
-                    line = first + 1 + reader.line_num
-                    more = "" if name in must else ", or leave the column out"
-                    raise ValueError(
-                        f"its column {head[index]!r} has {cell!r} in line {line}: give a number in "
-                        f"every line{more}"
-                    ) from error
-        raise
-    return dict(zip(at, rows.T, strict=True))
-
-
-def head_of_table(lines: Sequence[str]) -> tuple[int, str, list[str]]:
-    """Line of a table's header, what separates its columns, and their names."""
-    # Remarks may come first, and some programs write # before the header as well.
-    first = next((i for i, line in enumerate(lines) if any(m in line for m in _MARKS)), 0)
-    mark = next((mark for mark in _MARKS if mark in lines[first]), ",")
-    return first, mark, [name.strip().strip('"') for name in lines[first].split(mark)]
-
-
-def _is_finite(cell: str) -> bool:
-    try:
-        return bool(np.isfinite(float(cell)))
-    except ValueError:
-        return False
+    columns = with_yaw(
+        read_table(
+            text,
+            (TIME, *POSITION, *QUATERNION, *ANGLES),
+            required=needed,
+            columns=names,
+            ignore=ignore,
+            formats=POSE_TABLES,
+            refused=REFUSED_COLUMNS,
+            bare={"time_s": "s"} if tum else {},
+        )
+    )
+    seconds = columns["time_s"]
+    positions = np.stack([columns[name] for name in "xyz"], axis=1)
+    angles = [name for name in ("yaw_deg", "pitch_deg", "roll_deg") if name in columns]
+    if "qx" in columns:
+        if angles:
+            raise ValueError(f"it has both a quaternion and {angles[0]}: ignore one of these")
+        turns = np.stack([columns[name] for name in quaternion], axis=1)
+        return Poses(seconds, positions, turns)
+    if not angles:
+        return Poses(seconds, positions, None)
+    if "yaw_deg" not in angles:
+        raise ValueError(
+            f"it has {angles[0]} and neither yaw_deg nor heading_deg: give one, or ignore "
+            f"{angles[0]} to face the direction of travel"
+        )
+    return Poses(seconds, positions, quaternions_of(rotations_of(angles_of(columns, len(seconds)))))
 
 
 def _from_camera(track: Track) -> Track:

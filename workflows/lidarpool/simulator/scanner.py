@@ -221,7 +221,10 @@ class Scanner:
                     f"the trajectory lasts {path.duration_ns / 1e9:.6g} s: begin earlier "
                     "(start_s), or take a longer one."
                 )
-            check_trajectory(path)
+            try:
+                check_trajectory(path)
+            except ValueError as error:
+                raise LidarpoolError(str(error)) from error
             returns = rig.returns(specs, path, late_ns, tally=False)
         survey = rig.survey
         origin = rig.scene.origin if survey.coordinates == "world" else np.zeros(3)
@@ -260,8 +263,8 @@ class Scanner:
         Raises
         ------
         LidarpoolError
-            If the poses are no such list or array, a number is not finite, or a matrix does not
-            rotate.
+            If the poses are no such list or array, a number is not finite, or a matrix mirrors or
+            deforms.
         """
         positions, rotations = _placed(poses)
         with self._casting() as rig:
@@ -293,7 +296,8 @@ class Scanner:
         Raises
         ------
         LidarpoolError
-            If there is no such actor or instance, or an instance would move during a sweep.
+            If there is no such actor or instance, an instance would move during a sweep, or a
+            rotation of the trajectory mirrors or deforms.
         """
         path = _path(pose)
         scene = self._rig.scene

@@ -202,8 +202,18 @@ def _columns(text: str, settings: dict[str, str]) -> dict[str, Floats]:
         names = [word.strip(" \"'") for word in header[1].split(",")]
     else:
         names = ["t", "x", "y", "z"] if width == 4 else usual
+    listed = f"its trajectory has {width} columns, named {', '.join(names)}"
     if len(names) != width or not {"t", "x", "y", "z"} <= {*names}:
+        raise LidarpoolError(f"{listed}; it needs t, x, y and z.")
+    used = [name for name in names if name]  # indices leave out the others
+    unknown = [name for name in used if name not in usual]
+    if unknown or len(set(used)) < len(used):
+        fault = f"{unknown[0]!r} is not known" if unknown else "a name is there twice"
         raise LidarpoolError(
-            f"its trajectory has {width} columns, named {', '.join(names)}; it needs t, x, y and z."
+            f"{listed}, and {fault}: name those to read by their indices, such as tIndex and "
+            "xIndex, in platformSettings."
         )
-    return dict(zip(names, rows.T, strict=True))
+    angles = {"roll", "pitch", "yaw"}.intersection(used)
+    if angles and len(angles) < 3:
+        raise LidarpoolError(f"{listed}; it needs roll, pitch and yaw, or none of them.")
+    return {name: column for name, column in zip(names, rows.T, strict=True) if name}

@@ -1,0 +1,306 @@
+"""Files of trajectories: what is read, with the right values, and what is refused."""
+
+import gzip
+
+import numpy as np
+import pytest
+
+from lidarpool import LidarpoolError, Pose, Track, load_trajectory
+from lidarpool.scenario.build import build
+from lidarpool.scenario.scenario import Scenario
+
+# Of x 0 to 10 m, z 1 m; the values of a case are those of both rows.
+HEAD, ROWS = "time_s,x,y,z", ("0,0,0,1", "1,10,0,1")
+TURN = Pose((0, 0, 1), yaw_deg=40, pitch_deg=5, roll_deg=-3)
+HALF = np.radians(40) / 2
+SINE, COSINE = np.sin(HALF), np.cos(HALF)
+
+
+@pytest.fixture
+def load(tmp_path):
+    """Write a table of a carrier that drives along x, with further columns, and read it."""
+
+    def read(names="", values="", head=HEAD, rows=ROWS, name="drive.csv", **options):
+        separator = "," if names else ""
+        lines = [f"{head}{separator}{names}", *(f"{row}{separator}{values}" for row in rows)]
+        (tmp_path / name).write_text("\n".join(lines))
+        return load_trajectory(tmp_path / name, **options)
+
+    return read
+
+
+def angles(track):
+    pose = track.pose(0)
+    return np.array([pose.yaw_deg, pose.pitch_deg, pose.roll_deg])
+
+
+@pytest.mark.parametrize(
+    ("names", "values"),
+    [
+        ("yaw_deg", "40"),
+        ("Yaw [deg]", "40"),
+        ("YAW(deg)", "40"),
+        ("yaw deg", "40"),
+        ("Yaw [Degrees]", "40"),
+        ("Yaw [°]", "40"),
+        ("yaw_rad", f"{np.radians(40)}"),
+        ("yaw (rad)", f"{np.radians(40)}"),
+        ("YawDeg", "40"),
+        ("roll_deg,pitch_deg,yaw_deg", "0,0,40"),
+        ("heading", "50"),
+        ("Heading [deg]", "50"),
+        ("heading_rad", f"{np.radians(50)}"),
+        ("Roll(deg),Pitch(deg),Heading(deg)", "0,0,50"),
+        ("qx,qy,qz,qw", f"0,0,{SINE},{COSINE}"),
+        ("qw,qx,qy,qz", f"{COSINE},0,0,{SINE}"),
+        ("q_x,q_y,q_z,q_w", f"0,0,{SINE},{COSINE}"),
+        ("Q_W,Q_X,Q_Y,Q_Z", f"{COSINE},0,0,{SINE}"),
+        ("orientation_x,orientation_y,orientation_z,orientation_w", f"0,0,{SINE},{COSINE}"),
+        ("orientation.w,orientation.x,orientation.y,orientation.z", f"{COSINE},0,0,{SINE}"),
+        ("quat x,quat y,quat z,quat w", f"0,0,{SINE},{COSINE}"),
+    ],
+)
+def test_spellings_of_an_orientation(load, names, values):
+    assert np.allclose(angles(load(names, values)), [40, 0, 0], atol=1e-9)
+
+
+def test_angles_turn_as_those_of_a_pose(load):
+    given = load("yaw_deg,pitch_deg,roll_deg", "40,5,-3")
+    assert np.allclose(given.pose(0).rotation, TURN.rotation)
+    radians = ",".join(map(str, np.radians([40, 5, -3])))
+    assert np.allclose(load("yaw_rad,pitch_rad,roll_rad", radians).pose(0).rotation, TURN.rotation)
+    # Inertial navigation systems: clockwise from north, nose up, right side down.
+    navigation = load("Heading[deg],Pitch[deg],Roll[deg]", "50,-5,-3")
+    assert np.allclose(navigation.pose(0).rotation, TURN.rotation)
+
+
+def test_without_an_orientation_the_carrier_faces_its_direction_of_travel(load):
+    assert angles(load()).tolist() == [0, 0, 0]
+    assert angles(load("yaw_deg", "40", ignore=["yaw_deg"])).tolist() == [0, 0, 0]
+
+
+@pytest.mark.parametrize(
+    ("names", "values", "words"),
+    [
+        ("roll,pitch,yaw", "0,0,40", "'roll' has no unit: call it roll_deg, in degrees"),
+        ("yaw", "40", r"give columns: \{yaw_deg: yaw\}; yaw_rad is read as well"),
+        ("heading", "0.5", "'heading' has no unit, and values up to 0.5 may have any"),
+        ("yaw [mrad]", "40", r"has the unit 'mrad': give it in deg or rad"),
+        ("omega,phi,kappa", "0,0,40", "'omega' is an angle of photogrammetry"),
+        ("Kappa [deg]", "40", "convert the angles to yaw_deg"),
+        ("yaw_deg,yaw_deg", "40,50", "it has the column 'yaw_deg' twice"),
+        ("yaw_deg,yaw_rad", "40,0.7", "'yaw_deg' and 'yaw_rad' are both yaw_deg"),
+        ("yaw_deg,heading_deg", "40,50", "both a yaw and a heading"),
+        ("pitch_deg", "3", "pitch_deg and neither yaw_deg nor heading_deg"),
+        ("pitch_deg,yaw", "3,40", "'yaw' has no unit"),
+        ("qx,qy,qz,qw,yaw_deg", "0,0,0,1,40", "both a quaternion and yaw_deg"),
+        ("qx,qy,qz,qw,q_w", "0,0,0,1,1", "'qw' and 'q_w' are both qw"),
+        ("qz,qw", "0,1", "no column 'qx'"),
+        ("yaw_dge", "40", r"not known: yaw_dge\. Did you mean 'yaw_deg'\?"),
+        ("speed", "40", r"not known: speed\. .*give ignore: \[speed\] to leave it out"),
+        ("speed,course", "40,1", "columns are not known: speed, course"),
+        ("q0,q1,q2,q3", "1,0,0,0", "not known: q0, q1, q2, q3"),
+        ("latitude", "48", "'latitude' is a geodetic coordinate"),
+        ("pos_x", "4", "'x' and 'pos_x' are both x"),
+        ("timestamp_ns", "4", "'time_s' and 'timestamp_ns' are both time_s"),
+        ("", "40", "line 2 has 5 cells, and the header 4"),
+    ],
+)  # fmt: skip
+def test_a_column_that_is_not_understood_is_refused(load, names, values, words):
+    rows = ROWS if names else [f"{row},{values}" for row in ROWS]
+    with pytest.raises(LidarpoolError, match=words) as raised:
+        load(names, values if names else "", rows=rows)
+    assert len(str(raised.value).splitlines()) == 1
+
+
+def test_columns_that_are_named_or_ignored(load):
+    both = "heading,speed,speed_up", "40,3,4"
+    track = load(*both, columns={"yaw_deg": "heading"}, ignore=["Speed*"])
+    assert np.isclose(angles(track)[0], 40)
+    assert np.isclose(angles(load("psi", "0.7", columns={"yaw_rad": "psi"}))[0], np.degrees(0.7))
+    for options, words in (
+        ({"ignore": ["speed"]}, "not known: speed_up"),
+        ({"ignore": ["Spede"]}, "ignore names 'Spede', which is no column"),
+        ({"columns": {"yaw_deg": "Speeed"}}, "no column 'Speeed'"),
+        ({"columns": {"yaw": "heading"}, "ignore": ["sp*"]}, "'heading' has no unit: call it yaw"),
+        ({"columns": {"jaw": "speed"}}, "columns names 'jaw'; possible names are time_s"),
+    ):
+        with pytest.raises(LidarpoolError, match=words):
+            load(*both, **options)
+    with pytest.raises(LidarpoolError, match=r"'yaw_rad' as yaw_deg: the header states rad"):
+        load("yaw_rad", "1", columns={"yaw_deg": "yaw_rad"})
+
+
+def test_times_have_a_unit(load):
+    for name, times in (("timestamp [ns]", (0, 1e9)), ("t_ms", (0, 1e3)), ("Time(us)", (0, 1e6))):
+        rows = [f"{time:.0f},{x},0,1" for time, x in zip(times, (0, 10), strict=True)]
+        assert load(head=f"{name},x,y,z", rows=rows).times_s.tolist() == [0, 1]
+    with pytest.raises(LidarpoolError, match="'time' has no unit: call it time_s, in seconds"):
+        load(head="time,x,y,z")
+    rows = ["0;0;0;1000", "1;10000;0;1000"]
+    track = load(head="time_s;x [mm];y [mm];z [mm]", rows=rows)
+    assert track.positions.tolist() == [[0, 0, 1], [10, 0, 1]]
+
+
+EUROC = (
+    "#timestamp, p_RS_R_x [m], p_RS_R_y [m], p_RS_R_z [m], q_RS_w [], q_RS_x [], q_RS_y [], "
+    "q_RS_z [], v_RS_R_x [m s^-1], v_RS_R_y [m s^-1], v_RS_R_z [m s^-1], b_w_RS_S_x [rad s^-1], "
+    "b_w_RS_S_y [rad s^-1], b_w_RS_S_z [rad s^-1], b_a_RS_S_x [m s^-2], b_a_RS_S_y [m s^-2], "
+    "b_a_RS_S_z [m s^-2]"
+)
+
+
+@pytest.mark.parametrize("first", ["#timestamp", "#timestamp [ns]", "# timestamp_ns"])
+def test_ground_truth_of_euroc(tmp_path, first):
+    rows = [
+        f"{time},{x},2,3,{COSINE},0,0,{SINE},1,2,3,4,5,6,7,8,9"
+        for time, x in ((1403636580838555648, 1), (1403636581838555648, 2))
+    ]
+    (tmp_path / "data.csv").write_text("\r\n".join([EUROC.replace("#timestamp", first), *rows]))
+    track = load_trajectory(tmp_path / "data.csv")
+    assert np.allclose(track.times_s, [1403636580.838555648, 1403636581.838555648], atol=1e-6)
+    assert track.positions.tolist() == [[1, 2, 3], [2, 2, 3]]
+    assert np.allclose(angles(track), [40, 0, 0])
+
+
+@pytest.mark.parametrize(
+    ("remarks", "columns"),
+    [
+        ((), "xyzw"),
+        (("# ground truth trajectory", "# timestamp tx ty tz qx qy qz qw"), "xyzw"),
+        (("# timestamp tx ty tz qw qx qy qz",), "wxyz"),
+        (("# time x y z qw qx qy qz", "# made by hand"), "wxyz"),
+        (("#timestamp [s] tx [m] ty [m] tz [m] qw [] qx [] qy [] qz []",), "wxyz"),
+        (("# eight words that are no names of anything",), "xyzw"),
+        (("timestamp tx ty tz qw qx qy qz",), "wxyz"),
+    ],
+)
+@pytest.mark.parametrize("name", ["drive.tum", "drive.txt", "drive.csv"])
+def test_tum_honours_the_order_of_its_header(tmp_path, remarks, columns, name):
+    turn = dict(zip("xyzw", (0, 0, SINE, COSINE), strict=True))
+    numbers = " ".join(str(turn[axis]) for axis in columns)
+    (tmp_path / name).write_text("\n".join([*remarks, f"5 1 2 3 {numbers}", f"6 2 2 3 {numbers}"]))
+    track = load_trajectory(tmp_path / name)
+    assert track.times_s.tolist() == [5, 6] and track.positions[0].tolist() == [1, 2, 3]
+    assert np.allclose(angles(track), [40, 0, 0])
+
+
+def test_a_header_of_tum_with_unknown_names(tmp_path):
+    (tmp_path / "a.tum").write_text("# timestamp tx ty tz a b c d\n0 0 0 0 0 0 0 1\n")
+    with pytest.raises(LidarpoolError, match="not known: a, b, c, d"):
+        load_trajectory(tmp_path / "a.tum")
+
+
+OXTS = [49.0, 8.4, 112.8, 0.02, -0.01, 0.7, *[0.0] * 24]
+
+
+@pytest.fixture
+def oxts(tmp_path):
+    """A drive of KITTI: 0.00001 degrees east and 0.00002 degrees north, 0.1 m up."""
+    folder = tmp_path / "2011_09_26_drive_0001_sync" / "oxts"
+    (folder / "data").mkdir(parents=True)
+    for number, row in enumerate(
+        (OXTS, [49.00002, 8.40001, 112.9, *OXTS[3:]], [49.00004, 8.40002, 113.0, *OXTS[3:]])
+    ):
+        (folder / "data" / f"{number:010}.txt").write_text(" ".join(map(str, row)))
+    stamps = [f"2011-09-26 13:02:2{second}.500000000" for second in (5, 6, 7)]
+    (folder / "timestamps.txt").write_text("\n".join(stamps) + "\n")
+    return folder
+
+
+def test_oxts_of_kitti(oxts):
+    radius, scale = 6378137.0, np.cos(np.radians(49))
+
+    def mercator(latitude, longitude):
+        north = np.log(np.tan((90 + latitude) * np.pi / 360))
+        return scale * radius * np.array([np.radians(longitude), north])
+
+    expected = mercator(49.00002, 8.40001) - mercator(49, 8.4)
+    for path in (oxts, oxts.parent, oxts / "data"):
+        track = load_trajectory(path)
+        assert track.times_s[0] == 1317042145.5 and track.duration_ns == 2e9
+        assert np.allclose(track.positions[0], 0)
+        assert np.allclose(track.positions[1], [*expected, 0.1], atol=1e-6)
+        assert np.allclose(angles(track), np.degrees([0.7, -0.01, 0.02]))
+    world = load_trajectory(oxts, origin=(49.0, 8.4, 100.0))
+    assert np.allclose(world.positions - track.positions, [0, 0, 12.8])
+    rows = [OXTS, [*OXTS[:2], 114.0, *OXTS[3:]]]
+    np.savetxt(oxts / "0000.txt", rows)
+    np.savetxt(oxts / "times.txt", [0, 1])
+    track = load_trajectory(oxts / "0000.txt", times=oxts / "times.txt")
+    assert np.allclose(track.positions, [[0, 0, 0], [0, 0, 1.2]])
+
+
+def test_oxts_that_are_not_whole(oxts):
+    (oxts / "data" / "0000000001.txt").write_text("1 2 3")
+    with pytest.raises(LidarpoolError, match=r"0000000001\.txt has 3 numbers, not 30"):
+        load_trajectory(oxts)
+    (oxts / "data" / "0000000001.txt").unlink()
+    with pytest.raises(LidarpoolError, match=r"2 files of data, and timestamps\.txt 3 times"):
+        load_trajectory(oxts)
+    (oxts / "timestamps.txt").unlink()
+    with pytest.raises(LidarpoolError, match=r"a folder is one of KITTI, with timestamps\.txt"):
+        load_trajectory(oxts)
+
+
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [
+        (b"#ROSBAG V2.0\n\x00\xff", "a bag of ROS 1: convert it, rosbags-convert"),
+        (b"\x89MCAP0\r\n\x00\xff", "give it the ending .mcap"),
+        (b"SQLite format 3\x00\xff", "give it the ending .db3"),
+        (b"TSCANTRJ\x00\xff", "a trajectory of TerraScan: export it as text"),
+        (gzip.compress(b"0 0 0 0 0 0 0 1"), "compressed by gzip: unpack it"),
+        (np.arange(34.0).tobytes(), "a binary file of an unknown kind"),
+        ("time_s,x,y,z".encode("utf-16"), "text in UTF-16: save it as UTF-8"),
+        ("# \xe4\n0 0 0 0 0 0 0 1".encode("latin-1"), "no text in UTF-8"),
+        (b"0,0,0,0,1,0,0,0\n1,1,0,0,1,0,0,0\n", "it has no header: name its columns"),
+        (b"0 0 0 0 0 0 0\n1 1 0 0 0 0 0\n", "7 numbers and no header: rows of TUM have 8"),
+        (b"1 0 0 0 0 1 0 0 0 0 1 0\n", "KITTI's poses have no times"),
+    ],
+)
+@pytest.mark.parametrize("name", ["a.bag", "a.csv"])
+def test_other_files_are_named(tmp_path, content, words, name):
+    (tmp_path / name).write_bytes(content)
+    with pytest.raises(LidarpoolError, match=words) as raised:
+        load_trajectory(tmp_path / name)
+    assert "codec" not in str(raised.value)
+
+
+def test_a_trj_of_helios_is_read_with_its_units(tmp_path):
+    text = '#HEADER: "t", "roll", "pitch", "yaw", "x", "y", "z"\n0,0,0,0.5,0,0,9\n1,0,0,0.5,5,0,9\n'
+    (tmp_path / "a.trj").write_text(text)
+    with pytest.raises(LidarpoolError, match=r"'t' has no unit.*lidarpool import` reads a \.trj"):
+        load_trajectory(tmp_path / "a.trj")
+    columns = {"time_s": "t", "yaw_rad": "yaw", "pitch_rad": "pitch", "roll_rad": "roll"}
+    track = load_trajectory(tmp_path / "a.trj", columns=columns)
+    assert np.isclose(track.pose(0).yaw_deg, np.degrees(0.5))
+
+
+def test_options_of_other_formats_are_refused(load, tmp_path):
+    for options, words in (
+        ({"topic": "/odom"}, "topic is of bags"),
+        ({"origin": (49.0, 8.4, 0.0)}, "origin is of latitudes"),
+        ({"format": "bag"}, "a folder is one of KITTI|metadata.yaml"),
+    ):
+        with pytest.raises(LidarpoolError, match=words):
+            load("yaw_deg", "40", **options)
+    np.savetxt(tmp_path / "a.tum", np.eye(8)[[7, 7]] + np.arange(2)[:, None] * np.eye(8)[0])
+    assert isinstance(load_trajectory(tmp_path / "a.tum"), Track)
+    with pytest.raises(LidarpoolError, match="columns and ignore are of tables"):
+        load_trajectory(tmp_path / "a.tum", ignore=["a"])
+
+
+def test_binary_files_of_times_are_named(tmp_path):
+    np.savetxt(tmp_path / "poses.txt", [np.eye(4)[:3].ravel()] * 2)
+    (tmp_path / "times.txt").write_bytes(gzip.compress(b"0\n1\n"))
+    with pytest.raises(LidarpoolError, match=r"times\.txt has no times: it is compressed by gzip"):
+        load_trajectory(tmp_path / "poses.txt", times=tmp_path / "times.txt")
+
+
+def test_a_scenario_depends_on_the_files_of_a_folder(oxts, tmp_path):
+    path = tmp_path / "drive.yaml"
+    path.write_text(f"trajectory: {{file: {oxts.parent.name}, origin: [49, 8.4, 100]}}\n")
+    names = [file.name for file in Scenario.load(path).files]
+    assert names == [f"{number:010}.txt" for number in range(3)] + ["timestamps.txt"]
+    assert np.isclose(build(Scenario.load(path)).job().survey.pose(0).position[2], 12.8)

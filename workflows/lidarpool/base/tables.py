@@ -1,0 +1,501 @@
+"""Tables of numbers with a header: spellings of their columns, and the units that headers state.
+
+A column is either understood, with its unit, or named by the user to be ignored, or the table is
+refused: a column that is silently left out may be the one that turns the sensor.
+"""
+
+from __future__ import annotations
+
+import csv
+import re
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from fnmatch import fnmatchcase
+from itertools import islice
+from typing import NamedTuple
+
+import numpy as np
+
+from .arrays import Floats
+from .words import did_you_mean, printable
+
+# {unit: how many of it are one of the first unit}
+SECONDS = {"s": 1.0, "ms": 1e3, "us": 1e6, "ns": 1e9}
+METRES = {"m": 1.0, "cm": 1e2, "mm": 1e3, "km": 1e-3}
+DEGREES = {"deg": 1.0, "rad": np.pi / 180}
+RADIANS = {"rad": 1.0, "deg": 180 / np.pi}
+NUMBERS = {"": 1.0}
+_UNIT_WORDS = {"s": "seconds", "deg": "degrees", "rad": "radians", "m": "metres"}
+_UNIT_SPELLINGS = {
+    "s": ("sec", "secs", "second", "seconds"),
+    "ms": ("msec", "msecs", "millisecond", "milliseconds"),
+    "us": ("usec", "usecs", "µs", "μs", "microsecond", "microseconds"),
+    "ns": ("nsec", "nsecs", "nanosec", "nanosecs", "nanosecond", "nanoseconds"),
+    "m": ("meter", "meters", "metre", "metres"),
+    "cm": (),
+    "mm": (),
+    "km": (),
+    "deg": ("degs", "degree", "degrees", "°"),
+    "rad": ("rads", "radian", "radians"),
+    "": ("-", "1"),
+}
+_UNITS = {word: unit for unit, words in _UNIT_SPELLINGS.items() for word in (unit, *words)}
+_BRACKETS = re.compile(r"(.*?)\s*[\[(]\s*([^\])]*?)\s*[\])]")
+# A name of a header that spaces separate, with its unit: q_w []
+_WORD = re.compile(r"[^\s\[(]+(?:\s*[\[(][^\])]*[\])])?")
+_SEPARATORS = ",;\t"
+_HEADER_MARK = re.compile(r"^[#%\s]*(?:HEADER:)?")  # before a header in a remark
+_BETWEEN = re.compile(r"[\s_\-./:]+")  # words of a name
+_SUFFIX = re.compile(r"(.+?)[\s_\-./:]+([^\s_\-./:]+)")
+_CAMEL = re.compile(r"(?<=[a-z])(?=[A-Z])")  # between the words of timeStamp
+_SHOWN = 40  # columns that a message names
+
+
+@dataclass(frozen=True)
+class Quantity:
+    """A quantity that a column of a table may hold.
+
+    Parameters
+    ----------
+    name
+        Name of the column as it is returned, with its unit: yaw_deg.
+    spellings
+        Names in headers, without a unit; case, spaces, underscores, hyphens and dots are ignored.
+    units
+        Units that a header may state, as `SECONDS`; values are returned in the first.
+    bare
+        Unit of a column whose header states none; None to refuse such a column.
+    evident_above
+        A column without a stated unit is refused if all its values are nearer to zero than this
+        and some is not zero: they may have another unit.
+    exact
+        Names with the same letters in another case are the only other spellings.
+    """
+
+    name: str
+    spellings: tuple[str, ...]
+    units: Mapping[str, float]
+    bare: str | None
+    evident_above: float = 0.0
+    exact: bool = False
+
+
+@dataclass(frozen=True)
+class TableFormat:
+    """A table whose columns a specification defines.
+
+    Parameters
+    ----------
+    name
+        Name of the format.
+    marker
+        A column that only this format has.
+    bare
+        {quantity: its unit, if the header states none}.
+    unused
+        Columns that the specification defines and that nothing here uses, with * and ?.
+    """
+
+    name: str
+    marker: str
+    bare: Mapping[str, str]
+    unused: tuple[str, ...] = ()
+
+
+class Header(NamedTuple):
+    """Header of a table."""
+
+    cells: list[str]  # names of the columns, as the file has them
+    separator: str | None  # None for spaces
+    body: int  # index of the line after the header, or of the first row
+    comment: bool  # True if the header is a remark that begins with #
+
+
+class ColumnName(NamedTuple):
+    """A name in a header: «Yaw [deg]»."""
+
+    stem: str  # without the unit: Yaw
+    words: str  # the same without case and separators: yaw
+    unit: str | None  # in small letters; None if the header states none
+
+
+def column_name(cell: str) -> ColumnName:
+    """Split a name in a header into its words and its unit."""
+    text = cell.strip()
+    if (bracketed := _BRACKETS.fullmatch(text)) is not None:
+        stem, unit = bracketed[1], bracketed[2].lower()
+        return ColumnName(stem, _letters(stem), _UNITS.get(unit, unit))
+    suffixed = _SUFFIX.fullmatch(_CAMEL.sub("_", text))
+    if suffixed is not None and (unit := suffixed[2].lower()) in _UNITS and unit.isalpha():
+        return ColumnName(suffixed[1], _letters(suffixed[1]), _UNITS[unit])
+    return ColumnName(text, _letters(text), None)
+
+
+def ignored_columns(names: Sequence[str], ignore: Sequence[str]) -> set[int]:
+    """Return the indices of the columns that patterns with * and ? name, in any case.
+
+    ValueError for a pattern that names none.
+    """
+    indices = set[int]()
+    for pattern in ignore:
+        matches = {
+            index for index, name in enumerate(names) if fnmatchcase(name.lower(), pattern.lower())
+        }
+        if not matches:
+            raise ValueError(
+                f"ignore names {pattern!r}, which is no column; it has {_listed(names)}"
+            )
+        indices |= matches
+    return indices
+
+
+def _letters(name: str) -> str:
+    return _BETWEEN.sub("", name).lower()
+
+
+def find_header(
+    lines: Sequence[str], known: Callable[[str], bool] = lambda name: True
+) -> Header | None:
+    """Return the header of a table, or None if it has none.
+
+    The header is the first line that is neither empty nor a remark, if it has a word among its
+    cells. Else it is the last remark before the numbers that has as many names as these, of which
+    half, or four, are `known`.
+    """
+    body = next((i for i, line in enumerate(lines) if not _is_remark(line)), len(lines))
+    if body < len(lines) and not _all_numbers(lines[body]):
+        separator = _separator_of(lines[body])
+        return Header(_cells(lines[body], separator), separator, body + 1, False)
+    for line in reversed(lines[:body]):
+        names = _HEADER_MARK.sub("", line).strip()
+        separator = _separator_of(lines[body]) if body < len(lines) else _separator_of(names)
+        cells = _cells(names, separator)
+        count = len(_cells(lines[body], separator)) if body < len(lines) else len(cells)
+        if cells and len(cells) == count and sum(map(known, cells)) >= min(4, count / 2):
+            return Header(cells, separator, body, True)
+    return None
+
+
+def _is_remark(line: str) -> bool:
+    return not line.strip() or line.lstrip().startswith("#")
+
+
+def _all_numbers(line: str) -> bool:
+    cells = [cell for cell in _cells(line, _separator_of(line)) if cell]
+    return all(map(_is_number, cells))
+
+
+def _is_number(cell: str) -> bool:
+    try:
+        float(cell)
+    except ValueError:
+        return False
+    return True
+
+
+def _is_finite(cell: str) -> bool:
+    return _is_number(cell) and bool(np.isfinite(float(cell)))
+
+
+def _separator_of(line: str) -> str | None:
+    """Return the most frequent of comma, semicolon and tab outside brackets; None for spaces."""
+    outside = re.sub(r"[\[(][^\])]*[\])]", "", line)
+    separator = max(_SEPARATORS, key=outside.count)
+    return separator if separator in outside else None
+
+
+def _cells(line: str, separator: str | None) -> list[str]:
+    if separator is None:
+        return [word.strip('"') for word in _WORD.findall(line)]
+    (cells,) = csv.reader([line], delimiter=separator, skipinitialspace=True)
+    return [cell.strip().strip('"') for cell in cells]
+
+
+def read_table(
+    text: str,
+    quantities: Sequence[Quantity],
+    *,
+    required: Callable[[Mapping[str, Floats]], Sequence[str]] = lambda columns: (),
+    columns: Mapping[str, str] | None = None,
+    ignore: Sequence[str] = (),
+    formats: Sequence[TableFormat] = (),
+    unused: Sequence[str] = (),
+    refused: Mapping[str, str] | None = None,
+    bare: Mapping[str, str] | None = None,
+) -> dict[str, Floats]:
+    """Read a table of numbers; refuse each column that is not understood.
+
+    Parameters
+    ----------
+    text
+        A header, and rows; commas, semicolons, tabs or spaces separate the cells, and lines that
+        begin with # are remarks.
+    quantities
+        What columns may hold.
+    required
+        Returns the names of the quantities that a table with some columns must have.
+    columns
+        {name of a quantity, with its unit: name in the file}, for other spellings.
+    ignore
+        Names of columns to leave out, with * and ?.
+    formats
+        Formats with columns of their own.
+    unused
+        Further columns to accept and leave out, without a word.
+    refused
+        {spelling: why such a column cannot be used}.
+    bare
+        {quantity: unit of a column whose header states none}.
+
+    Returns
+    -------
+    dict
+        {name of a quantity: float64 (k,)} in the first unit of the quantity.
+
+    Raises
+    ------
+    ValueError
+        If there is no header, a column is not known, missing or not unique, a unit is missing or
+        not known, or a cell holds no finite number.
+    """
+    lines = text.splitlines()
+    spellings = {_letters(name): one for one in quantities for name in one.spellings}
+    exact = {one.name.lower(): one for one in quantities if one.exact}
+    exact |= {one.name: one for one in quantities if one.exact}
+    header = find_header(
+        lines, lambda cell: column_name(cell).words in spellings or cell.lower() in exact
+    )
+    if header is None:
+        example = ",".join(one.name for one in quantities[:4])
+        raise ValueError(f"it has no header: name its columns in its first line, as in {example}")
+    reader = _ColumnReader(header, quantities, spellings, exact)
+    reader.choose(columns or {})
+    reader.leave_out(ignore)
+    reader.assign(formats, unused, refused or {}, bare or {})
+    names = {name: number for name, (number, _) in reader.assigned.items()}
+    needed = required(dict.fromkeys(names, np.empty(0)))
+    if missing := next((name for name in needed if name not in names), None):
+        raise ValueError(f"it has no column {missing!r}; it has {_listed(header.cells)}")
+    values = _numbers(lines, header, names, [*needed, *(columns or {})])
+    return {name: reader.converted(name, values[:, i]) for i, name in enumerate(reader.assigned)}
+
+
+class _ColumnReader:
+    """Assignment of the columns of a header to quantities."""
+
+    def __init__(
+        self,
+        header: Header,
+        quantities: Sequence[Quantity],
+        spellings: Mapping[str, Quantity],
+        exact: Mapping[str, Quantity],
+    ) -> None:
+        self.cells = [cell.lstrip("#%").strip() for cell in header.cells]
+        self.quantities, self.spellings, self.exact = quantities, spellings, exact
+        # {name of a quantity: index of its column, and the unit; None if no header states it}
+        self.assigned: dict[str, tuple[int, str | None]] = {}
+        self.left_out: set[int] = set()  # indices of columns
+
+    def quantity_of(self, cell: str) -> tuple[Quantity, str | None] | None:
+        """Return the quantity and the stated unit of a name, or None if the name is not known."""
+        if (quantity := self.exact.get(cell) or self.exact.get(cell.lower())) is not None:
+            return quantity, None
+        name = column_name(cell)
+        quantity = self.spellings.get(name.words) or self.exact.get(name.stem.lower())
+        return None if quantity is None else (quantity, name.unit)
+
+    def choose(self, columns: Mapping[str, str]) -> None:
+        """Assign the columns that the user names."""
+        for ours, theirs in columns.items():
+            known = self.quantity_of(ours)
+            if known is None:
+                raise ValueError(f"columns names {ours!r}; possible names are {self.possible}")
+            quantity, unit = known
+            wanted = theirs.lstrip("#%").strip()
+            matches = [i for i, cell in enumerate(self.cells) if cell == wanted] or [
+                i for i, cell in enumerate(self.cells) if cell.lower() == wanted.lower()
+            ]
+            if not matches:
+                raise ValueError(f"it has no column {theirs!r}; it has {_listed(self.cells)}")
+            if len(matches) > 1:
+                raise ValueError(f"it has the column {theirs!r} {len(matches)} times")
+            stated = column_name(wanted).unit
+            if unit is not None and stated in quantity.units and stated != unit:
+                raise ValueError(f"columns reads {theirs!r} as {ours}: the header states {stated}")
+            if unit is None:
+                unit = self._unit(quantity, theirs, stated, {})
+            self._add(quantity, matches[0], unit)
+
+    def leave_out(self, ignore: Sequence[str]) -> None:
+        """Leave out the columns that the user ignores."""
+        self.left_out |= ignored_columns(self.cells, ignore)
+
+    def assign(
+        self,
+        formats: Sequence[TableFormat],
+        unused: Sequence[str],
+        refused: Mapping[str, str],
+        bare: Mapping[str, str],
+    ) -> None:
+        """Assign the other columns by their names; ValueError for one that is not known."""
+        chosen = {number for number, _ in self.assigned.values()} | self.left_out
+        words = [column_name(cell).words for cell in self.cells]
+        forms = [one for one in formats if _letters(one.marker) in words]
+        patterns = [_letters(name) for one in forms for name in one.unused]
+        patterns += [_letters(name) for name in unused]
+        units = {**bare, **{name: unit for one in forms for name, unit in one.bare.items()}}
+        unknown = []
+        for number, cell in enumerate(self.cells):
+            if number in chosen or not cell or re.fullmatch(r"unnamed: \d+", cell.lower()):
+                continue  # columns without a name are checked with the rows
+            if (known := self.quantity_of(cell)) is not None:
+                quantity, unit = known
+                self._add(quantity, number, self._unit(quantity, cell, unit, units))
+            elif reason := next((refused[w] for w in refused if _letters(w) == words[number]), ""):
+                raise ValueError(f"its column {cell!r} {reason}")
+            elif not any(fnmatchcase(words[number], pattern) for pattern in patterns):
+                unknown.append(cell)
+        if unknown:
+            columns = "columns are" if len(unknown) > 1 else "column is"
+            hint = did_you_mean(unknown[0], [one.name for one in self.quantities])
+            raise ValueError(
+                f"its {columns} not known: {_listed(unknown)}.{hint} Known are {self.possible}: "
+                f"rename it, or give ignore: [{unknown[0]}] to leave it out"
+            )
+
+    def _unit(
+        self, quantity: Quantity, cell: str, unit: str | None, units: Mapping[str, str]
+    ) -> str | None:
+        """Return the unit of a column; None if it is the bare one, which is yet to be checked."""
+        if unit is not None:
+            if unit not in quantity.units:
+                known = " or ".join(one or "none" for one in quantity.units)
+                raise ValueError(f"its column {cell!r} has the unit {unit!r}: give it in {known}")
+            return unit
+        if (implied := units.get(quantity.name)) is not None:
+            return implied
+        if quantity.bare is None:
+            first, *others = quantity.units
+            stem = quantity.name.removesuffix(f"_{first}")
+            raise ValueError(
+                f"its column {printable(cell)!r} has no unit: call it {quantity.name}, in "
+                f"{_UNIT_WORDS[first]}, or give columns: {{{quantity.name}: {cell}}}; "
+                f"{' or '.join(f'{stem}_{other}' for other in others)} is read as well"
+            )
+        return None
+
+    def _add(self, quantity: Quantity, number: int, unit: str | None) -> None:
+        if (earlier := self.assigned.get(quantity.name)) is not None:
+            one, other = self.cells[earlier[0]], self.cells[number]
+            if one == other:
+                raise ValueError(f"it has the column {one!r} twice")
+            raise ValueError(
+                f"its columns {one!r} and {other!r} are both {quantity.name}: give ignore: "
+                f"[{other}] to leave one out"
+            )
+        self.assigned[quantity.name] = number, unit
+
+    def converted(self, name: str, values: Floats) -> Floats:
+        """Convert the values of a quantity to its first unit."""
+        number, unit = self.assigned[name]
+        quantity = next(one for one in self.quantities if one.name == name)
+        if unit is None:
+            unit = quantity.bare
+            largest = np.abs(values).max(initial=0.0)
+            if 0 < largest <= quantity.evident_above:
+                stem = name.removesuffix(f"_{unit}")
+                names = " or ".join(f"{stem}_{one}" for one in quantity.units)
+                raise ValueError(
+                    f"its column {self.cells[number]!r} has no unit, and values up to "
+                    f"{largest:.3g} may have any: call it {names}"
+                )
+        assert unit is not None  # set above
+        count = quantity.units[unit]
+        return values if count == 1 else values / count
+
+    @property
+    def possible(self) -> str:
+        """Names of the quantities, with the other units of each."""
+        names = []
+        for quantity in self.quantities:
+            first, *others = quantity.units
+            stem = quantity.name.removesuffix(f"_{first}")
+            units = [] if quantity.bare == first else [f"{stem}_{other}" for other in others]
+            names.append(f"{quantity.name} (or {', '.join(units)})" if units else quantity.name)
+        return ", ".join(names)
+
+
+def _listed(cells: Sequence[str]) -> str:
+    return ", ".join(printable(cell) for cell in cells[:_SHOWN]) + ", …" * (len(cells) > _SHOWN)
+
+
+def _numbers(
+    lines: Sequence[str], header: Header, names: Mapping[str, int], needed: Sequence[str]
+) -> Floats:
+    """Return the numbers of some columns, (rows, columns); ValueError names a bad cell."""
+    body = lines[header.body :]
+    rows = [line for line in body if not _is_remark(line)]
+    if not rows:
+        raise ValueError("it has no rows of numbers")
+    _check_widths(lines, header)
+    _check_unnamed(rows, header)
+    if not names:
+        return np.empty((len(rows), 0))
+    try:
+        values = np.loadtxt(
+            rows, ndmin=2, delimiter=header.separator, quotechar='"', comments=None,
+            usecols=[*names.values()],
+        )  # fmt: skip
+        if not np.isfinite(values).all():
+            raise ValueError("it has a nan or inf")
+    except ValueError as error:
+        for number, cells in _rows_of(lines, header):
+            for name, index in names.items():
+                if not _is_finite(cells[index]):
+                    more = "" if name in needed else ", or ignore the column"
+                    raise ValueError(
+                        f"its column {header.cells[index]!r} has {cells[index]!r} in line "
+                        f"{number}: give a number in every line{more}"
+                    ) from error
+        raise
+    return np.asarray(values, np.float64)
+
+
+def _rows_of(lines: Sequence[str], header: Header) -> Iterator[tuple[int, list[str]]]:
+    """Yield the number of the line, counted from 1, and the cells of each row."""
+    for number, line in enumerate(islice(lines, header.body, None), header.body + 1):
+        if not _is_remark(line):
+            yield number, _cells(line, header.separator)
+
+
+def _check_widths(lines: Sequence[str], header: Header) -> None:
+    """Check that each row has as many cells as the header; one empty cell more may end it."""
+    width = len(header.cells)
+    for number, line in enumerate(islice(lines, header.body, None), header.body + 1):
+        if _is_remark(line):
+            continue
+        if header.separator is None:
+            count = len(line.split())
+        elif '"' in line:
+            count = len(_cells(line, header.separator))
+        else:
+            count = line.count(header.separator) + 1
+        if count == width + 1 and header.separator and line.rstrip().endswith(header.separator):
+            continue
+        if count != width:
+            raise ValueError(f"line {number} has {count} cells, and the header {width}")
+
+
+def _check_unnamed(rows: Sequence[str], header: Header) -> None:
+    """Refuse a column without a name, unless it is empty or numbers the rows from 0."""
+    for index, cell in enumerate(header.cells):
+        if cell and not re.fullmatch(r"unnamed: \d+", cell.lower()):
+            continue
+        for number, row in enumerate(rows):
+            cells = _cells(row, header.separator)
+            text = cells[index] if index < len(cells) else ""
+            if text not in ("", str(number)):
+                raise ValueError(
+                    f"its column {index + 1} has no name, and holds {text[:20]!r}: name it in "
+                    "the header"
+                )

@@ -1,0 +1,85 @@
+"""Folders «oxts» of the KITTI data set: positions and angles of an OXTS inertial navigation system.
+
+Each file has a row of 30 numbers: latitude and longitude in degrees, altitude in metres, and roll,
+pitch and yaw in radians (dataformat.txt of KITTI's development kit). Yaw is counter-clockwise from
+east, pitch positive nose down and roll positive right side down, as of `Pose`; the unit's axes are
+x ahead, y left and z up.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from ..base.allowance import check_fits
+from ..base.arrays import Floats
+from ..base.elementary import log, sin_cos, sin_cos_of
+from ..base.words import natural
+from .trajectory import quaternions_of, rotations_of
+
+WIDTH = 30  # numbers of a row
+_RADIUS_M = 6378137.0  # of KITTI's Mercator projection
+OXTS_TIMES = "timestamps.txt"
+
+
+def find_oxts(path: Path) -> Path | None:
+    """Return the folder «oxts» that a path is or holds, or None."""
+    for folder in (path, path / "oxts", path.parent if path.name == "data" else path):
+        if (folder / "data").is_dir() and (folder / OXTS_TIMES).is_file():
+            return folder
+    return None
+
+
+def oxts_files(folder: Path) -> list[Path]:
+    """Return the files of a folder «oxts», a row each, in the order of their numbers."""
+    return sorted((folder / "data").glob("*.txt"), key=lambda file: natural(file.name))
+
+
+def read_oxts(folder: Path, origin: Sequence[float] | None) -> tuple[Floats, Floats, Floats]:
+    """Read a folder with «data» and «timestamps.txt».
+
+    Returns
+    -------
+    seconds since 1970 (k,), and positions (k, 3) and quaternions (k, 4) as of `oxts_poses`.
+    """
+    files = oxts_files(folder)
+    if not files:
+        raise ValueError("its folder data has no .txt files")
+    rows = []
+    for file in files:
+        check_fits(file)
+        numbers = file.read_text("utf-8-sig").split()
+        if len(numbers) != WIDTH:
+            raise ValueError(f"data/{file.name} has {len(numbers)} numbers, not {WIDTH}")
+        rows.append([float(number) for number in numbers])
+    check_fits(folder / OXTS_TIMES)
+    lines = (folder / OXTS_TIMES).read_text("utf-8-sig").split("\n")
+    times = np.array([line.strip() for line in lines if line.strip()], "datetime64[ns]")
+    if len(times) != len(files):
+        raise ValueError(f"it has {len(files)} files of data, and {OXTS_TIMES} {len(times)} times")
+    return times.astype(np.int64) / 1e9, *oxts_poses(np.array(rows), origin)
+
+
+def oxts_poses(rows: Floats, origin: Sequence[float] | None) -> tuple[Floats, Floats]:
+    """Return positions east, north and up of an origin (k, 3) and quaternions (k, 4) of rows.
+
+    KITTI's Mercator projection, whose scale is true at the latitude of the origin: latitude and
+    longitude in degrees and altitude in metres, by default those of the first row.
+    """
+    latitude, longitude, altitude = rows[:, :3].T
+    if not ((np.abs(latitude) < 90) & (np.abs(longitude) <= 360)).all():
+        raise ValueError("its first two numbers are not latitude and longitude in degrees")
+    zero = rows[0, :3] if origin is None else np.asarray(origin, np.float64)
+    scale = sin_cos_of(np.radians(float(zero[0])))[1]
+
+    def projected(latitude: Floats, longitude: Floats) -> Floats:
+        sine, cosine = sin_cos((90.0 + latitude) * (np.pi / 360.0))
+        north = log(sine / cosine)
+        return scale * _RADIUS_M * np.stack([np.radians(longitude), north], axis=-1)
+
+    level = projected(latitude, longitude) - projected(zero[0], zero[1])
+    positions = np.column_stack([level, altitude - zero[2]])
+    angles_deg = np.degrees(rows[:, [5, 4, 3]])
+    return positions, quaternions_of(rotations_of(angles_deg))
