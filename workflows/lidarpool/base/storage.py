@@ -21,6 +21,7 @@ from pathlib import Path
 from typing import IO, Any
 
 from .errors import LidarpoolError
+from .input_files import open_input
 
 _PIECE = 1 << 20  # bytes in memory of a file that is checked
 TEMPORARY = ".lidarpool-tmp-"  # begins the name of an unfinished file
@@ -234,7 +235,7 @@ class Storage:
     def read(self, name: str, first: int = 0, stop: int | None = None) -> bytes:
         """Read a file, or its bytes from `first` to `stop`; fewer if it ends before."""
         if self.is_local:
-            with self.local(name).open("rb", buffering=0 if stop else -1) as file:
+            with open_input(self.local(name), buffering=0 if stop else -1) as file:
                 file.seek(first)
                 return file.read(-1 if stop is None else stop - first)
         with self._remote() as (system, folder):

@@ -19,6 +19,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field
 from importlib.util import find_spec
+from io import TextIOWrapper
 from itertools import islice
 from pathlib import Path
 from typing import IO, Any
@@ -26,6 +27,7 @@ from typing import IO, Any
 import numpy as np
 
 from ..base.errors import LidarpoolError, explained
+from ..base.input_files import open_input
 from ..base.storage import Storage
 from ..columns.cloud import Cloud, CloudLike
 
@@ -226,7 +228,8 @@ def read_table(place: Storage) -> Iterator[JobRow]:
                 folder = stack.enter_context(tempfile.TemporaryDirectory(prefix="lidarpool-"))
                 path = Path(folder, TABLE_FILE)
                 place.get(TABLE_FILE, path)
-            file = stack.enter_context(path.open(encoding="utf-8", newline=""))
+            file = TextIOWrapper(open_input(path), encoding="utf-8", newline="")
+            stack.enter_context(file)
         reader = csv.reader(file, strict=True)
         try:
             header = next(reader, [])

@@ -7,6 +7,7 @@ import math
 import zlib
 from array import array
 from collections.abc import Callable, Iterator, Mapping
+from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
 from fnmatch import fnmatchcase
 from pathlib import Path
@@ -19,6 +20,7 @@ from pydantic import model_validator
 from ..base.arrays import Floats
 from ..base.declared import Several, Text, TextOrTexts, Triple, about, by_text, declared, one_of
 from ..base.errors import LidarpoolError, prefixed
+from ..base.input_files import open_input
 from ..base.xmlfile import refuse_entity
 from ..scene.actors import Actor
 from ..scene.files.meshfile import ROBOTS
@@ -389,7 +391,10 @@ def _elements(path: Path) -> Iterator[tuple[str, Mapping[str, str]]]:
     parser = expat.ParserCreate()
     parser.EntityDeclHandler = refuse_entity
     parser.StartElementHandler = lambda tag, at: begun.append((tag, at))
-    with (gzip.open if path.suffix.lower() == ".gz" else open)(path, "rb") as file:
+    with ExitStack() as stack:
+        file = stack.enter_context(open_input(path))
+        if path.suffix.lower() == ".gz":
+            file = stack.enter_context(gzip.open(file))
         while piece := file.read(_PIECE):
             parser.Parse(piece)
             yield from begun

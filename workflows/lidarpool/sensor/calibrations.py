@@ -12,10 +12,10 @@ from typing import Any
 import numpy as np
 import yaml
 
-from ..base.allowance import check_fits
 from ..base.arrays import Floats
 from ..base.elementary import sin_cos
 from ..base.errors import LidarpoolError
+from ..base.input_files import read_input_text
 from ..base.yamlfile import load_yaml
 from .beams import Beams
 
@@ -67,9 +67,8 @@ def read_calibration(path: Path) -> Calibration:
 
 
 def text_of(path: Path) -> str:
-    """Read a text file; ValueError if it is empty, and as `check_fits`."""
-    check_fits(path)
-    text = path.read_text("utf-8-sig")
+    """Read a text file; errors as of `read_input_text`, and ValueError if it is empty."""
+    text = read_input_text(path)
     if not text.strip():
         raise ValueError("it is empty")
     return text

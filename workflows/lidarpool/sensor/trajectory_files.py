@@ -11,9 +11,9 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import Field
 
-from ..base.allowance import check_fits
 from ..base.arrays import Floats
 from ..base.errors import LidarpoolError
+from ..base.input_files import read_input_text
 from ..base.validation import checked
 from ..base.vectors import determinant, matmul, turned
 from .calibrations import said, text_of
@@ -75,14 +75,12 @@ def load_trajectory(
     kind = format or ("kitti" if times else "csv" if path.suffix.lower() == ".csv" else "tum")
     try:
         text = text_of(path)
-        if times:
-            check_fits(Path(times))
         if kind == "csv":
             seconds, places, turns = _table(text, dict(columns or {}))
         elif kind == "kitti":
             if times is None:
                 raise ValueError("KITTI's poses have no times: give their file as times")
-            seconds = _numbers(Path(times).read_text("utf-8-sig"), 1)[:, 0]
+            seconds = _numbers(read_input_text(times), 1)[:, 0]
             rows = _numbers(text, 12).reshape(-1, 3, 4)
             if len(rows) != len(seconds):
                 raise ValueError(f"it has {len(rows)} poses and {times} {len(seconds)} times")

@@ -15,6 +15,7 @@ import numpy as np
 
 from ...base.arrays import Floats
 from ...base.errors import LidarpoolError, prefixed
+from ...base.input_files import read_input_text
 from ...scene.actors import one_mesh
 from ...scene.files.meshfile import load_meshes
 from ...scene.floor import heights_at
@@ -270,8 +271,8 @@ def _surfels(path: Path, given: dict[str, str]) -> SceneMesh:
 def _text(path: Path) -> str:
     """Content of a file that may be missing; then empty."""
     try:
-        return path.read_text("utf-8", "replace")
-    except (OSError, ValueError):  # a zero in the name
+        return read_input_text(path, "replace")
+    except (OSError, ValueError, LidarpoolError):  # a zero in the name
         return ""
 
 
