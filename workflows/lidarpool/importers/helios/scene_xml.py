@@ -19,8 +19,9 @@ from ...base.input_files import read_input_text
 from ...scene.actors import one_mesh
 from ...scene.files.meshfile import load_meshes
 from ...scene.floor import heights_at
+from ...scene.object_names import unique_names
 from ...scene.point_scene import surfels
-from ...scene.scene import Scene, unique_names
+from ...scene.scene import Scene
 from ...scene.scene_instances import SceneInstance
 from ...scene.scene_mesh import SceneMesh
 from ...scene.simplified import Drawn

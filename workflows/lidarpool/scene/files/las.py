@@ -49,10 +49,7 @@ def open_las(path: Path) -> Iterator[Any]:
     laspy: Any = import_module("laspy")  # an extra
     with open_input(path) as file:
         size = os.fstat(file.fileno()).st_size
-        _, points_start, records = _unpacked(file, *_LAYOUT)
-        # laspy would go through four thousand million records.
-        if _VLR.size * records > points_start or points_start > size:
-            raise ValueError("its header is wrong")
+        _, points_start, _ = _layout(file)
         file.seek(0)
         with laspy.open(file, closefd=False, read_evlrs=False) as reader:
             header = reader.header
@@ -83,7 +80,7 @@ def las_units(path: Path) -> CoordinateUnits | None:
 
 def _projection_records(file: BinaryIO) -> Iterator[tuple[int, bytes]]:
     """Yield the numbers and contents of the records of a coordinate system."""
-    header_size, _, count = _unpacked(file, *_LAYOUT)
+    header_size, _, count = _layout(file)
     yield from _records(file, header_size, count, _VLR)
     if header_size >= _HEADER_BYTES:
         start, count = _unpacked(file, *_EXTENDED)
@@ -102,6 +99,19 @@ def _records(
         if user.rstrip(b"\0") == _PROJECTION and size <= _MAX_RECORD:
             yield number, file.read(size)
         start += head.size + size
+
+
+def _layout(file: BinaryIO) -> tuple[int, int, int]:
+    """Return the size of the header, the offset of the points, and the number of VLRs.
+
+    ValueError if they contradict each other or the size of the file: laspy would go through four
+    thousand million records.
+    """
+    header_size, points_start, records = _unpacked(file, *_LAYOUT)
+    size = os.fstat(file.fileno()).st_size
+    if header_size + _VLR.size * records > points_start or points_start > size:
+        raise ValueError("its header is wrong")
+    return header_size, points_start, records
 
 
 def _unpacked(file: BinaryIO, layout: struct.Struct, offset: int) -> tuple[int, ...]:
