@@ -128,6 +128,21 @@ def test_formats_that_are_not_read_say_what_to_do(tmp_path, suffix):
         assert f"a{suffix} is not read: " in refused(scene_of_points, path)
 
 
+@pytest.mark.parametrize(
+    ("name", "advice"),
+    [
+        ("a.e57", "pdal translate"),
+        ("a.bag", "rosbags-convert"),
+        ("a.xyz", "as .ply or .las"),
+        ("a.glb", "run a survey of it first"),
+    ],
+)
+def test_recordings_that_are_not_read_say_what_to_do(tmp_path, name, advice):
+    path = tmp_path / name
+    path.write_text("anything")
+    assert advice in refused(lambda path: compare(path, path), path)
+
+
 def test_a_file_of_a_result_is_a_plain_file(tmp_path):
     os.mkfifo(tmp_path / "report.json")
     with pytest.raises(OSError, match="it is a pipe"):

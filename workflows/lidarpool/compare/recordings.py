@@ -28,7 +28,6 @@ from ..datasets.dataset import INDEX_FILE
 from ..datasets.loader import sweeps
 from ..export.sweeps import SWEEPS_FILE, Placed, Sweeps
 from ..scene.files.las import las_units, open_las
-from ..scene.files.meshfile import converted
 from ..scene.files.pcd import checked_pcd
 from ..scene.files.polygon_files import read_ply_columns
 
@@ -43,6 +42,13 @@ _POINT_CLOUD = "sensor_msgs/msg/PointCloud2"
 _WHITE = 100.0  # what Velodyne and Ouster report of a white surface, whatever its range
 _VELODYNE = (1248, 554)  # bytes of the first frame of a Velodyne's .pcap: points, or a position
 
+_CONVERTED = {  # {ending of recordings that are not read: what to do}
+    ".e57": "write it as .las (pdal translate IN.e57 OUT.las)",
+    **dict.fromkeys((".xyz", ".pts", ".csv", ".txt"), "write its points as .ply or .las"),
+    ".bag": "it is a bag of ROS 1, convert it (rosbags-convert --src IN.bag --dst OUT)",
+    ".db3": "it is a part of a bag of ROS 2, give the folder that it is in",
+    **dict.fromkeys((".glb", ".gltf", ".obj", ".stl"), "it is a mesh, run a survey of it first"),
+}
 _UNIT_SUFFIXES = (".las", ".laz", ".ply", ".pcd")  # of clouds that may have another unit
 
 Metres = tuple[float, float, float]  # in the units of x, y and z
@@ -192,7 +198,7 @@ def _of_path(
         if first in _VELODYNE:
             return _of_velodyne(path, name, light)
         return _of_ouster(path, name, sensor, light)
-    advice = f"{printable(path.suffix)} is not read: {converted(path)}; " if converted(path) else ""
+    advice = f"{_CONVERTED[kind]}, or " if kind in _CONVERTED else ""
     raise LidarpoolError(f"{name} cannot be compared: {advice}give {KINDS}.")
 
 

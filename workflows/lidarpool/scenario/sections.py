@@ -328,9 +328,7 @@ class SceneSection(Section):
     ] = ()
     same_names: Annotated[
         Literal["number", "join"],
-        about(
-            "objects of files with equal names: number them (Wall, Wall.2), or join them to one"
-        ),
+        about("objects of files with equal names: number them (Wall, Wall.2), or join them to one"),
     ] = "number"
     ground: Annotated[
         Ground | None,

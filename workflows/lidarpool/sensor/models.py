@@ -302,8 +302,7 @@ def _built_in(name: str) -> SensorModel:
 
 def _read(path: Path | Traversable) -> SensorModel:
     try:
-        is_file = isinstance(path, Path)
-        text = read_input_text(path) if is_file else path.read_text("utf-8")
+        text = read_input_text(path) if isinstance(path, Path) else path.read_text("utf-8")
         with sentences(SensorModel, path):
             return SensorModel.model_validate(load_yaml(text))
     except UNUSABLE as error:
