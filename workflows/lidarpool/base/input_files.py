@@ -8,8 +8,8 @@ from __future__ import annotations
 import errno
 import os
 import stat
+from io import BufferedReader
 from pathlib import Path
-from typing import BinaryIO
 
 from .allowance import bytes_of, memory
 from .errors import LidarpoolError
@@ -37,15 +37,13 @@ class InputFileError(OSError):
         super().__init__(errno.EINVAL, reason, str(path))
 
 
-def open_input(path: str | Path, buffering: int = -1) -> BinaryIO:
+def open_input(path: str | Path) -> BufferedReader:
     """Open a plain file for reading.
 
     Parameters
     ----------
     path
         A file, or a link to a file.
-    buffering
-        As of `open`; 0 returns an unbuffered file.
 
     Raises
     ------
@@ -65,7 +63,7 @@ def open_input(path: str | Path, buffering: int = -1) -> BinaryIO:
                     path, "it is a Git LFS pointer, get the file itself with git lfs pull"
                 )
             os.lseek(handle, 0, os.SEEK_SET)
-        return os.fdopen(handle, "rb", buffering)
+        return os.fdopen(handle, "rb")
     except BaseException:
         os.close(handle)
         raise
@@ -82,7 +80,7 @@ def _check_kind(path: str | Path, mode: int) -> None:
 
 def input_size(path: str | Path) -> int:
     """Return the size of a plain file in bytes; errors as of `open_input`."""
-    with open_input(path, 0) as file:
+    with open_input(path) as file:
         return os.fstat(file.fileno()).st_size
 
 

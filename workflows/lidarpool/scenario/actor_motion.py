@@ -7,9 +7,9 @@ import math
 import zlib
 from array import array
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
 from fnmatch import fnmatchcase
+from io import BufferedIOBase
 from pathlib import Path
 from typing import Annotated, Any, Literal
 from xml.parsers import expat
@@ -391,11 +391,10 @@ def _elements(path: Path) -> Iterator[tuple[str, Mapping[str, str]]]:
     parser = expat.ParserCreate()
     parser.EntityDeclHandler = refuse_entity
     parser.StartElementHandler = lambda tag, at: begun.append((tag, at))
-    with ExitStack() as stack:
-        file = stack.enter_context(open_input(path))
-        if path.suffix.lower() == ".gz":
-            file = stack.enter_context(gzip.open(file))
-        while piece := file.read(_PIECE):
+    with open_input(path) as file:
+        is_packed = path.suffix.lower() == ".gz"
+        content: BufferedIOBase = gzip.GzipFile(fileobj=file) if is_packed else file
+        while piece := content.read(_PIECE):
             parser.Parse(piece)
             yield from begun
             begun.clear()
