@@ -44,7 +44,7 @@ _VELODYNE = (1248, 554)  # bytes of the first frame of a Velodyne's .pcap: point
 
 _CONVERTED = {  # {ending of recordings that are not read: what to do}
     ".e57": "write it as .las (pdal translate IN.e57 OUT.las)",
-    **dict.fromkeys((".xyz", ".pts", ".csv", ".txt"), "write its points as .ply or .las"),
+    **dict.fromkeys((".xyz", ".pts"), "write its points as .ply or .las"),
     ".bag": "it is a bag of ROS 1, convert it (rosbags-convert --src IN.bag --dst OUT)",
     ".db3": "it is a part of a bag of ROS 2, give the folder that it is in",
     **dict.fromkeys((".glb", ".gltf", ".obj", ".stl"), "it is a mesh, run a survey of it first"),
