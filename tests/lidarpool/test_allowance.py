@@ -11,7 +11,7 @@ import pytest
 import trimesh
 from tests.meshes import NESTED
 
-from lidarpool.base import allowance
+from lidarpool.base import allowance, input_files
 from lidarpool.base.errors import LidarpoolError
 from lidarpool.scene.files.meshfile import load_meshes
 
@@ -197,6 +197,6 @@ def test_a_large_mesh_is_read_though_memory_is_short(tmp_path, monkeypatch):
     ball.export(path)
     monkeypatch.setattr(allowance, "memory", lambda: 1 + path.stat().st_size)
     assert len(load_meshes(path)[0].faces) == 81920
-    monkeypatch.setattr(allowance, "memory", lambda: path.stat().st_size - 1)
+    monkeypatch.setattr(input_files, "memory", lambda: path.stat().st_size - 1)
     with pytest.raises(LidarpoolError, match=r"ball\.ply: it has .* more than the memory"):
         load_meshes(path)

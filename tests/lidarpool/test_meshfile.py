@@ -211,7 +211,7 @@ def test_cuts_and_damage_end_in_meshes_or_in_one_clear_line(tmp_path, two_object
         ("m.ply", PLY.replace("3 0 2 3", "3 0 2 9"), "0 to 9"),
         ("m.ply", PLY.replace("element face", "element tristrips"), "triangle strips"),
         ("m.ply", PLY.partition("end_header")[0], "no PLY header"),
-        ("m.step", "LASF", "has the ending .step"),
+        ("m.part", "LASF", "has the ending .part"),
         ("m.gltf", "[" * 100_000, "no valid JSON"),
         *[
             (

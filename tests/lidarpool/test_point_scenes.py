@@ -153,3 +153,15 @@ def test_the_command(tmp_path):
     with pytest.raises(LidarpoolError, match=r"size is -1.0"):
         arguments += ["--size", "-1", "--overwrite"]
         CliRunner().invoke(command, arguments, catch_exceptions=False)
+
+
+@pytest.mark.parametrize("name", ["room-scan", "building-3", "tree-1", "car-2", "ground", "scan"])
+def test_only_generated_scenes_are_painted(tmp_path, name):
+    path, out = written(tmp_path / f"{name}.ply", plane()), tmp_path / "b.glb"
+    CliRunner().invoke(command, ["points", str(path), str(out)], catch_exceptions=False)
+    scene = Scene.load(out, colours=True)
+    assert scene.names == (name,)
+    assert not scene.has_colours.any(), "grey, 188"
+    city = tmp_path / "city.glb"
+    CliRunner().invoke(command, ["city", str(city), "--triangles", "5000"], catch_exceptions=False)
+    assert Scene.load(city, colours=True).has_colours.all()

@@ -8,7 +8,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from lidarpool.base.errors import LidarpoolError
-from lidarpool.scene.scene import Scene, unique_names
+from lidarpool.scenario.advice import advice
+from lidarpool.scenario.build import build
+from lidarpool.scenario.scenario import Scenario
+from lidarpool.scene.object_names import unique_names
+from lidarpool.scene.scene import Scene
 from lidarpool.scene.scene_mesh import SceneMesh
 from lidarpool.scene.transform import UP_AXES, Transform
 
@@ -104,3 +108,53 @@ def test_scale_then_x_then_y_then_z_then_translation():
 def test_no_placements(make, message):
     with pytest.raises(LidarpoolError, match=message):
         make()
+
+
+VERTICES = "v 0 0 0\nv 1 0 0\nv 0 1 0\n"
+TWICE = VERTICES + "o Wall\nf 1 2 3\no Door\nf 1 2 3\no Wall\nf 1 2 3\nf 1 3 2\n"
+
+
+def face_counts(scene):
+    counts = np.bincount(scene.face_object, minlength=len(scene.names))
+    return dict(zip(scene.names, counts.tolist(), strict=True))
+
+
+def test_objects_of_one_name_are_told_apart_with_a_note_or_joined(tmp_path, caplog):
+    path = tmp_path / "a.obj"
+    path.write_text(TWICE)
+    assert face_counts(Scene.load(path)) == {"Wall": 1, "Door": 1, "Wall.2": 2}
+    (note,) = [line for line in caplog.messages if "another one" in line]
+    assert note.startswith(f"{path}: 1 object has the name of another one and a number now: Wall.2")
+    assert 'Scene.load(path, same_names="join")' in note
+    caplog.clear()
+    assert face_counts(Scene.load(path, same_names="join")) == {"Wall": 3, "Door": 1}
+    assert not [line for line in caplog.messages if "another one" in line]
+
+
+def test_a_group_that_comes_again_continues(tmp_path, caplog):
+    path = tmp_path / "a.obj"
+    path.write_text(TWICE.replace("o ", "g "))
+    assert face_counts(Scene.load(path)) == {"Wall": 3, "Door": 1}
+    assert "another one" not in caplog.text
+
+
+@pytest.mark.parametrize(
+    ("same_names", "counts"),
+    [
+        (None, {"Wall": 1, "Door": 1, "Wall.2": 2, "Wall.3": 1}),
+        ("number", {"Wall": 1, "Door": 1, "Wall.2": 2, "Wall.3": 1}),
+        ("join", {"Wall": 4, "Door": 1}),
+    ],
+)
+def test_equal_names_of_the_files_of_a_scenario(tmp_path, same_names, counts):
+    (tmp_path / "a.obj").write_text(TWICE)
+    (tmp_path / "b.obj").write_text(VERTICES + "o Wall\nf 1 2 3\n")
+    section = {"files": ["a.obj", "b.obj"]}
+    if same_names:
+        section["same_names"] = same_names
+    built = build(Scenario.from_data({"scene": section, "poses": [[0, 0, 1]]}, folder=tmp_path))
+    assert face_counts(built.scene) == counts
+    notes = [note for note in advice(built) if "the name of another" in note]
+    assert len(notes) == (same_names != "join")
+    if notes:
+        assert "Wall.2, Wall.3; same_names: join in scene makes one object" in notes[0]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 import zipfile
@@ -874,3 +875,18 @@ def test_what_cannot_be_read_is_noted(folder, inputs, image, kind, colour, why):
     assert told(path)[1] == []  # colours are not asked for
     if "out.png" in image:
         assert seen(path, assets=folder.parent) == (PICTURE, [])
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="needs named pipes")
+@pytest.mark.parametrize(
+    "text",
+    [
+        "#usda 1.0\n(subLayers = [@f.usda@])\n",
+        '#usda 1.0\ndef "A" (references = @f.usda@) {}\n',
+    ],
+)
+def test_pipes_that_a_scene_names_are_not_waited_for(tmp_path, text):
+    os.mkfifo(tmp_path / "f.usda")
+    (tmp_path / "m.usda").write_text(text)
+    with pytest.raises(LidarpoolError, match=r"it names 'f\.usda', which is no plain file"):
+        load_meshes(tmp_path / "m.usda")

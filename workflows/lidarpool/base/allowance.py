@@ -87,15 +87,3 @@ def bytes_of(count: int) -> str:
     from dask.utils import format_bytes  # here, because Dask takes long to import
 
     return str(format_bytes(count))
-
-
-def check_fits(path: Path) -> None:
-    """Refuse a file that is larger than the memory, before it is read.
-
-    LidarpoolError if it is; OSError if there is none.
-    """
-    if (size := path.stat().st_size) > memory():
-        raise LidarpoolError(
-            f"it has {bytes_of(size)}, more than the memory of this machine "
-            f"({bytes_of(memory())}): read a part of it, or read it on a larger one."
-        )

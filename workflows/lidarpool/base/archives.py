@@ -17,6 +17,7 @@ import numpy as np
 from .allowance import Allowance
 from .arrays import AnyArray
 from .errors import LidarpoolError, explained, prefixed
+from .input_files import read_input
 
 # Head of an array of numbers in format 1.0 of NumPy, after ten bytes with its length at their end.
 _HEADER = re.compile(
@@ -43,7 +44,7 @@ def open_archive(
     """
     try:
         with explained(f"{path} cannot be read"), prefixed(path):
-            data = read() if read else Path(path).read_bytes()
+            data = read() if read else read_input(path)
             yield read_arrays(data, Allowance(len(data), _AGAIN))
     except LidarpoolError:
         raise

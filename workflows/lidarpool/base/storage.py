@@ -21,6 +21,7 @@ from pathlib import Path
 from typing import IO, Any
 
 from .errors import LidarpoolError
+from .input_files import open_input
 
 _PIECE = 1 << 20  # bytes in memory of a file that is checked
 TEMPORARY = ".lidarpool-tmp-"  # begins the name of an unfinished file
@@ -234,18 +235,26 @@ class Storage:
     def read(self, name: str, first: int = 0, stop: int | None = None) -> bytes:
         """Read a file, or its bytes from `first` to `stop`; fewer if it ends before."""
         if self.is_local:
-            with self.local(name).open("rb", buffering=0 if stop else -1) as file:
+            with open_input(self.local(name)) as file:
                 file.seek(first)
                 return file.read(-1 if stop is None else stop - first)
         with self._remote() as (system, folder):
             return bytes(system.cat_file(f"{folder}/{name}", start=first or None, end=stop))
 
+    @contextmanager
+    def _reading(self, name: str) -> Iterator[IO[bytes]]:
+        """Open a file for the body."""
+        if self.is_local:
+            with open_input(self.local(name)) as file:
+                yield file
+        else:
+            with self._remote() as (system, folder), system.open(f"{folder}/{name}", "rb") as file:
+                yield file
+
     def checksum(self, name: str) -> list[int]:
         """Bytes of a file and their CRC-32, read a piece at a time."""
         size = crc = 0
-        if self.is_local:
-            self.local(name)
-        with self._remote() as (system, folder), system.open(f"{folder}/{name}", "rb") as file:
+        with self._reading(name) as file:
             while piece := file.read(_PIECE):
                 size, crc = size + len(piece), zlib.crc32(piece, crc)
         return [size, crc]
@@ -277,8 +286,8 @@ class Storage:
             if other is system and not self.is_local:
                 system.cp_file(f"{folder}/{name}", f"{own_folder}/{own}")
                 return
-            with other.open(f"{folder}/{name}", "rb") as source, self.writing(own) as file:
-                shutil.copyfileobj(source, file, _PIECE)
+        with place._reading(name) as source, self.writing(own) as file:
+            shutil.copyfileobj(source, file, _PIECE)
 
     def sees(self, name: str, data: bytes) -> bool:
         """Whether a file has this content, so that this process sees the same place."""

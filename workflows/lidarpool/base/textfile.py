@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from .allowance import check_fits
+from .input_files import open_input, read_input
 
 _FIRST = 4096  # bytes that tell text from other content
 # First bytes of files that are no text: what each is, and what to do.
@@ -34,10 +34,11 @@ def read_text(path: Path) -> str:
     ValueError
         If the file is empty, or is no text; the message says what it is.
     LidarpoolError
-        As of `check_fits`.
+        If the file is larger than the memory.
+    OSError
+        As of `open_input`.
     """
-    check_fits(path)
-    with path.open("rb") as file:
+    with open_input(path) as file:
         first = file.read(_FIRST)
     kind = next((kind for magic, kind in _KINDS.items() if first.startswith(magic)), None)
     if kind is not None:
@@ -45,9 +46,9 @@ def read_text(path: Path) -> str:
     if b"\0" in first:
         raise ValueError("it is a binary file of an unknown kind, and a text file is expected")
     try:
-        text = path.read_text("utf-8-sig")
+        text = read_input(path).decode("utf-8-sig")
     except UnicodeDecodeError as error:
         raise ValueError("it is no text in UTF-8: save it as UTF-8") from error
     if not text.strip():
         raise ValueError("it is empty")
-    return text
+    return text.replace("\r\n", "\n").replace("\r", "\n")

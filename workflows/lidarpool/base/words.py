@@ -22,8 +22,13 @@ def did_you_mean(word: str, known: Iterable[str]) -> str:
 
 
 # In a note, a setting; and the calls of Python that take those of a section.
-_SETTING = re.compile(r'<(file|cloud|materials)\.(\w+)=("?)(\w+)\3>')
-_CALLS = {"file": "Scene.load(path", "cloud": "Survey(…", "materials": "Material(…"}
+_SETTING = re.compile(r'<(file|scene|cloud|materials)\.(\w+)=("?)(\w+)\3>')
+_CALLS = {
+    "file": "Scene.load(path",
+    "scene": "Scene.load(path",
+    "cloud": "Survey(…",
+    "materials": "Material(…",
+}
 
 
 def as_python(note: str) -> str:

@@ -8,8 +8,9 @@ from typing import Any
 
 import yaml
 
-from .allowance import Allowance, check_fits
+from .allowance import Allowance
 from .errors import LidarpoolError, prefixed
+from .input_files import read_input_text
 
 _NODE_BYTES = 500  # of a value, while the loader has it
 
@@ -94,8 +95,7 @@ def read_yaml(
     """
     try:
         with prefixed(path):
-            check_fits(path)
-            content = load_yaml(path.read_text("utf-8-sig"))
+            content = load_yaml(read_input_text(path))
     except FileNotFoundError as error:
         raise LidarpoolError(f"{path} does not exist: check the name and the folder.") from error
     except OSError as error:

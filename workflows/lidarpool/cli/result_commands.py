@@ -12,7 +12,7 @@ import click
 
 from ..base.errors import LidarpoolError
 from ..base.storage import Storage
-from ..base.vocabulary import PICTURES
+from ..base.vocabulary import PICTURES, UNITS_M
 from ..export.format_table import EXPORTS, LAYOUTS
 from . import shared_options as options
 
@@ -233,6 +233,12 @@ def view(
 @click.option("--sensor-b", metavar="NAME", help="The same of B.")
 @click.option("--intensity-a", metavar="COLUMN", help="Column of A to compare as intensity.")
 @click.option("--intensity-b", metavar="COLUMN", help="The same of B.")
+@click.option(
+    "--unit-a",
+    type=click.Choice([*UNITS_M]),
+    help="Unit of A; by default that of a .las or .laz, else m.",
+)
+@click.option("--unit-b", type=click.Choice([*UNITS_M]), help="The same of B.")
 @click.option("--azimuth-deg", type=float, help="Width of a cell; by default the step of pulses.")
 @click.option(
     "--distance",
@@ -263,6 +269,7 @@ def compare(a: Path, b: Path, out: Path, as_json: bool, **given: Any) -> None:
       lidarpool compare noisy clean
       lidarpool compare result recording.mcap --sensor-b /lidar/points --out compared
       lidarpool compare scan.laz earlier.laz --distance 0.05
+      lidarpool compare scan.laz model.ply --unit-b ft
     """  # noqa: D301 - click wants the character, not its name
     from ..base.fork_server import keep_freed_memory
     from ..compare.comparison import compare as compared

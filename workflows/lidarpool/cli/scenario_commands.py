@@ -9,6 +9,7 @@ import sys
 from collections.abc import Callable, Iterator
 from contextlib import nullcontext
 from dataclasses import replace
+from functools import partial
 from itertools import count
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -16,6 +17,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from ..base.errors import LidarpoolError
+from ..base.vocabulary import UNITS_M
 from ..base.words import plural, without_common_prefix
 from . import shared_options as options
 from .shared_options import WARNED, Command, overwrite, together
@@ -272,7 +274,7 @@ def city(out: Path, triangles: int, seed: int, overwrite: bool, trees: int, cars
     """  # noqa: D301 - click wants the character, not its name
     from ..scene.generated.city import city as make
 
-    _write(out, lambda: make(triangles, seed, trees, cars), overwrite)
+    _write(out, lambda: make(triangles, seed, trees, cars), overwrite, paint=True)
 
 
 @scene.command(context_settings={"show_default": True})
@@ -290,7 +292,7 @@ def terrain(out: Path, triangles: int, seed: int, side: float, overwrite: bool, 
     """  # noqa: D301 - click wants the character, not its name
     from ..scene.generated.terrain import terrain as make
 
-    _write(out, lambda: make(triangles, seed, side, trees), overwrite)
+    _write(out, lambda: make(triangles, seed, side, trees), overwrite, paint=True)
 
 
 @scene.command()
@@ -305,23 +307,38 @@ def terrain(out: Path, triangles: int, seed: int, side: float, overwrite: bool, 
     show_default=True,
     help="Factor of the surfels' sides: larger ones close gaps, and reach farther beyond edges.",
 )
+@click.option(
+    "--unit",
+    type=click.Choice([*UNITS_M]),
+    help="Unit of x, y and z; by default that of a .las or .laz, else m.",
+)
 @overwrite
 @click.argument("cloud", type=click.Path(path_type=Path), metavar="CLOUD.ply|.pcd|.xyz|.las|.laz")
 @_out
-def points(cloud: Path, out: Path, voxel_m: float | None, size: float, overwrite: bool) -> None:
-    """Make a scene of a point cloud, in metres and Z-up: a scan that can be scanned again.
+def points(
+    cloud: Path,
+    out: Path,
+    voxel_m: float | None,
+    size: float,
+    unit: str | None,
+    overwrite: bool,
+) -> None:
+    """Make a scene of a point cloud, Z-up: a scan that can be scanned again.
 
     \b
     Examples:
       lidarpool scene points scan.ply place.glb
       lidarpool scene points survey.laz place.obj --voxel-m 0.5
+      lidarpool scene points scan.xyz place.glb --unit mm
     """  # noqa: D301 - click wants the character, not its name
     from ..scene.point_scene import scene_of_points
 
-    _write(out, lambda: scene_of_points(cloud, voxel_m=voxel_m, size=size), overwrite)
+    made = partial(scene_of_points, cloud, voxel_m=voxel_m, size=size, unit=unit)
+    _write(out, made, overwrite)
 
 
-def _write(out: Path, make: Callable[[], Scene], overwrite: bool) -> None:
+def _write(out: Path, make: Callable[[], Scene], overwrite: bool, paint: bool = False) -> None:
+    """Make a scene and write it to a file; `paint` gives a generated scene its colours."""
     from ..scene.paint import painted
     from ..scene.scene_file import check_target, write_scene
 
@@ -330,7 +347,7 @@ def _write(out: Path, make: Callable[[], Scene], overwrite: bool) -> None:
         raise LidarpoolError(f"{out} exists: give another name, or --overwrite.")
     made = make()
     if out.suffix.lower() == ".glb":  # others keep no colours
-        made = painted(made)
+        made = painted(made) if paint else made
     elif made.instances and made.triangles > MOST_COPIED:
         raise LidarpoolError(
             f"{out} would hold {made.triangles:,} triangles, because only .glb files have a tree "

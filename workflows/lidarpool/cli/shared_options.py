@@ -14,6 +14,7 @@ from typing import Any
 
 import click
 
+from ..base.errors import explained
 from ..base.shard import Shard
 from ..base.storage import Storage, is_url
 from ..base.vocabulary import BACKENDS, UNITS_M
@@ -133,6 +134,7 @@ def scheduler(command: Command) -> Command:
 
     @wraps(command)
     def with_files(*arguments: Any, **given: Any) -> None:
+        from ..base.input_files import input_size
         from ..run.connection import TlsFiles
 
         if given.get("cluster") is not None and given["scheduler"] is not None:
@@ -150,6 +152,9 @@ def scheduler(command: Command) -> Command:
                 "--tls-ca, --tls-cert and --tls-key are for the cluster of --scheduler: give its "
                 "address, tls://host:8786."
             )
+        for file in filter(None, files):
+            with explained(f"{file} cannot be read"):
+                input_size(file)
         command(*arguments, files=files, **given)
 
     pem = click.Path(exists=True, dir_okay=False, path_type=Path)

@@ -12,6 +12,7 @@ import numpy as np
 
 from ..base.arrays import AnyArray
 from ..base.extras import need, reading
+from ..base.input_files import input_size
 
 if TYPE_CHECKING:
     from rosbags.rosbag2 import Reader
@@ -36,6 +37,9 @@ def open_bag(path: Path, name: str) -> Reader:
     from rosbags.rosbag2 import Reader
 
     with reading(name):
+        for file in path.iterdir() if path.is_dir() else [path]:
+            if not file.is_dir():
+                input_size(file)
         bag = Reader(path)
         bag.open()
     return bag

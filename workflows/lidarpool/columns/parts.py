@@ -24,6 +24,7 @@ from ..base.archives import read_arrays, read_npy
 from ..base.arrays import AnyArray, Floats, Floats32, Integers, Ints, Ints32, UInts32
 from ..base.elementary import decade
 from ..base.errors import LidarpoolError
+from ..base.input_files import open_input
 from ..base.sampling import even_indices
 from ..base.storage import Storage, target_of
 from .cloud import CHUNK_POINTS, Cloud, Shown, need_packages
@@ -213,7 +214,7 @@ def read_tally(storage: Storage, name: str) -> tuple[Ints32, Ints]:
         part = read_part(storage, name)
         return part.triangles, part.hits
     try:
-        with zipfile.ZipFile(storage.local(name)) as archive:
+        with open_input(storage.local(name)) as file, zipfile.ZipFile(file) as archive:
             triangles = read_npy(archive.read(".triangles.npy"), "triangles")
             return triangles, read_npy(archive.read(".hits.npy"), "hits")
     except Exception as error:  # as above

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -10,6 +11,7 @@ import numpy as np
 
 from ..base.arrays import AnyArray, Records
 from ..base.errors import LidarpoolError, explained
+from ..base.input_files import open_input
 from .table import Column
 
 AXES = ("x", "y", "z")
@@ -76,9 +78,8 @@ def layout(path: Path) -> tuple[int, int, np.dtype[np.void]]:
     ValueError
         If it is not a complete binary PLY file with our properties; the message is a clause.
     """
-    if path.is_fifo():  # would wait for a writer, and has no random access
-        raise ValueError("it is a pipe")
-    with path.open("rb") as file:
+    with open_input(path) as file:
+        size = os.fstat(file.fileno()).st_size
         data = file.read(_HEADER_LIMIT)
         if b"end_header\n" not in data:  # names of many classes, perhaps
             data += file.read(_COMMENTS_LIMIT)
@@ -88,7 +89,7 @@ def layout(path: Path) -> tuple[int, int, np.dtype[np.void]]:
         raise ValueError("it has no header of a binary little-endian PLY file")
     count, dtype = _parse_header(text)
     start = len(head) + len(found)
-    announced, size = start + count * dtype.itemsize, path.stat().st_size
+    announced = start + count * dtype.itemsize
     if size != announced:
         raise ValueError(f"{count:,} points in {announced:,} bytes announced, {size:,} bytes there")
     return start, count, dtype

@@ -19,6 +19,7 @@ from ..base.errors import LidarpoolError, explained
 from ..base.open3d_module import load_open3d
 from ..base.sampling import even_indices
 from ..base.validation import checked
+from ..base.vocabulary import UNITS_M
 from ..base.words import plural
 from ..columns.cloud import Cloud
 from ..columns.parts import StoredCloud
@@ -99,6 +100,8 @@ def compare(
     sensor_b: str | None = None,
     intensity_a: str | None = None,
     intensity_b: str | None = None,
+    unit_a: Literal[tuple(UNITS_M)] | None = None,  # type: ignore[valid-type]
+    unit_b: Literal[tuple(UNITS_M)] | None = None,  # type: ignore[valid-type]
     azimuth_deg: Annotated[float, Field(gt=0, le=90)] | None = None,
     distances_m: Sequence[float] = (0.05, 0.1, 0.2, 0.5),
     most_points: Annotated[int, Field(ge=1000)] = MOST_POINTS,
@@ -122,6 +125,9 @@ def compare(
         Of a recording of several: name of the sensor, or topic of a bag.
     intensity_a, intensity_b
         Columns to compare as intensity, if not ``intensity``.
+    unit_a, unit_b
+        Unit of a .las, .laz, .ply or .pcd (um, mm, cm, dm, m, km, in, ft, yd or mi), in place of
+        metres or of the units of the coordinate system that a .las or .laz states.
     azimuth_deg
         Width of a cell; by default the step from pulse to pulse, the coarser one.
     distances_m
@@ -137,8 +143,8 @@ def compare(
     if not distances_m or any(not 0 < one < np.inf for one in distances_m):
         raise LidarpoolError(f"distances_m is {list(distances_m)}; it must be lengths in metres.")
     recordings = (
-        open_recording(a, sensor_a, intensity_a, name="cloud A"),
-        open_recording(b, sensor_b, intensity_b, name="cloud B"),
+        open_recording(a, sensor_a, intensity_a, name="cloud A", unit=unit_a),
+        open_recording(b, sensor_b, intensity_b, name="cloud B", unit=unit_b),
     )
     found = _Comparing(recordings, tuple(sorted(distances_m)), azimuth_deg)
     first, second = recordings

@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import json
-import struct
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import nullcontext
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from importlib import import_module
 from importlib.util import find_spec
@@ -16,11 +15,12 @@ from typing import Any
 
 import numpy as np
 
-from ..base.allowance import check_fits
 from ..base.arrays import AnyArray, Floats, Indices, Ints
 from ..base.errors import LidarpoolError
 from ..base.extras import need, reading
 from ..base.fingerprint import fingerprint
+from ..base.input_files import input_size, open_input, read_input
+from ..base.vocabulary import UNITS_M
 from ..base.words import did_you_mean, natural
 from ..columns.bags import POINT_CLOUD, open_bag, point_columns
 from ..columns.cloud import CHUNK_POINTS, Cloud, CloudLike
@@ -29,6 +29,8 @@ from ..columns.parts import StoredCloud
 from ..datasets.dataset import INDEX_FILE
 from ..datasets.loader import sweeps
 from ..export.sweeps import SWEEPS_FILE, Placed, Sweeps
+from ..scene.files.las import las_units, open_las
+from ..scene.files.pcd import checked_pcd
 from ..scene.files.polygon_files import read_ply_columns
 
 KINDS = (
@@ -38,10 +40,20 @@ KINDS = (
 # What programs call the number of a beam, and the light that came back; the first there is.
 _RINGS = ("ring", "channel", "laser_id", "laser_number", "line", "beam")
 _LIGHTS = ("intensity", "reflectivity", "i")
-_RECORD = 54  # least bytes of a variable-length record of .las
 _WHITE = 100.0  # what Velodyne and Ouster report of a white surface, whatever its range
 _VELODYNE = (1248, 554)  # bytes of the first frame of a Velodyne's .pcap: points, or a position
 
+_CONVERTED = {  # {ending of recordings that are not read: what to do}
+    ".e57": "write it as .las (pdal translate IN.e57 OUT.las)",
+    **dict.fromkeys((".xyz", ".pts"), "write its points as .ply or .las"),
+    ".bag": "it is a bag of ROS 1, convert it (rosbags-convert --src IN.bag --dst OUT)",
+    ".db3": "it is a part of a bag of ROS 2, give the folder that it is in",
+    **dict.fromkeys((".glb", ".gltf", ".obj", ".stl"), "it is a mesh, run a survey of it first"),
+}
+_UNIT_SUFFIXES = (".las", ".laz", ".ply", ".pcd")  # of clouds that may have another unit
+
+Metres = tuple[float, float, float]  # in the units of x, y and z
+_METRES: Metres = (1.0, 1.0, 1.0)
 Columns = Mapping[str, AnyArray]
 # Positions (n, 3), columns, and the pose of their axes in the world (4, 4); None if unknown.
 Read = tuple[AnyArray, Columns, Floats | None]
@@ -91,6 +103,7 @@ class Recording:
     white: float | None = None  # intensity of a white surface, if it is the same at all ranges
     energies: bool = False  # whether intensities are energies, as those of results
     firings: str = ""  # recordings with the same have the same rays; "" for unknown
+    metres: Metres = _METRES  # in the units of x, y and z
 
     def turn(self, number: int, *, in_world: bool = False) -> Turn:
         """Read a sweep in its sensor's axes or the world's; LidarpoolError if it cannot be."""
@@ -104,14 +117,14 @@ class Recording:
         places = np.asarray(points, np.float64)
         # Drivers write NaN or zeros for pulses without a return.
         there = np.isfinite(places).all(axis=1) & places.any(axis=1)
-        places = places[there]
+        places = places[there] * self.metres
         if in_world and not self.whole:
             if pose is None:
                 raise LidarpoolError(
                     f"{self.name} is in the axes of its sensor, and does not say where that was: "
                     "compare it with a recording of sweeps."
                 )
-            places = places @ pose[:3, :3].T + pose[:3, 3]
+            places = places @ pose[:3, :3].T + pose[:3, 3] * self.metres
         lights = _LIGHTS if self.light is None else (self.light,)
         rings, light = (
             next((columns[name][there] for name in names if name in columns), None)
@@ -130,16 +143,36 @@ def open_recording(
     sensor: str | None = None,
     light: str | None = None,
     name: str = "the cloud",
+    unit: str | None = None,
 ) -> Recording:
     """Open a cloud or recording: `KINDS`; or a cloud in memory, which has sweeps if of a result.
 
     `sensor` chooses one of several sensors, or the topic of a bag; `light` is the column of the
-    intensity, if it has another name than usual; `name` is that of a cloud in memory.
+    intensity, if it has another name than usual; `name` is that of a cloud in memory; `unit` is
+    that of a file of `_UNIT_SUFFIXES`, in place of metres or of the units that a .las states.
     LidarpoolError if it is none, or cannot be opened.
     """
     if isinstance(place, Cloud | StoredCloud):
+        if unit is not None:
+            raise LidarpoolError(f"{name} is in metres: leave out its unit, {unit!r}.")
         return _of_cloud(name, place, place.sweeps, sensor, light)
-    path, name, kind = Path(place), str(place), Path(place).suffix.lower()
+    path, name = Path(place), str(place)
+    if unit is None:
+        return _of_path(path, name, sensor, light, None)
+    if path.suffix.lower() not in _UNIT_SUFFIXES:
+        raise LidarpoolError(
+            f"{name} is in metres: leave out its unit, {unit!r}, which is for a file "
+            f"{' '.join(_UNIT_SUFFIXES)}."
+        )
+    metre = UNITS_M[unit]
+    return _of_path(path, name, sensor, light, (metre, metre, metre))
+
+
+def _of_path(
+    path: Path, name: str, sensor: str | None, light: str | None, metres: Metres | None
+) -> Recording:
+    """Open a file or folder; `metres` are given in place of those of its units."""
+    kind = path.suffix.lower()
     if not path.exists() or (path.is_file() and not path.stat().st_size):
         raise LidarpoolError(f"{name} does not exist, or is empty: give {KINDS}.")
     if path.is_dir():
@@ -153,20 +186,21 @@ def open_recording(
         if files:
             return _of_pcd(sorted(files, key=lambda file: natural(file.name)), name, light)
     elif kind == ".ply":
-        return _of_ply(path, name, sensor, light)
+        return replace(_of_ply(path, name, sensor, light), metres=metres or _METRES)
     elif kind == ".pcd":
-        return _of_pcd([path], name, light)
+        return replace(_of_pcd([path], name, light), metres=metres or _METRES)
     elif kind in (".las", ".laz"):
-        return _of_las(path, name, light)
+        return _of_las(path, name, light, metres)
     elif kind == ".mcap":
         return _of_bag(path, name, sensor, light)
     elif kind in (".osf", ".pcap"):
-        with reading(name), path.open("rb") as file:
+        with reading(name), open_input(path) as file:
             first = int.from_bytes(file.read(36)[32:], "little")
         if first in _VELODYNE:
             return _of_velodyne(path, name, light)
         return _of_ouster(path, name, sensor, light)
-    raise LidarpoolError(f"{name} cannot be compared: give {KINDS}.")
+    advice = f"{_CONVERTED[kind]}, or " if kind in _CONVERTED else ""
+    raise LidarpoolError(f"{name} cannot be compared: {advice}give {KINDS}.")
 
 
 def _of_cloud(
@@ -219,17 +253,16 @@ def _of_ply(path: Path, name: str, sensor: str | None, light: str | None) -> Rec
     except LidarpoolError:  # text, or of another program
 
         def read(_: int) -> Read:
-            check_fits(path)
-            columns = read_ply_columns(path.read_bytes())
+            columns = read_ply_columns(read_input(path))
             return _places(columns), columns, None
 
         return Recording(name, 1, read, light, whole=True)
     if not (beside := path.with_name(SWEEPS_FILE)).exists():
         return _of_cloud(name, cloud, None, sensor, light)
     try:
-        report = json.loads(path.with_name("report.json").read_bytes())
+        report = json.loads(read_input(path.with_name("report.json")))
         every = int(report["parameters"]["keep_every"])
-    except (OSError, ValueError, TypeError, LookupError):
+    except (OSError, ValueError, TypeError, LookupError, LidarpoolError):
         every = 1
     note = (
         f"{name} keeps one of {every} hits, so its gaps are no lost returns: run it with "
@@ -257,9 +290,10 @@ def _of_pcd(files: list[Path], name: str, light: str | None) -> Recording:
         from pypcd4.pypcd4 import PointCloud  # an extra
 
         path = files[number]
-        check_fits(path)
         with reading(path.name) if len(files) > 1 else nullcontext():
-            file = PointCloud.from_path(path)
+            checked_pcd(path)
+            with open_input(path) as opened:
+                file = PointCloud.from_fileobj(opened)
             rows, (*place, w, x, y, z) = file.pc_data, file.metadata.viewpoint
             if len(rows) != file.metadata.points:
                 raise ValueError(f"{file.metadata.points:,} points announced, {len(rows):,} there")
@@ -270,28 +304,29 @@ def _of_pcd(files: list[Path], name: str, light: str | None) -> Recording:
     return Recording(name, len(files), read, light)
 
 
-def _of_las(path: Path, name: str, light: str | None) -> Recording:
-    need("laspy", "las", f"{name} is read")
-    laspy: Any = import_module("laspy")
+def _of_las(path: Path, name: str, light: str | None, metres: Metres | None) -> Recording:
+    """Open the points of a .las or .laz, in the units that it states unless others are given."""
+    notes = []
     with reading(name):
-        with path.open("rb") as start:
-            first, records = struct.unpack("<II", start.read(104)[96:])
-        if _RECORD * records > first:  # laspy would go through four thousand million of them
-            raise ValueError("its header is wrong")
-        with laspy.open(path, read_evlrs=False) as file:
-            count = file.header.point_count
+        with open_las(path) as reader:
+            count = reader.header.point_count
+        if metres is None and (units := las_units(path)) is not None:
+            metres = units.factors
+            notes = [f"{name} {note}" for note in [units.note()] if note]
 
     def read(number: int) -> Read:
         wanted = min(CHUNK_POINTS, count - number * CHUNK_POINTS)
-        with laspy.open(path, read_evlrs=False) as file:
-            file.seek(number * CHUNK_POINTS)
-            points = file.read_points(wanted)
+        with open_las(path) as reader:
+            reader.seek(number * CHUNK_POINTS)
+            points = reader.read_points(wanted)
         if len(points) != wanted:
             raise ValueError(f"{count:,} points announced, and there are fewer")
         columns = {name: np.asarray(points[name]) for name in points.point_format.dimension_names}
         return np.stack([points.x, points.y, points.z], axis=1), columns, None
 
-    return Recording(name, -(-count // CHUNK_POINTS), read, light, True, count)
+    parts = -(-count // CHUNK_POINTS)
+    metres = metres or _METRES
+    return Recording(name, parts, read, light, True, count, notes=tuple(notes), metres=metres)
 
 
 def _of_bag(path: Path, name: str, topic: str | None, light: str | None) -> Recording:
@@ -317,6 +352,9 @@ def _of_ouster(path: Path, name: str, sensor: str | None, light: str | None) -> 
         raise LidarpoolError(f"{name} is read by ouster-sdk: pip install --no-deps ouster-sdk.")
     sdk: Any = import_module("ouster.sdk")
     with reading(name):
+        input_size(path)
+        if (metadata := path.with_suffix(".json")).exists():
+            input_size(metadata)
         infos = sdk.open_source(str(path)).sensor_info
         known = [f"{one.prod_line} {one.sn}".strip() for one in infos]
     which = known.index(_chosen(name, "sensors", known, sensor))
@@ -340,7 +378,7 @@ def _of_velodyne(path: Path, name: str, light: str | None) -> Recording:
     """Open packets of a Velodyne, which say the model."""
     need("velodyne_decoder", "fit", f"{name} is read")
     decoder: Any = import_module("velodyne_decoder")
-    with reading(name), path.open("rb") as file:
+    with reading(name), open_input(path) as file:
         file.seek(24)
         heads = iter(partial(file.read, 16), b"")
         frames = (file.read(int.from_bytes(head[8:12], "little")) for head in heads)

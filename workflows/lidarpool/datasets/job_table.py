@@ -20,6 +20,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field
 from importlib.util import find_spec
+from io import TextIOWrapper
 from itertools import islice
 from pathlib import Path
 from typing import IO, Any
@@ -27,6 +28,7 @@ from typing import IO, Any
 import numpy as np
 
 from ..base.errors import LidarpoolError, explained
+from ..base.input_files import open_input
 from ..base.storage import Storage
 from ..columns.cloud import Cloud, CloudLike
 
@@ -239,7 +241,8 @@ def read_table(place: Storage, checksum: Sequence[int] | None = None) -> Iterato
                     f"{place.path(TABLE_FILE)} is damaged or edited, its checksum is not that of "
                     f"the data set: {AGAIN}."
                 )
-            file = stack.enter_context(path.open(encoding="utf-8", newline=""))
+            file = TextIOWrapper(open_input(path), encoding="utf-8", newline="")
+            stack.enter_context(file)
         reader = csv.reader(file, strict=True)
         try:
             header = [_unshielded(name) for name in next(reader, [])]

@@ -9,12 +9,14 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass
 from importlib import import_module
+from io import TextIOWrapper
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from ..base.arrays import Floats
+from ..base.input_files import open_input
 from ..sensor import Survey
 from ..sensor.navigation import fixes, geodetic, imu_samples
 from ..sensor.trajectory import Pose, quaternions_of
@@ -92,7 +94,7 @@ class Instruments:
         """Yield the rows of a file, without its header; none if it is not written."""
         if self.folder is None or name not in self.files:
             return
-        with (self.folder / name).open(encoding="ascii") as file:
+        with TextIOWrapper(open_input(self.folder / name), encoding="ascii") as file:
             next(file)
             for line in file:
                 yield line.rstrip("\n").split(",")

@@ -9,6 +9,7 @@ from array import array
 from collections.abc import Callable, Iterator, Mapping, Sequence, Set
 from dataclasses import dataclass, field, replace
 from fnmatch import fnmatchcase
+from io import BufferedIOBase
 from pathlib import Path
 from typing import Annotated, Any, Literal
 from xml.parsers import expat
@@ -19,6 +20,7 @@ from pydantic import Strict, model_validator
 from ..base.arrays import Floats
 from ..base.declared import Several, Text, TextOrTexts, Triple, about, by_text, declared, one_of
 from ..base.errors import LidarpoolError, prefixed
+from ..base.input_files import open_input
 from ..base.words import printable
 from ..base.xmlfile import refuse_entity
 from ..scene.actors import Actor
@@ -452,8 +454,10 @@ def _elements(path: Path) -> Iterator[tuple[str, Mapping[str, str]]]:
     parser = expat.ParserCreate()
     parser.EntityDeclHandler = refuse_entity
     parser.StartElementHandler = lambda tag, at: begun.append((tag, at))
-    with (gzip.open if path.suffix.lower() == ".gz" else open)(path, "rb") as file:
-        while piece := file.read(_PIECE):
+    with open_input(path) as file:
+        is_packed = path.suffix.lower() == ".gz"
+        content: BufferedIOBase = gzip.GzipFile(fileobj=file) if is_packed else file
+        while piece := content.read(_PIECE):
             parser.Parse(piece)
             yield from begun
             begun.clear()

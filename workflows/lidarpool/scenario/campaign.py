@@ -23,6 +23,7 @@ from pydantic_core import to_json
 from ..base.declared import Seed
 from ..base.errors import LidarpoolError, Mistakes, prefixed
 from ..base.fingerprint import fingerprint
+from ..base.input_files import open_input, read_input_text
 from ..base.shard import ALL, Shard
 from ..base.textfile import read_text
 from ..base.validation import (
@@ -146,7 +147,7 @@ class CampaignSpec:
         jobs = _Varied(section, path)
         self = cls.__new__(cls)
         self._begin(jobs, section.model_copy(update={"title": section.title or path.stem}))
-        self.command, self.description = shlex.quote(path.name), path.read_text("utf-8-sig")
+        self.command, self.description = shlex.quote(path.name), read_input_text(path)
         return self
 
     @classmethod
@@ -283,7 +284,7 @@ def is_campaign(path: str | Path) -> bool:
     if path.suffix.lower() not in _SUFFIXES:
         return False
     try:
-        if not _KEYS.search(path.read_text("utf-8-sig")):
+        if not _KEYS.search(read_input_text(path)):
             return False  # without reading all poses of a scenario as YAML
         return bool({"base", "vary"} & read_yaml(path).keys())
     except (OSError, ValueError, LidarpoolError):
@@ -656,7 +657,7 @@ def hashes(files: Iterable[Path]) -> list[tuple[str, str]]:
 @cache
 def _hash(path: Path, *_: int) -> str:
     """SHA-256 of a file, which is read once for each of its states."""
-    with path.open("rb") as file:
+    with open_input(path) as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 

@@ -330,6 +330,10 @@ class SceneSection(Section):
             max_length=10_000,
         ),
     ] = ()
+    same_names: Annotated[
+        Literal["number", "join"],
+        about("objects of files with equal names: number them (Wall, Wall.2), or join them to one"),
+    ] = "number"
     ground: Annotated[
         Ground | None,
         about("a horizontal rectangle below the scene, metres", {"height_m": 0, "margin_m": 5}),

@@ -18,6 +18,7 @@ from ..scene.actors import Actor, box, one_mesh
 from ..scene.files.meshfile import ROBOTS, Objects, load_objects
 from ..scene.files.scene_graph import Raster
 from ..scene.files.urdf import load_robot
+from ..scene.object_names import told_apart
 from ..scene.robot import Robot
 from ..scene.scene import Scene
 from ..scene.scene_instances import SceneInstance
@@ -114,6 +115,7 @@ def read_static_scene(scenario: Scenario) -> StaticScene:
             meshes += read.standing
             moving += read.moving
     mistakes.tell()
+    meshes = told_apart(meshes, section.same_names, found.notes.append)
     if section.copies:
         meshes += _copies(shapes, meshes)
     objects = Objects(tuple(meshes), tuple(moving))

@@ -15,6 +15,7 @@ from PIL import Image
 
 from ..base.allowance import Allowance
 from ..base.arrays import AnyArray, Bools, Bytes, Floats, Floats32, Ints
+from ..base.input_files import InputFileError, open_input
 from ..base.words import printable
 from .colours import Colours
 from .scene_mesh import UV_MOST, Cutout
@@ -87,18 +88,22 @@ def read_colours(image: Path | bytes, allowance: Allowance, notes: MaskNotes) ->
 def _opened(image: Path | bytes) -> Iterator[Image.Image]:
     """Open an image; MaskError for whatever is wrong with it, also in the body."""
     name = image.name if isinstance(image, Path) else "its image"
-    source = image if isinstance(image, Path) else BytesIO(image)
     try:
         # Pillow warns of images that it reads all the same, and of those that are too large.
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             warnings.simplefilter("error", Image.DecompressionBombWarning)
-            with Image.open(source, formats=FORMATS) as opened:
+            with (
+                open_input(image) if isinstance(image, Path) else BytesIO(image) as source,
+                Image.open(source, formats=FORMATS) as opened,
+            ):
                 yield opened
     except Image.UnidentifiedImageError as error:
         raise MaskError(f"{name} is no {', '.join(FORMATS)}") from error
     except (Image.DecompressionBombError, Image.DecompressionBombWarning, _TooLargeError) as error:
         raise MaskError(f"{name} has too many pixels") from error
+    except InputFileError as error:
+        raise MaskError(f"{name} is no image: {error.strerror}") from error
     except Exception as error:
         # Decoders raise whatever they stumble over: OSError, SyntaxError, struct.error, …
         raise MaskError(f"{name} cannot be decoded") from error

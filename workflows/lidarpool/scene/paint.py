@@ -31,9 +31,10 @@ _UP, _FLAT, _STEEP = 0.2, 0.98, 0.65  # of normals along z: roofs, level ones; o
 
 
 def painted(scene: Scene) -> Scene:
-    """Give a scene of `city` or `terrain` plain colours."""
-    kinds = [name.rpartition("-")[0] or name for name in scene.names]
-    turns = [int(name.rpartition("-")[2]) if "-" in name else 0 for name in scene.names]
+    """Give a scene of `city` or `terrain` plain colours, by the names that these give objects."""
+    numbered = [name.rpartition("-") for name in scene.names]
+    kinds = [kind or name for kind, _, name in numbered]
+    turns = [int(number) if kind else 0 for kind, _, number in numbered]
     paints = [
         _FIRST[kind] + turn % len(_PAINTS[kind]) if kind in _PAINTS else 0
         for kind, turn in zip(kinds, turns, strict=True)

@@ -8,20 +8,24 @@ from, and closed what is open, so that a tenth of the ranges were wrong by more 
 from __future__ import annotations
 
 import io
-import struct
 from collections.abc import Callable
-from importlib.util import find_spec
+from itertools import accumulate
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
-from ..base.allowance import bytes_of, check_fits, memory
+from ..base.allowance import bytes_of, memory
 from ..base.arrays import Floats
 from ..base.errors import LidarpoolError, explained, prefixed
+from ..base.input_files import check_input, read_input, read_input_text
 from ..base.open3d_module import load_open3d
 from ..base.validation import checked
+from ..base.vocabulary import UNITS_M
 from ..base.words import printable
+from .files.las import las_units, open_las
+from .files.meshfile import converted, warn
+from .files.pcd import checked_pcd
 from .files.polygon_files import read_ply_points
 from .scene import Scene
 from .scene_instances import FARTHEST_M
@@ -33,12 +37,18 @@ _NEIGHBOURS, _EXTENT = 12, 0.85
 _MOST_VOXELS = 3  # that half a surfel is long: distant and stray points have no neighbours
 _SAMPLE = 20_000  # points whose neighbours tell the spacing
 _NEAREST = 9  # a point itself, and the eight around it on a square grid
-_RECORD = 54  # least bytes of a variable-length record of .las, all before the first point
 _BYTES = 700  # for a point while its surfel is made and written
 
 
 @checked
-def scene_of_points(path: str | Path, *, voxel_m: float | None = None, size: float = 1.0) -> Scene:
+def scene_of_points(
+    path: str | Path,
+    *,
+    voxel_m: float | None = None,
+    size: float = 1.0,
+    unit: Literal[tuple(UNITS_M)] | None = None,  # type: ignore[valid-type]
+    tell: Callable[[str], None] = warn,
+) -> Scene:
     """Make a scene of a point cloud, for example a scan of a real place.
 
     A surfel lies where a principal component analysis of the 12 nearest points puts their plane,
@@ -48,12 +58,16 @@ def scene_of_points(path: str | Path, *, voxel_m: float | None = None, size: flo
     ----------
     path
         .ply, .pcd, .xyz (x, y and z are the first numbers of a line), .las or .laz, which need
-        laspy. In metres, Z-up.
+        laspy. Z-up; .las and .laz in the units of their coordinate system, others in metres.
     voxel_m
         Edge of the cubes in each of which all points become their mean. By default the median
         distance of points to the eighth of their neighbours.
     size
         A factor of the surfels' sides: larger ones close gaps, and reach farther beyond edges.
+    unit
+        Unit of x, y and z, in place of metres or of the units that a .las or .laz states.
+    tell
+        Called with a line on units that were converted; by default this package's logger warns.
 
     Returns
     -------
@@ -62,13 +76,14 @@ def scene_of_points(path: str | Path, *, voxel_m: float | None = None, size: flo
     Raises
     ------
     LidarpoolError
-        If the file cannot be read, has fewer than 12 points, or needs too much memory.
+        If the file cannot be read, has fewer than 12 points or a coordinate system without lengths,
+        or needs too much memory.
     """
     path = Path(path)
     for name, value in (("voxel_m", voxel_m), ("size", size)):
         if value is not None and not 0 < value < np.inf:
             raise LidarpoolError(f"{name} is {value}; it must be a positive number.")
-    return Scene.from_meshes([surfels(path, _read(path), voxel_m, size)])
+    return Scene.from_meshes([surfels(path, _read(path, unit, tell), voxel_m, size)])
 
 
 def surfels(path: Path, points: Floats, voxel_m: float | None, size: float = 1.0) -> SceneMesh:
@@ -128,18 +143,21 @@ def _spacing(o3d: Any, points: Floats) -> float:
     return float(np.sqrt(np.median(squares.numpy()[:, -1])))
 
 
-def _read(path: Path) -> Floats:
-    """Finite points (n, 3) of a file."""
+def _read(path: Path, unit: str | None, tell: Callable[[str], None]) -> Floats:
+    """Return the finite points of a file, (n, 3), metres."""
     suffix = path.suffix.lower()
     if suffix not in SUFFIXES:
+        if advice := converted(path):
+            raise LidarpoolError(f"{path} is not read: {advice}.")
         raise LidarpoolError(
             f"{path} has the ending {path.suffix or '(none)'}; point clouds are read from "
             f"{' '.join(SUFFIXES)}."
         )
     try:
         with explained(f"{path} cannot be read"), prefixed(path):
-            check_fits(path)
-            points = _READERS[suffix](path)
+            check_input(path)
+            metres = _metres(path, unit, tell)
+            points = _READERS[suffix](path) * metres
     except LidarpoolError:
         raise
     except Exception as error:  # readers raise whatever they stumble over
@@ -154,9 +172,21 @@ def _read(path: Path) -> Floats:
     if (reach := np.abs(points).max()) > FARTHEST_M:
         raise LidarpoolError(
             f"{path} reaches {reach:.3g} m from zero, farther than anything on Earth: it is "
-            "broken, or not in metres."
+            "broken, or in another unit (--unit, in Python unit=)."
         )
     return points
+
+
+def _metres(path: Path, unit: str | None, tell: Callable[[str], None]) -> Floats:
+    """Return the metres in the units of x, y and z of a file, (3,)."""
+    if unit is not None:
+        return np.full(3, UNITS_M[unit])
+    units = las_units(path) if path.suffix.lower() in (".las", ".laz") else None
+    if units is None:
+        return np.ones(3)
+    if note := units.note():
+        tell(f"{path} {note}")
+    return np.array(units.factors)
 
 
 def _read_pcd(path: Path) -> Floats:
@@ -164,15 +194,14 @@ def _read_pcd(path: Path) -> Floats:
 
     Of truncated text, Open3D returns uninitialised memory as points.
     """
-    head, _, rest = path.read_bytes().partition(b"\nDATA ")
-    lines = {words[0]: words[1:] for words in map(str.split, head.decode("latin-1").splitlines())
-             if words}  # fmt: skip
-    count = int(lines["POINTS"][0])
-    if not 0 <= count <= len(rest):
-        raise ValueError(f"{count:,} points announced, but there are fewer")
-    if rest.startswith(b"ascii"):
-        columns = [lines["FIELDS"].index(axis) for axis in "xyz"]
-        points = np.loadtxt(io.BytesIO(rest), usecols=columns, skiprows=1, ndmin=2)
+    header = checked_pcd(path)
+    count = int(header["POINTS"][0])
+    if header["DATA"][0] == "ascii":
+        repeats = map(int, header.get("COUNT", ["1"] * len(header["FIELDS"])))
+        starts = dict(zip(header["FIELDS"], accumulate(repeats, initial=0), strict=False))
+        columns = [starts[axis] for axis in "xyz"]
+        _, _, rows = read_input(path).partition(b"\nDATA ascii")
+        points = np.loadtxt(io.BytesIO(rows), usecols=columns, skiprows=1, ndmin=2)
     else:
         o3d = load_open3d()
         with o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error):
@@ -182,29 +211,25 @@ def _read_pcd(path: Path) -> Floats:
     return points
 
 
-def _read_las(path: Path) -> Floats:
-    if find_spec("laspy") is None:
-        raise LidarpoolError('it is read by laspy: pip install "lidarpool[las]"')
-    import laspy  # an extra
+def _read_xyz(path: Path) -> Floats:
+    return np.loadtxt(io.StringIO(read_input_text(path)), usecols=(0, 1, 2), ndmin=2)
 
-    with path.open("rb") as start:
-        first, records = struct.unpack("<II", start.read(104)[96:])
-    if _RECORD * records > first:  # laspy would go through four thousand million of them
-        raise ValueError("its header is wrong")
-    with laspy.open(path, read_evlrs=False) as file:
-        if (size := file.header.point_count * _BYTES) > memory():
+
+def _read_las(path: Path) -> Floats:
+    with open_las(path) as reader:
+        if (size := reader.header.point_count * _BYTES) > memory():
             raise LidarpoolError(
-                f"it has {file.header.point_count:,} points, which take {bytes_of(size)} of "
+                f"it has {reader.header.point_count:,} points, which take {bytes_of(size)} of "
                 "memory: thin it first."
             )
-        found = file.read_points(-1)
-    return np.stack([found.x, found.y, found.z], axis=1)
+        points = reader.read_points(-1)
+    return np.stack([points.x, points.y, points.z], axis=1)
 
 
 _READERS: dict[str, Callable[[Path], Floats]] = {
-    ".ply": lambda path: read_ply_points(path.read_bytes()),
+    ".ply": lambda path: read_ply_points(read_input(path)),
     ".pcd": _read_pcd,
-    ".xyz": lambda path: np.loadtxt(path, usecols=(0, 1, 2), ndmin=2),
+    ".xyz": _read_xyz,
     ".las": _read_las,
     ".laz": _read_las,
 }

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable
 from copy import copy
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -22,8 +22,9 @@ from . import colours as coloured
 from .actors import Actor
 from .colours import Colours, within
 from .face_materials import ObjectMaterials
-from .files.meshfile import Objects, OpacityMode, load_objects
+from .files.meshfile import Objects, OpacityMode, load_objects, warn
 from .files.rasters import Window
+from .object_names import SameNames, told_apart, unique_names
 from .scene_instances import Instances, MeshPart, SceneInstance, parts_of
 from .scene_mesh import Cutout, SceneMesh, compacted, points_array, stacked
 from .shapes import seed_objects
@@ -138,6 +139,7 @@ class Scene:
         window: Window | None = None,
         epsg: int | None = None,
         assets: str | Path | None = None,
+        same_names: SameNames = "number",
     ) -> Scene:
         """Read a scene file, such as .glb, .obj, .usd, CityJSON, or a raster of heights (.tif).
 
@@ -168,6 +170,9 @@ class Scene:
         assets
             A folder: files that the file names are read from here and below, and from its own
             folder and below.
+        same_names
+            With "number", objects that have the name of another one get a number: Wall, Wall.2.
+            With "join", all objects of a name are one object.
 
         Returns
         -------
@@ -191,7 +196,8 @@ class Scene:
             epsg=epsg,
             assets=assets,
         )
-        return cls.of_objects(found)
+        standing = told_apart(found.standing, same_names, lambda note: warn(f"{path}: {note}"))
+        return cls.of_objects(found._replace(standing=tuple(standing)))
 
     @classmethod
     def of_objects(cls, objects: Objects, tell: Callable[[str], None] = _log.warning) -> Scene:
@@ -549,25 +555,3 @@ def local_origin(vertices: Floats) -> Floats:
     if np.abs(middle).max() <= FAR_FROM_ZERO_M:
         return np.zeros(3)
     return np.round(middle)
-
-
-def unique_names(names: Sequence[str]) -> tuple[str, ...]:
-    """Make names unique by numbering repeated ones: Shelf, then Shelf.2.
-
-    Examples
-    --------
-    >>> unique_names(["Shelf", "Shelf", "Shelf.2", "Shelf"])
-    ('Shelf', 'Shelf.3', 'Shelf.2', 'Shelf.4')
-    """
-    given = set(names)
-    taken: set[str] = set()
-    numbers: dict[str, int] = {}  # {name: the last number given to it}
-    out = []
-    for name in names:
-        unique = name
-        while unique in taken or (unique != name and unique in given):
-            numbers[name] = numbers.get(name, 1) + 1
-            unique = f"{name}.{numbers[name]}"
-        taken.add(unique)
-        out.append(unique)
-    return tuple(out)

@@ -15,11 +15,11 @@ from typing import Annotated, Any, Literal, NamedTuple
 import numpy as np
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, model_validator
 
-from ..base.allowance import check_fits
 from ..base.arrays import Floats
 from ..base.declared import UnitShare
 from ..base.elementary import log1p
 from ..base.errors import LidarpoolError
+from ..base.input_files import read_input_text
 from ..base.validation import checked, sentences
 from ..base.words import did_you_mean
 from ..base.yamlfile import load_yaml
@@ -302,10 +302,9 @@ def _built_in(name: str) -> SensorModel:
 
 def _read(path: Path | Traversable) -> SensorModel:
     try:
-        if isinstance(path, Path):
-            check_fits(path)
+        text = read_input_text(path) if isinstance(path, Path) else path.read_text("utf-8")
         with sentences(SensorModel, path):
-            return SensorModel.model_validate(load_yaml(path.read_text("utf-8-sig")))
+            return SensorModel.model_validate(load_yaml(text))
     except UNUSABLE as error:
         raise LidarpoolError(f"{path} is not a usable model: {said(error)}") from error
 

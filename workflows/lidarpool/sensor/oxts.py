@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ..base.allowance import check_fits
+from ..base.input_files import read_input_text
 from ..base.arrays import Floats
 from ..base.elementary import log, sin_cos, sin_cos_of
 from ..base.words import natural
@@ -49,13 +49,11 @@ def read_oxts(folder: Path, origin: Sequence[float] | None) -> tuple[Floats, Flo
         raise ValueError("its folder data has no .txt files")
     rows = []
     for file in files:
-        check_fits(file)
-        numbers = file.read_text("utf-8-sig").split()
+        numbers = read_input_text(file).split()
         if len(numbers) != WIDTH:
             raise ValueError(f"data/{file.name} has {len(numbers)} numbers, not {WIDTH}")
         rows.append([float(number) for number in numbers])
-    check_fits(folder / OXTS_TIMES)
-    lines = (folder / OXTS_TIMES).read_text("utf-8-sig").split("\n")
+    lines = read_input_text(folder / OXTS_TIMES).split("\n")
     times = np.array([line.strip() for line in lines if line.strip()], "datetime64[ns]")
     if len(times) != len(files):
         raise ValueError(f"it has {len(files)} files of data, and {OXTS_TIMES} {len(times)} times")

@@ -12,9 +12,9 @@ from xml.etree.ElementTree import Element
 
 import numpy as np
 
-from ...base.allowance import check_fits
 from ...base.arrays import Floats
 from ...base.errors import LidarpoolError, explained, prefixed
+from ...base.input_files import read_input
 from ...base.words import did_you_mean
 from ...base.xmlfile import xml_root
 from ...scene.transform import rotation_about
@@ -89,10 +89,9 @@ def _root(path: Path) -> Element:
 
 
 def read(path: Path) -> bytes:
-    """Content of a file; LidarpoolError if it is larger than the memory."""
-    with prefixed(path):
-        check_fits(path)
-    return path.read_bytes()
+    """Read a file; LidarpoolError if it is no plain file or larger than the memory."""
+    with explained(f"{path} cannot be read"), prefixed(path):
+        return read_input(path)
 
 
 def number(values: Element | dict[str, str], name: str, default: float) -> float:

@@ -16,11 +16,13 @@ import numpy as np
 
 from ...base.arrays import Floats
 from ...base.errors import LidarpoolError, prefixed
+from ...base.input_files import read_input_text
 from ...scene.actors import one_mesh
 from ...scene.files.meshfile import load_meshes
 from ...scene.floor import heights_at
+from ...scene.object_names import unique_names
 from ...scene.point_scene import surfels
-from ...scene.scene import Scene, unique_names
+from ...scene.scene import Scene
 from ...scene.scene_instances import SceneInstance
 from ...scene.scene_mesh import SceneMesh
 from ...scene.simplified import Drawn
@@ -299,8 +301,8 @@ def _surfels(path: Path, given: dict[str, str]) -> SceneMesh:
 def _text(path: Path) -> str:
     """Content of a file that may be missing; then empty."""
     try:
-        return path.read_text("utf-8", "replace")
-    except (OSError, ValueError):  # a zero in the name
+        return read_input_text(path, "replace")
+    except (OSError, ValueError, LidarpoolError):  # a zero in the name
         return ""
 
 

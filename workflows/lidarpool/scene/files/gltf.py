@@ -25,6 +25,7 @@ import numpy as np
 from ...base.allowance import Allowance
 from ...base.arrays import AnyArray, Bytes, Floats, Ints
 from ...base.elementary import sin_cos_of
+from ...base.input_files import read_input
 from ...base.vectors import applied, length, matmul
 from ...base.words import plural
 from ...sensor.trajectory import matrices
@@ -584,7 +585,7 @@ class _Reader:
                 "as .glb"
             )
         self._allowance.add_file(target)
-        return target.read_bytes()
+        return read_input(target)
 
 
 def _inline(uri: str) -> bytes:

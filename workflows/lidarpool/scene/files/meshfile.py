@@ -12,10 +12,10 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
-from ...base.allowance import check_fits
 from ...base.arrays import Floats
 from ...base.elementary import cbrt
 from ...base.errors import LidarpoolError, prefixed
+from ...base.input_files import open_input, read_input
 from ...base.validation import checked
 from ...base.vectors import determinant, matmul, turned
 from ...base.vocabulary import UNITS_M
@@ -59,16 +59,37 @@ _READERS: dict[str, Callable[[bytes, Path, Wanted], Content]] = {
 SUFFIXES = (*_READERS, *RASTERS)
 ROBOTS = (".urdf", ".xacro")  # of which `urdf` refuses the latter, with what to do
 _MUJOCO = "a model of MuJoCo becomes OpenUSD by mujoco-usd-converter"
-CONVERTED = {  # {ending of scenes that are not read: what to do}
-    **dict.fromkeys((".fbx", ".blend", ".3ds"), "export it as .glb, for example from Blender"),
+_POINTS = "make a mesh of it by lidarpool scene points"
+_BLENDER = "export it as .glb, for example from Blender"
+_GAZEBO = (
+    "it is a world or model of Gazebo, convert it to OpenUSD (sdf2usd of gz-usd) or URDF, or name "
+    "the meshes that it names"
+)
+_CAD = "it is a CAD model, make a mesh of it, for example .stl or .glb from FreeCAD"
+_RECORDING = (
+    "it is a recording, write its points as .ply, .pcd or .las and make a mesh of these by "
+    "lidarpool scene points"
+)
+CONVERTED = {  # {ending of files that are not read as scenes: what to do}
+    **dict.fromkeys((".fbx", ".blend", ".3ds", ".x3d", ".wrl", ".dxf", ".abc"), _BLENDER),
+    **dict.fromkeys((".las", ".laz", ".pcd", ".xyz"), _POINTS),
+    ".pts": f"it is a point cloud, write it as .xyz, .ply or .las and {_POINTS}",
+    ".e57": f"it is a point cloud, write it as .las (pdal translate IN.e57 OUT.las) and {_POINTS}",
+    **dict.fromkeys((".pcap", ".mcap", ".bag", ".db3", ".osf"), _RECORDING),
+    **dict.fromkeys((".sdf", ".world"), _GAZEBO),
+    **dict.fromkeys((".step", ".stp", ".iges", ".igs", ".brep", ".fcstd"), _CAD),
     **dict.fromkeys(
-        (".las", ".laz", ".pcd", ".xyz"), "make a mesh of it by lidarpool scene points"
+        (".dwg", ".skp"), "export it as .dae, .obj or .glb from the program that wrote it"
     ),
-    ".sdf": "convert it to OpenUSD (sdf2usd of gz-usd) or URDF, or name the meshes that it names",
+    **dict.fromkeys(
+        (".ifc", ".ifczip"), "it is a building, make a mesh of it: IfcConvert IN.ifc OUT.glb"
+    ),
+    ".gml": "it is a city model, convert it to CityJSON: citygml-tools to-cityjson IN.gml",
+    ".osm": "it is a map, make a mesh of its buildings, for example by blosm in Blender",
     ".mjcf": _MUJOCO,
     ".xml": f"{_MUJOCO}, lidarpool import reads a survey of HELIOS++, and traffic.file of a "
     "scenario names floating car data of SUMO",
-    ".xodr": "make a mesh of its roads, for example by libOpenDRIVE",
+    ".xodr": "it is a road network, make a mesh of its roads, for example by libOpenDRIVE",
 }
 ANIMATED = (".glb", ".gltf", ".usd", ".usda", ".usdc", ".usdz")
 UNITLESS = (".obj", ".stl", ".ply", ".off")  # formats without a unit
@@ -165,7 +186,7 @@ def load_objects(
     """
     path = Path(path)
     is_raster = path.suffix.lower() in RASTERS
-    data = _bytes_of(path, _HEAD if is_raster else -1)
+    data = _bytes_of(path, _HEAD if is_raster else None)
     raster = {"step_m": step_m, "window": window}
     if is_raster:
         if up_axis:
@@ -217,6 +238,11 @@ def load_objects(
     return objects._replace(summary=summary, raster=content.raster)
 
 
+def converted(path: Path) -> str:
+    """Return what to do with a file of a format that is not read; empty for other files."""
+    return CONVERTED.get(path.suffix.lower(), "")
+
+
 def load_meshes(
     path: str | Path, *, tell: Callable[[str], None] = warn, **options: Any
 ) -> tuple[SceneMesh | SceneInstance, ...]:
@@ -257,7 +283,7 @@ def _summary(
 
 def wrote_it(path: Path) -> bool:
     """Whether lidarpool wrote a mesh file of a format without a unit: it is in metres."""
-    with path.open("rb") as file:
+    with open_input(path) as file:
         return OWN.encode() in file.read(_HEAD)
 
 
@@ -323,24 +349,21 @@ def _read_whole(path: Path, data: bytes, wanted: Wanted, raster: dict[str, Any])
         ) from error
 
 
-def _bytes_of(path: Path, most: int) -> bytes:
-    """Content of a file of a known format, or of its beginning; -1 for all."""
+def _bytes_of(path: Path, max_bytes: int | None) -> bytes:
+    """Return the content of a file of a known format, or at most `max_bytes` of its start."""
     suffix = path.suffix.lower()
     if suffix in ROBOTS:
         raise LidarpoolError(f"{path} is a robot: read it with load_robot, or by a scenario.")
-    if suffix in CONVERTED:
-        raise LidarpoolError(f"{path} is not read: {CONVERTED[suffix]}.")
+    if advice := converted(path):
+        raise LidarpoolError(f"{path} is not read: {advice}.")
     if suffix not in SUFFIXES:
         raise LidarpoolError(
             f"{path} has the ending {path.suffix or '(none)'}, which is not a mesh format that "
             f"can be read; these are: {' '.join(SUFFIXES)} (a scenario has the ending .yaml)."
         )
     try:
-        if most < 0:
-            with prefixed(path):
-                check_fits(path)
-        with path.open("rb") as file:
-            data = file.read(most)
+        with prefixed(path):
+            data = read_input(path, max_bytes)
     except (FileNotFoundError, NotADirectoryError) as error:
         raise LidarpoolError(
             f"{path} does not exist: check the name and the folder.{_like(path)}"
@@ -366,7 +389,6 @@ def _like(path: Path) -> str:
 _FOREIGN = {
     rb"\x1f\x8b|BZh|\xfd7zXZ\0|7z\xbc\xaf": "is packed: unpack it first",
     rb"(?i)\s*(<!doctype html|<html)": "is a web page: download the file itself",
-    rb"version https://git-lfs": "is a Git LFS pointer: get the mesh with git lfs pull",
 }
 # Beginnings by which a file of the wrong ending is recognised, and endings that suit them.
 _BEGINNINGS = {

@@ -13,6 +13,7 @@ import numpy as np
 
 from ...base.allowance import Allowance
 from ...base.arrays import Bytes, Floats, Ints
+from ...base.input_files import read_input
 from ...base.words import as_text
 from ..colours import Colours, as_bytes
 from ..masks import HALF, MaskNotes, Texture, Wrap, read_colours, read_opacity, remembered
@@ -146,7 +147,7 @@ class MtlMaterials:
     def _content(self, path: Path | None) -> bytes:
         if path is None or path.stat().st_size > _MOST_BYTES:
             raise FileNotFoundError
-        return path.read_bytes()
+        return read_input(path)
 
     def _file(self, name: str) -> Path | None:
         """File of materials."""

@@ -60,8 +60,10 @@ class _ObjPolygons:
 def read_obj(data: bytes, path: Path, wanted: Wanted) -> Content:
     """Read a Wavefront file: an object for each name after 'o', or 'g' without any 'o'.
 
-    Objects are in order of their first face; materials do not divide them. Without masks,
-    triangles are solid; without these and colours, neither files of materials nor images are read.
+    A repeated name begins another object after 'o', and continues the group after 'g', as the
+    format says. Objects are in order of their first face; materials do not divide them. Without
+    masks, triangles are solid; without these, colours and wanted materials, neither files of
+    materials nor images are read.
     """
     masks, colours = wanted.masks, wanted.colours
     text = data.replace(b"\r\n", b"\n").replace(b"\r", b"\n")
@@ -71,8 +73,8 @@ def read_obj(data: bytes, path: Path, wanted: Wanted) -> Content:
     materials = MtlMaterials(path, len(data), libraries, wanted)
     dressed = materials.has_masks or colours or wanted.materials
     numbers, coordinates, tints = array("d"), array("d"), array("d")
-    parts = {path.stem: _ObjPolygons()}
-    part, kind, kinds = parts[path.stem], 0, {b"": 0}  # {material: its number}
+    parts = {(path.stem, 0): _ObjPolygons()}  # {(name, number of the line 'o'): polygons}
+    part, kind, kinds = parts[path.stem, 0], 0, {b"": 0}  # {material: its number}
     for line in text.split(b"\n"):
         key, _, rest = line.lstrip(b" ").partition(b" ")
         if key == b"v":
@@ -91,7 +93,8 @@ def read_obj(data: bytes, path: Path, wanted: Wanted) -> Content:
                 part.places.extend(_obj_places(rest, len(coordinates) // 2))
                 part.kinds.append(kind)
         elif key == divider:
-            part = parts.setdefault(as_text(rest.strip()) or path.stem, _ObjPolygons())
+            key_of_part = as_text(rest.strip()) or path.stem, len(parts) if divider == b"o" else 0
+            part = parts.setdefault(key_of_part, _ObjPolygons())
         elif key == b"usemtl":
             kind = kinds.setdefault(rest.strip(), len(kinds))
         elif key == b"vt" and dressed:
@@ -102,7 +105,7 @@ def read_obj(data: bytes, path: Path, wanted: Wanted) -> Content:
     if colours and len(tints) == len(numbers):
         tinted = as_bytes(_shares(np.frombuffer(tints).reshape(-1, 3)))
     names, meshes = list(kinds), list[SceneMesh]()
-    for name, part in parts.items():
+    for (name, _), part in parts.items():
         faces, at, kind_of = part.triangles(vertices)
         pieces = []
         for number in np.unique(kind_of).tolist():

@@ -20,9 +20,10 @@ from uuid import uuid4
 
 import numpy as np
 
-from ...base.allowance import LEAST, bytes_of, check_fits, memory_share
+from ...base.allowance import LEAST, bytes_of, memory_share
 from ...base.arrays import AnyArray, Bools, Floats
 from ...base.elementary import decade
+from ...base.input_files import input_size, read_input
 from ...base.vocabulary import UNITS_M
 from ...base.words import plural
 from ..scene_mesh import SceneMesh
@@ -129,15 +130,15 @@ def _opened(path: Path) -> Iterator[Any]:
         stack.enter_context(rasterio.Env(GDAL_CACHEMAX=LEAST, **alone))
         try:
             if driver == "GTiff":  # which may be larger than the memory, and reads a window
+                input_size(path)
                 source = rasterio.open(path.absolute(), driver=driver)
             else:
-                check_fits(path)
                 name = uuid4().hex
                 folder = f"/vsimem/{name}/"
                 stem = path.stem if driver == "SRTMHGT" else "raster"  # whose place is in the name
                 for one, content in (
                     (".prj", _beside(path, ".prj")),
-                    (path.suffix.lower(), path.read_bytes()),
+                    (path.suffix.lower(), read_input(path)),
                 ):
                     memory = MemoryFile(content, dirname=name, filename=f"{stem}{one}")
                     stack.enter_context(memory)
@@ -153,8 +154,7 @@ def _beside(path: Path, suffix: str) -> bytes:
     """Content of a small file beside a raster; empty if there is none."""
     for one in (suffix, suffix.upper()):
         if (file := path.with_suffix(one)).is_file():
-            with file.open("rb") as opened:
-                return opened.read(_BESIDE_MOST)
+            return read_input(file, _BESIDE_MOST)
     return b""
 
 

@@ -17,9 +17,10 @@ from xml.etree.ElementTree import Element, ParseError
 
 import numpy as np
 
-from ...base.allowance import Allowance, check_fits
+from ...base.allowance import Allowance
 from ...base.arrays import Bytes, Floats
 from ...base.errors import LidarpoolError, prefixed
+from ...base.input_files import read_input
 from ...base.validation import checked, shown
 from ...base.vectors import length
 from ...base.words import printable
@@ -75,8 +76,7 @@ def load_robot(
     """
     path = Path(path)
     try:
-        check_fits(path)
-        data = path.read_bytes()
+        data = read_input(path)
     except (OSError, ValueError) as error:
         reason = getattr(error, "strerror", None) or error
         raise LidarpoolError(f"{path} cannot be read: {reason}.") from error
@@ -381,8 +381,7 @@ def _package_name(folder: Path) -> str:
     """Name in the package.xml of a folder; empty if there is none."""
     file = folder / "package.xml"
     try:
-        check_fits(file)
-        return (xml_root(file.read_bytes()).findtext("name") or "").strip()
+        return (xml_root(read_input(file)).findtext("name") or "").strip()
     except (OSError, ValueError, LookupError, ParseError, LidarpoolError):
         return ""
 

@@ -559,6 +559,32 @@ def _reason(error: Exception, path: str) -> str:
     return re.sub(r"pxrInternal\w+::", "", text)[:300]
 
 
+def _checked_layers(path: str) -> list[Any]:
+    """Open a layer and its sublayers, and check the kind of every file that they name.
+
+    Opening a pipe waits for a writer. Layers that references of other layers name are not checked:
+    of these the composition decides which are opened.
+
+    Raises
+    ------
+    ValueError
+        If a file is a pipe, a socket or a device.
+    """
+    layers = [Sdf.Layer.FindOrOpen(path)]
+    names = {path}
+    for layer in filter(None, layers):
+        for name in layer.GetCompositionAssetDependencies():
+            named = layer.ComputeAbsolutePath(name)
+            outer = Ar.SplitPackageRelativePathOuter(named)[0]
+            is_usual = os.path.isfile(outer) or os.path.isdir(outer)  # noqa: PTH112, PTH113
+            if os.path.exists(outer) and not is_usual:  # noqa: PTH110
+                raise ValueError(f"it names {name[-80:]!r}, which is no plain file")
+            if name in layer.subLayerPaths and named not in names:
+                names.add(named)
+                layers.append(Sdf.Layer.FindOrOpen(named))
+    return layers
+
+
 def main(path: str, asked: dict[str, Any]) -> None:
     """Read a file, and write frames."""
     out = os.fdopen(os.dup(1), "wb")
@@ -574,7 +600,9 @@ def main(path: str, asked: dict[str, Any]) -> None:
 
     silent = UsdUtils.CoalescingDiagnosticDelegate()
     try:
+        layers = _checked_layers(path)
         stage = Usd.Stage.Open(path)
+        del layers
         missing = _missing(stage)
         animations, moved, times = _played(stage, asked)
         write({
