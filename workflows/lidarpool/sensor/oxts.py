@@ -13,9 +13,9 @@ from pathlib import Path
 
 import numpy as np
 
-from ..base.input_files import read_input_text
 from ..base.arrays import Floats
 from ..base.elementary import log, sin_cos, sin_cos_of
+from ..base.input_files import read_input_text
 from ..base.words import natural
 from .trajectory import quaternions_of, rotations_of
 
