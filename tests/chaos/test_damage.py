@@ -25,7 +25,7 @@ from lidarpool.columns.parts import part_name
 from lidarpool.pipeline.database import RunDatabase
 from lidarpool.pipeline.messages import Receipt
 
-DAMAGES = 12  # of each file, for each reader
+DAMAGES = 6  # of each file, for each reader
 
 
 @pytest.fixture(scope="module")
