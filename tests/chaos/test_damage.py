@@ -25,7 +25,7 @@ from lidarpool.columns.parts import part_name
 from lidarpool.pipeline.database import RunDatabase
 from lidarpool.pipeline.messages import Receipt
 
-DAMAGES = 12  # of each file, for each reader
+DAMAGES = 6  # of each file, for each reader
 
 
 @pytest.fixture(scope="module")
@@ -56,7 +56,7 @@ def test_files_of_a_data_set_are_read_right_or_refused(dataset, name):
         if file.suffix != ".parquet":
             attack(whole, reader, file, DAMAGES, chance, outcome, name)
     assert not outcome.faults, "\n".join(outcome.faults)
-    assert outcome.ends["refused"] > DAMAGES
+    assert outcome.ends["refused"] and outcome.ends["right"]
 
 
 def test_a_damaged_database_is_refused_or_the_same(tmp_path):

@@ -213,10 +213,10 @@ def test_signatures_can_be_read():
     )
     for name in lidarpool.__all__:
         thing = getattr(lidarpool, name)
-        if not callable(thing):
+        if not callable(thing) or thing is LidarpoolError:
             continue
         methods = [getattr(thing, one) for one in dir(thing) if not one.startswith("_")]
-        for one in (thing, *filter(inspect.isroutine, methods)):
+        for one in (thing, *filter(inspect.isfunction, methods)):
             text = str(inspect.signature(one))
             assert "Annotated" not in text and "about(" not in text, name
 

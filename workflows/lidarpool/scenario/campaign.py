@@ -125,10 +125,16 @@ class CampaignSpec:
         self._begin(_Made(make, count, seed), head)
 
     def _begin(self, jobs: _JobSource, head: CampaignSection) -> None:
-        self.seed, self.keep, self.splits = head.seed, head.keep, head.splits
-        self.license, self.title = head.license, head.title
-        self.count, self.files, self.choices = jobs.count, jobs.files, jobs.choices
-        self._jobs, self._splits = jobs, Splits(head.splits, head.seed)
+        self.seed = head.seed
+        self.keep = head.keep
+        self.splits = dict(head.splits)  # a read-only view of it cannot be pickled
+        self.license = head.license
+        self.title = head.title
+        self.count = jobs.count
+        self.files = jobs.files
+        self.choices = dict(jobs.choices)
+        self._jobs = jobs
+        self._splits = Splits(self.splits, head.seed)
 
     @classmethod
     @checked
