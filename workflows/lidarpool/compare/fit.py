@@ -61,6 +61,7 @@ _CHANGED_M = 0.1  # median change of ranges, from sweep to sweep, of a place tha
 _AGREEING = 0.5  # least share of the rays that a motion changes and explains
 _PAIRS, _YAW_M = 8, 10.0  # pairs of sweeps for the motion; distance at which yaw counts, metres
 _ROUGH_M, _SHIFT_M = 0.02, 0.5  # noise of ranges, and motion, for which rays are weighted, metres
+_AROUND = 5  # rays on either side whose scatter counts
 _SELDOM = 0.3  # a cell that returns in fewer sweeps tells no gap
 _CHANCE = -16.0  # logarithm of the chance of a run of lost pulses that is a gap instead
 _KINK_M, _KINK = 0.01, 0.001  # by how much a surface may leave its plane within four columns
@@ -71,6 +72,11 @@ _OTHER_DEG = 2.0  # a ring that is farther from all beams of a model is not one 
 _Z, _STEP = 1.959964, 1e-3  # of 95 %; of logarithms, for derivatives
 # Chances of a variance above which a ray is left out: certainly, and at most.
 _REJECTED, _TRIMMED = 1e-4, 0.1
+_PATCH_ROWS, _PATCHES = 4, 36  # rings of a patch of rays; patches of a turn
+_FRONTAL = 1.0  # tangent of incidence: below, noise is hardly that of directions
+_FRONTAL_RAYS, _FRONTAL_SHARE = 100, 0.05  # least number, and share, of such rays
+_KNOWN = 0.5  # a figure of noise whose interval is wider than this to either side is not determined
+_WRONG = 0.03  # relative error of the variances of steep or far rays
 _OUTLIER = 3.0  # quotient of a variance and the expected one that counts at most
 _SPAN, _TILT = 2.0, 0.3  # least quotient of ranges, and tangent of incidence, that tell noise
 _WEAK_RAYS, _RING_RAYS = 30, 20  # rays with losses that a threshold needs; that of a ring's bias
@@ -248,6 +254,10 @@ class Estimate(NamedTuple):
         spread = ((parts - share * wholes) ** 2).sum() / wholes.sum() ** 2
         return cls.of(share, spread)
 
+    def known_within(self, share: float) -> bool:
+        """Whether the half of the interval is at most this share of the value."""
+        return self.high - self.low <= 2 * share * abs(self.value)
+
     def power(self, exponent: float, scale: float = 1.0) -> Estimate:
         """Return the estimate of a power, times a scale; what is below 0 counts as 0."""
         value, *ends = (round(float(scale * max(one, 0.0) ** exponent), 9) for one in self)
@@ -264,7 +274,7 @@ class Repeats:
     ranges: Floats32  # (s, r, c): metres
     light: Floats32  # (s, r, c): intensities
     aside: Floats32  # (s, r, c): azimuths beside those of the directions, radians
-    sigma: Floats  # (r, c): rough scatter of ranges from sweep to sweep, as its ring has it, metres
+    sigma: Floats  # (r, c): rough scatter of ranges from sweep to sweep, metres
     trials: Ints  # (r, c): sweeps that cover the cell; the others have a gap there
     notes: tuple[str, ...]
 
@@ -322,11 +332,10 @@ class Repeats:
         )
         turned, up = first + mean, np.radians(level) + rise
         ways = [np.cos(up) * np.cos(turned), np.cos(up) * np.sin(turned), np.sin(up)]
-        sigma = _median(np.abs(np.diff(values[0], axis=0)), (0, 2)) / (0.6745 * np.sqrt(2))
-        sigma = np.where(np.isnan(sigma), _KINK_M, np.maximum(sigma, 1e-4))
+        sigma = rough_scatter(values[0])
         repeats = cls(
             cells.rings, cells.elevation_deg, np.stack(ways, axis=-1),
-            values[0], values[1], aside - mean, np.repeat(sigma[:, None], shape[1], axis=1),
+            values[0], values[1], aside - mean, sigma,
             covered.sum(axis=0), tuple(notes),
         )  # fmt: skip
         times = None if recording.times is None else np.array([*recording.times()])[numbers]
@@ -338,6 +347,19 @@ def _median(values: Floats32, axis: int | tuple[int, ...]) -> Any:
     """Return medians over what is there, float64; of nothing NaN."""
     with warnings.catch_warnings(action="ignore"):
         return np.nanmedian(values, axis=axis).astype(np.float64)
+
+
+def rough_scatter(ranges: Floats32) -> Floats:
+    """Scatter of ranges (s, r, c) of the rays around each, metres: that of the ring at least.
+
+    Surfaces that are weak or steep scatter more than others of a ring.
+    """
+    changes = np.abs(np.diff(ranges, axis=0)) / (0.6745 * np.sqrt(2))
+    ring, ray = _median(changes, (0, 2))[:, None], _median(changes, 0)
+    reach = range(-_AROUND, _AROUND + 1)
+    around = _median(np.stack([np.roll(ray, by, axis=1) for by in reach]), 0)
+    ring = np.where(np.isnan(ring), _KINK_M, np.maximum(ring, 1e-4))
+    return np.fmax(around, ring)
 
 
 class Surfaces(NamedTuple):
@@ -551,7 +573,9 @@ def smooth_rays(
     if expected is not None:
         slope = surfaces(repeats, expected, 0 * blur).slope
         smooth &= np.abs(middle - expected) < _BESIDE_M
-    row, column = cell = np.nonzero(smooth)
+    # A cell that is smooth by chance, as in leaves, has no smooth ones beside it.
+    beside = np.sum([np.roll(smooth, by, axis=1) for by in (-2, -1, 1, 2)], axis=0)
+    row, column = cell = np.nonzero(smooth & (beside >= 3))
     images = repeats.ranges, repeats.light, repeats.aside
     ranges, light, aside = (one[:, row, column].astype(np.float64) for one in images)
     ranges -= turn[cell] * aside
@@ -584,10 +608,15 @@ def fit_performance(
             threshold = fit_threshold(energy, rays.returns, rays.trials, dropout.value)
             strong = energy > 2 * threshold.value if threshold else strong
     figures, sigma, deviance = fit_scatter(rays, "range_per_m", rays.distance, 1)
+    frontal = int((rays.slope < _FRONTAL * rays.distance).sum())
     if energy is not None and threshold is not None:
         other = fit_scatter(rays, "range_at_threshold_m", threshold.value / energy, 2)
         if "range_at_threshold_m" in other[0] and other[2] < deviance:
             figures, sigma, _ = other
+    if frontal < max(_FRONTAL_RAYS, _FRONTAL_SHARE * len(rays.row)):
+        figures = {}  # noise of ranges and of directions are the same on steep surfaces
+    figures = {name: one for name, one in figures.items() if one.known_within(_KNOWN)}
+    if threshold is not None:
         figures["detection_range_m"] = threshold.power(-0.5, 10 * np.sqrt(TARGET_REFLECTANCE))
     if alarms := alarm_share(repeats):
         figures["false_alarms"] = alarms
@@ -605,8 +634,10 @@ def fit_scatter(
     """
     low, unit, high = np.quantile(spread, (0.05, 0.5, 0.95))
     tilted = np.quantile(rays.slope / rays.distance, 0.9) > _TILT
-    known = np.array([True, high > _SPAN * low, tilted])
-    repeated = rays.freedom > 0
+    # Growth is fitted even where it is not told: it makes the interval of range_m as wide as it is.
+    known = np.array([True, True, tilted])
+    # Rays that lose some of their pulses are known by the nearer or brighter ones of these.
+    repeated = (rays.freedom > 0) & (rays.returns >= _REPEATED * rays.trials)
     variance, slope, freedom = (
         values[repeated] for values in (rays.variance, rays.slope, rays.freedom)
     )
@@ -623,16 +654,23 @@ def fit_scatter(
         return model(some, spread[repeated], slope)
 
     start = np.array([1.0, 0.1, 0.1])[known]
-    theta, covariance = _trimmed(expected, start, variance, freedom, _TRIMMED)
+    patch = (rays.row // _PATCH_ROWS * _PATCHES + rays.column // max(1, rays.column.max() // _PATCHES))[repeated]
+    theta, covariance = _trimmed(expected, start, variance, freedom, _TRIMMED, patch)
     # Edges that are finer than the rays make the variances of some rays larger: what the figures
     # change if fewer of these are left out is an error of the model.
-    others, _ = _trimmed(expected, theta, variance, freedom, _REJECTED)
+    others, _ = _trimmed(expected, theta, variance, freedom, _REJECTED, patch)
     spreads = np.diag(covariance) + (theta - others) ** 2
+    # Nor are slopes exact: variances of steep rays, or far ones, may be wrong against the others.
+    for quantity in (slope / rays.distance[repeated], spread[repeated]):
+        wrong = _WRONG * np.where(quantity > np.median(quantity), 1.0, -1.0)
+        biased, _ = _trimmed(expected, theta, variance * (1 + wrong), freedom, _TRIMMED, patch)
+        spreads += (biased - theta) ** 2
     names, roots = ("range_m", growth, "angle_deg"), (1 / power, 1 / power, 0.5)
     scales = np.sqrt(usual) / np.array([1, unit, np.radians(steep)])
     figures = {
         names[k]: Estimate.of(value, square).power(roots[k], scales[k])
         for k, value, square in zip(np.flatnonzero(known), theta, spreads, strict=True)
+        if k != 1 or high > _SPAN * low
     }
     sizes = np.minimum(variance / expected(theta), _OUTLIER)
     deviance = freedom @ (np.log(expected(theta)) + sizes)
@@ -645,6 +683,7 @@ def _trimmed(
     variance: Floats,
     freedom: Ints,
     chance: float,
+    patch: Ints,
 ) -> tuple[Floats, Floats]:
     """Fit a model to variances (k,), and estimate the covariance of its parameters.
 
@@ -669,12 +708,20 @@ def _trimmed(
 
         solved = least_squares(off, theta, bounds=(0, np.inf), x_scale=np.maximum(theta, 0.01))
         theta = solved.x
-    return theta, _sandwich(solved.jac, solved.fun)
+    return theta, _sandwich(solved.jac, solved.fun, patch[kept])
 
 
-def _sandwich(design: Floats, off: Floats) -> Floats:
-    """Estimate the covariance of a least-squares fit whose residuals are of unequal size."""
+def _sandwich(design: Floats, off: Floats, patch: Ints | None = None) -> Floats:
+    """Estimate the covariance of a least-squares fit whose residuals are of unequal size.
+
+    Residuals of one patch (k,), such as of a surface, may be alike.
+    """
     inverse, score = np.linalg.pinv(design.T @ design, hermitian=True), design * off[:, None]
+    if patch is not None:
+        _, patch = np.unique(patch, return_inverse=True)
+        sums = np.zeros((patch.max() + 1, score.shape[1]))
+        np.add.at(sums, patch, score)
+        score = sums * np.sqrt(len(sums) / max(len(sums) - 1, 1))
     covariance: Floats = inverse @ (score.T @ score) @ inverse
     return covariance
 
