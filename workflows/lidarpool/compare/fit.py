@@ -145,7 +145,8 @@ def fit(
     Raises
     ------
     LidarpoolError
-        If it cannot be read, has no sweeps or rings, is of several sensors, or scipy is missing.
+        If it cannot be read, has no sweeps or rings, is of several sensors or of one that moves,
+        or scipy is missing.
     """
     need("scipy", "fit", "Figures are fitted")
     if not isinstance(recording, Recording):
@@ -191,6 +192,7 @@ def fit(
     figures = {
         "versions": {"lidarpool": __version__}, "name": name, "model": base.name,
         "sweeps": repeats.sweeps, "rays": len(rays.row),
+        "frontal": meet_frontally(rays),
         "intensity": bool(known), "energy": energy is not None,
         "figures": {key: one._asdict() for key, one in found.items()}, "notes": notes,
         "channels": _channels(repeats, rays, own, sigma, expected), "curves": curves,
@@ -453,7 +455,7 @@ def check_stands(repeats: Repeats, name: str, period_ns: float | None) -> None:
         )
         raise LidarpoolError(
             f"{name} is of a sensor that moves, by {told} from sweep to sweep: give sweeps of a "
-            "sensor that stands."
+            "sensor that stands, or one sweep for the bias of its rings."
         )
     changes = np.abs(np.diff(repeats.ranges, axis=0))
     if (change := _median(changes, (0, 1, 2))) > _CHANGED_M:
@@ -592,6 +594,12 @@ def smooth_rays(
     return Rays._make(one[some] for one in rays)
 
 
+def meet_frontally(rays: Rays) -> bool:
+    """Whether enough rays meet surfaces so that noise of ranges is not taken for directions'."""
+    frontal = (rays.slope < _FRONTAL * rays.distance).sum()
+    return bool(frontal >= max(_FRONTAL_RAYS, _FRONTAL_SHARE * len(rays.row)))
+
+
 def fit_performance(
     repeats: Repeats, rays: Rays, energy: Floats | None
 ) -> tuple[dict[str, Estimate], Floats]:
@@ -608,13 +616,12 @@ def fit_performance(
             threshold = fit_threshold(energy, rays.returns, rays.trials, dropout.value)
             strong = energy > 2 * threshold.value if threshold else strong
     figures, sigma, deviance = fit_scatter(rays, "range_per_m", rays.distance, 1)
-    frontal = int((rays.slope < _FRONTAL * rays.distance).sum())
     if energy is not None and threshold is not None:
         other = fit_scatter(rays, "range_at_threshold_m", threshold.value / energy, 2)
         if "range_at_threshold_m" in other[0] and other[2] < deviance:
             figures, sigma, _ = other
-    if frontal < max(_FRONTAL_RAYS, _FRONTAL_SHARE * len(rays.row)):
-        figures = {}  # noise of ranges and of directions are the same on steep surfaces
+    if not meet_frontally(rays):
+        figures = {}
     figures = {name: one for name, one in figures.items() if one.known_within(_KNOWN)}
     if threshold is not None:
         figures["detection_range_m"] = threshold.power(-0.5, 10 * np.sqrt(TARGET_REFLECTANCE))
@@ -629,8 +636,9 @@ def fit_scatter(
     """Fit noise of ranges and directions to the variances of rays, by their likelihood.
 
     Noise of ranges grows with a power of `spread` (k,). What rays do not tell, for want of spreads
-    or inclined surfaces, is left out. Sandwich estimators give the intervals, which rays of unequal
-    noise do not narrow. Returns figures, noise of ranges (k,) in metres, and the deviance.
+    or inclined surfaces, is left out. Intervals are of sandwich estimators, for patches of rays
+    that may be alike, and of errors of the model: edges, slopes, and growth. Returns figures, noise
+    of ranges (k,) in metres, and the deviance.
     """
     low, unit, high = np.quantile(spread, (0.05, 0.5, 0.95))
     tilted = np.quantile(rays.slope / rays.distance, 0.9) > _TILT
@@ -654,7 +662,8 @@ def fit_scatter(
         return model(some, spread[repeated], slope)
 
     start = np.array([1.0, 0.1, 0.1])[known]
-    patch = (rays.row // _PATCH_ROWS * _PATCHES + rays.column // max(1, rays.column.max() // _PATCHES))[repeated]
+    wide = max(int(rays.column.max()) // _PATCHES, 1)  # columns of a patch
+    patch = (rays.row // _PATCH_ROWS * (_PATCHES + 2) + rays.column // wide)[repeated]
     theta, covariance = _trimmed(expected, start, variance, freedom, _TRIMMED, patch)
     # Edges that are finer than the rays make the variances of some rays larger: what the figures
     # change if fewer of these are left out is an error of the model.
@@ -703,7 +712,9 @@ def _trimmed(
         scale = truncated if step else 1.0
         weight = np.sqrt(freedom / 2) / expected(theta)
 
-        def off(some: Floats, kept: Bools = kept, weight: Floats = weight, scale: Any = scale) -> Any:
+        def off(
+            some: Floats, kept: Bools = kept, weight: Floats = weight, scale: Any = scale
+        ) -> Any:
             return ((variance - scale * expected(some)) * weight)[kept]
 
         solved = least_squares(off, theta, bounds=(0, np.inf), x_scale=np.maximum(theta, 0.01))

@@ -16,7 +16,17 @@ from .sensor import LineSensor, Sensor
 # What directions and times of rays depend on; nothing else is made from a file.
 _KINDS = {
     kind.__name__: kind
-    for kind in (Sensor, LineSensor, PrismSensor, ListedSensor, Beams, Spin, Mirror, Prism, TurningMirror)
+    for kind in (
+        Sensor,
+        LineSensor,
+        PrismSensor,
+        ListedSensor,
+        Beams,
+        Spin,
+        Mirror,
+        Prism,
+        TurningMirror,
+    )
 }
 _LEFT_OUT = ("optics", "noise", "returns")
 
