@@ -75,7 +75,7 @@ _REJECTED, _TRIMMED = 1e-4, 0.1
 _PATCH_ROWS, _PATCHES = 4, 36  # rings of a patch of rays; patches of a turn
 _FRONTAL = 1.0  # tangent of incidence: below, noise is hardly that of directions
 _FRONTAL_RAYS, _FRONTAL_SHARE = 100, 0.05  # least number, and share, of such rays
-_KNOWN = 0.5  # a figure of noise whose interval is wider than this to either side is not determined
+_KNOWN = 0.75  # a figure of noise whose interval is wider than this to either side is not determined
 _WRONG = 0.03  # relative error of the variances of steep or far rays
 _OUTLIER = 3.0  # quotient of a variance and the expected one that counts at most
 _SPAN, _TILT = 2.0, 0.3  # least quotient of ranges, and tangent of incidence, that tell noise
@@ -789,6 +789,8 @@ def ring_bias(rays: Rays, directions: Floats, blur: Floats) -> dict[int, Estimat
     Planes u · x = 1 and offsets b are fitted at once: 1 / r = u · d − b / r², times r². Ranges have
     standard deviations `blur` (k,), metres.
     """
+    if not len(rays.row):
+        return {}
     some = even_indices(len(rays.row), _PLANE_POINTS)
     plane = _planes(rays.distance[some, None] * directions[some])
     many = np.bincount(rays.row[some[plane >= 0]], minlength=rays.row.max() + 1)[rays.row[some]]
