@@ -33,7 +33,7 @@ def fitted(recording):
 
 
 def test_intervals_hold_what_was_put_in():
-    """The table of docs/fidelity.md with ten trials; figures that are not determined are rare."""
+    """Ten trials in a street; figures that are not determined are rare."""
     held = []
     for number in range(10):
         truth, found = trial(number)
