@@ -1,22 +1,29 @@
 """How often the intervals of `lidarpool fit` hold the figures that a recording was made with.
 
 python -m benchmarks.fit_coverage [--trials 200]
+python -m benchmarks.fit_coverage --places [--trials 40] [--cache FOLDER]
+
+With `--places`, the sensor stands in turn in a room, a street of a city, a hall and a forest.
 """
 
 from __future__ import annotations
 
 import argparse
 from collections import defaultdict
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from lidarpool import Noise, Scanner, Scene, Sensor
+from lidarpool import LidarpoolError, Noise, Scanner, Scene, Sensor
 from lidarpool.compare.fit import fit
 from lidarpool.compare.recordings import Recording
+from lidarpool.scene.generated.city import city
+from lidarpool.scene.generated.plants import all_trees, placed
 from lidarpool.scene.scene_mesh import SceneMesh
 
 SWEEPS, COLUMNS, LAYERS, FARTHEST_M = 12, 360, 16, 120.0
+PLACES = ("room", "street", "hall", "forest")
 
 
 def street() -> Scene:
@@ -31,29 +38,91 @@ def street() -> Scene:
     return Scene.from_meshes(SceneMesh(name, np.array(at), faces) for name, at in corners.items())
 
 
-def recorded(noise: Noise, bias: Any = 0.0, sweeps: int = SWEEPS) -> Recording:
+def box(name: str, low: Any, high: Any) -> SceneMesh:
+    """Make a box between two corners, metres."""
+    x, y, z = np.transpose([low, high]).astype(float)
+    corners = np.array([(a, b, c) for a in x for b in y for c in z])
+    quads = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
+    faces = [face for a, b, c, d in quads for face in ((a, b, c), (a, c, d))]
+    return SceneMesh(name, corners, np.array(faces))
+
+
+def place(name: str, seed: int) -> tuple[Scene, tuple[float, float, float]]:
+    """Make one of `PLACES`, and the position of a sensor in it, metres."""
+    rng = np.random.default_rng(seed)
+    if name == "street":
+        return city(30_000, seed=seed), (0.0, 0.0, 1.8)
+    if name == "forest":
+        ground = box("ground", (-80, -80, -1), (80, 80, 0))
+        count = 120
+        at = np.column_stack([rng.uniform(-40, 40, (count, 2)), np.zeros(count)])
+        at = at[np.hypot(*at[:, :2].T) > 2.5]
+        trees = all_trees(0, 0.2)
+        kind = rng.integers(0, len(trees), len(at))
+        yaw, scale = rng.uniform(0, 2 * np.pi, len(at)), rng.uniform(0.6, 1.2, len(at))
+        return Scene.from_meshes([ground, *placed(trees, kind, at, yaw, scale)]), (0, 0, 1.6)
+    if name == "room":
+        x, y, z = rng.uniform(5, 9), rng.uniform(4, 7), rng.uniform(2.4, 3.2)
+        things, size, height = 8, 0.8, 1.2
+    else:
+        x, y, z = rng.uniform(30, 60), rng.uniform(18, 35), rng.uniform(7, 10)
+        things, size, height = 24, 2.5, 5.0
+    meshes = [box("shell", (-x / 2, -y / 2, 0), (x / 2, y / 2, z))]
+    for number in range(things):
+        a, b = rng.uniform(-0.45, 0.45, 2) * (x, y)
+        w, d, h = rng.uniform(0.15, 1, 3) * (size, size, height)
+        if np.hypot(a, b) > 1.0 + size:
+            meshes.append(box(f"thing-{number}", (a, b, 0), (a + w, b + d, h)))
+    return Scene.from_meshes(meshes), (0.0, 0.0, 1.1)
+
+
+def recorded(
+    noise: Noise,
+    bias: Any = 0.0,
+    sweeps: int = SWEEPS,
+    scene: Scene | None = None,
+    at: tuple[float, float, float] = (0, 0, 0),
+    columns: int = COLUMNS,
+    cache: Path | None = None,
+) -> Recording:
     """Sweeps of a sensor that stands in the street, with an error of each channel in metres."""
-    sensor = Sensor.grid(COLUMNS, LAYERS, vertical_fov_deg=40, max_range_m=FARTHEST_M)
-    scanner = Scanner(
-        street(), sensor, columns=["intensity"], noise=noise, precision_m=1e-4,
-        coordinates="sensor", threads=1,
-    )  # fmt: skip
-    made = [scanner.sweep((0, 0, 0), number=number) for number in range(sweeps)]
+    if cache is None or not cache.exists():
+        sensor = Sensor.grid(columns, LAYERS, vertical_fov_deg=40, max_range_m=FARTHEST_M)
+        scanner = Scanner(
+            scene or street(), sensor, columns=["intensity"], noise=noise, precision_m=1e-4,
+            coordinates="sensor", threads=1,
+        )  # fmt: skip
+        clouds = [scanner.sweep(at, number=number) for number in range(sweeps)]
+        arrays = {
+            f"{name}{number}": values
+            for number, cloud in enumerate(clouds)
+            for name, values in (
+                ("points", cloud.positions),
+                ("channel", cloud["channel"]),
+                ("intensity", cloud["intensity"]),
+            )
+        }
+        if cache is not None:
+            np.savez(cache, **arrays)
+    else:
+        arrays = dict(np.load(cache))
 
     def read(number: int) -> Any:
-        cloud = made[number]
-        points, ranges = cloud.positions, np.linalg.norm(cloud.positions, axis=1)
-        errors = np.broadcast_to(bias, LAYERS)[cloud["channel"]]
-        return points * (1 + errors / np.maximum(ranges, 1e-6))[:, None], cloud.columns, None
+        points, channel = arrays[f"points{number}"], arrays[f"channel{number}"]
+        ranges = np.linalg.norm(points, axis=1)
+        errors = np.broadcast_to(bias, LAYERS)[channel]
+        columns = {"channel": channel, "intensity": arrays[f"intensity{number}"]}
+        return points * (1 + errors / np.maximum(ranges, 1e-6))[:, None], columns, None
 
     return Recording("simulated", sweeps, read, energies=True)
 
 
-def trial(number: int) -> tuple[dict[str, float], dict[str, Any]]:
+def trial(number: int, cache: Path | None = None, where: str = "") -> tuple[dict[str, float], Any]:
     """Figures that a recording was made with, and those that were fitted: {name: …}.
 
     Every second sensor has noise by range and errors of its channels, the others noise by energy,
-    a threshold and false alarms.
+    a threshold and false alarms. With `where`, one of `PLACES`, the second is the error of the fit
+    if it is refused.
     """
     rng = np.random.default_rng(number)
     truth = {
@@ -62,7 +131,7 @@ def trial(number: int) -> tuple[dict[str, float], dict[str, Any]]:
         "dropout": rng.uniform(0.005, 0.03),
     }
     bias: Any = 0.0
-    if number % 2:
+    if number // len(PLACES) % 2 if where else number % 2:
         truth["range_per_m"] = rng.uniform(0.0003, 0.001)
         noise = Noise(**truth, seed=number)
         bias = rng.normal(0, 0.005, LAYERS)
@@ -75,37 +144,60 @@ def trial(number: int) -> tuple[dict[str, float], dict[str, Any]]:
         gate_s = Sensor.grid(max_range_m=FARTHEST_M).gate_s
         noise = Noise(**truth, false_alarm_hz=-np.log1p(-share) / gate_s, seed=number)
         truth["false_alarms"] = share
-    figures = fit(recorded(noise, bias)).figures
+    if where:
+        file = None if cache is None else cache / f"{where}-{number}.npz"
+        scene, at = (None, (0, 0, 0)) if file and file.exists() else place(where, number)
+        recording = recorded(noise, bias, 10, scene, at, 600, file)
+    else:
+        recording = recorded(noise, bias)
+    try:
+        figures = fit(recording).figures
+    except LidarpoolError as error:
+        if not where:
+            raise
+        return truth, str(error)
     found = dict(figures["figures"])
-    if bias_of := [row["bias_m"] for row in figures["channels"] if row["ring"] == 3]:
-        found["bias_m"] = bias_of[0]
+    of_rings = {row["ring"]: row["bias_m"] for row in figures["channels"] if row["bias_m"]}
+    if 3 in of_rings and "bias_m" in truth:  # beside the mean of the rings that have one
+        found["bias_m"] = of_rings[3]
+        truth["bias_m"] = bias[3] - bias[list(of_rings)].mean()
     return truth, found
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--trials", type=int, default=200)
-    trials = parser.parse_args().trials
-    rows: dict[str, list[tuple[bool, float, float]]] = defaultdict(list)
-    missing: dict[str, int] = defaultdict(int)
+    parser.add_argument("--trials", type=int)
+    parser.add_argument("--places", action="store_true")
+    parser.add_argument("--cache", type=Path, help="folder that keeps simulated recordings")
+    arguments = parser.parse_args()
+    places = PLACES if arguments.places else ("",)
+    trials = arguments.trials or (40 if arguments.places else 200)
+    # {(place, figure): (held, relative error, relative half-width) of each trial}
+    rows: dict[tuple[str, str], list[tuple[bool, float, float]]] = defaultdict(list)
+    missing: dict[tuple[str, str], int] = defaultdict(int)
     for number in range(trials):
-        truth, found = trial(number)
+        where = places[number % len(places)]
+        truth, fitted = trial(number, arguments.cache, where)
+        if isinstance(fitted, str):
+            print(f"{where} {number}: {fitted}")
+            fitted = {}
         for name, true in truth.items():
-            one = found.get(name)
-            if one is None:
-                missing[name] += 1
-                continue
-            held = one["low"] <= true <= one["high"]
-            rows[name].append(
-                (held, one["value"] / true - 1, (one["high"] - one["low"]) / 2 / true)
-            )
-    print("| figure | trials | not found | held | median error | median half-width |")
-    print("|---|--:|--:|--:|--:|--:|")
-    for name, values in rows.items():
-        held, error, half = np.array(values, float).T
+            estimate = fitted.get(name)
+            for key in {(where, name), ("all", name)}:
+                if estimate is None:
+                    missing[key] += 1
+                    continue
+                held = estimate["low"] <= true <= estimate["high"]
+                half = (estimate["high"] - estimate["low"]) / 2 / true
+                rows[key].append((held, estimate["value"] / true - 1, half))
+    print("| place | figure | trials | not determined | held | median error | median half-width |")
+    print("|---|---|--:|--:|--:|--:|--:|")
+    for where, name in sorted({*rows, *missing}):
+        held, error, half = np.reshape(rows[where, name] or [(0, np.nan, np.nan)], (-1, 3)).T
         print(
-            f"| `{name}` | {len(held)} | {missing[name]} | {100 * held.mean():.1f} % "
-            f"| {100 * np.median(error):+.2f} % | {100 * np.median(np.abs(half)):.1f} % |"
+            f"| {where} | `{name}` | {len(rows[where, name])} | {missing[where, name]} "
+            f"| {100 * held.mean():.1f} % | {100 * np.median(error):+.2f} % "
+            f"| {100 * np.median(np.abs(half)):.1f} % |"
         )
 
 

@@ -8,12 +8,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import yaml
-from benchmarks.fit_coverage import recorded, street, trial
+from benchmarks.fit_coverage import PLACES, place, recorded, street, trial
 
-from lidarpool import LidarpoolError, Noise, Scanner, Sensor, fit, load_sensor
+from lidarpool import LidarpoolError, Noise, Pose, Scanner, Sensor, fit, load_sensor
 from lidarpool.compare.recordings import Recording, open_recording
 from lidarpool.export.formats import Format
 from lidarpool.export.sweeps import Sweeps
+from lidarpool.scene.generated.city import city
 from lidarpool.sensor.models import read_model
 
 pytest.importorskip("scipy", reason="the extra fit is not installed")
@@ -32,15 +33,16 @@ def fitted(recording):
 
 
 def test_intervals_hold_what_was_put_in():
-    """The table of docs/fidelity.md with ten trials: of 55 intervals about three miss."""
+    """Ten trials in a street; figures that are not determined are rare."""
     held = []
     for number in range(10):
         truth, found = trial(number)
         for name, true in truth.items():
-            one = found[name]
+            if (one := found.get(name)) is None:
+                continue
             held.append(one["low"] <= true <= one["high"])
             assert abs(one["value"] - true) < 5 * max(one["high"] - one["low"], 1e-6) / 2, name
-    assert len(held) == 55 and np.mean(held) > 0.8
+    assert len(held) > 45 and np.mean(held) > 0.85
 
 
 def test_the_file_is_a_sensor_with_these_figures(fitted, tmp_path):
@@ -111,17 +113,116 @@ def test_beams_that_begin_beside_zero_bias_no_ring():
     assert len(bias) > 20 and np.abs(bias).max() < 0.001
 
 
-def test_a_single_sweep_and_a_moving_sensor_tell_bias_alone(recording):
+def test_a_single_sweep_tells_bias_alone(recording):
     single = fit(replace(recording, count=1))
     assert not single.figures["figures"] and "there is a single sweep" in repr(single)
     assert single.model.performance is None
-    sensor = Sensor.grid(360, 16, vertical_fov_deg=40, max_range_m=120)
-    scanner = Scanner(street(), sensor, coordinates="sensor")
-    drive = [scanner.sweep((0, k, 0.3 * k), number=k) for k in range(4)]
-    moving = Recording("drive", 4, lambda k: (drive[k].positions, drive[k].columns, None))
-    found = fit(moving)
-    assert not found.figures["figures"] and "the sensor moves" in repr(found)
-    assert sum(row["bias_m"] is not None for row in found.figures["channels"]) > 10
+    assert sum(row["bias_m"] is not None for row in single.figures["channels"]) > 10
+
+
+def drive(scene, height_m, step_m, yaw_deg=0.0, sweeps=6):
+    """Sweeps of a VLP-16 at 20 Hz that goes ahead and turns from sweep to sweep."""
+    sensor = load_sensor("velodyne/vlp16", rate_hz=20)
+    scanner = Scanner(scene, sensor, coordinates="sensor", noise=Noise(range_m=0.01, seed=1))
+    clouds = [
+        scanner.sweep(
+            Pose((-20 + step_m * number, 0.2, height_m), yaw_deg=yaw_deg * number), number=number
+        )
+        for number in range(sweeps)
+    ]
+
+    def read(number):
+        return clouds[number].positions, clouds[number].columns, None
+
+    return Recording("drive.pcap", sweeps, read, times=lambda: 5e7 * np.arange(sweeps))
+
+
+@pytest.fixture(scope="module")
+def block():
+    return city(30_000, seed=1)
+
+
+def test_a_sensor_that_moves_is_refused_with_its_speed(block):
+    """26 m/s, 0.06 m a sweep, and a turn on the spot; most ranges of a street stay the same."""
+    cases = (street(), 0.0, 1.3, 0.0), (block, 1.8, 1.3, 0.0), (block, 1.8, 0.06, 0.0)
+    for scene, height_m, step_m, yaw_deg in cases:
+        with pytest.raises(LidarpoolError, match="is of a sensor that moves") as raised:
+            fit(drive(scene, height_m, step_m, yaw_deg))
+        told = str(raised.value)
+        speed = float(told.partition("(")[2].partition(" m/s")[0])
+        assert speed == pytest.approx(step_m / 0.05, rel=0.1), told
+        assert len(told.splitlines()) == 1
+    with pytest.raises(LidarpoolError, match=r"moves, by .*2(.[01])?° from sweep to sweep"):
+        fit(drive(block, 1.8, 0.0, 2.0))
+
+
+def test_a_sensor_that_stands_is_fitted_beside_cars_that_move(block):
+    stands = drive(block, 1.8, 0.0)
+
+    def passed(number):
+        """Points of a van of 5 by 2 m that comes along the street; what is behind it is hidden."""
+        points, columns, pose = stands.read(number)
+        ahead = np.array([8.0 - 1.3 * number, 3.0])
+        azimuth = np.arctan2(points[:, 1], points[:, 0])
+        middle = np.arctan2(ahead[1], ahead[0])
+        hit = (np.abs(azimuth - middle) < 0.12) & (np.abs(points[:, 2]) < 2)
+        flat = np.hypot(points[:, 0], points[:, 1])
+        near = np.where(hit, np.minimum(1, np.hypot(*ahead) / np.maximum(flat, 0.1)), 1)
+        return points * near[:, None], columns, pose
+
+    assert fit(replace(stands, read=passed)).figures["sweeps"] == 6
+
+
+def test_points_that_are_not_in_metres_are_refused(recording):
+    def scaled(number):
+        points, columns, pose = recording.read(number)
+        return points * 1000, columns, pose
+
+    with pytest.raises(LidarpoolError, match=r"ranges that change by .* give points in metres"):
+        fit(replace(recording, read=scaled))
+
+
+def test_gaps_and_sweeps_cut_short_are_no_lost_pulses():
+    """Sweeps without lost pulses, in which packets are missing and every third is cut."""
+    whole = recorded(replace(NOISE, dropout=0.0))
+
+    def holed(number):
+        points, columns, pose = whole.read(number)
+        azimuth = np.degrees(np.arctan2(points[:, 1], points[:, 0])) % 360
+        kept = (azimuth > 110) | (number % 3 > 0)
+        for begin in np.random.default_rng(number).uniform(0, 360, 8):
+            kept &= (azimuth < begin) | (azimuth > begin + 6)
+        return points[kept], {name: values[kept] for name, values in columns.items()}, pose
+
+    fitted = fit(replace(whole, read=holed))
+    figures = fitted.figures["figures"]
+    assert figures["dropout"]["value"] < 1e-4
+    assert figures["range_m"]["low"] < NOISE.range_m < figures["range_m"]["high"]
+    assert "% of the sweeps are gaps, of lost packets or sweeps cut short" in repr(fitted)
+    lossy = recorded(replace(NOISE, dropout=0.1))
+    figures = fit(replace(lossy, read=lossy.read)).figures["figures"]
+    assert figures["dropout"]["low"] < 0.1 < figures["dropout"]["high"]
+
+
+@pytest.mark.parametrize("where", PLACES)
+def test_intervals_hold_in_rooms_streets_halls_and_forests(where):
+    """Two recordings of a place each; fidelity.md has 40."""
+    for number in (PLACES.index(where), PLACES.index(where) + 4):
+        truth, fitted = trial(number, where=where)
+        assert "dropout" in fitted
+        for name, true in truth.items():
+            if name in fitted:
+                half = (fitted[name]["high"] - fitted[name]["low"]) / 2
+                assert abs(fitted[name]["value"] - true) < 2 * half, (number, name)
+
+
+def test_where_only_the_ground_is_smooth_noise_is_not_determined():
+    noise = Noise(range_m=0.02, range_per_m=0.0005, angle_deg=0.1, dropout=0.02, seed=3)
+    scene, at = place("forest", 3)
+    figures = fit(recorded(noise, scene=scene, at=at, columns=600))
+    assert not {"range_m", "range_per_m", "angle_deg"} & set(figures.figures["figures"])
+    assert "hardly a smooth surface is met at less than 45°" in repr(figures)
+    assert figures.figures["figures"]["dropout"]["value"] == pytest.approx(0.02, rel=0.3)
 
 
 def test_intensities_of_unknown_scale_need_the_white_one():
@@ -144,7 +245,7 @@ def test_cut_and_mixed_recordings_are_told_in_a_line(recording, tmp_path):
         some = len(points) // 3 if number == 5 else len(points)
         return points[:some], {name: one[:some] for name, one in columns.items()}, pose
 
-    assert "1 sweep cut short, left out" in repr(fit(replace(recording, read=cut)))
+    assert "5.6 % of the sweeps are gaps" in repr(fit(replace(recording, read=cut)))
     other = Scanner(street(), Sensor.grid(360, 40, vertical_fov_deg=80), coordinates="sensor")
     sweep = other.sweep((0, 0, 0))
 

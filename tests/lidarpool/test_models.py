@@ -24,7 +24,8 @@ def angles(directions):
 @pytest.mark.parametrize("name", READY)
 def test_every_model_makes_a_sensor(name):
     model, sensor = read_model(name), load_sensor(name)
-    assert sensor.name == model.name and all(model.sources.values())
+    name = f"{model.name}, typical pattern" if model.typical else model.name
+    assert sensor.name == name and all(model.sources.values())
     assert model.range_m == (sensor.min_range_m, sensor.max_range_m)
     firings = np.arange(200_000, 200_500)
     directions, times = sensor.directions(firings), sensor.times_ns(firings)
@@ -269,6 +270,68 @@ def test_a_list_of_rays_of_livox(tmp_path):
     assert sensor.name == "Livox Mid-360, mid360.csv" and sensor.max_range_m == 70
 
 
+# Shares of the field that a sensor covers after 0.1, 0.5 and 1 s. Mid-40, Horizon and Tele-15: the
+# curves of Livox's documentation (livox_wiki_en, livox_scanning_pattern.rst). The others, for which
+# no curve could be read: rays of a unit, as Livox lists them (livox_laser_simulation, scan_mode).
+COVERED = {
+    "livox/mid40": (0.195, 0.68, 0.925),
+    "livox/horizon": (0.59, 0.985, 1.0),
+    "livox/tele15": (0.985, 1.0, 1.0),
+    "livox/avia": (0.319, 0.830, 0.970),
+    "livox/mid360": (0.079, 0.331, 0.538),
+    "livox/hap": (0.682, 0.953, 0.982),
+}
+
+
+@pytest.mark.parametrize(("name", "shares"), COVERED.items(), ids=COVERED)
+def test_livox_sensors_cover_their_field_as_documented(name, shares):
+    """Cells are as wide as the beam, 0.28°; the field are those that are met within 4 s."""
+    sensor = load_sensor(name)
+    assert ("typical pattern" in sensor.name) == (name != "livox/mid40")
+    per_second = round(sensor.head.firings_per_turn * sensor.head.rate_hz)
+    azimuth, elevation = angles(sensor.directions(np.arange(4 * per_second)))
+    cells = (np.floor(azimuth / 0.28) * 4096 + np.floor(elevation / 0.28)).astype(np.int64)
+    field = len(np.unique(cells))
+    for seconds, share in zip((0.1, 0.5, 1.0), shares, strict=True):
+        covered = len(np.unique(cells[: round(seconds * per_second)])) / field
+        assert covered == pytest.approx(share, abs=0.05), seconds
+
+
+# The first rays of Livox's lists: azimuth and elevation, degrees, of the beams from the lowest.
+FIRST_RAYS = {
+    "livox/avia": [
+        (-35.271, -2.243), (-35.236, -1.346), (-35.218, -0.449), (-35.218, 0.449),
+        (-35.236, 1.346), (-35.271, 2.243),
+    ],
+    "livox/horizon": [
+        (-40.954, -2.276), (-40.907, -1.379), (-40.881, -0.481), (-40.877, 0.416),
+        (-40.895, 1.314), (-40.935, 2.210),
+    ],
+    "livox/tele15": [
+        (-7.323, -0.856), (-7.322, -0.539), (-7.322, -0.222), (-7.322, 0.095), (-7.322, 0.412),
+        (-7.323, 0.728),
+    ],
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(("name", "listed"), FIRST_RAYS.items(), ids=FIRST_RAYS)
+def test_prisms_of_livox_sensors_are_those_of_a_unit(name, listed):
+    azimuth, elevation = angles(load_sensor(name).directions(np.array([0]))[0])
+    assert np.column_stack([azimuth, elevation]) == pytest.approx(np.array(listed), abs=0.05)
+
+
+def test_the_mid360_sees_all_around():
+    azimuth, elevation = angles(load_sensor("mid360").directions(np.arange(100_000)))
+    assert (elevation.min(), elevation.max()) == pytest.approx((-7, 52), abs=0.5)
+    assert np.histogram(azimuth, 36)[0].min() > 8_000  # of 11,111 in ten degrees
+    assert read_model("mid360").firing_us == 20 and load_sensor("mid360").channels == 4
+
+
+def test_the_helios_has_the_angles_of_its_manual():
+    _, elevation = angles(load_sensor("rs-helios").directions(np.array([0]))[0])
+    assert elevation[[0, 15, 22, 26, 31]] == pytest.approx([-55, -10, 0, 5.5, 15], abs=1e-6)
+
+
 def test_a_table_of_beams(tmp_path):
     file = write(tmp_path, "beams.csv", "azimuth_deg,elevation_deg,time_us\n1,5,2\n0,-5,4\n")
     sensor = load_sensor(calibration=file, columns=100, rate_hz=20)
@@ -350,7 +413,6 @@ def test_bad_files_are_refused_in_one_line(tmp_path, file, text, message):
     ("options", "message"),
     [
         ({}, "a model, a calibration, or both"),
-        ({"model": "livox/mid360"}, "Mid-360 has no rays of its own: give calibration: FILE"),
         ({"model": "velodyne/vlp61"}, "no sensor model 'velodyne/vlp61'.* mean 'velodyne/vlp16'"),
         ({"model": "velodyne/vlp16", "columns": 1800}, "55.296 µs.* leave columns out"),
         ({"model": "velodyne/vlp16", "calibration": "xt.csv"}, "32 beams, but Velodyne .* has 16"),

@@ -387,6 +387,8 @@ def sensors(model: str | None, out: Path | None) -> None:
         raise click.UsageError(f"{out} is not a picture: give a name that ends in .png.")
     click.echo(described.name)
     lines = [*described.sources.items()]
+    if described.typical:
+        lines.insert(0, ("rays", "a typical pattern; calibration: FILE has those of a unit"))
     if described.performance is not None:
         sheet = described.datasheet()
         lines.append(("noise", shown_noise(sheet.noise)))
@@ -415,15 +417,19 @@ def _row(name: str) -> tuple[str, ...]:
     firings, rate = model.turn(None, None)
     beams = model.beams
     channels = len(beams.elevation_deg) or len(beams.time_us) or 1
-    if model.needs_calibration:
-        view = "by the unit's file"
-    elif model.mirror:
+    if model.mirror:
         view = f"{model.mirror.width_deg:g}° across, below"
     elif model.prisms:
-        ahead = load_sensor(name).directions(np.arange(20_000))[..., 0].min()
-        view = f"{2 * np.degrees(np.arccos(ahead)):.1f}° circle ahead"
+        x, y, z = load_sensor(name).directions(np.arange(20_000)).reshape(-1, 3).T
+        up = np.degrees(np.arcsin(np.clip([z.min(), z.max()], -1, 1)))
+        across = 2 * np.degrees(np.abs(np.arctan2(y, x)).max())
+        view = f"{across:.0f}° x {up[0]:.1f}° to {up[1]:.1f}°"
+        if len(beams.elevation_deg) < 2:
+            view = f"{2 * np.degrees(np.arccos(x.min())):.1f}° circle ahead"
     else:
         view = f"360° x {min(beams.elevation_deg):.1f}° to {max(beams.elevation_deg):.1f}°"
+    if model.typical:
+        view += ", typical"
     turns, points = " to ".join(f"{one:g}" for one in rates), f"{firings * rate * channels:,.0f}"
     return name, f"{channels:,}", view, f"{low:g} to {high:g} m", turns, points
 

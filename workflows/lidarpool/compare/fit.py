@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
@@ -55,15 +55,30 @@ _HEAD_M = 0.1  # how far from zero the beams of a head may meet
 _FLAT = 1.7  # tangent of incidence: beyond, noise of directions makes mean ranges longer
 _DARKEST = 1 / 400  # reflectance of what is reported as 0
 MOST_VALUES = 1 << 24  # returns in memory; of more sweeps than these make, some are read
-_WHOLE = 0.8  # a sweep with fewer points than this share of the median is cut
-_STILL_M = 0.1  # a median change of ranges, from sweep to sweep, of a sensor that moves
+_REPEATED = 0.8  # least share of a ray's returns that belong to one surface
+_STILL_M = 0.02  # shift of a sensor, metres, from which on it moves
+_STILL_RAD = 0.003  # the same of its yaw
+_CHANGED_M = 0.1  # median change of ranges, from sweep to sweep, of a place that changes
+_AGREEING = 0.5  # least share of the rays that a motion changes and explains
+_PAIRS, _YAW_M = 8, 10.0  # pairs of sweeps for the motion; distance at which yaw counts, metres
+_ROUGH_M, _SHIFT_M = 0.02, 0.5  # noise of ranges, and motion, for which rays are weighted, metres
+_AROUND = 5  # rays on either side whose scatter counts
+_SELDOM = 0.3  # a cell that returns in fewer sweeps tells no gap
+_CHANCE = -16.0  # logarithm of the chance of a run of lost pulses that is a gap instead
 _KINK_M, _KINK = 0.01, 0.001  # by how much a surface may leave its plane within four columns
 _SIGMAS = 6.0  # a return beyond these is of something that moves
 _STEEPEST = 5.7  # tangent of incidence: beyond, a beam meets several surfaces
 _BESIDE_M, _BESIDE = 0.3, 0.5  # how far surfaces may be from the scene's, and share of these
 _OTHER_DEG = 2.0  # a ring that is farther from all beams of a model is not one of them
 _Z, _STEP = 1.959964, 1e-3  # of 95 %; of logarithms, for derivatives
-_REJECTED = 1e-4  # chance of a variance above which a ray is left out
+# Chances of a variance above which a ray is left out: certainly, and at most.
+_REJECTED, _TRIMMED = 1e-4, 0.1
+_PATCH_ROWS, _PATCHES = 4, 36  # rings of a patch of rays; patches of a turn
+_FRONTAL = 1.0  # tangent of incidence: below, noise is hardly that of directions
+_FRONTAL_RAYS, _FRONTAL_SHARE = 100, 0.05  # least number, and share, of such rays
+_KNOWN = 0.75  # half of the interval of a figure of noise, over its value, at most
+_WRONG = 0.03  # relative error of the variances of steep or far rays
+_OUTLIER = 3.0  # quotient of a variance and the expected one that counts at most
 _SPAN, _TILT = 2.0, 0.3  # least quotient of ranges, and tangent of incidence, that tell noise
 _WEAK_RAYS, _RING_RAYS = 30, 20  # rays with losses that a threshold needs; that of a ring's bias
 _SKY = (7, 31)  # rows and columns of which no ray returns twice, around a ray into the sky
@@ -131,7 +146,8 @@ def fit(
     Raises
     ------
     LidarpoolError
-        If it cannot be read, has no sweeps or rings, is of several sensors, or scipy is missing.
+        If it cannot be read, has no sweeps or rings, is of several sensors or of one that moves,
+        or scipy is missing.
     """
     need("scipy", "fit", "Figures are fitted")
     if not isinstance(recording, Recording):
@@ -144,9 +160,10 @@ def fit(
         if not (off < _BESIDE_M).sum() > _BESIDE * np.isfinite(off).sum():
             told = f"less than half of {recording.name} is within {_BESIDE_M} m of the scene"
             raise LidarpoolError(f"{told}: give the sensor's --pose in it, or no scene.")
-        *_, smooth = surfaces(repeats, expected, 0 * sigma)
-        lost = np.isnan(repeats.ranges).mean(axis=0)
-        curves["lost_by_range"] = _curve(expected[smooth], lost[smooth])
+        smooth = surfaces(repeats, expected, 0 * sigma).smooth & (repeats.trials > 0)
+        returned = np.isfinite(repeats.ranges).sum(axis=0)
+        lost = 1 - returned[smooth] / repeats.trials[smooth]
+        curves["lost_by_range"] = _curve(expected[smooth], lost)
     found = dict[str, Estimate]()
     for _ in range(2):  # the first finds what the second leaves out
         rays = smooth_rays(repeats, sigma, 0.0 if found else _AIM, expected)
@@ -165,7 +182,7 @@ def fit(
     curves["noise_by_range"] = _curve(rays.distance, own, 0.5)
     curves["noise_by_light"] = _curve(light, own, 0.5)
     curves["noise_by_tilt"] = _curve(np.degrees(np.arctan(rays.slope / rays.distance)), tilted, 0.5)
-    curves["returned_by_light"] = _curve(light, rays.returns / count) if count > 1 else []
+    curves["returned_by_light"] = _curve(light, rays.returns / rays.trials) if count > 1 else []
     curves["light_by_range"] = _curve(rays.distance, rays.light)
     base, name = read_model(model) if model else _recorded(repeats), Path(recording.name).name
     source = f"fitted by lidarpool {__version__} to {name}, {plural(repeats.sweeps, 'sweep')}"
@@ -175,7 +192,8 @@ def fit(
         notes.append(f"the recorded rings are not those of {base.name}: check --model")
     figures = {
         "versions": {"lidarpool": __version__}, "name": name, "model": base.name,
-        "sweeps": repeats.sweeps, "moves": repeats.moves, "rays": len(rays.row),
+        "sweeps": repeats.sweeps, "rays": len(rays.row),
+        "frontal": meet_frontally(rays),
         "intensity": bool(known), "energy": energy is not None,
         "figures": {key: one._asdict() for key, one in found.items()}, "notes": notes,
         "channels": _channels(repeats, rays, own, sigma, expected), "curves": curves,
@@ -232,6 +250,17 @@ class Estimate(NamedTuple):
         """Make one of the mean of values (n,)."""
         return cls.of(values.mean(), values.var() / len(values))
 
+    @classmethod
+    def ratio(cls, parts: Ints, wholes: Ints) -> Estimate:
+        """Make one of the sum of parts (n,) over that of wholes (n,)."""
+        share = parts.sum() / wholes.sum()
+        spread = ((parts - share * wholes) ** 2).sum() / wholes.sum() ** 2
+        return cls.of(share, spread)
+
+    def known_within(self, share: float) -> bool:
+        """Whether the half of the interval is at most this share of the value."""
+        return self.high - self.low <= 2 * share * abs(self.value)
+
     def power(self, exponent: float, scale: float = 1.0) -> Estimate:
         """Return the estimate of a power, times a scale; what is below 0 counts as 0."""
         value, *ends = (round(float(scale * max(one, 0.0) ** exponent), 9) for one in self)
@@ -248,10 +277,14 @@ class Repeats:
     ranges: Floats32  # (s, r, c): metres
     light: Floats32  # (s, r, c): intensities
     aside: Floats32  # (s, r, c): azimuths beside those of the directions, radians
-    sigma: Floats  # (r, c): rough scatter of ranges from sweep to sweep, as its ring has it, metres
-    sweeps: int  # that are whole
-    moves: bool  # whether the sensor does, or most around it: only the first sweep is here
+    sigma: Floats  # (r, c): rough scatter of ranges from sweep to sweep, metres
+    trials: Ints  # (r, c): sweeps that cover the cell; the others have a gap there
     notes: tuple[str, ...]
+
+    @property
+    def sweeps(self) -> int:
+        """Number of sweeps."""
+        return len(self.ranges)
 
     @classmethod
     def read(cls, recording: Recording) -> Repeats:
@@ -285,17 +318,13 @@ class Repeats:
             _, rows, there = np.intersect1d(found.rings, cells.rings, return_indices=True)
             columns = round(found.begin_deg / found.step_deg) + np.arange(found.images.shape[-1])
             values[:, k, there[:, None], columns % shape[1]] = found.images[0][:, rows]
-        counts = np.isfinite(values[0]).sum(axis=(1, 2))
-        whole = counts >= _WHOLE * np.median(counts[counts > 0])
-        if not whole.all():
-            notes.append(f"{plural(int((~whole).sum()), 'sweep')} cut short, left out")
-        values = values[:, whole]
-        # Ranges change by noise from sweep to sweep; or on and on, if the sensor moves.
-        step = _median(np.abs(np.diff(values[0], axis=0)), (0, 1, 2))
-        drift = _median(np.abs(values[0, -1] - values[0, 0]), (0, 1))
-        usual = min(0.6 + 0.4 * (whole.sum() - 1), 3) * step + 0.001
-        if moves := bool(step > _STILL_M or drift > usual):
-            values = values[:, :1]
+        values = values[:, np.isfinite(values[0]).any(axis=(1, 2))]
+        covered = covered_cells(np.isfinite(values[0]))
+        if (gaps := 1 - covered[:, np.isfinite(values[0]).any(axis=0)].mean()) > 0.5 / covered.size:
+            notes.append(
+                f"{100 * gaps:.2g} % of the sweeps are gaps, of lost packets or sweeps cut short, "
+                "and count as no lost pulses"
+            )
         level = cells.elevation_deg[:, None]
         first = np.radians(cells.step_deg * np.arange(shape[1]))
         aside = (np.radians(values[2]) - first + np.pi) % (2 * np.pi) - np.pi
@@ -306,13 +335,15 @@ class Repeats:
         )
         turned, up = first + mean, np.radians(level) + rise
         ways = [np.cos(up) * np.cos(turned), np.cos(up) * np.sin(turned), np.sin(up)]
-        sigma = _median(np.abs(np.diff(values[0], axis=0)), (0, 2)) / (0.6745 * np.sqrt(2))
-        sigma = np.where(np.isnan(sigma), _KINK_M, np.maximum(sigma, 1e-4))
-        return cls(
+        sigma = rough_scatter(values[0])
+        repeats = cls(
             cells.rings, cells.elevation_deg, np.stack(ways, axis=-1),
-            values[0], values[1], aside - mean, np.repeat(sigma[:, None], shape[1], axis=1),
-            int(whole.sum()), moves, tuple(notes),
+            values[0], values[1], aside - mean, sigma,
+            covered.sum(axis=0), tuple(notes),
         )  # fmt: skip
+        times = None if recording.times is None else np.array([*recording.times()])[numbers]
+        check_stands(repeats, name, None if times is None else float(np.median(np.diff(times))))
+        return repeats
 
 
 def _median(values: Floats32, axis: int | tuple[int, ...]) -> Any:
@@ -321,12 +352,30 @@ def _median(values: Floats32, axis: int | tuple[int, ...]) -> Any:
         return np.nanmedian(values, axis=axis).astype(np.float64)
 
 
-def surfaces(repeats: Repeats, distance: Floats, blur: Floats) -> tuple[Floats, Floats, Bools]:
-    """Find slopes and edges of a range image (r, c), whose ranges have errors of `blur` metres.
+def rough_scatter(ranges: Floats32) -> Floats:
+    """Scatter of ranges (s, r, c) of the rays around each, metres: that of the ring at least.
 
-    Returns by how much the range changes with the azimuth, and with the direction where it changes
-    most, metres in a radian; and whether the neighbours lie in one plane with it. (r, c) each.
+    Surfaces that are weak or steep scatter more than others of a ring.
     """
+    changes = np.abs(np.diff(ranges, axis=0)) / (0.6745 * np.sqrt(2))
+    ring, ray = _median(changes, (0, 2))[:, None], _median(changes, 0)
+    reach = range(-_AROUND, _AROUND + 1)
+    around = _median(np.stack([np.roll(ray, by, axis=1) for by in reach]), 0)
+    ring = np.where(np.isnan(ring), _KINK_M, np.maximum(ring, 1e-4))
+    return np.fmax(around, ring)
+
+
+class Surfaces(NamedTuple):
+    """Surfaces of a range image, (r, c) each."""
+
+    turn: Floats  # change of the range with the azimuth, metres in a radian
+    slope: Floats  # change of the range with the direction where it changes most, likewise
+    smooth: Bools  # whether the neighbours lie in one plane with the cell
+    normal: Floats  # (r, c, 3): normal of the plane, over its product with the ray's direction
+
+
+def surfaces(repeats: Repeats, distance: Floats, blur: Floats) -> Surfaces:
+    """Find slopes and edges of a range image (r, c), whose ranges have errors of `blur` metres."""
     points, rows = distance[..., None] * repeats.directions, np.arange(len(distance))
     with np.errstate(invalid="ignore", divide="ignore"):
         beams = points - _meeting(points)
@@ -345,7 +394,146 @@ def surfaces(repeats: Repeats, distance: Floats, blur: Floats) -> tuple[Floats, 
         near, wide = (ahead + back) / 2, (far + rear) / 2
         for beside, times in ((near, 1), (wide, 2), (above, 2), (below, 2)):
             smooth &= np.abs(((beside - points) * normal).sum(axis=-1)) < times * allowed
-    return change[..., 1] * ways[..., 0] - change[..., 0] * ways[..., 1], slope, smooth
+    turn = change[..., 1] * ways[..., 0] - change[..., 0] * ways[..., 1]
+    return Surfaces(turn, slope, smooth, normal)
+
+
+def covered_cells(returned: Bools) -> Bools:
+    """Tell the cells (s, r, c) that sweeps cover from gaps: lost packets, and sweeps cut short.
+
+    `returned` (s, r, c) are the cells with a return. A run of cells without any, in all rings or in
+    one, is a gap if pulses that are lost independently would hardly ever make such a run.
+    """
+    share = (returned.sum(axis=0) + 0.5) / (len(returned) + 1)
+    chance = np.where(share > _SELDOM, np.log1p(-share), 0.0)
+    columns = _long_runs(~returned.any(axis=1), chance.sum(axis=0))
+    rings = _long_runs(~returned, chance)
+    return ~(columns[:, None] | rings)
+
+
+def _long_runs(empty: Bools, chance: Floats) -> Bools:
+    """Mark the runs along the last axis, which is a turn, that are too long for chance.
+
+    `chance` are the logarithms of the chances that a cell is empty.
+    """
+    count = empty.shape[-1]
+    edge = np.zeros((*empty.shape[:-1], 1), bool)
+    twice = np.concatenate([edge, empty, empty, edge], axis=-1)
+    first, last = (np.flatnonzero(np.diff(twice.ravel().astype(np.int8)) == by) for by in (1, -1))
+    weights = np.zeros(twice.shape)
+    weights[..., 1:-1] = np.concatenate([chance, chance], axis=-1)
+    total = np.cumsum(weights.ravel())
+    gaps = total[last] - total[first] < _CHANCE
+    marks = np.zeros(twice.size, np.int64)
+    marks[first[gaps] + 1] += 1
+    marks[last[gaps] + 1] -= 1
+    inside = np.cumsum(marks).reshape(twice.shape) > 0
+    return np.asarray(inside[..., 1 : count + 1] | inside[..., count + 1 : -1])
+
+
+def check_stands(repeats: Repeats, name: str, period_ns: float | None) -> None:
+    """Refuse sweeps of a sensor that moves, or of a place that does.
+
+    One rigid motion, a shift and a yaw, has to explain the ranges of most of the rays that it
+    changes. `period_ns` is the time from sweep to sweep, if it is known.
+    """
+    if (count := repeats.sweeps) < 2:
+        return
+    starts = even_indices(count - 1, _PAIRS).tolist()
+    steps = [sensor_motion(repeats, k, k + 1) for k in starts]
+    overall = [sensor_motion(repeats, 0, k) for k in {count // 2, count - 1}]
+    moving = [step for step in steps if step.moves]
+    if len(moving) > len(steps) / 2 or all(motion.moves for motion in overall):
+        motion = moving if len(moving) > len(steps) / 2 else [overall[-1]]
+        sweeps = 1 if len(moving) > len(steps) / 2 else count - 1
+        shift_m = float(np.median([one.shift_m for one in motion])) / sweeps
+        yaw_deg = float(np.degrees(np.median([one.yaw_rad for one in motion]))) / sweeps
+        speeds = [f"{shift_m:.2g} m", f"{yaw_deg:.2g}°"]
+        if period_ns:
+            speeds[0] += f" ({1e9 * shift_m / period_ns:.2g} m/s)"
+        told = " and ".join(
+            speed for speed, some in zip(speeds, (shift_m > 0, yaw_deg > 0), strict=True) if some
+        )
+        raise LidarpoolError(
+            f"{name} is of a sensor that moves, by {told} from sweep to sweep: give sweeps of a "
+            "sensor that stands, or one sweep for the bias of its rings."
+        )
+    changes = np.abs(np.diff(repeats.ranges, axis=0))
+    if (change := _median(changes, (0, 1, 2))) > _CHANGED_M:
+        raise LidarpoolError(
+            f"{name} has ranges that change by {change:.2g} m from sweep to sweep, in the median, "
+            "and no motion of the sensor explains that: give points in metres, of a place that "
+            "stands still."
+        )
+
+
+class SensorMotion(NamedTuple):
+    """Motion of a sensor from a sweep to another; 0 where none can be told from noise."""
+
+    shift_m: float
+    yaw_rad: float
+
+    @property
+    def moves(self) -> bool:
+        """Whether the sensor moves."""
+        return self.shift_m > _STILL_M or self.yaw_rad > _STILL_RAD
+
+
+def sensor_motion(repeats: Repeats, first: int, second: int) -> SensorMotion:
+    """Fit the shift and the yaw of the sensor between two sweeps to the changes of ranges.
+
+    A plane n · x = c is nearer by n · s / (n · d) in the direction d after a shift s.
+    """
+    distance = repeats.ranges[first].astype(np.float64)
+    # Changes of ranges from sweep to sweep tell no noise if the sensor moves.
+    plane = surfaces(repeats, distance, np.full_like(distance, _ROUGH_M))
+    with np.errstate(invalid="ignore"):
+        turned = repeats.aside[second] - repeats.aside[first]
+        change = repeats.ranges[second] - distance - plane.turn * turned
+        chosen = plane.smooth & np.isfinite(change) & (plane.slope < _FLAT * distance)
+    if chosen.sum() < _FEW:
+        return SensorMotion(0.0, 0.0)
+    change, far = change[chosen], distance[chosen]
+    # Normals are of points two columns away on either side: those of near points are inexact.
+    inexact = _ROUGH_M / (np.sqrt(10) * far * 2 * np.pi / distance.shape[1])
+    noise = np.hypot(_ROUGH_M + _KINK * far, _SHIFT_M * inexact)
+    # Yaw as metres at a distance of 10 m, so that the unknowns are of about the same size.
+    design = np.column_stack([-plane.normal[chosen], plane.turn[chosen] / _YAW_M])
+    changed = np.abs(change) > 5 * noise  # in a street, few rays tell how far the sensor goes
+    for rays in (slice(None), changed):
+        motion = _rigid_motion(design[rays], change[rays], noise[rays])
+        explained = design @ motion
+        off = np.abs(change - explained)
+        scale = 1.4826 * np.median(off / noise)
+        limit = np.hypot(3 * scale * noise, 3 * inexact * np.linalg.norm(motion[:3]))
+        told = np.abs(explained) > limit
+        if told.sum() < _FEW or (off < np.abs(explained) / 2)[told].mean() < _AGREEING:
+            continue
+        shift_m, yaw_rad = float(np.linalg.norm(motion[:3])), float(abs(motion[3])) / _YAW_M
+        return SensorMotion(
+            shift_m if shift_m > _STILL_M else 0.0, yaw_rad if yaw_rad > _STILL_RAD else 0.0
+        )
+    return SensorMotion(0.0, 0.0)
+
+
+def _rigid_motion(design: Floats, change: Floats, noise: Floats) -> Floats:
+    """Fit a shift and a yaw (4,) to changes of ranges (k,); 0 where the changes do not tell them.
+
+    Huber's estimate: few rays of things that move count little.
+    """
+    motion = np.zeros(4)
+    if len(change) < _FEW:
+        return motion
+    for _ in range(30):
+        size = np.abs(change - design @ motion) / noise
+        weight = np.sqrt(np.minimum(1, 2 / np.maximum(size, 1e-9))) / noise
+        weighted = design * weight[:, None]
+        motion = np.linalg.lstsq(weighted, change * weight, rcond=1e-6)[0]
+    spread, axes = np.linalg.eigh(_sandwich(weighted, (change - design @ motion) * weight))
+    along = axes.T @ motion
+    known = np.abs(along) > 5 * np.sqrt(np.maximum(spread, 0)) + 1e-9
+    motion = axes @ np.where(known, along, 0.0)
+    return np.asarray(motion)
 
 
 def _meeting(points: Floats) -> Floats:
@@ -367,7 +555,8 @@ class Rays(NamedTuple):
     distance: Floats  # mean of the ranges, metres
     slope: Floats  # by how much the range changes with the direction, metres in a radian
     light: Floats  # mean intensity; NaN if unknown
-    returns: Ints  # sweeps with one
+    returns: Ints  # sweeps with a return
+    trials: Ints  # sweeps that cover the ray
     variance: Floats  # of the range over the sweeps, square metres
     freedom: Ints  # returns of which it is, less one
 
@@ -383,11 +572,13 @@ def smooth_rays(
     """
     middle, there = _median(repeats.ranges, 0), np.isfinite(repeats.ranges).sum(axis=0)
     blur = repeats.sigma / np.sqrt(np.maximum(there, 1))
-    turn, slope, smooth = surfaces(repeats, middle, blur)
+    turn, slope, smooth, _ = surfaces(repeats, middle, blur)
     if expected is not None:
-        _, slope, _ = surfaces(repeats, expected, 0 * blur)
+        slope = surfaces(repeats, expected, 0 * blur).slope
         smooth &= np.abs(middle - expected) < _BESIDE_M
-    row, column = cell = np.nonzero(smooth)
+    # A cell that is smooth by chance, as in leaves, has no smooth ones beside it.
+    beside = np.sum([np.roll(smooth, by, axis=1) for by in (-2, -1, 1, 2)], axis=0)
+    row, column = cell = np.nonzero(smooth & (beside >= 3))
     images = repeats.ranges, repeats.light, repeats.aside
     ranges, light, aside = (one[:, row, column].astype(np.float64) for one in images)
     ranges -= turn[cell] * aside
@@ -398,9 +589,16 @@ def smooth_rays(
     count = np.maximum(used, 1)
     mean, bright = (np.where(kept, one, 0).sum(axis=0) / count for one in (ranges, light))
     variance = np.where(kept, (ranges - mean) ** 2, 0).sum(axis=0) / np.maximum(used - 1, 1)
-    some = np.flatnonzero((used > 0) & (used >= _WHOLE * returns))
-    rays = row, column, mean, slope, bright, returns, variance, used - 1
+    some = np.flatnonzero((used > 0) & (used >= _REPEATED * returns))
+    trials = repeats.trials[cell]
+    rays = row, column, mean, slope, bright, returns, trials, variance, used - 1
     return Rays._make(one[some] for one in rays)
+
+
+def meet_frontally(rays: Rays) -> bool:
+    """Whether enough rays meet surfaces so that noise of ranges is not taken for directions'."""
+    frontal = (rays.slope < _FRONTAL * rays.distance).sum()
+    return bool(frontal >= max(_FRONTAL_RAYS, _FRONTAL_SHARE * len(rays.row)))
 
 
 def fit_performance(
@@ -411,18 +609,22 @@ def fit_performance(
     Returns what is known by the names of `Noise`; and the standard deviations of rays (k,), metres,
     by range or by energy, whichever is likelier.
     """
-    sweeps, light = len(repeats.ranges), np.nan_to_num(rays.light) if energy is None else energy
+    light = np.nan_to_num(rays.light) if energy is None else energy
     strong, threshold = light >= np.median(light), None
     for _ in range(3):  # the threshold tells what loses nothing by energy
-        dropout = Estimate.mean(1 - rays.returns[strong] / sweeps)
+        dropout = Estimate.ratio((rays.trials - rays.returns)[strong], rays.trials[strong])
         if energy is not None:
-            threshold = fit_threshold(energy, rays.returns, sweeps, dropout.value)
+            threshold = fit_threshold(energy, rays.returns, rays.trials, dropout.value)
             strong = energy > 2 * threshold.value if threshold else strong
     figures, sigma, deviance = fit_scatter(rays, "range_per_m", rays.distance, 1)
     if energy is not None and threshold is not None:
         other = fit_scatter(rays, "range_at_threshold_m", threshold.value / energy, 2)
         if "range_at_threshold_m" in other[0] and other[2] < deviance:
             figures, sigma, _ = other
+    if not meet_frontally(rays):
+        figures = {}
+    figures = {name: one for name, one in figures.items() if one.known_within(_KNOWN)}
+    if threshold is not None:
         figures["detection_range_m"] = threshold.power(-0.5, 10 * np.sqrt(TARGET_REFLECTANCE))
     if alarms := alarm_share(repeats):
         figures["false_alarms"] = alarms
@@ -435,50 +637,108 @@ def fit_scatter(
     """Fit noise of ranges and directions to the variances of rays, by their likelihood.
 
     Noise of ranges grows with a power of `spread` (k,). What rays do not tell, for want of spreads
-    or inclined surfaces, is left out. Sandwich estimators give the intervals, which rays of unequal
-    noise do not narrow. Returns figures, noise of ranges (k,) in metres, and the deviance.
+    or inclined surfaces, is left out. Intervals are of sandwich estimators, for patches of rays
+    that may be alike, and of errors of the model: edges, slopes, and growth. Returns figures, noise
+    of ranges (k,) in metres, and the deviance.
+    """
+    low, unit, high = np.quantile(spread, (0.05, 0.5, 0.95))
+    tilted = np.quantile(rays.slope / rays.distance, 0.9) > _TILT
+    # Growth is fitted even where it is not told: it makes the interval of range_m as wide as it is.
+    known = np.array([True, True, tilted])
+    # Rays that lose some of their pulses are known by the nearer or brighter ones of these.
+    repeated = (rays.freedom > 0) & (rays.returns >= _REPEATED * rays.trials)
+    variance, slope, freedom = (
+        values[repeated] for values in (rays.variance, rays.slope, rays.freedom)
+    )
+    steep = np.median(rays.slope)
+    usual = max(float(np.median(variance)), 1e-12)
+
+    def model(some: Floats, spread: Floats, slope: Floats) -> Floats:
+        theta = np.zeros(3)
+        theta[known] = some
+        ranges = theta[0] + theta[1] * (spread / unit) ** power
+        return np.asarray(usual * (ranges ** (2 / power) + theta[2] * (slope / steep) ** 2))
+
+    def expected(some: Floats) -> Floats:
+        return model(some, spread[repeated], slope)
+
+    start = np.array([1.0, 0.1, 0.1])[known]
+    wide = max(int(rays.column.max()) // _PATCHES, 1)  # columns of a patch
+    patch = (rays.row // _PATCH_ROWS * (_PATCHES + 2) + rays.column // wide)[repeated]
+    theta, covariance = _trimmed(expected, start, variance, freedom, _TRIMMED, patch)
+    # Edges that are finer than the rays make the variances of some rays larger: what the figures
+    # change if fewer of these are left out is an error of the model.
+    others, _ = _trimmed(expected, theta, variance, freedom, _REJECTED, patch)
+    spreads = np.diag(covariance) + (theta - others) ** 2
+    # Nor are slopes exact: variances of steep rays, or far ones, may be wrong against the others.
+    for quantity in (slope / rays.distance[repeated], spread[repeated]):
+        wrong = _WRONG * np.where(quantity > np.median(quantity), 1.0, -1.0)
+        biased, _ = _trimmed(expected, theta, variance * (1 + wrong), freedom, _TRIMMED, patch)
+        spreads += (biased - theta) ** 2
+    names, roots = ("range_m", growth, "angle_deg"), (1 / power, 1 / power, 0.5)
+    scales = np.sqrt(usual) / np.array([1, unit, np.radians(steep)])
+    figures = {
+        names[k]: Estimate.of(value, square).power(roots[k], scales[k])
+        for k, value, square in zip(np.flatnonzero(known), theta, spreads, strict=True)
+        if k != 1 or high > _SPAN * low
+    }
+    sizes = np.minimum(variance / expected(theta), _OUTLIER)
+    deviance = freedom @ (np.log(expected(theta)) + sizes)
+    return figures, np.sqrt(model(theta, spread, rays.slope)), float(deviance)
+
+
+def _trimmed(
+    expected: Callable[[Floats], Floats],
+    start: Floats,
+    variance: Floats,
+    freedom: Ints,
+    chance: float,
+    patch: Ints,
+) -> tuple[Floats, Floats]:
+    """Fit a model to variances (k,), and estimate the covariance of its parameters.
+
+    Variances above a quantile of their distribution, which they exceed with a `chance`, are left
+    out, and the mean of the others is that of the truncated distribution.
     """
     from scipy.optimize import least_squares
     from scipy.stats import chi2
 
-    low, unit, high = np.quantile(spread, (0.05, 0.5, 0.95))
-    tilted = np.quantile(rays.slope / rays.distance, 0.9) > _TILT
-    known = np.array([True, high > _SPAN * low, tilted])
-    kept, steep = rays.freedom > 0, np.median(rays.slope)
-    usual = max(float(np.median(rays.variance[kept])), 1e-12)
+    limit = chi2.isf(chance, freedom)
+    kept = np.ones(len(variance), bool)
+    truncated = chi2.cdf(limit, freedom + 2) / (1 - chance)
+    theta = start
+    for step in range(12):
+        if step:
+            kept = freedom * variance / expected(theta) < limit
+        scale = truncated if step else 1.0
+        weight = np.sqrt(freedom / 2) / expected(theta)
 
-    def model(some: Floats) -> Floats:
-        theta = np.zeros(3)
-        theta[known] = some
-        own = theta[0] + theta[1] * (spread / unit) ** power
-        return usual * (own ** (2 / power) + theta[2] * (rays.slope / steep) ** 2)
+        def off(
+            some: Floats, kept: Bools = kept, weight: Floats = weight, scale: Any = scale
+        ) -> Any:
+            return ((variance - scale * expected(some)) * weight)[kept]
 
-    theta = np.array([1.0, 0.1, 0.1])[known]
-    for _ in range(10):
-        weight = np.sqrt(rays.freedom / 2) / model(theta)
-        found = least_squares(
-            lambda some: ((rays.variance - model(some)) * weight)[kept],  # noqa: B023
-            theta, bounds=(0, np.inf), x_scale=np.maximum(theta, 0.01),
-        )  # fmt: skip
-        theta, expected = found.x, model(found.x)
-        kept = rays.freedom * rays.variance / expected < chi2.isf(_REJECTED, rays.freedom)
-    names, roots = ("range_m", growth, "angle_deg"), (1 / power, 1 / power, 0.5)
-    scales = np.sqrt(usual) / np.array([1, unit, np.radians(steep)])
-    spreads, figures = np.diag(_sandwich(found.jac, found.fun)), {}
-    for k, *one in zip(np.flatnonzero(known), theta, spreads, strict=True):
-        figures[names[k]] = Estimate.of(*one).power(roots[k], scales[k])
-    deviance = rays.freedom @ (np.log(expected) + rays.variance / expected)
-    return figures, np.sqrt(expected), float(deviance)
+        solved = least_squares(off, theta, bounds=(0, np.inf), x_scale=np.maximum(theta, 0.01))
+        theta = solved.x
+    return theta, _sandwich(solved.jac, solved.fun, patch[kept])
 
 
-def _sandwich(design: Floats, off: Floats) -> Floats:
-    """Estimate the covariance of a least-squares fit whose residuals are of unequal size."""
+def _sandwich(design: Floats, off: Floats, patch: Ints | None = None) -> Floats:
+    """Estimate the covariance of a least-squares fit whose residuals are of unequal size.
+
+    Residuals of one patch (k,), such as of a surface, may be alike.
+    """
     inverse, score = np.linalg.pinv(design.T @ design, hermitian=True), design * off[:, None]
+    if patch is not None:
+        _, patch = np.unique(patch, return_inverse=True)
+        sums = np.zeros((patch.max() + 1, score.shape[1]))
+        np.add.at(sums, patch, score)
+        score = sums * np.sqrt(len(sums) / max(len(sums) - 1, 1))
     covariance: Floats = inverse @ (score.T @ score) @ inverse
     return covariance
 
 
-def fit_threshold(energy: Floats, count: Ints, sweeps: int, dropout: float) -> Estimate | None:
+def fit_threshold(energy: Floats, count: Ints, trials: Ints, dropout: float) -> Estimate | None:
     """Energy of which half of the pulses return, by the curve of `Noise.detected`.
 
     A ray is there only if a pulse returned: the likelihood is that of a truncated binomial
@@ -494,7 +754,7 @@ def fit_threshold(energy: Floats, count: Ints, sweeps: int, dropout: float) -> E
 
     def unlikely(log_threshold: Any) -> Floats:
         p: Floats = seen(log_threshold)
-        return np.log1p(-((1 - p) ** sweeps)) - binom.logpmf(count, sweeps, p)
+        return np.log1p(-((1 - p) ** trials)) - binom.logpmf(count, trials, p)
 
     low, high = np.log(np.quantile(energy, (0.001, 0.999)))
     (found,) = brute(lambda one: unlikely(one).sum(), [(low - 2, high)], Ns=60)
@@ -518,8 +778,8 @@ def alarm_share(repeats: Repeats) -> Estimate | None:
     # Weak surfaces, which return seldom, are beside those that return more often.
     sky = maximum_filter(count, size=_SKY, mode=("nearest", "wrap")) <= 1
     alarms = int((count[sky] == 1).sum())
-    trials = len(repeats.ranges) * int((count[sky] == 0).sum()) + alarms
-    if not trials or len(repeats.ranges) < 3:
+    trials = int(repeats.trials[sky & (count == 0)].sum()) + alarms
+    if not trials or repeats.sweeps < 3:
         return None
     return Estimate(alarms / trials, *map(float, binomtest(alarms, trials).proportion_ci()))
 
@@ -530,6 +790,8 @@ def ring_bias(rays: Rays, directions: Floats, blur: Floats) -> dict[int, Estimat
     Planes u · x = 1 and offsets b are fitted at once: 1 / r = u · d − b / r², times r². Ranges have
     standard deviations `blur` (k,), metres.
     """
+    if not len(rays.row):
+        return {}
     some = even_indices(len(rays.row), _PLANE_POINTS)
     plane = _planes(rays.distance[some, None] * directions[some])
     many = np.bincount(rays.row[some[plane >= 0]], minlength=rays.row.max() + 1)[rays.row[some]]

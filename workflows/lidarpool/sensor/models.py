@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import fields
+from dataclasses import fields, replace
 from fractions import Fraction
 from functools import cache
 from importlib.resources import files
@@ -27,7 +27,7 @@ from .beams import Beams, Duty, Mirror, MirrorMotion, Rate, Spin, Step, Width
 from .calibrations import UNUSABLE, Calibration, read_calibration, said
 from .noise import TARGET_REFLECTANCE, THRESHOLD_SIGMAS, Noise
 from .optics import LIGHT_M_NS, Mode, Optics, Returns
-from .ray_sensors import ListedSensor, Prism, PrismSensor
+from .ray_sensors import ListedSensor, Prism, PrismSensor, TurningMirror
 from .sensor import LineSensor, MaxRange, MinRange, Sensor
 
 _BUILT_IN = files("lidarpool.sensor") / "data"
@@ -198,6 +198,8 @@ class SensorModel(_ModelSection):
     beams: BeamTable = BeamTable()
     mirror: MirrorPart | None = None
     prisms: tuple[Prism, ...] = ()
+    turning_mirror: TurningMirror | None = None  # behind the prisms
+    typical: bool = False  # whether units differ: its rays are like those of a unit, not the same
     optics: Optics = Optics()
     performance: Performance | None = None
     listed: bool = False
@@ -216,6 +218,8 @@ class SensorModel(_ModelSection):
         unused = self.model_dump(include=others, exclude_defaults=True)
         if self.prisms and unused:
             raise ValueError(f"prisms turn about x: leave {min(unused)} out, and turn the sensor")
+        if self.turning_mirror and not self.prisms:
+            raise ValueError("turning_mirror needs prisms: a mirror that sweeps lines is mirror")
         self.beams.beams()  # LidarpoolError if it cannot be made
         return self
 
@@ -393,7 +397,7 @@ def load_sensor(
     common: dict[str, Any] = {
         "min_range_m": low if min_range_m is None else min_range_m,
         "max_range_m": high if max_range_m is None else max_range_m,
-        "name": described.name if unit is None else f"{described.name}, {unit.file}",
+        "name": _sensor_name(described, unit),
         "optics": described.optics,
     }
     own = described.performance is not None and str(model).endswith(MODEL_FILES)
@@ -405,7 +409,8 @@ def load_sensor(
         return _listed(described, unit, head, common)
     beams = described.beams.beams() if unit is None else _calibrated(described, unit)
     if described.prisms:
-        return PrismSensor(beams, head, prisms=described.prisms, **common)
+        mirror = described.turning_mirror
+        return PrismSensor(beams, head, prisms=described.prisms, mirror=mirror, **common)
     if described.mirror is not None:
         mirror = described.mirror.model_dump()
         head = Mirror(firings, step_deg, rate, head.clockwise, head.zero_deg, **mirror)
@@ -413,6 +418,13 @@ def load_sensor(
         beams = beams.turning(head.radians_per_ns)
     kind = LineSensor if described.axis == "x" else Sensor
     return kind(beams.lowest_first(), head, **common)
+
+
+def _sensor_name(described: SensorModel, unit: Calibration | None) -> str:
+    """Return the name of a sensor for reports, with the source of its rays."""
+    if unit is not None:
+        return f"{described.name}, {unit.file}"
+    return f"{described.name}, typical pattern" if described.typical else described.name
 
 
 def _model_of(unit: Calibration, columns: int | None) -> SensorModel:
@@ -438,10 +450,13 @@ def _listed(
     described: SensorModel, unit: Calibration, head: Spin, common: dict[str, Any]
 ) -> ListedSensor:
     """Rays of a unit's list, at the model's rate if the list has no times."""
-    if unit.rays is None or described.beams.elevation_deg:
+    if unit.rays is None or (described.beams.elevation_deg and not described.prisms):
         raise LidarpoolError(
             f"{unit.file} does not fit {described.name}: one lists rays, the other beams."
         )
+    if not unit.head:  # a firing of the model is of all beams, and of the list one ray
+        firings = head.firings_per_turn * len(described.beams.beams())
+        head = replace(head, firings_per_turn=firings)
     each_ns = 1e9 / (head.firings_per_turn * head.rate_hz)
     times = unit.shot_ns
     if times is None:

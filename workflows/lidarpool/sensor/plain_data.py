@@ -10,13 +10,23 @@ import numpy as np
 
 from ..base.arrays import AnyArray
 from .beams import Beams, Mirror, Spin
-from .ray_sensors import ListedSensor, Prism, PrismSensor
+from .ray_sensors import ListedSensor, Prism, PrismSensor, TurningMirror
 from .sensor import LineSensor, Sensor
 
 # What directions and times of rays depend on; nothing else is made from a file.
 _KINDS = {
     kind.__name__: kind
-    for kind in (Sensor, LineSensor, PrismSensor, ListedSensor, Beams, Spin, Mirror, Prism)
+    for kind in (
+        Sensor,
+        LineSensor,
+        PrismSensor,
+        ListedSensor,
+        Beams,
+        Spin,
+        Mirror,
+        Prism,
+        TurningMirror,
+    )
 }
 _LEFT_OUT = ("optics", "noise", "returns")
 

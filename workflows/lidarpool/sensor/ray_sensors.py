@@ -29,18 +29,30 @@ class Prism:
     inclined_first: bool = False  # light enters through the inclined face; else the flat one
 
 
+@dataclass(frozen=True)
+@checked_fields
+class TurningMirror:
+    """A plane mirror behind the prisms, which turns about their axis and looks up."""
+
+    tilt_deg: Annotated[float, Field(gt=0, lt=90)]  # angle between its normal and the axis
+    rpm: float  # turns a minute about the axis, from x to y of the sensor
+    phase_deg: float = 0.0  # azimuth of its normal at time 0, likewise
+
+
 @dataclass(frozen=True, eq=False)
 class PrismSensor(Sensor):
     """Beams along x through wedge prisms that turn about x at different rates.
 
-    The head is only the clock. Directions are exact by Snell's law at each face. Prisms are
-    thin: all rays start at the sensor's centre. The pattern has no useful period.
+    With a mirror, the axis of prisms and mirror is z instead, and y and z of the prisms are x and y
+    of the sensor. The head is only the clock. Directions are exact by Snell's law at each face.
+    Prisms are thin: all rays start at the sensor's centre. The pattern has no useful period.
     """
 
     # One along x by default; others enter the first prism at an angle.
     beams: Beams = field(default_factory=lambda: Beams(np.zeros(1)))
     # In the order in which light passes them.
     prisms: tuple[Prism, ...] = (Prism(18, 1.5, 7294), Prism(18, 1.5, -4664, 0, True))
+    mirror: TurningMirror | None = None
     cycle: ClassVar[str] = "frame"
 
     def __post_init__(self) -> None:
@@ -70,7 +82,20 @@ class PrismSensor(Sensor):
             faces = (inclined, flat) if prism.inclined_first else (flat, inclined)
             for face, ratio in zip(faces, (1 / prism.index, prism.index), strict=True):
                 ray = _refracted(ray, face, ratio)
+        if self.mirror is not None:
+            ray = self._reflected(ray, minutes)
         return np.ascontiguousarray(ray.transpose(1, 2, 0))
+
+    def _reflected(self, rays: Floats, minutes: Floats) -> Floats:
+        """Reflect rays (3, k, c) at the mirror, at times (k,): (3, k, c), z along the axis."""
+        assert self.mirror is not None
+        angle = 2 * np.pi * ((self.mirror.rpm * minutes + self.mirror.phase_deg / 360) % 1)
+        sine, cosine = sin_cos_of(math.radians(self.mirror.tilt_deg))
+        normal = np.empty((3, len(minutes), 1))
+        normal[0] = -cosine
+        normal[1:, :, 0] = sine * np.stack(sin_cos(angle)[::-1])
+        reflected = rays - 2 * (rays * normal).sum(axis=0) * normal
+        return reflected[[1, 2, 0]]
 
 
 def _refracted(rays: Floats, normals: Floats, ratio: float) -> Floats:
