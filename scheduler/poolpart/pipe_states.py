@@ -150,6 +150,11 @@ def pipes_of(scheduler: Any) -> dict[str, PipeState]:
     return scheduler.plugins[NAME].states if NAME in scheduler.plugins else {}
 
 
+def names_of_pipes(dask_scheduler: Any = None) -> list[str]:
+    """Return the names of all pipes. Runs on the scheduler."""
+    return list(pipes_of(dask_scheduler))
+
+
 def open_pipe(
     name: str, owner: str, capacity: int, producers: int, dask_scheduler: Any = None
 ) -> bool:
