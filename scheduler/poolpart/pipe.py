@@ -23,7 +23,7 @@ from contextlib import suppress
 from itertools import islice
 from typing import Any
 
-from distributed import Client
+from distributed import Client, Future
 from distributed.protocol.pickle import dumps
 
 from .errors import PipeClosed, PipeFailed
@@ -276,8 +276,29 @@ class Pipe:
         if reply["failure"]:
             self._taken.extendleft(reversed(taken))
             raise PipeFailed(reply["failure"])
-        items = [unpack(self.client, packed) for packed in reply["answer"]]
-        return [*taken, *items], reply["closed"]
+        return [*taken, *self._unpacked(reply)], reply["closed"]
+
+    def _unpacked(self, reply: Reply) -> list[Any]:
+        return [unpack(self.client, packed) for packed in reply["answer"]]
+
+    def take_beside(self, futures: Sequence[Future], limit: int) -> tuple[list[Any], bool]:
+        """Take up to `limit` queued items, as soon as there are any or a task has ended.
+
+        For `Partition.for_each`. Returns the items, and whether the pipe is closed; raises
+        `PipeFailed`.
+        """
+        if taken := [self._taken.popleft() for _ in range(min(limit, len(self._taken)))]:
+            return taken, False
+        reply = self._ask_until(
+            math.inf,
+            lambda reply: reply["answer"] or any(future.done() for future in futures),
+            TAKE,
+            keys=[future.key for future in futures],
+            limit=limit,
+        )
+        if reply["failure"]:
+            raise PipeFailed(reply["failure"])
+        return self._unpacked(reply), reply["closed"]
 
     def get_all(self, timeout_s: float | None = None, *, linger_s: float = 0.0) -> list[Any]:
         """Take all queued items, as soon as there are any.

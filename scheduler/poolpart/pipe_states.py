@@ -12,6 +12,7 @@ only, and takes items only if its client is still there.
 
 from __future__ import annotations
 
+import sys
 from collections import defaultdict
 from collections.abc import Awaitable, Callable, Collection, Mapping, Sequence
 from typing import Any
@@ -275,10 +276,12 @@ class Pipes(SchedulerPlugin):
         linger_s: float = 0.0,
         keys: Sequence[str] = (),
         puts: Mapping[str, list[bytes]] | None = None,
+        limit: int = sys.maxsize,
     ) -> Replies:
         """Take the items of pipes, once one has any or has ended, or a task has ended.
 
-        Before that, put items into other pipes.
+        Before that, put items into other pipes. No more than `limit` items of each are taken; with
+        0, the request waits for the end of a pipe or a task.
         """
         for name, items in (puts or {}).items():
             self.put([name], asker, items, unbounded=True, seconds=0.0)
@@ -287,7 +290,7 @@ class Pipes(SchedulerPlugin):
             tasks = (self.scheduler.tasks.get(key) for key in keys)
             return (
                 len(states) < len(names)
-                or any(state.has_ended or not state.queue.empty() for state in states.values())
+                or any(s.has_ended or (limit and not s.queue.empty()) for s in states.values())
                 or any(task is None or task.state in _ENDED for task in tasks)
             )
 
@@ -295,7 +298,7 @@ class Pipes(SchedulerPlugin):
             return any(state.has_ended or not state.queue.room for state in states.values())
 
         def take(state: PipeState) -> list[Any]:
-            return state.take() if asker in self.scheduler.clients else []
+            return state.take(limit) if asker in self.scheduler.clients else []
 
         states = self._existing(names)
         of_pipes = [state.queue.changes for state in states.values()]

@@ -198,9 +198,9 @@ class QueueAndVariable:
         """Add pickled items to the queue, also beyond its capacity."""
         self.queue.extend([_record_of(item) for item in items])
 
-    def take(self) -> list[bytes | Record]:
-        """Remove all items from the queue; returns what `unpack` of a client takes."""
-        records = self.queue.take(self.queue.qsize())
+    def take(self, limit: int) -> list[bytes | Record]:
+        """Remove the first items from the queue; returns what `unpack` of a client takes."""
+        records = self.queue.take(limit)
         return [_packed(self.name, record) for record in records]
 
     def delete(self) -> None:
