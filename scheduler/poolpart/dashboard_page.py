@@ -12,11 +12,11 @@ from distributed.diagnostics.plugin import SchedulerPlugin
 from tornado import web
 from tornado.template import Template
 
-from .errors import PoolError
+from .errors import PipeClosed, PoolError
 from .fence import fences_of
 from .internals.names import PAGE, require
 from .internals.scheduler import serve, serve_no_longer
-from .pipe import pipes_of
+from .pipe_states import pipes_of
 from .stats import NAME as STATISTICS
 from .stats import StageStats, forget_statistics, running_on, slots_of, statistics_of, stats_of
 from .steward import NAME as STEWARD
@@ -61,8 +61,11 @@ def page_of(scheduler: Any) -> bytes:
         partitions.append([title, p.workers, p.slots, p.busy, *_counts(p)])
         stages += [[name, _shown(p.name), *_counts(stage)] for name, stage in p.stages.items()]
     for name, pipe in pipes_of(scheduler).items():
-        state = f"failed: {pipe.failure}" if pipe.failure else "closed" if pipe.closed else "open"
-        pipes.append([name, len(pipe.items), state])
+        end = pipe.end()
+        state = (
+            "open" if end is None else "closed" if isinstance(end, PipeClosed) else f"failed: {end}"
+        )
+        pipes.append([name, pipe.queue.qsize(), state])
     tables = [
         ("Partitions", ["workers", "slots", "busy", *_COUNTS], partitions),
         ("Stages", ["partition", *_COUNTS], stages),

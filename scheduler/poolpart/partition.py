@@ -15,9 +15,11 @@ from distributed import Client, Future
 from .adapting import IDLE_S, Bounds, adapt, want
 from .division import ask, dissolve, grow, shrink
 from .errors import PoolError
+from .for_each import ItemTasks
 from .internals.names import MAP, require
 from .mapping import Results, Stage
 from .membership import addresses_of, check_slots, forget_memberships
+from .pipe import Pipe
 from .rules import check_count
 from .stats import PartitionStats, stats_of
 from .task_context import own_client
@@ -249,6 +251,62 @@ class Partition:
         options = (ordered, window, chunk, priority, retries, slots, return_exceptions, kwargs)
         stage = Stage(self.client, self.name, function, *options, by_rule=self._by_rule)
         return Results(stage, iterables)
+
+    def for_each(
+        self,
+        pipe: Pipe,
+        function: Callable[..., Any],
+        /,
+        *,
+        window: int | None = None,
+        priority: int = 0,
+        retries: int = 0,
+        slots: int = 1,
+        **kwargs: Any,
+    ) -> int:
+        """Call a function for each item that comes through a pipe, in a task each.
+
+        It returns once the pipe is closed and all tasks are done. A bounded number of tasks is
+        under way. Further items wait in the pipe, so that producers wait when it is full. An item
+        whose worker dies is run on another; several `for_each` may share a pipe.
+
+        Parameters
+        ----------
+        pipe, function
+            The function gets an item, or the result of a future that a `distributed.Queue` has
+            put. Its result is dropped: it may put something into another pipe.
+        window
+            Tasks under way at most. By default two for each slot, whose number may change
+            meanwhile.
+        priority, retries, slots
+            Of each task, as in `submit`.
+        kwargs
+            Keyword arguments of each call. Bind those that have the name of an option with
+            `functools.partial`.
+
+        Returns
+        -------
+        int
+            Number of items.
+
+        Raises
+        ------
+        PipeFailed
+            If the pipe was failed or deleted. Tasks that have not started are cancelled.
+        Exception
+            What the function raises first; a note names the item. The pipe fails with it, so that
+            producers end, and tasks that have not started are cancelled.
+
+        Examples
+        --------
+        >>> gpu.for_each(scans, cast, scene=scene)                       # doctest: +SKIP
+        36
+        """
+        options = {"priority": priority, "retries": retries, "slots": slots, **kwargs}
+        self._taking(slots)
+        tasks = ItemTasks(self, pipe, function, window, options)
+        tasks.run()
+        return tasks.count
 
     # -- collections and data ----------------------------------------------------------
 

@@ -16,6 +16,7 @@ from .division import ask, declare, dissolve
 from .errors import PoolError
 from .membership import forget_memberships
 from .partition import Partition
+from .pipe_states import names_of_pipes
 from .probe import worker_gpus
 from .rules import Rule, check_name, named, per_gpu, per_host
 from .rules import n_workers as count
@@ -295,6 +296,13 @@ class Pool:
             If the scheduler lacks this package, or runs no HTTP server.
         """
         return partitions_page(self.client)
+
+    def pipes(self) -> list[str]:
+        """Return the names of all pipes of the cluster, whoever has created them.
+
+        Dask's ``Queue(name)`` has the items of a pipe, and ``Variable(name)`` its state.
+        """
+        return sorted(on_scheduler(self.client, names_of_pipes))
 
     def leave_page(self) -> None:
         """Remove the page, unless other clients want it."""

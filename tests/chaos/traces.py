@@ -7,7 +7,7 @@ from typing import Any
 
 from distributed import Client
 
-from poolpart.pipe import pipes_of
+from poolpart.pipe_states import pipes_of
 
 SETTLE_S = 300.0  # for what was closed to be gone: connections end a moment later
 

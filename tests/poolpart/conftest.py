@@ -142,8 +142,9 @@ def make_pipe():
     """Make pipes with names of their own; those that a test leaves are deleted."""
     made = []
 
-    def make(client, capacity=3):
-        made.append(Pipe(f"test-{uuid.uuid4().hex[:8]}", capacity, client).create())
+    def make(client, capacity=3, producers=1):
+        name = f"test-{uuid.uuid4().hex[:8]}"
+        made.append(Pipe(name, capacity, client, producers).create())
         return made[-1]
 
     yield make

@@ -16,7 +16,7 @@ from distributed import Client, LocalCluster
 from tests.clusters import import_jobqueue
 
 from poolpart import Partition
-from poolpart.pipe import pipes_of
+from poolpart.pipe_states import pipes_of
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 EXAMPLE = EXAMPLES / "thumbnails.py"

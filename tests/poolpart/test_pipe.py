@@ -7,14 +7,15 @@ from collections import deque
 from concurrent.futures import ThreadPoolExecutor
 
 import pytest
-from distributed import Client
+from distributed import Client, Queue, Variable
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from tests.poolpart.helpers import LONG_S
 
 from poolpart import Pipe, PipeClosed, PipeFailed
 from poolpart import pipe as pipe_module
-from poolpart.pipe import pipes_of, take_news
+from poolpart.pipe import take_news
+from poolpart.pipe_states import PipeState, pipes_of
 
 
 def again(pipe):
@@ -281,3 +282,245 @@ def test_all_that_is_in_the_pipes_is_taken_in_one_request(client, make_pipe, mon
     assert len(asked) == 1
     assert found == {one.name: [0, 1, 2, 3, 4], two.name: [{"scan": 7}]}
     assert take_news(client, 0.0, [one.name, two.name, empty.name]) == {}
+
+
+# -- several producers -------------------------------------------------------------------------
+
+
+def test_a_pipe_of_several_producers_is_closed_by_the_last(client, make_pipe):
+    pipe = make_pipe(client, capacity=10, producers=3)
+    for number in range(3):
+        with pytest.raises(TimeoutError):
+            again(pipe).get(timeout_s=0)
+        pipe.put(number)
+        assert pipe.get() == number
+        pipe.close()
+    with pytest.raises(PipeClosed):
+        pipe.get()
+
+
+def produce_and_close(pipe, items):
+    pipe.put_many(items)
+    pipe.close()
+
+
+def test_a_task_that_is_run_again_closes_for_one_producer(client, a, make_pipe, wait_until):
+    pipe = make_pipe(client, capacity=100, producers=2)
+    for _ in range(2):
+        a.submit(produce_and_close, pipe, range(3), key="producer-1").result(LONG_S)
+        wait_until(lambda: not client.cluster.scheduler.tasks)
+    assert pipe.get_all() == [0, 1, 2, 0, 1, 2]
+    with pytest.raises(TimeoutError):
+        pipe.get(timeout_s=0)
+    a.submit(produce_and_close, pipe, [9], key="producer-2").result(LONG_S)
+    assert list(pipe) == [9]
+
+
+@pytest.mark.parametrize("options", [{"capacity": 0}, {"producers": 0}, {"producers": 1.5}])
+def test_numbers_that_make_no_pipe(client, options):
+    with pytest.raises(ValueError, match=r"is (0|1\.5); give a whole number, 1 or more"):
+        Pipe("nothing", client=client, **options)
+
+
+# -- beside distributed.Queue and distributed.Variable, which a pipe consists of ---------------
+
+
+@pytest.fixture
+def other(client):
+    """Another client, which uses Dask's own classes."""
+    with Client(client.cluster, set_as_default=False) as other:
+        yield other
+
+
+def test_a_queue_of_another_client_puts_and_gets_the_same_items(client, other, make_pipe, pool):
+    pipe = make_pipe(client)
+    queue = Queue(pipe.name, other)
+    waiting = pool.submit(pipe.get, LONG_S)
+    time.sleep(0.05)
+    queue.put({"plain": (1, b"2")})
+    assert waiting.result(LONG_S) == {"plain": (1, b"2")}
+    waiting = pool.submit(queue.get, LONG_S)
+    time.sleep(0.05)
+    pipe.put({1, 2})  # pickled, and unpickled by the other client
+    assert waiting.result(LONG_S) == {1, 2}
+    pipe.put("first")
+    queue.put("second")
+    queue.put(other.submit(pow, 2, 10))
+    assert queue.qsize() == pipe.depth == 3
+    first, second, future = pipe.get_all()
+    assert (first, second, future.result(LONG_S)) == ("first", "second", 1024)
+    pipe.put_many(range(3))
+    assert queue.get(batch=True) == [0, 1, 2]
+    assert queue.qsize() == pipe.depth == 0
+
+
+def test_a_queue_waits_for_room_as_well(client, other, make_pipe, pool):
+    pipe = make_pipe(client, capacity=1)
+    queue = Queue(pipe.name, other)
+    pipe.put(1)
+    waiting = pool.submit(queue.put, 2)
+    time.sleep(0.05)
+    assert not waiting.done()
+    assert pipe.poll() == [1]
+    waiting.result(LONG_S)
+    waiting = pool.submit(pipe.put, 3)
+    time.sleep(0.05)
+    assert not waiting.done()
+    assert queue.get() == 2
+    waiting.result(LONG_S)
+    assert pipe.poll() == [3]
+
+
+def test_several_queues_and_pipes_lose_and_double_nothing(client, other, make_pipe, pool):
+    pipe = make_pipe(client, capacity=2)
+    queue = Queue(pipe.name, other)
+    consumers = [pool.submit(consume, again(pipe)) for _ in range(2)]
+    takers = [pool.submit(lambda: [queue.get() for _ in range(20)]) for _ in range(2)]
+    producers = [pool.submit(produce, again(pipe), range(30)) for _ in range(2)]
+    putters = [pool.submit(lambda: [queue.put(item) for item in range(30, 60)]) for _ in range(2)]
+    for future in producers + putters:
+        future.result(LONG_S)
+    received = list(itertools.chain(*(taker.result(LONG_S) for taker in takers)))
+    pipe.close()
+    received += itertools.chain(*(consumer.result(LONG_S) for consumer in consumers))
+    assert sorted(received) == sorted([*range(60), *range(60)])
+
+
+@pytest.mark.parametrize("end", ["close", "fail", "delete"])
+def test_waits_of_a_queue_end_with_the_pipe(client, other, make_pipe, pool, end):
+    empty, full = make_pipe(client), make_pipe(client, capacity=1)
+    full.put(1)
+    waiting = [pool.submit(Queue(empty.name, other).get, LONG_S)]
+    waiting += [pool.submit(Queue(full.name, other).put, 2, LONG_S)]
+    time.sleep(0.05)
+    for pipe in (empty, full):
+        pipe.fail("the disk is full") if end == "fail" else getattr(pipe, end)()
+    message = {"close": "is closed", "fail": "the disk is full", "delete": "was deleted"}[end]
+    for future in waiting:
+        with pytest.raises((PipeClosed, PipeFailed), match=message):
+            future.result(LONG_S)
+
+
+def test_the_items_of_a_closed_pipe_are_left_for_queues_those_of_a_failed_one_not(
+    client, other, make_pipe
+):
+    pipe = make_pipe(client)
+    queue = Queue(pipe.name, other)
+    pipe.put_many([1, 2])
+    pipe.close()
+    assert queue.get() == 1
+    pipe.fail("the disk is full")
+    with pytest.raises(PipeFailed, match="the disk is full"):
+        queue.get()
+
+
+def test_the_variable_is_the_state(client, other, make_pipe, pool):
+    pipe = make_pipe(client, producers=2)
+    variable = Variable(pipe.name, other)
+    assert variable.get() == {
+        "owner": client.id,
+        "capacity": 3,
+        "producers": 2,
+        "closed_by": (),
+        "closed": False,
+        "failure": "",
+        "advice": 1,
+    }
+    variable.set({**variable.get(), "advice": 5})
+    assert again(pipe).advice == 5
+    pipe.close()
+    assert len(variable.get()["closed_by"]) == 1
+    waiting = pool.submit(pipe.get, LONG_S)
+    time.sleep(0.05)
+    variable.set({**variable.get(), "closed": True})
+    with pytest.raises(PipeClosed):
+        waiting.result(LONG_S)
+    variable.set({**variable.get(), "failure": "of another client"})
+    with pytest.raises(PipeFailed, match="of another client"):
+        pipe.get()
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"closed": False}, "a closed pipe stays closed"),
+        ({"capacity": 9}, "capacity cannot be changed to 9"),
+        ({"owner": ""}, "owner cannot be changed to ''"),
+        ({"closed_by": ["x"]}, "closed_by cannot be changed"),
+        ({"closed": 1}, "closed cannot be 1"),
+        ({"advice": 0}, "advice is at least 1, not 0"),
+        ({"failure": "another"}, "the first reason of a failure stays"),
+        ({"size": 2}, "has other fields"),
+    ],
+)
+def test_what_cannot_follow_from_the_state_is_refused(client, other, make_pipe, change, message):
+    pipe = make_pipe(client)
+    pipe.close()
+    pipe.fail("the first")
+    variable = Variable(pipe.name, other)
+    state = variable.get()
+    with pytest.raises(ValueError, match=f"is the state of a pipe.*{message}"):
+        variable.set({**state, **change})
+    for value in (None, 5, client.submit(pow, 2, 10)):
+        with pytest.raises(ValueError, match="has other fields"):
+            variable.set(value)
+    assert variable.get() == state
+
+
+@pytest.mark.parametrize("kind", [Queue, Variable])
+def test_who_deletes_the_queue_or_the_variable_deletes_the_pipe(
+    client, other, make_pipe, pool, kind
+):
+    pipe = make_pipe(client)
+    queue = Queue(pipe.name, other)
+    waiting = [pool.submit(again(pipe).get), pool.submit(queue.get)]
+    time.sleep(0.05)
+    if kind is Variable:
+        Variable(pipe.name, other).delete()
+    else:
+        queue.close()
+        queue.close()  # Dask counts references: this one, and the pipe's
+    for future in waiting:
+        with pytest.raises(PipeFailed, match="does not exist"):
+            future.result(LONG_S)
+    with pytest.raises(PipeFailed, match="does not exist"):
+        pipe.put(1)
+    pipe.delete()
+    assert again(pipe).create().depth == 0
+
+
+def test_other_queues_and_variables_are_as_ever(client, other, make_pipe):
+    make_pipe(client)
+    queue, variable = Queue("of-somebody", other), Variable("of-somebody", other)
+    queue.put(1)
+    variable.set("a value")
+    variable.set(other.submit(pow, 2, 10))
+    assert queue.get() == 1
+    assert variable.get().result(LONG_S) == 1024
+    variable.delete()
+    queue.close()
+
+
+def test_a_change_of_a_pipe_wakes_those_that_wait_for_it_only(client, make_pipe, pool, monkeypatch):
+    """The time of an item would grow with the number of pipes."""
+    looks = []
+    has_ended = PipeState.has_ended.fget
+    monkeypatch.setattr(
+        PipeState,
+        "has_ended",
+        property(lambda state: looks.append(state.name) or has_ended(state)),
+    )
+    monkeypatch.setattr(pipe_module, "_WAIT_S", LONG_S)
+    monkeypatch.setattr("poolpart.internals.queues.LOOK_S", LONG_S)
+    idle, busy = [make_pipe(client) for _ in range(8)], make_pipe(client)
+    waiting = [pool.submit(again(pipe).get) for pipe in idle]
+    time.sleep(0.2)
+    looks.clear()
+    for number in range(20):
+        busy.put(number)
+        assert busy.get() == number
+    assert set(looks) == {busy.name}
+    for pipe in idle:
+        pipe.close()
+    for future in waiting:
+        assert isinstance(future.exception(LONG_S), PipeClosed)

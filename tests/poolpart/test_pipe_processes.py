@@ -8,10 +8,11 @@ import time
 import uuid
 
 import pytest
+from distributed import Client
 from tests.poolpart.helpers import LONG_S
 
 from poolpart import Partition, Pipe, PipeFailed
-from poolpart.pipe import pipes_of
+from poolpart.pipe_states import pipes_of
 
 
 def consume(pipe):
@@ -68,27 +69,47 @@ time.sleep(60)
 """
 
 
-def test_a_pipe_ends_with_the_process_that_made_it(processes, make_pipe):
+def test_a_pipe_ends_with_the_process_that_made_it(processes, make_pipe, wait_until):
     """Tasks that wait at its ends would keep their slots for ever."""
 
     def plugins(dask_scheduler):
         return sorted(name for name in dask_scheduler.plugins if name.startswith("poolpart"))
 
+    other = make_pipe(processes)
+    # A client that submits to a partition keeps nested tasks in it for as long as the client
+    # exists, so a client of its own submits here.
     before = processes.run_on_scheduler(plugins)
     maker = subprocess.Popen(
         [sys.executable, "-c", MAKER, processes.scheduler.address], stdout=subprocess.PIPE
     )
     assert maker.stdout.readline() == b"made\n"
-    other = make_pipe(processes)
-    consumer = Partition("OTHER", processes).submit(consume, Pipe("of-a-process", 3))
-    time.sleep(0.2)
-    assert consumer.status == "pending"
-    maker.kill()
-    maker.wait(LONG_S)
-    maker.stdout.close()
-    with pytest.raises(PipeFailed, match="does not exist"):
-        consumer.result(LONG_S)
+    with Client(processes.scheduler.address, set_as_default=False) as client:
+        consumer = Partition("OTHER", client).submit(consume, Pipe("of-a-process", 3))
+        time.sleep(0.2)
+        assert consumer.status == "pending"
+        maker.kill()
+        maker.wait(LONG_S)
+        maker.stdout.close()
+        with pytest.raises(PipeFailed, match="does not exist"):
+            consumer.result(LONG_S)
     other.put("another's pipe is untouched")
     assert other.get() == "another's pipe is untouched"
+    wait_until(lambda: processes.run_on_scheduler(plugins) == before)
     other.delete()
-    assert processes.run_on_scheduler(plugins) == before
+    assert "poolpart-pipes" not in processes.run_on_scheduler(plugins)
+
+
+def test_a_plain_client_of_another_process_uses_queue_and_variable(processes, make_pipe):
+    pipe = make_pipe(processes)
+    pipe.put_many([{1, 2}, {"scan": 7}])
+    program = f"""
+from distributed import Client, Queue, Variable
+with Client("{processes.scheduler.address}") as client:
+    queue, variable = Queue("{pipe.name}"), Variable("{pipe.name}")
+    print(queue.qsize(), queue.get(), queue.get(), variable.get()["capacity"])
+    queue.put({{"plain": 8}})
+    variable.set({{**variable.get(), "closed": True}})
+"""
+    answer = subprocess.run([sys.executable, "-c", program], stdout=subprocess.PIPE, check=True)
+    assert answer.stdout == b"2 {1, 2} {'scan': 7} 3\n"
+    assert list(pipe) == [{"plain": 8}]

@@ -28,7 +28,7 @@ from lidarpool.base.tracing import trace_to
 from lidarpool.cli.commands import main
 from lidarpool.run.connection import local_cluster
 from poolpart.fetch import fetch_available
-from poolpart.pipe import pipes_of
+from poolpart.pipe_states import pipes_of
 
 
 @pytest.fixture(scope="session")

@@ -1,15 +1,24 @@
 """What a survey gives, against what it must give by geometry."""
 
 import logging
+import re
+import time
 import urllib.error
 import urllib.request
+from collections import Counter
 
 import numpy as np
 import pytest
-from distributed import Client
+from distributed import Client, Queue, Variable
 from tests.shapes import room
 
 from lidarpool import LidarpoolError, Planning, ScanSpec, Sensor, Survey, simulate
+from lidarpool.pipeline.messages import ScanRange
+from lidarpool.scenario.build import build
+from lidarpool.scenario.scenario import Scenario
+from poolpart import Pool
+
+LONG_S = 60.0  # for what happens at once, or the test fails
 
 
 @pytest.fixture
@@ -63,6 +72,84 @@ def test_a_run_has_a_page_of_partitions_as_long_as_it_lasts(client, caplog):
     assert all(f"<td>{name}</td>" in pages[-1] for name in ("GPU", "LIDAR", "OTHER", "intersect"))
     with pytest.raises(urllib.error.HTTPError, match="404"):
         urllib.request.urlopen(pages[0], timeout=120)
+
+
+@pytest.fixture
+def plain(client):
+    """Another client of the cluster, which uses Dask's own classes only."""
+    with Client(client.scheduler.address, set_as_default=False) as plain:
+        yield plain
+
+
+def queue_sizes(plain, names):
+    return {name: Queue(name, plain).qsize() for name in names}
+
+
+def test_another_client_watches_the_queues_and_variables_of_the_default_survey(client, plain):
+    """Stage 1 is ahead of the driver at the start; stages 3 and 4 are while it handles a frame."""
+    job = build(Scenario())
+    sizes, states = Counter(), {}
+
+    def look():
+        names = Pool.from_client(plain).pipes()
+        until = time.monotonic() + 5
+        while time.monotonic() < until:
+            for name, size in queue_sizes(plain, names).items():
+                kind = re.sub(r"^lidarpool-[0-9a-f]+-", "", name)
+                sizes[kind] = max(sizes[kind], size)
+                states[kind] = Variable(name, plain).get(timeout=LONG_S)
+            if sizes["scans"] and (sizes["news"] or not looked_at_frames):
+                break
+
+    looked_at_frames = []
+
+    def look_at_frame(frame):
+        if not looked_at_frames or not sizes["news"]:
+            looked_at_frames.append(frame)
+            look()
+
+    def look_at_progress(_):
+        if not sizes["scans"]:
+            look()
+
+    result = simulate(
+        job.scene,
+        job.survey,
+        client=client,
+        on_frame=look_at_frame,
+        on_progress=look_at_progress,
+    )
+    assert result.rays == job.survey.ray_count
+    assert {"scans", "news", "generate-0", "sort-1", "collect-0-2"} <= states.keys()
+    assert sizes["scans"] >= 1
+    assert sizes["news"] >= 1
+    for state in states.values():
+        assert state["owner"] == client.id
+        assert not state["closed"]
+        assert not state["failure"]
+    assert not Pool.from_client(plain).pipes()
+
+
+@pytest.mark.parametrize("kind", ["scans", "news", "generate-0", "sort-1", "collect-0-2"])
+def test_a_pipe_that_another_client_closes_ends_the_run_with_its_name(client, plain, kind):
+    closed, items = [], []
+
+    def close(_):
+        names = [name for name in Pool.from_client(plain).pipes() if name.endswith(f"-{kind}")]
+        if closed or not names or (kind == "scans" and not Queue(names[0], plain).qsize()):
+            return
+        if kind == "scans":
+            items.append(Queue(names[0], plain).get(timeout=LONG_S))
+        variable = Variable(names[0], plain)
+        variable.set({**variable.get(timeout=LONG_S), "closed": True})
+        closed.append(names[0])
+
+    survey = Survey(SENSOR, [(0, 0, 0)], steps=400)
+    with pytest.raises(LidarpoolError, match=f"another client has closed.*-{kind}'"):
+        simulate(room(), survey, client=client, on_progress=close, on_frame=close)
+    assert closed
+    assert all(isinstance(item, ScanRange) for item in items)
+    assert len(items) == (kind == "scans")
 
 
 def test_a_client_that_has_given_its_scheduler_up_is_told_of_in_one_sentence(client):

@@ -18,6 +18,7 @@ from typing import Any
 import distributed
 
 from ..errors import PoolError
+from .queues import PRIVATE_NAMES as PIPE_NAMES
 
 TESTED = "2025.5.0", "2026.8.0"  # oldest and newest version of distributed; see `make compat`
 
@@ -189,15 +190,11 @@ PRIVATE_NAMES = (
     ),
     PrivateNames(
         PIPES,
-        (
-            "distributed.queues:QueueExtension.queues",
-            "distributed.variable:VariableExtension.variables",
-            f"{_SCHEDULER}.extensions",
-            f"{_SCHEDULER}.handlers",
-        ),
-        "a pipe is a Queue and a Variable",
+        PIPE_NAMES,
+        "a pipe is a Queue and a Variable, which all clients see and set",
         (
             "test_pipe_processes.py::test_deleting_forgets_consumers_that_were_killed",
+            "test_pipe_processes.py::test_a_plain_client_of_another_process_uses_queue_and_variable",
             "test_pipe.py::test_using_a_deleted_pipe_says_so_and_does_not_bring_it_back",
         ),
     ),

@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import time
 from collections import Counter, defaultdict
-from collections.abc import Callable, Collection, Iterable
+from collections.abc import Callable, Collection
 from contextlib import suppress
 from typing import Any, NamedTuple
 
@@ -273,48 +273,6 @@ def handlers_of(scheduler: Any) -> dict[str, Any]:
     """Handlers of a scheduler, by request; they and their callers exchange plain data."""
     handlers: dict[str, Any] = scheduler.handlers
     return handlers
-
-
-class QueueAndVariable:
-    """A `distributed.Queue` and a `distributed.Variable` of one name, used on their scheduler.
-
-    The queue has no limit: what puts and takes here never waits.
-    """
-
-    def __init__(self, scheduler: Any, name: str) -> None:
-        self._queues = scheduler.extensions["queues"]
-        self._variables = scheduler.extensions["variables"]
-        self.name = name
-        self._queues.create(name=name)
-        self._queue = self._queues.queues[name]
-
-    @staticmethod
-    def exists(scheduler: Any, name: str) -> bool:
-        """Whether the cluster has a queue or a variable of a name."""
-        extensions = scheduler.extensions
-        return name in extensions["queues"].queues or name in extensions["variables"].variables
-
-    def __len__(self) -> int:
-        return int(self._queue.qsize())
-
-    def put(self, items: Iterable[bytes]) -> None:
-        """Put items into the queue."""
-        for item in items:
-            self._queue.put_nowait({"type": "msgpack", "value": item})
-
-    def take(self) -> list[bytes]:
-        """Take all items out of the queue."""
-        return [self._queue.get_nowait()["value"] for _ in range(len(self))]
-
-    def set(self, value: dict[str, Any]) -> None:
-        """Set the variable to plain data."""
-        self._variables.variables[self.name] = {"type": "msgpack", "value": value}
-
-    def delete(self) -> None:
-        """Delete both, whoever refers to them."""
-        while self.name in self._queues.queues:
-            self._queues.release(name=self.name, client="poolpart")
-        self._variables.variables.pop(self.name, None)
 
 
 # -- the scheduler's HTTP server ---------------------------------------------------------

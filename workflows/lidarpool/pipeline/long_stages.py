@@ -1,4 +1,16 @@
-"""The long-running stages 1, 3 and 4, and the pipes between them and the driver."""
+"""The long-running stages 1, 3 and 4, and the pipes between them and the driver.
+
+A pipe is a Queue and a Variable of Dask, which other clients see by its name. RUN is the id of the
+run, in the keys of its tasks as well; N grows each time that a stage is started.
+
+===============================  ============================================
+lidarpool-RUN-scans              ranges of scans, from stage 1 to the driver
+lidarpool-RUN-news               frames, receipts and errors, from stages 3 and 4 to the driver
+lidarpool-RUN-generate-N         surveys to describe, from the driver to stage 1
+lidarpool-RUN-sort-N             summaries, from the driver to stage 3
+lidarpool-RUN-collect-C-N        batches to collect, from the driver to collector C of stage 4
+===============================  ============================================
+"""
 
 from __future__ import annotations
 
@@ -248,6 +260,7 @@ class LongStages:
         free = dict(seen.free)
         for name, task in list(self._tasks.items()):
             if task.future.status == "finished":
+                self._check_end(name)
                 continue
             room = max(free.values(), default=0) > 0
             # A silent worker may wake up: it keeps its stages while there are no other slots.
@@ -274,6 +287,15 @@ class LongStages:
                 what = f"no free slot in partition {self.partition.name!r} for"
                 raise self._too_few(f"Stage {name} has had {what}", " since its worker died")
         return died, started
+
+    def _check_end(self, name: str) -> None:
+        """LidarpoolError if a stage has ended before `close`, as when somebody ends its pipe."""
+        if self._closed_at is None:
+            pipes = ", ".join(repr(pipe.name) for pipe in self._pipes)
+            raise LidarpoolError(
+                f"Stage {name} has ended too early: another client has closed, failed or deleted a "
+                f"Queue or Variable of this run ({pipes}). Leave these alone, and run it again."
+            )
 
     def _count_death(self, name: str, worker: str) -> None:
         """LidarpoolError when a stage keeps dying."""

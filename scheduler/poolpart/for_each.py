@@ -1,0 +1,110 @@
+"""A task of a partition for each item of a pipe, with a bounded number of tasks."""
+
+from __future__ import annotations
+
+import reprlib
+import time
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from typing import TYPE_CHECKING, Any
+
+from dask.utils import funcname
+from distributed import Future, wait
+
+from .adapting import max_running_tasks
+from .errors import PipeFailed
+from .pipe import Pipe
+from .workers import on_scheduler
+
+if TYPE_CHECKING:
+    from .partition import Partition
+
+LOOK_S = 5.0  # between looks at the number of slots
+
+
+class ItemTasks:
+    """The tasks for the items of one pipe: at most `window` of them are under way.
+
+    No window is two tasks a slot, so that each slot has the next item at hand. Items that have no
+    task yet stay in the pipe, so that producers wait when the tasks are slower than they are.
+    """
+
+    def __init__(
+        self,
+        partition: Partition,
+        pipe: Pipe,
+        function: Callable[..., Any],
+        window: int | None,
+        options: dict[str, Any],
+    ) -> None:
+        if window is not None and (not isinstance(window, int) or window < 1):
+            raise ValueError(f"window is {window!r}; give a whole number, 1 or more.")
+        self.count = 0  # items that have a task, or had
+        self._partition = partition
+        self._pipe = pipe
+        self._function = function
+        self._given_window = window
+        self._options = options  # of `Partition.submit`, and keyword arguments of the function
+        # {key of a task: the task, the number of its item and the item}
+        self._running: dict[str, tuple[Future, int, Any]] = {}
+        self._window = 1
+        self._next_look = 0.0
+
+    def run(self) -> None:
+        """Run tasks until the pipe is closed and all of them are done.
+
+        An error of a task, or of the pipe, cancels the other tasks; the pipe fails with it.
+        """
+        closed = drained = False
+        try:
+            while self._running or not drained:
+                self._look()
+                free = max(0, self._window - len(self._running))
+                futures = [future for future, _, _ in self._running.values()]
+                if drained or (closed and not free):
+                    wait(futures, return_when="FIRST_COMPLETED")
+                else:
+                    items, closed = self._pipe.take_beside(futures, free)
+                    drained = closed and len(items) < free
+                    self._submit(items)
+                self._check()
+        except BaseException as error:
+            self._partition.client.cancel([future for future, _, _ in self._running.values()])
+            if not isinstance(error, PipeFailed):
+                with suppress(PipeFailed, OSError):  # the pipe or the scheduler is gone
+                    self._pipe.fail(f"{funcname(self._function)} has failed: {error!r}")
+            raise
+
+    def _look(self) -> None:
+        """Read the number of slots: partitions grow and shrink."""
+        if self._given_window is not None:
+            self._window = self._given_window
+        elif time.monotonic() > self._next_look:
+            partition, slots = self._partition, self._options["slots"]
+            running = on_scheduler(
+                partition.client, max_running_tasks, name=partition.name, slots=slots
+            )
+            self._window = max(2, 2 * running)
+            self._next_look = time.monotonic() + LOOK_S
+
+    def _submit(self, items: Sequence[Any]) -> None:
+        """Submit a task for each item."""
+        for item in items:
+            future = self._partition.submit(self._function, item, **self._options)
+            self._running[future.key] = future, self.count, item
+            self.count += 1
+
+    def _check(self) -> None:
+        """Forget tasks that are done; raise the error of one that has failed."""
+        done = [key for key, (future, _, _) in self._running.items() if future.done()]
+        for key in done:
+            future, number, item = self._running.pop(key)
+            if future.status != "finished":
+                try:
+                    future.result()
+                except Exception as error:
+                    shown = reprlib.repr(item)
+                    error.add_note(
+                        f"poolpart: this was item {number} of pipe {self._pipe.name!r}: {shown}"
+                    )
+                    raise

@@ -1,0 +1,326 @@
+"""Pipes on the scheduler: a `distributed.Queue` and a `distributed.Variable` of one name each.
+
+The Queue holds the items. The Variable holds all else that is known of the pipe, and is the only
+copy: a client that sets it to ``{**state, "closed": True}`` closes the pipe. Other clients may put,
+take and look by Dask's own classes.
+
+Pipes use requests of their own, because Dask's lack three things: `Queue.get` does not know its
+client, so that the item which a killed client waits for is lost; a queue cannot be closed; and
+state and items cannot be asked for together. A request waits here, for the pipes that it names
+only, and takes items only if its client is still there.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections import defaultdict
+from collections.abc import Awaitable, Callable, Collection, Mapping, Sequence
+from typing import Any
+
+from distributed.diagnostics.plugin import SchedulerPlugin
+
+from .errors import PipeClosed, PipeFailed
+from .internals.queues import (
+    BoundedQueue,
+    Changes,
+    QueueAndVariable,
+    intercept_variable_set,
+    wait_until,
+)
+from .internals.scheduler import handlers_of
+
+NAME = "poolpart-pipes"
+CHANGE, PUT, TAKE = (f"poolpart_pipes_{name}" for name in ("change", "put", "take"))
+
+Reply = dict[str, Any]  # state of a pipe, and the answer to a request
+Replies = dict[str, Reply]  # by pipe, of those that exist
+
+_ENDED = ("memory", "erred", "forgotten")  # states of tasks that nobody need wait for
+_SETTABLE = ("closed", "failure", "advice")  # what any client may set
+
+
+class PipeState:
+    """A pipe, as the scheduler and all clients see it.
+
+    The value of the Variable is a dict:
+
+    ==========  ====================================================================
+    owner       id of the client that has created the pipe, and with which it ends
+    capacity    items that may be queued
+    producers   number of producers that close the pipe, each for itself
+    closed_by   those that have: keys of their tasks, or random ids
+    closed      whether nothing may be put any more
+    failure     reason why the pipe has failed, "" while it has not
+    advice      amount that the consumer wants in one item
+    ==========  ====================================================================
+    """
+
+    def __init__(
+        self, scheduler: Any, name: str, owner: str, capacity: int, producers: int
+    ) -> None:
+        self.name = name
+        self.owner = owner  # cannot change, and outlasts a Variable that a client has deleted
+        self.queue = BoundedQueue(capacity, self.end, self.failure)
+        value = {
+            "owner": owner,
+            "capacity": capacity,
+            "producers": producers,
+            "closed_by": (),
+            "closed": False,
+            "failure": "",
+            "advice": 1,
+        }
+        self._dask = QueueAndVariable(scheduler, name, self.queue, value)
+        self.put = self._dask.put
+        self.take = self._dask.take
+        self.delete = self._dask.delete
+
+    @property
+    def value(self) -> dict[str, Any]:
+        """What the Variable says."""
+        value: dict[str, Any] = self._dask.value
+        return value
+
+    @property
+    def exists(self) -> bool:
+        """Whether no client has deleted the Queue or the Variable."""
+        return self._dask.exists
+
+    @property
+    def has_ended(self) -> bool:
+        """Whether the pipe was closed or deleted, or has failed."""
+        return not self.exists or self.value["closed"] or bool(self.value["failure"])
+
+    def failure(self) -> PipeFailed | None:
+        """Return why no items may be taken any more; None if they may."""
+        if not self.exists:
+            return PipeFailed(f"Pipe {self.name!r} does not exist: it was deleted.")
+        reason = self.value["failure"]
+        return PipeFailed(reason) if reason else None
+
+    def end(self) -> PipeFailed | PipeClosed | None:
+        """Return why no items may be put any more; None if they may."""
+        if (error := self.failure()) is not None:
+            return error
+        return PipeClosed(f"Pipe {self.name!r} is closed.") if self.value["closed"] else None
+
+    def change(self, **changes: Any) -> None:
+        """Change what the Variable says."""
+        self._dask.set({**self.value, **changes})
+
+    def close(self, producer: str) -> None:
+        """Close the pipe for one of its producers; with the last of them it is closed."""
+        closed_by = tuple(dict.fromkeys((*self.value["closed_by"], producer)))
+        closed = self.value["closed"] or len(closed_by) >= self.value["producers"]
+        self.change(closed_by=closed_by, closed=closed)
+
+    def fail(self, reason: str) -> None:
+        """Let the pipe fail; the first reason is the cause, later ones are its consequences."""
+        self.change(failure=self.value["failure"] or reason)
+
+    def check(self, value: Any) -> None:
+        """Check what a client sets the Variable to; ValueError if that cannot follow."""
+        if not self.exists:
+            raise ValueError(f"Variable {self.name!r} belongs to a pipe that was deleted.")
+        if doubt := self._doubt(value):
+            raise ValueError(
+                f"Variable {self.name!r} is the state of a pipe, now {self.value}: {doubt}. Change "
+                f"{', '.join(_SETTABLE)} of what Variable.get returns."
+            )
+
+    def _doubt(self, value: Any) -> str:
+        now = self.value
+        if not isinstance(value, dict) or value.keys() != now.keys():
+            return f"{value!r} has other fields"
+        for name, setting in value.items():
+            if name == "closed_by" and isinstance(setting, list | tuple):
+                setting = tuple(setting)  # Dask makes tuples of lists, in one of its directions
+            if type(setting) is not type(now[name]):
+                return f"{name} cannot be {setting!r}"
+            if name not in _SETTABLE and setting != now[name]:
+                return f"{name} cannot be changed to {setting!r}"
+        if now["closed"] and not value["closed"]:
+            return "a closed pipe stays closed"
+        if now["failure"] and value["failure"] != now["failure"]:
+            return "the first reason of a failure stays"
+        return "" if value["advice"] >= 1 else f"advice is at least 1, not {value['advice']}"
+
+
+def pipes_of(scheduler: Any) -> dict[str, PipeState]:
+    """Return the states of all pipes, by name."""
+    return scheduler.plugins[NAME].states if NAME in scheduler.plugins else {}
+
+
+def names_of_pipes(dask_scheduler: Any = None) -> list[str]:
+    """Return the names of all pipes. Runs on the scheduler."""
+    return list(pipes_of(dask_scheduler))
+
+
+def open_pipe(
+    name: str, owner: str, capacity: int, producers: int, dask_scheduler: Any = None
+) -> bool:
+    """Create a pipe; False if its name is used. Runs on the scheduler."""
+    # The last request of a killed owner may arrive after its removal: nobody would delete the pipe,
+    # or get the answer.
+    if QueueAndVariable.is_used(dask_scheduler, name) or owner not in dask_scheduler.clients:
+        return False
+    if NAME not in dask_scheduler.plugins:
+        dask_scheduler.add_plugin(Pipes(dask_scheduler))
+    pipes_of(dask_scheduler)[name] = PipeState(dask_scheduler, name, owner, capacity, producers)
+    return True
+
+
+def delete_pipes(names: Collection[str], dask_scheduler: Any = None) -> None:
+    """Delete pipes, as far as they exist. Runs on the scheduler."""
+    if NAME in dask_scheduler.plugins:
+        dask_scheduler.plugins[NAME].delete(names)
+
+
+class Pipes(SchedulerPlugin):
+    """The pipes of a scheduler; exists, and answers requests, as long as there are any."""
+
+    name = NAME
+
+    def __init__(self, scheduler: Any) -> None:
+        self.scheduler = scheduler
+        self.states: dict[str, PipeState] = {}
+        # {key of a task that requests wait for: those requests}
+        self._awaited: defaultdict[str, Changes] = defaultdict(Changes)
+        handlers = handlers_of(scheduler)
+        handlers.update({CHANGE: self.change, PUT: self.put, TAKE: self.take})
+        self._end_interception = intercept_variable_set(handlers, self._check, self._notify)
+
+    # -- what happens on the scheduler -------------------------------------------------
+
+    def remove_client(self, scheduler: Any, client: str) -> None:
+        """Delete the pipes of a client that has left."""
+        self.delete([name for name, state in self.states.items() if state.owner == client])
+
+    def transition(self, key: Any, start: str, finish: str, *args: Any, **kwargs: Any) -> None:
+        """Let requests that wait for a task look again, once it has ended."""
+        # A look every 5 ms took the scheduler of a run 2 % of a core.
+        if finish in _ENDED and key in self._awaited:
+            self._awaited[key].notify()
+
+    def delete(self, names: Collection[str]) -> None:
+        """Delete pipes, as far as they exist; with the last one, leave the scheduler."""
+        for name in self.states.keys() & set(names):
+            self.states.pop(name).delete()
+        if not self.states:
+            self.scheduler.remove_plugin(NAME)
+            self._end_interception()
+            for question in (CHANGE, PUT, TAKE):
+                del handlers_of(self.scheduler)[question]
+
+    def _check(self, name: str, value: Any) -> None:
+        """Check what a client sets a Variable to."""
+        if (state := self.states.get(name)) is not None:
+            state.check(value)
+
+    def _notify(self, name: str) -> None:
+        """Let requests look at a Variable that a client has set."""
+        if (state := self.states.get(name)) is not None:
+            state.queue.changes.notify()
+
+    # -- requests ----------------------------------------------------------------------
+
+    def change(
+        self,
+        names: Sequence[str],
+        asker: str,
+        producer: str = "",
+        failure: str = "",
+        advice: int = 0,
+    ) -> Replies:
+        """Close pipes for a producer, let them fail, or set an advice; answer the items queued."""
+        states = self._existing(names)
+        for state in states.values():
+            if producer:
+                state.close(producer)
+            if failure:
+                state.fail(failure)
+            if advice:
+                state.change(advice=advice)
+        return self._replies(states, lambda state: state.queue.qsize())
+
+    def put(
+        self, names: Sequence[str], asker: str, items: list[bytes], unbounded: bool, seconds: float
+    ) -> Replies | Awaitable[Replies]:
+        """Put items into a pipe as soon as there is room for any; the answer is their number.
+
+        At once if there is room: for a coroutine Dask makes a task, which takes longer than this.
+        """
+
+        def put(state: PipeState) -> int:
+            if state.has_ended or asker not in self.scheduler.clients:
+                return 0
+            fitting = items if unbounded else items[: state.queue.room]
+            state.put(fitting)
+            return len(fitting)
+
+        def ready() -> bool:
+            return unbounded or all(s.has_ended or s.queue.room for s in states.values())
+
+        async def later() -> Replies:
+            await wait_until(ready, [state.queue.changes for state in states.values()], seconds)
+            return self._replies(states, put)
+
+        states = self._existing(names)
+        return self._replies(states, put) if ready() else later()
+
+    async def take(
+        self,
+        names: Sequence[str],
+        asker: str,
+        seconds: float,
+        linger_s: float = 0.0,
+        keys: Sequence[str] = (),
+        puts: Mapping[str, list[bytes]] | None = None,
+        limit: int = sys.maxsize,
+    ) -> Replies:
+        """Take the items of pipes, once one has any or has ended, or a task has ended.
+
+        Before that, put items into other pipes. No more than `limit` items of each are taken; with
+        0, the request waits for the end of a pipe or a task.
+        """
+        for name, items in (puts or {}).items():
+            self.put([name], asker, items, unbounded=True, seconds=0.0)
+
+        def news() -> bool:
+            tasks = (self.scheduler.tasks.get(key) for key in keys)
+            return (
+                len(states) < len(names)
+                or any(s.has_ended or (limit and not s.queue.empty()) for s in states.values())
+                or any(task is None or task.state in _ENDED for task in tasks)
+            )
+
+        def full() -> bool:
+            return any(state.has_ended or not state.queue.room for state in states.values())
+
+        def take(state: PipeState) -> list[Any]:
+            return state.take(limit) if asker in self.scheduler.clients else []
+
+        states = self._existing(names)
+        of_pipes = [state.queue.changes for state in states.values()]
+        try:
+            of_tasks = [self._awaited[key] for key in keys]
+            await wait_until(news, of_pipes + of_tasks, seconds)
+        finally:
+            for key in keys:
+                if not self._awaited[key]:
+                    del self._awaited[key]
+        if linger_s:
+            await wait_until(full, of_pipes, min(linger_s, seconds))
+        return self._replies(states, take)
+
+    def _existing(self, names: Sequence[str]) -> dict[str, PipeState]:
+        states = {name: self.states[name] for name in names if name in self.states}
+        return {name: state for name, state in states.items() if state.exists}
+
+    def _replies(self, states: dict[str, PipeState], answer: Callable[[PipeState], Any]) -> Replies:
+        """Answer for each pipe that was not deleted meanwhile."""
+        return {
+            name: {"answer": answer(state)} | {part: state.value[part] for part in _SETTABLE}
+            for name, state in states.items()
+            if state.exists
+        }

@@ -1,0 +1,134 @@
+"""A function for each item of a pipe: each once, on its partition, no faster than it can."""
+
+import itertools
+import time
+from concurrent.futures import ThreadPoolExecutor
+
+import pytest
+from distributed import Client, Event, Queue
+from tests.poolpart.helpers import LONG_S, here, wait_for
+
+from poolpart import PipeClosed, PipeFailed
+
+
+@pytest.fixture
+def pool():
+    with ThreadPoolExecutor(8) as pool:
+        yield pool
+
+
+def where(item, done):
+    done.put((item, here()))
+
+
+def test_each_item_is_run_once_on_the_partition(client, a, make_pipe, pool):
+    pipe, done = make_pipe(client), make_pipe(client, capacity=1000)
+    counts = [pool.submit(a.for_each, pipe, where, done=done) for _ in range(2)]
+    pipe.put_many(range(50))
+    pipe.close()
+    assert sum(count.result(LONG_S) for count in counts) == 50
+    results = done.poll()
+    assert sorted(item for item, _ in results) == list(range(50))
+    assert {worker for _, worker in results} == {"A-0", "A-1"}
+
+
+def test_of_a_pipe_without_items(client, a, make_pipe):
+    pipe = make_pipe(client)
+    pipe.close()
+    assert a.for_each(pipe, abs) == 0
+    assert repr(a) == "<Partition 'A'>"
+
+
+def test_producers_wait_when_tasks_are_slow(client, b, make_pipe, pool):
+    pipe, event = make_pipe(client, capacity=3), f"slow-{time.time()}"
+    put = []
+
+    def produce():
+        for number in itertools.count():
+            pipe.put(event)
+            put.append(number)
+
+    producer = pool.submit(produce)
+    consumer = pool.submit(b.for_each, pipe, wait_for, window=2)
+    time.sleep(1)
+    assert len(put) == 3 + 2  # in the pipe, and under way
+    pipe.fail("enough")
+    for future in (producer, consumer):
+        with pytest.raises(PipeFailed, match="enough"):
+            future.result(LONG_S)
+    Event(event, client).set()
+
+
+def invert(item):
+    return 1 / item
+
+
+def test_an_error_is_raised_at_once_and_ends_the_producers(client, a, make_pipe, pool):
+    """Nothing else comes through the pipe that could wake who waits for it."""
+    pipe = make_pipe(client, capacity=1)
+    consumer = pool.submit(a.for_each, pipe, invert)
+    pipe.put_many([4, 2, 0])
+    error = consumer.exception(LONG_S)
+    assert isinstance(error, ZeroDivisionError)
+    assert error.__notes__ == [f"poolpart: this was item 2 of pipe {pipe.name!r}: 0"]
+    with pytest.raises(PipeFailed, match="invert has failed: ZeroDivisionError"):
+        pipe.put(1)
+
+
+def test_an_error_of_the_last_item_of_a_closed_pipe(client, a, make_pipe):
+    pipe = make_pipe(client, capacity=9)
+    pipe.put_many([1, 2, 0])
+    pipe.close()
+    with pytest.raises(ZeroDivisionError):
+        a.for_each(pipe, invert, window=1)
+
+
+attempts = []
+
+
+def fail_once(item):
+    attempts.append(item)
+    if attempts.count(item) == 1:
+        raise OSError("try again")
+
+
+def test_items_are_tried_again(client, a, make_pipe):
+    attempts.clear()
+    pipe = make_pipe(client, capacity=9)
+    pipe.put_many([1, 2, 3, 4])
+    pipe.close()
+    assert pipe.get() == 1  # takes more than this item
+    assert a.for_each(pipe, fail_once, retries=1) == 3
+    assert sorted(attempts) == [2, 2, 3, 3, 4, 4]
+
+
+def test_an_item_may_be_a_future_that_a_queue_has_put(client, a, make_pipe):
+    pipe, done = make_pipe(client), make_pipe(client)
+    with Client(client.cluster, set_as_default=False) as other:
+        Queue(pipe.name, other).put(other.submit(pow, 2, 10))
+        pipe.close()
+        assert a.for_each(pipe, done.put) == 1
+    assert done.poll() == [1024]
+
+
+@pytest.mark.parametrize("options", [{"window": 0}, {"slots": 0}])
+def test_options_that_make_no_sense(client, a, make_pipe, options):
+    with pytest.raises(ValueError, match=r"is 0; give a whole number, 1 or more"):
+        a.for_each(make_pipe(client), abs, **options)
+
+
+def forward(pipe, outlet, partition):
+    count = partition.for_each(pipe, outlet.put)
+    outlet.close()
+    return count
+
+
+def test_it_may_run_in_a_task_and_its_tasks_may_put(client, a, b, make_pipe):
+    first, second = make_pipe(client), make_pipe(client)
+    task = b.submit(forward, first, second, a)
+    first.put_many(range(3))
+    first.close()
+    assert sorted(second) == [0, 1, 2]
+    assert task.result(LONG_S) == 3
+    with pytest.raises(PipeClosed):
+        second.put(1)
