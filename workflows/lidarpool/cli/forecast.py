@@ -7,6 +7,7 @@ import os
 import shutil
 import tempfile
 from collections.abc import Iterator, Mapping
+from contextlib import suppress
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -133,7 +134,7 @@ def look_at(
     found = {
         "can_run": not mistakes.lines,
         "reasons": list(dict.fromkeys(mistakes.lines)),
-        "occupied": bool(options.out and Storage.at(options.out).entries()),
+        "occupied": _holds_files(options.out),
         "notes": list(dict.fromkeys(notes)),
         "warnings": list(dict.fromkeys(warnings)),
         "count": campaign.count,
@@ -163,7 +164,7 @@ def forecast(job: Job, options: RunOptions, client: Client | None = None) -> dic
     mistakes, notes, warnings = Mistakes(), list[str](), list[str]()
     with mistakes.noted():
         notes += _look_at_folder(out)
-    occupied = FILE in Storage.at(out).below(RUN_FOLDER).sizes()
+    occupied = bool(notes)  # an unfinished run
     try:
         SurveyOutput(out, job.survey, formats).refuse(lambda: identity_of(job))
     except LidarpoolError as error:
@@ -339,6 +340,13 @@ def _of_fine_triangles(scene: Scene) -> list[str]:
         count += int(((edges > 0) & (edges < least)).sum())
     note = "with an edge below a millionth of the scene may be missed by embree, not by numpy"
     return [f"{plural(count, 'triangle')} {note}"] if count else []
+
+
+def _holds_files(out: Path | Storage | None) -> bool:
+    """Whether there are files where the result would be."""
+    with suppress(NotADirectoryError):
+        return bool(out and Storage.at(out).entries())
+    return False
 
 
 def _look_at_folder(out: Path | Storage) -> list[str]:

@@ -59,6 +59,8 @@ def run_scenario(
     with terminal.status("reading the scene", logged=False):
         built = build(scenario, plans=not no_plan)
         job = built.job()
+    for warning in implausibilities(built):
+        terminal.warn(warning)
     if shard is None:
         _run_survey(built, job, options, terminal, extent)
         return
@@ -85,8 +87,6 @@ def _run_survey(
     assert options.out is not None, "commands write"
     for note in advice(built):
         terminal.tell(note)
-    for warning in implausibilities(built):
-        terminal.warn(warning)
     jobs = OneJob(job)
     extent = extent or "page"
     output = SurveyOutput(options.out, job.survey, job.outputs, extent, built.scenario, judge)
@@ -151,6 +151,8 @@ def run_job(
     scenario = campaign.scenario(number)
     assert scenario is not None, "of a file"
     built, job = build(scenario, plans=False), campaign.job(number, columns=dataset.columns)
+    for warning in implausibilities(built):
+        terminal.warn(warning)
 
     def compare(result: RunResult) -> str:
         rows = read_table(place) if of_dataset else ()

@@ -121,11 +121,9 @@ class Surroundings:
         A body that stands on the ground may lack a bottom.
         """
         views = self.views(position)
-        extent = np.zeros(3)
-        if views.hit.any():
-            hits = views.distance[:, None] * views.directions
-            extent = np.ptp(hits[np.isfinite(views.distance)], axis=0)
-        spans = bool((extent >= _SPANS * np.ptp(self._scene.bounds, axis=0)).all())
+        hit_points = views.distance[views.hit, None] * views.directions[views.hit]
+        sides = np.ptp(hit_points, axis=0) if len(hit_points) else np.zeros(3)
+        spans = bool((sides >= _SPANS * np.ptp(self._scene.bounds, axis=0)).all())
         if views.in_a_body:
             return not (spans and self._is_room(views))
         raised = views.directions[:, 2] > _RAISED
