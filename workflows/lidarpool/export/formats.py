@@ -57,7 +57,7 @@ class Format:
             )
 
     @classmethod
-    def of(cls, entry: str | Mapping[str, str]) -> Format:
+    def of(cls, entry: str | Mapping[str, Any]) -> Format:
         """Return what an entry of a scenario's `output.write` names."""
         try:
             return cls(entry) if isinstance(entry, str) else cls(**entry)
