@@ -53,8 +53,10 @@ def points_of(scene: Scene, number: int) -> Cloud:
         "intensity": rng.uniform(0, 1, count).astype(np.float32),
         "class": rng.integers(0, 30, count),
         "time": scan * 1000,
-        **dict.fromkeys(("range", "azimuth", "elevation", "reflectivity"), np.ones(count)),
+        **dict.fromkeys(("range", "azimuth", "elevation"), np.ones(count)),
+        **dict.fromkeys(("return_number", "returns"), np.ones(count, np.uint8)),
     }
+    columns["reflectivity"] = np.rint(255 * columns["intensity"]).astype(np.uint8)
     columns["signal"] = np.rint(10_000 * columns["intensity"]).astype(np.uint16)
     places = scene.origin + rng.uniform(-60, 60, (count, 3))
     return Cloud(np.round(places, 3), columns)

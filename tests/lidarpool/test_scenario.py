@@ -287,6 +287,14 @@ def test_all_files_that_cannot_be_read_are_told_at_once(scenario):
     assert str(raised.value).count("does not exist") == 2
 
 
+def test_formats_that_contradict_the_frame_of_points_are_in_the_advice(scenario):
+    read = scenario("cloud: {coordinates: sensor}\noutput: {write: [mcap, laz, kitti]}")
+    las, kitti = advice(build(read))
+    assert "expect points in one coordinate system" in las and "use world" in las
+    assert "kitti holds points compensated for motion" in kitti
+    assert advice(build(scenario("output: {write: [laz, kitti]}"))) == []
+
+
 @pytest.mark.parametrize(
     ("idle", "used"),
     [

@@ -21,7 +21,7 @@ trajectory: {points: [{time_s: 0, position: [0, 0, 1]}, {time_s: 0.3, position: 
 sensors:
   front: {model: velodyne/vlp16, mount: {position: [1, 0, 0]}}
   rear: {model: velodyne/vlp16}
-cloud: {keep_every: 7}
+cloud: {columns: [intensity], keep_every: 7}
 output: {write: [ply, laz, {format: mcap, layout: ouster}, kitti]}
 planning: {enabled: false}
 """
@@ -53,7 +53,7 @@ def test_a_run_writes_what_its_scenario_asks_for_and_a_result_is_exported(
     refused = lidarpool(
         "export", out, "-f", "mcap", "--layout", "autoware", "--out", tmp_path / "no"
     )
-    assert refused.code == 2 and "layout autoware needs azimuth, elevation" in refused.err
+    assert refused.code == 2 and "layout autoware needs return_number, returns" in refused.err
     assert not (tmp_path / "no").exists()
     (out / ".lidarpool-writing-01234567").mkdir()  # of an export that was killed
     refused = lidarpool("export", out, "-f", "pcd", "-f", "laz")

@@ -12,7 +12,7 @@ from functools import cached_property
 from html import escape
 from pathlib import Path
 from tempfile import TemporaryDirectory, mkdtemp
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from ..base.notebook import cell_display
 from ..base.validation import checked
@@ -47,7 +47,7 @@ class Result(RunResult):
         *,
         only_cloud: bool = False,
         pictures: bool = False,
-        formats: Sequence[str | Mapping[str, str]] = (),
+        formats: Sequence[str | Mapping[str, Any]] = (),
         overwrite: bool = False,
     ) -> None:
         """Write what `lidarpool run` does: cloud, pictures and report, all of them or none.

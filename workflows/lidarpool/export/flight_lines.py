@@ -106,7 +106,9 @@ class FlightLines:
         """Fill in the fields of the points of a sweep, but for edges."""
         sweeps = self.sweeps
         poses = sweeps.firing_poses(sweep, points)
-        exact = points.positions.astype(np.float64)
+        # As files hold them: parts and cloud.ply have other digits behind the precision.
+        exact = np.rint(points.positions.astype(np.float64) / sweeps.precision_m)
+        exact *= sweeps.precision_m
         in_world = poses.outward(exact) if sweeps.coordinates == "sensor" else exact
         steps = np.zeros((3, 1)) if poses.steps is None else poses.steps
         ahead = _level(steps.T, sweeps.pose.turns[sweep][:, 0])

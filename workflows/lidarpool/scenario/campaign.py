@@ -116,7 +116,7 @@ class CampaignSpec:
         count: Annotated[int, Field(ge=1, le=COUNT_MOST)],
         *,
         seed: Seed = 0,
-        keep: str | Keep | Mapping[str, str] = "kitti",
+        keep: str | Keep | Mapping[str, Any] = "kitti",
         splits: Mapping[str, float] = MappingProxyType({}),
         license: str = "",  # noqa: A002 - as in the file
         title: str = "",
@@ -162,7 +162,7 @@ class CampaignSpec:
         cls,
         paths: Iterable[str | Path],
         *,
-        keep: str | Keep | Mapping[str, str] = "folder",
+        keep: str | Keep | Mapping[str, Any] = "folder",
         splits: Mapping[str, float] = MappingProxyType({}),
         seed: Seed = 0,
         license: str = "",  # noqa: A002 - as in the file
