@@ -319,8 +319,10 @@ class Pipes(SchedulerPlugin):
 
     def _replies(self, states: dict[str, PipeState], answer: Callable[[PipeState], Any]) -> Replies:
         """Answer for each pipe that was not deleted meanwhile."""
-        return {
-            name: {"answer": answer(state)} | {part: state.value[part] for part in _SETTABLE}
-            for name, state in states.items()
-            if state.exists
-        }
+        replies: Replies = {}
+        for name, state in states.items():
+            if state.exists:
+                value = state.value
+                replies[name] = {part: value[part] for part in _SETTABLE}
+                replies[name]["answer"] = answer(state)
+        return replies
