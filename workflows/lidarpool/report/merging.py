@@ -283,7 +283,8 @@ def _merge_dataset(parts: Sequence[_Part], out: Storage, partial: bool) -> dict[
             for part, file in zip(parts, files[-len(parts) :], strict=True):
                 file.write(part, _taken(part, dataset, damaged), _seconds(part, notes))
             if own:
-                files[0].write(own, _rows_of(own, dataset), _seconds(own, notes))
+                # A killed merge leaves a table that is not that of its index: no news.
+                files[0].write(own, _rows_of(own, dataset), _seconds(own, []))
         if not damaged:
             damaged += _lacking(known, _merged(files))
         if damaged:
