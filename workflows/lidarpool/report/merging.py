@@ -290,7 +290,8 @@ def _merge_dataset(
             for part, file in zip(parts, files[-len(parts) :], strict=True):
                 file.write(part, _taken(part, dataset, damaged), _seconds(part, notes))
             if own:
-                files[0].write(own, _rows_of(own, dataset), _seconds(own, notes))
+                # A killed merge leaves a table that is not that of its index: no news.
+                files[0].write(own, _rows_of(own, dataset), _seconds(own, []))
         if not damaged:
             damaged += _lacking(known, _merged(files))
         if damaged:
