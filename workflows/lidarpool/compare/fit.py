@@ -406,7 +406,8 @@ def covered_cells(returned: Bools) -> Bools:
     """
     share = (returned.sum(axis=0) + 0.5) / (len(returned) + 1)
     chance = np.where(share > _SELDOM, np.log1p(-share), 0.0)
-    columns = _long_runs(~returned.any(axis=1), chance.sum(axis=0))
+    empty_columns: Bools = ~returned.any(axis=1)
+    columns = _long_runs(empty_columns, chance.sum(axis=0))
     rings = _long_runs(~returned, chance)
     return ~(columns[:, None] | rings)
 
@@ -521,7 +522,7 @@ def _rigid_motion(design: Floats, change: Floats, noise: Floats) -> Floats:
 
     Huber's estimate: few rays of things that move count little.
     """
-    motion = np.zeros(4)
+    motion: Floats = np.zeros(4)
     if len(change) < _FEW:
         return motion
     for _ in range(30):
@@ -647,9 +648,9 @@ def fit_scatter(
     known = np.array([True, True, tilted])
     # Rays that lose some of their pulses are known by the nearer or brighter ones of these.
     repeated = (rays.freedom > 0) & (rays.returns >= _REPEATED * rays.trials)
-    variance, slope, freedom = (
-        values[repeated] for values in (rays.variance, rays.slope, rays.freedom)
-    )
+    variance = rays.variance[repeated]
+    slope = rays.slope[repeated]
+    freedom = rays.freedom[repeated]
     steep = np.median(rays.slope)
     usual = max(float(np.median(variance)), 1e-12)
 
