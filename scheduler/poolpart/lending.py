@@ -6,13 +6,15 @@ while it waits, its slots are there for others, and its thread if it has one of 
 - in `Future.result`, `Client.gather`, `distributed.wait`, `as_completed`, for a collection or a
   `Partition.map`: at once;
 - in every other call of the scheduler that waits, such as `Queue.get`, `Variable.get`,
-  `Event.wait`, `Lock.acquire`, `Pipe.get` and `Pipe.put`: from the moment on that a task which
-  another task has submitted, or a task that wants its slots back, waits for slots of the worker.
-  A long task on a worker without nested tasks keeps its slots.
+  `Event.wait`, `Lock.acquire`, `Pipe.get` and `Pipe.put`: once a nested task, or a task that wants
+  its own slots or thread back, is waiting on this worker. A nested task is one that another task of
+  a partition has submitted. A long task on a worker without nested tasks keeps its slots. So a
+  producer and a consumer that a client submits need a slot each.
 
-A loan lasts to the end of the wait. The task gets slots and thread back before it goes on, also
-when the wait ends by a time-out; until then no waiting task gets the slots. Of several tasks that
-want slots back on one worker, the first to ask is the first to get them.
+A loan lasts to the end of the wait. Then the task gets slots and thread back before it goes on,
+also if the wait ended by a time-out; from the end of its wait until it has them, no other task may
+start in them. Of several tasks that want slots back on one worker, the first to ask is the first to
+get them. Do not hold a `threading.Lock` while you wait: a task that borrows the slot may want it.
 
 A task that waits in another way, such as a loop over `Future.done`, lends nothing. If a task that
 it has submitted waits for slots meanwhile, all clients get a warning.
@@ -52,12 +54,14 @@ from .internals.worker import (
     submitter_of,
     take_slots,
     task_of_thread,
+    threads_of,
 )
 
 logger = logging.getLogger(__name__)
 
 WARN_AFTER_S = 5.0  # that a nested task waits for slots, before clients are warned
 _CHECK_EVERY_S = 1.0  # whether the worker still exists
+_ENDING = (Status.closing, Status.closed, Status.failed)
 
 _lock = threading.Lock()
 _lenders: dict[Any, Lender] = {}  # by worker of this process
@@ -91,6 +95,8 @@ class Lender:
         self._nested: dict[Any, _NestedTask] = {}  # {key: a task that waits for slots}
         self._lending: Counter[Any] = Counter()  # {key of a task: its loans under way}
         self._returning: deque[_Loan] = deque()  # loans whose tasks wait for their slots
+        self._rejoining: set[Any] = set()  # keys of tasks that wait for a thread of the worker
+        self._lent: set[Any] = set()  # keys of running tasks that have lent before
         self._warned: set[Any] = set()  # keys of submitting tasks
         self._next_look: Any = None  # handle of the event loop
 
@@ -99,6 +105,7 @@ class Lender:
     def lend(self, loan: _Loan) -> None:
         """Let other tasks have the slots."""
         self._lending[loan.key] += 1
+        self._lent.add(loan.key)
         free_slots(self.worker, loan.slots)
         self.serve()
 
@@ -110,6 +117,15 @@ class Lender:
         take_slots(self.worker, loan.slots)
         self._returning.append(loan)
         self.serve()
+
+    def begin_rejoin(self, key: Any) -> None:
+        """Note a task that has its slots back, and waits for a thread."""
+        self._rejoining.add(key)
+        self._notify()
+
+    def end_rejoin(self, key: Any) -> None:
+        """Note a task that has a thread again."""
+        self._rejoining.discard(key)
 
     def serve(self) -> None:
         """Give slots back, as far as they are free."""
@@ -129,8 +145,17 @@ class Lender:
     # -- who wants slots ---------------------------------------------------------------
 
     def slots_wanted(self) -> bool:
-        """Whether nested tasks, or tasks that have lent their slots, wait for slots here."""
-        return bool(self._nested or self._returning)
+        """Whether nested tasks, or tasks that have lent, wait for slots or a thread here."""
+        return bool(self._nested or self._returning or self._rejoining)
+
+    def lends_at_once(self, loan: _Loan) -> bool:
+        """Whether a task lends in each wait, because threads may be short without slots being so.
+
+        Dask counts a task that has seceded as long-running to its end, also in a thread of the
+        worker: with more slots than threads, a nested task then starts, and waits for that thread.
+        """
+        slots = sum(slots_here(self.worker, name)[1] for name in loan.slots)
+        return loan.key in self._lent and slots > threads_of(self.worker)
 
     def _notify(self) -> None:
         """Wake the threads that would lend, if slots are wanted."""
@@ -141,11 +166,20 @@ class Lender:
     def transition(self, key: Any, finish: str) -> None:
         """Follow the tasks of the worker: "constrained" are those that wait for slots."""
         self._nested.pop(key, None)
+        if finish not in ("executing", "long-running"):
+            self._lent.discard(key)
         if finish == "constrained" and (submitter := submitter_of(self.worker, key)) is not None:
             self._nested[key] = _NestedTask(submitter, time.monotonic())
             if self._next_look is None:
                 self._look_later()
         self.serve()
+
+    def stop(self) -> None:
+        """End with the last partition: give all slots back, and warn of nothing more."""
+        self._nested.clear()
+        if self._next_look is not None:
+            self._next_look.cancel()
+            self._next_look = None
 
     # -- warnings ----------------------------------------------------------------------
 
@@ -167,15 +201,16 @@ class Lender:
             self._warned.clear()
 
     def holds_slots(self, key: Any) -> bool:
-        """Whether a task runs here and has not lent its slots."""
-        return is_running(self.worker, key) and not self._lending[key]
+        """Whether a task runs here, has not lent its slots, and does not wait for them."""
+        waits = any(loan.key == key for loan in self._returning)
+        return is_running(self.worker, key) and not (self._lending[key] or waits)
 
     async def _warn(self, key: Any, submitter: Submitter) -> None:
         """Warn all clients if the submitter of a waiting task, on whichever worker, holds slots."""
         try:
             holds = await call(self.worker, submitter.worker, _holds_slots, key=submitter.key)
         except (OSError, ValueError):  # the worker has left, or the submitter's is not known
-            return
+            holds = False
         if not holds or key not in self._nested:
             self._warned.discard(submitter.key)
             return
@@ -222,16 +257,17 @@ class _Lending:
 
     def until_wanted(self, answer: concurrent.futures.Future[Any]) -> None:
         """Wait until a call has its answer, or other tasks want the slots."""
-        loan = _loan_of_thread()
-        if loan is None:
+        loan_of_task = _loan_of_thread()
+        if loan_of_task is None:
             return
-        lender, _ = loan
+        lender, loan = loan_of_task
         waiter = threading.Event()
         answer.add_done_callback(lambda _: waiter.set())
         lender.waiters.add(waiter)
         try:
-            # Its event loop looks for waiters after it has noted who wants slots.
-            while not (waiter.is_set() or lender.slots_wanted()):
+            # The worker's event loop first notes who wants slots, and then sets the waiters that
+            # there are: with this order no wish is missed.
+            while not (waiter.is_set() or lender.slots_wanted() or lender.lends_at_once(loan)):
                 waiter.wait(_CHECK_EVERY_S)
                 if lender.worker.status is Status.closed:
                     return
@@ -264,9 +300,12 @@ class _Lending:
             worker.loop.add_callback(lender.take_back, loan)
             while not loan.returned.wait(_CHECK_EVERY_S) and worker.status is not Status.closed:
                 pass
-            # Not before: those that have the slots need the worker's threads to end.
-            if has_thread and worker.status is not Status.closed:
+            # Not before: tasks that have borrowed the slots need the worker's threads to end. While
+            # this one waits for a thread, tasks that wait in one lend theirs.
+            if has_thread and worker.status not in _ENDING:  # then the threads end as well
+                worker.loop.add_callback(lender.begin_rejoin, loan.key)
                 rejoin()
+                worker.loop.add_callback(lender.end_rejoin, loan.key)
 
 
 LENDING = _Lending()
@@ -292,7 +331,8 @@ def end_lending(worker: Any, name: str) -> None:
         lender.names.discard(name)
         if not lender.names:
             del _lenders[worker]
-            lender.serve()
+            lender.stop()
+        lender.serve()
 
 
 def lending_plugin(name: str) -> bytes:

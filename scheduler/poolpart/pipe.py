@@ -14,6 +14,7 @@ wait for ever, and keep their slots; Dask does not stop the thread of a task who
 
 from __future__ import annotations
 
+import asyncio
 import math
 import time
 import uuid
@@ -36,6 +37,7 @@ from .task_context import own_client
 from .workers import check_client, on_scheduler
 
 _WAIT_S = 1.0  # in one request; a pipe that is closed or fails ends it
+_AGAIN_S = 0.01  # between two requests of one wait
 _LINGER_S = 0.002  # `get` waits so long for more items, which saves requests
 
 
@@ -270,17 +272,20 @@ class Pipe:
 
     def _take(self, deadline: float, linger_s: float = 0.0) -> tuple[list[Any], bool]:
         """Return items, none if the deadline has passed, and whether the pipe is closed."""
-        taken = []
+        buffered = []
         with suppress(IndexError):  # threads may share this object
             while True:
-                taken.append(self._taken.popleft())
-        if taken:
+                buffered.append(self._taken.popleft())
+        if buffered:
             deadline = -math.inf
-        reply = self._ask_until(deadline, _has_answer, TAKE, linger_s=linger_s)
-        if reply["failure"]:
-            self._taken.extendleft(reversed(taken))
-            raise PipeFailed(reply["failure"])
-        return [*taken, *self._unpacked(reply)], reply["closed"]
+        try:
+            reply = self._ask_until(deadline, _has_answer, TAKE, linger_s=linger_s)
+            if reply["failure"]:
+                raise PipeFailed(reply["failure"])
+        except BaseException:  # such as of a pipe that was deleted
+            self._taken.extendleft(reversed(buffered))
+            raise
+        return [*buffered, *self._unpacked(reply)], reply["closed"]
 
     def _unpacked(self, reply: Reply) -> list[Any]:
         return [unpack(self.client, packed) for packed in reply["answer"]]
@@ -435,6 +440,9 @@ def _ask_until(
             replies: Replies = await ask(client, None, question, **options) or {}
             if is_settled(replies) or time.monotonic() > deadline:
                 return replies
+            # A reply may come at once, though not settled: while this client reconnects, or until
+            # it hears that a task has ended.
+            await asyncio.sleep(_AGAIN_S)
 
     check_client(client)
     return client.sync(ask_until)

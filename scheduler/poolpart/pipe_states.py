@@ -133,11 +133,14 @@ class PipeState:
         if not isinstance(value, dict) or value.keys() != now.keys():
             return f"{value!r} has other fields"
         for name, setting in value.items():
+            current = now[name]
             if name == "closed_by" and isinstance(setting, list | tuple):
-                setting = tuple(setting)  # Dask makes tuples of lists, in one of its directions
-            if type(setting) is not type(now[name]):
+                # A list comes as a tuple from another process, and as a list from this one.
+                setting = tuple(setting)
+                current = tuple(current)
+            if type(setting) is not type(current):
                 return f"{name} cannot be {setting!r}"
-            if name not in _SETTABLE and setting != now[name]:
+            if name not in _SETTABLE and setting != current:
                 return f"{name} cannot be changed to {setting!r}"
         if now["closed"] and not value["closed"]:
             return "a closed pipe stays closed"

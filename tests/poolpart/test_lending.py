@@ -8,6 +8,7 @@ import subprocess
 import sys
 import threading
 import time
+from itertools import product
 
 import dask
 import pytest
@@ -24,8 +25,9 @@ from distributed import (
 )
 from tests.poolpart.helpers import LONG_S, addresses, declared, here, join, kill, wait_for
 
-from poolpart import Partition, Pool, PoolError, inherit, rest
+from poolpart import Partition, Pipe, Pool, PoolError, inherit, rest
 from poolpart.lending import lending_plugin
+from poolpart.pipe import forget_pipes
 
 
 class Gauge:
@@ -468,24 +470,80 @@ def test_a_waiting_task_without_nested_tasks_keeps_its_slot(client, b):
     assert later.result(LONG_S) == "B-0"
 
 
-def grow_tree(name, level):
+def grow_tree(channel, name, level):
     """Run a tree of tasks, each of which waits for a message of each task below it."""
     below = [f"{name}{branch}" for branch in range(2 if level else 0)]
-    futures = [get_client().submit(grow_tree, child, level - 1, pure=False) for child in below]
-    total = 1 + sum(Queue(child).get(LONG_S) for child in below)
-    Queue(name).put(total)
+    client = get_client()
+    futures = [client.submit(grow_tree, channel, child, level - 1, pure=False) for child in below]
+    total = 1 + sum(channel(child).get(LONG_S) for child in below)
+    channel(name).put(total)
     return len(futures)
 
 
-def test_a_tree_of_200_waiting_tasks_on_two_slots_ends(start):
+LEVELS = 7
+
+
+@pytest.fixture(params=[Queue, Pipe])
+def tree(request):
+    """Grow a tree of 255 tasks in a partition, whose messages go through queues or pipes."""
+
+    def grow(client):
+        channel = request.param
+        root = f"tree-{client.id}-"
+        branches = ["".join(path) for n in range(LEVELS + 1) for path in product("01", repeat=n)]
+        pipes = [Pipe(root + branch, client=client).create() for branch in branches]
+        if channel is Queue:
+            forget_pipes(client, [pipe.name for pipe in pipes])
+        part = Partition("A", client)
+        assert part.submit(grow_tree, channel, root, LEVELS).result(LONG_S) == 2
+        return channel(root, client=client).get(LONG_S)
+
+    return grow
+
+
+def test_a_tree_of_waiting_tasks_on_two_slots_ends(start, tree):
     client = start({"a": {"resources": {"A": 2}, "nthreads": 2}})
-    name = f"tree-{client.id}-"
-    assert Partition("A", client).submit(grow_tree, name, 7).result(LONG_S) == 2
-    assert Queue(name, client).get(LONG_S) == 2**8 - 1
+    assert tree(client) == 2 ** (LEVELS + 1) - 1
 
 
-def test_a_tree_of_200_waiting_tasks_on_two_workers_ends(start):
+def test_a_tree_of_waiting_tasks_on_two_workers_ends(start, tree):
     client = start({name: {"resources": {"A": 1}} for name in "ab"})
-    name = f"tree-{client.id}-"
-    assert Partition("A", client).submit(grow_tree, name, 7).result(LONG_S) == 2
-    assert Queue(name, client).get(LONG_S) == 2**8 - 1
+    assert tree(client) == 2 ** (LEVELS + 1) - 1
+
+
+def test_with_more_slots_than_threads_tasks_lend_their_thread_again(start):
+    """Dask then starts a nested task that has no thread: it waits for that of its parent."""
+    client = start({"a": {"resources": {"A": 3}, "nthreads": 1}})
+    part = Partition("A", client)
+    assert part.submit(converse, f"three-{client.id}").result(LONG_S) == [10, 20, 30]
+    assert part.submit(converse_anew, f"anew-{client.id}", 3).result(LONG_S) == [10, 20, 30]
+
+
+def converse_anew(name, times):
+    return [converse(f"{name}-{number}")[number] for number in range(times)]
+
+
+def wait_and_hand_over(name):
+    """Wait, so that another task gets the only thread, and then give it what it waits for."""
+    Queue(f"{name}-first").get(LONG_S)
+    Queue(f"{name}-second").put(1)
+    return 1
+
+
+def start_the_other(name):
+    Queue(f"{name}-first").put(1)
+    return Queue(f"{name}-second").get(LONG_S)
+
+
+def test_a_task_that_wants_its_thread_back_gets_it_from_one_that_waits(start):
+    client = start({"a": {"resources": {"A": 2}, "nthreads": 1}})
+    part = Partition("A", client)
+    name = f"thread-{client.id}"
+    futures = [part.submit(parent_of_both, name)]
+    assert client.gather(futures) == [[1, 1]]
+
+
+def parent_of_both(name):
+    client = get_client()
+    futures = [client.submit(f, name, pure=False) for f in (wait_and_hand_over, start_the_other)]
+    return client.gather(futures)

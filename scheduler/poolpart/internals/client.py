@@ -54,7 +54,9 @@ def let_waits_lend(lending: Lending) -> None:
         if getattr(function, "__func__", function) in waits_for_futures:
             owner = getattr(function, "__self__", None)
             futures = futures_of(owner if isinstance(owner, Future) else [*args])
-            waits = any(future.status in ("pending", "lost") for future in futures)
+            pending = [future.status in ("pending", "lost") for future in futures]
+            first = kwargs.get("return_when") == "FIRST_COMPLETED"
+            waits = all(pending) if first else any(pending)
             with lending.lent(waits):
                 return sync(caller, function, *args, **kwargs)
         if caller.asynchronous or not kwargs.keys().isdisjoint(_OPTIONS_OF_SYNC):

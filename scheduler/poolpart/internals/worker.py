@@ -81,6 +81,11 @@ def submitter_of(worker: Any, key: Any) -> Submitter | None:
     return None if submitter is None else Submitter(*submitter)
 
 
+def threads_of(worker: Any) -> int:
+    """Return the number of threads that a worker has for tasks."""
+    return int(worker.state.nthreads)
+
+
 def is_running(worker: Any, key: Any) -> bool:
     """Whether a task runs on this worker, also one that has seceded."""
     return any(task.key == key for task in worker.state.all_running_tasks)

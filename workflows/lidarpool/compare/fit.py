@@ -406,8 +406,7 @@ def covered_cells(returned: Bools) -> Bools:
     """
     share = (returned.sum(axis=0) + 0.5) / (len(returned) + 1)
     chance = np.where(share > _SELDOM, np.log1p(-share), 0.0)
-    empty_columns: Bools = ~returned.any(axis=1)
-    columns = _long_runs(empty_columns, chance.sum(axis=0))
+    columns = _long_runs(np.asarray(~returned.any(axis=1)), chance.sum(axis=0))
     rings = _long_runs(~returned, chance)
     return ~(columns[:, None] | rings)
 
@@ -529,7 +528,7 @@ def _rigid_motion(design: Floats, change: Floats, noise: Floats) -> Floats:
         size = np.abs(change - design @ motion) / noise
         weight = np.sqrt(np.minimum(1, 2 / np.maximum(size, 1e-9))) / noise
         weighted = design * weight[:, None]
-        motion = np.linalg.lstsq(weighted, change * weight, rcond=1e-6)[0]
+        motion = np.asarray(np.linalg.lstsq(weighted, change * weight, rcond=1e-6)[0], np.float64)
     spread, axes = np.linalg.eigh(_sandwich(weighted, (change - design @ motion) * weight))
     along = axes.T @ motion
     known = np.abs(along) > 5 * np.sqrt(np.maximum(spread, 0)) + 1e-9
