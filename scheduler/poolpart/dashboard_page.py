@@ -61,7 +61,7 @@ def page_of(scheduler: Any) -> bytes:
         partitions.append([title, p.workers, p.slots, p.busy, *_counts(p)])
         stages += [[name, _shown(p.name), *_counts(stage)] for name, stage in p.stages.items()]
     for name, pipe in pipes_of(scheduler).items():
-        end = pipe.end()
+        end = pipe.why_no_put()
         state = (
             "open" if end is None else "closed" if isinstance(end, PipeClosed) else f"failed: {end}"
         )

@@ -93,7 +93,7 @@ class Lender:
         self.names: set[str] = set()  # partitions whose tasks lend
         self.waiters: set[threading.Event] = set()  # of threads that lend once slots are wanted
         self._nested: dict[Any, _NestedTask] = {}  # {key: a task that waits for slots}
-        self._lending: Counter[Any] = Counter()  # {key of a task: its loans under way}
+        self._loans: Counter[Any] = Counter()  # {key of a task: its loans under way}
         self._returning: deque[_Loan] = deque()  # loans whose tasks wait for their slots
         self._rejoining: set[Any] = set()  # keys of tasks that wait for a thread of the worker
         self._lent: set[Any] = set()  # keys of running tasks that have lent before
@@ -104,16 +104,16 @@ class Lender:
 
     def lend(self, loan: _Loan) -> None:
         """Let other tasks have the slots."""
-        self._lending[loan.key] += 1
+        self._loans[loan.key] += 1
         self._lent.add(loan.key)
         free_slots(self.worker, loan.slots)
         self.serve()
 
     def take_back(self, loan: _Loan) -> None:
         """Let no other task start in these slots, and say when they are free."""
-        self._lending[loan.key] -= 1
-        if not self._lending[loan.key]:
-            del self._lending[loan.key]
+        self._loans[loan.key] -= 1
+        if not self._loans[loan.key]:
+            del self._loans[loan.key]
         take_slots(self.worker, loan.slots)
         self._returning.append(loan)
         self.serve()
@@ -203,7 +203,7 @@ class Lender:
     def holds_slots(self, key: Any) -> bool:
         """Whether a task runs here, has not lent its slots, and does not wait for them."""
         waits = any(loan.key == key for loan in self._returning)
-        return is_running(self.worker, key) and not (self._lending[key] or waits)
+        return is_running(self.worker, key) and not (self._loans[key] or waits)
 
     async def _warn(self, key: Any, submitter: Submitter) -> None:
         """Warn all clients if the submitter of a waiting task, on whichever worker, holds slots."""
@@ -238,7 +238,7 @@ def _holds_slots(key: Any, dask_worker: Any = None) -> bool:
 def _loan_of_thread() -> tuple[Lender, _Loan] | None:
     """Return what the task of this thread may lend; None if it has nothing to lend."""
     running = task_of_thread()
-    if running is None or getattr(_thread, "lends", False):
+    if running is None or getattr(_thread, "in_loan", False):
         return None
     worker, task = running
     lender = _lenders.get(worker)
@@ -248,8 +248,8 @@ def _loan_of_thread() -> tuple[Lender, _Loan] | None:
     return (lender, _Loan(task.key, slots)) if slots else None
 
 
-class _Lending:
-    """How the waits of clients lend."""
+class _WaitHooks:
+    """What the waits of clients call, see `internals.client.WaitHooks`."""
 
     def may_lend(self) -> bool:
         """Whether the task of this thread has slots that it may lend."""
@@ -286,7 +286,7 @@ class _Lending:
             return
         lender, loan = loan_of_task
         worker = lender.worker
-        _thread.lends = True
+        _thread.in_loan = True
         has_thread = False
         # After `worker_client`, or in an executor of the user's, this is no thread of the worker's.
         with suppress(KeyError, AttributeError):
@@ -296,7 +296,7 @@ class _Lending:
         try:
             yield
         finally:
-            _thread.lends = False
+            _thread.in_loan = False
             worker.loop.add_callback(lender.take_back, loan)
             while not loan.returned.wait(_CHECK_EVERY_S) and worker.status is not Status.closed:
                 pass
@@ -308,8 +308,8 @@ class _Lending:
                 worker.loop.add_callback(lender.end_rejoin, loan.key)
 
 
-LENDING = _Lending()
-slots_lent = LENDING.lent
+WAIT_HOOKS = _WaitHooks()
+slots_lent = WAIT_HOOKS.lent
 
 
 # -- on and off --------------------------------------------------------------------------
@@ -318,7 +318,7 @@ slots_lent = LENDING.lent
 def begin_lending(worker: Any, name: str) -> Lender:
     """Have the tasks of a partition lend on this worker; runs in its event loop."""
     with _lock:
-        let_waits_lend(LENDING)
+        let_waits_lend(WAIT_HOOKS)
         lender = _lenders.setdefault(worker, Lender(worker))
     lender.names.add(name)
     return lender
@@ -341,7 +341,7 @@ def lending_plugin(name: str) -> bytes:
     A worker that joins gets tasks before any request can reach it. A plugin comes first.
     """
 
-    class Lending(WorkerPlugin):
+    class LendingPlugin(WorkerPlugin):
         # A class within a function is sent by value.
         lender: Any = None
 
@@ -364,5 +364,5 @@ def lending_plugin(name: str) -> bytes:
             if self.lender is not None:
                 self.lender.transition(key, finish)
 
-    plugin: bytes = dumps(Lending())
+    plugin: bytes = dumps(LendingPlugin())
     return plugin

@@ -5,8 +5,9 @@ the pipe's name; `pipe_states.py` is their side on the scheduler. Any client can
 and take by `Queue(name)`, and close the pipe by `Variable(name)`.
 
 `Pipe.put` and `Pipe.get` ask the scheduler by requests of their own. A request waits there for a
-second at most, and is then asked again: so an item goes to no process that was stopped or killed
-while it waited.
+second at most, and is then asked again. So no item goes to a process that was killed while it
+waited, and to a process that was stopped, or a machine that was cut off, at most the items of one
+second.
 
 Pipes end with the client that made them, also if it was killed. Otherwise tasks at both ends would
 wait for ever, and keep their slots; Dask does not stop the thread of a task whose client has left.
@@ -52,16 +53,17 @@ class Pipe:
 
     With several `producers`, the pipe is closed once each of them has called `close`.
 
-    After `fail`, every `put` raises `PipeFailed`, and every `get` once the consumer has used up its
-    items; waiting calls do so within a second. A pipe that does not exist, or was deleted, raises
-    it as well. If the scheduler has died they raise OSError, after Dask's
-    ``distributed.comm.timeouts.connect``.
+    After `fail`, every `put` raises `PipeFailed`. A `get` first hands out what this object has
+    already taken, and then raises; waiting calls raise within a second. A pipe that does not exist,
+    or was deleted, raises the same error, also in `close` and `fail`. If the scheduler has died,
+    calls raise OSError, after Dask's ``distributed.comm.timeouts.connect``.
 
     A consumer takes all that is queued, some `capacity` items, in one request; `get` and
     iteration hand them out one by one. At most ``capacity * (1 + consumers)`` items are
     under way. With slow items and several consumers, choose a small capacity, so that no consumer
-    holds items while another idles. Items taken by a consumer that dies are lost with it: for
-    exactly-once delivery, record what has arrived, and put missing items again.
+    holds items while another idles. Items that an object has taken are lost if its process dies, or
+    if the object is dropped, such as by a `break` and the end of the task: for exactly-once
+    delivery, record what has arrived, and put missing items again.
 
     Parameters
     ----------
@@ -81,8 +83,9 @@ class Pipe:
     raise `PipeClosed` and `PipeFailed`, too. Unlike `Pipe.get`, `Queue.get` loses an item if its
     client is killed while it waits: the scheduler does not know whose request it is. The variable
     is the state, see `poolpart.pipe_states.PipeState`. ``variable.set({**variable.get(), "closed":
-    True})`` closes the pipe; what does not follow from the state is a ValueError. Deleting either
-    deletes the pipe.
+    True})`` closes the pipe; what does not follow from the state is a ValueError, also if the state
+    has changed since it was read: read and set it again. ``Variable.delete``, or releasing the last
+    reference to the queue, deletes the pipe.
 
     Examples
     --------
@@ -206,14 +209,17 @@ class Pipe:
 
     @property
     def advice(self) -> int:
-        """Amount that the consumer wants in one item, as of the last `put`.
+        """Number of records that the consumer wants bundled in one item, as of the last `put`.
 
         A producer may ignore it.
         """
         return int(self._change()["advice"] if self._advice is None else self._advice)
 
     def advise(self, amount: int) -> None:
-        """Set the amount that producers should put into one item, 1 or more; for one caller."""
+        """Set the number of records that producers should bundle in one item, 1 or more.
+
+        Only one consumer may call this.
+        """
         if amount < 1:
             raise ValueError(f"The advice for pipe {self.name!r} is {amount}; give 1 or more.")
         if amount != self.advice:
@@ -248,8 +254,8 @@ class Pipe:
     ) -> None:
         """Add items in order, up to `capacity` of them in one request; waits like `put`.
 
-        The items may be endless. After an error, such as that `timeout_s` in all was too short, the
-        first of them may be in the pipe.
+        The items may be endless; `capacity` of them are read before they are sent. After an error,
+        such as that `timeout_s` was too short for all, the first of them may be in the pipe.
         """
         deadline = _deadline(timeout_s)
         source, waiting = iter(items), list[bytes]()

@@ -22,8 +22,8 @@ from distributed.diagnostics.plugin import SchedulerPlugin
 from .errors import PipeClosed, PipeFailed
 from .internals.queues import (
     BoundedQueue,
-    Changes,
     QueueAndVariable,
+    Waiters,
     intercept_variable_set,
     wait_until,
 )
@@ -51,7 +51,7 @@ class PipeState:
     closed_by   those that have: keys of their tasks, or random ids
     closed      whether nothing may be put any more
     failure     reason why the pipe has failed, "" while it has not
-    advice      amount that the consumer wants in one item
+    advice      number of records that the consumer wants in one item
     ==========  ====================================================================
     """
 
@@ -60,7 +60,7 @@ class PipeState:
     ) -> None:
         self.name = name
         self.owner = owner  # cannot change, and outlasts a Variable that a client has deleted
-        self.queue = BoundedQueue(capacity, self.end, self.failure)
+        self.queue = BoundedQueue(capacity, self.why_no_put, self.why_no_get)
         value = {
             "owner": owner,
             "capacity": capacity,
@@ -91,16 +91,16 @@ class PipeState:
         """Whether the pipe was closed or deleted, or has failed."""
         return not self.exists or self.value["closed"] or bool(self.value["failure"])
 
-    def failure(self) -> PipeFailed | None:
+    def why_no_get(self) -> PipeFailed | None:
         """Return why no items may be taken any more; None if they may."""
         if not self.exists:
             return PipeFailed(f"Pipe {self.name!r} does not exist: it was deleted.")
         reason = self.value["failure"]
         return PipeFailed(reason) if reason else None
 
-    def end(self) -> PipeFailed | PipeClosed | None:
+    def why_no_put(self) -> PipeFailed | PipeClosed | None:
         """Return why no items may be put any more; None if they may."""
-        if (error := self.failure()) is not None:
+        if (error := self.why_no_get()) is not None:
             return error
         return PipeClosed(f"Pipe {self.name!r} is closed.") if self.value["closed"] else None
 
@@ -180,7 +180,7 @@ def delete_pipes(names: Collection[str], dask_scheduler: Any = None) -> None:
 
 
 class Pipes(SchedulerPlugin):
-    """The pipes of a scheduler; exists, and answers requests, as long as there are any."""
+    """The pipes of a scheduler; exists, and answers requests, as long as there are any pipes."""
 
     name = NAME
 
@@ -188,7 +188,7 @@ class Pipes(SchedulerPlugin):
         self.scheduler = scheduler
         self.states: dict[str, PipeState] = {}
         # {key of a task that requests wait for: those requests}
-        self._awaited: defaultdict[str, Changes] = defaultdict(Changes)
+        self._awaited: defaultdict[str, Waiters] = defaultdict(Waiters)
         handlers = handlers_of(scheduler)
         handlers.update({CHANGE: self.change, PUT: self.put, TAKE: self.take})
         self._end_interception = intercept_variable_set(handlers, self._check, self._notify)
@@ -223,7 +223,7 @@ class Pipes(SchedulerPlugin):
     def _notify(self, name: str) -> None:
         """Let requests look at a Variable that a client has set."""
         if (state := self.states.get(name)) is not None:
-            state.queue.changes.notify()
+            state.queue.waiters.notify()
 
     # -- requests ----------------------------------------------------------------------
 
@@ -254,7 +254,7 @@ class Pipes(SchedulerPlugin):
         At once if there is room: for a coroutine Dask makes a task, which takes longer than this.
         """
 
-        def put(state: PipeState) -> int:
+        def put_into(state: PipeState) -> int:
             if state.has_ended or asker not in self.scheduler.clients:
                 return 0
             fitting = items if unbounded else items[: state.queue.room]
@@ -265,11 +265,11 @@ class Pipes(SchedulerPlugin):
             return unbounded or all(s.has_ended or s.queue.room for s in states.values())
 
         async def later() -> Replies:
-            await wait_until(ready, [state.queue.changes for state in states.values()], seconds)
-            return self._replies(states, put)
+            await wait_until(ready, [state.queue.waiters for state in states.values()], seconds)
+            return self._replies(states, put_into)
 
         states = self._existing(names)
-        return self._replies(states, put) if ready() else later()
+        return self._replies(states, put_into) if ready() else later()
 
     async def take(
         self,
@@ -300,11 +300,11 @@ class Pipes(SchedulerPlugin):
         def full() -> bool:
             return any(state.has_ended or not state.queue.room for state in states.values())
 
-        def take(state: PipeState) -> list[Any]:
+        def take_from(state: PipeState) -> list[Any]:
             return state.take(limit) if asker in self.scheduler.clients else []
 
         states = self._existing(names)
-        of_pipes = [state.queue.changes for state in states.values()]
+        of_pipes = [state.queue.waiters for state in states.values()]
         try:
             of_tasks = [self._awaited[key] for key in keys]
             await wait_until(news, of_pipes + of_tasks, seconds)
@@ -314,7 +314,7 @@ class Pipes(SchedulerPlugin):
                     del self._awaited[key]
         if linger_s:
             await wait_until(full, of_pipes, min(linger_s, seconds))
-        return self._replies(states, take)
+        return self._replies(states, take_from)
 
     def _existing(self, names: Sequence[str]) -> dict[str, PipeState]:
         states = {name: self.states[name] for name in names if name in self.states}

@@ -16,8 +16,8 @@ REQUEST_S = 0.05  # a call of the scheduler that takes longer waits for somethin
 _OPTIONS_OF_SYNC = {"asynchronous", "callback_timeout"}  # the others are of the called function
 
 
-class Lending(Protocol):
-    """What a wait needs to know of the slots of the task that waits."""
+class WaitHooks(Protocol):
+    """What a wait calls to lend the slots of the task that waits."""
 
     def may_lend(self) -> bool:
         """Whether the task of this thread has slots that it may lend."""
@@ -30,7 +30,7 @@ class Lending(Protocol):
 
 
 @cache  # once: another library may have wrapped the same since, and goes on calling this
-def let_waits_lend(lending: Lending) -> None:
+def let_waits_lend(hooks: WaitHooks) -> None:
     """Wrap the waits of Dask's clients so that tasks of this process lend their slots in them.
 
     `Future.result` and `exception`, `Client.gather`, `wait`, the computing of collections, and
@@ -49,15 +49,15 @@ def let_waits_lend(lending: Lending) -> None:
     result_of_actor = ActorFuture.result
 
     def sync_lending(caller: Any, function: Any, *args: Any, **kwargs: Any) -> Any:
-        if not lending.may_lend():
+        if not hooks.may_lend():
             return sync(caller, function, *args, **kwargs)
         if getattr(function, "__func__", function) in waits_for_futures:
-            owner = getattr(function, "__self__", None)
-            futures = futures_of(owner if isinstance(owner, Future) else [*args])
+            bound_to = getattr(function, "__self__", None)
+            futures = futures_of(bound_to if isinstance(bound_to, Future) else [*args])
             pending = [future.status in ("pending", "lost") for future in futures]
             first = kwargs.get("return_when") == "FIRST_COMPLETED"
             waits = all(pending) if first else any(pending)
-            with lending.lent(waits):
+            with hooks.lent(waits):
                 return sync(caller, function, *args, **kwargs)
         if caller.asynchronous or not kwargs.keys().isdisjoint(_OPTIONS_OF_SYNC):
             return sync(caller, function, *args, **kwargs)
@@ -70,21 +70,21 @@ def let_waits_lend(lending: Lending) -> None:
         answer = asyncio.run_coroutine_threadsafe(call(), caller.loop.asyncio_loop)
         try:
             concurrent.futures.wait([answer], REQUEST_S)
-            lending.until_wanted(answer)
+            hooks.until_wanted(answer)
             # One loan to the end of the wait: a task that borrows the slots may wait in turn, and
             # trees of such tasks hang if each looks again and again whether its slots are wanted.
-            with lending.lent(not answer.done()):
+            with hooks.lent(not answer.done()):
                 return answer.result()
         finally:
             answer.cancel()  # after an error in this thread
 
     def next_lending(completed: Any) -> Any:
         waits = not completed.has_ready() and not completed.is_empty()
-        with lending.lent(waits):
+        with hooks.lent(waits):
             return next_completed(completed)
 
     def result_of_actor_lending(future: Any, *args: Any, **kwargs: Any) -> Any:
-        with lending.lent(not future.done()):
+        with hooks.lent(not future.done()):
             return result_of_actor(future, *args, **kwargs)
 
     SyncMethodMixin.sync = sync_lending

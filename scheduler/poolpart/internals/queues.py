@@ -36,8 +36,8 @@ Record = dict[str, Any]  # of an item, as Dask's queue extension keeps them
 _PICKLED = "pickled"
 
 
-class Changes:
-    """The requests that wait for changes of one queue.
+class Waiters:
+    """The requests that wait for changes of one queue, or for the end of one task.
 
     A request looks again whether its condition holds after each `notify`.
     """
@@ -63,15 +63,15 @@ class Changes:
 
 
 async def wait_until(
-    condition: Callable[[], bool], changes: Collection[Changes], seconds: float = math.inf
+    condition: Callable[[], bool], waiters: Collection[Waiters], seconds: float = math.inf
 ) -> None:
     """Wait until a condition holds that depends on some queues, at most so long."""
     if condition():
         return
     deadline = time.monotonic() + seconds
     event = asyncio.Event()
-    for change in changes:
-        change.subscribe(event)
+    for group in waiters:
+        group.subscribe(event)
     try:
         while not condition() and (remaining := deadline - time.monotonic()) > 0:
             event.clear()
@@ -79,8 +79,8 @@ async def wait_until(
                 async with asyncio.timeout(min(remaining, LOOK_S)):
                     await event.wait()
     finally:
-        for change in changes:
-            change.unsubscribe(event)
+        for group in waiters:
+            group.unsubscribe(event)
 
 
 class BoundedQueue:
@@ -94,22 +94,22 @@ class BoundedQueue:
     ----------
     capacity
         Items that may be queued, except by `extend`.
-    end
+    why_no_put
         Returns the error of a `put` now, or None while the pipe is open.
-    failure
+    why_no_get
         Returns the error of a `get` now, or None while the items may be taken.
     """
 
     def __init__(
         self,
         capacity: int,
-        end: Callable[[], Exception | None],
-        failure: Callable[[], Exception | None],
+        why_no_put: Callable[[], Exception | None],
+        why_no_get: Callable[[], Exception | None],
     ) -> None:
         self.capacity = capacity
-        self.changes = Changes()
-        self._end = end
-        self._failure = failure
+        self.waiters = Waiters()
+        self._why_no_put = why_no_put
+        self._why_no_get = why_no_get
         # The extension looks in an attribute of this name for futures, when it deletes a queue.
         self._queue: deque[Record] = deque()
 
@@ -128,15 +128,17 @@ class BoundedQueue:
 
     async def put(self, record: Record) -> None:
         """Add an item, once there is room."""
-        await wait_until(lambda: self.room > 0 or self._end() is not None, [self.changes])
-        if (error := self._end()) is not None:
+        await wait_until(lambda: self.room > 0 or self._why_no_put() is not None, [self.waiters])
+        if (error := self._why_no_put()) is not None:
             raise error
         self.extend([record])
 
     async def get(self) -> Record:
         """Remove the first item, once there is one."""
-        await wait_until(lambda: bool(self._queue) or self._end() is not None, [self.changes])
-        error = self._failure() if self._queue else self._end()
+        await wait_until(
+            lambda: bool(self._queue) or self._why_no_put() is not None, [self.waiters]
+        )
+        error = self._why_no_get() if self._queue else self._why_no_put()
         if error is not None:
             raise error
         return self.take(1)[0]
@@ -145,15 +147,15 @@ class BoundedQueue:
         """Add items, also beyond the capacity."""
         was_empty = not self._queue
         self._queue.extend(records)
-        if was_empty or not self.room:  # else nobody waits for this
-            self.changes.notify()
+        if was_empty or not self.room:  # takers wait for the first item, or linger until it is full
+            self.waiters.notify()
 
     def take(self, number: int) -> list[Record]:
         """Remove the first items, at most so many."""
         had_room = self.room > 0
         records = [self._queue.popleft() for _ in range(min(number, len(self._queue)))]
-        if records and not had_room:  # else nobody waits for this
-            self.changes.notify()
+        if records and not had_room:  # producers wait only while the queue is full
+            self.waiters.notify()
         return records
 
 
@@ -192,7 +194,7 @@ class QueueAndVariable:
     def set(self, value: Any) -> None:
         """Set the variable, and let all requests that wait look at it."""
         self._variables.variables[self.name] = {"type": "msgpack", "value": value}
-        self.queue.changes.notify()
+        self.queue.waiters.notify()
 
     def put(self, items: Iterable[bytes]) -> None:
         """Add pickled items to the queue, also beyond its capacity."""
@@ -208,7 +210,7 @@ class QueueAndVariable:
         while self._queues.queues.get(self.name) is self.queue:
             self._queues.release(name=self.name)
         self._variables.variables.pop(self.name, None)
-        self.queue.changes.notify()
+        self.queue.waiters.notify()
 
 
 def _record_of(item: bytes) -> Record:
