@@ -254,6 +254,8 @@ def write_shared(
     from .charts import draw_sweep
 
     campaign, place = record["campaign"], dataset.place
+    with explained(f"{place} cannot be written"):
+        place.remove([INDEX_FILE])  # it has the checksum of the table
     write_table(place, campaign["names"], rows)
     write_record(place, record)  # behind the table, which has the jobs of all shards in it
     dataset.finish(rows())
