@@ -13,7 +13,7 @@ from typing import Any
 import click
 
 from ..base.errors import LidarpoolError
-from ..base.shard import Shard
+from ..base.shard import Shard, shard_in_words
 from ..base.storage import Storage
 from ..base.words import plural
 from ..datasets.dataset import DataSet
@@ -71,7 +71,8 @@ def run_scenario(
     with result_folder(options.out), page_of(jobs, options.live) as page:
         result = Conductor(jobs, options, output, terminal, page)()
     points, lines = len(result.points), [*terminal.notes(result.notes)]
-    lines.append(f"shard {shard} in {options.out}: {plural(points, 'point')}, for lidarpool merge")
+    words = shard_in_words(str(shard))
+    lines.append(f"{words} in {options.out}: {plural(points, 'point')}, for lidarpool merge")
     told = {"folder": str(options.out), "shard": str(shard), "points": points}
     show(told, lines, terminal.as_json)
 
