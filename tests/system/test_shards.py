@@ -23,6 +23,7 @@ from lidarpool import Campaign, Job, LidarpoolError, Noise, Scene, Sensor, Surve
 from lidarpool.base.sealed import sealed, unsealed
 from lidarpool.base.shard import Shard
 from lidarpool.base.storage import Storage
+from lidarpool.datasets.job_table import read_table
 from lidarpool.export.format_table import DATA_SETS
 from lidarpool.report.campaign_output import verify
 from lidarpool.scene.actors import box
@@ -227,6 +228,10 @@ def test_a_shard_is_never_made_the_whole(parts):
     for out, relation in ((parts[0], "is one of"), (inside, "lies in"), (around, "holds")):
         with pytest.raises(LidarpoolError, match=f"--out {out} {relation} the shard"):
             merge(parts, out)
+    with pytest.raises(LidarpoolError, match="is one of the shards"):
+        merge([parts[0].as_uri(), *parts[1:]], parts[0])
+    with pytest.raises(LidarpoolError, match="is one of the shards"):
+        merge(parts, parts[0].as_uri())
     assert content(parts[0].parent) == before
 
 
@@ -309,6 +314,29 @@ def test_a_manifest_that_names_files_elsewhere_is_damaged(parts, tmp_path):
     with pytest.raises(LidarpoolError, match=r"^missing or damaged: .*part-2/\.jobs/0001\.json"):
         merge(parts, out)
     assert not (out.parent / "stranger").exists()
+
+
+STRANGE_ENTRIES = {
+    "an unknown entry of the row": lambda manifest: manifest["row"].update(colour="red"),
+    "no points": lambda manifest: manifest["row"].pop("points"),
+    "a broken number": lambda manifest: manifest["row"].update(number=1.0),
+    "a class without number": lambda manifest: manifest["row"].update(classes={"car": 1}),
+    "no files": lambda manifest: manifest.pop("files"),
+    "a list of files": lambda manifest: manifest.update(files=["cloud.ply"]),
+    "a list of software": lambda manifest: manifest.update(made_with=["numpy"]),
+}
+
+
+@pytest.mark.parametrize("edit", quick(("no points", "no files"), STRANGE_ENTRIES))
+def test_a_manifest_with_other_entries_is_damaged(parts, tmp_path, edit):
+    path = parts[1] / ".jobs/0001.json"
+    manifest = json.loads(path.read_text())
+    del manifest["crc"]
+    STRANGE_ENTRIES[edit](manifest)
+    crc = zlib.crc32(json.dumps(manifest).encode())
+    path.write_text(json.dumps(manifest | {"crc": crc}))
+    with pytest.raises(LidarpoolError, match=r"^missing or damaged: .*part-2/\.jobs/0001\.json"):
+        merge(parts, tmp_path / "ds")
 
 
 def doubled(parts: list[Path]) -> list[Path]:
@@ -489,6 +517,7 @@ KILLED = """
 import os, signal, sys
 from lidarpool import merge
 from lidarpool.base.storage import Storage
+from lidarpool.datasets.job_table import read_table
 import lidarpool.report.campaign_output as output
 owners = {"take": Storage, "write_table": output, "finish": output.DataSet}
 name, left = sys.argv[1], [int(sys.argv[2])]
@@ -519,6 +548,18 @@ def test_a_killed_merge_goes_on(parts, campaigns, tmp_path):
     merge(parts, out)
     assert content(out) == content(campaigns("folder") / "one")
     assert times == {path: path.stat().st_ctime_ns for path in times}  # they were not taken again
+
+
+def test_seconds_of_shards_outlast_a_killed_merge(parts, tmp_path):
+    out = tmp_path / "ds"
+    merge(parts[:2], out, partial=True)
+    table = Storage.at(out)
+    seconds = {row.number: row.seconds for row in read_table(table)}
+    for moment in ("write_table", "finish"):
+        killed(out, parts[2:], (moment, 1))
+        merge(parts[2:], out)
+        assert json.loads((out / "report.json").read_text())["notes"] == []
+        assert seconds == {r.number: r.seconds for r in read_table(table) if r.number in seconds}
 
 
 # -- surveys --------------------------------------------------------------------------------------

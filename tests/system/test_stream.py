@@ -178,6 +178,15 @@ def test_jobs_that_fail_are_left_out(cluster_client, caplog):
     assert told.startswith("Job 0001 is left out of the stream") and "no such street" in told
 
 
+def test_the_first_job_without_points_is_named(cluster_client, caplog):
+    far = Survey(Sensor.grid(90, 2, step_deg=30), poses=[(0, 0, 10_000)], steps=12)
+    sweeps = list(Campaign(lambda number, rng: Job(SCENE, far), 3).stream(cluster_client))
+    assert [len(sweep.points) for sweep in sweeps] == [0] * 3
+    (told,) = [record.getMessage() for record in caplog.records if "no points" in record.message]
+    assert told.startswith("Job 0000 of the stream has no points: no ray hit anything")
+    assert told.endswith("Further jobs without points are not named.")
+
+
 def test_errors_are_told_in_a_line(cluster_client):
     for options, words in (
         ({"ahead": 0}, "ahead is 0; it must be at least 1"),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Mapping
+from contextlib import suppress
 from dataclasses import asdict, replace
 from pathlib import Path
 from types import MappingProxyType
@@ -12,7 +13,7 @@ from typing import Any
 import click
 
 from ..base.errors import LidarpoolError
-from ..base.shard import Shard
+from ..base.shard import Shard, shard_in_words
 from ..base.storage import Storage
 from ..base.words import plural
 from ..datasets.dataset import DataSet
@@ -70,7 +71,8 @@ def run_scenario(
     with result_folder(options.out), page_of(jobs, options.live) as page:
         result = Conductor(jobs, options, output, terminal, page)()
     points, lines = len(result.points), [*terminal.notes(result.notes)]
-    lines.append(f"shard {shard} in {options.out}: {plural(points, 'point')}, for lidarpool merge")
+    words = shard_in_words(str(shard))
+    lines.append(f"{words} in {options.out}: {plural(points, 'point')}, for lidarpool merge")
     told = {"folder": str(options.out), "shard": str(shard), "points": points}
     show(told, lines, terminal.as_json)
 
@@ -105,6 +107,8 @@ def run_campaign(
     """Run a campaign, and print a summary; LidarpoolError if it or a job fails."""
     options = options.with_pool(campaign.pool, backend)
     assert options.out is not None, "commands write"
+    for warning in _first_job_warnings(campaign, terminal):
+        terminal.warn(warning)
     with page_of(campaign, options.live) as page:
         output = DataSetOutput(options.out, campaign)
         run = Conductor(campaign, options, output, terminal, page)()
@@ -123,6 +127,21 @@ def run_campaign(
             page.stay()
     if run.failed:
         raise LidarpoolError(failures(run))
+
+
+def _first_job_warnings(campaign: CampaignSpec, terminal: Terminal) -> list[str]:
+    """Return what is implausible in the first job of a campaign, or of its shard.
+
+    Jobs that cannot be made are reported by the run.
+    """
+    if not campaign.numbers:
+        return []
+    number = campaign.numbers[0]
+    with suppress(LidarpoolError), terminal.status("reading the scene", logged=False):
+        if (scenario := campaign.scenario(number)) is not None:  # else a function makes the jobs
+            warnings = implausibilities(build(scenario, plans=False))
+            return [f"job {campaign.name(number)}: {warning}" for warning in warnings]
+    return []
 
 
 def run_job(

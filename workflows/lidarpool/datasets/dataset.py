@@ -317,7 +317,10 @@ class DataSet:
         """Read the manifest of a job; empty if it is missing, damaged or of another job."""
         try:
             manifest: dict[str, Any] = json.loads(self.place.read(manifest_file(name)))
-            whole = manifest.pop("crc") == _crc(manifest) and manifest["row"]["name"] == name
+            whole = manifest.pop("crc") == _crc(manifest)
+            whole &= JobRow.of(manifest["row"]).name == name
+            whole &= isinstance(manifest["made_with"], dict)
+            whole &= all(len(checksum) == 2 for checksum in manifest["files"].values())
         except (FileNotFoundError, ValueError, LookupError, TypeError, AttributeError):
             return {}
         return manifest if whole else {}

@@ -18,7 +18,7 @@ import tempfile
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from importlib.util import find_spec
 from io import TextIOWrapper
 from itertools import islice
@@ -108,8 +108,17 @@ class JobRow:
 
     @classmethod
     def of(cls, data: Mapping[str, Any]) -> JobRow:
-        """Make a row of what JSON gives of one."""
-        classes = {int(number): count for number, count in data["classes"].items()}
+        """Make a row of what JSON gives of one.
+
+        ValueError if an entry is missing, unknown or of another type.
+        """
+        if differing := data.keys() ^ {entry.name for entry in fields(cls)}:
+            raise ValueError(f"a row of a job has other entries: {min(differing)}")
+        kinds = {**_HEAD, **_TAIL, "seconds": int | float, "values": dict, "classes": dict}
+        for name, kind in kinds.items():
+            if not isinstance(data[name], kind):
+                raise ValueError(f"the {name} of a job is {data[name]!r}")
+        classes = {int(number): int(count) for number, count in data["classes"].items()}
         return cls(**{**data, "classes": classes})
 
 

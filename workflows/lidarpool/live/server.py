@@ -42,9 +42,9 @@ _PORTS_TRIED = 100
 
 _HUB = "JUPYTERHUB_SERVICE_PREFIX"  # in the environment of kernels of a hub: where its user's is
 
-SLOW_AT_ONCE = 2  # slow answers that are made or sent at a time
-SLOW_WAITING = 16  # slow questions that wait for their turn; further ones get status 503
-LARGE_POINTS = 1_000_000  # a question for more points is slow
+SLOW_AT_ONCE = 2  # slow answers of a kind that are made or sent at a time
+SLOW_WAITING = 16  # slow questions of a kind that wait; further ones get status 503
+LARGE_POINTS = 1_000_000  # an answer of more points is large
 LONG_TEXT = 1_000  # letters: a question for points of longer lists is slow
 STALL_S = 20.0  # without a byte that the browser reads; then its connection is closed
 
@@ -82,22 +82,26 @@ def bundle(header: dict[str, Any], arrays: Mapping[str, AnyArray]) -> list[bytes
     return [len(text).to_bytes(4, "little"), text, *pieces]
 
 
-def is_slow(what: str, asked: Arguments) -> bool:
-    """Whether an answer may take seconds: it searches all points, or has millions of them.
+def is_large(what: str, asked: Arguments) -> bool:
+    """Whether an answer may have millions of points: then it holds memory until it is read.
 
     ValueError if the number of points is no number.
     """
     kind = what.rpartition("/")[2]
-    if kind != "points":
-        return kind == "export"
+    return kind == "export" or (kind == "points" and int(asked.get("most", 0)) > LARGE_POINTS)
+
+
+def is_search(what: str, asked: Arguments) -> bool:
+    """Whether an answer may take seconds because all points are searched."""
     long_lists = len(asked.get("scans", "")) > LONG_TEXT
-    return bool(asked.get("filter")) or long_lists or int(asked.get("most", 0)) > LARGE_POINTS
+    return what.rpartition("/")[2] == "points" and (bool(asked.get("filter")) or long_lists)
 
 
 class SlowQuestions:
-    """Answers few slow questions at a time, in threads of their own.
+    """Answers few slow questions of a kind at a time, in threads of their own.
 
     An answer has its turn until the browser has read it, so that few large ones are in memory.
+    Large answers and searches are two kinds: large ones that nobody reads delay no search.
     """
 
     def __init__(self) -> None:
@@ -156,7 +160,7 @@ class _File(_Guarded, StaticFileHandler):
 class _Question(_Guarded):
     """Answers one question. `source` may take long: it is asked in a thread of its own.
 
-    Slow questions wait for one another, others are answered meanwhile.
+    Slow questions of a kind wait for one another, others are answered meanwhile.
     """
 
     def initialize(self, source: Source, stop: Callable[[], None] | None) -> None:
@@ -165,9 +169,13 @@ class _Question(_Guarded):
 
     async def get(self, what: str) -> None:
         asked = {name: self.get_query_argument(name) for name in self.request.query_arguments}
-        slow: SlowQuestions = self.settings["slow"]
         try:
-            if is_slow(what, asked):
+            slow: SlowQuestions | None = None
+            if is_large(what, asked):
+                slow = self.settings["large"]
+            elif is_search(what, asked):
+                slow = self.settings["searches"]
+            if slow is not None:
                 async with slow.turn():
                     await self._answer(slow.threads, what, asked)
             else:
@@ -254,7 +262,8 @@ def page_server(
         ]
         application = Application(handlers, log_function=lambda _: None)
         application.settings |= {
-            "slow": SlowQuestions(),
+            "large": SlowQuestions(),
+            "searches": SlowQuestions(),
             "page": made,
             "in_notebook": cell_display() is not None,
         }

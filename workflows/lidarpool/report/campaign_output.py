@@ -29,16 +29,17 @@ from ..run.store import RUN_FOLDER, RunStore, remove_run
 from ..scenario.campaign import CampaignSpec, hashes
 
 CAMPAIGN_FILE = "campaign.json"  # whose data set this is, and the software that made it
-_RECORDED = {
-    "identity",
-    "casting",
-    "backend",
-    "sensors",
-    "files",
-    "campaign",
-    "shards",
-    "notes",
-}  # names of the entries of CAMPAIGN_FILE
+# Entries of CAMPAIGN_FILE and their types.
+_RECORDED: dict[str, type] = {
+    "identity": dict,
+    "casting": dict,
+    "backend": str,
+    "sensors": dict,
+    "files": list,
+    "campaign": dict,
+    "shards": list,
+    "notes": list,
+}
 
 # With what `write_shared` writes, CAMPAIGN_FILE first.
 _FINISHED = re.compile(
@@ -205,10 +206,11 @@ def read_record(place: Storage) -> dict[str, Any]:
     """
     try:
         record = unsealed(place.read(CAMPAIGN_FILE))
-        if missing := _RECORDED - record.keys():
-            raise ValueError(f"it has no {min(missing)}")
+        for name, kind in _RECORDED.items():
+            if not isinstance(record.get(name), kind):
+                raise ValueError(f"its entry {name} is missing or of another type")
         for shard in record["shards"]:
-            Shard.parse(shard)
+            Shard.parse(str(shard))
     except OSError as error:
         raise LidarpoolError(
             f"{place} holds no finished data set, which has a {CAMPAIGN_FILE}: {error}."
@@ -254,6 +256,8 @@ def write_shared(
     from .charts import draw_sweep
 
     campaign, place = record["campaign"], dataset.place
+    with explained(f"{place} cannot be written"):
+        place.remove([INDEX_FILE])  # it has the checksum of the table
     write_table(place, campaign["names"], rows)
     write_record(place, record)  # behind the table, which has the jobs of all shards in it
     dataset.finish(rows())

@@ -150,8 +150,11 @@ def merge(
 
 
 def _real(place: Storage) -> str:
-    """Return the same for a folder by whatever path, which may lead through links."""
-    return str(Path(place.url).resolve()) if place.is_local else place.url
+    """Return the same for a folder by whatever path or URL, which may lead through links."""
+    scheme, separator, path = place.url.partition("://")
+    if separator and scheme not in ("file", "local"):
+        return place.url
+    return str(Path(path or place.url).resolve())
 
 
 def _check_apart(out: Storage, places: Mapping[str, Storage]) -> None:
@@ -377,7 +380,8 @@ def _seconds(part: _Part, notes: list[str]) -> dict[int, tuple[str, float]]:
     if not part.shards:
         return {}
     try:
-        table = read_table(part.place, read_index(part.place)["table"])
+        finished = INDEX_FILE in part.place.sizes()  # else an earlier merge was killed
+        table = read_table(part.place, read_index(part.place)["table"] if finished else None)
         return {row.number: (row.sha256, row.seconds) for row in table}
     except LidarpoolError:
         notes.append(

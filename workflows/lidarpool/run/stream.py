@@ -40,6 +40,7 @@ from ..pipeline.messages import CollectOrder, ColumnsLost, Receipt
 from ..pipeline.names import GPU
 from ..scenario.build import Job
 from ..scenario.campaign import CampaignSpec
+from ..scenario.empty_cloud import empty_cloud_reason
 from ..simulator.memory import MB, scans_that_fit
 from ..simulator.scene_caster import check_backend_here
 from .checks import check_workers, find_workers
@@ -113,6 +114,7 @@ class _Streamed:
     sweeps: Sweeps
     state: JobState
     begun: int = 0  # sweeps that were given to the dispatcher
+    points: int = 0  # of the sweeps that were taken
     parts: dict[int, PartColumns] = field(default_factory=dict)  # {first scan: what was cast}
 
     def take(self, number: int) -> Sweep | None:
@@ -132,6 +134,7 @@ class _Streamed:
         rest = [c for c in survey.stored_columns if c not in AXES and c.name != WAVEFORM]
         table = (SCAN, *rest)
         cloud = Cloud.joined([part.cloud(table, survey.precision_m, origin) for part in parts])
+        self.points += len(cloud)
         places = sweeps.in_sensor(number, cloud.positions).astype(np.float32)
         columns = {column.name: np.array(cloud[column.name]) for column in table}
         boxes = Boxes.of(sweeps, number, cloud) if sweeps.actors else None
@@ -160,6 +163,7 @@ class _Casting:
         self._jobs: dict[int, _Streamed] = {}  # those that are cast
         self._next: _Streamed | None = None  # the job whose sweeps are cast next
         self._coming: deque[tuple[_Streamed, int]] = deque()  # sweeps that are being cast
+        self._warned = False  # of a job without points
 
     def send(self, name: str, orders: Sequence[CollectOrder]) -> None:
         """Take orders of the dispatcher, for stage 4."""
@@ -178,6 +182,7 @@ class _Casting:
                 self._coming.popleft()
                 if number + 1 == len(streamed.sweeps):
                     self._end(streamed)
+                    self._warn_if_empty(streamed)
                 moved = True
                 yield sweep
             pause_s = 0.0 if moved else min(max(0.001, 2 * pause_s), LONGEST_PAUSE_S)
@@ -271,6 +276,17 @@ class _Casting:
         del self._jobs[streamed.job.number]
         self._dispatcher.drop(streamed.state)
         self._casting.remove(streamed.job.number)
+
+    def _warn_if_empty(self, streamed: _Streamed) -> None:
+        """Warn of the first job without points: to find the reason, rays are cast here."""
+        if streamed.points or self._warned:
+            return
+        self._warned, job = True, streamed.job
+        logger.warning(
+            "Job %s of the stream has no points: %s. Further jobs without points are not named.",
+            job.name,
+            empty_cloud_reason(job.scene, job.survey),
+        )
 
     def _leave_out(self, name: str, error: object) -> None:
         logger.warning("Job %s is left out of the stream: %s", name, error)
