@@ -43,6 +43,7 @@ from lidarpool import (
 from lidarpool.base.open3d_module import load_open3d
 from lidarpool.base.storage import Storage
 from lidarpool.base.yamlfile import load_yaml
+from lidarpool.columns.bags import point_columns
 from lidarpool.columns.cloud_file import CloudFile
 from lidarpool.columns.table import COLOURS, TABLE
 from lidarpool.export import las as las_module
@@ -51,7 +52,7 @@ from lidarpool.export.boxes import Boxes
 from lidarpool.export.format_table import EXPORTS, FORMATS, LAYOUTS
 from lidarpool.export.formats import Format
 from lidarpool.export.las import wkt
-from lidarpool.export.ros import START_NS, columns_of
+from lidarpool.export.ros import START_NS
 from lidarpool.export.sweeps import Sweeps
 from lidarpool.scene.actors import Actor, box
 from lidarpool.sensor.trajectory import matrices
@@ -765,10 +766,11 @@ def test_normals_and_origins_follow_the_points_into_the_sensors_axes(drive, tmp_
     assert cosine.min() > 0  # normals face the sensor
     np.testing.assert_allclose(np.cos(np.radians(drive["incidence_deg"])), cosine, atol=2e-3)
 
-    files = {"c.ply": None, "c.las": None, "c.parquet": None, "c.mcap": None,
-             "pcd": "pcd", "webdataset": "webdataset"}  # fmt: skip
-    for name, kind in files.items():
-        assert not {*save_cloud(drive, tmp_path / name, format=kind)} & {*SURFACE}, name
+    files = {"c.ply": {}, "c.las": {}, "c.parquet": {}, "c.mcap": {"compensated": True},
+             "pcd": {"format": "pcd", "compensated": True},
+             "webdataset": {"format": "webdataset"}}  # fmt: skip
+    for name, options in files.items():
+        assert not {*save_cloud(drive, tmp_path / name, **options)} & {*SURFACE}, name
     ply = load_open3d().io.read_point_cloud(str(tmp_path / "c.ply"))
     np.testing.assert_allclose(np.asarray(ply.normals), normals, atol=1e-7)
     las, frame = laspy.read(tmp_path / "c.las"), pd.read_parquet(tmp_path / "c.parquet")
@@ -790,7 +792,7 @@ def test_normals_and_origins_follow_the_points_into_the_sensors_axes(drive, tmp_
         *_, (_, _, data) = (m for m in bag.messages() if m[0].topic == "/front/points")
     held = {
         "pcd": {name: pcd.numpy((name,))[:, 0] for name in pcd.fields},
-        "bag": columns_of(bytes(data)),
+        "bag": point_columns(bytes(data)),
     }
     with tarfile.open(next((tmp_path / "webdataset").rglob("*.tar"))) as tar:
         sample = {m.name.split(".")[1]: m for m in tar if m.name.startswith("front-000001")}
