@@ -337,7 +337,10 @@ HALF_ROOM_M = np.array([5.0, 4.0, 3.0])
 
 @cache
 def cloud_of_room(model, coordinates):
-    """A survey and its cloud: a sensor that crosses a room at 6 m/s, turns at 2 rad/s, nods and rolls, for 3 sweeps."""
+    """Return a survey of 3 sweeps and its cloud.
+
+    The sensor crosses a room at 6 m/s, turns at 2 rad/s, nods and rolls.
+    """
     times = np.linspace(0, 0.5, 26)
     yaw = 2 * times
     places = [6 * times - 1.5, 1.5 * np.sin(yaw), 0.2 * np.sin(9 * times)]
