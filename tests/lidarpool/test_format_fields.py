@@ -241,6 +241,28 @@ def test_pcd_and_bags_say_which_frame_their_points_have(tmp_path, compensated):
             np.testing.assert_allclose(file.numpy(("time",))[:, 0], since, atol=1e-8)
 
 
+@pytest.mark.parametrize("coordinates", ["world", "sensor"])
+def test_ply_and_parquet_say_which_frame_their_points_have(tmp_path, coordinates):
+    cloud = Drive("velodyne/vlp16").cloud(coordinates)
+    save_cloud(cloud, tmp_path / "cloud.ply", precision_m=1e-6)
+    head = (tmp_path / "cloud.ply").read_bytes().split(b"end_header")[0]
+    assert (b"comment points in the sensor's axes at the firing" in head) == (
+        coordinates == "sensor"
+    )
+    assert len(read_cloud(tmp_path / "cloud.ply")) == len(cloud)
+    save_cloud(cloud, tmp_path / "cloud.parquet")
+    metadata = pq.read_schema(tmp_path / "cloud.parquet/part-00000.parquet").metadata
+    assert metadata[b"coordinates"].decode() == coordinates
+
+
+@pytest.mark.parametrize("format_name", ["pcd", "mcap"])
+def test_compensated_files_are_said_to_lack_time(tmp_path, format_name):
+    cloud = Drive("velodyne/vlp16").cloud()
+    lost = save_cloud(cloud, tmp_path / "a", format=format_name, compensated=True)
+    assert "time" in lost
+    assert "time" not in save_cloud(cloud, tmp_path / "b", format=format_name)
+
+
 def test_a_clock_that_jumps_and_a_frozen_sensor_do_not_move_points():
     faults = [Fault("frozen", 0.12, 0.22), Fault("time_jump", 0.05, 0.26, by_s=-0.04)]
     survey = replace(Drive("velodyne/vlp16").survey, faults=faults)
