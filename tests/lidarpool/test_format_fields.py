@@ -6,6 +6,7 @@ Files are read with programs that are not of this project.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cache
 from typing import ClassVar
 
 import laspy
@@ -240,6 +241,28 @@ def test_pcd_and_bags_say_which_frame_their_points_have(tmp_path, compensated):
             np.testing.assert_allclose(file.numpy(("time",))[:, 0], since, atol=1e-8)
 
 
+@pytest.mark.parametrize("coordinates", ["world", "sensor"])
+def test_ply_and_parquet_say_which_frame_their_points_have(tmp_path, coordinates):
+    cloud = Drive("velodyne/vlp16").cloud(coordinates)
+    save_cloud(cloud, tmp_path / "cloud.ply", precision_m=1e-6)
+    head = (tmp_path / "cloud.ply").read_bytes().split(b"end_header")[0]
+    assert (b"comment points in the sensor's axes at the firing" in head) == (
+        coordinates == "sensor"
+    )
+    assert len(read_cloud(tmp_path / "cloud.ply")) == len(cloud)
+    save_cloud(cloud, tmp_path / "cloud.parquet")
+    metadata = pq.read_schema(tmp_path / "cloud.parquet/part-00000.parquet").metadata
+    assert metadata[b"coordinates"].decode() == coordinates
+
+
+@pytest.mark.parametrize("format_name", ["pcd", "mcap"])
+def test_compensated_files_are_said_to_lack_time(tmp_path, format_name):
+    cloud = Drive("velodyne/vlp16").cloud()
+    lost = save_cloud(cloud, tmp_path / "a", format=format_name, compensated=True)
+    assert "time" in lost
+    assert "time" not in save_cloud(cloud, tmp_path / "b", format=format_name)
+
+
 def test_a_clock_that_jumps_and_a_frozen_sensor_do_not_move_points():
     faults = [Fault("frozen", 0.12, 0.22), Fault("time_jump", 0.05, 0.26, by_s=-0.04)]
     survey = replace(Drive("velodyne/vlp16").survey, faults=faults)
@@ -324,6 +347,87 @@ def test_what_contradicts_a_frame_is_noted():
         assert "cloud.coordinates" in note
     with pytest.raises(LidarpoolError, match="option of pcd, mcap, rosbag2, not of kitti"):
         Format("kitti", compensated=True)
+
+
+# -- normals and origins of rays -------------------------------------------------------------------
+
+SURFACES = (
+    "normal_x", "normal_y", "normal_z", "incidence_deg", "origin_x", "origin_y", "origin_z",
+)  # fmt: skip
+HALF_ROOM_M = np.array([5.0, 4.0, 3.0])
+
+
+@cache
+def cloud_of_room(model, coordinates):
+    """Return a survey of 3 sweeps and its cloud.
+
+    The sensor crosses a room at 6 m/s, turns at 2 rad/s, nods and rolls.
+    """
+    times = np.linspace(0, 0.5, 26)
+    yaw = 2 * times
+    places = [6 * times - 1.5, 1.5 * np.sin(yaw), 0.2 * np.sin(9 * times)]
+    turns = [0.05 * np.sin(7 * times), 0.06 * np.cos(5 * times), np.sin(yaw / 2), np.cos(yaw / 2)]
+    turns = np.stack(turns, axis=1)
+    turns /= np.linalg.norm(turns, axis=1, keepdims=True)
+    sensor = load_sensor(model, min_range_m=0.1)
+    survey = Survey(
+        sensors=[Mounted(sensor, Pose((0.6, 0.2, 0.3), 30.0, 8.0), "lidar")],
+        trajectory=Track(times, np.stack(places, axis=1), turns, smooth=True), steps=108,
+        columns=(*COLUMNS, *SURFACES), precision_m=1e-6, coordinates=coordinates,
+    )  # fmt: skip
+    return survey, cloud_of(survey, room())
+
+
+def sweeps_in_file(path, format_name):
+    """Return the fields of the points of each sweep, {name: (n,)}."""
+    if format_name == "pcd":
+        files = [PointCloud.from_path(file) for file in sorted(path.iterdir())]
+        return [{name: file.numpy((name,))[:, 0] for name in file.fields} for file in files]
+    return [
+        {name: rows[name] for name in rows.dtype.names} for rows in map(rows_of, messages_of(path))
+    ]
+
+
+def vectors_of(fields, prefix=""):
+    return np.stack([fields[f"{prefix}{axis}"] for axis in "xyz"], axis=1).astype(float)
+
+
+@pytest.mark.parametrize("coordinates", ["world", "sensor"])
+@pytest.mark.parametrize("compensated", [False, True])
+@pytest.mark.parametrize("format_name", ["pcd", "mcap"])
+@pytest.mark.parametrize("model", ["velodyne/vlp16", "ouster/os1-32"])
+def test_normals_and_origins_are_in_the_axes_of_the_points(
+    tmp_path, model, format_name, compensated, coordinates
+):
+    survey, cloud = cloud_of_room(model, coordinates)
+    path = tmp_path / "out"
+    lost = save_cloud(cloud, path, format=format_name, compensated=compensated)
+    assert not {*lost} & {*SURFACES}
+    sweeps = sweeps_in_file(path, format_name)
+    assert len(sweeps) == 3
+    for sweep, fields in enumerate(sweeps):
+        points = cloud[(cloud.scan >= 36 * sweep) & (cloud.scan < 36 * sweep + 36)]
+        place, origin, normal = (vectors_of(fields, of) for of in ("", "origin_", "normal_"))
+        ray = place - origin
+        np.testing.assert_allclose(np.linalg.norm(ray, axis=1), points.range, atol=5e-5)
+        cosine = -(ray * normal).sum(axis=1) / points.range
+        np.testing.assert_allclose(cosine, np.cos(np.radians(points.incidence_deg)), atol=5e-5)
+        for row in range(0, len(points), 211):
+            fired = survey.path.pose(0, float(points.time[row])).then(survey.carried[0].mount)
+            pose = survey.pose(36 * sweep) if compensated else fired
+            # In the world normals are those of the sides of the room, on which the points lie.
+            upright = pose.rotation @ normal[row]
+            side = np.rint(upright)
+            np.testing.assert_allclose(upright, side, atol=2e-5)
+            on_side = pose.rotation @ place[row] + pose.position
+            assert abs(on_side @ side + HALF_ROOM_M @ np.abs(side)) < 1e-4
+            # Rays begin within the sensor: Ouster's 16 mm from the axis of its head.
+            began = pose.rotation @ origin[row] + pose.position
+            lever = (began - fired.position) @ fired.rotation
+            beams = survey.carried[0].sensor.beams
+            assert (
+                abs(np.hypot(*lever[:2]) - np.hypot(*beams.origin[points.channel[row], :2])) < 5e-5
+            )
 
 
 # -- LAS ---------------------------------------------------------------------------------------

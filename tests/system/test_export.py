@@ -55,6 +55,12 @@ def test_a_run_writes_what_its_scenario_asks_for_and_a_result_is_exported(
     )
     assert refused.code == 2 and "layout autoware needs return_number, returns" in refused.err
     assert not (tmp_path / "no").exists()
+    mixed = ("export", out, "-f", "pcd", "-f", "kitti", "--compensated", "--out", tmp_path / "mix")
+    mixed = lidarpool(*mixed)
+    assert mixed.code == 0 and "note: pcd does not hold time" in mixed.err
+    assert b"start of the sweep" in (tmp_path / "mix/pcd/000000.pcd").read_bytes()[:100]
+    refused = lidarpool("export", out, "-f", "kitti", "--compensated", "--out", tmp_path / "no")
+    assert refused.code == 2 and "compensated is an option of pcd" in refused.err
     (out / ".lidarpool-writing-01234567").mkdir()  # of an export that was killed
     refused = lidarpool("export", out, "-f", "pcd", "-f", "laz")
     assert refused.code == 2 and "cloud.laz exists" in refused.err

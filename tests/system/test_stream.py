@@ -7,6 +7,7 @@ import pickle
 import types
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from typing import Any
 
 import cloudpickle
@@ -85,6 +86,27 @@ def test_the_sweeps_are_those_of_the_data_set(cluster_client, client, tmp_path, 
         for one, two in zip(*items, strict=True):
             assert {"points", "intensity", "class", "boxes", "pose"} <= one.keys() <= two.keys()
             assert all(np.array_equal(one[name], two[name]) for name in one)
+
+
+def test_normals_and_origins_are_in_the_axes_of_the_points(client):
+    normal_names = ["normal_x", "normal_y", "normal_z"]
+    origin_names = ["origin_x", "origin_y", "origin_z"]
+
+    def with_vectors(number: int, rng: np.random.Generator) -> Job:
+        job = make(number, rng)
+        columns = ["range", "incidence_deg", *normal_names, *origin_names]
+        return replace(
+            job, survey=replace(job.survey, noise=Noise(), columns=columns, precision_m=1e-4)
+        )
+
+    for sweep in Campaign(with_vectors, 2, seed=4).stream(client):
+        normal = np.stack([sweep.columns[name] for name in normal_names], axis=1)
+        origin = np.stack([sweep.columns[name] for name in origin_names], axis=1)
+        ray = sweep.points - origin
+        np.testing.assert_allclose(np.linalg.norm(ray, axis=1), sweep.columns["range"], atol=2e-3)
+        cosine = -(ray * normal).sum(axis=1) / sweep.columns["range"]
+        expected = np.cos(np.radians(sweep.columns["incidence_deg"]))
+        np.testing.assert_allclose(cosine, expected, atol=2e-3)
 
 
 def test_sweeps_of_a_killed_worker_are_cast_again(client, sabotage, expected):

@@ -13,7 +13,7 @@ import click
 from ..base.errors import LidarpoolError
 from ..base.storage import Storage
 from ..base.vocabulary import PICTURES, UNITS_M
-from ..export.format_table import EXPORTS, LAYOUTS
+from ..export.format_table import EXPORTS, FORMATS, LAYOUTS
 from . import shared_options as options
 
 
@@ -140,7 +140,12 @@ def export(
                 )
         sweeps = Sweeps.load(made / SWEEPS_FILE)
         cloud = CloudFile(made / "cloud.ply")
-        wanted = [Format(name, layout, compensated) for name in dict.fromkeys(formats)]
+        # As the layout, for the formats that have the option; refused if none has.
+        choosing = {name for name in formats if FORMATS[name].raw_or_compensated} or {*formats}
+        wanted = [
+            Format(name, layout, compensated and name in choosing)
+            for name in dict.fromkeys(formats)
+        ]
         written: list[str] = []
         with result_folder(place) as folder:
             for one in wanted:  # before any is written, which may take long

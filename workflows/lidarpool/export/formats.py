@@ -89,7 +89,9 @@ class Format:
         more = self._laid_out + (self.row.named if sweeps.classes else ())
         if self.row.module == "ros" and has_laser_scans(sweeps):
             more += LASER_SCAN_COLUMNS
-        return [] if held is None else [name for name in there if name not in held + more]
+        if held is None:
+            return [name for name in there if name == "time" and self.compensated]
+        return [name for name in there if name not in held + more]
 
     def notes(self, cloud: CloudLike, sweeps: Sweeps) -> list[str]:
         """Return a note for the user on the cloud in this format, or none."""

@@ -19,7 +19,7 @@ from ..columns.ply_format import AXES, as_held, header, layout, mapped_rows, row
 from ..columns.table import AXES as POSITION
 from ..columns.table import NORMAL, TABLE, check_names
 from . import reading
-from .sweeps import SWEEPS_FILE, Sweeps
+from .sweeps import AS_FIRED, SWEEPS_FILE, Sweeps
 
 # Positions are stored in single precision if the error is below this part of the precision.
 _ROUNDING_SHARE = 0.05
@@ -33,12 +33,13 @@ def write_ply(path: Path, cloud: CloudLike, sweeps: Sweeps) -> None:
     bytes are the same as if Open3D wrote all points at once, which would need memory for all.
     float64 positions are stored in single precision if the error is below a twentieth of the
     precision of the sweeps, else in double. Names of classes and materials are comments: `class 40
-    road`, `material 0 Brick`.
+    road`, `material 0 Brick`. A comment says if points are not in the axes of the world.
     """
     check_names((*POSITION, *cloud.table))
     real = real_type(cloud.bounds, sweeps.precision_m)
     row = row_type(real, cloud.table)
-    comments = "".join(f"comment class {n} {name}\n" for n, name in sweeps.classes.items())
+    comments = f"comment {AS_FIRED}\n" if sweeps.coordinates == "sensor" else ""
+    comments += "".join(f"comment class {n} {name}\n" for n, name in sweeps.classes.items())
     if any(column.name == "material" for column in cloud.table):
         names = enumerate(map(_comment, sweeps.materials))
         comments += "".join(f"comment material {n} {name}\n" for n, name in names)

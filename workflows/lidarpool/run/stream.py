@@ -136,7 +136,8 @@ class _Streamed:
         cloud = Cloud.joined([part.cloud(table, survey.precision_m, origin) for part in parts])
         self.points += len(cloud)
         places = sweeps.in_sensor(number, cloud.positions).astype(np.float32)
-        columns = {column.name: np.array(cloud[column.name]) for column in table}
+        in_sensor = sweeps.columns_in_sensor(number, cloud)
+        columns = {column.name: np.array(in_sensor[column.name]) for column in table}
         boxes = Boxes.of(sweeps, number, cloud) if sweeps.actors else None
         boxes = boxes and boxes.inward(sweeps.pose, number)
         row = JobRow(job.number, job.name, job.split, job.values)
