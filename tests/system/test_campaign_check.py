@@ -63,7 +63,8 @@ def test_one_job_is_shown_like_a_scenario(campaign, lidarpool):
 def test_as_json(campaign, lidarpool):
     found = json.loads(lidarpool("check", campaign, "--json").out)
     assert found["can_run"] and found["count"] == 9
-    assert found["keep"] == {"format": "mcap", "layout": "ouster"}
+    keep = {"format": "mcap", "layout": "ouster", "compensated": False}
+    assert found["keep"] == keep
     assert [job["number"] for job in found["jobs"]] == [0, 2, 4, 6, 8]
     one = json.loads(lidarpool("check", campaign, "--json", "--job", 4).out)
     assert one["job"] == found["jobs"][2]

@@ -1,6 +1,5 @@
 """Campaigns: many jobs into one data set, whatever happens to workers, drivers and single jobs."""
 
-import json
 import re
 import shutil
 import signal
@@ -35,6 +34,7 @@ from lidarpool import (
     sweeps,
 )
 from lidarpool.base.errors import explained
+from lidarpool.base.sealed import sealed, unsealed
 from lidarpool.base.storage import Storage
 from lidarpool.datasets.dataset import DataSet
 from lidarpool.datasets.job_table import JobRow
@@ -256,7 +256,9 @@ def test_a_job_that_cannot_be_written_fails_alone_and_leaves_nothing(client, tmp
     assert [row.name for row in run.failed] == ["0001"] and run.done == 2
     assert "cannot be written" in run.failed[0].error
     names = {Path(name).stem for name in bytes_of(tmp_path / "ds") if name.startswith(".jobs")}
-    assert names == {"0000", "0002"}
+    assert names == {"0000", "0001", "0002"}
+    manifest = (tmp_path / "ds" / ".jobs" / "0001.json").read_text()
+    assert '"files": {}' in manifest and "cannot be written" in manifest
     assert not (tmp_path / "ds" / "jobs" / "0001").exists()
 
 
@@ -312,6 +314,7 @@ def test_failed_jobs_are_done_again_and_no_others(client, tmp_path):
     assert "new model, 10 Hz; old model, 10 Hz" in (tmp_path / "ds" / "README.md").read_text()
     assert set(made) <= {0, 2}  # the first says which values there are
     after = bytes_of(tmp_path / "ds")
+    before.pop(".jobs/0002.json")  # said that the job had failed
     assert before.items() <= after.items() and len(after) > len(before)
     assert not (tmp_path / "ds" / "run").exists()
     assert campaign.run(tmp_path / "ds", client=client, retry_failed=True).done == 4
@@ -453,9 +456,9 @@ def test_other_content_or_software_is_refused(files, finished, lidarpool, slots)
         assert other.code == 2 and "is of another campaign: its seed differs" in other.err
     (files / "c.yaml").write_text(CAMPAIGN)
     record = files / "ds" / "campaign.json"
-    made = json.loads(record.read_text())
+    made = unsealed(record.read_bytes())
     made["casting"]["numpy"] = "1.0"
-    record.write_text(json.dumps(made))
+    record.write_bytes(sealed(made))
     old = lidarpool(*run, "--job", 1)
     assert old.code == 2 and "was made with numpy 1.0, " in old.err and old.err.count("\n") == 1
 

@@ -57,7 +57,7 @@ class Pieces(pieces.Pieces):
         folder, name = self.sequences[sweeps.sensor[number]], f"{sweeps.numbers[number]:06}"
         rows = np.empty((len(points), 4), "<f4")
         rows[:, :3] = sweeps.compensated(number, points)
-        rows[:, 3] = points["reflectivity"] / np.float32(255)
+        rows[:, 3] = intensity_of(points)
         labels = (points["object"].astype("<u4") + 1) << 16 | points["class"]
         files: dict[str, Data] = {
             f"{folder}/velodyne/{name}.bin": as_data(rows),
@@ -89,6 +89,11 @@ class Pieces(pieces.Pieces):
         if sweeps.classes and self.entry is None:  # else all jobs share a file
             files[NAMES_FILE] = labels_file(sweeps.classes)
         return files
+
+
+def intensity_of(points: Cloud) -> Floats32:
+    """Return what KITTI calls intensity (n,): reflectivity from 0 to 1, whatever the range."""
+    return np.asarray(points["reflectivity"] / np.float32(255), np.float32)
 
 
 class Reader(reading.Reader):

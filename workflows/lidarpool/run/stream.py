@@ -30,6 +30,7 @@ from ..columns.waveforms import WAVEFORM
 from ..datasets.job_table import JobRow
 from ..datasets.sweep_data import Sweep
 from ..export.boxes import Boxes
+from ..export.kitti import intensity_of
 from ..export.sweeps import Sweeps
 from ..pipeline.casting_workers import CastingWorkers
 from ..pipeline.database import JobParts
@@ -113,6 +114,7 @@ class _Streamed:
     job: Job
     sweeps: Sweeps
     state: JobState
+    format: str  # of the data set that a run of the campaign writes
     begun: int = 0  # sweeps that were given to the dispatcher
     points: int = 0  # of the sweeps that were taken
     parts: dict[int, PartColumns] = field(default_factory=dict)  # {first scan: what was cast}
@@ -138,6 +140,8 @@ class _Streamed:
         places = sweeps.in_sensor(number, cloud.positions).astype(np.float32)
         in_sensor = sweeps.columns_in_sensor(number, cloud)
         columns = {column.name: np.array(in_sensor[column.name]) for column in table}
+        if self.format == "kitti":  # as its files have it
+            columns["intensity"] = intensity_of(cloud)
         boxes = Boxes.of(sweeps, number, cloud) if sweeps.actors else None
         boxes = boxes and boxes.inward(sweeps.pose, number)
         row = JobRow(job.number, job.name, job.split, job.values)
@@ -251,7 +255,8 @@ class _Casting:
         run, count = self._casting.run, survey.scan_count
         named = (run, number, survey, parts, packed, scene, fit, count)
         assert sweeps is not None, "of a campaign"
-        self._next = _Streamed(job, sweeps, JobState(*named, None, None, None))
+        state = JobState(*named, None, None, None)
+        self._next = _Streamed(job, sweeps, state, self._stream.campaign.keep.format)
         self._jobs[number] = self._next
         return True
 
