@@ -9,7 +9,7 @@ from functools import cached_property
 import numpy as np
 import yaml
 
-from ..base.arrays import Floats
+from ..base.arrays import Floats, Floats32
 from ..base.errors import LidarpoolError
 from ..columns.cloud import Cloud, CloudLike
 from ..sensor.trajectory import matrices
