@@ -163,6 +163,7 @@ def test_the_first_entry_that_fits_a_face_counts(house):
         ([Material("Ground", material="Glass"), Material("*")], "no face of 'Ground' has the mat"),
         ([Material(material="Glass")], r"no entry names the object 'House', material 'Brick' and"),
         ([Material("Hause"), Material("*")], "'Hause', but no object has that name.*'House'"),
+        ([Material("Q"), Material("*")], r"no object has that name\. There are House, Ground\.$"),
     ],
 )
 def test_entries_that_fit_nothing_are_refused(house, entries, message):

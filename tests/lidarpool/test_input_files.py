@@ -112,7 +112,20 @@ def test_pointers_of_git_lfs_are_no_content(tmp_path, name):
     assert "git lfs pull" in refused(READERS[name], path)
 
 
-@pytest.mark.parametrize("name", [name for name in READERS if not name.startswith("recording")])
+def test_a_note_names_materials_that_are_a_pointer_of_git_lfs(tmp_path):
+    (tmp_path / "a.mtl").write_text(
+        f"version https://git-lfs.github.com/spec/v1\noid sha256:{64 * '0'}\nsize 123456\n"
+    )
+    path = tmp_path / "a.obj"
+    path.write_text("mtllib a.mtl\nv 0 0 0\nv 1 0 0\nv 0 1 0\nusemtl Glass\nf 1 2 3\n")
+    notes = []
+    load_meshes(path, tell=notes.append)
+    assert any("a.mtl (it is a Git LFS pointer, get the file itself" in note for note in notes)
+
+
+@pytest.mark.parametrize(
+    "name", [name for name in READERS if not name.startswith(("recording", "trajectory"))]
+)  # those may be folders
 def test_folders_are_no_files(tmp_path, name):
     path = tmp_path / name
     path.mkdir()

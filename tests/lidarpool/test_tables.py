@@ -70,7 +70,7 @@ def test_exact_names_are_not_spelled_otherwise():
         ),
         ("", "it has no header"),
         ("time_s,range\n", "it has no rows of numbers"),
-        ("time,range\n0,1\n", "'time' has no unit: call it time_s, in seconds, or give columns"),
+        ("time,range\n0,1\n", "'time' has no unit: call it time_s, in seconds; time_ms"),
         ("time_s,range [ft]\n0,1\n", "'range \\[ft\\]' has the unit 'ft': give it in m or cm"),
         ("time_s,range,range\n0,1,1\n", "has the column 'range' twice"),
         ("time_s,range,distance\n0,1,1\n", "'range' and 'distance' are both range_m"),

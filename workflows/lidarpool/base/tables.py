@@ -164,12 +164,14 @@ def find_header(
     """
     body = next((i for i, line in enumerate(lines) if not _is_remark(line)), len(lines))
     if body < len(lines) and not _all_numbers(lines[body]):
-        separator = _separator_of(lines[body])
-        return Header(_cells(lines[body], separator), separator, body + 1, False)
+        names = lines[body].lstrip("% ")
+        separator = _separator_of(names)
+        return Header(_cells(names, separator), separator, body + 1, False)
     for line in reversed(lines[:body]):
         names = _HEADER_MARK.sub("", line).strip()
+        # A remark may separate names otherwise than the rows separate numbers.
+        cells = _cells(names, _separator_of(names))
         separator = _separator_of(lines[body]) if body < len(lines) else _separator_of(names)
-        cells = _cells(names, separator)
         count = len(_cells(lines[body], separator)) if body < len(lines) else len(cells)
         if cells and len(cells) == count and sum(map(known, cells)) >= min(4, count / 2):
             return Header(cells, separator, body, True)
@@ -235,7 +237,8 @@ def read_table(
     required
         Returns the names of the quantities that a table with some columns must have.
     columns
-        {name of a quantity, with its unit: name in the file}, for other spellings.
+        {name of a quantity, with its unit: name in the file}, for other spellings; None where users
+        cannot give it, so that messages do not name it.
     ignore
         Names of columns to leave out, with * and ?.
     formats
@@ -269,7 +272,7 @@ def read_table(
         example = ",".join(one.name for one in quantities[:4])
         raise ValueError(f"it has no header: name its columns in its first line, as in {example}")
     reader = _ColumnReader(header, quantities, spellings, exact)
-    reader.choose(columns or {})
+    reader.choose(columns)
     reader.leave_out(ignore)
     reader.assign(formats, unused, refused or {}, bare or {})
     names = {name: number for name, (number, _) in reader.assigned.items()}
@@ -295,6 +298,7 @@ class _ColumnReader:
         # {name of a quantity: index of its column, and the unit; None if no header states it}
         self.assigned: dict[str, tuple[int, str | None]] = {}
         self.left_out: set[int] = set()  # indices of columns
+        self.can_choose = False  # whether users can name columns, which messages advise then
 
     def quantity_of(self, cell: str) -> tuple[Quantity, str | None] | None:
         """Return the quantity and the stated unit of a name, or None if the name is not known."""
@@ -304,9 +308,10 @@ class _ColumnReader:
         quantity = self.spellings.get(name.words) or self.exact.get(name.stem.lower())
         return None if quantity is None else (quantity, name.unit)
 
-    def choose(self, columns: Mapping[str, str]) -> None:
-        """Assign the columns that the user names."""
-        for ours, theirs in columns.items():
+    def choose(self, columns: Mapping[str, str] | None) -> None:
+        """Assign the columns that the user names; None if users cannot name any."""
+        self.can_choose = columns is not None
+        for ours, theirs in (columns or {}).items():
             known = self.quantity_of(ours)
             if known is None:
                 raise ValueError(f"columns names {ours!r}; possible names are {self.possible}")
@@ -357,10 +362,11 @@ class _ColumnReader:
                 unknown.append(cell)
         if unknown:
             columns = "columns are" if len(unknown) > 1 else "column is"
+            it = "them" if len(unknown) > 1 else "it"
             hint = did_you_mean(unknown[0], [one.name for one in self.quantities])
             raise ValueError(
                 f"its {columns} not known: {_listed(unknown)}.{hint} Known are {self.possible}: "
-                f"rename it, or give ignore: [{unknown[0]}] to leave it out"
+                f"rename {it}, or give ignore: [{_listed(unknown)}] to leave {it} out"
             )
 
     def _unit(
@@ -377,9 +383,10 @@ class _ColumnReader:
         if quantity.bare is None:
             first, *others = quantity.units
             stem = quantity.name.removesuffix(f"_{first}")
+            choice = f", or give columns: {{{quantity.name}: {cell}}}" * self.can_choose
             raise ValueError(
                 f"its column {printable(cell)!r} has no unit: call it {quantity.name}, in "
-                f"{_UNIT_WORDS[first]}, or give columns: {{{quantity.name}: {cell}}}; "
+                f"{_UNIT_WORDS[first]}{choice}; "
                 f"{' or '.join(f'{stem}_{other}' for other in others)} is read as well"
             )
         return None

@@ -423,9 +423,10 @@ def _matching_rows(pattern: str, names: Sequence[str], known: Mapping[str, int])
         return np.array([known[pattern]])
     rows = rows_named(pattern, names)
     if not len(rows):
+        listed = f" There are {', '.join(names[:5])}{', …' * (len(names) > 5)}."
         raise LidarpoolError(
             f"materials names {pattern!r}, but no object has that name."
-            + (did_you_mean(pattern, names) or f" There are {', '.join(names[:5])}, …")
+            + (did_you_mean(pattern, names) or listed)
         )
     return rows
 

@@ -13,7 +13,7 @@ import numpy as np
 
 from ...base.allowance import Allowance
 from ...base.arrays import Bytes, Floats, Ints
-from ...base.input_files import read_input
+from ...base.input_files import InputFileError, read_input
 from ...base.words import as_text
 from ..colours import Colours, as_bytes
 from ..masks import HALF, MaskNotes, Texture, Wrap, read_colours, read_opacity, remembered
@@ -141,6 +141,8 @@ class MtlMaterials:
                     read.add(path)
                     try:
                         yield self._content(path)
+                    except InputFileError as error:
+                        self.notes.gone.append(f"{name} ({error.strerror})")
                     except OSError:
                         self.notes.gone.append(name)
 
