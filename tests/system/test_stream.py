@@ -75,23 +75,17 @@ def test_the_sweeps_are_those_of_the_data_set(cluster_client, client, tmp_path, 
     fresh = list(varied.stream(client))
     assert len(fresh) == len(saved) == 3 * SWEEPS and sum(map(len, fresh)) > 1000
     assert any(sweep.boxes.points.any() for sweep in fresh)
-    # The intensity of KITTI is reflectivity / 255, which a streamed sweep has as a column.
-    differing = {"intensity"} if keep == "kitti" else set()
     for one, two in zip(saved, fresh, strict=True):
-        assert same(one, two, {*one.columns} - differing) and {*one.columns} <= {*two.columns}
-        if differing:
-            reflectivity = two.columns["reflectivity"] / np.float32(255)
-            np.testing.assert_array_equal(one.columns["intensity"], reflectivity)
+        assert same(one, two, {*one.columns}) and {*one.columns} <= {*two.columns}
     chosen = list(varied.stream(cluster_client, split="test", ahead=1))
     saved = list(lp.sweeps(tmp_path / "ds", split="test"))
     assert [one.job for one in chosen] == [one.job for one in saved] != []
-    pairs = zip(saved, chosen, strict=True)
-    assert all(same(one, two, {*one.columns} - differing) for one, two in pairs)
+    assert all(same(one, two, {*one.columns}) for one, two in zip(saved, chosen, strict=True))
     for _ in range(2):  # epochs of a network
         items = lp.sweeps(tmp_path / "ds").torch(), varied.stream(client).torch()
         for one, two in zip(*items, strict=True):
             assert {"points", "intensity", "class", "boxes", "pose"} <= one.keys() <= two.keys()
-            assert all(np.array_equal(one[name], two[name]) for name in one.keys() - differing)
+            assert all(np.array_equal(one[name], two[name]) for name in one)
 
 
 def test_normals_and_origins_are_in_the_axes_of_the_points(client):
