@@ -319,12 +319,12 @@ def test_classes_and_reflectances_are_those_of_the_faces(imported):
     house = (
         "mtllib house.mtl\no House\n"
         + "".join(f"v {x} {y} 0\n" for x in range(4) for y in (0, 1))
-        + "usemtl wall\nf 1 3 4 2\nusemtl roof[1]\nf 3 5 6 4\nusemtl other\nf 5 7 8 6\n"
+        + "usemtl wall\nf 1 3 4 2\nusemtl red roof[1]\nf 3 5 6 4\nusemtl other\nf 5 7 8 6\n"
         + "o Shed\nusemtl wall\nf 1 5 6\n"
     )
     library = (
         "newmtl wall\nhelios_reflectance 0.2\nhelios_classification 6\n"
-        "newmtl roof[1]\nhelios_reflectance 60\nhelios_classification 7\nnewmtl other\n"
+        "newmtl red roof[1]\nhelios_reflectance 60\nhelios_classification 7\nnewmtl other\n"
     )
     part = """<part><filter type="objloader">
   <param type="string" key="filepath" value="parts/house.obj"/></filter></part></scene>"""
@@ -343,7 +343,7 @@ def test_classes_and_reflectances_are_those_of_the_faces(imported):
     assert found == {
         ("ground", "soil"): (2, 0.3),
         ("House", "wall"): (6, 0.2),
-        ("House", "roof[1]"): (7, 0.6),
+        ("House", "red roof[1]"): (7, 0.6),
         ("House", "other"): (0, 0.5),
         ("Shed", "wall"): (6, 0.2),
     }

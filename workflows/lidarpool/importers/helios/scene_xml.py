@@ -51,16 +51,18 @@ class HeliosPart:
     def materials(self) -> dict[str, dict[str, str]]:
         """Values that HELIOS++ reads of the materials of its faces, {name: values}."""
         text = _text(self.file) if self.file.suffix.lower() == ".obj" else ""
-        used = {self.material, *re.findall(r"^\s*usemtl\s+(\S+)", text, re.MULTILINE)}
+        used = {self.material, *re.findall(r"^\s*usemtl\s+(.+?)\s*$", text, re.MULTILINE)}
         found: dict[str, dict[str, str]] = {}
         named = re.findall(r"^\s*mtllib\s+(.+?)\s*$", text, re.MULTILINE)
         libraries = [self.file.parent / name for name in named]
         libraries += [self.library] if self.library else []
         for library in libraries:
             values: dict[str, str] = {}
-            for words in (line.split() for line in _text(library).splitlines()):
+            for line in _text(library).splitlines():
+                words = line.split()
                 if words[:1] == ["newmtl"] and len(words) > 1:
-                    values = found.setdefault(words[1], {})
+                    name = line.split(maxsplit=1)[1].strip()  # which may have spaces
+                    values = found.setdefault(name, {})
                 elif len(words) > 1 and words[0].startswith("helios_"):
                     values[words[0].removeprefix("helios_")] = words[1]
         return {name: values for name, values in found.items() if name in used}

@@ -43,7 +43,8 @@ _EPSG_UNITS = {  # {EPSG code: (name, metres)}
 # Projected systems that are in metres by definition: UTM zones of WGS 84, ETRS89 and NAD83.
 _METRIC_EPSG = (range(32601, 32661), range(32701, 32761), range(25828, 25839), range(26901, 26924))
 _DATUMS = range(5001, 5300)  # in a vertical system's key by GeoTIFF 1.0: datums, without units
-_OVERRIDE = "give the unit (--unit, in Python unit=)"
+# Commands and functions that read a cloud have unit; compare has two clouds.
+_OVERRIDE = "give its unit (--unit, in Python unit=; of compare --unit-a and unit_a=, or b)"
 _PROJECT = (
     "project it to metres first (pdal translate IN OUT reprojection "
     "--filters.reprojection.out_srs=EPSG:CODE)"
