@@ -56,7 +56,8 @@ def test_files_of_a_data_set_are_read_right_or_refused(dataset, name):
         if file.suffix != ".parquet":
             attack(whole, reader, file, DAMAGES, chance, outcome, name)
     assert not outcome.faults, "\n".join(outcome.faults)
-    assert outcome.ends["refused"] and outcome.ends["right"]
+    assert outcome.ends["refused"]
+    assert outcome.ends["right"] or name == "verify"  # which compares every byte
 
 
 def test_a_damaged_database_is_refused_or_the_same(tmp_path):

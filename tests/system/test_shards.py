@@ -289,7 +289,8 @@ def test_a_manifest_of_another_job_is_refused(parts, tmp_path):
 def test_a_damaged_record_of_a_campaign_is_named_and_made_again(parts, tmp_path, slots):
     path = parts[1] / "campaign.json"
     whole = path.read_bytes()
-    for data in (whole[:-1], whole[:90] + b"x" + whole[91:], b"[]", b""):
+    other_type = sealed(unsealed(whole) | {"notes": 5})
+    for data in (whole[:-1], whole[:90] + b"x" + whole[91:], b"[]", b"", other_type):
         path.write_bytes(data)
         with pytest.raises(
             LidarpoolError, match=r"campaign\.json is damaged or edited \(its .*\):"

@@ -412,8 +412,8 @@ def load_sensor(
         mirror = described.turning_mirror
         return PrismSensor(beams, head, prisms=described.prisms, mirror=mirror, **common)
     if described.mirror is not None:
-        options = described.mirror.model_dump()
-        head = Mirror(firings, step_deg, rate, head.clockwise, head.zero_deg, **options)
+        mirror_fields = described.mirror.model_dump()
+        head = Mirror(firings, step_deg, rate, head.clockwise, head.zero_deg, **mirror_fields)
     else:
         beams = beams.turning(head.radians_per_ns)
     kind = LineSensor if described.axis == "x" else Sensor
