@@ -2,7 +2,19 @@
 
 import time
 
+import pytest
+from distributed import Client
+from tests.clusters import cluster_of
+
 from lidarpool.pipeline.placement import placement_violations, recorded
+
+
+@pytest.fixture
+def client():
+    """Client of a cluster of threads: a worker of A, one of B, and a plain one."""
+    workers = {"A-0": {"resources": {"A": 2}}, "B-0": {"resources": {"B": 1}}, "plain": {}}
+    with cluster_of(workers, {"protocol": "inproc://"}) as cluster, Client(cluster) as client:
+        yield client
 
 
 def twice(x, *, plus=0):

@@ -34,7 +34,7 @@ def readable(signature: inspect.Signature) -> inspect.Signature:
 
     Examples
     --------
-    >>> def scan(count: "Annotated[int, Field(ge=1)]", name: "str | None" = None): ...
+    >>> def scan(count: Annotated[int, Field(ge=1)], name: str | None = None): ...
     >>> readable(inspect.signature(scan))
     <Signature (count: int, name: str | None = None)>
     """
