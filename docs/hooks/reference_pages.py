@@ -35,6 +35,7 @@ _SECTIONS = {
     "mount": "MountSection",
     "actors": "ActorSection",
     "actors: animation": "AnimationSection",
+    "actors: joints": "JointTable",
     "traffic": "TrafficSection",
     "traffic: vehicles": "VehicleSection",
     "materials": "Material",
