@@ -1,8 +1,8 @@
 """The worker of a task, chosen in a time that does not grow with the cluster.
 
 For a task with a resource, and for a task that a fence keeps out of a partition, Dask compares all
-workers that may take it: 1.3 ms with 2,000 workers. Here the scheduler compares a few workers of
-the group that may take the task:
+workers that may take it, which takes the scheduler some microseconds for each worker
+(`benchmarks.placing`). Here it compares a few workers of the group that may take the task:
 
 - workers that hold inputs of the task;
 - else workers that have free slots, in the order in which they became free;
