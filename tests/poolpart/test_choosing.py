@@ -1,6 +1,7 @@
 """Workers of large groups are chosen among a few, as evenly as Dask chooses among all."""
 
 import asyncio
+import time
 from collections import Counter
 
 import dask
@@ -38,10 +39,28 @@ def wait_here(event, *_):
     return here()
 
 
+def open_gate(client, gate, futures):
+    """Let the tasks of ``futures`` end once each has a worker, so that none finds one idle again."""
+    keys = {future.key for future in futures}
+    deadline = time.monotonic() + LONG_S
+    while count_placed(client, keys) < len(keys):
+        assert time.monotonic() < deadline
+        time.sleep(0.01)
+    Event(gate, client).set()
+
+
+def count_placed(client, keys):
+    def count(dask_scheduler):
+        tasks = dask_scheduler.tasks
+        return sum(key in tasks and tasks[key].processing_on is not None for key in keys)
+
+    return client.run_on_scheduler(count)
+
+
 def test_each_worker_of_a_partition_gets_as_many_tasks(client, parts):
     gate = f"gate-{client.id}"
     futures = [parts["A"].submit(wait_here, gate) for _ in range(20)]
-    Event(gate, client).set()
+    open_gate(client, gate, futures)
     members = {worker.name for worker in parts["A"].workers}
     assert gather_places(client, futures) == dict.fromkeys(members, 4)
 
@@ -51,7 +70,7 @@ def test_tasks_of_others_stay_outside_and_are_spread(client, parts):
     with Client(client.cluster) as stranger:
         # Other keys: Dask would queue the tasks of a large group.
         futures = [stranger.submit(wait_here, gate, n, key=f"{n}-work") for n in range(20)]
-        Event(gate, client).set()
+        open_gate(client, gate, futures)
         outside = {worker.name for worker in parts["B"].workers}
         assert gather_places(stranger, futures) == dict.fromkeys(outside, 4)
 
@@ -61,7 +80,7 @@ def test_a_worker_that_is_free_is_chosen_before_busy_workers(client, parts):
     busy = [parts["A"].submit(wait_here, gate) for _ in range(4)]
     for _ in range(8):
         assert parts["A"].submit(here).result(LONG_S)
-    Event(gate, client).set()
+    open_gate(client, gate, busy)
     client.gather(busy)
 
 
@@ -89,7 +108,7 @@ def test_workers_that_join_leave_and_move_are_counted(client, parts):
     parts["A"].grow(2, source="B")
     gate = f"gate-{client.id}"
     futures = [parts["A"].submit(wait_here, gate) for _ in range(14)]
-    Event(gate, client).set()
+    open_gate(client, gate, futures)
     members = {worker.name for worker in parts["A"].workers}
     places = gather_places(client, futures)
     assert len(members) == 7

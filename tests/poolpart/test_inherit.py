@@ -91,15 +91,16 @@ def ask_foreman(foreman):
 
 
 def test_what_an_actor_submits_belongs_to_the_partition_of_the_actor(client):
-    foreman = Partition("A", client).submit(Foreman, actor=True).result(LONG_S)
+    future = Partition("A", client).submit(Foreman, actor=True)
+    foreman = future.result(LONG_S)  # an actor may end with its future
     assert foreman.places(6).result(LONG_S) == ["A-0"] * 6
     # A task in the only slot that waits for the actor lends the slot to what the actor submits.
     assert Partition("A", client).submit(ask_foreman, foreman).result(LONG_S) == ["A-0"] * 6
     # Two actors of one key prefix in different partitions: which of them submits is not known.
-    other = Partition("B", client).submit(Foreman, actor=True).result(LONG_S)
-    assert len(set(other.places(12).result(LONG_S))) > 1
-    named_actor = Partition("B", client).submit(Foreman, actor=True, key="of-b").result(LONG_S)
-    assert named_actor.places(6).result(LONG_S) == ["B-0"] * 6
+    other = Partition("B", client).submit(Foreman, actor=True)
+    assert len(set(other.result(LONG_S).places(12).result(LONG_S))) > 1
+    of_b = Partition("B", client).submit(Foreman, actor=True, key="of-b")
+    assert of_b.result(LONG_S).places(6).result(LONG_S) == ["B-0"] * 6
 
 
 async def coroutine(number=0):
