@@ -1,4 +1,4 @@
-"""Sub-rays are made while they are cast: all backends cast those that `Pattern.rays` returns."""
+"""Sub-rays are made while they are cast: all backends cast those that `pattern_rays` returns."""
 
 import numpy as np
 import pytest
@@ -12,7 +12,7 @@ from raybeam import (
     check_scan,
     hits_on,
 )
-from raybeam.pattern import plain_rays
+from raybeam.pattern_rays import plain_rays
 from raybeam.poses import check_poses
 
 RINGS, FIRINGS = 7, 45
