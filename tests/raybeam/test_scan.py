@@ -308,4 +308,4 @@ def test_pattern_refused():
 )
 def test_rays_refused(change, error, words):
     with pytest.raises(error, match=words):
-        Pattern(np.eye(3)).rays(**{"numbers": [0, 1], "positions": [0, 0, 0], **change})
+        pattern_rays(Pattern(np.eye(3)), **{"numbers": [0, 1], "positions": [0, 0, 0], **change})
