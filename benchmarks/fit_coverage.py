@@ -18,9 +18,9 @@ import numpy as np
 from lidarpool import LidarpoolError, Noise, Scanner, Scene, Sensor
 from lidarpool.compare.fit import fit
 from lidarpool.compare.recordings import Recording
-from lidarpool.scene.generated.city import city
-from lidarpool.scene.generated.plants import all_trees, placed
-from lidarpool.scene.scene_mesh import SceneMesh
+from lidarsim.scene.generated.city import city
+from lidarsim.scene.generated.plants import all_trees, placed
+from lidarsim.scene.scene_mesh import SceneMesh
 
 SWEEPS, COLUMNS, LAYERS, FARTHEST_M = 12, 360, 16, 120.0
 PLACES = ("room", "street", "hall", "forest")

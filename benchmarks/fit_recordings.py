@@ -20,7 +20,7 @@ from matplotlib.figure import Figure
 from lidarpool import LidarpoolError, Noise, fit
 from lidarpool.compare.fit import Repeats, smooth_rays, surfaces
 from lidarpool.compare.recordings import Recording, open_recording
-from lidarpool.sensor.models import read_model
+from lidarsim.sensor.models import read_model
 
 COLOURS = {"recorded": "#1c2430", "data sheet": "#ee7733", "fitted": "#4477aa"}
 

@@ -32,7 +32,7 @@ _ELSEWHERE = {
     "CONTRIBUTING.md": "contributing.md",
 }
 # Sources that the reference shows in a better way. {file: page}
-_SHOWN = {"workflows/lidarpool/columns/table.py": "reference/columns.md"}
+_SHOWN = {"workflows/lidarsim/columns/table.py": "reference/columns.md"}
 _LINK = re.compile(r"(\]\()([^)#\s]+)([^)]*\))")
 # What a browser would fetch by itself, from elsewhere.
 _FETCHED = re.compile(

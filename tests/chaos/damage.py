@@ -31,11 +31,11 @@ from tests.clusters import thread_cluster
 
 import lidarpool
 from lidarpool import Campaign, LidarpoolError
-from lidarpool.base.storage import Storage
 from lidarpool.cli.commands import cli
 from lidarpool.report.campaign_output import verify
 from lidarpool.scenario.build import build
 from lidarpool.scenario.scenario import Scenario
+from lidarsim.base.storage import Storage
 
 BASE = """
 sensor: {rays_per_revolution: 90, layers: 4, step_deg: 4}

@@ -24,13 +24,13 @@ from lidarpool import (
     Survey,
     Track,
 )
-from lidarpool.columns.table import CAUSES
-from lidarpool.scene.actors import box as cuboid
-from lidarpool.scene.scene_mesh import SceneMesh
-from lidarpool.sensor.materials import extinction
-from lidarpool.sensor.weather import EXIT_M, dust, rain, snow, spray
-from lidarpool.simulator.air import highest
-from lidarpool.simulator.rig import Rig
+from lidarsim.columns.table import CAUSES
+from lidarsim.scene.actors import box as cuboid
+from lidarsim.scene.scene_mesh import SceneMesh
+from lidarsim.sensor.materials import extinction
+from lidarsim.sensor.weather import EXIT_M, dust, rain, snow, spray
+from lidarsim.simulator.air import highest
+from lidarsim.simulator.rig import Rig
 
 SEEN = Noise(detection_range_m=100)
 THRESHOLD = 0.1 * (10 / 100) ** 2

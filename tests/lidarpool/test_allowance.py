@@ -11,9 +11,9 @@ import pytest
 import trimesh
 from tests.meshes import NESTED
 
-from lidarpool.base import allowance, input_files
-from lidarpool.base.errors import LidarpoolError
-from lidarpool.scene.files.meshfile import load_meshes
+from lidarsim.base import allowance, input_files
+from lidarsim.base.errors import LidarpoolError
+from lidarsim.scene.files.meshfile import load_meshes
 
 VERTEX = b'<vertex x="0" y="0" z="0"/>'
 MODEL = (

@@ -21,19 +21,19 @@ from lidarpool import (
     Track,
     save_cloud,
 )
-from lidarpool.columns.cloud import Cloud
 from lidarpool.export.boxes import Boxes
-from lidarpool.export.sweeps import Sweeps
 from lidarpool.run.picture_file import PictureContent
 from lidarpool.scenario.advice import advice
 from lidarpool.scenario.build import Job, build
 from lidarpool.scenario.scenario import Scenario
-from lidarpool.scene.actors import box, one_mesh, shapes_of
-from lidarpool.scene.animation import PICTURED, Animation
-from lidarpool.scene.files.meshfile import load_objects
-from lidarpool.scene.scene_mesh import SceneMesh
-from lidarpool.scene.wheels import rolling
-from lidarpool.sensor.trajectory import matrices
+from lidarsim.columns.cloud import Cloud
+from lidarsim.scene.actors import box, one_mesh, shapes_of
+from lidarsim.scene.animation import PICTURED, Animation
+from lidarsim.scene.files.meshfile import load_objects
+from lidarsim.scene.scene_mesh import SceneMesh
+from lidarsim.scene.wheels import rolling
+from lidarsim.sensor.trajectory import matrices
+from lidarsim.sweeps.sweeps import Sweeps
 
 KINDS = {"f": 5126, "B": 5121, "H": 5123}
 SHAPES = {1: "SCALAR", 3: "VEC3", 4: "VEC4", 16: "MAT4"}

@@ -23,11 +23,11 @@ from lidarpool import (
     Survey,
     load_sensor,
 )
-from lidarpool.scene.scene_mesh import SceneMesh
-from lidarpool.sensor.disc import SUBRAYS, Beam
-from lidarpool.sensor.ray_sensors import PrismSensor
-from lidarpool.sensor.sensor import LineSensor
-from lidarpool.simulator.rig import Rig
+from lidarsim.scene.scene_mesh import SceneMesh
+from lidarsim.sensor.disc import SUBRAYS, Beam
+from lidarsim.sensor.ray_sensors import PrismSensor
+from lidarsim.sensor.sensor import LineSensor
+from lidarsim.simulator.rig import Rig
 
 
 def plane(point, normal, size=4000.0):

@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 from tests.meshes import NESTED
 
-from lidarpool.base.errors import LidarpoolError
 from lidarpool.scenario.build import build
 from lidarpool.scenario.scenario import Scenario
-from lidarpool.scene.files.meshfile import load_meshes
-from lidarpool.scene.scene_instances import SceneInstance
-from lidarpool.scene.scene_mesh import triangle_areas
-from lidarpool.sensor.materials import MaterialTable
+from lidarsim.base.errors import LidarpoolError
+from lidarsim.scene.files.meshfile import load_meshes
+from lidarsim.scene.scene_instances import SceneInstance
+from lidarsim.scene.scene_mesh import triangle_areas
+from lidarsim.sensor.materials import MaterialTable
 
 # A cube of 2 units, its rings running outward.
 CUBE = [[x, y, z] for z in (0, 2) for y in (0, 2) for x in (0, 2)]
@@ -252,7 +252,7 @@ def test_what_is_wrong_is_said(tmp_path, document, words):
 
 
 def test_memory_is_refused_before_it_is_taken(tmp_path, monkeypatch):
-    monkeypatch.setattr("lidarpool.base.allowance.memory", lambda: 100_000_000)
+    monkeypatch.setattr("lidarsim.base.allowance.memory", lambda: 100_000_000)
     with pytest.raises(LidarpoolError, match=r"would unpack to .* CityJSONSeq"):
         load(tmp_path, '{"type": "CityJSON", "x": [' + "[]," * 300_000 + "[]]}")
 

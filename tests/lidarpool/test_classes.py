@@ -18,18 +18,18 @@ from tests.drives import SCANS, points_of, the_scene, the_sweeps
 import lidarpool
 from lidarpool import LidarpoolError, Material, Sensor, Survey, read_cloud
 from lidarpool.base.fingerprint import fingerprint
-from lidarpool.base.storage import Storage
 from lidarpool.datasets.dataset import DataSet
 from lidarpool.datasets.job_table import JobRow, write_table
 from lidarpool.export.format_table import DATA_SETS
 from lidarpool.export.formats import Format
-from lidarpool.export.sweeps import SWEEPS_FILE, Sweeps
 from lidarpool.live.view import open_result
 from lidarpool.report.charts import draw_sweep
 from lidarpool.run.picture_file import PICTURE_FILE, PictureContent
 from lidarpool.scenario.build import Job
 from lidarpool.scenario.campaign import find_field
 from lidarpool.scenario.scenario import Scenario
+from lidarsim.base.storage import Storage
+from lidarsim.sweeps.sweeps import SWEEPS_FILE, Sweeps
 
 NAMES = {3: "road", 7: "Straße", 20: "pole, or a sign at one", 299: "car"}
 

@@ -36,10 +36,10 @@ from lidarpool import (
     Sensor,
     Track,
 )
-from lidarpool.columns.table import COLOURS
 from lidarpool.scenario.scenario import Scenario
-from lidarpool.scene import masks
-from lidarpool.scene.colours import (
+from lidarsim.columns.table import COLOURS
+from lidarsim.scene import masks
+from lidarsim.scene.colours import (
     GREY,
     LINEAR,
     WEIGHTS,
@@ -50,7 +50,7 @@ from lidarpool.scene.colours import (
     packed,
     unpacked,
 )
-from lidarpool.sensor.materials import DARKEST, reflectances
+from lidarsim.sensor.materials import DARKEST, reflectances
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 RNG = np.random.default_rng(7)

@@ -29,8 +29,8 @@ from lidarpool import (
     save_cloud,
     simulate,
 )
-from lidarpool.columns.table import ALWAYS, OPTIONAL, TABLE, chosen, stored
-from lidarpool.simulator.points import BatchPoints
+from lidarsim.columns.table import ALWAYS, OPTIONAL, TABLE, chosen, stored
+from lidarsim.simulator.points import BatchPoints
 
 # -- the table ------------------------------------------------------------------------------------
 

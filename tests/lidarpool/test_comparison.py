@@ -18,7 +18,7 @@ from lidarpool.compare import comparison
 from lidarpool.compare.recordings import open_recording
 from lidarpool.datasets.figures import rank_correlation
 from lidarpool.export.formats import Format
-from lidarpool.export.sweeps import Sweeps
+from lidarsim.sweeps.sweeps import Sweeps
 
 RINGS, COLUMNS = 16, 720
 ELEVATION = np.linspace(-15, 15, RINGS)

@@ -11,10 +11,10 @@ from lidarpool import LidarpoolError, Pose
 from lidarpool.base.fingerprint import fingerprint
 from lidarpool.scenario.build import build
 from lidarpool.scenario.scenario import Scenario
-from lidarpool.scene.scene import Scene
-from lidarpool.scene.scene_file import write_scene
-from lidarpool.scene.scene_mesh import SceneMesh
-from lidarpool.sensor.materials import MaterialTable
+from lidarsim.scene.scene import Scene
+from lidarsim.scene.scene_file import write_scene
+from lidarsim.scene.scene_mesh import SceneMesh
+from lidarsim.sensor.materials import MaterialTable
 
 
 @pytest.fixture

@@ -5,9 +5,9 @@ import pytest
 import trimesh
 from tests.meshes import NESTED
 
-from lidarpool.base.errors import LidarpoolError
-from lidarpool.scene.files.meshfile import load_meshes
-from lidarpool.scene.scene import Scene
+from lidarsim.base.errors import LidarpoolError
+from lidarsim.scene.files.meshfile import load_meshes
+from lidarsim.scene.scene import Scene
 
 DAE = """<?xml version="1.0"?>{doctype}
 <COLLADA xmlns="http://www.collada.org/2005/11/COLLADASchema" version="1.4.1">

@@ -19,13 +19,13 @@ import pytest
 from tests.drives import SCANS, TURNS, points_of, the_scene, the_sweeps
 
 from lidarpool import Cloud, LidarpoolError, Scene, Sensor, Survey
-from lidarpool.base.storage import Storage
 from lidarpool.datasets.dataset import INDEX_FILE, DataSet, Listing
 from lidarpool.datasets.job_table import JobRow
 from lidarpool.export.boxes import Boxes
 from lidarpool.export.format_table import DATA_SETS
 from lidarpool.export.formats import Format
-from lidarpool.export.sweeps import Sweeps
+from lidarsim.base.storage import Storage
+from lidarsim.sweeps.sweeps import Sweeps
 
 
 @pytest.fixture(scope="module")

@@ -11,7 +11,7 @@ import yaml
 from click.testing import CliRunner
 from tests.shapes import beam_along_x, cast, wall
 
-from lidarpool import (
+from lidarpool import (  # fmt: skip
     LidarpoolError,
     Material,
     Mounted,
@@ -19,12 +19,12 @@ from lidarpool import (
     Returns,
     Survey,
     load_sensor,
-)  # fmt: skip
+)
 from lidarpool.cli.scenario_commands import sensors
 from lidarpool.scenario.advice import advice
 from lidarpool.scenario.build import build
 from lidarpool.scenario.scenario import Scenario
-from lidarpool.sensor.models import Detection, model_names, read_model
+from lidarsim.sensor.models import Detection, model_names, read_model
 
 RAYS = 20_000
 STATED = [name for name in model_names() if read_model(name).performance]

@@ -28,16 +28,16 @@ from lidarpool import (
     save_cloud,
     simulate,
 )
-from lidarpool.columns.table import SCAN
 from lidarpool.scenario.build import build
 from lidarpool.scenario.scenario import Scenario
-from lidarpool.scene.actors import one_mesh
-from lidarpool.scene.face_materials import FaceMaterials
-from lidarpool.scene.scene_file import write_scene
-from lidarpool.scene.scene_mesh import Cutout
-from lidarpool.simulator.batch import columns_of
-from lidarpool.simulator.returns import BLOOMING
-from lidarpool.simulator.rig import Rig
+from lidarsim.columns.table import SCAN
+from lidarsim.scene.actors import one_mesh
+from lidarsim.scene.face_materials import FaceMaterials
+from lidarsim.scene.scene_file import write_scene
+from lidarsim.scene.scene_mesh import Cutout
+from lidarsim.simulator.batch import columns_of
+from lidarsim.simulator.returns import BLOOMING
+from lidarsim.simulator.rig import Rig
 from raybeam import available_backends, registry
 
 CPU = [name for name in ("numpy", "embree") if not available_backends()[name]]

@@ -26,19 +26,19 @@ from lidarpool import (
     Track,
     load_sensor,
 )
-from lidarpool.columns.cloud import Cloud
 from lidarpool.datasets.job_table import JobRow
 from lidarpool.datasets.sweep_data import Sweep
 from lidarpool.export.boxes import Boxes
 from lidarpool.export.images import Image
 from lidarpool.export.ros import write_rosbag2
-from lidarpool.export.sweeps import Sweeps
 from lidarpool.export.webdataset import Pieces
 from lidarpool.scenario.build import build
 from lidarpool.scenario.campaign import CampaignSpec
 from lidarpool.scenario.scenario import Scenario
-from lidarpool.simulator.batch import columns_of
-from lidarpool.simulator.rig import Rig
+from lidarsim.columns.cloud import Cloud
+from lidarsim.simulator.batch import columns_of
+from lidarsim.simulator.rig import Rig
+from lidarsim.sweeps.sweeps import Sweeps
 
 LIDAR = load_sensor("velodyne/vlp16")  # 1808.4 firings a turn: sweeps do not repeat firings
 COLUMNS = ("time", "range", "intensity", "azimuth", "elevation", "ray", "object")

@@ -25,7 +25,7 @@ from hypothesis.extra import numpy as npst
 from lidarpool import Beams, LidarpoolError, Sensor, Spin
 from lidarpool.base.fingerprint import fingerprint
 from lidarpool.base.software import PACKAGES, difference, software, sources
-from lidarpool.sensor import Head
+from lidarsim.sensor import Head
 from raybeam import available_backends
 
 Pair = namedtuple("Pair", "a b")

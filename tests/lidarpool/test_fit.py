@@ -13,9 +13,9 @@ from benchmarks.fit_coverage import PLACES, place, recorded, street, trial
 from lidarpool import LidarpoolError, Noise, Pose, Scanner, Sensor, fit, load_sensor
 from lidarpool.compare.recordings import Recording, open_recording
 from lidarpool.export.formats import Format
-from lidarpool.export.sweeps import Sweeps
-from lidarpool.scene.generated.city import city
-from lidarpool.sensor.models import read_model
+from lidarsim.scene.generated.city import city
+from lidarsim.sensor.models import read_model
+from lidarsim.sweeps.sweeps import Sweeps
 
 pytest.importorskip("scipy", reason="the extra fit is not installed")
 

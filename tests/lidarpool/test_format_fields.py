@@ -32,15 +32,15 @@ from lidarpool import (
     read_cloud,
     save_cloud,
 )
-from lidarpool.base.yamlfile import load_yaml
-from lidarpool.columns.table import SCAN
 from lidarpool.export.formats import Format
-from lidarpool.export.sweeps import Sweeps
-from lidarpool.scene.generated.city import city
-from lidarpool.sensor.beams import Beams, Mirror
-from lidarpool.sensor.sensor import LineSensor
-from lidarpool.simulator.batch import columns_of
-from lidarpool.simulator.rig import Rig
+from lidarsim.base.yamlfile import load_yaml
+from lidarsim.columns.table import SCAN
+from lidarsim.scene.generated.city import city
+from lidarsim.sensor.beams import Beams, Mirror
+from lidarsim.sensor.sensor import LineSensor
+from lidarsim.simulator.batch import columns_of
+from lidarsim.simulator.rig import Rig
+from lidarsim.sweeps.sweeps import Sweeps
 
 COLUMNS = (
     "time", "intensity", "reflectivity", "reflectance", "signal", "range", "azimuth", "elevation",

@@ -41,11 +41,7 @@ from lidarpool import (
     simulate,
 )
 from lidarpool.base.open3d_module import load_open3d
-from lidarpool.base.storage import Storage
-from lidarpool.base.yamlfile import load_yaml
-from lidarpool.columns.bags import point_columns
 from lidarpool.columns.cloud_file import CloudFile
-from lidarpool.columns.table import COLOURS, TABLE
 from lidarpool.export import las as las_module
 from lidarpool.export import parquet, pieces
 from lidarpool.export.boxes import Boxes
@@ -53,9 +49,13 @@ from lidarpool.export.format_table import EXPORTS, FORMATS, LAYOUTS
 from lidarpool.export.formats import Format
 from lidarpool.export.las import wkt
 from lidarpool.export.ros import START_NS
-from lidarpool.export.sweeps import Sweeps
-from lidarpool.scene.actors import Actor, box
-from lidarpool.sensor.trajectory import matrices
+from lidarsim.base.storage import Storage
+from lidarsim.base.yamlfile import load_yaml
+from lidarsim.columns.bags import point_columns
+from lidarsim.columns.table import COLOURS, TABLE
+from lidarsim.scene.actors import Actor, box
+from lidarsim.sensor.trajectory import matrices
+from lidarsim.sweeps.sweeps import Sweeps
 
 COLUMNS = ("time", "intensity", "reflectivity", "range", "azimuth", "elevation", "class",
            "return_number", "returns", "sensor", "ray", "signal")  # fmt: skip

@@ -11,14 +11,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from lidarpool import LidarpoolError
-from lidarpool.scene.generated.cars import MODELS, all_cars
-from lidarpool.scene.generated.city import city
-from lidarpool.scene.generated.city_kinds import all_kinds
-from lidarpool.scene.generated.plants import SCALES, SPECIES, tree
-from lidarpool.scene.generated.terrain import terrain
-from lidarpool.scene.scene_file import write_scene
-from lidarpool.scene.scene_mesh import triangle_areas
-from lidarpool.scene.shapes import SEED_POSITIONS, revolve, seed_objects
+from lidarsim.scene.generated.cars import MODELS, all_cars
+from lidarsim.scene.generated.city import city
+from lidarsim.scene.generated.city_kinds import all_kinds
+from lidarsim.scene.generated.plants import SCALES, SPECIES, tree
+from lidarsim.scene.generated.terrain import terrain
+from lidarsim.scene.scene_file import write_scene
+from lidarsim.scene.scene_mesh import triangle_areas
+from lidarsim.scene.shapes import SEED_POSITIONS, revolve, seed_objects
 from raybeam import RayCaster
 
 TREES, CARS = [species.name for species in SPECIES], [model.name for model in MODELS]

@@ -8,9 +8,9 @@ import pytest
 from tests.shapes import CPU, beam_along_x, cast, level, made, quad, wall
 
 from lidarpool import Beams, LidarpoolError, Material, Noise, Returns, Scene, Sensor, Spin, Survey
-from lidarpool.columns.table import CAUSES
-from lidarpool.scene.colours import Colours
-from lidarpool.sensor.materials import WATER_INDEX, below_water, fresnel
+from lidarsim.columns.table import CAUSES
+from lidarsim.scene.colours import Colours
+from lidarsim.sensor.materials import WATER_INDEX, below_water, fresnel
 
 COLUMNS = ("range", "reflectance", "class", "cause", "return_number")
 GHOST = CAUSES.index("ghost")

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from tests.meshes import write
 
-from lidarpool.base.errors import LidarpoolError
-from lidarpool.scene.files.meshfile import load_meshes
+from lidarsim.base.errors import LidarpoolError
+from lidarsim.scene.files.meshfile import load_meshes
 
 CORNERS = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]], "<f4").tobytes()
 

@@ -12,8 +12,8 @@ from lidarpool import LidarpoolError
 from lidarpool.cli.scenario_commands import import_
 from lidarpool.importers.helios import import_survey
 from lidarpool.scenario.build import build
-from lidarpool.sensor.materials import MaterialTable
-from lidarpool.simulator.rig import Rig
+from lidarsim.sensor.materials import MaterialTable
+from lidarsim.simulator.rig import Rig
 from raybeam import RayCaster
 
 X, Y, Z = np.eye(3)

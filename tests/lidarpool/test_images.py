@@ -26,20 +26,20 @@ from lidarpool import (
     Survey,
     load_sensor,
 )
-from lidarpool.base.yamlfile import load_yaml
-from lidarpool.columns.table import SCAN
 from lidarpool.export.formats import Format
-from lidarpool.export.sweeps import Sweeps
 from lidarpool.scenario.build import build
 from lidarpool.scenario.scenario import Scenario
-from lidarpool.scene.generated.city import city
-from lidarpool.sensor.beams import Mirror
-from lidarpool.sensor.models import model_names, read_model
-from lidarpool.sensor.plain_data import described, remade
-from lidarpool.sensor.ray_sensors import ListedSensor
-from lidarpool.sensor.sensor import LineSensor
-from lidarpool.simulator.batch import columns_of
-from lidarpool.simulator.rig import Rig
+from lidarsim.base.yamlfile import load_yaml
+from lidarsim.columns.table import SCAN
+from lidarsim.scene.generated.city import city
+from lidarsim.sensor.beams import Mirror
+from lidarsim.sensor.models import model_names, read_model
+from lidarsim.sensor.plain_data import described, remade
+from lidarsim.sensor.ray_sensors import ListedSensor
+from lidarsim.sensor.sensor import LineSensor
+from lidarsim.simulator.batch import columns_of
+from lidarsim.simulator.rig import Rig
+from lidarsim.sweeps.sweeps import Sweeps
 
 COLUMNS = ("ray", "range", "time", "azimuth", "elevation", "intensity", "class", "return_number")
 SCENE = city(4_000)

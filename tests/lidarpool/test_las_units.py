@@ -7,11 +7,11 @@ import pytest
 from click.testing import CliRunner
 
 from lidarpool import compare
-from lidarpool.base.errors import LidarpoolError
 from lidarpool.cli.scenario_commands import scene as command
-from lidarpool.scene.files import las_units
-from lidarpool.scene.point_scene import scene_of_points
-from lidarpool.scene.scene import Scene
+from lidarpool.scenario.point_scene import scene_of_points
+from lidarsim.base.errors import LidarpoolError
+from lidarsim.scene.files import las_units
+from lidarsim.scene.scene import Scene
 
 laspy = pytest.importorskip("laspy", reason="laspy is an extra")
 

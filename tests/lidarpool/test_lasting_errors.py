@@ -11,8 +11,8 @@ from tests.shapes import wall
 from lidarpool import LidarpoolError, Mounted, Noise, Scene, Sensor, Survey, Track, load_sensor
 from lidarpool.scenario.build import build
 from lidarpool.scenario.scenario import Scenario
-from lidarpool.simulator.batch import columns_of
-from lidarpool.simulator.rig import Rig
+from lidarsim.simulator.batch import columns_of
+from lidarsim.simulator.rig import Rig
 
 CHANNELS, TURNS = 100, 4
 SENSOR = Sensor.grid(40, CHANNELS, 20, step_deg=90, horizontal_fov_deg=40)

@@ -12,13 +12,13 @@ from tests.lidarpool.test_gltf import glb
 from tests.meshes import write
 
 from lidarpool import LidarpoolError, Pose, Scanner, Scene
-from lidarpool.base import allowance
-from lidarpool.scene.actors import Actor
-from lidarpool.scene.files.meshfile import load_meshes
-from lidarpool.scene.scene_file import write_scene
-from lidarpool.scene.scene_instances import SceneInstance
-from lidarpool.scene.scene_mesh import Cutout, SceneMesh
-from lidarpool.sensor import Sensor
+from lidarsim.base import allowance
+from lidarsim.scene.actors import Actor
+from lidarsim.scene.files.meshfile import load_meshes
+from lidarsim.scene.scene_file import write_scene
+from lidarsim.scene.scene_instances import SceneInstance
+from lidarsim.scene.scene_mesh import Cutout, SceneMesh
+from lidarsim.sensor import Sensor
 
 BACKENDS = ["numpy", "embree"]
 # No row or column is another's, reversed or not.

@@ -9,11 +9,11 @@ import pytest
 import trimesh
 from tests.meshes import PLY, write
 
-from lidarpool.base.errors import LidarpoolError
-from lidarpool.scene.files import usd
-from lidarpool.scene.files.meshfile import SUFFIXES, load_meshes
-from lidarpool.scene.scene import Scene
-from lidarpool.scene.transform import Transform
+from lidarsim.base.errors import LidarpoolError
+from lidarsim.scene.files import usd
+from lidarsim.scene.files.meshfile import SUFFIXES, load_meshes
+from lidarsim.scene.scene import Scene
+from lidarsim.scene.transform import Transform
 
 OBJ = """# two objects
 o Box

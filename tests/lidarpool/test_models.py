@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from lidarpool import LidarpoolError
-from lidarpool.sensor.models import load_sensor, model_names, read_model
-from lidarpool.sensor.ray_sensors import ListedSensor, Prism, PrismSensor
+from lidarsim.sensor.models import load_sensor, model_names, read_model
+from lidarsim.sensor.ray_sensors import ListedSensor, Prism, PrismSensor
 
 READY = [name for name in model_names() if not read_model(name).needs_calibration]
 

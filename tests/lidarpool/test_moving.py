@@ -20,12 +20,12 @@ from lidarpool import (
     Track,
     load_sensor,
 )
-from lidarpool.base.vectors import into_axes
 from lidarpool.run.job_source import identity_of
 from lidarpool.scenario.build import Job
-from lidarpool.scene.actors import Actor, box
-from lidarpool.sensor.optics import Returns
-from lidarpool.simulator.rig import Rig
+from lidarsim.base.vectors import into_axes
+from lidarsim.scene.actors import Actor, box
+from lidarsim.sensor.optics import Returns
+from lidarsim.simulator.rig import Rig
 from raybeam import moving_loops
 
 WALL_M = 8.0

@@ -25,14 +25,14 @@ from lidarpool import (
     load_sensor,
 )
 from lidarpool.export.formats import Format
-from lidarpool.export.instruments import GNSS_FILE, IMU_FILE, Instruments
 from lidarpool.export.navigation_files import instrument_bytes, write_instruments
-from lidarpool.export.sweeps import Sweeps
 from lidarpool.scenario.build import Job, build
 from lidarpool.scenario.campaign import CampaignSpec
 from lidarpool.scenario.scenario import Scenario
-from lidarpool.sensor.navigation import fixes, geodetic, imu_samples
-from lidarpool.sensor.trajectory import Stations, matrices
+from lidarsim.sensor.navigation import fixes, geodetic, imu_samples
+from lidarsim.sensor.trajectory import Stations, matrices
+from lidarsim.sweeps.instruments import GNSS_FILE, IMU_FILE, Instruments
+from lidarsim.sweeps.sweeps import Sweeps
 
 GRAVITY = 9.80665
 

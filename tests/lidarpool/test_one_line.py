@@ -37,8 +37,8 @@ from lidarpool import (
     Track,
     load_sensor,
 )
-from lidarpool.columns.table import TABLE
-from lidarpool.sensor.trajectory import Stations
+from lidarsim.columns.table import TABLE
+from lidarsim.sensor.trajectory import Stations
 
 SENSOR = load_sensor("velodyne/vlp16")
 MESH = SceneMesh("hall", np.eye(300, 3), np.arange(300).reshape(100, 3))

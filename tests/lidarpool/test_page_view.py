@@ -12,11 +12,8 @@ import pytest
 import trimesh
 
 from lidarpool import LidarpoolError, Planning, Pose, Scene, Sensor, Survey, Track
-from lidarpool.columns.cloud import Cloud
 from lidarpool.columns.cloud_file import CloudFile
 from lidarpool.columns.ply_format import header, row_type
-from lidarpool.columns.table import CHANNEL, OBJECT, SCAN, TABLE, Column
-from lidarpool.export.sweeps import SWEEPS_FILE, Sweeps
 from lidarpool.live import point_selection as points
 from lidarpool.live.point_selection import (
     TILES,
@@ -40,8 +37,11 @@ from lidarpool.live.view import (
 from lidarpool.plan import Plan
 from lidarpool.render.colouring import colours_of as colouring_of
 from lidarpool.run.picture_file import PICTURE_FILE, PictureContent, SensorWay
-from lidarpool.scene.actors import Actor, box
-from lidarpool.scene.colours import Colours, as_bytes
+from lidarsim.columns.cloud import Cloud
+from lidarsim.columns.table import CHANNEL, OBJECT, SCAN, TABLE, Column
+from lidarsim.scene.actors import Actor, box
+from lidarsim.scene.colours import Colours, as_bytes
+from lidarsim.sweeps.sweeps import SWEEPS_FILE, Sweeps
 
 POSES = 25
 NOWHERE = np.zeros((0, 3), np.float32)

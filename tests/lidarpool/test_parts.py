@@ -10,8 +10,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from lidarpool import Cloud, LidarpoolError
-from lidarpool.base.storage import Storage
-from lidarpool.columns.part_columns import PartColumns, positions_of
 from lidarpool.columns.parts import (
     StoredCloud,
     mark_name,
@@ -24,7 +22,9 @@ from lidarpool.columns.parts import (
     scans_of,
     unpack,
 )
-from lidarpool.columns.table import OPTIONAL, stored
+from lidarsim.base.storage import Storage
+from lidarsim.columns.part_columns import PartColumns, positions_of
+from lidarsim.columns.table import OPTIONAL, stored
 
 COLUMNS = stored(OPTIONAL)
 ORIGIN = np.array([500_000.0, 5_400_000.0, 300.0])

@@ -6,7 +6,7 @@ from tests.shapes import block, wall
 
 from lidarpool import LidarpoolError, Scene, SceneMesh, Sensor
 from lidarpool.plan.stations import plan_stations
-from lidarpool.scene.actors import box
+from lidarsim.scene.actors import box
 
 EVERYWHERE = Sensor.grid(vertical_fov_deg=180)
 

@@ -23,16 +23,16 @@ from lidarpool import (
     Track,
     save_cloud,
 )
-from lidarpool.base.storage import Storage
 from lidarpool.cli.commands import cli
-from lidarpool.columns.table import Column
 from lidarpool.plan import best
 from lidarpool.plan.trial import run_trial
 from lidarpool.render.picture_page import Page
 from lidarpool.run.picture_file import PICTURE_FILE, PictureContent, SensorWay, sensor_ways
-from lidarpool.scene.actors import Actor, box
-from lidarpool.scene.scene_mesh import SceneMesh
-from lidarpool.scene.shapes import seed_objects
+from lidarsim.base.storage import Storage
+from lidarsim.columns.table import Column
+from lidarsim.scene.actors import Actor, box
+from lidarsim.scene.scene_mesh import SceneMesh
+from lidarsim.scene.shapes import seed_objects
 
 SMALL = ("--size", "480x480")
 NAMES = ("Kübel\x00", "a\udc80", "")  # as files may have them

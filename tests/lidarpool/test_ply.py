@@ -14,13 +14,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as npst
 
-from lidarpool.base.errors import LidarpoolError
 from lidarpool.base.open3d_module import load_open3d
-from lidarpool.columns.cloud import Cloud
-from lidarpool.columns.table import Column
 from lidarpool.export import ply
 from lidarpool.export.formats import save_cloud
 from lidarpool.export.ply import read_cloud
+from lidarsim.base.errors import LidarpoolError
+from lidarsim.columns.cloud import Cloud
+from lidarsim.columns.table import Column
 
 
 def sample(count, *, offset=0.0, seed=1):

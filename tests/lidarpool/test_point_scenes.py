@@ -5,11 +5,11 @@ import pytest
 from click.testing import CliRunner
 
 from lidarpool import Cloud, Noise, Pose, Scanner, Scene, load_sensor, save_cloud
-from lidarpool.base.errors import LidarpoolError
 from lidarpool.base.open3d_module import load_open3d
 from lidarpool.cli.scenario_commands import scene as command
-from lidarpool.scene.point_scene import scene_of_points
-from lidarpool.scene.scene_file import write_scene
+from lidarpool.scenario.point_scene import scene_of_points
+from lidarsim.base.errors import LidarpoolError
+from lidarsim.scene.scene_file import write_scene
 
 GRID = np.mgrid[0:4:40j, 0:3:30j].reshape(2, -1).T
 FAR = (500_000.0, 5_000_000.0, 100.0)
@@ -128,7 +128,7 @@ def test_what_is_wrong_is_said(tmp_path, name, text, words):
 
 def test_too_many_points_are_refused(tmp_path, monkeypatch):
     path = written(tmp_path / "a.ply", plane())
-    monkeypatch.setattr("lidarpool.scene.point_scene.memory", lambda: 1_000_000)
+    monkeypatch.setattr("lidarpool.scenario.point_scene.memory", lambda: 1_000_000)
     with pytest.raises(LidarpoolError, match=r"1,200 surfels, .* larger voxel_m than 0.01"):
         scene_of_points(path, voxel_m=0.01)
     assert len(scene_of_points(path, voxel_m=0.3).faces) < 2 * 500

@@ -13,9 +13,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from tests.meshes import PLY, write
 
-from lidarpool.base.errors import LidarpoolError
-from lidarpool.scene.files.meshfile import load_meshes
-from lidarpool.scene.files.polygons import MOST_CORNERS, triangulated, with_holes
+from lidarsim.base.errors import LidarpoolError
+from lidarsim.scene.files.meshfile import load_meshes
+from lidarsim.scene.files.polygons import MOST_CORNERS, triangulated, with_holes
 
 CORNERS = np.array([[0, 0, 0], [2, 0, 0], [2, 2, 0], [0, 2, 0], [1, 1, 3]], dtype=float)
 ROOF = [[0, 3, 2, 1], [0, 1, 4], [1, 2, 4], [2, 3, 4], [3, 0, 4]]  # a square under four triangles

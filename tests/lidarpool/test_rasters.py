@@ -10,15 +10,15 @@ from click.testing import CliRunner
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from lidarpool.base.errors import LidarpoolError
 from lidarpool.cli.commands import cli
 from lidarpool.scenario.advice import advice
 from lidarpool.scenario.build import build
 from lidarpool.scenario.scenario import Scenario
-from lidarpool.scene.files import rasters
-from lidarpool.scene.files.meshfile import load_meshes, load_objects
-from lidarpool.sensor import Sensor
-from lidarpool.simulator.scanner import Scanner
+from lidarsim.base.errors import LidarpoolError
+from lidarsim.scene.files import rasters
+from lidarsim.scene.files.meshfile import load_meshes, load_objects
+from lidarsim.sensor import Sensor
+from lidarsim.simulator.scanner import Scanner
 
 pytestmark = pytest.mark.skipif(find_spec("rasterio") is None, reason="needs rasterio, an extra")
 if find_spec("rasterio") is not None:

@@ -27,13 +27,13 @@ from lidarpool import (
     Spin,
     Survey,
 )
-from lidarpool.columns.table import AXES, SCAN
-from lidarpool.columns.waveforms import WAVEFORM
-from lidarpool.scene.scene_mesh import SceneMesh
-from lidarpool.sensor.noise import THRESHOLD_SIGMAS
-from lidarpool.simulator.batch import columns_of
-from lidarpool.simulator.returns import BLOOMING, CROSSTALK, FALSE_ALARM, SURFACE
-from lidarpool.simulator.rig import Rig
+from lidarsim.columns.table import AXES, SCAN
+from lidarsim.columns.waveforms import WAVEFORM
+from lidarsim.scene.scene_mesh import SceneMesh
+from lidarsim.sensor.noise import THRESHOLD_SIGMAS
+from lidarsim.simulator.batch import columns_of
+from lidarsim.simulator.returns import BLOOMING, CROSSTALK, FALSE_ALARM, SURFACE
+from lidarsim.simulator.rig import Rig
 from raybeam import available_backends
 
 WHITE = [Material("*", reflectance=1.0)]

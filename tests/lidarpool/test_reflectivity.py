@@ -9,8 +9,8 @@ import pytest
 from tests.shapes import beam_along_x, cast, wall
 
 from lidarpool import LidarpoolError, Material, Noise, load_sensor
-from lidarpool.sensor.models import model_names, read_model
-from lidarpool.sensor.reflectivity import SCALES
+from lidarsim.sensor.models import model_names, read_model
+from lidarsim.sensor.reflectivity import SCALES
 
 COLUMNS = ("range", "intensity", "reflectivity", "signal")
 

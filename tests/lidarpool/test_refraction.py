@@ -9,18 +9,8 @@ import pytest
 import trimesh
 from tests.shapes import CPU, box, cast, level, solid
 
-from lidarpool import (
-    Beams,
-    LidarpoolError,
-    Material,
-    Optics,
-    Pose,
-    Returns,
-    Scene,
-    Sensor,
-    Spin,
-)
-from lidarpool.sensor.materials import extinction, fresnel
+from lidarpool import Beams, LidarpoolError, Material, Optics, Pose, Returns, Scene, Sensor, Spin
+from lidarsim.sensor.materials import extinction, fresnel
 
 WATER = {"transparent": "pass", "refractive_index": 1.33}
 SURFACE = level("Water", 0, 90)

@@ -13,14 +13,14 @@ from tests.shapes import level, made
 
 from lidarpool import LidarpoolError, Pose, Scene, Survey, Track, load_robot, load_sensor
 from lidarpool.base.fingerprint import fingerprint
-from lidarpool.base.vectors import into_axes
 from lidarpool.scenario.advice import advice
 from lidarpool.scenario.build import build
 from lidarpool.scenario.scenario import Scenario
-from lidarpool.scene.actors import box
-from lidarpool.sensor import Mounted
-from lidarpool.sensor.trajectory import presence_ns
-from lidarpool.simulator.rig import Rig
+from lidarsim.base.vectors import into_axes
+from lidarsim.scene.actors import box
+from lidarsim.sensor import Mounted
+from lidarsim.sensor.trajectory import presence_ns
+from lidarsim.simulator.rig import Rig
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 BOX = '<visual><geometry><box size="0.2 0.2 0.2"/></geometry></visual>'

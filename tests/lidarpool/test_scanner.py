@@ -36,14 +36,14 @@ from lidarpool import (
     Track,
     load_sensor,
 )
-from lidarpool.columns.table import OPTIONAL, SCAN
-from lidarpool.export.sweeps import Sweeps
-from lidarpool.scene.actors import box
-from lidarpool.scene.scene_mesh import Cutout
-from lidarpool.scene.shapes import seed_objects
-from lidarpool.simulator import rig as rig_module
-from lidarpool.simulator.batch import columns_of
-from lidarpool.simulator.rig import Rig
+from lidarsim.columns.table import OPTIONAL, SCAN
+from lidarsim.scene.actors import box
+from lidarsim.scene.scene_mesh import Cutout
+from lidarsim.scene.shapes import seed_objects
+from lidarsim.simulator import rig as rig_module
+from lidarsim.simulator.batch import columns_of
+from lidarsim.simulator.rig import Rig
+from lidarsim.sweeps.sweeps import Sweeps
 
 COLUMNS = [column.name for column in OPTIONAL]
 VLP16 = load_sensor("velodyne/vlp16")

@@ -13,13 +13,13 @@ from hypothesis import strategies as st
 from trimesh.exchange.gltf import export_glb
 
 from lidarpool import Scene
-from lidarpool.base.errors import LidarpoolError
 from lidarpool.base.fingerprint import fingerprint
 from lidarpool.scenario.advice import advice
 from lidarpool.scenario.build import build
 from lidarpool.scenario.scenario import Scenario
-from lidarpool.sensor import Noise, Returns, Sensor, Survey
-from lidarpool.sensor.materials import MaterialTable, SurfaceKinds
+from lidarsim.base.errors import LidarpoolError
+from lidarsim.sensor import Noise, Returns, Sensor, Survey
+from lidarsim.sensor.materials import MaterialTable, SurfaceKinds
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 DEFAULT = Survey(Sensor.grid(), poses=[(0, 0, 1), (0, 0, 2), (0, 0, 3)], keep_every=5)
@@ -169,7 +169,7 @@ def test_short_forms_say_the_same(scenario):
 
 
 def test_a_model_of_ones_own_is_a_file_beside_the_scenario(scenario, tmp_path):
-    data = files("lidarpool.sensor") / "data" / "velodyne" / "vlp16.yaml"
+    data = files("lidarsim.sensor") / "data" / "velodyne" / "vlp16.yaml"
     (tmp_path / "mine.yaml").write_text(data.read_text().replace("VLP-16", "Mine"))
     made = scenario("sensor: mine.yaml")
     assert made.files == (tmp_path / "mine.yaml",)

@@ -7,14 +7,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from lidarpool.base.errors import LidarpoolError
 from lidarpool.scenario.advice import advice
 from lidarpool.scenario.build import build
 from lidarpool.scenario.scenario import Scenario
-from lidarpool.scene.object_names import unique_names
-from lidarpool.scene.scene import Scene
-from lidarpool.scene.scene_mesh import SceneMesh
-from lidarpool.scene.transform import UP_AXES, Transform
+from lidarsim.base.errors import LidarpoolError
+from lidarsim.scene.object_names import unique_names
+from lidarsim.scene.scene import Scene
+from lidarsim.scene.scene_mesh import SceneMesh
+from lidarsim.scene.transform import UP_AXES, Transform
 
 FACES = np.array([[0, 1, 2]])
 

@@ -13,13 +13,13 @@ from click.testing import CliRunner
 
 from lidarpool import LidarpoolError, Scene
 from lidarpool.cli.scenario_commands import scene as command
-from lidarpool.scene.actors import box
-from lidarpool.scene.colours import WHITE, Colours
-from lidarpool.scene.files.meshfile import load_meshes
-from lidarpool.scene.generated.city import city
-from lidarpool.scene.scene_file import write_scene
-from lidarpool.scene.scene_instances import SceneInstance
-from lidarpool.scene.scene_mesh import Cutout
+from lidarsim.scene.actors import box
+from lidarsim.scene.colours import WHITE, Colours
+from lidarsim.scene.files.meshfile import load_meshes
+from lidarsim.scene.generated.city import city
+from lidarsim.scene.scene_file import write_scene
+from lidarsim.scene.scene_instances import SceneInstance
+from lidarsim.scene.scene_mesh import Cutout
 
 
 @pytest.mark.parametrize("suffix", [".ply", ".glb", ".obj", ".GLB"])

@@ -13,7 +13,6 @@ from jsonschema import Draft202012Validator
 
 from lidarpool import LidarpoolError
 from lidarpool.base.fingerprint import fingerprint
-from lidarpool.base.validation import fields_of, is_section
 from lidarpool.scenario.build import build
 from lidarpool.scenario.campaign import CampaignSpec, is_campaign
 from lidarpool.scenario.scenario import Scenario
@@ -24,6 +23,7 @@ from lidarpool.scenario.schema import (
     schema_text,
     short_scenario,
 )
+from lidarsim.base.validation import fields_of, is_section
 
 FILES = sorted((Path(__file__).parents[2] / "examples").glob("*.yaml"))
 CAMPAIGNS = [path for path in FILES if is_campaign(path)]

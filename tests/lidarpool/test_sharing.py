@@ -18,14 +18,14 @@ import lidarpool.render.film
 from lidarpool import LidarpoolError, Scene, Sensor, Survey, Track
 from lidarpool.cli.commands import cli
 from lidarpool.columns.ply_format import header, row_type
-from lidarpool.columns.table import CHANNEL, SCAN
-from lidarpool.export.sweeps import SWEEPS_FILE, Sweeps
 from lidarpool.live.sharing import film_of, page_of, share
 from lidarpool.live.view import open_result
 from lidarpool.render.film import ACTOR, SURFACE, Film
 from lidarpool.render.theme import rgb
 from lidarpool.run.picture_file import PICTURE_FILE, PictureContent, sensor_ways
-from lidarpool.scene.actors import Actor, box
+from lidarsim.columns.table import CHANNEL, SCAN
+from lidarsim.scene.actors import Actor, box
+from lidarsim.sweeps.sweeps import SWEEPS_FILE, Sweeps
 
 COUNT, SCANS = 3600, 360
 RED = np.array([1.0, 0.0, 0.0, 1.0])

@@ -16,10 +16,10 @@ import numpy as np
 import pytest
 
 from lidarpool import LidarpoolError
-from lidarpool.base import allowance
-from lidarpool.base.archives import open_archive
-from lidarpool.base.storage import Storage
-from lidarpool.export.sweeps import Sweeps
+from lidarsim.base import allowance
+from lidarsim.base.archives import open_archive
+from lidarsim.base.storage import Storage
+from lidarsim.sweeps.sweeps import Sweeps
 
 
 @pytest.fixture(params=["folder", "memory"])

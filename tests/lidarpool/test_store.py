@@ -17,13 +17,13 @@ from tests.committing import commit
 import lidarpool.run.remote
 import lidarpool.run.store
 from lidarpool import Campaign, Job, LidarpoolError, Planning, Scene, Sensor, Survey, remove_run
-from lidarpool.base.storage import Storage
 from lidarpool.columns.parts import mark_name, part_name, probe_name
 from lidarpool.datasets.job_table import JobRow
 from lidarpool.plan import run_trial
 from lidarpool.run.job_source import OneJob
 from lidarpool.run.store import RunStore
-from lidarpool.scene.shapes import seed_objects
+from lidarsim.base.storage import Storage
+from lidarsim.scene.shapes import seed_objects
 
 SCENE = Scene.from_meshes(seed_objects(rings=4, segments=6))
 SURVEY = Survey(Sensor.grid(layers=2), poses=[(0, 0, 1)], steps=6, columns=["time"])

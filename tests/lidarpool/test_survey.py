@@ -26,7 +26,7 @@ from lidarpool import (
     load_trajectory,
 )
 from lidarpool.base.fingerprint import fingerprint
-from lidarpool.sensor.trajectory import matrices, quaternions_of, rotations_of, velocities
+from lidarsim.sensor.trajectory import matrices, quaternions_of, rotations_of, velocities
 
 RNG = np.random.default_rng(5)
 TIMES = np.cumsum(RNG.uniform(0.05, 0.4, 12)) + 1.4e9

@@ -25,11 +25,11 @@ from tests.rows import quick
 import lidarpool
 import lidarpool.export.kitti
 from lidarpool import LidarpoolError, Scene, Sweep
-from lidarpool.base.storage import Storage
 from lidarpool.datasets.dataset import INDEX_FILE
 from lidarpool.export.boxes import Boxes
 from lidarpool.export.format_table import DATA_SETS
-from lidarpool.export.sweeps import Sweeps
+from lidarsim.base.storage import Storage
+from lidarsim.sweeps.sweeps import Sweeps
 
 JOBS = len(SPLITS)
 

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from tests.meshes import NESTED
 
-from lidarpool.base.errors import LidarpoolError
-from lidarpool.scene.files.meshfile import load_meshes
+from lidarsim.base.errors import LidarpoolError
+from lidarsim.scene.files.meshfile import load_meshes
 
 MODEL = (
     '<?xml version="1.0"?>{doctype}'

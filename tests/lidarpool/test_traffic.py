@@ -12,15 +12,15 @@ from tests.shapes import cast_between, made
 
 from lidarpool import LidarpoolError, Mounted, Pose, Scene, Survey, Track, load_sensor, save_cloud
 from lidarpool.base.fingerprint import fingerprint
-from lidarpool.columns.cloud import Cloud
-from lidarpool.export.sweeps import Sweeps
 from lidarpool.run.picture_file import PictureContent
 from lidarpool.scenario.advice import advice
 from lidarpool.scenario.build import build
 from lidarpool.scenario.scenario import Scenario
-from lidarpool.scene.actors import Actor, box
-from lidarpool.simulator.rig import Rig
-from lidarpool.simulator.surfaces import Surfaces
+from lidarsim.columns.cloud import Cloud
+from lidarsim.scene.actors import Actor, box
+from lidarsim.simulator.rig import Rig
+from lidarsim.simulator.surfaces import Surfaces
+from lidarsim.sweeps.sweeps import Sweeps
 
 FLOOR = box("Floor", (60, 60, 0.01))
 COLUMNS = ["time", "range", "triangle", "intensity", "class"]

@@ -18,18 +18,18 @@ from PIL import Image
 from tests.usd_server import UsdServer
 
 from lidarpool import Pose, Scanner, Scene, Sensor
-from lidarpool.base import allowance
-from lidarpool.base.errors import LidarpoolError
-from lidarpool.columns.table import COLOURS
 from lidarpool.scenario.advice import advice
 from lidarpool.scenario.build import build
 from lidarpool.scenario.scenario import Scenario
-from lidarpool.scene.colours import LINEAR, as_srgb
-from lidarpool.scene.files import scene_graph as nodes
-from lidarpool.scene.files import usd
-from lidarpool.scene.files.meshfile import load_meshes, load_objects
-from lidarpool.scene.scene_instances import SceneInstance
-from lidarpool.scene.transform import Transform
+from lidarsim.base import allowance
+from lidarsim.base.errors import LidarpoolError
+from lidarsim.columns.table import COLOURS
+from lidarsim.scene.colours import LINEAR, as_srgb
+from lidarsim.scene.files import scene_graph as nodes
+from lidarsim.scene.files import usd
+from lidarsim.scene.files.meshfile import load_meshes, load_objects
+from lidarsim.scene.scene_instances import SceneInstance
+from lidarsim.scene.transform import Transform
 
 pytestmark = pytest.mark.skipif(find_spec("pxr") is None, reason="needs usd-core, an extra")
 

@@ -25,9 +25,9 @@ from lidarpool import (
     Survey,
     Track,
 )
-from lidarpool.scene.scene_mesh import SceneMesh
-from lidarpool.sensor.leaves import NAMES, brightness, density, projection
-from lidarpool.simulator.rig import Rig
+from lidarsim.scene.scene_mesh import SceneMesh
+from lidarsim.sensor.leaves import NAMES, brightness, density, projection
+from lidarsim.simulator.rig import Rig
 
 GROUND = Material("*", 0.3)
 cast = partial(shapes.cast, backend="embree")

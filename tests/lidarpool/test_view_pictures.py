@@ -23,10 +23,10 @@ from lidarpool.render.shot import GROUND, SKY, take_shot
 from lidarpool.render.stage import make_axis, nice_step
 from lidarpool.render.theme import object_colours
 from lidarpool.report.result_pictures import draw_path
-from lidarpool.scene.actors import box
-from lidarpool.scene.scene import Scene
-from lidarpool.scene.scene_mesh import SceneMesh
-from lidarpool.scene.shapes import seed_objects
+from lidarsim.scene.actors import box
+from lidarsim.scene.scene import Scene
+from lidarsim.scene.scene_mesh import SceneMesh
+from lidarsim.scene.shapes import seed_objects
 
 SIZE = (320, 200)
 LEFT = slice(0, int(0.8 * SIZE[0]))  # columns beside the legend

@@ -25,14 +25,14 @@ from lidarpool import (
 )
 from lidarpool.scenario.build import build
 from lidarpool.scenario.scenario import Scenario
-from lidarpool.scene.actors import one_mesh
-from lidarpool.scene.files.meshfile import load_meshes
-from lidarpool.scene.scene_file import write_scene
-from lidarpool.scene.scene_mesh import SceneMesh, Voxels
-from lidarpool.scene.transform import Transform
-from lidarpool.sensor.leaves import projection
-from lidarpool.simulator.memory import cast_bytes
-from lidarpool.simulator.rig import Rig
+from lidarsim.scene.actors import one_mesh
+from lidarsim.scene.files.meshfile import load_meshes
+from lidarsim.scene.scene_file import write_scene
+from lidarsim.scene.scene_mesh import SceneMesh, Voxels
+from lidarsim.scene.transform import Transform
+from lidarsim.sensor.leaves import projection
+from lidarsim.simulator.memory import cast_bytes
+from lidarsim.simulator.rig import Rig
 
 NAMES = "i j k PadBVTotal angleMean nbSampling"
 
@@ -317,8 +317,8 @@ def test_batches_blocks_and_backends_leave_no_trace(tmp_path, path, monkeypatch)
     rig = Rig(Scene.from_meshes(meshes), survey, "numpy")
     whole = cast_between(rig, survey, [0, 24])
     assert len(whole[0]["x"]) > 4000
-    monkeypatch.setattr("lidarpool.simulator.pulses.CHUNK_RAYS", 1000)
-    monkeypatch.setattr("lidarpool.simulator.voxels.BLOCK_RAYS", 33)
+    monkeypatch.setattr("lidarsim.simulator.pulses.CHUNK_RAYS", 1000)
+    monkeypatch.setattr("lidarsim.simulator.voxels.BLOCK_RAYS", 33)
     assert cast_between(rig, survey, [0, 1, 5, 12, 17, 24]) == whole
     if "embree" in CPU:
         other = Rig(Scene.from_meshes(meshes), survey, "embree")

@@ -22,14 +22,14 @@ from lidarpool import (
     Survey,
     save_cloud,
 )
-from lidarpool.columns.table import AXES, CAUSES, SCAN
-from lidarpool.columns.waveforms import WAVEFORM
 from lidarpool.report.report import CountedCloud
-from lidarpool.sensor.optics import FWHM, LIGHT_M_NS, Optics
-from lidarpool.simulator.batch import columns_of
-from lidarpool.simulator.returns import PulseReturns
-from lidarpool.simulator.rig import Rig
-from lidarpool.simulator.waveform import Digitizer, returns_in
+from lidarsim.columns.table import AXES, CAUSES, SCAN
+from lidarsim.columns.waveforms import WAVEFORM
+from lidarsim.sensor.optics import FWHM, LIGHT_M_NS, Optics
+from lidarsim.simulator.batch import columns_of
+from lidarsim.simulator.returns import PulseReturns
+from lidarsim.simulator.rig import Rig
+from lidarsim.simulator.waveform import Digitizer, returns_in
 from raybeam import available_backends
 
 SIGMA_NS = 5 / FWHM

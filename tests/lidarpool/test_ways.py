@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from lidarpool import LidarpoolError, Pose, Track
-from lidarpool.sensor import Stations
-from lidarpool.simulator.ways import Ways
+from lidarsim.sensor import Stations
+from lidarsim.simulator.ways import Ways
 
 
 class Circle:

@@ -33,14 +33,14 @@ from lidarpool import (
     simulate,
     sweeps,
 )
-from lidarpool.base.errors import explained
 from lidarpool.base.sealed import sealed, unsealed
-from lidarpool.base.storage import Storage
 from lidarpool.datasets.dataset import DataSet
 from lidarpool.datasets.job_table import JobRow
 from lidarpool.export.format_table import DATA_SETS
 from lidarpool.report.campaign_output import verify
 from lidarpool.run.progress import Progress
+from lidarsim.base.errors import explained
+from lidarsim.base.storage import Storage
 
 BASE = """
 sensor: {rays_per_revolution: 180, layers: 4, step_deg: 4}

@@ -19,7 +19,12 @@ from lidarpool import __version__
 ROOT = Path(__file__).parents[2]
 FOLDERS = {"lidarpool": ".", "raybeam": "kernels", "poolpart": "scheduler"}
 PACKAGES = {
-    "lidarpool": ["kernels/raybeam", "scheduler/poolpart", "workflows/lidarpool"],
+    "lidarpool": [
+        "kernels/raybeam",
+        "scheduler/poolpart",
+        "workflows/lidarsim",
+        "workflows/lidarpool",
+    ],
     "raybeam": ["raybeam"],
     "poolpart": ["poolpart"],
 }

@@ -35,13 +35,13 @@ from lidarpool import Cloud, LidarpoolError, save_cloud
 from lidarpool.cli.commands import cli
 from lidarpool.datasets.dataset import DATA_SETS
 from lidarpool.export.format_table import EXPORTS, LAYOUTS
+from lidarpool.scenario import point_scene as points
 from lidarpool.scenario.build import build
 from lidarpool.scenario.campaign_sections import CampaignSection
 from lidarpool.scenario.plausibility import implausibilities
 from lidarpool.scenario.scenario import Scenario
-from lidarpool.scene import point_scene as points
-from lidarpool.scene.files import meshfile, rasters
-from lidarpool.sensor.models import SensorModel, model_names, read_model
+from lidarsim.scene.files import meshfile, rasters
+from lidarsim.sensor.models import SensorModel, model_names, read_model
 
 ROOT = Path(__file__).parents[2]
 DOCUMENTS = [ROOT / "README.md", *sorted(ROOT.glob("docs/**/*.md"))]

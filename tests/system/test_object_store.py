@@ -20,14 +20,14 @@ from tests.system.test_resume import SCANS
 from tests.system.test_resume import SCENARIO as RESUMED
 
 import lidarpool as package
-from lidarpool.base.storage import Storage
-from lidarpool.columns.part_columns import PartColumns
 from lidarpool.columns.parts import unpack
 from lidarpool.datasets.dataset import job_file
 from lidarpool.datasets.job_table import JobRow
 from lidarpool.export.format_table import DATA_SETS
-from lidarpool.export.sweeps import SWEEPS_FILE
 from lidarpool.run.store import RunStore
+from lidarsim.base.storage import Storage
+from lidarsim.columns.part_columns import PartColumns
+from lidarsim.sweeps.sweeps import SWEEPS_FILE
 
 pytest.importorskip("s3fs", reason="parts in an object store need s3fs")
 server = pytest.importorskip("moto.server", reason="the object store of these tests is moto's")

@@ -17,7 +17,7 @@ from lidarpool import (
     simulate,
 )
 from lidarpool.api.result import Result
-from lidarpool.scene.shapes import seed_objects
+from lidarsim.scene.shapes import seed_objects
 
 SENSOR = Sensor.grid(rays_per_revolution=90, layers=6)
 

@@ -22,11 +22,11 @@ from tests.rows import quick
 from lidarpool import Campaign, Job, LidarpoolError, Noise, Scene, Sensor, Survey, merge, sweeps
 from lidarpool.base.sealed import sealed, unsealed
 from lidarpool.base.shard import Shard
-from lidarpool.base.storage import Storage
 from lidarpool.datasets.job_table import read_table
 from lidarpool.export.format_table import DATA_SETS
 from lidarpool.report.campaign_output import verify
-from lidarpool.scene.actors import box
+from lidarsim.base.storage import Storage
+from lidarsim.scene.actors import box
 
 CAMPAIGN = """
 base: base.yaml
@@ -517,7 +517,7 @@ def test_shards_fit_together_after_a_mesh_was_repaired(tmp_path, slots):
 KILLED = """
 import os, signal, sys
 from lidarpool import merge
-from lidarpool.base.storage import Storage
+from lidarsim.base.storage import Storage
 from lidarpool.datasets.job_table import read_table
 import lidarpool.report.campaign_output as output
 owners = {"take": Storage, "write_table": output, "finish": output.DataSet}

@@ -178,17 +178,17 @@ def raise_at(scan: int | str | None, scan_of=None):
     ("target", "stand_in", "message"),
     [
         (
-            "lidarpool.sensor.survey.Survey.scan",
+            "lidarsim.sensor.survey.Survey.scan",
             raise_at(0, lambda arguments: arguments[1]),
             "stage generate failed: scan 0: FloatingPointError",
         ),
         (
-            "lidarpool.simulator.rig.Rig.cast",
+            "lidarsim.simulator.rig.Rig.cast",
             raise_at(None),
             r"stage intersect failed: scan \d+: FloatingPointError",
         ),
         (
-            "lidarpool.simulator.scene_caster.RayCaster",
+            "lidarsim.simulator.scene_caster.RayCaster",
             raise_at(None),
             "preparing the scene on the casting workers failed: .*the mirror is loose",
         ),

@@ -3,34 +3,19 @@
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-from ._version import __version__
+from lidarsim._version import __version__
 
 if TYPE_CHECKING:
-    from .api.result import Result
-    from .api.simulation import Campaign, simulate
-    from .base.errors import LidarpoolError
-    from .columns.cloud import Cloud
-    from .columns.table import Column
-    from .compare.comparison import Comparison, compare
-    from .compare.fit import Fit, fit
-    from .datasets.loader import sweeps
-    from .datasets.sweep_data import Sweep
-    from .export.formats import save_cloud
-    from .export.open3d_cloud import to_open3d
-    from .export.ply import read_cloud
-    from .pipeline.messages import ScanFrame
-    from .plan import Plan, Planning
-    from .report.merging import merge
-    from .run.run_result import CampaignRun
-    from .run.store import remove_run
-    from .scenario.build import Job
-    from .scene.actors import Actor
-    from .scene.files.urdf import load_robot
-    from .scene.robot import Robot
-    from .scene.scene import Scene
-    from .scene.scene_instances import SceneInstance
-    from .scene.scene_mesh import SceneMesh
-    from .sensor import (
+    from lidarsim.base.errors import LidarpoolError
+    from lidarsim.columns.cloud import Cloud
+    from lidarsim.columns.table import Column
+    from lidarsim.scene.actors import Actor
+    from lidarsim.scene.files.urdf import load_robot
+    from lidarsim.scene.robot import Robot
+    from lidarsim.scene.scene import Scene
+    from lidarsim.scene.scene_instances import SceneInstance
+    from lidarsim.scene.scene_mesh import SceneMesh
+    from lidarsim.sensor import (
         Beams,
         Fault,
         Gnss,
@@ -47,10 +32,26 @@ if TYPE_CHECKING:
         Spin,
         Survey,
     )
-    from .sensor.models import load_sensor
-    from .sensor.trajectory import Track
-    from .sensor.trajectory_files import load_trajectory
-    from .simulator import Scanner
+    from lidarsim.sensor.models import load_sensor
+    from lidarsim.sensor.trajectory import Track
+    from lidarsim.sensor.trajectory_files import load_trajectory
+    from lidarsim.simulator import Scanner
+
+    from .api.result import Result
+    from .api.simulation import Campaign, simulate
+    from .compare.comparison import Comparison, compare
+    from .compare.fit import Fit, fit
+    from .datasets.loader import sweeps
+    from .datasets.sweep_data import Sweep
+    from .export.formats import save_cloud
+    from .export.open3d_cloud import to_open3d
+    from .export.ply import read_cloud
+    from .pipeline.messages import ScanFrame
+    from .plan import Plan, Planning
+    from .report.merging import merge
+    from .run.run_result import CampaignRun
+    from .run.store import remove_run
+    from .scenario.build import Job
 
 __all__ = [
     "Actor",
@@ -103,51 +104,41 @@ __all__ = [
     "to_open3d",
 ]
 
-# Where the names above are, but for those of `sensor`. They are imported when they are asked for,
-# which takes a second: the command has to see to its signals before (`__main__.py`).
+# Modules of the names above, except names of lidarsim. A module is imported when one of its names
+# is asked for: importing all takes a second, and the command sees to its signals before that
+# (`__main__.py`).
 _MODULES = {
-    "api.result": ("Result",),
-    "api.simulation": ("Campaign", "simulate"),
-    "base.errors": ("LidarpoolError",),
-    "columns.cloud": ("Cloud",),
-    "columns.table": ("Column",),
-    "datasets.loader": ("sweeps",),
-    "datasets.sweep_data": ("Sweep",),
-    "export.formats": ("save_cloud",),
-    "export.open3d_cloud": ("to_open3d",),
-    "export.ply": ("read_cloud",),
-    "pipeline.messages": ("ScanFrame",),
-    "plan": ("Plan", "Planning"),
-    "report.merging": ("merge",),
-    "compare.comparison": ("Comparison", "compare"),
-    "compare.fit": ("Fit", "fit"),
-    "run.run_result": ("CampaignRun",),
-    "run.store": ("remove_run",),
-    "scenario.build": ("Job",),
-    "scene.actors": ("Actor",),
-    "scene.scene_instances": ("SceneInstance",),
-    "scene.scene_mesh": ("SceneMesh",),
-    "scene.robot": ("Robot",),
-    "scene.scene": ("Scene",),
-    "scene.files.urdf": ("load_robot",),
-    "sensor.models": ("load_sensor",),
-    "sensor.trajectory": ("Track",),
-    "sensor.trajectory_files": ("load_trajectory",),
-    "simulator": ("Scanner",),
+    ".api.result": ("Result",),
+    ".api.simulation": ("Campaign", "simulate"),
+    ".datasets.loader": ("sweeps",),
+    ".datasets.sweep_data": ("Sweep",),
+    ".export.formats": ("save_cloud",),
+    ".export.open3d_cloud": ("to_open3d",),
+    ".export.ply": ("read_cloud",),
+    ".pipeline.messages": ("ScanFrame",),
+    ".plan": ("Plan", "Planning"),
+    ".report.merging": ("merge",),
+    ".compare.comparison": ("Comparison", "compare"),
+    ".compare.fit": ("Fit", "fit"),
+    ".run.run_result": ("CampaignRun",),
+    ".run.store": ("remove_run",),
+    ".scenario.build": ("Job",),
+    "lidarsim.scene.robot": ("Robot",),
+    "lidarsim.scene.files.urdf": ("load_robot",),
 }
 
 
 def __getattr__(name: str) -> Any:
     if name not in __all__:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    module = next((module for module, names in _MODULES.items() if name in names), "sensor")
-    found = getattr(import_module(f".{module}", __name__), name)
+    module = next((module for module, names in _MODULES.items() if name in names), "lidarsim")
+    value = getattr(import_module(module, __name__), name)
     # Importing a module of the folder compare puts the folder in the function's place.
-    if module.startswith("compare."):
+    if module.startswith(".compare."):
         comparison = import_module(".compare.comparison", __name__)
         globals()["compare"] = comparison.compare
-    globals()[name] = found
-    return found
+    globals()[name] = value
+    return value
 
 
 def __dir__() -> list[str]:

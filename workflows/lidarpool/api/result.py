@@ -14,9 +14,10 @@ from pathlib import Path
 from tempfile import TemporaryDirectory, mkdtemp
 from typing import TYPE_CHECKING, Any
 
+from lidarsim.base.validation import checked
+from lidarsim.base.words import plural
+
 from ..base.notebook import cell_display
-from ..base.validation import checked
-from ..base.words import plural
 from ..export.formats import save_cloud
 from ..run.run_result import RunResult
 

@@ -9,13 +9,17 @@ from typing import Annotated
 from distributed import Client
 from pydantic import Field
 
-from ..base.declared import declared
-from ..base.errors import LidarpoolError
+from lidarsim.base.declared import declared
+from lidarsim.base.errors import LidarpoolError
+from lidarsim.base.storage import Storage
+from lidarsim.base.validation import checked
+from lidarsim.base.vocabulary import PATIENCE_S, WAIT_S
+from lidarsim.base.words import did_you_mean
+from lidarsim.scene.scene import Scene
+from lidarsim.sensor import Survey
+from lidarsim.simulator.scene_caster import check_backend_here
+
 from ..base.shard import Shard
-from ..base.storage import Storage
-from ..base.validation import checked
-from ..base.vocabulary import PATIENCE_S, WAIT_S
-from ..base.words import did_you_mean
 from ..export.folder import output_place
 from ..live import page_of
 from ..pipeline.messages import ScanFrame
@@ -30,9 +34,6 @@ from ..run.store import RUN_FOLDER
 from ..run.stream import SweepStream
 from ..scenario import campaign as described
 from ..scenario.build import Job
-from ..scene.scene import Scene
-from ..sensor import Survey
-from ..simulator.scene_caster import check_backend_here
 from .result import Result
 
 

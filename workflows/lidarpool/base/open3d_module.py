@@ -8,8 +8,8 @@ from importlib.util import find_spec, module_from_spec
 from threading import Lock
 from typing import Any
 
-from .errors import LidarpoolError
-from .interrupts import deferred_interrupts
+from lidarsim.base.errors import LidarpoolError
+from lidarsim.base.interrupts import deferred_interrupts
 
 _LOCK = Lock()  # a second thread would find the package that is to be taken away
 

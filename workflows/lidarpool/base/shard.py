@@ -7,7 +7,7 @@ import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from .errors import LidarpoolError
+from lidarsim.base.errors import LidarpoolError
 
 _SLURM = [f"SLURM_ARRAY_TASK_{name}" for name in ("ID", "MIN", "MAX", "STEP", "COUNT")]
 _KUBERNETES = ["JOB_COMPLETION_INDEX"]

@@ -14,14 +14,13 @@ import numpy as np
 import psutil
 from distributed import get_worker
 
+from lidarsim._version import __version__
+from lidarsim.base.errors import LidarpoolError
 from raybeam import backend_build
-
-from .._version import __version__
-from .errors import LidarpoolError
 
 T = TypeVar("T")
 
-PACKAGES = ("lidarpool", "poolpart", "raybeam")
+PACKAGES = ("lidarpool", "lidarsim", "poolpart", "raybeam")
 IMPORTED = time.time()  # in a forked worker, when the fork server imported it
 CLOCKS_S = 5.0  # clocks of a file server and of this machine may differ by so much
 
@@ -73,11 +72,11 @@ def software_there(backend: str = "") -> Callable[[], dict[str, str]]:
 
     def ask() -> dict[str, str]:
         try:
-            from lidarpool._version import __version__
+            from lidarsim._version import __version__
         except ModuleNotFoundError:
             return {}
         try:
-            from lidarpool.base.software import software
+            from .software import software
         except ModuleNotFoundError:
             return {"lidarpool": __version__}
         return software(backend)

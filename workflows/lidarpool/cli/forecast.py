@@ -18,14 +18,22 @@ from dask.utils import format_bytes
 from distributed import Client
 from distributed.system import MEMORY_LIMIT
 
+from lidarsim.base.errors import LidarpoolError, Mistakes
+from lidarsim.base.storage import Storage
+from lidarsim.base.words import plural
+from lidarsim.columns.cloud import CHUNK_POINTS
+from lidarsim.scene.actors import shapes_of
+from lidarsim.scene.scene import Scene
+from lidarsim.scene.simplified import DRAWN_TRIANGLES
+from lidarsim.sensor import Survey
+from lidarsim.simulator.memory import MB, cast_bytes, scans_that_fit
+from lidarsim.simulator.rig import PATTERN_RAYS
+from lidarsim.simulator.sampling import sample_survey
+from lidarsim.simulator.scene_caster import check_backend_here
 from poolpart import Pool
 from poolpart.probe import visible_gpus
 from raybeam import available_backends
 
-from ..base.errors import LidarpoolError, Mistakes
-from ..base.storage import Storage
-from ..base.words import plural
-from ..columns.cloud import CHUNK_POINTS
 from ..export.navigation_files import instrument_bytes
 from ..pipeline.database import FILE
 from ..pipeline.names import GPU, LIDAR, OTHER
@@ -42,14 +50,6 @@ from ..scenario.campaign import CampaignSpec, is_campaign
 from ..scenario.empty_cloud import EMPTY, empty_cloud_reason
 from ..scenario.plausibility import implausibilities
 from ..scenario.scenario import Scenario
-from ..scene.actors import shapes_of
-from ..scene.scene import Scene
-from ..scene.simplified import DRAWN_TRIANGLES
-from ..sensor import Survey
-from ..simulator.memory import MB, cast_bytes, scans_that_fit
-from ..simulator.rig import PATTERN_RAYS
-from ..simulator.sampling import sample_survey
-from ..simulator.scene_caster import check_backend_here
 from .terminal import Terminal
 
 # Measured on Linux: a process of ours with Dask loaded, and the most that a triangle takes while a

@@ -10,9 +10,10 @@ from typing import Any
 
 import click
 
-from ..base.errors import LidarpoolError
-from ..base.storage import Storage
-from ..base.vocabulary import PICTURES, UNITS_M
+from lidarsim.base.errors import LidarpoolError
+from lidarsim.base.storage import Storage
+from lidarsim.base.vocabulary import PICTURES, UNITS_M
+
 from ..export.format_table import EXPORTS, FORMATS, LAYOUTS
 from . import shared_options as options
 
@@ -120,11 +121,12 @@ def export(
       lidarpool export lidarpool-out --format laz
       lidarpool export lidarpool-out --format mcap --layout autoware --out bags
     """  # noqa: D301 - click wants the character, not its name
+    from lidarsim.sweeps.instruments import INSTRUMENT_FILES
+    from lidarsim.sweeps.sweeps import SWEEPS_FILE, Sweeps
+
     from ..columns.cloud_file import CloudFile
     from ..export.folder import local_result, result_folder, send
     from ..export.formats import Format
-    from ..export.instruments import INSTRUMENT_FILES
-    from ..export.sweeps import SWEEPS_FILE, Sweeps
 
     # The report of a result is moved into place last.
     needed = ("cloud.ply", SWEEPS_FILE, "report.json")
@@ -198,8 +200,9 @@ def view(
       lidarpool view before after
       lidarpool view drive --film drive.gif --export drive.html
     """  # noqa: D301 - click wants the character, not its name
+    from lidarsim.sweeps.sweeps import SWEEPS_FILE
+
     from ..export.folder import local_result
-    from ..export.sweeps import SWEEPS_FILE
     from ..live.sharing import share
     from ..live.view import CLOUD, open_results, show_view
     from ..run.picture_file import PICTURE_FILE

@@ -12,10 +12,12 @@ from typing import Any
 
 import click
 
-from ..base.errors import LidarpoolError
+from lidarsim.base.errors import LidarpoolError
+from lidarsim.base.storage import Storage
+from lidarsim.base.words import plural
+from lidarsim.simulator.scene_caster import check_backend_here
+
 from ..base.shard import Shard, shard_in_words
-from ..base.storage import Storage
-from ..base.words import plural
 from ..datasets.dataset import DataSet
 from ..datasets.job_table import Tally, read_table
 from ..export.folder import local_result, output_place, result_folder
@@ -33,7 +35,6 @@ from ..scenario.build import Built, Job, build
 from ..scenario.campaign import CampaignSpec
 from ..scenario.plausibility import implausibilities
 from ..scenario.scenario import Scenario
-from ..simulator.scene_caster import check_backend_here
 from .shared_options import show
 from .terminal import Terminal
 

@@ -9,11 +9,12 @@ from typing import Any
 
 import numpy as np
 
-from ..base.arrays import AnyArray, AnyFloats, Ints, Records
-from ..base.sampling import even_indices
-from .cloud import CHUNK_POINTS, Cloud
+from lidarsim.base.arrays import AnyArray, AnyFloats, Ints, Records
+from lidarsim.base.sampling import even_indices
+from lidarsim.columns.cloud import CHUNK_POINTS, Cloud
+from lidarsim.columns.table import TABLE, Column
+
 from .ply_format import AXES, mapped_rows
-from .table import TABLE, Column
 
 
 class CloudFile:

@@ -20,16 +20,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import DTypeLike
 
-from ..base.archives import read_arrays, read_npy
-from ..base.arrays import AnyArray, Floats, Integers, Ints, Ints32
-from ..base.errors import LidarpoolError
-from ..base.input_files import open_input
-from ..base.sampling import even_indices
-from ..base.storage import Storage, target_of
-from .cloud import CHUNK_POINTS, Cloud, Shown, need_packages
-from .part_columns import PartColumns, positions_of
-from .table import AXES, SCAN, Column
-from .waveforms import WAVEFORM
+from lidarsim.base.archives import read_arrays, read_npy
+from lidarsim.base.arrays import AnyArray, Floats, Integers, Ints, Ints32
+from lidarsim.base.errors import LidarpoolError
+from lidarsim.base.input_files import open_input
+from lidarsim.base.sampling import even_indices
+from lidarsim.base.storage import Storage, target_of
+from lidarsim.columns.cloud import CHUNK_POINTS, Cloud, Shown, need_packages
+from lidarsim.columns.part_columns import PartColumns, positions_of
+from lidarsim.columns.table import AXES, SCAN, Column
+from lidarsim.columns.waveforms import WAVEFORM
 
 # Files of a run in the folder of its parts: its mark, then what it is.
 _PART = re.compile(r"([0-9a-f]{16})-(\d{6,})-(\d{8,})-(\d{8,})\.npz", re.ASCII)

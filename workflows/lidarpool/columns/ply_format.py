@@ -9,10 +9,10 @@ from typing import Any
 
 import numpy as np
 
-from ..base.arrays import AnyArray, Records
-from ..base.errors import LidarpoolError, explained
-from ..base.input_files import open_input
-from .table import Column
+from lidarsim.base.arrays import AnyArray, Records
+from lidarsim.base.errors import LidarpoolError, explained
+from lidarsim.base.input_files import open_input
+from lidarsim.columns.table import Column
 
 AXES = ("x", "y", "z")
 

@@ -13,15 +13,16 @@ from matplotlib.axes import Axes
 from matplotlib.colors import LogNorm, Normalize
 from pydantic import Field
 
-from .._version import __version__
-from ..base.arrays import AnyArray, Floats, Ints
-from ..base.errors import LidarpoolError, explained
+from lidarsim._version import __version__
+from lidarsim.base.arrays import AnyArray, Floats, Ints
+from lidarsim.base.errors import LidarpoolError, explained
+from lidarsim.base.sampling import even_indices
+from lidarsim.base.validation import checked
+from lidarsim.base.vocabulary import UNITS_M
+from lidarsim.base.words import plural
+from lidarsim.columns.cloud import Cloud
+
 from ..base.open3d_module import load_open3d
-from ..base.sampling import even_indices
-from ..base.validation import checked
-from ..base.vocabulary import UNITS_M
-from ..base.words import plural
-from ..columns.cloud import Cloud
 from ..columns.parts import StoredCloud
 from ..datasets.figures import rank_correlation
 from ..export.folder import result_folder, staging

@@ -12,26 +12,27 @@ import numpy as np
 import yaml
 from pydantic import Field
 
-from .._version import __version__
-from ..base.arrays import Bools, Floats, Floats32, Ints
-from ..base.errors import LidarpoolError, explained, prefixed
-from ..base.extras import need
+from lidarsim._version import __version__
+from lidarsim.base.arrays import Bools, Floats, Floats32, Ints
+from lidarsim.base.errors import LidarpoolError, explained, prefixed
+from lidarsim.base.extras import need
+from lidarsim.base.sampling import even_indices
+from lidarsim.base.storage import Storage
+from lidarsim.base.validation import checked
+from lidarsim.base.words import plural
+from lidarsim.columns.cloud import Cloud
+from lidarsim.scene.scene import Scene
+from lidarsim.sensor import Pose, Spin
+from lidarsim.sensor.models import MODEL_FILES, Performance, SensorModel, read_model
+from lidarsim.sensor.noise import TARGET_REFLECTANCE, THRESHOLD_SIGMAS
+from lidarsim.sensor.ray_sensors import ListedSensor
+from lidarsim.simulator import Scanner
+
 from ..base.open3d_module import load_open3d
-from ..base.sampling import even_indices
-from ..base.storage import Storage
-from ..base.validation import checked
-from ..base.words import plural
-from ..columns.cloud import Cloud
 from ..columns.parts import StoredCloud
 from ..render import theme
 from ..render.picture_page import Page, label_logarithms
 from ..report.page.rendering import rendered
-from ..scene.scene import Scene
-from ..sensor import Pose, Spin
-from ..sensor.models import MODEL_FILES, Performance, SensorModel, read_model
-from ..sensor.noise import TARGET_REFLECTANCE, THRESHOLD_SIGMAS
-from ..sensor.ray_sensors import ListedSensor
-from ..simulator import Scanner
 from .range_image import range_images
 from .recordings import Recording, open_recording
 

@@ -11,9 +11,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ..base.arrays import Bools, Floats, Indices, Ints
-from ..base.errors import LidarpoolError
-from ..base.words import plural
+from lidarsim.base.arrays import Bools, Floats, Indices, Ints
+from lidarsim.base.errors import LidarpoolError
+from lidarsim.base.words import plural
+
 from .recordings import Turn
 
 _TILT_DEG = 1.0  # width of the middle half of a ring's elevations, of rings near each other

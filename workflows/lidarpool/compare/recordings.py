@@ -15,23 +15,24 @@ from typing import Any
 
 import numpy as np
 
-from ..base.arrays import AnyArray, Floats, Indices, Ints
-from ..base.errors import LidarpoolError
-from ..base.extras import need, reading
+from lidarsim.base.arrays import AnyArray, Floats, Indices, Ints
+from lidarsim.base.errors import LidarpoolError
+from lidarsim.base.extras import need, reading
+from lidarsim.base.input_files import input_size, open_input, read_input
+from lidarsim.base.vocabulary import UNITS_M
+from lidarsim.base.words import did_you_mean, natural
+from lidarsim.columns.bags import POINT_CLOUD, open_bag, point_columns
+from lidarsim.columns.cloud import CHUNK_POINTS, Cloud, CloudLike
+from lidarsim.scene.files.las import las_units, open_las
+from lidarsim.scene.files.pcd import checked_pcd
+from lidarsim.scene.files.polygon_files import read_ply_columns
+from lidarsim.sweeps.sweeps import SWEEPS_FILE, Placed, Sweeps
+
 from ..base.fingerprint import fingerprint
-from ..base.input_files import input_size, open_input, read_input
-from ..base.vocabulary import UNITS_M
-from ..base.words import did_you_mean, natural
-from ..columns.bags import POINT_CLOUD, open_bag, point_columns
-from ..columns.cloud import CHUNK_POINTS, Cloud, CloudLike
 from ..columns.cloud_file import CloudFile
 from ..columns.parts import StoredCloud
 from ..datasets.dataset import INDEX_FILE
 from ..datasets.loader import sweeps
-from ..export.sweeps import SWEEPS_FILE, Placed, Sweeps
-from ..scene.files.las import las_units, open_las
-from ..scene.files.pcd import checked_pcd
-from ..scene.files.polygon_files import read_ply_columns
 
 KINDS = (
     "the folder of a result or data set, a .ply, a .pcd or a folder of them, a .las or .laz, a bag "

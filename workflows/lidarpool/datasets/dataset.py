@@ -17,13 +17,15 @@ from typing import Any, Literal, TypeVar
 
 import numpy as np
 
-from .._version import __version__
-from ..base.archives import packed
-from ..base.errors import LidarpoolError, explained
+from lidarsim._version import __version__
+from lidarsim.base.archives import packed
+from lidarsim.base.errors import LidarpoolError, explained
+from lidarsim.base.storage import Storage
+from lidarsim.base.validation import checked_fields
+from lidarsim.columns.cloud import CloudLike
+from lidarsim.sweeps.sweeps import SWEEPS_FILE, Sweeps
+
 from ..base.sealed import SealedWriter
-from ..base.storage import Storage
-from ..base.validation import checked_fields
-from ..columns.cloud import CloudLike
 from ..export.boxes import Boxes
 from ..export.folder import local_folder
 from ..export.format_table import DATA_SETS, FORMATS, LAYOUTS, FormatRow
@@ -31,7 +33,6 @@ from ..export.formats import Format
 from ..export.kitti import NAMES_FILE, labels_file
 from ..export.nuscenes import merge
 from ..export.pieces import Entry, Pieces, pieces_of
-from ..export.sweeps import SWEEPS_FILE, Sweeps
 from .job_table import TABLE_FILE, JobRow, Tally
 
 T = TypeVar("T")

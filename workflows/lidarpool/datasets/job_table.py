@@ -27,10 +27,10 @@ from typing import IO, Any
 
 import numpy as np
 
-from ..base.errors import LidarpoolError, explained
-from ..base.input_files import open_input
-from ..base.storage import Storage
-from ..columns.cloud import Cloud, CloudLike
+from lidarsim.base.errors import LidarpoolError, explained
+from lidarsim.base.input_files import open_input
+from lidarsim.base.storage import Storage
+from lidarsim.columns.cloud import Cloud, CloudLike
 
 Value = bool | int | float | str
 

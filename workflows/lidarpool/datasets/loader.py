@@ -20,18 +20,19 @@ from typing import Annotated, Any
 import numpy as np
 from pydantic import Field
 
-from ..base.archives import open_archive
-from ..base.errors import LidarpoolError
+from lidarsim.base.archives import open_archive
+from lidarsim.base.errors import LidarpoolError
+from lidarsim.base.storage import Storage
+from lidarsim.base.validation import checked
+from lidarsim.base.words import did_you_mean
+from lidarsim.sweeps.sweeps import SWEEPS_FILE, Sweeps
+
 from ..base.sealed import unsealed
-from ..base.storage import Storage
-from ..base.validation import checked
-from ..base.words import did_you_mean
 from ..export.boxes import Boxes
 from ..export.format_table import DATA_SETS
 from ..export.formats import Format
 from ..export.pieces import Entry
 from ..export.reading import Reader
-from ..export.sweeps import SWEEPS_FILE, Sweeps
 from .dataset import BOXES_FILE, INDEX_FILE, VERSION, job_file
 from .job_table import AGAIN, TABLE_FILE, JobRow, read_table
 from .sweep_data import Sweep

@@ -12,7 +12,8 @@ import torch
 import torch.distributed
 import torch.utils.data
 
-from ..base.errors import LidarpoolError
+from lidarsim.base.errors import LidarpoolError
+
 from .sweep_data import Sweep
 
 if TYPE_CHECKING:

@@ -8,10 +8,10 @@ from functools import cached_property
 
 import numpy as np
 
-from ..base.arrays import Bools, Bytes, Floats, Indices, Ints
-from ..base.errors import LidarpoolError
-from ..columns.cloud import Cloud
-from .sweeps import MIXED_UP, Sweeps
+from lidarsim.base.arrays import Bools, Bytes, Floats, Indices, Ints
+from lidarsim.base.errors import LidarpoolError
+from lidarsim.columns.cloud import Cloud
+from lidarsim.sweeps.sweeps import MIXED_UP, Sweeps
 
 _MAX_SOURCE = 65_535  # that the format holds
 # A flight line begins where the direction of flight has changed by so much, and then stays within

@@ -12,8 +12,8 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
-from ..base.errors import LidarpoolError, explained
-from ..base.storage import WRITING, Storage, is_url
+from lidarsim.base.errors import LidarpoolError, explained
+from lidarsim.base.storage import WRITING, Storage, is_url
 
 LAST_FILE = "report.json"  # a result with this file is complete
 

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 from importlib import import_module
 from typing import Any
 
-from ..base.errors import LidarpoolError
+from lidarsim.base.errors import LidarpoolError
 
 
 @dataclass(frozen=True)

@@ -12,18 +12,19 @@ from typing import Annotated, Any, Literal
 
 import numpy as np
 
-from ..base.declared import about
-from ..base.errors import LidarpoolError, explained
-from ..base.storage import Storage, flush
-from ..base.validation import checked, checked_fields
-from ..columns.cloud import Cloud, CloudLike
+from lidarsim.base.declared import about
+from lidarsim.base.errors import LidarpoolError, explained
+from lidarsim.base.storage import Storage, flush
+from lidarsim.base.validation import checked, checked_fields
+from lidarsim.columns.cloud import Cloud, CloudLike
+from lidarsim.sweeps.sweeps import Sweeps
+
 from ..columns.parts import StoredCloud
 from .folder import staging
 from .format_table import EXPORTS, FORMATS, LAYOUTS, FormatRow
 from .laser_scan import COLUMNS as LASER_SCAN_COLUMNS
 from .laser_scan import has_laser_scans
 from .pieces import RangeWorkers, RangeWriter
-from .sweeps import Sweeps
 
 _ENDINGS = {Path(row.file).suffix: name for name, row in FORMATS.items() if "." in row.file}
 _FILES = "; ".join(f"{name}: {FORMATS[name].file}" for name in EXPORTS)

@@ -10,15 +10,16 @@ from typing import Any
 
 import numpy as np
 
-from ..base.archives import open_archive, packed
-from ..base.arrays import AnyArray, Ints, Ints32
-from ..base.errors import LidarpoolError
-from ..columns.cloud import Cloud, CloudLike
-from ..sensor import Sensor
+from lidarsim.base.archives import open_archive, packed
+from lidarsim.base.arrays import AnyArray, Ints, Ints32
+from lidarsim.base.errors import LidarpoolError
+from lidarsim.columns.cloud import Cloud, CloudLike
+from lidarsim.sensor import Sensor
+from lidarsim.sweeps.sweeps import MIXED_UP, Fired, Sweeps, plain_names
+
 from . import pieces, reading
 from .boxes import Boxes
 from .pieces import Entry
-from .sweeps import MIXED_UP, Fired, Sweeps, plain_names
 
 # Columns of points that images have for every ray, or that its place in them is.
 _OF_RAYS = ("scan", "ray", "channel", "sensor", "time", "azimuth", "elevation")

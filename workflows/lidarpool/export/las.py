@@ -20,13 +20,14 @@ import lazrs
 import numpy as np
 from laspy.vlrs.known import WaveformPacketStruct, WaveformPacketVlr, WktCoordinateSystemVlr
 
-from ..base.errors import LidarpoolError
-from ..base.interrupts import deferred_interrupts
-from ..columns.cloud import Cloud, CloudLike
-from ..columns.table import COLOURS, NORMAL, TABLE
-from ..columns.waveforms import WAVEFORM, ZERO, records
+from lidarsim.base.errors import LidarpoolError
+from lidarsim.base.interrupts import deferred_interrupts
+from lidarsim.columns.cloud import Cloud, CloudLike
+from lidarsim.columns.table import COLOURS, NORMAL, TABLE
+from lidarsim.columns.waveforms import WAVEFORM, ZERO, records
+from lidarsim.sweeps.sweeps import AS_FIRED, IN_WORLD, Sweeps
+
 from .flight_lines import FlightLines
-from .sweeps import AS_FIRED, IN_WORLD, Sweeps
 
 ANGLE_DEG = 0.006  # of one step of the format's scan angle
 FULL = 65_535  # the format's intensity for 1 and above

@@ -6,8 +6,9 @@ from typing import Any
 
 import numpy as np
 
+from lidarsim.columns.cloud import Cloud
+
 from ..base.open3d_module import load_open3d
-from ..columns.cloud import Cloud
 
 
 def to_open3d(cloud: Cloud) -> Any:

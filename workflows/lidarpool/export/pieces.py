@@ -10,12 +10,13 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from ..base.arrays import AnyArray
-from ..base.errors import LidarpoolError
-from ..base.storage import Storage
-from ..columns.cloud import Cloud, CloudLike
+from lidarsim.base.arrays import AnyArray
+from lidarsim.base.errors import LidarpoolError
+from lidarsim.base.storage import Storage
+from lidarsim.columns.cloud import Cloud, CloudLike
+from lidarsim.sweeps.sweeps import MIXED_UP, Sweeps
+
 from .format_table import FORMATS
-from .sweeps import MIXED_UP, Sweeps
 
 # NumPy, pyarrow and system calls for the disk hold Python's lock at most 6 % of the time.
 THREADS = min(4, os.cpu_count() or 1)

@@ -8,18 +8,19 @@ from pathlib import Path
 
 import numpy as np
 
-from ..base.arrays import AnyFloats, Records
-from ..base.errors import LidarpoolError
+from lidarsim.base.arrays import AnyFloats, Records
+from lidarsim.base.errors import LidarpoolError
+from lidarsim.base.validation import checked
+from lidarsim.base.words import printable
+from lidarsim.columns.cloud import CHUNK_POINTS, Cloud, CloudLike
+from lidarsim.columns.table import AXES as POSITION
+from lidarsim.columns.table import NORMAL, TABLE, check_names
+from lidarsim.sweeps.sweeps import AS_FIRED, SWEEPS_FILE, Sweeps
+
 from ..base.open3d_module import load_open3d
-from ..base.validation import checked
-from ..base.words import printable
-from ..columns.cloud import CHUNK_POINTS, Cloud, CloudLike
 from ..columns.cloud_file import CloudFile
 from ..columns.ply_format import AXES, as_held, header, layout, mapped_rows, row_type
-from ..columns.table import AXES as POSITION
-from ..columns.table import NORMAL, TABLE, check_names
 from . import reading
-from .sweeps import AS_FIRED, SWEEPS_FILE, Sweeps
 
 # Positions are stored in single precision if the error is below this part of the precision.
 _ROUNDING_SHARE = 0.05

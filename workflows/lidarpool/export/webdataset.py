@@ -11,15 +11,16 @@ from functools import cached_property, partial
 
 import numpy as np
 
-from ..base.archives import open_archive, packed, read_npy
-from ..base.arrays import AnyArray, Ints
-from ..base.errors import LidarpoolError
-from ..base.storage import Storage
-from ..columns.cloud import Cloud, CloudLike
+from lidarsim.base.archives import open_archive, packed, read_npy
+from lidarsim.base.arrays import AnyArray, Ints
+from lidarsim.base.errors import LidarpoolError
+from lidarsim.base.storage import Storage
+from lidarsim.columns.cloud import Cloud, CloudLike
+from lidarsim.sweeps.sweeps import AS_FIRED, COMPENSATED, Sweeps, plain_names
+
 from . import pieces, reading
 from .boxes import Boxes, SweepBoxes
 from .pieces import Entry, PieceRange, WrittenRange
-from .sweeps import AS_FIRED, COMPENSATED, Sweeps, plain_names
 
 SHARD_MOST = 1_000_000_000  # bytes of a tar file, unless a single sweep has more
 _OWN = ("points", "pose", "boxes")  # arrays that are no columns

@@ -21,18 +21,18 @@ from typing import Any
 import click
 import numpy as np
 
+from lidarsim.base.arrays import Floats, Floats32
+from lidarsim.base.errors import LidarpoolError
+from lidarsim.base.storage import Storage
+from lidarsim.columns.cloud import Cloud
+from lidarsim.sweeps.sweeps import SWEEPS_FILE, Sweeps
 from poolpart import Partition, PartitionStats
 
-from ..base.arrays import Floats, Floats32
-from ..base.errors import LidarpoolError
-from ..base.storage import Storage
-from ..columns.cloud import Cloud
 from ..columns.cloud_file import CloudFile
 from ..columns.parts import read_part
 from ..datasets.dataset import DataSet, job_file
 from ..datasets.figures import Figures
 from ..datasets.job_table import JobRow, Value
-from ..export.sweeps import SWEEPS_FILE, Sweeps
 from ..pipeline.messages import Receipt, ScanFrame
 from ..plan import best
 from ..report.charts import draw_results, draw_varied

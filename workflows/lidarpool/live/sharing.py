@@ -16,11 +16,12 @@ import click
 import numpy as np
 from PIL import Image
 
-from ..base.arrays import AnyArray, Floats
-from ..base.errors import LidarpoolError, explained
-from ..base.storage import Storage
-from ..columns.cloud import Cloud
-from ..export.sweeps import Sweeps
+from lidarsim.base.arrays import AnyArray, Floats
+from lidarsim.base.errors import LidarpoolError, explained
+from lidarsim.base.storage import Storage
+from lidarsim.columns.cloud import Cloud
+from lidarsim.sweeps.sweeps import Sweeps
+
 from ..render.colouring import TURBO
 from ..render.film import Film
 from ..run.progress import Screen, Written

@@ -17,19 +17,24 @@ from typing import Any
 import click
 import numpy as np
 
+from lidarsim.base.arrays import AnyArray, Bytes, Floats, Floats32, Ints
+from lidarsim.base.errors import LidarpoolError
+from lidarsim.base.words import plural
+from lidarsim.columns.cloud import Cloud
+from lidarsim.columns.table import AXES as POSITION
+from lidarsim.columns.table import CAUSES, NO_SURFACE, OBJECT, TABLE, Column, X, Y, Z, by_value
+from lidarsim.scene.actors import Actor, samples_each, shapes_of
+from lidarsim.scene.colours import as_bytes
+from lidarsim.scene.scene import Scene
+from lidarsim.scene.simplified import simplified
+from lidarsim.sensor.trajectory import presence_ns
+from lidarsim.sweeps.sweeps import SWEEPS_FILE, Sweeps
 from raybeam import RayCaster
 
-from ..base.arrays import AnyArray, Bytes, Floats, Floats32, Ints
-from ..base.errors import LidarpoolError
 from ..base.notebook import cell_display
-from ..base.words import plural
-from ..columns.cloud import Cloud
 from ..columns.cloud_file import CloudFile
 from ..columns.ply_format import AXES
-from ..columns.table import AXES as POSITION
-from ..columns.table import CAUSES, NO_SURFACE, OBJECT, TABLE, Column, X, Y, Z, by_value
 from ..export.formats import Format, save_cloud
-from ..export.sweeps import SWEEPS_FILE, Sweeps
 from ..pipeline.database import FILE
 from ..render.closeup import around_ways, floor_and_cut
 from ..render.colouring import (
@@ -46,11 +51,6 @@ from ..render.surface import apart
 from ..render.theme import mapped, object_colours
 from ..run.picture_file import PICTURE_FILE, PLACES_MOST, PictureContent, SensorWay, ways_of
 from ..run.store import RUN_FOLDER
-from ..scene.actors import Actor, samples_each, shapes_of
-from ..scene.colours import as_bytes
-from ..scene.scene import Scene
-from ..scene.simplified import simplified
-from ..sensor.trajectory import presence_ns
 from .point_selection import (
     RESULT,
     Eye,

@@ -13,15 +13,15 @@ from typing import Any
 import cloudpickle
 from distributed import Future
 
+from lidarsim.base.errors import LidarpoolError
+from lidarsim.scene.scene import Scene
+from lidarsim.sensor import Survey
 from poolpart import Partition
 from poolpart.fetch import fetch_available
 from poolpart.task_locations import TaskLocations, look_for_tasks
 from poolpart.workers import worker_identities
 
-from ..base.errors import LidarpoolError
 from ..base.software import difference, software_there
-from ..scene.scene import Scene
-from ..sensor import Survey
 from .failures import JobError, error_of, raise_if_failed, was_killed, words_on_memory
 from .job_state import Outcome
 from .messages import BatchRange

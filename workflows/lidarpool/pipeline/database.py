@@ -22,8 +22,9 @@ from typing import Any
 
 import numpy as np
 
-from ..base.arrays import Ints
-from ..base.errors import LidarpoolError
+from lidarsim.base.arrays import Ints
+from lidarsim.base.errors import LidarpoolError
+
 from ..columns.parts import part_name
 from ..datasets.job_table import JOBS_MOST
 from ..plan import Trial

@@ -14,9 +14,10 @@ import time
 from collections.abc import Callable, Iterable, Sequence
 from itertools import chain
 
-from ..columns.cloud import Cloud
-from ..scene.scene import Scene
-from ..sensor import Survey
+from lidarsim.columns.cloud import Cloud
+from lidarsim.scene.scene import Scene
+from lidarsim.sensor import Survey
+
 from .casting_workers import CastingWorkers
 from .database import RunDatabase
 from .dispatch import Dispatcher

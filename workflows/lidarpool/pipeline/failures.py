@@ -7,10 +7,10 @@ from contextlib import AbstractContextManager, contextmanager
 
 from distributed import Client, Future, KilledWorker
 
+from lidarsim.base.errors import LidarpoolError, explained
+from lidarsim.base.storage import Storage
 from poolpart.task_context import WorkerLeft
 
-from ..base.errors import LidarpoolError, explained
-from ..base.storage import Storage
 from .messages import scans_in_words
 
 ASK_S = 10.0  # for an error's text, which the scheduler has

@@ -23,14 +23,14 @@ from typing import Any
 
 from distributed import Future, Lock
 
+from lidarsim.base.errors import LidarpoolError
+from lidarsim.base.storage import Storage
 from poolpart import Partition, Pipe, PipeFailed
 from poolpart.fetch import fetch_available, take_held
 from poolpart.pipe import forget_pipes, take_news
 from poolpart.task_locations import TaskLocations, look_for_tasks
 
-from ..base.errors import LidarpoolError
 from ..base.software import call_alike
-from ..base.storage import Storage
 from ..columns.parts import probe_name
 from .failures import raise_if_failed, storing, was_killed, words_on_memory
 from .messages import CollectOrder, Description, Message, Receipt, StageStart, Summaries

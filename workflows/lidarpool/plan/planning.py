@@ -10,10 +10,11 @@ from typing import Annotated
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..base.arrays import Floats
-from ..base.declared import Seed, about
-from ..base.errors import LidarpoolError
-from ..base.validation import checked_fields
+from lidarsim.base.arrays import Floats
+from lidarsim.base.declared import Seed, about
+from lidarsim.base.errors import LidarpoolError
+from lidarsim.base.validation import checked_fields
+
 from .geometry import segment_distances
 
 

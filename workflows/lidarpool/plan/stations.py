@@ -10,15 +10,14 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
+from lidarsim.base.arrays import Bools, Floats, Ints
+from lidarsim.base.errors import LidarpoolError
+from lidarsim.base.validation import checked
+from lidarsim.scene.floor import SLAB_M
+from lidarsim.scene.scene import Scene
+from lidarsim.scene.simplified import Drawn
+from lidarsim.sensor import Sensor, Spin
 from raybeam import RayCaster
-
-from ..base.arrays import Bools, Floats, Ints
-from ..base.errors import LidarpoolError
-from ..base.validation import checked
-from ..scene.floor import SLAB_M
-from ..scene.scene import Scene
-from ..scene.simplified import Drawn
-from ..sensor import Sensor, Spin
 
 STATIONS_MOST = 100
 LEAST_GAIN = 0.01  # of what can be seen, that each adds if no number and no coverage is given
@@ -141,7 +140,7 @@ def plan_stations(
     Examples
     --------
     >>> from lidarpool import Sensor
-    >>> from lidarpool.scene.actors import box
+    >>> from lidarsim.scene.actors import box
     >>> room = Scene.from_meshes([box("Room", (8, 6, 3))])
     >>> plan = plan_stations(room, Sensor.grid(vertical_fov_deg=180), slant_deg=90)
     >>> len(plan.stations), plan.visible_m2.round().tolist()

@@ -8,9 +8,10 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from ..base.arrays import Floats
-from ..base.errors import LidarpoolError
-from ..base.validation import one_line
+from lidarsim.base.arrays import Floats
+from lidarsim.base.errors import LidarpoolError
+from lidarsim.base.validation import one_line
+
 from .cost import PathCost
 from .geometry import PathAxes, clearance, path_length, segment_distances
 from .planning import Planning

@@ -7,7 +7,8 @@ from pathlib import Path
 import numpy as np
 from matplotlib.colors import Normalize
 
-from ..sensor import LineSensor, Sensor
+from lidarsim.sensor import LineSensor, Sensor
+
 from .picture_page import Page
 from .shot import SIZE
 from .theme import mapped

@@ -11,12 +11,13 @@ from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from ..base.errors import LidarpoolError, explained
+from lidarsim.base.errors import LidarpoolError, explained
+from lidarsim.base.storage import Storage
+from lidarsim.base.words import plural
+
 from ..base.sealed import sealed, unsealed
 from ..base.shard import ALL, Shard, shard_in_words
 from ..base.software import difference, software
-from ..base.storage import Storage
-from ..base.words import plural
 from ..datasets.dataset import INDEX_FILE, OF_JOBS, DataSet, manifest_file
 from ..datasets.job_table import TABLE_FILE, JobRow, read_table, write_table
 from ..datasets.loader import read_index, sweeps

@@ -9,8 +9,9 @@ from collections.abc import Iterable, Iterator, Mapping
 from contextlib import ExitStack
 from typing import Any
 
-from ..base.errors import LidarpoolError, explained
-from ..base.storage import Storage
+from lidarsim.base.errors import LidarpoolError, explained
+from lidarsim.base.storage import Storage
+
 from ..datasets.figures import Figures
 from ..datasets.job_table import JobRow
 from ..export.folder import LAST_FILE

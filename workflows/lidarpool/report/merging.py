@@ -14,13 +14,14 @@ from operator import attrgetter
 from pathlib import Path
 from typing import Any
 
-from ..base.errors import LidarpoolError, Mistakes, explained
+from lidarsim.base.errors import LidarpoolError, Mistakes, explained
+from lidarsim.base.storage import Storage
+from lidarsim.base.validation import checked
+from lidarsim.base.words import plural
+
 from ..base.fingerprint import fingerprint
 from ..base.shard import ALL, Shard
 from ..base.software import software
-from ..base.storage import Storage
-from ..base.validation import checked
-from ..base.words import plural
 from ..columns.parts import part_name
 from ..datasets.dataset import INDEX_FILE, DataSet, ahead, manifest_file
 from ..datasets.job_table import TABLE_FILE, JobRow, read_table
@@ -41,13 +42,7 @@ from ..run.store import RUN_FOLDER, parts_of, remove_run, with_sensors
 from ..scenario.build import build
 from ..scenario.empty_cloud import NO_POINTS, empty_jobs_warning
 from ..scenario.scenario import Scenario
-from .campaign_output import (
-    CAMPAIGN_FILE,
-    dataset_files,
-    read_record,
-    write_record,
-    write_shared,
-)
+from .campaign_output import CAMPAIGN_FILE, dataset_files, read_record, write_record, write_shared
 from .output import SurveyOutput
 
 NAMED = 20  # shards or files in a message

@@ -10,25 +10,26 @@ from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
-from ..base.errors import LidarpoolError, explained
-from ..base.interrupts import deferred_interrupts
+from lidarsim.base.errors import LidarpoolError, explained
+from lidarsim.base.interrupts import deferred_interrupts
+from lidarsim.base.storage import Storage, flush
+from lidarsim.base.vocabulary import PICTURES
+from lidarsim.sensor import Survey
+from lidarsim.sweeps.instruments import INSTRUMENT_FILES, Instruments
+from lidarsim.sweeps.sweeps import SWEEPS_FILE, Sweeps
+
 from ..base.open3d_module import load_open3d
-from ..base.storage import Storage, flush
-from ..base.vocabulary import PICTURES
 from ..columns.parts import StoredCloud
 from ..export.folder import LAST_FILE, result_folder, staging
 from ..export.format_table import EXPORTS, FORMATS
 from ..export.formats import Format, refuse_strangers
-from ..export.instruments import INSTRUMENT_FILES, Instruments
 from ..export.navigation_files import write_instruments
-from ..export.sweeps import SWEEPS_FILE, Sweeps
 from ..run.conductor import Conductor, Output
 from ..run.picture_file import PICTURE_FILE, PictureContent
 from ..run.progress import Written
 from ..run.run_result import RunResult
 from ..run.writer import LidarWorkers
 from ..scenario.scenario import Scenario
-from ..sensor import Survey
 from .report import CountedCloud, make_report
 
 ROOM_BYTES = 32 << 20  # room for pictures and report

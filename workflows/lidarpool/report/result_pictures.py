@@ -15,14 +15,16 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Circle
 from matplotlib.patheffects import withStroke
 
-from ..base.arrays import Bools, Floats, Ints
-from ..base.errors import LidarpoolError, explained
-from ..base.sampling import even_indices
-from ..base.vocabulary import PICTURES
-from ..base.words import did_you_mean, plural
-from ..columns.cloud import Cloud
+from lidarsim.base.arrays import Bools, Floats, Ints
+from lidarsim.base.errors import LidarpoolError, explained
+from lidarsim.base.sampling import even_indices
+from lidarsim.base.vocabulary import PICTURES
+from lidarsim.base.words import did_you_mean, plural
+from lidarsim.columns.cloud import Cloud
+from lidarsim.columns.table import TABLE, Z
+from lidarsim.scene.scene import Scene
+
 from ..columns.cloud_file import CloudFile
-from ..columns.table import TABLE, Z
 from ..plan import Plan, Planning
 from ..plan.stations import Sight, StationPlan
 from ..render import theme
@@ -33,7 +35,6 @@ from ..render.shot import SIZE, Samples, SurfaceView, take_shot
 from ..render.stage import make_axis, nice_step
 from ..run.picture_file import PictureContent, ways_of
 from ..run.progress import Written
-from ..scene.scene import Scene
 from .page.rendering import put_picture
 
 SIDE_LEAST, SIDE_MOST = 480, 4096  # letters need some pixels; a pixel takes 0.4 kB of memory

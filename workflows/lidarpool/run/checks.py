@@ -11,20 +11,20 @@ from typing import Any
 
 from distributed import Client
 
+from lidarsim._version import __version__
+from lidarsim.base.errors import LidarpoolError
+from lidarsim.simulator.memory import MB, cast_bytes
+from lidarsim.simulator.scene_caster import AUTO_TAKES
 from poolpart import Pool, PoolError, WorkerInfo
 from poolpart.task_locations import look_for_tasks
 from poolpart.workers import ask_workers, worker_identities
 from raybeam import available_backends
 
-from .._version import __version__
-from ..base.errors import LidarpoolError
 from ..base.software import difference, software, software_there
 from ..pipeline.failures import JobError
 from ..pipeline.names import COLLECT, GENERATE, GPU, LIDAR, OTHER, SORT
 from ..scenario.build import Job
 from ..scenario.sections import TaskOptions
-from ..simulator.memory import MB, cast_bytes
-from ..simulator.scene_caster import AUTO_TAKES
 from .watch import Waiting, queued
 
 LOOK_EVERY_S = 0.2

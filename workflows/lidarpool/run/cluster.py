@@ -11,10 +11,10 @@ from distributed import Client, get_worker
 from distributed.client import FutureCancelledError
 from distributed.comm.core import CommClosedError
 
+from lidarsim.base.errors import LidarpoolError
 from poolpart import Partition, PipeClosed, PipeFailed, PoolError
 from poolpart.task_context import own_client
 
-from ..base.errors import LidarpoolError
 from ..pipeline.names import GPU, LIDAR, OTHER
 from ..scenario.build import Job
 from .checks import check_workers, find_workers, gpu_note, slots_needed

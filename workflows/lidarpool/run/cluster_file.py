@@ -12,14 +12,14 @@ from distributed import SpecCluster, SSHCluster
 from distributed.deploy import ssh
 from pydantic import BaseModel, ConfigDict, Field, PrivateAttr
 
+from lidarsim.base.errors import LidarpoolError
+from lidarsim.base.interrupts import deferred_interrupts
+from lidarsim.base.validation import sentences
+from lidarsim.base.words import did_you_mean, plural
+from lidarsim.base.yamlfile import read_yaml
 from poolpart.deploy import start_partitions
 from poolpart.deploy.clusters import INFORMATION
 
-from ..base.errors import LidarpoolError
-from ..base.interrupts import deferred_interrupts
-from ..base.validation import sentences
-from ..base.words import did_you_mean, plural
-from ..base.yamlfile import read_yaml
 from ..pipeline.names import GPU, LIDAR, OTHER
 
 # A scheduler that SSH has started outlives a driver that was killed: it ends when it has been

@@ -9,9 +9,11 @@ from contextlib import AbstractContextManager, ExitStack, nullcontext, suppress
 from dataclasses import dataclass
 from typing import Any, Generic, TypeVar
 
-from ..base.errors import LidarpoolError
+from lidarsim.base.errors import LidarpoolError
+from lidarsim.base.storage import Storage
+from lidarsim.simulator.scene_caster import check_backend_here
+
 from ..base.shard import ALL
-from ..base.storage import Storage
 from ..datasets.dataset import DataSet
 from ..datasets.job_table import JobRow
 from ..pipeline.database import FILE
@@ -20,7 +22,6 @@ from ..plan import best
 from ..scenario.build import Job
 from ..scenario.campaign import CampaignSpec
 from ..scenario.empty_cloud import EMPTY, empty_cloud_reason, empty_jobs_warning
-from ..simulator.scene_caster import check_backend_here
 from .cluster import Cluster
 from .job_source import JobMaker, Jobs, MadeJob, OneJob
 from .options import RunOptions

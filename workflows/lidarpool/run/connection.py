@@ -26,13 +26,13 @@ from distributed.comm import connect
 from distributed.utils import LoopRunner
 
 import poolpart.deploy
+from lidarsim.base.errors import LidarpoolError
+from lidarsim.base.interrupts import children_spared, deferred_interrupts
 from poolpart.deploy import forked_workers
 from poolpart.probe import visible_gpus
 from poolpart.rules import check_count
 
-from ..base.errors import LidarpoolError
 from ..base.fork_server import start_fork_server
-from ..base.interrupts import children_spared, deferred_interrupts
 from ..pipeline.names import GPU, LIDAR, OTHER
 from .checks import LOOK_EVERY_S, TooFewWorkersError
 from .cluster_file import ClusterFile

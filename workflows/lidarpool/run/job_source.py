@@ -11,11 +11,12 @@ from queue import Empty, Full, Queue
 from threading import Event, Thread
 from typing import NamedTuple
 
-from ..base.errors import LidarpoolError
+from lidarsim.base.errors import LidarpoolError
+from lidarsim.sweeps.sweeps import Sweeps
+
 from ..base.fingerprint import fingerprint
 from ..base.shard import ALL, Shard
 from ..datasets.job_table import JobRow, Value
-from ..export.sweeps import Sweeps
 from ..pipeline.failures import JobError
 from ..scenario.build import Job
 from ..scenario.campaign import CampaignSpec

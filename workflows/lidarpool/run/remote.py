@@ -12,8 +12,9 @@ import time
 from contextlib import AbstractContextManager
 from pathlib import Path
 
-from ..base.errors import LidarpoolError, explained
-from ..base.storage import Storage
+from lidarsim.base.errors import LidarpoolError, explained
+from lidarsim.base.storage import Storage
+
 from ..pipeline.database import FILE, RunDatabase
 
 OWNER = "run.owner"  # the mark of the run that may write the copy

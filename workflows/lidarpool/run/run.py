@@ -12,7 +12,9 @@ from functools import partial
 
 from distributed.client import FutureCancelledError
 
-from ..base.errors import LidarpoolError
+from lidarsim.base.errors import LidarpoolError
+from lidarsim.simulator.memory import MB, scans_that_fit
+
 from ..datasets.dataset import DataSet
 from ..datasets.job_table import JobRow
 from ..pipeline.casting_workers import CastingWorkers
@@ -24,7 +26,6 @@ from ..pipeline.messages import ScanFrame
 from ..pipeline.names import GPU, LIDAR, OTHER
 from ..pipeline.task_book import StageTotals
 from ..scenario.build import Job
-from ..simulator.memory import MB, scans_that_fit
 from .cluster import Cluster
 from .job_points import JobPoints
 from .job_source import JobMaker, MadeJob, OneJob, failed_row

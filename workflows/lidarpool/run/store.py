@@ -13,12 +13,14 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
-from ..base.errors import LidarpoolError, explained
+from lidarsim.base.errors import LidarpoolError, explained
+from lidarsim.base.storage import Storage
+from lidarsim.base.validation import checked
+from lidarsim.simulator.scene_caster import AUTO_TAKES
+
 from ..base.fingerprint import fingerprint
 from ..base.shard import shard_in_words
 from ..base.software import software
-from ..base.storage import Storage
-from ..base.validation import checked
 from ..columns.parts import mark_name, own_files, scans_of
 from ..datasets.job_table import JobRow
 from ..pipeline.database import (
@@ -31,7 +33,6 @@ from ..pipeline.database import (
 )
 from ..pipeline.failures import storing
 from ..scenario.build import Job
-from ..simulator.scene_caster import AUTO_TAKES
 from .job_points import JobPoints
 from .job_source import CONTENT, Jobs, OneJob, identity_of
 from .remote import OWNER, RemoteRun, fetch_database

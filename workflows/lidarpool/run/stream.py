@@ -19,19 +19,21 @@ from typing import Any
 import numpy as np
 from distributed import Client
 
+from lidarsim.base.errors import LidarpoolError
+from lidarsim.columns.cloud import Cloud
+from lidarsim.columns.part_columns import PartColumns
+from lidarsim.columns.table import AXES, SCAN
+from lidarsim.columns.waveforms import WAVEFORM
+from lidarsim.simulator.memory import MB, scans_that_fit
+from lidarsim.simulator.scene_caster import check_backend_here
+from lidarsim.sweeps.sweeps import Sweeps
 from poolpart import Partition, PoolError
 from poolpart.fetch import fetch_available
 
-from ..base.errors import LidarpoolError
-from ..columns.cloud import Cloud
-from ..columns.part_columns import PartColumns
-from ..columns.table import AXES, SCAN
-from ..columns.waveforms import WAVEFORM
 from ..datasets.job_table import JobRow
 from ..datasets.sweep_data import Sweep
 from ..export.boxes import Boxes
 from ..export.kitti import intensity_of
-from ..export.sweeps import Sweeps
 from ..pipeline.casting_workers import CastingWorkers
 from ..pipeline.database import JobParts
 from ..pipeline.dispatch import Dispatcher
@@ -42,8 +44,6 @@ from ..pipeline.names import GPU
 from ..scenario.build import Job
 from ..scenario.campaign import CampaignSpec
 from ..scenario.empty_cloud import empty_cloud_reason
-from ..simulator.memory import MB, scans_that_fit
-from ..simulator.scene_caster import check_backend_here
 from .checks import check_workers, find_workers
 from .cluster import client_of
 from .job_source import JobMaker

@@ -10,12 +10,11 @@ from typing import Any
 from dask.utils import format_bytes
 from distributed import Client
 
+from lidarsim.base.errors import LidarpoolError
+from lidarsim.base.vocabulary import PATIENCE_S
+from lidarsim.base.words import plural
 from poolpart.task_locations import look_for_tasks
 from poolpart.workers import worker_identities
-
-from ..base.errors import LidarpoolError
-from ..base.vocabulary import PATIENCE_S
-from ..base.words import plural
 
 WATCH_EVERY_S = 1.0
 TELL_EVERY_S = 5.0  # messages about waiting; less often in a long wait

@@ -13,17 +13,17 @@ from typing import Any, NamedTuple
 
 from distributed import Reschedule
 
+from lidarsim.base.errors import LidarpoolError, explained
+from lidarsim.base.storage import TEMPORARY
+from lidarsim.sweeps.sweeps import Sweeps
 from poolpart.fetch import fetch_available
 from poolpart.task_context import own_client
 
-from ..base.errors import LidarpoolError, explained
-from ..base.storage import TEMPORARY
 from ..columns.parts import StoredCloud
 from ..datasets.dataset import DataSet, Listing
 from ..datasets.job_table import JobRow
 from ..export.pieces import PieceRange, RangeWriter
 from ..export.pieces import WrittenRange as Range
-from ..export.sweeps import Sweeps
 from ..pipeline.casting_workers import share
 from ..pipeline.failures import JobError, raise_if_failed, was_killed
 from ..pipeline.names import EXPORT, LIDAR

@@ -17,20 +17,29 @@ from xml.parsers import expat
 import numpy as np
 from pydantic import Strict, model_validator
 
-from ..base.arrays import Floats
-from ..base.declared import Several, Text, TextOrTexts, Triple, about, by_text, declared, one_of
-from ..base.errors import LidarpoolError, prefixed
-from ..base.input_files import open_input
-from ..base.words import printable
-from ..base.xmlfile import refuse_entity
-from ..scene.actors import Actor
-from ..scene.files.meshfile import ROBOTS
-from ..scene.scene_mesh import SceneMesh
-from ..sensor import Mounted, Pose, Track, load_trajectory
-from ..sensor.calibrations import said
-from ..sensor.survey import StepCount
-from ..sensor.trajectory import CLOCK_S, Beyond, InstrumentPose, quaternions_of, rotations_of
-from ..sensor.trajectory_files import (
+from lidarsim.base.arrays import Floats
+from lidarsim.base.declared import (
+    Several,
+    Text,
+    TextOrTexts,
+    Triple,
+    about,
+    by_text,
+    declared,
+    one_of,
+)
+from lidarsim.base.errors import LidarpoolError, prefixed
+from lidarsim.base.input_files import open_input
+from lidarsim.base.words import printable
+from lidarsim.base.xmlfile import refuse_entity
+from lidarsim.scene.actors import Actor
+from lidarsim.scene.files.meshfile import ROBOTS
+from lidarsim.scene.scene_mesh import SceneMesh
+from lidarsim.sensor import Mounted, Pose, Track, load_trajectory
+from lidarsim.sensor.calibrations import said
+from lidarsim.sensor.survey import StepCount
+from lidarsim.sensor.trajectory import CLOCK_S, Beyond, InstrumentPose, quaternions_of, rotations_of
+from lidarsim.sensor.trajectory_files import (
     Duration,
     Height,
     Latitude,
@@ -38,6 +47,7 @@ from ..sensor.trajectory_files import (
     Seconds,
     TrajectoryFormat,
 )
+
 from .ground import Standing, following
 from .sections import (
     DeformingSection,

@@ -11,28 +11,29 @@ from typing import Any
 
 import numpy as np
 
-from ..base.arrays import Floats
-from ..base.declared import declared
-from ..base.errors import LidarpoolError, Mistakes, prefixed
-from ..base.validation import checked_fields
-from ..base.words import did_you_mean, plural
+from lidarsim.base.arrays import Floats
+from lidarsim.base.declared import declared
+from lidarsim.base.errors import LidarpoolError, Mistakes, prefixed
+from lidarsim.base.validation import checked_fields
+from lidarsim.base.words import did_you_mean, plural
+from lidarsim.scene.actors import Actor, check_spray
+from lidarsim.scene.files.cityjson import CLASS_NAMES as CITY_NAMES
+from lidarsim.scene.files.cityjson import CLASSES as CITY_CLASSES
+from lidarsim.scene.files.meshfile import CITYJSON
+from lidarsim.scene.robot import Robot
+from lidarsim.scene.scene import Scene
+from lidarsim.sensor import Material, Mounted, Noise, Pose, Returns, Sensor, Survey, Track
+from lidarsim.sensor.materials import MaterialTable, rows_named, with_class, with_classes
+from lidarsim.sensor.survey import CloudOptions
+from lidarsim.sensor.trajectory import CENTRE
+from lidarsim.sensor.weather import Weather
+from lidarsim.simulator.surfaces import warn_of_grey
+
 from ..export.format_table import check_whole
 from ..export.formats import Format
 from ..export.laser_scan import with_laser_scans
 from ..plan import Planning
 from ..plan.planning import Search
-from ..scene.actors import Actor, check_spray
-from ..scene.files.cityjson import CLASS_NAMES as CITY_NAMES
-from ..scene.files.cityjson import CLASSES as CITY_CLASSES
-from ..scene.files.meshfile import CITYJSON
-from ..scene.robot import Robot
-from ..scene.scene import Scene
-from ..sensor import Material, Mounted, Noise, Pose, Returns, Sensor, Survey, Track
-from ..sensor.materials import MaterialTable, rows_named, with_class, with_classes
-from ..sensor.survey import CloudOptions
-from ..sensor.trajectory import CENTRE
-from ..sensor.weather import Weather
-from ..simulator.surfaces import warn_of_grey
 from .actor_motion import (
     ActorSection,
     MountSection,

@@ -20,13 +20,11 @@ import numpy as np
 from pydantic import BaseModel, Field
 from pydantic_core import to_json
 
-from ..base.declared import Seed
-from ..base.errors import LidarpoolError, Mistakes, prefixed
-from ..base.fingerprint import fingerprint
-from ..base.input_files import open_input, read_input_text
-from ..base.shard import ALL, Shard
-from ..base.textfile import read_text
-from ..base.validation import (
+from lidarsim.base.declared import Seed
+from lidarsim.base.errors import LidarpoolError, Mistakes, prefixed
+from lidarsim.base.input_files import open_input, read_input_text
+from lidarsim.base.textfile import read_text
+from lidarsim.base.validation import (
     checked,
     dotted,
     field_hint,
@@ -36,8 +34,11 @@ from ..base.validation import (
     sentences,
     shown,
 )
-from ..base.words import did_you_mean, plural
-from ..base.yamlfile import read_yaml
+from lidarsim.base.words import did_you_mean, plural
+from lidarsim.base.yamlfile import read_yaml
+
+from ..base.fingerprint import fingerprint
+from ..base.shard import ALL, Shard
 from ..datasets.job_table import Value
 from ..export.format_table import check_whole
 from ..export.laser_scan import with_laser_scans

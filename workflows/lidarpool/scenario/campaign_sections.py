@@ -29,7 +29,7 @@ from pydantic import (
     model_validator,
 )
 
-from ..base.declared import (
+from lidarsim.base.declared import (
     Ends,
     Seed,
     Several,
@@ -43,16 +43,17 @@ from ..base.declared import (
     one_of,
     short,
 )
-from ..base.errors import LidarpoolError, Mistakes
-from ..base.tables import ignored_columns
-from ..base.textfile import read_text
-from ..base.validation import checked_fields, sections_in, sentences
-from ..base.words import did_you_mean, printable
-from ..base.yamlfile import load_yaml
+from lidarsim.base.errors import LidarpoolError, Mistakes
+from lidarsim.base.tables import ignored_columns
+from lidarsim.base.textfile import read_text
+from lidarsim.base.validation import checked_fields, sections_in, sentences
+from lidarsim.base.words import did_you_mean, printable
+from lidarsim.base.yamlfile import load_yaml
+from lidarsim.sensor.calibrations import said
+
 from ..datasets.job_table import Value
 from ..export.format_table import DATA_SETS, LAYOUTS
 from ..export.formats import Format
-from ..sensor.calibrations import said
 from .sections import IgnoredColumns, Section, may_be_empty
 
 SIGMAS = 6.0  # normal numbers are drawn again beyond, one of 500 million

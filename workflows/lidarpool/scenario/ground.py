@@ -8,16 +8,15 @@ from functools import cached_property
 
 import numpy as np
 
+from lidarsim.base.arrays import Floats, Indices, Ints32
+from lidarsim.base.errors import LidarpoolError
+from lidarsim.base.words import did_you_mean
+from lidarsim.scene.scene import Scene
+from lidarsim.scene.simplified import Drawn
+from lidarsim.sensor import Track
+from lidarsim.sensor.materials import rows_named
+from lidarsim.sensor.trajectory import quaternions_of
 from raybeam import RayCaster, available_backends
-
-from ..base.arrays import Floats, Indices, Ints32
-from ..base.errors import LidarpoolError
-from ..base.words import did_you_mean
-from ..scene.scene import Scene
-from ..scene.simplified import Drawn
-from ..sensor import Track
-from ..sensor.materials import rows_named
-from ..sensor.trajectory import quaternions_of
 
 STEP_M = 0.5  # of a trajectory that follows a surface
 STEPS_MOST = 1_000_000

@@ -11,17 +11,18 @@ from typing import Annotated, Any
 
 from pydantic import PrivateAttr
 
-from ..base.declared import Several, Text, about, by_text
-from ..base.errors import LidarpoolError, Mistakes, prefixed
-from ..base.validation import sentences
-from ..base.yamlfile import read_yaml
-from ..columns.table import COLOURS
-from ..sensor import Fault, Material, Navigation
-from ..sensor.materials import ClassNames
-from ..sensor.survey import SENSORS_MOST, CloudOptions, StepCount
-from ..sensor.trajectory import CENTRE
-from ..sensor.trajectory_files import files_of_trajectory
-from ..sensor.weather import Weather
+from lidarsim.base.declared import Several, Text, about, by_text
+from lidarsim.base.errors import LidarpoolError, Mistakes, prefixed
+from lidarsim.base.validation import sentences
+from lidarsim.base.yamlfile import read_yaml
+from lidarsim.columns.table import COLOURS
+from lidarsim.sensor import Fault, Material, Navigation
+from lidarsim.sensor.materials import ClassNames
+from lidarsim.sensor.survey import SENSORS_MOST, CloudOptions, StepCount
+from lidarsim.sensor.trajectory import CENTRE
+from lidarsim.sensor.trajectory_files import files_of_trajectory
+from lidarsim.sensor.weather import Weather
+
 from .actor_motion import ActorSection, CarriedEntry, MountEntry, TrafficSection, TrajectoryEntry
 from .sections import (
     CopiesSection,

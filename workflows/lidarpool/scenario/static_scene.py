@@ -9,26 +9,27 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..base.arrays import Floats
-from ..base.errors import LidarpoolError, Mistakes, prefixed
-from ..base.tables import NUMBERS, Quantity, read_table
-from ..base.textfile import read_text
-from ..base.words import plural
-from ..scene.actors import Actor, box, one_mesh
-from ..scene.files.meshfile import ROBOTS, Objects, load_objects
-from ..scene.files.scene_graph import Raster
-from ..scene.files.urdf import load_robot
-from ..scene.object_names import told_apart
-from ..scene.robot import Robot
-from ..scene.scene import Scene
-from ..scene.scene_instances import SceneInstance
-from ..scene.scene_mesh import SceneMesh
-from ..scene.shapes import seed_objects
-from ..scene.transform import Transform, affine
-from ..scene.wheels import rolling
-from ..sensor.calibrations import said
-from ..sensor.pose_columns import ANGLES, POSITION, REFUSED_COLUMNS, angles_of, with_yaw
-from ..sensor.trajectory import rotations_of
+from lidarsim.base.arrays import Floats
+from lidarsim.base.errors import LidarpoolError, Mistakes, prefixed
+from lidarsim.base.tables import NUMBERS, Quantity, read_table
+from lidarsim.base.textfile import read_text
+from lidarsim.base.words import plural
+from lidarsim.scene.actors import Actor, box, one_mesh
+from lidarsim.scene.files.meshfile import ROBOTS, Objects, load_objects
+from lidarsim.scene.files.scene_graph import Raster
+from lidarsim.scene.files.urdf import load_robot
+from lidarsim.scene.object_names import told_apart
+from lidarsim.scene.robot import Robot
+from lidarsim.scene.scene import Scene
+from lidarsim.scene.scene_instances import SceneInstance
+from lidarsim.scene.scene_mesh import SceneMesh
+from lidarsim.scene.shapes import seed_objects
+from lidarsim.scene.transform import Transform, affine
+from lidarsim.scene.wheels import rolling
+from lidarsim.sensor.calibrations import said
+from lidarsim.sensor.pose_columns import ANGLES, POSITION, REFUSED_COLUMNS, angles_of, with_yaw
+from lidarsim.sensor.trajectory import rotations_of
+
 from .ground import Standing
 from .scenario import Scenario
 from .sections import (

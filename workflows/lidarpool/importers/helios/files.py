@@ -12,12 +12,12 @@ from xml.etree.ElementTree import Element
 
 import numpy as np
 
-from ...base.arrays import Floats
-from ...base.errors import LidarpoolError, explained, prefixed
-from ...base.input_files import read_input
-from ...base.words import did_you_mean
-from ...base.xmlfile import xml_root
-from ...scene.transform import rotation_about
+from lidarsim.base.arrays import Floats
+from lidarsim.base.errors import LidarpoolError, explained, prefixed
+from lidarsim.base.input_files import read_input
+from lidarsim.base.words import did_you_mean
+from lidarsim.base.xmlfile import xml_root
+from lidarsim.scene.transform import rotation_about
 
 # Where a checkout of HELIOS++ has what its surveys call data/scanners_als.xml.
 _PACKAGE = Path("python/pyhelios")

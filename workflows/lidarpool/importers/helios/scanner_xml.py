@@ -15,9 +15,10 @@ from xml.etree.ElementTree import Element
 
 import numpy as np
 
-from ...base.arrays import Floats
-from ...base.errors import LidarpoolError
-from ...scene.transform import rotation_about as about
+from lidarsim.base.arrays import Floats
+from lidarsim.base.errors import LidarpoolError
+from lidarsim.scene.transform import rotation_about as about
+
 from .files import clean, number, rotation, vector
 
 _Z = np.array([0.0, 0.0, 1.0])

@@ -14,20 +14,21 @@ from xml.etree.ElementTree import Element
 
 import numpy as np
 
-from ...base.arrays import Floats
-from ...base.errors import LidarpoolError, prefixed
-from ...base.input_files import read_input_text
-from ...scene.actors import one_mesh
-from ...scene.files.meshfile import load_meshes
-from ...scene.floor import heights_at
-from ...scene.object_names import unique_names
-from ...scene.point_scene import surfels
-from ...scene.scene import Scene
-from ...scene.scene_instances import SceneInstance
-from ...scene.scene_mesh import SceneMesh
-from ...scene.simplified import Drawn
-from ...scene.transform import Transform
-from ...sensor import Pose
+from lidarsim.base.arrays import Floats
+from lidarsim.base.errors import LidarpoolError, prefixed
+from lidarsim.base.input_files import read_input_text
+from lidarsim.scene.actors import one_mesh
+from lidarsim.scene.files.meshfile import load_meshes
+from lidarsim.scene.floor import heights_at
+from lidarsim.scene.object_names import unique_names
+from lidarsim.scene.scene import Scene
+from lidarsim.scene.scene_instances import SceneInstance
+from lidarsim.scene.scene_mesh import SceneMesh
+from lidarsim.scene.simplified import Drawn
+from lidarsim.scene.transform import Transform
+from lidarsim.sensor import Pose
+
+from ...scenario.point_scene import surfels
 from .files import Assets, clean, number, read, rotation
 
 _LOADERS = ("objloader", "detailedvoxels", "geotiffloader", "xyzloader")

@@ -15,16 +15,17 @@ from xml.etree.ElementTree import Element
 import numpy as np
 import yaml
 
-from ...base.arrays import Floats
-from ...base.errors import LidarpoolError, prefixed
+from lidarsim.base.arrays import Floats
+from lidarsim.base.errors import LidarpoolError, prefixed
+from lidarsim.scene.scene import Scene
+from lidarsim.scene.scene_file import write_scene
+from lidarsim.scene.transform import rotation_about
+from lidarsim.sensor import Pose
+from lidarsim.sensor.disc import SUBRAYS
+from lidarsim.sensor.survey import SENSORS_MOST
+
 from ...scenario.build import build
 from ...scenario.scenario import Scenario
-from ...scene.scene import Scene
-from ...scene.scene_file import write_scene
-from ...scene.transform import rotation_about
-from ...sensor import Pose
-from ...sensor.disc import SUBRAYS
-from ...sensor.survey import SENSORS_MOST
 from .files import Assets, clean, number, rotation, vector
 from .scanner_xml import Device, channels, device, unread
 from .scene_xml import HeliosScene

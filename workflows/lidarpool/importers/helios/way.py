@@ -12,10 +12,11 @@ from xml.etree.ElementTree import Element
 
 import numpy as np
 
-from ...base.arrays import Floats
-from ...base.errors import LidarpoolError, prefixed
-from ...scene.transform import rotation_about as about
-from ...sensor.trajectory import quaternions_of
+from lidarsim.base.arrays import Floats
+from lidarsim.base.errors import LidarpoolError, prefixed
+from lidarsim.scene.transform import rotation_about as about
+from lidarsim.sensor.trajectory import quaternions_of
+
 from .files import Assets, clean, flag, number, read, vector
 
 _SPEED = 70.0  # metres a second, where nothing is said

@@ -15,21 +15,22 @@ from typing import Any, Literal
 
 import numpy as np
 
-from ..base.allowance import bytes_of, memory
-from ..base.arrays import Floats
-from ..base.errors import LidarpoolError, explained, prefixed
-from ..base.input_files import check_input, read_input, read_input_text
+from lidarsim.base.allowance import bytes_of, memory
+from lidarsim.base.arrays import Floats
+from lidarsim.base.errors import LidarpoolError, explained, prefixed
+from lidarsim.base.input_files import check_input, read_input, read_input_text
+from lidarsim.base.validation import checked
+from lidarsim.base.vocabulary import UNITS_M
+from lidarsim.base.words import printable
+from lidarsim.scene.files.las import las_units, open_las
+from lidarsim.scene.files.meshfile import converted, warn
+from lidarsim.scene.files.pcd import checked_pcd
+from lidarsim.scene.files.polygon_files import read_ply_points
+from lidarsim.scene.scene import Scene
+from lidarsim.scene.scene_instances import FARTHEST_M
+from lidarsim.scene.scene_mesh import SceneMesh
+
 from ..base.open3d_module import load_open3d
-from ..base.validation import checked
-from ..base.vocabulary import UNITS_M
-from ..base.words import printable
-from .files.las import las_units, open_las
-from .files.meshfile import converted, warn
-from .files.pcd import checked_pcd
-from .files.polygon_files import read_ply_points
-from .scene import Scene
-from .scene_instances import FARTHEST_M
-from .scene_mesh import SceneMesh
 
 # Chosen on scans of a city, from 7 to 30 neighbours and 0.7 to 1.4: more of either closes more gaps
 # between points, and makes surfels reach farther beyond edges.

@@ -364,7 +364,7 @@ class LinkPath:
 
     @property
     def presence_ns(self) -> tuple[float, float]:
-        """See `lidarpool.sensor.trajectory.presence_ns`."""
+        """See `lidarsim.sensor.trajectory.presence_ns`."""
         return presence_ns(self.base)
 
     def pose(self, station: int, time_ns: float = 0.0) -> Pose:
@@ -386,7 +386,7 @@ class LinkPath:
         return place.T, turn.transpose(2, 0, 1)
 
     def velocities(self, station: int, times_ns: Floats) -> tuple[Floats, Floats]:
-        """See `lidarpool.sensor.trajectory.velocities`: exact, through all joints.
+        """See `lidarsim.sensor.trajectory.velocities`: exact, through all joints.
 
         At a given value of a joint they are those behind it.
 

@@ -47,7 +47,7 @@ class Column:
     meaning
         What it is, in a few words without a full stop.
     source
-        Name of an attribute of the returns of a batch (`lidarpool.simulator.points.BatchPoints`),
+        Name of an attribute of the returns of a batch (`lidarsim.simulator.points.BatchPoints`),
         or a function that computes the column from them: an array (n,), one value for each
         point. It runs on the worker that casts the rays. By default the attribute of its name.
     coordinates

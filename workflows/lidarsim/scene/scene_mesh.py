@@ -78,13 +78,13 @@ class SceneMesh:
     cutouts
         Of the last faces, one cutout after the other.
     colours
-        Of the faces, see `lidarpool.scene.colours.Colours`; None if it has none.
+        Of the faces, see `lidarsim.scene.colours.Colours`; None if it has none.
     voxels
         Densities of leaves within its surface, which is closed then and has no cutouts.
     animation
         How its vertices move where an actor has it; elsewhere it stands as `vertices` say.
     materials
-        Names of the materials of the faces, see `lidarpool.scene.face_materials.FaceMaterials`;
+        Names of the materials of the faces, see `lidarsim.scene.face_materials.FaceMaterials`;
         None if they have none.
 
     Raises

@@ -40,7 +40,7 @@ class SceneInstance:
     transform
         A pose of the mesh's axes in world coordinates. Or (4, 4), takes the mesh's coordinates to
         the world's, metres: it may turn, move, mirror and scale, also unevenly. Or a
-        `lidarpool.scene.transform.Transform`.
+        `lidarsim.scene.transform.Transform`.
     name
         Of the object; by default the mesh's.
 

@@ -1,6 +1,6 @@
 """Loops over pulses: particles and spray that they meet, and the returns that a receiver reports.
 
-Each is compiled when it is first called. Random numbers are those of `lidarpool.sensor.noise.raw`,
+Each is compiled when it is first called. Random numbers are those of `lidarsim.sensor.noise.raw`,
 of which `starts` are the beginnings.
 """
 

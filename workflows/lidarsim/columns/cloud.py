@@ -77,7 +77,7 @@ class Cloud(Shown):
     positions
         float32 or float64 (n, 3), metres, world coordinates.
     columns
-        {name: (n,)}: the other columns, of `lidarpool.columns.table` or your own.
+        {name: (n,)}: the other columns, of `lidarsim.columns.table` or your own.
     own
         Descriptions of the columns that are not in the table.
     sweeps

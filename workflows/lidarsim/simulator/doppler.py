@@ -2,7 +2,7 @@
 
 The velocity of the point that was hit, less that of the ray's origin, along the ray: what the
 Doppler shift 2 v / wavelength of FMCW lidars shows (Hexsel, Vhavle and Chen 2022). Both are
-derivatives of the trajectories' own curves (`lidarpool.sensor.trajectory.velocities`).
+derivatives of the trajectories' own curves (`lidarsim.sensor.trajectory.velocities`).
 """
 
 from __future__ import annotations

@@ -33,7 +33,7 @@ class Allowance:
     --------
     >>> Allowance(1_500_000, "export it again").take(2_900_000_000)
     Traceback (most recent call last):
-    lidarpool.base.errors.LidarpoolError: it has 1.43 MiB and would unpack to \
+    lidarsim.base.errors.LidarpoolError: it has 1.43 MiB and would unpack to \
 2.70 GiB or more, of at most 256.00 MiB: export it again.
     """
 

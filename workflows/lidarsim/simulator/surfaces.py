@@ -18,13 +18,7 @@ from ..scene.colours import GREY, Colours, Lookup, joined, luminance, packed
 from ..scene.face_materials import FaceMaterials
 from ..scene.scene import Scene
 from ..sensor import Sensor, Survey
-from ..sensor.materials import (
-    NEAR_NM,
-    Material,
-    MaterialTable,
-    at_right_angles,
-    first_matches,
-)
+from ..sensor.materials import NEAR_NM, Material, MaterialTable, at_right_angles, first_matches
 from ..sensor.trajectory import velocities
 from .voxels import Grids
 from .ways import Ways

@@ -155,7 +155,7 @@ class Scene:
             its format states (y of .glb and .gltf), else z.
         transform
             Placement of the mesh in the world, in metres, after unit and up axis: a
-            `lidarpool.scene.transform.Transform`.
+            `lidarsim.scene.transform.Transform`.
         opacity
             With "mask", light passes where the image of a material is transparent (.glb, .gltf,
             .obj, .usd). With "ignore", triangles are solid, and no image is read.
@@ -166,7 +166,7 @@ class Scene:
             Whether faces keep the names of their materials (.glb, .gltf, .obj, .dae, .3mf, .usd,
             CityJSON), by which `Material` may choose them.
         step_m, window, epsg
-            Of a raster: see `lidarpool.scene.files.meshfile.load_objects`.
+            Of a raster: see `lidarsim.scene.files.meshfile.load_objects`.
         assets
             A folder: files that the file names are read from here and below, and from its own
             folder and below.

@@ -30,7 +30,7 @@ from .optics import LIGHT_M_NS, Mode, Optics, Returns
 from .ray_sensors import ListedSensor, Prism, PrismSensor, TurningMirror
 from .sensor import LineSensor, MaxRange, MinRange, Sensor
 
-_BUILT_IN = files("lidarpool.sensor") / "data"
+_BUILT_IN = files("lidarsim.sensor") / "data"
 MODEL_FILES = (".yaml", ".yml")
 Sheet = Literal["ideal", "datasheet"]
 

@@ -36,7 +36,7 @@ class BatchPoints:
     """Kept returns of some consecutive scans of one station, in (scan, ray) order.
 
     Its attributes are arrays (n,) with a value for each return, computed on first use: the
-    sources of columns (`lidarpool.columns.table`).
+    sources of columns (`lidarsim.columns.table`).
     """
 
     def __init__(
@@ -479,7 +479,7 @@ class BatchPoints:
 
     @property
     def waveform(self) -> Records:
-        """Recorded waveform, see `lidarpool.columns.waveforms.record`."""
+        """Recorded waveform, see `lidarsim.columns.waveforms.record`."""
         table = made(self.found.waveform).copy()
         begin_ps = table["begin"] * table["sample_ps"].astype(np.float64)
         table["location_ps"] = self.range * (2000 / LIGHT_M_NS) - begin_ps

@@ -66,7 +66,7 @@ def city(
         and lamps stay the same.
     cars
         Number of cars with windows and wheels instead of the simple ones: instances of one mesh for
-        each of `lidarpool.scene.generated.cars.MODELS`, parked at the kerbs.
+        each of `lidarsim.scene.generated.cars.MODELS`, parked at the kerbs.
 
     Raises
     ------

@@ -1,0 +1,99 @@
+"""Points that a lidar measures in a scene, computed in the calling process.
+
+`Scanner` casts single sweeps; a `Survey` describes sensors, poses, noise and weather. Neither Dask
+nor Open3D is imported. The package `lidarpool` makes thousands of surveys on a Dask cluster.
+"""
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+from ._version import __version__
+
+if TYPE_CHECKING:
+    from .base.errors import LidarpoolError
+    from .columns.cloud import Cloud
+    from .columns.table import Column
+    from .scene.actors import Actor
+    from .scene.scene import Scene
+    from .scene.scene_instances import SceneInstance
+    from .scene.scene_mesh import SceneMesh
+    from .sensor import (
+        Beams,
+        Fault,
+        Gnss,
+        Imu,
+        Material,
+        Mounted,
+        Navigation,
+        Noise,
+        Optics,
+        Pose,
+        Returns,
+        ScanSpec,
+        Sensor,
+        Spin,
+        Survey,
+    )
+    from .sensor.models import load_sensor
+    from .sensor.trajectory import Track
+    from .sensor.trajectory_files import load_trajectory
+    from .simulator import Scanner
+
+__all__ = [
+    "Actor",
+    "Beams",
+    "Cloud",
+    "Column",
+    "Fault",
+    "Gnss",
+    "Imu",
+    "LidarpoolError",
+    "Material",
+    "Mounted",
+    "Navigation",
+    "Noise",
+    "Optics",
+    "Pose",
+    "Returns",
+    "ScanSpec",
+    "Scanner",
+    "Scene",
+    "SceneInstance",
+    "SceneMesh",
+    "Sensor",
+    "Spin",
+    "Survey",
+    "Track",
+    "__version__",
+    "load_sensor",
+    "load_trajectory",
+]
+
+# Modules of the names above, except names of `sensor`. A module is imported when one of its names
+# is asked for, because importing all modules takes half a second.
+_MODULES = {
+    "base.errors": ("LidarpoolError",),
+    "columns.cloud": ("Cloud",),
+    "columns.table": ("Column",),
+    "scene.actors": ("Actor",),
+    "scene.scene": ("Scene",),
+    "scene.scene_instances": ("SceneInstance",),
+    "scene.scene_mesh": ("SceneMesh",),
+    "sensor.models": ("load_sensor",),
+    "sensor.trajectory": ("Track",),
+    "sensor.trajectory_files": ("load_trajectory",),
+    "simulator": ("Scanner",),
+}
+
+
+def __getattr__(name: str) -> Any:
+    if name not in __all__:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    module = next((module for module, names in _MODULES.items() if name in names), "sensor")
+    value = getattr(import_module(f".{module}", __name__), name)
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted(__all__)

@@ -1,0 +1,1 @@
+"""Foundations of the other rooms: errors, arrays, files, validation, words."""

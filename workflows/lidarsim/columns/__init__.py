@@ -1,0 +1,1 @@
+"""Columns of points, and clouds in memory."""
