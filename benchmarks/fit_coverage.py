@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from lidarpool import LidarpoolError, Noise, Scanner, Scene, Sensor
+from lidarpool import LidarError, Noise, Scanner, Scene, Sensor
 from lidarpool.compare.fit import fit
 from lidarpool.compare.recordings import Recording
 from lidarsim.scene.generated.city import city
@@ -152,7 +152,7 @@ def trial(number: int, cache: Path | None = None, where: str = "") -> tuple[dict
         recording = recorded(noise, bias)
     try:
         figures = fit(recording).figures
-    except LidarpoolError as error:
+    except LidarError as error:
         if not where:
             raise
         return truth, str(error)

@@ -30,7 +30,7 @@ from distributed import Client
 from tests.clusters import thread_cluster
 
 import lidarpool
-from lidarpool import Campaign, LidarpoolError
+from lidarpool import Campaign, LidarError
 from lidarpool.cli.commands import cli
 from lidarpool.report.campaign_output import verify
 from lidarpool.scenario.build import build
@@ -194,7 +194,7 @@ def attempt(reader: Reader, place: Path) -> tuple[str, str]:
         with redirect_stdout(StringIO()), redirect_stderr(StringIO()), warnings.catch_warnings():
             warnings.simplefilter("ignore")
             read = reader(place)
-    except LidarpoolError as error:
+    except LidarError as error:
         lines = str(error).count("\n") + 1
         return ("refused" if lines <= LINES_MOST else "many lines"), str(error)
     except Exception:

@@ -11,7 +11,7 @@ from tests.shapes import Cart, cast, quad, solid, wall
 
 from lidarpool import (
     Beams,
-    LidarpoolError,
+    LidarError,
     Material,
     Mounted,
     Optics,
@@ -364,5 +364,5 @@ def test_returns_go_before_what_the_sensor_states():
     ],
 )
 def test_beams_that_mean_nothing_are_refused(make, says):
-    with pytest.raises(LidarpoolError, match=says):
+    with pytest.raises(LidarError, match=says):
         make()

@@ -16,7 +16,7 @@ from rosbags.interfaces import QosDurability
 from tests.drives import SCANS, points_of, the_scene, the_sweeps
 
 import lidarpool
-from lidarpool import LidarpoolError, Material, Sensor, Survey, read_cloud
+from lidarpool import LidarError, Material, Sensor, Survey, read_cloud
 from lidarpool.base.fingerprint import fingerprint
 from lidarpool.datasets.dataset import DataSet
 from lidarpool.datasets.job_table import JobRow, write_table
@@ -66,7 +66,7 @@ def test_what_is_no_class_with_a_name_is_one_line(wrong):
         lambda: Survey(poses=[(0, 0, 1)], classes=wrong),
         lambda: Scenario.from_data({"classes": wrong}, source="a.yaml"),
     ):
-        with pytest.raises(LidarpoolError, match=r"classes: \{.*give whole numbers") as error:
+        with pytest.raises(LidarError, match=r"classes: \{.*give whole numbers") as error:
             make()
         assert "\n" not in str(error.value)
 
@@ -83,7 +83,7 @@ def test_names_add_the_column_and_are_no_part_of_the_survey():
 def test_a_path_of_a_campaign_leads_to_the_name_of_a_class():
     scenario = Scenario.from_data({"classes": {40: "road"}})
     assert [key for key, _ in find_field(scenario, "classes.40")[0]] == ["classes", 40]
-    with pytest.raises(LidarpoolError, match=r"no .41.\. It has 40"):
+    with pytest.raises(LidarError, match=r"no .41.\. It has 40"):
         find_field(scenario, "classes.41")
 
 

@@ -26,7 +26,7 @@ from tests.shapes import (
 from lidarpool import (
     Actor,
     Beams,
-    LidarpoolError,
+    LidarError,
     Material,
     Noise,
     Pose,
@@ -335,5 +335,5 @@ def test_one_subray_without_noise_is_the_plain_ray():
     ],
 )
 def test_numbers_that_mean_nothing_are_refused(make, says):
-    with pytest.raises(LidarpoolError, match=says):
+    with pytest.raises(LidarError, match=says):
         make()

@@ -15,7 +15,7 @@ from tests.shapes import block, wall
 from lidarpool import (
     Actor,
     Fault,
-    LidarpoolError,
+    LidarError,
     Mounted,
     Noise,
     Pose,
@@ -296,7 +296,7 @@ WRONG = {
 
 @pytest.mark.parametrize("words", WRONG)
 def test_what_does_not_fit_the_survey(words):
-    with pytest.raises(LidarpoolError, match=words) as caught:
+    with pytest.raises(LidarError, match=words) as caught:
         replace(STANDING, faults=[FAULTS["dirt"], WRONG[words]])
     assert str(caught.value).startswith("faults[1]: ")
 
@@ -330,9 +330,9 @@ PACKETS = {"share": 0.1, "packet": 9}
     ],
 )  # fmt: skip
 def test_what_is_no_fault(words, fields):
-    with pytest.raises(LidarpoolError, match=words):
+    with pytest.raises(LidarError, match=words):
         Scenario.from_data({"faults": [fields]})
-    with pytest.raises(LidarpoolError, match=words.partition(".*")[0]):
+    with pytest.raises(LidarError, match=words.partition(".*")[0]):
         Fault(**fields)
 
 

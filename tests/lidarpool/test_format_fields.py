@@ -21,7 +21,7 @@ from tests.shapes import level, room
 
 from lidarpool import (
     Fault,
-    LidarpoolError,
+    LidarError,
     Mounted,
     Pose,
     Returns,
@@ -345,7 +345,7 @@ def test_what_contradicts_a_frame_is_noted():
     for one in (Format("laz"), Format("kitti"), Format("mcap", compensated=True)):
         (note,) = one.contradictions("sensor")
         assert "cloud.coordinates" in note
-    with pytest.raises(LidarpoolError, match="option of pcd, mcap, rosbag2, not of kitti"):
+    with pytest.raises(LidarError, match="option of pcd, mcap, rosbag2, not of kitti"):
         Format("kitti", compensated=True)
 
 

@@ -18,7 +18,7 @@ from lidarpool.scenario.campaign import CampaignSpec
 from lidarpool.scenario.point_scene import SUFFIXES as CLOUDS
 from lidarpool.scenario.point_scene import scene_of_points
 from lidarpool.scenario.scenario import Scenario
-from lidarsim.base.errors import LidarpoolError
+from lidarsim.base.errors import LidarError
 from lidarsim.base.input_files import open_input, read_input, read_input_text
 from lidarsim.base.storage import Storage
 from lidarsim.base.yamlfile import read_yaml
@@ -77,7 +77,7 @@ def kitti_beside(path):
 
 def refused(read, path):
     """Return the message with which reading ends."""
-    with pytest.raises(LidarpoolError) as caught:
+    with pytest.raises(LidarError) as caught:
         read(path)
     message = str(caught.value)
     assert message.count("\n") <= 1 and len(message) < 500 + 2 * len(str(path)), message

@@ -10,7 +10,7 @@ from tests.rows import quick
 from tests.shapes import level, made, quad
 
 from lidarpool import (
-    LidarpoolError,
+    LidarError,
     Material,
     Mounted,
     Noise,
@@ -209,7 +209,7 @@ def test_no_ray_meets_an_actor_that_is_not_asked_about_it(street, monkeypatch, n
 
 def test_an_actor_must_be_there_as_long_as_the_survey_lasts(street):
     scene = replace(street, actors=(CAR,))
-    with pytest.raises(LidarpoolError, match=r"Actor 'Car': .* 0\.19\d* s outside"):
+    with pytest.raises(LidarError, match=r"Actor 'Car': .* 0\.19\d* s outside"):
         Job(scene, Survey(poses=[(0, 0, 1)] * 7))
     assert (
         identity_of(Job(scene, Survey(poses=[(0, 0, 1)])))["scene"]

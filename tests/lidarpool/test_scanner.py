@@ -20,7 +20,7 @@ from lidarpool import (
     Beams,
     Cloud,
     Column,
-    LidarpoolError,
+    LidarError,
     Material,
     Mounted,
     Noise,
@@ -259,7 +259,7 @@ def test_an_actor_stands_where_it_was_put(scene):
             on = points.positions[points.object == car]
             assert len(on) > 10 and (np.abs(on[:, 0] - x) < 2.3).all()
     scanner.move("Car", DRIVE)
-    with pytest.raises(LidarpoolError, match=r"Actor 'Car': The trajectory goes from 0 to 0\.5 s"):
+    with pytest.raises(LidarError, match=r"Actor 'Car': The trajectory goes from 0 to 0\.5 s"):
         scanner.sweep((0, 0, 1), start_s=9)
 
 
@@ -467,7 +467,7 @@ WRONG = {
 @pytest.mark.parametrize("name", WRONG)
 def test_wrong_arguments(scene, name):
     call, says = WRONG[name]
-    with pytest.raises(LidarpoolError) as raised:
+    with pytest.raises(LidarError) as raised:
         call(Scanner(scene, GRID, backend="numpy"))
     assert says in str(raised.value) and len(str(raised.value).splitlines()) <= 2
 

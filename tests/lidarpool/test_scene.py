@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from lidarpool.scenario.advice import advice
 from lidarpool.scenario.build import build
 from lidarpool.scenario.scenario import Scenario
-from lidarsim.base.errors import LidarpoolError
+from lidarsim.base.errors import LidarError
 from lidarsim.scene.object_names import unique_names
 from lidarsim.scene.scene import Scene
 from lidarsim.scene.scene_mesh import SceneMesh
@@ -77,7 +77,7 @@ def test_scenes_that_do_not_fit_together(change, message):
         "origin": np.zeros(3),
     }
     Scene(**good)
-    with pytest.raises(LidarpoolError, match=message):
+    with pytest.raises(LidarError, match=message):
         Scene(**(good | change))
 
 
@@ -106,7 +106,7 @@ def test_scale_then_x_then_y_then_z_then_translation():
     ],
 )
 def test_no_placements(make, message):
-    with pytest.raises(LidarpoolError, match=message):
+    with pytest.raises(LidarError, match=message):
         make()
 
 

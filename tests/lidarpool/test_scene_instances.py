@@ -10,7 +10,7 @@ from tests.shapes import tally_of
 
 from lidarpool import (
     Actor,
-    LidarpoolError,
+    LidarError,
     Material,
     Noise,
     Pose,
@@ -150,5 +150,5 @@ def test_several_instances_are_refused_as_one_is():
     flat = np.tile(np.eye(4), (3, 1, 1))
     assert [one.name for one in SceneInstance.several(SPHERE, flat, "V")] == ["V"] * 3
     flat[1, 2, 2] = 0
-    with pytest.raises(LidarpoolError, match="flattens the mesh"):
+    with pytest.raises(LidarError, match="flattens the mesh"):
         SceneInstance.several(SPHERE, flat, "V")

@@ -31,7 +31,7 @@ from distributed.cli import dask_scheduler, dask_worker
 from tests.clusters import import_jobqueue
 
 import lidarpool.run.cluster
-from lidarpool import Cloud, LidarpoolError, save_cloud
+from lidarpool import Cloud, LidarError, save_cloud
 from lidarpool.cli.commands import cli
 from lidarpool.datasets.dataset import DATA_SETS
 from lidarpool.export.format_table import EXPORTS, LAYOUTS
@@ -228,7 +228,7 @@ def test_yaml_is_what_it_is_for(block):
     else:
         scenario = Scenario.from_data(data, source=block.where)
         if all(path.exists() for path in scenario.files):
-            with suppress(LidarpoolError):  # a fragment, such as materials of another scene
+            with suppress(LidarError):  # a fragment, such as materials of another scene
                 assert implausibilities(build(scenario, plans=False)) == []
 
 

@@ -186,7 +186,7 @@ def test_a_data_set_is_written_and_read_in_the_bucket(environment, tmp_path, for
     system.rm(f"{folder}/{job_file(format, '00', SWEEPS_FILE)}")
     assert [bool(wrong) for _, (_, wrong) in data.look(rows)] == [True, False]
     system.rm(f"{folder}/dataset.json")
-    with pytest.raises(package.LidarpoolError, match="is an unfinished data set"):
+    with pytest.raises(package.LidarError, match="is an unfinished data set"):
         package.sweeps(url)
 
 

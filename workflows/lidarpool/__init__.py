@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 from lidarsim._version import __version__
 
 if TYPE_CHECKING:
-    from lidarsim.base.errors import LidarpoolError
+    from lidarsim.base.errors import LidarError
     from lidarsim.columns.cloud import Cloud
     from lidarsim.columns.table import Column
     from lidarsim.scene.actors import Actor
@@ -66,7 +66,7 @@ __all__ = [
     "Gnss",
     "Imu",
     "Job",
-    "LidarpoolError",
+    "LidarError",
     "Material",
     "Mounted",
     "Navigation",

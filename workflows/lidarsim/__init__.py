@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 from ._version import __version__
 
 if TYPE_CHECKING:
-    from .base.errors import LidarpoolError
+    from .base.errors import LidarError
     from .columns.cloud import Cloud
     from .columns.table import Column
     from .scene.actors import Actor
@@ -47,7 +47,7 @@ __all__ = [
     "Fault",
     "Gnss",
     "Imu",
-    "LidarpoolError",
+    "LidarError",
     "Material",
     "Mounted",
     "Navigation",
@@ -72,7 +72,7 @@ __all__ = [
 # Modules of the names above, except names of `sensor`. A module is imported when one of its names
 # is asked for, because importing all modules takes half a second.
 _MODULES = {
-    "base.errors": ("LidarpoolError",),
+    "base.errors": ("LidarError",),
     "columns.cloud": ("Cloud",),
     "columns.table": ("Column",),
     "scene.actors": ("Actor",),

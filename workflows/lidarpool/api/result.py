@@ -70,7 +70,7 @@ class Result(RunResult):
 
         Raises
         ------
-        LidarpoolError
+        LidarError
             If a file cannot be written, the folder holds the result of another survey, or a
             format lacks a package or column.
         """
@@ -113,7 +113,7 @@ class Result(RunResult):
 
         Raises
         ------
-        LidarpoolError
+        LidarError
             If there is no such picture, size or column, or a file cannot be written.
         """
         from ..report.result_pictures import draw_pictures

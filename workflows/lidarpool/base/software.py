@@ -15,7 +15,7 @@ import psutil
 from distributed import get_worker
 
 from lidarsim._version import __version__
-from lidarsim.base.errors import LidarpoolError
+from lidarsim.base.errors import LidarError
 from raybeam import backend_build
 
 T = TypeVar("T")
@@ -87,12 +87,12 @@ def software_there(backend: str = "") -> Callable[[], dict[str, str]]:
 def call_alike(wanted: str, function: Callable[..., T], *arguments: Any) -> T:
     """Call a function in a task, if its worker has the sources of the run.
 
-    `wanted` is ``lidarpool`` in the `software` of the run's driver. LidarpoolError if not.
+    `wanted` is ``lidarpool`` in the `software` of the run's driver. LidarError if not.
     """
     here = software()["lidarpool"]
     if here != wanted:
         worker = get_worker()
-        raise LidarpoolError(
+        raise LidarError(
             f"worker {worker.name} at {worker.address} has lidarpool {here}, the run {wanted}: "
             "install the same on both, and start the worker again."
         )

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, NoReturn
 import click
 
 from lidarsim._version import __version__
-from lidarsim.base.errors import LidarpoolError
+from lidarsim.base.errors import LidarError
 from lidarsim.base.interrupts import (
     INTERRUPTED,
     STOPPED,
@@ -362,7 +362,7 @@ def _explanation(error: Exception) -> str | None:
             return f"{name}: {error.strerror}: give another name or folder."
         case MemoryError():
             return "not enough memory: take a smaller scene, fewer scans or a larger keep_every."
-        case LidarpoolError():
+        case LidarError():
             return str(error)
         case RuntimeError():
             from poolpart import PoolError

@@ -10,7 +10,7 @@ from typing import Any
 
 import click
 
-from lidarsim.base.errors import LidarpoolError
+from lidarsim.base.errors import LidarError
 from lidarsim.base.storage import Storage
 from lidarsim.base.vocabulary import PICTURES, UNITS_M
 
@@ -68,7 +68,7 @@ def plot(result: Path | Storage, out: Path | Storage | None, **given: Any) -> No
     place = result if out is None else out
     with local_result(result, (PICTURE_FILE, CLOUD, PAGE)) as made:
         if not (made / PICTURE_FILE).exists():
-            raise LidarpoolError(
+            raise LidarError(
                 f"{result} holds no {PICTURE_FILE}, the data of the pictures: give the "
                 "folder of a finished run (its --out)."
             )
@@ -132,11 +132,11 @@ def export(
     needed = ("cloud.ply", SWEEPS_FILE, "report.json")
     place = result if out is None else out
     if isinstance(result, Path) and result.is_file():
-        raise LidarpoolError(f"{result} is a file: give its folder, {result.parent}.")
+        raise LidarError(f"{result} is a file: give its folder, {result.parent}.")
     with local_result(result, (*needed, *INSTRUMENT_FILES)) as made:
         for name in needed:
             if not (made / name).exists():
-                raise LidarpoolError(
+                raise LidarError(
                     f"{result} holds no {name}: give the folder of a finished run (its --out); "
                     "lidarpool run --resume continues an unfinished one."
                 )
@@ -153,7 +153,7 @@ def export(
             for one in wanted:  # before any is written, which may take long
                 one.check(folder / one.row.file, cloud, overwrite=overwrite)
                 if isinstance(place, Storage) and not overwrite and one.row.file in place.entries():
-                    raise LidarpoolError(
+                    raise LidarError(
                         f"{place.path(one.row.file)} is there already: give another place with "
                         "--out, or --overwrite."
                     )
@@ -164,7 +164,7 @@ def export(
                     for note in one.notes(cloud, sweeps):
                         click.echo(f"note: {note}", err=True)
                     click.echo(written[-1])
-            except (LidarpoolError, KeyboardInterrupt) as error:
+            except (LidarError, KeyboardInterrupt) as error:
                 if written:
                     error.add_note(f"Written before: {', '.join(written)}.")
                 raise
@@ -209,7 +209,7 @@ def view(
     from .terminal import Terminal
 
     if (film or export) and len(results) > 1:
-        raise LidarpoolError("--film and --export take one result: give them one after the other.")
+        raise LidarError("--film and --export take one result: give them one after the other.")
     with ExitStack() as stack:
         files = (CLOUD, PICTURE_FILE, SWEEPS_FILE)
         made = [stack.enter_context(local_result(result, files)) for result in results]

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from lidarsim.base.errors import LidarpoolError
+from lidarsim.base.errors import LidarError
 from lidarsim.base.vocabulary import UNITS_M
 from lidarsim.base.words import plural, without_common_prefix
 
@@ -90,7 +90,7 @@ def init(folder: Path, meshes: tuple[Path, ...], of_mesh: dict[str, Any], every:
             schema_text(scenario_schema()), encoding="utf-8", newline="\n"
         )
     except FileExistsError as error:
-        raise LidarpoolError(
+        raise LidarError(
             f"{error.filename} exists, and is not overwritten: name another folder, "
             "lidarpool init DIR, or remove it."
         ) from error
@@ -192,14 +192,14 @@ def check(
             found, lines = look_at(
                 scenario, of_mesh, number, client, asked, backend, no_plan=no_plan, quiet=as_json
             )
-    except LidarpoolError as error:
+    except LidarError as error:
         if as_json:
             reasons = {"reasons": [str(error)], "notes": [], "warnings": []}
             options.show({"can_run": False, **reasons}, (), True)
         raise
     options.show(found, lines, as_json)
     if found["reasons"]:
-        raise LidarpoolError("it cannot run. " + " ".join(found["reasons"]))
+        raise LidarError("it cannot run. " + " ".join(found["reasons"]))
     if not as_json:
         words = ["lidarpool", "run", str(scenario), *options.as_words(of_mesh)]
         given: dict[str, object] = {"out": out, "scheduler": scheduler, "cluster": cluster}
@@ -346,12 +346,12 @@ def _write(out: Path, make: Callable[[], Scene], overwrite: bool, paint: bool = 
 
     check_target(out)
     if out.exists() and not overwrite:
-        raise LidarpoolError(f"{out} exists: give another name, or --overwrite.")
+        raise LidarError(f"{out} exists: give another name, or --overwrite.")
     made = make()
     if out.suffix.lower() == ".glb":  # others keep no colours
         made = painted(made) if paint else made
     elif made.instances and made.triangles > MOST_COPIED:
-        raise LidarpoolError(
+        raise LidarError(
             f"{out} would hold {made.triangles:,} triangles, because only .glb files have a tree "
             "once for many places: write one."
         )
@@ -515,7 +515,7 @@ def stations(
     folder = Path(f"{scene.stem}-stations") if out is None else out
     there = [folder / name for name in (PLAN_FILE, PICTURE_FILE) if (folder / name).exists()]
     if there and not overwrite:
-        raise LidarpoolError(f"{there[0]} exists: give another folder, --out, or --overwrite.")
+        raise LidarError(f"{there[0]} exists: give another folder, --out, or --overwrite.")
     model = full_name(model)
     sensor = load_sensor(model)
     read, terminal = Scenario.load(scene), Terminal(quiet=as_json)

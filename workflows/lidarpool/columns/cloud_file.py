@@ -21,7 +21,7 @@ class CloudFile:
     """A cloud in PLY format, whose points stay on disk until they are selected.
 
     The file cannot store units, so `own` describes columns that are not in the table of columns, if
-    that is known. LidarpoolError if it cannot be read, or is not a point cloud of lidarpool.
+    that is known. LidarError if it cannot be read, or is not a point cloud of lidarpool.
     """
 
     def __init__(self, path: Path, own: Sequence[Column] = ()) -> None:

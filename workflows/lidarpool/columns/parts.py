@@ -22,7 +22,7 @@ from numpy.typing import DTypeLike
 
 from lidarsim.base.archives import read_arrays, read_npy
 from lidarsim.base.arrays import AnyArray, Floats, Integers, Ints, Ints32
-from lidarsim.base.errors import LidarpoolError
+from lidarsim.base.errors import LidarError
 from lidarsim.base.input_files import open_input
 from lidarsim.base.sampling import even_indices
 from lidarsim.base.storage import Storage, target_of
@@ -113,7 +113,7 @@ def pack(part: PartColumns) -> bytearray:
 def unpack(data: bytes) -> PartColumns:
     """Inverse of `pack`; every array's checksum is compared.
 
-    LidarpoolError if it is not a part, or damaged; the message is a clause.
+    LidarError if it is not a part, or damaged; the message is a clause.
     """
     try:
         arrays = read_arrays(data)
@@ -132,20 +132,20 @@ def unpack(data: bytes) -> PartColumns:
         ):
             raise ValueError("its arrays do not fit together")
     except Exception as error:  # zipfile, zlib, lzma and NumPy have a dozen kinds
-        raise LidarpoolError(f"it is damaged ({error})") from error
+        raise LidarError(f"it is damaged ({error})") from error
     return part
 
 
 def read_part(storage: Storage, name: str) -> PartColumns:
-    """Read a part; LidarpoolError if it is missing, cannot be read or is damaged."""
+    """Read a part; LidarError if it is missing, cannot be read or is damaged."""
     try:
         return unpack(storage.read(name))
-    except LidarpoolError as error:
-        raise LidarpoolError(
+    except LidarError as error:
+        raise LidarError(
             f"The part {storage.path(name)} cannot be used: {error}. {_AGAIN}"
         ) from error
     except OSError as error:
-        raise LidarpoolError(
+        raise LidarError(
             f"The part {storage.path(name)} cannot be read: {error.strerror or error}. {_AGAIN}"
         ) from error
 
@@ -160,7 +160,7 @@ def read_tally(storage: Storage, name: str) -> tuple[Ints32, Ints]:
             triangles = read_npy(archive.read(".triangles.npy"), "triangles")
             return triangles, read_npy(archive.read(".hits.npy"), "hits")
     except Exception as error:  # as above
-        raise LidarpoolError(
+        raise LidarError(
             f"The part {storage.path(name)} cannot be used ({error}). {_AGAIN}"
         ) from error
 
@@ -216,7 +216,7 @@ class StoredCloud(Shown):
     def chunks(self, points: int = CHUNK_POINTS, first: int = 0) -> Iterator[Cloud]:
         """Read the cloud in order, from row `first` on, so many points at a time.
 
-        LidarpoolError if a part cannot be read.
+        LidarError if a part cannot be read.
         """
         held: list[Cloud] = []
         count = 0
@@ -265,7 +265,7 @@ class StoredCloud(Shown):
 
         Raises
         ------
-        LidarpoolError
+        LidarError
             If pandas or pyarrow, which Dask's dataframes need, is not installed.
         """
         need_packages("pandas", "pyarrow")

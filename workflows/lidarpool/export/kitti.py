@@ -10,7 +10,7 @@ import numpy as np
 import yaml
 
 from lidarsim.base.arrays import Floats, Floats32
-from lidarsim.base.errors import LidarpoolError
+from lidarsim.base.errors import LidarError
 from lidarsim.columns.cloud import Cloud, CloudLike
 from lidarsim.sensor.trajectory import matrices
 from lidarsim.sweeps.sweeps import Sweeps, plain_names
@@ -44,7 +44,7 @@ class Pieces(pieces.Pieces):
 
     def __init__(self, cloud: CloudLike, sweeps: Sweeps, entry: Entry | None = None) -> None:
         if len(sweeps.objects) + len(sweeps.actors) > INSTANCES_MOST:
-            raise LidarpoolError(f"KITTI labels hold {INSTANCES_MOST:,} objects at most.")
+            raise LidarError(f"KITTI labels hold {INSTANCES_MOST:,} objects at most.")
         super().__init__(cloud, sweeps, entry)
         self.names = _names(sweeps, entry)
         self.sequences = [f"sequences/{name}" for name in self.names]

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from lidarsim.base.arrays import AnyArray
-from lidarsim.base.errors import LidarpoolError
+from lidarsim.base.errors import LidarError
 from lidarsim.base.storage import Storage
 from lidarsim.columns.cloud import Cloud, CloudLike
 from lidarsim.sweeps.sweeps import MIXED_UP, Sweeps
@@ -99,11 +99,11 @@ class Pieces:
     def finish(self, place: Storage, written: Iterable[WrittenRange]) -> list[Any]:
         """Write the files that are not of one piece; returns what was made of the pieces.
 
-        LidarpoolError if the cloud is not of these sweeps, or not in order; OSError.
+        LidarError if the cloud is not of these sweeps, or not in order; OSError.
         """
         counts, ranges = zip(*written, strict=True) if self else ((), ())
         if sum(counts) != len(self.cloud):
-            raise LidarpoolError(MIXED_UP)
+            raise LidarError(MIXED_UP)
         made = [more for one in ranges for more in one]
         for name, data in self.others(made).items():
             place.prepare(Path(name).parent)
@@ -154,7 +154,7 @@ class RangeWriter:
 
         Raises
         ------
-        LidarpoolError
+        LidarError
             If the cloud is not of these sweeps, or not in order; or as `workers`.
         """
         pieces = self._pieces()

@@ -22,7 +22,7 @@ import click
 import numpy as np
 
 from lidarsim.base.arrays import Floats, Floats32
-from lidarsim.base.errors import LidarpoolError
+from lidarsim.base.errors import LidarError
 from lidarsim.base.storage import Storage
 from lidarsim.columns.cloud import Cloud
 from lidarsim.sweeps.sweeps import SWEEPS_FILE, Sweeps
@@ -338,7 +338,7 @@ class Charts:
                 with self._lock:  # shortly: the run waits for no drawing
                     figures = deepcopy(self._figures)
                 self._drawn = figures.jobs
-                with self._share.taken(), suppress(LidarpoolError):
+                with self._share.taken(), suppress(LidarError):
                     pages = draw_varied(figures), draw_results(figures)
                     drawn = (f"<figure>{page.svg()}</figure>" for page in pages if page is not None)
                     self._svg = "".join(drawn)
@@ -430,7 +430,7 @@ class LiveJob:
             names, self._waiting = self._waiting[:PARTS_AT_ONCE], self._waiting[PARTS_AT_ONCE:]
             clouds = [self.cloud]
             for name in names:
-                with suppress(LidarpoolError):
+                with suppress(LidarError):
                     part = read_part(self._points.storage, name)
                     self._counts[part.triangles] += part.hits
                     self._hits += int(part.hits.sum())

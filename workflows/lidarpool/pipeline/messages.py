@@ -188,7 +188,7 @@ class ScanFrame:
 
         Raises
         ------
-        LidarpoolError
+        LidarError
             If the part cannot be read, such as after a run that was not kept.
         """
         return self._read(self.scan)

@@ -278,7 +278,7 @@ class Page:
 
         Raises
         ------
-        LidarpoolError
+        LidarError
             If the folder does not exist or is not writable.
         """
         advice = "choose a folder that exists, can be written to and has room"

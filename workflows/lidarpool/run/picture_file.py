@@ -211,7 +211,7 @@ class PictureContent:
 
     @classmethod
     def load(cls, path: Path) -> PictureContent:
-        """Read what `save` wrote; LidarpoolError if it is damaged. Nothing in the file is run."""
+        """Read what `save` wrote; LidarError if it is damaged. Nothing in the file is run."""
         with open_archive(path) as archive:
             return cls._from_arrays(archive)
 

@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 from distributed import Client
 
-from lidarsim.base.errors import LidarpoolError
+from lidarsim.base.errors import LidarError
 from lidarsim.columns.cloud import Cloud
 from lidarsim.columns.part_columns import PartColumns
 from lidarsim.columns.table import AXES, SCAN
@@ -89,7 +89,7 @@ class SweepStream:
             except Exception as error:  # Dask has many kinds where a cluster is gone
                 if client.status == "running" and not isinstance(error, (PoolError, OSError)):
                     raise
-                raise LidarpoolError(f"The stream has lost its cluster: {error}") from error
+                raise LidarError(f"The stream has lost its cluster: {error}") from error
 
     def torch(self, transform: Callable[[Sweep], Any] | None = None) -> Any:
         """Return a `torch.utils.data.IterableDataset` of the sweeps, in the order of jobs.
@@ -98,10 +98,10 @@ class SweepStream:
         torch.distributed, if that is initialised when the loader begins, get the same number of
         jobs each. `transform` makes an item of a sweep, as of `SavedSweeps.torch`.
 
-        LidarpoolError if torch is not installed; in a worker of a DataLoader.
+        LidarError if torch is not installed; in a worker of a DataLoader.
         """
         if find_spec("torch") is None:
-            raise LidarpoolError("This needs PyTorch: pip install torch.")
+            raise LidarError("This needs PyTorch: pip install torch.")
         from ..datasets.torch_sweeps import TorchStream
 
         return TorchStream(self, transform)

@@ -10,7 +10,7 @@ from typing import Any
 from dask.utils import format_bytes
 from distributed import Client
 
-from lidarsim.base.errors import LidarpoolError
+from lidarsim.base.errors import LidarError
 from lidarsim.base.vocabulary import PATIENCE_S
 from lidarsim.base.words import plural
 from poolpart.task_locations import look_for_tasks
@@ -85,7 +85,7 @@ class Watch:
             self._waits.pop(name, None)
 
     def look(self) -> None:
-        """Check from time to time; LidarpoolError if a partition was empty for too long."""
+        """Check from time to time; LidarError if a partition was empty for too long."""
         now = time.monotonic()
         if now - self._looked < WATCH_EVERY_S:
             return
@@ -103,7 +103,7 @@ class Watch:
             if name in there:
                 waiting.begin()
             elif not waiting.left():
-                raise LidarpoolError(_lacking(name, name in paused, f"{waiting.seconds:.0f} s"))
+                raise LidarError(_lacking(name, name in paused, f"{waiting.seconds:.0f} s"))
             elif name in paused:
                 advice = "give them a larger --memory-limit"
                 waiting.tell(f"paused workers of partition {name}", advice)

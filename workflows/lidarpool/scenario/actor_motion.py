@@ -28,7 +28,7 @@ from lidarsim.base.declared import (
     declared,
     one_of,
 )
-from lidarsim.base.errors import LidarpoolError, prefixed
+from lidarsim.base.errors import LidarError, prefixed
 from lidarsim.base.input_files import open_input
 from lidarsim.base.words import printable
 from lidarsim.base.xmlfile import refuse_entity
@@ -184,7 +184,7 @@ class TrajectorySection(Section):
     _one_source = one_of("file", "points")
 
     def track(self, path: PathOf, standing: Standing, start_s: float | None = None) -> Track:
-        """Return it in a scene's local coordinates; LidarpoolError if it cannot be used.
+        """Return it in a scene's local coordinates; LidarError if it cannot be used.
 
         `path` returns that of a file, `standing` is what there is to follow; `start_s` is that of
         a survey, of whose clock it is.
@@ -201,7 +201,7 @@ class TrajectorySection(Section):
         for piece in pieces:
             if piece.times_s[0] <= begin + CLOCK_S and end - CLOCK_S <= piece.times_s[-1]:
                 return replace(piece, beyond=way.beyond)
-        raise LidarpoolError(
+        raise LidarError(
             f"the trajectory leaves its surfaces ({', '.join(self.surfaces)}): let it end before."
         )
 
@@ -362,11 +362,11 @@ class TrafficSection(Section):
     )
 
     def shape_of(self, kind: str) -> VehicleSection:
-        """Return the entry of a type; LidarpoolError if there is none."""
+        """Return the entry of a type; LidarError if there is none."""
         for entry in self.vehicles:
             if any(fnmatchcase(kind, one) for one in entry.types):
                 return entry
-        raise LidarpoolError(
+        raise LidarError(
             f"{self.file} has vehicles of type {kind!r}, but no entry of traffic.vehicles fits: "
             f"add one, such as {{types: {kind!r}, box: [4.5, 1.8, 1.5]}}."
         )
@@ -396,7 +396,7 @@ def read_fcd(
 
     Raises
     ------
-    LidarpoolError
+    LidarError
         If it cannot be read, is no floating car data, or has attributes that are not known.
     """
     known_attributes = set(_KNOWN)
@@ -439,7 +439,7 @@ def read_fcd(
         if step < 0:
             raise ValueError("it has no time steps")
     except (OSError, EOFError, zlib.error, ValueError, KeyError, expat.ExpatError) as error:
-        raise LidarpoolError(
+        raise LidarError(
             f"{path} is not usable as floating car data, which sumo --fcd-output writes: "
             f"{said(error)}"
         ) from error
@@ -495,7 +495,7 @@ def actors_of(
 
     Raises
     ------
-    LidarpoolError
+    LidarError
         If a type has no shape, or there are too many.
     """
     actors: list[tuple[Actor, VehicleSection]] = []
@@ -522,7 +522,7 @@ def actors_of(
         offset_s += 0.0 if mesh.animation is None else share * mesh.animation.duration_s
         actors += [(Actor(named, way, offset_s), entry) for way in ways]
         if len(actors) > ACTORS_MOST:
-            raise LidarpoolError(
+            raise LidarError(
                 f"{section.file} has more than {ACTORS_MOST:,} vehicles and persons during the "
                 "survey: make the survey shorter, or simulate a part of the network."
             )

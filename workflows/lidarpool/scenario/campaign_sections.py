@@ -43,7 +43,7 @@ from lidarsim.base.declared import (
     one_of,
     short,
 )
-from lidarsim.base.errors import LidarpoolError, Mistakes
+from lidarsim.base.errors import LidarError, Mistakes
 from lidarsim.base.tables import ignored_columns
 from lidarsim.base.textfile import read_text
 from lidarsim.base.validation import checked_fields, sections_in, sentences
@@ -357,7 +357,7 @@ def _in_table(value: Any, position: int) -> Value | None:
 class Keep:
     """The format of a data set.
 
-    LidarpoolError if there is no such format or layout.
+    LidarError if there is no such format or layout.
     """
 
     format: Annotated[
@@ -376,7 +376,7 @@ class Keep:
     ] = False
 
     def __post_init__(self) -> None:
-        _ = self.of_jobs  # LidarpoolError if its fields do not fit together
+        _ = self.of_jobs  # LidarError if its fields do not fit together
 
     @property
     def of_jobs(self) -> Format:
@@ -503,13 +503,13 @@ def read_rows(path: Path, kind: Any, ignore: Sequence[str] = ()) -> list[Any]:
 
     Raises
     ------
-    LidarpoolError
+    LidarError
         If the file cannot be read, the field is no list, or a row is no entry of it; the message
         has the line.
     """
     entry = next(_entries(kind), None)
     if entry is None:
-        raise LidarpoolError("sample adds entries to a list, such as actors, and this is none.")
+        raise LidarError("sample adds entries to a list, such as actors, and this is none.")
     try:
         lines = read_text(path).splitlines()
         first = next((line for line in lines if line.strip() and line.lstrip()[0] != "#"), "")
@@ -530,18 +530,16 @@ def read_rows(path: Path, kind: Any, ignore: Sequence[str] = ()) -> list[Any]:
         model = next(sections_in(entry), BaseModel)
         _check_columns(head, model)
     except FileNotFoundError as error:
-        raise LidarpoolError(f"{path} does not exist: check the name and the folder.") from error
-    except (OSError, ValueError, csv.Error, LidarpoolError) as error:
-        raise LidarpoolError(f"{path} is not a usable table: {said(error)}") from error
+        raise LidarError(f"{path} does not exist: check the name and the folder.") from error
+    except (OSError, ValueError, csv.Error, LidarError) as error:
+        raise LidarError(f"{path} is not a usable table: {said(error)}") from error
     adapter = TypeAdapter(entry)
     mistakes, rows = Mistakes(), []
     for line, row in cells:
         where = f"{path}, line {line}"
         with mistakes.noted(), sentences(model, where):
             if len(row) > len(header):
-                raise LidarpoolError(
-                    f"{where}: it has {len(row)} cells, and the header {len(header)}."
-                )
+                raise LidarError(f"{where}: it has {len(row)} cells, and the header {len(header)}.")
             read = [cell for index, cell in enumerate(row) if index not in left_out]
             rows.append(_checked(adapter, dict(zip(head, read, strict=False))))
     mistakes.tell()

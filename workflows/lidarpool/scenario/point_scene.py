@@ -17,7 +17,7 @@ import numpy as np
 
 from lidarsim.base.allowance import bytes_of, memory
 from lidarsim.base.arrays import Floats
-from lidarsim.base.errors import LidarpoolError, explained, prefixed
+from lidarsim.base.errors import LidarError, explained, prefixed
 from lidarsim.base.input_files import check_input, read_input, read_input_text
 from lidarsim.base.validation import checked
 from lidarsim.base.vocabulary import UNITS_M
@@ -76,14 +76,14 @@ def scene_of_points(
 
     Raises
     ------
-    LidarpoolError
+    LidarError
         If the file cannot be read, has fewer than 12 points or a coordinate system without lengths,
         or needs too much memory.
     """
     path = Path(path)
     for name, value in (("voxel_m", voxel_m), ("size", size)):
         if value is not None and not 0 < value < np.inf:
-            raise LidarpoolError(f"{name} is {value}; it must be a positive number.")
+            raise LidarError(f"{name} is {value}; it must be a positive number.")
     return Scene.from_meshes([surfels(path, _read(path, unit, tell), voxel_m, size)])
 
 
@@ -97,21 +97,21 @@ def surfels(path: Path, points: Floats, voxel_m: float | None, size: float = 1.0
     cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points))
     del points
     if not voxel_m:
-        raise LidarpoolError(f"{path} has most of its points in the same places: give voxel_m.")
+        raise LidarError(f"{path} has most of its points in the same places: give voxel_m.")
     try:
         cloud = cloud.voxel_down_sample(voxel_m)
     except RuntimeError as error:
-        raise LidarpoolError(
+        raise LidarError(
             f"{path} is too wide for voxels of {voxel_m:.3g} m: give a larger voxel_m."
         ) from error
     count = len(cloud.points)
     if count * _BYTES > memory() // 2:
-        raise LidarpoolError(
+        raise LidarError(
             f"{path} makes {count:,} surfels, which take {bytes_of(count * _BYTES)} of memory, of "
             f"at most {bytes_of(memory() // 2)}: give a larger voxel_m than {voxel_m:.3g}."
         )
     if count < _NEIGHBOURS:
-        raise LidarpoolError(
+        raise LidarError(
             f"{path} has {count} points in different voxels of {voxel_m:.3g} m, and at least "
             f"{_NEIGHBOURS} are needed: give a smaller voxel_m, or another cloud."
         )
@@ -149,8 +149,8 @@ def _read(path: Path, unit: str | None, tell: Callable[[str], None]) -> Floats:
     suffix = path.suffix.lower()
     if suffix not in SUFFIXES:
         if advice := converted(path):
-            raise LidarpoolError(f"{path} is not read: {advice}.")
-        raise LidarpoolError(
+            raise LidarError(f"{path} is not read: {advice}.")
+        raise LidarError(
             f"{path} has the ending {path.suffix or '(none)'}; point clouds are read from "
             f"{' '.join(SUFFIXES)}."
         )
@@ -159,19 +159,19 @@ def _read(path: Path, unit: str | None, tell: Callable[[str], None]) -> Floats:
             check_input(path)
             metres = _metres(path, unit, tell)
             points = _READERS[suffix](path) * metres
-    except LidarpoolError:
+    except LidarError:
         raise
     except Exception as error:  # readers raise whatever they stumble over
         reason = printable(str(error))[:200] or type(error).__name__
-        raise LidarpoolError(f"{path} is broken or cut short ({reason}).") from error
+        raise LidarError(f"{path} is broken or cut short ({reason}).") from error
     points = points[np.isfinite(points).all(axis=1)]  # depth cameras write NaN where nothing is
     if len(points) < _NEIGHBOURS:
-        raise LidarpoolError(
+        raise LidarError(
             f"{path} has {len(points)} points, and at least {_NEIGHBOURS} are needed: it is empty, "
             "cut short, or no point cloud."
         )
     if (reach := np.abs(points).max()) > FARTHEST_M:
-        raise LidarpoolError(
+        raise LidarError(
             f"{path} reaches {reach:.3g} m from zero, farther than anything on Earth: it is "
             "broken, or in another unit (--unit, in Python unit=)."
         )
@@ -219,7 +219,7 @@ def _read_xyz(path: Path) -> Floats:
 def _read_las(path: Path) -> Floats:
     with open_las(path) as reader:
         if (size := reader.header.point_count * _BYTES) > memory():
-            raise LidarpoolError(
+            raise LidarError(
                 f"it has {reader.header.point_count:,} points, which take {bytes_of(size)} of "
                 "memory: thin it first."
             )

@@ -430,7 +430,7 @@ class SensorSection(Section):
         returns: ReturnsSection,
         name: str = "",
     ) -> Mounted:
-        """Return the lidar on its carrier; LidarpoolError if its files cannot be used.
+        """Return the lidar on its carrier; LidarError if its files cannot be used.
 
         `path` returns those of files. Equal sections have the same sensor, unless their files have
         changed. A sensor with a data sheet has noise and returns of its own: those of the sheet,

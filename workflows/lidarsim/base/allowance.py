@@ -8,7 +8,7 @@ from pathlib import Path
 
 import psutil
 
-from .errors import LidarpoolError
+from .errors import LidarError
 
 TIMES, LEAST = 100, 256 * 2**20  # of the file's bytes, and bytes of a small one
 _CONTROL_GROUPS = Path("/sys/fs/cgroup")
@@ -33,7 +33,7 @@ class Allowance:
     --------
     >>> Allowance(1_500_000, "export it again").take(2_900_000_000)
     Traceback (most recent call last):
-    lidarsim.base.errors.LidarpoolError: it has 1.43 MiB and would unpack to \
+    lidarsim.base.errors.LidarError: it has 1.43 MiB and would unpack to \
 2.70 GiB or more, of at most 256.00 MiB: export it again.
     """
 
@@ -64,11 +64,11 @@ class Allowance:
     def take(self, count: int) -> None:
         """Take so many bytes, before they are made.
 
-        LidarpoolError if that is more than the limit.
+        LidarError if that is more than the limit.
         """
         self.taken += count
         if self.taken > self.limit:
-            raise LidarpoolError(
+            raise LidarError(
                 f"it has {bytes_of(self._size)} and would unpack to {bytes_of(self.taken)} or "
                 f"more, of at most {bytes_of(self.limit)}: {self._advice}."
             )

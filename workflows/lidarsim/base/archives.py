@@ -16,7 +16,7 @@ import numpy as np
 
 from .allowance import Allowance
 from .arrays import AnyArray
-from .errors import LidarpoolError, explained, prefixed
+from .errors import LidarError, explained, prefixed
 from .input_files import read_input
 
 # Head of an array of numbers in format 1.0 of NumPy, after ten bytes with its length at their end.
@@ -38,7 +38,7 @@ def packed(arrays: Mapping[str, Any]) -> bytes:
 def open_archive(
     path: Path | str, read: Callable[[], bytes] | None = None
 ) -> Iterator[dict[str, Any]]:
-    """Read an archive for the body, whose errors become LidarpoolError; nothing in it is run.
+    """Read an archive for the body, whose errors become LidarError; nothing in it is run.
 
     With `read`, which returns the content of the file, the path is only its name in errors.
     """
@@ -46,11 +46,11 @@ def open_archive(
         with explained(f"{path} cannot be read"), prefixed(path):
             data = read() if read else read_input(path)
             yield read_arrays(data, Allowance(len(data), _AGAIN))
-    except LidarpoolError:
+    except LidarError:
         raise
     except Exception as error:  # zipfile, zlib, NumPy and Scene have many
         reason = " ".join(str(error).split())
-        raise LidarpoolError(
+        raise LidarError(
             f"{path} is damaged or not of this version of lidarpool ({reason}): run the survey "
             "again."
         ) from error
@@ -59,7 +59,7 @@ def open_archive(
 def read_arrays(data: bytes, allowance: Allowance | None = None) -> dict[str, AnyArray]:
     """Read all arrays of an archive, and compare their checksums.
 
-    They are taken from `allowance`. LidarpoolError if they are more; any exception if the archive
+    They are taken from `allowance`. LidarError if they are more; any exception if the archive
     is damaged.
     """
     with zipfile.ZipFile(io.BytesIO(data)) as archive:

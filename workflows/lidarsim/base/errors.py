@@ -8,7 +8,7 @@ from contextlib import contextmanager
 MISTAKES_TOLD = 20
 
 
-class LidarpoolError(Exception):
+class LidarError(Exception):
     """An error that the user can correct: bad input, a missing partition, a full disk.
 
     The message is one or two lines that say what was given, what was expected and what to
@@ -18,22 +18,22 @@ class LidarpoolError(Exception):
 
 @contextmanager
 def explained(what: str, advice: str = "") -> Iterator[None]:
-    """Turn an OSError of the body into a LidarpoolError: what failed, why, and what to do."""
+    """Turn an OSError of the body into a LidarError: what failed, why, and what to do."""
     try:
         yield
     except OSError as error:
         why = error.strerror or error
         told = f"{what} ({why}): {advice}." if advice else f"{what}: {why}."
-        raise LidarpoolError(told) from error
+        raise LidarError(told) from error
 
 
 @contextmanager
 def prefixed(what: object) -> Iterator[None]:
-    """Begin a LidarpoolError of the body with what it is about: «leg 3: …»."""
+    """Begin a LidarError of the body with what it is about: «leg 3: …»."""
     try:
         yield
-    except LidarpoolError as error:
-        raise LidarpoolError(f"{what}: {error}") from error
+    except LidarError as error:
+        raise LidarError(f"{what}: {error}") from error
 
 
 class Mistakes:
@@ -44,16 +44,16 @@ class Mistakes:
 
     @contextmanager
     def noted(self) -> Iterator[None]:
-        """Note a LidarpoolError of the body, and go on behind it."""
+        """Note a LidarError of the body, and go on behind it."""
         try:
             yield
-        except LidarpoolError as error:
+        except LidarError as error:
             self.lines.append(str(error))
 
     def tell(self) -> None:
-        """Raise LidarpoolError with a line for each, if anything was wrong."""
+        """Raise LidarError with a line for each, if anything was wrong."""
         lines = list(dict.fromkeys(self.lines))
         if len(lines) > MISTAKES_TOLD:
             lines[MISTAKES_TOLD:] = [f"And {len(lines) - MISTAKES_TOLD:,} more."]
         if lines:
-            raise LidarpoolError("\n".join(lines))
+            raise LidarError("\n".join(lines))

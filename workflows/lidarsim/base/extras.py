@@ -6,24 +6,24 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from importlib.util import find_spec
 
-from .errors import LidarpoolError, explained, prefixed
+from .errors import LidarError, explained, prefixed
 from .words import printable
 
 
 def need(package: str, extra: str, what: str) -> None:
-    """LidarpoolError if the package of an extra, which does what is said, is not installed."""
+    """LidarError if the package of an extra, which does what is said, is not installed."""
     if find_spec(package) is None:
-        raise LidarpoolError(f'{what} by {package}: pip install "lidarpool[{extra}]".')
+        raise LidarError(f'{what} by {package}: pip install "lidarpool[{extra}]".')
 
 
 @contextmanager
 def reading(name: str) -> Iterator[None]:
-    """Turn the errors of a library that reads a file into a LidarpoolError of a line."""
+    """Turn the errors of a library that reads a file into a LidarError of a line."""
     try:
         with explained(f"{name} cannot be read"), prefixed(name):
             yield
-    except LidarpoolError:
+    except LidarError:
         raise
     except Exception as error:  # libraries raise whatever they stumble over
         reason = printable(str(error).partition("\n")[0]) or type(error).__name__
-        raise LidarpoolError(f"{name} is broken or cut short ({reason}).") from error
+        raise LidarError(f"{name} is broken or cut short ({reason}).") from error

@@ -12,7 +12,7 @@ from io import BufferedReader
 from pathlib import Path
 
 from .allowance import bytes_of, memory
-from .errors import LidarpoolError
+from .errors import LidarError
 
 # Opening a pipe waits for a writer, and opening a terminal may make it that of the process. Both
 # flags only matter if the path changes its kind between the check and the opening.
@@ -89,14 +89,14 @@ def check_input(path: str | Path) -> int:
 
     Raises
     ------
-    LidarpoolError
+    LidarError
         If the file is larger than the memory.
     OSError
         As of `open_input`.
     """
     size = input_size(path)
     if size > memory():
-        raise LidarpoolError(
+        raise LidarError(
             f"it has {bytes_of(size)}, more than the memory of this machine "
             f"({bytes_of(memory())}): read a part of it, or read it on a larger one."
         )
@@ -108,7 +108,7 @@ def read_input(path: str | Path, max_bytes: int | None = None) -> bytes:
 
     Raises
     ------
-    LidarpoolError
+    LidarError
         If the file is read as a whole and is larger than the memory.
     OSError
         As of `open_input`.

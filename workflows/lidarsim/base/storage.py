@@ -20,7 +20,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import IO, Any
 
-from .errors import LidarpoolError
+from .errors import LidarError
 from .input_files import open_input
 
 _PIECE = 1 << 20  # bytes in memory of a file that is checked
@@ -47,7 +47,7 @@ class Storage:
     Nothing is opened, written or removed through a link below the folder that the user named. A
     link in place of a file that is written or removed goes, not what it leads to.
 
-    Its methods raise OSError if the storage fails, and LidarpoolError if it cannot be opened or
+    Its methods raise OSError if the storage fails, and LidarError if it cannot be opened or
     there is such a link.
 
     Parameters
@@ -70,7 +70,7 @@ class Storage:
     def at(cls, place: str | Path | Storage, *, durable: bool = True) -> Storage:
         """Storage at a path that the user named, made absolute, or a URL; a storage as it is.
 
-        LidarpoolError if the URL holds a password, which would get into databases and reports, or
+        LidarError if the URL holds a password, which would get into databases and reports, or
         only a scheme.
         """
         if isinstance(place, Storage):
@@ -80,13 +80,13 @@ class Storage:
             path = str(Path(text).absolute())
             return cls(path, durable, path)
         if ":" in text.partition("://")[2].partition("/")[0].rpartition("@")[0]:
-            raise LidarpoolError(
+            raise LidarError(
                 f"A URL for {text.partition(':')[0]} has a password: leave it out, and give "
                 "it in the environment or the configuration of that storage's library."
             )
         # Else `s3://$BUCKET`, with no such variable, would be a local folder.
         if not is_url(text.rstrip("/")):
-            raise LidarpoolError(f"{text} names no folder: give one, such as {text}bucket/run.")
+            raise LidarError(f"{text} names no folder: give one, such as {text}bucket/run.")
         return cls(text.rstrip("/"), durable)
 
     def __str__(self) -> str:
@@ -110,7 +110,7 @@ class Storage:
             if len(str(part)) <= len(self.named):
                 break
             if part.is_symlink():
-                raise LidarpoolError(
+                raise LidarError(
                     f"{part} is a link, and nothing behind a link in {self.named} is opened, "
                     "written or deleted: remove it, or put there what it leads to."
                 ) from OSError(errno.ELOOP, os.strerror(errno.ELOOP))  # it fails all alike
@@ -130,7 +130,7 @@ class Storage:
             _, system, folder = self._opened
             system.invalidate_cache()  # other processes write there, too
             yield system, folder
-        except (OSError, LidarpoolError):
+        except (OSError, LidarError):
             raise
         except Exception as error:
             raise OSError(f"{type(error).__name__}: {error}") from error
@@ -145,7 +145,7 @@ class Storage:
         except (ImportError, ValueError) as error:
             extra = 'pip install "lidarpool[s3]"' if self.url.startswith("s3://") else ""
             hint = f": {extra}" if extra and isinstance(error, ImportError) else ""
-            raise LidarpoolError(f"{self.url} cannot be opened: {error}{hint}.") from error
+            raise LidarError(f"{self.url} cannot be opened: {error}{hint}.") from error
         return os.getpid(), system, folder
 
     def file_system(self) -> tuple[Any, str]:
@@ -171,18 +171,18 @@ class Storage:
                 system.makedirs(f"{folder}/{name}".rstrip("/"), exist_ok=True)
 
     def claim(self) -> None:
-        """Make the folder; LidarpoolError if files cannot be written and removed there."""
+        """Make the folder; LidarError if files cannot be written and removed there."""
         name = f"{TEMPORARY}{secrets.token_hex(4)}"
         try:
             self.prepare()
             self.write(name, b"")
             self.remove([name])
         except FileNotFoundError as error:
-            raise LidarpoolError(
+            raise LidarError(
                 f"Cannot write to {self.url} ({error}): make the bucket first, or give another."
             ) from error
         except OSError as error:
-            raise LidarpoolError(
+            raise LidarError(
                 f"Cannot write to {self.url} ({error}): check the credentials and rights that "
                 "its library finds, and at its address."
             ) from error
@@ -332,7 +332,7 @@ class Storage:
                 self.local().rmdir()
 
     def tree(self, name: str = "") -> list[str]:
-        """Names, as of `read`, of all files in a folder and below; LidarpoolError for a link."""
+        """Names, as of `read`, of all files in a folder and below; LidarError for a link."""
         if self.is_local:
             found: list[Path] = []
             for folder, folders, files in os.walk(self.local(name)):

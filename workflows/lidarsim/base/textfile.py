@@ -33,7 +33,7 @@ def read_text(path: Path) -> str:
     ------
     ValueError
         If the file is empty, or is no text; the message says what it is.
-    LidarpoolError
+    LidarError
         If the file is larger than the memory.
     OSError
         As of `open_input`.

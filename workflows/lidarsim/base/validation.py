@@ -39,7 +39,7 @@ from pydantic_core import (
 )
 
 from .arrays import AnyArray
-from .errors import LidarpoolError, Mistakes
+from .errors import LidarError, Mistakes
 from .signatures import ReadableSignature, annotated, readable
 from .words import did_you_mean, plural
 
@@ -108,7 +108,7 @@ def checked(function: Callable[P, R]) -> Callable[P, R]:
 
     Raises
     ------
-    LidarpoolError
+    LidarError
         From the function: the argument, its value, and what it must be.
     """
 
@@ -159,7 +159,7 @@ def _section(_: type, source: Any, handler: GetCoreSchemaHandler) -> core_schema
     def made(value: Any, inner: Callable[[Any], Any]) -> Any:
         try:
             return inner(value)
-        except LidarpoolError as error:  # of `__post_init__`
+        except LidarError as error:  # of `__post_init__`
             raise ValueError(str(error)) from error
 
     return core_schema.no_info_wrap_validator_function(made, schema)
@@ -182,7 +182,7 @@ def _check(thing: Any, given: Mapping[str, Any]) -> None:
         try:
             validator.validate_python(without_numpy(given))
         except ValidationError as error:
-            raise LidarpoolError(_argument_error(error, hints)) from None
+            raise LidarError(_argument_error(error, hints)) from None
 
 
 def without_numpy(value: Any) -> Any:
@@ -268,7 +268,7 @@ def _having(protocol: type) -> Callable[[Any], Any]:
 
 @contextmanager
 def sentences(section: Any, source: object = "") -> Iterator[None]:
-    """Turn pydantic's error of the body into a LidarpoolError with a line for each mistake."""
+    """Turn pydantic's error of the body into a LidarError with a line for each mistake."""
     try:
         yield
     except ValidationError as error:
@@ -503,10 +503,10 @@ def _with_article(name: str) -> str:
 
 
 def as_array(name: str, values: ArrayLike, dtype: DTypeLike = np.float64) -> AnyArray:
-    """Return values as an array of numbers; LidarpoolError if they are not numbers."""
+    """Return values as an array of numbers; LidarError if they are not numbers."""
     try:
         return np.asarray(values, dtype)
     except (TypeError, ValueError, OverflowError) as error:
-        raise LidarpoolError(
+        raise LidarError(
             f"{name} is {shown(values)}; it must be an array of numbers, or lists of them."
         ) from error

@@ -9,7 +9,7 @@ from typing import Any
 import yaml
 
 from .allowance import Allowance
-from .errors import LidarpoolError, prefixed
+from .errors import LidarError, prefixed
 from .input_files import read_input_text
 
 _NODE_BYTES = 500  # of a value, while the loader has it
@@ -70,7 +70,7 @@ def load_yaml(text: str) -> Any:
 
     Raises
     ------
-    LidarpoolError
+    LidarError
         If it has too many values, with aliases written out; yaml.YAMLError if it is not YAML;
         ValueError, OverflowError or RecursionError for a number, a date or a depth that Python
         cannot hold.
@@ -89,7 +89,7 @@ def read_yaml(
 
     Raises
     ------
-    LidarpoolError
+    LidarError
         If the file is missing, unreadable, too large, not UTF-8, not YAML, empty, or holds
         something other than a mapping.
     """
@@ -97,20 +97,20 @@ def read_yaml(
         with prefixed(path):
             content = load_yaml(read_input_text(path))
     except FileNotFoundError as error:
-        raise LidarpoolError(f"{path} does not exist: check the name and the folder.") from error
+        raise LidarError(f"{path} does not exist: check the name and the folder.") from error
     except OSError as error:
-        raise LidarpoolError(f"{path} cannot be read: {error.strerror or error}.") from error
+        raise LidarError(f"{path} cannot be read: {error.strerror or error}.") from error
     except yaml.MarkedYAMLError as error:
         mark = error.problem_mark or error.context_mark
         where = f", line {mark.line + 1}" if mark else ""
-        raise LidarpoolError(f"{path}{where}: {error.problem or 'not valid YAML'}.") from error
+        raise LidarError(f"{path}{where}: {error.problem or 'not valid YAML'}.") from error
     except (yaml.YAMLError, ValueError, OverflowError, RecursionError) as error:
         # ValueError: not UTF-8, or a date or number that Python cannot hold, such as 2026-99-99.
         reason = " ".join(str(error).partition(";")[0].split())[:200]
-        raise LidarpoolError(f"{path} is not valid YAML: {reason}.") from error
+        raise LidarError(f"{path} is not valid YAML: {reason}.") from error
     if content is None:
-        raise LidarpoolError(f"{path} is empty; {form}.")
+        raise LidarError(f"{path} is empty; {form}.")
     if not isinstance(content, dict):
         kind = "a list" if isinstance(content, list) else f"only {str(content)[:40]!r}"
-        raise LidarpoolError(f"{path} holds {kind}; {form}.")
+        raise LidarError(f"{path} holds {kind}; {form}.")
     return content

@@ -32,7 +32,7 @@ def is_bag(path: Path) -> bool:
 
 
 def open_bag(path: Path, name: str) -> Reader:
-    """Open a bag; LidarpoolError, which begins with `name`, if that is impossible."""
+    """Open a bag; LidarError, which begins with `name`, if that is impossible."""
     need("rosbags", "ros", f"{name} is read")
     from rosbags.rosbag2 import Reader
 
@@ -47,7 +47,7 @@ def open_bag(path: Path, name: str) -> Reader:
 
 @contextmanager
 def opened_bag(path: Path, name: str) -> Iterator[Reader]:
-    """Open a bag for the body, and turn errors of reading it into a LidarpoolError."""
+    """Open a bag for the body, and turn errors of reading it into a LidarError."""
     with closing(open_bag(path, name)) as bag, reading(name):
         yield bag
 

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike, DTypeLike
 
 from ..base.arrays import AnyArray, AnyFloats
-from ..base.errors import LidarpoolError
+from ..base.errors import LidarError
 from ..base.validation import as_array, checked, checked_fields, shown
 from .table import TABLE, Column
 from .waveforms import WAVEFORM, Waveforms
@@ -85,7 +85,7 @@ class Cloud(Shown):
 
     Raises
     ------
-    LidarpoolError
+    LidarError
         If the lengths differ, a position is not finite, or a value does not fit its column.
     """
 
@@ -101,15 +101,15 @@ class Cloud(Shown):
         if positions.dtype not in (np.float32, np.float64):
             positions = as_array("positions", self.positions)
         if positions.ndim != 2 or positions.shape[1:] != (3,):
-            raise LidarpoolError(f"A cloud needs positions of (n, 3), not {positions.shape}.")
+            raise LidarError(f"A cloud needs positions of (n, 3), not {positions.shape}.")
         if not np.isfinite(positions).all():
-            raise LidarpoolError("A point of the cloud is NaN or infinite; it cannot be stored.")
+            raise LidarError("A point of the cloud is NaN or infinite; it cannot be stored.")
         known = TABLE | {column.name: column for column in self.own}
         columns = {}
         for name, values in self.columns.items():
             array = np.asarray(values)
             if array.shape != (len(positions),):
-                raise LidarpoolError(
+                raise LidarError(
                     f"Column {name!r} has the shape {array.shape}, but there are {len(positions)} "
                     "points: give one value for each point."
                 )
@@ -138,7 +138,7 @@ class Cloud(Shown):
         except (IndexError, TypeError):
             positions = np.empty(0)
         if positions.ndim != 2:
-            raise LidarpoolError(
+            raise LidarError(
                 f"Points of a cloud of {len(self):,} are a slice, as cloud[:100], a mask, or a "
                 f"list of their rows, not {shown(key)}; a column is its name, as cloud['range']."
             )
@@ -179,10 +179,10 @@ class Cloud(Shown):
     def waveforms(self) -> Waveforms:
         """Recorded waveforms of the points.
 
-        LidarpoolError if the survey recorded none: it needs `waveform_samples`.
+        LidarError if the survey recorded none: it needs `waveform_samples`.
         """
         if not self.recorded:
-            raise LidarpoolError(
+            raise LidarError(
                 "The cloud has no waveforms: give the survey cloud.waveform_samples, and take the "
                 "cloud of its result; of files only LAS and LAZ hold them."
             )
@@ -201,7 +201,7 @@ class Cloud(Shown):
 
         Raises
         ------
-        LidarpoolError
+        LidarError
             If the library is not installed.
         """
         need_packages(library)
@@ -234,24 +234,24 @@ class Cloud(Shown):
 
 
 def need_packages(*packages: str) -> None:
-    """Refuse with LidarpoolError what needs packages that are not installed."""
+    """Refuse with LidarError what needs packages that are not installed."""
     # A module that a program made itself has no spec.
     missing = [
         name for name in packages if sys.modules.get(name) is None and find_spec(name) is None
     ]
     if missing:
-        raise LidarpoolError(
+        raise LidarError(
             f"Dataframes need {' and '.join(missing)}: pip install {' '.join(missing)}."
         )
 
 
 def _fitting(column: Column, values: ArrayLike) -> AnyArray:
-    """Convert `values` to the column's type; LidarpoolError if a cast would wrap around."""
+    """Convert `values` to the column's type; LidarError if a cast would wrap around."""
     given, wanted = np.asarray(values), np.dtype(column.dtype)
     cast = given.astype(wanted, copy=False)
     if cast is not given and wanted.kind in "iu" and not np.array_equal(cast, given):
         limits = np.iinfo(wanted)
-        raise LidarpoolError(
+        raise LidarError(
             f"{column.name} holds {given.min()} to {given.max()}; it must be whole numbers of "
             f"{limits.min} to {limits.max}."
         )

@@ -13,7 +13,7 @@ from typing import Any, Literal
 import numpy as np
 
 from ..base.arrays import AnyArray
-from ..base.errors import LidarpoolError
+from ..base.errors import LidarError
 from ..base.validation import checked_fields
 from ..base.words import did_you_mean
 from .waveforms import WAVEFORM, column_type
@@ -59,7 +59,7 @@ class Column:
 
     Raises
     ------
-    LidarpoolError
+    LidarError
         If the name is no identifier or NumPy has no such type.
     """
 
@@ -74,14 +74,14 @@ class Column:
 
     def __post_init__(self) -> None:
         if not self.name.isidentifier():
-            raise LidarpoolError(f"A column cannot have the name {self.name!r}: use an identifier.")
+            raise LidarError(f"A column cannot have the name {self.name!r}: use an identifier.")
         try:
             kind = np.dtype(self.dtype).kind
             known = kind in "iuf" or (kind == "V" and self.name == WAVEFORM)
         except TypeError:
             known = False
         if not known:
-            raise LidarpoolError(
+            raise LidarError(
                 f"Column {self.name!r} has the type {self.dtype!r}; give a type of whole or real "
                 "numbers, such as uint8 or float32."
             )
@@ -94,13 +94,13 @@ class Column:
     def make(self, returns: Any) -> AnyArray:
         """Values of this column for the returns of a batch: (n,), of the column's type.
 
-        LidarpoolError if its source gives another number of values, or values that the type cannot
+        LidarError if its source gives another number of values, or values that the type cannot
         hold.
         """
         source = self.source or self.name
         values = np.asarray(source(returns) if callable(source) else getattr(returns, source))
         if values.shape != (len(returns),):
-            raise LidarpoolError(
+            raise LidarError(
                 f"Column {self.name!r} was made with the shape {values.shape}; it needs one value "
                 f"for each of the {len(returns)} points."
             )
@@ -108,9 +108,9 @@ class Column:
         if wanted.kind in "iu" and len(values) and values.dtype != wanted:
             limits = np.iinfo(wanted)
             if values.dtype.kind == "f" and not np.isfinite(values).all():
-                raise LidarpoolError(f"Column {self.name!r} holds NaN or infinity as {wanted}.")
+                raise LidarError(f"Column {self.name!r} holds NaN or infinity as {wanted}.")
             if values.min() < limits.min or values.max() > limits.max:
-                raise LidarpoolError(
+                raise LidarError(
                     f"Column {self.name!r} holds {values.min()} to {values.max()}, and {wanted} "
                     f"holds {limits.min} to {limits.max}: give it a wider type."
                 )
@@ -235,7 +235,7 @@ TABLE = {column.name: column for column in (SCAN, *ALWAYS, *OPTIONAL)}  # {name:
 def chosen(columns: Iterable[str | Column]) -> tuple[Column, ...]:
     """Columns in addition to `ALWAYS`, each once, with names looked up in `TABLE`.
 
-    LidarpoolError if there is no column of a name, two have the same name, a vector lacks an axis,
+    LidarError if there is no column of a name, two have the same name, a vector lacks an axis,
     or a name cannot be written.
     """
     kept: dict[str, Column] = {}
@@ -244,7 +244,7 @@ def chosen(columns: Iterable[str | Column]) -> tuple[Column, ...]:
         column = entry
         if isinstance(column, str):
             if column not in names:
-                raise LidarpoolError(
+                raise LidarError(
                     f"There is no column {column!r}."
                     + (did_you_mean(column, names) or f" There are {', '.join(names)}.")
                 )
@@ -252,11 +252,11 @@ def chosen(columns: Iterable[str | Column]) -> tuple[Column, ...]:
         if kept.get(column.name, column) != column or (
             column.name in TABLE and TABLE[column.name] != column
         ):
-            raise LidarpoolError(f"Two columns have the name {column.name!r}: rename one.")
+            raise LidarError(f"Two columns have the name {column.name!r}: rename one.")
         kept[column.name] = column
     for vector in VECTORS:
         if 0 < len(kept.keys() & {*vector}) < len(vector):
-            raise LidarpoolError(
+            raise LidarError(
                 f"The columns {', '.join(vector)} are one vector, which formats turn to other "
                 "axes: give all three."
             )
@@ -266,20 +266,20 @@ def chosen(columns: Iterable[str | Column]) -> tuple[Column, ...]:
 
 
 def check_names(columns: Iterable[Column]) -> None:
-    """Check that columns have distinct names in files; LidarpoolError if not."""
+    """Check that columns have distinct names in files; LidarError if not."""
     taken: set[str] = set()
     for name in (column.in_files for column in columns):
         if not name.isascii() or not name.isprintable() or " " in name:
-            raise LidarpoolError(
+            raise LidarError(
                 f"A column cannot have the name {name!r} in files: use ASCII letters and digits."
             )
         if name in _OPEN3D:
-            raise LidarpoolError(
+            raise LidarError(
                 f"A column cannot have the name {name!r} in files, where Open3D expects three "
                 "numbers for each point: use another name."
             )
         if name in taken:
-            raise LidarpoolError(f"Two columns have the name {name!r} in files: rename one.")
+            raise LidarError(f"Two columns have the name {name!r} in files: rename one.")
         taken.add(name)
 
 

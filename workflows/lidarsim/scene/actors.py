@@ -10,7 +10,7 @@ import numpy as np
 
 from ..base.arrays import Floats, Indices
 from ..base.elementary import interp
-from ..base.errors import LidarpoolError, prefixed
+from ..base.errors import LidarError, prefixed
 from ..base.validation import checked_fields
 from ..base.vectors import length, products, turned
 from ..sensor import Stations, Track, Trajectory
@@ -44,7 +44,7 @@ class Actor:
 
     Raises
     ------
-    LidarpoolError
+    LidarError
         If the mesh has voxels, or the first rotation of the trajectory mirrors or deforms.
     """
 
@@ -55,7 +55,7 @@ class Actor:
 
     def __post_init__(self) -> None:
         if self.mesh.voxels is not None:
-            raise LidarpoolError(
+            raise LidarError(
                 f"{self.name!r} is of voxels, which cannot move: name it in scene.files or copies."
             )
         if not isinstance(self.trajectory, Track | Stations):
@@ -66,7 +66,7 @@ class Actor:
         first_ns = max(presence_ns(self.trajectory)[0], 0.0)
         try:
             _, rotations = full_poses(self.trajectory, 0, np.array([first_ns]))
-        except LidarpoolError:  # it does not cover this time, which `check` says
+        except LidarError:  # it does not cover this time, which `check` says
             return
         with prefixed(f"Actor {self.name!r}"):
             check_rotations(np.asarray(rotations, np.float64))
@@ -152,22 +152,22 @@ class Actor:
         return times, positions, quaternions_of(rotations)
 
     def check(self, begin_ns: float, end_ns: float) -> None:
-        """Check that its trajectory covers a time; LidarpoolError if not."""
+        """Check that its trajectory covers a time; LidarError if not."""
         try:
             self.trajectory.poses(0, np.array([begin_ns, end_ns], np.float64))
-        except LidarpoolError as error:
+        except LidarError as error:
             words = str(error).rstrip(".")
-            raise LidarpoolError(
+            raise LidarError(
                 f"Actor {self.name!r}: {words}: let its trajectory begin before the first scan and "
                 "end after the last."
             ) from error
 
 
 def check_spray(actors: Iterable[Actor]) -> None:
-    """Check that actors that raise spray have a size; LidarpoolError if not."""
+    """Check that actors that raise spray have a size; LidarError if not."""
     for actor in actors:
         if actor.spray and not (np.ptp(actor.mesh.vertices, axis=0) > 0).all():
-            raise LidarpoolError(
+            raise LidarError(
                 f"Actor {actor.name!r} raises spray as wide and high as it is, and is flat: give "
                 "it a mesh with a length, width and height, or spray: false."
             )
@@ -202,7 +202,7 @@ def one_mesh(name: str, objects: Iterable[SceneMesh | SceneInstance]) -> SceneMe
     flat = [one.flat() if isinstance(one, SceneInstance) else one for one in objects]
     if any(part.voxels is not None for part in flat):
         if flat[1:]:
-            raise LidarpoolError(f"{name!r} has voxels, and cannot be joined to other objects.")
+            raise LidarError(f"{name!r} has voxels, and cannot be joined to other objects.")
         return replace(flat[0], name=name)
     if any(mesh.animation for mesh in flat):
         return _one_animated(name, flat)

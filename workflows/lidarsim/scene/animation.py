@@ -8,7 +8,7 @@ from functools import cached_property
 import numpy as np
 
 from ..base.arrays import Floats, Indices
-from ..base.errors import LidarpoolError
+from ..base.errors import LidarError
 from ..base.validation import as_array, checked_fields
 from ..base.vectors import turned
 
@@ -37,7 +37,7 @@ class Animation:
 
     Raises
     ------
-    LidarpoolError
+    LidarError
         If there are no two poses, a number is not finite, or the step or speed is not above 0.
     """
 
@@ -53,7 +53,7 @@ class Animation:
         good = len(shape) == 3 and shape[0] > 1 and shape[1] > 0 and shape[2] == 3
         good = good and self.step_s > 0 and (speed is None or speed > 0)
         if not good or not np.isfinite(self.vertices).all():
-            raise LidarpoolError(
+            raise LidarError(
                 "An animation has finite vertices (f, v, 3) of two poses at least, and a step and "
                 f"speed above 0; given: {shape}, {self.step_s} s, {speed} m/s."
             )

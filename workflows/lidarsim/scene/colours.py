@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 
 from ..base.arrays import Bools, Bytes, Floats, Floats32, Integers, Ints, Ints32, UInts32
 from ..base.elementary import power
-from ..base.errors import LidarpoolError
+from ..base.errors import LidarError
 from ..base.vectors import matmul
 from ..base.words import plural
 
@@ -101,14 +101,14 @@ class Colours:
         return replace(self, uv=uv, corners=corners)
 
     def check(self, name: str, faces: int) -> None:
-        """Check the shapes for so many faces of an object; LidarpoolError if they are wrong."""
+        """Check the shapes for so many faces of an object; LidarError if they are wrong."""
         shapes = [(self.image, (faces,)), (self.uv, (faces, 3, 2)), (self.corners, (faces, 3, 3))]
         well = all(one is None or one.shape == shape for one, shape in shapes)
         well &= all(one.dtype == np.uint8 and one.shape[2:] == (3,) for one in self.images)
         well &= all(one.size == 3 or (one.size > 3 and self.uv is not None) for one in self.images)
         well &= self.uv is None or bool(np.isfinite(self.uv).all())
         if not well or not within(self.image, len(self.images)):
-            raise LidarpoolError(
+            raise LidarError(
                 f"The colours of {name!r} do not fit its {faces} faces: images are uint8 "
                 "(h, w, 3), image (f,), uv (f, 3, 2), finite, and corners (f, 3, 3)."
             )

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..base.arrays import Integers, Ints32
-from ..base.errors import LidarpoolError
+from ..base.errors import LidarError
 from .colours import within
 
 
@@ -37,14 +37,14 @@ class FaceMaterials:
         return self if self.index is None else FaceMaterials(self.names, self.index[rows])
 
     def check(self, name: str, faces: int) -> None:
-        """Check that they are those of a number of faces; LidarpoolError if not."""
+        """Check that they are those of a number of faces; LidarError if not."""
         index = self.index
         fits = len(self.names) > 0 and len(set(self.names)) == len(self.names)
         if index is not None:
             fits = fits and index.shape == (faces,) and index.dtype == np.int32
             fits = fits and within(index, len(self.names))
         if not fits:
-            raise LidarpoolError(
+            raise LidarError(
                 f"The materials of {name!r} do not fit its {faces} faces: names are distinct, and "
                 "index is int32 (f,), rows of them, or None."
             )

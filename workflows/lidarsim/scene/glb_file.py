@@ -15,7 +15,7 @@ import numpy as np
 from PIL import Image
 
 from ..base.arrays import AnyArray, Bytes, Floats, Indices
-from ..base.errors import LidarpoolError
+from ..base.errors import LidarError
 from ..base.vectors import applied, matmul, turned
 from .colours import LINEAR
 from .files.meshfile import GENERATOR
@@ -36,7 +36,7 @@ def glb_of(scene: Scene) -> bytes:
 
     Raises
     ------
-    LidarpoolError
+    LidarError
         If it would have more than 4 GiB.
     """
     writer = _Writer(scene.origin)
@@ -203,6 +203,6 @@ class _Writer:
         text += b" " * (-len(text) % 4)
         total = 28 + len(text) + self._size
         if total > _MOST_BYTES:
-            raise LidarpoolError("it would have more than 4 GiB, the most of .glb: write a .ply.")
+            raise LidarError("it would have more than 4 GiB, the most of .glb: write a .ply.")
         head = struct.pack("<4sIII4s", b"glTF", 2, total, len(text), b"JSON")
         return b"".join([head, text, struct.pack("<I4s", self._size, b"BIN\0"), *self._pieces])

@@ -34,7 +34,7 @@ def told_apart(
 
     Raises
     ------
-    LidarpoolError
+    LidarError
         If voxels would be joined to another object.
     """
     if same_names == "join":

@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 
 from ..base.arrays import Floats
 from ..base.elementary import interp, sin_cos
-from ..base.errors import LidarpoolError
+from ..base.errors import LidarError
 from ..base.tables import METRES, RADIANS, Quantity, read_table
 from ..base.textfile import read_text
 from ..base.validation import as_array, checked
@@ -135,13 +135,11 @@ class Robot:
 
         Raises
         ------
-        LidarpoolError
+        LidarError
             If there is no such link, or the joints cannot be used.
         """
         if link not in self.joints and link != self.links[0]:
-            raise LidarpoolError(
-                f"{self.name} has no link {link!r}.{did_you_mean(link, self.links)}"
-            )
+            raise LidarError(f"{self.name} has no link {link!r}.{did_you_mean(link, self.links)}")
         return self._path(link, trajectory, *self._values(joints, ignore))
 
     @checked
@@ -174,7 +172,7 @@ class Robot:
 
         Raises
         ------
-        LidarpoolError
+        LidarError
             If the joints cannot be used.
         """
         times_s, values = self._values(joints, ignore, tell)
@@ -256,17 +254,17 @@ class Robot:
         times = table.pop("time_s", np.zeros(1))
         for name, value in table.items():
             if name not in self.moving:
-                raise LidarpoolError(
+                raise LidarError(
                     f"{self.name} has no joint {name!r} that moves."
                     f"{did_you_mean(name, self.moving)}"
                 )
             if value.shape != times.shape or not np.isfinite(value).all():
-                raise LidarpoolError(
+                raise LidarError(
                     f"The values of joint {name!r} must be finite, one for each time_s "
                     f"({len(times)}), or one without time_s; there are {value.size}."
                 )
         if not (len(times) and np.isfinite(times).all() and (np.diff(times) > 0).all()):
-            raise LidarpoolError("time_s of joints must be finite, and ascend.")
+            raise LidarError("time_s of joints must be finite, and ascend.")
         joints = {joint.name: joint for joint in self.joints.values() if joint.moves}
         for name in joints:
             chain = [joints[name]]
@@ -290,7 +288,7 @@ class Robot:
         return times, table
 
     def _read_values(self, path: Path, ignore: Sequence[str]) -> dict[str, Floats]:
-        """Read a table of values; LidarpoolError if it cannot be used."""
+        """Read a table of values; LidarError if it cannot be used."""
         quantities = [
             Quantity(
                 joint.name,
@@ -310,12 +308,10 @@ class Robot:
                 ignore=ignore,
                 unused=[joint.name for joint in self.joints.values() if not joint.moves],
             )
-        except (OSError, ValueError, LidarpoolError) as error:
-            raise LidarpoolError(
-                f"{path} is not a usable table of joints: {said(error)}"
-            ) from error
+        except (OSError, ValueError, LidarError) as error:
+            raise LidarError(f"{path} is not a usable table of joints: {said(error)}") from error
         if len(table) < 2:
-            raise LidarpoolError(
+            raise LidarError(
                 f"{path} has values of no joint that moves: name its columns as the joints of "
                 f"{self.name} are, such as {', '.join(self.moving[:3])}."
             )
@@ -379,7 +375,7 @@ class LinkPath:
 
         Raises
         ------
-        LidarpoolError
+        LidarError
             If the trajectory or the joints have no values for a time.
         """
         place, turn, *_ = self._along(station, times_ns, moving=False)
@@ -392,7 +388,7 @@ class LinkPath:
 
         Raises
         ------
-        LidarpoolError
+        LidarError
             If the trajectory or the joints have no values for a time.
         """
         _, _, velocity, rate = self._along(station, times_ns, moving=True)
@@ -417,7 +413,7 @@ class LinkPath:
         low, high = at.min(initial=np.inf), at.max(initial=-np.inf)
         first, last = self.times_s[[0, -1]]
         if self.hinges and max(first - low, high - last) > _LATE_S:
-            raise LidarpoolError(
+            raise LidarError(
                 f"The joints have values from {first:.9g} to {last:.9g} s; poses are asked for "
                 f"from {low:.9g} to {high:.9g} s."
             )

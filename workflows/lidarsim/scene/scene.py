@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from ..base.arrays import Bools, Floats, Ints32
-from ..base.errors import LidarpoolError
+from ..base.errors import LidarError
 from ..base.validation import as_array, checked, checked_fields, shown
 from ..base.vectors import hypot
 from ..base.words import plural
@@ -69,7 +69,7 @@ class Scene:
 
     Raises
     ------
-    LidarpoolError
+    LidarError
         If there is no triangle, or the arrays do not fit together.
     """
 
@@ -94,11 +94,11 @@ class Scene:
         owners = np.ascontiguousarray(as_array("face_object", self.face_object, np.int32))
         (origin,) = points_array("the scene's origin", [as_array("origin", self.origin)])
         if faces.ndim != 2 or faces.shape[1:] != (3,) or not (len(faces) or self.instances):
-            raise LidarpoolError(f"A scene needs triangles, faces of (f, 3), not {faces.shape}.")
+            raise LidarError(f"A scene needs triangles, faces of (f, 3), not {faces.shape}.")
         if not within(faces, len(vertices)):
-            raise LidarpoolError(f"Faces must name the {len(vertices)} vertices, from 0 up.")
+            raise LidarError(f"Faces must name the {len(vertices)} vertices, from 0 up.")
         if owners.shape != faces.shape[:1] or not within(owners, len(self.names)):
-            raise LidarpoolError(
+            raise LidarError(
                 f"face_object must give one of the {len(self.names)} objects, from 0 up, for "
                 f"each of the {len(faces)} faces."
             )
@@ -180,7 +180,7 @@ class Scene:
 
         Raises
         ------
-        LidarpoolError
+        LidarError
             If the file cannot be read completely, or has no triangles.
         """
         found = load_objects(
@@ -227,18 +227,18 @@ class Scene:
 
         Raises
         ------
-        LidarpoolError
+        LidarError
             If there are none, or more vertices or triangles than 32 bits can count.
         """
         objects = list(meshes)
         for one in objects:
             if not isinstance(one, (SceneMesh, SceneInstance)):
-                raise LidarpoolError(
+                raise LidarError(
                     f"meshes holds {shown(one)}; each must be a SceneMesh(name, vertices, faces), "
                     "or a SceneInstance of one."
                 )
         if not objects:
-            raise LidarpoolError("A scene needs at least one object with triangles.")
+            raise LidarError("A scene needs at least one object with triangles.")
         plain: list[tuple[int, SceneMesh]] = []  # (object, mesh without masks and voxels)
         shared: list[tuple[int, int, Floats]] = []  # (object, part, matrix)
         parts: list[MeshPart] = []
@@ -272,7 +272,7 @@ class Scene:
         points, most = sum(len(mesh.vertices) for _, mesh in plain), np.iinfo(np.int32).max
         triangles = sum(sizes) + sum(len(parts[part].faces) for _, part, _ in shared)
         if max(points, triangles) > most:
-            raise LidarpoolError(
+            raise LidarError(
                 f"The scene has {points} vertices and {triangles} triangles; at most {most} of "
                 "each can be numbered."
             )
@@ -314,13 +314,13 @@ class Scene:
 
         Raises
         ------
-        LidarpoolError
+        LidarError
             If something is no actor.
         """
         found = tuple(actors)
         for actor in found:
             if not isinstance(actor, Actor):
-                raise LidarpoolError(
+                raise LidarError(
                     f"actors holds {shown(actor)}; each must be an Actor(mesh, trajectory)."
                 )
         scene = copy(self)

@@ -11,7 +11,7 @@ import trimesh
 from trimesh.exchange.obj import export_obj
 from trimesh.exchange.ply import export_ply
 
-from ..base.errors import LidarpoolError, explained
+from ..base.errors import LidarError, explained
 from ..base.storage import Storage
 from .files.meshfile import OWN
 from .glb_file import glb_of
@@ -35,7 +35,7 @@ def write_scene(path: str | Path, scene: Scene) -> Path:
 
     Raises
     ------
-    LidarpoolError
+    LidarError
         As for `check_target`, if the disk is full, or a .ply is too coarse for so far a scene.
     """
     path = Path(path)
@@ -51,30 +51,30 @@ def check_target(path: Path) -> None:
 
     Raises
     ------
-    LidarpoolError
+    LidarError
         If the ending is not one of `SUFFIXES`, or the folder is missing or not writable.
     """
     if path.suffix.lower() not in SUFFIXES:
-        raise LidarpoolError(
+        raise LidarError(
             f"{path} has the ending {path.suffix or '(none)'}; "
             f"scenes are written as {', '.join(SUFFIXES)}."
         )
     if not path.parent.is_dir():
-        raise LidarpoolError(f"The folder {path.parent} does not exist: make it first.")
+        raise LidarError(f"The folder {path.parent} does not exist: make it first.")
     if path.is_dir() or not os.access(path.parent, os.W_OK):
-        raise LidarpoolError(f"{path} cannot be written: choose another place.")
+        raise LidarError(f"{path} cannot be written: choose another place.")
 
 
 def _encoded(suffix: str, scene: Scene) -> bytes:
     """Content of a file of one of `SUFFIXES`."""
     if scene.has_voxels.any():
         name = scene.all_names[scene.has_voxels.argmax()]
-        raise LidarpoolError(f"{name!r} is of voxels, which cannot be written: name its .vox file.")
+        raise LidarError(f"{name!r} is of voxels, which cannot be written: name its .vox file.")
     if suffix == ".ply":
         if scene.origin.any():
             step = np.spacing(np.float32(np.abs(scene.origin).max()))
             x, y, _ = scene.origin
-            raise LidarpoolError(
+            raise LidarError(
                 f"A .ply would have coordinates in steps of {step:.2g} m around x {x:.0f}, "
                 f"y {y:.0f}, because they are in single precision: write a .glb or .obj."
             )

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 
 from ..base.arrays import Bools, Floats, Floats32, Indices, Ints, Ints32
 from ..base.elementary import decade
-from ..base.errors import LidarpoolError
+from ..base.errors import LidarError
 from ..base.validation import checked_fields
 from ..base.vectors import applied, determinant, inverse, matmul, rank
 from ..sensor import Pose
@@ -46,7 +46,7 @@ class SceneInstance:
 
     Raises
     ------
-    LidarpoolError
+    LidarError
         If the transform is not that of a place, or flattens the mesh.
     """
 
@@ -65,7 +65,7 @@ class SceneInstance:
 
     @classmethod
     def several(cls, mesh: SceneMesh, transforms: Floats, name: str) -> list[SceneInstance]:
-        """Instances of a mesh at (n, 4, 4), checked all at once; LidarpoolError as of one."""
+        """Instances of a mesh at (n, 4, 4), checked all at once; LidarError as of one."""
         linear = transforms[:, :3, :3]
         well = np.isfinite(transforms).all() and (np.abs(transforms[:, :3, 3]) <= FARTHEST_M).all()
         if not well or (rank(linear) < 3).any():
@@ -92,9 +92,9 @@ class SceneInstance:
 
 
 def check_near(position: Floats) -> None:
-    """Check that a place (3,) is on Earth; LidarpoolError if it is farther than `FARTHEST_M`."""
+    """Check that a place (3,) is on Earth; LidarError if it is farther than `FARTHEST_M`."""
     if not (np.abs(position) <= FARTHEST_M).all():
-        raise LidarpoolError(
+        raise LidarError(
             f"An instance cannot be at {np.asarray(position).tolist()}: give metres within "
             f"{FARTHEST_M:g} of zero."
         )

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ..base.arrays import AnyArray, AnyFloats, Bools, Floats, Floats32, Integers, Ints
-from ..base.errors import LidarpoolError
+from ..base.errors import LidarError
 from ..base.validation import as_array, checked_fields
 from ..base.vectors import determinant, length, matmul, rank, turned
 from .animation import Animation
@@ -89,7 +89,7 @@ class SceneMesh:
 
     Raises
     ------
-    LidarpoolError
+    LidarError
         If there is no triangle, a shape is wrong, a coordinate is NaN or infinite, or a face
         refers to a vertex that does not exist.
     """
@@ -107,14 +107,14 @@ class SceneMesh:
         object.__setattr__(self, "vertices", points_array(self.name, self.vertices))
         faces = np.asarray(self.faces)
         if faces.ndim != 2 or faces.shape[1] != 3 or not np.issubdtype(faces.dtype, np.integer):
-            raise LidarpoolError(
+            raise LidarError(
                 f"The faces of {self.name!r} have shape {faces.shape} and type {faces.dtype}; "
                 "expected integers of shape (f, 3)."
             )
         if not len(faces):
-            raise LidarpoolError(f"Object {self.name!r} has no triangles.")
+            raise LidarError(f"Object {self.name!r} has no triangles.")
         if faces.min() < 0 or faces.max() >= len(self.vertices):
-            raise LidarpoolError(
+            raise LidarError(
                 f"The faces of {self.name!r} refer to vertices {faces.min()} to {faces.max()}; "
                 f"there are {len(self.vertices)}, counted from 0."
             )
@@ -128,11 +128,11 @@ class SceneMesh:
         if self.voxels is not None:
             _check_voxels(self.name, self.voxels)
             if self.cutouts:
-                raise LidarpoolError(f"{self.name!r} has voxels and cutouts: leave out one.")
+                raise LidarError(f"{self.name!r} has voxels and cutouts: leave out one.")
         if self.animation is not None:
             moving = self.animation.vertices.shape[1]
             if moving != len(self.vertices) or self.cutouts or self.voxels is not None:
-                raise LidarpoolError(
+                raise LidarError(
                     f"{self.name!r} has {len(self.vertices)} vertices, and its animation moves "
                     f"{moving}: it must move all of them, of a mesh without cutouts and voxels."
                 )
@@ -171,7 +171,7 @@ def _check_voxels(name: str, voxels: Voxels) -> None:
     well = well and bool(0 <= density.min() <= density.max() <= DENSEST)
     well = well and matrix.shape == (3, 4) and bool(np.isfinite(matrix).all())
     if not well or rank(matrix[:, :3]) < 3:
-        raise LidarpoolError(
+        raise LidarError(
             f"The voxels of {name!r} are {density.dtype} {density.shape}, with a matrix "
             f"{matrix.shape}; they must be float32 (nx, ny, nz), {VOXELS_MOST:,} at most along "
             f"each axis, of 0 to {DENSEST:g} m²/m³, and the matrix finite (3, 4), invertible."
@@ -183,12 +183,12 @@ def _check_cutouts(name: str, cutouts: tuple[Cutout, ...], faces: int) -> None:
         well = cut.mask.dtype == np.bool_ and cut.mask.ndim == 2 and cut.mask.size > 0
         well = well and cut.uv.shape[1:] == (3, 2) and len(cut.uv) > 0
         if not well or not (np.abs(cut.uv) < UV_MOST).all():
-            raise LidarpoolError(
+            raise LidarError(
                 f"A cutout of {name!r} has a mask {cut.mask.dtype} {cut.mask.shape} and uv "
                 f"{cut.uv.shape}; they must be bool (h, w), and (k, 3, 2) within {UV_MOST:,}."
             )
     if (cut_out := sum(len(cut.uv) for cut in cutouts)) > faces:
-        raise LidarpoolError(f"{name!r} has {faces} faces, and cutouts of {cut_out}.")
+        raise LidarError(f"{name!r} has {faces} faces, and cutouts of {cut_out}.")
 
 
 def stacked(parts: Iterable[tuple[AnyArray, AnyArray]]) -> tuple[AnyArray, AnyArray]:
@@ -218,15 +218,15 @@ def points_array(name: str, points: ArrayLike) -> Floats:
 
     Raises
     ------
-    LidarpoolError
+    LidarError
         If it is not that; the message starts with `name`.
     """
     array = np.ascontiguousarray(as_array(f"vertices of {name!r}", points))
     if array.ndim != 2 or array.shape[1] != 3:
-        raise LidarpoolError(f"The vertices of {name!r} have shape {array.shape}; expected (v, 3).")
+        raise LidarError(f"The vertices of {name!r} have shape {array.shape}; expected (v, 3).")
     bad = ~np.isfinite(array).all(axis=1)
     if bad.any():
-        raise LidarpoolError(
+        raise LidarError(
             f"{int(bad.sum())} of the {len(array)} vertices of {name!r} are NaN or infinite, "
             f"the first is number {int(bad.argmax())}: repair the mesh."
         )

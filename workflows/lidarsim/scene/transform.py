@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 
 from ..base.arrays import Floats
 from ..base.elementary_scalars import sin_cos_of
-from ..base.errors import LidarpoolError
+from ..base.errors import LidarError
 from ..base.validation import as_array
 from ..base.vectors import length, matmul, rank
 from ..sensor import Pose
@@ -52,7 +52,7 @@ class Transform:
 
     Raises
     ------
-    LidarpoolError
+    LidarError
         If the numbers are not finite or `linear` flattens the mesh.
     """
 
@@ -62,14 +62,14 @@ class Transform:
     def __post_init__(self) -> None:
         linear, offset = as_array("linear", self.linear), as_array("offset", self.offset)
         if linear.shape != (3, 3) or offset.shape != (3,):
-            raise LidarpoolError(
+            raise LidarError(
                 f"A transform needs a (3, 3) matrix and 3 offsets, not {linear.shape} and "
                 f"{offset.shape}."
             )
         if not (np.isfinite(linear).all() and np.isfinite(offset).all()):
-            raise LidarpoolError("A transform must be of finite numbers.")
+            raise LidarError("A transform must be of finite numbers.")
         if rank(linear) < 3:
-            raise LidarpoolError("The transform flattens the mesh: its matrix has no inverse.")
+            raise LidarError("The transform flattens the mesh: its matrix has no inverse.")
         object.__setattr__(self, "linear", linear)
         object.__setattr__(self, "offset", offset)
 
@@ -105,7 +105,7 @@ class Transform:
         """Make a transform of a homogeneous (4, 4) matrix whose last row is 0 0 0 1."""
         array = as_array("transform", matrix)
         if array.shape != (4, 4) or not np.array_equal(array[3], [0, 0, 0, 1]):
-            raise LidarpoolError(
+            raise LidarError(
                 "A transform matrix has four rows of four numbers, the last one 0 0 0 1; "
                 f"given: {array.tolist()}."
             )

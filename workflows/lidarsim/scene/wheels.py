@@ -9,7 +9,7 @@ from fnmatch import fnmatchcase
 import numpy as np
 
 from ..base.elementary import sin_cos
-from ..base.errors import LidarpoolError
+from ..base.errors import LidarError
 from ..base.words import did_you_mean
 from .animation import Animation
 from .scene_instances import SceneInstance
@@ -42,7 +42,7 @@ def rolling(
 
     Raises
     ------
-    LidarpoolError
+    LidarError
         If no object has one of the names, or none of them is round.
     """
     flat = [one.flat() if isinstance(one, SceneInstance) else one for one in objects]
@@ -50,7 +50,7 @@ def rolling(
     for wheel in wheels:
         if not any(fnmatchcase(name, wheel) for name in names):
             hint = did_you_mean(wheel, names) or f" There are {', '.join(names[:5])}."
-            raise LidarpoolError(f"wheels names {wheel!r}, but no object has that name.{hint}")
+            raise LidarError(f"wheels names {wheel!r}, but no object has that name.{hint}")
     radii: dict[int, float] = {}
     still: list[str] = []  # notes on wheels that are not round
     for number, one in enumerate(flat):
@@ -64,7 +64,7 @@ def rolling(
             else:
                 radii[number] = height / 2
     if not radii:
-        raise LidarpoolError(f"no object that wheels names can turn: {still[0]}.")
+        raise LidarError(f"no object that wheels names can turn: {still[0]}.")
     largest = max(radii.values())
     turns = {number: round(largest / radius) for number, radius in radii.items()}
     for number in [number for number, own in turns.items() if own > _TURNS_MOST]:

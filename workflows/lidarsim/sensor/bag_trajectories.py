@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from ..base.arrays import Floats, Ints
-from ..base.errors import LidarpoolError
+from ..base.errors import LidarError
 from ..base.vectors import applied, matmul
 from ..base.words import did_you_mean
 from ..columns.bags import messages_of, opened_bag
@@ -68,7 +68,7 @@ def read_bag(path: Path, topic: str | None, origin: Origin) -> TimedPoses:
 
     Raises
     ------
-    LidarpoolError
+    LidarError
         If the bag cannot be read, or the topic is not clear.
     """
     with opened_bag(path, "the bag") as bag:
@@ -99,11 +99,11 @@ def _chosen(labels: Sequence[str], topic: str | None) -> str:
     if topic is None and len(labels) == 1:
         return labels[0]
     if not labels:
-        raise LidarpoolError(f"it has no poses: topics of {_READ} are read.")
+        raise LidarError(f"it has no poses: topics of {_READ} are read.")
     listed = f"it has the poses {', '.join(labels)}"
     if topic is None:
-        raise LidarpoolError(f"{listed}: choose one with topic.")
-    raise LidarpoolError(f"{listed}, not {topic!r}.{did_you_mean(topic, labels)}")
+        raise LidarError(f"{listed}: choose one with topic.")
+    raise LidarError(f"{listed}, not {topic!r}.{did_you_mean(topic, labels)}")
 
 
 def _row_of(pose: Any) -> list[float]:
@@ -136,9 +136,9 @@ def _topic_poses(bag: Reader, topic: str, pose_of: Callable[[Any], Any]) -> Time
         rows.append(_row_of(pose_of(message)))
         frames.add(message.header.frame_id)
     if not rows:
-        raise LidarpoolError(f"{topic} has no messages.")
+        raise LidarError(f"{topic} has no messages.")
     if len(frames) > 1:
-        raise LidarpoolError(f"{topic} has poses in several frames: {', '.join(sorted(frames))}.")
+        raise LidarError(f"{topic} has poses in several frames: {', '.join(sorted(frames))}.")
     # Programs that set no stamps leave zeros.
     times_ns, table = _in_order(stamps if any(stamps) else times, rows)
     return TimedPoses(times_ns / 1e9, table[:, :3], table[:, 3:])
@@ -155,7 +155,7 @@ def _gnss_poses(
             times_ns.append(_stamp_ns(fix.header))
             fixes.append(place)
     if len(fixes) < 2:
-        raise LidarpoolError(f"{topic} has {len(fixes)} fixes, and a trajectory needs two.")
+        raise LidarError(f"{topic} has {len(fixes)} fixes, and a trajectory needs two.")
     times, places = _in_order(times_ns, fixes)
     zero = places[0] if origin is None else np.asarray(origin, np.float64)
     latitude, longitude, height = zero.tolist()
@@ -165,7 +165,7 @@ def _gnss_poses(
         return TimedPoses(times / 1e9, positions, None)
     within = (times >= orientations[0][0]) & (times <= orientations[0][-1])
     if within.sum() < 2:
-        raise LidarpoolError(f"{topic} and the orientations of its Imu are not of the same time.")
+        raise LidarError(f"{topic} and the orientations of its Imu are not of the same time.")
     _, turns = _edge_poses(*orientations, times[within])
     return TimedPoses(times[within] / 1e9, positions[within], quaternions_of(turns))
 
@@ -174,7 +174,7 @@ def _orientations(bag: Reader, kinds: Mapping[str, str], imu: str) -> tuple[Ints
     """Return times (k,), ns, and rows (k, 7) with orientations of an IMU; None without any."""
     topics = [one for one, kind in kinds.items() if kind == _IMU]
     if imu and imu not in topics:
-        raise LidarpoolError(f"it has no Imu {imu!r}.{did_you_mean(imu, topics)}")
+        raise LidarError(f"it has no Imu {imu!r}.{did_you_mean(imu, topics)}")
     measured: dict[str, tuple[list[int], list[list[float]]]] = {}
     for topic, _, message in messages_of(bag, [imu] if imu else topics):
         if message.orientation_covariance[0] != -1:  # an IMU without orientation, by its definition
@@ -183,13 +183,13 @@ def _orientations(bag: Reader, kinds: Mapping[str, str], imu: str) -> tuple[Ints
             times.append(_stamp_ns(message.header))
             rows.append([0.0, 0.0, 0.0, turn.x, turn.y, turn.z, turn.w])
     if len(measured) > 1:
-        raise LidarpoolError(
+        raise LidarError(
             f"it has several Imu with orientations, {', '.join(measured)}: give topic both names, "
             f"of the NavSatFix and the Imu, separated by a space."
         )
     if not measured:
         if imu:
-            raise LidarpoolError(f"{imu} has no orientations.")
+            raise LidarError(f"{imu} has no orientations.")
         return None
     return _in_order(*next(iter(measured.values())))
 
@@ -205,7 +205,7 @@ def _edges_of(bag: Reader, kinds: Mapping[str, str]) -> dict[str, _Edge]:
             )
             edge = edges.setdefault(child, _Edge(parent))
             if edge.parent != parent:
-                raise LidarpoolError(
+                raise LidarError(
                     f"its frame {child!r} is in the frames {edge.parent!r} and {parent!r}."
                 )
             if topic.endswith(_STATIC):
@@ -221,7 +221,7 @@ def _chain(edges: Mapping[str, _Edge], frame: str) -> list[_Edge]:
     chain, passed = [], set[str]()
     while frame in edges:
         if frame in passed:
-            raise LidarpoolError(f"its frame {frame!r} is above itself.")
+            raise LidarError(f"its frame {frame!r} is above itself.")
         passed.add(frame)
         chain.append(edges[frame])
         frame = edges[frame].parent
@@ -246,11 +246,11 @@ def _frame_poses(edges: Mapping[str, _Edge], frame: str) -> TimedPoses:
     tables = [_in_order(edge.times_ns, edge.rows) for edge in chain]
     moving = [times for times, _ in tables if len(times) > 1]
     if not moving:
-        raise LidarpoolError(f"its frame {frame!r} has one pose, and a trajectory needs two.")
+        raise LidarError(f"its frame {frame!r} has one pose, and a trajectory needs two.")
     first, last = max(times[0] for times in moving), min(times[-1] for times in moving)
     times = moving[0][(moving[0] >= first) & (moving[0] <= last)]
     if len(times) < 2:
-        raise LidarpoolError(f"the frames above {frame!r} have no poses at the same time.")
+        raise LidarError(f"the frames above {frame!r} have no poses at the same time.")
     positions = np.zeros((len(times), 3))
     rotations = np.broadcast_to(np.eye(3), (len(times), 3, 3))
     for edge_times, rows in tables:

@@ -14,7 +14,7 @@ from pydantic import Field
 from ..base.arrays import Floats, Ints
 from ..base.declared import about
 from ..base.elementary import cos, sin_cos
-from ..base.errors import LidarpoolError
+from ..base.errors import LidarError
 from ..base.validation import as_array, checked, checked_fields
 
 CHANNELS_MOST = 65_535  # the type of the column
@@ -40,7 +40,7 @@ class Beams:
 
     Raises
     ------
-    LidarpoolError
+    LidarError
         If the lengths differ, a value is not finite, or there are no beams or too many.
     """
 
@@ -52,7 +52,7 @@ class Beams:
     def __post_init__(self) -> None:
         count = as_array("Beams.elevation", self.elevation).size
         if not 1 <= count <= CHANNELS_MOST:
-            raise LidarpoolError(f"A sensor has 1 to {CHANNELS_MOST} beams, not {count}.")
+            raise LidarError(f"A sensor has 1 to {CHANNELS_MOST} beams, not {count}.")
         for name, shape in (
             ("elevation", (count,)),
             ("azimuth", (count,)),
@@ -139,7 +139,7 @@ class Spin:
 
     Raises
     ------
-    LidarpoolError
+    LidarError
         If a value is out of its range, or a time step holds no firing at all.
 
     Examples
@@ -157,7 +157,7 @@ class Spin:
 
     def __post_init__(self) -> None:
         if self._firings_per_step < 1:
-            raise LidarpoolError(
+            raise LidarError(
                 f"step_deg {self.step_deg} is less than one firing "
                 f"({360 / self.firings_per_turn:g} degrees), so some scans would be empty: make "
                 "step_deg or the number of firings larger."
@@ -244,7 +244,7 @@ def _table(name: str, values: ArrayLike, shape: tuple[int, ...]) -> Floats:
     if not array.size:
         array = np.zeros(shape)
     if array.shape != shape or not np.isfinite(array).all():
-        raise LidarpoolError(
+        raise LidarError(
             f"Beams.{name} must be {shape} finite numbers, one for each beam; given: {array.shape}."
         )
     array.flags.writeable = False

@@ -14,7 +14,7 @@ import yaml
 
 from ..base.arrays import Floats
 from ..base.elementary import sin_cos
-from ..base.errors import LidarpoolError
+from ..base.errors import LidarError
 from ..base.textfile import read_text
 from ..base.yamlfile import load_yaml
 from .beams import Beams
@@ -22,7 +22,7 @@ from .beams import Beams
 # Errors of files that users write.
 UNUSABLE = (
     OSError, ValueError, TypeError, KeyError, ArithmeticError, MemoryError, RecursionError,
-    yaml.YAMLError, LidarpoolError,
+    yaml.YAMLError, LidarError,
 )  # fmt: skip
 
 
@@ -52,7 +52,7 @@ def read_calibration(path: Path) -> Calibration:
 
     Raises
     ------
-    LidarpoolError
+    LidarError
         If it is none of these, or numbers are missing, not finite or in the wrong order.
     """
     try:
@@ -63,7 +63,7 @@ def read_calibration(path: Path) -> Calibration:
             return _ouster(path.name, json.loads(text))
         return _table(path.name, text)
     except UNUSABLE as error:
-        raise LidarpoolError(f"{path} is not a usable calibration: {said(error)}") from error
+        raise LidarError(f"{path} is not a usable calibration: {said(error)}") from error
 
 
 def said(error: Exception) -> str:

@@ -11,7 +11,7 @@ from pydantic import Field
 
 from ..base.arrays import Bools, Floats, Ints
 from ..base.declared import AngleDeg, Ends, Several, Text, Two, UnitShare, about
-from ..base.errors import LidarpoolError, prefixed
+from ..base.errors import LidarError, prefixed
 from ..base.validation import checked_fields, without_numpy
 from ..base.words import did_you_mean
 
@@ -41,7 +41,7 @@ class Fault:
 
     Raises
     ------
-    LidarpoolError
+    LidarError
         If a number is outside its range, or its fields do not fit together.
     """
 
@@ -65,9 +65,9 @@ class Fault:
         for name in sorted((given ^ {*own}) - {one for one in own if one.endswith("_deg")}):
             advice = f"leave {name} out" if name in given else f"give {name}"
             takes = f"takes {', '.join(own)}" if own else "has times only"
-            raise LidarpoolError(f"{self.kind} {takes}: {advice}.")
+            raise LidarError(f"{self.kind} {takes}: {advice}.")
         if self.to_s is not None and self.to_s <= self.from_s:
-            raise LidarpoolError(f"to_s is {self.to_s:g}; give more than from_s, {self.from_s:g}.")
+            raise LidarError(f"to_s is {self.to_s:g}; give more than from_s, {self.from_s:g}.")
 
     def words(self) -> dict[str, Any]:
         """Return what is given, for labels: {field: value}."""
@@ -96,7 +96,7 @@ def faults_of(survey: Survey, number: int, *kinds: FaultKind) -> dict[int, Fault
 
 
 def check_faults(survey: Survey) -> None:
-    """Check that faults fit sensors and times of a survey; LidarpoolError if not."""
+    """Check that faults fit sensors and times of a survey; LidarError if not."""
     names, lasts_s = [carried.name for carried in survey.carried], survey.duration_ns / 1e9
     for place, fault in enumerate(survey.faults):
         with prefixed(f"faults[{place}]"):
@@ -104,16 +104,16 @@ def check_faults(survey: Survey) -> None:
             if not lidars:
                 known = f" There are {', '.join(names)}." if any(names) else " Leave it out."
                 hint = did_you_mean(str(fault.sensor), names) or known
-                raise LidarpoolError(f"there is no sensor {fault.sensor!r}.{hint}")
+                raise LidarError(f"there is no sensor {fault.sensor!r}.{hint}")
             first_s = max(one.begins_ns(np.zeros(1, np.int64))[0] + one.lead_ns for one in lidars)
             if fault.kind == "frozen" and fault.from_s <= first_s / 1e9:
-                raise LidarpoolError("a frozen sensor repeats a sweep: give a later from_s.")
+                raise LidarError("a frozen sensor repeats a sweep: give a later from_s.")
             if fault.from_s > lasts_s:
                 told = f"from_s is {fault.from_s:g}, and the survey lasts {lasts_s:.6g} s"
-                raise LidarpoolError(f"{told}: make from_s smaller.")
+                raise LidarError(f"{told}: make from_s smaller.")
             least, last = min(one.channels for one in lidars), max(fault.channels or (0,))
             if last >= least:
-                raise LidarpoolError(f"there is no channel {last}, but 0 to {least - 1}.")
+                raise LidarError(f"there is no channel {last}, but 0 to {least - 1}.")
 
 
 def sent(survey: Survey, index: int) -> ScanSpec:

@@ -19,7 +19,7 @@ from pydantic import Field, WrapValidator
 from ..base.arrays import Bools, Floats, Indices, Integers
 from ..base.declared import TextOrTexts, UnitShare, about, allowed, written_as
 from ..base.elementary import exp, power
-from ..base.errors import LidarpoolError
+from ..base.errors import LidarError
 from ..base.validation import checked_fields, shown
 from ..base.words import did_you_mean
 from .leaves import LeafAngle
@@ -92,7 +92,7 @@ class Material:
 
     Raises
     ------
-    LidarpoolError
+    LidarError
         If it is for nothing, a value is outside its range, the table of reflectances has no such
         spectrum, or two values contradict each other.
     """
@@ -182,7 +182,7 @@ class Material:
 
     def __post_init__(self) -> None:
         if self.objects is None and self.material is None:
-            raise LidarpoolError(
+            raise LidarError(
                 'a material is for nothing: give objects, such as objects: "*", or material, a '
                 "name of the scene's file."
             )
@@ -192,30 +192,28 @@ class Material:
                 continue
             names = (given,) if isinstance(given, str) else tuple(given)
             if not names or not all(names):
-                raise LidarpoolError(
-                    f"{field_name} is {given!r}; it must be names of {field_name}."
-                )
+                raise LidarError(f"{field_name} is {given!r}; it must be names of {field_name}.")
             object.__setattr__(self, field_name, names)
         if self.spectrum is not None:
             if self.spectrum not in (known := reflectances()):
                 there = _materials_like(self.spectrum, [*known])
-                raise LidarpoolError(f"There is no spectrum {self.spectrum!r}.{there}")
+                raise LidarError(f"There is no spectrum {self.spectrum!r}.{there}")
             if self.reflectance is not None:
-                raise LidarpoolError("give either spectrum or reflectance, not both.")
+                raise LidarError("give either spectrum or reflectance, not both.")
         if self.reflectance == "texture":
             if self.transparent != "none":
-                raise LidarpoolError(
+                raise LidarError(
                     f"reflectance texture is for opaque objects: with transparent "
                     f"{self.transparent}, give a number."
                 )
         elif self.scale != 1:
-            raise LidarpoolError("scale is a factor of colours: give reflectance texture with it.")
+            raise LidarError("scale is a factor of colours: give reflectance texture with it.")
 
         if self.roughness is None and self.metalness:
-            raise LidarpoolError("metalness needs a roughness: give 0.1 (polished) to 1 (matt).")
+            raise LidarError("metalness needs a roughness: give 0.1 (polished) to 1 (matt).")
         smooth = self.transparent != "none" or self.specular_reflectance is not None
         if self.roughness is not None and (self.retro or smooth):
-            raise LidarpoolError(
+            raise LidarError(
                 "roughness is for opaque surfaces without retro and specular_reflectance."
             )
         self._check_within()
@@ -224,20 +222,18 @@ class Material:
         """Refuse what contradicts the medium within a surface, or the light that passes it."""
         mirrors = self.specular_reflectance
         if mirrors is not None and (mirrors == "fresnel") != (self.transparent == "pass"):
-            raise LidarpoolError(
+            raise LidarError(
                 f"specular_reflectance is {mirrors!r} with transparent: {self.transparent}; give "
                 "fresnel for what light passes, else 0 to 1."
             )
         if self.refractive_index is not None and self.transparent != "pass":
-            raise LidarpoolError(
-                "refractive_index is for light that passes: add transparent: pass."
-            )
+            raise LidarError("refractive_index is for light that passes: add transparent: pass.")
         if self.attenuation_per_m and self.refractive_index is None:
-            raise LidarpoolError("attenuation_per_m needs a refractive_index, such as 1.33.")
+            raise LidarError("attenuation_per_m needs a refractive_index, such as 1.33.")
         if self.leaf_area_density is None:
             return
         if not self._suits_leaves:
-            raise LidarpoolError(
+            raise LidarError(
                 "leaf_area_density is for leaves that scatter light: leave out transparent, "
                 "retro, roughness and specular_reflectance, and give reflectance as a number, or a "
                 "spectrum."
@@ -249,14 +245,14 @@ class Material:
         return not (other or self.specular_reflectance) and self.reflectance != "texture"
 
     def check_leaves(self, name: str, voxels: bool) -> None:
-        """Check that it suits an object, by whether that has voxels; LidarpoolError if not."""
+        """Check that it suits an object, by whether that has voxels; LidarError if not."""
         if voxels and (self.leaf_area_density is not None or not self._suits_leaves):
-            raise LidarpoolError(
+            raise LidarError(
                 f"materials: {name!r} is of voxels, whose file has the leaf area: give it an entry "
                 "with a reflectance, or a spectrum, and perhaps a leaf_angle, but nothing else."
             )
         if not voxels and self.leaf_angle != "spherical" and self.leaf_area_density is None:
-            raise LidarpoolError(
+            raise LidarError(
                 f"materials: {name!r} has a leaf_angle, which needs a leaf_area_density, m²/m³, "
                 "such as 0.8, if it is not of voxels (.vox)."
             )
@@ -356,7 +352,7 @@ class SurfaceKinds:
 def first_matches(materials: Sequence[Material], kinds: SurfaceKinds) -> Indices:
     """First material that is for each kind of surface, -1 for none: (k,).
 
-    LidarpoolError if a material is for nothing in the scene, or hides those after it.
+    LidarError if a material is for nothing in the scene, or hides those after it.
     """
     first = np.full(len(kinds.object), -1)
     known = {name: row for row, name in enumerate(kinds.names)}
@@ -367,7 +363,7 @@ def first_matches(materials: Sequence[Material], kinds: SurfaceKinds) -> Indices
                 of_material.setdefault(name, []).append(kind)
     for number, entry in enumerate(materials):
         if entry.for_all and number + 1 < len(materials):
-            raise LidarpoolError(
+            raise LidarError(
                 f"materials: the first entry for a surface counts, so that none after number "
                 f'{number + 1}, {{objects: "*"}}, would: put it last.'
             )
@@ -382,7 +378,7 @@ def _matching_kinds(
     known: Mapping[str, int],
     of_material: Mapping[str, Sequence[int]],
 ) -> Indices:
-    """Kinds that a material is for; LidarpoolError if a name fits nothing in the scene."""
+    """Kinds that a material is for; LidarError if a name fits nothing in the scene."""
     matches: Indices | None = None
     if entry.objects is not None:
         rows = [_matching_rows(pattern, kinds.names, known) for pattern in entry.objects]
@@ -397,7 +393,7 @@ def _matching_kinds(
         if not len(rows_of_pattern):
             listed = f" There are {', '.join(names[:5])}{', …' * (len(names) > 5)}."
             measured = f" For a measured reflectance, write spectrum: {pattern!r}."
-            raise LidarpoolError(
+            raise LidarError(
                 f"materials names the material {pattern!r}, but no face of the scene has one of "
                 "that name."
                 + (did_you_mean(pattern, names) or (listed if names else " No face has any."))
@@ -410,7 +406,7 @@ def _matching_kinds(
         return some
     both = np.intersect1d(matches, some)
     if not len(both):
-        raise LidarpoolError(
+        raise LidarError(
             f"materials: no face of {', '.join(map(repr, entry.objects or ()))} has the material "
             f"{', '.join(map(repr, entry.material))}."
         )
@@ -418,13 +414,13 @@ def _matching_kinds(
 
 
 def _matching_rows(pattern: str, names: Sequence[str], known: Mapping[str, int]) -> Indices:
-    """Rows of objects that a pattern fits; LidarpoolError if there are none."""
+    """Rows of objects that a pattern fits; LidarError if there are none."""
     if pattern in known and not any(sign in pattern for sign in "*?["):
         return np.array([known[pattern]])
     rows = rows_named(pattern, names)
     if not len(rows):
         listed = f" There are {', '.join(names[:5])}{', …' * (len(names) > 5)}."
-        raise LidarpoolError(
+        raise LidarError(
             f"materials names {pattern!r}, but no object has that name."
             + (did_you_mean(pattern, names) or listed)
         )
@@ -436,7 +432,7 @@ def with_classes(
 ) -> list[Material]:
     """Give objects whose material has no class one by their names: {class: patterns}.
 
-    LidarpoolError if a material is for nothing in the scene.
+    LidarError if a material is for nothing in the scene.
     """
     first = first_matches(materials, kinds)
     before: list[list[Material]] = [[] for _ in materials]  # what comes before each
@@ -465,7 +461,7 @@ def with_class(
 ) -> list[Material]:
     """Give some objects a class, and leave the rest of their materials.
 
-    LidarpoolError if a material is for nothing in the scene.
+    LidarError if a material is for nothing in the scene.
     """
     first, of_rows = first_matches(materials, kinds), kinds.of_rows(rows)
     out: list[Material] = []
@@ -512,7 +508,7 @@ class MaterialTable:
 
         Raises
         ------
-        LidarpoolError
+        LidarError
             If a name fits nothing, there are materials and a kind has none, or one is not for
             leaves, and its object has some.
         """
@@ -520,7 +516,7 @@ class MaterialTable:
         without = np.flatnonzero(first < 0)
         if len(without) and materials:
             more = f" and {len(without) - 1} more" if without[1:].size else ""
-            raise LidarpoolError(
+            raise LidarError(
                 f"materials: no entry names the object {kinds.describe(without[0])}{more}: end "
                 'with one for all the others, such as {objects: "*"}.'
             )

@@ -18,7 +18,7 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, model_valida
 from ..base.arrays import Floats
 from ..base.declared import UnitShare
 from ..base.elementary import log1p
-from ..base.errors import LidarpoolError
+from ..base.errors import LidarError
 from ..base.input_files import read_input_text
 from ..base.validation import checked, sentences
 from ..base.words import did_you_mean
@@ -152,7 +152,7 @@ class Performance(_ModelSection):
         for name in ("precision", "false_alarms", "range_at_threshold_m"):
             if getattr(self, name) and self.detection is None:
                 raise ValueError(f"{name} needs detection")
-        self.noise(1.0)  # LidarpoolError if it cannot be made
+        self.noise(1.0)  # LidarError if it cannot be made
         return self
 
     def noise(self, gate_s: float) -> Noise:
@@ -178,7 +178,7 @@ class Performance(_ModelSection):
         (x, y), (s, t) = np.square(weak), np.square([one.sigma_m for one in self.precision])
         slope = (t - s) / (y - x)
         if not (slope >= 0 and s - slope * x >= 0):
-            raise LidarpoolError("performance.precision does not fall as the energy grows.")
+            raise LidarError("performance.precision does not fall as the energy grows.")
         return float(np.sqrt(s - slope * x)), float(np.sqrt(slope))
 
 
@@ -220,7 +220,7 @@ class SensorModel(_ModelSection):
             raise ValueError(f"prisms turn about x: leave {min(unused)} out, and turn the sensor")
         if self.turning_mirror and not self.prisms:
             raise ValueError("turning_mirror needs prisms: a mirror that sweeps lines is mirror")
-        self.beams.beams()  # LidarpoolError if it cannot be made
+        self.beams.beams()  # LidarError if it cannot be made
         return self
 
     @property
@@ -229,10 +229,10 @@ class SensorModel(_ModelSection):
         return not (self.beams.elevation_deg or self.mirror or self.prisms)
 
     def datasheet(self) -> Datasheet:
-        """Return its noise and returns; LidarpoolError if its file states no performance."""
+        """Return its noise and returns; LidarError if its file states no performance."""
         stated = self.performance
         if stated is None:
-            raise LidarpoolError(
+            raise LidarError(
                 f"{self.name} has no performance in its data file, since no source that could be "
                 "read states it: give noise yourself."
             )
@@ -247,7 +247,7 @@ class SensorModel(_ModelSection):
         rate = self.rate_hz if rate_hz is None else rate_hz
         if self.firing_us is not None:
             if columns is not None:
-                raise LidarpoolError(
+                raise LidarError(
                     f"{self.name} fires every {float(self.firing_us):g} µs, so its firings a turn "
                     "follow from rate_hz: leave columns out."
                 )
@@ -277,7 +277,7 @@ def read_model(name: str | Path) -> SensorModel:
 
     Raises
     ------
-    LidarpoolError
+    LidarError
         If there is none of that name, or the file is not one of a sensor.
     """
     if str(name).endswith(MODEL_FILES):
@@ -287,7 +287,7 @@ def read_model(name: str | Path) -> SensorModel:
         near = [model for model in known if _plain(name) in _plain(model)][:3]
         hint = f" Did you mean {' or '.join(map(repr, near))}?" if near else ""
         names = [*known, *(model.partition("/")[2] for model in known)]
-        raise LidarpoolError(
+        raise LidarError(
             f"There is no sensor model {name!r}.{hint or did_you_mean(name, names)} "
             "lidarpool sensors lists them; give your own as a file, such as mine.yaml."
         )
@@ -310,7 +310,7 @@ def _read(path: Path | Traversable) -> SensorModel:
         with sentences(SensorModel, path):
             return SensorModel.model_validate(load_yaml(text))
     except UNUSABLE as error:
-        raise LidarpoolError(f"{path} is not a usable model: {said(error)}") from error
+        raise LidarError(f"{path} is not a usable model: {said(error)}") from error
 
 
 class Datasheet(NamedTuple):
@@ -369,7 +369,7 @@ def load_sensor(
 
     Raises
     ------
-    LidarpoolError
+    LidarError
         If there is no such model, a file cannot be used, or they do not fit together.
 
     Examples
@@ -384,11 +384,11 @@ def load_sensor(
     elif unit is not None:
         described = _model_of(unit, columns)
     else:
-        raise LidarpoolError("A sensor needs a model, a calibration, or both.")
+        raise LidarError("A sensor needs a model, a calibration, or both.")
     if unit is not None:
         described = described.model_copy(update=unit.head)
     elif described.needs_calibration:
-        raise LidarpoolError(
+        raise LidarError(
             f"{described.name} has no rays of its own: give calibration: FILE "
             f"({next(iter(described.sources.values()), 'of the unit')})."
         )
@@ -439,7 +439,7 @@ def _model_of(unit: Calibration, columns: int | None) -> SensorModel:
         return read_model(min(off, key=off.__getitem__))
     head = {"firings_per_turn": columns} if columns and unit.maker is None else unit.head
     if not head:
-        raise LidarpoolError(
+        raise LidarError(
             f"{unit.file} fits no known model, and has no firing times: give model:"
             f"{'' if unit.maker else ', or columns: (firings in a turn),'} as well."
         )
@@ -451,7 +451,7 @@ def _listed(
 ) -> ListedSensor:
     """Rays of a unit's list, at the model's rate if the list has no times."""
     if unit.rays is None or (described.beams.elevation_deg and not described.prisms):
-        raise LidarpoolError(
+        raise LidarError(
             f"{unit.file} does not fit {described.name}: one lists rays, the other beams."
         )
     if not unit.head:  # a firing of the model is of all beams, and of the list one ray
@@ -471,7 +471,7 @@ def _calibrated(described: SensorModel, unit: Calibration) -> Beams:
     assert beams is not None  # a file has beams or rays
     expected = len(table.elevation_deg) or len(table.time_us)
     if expected not in (0, len(beams)):
-        raise LidarpoolError(
+        raise LidarError(
             f"{unit.file} has {len(beams)} beams, but {described.name} has {expected}."
         )
     times = beams.time_ns if beams.time_ns.any() else np.multiply(table.time_us, 1000.0)

@@ -26,7 +26,7 @@ from ..base.arrays import Floats, Ints
 from ..base.declared import Ends, Seed, Several, UnitShare, about
 from ..base.elementary import arctan2, exp, sin_cos
 from ..base.elementary_scalars import exp_of, sin_cos_of
-from ..base.errors import LidarpoolError
+from ..base.errors import LidarError
 from ..base.validation import checked_fields
 from ..base.vectors import applied, hypot, into_axes, length, matmul, turned
 from .noise import Purpose, named_seed, normal
@@ -61,7 +61,7 @@ class Imu:
 
     Raises
     ------
-    LidarpoolError
+    LidarError
         If a number is outside its range.
     """
 
@@ -100,7 +100,7 @@ class Gnss:
 
     Raises
     ------
-    LidarpoolError
+    LidarError
         If a number is outside its range.
     """
 
@@ -145,7 +145,7 @@ class Navigation:
 
     Raises
     ------
-    LidarpoolError
+    LidarError
         If a number is outside its range.
     """
 
@@ -186,15 +186,15 @@ class Fixes(NamedTuple):
 
 
 def check_navigation(navigation: Navigation, path: Trajectory, epsg: int | None) -> None:
-    """Check that instruments can be on a carrier, in a coordinate system; LidarpoolError if not."""
+    """Check that instruments can be on a carrier, in a coordinate system; LidarError if not."""
     if path.stations > 1:
-        raise LidarpoolError(
+        raise LidarError(
             f"navigation needs a carrier that drives or stands, and this one jumps between "
             f"{path.stations} poses: give a trajectory, or one pose."
         )
     gnss = navigation.gnss
     if gnss and epsg and gnss.origin is None and find_spec("rasterio") is None:
-        raise LidarpoolError(
+        raise LidarError(
             f"Latitudes of navigation.gnss in EPSG:{epsg} need rasterio: pip install "
             '"lidarpool[geo]", or give navigation.gnss.origin.'
         )

@@ -21,7 +21,7 @@ from pydantic import Field
 from ..base.arrays import Bools, Floats, Indices, Integers, Ints
 from ..base.declared import AngleDeg, Seed, Several, UnitShare, about, allowed
 from ..base.elementary import exp, log
-from ..base.errors import LidarpoolError
+from ..base.errors import LidarError
 from ..base.validation import checked_fields
 from .materials import at_right_angles
 
@@ -91,7 +91,7 @@ class Noise:
 
     Raises
     ------
-    LidarpoolError
+    LidarError
         If a number is outside its range, or needs a detection range and there is none.
     """
 
@@ -194,7 +194,7 @@ class Noise:
         if self.detection_range_m is None:
             for name in (*needs, "saturation"):
                 if getattr(self, name):
-                    raise LidarpoolError(
+                    raise LidarError(
                         f"noise.{name} is measured by the threshold of detection: give "
                         "noise.detection_range_m as well."
                     )

@@ -12,7 +12,7 @@ from pydantic import Field
 
 from ..base.declared import about, allowed
 from ..base.elementary_scalars import log_of
-from ..base.errors import LidarpoolError
+from ..base.errors import LidarError
 from ..base.validation import checked_fields
 from ..base.vectors import hypot
 from .disc import SUBRAYS, Beam, Profile
@@ -81,7 +81,7 @@ class Returns:
 
     Raises
     ------
-    LidarpoolError
+    LidarError
         If there is no such mode, or a number is outside its range.
     """
 
@@ -143,7 +143,7 @@ class Returns:
 
         Raises
         ------
-        LidarpoolError
+        LidarError
             If there are sub-rays, and the divergence is unknown.
         """
         across, up = self._divergence(optics)
@@ -163,7 +163,7 @@ class Returns:
         """Across and up, radians."""
         wide = optics.divergence_mrad if self.divergence_mrad is None else self.divergence_mrad
         if wide is None and self.subrays > 1:
-            raise LidarpoolError(
+            raise LidarError(
                 f"returns.subrays is {self.subrays}, but the sensor has no divergence: give "
                 "returns.divergence_mrad."
             )
@@ -181,13 +181,13 @@ class Returns:
 
         Raises
         ------
-        LidarpoolError
+        LidarError
             If the samples are too far apart for it.
         """
         response = 0.0 if self.bandwidth_mhz is None else 1000 * _RESPONSE / self.bandwidth_mhz
         sigma = hypot(self.length_ns(optics) / FWHM, response)
         if not 2 * self.sample_ns <= FWHM * sigma * (1 + 1e-9):
-            raise LidarpoolError(
+            raise LidarError(
                 f"returns.sample_ns is {self.sample_ns:g}, and the pulse is {FWHM * sigma:.3g} ns "
                 f"wide in the waveform: sample it twice at least, every {FWHM * sigma / 2:.3g} ns, "
                 "or give a longer pulse_ns."

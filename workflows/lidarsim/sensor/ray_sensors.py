@@ -12,7 +12,7 @@ from pydantic import Field
 from ..base.arrays import Floats, Ints
 from ..base.elementary import sin_cos
 from ..base.elementary_scalars import sin_cos_of
-from ..base.errors import LidarpoolError
+from ..base.errors import LidarError
 from ..base.validation import checked_fields
 from .beams import Beams
 from .sensor import Sensor
@@ -58,7 +58,7 @@ class PrismSensor(Sensor):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        self.directions(np.arange(0, 100_000, 97))  # LidarpoolError if light does not get through
+        self.directions(np.arange(0, 100_000, 97))  # LidarError if light does not get through
 
     @property
     def period(self) -> int | None:
@@ -107,7 +107,7 @@ def _refracted(rays: Floats, normals: Floats, ratio: float) -> Floats:
     along = (rays * normals).sum(axis=0)
     behind = 1 - ratio * ratio * (1 - along * along)
     if not (behind >= 0).all():
-        raise LidarpoolError(
+        raise LidarError(
             "A prism reflects light back at its inner face, so that no ray leaves the sensor: "
             "make its wedge or its index smaller."
         )

@@ -14,7 +14,7 @@ from pydantic import Field
 from ..base.arrays import Floats, Ints
 from ..base.declared import about
 from ..base.elementary import sin_cos
-from ..base.errors import LidarpoolError
+from ..base.errors import LidarError
 from ..base.validation import checked, checked_fields
 from ..base.vectors import turned
 from .beams import CHANNELS_MOST, Beams, Head, Mirror, Rate, Spin, Step
@@ -58,7 +58,7 @@ class Sensor:
 
     Raises
     ------
-    LidarpoolError
+    LidarError
         If a range or the start is out of bounds.
 
     Examples
@@ -81,9 +81,7 @@ class Sensor:
 
     def __post_init__(self) -> None:
         if not self.max_range_m > self.min_range_m:
-            raise LidarpoolError(
-                f"max_range_m is {self.max_range_m}; it must be above min_range_m."
-            )
+            raise LidarError(f"max_range_m is {self.max_range_m}; it must be above min_range_m.")
 
     @property
     def model(self) -> str:
@@ -130,12 +128,12 @@ class Sensor:
 
         Raises
         ------
-        LidarpoolError
+        LidarError
             If a value is outside its range, several layers have no field of view, or a time step
             holds no firing at all.
         """
         if layers > 1 and vertical_fov_deg == 0:
-            raise LidarpoolError(
+            raise LidarError(
                 f"vertical_fov_deg is 0 with {layers:,} layers, which would be the same: give one "
                 "layer, or a field of view above 0."
             )

@@ -16,7 +16,7 @@ from pydantic import AwareDatetime, Field, Strict
 
 from ..base.arrays import Floats, Ints
 from ..base.declared import FILLED_IN, Several, about, written_as
-from ..base.errors import LidarpoolError
+from ..base.errors import LidarError
 from ..base.validation import checked_fields, shown
 from ..columns.table import COORDINATES, OPTIONAL, TABLE, Column, chosen, stored, waveform_column
 from .faults import Fault, check_faults
@@ -224,7 +224,7 @@ class Survey(CloudOptions, Weather):
 
     Raises
     ------
-    LidarpoolError
+    LidarError
         If a number is out of range, there is no pose, or no such column, or if the trajectory
         does not last long enough.
 
@@ -280,16 +280,16 @@ class Survey(CloudOptions, Weather):
     def _trajectory(self) -> Trajectory:
         if self.trajectory is None:
             if not self.poses:
-                raise LidarpoolError("A survey needs at least one pose to scan from.")
+                raise LidarError("A survey needs at least one pose to scan from.")
             return Stations(tuple(self.poses))
         if self.poses and self.trajectory != Stations(tuple(self.poses)):
-            raise LidarpoolError("A survey has either poses or a trajectory, not both.")
+            raise LidarError("A survey has either poses or a trajectory, not both.")
         return self.trajectory
 
     def _check_names(self) -> None:
         names = [carried.name for carried in self.sensors]
         if len(names) > SENSORS_MOST or len({*names}) < len(names):
-            raise LidarpoolError(
+            raise LidarError(
                 f"A survey has at most {SENSORS_MOST} sensors, each with a name of its own; given: "
                 f"{', '.join(names[:10])}."
             )
@@ -298,22 +298,22 @@ class Survey(CloudOptions, Weather):
         if self.navigation is not None:
             check_navigation(self.navigation, self.path, self.epsg)
         if self.start is not None and (self.start.tzinfo is None or self.start < START_FROM):
-            raise LidarpoolError(
+            raise LidarError(
                 f"start is {self.start}; it must be a time from 2017 on, with its time zone: "
                 "2026-11-21T10:00:00Z."
             )
         for carried, returns in zip(self.carried, self.returns_each, strict=True):
-            returns.of(carried.sensor.optics)  # LidarpoolError if they do not fit together
+            returns.of(carried.sensor.optics)  # LidarError if they do not fit together
             if returns.waveform != "none" or self.waveform_samples:
                 sigma_ns = returns.system_ns(carried.sensor.optics)
                 least = ceil(WINDOW_SIGMAS * sigma_ns / returns.sample_ns) + 2
                 if 0 < self.waveform_samples < least:
-                    raise LidarpoolError(
+                    raise LidarError(
                         f"waveform_samples is {self.waveform_samples}, and one echo takes {least} "
                         f"samples of {returns.sample_ns:g} ns: record as many at least."
                     )
             if self.waveform_samples and abs(returns.sample_ns * 1000 % 1 - 0.5) < 0.5 - 1e-6:
-                raise LidarpoolError(
+                raise LidarError(
                     f"returns.sample_ns is {returns.sample_ns:g}, and LAS records whole "
                     f"picoseconds: with waveform_samples, give {round(returns.sample_ns, 3):g}."
                 )
@@ -322,7 +322,7 @@ class Survey(CloudOptions, Weather):
             if noise.crosstalk:
                 self._check_crosstalk(number)
         if self.spray_g_m3 and not self.wet:
-            raise LidarpoolError(
+            raise LidarError(
                 "spray_g_m3 is of wheels on wet ground, and none is: give wet as well, 0 to 1."
             )
         if self.returns_light or self.spray_g_m3:
@@ -332,18 +332,18 @@ class Survey(CloudOptions, Weather):
     def _check_crosstalk(self, number: int) -> None:
         """Check that there are other sensors, and that what a sensor sees ends."""
         if len(self.carried) == 1:
-            raise LidarpoolError(
+            raise LidarError(
                 "noise.crosstalk needs several sensors, and this survey has one: give sensors."
             )
         for carried in self.carried:
             if not carried.sensor.max_range_m < float("inf"):
-                raise LidarpoolError(
+                raise LidarError(
                     f"noise.crosstalk needs sensors with a greatest range, and {carried.name} has "
                     "none: give its max_range_m."
                 )
         wide, _ = self.returns_each[number].of(self.carried[number].sensor.optics)
         if not wide:
-            raise LidarpoolError(
+            raise LidarError(
                 "noise.crosstalk needs a field of view as wide as the beam, and "
                 f"{self.carried[number].name} has no divergence: give returns.divergence_mrad."
             )
@@ -355,19 +355,19 @@ class Survey(CloudOptions, Weather):
         if self.noise_each[number].detection_range_m is None:
             lacks = "is not given" if carried.noise is None else "its data sheet does not state"
             guess = sensor.max_range_m / 2 if sensor.max_range_m < np.inf else 100
-            raise LidarpoolError(
+            raise LidarError(
                 f"Returns from rain, snow, spray, dust or fog need noise.detection_range_m{name}, "
                 f"the range at 10 % reflectance, which {lacks}: write what is known of it, or "
                 f"half of the sensor's range, noise: {{detection_range_m: {guess:.3g}}}."
             )
         wide = (self.returns_each[number].divergence_mrad, sensor.optics.divergence_mrad)
         if (self.particles or self.spray_g_m3) and wide == (None, None):
-            raise LidarpoolError(
+            raise LidarError(
                 f"Rain, snow and spray need the width of the beam{name}: give "
                 "returns.divergence_mrad."
             )
         if (met := self.met(number)) > PARTICLES_MOST:
-            raise LidarpoolError(
+            raise LidarError(
                 f"A pulse{name} would return from {met:,.0f} drops or flakes, more than "
                 f"{PARTICLES_MOST}: make rain_mm_h, snow_mm_h or noise.detection_range_m smaller."
             )
@@ -376,20 +376,20 @@ class Survey(CloudOptions, Weather):
         """Check that the trajectory lasts as long as a sensor, and that its numbers do not end."""
         needed, there = _end_ns(sensor, steps) / 1e9, self.path.duration_ns / 1e9
         if needed > there:
-            raise LidarpoolError(
+            raise LidarError(
                 f"steps {steps} take until {needed:.6g} s and the trajectory lasts {there:.6g} s, "
                 f"{needed - there:.6g} s less: take fewer steps, or leave them out for as many as "
                 "it lasts."
             )
         first, stop = sensor.firings(0)
         if (rays := (stop - first) * sensor.channels) > RAYS_MOST:
-            raise LidarpoolError(
+            raise LidarError(
                 f"A scan would have {rays:,} rays, more than {RAYS_MOST:,}: make step_deg smaller, "
                 "or take fewer rays."
             )
         lasts = begin_ns(sensor, sensor.firings(steps - 1)[1]) * self.path.stations
         if not lasts < LASTS_MOST_NS:
-            raise LidarpoolError(
+            raise LidarError(
                 f"The survey would last {lasts / 1e9:.3g} s, and times are counted in nanoseconds "
                 "for 292 years: make rate_hz larger, or start_s or steps smaller."
             )
@@ -460,7 +460,7 @@ class Survey(CloudOptions, Weather):
             ends = partial(_end_ns, carried.sensor)
             counts.append(bisect_right(lasts, self.path.duration_ns, key=ends))
             if not counts[-1]:
-                raise LidarpoolError(
+                raise LidarError(
                     f"The trajectory lasts {self.path.duration_ns / 1e9:.6g} s, and one time step "
                     f"of the sensor takes until {ends(1) / 1e9:.6g} s."
                 )
@@ -543,19 +543,19 @@ def _check_noise(noise: Noise, sensor: Sensor) -> None:
     """Check that a sensor can have its noise, and that false alarms are not too many."""
     biases, channels = noise.channel_bias_m, sensor.channels
     if isinstance(biases, Sequence) and len(biases) != channels:
-        raise LidarpoolError(
+        raise LidarError(
             f"noise.channel_bias_m has {len(biases)} numbers; {sensor.model} needs {channels}: "
             "give one for each channel, or their standard deviation."
         )
     if noise.ripple_deg and sensor.spins(np.zeros(1, np.int64)) is None:
-        raise LidarpoolError(f"noise.ripple_deg needs a head that turns, unlike {sensor.model}'s.")
+        raise LidarError(f"noise.ripple_deg needs a head that turns, unlike {sensor.model}'s.")
     if noise.false_alarm_hz and not sensor.gate_s < float("inf"):
-        raise LidarpoolError(
+        raise LidarError(
             f"noise.false_alarm_hz needs a sensor with a greatest range, and {sensor.model} has "
             "none: give max_range_m."
         )
     if noise.false_alarm_hz and (mean := noise.false_alarm_hz * sensor.gate_s) > ALARMS_MOST:
-        raise LidarpoolError(
+        raise LidarError(
             f"noise.false_alarm_hz is {noise.false_alarm_hz:g}, which are {mean:.3g} false alarms "
             f"of each pulse; {ALARMS_MOST} are possible: make it or max_range_m smaller."
         )
@@ -573,5 +573,5 @@ def _end_ns(sensor: Sensor, steps: int) -> float:
 
 def _poses(given: Sequence[Any]) -> tuple[Pose, ...]:
     if isinstance(given, str) or not isinstance(given, Iterable):
-        raise LidarpoolError(f"poses is {shown(given)}; it must be a list of poses: [(0, 0, 1)].")
+        raise LidarError(f"poses is {shown(given)}; it must be a list of poses: [(0, 0, 1)].")
     return tuple(pose_of("poses", pose) for pose in given)

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 from ..base.arrays import Bools, Floats, Indices
 from ..base.declared import AngleDeg, Triple, about, short, written_as
 from ..base.elementary import arctan2, sin_cos
-from ..base.errors import LidarpoolError
+from ..base.errors import LidarError
 from ..base.validation import as_array, checked_fields, one_line, shown
 from ..base.vectors import applied, determinant, hypot, length, matmul
 from .spline import knots_of, on_curve
@@ -69,7 +69,7 @@ class Pose:
     def of(cls, position: ArrayLike, rotation: Floats | None) -> Pose:
         """Make a pose of a position and a rotation matrix (3, 3), or None.
 
-        LidarpoolError if the matrix mirrors or deforms.
+        LidarError if the matrix mirrors or deforms.
         """
         place = tuple(np.asarray(position, np.float64).tolist())
         if rotation is None:
@@ -100,7 +100,7 @@ def rotations_of(angles_deg: Floats) -> Floats:
 
 
 def check_rotations(rotations: Floats, slack: float = 1e-6) -> None:
-    """Check matrices (k, 3, 3) of poses; LidarpoolError for one that mirrors or deforms.
+    """Check matrices (k, 3, 3) of poses; LidarError for one that mirrors or deforms.
 
     Products of their columns may differ by `slack` from those of a rotation.
     """
@@ -112,7 +112,7 @@ def check_rotations(rotations: Floats, slack: float = 1e-6) -> None:
     if len(bad):
         first = int(bad[0])
         fault = "mirrors" if rigid[first] else "deforms"
-        raise LidarpoolError(
+        raise LidarError(
             f"Matrix {first} of a pose {fault}: {rotations[first].round(6).tolist()}. A pose turns "
             "and moves: give a matrix with orthonormal rows and the determinant 1 (matrices are "
             "counted from 0)."
@@ -120,13 +120,13 @@ def check_rotations(rotations: Floats, slack: float = 1e-6) -> None:
 
 
 def pose_of(name: str, given: Any) -> Pose:
-    """Return a pose as given, or of x, y and z; LidarpoolError with its name if it is neither."""
+    """Return a pose as given, or of x, y and z; LidarError with its name if it is neither."""
     if isinstance(given, Pose):
         return given
     try:
         return Pose(tuple(map(float, given)))  # type: ignore[arg-type]  # it counts them
     except (TypeError, ValueError) as error:
-        raise LidarpoolError(
+        raise LidarError(
             f"{name} is {shown(given)}; it must be a Pose, or x, y and z in metres, such as "
             "(0, 0, 1)."
         ) from error
@@ -278,7 +278,7 @@ class Track:
 
     Raises
     ------
-    LidarpoolError
+    LidarError
         If there are fewer than two poses, a number is not finite, times do not ascend, a
         quaternion is invalid, or the station is not within the times.
 
@@ -303,7 +303,7 @@ class Track:
         times = as_array("times_s", self.times_s).copy()
         places = as_array("positions", self.positions).copy()
         if times.ndim != 1 or len(times) < 2 or places.shape != (len(times), 3):
-            raise LidarpoolError(
+            raise LidarError(
                 f"A trajectory needs two poses at least, with x, y and z each; there are "
                 f"{times.size} times and positions of {places.shape}."
             )
@@ -318,7 +318,7 @@ class Track:
         else:
             turns = as_array("quaternions", self.quaternions).copy()
             if turns.shape != (len(times), 4):
-                raise LidarpoolError(
+                raise LidarError(
                     f"quaternions are x, y, z and w of each of the {len(times)} poses, not "
                     f"{turns.shape}."
                 )
@@ -336,12 +336,12 @@ class Track:
         for what, time in (("start_s", start), ("the end by duration_s", last)):
             gap = max(times[0] - time, time - times[-1])
             if not gap <= most:  # or NaN
-                raise LidarpoolError(
+                raise LidarError(
                     f"{what} is {time:.9g} s, {gap:.6g} s outside the trajectory, which goes from "
                     f"{times[0]:.9g} to {times[-1]:.9g} s."
                 )
         if self.beyond == "refuse" and last <= start:
-            raise LidarpoolError(f"A trajectory from {start:.9g} to {last:.9g} s has no duration.")
+            raise LidarError(f"A trajectory from {start:.9g} to {last:.9g} s has no duration.")
         object.__setattr__(self, "start_s", float(start))
         object.__setattr__(self, "duration_s", float(max(last - start, 0.0)))
 
@@ -375,7 +375,7 @@ class Track:
 
         Raises
         ------
-        LidarpoolError
+        LidarError
             If a time is not within the trajectory.
         """
         segment, since, _ = self._at(times_ns)
@@ -398,7 +398,7 @@ class Track:
 
         Raises
         ------
-        LidarpoolError
+        LidarError
             If a time is not within the trajectory.
         """
         segment, since, within = self._at(times_ns)
@@ -422,7 +422,7 @@ class Track:
             within = (times[0] <= at) & (at <= times[-1])
             at = at.clip(times[0], times[-1])
         elif gap > self.slack_s:
-            raise LidarpoolError(
+            raise LidarError(
                 f"The trajectory goes from {times[0]:.9g} to {times[-1]:.9g} s; poses are asked "
                 f"for from {low:.9g} to {high:.9g} s, {gap:.6g} s outside."
             )
@@ -523,6 +523,6 @@ def _along(slopes: Floats) -> Floats:
 
 
 def _refuse(bad: Bools, words: str) -> None:
-    """Raise LidarpoolError if any is bad, with the number of the first."""
+    """Raise LidarError if any is bad, with the number of the first."""
     if bad.any():
-        raise LidarpoolError(f"{words.format(int(bad.argmax()))} (poses are counted from 0).")
+        raise LidarError(f"{words.format(int(bad.argmax()))} (poses are counted from 0).")

@@ -11,7 +11,7 @@ import numpy as np
 from pydantic import Field
 
 from ..base.arrays import Floats
-from ..base.errors import LidarpoolError
+from ..base.errors import LidarError
 from ..base.tables import column_name, find_header, read_table
 from ..base.textfile import read_text
 from ..base.validation import checked
@@ -113,7 +113,7 @@ def load_trajectory(
 
     Raises
     ------
-    LidarpoolError
+    LidarError
         If it cannot be read, has something that is not understood, or is invalid; the message
         names the file.
     """
@@ -135,9 +135,9 @@ def load_trajectory(
         if camera_axes or (camera_axes is None and kind == "kitti"):
             track = _from_camera(track)
         return track
-    except (OSError, ValueError, LidarpoolError) as error:
+    except (OSError, ValueError, LidarError) as error:
         more = _HELIOS if path.suffix.lower() == ".trj" else ""
-        raise LidarpoolError(f"{path} is not a usable trajectory: {said(error)}{more}") from error
+        raise LidarError(f"{path} is not a usable trajectory: {said(error)}{more}") from error
 
 
 def files_of_trajectory(path: Path) -> list[Path]:

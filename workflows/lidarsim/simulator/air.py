@@ -59,7 +59,7 @@ class WeatherStep(PulseStep):
 
     Raises
     ------
-    LidarpoolError
+    LidarError
         If one of its beams would return from too many particles.
     """
 

@@ -20,7 +20,7 @@ from raybeam import Pattern, any_axes
 from ..base.arrays import AnyArray, Bools, Floats, Indices, Integers, Ints, Ints32
 from ..base.elementary import exp, log
 from ..base.elementary_scalars import log_of
-from ..base.errors import LidarpoolError
+from ..base.errors import LidarError
 from ..base.vectors import applied, products
 from ..scene.scene import Scene
 from ..sensor.leaves import brightness, projection
@@ -173,7 +173,7 @@ class Media:
         closed, self._inwards = surfaces.solids
         for number in np.flatnonzero(table.leafy).tolist():
             if not closed[number]:
-                raise LidarpoolError(
+                raise LidarError(
                     f"materials: {surfaces.material_kinds.describe(number)} has a "
                     "leaf_area_density, but its surface has gaps: give a closed one, such as a box "
                     "or a sphere."

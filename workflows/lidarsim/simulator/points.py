@@ -11,7 +11,7 @@ from raybeam import Pattern
 
 from ..base.arrays import AnyArray, Bytes, Floats, Ints, Ints32, Records, UInts32
 from ..base.elementary import arccos, arcsin, arctan2
-from ..base.errors import LidarpoolError
+from ..base.errors import LidarError
 from ..base.vectors import products, turned
 from ..columns.table import Column
 from ..columns.waveforms import column_type
@@ -219,7 +219,7 @@ class BatchPoints:
                 cells[:] = np.rint(scaled, out=scaled).T
         except FloatingPointError:
             far, step = np.abs(scaled).max() * self.survey.precision_m, self.survey.precision_m
-            raise LidarpoolError(
+            raise LidarError(
                 f"precision_m {step} is too fine for points {far:.0f} m from the "
                 f"origin: use at least {far / 2e9:.2g}."
             ) from None

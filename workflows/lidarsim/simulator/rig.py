@@ -12,7 +12,7 @@ import numpy as np
 from raybeam import Pattern
 
 from ..base.arrays import Floats, Floats32
-from ..base.errors import LidarpoolError
+from ..base.errors import LidarError
 from ..base.vectors import turned
 from ..scene.actors import Actor
 from ..scene.scene import Scene
@@ -113,12 +113,12 @@ class Rig:
         return rig
 
     def check_actors(self, begin_ns: float, end_ns: float) -> None:
-        """Check that the trajectories of actors cover a time; LidarpoolError if not."""
+        """Check that the trajectories of actors cover a time; LidarError if not."""
         moving = np.flatnonzero([way.moves for way in self._ways])
         try:
             times = np.repeat([begin_ns, end_ns], len(moving)).astype(np.float64)
             self._ways.poses(np.tile(moving, 2), times)
-        except LidarpoolError:
+        except LidarError:
             for number in moving:
                 self.scene.actors[number].check(begin_ns, end_ns)  # which names it
             raise

@@ -16,7 +16,7 @@ from pydantic import Field
 from raybeam.poses import check_poses
 
 from ..base.arrays import Floats, Floats32
-from ..base.errors import LidarpoolError
+from ..base.errors import LidarError
 from ..base.validation import checked, shown
 from ..base.words import did_you_mean
 from ..columns.cloud import Cloud
@@ -78,7 +78,7 @@ class Scanner:
 
     Raises
     ------
-    LidarpoolError
+    LidarError
         If an argument does not fit, or the backend cannot be used here.
 
     Examples
@@ -116,7 +116,7 @@ class Scanner:
         device: int | None = None,
     ) -> None:
         if name and isinstance(sensor, Mounted):
-            raise LidarpoolError(
+            raise LidarError(
                 f"name is {name!r}, and a Mounted sensor has a name of its own: give it there, "
                 f"Mounted(sensor, name={name!r})."
             )
@@ -147,7 +147,7 @@ class Scanner:
         try:
             self._rig = Rig(scene, survey, **options)
         except ValueError as error:  # of threads or device
-            raise LidarpoolError(str(error)) from error
+            raise LidarError(str(error)) from error
         self._actors = list(scene.actors)
         self._numbers = {name: number for number, name in enumerate(scene.all_names)}
         # Objects of which all triangles are in instances.
@@ -208,7 +208,7 @@ class Scanner:
 
         Raises
         ------
-        LidarpoolError
+        LidarError
             If the trajectory, or that of an actor, does not last as long as the sweep.
         """
         path = _path(pose)
@@ -216,7 +216,7 @@ class Scanner:
             specs, late_ns = self._specs(rig, number, start_s, 1)
             begin_ns, end_ns = _span_ns(rig, specs)
             if end_ns > path.duration_ns:
-                raise LidarpoolError(
+                raise LidarError(
                     f"The sweep would last from {begin_ns / 1e9:.6g} to {end_ns / 1e9:.6g} s, and "
                     f"the trajectory lasts {path.duration_ns / 1e9:.6g} s: begin earlier "
                     "(start_s), or take a longer one."
@@ -224,7 +224,7 @@ class Scanner:
             try:
                 check_trajectory(path)
             except ValueError as error:
-                raise LidarpoolError(str(error)) from error
+                raise LidarError(str(error)) from error
             returns = rig.returns(specs, path, late_ns, tally=False)
         survey = rig.survey
         origin = rig.scene.origin if survey.coordinates == "world" else np.zeros(3)
@@ -262,7 +262,7 @@ class Scanner:
 
         Raises
         ------
-        LidarpoolError
+        LidarError
             If the poses are no such list or array, a number is not finite, or a matrix mirrors or
             deforms.
         """
@@ -276,7 +276,7 @@ class Scanner:
             try:
                 made = check_poses(positions, rotations, rays, rays * len(positions), None)
             except ValueError as error:
-                raise LidarpoolError(str(error)) from error
+                raise LidarError(str(error)) from error
             return rig.ranges(specs, made.positions, made.rotations)
 
     @checked
@@ -295,7 +295,7 @@ class Scanner:
 
         Raises
         ------
-        LidarpoolError
+        LidarError
             If there is no such actor or instance, an instance would move during a sweep, or a
             rotation of the trajectory mirrors or deforms.
         """
@@ -305,7 +305,7 @@ class Scanner:
         number = self._numbers.get(name, -1)
         if 0 <= number < standing and self._movable[number]:
             if path.moves:
-                raise LidarpoolError(
+                raise LidarError(
                     f"{name!r} is a SceneInstance, which stands still during a sweep: give a pose, "
                     "or make it an Actor."
                 )
@@ -316,7 +316,7 @@ class Scanner:
             hint = did_you_mean(name, names) or f" There are {', '.join(names[:5]) or 'none'}."
             if number >= 0:
                 hint = " It is part of the standing scene: make it an Actor or a SceneInstance."
-            raise LidarpoolError(f"There is no actor or instance {name!r}.{hint}")
+            raise LidarError(f"There is no actor or instance {name!r}.{hint}")
         with self._lock:
             self._actors[number - standing] = replace(
                 self._actors[number - standing], trajectory=path
@@ -340,7 +340,7 @@ class Scanner:
         sensor, ahead = rig.survey.sensor, 0
         steps = sensor.steps_of_turn(number or 0)
         if steps.stop > SCANS_MOST:
-            raise LidarpoolError(f"number is {number}; scans are counted up to {SCANS_MOST:,}.")
+            raise LidarError(f"number is {number}; scans are counted up to {SCANS_MOST:,}.")
         if number is None:
             with self._lock:
                 ahead = self._unnumbered * len(steps)
@@ -397,9 +397,9 @@ def _placed(poses: Any) -> tuple[Floats, Floats | None]:
         return table.reshape(-1, 3), None
     if table.ndim == 3 and table.shape[1:] == (4, 4):
         if not np.allclose(table[:, 3], [0, 0, 0, 1]):
-            raise LidarpoolError("The last row of each matrix of poses must be 0, 0, 0, 1.")
+            raise LidarError("The last row of each matrix of poses must be 0, 0, 0, 1.")
         return table[:, :3, 3], table[:, :3, :3]
-    raise LidarpoolError(
+    raise LidarError(
         f"poses is {shown(poses)} of the shape {table.shape}; it must be a list of Pose, positions "
         "(k, 3), or matrices (k, 4, 4)."
     )

@@ -29,7 +29,7 @@ from raybeam import (
 from raybeam.crossing import Nearest
 
 from ..base.arrays import Bools, Floats, Indices, Ints, Ints32
-from ..base.errors import LidarpoolError
+from ..base.errors import LidarError
 from ..base.interrupts import deferred_interrupts
 from ..base.words import did_you_mean
 from ..scene.actors import Actor, shapes_of
@@ -50,11 +50,9 @@ def check_backend_here(wanted: str, advice: str = AUTO_TAKES) -> None:
         backends = {"auto": "", **available_backends()}
     if wanted not in backends:
         hint = did_you_mean(wanted, backends) or f" There are {', '.join(backends)}."
-        raise LidarpoolError(f"There is no backend {wanted!r}.{hint}")
+        raise LidarError(f"There is no backend {wanted!r}.{hint}")
     if backends[wanted]:
-        raise LidarpoolError(
-            f"Backend {wanted!r} cannot be used here: {backends[wanted]}. {advice}"
-        )
+        raise LidarError(f"Backend {wanted!r} cannot be used here: {backends[wanted]}. {advice}")
 
 
 class SceneCaster:

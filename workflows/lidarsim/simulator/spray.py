@@ -37,7 +37,7 @@ class SprayStep(PulseStep):
 
     Raises
     ------
-    LidarpoolError
+    LidarError
         If an actor that raises spray has no size.
     """
 

@@ -73,7 +73,7 @@ class Surfaces:
 
     Raises
     ------
-    LidarpoolError
+    LidarError
         If there are materials, and an object has none, or a name fits no object.
     """
 

@@ -90,7 +90,7 @@ class Ways(tuple[Trajectory, ...]):
 
         Raises
         ------
-        LidarpoolError
+        LidarError
             If a time is not within its trajectory.
         """
         from . import surface_loops  # not before: numba takes half a second to import

@@ -15,7 +15,7 @@ import numpy as np
 
 from ..base.archives import open_archive, packed
 from ..base.arrays import AnyArray, AnyFloats, Bools, Bytes, Floats, Floats32, Ints
-from ..base.errors import LidarpoolError
+from ..base.errors import LidarError
 from ..columns.cloud import Cloud, CloudLike
 from ..columns.table import NORMAL, ORIGIN, TABLE
 from ..scene.scene import Scene
@@ -328,7 +328,7 @@ class Sweeps:
 
         Raises
         ------
-        LidarpoolError
+        LidarError
             If they are not in the order of scans, or of another survey.
         """
         held: list[Cloud] = []
@@ -337,7 +337,7 @@ class Sweeps:
         for chunk in cloud.chunks(_PIECE, cloud.row_of(int(self.scans[first])) if first else 0):
             sweep = np.searchsorted(self.scans, chunk["scan"], "right") - 1
             if sweep[0] < current or sweep[-1] >= len(self) or (np.diff(sweep) < 0).any():
-                raise LidarpoolError(MIXED_UP)
+                raise LidarError(MIXED_UP)
             end = int(np.searchsorted(sweep, stop))
             starts = np.flatnonzero(np.diff(sweep[:end], prepend=-1))
             for start, after in pairwise([*starts, end]):
@@ -382,7 +382,7 @@ class Sweeps:
 
         Raises
         ------
-        LidarpoolError
+        LidarError
             If it cannot be read, is damaged, or of another version.
         """
         with open_archive(path, read) as arrays:

@@ -79,7 +79,7 @@ def write_page(
 def put_picture(page: Path, name: str, svg: str) -> None:
     """Put a picture in its place in a page that `write_page` wrote; other pages stay as they are.
 
-    LidarpoolError if it cannot be written.
+    LidarError if it cannot be written.
     """
     place = re.compile(rf'(<figure data-picture="{name}").*?(?=<figcaption>)', re.DOTALL)
     with explained(f"{page} cannot be written"):

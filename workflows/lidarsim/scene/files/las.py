@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 from ...base.allowance import Allowance
-from ...base.errors import LidarpoolError
+from ...base.errors import LidarError
 from ...base.input_files import open_input
 from .las_units import CoordinateUnits, units_of
 
@@ -36,7 +36,7 @@ def open_las(path: Path) -> Iterator[Any]:
 
     Raises
     ------
-    LidarpoolError
+    LidarError
         If laspy is not installed, or if the points would take far more memory than the file has
         bytes.
     ValueError
@@ -45,7 +45,7 @@ def open_las(path: Path) -> Iterator[Any]:
         If the file cannot be read.
     """
     if find_spec("laspy") is None:
-        raise LidarpoolError('it is read by laspy: pip install "lidarpool[las]"')
+        raise LidarError('it is read by laspy: pip install "lidarpool[las]"')
     laspy: Any = import_module("laspy")  # an extra
     with open_input(path) as file:
         size = os.fstat(file.fileno()).st_size
@@ -65,7 +65,7 @@ def las_units(path: Path) -> CoordinateUnits | None:
 
     Raises
     ------
-    LidarpoolError
+    LidarError
         If the coordinate system has a unit that cannot be known, or angles.
     ValueError
         If the records of the coordinate system are broken.

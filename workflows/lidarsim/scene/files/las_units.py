@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 from importlib.util import find_spec
 from typing import NamedTuple
 
-from ...base.errors import LidarpoolError
+from ...base.errors import LidarError
 
 # Records of LASF_Projection, by ASPRS LAS 1.4.
 _WKT = 2112
@@ -108,7 +108,7 @@ def units_of(records: Mapping[int, bytes], prefer_wkt: bool) -> CoordinateUnits 
 
     Raises
     ------
-    LidarpoolError
+    LidarError
         If coordinates are angles, or have a unit that cannot be known.
     ValueError
         If a record is broken.
@@ -158,11 +158,11 @@ def wkt_units(text: str) -> CoordinateUnits:
     name = node.values[0] if node.values else node.keyword
     if horizontal is None:
         if any(part.keyword in _ANGULAR for part in parts):
-            raise LidarpoolError(f"its coordinates are angles ({name[:80]}): {_PROJECT}.")
+            raise LidarError(f"its coordinates are angles ({name[:80]}): {_PROJECT}.")
         raise ValueError(f"its coordinate system begins with {node.keyword[:20]}")
     unit = _length_unit(horizontal)
     if unit is None:
-        raise LidarpoolError(f"its coordinate system {name[:80]!r} states no unit: {_OVERRIDE}.")
+        raise LidarError(f"its coordinate system {name[:80]!r} states no unit: {_OVERRIDE}.")
     heights = _length_unit(vertical) if vertical is not None else _third_unit(horizontal)
     if heights is None:
         return CoordinateUnits(unit, unit, vertical_stated=False)
@@ -216,7 +216,7 @@ def _unit_of(node: _Node) -> CoordinateUnit:
     name, *factors = node.values
     metres = float(factors[0]) if factors else 0.0
     if not 1e-6 <= metres <= 1e6:
-        raise LidarpoolError(f"its unit {name[:40]!r} has no length in metres: {_OVERRIDE}.")
+        raise LidarError(f"its unit {name[:40]!r} has no length in metres: {_OVERRIDE}.")
     return CoordinateUnit(name[:40], metres)
 
 
@@ -251,9 +251,7 @@ def _units_of_keys(keys: Mapping[int, float]) -> CoordinateUnits | None:
         _GEODETIC_CRS in keys and not projected and not model
     ):
         code = int(keys.get(_GEODETIC_CRS, 0))
-        raise LidarpoolError(
-            f"its coordinates are angles, or geocentric (EPSG:{code}): {_PROJECT}."
-        )
+        raise LidarError(f"its coordinates are angles, or geocentric (EPSG:{code}): {_PROJECT}.")
     unit, heights = _unit_of_code(keys.get(_LINEAR_UNIT)), None
     if keys.get(_LINEAR_UNIT) == _USER_DEFINED and _LINEAR_UNIT_SIZE in keys:
         unit = CoordinateUnit("of its own", keys[_LINEAR_UNIT_SIZE])
@@ -264,9 +262,7 @@ def _units_of_keys(keys: Mapping[int, float]) -> CoordinateUnits | None:
     if unit is None:
         if not projected:
             return None  # keys that say nothing of a projection
-        raise LidarpoolError(
-            f"its coordinate system is of its own and states no unit: {_OVERRIDE}."
-        )
+        raise LidarError(f"its coordinate system is of its own and states no unit: {_OVERRIDE}.")
     vertical = int(keys.get(_VERTICAL_CRS, 0))
     if _VERTICAL_UNIT in keys:
         heights = _unit_of_code(keys[_VERTICAL_UNIT])
@@ -282,7 +278,7 @@ def _unit_of_code(code: float | None) -> CoordinateUnit | None:
     if code is None or code in (0, _USER_DEFINED):
         return None
     if int(code) not in _EPSG_UNITS:
-        raise LidarpoolError(f"its unit EPSG:{int(code)} is not known: {_OVERRIDE}.")
+        raise LidarError(f"its unit EPSG:{int(code)} is not known: {_OVERRIDE}.")
     return CoordinateUnit(*_EPSG_UNITS[int(code)])
 
 
@@ -304,7 +300,7 @@ def _vertical_unit_of_epsg(code: int) -> CoordinateUnit | None:
 def _wkt_of_epsg(code: int) -> str:
     """Return a system of the EPSG registry as WKT."""
     if find_spec("rasterio") is None:
-        raise LidarpoolError(
+        raise LidarError(
             f"its coordinate system EPSG:{code} may be in any unit: {_OVERRIDE}, or install what "
             'knows it, pip install "lidarpool[geo]".'
         )
@@ -314,6 +310,4 @@ def _wkt_of_epsg(code: int) -> str:
     try:
         return str(CRS.from_epsg(code).to_wkt(version="WKT2_2019"))
     except CRSError as error:
-        raise LidarpoolError(
-            f"its coordinate system EPSG:{code} is not known: {_OVERRIDE}."
-        ) from error
+        raise LidarError(f"its coordinate system EPSG:{code} is not known: {_OVERRIDE}.") from error

@@ -14,7 +14,7 @@ import numpy as np
 
 from ...base.arrays import Floats
 from ...base.elementary import cbrt
-from ...base.errors import LidarpoolError, prefixed
+from ...base.errors import LidarError, prefixed
 from ...base.input_files import open_input, read_input
 from ...base.validation import checked
 from ...base.vectors import determinant, matmul, turned
@@ -181,7 +181,7 @@ def load_objects(
 
     Raises
     ------
-    LidarpoolError
+    LidarError
         If the file cannot be read completely, or has no triangles.
     """
     path = Path(path)
@@ -190,16 +190,16 @@ def load_objects(
     raster = {"step_m": step_m, "window": window}
     if is_raster:
         if up_axis:
-            raise LidarpoolError(f"{path} is a raster, whose heights are z: leave out up_axis.")
+            raise LidarError(f"{path} is a raster, whose heights are z: leave out up_axis.")
         raster |= {"unit": unit, "epsg": epsg}
         unit = None
     elif given := [name for name, value in raster.items() if value is not None]:
-        raise LidarpoolError(
+        raise LidarError(
             f"{path} is no raster: leave out {' and '.join(given)}, or give a raster "
             f"({' '.join(RASTERS)})."
         )
     if animation is not None and path.suffix.lower() not in ANIMATED:
-        raise LidarpoolError(
+        raise LidarError(
             f"{path} has no animations that are read: give a {' or '.join(ANIMATED)}, or leave out "
             "animation."
         )
@@ -210,8 +210,8 @@ def load_objects(
     with np.errstate(all="ignore"):
         try:
             content = _read_whole(path, data, wanted, raster)
-        except LidarpoolError as error:
-            raise LidarpoolError(f"{error}{_other_format(path, data)}") from error
+        except LidarError as error:
+            raise LidarError(f"{error}{_other_format(path, data)}") from error
         unit_m = UNITS_M[unit] if unit else content.unit_m or 1.0
         up = up_axis or content.up_axis or "z"
         upright = Transform(UP_AXES[up] * unit_m, np.zeros(3))
@@ -228,7 +228,7 @@ def load_objects(
         tell(f"{path} {note}")
     all_of_it = objects.still(lambda _: None)
     if not any((one.mesh if isinstance(one, SceneInstance) else one).has_area for one in all_of_it):
-        raise LidarpoolError(f"{path} has no triangle with an area.")
+        raise LidarError(f"{path} has no triangle with an area.")
     if content.raster is not None:
         summary = content.raster.told
     else:
@@ -318,7 +318,7 @@ def _lies(content: Content, meshes: Sequence[SceneMesh | SceneInstance]) -> str:
 
 
 def _read_whole(path: Path, data: bytes, wanted: Wanted, raster: dict[str, Any]) -> Content:
-    """Read any file, a raster with these options: at least one object, or LidarpoolError."""
+    """Read any file, a raster with these options: at least one object, or LidarError."""
     try:
         for beginning, what in _FOREIGN.items():
             if re.match(beginning, data):
@@ -337,27 +337,25 @@ def _read_whole(path: Path, data: bytes, wanted: Wanted, raster: dict[str, Any])
     except MemoryError:
         raise
     except MeshFileError as refused:
-        raise LidarpoolError(f"{path} {refused}.") from refused
-    except LidarpoolError as error:
-        raise LidarpoolError(f"{path}: {error}") from error
+        raise LidarError(f"{path} {refused}.") from refused
+    except LidarError as error:
+        raise LidarError(f"{path}: {error}") from error
     except Exception as error:
         # Readers raise whatever they stumble over: ValueError, IndexError, KeyError, BadZipFile,
         # ParseError, struct.error, …
         reason = printable(str(error)) or type(error).__name__
-        raise LidarpoolError(
-            f"{path} is broken or cut short ({reason}): export it again."
-        ) from error
+        raise LidarError(f"{path} is broken or cut short ({reason}): export it again.") from error
 
 
 def _bytes_of(path: Path, max_bytes: int | None) -> bytes:
     """Return the content of a file of a known format, or at most `max_bytes` of its start."""
     suffix = path.suffix.lower()
     if suffix in ROBOTS:
-        raise LidarpoolError(f"{path} is a robot: read it with load_robot, or by a scenario.")
+        raise LidarError(f"{path} is a robot: read it with load_robot, or by a scenario.")
     if advice := converted(path):
-        raise LidarpoolError(f"{path} is not read: {advice}.")
+        raise LidarError(f"{path} is not read: {advice}.")
     if suffix not in SUFFIXES:
-        raise LidarpoolError(
+        raise LidarError(
             f"{path} has the ending {path.suffix or '(none)'}, which is not a mesh format that "
             f"can be read; these are: {' '.join(SUFFIXES)} (a scenario has the ending .yaml)."
         )
@@ -365,14 +363,14 @@ def _bytes_of(path: Path, max_bytes: int | None) -> bytes:
         with prefixed(path):
             data = read_input(path, max_bytes)
     except (FileNotFoundError, NotADirectoryError) as error:
-        raise LidarpoolError(
+        raise LidarError(
             f"{path} does not exist: check the name and the folder.{_like(path)}"
         ) from error
     except (OSError, ValueError) as error:  # a NUL in the name
         reason = getattr(error, "strerror", None) or error
-        raise LidarpoolError(f"{path} cannot be read: {reason}.") from error
+        raise LidarError(f"{path} cannot be read: {reason}.") from error
     if not data:
-        raise LidarpoolError(f"{path} is empty (0 bytes): export the mesh again.")
+        raise LidarError(f"{path} is empty (0 bytes): export the mesh again.")
     return data.removeprefix(codecs.BOM_UTF8)  # the byte order mark of text editors
 
 
@@ -417,7 +415,7 @@ def _placed(
         one = one.moved(name, place.linear, place.offset)
     reach = np.abs(_corners(one)).max()
     if reach > FARTHEST_M:
-        raise LidarpoolError(
+        raise LidarError(
             f"Object {one.name!r} reaches {reach:.3g} m from the origin, farther than anything "
             "on Earth: check its unit and placement."
         )
@@ -433,13 +431,13 @@ def _actor(one: RigidPart, stem: str, upright: Transform, placed: Transform) -> 
     unit_m, scale = (cbrt(determinant(place.linear)) for place in (upright, placed))
     axes, turn = upright.linear / unit_m, placed.linear / scale
     if np.abs(matmul(turn, turn.T) - np.eye(3)).max() > _EVEN:
-        raise LidarpoolError(
+        raise LidarError(
             f"Object {name!r} moves, and its placement scales it unevenly: give one factor."
         )
     objects = [part.moved(name, scale * upright.linear, np.zeros(3)) for part in one.objects]
     positions = turned(one.positions, matmul(placed.linear, upright.linear)) + placed.offset
     if not np.abs(positions).max() <= FARTHEST_M:
-        raise LidarpoolError(
+        raise LidarError(
             f"Object {name!r} moves farther than anything on Earth: check its unit and placement."
         )
     turns = quaternions_of(matmul(matmul(matmul(turn, axes), one.rotations), axes.T))

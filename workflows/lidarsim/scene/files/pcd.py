@@ -24,7 +24,7 @@ def checked_pcd(path: Path) -> dict[str, list[str]]:
     ------
     ValueError
         If the header is incomplete, or announces more numbers than the file can hold.
-    LidarpoolError
+    LidarError
         If the points would take far more memory than the file has bytes.
     OSError
         If the file cannot be read.

@@ -239,7 +239,7 @@ def joined(
     Raises
     ------
     ValueError
-        If a face refers to a missing vertex; LidarpoolError if it takes more than allowed.
+        If a face refers to a missing vertex; LidarError if it takes more than allowed.
     """
     solid: list[Piece] = []
     masked: dict[int, list[Piece]] = {}  # {id of a mask: its pieces}

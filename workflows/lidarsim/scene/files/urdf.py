@@ -19,7 +19,7 @@ import numpy as np
 
 from ...base.allowance import Allowance
 from ...base.arrays import Bytes, Floats
-from ...base.errors import LidarpoolError, prefixed
+from ...base.errors import LidarError, prefixed
 from ...base.input_files import read_input
 from ...base.validation import checked, shown
 from ...base.vectors import length
@@ -71,7 +71,7 @@ def load_robot(
 
     Raises
     ------
-    LidarpoolError
+    LidarError
         If the file or a mesh cannot be read, or the joints do not make a tree.
     """
     path = Path(path)
@@ -79,23 +79,23 @@ def load_robot(
         data = read_input(path)
     except (OSError, ValueError) as error:
         reason = getattr(error, "strerror", None) or error
-        raise LidarpoolError(f"{path} cannot be read: {reason}.") from error
+        raise LidarError(f"{path} cannot be read: {reason}.") from error
     target = path.name.removesuffix(".xacro").removesuffix(".urdf")
     target += ".expanded" * (path.suffix != ".xacro")  # not to write over what is read
     expand = f"{path} is xacro: expand it first: xacro {path.name} > {target}.urdf"
     if path.suffix.lower() == ".xacro":
-        raise LidarpoolError(expand)
+        raise LidarError(expand)
     try:
         root = xml_root(data.lstrip())  # some begin with an empty line
     except (ParseError, ValueError, LookupError) as error:  # an unknown encoding
         if b"<xacro:" in data:
-            raise LidarpoolError(expand) from error
-        raise LidarpoolError(f"{path} is no URDF that can be read: {error}.") from error
+            raise LidarError(expand) from error
+        raise LidarError(f"{path} is no URDF that can be read: {error}.") from error
     if any("xacro" in element.tag for element in root.iter()):
-        raise LidarpoolError(expand)
+        raise LidarError(expand)
     if root.tag != "robot":
         other = "; convert an SDF to URDF first" * (root.tag == "sdf")
-        raise LidarpoolError(f"{path} is no URDF: it begins with <{root.tag[:40]}>{other}.")
+        raise LidarError(f"{path} is no URDF: it begins with <{root.tag[:40]}>{other}.")
     with prefixed(path), np.errstate(all="ignore"):  # infinite values are refused
         name = printable(root.get("name", "")) or path.stem
         links = {_name(element): element for element in _named(root, "link")}
@@ -104,7 +104,7 @@ def load_robot(
             with prefixed(f"joint {_name(element)!r}"):
                 child, joint = _joint(element, links)
                 if child in held:
-                    raise LidarpoolError(f"link {child!r} has two joints that hold it.")
+                    raise LidarError(f"link {child!r} has two joints that hold it.")
                 if joint.kind in HELD[1:]:
                     tell(f"{path}: joint {joint.name} is {joint.kind}: it stays at zero")
                 held[child] = joint
@@ -118,7 +118,7 @@ def load_robot(
                     meshes[link] = one_mesh(link, parts)
         looks.tell_rest()
         if not meshes:
-            raise LidarpoolError("no link has a <visual> with triangles: there is nothing to see.")
+            raise LidarError("no link has a <visual> with triangles: there is nothing to see.")
     return Robot(name, tuple(order), {link: held[link] for link in order[1:]}, meshes)
 
 
@@ -136,12 +136,12 @@ def _named(root: Element, kind: str) -> list[Element]:
     """Elements of a kind, each with its own name."""
     found = root.findall(kind)
     if len(found) > _LINKS_MOST:
-        raise LidarpoolError(f"it has {len(found):,} {kind}s; at most {_LINKS_MOST:,} are read.")
+        raise LidarError(f"it has {len(found):,} {kind}s; at most {_LINKS_MOST:,} are read.")
     names = [_name(element) for element in found]
     if twice := next((name for name in names if name and names.count(name) > 1), None):
-        raise LidarpoolError(f"two {kind}s have the name {twice!r}: give each its own.")
+        raise LidarError(f"two {kind}s have the name {twice!r}: give each its own.")
     if "" in names:
-        raise LidarpoolError(f"a {kind} has no name.")
+        raise LidarError(f"a {kind} has no name.")
     return found
 
 
@@ -156,7 +156,7 @@ def _numbers(element: Element | None, name: str, count: int, default: str) -> Fl
         tag = "" if element is None else element.tag
         what = "a finite number" if count == 1 else f"{count} finite numbers"
         hint = " Expand the file by xacro first." * ("$" in text)
-        raise LidarpoolError(f"{name} of <{tag}> is {shown(text)}; it must be {what}.{hint}")
+        raise LidarError(f"{name} of <{tag}> is {shown(text)}; it must be {what}.{hint}")
     return values
 
 
@@ -171,7 +171,7 @@ def _joint(element: Element, links: Collection[str]) -> tuple[str, Joint]:
     """Return the link that a joint holds, and the joint."""
     kind = element.get("type", "")
     if kind not in (*MOVING, *HELD):
-        raise LidarpoolError(
+        raise LidarError(
             f"its type is {shown(kind)}; it must be one of {', '.join((*MOVING, *HELD))}."
         )
     ends = []
@@ -179,13 +179,13 @@ def _joint(element: Element, links: Collection[str]) -> tuple[str, Joint]:
         found = element.find(which)
         link = printable("" if found is None else found.get("link", ""))
         if link not in links:
-            raise LidarpoolError(f"its {which} {link!r} is no link of the file.")
+            raise LidarError(f"its {which} {link!r} is no link of the file.")
         ends.append(link)
     axis, limits, mimic = np.array([1.0, 0.0, 0.0]), None, None
     if kind in MOVING:
         axis = _numbers(element.find("axis"), "xyz", 3, "1 0 0")
         if not (size := length(axis)) > 1e-9:
-            raise LidarpoolError("its axis has no direction.")
+            raise LidarError("its axis has no direction.")
         axis = axis / size
         limit = element.find("limit")
         if kind != "continuous" and limit is not None:
@@ -202,19 +202,19 @@ def _joint(element: Element, links: Collection[str]) -> tuple[str, Joint]:
 
 
 def _in_order(links: list[str], held: Mapping[str, Joint]) -> list[str]:
-    """Links, each after its parent; LidarpoolError if they are not one tree."""
+    """Links, each after its parent; LidarError if they are not one tree."""
     roots = [link for link in links if link not in held]
     if not links:
-        raise LidarpoolError("it has no link.")
+        raise LidarError("it has no link.")
     if len(roots) > 1:
-        raise LidarpoolError(
+        raise LidarError(
             f"links {roots[0]!r} and {roots[1]!r} are not connected: one root must hold all links."
         )
     above = {link: [held[link].parent] if link in held else [] for link in links}
     try:
         return [*TopologicalSorter(above).static_order()]
     except CycleError as error:
-        raise LidarpoolError(
+        raise LidarError(
             f"the joints of link {error.args[1][0]!r} go round in a circle."
         ) from error
 
@@ -224,11 +224,11 @@ def _check_mimics(held: Mapping[str, Joint]) -> None:
     others = {name: [mimic[0]] for name, mimic in moving.items() if mimic is not None}
     for name, (other,) in others.items():
         if other not in moving:
-            raise LidarpoolError(f"joint {name!r} mimics {other!r}, which does not move.")
+            raise LidarError(f"joint {name!r} mimics {other!r}, which does not move.")
     try:
         TopologicalSorter(others).prepare()
     except CycleError as error:
-        raise LidarpoolError(f"joint {error.args[1][0]!r} mimics itself, in a circle.") from error
+        raise LidarError(f"joint {error.args[1][0]!r} mimics itself, in a circle.") from error
 
 
 @dataclass(eq=False)
@@ -263,7 +263,7 @@ class _Looks:
         for visual in visuals:
             shape = next(iter(visual.find("geometry") or ()), None)
             if shape is None:
-                raise LidarpoolError("a <visual> has no <geometry>.")
+                raise LidarError("a <visual> has no <geometry>.")
             place, colour = _place(visual), self._colour(visual)
             scale, parts = self._shape(shape)
             if not scale.all():
@@ -310,7 +310,7 @@ class _Looks:
             size = self._sizes(_numbers(shape, "size", 3, ""))
             return size, [_BOX]
         if shape.tag not in ("cylinder", "sphere", "capsule"):
-            raise LidarpoolError(
+            raise LidarError(
                 f"its shape is <{shape.tag[:40]}>; there are mesh, box, cylinder, sphere, capsule."
             )
         (radius,) = self._sizes(_numbers(shape, "radius", 1, ""))
@@ -325,14 +325,14 @@ class _Looks:
 
     def _sizes(self, sizes: Floats) -> Floats:
         if (sizes < 0).any():
-            raise LidarpoolError(f"a size is {sizes.min()}; it must not be negative.")
+            raise LidarError(f"a size is {sizes.min()}; it must not be negative.")
         return sizes
 
     def _meshes(self, name: str) -> list[SceneMesh]:
         """Meshes of a file, in its own axes."""
         path, package = self._find(name)
         if not path.resolve().is_relative_to(package):
-            raise LidarpoolError(
+            raise LidarError(
                 f"its mesh {name[:200]!r} is outside the package, {package}: put the .urdf into "
                 "the folder of its package, or above it."
             )
@@ -362,7 +362,7 @@ class _Looks:
         if scheme == "file":
             return Path(rest), self._package
         if scheme not in ("package", "model"):
-            raise LidarpoolError(
+            raise LidarError(
                 f"its mesh {name[:200]!r} must be a file's name, package://NAME/FILE or file://."
             )
         called, _, file = rest.partition("/")
@@ -371,7 +371,7 @@ class _Looks:
                 return folder / file, folder
             if (folder / called).is_dir():
                 return folder / called / file, (folder / called).resolve()
-        raise LidarpoolError(
+        raise LidarError(
             f"its mesh {name[:200]!r} is of a package that is not there: put the .urdf into the "
             f"folder {called[:80]!r} of that package, or beside it."
         )
@@ -382,7 +382,7 @@ def _package_name(folder: Path) -> str:
     file = folder / "package.xml"
     try:
         return (xml_root(read_input(file)).findtext("name") or "").strip()
-    except (OSError, ValueError, LookupError, ParseError, LidarpoolError):
+    except (OSError, ValueError, LookupError, ParseError, LidarError):
         return ""
 
 

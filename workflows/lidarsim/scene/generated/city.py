@@ -70,7 +70,7 @@ def city(
 
     Raises
     ------
-    LidarpoolError
+    LidarError
         For a number that is out of range, or trees or cars that do not fit.
 
     Examples

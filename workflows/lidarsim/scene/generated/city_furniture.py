@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from ...base.arrays import Floats, Ints
-from ...base.errors import LidarpoolError
+from ...base.errors import LidarError
 from ..scene_instances import SceneInstance
 from .cars import all_cars
 from .plants import SCALES, SPECIES, all_trees, placed
@@ -40,7 +40,7 @@ def street_trees(
 
     Raises
     ------
-    LidarpoolError
+    LidarError
         If they do not fit.
     """
     rng = np.random.default_rng([seed, count])
@@ -76,7 +76,7 @@ def parked_cars(blocks: Floats, count: int, seed: int) -> list[SceneInstance]:
 
     Raises
     ------
-    LidarpoolError
+    LidarError
         If they do not fit.
     """
     rng = np.random.default_rng([seed, count])
@@ -99,7 +99,7 @@ def parked_cars(blocks: Floats, count: int, seed: int) -> list[SceneInstance]:
 def _choose(weights: Floats, count: int, what: str, rng: np.random.Generator) -> Ints:
     """Choose places by weights (n,): (count,)."""
     if len(weights) < count:
-        raise LidarpoolError(
+        raise LidarError(
             f"The city has room for {len(weights):,} {what}, not {count:,}: give it more "
             f"triangles, which make it larger, or take fewer {what}."
         )

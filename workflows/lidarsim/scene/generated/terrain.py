@@ -9,7 +9,7 @@ from pydantic import Field
 
 from ...base.arrays import Floats, Ints
 from ...base.declared import Seed
-from ...base.errors import LidarpoolError
+from ...base.errors import LidarError
 from ...base.validation import checked
 from ..scene import Scene
 from ..scene_instances import SceneInstance
@@ -60,7 +60,7 @@ def terrain(
 
     Raises
     ------
-    LidarpoolError
+    LidarError
         For a number that is out of range, or trees that do not fit.
 
     Examples
@@ -97,7 +97,7 @@ def _woods(heights: Floats, side_m: float, count: int, seed: int) -> list[SceneI
     fits &= np.hypot(*places.T[:2]) > _GLADE_M
     fits &= np.abs(places[:, :2]).max(axis=1) < side_m / 2 - _EDGE_M
     if fits.sum() < count:
-        raise LidarpoolError(
+        raise LidarError(
             f"The terrain has room for {fits.sum():,} trees, not {count:,}: make it larger, or "
             "take fewer trees."
         )
