@@ -138,8 +138,10 @@ class Storage:
     @cached_property
     def _opened(self) -> tuple[int, Any, str]:
         """The process that has opened it, file system and folder."""
-        import fsspec
-
+        try:
+            import fsspec
+        except ImportError as error:
+            raise LidarError(f"{self.url} is opened by fsspec: pip install fsspec.") from error
         try:
             system, folder = fsspec.core.url_to_fs(self.url)
         except (ImportError, ValueError) as error:
