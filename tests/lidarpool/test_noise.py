@@ -99,7 +99,10 @@ def test_no_random_number_is_used_twice(monkeypatch):
 
     for name, module in [*sys.modules.items()]:
         for known, other in ((raw, recorded), (starts, begun)):
-            if name.startswith("lidarpool") and getattr(module, known.__name__, None) is known:
+            if (
+                name.startswith(("lidarpool", "lidarsim"))
+                and getattr(module, known.__name__, None) is known
+            ):
                 monkeypatch.setattr(module, known.__name__, other)
     plain = vars(pulse_loops) | {"_bits": hashed}  # others are compiled without these
     for name in ("_uniform", "_scan_of", "_column", "particles", "fog", "spray"):

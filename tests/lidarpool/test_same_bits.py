@@ -10,13 +10,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-import lidarpool
+import lidarsim
 import raybeam
 from lidarpool import Actor, Material, Noise, Returns, Scanner, Scene, Track, load_sensor
 from lidarsim.columns.table import Column
 from lidarsim.scene.shapes import capsule, cylinder
 
-ROOMS = ("base", "columns", "scene", "sensor", "simulator")
 # Of numpy and math: their last bits depend on the processor, or on versions of C's library.
 NAMES = """
 acos acosh arccos arccosh arcsin arcsinh arctan arctan2 arctanh asin asinh atan atan2 atanh cbrt
@@ -28,18 +27,17 @@ vecmat
 FUNCTIONS = {*NAMES.split()}
 SOURCES = {
     f"{package.__name__}/{path.relative_to(root).as_posix()}": path
-    for package, rooms in ((lidarpool, ROOMS), (raybeam, (".",)))
+    for package in (lidarsim, raybeam)
     for root in (Path(package.__file__).parent,)
-    for room in rooms
-    for path in sorted((root / room).rglob("*.py"))
+    for path in sorted(root.rglob("*.py"))
 }
 # What no byte of a cloud depends on, or what one process makes for all.
 EXCEPTIONS = {
-    "lidarpool/scene/generated/": "scenes are made once, and read by all",
-    "lidarpool/scene/simplified.py": "for pictures and planning",
-    "lidarpool/scene/point_scene.py": "a mesh of points is made once, and read by all",
-    "lidarpool/scene/surroundings.py": "for pictures and planning",
-    "lidarpool/scene/files/usd_child.py": "OpenUSD computes places itself; the rest are checks",
+    "lidarsim/scene/generated/": "scenes are made once, and read by all",
+    "lidarsim/scene/simplified.py": "for pictures and planning",
+    "lidarsim/scene/surroundings.py": "for pictures and planning",
+    "lidarsim/sweeps/": "files of sweeps are written by one process for all",
+    "lidarsim/scene/files/usd_child.py": "OpenUSD computes places itself; the rest are checks",
 }
 
 

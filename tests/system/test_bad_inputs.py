@@ -295,7 +295,7 @@ import sys
 
 class Absent:
     def find_spec(self, name, path=None, target=None):
-        if name.partition(".")[0] in ("lidarpool", "poolpart", "raybeam"):
+        if name.partition(".")[0] in ("lidarpool", "lidarsim", "poolpart", "raybeam"):
             raise ModuleNotFoundError(f"No module named {name!r}", name=name)
 
 sys.meta_path.insert(0, Absent())
