@@ -124,7 +124,8 @@ def test_a_worker_is_kept_for_what_would_be_lost_with_it(queue, wait_until):
             return data.clear
 
         def has_actor():
-            actor = [client.submit(Counter, actor=True, resources={"GPU": 1}).result(LONG_S)]
+            actor = [client.submit(Counter, actor=True, resources={"GPU": 1})]
+            wait(actor)
             return actor.clear
 
         def runs_what_was_cancelled():
