@@ -95,13 +95,13 @@ def test_adapting(tmp_path, capsys):
 
 
 def test_the_picture_of_jobs(tmp_path):
-    from benchmarks import adapting_slurm
+    from docs.pictures import adapting
 
     one = {"waiting": 1, "running": 2, "slots": 2, "busy": 1, "tasks": 9}
     samples = [{"t": t, "GPU": one, "IO": one} for t in (0.0, 50.0, 90.0)]
     (tmp_path / "samples.json").write_text(json.dumps(samples))
     picture = tmp_path / "jobs.png"
-    adapting_slurm.main([str(picture), "--samples", str(tmp_path / "samples.json")])
+    adapting.main([str(picture), "--samples", str(tmp_path / "samples.json")])
     assert picture.stat().st_size > 10_000
 
 
