@@ -82,6 +82,11 @@ def secedes(event):
     return wait_for(event)
 
 
+def tell_and_wait(event):
+    Event(f"{event}-began").set()
+    return wait_for(event)
+
+
 class Counter:
     """An actor."""
 
@@ -130,10 +135,9 @@ def test_a_worker_is_kept_for_what_would_be_lost_with_it(queue, wait_until):
 
         def runs_what_was_cancelled():
             name = f"end-{next(events)}"
-            task = gpu.submit(wait_for, name)
+            task = gpu.submit(tell_and_wait, name)
             [worker] = client.cluster.scheduler.workers.values()
-            wait_until(lambda: worker.processing)
-            time.sleep(0.1)  # it has begun
+            assert Event(f"{name}-began", client).wait(LONG_S)
             task.cancel()
             wait_until(lambda: not worker.processing)
             return Event(name, client).set

@@ -3,7 +3,6 @@
 import json
 import re
 import shutil
-import signal
 import subprocess
 import sys
 import zlib
@@ -518,29 +517,34 @@ def test_shards_fit_together_after_a_mesh_was_repaired(tmp_path, slots):
 # -- kills ----------------------------------------------------------------------------------------
 
 KILLED = """
-import os, signal, sys
+import json, os, signal, sys
 from lidarpool import merge
 from lidarpool.base.storage import Storage
 from lidarpool.datasets.job_table import read_table
 import lidarpool.report.campaign_output as output
 owners = {"take": Storage, "write_table": output, "finish": output.DataSet}
-name, left = sys.argv[1], [int(sys.argv[2])]
-function = getattr(owners[name], name)
-def call(*arguments, **options):
-    left[0] -= 1
-    if not left[0]:
-        os.kill(os.getpid(), signal.SIGKILL)
-    return function(*arguments, **options)
-setattr(owners[name], name, call)
-merge(sys.argv[4:], sys.argv[3])
+def die_at(name, number):
+    left, function = [number], getattr(owners[name], name)
+    def call(*arguments, **options):
+        left[0] -= 1
+        if not left[0]:
+            os.kill(os.getpid(), signal.SIGKILL)
+        return function(*arguments, **options)
+    setattr(owners[name], name, call)
+for moment in json.loads(sys.argv[1]):
+    if not (child := os.fork()):
+        die_at(*moment)
+        merge(sys.argv[3:], sys.argv[2])
+        os._exit(0)
+    if os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) != -signal.SIGKILL:
+        sys.exit(f"{moment} did not come")
 """
 
 
 def killed(out: Path, parts: list[Path], *moments: tuple[str, int]) -> None:
-    """Merge, killed at some calls."""
-    for name, number in moments:
-        code = [sys.executable, "-c", KILLED, name, str(number), str(out), *map(str, parts)]
-        assert subprocess.run(code, check=False).returncode == -signal.SIGKILL
+    """Merge, killed at some calls: forks of one process, which has imported all."""
+    arguments = [json.dumps(moments), str(out), *map(str, parts)]
+    subprocess.run([sys.executable, "-W", "ignore", "-c", KILLED, *arguments], check=True)
 
 
 def test_a_killed_merge_goes_on(parts, campaigns, tmp_path):
