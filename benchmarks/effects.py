@@ -17,9 +17,9 @@ from typing import Any
 from docs.pictures.effects._catalogue import load_effects
 from docs.pictures.effects._street import survey_without
 
-from lidarpool.scene.generated.city import city
-from lidarpool.simulator.batch import columns_of
-from lidarpool.simulator.rig import Rig
+from lidarsim.scene.generated.city import city
+from lidarsim.simulator.batch import columns_of
+from lidarsim.simulator.rig import Rig
 
 ROUNDS = 5
 

@@ -23,7 +23,7 @@ from lidarpool.render.camera import Camera
 from lidarpool.render.colouring import TURBO
 from lidarpool.render.pictures import splat
 from lidarpool.render.surface import unit
-from lidarpool.scene.generated.city import city
+from lidarsim.scene.generated.city import city
 
 SIZE, BACK = (720, 405), np.array([14, 17, 22, 255]) / 255
 EYE, TARGET = np.array([-38.0, -30.0, 34.0]), np.array([4.0, 4.0, 0.0])
