@@ -57,11 +57,8 @@ format: dev  ## rewrite the sources in the project's format
 	$(BIN)/ruff format .
 	$(BIN)/ruff check --fix .
 
-bench: dev  ## benchmarks: pipeline, planning, live page, ray casting; figures of the last in build/ as JSON
-	$(BIN)/python -m benchmarks.pipeline
+bench: dev  ## benchmarks: scheduler and driver, ray casting, trees; figures of the last two in build/ as JSON
 	$(BIN)/python -m benchmarks.scale
-	$(BIN)/python -m benchmarks.planning
-	$(BIN)/python -m benchmarks.live
 	@mkdir -p build
 	$(BIN)/python -m benchmarks.raycast --json build/raycast.json
 	$(BIN)/python -m benchmarks.trees --json build/trees.json

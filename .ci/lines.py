@@ -7,10 +7,10 @@ ENDINGS = {".py", ".cu", ".js"}
 
 
 def main() -> None:
-    """Print a row per package of the source roots, then tests, benchmarks and the total."""
+    """Print a row per package of the source roots, tests, benchmarks, and the code of docs."""
     packages = [path for root in ("kernels", "scheduler") for path in (ROOT / root).iterdir()]
     packages += (ROOT / "workflows").glob("*/*")
-    packages += [ROOT / "tests", ROOT / "benchmarks"]
+    packages += [ROOT / "tests", ROOT / "benchmarks", ROOT / "docs"]
     for package in sorted(path for path in packages if path.is_dir()):
         sources = [path for path in package.rglob("*") if path.suffix in ENDINGS]
         ours = [path for path in sources if ".min." not in path.name]  # minified: of other projects

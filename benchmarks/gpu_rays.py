@@ -22,10 +22,9 @@ from raybeam import (
 from raybeam.scan import Groups
 
 from .gpu_clock import Here, Split, milliseconds, wall_milliseconds
-from .gpu_scenes import Float, city, revolution, six_objects
+from .gpu_scenes import Float, beam_directions, city, revolution, six_objects, track
 from .gpu_scenes import Mesh as Faces
 from .instances import places, tree
-from .raycast_moving import beam_directions, track
 
 Rows = Iterator[tuple[str, dict[str, Any]]]
 MIDDLE = np.array([10.0, 10.0, 2.0])  # a crossing of the city

@@ -76,3 +76,29 @@ def revolution(rays: int, layers: int = 128) -> Float:
     level = np.cos(elevation)
     parts = (np.cos(azimuth) * level, np.sin(azimuth) * level, np.sin(elevation))
     return np.stack(np.broadcast_arrays(*parts), axis=-1).reshape(-1, 3)
+
+
+def beam_directions(beams: int, rays: int) -> Float:
+    """Make unit directions (n, 3), firing by firing, from 15 degrees below level to 45 above."""
+    azimuth = np.linspace(0, 2 * np.pi, max(1, rays // beams), endpoint=False)[:, None]
+    elevation = np.radians(np.linspace(-15, 45, beams))
+    flat = np.cos(elevation)
+    x, y = np.cos(azimuth) * flat, np.sin(azimuth) * flat
+    return np.stack([x, y, np.broadcast_to(np.sin(elevation), x.shape)], axis=-1).reshape(-1, 3)
+
+
+def track(firings: int) -> tuple[Float, Float]:
+    """Positions (k, 3) and rotations (k, 3, 3) of a head that moves by 1 m and turns by 5 degrees.
+
+    It is tilted by 2 degrees, so that no rotation is about an axis.
+    """
+    part = np.linspace(-0.5, 0.5, firings)
+    yaw, tilt = np.radians(5) * part, np.radians(2)
+    rotations = np.zeros((firings, 3, 3))
+    rotations[:, 0, 0] = rotations[:, 1, 1] = np.cos(yaw)
+    rotations[:, 1, 0] = np.sin(yaw)
+    rotations[:, 0, 1] = -rotations[:, 1, 0]
+    rotations[:, 2, 2] = 1
+    c, s = np.cos(tilt), np.sin(tilt)
+    positions = np.column_stack([10 + part, 10 + 0.3 * part, np.full(firings, 20.0)])
+    return positions, rotations @ np.array([[1, 0, 0], [0, c, -s], [0, s, c]])

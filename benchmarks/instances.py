@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from raybeam import Instance, Mesh, Pattern, RayCaster, available_backends
 
-from .raycast_moving import beam_directions
+from .gpu_scenes import beam_directions
 
 Float = NDArray[np.float64]
 

@@ -5,6 +5,7 @@ import os
 import signal
 import sys
 import types
+from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -50,6 +51,21 @@ else:
         "patient", deadline=None, suppress_health_check=slow, derandomize=True
     )
     settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "patient"))
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Mark as slow the rows of tests with `every_nth(n)`, but for the first, the n-th after it, …
+
+    Of a product of parameters, each value is met if their numbers have no factor of `n`.
+    """
+    counts: Counter[str] = Counter()
+    for item in items:
+        if mark := item.get_closest_marker("every_nth"):
+            test = item.nodeid.partition("[")[0]
+            if counts[test] % mark.args[0]:
+                item.add_marker(pytest.mark.slow)
+            counts[test] += 1
 
 
 _HANDLERS = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}

@@ -30,6 +30,7 @@ _ELSEWHERE = {
     "ARCHITECTURE.md": "architecture.md",
     "CHANGELOG.md": "changelog.md",
     "CONTRIBUTING.md": "contributing.md",
+    "benchmarks/README.md": "benchmarks.md",
 }
 # Sources that the reference shows in a better way. {file: page}
 _SHOWN = {"workflows/lidarsim/columns/table.py": "reference/columns.md"}

@@ -25,7 +25,7 @@ from lidarpool.columns.parts import part_name
 from lidarpool.pipeline.database import RunDatabase
 from lidarpool.pipeline.messages import Receipt
 
-DAMAGES = 6  # of each file, for each reader
+DAMAGES = 3  # of each file, for each reader
 
 
 @pytest.fixture(scope="module")
@@ -80,7 +80,7 @@ def test_a_damaged_database_is_refused_or_the_same(tmp_path):
     with closing(RunDatabase(path)) as db:
         expected = content(db)
     data, chance, refused = path.read_bytes(), random.Random(7), 0
-    for _ in range(300):
+    for _ in range(100):
         copy.write_bytes(damaged(data, chance))
         try:
             with closing(RunDatabase(copy, durable=False)) as db:
@@ -91,7 +91,7 @@ def test_a_damaged_database_is_refused_or_the_same(tmp_path):
             continue
         lost = set(map(str, found[3])) ^ set(map(str, expected[3]))
         assert found == expected or not copy.stat().st_size, lost
-    assert refused > 50
+    assert refused > 15
 
 
 @pytest.mark.slow

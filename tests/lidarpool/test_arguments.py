@@ -54,6 +54,8 @@ from lidarpool.scenario.sections import PoolSection
 POINTS, FACES, OWNERS = np.eye(3), np.array([[0, 1, 2]]), np.zeros(1, int)
 AT = [(0, 0, 1)]
 GRID = Sensor.grid()
+SCENE = Scene.from_meshes([SceneMesh("Car", POINTS, FACES)])
+SCANNER = Scanner(SCENE, GRID, backend="numpy")
 
 # Of everything public that takes arguments, calls that cannot be meant, and what is answered.
 WRONG = {
@@ -74,7 +76,7 @@ WRONG = {
     ],
     Job: [
         ("hall.glb", Survey(poses=AT), "Scene.load('hall.glb')"),
-        (Scene.seed(), Survey(poses=AT), ["fog"], "planning is ['fog']; it must be a Planning"),
+        (SCENE, Survey(poses=AT), ["fog"], "planning is ['fog']; it must be a Planning"),
     ],
     Cloud: [("x", {}, "positions"), ([["a", 0, 0]], {}, "numbers")],
     Column: [(1, "u1", "", "", "name"), ("a", "u1", "", "", 3, "source is 3")],
@@ -102,11 +104,11 @@ WRONG = {
     Scene.from_meshes: [("a.glb", "[SceneMesh('"), (GRID, "a Sensor")],
     Scanner: [
         ("hall.glb", GRID, "Scene.load('hall.glb')"),
-        (Scene.seed(), Survey(poses=AT), "sensor is a Survey; it must be a Sensor"),
+        (SCENE, Survey(poses=AT), "sensor is a Survey; it must be a Sensor"),
     ],
-    Scanner(Scene.seed(), GRID).sweep: [(None, "pose is None"), ((0, 1), "position[2] is missing")],
-    Scanner(Scene.seed(), GRID).ranges: [(None, "a list of Pose"), ([AT], "(k, 4, 4)")],
-    Scanner(Scene.seed(), GRID).move: [
+    SCANNER.sweep: [(None, "pose is None"), ((0, 1), "position[2] is missing")],
+    SCANNER.ranges: [(None, "a list of Pose"), ([AT], "(k, 4, 4)")],
+    SCANNER.move: [
         (3, AT[0], "name is 3"),
         ("Car", AT[0], "no actor or instance 'Car'"),
     ],
@@ -144,7 +146,7 @@ WRONG = {
     ],
     simulate: [
         ("hall.glb", Survey(poses=AT), "Scene.load('hall.glb')"),
-        (Scene.seed(), Survey(poses=AT), (25, 25), "Planning(("),
+        (SCENE, Survey(poses=AT), (25, 25), "Planning(("),
     ],
     sweeps: [(3, "place is 3"), ("nowhere", "no data set of lidarpool")],
 }

@@ -68,6 +68,7 @@ def test_a_scanner_finds_what_a_cast_and_open3d_find(tmp_path, capsys):
     assert "mujoco-lidar: not installed" in said and said.count("the bar of 1.3 x the cast is") == 3
 
 
+@pytest.mark.slow
 def test_what_is_real_is_measured_beside_what_is_bare(capsys):
     toy = ["--triangles", "2000", "--cars", "2", "3", "--sensor", "velodyne/vlp16"]
     assert realism.main([*toy, "--rounds", "1", "--json"]) == 0

@@ -191,6 +191,7 @@ MORE = {
 }
 
 
+@pytest.mark.every_nth(3)
 @pytest.mark.parametrize("actors", [(), ACTORS], ids=["", "actors"])
 @pytest.mark.parametrize("name", MORE)
 def test_numpy_makes_the_other_columns_of_the_hits(name, actors, scenes, backend):

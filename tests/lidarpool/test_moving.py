@@ -9,17 +9,7 @@ import pytest
 from tests.rows import quick
 from tests.shapes import level, made, quad
 
-from lidarpool import (
-    LidarError,
-    Material,
-    Mounted,
-    Noise,
-    Pose,
-    Scene,
-    Survey,
-    Track,
-    load_sensor,
-)
+from lidarpool import LidarError, Material, Mounted, Noise, Pose, Scene, Survey, Track, load_sensor
 from lidarpool.run.job_source import identity_of
 from lidarpool.scenario.build import Job
 from lidarsim.base.vectors import into_axes

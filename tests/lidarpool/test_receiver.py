@@ -110,6 +110,7 @@ def full(meshes, noise=FULL, retro="none", **options):
     return cast(meshes, noise=noise, materials=materials, columns=PULSES, **options)
 
 
+@pytest.mark.every_nth(4)
 @pytest.mark.parametrize("waveform", ["none", "peaks", "gaussian"])
 @pytest.mark.parametrize("distance", [2.0, 10.0, 40.0, 44.8, 90.0])
 def test_a_full_receiver_clips_and_widens(distance, waveform):

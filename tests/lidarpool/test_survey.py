@@ -14,17 +14,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from tests.shapes import Cart
 
-from lidarpool import (
-    Beams,
-    LidarError,
-    Mounted,
-    Pose,
-    Sensor,
-    Spin,
-    Survey,
-    Track,
-    load_trajectory,
-)
+from lidarpool import Beams, LidarError, Mounted, Pose, Sensor, Spin, Survey, Track, load_trajectory
 from lidarpool.base.fingerprint import fingerprint
 from lidarsim.sensor.trajectory import matrices, quaternions_of, rotations_of, velocities
 

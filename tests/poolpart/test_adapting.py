@@ -82,6 +82,11 @@ def secedes(event):
     return wait_for(event)
 
 
+def tell_and_wait(event):
+    Event(f"{event}-began").set()
+    return wait_for(event)
+
+
 class Counter:
     """An actor."""
 
@@ -124,15 +129,15 @@ def test_a_worker_is_kept_for_what_would_be_lost_with_it(queue, wait_until):
             return data.clear
 
         def has_actor():
-            actor = [client.submit(Counter, actor=True, resources={"GPU": 1}).result(LONG_S)]
+            actor = [client.submit(Counter, actor=True, resources={"GPU": 1})]
+            wait(actor)
             return actor.clear
 
         def runs_what_was_cancelled():
             name = f"end-{next(events)}"
-            task = gpu.submit(wait_for, name)
+            task = gpu.submit(tell_and_wait, name)
             [worker] = client.cluster.scheduler.workers.values()
-            wait_until(lambda: worker.processing)
-            time.sleep(0.1)  # it has begun
+            assert Event(f"{name}-began", client).wait(LONG_S)
             task.cancel()
             wait_until(lambda: not worker.processing)
             return Event(name, client).set

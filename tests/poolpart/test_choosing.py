@@ -40,7 +40,7 @@ def wait_here(event, *_):
 
 
 def open_gate(client, gate, futures):
-    """Let the tasks of ``futures`` end once each has a worker: none finds a worker idle again."""
+    """Let the tasks of `futures` end once each has a worker, so that none finds one idle again."""
     keys = {future.key for future in futures}
     deadline = time.monotonic() + LONG_S
     while count_placed(client, keys) < len(keys):

@@ -39,7 +39,7 @@ def test_of_a_pipe_without_items(client, a, make_pipe):
     assert repr(a) == "<Partition 'A'>"
 
 
-def test_producers_wait_when_tasks_are_slow(client, b, make_pipe, pool):
+def test_producers_wait_when_tasks_are_slow(client, b, make_pipe, pool, wait_until):
     pipe, event = make_pipe(client, capacity=3), f"slow-{time.time()}"
     put = []
 
@@ -50,8 +50,9 @@ def test_producers_wait_when_tasks_are_slow(client, b, make_pipe, pool):
 
     producer = pool.submit(produce)
     consumer = pool.submit(b.for_each, pipe, wait_for, window=2)
-    time.sleep(1)
-    assert len(put) == 3 + 2  # in the pipe, and under way
+    wait_until(lambda: len(put) == 3 + 2)  # in the pipe, and under way
+    time.sleep(0.2)
+    assert len(put) == 3 + 2
     pipe.fail("enough")
     for future in (producer, consumer):
         with pytest.raises(PipeFailed, match="enough"):

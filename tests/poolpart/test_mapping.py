@@ -8,6 +8,7 @@ import threading
 import time
 import uuid
 from collections import Counter
+from types import SimpleNamespace
 
 import pytest
 from distributed import CancelledError, Client, Event, as_completed, get_worker
@@ -26,8 +27,8 @@ def slow_if_even(x):
     return x
 
 
-def slow_from_100(x):
-    time.sleep(0.005 if x < 100 else 0.06)
+def slowly(x):
+    time.sleep(0.06)
     return x
 
 
@@ -140,9 +141,26 @@ def test_a_bounded_number_is_under_way_even_of_endless_items(a, client, ordered,
     results.close()
 
 
-def test_the_window_of_small_chunks_grows_with_short_items_and_shrinks_with_long_ones(a, client):
+task_clock = threading.local()  # of each thread of a worker; only `last_on_task_clock` moves it
+
+
+def read_task_clock():
+    return getattr(task_clock, "seconds", 0.0)
+
+
+def last_on_task_clock(x):
+    """Take 5 ms, or 60 ms from item 100 on, however busy the machine is."""
+    task_clock.seconds = read_task_clock() + (0.005 if x < 100 else 0.06)
+    return x
+
+
+def test_the_window_of_small_chunks_grows_with_short_items_and_shrinks_with_long_ones(
+    a, client, monkeypatch, wait_until
+):
+    clock = SimpleNamespace(perf_counter=read_task_clock, monotonic=time.monotonic)
+    monkeypatch.setattr("poolpart.mapping.time", clock)
     taken = itertools.count()
-    results = a.map(slow_from_100, taken, chunk=1)
+    results = a.map(last_on_task_clock, taken, chunk=1)
     most = 0
     for number in range(100):
         assert next(results) == number
@@ -152,7 +170,7 @@ def test_the_window_of_small_chunks_grows_with_short_items_and_shrinks_with_long
     assert reached <= 100 + 2 * 512
     for _ in range(100, reached):
         next(results)
-    assert task_count(client) <= 4 * a.slots  # those that are done go a moment later
+    wait_until(lambda: task_count(client) <= 4 * a.slots)  # those that are done go a moment later
     results.close()
 
 
@@ -277,7 +295,7 @@ def test_all_results_of_a_partition_that_was_dissolved_are_read(start, monkeypat
 
 def test_a_restart_of_the_cluster_ends_it(own_nannies):
     part = Pool.from_client(own_nannies).divide({"A": rest()})["A"]
-    results = part.map(slow_from_100, itertools.count(100), chunk=1)
+    results = part.map(slowly, itertools.count(100), chunk=1)
     assert next(results) == 100
     own_nannies.restart()
     with pytest.raises(CancelledError, match="Scheduler has restarted") as caught:

@@ -6,6 +6,7 @@ import threading
 import pytest
 from distributed import Status
 from distributed.diagnostics.plugin import SchedulerPlugin
+from tests.poolpart.helpers import LONG_S
 
 from poolpart.task_context import WorkerLeft, own_client, telling_departure
 from poolpart.workers import worker_identities
@@ -21,7 +22,7 @@ def test_a_coroutine_does_not_wait_for_a_thread_that_needs_its_loop(monkeypatch)
             if threading.current_thread() is threading.main_thread():
                 return "coroutine"
             entered.set()
-            asyncio.run_coroutine_threadsafe(asyncio.sleep(0.01), loop).result(10)
+            asyncio.run_coroutine_threadsafe(asyncio.sleep(0.01), loop).result(LONG_S)
             return "thread"
 
         monkeypatch.setattr("poolpart.task_context.get_client", make)

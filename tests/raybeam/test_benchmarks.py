@@ -5,20 +5,10 @@ import re
 from pathlib import Path
 
 import pytest
-from benchmarks import gpu, gpu_points, gpu_rays, instances, raycast_moving
+from benchmarks import gpu, gpu_points, gpu_rays, instances
 from tests.cuda_on_host import played_cuda  # noqa: F401 - a fixture
 
 from raybeam import available_backends
-
-
-@pytest.mark.slow
-def test_moving_sensors_of_all_numbers_of_beams(capsys):
-    if reason := available_backends()["embree"]:
-        pytest.skip(f"embree: {reason}")
-    assert raycast_moving.main(["--quick"]) == 0
-    lines = capsys.readouterr().out.splitlines()
-    assert [int(line.split()[0]) for line in lines] == [16, 16, 64, 64, 128, 128]
-    assert all("x bare; moving" in line and "hits 0 %" not in line for line in lines)
 
 
 @pytest.mark.slow

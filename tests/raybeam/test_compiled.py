@@ -1,7 +1,6 @@
 """Loops are compiled once, and again when a file that they depend on has changed."""
 
 import os
-import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -13,7 +12,7 @@ from raybeam import compiled
 pytest.importorskip("numba")
 
 LOOP = """
-from .compiled import compiled
+from raybeam.compiled import compiled
 from .numbers import MORE
 
 @compiled("f8(f8)")
@@ -26,61 +25,46 @@ if __name__ == "__main__":
 
 
 @pytest.fixture
-def run(tmp_path):
-    """Run a loop of a package with another file that says a number: what it adds, and misses."""
+def package(tmp_path):
+    """A package with a loop that depends on a number of another file, read through a third."""
     package = tmp_path / "loops"
     package.mkdir()
-    shutil.copy(Path(compiled.__file__), package)
     (package / "__init__.py").touch()
     (package / "more.py").write_text(LOOP)
-
-    def go(number=None):
-        if number is not None:
-            (package / "numbers.py").write_text(f"MORE = {number}\n")
-        command = [sys.executable, "-m", "loops.more"]
-        result = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=True)
-        return result.stdout.split()
-
-    return go
-
-
-def test_a_change_of_another_file_compiles_again(run):
-    """What a loop takes from there is a constant of its code, of which numba knows nothing."""
-    assert run("2.0") == ["3.0", "1"]
-    assert run() == ["3.0", "0"]
-    assert run("30.0") == ["31.0", "1"]
-
-
-def test_only_a_change_of_imported_files_compiles_again(tmp_path):
-    """A loop depends on what its file imports, also indirectly, and not on all of its package."""
-    package = tmp_path / "loops"
-    package.mkdir()
-    (package / "__init__.py").touch()
-    (package / "more.py").write_text(LOOP.replace("from .compiled", "from raybeam.compiled"))
     (package / "numbers.py").write_text("from .constants import MORE\n")
-
-    def run():
-        command = [sys.executable, "-m", "loops.more"]
-        path = {**os.environ, "PYTHONPATH": str(Path(compiled.__file__).parents[1])}
-        return subprocess.check_output(command, cwd=tmp_path, text=True, env=path).split()
-
     (package / "constants.py").write_text("MORE = 2.0\n")
-    assert run() == ["3.0", "1"]
+    return package
+
+
+def start(package):
+    """Run the loop in a process, which prints what it adds and how often it compiled."""
+    path = {**os.environ, "PYTHONPATH": str(Path(compiled.__file__).parents[1])}
+    return subprocess.Popen(
+        [sys.executable, "-m", "loops.more"],
+        cwd=package.parent, env=path, stdout=subprocess.PIPE, text=True,
+    )  # fmt: skip
+
+
+def printed(process):
+    return process.communicate()[0].split()
+
+
+def test_only_a_change_of_imported_files_compiles_again(package):
+    """A loop depends on what its file imports, also indirectly, and not on all of its package.
+
+    What a loop takes from there is a constant of its code, of which numba knows nothing.
+    """
+    assert printed(start(package)) == ["3.0", "1"]
     (package / "unrelated.py").write_text("LESS = 1.0\n")
-    assert run() == ["3.0", "0"]
+    assert printed(start(package)) == ["3.0", "0"]
     (package / "constants.py").write_text("MORE = 30.0\n")
-    assert run() == ["31.0", "1"]
+    assert printed(start(package)) == ["31.0", "1"]
 
 
-def test_processes_that_start_together_compile_once(run, tmp_path):
+def test_processes_that_start_together_compile_once(package):
     """The others wait, and load what the first has kept."""
-    (tmp_path / "loops/numbers.py").write_text("MORE = 2.0\n")
-    command = [sys.executable, "-m", "loops.more"]
-    started = [
-        subprocess.Popen(command, cwd=tmp_path, stdout=subprocess.PIPE, text=True) for _ in range(8)
-    ]
-    printed = sorted(one.communicate()[0].split() for one in started)
-    assert printed == [["3.0", "0"]] * 7 + [["3.0", "1"]]
+    started = [start(package) for _ in range(4)]
+    assert sorted(map(printed, started)) == [["3.0", "0"]] * 3 + [["3.0", "1"]]
 
 
 def test_an_inner_function_is_compiled_once_for_all_whole_numbers():

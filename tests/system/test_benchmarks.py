@@ -4,33 +4,16 @@ import json
 from contextlib import contextmanager
 
 import pytest
-from benchmarks import control, formats, gpu, live, model, pipeline, scale
+from benchmarks import control, effects, formats, gpu, model, scale
 from distributed import Client
+from docs.pictures import adapting as adapting_picture
+from docs.pictures.effects import __main__ as pictures
 from tests.clusters import import_jobqueue, thread_cluster
 from tests.cuda_on_host import played_cuda, source_backend  # noqa: F401 - fixtures
 
 import lidarpool.run.cluster
 
 pytestmark = pytest.mark.slow
-
-
-@pytest.fixture(autouse=True)
-def in_threads(monkeypatch):
-    """Have benchmarks start clusters of threads."""
-    slots = ({"GPU": 1}, {"LIDAR": 4}, {"OTHER": 1})
-    for module in (pipeline, live):
-        monkeypatch.setattr(module, "local_cluster", lambda: thread_cluster(*slots))
-
-
-def test_pipeline(tmp_path, capsys):
-    path = tmp_path / "figures.json"
-    sizes = ["--scans", "40", "--runs", "1", "--sizes", "20"]
-    figures = pipeline.main([*sizes, "--json", str(path)])
-    assert json.loads(path.read_text()) == figures
-    assert figures["scans_per_second"] > 0
-    assert set(figures["stage_ms_per_scan"]) == {"generate", "intersect", "sort", "collect"}
-    assert figures["cpu_seconds_per_million_rays"]["20"] > 0
-    assert "scans/s" in capsys.readouterr().out
 
 
 def test_scale(tmp_path, capsys):
@@ -46,19 +29,8 @@ def test_scale(tmp_path, capsys):
 
 def test_scale_of_receipts_and_jobs(tmp_path, capsys):
     path = tmp_path / "figures.json"
-    sizes = [
-        "--workers",
-        "3",
-        "--receipts",
-        "0.05",
-        "--scans",
-        "40",
-        "--jobs",
-        "10",
-        "--shards",
-        "2",
-    ]
-    rows = scale.main([*sizes, "--json", str(path)])
+    sizes = ["--workers", "3", "--scans", "40", "--jobs", "10", "--shards", "2"]
+    rows = scale.main([*sizes, "--receipts", "0.05", "--json", str(path)])
     assert json.loads(path.read_text()) == rows
     assert all(row["driver_ms"] > 0 and row["a_second"] > 0 for row in rows.values())
     assert 0 < rows["2 x 3 workers, batches of 0.05 s"]["busy"] <= 1
@@ -71,15 +43,6 @@ def test_scale_of_receipts_and_jobs(tmp_path, capsys):
     assert rate == pytest.approx(200, rel=0.05) and by == "casting" and shards == 1
     assert picture.stat().st_size > 10_000
     assert "by the model" in capsys.readouterr().out
-
-
-def test_live(tmp_path, capsys):
-    path = tmp_path / "figures.json"
-    figures = live.main(["--poses", "1", "--runs", "1", "--json", str(path)])
-    assert json.loads(path.read_text()) == figures
-    assert figures["ratio"] > 0
-    assert figures["megabytes_sent"] > 0  # or nobody looked
-    assert "times as long" in capsys.readouterr().out
 
 
 def test_adapting(tmp_path, capsys):
@@ -95,19 +58,28 @@ def test_adapting(tmp_path, capsys):
 
 
 def test_the_picture_of_jobs(tmp_path):
-    from benchmarks import adapting_slurm
-
     one = {"waiting": 1, "running": 2, "slots": 2, "busy": 1, "tasks": 9}
     samples = [{"t": t, "GPU": one, "IO": one} for t in (0.0, 50.0, 90.0)]
     (tmp_path / "samples.json").write_text(json.dumps(samples))
     picture = tmp_path / "jobs.png"
-    adapting_slurm.main([str(picture), "--samples", str(tmp_path / "samples.json")])
+    adapting_picture.main([str(picture), "--samples", str(tmp_path / "samples.json")])
     assert picture.stat().st_size > 10_000
 
 
 def test_bytes_of_batches(capsys):
     control.count_batches(5)
     assert "a further batch of one scan adds" in capsys.readouterr().out
+
+
+def test_effects(capsys):
+    toy = ["--rounds", "1", "--triangles", "500"]
+    assert effects.main(["--only", "rain", "spray", *toy]).keys() == {"rain", "spray"}
+    assert capsys.readouterr().out.startswith("rain ")
+
+
+def test_a_picture_of_an_effect(tmp_path):
+    pictures.main([str(tmp_path), "--only", "range_noise"])
+    assert (tmp_path / "effect-range-noise.png").stat().st_size > 10_000
 
 
 def test_formats(capsys):

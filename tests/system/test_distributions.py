@@ -1,4 +1,4 @@
-"""lidarpool, raybeam and poolpart as distributions: what they hold, alone and together."""
+"""The distributions of this repository: what they hold, alone and together."""
 
 import importlib.metadata
 import os
@@ -8,7 +8,9 @@ import sys
 import tarfile
 import tomllib
 import zipfile
+from collections import Counter
 from collections.abc import Iterable
+from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
@@ -17,34 +19,62 @@ from packaging.requirements import Requirement
 from lidarpool import __version__
 
 ROOT = Path(__file__).parents[2]
-FOLDERS = {"lidarpool": ".", "raybeam": "kernels", "poolpart": "scheduler"}
-PACKAGES = {
-    "lidarpool": [
-        "kernels/raybeam",
-        "scheduler/poolpart",
-        "workflows/lidarsim",
-        "workflows/lidarpool",
-    ],
-    "raybeam": ["raybeam"],
-    "poolpart": ["poolpart"],
+
+
+@dataclass(frozen=True)
+class Distribution:
+    """A distribution: `pip install ROOT/folder`."""
+
+    folder: str  # with pyproject.toml
+    packages: tuple[str, ...]  # folders of its import packages, from `folder`
+    only: frozenset[str] = frozenset()  # all distributions that come with it, if they are few
+    without: frozenset[str] = frozenset()  # distributions that do not come with it
+    prints: str = ""  # by the example of its README, if it has one
+    more: str = ""  # code behind that example
+
+
+# {name: distribution}; the first holds all packages.
+DISTRIBUTIONS = {
+    "lidarpool": Distribution(
+        ".",
+        ("kernels/raybeam", "scheduler/poolpart", "workflows/lidarsim", "workflows/lidarpool"),
+        without=frozenset({"raybeam", "poolpart", "lidarsim", "pytest"}),
+    ),
+    "raybeam": Distribution(
+        "kernels",
+        ("raybeam",),
+        only=frozenset({"numpy"}),
+        prints="[ 5. inf]\nnumpy\n",
+        more="print(caster.backend)\n",
+    ),
+    "poolpart": Distribution(
+        "scheduler",
+        ("poolpart",),
+        without=frozenset({"lidarpool", "raybeam", "numpy"}),
+        prints="1 2 45\n",
+    ),
 }
+WHOLE, *PARTS = DISTRIBUTIONS
+
+
+def folder_of(name: str) -> Path:
+    return ROOT / DISTRIBUTIONS[name].folder
 
 
 def declared(name: str) -> dict:
-    project = (ROOT / FOLDERS[name] / "pyproject.toml").read_text(encoding="utf-8")
-    return tomllib.loads(project)
+    return tomllib.loads((folder_of(name) / "pyproject.toml").read_text(encoding="utf-8"))
 
 
-@pytest.mark.parametrize("name", ["raybeam", "poolpart"])
+@pytest.mark.parametrize("name", PARTS)
 def test_a_part_wants_what_the_whole_wants(name):
-    whole, part = declared("lidarpool")["project"], declared(name)["project"]
+    whole, part = declared(WHOLE)["project"], declared(name)["project"]
     extras = whole["optional-dependencies"]
-    assert set(part["dependencies"]) < set(whole["dependencies"])
+    foreign = {text for text in part["dependencies"] if Requirement(text).name not in PARTS}
+    assert foreign < set(whole["dependencies"])
     for extra, wanted in part.get("optional-dependencies", {}).items():
         assert set(wanted) <= set(extras.get(extra, whole["dependencies"]))
     assert part["requires-python"] == whole["requires-python"]
-    licence = (ROOT / FOLDERS[name] / "LICENSE").read_bytes()
-    assert licence == (ROOT / "LICENSE").read_bytes()
+    assert (folder_of(name) / "LICENSE").read_bytes() == (ROOT / "LICENSE").read_bytes()
 
 
 def outside() -> dict[str, str]:
@@ -70,8 +100,8 @@ def built(tmp_path_factory) -> Path:
     for tool in ("pip", "hatchling", "twine"):
         pytest.importorskip(tool, reason=f"needs {tool}: pip install '.[dev]'")
     place = tmp_path_factory.mktemp("built")
-    for folder in FOLDERS.values():
-        python("-m", "hatchling", "build", "-t", "sdist", "-d", place, cwd=ROOT / folder)
+    for name in DISTRIBUTIONS:
+        python("-m", "hatchling", "build", "-t", "sdist", "-d", place, cwd=folder_of(name))
     python(
         *("-m", "pip", "wheel", "--quiet", "--no-build-isolation", "--no-deps", "--no-index"),
         *("-w", place, *place.glob("*.tar.gz")),
@@ -81,11 +111,11 @@ def built(tmp_path_factory) -> Path:
 
 @pytest.mark.slow
 @pytest.mark.sample
-@pytest.mark.parametrize("name", FOLDERS)
+@pytest.mark.parametrize("name", DISTRIBUTIONS)
 def test_they_hold_the_files_that_git_has_and_no_others(built, name):
     tracked = subprocess.run(
-        ["git", "ls-files", *PACKAGES[name]],
-        cwd=ROOT / FOLDERS[name],
+        ["git", "ls-files", *DISTRIBUTIONS[name].packages],
+        cwd=folder_of(name),
         stdout=subprocess.PIPE,
         text=True,
         check=True,
@@ -99,7 +129,7 @@ def test_they_hold_the_files_that_git_has_and_no_others(built, name):
     with zipfile.ZipFile(built / f"{stem}-py3-none-any.whl") as archive:
         found = set(archive.namelist())
     about = {file for file in found if file.startswith(f"{stem}.dist-info/")}
-    outer = {f"{Path(package).parent}/" for package in PACKAGES[name]} - {"./"}
+    outer = {f"{Path(package).parent}/" for package in DISTRIBUTIONS[name].packages} - {"./"}
     wanted = {re.sub(f"^({'|'.join(outer)})", "", file) for file in tracked}
     assert found - about == wanted
     assert f"{stem}.dist-info/licenses/LICENSE" in about
@@ -109,7 +139,7 @@ def test_they_hold_the_files_that_git_has_and_no_others(built, name):
 @pytest.mark.sample
 def test_a_package_index_would_take_them(built):
     files = sorted(built.iterdir())
-    assert len(files) == 6
+    assert len(files) == 2 * len(DISTRIBUTIONS)
     python("-m", "twine", "--no-color", "check", "--strict", *files)
 
 
@@ -133,6 +163,8 @@ class Environment:
         done: set[tuple[str, str]] = set()
         while wanted:
             requirement = wanted.pop()
+            if requirement.name in DISTRIBUTIONS and requirement.name not in self.names():
+                self.pip("install", requirement.name)
             [distribution, *_] = importlib.metadata.distributions(
                 name=requirement.name, path=[str(self._site), *sys.path]
             )
@@ -170,32 +202,35 @@ class Environment:
         )  # fmt: skip
         return done.stdout if done.returncode == 0 else f"exit {done.returncode}: {done.stdout}"
 
-    def run_readme(self, name: str, folder: Path, more: str = "") -> str:
-        """Run the example of a part's README."""
-        readme = (ROOT / FOLDERS[name] / "README.md").read_text(encoding="utf-8")
+    def run_readme(self, name: str, folder: Path) -> str:
+        """Run the example of a distribution's README."""
+        readme = (folder_of(name) / "README.md").read_text(encoding="utf-8")
         [code] = re.findall(r"```python\n(.*?)```", readme, re.DOTALL)
-        (folder / "example.py").write_text(code + more, encoding="utf-8")
+        code += DISTRIBUTIONS[name].more
+        (folder / "example.py").write_text(code, encoding="utf-8")
         return self.run("python", "-I", "example.py", cwd=folder)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("extra", "backend"),
-    [pytest.param("", "numpy", marks=pytest.mark.sample), ("[embree]", "embree")],
-)
-def test_raybeam_alone_needs_numpy_alone(built, tmp_path, extra, backend):
-    alone = Environment(tmp_path / "venv", built, f"raybeam{extra}")
-    assert alone.names() - {"embreex", "numba", "llvmlite"} == {"raybeam", "numpy"}
-    said = alone.run_readme("raybeam", tmp_path, "print(caster.backend)\n")
-    assert said == f"[ 5. inf]\n{backend}\n"
+@pytest.mark.sample
+@pytest.mark.parametrize("name", DISTRIBUTIONS)
+def test_each_alone_needs_no_more_than_it_declares(built, tmp_path, name):
+    alone = Environment(tmp_path / "venv", built, name)
+    distribution = DISTRIBUTIONS[name]
+    assert not distribution.without & alone.names()
+    assert not distribution.only or alone.names() == distribution.only | {name}
+    if name == WHOLE:
+        assert "results in out: cloud.ply" in surveys(alone, tmp_path)
+        assert (tmp_path / "out" / "report.html").stat().st_size > 10_000
+    else:
+        assert alone.run_readme(name, tmp_path) == distribution.prints
 
 
 @pytest.mark.slow
-@pytest.mark.sample
-def test_poolpart_alone_needs_dask_alone(built, tmp_path):
-    alone = Environment(tmp_path / "venv", built, "poolpart")
-    assert not {"numpy", "lidarpool", "raybeam"} & alone.names()
-    assert alone.run_readme("poolpart", tmp_path) == "1 2 45\n"
+def test_raybeam_with_embree_needs_three_packages_more(built, tmp_path):
+    alone = Environment(tmp_path / "venv", built, "raybeam[embree]")
+    assert alone.names() - {"embreex", "numba", "llvmlite"} == {"raybeam", "numpy"}
+    assert alone.run_readme("raybeam", tmp_path) == "[ 5. inf]\nembree\n"
 
 
 def surveys(environment: Environment, folder: Path, *options: str) -> str:
@@ -205,23 +240,17 @@ def surveys(environment: Environment, folder: Path, *options: str) -> str:
 
 
 @pytest.mark.slow
-@pytest.mark.sample
-def test_lidarpool_alone_needs_no_more_than_it_declares(built, tmp_path):
-    alone = Environment(tmp_path / "venv", built, "lidarpool")
-    assert not {"raybeam", "poolpart", "pytest"} & alone.names()
-    assert "results in out: cloud.ply" in surveys(alone, tmp_path)
-    assert (tmp_path / "out" / "report.html").stat().st_size > 10_000
-
-
-@pytest.mark.slow
-def test_the_three_together_share_equal_files(built, tmp_path):
+def test_all_together_share_equal_files(built, tmp_path):
     """Uninstalling a part takes its files from lidarpool, which is then to be installed again."""
-    together = Environment(tmp_path / "venv", built, *FOLDERS)
-    found = together.hashes(FOLDERS)
+    together = Environment(tmp_path / "venv", built, *DISTRIBUTIONS)
+    found = together.hashes(DISTRIBUTIONS)
     assert all(len(set(hashes)) == 1 for hashes in found.values())
     twice = {file.split("/")[0] for file, hashes in found.items() if len(hashes) == 2}
-    assert twice == {"raybeam", "poolpart"}
-    together.pip("uninstall", "--yes", "raybeam", "poolpart")
+    packages = [package for one in DISTRIBUTIONS.values() for package in one.packages]
+    held = Counter(Path(package).name for package in packages)
+    shared = {name for name, count in held.items() if count == 2}
+    assert twice == shared
+    together.pip("uninstall", "--yes", *shared)
     assert surveys(together, tmp_path).startswith("exit 1")
     together.pip("install", "--force-reinstall", "lidarpool")
     assert "results in out: cloud.ply" in surveys(together, tmp_path, "--only", "cloud")

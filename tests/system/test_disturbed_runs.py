@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from distributed import Client, Worker
 from tests.clusters import thread_cluster
+from tests.rows import quick
 
 from lidarpool import LidarError, Planning, ScanFrame, Scene, Sensor, Survey, simulate
 from lidarpool.pipeline.driver import RunDriver
@@ -104,7 +105,7 @@ def test_a_worker_that_dask_pauses_gets_no_more_batches(
     assert placement_violations(result.records) == []
 
 
-@pytest.mark.parametrize("kind", [OSError, KeyboardInterrupt])
+@pytest.mark.parametrize("kind", quick((KeyboardInterrupt,), [OSError, KeyboardInterrupt]))
 def test_an_error_in_the_callback_passes_through_and_stops_the_run(
     cluster_client, undisturbed, same_cloud, kind, left_over
 ):
@@ -120,7 +121,7 @@ def test_an_error_in_the_callback_passes_through_and_stops_the_run(
         assert same_cloud(again.cloud, undisturbed.cloud)
 
 
-@pytest.mark.parametrize("pump", [RunDriver, TrialPump])
+@pytest.mark.parametrize("pump", quick((RunDriver,), [RunDriver, TrialPump]))
 def test_an_interrupt_while_starting_leaves_nothing(cluster_client, monkeypatch, pump, left_over):
     method = "open" if pump is RunDriver else "step"
     original = getattr(pump, method)

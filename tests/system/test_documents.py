@@ -407,6 +407,17 @@ def test_files_that_the_architecture_names_exist():
     ] == []
 
 
+def test_every_benchmark_is_listed_and_cited_on_its_pages():
+    table = (ROOT / "benchmarks/README.md").read_text("utf-8")
+    rows = dict(re.findall(r"^\| `(\w+)` \|.*\| (.*) \|$", table, re.MULTILINE))
+    sources = {path.stem: path.read_text("utf-8") for path in ROOT.glob("benchmarks/*.py")}
+    commands = {name for name, text in sources.items() if f"python -m benchmarks.{name}" in text}
+    assert rows.keys() == commands
+    for name, links in rows.items():
+        for page in re.findall(r"\]\(\.\./([^)#]+)", links):
+            assert f"python -m benchmarks.{name}" in (ROOT / page).read_text("utf-8"), (name, page)
+
+
 def test_the_docstring_of_simulate_says_what_is_printed(in_threads, capsys):
     examples = doctest.DocTestParser().get_examples(lidarpool.simulate.__doc__ or "")
     names: dict[str, Any] = {}

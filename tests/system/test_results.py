@@ -6,16 +6,7 @@ from dataclasses import replace
 
 import pytest
 
-from lidarpool import (
-    LidarError,
-    Planning,
-    Scene,
-    SceneMesh,
-    Sensor,
-    Survey,
-    read_cloud,
-    simulate,
-)
+from lidarpool import LidarError, Planning, Scene, SceneMesh, Sensor, Survey, read_cloud, simulate
 from lidarpool.api.result import Result
 from lidarsim.scene.shapes import seed_objects
 

@@ -15,16 +15,7 @@ import yaml
 from distributed import Client
 from tests import killed_drivers
 
-from lidarpool import (
-    LidarError,
-    ScanFrame,
-    Scene,
-    Sensor,
-    Survey,
-    remove_run,
-    save_cloud,
-    simulate,
-)
+from lidarpool import LidarError, ScanFrame, Scene, Sensor, Survey, remove_run, save_cloud, simulate
 from lidarpool.scenario.build import build
 from lidarpool.scenario.scenario import Scenario
 

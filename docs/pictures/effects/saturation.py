@@ -6,10 +6,10 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+from docs.pictures.effects._receiver import BLUE, GREY, RED, ahead, shot, wall
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from benchmarks.effects._receiver import BLUE, GREY, RED, ahead, shot, wall
 from lidarpool import Material, Noise, Returns, Scene, Survey
 from lidarsim.columns.table import AXES, SCAN
 from lidarsim.columns.waveforms import WAVEFORM

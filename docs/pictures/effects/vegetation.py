@@ -9,10 +9,10 @@ from typing import Any
 
 import numpy as np
 import trimesh
+from docs.pictures.effects.refraction import box
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from benchmarks.effects.refraction import box
 from lidarpool import Beams, Material, Noise, Scene, SceneMesh, Sensor, Spin, Survey
 from lidarpool.render.theme import INK, LINE, MUTED, OBJECT_COLOURS
 from lidarsim.sensor.leaves import projection

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from benchmarks.effects import _air
+from docs.pictures.effects import _air
+
 from lidarpool import Survey
 
 DRAWS = "effect-dust.png"

@@ -13,7 +13,7 @@ from lidarsim.scene.actors import box, one_mesh
 from lidarsim.scene.files.meshfile import load_objects
 
 DRAWS = "effect-walkers.png"
-PERSON = Path(__file__).parents[2] / "examples" / "pedestrian.glb"
+PERSON = Path(__file__).parents[3] / "examples" / "pedestrian.glb"
 AWAY, SPEED, SECONDS, RATE_HZ = 9.0, 1.4, 2.2, 25  # m at first, m/s towards the sensor
 DARK = "#3a3f47"
 

@@ -6,9 +6,9 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+from docs.pictures.effects._receiver import BLUE, GREY, RED, ahead, shot, wall
 from matplotlib.figure import Figure
 
-from benchmarks.effects._receiver import BLUE, GREY, RED, ahead, shot, wall
 from lidarpool import Material, Survey
 from lidarsim.sensor.models import read_model
 

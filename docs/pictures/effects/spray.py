@@ -7,9 +7,9 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+from docs.pictures.effects._receiver import BLUE, GREY, RED, cloud
 from matplotlib.figure import Figure
 
-from benchmarks.effects._receiver import BLUE, GREY, RED, cloud
 from lidarpool import (  # fmt: skip
     Actor,
     Beams,

@@ -1,4 +1,4 @@
-"""A film of what is real, in the sensor's own time: `python -m benchmarks.film OUT.webp`.
+"""A film of what is real, in the sensor's own time: `python -m docs.pictures.film OUT.webp`.
 
 Sweeps of an OS1-64 amid moving cars, with sub-rays, noise and rain (`real` of
 `benchmarks.realism`), are cast on one core while another draws them, a frame for each. It prints
@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from benchmarks.realism import TURN_S, cases
 from PIL import Image
 
 from lidarpool.render.camera import Camera
@@ -23,8 +24,6 @@ from lidarpool.render.colouring import TURBO
 from lidarpool.render.pictures import splat
 from lidarpool.render.surface import unit
 from lidarsim.scene.generated.city import city
-
-from .realism import TURN_S, cases
 
 SIZE, BACK = (720, 405), np.array([14, 17, 22, 255]) / 255
 EYE, TARGET = np.array([-38.0, -30.0, 34.0]), np.array([4.0, 4.0, 0.0])

@@ -1,6 +1,6 @@
 """Jobs, tasks and slots of two adaptive partitions on Slurm, recorded and drawn.
 
-``python -m benchmarks.adapting_slurm docs/images/adapting.png`` starts a Slurm of this user on this
+`python -m docs.pictures.adapting docs/images/adapting.png` starts a Slurm of this user on this
 machine, whose node says that it has 2 GPUs: of four GPU jobs two run, and two wait. Tasks of GPU
 sleep for two seconds, those of IO for one. Slurm comes from Debian's packages, as in the tests.
 """

@@ -6,10 +6,10 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+from docs.pictures.effects._air import save
+from docs.pictures.effects._receiver import BLUE, GREY, RED, wall
 from matplotlib.figure import Figure
 
-from benchmarks.effects._air import save
-from benchmarks.effects._receiver import BLUE, GREY, RED, wall
 from lidarpool import Noise, Scene, Sensor, Survey, load_sensor
 from lidarsim.simulator.rig import Rig
 

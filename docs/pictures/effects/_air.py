@@ -9,10 +9,10 @@ from statistics import NormalDist
 from typing import Any
 
 import numpy as np
+from docs.pictures.effects._street import survey_without
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from benchmarks.effects.__main__ import survey_without
 from lidarpool import Noise, Returns, Scene, SceneMesh, Survey
 from lidarpool.render.theme import INK, LINE, MUTED, OBJECT_COLOURS, SENSOR
 from lidarsim.scene.generated.city import city

@@ -6,11 +6,11 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+from docs.pictures.effects._air import save
+from docs.pictures.effects._receiver import BLUE, GREY, RED, wall
+from docs.pictures.effects._street import survey_without
 from matplotlib.figure import Figure
 
-from benchmarks.effects.__main__ import survey_without
-from benchmarks.effects._air import save
-from benchmarks.effects._receiver import BLUE, GREY, RED, wall
 from lidarpool import Fault, Scene, Sensor, Survey, Track
 from lidarsim.scene.generated.city import city
 from lidarsim.simulator.rig import Rig

@@ -7,9 +7,9 @@ from pathlib import Path
 from statistics import NormalDist
 
 import numpy as np
+from docs.pictures.effects._receiver import BLUE, shot, wall
 from matplotlib.figure import Figure
 
-from benchmarks.effects._receiver import BLUE, shot, wall
 from lidarpool import Beams, Material, Noise, Sensor, Spin, Survey
 
 DRAWS = "effect-blooming.png"

@@ -6,9 +6,9 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+from docs.pictures.effects._receiver import BLUE, GREY, RED, cloud, points, wall
 from matplotlib.figure import Figure
 
-from benchmarks.effects._receiver import BLUE, GREY, RED, cloud, points, wall
 from lidarpool import Beams, Material, Noise, Returns, Scene, SceneMesh, Sensor, Spin, Survey
 from lidarsim.sensor.materials import WATER_INDEX, below_water, fresnel
 

@@ -7,10 +7,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from docs.pictures.effects._receiver import BLUE, GREY, RED, WIDE_RAD, points, room, turning
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from benchmarks.effects._receiver import BLUE, GREY, RED, WIDE_RAD, points, room, turning
 from lidarpool import Material, Mounted, Noise, Pose, Returns, SceneMesh, Survey
 from lidarsim.sensor.optics import Mode
 

@@ -1,14 +1,15 @@
-"""Snow that returns light."""
+"""Rain that returns light."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
-from benchmarks.effects import _air
+from docs.pictures.effects import _air
+
 from lidarpool import Survey
 
-DRAWS = "effect-snow.png"
-WEATHER = {"snow_mm_h": 1.0}
+DRAWS = "effect-rain.png"
+WEATHER = {"rain_mm_h": 50.0}
 
 
 def on(survey: Survey) -> Survey:
@@ -18,6 +19,6 @@ def on(survey: Survey) -> Survey:
 
 def picture(path: Path) -> None:
     """Draw a street in it, and the numbers of returns against range."""
-    figure, right = _air.page("1 mm/h of snow", WEATHER, 20.0)
-    _air.counts(right, WEATHER, 16.0)
+    figure, right = _air.page("50 mm/h of rain", WEATHER, 12.0)
+    _air.counts(right, WEATHER, 6.0)
     _air.save(figure, path)

@@ -1,0 +1,72 @@
+"""What each effect of docs/effects.md costs: `python -m benchmarks.effects [--only rain fog]`.
+
+Stage 2 of a survey in a street, with the effect and without, in turns. Prints the median ratio of
+processor times. The surveys are those of `docs/pictures/effects/`.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import statistics
+import time
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from docs.pictures.effects._catalogue import load_effects
+from docs.pictures.effects._street import survey_without
+
+from lidarsim.scene.generated.city import city
+from lidarsim.simulator.batch import columns_of
+from lidarsim.simulator.rig import Rig
+
+ROUNDS = 5
+
+
+def seconds(rig: Rig) -> float:
+    """Processor time of casting all scans and making their columns."""
+    begin = time.process_time()
+    columns_of(list(rig.cast(0, rig.survey.scan_count)))
+    return time.process_time() - begin
+
+
+def costs(
+    effects: Mapping[str, Any], rounds: int = ROUNDS, triangles: int = 20_000
+) -> dict[str, float]:
+    """Return the time of stage 2 with each effect, relative to the time without: medians."""
+    scene = city(triangles)
+    without = survey_without()
+    plain = Rig(scene, without)
+    rigs = {}  # {effect: (with it, without it)}
+    for name, effect in effects.items():
+        moving = effect.of(scene) if hasattr(effect, "of") else None
+        bare = plain if moving is None else Rig(moving, without)
+        rigs[name] = Rig(moving or scene, effect.on(without)), bare
+    ratios: dict[str, list[float]] = {name: [] for name in rigs}
+    for number in range(rounds + 1):
+        for name, (rig, bare) in rigs.items():
+            ratio = seconds(rig) / seconds(bare)
+            if number:  # the first compiles and fills caches
+                ratios[name].append(ratio)
+    return {name: statistics.median(values) for name, values in ratios.items()}
+
+
+def main(arguments: Sequence[str] | None = None) -> dict[str, float]:
+    """Print the table of costs."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--only", nargs="*", default=[], help="names of effects")
+    parser.add_argument("--rounds", type=int, default=ROUNDS)
+    parser.add_argument("--triangles", type=int, default=20_000, help="of the street")
+    parser.add_argument("--json", type=Path)
+    options = parser.parse_args(arguments)
+    figures = costs(load_effects(options.only), options.rounds, options.triangles)
+    for name, ratio in figures.items():
+        print(f"{name:<16} {ratio:6.2f}")
+    if options.json:
+        options.json.write_text(json.dumps(figures))
+    return figures
+
+
+if __name__ == "__main__":
+    main()

@@ -1,1 +1,0 @@
-"""Effects of lidars: the pictures of docs/effects.md, and what each effect costs."""

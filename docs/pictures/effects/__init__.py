@@ -1,0 +1,1 @@
+"""A module for each effect of docs/effects.md: its picture, and a survey with the effect."""
