@@ -35,7 +35,7 @@ class Counting:
 @pytest.fixture
 def client(start, monkeypatch):
     # How long workers may take to answer, and after which time tasks that wait are told of again.
-    monkeypatch.setattr("poolpart.fence.COMPLAIN_EVERY_S", 3600.0)
+    monkeypatch.setattr("poolpart.fence.WARN_EVERY_S", 3600.0)
     client = start({key: {} for key in ("A-0", "A-1", "B-0", "plain")})
     client.cluster.scheduler.validate = True  # Dask checks itself after each step
     return client

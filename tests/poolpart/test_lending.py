@@ -321,10 +321,10 @@ def test_workers_that_end_before_they_keep_their_slots_again_print_nothing(
         for pid in pids:
             os.kill(pid, signal.SIGSTOP)  # before they answer
     wait_until(lambda: inherit.NAME not in own_nannies.cluster.scheduler.plugins)
-    assert inherit._told
+    assert inherit._requests
     for pid in pids:
         os.kill(pid, signal.SIGKILL)
-    wait_until(lambda: not inherit._told)
+    wait_until(lambda: not inherit._requests)
     assert caplog.text == ""
 
 

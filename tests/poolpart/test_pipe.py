@@ -1,6 +1,7 @@
 """Pipes between threads of one process: order, bound, end, failure, deletion."""
 
 import itertools
+import signal
 import threading
 import time
 from collections import deque
@@ -282,6 +283,79 @@ def test_all_that_is_in_the_pipes_is_taken_in_one_request(client, make_pipe, mon
     assert len(asked) == 1
     assert found == {one.name: [0, 1, 2, 3, 4], two.name: [{"scan": 7}]}
     assert take_news(client, 0.0, [one.name, two.name, empty.name]) == {}
+
+
+# -- waits and items that go wrong ---------------------------------------------------------
+
+
+class Unreadable:
+    """An item whose unpickling raises ValueError."""
+
+    def __reduce__(self):
+        return int, ("not a number",)
+
+
+@pytest.mark.parametrize("take", [Pipe.get_all, Pipe.poll])
+def test_of_the_items_of_a_request_only_the_unreadable_one_is_lost(client, make_pipe, take):
+    pipe = make_pipe(client, capacity=10)
+    pipe.put_many([0, 1, Unreadable(), 2, 3])
+    assert take(pipe) == [0, 1]
+    with pytest.raises(ValueError, match="not a number"):
+        take(pipe)
+    assert take(pipe) == [2, 3]
+
+
+def test_get_raises_the_error_of_an_unreadable_item_in_the_place_of_the_item(client, make_pipe):
+    pipe = make_pipe(client, capacity=10)
+    pipe.put_many([0, Unreadable(), 1])
+    pipe.close()
+    assert pipe.get() == 0
+    with pytest.raises(ValueError, match="not a number"):
+        pipe.get()
+    assert list(pipe) == [1]
+
+
+@pytest.fixture
+def interrupt():
+    """Return a function that interrupts the main thread once, as Ctrl-C does, after some seconds."""
+
+    def raise_interrupt(number, frame):
+        raise KeyboardInterrupt
+
+    handler = signal.signal(signal.SIGALRM, raise_interrupt)
+    yield lambda seconds: signal.setitimer(signal.ITIMER_REAL, seconds)
+    signal.setitimer(signal.ITIMER_REAL, 0)
+    signal.signal(signal.SIGALRM, handler)
+
+
+@pytest.mark.parametrize("take", [Pipe.get, Pipe.get_all, list])
+def test_a_wait_that_is_interrupted_takes_no_item_away(client, make_pipe, interrupt, take):
+    pipe = make_pipe(client)
+    interrupt(0.3)
+    with pytest.raises(KeyboardInterrupt):
+        take(pipe)
+    again(pipe).put("item")  # within the second for which the scheduler keeps the request
+    time.sleep(0.1)
+    assert pipe.get(5.0) == "item"
+
+
+def test_an_interrupted_wait_asks_no_further(client, make_pipe, interrupt):
+    pipe = make_pipe(client)
+    interrupt(0.3)
+    with pytest.raises(KeyboardInterrupt):
+        pipe.get()
+    time.sleep(1.5)  # the scheduler keeps a request for a second
+    again(pipe).put("item")
+    assert again(pipe).get(5.0) == "item"
+
+
+def test_a_variable_that_is_read_before_its_pipe_exists(client, make_pipe, pool):
+    """Dask wakes the requests that wait for a variable only when a client sets the variable."""
+    with Client(client.cluster, set_as_default=False) as other:
+        waiting = pool.submit(Variable("opened-later", other).get, LONG_S)
+        time.sleep(0.2)
+        with Pipe("opened-later", 3, client):
+            assert waiting.result(5.0)["capacity"] == 3
 
 
 # -- several producers -------------------------------------------------------------------------
