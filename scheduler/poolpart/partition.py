@@ -32,9 +32,9 @@ _entered: ContextVar[tuple[ExitStack, ...]] = ContextVar("_entered", default=())
 class Partition:
     """The workers of a cluster that declare the resource `name`.
 
-    Every task that it submits takes a slot of that resource, so that it runs on these workers
-    only. The members are the workers that declare the resource now, including restarted
-    workers and ones that joined with it.
+    Every task of a partition takes a slot of the resource, and so runs on these workers only. The
+    members are the workers that declare the resource now, including restarted workers and workers
+    that joined with the resource.
 
     Parameters
     ----------
@@ -49,9 +49,11 @@ class Partition:
 
     Notes
     -----
-    It can be an argument of a task, which then submits with the client of its worker. What a task
-    of a partition submits to a `Client` belongs to the same partition and takes a slot; the task
-    lends its own while it waits for results.
+    A partition can be an argument of a task, which then submits with the client of its worker.
+    Tasks that a task of a partition submits to a `Client` belong to the same partition and take a
+    slot each; the submitting task lends its own slot while it waits for results. Release a
+    `threading.Lock` before such a wait: a task that borrows the slot may wait for the lock, and
+    then neither task goes on. A `distributed.Lock` may be held.
     """
 
     def __init__(

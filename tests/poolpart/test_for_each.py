@@ -6,7 +6,7 @@ from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 from distributed import Client, Event, Queue
-from tests.poolpart.helpers import LONG_S, here, wait_for
+from tests.poolpart.helpers import LONG_S, wait_for, worker_name
 
 from poolpart import PipeClosed, PipeFailed
 
@@ -18,7 +18,7 @@ def pool():
 
 
 def where(item, done):
-    done.put((item, here()))
+    done.put((item, worker_name()))
 
 
 def test_each_item_is_run_once_on_the_partition(client, a, make_pipe, pool):

@@ -23,7 +23,7 @@ from distributed import (
     wait,
     worker_client,
 )
-from tests.poolpart.helpers import LONG_S, addresses, declared, here, join, kill, wait_for
+from tests.poolpart.helpers import LONG_S, addresses, declared, join, kill, wait_for, worker_name
 
 from poolpart import Partition, Pipe, Pool, PoolError, inherit, rest
 from poolpart.lending import lending_plugin
@@ -287,7 +287,7 @@ def test_a_worker_without_this_package_ignores_the_plugin():
 
 def wait_and_say(gate):
     wait_for(gate)
-    return here()
+    return worker_name()
 
 
 @pytest.mark.parametrize("who", ["parent", "child"])
@@ -316,7 +316,7 @@ def test_workers_that_end_before_they_keep_their_slots_again_print_nothing(
     """As when a cluster is closed right after its last client."""
     caplog.set_level(logging.ERROR)
     with Client(own_nannies.cluster) as client:
-        Partition("A", client).submit(here)
+        Partition("A", client).submit(worker_name)
         pids = client.run(os.getpid).values()
         for pid in pids:
             os.kill(pid, signal.SIGSTOP)  # before they answer
@@ -411,7 +411,7 @@ def test_a_nested_task_that_waits_for_a_lock_lends_its_slot(client, b, wait_unti
 
 
 def poll(stop):
-    future = get_client().submit(here, pure=False)
+    future = get_client().submit(worker_name, pure=False)
     while not future.done() and not Event(stop).is_set():
         time.sleep(0.01)
     return future.done()
@@ -462,7 +462,7 @@ def test_a_waiting_task_without_nested_tasks_keeps_its_slot(client, b):
     name = f"alone-{client.id}"
     waiting = b.submit(wait_alone, name)
     assert Event(f"{name}-started", client).wait(LONG_S)
-    later = b.submit(here)
+    later = b.submit(worker_name)
     time.sleep(0.3)
     assert not later.done()
     Queue(name, client).put(1)

@@ -8,7 +8,7 @@ import time
 
 import pytest
 from distributed import Event, secede
-from tests.poolpart.helpers import LONG_S, declared, declared_by_themselves, here, wait_for
+from tests.poolpart.helpers import LONG_S, declared, declared_by_themselves, wait_for, worker_name
 
 from lidarpool.pipeline.placement import recorded
 from poolpart import Partition, Pool, PoolError, n_workers, per_host, rest, steward
@@ -17,7 +17,7 @@ from poolpart.workers import worker_identities
 
 def brief(_=None):
     time.sleep(0.01)
-    return here()
+    return worker_name()
 
 
 # The workers are threads of this process. A task that has been cancelled needs no client to wait.
@@ -140,7 +140,9 @@ def test_a_cancelled_task_that_is_on_its_way_when_its_worker_leaves(start, monke
     assert parts["A"].shrink() == [moving.name]
     monkeypatch.undo()
     client.sync(_send_all, send, on_the_way)
-    assert client.submit(here, workers=[moving.address]).result(timeout=LONG_S) == moving.name
+    assert (
+        client.submit(worker_name, workers=[moving.address]).result(timeout=LONG_S) == moving.name
+    )
     worker = client.cluster.workers[moving.name]
     wait_until(lambda: not worker.state.tasks)
     assert worker.state.total_resources == worker.state.available_resources == {"B": 1}
