@@ -41,7 +41,7 @@ logger = logging.getLogger(__name__)
 NAME = "poolpart-steward"
 HOLD_S = 30.0  # time in seconds for which the seat of a worker that its nanny restarts is kept
 LOOK_EVERY_S = 0.01
-_PLACE_EVERY_S = 0.1  # applying all rules to a thousand workers takes as long
+_ASSIGN_EVERY_S = 0.1  # applying all rules to a thousand workers takes as long
 
 
 @dataclass(eq=False)
@@ -75,7 +75,7 @@ class Steward(SchedulerPlugin):
         self.seats: dict[Hashable, Seat] = {}  # by key
         self.open_requests = 0  # of clients
         self._names: set[str] = set()  # of all partitions so far
-        self._placing: asyncio.TimerHandle | None = None
+        self._assigning: asyncio.TimerHandle | None = None
         for worker in scheduler.workers.values():
             self._seat(worker)
 
@@ -103,8 +103,8 @@ class Steward(SchedulerPlugin):
     def target_resources(self, seat: Seat) -> Resources:
         """Return the resources that a worker should declare, with the resource of its partition."""
         if seat.partition is None:
-            return {r: q for r, q in seat.original.items() if r not in self.rules}
-        original = {r: q for r, q in seat.original.items() if r not in self._names}
+            return {r: slots for r, slots in seat.original.items() if r not in self.rules}
+        original = {r: slots for r, slots in seat.original.items() if r not in self._names}
         return {**original, seat.partition: seat.slots}
 
     def put(self, seat: Seat, name: str | None, slots: float | None = None) -> None:
@@ -121,7 +121,7 @@ class Steward(SchedulerPlugin):
             seat.slots = slots or rule.slots or seat.original.get(name) or rule.slots_of(seat.info)
         if worker := self.scheduler.workers.get(seat.info.address):
             expect(self.scheduler, worker, name)
-        self._place_soon()
+        self._assign_soon()
 
     def enter(self, name: str, rule: Rule) -> None:
         """Add a partition or change its rule; the partition with the rule `rest` stays last."""
@@ -203,7 +203,7 @@ class Steward(SchedulerPlugin):
         if remainder := self.remainder():
             for member in self.members(remainder):
                 member.unplaced = member.by_rule
-        self._place_soon()
+        self._assign_soon()
         self.remove_if_done()
 
     def valid_workers_downscaling(self, scheduler: Any, workers: list[Any]) -> list[Any]:
@@ -220,16 +220,17 @@ class Steward(SchedulerPlugin):
 
     # -- assigning workers that join ---------------------------------------------------
 
-    def _place_soon(self) -> None:
-        """Assign workers without a partition a moment later: rules or members have changed."""
-        if self._placing is None:
+    def _assign_soon(self) -> None:
+        """Assign workers without a partition soon: rules or members have changed."""
+        if self._assigning is None:
             loop = asyncio.get_running_loop()
-            self._placing = loop.call_later(_PLACE_EVERY_S, self._place_all)
+            self._assigning = loop.call_later(_ASSIGN_EVERY_S, self._assign_waiting)
 
-    def _place_all(self) -> None:
-        self._placing = None
+    def _assign_waiting(self) -> None:
+        """Assign all present workers without a partition that have listed their GPUs."""
+        self._assigning = None
         waiting = [s for s in self.seats.values() if s.unplaced and not s.away]
-        # A worker that is being queried for its GPUs is assigned when it has answered.
+        # Other workers are still asked for their GPUs, and are assigned after their answer.
         ready = [s for s in waiting if s.reconciler and s.reconciler.done()]
         self.settle([seat for seat in ready if self._assign(seat)])
 
@@ -244,6 +245,7 @@ class Steward(SchedulerPlugin):
         return moves
 
     async def _ask_for_gpus(self, seat: Seat) -> None:
+        """Record the GPUs of a worker, if a rule depends on GPUs."""
         if not any(isinstance(rule, per_gpu) for rule in self.rules.values()):
             return
         try:
@@ -271,13 +273,15 @@ class Steward(SchedulerPlugin):
                 seat.reconciler.add_done_callback(partial(self._ended, seat))
 
     def _ended(self, seat: Seat, task: asyncio.Task[None]) -> None:
+        """Remove the seat of a worker that cannot declare resources, and leave if all is done."""
         if not (task.cancelled() or seat.away) and (error := task.exception()):
             logger.error("Worker %s can be in no partition: %r", seat.info.name, error)
             self.put(seat, None)
-            self._give_up(seat)  # such as one without this package; an absent one keeps its place
+            self._give_up(seat)  # the worker may lack this package; absent workers keep their seat
         self.remove_if_done()
 
     async def _settle(self, seat: Seat, address: str) -> None:
+        """Have a worker declare its target resources, in as many steps as its tasks require."""
         if seat.unplaced:
             await self._ask_for_gpus(seat)
             if seat.unplaced:
@@ -287,7 +291,7 @@ class Steward(SchedulerPlugin):
             try:
                 if not await self._step(seat, worker, requested_moves):
                     await asyncio.sleep(LOOK_EVERY_S)
-            except OSError as error:  # it is leaving, or the connection was bad
+            except OSError as error:  # the worker is leaving, or the connection was bad
                 logger.info("The worker at %s does not answer: %s", address, error)
                 await asyncio.sleep(10 * LOOK_EVERY_S)
         # A resource set by hand earlier has woken no tasks.
@@ -298,13 +302,8 @@ class Steward(SchedulerPlugin):
         """Advance a worker towards its seat; return False if its tasks must end first."""
         target = self.target_resources(seat)
         leaving = {name for name, slots in seat.declared.items() if slots and name not in target}
-        if leaving:
-            # No new tasks; its tasks end here or move. It keeps the resource until then.
-            remaining = {name: q for name, q in seat.declared.items() if name not in leaving}
-            self._show(seat, worker, remaining)
-            hand_off(self.scheduler, worker, leaving, requested_moves)
-            if held_by(self.scheduler, worker, leaving):
-                return False
+        if leaving and not self._has_released(seat, worker, leaving, requested_moves):
+            return False
         seat.is_declaring = True
         try:
             accepted = await call(
@@ -318,12 +317,26 @@ class Steward(SchedulerPlugin):
             seat.declared = target
             if self.target_resources(seat) == target:
                 self._show(seat, worker, target)
-                for name in leaving:  # those that took over tasks
+                for name in leaving:  # other members may have taken over tasks
                     for address in self.scheduler.resources.get(name, ()):
                         recount(self.scheduler.workers[address])
         return True
 
+    def _has_released(
+        self, seat: Seat, worker: Any, leaving: Collection[str], requested_moves: set[Any]
+    ) -> bool:
+        """Move the tasks of partitions that a worker leaves; return whether none is left.
+
+        The worker gets no new tasks of these partitions. Tasks that run end on the worker, which
+        keeps the resource until then.
+        """
+        remaining = {name: slots for name, slots in seat.declared.items() if name not in leaving}
+        self._show(seat, worker, remaining)
+        hand_off(self.scheduler, worker, leaving, requested_moves)
+        return not held_by(self.scheduler, worker, leaving)
+
     def _show(self, seat: Seat, worker: Any, resources: Resources) -> None:
+        """Let the scheduler place tasks by the given resources of a worker only."""
         show(self.scheduler, worker, resources)
         note_change(self.scheduler)
         expect(self.scheduler, worker, seat.partition)
@@ -331,7 +344,7 @@ class Steward(SchedulerPlugin):
     async def arrive(self, seats: Collection[Seat], timeout_s: float) -> list[Seat]:
         """Wait until workers declare their target resources; return the late workers.
 
-        Restarting workers are waited for; those that have left are not.
+        Restarting workers are waited for; workers that have left for good are not.
         """
         self.settle(seats)
         deadline = time.monotonic() + timeout_s
@@ -348,11 +361,11 @@ class Steward(SchedulerPlugin):
         self._stop()
 
     def _stop(self) -> None:
-        work = [
-            self._placing,
-            *(w for s in self.seats.values() for w in (s.reconciler, s.giving_up)),
-        ]
-        for task in work:
+        """Cancel all timers and loops."""
+        scheduled: list[asyncio.TimerHandle | asyncio.Task[None] | None] = [self._assigning]
+        for seat in self.seats.values():
+            scheduled += [seat.reconciler, seat.giving_up]
+        for task in scheduled:
             if task is not None:
                 task.cancel()
 
