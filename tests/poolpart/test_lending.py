@@ -411,10 +411,23 @@ def test_a_nested_task_that_waits_for_a_lock_lends_its_slot(client, b, wait_unti
 
 
 def poll(stop):
+    """Poll for a nested task without any request to the scheduler, which may lend the slot."""
     future = get_client().submit(worker_name, pure=False)
-    while not future.done() and not Event(stop).is_set():
+    while not future.done() and not stops[stop].is_set():
         time.sleep(0.01)
     return future.done()
+
+
+stops = {}  # {name: threading.Event}; tasks of a cluster of threads share it
+
+
+@pytest.fixture
+def stop():
+    """Name of an event that ends polling."""
+    name = f"stop-{time.monotonic_ns()}"
+    stops[name] = threading.Event()
+    yield name
+    stops.pop(name).set()
 
 
 @pytest.fixture
@@ -424,32 +437,30 @@ def warned(monkeypatch):
     return lambda client: [pickle.loads(event["message"]) for _, event in client.get_events("warn")]
 
 
-def test_polling_for_a_nested_task_is_reported_to_the_client(client, b, warned, wait_until):
-    stop = f"stop-{client.id}"
+def test_polling_for_a_nested_task_is_reported_to_the_client(client, b, warned, wait_until, stop):
     future = b.submit(poll, stop)
     wait_until(lambda: any(future.key in message for message in warned(client)))
     [message] = [message for message in warned(client) if future.key in message]
     assert "partition 'B'" in message and "use Future.result, distributed.wait" in message
-    Event(stop, client).set()
+    stops[stop].set()
     assert future.result(LONG_S) is False
 
 
 def poll_together(stop, number, count):
     """Poll when all parents hold their slots, so that each nested task waits on some worker."""
     Event(f"{stop}-{number}").set()
-    for other in range(count):
-        assert Event(f"{stop}-{other}").wait(LONG_S)
+    for parent_number in range(count):
+        assert Event(f"{stop}-{parent_number}").wait(LONG_S)
     return poll(stop)
 
 
-def test_polling_on_several_workers_is_reported(start, warned, wait_until):
+def test_polling_on_several_workers_is_reported(start, warned, wait_until, stop):
     client = start({name: {"resources": {"A": 1}} for name in "ab"})
     part = Partition("A", client)
-    stop = f"stop-{client.id}"
     futures = [part.submit(poll_together, stop, n, 2, workers="ab"[n]) for n in range(2)]
     keys = [future.key for future in futures]
     wait_until(lambda: any(key in message for message in warned(client) for key in keys))
-    Event(stop, client).set()
+    stops[stop].set()
     assert client.gather(futures) == [False, False]
 
 
