@@ -65,7 +65,7 @@ class ItemTasks:
                     wait(futures, return_when="FIRST_COMPLETED")
                 else:
                     items, closed = self._pipe.take_beside(futures, free)
-                    drained = closed and len(items) < free
+                    drained = closed and not self._pipe.buffered and len(items) < free
                     self._submit(items)
                 self._check()
         except BaseException as error:

@@ -342,33 +342,39 @@ class Pipe:
             else:
                 return unpack(self.client, packed)
 
+    @property
+    def buffered(self) -> int:
+        """Number of items that this object has taken and not returned."""
+        return len(self._buffer)
+
     def take_beside(self, futures: Sequence[Future], limit: int) -> tuple[list[Any], bool]:
         """Take up to `limit` queued items, as soon as there are any or a task has ended.
 
-        For `Partition.for_each`. Returns the items, and whether the pipe is closed and this object
-        has no more of its items; raises `PipeFailed`.
+        For `Partition.for_each`. With a limit of 0, waits for the end of the pipe or of a task.
+        Returns the items, and whether the scheduler has said that the pipe is closed; raises
+        `PipeFailed`.
         """
 
         def is_settled(reply: Reply) -> bool:
-            return bool(reply["answer"]) or any(future.done() for future in futures)
+            return bool(limit and self._buffer) or any(future.done() for future in futures)
 
         closed = False
-        if not self._buffer:
+        if not (limit and self._buffer):
             keys = [future.key for future in futures]
             reply = self._fill_buffer(math.inf, is_settled, keys=keys, limit=limit)
             closed = reply["closed"]
-        items = self._unpack(self._remove(limit))
-        return items, closed and not self._buffer
+        return self._unpack(self._remove(limit)), closed
 
     def _fill_buffer(
         self,
         deadline: float,
-        is_settled: Callable[[Reply], Any] = lambda reply: reply["answer"],
+        is_settled: Callable[[Reply], bool] | None = None,
         **arguments: Any,
     ) -> Reply:
         """Have the event loop append queued items to the buffer; raises `PipeFailed`.
 
-        Returns after a reply with items, also one to another thread, or after the deadline.
+        Returns the last reply, once the buffer has items (also of a request of another thread), or
+        after the deadline.
         """
 
         def append_items(reply: Reply) -> None:
@@ -376,9 +382,9 @@ class Pipe:
                 self._buffer.extend(reply["answer"])
 
         def has_items(reply: Reply) -> bool:
-            return bool(self._buffer) or is_settled(reply)
+            return bool(self._buffer)
 
-        reply = self._ask_until(deadline, has_items, TAKE, append_items, **arguments)
+        reply = self._ask_until(deadline, is_settled or has_items, TAKE, append_items, **arguments)
         if reply["failure"]:
             raise PipeFailed(reply["failure"])
         return reply

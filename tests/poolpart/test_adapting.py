@@ -43,7 +43,8 @@ def adaptive(minimum: int, maximum: int, **options: Any) -> dict[str, Any]:
 
 def test_jobs_are_of_the_partition_that_has_work_and_go_when_it_is_done(queue, wait_until):
     with cluster_of({"GPU": adaptive(0, 3), "IO": adaptive(0, 3), "FIX": {}}) as client:
-        gpu, io = Partition("GPU", client), Partition("IO", client)
+        gpu = Partition("GPU", client)
+        io = Partition("IO", client)
         assert queue.submitted == ["FIX-0"]
         tasks = [gpu.submit(wait_for, "go") for _ in range(8)]
         wait_until(lambda: len(gpu) == 3)
@@ -90,7 +91,8 @@ def is_kept(partition, queue, begin):
     """Whether the one worker stays that has what `begin` begins; it ends with what that returns."""
     partition.adapt(1, 1)
     partition.submit(worker_name).result(LONG_S)
-    began, end = len(queue.submitted), begin()
+    began = len(queue.submitted)
+    end = begin()
     partition.adapt(0, 1, idle_s=IDLE_S)
     time.sleep(2.5 * IDLE_S)
     kept = len(partition) == 1 and len(queue.submitted) == began
@@ -167,7 +169,8 @@ def test_a_worker_whose_job_was_cancelled_too_late_gets_no_task(queue, wait_unti
         gpu = Partition("GPU", client)
         task = gpu.submit(worker_name)
         wait_until(lambda: queue.waiting)
-        [number], scheduler = queue.waiting, client.cluster.scheduler
+        [number] = queue.waiting
+        scheduler = client.cluster.scheduler
         task.cancel()
         # The scheduler has decided, and the queue has not been told.
         adaptation = scheduler.plugins[poolpart.adapting.NAME]

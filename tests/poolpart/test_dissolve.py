@@ -95,7 +95,8 @@ def test_a_worker_that_comes_back_after_all_is_as_it_was(nannies, wait_until):
 def test_a_worker_that_is_just_being_told_to_belong(start, wait_until, monkeypatch):
     client = start({"a": {}})
     Pool.from_client(client).divide({"A": rest()})
-    told, call = threading.Event(), steward.call
+    told = threading.Event()
+    call = steward.call
 
     async def call_and_linger(*args, **kwargs):
         answer = await call(*args, **kwargs)

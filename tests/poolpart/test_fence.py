@@ -232,7 +232,8 @@ def test_nothing_is_lost_while_workers_move_to_and_fro(start):
     client.cluster.scheduler.validate = True
     pool = Pool.from_client(client)
     part, _ = pool.partition("P", n_workers=1, exclusive=True)
-    inside, outside = [], []
+    inside = []
+    outside = []
     for move in (part.grow, part.grow, part.shrink, part.grow, part.shrink, part.shrink):
         inside += [part.submit(place, pause_s=0.02) for _ in range(20)]
         outside += client.map(place, range(40), pause_s=0.01, pure=False)

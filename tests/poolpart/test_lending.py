@@ -246,7 +246,8 @@ def test_a_partition_that_workers_were_started_with(start, wait_until):
 
 def test_what_another_library_has_wrapped_meanwhile_stays(start, monkeypatch):
     part = one_worker(start, slots=1)
-    called, wrapped = [], {Client: "sync", as_completed: "__next__"}
+    called = []
+    wrapped = {Client: "sync", as_completed: "__next__"}
 
     def wrap(inner):
         def theirs(*args, **kwargs):

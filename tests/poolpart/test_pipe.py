@@ -58,7 +58,9 @@ OPERATIONS = st.lists(
 @settings(max_examples=40)
 def test_behaves_as_a_bounded_queue(_threads_client, operations, capacity):
     pipe = Pipe("model", capacity, _threads_client).create()
-    producer, queued, taken = other_end(pipe), deque(), deque()
+    producer = other_end(pipe)
+    queued = deque()
+    taken = deque()
     try:
         for operation, item in operations:
             if operation == "put" and len(queued) == capacity:
@@ -129,7 +131,8 @@ def test_consumers_drain_a_closed_pipe_and_end(client, make_pipe):
 
 
 def test_failing_wakes_both_ends_with_the_reason(client, make_pipe, pool):
-    empty, full = make_pipe(client), make_pipe(client, capacity=1)
+    empty = make_pipe(client)
+    full = make_pipe(client, capacity=1)
     full.put("x")
     waiting = [pool.submit(other_end(empty).get), pool.submit(other_end(empty).get_all)]
     waiting += [pool.submit(other_end(full).put, number) for number in range(3)]
@@ -151,7 +154,8 @@ def test_advice_can_return_to_what_it_was(client, make_pipe):
 
 
 def test_of_many_items_those_before_an_error_are_in_the_pipe(client, make_pipe):
-    pipe, source = make_pipe(client, capacity=2), itertools.count()
+    pipe = make_pipe(client, capacity=2)
+    source = itertools.count()
     pipe.put_many([])
     pipe.put("first")
     with pytest.raises(TimeoutError, match=r"stayed full for 0\.1 s"):
@@ -277,7 +281,8 @@ def test_all_that_is_in_the_pipes_is_taken_in_one_request(client, make_pipe, mon
         one.put(number)
     two.put({"scan": 7})
     one.close()
-    asked, ask = [], client.sync
+    asked = []
+    ask = client.sync
     monkeypatch.setattr(client, "sync", lambda *a, **k: asked.append(1) or ask(*a, **k))
     found = take_news(client, LONG_S, [pipe.name for pipe in pipes])
     assert len(asked) == 1
@@ -462,7 +467,8 @@ def test_several_queues_and_pipes_lose_and_double_nothing(client, other, make_pi
 
 @pytest.mark.parametrize("end", ["close", "fail", "delete"])
 def test_waits_of_a_queue_end_with_the_pipe(client, other, make_pipe, pool, end):
-    empty, full = make_pipe(client), make_pipe(client, capacity=1)
+    empty = make_pipe(client)
+    full = make_pipe(client, capacity=1)
     full.put(1)
     waiting = [pool.submit(Queue(empty.name, other).get, LONG_S)]
     waiting += [pool.submit(Queue(full.name, other).put, 2, LONG_S)]
@@ -565,7 +571,8 @@ def test_who_deletes_the_queue_or_the_variable_deletes_the_pipe(
 
 def test_other_queues_and_variables_are_as_ever(client, other, make_pipe):
     make_pipe(client)
-    queue, variable = Queue("of-somebody", other), Variable("of-somebody", other)
+    queue = Queue("of-somebody", other)
+    variable = Variable("of-somebody", other)
     queue.put(1)
     variable.set("a value")
     variable.set(other.submit(pow, 2, 10))

@@ -93,7 +93,8 @@ def test_what_is_short_is_filled_first():
 
 
 def test_nobody_wants_it():
-    rules, members = {"A": n_workers(1), "B": named("b")}, {"A": [worker("a")], "B": []}
+    rules = {"A": n_workers(1), "B": named("b")}
+    members = {"A": [worker("a")], "B": []}
     assert partition_for(worker("new"), rules, members) is None
     assert partition_for(worker("b"), rules, members) == "B"
 
