@@ -13,8 +13,9 @@ from poolpart import Pipe, PipeClosed, PipeFailed
 
 @pytest.fixture
 def pool():
-    with ThreadPoolExecutor(8) as pool:
-        yield pool
+    pool = ThreadPoolExecutor(8)
+    yield pool
+    pool.shutdown(wait=False)  # threads of a failed test wait until its pipes are deleted
 
 
 def where(item, done):
@@ -40,7 +41,7 @@ def test_of_a_pipe_without_items(client, a, make_pipe):
     assert repr(a) == "<Partition 'A'>"
 
 
-def test_producers_wait_when_tasks_are_slow(client, b, make_pipe, pool):
+def test_producers_wait_when_tasks_are_slow(client, b, make_pipe, pool, wait_until):
     pipe = make_pipe(client, capacity=3)
     event = f"slow-{time.time()}"
     put = []
@@ -52,8 +53,9 @@ def test_producers_wait_when_tasks_are_slow(client, b, make_pipe, pool):
 
     producer = pool.submit(produce)
     consumer = pool.submit(b.for_each, pipe, wait_for, window=2)
-    time.sleep(1)
-    assert len(put) == 3 + 2  # in the pipe, and under way
+    wait_until(lambda: len(put) >= 3 + 2)  # in the pipe, and under way
+    time.sleep(0.5)
+    assert len(put) == 3 + 2
     pipe.fail("enough")
     for future in (producer, consumer):
         with pytest.raises(PipeFailed, match="enough"):

@@ -41,8 +41,9 @@ def produce(pipe, items):
 
 @pytest.fixture
 def pool():
-    with ThreadPoolExecutor(16) as pool:
-        yield pool
+    pool = ThreadPoolExecutor(16)
+    yield pool
+    pool.shutdown(wait=False)  # threads of a failed test wait until its pipes are deleted
 
 
 OPERATIONS = st.lists(
