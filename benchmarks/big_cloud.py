@@ -19,7 +19,8 @@ import numpy as np
 import open3d  # noqa: F401 - counted among the libraries
 
 from lidarpool.base.storage import Storage
-from lidarpool.columns.parts import PartColumns, StoredCloud, pack
+from lidarpool.columns.part_columns import PartColumns
+from lidarpool.columns.parts import StoredCloud, pack
 from lidarpool.columns.table import ALWAYS
 from lidarpool.export.formats import save_cloud
 

@@ -22,7 +22,8 @@ import numpy as np
 import lidarpool.simulator.device
 from lidarpool import Scene, Survey, Track, load_sensor
 from lidarpool.base.storage import Storage
-from lidarpool.columns.parts import PartColumns, pack
+from lidarpool.columns.part_columns import PartColumns
+from lidarpool.columns.parts import pack
 from lidarpool.scene.actors import Actor, box
 from lidarpool.scene.generated.city import city
 from lidarpool.simulator.batch import columns_of

@@ -8,7 +8,17 @@ from typing import Any
 
 import numpy as np
 
-from raybeam import Instance, Mesh, Motion, Opacity, Pattern, RayCaster, Scan, check_scan
+from raybeam import (
+    Instance,
+    Mesh,
+    Motion,
+    Opacity,
+    Pattern,
+    RayCaster,
+    Scan,
+    check_scan,
+    pattern_rays,
+)
 from raybeam.scan import Groups
 
 from .gpu_clock import Here, Split, milliseconds, wall_milliseconds
@@ -224,7 +234,7 @@ def _different(casters: list[RayCaster], sample: Float, origin: Float) -> dict[s
     out["different tally"] = int((got.tally != want.tally).sum())  # type: ignore[operator]
     made: list[tuple[Float, Float]] = []
     casters[0].visit(moving, lambda hits: made.append(tuple(a.get() for a in hits.rays())))
-    at, to = pattern.rays(want.ray, moving.poses)
+    at, to = pattern_rays(pattern, want.ray, moving.poses)
     out["different rays"] = int(sum(
         (rays != np.concatenate(parts, axis=1).T).sum()
         for parts, rays in zip(zip(*made, strict=True), (at, to), strict=True)

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from lidarpool.columns.parts import PartColumns, pack, part_name
+from lidarpool.columns.part_columns import PartColumns
+from lidarpool.columns.parts import pack, part_name
 from lidarpool.pipeline.messages import Receipt, samples_of_scan
 
 

@@ -17,6 +17,7 @@ from lidarpool import Beams, Returns, Scene, SceneMesh, Sensor, Spin, Survey
 from lidarpool.render.theme import INK, LINE, MUTED, OBJECT_COLOURS
 from lidarpool.sensor.disc import Beam
 from lidarpool.simulator.rig import Rig
+from raybeam import pattern_rays
 
 DRAWS = "effect-beams.png"
 OVAL = (3.0, 1.5)  # mrad, as Velodyne's manual of the VLP-16 has it
@@ -44,7 +45,7 @@ def footprint(returns: Returns, distance: float) -> NDArray[np.float64]:
     scene = Scene.from_meshes([wall("Wall", distance)])
     rig = Rig(scene, Survey(SENSOR, poses=[(0, 0, 0)], steps=1, returns=returns), "numpy")
     beams = rig._pulses[0].emitter.divided(rig.pattern(0, 0, 1))
-    starts, directions = beams.rays(np.arange(len(beams)), (0, 0, 0))
+    starts, directions = pattern_rays(beams, np.arange(len(beams)), (0, 0, 0))
     hits = rig._caster.caster.cast(starts, directions)
     ends = starts + hits.distance[:, None] * directions
     return np.asarray(ends[:, 1:])

@@ -67,7 +67,7 @@ _FIRST = {
     "lidarpool": (
         "Scanner",
         *("simulate", "remove_run", "Scene", "Sensor", "Beams", "Spin", "Pose", "Survey"),
-        *("Planning", "Result", "ScanFrame", "Cloud", "Column", "read_cloud", "save_cloud"),
+        *("Planning", "Result", "ScanFrame", "Cloud", "Column", "read_cloud", "save_cloud", "to_open3d"),
     ),
     "poolpart": (
         *("Pool", "Partition", "Rule", "per_gpu", "per_host", "n_workers", "named", "rest"),

@@ -9,6 +9,7 @@ from .instances import Instance, Mesh
 from .moving import Moving, hits_on
 from .opacity import Opacity
 from .pattern import Pattern
+from .pattern_rays import pattern_rays
 from .poses import Motion
 from .registry import available_backends, backend_build
 from .scan import Scan, check_scan
@@ -36,4 +37,5 @@ __all__ = [
     "backend_build",
     "check_scan",
     "hits_on",
+    "pattern_rays",
 ]

@@ -246,7 +246,7 @@ class RayCaster:
     ) -> ScanReturns:
         """Cast a pattern of rays from one pose or from many: the fastest way for a lidar.
 
-        Rays are numbered from 0 at the window's start. `Pattern.rays` returns the rays.
+        Rays are numbered from 0 at the window's start. `pattern_rays` returns the rays.
 
         Parameters
         ----------
@@ -276,7 +276,7 @@ class RayCaster:
             How the lidar moves within each pose, if its rays have different delays.
         room
             float64 (6, rays), contiguous: origins and directions of all rays are written there, as
-            `Pattern.rays` makes them; (3, rays) for directions alone. None for nowhere.
+            `pattern_rays` makes them; (3, rays) for directions alone. None for nowhere.
 
         Raises
         ------

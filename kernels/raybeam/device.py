@@ -43,7 +43,7 @@ class DeviceHits:
     def rays(self) -> tuple[Any, Any]:
         """Origins, metres, and unit directions of the rays: float64 (3, k) on the device.
 
-        They have the bits of `Pattern.rays`.
+        They have the bits of `pattern_rays`.
         """
         return self.make_rays(self.ray)
 

@@ -20,6 +20,7 @@ from .crossing import Crossing, Nearest
 from .hits import Part, joined
 from .instances import Scene
 from .mesh import NEAR
+from .pattern_rays import checked_rays
 from .poses import Poses
 from .rays import Rays
 from .scan import Scan
@@ -324,6 +325,6 @@ def _spread(scan: Scan, way: _Way) -> float:
     if room <= 0:
         return -1.0
     ray = np.linspace(0, room - 1, 32).astype(np.int64)[:, None] + lags
-    _, directions = scan.pattern.made(scan.first, ray.reshape(-1), scan.poses)
+    _, directions = checked_rays(scan.pattern, scan.first, ray.reshape(-1), scan.poses)
     packets = directions.reshape(-1, len(lags), 3)
     return float((packets[:, 1:] * packets[:, :1]).sum(axis=2).min(axis=1).mean())

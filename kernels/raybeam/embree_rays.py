@@ -356,8 +356,8 @@ def _gather(casts, rays, origins, directions):  # type: ignore[no-untyped-def]
                 origins[2, k] = floats[_OZ + lane]
 
 
-def made(pattern: Pattern, first: int, ray: Ints, poses: Poses) -> tuple[Floats | None, Floats]:
-    """Make rays of a pattern, see `Pattern.made`: origins and directions, (3, n) each.
+def rays_of(pattern: Pattern, first: int, ray: Ints, poses: Poses) -> tuple[Floats | None, Floats]:
+    """Return rays, see `pattern_rays.checked_rays`: origins and directions, (3, n) each.
 
     None for origins that are all the position of the pose.
     """

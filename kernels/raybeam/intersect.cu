@@ -839,7 +839,7 @@ KERNEL pack(
 }
 
 // Starts in metres and directions of the rays that are listed, counted from `start`: (3, count) each,
-// with the bits of `Pattern.rays`.
+// with the bits of `pattern_rays`.
 KERNEL make_rays(
     const double* __restrict__ positions, const double* __restrict__ rotations,
     const double* __restrict__ directions, const double* __restrict__ origins,

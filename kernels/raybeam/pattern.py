@@ -3,20 +3,17 @@
 from __future__ import annotations
 
 from copy import copy
-from functools import cache, cached_property
-from importlib.util import find_spec
-from operator import index
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from .arrays import Floats, Ints
-from .poses import Motion, Poses, check_poses
+from .poses import Poses
 from .rays import check_origins, unit_directions
-from .sub_rays import SubRays, spread
+from .sub_rays import SubRays
 
 _MOST_STEP = 1 << 10  # beams of a lidar, by far
-_BLOCK = 1 << 14  # rays that are made at a time: their arrays stay in a core's cache
 
 
 class Pattern:
@@ -46,11 +43,8 @@ class Pattern:
     Examples
     --------
     >>> pattern = Pattern([[2, 0, 0], [0, 1, 0]], origins=[[0.1, 0, 0], [0, 0.1, 0]])
-    >>> origins, directions = pattern.rays([0, 1, 2], positions=[0, 0, 5])
-    >>> origins.tolist()
-    [[0.1, 0.0, 5.0], [0.0, 0.1, 5.0], [0.1, 0.0, 5.0]]
-    >>> directions.tolist()
-    [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [1.0, 0.0, 0.0]]
+    >>> len(pattern), pattern.directions.tolist()
+    (2, [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
     """
 
     def __init__(
@@ -128,103 +122,7 @@ class Pattern:
             cosines += axis[samples][:, None] * axis[apart % rows]
         return int(steps[np.argmax(cosines.min(axis=0).mean(axis=0))])
 
-    def rays(
-        self,
-        numbers: ArrayLike,
-        positions: ArrayLike | Poses,
-        rotations: ArrayLike | None = None,
-        *,
-        start: int = 0,
-        rays_per_pose: int | None = None,
-        motion: Motion | None = None,
-    ) -> tuple[Floats, Floats]:
-        """Origins and directions, in the mesh's axes, of some of the rays that a scan casts.
-
-        They have the same bits as the rays that `RayCaster.scan` casts, in any batch.
-
-        Parameters
-        ----------
-        numbers
-            (m,) whole numbers: rays numbered as in `ScanReturns`, from 0 at the window's start.
-        positions, rotations, rays_per_pose, motion
-            Those given to `RayCaster.scan`.
-        start
-            Start of the window.
-
-        Returns
-        -------
-        origins
-            float64 (m, 3), or (1, 3) when all are the same, metres.
-        directions
-            float64 (m, 3), unit vectors.
-
-        Raises
-        ------
-        ValueError
-            If poses are invalid, or a ray has no pose or no row in the pattern.
-        """
-        ray = np.asarray(numbers).astype(np.int64, casting="same_kind")
-        first = index(start)
-        most = int(ray.max()) + 1 if len(ray) else 0
-        if first < 0 or (len(ray) and (int(ray.min()) < 0 or not len(self))):
-            raise ValueError(
-                f"There are no rays {ray.min() if len(ray) else 0} to {most} after row {start} of "
-                f"a pattern with {len(self)} rows: numbers and rows start at 0."
-            )
-        poses = check_poses(positions, rotations, rays_per_pose, most, motion)
-        return self.made(first, ray, poses)
-
-    def made(self, first: int, ray: Ints, poses: Poses) -> tuple[Floats, Floats]:
-        """Make checked rays, in compiled loops if numba is installed; see `plain_rays`."""
-        if not (_compiles() and len(ray)):
-            return plain_rays(self, first, ray, poses)
-        from . import embree_rays  # not before: numba takes half a second to import
-
-        origins, directions = embree_rays.made(self, first, ray, poses)
-        return (poses.positions if origins is None else origins.T), directions.T
-
     def starts_at_once(self, poses: Poses) -> bool:
         """Whether all rays start at one position."""
-        aside = self._origins is not None or (self.sub_rays and self.sub_rays.starts is not None)
-        return len(poses) == 1 and poses.motion is None and not aside
-
-
-def plain_rays(pattern: Pattern, first: int, ray: Ints, poses: Poses) -> tuple[Floats, Floats]:
-    """Make checked rays; see `Pattern.rays`, of which `first` is the start.
-
-    Vectors are rotated to the mesh's axes, then translated: ``((x a + y b) + z c) + p``; if the
-    lidar moves within a pose, ``v + t (w x v)`` and ``p + t u`` follow each step.
-    """
-    sub_rays, one = pattern.sub_rays, pattern.starts_at_once(poses)
-    places, directions = np.empty((2, 3, len(ray)))
-    room = np.empty((18, min(len(ray), _BLOCK)))
-    for start in range(0, len(ray), _BLOCK):
-        block = slice(start, start + _BLOCK)
-        some = ray[block]
-        row, these = first + some, poses.of(some, room[:, : len(some)])
-        row -= row // len(pattern) * len(pattern)  # takes half as long as the remainder
-        beam = row // pattern.each
-        ahead, begun = _columns(pattern.directions.T, beam), None
-        if sub_rays is not None:
-            own = None if pattern.offsets is None else pattern.offsets[:, beam]
-            ahead, begun = spread(sub_rays, ahead, row - beam * len(sub_rays), own)
-        directions[:, block] = these.turned(ahead)
-        if one:
-            continue
-        at = these.positions
-        if pattern.origins is not None:
-            here = _columns(pattern.origins.T, beam)
-            begun = here if begun is None else here + begun
-        if begun is not None:
-            at = these.turned(begun) + at
-        places[:, block] = these.moved(at)
-    return (poses.positions if one else places.T), directions.T
-
-
-@cache
-def _compiles() -> bool:
-    return find_spec("numba") is not None
-
-
-def _columns(table: Floats, row: Ints) -> Floats:
-    return np.stack([numbers.take(row) for numbers in table])
+        apart = self._origins is not None or (self.sub_rays and self.sub_rays.starts is not None)
+        return len(poses) == 1 and poses.motion is None and not apart

@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike
 from .arrays import Floats, Indices, Integers, Ints, Ints32
 from .hits import Part, ScanReturns, joined
 from .pattern import Pattern
+from .pattern_rays import checked_rays
 from .poses import Motion, Poses, check_poses
 from .rays import Rays, check_interval
 
@@ -65,9 +66,9 @@ class Scan:
             yield start, min(start + size, self.count)
 
     def rays(self, start: int, stop: int) -> Rays:
-        """Rays `start` to `stop`, with the bits of `Pattern.rays`."""
+        """Rays `start` to `stop`, with the bits of `pattern_rays`."""
         ray = np.arange(start, stop, dtype=np.int64)
-        origins, directions = self.pattern.made(self.first, ray, self.poses)
+        origins, directions = checked_rays(self.pattern, self.first, ray, self.poses)
         if self.room is not None:
             self.room[-3:, start:stop] = directions.T
             if len(self.room) > 3:

@@ -200,3 +200,23 @@ def test_a_large_mesh_is_read_though_memory_is_short(tmp_path, monkeypatch):
     monkeypatch.setattr(input_files, "memory", lambda: path.stat().st_size - 1)
     with pytest.raises(LidarpoolError, match=r"ball\.ply: it has .* more than the memory"):
         load_meshes(path)
+
+
+def test_memory_is_at_most_what_a_control_group_allows(monkeypatch, tmp_path):
+    limit = 3 * 2**30
+    (tmp_path / "memory.max").write_text(f"{limit}\n")
+    (tmp_path / "memory").mkdir()
+    (tmp_path / "memory/memory.limit_in_bytes").write_text(f"{limit}\n")
+    monkeypatch.setattr(allowance, "_CONTROL_GROUPS", tmp_path)
+    assert allowance.memory.__wrapped__() == limit
+    for name in ("memory.max", "memory/memory.limit_in_bytes"):
+        (tmp_path / name).write_text("max\n")
+    assert allowance.memory.__wrapped__() > limit
+
+
+@pytest.mark.parametrize(
+    ("count", "text"),
+    [(0, "0 B"), (900, "900 B"), (1234, "1.21 kiB"), (12_345_678, "11.77 MiB")],
+)
+def test_bytes_as_text(count, text):
+    assert allowance.bytes_of(count) == text

@@ -25,13 +25,8 @@ from lidarpool import (
     load_sensor,
 )
 from lidarpool.export.formats import Format
-from lidarpool.export.navigation_files import (
-    GNSS_FILE,
-    IMU_FILE,
-    Instruments,
-    instrument_bytes,
-    write_instruments,
-)
+from lidarpool.export.instruments import GNSS_FILE, IMU_FILE, Instruments
+from lidarpool.export.navigation_files import instrument_bytes, write_instruments
 from lidarpool.export.sweeps import Sweeps
 from lidarpool.scenario.build import Job, build
 from lidarpool.scenario.campaign import CampaignSpec

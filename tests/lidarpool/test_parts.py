@@ -11,14 +11,13 @@ from hypothesis import strategies as st
 
 from lidarpool import Cloud, LidarpoolError
 from lidarpool.base.storage import Storage
+from lidarpool.columns.part_columns import PartColumns, positions_of
 from lidarpool.columns.parts import (
-    PartColumns,
     StoredCloud,
     mark_name,
     own_files,
     pack,
     part_name,
-    positions,
     probe_name,
     read_part,
     read_tally,
@@ -242,7 +241,7 @@ def test_a_sample_is_of_the_cloud_and_in_its_order(storage):
 @pytest.mark.parametrize("precision", [1e-6, 1e-3, 0.01, 0.05, 0.07, 0.25, 1.0, 1000.0])
 def test_positions_are_the_short_decimals_that_are_meant(precision):
     cells = np.arange(-1000, 1000)[:, None] * np.ones(3, int)
-    found = positions(cells, precision, np.zeros(3))[:, 0]
+    found = positions_of(cells, precision, np.zeros(3))[:, 0]
     assert [repr(abs(float(x))) for x in found] == [
         repr(abs(float(f"{c * precision:.9g}"))) for c in range(-1000, 1000)
     ]

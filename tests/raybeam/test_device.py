@@ -8,7 +8,16 @@ import pytest
 from tests.cuda_on_host import played_cuda  # noqa: F401 - a fixture
 from tests.raybeam.test_scan import case_of
 
-from raybeam import BackendUnavailable, Instance, Mesh, OtherHits, Pattern, RayCaster, check_scan
+from raybeam import (
+    BackendUnavailable,
+    Instance,
+    Mesh,
+    OtherHits,
+    Pattern,
+    RayCaster,
+    check_scan,
+    pattern_rays,
+)
 
 CASE = case_of("on the move, lever arms")
 PATTERN = Pattern(CASE["directions"], CASE["origins"])
@@ -59,7 +68,7 @@ def test_a_visit_sees_what_a_scan_returns(vase, every):
     assert rows.tolist() == np.flatnonzero(want.tally).tolist()
     assert counted.tolist() == want.tally[rows].tolist()
     pose = {"start": 700, "rays_per_pose": CASE["each"], "motion": CASE["motion"]}
-    at, to = PATTERN.rays(want.ray, CASE["positions"], CASE["rotations"], **pose)
+    at, to = pattern_rays(PATTERN, want.ray, CASE["positions"], CASE["rotations"], **pose)
     np.testing.assert_array_equal(origins.T, at)
     np.testing.assert_array_equal(directions.T, to)
 

@@ -19,6 +19,7 @@ from raybeam import (
     triangle,
 )
 from raybeam import moving as module
+from raybeam.pattern_rays import checked_rays
 
 RAYS, PERIOD = 3_000, 0.1
 FLAT = np.array([[-1.0, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]]), [[0, 1, 2], [0, 2, 3]]
@@ -111,7 +112,7 @@ def scans(kind, rays=RAYS):
 
 def by_all(moving, scan, times):
     """Nearest hits, of each ray cast by itself at every body that is there."""
-    origins, directions = scan.pattern.made(scan.first, np.arange(len(scan)), scan.poses)
+    origins, directions = checked_rays(scan.pattern, scan.first, np.arange(len(scan)), scan.poses)
     best = {}
     for body, (first, last) in enumerate(moving.there):
         rows = np.flatnonzero((first <= times) & (times <= last))

@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from raybeam import Motion, Pattern, RayCaster
+from raybeam import Motion, Pattern, RayCaster, pattern_rays
 from raybeam.rays import Rays, unit_directions
 
 TRIANGLE = [[0, 0, 0], [1, 0, 0], [0, 1, 0]], [[0, 1, 2]]
@@ -112,7 +112,7 @@ def same(got, want):
 
 
 def check(caster, case, windows, limits):
-    """A scan's hits are those of its rays, and `Pattern.rays` makes the same rays."""
+    """A scan's hits are those of its rays, and `pattern_rays` makes the same rays."""
     pattern = Pattern(case["directions"], case["origins"])
     for window in windows:
         origins, directions = made(case, window)
@@ -124,7 +124,7 @@ def check(caster, case, windows, limits):
         assert len(want.ray) > len(origins) / 10 or not len(origins)
         some = np.random.default_rng(1).integers(0, max(len(origins), 1), 50)[: len(origins)]
         pose = {"start": window[0], "rays_per_pose": case["each"], "motion": case["motion"]}
-        at, to = pattern.rays(some, case["positions"], case["rotations"], **pose)
+        at, to = pattern_rays(pattern, some, case["positions"], case["rotations"], **pose)
         np.testing.assert_array_equal(np.broadcast_to(at, to.shape), origins[some])
         np.testing.assert_array_equal(to, directions[some])
 
@@ -241,7 +241,7 @@ def test_thinning_where_rays_graze(caster):
 def test_nothing_to_scan(caster, shapes):
     vase = caster(*shapes["vase"]())
     for pattern in (Pattern(np.empty((0, 3))), Pattern(np.eye(3))):
-        assert pattern.rays(np.zeros(0, int), [1, 2, 3])[1].shape == (0, 3)
+        assert pattern_rays(pattern, np.zeros(0, int), [1, 2, 3])[1].shape == (0, 3)
         found = vase.scan(pattern, [0, 0, 1], window=(0, 0), keep_every=3, groups=[0, 0])
         assert len(found) == 0
         assert found.hits.tolist() == [0, 0]
@@ -308,4 +308,4 @@ def test_pattern_refused():
 )
 def test_rays_refused(change, error, words):
     with pytest.raises(error, match=words):
-        Pattern(np.eye(3)).rays(**{"numbers": [0, 1], "positions": [0, 0, 0], **change})
+        pattern_rays(Pattern(np.eye(3)), **{"numbers": [0, 1], "positions": [0, 0, 0], **change})

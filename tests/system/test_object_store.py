@@ -21,7 +21,8 @@ from tests.system.test_resume import SCENARIO as RESUMED
 
 import lidarpool as package
 from lidarpool.base.storage import Storage
-from lidarpool.columns.parts import PartColumns, unpack
+from lidarpool.columns.part_columns import PartColumns
+from lidarpool.columns.parts import unpack
 from lidarpool.datasets.dataset import job_file
 from lidarpool.datasets.job_table import JobRow
 from lidarpool.export.format_table import DATA_SETS

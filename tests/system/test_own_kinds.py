@@ -7,7 +7,17 @@ import laspy
 import numpy as np
 import pytest
 
-from lidarpool import Beams, Column, Scene, Sensor, Survey, read_cloud, save_cloud, simulate
+from lidarpool import (
+    Beams,
+    Column,
+    Scene,
+    Sensor,
+    Survey,
+    read_cloud,
+    save_cloud,
+    simulate,
+    to_open3d,
+)
 
 
 @dataclass(frozen=True)
@@ -91,7 +101,7 @@ def test_a_result_tells_of_itself_and_its_points_become_frames_and_clouds(result
     np.testing.assert_array_equal(frame["z"], cloud.positions[:, 2])
     assert lazy.npartitions == sum(rows > 0 for rows in result.points.rows)
     np.testing.assert_array_equal(lazy.compute()["time"], cloud["time"])
-    found = cloud.to_open3d().point
+    found = to_open3d(cloud).point
     np.testing.assert_array_equal(found["positions"].numpy(), cloud.positions)
     np.testing.assert_array_equal(found["ring"].numpy()[:, 0], cloud.channel)
 

@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from .datasets.loader import sweeps
     from .datasets.sweep_data import Sweep
     from .export.formats import save_cloud
+    from .export.open3d_cloud import to_open3d
     from .export.ply import read_cloud
     from .pipeline.messages import ScanFrame
     from .plan import Plan, Planning
@@ -99,6 +100,7 @@ __all__ = [
     "save_cloud",
     "simulate",
     "sweeps",
+    "to_open3d",
 ]
 
 # Where the names above are, but for those of `sensor`. They are imported when they are asked for,
@@ -112,6 +114,7 @@ _MODULES = {
     "datasets.loader": ("sweeps",),
     "datasets.sweep_data": ("Sweep",),
     "export.formats": ("save_cloud",),
+    "export.open3d_cloud": ("to_open3d",),
     "export.ply": ("read_cloud",),
     "pipeline.messages": ("ScanFrame",),
     "plan": ("Plan", "Planning"),

@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from functools import cache
 from pathlib import Path
+
+import psutil
 
 from .errors import LidarpoolError
 
 TIMES, LEAST = 100, 256 * 2**20  # of the file's bytes, and bytes of a small one
+_CONTROL_GROUPS = Path("/sys/fs/cgroup")
+_PREFIXES = {"Pi": 2**50, "Ti": 2**40, "Gi": 2**30, "Mi": 2**20, "ki": 2**10}
 _SHARE = 4  # of the memory: a scene is copied while its objects are placed and joined
 
 
@@ -71,10 +76,49 @@ class Allowance:
 
 @cache
 def memory() -> int:
-    """Memory of this machine, or of the container that we run in, bytes."""
-    from distributed.system import MEMORY_LIMIT  # here, because it takes half a second
+    """Memory that this process may use, bytes.
 
-    return int(MEMORY_LIMIT)
+    The least of the machine's memory and the limits of control groups and of `ulimit -m`.
+    """
+    return min([psutil.virtual_memory().total, *_control_group_limits(), *_resident_limit()])
+
+
+def _control_group_limits() -> list[int]:
+    """Return the limits of the control groups, version 1 and 2, that contain this process, bytes.
+
+    Batch systems and containers limit a group that contains the process, at any depth.
+    """
+    try:
+        memberships = Path("/proc/self/cgroup").read_text("utf-8").splitlines()
+    except OSError:  # only Linux has control groups
+        return []
+    limits = []
+    for line in memberships:
+        _, controllers, group = line.split(":", 2)
+        if not controllers:
+            top, file_name = _CONTROL_GROUPS, "memory.max"
+        elif "memory" in controllers.split(","):
+            top, file_name = _CONTROL_GROUPS / "memory", "memory.limit_in_bytes"
+        else:
+            continue
+        folder = top / group.lstrip("/")
+        for ancestor in (folder, *folder.parents):
+            if not ancestor.is_relative_to(top):
+                break
+            # A file says «max» without a limit; a container may not see the folders of its group.
+            with suppress(OSError, ValueError):
+                limits.append(int((ancestor / file_name).read_text("utf-8")))
+    return limits
+
+
+def _resident_limit() -> list[int]:
+    """Return the limit of resident memory (`ulimit -m`), bytes; empty without a limit."""
+    try:
+        import resource
+    except ImportError:  # Windows has no such limits
+        return []
+    limit = resource.getrlimit(resource.RLIMIT_RSS)[1]
+    return [limit] if limit > 0 else []
 
 
 def memory_share() -> int:
@@ -84,6 +128,7 @@ def memory_share() -> int:
 
 def bytes_of(count: int) -> str:
     """Return bytes as text: «1.43 MiB»."""
-    from dask.utils import format_bytes  # here, because Dask takes long to import
-
-    return str(format_bytes(count))
+    for prefix, size in _PREFIXES.items():
+        if count >= 0.9 * size:
+            return f"{count / size:.2f} {prefix}B"
+    return f"{count} B"

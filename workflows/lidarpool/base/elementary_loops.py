@@ -1,4 +1,4 @@
-"""The functions of `elementary`, compiled."""
+"""The functions of `elementary_scalars`, compiled."""
 
 # mypy: disable-error-code="no-untyped-def"
 
@@ -6,10 +6,12 @@ from __future__ import annotations
 
 from raybeam.compiled import compiled, inlined
 
-from . import elementary
+from . import elementary_scalars
 
-sin_cos, exp, log = map(inlined, (elementary.sin_cos_of, elementary.exp_of, elementary.log_of))
-arctan2 = inlined(elementary.arctan2_of)
+sin_cos = inlined(elementary_scalars.sin_cos_of)
+exp = inlined(elementary_scalars.exp_of)
+log = inlined(elementary_scalars.log_of)
+arctan2 = inlined(elementary_scalars.arctan2_of)
 
 
 @compiled()

@@ -123,7 +123,7 @@ def export(
     from ..columns.cloud_file import CloudFile
     from ..export.folder import local_result, result_folder, send
     from ..export.formats import Format
-    from ..export.navigation_files import FILES as INSTRUMENT_FILES
+    from ..export.instruments import INSTRUMENT_FILES
     from ..export.sweeps import SWEEPS_FILE, Sweeps
 
     # The report of a result is moved into place last.

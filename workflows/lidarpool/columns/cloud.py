@@ -16,7 +16,6 @@ from numpy.typing import ArrayLike, DTypeLike
 
 from ..base.arrays import AnyArray, AnyFloats
 from ..base.errors import LidarpoolError
-from ..base.open3d_module import load_open3d
 from ..base.validation import as_array, checked, checked_fields, shown
 from .table import TABLE, Column
 from .waveforms import WAVEFORM, Waveforms
@@ -207,15 +206,6 @@ class Cloud(Shown):
         """
         need_packages(library)
         return import_module(library).DataFrame(self.by_name)
-
-    def to_open3d(self) -> Any:
-        """Return an `open3d.t.geometry.PointCloud` of all columns, by their names in files."""
-        o3d = load_open3d()
-        cloud = o3d.t.geometry.PointCloud(o3d.core.Tensor(np.ascontiguousarray(self.positions)))
-        for column in self.table:
-            values = np.ascontiguousarray(self[column.name])[:, None]
-            cloud.point[column.in_files] = o3d.core.Tensor(values)
-        return cloud
 
     def head(self, points: int = SHOWN_POINTS) -> Cloud:
         """Select the first points, or all if there are fewer."""

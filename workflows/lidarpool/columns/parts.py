@@ -13,21 +13,21 @@ import io
 import re
 import zipfile
 from bisect import bisect_right
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import DTypeLike
 
 from ..base.archives import read_arrays, read_npy
-from ..base.arrays import AnyArray, Floats, Floats32, Integers, Ints, Ints32, UInts32
-from ..base.elementary import decade
+from ..base.arrays import AnyArray, Floats, Integers, Ints, Ints32
 from ..base.errors import LidarpoolError
 from ..base.input_files import open_input
 from ..base.sampling import even_indices
 from ..base.storage import Storage, target_of
 from .cloud import CHUNK_POINTS, Cloud, Shown, need_packages
+from .part_columns import PartColumns, positions_of
 from .table import AXES, SCAN, Column
 from .waveforms import WAVEFORM
 
@@ -82,64 +82,6 @@ def _mark_of(name: str) -> str:
     """Mark in the name of a file of a run; empty for any other name."""
     found = _PART.fullmatch(name) or _OTHER.fullmatch(name)
     return found[1] if found else ""
-
-
-@dataclass(frozen=True)
-class PartColumns:
-    """Content of a part."""
-
-    first: int  # scan
-    counts: Ints  # (scans,): rows of each scan
-    columns: Mapping[str, AnyArray]  # {name: (rows,)}, positions as cells
-    triangles: Ints32  # (k,): those that were hit
-    hits: Ints  # (k,): all their hits
-    # (scans,) and (scans, samples, 3): hits of each scan, and ends of some of its rays, metres,
-    # local coordinates, NaN where there are fewer; empty in a part that is not stored.
-    scan_hits: UInts32 = field(default_factory=lambda: np.zeros(0, np.uint32))
-    samples: Floats32 = field(default_factory=lambda: np.zeros((0, 0, 3), np.float32))
-
-    def __len__(self) -> int:
-        return int(self.counts.sum())
-
-    @property
-    def stop(self) -> int:
-        """One past its last scan."""
-        return self.first + len(self.counts)
-
-    @property
-    def cells(self) -> Ints | None:
-        """Lowest and highest cell, (2, 3); None without rows."""
-        if not len(self):
-            return None
-        axes = [self.columns[axis.name] for axis in AXES]
-        return np.array([[a.min() for a in axes], [a.max() for a in axes]], np.int64)
-
-    def scan_column(self) -> Ints32:
-        """Scan of each row."""
-        scans = np.arange(self.first, self.stop, dtype=np.int32)
-        return np.repeat(scans, self.counts)
-
-    def cloud(
-        self,
-        table: Sequence[Column],
-        precision_m: float,
-        origin: Floats,
-        rows: Integers | slice = slice(None),
-        sweeps: Callable[[], Any] | None = None,
-    ) -> Cloud:
-        """Points of the part, or some of its rows, with these columns beside the positions.
-
-        Their cells are of `precision_m`, from the world position `origin`, (3,), metres; `sweeps`
-        as of `Cloud`.
-        """
-        cells = np.stack([self.columns[axis.name][rows] for axis in AXES], axis=1)
-        columns = {
-            c.name: self.scan_column()[rows] if c is SCAN else self.columns[c.name][rows]
-            for c in table
-        }
-        if WAVEFORM in self.columns:
-            columns[WAVEFORM] = self.columns[WAVEFORM][rows]
-        return Cloud(positions(cells, precision_m, origin), columns, tuple(table), sweeps)
 
 
 def pack(part: PartColumns) -> bytearray:
@@ -254,7 +196,7 @@ class StoredCloud(Shown):
         """Lowest and highest coordinates, (2, 3), metres; zeros where there are no points."""
         if self.cells is None:
             return np.zeros((2, 3))
-        return positions(self.cells, self.precision_m, self.origin)
+        return positions_of(self.cells, self.precision_m, self.origin)
 
     @property
     def table(self) -> tuple[Column, ...]:
@@ -349,11 +291,3 @@ class StoredCloud(Shown):
         rest = (column for column in self.columns if column not in AXES)
         columns = {column.name: np.zeros(0, column.dtype) for column in (SCAN, *rest)}
         return Cloud(np.zeros((0, 3)), columns, self.table, self.sweeps)
-
-
-def positions(cells: Integers, precision_m: float, origin: Floats) -> Floats:
-    """World coordinates, (n, 3), of points in these cells, (n, 3)."""
-    found = cells * precision_m + origin
-    # Multiplying gives 0.07000000000000001 for 0.07; take the nearest short decimal.
-    digits = max(0, 3 - decade(precision_m))
-    return np.round(found, digits, out=found)

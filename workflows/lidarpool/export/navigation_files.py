@@ -7,22 +7,15 @@ all formats have the same numbers, however long the survey.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import asdict, dataclass
 from importlib import import_module
-from io import TextIOWrapper
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from ..base.arrays import Floats
-from ..base.input_files import open_input
 from ..sensor import Survey
 from ..sensor.navigation import fixes, geodetic, imu_samples
-from ..sensor.trajectory import Pose, quaternions_of
-
-IMU_FILE, GNSS_FILE = "imu.csv", "gnss.csv"
-FILES = (IMU_FILE, GNSS_FILE)
+from .instruments import IMU_FILE, Instruments
 
 _IMU = (
     "time_ns",
@@ -33,71 +26,6 @@ _PLACE = ("time_ns", "x_m", "y_m", "z_m")
 _GEODETIC = ("latitude_deg", "longitude_deg", "height_m")
 
 _ROW_BYTES, _MESSAGE_BYTES = 120, 500  # of a sample, at most: in its file, and in a bag
-
-
-@dataclass(frozen=True)
-class Instrument:
-    """What bags say of an instrument besides its samples."""
-
-    position: list[float]  # on the carrier, metres
-    quaternion: list[float]  # x, y, z, w
-    # Of white noise: of angular velocities and specific forces; of positions to the east, the north
-    # and up, where those that drift are added.
-    variances: list[float]
-
-
-@dataclass(frozen=True)
-class Instruments:
-    """The instruments of a survey, and where their files are."""
-
-    imu: Instrument | None
-    gnss: Instrument | None
-    folder: Path | None = None  # None as long as they are not written
-
-    @classmethod
-    def of(cls, survey: Survey) -> Instruments | None:
-        """Return those of a survey; None if it has none."""
-        navigation = survey.navigation
-        if navigation is None or (navigation.imu is None and navigation.gnss is None):
-            return None
-        imu, gnss = navigation.imu, navigation.gnss
-        inertial = satellite = None
-        if imu is not None:
-            densities = imu.gyroscope_noise_density, imu.accelerometer_noise_density
-            inertial = _instrument(imu.mount, [imu.rate_hz * one**2 for one in densities])
-        if gnss is not None:
-            level = gnss.horizontal_m**2 + gnss.drift_horizontal_m**2
-            up = gnss.vertical_m**2 + gnss.drift_vertical_m**2
-            satellite = _instrument(gnss.mount, [level, level, up])
-        return cls(inertial, satellite)
-
-    @property
-    def files(self) -> list[str]:
-        """Names of their files."""
-        both = zip(FILES, (self.imu, self.gnss), strict=True)
-        return [name for name, one in both if one is not None]
-
-    def words(self) -> dict[str, Any]:
-        """Return them for a file of JSON, without their place."""
-        both = {"imu": self.imu, "gnss": self.gnss}
-        return {name: one and asdict(one) for name, one in both.items()}
-
-    @classmethod
-    def from_words(cls, words: dict[str, Any], folder: Path) -> Instruments:
-        """Return what `words` gave, with files in a folder if they are there."""
-        imu, gnss = (words[name] and Instrument(**words[name]) for name in ("imu", "gnss"))
-        made = cls(imu, gnss, folder)
-        there = all((folder / name).exists() for name in made.files)
-        return made if there else cls(imu, gnss)
-
-    def rows(self, name: str) -> Iterator[list[str]]:
-        """Yield the rows of a file, without its header; none if it is not written."""
-        if self.folder is None or name not in self.files:
-            return
-        with TextIOWrapper(open_input(self.folder / name), encoding="ascii") as file:
-            next(file)
-            for line in file:
-                yield line.rstrip("\n").split(",")
 
 
 def instrument_bytes(survey: Survey, bags: int) -> int:
@@ -162,9 +90,3 @@ def _to_geodetic(survey: Survey) -> Callable[[Floats], Floats] | None:
         return np.column_stack([latitude, longitude, z])
 
     return by_code
-
-
-def _instrument(mount: Pose, variances: list[float]) -> Instrument:
-    quaternion = quaternions_of(mount.turn[None])[0]
-    quaternion *= -1 if quaternion[3] < 0 else 1
-    return Instrument([*mount.position], quaternion.tolist(), variances)

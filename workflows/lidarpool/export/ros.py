@@ -32,9 +32,9 @@ from ..sensor.reflectivity import COUNTS
 from . import reading
 from .boxes import Boxes
 from .images import Image
+from .instruments import GNSS_FILE, IMU_FILE, Instruments
 from .laser_scan import ScanRays
 from .lidar_traits import LidarTraits
-from .navigation_files import GNSS_FILE, IMU_FILE, Instruments
 from .sweeps import AS_FIRED, COMPENSATED, Placed, Sweeps, plain_names
 
 Sent = tuple[str, Any, int]  # topic, message, time in nanoseconds

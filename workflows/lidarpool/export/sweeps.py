@@ -25,8 +25,8 @@ from ..sensor.faults import sent
 from ..sensor.plain_data import described, remade
 from ..sensor.survey import nanoseconds
 from ..sensor.trajectory import full_poses, matrices, presence_ns, quaternions_of
+from .instruments import Instruments
 from .lidar_traits import LidarTraits
-from .navigation_files import Instruments
 from .sweep_motion import STILL, FiringPoses, knots_of, poses_at
 
 SWEEPS_FILE = "sweeps.npz"

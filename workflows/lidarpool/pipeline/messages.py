@@ -15,7 +15,7 @@ from ..base.arrays import Floats32
 from ..base.tracing import trace
 from ..base.validation import one_line
 from ..columns.cloud import Cloud
-from ..columns.parts import PartColumns
+from ..columns.part_columns import PartColumns
 from ..sensor import Pose, Survey
 from .placement import TaskRecord
 

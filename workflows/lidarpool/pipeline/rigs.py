@@ -22,7 +22,7 @@ from poolpart import own_device
 
 from ..base.arrays import Floats32
 from ..base.tracing import trace
-from ..columns.parts import PartColumns
+from ..columns.part_columns import PartColumns
 from ..scene.scene import Scene
 from ..sensor import Survey
 from ..simulator.batch import columns_of

@@ -19,8 +19,8 @@ from ..columns.parts import StoredCloud
 from ..export.folder import LAST_FILE, result_folder, staging
 from ..export.format_table import EXPORTS, FORMATS
 from ..export.formats import Format, refuse_strangers
-from ..export.navigation_files import FILES as INSTRUMENT_FILES
-from ..export.navigation_files import Instruments, write_instruments
+from ..export.instruments import INSTRUMENT_FILES, Instruments
+from ..export.navigation_files import write_instruments
 from ..export.sweeps import SWEEPS_FILE, Sweeps
 from ..run.conductor import Conductor, Output
 from ..run.picture_file import PICTURE_FILE, PictureContent

@@ -24,7 +24,7 @@ from poolpart.fetch import fetch_available
 
 from ..base.errors import LidarpoolError
 from ..columns.cloud import Cloud
-from ..columns.parts import PartColumns
+from ..columns.part_columns import PartColumns
 from ..columns.table import AXES, SCAN
 from ..columns.waveforms import WAVEFORM
 from ..datasets.job_table import JobRow

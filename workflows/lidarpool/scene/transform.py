@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ..base.arrays import Floats
-from ..base.elementary import sin_cos_of
+from ..base.elementary_scalars import sin_cos_of
 from ..base.errors import LidarpoolError
 from ..base.validation import as_array
 from ..base.vectors import length, matmul, rank

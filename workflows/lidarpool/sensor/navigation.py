@@ -24,7 +24,8 @@ from pydantic import Field, Strict
 
 from ..base.arrays import Floats, Ints
 from ..base.declared import Ends, Seed, Several, UnitShare, about
-from ..base.elementary import arctan2, exp, exp_of, sin_cos, sin_cos_of
+from ..base.elementary import arctan2, exp, sin_cos
+from ..base.elementary_scalars import exp_of, sin_cos_of
 from ..base.errors import LidarpoolError
 from ..base.validation import checked_fields
 from ..base.vectors import applied, hypot, into_axes, length, matmul, turned

@@ -11,7 +11,7 @@ import numpy as np
 from pydantic import Field
 
 from ..base.declared import about, allowed
-from ..base.elementary import log_of
+from ..base.elementary_scalars import log_of
 from ..base.errors import LidarpoolError
 from ..base.validation import checked_fields
 from ..base.vectors import hypot

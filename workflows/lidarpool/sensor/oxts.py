@@ -14,7 +14,8 @@ from pathlib import Path
 import numpy as np
 
 from ..base.arrays import Floats
-from ..base.elementary import log, sin_cos, sin_cos_of
+from ..base.elementary import log, sin_cos
+from ..base.elementary_scalars import sin_cos_of
 from ..base.input_files import read_input_text
 from ..base.words import natural
 from .trajectory import quaternions_of, rotations_of

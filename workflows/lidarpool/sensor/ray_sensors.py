@@ -10,7 +10,8 @@ import numpy as np
 from pydantic import Field
 
 from ..base.arrays import Floats, Ints
-from ..base.elementary import sin_cos, sin_cos_of
+from ..base.elementary import sin_cos
+from ..base.elementary_scalars import sin_cos_of
 from ..base.errors import LidarpoolError
 from ..base.validation import checked_fields
 from .beams import Beams

@@ -15,7 +15,8 @@ import numpy as np
 
 from ..base.arrays import Floats
 from ..base.declared import UnitShare, about
-from ..base.elementary import exp, exp_of, geomspace, power
+from ..base.elementary import exp, geomspace, power
+from ..base.elementary_scalars import exp_of
 from ..base.validation import checked_fields
 from ..base.vectors import hypot
 from .materials import REFERENCE_M, WATER_INDEX, extinction

@@ -14,7 +14,8 @@ from typing import NamedTuple
 import numpy as np
 
 from ..base.arrays import Bools, Floats, Indices, Ints
-from ..base.elementary import exp, exp_of, expm1, geomspace, interp, log1p
+from ..base.elementary import exp, expm1, geomspace, interp, log1p
+from ..base.elementary_scalars import exp_of
 from ..sensor.materials import MaterialTable
 from ..sensor.noise import THRESHOLD_SIGMAS, Purpose, named_seed, starts
 from ..sensor.weather import FAINTEST, FARTHEST_M, NODES, Air, Particles

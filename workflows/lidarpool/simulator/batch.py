@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from ..columns.parts import PartColumns
+from ..columns.part_columns import PartColumns
 from .device import DevicePoints
 from .points import BatchPoints
 

@@ -11,7 +11,8 @@ import numpy as np
 from raybeam import Pattern
 
 from ..base.arrays import Floats, Indices, Ints, Ints32, owned
-from ..base.elementary import arccos, exp, sin_cos_of
+from ..base.elementary import arccos, exp
+from ..base.elementary_scalars import sin_cos_of
 from ..base.vectors import into_axes, length, products, turned
 from ..sensor import Sensor, Survey
 from ..sensor.materials import at_right_angles

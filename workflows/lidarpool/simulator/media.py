@@ -18,7 +18,8 @@ from numpy.typing import NDArray
 from raybeam import Pattern, any_axes
 
 from ..base.arrays import AnyArray, Bools, Floats, Indices, Integers, Ints, Ints32
-from ..base.elementary import exp, log, log_of
+from ..base.elementary import exp, log
+from ..base.elementary_scalars import log_of
 from ..base.errors import LidarpoolError
 from ..base.vectors import applied, products
 from ..scene.scene import Scene

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 import raybeam.poses
-from raybeam import Motion, Pattern
+from raybeam import Motion, Pattern, pattern_rays
 
 from ..base.arrays import Floats, Indices, Integers, Ints, owned
 from ..base.vectors import into_axes, matmul
@@ -79,7 +79,7 @@ class Poses:
 
     @cached_property
     def given(self) -> dict[str, Any]:
-        """Arguments of `RayCaster.scan` and `Pattern.rays`."""
+        """Arguments of `RayCaster.scan` and `pattern_rays`."""
         if self.rays_per_pose is None:
             return {"positions": self.positions, "rotations": self.rotations}
         # Not checked again, see `check_trajectory`: that would take a fortieth of the casting time.
@@ -136,8 +136,8 @@ class Poses:
         return velocity + np.cross(rate, origins - places)
 
     def rays(self, pattern: Pattern, ray: Integers, start: int = 0) -> tuple[Floats, Floats]:
-        """Origins and directions of rays of a pattern, see `Pattern.rays`."""
-        return pattern.rays(ray, start=start, **self.given)
+        """Origins and directions of rays of a pattern, see `pattern_rays`."""
+        return pattern_rays(pattern, ray, start=start, **self.given)
 
 
 def along_rings(beam: Ints, channels: int) -> Indices:

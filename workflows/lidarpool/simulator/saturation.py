@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from ..base.arrays import owned
-from ..base.elementary import log, log_of
+from ..base.elementary import log
+from ..base.elementary_scalars import log_of
 from ..sensor.optics import FWHM, LIGHT_M_NS
 from .returns import PulseReturns, made
 from .step import Memory, PulseBatch, PulseStep, Setup, Sizes

@@ -24,7 +24,7 @@ import numpy as np
 
 from ...base.allowance import Allowance
 from ...base.arrays import AnyArray, Bytes, Floats, Ints
-from ...base.elementary import sin_cos_of
+from ...base.elementary_scalars import sin_cos_of
 from ...base.input_files import read_input
 from ...base.vectors import applied, length, matmul
 from ...base.words import plural

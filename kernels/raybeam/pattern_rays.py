@@ -1,0 +1,133 @@
+"""Origins and directions of the rays of a pattern, for whoever wants them outside of a cast."""
+
+from __future__ import annotations
+
+from functools import cache
+from importlib.util import find_spec
+from operator import index
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from .arrays import Floats, Ints
+from .pattern import Pattern
+from .poses import Motion, Poses, check_poses
+from .sub_rays import spread
+
+_BLOCK_RAYS = 1 << 14  # rays that are computed at a time: their arrays stay in a core's cache
+
+
+def pattern_rays(
+    pattern: Pattern,
+    numbers: ArrayLike,
+    positions: ArrayLike | Poses,
+    rotations: ArrayLike | None = None,
+    *,
+    start: int = 0,
+    rays_per_pose: int | None = None,
+    motion: Motion | None = None,
+) -> tuple[Floats, Floats]:
+    """Return origins and directions, in the mesh's axes, of some of the rays that a scan casts.
+
+    The rays have the same bits as those that `RayCaster.scan` casts, in any batch.
+
+    Parameters
+    ----------
+    pattern
+        The pattern that is cast.
+    numbers
+        (m,) whole numbers: rays numbered as in `ScanReturns`, from 0 at the window's start.
+    positions, rotations, rays_per_pose, motion
+        Those given to `RayCaster.scan`.
+    start
+        Start of the window.
+
+    Returns
+    -------
+    origins
+        float64 (m, 3), or (1, 3) when all are the same, metres.
+    directions
+        float64 (m, 3), unit vectors.
+
+    Raises
+    ------
+    ValueError
+        If poses are invalid, or a ray has no pose or no row in the pattern.
+
+    Examples
+    --------
+    >>> pattern = Pattern([[2, 0, 0], [0, 1, 0]], origins=[[0.1, 0, 0], [0, 0.1, 0]])
+    >>> origins, directions = pattern_rays(pattern, [0, 1, 2], positions=[0, 0, 5])
+    >>> origins.tolist()
+    [[0.1, 0.0, 5.0], [0.0, 0.1, 5.0], [0.1, 0.0, 5.0]]
+    >>> directions.tolist()
+    [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [1.0, 0.0, 0.0]]
+    """
+    ray = np.asarray(numbers).astype(np.int64, casting="same_kind")
+    first = index(start)
+    stop = int(ray.max()) + 1 if len(ray) else 0
+    if first < 0 or (len(ray) and (int(ray.min()) < 0 or not len(pattern))):
+        raise ValueError(
+            f"There are no rays {ray.min() if len(ray) else 0} to {stop} after row {start} of "
+            f"a pattern with {len(pattern)} rows: numbers and rows start at 0."
+        )
+    poses = check_poses(positions, rotations, rays_per_pose, stop, motion)
+    return checked_rays(pattern, first, ray, poses)
+
+
+def checked_rays(pattern: Pattern, first: int, ray: Ints, poses: Poses) -> tuple[Floats, Floats]:
+    """Return rays as `pattern_rays` does, without checks; in compiled loops if numba is installed.
+
+    `first` is the start of the window; `ray` (m,) are numbers of rays.
+    """
+    if not (_numba_is_installed() and len(ray)):
+        return plain_rays(pattern, first, ray, poses)
+    from . import embree_rays  # here, because numba takes half a second to import
+
+    origins, directions = embree_rays.rays_of(pattern, first, ray, poses)
+    return (poses.positions if origins is None else origins.T), directions.T
+
+
+def plain_rays(pattern: Pattern, first: int, ray: Ints, poses: Poses) -> tuple[Floats, Floats]:
+    """Return rays as `checked_rays` does, by NumPy.
+
+    Vectors are rotated to the mesh's axes, then translated: ``((x a + y b) + z c) + p``; if the
+    lidar moves within a pose, ``v + t (w x v)`` and ``p + t u`` follow each step.
+    """
+    sub_rays = pattern.sub_rays
+    share_origin = pattern.starts_at_once(poses)
+    origins, directions = np.empty((2, 3, len(ray)))
+    scratch = np.empty((18, min(len(ray), _BLOCK_RAYS)))
+    for start in range(0, len(ray), _BLOCK_RAYS):
+        block = slice(start, start + _BLOCK_RAYS)
+        numbers = ray[block]
+        row = first + numbers
+        ray_poses = poses.of(numbers, scratch[:, : len(numbers)])
+        row -= row // len(pattern) * len(pattern)  # takes half as long as the remainder
+        beam = row // pattern.each
+        direction = _columns(pattern.directions.T, beam)
+        offset = None  # of the ray's start from the sensor's position
+        if sub_rays is not None:
+            angles = None if pattern.offsets is None else pattern.offsets[:, beam]
+            sub_ray = row - beam * len(sub_rays)
+            direction, offset = spread(sub_rays, direction, sub_ray, angles)
+        directions[:, block] = ray_poses.turned(direction)
+        if share_origin:
+            continue
+        origin = ray_poses.positions
+        if pattern.origins is not None:
+            beam_origin = _columns(pattern.origins.T, beam)
+            offset = beam_origin if offset is None else beam_origin + offset
+        if offset is not None:
+            origin = ray_poses.turned(offset) + origin
+        origins[:, block] = ray_poses.moved(origin)
+    return (poses.positions if share_origin else origins.T), directions.T
+
+
+@cache
+def _numba_is_installed() -> bool:
+    return find_spec("numba") is not None
+
+
+def _columns(table: Floats, row: Ints) -> Floats:
+    return np.stack([numbers.take(row) for numbers in table])

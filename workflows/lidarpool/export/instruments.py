@@ -1,0 +1,95 @@
+"""Instruments that a carrier has beside its lidars: an IMU and a GNSS receiver."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass
+from io import TextIOWrapper
+from pathlib import Path
+from typing import Any
+
+from ..base.input_files import open_input
+from ..sensor import Survey
+from ..sensor.trajectory import Pose, quaternions_of
+
+IMU_FILE = "imu.csv"
+GNSS_FILE = "gnss.csv"
+INSTRUMENT_FILES = (IMU_FILE, GNSS_FILE)
+
+
+@dataclass(frozen=True)
+class Instrument:
+    """Mount and noise of an instrument, as bags state them beside its samples."""
+
+    position: list[float]  # on the carrier, metres
+    quaternion: list[float]  # x, y, z, w
+    # Of white noise: of angular velocities and specific forces; of positions to the east, the north
+    # and up, where those that drift are added.
+    variances: list[float]
+
+
+@dataclass(frozen=True)
+class Instruments:
+    """The instruments of a survey, and the folder of their files."""
+
+    imu: Instrument | None
+    gnss: Instrument | None
+    folder: Path | None = None  # None until the files are written
+
+    @classmethod
+    def of(cls, survey: Survey) -> Instruments | None:
+        """Return the instruments of a survey; None if the survey has none."""
+        navigation = survey.navigation
+        if navigation is None or (navigation.imu is None and navigation.gnss is None):
+            return None
+        imu = gnss = None
+        if navigation.imu is not None:
+            model = navigation.imu
+            densities = (model.gyroscope_noise_density, model.accelerometer_noise_density)
+            imu = _instrument(model.mount, [model.rate_hz * density**2 for density in densities])
+        if navigation.gnss is not None:
+            receiver = navigation.gnss
+            horizontal = receiver.horizontal_m**2 + receiver.drift_horizontal_m**2
+            vertical = receiver.vertical_m**2 + receiver.drift_vertical_m**2
+            gnss = _instrument(receiver.mount, [horizontal, horizontal, vertical])
+        return cls(imu, gnss)
+
+    @property
+    def files(self) -> list[str]:
+        """Names of the files of the instruments."""
+        instruments = (self.imu, self.gnss)
+        return [
+            name
+            for name, instrument in zip(INSTRUMENT_FILES, instruments, strict=True)
+            if instrument is not None
+        ]
+
+    def words(self) -> dict[str, Any]:
+        """Return the instruments as JSON holds them, without the folder."""
+        instruments = {"imu": self.imu, "gnss": self.gnss}
+        return {name: instrument and asdict(instrument) for name, instrument in instruments.items()}
+
+    @classmethod
+    def from_words(cls, words: dict[str, Any], folder: Path) -> Instruments:
+        """Return what `words` gave; with `folder` if it has the files of all instruments."""
+        imu = words["imu"] and Instrument(**words["imu"])
+        gnss = words["gnss"] and Instrument(**words["gnss"])
+        instruments = cls(imu, gnss, folder)
+        if all((folder / name).exists() for name in instruments.files):
+            return instruments
+        return cls(imu, gnss)
+
+    def rows(self, name: str) -> Iterator[list[str]]:
+        """Yield the rows of a file, without its header; none if the file is not written."""
+        if self.folder is None or name not in self.files:
+            return
+        with TextIOWrapper(open_input(self.folder / name), encoding="ascii") as file:
+            next(file)
+            for line in file:
+                yield line.rstrip("\n").split(",")
+
+
+def _instrument(mount: Pose, variances: list[float]) -> Instrument:
+    quaternion = quaternions_of(mount.turn[None])[0]
+    quaternion *= -1 if quaternion[3] < 0 else 1
+    return Instrument([*mount.position], quaternion.tolist(), variances)

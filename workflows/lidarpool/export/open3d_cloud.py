@@ -1,0 +1,24 @@
+"""Clouds as Open3D's point clouds."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from ..base.open3d_module import load_open3d
+from ..columns.cloud import Cloud
+
+
+def to_open3d(cloud: Cloud) -> Any:
+    """Return an `open3d.t.geometry.PointCloud` of all columns, by their names in files.
+
+    LidarpoolError if Open3D is not installed, or lacks a library of the system.
+    """
+    o3d = load_open3d()
+    positions = np.ascontiguousarray(cloud.positions)
+    point_cloud = o3d.t.geometry.PointCloud(o3d.core.Tensor(positions))
+    for column in cloud.table:
+        values = np.ascontiguousarray(cloud[column.name])[:, None]
+        point_cloud.point[column.in_files] = o3d.core.Tensor(values)
+    return point_cloud
