@@ -61,8 +61,8 @@ class Bounds:
         PoolError
             If a number is not possible.
         """
-        check_count(f"The minimum of partition {name!r}", minimum, least=0)
-        check_count(f"The maximum of partition {name!r}", maximum, least=max(1, minimum))
+        check_count(f"The minimum of partition {name!r}", minimum, minimum=0)
+        check_count(f"The maximum of partition {name!r}", maximum, minimum=max(1, minimum))
         if not isinstance(idle_s, int | float) or not 0 <= idle_s < math.inf:
             raise PoolError(
                 f"idle_s of partition {name!r} is {idle_s!r}; give seconds, such as 60."
@@ -97,7 +97,7 @@ class _Decision:
 
 @dataclass
 class _Record:
-    """State of one partition; times are of `time.monotonic`."""
+    """State of a partition; times are values of `time.monotonic`."""
 
     kind: JobKind
     queued_jobs: int = 0  # jobs whose workers have not joined
@@ -134,7 +134,7 @@ class Adaptation(SchedulerPlugin):
     def transition(
         self, key: Any, start: str, finish: str, *args: Any, worker: str = "", **kwargs: Any
     ) -> None:
-        """Note when a worker last ended a task: looks once a second would miss short ones."""
+        """Note when a worker last ended a task: periodic looks would miss short tasks."""
         if start == "processing" and worker in self._busy_at:
             self._busy_at[worker] = time.monotonic()
 
@@ -209,7 +209,7 @@ class Adaptation(SchedulerPlugin):
             Slots that tasks without a worker wait for.
         """
         record = self.records[name]
-        now = time.monotonic()
+        decided_at = time.monotonic()
         states = {str(worker.name): worker for worker in self.scheduler.workers.values()}
         present = {
             job: [states[worker] for worker in names if worker in states]
@@ -219,7 +219,7 @@ class Adaptation(SchedulerPlugin):
         ended = [job for job, names in jobs.items() if self._cancelled.issuperset(names)]
         queued = [job for job, workers in present.items() if not workers and job not in ended]
         record.queued_jobs = len(queued)
-        record.reported_at = now
+        record.reported_at = decided_at
         bounds = record.kind.bounds
         if bounds is None:
             return None
@@ -238,10 +238,12 @@ class Adaptation(SchedulerPlugin):
 
         superfluous = queued[jobs_needed(missing) :]
         record.superfluous_since = {
-            job: record.superfluous_since.get(job, now) for job in superfluous
+            job: record.superfluous_since.get(job, decided_at) for job in superfluous
         }
         cancelled = [
-            job for job, since in record.superfluous_since.items() if now - since >= bounds.idle_s
+            job
+            for job, since in record.superfluous_since.items()
+            if decided_at - since >= bounds.idle_s
         ]
         self._cancelled.update(worker for job in cancelled for worker in jobs[job])
         to_start = max(0, jobs_needed(lasting) - len(queued))
@@ -253,7 +255,7 @@ class Adaptation(SchedulerPlugin):
         self, name: str, running: Mapping[str, Sequence[Any]], spare_jobs: float, bounds: Bounds
     ) -> dict[str, list[Any]]:
         """Return the workers to close by job: of the jobs that have been idle for longest."""
-        now = time.monotonic()
+        decided_at = time.monotonic()
         members = {
             job: workers
             for job, workers in running.items()
@@ -263,10 +265,12 @@ class Adaptation(SchedulerPlugin):
         for job, workers in members.items():
             for worker in workers:
                 if not is_idle(self.scheduler, worker):
-                    self._busy_at[worker.address] = now
-            busy_at[job] = max(self._busy_at.setdefault(worker.address, now) for worker in workers)
+                    self._busy_at[worker.address] = decided_at
+            busy_at[job] = max(
+                self._busy_at.setdefault(worker.address, decided_at) for worker in workers
+            )
         number = max(0, min(len(members) - bounds.minimum, math.floor(spare_jobs)))
-        idle = [job for job in members if now - busy_at[job] >= bounds.idle_s]
+        idle = [job for job in members if decided_at - busy_at[job] >= bounds.idle_s]
         idle.sort(key=busy_at.__getitem__)
         return {job: [*members[job]] for job in idle[:number]}
 
@@ -291,7 +295,7 @@ class Adaptation(SchedulerPlugin):
 
 
 def _is_busy(dask_worker: Any = None) -> bool:
-    """Whether a worker runs a task, or holds data, that its scheduler does not know of."""
+    """Return whether a worker runs a task, or holds data, unknown to its scheduler."""
     return has_running_tasks(dask_worker) or holds_for_driver()
 
 
@@ -300,7 +304,7 @@ def _is_busy(dask_worker: Any = None) -> bool:
 
 def begin(kinds: Mapping[str, JobKind], dask_scheduler: Any = None) -> None:
     """Create the records of partitions whose jobs a process starts."""
-    record = _of(dask_scheduler) or Adaptation(dask_scheduler)
+    record = _adaptation_of(dask_scheduler) or Adaptation(dask_scheduler)
     if NAME not in dask_scheduler.plugins:
         dask_scheduler.add_plugin(record)
     for name, kind in kinds.items():
@@ -315,7 +319,7 @@ async def look(
     `jobs` is {partition: {job: names of its workers}}. Partitions with a fixed number of jobs have
     no advice.
     """
-    adaptation = _of(dask_scheduler)
+    adaptation = _adaptation_of(dask_scheduler)
     if adaptation is None:
         return {}
     waiting = adaptation.waiting_slots()
@@ -354,7 +358,7 @@ def want(name: str, slots: int, asking: str, dask_scheduler: Any = None) -> bool
 
     Returns False if the partition does not adapt.
     """
-    adaptation = _of(dask_scheduler)
+    adaptation = _adaptation_of(dask_scheduler)
     # The last request of a client that was killed may come after it has left.
     if adaptation is None or asking not in dask_scheduler.clients:
         return False
@@ -377,7 +381,7 @@ def max_running_tasks(name: str, slots: int, dask_scheduler: Any = None) -> int:
 
 def adaptive_names(dask_scheduler: Any = None) -> set[str]:
     """Return the names of adaptive partitions, which may have no workers."""
-    adaptation = _of(dask_scheduler)
+    adaptation = _adaptation_of(dask_scheduler)
     records = adaptation.records if adaptation else {}
     return {name for name, record in records.items() if record.kind.bounds is not None}
 
@@ -412,11 +416,11 @@ def _upper_bound(scheduler: Any, name: str) -> tuple[int, int]:
     return record.kind.bounds.maximum * record.kind.workers, record.kind.slots
 
 
-def _of(scheduler: Any) -> Adaptation | None:
+def _adaptation_of(scheduler: Any) -> Adaptation | None:
     adaptation: Adaptation | None = scheduler.plugins.get(NAME)
     return adaptation
 
 
 def _record(scheduler: Any, name: str) -> _Record | None:
-    adaptation = _of(scheduler)
+    adaptation = _adaptation_of(scheduler)
     return adaptation.records.get(name) if adaptation else None

@@ -48,10 +48,10 @@ class _Group:
         self.workers = workers
         self.members = set(workers)
         self.free = dict.fromkeys(workers)  # ordered set: workers that may have free slots
-        self._turn = 0  # index of the worker that is next in turn
+        self._next_index = 0  # of the first worker that `in_turn` returns next
 
     def with_free_slots(self, slots: float) -> list[Any]:
-        """Return some workers with so many free slots; forget workers that have none."""
+        """Return up to `COMPARED` workers with enough free slots; forget full workers."""
         workers: list[Any] = []
         for worker in list(islice(self.free, _EXAMINED)):
             free = free_slots_of(worker, self.name)
@@ -64,10 +64,10 @@ class _Group:
         return workers
 
     def in_turn(self) -> list[Any]:
-        """Return some workers, evenly spread, others at each call."""
+        """Return `COMPARED` workers, evenly spread and different at each call."""
         number = len(self.workers)
-        start = self._turn
-        self._turn = (start + 1) % number
+        start = self._next_index
+        self._next_index = (start + 1) % number
         return [self.workers[(start + n * number // COMPARED) % number] for n in range(COMPARED)]
 
 
@@ -93,7 +93,7 @@ class WorkerChoice(SchedulerPlugin):
     # -- groups ------------------------------------------------------------------------
 
     def note_change(self) -> None:
-        """Note that a worker declares something else than before."""
+        """Note that a worker declares different resources than before."""
         self._changes += 1
 
     def add_worker(self, scheduler: Any, worker: str) -> None:
@@ -108,7 +108,7 @@ class WorkerChoice(SchedulerPlugin):
     def transition(
         self, key: Any, start: str, finish: str, *args: Any, worker: str = "", **kwargs: Any
     ) -> None:
-        """Note a worker that has ended a task: it may have a free slot."""
+        """Note a worker that has ended a task, and may have a free slot."""
         if start == "processing" and (state := self.scheduler.workers.get(worker)):
             for group in self._groups.values():
                 if state in group.members:
@@ -164,7 +164,7 @@ class WorkerChoice(SchedulerPlugin):
 
 
 def note_change(scheduler: Any) -> None:
-    """Note that a worker declares something else than before."""
+    """Note that a worker of a scheduler declares different resources than before."""
     choice: WorkerChoice | None = scheduler.plugins.get(NAME)
     if choice is not None:
         choice.note_change()

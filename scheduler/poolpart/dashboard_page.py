@@ -51,11 +51,13 @@ _OF_A_WORKER = ("partition", "slots", "busy", "tasks given", "status", "address"
 
 
 def page_of(scheduler: Any) -> bytes:
-    """HTML of the current page."""
+    """Return the HTML of the current page."""
     workers = list(scheduler.workers.values())
     names = {name for worker in workers for name, slots in worker.resources.items() if slots}
     names |= fences_of(scheduler) | {name for name, _ in statistics_of(scheduler).ended if name}
-    partitions, stages, pipes = [], [], []
+    partitions: list[list[object]] = []
+    stages: list[list[object]] = []
+    pipes: list[list[object]] = []
     for p in stats_of([*sorted(names), ""], scheduler):
         title = f"{_shown(p.name)}{' (exclusive)' * p.exclusive}"
         partitions.append([title, p.workers, p.slots, p.busy, *_counts(p)])
@@ -85,13 +87,19 @@ def _counts(stats: StageStats) -> list[object]:
 
 def _worker(worker: Any) -> list[object]:
     partition = next((name for name, slots in worker.resources.items() if slots), "")
-    slots, busy = slots_of(worker, partition), running_on(worker, partition)[1]
-    given, status = len(worker.processing), worker.status.name
-    return [worker.name, _shown(partition), slots, busy, given, status, worker.address]
+    return [
+        worker.name,
+        _shown(partition),
+        slots_of(worker, partition),
+        running_on(worker, partition)[1],
+        len(worker.processing),
+        worker.status.name,
+        worker.address,
+    ]
 
 
 class _Handler(web.RequestHandler):
-    """Sends the page; the browser may load and run nothing else."""
+    """Sends the page; the browser may load and run the page alone."""
 
     def initialize(self, scheduler: Any) -> None:
         self.scheduler = scheduler
@@ -103,7 +111,7 @@ class _Handler(web.RequestHandler):
 
 
 class PageOwners(SchedulerPlugin):
-    """Serves the page, until the last client that wanted it has gone."""
+    """Serves the page until the last client that wanted the page has gone."""
 
     name = NAME
 
@@ -150,7 +158,7 @@ async def _open(owner: str, dask_scheduler: Any = None) -> None:
 
 
 async def leave_page(owner: str, dask_scheduler: Any = None) -> None:
-    """Remove the page, unless others want it, as when its client leaves; on the scheduler."""
+    """Remove the page for a client; the page stays for further clients. Runs on the scheduler."""
     if NAME in dask_scheduler.plugins:
         dask_scheduler.plugins[NAME].remove_client(dask_scheduler, owner)
 

@@ -64,7 +64,7 @@ def own_device() -> int | None:
 
 
 def _assign(address: str, gpus: Sequence[str], dask_scheduler: Any = None) -> int | None:
-    """Device of a worker, from the UUIDs that it sees; None for a worker that has left."""
+    """Return the device of a worker for its list of UUIDs, or None if the worker has left."""
     worker = dask_scheduler.workers.get(address)
     if worker is None:
         return None
@@ -74,13 +74,15 @@ def _assign(address: str, gpus: Sequence[str], dask_scheduler: Any = None) -> in
 
 
 def _least_used(scheduler: Any, worker: Any, gpus: Sequence[str]) -> str:
-    fellows, everyone = Counter[str](), Counter[str]()  # {UUID: workers that use it}
-    own = _partitions(worker)
-    for other in scheduler.workers.values():
-        if held := other.extra.get(_HELD):
-            everyone[held] += 1
-            fellows[held] += not own.isdisjoint(_partitions(other))
-    return min(gpus, key=lambda gpu: (fellows[gpu], everyone[gpu]))
+    """Return the device that the fewest workers use, in the partition first, then in all."""
+    users_in_partition = Counter[str]()  # {UUID: workers}
+    users = Counter[str]()  # {UUID: workers}
+    partitions = _partitions(worker)
+    for peer in scheduler.workers.values():
+        if gpu := peer.extra.get(_HELD):
+            users[gpu] += 1
+            users_in_partition[gpu] += not partitions.isdisjoint(_partitions(peer))
+    return min(gpus, key=lambda gpu: (users_in_partition[gpu], users[gpu]))
 
 
 def _partitions(worker: Any) -> set[str]:

@@ -17,7 +17,7 @@ from distributed import Client
 from .dashboard_page import close_page
 from .errors import PoolError
 from .fence import enclose, lower
-from .inherit import begin_inheritance, end_inheritance, workers_told
+from .inherit import begin_inheritance, end_inheritance, workers_informed
 from .internals.scheduler import asks_for, lift_restrictions
 from .rules import Rule, check_count, divide
 from .stats import forget_statistics, statistics_of
@@ -33,7 +33,7 @@ _UNFINISHED = ("waiting", "queued", "no-worker", "processing")
 
 
 def ask(client: Client, question: Callable[..., Any], **arguments: Any) -> Any:
-    """Call `question(steward, **arguments)` on the scheduler; a PoolError of it is raised here."""
+    """Call `question(steward, **arguments)` on the scheduler; raise its PoolError here."""
     result, complaint = on_scheduler(client, _answer, question=question, arguments=arguments)
     if complaint:
         raise PoolError(complaint)
@@ -57,51 +57,83 @@ async def _answer(
 async def declare(
     steward: Steward,
     rules: Mapping[str, Rule],
-    now: Mapping[str, Rule],
+    initial_rules: Mapping[str, Rule],
     pool: Mapping[str, tuple[str, ...]],
-    seen: Collection[str],
+    known_partitions: Collection[str],
 ) -> tuple[dict[str, str], list[WorkerInfo]]:
-    """Make partitions, and follow their rules from now on; all or none.
+    """Make all of some partitions, or none, and follow their rules afterwards.
 
-    `now` are the rules by which workers are chosen at first, `pool` the devices of the workers to
-    choose from, by name, and `seen` the partitions that the client knew of. Returns notes by
-    partition, and the workers that are left. PoolError if there are too few workers, if others have
-    a partition of this name, or if a worker leaves meanwhile.
+    Parameters
+    ----------
+    steward
+        The scheduler's steward.
+    rules
+        {partition: rule for workers that join later}.
+    initial_rules
+        {partition: rule by which workers are chosen at first}.
+    pool
+        {name of a worker to choose from: UUIDs of its GPUs}.
+    known_partitions
+        Partitions that the client knew when it sent the request. It may make them again.
+
+    Returns
+    -------
+    notes
+        {partition: remark for users, possibly empty}.
+    remainder
+        Workers of the pool that no rule has chosen.
+
+    Raises
+    ------
+    PoolError
+        If there are too few workers, another client has a partition of the same name, or a worker
+        leaves meanwhile.
     """
     # Up to the first await nothing else happens on the scheduler.
-    seats = {s.info.address: s for s in steward.seats.values() if not s.away}
-    there = [replace(seat.info, resources=steward.wanted(seat)) for seat in seats.values()]
+    seats = {seat.info.address: seat for seat in steward.seats.values() if not seat.away}
+    present = [
+        replace(seat.info, resources=steward.target_resources(seat)) for seat in seats.values()
+    ]
     # By name: a restarted worker has another address.
-    mine = [worker.with_gpus(pool[worker.name]) for worker in there if worker.name in pool]
-    chosen, notes = divide(now, mine)
+    candidates = [worker.with_gpus(pool[worker.name]) for worker in present if worker.name in pool]
+    chosen, notes = divide(initial_rules, candidates)
     for name in rules:
-        members = {worker.address for worker in there if name in worker.partitions}
-        # One that the client knew of can be made again, of all of it.
-        if others := members - ({w.address for w in chosen[name]} if name in seen else set()):
+        permitted = {worker.address for worker in chosen[name]} if name in known_partitions else ()
+        foreign = [
+            worker.address
+            for worker in present
+            if name in worker.partitions and worker.address not in permitted
+        ]
+        if foreign:
             raise PoolError(
-                f"Partition {name!r} exists already, with {names_of(seats[a] for a in others)}, "
+                f"Partition {name!r} exists already, with {names_of(seats[a] for a in foreign)}, "
                 "which this call did not see, or does not choose: use "
                 f"Pool.partitions()[{name!r}] of a new pool, or give another name."
             )
-    common = _begin(steward, rules)
-    for worker in mine:
+    common_note = _begin(steward, rules)
+    for worker in candidates:
         if worker.gpus:
             seats[worker.address].info = seats[worker.address].info.with_gpus(worker.gpus)
     for name, rule in rules.items():
         steward.enter(name, rule)
         for worker in chosen[name]:
             steward.put(seats[worker.address], name, rule.slots_of(worker))
-    await workers_told()  # before they get tasks
-    taken = [seats[worker.address] for group in chosen.values() for worker in group]
-    late = await steward.arrive(taken, PATIENCE_S)
-    if away := [seat for seat in taken if seat in late or seat.gone]:
+    await workers_informed()  # before they get tasks
+    members = [seats[worker.address] for group in chosen.values() for worker in group]
+    await _expect_arrival(steward, members)
+    notes_of_all = {name: "; ".join(filter(None, (notes.get(name), common_note))) for name in rules}
+    return notes_of_all, [worker for worker in candidates if seats[worker.address] not in members]
+
+
+async def _expect_arrival(steward: Steward, members: Sequence[Seat]) -> None:
+    """Wait until new members of partitions declare their resources; PoolError if any does not."""
+    late = await steward.arrive(members, PATIENCE_S)
+    if absent := [seat for seat in members if seat in late or seat.removed]:
         raise PoolError(
-            f"{names_of(away)} left, or did not answer, when assigned to partition "
-            f"{' and '.join(sorted({str(seat.partition) for seat in away}))}; the other workers "
+            f"{names_of(absent)} left, or did not answer, when assigned to partition "
+            f"{' and '.join(sorted({str(seat.partition) for seat in absent}))}; the other workers "
             "were assigned. Make a new pool to divide it again."
         )
-    told = {name: "; ".join(filter(None, (notes.get(name), common))) for name in rules}
-    return told, [worker for worker in mine if seats[worker.address] not in taken]
 
 
 def _begin(steward: Steward, rules: Mapping[str, Rule]) -> str:
@@ -139,29 +171,30 @@ async def grow(
         raise PoolError(f"Partition {name!r} cannot take workers from itself.")
     if source is not None:
         steward.adopt(source)
-    lender = source or steward.remainder()
-    there = [] if source else [seat for seat in steward.free() if steward.settled(seat)]
-    if lender is not None and lender != name:
-        members = _arrived(steward, lender)
-        there += members[: max(0, len(members) - steward.rules[lender].minimum)]
-    if len(there) < count:
-        place = f"partition {lender!r}, beyond its minimum," if source else "the remainder"
+    donor = source or steward.remainder()
+    spare = [] if source else [seat for seat in steward.free() if steward.settled(seat)]
+    if donor is not None and donor != name:
+        members = _settled_members(steward, donor)
+        spare += members[: max(0, len(members) - steward.rules[donor].minimum)]
+    if len(spare) < count:
+        donor_text = f"partition {donor!r}, beyond its minimum," if source else "the remainder"
         raise PoolError(
-            f"Partition {name!r} cannot grow by {count}: {place} has "
-            f"{len(there)} spare workers. Start more, or shrink another partition first."
+            f"Partition {name!r} cannot grow by {count}: {donor_text} has "
+            f"{len(spare)} spare workers. Start more, or shrink another partition first."
         )
-    return await _move(steward, _by_load(steward, there)[:count], name, timeout_s)
+    return await _move(steward, _by_load(steward, spare)[:count], name, timeout_s)
 
 
 async def shrink(steward: Steward, name: str, count: int, timeout_s: float) -> list[str]:
     """Move workers out of a partition; see `Partition.shrink`. Returns their names."""
     check_count(_MOVES, count)
     steward.adopt(name)
-    members, least = _arrived(steward, name), steward.rules[name].minimum
-    if len(members) - count < least:
+    members = _settled_members(steward, name)
+    minimum = steward.rules[name].minimum
+    if len(members) - count < minimum:
         raise PoolError(
             f"Partition {name!r} cannot shrink by {count}: it has {len(members)} workers and "
-            f"needs at least {least}."
+            f"needs at least {minimum}."
         )
     target = steward.remainder()
     return await _move(steward, members[:count], None if target == name else target, timeout_s)
@@ -170,15 +203,18 @@ async def shrink(steward: Steward, name: str, count: int, timeout_s: float) -> l
 async def _move(
     steward: Steward, seats: Sequence[Seat], target: str | None, timeout_s: float
 ) -> list[str]:
-    """Move workers; PoolError if some are not free in time, and those stay."""
-    before = {seat: (seat.partition, seat.slots) for seat in seats}
+    """Move workers into a partition or, with None, out of all; return their names.
+
+    Workers whose tasks do not end in time stay where they are, and raise a PoolError.
+    """
+    origins = {seat: (seat.partition, seat.slots) for seat in seats}
     for seat in seats:
         steward.resize(seat.partition, -1)
         steward.resize(target, 1)
         steward.put(seat, target)
     late = await steward.arrive(seats, timeout_s)
     for seat in late:
-        origin, slots = before[seat]
+        origin, slots = origins[seat]
         if seat.partition != target or (origin and origin not in steward.rules):
             continue  # another client has moved it, or dissolved its partition
         steward.resize(target, -1)
@@ -191,16 +227,20 @@ async def _move(
             f"{timeout_s:g} s, because their tasks have not ended, or they do not answer: "
             f"{names_of(late)} stay."
         )
-    return [seat.info.name for seat in seats if not seat.gone]
+    return [seat.info.name for seat in seats if not seat.removed]
 
 
-def _arrived(steward: Steward, name: str) -> list[Seat]:
-    """Members that may be moved, by load; not those on their way, which may return."""
-    return _by_load(steward, [s for s in steward.members(name) if steward.settled(s)])
+def _settled_members(steward: Steward, name: str) -> list[Seat]:
+    """Return the members that may be moved, by load.
+
+    Members that are just arriving do not count: they may return to their former partition.
+    """
+    members = [seat for seat in steward.members(name) if steward.settled(seat)]
+    return _by_load(steward, members)
 
 
 def _by_load(steward: Steward, seats: Sequence[Seat]) -> list[Seat]:
-    """Sort by load, workers with long-running tasks last."""
+    """Sort seats by the load of their workers; workers with long-running tasks come last."""
 
     def load(seat: Seat) -> tuple[int, int]:
         worker = steward.scheduler.workers[seat.info.address]
@@ -209,37 +249,21 @@ def _by_load(steward: Steward, seats: Sequence[Seat]) -> list[Seat]:
     return sorted(seats, key=load)
 
 
-# -- undoing it ------------------------------------------------------------------------
+# -- dissolving partitions ------------------------------------------------------------------------
 
 
 async def dissolve(steward: Steward, names: Collection[str] | None, timeout_s: float) -> list[str]:
-    """Undo partitions, all of them if None; see `Pool.dissolve`. Returns their names."""
+    """Undo partitions, or every partition if `names` is None, and return their names.
+
+    See `Pool.dissolve`.
+    """
     scheduler = steward.scheduler
-
-    def those() -> list[str]:
-        return [name for name in steward.rules if names is None or name in names]
-
-    deadline = time.monotonic() + timeout_s
-    # Tasks that the client just submitted arrive by another connection, milliseconds later.
-    await asyncio.sleep(_LOOK_EVERY_S)
-    while tasks := _unfinished(scheduler, those()):
-        if time.monotonic() >= deadline:
-            raise PoolError(
-                f"After {timeout_s:g} s {len(tasks)} tasks of {' and '.join(those())} "
-                f"had not ended, such as {tasks[0].key}: wait or cancel, then dissolve."
-            )
-        await asyncio.sleep(_LOOK_EVERY_S)
+    await _wait_for_tasks(steward, names, timeout_s)
     # Until the next await nothing else happens on the scheduler; before, another client may have
     # dissolved the same partitions, or made some.
-    gone = those()
-    seats = [
-        seat
-        for seat in steward.seats.values()
-        # Or it was started with one, and has left it.
-        if seat.partition in gone
-        or (seat.partition is None and not seat.found.keys().isdisjoint(gone))
-    ]
-    for name in gone:
+    dissolved = _existing(steward, names)
+    seats = [seat for seat in steward.seats.values() if _belongs(seat, dissolved)]
+    for name in dissolved:
         del steward.rules[name]
         # At once, even if the client dies or workers do not answer.
         lower(scheduler, name)
@@ -251,18 +275,48 @@ async def dissolve(steward: Steward, names: Collection[str] | None, timeout_s: f
         forget_statistics(scheduler)
     for seat in seats:
         steward.put(seat, None)
-    lift_restrictions(scheduler, gone)
-    await workers_told()
+    lift_restrictions(scheduler, dissolved)
+    await workers_informed()
     # An absent worker comes back as it was started.
-    here = [seat for seat in seats if not seat.away]
-    if late := await steward.arrive(here, max(timeout_s, _RETURN_S)):
+    present = [seat for seat in seats if not seat.away]
+    if late := await steward.arrive(present, max(timeout_s, _RETURN_S)):
         raise PoolError(
-            f"{names_of(late)} did not answer while {' and '.join(gone)} were dissolved; they "
+            f"{names_of(late)} did not answer while {' and '.join(dissolved)} were dissolved; they "
             "are restored when they answer."
         )
-    return gone
+    return dissolved
+
+
+def _existing(steward: Steward, names: Collection[str] | None) -> list[str]:
+    """Return the partitions of these names that exist; every partition if `names` is None."""
+    return [name for name in steward.rules if names is None or name in names]
+
+
+def _belongs(seat: Seat, names: Collection[str]) -> bool:
+    """Return whether a worker is in a partition, or was started in it and is in no partition."""
+    if seat.partition is None:
+        return not seat.original.keys().isdisjoint(names)
+    return seat.partition in names
+
+
+async def _wait_for_tasks(
+    steward: Steward, names: Collection[str] | None, timeout_s: float
+) -> None:
+    """Wait until the tasks of partitions have ended; PoolError if they have not in time."""
+    deadline = time.monotonic() + timeout_s
+    # Tasks that the client just submitted arrive by another connection, milliseconds later.
+    await asyncio.sleep(_LOOK_EVERY_S)
+    while tasks := _unfinished(steward.scheduler, _existing(steward, names)):
+        if time.monotonic() >= deadline:
+            raise PoolError(
+                f"After {timeout_s:g} s {len(tasks)} tasks of "
+                f"{' and '.join(_existing(steward, names))} had not ended, such as "
+                f"{tasks[0].key}: wait or cancel, then dissolve."
+            )
+        await asyncio.sleep(_LOOK_EVERY_S)
 
 
 def _unfinished(scheduler: Any, names: Collection[str]) -> list[Any]:
+    """Return the states of the tasks of partitions that have not ended."""
     tasks = scheduler.tasks.values()
     return [task for task in tasks if task.state in _UNFINISHED and asks_for(task, names)]

@@ -2,7 +2,7 @@
 
 
 class PoolError(RuntimeError):
-    """A pool cannot be divided as requested, or lacks something that a job needs."""
+    """A pool cannot be divided as requested, or lacks workers or slots that a job needs."""
 
 
 class PipeClosed(Exception):  # noqa: N818 - like StopIteration: an end, not an error

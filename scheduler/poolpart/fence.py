@@ -32,19 +32,19 @@ from typing import Any
 
 from distributed.diagnostics.plugin import SchedulerPlugin
 
-from .internals.method_rules import Rules, could_take, rule_for_fences, take_back_fences
+from .internals.method_rules import Rules, rule_for_fences, take_back_fences, workers_without_fences
 from .internals.names import FENCES, require
 from .internals.scheduler import open_to_all
 
 logger = logging.getLogger(__name__)
 
 NAME = "poolpart-fences"
-COMPLAIN_EVERY_S = 10.0
+WARN_EVERY_S = 10.0
 _EXPECTED = "poolpart-partition"  # key in the scheduler's state of a worker
 
 
 def enclose(scheduler: Any, name: str) -> None:
-    """Raise a fence: from now on no other task comes in.
+    """Raise a fence: from now on, tasks without the resource of a partition stay out.
 
     Raises
     ------
@@ -67,7 +67,7 @@ def expect(scheduler: Any, worker: Any, name: str | None) -> None:
 
 
 def lower(scheduler: Any, name: str) -> None:
-    """Lower a fence; the last one removes the rule."""
+    """Lower a fence; lowering the last fence removes the rule."""
     fences: Fences | None = scheduler.plugins.get(NAME)
     if fences is None or name not in fences.names:
         return
@@ -78,7 +78,7 @@ def lower(scheduler: Any, name: str) -> None:
 
 
 def fences_of(scheduler: Any) -> frozenset[str]:
-    """Names of the fences that are raised."""
+    """Return the names of the raised fences."""
     fences: Fences | None = scheduler.plugins.get(NAME)
     return frozenset(fences.names) if fences else frozenset()
 
@@ -92,9 +92,9 @@ class Fences(SchedulerPlugin):
         self.scheduler = scheduler
         self.names: set[str] = set()
         self.closed: set[Any] = set()  # states of the workers behind fences
-        self.changes = 0  # how often that set has changed
+        self.changes = 0  # of the set `closed`
         self._rules = Rules()
-        self._complained_at = float("-inf")
+        self._warned_at = float("-inf")  # time.monotonic()
         rule_for_fences(self._rules, scheduler, self.closed, self.stop)
         scheduler.add_plugin(self)
 
@@ -106,7 +106,7 @@ class Fences(SchedulerPlugin):
     # -- who is behind a fence ---------------------------------------------------------
 
     def look_again(self) -> None:
-        """Find out which workers are behind fences."""
+        """Enclose or release each worker, after a change of the fences."""
         for worker in self.scheduler.workers.values():
             self.look_at(worker)
 
@@ -133,9 +133,9 @@ class Fences(SchedulerPlugin):
     # -- the rule ----------------------------------------------------------------------
 
     def stop(self, task: Any) -> bool:
-        """Whether fences keep a task out: it asks for none of their resources."""
-        asked = task.resource_restrictions
-        return not asked or self.names.isdisjoint(asked)
+        """Return whether fences keep a task out: the task asks for no resource of a fence."""
+        resources = task.resource_restrictions
+        return not resources or self.names.isdisjoint(resources)
 
     # -- warnings ----------------------------------------------------------------------
 
@@ -146,19 +146,19 @@ class Fences(SchedulerPlugin):
         # Queued tasks may also wait just for their turn.
         if finish == "queued" and not self.scheduler.running <= self.closed:
             return
-        now = time.monotonic()
         task = self.scheduler.tasks[key]
-        if now - self._complained_at < COMPLAIN_EVERY_S or not self.stop(task):
+        elapsed_s = time.monotonic() - self._warned_at
+        if elapsed_s < WARN_EVERY_S or not self.stop(task):
             return
-        could = could_take(self.scheduler, task)
-        if not could or not could <= self.closed:  # it waits also without fences
+        candidates = workers_without_fences(self.scheduler, task)
+        if not candidates or not candidates <= self.closed:  # it waits also without fences
             return
-        self._complained_at = now
+        self._warned_at = time.monotonic()
         fences = ", ".join(sorted(self.names))
-        complaint = (
+        message = (
             f"Tasks wait, such as {key!r}: all workers that could take them are kept for "
             f"exclusive partitions ({fences}). Start more workers, submit to a partition, or "
             "make a partition that is not exclusive."
         )
-        logger.warning(complaint)
-        self.scheduler.log_event("warn", {"message": pickle.dumps(complaint)})
+        logger.warning(message)
+        self.scheduler.log_event("warn", {"message": pickle.dumps(message)})

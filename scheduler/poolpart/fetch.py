@@ -114,7 +114,7 @@ def holds_for_driver() -> bool:
 
 
 def take_held(client: Client, address: str, name: str, patience_s: float = 2.0) -> Any:
-    """Fetch bytes that a worker holds under a name, and have the worker forget them.
+    """Fetch bytes that a worker holds under a name; the worker then forgets the bytes.
 
     The address is the result of `hold_for_driver`. Returns None if the bytes were taken before, or
     if the worker has died or is silent for `patience_s`; a transfer may take longer.
@@ -132,6 +132,6 @@ def take_held(client: Client, address: str, name: str, patience_s: float = 2.0) 
 
 
 def _hand_over(name: str) -> dict[str, Any]:
-    """Return held bytes, and forget them; handler of a worker."""
+    """Return and forget held bytes; a handler of a worker."""
     data = _held.pop(name, None)
     return {"data": None if data is None else as_bytes(data)}

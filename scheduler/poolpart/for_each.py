@@ -23,7 +23,7 @@ LOOK_S = 5.0  # between looks at the number of slots
 
 
 class ItemTasks:
-    """The tasks for the items of one pipe: at most `window` of them are under way.
+    """Tasks for the items of a pipe, of which at most `window` are under way.
 
     No window is two tasks a slot, so that each slot has the next item at hand. Items that have no
     task yet stay in the pipe, so that producers wait when the tasks are slower than they are.
@@ -51,7 +51,7 @@ class ItemTasks:
         self._next_look = 0.0
 
     def run(self) -> None:
-        """Run tasks until the pipe is closed and all of them are done.
+        """Run tasks until the pipe is closed and all tasks have ended.
 
         An error of a task, or of the pipe, cancels the other tasks; the pipe fails with it.
         """
@@ -65,7 +65,7 @@ class ItemTasks:
                     wait(futures, return_when="FIRST_COMPLETED")
                 else:
                     items, closed = self._pipe.take_beside(futures, free)
-                    drained = closed and len(items) < free
+                    drained = closed and not self._pipe.buffered and len(items) < free
                     self._submit(items)
                 self._check()
         except BaseException as error:
@@ -80,9 +80,11 @@ class ItemTasks:
         if self._given_window is not None:
             self._window = self._given_window
         elif time.monotonic() > self._next_look:
-            partition, slots = self._partition, self._options["slots"]
             running = on_scheduler(
-                partition.client, max_running_tasks, name=partition.name, slots=slots
+                self._partition.client,
+                max_running_tasks,
+                name=self._partition.name,
+                slots=self._options["slots"],
             )
             self._window = max(2, 2 * running)
             self._next_look = time.monotonic() + LOOK_S
@@ -95,9 +97,9 @@ class ItemTasks:
             self.count += 1
 
     def _check(self) -> None:
-        """Forget tasks that are done; raise the error of one that has failed."""
-        done = [key for key, (future, _, _) in self._running.items() if future.done()]
-        for key in done:
+        """Forget tasks that have ended; raise the error of a failed task."""
+        ended = [key for key, (future, _, _) in self._running.items() if future.done()]
+        for key in ended:
             future, number, item = self._running.pop(key)
             if future.status != "finished":
                 try:

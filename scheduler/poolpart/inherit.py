@@ -59,7 +59,7 @@ class Inheritance(SchedulerPlugin):
         scheduler.add_plugin(self)
 
     def _begin(self, feature: str, without: str, begin: Callable[[], None]) -> bool:
-        """Begin a feature; returns False, and notes what is missing, if Dask lacks its names."""
+        """Begin a feature; return False, and note the missing names, if Dask lacks its names."""
         try:
             require(feature)
             begin()
@@ -79,12 +79,12 @@ class Inheritance(SchedulerPlugin):
         self._choice = WorkerChoice(self.scheduler, self.names)
 
     def _bequeath(self, task: Any) -> Resources:
-        """Resources for what a task submits; none if it belongs to no partition."""
-        asked = task.resource_restrictions
-        return dict.fromkeys(self.names & asked.keys(), 1) if asked else {}
+        """Return the resources of tasks that a task submits; empty outside partitions."""
+        resources = task.resource_restrictions
+        return dict.fromkeys(self.names & resources.keys(), 1) if resources else {}
 
     def remove_client(self, scheduler: Any, client: str) -> None:
-        """End what nobody who asked for it is left to use."""
+        """End inheritance in partitions whose last client has left."""
         for name in [name for name, clients in self.clients.items() if client in clients]:
             self.clients[name].discard(client)
             if not self.clients[name]:
@@ -99,10 +99,11 @@ class Inheritance(SchedulerPlugin):
 
 
 def begin_inheritance(names: Iterable[str], scheduler: Any, client: str | None = None) -> str:
-    """Have tasks that tasks of these partitions submit belong to them, and shuffles stay there.
+    """Have nested tasks and shuffles of partitions stay in their partition.
 
-    Until the partition is dissolved, or the clients that are given, by id, have left. Returns what
-    a user should know, where there is anything.
+    Inheritance lasts until the partition is dissolved or, in a partition that workers were started
+    with, until the last client (given by id) has left. Returns a remark for users on features that
+    this version of Dask lacks, or "".
     """
     rule: Inheritance = scheduler.plugins.get(NAME) or Inheritance(scheduler)
     for name in names:
@@ -113,42 +114,44 @@ def begin_inheritance(names: Iterable[str], scheduler: Any, client: str | None =
         if name not in rule.names:
             rule.names.add(name)
             if rule.lends:
-                _tell(scheduler, name, lending_plugin(name))
+                _inform_workers(scheduler, name, lending_plugin(name))
     return rule.note
 
 
 def is_inherited(scheduler: Any, name: str) -> bool:
-    """Whether what tasks of a partition submit belongs to it."""
+    """Return whether nested tasks of a partition belong to the partition."""
     rule: Inheritance | None = scheduler.plugins.get(NAME)
     return rule is not None and name in rule.names
 
 
 def end_inheritance(scheduler: Any, name: str | None) -> None:
-    """Leave it to Dask again where such tasks go, or all of them; nothing is left behind."""
+    """End inheritance in a partition, or in all if the name is None; nothing stays behind."""
     rule: Inheritance | None = scheduler.plugins.get(NAME)
     if rule is None:
         return
     for ended in rule.names & (rule.names if name is None else {name}):
         rule.names.discard(ended)
         rule.clients.pop(ended, None)
-        _tell(scheduler, ended, None)
+        _inform_workers(scheduler, ended, None)
     if not rule.names:
         rule.uninstall()
 
 
 # -- workers, which lend -------------------------------------------------------------------
 
-_told: set[asyncio.Future[Any]] = set()  # requests to workers under way, of all schedulers here
+_requests: set[asyncio.Future[Any]] = set()  # to workers, under way, of all schedulers here
 
 
-def _tell(scheduler: Any, name: str, plugin: bytes | None) -> None:
+def _inform_workers(scheduler: Any, name: str, plugin: bytes | None) -> None:
+    """Add the plugin of a partition to all workers, or remove the plugin if it is None."""
     for request in tell_of_plugin(scheduler, f"poolpart-lending-{name}", plugin):
-        _told.add(request)
-        request.add_done_callback(_told.discard)
+        _requests.add(request)
+        request.add_done_callback(_requests.discard)
 
 
-async def workers_told() -> None:
-    """Wait until workers that answer have begun or ended to lend."""
-    own = {request for request in _told if request.get_loop() is asyncio.get_running_loop()}
-    if own:
-        await asyncio.wait(own, timeout=ANSWER_S)
+async def workers_informed() -> None:
+    """Wait until the workers have begun or ended to lend, at most `ANSWER_S` seconds."""
+    loop = asyncio.get_running_loop()
+    requests = {request for request in _requests if request.get_loop() is loop}
+    if requests:
+        await asyncio.wait(requests, timeout=ANSWER_S)

@@ -70,7 +70,7 @@ _thread = threading.local()
 
 @dataclass
 class _Loan:
-    """Slots that one task has lent, and whether it has them back."""
+    """Slots that a task has lent, and whether the task has the slots back."""
 
     key: Any  # of the task
     slots: Resources
@@ -79,7 +79,7 @@ class _Loan:
 
 @dataclass(frozen=True)
 class _NestedTask:
-    """A task that waits for slots of this worker, and the task that has submitted it."""
+    """A task that waits for slots of this worker, with its submitting task."""
 
     submitter: Submitter
     since: float  # time.monotonic()
@@ -103,14 +103,14 @@ class Lender:
     # -- loans -------------------------------------------------------------------------
 
     def lend(self, loan: _Loan) -> None:
-        """Let other tasks have the slots."""
+        """Make the slots of a loan free for further tasks."""
         self._loans[loan.key] += 1
         self._lent.add(loan.key)
         free_slots(self.worker, loan.slots)
         self.serve()
 
     def take_back(self, loan: _Loan) -> None:
-        """Let no other task start in these slots, and say when they are free."""
+        """Reserve the slots of a loan, and set `returned` of the loan once the slots are free."""
         self._loans[loan.key] -= 1
         if not self._loans[loan.key]:
             del self._loans[loan.key]
@@ -137,7 +137,7 @@ class Lender:
         for name, number in slots.items():
             available, total = slots_here(self.worker, name)
             free = available + sum(loan.slots.get(name, 0) for loan in self._returning)
-            # All that there are may be fewer than before: the partition has changed.
+            # The total may be smaller than the loan: the partition has changed.
             if free < min(number, total):
                 return False
         return True
@@ -145,11 +145,11 @@ class Lender:
     # -- who wants slots ---------------------------------------------------------------
 
     def slots_wanted(self) -> bool:
-        """Whether nested tasks, or tasks that have lent, wait for slots or a thread here."""
+        """Return whether nested or returning tasks wait for slots or a thread of the worker."""
         return bool(self._nested or self._returning or self._rejoining)
 
     def lends_at_once(self, loan: _Loan) -> bool:
-        """Whether a task lends in each wait, because threads may be short without slots being so.
+        """Return whether a task lends in each wait: threads may be short while slots are free.
 
         Dask counts a task that has seceded as long-running to its end, also in a thread of the
         worker: with more slots than threads, a nested task then starts, and waits for that thread.
@@ -164,7 +164,7 @@ class Lender:
                 waiter.set()
 
     def transition(self, key: Any, finish: str) -> None:
-        """Follow the tasks of the worker: "constrained" are those that wait for slots."""
+        """Follow the tasks of the worker; tasks in the state "constrained" wait for slots."""
         self._nested.pop(key, None)
         if finish not in ("executing", "long-running"):
             self._lent.discard(key)
@@ -175,7 +175,7 @@ class Lender:
         self.serve()
 
     def stop(self) -> None:
-        """End with the last partition: give all slots back, and warn of nothing more."""
+        """End with the last partition: forget waiting tasks, and warn no more."""
         self._nested.clear()
         if self._next_look is not None:
             self._next_look.cancel()
@@ -190,9 +190,12 @@ class Lender:
     def _look(self) -> None:
         """Ask for each task that has waited long whether its submitter holds slots."""
         self._next_look = None
-        now = time.monotonic()
+        looked_at = time.monotonic()
         for key, nested in self._nested.items():
-            if now - nested.since >= WARN_AFTER_S and nested.submitter.key not in self._warned:
+            if (
+                looked_at - nested.since >= WARN_AFTER_S
+                and nested.submitter.key not in self._warned
+            ):
                 self._warned.add(nested.submitter.key)
                 self.worker.loop.add_callback(self._warn, key, nested.submitter)
         if self._nested:
@@ -201,7 +204,7 @@ class Lender:
             self._warned.clear()
 
     def holds_slots(self, key: Any) -> bool:
-        """Whether a task runs here, has not lent its slots, and does not wait for them."""
+        """Return whether a task runs here and holds its slots."""
         waits = any(loan.key == key for loan in self._returning)
         return is_running(self.worker, key) and not (self._loans[key] or waits)
 
@@ -214,8 +217,8 @@ class Lender:
         if not holds or key not in self._nested:
             self._warned.discard(submitter.key)
             return
-        wanted = resources_of(self.worker.state.tasks[key])
-        names = " and ".join(repr(name) for name in wanted)
+        restrictions = resources_of(self.worker.state.tasks[key])
+        names = " and ".join(repr(name) for name in restrictions)
         message = (
             f"Task {submitter.key!r} of partition {names} holds a slot while task {key!r}, which "
             "it has submitted, waits for one. If it polls, as with Future.done in a loop, both "
@@ -227,7 +230,7 @@ class Lender:
 
 
 def _holds_slots(key: Any, dask_worker: Any = None) -> bool:
-    """Whether a task holds slots of a worker; runs on that worker."""
+    """Return whether a task holds slots of a worker; runs on that worker."""
     lender = _lenders.get(dask_worker)
     return lender is not None and lender.holds_slots(key)
 
@@ -236,7 +239,7 @@ def _holds_slots(key: Any, dask_worker: Any = None) -> bool:
 
 
 def _loan_of_thread() -> tuple[Lender, _Loan] | None:
-    """Return what the task of this thread may lend; None if it has nothing to lend."""
+    """Return the lender and a new loan for the task of this thread; None without slots."""
     running = task_of_thread()
     if running is None or getattr(_thread, "in_loan", False):
         return None
@@ -252,11 +255,11 @@ class _WaitHooks:
     """What the waits of clients call, see `internals.client.WaitHooks`."""
 
     def may_lend(self) -> bool:
-        """Whether the task of this thread has slots that it may lend."""
+        """Return whether the task of this thread has slots to lend."""
         return _loan_of_thread() is not None
 
     def until_wanted(self, answer: concurrent.futures.Future[Any]) -> None:
-        """Wait until a call has its answer, or other tasks want the slots."""
+        """Wait until a call has its answer, or further tasks want the slots."""
         loan_of_task = _loan_of_thread()
         if loan_of_task is None:
             return
@@ -276,7 +279,7 @@ class _WaitHooks:
 
     @contextmanager
     def lent(self, waits: bool = True) -> Iterator[None]:
-        """Lend the slots and the thread of this thread's task, if it waits.
+        """Lend the slots and the thread of this thread's task within the block, if `waits`.
 
         At the end of the block the thread waits until the task has them back.
         """
@@ -316,7 +319,7 @@ slots_lent = WAIT_HOOKS.lent
 
 
 def begin_lending(worker: Any, name: str) -> Lender:
-    """Have the tasks of a partition lend on this worker; runs in its event loop."""
+    """Let the tasks of a partition lend on a worker; runs in its event loop."""
     with _lock:
         let_waits_lend(WAIT_HOOKS)
         lender = _lenders.setdefault(worker, Lender(worker))
@@ -325,7 +328,7 @@ def begin_lending(worker: Any, name: str) -> Lender:
 
 
 def end_lending(worker: Any, name: str) -> None:
-    """Have them keep their slots again."""
+    """Let the tasks of a partition keep their slots again."""
     with _lock:
         lender = _lenders[worker]
         lender.names.discard(name)
@@ -336,9 +339,10 @@ def end_lending(worker: Any, name: str) -> None:
 
 
 def lending_plugin(name: str) -> bytes:
-    """Plugin by which workers begin, and end; those without this package ignore it.
+    """Return a pickled plugin by which workers begin to lend, and end with its removal.
 
-    A worker that joins gets tasks before any request can reach it. A plugin comes first.
+    A joining worker gets tasks before a request can reach the worker, and plugins before its tasks.
+    Workers without this package ignore the plugin.
     """
 
     class LendingPlugin(WorkerPlugin):

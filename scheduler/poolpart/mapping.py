@@ -49,7 +49,7 @@ Row = tuple[Call, ...]  # of one item, by stage: arguments besides the previous 
 
 @dataclass(frozen=True)
 class Chunk:
-    """Items of one task: index of the first, and the calls of each, by stage."""
+    """Items of a task: index of the first item, and the calls of each item, by stage."""
 
     first: int
     rows: Sequence[Row]
@@ -64,32 +64,52 @@ class ChunkResult:
     nbytes: int  # estimated size of items and results
 
     def __sizeof__(self) -> int:
-        """Size in bytes that Dask counts and spills by: that of the results."""
+        """Return the size of the results in bytes, by which Dask counts and spills."""
         return int(sizeof(self.results))
 
 
 def run_chunk(
     function: Callable[..., Any],
-    patience_s: float,
-    at: int,
-    return_exceptions: bool,
     first: int,
     calls: Sequence[Call],
     keywords: dict[str, Any],
-    before: ChunkResult | None = None,
+    previous: ChunkResult | None = None,
+    *,
+    patience_s: float,
+    result_position: int,
+    return_exceptions: bool,
 ) -> ChunkResult:
-    """Call a function for the items of a chunk, one after the other; runs on a worker.
+    """Call a function for each item of a chunk in turn; runs on a worker.
 
-    It stops early after `patience_s` seconds, so that items which take longer than earlier ones do
-    not wait for each other on one worker. An error of the first item is the task's; at a later
-    one it stops, and the error occurs when the rest is sent again; with `return_exceptions`, the
-    error is the item's result. Argument number `at` is the result of the stage before.
+    The task fails if the function fails for the first item of the chunk. If the function fails for
+    a later item, the task ends before that item, and the error occurs when the items are sent
+    again.
+
+    Parameters
+    ----------
+    function, keywords
+        The function and its keyword arguments.
+    first
+        Index of the first item of the chunk in the map.
+    calls
+        Positional arguments of each call, without the result of the previous stage.
+    previous
+        Results of the previous stage, if there is one.
+    patience_s
+        The task ends after the item at which so many seconds have passed, so that items which take
+        longer than earlier items do not wait for each other on one worker.
+    result_position
+        Position of the previous result among the arguments.
+    return_exceptions
+        Return the error of an item as its result.
     """
     start = time.perf_counter()
     results: list[Any] = []
-    if before is not None:
-        made = zip(calls, before.results, strict=False)
-        calls = [(*call[:at], result, *call[at:]) for call, result in made]
+    if previous is not None:
+        calls = [
+            (*call[:result_position], result, *call[result_position:])
+            for call, result in zip(calls, previous.results, strict=False)
+        ]
     for number, call in enumerate(calls, first):
         try:
             results.append(_call(function, call, keywords))
@@ -106,8 +126,8 @@ def run_chunk(
         if time.perf_counter() - start > patience_s:
             break
     seconds = time.perf_counter() - start
-    if before is not None:
-        seconds += before.seconds
+    if previous is not None:
+        seconds += previous.seconds
     return ChunkResult(results, seconds, sizeof(calls) + sizeof(results))
 
 
@@ -120,7 +140,7 @@ def _call(function: Callable[..., Any], call: Call, keywords: dict[str, Any]) ->
 
 
 def _sendable(error: Exception) -> Exception:
-    """Copy an error without its traceback, or, as Dask does, make one that can be pickled."""
+    """Return a copy of an error without its traceback, or a similar error that can be pickled."""
     try:
         copy: Exception = loads(dumps(error))
     except Exception:
@@ -181,14 +201,14 @@ class Stage:
     slots: int = 1
     return_exceptions: bool = False
     keywords: dict[str, Any] = field(default_factory=dict)
-    at: int = 0  # number of the argument that is the result of the stage before
+    result_position: int = 0  # number of the argument that is a result of the stage before
     by_rule: bool = False  # the partition can be dissolved
 
     def __post_init__(self) -> None:
-        for name, least in (("window", 1), ("chunk", 1), ("retries", 0)):
+        for name, minimum in (("window", 1), ("chunk", 1), ("retries", 0)):
             value = getattr(self, name)
-            if value is not None and (not isinstance(value, int) or value < least):
-                raise ValueError(f"{name} is {value!r}; give a whole number, {least} or more.")
+            if value is not None and (not isinstance(value, int) or value < minimum):
+                raise ValueError(f"{name} is {value!r}; give a whole number, {minimum} or more.")
 
     def running(self) -> int:
         """Tasks of this stage that run at a time, with all workers that may be started.
@@ -207,20 +227,26 @@ class Stage:
         patience_s: float,
         firsts: Sequence[int],
         calls: Sequence[Sequence[Call]],
-        before: Sequence[Future] | None = None,
+        previous_tasks: Sequence[Future] | None = None,
     ) -> list[Future]:
-        """Submit a task for each chunk; `before` are the tasks of the stage before."""
+        """Submit a task for each chunk; `previous_tasks` are those of the stage before."""
         # Dask tries again only what fails.
         keep_errors = self.return_exceptions and not self.retries
         # One message is cheaper for the scheduler than one for each task.
         futures: list[Future] = self.client.map(
-            partial(run_chunk, self.function, patience_s, self.at, keep_errors),
+            partial(
+                run_chunk,
+                self.function,
+                patience_s=patience_s,
+                result_position=self.result_position,
+                return_exceptions=keep_errors,
+            ),
             firsts,
             calls,
             # As an argument, so that futures among them are replaced by results. Dask's own keyword
             # arguments share one key on the cluster if they are large.
             [self.keywords] * len(firsts),
-            *([before] if before else []),
+            *([previous_tasks] if previous_tasks else []),
             key=f"map-{funcname(self.function)}",
             pure=False,
             priority=self.priority,
@@ -244,42 +270,42 @@ class Results(Iterator[Any]):
         self._length = math.inf if math.inf in lengths else min(lengths, default=0)
         self._closed = False
         self._begun = False  # a result was requested
-        self._taken = 0  # items taken from the source
-        self._again: list[tuple[int, Sequence[Row]]] = []  # heap of items to be sent once more
+        self._items_read = 0  # from the source
+        self._unfinished: list[tuple[int, Sequence[Row]]] = []  # heap of items to be sent again
         self._size = ChunkSize()
         self._running: dict[Future, Chunk] = {}
-        self._done: queue.SimpleQueue[Future] = queue.SimpleQueue()
-        # {index of its first item: a chunk that was fetched and not delivered yet}
-        self._back: dict[int, tuple[Chunk, ChunkResult | Future]] = {}
+        self._ended: queue.SimpleQueue[Future] = queue.SimpleQueue()  # tasks that were sent
+        # {index of the first item: a chunk that has ended, and its result or the failed task}
+        self._undelivered: dict[int, tuple[Chunk, ChunkResult | Future]] = {}
         self._next_item = 0  # index of the next one to deliver, if in order
         self._ready: deque[Any] = deque()  # results to be delivered
         self._failed: tuple[Chunk, Future] | None = None  # to be raised after these
         maps = [n for n, i in enumerate(iterables) if isinstance(i, Results) and not i._begun]
         # A second map is an ordinary iterable: its tasks have other items.
-        before = iterables[maps[0]] if maps else None
-        if isinstance(before, Results):
-            others = [i for i in iterables if i is not before]
-            self._follow(before, replace(stage, at=maps[0]), others)
+        previous = iterables[maps[0]] if maps else None
+        if isinstance(previous, Results):
+            other_iterables = [i for i in iterables if i is not previous]
+            self._follow(previous, replace(stage, result_position=maps[0]), other_iterables)
         else:
             self._stages: tuple[Stage, ...] = (stage,)
             self._source: Iterator[Row] = ((call,) for call in zip(*iterables, strict=False))
             self._look()
         self._submit()
 
-    def _follow(self, before: Results, stage: Stage, iterables: Sequence[Iterable[Any]]) -> None:
+    def _follow(self, previous: Results, stage: Stage, iterables: Sequence[Iterable[Any]]) -> None:
         """Take over an unread map, as the stages before the last."""
         calls: Iterator[Call] = zip(*iterables, strict=False) if iterables else repeat(())
-        self._stages = (*before._stages, stage)
-        self._source = ((*row, call) for call, row in zip(calls, before._source, strict=False))
-        self._taken = before._taken
+        self._stages = (*previous._stages, stage)
+        self._source = ((*row, call) for call, row in zip(calls, previous._source, strict=False))
+        self._items_read = previous._items_read
         self._look()
         sent: dict[Future, Chunk] = {}
-        for future, chunk in before._running.items():
+        for future, chunk in previous._running.items():
             if rows := [(*row, call) for row, call in zip(chunk.rows, calls, strict=False)]:
                 sent[future] = Chunk(chunk.first, rows)
         self._run([*sent.values()], [*sent])
-        before._begun = before._closed = True
-        before._running.clear()
+        previous._begun = previous._closed = True
+        previous._running.clear()
 
     # -- for the user ------------------------------------------------------------------
 
@@ -315,13 +341,14 @@ class Results(Iterator[Any]):
         last = self._stages[-1]
         return (
             f"<Results of {funcname(last.function)} on {last.partition!r}: "
-            f"{self._taken} items taken, {state}>"
+            f"{self._items_read} items taken, {state}>"
         )
 
     def close(self) -> None:
         """Stop: waiting tasks are cancelled, results that were not read are dropped."""
-        self._closed, self._failed = True, None
-        for held in (self._ready, self._back, self._again):
+        self._closed = True
+        self._failed = None
+        for held in (self._ready, self._undelivered, self._unfinished):
             held.clear()
         # Release each one: the callback that waits for it holds a reference as well.
         for future in self._running:
@@ -335,7 +362,7 @@ class Results(Iterator[Any]):
     # -- steps -------------------------------------------------------------------------
 
     def _step(self) -> None:
-        """Wait for tasks, fetch their results, send more."""
+        """Wait for tasks, fetch their results, and send further tasks."""
         if not self._running:
             self._submit()
         if self._running:
@@ -354,7 +381,7 @@ class Results(Iterator[Any]):
         self._next_look = time.monotonic() + LOOK_S
 
     def _submit(self) -> None:
-        """Send chunks, several in one message, up to the window."""
+        """Send chunks up to the window, in as few messages as possible."""
         size, window = self._sizes()
         free = window - len(self._running)
         # Avoid a message for each chunk; the tasks under way keep the slots busy.
@@ -362,7 +389,7 @@ class Results(Iterator[Any]):
             return
         chunks: list[Chunk] = []
         # Chunks that came out of order take room as well, but not from earlier items.
-        fresh = free - len(self._back)
+        fresh = free - len(self._undelivered)
         while len(chunks) < free and (chunk := self._next_chunk(size, len(chunks) < fresh)):
             chunks.append(chunk)
         self._run(chunks)
@@ -380,33 +407,34 @@ class Results(Iterator[Any]):
             window = max(window, grown)
         return size, window
 
-    def _run(self, chunks: Sequence[Chunk], done: list[Future] | None = None) -> None:
-        """Send chunks through all stages, or through the last if the others are `done`."""
+    def _run(self, chunks: Sequence[Chunk], previous_tasks: list[Future] | None = None) -> None:
+        """Send chunks through all stages, or through the last stage after `previous_tasks`."""
         if not chunks:
             return
         firsts = [chunk.first for chunk in chunks]
         stages = list(enumerate(self._stages))
-        futures = done
-        for number, stage in stages if done is None else stages[-1:]:
+        futures = previous_tasks
+        for number, stage in stages if previous_tasks is None else stages[-1:]:
             patience_s = math.inf if stage.chunk else PATIENCE * self._target_s()
             calls = [[row[number] for row in chunk.rows] for chunk in chunks]
             # Only the next task holds the result of a stage.
             futures = stage.send(patience_s, firsts, calls, futures)
         for future, chunk in zip(futures or [], chunks, strict=True):
             self._running[future] = chunk
-            when_done(future, self._done.put)
+            when_done(future, self._ended.put)
 
     def _next_chunk(self, size: int, fresh: bool) -> Chunk | None:
-        """Take items: first those to send again, then, if `fresh`, from the source."""
-        if self._again:
-            first, rows = heapq.heappop(self._again)
+        """Return a chunk of items to send again or, if `fresh`, of new items; None if empty."""
+        if self._unfinished:
+            first, rows = heapq.heappop(self._unfinished)
             if len(rows) > size:
-                heapq.heappush(self._again, (first + size, rows[size:]))
+                heapq.heappush(self._unfinished, (first + size, rows[size:]))
             return Chunk(first, rows[:size])
         if not fresh:
             return None
         rows = list(islice(self._source, size))
-        first, self._taken = self._taken, self._taken + len(rows)
+        first = self._items_read
+        self._items_read += len(rows)
         return Chunk(first, rows) if rows else None
 
     def _target_s(self) -> float:
@@ -414,15 +442,15 @@ class Results(Iterator[Any]):
 
     def _wait(self) -> list[Future]:
         """Wait until tasks are done; a task of a partition lends its slots meanwhile."""
-        done: list[Future] = []
-        with slots_lent(self._done.empty()):
-            while not done:
+        ended: list[Future] = []
+        with slots_lent(self._ended.empty()):
+            while not ended:
                 self._check_while_waiting()
                 with suppress(queue.Empty):
-                    done.append(self._done.get(timeout=1))
-        while not self._done.empty():
-            done.append(self._done.get())
-        return done
+                    ended.append(self._ended.get(timeout=1))
+        while not self._ended.empty():
+            ended.append(self._ended.get())
+        return ended
 
     def _check_while_waiting(self) -> None:
         """Raise if the client was closed, and count the partition's slots from time to time."""
@@ -431,33 +459,33 @@ class Results(Iterator[Any]):
                 f"The client of partition {self._stages[-1].partition!r} was closed."
             )
         # Not while there are results: those of a partition that was dissolved are read first.
-        if self._done.empty() and time.monotonic() > self._next_look:
+        if self._ended.empty() and time.monotonic() > self._next_look:
             self._look()
 
-    def _take_back(self, done: list[Future]) -> None:
+    def _take_back(self, ended: list[Future]) -> None:
         """Fetch the results of finished tasks, all at once."""
         finished = []
-        for future in done:
+        for future in ended:
             if future.status == "finished":
                 finished.append(future)
             elif future.status in ("pending", "lost"):  # lost with its worker: run it again
-                when_done(future, self._done.put)
+                when_done(future, self._ended.put)
             else:
                 chunk = self._running.pop(future)
-                self._back[chunk.first] = chunk, future
+                self._undelivered[chunk.first] = chunk, future
         answers = self._stages[-1].client.gather(finished) if finished else ()
         for future, answer in zip(finished, answers, strict=True):
             chunk = self._running.pop(future)
-            self._back[chunk.first] = chunk, answer
+            self._undelivered[chunk.first] = chunk, answer
             self._size.learn(max(1, len(answer.results)), answer.seconds, answer.nbytes)
 
     def _deliver(self) -> None:
         """Queue the results to be delivered next."""
-        while self._back and self._failed is None:
-            first = self._next_item if self._stages[-1].ordered else next(iter(self._back))
-            if first not in self._back:
+        while self._undelivered and self._failed is None:
+            first = self._next_item if self._stages[-1].ordered else next(iter(self._undelivered))
+            if first not in self._undelivered:
                 return
-            chunk, answer = self._back.pop(first)
+            chunk, answer = self._undelivered.pop(first)
             if isinstance(answer, Future):
                 error = answer.exception() if self._stages[-1].return_exceptions else None
                 if not _of_item(error):
@@ -468,7 +496,7 @@ class Results(Iterator[Any]):
             self._ready.extend(answer.results)
             self._next_item += count
             if count < len(chunk.rows):
-                heapq.heappush(self._again, (first + count, chunk.rows[count:]))
+                heapq.heappush(self._unfinished, (first + count, chunk.rows[count:]))
 
     def _raise(self, chunk: Chunk, future: Future) -> NoReturn:
         """Stop, and raise a task's error; a note names the item."""
@@ -492,7 +520,7 @@ def _of_item(error: BaseException | None) -> bool:
 
 
 def _length(iterable: Iterable[Any]) -> float:
-    """Return the number of items to come; infinite if it is not known."""
+    """Return the number of items to come, or infinity if an iterable has no length."""
     if isinstance(iterable, Results):
         return iterable._length - iterable.done
     return len(iterable) if isinstance(iterable, Sized) else math.inf

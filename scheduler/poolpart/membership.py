@@ -12,7 +12,7 @@ from distributed import Client
 
 from .adapting import slots_of_new_worker
 from .errors import PoolError
-from .inherit import begin_inheritance, is_inherited, workers_told
+from .inherit import begin_inheritance, is_inherited, workers_informed
 from .internals.worker import task_of_thread
 from .steward import NAME as STEWARD
 from .steward import Steward
@@ -23,7 +23,7 @@ KEEP_S = 1.0  # for which an answer is kept: a request for each task would take 
 
 @dataclass(frozen=True)
 class Membership:
-    """Members of a partition at one moment."""
+    """Members of a partition when the scheduler was asked."""
 
     names: Mapping[str, str]  # {address of a present member: its name}
     max_slots: float  # of one member, including members that are starting or may be started
@@ -62,7 +62,7 @@ def forget_memberships() -> None:
 
 
 def check_slots(client: Client, name: str, slots: int, made_by_rule: bool) -> bool:
-    """Check that a partition may run a task; returns whether the partition has a rule, or had one.
+    """Check that a partition may run a task; return whether the partition has, or had, a rule.
 
     Raises
     ------
@@ -142,6 +142,6 @@ async def _look(name: str, client_id: str, in_task: bool, dask_scheduler: Any = 
         # that other clients have begun.
         if not (in_task and is_inherited(dask_scheduler, name)):
             begin_inheritance([name], dask_scheduler, client_id)
-        await workers_told()
+        await workers_informed()
     nonmembers = frozenset(workers.keys() - members.keys())
     return Membership(members, max(slots, default=0), has_rule, nonmembers)

@@ -18,7 +18,7 @@ _LABELS = ["partition"]
 
 
 class PartitionCollector:
-    """Collects the figures of one scheduler's partitions whenever they are requested."""
+    """Collects the figures of a scheduler's partitions at each request."""
 
     def __init__(self, collect_stats: Callable[[], list[PartitionStats]]) -> None:
         self._collect_stats = collect_stats

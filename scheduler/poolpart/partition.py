@@ -32,9 +32,9 @@ _entered: ContextVar[tuple[ExitStack, ...]] = ContextVar("_entered", default=())
 class Partition:
     """The workers of a cluster that declare the resource `name`.
 
-    Every task that it submits takes a slot of that resource, so that it runs on these workers
-    only. The members are the workers that declare the resource now, including restarted
-    workers and ones that joined with it.
+    Every task of a partition takes a slot of the resource, and so runs on these workers only. The
+    members are the workers that declare the resource now, including restarted workers and workers
+    that joined with the resource.
 
     Parameters
     ----------
@@ -49,16 +49,20 @@ class Partition:
 
     Notes
     -----
-    It can be an argument of a task, which then submits with the client of its worker. What a task
-    of a partition submits to a `Client` belongs to the same partition and takes a slot; the task
-    lends its own while it waits for results.
+    A partition can be an argument of a task, which then submits with the client of its worker.
+    Tasks that a task of a partition submits to a `Client` belong to the same partition and take a
+    slot each; the submitting task lends its own slot while it waits for results. Release a
+    `threading.Lock` before such a wait: a task that borrows the slot may wait for the lock, and
+    then neither task goes on. A `distributed.Lock` may be held.
     """
 
     def __init__(
         self, name: str, client: Client | None = None, note: str = "", by_rule: bool = False
     ) -> None:
-        self.name, self.note = name, note
-        self._client, self._by_rule = client, by_rule
+        self.name = name
+        self.note = note
+        self._client = client
+        self._by_rule = by_rule
 
     def __reduce__(self) -> tuple[Any, ...]:
         return Partition, (self.name, None, self.note, self._by_rule)
@@ -89,7 +93,7 @@ class Partition:
         return f"<Partition {self.name!r}{'; ' + self.note if self.note else ''}>"
 
     def stats(self) -> PartitionStats:
-        """Its load and its finished tasks, whoever submitted them.
+        """Return the load and the finished tasks of the partition, of all clients.
 
         Tasks are counted from the division of the pool on; in a partition that the workers were
         started with, from the first call.
@@ -99,8 +103,8 @@ class Partition:
         PoolError
             If the scheduler lacks this package.
         """
-        found: list[PartitionStats] = on_scheduler(self.client, stats_of, names=[self.name])
-        return found[0]
+        stats: list[PartitionStats] = on_scheduler(self.client, stats_of, names=[self.name])
+        return stats[0]
 
     # -- tasks -------------------------------------------------------------------------
 
@@ -116,7 +120,7 @@ class Partition:
         workers: str | int | Sequence[str | int] | None = None,
         **kwargs: Any,
     ) -> Future:
-        """Submit one task to these workers.
+        """Submit a task to the workers of this partition.
 
         Parameters
         ----------
@@ -171,7 +175,7 @@ class Partition:
         )
 
     def _taking(self, slots: int, asks: bool = True) -> dict[str, int]:
-        """Resources of a task, which is checked first; `asks` allows a request."""
+        """Check and return the resources of a task; `asks` allows a request to the scheduler."""
         if not isinstance(slots, int) or slots < 1:
             raise ValueError(f"slots is {slots!r}; give a whole number, 1 or more.")
         if asks:
@@ -248,8 +252,20 @@ class Partition:
         require(MAP)
         _refuse_coroutine(self.name, function)
         self._taking(slots)
-        options = (ordered, window, chunk, priority, retries, slots, return_exceptions, kwargs)
-        stage = Stage(self.client, self.name, function, *options, by_rule=self._by_rule)
+        stage = Stage(
+            self.client,
+            self.name,
+            function,
+            ordered=ordered,
+            window=window,
+            chunk=chunk,
+            priority=priority,
+            retries=retries,
+            slots=slots,
+            return_exceptions=return_exceptions,
+            keywords=kwargs,
+            by_rule=self._by_rule,
+        )
         return Results(stage, iterables)
 
     def for_each(
@@ -435,7 +451,7 @@ class Partition:
     # -- workers that come and go ------------------------------------------------------
 
     def adapt(self, minimum: int, maximum: int, *, idle_s: float = IDLE_S) -> None:
-        """Let the number of jobs follow the work, where `start_partitions` has started them.
+        """Let the number of jobs of a `start_partitions` partition follow the work.
 
         Jobs are started for tasks that can run and have no slot, second by second, and for what
         clients `want`. One is returned, or cancelled while it waits in the queue, when it was not
@@ -483,7 +499,7 @@ class Partition:
         >>> gpu.want(4)                                                # doctest: +SKIP
         True
         """
-        check_count("The number of slots that are wanted", slots, least=0)
+        check_count("The number of slots that are wanted", slots, minimum=0)
         asking = {"slots": slots, "asking": self.client.id}
         return bool(on_scheduler(self.client, want, name=self.name, **asking))
 

@@ -17,6 +17,7 @@ from __future__ import annotations
 
 import asyncio
 import math
+import threading
 import time
 import uuid
 from collections import deque
@@ -31,7 +32,7 @@ from distributed.protocol.pickle import dumps
 from .errors import PipeClosed, PipeFailed
 from .internals.client import ask
 from .internals.names import PIPES, require
-from .internals.queues import unpack
+from .internals.queues import Packed, unpack
 from .internals.worker import task_of_thread
 from .pipe_states import CHANGE, PUT, TAKE, Replies, Reply, delete_pipes, open_pipe
 from .task_context import own_client
@@ -58,12 +59,19 @@ class Pipe:
     or was deleted, raises the same error, also in `close` and `fail`. If the scheduler has died,
     calls raise OSError, after Dask's ``distributed.comm.timeouts.connect``.
 
-    A consumer takes all that is queued, some `capacity` items, in one request; `get` and
+    A consumer takes all queued items, up to about `capacity`, in one request; `get` and
     iteration hand them out one by one. At most ``capacity * (1 + consumers)`` items are
     under way. With slow items and several consumers, choose a small capacity, so that no consumer
     holds items while another idles. Items that an object has taken are lost if its process dies, or
     if the object is dropped, such as by a `break` and the end of the task: for exactly-once
     delivery, record what has arrived, and put missing items again.
+
+    Each object hands out items in the order in which they were put, but threads that share an
+    object get them in any order. An item that cannot be unpickled raises its error when its turn
+    comes, and is lost; the items after it are not. A wait that is interrupted, as by Ctrl-C, takes
+    no item away: an item that arrives within the next second stays in the object for its next
+    `get`. A thread that an event loop no longer awaits (`asyncio.to_thread`) goes on waiting, and
+    its item is lost: use `timeout_s` there.
 
     Parameters
     ----------
@@ -81,7 +89,9 @@ class Pipe:
     Any client can use ``Queue(pipe.name)`` and ``Variable(pipe.name)`` of Dask. The items of the
     queue are those of the pipe, in the same order and within the same capacity; its `put` and `get`
     raise `PipeClosed` and `PipeFailed`, too. Unlike `Pipe.get`, `Queue.get` loses an item if its
-    client is killed while it waits: the scheduler does not know whose request it is. The variable
+    client is killed while it waits: the scheduler does not know whose request it is. A
+    ``Queue.get(batch=5)`` that has got fewer items when the pipe ends raises, and loses these
+    items: use ``batch=True``, which does not wait. The variable
     is the state, see `poolpart.pipe_states.PipeState`. ``variable.set({**variable.get(), "closed":
     True})`` closes the pipe; what does not follow from the state is a ValueError, also if the state
     has changed since it was read: read and set it again. ``Variable.delete``, or releasing the last
@@ -109,8 +119,10 @@ class Pipe:
         self.capacity = capacity
         self.producers = producers
         self._client = client
-        self._taken: deque[Any] = deque()
-        self._advice: int | None = None  # as the last request found it
+        # Items that the scheduler has handed over and no call has returned yet. The event loop of
+        # the client appends them, threads that share this object remove them.
+        self._buffer: deque[Packed] = deque()
+        self._advice: int | None = None  # of the last reply
 
     def __reduce__(self) -> tuple[Any, ...]:
         return Pipe, (self.name, self.capacity, None, self.producers)
@@ -149,7 +161,7 @@ class Pipe:
         return self
 
     def delete(self) -> None:
-        """Delete the pipe on the scheduler, with its items; no error if it is gone."""
+        """Delete the pipe on the scheduler, with its items; do nothing if the pipe is gone."""
         forget_pipes(self.client, [self.name])
 
     def __enter__(self) -> Pipe:
@@ -167,20 +179,34 @@ class Pipe:
         return reply
 
     def _change(self, **changes: Any) -> Reply:
-        """Change the state of the pipe, or only look at it."""
+        """Change the state of the pipe; without changes, return the current state."""
         return self._reply(_ask(self.client, CHANGE, names=[self.name], **changes))
 
     def _ask_until(
-        self, deadline: float, settled: Callable[[Reply], Any], question: str, **arguments: Any
+        self,
+        deadline: float,
+        is_settled: Callable[[Reply], Any],
+        question: str,
+        on_reply: Callable[[Reply], None] = lambda reply: None,
+        **arguments: Any,
     ) -> Reply:
-        """Ask the scheduler again and again until a reply is settled, or a deadline has passed."""
+        """Repeat a request to the scheduler until a reply is settled or a deadline has passed.
 
-        def is_settled(replies: Replies) -> bool:
+        A reply is also settled if the pipe has ended. `on_reply` is called with each reply in the
+        event loop of the client, even if this thread has been interrupted.
+        """
+
+        def has_settled_reply(replies: Replies) -> bool:
             reply = replies.get(self.name)
-            return reply is None or bool(reply["failure"] or reply["closed"] or settled(reply))
+            return reply is None or bool(reply["failure"] or reply["closed"] or is_settled(reply))
 
+        def pass_on(replies: Replies) -> None:
+            if self.name in replies:
+                on_reply(replies[self.name])
+
+        options = {"names": [self.name], **arguments}
         return self._reply(
-            _ask_until(self.client, deadline, is_settled, question, names=[self.name], **arguments)
+            _ask_until(self.client, deadline, has_settled_reply, question, pass_on, **options)
         )
 
     # -- both ends ---------------------------------------------------------------------
@@ -191,7 +217,7 @@ class Pipe:
         return int(self._change()["answer"])
 
     def close(self) -> None:
-        """End the pipe for one producer, and with the last one for all.
+        """Close the pipe for a producer; the last producer closes the pipe for all.
 
         Then nothing can be put, and consumers take the remaining items and end. With several
         `producers`, each task counts once, also if it is run again; elsewhere each call counts.
@@ -209,14 +235,14 @@ class Pipe:
 
     @property
     def advice(self) -> int:
-        """Number of records that the consumer wants bundled in one item, as of the last `put`.
+        """Number of records that the consumer wants bundled in an item, as of the last `put`.
 
         A producer may ignore it.
         """
         return int(self._change()["advice"] if self._advice is None else self._advice)
 
     def advise(self, amount: int) -> None:
-        """Set the number of records that producers should bundle in one item, 1 or more.
+        """Set the number of records that producers should bundle in an item, 1 or more.
 
         Only one consumer may call this.
         """
@@ -252,78 +278,40 @@ class Pipe:
     def put_many(
         self, items: Iterable[Any], timeout_s: float | None = None, *, unbounded: bool = False
     ) -> None:
-        """Add items in order, up to `capacity` of them in one request; waits like `put`.
+        """Add items in order, up to `capacity` items in a request; waits like `put`.
 
         The items may be endless; `capacity` of them are read before they are sent. After an error,
         such as that `timeout_s` was too short for all, the first of them may be in the pipe.
         """
         deadline = _deadline(timeout_s)
-        source, waiting = iter(items), list[bytes]()
-        while waiting := waiting or [dumps(item) for item in islice(source, self.capacity)]:
-            options = {"items": waiting, "unbounded": unbounded}
-            reply = self._ask_until(deadline, _has_answer, PUT, **options)
+        source = iter(items)
+        unsent: list[bytes] = []
+        while unsent := unsent or [dumps(item) for item in islice(source, self.capacity)]:
+            reply = self._ask_until(deadline, _is_answered, PUT, items=unsent, unbounded=unbounded)
             if reply["failure"]:
                 raise PipeFailed(reply["failure"])
             if reply["closed"]:
                 raise PipeClosed(f"Pipe {self.name!r} is closed; nothing can be put into it.")
-            waiting = waiting[reply["answer"] :]
-            if waiting and time.monotonic() > deadline:
+            unsent = unsent[reply["answer"] :]
+            if unsent and time.monotonic() > deadline:
                 raise TimeoutError(f"Pipe {self.name!r} stayed full for {timeout_s} s.")
 
     # -- consumers ---------------------------------------------------------------------
 
     def poll(self) -> list[Any]:
         """Take all queued items, possibly none; never waits, and raises `PipeFailed`."""
-        return self._take(-math.inf)[0]
-
-    def _take(self, deadline: float, linger_s: float = 0.0) -> tuple[list[Any], bool]:
-        """Return items, none if the deadline has passed, and whether the pipe is closed."""
-        buffered = []
-        with suppress(IndexError):  # threads may share this object
-            while True:
-                buffered.append(self._taken.popleft())
-        if buffered:
-            deadline = -math.inf
-        try:
-            reply = self._ask_until(deadline, _has_answer, TAKE, linger_s=linger_s)
-            if reply["failure"]:
-                raise PipeFailed(reply["failure"])
-        except BaseException:  # such as of a pipe that was deleted
-            self._taken.extendleft(reversed(buffered))
-            raise
-        return [*buffered, *self._unpacked(reply)], reply["closed"]
-
-    def _unpacked(self, reply: Reply) -> list[Any]:
-        return [unpack(self.client, packed) for packed in reply["answer"]]
-
-    def take_beside(self, futures: Sequence[Future], limit: int) -> tuple[list[Any], bool]:
-        """Take up to `limit` queued items, as soon as there are any or a task has ended.
-
-        For `Partition.for_each`. Returns the items, and whether the pipe is closed; raises
-        `PipeFailed`.
-        """
-        if taken := [self._taken.popleft() for _ in range(min(limit, len(self._taken)))]:
-            return taken, False
-        reply = self._ask_until(
-            math.inf,
-            lambda reply: reply["answer"] or any(future.done() for future in futures),
-            TAKE,
-            keys=[future.key for future in futures],
-            limit=limit,
-        )
-        if reply["failure"]:
-            raise PipeFailed(reply["failure"])
-        return self._unpacked(reply), reply["closed"]
+        self._fill_buffer(-math.inf)
+        return self._unpack(self._remove())
 
     def get_all(self, timeout_s: float | None = None, *, linger_s: float = 0.0) -> list[Any]:
-        """Take all queued items, as soon as there are any.
+        """Take all queued items; waits until there are any.
 
         Parameters
         ----------
         timeout_s
             Longest wait in seconds.
         linger_s
-            Wait so long for more once there are some.
+            Time in seconds for which to wait for further items after the first.
 
         Raises
         ------
@@ -334,22 +322,105 @@ class Pipe:
         TimeoutError
             If nothing came for so long.
         """
-        items, closed = self._take(_deadline(timeout_s), linger_s)
-        if items:
-            return items
-        if closed:
-            raise PipeClosed(f"Pipe {self.name!r} is closed and empty.")
-        raise TimeoutError(f"Nothing came through pipe {self.name!r} for {timeout_s} s.")
+        deadline = _deadline(timeout_s)
+        while True:
+            reply = self._fill_buffer(-math.inf if self._buffer else deadline, linger_s=linger_s)
+            if packed := self._remove():
+                return self._unpack(packed)
+            self._raise_at_end(reply, deadline, timeout_s)
 
     def get(self, timeout_s: float | None = None) -> Any:
-        """Take the next item; waits for one and 2 ms for others, and raises like `get_all`."""
-        try:
-            # One atomic operation: threads may share this object.
-            return self._taken.popleft()
-        except IndexError:
-            item, *more = self.get_all(timeout_s, linger_s=_LINGER_S)
-            self._taken.extend(more)
-            return item
+        """Take the next item; waits for an item and 2 ms for more, and raises like `get_all`."""
+        deadline = _deadline(timeout_s)
+        while True:
+            try:
+                packed = self._buffer.popleft()  # one atomic operation: threads may share this
+            except IndexError:
+                reply = self._fill_buffer(deadline, linger_s=_LINGER_S)
+                if not self._buffer:
+                    self._raise_at_end(reply, deadline, timeout_s)
+            else:
+                return unpack(self.client, packed)
+
+    @property
+    def buffered(self) -> int:
+        """Number of items that this object has taken and not returned."""
+        return len(self._buffer)
+
+    def take_beside(self, futures: Sequence[Future], limit: int) -> tuple[list[Any], bool]:
+        """Take up to `limit` queued items, as soon as there are any or a task has ended.
+
+        For `Partition.for_each`. With a limit of 0, waits for the end of the pipe or of a task.
+        Returns the items, and whether the scheduler has said that the pipe is closed; raises
+        `PipeFailed`.
+        """
+
+        def is_settled(reply: Reply) -> bool:
+            return bool(limit and self._buffer) or any(future.done() for future in futures)
+
+        closed = False
+        if not (limit and self._buffer):
+            keys = [future.key for future in futures]
+            reply = self._fill_buffer(math.inf, is_settled, keys=keys, limit=limit)
+            closed = reply["closed"]
+        return self._unpack(self._remove(limit)), closed
+
+    def _fill_buffer(
+        self,
+        deadline: float,
+        is_settled: Callable[[Reply], bool] | None = None,
+        **arguments: Any,
+    ) -> Reply:
+        """Have the event loop append queued items to the buffer; raises `PipeFailed`.
+
+        Returns the last reply, once the buffer has items (also of a request of another thread), or
+        after the deadline.
+        """
+
+        def append_items(reply: Reply) -> None:
+            if not reply["failure"]:
+                self._buffer.extend(reply["answer"])
+
+        def has_items(reply: Reply) -> bool:
+            return bool(self._buffer)
+
+        reply = self._ask_until(deadline, is_settled or has_items, TAKE, append_items, **arguments)
+        if reply["failure"]:
+            raise PipeFailed(reply["failure"])
+        return reply
+
+    def _remove(self, limit: float = math.inf) -> list[Packed]:
+        """Remove and return the first items of the buffer, at most `limit` items."""
+        packed: list[Packed] = []
+        with suppress(IndexError):  # threads may share this object
+            while len(packed) < limit:
+                packed.append(self._buffer.popleft())
+        return packed
+
+    def _unpack(self, packed: Sequence[Packed]) -> list[Any]:
+        """Return the items before the first that cannot be unpickled; raise the error of that item.
+
+        The error is raised if no item comes before. Items that are not returned go back to the
+        buffer.
+        """
+        items: list[Any] = []
+        for number, packed_item in enumerate(packed):
+            try:
+                items.append(unpack(self.client, packed_item))
+            except Exception:
+                remaining = packed[number:] if items else packed[1:]
+                self._buffer.extendleft(reversed(remaining))
+                if not items:
+                    raise
+                break
+        return items
+
+    def _raise_at_end(self, reply: Reply, deadline: float, timeout_s: float | None) -> None:
+        """Raise if no item can come any more, or none has come until the deadline."""
+        if reply["closed"]:
+            raise PipeClosed(f"Pipe {self.name!r} is closed and empty.")
+        if time.monotonic() > deadline:
+            raise TimeoutError(f"Nothing came through pipe {self.name!r} for {timeout_s} s.")
 
     def __iter__(self) -> Iterator[Any]:
         """Yield items until the pipe is closed and empty."""
@@ -362,18 +433,18 @@ def _deadline(timeout_s: float | None) -> float:
     return math.inf if timeout_s is None else time.monotonic() + timeout_s
 
 
-def _has_answer(reply: Reply) -> Any:
-    return reply["answer"]
+def _is_answered(reply: Reply) -> bool:
+    return bool(reply["answer"])
 
 
 def _producer() -> str:
-    """Return the key of the task that runs in this thread, or a random id in any other thread."""
+    """Return the key of the task of this thread, or a random id outside tasks."""
     running = task_of_thread()
     return uuid.uuid4().hex if running is None else str(running[1].key)
 
 
 def forget_pipes(client: Client, names: Sequence[str]) -> None:
-    """Delete these pipes on the scheduler, with their items; unknown ones are skipped."""
+    """Delete pipes on the scheduler, with their items; skip unknown pipes."""
     on_scheduler(client, delete_pipes, names=list(names))
 
 
@@ -404,7 +475,8 @@ def take_news(
 
     Returns
     -------
-    The items by pipe, of those that had some.
+    {pipe: its items}, without pipes that had no items. An item that cannot be unpickled raises, and
+    all items of the request are lost.
     """
     pickled = {name: [dumps(item) for item in items] for name, items in (puts or {}).items()}
     replies = _ask(
@@ -421,7 +493,7 @@ def take_news(
 
 
 def _ask(client: Client, question: str, **arguments: Any) -> Replies:
-    """Ask the scheduler once."""
+    """Send a request to the scheduler and return its replies."""
     check_client(client)
     replies = client.sync(ask, client, None, question, asker=client.id, **arguments)
     return replies or {}  # a scheduler without pipes has no such handler
@@ -432,23 +504,37 @@ def _ask_until(
     deadline: float,
     is_settled: Callable[[Replies], bool],
     question: str,
+    on_replies: Callable[[Replies], None],
     **arguments: Any,
 ) -> Replies:
-    """Ask the scheduler again until the replies are settled, or a deadline has passed.
+    """Repeat a request to the scheduler until its replies are settled or a deadline has passed.
 
-    All of it is one wait of this thread: a task of a partition that waits lends its slot once.
+    All requests are one wait of this thread: a task of a partition that waits lends its slot once.
     """
+    interrupted = threading.Event()
 
-    async def ask_until() -> Replies:
+    async def request() -> Replies:
+        seconds = min(_WAIT_S, max(0.0, deadline - time.monotonic()))
+        options = {"asker": client.id, "seconds": seconds, **arguments}
+        replies: Replies = await ask(client, None, question, **options) or {}
+        on_replies(replies)
+        return replies
+
+    async def repeat_request() -> Replies:
         while True:
-            seconds = min(_WAIT_S, max(0.0, deadline - time.monotonic()))
-            options = {"asker": client.id, "seconds": seconds, **arguments}
-            replies: Replies = await ask(client, None, question, **options) or {}
-            if is_settled(replies) or time.monotonic() > deadline:
+            # Dask cancels this wait if its thread is interrupted. The scheduler answers all the
+            # same, and has then removed the items from its queue.
+            replies = await asyncio.shield(request())
+            expired = time.monotonic() > deadline or interrupted.is_set()
+            if expired or is_settled(replies):
                 return replies
             # A reply may come at once, though not settled: while this client reconnects, or until
             # it hears that a task has ended.
             await asyncio.sleep(_AGAIN_S)
 
     check_client(client)
-    return client.sync(ask_until)
+    try:
+        return client.sync(repeat_request)
+    except BaseException:
+        interrupted.set()
+        raise

@@ -40,9 +40,9 @@ _SETTABLE = ("closed", "failure", "advice")  # what any client may set
 
 
 class PipeState:
-    """A pipe, as the scheduler and all clients see it.
+    """State and queue of a pipe on the scheduler.
 
-    The value of the Variable is a dict:
+    The value of the Variable, which all clients see, is a dict:
 
     ==========  ====================================================================
     owner       id of the client that has created the pipe, and with which it ends
@@ -74,10 +74,11 @@ class PipeState:
         self.put = self._dask.put
         self.take = self._dask.take
         self.delete = self._dask.delete
+        self.wake_early_readers = self._dask.wake_early_readers
 
     @property
     def value(self) -> dict[str, Any]:
-        """What the Variable says."""
+        """Value of the Variable."""
         value: dict[str, Any] = self._dask.value
         return value
 
@@ -92,34 +93,34 @@ class PipeState:
         return not self.exists or self.value["closed"] or bool(self.value["failure"])
 
     def why_no_get(self) -> PipeFailed | None:
-        """Return why no items may be taken any more; None if they may."""
+        """Return the error of taking items now, or None while items may be taken."""
         if not self.exists:
             return PipeFailed(f"Pipe {self.name!r} does not exist: it was deleted.")
         reason = self.value["failure"]
         return PipeFailed(reason) if reason else None
 
     def why_no_put(self) -> PipeFailed | PipeClosed | None:
-        """Return why no items may be put any more; None if they may."""
+        """Return the error of putting items now, or None while items may be put."""
         if (error := self.why_no_get()) is not None:
             return error
         return PipeClosed(f"Pipe {self.name!r} is closed.") if self.value["closed"] else None
 
     def change(self, **changes: Any) -> None:
-        """Change what the Variable says."""
+        """Change fields of the Variable."""
         self._dask.set({**self.value, **changes})
 
     def close(self, producer: str) -> None:
-        """Close the pipe for one of its producers; with the last of them it is closed."""
+        """Close the pipe for a producer; the last producer closes the pipe for all."""
         closed_by = tuple(dict.fromkeys((*self.value["closed_by"], producer)))
         closed = self.value["closed"] or len(closed_by) >= self.value["producers"]
         self.change(closed_by=closed_by, closed=closed)
 
     def fail(self, reason: str) -> None:
-        """Let the pipe fail; the first reason is the cause, later ones are its consequences."""
+        """Let the pipe fail; the first reason stays, later reasons are its consequences."""
         self.change(failure=self.value["failure"] or reason)
 
     def check(self, value: Any) -> None:
-        """Check what a client sets the Variable to; ValueError if that cannot follow."""
+        """Raise ValueError unless a client may set the Variable to a value."""
         if not self.exists:
             raise ValueError(f"Variable {self.name!r} belongs to a pipe that was deleted.")
         if doubt := self._doubt(value):
@@ -129,11 +130,12 @@ class PipeState:
             )
 
     def _doubt(self, value: Any) -> str:
-        now = self.value
-        if not isinstance(value, dict) or value.keys() != now.keys():
+        """Return why a client may not set the Variable to a value, or an empty string."""
+        state = self.value
+        if not isinstance(value, dict) or value.keys() != state.keys():
             return f"{value!r} has other fields"
         for name, setting in value.items():
-            current = now[name]
+            current = state[name]
             if name == "closed_by" and isinstance(setting, list | tuple):
                 # A list comes as a tuple from another process, and as a list from this one.
                 setting = tuple(setting)
@@ -142,9 +144,9 @@ class PipeState:
                 return f"{name} cannot be {setting!r}"
             if name not in _SETTABLE and setting != current:
                 return f"{name} cannot be changed to {setting!r}"
-        if now["closed"] and not value["closed"]:
+        if state["closed"] and not value["closed"]:
             return "a closed pipe stays closed"
-        if now["failure"] and value["failure"] != now["failure"]:
+        if state["failure"] and value["failure"] != state["failure"]:
             return "the first reason of a failure stays"
         return "" if value["advice"] >= 1 else f"advice is at least 1, not {value['advice']}"
 
@@ -159,7 +161,7 @@ def names_of_pipes(dask_scheduler: Any = None) -> list[str]:
     return list(pipes_of(dask_scheduler))
 
 
-def open_pipe(
+async def open_pipe(
     name: str, owner: str, capacity: int, producers: int, dask_scheduler: Any = None
 ) -> bool:
     """Create a pipe; False if its name is used. Runs on the scheduler."""
@@ -169,7 +171,9 @@ def open_pipe(
         return False
     if NAME not in dask_scheduler.plugins:
         dask_scheduler.add_plugin(Pipes(dask_scheduler))
-    pipes_of(dask_scheduler)[name] = PipeState(dask_scheduler, name, owner, capacity, producers)
+    state = PipeState(dask_scheduler, name, owner, capacity, producers)
+    pipes_of(dask_scheduler)[name] = state
+    await state.wake_early_readers()
     return True
 
 
@@ -200,13 +204,13 @@ class Pipes(SchedulerPlugin):
         self.delete([name for name, state in self.states.items() if state.owner == client])
 
     def transition(self, key: Any, start: str, finish: str, *args: Any, **kwargs: Any) -> None:
-        """Let requests that wait for a task look again, once it has ended."""
+        """Let requests that wait for a task look again after the end of the task."""
         # A look every 5 ms took the scheduler of a run 2 % of a core.
         if finish in _ENDED and key in self._awaited:
             self._awaited[key].notify()
 
     def delete(self, names: Collection[str]) -> None:
-        """Delete pipes, as far as they exist; with the last one, leave the scheduler."""
+        """Delete pipes, as far as they exist; after the last pipe, leave the scheduler."""
         for name in self.states.keys() & set(names):
             self.states.pop(name).delete()
         if not self.states:
@@ -216,12 +220,12 @@ class Pipes(SchedulerPlugin):
                 del handlers_of(self.scheduler)[question]
 
     def _check(self, name: str, value: Any) -> None:
-        """Check what a client sets a Variable to."""
+        """Check a value to which a client sets a Variable."""
         if (state := self.states.get(name)) is not None:
             state.check(value)
 
     def _notify(self, name: str) -> None:
-        """Let requests look at a Variable that a client has set."""
+        """Let waiting requests look at a Variable that a client has set."""
         if (state := self.states.get(name)) is not None:
             state.queue.waiters.notify()
 
@@ -235,7 +239,7 @@ class Pipes(SchedulerPlugin):
         failure: str = "",
         advice: int = 0,
     ) -> Replies:
-        """Close pipes for a producer, let them fail, or set an advice; answer the items queued."""
+        """Close pipes for a producer, let pipes fail, or set an advice; answer the depth."""
         states = self._existing(names)
         for state in states.values():
             if producer:
@@ -281,39 +285,57 @@ class Pipes(SchedulerPlugin):
         puts: Mapping[str, list[bytes]] | None = None,
         limit: int = sys.maxsize,
     ) -> Replies:
-        """Take the items of pipes, once one has any or has ended, or a task has ended.
+        """Take items of pipes, after a wait for an item, or for the end of a pipe or a task.
 
-        Before that, put items into other pipes. No more than `limit` items of each are taken; with
-        0, the request waits for the end of a pipe or a task.
+        Parameters
+        ----------
+        names
+            Pipes to take from.
+        asker
+            Id of the client. A client that has left gets no items.
+        seconds
+            Longest wait.
+        linger_s
+            Longest wait for further items after the first, within `seconds`.
+        keys
+            Tasks whose end ends the wait.
+        puts
+            Items by pipe, which are put before the wait, whatever the capacity of the pipe.
+        limit
+            Number of items to take of each pipe; with 0, the request waits for the end of a pipe
+            or a task.
         """
         for name, items in (puts or {}).items():
             self.put([name], asker, items, unbounded=True, seconds=0.0)
 
-        def news() -> bool:
+        def has_items(state: PipeState) -> bool:
+            return limit > 0 and not state.queue.empty()
+
+        def has_news() -> bool:
             tasks = (self.scheduler.tasks.get(key) for key in keys)
             return (
                 len(states) < len(names)
-                or any(s.has_ended or (limit and not s.queue.empty()) for s in states.values())
+                or any(has_items(state) or state.has_ended for state in states.values())
                 or any(task is None or task.state in _ENDED for task in tasks)
             )
 
-        def full() -> bool:
+        def is_full_or_ended() -> bool:
             return any(state.has_ended or not state.queue.room for state in states.values())
 
         def take_from(state: PipeState) -> list[Any]:
             return state.take(limit) if asker in self.scheduler.clients else []
 
         states = self._existing(names)
-        of_pipes = [state.queue.waiters for state in states.values()]
+        pipe_waiters = [state.queue.waiters for state in states.values()]
         try:
-            of_tasks = [self._awaited[key] for key in keys]
-            await wait_until(news, of_pipes + of_tasks, seconds)
+            task_waiters = [self._awaited[key] for key in keys]
+            await wait_until(has_news, pipe_waiters + task_waiters, seconds)
         finally:
             for key in keys:
                 if not self._awaited[key]:
                     del self._awaited[key]
         if linger_s:
-            await wait_until(full, of_pipes, min(linger_s, seconds))
+            await wait_until(is_full_or_ended, pipe_waiters, min(linger_s, seconds))
         return self._replies(states, take_from)
 
     def _existing(self, names: Sequence[str]) -> dict[str, PipeState]:
@@ -321,7 +343,7 @@ class Pipes(SchedulerPlugin):
         return {name: state for name, state in states.items() if state.exists}
 
     def _replies(self, states: dict[str, PipeState], answer: Callable[[PipeState], Any]) -> Replies:
-        """Answer for each pipe that was not deleted meanwhile."""
+        """Return a reply for each pipe that exists, with `answer(state)`."""
         replies: Replies = {}
         for name, state in states.items():
             if state.exists:

@@ -46,7 +46,7 @@ class Pool:
     def __init__(self, client: Client, workers: Sequence[WorkerInfo]) -> None:
         self.client = client
         self.workers = tuple(workers)
-        self._made: list[str] = []  # partitions, also of its remainders
+        self._partition_names: list[str] = []  # made by this pool or its remainders
 
     @classmethod
     def from_client(cls, client: Client, declaring: Set[str] | None = None) -> Pool:
@@ -75,14 +75,14 @@ class Pool:
         if declaring is not None:
             workers = [worker for worker in workers if declaring & set(worker.resources)]
         answers = ask_workers(client, worker_gpus, [worker.address for worker in workers])
-        there = [worker for worker in workers if worker.address in answers]  # others have left
-        for worker in there:
+        present = [worker for worker in workers if worker.address in answers]  # others have left
+        for worker in present:
             if isinstance(error := answers[worker.address], BaseException):
                 raise PoolError(
                     f"Worker {worker.name} at {worker.address} cannot describe its "
                     f"machine ({type(error).__name__}: {error}); is poolpart installed there?"
                 )
-        return cls(client, [worker.with_gpus(answers[worker.address]) for worker in there])
+        return cls(client, [worker.with_gpus(answers[worker.address]) for worker in present])
 
     # -- looking -----------------------------------------------------------------------
 
@@ -96,18 +96,18 @@ class Pool:
         hosts = {worker.host for worker in self.workers}
         gpus = {gpu for worker in self.workers for gpu in worker.gpus}
         try:
-            now = all_workers(self.client)
+            workers = all_workers(self.client)
         except (PoolError, OSError):  # its client was closed
-            now = list(self.workers)
-        declared = Counter(name for worker in now for name in worker.partitions)
+            workers = list(self.workers)
+        declared = Counter(name for worker in workers for name in worker.partitions)
         parts = ", ".join(f"{name} {count}" for name, count in sorted(declared.items()))
         parts = f"; partitions: {parts}" if parts else ""
         return f"<Pool: workers {len(self)}, hosts {len(hosts)}, GPUs {len(gpus)}{parts}>"
 
     def __getitem__(self, name: str) -> Partition:
         if (part := (parts := self.partitions()).get(name)) is None:
-            there = ", ".join(parts) or "none yet: divide makes some"
-            raise PoolError(f"There is no partition {name!r}; there are {there}.")
+            names = ", ".join(parts) or "none yet: divide makes some"
+            raise PoolError(f"There is no partition {name!r}; there are {names}.")
         return part
 
     @property
@@ -116,14 +116,14 @@ class Pool:
         return [worker.name for worker in self.workers]
 
     def partitions(self) -> dict[str, Partition]:
-        """Find the partitions that workers declare now, and adaptive ones, by name."""
+        """Return the partitions that workers declare now, and adaptive partitions, by name."""
         workers = all_workers(self.client)
         names = {name for worker in workers for name in worker.partitions}
         names |= on_scheduler(self.client, adaptive_names)  # perhaps empty
         return {name: Partition(name, self.client) for name in sorted(names)}
 
     def require(self, slots: Mapping[str, int], purpose: Mapping[str, str] | None = None) -> None:
-        """Check that partitions have enough slots before anything is submitted.
+        """Check that partitions have enough slots before tasks are submitted.
 
         Dask itself would wait silently for ever for a resource that no worker declares.
 
@@ -152,15 +152,15 @@ class Pool:
                     f"Worker {worker.name} declares {' and '.join(several)}: give each worker "
                     "one of them, because tasks of one would delay those of the other."
                 )
-        for name, needed in slots.items():
-            there = int(sum(worker.resources.get(name, 0) for worker in self.workers))
-            if there < needed:
+        for name, minimum in slots.items():
+            total = int(sum(worker.resources.get(name, 0) for worker in self.workers))
+            if total < minimum:
                 reason = f" ({purpose[name]})" if purpose and name in purpose else ""
                 raise PoolError(
-                    f"Partition {name!r} has {there} of the "
-                    f"{needed} slots needed{reason}: "
-                    f'start workers with --resources "{name}=1" or one with --nthreads {needed} '
-                    f'--resources "{name}={needed}".'
+                    f"Partition {name!r} has {total} of the "
+                    f"{minimum} slots needed{reason}: "
+                    f'start workers with --resources "{name}=1" or one with --nthreads {minimum} '
+                    f'--resources "{name}={minimum}".'
                 )
 
     # -- dividing ----------------------------------------------------------------------
@@ -170,10 +170,10 @@ class Pool:
 
     def __exit__(self, kind: object, error: BaseException | None, traceback: object) -> None:
         try:
-            if self._made:  # by now `dissolve` may have undone them
-                ask(self.client, dissolve, names=self._made, timeout_s=30.0)
+            if self._partition_names:  # by now `dissolve` may have undone them
+                ask(self.client, dissolve, names=self._partition_names, timeout_s=30.0)
                 forget_memberships()
-                self._made.clear()
+                self._partition_names.clear()
         except (PoolError, OSError) as failure:
             if error is None:
                 raise
@@ -268,19 +268,21 @@ class Pool:
             (max_workers_per_host, per_host),
             (n_workers, count),
         )
-        given: list[Rule] = [rule(n, **common) for n, rule in numbers if n is not None]
+        selectors: list[Rule] = [rule(n, **common) for n, rule in numbers if n is not None]
         if workers is not None:
-            given.append(named(*workers, **common))
-        if len(given) != 1:
+            selectors.append(named(*workers, **common))
+        if len(selectors) != 1:
             raise PoolError(
                 "Give exactly one of max_workers_per_gpu, max_workers_per_host, n_workers and "
-                f"workers to partition {name!r}, not {len(given)}."
+                f"workers to partition {name!r}, not {len(selectors)}."
             )
-        [rule] = given
+        [rule] = selectors
         # All of the workers have to be present now; later there may be fewer.
-        needed = n_workers or len(workers or ()) or max(1, minimum)
-        made, remainder = self._divide({name: rule}, {name: replace(rule, minimum=needed)})
-        return made[name], remainder
+        initial_minimum = n_workers or len(workers or ()) or max(1, minimum)
+        parts, remainder = self._divide(
+            {name: rule}, {name: replace(rule, minimum=initial_minimum)}
+        )
+        return parts[name], remainder
 
     def page(self) -> str:
         """Add a page to Dask's dashboard: partitions, stages, workers and pipes; returns its URL.
@@ -298,18 +300,18 @@ class Pool:
         return partitions_page(self.client)
 
     def pipes(self) -> list[str]:
-        """Return the names of all pipes of the cluster, whoever has created them.
+        """Return the names of all pipes of the cluster, whichever client has created them.
 
         Dask's ``Queue(name)`` has the items of a pipe, and ``Variable(name)`` its state.
         """
         return sorted(on_scheduler(self.client, names_of_pipes))
 
     def leave_page(self) -> None:
-        """Remove the page, unless other clients want it."""
+        """Remove the page, unless further clients want the page."""
         on_scheduler(self.client, leave_page, owner=self.client.id)
 
     def dissolve(self, timeout_s: float = 30.0) -> list[str]:
-        """Undo every partition of this cluster that was made while it ran, by any client.
+        """Undo every partition that any client has made while this cluster ran.
 
         Workers declare their original resources again. Rules, fences, statistics and the page
         are removed. Results that are held stay; if one is lost, any worker recomputes it.
@@ -331,16 +333,16 @@ class Pool:
             If their tasks have not ended; then everything stays.
         """
         names: list[str] = ask(self.client, dissolve, names=None, timeout_s=timeout_s)
-        self._made.clear()
+        self._partition_names.clear()
         forget_memberships()
         return names
 
     def _divide(
-        self, rules: Mapping[str, Rule], now: Mapping[str, Rule]
+        self, rules: Mapping[str, Rule], initial_rules: Mapping[str, Rule]
     ) -> tuple[dict[str, Partition], Pool]:
-        """Make partitions, all or none; `now` are the rules by which workers are chosen at first.
+        """Make all of some partitions, or none; return them by name, and a pool of the remainder.
 
-        Returns also a pool of the workers that are left.
+        Workers are chosen by `initial_rules` at first, and by `rules` when workers join later.
         """
         for name, rule in rules.items():
             check_name(name)
@@ -349,20 +351,20 @@ class Pool:
                     f"The rule of partition {name!r} is {rule!r}: give one such as n_workers(2), "
                     "per_gpu(1) or rest()."
                 )
-        notes, left = ask(
+        notes, remaining_workers = ask(
             self.client,
             declare,
             rules=dict(rules),
-            now=dict(now),
+            initial_rules=dict(initial_rules),
             pool={worker.name: worker.gpus for worker in self.workers},
-            seen=set(self.partitions()),
+            known_partitions=set(self.partitions()),
         )
         parts = {name: Partition(name, self.client, note, True) for name, note in notes.items()}
         for part in parts.values():
             if part.note:
                 logger.warning("Partition %r: %s", part.name, part.note)
         forget_memberships()
-        self._made += parts
-        remainder = Pool(self.client, left)
-        remainder._made = self._made
+        self._partition_names += parts
+        remainder = Pool(self.client, remaining_workers)
+        remainder._partition_names = self._partition_names
         return parts, remainder

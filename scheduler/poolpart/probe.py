@@ -38,8 +38,8 @@ def _listing() -> tuple[str, ...]:
     except OSError:
         return ()
     command = [sys.executable, "-c", _LIST_GPUS, _DRIVER]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=True)
-    return tuple(done.stdout.split())
+    process = subprocess.run(command, capture_output=True, text=True, timeout=60, check=True)
+    return tuple(process.stdout.split())
 
 
 def visible_gpus() -> tuple[str, ...]:

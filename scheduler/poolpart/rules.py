@@ -35,10 +35,10 @@ class Rule:
     exclusive: bool = False
 
     def __post_init__(self) -> None:
-        for name, least in (("slots", 1), ("minimum", 0), ("max_workers", 1), ("workers", 0)):
+        for name, lower_bound in (("slots", 1), ("minimum", 0), ("max_workers", 1), ("workers", 0)):
             value = getattr(self, name, None)
             if value is not None:
-                check_count(f"{name} of the rule {type(self).__name__}", value, least)
+                check_count(f"{name} of the rule {type(self).__name__}", value, lower_bound)
 
     def choose(self, free: Sequence[WorkerInfo]) -> list[WorkerInfo]:
         """Choose from available workers; the first workers are preferred.
@@ -201,7 +201,7 @@ def divide(
 
 
 def _advice(rule: Rule, free: Sequence[WorkerInfo], pool: Sequence[WorkerInfo]) -> str:
-    """Return what to do about a rule that finds too few workers."""
+    """Return advice about a rule that has too few workers."""
     if not isinstance(rule, Named):
         return f"{len(free)} of {len(pool)} are left for it. Start more, or list it first."
     present = ", ".join(repr(worker.name) for worker in pool[:9])
@@ -236,7 +236,7 @@ def check_name(partition: object) -> None:
         raise PoolError(f"The name of a partition is {partition!r}; give one such as 'GPU'.")
 
 
-def check_count(name: str, count: object, least: int = 1) -> None:
+def check_count(name: str, count: object, minimum: int = 1) -> None:
     """Raise a PoolError unless a count is a whole number of at least `least`."""
-    if not isinstance(count, Integral) or count < least:
-        raise PoolError(f"{name} is {count!r}; give a whole number, {least} or more.")
+    if not isinstance(count, Integral) or count < minimum:
+        raise PoolError(f"{name} is {count!r}; give a whole number, {minimum} or more.")

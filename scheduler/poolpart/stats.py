@@ -23,7 +23,13 @@ from .metrics import PartitionCollector, publish, withdraw
 NAME = "poolpart-stats"
 _LOOK_AT_MOST = 1000  # tasks of one worker that are examined for running ones
 _RUNNABLE = {"processing", "queued", "no-worker"}  # states of tasks whose inputs are there
-_WAITING = {"waiting": "waiting", "queued": "queued", "no-worker": "queued", "processing": "given"}
+# {Dask's state of a task: how the task is counted}; some assigned tasks run, some are queued
+_WAITING = {
+    "waiting": "waiting",
+    "queued": "queued",
+    "no-worker": "queued",
+    "processing": "assigned",
+}
 
 
 class Statistics(SchedulerPlugin):
@@ -36,7 +42,7 @@ class Statistics(SchedulerPlugin):
         # {(partition, stage): sums of its tasks that have ended, by fields of `StageStats`}
         self.ended: dict[tuple[str, str], Counter[str]] = defaultdict(Counter)
         self._runnable: dict[Any, float] = {}  # {key: time since when a task could run}
-        self._collector: PartitionCollector | None = publish(self._of_all)
+        self._collector: PartitionCollector | None = publish(self._all_stats)
 
     def transition(
         self, key: Any, start: str, finish: str, *args: Any, stimulus_id: str = "", **kwargs: Any
@@ -57,8 +63,8 @@ class Statistics(SchedulerPlugin):
         if computing and runnable is not None:  # by the scheduler's clock, as Dask corrects both
             counts["queued_seconds"] += max(0.0, computing[0]["start"] - runnable)
 
-    def _of_all(self) -> list[PartitionStats]:
-        """Return the statistics of all partitions, and of tasks without one."""
+    def _all_stats(self) -> list[PartitionStats]:
+        """Return the statistics of each partition, and of tasks without a partition."""
         names = {name for name, _ in self.ended}
         for worker in self.scheduler.workers.values():
             names.update(name for name, slots in worker.resources.items() if slots)
@@ -75,13 +81,13 @@ class Statistics(SchedulerPlugin):
 
 
 def partition_of(task: Any) -> str:
-    """Resource that a task asks for, "" for none."""
-    asked = task.resource_restrictions
-    return next(iter(asked)) if asked else ""
+    """Return the resource that a task asks for, or ""."""
+    resources = task.resource_restrictions
+    return next(iter(resources)) if resources else ""
 
 
 def members(scheduler: Any, partition: str) -> list[Any]:
-    """States of the workers of a partition; for "", of those that declare nothing."""
+    """Return the states of the workers of a partition; for "", of workers without resources."""
     workers = scheduler.workers.values()
     if partition:
         return [worker for worker in workers if worker.resources.get(partition)]
@@ -89,12 +95,12 @@ def members(scheduler: Any, partition: str) -> list[Any]:
 
 
 def slots_of(worker: Any, partition: str) -> int:
-    """Slots of a worker for a partition; its threads for tasks without one."""
+    """Return the slots of a worker for a partition; for "", the threads of the worker."""
     return int(worker.resources.get(partition, 0)) if partition else int(worker.nthreads)
 
 
 def running_on(worker: Any, partition: str) -> tuple[Counter[str], int]:
-    """Tasks of a partition that a worker runs, by stage, and the slots that they hold.
+    """Return the tasks of a partition that a worker runs, by stage, and their slots.
 
     The scheduler only knows which tasks it gave to a worker: as many of them run as the worker
     has slots. So of a task that waits and the nested tasks in its slots, some do not count.
@@ -115,7 +121,7 @@ def running_on(worker: Any, partition: str) -> tuple[Counter[str], int]:
 
 @dataclass(frozen=True)
 class StageStats:
-    """Tasks of one stage, that is, with one key prefix.
+    """Tasks of a stage, that is, with a common key prefix.
 
     Parameters
     ----------
@@ -193,27 +199,27 @@ def forget_statistics(scheduler: Any) -> None:
 
 
 def stats_of(names: Sequence[str], dask_scheduler: Any = None) -> list[PartitionStats]:
-    """Statistics of partitions; runs on the scheduler."""
+    """Return the statistics of partitions; runs on the scheduler."""
     scheduler = dask_scheduler
     statistics = statistics_of(scheduler)
     under_way: dict[tuple[str, str], Counter[str]] = defaultdict(Counter)
     for task in scheduler.tasks.values():
         if count := _WAITING.get(task.state):
             under_way[partition_of(task), task.prefix.name][count] += 1
-    places = sorted(under_way.keys() | statistics.ended.keys())
+    all_stages = sorted(under_way.keys() | statistics.ended.keys())
     answers = []
     for name in names:
         workers = members(scheduler, name)
         by_worker = [running_on(worker, name) for worker in workers]
         running: Counter[str] = sum((stages for stages, _ in by_worker), Counter())
         stages = {}
-        for partition, stage in places:
+        for partition, stage in all_stages:
             if partition == name:
-                now = under_way[name, stage]
+                counts = under_way[name, stage]
                 ended = statistics.ended.get((name, stage), Counter[str]())
-                runs = min(running[stage], now["given"])
-                queued = now["queued"] + now["given"] - runs
-                stages[stage] = StageStats(now["waiting"], queued, runs, **ended)
+                runs = min(running[stage], counts["assigned"])
+                queued = counts["queued"] + counts["assigned"] - runs
+                stages[stage] = StageStats(counts["waiting"], queued, runs, **ended)
         sums = {
             count: sum(getattr(stage, count) for stage in stages.values())
             for count in StageStats.__dataclass_fields__

@@ -39,27 +39,27 @@ from .workers import WorkerInfo
 logger = logging.getLogger(__name__)
 
 NAME = "poolpart-steward"
-HOLD_S = 30.0  # how long a worker's place is kept while its nanny starts it again
+HOLD_S = 30.0  # time in seconds for which the seat of a worker that its nanny restarts is kept
 LOOK_EVERY_S = 0.01
-_PLACE_EVERY_S = 0.1  # applying all rules to a thousand workers takes as long
+_ASSIGN_EVERY_S = 0.1  # applying all rules to a thousand workers takes as long
 
 
 @dataclass(eq=False)
 class Seat:
-    """Partition and state of one worker, also during a restart by its nanny."""
+    """Partition and state of a worker, also while the nanny of the worker restarts it."""
 
     key: Hashable  # identifies the worker, see `seat_key`
     info: WorkerInfo
     nanny: str | None = None  # its address
-    found: Resources = field(default_factory=dict)  # resources that it was started with
-    declared: Resources = field(default_factory=dict)  # that it declares now, as far as known
-    being_told: bool = False  # a request to declare resources is under way
+    original: Resources = field(default_factory=dict)  # resources that the worker was started with
+    declared: Resources = field(default_factory=dict)  # resources at the worker's last reply
+    is_declaring: bool = False  # a request to declare resources is under way
     partition: str | None = None
     slots: float = 0  # of the partition
     unplaced: bool = False  # it joined after the division, and a rule has yet to take it
     by_rule: bool = False  # it joined after the division, and a rule has taken it
     away: bool = False  # it has left, and its nanny may be restarting it
-    gone: bool = False  # it is no longer expected
+    removed: bool = False  # it is no longer expected
     reconciler: asyncio.Task[None] | None = None
     giving_up: asyncio.TimerHandle | None = None
 
@@ -73,56 +73,64 @@ class Steward(SchedulerPlugin):
         self.scheduler = scheduler
         self.rules: dict[str, Rule] = {}  # by partition, in the order in which they choose
         self.seats: dict[Hashable, Seat] = {}  # by key
-        self.asked = 0  # requests of clients in progress
+        self.open_requests = 0  # of clients
         self._names: set[str] = set()  # of all partitions so far
-        self._placing: asyncio.TimerHandle | None = None
+        self._assigning: asyncio.TimerHandle | None = None
         for worker in scheduler.workers.values():
             self._seat(worker)
 
     # -- membership --------------------------------------------------------------------
 
     def members(self, name: str, present: bool = False) -> list[Seat]:
-        """Seats of a partition; only of present workers if `present`."""
+        """Return the seats of a partition; only of present workers if `present`."""
         members = (seat for seat in self.seats.values() if seat.partition == name)
         return [seat for seat in members if not (present and seat.away)]
 
     def free(self) -> list[Seat]:
-        """Present workers without a partition or another resource."""
+        """Return the seats of present workers without a partition or another resource."""
         return [
             seat
             for seat in self.seats.values()
-            if not seat.away and not seat.partition and not any(self.wanted(seat).values())
+            if not seat.away
+            and not seat.partition
+            and not any(self.target_resources(seat).values())
         ]
 
     def remainder(self) -> str | None:
-        """Partition that has the rest, if there is one."""
+        """Return the partition with the rule `rest`, or None."""
         return next((name for name, rule in self.rules.items() if isinstance(rule, rest)), None)
 
-    def wanted(self, seat: Seat) -> Resources:
-        """Resources that a worker should declare: its own, and its partition's."""
+    def target_resources(self, seat: Seat) -> Resources:
+        """Return the resources that a worker should declare, with the resource of its partition."""
         if seat.partition is None:
-            return {r: q for r, q in seat.found.items() if r not in self.rules}
-        own = {r: q for r, q in seat.found.items() if r not in self._names}
-        return {**own, seat.partition: seat.slots}
+            return {r: slots for r, slots in seat.original.items() if r not in self.rules}
+        original = {r: slots for r, slots in seat.original.items() if r not in self._names}
+        return {**original, seat.partition: seat.slots}
 
     def put(self, seat: Seat, name: str | None, slots: float | None = None) -> None:
-        """Put a worker into a partition, or None; slots default to those it was started with."""
-        seat.partition, seat.slots, seat.unplaced, seat.by_rule = name, 0, False, False
+        """Put a worker into a partition or, with None, into no partition.
+
+        The slots default to those that the worker was started with.
+        """
+        seat.partition = name
+        seat.slots = 0
+        seat.unplaced = False
+        seat.by_rule = False
         if name is not None:
             rule = self.rules[name]
-            seat.slots = slots or rule.slots or seat.found.get(name) or rule.slots_of(seat.info)
+            seat.slots = slots or rule.slots or seat.original.get(name) or rule.slots_of(seat.info)
         if worker := self.scheduler.workers.get(seat.info.address):
             expect(self.scheduler, worker, name)
-        self._place_soon()
+        self._assign_soon()
 
     def enter(self, name: str, rule: Rule) -> None:
-        """Add a partition, or change its rule. The one that has the rest stays last."""
+        """Add a partition or change its rule; the partition with the rule `rest` stays last."""
         self._names.add(name)
         rules = {**self.rules, name: rule}.items()
         self.rules = dict(sorted(rules, key=lambda item: isinstance(item[1], rest)))
 
     def adopt(self, name: str) -> None:
-        """Add a partition whose workers declare it by themselves.
+        """Add a partition whose workers declared its resource before this division.
 
         Raises
         ------
@@ -131,7 +139,7 @@ class Steward(SchedulerPlugin):
         """
         if name in self.rules:
             return
-        members = [s for s in self.seats.values() if s.partition is None and s.found.get(name)]
+        members = [s for s in self.seats.values() if s.partition is None and s.original.get(name)]
         if not members:
             raise PoolError(
                 f"There is no partition {name!r}: no worker declares it, and it was not made "
@@ -139,10 +147,10 @@ class Steward(SchedulerPlugin):
             )
         self.enter(name, Rule(minimum=0))
         for seat in members:
-            self.put(seat, name, seat.found[name])
+            self.put(seat, name, seat.original[name])
 
     def resize(self, name: str | None, change: int) -> None:
-        """Change the number of workers of a rule, if it has one."""
+        """Change the number of workers in a rule `n_workers`; do nothing for another rule."""
         if name in self.rules and isinstance(rule := self.rules[name], n_workers):
             workers = rule.workers + change
             self.rules[name] = replace(rule, workers=workers, minimum=min(rule.minimum, workers))
@@ -150,32 +158,34 @@ class Steward(SchedulerPlugin):
     # -- joining and leaving -----------------------------------------------------------
 
     def _seat(self, worker: Any) -> Seat:
-        """Seat of a worker that has joined, or returned."""
+        """Return the seat of a worker that has joined or returned, updated."""
         key = seat_key(worker.name, worker.address, worker.nanny)
         info = WorkerInfo.from_identity(worker.address, worker.identity())
         seat = self.seats.setdefault(key, Seat(key, info))
-        seat.info, seat.nanny = info.with_gpus(seat.info.gpus), worker.nanny
-        seat.found, seat.declared = dict(worker.resources), dict(worker.resources)
+        seat.info = info.with_gpus(seat.info.gpus)
+        seat.nanny = worker.nanny
+        seat.original = dict(worker.resources)
+        seat.declared = dict(worker.resources)
         seat.away = False
         if seat.giving_up:
             seat.giving_up.cancel()
         return seat
 
     def add_worker(self, scheduler: Any, worker: str) -> None:
-        """Assign a worker that joins: to its former partition, a declared one, or by rule."""
-        known = set(self.seats)
+        """Assign a joining worker: to its former partition, a declared partition, or by rule."""
+        former_keys = set(self.seats)
         seat = self._seat(scheduler.workers[worker])
-        declared = [name for name in self.rules if seat.found.get(name)]
-        if seat.key in known:
+        declared = [name for name in self.rules if seat.original.get(name)]
+        if seat.key in former_keys:
             expect(scheduler, scheduler.workers[worker], seat.partition)
         elif declared:
-            self.put(seat, declared[0], seat.found[declared[0]])
+            self.put(seat, declared[0], seat.original[declared[0]])
         else:
-            seat.unplaced = not any(seat.found.values())
+            seat.unplaced = not any(seat.original.values())
         self.settle([seat])
 
     def remove_worker(self, scheduler: Any, worker: str, **kwargs: Any) -> None:
-        """Record that a worker has left; its place is kept for a while if it has a nanny."""
+        """Record that a worker has left; the seat of a worker with a nanny is kept for a while."""
         for seat in list(self.seats.values()):
             if seat.info.address == worker and not seat.away:
                 seat.away = True
@@ -186,13 +196,14 @@ class Steward(SchedulerPlugin):
                 seat.giving_up = loop.call_later(HOLD_S if seat.nanny else 0, self._give_up, seat)
 
     def _give_up(self, seat: Seat) -> None:
-        seat.gone = True
+        """Remove the seat of a worker that has not returned in time."""
+        seat.removed = True
         del self.seats[seat.key]
-        # One that was started in its place has joined before this, and went to the rest.
+        # A worker that was started as a replacement has joined before, and went to the rest.
         if remainder := self.remainder():
-            for other in self.members(remainder):
-                other.unplaced = other.by_rule
-        self._place_soon()
+            for member in self.members(remainder):
+                member.unplaced = member.by_rule
+        self._assign_soon()
         self.remove_if_done()
 
     def valid_workers_downscaling(self, scheduler: Any, workers: list[Any]) -> list[Any]:
@@ -209,21 +220,22 @@ class Steward(SchedulerPlugin):
 
     # -- assigning workers that join ---------------------------------------------------
 
-    def _place_soon(self) -> None:
-        """Try again to assign workers without a partition: rules or members have changed."""
-        if self._placing is None:
+    def _assign_soon(self) -> None:
+        """Assign workers without a partition soon: rules or members have changed."""
+        if self._assigning is None:
             loop = asyncio.get_running_loop()
-            self._placing = loop.call_later(_PLACE_EVERY_S, self._place_all)
+            self._assigning = loop.call_later(_ASSIGN_EVERY_S, self._assign_waiting)
 
-    def _place_all(self) -> None:
-        self._placing = None
+    def _assign_waiting(self) -> None:
+        """Assign all present workers without a partition that have listed their GPUs."""
+        self._assigning = None
         waiting = [s for s in self.seats.values() if s.unplaced and not s.away]
-        # A worker that is being asked for its GPUs is assigned when it has answered.
-        asked = [s for s in waiting if s.reconciler and s.reconciler.done()]
-        self.settle([seat for seat in asked if self._place(seat)])
+        # Other workers are still asked for their GPUs, and are assigned after their answer.
+        ready = [s for s in waiting if s.reconciler and s.reconciler.done()]
+        self.settle([seat for seat in ready if self._assign(seat)])
 
-    def _place(self, seat: Seat) -> bool:
-        """Find a partition for a worker that joined; returns whether it moves to another."""
+    def _assign(self, seat: Seat) -> bool:
+        """Assign a joining worker by the rules; return whether its partition changes."""
         groups = {name: [member.info for member in self.members(name)] for name in self.rules}
         name = partition_for(seat.info, self.rules, groups)
         if moves := name not in (None, seat.partition):
@@ -233,6 +245,7 @@ class Steward(SchedulerPlugin):
         return moves
 
     async def _ask_for_gpus(self, seat: Seat) -> None:
+        """Record the GPUs of a worker, if a rule depends on GPUs."""
         if not any(isinstance(rule, per_gpu) for rule in self.rules.values()):
             return
         try:
@@ -245,14 +258,14 @@ class Steward(SchedulerPlugin):
     # -- reconciling workers --------------------------------------------------------------
 
     def settled(self, seat: Seat) -> bool:
-        """Whether a worker declares its resources, and the scheduler knows them."""
+        """Return whether a worker declares its target resources and the scheduler knows."""
         worker = self.scheduler.workers.get(seat.info.address)
-        if worker is None or seat.being_told:
+        if worker is None or seat.is_declaring:
             return False
-        return bool(worker.resources == seat.declared == self.wanted(seat))
+        return bool(worker.resources == seat.declared == self.target_resources(seat))
 
     def settle(self, seats: Iterable[Seat]) -> None:
-        """Let workers declare their resources; `settled` waits until they do."""
+        """Have workers declare their target resources; `settled` is True once they do."""
         for seat in seats:
             # A running loop checks the seat again before it ends.
             if not seat.away and (seat.reconciler is None or seat.reconciler.done()):
@@ -260,69 +273,82 @@ class Steward(SchedulerPlugin):
                 seat.reconciler.add_done_callback(partial(self._ended, seat))
 
     def _ended(self, seat: Seat, task: asyncio.Task[None]) -> None:
+        """Remove the seat of a worker that cannot declare resources, and leave if all is done."""
         if not (task.cancelled() or seat.away) and (error := task.exception()):
             logger.error("Worker %s can be in no partition: %r", seat.info.name, error)
             self.put(seat, None)
-            self._give_up(seat)  # such as one without this package; an absent one keeps its place
+            self._give_up(seat)  # the worker may lack this package; absent workers keep their seat
         self.remove_if_done()
 
     async def _settle(self, seat: Seat, address: str) -> None:
+        """Have a worker declare its target resources, in as many steps as its tasks require."""
         if seat.unplaced:
             await self._ask_for_gpus(seat)
             if seat.unplaced:
-                self._place(seat)
-        asked = set[Any]()
+                self._assign(seat)
+        requested_moves: set[Any] = set()  # tasks that the worker was asked to give up
         while (worker := self.scheduler.workers.get(address)) and not self.settled(seat):
             try:
-                if not await self._step(seat, worker, asked):
+                if not await self._step(seat, worker, requested_moves):
                     await asyncio.sleep(LOOK_EVERY_S)
-            except OSError as error:  # it is leaving, or the connection was bad
+            except OSError as error:  # the worker is leaving, or the connection was bad
                 logger.info("The worker at %s does not answer: %s", address, error)
                 await asyncio.sleep(10 * LOOK_EVERY_S)
         # A resource set by hand earlier has woken no tasks.
         if worker:
             wake(self.scheduler, worker)
 
-    async def _step(self, seat: Seat, worker: Any, asked: set[Any]) -> bool:
-        """Advance a worker towards its seat; False if its tasks must end first."""
-        wanted = self.wanted(seat)
-        leaving = {name for name, slots in seat.declared.items() if slots and name not in wanted}
-        if leaving:
-            # No new tasks; its tasks end here or move. It keeps the resource until then.
-            kept = {name: q for name, q in seat.declared.items() if name not in leaving}
-            self._show(seat, worker, kept)
-            hand_off(self.scheduler, worker, leaving, asked)
-            if held_by(self.scheduler, worker, leaving):
-                return False
-        seat.being_told = True
+    async def _step(self, seat: Seat, worker: Any, requested_moves: set[Any]) -> bool:
+        """Advance a worker towards its seat; return False if its tasks must end first."""
+        target = self.target_resources(seat)
+        leaving = {name for name, slots in seat.declared.items() if slots and name not in target}
+        if leaving and not self._has_released(seat, worker, leaving, requested_moves):
+            return False
+        seat.is_declaring = True
         try:
-            done = await call(self.scheduler, worker.address, declare_on_worker, resources=wanted)
+            accepted = await call(
+                self.scheduler, worker.address, declare_on_worker, resources=target
+            )
         finally:
-            seat.being_told = False
-        if not done:
+            seat.is_declaring = False
+        if not accepted:
             return False
         if self.scheduler.workers.get(worker.address) is worker:
-            seat.declared = wanted
-            if self.wanted(seat) == wanted:
-                self._show(seat, worker, wanted)
-                for name in leaving:  # those that took over tasks
+            seat.declared = target
+            if self.target_resources(seat) == target:
+                self._show(seat, worker, target)
+                for name in leaving:  # other members may have taken over tasks
                     for address in self.scheduler.resources.get(name, ()):
                         recount(self.scheduler.workers[address])
         return True
 
+    def _has_released(
+        self, seat: Seat, worker: Any, leaving: Collection[str], requested_moves: set[Any]
+    ) -> bool:
+        """Move the tasks of partitions that a worker leaves; return whether none is left.
+
+        The worker gets no new tasks of these partitions. Tasks that run end on the worker, which
+        keeps the resource until then.
+        """
+        remaining = {name: slots for name, slots in seat.declared.items() if name not in leaving}
+        self._show(seat, worker, remaining)
+        hand_off(self.scheduler, worker, leaving, requested_moves)
+        return not held_by(self.scheduler, worker, leaving)
+
     def _show(self, seat: Seat, worker: Any, resources: Resources) -> None:
+        """Let the scheduler place tasks by the given resources of a worker only."""
         show(self.scheduler, worker, resources)
         note_change(self.scheduler)
         expect(self.scheduler, worker, seat.partition)
 
     async def arrive(self, seats: Collection[Seat], timeout_s: float) -> list[Seat]:
-        """Wait until workers declare their resources; returns those that do not in time.
+        """Wait until workers declare their target resources; return the late workers.
 
-        Restarting workers are waited for; those that have left are not.
+        Restarting workers are waited for; workers that have left for good are not.
         """
         self.settle(seats)
         deadline = time.monotonic() + timeout_s
-        while late := [seat for seat in seats if not seat.gone and not self.settled(seat)]:
+        while late := [seat for seat in seats if not seat.removed and not self.settled(seat)]:
             if time.monotonic() >= deadline:
                 break
             await asyncio.sleep(LOOK_EVERY_S)
@@ -335,25 +361,25 @@ class Steward(SchedulerPlugin):
         self._stop()
 
     def _stop(self) -> None:
-        work = [
-            self._placing,
-            *(w for s in self.seats.values() for w in (s.reconciler, s.giving_up)),
-        ]
-        for task in work:
+        """Cancel all timers and loops."""
+        scheduled: list[asyncio.TimerHandle | asyncio.Task[None] | None] = [self._assigning]
+        for seat in self.seats.values():
+            scheduled += [seat.reconciler, seat.giving_up]
+        for task in scheduled:
             if task is not None:
                 task.cancel()
 
     def remove_if_done(self) -> None:
         """Leave the scheduler once there are no partitions and all workers are restored."""
-        here = [seat for seat in self.seats.values() if not seat.away]
-        if not self.rules and not self.asked and all(map(self.settled, here)):
+        present = [seat for seat in self.seats.values() if not seat.away]
+        if not self.rules and not self.open_requests and all(map(self.settled, present)):
             self._stop()
             if self.scheduler.plugins.get(NAME) is self:
                 self.scheduler.remove_plugin(NAME)
 
 
 def seat_key(name: Hashable, address: str, nanny: str | None) -> Hashable:
-    """Key of a worker that outlives restarts: its name or, without one, its nanny.
+    """Return a key of a worker that outlives restarts: its name or else its nanny's address.
 
     The default name is the address, which changes with a restart. Names are not converted: to
     Dask 0, from `LocalCluster`, and "0", from a command line, are two workers.
@@ -362,21 +388,21 @@ def seat_key(name: Hashable, address: str, nanny: str | None) -> Hashable:
 
 
 def names_of(seats: Iterable[Seat]) -> str:
-    """Names of workers, for messages."""
+    """Return the names of workers, for messages."""
     return ", ".join(sorted(seat.info.name for seat in seats))
 
 
 @contextmanager
 def steward_of(scheduler: Any) -> Iterator[Steward]:
-    """Return the scheduler's steward, or a new one; one without partitions leaves at once."""
+    """Yield the scheduler's steward; a steward without partitions leaves after the block."""
     require(DIVIDING)
     steward: Steward | None = scheduler.plugins.get(NAME)
     if steward is None:
         steward = Steward(scheduler)
         scheduler.add_plugin(steward)
-    steward.asked += 1
+    steward.open_requests += 1
     try:
         yield steward
     finally:
-        steward.asked -= 1
+        steward.open_requests -= 1
         steward.remove_if_done()

@@ -16,7 +16,7 @@ _one_at_a_time = threading.Lock()
 
 
 def own_client() -> Client:
-    """Client of this task's worker; elsewhere the current one.
+    """Return the client of this task's worker; outside tasks, the current client.
 
     `distributed.get_client` makes the worker's client on first use. That fails, with an
     AssertionError without a message, if the scheduler broadcasts to all clients while it registers
@@ -52,7 +52,7 @@ _LEAVING = (Status.closing, Status.closed, Status.failed)
 
 
 class WorkerLeft(RuntimeError):  # noqa: N818 - reads as what happened
-    """A long task has ended because its worker is leaving; start it again on another."""
+    """A long task has ended because its worker is leaving; submit the task again."""
 
 
 @contextmanager
@@ -76,6 +76,6 @@ def telling_departure() -> Iterator[None]:
         with suppress(ValueError):  # not in a task
             if get_worker().status in _LEAVING:
                 # Without the cause, which may not be picklable.
-                told = f"the worker has left ({type(error).__name__}: {error})"
-                raise WorkerLeft(told) from None
+                message = f"the worker has left ({type(error).__name__}: {error})"
+                raise WorkerLeft(message) from None
         raise

@@ -25,7 +25,7 @@ class TaskPlace:
 
 @dataclass(frozen=True)
 class TaskLocations:
-    """Members of a partition, their slots, and tasks, at one moment.
+    """Members of a partition, their slots, and tasks, at a moment.
 
     Workers that take no tasks at the moment, because Dask has paused them for their memory or they
     are leaving, and silent ones have neither `free` nor `slots`.
@@ -43,25 +43,25 @@ class TaskLocations:
     tasks: dict[str, TaskPlace] = field(default_factory=dict)  # by requested key, of known ones
 
     def out_of_reach(self, key: str) -> bool:
-        """Whether a task or its result is on silent workers only."""
-        place = self.tasks.get(key)
-        return place is not None and bool(place.workers) and self.silent.issuperset(place.workers)
+        """Return whether a task or its result is on silent workers only."""
+        task = self.tasks.get(key)
+        return task is not None and bool(task.workers) and self.silent.issuperset(task.workers)
 
     def runs_for_long(self, key: str) -> bool:
-        """Whether a task runs and has seceded."""
+        """Return whether a task runs and has seceded."""
         return key in self.tasks and self.tasks[key].long_running
 
 
 def look_for_tasks(client: Client, partition: str, keys: Collection[str] = ()) -> TaskLocations:
-    """Ask the scheduler about the slots of a partition and some tasks.
+    """Ask the scheduler about the slots of a partition and about tasks.
 
     Dask places a task by a worker's total resources, not by the free ones, and prefers the
     worker with the least work ahead; a worker whose only slot is held by a seceded task looks
     idle. A second long-running task there waits as long as the first runs. So choose the
     workers of long-running tasks yourself.
     """
-    found: TaskLocations = on_scheduler(client, _look, partition=partition, keys=list(keys))
-    return found
+    locations: TaskLocations = on_scheduler(client, _look, partition=partition, keys=list(keys))
+    return locations
 
 
 def _look(partition: str, keys: list[str], dask_scheduler: Any = None) -> TaskLocations:
@@ -70,7 +70,7 @@ def _look(partition: str, keys: list[str], dask_scheduler: Any = None) -> TaskLo
     addresses = frozenset(ws.address for ws in members)
     silent = addresses & silent_workers({ws.address: ws.last_seen for ws in workers})
     usable = [ws for ws in members if ws.status.name == "running" and ws.address not in silent]
-    places = {key: _place(dask_scheduler.tasks[key]) for key in keys if key in dask_scheduler.tasks}
+    tasks = dask_scheduler.tasks
     slots = sum(int(ws.resources[partition]) for ws in usable)
     return TaskLocations(
         members=addresses,
@@ -79,17 +79,17 @@ def _look(partition: str, keys: list[str], dask_scheduler: Any = None) -> TaskLo
         slots=slots,
         most_slots=max(slots, max_slots(dask_scheduler, partition)),
         coming=queued_jobs_of(dask_scheduler, partition),
-        tasks=places,
+        tasks={key: _task_place(tasks[key]) for key in keys if key in tasks},
     )
 
 
-def _place(task: Any) -> TaskPlace:
+def _task_place(task: Any) -> TaskPlace:
     worker = task.processing_on
     holders = task.who_has or ([worker] if worker else [])
     long_running = worker is not None and task in worker.long_running
-    places = tuple(ws.address for ws in holders)
+    addresses = tuple(holder.address for holder in holders)
     started = worker is not None and task in worker.executing
-    return TaskPlace(task.state, places, task.suspicious, long_running, started)
+    return TaskPlace(task.state, addresses, task.suspicious, long_running, started)
 
 
 def _in_use(worker: Any, resource: str) -> float:

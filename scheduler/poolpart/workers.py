@@ -48,7 +48,7 @@ class WorkerInfo:
 
     @property
     def partitions(self) -> frozenset[str]:
-        """Names of its partitions: the resources of which it declares a slot."""
+        """Partitions of the worker: resources of which the worker declares a slot."""
         return frozenset(name for name, slots in self.resources.items() if slots)
 
     def with_gpus(self, gpus: Iterable[str]) -> WorkerInfo:
@@ -139,8 +139,8 @@ def ask_workers(
             answers = asyncio.ensure_future(request)
             try:
                 while silent.isdisjoint(remaining):
-                    done, _ = await asyncio.wait([answers], timeout=_LOOK_S)
-                    if done:
+                    answered, _ = await asyncio.wait([answers], timeout=_LOOK_S)
+                    if answered:
                         return dict(answers.result())
                     present = (await ask(client, None, "identity", n_workers=-1))["workers"]
                     silent = silent_workers({a: w["last_seen"] for a, w in present.items()})
@@ -164,7 +164,7 @@ def silent_workers(last_seen: Mapping[str, float]) -> set[str]:
     `last_seen` is {address: time of the last heartbeat, seconds}. Times are compared with the
     latest heartbeat: if all workers have been silent, the scheduler itself was stopped or busy.
     """
-    now = max(last_seen.values(), default=0.0)
+    latest = max(last_seen.values(), default=0.0)
     # Dask's interval, which is long in large clusters.
     patience_s = max(SILENT_S, _MISSED_BEATS * (1 + len(last_seen) / 100))
-    return {address for address, seen in last_seen.items() if now - seen > patience_s}
+    return {address for address, heartbeat in last_seen.items() if latest - heartbeat > patience_s}

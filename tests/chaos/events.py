@@ -14,21 +14,25 @@ import logging
 import os
 import resource
 import signal
+import sys
+import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
+from types import FrameType
 from typing import Any
 
 from distributed.diagnostics.plugin import WorkerPlugin
 from distributed.worker import thread_state
 
 from lidarpool.base.tracing import trace_to
+from poolpart import pipe
 
 Event = dict[str, Any]
 
-KILL, TERM, SEGV, STOP, RETIRE, RESTART, PAUSE, DAMAGE, LINK = KINDS = (
+KILL, TERM, SEGV, STOP, RETIRE, RESTART, PAUSE, DAMAGE, LINK, CLIENT = KINDS = (
     "kill",  # SIGKILL
     "term",  # SIGTERM
     "segv",  # segmentation fault
@@ -38,11 +42,15 @@ KILL, TERM, SEGV, STOP, RETIRE, RESTART, PAUSE, DAMAGE, LINK = KINDS = (
     "pause",  # as Dask does if memory is short, and on again some time later
     "damage",  # a bit of a part in storage is flipped; the run is resumed once it has ended
     "link",  # the run's folder gets a link to another's; the run is resumed with and without it
+    "client",  # SIGKILL while a thread waits in `Pipe.get`, `Pipe.put` or the like
 )
 SIGNALS = {KILL: signal.SIGKILL, TERM: signal.SIGTERM, SEGV: signal.SIGSEGV, STOP: signal.SIGSTOP}
 
 RANDOM = "random time"  # in place of a point
 HOLD_S = 5.0  # longest time that a point is held for somebody else to carry a fault out
+PIPE_WAIT_S = 10.0  # longest time until a worker of the LIDAR stages waits at a pipe
+# Functions of poolpart/pipe.py in which a thread waits for the scheduler's answer.
+REQUESTS = {pipe._ask.__code__, pipe._ask_until.__code__}
 _EVENTS, _ARMED, _FIRED = "events", "armed", "fired"
 
 
@@ -183,8 +191,36 @@ class Sink:
             self.strike(fired)
 
 
+def die_at_pipe() -> None:
+    """Start a thread that kills this process as soon as another thread waits at a pipe.
+
+    The scheduler then has a request of a client that is dead.
+    """
+
+    def waits_at_pipe() -> bool:
+        for frame in sys._current_frames().values():
+            caller: FrameType | None = frame
+            while caller is not None:
+                if caller.f_code in REQUESTS:
+                    return True
+                caller = caller.f_back
+        return False
+
+    def kill_when_waiting() -> None:
+        deadline = time.monotonic() + PIPE_WAIT_S
+        while time.monotonic() < deadline:
+            if waits_at_pipe():
+                os.kill(os.getpid(), signal.SIGKILL)
+            time.sleep(0.001)
+
+    threading.Thread(target=kill_when_waiting, name="die at pipe", daemon=True).start()
+
+
 def strike_self(fired: Fired) -> None:
     """End or stop this process, or hold this thread until somebody has done what is to be done."""
+    if fired.kind == CLIENT:
+        die_at_pipe()  # the thread of the point has to go on to the pipe
+        return
     if fired.kind == SEGV:
         resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
         ctypes.string_at(0)

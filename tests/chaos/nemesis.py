@@ -20,10 +20,12 @@ from lidarpool.base.tracing import trace_to
 
 from .arena import TIME_TO_LIVE_S, Arena
 from .events import (
+    CLIENT,
     DAMAGE,
     KINDS,
     LINK,
     PAUSE,
+    PIPE_WAIT_S,
     RANDOM,
     RESTART,
     RETIRE,
@@ -32,7 +34,8 @@ from .events import (
     Fault,
     Fired,
     Sink,
-)  # fmt: skip
+    die_at_pipe,
+)
 
 PARTITIONS = ("GPU", "LIDAR", "OTHER")
 ALL_AT_ONCE = 0.15  # part of the faults at random times that come together with the one before
@@ -65,13 +68,22 @@ def make_plan(
         *chain.from_iterable(others),
         *((chance.choice(KINDS), point, "LIDAR") for point in driver_points),
     ]
-    # Where a stage starts there may be no part yet.
-    at = [one for one in at if one[0] != DAMAGE or not one[1].endswith(".start")]
+    at = [place for place in at if _is_possible(*place[:2])]
     while len(at) < count:
         at.append((KINDS[len(at) % len(KINDS)], RANDOM, chance.choice(PARTITIONS)))
-    at = at[:count]
+    at = [
+        (kind, point, "LIDAR" if kind == CLIENT and partition else partition)
+        for kind, point, partition in at[:count]
+    ]
     chance.shuffle(at)
     return [_fault(chance, scans, number, *choice) for number, choice in enumerate(at)]
+
+
+def _is_possible(kind: str, point: str) -> bool:
+    """Return False for a part where a stage starts, and a pipe where rays are cast."""
+    if kind == DAMAGE:
+        return not point.endswith(".start")
+    return kind != CLIENT or not point.startswith("intersect.")
 
 
 def _fault(
@@ -130,7 +142,7 @@ class Nemesis:
         self.arena.board.disarm()
         for fired in self.arena.board.fired():
             fault = self.faults[fired.number]
-            if not fault.given_up:  # nobody has done that
+            if not fault.given_up and fault.kind != CLIENT:  # nobody has done that
                 self._note(fault)
             fired.path.unlink()
             if fault.kind == STOP and not fault.partition:
@@ -166,7 +178,7 @@ class Nemesis:
         if fault.partition:  # the driver does that in its own thread
             return
         do = self._files.get(fault.kind)
-        if do is None or do(fault):
+        if fault.kind != CLIENT and (do is None or do(fault)):
             self._note(fault)
         fired.path.unlink()
         if fault.kind == STOP:
@@ -176,6 +188,8 @@ class Nemesis:
                 self.arena.give_up(fired.pid)
             with self._lock:
                 self._stopped[fired.pid] = time.monotonic() + fault.stop_s
+        elif fault.kind == CLIENT:
+            self._start_helper(self._note_death, fault, fired.pid)
         elif fault.kind in (RETIRE, RESTART, PAUSE):
             self._help(fault, fired.worker)
 
@@ -201,6 +215,8 @@ class Nemesis:
         if not names:
             return False
         name = names[int(fault.pick * len(names))]
+        if fault.kind == CLIENT:
+            return self._kill_at_pipe(fault, name)
         if fault.kind in self._files:
             done = self._files[fault.kind](fault)
         else:
@@ -248,13 +264,37 @@ class Nemesis:
         if address is None:
             return False
         acts = {RETIRE: self._retire, RESTART: self._restart, PAUSE: self._pause}
-        arguments = (name, address, fault.stop_s)
-        helper = threading.Thread(
-            target=acts[fault.kind], args=arguments, name=f"{fault.kind} {name}"
-        )
+        self._start_helper(acts[fault.kind], name, address, fault.stop_s)
+        return True
+
+    def _start_helper(self, act: Callable[..., None], *arguments: object) -> None:
+        helper = threading.Thread(target=act, args=arguments, name=act.__name__)
         self._helpers.append(helper)
         helper.start()
+
+    def _kill_at_pipe(self, fault: Fault, name: str) -> bool:
+        """Have a worker die as soon as it waits at a pipe; False if the worker has left."""
+        pid = self.arena.pid(name)
+        address = self.arena.address(name)
+        if pid is None or address is None:
+            return False
+
+        def ask_and_note() -> None:
+            with suppress(OSError, ValueError):  # the worker has died by another fault
+                self.arena.client.run(die_at_pipe, workers=[address], on_error="ignore")
+                self._note_death(fault, pid)
+
+        self._start_helper(ask_and_note)
         return True
+
+    def _note_death(self, fault: Fault, pid: int) -> None:
+        """Note a fault once its process has died; not if the process has waited at no pipe."""
+        deadline = time.monotonic() + PIPE_WAIT_S
+        while time.monotonic() < deadline:
+            if not psutil.pid_exists(pid):
+                self._note(fault)
+                return
+            time.sleep(LOOK_EVERY_S)
 
     def _pause(self, name: str, address: str, seconds: float) -> None:
         def pause_at(fraction: float, dask_worker: Worker) -> None:

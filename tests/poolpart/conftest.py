@@ -1,4 +1,4 @@
-"""Clusters to test on: of threads where nothing is killed, of processes where something is."""
+"""Clusters to test on: of threads, or of processes for tests that kill workers."""
 
 from __future__ import annotations
 
@@ -19,7 +19,10 @@ from poolpart.deploy.local_processes import FixedCluster
 
 
 def thread_cluster(workers):
-    """Cluster in this process, whose tasks get the objects that tests have; options by name."""
+    """Return a cluster in this process, whose tasks get the objects of the tests.
+
+    `workers` has options of each worker, by name.
+    """
     return cluster_of(workers, {"protocol": "inproc://"})
 
 
@@ -48,7 +51,7 @@ def _threads():
 
 @pytest.fixture
 def client(_threads):
-    """Client of a cluster of threads: A with two workers of two slots, B with one, one plain."""
+    """Client of a cluster of threads: A-0 and A-1 of two slots each, B-0, and a plain worker."""
     with Client(_threads) as client:
         yield client
     wait_until(lambda: not _threads.scheduler.tasks)
@@ -66,7 +69,7 @@ def b(client):
 
 @pytest.fixture(scope="session")
 def processes():
-    """Client of a local cluster of processes: GPU, IO of four slots, and OTHER, one worker each."""
+    """Client of a local cluster of processes: workers GPU, IO with four slots, and OTHER."""
     with (
         local_cluster({"GPU": (1, 1), "IO": (1, 4), "OTHER": (1, 1)}) as cluster,
         Client(cluster) as client,
@@ -115,23 +118,24 @@ def nannies(_nannies, patient):
 
 
 def partitions_of(worker):
-    """Partitions that a worker belongs to, as the scheduler knows it."""
+    """Return the partitions of a worker, as the scheduler knows the worker."""
     return [name for name, slots in worker.resources.items() if slots]
 
 
 @pytest.fixture
 def own_nannies(patient):
-    """Client of such a cluster that a test has for itself, to do with as it likes."""
+    """Client of a `nanny_cluster` that a test may damage."""
     with nanny_cluster() as cluster, Client(cluster) as client:
         yield client
 
 
 @pytest.fixture
 def queue(monkeypatch):
-    """A queue in place of Slurm's; partitions look often what has become of their jobs."""
-    jobs, queue = import_jobqueue().slurm.SLURMJob, Queue()
+    """Stand-in for the queue of Slurm; partitions look at their jobs 20 times a second."""
+    jobs = import_jobqueue().slurm.SLURMJob
+    queue = Queue()
     monkeypatch.setattr(jobs, "_submit_job", lambda job, path: queue.submit(job, path))
-    monkeypatch.setattr(jobs, "_close_job", lambda job, *what: queue.close(job, *what))
+    monkeypatch.setattr(jobs, "_close_job", lambda job, *arguments: queue.close(job, *arguments))
     monkeypatch.setattr("poolpart.deploy.clusters._ADAPT_EVERY_S", 0.05)
     monkeypatch.setattr("poolpart.deploy.clusters._LOOK_EVERY_S", 0.05)
     return queue
@@ -139,23 +143,24 @@ def queue(monkeypatch):
 
 @pytest.fixture
 def make_pipe():
-    """Make pipes with names of their own; those that a test leaves are deleted."""
-    made = []
+    """Return a function that makes pipes of random names, and delete these pipes."""
+    pipes = []
 
     def make(client, capacity=3, producers=1):
         name = f"test-{uuid.uuid4().hex[:8]}"
-        made.append(Pipe(name, capacity, client, producers).create())
-        return made[-1]
+        pipes.append(Pipe(name, capacity, client, producers).create())
+        return pipes[-1]
 
     yield make
-    for pipe in made:
+    for pipe in pipes:
         pipe.delete()
 
 
 @pytest.fixture
 def received(monkeypatch):
-    """Bytes that this process, with client and scheduler, receives: {peer: bytes}."""
-    counts, read = Counter(), tcp.read_bytes_rw
+    """Count the bytes that this process, with client and scheduler, receives: {peer: bytes}."""
+    counts = Counter()
+    read = tcp.read_bytes_rw
 
     async def count(stream, n):
         counts[stream.socket.getpeername()[:2]] += n

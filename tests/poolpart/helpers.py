@@ -1,4 +1,4 @@
-"""What several files of these tests do to clusters, and look at."""
+"""Helpers that several files of these tests share: tasks, and changes of clusters."""
 
 import os
 import signal
@@ -9,11 +9,11 @@ from distributed.core import Status
 
 from poolpart.workers import worker_identities
 
-LONG_S = 120.0  # for what happens at once, or the test fails
+LONG_S = 120.0  # longest wait for an immediate event before a test fails
 
 
-def here(*_):
-    """Name of the worker that runs this."""
+def worker_name(*_):
+    """Return the name of the worker that runs this task."""
     return str(get_worker().name)
 
 
@@ -26,13 +26,13 @@ def wait_for(event):
 
 
 def declared(client):
-    """Resources by worker, as the scheduler knows them."""
+    """Return the resources of each worker, by name, as the scheduler knows the workers."""
     workers = worker_identities(client).values()
     return {str(worker["name"]): worker["resources"] for worker in workers}
 
 
 def declared_by_themselves(client):
-    """Resources by worker, as the workers know them."""
+    """Return the resources of each worker, by name, as the workers state."""
     names = {address: str(w["name"]) for address, w in worker_identities(client).items()}
     return {names[address]: slots for address, slots in client.run(_slots).items()}
 
@@ -42,16 +42,16 @@ def _slots(dask_worker):
 
 
 def addresses(client):
-    """Addresses of the workers by name."""
+    """Return the addresses of the workers, by name."""
     workers = worker_identities(client).items()
     return {str(worker["name"]): address for address, worker in workers}
 
 
 def kill(client, name):
-    """Kill a worker's process as soon as its nanny would start it again; returns its address.
+    """Kill a worker's process as soon as its nanny can start a new process; return its address.
 
-    A nanny ends when its first worker dies before it has heard that this one is up. It looks 20
-    times a second, on a busy machine less often.
+    A nanny ends if its first worker dies before the nanny has noticed that the worker is up. The
+    nanny looks 20 times a second, on a busy machine less often.
     """
     address = addresses(client)[name]
     pid = client.run(os.getpid, workers=[address])[address]
@@ -66,7 +66,7 @@ def _hears_of_worker(dask_worker):
 
 
 def join(client, name, **options):
-    """Start one more worker, like the first but for these options."""
+    """Start a further worker, like the first worker but for the given options."""
     spec = next(iter(client.cluster.worker_spec.values()))
     client.cluster.worker_spec[name] = {**spec, "options": {**spec["options"], **options}}
     client.sync(client.cluster._correct_state)

@@ -1,4 +1,4 @@
-"""A queue that is made up: jobs of Slurm whose workers are in this process.
+"""A stand-in for a queue: jobs of Slurm whose workers are in this process.
 
 `tests/system/test_queues.py` has a real one.
 """
@@ -17,7 +17,7 @@ SCHEDULER = {"host": "127.0.0.1", "port": 0, "dashboard": False, "dashboard_addr
 
 
 class Queue:
-    """A queue whose jobs begin at once, unless it is held."""
+    """A queue whose jobs begin at once, unless `held` is set."""
 
     def __init__(self) -> None:
         self.held = self.full = False
@@ -46,14 +46,16 @@ class Queue:
         return f"Submitted batch job {number}"
 
     async def begin(self, number: str) -> None:
-        """Let a job begin."""
-        name, text = self.waiting.pop(number), self.scripts[number]
+        """Start the workers of a job."""
+        name = self.waiting.pop(number)
+        text = self.scripts[number]
         partition, slots = re.search(r"--resources (\w+)=(\d+)", text).groups()
         count = re.search(r"--nworkers (\d+)", text)
         names = [f"{name}-{n}" for n in range(int(count[1]))] if count else [name]
         options = {"nthreads": 2, "resources": {partition: int(slots)}, "dashboard": False}
         self.workers[number] = [
-            await Worker(self._scheduler, name=one, host="127.0.0.1", **options) for one in names
+            await Worker(self._scheduler, name=worker_name, host="127.0.0.1", **options)
+            for worker_name in names
         ]
 
     async def close(self, job: Any, number: str, command: str) -> None:

@@ -14,7 +14,7 @@ import dask
 import pytest
 from distributed import Client, Event, get_client, secede, wait
 from tests.clusters import import_jobqueue
-from tests.poolpart.helpers import LONG_S, here, twice, wait_for
+from tests.poolpart.helpers import LONG_S, twice, wait_for, worker_name
 from tests.poolpart.job_queue import SCHEDULER
 
 import poolpart.adapting
@@ -43,14 +43,15 @@ def adaptive(minimum: int, maximum: int, **options: Any) -> dict[str, Any]:
 
 def test_jobs_are_of_the_partition_that_has_work_and_go_when_it_is_done(queue, wait_until):
     with cluster_of({"GPU": adaptive(0, 3), "IO": adaptive(0, 3), "FIX": {}}) as client:
-        gpu, io = Partition("GPU", client), Partition("IO", client)
+        gpu = Partition("GPU", client)
+        io = Partition("IO", client)
         assert queue.submitted == ["FIX-0"]
         tasks = [gpu.submit(wait_for, "go") for _ in range(8)]
         wait_until(lambda: len(gpu) == 3)
         assert len(io) == 0
         Event("go", client).set()
         client.gather(tasks)
-        names = {gpu.submit(here).result(LONG_S) for _ in range(5)}
+        names = {gpu.submit(worker_name).result(LONG_S) for _ in range(5)}
         assert names <= {"GPU-0", "GPU-1", "GPU-2"}
         del tasks
         wait_until(lambda: len(gpu) == 0)
@@ -60,7 +61,7 @@ def test_jobs_are_of_the_partition_that_has_work_and_go_when_it_is_done(queue, w
         assert sorted(queue.submitted) == ["FIX-0", "GPU-0", "GPU-1", "GPU-2"]
         assert list(queue.workers) == ["0"]
         # Later ones have names of their own.
-        assert gpu.submit(here).result(LONG_S) == "GPU-3"
+        assert gpu.submit(worker_name).result(LONG_S) == "GPU-3"
         assert Pool.from_client(client).partitions().keys() == {"FIX", "GPU", "IO"}
 
 
@@ -94,8 +95,9 @@ class Counter:
 def is_kept(partition, queue, begin):
     """Whether the one worker stays that has what `begin` begins; it ends with what that returns."""
     partition.adapt(1, 1)
-    partition.submit(here).result(LONG_S)
-    began, end = len(queue.submitted), begin()
+    partition.submit(worker_name).result(LONG_S)
+    began = len(queue.submitted)
+    end = begin()
     partition.adapt(0, 1, idle_s=IDLE_S)
     time.sleep(2.5 * IDLE_S)
     kept = len(partition) == 1 and len(queue.submitted) == began
@@ -153,7 +155,7 @@ def test_a_job_in_the_queue_is_cancelled_when_its_work_is_gone(queue, wait_until
     queue.held = True
     with cluster_of({"GPU": adaptive(0, 4)}) as client:
         gpu = Partition("GPU", client)
-        tasks = [gpu.submit(here) for _ in range(3)]
+        tasks = [gpu.submit(worker_name) for _ in range(3)]
         wait_until(lambda: look_for_tasks(client, "GPU").coming == 3)
         seen = look_for_tasks(client, "GPU")
         assert (len(queue.waiting), seen.slots, seen.most_slots) == (3, 0, 4)
@@ -170,14 +172,15 @@ def test_a_worker_whose_job_was_cancelled_too_late_gets_no_task(queue, wait_unti
     queue.held = True
     with cluster_of({"GPU": adaptive(0, 1)}) as client:
         gpu = Partition("GPU", client)
-        task = gpu.submit(here)
+        task = gpu.submit(worker_name)
         wait_until(lambda: queue.waiting)
-        [number], scheduler = queue.waiting, client.cluster.scheduler
+        [number] = queue.waiting
+        scheduler = client.cluster.scheduler
         task.cancel()
         # The scheduler has decided, and the queue has not been told.
         adaptation = scheduler.plugins[poolpart.adapting.NAME]
         adaptation._cancelled.add("GPU-0")
-        task = gpu.submit(here)
+        task = gpu.submit(worker_name)
         client.sync(queue.begin, number)
         wait_until(lambda: not scheduler.workers)
         assert not task.done()
@@ -206,12 +209,12 @@ def test_jobs_that_the_queue_refuses_are_tried_again_while_there_is_work(queue, 
     queue.full = True
     with cluster_of({"GPU": adaptive(0, 2)}, tell=said.append) as client:
         gpu = Partition("GPU", client)
-        task = gpu.submit(here)
+        task = gpu.submit(worker_name)
         wait_until(lambda: said)
         assert said == ["A worker cannot be started: the queue is full"]
         task.cancel()
         wait_until(lambda: not client.cluster.worker_spec)
-        task = gpu.submit(here)
+        task = gpu.submit(worker_name)
         wait_until(lambda: client.cluster.worker_spec)
         queue.full = False
         assert task.result(LONG_S).startswith("GPU-")
@@ -258,7 +261,7 @@ def test_tasks_for_one_worker_start_no_others(queue, wait_until):
         tasks = [gpu.submit(wait_for, "go", workers="GPU-0") for _ in range(5)]
         time.sleep(0.5)
         assert queue.submitted == ["GPU-0"]
-        tasks.append(gpu.submit(here))
+        tasks.append(gpu.submit(worker_name))
         assert tasks[-1].result(LONG_S) == "GPU-1"
         Event("go", client).set()
         client.gather(tasks)
@@ -276,8 +279,8 @@ def test_a_map_has_work_for_all_that_may_come(queue, wait_until):
 def test_a_task_that_no_worker_to_come_can_run_is_refused(queue):
     with cluster_of({"GPU": adaptive(0, 3, slots=2)}) as client:
         with pytest.raises(PoolError, match=r"asks for 3 slots .* have 2 at most"):
-            Partition("GPU", client).submit(here, slots=3)
-        assert Partition("GPU", client).submit(here, slots=2).result(LONG_S) == "GPU-0"
+            Partition("GPU", client).submit(worker_name, slots=3)
+        assert Partition("GPU", client).submit(worker_name, slots=2).result(LONG_S) == "GPU-0"
 
 
 def outer(number):
@@ -288,7 +291,7 @@ ran: list[tuple[int, str, str]] = []  # number of a task, its partition, and its
 
 
 def note(number, partition):
-    ran.append((number, partition, here()))
+    ran.append((number, partition, worker_name()))
     return number
 
 

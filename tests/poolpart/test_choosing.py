@@ -8,7 +8,7 @@ import dask
 import pytest
 from benchmarks import placing
 from distributed import Client, Event, wait
-from tests.poolpart.helpers import LONG_S, here, wait_for
+from tests.poolpart.helpers import LONG_S, wait_for, worker_name
 
 from poolpart import Pool, n_workers, rest
 
@@ -36,11 +36,11 @@ def gather_places(client, futures):
 
 def wait_here(event, *_):
     wait_for(event)
-    return here()
+    return worker_name()
 
 
 def open_gate(client, gate, futures):
-    """Let the tasks of `futures` end once each has a worker, so that none finds one idle again."""
+    """Let tasks end once each task has a worker, so that no task finds an idle worker again."""
     keys = {future.key for future in futures}
     deadline = time.monotonic() + LONG_S
     while count_placed(client, keys) < len(keys):
@@ -79,18 +79,18 @@ def test_a_worker_that_is_free_is_chosen_before_busy_workers(client, parts):
     gate = f"gate-{client.id}"
     busy = [parts["A"].submit(wait_here, gate) for _ in range(4)]
     for _ in range(8):
-        assert parts["A"].submit(here).result(LONG_S)
+        assert parts["A"].submit(worker_name).result(LONG_S)
     open_gate(client, gate, busy)
     client.gather(busy)
 
 
 def place_of_input(data, *_):
-    return data, here()
+    return data, worker_name()
 
 
 def test_a_task_runs_where_its_input_is(client, parts):
     for _ in range(8):
-        data = parts["A"].submit(here)
+        data = parts["A"].submit(worker_name)
         wait(data)
         place, own = parts["A"].submit(place_of_input, data).result(LONG_S)
         assert place == own
@@ -101,7 +101,7 @@ def test_a_task_that_takes_several_slots_goes_to_a_worker_that_has_them(client):
     parts = Pool.from_client(client).divide(rules)
     members = {worker.name for worker in parts["B"].workers}
     for _ in range(8):
-        assert parts["B"].submit(here, slots=3).result(LONG_S) in members
+        assert parts["B"].submit(worker_name, slots=3).result(LONG_S) in members
 
 
 def test_workers_that_join_leave_and_move_are_counted(client, parts):
@@ -118,13 +118,15 @@ def test_workers_that_join_leave_and_move_are_counted(client, parts):
 def test_dask_decides_within_the_fence_if_the_rule_fails(client, parts, monkeypatch, caplog):
     monkeypatch.delattr("poolpart.choosing.free_slots_of")
     members = {worker.name for worker in parts["A"].workers}
-    assert {parts["A"].submit(here).result(LONG_S) for _ in range(10)} <= members
-    assert not {client.submit(here, n, pure=False).result(LONG_S) for n in range(10)} & members
+    assert {parts["A"].submit(worker_name).result(LONG_S) for _ in range(10)} <= members
+    assert (
+        not {client.submit(worker_name, n, pure=False).result(LONG_S) for n in range(10)} & members
+    )
     assert "Dask decides without it" in caplog.text
 
 
 def test_nothing_is_left_after_dissolving(client, parts):
-    parts["A"].submit(here).result(LONG_S)
+    parts["A"].submit(worker_name).result(LONG_S)
     Pool.from_client(client).dissolve()
     scheduler = client.cluster.scheduler
     assert "poolpart-choice" not in scheduler.plugins

@@ -5,7 +5,7 @@ import threading
 
 import pytest
 from distributed import Event
-from tests.poolpart.helpers import LONG_S, declared, here, join, kill, wait_for
+from tests.poolpart.helpers import LONG_S, declared, join, kill, wait_for, worker_name
 
 from poolpart import Pool, PoolError, n_workers, named, per_host, rest, steward
 from poolpart.workers import worker_identities
@@ -56,13 +56,13 @@ def _on_worker(dask_worker):
 def test_everything_is_as_before(start, wait_until):
     workers = {"native": {"resources": {"GPU": 2}}, "disk": {"resources": {"DISK": 1}}}
     client = start({**{name: {} for name in "abcd"}, **workers})
-    held = client.submit(here, key="held")
+    held = client.submit(worker_name, key="held")
     held.result()
     before = known(client)
     pool = Pool.from_client(client)
     parts = pool.divide({"A": n_workers(2, exclusive=True), "B": per_host(1), "C": rest()})
     part, _ = pool.partition("GPU", workers=["native"], slots=5)
-    client.gather([part.submit(here), *(p.submit(here) for p in parts.values())])
+    client.gather([part.submit(worker_name), *(p.submit(worker_name) for p in parts.values())])
     parts["A"].grow(1)
     wait_until(lambda: client.cluster.scheduler.tasks.keys() == {"held"})
     assert known(client) != before
@@ -95,7 +95,8 @@ def test_a_worker_that_comes_back_after_all_is_as_it_was(nannies, wait_until):
 def test_a_worker_that_is_just_being_told_to_belong(start, wait_until, monkeypatch):
     client = start({"a": {}})
     Pool.from_client(client).divide({"A": rest()})
-    told, call = threading.Event(), steward.call
+    told = threading.Event()
+    call = steward.call
 
     async def call_and_linger(*args, **kwargs):
         answer = await call(*args, **kwargs)
@@ -155,7 +156,7 @@ def test_a_result_that_is_lost_afterwards_is_computed_again(start, wait_until):
     client = start({"a": {}, "b": {}})
     pool = Pool.from_client(client)
     part, _ = pool.partition("P", workers=["a"])
-    future = part.submit(here)
+    future = part.submit(worker_name)
     assert future.result() == "a"
     pool.dissolve()
     del client.cluster.worker_spec["a"]

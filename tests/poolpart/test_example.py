@@ -34,8 +34,10 @@ def thumbnails(count):
 
 @pytest.mark.slow
 def test_whichever_worker_is_killed_the_file_is_the_same(tmp_path, wait_until):
-    path, total = tmp_path / "out.bin", 100
-    run, all_killed = runpy.run_path(str(EXAMPLE))["run"], threading.Event()
+    path = tmp_path / "out.bin"
+    total = 100
+    run = runpy.run_path(str(EXAMPLE))["run"]
+    all_killed = threading.Event()
 
     def pause(seconds):
         time.sleep(seconds)

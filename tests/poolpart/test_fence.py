@@ -16,7 +16,7 @@ from poolpart import Pool, named
 OUTSIDE = {"B-0", "plain"}
 
 
-def here(*_, pause_s=0.0):
+def worker_name(*_, pause_s=0.0):
     time.sleep(pause_s)
     return str(get_worker().name)
 
@@ -24,18 +24,18 @@ def here(*_, pause_s=0.0):
 def inside(count):
     """Submit from inside a task, without a partition."""
     with worker_client() as client:
-        return client.gather([client.submit(here, i, pure=False) for i in range(count)])
+        return client.gather([client.submit(worker_name, i, pure=False) for i in range(count)])
 
 
 class Counting:
     def where(self):
-        return here()
+        return worker_name()
 
 
 @pytest.fixture
 def client(start, monkeypatch):
     # How long workers may take to answer, and after which time tasks that wait are told of again.
-    monkeypatch.setattr("poolpart.fence.COMPLAIN_EVERY_S", 3600.0)
+    monkeypatch.setattr("poolpart.fence.WARN_EVERY_S", 3600.0)
     client = start({key: {} for key in ("A-0", "A-1", "B-0", "plain")})
     client.cluster.scheduler.validate = True  # Dask checks itself after each step
     return client
@@ -65,7 +65,7 @@ go = threading.Event()  # the workers are threads of this process
 def here_after_all(*_, pause_s=0.0):
     """Wait until all are submitted: else the first have ended by then, on a slow machine."""
     go.wait(LONG_S)
-    return here(pause_s=pause_s)
+    return worker_name(pause_s=pause_s)
 
 
 def pile_up(client, wait_until, count=40):
@@ -78,11 +78,11 @@ def pile_up(client, wait_until, count=40):
 
 
 def submitted(client):
-    return client.gather([client.submit(here, i, pure=False) for i in range(40)])
+    return client.gather([client.submit(worker_name, i, pure=False) for i in range(40)])
 
 
 def mapped(client):
-    return client.gather(client.map(here, range(200), pure=False))
+    return client.gather(client.map(worker_name, range(200), pure=False))
 
 
 def mapped_on_a_scheduler_without_a_queue(client):
@@ -95,7 +95,7 @@ def from_inside_others(client):
 
 
 def delayed(client):
-    return dask.compute(*(dask.delayed(here, pure=False)(i) for i in range(40)))
+    return dask.compute(*(dask.delayed(worker_name, pure=False)(i) for i in range(40)))
 
 
 def dependent(client):
@@ -110,7 +110,7 @@ def dependent(client):
 def preferring_the_partition(client):
     wanted = [state_of(client, "A-0").address]
     futures = [
-        client.submit(here, i, workers=wanted, allow_other_workers=True, pure=False)
+        client.submit(worker_name, i, workers=wanted, allow_other_workers=True, pure=False)
         for i in range(10)
     ]
     return client.gather(futures)
@@ -156,8 +156,8 @@ def test_without_a_fence_they_come_in(client):
 
 def test_tasks_of_the_partition_pass(client):
     parts = enclose(client, **A, **B)
-    assert set(parts["A"].map(here, range(20))) == {"A-0", "A-1"}
-    assert set(parts["B"].map(here, range(5))) == {"B-0"}
+    assert set(parts["A"].map(worker_name, range(20))) == {"A-0", "A-1"}
+    assert set(parts["B"].map(worker_name, range(5))) == {"B-0"}
     assert set(submitted(client)) == {"plain"}
     assert len(client.run(os.getpid)) == 4  # not a task
 
@@ -199,8 +199,8 @@ def test_tasks_wait_where_all_workers_are_behind_fences_and_everybody_is_told(cl
     parts = enclose(client, **A, **B, C=["plain"])
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
-        one = client.submit(here, pure=False)
-        many = client.map(here, range(100), pure=False)
+        one = client.submit(worker_name, pure=False)
+        many = client.map(worker_name, range(100), pure=False)
         wait_until(lambda: complaints(caught) and len(scheduler_of(client).tasks) == 101)
     [complaint] = complaints(caught)  # not one for each task
     assert "exclusive partitions (A, B, C)" in complaint
@@ -213,7 +213,10 @@ def test_waiting_tasks_go_to_a_worker_that_leaves_the_partition(start, wait_unti
     client = start({"A-0": {}})
     part, _ = Pool.from_client(client).partition("A", n_workers=1, exclusive=True, minimum=0)
     with pytest.warns(UserWarning, match="Tasks wait") as told:
-        waiting = [client.submit(here, pure=False), *client.map(here, range(50), pure=False)]
+        waiting = [
+            client.submit(worker_name, pure=False),
+            *client.map(worker_name, range(50), pure=False),
+        ]
         wait_until(lambda: complaints(told))
     part.shrink()
     assert set(client.gather(waiting)) == {"A-0"}
@@ -229,7 +232,8 @@ def test_nothing_is_lost_while_workers_move_to_and_fro(start):
     client.cluster.scheduler.validate = True
     pool = Pool.from_client(client)
     part, _ = pool.partition("P", n_workers=1, exclusive=True)
-    inside, outside = [], []
+    inside = []
+    outside = []
     for move in (part.grow, part.grow, part.shrink, part.grow, part.shrink, part.shrink):
         inside += [part.submit(place, pause_s=0.02) for _ in range(20)]
         outside += client.map(place, range(40), pause_s=0.01, pure=False)

@@ -71,7 +71,8 @@ def test_a_worker_that_is_slow_is_waited_for(nannies, monkeypatch):
 def test_a_worker_that_does_not_answer_keeps_only_its_own_results(nannies, wait_until):
     futures = [nannies.submit(os.getpid, workers=[name], pure=False) for name in (0, 1)]
     answering, stopped = (future.result(120) for future in futures)
-    keys, fetched = [future.key for future in futures], {}
+    keys = [future.key for future in futures]
+    fetched = {}
 
     def try_once():
         # The other one as well may be slower than that once.

@@ -5,7 +5,7 @@ from itertools import chain
 import dask
 import pytest
 from distributed import get_client, secede, worker_client
-from tests.poolpart.helpers import LONG_S, here
+from tests.poolpart.helpers import LONG_S, worker_name
 
 from poolpart import Partition, Pool, PoolError, named
 
@@ -13,7 +13,7 @@ from poolpart import Partition, Pool, PoolError, named
 def descend(depth, way):
     """Names of the workers of a tree of tasks, each of which waits for those it submits."""
     if not depth:
-        return [here()]
+        return [worker_name()]
     if way == "get_client":
         client = get_client()
         children = [client.submit(descend, depth - 1, way, pure=False) for _ in range(2)]
@@ -26,7 +26,7 @@ def descend(depth, way):
     else:
         with worker_client() as client:
             below = client.gather(client.map(descend, [depth - 1] * 2, way=way, pure=False))
-    return [here(), *chain.from_iterable(below)]
+    return [worker_name(), *chain.from_iterable(below)]
 
 
 @pytest.fixture
@@ -56,14 +56,14 @@ def test_at_any_depth_and_on_a_single_slot(client, way):
 def say_otherwise():
     with worker_client() as client:
         with dask.annotate(resources={}):
-            anywhere = [client.submit(here, i, pure=False) for i in range(20)]
-        by_resource = client.submit(here, "resource", resources={"B": 1})
-        by_partition = Partition("B", client).submit(here)
-        by_worker = client.submit(here, "worker", workers=["plain"])
-        inherited = client.submit(here, "inherited")
+            anywhere = [client.submit(worker_name, i, pure=False) for i in range(20)]
+        by_resource = client.submit(worker_name, "resource", resources={"B": 1})
+        by_partition = Partition("B", client).submit(worker_name)
+        by_worker = client.submit(worker_name, "worker", workers=["plain"])
+        inherited = client.submit(worker_name, "inherited")
         with dask.annotate(resources={"B": 1}):
-            annotated = dask.delayed(here)("annotated")
-        mixed = dask.compute(annotated, dask.delayed(here)("mixed"), optimize_graph=False)
+            annotated = dask.delayed(worker_name)("annotated")
+        mixed = dask.compute(annotated, dask.delayed(worker_name)("mixed"), optimize_graph=False)
         return (
             set(client.gather(anywhere)),
             client.gather([by_resource, by_partition, by_worker, inherited]),
@@ -83,7 +83,7 @@ class Foreman:
 
     def places(self, count):
         client = get_client()
-        return client.gather([client.submit(here, n, pure=False) for n in range(count)])
+        return client.gather([client.submit(worker_name, n, pure=False) for n in range(count)])
 
 
 def ask_foreman(foreman):

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 from distributed import Client, scheduler, worker_client
-from tests.poolpart.helpers import LONG_S, here
+from tests.poolpart.helpers import LONG_S, worker_name
 
 import poolpart
 from poolpart import Partition, Pool, PoolError, n_workers, rest
@@ -38,7 +38,7 @@ def _look_names_up_again():
 
 def nested():
     with worker_client() as client:
-        return client.gather(client.map(here, range(20), pure=False))
+        return client.gather(client.map(worker_name, range(20), pure=False))
 
 
 def test_nothing_else_reaches_into_dask():
@@ -76,8 +76,8 @@ def test_a_renamed_keyword_does_not_reach_strangers(renamed_keyword, start, capl
         parts = Pool.from_client(client).divide({"A": n_workers(1, exclusive=True), "B": rest()})
         assert stranger.submit(pow, 2, 10).result(LONG_S) == 1024
         outside = {worker.name for worker in parts["B"].workers}
-        assert set(stranger.gather(stranger.map(here, range(20), pure=False))) == outside
-        assert parts["A"].submit(here).result(LONG_S) not in outside
+        assert set(stranger.gather(stranger.map(worker_name, range(20), pure=False))) == outside
+        assert parts["A"].submit(worker_name).result(LONG_S) not in outside
         assert outside.issuperset(stranger.submit(nested).result(LONG_S))
     # The owner is told what is missing.
     assert "tasks from inside tasks may run anywhere" in parts["A"].note
@@ -138,7 +138,7 @@ def without(name, program):
         from tests.clusters import cluster_of
         import poolpart
         from poolpart import Partition, Pool, PoolError, n_workers, rest
-        from tests.poolpart.helpers import here
+        from tests.poolpart.helpers import worker_name
         with cluster_of({{"a": {{}}, "b": {{}}}}, {{"protocol": "inproc://"}}) as cluster:
             with Client(cluster) as client:
                 pool = Pool.from_client(client)
@@ -198,7 +198,7 @@ def test_the_rest_works_where_a_feature_is_off(start, monkeypatch):
     part = Pool.from_client(start({"a": {}})).divide({"A": rest()})["A"]
     with pytest.raises(PoolError, match=r"lacks Future._gone, so Partition.map is off; versions"):
         part.map(abs, [1])
-    assert part.submit(here).result(LONG_S) == "a"
+    assert part.submit(worker_name).result(LONG_S) == "a"
 
 
 def test_an_untested_version_is_warned_about(monkeypatch):

@@ -73,7 +73,8 @@ def sizes(client):
 
 def kill_when_told(process, monkeypatch):
     """Kill the driver when the scheduler, which is in this process, first tells a worker."""
-    killed, call = [], steward.call
+    killed = []
+    call = steward.call
 
     async def kill_and_call(*args, **kwargs):
         if not killed:

@@ -23,7 +23,7 @@ from distributed import (
     wait,
     worker_client,
 )
-from tests.poolpart.helpers import LONG_S, addresses, declared, here, join, kill, wait_for
+from tests.poolpart.helpers import LONG_S, addresses, declared, join, kill, wait_for, worker_name
 
 from poolpart import Partition, Pipe, Pool, PoolError, inherit, rest
 from poolpart.lending import lending_plugin
@@ -246,7 +246,8 @@ def test_a_partition_that_workers_were_started_with(start, wait_until):
 
 def test_what_another_library_has_wrapped_meanwhile_stays(start, monkeypatch):
     part = one_worker(start, slots=1)
-    called, wrapped = [], {Client: "sync", as_completed: "__next__"}
+    called = []
+    wrapped = {Client: "sync", as_completed: "__next__"}
 
     def wrap(inner):
         def theirs(*args, **kwargs):
@@ -287,7 +288,7 @@ def test_a_worker_without_this_package_ignores_the_plugin():
 
 def wait_and_say(gate):
     wait_for(gate)
-    return here()
+    return worker_name()
 
 
 @pytest.mark.parametrize("who", ["parent", "child"])
@@ -316,15 +317,15 @@ def test_workers_that_end_before_they_keep_their_slots_again_print_nothing(
     """As when a cluster is closed right after its last client."""
     caplog.set_level(logging.ERROR)
     with Client(own_nannies.cluster) as client:
-        Partition("A", client).submit(here)
+        Partition("A", client).submit(worker_name)
         pids = client.run(os.getpid).values()
         for pid in pids:
             os.kill(pid, signal.SIGSTOP)  # before they answer
     wait_until(lambda: inherit.NAME not in own_nannies.cluster.scheduler.plugins)
-    assert inherit._told
+    assert inherit._requests
     for pid in pids:
         os.kill(pid, signal.SIGKILL)
-    wait_until(lambda: not inherit._told)
+    wait_until(lambda: not inherit._requests)
     assert caplog.text == ""
 
 
@@ -411,10 +412,23 @@ def test_a_nested_task_that_waits_for_a_lock_lends_its_slot(client, b, wait_unti
 
 
 def poll(stop):
-    future = get_client().submit(here, pure=False)
-    while not future.done() and not Event(stop).is_set():
+    """Poll for a nested task without any request to the scheduler, which may lend the slot."""
+    future = get_client().submit(worker_name, pure=False)
+    while not future.done() and not stops[stop].is_set():
         time.sleep(0.01)
     return future.done()
+
+
+stops = {}  # {name: threading.Event}; tasks of a cluster of threads share it
+
+
+@pytest.fixture
+def stop():
+    """Name of an event that ends polling."""
+    name = f"stop-{time.monotonic_ns()}"
+    stops[name] = threading.Event()
+    yield name
+    stops.pop(name).set()
 
 
 @pytest.fixture
@@ -424,32 +438,30 @@ def warned(monkeypatch):
     return lambda client: [pickle.loads(event["message"]) for _, event in client.get_events("warn")]
 
 
-def test_polling_for_a_nested_task_is_reported_to_the_client(client, b, warned, wait_until):
-    stop = f"stop-{client.id}"
+def test_polling_for_a_nested_task_is_reported_to_the_client(client, b, warned, wait_until, stop):
     future = b.submit(poll, stop)
     wait_until(lambda: any(future.key in message for message in warned(client)))
     [message] = [message for message in warned(client) if future.key in message]
     assert "partition 'B'" in message and "use Future.result, distributed.wait" in message
-    Event(stop, client).set()
+    stops[stop].set()
     assert future.result(LONG_S) is False
 
 
 def poll_together(stop, number, count):
     """Poll when all parents hold their slots, so that each nested task waits on some worker."""
     Event(f"{stop}-{number}").set()
-    for other in range(count):
-        assert Event(f"{stop}-{other}").wait(LONG_S)
+    for parent_number in range(count):
+        assert Event(f"{stop}-{parent_number}").wait(LONG_S)
     return poll(stop)
 
 
-def test_polling_on_several_workers_is_reported(start, warned, wait_until):
+def test_polling_on_several_workers_is_reported(start, warned, wait_until, stop):
     client = start({name: {"resources": {"A": 1}} for name in "ab"})
     part = Partition("A", client)
-    stop = f"stop-{client.id}"
     futures = [part.submit(poll_together, stop, n, 2, workers="ab"[n]) for n in range(2)]
     keys = [future.key for future in futures]
     wait_until(lambda: any(key in message for message in warned(client) for key in keys))
-    Event(stop, client).set()
+    stops[stop].set()
     assert client.gather(futures) == [False, False]
 
 
@@ -462,7 +474,7 @@ def test_a_waiting_task_without_nested_tasks_keeps_its_slot(client, b):
     name = f"alone-{client.id}"
     waiting = b.submit(wait_alone, name)
     assert Event(f"{name}-started", client).wait(LONG_S)
-    later = b.submit(here)
+    later = b.submit(worker_name)
     time.sleep(0.3)
     assert not later.done()
     Queue(name, client).put(1)

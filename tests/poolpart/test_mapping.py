@@ -194,7 +194,8 @@ def test_the_first_tasks_start_at_once(a, client, wait_until):
 @pytest.mark.parametrize("chunk", [None, 1, 10])
 @pytest.mark.parametrize("ordered", [True, False])
 def test_an_error_names_its_item_and_lets_go_of_the_others(a, client, ordered, chunk, wait_until):
-    results, taken = a.map(fail_at_3, range(50), ordered=ordered, chunk=chunk, window=8), []
+    results = a.map(fail_at_3, range(50), ordered=ordered, chunk=chunk, window=8)
+    taken = []
     with pytest.raises(ZeroDivisionError, match="at 3") as caught:
         taken.extend(results)
     assert taken == [0, 1, 2] or not ordered
@@ -322,7 +323,8 @@ def length_and_place(data, other=0):
 
 
 def test_a_map_of_a_map_keeps_data_away_from_driver_and_scheduler(processes, received):
-    io, gpu = Partition("IO", processes), Partition("GPU", processes)
+    io = Partition("IO", processes)
+    gpu = Partition("GPU", processes)
     results = list(gpu.map(length_and_place, io.map(block, range(64))))
     assert results == [(2**20, "GPU")] * 64
     assert 0 < received.total() < 2**20  # of 64 MiB

@@ -5,7 +5,7 @@ import pickle
 import dask
 import pytest
 from distributed import Client
-from tests.poolpart.helpers import LONG_S, addresses, here, join, kill, leave, twice
+from tests.poolpart.helpers import LONG_S, addresses, join, kill, leave, twice, worker_name
 
 from poolpart import Partition, Pool, PoolError, n_workers, named, rest
 from poolpart.workers import worker_identities
@@ -19,7 +19,7 @@ def calls(part):
             pass
 
     return (
-        lambda: part.submit(here),
+        lambda: part.submit(worker_name),
         lambda: part.map(twice, [1]),
         lambda: part.compute(dask.delayed(1)),
         block,
@@ -31,7 +31,7 @@ def test_a_partition_that_was_dissolved(start):
     pool = Pool.from_client(client)
     part = pool.divide({"A": rest()})["A"]
     found = pool.partitions()["A"]  # learns that there is a rule when it submits
-    assert found.submit(here).result(LONG_S) in ("a", "b")
+    assert found.submit(worker_name).result(LONG_S) in ("a", "b")
     copy = pickle.loads(pickle.dumps(part))
     pool.dissolve()
     for partition in (part, found, copy):
@@ -39,18 +39,18 @@ def test_a_partition_that_was_dissolved(start):
             with pytest.raises(PoolError, match="Partition 'A' was dissolved: divide the pool"):
                 call()
     pool.divide({"A": rest()})
-    assert part.submit(here).result(LONG_S) in ("a", "b")
+    assert part.submit(worker_name).result(LONG_S) in ("a", "b")
 
 
 def test_by_another_client(start, monkeypatch):
     monkeypatch.setattr("poolpart.membership.KEEP_S", 0.0)
     client = start({"a": {}})
     part = Pool.from_client(client).divide({"A": rest()})["A"]
-    assert part.submit(here).result(LONG_S) == "a"
+    assert part.submit(worker_name).result(LONG_S) == "a"
     with Client(client.cluster) as other:
         Pool(other, []).dissolve()
     with pytest.raises(PoolError, match="was dissolved"):
-        part.submit(here)
+        part.submit(worker_name)
 
 
 def test_more_slots_than_any_worker_has(start):
@@ -59,12 +59,12 @@ def test_more_slots_than_any_worker_has(start):
     message = "A task asks for 4 slots of one worker, and workers of partition 'A' have 3 at most"
     for submit in (part.submit, lambda f, slots: part.map(f, [1], slots=slots)):
         with pytest.raises(PoolError, match=f"{message}.* by slots=4 in its rule"):
-            submit(here, slots=4)
+            submit(worker_name, slots=4)
     with pytest.raises(PoolError, match=r'have 1 at most: ask for fewer.*--resources "C=2"'):
         Partition("C", client).compute(dask.delayed(1), slots=2)
-    assert part.submit(here, slots=3).result(LONG_S) == "b"
+    assert part.submit(worker_name, slots=3).result(LONG_S) == "b"
     join(client, "d", nthreads=1, resources={"A": 5})  # what was known is not long believed
-    assert part.submit(here, slots=5).result(LONG_S) == "d"
+    assert part.submit(worker_name, slots=5).result(LONG_S) == "d"
 
 
 def test_without_workers_at_the_moment_it_waits(start):
@@ -91,12 +91,12 @@ def test_workers_by_name_address_or_both(start):
     part, _ = Pool.from_client(client).partition("A", workers=["a", "b", "c"])
     there = addresses(client)
     for workers, names in (("b", {"b"}), (there["c"], {"c"}), (["a", there["b"]], {"a", "b"})):
-        assert {part.submit(here, workers=workers).result(LONG_S) for _ in range(8)} <= names
+        assert {part.submit(worker_name, workers=workers).result(LONG_S) for _ in range(8)} <= names
     for stranger in ("stranger", "nobody", there["stranger"]):
         with pytest.raises(PoolError, match=r"does not belong to partition 'A': .* \(a, b, c\)"):
-            part.submit(here, workers=["a", stranger])
+            part.submit(worker_name, workers=["a", stranger])
     join(client, "d", resources={"A": 1})
-    assert part.submit(here, workers="d").result(LONG_S) == "d"
+    assert part.submit(worker_name, workers="d").result(LONG_S) == "d"
 
 
 def test_an_address_that_has_just_left_is_no_error(start, wait_until):
@@ -105,7 +105,7 @@ def test_an_address_that_has_just_left_is_no_error(start, wait_until):
     address = addresses(client)["b"]
     leave(client, "b")
     wait_until(lambda: address not in worker_identities(client))
-    future = part.submit(here, workers=address)
+    future = part.submit(worker_name, workers=address)
     wait_until(lambda: client.cluster.scheduler.unrunnable)
     assert future.status == "pending"
 
@@ -123,12 +123,12 @@ def test_many_tasks_take_few_requests(start, monkeypatch):
 
     monkeypatch.setattr(Client, "run_on_scheduler", count)
     monkeypatch.setattr("poolpart.membership.KEEP_S", LONG_S)
-    client.gather([part.submit(here, workers=address) for _ in range(50)])
+    client.gather([part.submit(worker_name, workers=address) for _ in range(50)])
     assert len(asked) == 1
 
 
 async def submit_in_the_loop(part):
-    return await part.submit(here)
+    return await part.submit(worker_name)
 
 
 def test_a_coroutine_submits_without_asking(start):

@@ -8,7 +8,7 @@ import time
 
 import pytest
 from distributed import Event, secede
-from tests.poolpart.helpers import LONG_S, declared, declared_by_themselves, here, wait_for
+from tests.poolpart.helpers import LONG_S, declared, declared_by_themselves, wait_for, worker_name
 
 from lidarpool.pipeline.placement import recorded
 from poolpart import Partition, Pool, PoolError, n_workers, per_host, rest, steward
@@ -17,11 +17,12 @@ from poolpart.workers import worker_identities
 
 def brief(_=None):
     time.sleep(0.01)
-    return here()
+    return worker_name()
 
 
 # The workers are threads of this process. A task that has been cancelled needs no client to wait.
-begun, released = queue.SimpleQueue(), threading.Event()
+begun = queue.SimpleQueue()
+released = threading.Event()
 
 
 def begin_and_wait(worker):
@@ -129,8 +130,10 @@ def test_a_task_that_was_cancelled_but_runs_on_keeps_its_slot(divided):
 def test_a_cancelled_task_that_is_on_its_way_when_its_worker_leaves(start, monkeypatch, wait_until):
     client = start({"a": {}, "b": {}})
     parts = Pool.from_client(client).divide({"A": n_workers(1, minimum=0), "B": rest()})
-    scheduler, moving = client.cluster.scheduler, parts["A"].workers[0]
-    stream, on_the_way = scheduler.stream_comms[moving.address], []
+    scheduler = client.cluster.scheduler
+    moving = parts["A"].workers[0]
+    stream = scheduler.stream_comms[moving.address]
+    on_the_way = []
     send = stream.send
     monkeypatch.setattr(stream, "send", lambda *messages: on_the_way.extend(messages))
     task = parts["A"].submit(brief)
@@ -140,7 +143,9 @@ def test_a_cancelled_task_that_is_on_its_way_when_its_worker_leaves(start, monke
     assert parts["A"].shrink() == [moving.name]
     monkeypatch.undo()
     client.sync(_send_all, send, on_the_way)
-    assert client.submit(here, workers=[moving.address]).result(timeout=LONG_S) == moving.name
+    assert (
+        client.submit(worker_name, workers=[moving.address]).result(timeout=LONG_S) == moving.name
+    )
     worker = client.cluster.workers[moving.name]
     wait_until(lambda: not worker.state.tasks)
     assert worker.state.total_resources == worker.state.available_resources == {"B": 1}
@@ -195,10 +200,13 @@ def test_a_cluster_that_was_divided_when_it_was_started(start):
 
 def test_a_worker_that_is_killed_while_it_moves(nannies, wait_until, monkeypatch):
     parts = Pool.from_client(nannies).divide({"A": per_host(1), "B": rest()})
-    target, moving = members(parts["A"])[0], members(parts["B"])[0]
+    target = members(parts["A"])[0]
+    moving = members(parts["B"])[0]
     tasks = [parts["B"].submit(recorded, "s", "B", brief) for _ in range(20)]
     tasks += [parts["A"].submit(recorded, "s", "A", brief) for _ in range(20)]
-    pids, killed, declare = nannies.run(os.getpid), [], steward.call
+    pids = nannies.run(os.getpid)
+    killed = []
+    declare = steward.call
 
     async def kill_and_declare(scheduler, address, *args, **kwargs):
         if not killed:  # its tasks have ended, and it is about to be told

@@ -11,7 +11,7 @@ import dask.bag
 import numpy as np
 import pytest
 from distributed import Client, Event, secede
-from tests.poolpart.helpers import here, twice, wait_for
+from tests.poolpart.helpers import twice, wait_for, worker_name
 
 from poolpart import Partition, Pool, PoolError
 
@@ -23,7 +23,7 @@ def stamp():
 def test_tasks_run_on_its_workers_and_on_all_of_them(a, b):
     assert [worker.name for worker in a.workers] == ["A-0", "A-1"]
     assert (len(a), a.slots, len(b), b.slots) == (2, 4, 1, 1)
-    in_a, in_b = ([part.submit(here) for _ in range(200)] for part in (a, b))
+    in_a, in_b = ([part.submit(worker_name) for _ in range(200)] for part in (a, b))
     assert {future.result() for future in in_a} == {"A-0", "A-1"}
     assert {future.result() for future in in_b} == {"B-0"}
 
@@ -51,7 +51,7 @@ def test_higher_priority_runs_first(b, client, wait_until):
 
 def submit_to(part, number):
     secede()
-    return part.submit(here).result(), sum(part.map(twice, range(number)))
+    return part.submit(worker_name).result(), sum(part.map(twice, range(number)))
 
 
 def test_a_partition_can_be_given_to_a_task_of_another(a, b):
@@ -107,7 +107,7 @@ def test_a_task_may_take_several_slots(a, client, wait_until):
     gate = Event(f"gate-{uuid.uuid4().hex}", client=client)
     tasks = [a.submit(wait_for, gate.name, slots=2) for _ in range(2)]
     wait_until(lambda: a.stats().busy == 4)
-    behind = a.submit(here)
+    behind = a.submit(worker_name)
     time.sleep(0.1)
     assert not behind.done()
     gate.set()
@@ -120,7 +120,7 @@ def test_a_task_may_take_several_slots(a, client, wait_until):
 
 
 def places(_=None):
-    return np.array([[int(here() == "B-0")]])
+    return np.array([[int(worker_name() == "B-0")]])
 
 
 def ones(name):
@@ -130,19 +130,19 @@ def ones(name):
 def test_collections_are_computed_on_its_workers(b, client):
     total = ones("a").sum()
     assert b.compute(total).result() == b.compute(total, sync=True) == 4
-    first, second = b.compute([ones("a").sum(), dask.delayed(here, pure=False)()])
+    first, second = b.compute([ones("a").sum(), dask.delayed(worker_name, pure=False)()])
     assert client.gather([first, second]) == [4, "B-0"]
-    assert dask.bag.range(4, 2).map(lambda _: here()).compute() != ["B-0"] * 4
+    assert dask.bag.range(4, 2).map(lambda _: worker_name()).compute() != ["B-0"] * 4
 
 
 def test_in_a_block_everything_is_on_its_workers(a, b, client):
     with b:
         assert ones("c").sum().compute() == 4
-        assert dask.compute(dask.delayed(here, pure=False)())[0] == "B-0"
+        assert dask.compute(dask.delayed(worker_name, pure=False)())[0] == "B-0"
         kept = ones("b").persist()
-        assert client.submit(here, pure=False).result() == "B-0"
+        assert client.submit(worker_name, pure=False).result() == "B-0"
         with a:
-            assert client.submit(here, pure=False).result() in ("A-0", "A-1")
+            assert client.submit(worker_name, pure=False).result() in ("A-0", "A-1")
         assert set(client.gather(client.map(places, range(3)))[0].flat) == {1}
     assert kept.sum().compute() == 4
     assert not dask.get_annotations()

@@ -1,6 +1,7 @@
 """Pipes between threads of one process: order, bound, end, failure, deletion."""
 
 import itertools
+import signal
 import threading
 import time
 from collections import deque
@@ -18,8 +19,8 @@ from poolpart.pipe import take_news
 from poolpart.pipe_states import PipeState, pipes_of
 
 
-def again(pipe):
-    """Make another object for the same pipe, which has seen nothing of it yet."""
+def other_end(pipe):
+    """Return a further object for the same pipe, with an empty buffer."""
     return Pipe(pipe.name, pipe.capacity, pipe.client)
 
 
@@ -40,8 +41,9 @@ def produce(pipe, items):
 
 @pytest.fixture
 def pool():
-    with ThreadPoolExecutor(16) as pool:
-        yield pool
+    pool = ThreadPoolExecutor(16)
+    yield pool
+    pool.shutdown(wait=False)  # threads of a failed test wait until its pipes are deleted
 
 
 OPERATIONS = st.lists(
@@ -57,7 +59,9 @@ OPERATIONS = st.lists(
 @settings(max_examples=40)
 def test_behaves_as_a_bounded_queue(_threads_client, operations, capacity):
     pipe = Pipe("model", capacity, _threads_client).create()
-    producer, queued, taken = again(pipe), deque(), deque()
+    producer = other_end(pipe)
+    queued = deque()
+    taken = deque()
     try:
         for operation, item in operations:
             if operation == "put" and len(queued) == capacity:
@@ -95,7 +99,7 @@ def test_several_producers_and_consumers_lose_and_double_nothing(
     client, make_pipe, pool, shared, put
 ):
     pipe = make_pipe(client, capacity=5)
-    ends = [pipe if shared else again(pipe) for _ in range(8)]
+    ends = [pipe if shared else other_end(pipe) for _ in range(8)]
     consumers = [pool.submit(consume, end) for end in ends[:4]]
     producers = [
         pool.submit(put, end, [(number, item) for item in range(40)])
@@ -117,7 +121,7 @@ def test_consumers_drain_a_closed_pipe_and_end(client, make_pipe):
     pipe.put(2)
     pipe.close()
     pipe.close()
-    end = again(pipe)
+    end = other_end(pipe)
     assert end.get() == 1
     assert list(end) == [2]
     with pytest.raises(PipeClosed, match="is closed and empty"):
@@ -128,10 +132,11 @@ def test_consumers_drain_a_closed_pipe_and_end(client, make_pipe):
 
 
 def test_failing_wakes_both_ends_with_the_reason(client, make_pipe, pool):
-    empty, full = make_pipe(client), make_pipe(client, capacity=1)
+    empty = make_pipe(client)
+    full = make_pipe(client, capacity=1)
     full.put("x")
-    waiting = [pool.submit(again(empty).get), pool.submit(again(empty).get_all)]
-    waiting += [pool.submit(again(full).put, number) for number in range(3)]
+    waiting = [pool.submit(other_end(empty).get), pool.submit(other_end(empty).get_all)]
+    waiting += [pool.submit(other_end(full).put, number) for number in range(3)]
     time.sleep(0.05)
     assert not any(future.done() for future in waiting)
     for pipe in (empty, full):
@@ -145,12 +150,13 @@ def test_failing_wakes_both_ends_with_the_reason(client, make_pipe, pool):
 def test_advice_can_return_to_what_it_was(client, make_pipe):
     pipe = make_pipe(client)
     pipe.advise(5)
-    again(pipe).advise(1)
-    assert again(pipe).advice == 1
+    other_end(pipe).advise(1)
+    assert other_end(pipe).advice == 1
 
 
 def test_of_many_items_those_before_an_error_are_in_the_pipe(client, make_pipe):
-    pipe, source = make_pipe(client, capacity=2), itertools.count()
+    pipe = make_pipe(client, capacity=2)
+    source = itertools.count()
     pipe.put_many([])
     pipe.put("first")
     with pytest.raises(TimeoutError, match=r"stayed full for 0\.1 s"):
@@ -195,7 +201,7 @@ def test_using_a_deleted_pipe_says_so_and_does_not_bring_it_back(client, make_pi
     pipe.delete()
     pipe.delete()
     for use in USES.values():
-        for end in (pipe, again(pipe)):
+        for end in (pipe, other_end(pipe)):
             with pytest.raises(PipeFailed, match="does not exist: never created, or deleted"):
                 use(end)
     assert known(client) == before
@@ -214,10 +220,10 @@ def test_two_pipes_of_one_name(client, make_pipe):
     pipe = make_pipe(client)
     pipe.put("mine")
     with pytest.raises(ValueError, match=f"has a queue or variable {pipe.name!r}"):
-        again(pipe).create()
+        other_end(pipe).create()
     assert pipe.get() == "mine"
     pipe.delete()
-    assert again(pipe).create().depth == 0
+    assert other_end(pipe).create().depth == 0
 
 
 @pytest.mark.parametrize(
@@ -276,12 +282,86 @@ def test_all_that_is_in_the_pipes_is_taken_in_one_request(client, make_pipe, mon
         one.put(number)
     two.put({"scan": 7})
     one.close()
-    asked, ask = [], client.sync
+    asked = []
+    ask = client.sync
     monkeypatch.setattr(client, "sync", lambda *a, **k: asked.append(1) or ask(*a, **k))
     found = take_news(client, LONG_S, [pipe.name for pipe in pipes])
     assert len(asked) == 1
     assert found == {one.name: [0, 1, 2, 3, 4], two.name: [{"scan": 7}]}
     assert take_news(client, 0.0, [one.name, two.name, empty.name]) == {}
+
+
+# -- waits and items that go wrong ---------------------------------------------------------
+
+
+class Unreadable:
+    """An item whose unpickling raises ValueError."""
+
+    def __reduce__(self):
+        return int, ("not a number",)
+
+
+@pytest.mark.parametrize("take", [Pipe.get_all, Pipe.poll])
+def test_of_the_items_of_a_request_only_the_unreadable_one_is_lost(client, make_pipe, take):
+    pipe = make_pipe(client, capacity=10)
+    pipe.put_many([0, 1, Unreadable(), 2, 3])
+    assert take(pipe) == [0, 1]
+    with pytest.raises(ValueError, match="not a number"):
+        take(pipe)
+    assert take(pipe) == [2, 3]
+
+
+def test_get_raises_the_error_of_an_unreadable_item_in_the_place_of_the_item(client, make_pipe):
+    pipe = make_pipe(client, capacity=10)
+    pipe.put_many([0, Unreadable(), 1])
+    pipe.close()
+    assert pipe.get() == 0
+    with pytest.raises(ValueError, match="not a number"):
+        pipe.get()
+    assert list(pipe) == [1]
+
+
+@pytest.fixture
+def interrupt():
+    """Return a function that interrupts the main thread after some seconds, as Ctrl-C does."""
+
+    def raise_interrupt(number, frame):
+        raise KeyboardInterrupt
+
+    handler = signal.signal(signal.SIGALRM, raise_interrupt)
+    yield lambda seconds: signal.setitimer(signal.ITIMER_REAL, seconds)
+    signal.setitimer(signal.ITIMER_REAL, 0)
+    signal.signal(signal.SIGALRM, handler)
+
+
+@pytest.mark.parametrize("take", [Pipe.get, Pipe.get_all, list])
+def test_a_wait_that_is_interrupted_takes_no_item_away(client, make_pipe, interrupt, take):
+    pipe = make_pipe(client)
+    interrupt(0.3)
+    with pytest.raises(KeyboardInterrupt):
+        take(pipe)
+    other_end(pipe).put("item")  # within the second for which the scheduler keeps the request
+    time.sleep(0.1)
+    assert pipe.get(5.0) == "item"
+
+
+def test_an_interrupted_wait_asks_no_further(client, make_pipe, interrupt):
+    pipe = make_pipe(client)
+    interrupt(0.3)
+    with pytest.raises(KeyboardInterrupt):
+        pipe.get()
+    time.sleep(1.5)  # the scheduler keeps a request for a second
+    other_end(pipe).put("item")
+    assert other_end(pipe).get(5.0) == "item"
+
+
+def test_a_variable_that_is_read_before_its_pipe_exists(client, make_pipe, pool):
+    """Dask wakes the requests that wait for a variable only when a client sets the variable."""
+    with Client(client.cluster, set_as_default=False) as other:
+        waiting = pool.submit(Variable("opened-later", other).get, LONG_S)
+        time.sleep(0.2)
+        with Pipe("opened-later", 3, client):
+            assert waiting.result(5.0)["capacity"] == 3
 
 
 # -- several producers -------------------------------------------------------------------------
@@ -291,7 +371,7 @@ def test_a_pipe_of_several_producers_is_closed_by_the_last(client, make_pipe):
     pipe = make_pipe(client, capacity=10, producers=3)
     for number in range(3):
         with pytest.raises(TimeoutError):
-            again(pipe).get(timeout_s=0)
+            other_end(pipe).get(timeout_s=0)
         pipe.put(number)
         assert pipe.get() == number
         pipe.close()
@@ -374,9 +454,9 @@ def test_a_queue_waits_for_room_as_well(client, other, make_pipe, pool):
 def test_several_queues_and_pipes_lose_and_double_nothing(client, other, make_pipe, pool):
     pipe = make_pipe(client, capacity=2)
     queue = Queue(pipe.name, other)
-    consumers = [pool.submit(consume, again(pipe)) for _ in range(2)]
+    consumers = [pool.submit(consume, other_end(pipe)) for _ in range(2)]
     takers = [pool.submit(lambda: [queue.get() for _ in range(20)]) for _ in range(2)]
-    producers = [pool.submit(produce, again(pipe), range(30)) for _ in range(2)]
+    producers = [pool.submit(produce, other_end(pipe), range(30)) for _ in range(2)]
     putters = [pool.submit(lambda: [queue.put(item) for item in range(30, 60)]) for _ in range(2)]
     for future in producers + putters:
         future.result(LONG_S)
@@ -388,7 +468,8 @@ def test_several_queues_and_pipes_lose_and_double_nothing(client, other, make_pi
 
 @pytest.mark.parametrize("end", ["close", "fail", "delete"])
 def test_waits_of_a_queue_end_with_the_pipe(client, other, make_pipe, pool, end):
-    empty, full = make_pipe(client), make_pipe(client, capacity=1)
+    empty = make_pipe(client)
+    full = make_pipe(client, capacity=1)
     full.put(1)
     waiting = [pool.submit(Queue(empty.name, other).get, LONG_S)]
     waiting += [pool.submit(Queue(full.name, other).put, 2, LONG_S)]
@@ -427,7 +508,7 @@ def test_the_variable_is_the_state(client, other, make_pipe, pool):
         "advice": 1,
     }
     variable.set({**variable.get(), "advice": 5})
-    assert again(pipe).advice == 5
+    assert other_end(pipe).advice == 5
     pipe.close()
     assert len(variable.get()["closed_by"]) == 1
     waiting = pool.submit(pipe.get, LONG_S)
@@ -473,7 +554,7 @@ def test_who_deletes_the_queue_or_the_variable_deletes_the_pipe(
 ):
     pipe = make_pipe(client)
     queue = Queue(pipe.name, other)
-    waiting = [pool.submit(again(pipe).get), pool.submit(queue.get)]
+    waiting = [pool.submit(other_end(pipe).get), pool.submit(queue.get)]
     time.sleep(0.05)
     if kind is Variable:
         Variable(pipe.name, other).delete()
@@ -486,12 +567,13 @@ def test_who_deletes_the_queue_or_the_variable_deletes_the_pipe(
     with pytest.raises(PipeFailed, match="does not exist"):
         pipe.put(1)
     pipe.delete()
-    assert again(pipe).create().depth == 0
+    assert other_end(pipe).create().depth == 0
 
 
 def test_other_queues_and_variables_are_as_ever(client, other, make_pipe):
     make_pipe(client)
-    queue, variable = Queue("of-somebody", other), Variable("of-somebody", other)
+    queue = Queue("of-somebody", other)
+    variable = Variable("of-somebody", other)
     queue.put(1)
     variable.set("a value")
     variable.set(other.submit(pow, 2, 10))
@@ -501,7 +583,9 @@ def test_other_queues_and_variables_are_as_ever(client, other, make_pipe):
     queue.close()
 
 
-def test_a_change_of_a_pipe_wakes_those_that_wait_for_it_only(client, make_pipe, pool, monkeypatch):
+def test_a_change_of_a_pipe_wakes_those_that_wait_for_it_only(
+    client, make_pipe, pool, monkeypatch, wait_until
+):
     """The time of an item would grow with the number of pipes."""
     looks = []
     has_ended = PipeState.has_ended.fget
@@ -512,9 +596,11 @@ def test_a_change_of_a_pipe_wakes_those_that_wait_for_it_only(client, make_pipe,
     )
     monkeypatch.setattr(pipe_module, "_WAIT_S", LONG_S)
     monkeypatch.setattr("poolpart.internals.queues.LOOK_S", LONG_S)
-    idle, busy = [make_pipe(client) for _ in range(8)], make_pipe(client)
-    waiting = [pool.submit(again(pipe).get) for pipe in idle]
-    time.sleep(0.2)
+    idle = [make_pipe(client) for _ in range(8)]
+    busy = make_pipe(client)
+    waiting = [pool.submit(other_end(pipe).get, LONG_S) for pipe in idle]
+    states = pipes_of(client.cluster.scheduler)
+    wait_until(lambda: all(states[pipe.name].queue.waiters for pipe in idle))
     looks.clear()
     for number in range(20):
         busy.put(number)

@@ -37,7 +37,8 @@ def kill_a_waiting_consumer(client, greetings, pipe):
 
 
 def test_a_consumer_that_is_killed_while_it_waits_swallows_nothing(processes, make_pipe):
-    greetings, pipe = make_pipe(processes), make_pipe(processes, capacity=10)
+    greetings = make_pipe(processes)
+    pipe = make_pipe(processes, capacity=10)
     kill_a_waiting_consumer(processes, greetings, pipe)
     for item in range(8):
         pipe.put(item)
@@ -49,7 +50,8 @@ def test_deleting_forgets_consumers_that_were_killed(processes, make_pipe, wait_
     def names(dask_scheduler):
         return set(pipes_of(dask_scheduler))
 
-    greetings, pipe = make_pipe(processes), make_pipe(processes)
+    greetings = make_pipe(processes)
+    pipe = make_pipe(processes)
     kill_a_waiting_consumer(processes, greetings, pipe)
     assert {pipe.name, greetings.name} <= processes.run_on_scheduler(names)
     pipe.delete()

@@ -7,7 +7,7 @@ import signal
 
 import pytest
 from distributed import Client, LocalCluster
-from tests.poolpart.helpers import declared, here
+from tests.poolpart.helpers import declared, worker_name
 
 from poolpart import Pool, PoolError, WorkerInfo, n_workers, probe, rest
 
@@ -50,7 +50,7 @@ def test_a_cluster_from_the_command_line_is_divided_already(start):
         "GPU": (1, 1),
         "IO": (1, 4),
     }
-    assert parts["IO"].submit(here).result() == "l"
+    assert parts["IO"].submit(worker_name).result() == "l"
 
 
 def test_workers_by_name_and_by_address(start):
@@ -71,7 +71,7 @@ def test_workers_that_local_cluster_numbers():
         part, rest = Pool.from_client(client).partition("P", workers=[0, "2"])
         assert [worker.name for worker in part.workers] == ["0", "2"]
         assert rest.names == ["1"]
-        assert part.submit(here).result() in ("0", "2")
+        assert part.submit(worker_name).result() in ("0", "2")
 
 
 def test_a_refused_request_changes_nothing(start):

@@ -25,7 +25,8 @@ def fake_driver(tmp_path, monkeypatch):
         pytest.skip("no C compiler to make a driver with")
 
     def install(body="", uuid="cuDeviceGetUuid", error="0"):
-        source, library = tmp_path / "fake.c", tmp_path / "libfake.so"
+        source = tmp_path / "fake.c"
+        library = tmp_path / "libfake.so"
         source.write_text(FAKE)
         defines = [f"-DBODY={body}", f"-DUUID={uuid}", f"-DERROR={error}"]
         command = [compiler, "-w", "-shared", "-fPIC", *defines, "-o", library, source]

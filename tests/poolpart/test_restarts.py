@@ -1,7 +1,7 @@
 """Workers that are killed come back into their partition, and tasks that waited run."""
 
 import pytest
-from tests.poolpart.helpers import LONG_S, addresses, declared, here, join, kill, leave
+from tests.poolpart.helpers import LONG_S, addresses, declared, join, kill, leave, worker_name
 
 from poolpart import Partition, Pool, n_workers, rest
 
@@ -9,7 +9,7 @@ from poolpart import Partition, Pool, n_workers, rest
 def kill_and_submit_at_once(client, partition, name, count=5):
     """Kill a partition's only worker and submit before the scheduler knows of it."""
     kill(client, name)
-    return [partition.submit(here) for _ in range(count)]
+    return [partition.submit(worker_name) for _ in range(count)]
 
 
 def test_a_partition_made_at_run_time(nannies, wait_until):
@@ -20,7 +20,7 @@ def test_a_partition_made_at_run_time(nannies, wait_until):
         assert [(w.name, w.resources) for w in part.workers] == [("1", {"P": 3})]
     # The other worker belongs to no partition, and stays so.
     assert remainder.names == ["0"]
-    assert part.submit(here, workers=1).result(LONG_S) == "1"  # Dask's own names are numbers
+    assert part.submit(worker_name, workers=1).result(LONG_S) == "1"  # Dask's own names are numbers
     killed = kill(nannies, "0")
     wait_until(lambda: addresses(nannies).get("0", killed) != killed)
     assert [worker.name for worker in part.workers] == ["1"]

@@ -6,7 +6,7 @@ import pytest
 from distributed import Client
 from hypothesis import given
 from hypothesis import strategies as st
-from tests.poolpart.helpers import declared, here, join, leave
+from tests.poolpart.helpers import declared, join, leave, worker_name
 
 from poolpart import (
     Pool,
@@ -93,7 +93,8 @@ def test_what_is_short_is_filled_first():
 
 
 def test_nobody_wants_it():
-    rules, members = {"A": n_workers(1), "B": named("b")}, {"A": [worker("a")], "B": []}
+    rules = {"A": n_workers(1), "B": named("b")}
+    members = {"A": [worker("a")], "B": []}
     assert partition_for(worker("new"), rules, members) is None
     assert partition_for(worker("b"), rules, members) == "B"
 
@@ -149,7 +150,7 @@ def test_a_worker_that_left_is_replaced_by_one_that_joins_and_waiting_tasks_run(
     client = start({"a": {}, "b": {}})
     parts = Pool.from_client(client).divide({"A": named("b", "late"), "B": rest()})
     leave(client, "b")
-    waiting = [parts["A"].submit(here) for _ in range(3)]
+    waiting = [parts["A"].submit(worker_name) for _ in range(3)]
     wait_until(lambda: len(client.cluster.scheduler.unrunnable) == 3)
     join(client, "late")
     assert client.gather(waiting) == ["late"] * 3

@@ -20,13 +20,13 @@ def by_p2p():
         yield
 
 
-def here(block):
+def worker_name(block):
     return block * 0 + ord(get_worker().name)
 
 
 def rechunked():
     array = da.ones((60, 60), chunks=(10, 60)).rechunk((60, 10))
-    return array.map_blocks(here, dtype=float)
+    return array.map_blocks(worker_name, dtype=float)
 
 
 def shuffled():
@@ -37,7 +37,7 @@ def shuffled():
     return (
         frame.from_pandas(table, npartitions=8)
         .shuffle("x")
-        .map_partitions(here, meta={"x": int, "y": int})["y"]
+        .map_partitions(worker_name, meta={"x": int, "y": int})["y"]
         .unique()
     )
 

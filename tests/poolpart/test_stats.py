@@ -108,7 +108,8 @@ def test_prometheus_reads_the_demand_of_each_partition(client, wait_until):
 
 def test_partitions_are_counted_apart_and_from_any_client(client):
     Partition("A", client).stats()  # counts from here on
-    a, b = Partition("A", client), Partition("B", client)
+    a = Partition("A", client)
+    b = Partition("B", client)
     kept = client.gather([a.submit(after), b.submit(after), client.submit(after, 1)])
     with Client(client.scheduler.address, set_as_default=False) as other:
         assert Partition("A", other).stats().done == 1

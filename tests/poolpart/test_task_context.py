@@ -16,7 +16,8 @@ def test_a_coroutine_does_not_wait_for_a_thread_that_needs_its_loop(monkeypatch)
     """As a task that is a coroutine, beside one that is none: both would wait for ever."""
 
     async def meet() -> list[str]:
-        loop, entered = asyncio.get_running_loop(), threading.Event()
+        loop = asyncio.get_running_loop()
+        entered = threading.Event()
 
         def make() -> str:
             if threading.current_thread() is threading.main_thread():

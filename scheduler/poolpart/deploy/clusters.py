@@ -103,7 +103,8 @@ def start_partitions(
             "one without (no n_workers; of an SSHCluster's hosts only the scheduler's)."
         )
     parts = {
-        name: _PartitionJobs.of(cluster, describe, name, own) for name, own in partitions.items()
+        name: _PartitionJobs.from_options(cluster, describe, name, options)
+        for name, options in partitions.items()
     }
     cluster.sync(_JobStarter(cluster, parts, tell).begin)
 
@@ -113,7 +114,7 @@ Describe = Callable[[Any, str, str, int, int, Mapping[str, Any]], dict[str, Any]
 
 @dataclass
 class _PartitionJobs:
-    """The jobs of one partition."""
+    """The jobs of a partition."""
 
     name: str
     options: Mapping[str, Any]  # of the cluster's class, where this partition differs
@@ -124,10 +125,10 @@ class _PartitionJobs:
     host_indices: dict[str, int] = field(default_factory=dict)  # {job: index of its host}
 
     @classmethod
-    def of(
+    def from_options(
         cls, cluster: SpecCluster, describe: Describe, name: str, options: Mapping[str, Any]
     ) -> _PartitionJobs:
-        """Read the options of a partition; nothing is started.
+        """Read the options of a partition, without starting jobs.
 
         Raises
         ------
@@ -145,7 +146,7 @@ class _PartitionJobs:
             else:
                 hosts = cluster_options.get("hosts", ".")
                 count = cluster_options.pop("workers", len(hosts))
-            check_count(f"The number of workers of partition {name!r}", count, least=0)
+            check_count(f"The number of workers of partition {name!r}", count, minimum=0)
             # A first description shows that the cluster's class takes the options.
             sample = describe(cluster, f"{name}-0", name, slots, 0, cluster_options)
         except (TypeError, ValueError) as error:
@@ -176,7 +177,7 @@ class _PartitionJobs:
 
 
 def _take_bounds(name: str, options: dict[str, Any]) -> Bounds | None:
-    """Take `adapt` and `idle_s` out of the options of a partition; None if it does not adapt."""
+    """Remove `adapt` and `idle_s` from the options of a partition; return None if absent."""
     adapt = options.pop("adapt", None)
     idle_s = options.pop("idle_s", None)
     if adapt is None:
@@ -235,8 +236,8 @@ class _JobStarter:
             return
         with suppress(OSError):  # the scheduler is ending
             changed = await self._adapt()
-            now = time.monotonic()
-            due = now - self._logs_read_at >= _LOOK_EVERY_S
+            looked_at = time.monotonic()
+            due = looked_at - self._logs_read_at >= _LOOK_EVERY_S
             if changed or due:
                 # A SpecCluster drops a lost worker, and starts a new worker when it is awaited.
                 try:
@@ -244,13 +245,13 @@ class _JobStarter:
                 except Exception as error:
                     self._say(f"A worker cannot be started: {error}")
             if due:
-                self._logs_read_at = now
+                self._logs_read_at = looked_at
                 if self._cluster.plan - self._cluster.observed:  # workers are missing
                     for line in self._logs.endings():
                         self._say(line)
 
     async def _adapt(self) -> bool:
-        """Do what the scheduler advises; returns whether jobs have to be started."""
+        """Start and forget jobs as the scheduler advises; return whether jobs must be started."""
         jobs = {name: part.workers(self._cluster) for name, part in self._parts.items()}
         advice = await ask_of_cluster(self._cluster, look, jobs=jobs)
         for name, advice_of_part in advice.items():

@@ -68,7 +68,7 @@ def local_cluster(
     require(CLUSTERS)
     for name, (count, slots) in partitions.items():
         check_name(name)
-        check_count(f"The number of workers of partition {name!r}", count, least=0)
+        check_count(f"The number of workers of partition {name!r}", count, minimum=0)
         check_count(f"The number of slots of partition {name!r}", slots)
     if not any(count for count, _ in partitions.values()):
         raise PoolError('There would be no worker; give {"NAME": (workers, slots)}.')

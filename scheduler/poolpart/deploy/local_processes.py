@@ -21,16 +21,17 @@ def forked_workers() -> Iterator[None]:
 
     Dask would make it import pandas and more; it has already imported what is needed.
     """
-    utils, before = distributed.utils, distributed.utils._forkserver_preload_set
+    utils = distributed.utils
+    preload_set = utils._forkserver_preload_set
     with dask.config.set({"distributed.worker.multiprocessing-method": "forkserver"}):
         utils._forkserver_preload_set = True
         try:
             yield
         finally:
-            utils._forkserver_preload_set = before
+            utils._forkserver_preload_set = preload_set
 
 
-_starting: set[Nanny] = set()  # those of `OwnNanny` that start a worker just now
+_starting: set[Nanny] = set()  # nannies of `OwnNanny` that are starting a worker
 
 
 @cache  # once: another library may have wrapped the same since
@@ -48,14 +49,14 @@ def _spare_workers_the_script() -> None:
 
 
 class OwnNanny(Nanny):
-    """A nanny whose workers do not import the script that starts them.
+    """A nanny whose workers do not import the script that starts the nanny.
 
     multiprocessing imports it to find functions by name, and a script without a main guard would
     start itself again in each worker. Dask sends what a script defines by value.
     """
 
     async def instantiate(self) -> Status:
-        """Start a worker, or start it again."""
+        """Start a worker for the first time or again."""
         _spare_workers_the_script()
         _starting.add(self)
         try:

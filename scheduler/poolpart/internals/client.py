@@ -17,13 +17,13 @@ _OPTIONS_OF_SYNC = {"asynchronous", "callback_timeout"}  # the others are of the
 
 
 class WaitHooks(Protocol):
-    """What a wait calls to lend the slots of the task that waits."""
+    """Functions that a wait calls to lend the slots of the waiting task."""
 
     def may_lend(self) -> bool:
-        """Whether the task of this thread has slots that it may lend."""
+        """Return whether the task of this thread has slots to lend."""
 
     def until_wanted(self, answer: concurrent.futures.Future[Any]) -> None:
-        """Wait until a call has its answer, or other tasks want the slots."""
+        """Wait until a call has its answer, or further tasks want the slots."""
 
     def lent(self, waits: bool = True) -> AbstractContextManager[None]:
         """Lend the slots within the block, if the task waits."""
@@ -31,7 +31,7 @@ class WaitHooks(Protocol):
 
 @cache  # once: another library may have wrapped the same since, and goes on calling this
 def let_waits_lend(hooks: WaitHooks) -> None:
-    """Wrap the waits of Dask's clients so that tasks of this process lend their slots in them.
+    """Wrap the waits of Dask's clients so that waiting tasks of this process lend slots.
 
     `Future.result` and `exception`, `Client.gather`, `wait`, the computing of collections, and
     `as_completed` lend at once if they have to wait. All other calls of the scheduler, such as
@@ -109,7 +109,7 @@ def when_done(future: Future, function: Callable[[Future], Any]) -> None:
 
 
 async def take_from_worker(client: Client, address: str, keys: Collection[str]) -> dict[str, Any]:
-    """Fetch results straight from a worker, as far as it has them."""
+    """Fetch the results that a worker has, without the scheduler."""
     from distributed.utils_comm import gather_from_workers
 
     data, *_ = await gather_from_workers({key: [address] for key in keys}, rpc=client.rpc)
@@ -117,12 +117,12 @@ async def take_from_worker(client: Client, address: str, keys: Collection[str]) 
 
 
 async def ask(client: Client, address: str | None, question: str, **arguments: Any) -> Any:
-    """Call such a handler of a worker, or of the scheduler if the address is None.
+    """Call a handler of a worker, or of the scheduler if the address is None.
 
-    None if the scheduler does not have it, which its log tells.
+    Returns None if the scheduler lacks the handler; the log of the scheduler then says so.
     """
-    there = client.scheduler if address is None else client.rpc(address)
-    return await getattr(there, question)(**arguments)
+    server = client.scheduler if address is None else client.rpc(address)
+    return await getattr(server, question)(**arguments)
 
 
 def as_bytes(data: Any) -> Any:

@@ -23,7 +23,7 @@ Instead = Callable[..., Any]  # gets the method's arguments; NotImplemented: the
 
 
 class _Method:
-    """Replacement of a method: the method itself, with rules before, after and in place of it.
+    """Replacement of a method: the original, with rules before, after and in place of a call.
 
     A rule that raises is skipped, and the log says so once: other users of the cluster get what
     Dask does without it. An error of the method itself reaches its caller unchanged.
@@ -32,36 +32,37 @@ class _Method:
     def __init__(self, original: Callable[..., Any]) -> None:
         self.original = original
         self.__name__ = original.__name__  # the server logs the name of the handler
-        self.before: list[Before] = []
-        self.instead: list[Instead] = []
-        self.after: list[After] = []
-        self._said: set[Any] = set()  # rules whose failure has been logged
+        self.rules_before: list[Before] = []
+        self.rules_instead: list[Instead] = []
+        self.rules_after: list[After] = []
+        self._logged: set[Any] = set()  # rules whose failure has been logged
 
     def __call__(self, *args: Any, **kwargs: Any) -> Any:
-        for before in self.before:
+        for rule_before in self.rules_before:
             try:
-                kwargs = before(kwargs)
+                kwargs = rule_before(kwargs)
             except Exception:
-                self._step_aside(before)
-        for instead in self.instead:
+                self._log_failure(rule_before)
+        for rule_instead in self.rules_instead:
             try:
-                result = instead(*args, **kwargs)
+                result = rule_instead(*args, **kwargs)
             except Exception:
-                self._step_aside(instead)
+                self._log_failure(rule_instead)
                 continue
             if result is not NotImplemented:
                 return result
         result = self.original(*args, **kwargs)
-        for after in self.after:
+        for rule_after in self.rules_after:
             try:
-                result = after(result, *args, **kwargs)
+                result = rule_after(result, *args, **kwargs)
             except Exception:
-                self._step_aside(after)
+                self._log_failure(rule_after)
         return result
 
-    def _step_aside(self, rule: Any) -> None:
-        if rule not in self._said:
-            self._said.add(rule)
+    def _log_failure(self, rule: Any) -> None:
+        """Log the exception of a rule, at its first failure."""
+        if rule not in self._logged:
+            self._logged.add(rule)
             logger.exception(
                 "A rule of poolpart for %s failed with distributed %s, so Dask decides without "
                 "it: tasks may run outside their partition, or others in it.",
@@ -71,29 +72,29 @@ class _Method:
 
 
 class Rules:
-    """Rules for methods of a running scheduler; several may have rules for one method."""
+    """Rules for methods of a running scheduler; several objects may have rules for a method."""
 
     def __init__(self) -> None:
-        self._places: list[tuple[Any, str, Any]] = []
+        self._added: list[tuple[Any, str, Any]] = []  # (object, name of its method, rule)
 
-    def after(self, owner: Any, name: str, rule: After, parameter: str) -> None:
-        """Call `rule(result, …)` with a method's result and arguments; it returns a result.
+    def call_after(self, owner: Any, name: str, rule: After, parameter: str) -> None:
+        """Call `rule(result, …)` after a method, with its result and arguments, for a new result.
 
         `parameter` is the name of the method's only parameter. PoolError if this version of Dask
         has no such method; then all rules are removed.
         """
-        self._stand_in(owner, name, {parameter}).after.append(rule)
-        self._places.append((owner, name, rule))
+        self._stand_in(owner, name, {parameter}).rules_after.append(rule)
+        self._added.append((owner, name, rule))
 
-    def before(self, owner: Any, name: str, rule: Before, *parameters: str) -> None:
-        """Call `rule(keywords)` before a method; it returns the keywords to use."""
-        self._stand_in(owner, name, {*parameters}).before.append(rule)
-        self._places.append((owner, name, rule))
+    def call_before(self, owner: Any, name: str, rule: Before, *parameters: str) -> None:
+        """Call `rule(keywords)` before a method, for the keyword arguments to use."""
+        self._stand_in(owner, name, {*parameters}).rules_before.append(rule)
+        self._added.append((owner, name, rule))
 
-    def instead(self, owner: Any, name: str, rule: Instead, parameter: str) -> None:
-        """Call `rule(…)` in place of a method, unless it returns NotImplemented."""
-        self._stand_in(owner, name, {parameter}).instead.append(rule)
-        self._places.append((owner, name, rule))
+    def call_instead(self, owner: Any, name: str, rule: Instead, parameter: str) -> None:
+        """Call `rule(…)` in place of a method; the method runs if that is NotImplemented."""
+        self._stand_in(owner, name, {parameter}).rules_instead.append(rule)
+        self._added.append((owner, name, rule))
 
     def _stand_in(self, owner: Any, name: str, parameters: set[str]) -> _Method:
         method = getattr(type(owner), name, None)
@@ -112,23 +113,24 @@ class Rules:
 
     def take_back(self) -> None:
         """Remove these rules."""
-        while self._places:
-            owner, name, rule = self._places.pop()
+        while self._added:
+            owner, name, rule = self._added.pop()
             method = vars(owner)[name]
-            for rules in (method.before, method.instead, method.after):
-                rules[:] = [other for other in rules if other != rule]
-            if not (method.before or method.instead or method.after):
+            for rules in (method.rules_before, method.rules_instead, method.rules_after):
+                if rule in rules:
+                    rules.remove(rule)
+            if not (method.rules_before or method.rules_instead or method.rules_after):
                 delattr(owner, name)
 
 
 def rule_for_graphs(rules: Rules, scheduler: Any, bequeath: Callable[[Any], Resources]) -> None:
-    """Give tasks resources that their graph leaves open, by the task that submits the graph.
+    """Give the tasks of a graph that a task submits the resources that the graph leaves open.
 
-    `bequeath` returns them, from the state of the submitting task. Each task is annotated with the
-    task that submits it, so that workers know which tasks wait for slots of their parents.
+    `bequeath` returns these resources for the state of the submitting task. Each task is annotated
+    with the task that submits it, so that workers know which tasks wait for slots of their parents.
     """
 
-    def before(graph: dict[str, Any]) -> dict[str, Any]:
+    def add_annotations(graph: dict[str, Any]) -> dict[str, Any]:
         name = graph["submitting_task"]
         task = scheduler.tasks.get(name) or actor_of_method(scheduler, name)
         inherited = bequeath(task) if task is not None else {}
@@ -146,10 +148,10 @@ def rule_for_graphs(rules: Rules, scheduler: Any, bequeath: Callable[[Any], Reso
             by_type["resources"] = {**stated, **heirs}
         return {**graph, "annotations_by_type": by_type}
 
-    rules.before(
+    rules.call_before(
         scheduler,
         "_create_taskstate_from_graph",
-        before,
+        add_annotations,
         *("submitting_task", "annotations_by_type", "global_annotations", "dsk"),
     )
 
@@ -163,7 +165,7 @@ def rule_for_shuffles(rules: Rules, scheduler: Any) -> None:
     if not (shuffle := scheduler.extensions.get("shuffle")):
         return
 
-    def after(chosen: dict[Any, str], spec: Any) -> dict[Any, str]:
+    def move_outputs(chosen: dict[Any, str], spec: Any) -> dict[Any, str]:
         from distributed.shuffle._core import barrier_key  # not where poolpart is imported
 
         valid = scheduler.valid_workers(scheduler.tasks[barrier_key(spec.id)])
@@ -176,7 +178,7 @@ def rule_for_shuffles(rules: Rules, scheduler: Any) -> None:
             for number, (output, worker) in enumerate(chosen.items())
         }
 
-    rules.after(shuffle, "_calculate_worker_for", after, "spec")
+    rules.call_after(shuffle, "_calculate_worker_for", move_outputs, "spec")
 
 
 def rule_for_fences(
@@ -208,33 +210,33 @@ def rule_for_fences(
             scheduler.decide_worker_non_rootish(task) if worker in closed and stop(task) else worker
         )
 
-    rules.after(scheduler, "valid_workers", valid_workers, "ts")
-    rules.after(scheduler, "decide_worker_rootish_queuing_disabled", rootish, "ts")
+    rules.call_after(scheduler, "valid_workers", valid_workers, "ts")
+    rules.call_after(scheduler, "decide_worker_rootish_queuing_disabled", rootish, "ts")
     scheduler.idle_task_count = _OpenWorkers(closed, scheduler.idle_task_count)
 
 
 def rule_for_choice(rules: Rules, scheduler: Any, choose: Callable[[Any], Any]) -> None:
-    """Let `choose` choose the workers of tasks, as far as it does not return NotImplemented.
+    """Let `choose` choose the workers of tasks, unless `choose` returns NotImplemented.
 
     PoolError if this version of Dask places tasks in another way.
     """
-    rules.instead(scheduler, "decide_worker_non_rootish", choose, "ts")
+    rules.call_instead(scheduler, "decide_worker_non_rootish", choose, "ts")
 
 
 def take_back_fences(rules: Rules, scheduler: Any) -> None:
-    """Remove that rule from the scheduler."""
+    """Remove the rule for fences from the scheduler."""
     rules.take_back()
     scheduler.idle_task_count = set(scheduler.idle_task_count)
 
 
-def could_take(scheduler: Any, task: Any) -> Any:
-    """Workers that Dask itself would let take a task."""
+def workers_without_fences(scheduler: Any, task: Any) -> Any:
+    """Return the workers that could take a task if there were no fences."""
     valid = type(scheduler).valid_workers(scheduler, task)
     return scheduler.running if valid is None else valid
 
 
 class _OpenWorkers(set[Any]):
-    """Workers with room for tasks from the queue, without those behind fences."""
+    """Workers outside fences that have room for tasks from the queue."""
 
     def __init__(self, closed: set[Any], workers: Iterable[Any]) -> None:
         super().__init__(workers)

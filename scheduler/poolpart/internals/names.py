@@ -37,7 +37,7 @@ ADAPTING = "adaptive partitions"
 
 @dataclass(frozen=True)
 class PrivateNames:
-    """Private names of Dask for one purpose."""
+    """Private names of Dask that a feature needs for a purpose."""
 
     feature: str  # that does not work without them
     names: tuple[str, ...]  # "module:object.attribute", with (parameters) of a method
@@ -307,7 +307,7 @@ def _numbers(version: str) -> tuple[int, ...]:
 
 
 def _exists(name: str) -> bool:
-    """Whether an object or an attribute exists, and a method has the parameters."""
+    """Return whether an object or an attribute exists, and a method has the parameters."""
     path, _, parameters = name.removesuffix(")").partition("(")
     module_name, _, attributes = path.partition(":")
     try:
@@ -326,7 +326,7 @@ def _exists(name: str) -> bool:
 
 
 def _attributes(owner: Any) -> set[str]:
-    """Names of attributes of an object, and of those that instances of a class get."""
+    """Return the names of the attributes of an object or of a class and its instances."""
     names = set(dir(owner))
     if isinstance(owner, type):
         for kind in owner.__mro__:
@@ -341,7 +341,7 @@ def _slots(kind: type) -> Iterator[str]:
 
 
 def _assigned(kind: type) -> tuple[str, ...]:
-    """Names that the constructor of a class uses: attributes without annotations are among them."""
+    """Return the names in the constructor of a class, among them unannotated attributes."""
     constructor = vars(kind).get("__init__")
     code = getattr(inspect.unwrap(constructor), "__code__", None) if constructor else None
     return code.co_names if code is not None else ()

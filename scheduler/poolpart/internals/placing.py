@@ -35,14 +35,14 @@ def free_slots_of(worker: Any, name: str) -> float:
 
 
 def may_take(scheduler: Any, worker: Any, name: str, slots: float) -> bool:
-    """Whether a worker runs, and declares so many slots of a resource; "" is for none."""
+    """Return whether a worker runs and declares enough slots of a resource; "" is no resource."""
     enough = not name or worker.resources.get(name, 0) >= slots
     return bool(enough and worker in scheduler.running)
 
 
 def holders_of_inputs(task: Any) -> list[Any]:
     """Workers that hold inputs of a task, each once for each input."""
-    return [worker for needed in task.dependencies for worker in needed.who_has or ()]
+    return [worker for task_input in task.dependencies for worker in task_input.who_has or ()]
 
 
 def start_first(scheduler: Any, task: Any, workers: list[Any]) -> Any:

@@ -20,6 +20,7 @@ PRIVATE_NAMES = (
     "distributed.queues:QueueExtension.get(name, batch)",  # awaits `get` of the queue
     "distributed.queues:QueueExtension.release(name)",
     "distributed.variable:VariableExtension.variables",
+    "distributed.variable:VariableExtension.started",  # condition of `get` before the first `set`
     "distributed.variable:VariableExtension.set(name, key, data)",
     "distributed.scheduler:Scheduler.extensions",
     "distributed.scheduler:Scheduler.handlers",
@@ -31,13 +32,14 @@ VARIABLE_SET = "variable_set"  # the request of `Variable.set`
 LOOK_S = 1.0  # a wait looks so often whether it has ended, even if nothing has changed
 
 Record = dict[str, Any]  # of an item, as Dask's queue extension keeps them
+Packed = bytes | Record  # an item on its way to a client, see `unpack`
 # Type of the items that pipes put. Their value is serialized: the scheduler passes it on, and
 # `Queue.get` of a client returns the object. Clients themselves put types "msgpack" and "Future".
 _PICKLED = "pickled"
 
 
 class Waiters:
-    """The requests that wait for changes of one queue, or for the end of one task.
+    """Requests that wait for changes of a queue, or for the end of a task.
 
     A request looks again whether its condition holds after each `notify`.
     """
@@ -65,7 +67,7 @@ class Waiters:
 async def wait_until(
     condition: Callable[[], bool], waiters: Collection[Waiters], seconds: float = math.inf
 ) -> None:
-    """Wait until a condition holds that depends on some queues, at most so long."""
+    """Wait until a condition that depends on queues holds, or for `seconds`."""
     if condition():
         return
     deadline = time.monotonic() + seconds
@@ -127,14 +129,14 @@ class BoundedQueue:
         return max(0, self.capacity - len(self._queue))
 
     async def put(self, record: Record) -> None:
-        """Add an item, once there is room."""
+        """Add an item, after a wait until the queue has room."""
         await wait_until(lambda: self.room > 0 or self._why_no_put() is not None, [self.waiters])
         if (error := self._why_no_put()) is not None:
             raise error
         self.extend([record])
 
     async def get(self) -> Record:
-        """Remove the first item, once there is one."""
+        """Remove the first item, after a wait until the queue has an item."""
         await wait_until(
             lambda: bool(self._queue) or self._why_no_put() is not None, [self.waiters]
         )
@@ -151,7 +153,7 @@ class BoundedQueue:
             self.waiters.notify()
 
     def take(self, number: int) -> list[Record]:
-        """Remove the first items, at most so many."""
+        """Remove and return the first items, `number` at most."""
         had_room = self.room > 0
         records = [self._queue.popleft() for _ in range(min(number, len(self._queue)))]
         if records and not had_room:  # producers wait only while the queue is full
@@ -160,9 +162,9 @@ class BoundedQueue:
 
 
 class QueueAndVariable:
-    """A `distributed.Queue` of items and a `distributed.Variable` of one name, for all clients.
+    """A `distributed.Queue` of items and a `distributed.Variable` with a common name.
 
-    The value of the variable is plain data.
+    All clients of the cluster see both. The value of the variable is plain data.
     """
 
     def __init__(self, scheduler: Any, name: str, queue: BoundedQueue, value: Any) -> None:
@@ -182,7 +184,7 @@ class QueueAndVariable:
 
     @property
     def exists(self) -> bool:
-        """Whether both exist: any client can delete them."""
+        """Whether both exist: any client can delete either."""
         is_queued = self._queues.queues.get(self.name) is self.queue
         return is_queued and self.name in self._variables.variables
 
@@ -192,21 +194,26 @@ class QueueAndVariable:
         return self._variables.variables[self.name]["value"]
 
     def set(self, value: Any) -> None:
-        """Set the variable, and let all requests that wait look at it."""
+        """Set the variable, and let all waiting requests look at its value."""
         self._variables.variables[self.name] = {"type": "msgpack", "value": value}
         self.queue.waiters.notify()
+
+    async def wake_early_readers(self) -> None:
+        """Answer the requests that have read the variable before the variable existed."""
+        async with self._variables.started:
+            self._variables.started.notify_all()
 
     def put(self, items: Iterable[bytes]) -> None:
         """Add pickled items to the queue, also beyond its capacity."""
         self.queue.extend([_record_of(item) for item in items])
 
-    def take(self, limit: int) -> list[bytes | Record]:
-        """Remove the first items from the queue; returns what `unpack` of a client takes."""
+    def take(self, limit: int) -> list[Packed]:
+        """Remove the first items, at most `limit`, from the queue; return these items packed."""
         records = self.queue.take(limit)
         return [_packed(self.name, record) for record in records]
 
     def delete(self) -> None:
-        """Delete both, whoever refers to them, and end the requests that wait."""
+        """Delete queue and variable, and end the waiting requests."""
         while self._queues.queues.get(self.name) is self.queue:
             self._queues.release(name=self.name)
         self._variables.variables.pop(self.name, None)
@@ -222,15 +229,15 @@ def _record_of(item: bytes) -> Record:
     }
 
 
-def _packed(name: str, record: Record) -> bytes | Record:
-    """Pack an item for a client: the pickled item, or the record of what a `Queue.put` has put."""
+def _packed(name: str, record: Record) -> Packed:
+    """Pack an item for a client: the pickled item, or the record of an item of `Queue.put`."""
     if record["type"] == _PICKLED:
         item: bytes = record["value"].frames[0]
         return item
     return {**record, "queue": name}
 
 
-def unpack(client: Client, packed: bytes | Record) -> Any:
+def unpack(client: Client, packed: Packed) -> Any:
     """Return an item that a client has got from `QueueAndVariable.take`, as `Queue.get` would."""
     from distributed.protocol.pickle import loads
 
@@ -246,9 +253,9 @@ def unpack(client: Client, packed: bytes | Record) -> Any:
 
 
 def intercept_variable_set(
-    handlers: dict[str, Any], check: Callable[[str, Any], None], after: Callable[[str], None]
+    handlers: dict[str, Any], check: Callable[[str, Any], None], on_change: Callable[[str], None]
 ) -> Callable[[], None]:
-    """Check what clients set variables to, and hear of it; returns a function that ends this.
+    """Check and follow the variables that clients set; return a function that ends this.
 
     Parameters
     ----------
@@ -257,7 +264,7 @@ def intercept_variable_set(
     check
         Is called with the name and the value of a variable that a client sets, None for a future;
         an error that it raises is the client's.
-    after
+    on_change
         Is called with the name once the variable has its value.
     """
     answer: Callable[..., Awaitable[None]] = handlers[VARIABLE_SET]
@@ -265,7 +272,7 @@ def intercept_variable_set(
     async def set_variable(name: str, key: Any = None, data: Any = None, **options: Any) -> None:
         check(name, data if key is None else None)
         await answer(name=name, key=key, data=data, **options)
-        after(name)
+        on_change(name)
 
     def end() -> None:
         if handlers[VARIABLE_SET] is set_variable:  # else another library has wrapped it since

@@ -30,7 +30,7 @@ class Submitter(NamedTuple):
 
 
 def show(scheduler: Any, worker: Any, resources: Resources) -> None:
-    """Let the scheduler place tasks by these resources of a worker, and no others."""
+    """Let the scheduler place tasks by the given resources of a worker only."""
     for name in worker.resources.keys() | resources.keys():
         declaring = scheduler.resources.setdefault(name, {})
         declaring.pop(worker.address, None)
@@ -56,7 +56,7 @@ def recount(worker: Any) -> None:
 
 
 def wake(scheduler: Any, worker: Any) -> None:
-    """Send tasks that wait for such a worker to it, as the scheduler does when one joins.
+    """Send a worker the tasks that wait for its resources, as when a worker joins.
 
     The scheduler does not when a running worker gets a resource: the tasks would wait for ever.
     """
@@ -68,7 +68,7 @@ def wake(scheduler: Any, worker: Any) -> None:
 
 
 def open_to_all(scheduler: Any, worker: Any) -> None:
-    """Send tasks to a worker that a fence no longer closes to them."""
+    """Send tasks to a worker that has been behind a fence."""
     scheduler.check_idle_saturated(worker)
     if worker.status is Status.running:
         wake(scheduler, worker)
@@ -76,10 +76,11 @@ def open_to_all(scheduler: Any, worker: Any) -> None:
 
 
 def actor_of_method(scheduler: Any, name: Any) -> Any:
-    """Return the state of an actor whose method submits tasks, by the name that Dask gives those.
+    """Return the state of an actor by Dask's name for a method that submits tasks, or None.
 
-    The name is the prefix of the actor's key, and the method. None if it is no such name, or if
-    actors with that prefix ask for different resources, so that the actor is not certain.
+    The name consists of the prefix of the actor's key and the method. None if the name has another
+    form, or if actors with the same prefix ask for different resources, so that the actor is not
+    certain.
     """
     prefix, dot, _ = name.rpartition(".") if isinstance(name, str) else ("", "", "")
     if not dot:
@@ -91,11 +92,15 @@ def actor_of_method(scheduler: Any, name: Any) -> Any:
         if key_split(task.key) == prefix
     ]
     resources = [actor.resource_restrictions for actor in actors]
-    return actors[0] if actors and all(asked == resources[0] for asked in resources) else None
+    return (
+        actors[0]
+        if actors and all(restrictions == resources[0] for restrictions in resources)
+        else None
+    )
 
 
 def asks_for(task: Any, names: Collection[str]) -> bool:
-    """Whether a task takes a slot of one of these partitions."""
+    """Return whether a task takes a slot of any of the named partitions."""
     return not (task.resource_restrictions or {}).keys().isdisjoint(names)
 
 
@@ -106,8 +111,9 @@ def lift_restrictions(scheduler: Any, names: Collection[str]) -> None:
     """
     for task in scheduler.tasks.values():
         if asks_for(task, names):
-            kept = {n: q for n, q in task.resource_restrictions.items() if n not in names}
-            task.resource_restrictions = kept or None
+            restrictions = task.resource_restrictions.items()
+            remaining = {name: slots for name, slots in restrictions if name not in names}
+            task.resource_restrictions = remaining or None
 
 
 # -- moving waiting tasks, by the protocol of work stealing --------------------------------
@@ -116,31 +122,40 @@ def lift_restrictions(scheduler: Any, names: Collection[str]) -> None:
 
 
 def held_by(scheduler: Any, worker: Any, names: Collection[str]) -> list[str]:
-    """Keys of a worker's tasks that need these resources, and of those on their way there."""
+    """Return the keys of tasks with these resources that a worker has or is about to get."""
     tasks = {task for task in worker.processing if asks_for(task, names)}
     if stealing := scheduler.extensions.get("stealing"):
         moves = stealing.in_flight.items()
-        tasks |= {t for t, m in moves if m["thief"] is worker and asks_for(t, names)}
+        tasks |= {task for task, move in moves if move["thief"] is worker and asks_for(task, names)}
     return [task.key for task in tasks]
 
 
-def hand_off(scheduler: Any, worker: Any, names: Collection[str], asked: set[Any]) -> None:
-    """Move a worker's tasks that have not started to other members of their partition.
+def hand_off(scheduler: Any, worker: Any, names: Collection[str], requested: set[Any]) -> None:
+    """Move the tasks of a worker that have not started to further members of their partition.
 
-    A task that no other worker may take stays, and ends here. `names` are the partitions that the
-    worker leaves; `asked` are tasks that were requested already, and is extended.
+    A task that no other worker may take stays, and ends on this worker.
+
+    Parameters
+    ----------
+    scheduler, worker
+        Their states.
+    names
+        Partitions that the worker leaves.
+    requested
+        States of the tasks that the worker was asked to give up; extended.
     """
     stealing = scheduler.extensions.get("stealing")
     if stealing is None:
         return
-    given = Counter[Any]()  # by new worker: the scheduler counts a task when the old one agrees
+    # {worker: tasks on their way to it}. The scheduler counts a task when the old worker agrees.
+    moving = Counter[Any]()
     for task in list(worker.processing - worker.long_running):
-        if task in asked or task.actor or not asks_for(task, names):
+        if task in requested or task.actor or not asks_for(task, names):
             continue
-        asked.add(task)
-        if others := (scheduler.valid_workers(task) or set()) - {worker}:
-            thief = min(others, key=lambda o: (len(o.processing) + given[o]) / o.nthreads)
-            given[thief] += 1
+        requested.add(task)
+        if candidates := (scheduler.valid_workers(task) or set()) - {worker}:
+            thief = min(candidates, key=lambda w: (len(w.processing) + moving[w]) / w.nthreads)
+            moving[thief] += 1
             stealing.move_task_request(task, worker, thief)
 
 
@@ -151,7 +166,7 @@ def hand_off(scheduler: Any, worker: Any, names: Collection[str], asked: set[Any
 
 
 def is_idle(scheduler: Any, worker: Any) -> bool:
-    """Whether nothing is lost with a worker: it has no task, and no result that is only there."""
+    """Return whether a worker has no task, and no result that no further worker has."""
     if worker.status is not Status.running or worker.processing or worker.actors:
         return False
     stealing = scheduler.extensions.get("stealing")
@@ -162,18 +177,18 @@ def is_idle(scheduler: Any, worker: Any) -> bool:
 
 
 def takes_tasks(worker: Any) -> bool:
-    """Whether a worker gets tasks, or will in a moment: one that joins is not ready at once."""
+    """Return whether a worker gets tasks now, or after it has finished joining."""
     return worker.status in (Status.running, Status.init)
 
 
 def shut(scheduler: Any, worker: Any) -> None:
-    """Let a worker get no more tasks."""
+    """Let a worker get no further tasks."""
     stimulus = f"poolpart-shut-{time.time()}"
     scheduler.handle_worker_status_change(Status.closing_gracefully, worker, stimulus)
 
 
 def reopen(scheduler: Any, worker: Any) -> None:
-    """Let a worker get tasks again that `shut`, or a retirement in vain, has kept from it."""
+    """Let a worker get tasks again after `shut`, or after a retirement that failed."""
     if scheduler.workers.get(worker.address) is worker:
         stimulus = f"poolpart-reopened-{time.time()}"
         message = {"op": "worker-status-change", "status": "running", "stimulus_id": stimulus}
@@ -182,25 +197,25 @@ def reopen(scheduler: Any, worker: Any) -> None:
 
 
 async def retire(scheduler: Any, workers: Collection[Any]) -> bool:
-    """Close workers; False if some stay, because they have results that nobody else can take."""
+    """Close workers; return False if any stays, because nobody can take over its results."""
     addresses = [worker.address for worker in workers]
-    done = await scheduler.retire_workers(workers=addresses, close_workers=True, remove=True)
-    return len(done) == len(addresses)
+    retired = await scheduler.retire_workers(workers=addresses, close_workers=True, remove=True)
+    return len(retired) == len(addresses)
 
 
 def turn_away(scheduler: Any, worker: Any) -> None:
-    """Close a worker that is just joining, before it gets tasks."""
+    """Close a joining worker before the worker gets tasks."""
     shut(scheduler, worker)
     scheduler.close_worker(worker.address)
 
 
 def is_bound(task: Any) -> bool:
-    """Whether a task may run on certain workers only."""
+    """Return whether a task may run on certain workers only."""
     return bool(task.worker_restrictions or task.host_restrictions) and not task.loose_restrictions
 
 
 def waiting_for_workers(scheduler: Any) -> Collection[Any]:
-    """Tasks that could run, and for which there is no worker."""
+    """Return the tasks that could run, and for which there is no worker."""
     tasks: Collection[Any] = scheduler.unrunnable
     return tasks
 
@@ -228,7 +243,7 @@ async def call(scheduler: Any, address: str, function: Callable[..., Any], **arg
 
 
 def _unpacked(result: Any) -> Any:
-    """Unpack a reply, which may come as it is: as bytes, or unpacked from the same process."""
+    """Return the object of a reply: serialized, or wrapped by a server of this process."""
     from distributed.protocol.serialize import Serialize, Serialized, deserialize
 
     if isinstance(result, Serialized):
@@ -237,17 +252,17 @@ def _unpacked(result: Any) -> Any:
 
 
 def tell_of_plugin(scheduler: Any, name: str, plugin: bytes | None) -> list[asyncio.Future[Any]]:
-    """Give a plugin to all workers, also later ones before they get tasks, or take it from all.
+    """Add a plugin to all workers, present and future; remove the plugin if None.
 
     Returns the requests under way. A worker that does not answer, at the end of a cluster, is left.
     """
 
-    # Nested, so that it is sent by value. A worker that is closing takes its plugins off itself;
-    # of two that take one off, Dask's writes a traceback into the log.
+    # Nested, so that it is sent by value. A worker that is closing removes its plugins itself;
+    # Dask logs a traceback if a plugin was removed before.
     def remove(dask_worker: Any = None) -> None:
         closing = dask_worker.status.name in ("closing", "closed")
-        if not closing and (found := dask_worker.plugins.pop(name, None)):
-            found.teardown(dask_worker)
+        if not closing and (removed := dask_worker.plugins.pop(name, None)):
+            removed.teardown(dask_worker)
 
     async def tell(address: str) -> None:
         with suppress(OSError, RuntimeError):  # `Scheduler.broadcast` would print it
@@ -284,5 +299,5 @@ def serve(scheduler: Any, application: web.Application) -> None:
 
 
 def serve_no_longer(scheduler: Any, application: web.Application) -> None:
-    """Remove them."""
+    """Remove pages from the scheduler's HTTP server."""
     scheduler.http_application.applications.remove(application)

@@ -10,7 +10,7 @@ from .scheduler import SUBMITTER, Resources, Submitter
 
 
 def has_running_tasks(dask_worker: Any = None) -> bool:
-    """Whether a worker runs anything, also cancelled tasks, which its scheduler has forgotten."""
+    """Return whether a worker runs a task, even if its scheduler has forgotten the task."""
     return bool(dask_worker.state.all_running_tasks)
 
 
@@ -18,7 +18,7 @@ def has_running_tasks(dask_worker: Any = None) -> bool:
 
 
 class _Available(dict[str, float]):
-    """Slots that a worker has available: 0, rather than an error, of what it does not declare.
+    """Available slots by resource: 0, rather than an error, for an undeclared resource.
 
     The request to declare and tasks use different connections: a cancelled task may still be on
     its way, and a worker would break down if it got a task for an unknown resource.
@@ -29,25 +29,28 @@ class _Available(dict[str, float]):
 
 
 def declare_on_worker(resources: Resources, dask_worker: Any = None) -> bool:
-    """Declare these resources, and none of any other; runs on a worker.
+    """Declare exactly these resources; runs on a worker.
 
     Returns False if tasks still hold a resource that is removed. Such a task may be cancelled but
     still running, and unknown to the scheduler.
     """
     state = dask_worker.state
-    total, available = state.total_resources, state.available_resources
+    total = state.total_resources
+    available = state.available_resources
     # Not what is available: a task may have lent its slots, and takes them back.
     held = {name for task in state.all_running_tasks for name in resources_of(task)}
     if held & (total.keys() - resources.keys()):
         return False
-    left = {name: available.get(name, 0) - total.get(name, 0) for name in resources}
-    state.available_resources = _Available({n: q + left[n] for n, q in resources.items()})
+    held_slots = {name: total.get(name, 0) - available.get(name, 0) for name in resources}
+    state.available_resources = _Available(
+        {name: slots - held_slots[name] for name, slots in resources.items()}
+    )
     state.total_resources = dict(resources)
     return True
 
 
 def resources_of(task: Any) -> Resources:
-    """Resources that a task of this worker takes while it runs."""
+    """Return the resources that a running task takes from its worker."""
     return {name: slots for name, slots in (task.resource_restrictions or {}).items() if slots}
 
 
@@ -64,7 +67,7 @@ def resources_here(worker: Any) -> tuple[str, ...]:
 
 
 def task_of_thread() -> tuple[Any, Any] | None:
-    """Worker and state of the task that runs in this thread; None in any other thread."""
+    """Return the worker and the state of the task of this thread, or None outside tasks."""
     from distributed.worker import thread_state
 
     if (key := getattr(thread_state, "key", None)) is None:
@@ -87,12 +90,12 @@ def threads_of(worker: Any) -> int:
 
 
 def is_running(worker: Any, key: Any) -> bool:
-    """Whether a task runs on this worker, also one that has seceded."""
+    """Return whether a worker runs a task; a task that has seceded counts."""
     return any(task.key == key for task in worker.state.all_running_tasks)
 
 
 def free_slots(worker: Any, slots: Resources) -> None:
-    """Let waiting tasks of a worker have these slots; runs in its event loop."""
+    """Give slots of a worker to its waiting tasks; runs in its event loop."""
     from distributed.worker_state_machine import UnpauseEvent
 
     for name, number in slots.items():
@@ -108,10 +111,10 @@ def take_slots(worker: Any, slots: Resources) -> None:
 
 
 def slots_here(worker: Any, name: str) -> tuple[float, float]:
-    """Slots of a worker that are available, below 0 if reserved, and all."""
+    """Return the available slots of a worker, below 0 if reserved, and all its slots."""
     return worker.state.available_resources[name], worker.state.total_resources[name]
 
 
 def answer_to(worker: Any, question: str, answer: Callable[..., Any]) -> None:
-    """Add a handler to a worker, unless it has it."""
+    """Add a handler to a worker that lacks the handler."""
     worker.handlers.setdefault(question, answer)
