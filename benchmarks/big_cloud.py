@@ -18,11 +18,11 @@ from pathlib import Path
 import numpy as np
 import open3d  # noqa: F401 - counted among the libraries
 
-from lidarpool.base.storage import Storage
-from lidarpool.columns.part_columns import PartColumns
 from lidarpool.columns.parts import StoredCloud, pack
-from lidarpool.columns.table import ALWAYS
 from lidarpool.export.formats import save_cloud
+from lidarsim.base.storage import Storage
+from lidarsim.columns.part_columns import PartColumns
+from lidarsim.columns.table import ALWAYS
 
 PER_SCAN = 20_000
 PER_PART = 10  # scans

@@ -22,7 +22,7 @@ from lidarpool.render.camera import Camera
 from lidarpool.render.colouring import TURBO
 from lidarpool.render.pictures import splat
 from lidarpool.render.surface import unit
-from lidarpool.scene.generated.city import city
+from lidarsim.scene.generated.city import city
 
 from .realism import TURN_S, cases
 

@@ -15,12 +15,12 @@ from typing import Any
 
 import numpy as np
 
-from lidarpool import LidarpoolError, Noise, Scanner, Scene, Sensor
+from lidarpool import LidarError, Noise, Scanner, Scene, Sensor
 from lidarpool.compare.fit import fit
 from lidarpool.compare.recordings import Recording
-from lidarpool.scene.generated.city import city
-from lidarpool.scene.generated.plants import all_trees, placed
-from lidarpool.scene.scene_mesh import SceneMesh
+from lidarsim.scene.generated.city import city
+from lidarsim.scene.generated.plants import all_trees, placed
+from lidarsim.scene.scene_mesh import SceneMesh
 
 SWEEPS, COLUMNS, LAYERS, FARTHEST_M = 12, 360, 16, 120.0
 PLACES = ("room", "street", "hall", "forest")
@@ -152,7 +152,7 @@ def trial(number: int, cache: Path | None = None, where: str = "") -> tuple[dict
         recording = recorded(noise, bias)
     try:
         figures = fit(recording).figures
-    except LidarpoolError as error:
+    except LidarError as error:
         if not where:
             raise
         return truth, str(error)

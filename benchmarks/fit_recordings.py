@@ -17,10 +17,10 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from lidarpool import LidarpoolError, Noise, fit
+from lidarpool import LidarError, Noise, fit
 from lidarpool.compare.fit import Repeats, smooth_rays, surfaces
 from lidarpool.compare.recordings import Recording, open_recording
-from lidarpool.sensor.models import read_model
+from lidarsim.sensor.models import read_model
 
 COLOURS = {"recorded": "#1c2430", "data sheet": "#ee7733", "fitted": "#4477aa"}
 
@@ -65,7 +65,7 @@ def compared(recording: Recording, model: str, white: float | None) -> tuple[dic
     fitted = found.model.datasheet().noise
     try:
         sheet = read_model(model).datasheet().noise
-    except LidarpoolError:
+    except LidarError:
         sheet = Noise()
     cell = rays.row, rays.column
     recorded = other.ranges[:, *cell].astype(float)

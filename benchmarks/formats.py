@@ -26,7 +26,7 @@ from lidarpool import Cloud, Scene, Sensor, Survey, Track, save_cloud
 from lidarpool.columns.cloud_file import CloudFile
 from lidarpool.columns.ply_format import layout
 from lidarpool.export.formats import Format
-from lidarpool.export.sweeps import Sweeps
+from lidarsim.sweeps.sweeps import Sweeps
 
 COLUMNS = (
     "time",

@@ -19,15 +19,15 @@ from unittest.mock import patch
 
 import numpy as np
 
-import lidarpool.simulator.device
+import lidarsim.simulator.device
 from lidarpool import Scene, Survey, Track, load_sensor
-from lidarpool.base.storage import Storage
-from lidarpool.columns.part_columns import PartColumns
 from lidarpool.columns.parts import pack
-from lidarpool.scene.actors import Actor, box
-from lidarpool.scene.generated.city import city
-from lidarpool.simulator.batch import columns_of
-from lidarpool.simulator.rig import Rig
+from lidarsim.base.storage import Storage
+from lidarsim.columns.part_columns import PartColumns
+from lidarsim.scene.actors import Actor, box
+from lidarsim.scene.generated.city import city
+from lidarsim.simulator.batch import columns_of
+from lidarsim.simulator.rig import Rig
 from raybeam import Outbox
 
 from .gpu_clock import Here, Sizes, Split, to_pinned
@@ -85,7 +85,7 @@ def timed(rig: Rig, rays: int, seconds: float) -> dict[str, Any]:
 def watched(cupy: Any, rig: Rig) -> Iterator[Split]:
     """Take the times of kernels and of copies of columns."""
     split, engine = Split(cupy), rig._caster.caster._engine
-    run, kernel = engine._run, lidarpool.simulator.device._kernel  # type: ignore[attr-defined]
+    run, kernel = engine._run, lidarsim.simulator.device._kernel  # type: ignore[attr-defined]
     send = Outbox.send
 
     def running(name: str, *given: Any) -> None:
@@ -106,7 +106,7 @@ def watched(cupy: Any, rig: Rig) -> Iterator[Split]:
 
     with (
         patch.object(engine, "_run", running),
-        patch.object(lidarpool.simulator.device, "_kernel", columns),
+        patch.object(lidarsim.simulator.device, "_kernel", columns),
         patch.object(Outbox, "send", sending),
     ):
         yield split

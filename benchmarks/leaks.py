@@ -17,8 +17,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from lidarpool.scene.generated.terrain import terrain
-from lidarpool.scene.shapes import revolve, seed_objects
+from lidarsim.scene.generated.terrain import terrain
+from lidarsim.scene.shapes import revolve, seed_objects
 from raybeam import RayCaster, available_backends
 
 from .seams import escaped

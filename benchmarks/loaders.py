@@ -27,11 +27,11 @@ from pathlib import Path
 import numpy as np
 
 import lidarpool as lp
-from lidarpool.base.storage import Storage
 from lidarpool.datasets.dataset import DataSet
 from lidarpool.datasets.job_table import JobRow, write_table
-from lidarpool.export.sweeps import Sweeps
-from lidarpool.scene.actors import Actor, box
+from lidarsim.base.storage import Storage
+from lidarsim.scene.actors import Actor, box
+from lidarsim.sweeps.sweeps import Sweeps
 
 POINTS, TURNS, JOBS, ROUNDS = 30_000, 20, 6, 15
 

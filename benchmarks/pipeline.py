@@ -23,7 +23,7 @@ from distributed import Client
 
 from lidarpool import Result, Scene, Sensor, Survey, simulate
 from lidarpool.run.connection import local_cluster
-from lidarpool.scene.scene_mesh import SceneMesh
+from lidarsim.scene.scene_mesh import SceneMesh
 
 STAGES = ("generate", "intersect", "sort", "collect")
 COST_RAYS = 64  # a scan, where the time for a million rays is measured

@@ -31,12 +31,12 @@ from lidarpool import (
     Track,
     load_sensor,
 )
-from lidarpool.scene.actors import box, one_mesh
-from lidarpool.scene.files.meshfile import load_objects
-from lidarpool.scene.generated.city import city
-from lidarpool.scene.scene_mesh import SceneMesh
-from lidarpool.simulator.batch import columns_of
-from lidarpool.simulator.rig import Rig
+from lidarsim.scene.actors import box, one_mesh
+from lidarsim.scene.files.meshfile import load_objects
+from lidarsim.scene.generated.city import city
+from lidarsim.scene.scene_mesh import SceneMesh
+from lidarsim.simulator.batch import columns_of
+from lidarsim.simulator.rig import Rig
 from raybeam import available_backends
 
 from .raycast import environment

@@ -45,7 +45,7 @@ from benchmarks.campaign import BASE, CAMPAIGN
 from benchmarks.control import single_scans
 from lidarpool import Campaign, Scene, Sensor, Survey, simulate
 from lidarpool.run.progress import Progress
-from lidarpool.scene.actors import box
+from lidarsim.scene.actors import box
 from poolpart import Partition, Pool
 
 NAMES = ("A", "B", "C", "D")

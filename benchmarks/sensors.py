@@ -30,10 +30,10 @@ from typing import Any
 import numpy as np
 
 from lidarpool import Beams, Noise, Returns, Scene, Sensor, Spin, Survey, Track, load_sensor
-from lidarpool.scene.actors import Actor, box
-from lidarpool.scene.generated.city import city
-from lidarpool.simulator.points import BatchPoints
-from lidarpool.simulator.rig import Rig
+from lidarsim.scene.actors import Actor, box
+from lidarsim.scene.generated.city import city
+from lidarsim.simulator.points import BatchPoints
+from lidarsim.simulator.rig import Rig
 from raybeam import available_backends
 
 from .raycast import CLOCKS, environment

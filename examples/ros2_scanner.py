@@ -11,7 +11,7 @@ from array import array
 import numpy as np
 
 from lidarpool import Pose, Scanner, Scene, load_sensor
-from lidarpool.sensor.trajectory import matrices
+from lidarsim.sensor.trajectory import matrices
 
 FRAME, RATE_HZ, STEP = "lidar", 10, 22
 # Name, NumPy's type, ROS's type, and place in the 22 bytes of a point.

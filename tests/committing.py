@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from lidarpool.columns.part_columns import PartColumns
 from lidarpool.columns.parts import pack, part_name
 from lidarpool.pipeline.messages import Receipt, samples_of_scan
+from lidarsim.columns.part_columns import PartColumns
 
 
 def commit(store, first, counts, triangles, hits, job=None):

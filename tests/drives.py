@@ -8,11 +8,11 @@ from pathlib import Path
 import numpy as np
 
 from lidarpool import Cloud, Mounted, Pose, Scene, Sensor, Survey, Track
-from lidarpool.base.storage import Storage
 from lidarpool.datasets.dataset import DataSet
 from lidarpool.datasets.job_table import JobRow, write_table
-from lidarpool.export.sweeps import Sweeps
-from lidarpool.scene.actors import Actor, box
+from lidarsim.base.storage import Storage
+from lidarsim.scene.actors import Actor, box
+from lidarsim.sweeps.sweeps import Sweeps
 
 TURNS, SCANS = 3, 36  # of a sensor, of a turn
 SPLITS = ["train"] * 4 + ["val", "test"]

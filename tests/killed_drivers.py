@@ -15,7 +15,7 @@ import lidarpool.cli.run_command, lidarpool.pipeline.policies
 import lidarpool.report.campaign_output as campaign_output
 import lidarpool.report.result_pictures as pictures
 from lidarpool.__main__ import main
-from lidarpool.base.storage import Storage
+from lidarsim.base.storage import Storage
 from lidarpool.base.tracing import trace_to
 from lidarpool.datasets.dataset import DataSet
 from lidarpool.export.formats import Format

@@ -9,8 +9,8 @@ import numpy as np
 import trimesh
 
 from lidarpool import Beams, Optics, Pose, Scene, Sensor, Spin, Survey
-from lidarpool.scene.scene_mesh import SceneMesh
-from lidarpool.simulator.rig import Rig
+from lidarsim.scene.scene_mesh import SceneMesh
+from lidarsim.simulator.rig import Rig
 from raybeam import available_backends
 
 CPU = [name for name in ("numpy", "embree") if not available_backends()[name]]

@@ -23,9 +23,9 @@ from typing import Any
 
 from benchmarks import effects
 from lidarpool import Survey, load_sensor
-from lidarpool.scene.generated.city import city
-from lidarpool.simulator.batch import columns_of
-from lidarpool.simulator.rig import Rig
+from lidarsim.scene.generated.city import city
+from lidarsim.simulator.batch import columns_of
+from lidarsim.simulator.rig import Rig
 
 ROUNDS, SCANS = 5, 36
 

@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 
 from lidarpool import Beams, Returns, Scene, SceneMesh, Sensor, Spin, Survey
 from lidarpool.render.theme import INK, LINE, MUTED, OBJECT_COLOURS
-from lidarpool.sensor.disc import Beam
-from lidarpool.simulator.rig import Rig
+from lidarsim.sensor.disc import Beam
+from lidarsim.simulator.rig import Rig
 from raybeam import pattern_rays
 
 DRAWS = "effect-beams.png"

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from benchmarks.effects._receiver import BLUE, GREY, RED, WIDE_RAD, points, room, turning
 from lidarpool import Material, Mounted, Noise, Pose, Returns, SceneMesh, Survey
-from lidarpool.sensor.optics import Mode
+from lidarsim.sensor.optics import Mode
 
 DRAWS = "effect-crosstalk.png"
 NOISE = Noise(detection_range_m=100, crosstalk=True)

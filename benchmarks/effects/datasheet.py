@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 
 from benchmarks.effects._receiver import BLUE, GREY, RED, ahead, shot, wall
 from lidarpool import Material, Survey
-from lidarpool.sensor.models import read_model
+from lidarsim.sensor.models import read_model
 
 DRAWS = "effect-datasheet.png"
 SHOWN = {

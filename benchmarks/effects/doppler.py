@@ -10,9 +10,9 @@ import numpy as np
 from lidarpool import Actor, Mounted, Noise, Pose, Survey, Track, load_sensor
 from lidarpool.render import theme
 from lidarpool.render.colouring import DIVERGING
-from lidarpool.scene.generated.cars import MODELS, car
-from lidarpool.scene.generated.city import city
-from lidarpool.simulator.rig import Rig
+from lidarsim.scene.generated.cars import MODELS, car
+from lidarsim.scene.generated.city import city
+from lidarsim.simulator.rig import Rig
 
 DRAWS = "effect-doppler.png"
 DARK = "#3a3f47"

@@ -12,8 +12,8 @@ from benchmarks.effects.__main__ import survey_without
 from benchmarks.effects._air import save
 from benchmarks.effects._receiver import BLUE, GREY, RED, wall
 from lidarpool import Fault, Scene, Sensor, Survey, Track
-from lidarpool.scene.generated.city import city
-from lidarpool.simulator.rig import Rig
+from lidarsim.scene.generated.city import city
+from lidarsim.simulator.rig import Rig
 
 DRAWS = "effect-faults.png"
 DIRT = Fault("dirt", azimuth_deg=(60, 130), elevation_deg=(-25, 5), transmission=0.3)

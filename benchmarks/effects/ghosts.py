@@ -10,8 +10,8 @@ from matplotlib.figure import Figure
 
 from benchmarks.effects._receiver import BLUE, GREY, RED, cloud, shot
 from lidarpool import Beams, Material, Noise, Returns, Scene, SceneMesh, Sensor, Spin, Survey
-from lidarpool.scene.actors import box
-from lidarpool.sensor.materials import fresnel
+from lidarsim.scene.actors import box
+from lidarsim.sensor.materials import fresnel
 
 DRAWS = "effect-ghosts.png"
 PAINT, DIRT = 0.04, 0.1

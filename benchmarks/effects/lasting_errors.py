@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from benchmarks.effects._air import save
 from benchmarks.effects._receiver import BLUE, GREY, RED, wall
 from lidarpool import Noise, Scene, Sensor, Survey, load_sensor
-from lidarpool.simulator.rig import Rig
+from lidarsim.simulator.rig import Rig
 
 DRAWS = "effect-lasting-errors.png"
 NOISE = Noise(

@@ -11,7 +11,7 @@ import numpy as np
 
 from lidarpool import Gnss, Imu, Navigation, Survey
 from lidarpool.render import theme
-from lidarpool.sensor.navigation import fixes, imu_samples
+from lidarsim.sensor.navigation import fixes, imu_samples
 
 DRAWS = "effect-navigation.png"
 HOURS = 4
@@ -75,7 +75,7 @@ def picture(path: Path) -> None:
     """Draw Allan deviations, and the errors of positions over the hours."""
     from matplotlib.figure import Figure
 
-    from lidarpool.sensor.trajectory import CENTRE, Stations
+    from lidarsim.sensor.trajectory import CENTRE, Stations
 
     still = SimpleNamespace(
         navigation=Navigation(imu=IMU, gnss=GNSS, seed=2),

@@ -13,13 +13,13 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from lidarpool import Material, Noise, Survey, load_sensor
-from lidarpool.columns.table import SCAN
 from lidarpool.export.formats import Format
-from lidarpool.export.sweeps import Sweeps
-from lidarpool.scene.generated.city import city
-from lidarpool.scene.scene import Scene
-from lidarpool.simulator.batch import columns_of
-from lidarpool.simulator.rig import Rig
+from lidarsim.columns.table import SCAN
+from lidarsim.scene.generated.city import city
+from lidarsim.scene.scene import Scene
+from lidarsim.simulator.batch import columns_of
+from lidarsim.simulator.rig import Rig
+from lidarsim.sweeps.sweeps import Sweeps
 
 DRAWS = "effect-range-image.png"
 SKY, LOST = "#dfe5ec", "#e0182d"

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from lidarpool import Beams, Material, Scene, SceneMesh, Sensor, Spin, Survey
 from lidarpool.render.theme import INK, LINE, MUTED, OBJECT_COLOURS
 from lidarpool.render.theme import SENSOR as RED
-from lidarpool.sensor.materials import fresnel
-from lidarpool.simulator.rig import Rig
+from lidarsim.sensor.materials import fresnel
+from lidarsim.simulator.rig import Rig
 
 DRAWS = "effect-refraction.png"
 HEIGHT, DEPTH, INDEX, LOSS = 3.0, 2.0, 1.33, 0.15

@@ -11,11 +11,11 @@ from numpy.typing import NDArray
 
 from benchmarks.effects._receiver import BLUE, GREY, RED, ahead, shot, wall
 from lidarpool import Material, Noise, Returns, Scene, Survey
-from lidarpool.columns.table import AXES, SCAN
-from lidarpool.columns.waveforms import WAVEFORM
-from lidarpool.sensor.optics import LIGHT_M_NS
-from lidarpool.simulator.batch import columns_of
-from lidarpool.simulator.rig import Rig
+from lidarsim.columns.table import AXES, SCAN
+from lidarsim.columns.waveforms import WAVEFORM
+from lidarsim.sensor.optics import LIGHT_M_NS
+from lidarsim.simulator.batch import columns_of
+from lidarsim.simulator.rig import Rig
 
 DRAWS = "effect-saturation.png"
 NOISE = Noise(detection_range_m=100, saturation=100)  # full by a white wall 31.6 m away

@@ -10,7 +10,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from benchmarks.effects._receiver import BLUE, GREY, RED, cloud
-from lidarpool import (
+from lidarpool import (  # fmt: skip
     Actor,
     Beams,
     Noise,
@@ -23,9 +23,9 @@ from lidarpool import (
     Survey,
     Track,
     load_sensor,
-)  # fmt: skip
-from lidarpool.scene.actors import box
-from lidarpool.sensor.weather import spray
+)
+from lidarsim.scene.actors import box
+from lidarsim.sensor.weather import spray
 
 DRAWS = "effect-spray.png"
 WEATHER = {"wet": 1.0, "spray_g_m3": 20.0}

@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 from benchmarks.effects.refraction import box
 from lidarpool import Beams, Material, Noise, Scene, SceneMesh, Sensor, Spin, Survey
 from lidarpool.render.theme import INK, LINE, MUTED, OBJECT_COLOURS
-from lidarpool.sensor.leaves import projection
-from lidarpool.simulator.rig import Rig
+from lidarsim.sensor.leaves import projection
+from lidarsim.simulator.rig import Rig
 
 DRAWS = "effect-vegetation.png"
 DENSITY, HIGH = 0.6, 3.0  # m²/m³, and metres of a canopy: a leaf area index of 1.8

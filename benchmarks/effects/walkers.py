@@ -9,8 +9,8 @@ import numpy as np
 
 from lidarpool import Actor, Scanner, Scene, Sensor, Survey, Track
 from lidarpool.render.colouring import DIVERGING
-from lidarpool.scene.actors import box, one_mesh
-from lidarpool.scene.files.meshfile import load_objects
+from lidarsim.scene.actors import box, one_mesh
+from lidarsim.scene.files.meshfile import load_objects
 
 DRAWS = "effect-walkers.png"
 PERSON = Path(__file__).parents[2] / "examples" / "pedestrian.glb"

@@ -10,13 +10,13 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 from lidarpool import Beams, Material, Optics, Pose, Returns, Scene, SceneMesh, Sensor, Spin, Survey
-from lidarpool.columns.cloud import Cloud
-from lidarpool.columns.table import AXES, SCAN
-from lidarpool.columns.waveforms import WAVEFORM
-from lidarpool.scene.generated.plants import SPECIES, tree
-from lidarpool.sensor.optics import FWHM, LIGHT_M_NS
-from lidarpool.simulator.batch import columns_of
-from lidarpool.simulator.rig import Rig
+from lidarsim.columns.cloud import Cloud
+from lidarsim.columns.table import AXES, SCAN
+from lidarsim.columns.waveforms import WAVEFORM
+from lidarsim.scene.generated.plants import SPECIES, tree
+from lidarsim.sensor.optics import FWHM, LIGHT_M_NS
+from lidarsim.simulator.batch import columns_of
+from lidarsim.simulator.rig import Rig
 
 DRAWS = "effect-waveform.png"
 

@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 
 from benchmarks.effects._receiver import BLUE, GREY, RED, cloud, points, wall
 from lidarpool import Beams, Material, Noise, Returns, Scene, SceneMesh, Sensor, Spin, Survey
-from lidarpool.sensor.materials import WATER_INDEX, below_water, fresnel
+from lidarsim.sensor.materials import WATER_INDEX, below_water, fresnel
 
 DRAWS = "effect-wet.png"
 ROAD = 0.2

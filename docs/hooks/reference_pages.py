@@ -15,8 +15,8 @@ from pydantic.warnings import UnsupportedFieldAttributeWarning
 
 from lidarpool.cli.commands import cli
 from lidarpool.columns.ply_format import held_type
-from lidarpool.columns.table import ALWAYS, AXES, OPTIONAL, SCAN, Column
 from lidarpool.scenario.schema import campaign_schema, scenario_schema
+from lidarsim.columns.table import ALWAYS, AXES, OPTIONAL, SCAN, Column
 
 # Sections in the order of a scenario file, and what stands in the sections of another.
 _SECTIONS = {
@@ -67,7 +67,16 @@ _FIRST = {
     "lidarpool": (
         "Scanner",
         *("simulate", "remove_run", "Scene", "Sensor", "Beams", "Spin", "Pose", "Survey"),
-        *("Planning", "Result", "ScanFrame", "Cloud", "Column", "read_cloud", "save_cloud", "to_open3d"),
+        *(
+            "Planning",
+            "Result",
+            "ScanFrame",
+            "Cloud",
+            "Column",
+            "read_cloud",
+            "save_cloud",
+            "to_open3d",
+        ),
     ),
     "poolpart": (
         *("Pool", "Partition", "Rule", "per_gpu", "per_host", "n_workers", "named", "rest"),

@@ -10,14 +10,14 @@ import pytest
 from lidarpool import Column, Scene, Sensor, Survey, Track
 from lidarpool.columns.cloud_file import CloudFile
 from lidarpool.columns.ply_format import header, row_type
-from lidarpool.columns.table import OBJECT, SCAN, TABLE
-from lidarpool.export.sweeps import Sweeps
 from lidarpool.live.server import page_server
 from lidarpool.live.sharing import page_of
 from lidarpool.live.view import View, open_results
 from lidarpool.run.picture_file import PictureContent, sensor_ways
-from lidarpool.scene.actors import Actor, box
-from lidarpool.scene.animation import Animation
+from lidarsim.columns.table import OBJECT, SCAN, TABLE
+from lidarsim.scene.actors import Actor, box
+from lidarsim.scene.animation import Animation
+from lidarsim.sweeps.sweeps import Sweeps
 
 pytestmark = [pytest.mark.browser, pytest.mark.slow]
 

@@ -30,12 +30,12 @@ from distributed import Client
 from tests.clusters import thread_cluster
 
 import lidarpool
-from lidarpool import Campaign, LidarpoolError
-from lidarpool.base.storage import Storage
+from lidarpool import Campaign, LidarError
 from lidarpool.cli.commands import cli
 from lidarpool.report.campaign_output import verify
 from lidarpool.scenario.build import build
 from lidarpool.scenario.scenario import Scenario
+from lidarsim.base.storage import Storage
 
 BASE = """
 sensor: {rays_per_revolution: 90, layers: 4, step_deg: 4}
@@ -194,7 +194,7 @@ def attempt(reader: Reader, place: Path) -> tuple[str, str]:
         with redirect_stdout(StringIO()), redirect_stderr(StringIO()), warnings.catch_warnings():
             warnings.simplefilter("ignore")
             read = reader(place)
-    except LidarpoolError as error:
+    except LidarError as error:
         lines = str(error).count("\n") + 1
         return ("refused" if lines <= LINES_MOST else "many lines"), str(error)
     except Exception:

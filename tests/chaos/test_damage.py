@@ -20,7 +20,7 @@ from tests.chaos.damage import (
 )
 from tests.drives import the_scene, the_sweeps, write_set
 
-from lidarpool import LidarpoolError
+from lidarpool import LidarError
 from lidarpool.columns.parts import part_name
 from lidarpool.pipeline.database import RunDatabase
 from lidarpool.pipeline.messages import Receipt
@@ -85,7 +85,7 @@ def test_a_damaged_database_is_refused_or_the_same(tmp_path):
         try:
             with closing(RunDatabase(copy, durable=False)) as db:
                 found = content(db)
-        except LidarpoolError as error:
+        except LidarError as error:
             assert "\n" not in str(error)
             refused += 1
             continue

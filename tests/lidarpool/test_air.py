@@ -12,7 +12,7 @@ from tests.shapes import box, made, quad, wall
 from lidarpool import (
     Actor,
     Beams,
-    LidarpoolError,
+    LidarError,
     Material,
     Mounted,
     Noise,
@@ -24,13 +24,13 @@ from lidarpool import (
     Survey,
     Track,
 )
-from lidarpool.columns.table import CAUSES
-from lidarpool.scene.actors import box as cuboid
-from lidarpool.scene.scene_mesh import SceneMesh
-from lidarpool.sensor.materials import extinction
-from lidarpool.sensor.weather import EXIT_M, dust, rain, snow, spray
-from lidarpool.simulator.air import highest
-from lidarpool.simulator.rig import Rig
+from lidarsim.columns.table import CAUSES
+from lidarsim.scene.actors import box as cuboid
+from lidarsim.scene.scene_mesh import SceneMesh
+from lidarsim.sensor.materials import extinction
+from lidarsim.sensor.weather import EXIT_M, dust, rain, snow, spray
+from lidarsim.simulator.air import highest
+from lidarsim.simulator.rig import Rig
 
 SEEN = Noise(detection_range_m=100)
 THRESHOLD = 0.1 * (10 / 100) ** 2
@@ -286,7 +286,7 @@ def test_no_spray_behind_who_walks_or_raises_none(options):
 
 
 def test_a_flat_actor_raises_no_spray():
-    with pytest.raises(LidarpoolError, match="is flat: give it a mesh"):
+    with pytest.raises(LidarError, match="is flat: give it a mesh"):
         sprayed(car(size=(4, 2, 0)))
 
 
@@ -417,7 +417,7 @@ def test_what_is_no_surface_is_grey_and_of_no_class():
     ],
 )
 def test_what_does_not_fit_is_said(options, message):
-    with pytest.raises(LidarpoolError, match=message) as refused:
+    with pytest.raises(LidarError, match=message) as refused:
         survey_of(**options)
     assert len(str(refused.value).splitlines()) == 1
 
@@ -430,7 +430,7 @@ def test_each_sensor_has_its_own_air():
     batches = list(Rig(Scene.from_meshes([NOTHING]), survey, "numpy").cast(0, 2))
     counts = {batch.carried.name: len(batch) for batch in batches}
     assert counts["far"] > 5 * counts["near"] > 0
-    with pytest.raises(LidarpoolError, match="of near"):
+    with pytest.raises(LidarError, match="of near"):
         Survey(
             sensors=[sensors[0], Mounted(beams(), name="near", noise=Noise())],
             poses=[(0, 0, 0)],

@@ -11,9 +11,9 @@ import pytest
 import trimesh
 from tests.meshes import NESTED
 
-from lidarpool.base import allowance, input_files
-from lidarpool.base.errors import LidarpoolError
-from lidarpool.scene.files.meshfile import load_meshes
+from lidarsim.base import allowance, input_files
+from lidarsim.base.errors import LidarError
+from lidarsim.scene.files.meshfile import load_meshes
 
 VERTEX = b'<vertex x="0" y="0" z="0"/>'
 MODEL = (
@@ -129,7 +129,7 @@ READ = """
 import re, sys
 from pathlib import Path
 import distributed, DracoPy
-from lidarpool import LidarpoolError, Scene, load_sensor
+from lidarpool import LidarError, Scene, load_sensor
 from lidarpool.scenario.scenario import Scenario
 
 READERS = {
@@ -146,7 +146,7 @@ for name in sys.argv[1:]:
     try:
         READERS.get(path.name, READERS.get(path.suffix, Scene.load))(path)
         print("read")
-    except LidarpoolError as error:
+    except LidarError as error:
         print(str(error).replace(chr(10), chr(9)))
 print((peak() - first) * 1024)
 """
@@ -198,7 +198,7 @@ def test_a_large_mesh_is_read_though_memory_is_short(tmp_path, monkeypatch):
     monkeypatch.setattr(allowance, "memory", lambda: 1 + path.stat().st_size)
     assert len(load_meshes(path)[0].faces) == 81920
     monkeypatch.setattr(input_files, "memory", lambda: path.stat().st_size - 1)
-    with pytest.raises(LidarpoolError, match=r"ball\.ply: it has .* more than the memory"):
+    with pytest.raises(LidarError, match=r"ball\.ply: it has .* more than the memory"):
         load_meshes(path)
 
 

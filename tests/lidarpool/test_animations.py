@@ -10,30 +10,20 @@ import pytest
 from tests.meshes import write
 from tests.shapes import made
 
-from lidarpool import (
-    Actor,
-    LidarpoolError,
-    Material,
-    Scanner,
-    Scene,
-    Sensor,
-    Survey,
-    Track,
-    save_cloud,
-)
-from lidarpool.columns.cloud import Cloud
+from lidarpool import Actor, LidarError, Material, Scanner, Scene, Sensor, Survey, Track, save_cloud
 from lidarpool.export.boxes import Boxes
-from lidarpool.export.sweeps import Sweeps
 from lidarpool.run.picture_file import PictureContent
 from lidarpool.scenario.advice import advice
 from lidarpool.scenario.build import Job, build
 from lidarpool.scenario.scenario import Scenario
-from lidarpool.scene.actors import box, one_mesh, shapes_of
-from lidarpool.scene.animation import PICTURED, Animation
-from lidarpool.scene.files.meshfile import load_objects
-from lidarpool.scene.scene_mesh import SceneMesh
-from lidarpool.scene.wheels import rolling
-from lidarpool.sensor.trajectory import matrices
+from lidarsim.columns.cloud import Cloud
+from lidarsim.scene.actors import box, one_mesh, shapes_of
+from lidarsim.scene.animation import PICTURED, Animation
+from lidarsim.scene.files.meshfile import load_objects
+from lidarsim.scene.scene_mesh import SceneMesh
+from lidarsim.scene.wheels import rolling
+from lidarsim.sensor.trajectory import matrices
+from lidarsim.sweeps.sweeps import Sweeps
 
 KINDS = {"f": 5126, "B": 5121, "H": 5123}
 SHAPES = {1: "SCALAR", 3: "VEC3", 4: "VEC4", 16: "MAT4"}
@@ -230,7 +220,7 @@ def test_unusable_animations_are_refused_in_a_line(tmp_path, edit, name, message
     made.moved(2, "translation", KEYS, np.reshape(MOVES, -1))
     edit(made.header)
     path = made.write(tmp_path / "m.gltf")
-    with pytest.raises(LidarpoolError, match=message) as told:
+    with pytest.raises(LidarError, match=message) as told:
         load_objects(path, animation=name)
     assert "\n" not in str(told.value)
 
@@ -243,7 +233,7 @@ def test_unusable_animations_are_refused_in_a_line(tmp_path, edit, name, message
 def test_endless_animations_and_ways_are_refused(tmp_path, keys, way, message):
     made = skinned()
     made.moved(2, "translation", keys, [0, 1, 0, way, 1, 0])
-    with pytest.raises(LidarpoolError, match=message):
+    with pytest.raises(LidarError, match=message):
         load_objects(made.write(tmp_path / "m.gltf"), animation="Move")
 
 
@@ -290,7 +280,7 @@ def test_a_chain_of_five_hundred_joints(tmp_path):
 
 def test_only_gltf_has_animations(tmp_path):
     path = write(tmp_path / "m.obj", "v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n")
-    with pytest.raises(LidarpoolError, match=r"has no animations that are read: give a .glb"):
+    with pytest.raises(LidarError, match=r"has no animations that are read: give a .glb"):
         load_objects(path, animation="Walk")
 
 
@@ -550,7 +540,7 @@ def test_damaged_poses_in_a_file_of_pictures_are_told(walker, tmp_path):
         arrays = dict(archive)
     for name, value in (("mesh0_steps", arrays["mesh0_steps"][:, 1:]), ("mesh0_played", [0])):
         np.savez_compressed(path, **(arrays | {name: value}))
-        with pytest.raises(LidarpoolError, match=r"p\.npz.*(its animation moves|run the survey)"):
+        with pytest.raises(LidarError, match=r"p\.npz.*(its animation moves|run the survey)"):
             PictureContent.load(path)
 
 
@@ -600,9 +590,9 @@ def test_wheels_turn_by_speed_over_radius():
     nut = ring("wheel_nut", 0.01, [1.2, 0.9, 0.3])
     rolling([*parts, nut], ["wheel*"], notes.append)
     assert notes[1:] == ["wheel_nut is 60 times smaller than the largest, and does not turn"]
-    with pytest.raises(LidarpoolError, match=r"'axle', but no object has that name\. There are Bo"):
+    with pytest.raises(LidarError, match=r"'axle', but no object has that name\. There are Bo"):
         rolling(parts, ["wheel*", "axle"], notes.append)
-    with pytest.raises(LidarpoolError, match=r"can turn: wheel_flat has no axle, .* about y\.$"):
+    with pytest.raises(LidarError, match=r"can turn: wheel_flat has no axle, .* about y\.$"):
         rolling([*parts, flat], ["wheel_flat"], notes.append)
 
 
@@ -650,7 +640,7 @@ def test_scenarios_name_animations(tmp_path):
     ],
 )
 def test_what_is_wrong_with_a_scenario_is_a_line(tmp_path, entry, message):
-    with pytest.raises(LidarpoolError, match=message):
+    with pytest.raises(LidarError, match=message):
         build(scenario(tmp_path, {"name": "A", "trajectory": WAY} | entry))
 
 
@@ -677,13 +667,13 @@ def test_bad_animations_are_refused():
     mesh = box("Box", (1, 1, 1))
     poses = np.stack([mesh.vertices] * 2)
     assert np.array_equal(Animation(poses.astype("f").tolist(), 1).vertices, poses)
-    with pytest.raises(LidarpoolError, match="step_s is inf; it must be a finite number"):
+    with pytest.raises(LidarError, match="step_s is inf; it must be a finite number"):
         Animation(poses, np.inf)
-    with pytest.raises(LidarpoolError, match=r"vertices of an animation is 'abc'; it must be an a"):
+    with pytest.raises(LidarError, match=r"vertices of an animation is 'abc'; it must be an a"):
         Animation("abc", 1)
-    with pytest.raises(LidarpoolError, match=r"of two poses at least.*given: \(1, 8, 3\), 0.1 s"):
+    with pytest.raises(LidarError, match=r"of two poses at least.*given: \(1, 8, 3\), 0.1 s"):
         Animation(mesh.vertices[None], 0.1)
-    with pytest.raises(LidarpoolError, match=r"above 0; given.* 0 s, None"):
+    with pytest.raises(LidarError, match=r"above 0; given.* 0 s, None"):
         Animation(np.stack([mesh.vertices] * 2), 0)
-    with pytest.raises(LidarpoolError, match="has 8 vertices, and its animation moves 7"):
+    with pytest.raises(LidarError, match="has 8 vertices, and its animation moves 7"):
         replace(mesh, animation=Animation(np.stack([mesh.vertices[1:]] * 2), 0.1))

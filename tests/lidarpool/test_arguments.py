@@ -19,7 +19,7 @@ from lidarpool import (
     Gnss,
     Imu,
     Job,
-    LidarpoolError,
+    LidarError,
     Material,
     Mounted,
     Navigation,
@@ -156,7 +156,7 @@ WRONG = {
     ids=lambda value: getattr(value, "__qualname__", ""),
 )
 def test_it_is_told_what_is_expected(call, arguments, says):
-    with pytest.raises(LidarpoolError) as raised:
+    with pytest.raises(LidarError) as raised:
         call(*arguments)
     assert says in str(raised.value)
     assert len(str(raised.value).splitlines()) <= 2 and len(str(raised.value)) < 320
@@ -171,7 +171,7 @@ def test_options_of_a_survey_are_checked_too():
         ({"epsg": 25832.5}, "epsg is 25832.5; it must be a whole number"),
         ({"coordinates": "map"}, "coordinates is 'map'; it must be 'world' or 'sensor'"),
     ):
-        with pytest.raises(LidarpoolError) as raised:
+        with pytest.raises(LidarError) as raised:
             Survey(poses=AT, **options)
         assert says in str(raised.value)
 
@@ -196,7 +196,7 @@ def test_nothing_public_is_left_out():
         "Result",
         "Robot",
         "ScanSpec",
-        "LidarpoolError",
+        "LidarError",
         "Sweep",
         "__version__",
     }
@@ -213,7 +213,7 @@ def test_signatures_can_be_read():
     )
     for name in lidarpool.__all__:
         thing = getattr(lidarpool, name)
-        if not callable(thing) or thing is LidarpoolError:
+        if not callable(thing) or thing is LidarError:
             continue
         methods = [getattr(thing, one) for one in dir(thing) if not one.startswith("_")]
         for one in (thing, *filter(inspect.isfunction, methods)):
@@ -226,5 +226,5 @@ def test_what_is_like_it_will_do():
     assert survey.scan_count == 3
     assert Noise(np.float32(0.5), dropout=1).dropout == 1
     assert isinstance(inspect.signature(simulate).parameters["wait_s"].default, float)
-    with pytest.raises(LidarpoolError, match="does not exist"):
+    with pytest.raises(LidarError, match="does not exist"):
         Scene.load(Path("nothing.glb"))

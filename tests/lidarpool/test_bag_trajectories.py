@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from lidarpool import LidarpoolError, Pose, Track, load_trajectory
+from lidarpool import LidarError, Pose, Track, load_trajectory
 
 rosbag2 = pytest.importorskip("rosbags.rosbag2")
 typesys = pytest.importorskip("rosbags.typesys")
@@ -150,10 +150,10 @@ def test_several_topics_have_to_be_chosen(bag):
         tf=[carrier(row) for row in ROWS],
     )
     with pytest.raises(
-        LidarpoolError, match="the poses /odom, /slam, /tf:base_link: choose one with topic"
+        LidarError, match="the poses /odom, /slam, /tf:base_link: choose one with topic"
     ):
         load_trajectory(path)
-    with pytest.raises(LidarpoolError, match=r"not '/odmo'\. Did you mean '/odom'"):
+    with pytest.raises(LidarError, match=r"not '/odmo'\. Did you mean '/odom'"):
         load_trajectory(path, topic="/odmo")
     track = load_trajectory(path, topic="/slam")
     assert len(track.times_s) == 16
@@ -176,7 +176,7 @@ def test_frames_above_each_other(bag):
         ],
         tf_static=[frames(transform(0, "base_link", "lidar", mount.position, turn))],
     )
-    with pytest.raises(LidarpoolError, match="/tf:base_link, /tf:odom: choose one"):
+    with pytest.raises(LidarError, match="/tf:base_link, /tf:odom: choose one"):
         load_trajectory(path)
     track = load_trajectory(path, topic="/tf:lidar")
     assert np.isclose(track.times_s[0] - START_NS / 1e9, 0.1)
@@ -205,15 +205,15 @@ def test_gnss_without_orientations_faces_its_direction_of_travel(bag):
     track = load_trajectory(path, origin=origin)
     assert_same(track, atol=1e-3, turned=False)
     assert np.isclose(track.pose(0, 1e9).yaw_deg, np.degrees(0.2), atol=0.1)
-    with pytest.raises(LidarpoolError, match="/imu has no orientations"):
+    with pytest.raises(LidarError, match="/imu has no orientations"):
         load_trajectory(path, topic="/fix /imu")
 
 
 def test_bags_without_poses(bag):
     path = bag(imu=[imu(0), imu(1)])
-    with pytest.raises(LidarpoolError, match="it has no poses: topics of nav_msgs/msg/Odometry"):
+    with pytest.raises(LidarError, match="it has no poses: topics of nav_msgs/msg/Odometry"):
         load_trajectory(path)
-    with pytest.raises(LidarpoolError, match="no poses"):
+    with pytest.raises(LidarError, match="no poses"):
         load_trajectory(path, ignore=["x"])
 
 
@@ -221,6 +221,6 @@ def test_a_cut_bag_and_a_zero_quaternion(bag, tmp_path):
     path = bag(state=[pose_stamped(row) for row in ROWS])
     file = path if path.is_file() else next(path.glob("*.mcap"))
     file.write_bytes(file.read_bytes()[: file.stat().st_size // 3])
-    with pytest.raises(LidarpoolError, match="not a usable trajectory") as raised:
+    with pytest.raises(LidarError, match="not a usable trajectory") as raised:
         load_trajectory(path)
     assert len(str(raised.value).splitlines()) == 1

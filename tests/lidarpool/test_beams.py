@@ -11,7 +11,7 @@ from tests.shapes import Cart, cast, quad, solid, wall
 
 from lidarpool import (
     Beams,
-    LidarpoolError,
+    LidarError,
     Material,
     Mounted,
     Optics,
@@ -23,11 +23,11 @@ from lidarpool import (
     Survey,
     load_sensor,
 )
-from lidarpool.scene.scene_mesh import SceneMesh
-from lidarpool.sensor.disc import SUBRAYS, Beam
-from lidarpool.sensor.ray_sensors import PrismSensor
-from lidarpool.sensor.sensor import LineSensor
-from lidarpool.simulator.rig import Rig
+from lidarsim.scene.scene_mesh import SceneMesh
+from lidarsim.sensor.disc import SUBRAYS, Beam
+from lidarsim.sensor.ray_sensors import PrismSensor
+from lidarsim.sensor.sensor import LineSensor
+from lidarsim.simulator.rig import Rig
 
 
 def plane(point, normal, size=4000.0):
@@ -364,5 +364,5 @@ def test_returns_go_before_what_the_sensor_states():
     ],
 )
 def test_beams_that_mean_nothing_are_refused(make, says):
-    with pytest.raises(LidarpoolError, match=says):
+    with pytest.raises(LidarError, match=says):
         make()

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import yaml
 
-from lidarpool import Campaign, Job, LidarpoolError, Noise, Scene, Survey
+from lidarpool import Campaign, Job, LidarError, Noise, Scene, Survey
 from lidarpool.scenario.campaign import hashes, is_campaign
 from lidarpool.scenario.campaign_sections import JobRandom
 from lidarpool.scenario.scenario import Scenario
@@ -206,13 +206,11 @@ def test_tables_may_be_written_in_several_ways(campaign, folder, text):
 def test_columns_of_a_table_are_fields_or_ignored(campaign, folder):
     (folder / "crates.csv").write_text('name,Wood,box,at,wood\nA,oak,"[1, 2, 3]","[[1, 2]]",5\n')
     sample = {"from": "crates.csv", "count": 1}
-    with pytest.raises(
-        LidarpoolError, match=r"columns are not known: Wood, wood\. Known are name, "
-    ):
+    with pytest.raises(LidarError, match=r"columns are not known: Wood, wood\. Known are name, "):
         campaign({"scene.copies": {"sample": sample}}).check_files()
     found = campaign({"scene.copies": {"sample": {**sample, "ignore": "wood"}}})
     assert found.scenario(0).scene.copies[1].box == (1, 2, 3)
-    with pytest.raises(LidarpoolError, match=r"ignore names 'steel', which is no column"):
+    with pytest.raises(LidarError, match=r"ignore names 'steel', which is no column"):
         campaign({"scene.copies": {"sample": {**sample, "ignore": ["wood", "steel"]}}})
 
 
@@ -416,7 +414,7 @@ def test_a_function_makes_jobs():
     ids=["no job", "raises", "refused", "other names", "a list"],
 )
 def test_a_function_that_makes_no_job(make, says):
-    with pytest.raises(LidarpoolError) as raised:
+    with pytest.raises(LidarError) as raised:
         Campaign(make, count=3).job(1)
     assert says in str(raised.value)
 
@@ -476,7 +474,7 @@ def test_a_missing_file_of_a_table_is_named_with_its_line(campaign, folder):
         "# van.obj\nname,file,trajectory\nCar,hall.glb,\nVan,van.obj,\n"
     )
     vary = {"actors": {"sample": {"from": "cars.csv", "count": 1}}}
-    with pytest.raises(LidarpoolError) as raised:
+    with pytest.raises(LidarError) as raised:
         campaign(vary).check_files()
     where = f"actors: {folder / 'cars.csv'}, line 4: {str(folder / 'van.obj')!r} does not exist"
     assert where in str(raised.value)
@@ -485,7 +483,7 @@ def test_a_missing_file_of_a_table_is_named_with_its_line(campaign, folder):
 @pytest.mark.parametrize("name", WRONG)
 def test_it_is_told_what_is_wrong(campaign, name):
     vary, says = WRONG[name]
-    with pytest.raises(LidarpoolError) as raised:
+    with pytest.raises(LidarError) as raised:
         campaign(vary).check_files()
     told = str(raised.value)
     assert says in told
@@ -506,14 +504,14 @@ def test_it_is_told_what_is_wrong(campaign, name):
     ],
 )
 def test_fields_that_cannot_be_meant(campaign, fields, says):
-    with pytest.raises(LidarpoolError) as raised:
+    with pytest.raises(LidarError) as raised:
         campaign(**fields)
     assert says in str(raised.value) and "campaign.yaml" in str(raised.value)
     assert len(str(raised.value).splitlines()) == 1
 
 
 def test_a_count_is_needed_where_something_is_drawn(campaign):
-    with pytest.raises(LidarpoolError, match=r"count is missing: steps is drawn"):
+    with pytest.raises(LidarError, match=r"count is missing: steps is drawn"):
         campaign({"steps": {"integer": [1, 2]}}, count=None)
     assert campaign(count=None).count == 1
 
@@ -521,7 +519,7 @@ def test_a_count_is_needed_where_something_is_drawn(campaign):
 def test_values_that_do_not_fit_together_are_told_with_the_job(campaign):
     found = campaign({"returns.subrays": {"integer": [1, 7]}})  # of which only the ends are
     wrong = next(n for n in range(40) if 1 < JobRandom(7, n, "returns.subrays").integer(1, 7) < 7)
-    with pytest.raises(LidarpoolError) as raised:
+    with pytest.raises(LidarError) as raised:
         found.job(wrong)
     assert f"campaign.yaml: job {wrong}: returns.subrays is " in str(raised.value)
     assert "\nIts values are returns.subrays: " in str(raised.value)
@@ -533,7 +531,7 @@ def test_files_of_every_row_are_looked_for(campaign, folder):
     vary = {"actors": {"sample": {"from": "cars.csv", "count": [0, 2]}}}
     for i in range(4):
         (folder / f"{i}.csv").touch()
-    with pytest.raises(LidarpoolError, match=r"4\.csv' does not exist"):
+    with pytest.raises(LidarError, match=r"4\.csv' does not exist"):
         campaign(vary).check_files()
     (folder / "4.csv").touch()
     campaign(vary).check_files()
@@ -541,21 +539,21 @@ def test_files_of_every_row_are_looked_for(campaign, folder):
 
 def test_of_several_bases_the_wrong_one_is_named(campaign, folder):
     (folder / "fog.yaml").write_text("steps: 3\n")
-    with pytest.raises(LidarpoolError) as raised:
+    with pytest.raises(LidarError) as raised:
         campaign(
             {"sensors.roof.model": {"choice": ["velodyne/vlp16"]}}, base=["base.yaml", "fog.yaml"]
         )
     assert "campaign.yaml: vary, of fog.yaml: sensors of the base has no 'roof'" in str(
         raised.value
     )
-    with pytest.raises(LidarpoolError, match=r"vary, of fog\.yaml: steps can be 0; it must"):
+    with pytest.raises(LidarError, match=r"vary, of fog\.yaml: steps can be 0; it must"):
         campaign({"steps": {"choice": [0]}}, base=["base.yaml", "fog.yaml"])
 
 
 def test_a_grid_that_is_too_large(campaign):
     many = {"each": list(range(1, 1001))}
     vary = {"steps": many, "planning.seed": many, "noise.seed": many}
-    with pytest.raises(LidarpoolError, match=r"all values of each are 1,000,000,000 jobs"):
+    with pytest.raises(LidarError, match=r"all values of each are 1,000,000,000 jobs"):
         campaign(vary, count=None)
     assert campaign(vary, count=5).count == 5
 
@@ -564,7 +562,7 @@ def test_given_files_that_cannot_be_used(folder):
     (folder / "wrong.yaml").write_text("stepps: 3\n")
     (folder / "campaign.yaml").write_text("base: base.yaml\n")
     names = ("none.yaml", "wrong.yaml", "none.glb", "campaign.yaml", "base.yaml")
-    with pytest.raises(LidarpoolError) as raised:
+    with pytest.raises(LidarError) as raised:
         Campaign.of_scenarios([folder / name for name in names])
     lines = str(raised.value).splitlines()
     says = (
@@ -573,7 +571,7 @@ def test_given_files_that_cannot_be_used(folder):
         "is a campaign",
     )
     assert len(lines) == 3 and all(map(str.__contains__, lines, says))
-    with pytest.raises(LidarpoolError, match=r"none\.glb' does not exist"):
+    with pytest.raises(LidarError, match=r"none\.glb' does not exist"):
         Campaign.of_scenarios([folder / "none.glb", folder / "base.yaml"]).check_files()
 
 

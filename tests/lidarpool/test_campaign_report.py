@@ -9,12 +9,12 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from lidarpool import LidarpoolError
-from lidarpool.base.storage import Storage
+from lidarpool import LidarError
 from lidarpool.datasets.figures import Figures
 from lidarpool.datasets.job_table import JobRow
 from lidarpool.render.picture_page import Page
 from lidarpool.report.campaign_report import write_card
+from lidarsim.base.storage import Storage
 
 NAMES = ("visibility", "model", "night")
 EVIL = '<script>alert(1)</script> | `x` $\\frac{1 [a](b) \u202e "'
@@ -181,18 +181,18 @@ def test_an_earlier_report_goes_first(tmp_path):
 
     def broken():
         yield ROWS[0]
-        raise LidarpoolError("the database cannot be read")
+        raise LidarError("the database cannot be read")
 
     place = Storage.at(tmp_path, durable=False)
     write(place, ROWS)
-    with pytest.raises(LidarpoolError, match="database"):
+    with pytest.raises(LidarError, match="database"):
         write(place, broken())
     assert not (tmp_path / "report.json").exists()
 
 
 @pytest.mark.parametrize("split", ["../x", "a/b", "-", "a\nb"])
 def test_splits_are_names_of_files(tmp_path, split):
-    with pytest.raises(LidarpoolError, match="cannot be called"):
+    with pytest.raises(LidarError, match="cannot be called"):
         write(Storage.at(tmp_path), [row(0, split=split)])
 
 

@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 from tests.meshes import NESTED
 
-from lidarpool.base.errors import LidarpoolError
 from lidarpool.scenario.build import build
 from lidarpool.scenario.scenario import Scenario
-from lidarpool.scene.files.meshfile import load_meshes
-from lidarpool.scene.scene_instances import SceneInstance
-from lidarpool.scene.scene_mesh import triangle_areas
-from lidarpool.sensor.materials import MaterialTable
+from lidarsim.base.errors import LidarError
+from lidarsim.scene.files.meshfile import load_meshes
+from lidarsim.scene.scene_instances import SceneInstance
+from lidarsim.scene.scene_mesh import triangle_areas
+from lidarsim.sensor.materials import MaterialTable
 
 # A cube of 2 units, its rings running outward.
 CUBE = [[x, y, z] for z in (0, 2) for y in (0, 2) for x in (0, 2)]
@@ -135,7 +135,7 @@ def test_a_sequence_is_read_like_a_file(tmp_path):
     assert cube.name == "Building b"
     np.testing.assert_array_equal(cube.bounds, [[84000, 447000, 3], [84001, 447001, 4]])
     write(path, "\n".join(map(json.dumps, lines[1:])))
-    with pytest.raises(LidarpoolError, match="not CityJSON"):
+    with pytest.raises(LidarError, match="not CityJSON"):
         load_meshes(path)
 
 
@@ -211,7 +211,7 @@ def test_reference_systems(tmp_path):
         {"metadata": {"referenceSystem": "urn:ogc:def:crs:EPSG::4979"}},
         {"transform": {"scale": [1e-5, 1e-5, 1], "translate": [4.3, 52, 0]}},
     ):
-        with pytest.raises(LidarpoolError, match="in degrees"):
+        with pytest.raises(LidarError, match="in degrees"):
             load(tmp_path, city({"a": thing(geometry())}, **more))
 
 
@@ -246,14 +246,14 @@ def test_the_first_version_needs_no_transform(tmp_path):
     ],
 )
 def test_what_is_wrong_is_said(tmp_path, document, words):
-    with pytest.raises(LidarpoolError, match=words) as caught:
+    with pytest.raises(LidarError, match=words) as caught:
         load(tmp_path, document)
     assert len(str(caught.value).removeprefix(str(tmp_path))) < 400
 
 
 def test_memory_is_refused_before_it_is_taken(tmp_path, monkeypatch):
-    monkeypatch.setattr("lidarpool.base.allowance.memory", lambda: 100_000_000)
-    with pytest.raises(LidarpoolError, match=r"would unpack to .* CityJSONSeq"):
+    monkeypatch.setattr("lidarsim.base.allowance.memory", lambda: 100_000_000)
+    with pytest.raises(LidarError, match=r"would unpack to .* CityJSONSeq"):
         load(tmp_path, '{"type": "CityJSON", "x": [' + "[]," * 300_000 + "[]]}")
 
 

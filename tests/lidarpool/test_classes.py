@@ -16,20 +16,20 @@ from rosbags.interfaces import QosDurability
 from tests.drives import SCANS, points_of, the_scene, the_sweeps
 
 import lidarpool
-from lidarpool import LidarpoolError, Material, Sensor, Survey, read_cloud
+from lidarpool import LidarError, Material, Sensor, Survey, read_cloud
 from lidarpool.base.fingerprint import fingerprint
-from lidarpool.base.storage import Storage
 from lidarpool.datasets.dataset import DataSet
 from lidarpool.datasets.job_table import JobRow, write_table
 from lidarpool.export.format_table import DATA_SETS
 from lidarpool.export.formats import Format
-from lidarpool.export.sweeps import SWEEPS_FILE, Sweeps
 from lidarpool.live.view import open_result
 from lidarpool.report.charts import draw_sweep
 from lidarpool.run.picture_file import PICTURE_FILE, PictureContent
 from lidarpool.scenario.build import Job
 from lidarpool.scenario.campaign import find_field
 from lidarpool.scenario.scenario import Scenario
+from lidarsim.base.storage import Storage
+from lidarsim.sweeps.sweeps import SWEEPS_FILE, Sweeps
 
 NAMES = {3: "road", 7: "Straße", 20: "pole, or a sign at one", 299: "car"}
 
@@ -66,7 +66,7 @@ def test_what_is_no_class_with_a_name_is_one_line(wrong):
         lambda: Survey(poses=[(0, 0, 1)], classes=wrong),
         lambda: Scenario.from_data({"classes": wrong}, source="a.yaml"),
     ):
-        with pytest.raises(LidarpoolError, match=r"classes: \{.*give whole numbers") as error:
+        with pytest.raises(LidarError, match=r"classes: \{.*give whole numbers") as error:
             make()
         assert "\n" not in str(error.value)
 
@@ -83,7 +83,7 @@ def test_names_add_the_column_and_are_no_part_of_the_survey():
 def test_a_path_of_a_campaign_leads_to_the_name_of_a_class():
     scenario = Scenario.from_data({"classes": {40: "road"}})
     assert [key for key, _ in find_field(scenario, "classes.40")[0]] == ["classes", 40]
-    with pytest.raises(LidarpoolError, match=r"no .41.\. It has 40"):
+    with pytest.raises(LidarError, match=r"no .41.\. It has 40"):
         find_field(scenario, "classes.41")
 
 

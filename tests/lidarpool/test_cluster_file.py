@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from jsonschema import Draft7Validator
 from tests.clusters import import_jobqueue
 
-from lidarpool import LidarpoolError
+from lidarpool import LidarError
 from lidarpool.run.checks import gpu_note
 from lidarpool.run.cluster_file import ClusterFile
 from lidarpool.run.connection import default_workers, local_cluster
@@ -41,7 +41,7 @@ def test_slots_and_workers_of_a_file(tmp_path):
     assert file.slots == {"GPU": 4, "LIDAR": 4, "OTHER": 5}
     assert str(file) == "SSHCluster: 8 workers, GPU 2, LIDAR 1, OTHER 5"
     file.require({"GPU": 1, "LIDAR": 4})
-    with pytest.raises(LidarpoolError, match=r"c.yaml: partition LIDAR has 4 of the 5 slots"):
+    with pytest.raises(LidarError, match=r"c.yaml: partition LIDAR has 4 of the 5 slots"):
         file.require({"LIDAR": 5})
 
 
@@ -54,7 +54,7 @@ def test_partitions_that_grow_with_their_work(tmp_path):
     assert str(file) == "SSHCluster: up to 12 workers, GPU 1 to 3, LIDAR 1, OTHER 0 to 8"
     file.require({"GPU": 1, "LIDAR": 4, "OTHER": 1})
     few = load(tmp_path, GOOD.replace("slots: 4", "adapt: [0, 3]"))
-    with pytest.raises(LidarpoolError, match=r"partition LIDAR has 3 of the 4 slots needed"):
+    with pytest.raises(LidarError, match=r"partition LIDAR has 3 of the 4 slots needed"):
         few.require({"LIDAR": 4})
 
 
@@ -98,14 +98,14 @@ WRONG = {
 @pytest.mark.parametrize("case", WRONG)
 def test_what_is_wrong_with_a_file(tmp_path, case):
     text, says = WRONG[case]
-    with pytest.raises(LidarpoolError, match=f"c.yaml.*{says}"):
+    with pytest.raises(LidarError, match=f"c.yaml.*{says}"):
         load(tmp_path, text)
 
 
 def test_a_cluster_that_does_not_start(tmp_path):
     file = load(tmp_path, GOOD.replace("hosts: [head]}", "host: head}", 1))
     with (
-        pytest.raises(LidarpoolError, match=r"c.yaml: distributed.SSHCluster was not started \(.*"),
+        pytest.raises(LidarError, match=r"c.yaml: distributed.SSHCluster was not started \(.*"),
         file.started(print),
     ):
         pass

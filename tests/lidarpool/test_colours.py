@@ -24,7 +24,7 @@ from trimesh.visual.material import PBRMaterial
 from lidarpool import (
     Actor,
     Column,
-    LidarpoolError,
+    LidarError,
     Material,
     Noise,
     Pose,
@@ -36,10 +36,10 @@ from lidarpool import (
     Sensor,
     Track,
 )
-from lidarpool.columns.table import COLOURS
 from lidarpool.scenario.scenario import Scenario
-from lidarpool.scene import masks
-from lidarpool.scene.colours import (
+from lidarsim.columns.table import COLOURS
+from lidarsim.scene import masks
+from lidarsim.scene.colours import (
     GREY,
     LINEAR,
     WEIGHTS,
@@ -50,7 +50,7 @@ from lidarpool.scene.colours import (
     packed,
     unpacked,
 )
-from lidarpool.sensor.materials import DARKEST, reflectances
+from lidarsim.sensor.materials import DARKEST, reflectances
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 RNG = np.random.default_rng(7)
@@ -397,7 +397,7 @@ def test_colours_that_do_not_fit_are_refused():
         Colours((PICTURE,), np.zeros(128, np.int32), np.full((128, 3, 2), np.nan, np.float32)),
         Colours((GREY.astype(float),), np.zeros(128, np.int32)),
     ):
-        with pytest.raises(LidarpoolError, match="do not fit its 128 faces"):
+        with pytest.raises(LidarError, match="do not fit its 128 faces"):
             SceneMesh("Hills", vertices, faces, colours=colours)
 
 
@@ -441,7 +441,7 @@ def test_a_gloss_adds_to_diffuse_light_and_replaces_that_of_metals():
         want = np.pi * cosine * d * front * g / (4 * cosine**2) + (1 - metalness) * matt
         np.testing.assert_allclose(found, want, rtol=1e-4)
     for wrong in ({"metalness": 0.5}, {"roughness": 0.5, "retro": True}, {"roughness": 0.0}):
-        with pytest.raises(LidarpoolError):
+        with pytest.raises(LidarError):
             Material("*", **wrong)
 
 
@@ -457,12 +457,12 @@ def test_names_of_materials_are_looked_up_and_contradictions_refused():
         ({"scale": 2.0}, "give reflectance texture"),
         ({"reflectance": "textures"}, "it must be 0 to 1, or texture"),
     ):
-        with pytest.raises(LidarpoolError, match=why):
+        with pytest.raises(LidarError, match=why):
             Material("*", **arguments)
-    with pytest.raises(LidarpoolError, match=r"\[0\].reflectance is 'white'; it must"):
+    with pytest.raises(LidarError, match=r"\[0\].reflectance is 'white'; it must"):
         Scenario.from_data({"materials": [{"objects": "*", "reflectance": "white"}]})
     wrong = {"objects": "*", "spectrum": "asphalt, dry", "reflectance": 0.2}
-    with pytest.raises(LidarpoolError, match=r"^scenario: materials\[1\]: give either spectrum or"):
+    with pytest.raises(LidarError, match=r"^scenario: materials\[1\]: give either spectrum or"):
         Scenario.from_data({"materials": [{"objects": "*"}, wrong]})
     table = reflectances()
     assert len(table) >= 30

@@ -15,7 +15,7 @@ from lidarpool import (
     Cloud,
     Column,
     Fault,
-    LidarpoolError,
+    LidarError,
     Material,
     Mounted,
     Noise,
@@ -29,8 +29,8 @@ from lidarpool import (
     save_cloud,
     simulate,
 )
-from lidarpool.columns.table import ALWAYS, OPTIONAL, TABLE, chosen, stored
-from lidarpool.simulator.points import BatchPoints
+from lidarsim.columns.table import ALWAYS, OPTIONAL, TABLE, chosen, stored
+from lidarsim.simulator.points import BatchPoints
 
 # -- the table ------------------------------------------------------------------------------------
 
@@ -64,29 +64,29 @@ def test_columns_are_chosen_by_name_once_and_in_order():
     ],
 )
 def test_columns_that_cannot_be_chosen(columns, message):
-    with pytest.raises(LidarpoolError, match=message):
+    with pytest.raises(LidarError, match=message):
         chosen(columns)
 
 
 @pytest.mark.parametrize("name", ["", "a b", "1st", "a-b", "../x"])
 def test_a_column_is_called_by_an_identifier(name):
-    with pytest.raises(LidarpoolError, match=f"cannot have the name '{name}': use an identifier"):
+    with pytest.raises(LidarError, match=f"cannot have the name '{name}': use an identifier"):
         Column(name, "u1", "", "")
 
 
 @pytest.mark.parametrize("name", ["a b", "a\nb", "höhe", "positions", "normals", "colors", "x"])
 def test_a_column_that_files_cannot_hold_is_neither_chosen_nor_written(name, tmp_path):
     column = Column("a", "u1", "", "", file_name=name)
-    with pytest.raises(LidarpoolError, match=r"name .* in files.*: (use|rename)"):
+    with pytest.raises(LidarError, match=r"name .* in files.*: (use|rename)"):
         chosen([column])
-    with pytest.raises(LidarpoolError, match=r"name .* in files.*: (use|rename)"):
+    with pytest.raises(LidarError, match=r"name .* in files.*: (use|rename)"):
         save_cloud(Cloud(np.zeros((1, 3)), {"a": [1]}, (column,)), tmp_path / "c.ply")
     assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.parametrize("dtype", ["float23", "U5", "O", "bool", "M8[s]", "complex64", "3f4"])
 def test_a_column_holds_numbers(dtype):
-    with pytest.raises(LidarpoolError, match="give a type of whole or real numbers"):
+    with pytest.raises(LidarError, match="give a type of whole or real numbers"):
         Column("a", dtype, "", "")
 
 
@@ -120,7 +120,7 @@ def test_a_column_is_made_of_an_attribute_or_by_a_function(dtype, values):
     ],
 )
 def test_values_that_do_not_fit_their_column(dtype, values, message):
-    with pytest.raises(LidarpoolError, match=message):
+    with pytest.raises(LidarError, match=message):
         Column("a", dtype, "", "", lambda returns: values).make(BatchStub())
 
 
@@ -177,7 +177,7 @@ def test_points_are_selected_as_rows_of_an_array():
 
 @pytest.mark.parametrize("key", [2, [9], 0.5, [0.5], None, np.ones((5, 3), bool), [True], True])
 def test_what_selects_no_points(key):
-    with pytest.raises(LidarpoolError, match=r"cloud of 5 are a slice, as cloud\[:100\], a mask"):
+    with pytest.raises(LidarError, match=r"cloud of 5 are a slice, as cloud\[:100\], a mask"):
         cloud_of()[key]
 
 
@@ -193,7 +193,7 @@ def test_a_column_of_ones_own_is_held_to_its_description():
     cloud = Cloud(np.zeros((2, 3)), {"mine": [1, 2]}, own)
     assert cloud.mine.dtype == np.uint8 and cloud.table == own
     assert cloud[1:2].table == own
-    with pytest.raises(LidarpoolError, match="mine holds 1 to 256"):
+    with pytest.raises(LidarError, match="mine holds 1 to 256"):
         Cloud(np.zeros((2, 3)), {"mine": [1, 256]}, own)
 
 
@@ -214,7 +214,7 @@ def test_a_column_of_ones_own_is_held_to_its_description():
     ],
 )
 def test_arrays_that_are_no_cloud(positions, columns, message):
-    with pytest.raises(LidarpoolError, match=message):
+    with pytest.raises(LidarError, match=message):
         Cloud(positions, columns)
 
 
@@ -348,6 +348,6 @@ def test_a_ghost_has_no_normal_and_a_frozen_sensor_takes_normals_along():
 
 
 def test_a_vector_is_chosen_as_a_whole():
-    with pytest.raises(LidarpoolError, match="normal_x, normal_y, normal_z are one vector"):
+    with pytest.raises(LidarError, match="normal_x, normal_y, normal_z are one vector"):
         chosen(["normal_z"])
     assert len(chosen(SURFACE)) == 7

@@ -13,12 +13,12 @@ from pypcd4 import PointCloud
 from tests.drives import points_of, the_scene, the_sweeps, write_set
 
 import lidarpool
-from lidarpool import Cloud, LidarpoolError, Scene, Sensor, Survey, compare, save_cloud
+from lidarpool import Cloud, LidarError, Scene, Sensor, Survey, compare, save_cloud
 from lidarpool.compare import comparison
 from lidarpool.compare.recordings import open_recording
 from lidarpool.datasets.figures import rank_correlation
 from lidarpool.export.formats import Format
-from lidarpool.export.sweeps import Sweeps
+from lidarsim.sweeps.sweeps import Sweeps
 
 RINGS, COLUMNS = 16, 720
 ELEVATION = np.linspace(-15, 15, RINGS)
@@ -313,7 +313,7 @@ def test_a_survey_that_moved_is_compared_with_a_map(written):
         assert found["distances"]["b_to_a"]["points"] == len(made)
         assert max(found["distances"][way]["max_m"] for way in ("a_to_b", "b_to_a")) < 1e-3
         assert "cloud.laz has no sweeps" in found["notes"][0]
-    with pytest.raises(LidarpoolError, match="does not say where that was"):
+    with pytest.raises(LidarError, match="does not say where that was"):
         compare(folder / "cloud.mcap", folder / "cloud.laz")
 
 
@@ -326,7 +326,7 @@ def test_sweeps_are_matched_by_time(written, tmp_path):
     assert found["pairs"] == 2
     assert found["notes"][0] == "A has 3 sweeps, B 3: 2 pairs by time"
     assert found["distances"]["a_to_b"]["max_m"] < 20  # one turn on: in the sensors' own axes
-    with pytest.raises(LidarpoolError, match="has no times of sweeps: leave out --match time"):
+    with pytest.raises(LidarError, match="has no times of sweeps: leave out --match time"):
         compare(folder / "pcd", folder, match="time")
     for name in ("0.pcd", "1.pcd"):
         (tmp_path / name).write_bytes((folder / "pcd/000000.pcd").read_bytes())
@@ -343,7 +343,7 @@ def test_one_of_several_sensors_is_chosen(tmp_path):
     of.save(tmp_path / "sweeps.npz")
     bag = tmp_path / "cloud.mcap"
     for place, names in ((tmp_path, "sensors front, rear/left"), (bag, "/front/points, /rear")):
-        with pytest.raises(LidarpoolError, match=rf"{names}.*: choose one \(--sensor-a"):
+        with pytest.raises(LidarError, match=rf"{names}.*: choose one \(--sensor-a"):
             compare(place, tmp_path, sensor_b="front")
     found = compare(bag, tmp_path, sensor_a="/rear_left/points", sensor_b="rear/left").figures
     assert found["pairs"] == 3 and found["distances"]["a_to_b"]["max_m"] < 2e-3
@@ -374,7 +374,7 @@ def test_names_and_places_of_other_programs(tmp_path):
     found = compare(tmp_path / "turn.pcd", tmp_path, intensity_a="signal", intensity_b="signal")
     assert found.figures["range_image"]["no_return"]["returns_in_both"] == CELLS
     assert found.figures["intensity"]["rank_correlation"] == pytest.approx(1)
-    with pytest.raises(LidarpoolError, match=r"no column 'signl'.* Did you mean 'signal'\?"):
+    with pytest.raises(LidarError, match=r"no column 'signl'.* Did you mean 'signal'\?"):
         compare(tmp_path, tmp_path, intensity_a="signl")
 
 
@@ -440,7 +440,7 @@ def test_cut_and_garbled_files_are_a_line(written, tmp_path, name):
         garbled[place] = rng.integers(256)
     for content in (b"", b"x", whole[:40], whole[: len(whole) // 2], whole[:-40], bytes(garbled)):
         path.write_bytes(content)
-        with pytest.raises(LidarpoolError) as raised:
+        with pytest.raises(LidarError) as raised:
             compare(path, folder)
         assert path.name in str(raised.value)
         assert len(str(raised.value).splitlines()) == 1 and len(str(raised.value)) < 400
@@ -458,7 +458,7 @@ def test_what_cannot_be_compared_says_what_to_give(written, tmp_path):
         ("empty", "cannot be compared"),
         ("none.las", "has no points: there is nothing to compare"),
     ):
-        with pytest.raises(LidarpoolError, match=says):
+        with pytest.raises(LidarError, match=says):
             compare(tmp_path / path, made)
     for options, says in (
         ({"sweeps": [3]}, r"there is no sweep 3: 3 pairs of sweeps, from 0"),
@@ -466,11 +466,11 @@ def test_what_cannot_be_compared_says_what_to_give(written, tmp_path):
         ({"sensor_b": "/points"}, "has the sensors"),
         ({"distances_m": [0.0]}, "it must be lengths in metres"),
     ):
-        with pytest.raises(LidarpoolError, match=says):
+        with pytest.raises(LidarError, match=says):
             compare(folder, folder, **options)
-    with pytest.raises(LidarpoolError, match="has no sweeps: leave out --sweep and --match"):
+    with pytest.raises(LidarError, match="has no sweeps: leave out --sweep and --match"):
         compare(made, folder, sweeps=[0])
-    with pytest.raises(LidarpoolError, match="topics of PointCloud2 /points, not '/point'"):
+    with pytest.raises(LidarError, match="topics of PointCloud2 /points, not '/point'"):
         open_recording(folder / "cloud.mcap", "/point")
 
 

@@ -7,14 +7,14 @@ import pytest
 import trimesh
 from tests.shapes import quad
 
-from lidarpool import LidarpoolError, Pose
+from lidarpool import LidarError, Pose
 from lidarpool.base.fingerprint import fingerprint
 from lidarpool.scenario.build import build
 from lidarpool.scenario.scenario import Scenario
-from lidarpool.scene.scene import Scene
-from lidarpool.scene.scene_file import write_scene
-from lidarpool.scene.scene_mesh import SceneMesh
-from lidarpool.sensor.materials import MaterialTable
+from lidarsim.scene.scene import Scene
+from lidarsim.scene.scene_file import write_scene
+from lidarsim.scene.scene_mesh import SceneMesh
+from lidarsim.sensor.materials import MaterialTable
 
 
 @pytest.fixture
@@ -232,13 +232,13 @@ def test_what_cannot_be_is_told_in_a_line(made, folder, name, monkeypatch):
     (folder / "a.csv").write_text("x,z\n1,nan\n")
     (folder / "some.csv").write_text("x,y,z\n# first\n1,2,3\n\n4,5,\n")
     (folder / "yaw.csv").write_text("x,y,yaw\n1,2,90\n")
-    with pytest.raises(LidarpoolError) as raised:
+    with pytest.raises(LidarError) as raised:
         made(entry)
     assert says in str(raised.value) and len(str(raised.value).splitlines()) == 1
 
 
 def test_nothing_to_stand_on(made):
-    with pytest.raises(LidarpoolError, match=r"nothing to stand on: add scene\.files"):
+    with pytest.raises(LidarError, match=r"nothing to stand on: add scene\.files"):
         made(TREE | {"scatter": {"count": 1}}, scene={"files": []})
-    with pytest.raises(LidarpoolError, match="give z"):
+    with pytest.raises(LidarError, match="give z"):
         made(TREE | {"at": [[0, 0]]}, scene={"files": []})

@@ -5,9 +5,9 @@ import pytest
 import trimesh
 from tests.meshes import NESTED
 
-from lidarpool.base.errors import LidarpoolError
-from lidarpool.scene.files.meshfile import load_meshes
-from lidarpool.scene.scene import Scene
+from lidarsim.base.errors import LidarError
+from lidarsim.scene.files.meshfile import load_meshes
+from lidarsim.scene.scene import Scene
 
 DAE = """<?xml version="1.0"?>{doctype}
 <COLLADA xmlns="http://www.collada.org/2005/11/COLLADASchema" version="1.4.1">
@@ -131,7 +131,7 @@ def test_nodes_of_a_library_stand_where_they_are_named(tmp_path):
     nodes = "".join(f'<node id="k{i + 1}">{here.format(i) * 2}</node>' for i in range(3))
     nodes += f'<node id="k0">{HERE}</node>'
     assert len(load(tmp_path, nodes=nodes, here=here.format(3))) == 8
-    with pytest.raises(LidarpoolError, match="contain each other"):
+    with pytest.raises(LidarError, match="contain each other"):
         load(tmp_path, nodes=nodes.replace(HERE, here.format(3)), here=here.format(3))
 
 
@@ -167,7 +167,7 @@ CONTROLLER = (
     ids=str,
 )  # fmt: skip
 def test_what_cannot_be_read_says_what_it_is(tmp_path, parts, message):
-    with pytest.raises(LidarpoolError, match=message) as caught:
+    with pytest.raises(LidarError, match=message) as caught:
         load(tmp_path, **parts)
     assert len(str(caught.value)) < 400 + len(str(tmp_path))
 
@@ -177,5 +177,5 @@ def test_a_cut_file_never_loses_triangles_in_silence(tmp_path):
     whole = DAE.format(**PARTS).strip()
     for cut in range(1, len(whole), 40):
         path.write_text(whole[:-cut])
-        with pytest.raises(LidarpoolError, match="broken"):
+        with pytest.raises(LidarError, match="broken"):
             load_meshes(path)

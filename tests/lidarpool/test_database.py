@@ -12,7 +12,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from lidarpool import LidarpoolError
+from lidarpool import LidarError
 from lidarpool.columns.parts import part_name
 from lidarpool.pipeline.database import RunDatabase
 from lidarpool.pipeline.messages import Receipt
@@ -267,7 +267,7 @@ def test_a_damaged_file_is_refused_and_left_alone(db, damage):
     DAMAGE[damage](db.path)
     before = db.path.read_bytes()
     with (
-        pytest.raises(LidarpoolError, match=r"run\.db (is damaged|cannot be written) \(.*\): "),
+        pytest.raises(LidarError, match=r"run\.db (is damaged|cannot be written) \(.*\): "),
         closing(RunDatabase(db.path)) as opened,
     ):
         opened.job(JOB, SCANS)
@@ -275,10 +275,10 @@ def test_a_damaged_file_is_refused_and_left_alone(db, damage):
 
 
 def test_a_file_that_cannot_be_made(tmp_path):
-    with pytest.raises(LidarpoolError, match=r"run\.db cannot be written .*give another folder"):
+    with pytest.raises(LidarError, match=r"run\.db cannot be written .*give another folder"):
         RunDatabase(tmp_path / "none" / "run.db")
     (tmp_path / "run.db").mkdir()
-    with pytest.raises(LidarpoolError, match="cannot be written"):
+    with pytest.raises(LidarError, match="cannot be written"):
         RunDatabase(tmp_path / "run.db")
 
 
@@ -296,8 +296,8 @@ def test_one_run_at_a_time(db, tmp_path):
         text=True,
         check=True,
     )
-    assert done.stdout.strip() == f"LidarpoolError Another run is using {tmp_path}."
-    with pytest.raises(LidarpoolError, match="Another run is using"):  # nor in this process
+    assert done.stdout.strip() == f"LidarError Another run is using {tmp_path}."
+    with pytest.raises(LidarError, match="Another run is using"):  # nor in this process
         RunDatabase(db.path)
     assert db.commit([receipt(5, 6)])
     reopened(db).close()

@@ -18,14 +18,14 @@ import pyarrow.parquet
 import pytest
 from tests.drives import SCANS, TURNS, points_of, the_scene, the_sweeps
 
-from lidarpool import Cloud, LidarpoolError, Scene, Sensor, Survey
-from lidarpool.base.storage import Storage
+from lidarpool import Cloud, LidarError, Scene, Sensor, Survey
 from lidarpool.datasets.dataset import INDEX_FILE, DataSet, Listing
 from lidarpool.datasets.job_table import JobRow
 from lidarpool.export.boxes import Boxes
 from lidarpool.export.format_table import DATA_SETS
 from lidarpool.export.formats import Format
-from lidarpool.export.sweeps import Sweeps
+from lidarsim.base.storage import Storage
+from lidarsim.sweeps.sweeps import Sweeps
 
 
 @pytest.fixture(scope="module")
@@ -245,23 +245,23 @@ def test_parquet_with_as_many_files_as_sweeps(scene, sweeps, job, tmp_path):
 def test_what_cannot_be_written_is_told_in_a_line(job, sweeps, tmp_path, monkeypatch):
     place = Storage.at(tmp_path / "d")
     bare = Cloud(job(0).positions, {"scan": job(0).scan})
-    with pytest.raises(LidarpoolError, match="kitti needs object, reflectivity, class"):
+    with pytest.raises(LidarError, match="kitti needs object, reflectivity, class"):
         DataSet(place, "kitti").write_job(JobRow(0, "0"), bare, sweeps)
     assert DataSet(place, "kitti").columns == ("scan", "object", "reflectivity", "class")
     assert DataSet(place, "folder").columns == ()
     assert "range" in DataSet(place, "mcap", "ouster").columns
     half = replace(sweeps, scans=sweeps.scans[:4], begins_ns=sweeps.begins_ns[:3])
-    with pytest.raises(LidarpoolError, match="not in the order of their scans, or of another"):
+    with pytest.raises(LidarError, match="not in the order of their scans, or of another"):
         DataSet(place, "kitti").write_job(JobRow(0, "0"), job(0), half)
-    with pytest.raises(LidarpoolError, match=r"Job 5 of .* is not whole: its \.jobs/5\.json"):
+    with pytest.raises(LidarError, match=r"Job 5 of .* is not whole: its \.jobs/5\.json"):
         DataSet(place, "kitti").finish([JobRow(5, "5")])
     assert not (tmp_path / "d" / INDEX_FILE).exists()
     (tmp_path / "file").write_text("")
-    with pytest.raises(LidarpoolError, match=r"Job 0 cannot be written to .*file") as told:
+    with pytest.raises(LidarError, match=r"Job 0 cannot be written to .*file") as told:
         DataSet(Storage.at(tmp_path / "file"), "kitti").write_job(JobRow(0, "0"), job(0), sweeps)
     assert "\n" not in str(told.value)
     monkeypatch.setattr("lidarpool.export.formats.find_spec", lambda name: None)
-    with pytest.raises(LidarpoolError, match=r'pip install "lidarpool\[parquet\]"'):
+    with pytest.raises(LidarError, match=r'pip install "lidarpool\[parquet\]"'):
         DataSet(place, "parquet").write_job(JobRow(0, "0"), job(0), sweeps)
 
 

@@ -11,20 +11,20 @@ import yaml
 from click.testing import CliRunner
 from tests.shapes import beam_along_x, cast, wall
 
-from lidarpool import (
-    LidarpoolError,
+from lidarpool import (  # fmt: skip
+    LidarError,
     Material,
     Mounted,
     Noise,
     Returns,
     Survey,
     load_sensor,
-)  # fmt: skip
+)
 from lidarpool.cli.scenario_commands import sensors
 from lidarpool.scenario.advice import advice
 from lidarpool.scenario.build import build
 from lidarpool.scenario.scenario import Scenario
-from lidarpool.sensor.models import Detection, model_names, read_model
+from lidarsim.sensor.models import Detection, model_names, read_model
 
 RAYS = 20_000
 STATED = [name for name in model_names() if read_model(name).performance]
@@ -46,7 +46,7 @@ def test_each_model_says_where_its_figures_are_from_or_that_none_were_found(name
     model = read_model(name)
     if model.performance is None:
         assert model.sources["performance"].startswith("none that could be read")
-        with pytest.raises(LidarpoolError, match="give noise yourself"):
+        with pytest.raises(LidarError, match="give noise yourself"):
             model.datasheet()
         return
     sheet = model.datasheet()
@@ -176,7 +176,7 @@ def test_what_a_data_sheet_lacks_is_told_as_long_as_nobody_gives_it(given, lacks
 )
 def test_rain_without_a_detection_range_proposes_one_that_can_be_written(sensor, lacks, proposed):
     rain = {"sensor": {"model": "velodyne/vlp16", **sensor}, "weather": {"rain_mm_h": 10}}
-    with pytest.raises(LidarpoolError, match=lacks) as told:
+    with pytest.raises(LidarError, match=lacks) as told:
         carried(**rain)
     (entry,) = re.findall(r"write .*, (noise: {.*})", str(told.value))
     assert yaml.safe_load(entry) == {"noise": {"detection_range_m": proposed}}
@@ -192,7 +192,7 @@ def test_rain_without_a_detection_range_proposes_one_that_can_be_written(sensor,
     ],
 )
 def test_a_switch_that_cannot_work_says_so(sensor, says):
-    with pytest.raises(LidarpoolError, match=says):
+    with pytest.raises(LidarError, match=says):
         carried(sensor=sensor)
 
 

@@ -33,17 +33,17 @@ from lidarpool import (
 )
 from lidarpool.columns.parts import pack
 from lidarpool.pipeline import rigs as stage
-from lidarpool.scene.actors import box
-from lidarpool.scene.colours import Colours
-from lidarpool.scene.shapes import seed_objects
-from lidarpool.sensor.materials import Material
-from lidarpool.sensor.models import load_sensor
-from lidarpool.sensor.optics import Returns
-from lidarpool.sensor.trajectory import Stations
-from lidarpool.simulator.batch import columns_of
-from lidarpool.simulator.device import OPTIONS, DevicePoints
-from lidarpool.simulator.memory import cast_bytes
-from lidarpool.simulator.rig import Rig
+from lidarsim.scene.actors import box
+from lidarsim.scene.colours import Colours
+from lidarsim.scene.shapes import seed_objects
+from lidarsim.sensor.materials import Material
+from lidarsim.sensor.models import load_sensor
+from lidarsim.sensor.optics import Returns
+from lidarsim.sensor.trajectory import Stations
+from lidarsim.simulator.batch import columns_of
+from lidarsim.simulator.device import OPTIONS, DevicePoints
+from lidarsim.simulator.memory import cast_bytes
+from lidarsim.simulator.rig import Rig
 from raybeam import registry
 
 COLUMNS = (
@@ -279,7 +279,7 @@ def test_the_kernel_compiles_without_spills(card, tmp_path):
     known = subprocess.run([nvcc, "--list-gpu-arch"], capture_output=True, text=True).stdout
     if f"compute_{card}" not in known.split():
         pytest.skip(f"this nvcc does not know sm_{card}")
-    source = importlib.resources.files("lidarpool.simulator") / "columns.cu"
+    source = importlib.resources.files("lidarsim.simulator") / "columns.cu"
     done = subprocess.run(
         [nvcc, *OPTIONS, f"-arch=sm_{card}", "-cubin", "-Xptxas", "-v", "-o",
          str(tmp_path / "out"), str(source)],

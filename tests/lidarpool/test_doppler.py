@@ -20,12 +20,12 @@ from lidarpool import (
     Track,
     load_sensor,
 )
-from lidarpool.scene.actors import Actor, box
-from lidarpool.scene.robot import Hinge, LinkPath
-from lidarpool.sensor.trajectory import Stations, quaternions_of, rotations_of, velocities
-from lidarpool.simulator.returns import AIR, FALSE_ALARM, PulseReturns
-from lidarpool.simulator.rig import Rig
-from lidarpool.simulator.separation import separated
+from lidarsim.scene.actors import Actor, box
+from lidarsim.scene.robot import Hinge, LinkPath
+from lidarsim.sensor.trajectory import Stations, quaternions_of, rotations_of, velocities
+from lidarsim.simulator.returns import AIR, FALSE_ALARM, PulseReturns
+from lidarsim.simulator.rig import Rig
+from lidarsim.simulator.separation import separated
 
 SPEED, RADIUS = 25.0, 50.0  # of the train
 RATE = SPEED / RADIUS

@@ -8,10 +8,10 @@ from tests.shapes import block, level
 
 from lidarpool import Scene
 from lidarpool.render.closeup import ShownPart, floor_and_cut
-from lidarpool.scene.actors import box
-from lidarpool.scene.generated.plants import SPECIES, placed, tree
-from lidarpool.scene.scene_mesh import Cutout, SceneMesh, triangle_areas
-from lidarpool.scene.simplified import PART_LEAST, Drawn, cut
+from lidarsim.scene.actors import box
+from lidarsim.scene.generated.plants import SPECIES, placed, tree
+from lidarsim.scene.scene_mesh import Cutout, SceneMesh, triangle_areas
+from lidarsim.scene.simplified import PART_LEAST, Drawn, cut
 from raybeam import RayCaster
 
 

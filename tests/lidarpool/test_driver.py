@@ -14,7 +14,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from lidarpool import Scene, Sensor, Survey
-from lidarpool.base.storage import Storage
 from lidarpool.pipeline import dispatch, driver, policies
 from lidarpool.pipeline import job_state as jobs
 from lidarpool.pipeline.database import RunDatabase
@@ -33,6 +32,7 @@ from lidarpool.pipeline.messages import (
 )
 from lidarpool.pipeline.placement import TaskRecord
 from lidarpool.pipeline.policies import LATE_S, SPAN, TASK_SECONDS, most_under_way
+from lidarsim.base.storage import Storage
 from poolpart.task_locations import TaskLocations
 
 SCANS = 60

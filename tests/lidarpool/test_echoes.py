@@ -26,7 +26,7 @@ from tests.shapes import (
 from lidarpool import (
     Actor,
     Beams,
-    LidarpoolError,
+    LidarError,
     Material,
     Noise,
     Pose,
@@ -37,14 +37,14 @@ from lidarpool import (
     Survey,
     Track,
 )
-from lidarpool.scene.actors import box as cuboid
-from lidarpool.scene.scene_mesh import SceneMesh
-from lidarpool.scene.shapes import seed_objects
-from lidarpool.sensor.materials import extinction, fresnel
-from lidarpool.sensor.noise import Purpose, raw
-from lidarpool.simulator.returns import PulseReturns
-from lidarpool.simulator.rig import Rig
-from lidarpool.simulator.separation import chosen, separated
+from lidarsim.scene.actors import box as cuboid
+from lidarsim.scene.scene_mesh import SceneMesh
+from lidarsim.scene.shapes import seed_objects
+from lidarsim.sensor.materials import extinction, fresnel
+from lidarsim.sensor.noise import Purpose, raw
+from lidarsim.simulator.returns import PulseReturns
+from lidarsim.simulator.rig import Rig
+from lidarsim.simulator.separation import chosen, separated
 
 # -- random numbers ------------------------------------------------------------------------------
 
@@ -291,7 +291,7 @@ def test_batches_and_chunks_leave_no_trace(options, path, per_turn, monkeypatch)
     whole = cast_between(rig, survey, [0, 28])
     assert len(whole[0]["x"]) > 200
     assert cast_between(rig, survey, [0, 1, 5, 14, 17, 28]) == whole
-    monkeypatch.setattr("lidarpool.simulator.pulses.CHUNK_RAYS", 100)
+    monkeypatch.setattr("lidarsim.simulator.pulses.CHUNK_RAYS", 100)
     assert cast_between(rig, survey, list(range(29))) == whole
 
 
@@ -335,5 +335,5 @@ def test_one_subray_without_noise_is_the_plain_ray():
     ],
 )
 def test_numbers_that_mean_nothing_are_refused(make, says):
-    with pytest.raises(LidarpoolError, match=says):
+    with pytest.raises(LidarError, match=says):
         make()

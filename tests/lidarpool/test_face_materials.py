@@ -15,7 +15,7 @@ from tests.shapes import ball, beam_along_x, block, level, quad, wall
 
 from lidarpool import (
     Actor,
-    LidarpoolError,
+    LidarError,
     Material,
     Noise,
     Scene,
@@ -28,16 +28,16 @@ from lidarpool import (
     save_cloud,
     simulate,
 )
-from lidarpool.columns.table import SCAN
 from lidarpool.scenario.build import build
 from lidarpool.scenario.scenario import Scenario
-from lidarpool.scene.actors import one_mesh
-from lidarpool.scene.face_materials import FaceMaterials
-from lidarpool.scene.scene_file import write_scene
-from lidarpool.scene.scene_mesh import Cutout
-from lidarpool.simulator.batch import columns_of
-from lidarpool.simulator.returns import BLOOMING
-from lidarpool.simulator.rig import Rig
+from lidarsim.columns.table import SCAN
+from lidarsim.scene.actors import one_mesh
+from lidarsim.scene.face_materials import FaceMaterials
+from lidarsim.scene.scene_file import write_scene
+from lidarsim.scene.scene_mesh import Cutout
+from lidarsim.simulator.batch import columns_of
+from lidarsim.simulator.returns import BLOOMING
+from lidarsim.simulator.rig import Rig
 from raybeam import available_backends, registry
 
 CPU = [name for name in ("numpy", "embree") if not available_backends()[name]]
@@ -168,18 +168,18 @@ def test_the_first_entry_that_fits_a_face_counts(house):
 )
 def test_entries_that_fit_nothing_are_refused(house, entries, message):
     scene = Scene.load(house, materials=True)
-    with pytest.raises(LidarpoolError, match=message):
+    with pytest.raises(LidarError, match=message):
         cloud_of(scene, survey(entries))
 
 
 def test_names_of_materials_are_unknown_without_being_asked_for(house):
     scene = Scene.load(house)
     assert scene.materials is None and scene.material_names == ()
-    with pytest.raises(LidarpoolError, match=r"'Glass', but no face .* No face has any"):
+    with pytest.raises(LidarError, match=r"'Glass', but no face .* No face has any"):
         cloud_of(scene, survey([Material(material="Glass"), Material("*")]))
-    with pytest.raises(LidarpoolError, match="for nothing: give objects"):
+    with pytest.raises(LidarError, match="for nothing: give objects"):
         Material()
-    with pytest.raises(LidarpoolError, match="material is ''"):
+    with pytest.raises(LidarError, match="material is ''"):
         Material(material="")
 
 
@@ -462,7 +462,7 @@ def test_materials_of_one_entry_are_one_surface():
     ranges = cloud_of(scene, options)["range"]
     assert ((ranges > 4) & (ranges < 6)).any() and (ranges > 13).any()
     half = [replace(leaves, objects=None, material="High"), Material("*")]
-    with pytest.raises(LidarpoolError, match="'Crown', material 'High' has a leaf_area_density"):
+    with pytest.raises(LidarError, match="'Crown', material 'High' has a leaf_area_density"):
         cloud_of(scene, replace(options, materials=half))
 
 

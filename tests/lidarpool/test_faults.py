@@ -15,7 +15,7 @@ from tests.shapes import block, wall
 from lidarpool import (
     Actor,
     Fault,
-    LidarpoolError,
+    LidarError,
     Mounted,
     Noise,
     Pose,
@@ -26,19 +26,19 @@ from lidarpool import (
     Track,
     load_sensor,
 )
-from lidarpool.columns.cloud import Cloud
 from lidarpool.datasets.job_table import JobRow
 from lidarpool.datasets.sweep_data import Sweep
 from lidarpool.export.boxes import Boxes
 from lidarpool.export.images import Image
 from lidarpool.export.ros import write_rosbag2
-from lidarpool.export.sweeps import Sweeps
 from lidarpool.export.webdataset import Pieces
 from lidarpool.scenario.build import build
 from lidarpool.scenario.campaign import CampaignSpec
 from lidarpool.scenario.scenario import Scenario
-from lidarpool.simulator.batch import columns_of
-from lidarpool.simulator.rig import Rig
+from lidarsim.columns.cloud import Cloud
+from lidarsim.simulator.batch import columns_of
+from lidarsim.simulator.rig import Rig
+from lidarsim.sweeps.sweeps import Sweeps
 
 LIDAR = load_sensor("velodyne/vlp16")  # 1808.4 firings a turn: sweeps do not repeat firings
 COLUMNS = ("time", "range", "intensity", "azimuth", "elevation", "ray", "object")
@@ -296,7 +296,7 @@ WRONG = {
 
 @pytest.mark.parametrize("words", WRONG)
 def test_what_does_not_fit_the_survey(words):
-    with pytest.raises(LidarpoolError, match=words) as caught:
+    with pytest.raises(LidarError, match=words) as caught:
         replace(STANDING, faults=[FAULTS["dirt"], WRONG[words]])
     assert str(caught.value).startswith("faults[1]: ")
 
@@ -330,9 +330,9 @@ PACKETS = {"share": 0.1, "packet": 9}
     ],
 )  # fmt: skip
 def test_what_is_no_fault(words, fields):
-    with pytest.raises(LidarpoolError, match=words):
+    with pytest.raises(LidarError, match=words):
         Scenario.from_data({"faults": [fields]})
-    with pytest.raises(LidarpoolError, match=words.partition(".*")[0]):
+    with pytest.raises(LidarError, match=words.partition(".*")[0]):
         Fault(**fields)
 
 

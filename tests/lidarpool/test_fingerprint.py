@@ -22,10 +22,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as npst
 
-from lidarpool import Beams, LidarpoolError, Sensor, Spin
+from lidarpool import Beams, LidarError, Sensor, Spin
 from lidarpool.base.fingerprint import fingerprint
 from lidarpool.base.software import PACKAGES, difference, software, sources
-from lidarpool.sensor import Head
+from lidarsim.sensor import Head
 from raybeam import available_backends
 
 Pair = namedtuple("Pair", "a b")
@@ -211,7 +211,7 @@ def test_another_process_finds_the_same():
 )
 def test_what_has_none_is_refused_by_name(thing, name):
     for outer in (thing, [thing], Box({"a": thing})):
-        with pytest.raises(LidarpoolError, match=f"of type {name} has no fingerprint.*keep num"):
+        with pytest.raises(LidarError, match=f"of type {name} has no fingerprint.*keep num"):
             fingerprint(outer)
 
 

@@ -10,12 +10,12 @@ import pytest
 import yaml
 from benchmarks.fit_coverage import PLACES, place, recorded, street, trial
 
-from lidarpool import LidarpoolError, Noise, Pose, Scanner, Sensor, fit, load_sensor
+from lidarpool import LidarError, Noise, Pose, Scanner, Sensor, fit, load_sensor
 from lidarpool.compare.recordings import Recording, open_recording
 from lidarpool.export.formats import Format
-from lidarpool.export.sweeps import Sweeps
-from lidarpool.scene.generated.city import city
-from lidarpool.sensor.models import read_model
+from lidarsim.scene.generated.city import city
+from lidarsim.sensor.models import read_model
+from lidarsim.sweeps.sweeps import Sweeps
 
 pytest.importorskip("scipy", reason="the extra fit is not installed")
 
@@ -58,7 +58,7 @@ def test_the_file_is_a_sensor_with_these_figures(fitted, tmp_path):
     assert "12 sweeps" in stated["sources"]["performance"]
     again = fitted.save(tmp_path / "again.yaml")
     assert [one.read_bytes() for one in again] == [one.read_bytes() for one in written]
-    with pytest.raises(LidarpoolError, match="no sensor file: give a name such as mine"):
+    with pytest.raises(LidarError, match="no sensor file: give a name such as mine"):
         fitted.save(tmp_path / "mine.json")
 
 
@@ -99,7 +99,7 @@ def test_bias_of_channels_against_planes_and_against_the_scene():
             assert abs(one["value"] - true) < max(one["high"] - one["low"], 0.002), row
     found = fit(made, scene=street()).figures["curves"]
     assert len(found["lost_by_range"]) > 3 and found["lost_by_range"][0]["value"] < 0.01
-    with pytest.raises(LidarpoolError, match="less than half of simulated is within"):
+    with pytest.raises(LidarError, match="less than half of simulated is within"):
         fit(made, scene=street(), pose=(3, 1, 0))
 
 
@@ -146,13 +146,13 @@ def test_a_sensor_that_moves_is_refused_with_its_speed(block):
     """26 m/s, 0.06 m a sweep, and a turn on the spot; most ranges of a street stay the same."""
     cases = (street(), 0.0, 1.3, 0.0), (block, 1.8, 1.3, 0.0), (block, 1.8, 0.06, 0.0)
     for scene, height_m, step_m, yaw_deg in cases:
-        with pytest.raises(LidarpoolError, match="is of a sensor that moves") as raised:
+        with pytest.raises(LidarError, match="is of a sensor that moves") as raised:
             fit(drive(scene, height_m, step_m, yaw_deg))
         told = str(raised.value)
         speed = float(told.partition("(")[2].partition(" m/s")[0])
         assert speed == pytest.approx(step_m / 0.05, rel=0.1), told
         assert len(told.splitlines()) == 1
-    with pytest.raises(LidarpoolError, match=r"moves, by .*2(.[01])?° from sweep to sweep"):
+    with pytest.raises(LidarError, match=r"moves, by .*2(.[01])?° from sweep to sweep"):
         fit(drive(block, 1.8, 0.0, 2.0))
 
 
@@ -178,7 +178,7 @@ def test_points_that_are_not_in_metres_are_refused(recording):
         points, columns, pose = recording.read(number)
         return points * 1000, columns, pose
 
-    with pytest.raises(LidarpoolError, match=r"ranges that change by .* give points in metres"):
+    with pytest.raises(LidarError, match=r"ranges that change by .* give points in metres"):
         fit(replace(recording, read=scaled))
 
 
@@ -260,7 +260,7 @@ def test_cut_and_mixed_recordings_are_told_in_a_line(recording, tmp_path):
         (replace(recording, thinned=True, notes=("one of 5 hits",)), "one of 5 hits"),
         (replace(recording, read=lambda k: (*recording.read(k)[:1], {}, None)), "has no rings"),
     ):
-        with pytest.raises(LidarpoolError, match=says) as raised:
+        with pytest.raises(LidarError, match=says) as raised:
             fit(made)
         assert len(str(raised.value).splitlines()) == 1
 
@@ -273,7 +273,7 @@ def test_broken_files_are_told_in_a_line(tmp_path, name):
     record = struct.pack("<IIII", 1, 0, 1248, 1248)
     content = {"empty.pcap": b"", "cut.pcap": head + record + frame, "text.osf": b"no scans"}
     (tmp_path / name).write_bytes(content[name])
-    with pytest.raises(LidarpoolError) as raised:
+    with pytest.raises(LidarError) as raised:
         fit(tmp_path / name)
     assert name in str(raised.value) and len(str(raised.value).splitlines()) == 1
 
@@ -303,7 +303,7 @@ def test_packets_of_a_velodyne_are_sweeps(tmp_path):
     frame = bytearray(frames[-1])
     frame[16 + 29] = 7  # the end of the sender's address
     (tmp_path / "room.pcap").write_bytes(b"".join([*frames, frame]))
-    with pytest.raises(LidarpoolError, match=r"2 units: keep one, tcpdump .* src 0\.0\.0\.0 and"):
+    with pytest.raises(LidarError, match=r"2 units: keep one, tcpdump .* src 0\.0\.0\.0 and"):
         open_recording(tmp_path / "room.pcap")
 
 

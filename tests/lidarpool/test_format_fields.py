@@ -21,7 +21,7 @@ from tests.shapes import level, room
 
 from lidarpool import (
     Fault,
-    LidarpoolError,
+    LidarError,
     Mounted,
     Pose,
     Returns,
@@ -32,15 +32,15 @@ from lidarpool import (
     read_cloud,
     save_cloud,
 )
-from lidarpool.base.yamlfile import load_yaml
-from lidarpool.columns.table import SCAN
 from lidarpool.export.formats import Format
-from lidarpool.export.sweeps import Sweeps
-from lidarpool.scene.generated.city import city
-from lidarpool.sensor.beams import Beams, Mirror
-from lidarpool.sensor.sensor import LineSensor
-from lidarpool.simulator.batch import columns_of
-from lidarpool.simulator.rig import Rig
+from lidarsim.base.yamlfile import load_yaml
+from lidarsim.columns.table import SCAN
+from lidarsim.scene.generated.city import city
+from lidarsim.sensor.beams import Beams, Mirror
+from lidarsim.sensor.sensor import LineSensor
+from lidarsim.simulator.batch import columns_of
+from lidarsim.simulator.rig import Rig
+from lidarsim.sweeps.sweeps import Sweeps
 
 COLUMNS = (
     "time", "intensity", "reflectivity", "reflectance", "signal", "range", "azimuth", "elevation",
@@ -345,7 +345,7 @@ def test_what_contradicts_a_frame_is_noted():
     for one in (Format("laz"), Format("kitti"), Format("mcap", compensated=True)):
         (note,) = one.contradictions("sensor")
         assert "cloud.coordinates" in note
-    with pytest.raises(LidarpoolError, match="option of pcd, mcap, rosbag2, not of kitti"):
+    with pytest.raises(LidarError, match="option of pcd, mcap, rosbag2, not of kitti"):
         Format("kitti", compensated=True)
 
 

@@ -28,7 +28,7 @@ from rosbags.typesys import Stores, get_typestore
 
 from lidarpool import (
     Cloud,
-    LidarpoolError,
+    LidarError,
     Mounted,
     Pose,
     Scene,
@@ -41,11 +41,7 @@ from lidarpool import (
     simulate,
 )
 from lidarpool.base.open3d_module import load_open3d
-from lidarpool.base.storage import Storage
-from lidarpool.base.yamlfile import load_yaml
-from lidarpool.columns.bags import point_columns
 from lidarpool.columns.cloud_file import CloudFile
-from lidarpool.columns.table import COLOURS, TABLE
 from lidarpool.export import las as las_module
 from lidarpool.export import parquet, pieces
 from lidarpool.export.boxes import Boxes
@@ -53,9 +49,13 @@ from lidarpool.export.format_table import EXPORTS, FORMATS, LAYOUTS
 from lidarpool.export.formats import Format
 from lidarpool.export.las import wkt
 from lidarpool.export.ros import START_NS
-from lidarpool.export.sweeps import Sweeps
-from lidarpool.scene.actors import Actor, box
-from lidarpool.sensor.trajectory import matrices
+from lidarsim.base.storage import Storage
+from lidarsim.base.yamlfile import load_yaml
+from lidarsim.columns.bags import point_columns
+from lidarsim.columns.table import COLOURS, TABLE
+from lidarsim.scene.actors import Actor, box
+from lidarsim.sensor.trajectory import matrices
+from lidarsim.sweeps.sweeps import Sweeps
 
 COLUMNS = ("time", "intensity", "reflectivity", "range", "azimuth", "elevation", "class",
            "return_number", "returns", "sensor", "ray", "signal")  # fmt: skip
@@ -394,20 +394,20 @@ def test_what_cannot_be_written_is_one_line_and_leaves_nothing(
     cloud, sweeps, tmp_path, monkeypatch
 ):
     bare = Cloud(cloud.positions, {name: cloud[name] for name in ("scan", "channel", "object")})
-    with pytest.raises(LidarpoolError, match=r"kitti needs reflectivity, class, .*output\.write"):
+    with pytest.raises(LidarError, match=r"kitti needs reflectivity, class, .*output\.write"):
         Format("kitti").write(tmp_path / "kitti", bare, sweeps)
-    with pytest.raises(LidarpoolError, match="mcap with the layout ouster needs signal, time"):
+    with pytest.raises(LidarError, match="mcap with the layout ouster needs signal, time"):
         Format("mcap", "ouster").write(tmp_path / "cloud.mcap", bare, sweeps)
     (tmp_path / "cloud.laz").write_text("mine")
-    with pytest.raises(LidarpoolError, match=r"exists: .* --overwrite"):
+    with pytest.raises(LidarError, match=r"exists: .* --overwrite"):
         Format("laz").write(tmp_path / "cloud.laz", cloud, sweeps)
     assert (tmp_path / "cloud.laz").read_text() == "mine"
     Format("laz").write(tmp_path / "cloud.laz", cloud, sweeps, overwrite=True)
     assert len(laspy.read(tmp_path / "cloud.laz")) == len(cloud)
-    with pytest.raises(LidarpoolError, match="gone does not exist: make it first"):
+    with pytest.raises(LidarError, match="gone does not exist: make it first"):
         Format("pcd").write(tmp_path / "gone/pcd", cloud, sweeps)
     monkeypatch.setattr("lidarpool.export.formats.find_spec", lambda name: None)
-    with pytest.raises(LidarpoolError, match=r'laspy and lazrs: pip install "lidarpool\[las\]"'):
+    with pytest.raises(LidarError, match=r'laspy and lazrs: pip install "lidarpool\[las\]"'):
         Format("las").check_installed()
     assert {path.name for path in tmp_path.iterdir()} == {"cloud.laz"}
 
@@ -420,7 +420,7 @@ def test_a_file_that_cannot_grow_is_one_line_and_leaves_nothing(cloud, sweeps, t
     one, before = Format(name), resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (2000, before[1]))  # as a full disk does
     try:
-        with pytest.raises(LidarpoolError, match="cannot be written") as told:
+        with pytest.raises(LidarError, match="cannot be written") as told:
             one.write(tmp_path / one.row.file, cloud, sweeps)
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, before)
@@ -502,10 +502,10 @@ def test_zones_of_utm_need_no_other_package(epsg, middle, north):
 def test_other_coordinate_systems_come_from_rasterio(monkeypatch):
     if las_module.find_spec("rasterio"):
         assert wkt(2056).startswith('PROJCS["CH1903+ / LV95"')
-        with pytest.raises(LidarpoolError, match="rasterio cannot write EPSG:1024 as WKT 1"):
+        with pytest.raises(LidarError, match="rasterio cannot write EPSG:1024 as WKT 1"):
             wkt(1024)
     monkeypatch.setattr(las_module, "find_spec", lambda name: None)
-    with pytest.raises(LidarpoolError, match=r"EPSG:2056 is not a UTM zone .*lidarpool\[geo\]"):
+    with pytest.raises(LidarError, match=r"EPSG:2056 is not a UTM zone .*lidarpool\[geo\]"):
         wkt(2056)
 
 
@@ -628,20 +628,18 @@ def test_a_cloud_is_saved_in_the_format_of_its_ending(cloud, sweeps, tmp_path):
         ("is a folder", "result", {"format": "laz"}),
         ("precision_m is -1; it must be a length in metres", "x.las", {"precision_m": -1}),
     ):
-        with pytest.raises(LidarpoolError, match=told):
+        with pytest.raises(LidarError, match=told):
             save_cloud(known, tmp_path / path, **more)
-    with pytest.raises(LidarpoolError, match="mcap stores single sweeps, but this cloud has none"):
+    with pytest.raises(LidarError, match="mcap stores single sweeps, but this cloud has none"):
         save_cloud(bare, tmp_path / "x.mcap")
-    with pytest.raises(
-        LidarpoolError, match="kitti needs scan, object, reflectivity, class, which"
-    ):
+    with pytest.raises(LidarError, match="kitti needs scan, object, reflectivity, class, which"):
         save_cloud(
             Cloud(cloud.positions, {}, sweeps=lambda: sweeps), tmp_path / "x", format="kitti"
         )
-    with pytest.raises(LidarpoolError, match="not in the order of their scans"):
+    with pytest.raises(LidarError, match="not in the order of their scans"):
         save_cloud(known[::-1], tmp_path / "x.e57")
     shorter = replace(sweeps, scans=sweeps.scans[:6], begins_ns=sweeps.begins_ns[:5])
-    with pytest.raises(LidarpoolError, match="or of another survey than the sweeps"):
+    with pytest.raises(LidarError, match="or of another survey than the sweeps"):
         save_cloud(replace(cloud, sweeps=lambda: shorter), tmp_path / "x.mcap")
     assert sorted(tmp_path.rglob("*")) == before
 
@@ -715,7 +713,7 @@ def test_a_cloud_becomes_a_dataframe_of_a_library(cloud, monkeypatch):
     frame = cloud.to_dataframe("polars")
     np.testing.assert_array_equal(frame["channel"], cloud.channel)
     monkeypatch.setitem(sys.modules, "pandas", None)  # as where it is not installed
-    with pytest.raises(LidarpoolError, match="Dataframes need pandas: pip install pandas"):
+    with pytest.raises(LidarError, match="Dataframes need pandas: pip install pandas"):
         cloud.to_dataframe()
 
 

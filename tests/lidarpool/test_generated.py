@@ -10,15 +10,15 @@ import trimesh
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from lidarpool import LidarpoolError
-from lidarpool.scene.generated.cars import MODELS, all_cars
-from lidarpool.scene.generated.city import city
-from lidarpool.scene.generated.city_kinds import all_kinds
-from lidarpool.scene.generated.plants import SCALES, SPECIES, tree
-from lidarpool.scene.generated.terrain import terrain
-from lidarpool.scene.scene_file import write_scene
-from lidarpool.scene.scene_mesh import triangle_areas
-from lidarpool.scene.shapes import SEED_POSITIONS, revolve, seed_objects
+from lidarpool import LidarError
+from lidarsim.scene.generated.cars import MODELS, all_cars
+from lidarsim.scene.generated.city import city
+from lidarsim.scene.generated.city_kinds import all_kinds
+from lidarsim.scene.generated.plants import SCALES, SPECIES, tree
+from lidarsim.scene.generated.terrain import terrain
+from lidarsim.scene.scene_file import write_scene
+from lidarsim.scene.scene_mesh import triangle_areas
+from lidarsim.scene.shapes import SEED_POSITIONS, revolve, seed_objects
 from raybeam import RayCaster
 
 TREES, CARS = [species.name for species in SPECIES], [model.name for model in MODELS]
@@ -101,15 +101,13 @@ def test_same_seed_same_trees_and_cars(tmp_path):
 
 @pytest.mark.parametrize("more", [{"trees": 5_000}, {"cars": 5_000}])
 def test_more_than_fit(more):
-    with pytest.raises(
-        LidarpoolError, match=r"city has room for \d+ (trees|cars), not 5,000: give"
-    ):
+    with pytest.raises(LidarError, match=r"city has room for \d+ (trees|cars), not 5,000: give"):
         city(20_000, **more)
 
 
 @pytest.mark.parametrize(("triangles", "seed"), [(0, 0), (999, 0), (10**9, 0), (10_000, -1)])
 def test_out_of_range(triangles, seed):
-    with pytest.raises(LidarpoolError, match=r"triangles is|seed is"):
+    with pytest.raises(LidarError, match=r"triangles is|seed is"):
         city(triangles, seed)
 
 
@@ -160,7 +158,7 @@ def test_trees_stand_on_ground_that_is_not_steep():
 
 @pytest.mark.parametrize(("side", "room"), [(30.0, "0"), (100.0, r"\d+")])
 def test_more_trees_than_fit(side, room):
-    with pytest.raises(LidarpoolError, match=rf"has room for {room} trees, not 900: make it"):
+    with pytest.raises(LidarError, match=rf"has room for {room} trees, not 900: make it"):
         terrain(20_000, 0, side, trees=900)
 
 
@@ -176,7 +174,7 @@ def test_more_trees_than_fit(side, room):
     ],
 )
 def test_terrains_out_of_range(wrong):
-    with pytest.raises(LidarpoolError):
+    with pytest.raises(LidarError):
         terrain(**{"triangles": 1000, **wrong})
 
 

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 from tests.shapes import CPU, beam_along_x, cast, level, made, quad, wall
 
-from lidarpool import Beams, LidarpoolError, Material, Noise, Returns, Scene, Sensor, Spin, Survey
-from lidarpool.columns.table import CAUSES
-from lidarpool.scene.colours import Colours
-from lidarpool.sensor.materials import WATER_INDEX, below_water, fresnel
+from lidarpool import Beams, LidarError, Material, Noise, Returns, Scene, Sensor, Spin, Survey
+from lidarsim.columns.table import CAUSES
+from lidarsim.scene.colours import Colours
+from lidarsim.sensor.materials import WATER_INDEX, below_water, fresnel
 
 COLUMNS = ("range", "reflectance", "class", "cause", "return_number")
 GHOST = CAUSES.index("ghost")
@@ -135,7 +135,7 @@ def test_ghosts_of_textures_take_what_the_colours_leave():
     ],
 )
 def test_bad_mirrors(values, message):
-    with pytest.raises(LidarpoolError, match=message):
+    with pytest.raises(LidarError, match=message):
         Material("*", **values)
 
 

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from tests.meshes import write
 
-from lidarpool.base.errors import LidarpoolError
-from lidarpool.scene.files.meshfile import load_meshes
+from lidarsim.base.errors import LidarError
+from lidarsim.scene.files.meshfile import load_meshes
 
 CORNERS = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]], "<f4").tobytes()
 
@@ -67,7 +67,7 @@ def test_a_node_with_several_parents_stands_in_each_also_below_a_camera(tmp_path
 def test_nodes_that_contain_each_other_end(tmp_path):
     header = triangle()
     header["nodes"] = [{"mesh": 0, "children": [1]}, {"children": [0]}]
-    with pytest.raises(LidarpoolError, match="contain each other"):
+    with pytest.raises(LidarError, match="contain each other"):
         load(tmp_path, header)
 
 
@@ -90,7 +90,7 @@ def test_a_node_scaled_to_nothing_is_skipped_and_said(tmp_path, caplog):
     assert [mesh.name for mesh in load_meshes(path)] == ["Sign"]
     assert "without an area, which are left out: Hidden" in caplog.text
     header["scenes"][0]["nodes"] = [1]
-    with pytest.raises(LidarpoolError, match="no triangle with an area"):
+    with pytest.raises(LidarError, match="no triangle with an area"):
         load(tmp_path, header)
 
 
@@ -197,7 +197,7 @@ def test_skins_are_bent_by_their_joints_as_they_stand(tmp_path):
         f"{path} has 1 animation, of 1 bent mesh: all stands still; actors move by animation: NAME"
     ]
     header["nodes"][3]["children"] = [2]
-    with pytest.raises(LidarpoolError, match="nodes contain each other"):
+    with pytest.raises(LidarError, match="nodes contain each other"):
         load(tmp_path, header, body)
 
 
@@ -218,7 +218,7 @@ def test_skins_are_bent_by_their_joints_as_they_stand(tmp_path):
 def test_what_cannot_be_read_says_what_it_is(tmp_path, edit, message):
     header = triangle()
     edit(header)
-    with pytest.raises(LidarpoolError, match=message):
+    with pytest.raises(LidarError, match=message):
         load(tmp_path, header)
 
 
@@ -238,10 +238,10 @@ def test_buffers_with_escaped_names_and_in_the_text(tmp_path):
     header["buffers"][0]["uri"] = "sub dir/50%.bin"
     write(path, json.dumps(header))
     write(buffer, CORNERS[:-1])
-    with pytest.raises(LidarpoolError, match=r"50%.*cut short: it has 35"):
+    with pytest.raises(LidarError, match=r"50%.*cut short: it has 35"):
         load_meshes(path)
     buffer.unlink()
-    with pytest.raises(LidarpoolError, match=r"50%.*not there"):
+    with pytest.raises(LidarError, match=r"50%.*not there"):
         load_meshes(path)
 
 
@@ -255,5 +255,5 @@ def test_only_files_beside_are_read(tmp_path, uri):
     (tmp_path / "inner" / "l").symlink_to(tmp_path / "a.bin")
     header = triangle()
     header["buffers"][0]["uri"] = uri
-    with pytest.raises(LidarpoolError, match=r"only files in its own folder|not there"):
+    with pytest.raises(LidarError, match=r"only files in its own folder|not there"):
         load_meshes(write(tmp_path / "inner" / "m.gltf", json.dumps(header)))

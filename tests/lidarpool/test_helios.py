@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
-from lidarpool import LidarpoolError
+from lidarpool import LidarError
 from lidarpool.cli.scenario_commands import import_
 from lidarpool.importers.helios import import_survey
 from lidarpool.scenario.build import build
-from lidarpool.sensor.materials import MaterialTable
-from lidarpool.simulator.rig import Rig
+from lidarsim.sensor.materials import MaterialTable
+from lidarsim.simulator.rig import Rig
 from raybeam import RayCaster
 
 X, Y, Z = np.eye(3)
@@ -396,7 +396,7 @@ def test_columns_of_a_trajectory_are_known_or_refused(imported, names, words):
         '<scannerSettings pulseFreq_hz="1000" scanAngle_deg="20"/></leg>'
     )
     rows = "".join(f"{t},0,0,90,{10 * t},2,30\n" for t in (5, 6, 7))
-    with pytest.raises(LidarpoolError, match=words):
+    with pytest.raises(LidarError, match=words):
         imported(
             scanner("conic", "", scanAngleMax_deg=20, scanFreqMax_Hz=10),
             inside,
@@ -560,7 +560,7 @@ def test_mistakes_are_told_in_a_line_and_nothing_is_written(survey, tmp_path, ch
     for file in (path, path.parents[1] / "devices.xml"):
         text = file.read_text()
         file.write_text(text.replace(*change))
-    with pytest.raises(LidarpoolError, match=message) as told:
+    with pytest.raises(LidarError, match=message) as told:
         import_survey(path, tmp_path / "out")
     assert str(told.value).startswith(str(path)) and "\n" not in str(told.value)
     assert [entry.name for entry in tmp_path.iterdir()] == ["helios"]

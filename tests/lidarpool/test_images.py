@@ -16,7 +16,7 @@ from tests.shapes import Cart
 
 from lidarpool import (
     Beams,
-    LidarpoolError,
+    LidarError,
     Mounted,
     Noise,
     Pose,
@@ -26,20 +26,20 @@ from lidarpool import (
     Survey,
     load_sensor,
 )
-from lidarpool.base.yamlfile import load_yaml
-from lidarpool.columns.table import SCAN
 from lidarpool.export.formats import Format
-from lidarpool.export.sweeps import Sweeps
 from lidarpool.scenario.build import build
 from lidarpool.scenario.scenario import Scenario
-from lidarpool.scene.generated.city import city
-from lidarpool.sensor.beams import Mirror
-from lidarpool.sensor.models import model_names, read_model
-from lidarpool.sensor.plain_data import described, remade
-from lidarpool.sensor.ray_sensors import ListedSensor
-from lidarpool.sensor.sensor import LineSensor
-from lidarpool.simulator.batch import columns_of
-from lidarpool.simulator.rig import Rig
+from lidarsim.base.yamlfile import load_yaml
+from lidarsim.columns.table import SCAN
+from lidarsim.scene.generated.city import city
+from lidarsim.sensor.beams import Mirror
+from lidarsim.sensor.models import model_names, read_model
+from lidarsim.sensor.plain_data import described, remade
+from lidarsim.sensor.ray_sensors import ListedSensor
+from lidarsim.sensor.sensor import LineSensor
+from lidarsim.simulator.batch import columns_of
+from lidarsim.simulator.rig import Rig
+from lidarsim.sweeps.sweeps import Sweeps
 
 COLUMNS = ("ray", "range", "time", "azimuth", "elevation", "intensity", "class", "return_number")
 SCENE = city(4_000)
@@ -226,15 +226,15 @@ class Upward(Sensor):
 def test_what_cannot_be_an_image_says_so(tmp_path):
     thinned = replace(SURVEYS["still"], keep_every=2)
     cloud = cloud_of(thinned)
-    with pytest.raises(LidarpoolError, match="keep_every 1 and the column ray"):
+    with pytest.raises(LidarError, match="keep_every 1 and the column ray"):
         Format("images").write(tmp_path / "i", cloud, Sweeps.of(thinned, SCENE))
     own = replace(SURVEYS["still"], sensor=Upward(GRID.beams, GRID.head), trajectory=None)
     cloud, sweeps = cloud_of(own), Sweeps.of(own, SCENE)
     Format("images").write(tmp_path / "own", cloud, sweeps)
     sweeps.save(tmp_path / "sweeps.npz")
-    with pytest.raises(LidarpoolError, match="of your own they are written with the run only"):
+    with pytest.raises(LidarError, match="of your own they are written with the run only"):
         Format("images").write(tmp_path / "i", cloud, Sweeps.load(tmp_path / "sweeps.npz"))
-    with pytest.raises(LidarpoolError, match="needs ray, range, which the cloud lacks"):
+    with pytest.raises(LidarError, match="needs ray, range, which the cloud lacks"):
         Cloud = type(cloud)  # noqa: N806
         bare = Cloud(cloud.positions, {"scan": cloud.scan, "channel": cloud.channel})
         Format("images").write(tmp_path / "i", bare, sweeps)
@@ -249,7 +249,7 @@ def test_a_scenario_keeps_every_return(entry):
     thinned = Scenario.from_data(
         load_yaml(f"{{output: {{write: [{entry}]}}, cloud: {{keep_every: 5}}}}")
     )
-    with pytest.raises(LidarpoolError, match=r"keep_every is 5: set cloud\.keep_every to 1"):
+    with pytest.raises(LidarError, match=r"keep_every is 5: set cloud\.keep_every to 1"):
         build(thinned)
 
 

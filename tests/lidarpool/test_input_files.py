@@ -12,18 +12,18 @@ import pytest
 import trimesh
 
 from lidarpool import compare, load_robot, load_sensor, load_trajectory, read_cloud
-from lidarpool.base.errors import LidarpoolError
-from lidarpool.base.input_files import open_input, read_input, read_input_text
-from lidarpool.base.storage import Storage
-from lidarpool.base.yamlfile import read_yaml
 from lidarpool.importers.helios import import_survey
 from lidarpool.scenario.build import build
 from lidarpool.scenario.campaign import CampaignSpec
+from lidarpool.scenario.point_scene import SUFFIXES as CLOUDS
+from lidarpool.scenario.point_scene import scene_of_points
 from lidarpool.scenario.scenario import Scenario
-from lidarpool.scene.files.meshfile import CONVERTED, load_meshes
-from lidarpool.scene.files.meshfile import SUFFIXES as MESHES
-from lidarpool.scene.point_scene import SUFFIXES as CLOUDS
-from lidarpool.scene.point_scene import scene_of_points
+from lidarsim.base.errors import LidarError
+from lidarsim.base.input_files import open_input, read_input, read_input_text
+from lidarsim.base.storage import Storage
+from lidarsim.base.yamlfile import read_yaml
+from lidarsim.scene.files.meshfile import CONVERTED, load_meshes
+from lidarsim.scene.files.meshfile import SUFFIXES as MESHES
 
 RECORDINGS = (".ply", ".pcd", ".las", ".laz", ".mcap", ".pcap", ".osf")
 TABLES = (".csv", ".tum", ".txt")
@@ -77,7 +77,7 @@ def kitti_beside(path):
 
 def refused(read, path):
     """Return the message with which reading ends."""
-    with pytest.raises(LidarpoolError) as caught:
+    with pytest.raises(LidarError) as caught:
         read(path)
     message = str(caught.value)
     assert message.count("\n") <= 1 and len(message) < 500 + 2 * len(str(path)), message

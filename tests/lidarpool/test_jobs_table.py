@@ -11,9 +11,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from lidarpool import Cloud, LidarpoolError
-from lidarpool.base.storage import Storage
+from lidarpool import Cloud, LidarError
 from lidarpool.datasets.job_table import JobRow, Tally, read_table, write_table
+from lidarsim.base.storage import Storage
 
 DONE = JobRow(
     7, "0007", "train", {"weather.rain": 2, "sensors.roof.model": "vlp16", "night": True},
@@ -101,20 +101,20 @@ def test_no_cell_of_text_is_a_formula_for_spreadsheets(tmp_path, text):
 def test_a_table_is_whole_or_not_there(tmp_path):
     def broken():
         yield DONE
-        raise LidarpoolError("the database cannot be read")
+        raise LidarError("the database cannot be read")
 
-    with pytest.raises(LidarpoolError, match="database"):
+    with pytest.raises(LidarError, match="database"):
         write_table(Storage.at(tmp_path), NAMES, broken)
     assert list(tmp_path.iterdir()) == []
 
 
 def test_what_does_not_fit_is_refused(tmp_path):
     place = Storage.at(tmp_path)
-    with pytest.raises(LidarpoolError, match=r"0007 has a value 'night'.*weather.rain"):
+    with pytest.raises(LidarError, match=r"0007 has a value 'night'.*weather.rain"):
         write_table(place, NAMES[:2], lambda: [DONE])
-    with pytest.raises(LidarpoolError, match=r"\[1\], a list"):
+    with pytest.raises(LidarError, match=r"\[1\], a list"):
         write_table(place, ["a"], lambda: [JobRow(0, "0", values={"a": [1]})])
-    with pytest.raises(LidarpoolError, match="cannot be written"):
+    with pytest.raises(LidarError, match="cannot be written"):
         write_table(Storage.at("/proc/none"), [], list)
 
 
@@ -134,7 +134,7 @@ def test_damaged_tables_are_refused(tmp_path, text):
     head = "number,name,split,error,scans,sweeps,rays,hits,points,seconds,sha256\n"
     data = text.replace("HEAD", head).encode("utf-8", "surrogatepass")
     (tmp_path / "jobs.csv").write_bytes(data)
-    with pytest.raises(LidarpoolError, match=r"jobs\.csv is damaged near line \d"):
+    with pytest.raises(LidarError, match=r"jobs\.csv is damaged near line \d"):
         list(read_table(Storage.at(tmp_path)))
 
 
@@ -143,12 +143,12 @@ def test_a_table_with_other_columns_is_refused(tmp_path, column):
     head = "number,name,split,error,scans,sweeps,rays,hits,points,seconds,sha256"
     row = "0,a,,,1,1,1,1,1,0.0,,3"
     (tmp_path / "jobs.csv").write_text(f"{head},{column}\n{row}\n")
-    with pytest.raises(LidarpoolError, match=r"damaged near line 1 .*(not known|twice)"):
+    with pytest.raises(LidarError, match=r"damaged near line 1 .*(not known|twice)"):
         list(read_table(Storage.at(tmp_path)))
 
 
 def test_a_missing_table_is_named(place):
-    with pytest.raises(LidarpoolError, match=r"jobs\.csv cannot be read.*--resume"):
+    with pytest.raises(LidarError, match=r"jobs\.csv cannot be read.*--resume"):
         list(read_table(place))
 
 

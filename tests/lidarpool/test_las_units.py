@@ -7,11 +7,11 @@ import pytest
 from click.testing import CliRunner
 
 from lidarpool import compare
-from lidarpool.base.errors import LidarpoolError
 from lidarpool.cli.scenario_commands import scene as command
-from lidarpool.scene.files import las_units
-from lidarpool.scene.point_scene import scene_of_points
-from lidarpool.scene.scene import Scene
+from lidarpool.scenario.point_scene import scene_of_points
+from lidarsim.base.errors import LidarError
+from lidarsim.scene.files import las_units
+from lidarsim.scene.scene import Scene
 
 laspy = pytest.importorskip("laspy", reason="laspy is an extra")
 
@@ -171,9 +171,9 @@ def test_what_cannot_be_known_is_refused_unless_the_unit_is_given(
 ):
     monkeypatch.setattr(las_units, "find_spec", lambda name: None)
     path = written(tmp_path / "a.las", PLACE / FOOT, records)
-    with pytest.raises(LidarpoolError, match=message):
+    with pytest.raises(LidarError, match=message):
         scene_of_points(path)
-    with pytest.raises(LidarpoolError, match=message):
+    with pytest.raises(LidarError, match=message):
         compare(path, path)
     low, _ = scene_of_points(path, voxel_m=0.01, unit="ft").bounds
     np.testing.assert_allclose(low, PLACE.min(axis=0), atol=0.1)
@@ -193,7 +193,7 @@ def test_equal_numbers_of_feet_and_metres_are_apart(tmp_path):
 
 def test_what_is_in_metres_has_no_unit_to_give(tmp_path):
     (tmp_path / "a.mcap").write_bytes(b"0")
-    with pytest.raises(LidarpoolError, match=r"a\.mcap is in metres: leave out its unit, 'ft'"):
+    with pytest.raises(LidarError, match=r"a\.mcap is in metres: leave out its unit, 'ft'"):
         compare(tmp_path / "a.mcap", tmp_path / "a.mcap", unit_a="ft")
 
 

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 from tests.shapes import wall
 
-from lidarpool import LidarpoolError, Mounted, Noise, Scene, Sensor, Survey, Track, load_sensor
+from lidarpool import LidarError, Mounted, Noise, Scene, Sensor, Survey, Track, load_sensor
 from lidarpool.scenario.build import build
 from lidarpool.scenario.scenario import Scenario
-from lidarpool.simulator.batch import columns_of
-from lidarpool.simulator.rig import Rig
+from lidarsim.simulator.batch import columns_of
+from lidarsim.simulator.rig import Rig
 
 CHANNELS, TURNS = 100, 4
 SENSOR = Sensor.grid(40, CHANNELS, 20, step_deg=90, horizontal_fov_deg=40)
@@ -102,11 +102,11 @@ def test_batches_and_backends_do_not_matter():
 
 
 def test_what_does_not_fit():
-    with pytest.raises(LidarpoolError, match=r"has 2 numbers; .* needs 100"):
+    with pytest.raises(LidarError, match=r"has 2 numbers; .* needs 100"):
         replace(SURVEY, noise=Noise(channel_bias_m=[0.1, 0.2]))
-    with pytest.raises(LidarpoolError, match="needs a head that turns, unlike Livox"):
+    with pytest.raises(LidarError, match="needs a head that turns, unlike Livox"):
         Survey(load_sensor("livox/mid70"), poses=[(0, 0, 0)], noise=Noise(ripple_deg=0.1))
-    with pytest.raises(LidarpoolError, match="channel_bias_m is 'x'; it must be a number of 0 to"):
+    with pytest.raises(LidarError, match="channel_bias_m is 'x'; it must be a number of 0 to"):
         Scenario.from_data({"noise": {"channel_bias_m": "x"}})
 
 

@@ -19,7 +19,6 @@ from tests.shapes import box
 
 from lidarpool import Campaign, Column, Job, Planning, Scene, Sensor, Survey
 from lidarpool.columns.ply_format import header, row_type
-from lidarpool.columns.table import CHANNEL, OBJECT, SCAN
 from lidarpool.datasets.job_table import JobRow
 from lidarpool.live.live_page import (
     ENDED_MOST,
@@ -37,6 +36,7 @@ from lidarpool.run.options import RunOptions
 from lidarpool.run.progress import Progress, Screen
 from lidarpool.run.run_page import JobNow
 from lidarpool.run.store import RunStore
+from lidarsim.columns.table import CHANNEL, OBJECT, SCAN
 from poolpart import PartitionStats
 
 LONG_S = 120.0

@@ -11,14 +11,14 @@ from PIL import Image
 from tests.lidarpool.test_gltf import glb
 from tests.meshes import write
 
-from lidarpool import LidarpoolError, Pose, Scanner, Scene
-from lidarpool.base import allowance
-from lidarpool.scene.actors import Actor
-from lidarpool.scene.files.meshfile import load_meshes
-from lidarpool.scene.scene_file import write_scene
-from lidarpool.scene.scene_instances import SceneInstance
-from lidarpool.scene.scene_mesh import Cutout, SceneMesh
-from lidarpool.sensor import Sensor
+from lidarpool import LidarError, Pose, Scanner, Scene
+from lidarsim.base import allowance
+from lidarsim.scene.actors import Actor
+from lidarsim.scene.files.meshfile import load_meshes
+from lidarsim.scene.scene_file import write_scene
+from lidarsim.scene.scene_instances import SceneInstance
+from lidarsim.scene.scene_mesh import Cutout, SceneMesh
+from lidarsim.sensor import Sensor
 
 BACKENDS = ["numpy", "embree"]
 # No row or column is another's, reversed or not.
@@ -205,11 +205,11 @@ def test_copies_of_a_node(tmp_path):
     np.testing.assert_allclose(bounds[2], [[10, -4, 96], [10, 4, 104]], atol=1e-6)
 
     header["accessors"][3]["count"] = 2
-    with pytest.raises(LidarpoolError, match=r"have \[2, 3, 3\] rows"):
+    with pytest.raises(LidarError, match=r"have \[2, 3, 3\] rows"):
         load(path, header, body)
     for accessor in header["accessors"][3:]:
         accessor["count"] = 1_000_000
-    with pytest.raises(LidarpoolError, match="places a mesh 1,000,000 times by EXT_mesh_gpu"):
+    with pytest.raises(LidarError, match="places a mesh 1,000,000 times by EXT_mesh_gpu"):
         load(path, header, body)
 
 
@@ -451,5 +451,5 @@ def test_a_scenario_ignores_masks_if_told(tmp_path):
         write(path, json.dumps({"scene": {"files": [{"file": "m.glb", "opacity": opacity}]}}))
         assert build(Scenario.load(path)).scene.masked == masked
     write(path, json.dumps({"scene": {"files": [{"file": "m.glb", "opacity": "glass"}]}}))
-    with pytest.raises(LidarpoolError, match="opacity"):
+    with pytest.raises(LidarError, match="opacity"):
         Scenario.load(path)

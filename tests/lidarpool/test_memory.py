@@ -27,11 +27,11 @@ from lidarpool import (
     Track,
     load_sensor,
 )
-from lidarpool.scene.colours import Colours
-from lidarpool.sensor.survey import OPTIONAL_NAMES
-from lidarpool.simulator.batch import columns_of
-from lidarpool.simulator.memory import TRIANGLE, cast_bytes, scans_that_fit
-from lidarpool.simulator.rig import Rig
+from lidarsim.scene.colours import Colours
+from lidarsim.sensor.survey import OPTIONAL_NAMES
+from lidarsim.simulator.batch import columns_of
+from lidarsim.simulator.memory import TRIANGLE, cast_bytes, scans_that_fit
+from lidarsim.simulator.rig import Rig
 
 RAYS = 600_000
 

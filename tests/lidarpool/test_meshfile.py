@@ -9,11 +9,11 @@ import pytest
 import trimesh
 from tests.meshes import PLY, write
 
-from lidarpool.base.errors import LidarpoolError
-from lidarpool.scene.files import usd
-from lidarpool.scene.files.meshfile import SUFFIXES, load_meshes
-from lidarpool.scene.scene import Scene
-from lidarpool.scene.transform import Transform
+from lidarsim.base.errors import LidarError
+from lidarsim.scene.files import usd
+from lidarsim.scene.files.meshfile import SUFFIXES, load_meshes
+from lidarsim.scene.scene import Scene
+from lidarsim.scene.transform import Transform
 
 OBJ = """# two objects
 o Box
@@ -115,7 +115,7 @@ def test_a_binary_stl_with_a_few_bytes_more_or_a_wrong_number(tmp_path):
     assert len(load_meshes(path)[0].faces) == 12
     for number in (0, 5, 13):
         write(path, content[:80] + struct.pack("<I", number) + content[84:])
-        with pytest.raises(LidarpoolError, match=f"announces {number} triangles and has 12"):
+        with pytest.raises(LidarError, match=f"announces {number} triangles and has 12"):
             load_meshes(path)
 
 
@@ -130,14 +130,14 @@ def test_a_binary_stl_with_a_few_bytes_more_or_a_wrong_number(tmp_path):
     ],
 )
 def test_what_is_no_mesh_is_recognised(tmp_path, content, message):
-    with pytest.raises(LidarpoolError, match=message):
+    with pytest.raises(LidarError, match=message):
         load_meshes(write(tmp_path / "m.obj", content))
 
 
 def test_a_scene_farther_than_anything_on_earth(tmp_path):
     path = write(tmp_path / "m.obj", OBJ.format(x=0, x1=2e5))
     assert len(load_meshes(path)) == 2
-    with pytest.raises(LidarpoolError, match=r"Object 'Box' reaches 2e\+08 m from the origin"):
+    with pytest.raises(LidarError, match=r"Object 'Box' reaches 2e\+08 m from the origin"):
         load_meshes(path, unit="km")
 
 
@@ -175,7 +175,7 @@ def test_cuts_and_damage_end_in_meshes_or_in_one_clear_line(tmp_path, two_object
     for broken in [*cut, *(damaged(content, rng) for _ in range(40))]:
         try:
             meshes = load_meshes(write(path, broken))
-        except LidarpoolError as error:
+        except LidarError as error:
             refused.append(broken)
             assert str(error).startswith(str(path))
             assert str(error).isprintable() and len(str(error)) < 400 + len(str(path))
@@ -226,7 +226,7 @@ def test_cuts_and_damage_end_in_meshes_or_in_one_clear_line(tmp_path, two_object
 )
 def test_bad_files(tmp_path, name, content, message):
     path = write(tmp_path / name, content)
-    with pytest.raises(LidarpoolError, match=message) as caught:
+    with pytest.raises(LidarError, match=message) as caught:
         load_meshes(path)
     assert str(path) in str(caught.value)
     assert len(str(caught.value)) < 400 + len(str(path)) and str(caught.value).isprintable()
@@ -234,13 +234,13 @@ def test_bad_files(tmp_path, name, content, message):
 
 def test_missing_and_folders(tmp_path):
     (tmp_path / "d.glb").mkdir()
-    with pytest.raises(LidarpoolError, match="does not exist"):
+    with pytest.raises(LidarError, match="does not exist"):
         load_meshes(tmp_path / "no.glb")
-    with pytest.raises(LidarpoolError, match="cannot be read: Is a directory"):
+    with pytest.raises(LidarError, match="cannot be read: Is a directory"):
         load_meshes(tmp_path / "d.glb")
 
 
 def test_without_the_library_of_openusd_the_error_says_what_to_install(tmp_path, monkeypatch):
     monkeypatch.setattr(usd, "find_spec", lambda name: None)
-    with pytest.raises(LidarpoolError, match=r'pip install "lidarpool\[usd\]"\.$'):
+    with pytest.raises(LidarError, match=r'pip install "lidarpool\[usd\]"\.$'):
         load_meshes(write(tmp_path / "m.usda", "#usda 1.0\n"))

@@ -8,9 +8,9 @@ from fractions import Fraction
 import numpy as np
 import pytest
 
-from lidarpool import LidarpoolError
-from lidarpool.sensor.models import load_sensor, model_names, read_model
-from lidarpool.sensor.ray_sensors import ListedSensor, Prism, PrismSensor
+from lidarpool import LidarError
+from lidarsim.sensor.models import load_sensor, model_names, read_model
+from lidarsim.sensor.ray_sensors import ListedSensor, Prism, PrismSensor
 
 READY = [name for name in model_names() if not read_model(name).needs_calibration]
 
@@ -148,7 +148,7 @@ def test_a_livox_fires_where_the_list_of_its_maker_says(name, rows):
 
 
 def test_a_prism_that_reflects_all_light_is_refused():
-    with pytest.raises(LidarpoolError, match="A prism reflects light back"):
+    with pytest.raises(LidarError, match="A prism reflects light back"):
         PrismSensor(prisms=(Prism(60, 1.9, 7),))
 
 
@@ -237,7 +237,7 @@ def test_beams_of_ouster_that_are_turned_are_refused(tmp_path):
         "beam_azimuth_angles": [4.0, 0.0],
         "beam_to_lidar_transform": mirrored,
     }
-    with pytest.raises(LidarpoolError, match="beam_to_lidar_transform turns the beams"):
+    with pytest.raises(LidarError, match="beam_to_lidar_transform turns the beams"):
         load_sensor(calibration=write(tmp_path, "os.json", json.dumps(data)))
 
 
@@ -404,7 +404,7 @@ def test_bad_files_are_refused_in_one_line(tmp_path, file, text, message):
     path = tmp_path / file
     path.write_bytes(text if isinstance(text, bytes) else text.encode())
     given = {"model": path} if file.endswith(".yaml") else {"calibration": path}
-    with pytest.raises(LidarpoolError, match=message) as caught:
+    with pytest.raises(LidarError, match=message) as caught:
         load_sensor(**given)
     assert file in str(caught.value) and "\n" not in str(caught.value)
 
@@ -426,5 +426,5 @@ def test_what_does_not_fit_together(tmp_path, options, message):
     write(tmp_path, "rays.csv", LIVOX + "0,1,2\n1e-5,1,2\n")
     if "calibration" in options:
         options = options | {"calibration": tmp_path / options["calibration"]}
-    with pytest.raises(LidarpoolError, match=message):
+    with pytest.raises(LidarError, match=message):
         load_sensor(**options)

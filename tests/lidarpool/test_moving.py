@@ -9,23 +9,13 @@ import pytest
 from tests.rows import quick
 from tests.shapes import level, made, quad
 
-from lidarpool import (
-    LidarpoolError,
-    Material,
-    Mounted,
-    Noise,
-    Pose,
-    Scene,
-    Survey,
-    Track,
-    load_sensor,
-)
-from lidarpool.base.vectors import into_axes
+from lidarpool import LidarError, Material, Mounted, Noise, Pose, Scene, Survey, Track, load_sensor
 from lidarpool.run.job_source import identity_of
 from lidarpool.scenario.build import Job
-from lidarpool.scene.actors import Actor, box
-from lidarpool.sensor.optics import Returns
-from lidarpool.simulator.rig import Rig
+from lidarsim.base.vectors import into_axes
+from lidarsim.scene.actors import Actor, box
+from lidarsim.sensor.optics import Returns
+from lidarsim.simulator.rig import Rig
 from raybeam import moving_loops
 
 WALL_M = 8.0
@@ -209,7 +199,7 @@ def test_no_ray_meets_an_actor_that_is_not_asked_about_it(street, monkeypatch, n
 
 def test_an_actor_must_be_there_as_long_as_the_survey_lasts(street):
     scene = replace(street, actors=(CAR,))
-    with pytest.raises(LidarpoolError, match=r"Actor 'Car': .* 0\.19\d* s outside"):
+    with pytest.raises(LidarError, match=r"Actor 'Car': .* 0\.19\d* s outside"):
         Job(scene, Survey(poses=[(0, 0, 1)] * 7))
     assert (
         identity_of(Job(scene, Survey(poses=[(0, 0, 1)])))["scene"]

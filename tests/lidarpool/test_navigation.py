@@ -14,7 +14,7 @@ from lidarpool import (
     Cloud,
     Gnss,
     Imu,
-    LidarpoolError,
+    LidarError,
     Mounted,
     Navigation,
     Pose,
@@ -25,14 +25,14 @@ from lidarpool import (
     load_sensor,
 )
 from lidarpool.export.formats import Format
-from lidarpool.export.instruments import GNSS_FILE, IMU_FILE, Instruments
 from lidarpool.export.navigation_files import instrument_bytes, write_instruments
-from lidarpool.export.sweeps import Sweeps
 from lidarpool.scenario.build import Job, build
 from lidarpool.scenario.campaign import CampaignSpec
 from lidarpool.scenario.scenario import Scenario
-from lidarpool.sensor.navigation import fixes, geodetic, imu_samples
-from lidarpool.sensor.trajectory import Stations, matrices
+from lidarsim.sensor.navigation import fixes, geodetic, imu_samples
+from lidarsim.sensor.trajectory import Stations, matrices
+from lidarsim.sweeps.instruments import GNSS_FILE, IMU_FILE, Instruments
+from lidarsim.sweeps.sweeps import Sweeps
 
 GRAVITY = 9.80665
 
@@ -199,7 +199,7 @@ def test_without_an_imu_outages_have_no_positions():
     seconds = np.arange(81) / 2
     out = ((seconds >= 10) & (seconds < 25)) | ((seconds >= 30) & (seconds < 31))
     assert np.array_equal(times, (seconds[~out] * 1e9).astype(int))
-    with pytest.raises(LidarpoolError, match="least, largest"):
+    with pytest.raises(LidarError, match="least, largest"):
         Gnss(outages=[(25, 10)])
 
 
@@ -394,16 +394,16 @@ def test_scenarios(tmp_path):
 
 
 def test_what_does_not_fit():
-    with pytest.raises(LidarpoolError, match="jumps between 2 poses"):
+    with pytest.raises(LidarError, match="jumps between 2 poses"):
         Survey(Sensor.grid(), poses=[(0, 0, 1), (1, 0, 1)], navigation=Navigation(imu=Imu()))
     survey = Survey(poses=[(0, 0, 1)], navigation=Navigation(imu=Imu()))
-    with pytest.raises(LidarpoolError, match="single surveys"):
+    with pytest.raises(LidarError, match="single surveys"):
         CampaignSpec(lambda number, rng: Job(Scene.seed(), survey), 1).job(0)
-    with pytest.raises(LidarpoolError, match="rate_hz is 0"):
+    with pytest.raises(LidarError, match="rate_hz is 0"):
         Imu(rate_hz=0)
-    with pytest.raises(LidarpoolError, match=r"origin\[0\] is 100; it must be at most 90"):
+    with pytest.raises(LidarError, match=r"origin\[0\] is 100; it must be at most 90"):
         Gnss(origin=(100, 9, 0))
-    with pytest.raises(LidarpoolError, match="gyroscope_noise_density is -1"):
+    with pytest.raises(LidarError, match="gyroscope_noise_density is -1"):
         Imu(gyroscope_noise_density=-1)
     assert not [*imu_samples(SimpleNamespace(navigation=None, path=None, duration_ns=1e9))]
     assert len([*itertools.islice(fixes(standing(1, imu=Imu())), 1)]) == 0

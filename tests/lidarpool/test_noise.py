@@ -26,11 +26,11 @@ from lidarpool import (
     Survey,
     Track,
 )
-from lidarpool.sensor.navigation import fixes, imu_samples
-from lidarpool.sensor.noise import Purpose, named_seed, raw, starts
-from lidarpool.sensor.weather import Weather, rain, snow
-from lidarpool.simulator import pulse_loops
-from lidarpool.simulator.rig import Rig
+from lidarsim.sensor.navigation import fixes, imu_samples
+from lidarsim.sensor.noise import Purpose, named_seed, raw, starts
+from lidarsim.sensor.weather import Weather, rain, snow
+from lidarsim.simulator import pulse_loops
+from lidarsim.simulator.rig import Rig
 from raybeam.compiled import compiled
 
 SENSOR = Sensor.grid(60, 8, step_deg=90, min_range_m=0.5, max_range_m=60)

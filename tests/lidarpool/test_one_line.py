@@ -37,8 +37,8 @@ from lidarpool import (
     Track,
     load_sensor,
 )
-from lidarpool.columns.table import TABLE
-from lidarpool.sensor.trajectory import Stations
+from lidarsim.columns.table import TABLE
+from lidarsim.sensor.trajectory import Stations
 
 SENSOR = load_sensor("velodyne/vlp16")
 MESH = SceneMesh("hall", np.eye(300, 3), np.arange(300).reshape(100, 3))
@@ -91,7 +91,7 @@ def test_it_is_one_line(thing):
 
 def test_every_public_class_is_among_them():
     # A result and a comparison are printed as tables; robot, scan and sweep have their tests.
-    elsewhere = {"Result", "Comparison", "Fit", "Robot", "ScanSpec", "Sweep", "LidarpoolError"}
+    elsewhere = {"Result", "Comparison", "Fit", "Robot", "ScanSpec", "Sweep", "LidarError"}
     public = {n for n in lidarpool.__all__ if isinstance(getattr(lidarpool, n), type)}
     parts = {"Imu", "Gnss"}  # of Navigation
     assert (

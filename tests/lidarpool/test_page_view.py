@@ -11,12 +11,9 @@ import numpy as np
 import pytest
 import trimesh
 
-from lidarpool import LidarpoolError, Planning, Pose, Scene, Sensor, Survey, Track
-from lidarpool.columns.cloud import Cloud
+from lidarpool import LidarError, Planning, Pose, Scene, Sensor, Survey, Track
 from lidarpool.columns.cloud_file import CloudFile
 from lidarpool.columns.ply_format import header, row_type
-from lidarpool.columns.table import CHANNEL, OBJECT, SCAN, TABLE, Column
-from lidarpool.export.sweeps import SWEEPS_FILE, Sweeps
 from lidarpool.live import point_selection as points
 from lidarpool.live.point_selection import (
     TILES,
@@ -40,8 +37,11 @@ from lidarpool.live.view import (
 from lidarpool.plan import Plan
 from lidarpool.render.colouring import colours_of as colouring_of
 from lidarpool.run.picture_file import PICTURE_FILE, PictureContent, SensorWay
-from lidarpool.scene.actors import Actor, box
-from lidarpool.scene.colours import Colours, as_bytes
+from lidarsim.columns.cloud import Cloud
+from lidarsim.columns.table import CHANNEL, OBJECT, SCAN, TABLE, Column
+from lidarsim.scene.actors import Actor, box
+from lidarsim.scene.colours import Colours, as_bytes
+from lidarsim.sweeps.sweeps import SWEEPS_FILE, Sweeps
 
 POSES = 25
 NOWHERE = np.zeros((0, 3), np.float32)
@@ -92,7 +92,7 @@ def test_what_is_no_result_is_refused(tmp_path):
         (tmp_path / "cut.ply").write_bytes(b"ply\n")
         (tmp_path / "run" / "run").mkdir(parents=True, exist_ok=True)
         (tmp_path / "run" / "run" / "run.db").touch()
-        with pytest.raises(LidarpoolError, match=words):
+        with pytest.raises(LidarError, match=words):
             show_view(open_result(tmp_path / name), port=0, browser=False)
 
 
@@ -303,7 +303,7 @@ def test_results_of_unlike_sweeps_are_not_played_and_those_in_sensor_axes_are_re
     unlike = [result_in(tmp_path / name, of) for name, of in (("a", spun), ("b", later))]
     assert open_results(unlike).sweeps is None
     in_axes = result_in(tmp_path / "c", replace(spun, coordinates="sensor"))
-    with pytest.raises(LidarpoolError, match=r"c has points in the axes of its sensors"):
+    with pytest.raises(LidarError, match=r"c has points in the axes of its sensors"):
         open_results([unlike[0], in_axes])
 
 
@@ -338,7 +338,7 @@ def test_what_cannot_be_written_is_told(tmp_path, spun, monkeypatch):
     held = View(HeldPoints(Cloud(np.zeros((1, 3)), {})))
     assert not told(held, "state")[0]["exports"], "of a run, some parts are read"
     monkeypatch.undo()
-    missing = Mock(side_effect=LidarpoolError("it needs laspy"))
+    missing = Mock(side_effect=LidarError("it needs laspy"))
     monkeypatch.setattr("lidarpool.live.view.save_cloud", missing)
     assert told(view, "export", format="las")[0] == {"error": "it needs laspy"}
 

@@ -9,9 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from lidarpool import Cloud, LidarpoolError
-from lidarpool.base.storage import Storage
-from lidarpool.columns.part_columns import PartColumns, positions_of
+from lidarpool import Cloud, LidarError
 from lidarpool.columns.parts import (
     StoredCloud,
     mark_name,
@@ -24,7 +22,9 @@ from lidarpool.columns.parts import (
     scans_of,
     unpack,
 )
-from lidarpool.columns.table import OPTIONAL, stored
+from lidarsim.base.storage import Storage
+from lidarsim.columns.part_columns import PartColumns, positions_of
+from lidarsim.columns.table import OPTIONAL, stored
 
 COLUMNS = stored(OPTIONAL)
 ORIGIN = np.array([500_000.0, 5_400_000.0, 300.0])
@@ -74,7 +74,7 @@ def test_damage_at_any_place_is_noticed_or_changes_nothing():
         damaged[place] ^= flip
         try:
             assert pack(unpack(bytes(damaged))) == data, (place, flip)
-        except LidarpoolError as error:
+        except LidarError as error:
             noticed += 1
             assert str(error).startswith("it is damaged (")
     assert noticed > len(data) / 3
@@ -83,7 +83,7 @@ def test_damage_at_any_place_is_noticed_or_changes_nothing():
 def test_a_cut_part_is_noticed_wherever_it_was_cut():
     data = bytes(pack(SMALL))
     for length in range(len(data)):
-        with pytest.raises(LidarpoolError, match="it is damaged"):
+        with pytest.raises(LidarError, match="it is damaged"):
             unpack(data[:length])
 
 
@@ -111,7 +111,7 @@ def test_arrays_that_do_not_fit_together(arrays):
         content = {name: archive[name] for name in archive.files} | arrays
     memory = io.BytesIO()
     np.savez(memory, **{name: array for name, array in content.items() if array is not None})
-    with pytest.raises(LidarpoolError, match="it is damaged"):
+    with pytest.raises(LidarError, match="it is damaged"):
         unpack(memory.getvalue())
 
 
@@ -128,12 +128,10 @@ def storage(request, tmp_path):
 
 @pytest.mark.parametrize("read", [read_part, read_tally])
 def test_a_part_that_cannot_be_read_is_named(storage, read):
-    with pytest.raises(LidarpoolError, match=r"The part .*none\.npz cannot be"):
+    with pytest.raises(LidarError, match=r"The part .*none\.npz cannot be"):
         read(storage, "none.npz")
     storage.write("cut.npz", bytes(pack(SMALL))[:-30])
-    with pytest.raises(
-        LidarpoolError, match=r"The part .*cut\.npz cannot be used.*Resuming .* casts"
-    ):
+    with pytest.raises(LidarError, match=r"The part .*cut\.npz cannot be used.*Resuming .* casts"):
         read(storage, "cut.npz")
 
 

@@ -18,19 +18,19 @@ from lidarpool.scenario.build import build
 from lidarpool.scenario.placing import place, poses_around
 from lidarpool.scenario.plausibility import implausibilities
 from lidarpool.scenario.scenario import Scenario
-from lidarpool.scene.floor import room_at
-from lidarpool.scene.generated.city import city
-from lidarpool.scene.generated.plants import SPECIES, tree
-from lidarpool.scene.generated.terrain import terrain
-from lidarpool.scene.scene import Scene
-from lidarpool.scene.scene_file import write_scene
-from lidarpool.scene.scene_instances import SceneInstance
-from lidarpool.scene.scene_mesh import SceneMesh
-from lidarpool.scene.surroundings import Surroundings, in_the_way
-from lidarpool.scene.transform import Transform
-from lidarpool.sensor import Mounted, Sensor, Survey
-from lidarpool.sensor.models import load_sensor
-from lidarpool.simulator.rig import Rig
+from lidarsim.scene.floor import room_at
+from lidarsim.scene.generated.city import city
+from lidarsim.scene.generated.plants import SPECIES, tree
+from lidarsim.scene.generated.terrain import terrain
+from lidarsim.scene.scene import Scene
+from lidarsim.scene.scene_file import write_scene
+from lidarsim.scene.scene_instances import SceneInstance
+from lidarsim.scene.scene_mesh import SceneMesh
+from lidarsim.scene.surroundings import Surroundings, in_the_way
+from lidarsim.scene.transform import Transform
+from lidarsim.sensor import Mounted, Sensor, Survey
+from lidarsim.sensor.models import load_sensor
+from lidarsim.simulator.rig import Rig
 
 GRID = Mounted(Sensor.grid())
 

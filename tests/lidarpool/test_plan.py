@@ -14,9 +14,9 @@ import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
-from lidarpool.base.errors import LidarpoolError
 from lidarpool.plan import Planning, Trial, best, run_trial, shortest_path_length
 from lidarpool.plan.geometry import clearance, segment_distances
+from lidarsim.base.errors import LidarError
 
 SEED_SCENE = [(-20, -20), (20, -20), (-20, 20), (20, 20), (-10, -5), (5, 5)]
 DEFAULT = Planning((25, 25), (-30, -20), SEED_SCENE, 2.0)
@@ -147,7 +147,7 @@ def test_where_no_path_is_free_the_plan_says_so():
     plan = best([trial_of(0, CROSSES), trial_of(1, GRAZES)], ONE_DISC)
     assert (plan.trial, plan.collision_free) == (1, False)
     assert plan.clearance == pytest.approx(-0.5)
-    with pytest.raises(LidarpoolError, match="No planning trial was finished"):
+    with pytest.raises(LidarError, match="No planning trial was finished"):
         best([], ONE_DISC)
 
 
@@ -189,7 +189,7 @@ BAD = {
 
 @pytest.mark.parametrize(("fields", "message"), BAD.values(), ids=BAD.keys())
 def test_bad_values_are_named(fields, message):
-    with pytest.raises(LidarpoolError, match=message) as error:
+    with pytest.raises(LidarError, match=message) as error:
         Planning(**fields)
     assert len(str(error.value).splitlines()) <= 2
 

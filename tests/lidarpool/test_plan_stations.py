@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from tests.shapes import block, wall
 
-from lidarpool import LidarpoolError, Scene, SceneMesh, Sensor
+from lidarpool import LidarError, Scene, SceneMesh, Sensor
 from lidarpool.plan.stations import plan_stations
-from lidarpool.scene.actors import box
+from lidarsim.scene.actors import box
 
 EVERYWHERE = Sensor.grid(vertical_fov_deg=180)
 
@@ -140,5 +140,5 @@ def test_stations_are_in_world_coordinates_and_stand_on_pavements():
 )
 def test_what_cannot_be_is_refused(given, says):
     given = {"scene": Scene.from_meshes(rooms()), "sensor": EVERYWHERE, **given}
-    with pytest.raises(LidarpoolError, match=says):
+    with pytest.raises(LidarError, match=says):
         plan_stations(**given)

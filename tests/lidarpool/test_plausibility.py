@@ -15,11 +15,11 @@ from lidarpool.scenario.build import build
 from lidarpool.scenario.campaign import CampaignSpec, is_campaign
 from lidarpool.scenario.plausibility import implausibilities
 from lidarpool.scenario.scenario import Scenario
-from lidarpool.scene.generated.city import city
-from lidarpool.scene.paint import painted
-from lidarpool.scene.scene import Scene
-from lidarpool.scene.scene_file import write_scene
-from lidarpool.scene.scene_mesh import SceneMesh
+from lidarsim.scene.generated.city import city
+from lidarsim.scene.paint import painted
+from lidarsim.scene.scene import Scene
+from lidarsim.scene.scene_file import write_scene
+from lidarsim.scene.scene_mesh import SceneMesh
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 CITY = {"city-drive", "crossing", "crossing-night", "drive"}

@@ -13,7 +13,7 @@ import pytest
 
 from lidarpool import (
     Cloud,
-    LidarpoolError,
+    LidarError,
     Mounted,
     Planning,
     Pose,
@@ -23,16 +23,16 @@ from lidarpool import (
     Track,
     save_cloud,
 )
-from lidarpool.base.storage import Storage
 from lidarpool.cli.commands import cli
-from lidarpool.columns.table import Column
 from lidarpool.plan import best
 from lidarpool.plan.trial import run_trial
 from lidarpool.render.picture_page import Page
 from lidarpool.run.picture_file import PICTURE_FILE, PictureContent, SensorWay, sensor_ways
-from lidarpool.scene.actors import Actor, box
-from lidarpool.scene.scene_mesh import SceneMesh
-from lidarpool.scene.shapes import seed_objects
+from lidarsim.base.storage import Storage
+from lidarsim.columns.table import Column
+from lidarsim.scene.actors import Actor, box
+from lidarsim.scene.scene_mesh import SceneMesh
+from lidarsim.scene.shapes import seed_objects
 
 SMALL = ("--size", "480x480")
 NAMES = ("Kübel\x00", "a\udc80", "")  # as files may have them
@@ -152,7 +152,7 @@ def changed(data: bytes, **arrays: Any) -> bytes:
 def test_a_damaged_file_is_refused(damage, said, result):
     file = result / PICTURE_FILE
     file.write_bytes(damage(file.read_bytes()))
-    with pytest.raises(LidarpoolError, match=said) as caught:
+    with pytest.raises(LidarError, match=said) as caught:
         plot(result, "--only", "scene")
     assert str(file) in str(caught.value) and "\n" not in str(caught.value)
 
@@ -173,7 +173,7 @@ def test_the_cloud_is_coloured_by_any_of_its_columns(unplanned, tmp_path, monkey
     assert [figure.axes[0].get_ylabel() for figure in figures[:2]] == ["z (m)", "wetness (%)"]
     keys = [[t.get_text() for t in figure.legends[0].get_texts()] for figure in figures[2:]]
     assert [key[0] for key in keys] == ["a\ufffd", "channel 0"]
-    with pytest.raises(LidarpoolError, match=r"no column 'wettness'\. Did you mean 'wetness'"):
+    with pytest.raises(LidarError, match=r"no column 'wettness'\. Did you mean 'wetness'"):
         plot(result, "--only", "cloud", "--colour", "wettness")
 
 
@@ -188,13 +188,13 @@ def test_pictures_that_there_are_not(coordinates, pictures, left_out, unplanned,
     result = make(tmp_path / "result", replace(unplanned, coordinates=coordinates))
     plot(result, *SMALL, "--out", tmp_path / "out")
     assert names(tmp_path / "out") == pictures
-    with pytest.raises(LidarpoolError, match=f"no picture '{left_out}'"):
+    with pytest.raises(LidarError, match=f"no picture '{left_out}'"):
         plot(result, "--only", left_out)
 
 
 def test_a_result_in_storage(result, tmp_path):
     url = f"memory://{tmp_path.name}/result"
-    with pytest.raises(LidarpoolError, match=f"^{url} has no complete result, which has a report"):
+    with pytest.raises(LidarError, match=f"^{url} has no complete result, which has a report"):
         plot(url, "--only", "path")
     for name in ("cloud.ply", PICTURE_FILE):
         Storage.at(url).put(result / name, name)
@@ -207,17 +207,15 @@ def test_a_result_in_storage(result, tmp_path):
 @pytest.mark.parametrize("size", ["big", "480", "480x", "0x0", "479x480", "9000x9000", "1000x480"])
 def test_sizes_that_cannot_be(size, result):
     words = "is not a picture size.*such as 1600x1000|cannot be .* pixels: .*such as 1600 x 1000"
-    with pytest.raises((click.UsageError, LidarpoolError), match=words):
+    with pytest.raises((click.UsageError, LidarError), match=words):
         plot(result, "--size", size)
 
 
 def test_folders_that_cannot_be_used(result, tmp_path):
-    with pytest.raises(
-        LidarpoolError, match=r"none holds no pictures\.npz.*give the folder of a f"
-    ):
+    with pytest.raises(LidarError, match=r"none holds no pictures\.npz.*give the folder of a f"):
         plot(tmp_path / "none")
     (tmp_path / "file").write_text("")
-    with pytest.raises(LidarpoolError, match=r"file.below cannot be made"):
+    with pytest.raises(LidarError, match=r"file.below cannot be made"):
         plot(result, "--out", tmp_path / "file" / "below")
 
 
@@ -235,7 +233,7 @@ def test_intensity_and_true_colour_are_drawn(unplanned, tmp_path):
     columns = dict.fromkeys(("scan", "channel", "object"), zeros)
     columns |= {"intensity": zeros + 1.0, "red": byte, "green": byte}
     save_cloud(Cloud(at, columns), result / "cloud.ply")
-    with pytest.raises(LidarpoolError, match="no column 'rgb'"):
+    with pytest.raises(LidarError, match="no column 'rgb'"):
         plot(result, "--only", "cloud", "--colour", "rgb", *SMALL)
     save_cloud(Cloud(at, columns | {"blue": byte}), result / "cloud.ply")
     plot(result, "--only", "intensity", "--only", "cloud", "--colour", "rgb", *SMALL)

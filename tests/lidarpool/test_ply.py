@@ -14,13 +14,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as npst
 
-from lidarpool.base.errors import LidarpoolError
 from lidarpool.base.open3d_module import load_open3d
-from lidarpool.columns.cloud import Cloud
-from lidarpool.columns.table import Column
 from lidarpool.export import ply
 from lidarpool.export.formats import save_cloud
 from lidarpool.export.ply import read_cloud
+from lidarsim.base.errors import LidarError
+from lidarsim.columns.cloud import Cloud
+from lidarsim.columns.table import Column
 
 
 def sample(count, *, offset=0.0, seed=1):
@@ -100,7 +100,7 @@ def test_columns_of_every_type_come_back(tmp_path):
 
 def test_a_number_that_a_file_cannot_hold_is_refused(tmp_path):
     cloud = Cloud(np.zeros((1, 3)), {"time": np.array([2**53 + 1])})
-    with pytest.raises(LidarpoolError, match="'time' holds 9007199254740993, and a PLY file holds"):
+    with pytest.raises(LidarError, match="'time' holds 9007199254740993, and a PLY file holds"):
         save_cloud(cloud, tmp_path / "c.ply")
     assert list(tmp_path.iterdir()) == []
 
@@ -124,10 +124,10 @@ def test_a_faulty_write_leaves_the_earlier_result(tmp_path, monkeypatch, fault):
 
     monkeypatch.setattr(ply, "_write_open3d", faulty)
     expected = {
-        "cut": (LidarpoolError, "could not be written"),
-        "fewer": (LidarpoolError, "999 of 1,000 points"),
+        "cut": (LidarError, "could not be written"),
+        "fewer": (LidarError, "999 of 1,000 points"),
         "interrupted": (KeyboardInterrupt, None),
-        "no space": (LidarpoolError, "No space left"),
+        "no space": (LidarError, "No space left"),
     }
     kind, message = expected[fault]
     with pytest.raises(kind, match=message):
@@ -142,13 +142,13 @@ def test_a_disk_without_room_is_told_the_size_of_the_file(tmp_path, monkeypatch,
     path, free = tmp_path / "c.ply", 0
     usage = shutil.disk_usage(tmp_path)
     monkeypatch.setattr(shutil, "disk_usage", lambda _: usage._replace(free=free))
-    with pytest.raises(LidarpoolError, match="could not be written: it takes") as caught:
+    with pytest.raises(LidarError, match="could not be written: it takes") as caught:
         save_cloud(sample(count), path)
     numbers = re.search(r"takes ([\d,]+) bytes, and ([\d,]+) beside it", str(caught.value))
     size, piece = (int(number.replace(",", "")) for number in numbers.groups())
     assert piece == min(count, 300) * (3 * 4 + 4 + 2 + 4)
     free = size + piece - 1
-    with pytest.raises(LidarpoolError, match=f"the disk has {free:,} bytes free"):
+    with pytest.raises(LidarError, match=f"the disk has {free:,} bytes free"):
         save_cloud(sample(count), path)
     assert not any(tmp_path.iterdir())
     free += 1
@@ -183,18 +183,18 @@ def test_reading_what_is_not_a_cloud(tmp_path):
     for name, (content, message) in cases.items():
         path = tmp_path / f"{name}.ply"
         path.write_bytes(content)
-        with pytest.raises(LidarpoolError, match=message):
+        with pytest.raises(LidarError, match=message):
             read_cloud(path)
-    with pytest.raises(LidarpoolError, match="No such file"):
+    with pytest.raises(LidarError, match="No such file"):
         read_cloud(tmp_path / "missing.ply")
-    with pytest.raises(LidarpoolError, match="cannot be read"):
+    with pytest.raises(LidarError, match="cannot be read"):
         read_cloud(tmp_path)
 
 
 @pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="needs named pipes")
 def test_a_pipe_is_refused_instead_of_waited_for(tmp_path):
     os.mkfifo(tmp_path / "cloud.ply")
-    with pytest.raises(LidarpoolError, match="it is a pipe"):
+    with pytest.raises(LidarError, match="it is a pipe"):
         read_cloud(tmp_path / "cloud.ply")
 
 
@@ -218,5 +218,5 @@ def test_what_it_lacks(monkeypatch, name):
     for module in ("open3d", "open3d.pybind"):
         monkeypatch.delitem(sys.modules, module, raising=False)
     monkeypatch.setitem(sys.modules, name, None)
-    with pytest.raises(LidarpoolError, match=r"does not load .*pip install open3d-cpu"):
+    with pytest.raises(LidarError, match=r"does not load .*pip install open3d-cpu"):
         load_open3d()

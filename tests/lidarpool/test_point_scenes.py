@@ -5,11 +5,11 @@ import pytest
 from click.testing import CliRunner
 
 from lidarpool import Cloud, Noise, Pose, Scanner, Scene, load_sensor, save_cloud
-from lidarpool.base.errors import LidarpoolError
 from lidarpool.base.open3d_module import load_open3d
 from lidarpool.cli.scenario_commands import scene as command
-from lidarpool.scene.point_scene import scene_of_points
-from lidarpool.scene.scene_file import write_scene
+from lidarpool.scenario.point_scene import scene_of_points
+from lidarsim.base.errors import LidarError
+from lidarsim.scene.scene_file import write_scene
 
 GRID = np.mgrid[0:4:40j, 0:3:30j].reshape(2, -1).T
 FAR = (500_000.0, 5_000_000.0, 100.0)
@@ -84,7 +84,7 @@ def test_far_clouds_keep_their_digits(tmp_path):
         again = Scene.load(write_scene(tmp_path / name, scene))
         difference = again.vertices + again.origin - (scene.vertices + scene.origin)
         assert np.abs(difference).max() < 1e-6
-    with pytest.raises(LidarpoolError, match=r"steps of 0.5 m .* write a .glb or .obj"):
+    with pytest.raises(LidarError, match=r"steps of 0.5 m .* write a .glb or .obj"):
         write_scene(tmp_path / "b.ply", scene)
 
 
@@ -101,7 +101,7 @@ def test_cut_files_are_refused(tmp_path, name):
     data = path.read_bytes()
     for share in (0, 0.01, 0.5, 0.98):
         path.write_bytes(data[: int(share * len(data))])
-        with pytest.raises(LidarpoolError, match=r"cut short"):
+        with pytest.raises(LidarError, match=r"cut short"):
             scene_of_points(path)
 
 
@@ -122,14 +122,14 @@ def test_what_is_wrong_is_said(tmp_path, name, text, words):
     path = tmp_path / name
     if text is not None:
         path.write_text(text)
-    with pytest.raises(LidarpoolError, match=words):
+    with pytest.raises(LidarError, match=words):
         scene_of_points(path)
 
 
 def test_too_many_points_are_refused(tmp_path, monkeypatch):
     path = written(tmp_path / "a.ply", plane())
-    monkeypatch.setattr("lidarpool.scene.point_scene.memory", lambda: 1_000_000)
-    with pytest.raises(LidarpoolError, match=r"1,200 surfels, .* larger voxel_m than 0.01"):
+    monkeypatch.setattr("lidarpool.scenario.point_scene.memory", lambda: 1_000_000)
+    with pytest.raises(LidarError, match=r"1,200 surfels, .* larger voxel_m than 0.01"):
         scene_of_points(path, voxel_m=0.01)
     assert len(scene_of_points(path, voxel_m=0.3).faces) < 2 * 500
 
@@ -139,7 +139,7 @@ def test_a_huge_number_of_records_is_refused_at_once(tmp_path):
     data = bytearray(path.read_bytes())
     data[100:104] = b"\xff\xff\xff\x7f"
     path.write_bytes(data)
-    with pytest.raises(LidarpoolError, match="its header is wrong"):
+    with pytest.raises(LidarError, match="its header is wrong"):
         scene_of_points(path)
 
 
@@ -148,9 +148,9 @@ def test_the_command(tmp_path):
     arguments = ["points", str(path), str(out)]
     CliRunner().invoke(command, [*arguments, "--voxel-m", "0.001"], catch_exceptions=False)
     assert Scene.load(out).triangles == 2 * len(GRID)
-    with pytest.raises(LidarpoolError, match="exists"):
+    with pytest.raises(LidarError, match="exists"):
         CliRunner().invoke(command, arguments, catch_exceptions=False)
-    with pytest.raises(LidarpoolError, match=r"size is -1.0"):
+    with pytest.raises(LidarError, match=r"size is -1.0"):
         arguments += ["--size", "-1", "--overwrite"]
         CliRunner().invoke(command, arguments, catch_exceptions=False)
 

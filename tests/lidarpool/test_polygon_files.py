@@ -13,9 +13,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from tests.meshes import PLY, write
 
-from lidarpool.base.errors import LidarpoolError
-from lidarpool.scene.files.meshfile import load_meshes
-from lidarpool.scene.files.polygons import MOST_CORNERS, triangulated, with_holes
+from lidarsim.base.errors import LidarError
+from lidarsim.scene.files.meshfile import load_meshes
+from lidarsim.scene.files.polygons import MOST_CORNERS, triangulated, with_holes
 
 CORNERS = np.array([[0, 0, 0], [2, 0, 0], [2, 2, 0], [0, 2, 0], [1, 1, 3]], dtype=float)
 ROOF = [[0, 3, 2, 1], [0, 1, 4], [1, 2, 4], [2, 3, 4], [3, 0, 4]]  # a square under four triangles
@@ -73,14 +73,14 @@ def test_a_cut_ply_of_mixed_faces_is_refused(tmp_path, order):
     content = ply_roof(order, after="texcoord").rstrip(b"\n")
     # Of the last number in a text, "0.25", a part may be missing that nobody misses.
     for cut in range(1 if order else 4, len(content), 3):
-        with pytest.raises(LidarpoolError):
+        with pytest.raises(LidarError):
             load_meshes(write(tmp_path / "roof.ply", content[:-cut]))
 
 
 def test_more_bytes_than_a_ply_announces(tmp_path):
     path = write(tmp_path / "roof.ply", ply_roof("<") + b"\n\0")
     assert len(load_meshes(path)[0].faces) == 6
-    with pytest.raises(LidarpoolError, match="4 bytes more than announced"):
+    with pytest.raises(LidarError, match="4 bytes more than announced"):
         load_meshes(write(path, ply_roof("<") + b"more"))
 
 
@@ -93,7 +93,7 @@ def test_a_list_of_negative_length_is_not_the_rest_of_the_file(tmp_path, kind, f
     lists[face] = (np.array(-1, length), lists[face][1])
     header = ply_roof("<").partition(b"end_header\n")[0].replace(b"uchar", kind.encode())
     body = CORNERS.tobytes() + b"".join(part.tobytes() for row in lists for part in row)
-    with pytest.raises(LidarpoolError, match="broken"):
+    with pytest.raises(LidarError, match="broken"):
         load_meshes(write(path, header + b"end_header\n" + body))
 
 

@@ -10,15 +10,15 @@ from click.testing import CliRunner
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from lidarpool.base.errors import LidarpoolError
 from lidarpool.cli.commands import cli
 from lidarpool.scenario.advice import advice
 from lidarpool.scenario.build import build
 from lidarpool.scenario.scenario import Scenario
-from lidarpool.scene.files import rasters
-from lidarpool.scene.files.meshfile import load_meshes, load_objects
-from lidarpool.sensor import Sensor
-from lidarpool.simulator.scanner import Scanner
+from lidarsim.base.errors import LidarError
+from lidarsim.scene.files import rasters
+from lidarsim.scene.files.meshfile import load_meshes, load_objects
+from lidarsim.sensor import Sensor
+from lidarsim.simulator.scanner import Scanner
 
 pytestmark = pytest.mark.skipif(find_spec("rasterio") is None, reason="needs rasterio, an extra")
 if find_spec("rasterio") is not None:
@@ -75,7 +75,7 @@ def upward_area(mesh):
 
 def test_without_the_library_the_error_says_what_to_install(tmp_path, monkeypatch):
     monkeypatch.setattr(rasters, "find_spec", lambda name: None)
-    with pytest.raises(LidarpoolError, match=r'pip install "lidarpool\[geo\]"\.$'):
+    with pytest.raises(LidarError, match=r'pip install "lidarpool\[geo\]"\.$'):
         load_meshes(write(tmp_path / "m.tif"))
 
 
@@ -118,7 +118,7 @@ def test_pixels_without_height_are_holes(tmp_path):
     mask[2, 2] = 0
     mesh, *_ = read(write(tmp_path / "mask.tif", SLOPE.astype(np.int16), mask=mask))
     assert len(mesh.faces) == 2 * (35 - 4)
-    with pytest.raises(LidarpoolError, match="no cell of four pixels with heights"):
+    with pytest.raises(LidarError, match="no cell of four pixels with heights"):
         read(write(tmp_path / "none.tif", np.full((4, 4), 7.0), nodata=7))
     for low in (-32768, -9999):
         *_, notes = read(write(tmp_path / "untold.tif", np.where(SLOPE == 3, low, SLOPE)))
@@ -173,12 +173,12 @@ def test_degrees_become_metres_of_the_utm_zone(tmp_path):
     column, row = (longitude + 58.5) * 1200, (-34.5 - latitude) * 1200
     np.testing.assert_allclose(z, 3 * (column - 0.5) - 2 * (row - 0.5), atol=0.3)
     wide = write(tmp_path / "wide.tif", crs="EPSG:4326", place=from_origin(-10, 50, 5, 1))
-    with pytest.raises(LidarpoolError, match=r"spans 40 degrees.*give cloud\.epsg"):
+    with pytest.raises(LidarError, match=r"spans 40 degrees.*give cloud\.epsg"):
         read(wide)
     assert read(wide, epsg=3035)[1].epsg == 3035
-    with pytest.raises(LidarpoolError, match="EPSG:1024, a code that rasterio does not know"):
+    with pytest.raises(LidarError, match="EPSG:1024, a code that rasterio does not know"):
         read(wide, epsg=1024)
-    with pytest.raises(LidarpoolError, match=r"EPSG:2263 \(.*not in metres"):
+    with pytest.raises(LidarError, match=r"EPSG:2263 \(.*not in metres"):
         read(wide, epsg=2263)
 
 
@@ -213,9 +213,9 @@ def test_a_coarser_grid_has_means_without_holes_of_the_finer(tmp_path):
     assert cut.bounds[:, :2].tolist() == [[X0 + 22.5, Y0 - 57.5], [X0 + 57.5, Y0 - 22.5]]
     x, _, z = read(write(path, np.tile(np.arange(40.0), (40, 1))), step_m=7)[0].vertices.T
     np.testing.assert_allclose(z, (x - X0 - 1) / 2, atol=0.1)  # at the edge, too
-    with pytest.raises(LidarpoolError, match="has pixels of 2 m: step_m must not be less"):
+    with pytest.raises(LidarError, match="has pixels of 2 m: step_m must not be less"):
         read(path, step_m=1)
-    with pytest.raises(LidarpoolError, match=r"reaches from x 500,000 to 500,080 and from y 5,"):
+    with pytest.raises(LidarError, match=r"reaches from x 500,000 to 500,080 and from y 5,"):
         read(path, window=(0, 0, 10, 10))
 
 
@@ -226,7 +226,7 @@ def inside(place, window):
 def test_too_large_ones_are_refused_with_what_fits(tmp_path, monkeypatch):
     path = write(tmp_path / "m.tif", np.zeros((300, 500)))
     monkeypatch.setattr(rasters, "memory_share", lambda: 2_000_000)
-    with pytest.raises(LidarpoolError) as refused:
+    with pytest.raises(LidarError) as refused:
         read(path)
     words = str(refused.value)
     window = [float(side) for side in re.search(r"window: \[(.*?)\]", words)[1].split(",")]
@@ -240,7 +240,7 @@ def test_too_large_ones_are_refused_with_what_fits(tmp_path, monkeypatch):
 def test_many_pixels_are_a_choice(tmp_path, monkeypatch):
     path = write(tmp_path / "m.tif", np.zeros((300, 500)))
     monkeypatch.setattr(rasters, "_UNASKED", 20_000)
-    with pytest.raises(LidarpoolError, match="500 x 300 pixels, 0 million triangles") as refused:
+    with pytest.raises(LidarError, match="500 x 300 pixels, 0 million triangles") as refused:
         read(path)
     told = str(refused.value)
     step = yaml.safe_load(re.search(r"scene: (\[\{.*?\}\])", told)[1])[0]
@@ -261,16 +261,16 @@ def test_small_files_that_claim_much(tmp_path):
     tiles = {"blockxsize": 4096, "blockysize": 4096, "sparse_ok": True, "bigtiff": "yes"}
     with rasterio.open(tmp_path / "m.tif", "w", **options, **tiles):
         pass
-    with pytest.raises(LidarpoolError, match=r"memory: give window: \S+ \S+ \S+ \S+ in"):
+    with pytest.raises(LidarError, match=r"memory: give window: \S+ \S+ \S+ \S+ in"):
         read(tmp_path / "m.tif")
-    with pytest.raises(LidarpoolError, match="made coarser from 4,000,000,000,000 pixels"):
+    with pytest.raises(LidarError, match="made coarser from 4,000,000,000,000 pixels"):
         read(tmp_path / "m.tif", step_m=1000)
     mesh, *_ = read(tmp_path / "m.tif", window=(X0, Y0 - 50, X0 + 50, Y0))
     assert len(mesh.vertices) == 2500
     tiles |= {"blockxsize": 80_000, "blockysize": 80_000}
     with rasterio.open(tmp_path / "b.tif", "w", **options, **tiles):
         pass
-    with pytest.raises(LidarpoolError, match=r"has blocks of 80,000 x 80,000 pixels"):
+    with pytest.raises(LidarError, match=r"has blocks of 80,000 x 80,000 pixels"):
         read(tmp_path / "b.tif", window=(X0, Y0 - 50, X0 + 50, Y0))
 
 
@@ -282,7 +282,7 @@ def test_nothing_that_a_file_names_is_opened(tmp_path):
         "</VRTRasterBand></VRTDataset>"
     )
     (tmp_path / "m.tif").write_text(vrt)
-    with pytest.raises(LidarpoolError, match=r"'m\.tif' not recognized"):
+    with pytest.raises(LidarError, match=r"'m\.tif' not recognized"):
         read(tmp_path / "m.tif")
     path = write(tmp_path / "plain.tif")
     (tmp_path / "plain.tif.msk").write_text(vrt)
@@ -307,20 +307,20 @@ def test_garbled_files_are_read_or_refused_in_a_line(tmp_path, data, suffix):
     path.write_bytes(content[:cut])
     try:
         read(path)
-    except LidarpoolError as error:
+    except LidarError as error:
         assert "\n" not in str(error) and len(str(error)) < 600
 
 
 def test_options_of_others_are_refused(tmp_path):
     (tmp_path / "m.off").write_text("OFF\n3 1 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n")
-    with pytest.raises(LidarpoolError, match="is no raster: leave out step_m and window"):
+    with pytest.raises(LidarError, match="is no raster: leave out step_m and window"):
         load_meshes(tmp_path / "m.off", step_m=2, window=(0, 0, 1, 1))
-    with pytest.raises(LidarpoolError, match="is a raster, whose heights are z"):
+    with pytest.raises(LidarError, match="is a raster, whose heights are z"):
         load_meshes(write(tmp_path / "m.tif"), up_axis="y")
-    with pytest.raises(LidarpoolError, match=r"window is .* \[x0, y0, x1, y1\]"):
+    with pytest.raises(LidarError, match=r"window is .* \[x0, y0, x1, y1\]"):
         Scenario.from_data({"scene": {"files": [{"file": "m.tif", "window": [1, 0, 0, 1]}]}})
     complex_one = write(tmp_path / "c.tif", SLOPE.astype(np.complex64))
-    with pytest.raises(LidarpoolError, match="type complex64, which are no heights"):
+    with pytest.raises(LidarError, match="type complex64, which are no heights"):
         read(complex_one)
 
 
@@ -338,7 +338,7 @@ def test_the_scene_has_one_coordinate_system(tmp_path):
     assert epsg_of(tmp_path, "west.tif") == 25832
     assert epsg_of(tmp_path, moved) is None and epsg_of(tmp_path, "west.tif", moved) == 25832
     assert epsg_of(tmp_path, {"file": "west.tif", "scale": [1, 1, 2]}) == 25832
-    with pytest.raises(LidarpoolError, match=r"west.tif in EPSG:25832, east.tif in EPSG:25833"):
+    with pytest.raises(LidarError, match=r"west.tif in EPSG:25832, east.tif in EPSG:25833"):
         epsg_of(tmp_path, "west.tif", "east.tif")
     assert epsg_of(tmp_path, "west.tif", "east.tif", epsg=25832) == 25832
 

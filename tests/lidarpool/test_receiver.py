@@ -14,7 +14,7 @@ from tests.shapes import Cart, beam_along_x, cast, cast_between, made, wall
 from lidarpool import (
     Actor,
     Beams,
-    LidarpoolError,
+    LidarError,
     Material,
     Mounted,
     Noise,
@@ -27,13 +27,13 @@ from lidarpool import (
     Spin,
     Survey,
 )
-from lidarpool.columns.table import AXES, SCAN
-from lidarpool.columns.waveforms import WAVEFORM
-from lidarpool.scene.scene_mesh import SceneMesh
-from lidarpool.sensor.noise import THRESHOLD_SIGMAS
-from lidarpool.simulator.batch import columns_of
-from lidarpool.simulator.returns import BLOOMING, CROSSTALK, FALSE_ALARM, SURFACE
-from lidarpool.simulator.rig import Rig
+from lidarsim.columns.table import AXES, SCAN
+from lidarsim.columns.waveforms import WAVEFORM
+from lidarsim.scene.scene_mesh import SceneMesh
+from lidarsim.sensor.noise import THRESHOLD_SIGMAS
+from lidarsim.simulator.batch import columns_of
+from lidarsim.simulator.returns import BLOOMING, CROSSTALK, FALSE_ALARM, SURFACE
+from lidarsim.simulator.rig import Rig
 from raybeam import available_backends
 
 WHITE = [Material("*", reflectance=1.0)]
@@ -87,7 +87,7 @@ def test_strong_returns_appear_nearer_as_of_a_gaussian_pulse_over_a_threshold():
     "field", ["range_at_threshold_m", "walk_m", "false_alarm_hz", "stray_light", "saturation"]
 )
 def test_what_is_measured_by_the_threshold_needs_one(field):
-    with pytest.raises(LidarpoolError, match=rf"noise\.{field} .*give noise\.detection_range_m"):
+    with pytest.raises(LidarError, match=rf"noise\.{field} .*give noise\.detection_range_m"):
         Noise(**{field: 1 if field == "saturation" else 0.1})
 
 
@@ -252,9 +252,9 @@ def test_a_strong_wall_wins_over_false_alarms():
 
 def test_false_alarms_need_a_greatest_range():
     noise = Noise(detection_range_m=FAR, false_alarm_hz=100)
-    with pytest.raises(LidarpoolError, match="has none: give max_range_m"):
+    with pytest.raises(LidarError, match="has none: give max_range_m"):
         Survey(beam_along_x(), poses=[(0, 0, 0)], steps=1, noise=noise)
-    with pytest.raises(LidarpoolError, match="667 false alarms of each pulse; 20 are possible"):
+    with pytest.raises(LidarError, match="667 false alarms of each pulse; 20 are possible"):
         Survey(
             beam_along_x(1, 100.0),
             poses=[(0, 0, 0)],
@@ -477,12 +477,12 @@ def test_counts_of_sensors_that_turn_against_each_other_are_those_of_all_pairs()
     ],
 )
 def test_crosstalk_needs_a_gate_and_a_field_of_view(one, says):
-    with pytest.raises(LidarpoolError, match=says):
+    with pytest.raises(LidarError, match=says):
         two(one, spinning(), [ring()])
 
 
 def test_crosstalk_needs_another_sensor():
-    with pytest.raises(LidarpoolError, match="needs several sensors"):
+    with pytest.raises(LidarError, match="needs several sensors"):
         Survey(spinning(), poses=[(0, 0, 0)], steps=1, noise=HEARS)
 
 

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from tests.shapes import beam_along_x, cast, wall
 
-from lidarpool import LidarpoolError, Material, Noise, load_sensor
-from lidarpool.sensor.models import model_names, read_model
-from lidarpool.sensor.reflectivity import SCALES
+from lidarpool import LidarError, Material, Noise, load_sensor
+from lidarsim.sensor.models import model_names, read_model
+from lidarsim.sensor.reflectivity import SCALES
 
 COLUMNS = ("range", "intensity", "reflectivity", "signal")
 
@@ -91,9 +91,9 @@ def test_models_have_the_scales_of_their_makers():
 
 
 def test_a_scale_that_is_not_known_is_named(tmp_path):
-    with pytest.raises(LidarpoolError, match=r"reflectivity.*velodyne.*ouster.*hesai"):
+    with pytest.raises(LidarError, match=r"reflectivity.*velodyne.*ouster.*hesai"):
         replace(beam_along_x().optics, reflectivity="livox")
     model = tmp_path / "mine.yaml"
     model.write_text("{name: Mine, firings_per_turn: 360, optics: {reflectivity: livox}}")
-    with pytest.raises(LidarpoolError, match=r"mine\.yaml.*optics\.reflectivity.*'ouster'"):
+    with pytest.raises(LidarError, match=r"mine\.yaml.*optics\.reflectivity.*'ouster'"):
         read_model(model)

@@ -9,18 +9,8 @@ import pytest
 import trimesh
 from tests.shapes import CPU, box, cast, level, solid
 
-from lidarpool import (
-    Beams,
-    LidarpoolError,
-    Material,
-    Optics,
-    Pose,
-    Returns,
-    Scene,
-    Sensor,
-    Spin,
-)
-from lidarpool.sensor.materials import extinction, fresnel
+from lidarpool import Beams, LidarError, Material, Optics, Pose, Returns, Scene, Sensor, Spin
+from lidarsim.sensor.materials import extinction, fresnel
 
 WATER = {"transparent": "pass", "refractive_index": 1.33}
 SURFACE = level("Water", 0, 90)
@@ -175,11 +165,11 @@ def test_water_in_a_tank_of_glass():
 
 
 def test_what_is_refused():
-    with pytest.raises(LidarpoolError, match="add transparent: pass"):
+    with pytest.raises(LidarError, match="add transparent: pass"):
         Material("*", refractive_index=1.33)
-    with pytest.raises(LidarpoolError, match="needs a refractive_index"):
+    with pytest.raises(LidarError, match="needs a refractive_index"):
         Material("*", transparent="pass", attenuation_per_m=0.1)
-    with pytest.raises(LidarpoolError, match=r"refractive_index is 0\.9; it must be 1 to 4"):
+    with pytest.raises(LidarError, match=r"refractive_index is 0\.9; it must be 1 to 4"):
         Material("*", transparent="pass", refractive_index=0.9)
 
 

@@ -16,17 +16,7 @@ import yaml
 from lxml import html
 from PIL import Image
 
-from lidarpool import (
-    Cloud,
-    Mounted,
-    Noise,
-    Planning,
-    Result,
-    Returns,
-    Scene,
-    Survey,
-    load_sensor,
-)
+from lidarpool import Cloud, Mounted, Noise, Planning, Result, Returns, Scene, Survey, load_sensor
 from lidarpool.pipeline.names import COLLECT, GENERATE, INTERSECT, SORT
 from lidarpool.pipeline.placement import TaskRecord
 from lidarpool.pipeline.task_book import TaskBook
@@ -36,8 +26,8 @@ from lidarpool.report.page.rendering import ROWS_MOST, put_picture, write_page
 from lidarpool.report.report import CountedCloud, make_report
 from lidarpool.run.trials import TRIAL
 from lidarpool.scenario.scenario import Scenario
-from lidarpool.scene.scene_mesh import SceneMesh
-from lidarpool.sensor import Sensor
+from lidarsim.scene.scene_mesh import SceneMesh
+from lidarsim.sensor import Sensor
 
 EVIL = (
     "\"'><script>alert(1)</script><img src=//evil.test/x onerror=y>&amp;{{ 7*7 }}\u202e\x00\udc80"

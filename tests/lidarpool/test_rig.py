@@ -14,11 +14,11 @@ from lidarpool import Actor, Beams, Column, Mounted, Pose, Scene, Sensor, Spin, 
 from lidarpool.columns.parts import pack
 from lidarpool.pipeline import rigs
 from lidarpool.pipeline.failures import naming_scans
-from lidarpool.scene.actors import box
-from lidarpool.scene.shapes import seed_objects
-from lidarpool.simulator import scene_caster
-from lidarpool.simulator.batch import columns_of
-from lidarpool.simulator.rig import Rig
+from lidarsim.scene.actors import box
+from lidarsim.scene.shapes import seed_objects
+from lidarsim.simulator import scene_caster
+from lidarsim.simulator.batch import columns_of
+from lidarsim.simulator.rig import Rig
 from poolpart.task_context import WorkerLeft
 from raybeam import RayCaster
 

@@ -11,16 +11,16 @@ import pytest
 from tests.lidarpool.test_moving import stored_positions
 from tests.shapes import level, made
 
-from lidarpool import LidarpoolError, Pose, Scene, Survey, Track, load_robot, load_sensor
+from lidarpool import LidarError, Pose, Scene, Survey, Track, load_robot, load_sensor
 from lidarpool.base.fingerprint import fingerprint
-from lidarpool.base.vectors import into_axes
 from lidarpool.scenario.advice import advice
 from lidarpool.scenario.build import build
 from lidarpool.scenario.scenario import Scenario
-from lidarpool.scene.actors import box
-from lidarpool.sensor import Mounted
-from lidarpool.sensor.trajectory import presence_ns
-from lidarpool.simulator.rig import Rig
+from lidarsim.base.vectors import into_axes
+from lidarsim.scene.actors import box
+from lidarsim.sensor import Mounted
+from lidarsim.sensor.trajectory import presence_ns
+from lidarsim.simulator.rig import Rig
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 BOX = '<visual><geometry><box size="0.2 0.2 0.2"/></geometry></visual>'
@@ -212,12 +212,12 @@ def test_mesh_files_of_packages(tmp_path):
         ("../meshes/arm.dae", "does not exist"),
         ("http://example.org/leg.dae", "must be a file's name"),
     ):
-        with pytest.raises(LidarpoolError, match=words) as caught:
+        with pytest.raises(LidarError, match=words) as caught:
             read(name)
         assert "link 'leg'" in str(caught.value) and len(str(caught.value).splitlines()) == 1
     (package / "package.xml").unlink()  # now the folder above the file's counts
     assert read("../meshes/leg.dae").meshes
-    with pytest.raises(LidarpoolError, match="outside the package"):
+    with pytest.raises(LidarError, match="outside the package"):
         read("../../other/leg.dae")
 
 
@@ -249,7 +249,7 @@ BROKEN = {
 
 @pytest.mark.parametrize("words", BROKEN)
 def test_broken_robots_are_refused_in_a_line(tmp_path, words):
-    with pytest.raises(LidarpoolError) as caught:
+    with pytest.raises(LidarError) as caught:
         robot_of(tmp_path, *BROKEN[words])
     assert words in str(caught.value)
     assert len(str(caught.value).splitlines()) == 1 and len(str(caught.value)) < 500
@@ -267,12 +267,12 @@ def test_xacro_other_files_and_garbled_copies(tmp_path):
         ("<!DOCTYPE r [<!ENTITY a 'b'>]><robot>&a;</robot>", "XML entity"),
     ):
         path.write_text(text)
-        with pytest.raises(LidarpoolError, match=words):
+        with pytest.raises(LidarError, match=words):
             load_robot(path)
-    with pytest.raises(LidarpoolError, match=r"xacro arm.urdf.xacro > arm.urdf"):
+    with pytest.raises(LidarError, match=r"xacro arm.urdf.xacro > arm.urdf"):
         (tmp_path / "arm.urdf.xacro").write_text("<robot/>")
         load_robot(tmp_path / "arm.urdf.xacro")
-    with pytest.raises(LidarpoolError, match="cannot be read"):
+    with pytest.raises(LidarError, match="cannot be read"):
         load_robot(tmp_path / "none.urdf")
     whole, rng, read = (EXAMPLES / "rover.urdf").read_bytes(), np.random.default_rng(0), 0
     for _ in range(150):
@@ -282,7 +282,7 @@ def test_xacro_other_files_and_garbled_copies(tmp_path):
         path.write_bytes(data[: rng.integers(0, len(data))] if rng.random() < 0.2 else data)
         try:
             read += bool(load_robot(path, colours=True, tell=lambda line: None).actors())
-        except LidarpoolError as error:
+        except LidarError as error:
             assert len(str(error).splitlines()) == 1
     assert 5 < read < 140
 
@@ -312,7 +312,7 @@ def test_tables_of_joints(tmp_path):
     table.write_text(f"time [s],Pan [deg]\n0,0\n1,{np.degrees(1)}\n")
     (*_, tip) = robot.actors(joints=table)
     assert np.allclose(tip.trajectory.pose(0, 5e8).position, tip_at(0.5, 0)[:3, 3])
-    with pytest.raises(LidarpoolError, match=r"'r/tip': The joints have values from 0 to 1 s"):
+    with pytest.raises(LidarError, match=r"'r/tip': The joints have values from 0 to 1 s"):
         tip.check(0, 2e9)
     for text, words in (
         ("", "it is empty"),
@@ -325,16 +325,16 @@ def test_tables_of_joints(tmp_path):
         ("time_s,pan\n1,0\n0,0\n", "must be finite, and ascend"),
     ):
         table.write_text(text)
-        with pytest.raises(LidarpoolError, match=words):
+        with pytest.raises(LidarError, match=words):
             robot.actors(joints=table)
     for given, words in (
         ({"pam": 1}, "no joint 'pam' that moves. Did you mean 'pan'"),
         ({"pan": [0, 1]}, "one for each time_s"),
         ({"time_s": [0, 1], "pan": [0, np.inf]}, "must be finite"),
     ):
-        with pytest.raises(LidarpoolError, match=words):
+        with pytest.raises(LidarError, match=words):
             robot.actors(joints=given)
-    with pytest.raises(LidarpoolError, match=r"no link 'tin'\. Did you mean 'tip'"):
+    with pytest.raises(LidarError, match=r"no link 'tin'\. Did you mean 'tip'"):
         robot.path("tin")
 
 
@@ -526,7 +526,7 @@ def test_a_robot_that_stands_moves_its_joints_by_the_clock_of_the_survey(folder)
 def test_scenarios_that_do_not_fit_their_robot(folder, change, words):
     data = SCENARIO | {"actors": [ROVER], "mount": {"link": "lidar"}} | change
     data = {key: value for key, value in data.items() if value is not None}
-    with pytest.raises(LidarpoolError, match=words):
+    with pytest.raises(LidarError, match=words):
         scenario = Scenario.from_data(data, folder=folder)
         build(scenario)
 
@@ -560,9 +560,9 @@ def test_a_robot_alone_stands_still_with_its_joints_at_zero(folder):
     at_zero, turned = (scene.bounds + scene.origin for scene in (alone.scene, placed))
     np.testing.assert_allclose(turned[:, 0], 5 - at_zero[::-1, 1], atol=1e-6)
     np.testing.assert_allclose(turned[:, 1:], at_zero[:, [0, 2]], atol=1e-6)
-    with pytest.raises(LidarpoolError, match="is a robot, which is in metres and Z-up: leave out"):
+    with pytest.raises(LidarError, match="is a robot, which is in metres and Z-up: leave out"):
         build(Scenario.from_data({"scene": [entry | {"unit": "mm"}]}, folder=folder))
-    with pytest.raises(LidarpoolError, match="is a robot: read it with load_robot"):
+    with pytest.raises(LidarError, match="is a robot: read it with load_robot"):
         Scene.load(folder / "rover.urdf")
 
 
@@ -580,7 +580,7 @@ def test_other_robots_are_refused_with_what_becomes_of_them(tmp_path, name, way)
         Scenario.load(tmp_path / name),
         Scenario.from_data({"scene": name}, folder=tmp_path),
     ):
-        with pytest.raises(LidarpoolError, match=f"{name} is not read: .*{way}"):
+        with pytest.raises(LidarError, match=f"{name} is not read: .*{way}"):
             build(scenario)
 
 

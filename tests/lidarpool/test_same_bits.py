@@ -13,8 +13,8 @@ import pytest
 import lidarpool
 import raybeam
 from lidarpool import Actor, Material, Noise, Returns, Scanner, Scene, Track, load_sensor
-from lidarpool.columns.table import Column
-from lidarpool.scene.shapes import capsule, cylinder
+from lidarsim.columns.table import Column
+from lidarsim.scene.shapes import capsule, cylinder
 
 ROOMS = ("base", "columns", "scene", "sensor", "simulator")
 # Of numpy and math: their last bits depend on the processor, or on versions of C's library.
@@ -71,9 +71,7 @@ def test_no_byte_comes_from_functions_that_differ(name):
     if name in EXCEPTIONS:
         assert lines, f"{name} is no exception any more"
     if not name.startswith((*EXCEPTIONS,)):
-        assert not lines, (
-            f"{SOURCES[name]}, lines {lines}: use lidarpool.base.elementary or vectors"
-        )
+        assert not lines, f"{SOURCES[name]}, lines {lines}: use lidarsim.base.elementary or vectors"
 
 
 @pytest.mark.parametrize(

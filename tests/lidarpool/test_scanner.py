@@ -20,7 +20,7 @@ from lidarpool import (
     Beams,
     Cloud,
     Column,
-    LidarpoolError,
+    LidarError,
     Material,
     Mounted,
     Noise,
@@ -36,14 +36,14 @@ from lidarpool import (
     Track,
     load_sensor,
 )
-from lidarpool.columns.table import OPTIONAL, SCAN
-from lidarpool.export.sweeps import Sweeps
-from lidarpool.scene.actors import box
-from lidarpool.scene.scene_mesh import Cutout
-from lidarpool.scene.shapes import seed_objects
-from lidarpool.simulator import rig as rig_module
-from lidarpool.simulator.batch import columns_of
-from lidarpool.simulator.rig import Rig
+from lidarsim.columns.table import OPTIONAL, SCAN
+from lidarsim.scene.actors import box
+from lidarsim.scene.scene_mesh import Cutout
+from lidarsim.scene.shapes import seed_objects
+from lidarsim.simulator import rig as rig_module
+from lidarsim.simulator.batch import columns_of
+from lidarsim.simulator.rig import Rig
+from lidarsim.sweeps.sweeps import Sweeps
 
 COLUMNS = [column.name for column in OPTIONAL]
 VLP16 = load_sensor("velodyne/vlp16")
@@ -259,7 +259,7 @@ def test_an_actor_stands_where_it_was_put(scene):
             on = points.positions[points.object == car]
             assert len(on) > 10 and (np.abs(on[:, 0] - x) < 2.3).all()
     scanner.move("Car", DRIVE)
-    with pytest.raises(LidarpoolError, match=r"Actor 'Car': The trajectory goes from 0 to 0\.5 s"):
+    with pytest.raises(LidarError, match=r"Actor 'Car': The trajectory goes from 0 to 0\.5 s"):
         scanner.sweep((0, 0, 1), start_s=9)
 
 
@@ -467,7 +467,7 @@ WRONG = {
 @pytest.mark.parametrize("name", WRONG)
 def test_wrong_arguments(scene, name):
     call, says = WRONG[name]
-    with pytest.raises(LidarpoolError) as raised:
+    with pytest.raises(LidarError) as raised:
         call(Scanner(scene, GRID, backend="numpy"))
     assert says in str(raised.value) and len(str(raised.value).splitlines()) <= 2
 

@@ -13,13 +13,13 @@ from hypothesis import strategies as st
 from trimesh.exchange.gltf import export_glb
 
 from lidarpool import Scene
-from lidarpool.base.errors import LidarpoolError
 from lidarpool.base.fingerprint import fingerprint
 from lidarpool.scenario.advice import advice
 from lidarpool.scenario.build import build
 from lidarpool.scenario.scenario import Scenario
-from lidarpool.sensor import Noise, Returns, Sensor, Survey
-from lidarpool.sensor.materials import MaterialTable, SurfaceKinds
+from lidarsim.base.errors import LidarError
+from lidarsim.sensor import Noise, Returns, Sensor, Survey
+from lidarsim.sensor.materials import MaterialTable, SurfaceKinds
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 DEFAULT = Survey(Sensor.grid(), poses=[(0, 0, 1), (0, 0, 2), (0, 0, 3)], keep_every=5)
@@ -169,7 +169,7 @@ def test_short_forms_say_the_same(scenario):
 
 
 def test_a_model_of_ones_own_is_a_file_beside_the_scenario(scenario, tmp_path):
-    data = files("lidarpool.sensor") / "data" / "velodyne" / "vlp16.yaml"
+    data = files("lidarsim.sensor") / "data" / "velodyne" / "vlp16.yaml"
     (tmp_path / "mine.yaml").write_text(data.read_text().replace("VLP-16", "Mine"))
     made = scenario("sensor: mine.yaml")
     assert made.files == (tmp_path / "mine.yaml",)
@@ -247,7 +247,7 @@ BAD = [
 
 @pytest.mark.parametrize(("text", "message"), BAD, ids=[str(i) for i in range(len(BAD))])
 def test_bad_scenarios(scenario, tmp_path, text, message):
-    with pytest.raises(LidarpoolError, match=message) as caught:
+    with pytest.raises(LidarError, match=message) as caught:
         everything(scenario(text))
     for line in str(caught.value).splitlines():
         assert str(tmp_path) in line
@@ -265,24 +265,24 @@ def test_all_faults_are_told_at_once(scenario, tmp_path):
         (of_fields, ["sensor.layers is 0", did_you_mean, "steps is 0", "cloud.keep_every is 0"]),
         (of_sections, ["planning is enabled", "either poses or a trajectory", "no divergence"]),
     ):
-        with pytest.raises(LidarpoolError) as raised:
+        with pytest.raises(LidarError) as raised:
             scenario(text)
         lines = str(raised.value).splitlines()
         assert len(lines) == len(words)
         for line, word in zip(lines, words, strict=True):
             assert word in line and str(tmp_path) in line
-    with pytest.raises(LidarpoolError) as raised:
+    with pytest.raises(LidarError) as raised:
         scenario("poses: [" + 100 * "[0, 0], " + "]")
     assert str(raised.value).endswith(
         "poses[0].position[2] is missing; it must be given. 99 more entries like it."
     )
-    with pytest.raises(LidarpoolError) as raised:
+    with pytest.raises(LidarError) as raised:
         scenario("\n".join(f"field{number}: 1" for number in range(100)))
     assert str(raised.value).splitlines()[-1] == "And 80 more."
 
 
 def test_all_files_that_cannot_be_read_are_told_at_once(scenario):
-    with pytest.raises(LidarpoolError) as raised:
+    with pytest.raises(LidarError) as raised:
         build(scenario("scene: [no.glb, nor.stl]"))
     assert str(raised.value).count("does not exist") == 2
 
@@ -343,7 +343,7 @@ YAML_VALUES = st.recursive(
 def test_any_data_is_a_scenario_or_one_error_for_users(data):
     try:
         loaded = Scenario.from_data(data, source="s.yaml")
-    except LidarpoolError as error:
+    except LidarError as error:
         assert all(re.match(r"s.yaml: |And \d+ more", line) for line in str(error).splitlines())
     else:
         assert set(data) <= set(Scenario.model_fields)
@@ -445,7 +445,7 @@ def test_a_start_is_a_time_of_yaml_or_text(scenario):
     for text in ("2026-11-21T10:00:00Z", "'2026-11-21T12:00:00+02:00'"):
         survey = build(scenario(f"cloud: {{epsg: 25832, start: {text}}}")).survey
         assert (survey.epsg, survey.start) == (25832, datetime(2026, 11, 21, 10, tzinfo=UTC))
-    with pytest.raises(LidarpoolError, match=r"cloud\.start"):
+    with pytest.raises(LidarError, match=r"cloud\.start"):
         scenario("cloud: {start: 2026-11-21T10:00:00}")
 
 

@@ -7,14 +7,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from lidarpool.base.errors import LidarpoolError
 from lidarpool.scenario.advice import advice
 from lidarpool.scenario.build import build
 from lidarpool.scenario.scenario import Scenario
-from lidarpool.scene.object_names import unique_names
-from lidarpool.scene.scene import Scene
-from lidarpool.scene.scene_mesh import SceneMesh
-from lidarpool.scene.transform import UP_AXES, Transform
+from lidarsim.base.errors import LidarError
+from lidarsim.scene.object_names import unique_names
+from lidarsim.scene.scene import Scene
+from lidarsim.scene.scene_mesh import SceneMesh
+from lidarsim.scene.transform import UP_AXES, Transform
 
 FACES = np.array([[0, 1, 2]])
 
@@ -77,7 +77,7 @@ def test_scenes_that_do_not_fit_together(change, message):
         "origin": np.zeros(3),
     }
     Scene(**good)
-    with pytest.raises(LidarpoolError, match=message):
+    with pytest.raises(LidarError, match=message):
         Scene(**(good | change))
 
 
@@ -106,7 +106,7 @@ def test_scale_then_x_then_y_then_z_then_translation():
     ],
 )
 def test_no_placements(make, message):
-    with pytest.raises(LidarpoolError, match=message):
+    with pytest.raises(LidarError, match=message):
         make()
 
 

@@ -11,15 +11,15 @@ import pytest
 import trimesh
 from click.testing import CliRunner
 
-from lidarpool import LidarpoolError, Scene
+from lidarpool import LidarError, Scene
 from lidarpool.cli.scenario_commands import scene as command
-from lidarpool.scene.actors import box
-from lidarpool.scene.colours import WHITE, Colours
-from lidarpool.scene.files.meshfile import load_meshes
-from lidarpool.scene.generated.city import city
-from lidarpool.scene.scene_file import write_scene
-from lidarpool.scene.scene_instances import SceneInstance
-from lidarpool.scene.scene_mesh import Cutout
+from lidarsim.scene.actors import box
+from lidarsim.scene.colours import WHITE, Colours
+from lidarsim.scene.files.meshfile import load_meshes
+from lidarsim.scene.generated.city import city
+from lidarsim.scene.scene_file import write_scene
+from lidarsim.scene.scene_instances import SceneInstance
+from lidarsim.scene.scene_mesh import Cutout
 
 
 @pytest.mark.parametrize("suffix", [".ply", ".glb", ".obj", ".GLB"])
@@ -101,7 +101,7 @@ def test_colours_come_back_from_a_glb_file(tmp_path):
     ],
 )
 def test_places_that_are_none(tmp_path, name, words):
-    with pytest.raises(LidarpoolError, match=words):
+    with pytest.raises(LidarError, match=words):
         write_scene(tmp_path / name, city(1_000))
     assert not list(tmp_path.iterdir())
 
@@ -114,7 +114,7 @@ def test_a_failed_write_leaves_what_was_there(tmp_path, monkeypatch):
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(Path, "replace", full)
-    with pytest.raises(LidarpoolError, match="No space left"):
+    with pytest.raises(LidarError, match="No space left"):
         write_scene(path, city(1_000))
     assert path.read_text() == "before"
     assert list(tmp_path.iterdir()) == [path]
@@ -142,6 +142,6 @@ def test_commands(arguments, words):
 
 def test_files_that_cannot_share_meshes_do_not_hold_a_forest(tmp_path):
     arguments = ["terrain", "out.obj", "--triangles", "800", "--side", "1000", "--trees", "5000"]
-    with pytest.raises(LidarpoolError, match=r"out.obj would hold 4\d,\d+,\d+ triangles, because"):
+    with pytest.raises(LidarError, match=r"out.obj would hold 4\d,\d+,\d+ triangles, because"):
         CliRunner().invoke(command, arguments, catch_exceptions=False)
     assert not list(tmp_path.iterdir())

@@ -10,7 +10,7 @@ from tests.shapes import tally_of
 
 from lidarpool import (
     Actor,
-    LidarpoolError,
+    LidarError,
     Material,
     Noise,
     Pose,
@@ -22,12 +22,12 @@ from lidarpool import (
     Track,
     load_sensor,
 )
-from lidarpool.columns.table import SCAN
-from lidarpool.scene.actors import box, one_mesh
-from lidarpool.scene.scene_mesh import Cutout
-from lidarpool.scene.shapes import seed_objects
-from lidarpool.simulator.batch import columns_of
-from lidarpool.simulator.rig import Rig
+from lidarsim.columns.table import SCAN
+from lidarsim.scene.actors import box, one_mesh
+from lidarsim.scene.scene_mesh import Cutout
+from lidarsim.scene.shapes import seed_objects
+from lidarsim.simulator.batch import columns_of
+from lidarsim.simulator.rig import Rig
 
 SPHERE = seed_objects(rings=8, segments=12)[0]
 SPHERE = SceneMesh(SPHERE.name, SPHERE.vertices + np.array([20, 20, 0]), SPHERE.faces)
@@ -150,5 +150,5 @@ def test_several_instances_are_refused_as_one_is():
     flat = np.tile(np.eye(4), (3, 1, 1))
     assert [one.name for one in SceneInstance.several(SPHERE, flat, "V")] == ["V"] * 3
     flat[1, 2, 2] = 0
-    with pytest.raises(LidarpoolError, match="flattens the mesh"):
+    with pytest.raises(LidarError, match="flattens the mesh"):
         SceneInstance.several(SPHERE, flat, "V")

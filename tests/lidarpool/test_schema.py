@@ -11,9 +11,8 @@ import pytest
 import yaml
 from jsonschema import Draft202012Validator
 
-from lidarpool import LidarpoolError
+from lidarpool import LidarError
 from lidarpool.base.fingerprint import fingerprint
-from lidarpool.base.validation import fields_of, is_section
 from lidarpool.scenario.build import build
 from lidarpool.scenario.campaign import CampaignSpec, is_campaign
 from lidarpool.scenario.scenario import Scenario
@@ -24,6 +23,7 @@ from lidarpool.scenario.schema import (
     schema_text,
     short_scenario,
 )
+from lidarsim.base.validation import fields_of, is_section
 
 FILES = sorted((Path(__file__).parents[2] / "examples").glob("*.yaml"))
 CAMPAIGNS = [path for path in FILES if is_campaign(path)]
@@ -90,7 +90,7 @@ def test_what_a_scenario_takes_is_valid(validator, data):
 
 @pytest.mark.parametrize("data", BAD, ids=str)
 def test_what_a_scenario_refuses_is_not(validator, data):
-    with pytest.raises(LidarpoolError):
+    with pytest.raises(LidarError):
         Scenario.from_data(data)
     assert not validator.is_valid(data)
 
@@ -156,7 +156,7 @@ def test_what_a_campaign_takes_is_valid(of_campaigns, load, data):
 @pytest.mark.parametrize("data", BAD_CAMPAIGNS, ids=str)
 def test_what_a_campaign_refuses_is_not(of_campaigns, load, data):
     data = {"base": "base.yaml"} | data
-    with pytest.raises(LidarpoolError):
+    with pytest.raises(LidarError):
         load(data)
     assert not of_campaigns.is_valid(data)
 

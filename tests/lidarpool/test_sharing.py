@@ -15,17 +15,17 @@ from tests.pages import unpacked
 
 import lidarpool.live.sharing
 import lidarpool.render.film
-from lidarpool import LidarpoolError, Scene, Sensor, Survey, Track
+from lidarpool import LidarError, Scene, Sensor, Survey, Track
 from lidarpool.cli.commands import cli
 from lidarpool.columns.ply_format import header, row_type
-from lidarpool.columns.table import CHANNEL, SCAN
-from lidarpool.export.sweeps import SWEEPS_FILE, Sweeps
 from lidarpool.live.sharing import film_of, page_of, share
 from lidarpool.live.view import open_result
 from lidarpool.render.film import ACTOR, SURFACE, Film
 from lidarpool.render.theme import rgb
 from lidarpool.run.picture_file import PICTURE_FILE, PictureContent, sensor_ways
-from lidarpool.scene.actors import Actor, box
+from lidarsim.columns.table import CHANNEL, SCAN
+from lidarsim.scene.actors import Actor, box
+from lidarsim.sweeps.sweeps import SWEEPS_FILE, Sweeps
 
 COUNT, SCANS = 3600, 360
 RED = np.array([1.0, 0.0, 0.0, 1.0])
@@ -200,20 +200,20 @@ def test_a_page_with_less_room_has_fewer_points_where_they_are_dense(drive, monk
     far = [np.linalg.norm(some, axis=1) > 15 for some in (places, dense)]
     assert 1000 < len(places) < 40_000 and far[0].mean() > 1.02 * far[1].mean()
     monkeypatch.setattr(lidarpool.live.sharing, "_PAGE_BYTES", 500_000)
-    with pytest.raises(LidarpoolError, match="Even without points"):
+    with pytest.raises(LidarError, match="Even without points"):
         page_of(open_result(drive))
 
 
 def test_wrong_names_and_results_without_points_are_refused(drive, tmp_path):
     film, page = tmp_path / "film.mp4", tmp_path / "page.htm"
-    with pytest.raises(LidarpoolError, match=r"film.mp4 does not end with .gif or .webp"):
+    with pytest.raises(LidarError, match=r"film.mp4 does not end with .gif or .webp"):
         share(drive, film, None)
-    with pytest.raises(LidarpoolError, match=r"page.htm does not end with .html"):
+    with pytest.raises(LidarError, match=r"page.htm does not end with .html"):
         share(drive, None, page)
-    with pytest.raises(LidarpoolError, match="cannot be written"):
+    with pytest.raises(LidarError, match="cannot be written"):
         share(drive, None, tmp_path / "none" / "page.html")
     rows = np.zeros(0, row_type(np.dtype(np.float32), (SCAN,)))
     (drive / "cloud.ply").write_bytes(header(rows.dtype, 0) + rows.tobytes())
-    with pytest.raises(LidarpoolError, match="no points to show"):
+    with pytest.raises(LidarError, match="no points to show"):
         share(drive, tmp_path / "film.gif", None)
     assert not film.exists() and not page.exists()

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 
 from lidarpool import Fault, Material, Mounted, Noise, Returns, Scene, Survey, load_sensor
-from lidarpool.sensor.noise import Purpose
-from lidarpool.sensor.survey import OPTIONAL_NAMES
-from lidarpool.simulator.returns import PulseReturns
-from lidarpool.simulator.rig import Rig
-from lidarpool.simulator.steps import STEPS
+from lidarsim.sensor.noise import Purpose
+from lidarsim.sensor.survey import OPTIONAL_NAMES
+from lidarsim.simulator.returns import PulseReturns
+from lidarsim.simulator.rig import Rig
+from lidarsim.simulator.steps import STEPS
 
 EFFECTS = Path(__file__).parents[2] / "docs/effects.md"
 # What is no step: figures for steps, a column, and files.

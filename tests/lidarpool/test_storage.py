@@ -15,11 +15,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from lidarpool import LidarpoolError
-from lidarpool.base import allowance
-from lidarpool.base.archives import open_archive
-from lidarpool.base.storage import Storage
-from lidarpool.export.sweeps import Sweeps
+from lidarpool import LidarError
+from lidarsim.base import allowance
+from lidarsim.base.archives import open_archive
+from lidarsim.base.storage import Storage
+from lidarsim.sweeps.sweeps import Sweeps
 
 
 @pytest.fixture(params=["folder", "memory"])
@@ -136,7 +136,7 @@ def test_nothing_goes_through_a_link_below_the_named_folder(use, tmp_path):
     named.symlink_to(tmp_path / "out")
     (named / "link").symlink_to(theirs)
     for storage in (Storage.at(named), pickle.loads(pickle.dumps(Storage.at(named)))):
-        with pytest.raises(LidarpoolError, match=f"{named}/link is a link, and nothing behind"):
+        with pytest.raises(LidarError, match=f"{named}/link is a link, and nothing behind"):
             USES[use](storage)
     assert {path.name for path in theirs.iterdir()} == {"in", "file"}
     Storage.at(named).discard("link")
@@ -147,13 +147,13 @@ def test_nothing_goes_through_a_link_below_the_named_folder(use, tmp_path):
 def test_a_storage_whose_library_is_missing_says_so(url, monkeypatch):
     monkeypatch.setitem(sys.modules, "gcsfs", None)
     for use in (Storage.prepare, Storage.sizes, lambda s: s.read("a"), lambda s: s.write("a", b"")):
-        with pytest.raises(LidarpoolError, match=f"{url} cannot be opened: .*[^.][.]$"):
+        with pytest.raises(LidarError, match=f"{url} cannot be opened: .*[^.][.]$"):
             use(Storage.at(url))
 
 
 @pytest.mark.parametrize("url", ["s3://", "file:///"])
 def test_a_scheme_alone_is_no_folder(url):
-    with pytest.raises(LidarpoolError, match="names no folder: give one"):
+    with pytest.raises(LidarError, match="names no folder: give one"):
         Storage.at(url)
 
 
@@ -227,7 +227,7 @@ def test_others_are_refused_in_a_line(tmp_path, monkeypatch, data, words):
     path = tmp_path / "0000.npz"
     path.write_bytes(data)
     for read in (None, path.read_bytes):
-        with pytest.raises(LidarpoolError, match=words) as told:
+        with pytest.raises(LidarError, match=words) as told:
             Sweeps.load(path, read)
         assert re.match(rf"{path}\b[^\n]*\.$", str(told.value))
 
@@ -269,5 +269,5 @@ def test_a_file_is_copied_where_there_are_no_links(tmp_path, monkeypatch):
     target.take(source, "a", "a")
     assert target.read("a") == b"new" and target.local("a").stat().st_nlink == 1
     (tmp_path / "link").symlink_to(tmp_path / "a")
-    with pytest.raises(LidarpoolError, match="link is a link"):
+    with pytest.raises(LidarError, match="link is a link"):
         target.take(source, "link", "link")

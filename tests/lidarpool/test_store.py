@@ -16,14 +16,14 @@ from tests.committing import commit
 
 import lidarpool.run.remote
 import lidarpool.run.store
-from lidarpool import Campaign, Job, LidarpoolError, Planning, Scene, Sensor, Survey, remove_run
-from lidarpool.base.storage import Storage
+from lidarpool import Campaign, Job, LidarError, Planning, Scene, Sensor, Survey, remove_run
 from lidarpool.columns.parts import mark_name, part_name, probe_name
 from lidarpool.datasets.job_table import JobRow
 from lidarpool.plan import run_trial
 from lidarpool.run.job_source import OneJob
 from lidarpool.run.store import RunStore
-from lidarpool.scene.shapes import seed_objects
+from lidarsim.base.storage import Storage
+from lidarsim.scene.shapes import seed_objects
 
 SCENE = Scene.from_meshes(seed_objects(rings=4, segments=6))
 SURVEY = Survey(Sensor.grid(layers=2), poses=[(0, 0, 1)], steps=6, columns=["time"])
@@ -120,7 +120,7 @@ def test_it_is_gone_on_with(unfinished):
     assert store.only.parts.missing(0, 6) == [(2, 3), (5, 6)]
     assert "were cast with it" in store.advice
     store.db.close()
-    with pytest.raises(LidarpoolError, match=r"'embree' is asked for, .* cast with 'numpy'"):
+    with pytest.raises(LidarError, match=r"'embree' is asked for, .* cast with 'numpy'"):
         opened(unfinished, backend="embree", resume=True)
 
 
@@ -134,7 +134,7 @@ OTHERS = {
 @pytest.mark.parametrize("other", OTHERS)
 def test_another_run_cannot_go_on(other, unfinished):
     for resume in (True, False):
-        with pytest.raises(LidarpoolError, match=f"cannot be continued, it is of another {other}"):
+        with pytest.raises(LidarError, match=f"cannot be continued, it is of another {other}"):
             opened(unfinished, resume=resume, job=OTHERS[other])
     remove_run(unfinished)
     opened(unfinished, job=OTHERS[other]).db.close()
@@ -143,7 +143,7 @@ def test_another_run_cannot_go_on(other, unfinished):
 def test_another_version_cannot_go_on(unfinished, monkeypatch):
     later = {"lidarpool": "0.2 (sources 12345678)"}
     monkeypatch.setattr(lidarpool.run.store, "software", lambda: later)
-    with pytest.raises(LidarpoolError, match=r"lidarpool \S+ \(sources \w+\), here it is 0\.2"):
+    with pytest.raises(LidarError, match=r"lidarpool \S+ \(sources \w+\), here it is 0\.2"):
         opened(unfinished, resume=True)
 
 
@@ -208,11 +208,11 @@ def test_a_part_that_is_damaged_meanwhile_is_made_again_by_the_next_run(folder):
     part = part_of(folder, 0)
     part.write_bytes(part.read_bytes()[:-1])
     for read in (lambda: store.only.points().load(), store.only.hit_counts):
-        with pytest.raises(LidarpoolError, match="cannot be used") as caught:
+        with pytest.raises(LidarError, match="cannot be used") as caught:
             read()
         assert "Resuming the run (--resume, in Python resume=True) casts its" in str(caught.value)
         assert "anew" not in str(caught.value)
-    with pytest.raises(LidarpoolError) as caught, store.kept_on_error():
+    with pytest.raises(LidarError) as caught, store.kept_on_error():
         store.only.points().load()
     (note,) = caught.value.__notes__
     assert "continue with --resume" in note
@@ -238,7 +238,7 @@ def test_storage_that_cannot_be_read_is_not_taken_for_damage(unfinished, monkeyp
 
     with monkeypatch.context() as patch:
         patch.setattr(Storage, "read", refuse)
-        with pytest.raises(LidarpoolError, match=r"\.npz cannot be read: Permission denied"):
+        with pytest.raises(LidarError, match=r"\.npz cannot be read: Permission denied"):
             opened(unfinished, resume=True)
     assert opened(unfinished, resume=True).only.resumed == 4
 
@@ -276,9 +276,9 @@ def test_a_run_is_gone_on_with_where_its_parts_are(anywhere, place, tmp_path):
 
 
 def test_places_that_cannot_be(tmp_path):
-    with pytest.raises(LidarpoolError, match="make the one that it lies in first"):
+    with pytest.raises(LidarError, match="make the one that it lies in first"):
         opened(tmp_path / "none" / "run")
-    with pytest.raises(LidarpoolError, match="give a folder for the run as well"):
+    with pytest.raises(LidarError, match="give a folder for the run as well"):
         opened(None, tmp_path / "parts")
 
 
@@ -383,7 +383,7 @@ def test_another_run_behind_a_link_stays(where, use, folder, tmp_path):
     link.symlink_to(target if target.exists() else theirs / "run.db")
     before = {name: (theirs / name).read_bytes() for name in names(theirs)}
     assert len(before) == 3
-    with pytest.raises(LidarpoolError, match=f"{link} is a link"):
+    with pytest.raises(LidarError, match=f"{link} is a link"):
         use(folder) if callable(use) else opened(folder, resume=use == "resume").remove()
     assert before == {name: (theirs / name).read_bytes() for name in names(theirs)}
     link.unlink()
@@ -408,7 +408,7 @@ def campaign(folder, *, height=1.0, resume=False):
 
 @pytest.mark.parametrize("left", ["a job that is done", "a job under way"])
 def test_a_survey_and_a_campaign_do_not_take_each_others_folder(left, folder, unfinished):
-    with pytest.raises(LidarpoolError, match="cannot be continued, "):
+    with pytest.raises(LidarError, match="cannot be continued, "):
         campaign(folder)
     assert len(names(folder)) > 2
     remove_run(folder)
@@ -421,7 +421,7 @@ def test_a_survey_and_a_campaign_do_not_take_each_others_folder(left, folder, un
     store.db.close()
     before = names(folder)
     for resume in (False, True):
-        with pytest.raises(LidarpoolError, match="cannot be continued, "):
+        with pytest.raises(LidarError, match="cannot be continued, "):
             opened(folder, resume=resume)
     assert names(folder) == before
 
@@ -488,7 +488,7 @@ def test_a_database_that_points_elsewhere(where, kept, request, tmp_path):
     put(tmp_path / "victim")
     place = tmp_path / "victim" if where == "victim" else other.storage.url
     change(folder, f"UPDATE meta SET value = '{place}' WHERE name = 'parts'")
-    with pytest.raises(LidarpoolError, match=r"run\.db is damaged .* is not the place of this"):
+    with pytest.raises(LidarError, match=r"run\.db is damaged .* is not the place of this"):
         opened(folder)
     remove_run(folder)
     assert not folder.exists()
@@ -512,7 +512,7 @@ def test_parts_of_another_mark_stay(unfinished, tmp_path):
 def test_a_damaged_database_is_dropped_with_the_parts_of_its_folder(unfinished):
     (unfinished / "run.db").write_bytes(bytes(8192))
     put(unfinished / "parts", ["a.npz"])
-    with pytest.raises(LidarpoolError, match="drop the run with --fresh"):
+    with pytest.raises(LidarError, match="drop the run with --fresh"):
         opened(unfinished)
     assert len(names(unfinished)) == 5
     remove_run(unfinished)
@@ -528,7 +528,7 @@ def test_a_lost_database_is_made_again_from_the_parts(harm, folder, place):
     path = folder / "run.db"
     path.unlink() if harm == "missing" else path.write_bytes(path.read_bytes()[:6000])
     before = names(folder)
-    with pytest.raises(LidarpoolError, match="cannot be continued, it is of another scene"):
+    with pytest.raises(LidarError, match="cannot be continued, it is of another scene"):
         opened(folder, place, resume=True, job=OTHERS["scene"])
     assert names(folder) == before
     again = opened(folder, place, resume=True)
@@ -545,7 +545,7 @@ def test_a_database_of_another_program_stays(folder):
     (folder / "run.db").unlink()
     change(folder, "CREATE TABLE mine (a)")
     for use in (remove_run, new_run, partial(opened, resume=True)):
-        with pytest.raises(LidarpoolError, match=r"run\.db (is not the database|is damaged)"):
+        with pytest.raises(LidarError, match=r"run\.db (is not the database|is damaged)"):
             use(folder)
     assert len(names(folder)) == 3
 
@@ -553,7 +553,7 @@ def test_a_database_of_another_program_stays(folder):
 def test_a_run_that_is_going_on_is_not_dropped(folder):
     store = opened(folder)
     add(store, 0, 6)
-    with pytest.raises(LidarpoolError, match=f"Another run is using {folder}"):
+    with pytest.raises(LidarError, match=f"Another run is using {folder}"):
         remove_run(folder)
     assert len(store.only.points().load()) == 18
 
@@ -616,7 +616,7 @@ def test_a_run_that_is_taken_over_ends_and_leaves_all_to_the_other(how, url):
     late.save(now=True)
     before = left(url)
     with (
-        pytest.raises(LidarpoolError, match=f"taken over or deleted {url}") as caught,
+        pytest.raises(LidarError, match=f"taken over or deleted {url}") as caught,
         early.kept_on_error(),
     ):
         early.save(now=True)
@@ -625,7 +625,7 @@ def test_a_run_that_is_taken_over_ends_and_leaves_all_to_the_other(how, url):
     late.save(now=True)
     again = opened(url, resume=True)
     assert again.only.resumed == (6 if how == "resumed" else 4)
-    with pytest.raises(LidarpoolError, match="this one has ended"), late.kept_on_error():
+    with pytest.raises(LidarError, match="this one has ended"), late.kept_on_error():
         late.remove()
     assert left(url) == before
 
@@ -637,7 +637,7 @@ def test_storage_that_fails(url, monkeypatch):
         raise OSError("it is full")
 
     monkeypatch.setattr(lidarpool.run.remote.Storage, "write", fail)
-    with pytest.raises(LidarpoolError, match=f"cannot be kept in {url}: it is full"):
+    with pytest.raises(LidarError, match=f"cannot be kept in {url}: it is full"):
         store.save(now=True)
-    with pytest.raises(LidarpoolError, match=rf"Cannot write to {url} \(it is full\)"):
+    with pytest.raises(LidarError, match=rf"Cannot write to {url} \(it is full\)"):
         opened(url, resume=True)

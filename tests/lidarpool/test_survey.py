@@ -14,19 +14,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from tests.shapes import Cart
 
-from lidarpool import (
-    Beams,
-    LidarpoolError,
-    Mounted,
-    Pose,
-    Sensor,
-    Spin,
-    Survey,
-    Track,
-    load_trajectory,
-)
+from lidarpool import Beams, LidarError, Mounted, Pose, Sensor, Spin, Survey, Track, load_trajectory
 from lidarpool.base.fingerprint import fingerprint
-from lidarpool.sensor.trajectory import matrices, quaternions_of, rotations_of, velocities
+from lidarsim.sensor.trajectory import matrices, quaternions_of, rotations_of, velocities
 
 RNG = np.random.default_rng(5)
 TIMES = np.cumsum(RNG.uniform(0.05, 0.4, 12)) + 1.4e9
@@ -225,11 +215,11 @@ class TestSurveys:
         assert Survey(Sensor.grid(), steps=5, trajectory=self.track).scan_count == 5
 
     def test_no_more_than_it_lasts(self):
-        with pytest.raises(LidarpoolError, match=r"steps 400 take until 1.111.* s, 0.061.* s less"):
+        with pytest.raises(LidarError, match=r"steps 400 take until 1.111.* s, 0.061.* s less"):
             Survey(Sensor.grid(rate_hz=10), steps=400, trajectory=self.track)
-        with pytest.raises(LidarpoolError, match="one time step"):
+        with pytest.raises(LidarError, match="one time step"):
             Survey(Sensor.grid(rate_hz=0.01), trajectory=self.track)
-        with pytest.raises(LidarpoolError, match=r"0 to 1.05 s.* 0.95 s outside"):
+        with pytest.raises(LidarError, match=r"0 to 1.05 s.* 0.95 s outside"):
             self.track.poses(0, np.array([2e9]))
 
     def test_sensors_come_one_after_the_other_each_with_its_rate(self):
@@ -301,7 +291,7 @@ def test_rotation_is_yaw_then_pitch_then_roll():
     ],
 )
 def test_values_out_of_range_say_which(arguments, message):
-    with pytest.raises(LidarpoolError, match=message):
+    with pytest.raises(LidarError, match=message):
         Survey(**({"poses": [(0, 0, 0)]} | arguments))
 
 
@@ -317,9 +307,7 @@ def test_each_sensor_may_start_later_and_take_steps_of_its_own():
     assert survey.pose(1000).position == pytest.approx((4, 0, 1))
     until = Survey(trajectory=way, sensors=[replace(late, steps=None)])
     assert until.steps_each == (800,)
-    with pytest.raises(
-        LidarpoolError, match=r"steps 900 take until 10[.]99.* trajectory lasts 10 s"
-    ):
+    with pytest.raises(LidarError, match=r"steps 900 take until 10[.]99.* trajectory lasts 10 s"):
         Survey(trajectory=way, sensors=[replace(late, steps=900)])
 
 
@@ -341,21 +329,21 @@ def test_a_pose_that_looks_straight_up_or_down_is_found_again(yaw, pitch):
     ],
 )
 def test_matrices_that_are_no_rotations_are_no_poses(matrix, fault, tmp_path):
-    with pytest.raises(LidarpoolError, match=f"pose {fault}: .* the determinant 1"):
+    with pytest.raises(LidarError, match=f"pose {fault}: .* the determinant 1"):
         Pose.of((1, 2, 3), matrix)
     rows = np.concatenate([np.eye(3), np.ones((3, 1))], axis=1)
     other = np.concatenate([matrix, np.ones((3, 1))], axis=1)
     np.savetxt(tmp_path / "poses.txt", [rows.ravel(), other.ravel()])
     np.savetxt(tmp_path / "times.txt", [0, 1])
-    with pytest.raises(LidarpoolError, match=f"Matrix 1 of a pose {fault}"):
+    with pytest.raises(LidarError, match=f"Matrix 1 of a pose {fault}"):
         load_trajectory(tmp_path / "poses.txt", times=tmp_path / "times.txt")
 
 
 def test_a_start_needs_a_time_zone_and_a_year_of_known_leap_seconds():
     for start in (datetime(2026, 11, 21), datetime(2016, 12, 31, tzinfo=UTC)):
-        with pytest.raises(LidarpoolError, match="a time from 2017 on, with its time zone"):
+        with pytest.raises(LidarError, match="a time from 2017 on, with its time zone"):
             Survey(poses=[(0, 0, 1)], start=start)
-    with pytest.raises(LidarpoolError, match="epsg is 5; it must be 1024 to 32767"):
+    with pytest.raises(LidarError, match="epsg is 5; it must be 1024 to 32767"):
         Survey(poses=[(0, 0, 1)], epsg=5)
 
 
@@ -445,7 +433,7 @@ def test_beams_cannot_be_changed_in_place():
     ],
 )
 def test_values_out_of_range_name_the_field(make, message):
-    with pytest.raises(LidarpoolError, match=message):
+    with pytest.raises(LidarError, match=message):
         make()
 
 
@@ -457,5 +445,5 @@ def test_a_turn_of_a_narrow_grid_sweeps_its_field_of_view():
     azimuth = np.degrees(np.arctan2(y, x))[::3]
     assert azimuth == pytest.approx(np.linspace(-15, 15, 400, endpoint=False))
     assert np.degrees(np.arcsin(z))[:3] == pytest.approx([-10, 0, 10])
-    with pytest.raises(LidarpoolError, match="horizontal_fov_deg is 361"):
+    with pytest.raises(LidarError, match="horizontal_fov_deg is 361"):
         Sensor.grid(horizontal_fov_deg=361)

@@ -24,12 +24,12 @@ from tests.rows import quick
 
 import lidarpool
 import lidarpool.export.kitti
-from lidarpool import LidarpoolError, Scene, Sweep
-from lidarpool.base.storage import Storage
+from lidarpool import LidarError, Scene, Sweep
 from lidarpool.datasets.dataset import INDEX_FILE
 from lidarpool.export.boxes import Boxes
 from lidarpool.export.format_table import DATA_SETS
-from lidarpool.export.sweeps import Sweeps
+from lidarsim.base.storage import Storage
+from lidarsim.sweeps.sweeps import Sweeps
 
 JOBS = len(SPLITS)
 
@@ -153,7 +153,7 @@ def test_sweeps_are_chosen_by_split_job_and_sensor(written):
         ({"shuffle": -1}, "shuffle is -1; it must be at least 0"),
         ({"sensors": "front"}, "sensors is 'front'; it must be a list of text"),
     ):
-        with pytest.raises(LidarpoolError, match=words) as told:
+        with pytest.raises(LidarError, match=words) as told:
             lidarpool.sweeps(place, **options)
         assert "\n" not in str(told.value)
 
@@ -173,7 +173,7 @@ def test_a_store_that_does_not_answer_is_not_taken_for_a_damaged_file(
         raise RuntimeError("Could not connect")  # libraries have errors of their own
 
     monkeypatch.setattr(MemoryFileSystem, "cat_file", unreachable)
-    with pytest.raises(LidarpoolError, match=r"01\.bin cannot be read: RuntimeError: Could not"):
+    with pytest.raises(LidarError, match=r"01\.bin cannot be read: RuntimeError: Could not"):
         data[1]
 
 
@@ -182,7 +182,7 @@ def test_what_is_no_data_set_is_told_in_a_line(written, tmp_path, monkeypatch):
     shutil.copytree(written("kitti"), place)
 
     def told(what: Callable[[], Any], words: str) -> None:
-        with pytest.raises(LidarpoolError, match=words) as raised:
+        with pytest.raises(LidarError, match=words) as raised:
             what()
         assert len(str(raised.value).splitlines()) == 1
 
@@ -239,9 +239,7 @@ def test_a_damaged_file_is_named(written, tmp_path, name, file):
         (place / file).write_bytes(there) if there is not None else (place / file).unlink()
         if name == "nuscenes" and there == b"":
             continue  # a sweep without points
-        with pytest.raises(
-            LidarpoolError, match=r"damaged|cannot be read|not a point cloud"
-        ) as told:
+        with pytest.raises(LidarError, match=r"damaged|cannot be read|not a point cloud") as told:
             list(lidarpool.sweeps(place, jobs=[0]))
         assert len(str(told.value).splitlines()) == 1 and file.split("/part")[0] in str(told.value)
 
@@ -372,5 +370,5 @@ def test_torch_divides_sweeps_between_ranks_and_workers(written, torch, ranks, w
 
 def test_without_torch(written, monkeypatch):
     monkeypatch.setattr("lidarpool.datasets.loader.find_spec", lambda name: None)
-    with pytest.raises(LidarpoolError, match="needs PyTorch: pip install torch"):
+    with pytest.raises(LidarError, match="needs PyTorch: pip install torch"):
         lidarpool.sweeps(written("kitti")).torch()

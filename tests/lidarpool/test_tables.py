@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from lidarpool.base.tables import DEGREES, METRES, SECONDS, Quantity, column_name, read_table
+from lidarsim.base.tables import DEGREES, METRES, SECONDS, Quantity, column_name, read_table
 
 TIME = Quantity("time_s", ("time", "t"), SECONDS, None)
 RANGE = Quantity("range_m", ("range", "distance"), METRES, "m")

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from tests.meshes import NESTED
 
-from lidarpool.base.errors import LidarpoolError
-from lidarpool.scene.files.meshfile import load_meshes
+from lidarsim.base.errors import LidarError
+from lidarsim.scene.files.meshfile import load_meshes
 
 MODEL = (
     '<?xml version="1.0"?>{doctype}'
@@ -165,5 +165,5 @@ def test_the_model_that_the_package_names_is_built(tmp_path):
     ids=str,
 )
 def test_what_cannot_be_read_says_what_it_is(tmp_path, parts, message):
-    with pytest.raises(LidarpoolError, match=message):
+    with pytest.raises(LidarError, match=message):
         load(tmp_path, **parts)

@@ -10,17 +10,17 @@ import numpy as np
 import pytest
 from tests.shapes import cast_between, made
 
-from lidarpool import LidarpoolError, Mounted, Pose, Scene, Survey, Track, load_sensor, save_cloud
+from lidarpool import LidarError, Mounted, Pose, Scene, Survey, Track, load_sensor, save_cloud
 from lidarpool.base.fingerprint import fingerprint
-from lidarpool.columns.cloud import Cloud
-from lidarpool.export.sweeps import Sweeps
 from lidarpool.run.picture_file import PictureContent
 from lidarpool.scenario.advice import advice
 from lidarpool.scenario.build import build
 from lidarpool.scenario.scenario import Scenario
-from lidarpool.scene.actors import Actor, box
-from lidarpool.simulator.rig import Rig
-from lidarpool.simulator.surfaces import Surfaces
+from lidarsim.columns.cloud import Cloud
+from lidarsim.scene.actors import Actor, box
+from lidarsim.simulator.rig import Rig
+from lidarsim.simulator.surfaces import Surfaces
+from lidarsim.sweeps.sweeps import Sweeps
 
 FLOOR = box("Floor", (60, 60, 0.01))
 COLUMNS = ["time", "range", "triangle", "intensity", "class"]
@@ -64,12 +64,12 @@ def test_an_actor_is_hit_only_while_it_is_there(model, backend):
 
 def test_an_actor_is_refused_held_or_absent_beyond_its_trajectory():
     times = np.array([-1e9, 0.02e9, 1e9])
-    with pytest.raises(LidarpoolError, match="outside"):
+    with pytest.raises(LidarError, match="outside"):
         passing("refuse").trajectory.poses(0, times)
     for beyond in ("hold", "absent"):
         places, _ = passing(beyond).trajectory.poses(0, times)
         assert places[:, 0].tolist() == pytest.approx([-2, -2, 2])
-    with pytest.raises(LidarpoolError, match="start_s is nan; it must be a finite number"):
+    with pytest.raises(LidarError, match="start_s is nan; it must be a finite number"):
         Track([0, 1], [[0, 0, 0], [1, 0, 0]], start_s=np.nan, beyond="absent")
 
 
@@ -243,9 +243,9 @@ def test_a_carrier_follows_surfaces_and_must_stay_on_them(tmp_path, far):
     points[1]["position"] = [x + 30, y + 5, 0]
     points.insert(1, {"time_s": 4, "position": [x + 10, y + 5, 0.3]})
     assert build(read(points, duration_s=3)).survey.path.duration_ns == 3e9
-    with pytest.raises(LidarpoolError, match=r"leaves its surfaces \(Ramp\)"):
+    with pytest.raises(LidarError, match=r"leaves its surfaces \(Ramp\)"):
         build(read(points))
-    with pytest.raises(LidarpoolError, match=r"trajectory\.beyond is for actors"):
+    with pytest.raises(LidarError, match=r"trajectory\.beyond is for actors"):
         read(points, beyond="hold")
 
 
@@ -285,7 +285,7 @@ def test_vehicles_of_one_entry_share_a_mesh_also_in_the_file_of_pictures(tmp_pat
     ],
 )
 def test_unusable_data_is_refused(tmp_path, text, told):
-    with pytest.raises(LidarpoolError, match=rf"fcd\.xml is not usable as floating .*{told}"):
+    with pytest.raises(LidarError, match=rf"fcd\.xml is not usable as floating .*{told}"):
         build(scenario(tmp_path, text))
 
 
@@ -331,13 +331,13 @@ def test_who_rides_in_a_vehicle_is_no_actor(tmp_path):
 def test_what_is_wrong_with_traffic_is_told(tmp_path):
     nobody = scenario(tmp_path, traffic={"offset_s": 300})
     assert any("no vehicle or person is in the" in n for n in advice(build(nobody)))
-    with pytest.raises(LidarpoolError, match=r"traffic\.surfaces"):
+    with pytest.raises(LidarError, match=r"traffic\.surfaces"):
         scenario(tmp_path, traffic={"surfaces": []})
-    with pytest.raises(LidarpoolError, match=r"type 'car', but no entry .* add one, such as"):
+    with pytest.raises(LidarError, match=r"type 'car', but no entry .* add one, such as"):
         build(scenario(tmp_path, traffic={"vehicles": SHAPES[:1]}))
-    with pytest.raises(LidarpoolError, match="give either file or box"):
+    with pytest.raises(LidarError, match="give either file or box"):
         scenario(tmp_path, traffic={"vehicles": [{"types": "*"}]})
-    with pytest.raises(LidarpoolError, match=r"no\.xml' does not exist|no\.xml.*No such file"):
+    with pytest.raises(LidarError, match=r"no\.xml' does not exist|no\.xml.*No such file"):
         build(scenario(tmp_path, traffic={"file": "no.xml"}))
-    with pytest.raises(LidarpoolError, match="surfaces names 'Street'"):
+    with pytest.raises(LidarError, match="surfaces names 'Street'"):
         build(scenario(tmp_path, traffic={"surfaces": "Street"}))

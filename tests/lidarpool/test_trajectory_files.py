@@ -5,7 +5,7 @@ import gzip
 import numpy as np
 import pytest
 
-from lidarpool import LidarpoolError, Pose, Track, load_trajectory
+from lidarpool import LidarError, Pose, Track, load_trajectory
 from lidarpool.scenario.build import build
 from lidarpool.scenario.scenario import Scenario
 
@@ -108,7 +108,7 @@ def test_without_an_orientation_the_carrier_faces_its_direction_of_travel(load):
 )  # fmt: skip
 def test_a_column_that_is_not_understood_is_refused(load, names, values, words):
     rows = ROWS if names else [f"{row},{values}" for row in ROWS]
-    with pytest.raises(LidarpoolError, match=words) as raised:
+    with pytest.raises(LidarError, match=words) as raised:
         load(names, values if names else "", rows=rows)
     assert len(str(raised.value).splitlines()) == 1
 
@@ -125,9 +125,9 @@ def test_columns_that_are_named_or_ignored(load):
         ({"columns": {"yaw": "heading"}, "ignore": ["sp*"]}, "'heading' has no unit: call it yaw"),
         ({"columns": {"jaw": "speed"}}, "columns names 'jaw'; possible names are time_s"),
     ):
-        with pytest.raises(LidarpoolError, match=words):
+        with pytest.raises(LidarError, match=words):
             load(*both, **options)
-    with pytest.raises(LidarpoolError, match=r"'yaw_rad' as yaw_deg: the header states rad"):
+    with pytest.raises(LidarError, match=r"'yaw_rad' as yaw_deg: the header states rad"):
         load("yaw_rad", "1", columns={"yaw_deg": "yaw_rad"})
 
 
@@ -135,7 +135,7 @@ def test_times_have_a_unit(load):
     for name, times in (("timestamp [ns]", (0, 1e9)), ("t_ms", (0, 1e3)), ("Time(us)", (0, 1e6))):
         rows = [f"{time:.0f},{x},0,1" for time, x in zip(times, (0, 10), strict=True)]
         assert load(head=f"{name},x,y,z", rows=rows).times_s.tolist() == [0, 1]
-    with pytest.raises(LidarpoolError, match="'time' has no unit: call it time_s, in seconds"):
+    with pytest.raises(LidarError, match="'time' has no unit: call it time_s, in seconds"):
         load(head="time,x,y,z")
     rows = ["0;0;0;1000", "1;10000;0;1000"]
     track = load(head="time_s;x [mm];y [mm];z [mm]", rows=rows)
@@ -190,7 +190,7 @@ def test_tum_honours_the_order_of_its_header(tmp_path, remarks, columns, name):
 
 def test_a_header_of_tum_with_unknown_names(tmp_path):
     (tmp_path / "a.tum").write_text("# timestamp tx ty tz a b c d\n0 0 0 0 0 0 0 1\n")
-    with pytest.raises(LidarpoolError, match="not known: a, b, c, d"):
+    with pytest.raises(LidarError, match="not known: a, b, c, d"):
         load_trajectory(tmp_path / "a.tum")
 
 
@@ -236,13 +236,13 @@ def test_oxts_of_kitti(oxts):
 
 def test_oxts_that_are_not_whole(oxts):
     (oxts / "data" / "0000000001.txt").write_text("1 2 3")
-    with pytest.raises(LidarpoolError, match=r"0000000001\.txt has 3 numbers, not 30"):
+    with pytest.raises(LidarError, match=r"0000000001\.txt has 3 numbers, not 30"):
         load_trajectory(oxts)
     (oxts / "data" / "0000000001.txt").unlink()
-    with pytest.raises(LidarpoolError, match=r"2 files of data, and timestamps\.txt 3 times"):
+    with pytest.raises(LidarError, match=r"2 files of data, and timestamps\.txt 3 times"):
         load_trajectory(oxts)
     (oxts / "timestamps.txt").unlink()
-    with pytest.raises(LidarpoolError, match=r"a folder is one of KITTI, with timestamps\.txt"):
+    with pytest.raises(LidarError, match=r"a folder is one of KITTI, with timestamps\.txt"):
         load_trajectory(oxts)
 
 
@@ -266,7 +266,7 @@ def test_oxts_that_are_not_whole(oxts):
 @pytest.mark.parametrize("name", ["a.bag", "a.csv"])
 def test_other_files_are_named(tmp_path, content, words, name):
     (tmp_path / name).write_bytes(content)
-    with pytest.raises(LidarpoolError, match=words) as raised:
+    with pytest.raises(LidarError, match=words) as raised:
         load_trajectory(tmp_path / name)
     assert "codec" not in str(raised.value)
 
@@ -274,7 +274,7 @@ def test_other_files_are_named(tmp_path, content, words, name):
 def test_a_trj_of_helios_is_read_with_its_units(tmp_path):
     text = '#HEADER: "t", "roll", "pitch", "yaw", "x", "y", "z"\n0,0,0,0.5,0,0,9\n1,0,0,0.5,5,0,9\n'
     (tmp_path / "a.trj").write_text(text)
-    with pytest.raises(LidarpoolError, match=r"'t' has no unit.*lidarpool import` reads a \.trj"):
+    with pytest.raises(LidarError, match=r"'t' has no unit.*lidarpool import` reads a \.trj"):
         load_trajectory(tmp_path / "a.trj")
     columns = {"time_s": "t", "yaw_rad": "yaw", "pitch_rad": "pitch", "roll_rad": "roll"}
     track = load_trajectory(tmp_path / "a.trj", columns=columns)
@@ -287,18 +287,18 @@ def test_options_of_other_formats_are_refused(load, tmp_path):
         ({"origin": (49.0, 8.4, 0.0)}, "origin is of latitudes"),
         ({"format": "bag"}, "a folder is one of KITTI|metadata.yaml"),
     ):
-        with pytest.raises(LidarpoolError, match=words):
+        with pytest.raises(LidarError, match=words):
             load("yaw_deg", "40", **options)
     np.savetxt(tmp_path / "a.tum", np.eye(8)[[7, 7]] + np.arange(2)[:, None] * np.eye(8)[0])
     assert isinstance(load_trajectory(tmp_path / "a.tum"), Track)
-    with pytest.raises(LidarpoolError, match="columns and ignore are of tables"):
+    with pytest.raises(LidarError, match="columns and ignore are of tables"):
         load_trajectory(tmp_path / "a.tum", ignore=["a"])
 
 
 def test_binary_files_of_times_are_named(tmp_path):
     np.savetxt(tmp_path / "poses.txt", [np.eye(4)[:3].ravel()] * 2)
     (tmp_path / "times.txt").write_bytes(gzip.compress(b"0\n1\n"))
-    with pytest.raises(LidarpoolError, match=r"times\.txt has no times: it is compressed by gzip"):
+    with pytest.raises(LidarError, match=r"times\.txt has no times: it is compressed by gzip"):
         load_trajectory(tmp_path / "poses.txt", times=tmp_path / "times.txt")
 
 

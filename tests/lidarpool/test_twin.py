@@ -11,18 +11,18 @@ from tests.lidarpool.twin import Hit
 from tests.shapes import quad
 
 from lidarpool import Beams, Material, Noise, Optics, Returns, Scene, Sensor, Spin, Survey
-from lidarpool.sensor.disc import Beam
-from lidarpool.sensor.noise import Purpose, named_seed, raw, starts
-from lidarpool.sensor.optics import FWHM, LIGHT_M_NS
-from lidarpool.sensor.weather import Air, spray
-from lidarpool.simulator import pulse_loops
-from lidarpool.simulator.air import WeatherStep, exponential, seen_by_range
-from lidarpool.simulator.returns import AIR, NO_SURFACE, Keys, PulseReturns
-from lidarpool.simulator.saturation import saturated
-from lidarpool.simulator.separation import Report, separated
-from lidarpool.simulator.step import Setup
-from lidarpool.simulator.surfaces import Light, Surfaces
-from lidarpool.simulator.waveform import Digitizer, returns_in
+from lidarsim.sensor.disc import Beam
+from lidarsim.sensor.noise import Purpose, named_seed, raw, starts
+from lidarsim.sensor.optics import FWHM, LIGHT_M_NS
+from lidarsim.sensor.weather import Air, spray
+from lidarsim.simulator import pulse_loops
+from lidarsim.simulator.air import WeatherStep, exponential, seen_by_range
+from lidarsim.simulator.returns import AIR, NO_SURFACE, Keys, PulseReturns
+from lidarsim.simulator.saturation import saturated
+from lidarsim.simulator.separation import Report, separated
+from lidarsim.simulator.step import Setup
+from lidarsim.simulator.surfaces import Light, Surfaces
+from lidarsim.simulator.waveform import Digitizer, returns_in
 
 GAP = 0.75
 KEYS = Keys(3, np.array([0, 40, 41, 300]))

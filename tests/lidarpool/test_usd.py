@@ -18,18 +18,18 @@ from PIL import Image
 from tests.usd_server import UsdServer
 
 from lidarpool import Pose, Scanner, Scene, Sensor
-from lidarpool.base import allowance
-from lidarpool.base.errors import LidarpoolError
-from lidarpool.columns.table import COLOURS
 from lidarpool.scenario.advice import advice
 from lidarpool.scenario.build import build
 from lidarpool.scenario.scenario import Scenario
-from lidarpool.scene.colours import LINEAR, as_srgb
-from lidarpool.scene.files import scene_graph as nodes
-from lidarpool.scene.files import usd
-from lidarpool.scene.files.meshfile import load_meshes, load_objects
-from lidarpool.scene.scene_instances import SceneInstance
-from lidarpool.scene.transform import Transform
+from lidarsim.base import allowance
+from lidarsim.base.errors import LidarError
+from lidarsim.columns.table import COLOURS
+from lidarsim.scene.colours import LINEAR, as_srgb
+from lidarsim.scene.files import scene_graph as nodes
+from lidarsim.scene.files import usd
+from lidarsim.scene.files.meshfile import load_meshes, load_objects
+from lidarsim.scene.scene_instances import SceneInstance
+from lidarsim.scene.transform import Transform
 
 pytestmark = pytest.mark.skipif(find_spec("pxr") is None, reason="needs usd-core, an extra")
 
@@ -236,7 +236,7 @@ def test_what_moves_otherwise_stands_and_is_noted(tmp_path):
     assert not built.scene.actors and built.scene.bounds[0, 0] == 1
     assert "nothing stands in the scene" in advice(built)[0]
     uneven = Transform.place(scale=(1, 2, 1))
-    with pytest.raises(LidarpoolError, match="'Car' moves, and its placement scales it unevenly"):
+    with pytest.raises(LidarError, match="'Car' moves, and its placement scales it unevenly"):
         Scene.load(path, transform=uneven)
 
 
@@ -255,11 +255,11 @@ def test_files_elsewhere_are_read_if_their_folder_is_named(tmp_path):
         files = [{"file": "scenes/m.usda"} | more]
         return build(Scenario.from_data({"scene": {"files": files}}, folder=tmp_path)).scene.names
 
-    with pytest.raises(LidarpoolError, match=r"name a folder .* as assets"):
+    with pytest.raises(LidarError, match=r"name a folder .* as assets"):
         names()
     assert names(assets="assets") == names(assets=".") == ("A", "B")
     write(scenes / "m.usda", outer, prim("C", "", "", "references = @../q.usda@</Quad>"))
-    with pytest.raises(LidarpoolError, match=r"'\.\./q\.usda', but only files"):
+    with pytest.raises(LidarError, match=r"'\.\./q\.usda', but only files"):
         names(assets="assets")
 
 
@@ -449,7 +449,7 @@ def test_unusable_animations_are_refused_in_a_line(tmp_path, stage, text, name, 
         person(path, stage=stage)
     else:
         write(path, prim("A", text=QUAD), prim("B", text=text), stage=stage)
-    with pytest.raises(LidarpoolError, match=message) as refused:
+    with pytest.raises(LidarError, match=message) as refused:
         load_objects(path, animation=name)
     assert "\n" not in str(refused.value)
 
@@ -564,17 +564,17 @@ def test_missing_and_foreign_files_are_named(tmp_path):
         "m.usda refers to what is not there or cannot be read, and lacks it: 'bad.usda', "
         "'https:/example.com/x.usd', 'no.usda'"
     ]
-    with pytest.raises(LidarpoolError, match=r"no triangles, and refers to .*: 'no\.usda'"):
+    with pytest.raises(LidarError, match=r"no triangles, and refers to .*: 'no\.usda'"):
         load_meshes(write(folder / "m.usda", missing[0]))
     with pytest.raises(
-        LidarpoolError, match=r"from '\.\./outside\.usda', but only files in its own folder"
+        LidarError, match=r"from '\.\./outside\.usda', but only files in its own folder"
     ):
         load_meshes(
             write(
                 folder / "m.usda", prim("A", "Xform", "", "references = @../outside.usda@</Quad>")
             )
         )
-    with pytest.raises(LidarpoolError, match="only files in its own folder"):
+    with pytest.raises(LidarError, match="only files in its own folder"):
         load_meshes(
             write(
                 folder / "m.usda", prim("Quad"), stage=METRES + "\nsubLayers = [@../outside.usda@]"
@@ -601,7 +601,7 @@ def test_bad_files_are_refused_in_a_line(tmp_path, capfd, text, message):
         path.write_text(text)
     else:
         write(path, prim("Quad", text=text))
-    with pytest.raises(LidarpoolError) as refused:
+    with pytest.raises(LidarError) as refused:
         load_meshes(path)
     assert message in str(refused.value) and "\n" not in str(refused.value)
     assert capfd.readouterr() == ("", "")
@@ -611,7 +611,7 @@ def test_few_lines_do_not_make_millions_of_objects(tmp_path):
     count = nodes.MOST_NODES + 1
     text = f"int[] protoIndices = [{'0,' * count}]\nrel prototypes = </F/K>\n" + prim("K")
     text += f"point3f[] positions = [{'(0,0,0),' * count}]\n"
-    with pytest.raises(LidarpoolError, match="more than 200,000 prims and copies"):
+    with pytest.raises(LidarError, match="more than 200,000 prims and copies"):
         load_meshes(write(tmp_path / "m.usda", prim("F", "PointInstancer", text)))
     levels = "".join(
         prim(f"L{i}", "Xform", "".join(
@@ -619,7 +619,7 @@ def test_few_lines_do_not_make_millions_of_objects(tmp_path):
             for k in range(10)) if i else prim("Quad"))
         for i in range(8)
     )  # fmt: skip
-    with pytest.raises(LidarpoolError, match="more than 200,000 in all"):
+    with pytest.raises(LidarError, match="more than 200,000 in all"):
         load_meshes(write(tmp_path / "m.usda", levels))
 
 
@@ -628,14 +628,14 @@ def test_a_library_that_dies_or_wants_too_much_ends_itself_only(tmp_path, monkey
     monkeypatch.setattr(usd, "subprocess", subprocess)
     monkeypatch.setattr(usd, "_BASE", 0)
     monkeypatch.setattr(usd, "memory_share", lambda: 60 * 2**20)
-    with pytest.raises(LidarpoolError, match=r"m\.usda is broken or cut short \("):
+    with pytest.raises(LidarError, match=r"m\.usda is broken or cut short \("):
         load_meshes(
             write(tmp_path / "m.usda", prim("Quad", text=QUAD + f"int[] a = [{'1,' * 10**6}]"))
         )
     monkeypatch.undo()
     monkeypatch.setattr(allowance, "LEAST", 1000)
     monkeypatch.setattr(allowance, "TIMES", 0.01)
-    with pytest.raises(LidarpoolError, match="would unpack to"):
+    with pytest.raises(LidarError, match="would unpack to"):
         load_meshes(
             write(
                 tmp_path / "m.usda",
@@ -667,7 +667,7 @@ def test_garbled_files_give_errors_or_meshes(tmp_path, changes):
     binary.write_bytes(data)
     try:
         assert load_meshes(binary)
-    except LidarpoolError as error:
+    except LidarError as error:
         assert str(error).count("\n") < 2
 
 
@@ -888,5 +888,5 @@ def test_what_cannot_be_read_is_noted(folder, inputs, image, kind, colour, why):
 def test_pipes_that_a_scene_names_are_not_waited_for(tmp_path, text):
     os.mkfifo(tmp_path / "f.usda")
     (tmp_path / "m.usda").write_text(text)
-    with pytest.raises(LidarpoolError, match=r"it names 'f\.usda', which is no plain file"):
+    with pytest.raises(LidarError, match=r"it names 'f\.usda', which is no plain file"):
         load_meshes(tmp_path / "m.usda")

@@ -14,7 +14,7 @@ from tests.shapes import CPU, ball, box
 from lidarpool import (
     Actor,
     Beams,
-    LidarpoolError,
+    LidarError,
     Material,
     Noise,
     Returns,
@@ -25,9 +25,9 @@ from lidarpool import (
     Survey,
     Track,
 )
-from lidarpool.scene.scene_mesh import SceneMesh
-from lidarpool.sensor.leaves import NAMES, brightness, density, projection
-from lidarpool.simulator.rig import Rig
+from lidarsim.scene.scene_mesh import SceneMesh
+from lidarsim.sensor.leaves import NAMES, brightness, density, projection
+from lidarsim.simulator.rig import Rig
 
 GROUND = Material("*", 0.3)
 cast = partial(shapes.cast, backend="embree")
@@ -153,7 +153,7 @@ def test_moved_and_turned_crowns_hold_the_same_leaves():
 def test_a_surface_with_gaps_is_refused():
     open_box = box("Crown", (1, -1, -1), (2, 1, 1))
     gappy = SceneMesh("Crown", open_box.vertices, open_box.faces[1:])
-    with pytest.raises(LidarpoolError, match="'Crown' has a leaf_area_density, but its surface"):
+    with pytest.raises(LidarError, match="'Crown' has a leaf_area_density, but its surface"):
         cast([gappy], rays(1), materials=[Material("*", leaf_area_density=1.0)])
 
 
@@ -166,12 +166,12 @@ def test_a_surface_with_gaps_is_refused():
     ],
 )
 def test_materials_that_mean_nothing_are_refused(fields, says):
-    with pytest.raises(LidarpoolError, match=says):
+    with pytest.raises(LidarError, match=says):
         Material("*", **fields)
 
 
 def test_a_leaf_angle_without_leaves_is_refused():
-    with pytest.raises(LidarpoolError, match="'Crown' has a leaf_angle, which needs a leaf_area"):
+    with pytest.raises(LidarError, match="'Crown' has a leaf_angle, which needs a leaf_area"):
         cast([ball("Crown", 1.0)], rays(1), materials=[Material("*", leaf_angle="planophile")])
 
 

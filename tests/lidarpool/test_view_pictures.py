@@ -15,7 +15,7 @@ from matplotlib.figure import Figure
 from PIL import Image
 from tests.shapes import block, quad
 
-from lidarpool import Cloud, LidarpoolError
+from lidarpool import Cloud, LidarError
 from lidarpool.plan import Planning, best, run_trial
 from lidarpool.render.hit_density import hit_density
 from lidarpool.render.pictures import draw_cloud, draw_hits, draw_scene, with_points
@@ -23,10 +23,10 @@ from lidarpool.render.shot import GROUND, SKY, take_shot
 from lidarpool.render.stage import make_axis, nice_step
 from lidarpool.render.theme import object_colours
 from lidarpool.report.result_pictures import draw_path
-from lidarpool.scene.actors import box
-from lidarpool.scene.scene import Scene
-from lidarpool.scene.scene_mesh import SceneMesh
-from lidarpool.scene.shapes import seed_objects
+from lidarsim.scene.actors import box
+from lidarsim.scene.scene import Scene
+from lidarsim.scene.scene_mesh import SceneMesh
+from lidarsim.scene.shapes import seed_objects
 
 SIZE = (320, 200)
 LEFT = slice(0, int(0.8 * SIZE[0]))  # columns beside the legend
@@ -205,14 +205,14 @@ def test_the_path_plot_has_equal_axes_in_world_coordinates(planned):
 
 
 def test_a_picture_that_cannot_be_written_is_named(tmp_path, shot, monkeypatch):
-    with pytest.raises(LidarpoolError, match=r"gone.*choose a folder"):
+    with pytest.raises(LidarError, match=r"gone.*choose a folder"):
         draw_scene(shot, 9).save(tmp_path / "gone" / "scene.png")
 
     def full_disk(figure, file, **options):
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(Figure, "savefig", full_disk)
-    with pytest.raises(LidarpoolError, match=r"scene\.png.*No space left"):
+    with pytest.raises(LidarError, match=r"scene\.png.*No space left"):
         draw_scene(shot, 9).save(tmp_path / "scene.png")
 
 

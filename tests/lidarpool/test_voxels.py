@@ -14,7 +14,7 @@ from tests.shapes import CPU, Cart, ball, box, cast_between
 from lidarpool import (
     Actor,
     Beams,
-    LidarpoolError,
+    LidarError,
     Material,
     Pose,
     Scene,
@@ -25,14 +25,14 @@ from lidarpool import (
 )
 from lidarpool.scenario.build import build
 from lidarpool.scenario.scenario import Scenario
-from lidarpool.scene.actors import one_mesh
-from lidarpool.scene.files.meshfile import load_meshes
-from lidarpool.scene.scene_file import write_scene
-from lidarpool.scene.scene_mesh import SceneMesh, Voxels
-from lidarpool.scene.transform import Transform
-from lidarpool.sensor.leaves import projection
-from lidarpool.simulator.memory import cast_bytes
-from lidarpool.simulator.rig import Rig
+from lidarsim.scene.actors import one_mesh
+from lidarsim.scene.files.meshfile import load_meshes
+from lidarsim.scene.scene_file import write_scene
+from lidarsim.scene.scene_mesh import SceneMesh, Voxels
+from lidarsim.scene.transform import Transform
+from lidarsim.sensor.leaves import projection
+from lidarsim.simulator.memory import cast_bytes
+from lidarsim.simulator.rig import Rig
 
 NAMES = "i j k PadBVTotal angleMean nbSampling"
 
@@ -147,7 +147,7 @@ def test_broken_files_are_refused(tmp_path, old, new, says):
     text = path.read_text()
     assert old in text
     path.write_text(text.replace(old, new), encoding="latin-1", errors="replace")
-    with pytest.raises(LidarpoolError, match=says) as refused:
+    with pytest.raises(LidarError, match=says) as refused:
         load_meshes(path)
     assert "\n" not in str(refused.value)
 
@@ -157,12 +157,12 @@ def test_cut_files_are_refused(tmp_path, cut):
     path = written(tmp_path / "a.vox", np.full((3, 1, 1), 0.5))
     content = path.read_bytes()
     path.write_bytes(content[: len(content) - len(b" 12\n") - cut])
-    with pytest.raises(LidarpoolError):
+    with pytest.raises(LidarError):
         load_meshes(path)
 
 
 def test_empty_and_huge_grids_are_refused_in_little_memory(tmp_path):
-    with pytest.raises(LidarpoolError, match="has no voxel whose PadBVTotal is above 0"):
+    with pytest.raises(LidarError, match="has no voxel whose PadBVTotal is above 0"):
         tree(tmp_path / "a.vox", np.zeros((2, 2, 2)))
     path = tmp_path / "b.vox"
     path.write_text(
@@ -170,7 +170,7 @@ def test_empty_and_huge_grids_are_refused_in_little_memory(tmp_path):
         "#res:1\ni j k PadBVTotal\n0 0 0 1\n9999 9999 9999 1\n"
     )
     tracemalloc.start()
-    with pytest.raises(LidarpoolError, match=r"would unpack to 3\.64 TiB"):
+    with pytest.raises(LidarError, match=r"would unpack to 3\.64 TiB"):
         load_meshes(path)
     assert tracemalloc.get_traced_memory()[1] < 10e6
     tracemalloc.stop()
@@ -317,8 +317,8 @@ def test_batches_blocks_and_backends_leave_no_trace(tmp_path, path, monkeypatch)
     rig = Rig(Scene.from_meshes(meshes), survey, "numpy")
     whole = cast_between(rig, survey, [0, 24])
     assert len(whole[0]["x"]) > 4000
-    monkeypatch.setattr("lidarpool.simulator.pulses.CHUNK_RAYS", 1000)
-    monkeypatch.setattr("lidarpool.simulator.voxels.BLOCK_RAYS", 33)
+    monkeypatch.setattr("lidarsim.simulator.pulses.CHUNK_RAYS", 1000)
+    monkeypatch.setattr("lidarsim.simulator.voxels.BLOCK_RAYS", 33)
     assert cast_between(rig, survey, [0, 1, 5, 12, 17, 24]) == whole
     if "embree" in CPU:
         other = Rig(Scene.from_meshes(meshes), survey, "embree")
@@ -334,25 +334,25 @@ def test_batches_blocks_and_backends_leave_no_trace(tmp_path, path, monkeypatch)
 )
 def test_materials_that_do_not_suit_voxels_are_refused(tmp_path, fields):
     mesh = tree(tmp_path / "T.vox", [[[1.0]]])
-    with pytest.raises(LidarpoolError, match="'T' is of voxels, whose file has the leaf area"):
+    with pytest.raises(LidarError, match="'T' is of voxels, whose file has the leaf area"):
         cast([mesh], rays(1), materials=[Material("*", **fields)])
 
 
 def test_what_voxels_cannot_do_is_refused(tmp_path):
     mesh = tree(tmp_path / "T.vox", [[[1.0]]])
-    with pytest.raises(LidarpoolError, match="'T' is of voxels, which cannot move"):
+    with pytest.raises(LidarError, match="'T' is of voxels, which cannot move"):
         Actor(mesh)
-    with pytest.raises(LidarpoolError, match="'X' has voxels, and cannot be joined"):
+    with pytest.raises(LidarError, match="'X' has voxels, and cannot be joined"):
         one_mesh("X", [mesh, mesh])
     assert one_mesh("X", [mesh]).voxels is not None
-    with pytest.raises(LidarpoolError, match="'T' is of voxels, which cannot be written"):
+    with pytest.raises(LidarError, match="'T' is of voxels, which cannot be written"):
         write_scene(tmp_path / "out.glb", Scene.from_meshes([mesh]))
     for density, matrix in [
         (np.zeros((1, 1, 1)), np.eye(3, 4)),
         (np.full((1, 1, 1), np.nan, np.float32), np.eye(3, 4)),
         (np.ones((1, 1, 1), np.float32), np.zeros((3, 4))),
     ]:
-        with pytest.raises(LidarpoolError, match=r"voxels of 'T' are .*; they must be float32"):
+        with pytest.raises(LidarError, match=r"voxels of 'T' are .*; they must be float32"):
             SceneMesh("T", mesh.vertices, mesh.faces, voxels=Voxels(density, matrix))
 
 

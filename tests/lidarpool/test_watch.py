@@ -4,7 +4,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from lidarpool import LidarpoolError
+from lidarpool import LidarError
 from lidarpool.run import watch
 from lidarpool.run.watch import Watch
 from poolpart.task_locations import TaskLocations
@@ -49,14 +49,14 @@ def test_a_partition_may_be_empty_for_a_while(look):
     look(63, *ALL)
     look(120, *ALL[1:])
     assert look.told[1:] == ["waiting for workers of partition GPU, for another 3 s"]
-    with pytest.raises(LidarpoolError, match=r"'GPU' has had no workers for 60 s.*\"GPU=1\""):
+    with pytest.raises(LidarError, match=r"'GPU' has had no workers for 60 s.*\"GPU=1\""):
         look(124, *ALL[1:])
 
 
 def test_workers_that_are_paused_take_no_tasks(look):
     paused = [("GPU", "paused"), *ALL[1:]]
     look(59, *paused)
-    with pytest.raises(LidarpoolError, match=r"'GPU' have taken no tasks for 60 s.*--memory-limit"):
+    with pytest.raises(LidarError, match=r"'GPU' have taken no tasks for 60 s.*--memory-limit"):
         look(61, *paused)
 
 
@@ -71,7 +71,7 @@ def test_one_that_is_not_paused_will_do_and_the_other_is_named_once(look):
 def test_what_runs_already_goes_on_where_workers_are_paused(look):
     look(61, *ALL[:2], ("LIDAR", "paused"))
     assert (look.told, look.watching.notes) == ([], [])
-    with pytest.raises(LidarpoolError, match="'LIDAR' has had no workers for 60 s"):
+    with pytest.raises(LidarError, match="'LIDAR' has had no workers for 60 s"):
         look(122, *ALL[:2])  # its workers count only as long as they are there
 
 
@@ -79,5 +79,5 @@ def test_a_partition_with_nothing_left_to_do_may_leave(look):
     look.watching.forget(["OTHER"])
     look(61, ALL[0], ALL[2])
     assert look.told == []
-    with pytest.raises(LidarpoolError, match="'GPU' has had no workers for 60 s"):
+    with pytest.raises(LidarError, match="'GPU' has had no workers for 60 s"):
         look(122, ALL[2])  # the others are watched as before

@@ -12,7 +12,7 @@ from tests.shapes import beam_along_x, cast, cast_between, quad, wall
 
 from lidarpool import (
     Beams,
-    LidarpoolError,
+    LidarError,
     Material,
     Noise,
     Returns,
@@ -22,14 +22,14 @@ from lidarpool import (
     Survey,
     save_cloud,
 )
-from lidarpool.columns.table import AXES, CAUSES, SCAN
-from lidarpool.columns.waveforms import WAVEFORM
 from lidarpool.report.report import CountedCloud
-from lidarpool.sensor.optics import FWHM, LIGHT_M_NS, Optics
-from lidarpool.simulator.batch import columns_of
-from lidarpool.simulator.returns import PulseReturns
-from lidarpool.simulator.rig import Rig
-from lidarpool.simulator.waveform import Digitizer, returns_in
+from lidarsim.columns.table import AXES, CAUSES, SCAN
+from lidarsim.columns.waveforms import WAVEFORM
+from lidarsim.sensor.optics import FWHM, LIGHT_M_NS, Optics
+from lidarsim.simulator.batch import columns_of
+from lidarsim.simulator.returns import PulseReturns
+from lidarsim.simulator.rig import Rig
+from lidarsim.simulator.waveform import Digitizer, returns_in
 from raybeam import available_backends
 
 SIGMA_NS = 5 / FWHM
@@ -199,7 +199,7 @@ def test_embree_and_numpy_agree():
 
 
 def test_what_does_not_fit_together_is_refused():
-    with pytest.raises(LidarpoolError, match=r"sample_ns is 1, and the pulse is 1 ns wide"):
+    with pytest.raises(LidarError, match=r"sample_ns is 1, and the pulse is 1 ns wide"):
         survey(returns=Returns(waveform="peaks", pulse_ns=1))
     assert Returns(pulse_ns=5).system_ns(Optics()) == pytest.approx(SIGMA_NS)
 
@@ -326,15 +326,15 @@ def test_las_files_hold_waveforms_that_lead_to_the_points(tmp_path, ending):
 
 
 def test_a_window_that_holds_no_echo_is_refused():
-    with pytest.raises(LidarpoolError, match=r"waveform_samples is 8, and one echo takes \d+"):
+    with pytest.raises(LidarError, match=r"waveform_samples is 8, and one echo takes \d+"):
         survey(waveform_samples=8)
-    with pytest.raises(LidarpoolError, match="has no waveforms"):
+    with pytest.raises(LidarError, match="has no waveforms"):
         _ = cloud_of(survey()).waveforms
 
 
 def test_samples_that_are_no_whole_picoseconds_apart_are_refused():
     sensor = beam_along_x()
-    with pytest.raises(LidarpoolError, match=r"whole picoseconds: .*give 0\.333"):
+    with pytest.raises(LidarError, match=r"whole picoseconds: .*give 0\.333"):
         Survey(sensor, poses=[(0, 0, 0)], returns=Returns(sample_ns=1 / 3), waveform_samples=160)
     for sample_ns in (0.333, 1.25, 0.1, 0.007):
         returns = Returns(sample_ns=sample_ns)

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from lidarpool import LidarpoolError, Pose, Track
-from lidarpool.sensor import Stations
-from lidarpool.simulator.ways import Ways
+from lidarpool import LidarError, Pose, Track
+from lidarsim.sensor import Stations
+from lidarsim.simulator.ways import Ways
 
 
 class Circle:
@@ -56,7 +56,7 @@ def test_a_time_outside_is_refused_as_by_the_trajectory():
     ways = Ways([*WAYS, track(3)])
     last = ways[-1].duration_ns
     ways.poses(np.array([len(WAYS)]), np.array([last]))
-    with pytest.raises(LidarpoolError, match=r"The trajectory goes from .* 1 s outside"):
+    with pytest.raises(LidarError, match=r"The trajectory goes from .* 1 s outside"):
         ways.poses(np.array([0, len(WAYS)]), np.array([0.0, last + 1e9]))
 
 

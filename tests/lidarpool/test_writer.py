@@ -7,12 +7,12 @@ from types import SimpleNamespace
 import pytest
 
 from lidarpool import Scene, Sensor, Survey
-from lidarpool.base.storage import Storage
 from lidarpool.datasets.dataset import DataSet
 from lidarpool.pipeline.failures import JobError
 from lidarpool.run import writer
 from lidarpool.run.checks import check_workers
 from lidarpool.run.writer import TOGETHER, JobWriter
+from lidarsim.base.storage import Storage
 
 
 @pytest.fixture

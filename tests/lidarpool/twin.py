@@ -16,11 +16,11 @@ from itertools import combinations, pairwise
 import numpy as np
 
 from lidarpool import Noise
-from lidarpool.base.arrays import Floats
-from lidarpool.sensor.disc import Beam
-from lidarpool.sensor.noise import Purpose, quantiles
-from lidarpool.sensor.weather import Air, Particles
-from lidarpool.simulator.waveform import Digitizer
+from lidarsim.base.arrays import Floats
+from lidarsim.sensor.disc import Beam
+from lidarsim.sensor.noise import Purpose, quantiles
+from lidarsim.sensor.weather import Air, Particles
+from lidarsim.simulator.waveform import Digitizer
 
 Vector = tuple[float, ...]
 Key = tuple[int, int]  # a scan, and the number of a pulse in it

@@ -8,7 +8,7 @@ import pytest
 
 from lidarpool.scenario.build import build
 from lidarpool.scenario.scenario import Scenario
-from lidarpool.simulator.rig import Rig
+from lidarsim.simulator.rig import Rig
 
 pytest.importorskip("pxr")
 pytest.importorskip("rasterio")

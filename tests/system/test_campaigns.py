@@ -22,25 +22,15 @@ from tests.rows import quick
 
 import lidarpool.run.cluster
 import lidarpool.run.writer
-from lidarpool import (
-    Campaign,
-    Job,
-    LidarpoolError,
-    Material,
-    Scene,
-    Sensor,
-    Survey,
-    simulate,
-    sweeps,
-)
-from lidarpool.base.errors import explained
+from lidarpool import Campaign, Job, LidarError, Material, Scene, Sensor, Survey, simulate, sweeps
 from lidarpool.base.sealed import sealed, unsealed
-from lidarpool.base.storage import Storage
 from lidarpool.datasets.dataset import DataSet
 from lidarpool.datasets.job_table import JobRow
 from lidarpool.export.format_table import DATA_SETS
 from lidarpool.report.campaign_output import verify
 from lidarpool.run.progress import Progress
+from lidarsim.base.errors import explained
+from lidarsim.base.storage import Storage
 
 BASE = """
 sensor: {rays_per_revolution: 180, layers: 4, step_deg: 4}
@@ -303,7 +293,7 @@ def test_failed_jobs_are_done_again_and_no_others(client, tmp_path):
     assert [row.number for row in run.failed] == [2] and run.done == 3
     assert run.sensors == {"lidar": "old model, 10 Hz"}
     before = bytes_of(tmp_path / "ds")
-    with pytest.raises(LidarpoolError, match=r"holds an unfinished run, 4 of 4 jobs"):
+    with pytest.raises(LidarError, match=r"holds an unfinished run, 4 of 4 jobs"):
         campaign.run(tmp_path / "ds", client=client)
     assert campaign.run(tmp_path / "ds", client=client, resume=True).failed == run.failed
     there.touch()
@@ -488,7 +478,7 @@ def full_disk(slots, tmp_path_factory):
     with (
         Client(slots, set_as_default=False) as client,
         pytest.MonkeyPatch.context() as patched,
-        pytest.raises(LidarpoolError, match=r"Job 000\d .*No space left") as ended,
+        pytest.raises(LidarError, match=r"Job 000\d .*No space left") as ended,
     ):  # the others would fail, too
         patched.setattr(DataSet, "write_job", fail)
         campaign.run(ds, client=client)
@@ -542,7 +532,7 @@ def test_nothing_behind_a_link_is_touched(client, here, unwritten, three, where)
     link, stranger = here / "ds" / where, here / "stranger"
     before = lead_away(link, stranger)
     for how in ("resume", "fresh"):
-        with pytest.raises(LidarpoolError) as caught:
+        with pytest.raises(LidarError) as caught:
             unwritten.run(here / "ds", client=client, **{how: True})
         assert f"{where} is a link" in str(caught.value)
         assert len(str(caught.value).splitlines()) == 1
@@ -560,7 +550,7 @@ def test_a_campaign_whose_only_job_was_harmed_goes_on(client, here, unwritten, m
     for path in (here / "ds").glob(harm):
         path.unlink()
     for _ in range(2):  # what is to be done again is forgotten first, and nothing else is there
-        with monkeypatch.context() as patched, pytest.raises(LidarpoolError, match="no cluster"):
+        with monkeypatch.context() as patched, pytest.raises(LidarError, match="no cluster"):
             patched.setattr(lidarpool.run.cluster, "client_of", refuse)
             unwritten.run(here / "ds", client=client, resume=True)
     assert unwritten.run(here / "ds", client=client, resume=True).done == 3
@@ -570,7 +560,7 @@ def test_a_campaign_whose_only_job_was_harmed_goes_on(client, here, unwritten, m
 
 
 def refuse(*_: Any, **__: Any) -> None:
-    raise LidarpoolError("no cluster")
+    raise LidarError("no cluster")
 
 
 LOST = {
@@ -585,7 +575,7 @@ def test_finished_jobs_are_known_without_the_database(client, here, unwritten, l
     ds = here / "ds"
     before, known = bytes_of(ds), len([*(ds / ".jobs").iterdir()])
     LOST[lost](ds / "run")
-    with pytest.raises(LidarpoolError, match=r"run\.db is damaged|needs a folder of its own"):
+    with pytest.raises(LidarError, match=r"run\.db is damaged|needs a folder of its own"):
         unwritten.run(ds, client=client)
     run = unwritten.run(ds, client=client, resume=True)
     assert (run.done, run.resumed, run.failed) == (3, known, ())
@@ -601,7 +591,7 @@ def test_a_run_removes_its_own_files_only(client, here, unwritten):
         (ds / name).write_text("mine")
         before = all_of(ds)
         for how in ("fresh", "resume"):
-            with pytest.raises(LidarpoolError, match=f"holds {name}: a data set needs a folder"):
+            with pytest.raises(LidarError, match=f"holds {name}: a data set needs a folder"):
                 unwritten.run(ds, client=client, **{how: True})
         assert before == all_of(ds) | {"run/run.db": before["run/run.db"]}
         (ds / name).unlink()
@@ -612,7 +602,7 @@ def test_a_run_removes_its_own_files_only(client, here, unwritten):
     (here / "mine").mkdir()
     (here / "other" / "jobs").symlink_to(here / "mine")
     for how in ("resume", "fresh", "overwrite"):
-        with pytest.raises(LidarpoolError, match=r"holds jobs: a data set|jobs is a link"):
+        with pytest.raises(LidarError, match=r"holds jobs: a data set|jobs is a link"):
             unwritten.run(here / "other", client=client, **{how: True})
     assert [*(here / "mine").iterdir()] == []
 
@@ -625,12 +615,12 @@ def test_a_finished_data_set_is_replaced_on_request_only(client, tmp_path, kept)
     before = all_of(ds)
     other = Campaign(failing(1), 2, keep="folder")
     for options in ({}, {"fresh": True}):
-        with pytest.raises(LidarpoolError, match=r"holds a finished data set, .* --overwrite"):
+        with pytest.raises(LidarError, match=r"holds a finished data set, .* --overwrite"):
             other.run(ds, client=client, **options)
         assert all_of(ds) == before
     (ds / "run").mkdir()
     (ds / "notes.txt").write_text("mine")
-    with pytest.raises(LidarpoolError, match=r"holds notes\.txt: a data set needs a folder"):
+    with pytest.raises(LidarError, match=r"holds notes\.txt: a data set needs a folder"):
         other.run(ds, client=client, overwrite=True)
     (ds / "notes.txt").unlink()
     assert all_of(ds) == before
@@ -639,7 +629,7 @@ def test_a_finished_data_set_is_replaced_on_request_only(client, tmp_path, kept)
         "run", ".jobs", "jobs", "campaign.json", "dataset.json", "jobs.csv", "jobs.parquet",
         "README.md", "report.html", "report.json", "pictures",
     }  # fmt: skip
-    with pytest.raises(LidarpoolError, match="holds a finished data set"):
+    with pytest.raises(LidarError, match="holds a finished data set"):
         other.run(ds, client=client, fresh=True)
 
 

@@ -23,12 +23,12 @@ from lidarpool.cli.forecast import forecast
 from lidarpool.run.options import RunOptions
 from lidarpool.scenario.build import build
 from lidarpool.scenario.scenario import Scenario
-from lidarpool.scene.actors import box
-from lidarpool.scene.scene import Scene
-from lidarpool.scene.scene_file import write_scene
-from lidarpool.scene.scene_mesh import Cutout, SceneMesh
-from lidarpool.simulator.rig import Rig
-from lidarpool.simulator.sampling import sample_survey
+from lidarsim.scene.actors import box
+from lidarsim.scene.scene import Scene
+from lidarsim.scene.scene_file import write_scene
+from lidarsim.scene.scene_mesh import Cutout, SceneMesh
+from lidarsim.simulator.rig import Rig
+from lidarsim.simulator.sampling import sample_survey
 from raybeam import available_backends
 
 SHORT = {"sensor": {"layers": 8}, "planning": {"trials": 4}, "pool": {"backend": "numpy"}}

@@ -13,7 +13,7 @@ import pytest
 from tests.clusters import cluster_of
 from tests.commands import RunningCommand
 
-from lidarpool import LidarpoolError
+from lidarpool import LidarError
 from lidarpool.run import watch
 from lidarpool.run.connection import connected, local_client
 from lidarpool.run.watch import Waiting
@@ -74,7 +74,7 @@ def test_a_scheduler_that_never_starts_is_named_with_the_time(address, monkeypat
     monkeypatch.setattr(watch, "TELL_EVERY_S", 0.0)
     told: list[str] = []
     with (
-        pytest.raises(LidarpoolError, match=rf"answers at '{address}' within 1.5 s \("),
+        pytest.raises(LidarError, match=rf"answers at '{address}' within 1.5 s \("),
         connected(address, waiting=Waiting(1.5, told.append)),
     ):
         pytest.fail("it is connected")

@@ -7,7 +7,7 @@ import pytest
 from distributed import Client, Worker
 from tests.clusters import thread_cluster
 
-from lidarpool import LidarpoolError, Planning, ScanFrame, Scene, Sensor, Survey, simulate
+from lidarpool import LidarError, Planning, ScanFrame, Scene, Sensor, Survey, simulate
 from lidarpool.pipeline.driver import RunDriver
 from lidarpool.pipeline.placement import placement_violations
 from lidarpool.run.trials import TrialPump
@@ -64,7 +64,7 @@ def test_a_partition_that_stays_empty_ends_the_run(tmp_path, monkeypatch):
     with (
         thread_cluster({"GPU": 1}, {"LIDAR": 4}) as cluster,
         Client(cluster, set_as_default=False) as client,
-        pytest.raises(LidarpoolError, match="Partition 'GPU' has had no workers for 2 s") as end,
+        pytest.raises(LidarError, match="Partition 'GPU' has had no workers for 2 s") as end,
     ):
         simulate(
             Scene.seed(), SURVEY, client=client, on_frame=on_frame, folder=tmp_path / "run",

@@ -31,17 +31,17 @@ from distributed.cli import dask_scheduler, dask_worker
 from tests.clusters import import_jobqueue
 
 import lidarpool.run.cluster
-from lidarpool import Cloud, LidarpoolError, save_cloud
+from lidarpool import Cloud, LidarError, save_cloud
 from lidarpool.cli.commands import cli
 from lidarpool.datasets.dataset import DATA_SETS
 from lidarpool.export.format_table import EXPORTS, LAYOUTS
+from lidarpool.scenario import point_scene as points
 from lidarpool.scenario.build import build
 from lidarpool.scenario.campaign_sections import CampaignSection
 from lidarpool.scenario.plausibility import implausibilities
 from lidarpool.scenario.scenario import Scenario
-from lidarpool.scene import point_scene as points
-from lidarpool.scene.files import meshfile, rasters
-from lidarpool.sensor.models import SensorModel, model_names, read_model
+from lidarsim.scene.files import meshfile, rasters
+from lidarsim.sensor.models import SensorModel, model_names, read_model
 
 ROOT = Path(__file__).parents[2]
 DOCUMENTS = [ROOT / "README.md", *sorted(ROOT.glob("docs/**/*.md"))]
@@ -228,7 +228,7 @@ def test_yaml_is_what_it_is_for(block):
     else:
         scenario = Scenario.from_data(data, source=block.where)
         if all(path.exists() for path in scenario.files):
-            with suppress(LidarpoolError):  # a fragment, such as materials of another scene
+            with suppress(LidarError):  # a fragment, such as materials of another scene
                 assert implausibilities(build(scenario, plans=False)) == []
 
 

@@ -10,9 +10,9 @@ import pytest
 from lidarpool import Campaign, Mounted, Pose, Scene, Sensor, Survey, Track, read_cloud, simulate
 from lidarpool.scenario.build import build
 from lidarpool.scenario.scenario import Scenario
-from lidarpool.scene.generated.city import city
-from lidarpool.scene.scene_file import write_scene
-from lidarpool.simulator.rig import Rig
+from lidarsim.scene.generated.city import city
+from lidarsim.scene.scene_file import write_scene
+from lidarsim.simulator.rig import Rig
 
 ROOT = Path(__file__).parents[2]
 

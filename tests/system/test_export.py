@@ -10,11 +10,11 @@ import pytest
 from rosbags.highlevel import AnyReader
 
 from lidarpool import Cloud, Scene, Survey, read_cloud, save_cloud
-from lidarpool.base.storage import Storage
 from lidarpool.export import pieces
 from lidarpool.export.folder import result_folder
 from lidarpool.export.formats import Format
-from lidarpool.export.sweeps import Sweeps
+from lidarsim.base.storage import Storage
+from lidarsim.sweeps.sweeps import Sweeps
 
 SCENARIO = """
 trajectory: {points: [{time_s: 0, position: [0, 0, 1]}, {time_s: 0.3, position: [3, 0, 1]}]}
@@ -184,7 +184,7 @@ def test_a_worker_that_cannot_write_is_one_line_and_nothing_is_lost(
 # Ends its worker at its first file of points, and never again.
 DIES = """
 import os, pathlib, signal
-from lidarpool.base.storage import Storage
+from lidarsim.base.storage import Storage
 armed = pathlib.Path(os.environ["ARMED"])
 def write_and_die(storage, name, data, write=Storage.write):  # a preload may run twice
     write(storage, name, data)

@@ -12,7 +12,7 @@ import yaml
 from distributed import Client
 
 import lidarpool.report.output as lidarpool_output
-from lidarpool import LidarpoolError, save_cloud, simulate
+from lidarpool import LidarError, save_cloud, simulate
 from lidarpool.report.output import FILES
 from lidarpool.scenario.build import build
 from lidarpool.scenario.scenario import Scenario
@@ -75,7 +75,7 @@ def test_the_disk_of_the_run_is_full(disk, run, expected):
     folder = disk(100) / "run"
     for kilobytes in (160, 4000):  # some more room, and it is full again
         with pytest.raises(
-            LidarpoolError, match=r"(cannot be kept in|cannot be written) .*: make room"
+            LidarError, match=r"(cannot be kept in|cannot be written) .*: make room"
         ) as caught:
             run(folder=folder, resume=True)
         assert "\n" not in str(caught.value)
@@ -92,7 +92,7 @@ def test_the_disk_of_the_run_is_full(disk, run, expected):
 def test_a_disk_without_room_for_anything(disk, run):
     folder = disk(4)
     (folder / "filler").write_bytes(bytes(4096))
-    with pytest.raises(LidarpoolError, match=r"run\.db cannot be written .*: make room") as caught:
+    with pytest.raises(LidarError, match=r"run\.db cannot be written .*: make room") as caught:
         run(folder=folder / "run")
     assert not hasattr(caught.value, "__notes__")
     assert [path.name for path in folder.iterdir()] == ["filler"]

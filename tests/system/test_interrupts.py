@@ -166,7 +166,7 @@ import re, subprocess, sys
 from multiprocessing import resource_tracker
 from pathlib import Path
 from signal import SIGHUP, SIGINT, SIGQUIT
-from lidarpool.base.interrupts import children_spared
+from lidarsim.base.interrupts import children_spared
 
 def blocked(process):
     mask = re.search(r"SigBlk:\\s+(\\w+)", Path(f"/proc/{process}/status").read_text())[1]
@@ -239,7 +239,7 @@ SIGNALLED = {
 @pytest.mark.parametrize("where", SIGNALLED)
 def test_a_signal_does_what_it_should(where):
     script, (code, out, err) = SIGNALLED[where]
-    script = f"import signal, time\nfrom lidarpool.base.interrupts import *\n{script}"
+    script = f"import signal, time\nfrom lidarsim.base.interrupts import *\n{script}"
     ended = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
     assert (ended.returncode, ended.stdout, ended.stderr[: len(err)]) == (code, out, err)
 

@@ -13,10 +13,10 @@ from distributed import Client
 from tests.clusters import thread_cluster
 from tests.daemons import wait_until
 
-import lidarpool.simulator.scene_caster
+import lidarsim.simulator.scene_caster
 from lidarpool import Campaign, Column, Job, Scene, Sensor, Survey, save_cloud, simulate
 from lidarpool.pipeline import rigs
-from lidarpool.scene.actors import box
+from lidarsim.scene.actors import box
 
 SEED, ROOM = Scene.seed(), Scene.from_meshes([box("Room", (8, 6, 3))])
 SENSOR = Sensor.grid(rays_per_revolution=900, layers=8, step_deg=2)
@@ -87,9 +87,9 @@ def test_jobs_of_a_scene_share_its_trees_and_others_that_fail_do_no_harm(
     client, tmp_path, left_over, monkeypatch
 ):
     before = {*rigs._kept}  # of other tests of this process
-    trees, build = [], lidarpool.simulator.scene_caster.RayCaster
+    trees, build = [], lidarsim.simulator.scene_caster.RayCaster
     monkeypatch.setattr(
-        lidarpool.simulator.scene_caster,
+        lidarsim.simulator.scene_caster,
         "RayCaster",
         lambda *a, **o: trees.append(1) or build(*a, **o),
     )

@@ -20,14 +20,14 @@ from tests.system.test_resume import SCANS
 from tests.system.test_resume import SCENARIO as RESUMED
 
 import lidarpool as package
-from lidarpool.base.storage import Storage
-from lidarpool.columns.part_columns import PartColumns
 from lidarpool.columns.parts import unpack
 from lidarpool.datasets.dataset import job_file
 from lidarpool.datasets.job_table import JobRow
 from lidarpool.export.format_table import DATA_SETS
-from lidarpool.export.sweeps import SWEEPS_FILE
 from lidarpool.run.store import RunStore
+from lidarsim.base.storage import Storage
+from lidarsim.columns.part_columns import PartColumns
+from lidarsim.sweeps.sweeps import SWEEPS_FILE
 
 pytest.importorskip("s3fs", reason="parts in an object store need s3fs")
 server = pytest.importorskip("moto.server", reason="the object store of these tests is moto's")
@@ -186,7 +186,7 @@ def test_a_data_set_is_written_and_read_in_the_bucket(environment, tmp_path, for
     system.rm(f"{folder}/{job_file(format, '00', SWEEPS_FILE)}")
     assert [bool(wrong) for _, (_, wrong) in data.look(rows)] == [True, False]
     system.rm(f"{folder}/dataset.json")
-    with pytest.raises(package.LidarpoolError, match="is an unfinished data set"):
+    with pytest.raises(package.LidarError, match="is an unfinished data set"):
         package.sweeps(url)
 
 

@@ -9,7 +9,7 @@ import pytest
 from distributed import Client
 from tests.system.default_survey import DEFAULT_CLOUD_SHA256
 
-from lidarpool import LidarpoolError, Planning, ScanFrame, Scene, Sensor, Survey, simulate
+from lidarpool import LidarError, Planning, ScanFrame, Scene, Sensor, Survey, simulate
 
 SURVEY = Survey(Sensor.grid(rays_per_revolution=360, layers=4, step_deg=5), [(0, 0, 1)], steps=72)
 EXAMPLE = Path(__file__).parents[2] / "examples" / "seed.yaml"
@@ -85,7 +85,7 @@ def test_other_workers_with_other_sources_end_the_run_before_they_change_a_byte(
 
     with (
         Client(cluster.address, set_as_default=False) as client,
-        pytest.raises(LidarpoolError, match=r"sources 12345678\), the run .*: install the same"),
+        pytest.raises(LidarError, match=r"sources 12345678\), the run .*: install the same"),
     ):
         long = replace(SURVEY, steps=72 * 1000)  # so that it lasts until the other worker is there
         simulate(Scene.seed(), long, planning, client=client, backend="numpy", on_frame=on_frame)

@@ -13,8 +13,8 @@ from rosbags.typesys import Stores, get_typestore
 from tests.clusters import thread_cluster
 from tests.shapes import room
 
-from lidarpool import LidarpoolError, Sensor, read_cloud
-from lidarpool.scene.scene_file import write_scene
+from lidarpool import LidarError, Sensor, read_cloud
+from lidarsim.scene.scene_file import write_scene
 
 SCANNER: dict[str, Any] = {
     "scene": "room.ply",
@@ -120,5 +120,5 @@ def test_thinned_returns_make_no_laser_scan_and_a_note(folder, lidarpool):
 
 def test_several_layers_need_a_field_of_view():
     assert Sensor.grid(layers=1, vertical_fov_deg=0).channels == 1
-    with pytest.raises(LidarpoolError, match="vertical_fov_deg is 0 with 40 layers"):
+    with pytest.raises(LidarError, match="vertical_fov_deg is 0 with 40 layers"):
         Sensor.grid(vertical_fov_deg=0)

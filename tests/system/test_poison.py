@@ -11,7 +11,7 @@ from distributed import Client
 import lidarpool.pipeline.long_stages
 import lidarpool.pipeline.rigs
 import lidarpool.run.trials
-from lidarpool import LidarpoolError, Planning, ScanFrame, Scene, Sensor, Survey, simulate
+from lidarpool import LidarError, Planning, ScanFrame, Scene, Sensor, Survey, simulate
 from lidarpool.pipeline.failures import words_on_memory
 
 SURVEY = Survey(Sensor.grid(rays_per_revolution=360, layers=8, step_deg=2), [(0, 0, 1)], steps=180)
@@ -42,7 +42,7 @@ def test_a_scan_that_kills_its_worker_is_named_and_all_others_are_kept(
         )  # fmt: skip
 
     message = rf"^scan {POISON} kills the worker that runs stage intersect: 3 workers died, one"
-    with pytest.raises(LidarpoolError, match=message) as caught:
+    with pytest.raises(LidarError, match=message) as caught:
         run()
     assert frames == list(range(len(frames)))
     assert len(frames) <= POISON
@@ -60,7 +60,7 @@ def test_a_scan_that_kills_its_worker_is_named_and_all_others_are_kept(
 def test_summaries_that_kill_the_sorter_end_the_run(client, sabotage, monkeypatch, left_over):
     monkeypatch.setattr(lidarpool.pipeline.long_stages, "DEATHS_MOST", 2)
     sabotage("sort.get", POISON)
-    with pytest.raises(LidarpoolError, match=r"stage \w+ was started 3 times, and each time"):
+    with pytest.raises(LidarError, match=r"stage \w+ was started 3 times, and each time"):
         simulate(Scene.seed(), SURVEY, client=client)
     assert left_over(client) == ([], [], [])
 

@@ -6,18 +6,9 @@ from dataclasses import replace
 
 import pytest
 
-from lidarpool import (
-    LidarpoolError,
-    Planning,
-    Scene,
-    SceneMesh,
-    Sensor,
-    Survey,
-    read_cloud,
-    simulate,
-)
+from lidarpool import LidarError, Planning, Scene, SceneMesh, Sensor, Survey, read_cloud, simulate
 from lidarpool.api.result import Result
-from lidarpool.scene.shapes import seed_objects
+from lidarsim.scene.shapes import seed_objects
 
 SENSOR = Sensor.grid(rays_per_revolution=90, layers=6)
 
@@ -64,7 +55,7 @@ def test_pictures_are_drawn_and_what_they_cannot_be_is_told(result, tmp_path):
         ({"only": "cloud"}, "only is 'cloud'; it must be a list of text"),
         ({"size": 480}, "size is 480; it must be a list of whole numbers"),
     ):
-        with pytest.raises(LidarpoolError, match=words):
+        with pytest.raises(LidarError, match=words):
             result.pictures(tmp_path, **wrong)
 
 
@@ -72,12 +63,12 @@ def test_a_report_does_not_replace_that_of_another_survey_unasked(result, anothe
     result.report(tmp_path, only_cloud=True)
     assert len(read_cloud(tmp_path / "cloud.ply")) == len(result.points)
     result.report(tmp_path, only_cloud=True)  # its own
-    with pytest.raises(LidarpoolError, match=r"holds the result of another survey: .*overwrite"):
+    with pytest.raises(LidarError, match=r"holds the result of another survey: .*overwrite"):
         another.report(tmp_path)
     another.report(tmp_path, only_cloud=True, overwrite=True)
     assert json.loads((tmp_path / "report.json").read_text())["identity"]["survey"] == "another"
     (tmp_path / "report.json").write_text("somebody's own")
-    with pytest.raises(LidarpoolError, match="another survey"):
+    with pytest.raises(LidarError, match="another survey"):
         another.report(tmp_path)
 
 
@@ -87,12 +78,12 @@ def test_files_of_no_result_are_neither_replaced_nor_removed_unasked(result, tmp
     own.write_text("mine")
     result.report(tmp_path, only_cloud=True)
     result.report(tmp_path, only_cloud=True)
-    with pytest.raises(LidarpoolError, match=r"holds kitti, which no result there lists: .*--over"):
+    with pytest.raises(LidarError, match=r"holds kitti, which no result there lists: .*--over"):
         result.report(tmp_path, only_cloud=True, formats=["kitti"])
     assert own.read_text() == "mine"
     (tmp_path / "other").mkdir()
     (tmp_path / "other" / "cloud.ply").write_text("mine")
-    with pytest.raises(LidarpoolError, match=r"other holds cloud\.ply, which no"):
+    with pytest.raises(LidarError, match=r"other holds cloud\.ply, which no"):
         result.report(tmp_path / "other", only_cloud=True)
     result.report(tmp_path / "other", only_cloud=True, overwrite=True)
     result.report(tmp_path / "other", only_cloud=True)
@@ -103,7 +94,7 @@ def test_a_folder_of_a_format_with_a_file_of_the_user_is_not_replaced(result, tm
     own = tmp_path / "pcd" / "notes.txt"
     own.write_text("mine")
     for formats in (["pcd"], []):  # it would be replaced, and removed
-        with pytest.raises(LidarpoolError, match=r"pcd/notes\.txt is not a file of lidarpool"):
+        with pytest.raises(LidarError, match=r"pcd/notes\.txt is not a file of lidarpool"):
             result.report(tmp_path, only_cloud=True, formats=formats, overwrite=True)
     assert own.read_text() == "mine" and (tmp_path / "report.json").exists()
     own.unlink()

@@ -15,16 +15,7 @@ import yaml
 from distributed import Client
 from tests import killed_drivers
 
-from lidarpool import (
-    LidarpoolError,
-    ScanFrame,
-    Scene,
-    Sensor,
-    Survey,
-    remove_run,
-    save_cloud,
-    simulate,
-)
+from lidarpool import LidarError, ScanFrame, Scene, Sensor, Survey, remove_run, save_cloud, simulate
 from lidarpool.scenario.build import build
 from lidarpool.scenario.scenario import Scenario
 
@@ -156,7 +147,7 @@ def test_frames_go_on_where_they_were(cluster_client, tmp_path, monkeypatch, sam
 
     def on_frame(frame: ScanFrame) -> None:
         if not first:
-            with pytest.raises(LidarpoolError, match=f"Another run is using {folder}"):
+            with pytest.raises(LidarError, match=f"Another run is using {folder}"):
                 run()
         first.append(frame.scan)
         if frame.scan == 50:  # its points are committed
@@ -169,7 +160,7 @@ def test_frames_go_on_where_they_were(cluster_client, tmp_path, monkeypatch, sam
         rf"\d+ of 144 scans are kept in {folder}: continue with --resume \(.*\)\.",
         *caught.value.__notes__,
     )
-    with pytest.raises(LidarpoolError, match=rf"{KEPT} --resume .*resume=True.*remove_run"):
+    with pytest.raises(LidarError, match=rf"{KEPT} --resume .*resume=True.*remove_run"):
         run()
     result = run(resume=True, on_frame=lambda frame: second.append(frame.scan))
     assert first == list(range(51))

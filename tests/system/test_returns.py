@@ -20,7 +20,7 @@ from lidarpool import (
     Track,
     simulate,
 )
-from lidarpool.columns.table import TABLE
+from lidarsim.columns.table import TABLE
 from poolpart.workers import worker_identities
 
 OPTIONAL = [name for name in TABLE if name not in ("scan", "x", "y", "z", "channel", "object")]

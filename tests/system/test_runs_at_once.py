@@ -9,7 +9,7 @@ from distributed import Client, Queue
 from tests.chaos.traces import scheduler_state, settled_differences
 from tests.clusters import thread_cluster
 
-from lidarpool import LidarpoolError, Planning, Result, ScanFrame, Scene, Sensor, Survey, simulate
+from lidarpool import LidarError, Planning, Result, ScanFrame, Scene, Sensor, Survey, simulate
 from lidarpool.pipeline.placement import placement_violations
 from lidarpool.run.progress import Progress
 from poolpart import Pool
@@ -62,7 +62,7 @@ def test_slots_that_are_gone_are_not_waited_for_forever(cluster, monkeypatch, le
     monkeypatch.setattr(Pool, "require", lambda *_: None)
     with Client(cluster, set_as_default=False) as client:
         with pytest.raises(
-            LidarpoolError, match=r"'LIDAR' has had 4 of the 7 slots needed for 0 s: start another"
+            LidarError, match=r"'LIDAR' has had 4 of the 7 slots needed for 0 s: start another"
         ):
             simulate(Scene.seed(), SURVEY, client=client, collectors=5, patience_s=0.5)
         assert left_over(client) == ([], [], [])

@@ -14,8 +14,8 @@ from lidarpool import (
     load_sensor,
     simulate,
 )
-from lidarpool.columns.table import OPTIONAL
-from lidarpool.scene.actors import box
+from lidarsim.columns.table import OPTIONAL
+from lidarsim.scene.actors import box
 
 OPTIONS = {
     "columns": [column.name for column in OPTIONAL],

@@ -55,7 +55,7 @@ def test_init_with_meshes_names_them_as_seen_from_the_scenario(tmp_path, lidarpo
 @pytest.mark.parametrize("every", [True, False])
 def test_init_writes_what_the_options_say(every, tmp_path, lidarpool):
     (tmp_path / "hall.stl").write_bytes(trimesh.creation.box((8, 6, 3)).export(file_type="stl"))
-    model = files("lidarpool.sensor") / "data" / "velodyne" / "vlp16.yaml"
+    model = files("lidarsim.sensor") / "data" / "velodyne" / "vlp16.yaml"
     (tmp_path / "mine.yaml").write_text(model.read_text())
     options = ["--mesh", "hall.stl", "--up-axis", "x", "--sensor", "mine.yaml", "--pose", "1,2.5,0"]
     options += ["--columns", "range", "--columns", "time,ray", "--format", "laz,mcap"]

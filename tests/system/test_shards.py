@@ -19,14 +19,14 @@ from tests.clusters import thread_cluster
 from tests.killed_drivers import drive
 from tests.rows import quick
 
-from lidarpool import Campaign, Job, LidarpoolError, Noise, Scene, Sensor, Survey, merge, sweeps
+from lidarpool import Campaign, Job, LidarError, Noise, Scene, Sensor, Survey, merge, sweeps
 from lidarpool.base.sealed import sealed, unsealed
 from lidarpool.base.shard import Shard
-from lidarpool.base.storage import Storage
 from lidarpool.datasets.job_table import read_table
 from lidarpool.export.format_table import DATA_SETS
 from lidarpool.report.campaign_output import verify
-from lidarpool.scene.actors import box
+from lidarsim.base.storage import Storage
+from lidarsim.scene.actors import box
 
 CAMPAIGN = """
 base: base.yaml
@@ -196,7 +196,7 @@ def test_damaged_files_are_named_and_the_next_merge_takes_them(
 ):
     DAMAGE[damage](parts[1])
     out, name = tmp_path / "ds", NAMED.get(damage, "0001/cloud.ply")
-    with pytest.raises(LidarpoolError, match=f"damaged.*part-2/.*{name}; run"):
+    with pytest.raises(LidarError, match=f"damaged.*part-2/.*{name}; run"):
         merge(parts, out)
     assert not (out / "dataset.json").exists() and (out / ".jobs/0000.json").exists()
     with Client(slots, set_as_default=False) as client:
@@ -217,7 +217,7 @@ def test_a_data_set_that_is_given_by_another_name_keeps_its_files(parts, tmp_pat
     before = content(out)
     (tmp_path / "link").symlink_to(out)
     for given in (out, out / ".." / "ds", tmp_path / "link"):
-        with pytest.raises(LidarpoolError, match="ds is one of the shards, which stays as it is"):
+        with pytest.raises(LidarError, match="ds is one of the shards, which stays as it is"):
             merge([*parts, given], out)
     assert content(out) == before
 
@@ -226,11 +226,11 @@ def test_a_shard_is_never_made_the_whole(parts):
     before = content(parts[0].parent)
     inside, around = parts[0] / "below/ds", parts[0].parent
     for out, relation in ((parts[0], "is one of"), (inside, "lies in"), (around, "holds")):
-        with pytest.raises(LidarpoolError, match=f"--out {out} {relation} the shard"):
+        with pytest.raises(LidarError, match=f"--out {out} {relation} the shard"):
             merge(parts, out)
-    with pytest.raises(LidarpoolError, match="is one of the shards"):
+    with pytest.raises(LidarError, match="is one of the shards"):
         merge([parts[0].as_uri(), *parts[1:]], parts[0])
-    with pytest.raises(LidarpoolError, match="is one of the shards"):
+    with pytest.raises(LidarError, match="is one of the shards"):
         merge(parts, parts[0].as_uri())
     assert content(parts[0].parent) == before
 
@@ -261,9 +261,9 @@ def test_a_table_of_jobs_is_only_compared(parts, campaigns, tmp_path, edit, slot
     assert [note[:50] for note in notes] == [f"{table} is damaged or edited: the rows"[:50]]
     for name in ("jobs.csv", "jobs.parquet", *(name for name in made if "jobs/" in name)):
         assert made[name] == expected[name]
-    with pytest.raises(LidarpoolError, match=r"jobs\.csv is damaged.*--resume, which writes"):
+    with pytest.raises(LidarError, match=r"jobs\.csv is damaged.*--resume, which writes"):
         sweeps(parts[1])
-    with pytest.raises(LidarpoolError, match=r"jobs\.csv is damaged"):
+    with pytest.raises(LidarError, match=r"jobs\.csv is damaged"):
         verify(Storage.at(parts[1]))
     with Client(slots, set_as_default=False) as client:
         campaign = Campaign.load(parts[0].parent / "c.yaml")
@@ -276,13 +276,13 @@ def test_a_table_of_jobs_is_only_compared(parts, campaigns, tmp_path, edit, slot
 
 def test_a_manifest_of_another_job_is_refused(parts, tmp_path):
     shutil.copy(parts[0] / ".jobs/0003.json", parts[1] / ".jobs/0003.json")
-    with pytest.raises(LidarpoolError, match=r"part-2/\.jobs/0003\.json is of job 3, which is not"):
+    with pytest.raises(LidarError, match=r"part-2/\.jobs/0003\.json is of job 3, which is not"):
         merge(parts, tmp_path / "ds")
     (parts[1] / ".jobs/0003.json").rename(parts[1] / ".jobs/0004.json")
-    with pytest.raises(LidarpoolError, match=r"damaged: .*part-2/\.jobs/0004\.json; run"):
+    with pytest.raises(LidarError, match=r"damaged: .*part-2/\.jobs/0004\.json; run"):
         merge(parts, tmp_path / "ds")
     (parts[1] / ".jobs/0004.json").unlink()
-    with pytest.raises(LidarpoolError, match=r"damaged: the manifest of job 4 in .*part-2; run"):
+    with pytest.raises(LidarError, match=r"damaged: the manifest of job 4 in .*part-2; run"):
         merge(parts, tmp_path / "ds")
 
 
@@ -292,9 +292,7 @@ def test_a_damaged_record_of_a_campaign_is_named_and_made_again(parts, tmp_path,
     other_type = sealed(unsealed(whole) | {"notes": 5})
     for data in (whole[:-1], whole[:90] + b"x" + whole[91:], b"[]", b"", other_type):
         path.write_bytes(data)
-        with pytest.raises(
-            LidarpoolError, match=r"campaign\.json is damaged or edited \(its .*\):"
-        ):
+        with pytest.raises(LidarError, match=r"campaign\.json is damaged or edited \(its .*\):"):
             merge(parts, tmp_path / "ds")
     with Client(slots, set_as_default=False) as client:
         campaign = Campaign.load(parts[0].parent / "c.yaml")
@@ -312,7 +310,7 @@ def test_a_manifest_that_names_files_elsewhere_is_damaged(parts, tmp_path):
     manifest["files"] = {"../stranger": 0} | manifest["files"]
     crc = zlib.crc32(json.dumps(manifest).encode())
     path.write_text(json.dumps(manifest | {"crc": crc}))
-    with pytest.raises(LidarpoolError, match=r"^missing or damaged: .*part-2/\.jobs/0001\.json"):
+    with pytest.raises(LidarError, match=r"^missing or damaged: .*part-2/\.jobs/0001\.json"):
         merge(parts, out)
     assert not (out.parent / "stranger").exists()
 
@@ -336,7 +334,7 @@ def test_a_manifest_with_other_entries_is_damaged(parts, tmp_path, edit):
     STRANGE_ENTRIES[edit](manifest)
     crc = zlib.crc32(json.dumps(manifest).encode())
     path.write_text(json.dumps(manifest | {"crc": crc}))
-    with pytest.raises(LidarpoolError, match=r"^missing or damaged: .*part-2/\.jobs/0001\.json"):
+    with pytest.raises(LidarError, match=r"^missing or damaged: .*part-2/\.jobs/0001\.json"):
         merge(parts, tmp_path / "ds")
 
 
@@ -392,7 +390,7 @@ def test_shards_that_do_not_fit_together_are_named(parts, tmp_path, wrong, lidar
 def test_meshes_of_all_shards_are_the_same(parts, tmp_path):
     for part, digest in zip(parts, "112", strict=True):
         change_record(part, '"files": []', f'"files": [["a.glb", "{digest}"]]')
-    with pytest.raises(LidarpoolError, match=r"part-3 and .*part-1 differ in the file a\.glb:"):
+    with pytest.raises(LidarError, match=r"part-3 and .*part-1 differ in the file a\.glb:"):
         merge(parts, tmp_path / "ds")
 
 
@@ -400,11 +398,11 @@ def test_merge_leaves_other_files_and_runs(parts, tmp_path):
     out = tmp_path / "ds"
     out.mkdir()
     (out / "thesis.txt").write_text("mine")
-    with pytest.raises(LidarpoolError, match=r"holds thesis\.txt: a data set needs a folder"):
+    with pytest.raises(LidarError, match=r"holds thesis\.txt: a data set needs a folder"):
         merge(parts, out)
     assert [*out.iterdir()] == [out / "thesis.txt"]
     for given, told in (([], "nothing to merge"), ([tmp_path / "none"], "none holds no finished")):
-        with pytest.raises(LidarpoolError, match=told):
+        with pytest.raises(LidarError, match=told):
             merge(given, tmp_path / "new")
 
 
@@ -435,7 +433,7 @@ def test_a_campaign_that_has_grown_is_merged_into_the_same_place(parts, tmp_path
         for number in (2, 3):  # jobs 7 and 8; the first shard has none of them
             run = campaign.run(parts[number - 1], client=client, resume=True, shard=(number, 3))
             assert run.done == 3
-    with pytest.raises(LidarpoolError, match=r"^missing: 1 shard, 3/3"):
+    with pytest.raises(LidarError, match=r"^missing: 1 shard, 3/3"):
         merge([parts[1]], out)
     merge([parts[1], parts[2]], out)
     assert content(out) == content(tmp_path / "one")
@@ -506,7 +504,7 @@ def test_shards_fit_together_after_a_mesh_was_repaired(tmp_path, slots):
             assert len(run.failed) == failed
         (tmp_path / "b.stl").write_text(TRIANGLE)
         assert campaign.run(parts[1], client=client, shard=(2, 2), retry_failed=True).done == 1
-        with pytest.raises(LidarpoolError, match=r"differ in the file b\.stl:"):
+        with pytest.raises(LidarError, match=r"differ in the file b\.stl:"):
             merge(parts, tmp_path / "ds")
         assert campaign.run(parts[0], client=client, shard=(1, 2), resume=True).done == 1
         assert merge(parts, tmp_path / "ds")["jobs"]["done"] == 2
@@ -517,7 +515,7 @@ def test_shards_fit_together_after_a_mesh_was_repaired(tmp_path, slots):
 KILLED = """
 import os, signal, sys
 from lidarpool import merge
-from lidarpool.base.storage import Storage
+from lidarsim.base.storage import Storage
 from lidarpool.datasets.job_table import read_table
 import lidarpool.report.campaign_output as output
 owners = {"take": Storage, "write_table": output, "finish": output.DataSet}
@@ -593,11 +591,11 @@ def test_shards_of_a_survey_have_the_files_of_one_run(survey, lidarpool, slots, 
 
 
 def _some_of_a_survey(survey: Path, shards: list[Path]) -> None:
-    with pytest.raises(LidarpoolError, match=r"^missing: 1 shard, 1/3: give them"):
+    with pytest.raises(LidarError, match=r"^missing: 1 shard, 1/3: give them"):
         merge(shards[:2], survey / "some")
-    with pytest.raises(LidarpoolError, match="part-2 is one of the shards, which stays as it is"):
+    with pytest.raises(LidarError, match="part-2 is one of the shards, which stays as it is"):
         merge(shards, shards[0])
-    with pytest.raises(LidarpoolError, match="part-2 holds a shard of a survey: give another"):
+    with pytest.raises(LidarError, match="part-2 holds a shard of a survey: give another"):
         merge(shards[1:], shards[0])
     report = merge(shards[:2], survey / "some", partial=True)
     assert "missing: 1 shard, 1/3" in report["notes"] and report["planning"] is None
@@ -612,7 +610,7 @@ def _a_damaged_shard_of_a_survey(survey: Path, shards: list[Path], one: dict[str
     for data in (whole[:-1], whole[:200] + bytes([whole[200] ^ 1]) + whole[201:]):
         part.unlink()
         part.write_bytes(data)
-        with pytest.raises(LidarpoolError, match=f"^missing or damaged: .*{part.name}; run their"):
+        with pytest.raises(LidarError, match=f"^missing or damaged: .*{part.name}; run their"):
             merge(shards, survey / "repaired")
     part.unlink()
     part.write_bytes(whole)
@@ -620,11 +618,11 @@ def _a_damaged_shard_of_a_survey(survey: Path, shards: list[Path], one: dict[str
     assert content(survey / "repaired") == one
     (survey / "elsewhere").mkdir()
     (survey / "s.yaml").rename(survey / "elsewhere/s.yaml")
-    with pytest.raises(LidarpoolError, match=r"s\.yaml, of which these shards are, does not exist"):
+    with pytest.raises(LidarError, match=r"s\.yaml, of which these shards are, does not exist"):
         merge(shards, survey / "moved")
     merge(shards, survey / "moved", scenario=survey / "elsewhere/s.yaml")
     change(survey / "elsewhere/s.yaml", "steps: 25", "steps: 26")
-    with pytest.raises(LidarpoolError, match=r"s\.yaml has another survey than these shards"):
+    with pytest.raises(LidarError, match=r"s\.yaml has another survey than these shards"):
         merge(shards, survey / "none", scenario=survey / "elsewhere/s.yaml")
     change(survey / "elsewhere/s.yaml", "steps: 26", "steps: 25")
     (survey / "elsewhere/s.yaml").rename(survey / "s.yaml")
@@ -659,7 +657,7 @@ def test_the_first_shard_plans_though_it_has_no_scans(tmp_path, lidarpool, slots
     parts = [tmp_path / f"part-{number}" for number in (1, 2, 3)]
     for number, part in enumerate(parts, 1):
         assert lidarpool(*run, "--shard", f"{number}/3", "--out", part).code == 0
-    with pytest.raises(LidarpoolError, match=r"^missing: 1 shard, 1/3: give"):
+    with pytest.raises(LidarError, match=r"^missing: 1 shard, 1/3: give"):
         merge(parts[1:], tmp_path / "all")
     report = merge(parts, tmp_path / "all")
     assert report["planning"]["trials"] == 3 and "report.html" not in report["files"]
@@ -709,7 +707,7 @@ def test_a_shard_is_given_or_found(text, environment, wanted):
     if isinstance(wanted, Shard):
         assert Shard.parse(text, names) == wanted
     else:
-        with pytest.raises(LidarpoolError, match=wanted):
+        with pytest.raises(LidarError, match=wanted):
             Shard.parse(text, names)
 
 

@@ -12,7 +12,7 @@ import pytest
 from distributed import Client, Queue, Variable
 from tests.shapes import room
 
-from lidarpool import LidarpoolError, Planning, ScanSpec, Sensor, Survey, simulate
+from lidarpool import LidarError, Planning, ScanSpec, Sensor, Survey, simulate
 from lidarpool.pipeline.messages import ScanRange
 from lidarpool.scenario.build import build
 from lidarpool.scenario.scenario import Scenario
@@ -145,7 +145,7 @@ def test_a_pipe_that_another_client_closes_ends_the_run_with_its_name(client, pl
         closed.append(names[0])
 
     survey = Survey(SENSOR, [(0, 0, 0)], steps=400)
-    with pytest.raises(LidarpoolError, match=f"another client has closed.*-{kind}'"):
+    with pytest.raises(LidarError, match=f"another client has closed.*-{kind}'"):
         simulate(room(), survey, client=client, on_progress=close, on_frame=close)
     assert closed
     assert all(isinstance(item, ScanRange) for item in items)
@@ -158,7 +158,7 @@ def test_a_client_that_has_given_its_scheduler_up_is_told_of_in_one_sentence(cli
     survey = Survey(SENSOR, [(0, 0, 0)])
     with (
         Client(address, set_as_default=False) as lost,
-        pytest.raises(LidarpoolError, match=f"The cluster at {address} cannot be reached"),
+        pytest.raises(LidarError, match=f"The cluster at {address} cannot be reached"),
     ):
         simulate(room(), survey, client=lost, on_frame=lambda _: lost.close())
 
@@ -178,17 +178,17 @@ def raise_at(scan: int | str | None, scan_of=None):
     ("target", "stand_in", "message"),
     [
         (
-            "lidarpool.sensor.survey.Survey.scan",
+            "lidarsim.sensor.survey.Survey.scan",
             raise_at(0, lambda arguments: arguments[1]),
             "stage generate failed: scan 0: FloatingPointError",
         ),
         (
-            "lidarpool.simulator.rig.Rig.cast",
+            "lidarsim.simulator.rig.Rig.cast",
             raise_at(None),
             r"stage intersect failed: scan \d+: FloatingPointError",
         ),
         (
-            "lidarpool.simulator.scene_caster.RayCaster",
+            "lidarsim.simulator.scene_caster.RayCaster",
             raise_at(None),
             "preparing the scene on the casting workers failed: .*the mirror is loose",
         ),
@@ -211,6 +211,6 @@ def test_a_failure_anywhere_ends_the_run_and_says_where(
     monkeypatch.setattr(target, stand_in)
     planning = Planning((25, 25), (-30, -20), [(0, 0)], 2.0, trials=1, particles=50, iterations=20)
     survey = Survey(SENSOR, [(0, 0, 0)], 20)
-    with pytest.raises(LidarpoolError, match=message):
+    with pytest.raises(LidarError, match=message):
         simulate(room(), survey, planning, client=client)
     assert left_over(client) == ([], [], [])

@@ -12,7 +12,7 @@ from tests.clusters import import_jobqueue
 
 import lidarpool.run.checks
 import poolpart.deploy.clusters
-from lidarpool import LidarpoolError, ScanFrame, Scene, Sensor, Survey, simulate
+from lidarpool import LidarError, ScanFrame, Scene, Sensor, Survey, simulate
 from lidarpool.pipeline.casting_workers import CastingWorkers
 from lidarpool.pipeline.names import GPU, LIDAR
 from lidarpool.run.checks import common_backend
@@ -131,7 +131,7 @@ def test_what_a_starting_run_waits_for_and_what_not(outside, lose_gpu):
         assert run(wait_s=300) > 0
         comes.join()
         lose_gpu(lambda: cluster.kill("scheduler"))
-        with pytest.raises(LidarpoolError, match=f"{cluster.address} cannot be reached any more"):
+        with pytest.raises(LidarError, match=f"{cluster.address} cannot be reached any more"):
             run()
 
 
@@ -155,7 +155,7 @@ def test_jobs_that_die_before_their_workers_connect_end_a_run(monkeypatch, tmp_p
     ) as cluster:
         kinds = {GPU: {"adapt": [0, 1]}, LIDAR: {"adapt": [0, 1], "slots": 4}}
         start_partitions(cluster, kinds, told.append)
-        with Client(cluster) as client, pytest.raises(LidarpoolError) as caught:
+        with Client(cluster) as client, pytest.raises(LidarError) as caught:
             simulate(Scene.seed(), SURVEY, client=client, wait_s=5.0)
     assert len(submitted) == 2  # they may wait in the queue: no others in their place
     assert "has no workers" in str(caught.value)

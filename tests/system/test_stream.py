@@ -20,7 +20,7 @@ from tests.daemons import wait_until
 from tests.drives import SCANS, TURNS, the_scene
 
 import lidarpool as lp
-from lidarpool import Campaign, Job, LidarpoolError, Mounted, Noise, Pose, Sensor, Survey, Sweep
+from lidarpool import Campaign, Job, LidarError, Mounted, Noise, Pose, Sensor, Survey, Sweep
 from lidarpool.base.tracing import trace_to
 
 SCENE = the_scene()
@@ -145,7 +145,7 @@ def test_no_workers_are_started_in_a_task(cluster_client):
         lp.simulate(lp.Scene.seed(), Survey(poses=[(0, 0, 1)]))
 
     task = cluster_client.submit(run, resources={"OTHER": 1}, pure=False)
-    with pytest.raises(LidarpoolError, match="which in a task of Dask cannot be done: give client"):
+    with pytest.raises(LidarError, match="which in a task of Dask cannot be done: give client"):
         task.result(timeout=300)
 
 
@@ -215,13 +215,13 @@ def test_errors_are_told_in_a_line(cluster_client):
         ({"split": "tran"}, r"no split 'tran'\. Did you mean 'train'"),
         ({"split": "x"}, r"no split 'x'\. It has train, test"),
     ):
-        with pytest.raises(LidarpoolError, match=words) as told:
+        with pytest.raises(LidarError, match=words) as told:
             campaign(splits={"train": 0.5, "test": 0.5}).stream(cluster_client, **options)
         assert "\n" not in str(told.value)
     with (
         thread_cluster({"LIDAR": 1}) as cluster,
         Client(cluster, set_as_default=False) as client,
-        pytest.raises(LidarpoolError, match="GPU"),
+        pytest.raises(LidarError, match="GPU"),
     ):
         next(iter(campaign().stream(client, wait_s=0)))
 
@@ -232,7 +232,7 @@ def test_a_cluster_that_is_lost_ends_it():
         stream = iter(campaign(9).stream(client, ahead=1))
         next(stream)
         client.close()
-        with pytest.raises(LidarpoolError, match="has lost its cluster"):
+        with pytest.raises(LidarError, match="has lost its cluster"):
             list(stream)
 
 
@@ -250,5 +250,5 @@ def test_torch_divides_jobs_between_ranks(cluster_client, torch):
         assert items[0]["points"].dtype == np.float32 and items[0]["boxes"].shape[1] == 7
     assert next(iter(stream.torch(transform=lambda sweep: sweep.job))) == "0001"
     torch.utils.data.get_worker_info = lambda: types.SimpleNamespace(id=0, num_workers=2)
-    with pytest.raises(LidarpoolError, match="num_workers=0"):
+    with pytest.raises(LidarError, match="num_workers=0"):
         next(iter(stream.torch()))

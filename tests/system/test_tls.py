@@ -9,7 +9,7 @@ import pytest
 from distributed import Client, Security
 from tests.clusters import thread_cluster
 
-from lidarpool import LidarpoolError
+from lidarpool import LidarError
 from lidarpool.run.connection import TlsFiles, connected, local_cluster
 from lidarpool.run.watch import Waiting
 from poolpart import Pool
@@ -37,7 +37,7 @@ def encrypted(tmp_path_factory) -> Iterator[tuple[str, TlsFiles]]:
 def told(address: str, files: TlsFiles | None = None) -> str:
     # Waiting would mend none of it, and is not done.
     waiting = Waiting(3600)
-    with pytest.raises(LidarpoolError) as refused, connected(address, files, waiting):
+    with pytest.raises(LidarError) as refused, connected(address, files, waiting):
         pytest.fail("it let us in")
     assert "\n" not in str(refused.value)
     return str(refused.value)

@@ -8,7 +8,7 @@ EVERYTHING_ELSE = """
 import sys
 from pathlib import Path
 from distributed import Client
-from lidarpool import LidarpoolError, Scene, Survey, read_cloud, simulate, save_cloud
+from lidarpool import LidarError, Scene, Survey, read_cloud, simulate, save_cloud
 from lidarpool.cli.commands import main
 from lidarpool.live.view import open_result, result_page
 
@@ -31,7 +31,7 @@ if __name__ == "__main__":
     save_cloud(points, "again.laz")
     try:
         save_cloud(points, "again.ply")
-    except LidarpoolError as error:
+    except LidarError as error:
         print(error)
 """
 

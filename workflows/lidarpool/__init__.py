@@ -3,34 +3,19 @@
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-from ._version import __version__
+from lidarsim._version import __version__
 
 if TYPE_CHECKING:
-    from .api.result import Result
-    from .api.simulation import Campaign, simulate
-    from .base.errors import LidarpoolError
-    from .columns.cloud import Cloud
-    from .columns.table import Column
-    from .compare.comparison import Comparison, compare
-    from .compare.fit import Fit, fit
-    from .datasets.loader import sweeps
-    from .datasets.sweep_data import Sweep
-    from .export.formats import save_cloud
-    from .export.open3d_cloud import to_open3d
-    from .export.ply import read_cloud
-    from .pipeline.messages import ScanFrame
-    from .plan import Plan, Planning
-    from .report.merging import merge
-    from .run.run_result import CampaignRun
-    from .run.store import remove_run
-    from .scenario.build import Job
-    from .scene.actors import Actor
-    from .scene.files.urdf import load_robot
-    from .scene.robot import Robot
-    from .scene.scene import Scene
-    from .scene.scene_instances import SceneInstance
-    from .scene.scene_mesh import SceneMesh
-    from .sensor import (
+    from lidarsim.base.errors import LidarError
+    from lidarsim.columns.cloud import Cloud
+    from lidarsim.columns.table import Column
+    from lidarsim.scene.actors import Actor
+    from lidarsim.scene.files.urdf import load_robot
+    from lidarsim.scene.robot import Robot
+    from lidarsim.scene.scene import Scene
+    from lidarsim.scene.scene_instances import SceneInstance
+    from lidarsim.scene.scene_mesh import SceneMesh
+    from lidarsim.sensor import (
         Beams,
         Fault,
         Gnss,
@@ -47,10 +32,26 @@ if TYPE_CHECKING:
         Spin,
         Survey,
     )
-    from .sensor.models import load_sensor
-    from .sensor.trajectory import Track
-    from .sensor.trajectory_files import load_trajectory
-    from .simulator import Scanner
+    from lidarsim.sensor.models import load_sensor
+    from lidarsim.sensor.trajectory import Track
+    from lidarsim.sensor.trajectory_files import load_trajectory
+    from lidarsim.simulator import Scanner
+
+    from .api.result import Result
+    from .api.simulation import Campaign, simulate
+    from .compare.comparison import Comparison, compare
+    from .compare.fit import Fit, fit
+    from .datasets.loader import sweeps
+    from .datasets.sweep_data import Sweep
+    from .export.formats import save_cloud
+    from .export.open3d_cloud import to_open3d
+    from .export.ply import read_cloud
+    from .pipeline.messages import ScanFrame
+    from .plan import Plan, Planning
+    from .report.merging import merge
+    from .run.run_result import CampaignRun
+    from .run.store import remove_run
+    from .scenario.build import Job
 
 __all__ = [
     "Actor",
@@ -65,7 +66,7 @@ __all__ = [
     "Gnss",
     "Imu",
     "Job",
-    "LidarpoolError",
+    "LidarError",
     "Material",
     "Mounted",
     "Navigation",
@@ -108,7 +109,7 @@ __all__ = [
 _MODULES = {
     "api.result": ("Result",),
     "api.simulation": ("Campaign", "simulate"),
-    "base.errors": ("LidarpoolError",),
+    "base.errors": ("LidarError",),
     "columns.cloud": ("Cloud",),
     "columns.table": ("Column",),
     "datasets.loader": ("sweeps",),

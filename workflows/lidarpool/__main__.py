@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 from typing import NoReturn, TextIO, cast
 
-from .base.interrupts import end_on_signals
+from lidarsim.base.interrupts import end_on_signals
 
 
 def main() -> NoReturn:

@@ -14,9 +14,10 @@ from pathlib import Path
 from tempfile import TemporaryDirectory, mkdtemp
 from typing import TYPE_CHECKING, Any
 
+from lidarsim.base.validation import checked
+from lidarsim.base.words import plural
+
 from ..base.notebook import cell_display
-from ..base.validation import checked
-from ..base.words import plural
 from ..export.formats import save_cloud
 from ..run.run_result import RunResult
 
@@ -69,7 +70,7 @@ class Result(RunResult):
 
         Raises
         ------
-        LidarpoolError
+        LidarError
             If a file cannot be written, the folder holds the result of another survey, or a
             format lacks a package or column.
         """
@@ -112,7 +113,7 @@ class Result(RunResult):
 
         Raises
         ------
-        LidarpoolError
+        LidarError
             If there is no such picture, size or column, or a file cannot be written.
         """
         from ..report.result_pictures import draw_pictures

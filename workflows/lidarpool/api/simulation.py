@@ -9,13 +9,17 @@ from typing import Annotated
 from distributed import Client
 from pydantic import Field
 
-from ..base.declared import declared
-from ..base.errors import LidarpoolError
+from lidarsim.base.declared import declared
+from lidarsim.base.errors import LidarError
+from lidarsim.base.storage import Storage
+from lidarsim.base.validation import checked
+from lidarsim.base.vocabulary import PATIENCE_S, WAIT_S
+from lidarsim.base.words import did_you_mean
+from lidarsim.scene.scene import Scene
+from lidarsim.sensor import Survey
+from lidarsim.simulator.scene_caster import check_backend_here
+
 from ..base.shard import Shard
-from ..base.storage import Storage
-from ..base.validation import checked
-from ..base.vocabulary import PATIENCE_S, WAIT_S
-from ..base.words import did_you_mean
 from ..export.folder import output_place
 from ..live import page_of
 from ..pipeline.messages import ScanFrame
@@ -30,9 +34,6 @@ from ..run.store import RUN_FOLDER
 from ..run.stream import SweepStream
 from ..scenario import campaign as described
 from ..scenario.build import Job
-from ..scene.scene import Scene
-from ..sensor import Survey
-from ..simulator.scene_caster import check_backend_here
 from .result import Result
 
 
@@ -120,7 +121,7 @@ def simulate(
 
     Raises
     ------
-    LidarpoolError
+    LidarError
         If the cluster lacks something or a task fails, if `folder` has an unfinished run and
         `resume` is not set, if that is damaged, or of another scene, survey, planning or
         version; one or two lines say which and what to do. KeyboardInterrupt passes through
@@ -226,7 +227,7 @@ class Campaign(described.CampaignSpec):  # noqa: D101 - as there
 
         Raises
         ------
-        LidarpoolError
+        LidarError
             If the cluster lacks something, or `out` holds something else, or the unfinished run of
             another campaign or version; one or two lines say which and what to do.
         """
@@ -274,14 +275,14 @@ class Campaign(described.CampaignSpec):  # noqa: D101 - as there
         declare the resource GPU; without one, each loop starts a local cluster, and stops it.
         `split` chooses jobs. The others are as of `run`.
 
-        LidarpoolError if there is no such split; in the loop, if the cluster lacks something or is
+        LidarError if there is no such split; in the loop, if the cluster lacks something or is
         lost.
         """
         if split is not None and split not in self.splits:
             known = (
                 did_you_mean(split, self.splits) or f" It has {', '.join(self.splits) or 'none'}."
             )
-            raise LidarpoolError(f"The campaign has no split {split!r}.{known}")
+            raise LidarError(f"The campaign has no split {split!r}.{known}")
         numbers = [n for n in range(self.count) if split in (None, self.split(n))]
         options = RunOptions(
             client=client, gpu_workers=gpu_workers, wait_s=wait_s, patience_s=patience_s

@@ -14,7 +14,7 @@ import sys
 from multiprocessing import forkserver
 from typing import Any
 
-from .interrupts import children_spared
+from lidarsim.base.interrupts import children_spared
 
 # Numerical libraries get one thread: workers share the cores, and threads cannot be forked.
 _ENVIRONMENT = dict.fromkeys(("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1")

@@ -8,8 +8,8 @@ from importlib.util import find_spec, module_from_spec
 from threading import Lock
 from typing import Any
 
-from .errors import LidarpoolError
-from .interrupts import deferred_interrupts
+from lidarsim.base.errors import LidarError
+from lidarsim.base.interrupts import deferred_interrupts
 
 _LOCK = Lock()  # a second thread would find the package that is to be taken away
 
@@ -21,7 +21,7 @@ def load_open3d() -> Any:
     a browser. So the extension is loaded below a package that has not been run, and that is taken
     away again: whoever says `import open3d`, before or after, gets the whole package.
 
-    LidarpoolError if Open3D is not installed, or lacks a library of the system.
+    LidarError if Open3D is not installed, or lacks a library of the system.
     """
     # Interrupted while it loads, an extension module cannot be loaded again.
     with deferred_interrupts(), _LOCK:
@@ -31,7 +31,7 @@ def load_open3d() -> Any:
             advice = "apt-get install libegl1 libgl1 libgomp1 libusb-1.0-0 (on Debian and Ubuntu)"
             if isinstance(error, ModuleNotFoundError):
                 advice = "pip install open3d-cpu (Linux x86_64) or open3d"
-            raise LidarpoolError(
+            raise LidarError(
                 f"Clouds are written through Open3D, which does not load ({error}): {advice}."
             ) from error
 

@@ -7,7 +7,7 @@ import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from .errors import LidarpoolError
+from lidarsim.base.errors import LidarError
 
 _SLURM = [f"SLURM_ARRAY_TASK_{name}" for name in ("ID", "MIN", "MAX", "STEP", "COUNT")]
 _KUBERNETES = ["JOB_COMPLETION_INDEX"]
@@ -20,14 +20,14 @@ def shard_in_words(text: str) -> str:
 
 @dataclass(frozen=True, order=True)
 class Shard:
-    """Share `number` of `of` shares, counted from 1; LidarpoolError if there is no such share."""
+    """Share `number` of `of` shares, counted from 1; LidarError if there is no such share."""
 
     number: int
     of: int
 
     def __post_init__(self) -> None:
         if not 1 <= self.number <= self.of:
-            raise LidarpoolError(
+            raise LidarError(
                 f"there is no shard {self}: they are 1/{self.of} to {self.of}/{self.of}."
             )
 
@@ -38,10 +38,10 @@ class Shard:
     def parse(cls, text: str, environment: Mapping[str, str] = os.environ) -> Shard:
         """Read ``3/10``; ``auto``, the task of a Slurm array; or ``auto/10``, a pod's index.
 
-        LidarpoolError if it is none of them, or there is no such shard, array or index.
+        LidarError if it is none of them, or there is no such shard, array or index.
         """
         if not (found := re.fullmatch(r"(?:(\d+)|auto)/(\d+)|auto", text, re.ASCII)):
-            raise LidarpoolError(f"{text!r} is no shard: give 3/10, auto/10 or auto.")
+            raise LidarError(f"{text!r} is no shard: give 3/10, auto/10 or auto.")
         if found[1]:
             return cls(int(found[1]), int(found[2]))
         names = _KUBERNETES if found[2] else _SLURM
@@ -53,7 +53,7 @@ class Shard:
             return cls((index - first) // step + 1, count)
         except (LookupError, ValueError, ZeroDivisionError) as error:
             told = ", ".join(f"{name}={environment.get(name, '')}" for name in names)
-            raise LidarpoolError(f"{text!r} finds no shard in {told}: give 3/10.") from error
+            raise LidarError(f"{text!r} finds no shard in {told}: give 3/10.") from error
 
     def jobs(self, count: int) -> range:
         """Return the jobs of the share, of so many: neighbouring jobs are in different shares."""

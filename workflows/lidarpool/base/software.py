@@ -14,10 +14,9 @@ import numpy as np
 import psutil
 from distributed import get_worker
 
+from lidarsim._version import __version__
+from lidarsim.base.errors import LidarError
 from raybeam import backend_build
-
-from .._version import __version__
-from .errors import LidarpoolError
 
 T = TypeVar("T")
 
@@ -73,11 +72,11 @@ def software_there(backend: str = "") -> Callable[[], dict[str, str]]:
 
     def ask() -> dict[str, str]:
         try:
-            from lidarpool._version import __version__
+            from lidarsim._version import __version__
         except ModuleNotFoundError:
             return {}
         try:
-            from lidarpool.base.software import software
+            from .software import software
         except ModuleNotFoundError:
             return {"lidarpool": __version__}
         return software(backend)
@@ -88,12 +87,12 @@ def software_there(backend: str = "") -> Callable[[], dict[str, str]]:
 def call_alike(wanted: str, function: Callable[..., T], *arguments: Any) -> T:
     """Call a function in a task, if its worker has the sources of the run.
 
-    `wanted` is ``lidarpool`` in the `software` of the run's driver. LidarpoolError if not.
+    `wanted` is ``lidarpool`` in the `software` of the run's driver. LidarError if not.
     """
     here = software()["lidarpool"]
     if here != wanted:
         worker = get_worker()
-        raise LidarpoolError(
+        raise LidarError(
             f"worker {worker.name} at {worker.address} has lidarpool {here}, the run {wanted}: "
             "install the same on both, and start the worker again."
         )

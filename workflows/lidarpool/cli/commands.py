@@ -15,18 +15,19 @@ from typing import TYPE_CHECKING, Any, NoReturn
 
 import click
 
-from .._version import __version__
-from ..base.errors import LidarpoolError
-from ..base.interrupts import (
+from lidarsim._version import __version__
+from lidarsim.base.errors import LidarError
+from lidarsim.base.interrupts import (
     INTERRUPTED,
     STOPPED,
     UNTOUCHED,
     deferred_interrupts,
     interrupt_on_signals,
 )
+from lidarsim.base.vocabulary import PATIENCE_S, QUEUE_S, WAIT_S
+from lidarsim.base.words import plural
+
 from ..base.shard import ALL
-from ..base.vocabulary import PATIENCE_S, QUEUE_S, WAIT_S
-from ..base.words import plural
 from . import shared_options as shared
 from .result_commands import compare, export, fit, plot, view
 from .scenario_commands import check, import_, init, scene, schema, sensors, stations
@@ -210,7 +211,8 @@ def run(
       lidarpool run examples/campaign.yaml --shard 3/10 --out part-3
       lidarpool run --verify dataset
     """  # noqa: D301 - click wants the character, not its name
-    from ..base.storage import Storage
+    from lidarsim.base.storage import Storage
+
     from ..report.campaign_output import verify
     from ..run.store import RUN_FOLDER
     from ..scenario.campaign import CampaignSpec, is_campaign
@@ -360,7 +362,7 @@ def _explanation(error: Exception) -> str | None:
             return f"{name}: {error.strerror}: give another name or folder."
         case MemoryError():
             return "not enough memory: take a smaller scene, fewer scans or a larger keep_every."
-        case LidarpoolError():
+        case LidarError():
             return str(error)
         case RuntimeError():
             from poolpart import PoolError

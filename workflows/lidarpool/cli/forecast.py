@@ -18,14 +18,22 @@ from dask.utils import format_bytes
 from distributed import Client
 from distributed.system import MEMORY_LIMIT
 
+from lidarsim.base.errors import LidarError, Mistakes
+from lidarsim.base.storage import Storage
+from lidarsim.base.words import plural
+from lidarsim.columns.cloud import CHUNK_POINTS
+from lidarsim.scene.actors import shapes_of
+from lidarsim.scene.scene import Scene
+from lidarsim.scene.simplified import DRAWN_TRIANGLES
+from lidarsim.sensor import Survey
+from lidarsim.simulator.memory import MB, cast_bytes, scans_that_fit
+from lidarsim.simulator.rig import PATTERN_RAYS
+from lidarsim.simulator.sampling import sample_survey
+from lidarsim.simulator.scene_caster import check_backend_here
 from poolpart import Pool
 from poolpart.probe import visible_gpus
 from raybeam import available_backends
 
-from ..base.errors import LidarpoolError, Mistakes
-from ..base.storage import Storage
-from ..base.words import plural
-from ..columns.cloud import CHUNK_POINTS
 from ..export.navigation_files import instrument_bytes
 from ..pipeline.database import FILE
 from ..pipeline.names import GPU, LIDAR, OTHER
@@ -42,14 +50,6 @@ from ..scenario.campaign import CampaignSpec, is_campaign
 from ..scenario.empty_cloud import EMPTY, empty_cloud_reason
 from ..scenario.plausibility import implausibilities
 from ..scenario.scenario import Scenario
-from ..scene.actors import shapes_of
-from ..scene.scene import Scene
-from ..scene.simplified import DRAWN_TRIANGLES
-from ..sensor import Survey
-from ..simulator.memory import MB, cast_bytes, scans_that_fit
-from ..simulator.rig import PATTERN_RAYS
-from ..simulator.sampling import sample_survey
-from ..simulator.scene_caster import check_backend_here
 from .terminal import Terminal
 
 # Measured on Linux: a process of ours with Dask loaded, and the most that a triangle takes while a
@@ -95,7 +95,7 @@ def look_at(
     """
     campaign = CampaignSpec.load(path) if not of_mesh and is_campaign(path) else None
     if campaign is None and number is not None:
-        raise LidarpoolError(f"{path} is no campaign, and has no job {number}.")
+        raise LidarError(f"{path} is no campaign, and has no job {number}.")
 
     terminal = Terminal(quiet)
 
@@ -167,7 +167,7 @@ def forecast(job: Job, options: RunOptions, client: Client | None = None) -> dic
     occupied = bool(notes)  # an unfinished run
     try:
         SurveyOutput(out, job.survey, formats).refuse(lambda: identity_of(job))
-    except LidarpoolError as error:
+    except LidarError as error:
         notes.append(str(error).rstrip("."))
         occupied = True
     for one in formats:
@@ -350,13 +350,13 @@ def _holds_files(out: Path | Storage | None) -> bool:
 
 
 def _look_at_folder(out: Path | Storage) -> list[str]:
-    """Return notes on the place of the result; LidarpoolError if it cannot be written there."""
+    """Return notes on the place of the result; LidarError if it cannot be written there."""
     if isinstance(out, Storage):
         out.claim()  # leaves nothing
     elif not (there := _existing(out)).is_dir():
-        raise LidarpoolError(f"{there} is a file: give a folder for the results with --out.")
+        raise LidarError(f"{there} is a file: give a folder for the results with --out.")
     elif not os.access(there, os.W_OK | os.X_OK):
-        raise LidarpoolError(f"Cannot write to the folder {there}: give another with --out.")
+        raise LidarError(f"Cannot write to the folder {there}: give another with --out.")
     unfinished = FILE in Storage.at(out).below(RUN_FOLDER).sizes()
     note = f"{out} holds an unfinished run: --resume continues it, --fresh deletes it"
     return [note] if unfinished else []

@@ -10,9 +10,10 @@ from typing import Any
 
 import click
 
-from ..base.errors import LidarpoolError
-from ..base.storage import Storage
-from ..base.vocabulary import PICTURES, UNITS_M
+from lidarsim.base.errors import LidarError
+from lidarsim.base.storage import Storage
+from lidarsim.base.vocabulary import PICTURES, UNITS_M
+
 from ..export.format_table import EXPORTS, FORMATS, LAYOUTS
 from . import shared_options as options
 
@@ -67,7 +68,7 @@ def plot(result: Path | Storage, out: Path | Storage | None, **given: Any) -> No
     place = result if out is None else out
     with local_result(result, (PICTURE_FILE, CLOUD, PAGE)) as made:
         if not (made / PICTURE_FILE).exists():
-            raise LidarpoolError(
+            raise LidarError(
                 f"{result} holds no {PICTURE_FILE}, the data of the pictures: give the "
                 "folder of a finished run (its --out)."
             )
@@ -120,21 +121,22 @@ def export(
       lidarpool export lidarpool-out --format laz
       lidarpool export lidarpool-out --format mcap --layout autoware --out bags
     """  # noqa: D301 - click wants the character, not its name
+    from lidarsim.sweeps.instruments import INSTRUMENT_FILES
+    from lidarsim.sweeps.sweeps import SWEEPS_FILE, Sweeps
+
     from ..columns.cloud_file import CloudFile
     from ..export.folder import local_result, result_folder, send
     from ..export.formats import Format
-    from ..export.instruments import INSTRUMENT_FILES
-    from ..export.sweeps import SWEEPS_FILE, Sweeps
 
     # The report of a result is moved into place last.
     needed = ("cloud.ply", SWEEPS_FILE, "report.json")
     place = result if out is None else out
     if isinstance(result, Path) and result.is_file():
-        raise LidarpoolError(f"{result} is a file: give its folder, {result.parent}.")
+        raise LidarError(f"{result} is a file: give its folder, {result.parent}.")
     with local_result(result, (*needed, *INSTRUMENT_FILES)) as made:
         for name in needed:
             if not (made / name).exists():
-                raise LidarpoolError(
+                raise LidarError(
                     f"{result} holds no {name}: give the folder of a finished run (its --out); "
                     "lidarpool run --resume continues an unfinished one."
                 )
@@ -151,7 +153,7 @@ def export(
             for one in wanted:  # before any is written, which may take long
                 one.check(folder / one.row.file, cloud, overwrite=overwrite)
                 if isinstance(place, Storage) and not overwrite and one.row.file in place.entries():
-                    raise LidarpoolError(
+                    raise LidarError(
                         f"{place.path(one.row.file)} is there already: give another place with "
                         "--out, or --overwrite."
                     )
@@ -162,7 +164,7 @@ def export(
                     for note in one.notes(cloud, sweeps):
                         click.echo(f"note: {note}", err=True)
                     click.echo(written[-1])
-            except (LidarpoolError, KeyboardInterrupt) as error:
+            except (LidarError, KeyboardInterrupt) as error:
                 if written:
                     error.add_note(f"Written before: {', '.join(written)}.")
                 raise
@@ -198,15 +200,16 @@ def view(
       lidarpool view before after
       lidarpool view drive --film drive.gif --export drive.html
     """  # noqa: D301 - click wants the character, not its name
+    from lidarsim.sweeps.sweeps import SWEEPS_FILE
+
     from ..export.folder import local_result
-    from ..export.sweeps import SWEEPS_FILE
     from ..live.sharing import share
     from ..live.view import CLOUD, open_results, show_view
     from ..run.picture_file import PICTURE_FILE
     from .terminal import Terminal
 
     if (film or export) and len(results) > 1:
-        raise LidarpoolError("--film and --export take one result: give them one after the other.")
+        raise LidarError("--film and --export take one result: give them one after the other.")
     with ExitStack() as stack:
         files = (CLOUD, PICTURE_FILE, SWEEPS_FILE)
         made = [stack.enter_context(local_result(result, files)) for result in results]

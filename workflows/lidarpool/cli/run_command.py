@@ -12,10 +12,12 @@ from typing import Any
 
 import click
 
-from ..base.errors import LidarpoolError
+from lidarsim.base.errors import LidarError
+from lidarsim.base.storage import Storage
+from lidarsim.base.words import plural
+from lidarsim.simulator.scene_caster import check_backend_here
+
 from ..base.shard import Shard, shard_in_words
-from ..base.storage import Storage
-from ..base.words import plural
 from ..datasets.dataset import DataSet
 from ..datasets.job_table import Tally, read_table
 from ..export.folder import local_result, output_place, result_folder
@@ -33,7 +35,6 @@ from ..scenario.build import Built, Job, build
 from ..scenario.campaign import CampaignSpec
 from ..scenario.plausibility import implausibilities
 from ..scenario.scenario import Scenario
-from ..simulator.scene_caster import check_backend_here
 from .shared_options import show
 from .terminal import Terminal
 
@@ -51,7 +52,7 @@ def run_scenario(
 ) -> None:
     """Run a scenario, write the result and print a summary.
 
-    Of a `shard`, the run stays, and says what it is `made_of`. LidarpoolError if the run fails;
+    Of a `shard`, the run stays, and says what it is `made_of`. LidarError if the run fails;
     notes of the error say what was kept.
     """
     options = options.with_pool(scenario.pool, backend)
@@ -104,7 +105,7 @@ def _run_survey(
 def run_campaign(
     campaign: CampaignSpec, terminal: Terminal, options: RunOptions, backend: str | None
 ) -> None:
-    """Run a campaign, and print a summary; LidarpoolError if it or a job fails."""
+    """Run a campaign, and print a summary; LidarError if it or a job fails."""
     options = options.with_pool(campaign.pool, backend)
     assert options.out is not None, "commands write"
     for warning in _first_job_warnings(campaign, terminal):
@@ -126,7 +127,7 @@ def run_campaign(
         if options.live and options.stay:
             page.stay()
     if run.failed:
-        raise LidarpoolError(failures(run))
+        raise LidarError(failures(run))
 
 
 def _first_job_warnings(campaign: CampaignSpec, terminal: Terminal) -> list[str]:
@@ -137,7 +138,7 @@ def _first_job_warnings(campaign: CampaignSpec, terminal: Terminal) -> list[str]
     if not campaign.numbers:
         return []
     number = campaign.numbers[0]
-    with suppress(LidarpoolError), terminal.status("reading the scene", logged=False):
+    with suppress(LidarError), terminal.status("reading the scene", logged=False):
         if (scenario := campaign.scenario(number)) is not None:  # else a function makes the jobs
             warnings = implausibilities(build(scenario, plans=False))
             return [f"job {campaign.name(number)}: {warning}" for warning in warnings]
@@ -155,7 +156,7 @@ def run_job(
     """Run one job of a campaign again, and write it as the result of a survey.
 
     Where the place is the data set of the campaign, the result is a folder in it, and its points
-    must be those of the data set. LidarpoolError if they are not, or cannot be: it was made by
+    must be those of the data set. LidarError if they are not, or cannot be: it was made by
     other software, or its files there are damaged.
     """
     assert options.out is not None, "commands write"
@@ -179,7 +180,7 @@ def run_job(
         if not known:
             return ""
         if Tally.of(result.points).sha256 not in known:
-            raise LidarpoolError(
+            raise LidarError(
                 f"job {name} has other points than those in {place}: files that it is "
                 "made of have changed, such as images of a mesh."
             )

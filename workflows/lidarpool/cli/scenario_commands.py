@@ -16,18 +16,20 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from ..base.errors import LidarpoolError
-from ..base.vocabulary import UNITS_M
-from ..base.words import plural, without_common_prefix
+from lidarsim.base.errors import LidarError
+from lidarsim.base.vocabulary import UNITS_M
+from lidarsim.base.words import plural, without_common_prefix
+
 from . import shared_options as options
 from .shared_options import WARNED, Command, overwrite, together
 
 if TYPE_CHECKING:
-    from ..base.storage import Storage
+    from lidarsim.base.storage import Storage
+    from lidarsim.scene.scene import Scene
+
     from ..plan.stations import StationPlan
     from ..run.connection import TlsFiles
     from ..scenario.scenario import Scenario
-    from ..scene.scene import Scene
 
 MOST_COPIED = 20_000_000  # triangles of files that cannot share them
 PLAN_FILE, PICTURE_FILE = "stations.yaml", "stations.png"
@@ -88,7 +90,7 @@ def init(folder: Path, meshes: tuple[Path, ...], of_mesh: dict[str, Any], every:
             schema_text(scenario_schema()), encoding="utf-8", newline="\n"
         )
     except FileExistsError as error:
-        raise LidarpoolError(
+        raise LidarError(
             f"{error.filename} exists, and is not overwritten: name another folder, "
             "lidarpool init DIR, or remove it."
         ) from error
@@ -190,14 +192,14 @@ def check(
             found, lines = look_at(
                 scenario, of_mesh, number, client, asked, backend, no_plan=no_plan, quiet=as_json
             )
-    except LidarpoolError as error:
+    except LidarError as error:
         if as_json:
             reasons = {"reasons": [str(error)], "notes": [], "warnings": []}
             options.show({"can_run": False, **reasons}, (), True)
         raise
     options.show(found, lines, as_json)
     if found["reasons"]:
-        raise LidarpoolError("it cannot run. " + " ".join(found["reasons"]))
+        raise LidarError("it cannot run. " + " ".join(found["reasons"]))
     if not as_json:
         words = ["lidarpool", "run", str(scenario), *options.as_words(of_mesh)]
         given: dict[str, object] = {"out": out, "scheduler": scheduler, "cluster": cluster}
@@ -214,7 +216,7 @@ def check(
 
 def _free_place(out: Path | Storage) -> str:
     """Name a place beside one that holds another result, in which nothing is."""
-    from ..base.storage import Storage
+    from lidarsim.base.storage import Storage
 
     names = (f"{str(out).rstrip('/')}-{number}" for number in count(2))
     return next(name for name in names if not Storage.at(name).entries())
@@ -272,7 +274,7 @@ def city(out: Path, triangles: int, seed: int, overwrite: bool, trees: int, cars
       lidarpool scene city city.ply --triangles 10000000 --seed 7
       lidarpool scene city green.glb --trees 500 --cars 200
     """  # noqa: D301 - click wants the character, not its name
-    from ..scene.generated.city import city as make
+    from lidarsim.scene.generated.city import city as make
 
     _write(out, lambda: make(triangles, seed, trees, cars), overwrite, paint=True)
 
@@ -290,7 +292,7 @@ def terrain(out: Path, triangles: int, seed: int, side: float, overwrite: bool, 
       lidarpool scene terrain small.obj --triangles 20000 --side 100
       lidarpool scene terrain woods.glb --trees 10000
     """  # noqa: D301 - click wants the character, not its name
-    from ..scene.generated.terrain import terrain as make
+    from lidarsim.scene.generated.terrain import terrain as make
 
     _write(out, lambda: make(triangles, seed, side, trees), overwrite, paint=True)
 
@@ -331,7 +333,7 @@ def points(
       lidarpool scene points survey.laz place.obj --voxel-m 0.5
       lidarpool scene points scan.xyz place.glb --unit mm
     """  # noqa: D301 - click wants the character, not its name
-    from ..scene.point_scene import scene_of_points
+    from ..scenario.point_scene import scene_of_points
 
     made = partial(scene_of_points, cloud, voxel_m=voxel_m, size=size, unit=unit)
     _write(out, made, overwrite)
@@ -339,17 +341,17 @@ def points(
 
 def _write(out: Path, make: Callable[[], Scene], overwrite: bool, paint: bool = False) -> None:
     """Make a scene and write it to a file; `paint` gives a generated scene its colours."""
-    from ..scene.paint import painted
-    from ..scene.scene_file import check_target, write_scene
+    from lidarsim.scene.paint import painted
+    from lidarsim.scene.scene_file import check_target, write_scene
 
     check_target(out)
     if out.exists() and not overwrite:
-        raise LidarpoolError(f"{out} exists: give another name, or --overwrite.")
+        raise LidarError(f"{out} exists: give another name, or --overwrite.")
     made = make()
     if out.suffix.lower() == ".glb":  # others keep no colours
         made = painted(made) if paint else made
     elif made.instances and made.triangles > MOST_COPIED:
-        raise LidarpoolError(
+        raise LidarError(
             f"{out} would hold {made.triangles:,} triangles, because only .glb files have a tree "
             "once for many places: write one."
         )
@@ -373,7 +375,7 @@ def sensors(model: str | None, out: Path | None) -> None:
       lidarpool sensors velodyne/vlp16
       lidarpool sensors velodyne/vlp16 --out vlp16.png
     """  # noqa: D301 - click wants the character, not its name
-    from ..sensor.models import load_sensor, model_names, read_model, shown_noise
+    from lidarsim.sensor.models import load_sensor, model_names, read_model, shown_noise
 
     if model is None:
         heads = ("model", "channels", "field of view", "range", "turns a second", "points a second")
@@ -409,7 +411,7 @@ def _row(name: str) -> tuple[str, ...]:
     """Name of a model, channels, field of view, range, rates, points a second."""
     import numpy as np
 
-    from ..sensor.models import load_sensor, read_model
+    from lidarsim.sensor.models import load_sensor, read_model
 
     model = read_model(name)
     low, high = model.range_m or (0.0, float("inf"))
@@ -500,19 +502,20 @@ def stations(
     count, coverage = given["count"], given["coverage"]
     if count is not None and coverage is not None:
         raise click.UsageError("--count and --coverage both say when to stop: give one of them.")
+    from lidarsim.sensor.models import full_name, load_sensor
+
     from ..plan.stations import STATIONS_MOST, plan_stations
     from ..report.result_pictures import draw_stations
     from ..scenario.advice import advice
     from ..scenario.build import build
     from ..scenario.placing import Placing
     from ..scenario.scenario import Scenario
-    from ..sensor.models import full_name, load_sensor
     from .terminal import Terminal
 
     folder = Path(f"{scene.stem}-stations") if out is None else out
     there = [folder / name for name in (PLAN_FILE, PICTURE_FILE) if (folder / name).exists()]
     if there and not overwrite:
-        raise LidarpoolError(f"{there[0]} exists: give another folder, --out, or --overwrite.")
+        raise LidarError(f"{there[0]} exists: give another folder, --out, or --overwrite.")
     model = full_name(model)
     sensor = load_sensor(model)
     read, terminal = Scenario.load(scene), Terminal(quiet=as_json)

@@ -14,10 +14,11 @@ from typing import Any
 
 import click
 
-from ..base.errors import explained
+from lidarsim.base.errors import explained
+from lidarsim.base.storage import Storage, is_url
+from lidarsim.base.vocabulary import BACKENDS, UNITS_M
+
 from ..base.shard import Shard
-from ..base.storage import Storage, is_url
-from ..base.vocabulary import BACKENDS, UNITS_M
 
 Command = Callable[..., None]
 
@@ -134,7 +135,8 @@ def scheduler(command: Command) -> Command:
 
     @wraps(command)
     def with_files(*arguments: Any, **given: Any) -> None:
-        from ..base.input_files import input_size
+        from lidarsim.base.input_files import input_size
+
         from ..run.connection import TlsFiles
 
         if given.get("cluster") is not None and given["scheduler"] is not None:

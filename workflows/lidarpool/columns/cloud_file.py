@@ -9,18 +9,19 @@ from typing import Any
 
 import numpy as np
 
-from ..base.arrays import AnyArray, AnyFloats, Ints, Records
-from ..base.sampling import even_indices
-from .cloud import CHUNK_POINTS, Cloud
+from lidarsim.base.arrays import AnyArray, AnyFloats, Ints, Records
+from lidarsim.base.sampling import even_indices
+from lidarsim.columns.cloud import CHUNK_POINTS, Cloud
+from lidarsim.columns.table import TABLE, Column
+
 from .ply_format import AXES, mapped_rows
-from .table import TABLE, Column
 
 
 class CloudFile:
     """A cloud in PLY format, whose points stay on disk until they are selected.
 
     The file cannot store units, so `own` describes columns that are not in the table of columns, if
-    that is known. LidarpoolError if it cannot be read, or is not a point cloud of lidarpool.
+    that is known. LidarError if it cannot be read, or is not a point cloud of lidarpool.
     """
 
     def __init__(self, path: Path, own: Sequence[Column] = ()) -> None:

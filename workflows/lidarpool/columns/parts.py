@@ -20,16 +20,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import DTypeLike
 
-from ..base.archives import read_arrays, read_npy
-from ..base.arrays import AnyArray, Floats, Integers, Ints, Ints32
-from ..base.errors import LidarpoolError
-from ..base.input_files import open_input
-from ..base.sampling import even_indices
-from ..base.storage import Storage, target_of
-from .cloud import CHUNK_POINTS, Cloud, Shown, need_packages
-from .part_columns import PartColumns, positions_of
-from .table import AXES, SCAN, Column
-from .waveforms import WAVEFORM
+from lidarsim.base.archives import read_arrays, read_npy
+from lidarsim.base.arrays import AnyArray, Floats, Integers, Ints, Ints32
+from lidarsim.base.errors import LidarError
+from lidarsim.base.input_files import open_input
+from lidarsim.base.sampling import even_indices
+from lidarsim.base.storage import Storage, target_of
+from lidarsim.columns.cloud import CHUNK_POINTS, Cloud, Shown, need_packages
+from lidarsim.columns.part_columns import PartColumns, positions_of
+from lidarsim.columns.table import AXES, SCAN, Column
+from lidarsim.columns.waveforms import WAVEFORM
 
 # Files of a run in the folder of its parts: its mark, then what it is.
 _PART = re.compile(r"([0-9a-f]{16})-(\d{6,})-(\d{8,})-(\d{8,})\.npz", re.ASCII)
@@ -113,7 +113,7 @@ def pack(part: PartColumns) -> bytearray:
 def unpack(data: bytes) -> PartColumns:
     """Inverse of `pack`; every array's checksum is compared.
 
-    LidarpoolError if it is not a part, or damaged; the message is a clause.
+    LidarError if it is not a part, or damaged; the message is a clause.
     """
     try:
         arrays = read_arrays(data)
@@ -132,20 +132,20 @@ def unpack(data: bytes) -> PartColumns:
         ):
             raise ValueError("its arrays do not fit together")
     except Exception as error:  # zipfile, zlib, lzma and NumPy have a dozen kinds
-        raise LidarpoolError(f"it is damaged ({error})") from error
+        raise LidarError(f"it is damaged ({error})") from error
     return part
 
 
 def read_part(storage: Storage, name: str) -> PartColumns:
-    """Read a part; LidarpoolError if it is missing, cannot be read or is damaged."""
+    """Read a part; LidarError if it is missing, cannot be read or is damaged."""
     try:
         return unpack(storage.read(name))
-    except LidarpoolError as error:
-        raise LidarpoolError(
+    except LidarError as error:
+        raise LidarError(
             f"The part {storage.path(name)} cannot be used: {error}. {_AGAIN}"
         ) from error
     except OSError as error:
-        raise LidarpoolError(
+        raise LidarError(
             f"The part {storage.path(name)} cannot be read: {error.strerror or error}. {_AGAIN}"
         ) from error
 
@@ -160,7 +160,7 @@ def read_tally(storage: Storage, name: str) -> tuple[Ints32, Ints]:
             triangles = read_npy(archive.read(".triangles.npy"), "triangles")
             return triangles, read_npy(archive.read(".hits.npy"), "hits")
     except Exception as error:  # as above
-        raise LidarpoolError(
+        raise LidarError(
             f"The part {storage.path(name)} cannot be used ({error}). {_AGAIN}"
         ) from error
 
@@ -216,7 +216,7 @@ class StoredCloud(Shown):
     def chunks(self, points: int = CHUNK_POINTS, first: int = 0) -> Iterator[Cloud]:
         """Read the cloud in order, from row `first` on, so many points at a time.
 
-        LidarpoolError if a part cannot be read.
+        LidarError if a part cannot be read.
         """
         held: list[Cloud] = []
         count = 0
@@ -265,7 +265,7 @@ class StoredCloud(Shown):
 
         Raises
         ------
-        LidarpoolError
+        LidarError
             If pandas or pyarrow, which Dask's dataframes need, is not installed.
         """
         need_packages("pandas", "pyarrow")

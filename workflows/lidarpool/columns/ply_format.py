@@ -9,10 +9,10 @@ from typing import Any
 
 import numpy as np
 
-from ..base.arrays import AnyArray, Records
-from ..base.errors import LidarpoolError, explained
-from ..base.input_files import open_input
-from .table import Column
+from lidarsim.base.arrays import AnyArray, Records
+from lidarsim.base.errors import LidarError, explained
+from lidarsim.base.input_files import open_input
+from lidarsim.columns.table import Column
 
 AXES = ("x", "y", "z")
 
@@ -39,12 +39,12 @@ def held_type(column: Column) -> np.dtype[Any]:
 
 
 def as_held(column: Column, values: AnyArray) -> AnyArray:
-    """Values of a column in its type in a file; LidarpoolError if one would not be exact."""
+    """Values of a column in its type in a file; LidarError if one would not be exact."""
     wanted = held_type(column)
     if wanted == np.float64 and values.dtype.kind in "iu" and len(values):
         largest = max(abs(int(values.min())), abs(int(values.max())))
         if largest > _EXACT:
-            raise LidarpoolError(
+            raise LidarError(
                 f"Column {column.name!r} holds {largest}, and a PLY file holds whole numbers up to "
                 f"{_EXACT} exactly: leave the column out."
             )
@@ -98,7 +98,7 @@ def layout(path: Path) -> tuple[int, int, np.dtype[np.void]]:
 def mapped_rows(path: Path) -> Records:
     """Return the points of a PLY file, a row each, which stay on the disk until they are used.
 
-    LidarpoolError if the file cannot be read, or is not a complete binary PLY file with our
+    LidarError if the file cannot be read, or is not a complete binary PLY file with our
     properties.
     """
     try:
@@ -107,7 +107,7 @@ def mapped_rows(path: Path) -> Records:
             # An empty file cannot be mapped.
             return np.memmap(path, dtype, "r", start, (count,)) if count else np.empty(0, dtype)
     except ValueError as error:
-        raise LidarpoolError(f"{path} is not a point cloud of lidarpool: {error}.") from error
+        raise LidarError(f"{path} is not a point cloud of lidarpool: {error}.") from error
 
 
 def _parse_header(text: str) -> tuple[int, np.dtype[np.void]]:

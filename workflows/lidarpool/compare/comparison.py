@@ -13,15 +13,16 @@ from matplotlib.axes import Axes
 from matplotlib.colors import LogNorm, Normalize
 from pydantic import Field
 
-from .._version import __version__
-from ..base.arrays import AnyArray, Floats, Ints
-from ..base.errors import LidarpoolError, explained
+from lidarsim._version import __version__
+from lidarsim.base.arrays import AnyArray, Floats, Ints
+from lidarsim.base.errors import LidarError, explained
+from lidarsim.base.sampling import even_indices
+from lidarsim.base.validation import checked
+from lidarsim.base.vocabulary import UNITS_M
+from lidarsim.base.words import plural
+from lidarsim.columns.cloud import Cloud
+
 from ..base.open3d_module import load_open3d
-from ..base.sampling import even_indices
-from ..base.validation import checked
-from ..base.vocabulary import UNITS_M
-from ..base.words import plural
-from ..columns.cloud import Cloud
 from ..columns.parts import StoredCloud
 from ..datasets.figures import rank_correlation
 from ..export.folder import result_folder, staging
@@ -68,7 +69,7 @@ class Comparison:
     def save(self, folder: str | Path) -> list[Path]:
         """Write compare.json, compare.html and pictures, and return their paths.
 
-        LidarpoolError if the folder, which is made, cannot be written to.
+        LidarError if the folder, which is made, cannot be written to.
         """
         place = Path(folder)
         with (
@@ -137,11 +138,11 @@ def compare(
 
     Raises
     ------
-    LidarpoolError
+    LidarError
         If one cannot be read, is empty, or they have nothing that can be compared.
     """
     if not distances_m or any(not 0 < one < np.inf for one in distances_m):
-        raise LidarpoolError(f"distances_m is {list(distances_m)}; it must be lengths in metres.")
+        raise LidarError(f"distances_m is {list(distances_m)}; it must be lengths in metres.")
     recordings = (
         open_recording(a, sensor_a, intensity_a, name="cloud A", unit=unit_a),
         open_recording(b, sensor_b, intensity_b, name="cloud B", unit=unit_b),
@@ -152,7 +153,7 @@ def compare(
         pairs = _pairs(first, second, match, found.notes)
         for number in sweeps or ():
             if not 0 <= number < len(pairs):
-                raise LidarpoolError(
+                raise LidarError(
                     f"there is no sweep {number}: {plural(len(pairs), 'pair')} of sweeps, from 0."
                 )
         if sweeps:
@@ -163,7 +164,7 @@ def compare(
         return found.result(len(pairs))
     one = first if first.whole else second
     if sweeps or match == "time":
-        raise LidarpoolError(f"{one.name} has no sweeps: leave out --sweep and --match.")
+        raise LidarError(f"{one.name} has no sweeps: leave out --sweep and --match.")
     if not first.whole or not second.whole:
         found.notes.append(f"{one.name} has no sweeps: all points of both are compared at once")
     found.add(found.cloud(first, most_points), found.cloud(second, most_points), MOST_VALUES)
@@ -177,7 +178,7 @@ def _pairs(a: Recording, b: Recording, match: str, notes: list[str]) -> list[tup
         times = []
         for one in (a, b):
             if one.times is None:
-                raise LidarpoolError(f"{one.name} has no times of sweeps: leave out --match time.")
+                raise LidarError(f"{one.name} has no times of sweeps: leave out --match time.")
             times.append(np.fromiter(one.times(), np.float64))
         of_a, of_b = times
         if pairs:
@@ -187,7 +188,7 @@ def _pairs(a: Recording, b: Recording, match: str, notes: list[str]) -> list[tup
             close = np.flatnonzero(np.abs(of_a[near] - of_b) <= period / 2)
             pairs = [(int(near[j]), int(j)) for j in close]
     if not pairs:
-        raise LidarpoolError(
+        raise LidarError(
             f"{a.name} with {plural(a.count, 'sweep')} and {b.name} with {b.count:,} have none of "
             f"the same {match}."
         )
@@ -264,7 +265,7 @@ class _Comparing:
         make = paired_images if same else range_images
         try:
             images = make(a, b, (first.name, second.name), self.azimuth_deg)
-        except LidarpoolError as error:
+        except LidarError as error:
             self.note(f"no range image: {error}")
             return
         for text in images.notes:
@@ -289,9 +290,9 @@ class _Comparing:
         """Return all figures, of so many pairs of sweeps; 0 of whole clouds."""
         for one, points in zip(self.recordings, self.points.tolist(), strict=True):
             if not points:
-                raise LidarpoolError(f"{one.name} has no points: there is nothing to compare.")
+                raise LidarError(f"{one.name} has no points: there is nothing to compare.")
         if not self.above:
-            raise LidarpoolError("No pair of sweeps has points in both: choose others.")
+            raise LidarError("No pair of sweeps has points in both: choose others.")
         (to_b, *of_points), (to_a, *_) = (
             tuple(map(np.concatenate, zip(*found, strict=True))) for found in self.pairs
         )

@@ -12,26 +12,27 @@ import numpy as np
 import yaml
 from pydantic import Field
 
-from .._version import __version__
-from ..base.arrays import Bools, Floats, Floats32, Ints
-from ..base.errors import LidarpoolError, explained, prefixed
-from ..base.extras import need
+from lidarsim._version import __version__
+from lidarsim.base.arrays import Bools, Floats, Floats32, Ints
+from lidarsim.base.errors import LidarError, explained, prefixed
+from lidarsim.base.extras import need
+from lidarsim.base.sampling import even_indices
+from lidarsim.base.storage import Storage
+from lidarsim.base.validation import checked
+from lidarsim.base.words import plural
+from lidarsim.columns.cloud import Cloud
+from lidarsim.scene.scene import Scene
+from lidarsim.sensor import Pose, Spin
+from lidarsim.sensor.models import MODEL_FILES, Performance, SensorModel, read_model
+from lidarsim.sensor.noise import TARGET_REFLECTANCE, THRESHOLD_SIGMAS
+from lidarsim.sensor.ray_sensors import ListedSensor
+from lidarsim.simulator import Scanner
+
 from ..base.open3d_module import load_open3d
-from ..base.sampling import even_indices
-from ..base.storage import Storage
-from ..base.validation import checked
-from ..base.words import plural
-from ..columns.cloud import Cloud
 from ..columns.parts import StoredCloud
 from ..render import theme
 from ..render.picture_page import Page, label_logarithms
 from ..report.page.rendering import rendered
-from ..scene.scene import Scene
-from ..sensor import Pose, Spin
-from ..sensor.models import MODEL_FILES, Performance, SensorModel, read_model
-from ..sensor.noise import TARGET_REFLECTANCE, THRESHOLD_SIGMAS
-from ..sensor.ray_sensors import ListedSensor
-from ..simulator import Scanner
 from .range_image import range_images
 from .recordings import Recording, open_recording
 
@@ -99,11 +100,11 @@ class Fit:
     def save(self, file: str | Path) -> list[Path]:
         """Write the sensor file and its page, a .html beside it, and return their paths.
 
-        LidarpoolError if the file is no .yaml, or cannot be written.
+        LidarError if the file is no .yaml, or cannot be written.
         """
         place = Path(file)
         if place.suffix not in MODEL_FILES:
-            raise LidarpoolError(f"{place} is no sensor file: give a name such as mine.yaml.")
+            raise LidarError(f"{place} is no sensor file: give a name such as mine.yaml.")
         told = self.model.model_dump(mode="json", exclude_defaults=True)
         text = "".join(f"# {line}\n" for line in repr(self).splitlines())
         text += yaml.safe_dump(told, sort_keys=False, allow_unicode=True, default_flow_style=None)
@@ -145,7 +146,7 @@ def fit(
 
     Raises
     ------
-    LidarpoolError
+    LidarError
         If it cannot be read, has no sweeps or rings, is of several sensors or of one that moves,
         or scipy is missing.
     """
@@ -159,7 +160,7 @@ def fit(
         off = np.abs(_median(repeats.ranges, 0) - expected)
         if not (off < _BESIDE_M).sum() > _BESIDE * np.isfinite(off).sum():
             told = f"less than half of {recording.name} is within {_BESIDE_M} m of the scene"
-            raise LidarpoolError(f"{told}: give the sensor's --pose in it, or no scene.")
+            raise LidarError(f"{told}: give the sensor's --pose in it, or no scene.")
         smooth = surfaces(repeats, expected, 0 * sigma).smooth & (repeats.trials > 0)
         returned = np.isfinite(repeats.ranges).sum(axis=0)
         lost = 1 - returned[smooth] / repeats.trials[smooth]
@@ -169,7 +170,7 @@ def fit(
         rays = smooth_rays(repeats, sigma, 0.0 if found else _AIM, expected)
         if len(rays.row) < _FEW:
             told = f"{recording.name} has {len(rays.row)} rays on smooth surfaces, not {_FEW}"
-            raise LidarpoolError(f"{told}: record walls or a floor, in the sensor's axes.")
+            raise LidarError(f"{told}: record walls or a floor, in the sensor's axes.")
         known = np.isfinite(rays.light).all()
         energy = rays.light if known and recording.energies else None
         if known and (white := white or recording.white):
@@ -290,16 +291,16 @@ class Repeats:
     def read(cls, recording: Recording) -> Repeats:
         """Put the sweeps of a recording into the same cells, one after the other.
 
-        LidarpoolError if it has no sweeps with points and rings, or they are of several sensors.
+        LidarError if it has no sweeps with points and rings, or they are of several sensors.
         """
         name, notes = recording.name, list(recording.notes)
         if recording.thinned:
-            raise LidarpoolError(f"{notes[0]}.")
+            raise LidarError(f"{notes[0]}.")
         if recording.whole or not recording.count:
-            raise LidarpoolError(f"{name} has no sweeps: give a recording of sweeps.")
+            raise LidarError(f"{name} has no sweeps: give a recording of sweeps.")
         own = max((recording.turn(k) for k in range(min(3, recording.count))), key=len)
         if not len(own):
-            raise LidarpoolError(f"{name} has no points: there is nothing to fit.")
+            raise LidarError(f"{name} has no points: there is nothing to fit.")
         with prefixed(name):
             cells = range_images(own, own, ("a sweep", "a sweep"))
         shape = len(cells.rings), round(360 / cells.step_deg)
@@ -314,7 +315,7 @@ class Repeats:
                 found = range_images(turn, own, (f"sweep {number}", "another"), cells.step_deg)
                 other = len(found.rings) > 1.2 * len(cells.rings)
                 if other or found.hidden[0] > cells.hidden[0] + 0.25:
-                    raise LidarpoolError(f"sweep {number} is of another sensor, or another mode.")
+                    raise LidarError(f"sweep {number} is of another sensor, or another mode.")
             _, rows, there = np.intersect1d(found.rings, cells.rings, return_indices=True)
             columns = round(found.begin_deg / found.step_deg) + np.arange(found.images.shape[-1])
             values[:, k, there[:, None], columns % shape[1]] = found.images[0][:, rows]
@@ -454,13 +455,13 @@ def check_stands(repeats: Repeats, name: str, period_ns: float | None) -> None:
         told = " and ".join(
             speed for speed, some in zip(speeds, (shift_m > 0, yaw_deg > 0), strict=True) if some
         )
-        raise LidarpoolError(
+        raise LidarError(
             f"{name} is of a sensor that moves, by {told} from sweep to sweep: give sweeps of a "
             "sensor that stands, or one sweep for the bias of its rings."
         )
     changes = np.abs(np.diff(repeats.ranges, axis=0))
     if (change := _median(changes, (0, 1, 2))) > _CHANGED_M:
-        raise LidarpoolError(
+        raise LidarError(
             f"{name} has ranges that change by {change:.2g} m from sweep to sweep, in the median, "
             "and no motion of the sensor explains that: give points in metres, of a place that "
             "stands still."

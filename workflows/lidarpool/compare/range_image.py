@@ -11,9 +11,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ..base.arrays import Bools, Floats, Indices, Ints
-from ..base.errors import LidarpoolError
-from ..base.words import plural
+from lidarsim.base.arrays import Bools, Floats, Indices, Ints
+from lidarsim.base.errors import LidarError
+from lidarsim.base.words import plural
+
 from .recordings import Turn
 
 _TILT_DEG = 1.0  # width of the middle half of a ring's elevations, of rings near each other
@@ -66,11 +67,9 @@ class _Polar:
 
     @classmethod
     def of(cls, turn: Turn, name: str) -> _Polar:
-        """Convert a sweep; LidarpoolError if it has no rings, or they are not around its zero."""
+        """Convert a sweep; LidarError if it has no rings, or they are not around its zero."""
         if turn.rings is None:
-            raise LidarpoolError(
-                f"{name} has no rings: the range image needs a column ring or channel"
-            )
+            raise LidarError(f"{name} has no rings: the range image needs a column ring or channel")
         x, y, z = turn.points.T
         elevation = np.degrees(np.arctan2(z, np.hypot(x, y)))
         rings, index = np.unique(turn.rings, return_inverse=True)
@@ -82,7 +81,7 @@ class _Polar:
             for share in (0.25, 0.5, 0.75)
         )
         if np.median(high - low) > max(_TILT_DEG, _spacing(middle) / 2):
-            raise LidarpoolError(
+            raise LidarError(
                 f"{name} has rings that are no cones around zero, which the range image needs: its "
                 "points are in the world's axes, or of several poses, or its sensor has no rings, "
                 "as a Livox"
@@ -157,7 +156,7 @@ def range_images(
     A column is as wide as the step of azimuth from pulse to pulse, the coarser of the two. Each
     ring's cells have their middles where its pulses are, in every 10 degrees, so that
     none falls between two although heads turn unevenly; a pulse of A is in the cell of the pulse of
-    B that is nearest. LidarpoolError if one has no rings, is not in the axes of its sensor, or they
+    B that is nearest. LidarError if one has no rings, is not in the axes of its sensor, or they
     are not of sensors with the same rings; a clause without a full stop.
     """
     first, second = _Polar.of(a, names[0]), _Polar.of(b, names[1])
@@ -257,7 +256,7 @@ def _common(
     both, in_a, in_b = np.intersect1d(numbers, b.rings, return_indices=True)
     off = np.abs(a.elevation[in_a] - b.elevation[in_b])
     if len(both) < min(len(a.rings), len(b.rings)) / 2 or np.median(off) > 2 * near:
-        raise LidarpoolError(
+        raise LidarError(
             f"the rings of {names[0]} look at {a.elevation.min():.1f}° to {a.elevation.max():.1f}° "
             f"and those of {names[1]} at {b.elevation.min():.1f}° to {b.elevation.max():.1f}°, at "
             "other angles: they are not of the same sensor"

@@ -15,23 +15,24 @@ from typing import Any
 
 import numpy as np
 
-from ..base.arrays import AnyArray, Floats, Indices, Ints
-from ..base.errors import LidarpoolError
-from ..base.extras import need, reading
+from lidarsim.base.arrays import AnyArray, Floats, Indices, Ints
+from lidarsim.base.errors import LidarError
+from lidarsim.base.extras import need, reading
+from lidarsim.base.input_files import input_size, open_input, read_input
+from lidarsim.base.vocabulary import UNITS_M
+from lidarsim.base.words import did_you_mean, natural
+from lidarsim.columns.bags import POINT_CLOUD, open_bag, point_columns
+from lidarsim.columns.cloud import CHUNK_POINTS, Cloud, CloudLike
+from lidarsim.scene.files.las import las_units, open_las
+from lidarsim.scene.files.pcd import checked_pcd
+from lidarsim.scene.files.polygon_files import read_ply_columns
+from lidarsim.sweeps.sweeps import SWEEPS_FILE, Placed, Sweeps
+
 from ..base.fingerprint import fingerprint
-from ..base.input_files import input_size, open_input, read_input
-from ..base.vocabulary import UNITS_M
-from ..base.words import did_you_mean, natural
-from ..columns.bags import POINT_CLOUD, open_bag, point_columns
-from ..columns.cloud import CHUNK_POINTS, Cloud, CloudLike
 from ..columns.cloud_file import CloudFile
 from ..columns.parts import StoredCloud
 from ..datasets.dataset import INDEX_FILE
 from ..datasets.loader import sweeps
-from ..export.sweeps import SWEEPS_FILE, Placed, Sweeps
-from ..scene.files.las import las_units, open_las
-from ..scene.files.pcd import checked_pcd
-from ..scene.files.polygon_files import read_ply_columns
 
 KINDS = (
     "the folder of a result or data set, a .ply, a .pcd or a folder of them, a .las or .laz, a bag "
@@ -106,11 +107,11 @@ class Recording:
     metres: Metres = _METRES  # in the units of x, y and z
 
     def turn(self, number: int, *, in_world: bool = False) -> Turn:
-        """Read a sweep in its sensor's axes or the world's; LidarpoolError if it cannot be."""
+        """Read a sweep in its sensor's axes or the world's; LidarError if it cannot be."""
         with reading(self.name):
             points, columns, pose = self.read(number)
             if self.light is not None and self.light not in columns:
-                raise LidarpoolError(
+                raise LidarError(
                     f"it has no column {self.light!r} to compare as intensity."
                     + (did_you_mean(self.light, columns) or f" It has {', '.join(columns)}.")
                 )
@@ -120,7 +121,7 @@ class Recording:
         places = places[there] * self.metres
         if in_world and not self.whole:
             if pose is None:
-                raise LidarpoolError(
+                raise LidarError(
                     f"{self.name} is in the axes of its sensor, and does not say where that was: "
                     "compare it with a recording of sweeps."
                 )
@@ -150,17 +151,17 @@ def open_recording(
     `sensor` chooses one of several sensors, or the topic of a bag; `light` is the column of the
     intensity, if it has another name than usual; `name` is that of a cloud in memory; `unit` is
     that of a file of `_UNIT_SUFFIXES`, in place of metres or of the units that a .las states.
-    LidarpoolError if it is none, or cannot be opened.
+    LidarError if it is none, or cannot be opened.
     """
     if isinstance(place, Cloud | StoredCloud):
         if unit is not None:
-            raise LidarpoolError(f"{name} is in metres: leave out its unit, {unit!r}.")
+            raise LidarError(f"{name} is in metres: leave out its unit, {unit!r}.")
         return _of_cloud(name, place, place.sweeps, sensor, light)
     path, name = Path(place), str(place)
     if unit is None:
         return _of_path(path, name, sensor, light, None)
     if path.suffix.lower() not in _UNIT_SUFFIXES:
-        raise LidarpoolError(
+        raise LidarError(
             f"{name} is in metres: leave out its unit, {unit!r}, which is for a file "
             f"{' '.join(_UNIT_SUFFIXES)}."
         )
@@ -174,7 +175,7 @@ def _of_path(
     """Open a file or folder; `metres` are given in place of those of its units."""
     kind = path.suffix.lower()
     if not path.exists() or (path.is_file() and not path.stat().st_size):
-        raise LidarpoolError(f"{name} does not exist, or is empty: give {KINDS}.")
+        raise LidarError(f"{name} does not exist, or is empty: give {KINDS}.")
     if path.is_dir():
         if (path / "cloud.ply").exists():
             return _of_ply(path / "cloud.ply", name, sensor, light)
@@ -200,7 +201,7 @@ def _of_path(
             return _of_velodyne(path, name, light)
         return _of_ouster(path, name, sensor, light)
     advice = f"{_CONVERTED[kind]}, or " if kind in _CONVERTED else ""
-    raise LidarpoolError(f"{name} cannot be compared: {advice}give {KINDS}.")
+    raise LidarError(f"{name} cannot be compared: {advice}give {KINDS}.")
 
 
 def _of_cloud(
@@ -250,7 +251,7 @@ def _of_ply(path: Path, name: str, sensor: str | None, light: str | None) -> Rec
     """Open a .ply, with the sweeps beside it if it is of a result."""
     try:
         cloud = CloudFile(path)
-    except LidarpoolError:  # text, or of another program
+    except LidarError:  # text, or of another program
 
         def read(_: int) -> Read:
             columns = read_ply_columns(read_input(path))
@@ -262,7 +263,7 @@ def _of_ply(path: Path, name: str, sensor: str | None, light: str | None) -> Rec
     try:
         report = json.loads(read_input(path.with_name("report.json")))
         every = int(report["parameters"]["keep_every"])
-    except (OSError, ValueError, TypeError, LookupError, LidarpoolError):
+    except (OSError, ValueError, TypeError, LookupError, LidarError):
         every = 1
     note = (
         f"{name} keeps one of {every} hits, so its gaps are no lost returns: run it with "
@@ -349,7 +350,7 @@ def _of_bag(path: Path, name: str, topic: str | None, light: str | None) -> Reco
 def _of_ouster(path: Path, name: str, sensor: str | None, light: str | None) -> Recording:
     """Open scans of ouster-sdk; a .pcap has its metadata in a .json beside it."""
     if find_spec("ouster") is None:  # it wants old versions of what it does not need to read
-        raise LidarpoolError(f"{name} is read by ouster-sdk: pip install --no-deps ouster-sdk.")
+        raise LidarError(f"{name} is read by ouster-sdk: pip install --no-deps ouster-sdk.")
     sdk: Any = import_module("ouster.sdk")
     with reading(name):
         input_size(path)
@@ -387,7 +388,7 @@ def _of_velodyne(path: Path, name: str, light: str | None) -> Recording:
     if len(units) > 1:
         a, b, c, d, port = min(units)
         one = f"tcpdump -r {name} -w one.pcap src {a}.{b}.{c}.{d} and dst port {port}"
-        raise LidarpoolError(f"{name} is of {len(units)} units: keep one, {one}.")
+        raise LidarError(f"{name} is of {len(units)} units: keep one, {one}.")
 
     def points(sweep: Any) -> Read:
         columns = {name: sweep.points[name] for name in sweep.points.dtype.names}
@@ -434,5 +435,5 @@ def _chosen(name: str, what: str, there: Iterable[str], wanted: str | None) -> s
     listed = f"{name} has the {what} {', '.join(known)}" if known else f"{name} has no {what}"
     if wanted is None:
         advice = "choose one (--sensor-a, --sensor-b; of fit --sensor)" if known else "record one"
-        raise LidarpoolError(f"{listed}: {advice}.")
-    raise LidarpoolError(f"{listed}, not {wanted!r}." + did_you_mean(wanted, known))
+        raise LidarError(f"{listed}: {advice}.")
+    raise LidarError(f"{listed}, not {wanted!r}." + did_you_mean(wanted, known))

@@ -17,13 +17,15 @@ from typing import Any, Literal, TypeVar
 
 import numpy as np
 
-from .._version import __version__
-from ..base.archives import packed
-from ..base.errors import LidarpoolError, explained
+from lidarsim._version import __version__
+from lidarsim.base.archives import packed
+from lidarsim.base.errors import LidarError, explained
+from lidarsim.base.storage import Storage
+from lidarsim.base.validation import checked_fields
+from lidarsim.columns.cloud import CloudLike
+from lidarsim.sweeps.sweeps import SWEEPS_FILE, Sweeps
+
 from ..base.sealed import SealedWriter
-from ..base.storage import Storage
-from ..base.validation import checked_fields
-from ..columns.cloud import CloudLike
 from ..export.boxes import Boxes
 from ..export.folder import local_folder
 from ..export.format_table import DATA_SETS, FORMATS, LAYOUTS, FormatRow
@@ -31,7 +33,6 @@ from ..export.formats import Format
 from ..export.kitti import NAMES_FILE, labels_file
 from ..export.nuscenes import merge
 from ..export.pieces import Entry, Pieces, pieces_of
-from ..export.sweeps import SWEEPS_FILE, Sweeps
 from .job_table import TABLE_FILE, JobRow, Tally
 
 T = TypeVar("T")
@@ -124,7 +125,7 @@ class DataSet:
         return self._of_jobs.needs
 
     def check_installed(self) -> None:
-        """Check that it can be written here; LidarpoolError if a package is missing."""
+        """Check that it can be written here; LidarError if a package is missing."""
         self._of_jobs.check_installed()
 
     def write_job(
@@ -146,7 +147,7 @@ class DataSet:
 
         Raises
         ------
-        LidarpoolError
+        LidarError
             If a package or column is missing, the cloud is not of these sweeps, or the place
             cannot be written to.
         """
@@ -192,7 +193,7 @@ class DataSet:
         return row
 
     def write_failed(self, rows: Iterable[JobRow]) -> None:
-        """Write the manifests of jobs that have failed; LidarpoolError if that fails."""
+        """Write the manifests of jobs that have failed; LidarError if that fails."""
         with explained(f"{self.place} cannot be written"):
             place = Listing.of(self.place)
             failed = (row for row in rows if not row.done)
@@ -213,7 +214,7 @@ class DataSet:
 
         Raises
         ------
-        LidarpoolError
+        LidarError
             If a job's files are not those of its manifest, or the place cannot be written to.
         """
         with explained(f"{self.place} cannot be written"):
@@ -240,7 +241,7 @@ class DataSet:
         for job, (manifest, wrong) in self.look(jobs):
             if wrong:
                 told = f"Job {job.name} of {self.place} is not whole: its {wrong}."
-                raise LidarpoolError(f"{told} Make it again with --resume.")
+                raise LidarError(f"{told} Make it again with --resume.")
             row = {"number": job.number, "name": job.name, "sensors": manifest["sensors"]}
             index.write(f"{comma}\n{json.dumps(row)}")
             comma = ","

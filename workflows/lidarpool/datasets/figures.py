@@ -13,8 +13,9 @@ from typing import Any
 
 import numpy as np
 
-from ..base.arrays import AnyArray, Bools, Floats, Ints
-from ..base.words import shortened, without_common_prefix
+from lidarsim.base.arrays import AnyArray, Bools, Floats, Ints
+from lidarsim.base.words import shortened, without_common_prefix
+
 from .job_table import JobRow
 
 FAILED_MOST, SLOWEST_MOST = 200, 10  # jobs that are kept whole

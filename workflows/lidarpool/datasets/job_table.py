@@ -27,10 +27,10 @@ from typing import IO, Any
 
 import numpy as np
 
-from ..base.errors import LidarpoolError, explained
-from ..base.input_files import open_input
-from ..base.storage import Storage
-from ..columns.cloud import Cloud, CloudLike
+from lidarsim.base.errors import LidarError, explained
+from lidarsim.base.input_files import open_input
+from lidarsim.base.storage import Storage
+from lidarsim.columns.cloud import Cloud, CloudLike
 
 Value = bool | int | float | str
 
@@ -154,7 +154,7 @@ class Tally:
     def add(self, chunk: Cloud) -> None:
         """Count the next points.
 
-        LidarpoolError if they have other columns than those before.
+        LidarError if they have other columns than those before.
         """
         if not len(chunk):
             return
@@ -167,7 +167,7 @@ class Tally:
         if not self.points:
             self._columns = {name: hashlib.sha256() for name in arrays}
         if self._columns.keys() != arrays.keys():
-            raise LidarpoolError(
+            raise LidarError(
                 f"Points of one job have the columns {', '.join(self._columns)} and then "
                 f"{', '.join(arrays)}: give all the same."
             )
@@ -210,7 +210,7 @@ def write_table(place: Storage, names: Sequence[str], jobs: Callable[[], Iterabl
 
     Raises
     ------
-    LidarpoolError
+    LidarError
         If a row has a value that is not in `names`, or the table cannot be written.
     """
     with explained(f"The table of jobs cannot be written to {place}", "make room or see to rights"):
@@ -233,7 +233,7 @@ def read_table(place: Storage, checksum: Sequence[int] | None = None) -> Iterato
 
     Raises
     ------
-    LidarpoolError
+    LidarError
         If there is no such table, or it is damaged: no checksum, a number that is not greater
         than the one before, or no row of a table.
     """
@@ -246,7 +246,7 @@ def read_table(place: Storage, checksum: Sequence[int] | None = None) -> Iterato
                 path = Path(folder, TABLE_FILE)
                 place.get(TABLE_FILE, path)
             if checksum is not None and Storage(str(path.parent)).checksum(path.name) != checksum:
-                raise LidarpoolError(
+                raise LidarError(
                     f"{place.path(TABLE_FILE)} is damaged or edited, its checksum is not that of "
                     f"the data set: {AGAIN}."
                 )
@@ -273,7 +273,7 @@ def read_table(place: Storage, checksum: Sequence[int] | None = None) -> Iterato
                 last_number = row.number
                 yield row
         except (ValueError, csv.Error) as error:
-            raise LidarpoolError(
+            raise LidarError(
                 f"{place.path(TABLE_FILE)} is damaged near line {reader.line_num} ({error}): "
                 f"{AGAIN}."
             ) from error
@@ -293,7 +293,7 @@ def _columns(
     kinds: dict[str, set[type]] = {name: set() for name in names}
     for row in jobs:
         if others := [name for name in row.values if name not in kinds]:
-            raise LidarpoolError(
+            raise LidarError(
                 f"Job {row.name} has a value {others[0]!r}, which is not among those that vary: "
                 f"{', '.join(names) or 'none'}."
             )
@@ -352,7 +352,7 @@ def _kind(value: Any) -> type:
     if kind is int and not -(2**63) <= plain < 2**63:
         return str
     if kind not in (bool, int, float, str):
-        raise LidarpoolError(
+        raise LidarError(
             f"A varied value is {value!r}, a {kind.__name__}: give a number, text, true or false."
         )
     return kind

@@ -20,18 +20,19 @@ from typing import Annotated, Any
 import numpy as np
 from pydantic import Field
 
-from ..base.archives import open_archive
-from ..base.errors import LidarpoolError
+from lidarsim.base.archives import open_archive
+from lidarsim.base.errors import LidarError
+from lidarsim.base.storage import Storage
+from lidarsim.base.validation import checked
+from lidarsim.base.words import did_you_mean
+from lidarsim.sweeps.sweeps import SWEEPS_FILE, Sweeps
+
 from ..base.sealed import unsealed
-from ..base.storage import Storage
-from ..base.validation import checked
-from ..base.words import did_you_mean
 from ..export.boxes import Boxes
 from ..export.format_table import DATA_SETS
 from ..export.formats import Format
 from ..export.pieces import Entry
 from ..export.reading import Reader
-from ..export.sweeps import SWEEPS_FILE, Sweeps
 from .dataset import BOXES_FILE, INDEX_FILE, VERSION, job_file
 from .job_table import AGAIN, TABLE_FILE, JobRow, read_table
 from .sweep_data import Sweep
@@ -116,7 +117,7 @@ class SavedSweeps:
     def __getitem__(self, index: int) -> Sweep:
         """Read a sweep.
 
-        LidarpoolError if a file is missing or damaged; IndexError if there is no such sweep.
+        LidarError if a file is missing or damaged; IndexError if there is no such sweep.
         """
         job, number = self._at(index)
         return job.read(number)
@@ -153,11 +154,11 @@ class SavedSweeps:
 
         Raises
         ------
-        LidarpoolError
+        LidarError
             If torch is not installed.
         """
         if find_spec("torch") is None:
-            raise LidarpoolError("This needs PyTorch: pip install torch.")
+            raise LidarError("This needs PyTorch: pip install torch.")
         from .torch_sweeps import TorchSweeps
 
         return TorchSweeps(self, transform, even)
@@ -245,7 +246,7 @@ def sweeps(
 
     Raises
     ------
-    LidarpoolError
+    LidarError
         If there is no data set, it is unfinished or damaged, a package that its format needs is
         not installed, or there is no such split, job or sensor.
     """
@@ -257,7 +258,7 @@ def sweeps(
     table = read_table(storage, head["table"])
     rows = [job for job in table if job.number in of_sensors]
     if len(rows) < len(of_sensors):
-        raise LidarpoolError(f"{storage.path(TABLE_FILE)} lacks jobs that are done: {AGAIN}.")
+        raise LidarError(f"{storage.path(TABLE_FILE)} lacks jobs that are done: {AGAIN}.")
     rows = _chosen(rows, split, jobs, storage)
     there = list(dict.fromkeys(name for job in rows for name in of_sensors[job.number]))
     if sensors is not None:
@@ -275,7 +276,7 @@ def sweeps(
 
 
 def read_index(place: Storage) -> dict[str, Any]:
-    """Read the index, with jobs by number, of a data set; LidarpoolError if it is not finished."""
+    """Read the index, with jobs by number, of a data set; LidarError if it is not finished."""
     try:
         head = unsealed(place.read(INDEX_FILE))
         if head["version"] != VERSION:
@@ -287,18 +288,18 @@ def read_index(place: Storage) -> dict[str, Any]:
         head["jobs"] = {row["number"]: dict(row["sensors"]) for row in head["jobs"]}
     except FileNotFoundError as error:
         if ".jobs" in place.entries():
-            raise LidarpoolError(
+            raise LidarError(
                 f"{place} is an unfinished data set: lidarpool run CAMPAIGN --out {place} --resume "
                 "continues it."
             ) from error
-        raise LidarpoolError(
+        raise LidarError(
             f"{place} is no data set of lidarpool, which has a {INDEX_FILE}: give the --out of a "
             "campaign."
         ) from error
     except OSError as error:
         raise _unreadable(place.path(INDEX_FILE), error) from error
     except (ValueError, LookupError, TypeError, AttributeError) as error:
-        raise LidarpoolError(
+        raise LidarError(
             f"{place.path(INDEX_FILE)} is damaged or of another version of lidarpool ({error}): "
             "run the campaign again with --resume, or merge its shards again."
         ) from error
@@ -320,7 +321,7 @@ def _chosen(
         wanted = {operator.index(job) if not isinstance(job, str) else job for job in jobs}
         known = {row.number for row in rows} | {row.name for row in rows}
         if missing := [job for job in jobs if job not in known]:
-            raise LidarpoolError(
+            raise LidarError(
                 f"{place} has no job {missing[0]!r}"
                 + ("" if split is None else f" in split {split!r}")
                 + " that is done: jobs.csv lists all, with their splits and errors."
@@ -330,24 +331,22 @@ def _chosen(
 
 
 def _check_known(what: str, wanted: Sequence[str], there: Any, place: Storage) -> None:
-    """Check that there are splits or sensors of these names, or raise LidarpoolError."""
+    """Check that there are splits or sensors of these names, or raise LidarError."""
     names = [name for name in there if name]
     for name in wanted:
         if name not in there:
             known = f" It has {', '.join(names)}." if names else f" It names no {what}s."
-            raise LidarpoolError(
-                f"{place} has no {what} {name!r}.{did_you_mean(name, names) or known}"
-            )
+            raise LidarError(f"{place} has no {what} {name!r}.{did_you_mean(name, names) or known}")
 
 
-def _unreadable(file: str, error: Exception) -> LidarpoolError:
+def _unreadable(file: str, error: Exception) -> LidarError:
     """Return the error of a file that is missing or damaged, in a line."""
-    if isinstance(error, LidarpoolError):
+    if isinstance(error, LidarError):
         return error
     if isinstance(error, OSError) and (error.strerror or error.__cause__):  # the latter of a URL
-        return LidarpoolError(f"{file} cannot be read: {error.strerror or error}.")
+        return LidarError(f"{file} cannot be read: {error.strerror or error}.")
     reason = (str(error).splitlines() or [type(error).__name__])[0].rstrip(". ")[:120]
-    return LidarpoolError(
+    return LidarError(
         f"{file} is missing or damaged ({reason}): get it again, or remove its job from the data "
         "set and run the campaign with --resume."
     )

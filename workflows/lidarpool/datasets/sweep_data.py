@@ -11,11 +11,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..base.arrays import AnyArray, Floats, Floats32, Ints32
+from lidarsim.base.arrays import AnyArray, Floats, Floats32, Ints32
+from lidarsim.sensor import Fault
+from lidarsim.sweeps.sweeps import Sweeps
+
 from ..export.boxes import Boxes, SweepBoxes
 from ..export.reading import PointColumns
-from ..export.sweeps import Sweeps
-from ..sensor import Fault
 from .job_table import JobRow, Value
 
 

@@ -12,7 +12,8 @@ import torch
 import torch.distributed
 import torch.utils.data
 
-from ..base.errors import LidarpoolError
+from lidarsim.base.errors import LidarError
+
 from .sweep_data import Sweep
 
 if TYPE_CHECKING:
@@ -52,7 +53,7 @@ class TorchStream(torch.utils.data.IterableDataset):
 
     def __iter__(self) -> Iterator[Any]:
         if torch.utils.data.get_worker_info() is not None:
-            raise LidarpoolError(
+            raise LidarError(
                 "A stream is read by the process that trains, since the cluster works ahead: give "
                 "the DataLoader num_workers=0."
             )

@@ -7,10 +7,10 @@ from types import EllipsisType
 
 import numpy as np
 
-from ..base.arrays import Bools, Floats, Floats32, Ints, Ints32
-from ..columns.cloud import Cloud
-from ..sensor.trajectory import matrices
-from .sweeps import Placed, Sweeps
+from lidarsim.base.arrays import Bools, Floats, Floats32, Ints, Ints32
+from lidarsim.columns.cloud import Cloud
+from lidarsim.sensor.trajectory import matrices
+from lidarsim.sweeps.sweeps import Placed, Sweeps
 
 
 @dataclass(frozen=True, eq=False)

@@ -14,10 +14,11 @@ import numpy as np
 import pye57
 from pye57 import libe57
 
+from lidarsim.columns.cloud import Cloud, CloudLike
+from lidarsim.columns.table import COLOURS, NORMAL
+from lidarsim.sweeps.sweeps import Sweeps
+
 from ..base.fingerprint import fingerprint
-from ..columns.cloud import Cloud, CloudLike
-from ..columns.table import COLOURS, NORMAL
-from .sweeps import Sweeps
 
 _NORMALS_URI = "http://www.libe57.org/E57_NOR_surface_normals.txt"
 _FIELDS = {f"nor:normal{name[-1].upper()}": name for name in NORMAL}  # {field: column}

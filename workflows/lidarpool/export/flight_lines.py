@@ -8,10 +8,10 @@ from functools import cached_property
 
 import numpy as np
 
-from ..base.arrays import Bools, Bytes, Floats, Indices, Ints
-from ..base.errors import LidarpoolError
-from ..columns.cloud import Cloud
-from .sweeps import MIXED_UP, Sweeps
+from lidarsim.base.arrays import Bools, Bytes, Floats, Indices, Ints
+from lidarsim.base.errors import LidarError
+from lidarsim.columns.cloud import Cloud
+from lidarsim.sweeps.sweeps import MIXED_UP, Sweeps
 
 _MAX_SOURCE = 65_535  # that the format holds
 # A flight line begins where the direction of flight has changed by so much, and then stays within
@@ -63,7 +63,7 @@ class FlightLines:
 
         Raises
         ------
-        LidarpoolError
+        LidarError
             If the points are of another survey.
         """
         held: tuple[Cloud, LineFields] | None = None
@@ -87,7 +87,7 @@ class FlightLines:
             return fields
         sweep = np.searchsorted(self.sweeps.scans, chunk["scan"], "right") - 1
         if sweep.max() >= len(self.sweeps):
-            raise LidarpoolError(MIXED_UP)
+            raise LidarError(MIXED_UP)
         order = np.argsort(sweep, kind="stable")
         for rows in np.split(order, 1 + np.flatnonzero(np.diff(sweep[order]))):
             self._fill(fields, rows, int(sweep[rows[0]]), chunk[rows])

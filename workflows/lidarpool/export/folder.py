@@ -12,8 +12,8 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
-from ..base.errors import LidarpoolError, explained
-from ..base.storage import WRITING, Storage, is_url
+from lidarsim.base.errors import LidarError, explained
+from lidarsim.base.storage import WRITING, Storage, is_url
 
 LAST_FILE = "report.json"  # a result with this file is complete
 
@@ -33,7 +33,7 @@ def result_folder(place: Path | Storage) -> Iterator[Path]:
 
     Raises
     ------
-    LidarpoolError
+    LidarError
         If it is a file, cannot be made or written to, or another run or export uses it.
     """
     if isinstance(place, Storage):
@@ -43,7 +43,7 @@ def result_folder(place: Path | Storage) -> Iterator[Path]:
         return
     folder = place
     if folder.exists() and not folder.is_dir():
-        raise LidarpoolError(f"{folder} is a file: give a folder with --out.")
+        raise LidarError(f"{folder} is a file: give a folder with --out.")
     made = [path for path in (folder, *folder.parents) if not path.exists()]  # innermost first
     with explained(f"Cannot write to the folder {folder}", "give another with --out"):
         try:
@@ -52,7 +52,7 @@ def result_folder(place: Path | Storage) -> Iterator[Path]:
                 lock = _lock(folder)
             Storage.at(folder).tidy(deep=False)
         except BlockingIOError as error:
-            raise LidarpoolError(
+            raise LidarError(
                 f"Another run or export is using the folder {folder}: wait for it, or give another "
                 "with --out."
             ) from error
@@ -69,7 +69,7 @@ def result_folder(place: Path | Storage) -> Iterator[Path]:
 def local_result(place: Path | Storage, names: Sequence[str]) -> Iterator[Path]:
     """Yield the folder of a result: from storage, a temporary copy of some of its files.
 
-    LidarpoolError if the storage cannot be read, or has no complete result.
+    LidarError if the storage cannot be read, or has no complete result.
     """
     with local_folder(place) as folder:
         if not isinstance(place, Storage):
@@ -78,7 +78,7 @@ def local_result(place: Path | Storage, names: Sequence[str]) -> Iterator[Path]:
         with explained(f"{place.url} cannot be read"):
             there = place.sizes()
             if LAST_FILE not in there:
-                raise LidarpoolError(
+                raise LidarError(
                     f"{place.url} has no complete result, which has a {LAST_FILE}: give the URL of "
                     "a finished run (its --out); lidarpool run --resume continues an unfinished "
                     "one."
@@ -93,7 +93,7 @@ def send(path: Path, place: Path | Storage) -> str:
     """Copy a file or folder of `result_folder` into its storage, if the place is one.
 
     What the storage has of that name is replaced. Returns the path or URL, for messages.
-    LidarpoolError if the storage cannot be written to.
+    LidarError if the storage cannot be written to.
     """
     if not isinstance(place, Storage):
         return str(path)
@@ -126,8 +126,8 @@ def staging(folder: Path, place: object = None) -> Iterator[Path]:
     try:
         staged.mkdir()
         yield staged
-    except LidarpoolError as error:
-        raise LidarpoolError(str(error).replace(str(staged), str(place or folder))) from error
+    except LidarError as error:
+        raise LidarError(str(error).replace(str(staged), str(place or folder))) from error
     finally:
         shutil.rmtree(staged, ignore_errors=True)
 

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 from importlib import import_module
 from typing import Any
 
-from ..base.errors import LidarpoolError
+from lidarsim.base.errors import LidarError
 
 
 @dataclass(frozen=True)
@@ -120,7 +120,7 @@ EXPORTS = tuple(name for name in FORMATS if name != "ply")  # what a result has 
 def check_whole(needs: Iterable[str], keep_every: int) -> None:
     """Refuse to thin out the returns for a format that shows which rays had none."""
     if "ray" in needs and keep_every > 1:
-        raise LidarpoolError(
+        raise LidarError(
             f"Range images need every return, and keep_every is {keep_every}: set cloud.keep_every "
             "to 1."
         )

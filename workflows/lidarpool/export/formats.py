@@ -12,18 +12,19 @@ from typing import Annotated, Any, Literal
 
 import numpy as np
 
-from ..base.declared import about
-from ..base.errors import LidarpoolError, explained
-from ..base.storage import Storage, flush
-from ..base.validation import checked, checked_fields
-from ..columns.cloud import Cloud, CloudLike
+from lidarsim.base.declared import about
+from lidarsim.base.errors import LidarError, explained
+from lidarsim.base.storage import Storage, flush
+from lidarsim.base.validation import checked, checked_fields
+from lidarsim.columns.cloud import Cloud, CloudLike
+from lidarsim.sweeps.sweeps import Sweeps
+
 from ..columns.parts import StoredCloud
 from .folder import staging
 from .format_table import EXPORTS, FORMATS, LAYOUTS, FormatRow
 from .laser_scan import COLUMNS as LASER_SCAN_COLUMNS
 from .laser_scan import has_laser_scans
 from .pieces import RangeWorkers, RangeWriter
-from .sweeps import Sweeps
 
 _ENDINGS = {Path(row.file).suffix: name for name, row in FORMATS.items() if "." in row.file}
 _FILES = "; ".join(f"{name}: {FORMATS[name].file}" for name in EXPORTS)
@@ -53,7 +54,7 @@ class Format:
     def __post_init__(self) -> None:
         if self.compensated and not self.row.raw_or_compensated:
             choices = [name for name, row in FORMATS.items() if row.raw_or_compensated]
-            raise LidarpoolError(
+            raise LidarError(
                 f"compensated is an option of {', '.join(choices)}, not of {self.format}: leave it "
                 "out."
             )
@@ -64,7 +65,7 @@ class Format:
         try:
             return cls(entry) if isinstance(entry, str) else cls(**entry)
         except TypeError as error:
-            raise LidarpoolError(
+            raise LidarError(
                 f"{entry!r} names no format: give a name, or {{'format': name, 'layout': name}}."
             ) from error
 
@@ -125,30 +126,30 @@ class Format:
         return not self._absent
 
     def check_installed(self) -> None:
-        """Check that it can be written here; LidarpoolError if a package is missing."""
+        """Check that it can be written here; LidarError if a package is missing."""
         if self._absent:
-            raise LidarpoolError(
+            raise LidarError(
                 f"The format {self.format} needs {' and '.join(self._absent)}: "
                 f'pip install "lidarpool[{self.row.module}]".'
             )
 
     def check(self, path: Path, cloud: CloudLike, *, overwrite: bool = False) -> None:
-        """Check the needs of `write` before anything is written, or raise LidarpoolError."""
+        """Check the needs of `write` before anything is written, or raise LidarError."""
         self.check_installed()
         if not path.parent.is_dir():
-            raise LidarpoolError(f"The folder {path.parent} does not exist: make it first.")
+            raise LidarError(f"The folder {path.parent} does not exist: make it first.")
         if path.exists() and not overwrite:
-            raise LidarpoolError(f"{path} exists: give another place with --out, or --overwrite.")
+            raise LidarError(f"{path} exists: give another place with --out, or --overwrite.")
         refuse_strangers(Storage.at(path.parent), [path.name])
         self.check_columns(cloud)
 
     def check_columns(self, cloud: CloudLike) -> None:
-        """Check that a cloud has the columns that the format needs, or raise LidarpoolError."""
+        """Check that a cloud has the columns that the format needs, or raise LidarError."""
         there = {column.name for column in cloud.table}
         if missing := [name for name in self.needs if name not in there]:
             laid_out = f"with the layout {self.layout} " if self.row.layouts else ""
             lacks = ", ".join(missing)
-            raise LidarpoolError(
+            raise LidarError(
                 f"The format {self.format} {laid_out}needs {lacks}, which the cloud lacks: run the "
                 f"survey again with {self.format} in output.write, or with {lacks} among "
                 "cloud.columns."
@@ -170,7 +171,7 @@ class Format:
 
         Raises
         ------
-        LidarpoolError
+        LidarError
             If a package or column is missing, if something is there, or if it cannot be written.
         """
         more: dict[str, Any] = {}
@@ -198,7 +199,7 @@ class Format:
     def put(
         self, storage: Storage, cloud: CloudLike, sweeps: Sweeps, workers: RangeWorkers | None
     ) -> None:
-        """Have workers write a format of many files into a storage; LidarpoolError leaves none."""
+        """Have workers write a format of many files into a storage; LidarError leaves none."""
         place = Storage(storage.path(self.row.file))
         with explained(f"{place} cannot be written"):
             try:
@@ -215,7 +216,7 @@ def refuse_strangers(place: Storage, names: Collection[str]) -> None:
         own = re.compile(rf"{row.file}/(?:{row.inside}|(?:.*/)?\.(?:lidarpool-|writing).*)")
         for name in place.tree(row.file):
             if not own.fullmatch(name):
-                raise LidarpoolError(
+                raise LidarError(
                     f"{place.path(name)} is not a file of lidarpool, and {row.file} would be "
                     "replaced: move it elsewhere, or give another folder with --out."
                 )
@@ -261,26 +262,26 @@ def save_cloud(
 
     Raises
     ------
-    LidarpoolError
+    LidarError
         If there is no such format, it lacks a column or package, it stores single sweeps and
         the cloud is not of a result, or the file cannot be written.
     """
     path = Path(path)
     name = format or _ENDINGS.get(path.suffix)
     if name is None:
-        raise LidarpoolError(
+        raise LidarError(
             f"{path}: its ending has no format: use {', '.join(_ENDINGS)}, or give a format."
         )
     if precision_m is not None and not 0 < precision_m < np.inf:
-        raise LidarpoolError(f"precision_m is {precision_m}; it must be a length in metres.")
+        raise LidarError(f"precision_m is {precision_m}; it must be a length in metres.")
     one = Format(name, layout, compensated)
     sweeps = Sweeps.unknown() if cloud.sweeps is None else cloud.sweeps()
     sweeps = replace(sweeps, precision_m=precision_m or sweeps.precision_m)
     with explained(f"{path} cannot be written"):
         if path.is_dir():
-            raise LidarpoolError(f"{path} is a folder: remove it, or give another path.")
+            raise LidarError(f"{path} is a folder: remove it, or give another path.")
     if cloud.sweeps is None and "scan" in one.needs:
-        raise LidarpoolError(
+        raise LidarError(
             f"{name} stores single sweeps, but this cloud has none: save the cloud of a "
             "Result, or one that was read from the folder of a result."
         )

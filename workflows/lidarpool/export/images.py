@@ -10,15 +10,16 @@ from typing import Any
 
 import numpy as np
 
-from ..base.archives import open_archive, packed
-from ..base.arrays import AnyArray, Ints, Ints32
-from ..base.errors import LidarpoolError
-from ..columns.cloud import Cloud, CloudLike
-from ..sensor import Sensor
+from lidarsim.base.archives import open_archive, packed
+from lidarsim.base.arrays import AnyArray, Ints, Ints32
+from lidarsim.base.errors import LidarError
+from lidarsim.columns.cloud import Cloud, CloudLike
+from lidarsim.sensor import Sensor
+from lidarsim.sweeps.sweeps import MIXED_UP, Fired, Sweeps, plain_names
+
 from . import pieces, reading
 from .boxes import Boxes
 from .pieces import Entry
-from .sweeps import MIXED_UP, Fired, Sweeps, plain_names
 
 # Columns of points that images have for every ray, or that its place in them is.
 _OF_RAYS = ("scan", "ray", "channel", "sensor", "time", "azimuth", "elevation")
@@ -41,7 +42,7 @@ class Image:
     def of(cls, sweeps: Sweeps, sweep: int, points: Cloud) -> Image:
         """Find the places of the points of a sweep.
 
-        LidarpoolError if they are not in order, or it is unknown which rays there were.
+        LidarError if they are not in order, or it is unknown which rays there were.
         """
         fired, number = fired_of(sweeps), int(sweeps.sensor[sweep])
         sensor = fired.sensors[number]
@@ -53,7 +54,7 @@ class Image:
         ray = points["ray"].astype(np.int64)
         ray += (bounds[points["scan"] - scans[0], 0] - firings[0]) * sensor.channels
         if (np.diff(ray) < 0).any() or (len(ray) and ray[-1] >= len(firings) * sensor.channels):
-            raise LidarpoolError(MIXED_UP)
+            raise LidarError(MIXED_UP)
         column, row = np.divmod(ray, sensor.channels)
         begins = np.flatnonzero(np.diff(ray, prepend=-1))  # of the points of each pulse
         plane = np.arange(len(ray)) - np.repeat(begins, np.diff(begins, append=len(ray)))
@@ -88,9 +89,9 @@ class Image:
 
 
 def fired_of(sweeps: Sweeps) -> Fired:
-    """Return what finds all rays; LidarpoolError if that is unknown."""
+    """Return what finds all rays; LidarError if that is unknown."""
     if sweeps.fired is None:
-        raise LidarpoolError(
+        raise LidarError(
             "Range images need every return of a survey: run it with keep_every 1 and the column "
             "ray. Of a Sensor class of your own they are written with the run only (output.write, "
             "Result.report)."
@@ -125,7 +126,7 @@ class Pieces(pieces.Pieces):
         for name, values in columns.items():
             for plane, made in enumerate(image.filled(values)):
                 if (key := _key(name, plane)) in arrays:
-                    raise LidarpoolError(f"Two arrays of an image would be {key!r}: rename one.")
+                    raise LidarError(f"Two arrays of an image would be {key!r}: rename one.")
                 arrays[key] = made
         arrays["pose"] = sweeps.pose.matrix(number)
         boxes = Boxes.of(sweeps, number, points) if sweeps.actors and self.entry else None

@@ -9,14 +9,15 @@ from functools import cached_property
 import numpy as np
 import yaml
 
-from ..base.arrays import Floats, Floats32
-from ..base.errors import LidarpoolError
-from ..columns.cloud import Cloud, CloudLike
-from ..sensor.trajectory import matrices
+from lidarsim.base.arrays import Floats, Floats32
+from lidarsim.base.errors import LidarError
+from lidarsim.columns.cloud import Cloud, CloudLike
+from lidarsim.sensor.trajectory import matrices
+from lidarsim.sweeps.sweeps import Sweeps, plain_names
+
 from . import pieces, reading
 from .boxes import Boxes
 from .pieces import Data, Entry, as_data
-from .sweeps import Sweeps, plain_names
 
 INSTANCES_MOST = 65_535
 NAMES_FILE = "semantic-kitti.yaml"
@@ -43,7 +44,7 @@ class Pieces(pieces.Pieces):
 
     def __init__(self, cloud: CloudLike, sweeps: Sweeps, entry: Entry | None = None) -> None:
         if len(sweeps.objects) + len(sweeps.actors) > INSTANCES_MOST:
-            raise LidarpoolError(f"KITTI labels hold {INSTANCES_MOST:,} objects at most.")
+            raise LidarError(f"KITTI labels hold {INSTANCES_MOST:,} objects at most.")
         super().__init__(cloud, sweeps, entry)
         self.names = _names(sweeps, entry)
         self.sequences = [f"sequences/{name}" for name in self.names]

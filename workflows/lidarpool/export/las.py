@@ -20,13 +20,14 @@ import lazrs
 import numpy as np
 from laspy.vlrs.known import WaveformPacketStruct, WaveformPacketVlr, WktCoordinateSystemVlr
 
-from ..base.errors import LidarpoolError
-from ..base.interrupts import deferred_interrupts
-from ..columns.cloud import Cloud, CloudLike
-from ..columns.table import COLOURS, NORMAL, TABLE
-from ..columns.waveforms import WAVEFORM, ZERO, records
+from lidarsim.base.errors import LidarError
+from lidarsim.base.interrupts import deferred_interrupts
+from lidarsim.columns.cloud import Cloud, CloudLike
+from lidarsim.columns.table import COLOURS, NORMAL, TABLE
+from lidarsim.columns.waveforms import WAVEFORM, ZERO, records
+from lidarsim.sweeps.sweeps import AS_FIRED, IN_WORLD, Sweeps
+
 from .flight_lines import FlightLines
-from .sweeps import AS_FIRED, IN_WORLD, Sweeps
 
 ANGLE_DEG = 0.006  # of one step of the format's scan angle
 FULL = 65_535  # the format's intensity for 1 and above
@@ -102,7 +103,7 @@ def _write(path: Path, cloud: CloudLike, sweeps: Sweeps, *, compress: bool) -> N
     header.scales = np.full(3, sweeps.precision_m)
     header.offsets = np.floor((low + high) / 2)
     if np.abs(np.stack([low, high]) - header.offsets).max() / sweeps.precision_m > _FAR:
-        raise LidarpoolError(
+        raise LidarError(
             f"{path.suffix[1:].upper()} holds 2^32 steps of {sweeps.precision_m} m along an axis, "
             f"and the cloud is {(high - low).max():.6g} m wide: use a coarser precision_m."
         )
@@ -241,7 +242,7 @@ def wkt(epsg: int) -> str:
 
     Raises
     ------
-    LidarpoolError
+    LidarError
         If rasterio is missing, or knows no such system.
     """
     zone = epsg % 100
@@ -250,7 +251,7 @@ def wkt(epsg: int) -> str:
     if 25828 <= epsg <= 25838:
         return _utm(epsg, zone, False, *_ETRS89)
     if find_spec("rasterio") is None:
-        raise LidarpoolError(
+        raise LidarError(
             f"EPSG:{epsg} is not a UTM zone of WGS 84 or ETRS89, and others need rasterio: "
             'pip install "lidarpool[geo]".'
         )
@@ -258,7 +259,7 @@ def wkt(epsg: int) -> str:
     try:
         return str(crs.CRS.from_epsg(epsg).to_wkt(version="WKT1_GDAL"))
     except crs.CRSError as error:
-        raise LidarpoolError(f"rasterio cannot write EPSG:{epsg} as WKT 1: {error}.") from error
+        raise LidarError(f"rasterio cannot write EPSG:{epsg} as WKT 1: {error}.") from error
 
 
 def _utm(

@@ -7,11 +7,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ..base.arrays import Floats, Floats32
-from ..columns.cloud import Cloud
-from ..sensor import Sensor, Survey
+from lidarsim.base.arrays import Floats, Floats32
+from lidarsim.columns.cloud import Cloud
+from lidarsim.sensor import Sensor, Survey
+from lidarsim.sweeps.sweeps import Sweeps
+
 from .images import Image
-from .sweeps import Sweeps
 
 COLUMNS = "ray", "range"  # that a LaserScan needs, and every return
 _BAGS = frozenset({"mcap", "rosbag2"})

@@ -12,10 +12,10 @@ from pathlib import Path
 
 import numpy as np
 
-from ..base.arrays import Floats
-from ..sensor import Survey
-from ..sensor.navigation import fixes, geodetic, imu_samples
-from .instruments import IMU_FILE, Instruments
+from lidarsim.base.arrays import Floats
+from lidarsim.sensor import Survey
+from lidarsim.sensor.navigation import fixes, geodetic, imu_samples
+from lidarsim.sweeps.instruments import IMU_FILE, Instruments
 
 _IMU = (
     "time_ns",

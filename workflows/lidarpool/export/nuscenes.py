@@ -13,14 +13,15 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from ..base.arrays import Bools, Ints
+from lidarsim.base.arrays import Bools, Ints
+from lidarsim.base.storage import Storage
+from lidarsim.columns.cloud import Cloud, CloudLike
+from lidarsim.sweeps.sweeps import COMPENSATED, Sweeps, plain_names
+
 from ..base.fingerprint import fingerprint
-from ..base.storage import Storage
-from ..columns.cloud import Cloud, CloudLike
 from . import pieces, reading
 from .boxes import Boxes
 from .pieces import Data, Entry, as_data
-from .sweeps import COMPENSATED, Sweeps, plain_names
 
 VERSION = "v1.0-lidarpool"
 _SCENE, _LOG = "scene-0001", "survey"

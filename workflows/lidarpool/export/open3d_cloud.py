@@ -6,14 +6,15 @@ from typing import Any
 
 import numpy as np
 
+from lidarsim.columns.cloud import Cloud
+
 from ..base.open3d_module import load_open3d
-from ..columns.cloud import Cloud
 
 
 def to_open3d(cloud: Cloud) -> Any:
     """Return an `open3d.t.geometry.PointCloud` of all columns, by their names in files.
 
-    LidarpoolError if Open3D is not installed, or lacks a library of the system.
+    LidarError if Open3D is not installed, or lacks a library of the system.
     """
     o3d = load_open3d()
     positions = np.ascontiguousarray(cloud.positions)

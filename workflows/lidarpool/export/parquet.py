@@ -14,11 +14,12 @@ import pyarrow as pa
 import pyarrow.dataset
 import pyarrow.parquet as pq
 
-from ..columns.cloud import CHUNK_POINTS, Cloud, CloudLike
-from ..columns.table import AXES, TABLE
+from lidarsim.columns.cloud import CHUNK_POINTS, Cloud, CloudLike
+from lidarsim.columns.table import AXES, TABLE
+from lidarsim.sweeps.sweeps import Sweeps
+
 from . import pieces, reading
 from .pieces import Entry
-from .sweeps import Sweeps
 
 _GROUP_ROWS = 65_536
 

@@ -7,11 +7,12 @@ import io
 import numpy as np
 from pypcd4.pypcd4 import Encoding, PointCloud
 
-from ..columns.cloud import Cloud
-from ..columns.table import COLOURS, NORMAL
-from ..scene.colours import as_float
+from lidarsim.columns.cloud import Cloud
+from lidarsim.columns.table import COLOURS, NORMAL
+from lidarsim.scene.colours import as_float
+from lidarsim.sweeps.sweeps import AS_FIRED, COMPENSATED
+
 from . import pieces
-from .sweeps import AS_FIRED, COMPENSATED
 
 
 class Pieces(pieces.Pieces):

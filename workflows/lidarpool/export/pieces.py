@@ -10,12 +10,13 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from ..base.arrays import AnyArray
-from ..base.errors import LidarpoolError
-from ..base.storage import Storage
-from ..columns.cloud import Cloud, CloudLike
+from lidarsim.base.arrays import AnyArray
+from lidarsim.base.errors import LidarError
+from lidarsim.base.storage import Storage
+from lidarsim.columns.cloud import Cloud, CloudLike
+from lidarsim.sweeps.sweeps import MIXED_UP, Sweeps
+
 from .format_table import FORMATS
-from .sweeps import MIXED_UP, Sweeps
 
 # NumPy, pyarrow and system calls for the disk hold Python's lock at most 6 % of the time.
 THREADS = min(4, os.cpu_count() or 1)
@@ -98,11 +99,11 @@ class Pieces:
     def finish(self, place: Storage, written: Iterable[WrittenRange]) -> list[Any]:
         """Write the files that are not of one piece; returns what was made of the pieces.
 
-        LidarpoolError if the cloud is not of these sweeps, or not in order; OSError.
+        LidarError if the cloud is not of these sweeps, or not in order; OSError.
         """
         counts, ranges = zip(*written, strict=True) if self else ((), ())
         if sum(counts) != len(self.cloud):
-            raise LidarpoolError(MIXED_UP)
+            raise LidarError(MIXED_UP)
         made = [more for one in ranges for more in one]
         for name, data in self.others(made).items():
             place.prepare(Path(name).parent)
@@ -153,7 +154,7 @@ class RangeWriter:
 
         Raises
         ------
-        LidarpoolError
+        LidarError
             If the cloud is not of these sweeps, or not in order; or as `workers`.
         """
         pieces = self._pieces()

@@ -8,18 +8,19 @@ from pathlib import Path
 
 import numpy as np
 
-from ..base.arrays import AnyFloats, Records
-from ..base.errors import LidarpoolError
+from lidarsim.base.arrays import AnyFloats, Records
+from lidarsim.base.errors import LidarError
+from lidarsim.base.validation import checked
+from lidarsim.base.words import printable
+from lidarsim.columns.cloud import CHUNK_POINTS, Cloud, CloudLike
+from lidarsim.columns.table import AXES as POSITION
+from lidarsim.columns.table import NORMAL, TABLE, check_names
+from lidarsim.sweeps.sweeps import AS_FIRED, SWEEPS_FILE, Sweeps
+
 from ..base.open3d_module import load_open3d
-from ..base.validation import checked
-from ..base.words import printable
-from ..columns.cloud import CHUNK_POINTS, Cloud, CloudLike
 from ..columns.cloud_file import CloudFile
 from ..columns.ply_format import AXES, as_held, header, layout, mapped_rows, row_type
-from ..columns.table import AXES as POSITION
-from ..columns.table import NORMAL, TABLE, check_names
 from . import reading
-from .sweeps import AS_FIRED, SWEEPS_FILE, Sweeps
 
 # Positions are stored in single precision if the error is below this part of the precision.
 _ROUNDING_SHARE = 0.05
@@ -70,7 +71,7 @@ def read_cloud(path: str | Path) -> Cloud:
 
     Raises
     ------
-    LidarpoolError
+    LidarError
         If the file is missing, truncated, or not a binary PLY with x, y and z.
     """
     path = Path(path)
@@ -124,7 +125,7 @@ def _check_room(path: Path, head: bytes, count: int, row_bytes: int) -> None:
     size, piece = len(head) + count * row_bytes, min(count, CHUNK_POINTS) * row_bytes
     free = shutil.disk_usage(path.parent).free
     if free < size + piece:
-        raise LidarpoolError(
+        raise LidarError(
             f"{path} could not be written: it takes {size:,} bytes, and {piece:,} beside it "
             f"meanwhile; the disk has {free:,} bytes free. Make room, or write to another folder."
         )
@@ -149,9 +150,9 @@ def _write_open3d(path: Path, cloud: Cloud, real: np.dtype[np.floating]) -> None
         with quiet:
             written = o3d.t.io.write_point_cloud(str(path), points, write_ascii=False)
     except (RuntimeError, UnicodeError) as error:
-        raise LidarpoolError(f"Open3D cannot write {path.parent}: {error}.") from error
+        raise LidarError(f"Open3D cannot write {path.parent}: {error}.") from error
     if not written:
-        raise LidarpoolError(f"Open3D cannot write to {path.parent}: check folder and disk.")
+        raise LidarError(f"Open3D cannot write to {path.parent}: check folder and disk.")
 
 
 def _rows(cloud: Cloud, row: np.dtype[np.void]) -> Records:
@@ -172,7 +173,7 @@ def _layout(piece: Path, path: Path, count: int) -> tuple[int, np.dtype[np.void]
             raise ValueError(f"{found:,} of {count:,} points")
     except ValueError as error:
         free = shutil.disk_usage(path.parent).free
-        raise LidarpoolError(
+        raise LidarError(
             f"{path} could not be written ({error}); the disk has {free:,} bytes free. "
             "Make room, or write to another folder."
         ) from error

@@ -13,11 +13,12 @@ from typing import Any
 
 import numpy as np
 
-from ..base.arrays import AnyArray, Floats32
-from ..base.storage import Storage
-from ..columns.cloud import Cloud
+from lidarsim.base.arrays import AnyArray, Floats32
+from lidarsim.base.storage import Storage
+from lidarsim.columns.cloud import Cloud
+from lidarsim.sweeps.sweeps import Sweeps
+
 from .pieces import Entry
-from .sweeps import Sweeps
 
 # Points, float32 (n, 3), metres in the sensor's axes, and {column: (n,)}, as the format holds them.
 PointColumns = tuple[Floats32, dict[str, AnyArray]]

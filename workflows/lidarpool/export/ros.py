@@ -23,19 +23,20 @@ from rosbags.rosbag2 import Reader as Bag
 from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from ..base.arrays import AnyArray, Floats32, Records
-from ..columns.bags import POINT_FIELDS, message_types
-from ..columns.cloud import Cloud, CloudLike
-from ..columns.table import COLOURS, SURFACE_COLUMNS, VELOCITY
-from ..scene.colours import as_float
-from ..sensor.reflectivity import COUNTS
+from lidarsim.base.arrays import AnyArray, Floats32, Records
+from lidarsim.columns.bags import POINT_FIELDS, message_types
+from lidarsim.columns.cloud import Cloud, CloudLike
+from lidarsim.columns.table import COLOURS, SURFACE_COLUMNS, VELOCITY
+from lidarsim.scene.colours import as_float
+from lidarsim.sensor.reflectivity import COUNTS
+from lidarsim.sweeps.instruments import GNSS_FILE, IMU_FILE, Instruments
+from lidarsim.sweeps.lidar_traits import LidarTraits
+from lidarsim.sweeps.sweeps import AS_FIRED, COMPENSATED, Placed, Sweeps, plain_names
+
 from . import reading
 from .boxes import Boxes
 from .images import Image
-from .instruments import GNSS_FILE, IMU_FILE, Instruments
 from .laser_scan import ScanRays
-from .lidar_traits import LidarTraits
-from .sweeps import AS_FIRED, COMPENSATED, Placed, Sweeps, plain_names
 
 Sent = tuple[str, Any, int]  # topic, message, time in nanoseconds
 

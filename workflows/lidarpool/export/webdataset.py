@@ -11,15 +11,16 @@ from functools import cached_property, partial
 
 import numpy as np
 
-from ..base.archives import open_archive, packed, read_npy
-from ..base.arrays import AnyArray, Ints
-from ..base.errors import LidarpoolError
-from ..base.storage import Storage
-from ..columns.cloud import Cloud, CloudLike
+from lidarsim.base.archives import open_archive, packed, read_npy
+from lidarsim.base.arrays import AnyArray, Ints
+from lidarsim.base.errors import LidarError
+from lidarsim.base.storage import Storage
+from lidarsim.columns.cloud import Cloud, CloudLike
+from lidarsim.sweeps.sweeps import AS_FIRED, COMPENSATED, Sweeps, plain_names
+
 from . import pieces, reading
 from .boxes import Boxes, SweepBoxes
 from .pieces import Entry, PieceRange, WrittenRange
-from .sweeps import AS_FIRED, COMPENSATED, Sweeps, plain_names
 
 SHARD_MOST = 1_000_000_000  # bytes of a tar file, unless a single sweep has more
 _OWN = ("points", "pose", "boxes")  # arrays that are no columns
@@ -44,7 +45,7 @@ class Pieces(pieces.Pieces):
         self.names = plain_names(name or "lidar" for name in sweeps.sensors)
         self.offsets = np.zeros((len(sweeps), 3), np.int64)
         if clash := [column.name for column in cloud.table if column.name in _OWN]:
-            raise LidarpoolError(f"WebDataset has other {clash[0]!r}: rename the column.")
+            raise LidarError(f"WebDataset has other {clash[0]!r}: rename the column.")
 
     def spans(self, parts: int = 1) -> list[PieceRange]:
         """Divide all sweeps into ranges, which begin a tar file each, wherever they are written."""

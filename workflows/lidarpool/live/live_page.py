@@ -21,18 +21,18 @@ from typing import Any
 import click
 import numpy as np
 
+from lidarsim.base.arrays import Floats, Floats32
+from lidarsim.base.errors import LidarError
+from lidarsim.base.storage import Storage
+from lidarsim.columns.cloud import Cloud
+from lidarsim.sweeps.sweeps import SWEEPS_FILE, Sweeps
 from poolpart import Partition, PartitionStats
 
-from ..base.arrays import Floats, Floats32
-from ..base.errors import LidarpoolError
-from ..base.storage import Storage
-from ..columns.cloud import Cloud
 from ..columns.cloud_file import CloudFile
 from ..columns.parts import read_part
 from ..datasets.dataset import DataSet, job_file
 from ..datasets.figures import Figures
 from ..datasets.job_table import JobRow, Value
-from ..export.sweeps import SWEEPS_FILE, Sweeps
 from ..pipeline.messages import Receipt, ScanFrame
 from ..plan import best
 from ..report.charts import draw_results, draw_varied
@@ -338,7 +338,7 @@ class Charts:
                 with self._lock:  # shortly: the run waits for no drawing
                     figures = deepcopy(self._figures)
                 self._drawn = figures.jobs
-                with self._share.taken(), suppress(LidarpoolError):
+                with self._share.taken(), suppress(LidarError):
                     pages = draw_varied(figures), draw_results(figures)
                     drawn = (f"<figure>{page.svg()}</figure>" for page in pages if page is not None)
                     self._svg = "".join(drawn)
@@ -430,7 +430,7 @@ class LiveJob:
             names, self._waiting = self._waiting[:PARTS_AT_ONCE], self._waiting[PARTS_AT_ONCE:]
             clouds = [self.cloud]
             for name in names:
-                with suppress(LidarpoolError):
+                with suppress(LidarError):
                     part = read_part(self._points.storage, name)
                     self._counts[part.triangles] += part.hits
                     self._hits += int(part.hits.sum())

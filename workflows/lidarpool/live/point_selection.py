@@ -10,12 +10,13 @@ from typing import Any
 
 import numpy as np
 
-from ..base.arrays import AnyArray, AnyFloats, Bools, Floats, Ints
-from ..base.sampling import even_indices
-from ..columns.cloud import Cloud
+from lidarsim.base.arrays import AnyArray, AnyFloats, Bools, Floats, Ints
+from lidarsim.base.sampling import even_indices
+from lidarsim.columns.cloud import Cloud
+from lidarsim.columns.table import Column
+
 from ..columns.cloud_file import CloudFile
 from ..columns.ply_format import AXES
-from ..columns.table import Column
 
 RESULT = Column("result", "uint8", "", "result that the point is of", kind="label")
 ScanRanges = tuple[tuple[int, int], ...]  # first and last scan of each range

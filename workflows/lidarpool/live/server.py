@@ -31,7 +31,8 @@ from tornado.httpserver import HTTPServer
 from tornado.iostream import StreamClosedError
 from tornado.web import Application, HTTPError, RequestHandler, StaticFileHandler
 
-from ..base.arrays import AnyArray
+from lidarsim.base.arrays import AnyArray
+
 from ..base.notebook import cell_display
 from .point_selection import Abandoned
 

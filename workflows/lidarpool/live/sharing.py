@@ -16,11 +16,12 @@ import click
 import numpy as np
 from PIL import Image
 
-from ..base.arrays import AnyArray, Floats
-from ..base.errors import LidarpoolError, explained
-from ..base.storage import Storage
-from ..columns.cloud import Cloud
-from ..export.sweeps import Sweeps
+from lidarsim.base.arrays import AnyArray, Floats
+from lidarsim.base.errors import LidarError, explained
+from lidarsim.base.storage import Storage
+from lidarsim.columns.cloud import Cloud
+from lidarsim.sweeps.sweeps import Sweeps
+
 from ..render.colouring import TURBO
 from ..render.film import Film
 from ..run.progress import Screen, Written
@@ -40,14 +41,14 @@ def share(path: Path, film: Path | None, page: Path | None, screen: Screen | Non
 
     `screen` shows what is being written; by default the log.
 
-    LidarpoolError if there are no points, or a file has another suffix or cannot be written.
+    LidarError if there are no points, or a file has another suffix or cannot be written.
     """
     for file, suffixes in (film, tuple(_FILMS)), (page, (".html",)):
         if file and file.suffix not in suffixes:
-            raise LidarpoolError(f"{file} does not end with {' or '.join(suffixes)}: rename it.")
+            raise LidarError(f"{file} does not end with {' or '.join(suffixes)}: rename it.")
     view = open_result(path)
     if not len(PointFinder(view.points, view.origin).find(1000)[0]):
-        raise LidarpoolError(f"{path} has no points to show: its rays hit nothing.")
+        raise LidarError(f"{path} has no points to show: its rays hit nothing.")
     if view.note:
         click.echo(f"note: {view.note}", err=True)
     screen = screen or Screen()
@@ -155,7 +156,7 @@ def page_of(view: View, show: Written = lambda *_: None) -> bytes:
     while len(cloud := _packed(*_thinned(view, most))) > room:
         most = int(most * min(0.9, 0.95 * max(room, 0) / len(cloud)))
         if most < 1000:
-            raise LidarpoolError("Even without points the page has 25 MB: use lidarpool view only.")
+            raise LidarError("Even without points the page has 25 MB: use lidarpool view only.")
     script = '<script type="text/plain" data-question="{}">{}</script>\n'
     texts = [script.format(*each) for each in (held | {"cloud?": cloud}).items()]
     return page.replace("</body>", "".join([*texts, "</body>"])).encode()

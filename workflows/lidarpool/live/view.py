@@ -17,19 +17,24 @@ from typing import Any
 import click
 import numpy as np
 
+from lidarsim.base.arrays import AnyArray, Bytes, Floats, Floats32, Ints
+from lidarsim.base.errors import LidarError
+from lidarsim.base.words import plural
+from lidarsim.columns.cloud import Cloud
+from lidarsim.columns.table import AXES as POSITION
+from lidarsim.columns.table import CAUSES, NO_SURFACE, OBJECT, TABLE, Column, X, Y, Z, by_value
+from lidarsim.scene.actors import Actor, samples_each, shapes_of
+from lidarsim.scene.colours import as_bytes
+from lidarsim.scene.scene import Scene
+from lidarsim.scene.simplified import simplified
+from lidarsim.sensor.trajectory import presence_ns
+from lidarsim.sweeps.sweeps import SWEEPS_FILE, Sweeps
 from raybeam import RayCaster
 
-from ..base.arrays import AnyArray, Bytes, Floats, Floats32, Ints
-from ..base.errors import LidarpoolError
 from ..base.notebook import cell_display
-from ..base.words import plural
-from ..columns.cloud import Cloud
 from ..columns.cloud_file import CloudFile
 from ..columns.ply_format import AXES
-from ..columns.table import AXES as POSITION
-from ..columns.table import CAUSES, NO_SURFACE, OBJECT, TABLE, Column, X, Y, Z, by_value
 from ..export.formats import Format, save_cloud
-from ..export.sweeps import SWEEPS_FILE, Sweeps
 from ..pipeline.database import FILE
 from ..render.closeup import around_ways, floor_and_cut
 from ..render.colouring import (
@@ -46,11 +51,6 @@ from ..render.surface import apart
 from ..render.theme import mapped, object_colours
 from ..run.picture_file import PICTURE_FILE, PLACES_MOST, PictureContent, SensorWay, ways_of
 from ..run.store import RUN_FOLDER
-from ..scene.actors import Actor, samples_each, shapes_of
-from ..scene.colours import as_bytes
-from ..scene.scene import Scene
-from ..scene.simplified import simplified
-from ..sensor.trajectory import presence_ns
 from .point_selection import (
     RESULT,
     Eye,
@@ -326,7 +326,7 @@ class View:
             made = Path(folder) / name
             try:
                 save_cloud(cloud, made)
-            except LidarpoolError as error:
+            except LidarError as error:
                 return {"error": str(error)}, {}
             if made.is_dir():
                 file, *more = made.iterdir()
@@ -647,14 +647,14 @@ def show_view(view: View, *, port: int, browser: bool = True) -> None:
 def open_results(paths: Sequence[Path]) -> View:
     """Open results of one place as one view, with the scene, sensors and actors of the first.
 
-    They are played if their sweeps are alike. LidarpoolError as of `open_result`, or if points are
+    They are played if their sweeps are alike. LidarError as of `open_result`, or if points are
     in the axes of their sensors.
     """
     first, *others = views = [open_result(path) for path in paths]
     if not others:
         return first
     if IN_SENSOR_AXES in (notes := [view.note for view in views]):
-        raise LidarpoolError(
+        raise LidarError(
             f"{paths[notes.index(IN_SENSOR_AXES)]} has points in the axes of its sensors, which "
             "fit no other result: show it alone, or run it with cloud.coordinates: world."
         )
@@ -670,26 +670,26 @@ def open_results(paths: Sequence[Path]) -> View:
 def open_result(path: Path) -> View:
     """Open a cloud or the folder of a result; with its scene and sweeps if there are any.
 
-    That these cannot be read is only noted. LidarpoolError if there is no cloud, or a damaged one.
+    That these cannot be read is only noted. LidarError if there is no cloud, or a damaged one.
     """
     title = f"{path.resolve().name} - lidarpool"
     if not path.is_dir():
         return View(CloudFile(path), title=title)
     cloud, scene, beside = path / CLOUD, path / PICTURE_FILE, path / SWEEPS_FILE
     if not cloud.exists() and (path / RUN_FOLDER / FILE).exists():
-        raise LidarpoolError(
+        raise LidarError(
             f"{path} holds an unfinished run: continue it with lidarpool run --resume, where "
             "--live shows its points."
         )
     if not cloud.exists():
-        raise LidarpoolError(
+        raise LidarError(
             f"{path} holds no {CLOUD}: give the folder of a result (its --out), or a cloud."
         )
     pictured, sweeps, note = None, None, ""
     try:
         sweeps = Sweeps.load(beside) if beside.exists() else None
         pictured = PictureContent.load(scene) if scene.exists() else None
-    except LidarpoolError as error:
+    except LidarError as error:
         note = f"The cloud is shown without all that belongs to it. {error}"
     file = CloudFile(cloud, pictured.own if pictured else ())
     return View(file, pictured, sweeps, note, title)

@@ -13,15 +13,15 @@ from typing import Any
 import cloudpickle
 from distributed import Future
 
+from lidarsim.base.errors import LidarError
+from lidarsim.scene.scene import Scene
+from lidarsim.sensor import Survey
 from poolpart import Partition
 from poolpart.fetch import fetch_available
 from poolpart.task_locations import TaskLocations, look_for_tasks
 from poolpart.workers import worker_identities
 
-from ..base.errors import LidarpoolError
 from ..base.software import difference, software_there
-from ..scene.scene import Scene
-from ..sensor import Survey
 from .failures import JobError, error_of, raise_if_failed, was_killed, words_on_memory
 from .job_state import Outcome
 from .messages import BatchRange
@@ -239,7 +239,7 @@ class CastingWorkers:
     def look(self) -> TaskLocations | None:
         """From time to time, handle workers that have joined or left, or take no tasks.
 
-        Returns where workers and casting tasks are, None if it is not time to look. LidarpoolError
+        Returns where workers and casting tasks are, None if it is not time to look. LidarError
         if no worker may cast, or several in a row die while they are checked.
         """
         if time.monotonic() - self._looked_at <= LOOK_EVERY_S:
@@ -321,7 +321,7 @@ class CastingWorkers:
                 f"worker {identity['name']} at {address} has {differs}: it cast nothing"
             )
             if self._refused.keys() >= self.seen.members:
-                raise LidarpoolError(
+                raise LidarError(
                     f"No worker of partition {self._partition.name!r} has the run's software: the "
                     f"one at {address} has {differs}. Install the same on all."
                 )
@@ -343,7 +343,7 @@ class CastingWorkers:
         if place is not None and place.deaths:
             self._died.append(address)
         if len(self._died) >= SETUP_DEATHS and not self.slots:
-            raise LidarpoolError(
+            raise LidarError(
                 f"{CHECKING} has killed {len(self._died)} of them in a row"
                 f"{words_on_memory(self._client, self._died)}: "
                 "look into their logs."

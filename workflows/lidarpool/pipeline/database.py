@@ -22,8 +22,9 @@ from typing import Any
 
 import numpy as np
 
-from ..base.arrays import Ints
-from ..base.errors import LidarpoolError
+from lidarsim.base.arrays import Ints
+from lidarsim.base.errors import LidarError
+
 from ..columns.parts import part_name
 from ..datasets.job_table import JOBS_MOST
 from ..plan import Trial
@@ -151,7 +152,7 @@ class JobParts:
         self.hits += sign * part.hits
 
 
-class DamagedError(LidarpoolError):
+class DamagedError(LidarError):
     """A database cannot be read any more."""
 
 
@@ -159,10 +160,10 @@ class RunDatabase:
     """Committed parts and trials of the jobs of a run, and the jobs that have ended.
 
     A file that does not exist is made, and begins with the values `new`. Commits survive a power
-    failure if they are `durable`. All methods that write raise LidarpoolError if the disk is full
+    failure if they are `durable`. All methods that write raise LidarError if the disk is full
     or fails.
 
-    LidarpoolError if it is damaged, of another version, in use by another run, or cannot be
+    LidarError if it is damaged, of another version, in use by another run, or cannot be
     written.
     """
 
@@ -438,8 +439,8 @@ def _explained(path: Path) -> Iterator[None]:
                 f"{path} is damaged ({words}): drop the run with --fresh, or give another folder."
             ) from error
         if "locked" in words:
-            raise LidarpoolError(f"Another run is using {path.parent}.") from error
-        raise LidarpoolError(
+            raise LidarError(f"Another run is using {path.parent}.") from error
+        raise LidarError(
             f"{path} cannot be written ({words}): make room on its disk, or give another folder."
         ) from error
 
@@ -476,7 +477,7 @@ def _checked_place(meta: Mapping[str, str]) -> tuple[str, str]:
 def read_place(path: Path) -> tuple[str, str] | None:
     """Mark of a run, and the place of its parts or "", from its database.
 
-    None if there is no database, or a damaged one; LidarpoolError if a run is using it, or if it is
+    None if there is no database, or a damaged one; LidarError if a run is using it, or if it is
     another program's.
     """
     if not path.exists():
@@ -488,7 +489,7 @@ def read_place(path: Path) -> tuple[str, str] | None:
         ) as sql:
             tables = {name for (name,) in sql.execute("SELECT name FROM sqlite_master")}
             if tables and not tables >= {"meta", "parts", "trials"}:
-                raise LidarpoolError(
+                raise LidarError(
                     f"{path} is not the database of a run: move it elsewhere, or give another "
                     "folder."
                 )
@@ -498,7 +499,7 @@ def read_place(path: Path) -> tuple[str, str] | None:
             return _checked_place({name: value for name, value, _ in rows})
     except sqlite3.Error as error:
         if "locked" in str(error):
-            raise LidarpoolError(f"Another run is using {path.parent}.") from error
+            raise LidarError(f"Another run is using {path.parent}.") from error
         return None
     except (ValueError, LookupError, TypeError, OverflowError):
         return None

@@ -14,9 +14,10 @@ import time
 from collections.abc import Callable, Iterable, Sequence
 from itertools import chain
 
-from ..columns.cloud import Cloud
-from ..scene.scene import Scene
-from ..sensor import Survey
+from lidarsim.columns.cloud import Cloud
+from lidarsim.scene.scene import Scene
+from lidarsim.sensor import Survey
+
 from .casting_workers import CastingWorkers
 from .database import RunDatabase
 from .dispatch import Dispatcher
@@ -152,7 +153,7 @@ class RunDriver:
     def step(self) -> bool:
         """Do what can be done now; returns whether there was anything to do.
 
-        LidarpoolError if something fails that all jobs need.
+        LidarError if something fails that all jobs need.
         """
         messages, self.stages.inbox = self.stages.inbox, []
         moved = bool(messages)
@@ -228,7 +229,7 @@ class RunDriver:
     def _look(self) -> None:
         """From time to time, handle workers and stages that have joined, died or are silent.
 
-        LidarpoolError if a stage has failed, or workers or slots are missing for too long.
+        LidarError if a stage has failed, or workers or slots are missing for too long.
         """
         if (seen := self.workers.look()) is not None:
             left = self.later + sum(job.left for job in self.jobs.values())

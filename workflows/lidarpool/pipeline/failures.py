@@ -7,16 +7,16 @@ from contextlib import AbstractContextManager, contextmanager
 
 from distributed import Client, Future, KilledWorker
 
+from lidarsim.base.errors import LidarError, explained
+from lidarsim.base.storage import Storage
 from poolpart.task_context import WorkerLeft
 
-from ..base.errors import LidarpoolError, explained
-from ..base.storage import Storage
 from .messages import scans_in_words
 
 ASK_S = 10.0  # for an error's text, which the scheduler has
 
 
-class JobError(LidarpoolError):
+class JobError(LidarError):
     """A survey cannot be made; others on the same workers can."""
 
 
@@ -41,7 +41,7 @@ def naming_scans(first: int, stop: int) -> Iterator[None]:
 
 
 def storing(storage: Storage) -> AbstractContextManager[None]:
-    """Turn an OSError of the body into a LidarpoolError that says what to do."""
+    """Turn an OSError of the body into a LidarError that says what to do."""
     advice = "make room there, or give another place with --parts"
     return explained(f"The points cannot be kept in {storage.url}", advice)
 
@@ -56,14 +56,14 @@ def was_killed(future: Future) -> bool:
     return isinstance(error_of(future), (KilledWorker, WorkerLeft))
 
 
-def raise_if_failed(future: Future, what: str, kind: type[LidarpoolError] = LidarpoolError) -> None:
-    """Raise an error of a `kind` if a task has failed, LidarpoolError if others cancelled it."""
+def raise_if_failed(future: Future, what: str, kind: type[LidarError] = LidarError) -> None:
+    """Raise an error of a `kind` if a task has failed, LidarError if others cancelled it."""
     if (error := error_of(future)) is not None:
         error.__traceback__ = future.traceback(timeout=ASK_S)
         words = str(error) or type(error).__name__  # some of Dask's have no message
         raise kind(f"{what} failed: {words}") from error
     if future.status == "cancelled":  # "lost" passes: a worker died and the task runs again
-        raise LidarpoolError(f"{what} was cancelled from outside this run.")
+        raise LidarError(f"{what} was cancelled from outside this run.")
 
 
 def words_on_memory(client: Client, workers: Collection[str]) -> str:

@@ -10,9 +10,10 @@ from enum import Enum
 
 import numpy as np
 
+from lidarsim.columns.cloud import Cloud
+from lidarsim.sensor import Survey
+
 from ..base.tracing import trace
-from ..columns.cloud import Cloud
-from ..sensor import Survey
 from .database import JobParts
 from .messages import Receipt, ScanFrame, Summaries, samples_of_scan, summary_type
 from .names import SORT

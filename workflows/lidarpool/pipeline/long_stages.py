@@ -23,14 +23,14 @@ from typing import Any
 
 from distributed import Future, Lock
 
+from lidarsim.base.errors import LidarError
+from lidarsim.base.storage import Storage
 from poolpart import Partition, Pipe, PipeFailed
 from poolpart.fetch import fetch_available, take_held
 from poolpart.pipe import forget_pipes, take_news
 from poolpart.task_locations import TaskLocations, look_for_tasks
 
-from ..base.errors import LidarpoolError
 from ..base.software import call_alike
-from ..base.storage import Storage
 from ..columns.parts import probe_name
 from .failures import raise_if_failed, storing, was_killed, words_on_memory
 from .messages import CollectOrder, Description, Message, Receipt, StageStart, Summaries
@@ -220,8 +220,8 @@ class LongStages:
         while len(self._look().tasks) < needed and time.monotonic() < now + SETTLE_S:
             time.sleep(0.005)
 
-    def _too_few(self, what: str, since: str = "") -> LidarpoolError:
-        return LidarpoolError(
+    def _too_few(self, what: str, since: str = "") -> LidarError:
+        return LidarError(
             f"{what} {self._patience_s:.0f} s{since}: start another worker with --resources "
             f'"{self.partition.name}=1" and run it again.'
         )
@@ -239,7 +239,7 @@ class LongStages:
         workers have died, {name: address}, and those that were started, for the first time or
         again.
 
-        LidarpoolError if a stage has failed, or keeps dying with nothing committed in between, or
+        LidarError if a stage has failed, or keeps dying with nothing committed in between, or
         the partition has too few slots for too long.
         """
         now = time.monotonic()
@@ -289,20 +289,20 @@ class LongStages:
         return died, started
 
     def _check_end(self, name: str) -> None:
-        """LidarpoolError if a stage has ended before `close`, as when somebody ends its pipe."""
+        """LidarError if a stage has ended before `close`, as when somebody ends its pipe."""
         if self._closed_at is None:
             pipes = ", ".join(repr(pipe.name) for pipe in self._pipes)
-            raise LidarpoolError(
+            raise LidarError(
                 f"Stage {name} has ended too early: another client has closed, failed or deleted a "
                 f"Queue or Variable of this run ({pipes}). Leave these alone, and run it again."
             )
 
     def _count_death(self, name: str, worker: str) -> None:
-        """LidarpoolError when a stage keeps dying."""
+        """LidarError when a stage keeps dying."""
         died = self._deaths.setdefault(name, [])
         died.append(worker)
         if len(died) > DEATHS_MOST:
-            raise LidarpoolError(
+            raise LidarError(
                 f"stage {name} was started {len(died)} times, and each time its worker died before "
                 f"anything was committed{words_on_memory(self.client, died)}: look into the logs "
                 "of the LIDAR workers."

@@ -11,12 +11,13 @@ from dataclasses import asdict, dataclass, field
 
 import numpy as np
 
-from ..base.arrays import Floats32
+from lidarsim.base.arrays import Floats32
+from lidarsim.base.validation import one_line
+from lidarsim.columns.cloud import Cloud
+from lidarsim.columns.part_columns import PartColumns
+from lidarsim.sensor import Pose, Survey
+
 from ..base.tracing import trace
-from ..base.validation import one_line
-from ..columns.cloud import Cloud
-from ..columns.part_columns import PartColumns
-from ..sensor import Pose, Survey
 from .placement import TaskRecord
 
 BatchRange = tuple[int, int]  # the first scan of a batch, and its end
@@ -187,7 +188,7 @@ class ScanFrame:
 
         Raises
         ------
-        LidarpoolError
+        LidarError
             If the part cannot be read, such as after a run that was not kept.
         """
         return self._read(self.scan)

@@ -18,17 +18,17 @@ from dataclasses import dataclass, replace
 import numpy as np
 from distributed import get_worker
 
+from lidarsim.base.arrays import Floats32
+from lidarsim.columns.part_columns import PartColumns
+from lidarsim.scene.scene import Scene
+from lidarsim.sensor import Survey
+from lidarsim.simulator.batch import columns_of
+from lidarsim.simulator.device import DevicePoints
+from lidarsim.simulator.points import BatchPoints
+from lidarsim.simulator.rig import Rig
 from poolpart import own_device
 
-from ..base.arrays import Floats32
 from ..base.tracing import trace
-from ..columns.part_columns import PartColumns
-from ..scene.scene import Scene
-from ..sensor import Survey
-from ..simulator.batch import columns_of
-from ..simulator.device import DevicePoints
-from ..simulator.points import BatchPoints
-from ..simulator.rig import Rig
 from .failures import naming_scans
 from .messages import BatchRange, samples_of_scan
 from .names import GPU, INTERSECT

@@ -16,13 +16,13 @@ from typing import Any
 
 from distributed import Client, secede
 
+from lidarsim.base.storage import Storage
+from lidarsim.sensor import Survey
 from poolpart import Pipe, PipeClosed, PipeFailed
 from poolpart.fetch import fetch_available, hold_for_driver
 from poolpart.task_context import telling_departure
 
-from ..base.storage import Storage
 from ..columns.parts import pack
-from ..sensor import Survey
 from .failures import ScanError, naming_scans, storing
 from .messages import (
     CollectOrder,

@@ -12,7 +12,7 @@ import itertools
 
 import numpy as np
 
-from ..base.arrays import Floats, Floats32
+from lidarsim.base.arrays import Floats, Floats32
 
 # Discs are made larger by this share of their distance and size: some 30 rounding errors of
 # single precision, so that a path which passes here also passes the exact check.

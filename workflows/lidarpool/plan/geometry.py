@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from ..base.arrays import Floats
+from lidarsim.base.arrays import Floats
 
 
 def segment_distances(first: Floats, last: Floats, centres: Floats) -> Floats:

@@ -10,10 +10,11 @@ from typing import Annotated
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..base.arrays import Floats
-from ..base.declared import Seed, about
-from ..base.errors import LidarpoolError
-from ..base.validation import checked_fields
+from lidarsim.base.arrays import Floats
+from lidarsim.base.declared import Seed, about
+from lidarsim.base.errors import LidarError
+from lidarsim.base.validation import checked_fields
+
 from .geometry import segment_distances
 
 
@@ -55,7 +56,7 @@ class Planning(Search):
 
     Raises
     ------
-    LidarpoolError
+    LidarError
         If an end lies within a disc, both ends are the same point, or a value is outside its
         range.
 
@@ -74,7 +75,7 @@ class Planning(Search):
     def __post_init__(self) -> None:
         start, target = ((float(x), float(y)) for x, y in (self.start, self.target))
         if start == target:
-            raise LidarpoolError(
+            raise LidarError(
                 f"start and target of the path are both {start}: there is nothing to plan. "
                 "Move one of them."
             )
@@ -107,7 +108,7 @@ def _checked(name: str, value: ArrayLike, fits: Callable[[Floats], bool], what: 
     except (TypeError, ValueError):
         numbers = np.array(np.nan)
     if not (np.isfinite(numbers).all() and fits(numbers)):
-        raise LidarpoolError(f"planning: {name} is {reprlib.repr(value)}; it must be {what}.")
+        raise LidarError(f"planning: {name} is {reprlib.repr(value)}; it must be {what}.")
     return numbers
 
 
@@ -118,7 +119,7 @@ def _check_outside(ends: dict[str, tuple[float, float]], centres: Floats, radii:
         if len(within):
             disc = int(within[0])
             x, y = centres[disc]
-            raise LidarpoolError(
+            raise LidarError(
                 f"The path's {name} ({end[0]:g}, {end[1]:g}) lies within disc {disc} of radius "
                 f"{radii[disc]:g} at ({x:g}, {y:g}): move the {name} out of it."
             )

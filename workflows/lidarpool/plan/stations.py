@@ -10,15 +10,14 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
+from lidarsim.base.arrays import Bools, Floats, Ints
+from lidarsim.base.errors import LidarError
+from lidarsim.base.validation import checked
+from lidarsim.scene.floor import SLAB_M
+from lidarsim.scene.scene import Scene
+from lidarsim.scene.simplified import Drawn
+from lidarsim.sensor import Sensor, Spin
 from raybeam import RayCaster
-
-from ..base.arrays import Bools, Floats, Ints
-from ..base.errors import LidarpoolError
-from ..base.validation import checked
-from ..scene.floor import SLAB_M
-from ..scene.scene import Scene
-from ..scene.simplified import Drawn
-from ..sensor import Sensor, Spin
 
 STATIONS_MOST = 100
 LEAST_GAIN = 0.01  # of what can be seen, that each adds if no number and no coverage is given
@@ -37,7 +36,7 @@ class Sight:
     """What a sensor sees from a station: surfaces in its range and field of view, not hidden.
 
     Its lowest and highest rays limit the field of view, `slant_deg` the angle of incidence, from
-    the normal of a surface. Actors are left out. LidarpoolError if it does not look all around.
+    the normal of a surface. Actors are left out. LidarError if it does not look all around.
     """
 
     def __init__(self, scene: Scene, sensor: Sensor, slant_deg: float) -> None:
@@ -53,7 +52,7 @@ class Sight:
         x, y, z = sensor.directions(firings).reshape(-1, 3).T
         sectors = np.floor(np.arctan2(y, x) / (2 * np.pi) * _SECTORS).astype(int) % _SECTORS
         if len(np.unique(sectors)) < min(_SECTORS, turn):
-            raise LidarpoolError(
+            raise LidarError(
                 f"{sensor.model} does not look all around, as it has to on a station: give "
                 "another sensor, such as terrestrial/riegl-vz400."
             )
@@ -134,21 +133,21 @@ def plan_stations(
 
     Raises
     ------
-    LidarpoolError
+    LidarError
         If a value is out of range, the sensor does not look all around, or there is nowhere to
         stand, or nothing to see.
 
     Examples
     --------
     >>> from lidarpool import Sensor
-    >>> from lidarpool.scene.actors import box
+    >>> from lidarsim.scene.actors import box
     >>> room = Scene.from_meshes([box("Room", (8, 6, 3))])
     >>> plan = plan_stations(room, Sensor.grid(vertical_fov_deg=180), slant_deg=90)
     >>> len(plan.stations), plan.visible_m2.round().tolist()
     (1, [180.0])
     """
     if count is not None and coverage is not None:
-        raise LidarpoolError("count and coverage both say when to stop: give one of them.")
+        raise LidarError("count and coverage both say when to stop: give one of them.")
     scene = Drawn.of(scene).scene
     sight = Sight(scene, sensor, slant_deg)
     if spacing_m is None:
@@ -160,7 +159,7 @@ def plan_stations(
     seen = np.concatenate([sides > 0, sides < 0], axis=1)
     visible = np.flatnonzero(seen.any(axis=0))
     if not len(visible):
-        raise LidarpoolError(
+        raise LidarError(
             f"Nothing is visible from {len(places):,} places at {height_m:g} m: check the unit of "
             "the scene, the range of the sensor, and the slant."
         )
@@ -225,13 +224,13 @@ def candidates(scene: Scene, caster: RayCaster, height_m: float, spacing_m: floa
 
     Raises
     ------
-    LidarpoolError
+    LidarError
         If there is none, or the grid is too fine.
     """
     low, high = scene.bounds
     across, along = np.maximum((high - low)[:2] / spacing_m, 1).astype(int).tolist()
     if across * along > _PLACES_MOST:
-        raise LidarpoolError(
+        raise LidarError(
             f"A grid of {spacing_m:g} m has {across * along:,} places, more than "
             f"{_PLACES_MOST:,}: give a larger spacing."
         )
@@ -266,7 +265,7 @@ def candidates(scene: Scene, caster: RayCaster, height_m: float, spacing_m: floa
     places = places[_clear(scene, caster, places)]
     if not len(places):
         what = "The scene has no floor" if not walkable.any() else "There is no room on the floor"
-        raise LidarpoolError(
+        raise LidarError(
             f"{what} for an instrument at {height_m:g} m, on a grid of {spacing_m:g} m: check the "
             "scene's unit and up axis, give another height or spacing, or add scene.ground."
         )

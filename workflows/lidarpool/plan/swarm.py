@@ -7,7 +7,8 @@ import math
 
 import numpy as np
 
-from ..base.arrays import Floats, Floats32
+from lidarsim.base.arrays import Floats, Floats32
+
 from .cost import PathCost
 
 _GROUPS = 5

@@ -16,7 +16,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..base.arrays import Floats, Indices
+from lidarsim.base.arrays import Floats, Indices
+
 from .geometry import PathAxes, segment_distances
 
 # A tangent this close to a disc, as a share of the scene's size, passes it. Three discs with one

@@ -8,9 +8,10 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from ..base.arrays import Floats
-from ..base.errors import LidarpoolError
-from ..base.validation import one_line
+from lidarsim.base.arrays import Floats
+from lidarsim.base.errors import LidarError
+from lidarsim.base.validation import one_line
+
 from .cost import PathCost
 from .geometry import PathAxes, clearance, path_length, segment_distances
 from .planning import Planning
@@ -125,7 +126,7 @@ def best(trials: Iterable[Trial], planning: Planning) -> Plan:
 
     Raises
     ------
-    LidarpoolError
+    LidarError
         If there are no trials.
     """
     candidates = []
@@ -134,7 +135,7 @@ def best(trials: Iterable[Trial], planning: Planning) -> Plan:
         room = clearance(path, planning.centres, planning.radii)
         candidates.append((max(0.0, -room), path_length(path), trial.trial, room, path))
     if not candidates:
-        raise LidarpoolError("No planning trial was finished, so there is no best path.")
+        raise LidarError("No planning trial was finished, so there is no best path.")
     _, length, number, room, path = min(candidates, key=lambda candidate: candidate[:3])
     return Plan(
         path=path,

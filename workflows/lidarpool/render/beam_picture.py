@@ -7,7 +7,8 @@ from pathlib import Path
 import numpy as np
 from matplotlib.colors import Normalize
 
-from ..sensor import LineSensor, Sensor
+from lidarsim.sensor import LineSensor, Sensor
+
 from .picture_page import Page
 from .shot import SIZE
 from .theme import mapped
@@ -21,7 +22,7 @@ def draw_beams(path: Path, sensor: Sensor) -> None:
 
     These are the rays of some firings; if a firing is one ray, those of a frame, or of two cycles
     of a mirror. For a sensor that looks down, whose rays lie in a plane, the angle over time.
-    LidarpoolError if the file, a .png, cannot be written.
+    LidarError if the file, a .png, cannot be written.
     """
     page = Page(SIZE)
     turn = round(getattr(sensor.head, "firings_per_turn", 1000))

@@ -7,11 +7,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from lidarsim.base.arrays import Floats, Ints
+from lidarsim.scene.scene import Scene
+from lidarsim.scene.scene_mesh import triangle_areas
 from raybeam import RayCaster
 
-from ..base.arrays import Floats, Ints
-from ..scene.scene import Scene
-from ..scene.scene_mesh import triangle_areas
 from .surface import spiral
 
 # Margin on each side of a trajectory: a share of its diagonal, times its height above the scene's

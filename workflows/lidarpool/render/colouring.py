@@ -7,9 +7,10 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from ..base.arrays import AnyArray, Floats
-from ..columns.table import COLOURS, NO_SURFACE, OBJECT, Column
-from ..scene.colours import packed, unpacked
+from lidarsim.base.arrays import AnyArray, Floats
+from lidarsim.columns.table import COLOURS, NO_SURFACE, OBJECT, Column
+from lidarsim.scene.colours import packed, unpacked
+
 from .theme import mapped, object_colours
 
 TURBO = mapped("turbo", np.linspace(0.07, 0.95, 256))  # (256, 3); its very ends are nearly black

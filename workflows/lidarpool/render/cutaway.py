@@ -6,7 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..base.arrays import Bools, Floats, Ints
+from lidarsim.base.arrays import Bools, Floats, Ints
+
 from .surface import Surface, dot, spiral
 
 MOST_SENSORS = 8  # sensors that are tested for what they see

@@ -8,10 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 from PIL import Image, ImageDraw
 
+from lidarsim.base.arrays import AnyFloats, Bytes, Floats
+from lidarsim.scene.actors import Actor
 from raybeam import RayCaster
 
-from ..base.arrays import AnyFloats, Bytes, Floats
-from ..scene.actors import Actor
 from .camera import Camera
 from .pictures import splat
 from .surface import dot, unit

@@ -7,9 +7,10 @@ import math
 
 import numpy as np
 
-from ..base.arrays import AnyArray, Bools, Floats, Floats32, Indices, Ints, Ints32
-from ..scene.scene import Scene
-from ..scene.scene_mesh import triangle_areas
+from lidarsim.base.arrays import AnyArray, Bools, Floats, Floats32, Indices, Ints, Ints32
+from lidarsim.scene.scene import Scene
+from lidarsim.scene.scene_mesh import triangle_areas
+
 from .colouring import TURBO
 from .theme import UNSEEN, rgb
 

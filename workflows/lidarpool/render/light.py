@@ -7,7 +7,8 @@ from itertools import product
 
 import numpy as np
 
-from ..base.arrays import Bools, Floats, Floats32
+from lidarsim.base.arrays import Bools, Floats, Floats32
+
 from .camera import Camera
 from .cutaway import Cutaway, blocked
 from .surface import Surface, dot, spiral

@@ -22,10 +22,11 @@ from matplotlib.lines import Line2D
 from matplotlib.patheffects import withStroke
 from matplotlib.ticker import LogLocator, NullFormatter
 
-from ..base.arrays import AnyFloats, Floats
-from ..base.errors import explained
-from ..base.storage import Storage
-from ..base.words import shortened
+from lidarsim.base.arrays import AnyFloats, Floats
+from lidarsim.base.errors import explained
+from lidarsim.base.storage import Storage
+from lidarsim.base.words import shortened
+
 from . import theme
 from .shot import SurfaceView
 
@@ -277,7 +278,7 @@ class Page:
 
         Raises
         ------
-        LidarpoolError
+        LidarError
             If the folder does not exist or is not writable.
         """
         advice = "choose a folder that exists, can be written to and has room"

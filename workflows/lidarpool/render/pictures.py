@@ -8,11 +8,12 @@ from textwrap import fill
 import numpy as np
 from matplotlib.colors import LogNorm, Normalize
 
-from ..base.arrays import AnyArray, AnyFloats, Floats, Floats32, Ints, UInts32
-from ..base.words import plural, without_common_prefix
-from ..columns.cloud import Cloud
-from ..columns.table import Column, Z
-from ..scene.scene import Scene
+from lidarsim.base.arrays import AnyArray, AnyFloats, Floats, Floats32, Ints, UInts32
+from lidarsim.base.words import plural, without_common_prefix
+from lidarsim.columns.cloud import Cloud
+from lidarsim.columns.table import Column, Z
+from lidarsim.scene.scene import Scene
+
 from . import theme
 from .colouring import TURBO, colours_of, values_of
 from .hit_density import HITS_TITLE, hit_colours

@@ -10,11 +10,11 @@ import numpy as np
 from numpy.typing import ArrayLike
 from PIL import Image, ImageDraw
 
+from lidarsim.base.arrays import Bools, Floats, Floats32, Ints
+from lidarsim.base.words import plural
+from lidarsim.scene.scene import Scene
 from raybeam import RayCaster
 
-from ..base.arrays import Bools, Floats, Floats32, Ints
-from ..base.words import plural
-from ..scene.scene import Scene
 from . import theme
 from .camera import Camera, fit_camera
 from .closeup import ShownPart, around_ways, floor_and_cut

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..base.arrays import Floats
+from lidarsim.base.arrays import Floats
 
 # Numbers of more digits than this are not read: far coordinates are labelled from an offset.
 MOST_DIGITS = 5

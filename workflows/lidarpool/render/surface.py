@@ -6,10 +6,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from lidarsim.base.arrays import AnyFloats, Floats, Integers, Ints
+from lidarsim.scene.scene import Scene
 from raybeam import RayCaster
-
-from ..base.arrays import AnyFloats, Floats, Integers, Ints
-from ..scene.scene import Scene
 
 # Faces that meet at a flatter angle than this are shaded as one smooth surface.
 CREASE_COSINE = np.cos(np.radians(35))

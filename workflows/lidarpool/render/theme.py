@@ -9,7 +9,7 @@ import numpy as np
 from matplotlib.colors import to_rgb
 from numpy.typing import ArrayLike
 
-from ..base.arrays import Floats
+from lidarsim.base.arrays import Floats
 
 PAGE, GROUND, LINE = "#ffffff", "#f1f3f5", "#c3cad3"
 INK, MUTED = "#1c2430", "#5d6876"

@@ -11,12 +11,13 @@ from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from ..base.errors import LidarpoolError, explained
+from lidarsim.base.errors import LidarError, explained
+from lidarsim.base.storage import Storage
+from lidarsim.base.words import plural
+
 from ..base.sealed import sealed, unsealed
 from ..base.shard import ALL, Shard, shard_in_words
 from ..base.software import difference, software
-from ..base.storage import Storage
-from ..base.words import plural
 from ..datasets.dataset import INDEX_FILE, OF_JOBS, DataSet, manifest_file
 from ..datasets.job_table import TABLE_FILE, JobRow, read_table, write_table
 from ..datasets.loader import read_index, sweeps
@@ -84,7 +85,7 @@ class DataSetOutput(Output[CampaignRun]):
         anew = options.fresh or options.overwrite
         if not conductor.resume and (anew or not unfinished):
             if INDEX_FILE in there and not options.overwrite:
-                raise LidarpoolError(
+                raise LidarError(
                     f"{out} holds a finished data set, and one needs a folder of its own: give "
                     "another with --out, or replace it with --overwrite (in Python overwrite=True)."
                 )
@@ -98,7 +99,7 @@ class DataSetOutput(Output[CampaignRun]):
             self._lost_record = f"{CAMPAIGN_FILE} was damaged, and is made again"
             return None
         if (shards := self._made["shards"]) != [str(self.campaign.shard)]:
-            raise LidarpoolError(
+            raise LidarError(
                 f"{out} holds {listed([*map(shard_in_words, shards)]) or 'no shard'}, and this is "
                 f"{shard_in_words(str(self.campaign.shard))}: give another folder with --out."
             )
@@ -189,7 +190,7 @@ class DataSetOutput(Output[CampaignRun]):
         return run
 
 
-class DamagedRecordError(LidarpoolError):
+class DamagedRecordError(LidarError):
     """CAMPAIGN_FILE cannot be read any more."""
 
 
@@ -202,7 +203,7 @@ def write_record(place: Storage, record: Mapping[str, Any]) -> None:
 def read_record(place: Storage) -> dict[str, Any]:
     """Read CAMPAIGN_FILE.
 
-    DamagedRecordError if the file is damaged or edited; LidarpoolError if there is none.
+    DamagedRecordError if the file is damaged or edited; LidarError if there is none.
     """
     try:
         record = unsealed(place.read(CAMPAIGN_FILE))
@@ -212,10 +213,10 @@ def read_record(place: Storage) -> dict[str, Any]:
         for shard in record["shards"]:
             Shard.parse(str(shard))
     except OSError as error:
-        raise LidarpoolError(
+        raise LidarError(
             f"{place} holds no finished data set, which has a {CAMPAIGN_FILE}: {error}."
         ) from error
-    except (ValueError, LidarpoolError) as error:
+    except (ValueError, LidarError) as error:
         raise DamagedRecordError(
             f"{place.path(CAMPAIGN_FILE)} is damaged or edited ({error}): run the campaign again "
             "with --resume, which writes it anew."
@@ -229,7 +230,7 @@ def with_seconds(place: Storage, rows: list[JobRow]) -> bool:
     `rows` are in the order of their numbers. Returns whether the table has the checksum that
     `dataset.json` has of it, and these rows.
     """
-    with suppress(LidarpoolError):
+    with suppress(LidarError):
         seconds = {row.number: row for row in read_table(place, read_index(place)["table"])}
         same = seconds.keys() == {row.number for row in rows}
         for index, row in enumerate(rows):
@@ -275,7 +276,7 @@ def _look(
 ) -> tuple[int, dict[int, str]]:
     """Count the jobs that are whole, and tell what is wrong with others, {number: a clause}.
 
-    LidarpoolError if a file of the campaign is another than the one that whole jobs are made of.
+    LidarError if a file of the campaign is another than the one that whole jobs are made of.
     """
     whole, wrong = 0, dict[int, str]()
     made: dict[tuple[str, str], list[str]] = {}  # {name and hash of a file: jobs made of it}
@@ -285,7 +286,7 @@ def _look(
                 share = (
                     "" if campaign.shard == ALL else f", of which this is shard {campaign.shard}"
                 )
-                raise LidarpoolError(
+                raise LidarError(
                     f"{dataset.place} has job {row.name}, and count is {campaign.count:,}{share}: "
                     "a campaign can only grow. Give another folder with --out."
                 )
@@ -298,7 +299,7 @@ def _look(
     now = hashes(campaign.files) if campaign is not None and made else []
     for (name, digest), jobs in made.items():
         if (name, digest) not in now and name in dict(now):
-            raise LidarpoolError(
+            raise LidarError(
                 f"Jobs of {dataset.place} were made of another {name} than there is now: "
                 f"{listed(jobs)}. Bring that back, or give another folder with --out."
             )
@@ -307,7 +308,7 @@ def _look(
 
 def _is_indexed(place: Storage, jobs: int) -> bool:
     """Whether the last file of a data set is there, whole, and has all of its jobs."""
-    with suppress(LidarpoolError):
+    with suppress(LidarError):
         return len(read_index(place)["jobs"]) == jobs
     return False
 
@@ -315,7 +316,7 @@ def _is_indexed(place: Storage, jobs: int) -> bool:
 def verify(place: Storage, number: int | None = None) -> str:
     """Compare each file of a finished data set, or of one of its jobs, with what is kept of it.
 
-    Returns a line; LidarpoolError names what is damaged, or says that there is no such data set.
+    Returns a line; LidarError names what is damaged, or says that there is no such data set.
     """
     index = read_index(place)
     dataset = DataSet(place, index["format"], index["layout"], index["compensated"])
@@ -327,7 +328,7 @@ def verify(place: Storage, number: int | None = None) -> str:
         read_record(place)
     wrong |= _look(dataset, rows, True)[1]
     if wrong:
-        raise LidarpoolError(
+        raise LidarError(
             f"{place} is damaged: {listed([*wrong.values()])}. With the campaign, --verify makes "
             "these jobs again."
         )
@@ -337,19 +338,19 @@ def verify(place: Storage, number: int | None = None) -> str:
 def check_same(place: Storage, campaign: CampaignSpec) -> Mapping[str, Any]:
     """Check that a data set is of this campaign, and of the software here; returns its record.
 
-    LidarpoolError names what differs, there and here.
+    LidarError names what differs, there and here.
     """
     made = read_record(place)
     here = software(made["backend"])
     there = made["casting"] or {"lidarpool": made["identity"]["lidarpool"]}
     if differs := difference(there, {name: here.get(name, "none") for name in there}):
-        raise LidarpoolError(
+        raise LidarError(
             f"{place} was made with {differs}: the bits of its jobs are the same only with that. "
             "Install it, or make the job in a folder of its own with --out."
         )
     for name, value in campaign.identity.items():
         if made["identity"].get(name) != value:
-            raise LidarpoolError(
+            raise LidarError(
                 f"{place} is of another campaign: its {name} differs. Make the job in a folder of "
                 "its own with --out."
             )
@@ -359,13 +360,13 @@ def check_same(place: Storage, campaign: CampaignSpec) -> Mapping[str, Any]:
 def dataset_files(out: Storage, *, begun: bool) -> list[str]:
     """Name the files of a data set, which has begun or is empty.
 
-    LidarpoolError if there is a link, or a file that neither jobs nor `write_shared` write.
+    LidarError if there is a link, or a file that neither jobs nor `write_shared` write.
     """
     files = [name for name in out.tree() if not _BESIDE.fullmatch(name)]
     own = _FINISHED if CAMPAIGN_FILE in files else OF_JOBS
     for name in sorted(files):
         if not begun or not own.fullmatch(name):
-            raise LidarpoolError(
+            raise LidarError(
                 f"{out} holds {name}: a data set needs a folder of its own, move that elsewhere, "
                 "or give another with --out."
             )
@@ -373,7 +374,7 @@ def dataset_files(out: Storage, *, begun: bool) -> list[str]:
 
 
 def _remove_dataset(out: Storage, kept: Storage) -> None:
-    """Remove a data set and its run; LidarpoolError, and nothing is removed, if there is more."""
+    """Remove a data set and its run; LidarError, and nothing is removed, if there is more."""
     begun = CAMPAIGN_FILE in out.sizes() or FILE in kept.sizes()
     own = dataset_files(out, begun=begun)
     with explained(f"{out} cannot be removed"):

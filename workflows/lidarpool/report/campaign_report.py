@@ -9,8 +9,9 @@ from collections.abc import Iterable, Iterator, Mapping
 from contextlib import ExitStack
 from typing import Any
 
-from ..base.errors import LidarpoolError, explained
-from ..base.storage import Storage
+from lidarsim.base.errors import LidarError, explained
+from lidarsim.base.storage import Storage
+
 from ..datasets.figures import Figures
 from ..datasets.job_table import JobRow
 from ..export.folder import LAST_FILE
@@ -60,7 +61,7 @@ def write_card(
 
     Raises
     ------
-    LidarpoolError
+    LidarError
         If a file cannot be written, or a split cannot be the name of a file.
     """
     with explained(f"The data set's card cannot be written to {place}", "make room"):
@@ -103,7 +104,7 @@ def _with_splits(place: Storage, jobs: Iterable[JobRow]) -> Iterator[JobRow]:
             if row.split and row.done:
                 if row.split not in files:
                     if not re.fullmatch(r"\w[\w.-]*", row.split):
-                        raise LidarpoolError(
+                        raise LidarError(
                             f"A split cannot be called {row.split!r}: use letters and digits."
                         )
                     name = f"{SPLITS}/{row.split}.txt"

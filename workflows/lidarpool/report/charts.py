@@ -10,10 +10,11 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.ticker import MaxNLocator
 
-from ..base.arrays import Bools, Floats
-from ..base.sampling import even_indices
-from ..base.words import plural, shortened
-from ..columns.table import TABLE, Z, by_value
+from lidarsim.base.arrays import Bools, Floats
+from lidarsim.base.sampling import even_indices
+from lidarsim.base.words import plural, shortened
+from lidarsim.columns.table import TABLE, Z, by_value
+
 from ..datasets.figures import Figures, Varied
 from ..datasets.sweep_data import Sweep
 from ..render import theme

@@ -14,13 +14,14 @@ from operator import attrgetter
 from pathlib import Path
 from typing import Any
 
-from ..base.errors import LidarpoolError, Mistakes, explained
+from lidarsim.base.errors import LidarError, Mistakes, explained
+from lidarsim.base.storage import Storage
+from lidarsim.base.validation import checked
+from lidarsim.base.words import plural
+
 from ..base.fingerprint import fingerprint
 from ..base.shard import ALL, Shard
 from ..base.software import software
-from ..base.storage import Storage
-from ..base.validation import checked
-from ..base.words import plural
 from ..columns.parts import part_name
 from ..datasets.dataset import INDEX_FILE, DataSet, ahead, manifest_file
 from ..datasets.job_table import TABLE_FILE, JobRow, read_table
@@ -41,13 +42,7 @@ from ..run.store import RUN_FOLDER, parts_of, remove_run, with_sensors
 from ..scenario.build import build
 from ..scenario.empty_cloud import NO_POINTS, empty_jobs_warning
 from ..scenario.scenario import Scenario
-from .campaign_output import (
-    CAMPAIGN_FILE,
-    dataset_files,
-    read_record,
-    write_record,
-    write_shared,
-)
+from .campaign_output import CAMPAIGN_FILE, dataset_files, read_record, write_record, write_shared
 from .output import SurveyOutput
 
 NAMED = 20  # shards or files in a message
@@ -125,7 +120,7 @@ def merge(
 
     Raises
     ------
-    LidarpoolError
+    LidarError
         If shards are missing, damaged, given twice, unfinished, of another run or other software:
         it names them.
     """
@@ -137,7 +132,7 @@ def merge(
         with mistakes.noted():
             parts.append(_read(one))
     mistakes.lines += [] if places else ["there is nothing to merge: give the folders of shards."]
-    with suppress(LidarpoolError):  # the result would have the place of the shard's points
+    with suppress(LidarError):  # the result would have the place of the shard's points
         if "made_of" in _read(Storage.at(place)).record:
             told = f"{place} holds a shard of a survey: give another folder with --out."
             parts, mistakes.lines = [], [told]
@@ -169,14 +164,14 @@ def _check_apart(out: Storage, places: Mapping[str, Storage]) -> None:
         elif f"{real}/".startswith(f"{path.rstrip('/')}/"):
             relation = f"holds the shard {place}"
         if relation:
-            raise LidarpoolError(
+            raise LidarError(
                 f"--out {out} {relation}, which stays as it is: give another folder with --out, or "
                 "name the shards without that one."
             )
 
 
 def _read(place: Storage) -> _Part:
-    """Read a finished shard, or data set of several; LidarpoolError if it is none, or damaged."""
+    """Read a finished shard, or data set of several; LidarError if it is none, or damaged."""
     with explained(f"{place} cannot be read"):
         files, run = place.sizes(), place.below(RUN_FOLDER)
         if {CAMPAIGN_FILE, INDEX_FILE, LAST_FILE} <= files.keys():
@@ -184,7 +179,7 @@ def _read(place: Storage) -> _Part:
         if FILE in run.sizes():
             with suppress(LookupError):
                 return _of_survey(place, run)
-    raise LidarpoolError(
+    raise LidarError(
         f"{place} holds no finished shard: give a folder of lidarpool run --shard; --resume "
         "finishes an unfinished one."
     )
@@ -202,7 +197,7 @@ def _of_dataset(place: Storage, of: int = 1) -> _Part:
 def _of_survey(place: Storage, run: Storage) -> _Part:
     """Read a shard of a survey; LookupError if it is none or not finished.
 
-    LidarpoolError if its database is damaged.
+    LidarError if its database is damaged.
     """
     with tempfile.TemporaryDirectory(prefix="lidarpool-") as folder:
         path = Path(folder, FILE)
@@ -220,7 +215,7 @@ def _of_survey(place: Storage, run: Storage) -> _Part:
                     raise LookupError("scans are missing")
                 return _Part(place, record, [shard], scan_count, kept.ordered, kept.trials)
         except DamagedError as error:
-            raise LidarpoolError(
+            raise LidarError(
                 f"{run.path(FILE)} is damaged: run its shard again with --resume, which makes it "
                 "anew from the points, and merge again."
             ) from error
@@ -229,7 +224,7 @@ def _of_survey(place: Storage, run: Storage) -> _Part:
 def _check(parts: Sequence[_Part], partial: bool, own: _Part | None = None) -> list[str]:
     """Check that all are of one run, and none is missing but with `partial`; returns all notes.
 
-    Others may have what is in `own`, too. LidarpoolError names the parts that are wrong.
+    Others may have what is in `own`, too. LidarError names the parts that are wrong.
     """
     mistakes, wanted = Mistakes(), software()
     first, seen = "the software here", dict[int, _Part]()
@@ -255,7 +250,7 @@ def _check(parts: Sequence[_Part], partial: bool, own: _Part | None = None) -> l
     if not partial:
         grown = any(shard in part.shards for part in parts for shard in missing)
         give = f"give them, too{', run again with the larger count and --resume' * grown}"
-        raise LidarpoolError(f"{told}: {give}, or merge what there is with --partial.")
+        raise LidarError(f"{told}: {give}, or merge what there is with --partial.")
     return [*notes, told]
 
 
@@ -298,7 +293,7 @@ def _merge_dataset(
         if not damaged:
             damaged += _lacking(known, _merged(files))
         if damaged:
-            raise LidarpoolError(f"missing or damaged: {listed(damaged, NAMED)}; {_AGAIN}.")
+            raise LidarError(f"missing or damaged: {listed(damaged, NAMED)}; {_AGAIN}.")
         lacking, there = _missing(known), {shard for part in known for shard in part.shards}
         record["shards"] = [*map(str, sorted(there.difference(lacking)) if lacking else [ALL])]
         if empty := [row for row in _merged(files) if row.done and not row.points]:
@@ -325,20 +320,20 @@ class _RowFile:
     ) -> None:
         """Write rows with their seconds of casting.
 
-        LidarpoolError if the part cannot have such a job, or two manifests are of one job.
+        LidarError if the part cannot have such a job, or two manifests are of one job.
         """
         ranges = [part.done(shard) for shard in part.shards]
         with self._path.open("wb") as file:
             for row in rows:
                 path, number = part.place.path(manifest_file(row.name)), row.number
                 if not any(number in numbers for numbers in ranges):
-                    raise LidarpoolError(
+                    raise LidarError(
                         f"{path} is of job {number}, which is not in shard "
                         f"{listed([*map(str, part.shards)])} of {part.whole:,} jobs: move it "
                         "elsewhere, and merge again."
                     )
                 if number in self._offsets:
-                    raise LidarpoolError(
+                    raise LidarError(
                         f"{path} is of job {number}, of which there is another manifest: move one "
                         "of them elsewhere, and merge again."
                     )
@@ -383,7 +378,7 @@ def _seconds(part: _Part, notes: list[str]) -> dict[int, tuple[str, float]]:
         finished = INDEX_FILE in part.place.sizes()  # else an earlier merge was killed
         table = read_table(part.place, read_index(part.place)["table"] if finished else None)
         return {row.number: (row.sha256, row.seconds) for row in table}
-    except LidarpoolError:
+    except LidarError:
         notes.append(
             f"{part.place.path(TABLE_FILE)} is damaged or edited: the rows of its jobs are those "
             "of their manifests, without seconds"
@@ -423,14 +418,14 @@ def _merge_survey(
     told = record["made_of"]
     path = Path(scenario or told["path"])
     if not path.exists():
-        raise LidarpoolError(f"{path}, of which these shards are, does not exist: give --scenario.")
+        raise LidarError(f"{path}, of which these shards are, does not exist: give --scenario.")
     with screen.status("reading the scene"):
         built = build(Scenario.load(path, told["options"]), plans=told["plans"])
         job = built.job()
         jobs = OneJob(job)
         identity = jobs.identity
     if differs := [name for name in identity if identity[name] != record["identity"][name]]:
-        raise LidarpoolError(f"{path} has another {differs[0]} than these shards: give --scenario.")
+        raise LidarError(f"{path} has another {differs[0]} than these shards: give --scenario.")
     own: dict[str, Any] = {"scenario": built.scenario, "parts": parts, "notes": notes}
     output = _Merged(out, job.survey, job.outputs, told["extent"], **own)
     options = RunOptions(out=out, folder=Storage.at(out).below(RUN_FOLDER), resume=True)
@@ -446,7 +441,7 @@ class _Merged(SurveyOutput):
     casts = False
 
     def look(self, conductor: Conductor[tuple[RunResult, dict[str, Any]]]) -> None:
-        """Take all points into the run's store; LidarpoolError names damaged files."""
+        """Take all points into the run's store; LidarError names damaged files."""
         store, damaged = conductor.store, list[str]()
         only, mark = store.only, store.db.meta["mark"]
         assert only is not None, "of a survey"
@@ -473,7 +468,7 @@ class _Merged(SurveyOutput):
                 if receipt is None or not store.db.commit([receipt]):
                     damaged.append(source.path(one.name))
         if damaged:
-            raise LidarpoolError(f"missing or damaged: {listed(damaged, NAMED)}; {_AGAIN}.")
+            raise LidarError(f"missing or damaged: {listed(damaged, NAMED)}; {_AGAIN}.")
         if not only.parts.trials:  # the first shard, which plans, is missing
             only.job = replace(only.job, planning=None)
         only.parts.frames, only.resumed = only.parts.scans.stop, 0

@@ -10,25 +10,26 @@ from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
-from ..base.errors import LidarpoolError, explained
-from ..base.interrupts import deferred_interrupts
+from lidarsim.base.errors import LidarError, explained
+from lidarsim.base.interrupts import deferred_interrupts
+from lidarsim.base.storage import Storage, flush
+from lidarsim.base.vocabulary import PICTURES
+from lidarsim.sensor import Survey
+from lidarsim.sweeps.instruments import INSTRUMENT_FILES, Instruments
+from lidarsim.sweeps.sweeps import SWEEPS_FILE, Sweeps
+
 from ..base.open3d_module import load_open3d
-from ..base.storage import Storage, flush
-from ..base.vocabulary import PICTURES
 from ..columns.parts import StoredCloud
 from ..export.folder import LAST_FILE, result_folder, staging
 from ..export.format_table import EXPORTS, FORMATS
 from ..export.formats import Format, refuse_strangers
-from ..export.instruments import INSTRUMENT_FILES, Instruments
 from ..export.navigation_files import write_instruments
-from ..export.sweeps import SWEEPS_FILE, Sweeps
 from ..run.conductor import Conductor, Output
 from ..run.picture_file import PICTURE_FILE, PictureContent
 from ..run.progress import Written
 from ..run.run_result import RunResult
 from ..run.writer import LidarWorkers
 from ..scenario.scenario import Scenario
-from ..sensor import Survey
 from .report import CountedCloud, make_report
 
 ROOM_BYTES = 32 << 20  # room for pictures and report
@@ -77,7 +78,7 @@ class SurveyOutput(Output[tuple[RunResult, dict[str, Any]]]):
         """Refuse a place that holds the result of another survey, or files of no result.
 
         `identity` returns that of this result, see `RunResult.identity`: large scenes take a
-        moment. LidarpoolError if there is a result of another scene or survey, or one that cannot
+        moment. LidarError if there is a result of another scene or survey, or one that cannot
         be read, or a file that this result would replace and that no report there lists, each
         unless `overwrite`; or a folder that would be replaced and holds files of others.
         """
@@ -93,12 +94,12 @@ class SurveyOutput(Output[tuple[RunResult, dict[str, Any]]]):
         if REPORT in there and not overwrite:
             here = identity()
             if earlier != {name: here[name] for name in _SURVEY}:
-                raise LidarpoolError(f"{place} holds the result of another survey: {advice}")
+                raise LidarError(f"{place} holds the result of another survey: {advice}")
         further = _further_files(self.survey, self.formats)
         foreign = [name for name in (*FILES, *further) if name in there and name not in listed]
         if foreign and not overwrite:
             lists = f"{place} holds {foreign[0]}, which no result there lists"
-            raise LidarpoolError(f"{lists}: {advice}")
+            raise LidarError(f"{lists}: {advice}")
         refuse_strangers(storage, {*further, *listed})
 
     def finish(
@@ -142,7 +143,7 @@ class SurveyOutput(Output[tuple[RunResult, dict[str, Any]]]):
         Where `place` is a storage, all is put into it, report.json last. Files of workers go there
         directly, and an earlier result is removed before.
 
-        LidarpoolError if a file cannot be written.
+        LidarError if a file cannot be written.
         """
         place, folder, formats = self.place, self._folder, self.formats
         storage = place if isinstance(place, Storage) else None

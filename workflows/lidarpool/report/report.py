@@ -13,21 +13,22 @@ from typing import Any
 
 import numpy as np
 
-from .._version import __version__
-from ..base.arrays import Floats
-from ..base.declared import declared
-from ..base.storage import Storage
-from ..columns.cloud import CHUNK_POINTS, Cloud, CloudLike
-from ..columns.table import NO_SURFACE, Column
+from lidarsim._version import __version__
+from lidarsim.base.arrays import Floats
+from lidarsim.base.declared import declared
+from lidarsim.base.storage import Storage
+from lidarsim.columns.cloud import CHUNK_POINTS, Cloud, CloudLike
+from lidarsim.columns.table import NO_SURFACE, Column
+from lidarsim.scene.scene import Scene
+from lidarsim.sensor import Sensor, Survey
+from lidarsim.sensor.survey import CloudOptions
+from lidarsim.sensor.weather import Weather
+
 from ..pipeline.names import COLLECT, EXPORT, GENERATE, INTERSECT, SORT
 from ..pipeline.task_book import StageTotals, union
 from ..plan.planning import Search
 from ..run.run_result import RunResult
 from ..run.trials import TRIAL
-from ..scene.scene import Scene
-from ..sensor import Sensor, Survey
-from ..sensor.survey import CloudOptions
-from ..sensor.weather import Weather
 
 _CELLS = 64  # along an axis of the grid in which points are counted, a power of two
 _ENOUGH = 12  # points in a cell from which a density is estimated

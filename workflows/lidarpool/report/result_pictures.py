@@ -15,14 +15,16 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Circle
 from matplotlib.patheffects import withStroke
 
-from ..base.arrays import Bools, Floats, Ints
-from ..base.errors import LidarpoolError, explained
-from ..base.sampling import even_indices
-from ..base.vocabulary import PICTURES
-from ..base.words import did_you_mean, plural
-from ..columns.cloud import Cloud
+from lidarsim.base.arrays import Bools, Floats, Ints
+from lidarsim.base.errors import LidarError, explained
+from lidarsim.base.sampling import even_indices
+from lidarsim.base.vocabulary import PICTURES
+from lidarsim.base.words import did_you_mean, plural
+from lidarsim.columns.cloud import Cloud
+from lidarsim.columns.table import TABLE, Z
+from lidarsim.scene.scene import Scene
+
 from ..columns.cloud_file import CloudFile
-from ..columns.table import TABLE, Z
 from ..plan import Plan, Planning
 from ..plan.stations import Sight, StationPlan
 from ..render import theme
@@ -33,7 +35,6 @@ from ..render.shot import SIZE, Samples, SurfaceView, take_shot
 from ..render.stage import make_axis, nice_step
 from ..run.picture_file import PictureContent, ways_of
 from ..run.progress import Written
-from ..scene.scene import Scene
 from .page.rendering import put_picture
 
 SIDE_LEAST, SIDE_MOST = 480, 4096  # letters need some pixels; a pixel takes 0.4 kB of memory
@@ -64,7 +65,7 @@ def draw_pictures(
     cloud, page = result / "cloud.ply", Path(folder) / "report.html"
     least, most = min(size), max(size)
     if least < SIDE_LEAST or most > SIDE_MOST or most > SIDES_RATIO * least:
-        raise LidarpoolError(
+        raise LidarError(
             f"A picture cannot be {size[0]} x {size[1]} pixels: give width and height of "
             f"{SIDE_LEAST} to {SIDE_MOST} each, one at most twice the other, such as 1600 x 1000."
         )
@@ -72,14 +73,14 @@ def draw_pictures(
     for name in only:
         if name not in PICTURES:
             there = did_you_mean(name, PICTURES) or f" There are {', '.join(PICTURES)}."
-            raise LidarpoolError(f"There is no picture {name!r}.{there}")
+            raise LidarError(f"There is no picture {name!r}.{there}")
         if name not in makers:
             why = f"the cloud has no column {' or '.join(_LIGHT)}"
             if name == "path":
                 why = "its run planned no path"
             elif shown.coordinates == "sensor":
                 why = "points are in the axes of their sensors"
-            raise LidarpoolError(f"There is no picture {name!r}: {why}.")
+            raise LidarError(f"There is no picture {name!r}: {why}.")
     with explained(f"The folder {folder} cannot be made", "give another"):
         Path(folder).mkdir(parents=True, exist_ok=True)
     names = only or [*makers]
@@ -130,7 +131,7 @@ def _picture_makers(
         known = with_rgb({name: c for c in (Z, *file.table) for name in (c.name, c.in_files)})
         if colour not in known:
             there = list(dict.fromkeys(c.name for c in known.values()))
-            raise LidarpoolError(
+            raise LidarError(
                 f"{cloud} has no column {colour!r}."
                 + (did_you_mean(colour, known) or f" There are {', '.join(there)}.")
             )

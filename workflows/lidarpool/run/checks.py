@@ -11,26 +11,26 @@ from typing import Any
 
 from distributed import Client
 
+from lidarsim._version import __version__
+from lidarsim.base.errors import LidarError
+from lidarsim.simulator.memory import MB, cast_bytes
+from lidarsim.simulator.scene_caster import AUTO_TAKES
 from poolpart import Pool, PoolError, WorkerInfo
 from poolpart.task_locations import look_for_tasks
 from poolpart.workers import ask_workers, worker_identities
 from raybeam import available_backends
 
-from .._version import __version__
-from ..base.errors import LidarpoolError
 from ..base.software import difference, software, software_there
 from ..pipeline.failures import JobError
 from ..pipeline.names import COLLECT, GENERATE, GPU, LIDAR, OTHER, SORT
 from ..scenario.build import Job
 from ..scenario.sections import TaskOptions
-from ..simulator.memory import MB, cast_bytes
-from ..simulator.scene_caster import AUTO_TAKES
 from .watch import Waiting, queued
 
 LOOK_EVERY_S = 0.2
 
 
-class TooFewWorkersError(LidarpoolError):
+class TooFewWorkersError(LidarError):
     """A partition lacks workers or slots; more may join."""
 
 
@@ -56,7 +56,7 @@ def find_workers(
     are in the queue, are waited for as long as `waiting` says. `writing` says that jobs are
     written, too.
 
-    LidarpoolError if workers, slots `needed` or the backend are missing, or versions differ.
+    LidarError if workers, slots `needed` or the backend are missing, or versions differ.
     """
     while True:
         looked = time.monotonic()
@@ -127,7 +127,7 @@ def _survey_pool(client: Client, needed: Mapping[str, int], writing: bool) -> Po
         pool = Pool.from_client(client, declaring=set(needed))
         pool.require(dict.fromkeys(needed, 0))  # that none declares two
     except PoolError as error:  # errors that more workers do not correct
-        raise LidarpoolError(str(error)) from error
+        raise LidarError(str(error)) from error
     purpose = {
         GPU: "stage 2 casts the rays",
         LIDAR: f"{GENERATE}, {SORT} and {needed.get(LIDAR, 0) - 2 - writing} x {COLLECT}"
@@ -146,19 +146,19 @@ def _check_versions(client: Client, workers: Sequence[str]) -> None:
     here = platform.python_version()
     for address, python in ask_workers(client, platform.python_version, workers).items():
         if str(python).split(".")[:2] != here.split(".")[:2]:  # code is sent to it by value
-            raise LidarpoolError(
+            raise LidarError(
                 f"The worker at {address} has Python {python}, here it is {here}: install the same "
                 "one on both sides."
             )
     ours = software()["lidarpool"]
     for address, answer in _answers(client, software_there(), workers).items():
         if not answer:
-            raise LidarpoolError(
+            raise LidarError(
                 f"The worker at {address} does not have lidarpool: install lidarpool "
                 f"{__version__} in the environment that dask worker is started from."
             )
         if answer["lidarpool"] != ours:
-            raise LidarpoolError(
+            raise LidarError(
                 f"The worker at {address} has lidarpool {answer['lidarpool']}, here it is "
                 f"{ours}: install the same on both sides, and start the worker again."
             )
@@ -169,13 +169,13 @@ def common_software(
 ) -> dict[str, str]:
     """Software of the workers that cast: `earlier` if there is one, else what most of them have.
 
-    Workers with another are refused one by one when they are prepared. LidarpoolError if none has
+    Workers with another are refused one by one when they are prepared. LidarError if none has
     the earlier one.
     """
     answers = _answers(client, software_there(backend), [worker.address for worker in workers])
     if earlier and dict(earlier) not in answers.values():
         address, there = next(iter(answers.items()))
-        raise LidarpoolError(
+        raise LidarError(
             "The scans of the run were cast with other software than the casting workers have: "
             f"the worker at {address} has {difference(there, earlier)}. Continue it there, or drop "
             "it with --fresh (in Python remove_run)."
@@ -215,7 +215,7 @@ def common_backend(
     """Name of the ray-casting backend to use on all these workers.
 
     "auto" is resolved here, once: if each worker chose for itself, a cloud would depend on which
-    worker casts which scan. LidarpoolError, which ends with `advice`, if a worker lacks it.
+    worker casts which scan. LidarError, which ends with `advice`, if a worker lacks it.
     """
     answers = _answers(client, available_backends, [worker.address for worker in workers])
     if wanted == "auto":
@@ -223,7 +223,7 @@ def common_backend(
         return next(n for n in names if not any(reasons[n] for reasons in answers.values()))
     for address, reasons in answers.items():
         if reason := reasons.get(wanted, "there is no backend of that name"):
-            raise LidarpoolError(
+            raise LidarError(
                 f"Backend {wanted!r} cannot be used on the casting worker at {address}: "
                 f"{reason}. {advice}"
             )

@@ -11,10 +11,10 @@ from distributed import Client, get_worker
 from distributed.client import FutureCancelledError
 from distributed.comm.core import CommClosedError
 
+from lidarsim.base.errors import LidarError
 from poolpart import Partition, PipeClosed, PipeFailed, PoolError
 from poolpart.task_context import own_client
 
-from ..base.errors import LidarpoolError
 from ..pipeline.names import GPU, LIDAR, OTHER
 from ..scenario.build import Job
 from .checks import check_workers, find_workers, gpu_note, slots_needed
@@ -55,7 +55,7 @@ class Cluster:
     """The cluster that is there, or started, once it was checked for jobs such as `first`.
 
     `store` says which are left, and what earlier runs cast with; `enter` has the cluster left or
-    stopped in the end. LidarpoolError if it lacks something.
+    stopped in the end. LidarError if it lacks something.
     """
 
     def __init__(
@@ -76,9 +76,7 @@ class Cluster:
         # For errors about a lost cluster; a client that was never connected is refused below.
         self.address: str = getattr(client.scheduler, "address", "")
         if client.asynchronous:
-            raise LidarpoolError(
-                "The client is asynchronous: give one made without asynchronous=True."
-            )
+            raise LidarError("The client is asynchronous: give one made without asynchronous=True.")
         self.partitions = {name: Partition(name, client) for name in (GPU, LIDAR, OTHER)}
         try:
             left = first.survey.scan_count * (len(store.jobs.numbers) - store.db.ended_count)
@@ -98,7 +96,7 @@ class Cluster:
             store.cast_with(self.backend, self.software)
             if store.only is not None:  # others are checked one by one
                 self.check(store.only.job)
-        except LidarpoolError:
+        except LidarError:
             self._want_nothing()
             raise
         except Exception as error:  # the kind depends on the request
@@ -120,8 +118,8 @@ class Cluster:
                 for partition in self.partitions.values():
                     partition.want(0)
 
-    def _lost_error(self) -> LidarpoolError:
-        return LidarpoolError(
+    def _lost_error(self) -> LidarError:
+        return LidarError(
             f"The cluster at {self.address} cannot be reached any more, or somebody cancelled "
             "the tasks of this run; it has ended without a result."
         )
@@ -180,7 +178,7 @@ class Cluster:
             if error is self._callers_error:
                 raise
             if isinstance(error, PoolError) and not lost:
-                raise LidarpoolError(str(error)) from error
+                raise LidarError(str(error)) from error
             if isinstance(error, _CLUSTER_LOST) or (lost and isinstance(error, Exception)):
                 raise self._lost_error() from error
             raise

@@ -12,14 +12,14 @@ from distributed import SpecCluster, SSHCluster
 from distributed.deploy import ssh
 from pydantic import BaseModel, ConfigDict, Field, PrivateAttr
 
+from lidarsim.base.errors import LidarError
+from lidarsim.base.interrupts import deferred_interrupts
+from lidarsim.base.validation import sentences
+from lidarsim.base.words import did_you_mean, plural
+from lidarsim.base.yamlfile import read_yaml
 from poolpart.deploy import start_partitions
 from poolpart.deploy.clusters import INFORMATION
 
-from ..base.errors import LidarpoolError
-from ..base.interrupts import deferred_interrupts
-from ..base.validation import sentences
-from ..base.words import did_you_mean, plural
-from ..base.yamlfile import read_yaml
 from ..pipeline.names import GPU, LIDAR, OTHER
 
 # A scheduler that SSH has started outlives a driver that was killed: it ends when it has been
@@ -75,7 +75,7 @@ class ClusterFile(BaseModel):
     def load(cls, path: Path) -> ClusterFile:
         """Read a file and import what it names; nothing is started.
 
-        LidarpoolError if it cannot be read, a field is wrong, a package is missing, or the class is
+        LidarError if it cannot be read, a field is wrong, a package is missing, or the class is
         not a cluster.
         """
         content = read_yaml(path, "a cluster file has cluster:, arguments: and partitions:")
@@ -84,12 +84,12 @@ class ClusterFile(BaseModel):
         file._source = str(path)
         for name, workers in file.partitions.items():
             if name not in (GPU, LIDAR, OTHER):
-                raise LidarpoolError(
+                raise LidarError(
                     f"{path}: partitions.{name} is not a partition of a survey: GPU, LIDAR or "
                     f"OTHER.{did_you_mean(name, (GPU, LIDAR, OTHER))}"
                 )
             if wrong := workers.wrong():
-                raise LidarpoolError(f"{path}: partitions.{name}.{wrong}")
+                raise LidarError(f"{path}: partitions.{name}.{wrong}")
         file._factory()
         return file
 
@@ -99,10 +99,10 @@ class ClusterFile(BaseModel):
         return {name: one.most * one.slots for name, one in self.partitions.items()}
 
     def require(self, needed: Mapping[str, int]) -> None:
-        """Check that the partitions have so many slots; LidarpoolError if not."""
+        """Check that the partitions have so many slots; LidarError if not."""
         for name, least in needed.items():
             if (there := self.slots.get(name, 0)) < least:
-                raise LidarpoolError(
+                raise LidarError(
                     f"{self._source}: partition {name} has {there} of the {least} slots needed: "
                     f"give it more slots or workers, such as {{slots: {least}}}."
                 )
@@ -117,7 +117,7 @@ class ClusterFile(BaseModel):
     def started(self, tell: Callable[[str], object]) -> Iterator[SpecCluster]:
         """Cluster with these workers, which are there or in a queue, as long as the body runs.
 
-        `tell` is called with what goes wrong with workers meanwhile. LidarpoolError if it does not
+        `tell` is called with what goes wrong with workers meanwhile. LidarError if it does not
         start, or does not take an argument.
         """
         arguments = dict(self.arguments)
@@ -145,7 +145,7 @@ class ClusterFile(BaseModel):
             told = str(error).partition(" Very likely")[0]  # jobqueue goes on with all arguments
             told = ": ".join([told, *[line for line in heard if INFORMATION not in line][-1:]])
             reason = " ".join(f"{type(error).__name__}: {told}".split())[:400]
-            raise LidarpoolError(
+            raise LidarError(
                 f"{self._source}: {self.cluster} was not started ({reason})."
             ) from error
         with cluster:
@@ -158,7 +158,7 @@ class ClusterFile(BaseModel):
             with deferred_interrupts():  # and their handlers kept: dask-jobqueue brings its own
                 found = getattr(import_module(package), name, None)
         except ModuleNotFoundError as error:
-            raise LidarpoolError(
+            raise LidarError(
                 f"{self._source}: {self.cluster} is not installed ({error}): pip install "
                 "'lidarpool[clusters]' has dask-jobqueue and what SSHCluster needs."
             ) from error
@@ -167,7 +167,7 @@ class ClusterFile(BaseModel):
         if found is not SSHCluster and not (
             isinstance(found, type) and issubclass(found, SpecCluster)
         ):
-            raise LidarpoolError(
+            raise LidarError(
                 f"{self._source}: {self.cluster} cannot be started by partition: "
                 "give dask_jobqueue.SLURMCluster, another of dask_jobqueue, or "
                 "distributed.SSHCluster. Start others yourself, and use --scheduler."

@@ -9,9 +9,11 @@ from contextlib import AbstractContextManager, ExitStack, nullcontext, suppress
 from dataclasses import dataclass
 from typing import Any, Generic, TypeVar
 
-from ..base.errors import LidarpoolError
+from lidarsim.base.errors import LidarError
+from lidarsim.base.storage import Storage
+from lidarsim.simulator.scene_caster import check_backend_here
+
 from ..base.shard import ALL
-from ..base.storage import Storage
 from ..datasets.dataset import DataSet
 from ..datasets.job_table import JobRow
 from ..pipeline.database import FILE
@@ -20,7 +22,6 @@ from ..plan import best
 from ..scenario.build import Job
 from ..scenario.campaign import CampaignSpec
 from ..scenario.empty_cloud import EMPTY, empty_cloud_reason, empty_jobs_warning
-from ..simulator.scene_caster import check_backend_here
 from .cluster import Cluster
 from .job_source import JobMaker, Jobs, MadeJob, OneJob
 from .options import RunOptions
@@ -76,7 +77,7 @@ class Kept(Output[RunResult]):
 class Conductor(Generic[R]):
     """Does what is left of a run, and has its output written.
 
-    Call it once. LidarpoolError if the place holds something else, the cluster lacks something, or
+    Call it once. LidarError if the place holds something else, the cluster lacks something, or
     a task fails; its notes, and those of an interrupt, say what was kept.
     """
 
@@ -115,7 +116,7 @@ class Conductor(Generic[R]):
         if not empty:
             return []
         reason = ""
-        with suppress(LidarpoolError):  # a file that the job is made of may be gone
+        with suppress(LidarError):  # a file that the job is made of may be gone
             job = self.jobs.job(empty[0].number) if isinstance(self.jobs, CampaignSpec) else None
             reason = empty_cloud_reason(job.scene, job.survey) if job else ""
         warning = empty_jobs_warning(empty, reason)
@@ -135,7 +136,7 @@ class Conductor(Generic[R]):
 
     def _hold_place(self) -> None:
         if (self.options.fresh or self.options.overwrite) and self.resume:
-            raise LidarpoolError(
+            raise LidarError(
                 "fresh and overwrite remove what resume, retry_failed and verify go on with."
             )
         self.stack.enter_context(self.output.held())

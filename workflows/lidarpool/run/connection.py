@@ -26,13 +26,13 @@ from distributed.comm import connect
 from distributed.utils import LoopRunner
 
 import poolpart.deploy
+from lidarsim.base.errors import LidarError
+from lidarsim.base.interrupts import children_spared, deferred_interrupts
 from poolpart.deploy import forked_workers
 from poolpart.probe import visible_gpus
 from poolpart.rules import check_count
 
-from ..base.errors import LidarpoolError
 from ..base.fork_server import start_fork_server
-from ..base.interrupts import children_spared, deferred_interrupts
 from ..pipeline.names import GPU, LIDAR, OTHER
 from .checks import LOOK_EVERY_S, TooFewWorkersError
 from .cluster_file import ClusterFile
@@ -101,7 +101,7 @@ def local_cluster(
 
 
 def check_starts_workers() -> None:
-    """Check that this process may start workers; LidarpoolError in a task of Dask or a daemon."""
+    """Check that this process may start workers; LidarError in a task of Dask or a daemon."""
     try:
         get_worker()
         place = "in a task of Dask"
@@ -109,7 +109,7 @@ def check_starts_workers() -> None:
         place = "in a daemonic process, such as a worker of a DataLoader,"
         if not current_process().daemon:
             return
-    raise LidarpoolError(
+    raise LidarError(
         f"A run without a client starts workers, which {place} cannot be done: give "
         "client=distributed.get_client() in a task, or call it in a process of its own."
     )
@@ -153,7 +153,7 @@ def local_client(
 def started_client(file: ClusterFile, tell: Callable[[str], object]) -> Iterator[Client]:
     """Client of a cluster that is started for it and lasts as long as the body.
 
-    `tell` is called when it has started, and with what goes wrong with workers. LidarpoolError if
+    `tell` is called when it has started, and with what goes wrong with workers. LidarError if
     it does not start.
     """
     with _client_of(file.started(tell)) as client:
@@ -191,7 +191,7 @@ def connected(
 
     `scheduler` is an address such as ``tcp://host:8786`` or ``tls://host:8786``; certificates for
     the latter are by default those of Dask's configuration. A scheduler that nobody has started yet
-    is waited for as `waiting` says, by default some seconds. LidarpoolError if none answers, or the
+    is waited for as `waiting` says, by default some seconds. LidarError if none answers, or the
     certificates are wrong.
     """
     if not scheduler.startswith("inproc"):
@@ -211,7 +211,7 @@ def connected(
         )
     except Exception as error:
         waited = f" within {waiting.seconds:g} s" if waiting.seconds and _absent(error) else ""
-        raise LidarpoolError(
+        raise LidarError(
             f"No Dask scheduler answers at {scheduler!r}{waited} ({_reason(error)}): start one "
             "with dask scheduler, and give its address as tcp://host:8786; of an encrypted one as "
             "tls://host:8786, with --tls-ca, --tls-cert and --tls-key."
@@ -226,7 +226,7 @@ def _check_address(address: str) -> None:
         given = urlsplit(f"//{address.rpartition('//')[2]}")
         if given.hostname and given.port:
             return
-    raise LidarpoolError(
+    raise LidarError(
         f"The address {address!r} has no host, or no port of 1 to 65535: give that of the "
         "scheduler, such as tcp://host:8786."
     )

@@ -12,11 +12,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ..base.arrays import Floats32, Ints
-from ..base.errors import LidarpoolError
-from ..columns.cloud import Cloud
+from lidarsim.base.arrays import Floats32, Ints
+from lidarsim.base.errors import LidarError
+from lidarsim.columns.cloud import Cloud
+from lidarsim.sweeps.sweeps import Sweeps
+
 from ..columns.parts import StoredCloud, read_part, read_tally, unpack
-from ..export.sweeps import Sweeps
 from ..pipeline.database import JobParts
 from ..pipeline.messages import Receipt, samples_of_scan, scans_in_words, summary_type
 from ..scenario.build import Job
@@ -93,12 +94,12 @@ class JobPoints:
         try:
             data = storage.read(name)
             return Receipt.of_part(unpack(data), self.job.number, name, len(data))
-        except LidarpoolError:
+        except LidarError:
             return None
         except OSError as error:
             if error.errno in (errno.EIO, errno.ENOENT):  # a bad disk; just removed
                 return None
-            raise LidarpoolError(
+            raise LidarError(
                 f"The part {storage.path(name)} cannot be read: {error.strerror or error}."
             ) from error
 

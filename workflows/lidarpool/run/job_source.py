@@ -11,11 +11,12 @@ from queue import Empty, Full, Queue
 from threading import Event, Thread
 from typing import NamedTuple
 
-from ..base.errors import LidarpoolError
+from lidarsim.base.errors import LidarError
+from lidarsim.sweeps.sweeps import Sweeps
+
 from ..base.fingerprint import fingerprint
 from ..base.shard import ALL, Shard
 from ..datasets.job_table import JobRow, Value
-from ..export.sweeps import Sweeps
 from ..pipeline.failures import JobError
 from ..scenario.build import Job
 from ..scenario.campaign import CampaignSpec
@@ -34,7 +35,7 @@ def identity_of(job: Job) -> dict[str, str]:
     """
     try:
         return {name: fingerprint(getattr(job, name)) for name in CONTENT}
-    except LidarpoolError as error:
+    except LidarError as error:
         raise JobError(str(error)) from error
 
 
@@ -133,7 +134,7 @@ class JobMaker:
             raise
         except Exception as error:
             # A class of the user's own may raise anything: the other jobs go on.
-            told = str(error) if isinstance(error, LidarpoolError) else repr(error)
+            told = str(error) if isinstance(error, LidarError) else repr(error)
             return failed_row(self._campaign, number, told)
 
     def _put(self, found: MadeJob | JobRow | BaseException | None) -> bool:

@@ -9,10 +9,11 @@ from typing import Annotated
 from distributed import Client
 from pydantic import Field
 
-from ..base.declared import declared
-from ..base.storage import Storage
-from ..base.validation import checked_fields
-from ..base.vocabulary import PATIENCE_S, WAIT_S
+from lidarsim.base.declared import declared
+from lidarsim.base.storage import Storage
+from lidarsim.base.validation import checked_fields
+from lidarsim.base.vocabulary import PATIENCE_S, WAIT_S
+
 from ..scenario.sections import PoolSection, TaskOptions
 from .cluster_file import ClusterFile
 from .connection import TlsFiles

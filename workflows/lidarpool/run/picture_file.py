@@ -10,21 +10,22 @@ from typing import Any
 
 import numpy as np
 
-from ..base.archives import open_archive, packed
-from ..base.arrays import AnyArray, Floats, Floats32
-from ..base.words import plural
-from ..columns.table import CAUSES, TABLE, Column, by_value
+from lidarsim.base.archives import open_archive, packed
+from lidarsim.base.arrays import AnyArray, Floats, Floats32
+from lidarsim.base.words import plural
+from lidarsim.columns.table import CAUSES, TABLE, Column, by_value
+from lidarsim.scene.actors import Actor, samples_each, shapes_of
+from lidarsim.scene.animation import Animation
+from lidarsim.scene.colours import Colours
+from lidarsim.scene.scene import Scene
+from lidarsim.scene.scene_mesh import SceneMesh
+from lidarsim.scene.simplified import Drawn, cut
+from lidarsim.sensor import Survey, Track
+from lidarsim.sensor.materials import MaterialTable
+from lidarsim.sensor.trajectory import ALWAYS, Beyond, presence_ns
+
 from ..plan import Plan, Planning
 from ..scenario.build import Job
-from ..scene.actors import Actor, samples_each, shapes_of
-from ..scene.animation import Animation
-from ..scene.colours import Colours
-from ..scene.scene import Scene
-from ..scene.scene_mesh import SceneMesh
-from ..scene.simplified import Drawn, cut
-from ..sensor import Survey, Track
-from ..sensor.materials import MaterialTable
-from ..sensor.trajectory import ALWAYS, Beyond, presence_ns
 from .run_result import RunResult
 
 PICTURE_FILE = "pictures.npz"
@@ -210,7 +211,7 @@ class PictureContent:
 
     @classmethod
     def load(cls, path: Path) -> PictureContent:
-        """Read what `save` wrote; LidarpoolError if it is damaged. Nothing in the file is run."""
+        """Read what `save` wrote; LidarError if it is damaged. Nothing in the file is run."""
         with open_archive(path) as archive:
             return cls._from_arrays(archive)
 

@@ -12,8 +12,9 @@ import time
 from contextlib import AbstractContextManager
 from pathlib import Path
 
-from ..base.errors import LidarpoolError, explained
-from ..base.storage import Storage
+from lidarsim.base.errors import LidarError, explained
+from lidarsim.base.storage import Storage
+
 from ..pipeline.database import FILE, RunDatabase
 
 OWNER = "run.owner"  # the mark of the run that may write the copy
@@ -27,7 +28,7 @@ class RemoteRun:
     A resumed run takes over what an earlier run left. If the earlier run is still alive, it detects
     this before its next copy, and ends.
 
-    All methods raise LidarpoolError if the storage fails, and also if nothing can be written there.
+    All methods raise LidarError if the storage fails, and also if nothing can be written there.
     """
 
     def __init__(self, storage: Storage) -> None:
@@ -46,7 +47,7 @@ class RemoteRun:
     def save(self, db: RunDatabase, *, now: bool = False) -> None:
         """Put a copy of the database into the storage, if it is time or `now`.
 
-        LidarpoolError if another run has taken over.
+        LidarError if another run has taken over.
         """
         began = time.monotonic()
         if began < self._due and not now:
@@ -58,14 +59,14 @@ class RemoteRun:
         self._due = ended + max(COPY_EVERY_S, COPY_REST * (ended - began))
 
     def check(self) -> None:
-        """Check that the run is still this one's; LidarpoolError if another has taken over."""
+        """Check that the run is still this one's; LidarError if another has taken over."""
         with self._explained():
             try:
                 self.lost = self.storage.read(OWNER) != self._mark
             except FileNotFoundError:  # a later run has finished and deleted it
                 self.lost = True
         if self.lost:
-            raise LidarpoolError(
+            raise LidarError(
                 f"A later run has taken over or deleted {self.storage.url}: this one has ended."
             )
 

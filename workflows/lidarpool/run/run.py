@@ -12,7 +12,9 @@ from functools import partial
 
 from distributed.client import FutureCancelledError
 
-from ..base.errors import LidarpoolError
+from lidarsim.base.errors import LidarError
+from lidarsim.simulator.memory import MB, scans_that_fit
+
 from ..datasets.dataset import DataSet
 from ..datasets.job_table import JobRow
 from ..pipeline.casting_workers import CastingWorkers
@@ -24,7 +26,6 @@ from ..pipeline.messages import ScanFrame
 from ..pipeline.names import GPU, LIDAR, OTHER
 from ..pipeline.task_book import StageTotals
 from ..scenario.build import Job
-from ..simulator.memory import MB, scans_that_fit
 from .cluster import Cluster
 from .job_points import JobPoints
 from .job_source import JobMaker, MadeJob, OneJob, failed_row
@@ -95,7 +96,7 @@ class Run:
     def step(self) -> bool:
         """Do what can be done now; returns whether there was anything to do.
 
-        LidarpoolError if something fails that all jobs need.
+        LidarError if something fails that all jobs need.
         """
         moved = self._admit()
         moved |= self._driver.step()
@@ -107,7 +108,7 @@ class Run:
                 self.kept = state
             else:
                 self._writer.add(self._files_of(state))
-        for_all: LidarpoolError | None = None
+        for_all: LidarError | None = None
         # A stage whose worker has died gets its slot first.
         slots = 0 if self._driver.stages.lacks_slot else self._cluster.spare
         more = bool(self._driver.jobs)
@@ -115,7 +116,7 @@ class Run:
             moved = True
             if isinstance(made, JobError):
                 self._fail(files.row.number, made)
-            elif isinstance(made, LidarpoolError):
+            elif isinstance(made, LidarError):
                 for_all = made
             else:
                 self._rows.append(made)
@@ -197,7 +198,7 @@ class Run:
         )
         return JobFiles(row, points.points(), sweeps, job.made_of)
 
-    def _fail(self, number: int, error: LidarpoolError) -> None:
+    def _fail(self, number: int, error: LidarError) -> None:
         """Note that a job has failed; if there is only one, so has the run."""
         if isinstance(self._store.jobs, OneJob):
             raise error
@@ -224,10 +225,10 @@ class Run:
 
     def _remove(self, ended: Sequence[tuple[JobRow, JobPoints]]) -> None:
         for row, points in ended:
-            with suppress(LidarpoolError, OSError):  # what is left does no harm
+            with suppress(LidarError, OSError):  # what is left does no harm
                 if row.done:
                     self._page.look(row, points)
-            with suppress(LidarpoolError, OSError):
+            with suppress(LidarError, OSError):
                 self._store.storage.remove([part.name for part in points.parts.ordered])
 
     def under_way(self) -> list[JobNow]:

@@ -7,16 +7,17 @@ from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
 
-from ..base.arrays import Floats32, Ints
-from ..base.validation import one_line
-from ..columns.cloud import Cloud
+from lidarsim.base.arrays import Floats32, Ints
+from lidarsim.base.validation import one_line
+from lidarsim.columns.cloud import Cloud
+from lidarsim.scene.scene import Scene
+from lidarsim.sensor import Survey
+
 from ..columns.parts import StoredCloud
 from ..datasets.job_table import JobRow
 from ..pipeline.placement import TaskRecord
 from ..pipeline.task_book import StageTotals
 from ..plan import Plan, Planning, Trial
-from ..scene.scene import Scene
-from ..sensor import Survey
 
 
 @dataclass(frozen=True, eq=False)

@@ -13,12 +13,14 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
-from ..base.errors import LidarpoolError, explained
+from lidarsim.base.errors import LidarError, explained
+from lidarsim.base.storage import Storage
+from lidarsim.base.validation import checked
+from lidarsim.simulator.scene_caster import AUTO_TAKES
+
 from ..base.fingerprint import fingerprint
 from ..base.shard import shard_in_words
 from ..base.software import software
-from ..base.storage import Storage
-from ..base.validation import checked
 from ..columns.parts import mark_name, own_files, scans_of
 from ..datasets.job_table import JobRow
 from ..pipeline.database import (
@@ -31,7 +33,6 @@ from ..pipeline.database import (
 )
 from ..pipeline.failures import storing
 from ..scenario.build import Job
-from ..simulator.scene_caster import AUTO_TAKES
 from .job_points import JobPoints
 from .job_source import CONTENT, Jobs, OneJob, identity_of
 from .remote import OWNER, RemoteRun, fetch_database
@@ -67,7 +68,7 @@ class RunStore:
     resume
         Whether to continue an existing run; otherwise there must be none.
 
-    LidarpoolError if it holds an unfinished run and that is not to be resumed, or cannot be: it is
+    LidarError if it holds an unfinished run and that is not to be resumed, or cannot be: it is
     of other jobs, in use, or cast with another backend than is asked for; or if there are `parts`
     without a `place`, whose database says which parts there are.
     """
@@ -82,7 +83,7 @@ class RunStore:
         resume: bool = False,
     ) -> None:
         if parts is not None and place is None:
-            raise LidarpoolError(
+            raise LidarError(
                 "parts are given a place, and nothing would know of them afterwards: give a "
                 "folder for the run as well."
             )
@@ -133,8 +134,8 @@ class RunStore:
                 mark, earlier = db.meta["mark"], db.meta.get("parts", "")
         except DamagedError as error:
             damage = error
-        except LidarpoolError as error:  # the copy of a database is nobody's business
-            raise LidarpoolError(str(error).replace(self._folder.url, self.place.url)) from error
+        except LidarError as error:  # the copy of a database is nobody's business
+            raise LidarError(str(error).replace(self._folder.url, self.place.url)) from error
         new = self._marked(parts) if resume else None
         if new is not None and mark and self._other(new["identity"]):
             new = None  # it has kept nothing
@@ -146,7 +147,7 @@ class RunStore:
             self.notes += [lost] * (not mark)
         elif damage is not None:
             told = str(damage).replace(self._folder.url, self.place.url)
-            raise LidarpoolError(told) from damage
+            raise LidarError(told) from damage
         elif self.lasting:
             _remove(self.place, parts_of(self.place, earlier), mark)
         path.unlink(missing_ok=True)
@@ -157,7 +158,7 @@ class RunStore:
             new = {"mark": mark, "identity": json.dumps(self._whose), "parts": shared}
         try:
             return RunDatabase(path, durable=durable, **new)
-        except LidarpoolError:
+        except LidarError:
             if path.exists() and not path.stat().st_size:  # the disk is full
                 path.unlink()
                 path.with_name(f"{FILE}-journal").unlink(missing_ok=True)  # SQLite 3.37 leaves it
@@ -210,12 +211,12 @@ class RunStore:
     def _go_on(self, resume: bool) -> None:
         """Check that this run may continue the existing one, which is the same."""
         if not resume:
-            raise LidarpoolError(
+            raise LidarError(
                 f"{self.place} holds an unfinished run, {self.kept}: continue it with "
                 f"{_RESUME}, or drop it with {_DROP}."
             )
         if self.backend and self._wanted not in ("auto", self.backend):
-            raise LidarpoolError(
+            raise LidarError(
                 f"Backend {self._wanted!r} is asked for, and the scans in {self.place} were "
                 f"cast with {self.backend!r}: continue with that, or drop them with {_DROP}."
             )
@@ -238,7 +239,7 @@ class RunStore:
     def _check_same(self, identity: str) -> None:
         """Check that the run that is there is the same."""
         if other := self._other(identity):
-            raise LidarpoolError(
+            raise LidarError(
                 f"The run in {self.place} cannot be continued, {other}. Drop it with {_DROP}, or "
                 "give another folder."
             )
@@ -344,7 +345,7 @@ class RunStore:
     def save(self, *, now: bool = False) -> None:
         """Keep how many frames were handed out, and what jobs are made of that are partly cast.
 
-        Where it is time or `now`, copy the database. LidarpoolError if that fails, or another run
+        Where it is time or `now`, copy the database. LidarError if that fails, or another run
         has taken over.
         """
         for number, points in self.under_way.items():
@@ -360,7 +361,7 @@ class RunStore:
         mark = self.db.meta["mark"]
         of_jobs = [part.name for p in self.under_way.values() for part in p.parts.ordered]
         ours = {mark_name(mark), *of_jobs}
-        with suppress(OSError, LidarpoolError):
+        with suppress(OSError, LidarError):
             self.storage.remove([n for n in own_files(self.storage, mark) if n not in ours])
 
     def remove(self) -> None:
@@ -379,7 +380,7 @@ class RunStore:
         except BaseException as error:
             if self._gone or not self.lasting:
                 raise
-            with suppress(LidarpoolError):  # report the first error
+            with suppress(LidarError):  # report the first error
                 self.save(now=True)
             if self._remote and self._remote.lost:
                 self.db.close()
@@ -395,7 +396,7 @@ class RunStore:
         used = self.db.used or self.begun
         self.db.close()
         if not used:
-            with suppress(OSError, LidarpoolError):
+            with suppress(OSError, LidarError):
                 _remove(self.place, self.storage, self.db.meta["mark"])
             self._folder.remove([FILE])  # where the place of the parts failed
 
@@ -415,12 +416,12 @@ def _hash_of(job: Job) -> str:
     """Hash of what a job is made of; empty if that cannot be told: then it is not resumed."""
     try:
         return fingerprint(identity_of(job))
-    except LidarpoolError:
+    except LidarError:
         return ""
 
 
 def _database(folder: Storage) -> Path:
-    """Path of the database in a folder of this machine; LidarpoolError if it is a link."""
+    """Path of the database in a folder of this machine; LidarError if it is a link."""
     folder.local(f"{FILE}-journal")  # which SQLite would follow, too
     return folder.local(FILE)
 
@@ -445,7 +446,7 @@ def remove_run(folder: str | Path | Storage) -> None:
 
     Raises
     ------
-    LidarpoolError
+    LidarError
         If another run uses it, it cannot be removed, or there is a link in place of its files.
     """
     place = Storage.at(folder)
@@ -455,8 +456,8 @@ def remove_run(folder: str | Path | Storage) -> None:
             fetch_database(place, path)
         try:
             found = read_place(path)
-        except LidarpoolError as error:
-            raise LidarpoolError(str(error).replace(temporary, place.url)) from error
+        except LidarError as error:
+            raise LidarError(str(error).replace(temporary, place.url)) from error
         mark, parts = found or (None, "")
         _remove(place, parts_of(place, parts), mark)
 

@@ -19,19 +19,21 @@ from typing import Any
 import numpy as np
 from distributed import Client
 
+from lidarsim.base.errors import LidarError
+from lidarsim.columns.cloud import Cloud
+from lidarsim.columns.part_columns import PartColumns
+from lidarsim.columns.table import AXES, SCAN
+from lidarsim.columns.waveforms import WAVEFORM
+from lidarsim.simulator.memory import MB, scans_that_fit
+from lidarsim.simulator.scene_caster import check_backend_here
+from lidarsim.sweeps.sweeps import Sweeps
 from poolpart import Partition, PoolError
 from poolpart.fetch import fetch_available
 
-from ..base.errors import LidarpoolError
-from ..columns.cloud import Cloud
-from ..columns.part_columns import PartColumns
-from ..columns.table import AXES, SCAN
-from ..columns.waveforms import WAVEFORM
 from ..datasets.job_table import JobRow
 from ..datasets.sweep_data import Sweep
 from ..export.boxes import Boxes
 from ..export.kitti import intensity_of
-from ..export.sweeps import Sweeps
 from ..pipeline.casting_workers import CastingWorkers
 from ..pipeline.database import JobParts
 from ..pipeline.dispatch import Dispatcher
@@ -42,8 +44,6 @@ from ..pipeline.names import GPU
 from ..scenario.build import Job
 from ..scenario.campaign import CampaignSpec
 from ..scenario.empty_cloud import empty_cloud_reason
-from ..simulator.memory import MB, scans_that_fit
-from ..simulator.scene_caster import check_backend_here
 from .checks import check_workers, find_workers
 from .cluster import client_of
 from .job_source import JobMaker
@@ -89,7 +89,7 @@ class SweepStream:
             except Exception as error:  # Dask has many kinds where a cluster is gone
                 if client.status == "running" and not isinstance(error, (PoolError, OSError)):
                     raise
-                raise LidarpoolError(f"The stream has lost its cluster: {error}") from error
+                raise LidarError(f"The stream has lost its cluster: {error}") from error
 
     def torch(self, transform: Callable[[Sweep], Any] | None = None) -> Any:
         """Return a `torch.utils.data.IterableDataset` of the sweeps, in the order of jobs.
@@ -98,10 +98,10 @@ class SweepStream:
         torch.distributed, if that is initialised when the loader begins, get the same number of
         jobs each. `transform` makes an item of a sweep, as of `SavedSweeps.torch`.
 
-        LidarpoolError if torch is not installed; in a worker of a DataLoader.
+        LidarError if torch is not installed; in a worker of a DataLoader.
         """
         if find_spec("torch") is None:
-            raise LidarpoolError("This needs PyTorch: pip install torch.")
+            raise LidarError("This needs PyTorch: pip install torch.")
         from ..datasets.torch_sweeps import TorchStream
 
         return TorchStream(self, transform)

@@ -42,7 +42,7 @@ class TrialPump:
     def step(self) -> bool:
         """Take results and submit more; returns whether there was anything to do.
 
-        LidarpoolError if a trial has failed.
+        LidarError if a trial has failed.
         """
         running = self.tasks.running
         if running and time.monotonic() - self._looked_at > LOOK_EVERY_S:

@@ -10,12 +10,11 @@ from typing import Any
 from dask.utils import format_bytes
 from distributed import Client
 
+from lidarsim.base.errors import LidarError
+from lidarsim.base.vocabulary import PATIENCE_S
+from lidarsim.base.words import plural
 from poolpart.task_locations import look_for_tasks
 from poolpart.workers import worker_identities
-
-from ..base.errors import LidarpoolError
-from ..base.vocabulary import PATIENCE_S
-from ..base.words import plural
 
 WATCH_EVERY_S = 1.0
 TELL_EVERY_S = 5.0  # messages about waiting; less often in a long wait
@@ -86,7 +85,7 @@ class Watch:
             self._waits.pop(name, None)
 
     def look(self) -> None:
-        """Check from time to time; LidarpoolError if a partition was empty for too long."""
+        """Check from time to time; LidarError if a partition was empty for too long."""
         now = time.monotonic()
         if now - self._looked < WATCH_EVERY_S:
             return
@@ -104,7 +103,7 @@ class Watch:
             if name in there:
                 waiting.begin()
             elif not waiting.left():
-                raise LidarpoolError(_lacking(name, name in paused, f"{waiting.seconds:.0f} s"))
+                raise LidarError(_lacking(name, name in paused, f"{waiting.seconds:.0f} s"))
             elif name in paused:
                 advice = "give them a larger --memory-limit"
                 waiting.tell(f"paused workers of partition {name}", advice)

@@ -13,17 +13,17 @@ from typing import Any, NamedTuple
 
 from distributed import Reschedule
 
+from lidarsim.base.errors import LidarError, explained
+from lidarsim.base.storage import TEMPORARY
+from lidarsim.sweeps.sweeps import Sweeps
 from poolpart.fetch import fetch_available
 from poolpart.task_context import own_client
 
-from ..base.errors import LidarpoolError, explained
-from ..base.storage import TEMPORARY
 from ..columns.parts import StoredCloud
 from ..datasets.dataset import DataSet, Listing
 from ..datasets.job_table import JobRow
 from ..export.pieces import PieceRange, RangeWriter
 from ..export.pieces import WrittenRange as Range
-from ..export.sweeps import Sweeps
 from ..pipeline.casting_workers import share
 from ..pipeline.failures import JobError, raise_if_failed, was_killed
 from ..pipeline.names import EXPORT, LIDAR
@@ -48,7 +48,7 @@ class JobFiles(NamedTuple):
     made_of: Sequence[Sequence[str]]
 
 
-JobOutcome = JobRow | LidarpoolError
+JobOutcome = JobRow | LidarError
 
 
 def write_jobs(
@@ -66,16 +66,16 @@ def write_jobs(
 
 
 def _written(dataset: DataSet, job: JobFiles) -> JobOutcome:
-    """Write a job; JobError if that fails, LidarpoolError if it is because of the place."""
+    """Write a job; JobError if that fails, LidarError if it is because of the place."""
     listing = Listing.of(dataset.place)
     try:
         return dataset.write_job(*job, listing=listing)
     except Exception as error:
         why = error if isinstance(error, OSError) else error.__cause__
-        told = str(error) if isinstance(error, LidarpoolError) else repr(error)
+        told = str(error) if isinstance(error, LidarError) else repr(error)
         if isinstance(why, OSError):  # a full disk fails all jobs
-            name = "" if isinstance(error, LidarpoolError) else f"job {job.row.name}: "
-            return LidarpoolError(f"{name}{told}")
+            name = "" if isinstance(error, LidarError) else f"job {job.row.name}: "
+            return LidarError(f"{name}{told}")
         with suppress(OSError):
             listing.prune(listing.files)
         return JobError(told)
@@ -146,7 +146,7 @@ class JobWriter:
                 continue
             try:
                 raise_if_failed(future, "writing it")
-            except LidarpoolError as error:
+            except LidarError as error:
                 ended += [(job, error) for job in jobs]
         for result in [one for one in self._here if one.done()]:
             ended.append((self._here.pop(result), result.result()))
@@ -205,7 +205,7 @@ class LidarWorkers:
     def __call__(self, writer: RangeWriter, spans: Sequence[PieceRange]) -> dict[PieceRange, Range]:
         """Write ranges; returns what was written of those whose workers see the folder.
 
-        The range of a worker that dies is written by another. LidarpoolError if one cannot write,
+        The range of a worker that dies is written by another. LidarError if one cannot write,
         several die of a range, or there is none for too long.
         """
         partition, running = self._tasks.partition, self._tasks.running
@@ -228,7 +228,7 @@ class LidarWorkers:
                 if not done:
                     time.sleep(LOOK_EVERY_S)
         except OSError as error:
-            raise LidarpoolError(f"The cluster was lost while it wrote {writer.place}.") from error
+            raise LidarError(f"The cluster was lost while it wrote {writer.place}.") from error
         finally:
             if running:
                 writer.stop()

@@ -17,20 +17,29 @@ from xml.parsers import expat
 import numpy as np
 from pydantic import Strict, model_validator
 
-from ..base.arrays import Floats
-from ..base.declared import Several, Text, TextOrTexts, Triple, about, by_text, declared, one_of
-from ..base.errors import LidarpoolError, prefixed
-from ..base.input_files import open_input
-from ..base.words import printable
-from ..base.xmlfile import refuse_entity
-from ..scene.actors import Actor
-from ..scene.files.meshfile import ROBOTS
-from ..scene.scene_mesh import SceneMesh
-from ..sensor import Mounted, Pose, Track, load_trajectory
-from ..sensor.calibrations import said
-from ..sensor.survey import StepCount
-from ..sensor.trajectory import CLOCK_S, Beyond, InstrumentPose, quaternions_of, rotations_of
-from ..sensor.trajectory_files import (
+from lidarsim.base.arrays import Floats
+from lidarsim.base.declared import (
+    Several,
+    Text,
+    TextOrTexts,
+    Triple,
+    about,
+    by_text,
+    declared,
+    one_of,
+)
+from lidarsim.base.errors import LidarError, prefixed
+from lidarsim.base.input_files import open_input
+from lidarsim.base.words import printable
+from lidarsim.base.xmlfile import refuse_entity
+from lidarsim.scene.actors import Actor
+from lidarsim.scene.files.meshfile import ROBOTS
+from lidarsim.scene.scene_mesh import SceneMesh
+from lidarsim.sensor import Mounted, Pose, Track, load_trajectory
+from lidarsim.sensor.calibrations import said
+from lidarsim.sensor.survey import StepCount
+from lidarsim.sensor.trajectory import CLOCK_S, Beyond, InstrumentPose, quaternions_of, rotations_of
+from lidarsim.sensor.trajectory_files import (
     Duration,
     Height,
     Latitude,
@@ -38,6 +47,7 @@ from ..sensor.trajectory_files import (
     Seconds,
     TrajectoryFormat,
 )
+
 from .ground import Standing, following
 from .sections import (
     DeformingSection,
@@ -174,7 +184,7 @@ class TrajectorySection(Section):
     _one_source = one_of("file", "points")
 
     def track(self, path: PathOf, standing: Standing, start_s: float | None = None) -> Track:
-        """Return it in a scene's local coordinates; LidarpoolError if it cannot be used.
+        """Return it in a scene's local coordinates; LidarError if it cannot be used.
 
         `path` returns that of a file, `standing` is what there is to follow; `start_s` is that of
         a survey, of whose clock it is.
@@ -191,7 +201,7 @@ class TrajectorySection(Section):
         for piece in pieces:
             if piece.times_s[0] <= begin + CLOCK_S and end - CLOCK_S <= piece.times_s[-1]:
                 return replace(piece, beyond=way.beyond)
-        raise LidarpoolError(
+        raise LidarError(
             f"the trajectory leaves its surfaces ({', '.join(self.surfaces)}): let it end before."
         )
 
@@ -352,11 +362,11 @@ class TrafficSection(Section):
     )
 
     def shape_of(self, kind: str) -> VehicleSection:
-        """Return the entry of a type; LidarpoolError if there is none."""
+        """Return the entry of a type; LidarError if there is none."""
         for entry in self.vehicles:
             if any(fnmatchcase(kind, one) for one in entry.types):
                 return entry
-        raise LidarpoolError(
+        raise LidarError(
             f"{self.file} has vehicles of type {kind!r}, but no entry of traffic.vehicles fits: "
             f"add one, such as {{types: {kind!r}, box: [4.5, 1.8, 1.5]}}."
         )
@@ -386,7 +396,7 @@ def read_fcd(
 
     Raises
     ------
-    LidarpoolError
+    LidarError
         If it cannot be read, is no floating car data, or has attributes that are not known.
     """
     known_attributes = set(_KNOWN)
@@ -429,7 +439,7 @@ def read_fcd(
         if step < 0:
             raise ValueError("it has no time steps")
     except (OSError, EOFError, zlib.error, ValueError, KeyError, expat.ExpatError) as error:
-        raise LidarpoolError(
+        raise LidarError(
             f"{path} is not usable as floating car data, which sumo --fcd-output writes: "
             f"{said(error)}"
         ) from error
@@ -485,7 +495,7 @@ def actors_of(
 
     Raises
     ------
-    LidarpoolError
+    LidarError
         If a type has no shape, or there are too many.
     """
     actors: list[tuple[Actor, VehicleSection]] = []
@@ -512,7 +522,7 @@ def actors_of(
         offset_s += 0.0 if mesh.animation is None else share * mesh.animation.duration_s
         actors += [(Actor(named, way, offset_s), entry) for way in ways]
         if len(actors) > ACTORS_MOST:
-            raise LidarpoolError(
+            raise LidarError(
                 f"{section.file} has more than {ACTORS_MOST:,} vehicles and persons during the "
                 "survey: make the survey shorter, or simulate a part of the network."
             )

@@ -6,14 +6,15 @@ from collections.abc import Iterator, Mapping
 
 import numpy as np
 
-from ..base.words import as_scenario, plural
-from ..columns.table import VELOCITY
+from lidarsim.base.words import as_scenario, plural
+from lidarsim.columns.table import VELOCITY
+from lidarsim.scene.files.meshfile import CITYJSON, UNITLESS, wrote_it
+from lidarsim.sensor.faults import faults_of
+from lidarsim.sensor.materials import MaterialTable
+from lidarsim.sensor.models import STATED
+from lidarsim.sensor.trajectory import presence_ns
+
 from ..export.laser_scan import has_planar_sensors
-from ..scene.files.meshfile import CITYJSON, UNITLESS, wrote_it
-from ..sensor.faults import faults_of
-from ..sensor.materials import MaterialTable
-from ..sensor.models import STATED
-from ..sensor.trajectory import presence_ns
 from .build import Built
 from .scenario import Scenario
 from .sections import SensorSection

@@ -11,28 +11,29 @@ from typing import Any
 
 import numpy as np
 
-from ..base.arrays import Floats
-from ..base.declared import declared
-from ..base.errors import LidarpoolError, Mistakes, prefixed
-from ..base.validation import checked_fields
-from ..base.words import did_you_mean, plural
+from lidarsim.base.arrays import Floats
+from lidarsim.base.declared import declared
+from lidarsim.base.errors import LidarError, Mistakes, prefixed
+from lidarsim.base.validation import checked_fields
+from lidarsim.base.words import did_you_mean, plural
+from lidarsim.scene.actors import Actor, check_spray
+from lidarsim.scene.files.cityjson import CLASS_NAMES as CITY_NAMES
+from lidarsim.scene.files.cityjson import CLASSES as CITY_CLASSES
+from lidarsim.scene.files.meshfile import CITYJSON
+from lidarsim.scene.robot import Robot
+from lidarsim.scene.scene import Scene
+from lidarsim.sensor import Material, Mounted, Noise, Pose, Returns, Sensor, Survey, Track
+from lidarsim.sensor.materials import MaterialTable, rows_named, with_class, with_classes
+from lidarsim.sensor.survey import CloudOptions
+from lidarsim.sensor.trajectory import CENTRE
+from lidarsim.sensor.weather import Weather
+from lidarsim.simulator.surfaces import warn_of_grey
+
 from ..export.format_table import check_whole
 from ..export.formats import Format
 from ..export.laser_scan import with_laser_scans
 from ..plan import Planning
 from ..plan.planning import Search
-from ..scene.actors import Actor, check_spray
-from ..scene.files.cityjson import CLASS_NAMES as CITY_NAMES
-from ..scene.files.cityjson import CLASSES as CITY_CLASSES
-from ..scene.files.meshfile import CITYJSON
-from ..scene.robot import Robot
-from ..scene.scene import Scene
-from ..sensor import Material, Mounted, Noise, Pose, Returns, Sensor, Survey, Track
-from ..sensor.materials import MaterialTable, rows_named, with_class, with_classes
-from ..sensor.survey import CloudOptions
-from ..sensor.trajectory import CENTRE
-from ..sensor.weather import Weather
-from ..simulator.surfaces import warn_of_grey
 from .actor_motion import (
     ActorSection,
     MountSection,
@@ -85,7 +86,7 @@ class Job:
 
     Raises
     ------
-    LidarpoolError
+    LidarError
         If something is of another type, the survey's precision is too fine for the scene, a
         material is for no object, or an object lacks a material while others have one.
     """
@@ -113,7 +114,7 @@ class Job:
             own = (actor.mesh.animation or actor.mesh).bounds
             reach = max(reach, float(np.abs(ways).max() + np.abs(own).max()))
         if reach / survey.precision_m >= 2**31 - 1:
-            raise LidarpoolError(
+            raise LidarError(
                 f"precision_m {survey.precision_m} is too fine for a scene that reaches "
                 f"{reach:.0f} m from its origin: use at least {reach / 2e9:.2g}."
             )
@@ -145,7 +146,7 @@ def build(
 
     Raises
     ------
-    LidarpoolError
+    LidarError
         If a file cannot be read, or fields do not fit together or the scene.
     """
     static = read_static_scene(scenario) if cache is None else cache.find(scenario)
@@ -224,7 +225,7 @@ def _common_epsg(scenario: Scenario, found: Findings) -> int | None:
     systems = {raster.crs: file for file, raster in stay if raster.crs}
     if len(systems) > 1:
         listed = ", ".join(f"{file} in {crs[:60]}" for crs, file in systems.items())
-        raise LidarpoolError(
+        raise LidarError(
             f"{scenario.source}: rasters of one scene have several coordinate systems: "
             f"{listed}. Give cloud.epsg, the code of the one that all of them are brought to."
         )
@@ -256,7 +257,7 @@ def _mount(section: SensorSection, shapes: Shapes) -> Pose:
     on = [(entry, robot) for entry, robot in carriers if mount.link in robot.links]
     if len(on) != 1:
         links = [link for _, robot in carriers for link in robot.links]
-        raise LidarpoolError(
+        raise LidarError(
             f"mount.link is {mount.link!r}, which {len(on) or 'no'} robots on the carrier "
             f"have; one must.{did_you_mean(mount.link, links)}"
         )
@@ -265,7 +266,7 @@ def _mount(section: SensorSection, shapes: Shapes) -> Pose:
         path = robot.path(mount.link, **_joints(entry, scenario))
     if path.moves:
         file = None if entry.joints is None else entry.joints.file
-        raise LidarpoolError(
+        raise LidarError(
             f"mount.link is {mount.link!r}, which {file} moves, and a mount is rigid: "
             "mount the sensor on a link that does not move, or leave out those joints' columns."
         )
@@ -433,7 +434,7 @@ def _planning(scenario: Scenario, scene: Scene) -> Planning | None:
         inside = np.hypot(*(discs[:, :2] - point).T) < discs[:, 2]
         if inside.any():
             first = int(inside.argmax())
-            raise LidarpoolError(
+            raise LidarError(
                 f"planning.{end} lies {discs[first, 2]:.2f} m or less from the middle of "
                 f"{labels[first]}, within its circle: move it, or list other "
                 "planning.obstacles."
@@ -460,7 +461,7 @@ def _discs(scenario: Scenario, scene: Scene) -> tuple[Floats, list[str]]:
         ]
         if not found:
             hint = did_you_mean(entry.object, scene.names)
-            raise LidarpoolError(
+            raise LidarError(
                 f"planning.obstacles names {entry.object!r}, but no object has that name."
                 + (hint or f" The scene has {', '.join(scene.names[:5])}, …")
             )

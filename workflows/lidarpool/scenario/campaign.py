@@ -20,13 +20,11 @@ import numpy as np
 from pydantic import BaseModel, Field
 from pydantic_core import to_json
 
-from ..base.declared import Seed
-from ..base.errors import LidarpoolError, Mistakes, prefixed
-from ..base.fingerprint import fingerprint
-from ..base.input_files import open_input, read_input_text
-from ..base.shard import ALL, Shard
-from ..base.textfile import read_text
-from ..base.validation import (
+from lidarsim.base.declared import Seed
+from lidarsim.base.errors import LidarError, Mistakes, prefixed
+from lidarsim.base.input_files import open_input, read_input_text
+from lidarsim.base.textfile import read_text
+from lidarsim.base.validation import (
     checked,
     dotted,
     field_hint,
@@ -36,8 +34,11 @@ from ..base.validation import (
     sentences,
     shown,
 )
-from ..base.words import did_you_mean, plural
-from ..base.yamlfile import read_yaml
+from lidarsim.base.words import did_you_mean, plural
+from lidarsim.base.yamlfile import read_yaml
+
+from ..base.fingerprint import fingerprint
+from ..base.shard import ALL, Shard
 from ..datasets.job_table import Value
 from ..export.format_table import check_whole
 from ..export.laser_scan import with_laser_scans
@@ -89,7 +90,7 @@ class CampaignSpec:
 
     Raises
     ------
-    LidarpoolError
+    LidarError
         If an argument cannot be meant.
 
     Notes
@@ -143,7 +144,7 @@ class CampaignSpec:
 
         Raises
         ------
-        LidarpoolError
+        LidarError
             With the file, the field or path, what was given and what is allowed: if a path leads
             to no field, a value that can be drawn is not valid there, or a file is missing.
         """
@@ -172,7 +173,7 @@ class CampaignSpec:
 
         Raises
         ------
-        LidarpoolError
+        LidarError
             If one of them cannot be used; or an argument cannot be meant.
         """
         jobs, self = _Given([Path(path) for path in paths]), cls.__new__(cls)
@@ -224,7 +225,7 @@ class CampaignSpec:
     def scenario(self, number: int) -> Scenario | None:
         """Return what a job is built of; None if a function makes it.
 
-        LidarpoolError if its values do not fit together; the message names it and them.
+        LidarError if its values do not fit together; the message names it and them.
         """
         return self._jobs.scenario(self._known(number))
 
@@ -240,13 +241,13 @@ class CampaignSpec:
         `cache` has static scenes of other jobs, which this one may share; `columns` are names of
         columns that the data set needs.
 
-        LidarpoolError if there is no such job, or it cannot be made; the message says why.
+        LidarError if there is no such job, or it cannot be made; the message says why.
         """
         number = self._known(number)
         own = {"number": number, "name": self.name(number), "split": self.split(number)}
         job = self._jobs.job(number, cache, columns, own)
         if job.survey.navigation is not None:
-            raise LidarpoolError(
+            raise LidarError(
                 "navigation is for single surveys, since a data set has no place for its files: "
                 "leave it out of the campaign's base."
             )
@@ -255,13 +256,13 @@ class CampaignSpec:
 
     def _known(self, number: int) -> int:
         if not 0 <= number < self.count:
-            raise LidarpoolError(
+            raise LidarError(
                 f"there is no job {number}: the campaign has jobs 0 to {self.count - 1}."
             )
         return int(number)  # of NumPy, perhaps
 
     def check_files(self) -> None:
-        """Check that all files are there that jobs may be made of, or raise LidarpoolError."""
+        """Check that all files are there that jobs may be made of, or raise LidarError."""
         mistakes = Mistakes()
         # `Path.exists` fails at names that no file can have.
         lost = [path for path in self.files if not os.path.exists(path)]  # noqa: PTH110
@@ -293,7 +294,7 @@ def is_campaign(path: str | Path) -> bool:
         if not _KEYS.search(read_input_text(path)):
             return False  # without reading all poses of a scenario as YAML
         return bool({"base", "vary"} & read_yaml(path).keys())
-    except (OSError, ValueError, LidarpoolError):
+    except (OSError, ValueError, LidarError):
         return False  # what is wrong, the reader of scenarios says
 
 
@@ -343,7 +344,7 @@ class _Made(_JobSource):
     @cached_property
     def names(self) -> tuple[str, ...]:  # type: ignore[override]  # found out when it is asked for
         for number in range(self.count):
-            with suppress(LidarpoolError):  # one that fails must not end the others
+            with suppress(LidarError):  # one that fails must not end the others
                 return tuple(self._made(number).values)
         return ()
 
@@ -357,7 +358,7 @@ class _Made(_JobSource):
     def job(self, number: int, cache: SceneCache | None, columns: Sequence[str], own: Any) -> Job:
         made = self._made(number)
         if extra := [name for name in made.values if name not in self.names]:
-            raise LidarpoolError(
+            raise LidarError(
                 f"job {number} has the value {extra[0]!r}, which the first has not: give all jobs "
                 "the same names, with None where there is no value."
             )
@@ -365,7 +366,7 @@ class _Made(_JobSource):
         for name, value in made.values.items():
             plain = value.item() if isinstance(value, np.generic) else value
             if not isinstance(name, str) or not isinstance(plain, Value | None):
-                raise LidarpoolError(
+                raise LidarError(
                     f"job {number} has the value {name!r}: {shown(plain)}; values are numbers, "
                     "text, True or False, by names."
                 )
@@ -385,14 +386,14 @@ class _Made(_JobSource):
         with prefixed(f"job {number}"):
             try:
                 made = self._make(number, JobRandom(self._seed, number, "make").generator())
-            except LidarpoolError:
+            except LidarError:
                 raise
             except Exception as error:  # one job's failure must not end the others
                 told = f"the function raised {type(error).__name__}: {error}"
-                raise LidarpoolError(told) from error
+                raise LidarError(told) from error
             if not isinstance(made, Job):
                 told = f"the function returned {shown(made)}; it must return a Job(scene, survey)."
-                raise LidarpoolError(told)
+                raise LidarError(told)
         return made
 
 
@@ -401,14 +402,14 @@ class _Given(_JobSource):
 
     def __init__(self, paths: Sequence[Path]) -> None:
         if not paths:
-            raise LidarpoolError("a campaign needs a scenario at least: name one or more files.")
+            raise LidarError("a campaign needs a scenario at least: name one or more files.")
         self.paths, self.count = paths, len(paths)
         mistakes, files, prints = Mistakes(), set[Path](), []
         for path in paths:
             with mistakes.noted():
                 if is_campaign(path):
                     told = f"{path} is a campaign, with jobs of its own: run it by itself."
-                    raise LidarpoolError(told)
+                    raise LidarError(told)
                 read = Scenario.load(path)
                 prints.append(_print(read))
                 files.update(read.files)
@@ -449,7 +450,7 @@ class _Varied(_JobSource):
             with mistakes.noted(), prefixed(path):
                 file = path.parent / Path(name).expanduser()
                 if is_campaign(file):
-                    raise LidarpoolError(f"base {name!r} is a campaign; give a scenario.")
+                    raise LidarError(f"base {name!r} is a campaign; give a scenario.")
                 where = f"vary, of {file.name}" if section.base[1:] else "vary"
                 self._bases.append(_Base(file, section.vary, tables, where))
         mistakes.tell()
@@ -465,11 +466,11 @@ class _Varied(_JobSource):
                 grid *= len(choice.options)
         drawn = [text for text in section.vary if text not in self._strides]
         if section.count is None and drawn:
-            raise LidarpoolError(
+            raise LidarError(
                 f"{path}: count is missing: {drawn[0]} is drawn, so say how many jobs."
             )
         if section.count is None and grid > COUNT_MOST:
-            raise LidarpoolError(
+            raise LidarError(
                 f"{path}: count is missing: all values of each are {grid:,} jobs, of at most "
                 f"{COUNT_MOST:,}."
             )
@@ -504,11 +505,9 @@ class _Varied(_JobSource):
         base, seed = self._bases[number % len(self._bases)], _noise_seed(self._seed, number)
         try:
             return base.changed(changes, f"{self._source}: job {number}", seed)
-        except LidarpoolError as error:
+        except LidarError as error:
             shown = ", ".join(f"{name}: {value}" for name, value in told.items())
-            raise LidarpoolError(
-                f"{error}\nIts values are {shown or 'those of the base'}."
-            ) from error
+            raise LidarError(f"{error}\nIts values are {shown or 'those of the base'}.") from error
 
     def _drawn(self, number: int) -> tuple[dict[str, Value], dict[str, Any]]:
         """Draw what a job has of its own: for the table of jobs, and for the scenario."""
@@ -557,7 +556,7 @@ class _Base:
                     self.tables[text] = tables[key]
                     if (most := choice.sample.count[1]) > (there := len(tables[key])):
                         has = plural(there, "row")
-                        raise LidarpoolError(f"count is up to {most:,}, and {table} has {has}.")
+                        raise LidarError(f"count is up to {most:,}, and {table} has {has}.")
         with mistakes.noted(), prefixed(where):
             self._check_apart()
         mistakes.tell()
@@ -568,10 +567,10 @@ class _Base:
         for other, one in combinations(places, 2):
             short, long = sorted((one, other), key=lambda text: len(places[text]))
             if places[short] == places[long]:
-                raise LidarpoolError(f"{other} and {one} lead to the same field: leave one out.")
+                raise LidarError(f"{other} and {one} lead to the same field: leave one out.")
             within = places[long][: len(places[short])] == places[short]
             if within and self._vary[short].sample is None:
-                raise LidarpoolError(
+                raise LidarError(
                     f"{short} is chosen as a whole, and {long} is a part of it: leave one out."
                 )
 
@@ -586,7 +585,7 @@ class _Base:
             changes = {text: tried[turn % len(tried)] for text, tried in trials.items()}
             try:
                 found = self.changed(changes, f"{source}: {self._where}")
-            except LidarpoolError as error:
+            except LidarError as error:
                 wrong = [line for text in self._vary for line in islice(self._tried(text), 1)]
                 mistakes.lines += [f"{source}: {self._where}: {line}" for line in wrong]
                 mistakes.lines += () if wrong else str(error).splitlines()
@@ -609,7 +608,7 @@ class _Base:
         for value in () if choice.sample else choice.ends:
             try:
                 self.changed({text: value}, "")
-            except LidarpoolError as error:
+            except LidarError as error:
                 told = str(error).partition("\n")[0].removeprefix(": ")
                 own = told.partition("; ")[2] if told.startswith(f"{place} is ") else ""
                 given = f"{text} can be {shown(value)}"
@@ -681,7 +680,7 @@ def find_field(scenario: Scenario, text: str) -> tuple[FieldSteps, Any]:
 
     Raises
     ------
-    LidarpoolError
+    LidarError
         If it leads to no field; the message has the nearest name.
     """
     node: Any = scenario
@@ -707,7 +706,7 @@ def find_field(scenario: Scenario, text: str) -> tuple[FieldSteps, Any]:
             node = node[key]
         else:
             what = f"the base has no {at}" if node is None else f"{at} has no fields of its own"
-            raise LidarpoolError(f"{text} leads to no field: {what}.")
+            raise LidarError(f"{text} leads to no field: {what}.")
         steps.append((key, node))
         rest = rest[used:]
     return tuple(steps), kind
@@ -717,7 +716,7 @@ def _field(node: BaseModel, name: str, at: str) -> tuple[str, Any, Any]:
     fields = {field.alias or own: own for own, field in fields_of(type(node)).items()}
     if name not in fields:
         place = f"a field of {at}" if at else "a section of a scenario"
-        raise LidarpoolError(f"{name!r} is not {place}.{field_hint(name, fields, Scenario)}")
+        raise LidarError(f"{name!r} is not {place}.{field_hint(name, fields, Scenario)}")
     own = fields[name]
     return name, getattr(node, own, None), fields_of(type(node))[own].annotation
 
@@ -728,14 +727,14 @@ def _named(names: Sequence[str], rest: Sequence[str], at: str) -> tuple[str, int
         if (name := ".".join(rest[:used])) in names:
             return name, used
     hint = did_you_mean(rest[0], names) or (f" It has {', '.join(names[:5])}." if names else "")
-    raise LidarpoolError(f"{at} of the base has no {rest[0]!r}.{hint}")
+    raise LidarError(f"{at} of the base has no {rest[0]!r}.{hint}")
 
 
 def _entry(entries: Sequence[Any], rest: Sequence[str], at: str) -> tuple[int, int]:
     if rest[0].isdecimal():
         if (number := int(rest[0])) < len(entries):
             return number, 1
-        raise LidarpoolError(
+        raise LidarError(
             f"{at} of the base has {plural(len(entries), 'entry', 'entries')}, counted from 0, "
             f"and no entry {number}."
         )

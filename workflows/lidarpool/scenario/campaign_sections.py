@@ -29,7 +29,7 @@ from pydantic import (
     model_validator,
 )
 
-from ..base.declared import (
+from lidarsim.base.declared import (
     Ends,
     Seed,
     Several,
@@ -43,16 +43,17 @@ from ..base.declared import (
     one_of,
     short,
 )
-from ..base.errors import LidarpoolError, Mistakes
-from ..base.tables import ignored_columns
-from ..base.textfile import read_text
-from ..base.validation import checked_fields, sections_in, sentences
-from ..base.words import did_you_mean, printable
-from ..base.yamlfile import load_yaml
+from lidarsim.base.errors import LidarError, Mistakes
+from lidarsim.base.tables import ignored_columns
+from lidarsim.base.textfile import read_text
+from lidarsim.base.validation import checked_fields, sections_in, sentences
+from lidarsim.base.words import did_you_mean, printable
+from lidarsim.base.yamlfile import load_yaml
+from lidarsim.sensor.calibrations import said
+
 from ..datasets.job_table import Value
 from ..export.format_table import DATA_SETS, LAYOUTS
 from ..export.formats import Format
-from ..sensor.calibrations import said
 from .sections import IgnoredColumns, Section, may_be_empty
 
 SIGMAS = 6.0  # normal numbers are drawn again beyond, one of 500 million
@@ -356,7 +357,7 @@ def _in_table(value: Any, position: int) -> Value | None:
 class Keep:
     """The format of a data set.
 
-    LidarpoolError if there is no such format or layout.
+    LidarError if there is no such format or layout.
     """
 
     format: Annotated[
@@ -375,7 +376,7 @@ class Keep:
     ] = False
 
     def __post_init__(self) -> None:
-        _ = self.of_jobs  # LidarpoolError if its fields do not fit together
+        _ = self.of_jobs  # LidarError if its fields do not fit together
 
     @property
     def of_jobs(self) -> Format:
@@ -502,13 +503,13 @@ def read_rows(path: Path, kind: Any, ignore: Sequence[str] = ()) -> list[Any]:
 
     Raises
     ------
-    LidarpoolError
+    LidarError
         If the file cannot be read, the field is no list, or a row is no entry of it; the message
         has the line.
     """
     entry = next(_entries(kind), None)
     if entry is None:
-        raise LidarpoolError("sample adds entries to a list, such as actors, and this is none.")
+        raise LidarError("sample adds entries to a list, such as actors, and this is none.")
     try:
         lines = read_text(path).splitlines()
         first = next((line for line in lines if line.strip() and line.lstrip()[0] != "#"), "")
@@ -529,18 +530,16 @@ def read_rows(path: Path, kind: Any, ignore: Sequence[str] = ()) -> list[Any]:
         model = next(sections_in(entry), BaseModel)
         _check_columns(head, model)
     except FileNotFoundError as error:
-        raise LidarpoolError(f"{path} does not exist: check the name and the folder.") from error
-    except (OSError, ValueError, csv.Error, LidarpoolError) as error:
-        raise LidarpoolError(f"{path} is not a usable table: {said(error)}") from error
+        raise LidarError(f"{path} does not exist: check the name and the folder.") from error
+    except (OSError, ValueError, csv.Error, LidarError) as error:
+        raise LidarError(f"{path} is not a usable table: {said(error)}") from error
     adapter = TypeAdapter(entry)
     mistakes, rows = Mistakes(), []
     for line, row in cells:
         where = f"{path}, line {line}"
         with mistakes.noted(), sentences(model, where):
             if len(row) > len(header):
-                raise LidarpoolError(
-                    f"{where}: it has {len(row)} cells, and the header {len(header)}."
-                )
+                raise LidarError(f"{where}: it has {len(row)} cells, and the header {len(header)}.")
             read = [cell for index, cell in enumerate(row) if index not in left_out]
             rows.append(_checked(adapter, dict(zip(head, read, strict=False))))
     mistakes.tell()

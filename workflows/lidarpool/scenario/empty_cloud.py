@@ -6,12 +6,13 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
-from ..base.arrays import Floats
-from ..base.words import plural
+from lidarsim.base.arrays import Floats
+from lidarsim.base.words import plural
+from lidarsim.scene.scene import Scene
+from lidarsim.sensor import Survey
+from lidarsim.simulator.sampling import sample_ranges
+
 from ..datasets.job_table import JobRow
-from ..scene.scene import Scene
-from ..sensor import Survey
-from ..simulator.sampling import sample_ranges
 from .placing import seen_from
 
 EMPTY = "the cloud has no points"

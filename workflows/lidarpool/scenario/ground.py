@@ -8,16 +8,15 @@ from functools import cached_property
 
 import numpy as np
 
+from lidarsim.base.arrays import Floats, Indices, Ints32
+from lidarsim.base.errors import LidarError
+from lidarsim.base.words import did_you_mean
+from lidarsim.scene.scene import Scene
+from lidarsim.scene.simplified import Drawn
+from lidarsim.sensor import Track
+from lidarsim.sensor.materials import rows_named
+from lidarsim.sensor.trajectory import quaternions_of
 from raybeam import RayCaster, available_backends
-
-from ..base.arrays import Floats, Indices, Ints32
-from ..base.errors import LidarpoolError
-from ..base.words import did_you_mean
-from ..scene.scene import Scene
-from ..scene.simplified import Drawn
-from ..sensor import Track
-from ..sensor.materials import rows_named
-from ..sensor.trajectory import quaternions_of
 
 STEP_M = 0.5  # of a trajectory that follows a surface
 STEPS_MOST = 1_000_000
@@ -39,12 +38,12 @@ class Standing:
         return np.zeros(3) if self._scene is None else self._scene.origin
 
     def only(self, names: Sequence[str]) -> Standing:
-        """Return the same of some objects; LidarpoolError if there is nothing to stand on."""
+        """Return the same of some objects; LidarError if there is nothing to stand on."""
         key, scene = tuple(names), self._scene
         if key in self._parts:
             return self._parts[key]
         if scene is None:
-            raise LidarpoolError(
+            raise LidarError(
                 "there is nothing to stand on: add scene.files, or scene.ground and a rectangle "
                 "(within)."
             )
@@ -54,11 +53,11 @@ class Standing:
                 hint = (
                     did_you_mean(name, scene.names) or f" There are {', '.join(scene.names[:5])}."
                 )
-                raise LidarpoolError(f"surfaces names {name!r}, but no object has that name.{hint}")
+                raise LidarError(f"surfaces names {name!r}, but no object has that name.{hint}")
         found = np.unique(np.concatenate(rows))
         made = self if len(found) == len(scene.names) else Standing(scene, found)
         if not len(made._tops[0]):
-            raise LidarpoolError(f"nothing of {', '.join(map(repr, names))} faces up.")
+            raise LidarError(f"nothing of {', '.join(map(repr, names))} faces up.")
         self._parts[key] = made
         return made
 
@@ -125,13 +124,13 @@ def following(track: Track, standing: Standing) -> list[Track]:
 
     Raises
     ------
-    LidarpoolError
+    LidarError
         If it is too long.
     """
     ways = np.linalg.norm(np.diff(track.positions, axis=0), axis=1)
     steps = np.maximum(np.ceil(ways / STEP_M), 1).astype(np.int64)
     if steps.sum() > STEPS_MOST:
-        raise LidarpoolError(
+        raise LidarError(
             f"the trajectory is {ways.sum() / 1000:,.0f} km long; at most "
             f"{STEPS_MOST * STEP_M / 1000:,.0f} km can follow surfaces."
         )

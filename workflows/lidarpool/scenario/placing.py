@@ -10,15 +10,15 @@ import numpy as np
 import yaml
 from numpy.typing import ArrayLike
 
-from ..base.arrays import Floats
-from ..base.words import plural
-from ..scene.files.cityjson import BUILDING, CLASSES
-from ..scene.floor import heights_at, reaching, room_at
-from ..scene.scene import Scene
-from ..scene.simplified import Drawn
-from ..scene.surroundings import Surroundings, in_the_way, is_open
-from ..sensor import Mounted, Pose, Sensor
-from ..sensor.materials import rows_named
+from lidarsim.base.arrays import Floats
+from lidarsim.base.words import plural
+from lidarsim.scene.files.cityjson import BUILDING, CLASSES
+from lidarsim.scene.floor import heights_at, reaching, room_at
+from lidarsim.scene.scene import Scene
+from lidarsim.scene.simplified import Drawn
+from lidarsim.scene.surroundings import Surroundings, in_the_way, is_open
+from lidarsim.sensor import Mounted, Pose, Sensor
+from lidarsim.sensor.materials import rows_named
 
 # Heights above a floor; and the least distance from the ceiling.
 _HEIGHTS_M, _BELOW_M = (1.0, 2.0, 3.0), 0.2

@@ -7,15 +7,16 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..base.arrays import Bools, Floats
-from ..base.sampling import even_indices
-from ..base.words import as_scenario
-from ..scene.actors import Actor
-from ..scene.scene import Scene
-from ..scene.surroundings import Surroundings
-from ..sensor import Survey, Track
-from ..sensor.sensor import LineSensor
-from ..sensor.trajectory import full_poses, matrices, quaternions_of, velocities
+from lidarsim.base.arrays import Bools, Floats
+from lidarsim.base.sampling import even_indices
+from lidarsim.base.words import as_scenario
+from lidarsim.scene.actors import Actor
+from lidarsim.scene.scene import Scene
+from lidarsim.scene.surroundings import Surroundings
+from lidarsim.sensor import Survey, Track
+from lidarsim.sensor.sensor import LineSensor
+from lidarsim.sensor.trajectory import full_poses, matrices, quaternions_of, velocities
+
 from .build import Built
 from .placing import seen_from, surroundings_of
 

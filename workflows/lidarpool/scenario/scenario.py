@@ -11,17 +11,18 @@ from typing import Annotated, Any
 
 from pydantic import PrivateAttr
 
-from ..base.declared import Several, Text, about, by_text
-from ..base.errors import LidarpoolError, Mistakes, prefixed
-from ..base.validation import sentences
-from ..base.yamlfile import read_yaml
-from ..columns.table import COLOURS
-from ..sensor import Fault, Material, Navigation
-from ..sensor.materials import ClassNames
-from ..sensor.survey import SENSORS_MOST, CloudOptions, StepCount
-from ..sensor.trajectory import CENTRE
-from ..sensor.trajectory_files import files_of_trajectory
-from ..sensor.weather import Weather
+from lidarsim.base.declared import Several, Text, about, by_text
+from lidarsim.base.errors import LidarError, Mistakes, prefixed
+from lidarsim.base.validation import sentences
+from lidarsim.base.yamlfile import read_yaml
+from lidarsim.columns.table import COLOURS
+from lidarsim.sensor import Fault, Material, Navigation
+from lidarsim.sensor.materials import ClassNames
+from lidarsim.sensor.survey import SENSORS_MOST, CloudOptions, StepCount
+from lidarsim.sensor.trajectory import CENTRE
+from lidarsim.sensor.trajectory_files import files_of_trajectory
+from lidarsim.sensor.weather import Weather
+
 from .actor_motion import ActorSection, CarriedEntry, MountEntry, TrafficSection, TrajectoryEntry
 from .sections import (
     CopiesSection,
@@ -92,7 +93,7 @@ class Scenario(Section):
     Raises
     ------
     pydantic.ValidationError
-        If a value is out of range; `load` and `from_data` raise LidarpoolError.
+        If a value is out of range; `load` and `from_data` raise LidarError.
     """
 
     scene: Annotated[SceneSection, scene_in_short] = SceneSection()
@@ -199,7 +200,7 @@ class Scenario(Section):
 
         Raises
         ------
-        LidarpoolError
+        LidarError
             With the file, the field, what was given and what is allowed.
         """
         path = Path(path)
@@ -207,7 +208,7 @@ class Scenario(Section):
         data = mesh_data([path], path.parent, options) if mesh else read_yaml(path)
         if options and not mesh:
             name = next(iter(options))
-            raise LidarpoolError(
+            raise LidarError(
                 f"--{name.replace('_', '-')} is for a mesh file: in {path}"
                 f"{', or rather its base' * ('base' in data)}, change {MESH_OPTIONS[name]}."
             )
@@ -230,7 +231,7 @@ class Scenario(Section):
 
         Raises
         ------
-        LidarpoolError
+        LidarError
             As `load`.
         """
         return cls().with_sections(data, source=source, folder=Path(folder))
@@ -240,7 +241,7 @@ class Scenario(Section):
     ) -> Scenario:
         """Return the scenario with other sections; the rest of it is not checked again.
 
-        LidarpoolError as `load`.
+        LidarError as `load`.
         """
         with sentences(Scenario, source):
             made = Scenario.model_validate(data)
@@ -251,7 +252,7 @@ class Scenario(Section):
         return scenario
 
     def _check(self) -> None:
-        """Raise LidarpoolError if fields do not fit together."""
+        """Raise LidarError if fields do not fit together."""
         mistakes, wrong, planning = Mistakes(), [], self.planning
         # The default objects have a start and a target.
         lacking = 0 if self.scene.has_seed else [planning.start, planning.target].count(None)

@@ -11,7 +11,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, model_validator
 
-from ..base.declared import (
+from lidarsim.base.declared import (
     AngleDeg,
     Coordinate,
     Ends,
@@ -29,17 +29,18 @@ from ..base.declared import (
     one_of,
     short,
 )
-from ..base.validation import STRICT
-from ..base.vocabulary import BACKENDS, UNITS_M
+from lidarsim.base.validation import STRICT
+from lidarsim.base.vocabulary import BACKENDS, UNITS_M
+from lidarsim.scene.files.meshfile import OpacityMode
+from lidarsim.scene.transform import Transform
+from lidarsim.sensor import Mounted, Noise, Pose, Returns, Sensor
+from lidarsim.sensor.beams import Rate, Step
+from lidarsim.sensor.materials import SemanticClass
+from lidarsim.sensor.models import MODEL_FILES, Sheet, load_sensor
+from lidarsim.sensor.sensor import Fov, Layers, MaxRange, MinRange, RaysPerRevolution, Sector
+
 from ..export.formats import Format
 from ..plan.planning import Search
-from ..scene.files.meshfile import OpacityMode
-from ..scene.transform import Transform
-from ..sensor import Mounted, Noise, Pose, Returns, Sensor
-from ..sensor.beams import Rate, Step
-from ..sensor.materials import SemanticClass
-from ..sensor.models import MODEL_FILES, Sheet, load_sensor
-from ..sensor.sensor import Fov, Layers, MaxRange, MinRange, RaysPerRevolution, Sector
 
 COPIES_MOST = 1_000_000  # of one entry
 PathOf = Callable[[str], Path]  # of a file that a scenario names
@@ -429,7 +430,7 @@ class SensorSection(Section):
         returns: ReturnsSection,
         name: str = "",
     ) -> Mounted:
-        """Return the lidar on its carrier; LidarpoolError if its files cannot be used.
+        """Return the lidar on its carrier; LidarError if its files cannot be used.
 
         `path` returns those of files. Equal sections have the same sensor, unless their files have
         changed. A sensor with a data sheet has noise and returns of its own: those of the sheet,

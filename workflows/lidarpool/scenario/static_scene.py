@@ -9,26 +9,27 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..base.arrays import Floats
-from ..base.errors import LidarpoolError, Mistakes, prefixed
-from ..base.tables import NUMBERS, Quantity, read_table
-from ..base.textfile import read_text
-from ..base.words import plural
-from ..scene.actors import Actor, box, one_mesh
-from ..scene.files.meshfile import ROBOTS, Objects, load_objects
-from ..scene.files.scene_graph import Raster
-from ..scene.files.urdf import load_robot
-from ..scene.object_names import told_apart
-from ..scene.robot import Robot
-from ..scene.scene import Scene
-from ..scene.scene_instances import SceneInstance
-from ..scene.scene_mesh import SceneMesh
-from ..scene.shapes import seed_objects
-from ..scene.transform import Transform, affine
-from ..scene.wheels import rolling
-from ..sensor.calibrations import said
-from ..sensor.pose_columns import ANGLES, POSITION, REFUSED_COLUMNS, angles_of, with_yaw
-from ..sensor.trajectory import rotations_of
+from lidarsim.base.arrays import Floats
+from lidarsim.base.errors import LidarError, Mistakes, prefixed
+from lidarsim.base.tables import NUMBERS, Quantity, read_table
+from lidarsim.base.textfile import read_text
+from lidarsim.base.words import plural
+from lidarsim.scene.actors import Actor, box, one_mesh
+from lidarsim.scene.files.meshfile import ROBOTS, Objects, load_objects
+from lidarsim.scene.files.scene_graph import Raster
+from lidarsim.scene.files.urdf import load_robot
+from lidarsim.scene.object_names import told_apart
+from lidarsim.scene.robot import Robot
+from lidarsim.scene.scene import Scene
+from lidarsim.scene.scene_instances import SceneInstance
+from lidarsim.scene.scene_mesh import SceneMesh
+from lidarsim.scene.shapes import seed_objects
+from lidarsim.scene.transform import Transform, affine
+from lidarsim.scene.wheels import rolling
+from lidarsim.sensor.calibrations import said
+from lidarsim.sensor.pose_columns import ANGLES, POSITION, REFUSED_COLUMNS, angles_of, with_yaw
+from lidarsim.sensor.trajectory import rotations_of
+
 from .ground import Standing
 from .scenario import Scenario
 from .sections import (
@@ -101,7 +102,7 @@ def read_static_scene(scenario: Scenario) -> StaticScene:
 
     Raises
     ------
-    LidarpoolError
+    LidarError
         If a file cannot be read, or copies have no place.
     """
     section, found = scenario.scene, Findings()
@@ -157,7 +158,7 @@ class Shapes:
         return made[key]
 
     def robot(self, entry: MeshFile) -> Robot:
-        """Return the robot of a file; LidarpoolError if it cannot be used."""
+        """Return the robot of a file; LidarError if it cannot be used."""
         if entry not in self._robots:
             path, tell = self.scenario.path(entry.file), self.found.notes.append
             colours = self.scenario.coloured
@@ -169,7 +170,7 @@ class Shapes:
         return self._robots[entry]
 
     def read(self, entry: MeshFile, animation: str | None = None) -> Objects:
-        """Read the objects of a file, with an animation; LidarpoolError if it cannot be used."""
+        """Read the objects of a file, with an animation; LidarError if it cannot be used."""
         scenario, found = self.scenario, self.found
         with prefixed(scenario.source):
             transform = entry.transform()
@@ -195,7 +196,7 @@ class Shapes:
     def _still_robot(self, entry: MeshFile, transform: Transform) -> Objects:
         """Return a robot with its joints at zero."""
         if other := sorted(entry.model_fields_set - _OF_ROBOTS):
-            raise LidarpoolError(
+            raise LidarError(
                 f"{self.scenario.path(entry.file)} is a robot, which is in metres and Z-up: leave "
                 f"out {' and '.join(other)}."
             )
@@ -271,7 +272,7 @@ def copies_of(
 
     Raises
     ------
-    LidarpoolError
+    LidarError
         If a table cannot be read, a place has no surface to stand on, or there is no room.
     """
     if entry.scatter is not None:
@@ -288,12 +289,12 @@ def copies_of(
             places[low, 2], _ = standing.under(places[low, :2])
         if len(low := np.flatnonzero(np.isnan(places[:, 2]))):
             x, y = places[low[0], :2].tolist()
-            raise LidarpoolError(
+            raise LidarError(
                 f"below x {x:g}, y {y:g} nothing of the scene's files or ground faces up to stand "
                 f"on ({plural(len(low), 'copy', 'copies')}): give z."
             )
         if (np.abs(scales) < SCALE_LEAST).any():
-            raise LidarpoolError(
+            raise LidarError(
                 f"a scale of {scales.flat[np.abs(scales).argmin()]:g} would flatten the mesh: give "
                 f"at least {SCALE_LEAST:g}."
             )
@@ -316,11 +317,11 @@ def _of_table(path: Path, table: CopyTable) -> tuple[Floats, Floats, Floats]:
         )
         if "scale" in columns and any(name in columns for name in _SCALES):
             raise ValueError("it has both scale and scales of axes: ignore one")
-    except (OSError, ValueError, LidarpoolError) as error:
-        raise LidarpoolError(f"{path} is not a usable table of copies: {said(error)}") from error
+    except (OSError, ValueError, LidarError) as error:
+        raise LidarError(f"{path} is not a usable table of copies: {said(error)}") from error
     count = len(columns["x"])
     if count > COPIES_MOST:
-        raise LidarpoolError(f"{path} has {count:,} rows; at most {COPIES_MOST:,} are allowed.")
+        raise LidarError(f"{path} has {count:,} rows; at most {COPIES_MOST:,} are allowed.")
 
     def some(names: Sequence[str], default: Any) -> Floats:
         return np.stack([columns.get(name, np.full(count, default)) for name in names], axis=1)
@@ -345,7 +346,7 @@ def _scattered(given: Scatter, name: str, standing: Standing) -> tuple[Floats, F
     drawn = 0
     while len(found) < given.count:
         if drawn > max(DRAWS_LEAST, DRAWS_MOST * given.count):
-            raise LidarpoolError(
+            raise LidarError(
                 f"only {len(found):,} of {given.count:,} found room on {', '.join(given.surfaces)} "
                 f"within x {x0:.6g} to {x1:.6g}, y {y0:.6g} to {y1:.6g}: take fewer, a smaller "
                 "spacing_m, or other surfaces."

@@ -12,12 +12,12 @@ from xml.etree.ElementTree import Element
 
 import numpy as np
 
-from ...base.arrays import Floats
-from ...base.errors import LidarpoolError, explained, prefixed
-from ...base.input_files import read_input
-from ...base.words import did_you_mean
-from ...base.xmlfile import xml_root
-from ...scene.transform import rotation_about
+from lidarsim.base.arrays import Floats
+from lidarsim.base.errors import LidarError, explained, prefixed
+from lidarsim.base.input_files import read_input
+from lidarsim.base.words import did_you_mean
+from lidarsim.base.xmlfile import xml_root
+from lidarsim.scene.transform import rotation_about
 
 # Where a checkout of HELIOS++ has what its surveys call data/scanners_als.xml.
 _PACKAGE = Path("python/pyhelios")
@@ -41,11 +41,11 @@ class Assets:
         self.root = cache(_root)
 
     def file(self, name: str) -> Path:
-        """Find a file; LidarpoolError if it is nowhere."""
+        """Find a file; LidarError if it is nowhere."""
         for place in self.places:
             if (place / name).is_file():
                 return place / name
-        raise LidarpoolError(
+        raise LidarError(
             f"there is no file {name!r} in the survey's folder or one above it: give the folder "
             "that it starts from, --assets DIR."
         )
@@ -56,9 +56,7 @@ class Assets:
         path = self.file(file) if file else home
         known = {element.get("id", ""): element for element in self.root(path).findall(kind)}
         if name not in known:
-            raise LidarpoolError(
-                f"there is no <{kind}> {name!r} in {path}.{did_you_mean(name, known)}"
-            )
+            raise LidarError(f"there is no <{kind}> {name!r} in {path}.{did_you_mean(name, known)}")
         return Asset(known[name], path)
 
     def settings(self, element: Element | None, home: Path, depth: int = 0) -> dict[str, str]:
@@ -69,27 +67,27 @@ class Assets:
         if (template := own.pop("template", None)) is None:
             return own
         if depth == _TEMPLATES_MOST:
-            raise LidarpoolError(f"the template {template!r} names itself, or too many others.")
+            raise LidarError(f"the template {template!r} names itself, or too many others.")
         under = self.asset(template, element.tag, home)
         return self.settings(*under, depth + 1) | own
 
 
 def _root(path: Path) -> Element:
-    """Return the <document> of a file; LidarpoolError if it is none."""
+    """Return the <document> of a file; LidarError if it is none."""
     try:
         with explained(f"{path} cannot be read"):
             root = xml_root(read(path))
     except (ElementTree.ParseError, ValueError, LookupError) as error:
-        raise LidarpoolError(f"{path} is not readable XML: {error}.") from error
+        raise LidarError(f"{path} is not readable XML: {error}.") from error
     if root.tag != "document":
-        raise LidarpoolError(
+        raise LidarError(
             f"{path} is XML, but not of HELIOS++: it begins with <{root.tag[:40]}>, not <document>."
         )
     return root
 
 
 def read(path: Path) -> bytes:
-    """Read a file; LidarpoolError if it is no plain file or larger than the memory."""
+    """Read a file; LidarError if it is no plain file or larger than the memory."""
     with explained(f"{path} cannot be read"), prefixed(path):
         return read_input(path)
 
@@ -102,7 +100,7 @@ def number(values: Element | dict[str, str], name: str, default: float) -> float
     with suppress(ValueError):
         if np.isfinite(value := float(text)):
             return value
-    raise LidarpoolError(f"{name} is {text!r}; it must be a number.")
+    raise LidarError(f"{name} is {text!r}; it must be a number.")
 
 
 def flag(values: dict[str, str], name: str, default: bool) -> bool:
@@ -124,7 +122,7 @@ def rotation(element: Element | None) -> Floats:
     for step in () if element is None else element.findall("rot"):
         axis = step.get("axis", "").lower()
         if axis not in ("x", "y", "z"):
-            raise LidarpoolError(f"<rot> has the axis {axis!r}; it must be x, y or z.")
+            raise LidarError(f"<rot> has the axis {axis!r}; it must be x, y or z.")
         turn = rotation_about(np.eye(3)["xyz".index(axis)], number(step, "angle_deg", 0.0))
         local = element is not None and element.get("rotations") == "local"
         out = out @ turn if local else turn @ out

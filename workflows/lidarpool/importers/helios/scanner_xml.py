@@ -15,9 +15,10 @@ from xml.etree.ElementTree import Element
 
 import numpy as np
 
-from ...base.arrays import Floats
-from ...base.errors import LidarpoolError
-from ...scene.transform import rotation_about as about
+from lidarsim.base.arrays import Floats
+from lidarsim.base.errors import LidarError
+from lidarsim.scene.transform import rotation_about as about
+
 from .files import clean, number, rotation, vector
 
 _Z = np.array([0.0, 0.0, 1.0])
@@ -112,16 +113,16 @@ def device(scanner: HeliosScanner, settings: dict[str, str]) -> Device:
 
     Raises
     ------
-    LidarpoolError
+    LidarError
         If its optics are of a kind that there is no sensor for, or its settings make no line.
     """
     supported = scanner.values.get("pulseFreqs_Hz", "").split(",")[0] or "0"
     pulses = number({"pulseFreq_hz": supported} | settings, "pulseFreq_hz", 0)
     if pulses <= 0:
-        raise LidarpoolError(f"{scanner.name} has no pulseFreq_hz above 0.")
+        raise LidarError(f"{scanner.name} has no pulseFreq_hz above 0.")
     optics = scanner.values.get("optics", "")
     if optics not in ("rotating", *_OPTICS):
-        raise LidarpoolError(
+        raise LidarError(
             f"{scanner.name} has the optics {optics!r}; there are rotating, {', '.join(_OPTICS)}."
         )
     axis = vector(scanner.child("headRotateAxis"))
@@ -138,12 +139,12 @@ def device(scanner: HeliosScanner, settings: dict[str, str]) -> Device:
     if head:
         tilt = _tilt(rotation(emitter))
         if line is None or tilt is None or abs(axis[2]) < (1 - 1e-12) * np.linalg.norm(axis):
-            raise LidarpoolError(
+            raise LidarError(
                 f"the head of {scanner.name} turns; only one with rotating optics may, whose lines "
                 "hold the axis z that it turns about."
             )
         if range_deg * head <= 0:
-            raise LidarpoolError(
+            raise LidarError(
                 f"the head of {scanner.name} turns at {head:g} degrees a second from {start:g}, "
                 f"never to {start + range_deg:g}."
             )
@@ -216,7 +217,7 @@ class _Line:
         first = floor((low + most) / step + _SLACK) + 1
         last = min(floor((high + most) / step + _SLACK), of_all - 1)
         if last < first:
-            raise LidarpoolError(
+            raise LidarError(
                 f"lines of {scanner.name} from {low:g} to {high:g} degrees hold no pulse."
             )
         return cls(first * step - most, step, last - first + 1, of_all, pulse_hz, scan_hz)
@@ -224,7 +225,7 @@ class _Line:
     def standing(self) -> ScannerSection:
         """Return a mirror whose firings are pulses."""
         if not self.scan_hz:
-            raise LidarpoolError("scanFreq_hz is 0, and no head turns.")
+            raise LidarError("scanFreq_hz is 0, and no head turns.")
         width = self.count * self.step_deg
         mirror = {
             "motion": "sawtooth",
@@ -277,7 +278,7 @@ def _oscillating(
     half = min(number(settings, "scanAngle_deg", 0), most)
     firings = floor(pulse_hz / scan_hz + _SLACK)
     if half <= 0 or not firings:
-        raise LidarpoolError(f"{scanner.name} has no scanAngle_deg above 0, or no pulse in a line.")
+        raise LidarError(f"{scanner.name} has no scanAngle_deg above 0, or no pulse in a line.")
     mirror = {"motion": "triangle", "width_deg": clean(2 * half)}
     return _mirror(firings, pulse_hz / firings, mirror), _LINE
 
@@ -293,7 +294,7 @@ def _cone(scanner: HeliosScanner, settings: dict[str, str], pulse_hz: float) -> 
     """Make a wedge that turns (Palmer); always at its greatest rate, as in HELIOS++."""
     rate_hz = scanner.number("scanFreqMax_Hz")
     if rate_hz <= 0:
-        raise LidarpoolError(f"{scanner.name} has no scanFreqMax_Hz above 0.")
+        raise LidarError(f"{scanner.name} has no scanFreqMax_Hz above 0.")
     beams = {"elevation_deg": [clean(90 - _half(scanner, settings))]}
     return {"firing_us": _us(1, pulse_hz), "rate_hz": rate_hz, "beams": beams}, _CONE
 
@@ -312,7 +313,7 @@ def _prisms(scanner: HeliosScanner, settings: dict[str, str], pulse_hz: float) -
         if abs(angle := scanner.number(f"angle{i}_deg")) > 1e-6
     ]
     if not prisms:
-        raise LidarpoolError(f"{scanner.name} has no prisms.")
+        raise LidarError(f"{scanner.name} has no prisms.")
     made: dict[str, Any] = {"firing_us": _us(1, pulse_hz), "rate_hz": _FRAME_HZ, "prisms": prisms}
     if (incident := scanner.child("incidentBeam")) is not None:
         x, y, z = _PRISM.T @ vector(incident)
@@ -337,7 +338,7 @@ def _half(scanner: HeliosScanner, settings: dict[str, str]) -> float:
     most = scanner.number("scanAngleMax_deg")
     half = min(max(number(settings, "scanAngle_deg", 0), 0), most) or most
     if half <= 0:
-        raise LidarpoolError(f"{scanner.name} has no scanAngleMax_deg above 0.")
+        raise LidarError(f"{scanner.name} has no scanAngleMax_deg above 0.")
     return half
 
 
@@ -348,7 +349,7 @@ def _scan_hz(
     rate_hz = number(settings, "scanFreq_hz", 0) if wished is None else wished
     least, most = scanner.number("scanFreqMin_Hz"), scanner.number("scanFreqMax_Hz") or np.inf
     if not least <= rate_hz <= most or rate_hz <= 0:
-        raise LidarpoolError(
+        raise LidarError(
             f"{scanner.name} cannot scan at scanFreq_hz {rate_hz:g}: {least:g} to {most:g}, above "
             "0."
         )

@@ -14,20 +14,21 @@ from xml.etree.ElementTree import Element
 
 import numpy as np
 
-from ...base.arrays import Floats
-from ...base.errors import LidarpoolError, prefixed
-from ...base.input_files import read_input_text
-from ...scene.actors import one_mesh
-from ...scene.files.meshfile import load_meshes
-from ...scene.floor import heights_at
-from ...scene.object_names import unique_names
-from ...scene.point_scene import surfels
-from ...scene.scene import Scene
-from ...scene.scene_instances import SceneInstance
-from ...scene.scene_mesh import SceneMesh
-from ...scene.simplified import Drawn
-from ...scene.transform import Transform
-from ...sensor import Pose
+from lidarsim.base.arrays import Floats
+from lidarsim.base.errors import LidarError, prefixed
+from lidarsim.base.input_files import read_input_text
+from lidarsim.scene.actors import one_mesh
+from lidarsim.scene.files.meshfile import load_meshes
+from lidarsim.scene.floor import heights_at
+from lidarsim.scene.object_names import unique_names
+from lidarsim.scene.scene import Scene
+from lidarsim.scene.scene_instances import SceneInstance
+from lidarsim.scene.scene_mesh import SceneMesh
+from lidarsim.scene.simplified import Drawn
+from lidarsim.scene.transform import Transform
+from lidarsim.sensor import Pose
+
+from ...scenario.point_scene import surfels
 from .files import Assets, clean, number, read, rotation
 
 _LOADERS = ("objloader", "detailedvoxels", "geotiffloader", "xyzloader")
@@ -134,7 +135,7 @@ class HeliosScene:
             with prefixed(f"{name}, part {index}"):
                 self.parts += self._read(part, f"part {index}", assets)
         if not self.parts:
-            raise LidarpoolError(
+            raise LidarError(
                 f"{name} has no part that can be read: only those of {' and '.join(_LOADERS)} are."
             )
         for one in self.parts:
@@ -179,12 +180,12 @@ class HeliosScene:
                 offset = _numbers(text.get("offset", ""), 3)
                 falls = text.get("onGround", "0") != "0"
             else:
-                raise LidarpoolError(
+                raise LidarError(
                     f"the filter {kind!r} is not known; there are {', '.join(_LOADERS)}, rotate, "
                     "scale, translate."
                 )
         if not files:
-            raise LidarpoolError("no filter loads a file.")
+            raise LidarError("no filter loads a file.")
         up = up if up in ("y", "z") else None
         place = up, turn, float(scale)
         for file, mesh in zip(files, cycle(points)):
@@ -280,13 +281,13 @@ def _files(text: dict[str, str], assets: Assets) -> list[Path]:
     try:
         fits = re.compile(names)
     except re.error as error:
-        raise LidarpoolError(f"efilepath is {text['efilepath']!r}: {error}.") from error
+        raise LidarError(f"efilepath is {text['efilepath']!r}: {error}.") from error
     for place in assets.places:
         if (place / folder).is_dir():
             found = sorted(p for p in (place / folder).iterdir() if fits.fullmatch(p.name))
             if found:
                 return found
-    raise LidarpoolError(f"no file fits the efilepath {text['efilepath']!r}.")
+    raise LidarError(f"no file fits the efilepath {text['efilepath']!r}.")
 
 
 def _surfels(path: Path, given: dict[str, str]) -> SceneMesh:
@@ -297,14 +298,14 @@ def _surfels(path: Path, given: dict[str, str]) -> SceneMesh:
         points = np.loadtxt(lines, comments="//", usecols=(0, 1, 2), ndmin=2)
         return surfels(path, points, number(given, "voxelSize", 1.0) or 1.0)
     except ValueError as error:
-        raise LidarpoolError(f"{path} has rows that are no points: {error}.") from error
+        raise LidarError(f"{path} has rows that are no points: {error}.") from error
 
 
 def _text(path: Path) -> str:
     """Content of a file that may be missing; then empty."""
     try:
         return read_input_text(path, "replace")
-    except (OSError, ValueError, LidarpoolError):  # a zero in the name
+    except (OSError, ValueError, LidarError):  # a zero in the name
         return ""
 
 
@@ -315,5 +316,5 @@ def _numbers(text: str, count: int) -> Floats:
     except ValueError:
         values = np.full(0, np.nan)
     if values.shape != (count,) or not np.isfinite(values).all():
-        raise LidarpoolError(f"{text!r} is not {count} number{'s' * (count > 1)}.")
+        raise LidarError(f"{text!r} is not {count} number{'s' * (count > 1)}.")
     return values

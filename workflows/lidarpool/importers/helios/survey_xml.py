@@ -15,16 +15,17 @@ from xml.etree.ElementTree import Element
 import numpy as np
 import yaml
 
-from ...base.arrays import Floats
-from ...base.errors import LidarpoolError, prefixed
+from lidarsim.base.arrays import Floats
+from lidarsim.base.errors import LidarError, prefixed
+from lidarsim.scene.scene import Scene
+from lidarsim.scene.scene_file import write_scene
+from lidarsim.scene.transform import rotation_about
+from lidarsim.sensor import Pose
+from lidarsim.sensor.disc import SUBRAYS
+from lidarsim.sensor.survey import SENSORS_MOST
+
 from ...scenario.build import build
 from ...scenario.scenario import Scenario
-from ...scene.scene import Scene
-from ...scene.scene_file import write_scene
-from ...scene.transform import rotation_about
-from ...sensor import Pose
-from ...sensor.disc import SUBRAYS
-from ...sensor.survey import SENSORS_MOST
 from .files import Assets, clean, number, rotation, vector
 from .scanner_xml import Device, channels, device, unread
 from .scene_xml import HeliosScene
@@ -62,19 +63,19 @@ def import_survey(
 
     Raises
     ------
-    LidarpoolError
+    LidarError
         If a file is missing or broken, or an essential feature is not supported; nothing is
         written then.
     """
     survey, out = Path(survey), Path(out)
     if out.exists():
-        raise LidarpoolError(f"{out} exists: name another folder, --out DIR.")
+        raise LidarError(f"{out} exists: name another folder, --out DIR.")
     try:
         made = _Import(survey, [Path(folder) for folder in assets], out)
-    except LidarpoolError as error:
+    except LidarError as error:
         told = str(error)
         told = told if told.startswith(str(survey)) else f"{survey}: {told}"
-        raise LidarpoolError(told) from error
+        raise LidarError(told) from error
     out.parent.mkdir(parents=True, exist_ok=True)
     partial = Path(tempfile.mkdtemp(prefix=f".{out.name}.", dir=out.parent))
     try:
@@ -87,9 +88,9 @@ def import_survey(
         build(scenario)  # with whatever is wrong about it
         partial.chmod(0o755)  # temporary folders are their owner's alone
         partial.rename(out)
-    except LidarpoolError as error:
+    except LidarError as error:
         told = str(error).replace(str(partial), str(out))
-        raise LidarpoolError(f"{survey} makes no scenario: {told}") from error
+        raise LidarError(f"{survey} makes no scenario: {told}") from error
     finally:
         shutil.rmtree(partial, ignore_errors=True)
     return Imported(out / SCENARIO_FILE, Scenario.load(out / SCENARIO_FILE), made.left_out)
@@ -102,7 +103,7 @@ class _Import:
         self._home, self._assets = survey, Assets(survey, folders)
         element = self._assets.root(survey).find("survey")
         if element is None:
-            raise LidarpoolError("it has no <survey>.")
+            raise LidarError("it has no <survey>.")
         self._element, self._name = element, element.get("name") or survey.stem
         self._scanners = channels(self._asset("scanner"))
         self._first = next(iter(self._scanners.values()))
@@ -112,9 +113,9 @@ class _Import:
         self._sensors: dict[str, dict[str, Any]] = {}
         self._way = self._carry()
         if not self._sensors:
-            raise LidarpoolError("no leg scans anything.")
+            raise LidarError("no leg scans anything.")
         if len(self._sensors) > SENSORS_MOST:
-            raise LidarpoolError(
+            raise LidarError(
                 f"{len(self._sensors)} legs and channels scan; a scenario has {SENSORS_MOST} "
                 "sensors at most."
             )
@@ -130,7 +131,7 @@ class _Import:
 
     def _asset(self, kind: str) -> Element:
         if not (reference := self._element.get(kind)):
-            raise LidarpoolError(f"its <survey> names no {kind}.")
+            raise LidarError(f"its <survey> names no {kind}.")
         return self._assets.asset(reference, kind, self._home).element
 
     def _carry(self) -> Way:

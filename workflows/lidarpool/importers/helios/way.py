@@ -12,10 +12,11 @@ from xml.etree.ElementTree import Element
 
 import numpy as np
 
-from ...base.arrays import Floats
-from ...base.errors import LidarpoolError, prefixed
-from ...scene.transform import rotation_about as about
-from ...sensor.trajectory import quaternions_of
+from lidarsim.base.arrays import Floats
+from lidarsim.base.errors import LidarError, prefixed
+from lidarsim.scene.transform import rotation_about as about
+from lidarsim.sensor.trajectory import quaternions_of
+
 from .files import Assets, clean, flag, number, read, vector
 
 _SPEED = 70.0  # metres a second, where nothing is said
@@ -89,7 +90,7 @@ def read_legs(
             longest = number(element, "maxDuration_s", number(scanner, "maxDuration_s", -1))
         legs.append(Leg(index, place, scanner, platform, longest if longest > 0 else np.inf))
     if not legs:
-        raise LidarpoolError("its <survey> has no <leg>.")
+        raise LidarError("its <survey> has no <leg>.")
     return legs
 
 
@@ -103,7 +104,7 @@ def flown(legs: Sequence[Leg]) -> Way:
             continue
         speed = number(leg.platform, "movePerSec_m", _SPEED)
         if speed <= 0:
-            raise LidarpoolError(f"leg {leg.number}: movePerSec_m is {speed:g}; it never ends.")
+            raise LidarError(f"leg {leg.number}: movePerSec_m is {speed:g}; it never ends.")
         seconds = min(length / speed, leg.longest_s)
         if way[:2].any():
             yaw = float(np.degrees(np.arctan2(way[1], way[0])))
@@ -112,7 +113,7 @@ def flown(legs: Sequence[Leg]) -> Way:
         stretches.append(Stretch(leg.number, leg.active, clock, seconds))
         clock, here = clock + seconds + _BETWEEN_S, there
     if not rows:
-        raise LidarpoolError("its platform moves, and no two legs are at different places.")
+        raise LidarError("its platform moves, and no two legs are at different places.")
     rows.append([clock + _AFTER_S, *here, yaw])
     return Way(np.array(rows), stretches)
 
@@ -125,7 +126,7 @@ def stood(legs: Sequence[Leg], heads: dict[int, float]) -> Way:
             continue
         seconds = min(heads[leg.number] or np.inf, leg.longest_s)
         if seconds == np.inf:
-            raise LidarpoolError(
+            raise LidarError(
                 f"leg {leg.number}: nothing moves, neither platform nor head, and there is no "
                 "maxDuration_s; it never ends."
             )
@@ -134,7 +135,7 @@ def stood(legs: Sequence[Leg], heads: dict[int, float]) -> Way:
         stretches.append(Stretch(leg.number, True, clock, seconds))
         clock += seconds + _BETWEEN_S
     if not rows:
-        raise LidarpoolError("no leg scans anything.")
+        raise LidarError("no leg scans anything.")
     rows.append([clock + _AFTER_S, *rows[-1][1:]])
     return Way(np.array(rows), stretches)
 
@@ -143,7 +144,7 @@ def read_way(survey: Element, legs: Sequence[Leg], assets: Assets) -> Way:
     """Read the file of an interpolated platform; each leg is a stretch of it."""
     files = {leg.platform.get("trajectory", "") for leg in legs}
     if len(files) != 1 or "" in files:
-        raise LidarpoolError("an interpolated platform needs one trajectory, the same in all legs.")
+        raise LidarError("an interpolated platform needs one trajectory, the same in all legs.")
     path = assets.file(files.pop())
     settings: dict[str, str] = {}
     for leg in reversed(legs):
@@ -151,7 +152,7 @@ def read_way(survey: Element, legs: Sequence[Leg], assets: Assets) -> Way:
     columns = _columns(read(path).decode("utf-8", "replace"), settings)
     times, first = np.unique(columns["t"], return_index=True)
     if len(times) < 2:
-        raise LidarpoolError(f"{path} is no trajectory: all its rows have one time.")
+        raise LidarError(f"{path} is no trajectory: all its rows have one time.")
     columns = {name: column[first] for name, column in columns.items()}
     turns = np.broadcast_to(np.eye(3), (len(times), 3, 3))
     if settings.get("interpolationDomain") != "position" and "yaw" in columns:
@@ -164,7 +165,7 @@ def read_way(survey: Element, legs: Sequence[Leg], assets: Assets) -> Way:
         begin = max(number(leg.platform, "tStart", times[0]), times[0])
         end = min(number(leg.platform, "tEnd", times[-1]), times[-1], begin + leg.longest_s)
         if end <= begin:
-            raise LidarpoolError(f"leg {leg.number}: tStart and tEnd lie outside the trajectory.")
+            raise LidarError(f"leg {leg.number}: tStart and tEnd lie outside the trajectory.")
         start_s = float(begin - times[0])
         stretches.append(Stretch(leg.number, leg.active, start_s, float(end - begin)))
     places = [columns[axis] for axis in "xyz"]
@@ -179,7 +180,7 @@ def _turned(kind: str, roll: float, pitch: float, yaw: float) -> Floats:
         return about(_X, roll) @ about(_Y, pitch) @ about(_Z, yaw)
     if kind == "ARINC 705":
         return about(-_Z, yaw) @ about(_Y, roll) @ about(_X, pitch)
-    raise LidarpoolError(f"rotationSpec is {kind!r}; there are ARINC 705 and CANONICAL.")
+    raise LidarError(f"rotationSpec is {kind!r}; there are ARINC 705 and CANONICAL.")
 
 
 def _columns(text: str, settings: dict[str, str]) -> dict[str, Floats]:
@@ -190,9 +191,9 @@ def _columns(text: str, settings: dict[str, str]) -> dict[str, Floats]:
     try:
         rows = np.array([[float(word) for word in line.split(separator)] for line in lines])
     except ValueError as error:
-        raise LidarpoolError(f"its trajectory has rows that are not alike: {error}.") from error
+        raise LidarError(f"its trajectory has rows that are not alike: {error}.") from error
     if rows.ndim != 2 or not np.isfinite(rows).all():
-        raise LidarpoolError("its trajectory is not a table of numbers.")
+        raise LidarError("its trajectory is not a table of numbers.")
     width = rows.shape[1]
     header = re.search(r"^#\s*HEADER:(.*)$", text, re.MULTILINE)
     if any(f"{name}Index" in settings for name in usual):
@@ -204,16 +205,16 @@ def _columns(text: str, settings: dict[str, str]) -> dict[str, Floats]:
         names = ["t", "x", "y", "z"] if width == 4 else usual
     listed = f"its trajectory has {width} columns, named {', '.join(names)}"
     if len(names) != width or not {"t", "x", "y", "z"} <= {*names}:
-        raise LidarpoolError(f"{listed}; it needs t, x, y and z.")
+        raise LidarError(f"{listed}; it needs t, x, y and z.")
     used = [name for name in names if name]  # indices leave out the others
     unknown = [name for name in used if name not in usual]
     if unknown or len(set(used)) < len(used):
         fault = f"{unknown[0]!r} is not known" if unknown else "a name is there twice"
-        raise LidarpoolError(
+        raise LidarError(
             f"{listed}, and {fault}: name those to read by their indices, such as tIndex and "
             "xIndex, in platformSettings."
         )
     angles = {"roll", "pitch", "yaw"}.intersection(used)
     if angles and len(angles) < 3:
-        raise LidarpoolError(f"{listed}; it needs roll, pitch and yaw, or none of them.")
+        raise LidarError(f"{listed}; it needs roll, pitch and yaw, or none of them.")
     return {name: column for name, column in zip(names, rows.T, strict=True) if name}

@@ -20,18 +20,19 @@ from jinja2 import Environment, PackageLoader, StrictUndefined, Template
 from markupsafe import Markup
 from PIL import Image
 
-from ...base.arrays import Ints
-from ...base.declared import declared
-from ...base.errors import explained
-from ...base.storage import Storage
-from ...base.words import natural, plural, shortened, without_common_prefix
+from lidarsim.base.arrays import Ints
+from lidarsim.base.declared import declared
+from lidarsim.base.errors import explained
+from lidarsim.base.storage import Storage
+from lidarsim.base.words import natural, plural, shortened, without_common_prefix
+from lidarsim.sensor import Noise, Returns
+from lidarsim.sensor.weather import Weather
+
 from ...pipeline.placement import TaskRecord
 from ...pipeline.task_book import StageTotals, union
 from ...render.stage import nice_step
 from ...run.run_result import RunResult
 from ...scenario.scenario import Scenario
-from ...sensor import Noise, Returns
-from ...sensor.weather import Weather
 from ..report import STAGES, CountedCloud, in_order
 
 SCENARIO_MOST = 50_000  # letters of the scenario; a survey may have a million poses
@@ -78,7 +79,7 @@ def write_page(
 def put_picture(page: Path, name: str, svg: str) -> None:
     """Put a picture in its place in a page that `write_page` wrote; other pages stay as they are.
 
-    LidarpoolError if it cannot be written.
+    LidarError if it cannot be written.
     """
     place = re.compile(rf'(<figure data-picture="{name}").*?(?=<figcaption>)', re.DOTALL)
     with explained(f"{page} cannot be written"):

@@ -1,0 +1,134 @@
+"""How much memory the content of a file may take: a few lines can unpack to any amount."""
+
+from __future__ import annotations
+
+from contextlib import suppress
+from functools import cache
+from pathlib import Path
+
+import psutil
+
+from .errors import LidarError
+
+TIMES, LEAST = 100, 256 * 2**20  # of the file's bytes, and bytes of a small one
+_CONTROL_GROUPS = Path("/sys/fs/cgroup")
+_PREFIXES = {"Pi": 2**50, "Ti": 2**40, "Gi": 2**30, "Mi": 2**20, "ki": 2**10}
+_SHARE = 4  # of the memory: a scene is copied while its objects are placed and joined
+
+
+class Allowance:
+    """Memory that the content of a file may take, and what it has taken of it.
+
+    The limit is 100 times the file's size or 256 MiB, whichever is larger, and at most a quarter of
+    the memory.
+
+    Parameters
+    ----------
+    size
+        Of the file, bytes.
+    advice
+        What the user can do if the content is larger; ends the error.
+
+    Examples
+    --------
+    >>> Allowance(1_500_000, "export it again").take(2_900_000_000)
+    Traceback (most recent call last):
+    lidarsim.base.errors.LidarError: it has 1.43 MiB and would unpack to \
+2.70 GiB or more, of at most 256.00 MiB: export it again.
+    """
+
+    def __init__(self, size: int, advice: str) -> None:
+        self.taken = 0
+        self._size, self._advice = size, advice
+        self._files: set[Path] = set()
+
+    @property
+    def limit(self) -> int:
+        """Bytes."""
+        return min(max(TIMES * self._size, LEAST), memory_share())
+
+    def grow(self, size: int) -> None:
+        """Count data of another file with it."""
+        self._size += size
+
+    def add_file(self, file: Path) -> None:
+        """Count another file with it, which it names, once however often it names it."""
+        if file not in self._files:
+            self._files.add(file)
+            self.grow(file.stat().st_size)
+
+    def fits(self, count: int) -> bool:
+        """Whether so many bytes more may be taken."""
+        return self.taken + count <= self.limit
+
+    def take(self, count: int) -> None:
+        """Take so many bytes, before they are made.
+
+        LidarError if that is more than the limit.
+        """
+        self.taken += count
+        if self.taken > self.limit:
+            raise LidarError(
+                f"it has {bytes_of(self._size)} and would unpack to {bytes_of(self.taken)} or "
+                f"more, of at most {bytes_of(self.limit)}: {self._advice}."
+            )
+
+
+@cache
+def memory() -> int:
+    """Memory that this process may use, bytes.
+
+    The least of the machine's memory and the limits of control groups and of `ulimit -m`.
+    """
+    return min([psutil.virtual_memory().total, *_control_group_limits(), *_resident_limit()])
+
+
+def _control_group_limits() -> list[int]:
+    """Return the limits of the control groups, version 1 and 2, that contain this process, bytes.
+
+    Batch systems and containers limit a group that contains the process, at any depth.
+    """
+    try:
+        memberships = Path("/proc/self/cgroup").read_text("utf-8").splitlines()
+    except OSError:  # only Linux has control groups
+        return []
+    limits = []
+    for line in memberships:
+        _, controllers, group = line.split(":", 2)
+        if not controllers:
+            top, file_name = _CONTROL_GROUPS, "memory.max"
+        elif "memory" in controllers.split(","):
+            top, file_name = _CONTROL_GROUPS / "memory", "memory.limit_in_bytes"
+        else:
+            continue
+        folder = top / group.lstrip("/")
+        for ancestor in (folder, *folder.parents):
+            if not ancestor.is_relative_to(top):
+                break
+            # A file says «max» without a limit; a container may not see the folders of its group.
+            with suppress(OSError, ValueError):
+                limits.append(int((ancestor / file_name).read_text("utf-8")))
+    return limits
+
+
+def _resident_limit() -> list[int]:
+    """Return the limit of resident memory (`ulimit -m`), bytes; empty without a limit."""
+    try:
+        import resource
+    except ImportError:  # Windows has no such limits
+        return []
+    limit = resource.getrlimit(resource.RLIMIT_RSS)[1]
+    return [limit] if limit > 0 else []
+
+
+def memory_share() -> int:
+    """Most bytes that the objects of a file may take."""
+    return memory() // _SHARE
+
+
+def bytes_of(count: int) -> str:
+    """Return bytes as text: «1.43 MiB»."""
+    for prefix, size in _PREFIXES.items():
+        if count >= 0.9 * size:
+            return f"{count / size:.2f} {prefix}B"
+    return f"{count} B"

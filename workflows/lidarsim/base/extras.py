@@ -1,0 +1,29 @@
+"""Libraries that are extras: whether one is installed, and what its errors mean."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from importlib.util import find_spec
+
+from .errors import LidarError, explained, prefixed
+from .words import printable
+
+
+def need(package: str, extra: str, what: str) -> None:
+    """LidarError if the package of an extra, which does what is said, is not installed."""
+    if find_spec(package) is None:
+        raise LidarError(f'{what} by {package}: pip install "lidarpool[{extra}]".')
+
+
+@contextmanager
+def reading(name: str) -> Iterator[None]:
+    """Turn the errors of a library that reads a file into a LidarError of a line."""
+    try:
+        with explained(f"{name} cannot be read"), prefixed(name):
+            yield
+    except LidarError:
+        raise
+    except Exception as error:  # libraries raise whatever they stumble over
+        reason = printable(str(error).partition("\n")[0]) or type(error).__name__
+        raise LidarError(f"{name} is broken or cut short ({reason}).") from error

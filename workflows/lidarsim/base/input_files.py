@@ -1,0 +1,127 @@
+"""Input files: plain files of a known size, never devices, pipes, sockets or folders.
+
+Every reader opens its file here, or calls `check_input` before a library opens the file.
+"""
+
+from __future__ import annotations
+
+import errno
+import os
+import stat
+from io import BufferedReader
+from pathlib import Path
+
+from .allowance import bytes_of, memory
+from .errors import LidarError
+
+# Opening a pipe waits for a writer, and opening a terminal may make it that of the process. Both
+# flags only matter if the path changes its kind between the check and the opening.
+_FLAGS = os.O_RDONLY | sum(getattr(os, name, 0) for name in ("O_NONBLOCK", "O_NOCTTY", "O_BINARY"))
+_KINDS = {  # {format of a mode: what the path leads to}
+    stat.S_IFIFO: "a pipe",
+    stat.S_IFSOCK: "a socket",
+    stat.S_IFCHR: "a device",
+    stat.S_IFBLK: "a device",
+}
+_LFS_POINTER = b"version https://git-lfs.github.com/spec/"
+_LFS_MAX_BYTES = 1024  # of a pointer, by the specification of Git LFS
+
+
+class InputFileError(OSError):
+    """An error of a path that leads to no plain file with content of its own.
+
+    `strerror` is one line that says what the path leads to and what to do.
+    """
+
+    def __init__(self, path: str | Path, reason: str) -> None:
+        super().__init__(errno.EINVAL, reason, str(path))
+
+
+def open_input(path: str | Path) -> BufferedReader:
+    """Open a plain file for reading.
+
+    Parameters
+    ----------
+    path
+        A file, or a link to a file.
+
+    Raises
+    ------
+    InputFileError
+        If the path leads to a pipe, a socket or a device, or if the file is a Git LFS pointer.
+    OSError
+        If the path leads to a folder or to nothing, or the file cannot be opened.
+    """
+    _check_kind(path, Path(path).stat().st_mode)
+    handle = os.open(path, _FLAGS)
+    try:
+        state = os.fstat(handle)
+        _check_kind(path, state.st_mode)
+        if len(_LFS_POINTER) <= state.st_size <= _LFS_MAX_BYTES:
+            if os.read(handle, len(_LFS_POINTER)) == _LFS_POINTER:
+                raise InputFileError(
+                    path, "it is a Git LFS pointer, get the file itself with git lfs pull"
+                )
+            os.lseek(handle, 0, os.SEEK_SET)
+        return os.fdopen(handle, "rb")
+    except BaseException:
+        os.close(handle)
+        raise
+
+
+def _check_kind(path: str | Path, mode: int) -> None:
+    """Raise an OSError that says what a path leads to, unless to a plain file."""
+    if stat.S_ISDIR(mode):
+        raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
+    if not stat.S_ISREG(mode):
+        kind = _KINDS.get(stat.S_IFMT(mode), "no plain file")
+        raise InputFileError(path, f"it is {kind}, give a plain file")
+
+
+def input_size(path: str | Path) -> int:
+    """Return the size of a plain file in bytes; errors as of `open_input`."""
+    with open_input(path) as file:
+        return os.fstat(file.fileno()).st_size
+
+
+def check_input(path: str | Path) -> int:
+    """Check a file that is read as a whole, and return its size in bytes.
+
+    Raises
+    ------
+    LidarError
+        If the file is larger than the memory.
+    OSError
+        As of `open_input`.
+    """
+    size = input_size(path)
+    if size > memory():
+        raise LidarError(
+            f"it has {bytes_of(size)}, more than the memory of this machine "
+            f"({bytes_of(memory())}): read a part of it, or read it on a larger one."
+        )
+    return size
+
+
+def read_input(path: str | Path, max_bytes: int | None = None) -> bytes:
+    """Read a file, or at most `max_bytes` of its start.
+
+    Raises
+    ------
+    LidarError
+        If the file is read as a whole and is larger than the memory.
+    OSError
+        As of `open_input`.
+    """
+    size = check_input(path) if max_bytes is None else max_bytes
+    with open_input(path) as file:
+        return file.read(size)
+
+
+def read_input_text(path: str | Path, errors: str = "strict") -> str:
+    """Read a text file in UTF-8 without its byte order mark; lines end with a newline alone.
+
+    `errors` is that of `bytes.decode`. Raises as `read_input`, and ValueError for other encodings.
+    """
+    text = read_input(path).decode("utf-8-sig", errors)
+    return text.replace("\r\n", "\n").replace("\r", "\n")

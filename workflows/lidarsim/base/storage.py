@@ -1,0 +1,383 @@
+"""Storage of runs and results: a folder, or any place that fsspec opens.
+
+Files appear completely or not at all: in a folder they are written under a temporary name and
+renamed, and an object store shows only complete objects.
+"""
+
+from __future__ import annotations
+
+import errno
+import os
+import re
+import secrets
+import shutil
+import tempfile
+import zlib
+from collections.abc import Collection, Iterable, Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+from typing import IO, Any
+
+from .errors import LidarError
+from .input_files import open_input
+
+_PIECE = 1 << 20  # bytes in memory of a file that is checked
+TEMPORARY = ".lidarpool-tmp-"  # begins the name of an unfinished file
+WRITING = ".lidarpool-writing-"  # begins the name of a folder of unfinished files
+_LEFT = re.compile(rf"(?:{re.escape(TEMPORARY)}(.+)-|{re.escape(WRITING)})[0-9a-f]{{8}}")
+
+
+def target_of(name: str) -> str:
+    """Name of the file that a temporary file was written for; other names are their own."""
+    found = _LEFT.fullmatch(name)
+    return found[1] or name if found else name
+
+
+def is_url(place: str | Path) -> bool:
+    """Whether a place is a URL, not a path."""
+    return "://" in str(place)
+
+
+@dataclass(frozen=True)
+class Storage:
+    """A folder of files, by path or URL; small when pickled.
+
+    Nothing is opened, written or removed through a link below the folder that the user named. A
+    link in place of a file that is written or removed goes, not what it leads to.
+
+    Its methods raise OSError if the storage fails, and LidarError if it cannot be opened or
+    there is such a link.
+
+    Parameters
+    ----------
+    url
+        A folder's path, or a URL such as ``s3://bucket/folder``. The library of that kind of
+        storage finds the credentials.
+    durable
+        Whether files must survive a power failure: flushing takes milliseconds for each file, and
+        is not needed for a temporary folder.
+    named
+        The folder that the user named, this or one above, which may be a link; "" follows all.
+    """
+
+    url: str
+    durable: bool = True
+    named: str = ""
+
+    @classmethod
+    def at(cls, place: str | Path | Storage, *, durable: bool = True) -> Storage:
+        """Storage at a path that the user named, made absolute, or a URL; a storage as it is.
+
+        LidarError if the URL holds a password, which would get into databases and reports, or
+        only a scheme.
+        """
+        if isinstance(place, Storage):
+            return place
+        text = str(place)
+        if not is_url(text):
+            path = str(Path(text).absolute())
+            return cls(path, durable, path)
+        if ":" in text.partition("://")[2].partition("/")[0].rpartition("@")[0]:
+            raise LidarError(
+                f"A URL for {text.partition(':')[0]} has a password: leave it out, and give "
+                "it in the environment or the configuration of that storage's library."
+            )
+        # Else `s3://$BUCKET`, with no such variable, would be a local folder.
+        if not is_url(text.rstrip("/")):
+            raise LidarError(f"{text} names no folder: give one, such as {text}bucket/run.")
+        return cls(text.rstrip("/"), durable)
+
+    def __str__(self) -> str:
+        return self.url
+
+    @property
+    def is_local(self) -> bool:
+        """Whether it is a folder in a local file system."""
+        return not is_url(self.url)
+
+    def below(self, name: str) -> Storage:
+        """Open a folder in it, which need not exist."""
+        if self.is_local:
+            self.local(name)
+        return replace(self, url=f"{self.url}/{name}")
+
+    def local(self, name: str | Path = "") -> Path:
+        """Path of a file or folder in a local file system, by default its own, to open it."""
+        path = Path(self.url, name)
+        for part in (path, *path.parents) if self.named else ():
+            if len(str(part)) <= len(self.named):
+                break
+            if part.is_symlink():
+                raise LidarError(
+                    f"{part} is a link, and nothing behind a link in {self.named} is opened, "
+                    "written or deleted: remove it, or put there what it leads to."
+                ) from OSError(errno.ELOOP, os.strerror(errno.ELOOP))  # it fails all alike
+        return path
+
+    def _target(self, name: str) -> Path:
+        """Path of a file or folder that is replaced or removed."""
+        path = Path(name)
+        return self.local(path.parent) / path.name
+
+    @contextmanager
+    def _remote(self) -> Iterator[tuple[Any, str]]:
+        """File system and folder of a URL; any error of its library becomes an OSError."""
+        try:
+            if self._opened[0] != os.getpid():  # a fork cannot use its parent's connections
+                self.__dict__.pop("_opened", None)
+            _, system, folder = self._opened
+            system.invalidate_cache()  # other processes write there, too
+            yield system, folder
+        except (OSError, LidarError):
+            raise
+        except Exception as error:
+            raise OSError(f"{type(error).__name__}: {error}") from error
+
+    @cached_property
+    def _opened(self) -> tuple[int, Any, str]:
+        """The process that has opened it, file system and folder."""
+        import fsspec
+
+        try:
+            system, folder = fsspec.core.url_to_fs(self.url)
+        except (ImportError, ValueError) as error:
+            extra = 'pip install "lidarpool[s3]"' if self.url.startswith("s3://") else ""
+            hint = f": {extra}" if extra and isinstance(error, ImportError) else ""
+            raise LidarError(f"{self.url} cannot be opened: {error}{hint}.") from error
+        return os.getpid(), system, folder
+
+    def file_system(self) -> tuple[Any, str]:
+        """Return the file system of fsspec and the folder, for libraries that open files."""
+        with self._remote() as opened:
+            return opened
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return Storage, (self.url, self.durable, self.named)
+
+    def path(self, name: str) -> str:
+        """Path or URL of a file, for messages."""
+        return f"{self.url}/{name}"
+
+    def prepare(self, name: str | Path = "") -> None:
+        """Make the folder, or one in it."""
+        if self.is_local:
+            self.local(name).mkdir(parents=True, exist_ok=True)
+            return
+        with suppress(FileExistsError), self._remote() as (system, folder):
+            # An object store has no folders, and s3fs would make a bucket for a mistyped name.
+            if folder.startswith("/"):
+                system.makedirs(f"{folder}/{name}".rstrip("/"), exist_ok=True)
+
+    def claim(self) -> None:
+        """Make the folder; LidarError if files cannot be written and removed there."""
+        name = f"{TEMPORARY}{secrets.token_hex(4)}"
+        try:
+            self.prepare()
+            self.write(name, b"")
+            self.remove([name])
+        except FileNotFoundError as error:
+            raise LidarError(
+                f"Cannot write to {self.url} ({error}): make the bucket first, or give another."
+            ) from error
+        except OSError as error:
+            raise LidarError(
+                f"Cannot write to {self.url} ({error}): check the credentials and rights that "
+                "its library finds, and at its address."
+            ) from error
+
+    def write(self, name: str, data: Any) -> None:
+        """Write bytes, or a list of them, completely or not at all; flush them if durable."""
+        pieces = data if isinstance(data, list) else [data]
+        if self.is_local:
+            with self._replacing(self._target(name)) as file:
+                file.writelines(pieces)
+            return
+        with self._remote() as (system, folder):
+            system.pipe_file(f"{folder}/{name}", b"".join(bytes(piece) for piece in pieces))
+
+    @contextmanager
+    def writing(self, name: str) -> Iterator[IO[bytes]]:
+        """Write a file bit by bit: it appears once the body has ended without an error.
+
+        Folders in its name are made.
+        """
+        if self.is_local:
+            target = self._target(name)
+            target.parent.mkdir(parents=True, exist_ok=True)
+            with self._replacing(target) as file:
+                yield file
+            return
+        with tempfile.TemporaryDirectory(prefix="lidarpool-") as folder:
+            path = Path(folder, "file")
+            with path.open("wb") as file:
+                yield file
+            self.put(path, name)
+
+    @contextmanager
+    def _replacing(self, target: Path) -> Iterator[IO[bytes]]:
+        temporary = target.with_name(f"{TEMPORARY}{target.name}-{secrets.token_hex(4)}")
+        try:
+            with temporary.open("xb") as file:
+                yield file
+                if self.durable:
+                    file.flush()
+                    os.fsync(file.fileno())
+            temporary.replace(target)
+        except BaseException:
+            with suppress(OSError):
+                temporary.unlink(missing_ok=True)
+            raise
+        if self.durable:
+            flush(target.parent)
+
+    def read(self, name: str, first: int = 0, stop: int | None = None) -> bytes:
+        """Read a file, or its bytes from `first` to `stop`; fewer if it ends before."""
+        if self.is_local:
+            with open_input(self.local(name)) as file:
+                file.seek(first)
+                return file.read(-1 if stop is None else stop - first)
+        with self._remote() as (system, folder):
+            return bytes(system.cat_file(f"{folder}/{name}", start=first or None, end=stop))
+
+    @contextmanager
+    def _reading(self, name: str) -> Iterator[IO[bytes]]:
+        """Open a file for the body."""
+        if self.is_local:
+            with open_input(self.local(name)) as file:
+                yield file
+        else:
+            with self._remote() as (system, folder), system.open(f"{folder}/{name}", "rb") as file:
+                yield file
+
+    def checksum(self, name: str) -> list[int]:
+        """Bytes of a file and their CRC-32, read a piece at a time."""
+        size = crc = 0
+        with self._reading(name) as file:
+            while piece := file.read(_PIECE):
+                size, crc = size + len(piece), zlib.crc32(piece, crc)
+        return [size, crc]
+
+    def put(self, path: Path, name: str) -> None:
+        """Copy a file of this machine, or a folder of files, into the storage."""
+        with self._remote() as (system, folder):
+            for file in sorted(path.rglob("*")) if path.is_dir() else [path]:
+                if file.is_file():
+                    below = file.relative_to(path).as_posix() if file != path else ""
+                    system.put_file(str(file), f"{folder}/{name}/{below}".rstrip("/"))
+
+    def get(self, name: str, path: Path) -> None:
+        """Copy a file of the storage to this machine."""
+        with self._remote() as (system, folder):
+            system.get_file(f"{folder}/{name}", str(path))
+
+    def take(self, place: Storage, name: str, own: str) -> None:
+        """Have a file of another storage here, completely or not at all, by a name of its `own`.
+
+        It is linked (a hard link), or an object store copies it, where that is possible.
+        """
+        if self.is_local and place.is_local:
+            self.remove([own])
+            with suppress(OSError):  # another disk, or one without links: it is copied
+                os.link(place.local(name), self._target(own))
+                return
+        with place._remote() as (other, folder), self._remote() as (system, own_folder):
+            if other is system and not self.is_local:
+                system.cp_file(f"{folder}/{name}", f"{own_folder}/{own}")
+                return
+        with place._reading(name) as source, self.writing(own) as file:
+            shutil.copyfileobj(source, file, _PIECE)
+
+    def sees(self, name: str, data: bytes) -> bool:
+        """Whether a file has this content, so that this process sees the same place."""
+        try:
+            return self.read(name) == data
+        except Exception:  # any error of a storage or its missing library
+            return False
+
+    def sizes(self) -> dict[str, int]:
+        """All plain files and their sizes in bytes; none without the folder."""
+        return {name: size for name, size in self.entries().items() if size is not None}
+
+    def entries(self) -> dict[str, int | None]:
+        """Everything in the folder: {name: bytes of a file, None for a folder or link}.
+
+        A missing folder is empty.
+        """
+        found: dict[str, int | None] = {}
+        if self.is_local:
+            with suppress(FileNotFoundError), os.scandir(self.local()) as entries:
+                for entry in entries:
+                    with suppress(FileNotFoundError):  # just renamed or removed
+                        plain = entry.is_file(follow_symlinks=False)
+                        found[entry.name] = entry.stat().st_size if plain else None
+            return found
+        with suppress(FileNotFoundError), self._remote() as (system, folder):
+            for one in system.ls(folder, detail=True):
+                plain = one["type"] == "file" and not one.get("islink")
+                found[one["name"].rpartition("/")[2]] = (one["size"] or 0) if plain else None
+        return found
+
+    def remove(self, names: Iterable[str], *, folder: bool = False) -> None:
+        """Remove files; no error for missing ones. Then the `folder` itself, if it is empty."""
+        for name in names:
+            if self.is_local:
+                self._target(name).unlink(missing_ok=True)
+            else:
+                with suppress(FileNotFoundError), self._remote() as (system, path):
+                    system.rm_file(f"{path}/{name}")
+        if folder and self.is_local:
+            with suppress(OSError):
+                self.local().rmdir()
+
+    def tree(self, name: str = "") -> list[str]:
+        """Names, as of `read`, of all files in a folder and below; LidarError for a link."""
+        if self.is_local:
+            found: list[Path] = []
+            for folder, folders, files in os.walk(self.local(name)):
+                paths = [Path(folder, one) for one in (*files, *folders)]
+                for path in filter(Path.is_symlink, paths):
+                    self.local(path)
+                found += paths[: len(files)]
+            return [path.relative_to(self.url).as_posix() for path in found]
+        with self._remote() as (system, folder):
+            below = system.find(f"{folder}/{name}".rstrip("/"))
+            return [one.removeprefix(f"{folder}/") for one in below]
+
+    def prune(self, names: Collection[str]) -> None:
+        """Remove files in folders in it, in this order, and the folders that are then empty."""
+        self.remove(names)
+        folders = {str(folder) for name in names for folder in Path(name).parents}
+        for folder in sorted(folders - {"."}, key=len, reverse=True):
+            self.below(folder).remove([], folder=True)
+
+    def discard(self, name: str) -> None:
+        """Remove a file, or a folder with its content, if it exists."""
+        if self.is_local:
+            path = self._target(name)
+            if path.is_dir() and not path.is_symlink():
+                shutil.rmtree(path)
+            else:
+                path.unlink(missing_ok=True)
+        else:
+            with suppress(FileNotFoundError), self._remote() as (system, folder):
+                system.rm(f"{folder}/{name}", recursive=True)
+
+    def tidy(self, *, deep: bool = True) -> None:
+        """Remove what killed writers have left in a folder of this machine, and below if `deep`."""
+        for folder, folders, files in os.walk(self.local()) if self.is_local else ():
+            for path in (Path(folder, name) for name in (*folders, *files)):
+                if _LEFT.fullmatch(path.name) and not path.is_symlink():
+                    self.discard(path.relative_to(self.url).as_posix())
+            if not deep:
+                break
+
+
+def flush(path: Path) -> None:
+    """Flush a file, or the names in a folder, to the disk."""
+    handle = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)

@@ -1,0 +1,87 @@
+"""Bags of ROS 2 through rosbags: the files, types of messages, and columns of PointCloud2."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from contextlib import closing, contextmanager
+from functools import cache
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from ..base.arrays import AnyArray
+from ..base.extras import need, reading
+from ..base.input_files import input_size
+
+if TYPE_CHECKING:
+    from rosbags.rosbag2 import Reader
+    from rosbags.typesys.store import Typestore
+
+BAG_FILES = (".mcap", ".db3")
+POINT_CLOUD = "sensor_msgs/msg/PointCloud2"
+# {type of an entry of a point: its number in PointField}
+POINT_FIELDS = {"i1": 1, "u1": 2, "i2": 3, "u2": 4, "i4": 5, "u4": 6, "f4": 7, "f8": 8}
+
+
+def is_bag(path: Path) -> bool:
+    """Return True for an .mcap or .db3, and for the folder of a bag."""
+    if path.is_dir():
+        return (path / "metadata.yaml").exists()
+    return path.suffix.lower() in BAG_FILES
+
+
+def open_bag(path: Path, name: str) -> Reader:
+    """Open a bag; LidarError, which begins with `name`, if that is impossible."""
+    need("rosbags", "ros", f"{name} is read")
+    from rosbags.rosbag2 import Reader
+
+    with reading(name):
+        for file in path.iterdir() if path.is_dir() else [path]:
+            if not file.is_dir():
+                input_size(file)
+        bag = Reader(path)
+        bag.open()
+    return bag
+
+
+@contextmanager
+def opened_bag(path: Path, name: str) -> Iterator[Reader]:
+    """Open a bag for the body, and turn errors of reading it into a LidarError."""
+    with closing(open_bag(path, name)) as bag, reading(name):
+        yield bag
+
+
+def messages_of(bag: Reader, topics: Sequence[str]) -> Iterator[tuple[str, int, Any]]:
+    """Yield topic, time in nanoseconds, and content of the messages of some topics."""
+    connections = [one for one in bag.connections if one.topic in topics]
+    if connections:  # without any, rosbags would give the messages of all topics
+        for connection, time_ns, data in bag.messages(connections):
+            message = message_types().deserialize_cdr(data, connection.msgtype)
+            yield connection.topic, time_ns, message
+
+
+@cache
+def message_types() -> Typestore:
+    """Return the types of messages of ROS 2."""
+    from rosbags.typesys import Stores, get_typestore
+
+    return get_typestore(Stores.ROS2_HUMBLE)
+
+
+def point_columns(data: bytes) -> dict[str, AnyArray]:
+    """Return the fields of a PointCloud2, {name: (n,)}; ValueError if its lengths disagree."""
+    message: Any = message_types().deserialize_cdr(data, POINT_CLOUD)
+    kinds = {number: kind for kind, number in POINT_FIELDS.items()}
+    order = ">" if message.is_bigendian else "<"
+    fields = [field for field in message.fields if field.count == 1]
+    row = np.dtype({
+        "names": [field.name for field in fields],
+        "formats": [order + kinds[field.datatype] for field in fields],
+        "offsets": [field.offset for field in fields],
+        "itemsize": message.point_step,
+    })  # fmt: skip
+    lines = message.data.reshape(message.height, message.row_step)
+    used = np.ascontiguousarray(lines[:, : message.width * message.point_step])
+    rows = used.reshape(-1).view(row)
+    return {name: rows[name] for name in row.names or ()}

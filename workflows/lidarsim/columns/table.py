@@ -1,0 +1,298 @@
+"""The table of columns: all quantities of points, and their sources.
+
+Sensors, stages, parts, exporters, viewer, colouring, report and documentation read this table;
+nothing else lists columns. Your own columns are `Column` objects in `Survey.columns`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+
+from ..base.arrays import AnyArray
+from ..base.errors import LidarError
+from ..base.validation import checked_fields
+from ..base.words import did_you_mean
+from .waveforms import WAVEFORM, column_type
+
+Kind = Literal["number", "label"]  # a colour scale, or one colour for each value
+
+NO_SURFACE = "no surface"  # instead of an object's name
+CAUSES = ("surface", "air", "false alarm", "crosstalk", "blooming", "ghost", "spray")  # of a return
+VELOCITY = "radial_velocity"
+COORDINATES = ("world", "sensor")  # coordinate systems of points
+NORMAL = ("normal_x", "normal_y", "normal_z")
+ORIGIN = ("origin_x", "origin_y", "origin_z")
+VECTORS = (NORMAL, ORIGIN)  # columns that are of use together only
+SURFACE_COLUMNS = (*NORMAL, "incidence_deg", *ORIGIN)
+_OPEN3D = ("positions", "normals", "colors")  # Open3D, which writes the files
+
+
+@dataclass(frozen=True)
+@checked_fields
+class Column:
+    """One quantity of every point of a cloud.
+
+    Parameters
+    ----------
+    name
+        A Python identifier; also used in files, unless there is a `file_name`.
+    dtype
+        NumPy's name of the type of one value.
+    unit
+        Unit of the values; "" for none.
+    meaning
+        What it is, in a few words without a full stop.
+    source
+        Name of an attribute of the returns of a batch (`lidarsim.simulator.points.BatchPoints`),
+        or a function that computes the column from them: an array (n,), one value for each
+        point. It runs on the worker that casts the rays. By default the attribute of its name.
+    coordinates
+        Coordinate system of the values: "world", "sensor", or "" for none.
+    kind
+        How it is shown: "number" on a colour scale, "label" with a colour for each value.
+    file_name
+        Its usual name in files.
+
+    Raises
+    ------
+    LidarError
+        If the name is no identifier or NumPy has no such type.
+    """
+
+    name: str
+    dtype: str
+    unit: str
+    meaning: str
+    source: str | Callable[[Any], AnyArray] = ""
+    coordinates: str = ""
+    kind: Kind = "number"
+    file_name: str = ""
+
+    def __post_init__(self) -> None:
+        if not self.name.isidentifier():
+            raise LidarError(f"A column cannot have the name {self.name!r}: use an identifier.")
+        try:
+            kind = np.dtype(self.dtype).kind
+            known = kind in "iuf" or (kind == "V" and self.name == WAVEFORM)
+        except TypeError:
+            known = False
+        if not known:
+            raise LidarError(
+                f"Column {self.name!r} has the type {self.dtype!r}; give a type of whole or real "
+                "numbers, such as uint8 or float32."
+            )
+
+    @property
+    def in_files(self) -> str:
+        """Name of the column in files."""
+        return self.file_name or self.name
+
+    def make(self, returns: Any) -> AnyArray:
+        """Values of this column for the returns of a batch: (n,), of the column's type.
+
+        LidarError if its source gives another number of values, or values that the type cannot
+        hold.
+        """
+        source = self.source or self.name
+        values = np.asarray(source(returns) if callable(source) else getattr(returns, source))
+        if values.shape != (len(returns),):
+            raise LidarError(
+                f"Column {self.name!r} was made with the shape {values.shape}; it needs one value "
+                f"for each of the {len(returns)} points."
+            )
+        wanted = np.dtype(self.dtype)
+        if wanted.kind in "iu" and len(values) and values.dtype != wanted:
+            limits = np.iinfo(wanted)
+            if values.dtype.kind == "f" and not np.isfinite(values).all():
+                raise LidarError(f"Column {self.name!r} holds NaN or infinity as {wanted}.")
+            if values.min() < limits.min or values.max() > limits.max:
+                raise LidarError(
+                    f"Column {self.name!r} holds {values.min()} to {values.max()}, and {wanted} "
+                    f"holds {limits.min} to {limits.max}: give it a wider type."
+                )
+        return values.astype(wanted, copy=False)
+
+
+SCAN = Column("scan", "int32", "", "scan of the point: a time step at a pose", kind="label")
+X = Column("x", "int32", "m", "position along x, to the east on maps", "cell_x", "world")
+Y = Column("y", "int32", "m", "position along y, to the north on maps", "cell_y", "world")
+Z = Column("z", "int32", "m", "position along z, up", "cell_z", "world")
+CHANNEL = Column(
+    "channel", "uint16", "", "beam of the sensor, the lowest is 0", kind="label", file_name="ring"
+)
+OBJECT = Column("object", "int32", "", "object that was hit; -1 for no surface", kind="label")
+
+AXES = (X, Y, Z)  # in a part: whole multiples of the precision from the scene's local origin
+ALWAYS = (*AXES, CHANNEL, OBJECT)  # the columns that every part holds; `scan` follows from its rows
+OPTIONAL = (
+    Column("ray", "uint32", "", "number of the ray within its scan"),
+    Column("time", "int64", "ns", "time of the ray since the survey's start"),
+    Column("azimuth", "float32", "deg", "angle about the sensor's z axis", coordinates="sensor"),
+    Column(
+        "elevation", "float32", "deg", "angle above the sensor's xy plane", coordinates="sensor"
+    ),
+    Column("range", "float32", "m", "distance from the beam's origin", coordinates="sensor"),
+    Column(
+        "intensity",
+        "float32",
+        "",
+        "energy received; 1 is a white surface 10 m away at right angles in clear air",
+    ),
+    Column(
+        "reflectance",
+        "float32",
+        "",
+        "intensity without the loss by distance and air: the surface's times cosine of incidence",
+    ),
+    Column("reflectivity", "uint8", "", "reflectance on the scale of the sensor's maker"),
+    Column("signal", "uint16", "", "counts: 10,000 for an intensity of 1, 65,535 at most"),
+    Column(
+        VELOCITY,
+        "float32",
+        "m/s",
+        "how fast the range grows: negative while it shrinks; NaN of false alarms",
+    ),
+    Column(
+        "amplitude",
+        "float32",
+        "",
+        "height of the echo in the waveform, clipped at the saturation of the receiver; of one as "
+        "narrow as the pulse its intensity",
+    ),
+    Column(
+        "pulse_width",
+        "float32",
+        "ns",
+        "full width at half maximum of the echo; without waveforms the pulse's, 0 for no echo",
+    ),
+    Column(
+        "return_number",
+        "uint8",
+        "",
+        "number among the reported returns of its pulse, from 1",
+        kind="label",
+    ),
+    Column("returns", "uint8", "", "number of reported returns of its pulse", kind="label"),
+    Column(
+        "class",
+        "uint16",
+        "",
+        "semantic class of the material; 0 for none",
+        "semantic_class",
+        kind="label",
+    ),
+    Column(
+        "material",
+        "int32",
+        "",
+        "material of the face in the scene's file; -1 for none",
+        "material_number",
+        kind="label",
+    ),
+    Column(
+        "cause",
+        "uint8",
+        "",
+        "why the return is there: " + "; ".join(f"{n} {what}" for n, what in enumerate(CAUSES)),
+        kind="label",
+    ),
+    Column("sensor", "uint8", "", "sensor of the carrier, from 0", "sensor_number", kind="label"),
+    Column("triangle", "int32", "", "triangle of the scene that was hit"),
+    *(
+        Column(
+            f"normal_{axis}",
+            "float32",
+            "",
+            f"{axis} of the surface's unit normal, on the side that was hit; NaN without a surface",
+            coordinates="world",
+            file_name=f"n{axis}",
+        )
+        for axis in "xyz"
+    ),
+    Column(
+        "incidence_deg",
+        "float32",
+        "deg",
+        "angle between the ray and the surface's normal, 0 to 90; NaN without a surface",
+    ),
+    *(
+        Column(f"origin_{axis}", "float64", "m", f"{axis} of the ray's origin", coordinates="world")
+        for axis in "xyz"
+    ),
+    Column("red", "uint8", "", "red of the surface, sRGB; what has no colour is grey, 188"),
+    Column("green", "uint8", "", "green of the surface, sRGB"),
+    Column("blue", "uint8", "", "blue of the surface, sRGB"),
+)
+COLOURS = ("red", "green", "blue")
+
+TABLE = {column.name: column for column in (SCAN, *ALWAYS, *OPTIONAL)}  # {name: column}
+
+
+def chosen(columns: Iterable[str | Column]) -> tuple[Column, ...]:
+    """Columns in addition to `ALWAYS`, each once, with names looked up in `TABLE`.
+
+    LidarError if there is no column of a name, two have the same name, a vector lacks an axis,
+    or a name cannot be written.
+    """
+    kept: dict[str, Column] = {}
+    names = {column.in_files: column for column in TABLE.values()} | TABLE
+    for entry in columns:
+        column = entry
+        if isinstance(column, str):
+            if column not in names:
+                raise LidarError(
+                    f"There is no column {column!r}."
+                    + (did_you_mean(column, names) or f" There are {', '.join(names)}.")
+                )
+            column = names[column]
+        if kept.get(column.name, column) != column or (
+            column.name in TABLE and TABLE[column.name] != column
+        ):
+            raise LidarError(f"Two columns have the name {column.name!r}: rename one.")
+        kept[column.name] = column
+    for vector in VECTORS:
+        if 0 < len(kept.keys() & {*vector}) < len(vector):
+            raise LidarError(
+                f"The columns {', '.join(vector)} are one vector, which formats turn to other "
+                "axes: give all three."
+            )
+    rest = tuple(column for column in kept.values() if column not in (SCAN, *ALWAYS))
+    check_names((SCAN, *ALWAYS, *rest))
+    return rest
+
+
+def check_names(columns: Iterable[Column]) -> None:
+    """Check that columns have distinct names in files; LidarError if not."""
+    taken: set[str] = set()
+    for name in (column.in_files for column in columns):
+        if not name.isascii() or not name.isprintable() or " " in name:
+            raise LidarError(
+                f"A column cannot have the name {name!r} in files: use ASCII letters and digits."
+            )
+        if name in _OPEN3D:
+            raise LidarError(
+                f"A column cannot have the name {name!r} in files, where Open3D expects three "
+                "numbers for each point: use another name."
+            )
+        if name in taken:
+            raise LidarError(f"Two columns have the name {name!r} in files: rename one.")
+        taken.add(name)
+
+
+def by_value(names: Mapping[int, str]) -> list[str]:
+    """Names of the values 0, 1, 2, … of a column; empty for those that are not in `names`."""
+    return [names.get(value, "") for value in range(max(names, default=-1) + 1)]
+
+
+def waveform_column(samples: int) -> Column:
+    """Column of recorded waveforms of so many samples, which only parts and clouds hold."""
+    return Column(WAVEFORM, column_type(samples), "", "waveform of the pulse", "waveform")
+
+
+def stored(optional: Sequence[Column]) -> tuple[Column, ...]:
+    """All columns of a part, in their order in the file."""
+    return (*ALWAYS, *optional)

@@ -1,0 +1,123 @@
+"""LAS and LAZ through laspy: files opened after a check of their headers, and their units."""
+
+from __future__ import annotations
+
+import os
+import struct
+from collections.abc import Iterator
+from contextlib import contextmanager
+from importlib import import_module
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any, BinaryIO
+
+from ...base.allowance import Allowance
+from ...base.errors import LidarError
+from ...base.input_files import open_input
+from .las_units import CoordinateUnits, units_of
+
+# Offsets within the header, by ASPRS LAS 1.4 R15, table 3.
+_HEADER_BYTES = 375  # of LAS 1.4; 1.2 has 227
+_ENCODING = struct.Struct("<H"), 6
+_LAYOUT = struct.Struct("<HII"), 94  # bytes of the header, offset of the points, number of VLRs
+_EXTENDED = struct.Struct("<QI"), 235  # offset and number of extended VLRs, of LAS 1.4
+_VLR = struct.Struct("<2x16sHH32x")  # user, record, bytes
+_EXTENDED_VLR = struct.Struct("<2x16sHQ32x")
+_PROJECTION = b"LASF_Projection"
+_MAX_EXTENDED = 1_000  # extended records that are searched for a coordinate system
+_MAX_RECORD = 1 << 20  # bytes of a record with a coordinate system
+_WKT_BIT = 16  # of the global encoding: the coordinate system is WKT
+_SMALLER = "write it as .las, or thin it first"
+
+
+@contextmanager
+def open_las(path: Path) -> Iterator[Any]:
+    """Open a .las or .laz file for the body, as a `laspy.LasReader`.
+
+    Raises
+    ------
+    LidarError
+        If laspy is not installed, or if the points would take far more memory than the file has
+        bytes.
+    ValueError
+        If the header announces more than the file holds; laspy raises further errors.
+    OSError
+        If the file cannot be read.
+    """
+    if find_spec("laspy") is None:
+        raise LidarError('it is read by laspy: pip install "lidarpool[las]"')
+    laspy: Any = import_module("laspy")  # an extra
+    with open_input(path) as file:
+        size = os.fstat(file.fileno()).st_size
+        _, points_start, _ = _layout(file)
+        file.seek(0)
+        with laspy.open(file, closefd=False, read_evlrs=False) as reader:
+            header = reader.header
+            announced = header.point_count * header.point_format.size
+            if not header.are_points_compressed and points_start + announced > size:
+                raise ValueError(f"{header.point_count:,} points announced, but there are fewer")
+            Allowance(size, _SMALLER).take(announced if header.are_points_compressed else 0)
+            yield reader
+
+
+def las_units(path: Path) -> CoordinateUnits | None:
+    """Return the units of a file's coordinates, or None if the file states no coordinate system.
+
+    Raises
+    ------
+    LidarError
+        If the coordinate system has a unit that cannot be known, or angles.
+    ValueError
+        If the records of the coordinate system are broken.
+    OSError
+        If the file cannot be read.
+    """
+    with open_input(path) as file:
+        (encoding,) = _unpacked(file, *_ENCODING)
+        records = dict(_projection_records(file))
+    return units_of(records, prefer_wkt=bool(encoding & _WKT_BIT))
+
+
+def _projection_records(file: BinaryIO) -> Iterator[tuple[int, bytes]]:
+    """Yield the numbers and contents of the records of a coordinate system."""
+    header_size, _, count = _layout(file)
+    yield from _records(file, header_size, count, _VLR)
+    if header_size >= _HEADER_BYTES:
+        start, count = _unpacked(file, *_EXTENDED)
+        yield from _records(file, start, min(count, _MAX_EXTENDED), _EXTENDED_VLR)
+
+
+def _records(
+    file: BinaryIO, start: int, count: int, head: struct.Struct
+) -> Iterator[tuple[int, bytes]]:
+    for _ in range(count):
+        file.seek(start)
+        data = file.read(head.size)
+        if len(data) < head.size:
+            raise ValueError("its variable-length records are cut short")
+        user, number, size = head.unpack(data)
+        if user.rstrip(b"\0") == _PROJECTION and size <= _MAX_RECORD:
+            yield number, file.read(size)
+        start += head.size + size
+
+
+def _layout(file: BinaryIO) -> tuple[int, int, int]:
+    """Return the size of the header, the offset of the points, and the number of VLRs.
+
+    ValueError if they contradict each other or the size of the file: laspy would go through four
+    thousand million records.
+    """
+    header_size, points_start, records = _unpacked(file, *_LAYOUT)
+    size = os.fstat(file.fileno()).st_size
+    if header_size + _VLR.size * records > points_start or points_start > size:
+        raise ValueError("its header is wrong")
+    return header_size, points_start, records
+
+
+def _unpacked(file: BinaryIO, layout: struct.Struct, offset: int) -> tuple[int, ...]:
+    """Unpack numbers at an offset of a file; ValueError if the file is shorter."""
+    file.seek(offset)
+    data = file.read(layout.size)
+    if len(data) < layout.size:
+        raise ValueError("its header is cut short")
+    return layout.unpack(data)

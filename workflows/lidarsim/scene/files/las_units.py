@@ -1,0 +1,313 @@
+"""Units of the coordinates of a LAS file, by its coordinate system: WKT or GeoTIFF keys.
+
+OGC WKT 1 and 2 state each unit with its length. GeoTIFF keys name units, or a coordinate system,
+by EPSG codes; the units of a coordinate system are in PROJ's database, which rasterio has.
+"""
+
+from __future__ import annotations
+
+import re
+import struct
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from importlib.util import find_spec
+from typing import NamedTuple
+
+from ...base.errors import LidarError
+
+# Records of LASF_Projection, by ASPRS LAS 1.4.
+_WKT = 2112
+_GEO_KEYS, _GEO_DOUBLES = 34735, 34736
+
+# GeoTIFF keys, by OGC GeoTIFF 1.1.
+_MODEL_TYPE, _GEODETIC_CRS = 1024, 2048
+_PROJECTED_CRS, _LINEAR_UNIT, _LINEAR_UNIT_SIZE = 3072, 3076, 3077
+_VERTICAL_CRS, _VERTICAL_UNIT = 4096, 4099
+_GEOGRAPHIC, _GEOCENTRIC = 2, 3  # models
+_USER_DEFINED = 32767
+
+_EPSG_UNITS = {  # {EPSG code: (name, metres)}
+    1025: ("millimetre", 0.001),
+    1033: ("centimetre", 0.01),
+    9001: ("metre", 1.0),
+    9002: ("foot", 0.3048),
+    9003: ("US survey foot", 12 / 39.37),
+    9005: ("Clarke's foot", 0.3047972654),
+    9036: ("kilometre", 1000.0),
+    9041: ("British foot (Sears 1922)", 0.3047994715386762),
+    9080: ("Indian foot", 0.304799510248147),
+    9093: ("mile", 1609.344),
+    9094: ("Gold Coast foot", 0.3047997101815088),
+    9096: ("yard", 0.9144),
+}
+# Projected systems that are in metres by definition: UTM zones of WGS 84, ETRS89 and NAD83.
+_METRIC_EPSG = (range(32601, 32661), range(32701, 32761), range(25828, 25839), range(26901, 26924))
+_DATUMS = range(5001, 5300)  # in a vertical system's key by GeoTIFF 1.0: datums, without units
+# Commands and functions that read a cloud have unit; compare has two clouds.
+_OVERRIDE = "give its unit (--unit, in Python unit=; of compare --unit-a and unit_a=, or b)"
+_PROJECT = (
+    "project it to metres first (pdal translate IN OUT reprojection "
+    "--filters.reprojection.out_srs=EPSG:CODE)"
+)
+
+
+class CoordinateUnit(NamedTuple):
+    """A unit of length."""
+
+    name: str
+    metres: float
+
+
+METRE = CoordinateUnit("metre", 1.0)
+
+
+@dataclass(frozen=True)
+class CoordinateUnits:
+    """Units of the coordinates of a file: of x and y, and of z."""
+
+    horizontal: CoordinateUnit
+    vertical: CoordinateUnit
+    vertical_stated: bool = True  # False if the unit of z is assumed to be that of x and y
+
+    @property
+    def factors(self) -> tuple[float, float, float]:
+        """Metres in the units of x, y and z."""
+        return self.horizontal.metres, self.horizontal.metres, self.vertical.metres
+
+    @property
+    def metric(self) -> bool:
+        """Whether all coordinates are in metres."""
+        return self.factors == (1.0, 1.0, 1.0)
+
+    def note(self) -> str:
+        """Return a clause that says what was converted; empty for metres."""
+        if self.metric:
+            return ""
+        if not self.vertical_stated:
+            return (
+                f"is in the unit {self.horizontal.name} and was converted to metres; it states no "
+                f"unit of heights, which are taken in the same: if they are not, {_OVERRIDE}"
+            )
+        if self.horizontal == self.vertical:
+            return f"is in the unit {self.horizontal.name} and was converted to metres"
+        return (
+            f"is in the unit {self.horizontal.name} with heights in the unit {self.vertical.name}, "
+            "and was converted to metres"
+        )
+
+
+def units_of(records: Mapping[int, bytes], prefer_wkt: bool) -> CoordinateUnits | None:
+    """Return the units that the records of a coordinate system state; None without a system.
+
+    Parameters
+    ----------
+    records
+        {number of a record of LASF_Projection: its content}.
+    prefer_wkt
+        Whether WKT counts where a file also has GeoTIFF keys.
+
+    Raises
+    ------
+    LidarError
+        If coordinates are angles, or have a unit that cannot be known.
+    ValueError
+        If a record is broken.
+    """
+    text = records.get(_WKT, b"").partition(b"\0")[0].decode("utf-8", "replace").strip()
+    keys = _geo_keys(records)
+    if text and (prefer_wkt or not keys):
+        return wkt_units(text)
+    return _units_of_keys(keys) if keys else None
+
+
+# -- WKT -----------------------------------------------------------------------------------------
+
+_TOKENS = re.compile(
+    r'"((?:[^"]|"")*)"|([A-Za-z_][A-Za-z_0-9]*)|([-+]?[\d.]+(?:[eE][-+]?\d+)?)|([][(),])'
+)
+_MAX_DEPTH = 50
+_HORIZONTAL = {"PROJCS", "PROJCRS", "PROJECTEDCRS", "LOCAL_CS", "ENGCRS", "ENGINEERINGCRS"}
+_VERTICAL = {"VERT_CS", "VERTCRS", "VERTICALCRS"}
+_ANGULAR = {"GEOGCS", "GEOGCRS", "GEOGRAPHICCRS", "GEODCRS", "GEODETICCRS", "GEOCCS"}
+_COMPOUND = {"COMPD_CS", "COMPOUNDCRS"}
+_BOUND = {"BOUNDCRS": "SOURCECRS"}
+_LENGTH_UNITS = ("UNIT", "LENGTHUNIT")
+
+
+@dataclass
+class _Node:
+    """A keyword of WKT with its texts and numbers, and the nodes within."""
+
+    keyword: str
+    values: list[str] = field(default_factory=list)
+    nodes: list[_Node] = field(default_factory=list)
+
+    def child(self, keywords: set[str]) -> _Node | None:
+        return next((node for node in self.nodes if node.keyword in keywords), None)
+
+
+def wkt_units(text: str) -> CoordinateUnits:
+    """Return the units of a coordinate system in WKT 1 or 2; errors as of `units_of`."""
+    node = _parsed(text)
+    if node.keyword == "BOUNDCRS":  # a system, and its transformation to another one
+        source = node.child({"SOURCECRS"})
+        node = source.nodes[0] if source and source.nodes else node
+    parts = node.nodes if node.keyword in _COMPOUND else [node]
+    horizontal = next((part for part in parts if part.keyword in _HORIZONTAL), None)
+    vertical = next((part for part in parts if part.keyword in _VERTICAL), None)
+    name = node.values[0] if node.values else node.keyword
+    if horizontal is None:
+        if any(part.keyword in _ANGULAR for part in parts):
+            raise LidarError(f"its coordinates are angles ({name[:80]}): {_PROJECT}.")
+        raise ValueError(f"its coordinate system begins with {node.keyword[:20]}")
+    unit = _length_unit(horizontal)
+    if unit is None:
+        raise LidarError(f"its coordinate system {name[:80]!r} states no unit: {_OVERRIDE}.")
+    heights = _length_unit(vertical) if vertical is not None else _third_unit(horizontal)
+    if heights is None:
+        return CoordinateUnits(unit, unit, vertical_stated=False)
+    return CoordinateUnits(unit, heights)
+
+
+def _parsed(text: str) -> _Node:
+    """Return the outermost node of a text in WKT."""
+    root = _Node("")
+    open_nodes = [root]
+    for match in _TOKENS.finditer(text):
+        quoted, keyword, number, mark = match.groups()
+        node = open_nodes[-1]
+        if keyword is not None:
+            node.nodes.append(_Node(keyword.upper()))
+        elif quoted is not None or number is not None:
+            node.values.append(number if quoted is None else quoted.replace('""', '"'))
+        elif mark in "[(":
+            if not node.nodes or len(open_nodes) > _MAX_DEPTH:
+                raise ValueError("its coordinate system is no WKT")
+            open_nodes.append(node.nodes[-1])
+        elif mark in "])":
+            if len(open_nodes) == 1:
+                raise ValueError("its coordinate system is no WKT")
+            open_nodes.pop()
+    if len(open_nodes) > 1 or not root.nodes:
+        raise ValueError("its coordinate system is no WKT, or cut short")
+    return root.nodes[0]
+
+
+def _length_unit(system: _Node) -> CoordinateUnit | None:
+    """Return the unit of a system's first axis: of the system, or of the axis itself in WKT 2."""
+    for node in (system, *system.nodes):
+        if node is system or node.keyword == "AXIS":
+            unit = node.child({*_LENGTH_UNITS})
+            if unit is not None:
+                return _unit_of(unit)
+    return None
+
+
+def _third_unit(system: _Node) -> CoordinateUnit | None:
+    """Return the unit of the third axis of a projected system in three dimensions, if any."""
+    axes = [node for node in system.nodes if node.keyword == "AXIS"]
+    if len(axes) < 3:
+        return None
+    unit = axes[2].child({*_LENGTH_UNITS})
+    return _length_unit(system) if unit is None else _unit_of(unit)
+
+
+def _unit_of(node: _Node) -> CoordinateUnit:
+    name, *factors = node.values
+    metres = float(factors[0]) if factors else 0.0
+    if not 1e-6 <= metres <= 1e6:
+        raise LidarError(f"its unit {name[:40]!r} has no length in metres: {_OVERRIDE}.")
+    return CoordinateUnit(name[:40], metres)
+
+
+# -- GeoTIFF keys --------------------------------------------------------------------------------
+
+
+def _geo_keys(records: Mapping[int, bytes]) -> dict[int, float]:
+    """Return the numbers of the GeoTIFF keys of a file; keys of texts are left out."""
+    data = records.get(_GEO_KEYS, b"")
+    if len(data) < 8:
+        return {}
+    doubles = records.get(_GEO_DOUBLES, b"")
+    (count,) = struct.unpack_from("<H", data, 6)
+    if 8 + 8 * count > len(data):
+        raise ValueError(f"{count} GeoTIFF keys announced, but there are fewer")
+    return dict(_key_values(data, count, doubles))
+
+
+def _key_values(data: bytes, count: int, doubles: bytes) -> Iterator[tuple[int, float]]:
+    for number in range(count):
+        key, location, _, value = struct.unpack_from("<4H", data, 8 + 8 * number)
+        if location == 0:
+            yield key, value
+        elif location == _GEO_DOUBLES:
+            yield key, struct.unpack_from("<d", doubles, 8 * value)[0]
+
+
+def _units_of_keys(keys: Mapping[int, float]) -> CoordinateUnits | None:
+    model = keys.get(_MODEL_TYPE)
+    projected = int(keys.get(_PROJECTED_CRS, 0))
+    if model in (_GEOGRAPHIC, _GEOCENTRIC) or (
+        _GEODETIC_CRS in keys and not projected and not model
+    ):
+        code = int(keys.get(_GEODETIC_CRS, 0))
+        raise LidarError(f"its coordinates are angles, or geocentric (EPSG:{code}): {_PROJECT}.")
+    unit, heights = _unit_of_code(keys.get(_LINEAR_UNIT)), None
+    if keys.get(_LINEAR_UNIT) == _USER_DEFINED and _LINEAR_UNIT_SIZE in keys:
+        unit = CoordinateUnit("of its own", keys[_LINEAR_UNIT_SIZE])
+    if projected not in (0, _USER_DEFINED) and unit is None:
+        system = _units_of_epsg(projected)
+        unit = system.horizontal
+        heights = system.vertical if system.vertical_stated else None
+    if unit is None:
+        if not projected:
+            return None  # keys that say nothing of a projection
+        raise LidarError(f"its coordinate system is of its own and states no unit: {_OVERRIDE}.")
+    vertical = int(keys.get(_VERTICAL_CRS, 0))
+    if _VERTICAL_UNIT in keys:
+        heights = _unit_of_code(keys[_VERTICAL_UNIT])
+    elif vertical not in (0, _USER_DEFINED):
+        heights = _vertical_unit_of_epsg(vertical)
+    if heights is None:
+        return CoordinateUnits(unit, unit, vertical_stated=False)
+    return CoordinateUnits(unit, heights)
+
+
+def _unit_of_code(code: float | None) -> CoordinateUnit | None:
+    """Return the unit of an EPSG code; None for none, or for one that another key defines."""
+    if code is None or code in (0, _USER_DEFINED):
+        return None
+    if int(code) not in _EPSG_UNITS:
+        raise LidarError(f"its unit EPSG:{int(code)} is not known: {_OVERRIDE}.")
+    return CoordinateUnit(*_EPSG_UNITS[int(code)])
+
+
+def _units_of_epsg(code: int) -> CoordinateUnits:
+    """Return the units of a projected or compound system of the EPSG registry."""
+    if any(code in codes for codes in _METRIC_EPSG):
+        return CoordinateUnits(METRE, METRE, vertical_stated=False)
+    return wkt_units(_wkt_of_epsg(code))
+
+
+def _vertical_unit_of_epsg(code: int) -> CoordinateUnit | None:
+    """Return the unit of a vertical system of the EPSG registry."""
+    if code in _DATUMS:
+        return None
+    node = _parsed(_wkt_of_epsg(code))
+    return _length_unit(node) if node.keyword in _VERTICAL else None
+
+
+def _wkt_of_epsg(code: int) -> str:
+    """Return a system of the EPSG registry as WKT."""
+    if find_spec("rasterio") is None:
+        raise LidarError(
+            f"its coordinate system EPSG:{code} may be in any unit: {_OVERRIDE}, or install what "
+            'knows it, pip install "lidarpool[geo]".'
+        )
+    from rasterio.crs import CRS
+    from rasterio.errors import CRSError
+
+    try:
+        return str(CRS.from_epsg(code).to_wkt(version="WKT2_2019"))
+    except CRSError as error:
+        raise LidarError(f"its coordinate system EPSG:{code} is not known: {_OVERRIDE}.") from error

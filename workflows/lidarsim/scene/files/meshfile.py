@@ -1,0 +1,459 @@
+"""Files of scenes, of the formats in `SUFFIXES`, to named meshes in metres, Z-up."""
+
+from __future__ import annotations
+
+import codecs
+import logging
+import re
+from collections.abc import Callable, Sequence
+from itertools import product
+from pathlib import Path
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+
+from ...base.arrays import Floats
+from ...base.elementary import cbrt
+from ...base.errors import LidarError, prefixed
+from ...base.input_files import open_input, read_input
+from ...base.validation import checked
+from ...base.vectors import determinant, matmul, turned
+from ...base.vocabulary import UNITS_M
+from ...base.words import as_python, did_you_mean, plural, printable
+from ...sensor import Track
+from ...sensor.trajectory import quaternions_of
+from ..actors import Actor, one_mesh
+from ..colours import colours_summary
+from ..scene_instances import FARTHEST_M, SceneInstance
+from ..scene_mesh import SceneMesh
+from ..transform import UP_AXES, Transform
+from .cityjson import read_cityjson
+from .dae import read_dae
+from .gltf import read_gltf
+from .polygon_files import read_obj, read_off, read_ply_mesh, read_stl
+from .rasters import SUFFIXES as RASTERS
+from .rasters import Window, read_raster
+from .scene_graph import Content, MeshFileError, Raster, RigidPart, Wanted
+from .threemf import read_3mf
+from .usd import read_usd
+from .vox import read_vox
+
+CITYJSON = (".json", ".cityjson", ".jsonl")
+
+# A reader gets the content of a file, its path, and what is wanted; read_raster gets the path and
+# options of its own. It raises MeshFileError for unsupported content, and any error for a broken
+# file. All but read_usd and read_raster are our own; their modules say why no library is used.
+_READERS: dict[str, Callable[[bytes, Path, Wanted], Content]] = {
+    ".glb": read_gltf,
+    ".gltf": read_gltf,
+    ".obj": read_obj,
+    ".stl": read_stl,
+    ".ply": read_ply_mesh,
+    ".off": read_off,
+    ".dae": read_dae,
+    ".3mf": read_3mf,
+    ".vox": read_vox,
+    **dict.fromkeys((".usd", ".usda", ".usdc", ".usdz"), read_usd),
+    **dict.fromkeys(CITYJSON, read_cityjson),
+}
+SUFFIXES = (*_READERS, *RASTERS)
+ROBOTS = (".urdf", ".xacro")  # of which `urdf` refuses the latter, with what to do
+_MUJOCO = "a model of MuJoCo becomes OpenUSD by mujoco-usd-converter"
+_POINTS = "make a mesh of it by lidarpool scene points"
+_BLENDER = "export it as .glb, for example from Blender"
+_GAZEBO = (
+    "it is a world or model of Gazebo, convert it to OpenUSD (sdf2usd of gz-usd) or URDF, or name "
+    "the meshes that it names"
+)
+_CAD = "it is a CAD model, make a mesh of it, for example .stl or .glb from FreeCAD"
+_RECORDING = (
+    "it is a recording, write its points as .ply, .pcd or .las and make a mesh of these by "
+    "lidarpool scene points"
+)
+CONVERTED = {  # {ending of files that are not read as scenes: what to do}
+    **dict.fromkeys((".fbx", ".blend", ".3ds", ".x3d", ".wrl", ".dxf", ".abc"), _BLENDER),
+    **dict.fromkeys((".las", ".laz", ".pcd", ".xyz"), _POINTS),
+    ".pts": f"it is a point cloud, write it as .xyz, .ply or .las and {_POINTS}",
+    ".e57": f"it is a point cloud, write it as .las (pdal translate IN.e57 OUT.las) and {_POINTS}",
+    **dict.fromkeys((".pcap", ".mcap", ".bag", ".db3", ".osf"), _RECORDING),
+    **dict.fromkeys((".sdf", ".world"), _GAZEBO),
+    **dict.fromkeys((".step", ".stp", ".iges", ".igs", ".brep", ".fcstd"), _CAD),
+    **dict.fromkeys(
+        (".dwg", ".skp"), "export it as .dae, .obj or .glb from the program that wrote it"
+    ),
+    **dict.fromkeys(
+        (".ifc", ".ifczip"), "it is a building, make a mesh of it: IfcConvert IN.ifc OUT.glb"
+    ),
+    ".gml": "it is a city model, convert it to CityJSON: citygml-tools to-cityjson IN.gml",
+    ".osm": "it is a map, make a mesh of its buildings, for example by blosm in Blender",
+    ".mjcf": _MUJOCO,
+    ".xml": f"{_MUJOCO}, lidarpool import reads a survey of HELIOS++, and traffic.file of a "
+    "scenario names floating car data of SUMO",
+    ".xodr": "it is a road network, make a mesh of its roads, for example by libOpenDRIVE",
+}
+ANIMATED = (".glb", ".gltf", ".usd", ".usda", ".usdc", ".usdz")
+UNITLESS = (".obj", ".stl", ".ply", ".off")  # formats without a unit
+
+GENERATOR = "lidarpool"  # that files of our own name, .glb as Y-up, others as Z-up
+OWN = "lidarpool: metres, Z-up"  # comment that files of our own without such a name begin with
+
+_EVEN = 1e-6  # how much the square of a scale may differ between axes
+_HEAD = 200  # bytes of a file that such a comment is in
+
+OpacityMode = Literal["mask", "ignore"]
+
+_log = logging.getLogger(__name__)
+
+
+def warn(note: str) -> None:
+    """Log a note in the words of Python."""
+    _log.warning(as_python(note))
+
+
+class Objects(NamedTuple):
+    """Objects of a mesh file, in world coordinates."""
+
+    standing: tuple[SceneMesh | SceneInstance, ...]
+    moving: tuple[Actor, ...] = ()  # each along a `Track`
+    summary: str = ""  # objects, triangles, unit, axes and colours
+    raster: Raster | None = None  # what was taken of one
+
+    def still(self, tell: Callable[[str], None]) -> tuple[SceneMesh | SceneInstance, ...]:
+        """Return all of them where they are at first; `tell` is called if that is a loss."""
+        if self.moving:
+            names = ", ".join(actor.name for actor in self.moving[:3])
+            names += ", …" * (len(self.moving) > 3)
+            tell(f"{names}: taken where they are at first, and still")
+        return (*self.standing, *map(_at_first, self.moving))
+
+
+@checked
+def load_objects(
+    path: str | Path,
+    *,
+    unit: Literal[tuple(UNITS_M)] | None = None,  # type: ignore[valid-type]
+    up_axis: Literal[tuple(UP_AXES)] | None = None,  # type: ignore[valid-type]
+    transform: Transform | None = None,
+    opacity: OpacityMode = "mask",
+    colours: bool = False,
+    materials: bool = False,
+    step_m: float | None = None,
+    window: Window | None = None,
+    epsg: int | None = None,
+    assets: str | Path | None = None,
+    animation: str | None = None,
+    tell: Callable[[str], None] = warn,
+    axes: Callable[[str], None] | None = None,
+) -> Objects:
+    """Read all objects of a mesh file.
+
+    Every place of a mesh in a scene graph is an object, named by its node; large meshes with many
+    places are instances. Files without names give one object named by the file. Objects that their
+    nodes scale to zero, and instances of meshes without an area, are left out.
+
+    Parameters
+    ----------
+    path, unit, up_axis, transform, opacity, colours, materials, assets
+        As of `Scene.load`, with a path of `SUFFIXES` in any case. The unit of a raster is that of
+        its heights.
+    step_m
+        Of a raster: mean heights in a grid of this step, metres; None takes its pixels.
+    window
+        Of a raster: lowest x and y, highest x and y of what is taken, metres in the coordinate
+        system of the result.
+    epsg
+        Code of the coordinate system that a raster is brought to, one in metres. None keeps its
+        own if it is in metres, else takes the UTM zone of its middle.
+    animation
+        Name of the animation that its meshes have, or its number if it has none; "" for the first,
+        in .usd for what is bound. Such meshes have no masks. None leaves all as it stands.
+    tell
+        Called with a line on objects left out, on images that cannot be read, on materials that
+        may be glass, or on a reference system; by default this module's logger warns.
+    axes
+        Called with a line on axes that a file did not state, or that were turned; by default this
+        module's logger has it, as a warning if the scene seems to lie on its side.
+
+    Returns
+    -------
+    Objects that stand and, of .usd, that move, in world coordinates. All arithmetic is in double
+    precision; .glb, .gltf and binary .stl store single precision.
+
+    Raises
+    ------
+    LidarError
+        If the file cannot be read completely, or has no triangles.
+    """
+    path = Path(path)
+    is_raster = path.suffix.lower() in RASTERS
+    data = _bytes_of(path, _HEAD if is_raster else None)
+    raster = {"step_m": step_m, "window": window}
+    if is_raster:
+        if up_axis:
+            raise LidarError(f"{path} is a raster, whose heights are z: leave out up_axis.")
+        raster |= {"unit": unit, "epsg": epsg}
+        unit = None
+    elif given := [name for name, value in raster.items() if value is not None]:
+        raise LidarError(
+            f"{path} is no raster: leave out {' and '.join(given)}, or give a raster "
+            f"({' '.join(RASTERS)})."
+        )
+    if animation is not None and path.suffix.lower() not in ANIMATED:
+        raise LidarError(
+            f"{path} has no animations that are read: give a {' or '.join(ANIMATED)}, or leave out "
+            "animation."
+        )
+    folders = tuple(Path(one).resolve() for one in (path.parent, assets) if one is not None)
+    masks = opacity == "mask" and animation is None
+    wanted = Wanted(masks, colours, folders, animation, materials)
+    # Of broken numbers in files: infinite and NaN values are refused.
+    with np.errstate(all="ignore"):
+        try:
+            content = _read_whole(path, data, wanted, raster)
+        except LidarError as error:
+            raise LidarError(f"{error}{_other_format(path, data)}") from error
+        unit_m = UNITS_M[unit] if unit else content.unit_m or 1.0
+        up = up_axis or content.up_axis or "z"
+        upright = Transform(UP_AXES[up] * unit_m, np.zeros(3))
+        placed = Transform(np.eye(3), np.zeros(3)) if transform is None else transform
+        places = [upright] if transform is None else [upright, transform]
+        with prefixed(path):
+            standing = tuple(_placed(mesh, path.stem, places) for mesh in content.meshes)
+            moving = tuple(_actor(one, path.stem, upright, placed) for one in content.moving)
+    objects = Objects(standing, moving)
+    if content.skipped:
+        names = ", ".join(content.skipped[:3]) + ", …" * (len(content.skipped) > 3)
+        tell(f"{path} has objects without an area, which are left out: {names}")
+    for note in (*content.notes, *(() if unit else filter(None, [content.unit_note]))):
+        tell(f"{path} {note}")
+    all_of_it = objects.still(lambda _: None)
+    if not any((one.mesh if isinstance(one, SceneInstance) else one).has_area for one in all_of_it):
+        raise LidarError(f"{path} has no triangle with an area.")
+    if content.raster is not None:
+        summary = content.raster.told
+    else:
+        summary = _summary(all_of_it, unit_m, up, wanted)
+    if up_axis is None and content.generator != GENERATOR and OWN.encode() not in data[:_HEAD]:
+        _tell_axes(path, content, all_of_it, axes)
+    return objects._replace(summary=summary, raster=content.raster)
+
+
+def converted(path: Path) -> str:
+    """Return what to do with a file of a format that is not read; empty for other files."""
+    return CONVERTED.get(path.suffix.lower(), "")
+
+
+def load_meshes(
+    path: str | Path, *, tell: Callable[[str], None] = warn, **options: Any
+) -> tuple[SceneMesh | SceneInstance, ...]:
+    """Read all objects of a mesh file, as `load_objects`, and let them stand."""
+    found = load_objects(path, tell=tell, **options)
+    return found.still(lambda line: tell(f"{path} moves {line}"))
+
+
+def _summary(
+    meshes: Sequence[SceneMesh | SceneInstance], unit_m: float, up_axis: str, wanted: Wanted
+) -> str:
+    """Say what a file gave: «4 objects, 38 triangles, in m, Y-up, 1 texture»."""
+    shapes = [one.mesh if isinstance(one, SceneInstance) else one for one in meshes]
+    shared = [mesh for one, mesh in zip(meshes, shapes, strict=True) if one is not mesh]
+    words = [plural(len(meshes), "object")]
+    if shared:
+        of = plural(len({id(mesh) for mesh in shared}), "mesh", "meshes")
+        words.append(f"{len(shared):,} of them instances of {of}")
+    words += [
+        " x ".join(map(str, mesh.voxels.density.shape)) + " voxels"
+        for mesh in shapes
+        if mesh.voxels is not None
+    ]
+    names = [name for name, metres in UNITS_M.items() if metres == unit_m]
+    words += [
+        plural(sum(len(mesh.faces) for mesh in shapes), "triangle"),
+        f"in {names[0] if names else f'units of {unit_m:g} m'}",
+        f"{up_axis.upper()}-up",
+    ]
+    if wanted.colours:
+        words.append(colours_summary(mesh.colours for mesh in shapes))
+    if wanted.materials:
+        named = [mesh.materials.names for mesh in shapes if mesh.materials is not None]
+        distinct = {name for of_mesh in named for name in of_mesh if name}
+        words.append(plural(len(distinct), "named material"))
+    return ", ".join(words)
+
+
+def wrote_it(path: Path) -> bool:
+    """Whether lidarpool wrote a mesh file of a format without a unit: it is in metres."""
+    with open_input(path) as file:
+        return OWN.encode() in file.read(_HEAD)
+
+
+def _tell_axes(
+    path: Path,
+    content: Content,
+    meshes: Sequence[SceneMesh | SceneInstance],
+    axes: Callable[[str], None] | None,
+) -> None:
+    if content.turned and content.up_axis == "y":
+        why, other = _lies(content, meshes), "z"
+        done = f"was turned from Y-up to Z-up, {content.turned}{why}"
+    elif path.suffix.lower() == ".obj":  # the one without axes that is Y-up as often as not
+        done, why, other = "states no axes and is taken as Z-up", "", "y"
+    else:
+        return
+    (axes or (warn if why else lambda note: _log.info(as_python(note))))(
+        f'{path.name} {done}; if it lies on its side, give <file.up_axis="{other}">; any '
+        "up_axis ends this note"
+    )
+
+
+def _lies(content: Content, meshes: Sequence[SceneMesh | SceneInstance]) -> str:
+    """Say why a file rotated from Y-up seems to have been Z-up; empty if it does not."""
+    if "trimesh" in content.generator:
+        return ", and trimesh wrote it, which keeps the axes that it is given"
+    low = np.min([_corners(mesh).min(axis=0) for mesh in meshes], axis=0)
+    x, y, z = np.max([_corners(mesh).max(axis=0) for mesh in meshes], axis=0) - low
+    if 2 * y < min(x, z):
+        return f", and is {x:,.3g} m wide, {z:,.3g} m high and {y:,.3g} m thick now"
+    return ""
+
+
+def _read_whole(path: Path, data: bytes, wanted: Wanted, raster: dict[str, Any]) -> Content:
+    """Read any file, a raster with these options: at least one object, or LidarError."""
+    try:
+        for beginning, what in _FOREIGN.items():
+            if re.match(beginning, data):
+                raise MeshFileError(what)
+        suffix = path.suffix.lower()
+        is_raster = suffix in RASTERS
+        content = read_raster(path, **raster) if is_raster else _READERS[suffix](data, path, wanted)
+        if not (content.meshes or content.moving):
+            if content.skipped:
+                raise MeshFileError("has no triangle with an area")
+            raise MeshFileError(
+                "holds no triangles: it is empty, or has only points, lines or other things that "
+                "reflect no light"
+            )
+        return content
+    except MemoryError:
+        raise
+    except MeshFileError as refused:
+        raise LidarError(f"{path} {refused}.") from refused
+    except LidarError as error:
+        raise LidarError(f"{path}: {error}") from error
+    except Exception as error:
+        # Readers raise whatever they stumble over: ValueError, IndexError, KeyError, BadZipFile,
+        # ParseError, struct.error, …
+        reason = printable(str(error)) or type(error).__name__
+        raise LidarError(f"{path} is broken or cut short ({reason}): export it again.") from error
+
+
+def _bytes_of(path: Path, max_bytes: int | None) -> bytes:
+    """Return the content of a file of a known format, or at most `max_bytes` of its start."""
+    suffix = path.suffix.lower()
+    if suffix in ROBOTS:
+        raise LidarError(f"{path} is a robot: read it with load_robot, or by a scenario.")
+    if advice := converted(path):
+        raise LidarError(f"{path} is not read: {advice}.")
+    if suffix not in SUFFIXES:
+        raise LidarError(
+            f"{path} has the ending {path.suffix or '(none)'}, which is not a mesh format that "
+            f"can be read; these are: {' '.join(SUFFIXES)} (a scenario has the ending .yaml)."
+        )
+    try:
+        with prefixed(path):
+            data = read_input(path, max_bytes)
+    except (FileNotFoundError, NotADirectoryError) as error:
+        raise LidarError(
+            f"{path} does not exist: check the name and the folder.{_like(path)}"
+        ) from error
+    except (OSError, ValueError) as error:  # a NUL in the name
+        reason = getattr(error, "strerror", None) or error
+        raise LidarError(f"{path} cannot be read: {reason}.") from error
+    if not data:
+        raise LidarError(f"{path} is empty (0 bytes): export the mesh again.")
+    return data.removeprefix(codecs.BOM_UTF8)  # the byte order mark of text editors
+
+
+def _like(path: Path) -> str:
+    """Existing mesh file with a similar name."""
+    try:
+        beside = [other.name for other in path.parent.iterdir()]
+    except OSError:
+        return ""
+    return did_you_mean(path.name, [name for name in beside if name.lower().endswith(SUFFIXES)])
+
+
+# Beginnings of files that are not meshes, as expressions.
+_FOREIGN = {
+    rb"\x1f\x8b|BZh|\xfd7zXZ\0|7z\xbc\xaf": "is packed: unpack it first",
+    rb"(?i)\s*(<!doctype html|<html)": "is a web page: download the file itself",
+}
+# Beginnings by which a file of the wrong ending is recognised, and endings that suit them.
+_BEGINNINGS = {
+    b"glTF": (".glb",), b"ply": (".ply",), b"OFF": (".off",), b"solid ": (".stl",),
+    b"II*\0": (".tif", ".tiff"), b"MM\0*": (".tif", ".tiff"),
+    b"PK\x03\x04": (".3mf", ".usdz"), b"PXR-USDC": (".usdc", ".usd"), b"#usda ": (".usda", ".usd"),
+}  # fmt: skip
+
+
+def _other_format(path: Path, data: bytes) -> str:
+    """Name the format by which a refused file begins, in a sentence, if it is another."""
+    if data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
+        return " It begins like text in UTF-16: save it as UTF-8."
+    for begins, suffixes in _BEGINNINGS.items():
+        if data.startswith(begins) and path.suffix.lower() not in suffixes:
+            return f" It begins like a {' or '.join(suffixes)} file: give it that ending."
+    return ""
+
+
+def _placed(
+    one: SceneMesh | SceneInstance, stem: str, places: Sequence[Transform]
+) -> SceneMesh | SceneInstance:
+    """Object in the world, with a name that is safe for terminals and files."""
+    name = printable(one.name) or printable(stem)
+    for place in places:
+        one = one.moved(name, place.linear, place.offset)
+    reach = np.abs(_corners(one)).max()
+    if reach > FARTHEST_M:
+        raise LidarError(
+            f"Object {one.name!r} reaches {reach:.3g} m from the origin, farther than anything "
+            "on Earth: check its unit and placement."
+        )
+    return one
+
+
+def _actor(one: RigidPart, stem: str, upright: Transform, placed: Transform) -> Actor:
+    """Return what moves as an actor, with its axes turned as those of the file are.
+
+    Its mesh has all scales, since a trajectory turns and moves only.
+    """
+    name = printable(one.name) or printable(stem)
+    unit_m, scale = (cbrt(determinant(place.linear)) for place in (upright, placed))
+    axes, turn = upright.linear / unit_m, placed.linear / scale
+    if np.abs(matmul(turn, turn.T) - np.eye(3)).max() > _EVEN:
+        raise LidarError(
+            f"Object {name!r} moves, and its placement scales it unevenly: give one factor."
+        )
+    objects = [part.moved(name, scale * upright.linear, np.zeros(3)) for part in one.objects]
+    positions = turned(one.positions, matmul(placed.linear, upright.linear)) + placed.offset
+    if not np.abs(positions).max() <= FARTHEST_M:
+        raise LidarError(
+            f"Object {name!r} moves farther than anything on Earth: check its unit and placement."
+        )
+    turns = quaternions_of(matmul(matmul(matmul(turn, axes), one.rotations), axes.T))
+    track = Track(one.times_s, positions, turns, start_s=0.0, beyond="hold")
+    return Actor(one_mesh(name, objects), track)
+
+
+def _at_first(actor: Actor) -> SceneMesh:
+    positions, rotations = actor.trajectory.poses(0, np.zeros(1))
+    turn = np.eye(3) if rotations is None else rotations[0]
+    return actor.mesh.moved(actor.name, turn, positions[0])
+
+
+def _corners(one: SceneMesh | SceneInstance) -> Floats:
+    """Points that an object lies between, in the world."""
+    if isinstance(one, SceneMesh):
+        return (one.animation or one).bounds
+    box = np.array(list(product(*one.mesh.bounds.T)))
+    return np.asarray(turned(box, one.matrix[:3, :3]) + one.matrix[:3, 3])

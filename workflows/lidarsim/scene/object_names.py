@@ -1,0 +1,78 @@
+"""Names of objects: each name once, by numbers, or by joining the objects of a name."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Literal
+
+from ..base.words import plural
+from .actors import one_mesh
+from .scene_instances import SceneInstance
+from .scene_mesh import SceneMesh
+
+SameNames = Literal["number", "join"]
+
+_MAX_SHOWN = 3
+
+
+def told_apart(
+    objects: Sequence[SceneMesh | SceneInstance],
+    same_names: SameNames,
+    tell: Callable[[str], None],
+) -> list[SceneMesh | SceneInstance]:
+    """Return the objects of scene files, as a scene takes them.
+
+    Parameters
+    ----------
+    objects
+        In world coordinates, in the order of the files.
+    same_names
+        With "join", all objects of a name become one object, at the place of the first. With
+        "number", the objects stay, and a scene numbers their names: Wall, Wall.2.
+    tell
+        Called with a line on names that a scene numbers.
+
+    Raises
+    ------
+    LidarError
+        If voxels would be joined to another object.
+    """
+    if same_names == "join":
+        groups: dict[str, list[SceneMesh | SceneInstance]] = {}
+        for one in objects:
+            groups.setdefault(one.name, []).append(one)
+        return [
+            group[0] if len(group) == 1 else one_mesh(name, group) for name, group in groups.items()
+        ]
+    names = [one.name for one in objects]
+    pairs = zip(names, unique_names(names), strict=True)
+    if numbered := [unique for name, unique in pairs if unique != name]:
+        shown = ", ".join(numbered[:_MAX_SHOWN]) + ", …" * (len(numbered) > _MAX_SHOWN)
+        have = "has" if len(numbered) == 1 else "have"
+        tell(
+            f"{plural(len(numbered), 'object')} {have} the name of another one and a number now: "
+            f'{shown}; <scene.same_names="join"> makes one object of each name'
+        )
+    return list(objects)
+
+
+def unique_names(names: Sequence[str]) -> tuple[str, ...]:
+    """Make names unique by numbering repeated ones: Shelf, then Shelf.2.
+
+    Examples
+    --------
+    >>> unique_names(["Shelf", "Shelf", "Shelf.2", "Shelf"])
+    ('Shelf', 'Shelf.3', 'Shelf.2', 'Shelf.4')
+    """
+    given = set(names)
+    taken: set[str] = set()
+    numbers: dict[str, int] = {}  # {name: the last number given to it}
+    out = []
+    for name in names:
+        unique = name
+        while unique in taken or (unique != name and unique in given):
+            numbers[name] = numbers.get(name, 1) + 1
+            unique = f"{name}.{numbers[name]}"
+        taken.add(unique)
+        out.append(unique)
+    return tuple(out)

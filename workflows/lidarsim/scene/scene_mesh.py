@@ -1,0 +1,240 @@
+"""One named triangle mesh, from a mesh file or a generated shape."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from ..base.arrays import AnyArray, AnyFloats, Bools, Floats, Floats32, Integers, Ints
+from ..base.errors import LidarError
+from ..base.validation import as_array, checked_fields
+from ..base.vectors import determinant, length, matmul, rank, turned
+from .animation import Animation
+from .colours import Colours
+from .face_materials import FaceMaterials
+
+UV_MOST = 1 << 30  # texture coordinates beyond this have no digits left
+VOXELS_MOST = 10_000  # along each axis: light takes as many steps
+DENSEST = 1e4  # leaf area density, m²/m³
+
+
+@dataclass(frozen=True, eq=False)
+class Cutout:
+    """What faces stop light only in part: leaves on cards, a wire fence.
+
+    Attributes
+    ----------
+    mask
+        bool (h, w): True where light is stopped.
+    uv
+        float32 (k, 3, 2): texture coordinates of the corners of k faces. As in glTF, (0, 0) is the
+        outer corner of the mask's first element, u grows along its rows, v along its columns, and
+        the mask repeats beyond.
+    """
+
+    mask: Bools
+    uv: Floats32
+
+
+@dataclass(frozen=True, eq=False)
+class Voxels:
+    """Leaves within a closed surface, by a grid of their densities; there are none beyond it.
+
+    Attributes
+    ----------
+    density
+        float32 (nx, ny, nz): one-sided leaf area, m²/m³, finite and not negative.
+    matrix
+        float64 (3, 4): takes places in the grid, in which voxels have the edge 1 and the first one
+        begins at zero, to coordinates of the mesh.
+    """
+
+    density: Floats32
+    matrix: Floats
+
+    def moved(self, linear: Floats, offset: Floats) -> Voxels:
+        """Return it at p -> linear @ p + offset; the densities are shared, and stay per m³."""
+        shift = np.pad(offset[:, None], ((0, 0), (3, 0)))
+        return Voxels(self.density, matmul(linear, self.matrix) + shift)
+
+
+@dataclass(frozen=True, eq=False)
+@checked_fields
+class SceneMesh:
+    """Triangles of one object, in world coordinates.
+
+    Parameters
+    ----------
+    name
+        Name of the object.
+    vertices
+        float64 (v, 3), metres, Z-up, finite.
+    faces
+        int64 (f, 3), indices into `vertices`, at least one face.
+    cutouts
+        Of the last faces, one cutout after the other.
+    colours
+        Of the faces, see `lidarsim.scene.colours.Colours`; None if it has none.
+    voxels
+        Densities of leaves within its surface, which is closed then and has no cutouts.
+    animation
+        How its vertices move where an actor has it; elsewhere it stands as `vertices` say.
+    materials
+        Names of the materials of the faces, see `lidarsim.scene.face_materials.FaceMaterials`;
+        None if they have none.
+
+    Raises
+    ------
+    LidarError
+        If there is no triangle, a shape is wrong, a coordinate is NaN or infinite, or a face
+        refers to a vertex that does not exist.
+    """
+
+    name: str
+    vertices: Floats
+    faces: Ints
+    cutouts: tuple[Cutout, ...] = ()
+    colours: Colours | None = None
+    voxels: Voxels | None = None
+    animation: Animation | None = None
+    materials: FaceMaterials | None = None
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "vertices", points_array(self.name, self.vertices))
+        faces = np.asarray(self.faces)
+        if faces.ndim != 2 or faces.shape[1] != 3 or not np.issubdtype(faces.dtype, np.integer):
+            raise LidarError(
+                f"The faces of {self.name!r} have shape {faces.shape} and type {faces.dtype}; "
+                "expected integers of shape (f, 3)."
+            )
+        if not len(faces):
+            raise LidarError(f"Object {self.name!r} has no triangles.")
+        if faces.min() < 0 or faces.max() >= len(self.vertices):
+            raise LidarError(
+                f"The faces of {self.name!r} refer to vertices {faces.min()} to {faces.max()}; "
+                f"there are {len(self.vertices)}, counted from 0."
+            )
+        object.__setattr__(self, "faces", np.ascontiguousarray(faces, dtype=np.int64))
+        object.__setattr__(self, "cutouts", tuple(self.cutouts))
+        _check_cutouts(self.name, self.cutouts, len(faces))
+        if self.colours is not None:
+            self.colours.check(self.name, len(faces))
+        if self.materials is not None:
+            self.materials.check(self.name, len(faces))
+        if self.voxels is not None:
+            _check_voxels(self.name, self.voxels)
+            if self.cutouts:
+                raise LidarError(f"{self.name!r} has voxels and cutouts: leave out one.")
+        if self.animation is not None:
+            moving = self.animation.vertices.shape[1]
+            if moving != len(self.vertices) or self.cutouts or self.voxels is not None:
+                raise LidarError(
+                    f"{self.name!r} has {len(self.vertices)} vertices, and its animation moves "
+                    f"{moving}: it must move all of them, of a mesh without cutouts and voxels."
+                )
+
+    @cached_property
+    def bounds(self) -> Floats:
+        """Lowest and highest corner of its vertices, (2, 3)."""
+        return np.stack([self.vertices.min(axis=0), self.vertices.max(axis=0)])
+
+    @cached_property
+    def has_area(self) -> bool:
+        """Whether rays can hit a triangle of it, in some pose if it is animated."""
+        blocks = (
+            self.vertices[self.faces[i : i + 65536]] for i in range(0, len(self.faces), 65536)
+        )
+        edges = (block[:, 1:] - block[:, :1] for block in blocks)
+        return self.animation is not None or any(np.cross(*e.swapaxes(0, 1)).any() for e in edges)
+
+    def moved(self, name: str, linear: Floats, offset: Floats) -> SceneMesh:
+        """Return a renamed copy at p -> linear @ p + offset, with faces still outward."""
+        faces, cutouts, colours = self.faces, self.cutouts, self.colours
+        if determinant(linear) < 0:
+            faces = faces[:, ::-1]
+            cutouts = tuple(replace(cut, uv=cut.uv[:, ::-1]) for cut in cutouts)
+            colours = colours and colours.mirrored()
+        voxels = self.voxels and self.voxels.moved(linear, offset)
+        animation = self.animation and self.animation.moved(linear, offset)
+        vertices = turned(self.vertices, linear) + offset
+        return SceneMesh(name, vertices, faces, cutouts, colours, voxels, animation, self.materials)
+
+
+def _check_voxels(name: str, voxels: Voxels) -> None:
+    density, matrix = voxels.density, voxels.matrix
+    well = density.dtype == np.float32 and density.ndim == 3 and density.size > 0
+    well = well and max(density.shape) <= VOXELS_MOST
+    well = well and bool(0 <= density.min() <= density.max() <= DENSEST)
+    well = well and matrix.shape == (3, 4) and bool(np.isfinite(matrix).all())
+    if not well or rank(matrix[:, :3]) < 3:
+        raise LidarError(
+            f"The voxels of {name!r} are {density.dtype} {density.shape}, with a matrix "
+            f"{matrix.shape}; they must be float32 (nx, ny, nz), {VOXELS_MOST:,} at most along "
+            f"each axis, of 0 to {DENSEST:g} m²/m³, and the matrix finite (3, 4), invertible."
+        )
+
+
+def _check_cutouts(name: str, cutouts: tuple[Cutout, ...], faces: int) -> None:
+    for cut in cutouts:
+        well = cut.mask.dtype == np.bool_ and cut.mask.ndim == 2 and cut.mask.size > 0
+        well = well and cut.uv.shape[1:] == (3, 2) and len(cut.uv) > 0
+        if not well or not (np.abs(cut.uv) < UV_MOST).all():
+            raise LidarError(
+                f"A cutout of {name!r} has a mask {cut.mask.dtype} {cut.mask.shape} and uv "
+                f"{cut.uv.shape}; they must be bool (h, w), and (k, 3, 2) within {UV_MOST:,}."
+            )
+    if (cut_out := sum(len(cut.uv) for cut in cutouts)) > faces:
+        raise LidarError(f"{name!r} has {faces} faces, and cutouts of {cut_out}.")
+
+
+def stacked(parts: Iterable[tuple[AnyArray, AnyArray]]) -> tuple[AnyArray, AnyArray]:
+    """Vertices and faces of several (vertices, faces), one after the other."""
+    vertices, faces, first = [], [], 0
+    for points, corners in parts:
+        vertices.append(points)
+        faces.append(corners + first)
+        first += len(points)
+    return np.concatenate(vertices), np.concatenate(faces)
+
+
+def compacted(vertices: AnyArray, faces: Integers) -> tuple[AnyArray, Ints]:
+    """Vertices that faces use, in order, and the faces with their new numbers."""
+    if faces.size < len(vertices):
+        used, corners = np.unique(faces, return_inverse=True)
+        return vertices[used], corners.reshape(-1, 3)
+    there = np.zeros(len(vertices), np.bool_)
+    there[faces] = True
+    if there.all():
+        return vertices, np.asarray(faces, np.int64)
+    return vertices[there], (np.cumsum(there) - 1)[faces]
+
+
+def points_array(name: str, points: ArrayLike) -> Floats:
+    """`points` as a contiguous float64 (n, 3) array of finite numbers.
+
+    Raises
+    ------
+    LidarError
+        If it is not that; the message starts with `name`.
+    """
+    array = np.ascontiguousarray(as_array(f"vertices of {name!r}", points))
+    if array.ndim != 2 or array.shape[1] != 3:
+        raise LidarError(f"The vertices of {name!r} have shape {array.shape}; expected (v, 3).")
+    bad = ~np.isfinite(array).all(axis=1)
+    if bad.any():
+        raise LidarError(
+            f"{int(bad.sum())} of the {len(array)} vertices of {name!r} are NaN or infinite, "
+            f"the first is number {int(bad.argmax())}: repair the mesh."
+        )
+    return array
+
+
+def triangle_areas(corners: AnyFloats) -> Floats:
+    """Areas (n,) of triangles with these corners (n, 3, 3)."""
+    sides = corners[:, 1:] - corners[:, :1]
+    doubled = length(np.cross(sides[:, 0], sides[:, 1]))
+    return np.asarray(doubled / 2, np.float64)

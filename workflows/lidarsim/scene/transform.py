@@ -1,0 +1,112 @@
+"""Units, up axes and placements: from mesh file coordinates to world coordinates."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from ..base.arrays import Floats
+from ..base.elementary_scalars import sin_cos_of
+from ..base.errors import LidarError
+from ..base.validation import as_array
+from ..base.vectors import length, matmul, rank
+from ..sensor import Pose
+
+# Proper rotations that take the named axis to +z; the rows hold only 0 and ±1, so that
+# rotating large coordinates loses no digit.
+UP_AXES = {
+    "x": np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]]),
+    "y": np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]]),
+    "z": np.eye(3),
+}
+
+
+def affine(linear: Floats, offset: Floats) -> Floats:
+    """Matrices (..., 4, 4) of p -> linear @ p + offset: (..., 3, 3) and (..., 3)."""
+    out = np.zeros((*np.shape(offset)[:-1], 4, 4))
+    out[..., :3, :3], out[..., :3, 3], out[..., 3, 3] = linear, offset, 1
+    return out
+
+
+def rotation_about(axis: ArrayLike, degrees: float) -> Floats:
+    """Rotation (3, 3) about an axis, which has a length (Rodrigues 1840)."""
+    cross = np.cross(np.eye(3), np.array(axis) / length(np.array(axis, np.float64)))
+    sine, cosine = sin_cos_of(math.radians(degrees))
+    turn: Floats = sine * cross + (1 - cosine) * matmul(cross, cross)
+    return np.eye(3) + turn
+
+
+@dataclass(frozen=True, eq=False)
+class Transform:
+    """An affine placement in the world: p -> linear @ p + offset.
+
+    Parameters
+    ----------
+    linear
+        float64 (3, 3), invertible.
+    offset
+        float64 (3,), metres.
+
+    Raises
+    ------
+    LidarError
+        If the numbers are not finite or `linear` flattens the mesh.
+    """
+
+    linear: Floats
+    offset: Floats
+
+    def __post_init__(self) -> None:
+        linear, offset = as_array("linear", self.linear), as_array("offset", self.offset)
+        if linear.shape != (3, 3) or offset.shape != (3,):
+            raise LidarError(
+                f"A transform needs a (3, 3) matrix and 3 offsets, not {linear.shape} and "
+                f"{offset.shape}."
+            )
+        if not (np.isfinite(linear).all() and np.isfinite(offset).all()):
+            raise LidarError("A transform must be of finite numbers.")
+        if rank(linear) < 3:
+            raise LidarError("The transform flattens the mesh: its matrix has no inverse.")
+        object.__setattr__(self, "linear", linear)
+        object.__setattr__(self, "offset", offset)
+
+    @property
+    def keeps_xy(self) -> bool:
+        """Whether x and y stay as they are."""
+        return not self.offset[:2].any() and bool((self.linear[:2] == np.eye(3)[:2]).all())
+
+    @classmethod
+    def place(
+        cls,
+        translation: tuple[float, float, float] = (0.0, 0.0, 0.0),
+        rotation_deg: tuple[float, float, float] = (0.0, 0.0, 0.0),
+        scale: float | tuple[float, float, float] = 1.0,
+    ) -> Transform:
+        """Scale, then rotate about the world's x, y and z axes in this order, then move.
+
+        Parameters
+        ----------
+        translation
+            Metres.
+        rotation_deg
+            Degrees about x, y and z.
+        scale
+            One factor, or one for each axis; not zero.
+        """
+        roll, pitch, yaw = rotation_deg
+        turn = Pose((0.0, 0.0, 0.0), yaw_deg=yaw, pitch_deg=pitch, roll_deg=roll).turn
+        return cls(turn * np.broadcast_to(scale, 3), np.array(translation))
+
+    @classmethod
+    def from_matrix(cls, matrix: ArrayLike) -> Transform:
+        """Make a transform of a homogeneous (4, 4) matrix whose last row is 0 0 0 1."""
+        array = as_array("transform", matrix)
+        if array.shape != (4, 4) or not np.array_equal(array[3], [0, 0, 0, 1]):
+            raise LidarError(
+                "A transform matrix has four rows of four numbers, the last one 0 0 0 1; "
+                f"given: {array.tolist()}."
+            )
+        return cls(array[:3, :3], array[:3, 3])

@@ -1,0 +1,270 @@
+"""Trajectories in bags of ROS 2: topics of poses, of GNSS receivers with an IMU, and of frames."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+
+from ..base.arrays import Floats, Ints
+from ..base.errors import LidarError
+from ..base.vectors import applied, matmul
+from ..base.words import did_you_mean
+from ..columns.bags import messages_of, opened_bag
+from .navigation import local_positions
+from .trajectory import Track, quaternions_of
+
+if TYPE_CHECKING:
+    from rosbags.rosbag2 import Reader
+
+Origin = Sequence[float] | None
+# {type of messages: the pose in a message}
+_POSES: dict[str, Callable[[Any], Any]] = {
+    "nav_msgs/msg/Odometry": lambda message: message.pose.pose,
+    "geometry_msgs/msg/PoseStamped": lambda message: message.pose,
+    "geometry_msgs/msg/PoseWithCovarianceStamped": lambda message: message.pose.pose,
+    "geometry_msgs/msg/TransformStamped": lambda message: message.transform,
+}
+_GNSS, _IMU = "sensor_msgs/msg/NavSatFix", "sensor_msgs/msg/Imu"
+_FRAMES = "tf2_msgs/msg/TFMessage"
+_STATIC = "/tf_static"
+_SAME = 1e-6  # between numbers of a pose that is sent twice
+_READ = ", ".join([*_POSES, _GNSS, _FRAMES])
+
+
+class TimedPoses(NamedTuple):
+    """Poses of a carrier."""
+
+    seconds: Floats  # (k,): by the clock of the bag
+    positions: Floats  # (k, 3): metres
+    quaternions: Floats | None  # (k, 4): x, y, z, w; None if the bag has none
+
+
+@dataclass
+class _Edge:
+    """Poses of a frame in the frame above it."""
+
+    parent: str
+    times_ns: list[int] = field(default_factory=list)
+    rows: list[list[float]] = field(default_factory=list)  # x, y, z and the quaternion
+
+
+def read_bag(path: Path, topic: str | None, origin: Origin) -> TimedPoses:
+    """Read a trajectory from a bag.
+
+    Parameters
+    ----------
+    path
+        An .mcap or .db3, or the folder of a bag.
+    topic
+        A topic of `_POSES` or NavSatFix; of NavSatFix and Imu, separated by a space; or, for a
+        frame of /tf, «/tf:FRAME». None for the only one.
+    origin
+        Of NavSatFix: latitude and longitude, degrees, and height, metres, of the world's zero.
+        None for the first fix.
+
+    Raises
+    ------
+    LidarError
+        If the bag cannot be read, or the topic is not clear.
+    """
+    with opened_bag(path, "the bag") as bag:
+        kinds = {one.topic: one.msgtype for one in bag.connections}
+        wanted, _, frame = (topic or "").partition(":")
+        wanted, _, imu = wanted.partition(" ")
+        posed = [one for one, kind in kinds.items() if kind in (*_POSES, _GNSS)]
+        if wanted in posed:
+            chosen = wanted
+        else:
+            edges = _edges_of(bag, kinds)
+            if wanted == "/tf" and frame in edges:  # of a frame that moves only with others, too
+                return _frame_poses(edges, frame)
+            labels = [*posed, *(f"/tf:{one}" for one in _moving(edges))]
+            chosen = _chosen(labels, topic)
+            if chosen.startswith("/tf:"):
+                return _frame_poses(edges, chosen.removeprefix("/tf:"))
+        if kinds[chosen] == _GNSS:
+            return _gnss_poses(bag, kinds, chosen, imu, origin)
+        return _topic_poses(bag, chosen, _POSES[kinds[chosen]])
+
+
+def _chosen(labels: Sequence[str], topic: str | None) -> str:
+    """Return the only label, or the only frame if the topic is /tf."""
+    frames = [label for label in labels if label.startswith("/tf:")]
+    if topic == "/tf" and len(frames) == 1:
+        return frames[0]
+    if topic is None and len(labels) == 1:
+        return labels[0]
+    if not labels:
+        raise LidarError(f"it has no poses: topics of {_READ} are read.")
+    listed = f"it has the poses {', '.join(labels)}"
+    if topic is None:
+        raise LidarError(f"{listed}: choose one with topic.")
+    raise LidarError(f"{listed}, not {topic!r}.{did_you_mean(topic, labels)}")
+
+
+def _row_of(pose: Any) -> list[float]:
+    """Return x, y, z and the quaternion of a Pose or a Transform."""
+    place = pose.position if hasattr(pose, "position") else pose.translation
+    turn = pose.orientation if hasattr(pose, "orientation") else pose.rotation
+    return [place.x, place.y, place.z, turn.x, turn.y, turn.z, turn.w]
+
+
+def _stamp_ns(header: Any) -> int:
+    return int(header.stamp.sec) * 1_000_000_000 + int(header.stamp.nanosec)
+
+
+def _in_order(times_ns: Sequence[int], rows: Sequence[Sequence[float]]) -> tuple[Ints, Floats]:
+    """Return times and rows in the order of time; rows that are sent twice count once."""
+    times, table = np.array(times_ns, np.int64), np.array(rows, np.float64)
+    order = np.argsort(times, kind="stable")
+    times, table = times[order], table[order]
+    close = np.abs(table[1:] - table[:-1]).max(axis=1) <= _SAME
+    again = np.append(False, (np.diff(times) == 0) & close)
+    return times[~again], table[~again]
+
+
+def _topic_poses(bag: Reader, topic: str, pose_of: Callable[[Any], Any]) -> TimedPoses:
+    """Return the poses of a topic, by the stamps of their headers."""
+    stamps, times, rows, frames = [], [], [], set()
+    for _, time_ns, message in messages_of(bag, [topic]):
+        stamps.append(_stamp_ns(message.header))
+        times.append(time_ns)
+        rows.append(_row_of(pose_of(message)))
+        frames.add(message.header.frame_id)
+    if not rows:
+        raise LidarError(f"{topic} has no messages.")
+    if len(frames) > 1:
+        raise LidarError(f"{topic} has poses in several frames: {', '.join(sorted(frames))}.")
+    # Programs that set no stamps leave zeros.
+    times_ns, table = _in_order(stamps if any(stamps) else times, rows)
+    return TimedPoses(times_ns / 1e9, table[:, :3], table[:, 3:])
+
+
+def _gnss_poses(
+    bag: Reader, kinds: Mapping[str, str], topic: str, imu: str, origin: Origin
+) -> TimedPoses:
+    """Return positions of a GNSS receiver, with the orientations of an IMU if the bag has some."""
+    times_ns, fixes = [], []
+    for _, _, fix in messages_of(bag, [topic]):
+        place = [fix.latitude, fix.longitude, fix.altitude]
+        if fix.status.status >= 0 and np.isfinite(place).all():
+            times_ns.append(_stamp_ns(fix.header))
+            fixes.append(place)
+    if len(fixes) < 2:
+        raise LidarError(f"{topic} has {len(fixes)} fixes, and a trajectory needs two.")
+    times, places = _in_order(times_ns, fixes)
+    zero = places[0] if origin is None else np.asarray(origin, np.float64)
+    latitude, longitude, height = zero.tolist()
+    positions = local_positions(places, (latitude, longitude, height))
+    orientations = _orientations(bag, kinds, imu)
+    if orientations is None:
+        return TimedPoses(times / 1e9, positions, None)
+    within = (times >= orientations[0][0]) & (times <= orientations[0][-1])
+    if within.sum() < 2:
+        raise LidarError(f"{topic} and the orientations of its Imu are not of the same time.")
+    _, turns = _edge_poses(*orientations, times[within])
+    return TimedPoses(times[within] / 1e9, positions[within], quaternions_of(turns))
+
+
+def _orientations(bag: Reader, kinds: Mapping[str, str], imu: str) -> tuple[Ints, Floats] | None:
+    """Return times (k,), ns, and rows (k, 7) with orientations of an IMU; None without any."""
+    topics = [one for one, kind in kinds.items() if kind == _IMU]
+    if imu and imu not in topics:
+        raise LidarError(f"it has no Imu {imu!r}.{did_you_mean(imu, topics)}")
+    measured: dict[str, tuple[list[int], list[list[float]]]] = {}
+    for topic, _, message in messages_of(bag, [imu] if imu else topics):
+        if message.orientation_covariance[0] != -1:  # an IMU without orientation, by its definition
+            turn = message.orientation
+            times, rows = measured.setdefault(topic, ([], []))
+            times.append(_stamp_ns(message.header))
+            rows.append([0.0, 0.0, 0.0, turn.x, turn.y, turn.z, turn.w])
+    if len(measured) > 1:
+        raise LidarError(
+            f"it has several Imu with orientations, {', '.join(measured)}: give topic both names, "
+            f"of the NavSatFix and the Imu, separated by a space."
+        )
+    if not measured:
+        if imu:
+            raise LidarError(f"{imu} has no orientations.")
+        return None
+    return _in_order(*next(iter(measured.values())))
+
+
+def _edges_of(bag: Reader, kinds: Mapping[str, str]) -> dict[str, _Edge]:
+    """Return {frame: its poses in the frame above it} of all topics of frames."""
+    edges: dict[str, _Edge] = {}
+    topics = [one for one, kind in kinds.items() if kind == _FRAMES]
+    for topic, _, message in messages_of(bag, topics):
+        for stamped in message.transforms:
+            parent, child = (
+                frame.lstrip("/") for frame in (stamped.header.frame_id, stamped.child_frame_id)
+            )
+            edge = edges.setdefault(child, _Edge(parent))
+            if edge.parent != parent:
+                raise LidarError(
+                    f"its frame {child!r} is in the frames {edge.parent!r} and {parent!r}."
+                )
+            if topic.endswith(_STATIC):
+                edge.times_ns.clear()
+                edge.rows.clear()
+            edge.times_ns.append(_stamp_ns(stamped.header))
+            edge.rows.append(_row_of(stamped.transform))
+    return edges
+
+
+def _chain(edges: Mapping[str, _Edge], frame: str) -> list[_Edge]:
+    """Return the edges from a frame upwards to the root."""
+    chain, passed = [], set[str]()
+    while frame in edges:
+        if frame in passed:
+            raise LidarError(f"its frame {frame!r} is above itself.")
+        passed.add(frame)
+        chain.append(edges[frame])
+        frame = edges[frame].parent
+    return chain
+
+
+def _moving(edges: Mapping[str, _Edge]) -> list[str]:
+    """Return the frames whose poses in the frame above change, or else those with several."""
+    several = [frame for frame, edge in edges.items() if len(set(edge.times_ns)) > 1]
+    changing = [
+        frame for frame in several if any(row != edges[frame].rows[0] for row in edges[frame].rows)
+    ]
+    return changing or several
+
+
+def _frame_poses(edges: Mapping[str, _Edge], frame: str) -> TimedPoses:
+    """Return the poses of a frame in the root of its tree.
+
+    Their times are those of the lowest frame that moves, as far as all others have poses then.
+    """
+    chain = _chain(edges, frame)
+    tables = [_in_order(edge.times_ns, edge.rows) for edge in chain]
+    moving = [times for times, _ in tables if len(times) > 1]
+    if not moving:
+        raise LidarError(f"its frame {frame!r} has one pose, and a trajectory needs two.")
+    first, last = max(times[0] for times in moving), min(times[-1] for times in moving)
+    times = moving[0][(moving[0] >= first) & (moving[0] <= last)]
+    if len(times) < 2:
+        raise LidarError(f"the frames above {frame!r} have no poses at the same time.")
+    positions = np.zeros((len(times), 3))
+    rotations = np.broadcast_to(np.eye(3), (len(times), 3, 3))
+    for edge_times, rows in tables:
+        origins, turns = _edge_poses(edge_times, rows, times)
+        positions = origins + applied(turns, positions)
+        rotations = matmul(turns, rotations)
+    return TimedPoses(times / 1e9, positions, quaternions_of(rotations))
+
+
+def _edge_poses(edge_times: Ints, rows: Floats, times: Ints) -> tuple[Floats, Floats]:
+    """Return positions (k, 3) and rotations (k, 3, 3) at times (k,), ns, within those of rows."""
+    if len(edge_times) == 1:  # a static frame
+        edge_times, rows = edge_times + np.arange(2), rows.repeat(2, axis=0)
+        times = np.broadcast_to(edge_times[0], len(times))
+    seconds = (edge_times - edge_times[0]) / 1e9
+    track = Track(seconds, rows[:, :3], rows[:, 3:])
+    return track.poses(0, (times - edge_times[0]).astype(np.float64))

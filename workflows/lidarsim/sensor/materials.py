@@ -1,0 +1,651 @@
+"""Materials by the names of objects and of their materials, energies of returns, weather."""
+
+from __future__ import annotations
+
+import csv
+import re
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import dataclass, replace
+from fnmatch import fnmatchcase, translate
+from functools import cache, cached_property
+from glob import escape
+from importlib.resources import files
+from typing import Annotated, Any, Literal, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field, WrapValidator
+
+from ..base.arrays import Bools, Floats, Indices, Integers
+from ..base.declared import TextOrTexts, UnitShare, about, allowed, written_as
+from ..base.elementary import exp, power
+from ..base.errors import LidarError
+from ..base.validation import checked_fields, shown
+from ..base.words import did_you_mean
+from .leaves import LeafAngle
+
+REFERENCE_M = 10.0  # energy is 1 for a white surface hit at right angles from here
+REFLECTANCE = 0.5  # default reflectance: between asphalt (0.1 to 0.2) and white paint (0.8)
+# Engineer grade sheeting, ASTM D4956 type I white: 70 cd/lx/m², of a white diffuser 1/π.
+RETRO_GAIN = 220.0
+GLASS_INDEX = 1.5
+# Of water, from 905 to 1550 nm (Hale and Querry 1973: 1.328 to 1.318).
+WATER_INDEX = 1.328
+# Share of diffuse light in water that its surface sends back, 1 - (1 - r) / n², where r is the mean
+# of Fresnel's reflection outside, over a half space (Lekner and Dorf 1988).
+WATER_INWARDS = 0.4702
+NEAREST_M = 1e-3  # energies do not grow below this distance
+NEAR_NM, FAR_NM = 905.0, 1550.0  # wavelengths of the table of reflectances
+POLISHED = 0.04  # share that plastics, paints and wet surfaces reflect at right angles, n = 1.5
+DARKEST = 1e-3  # least reflectance of a colour, so that every hit is a return
+
+SemanticClass = Annotated[int, Field(ge=0, le=65_535)]
+Transparent = Literal["none", "pass"]
+
+
+def _checked_names(given: Any, handler: Callable[[Any], Any]) -> Any:
+    """Refuse names of classes that files cannot hold, or that two classes share."""
+    for number, name in given.items() if isinstance(given, Mapping) else ():
+        known = type(number) is int and 0 <= number <= 65_535 and isinstance(name, str)
+        alone = [*given.values()].count(name) == 1
+        if not (known and alone and 0 < len(name) < 100 and name.isprintable()):
+            raise ValueError(
+                f"{shown({number: name})} is no class with a name of its own: give whole numbers "
+                "of 0 to 65535 and a different text for each, such as {10: car}."
+            )
+    return handler(given)
+
+
+ClassNames = Annotated[Mapping[SemanticClass, str], WrapValidator(_checked_names)]
+
+
+class Measured(NamedTuple):
+    """Reflectance of a material in a public spectral library."""
+
+    shares: tuple[float, float]  # at 905 and 1550 nm
+    library: str
+    sample: str
+
+
+@cache
+def reflectances() -> dict[str, Measured]:
+    """Return the table of reflectances: {name of a material: what was measured}."""
+    text = (files("lidarsim.sensor") / "reflectances.csv").read_text("utf-8")
+    return {
+        row["name"]: Measured(
+            (float(row["at_905_nm"]), float(row["at_1550_nm"])), row["library"], row["sample"]
+        )
+        for row in csv.DictReader(text.splitlines())
+    }
+
+
+@dataclass(frozen=True)
+@checked_fields
+class Material:
+    """Optical properties and class of surfaces; of several entries for a face, the first counts.
+
+    An entry is for objects by their names, for faces by the names that their materials have in the
+    scene's files, or for the faces of some objects that have some materials.
+
+    Reflectance is that at the sensor's wavelength, in all directions but for a gloss. Of light that
+    is not scattered, a share is mirrored; the rest passes, or is lost with "none".
+
+    Raises
+    ------
+    LidarError
+        If it is for nothing, a value is outside its range, the table of reflectances has no such
+        spectrum, or two values contradict each other.
+    """
+
+    objects: Annotated[
+        str | Sequence[str] | None,
+        written_as(TextOrTexts | None),
+        about("names of objects, with * and ?; by default all", min_length=1),
+    ] = None
+    reflectance: Annotated[
+        UnitShare | Literal["texture"] | None,
+        allowed("0 to 1, or texture"),
+        about(
+            "share of light that is scattered; by default 0.5, for glass and whole mirrors "
+            "0; texture: the luminance of the colour that was hit"
+        ),
+    ] = None
+    semantic_class: Annotated[SemanticClass, about("value of the column class", alias="class")] = 0
+    retro: Annotated[
+        bool, about("whether light returns in its own direction, as from traffic signs")
+    ] = False
+    transparent: Annotated[Transparent, about("pass: the rest of the light passes through")] = (
+        "none"
+    )
+    specular_reflectance: Annotated[
+        UnitShare | Literal["fresnel"] | None,
+        allowed("0 to 1, or fresnel"),
+        about(
+            "share of the rest that is mirrored at right angles, and shows ghosts; grows towards "
+            "grazing angles. 1 for a mirror, 0.04 for paint; fresnel for what light passes",
+            0.04,
+        ),
+    ] = None
+    scale: Annotated[
+        float, about("with reflectance: texture, a factor of the luminance", gt=0, le=100)
+    ] = 1.0
+    spectrum: Annotated[
+        str | None,
+        about("instead of reflectance: a material of the table of reflectances", "asphalt, dry"),
+    ] = None
+    roughness: Annotated[
+        float | None, about("adds a gloss, as of paint or metal; by default none", ge=0.1, le=1)
+    ] = None
+    metalness: Annotated[
+        UnitShare, about("with roughness: 1 for metals, which scatter by their gloss alone")
+    ] = 0.0
+    refractive_index: Annotated[
+        float | None,
+        about(
+            "with transparent: pass, light is refracted and slower within the closed "
+            "surface, as 1.33 for water; by default it goes straight on",
+            1.33,
+            ge=1,
+            le=4,
+        ),
+    ] = None
+    attenuation_per_m: Annotated[
+        float, about("with refractive_index, extinction within the surface", ge=0, le=1e6)
+    ] = 0.0
+    leaf_area_density: Annotated[
+        float | None,
+        about(
+            "the closed surface is full of leaves: their one-sided area, m²/m³; "
+            "reflectance is theirs",
+            0.8,
+            gt=0,
+            le=1e4,
+        ),
+    ] = None
+    leaf_angle: Annotated[
+        LeafAngle,
+        about(
+            "with leaf_area_density, or of voxels, how leaves are inclined: spherical, "
+            "planophile, erectophile, plagiophile, extremophile, uniform, or Campbell's ratio "
+            "of axes"
+        ),
+    ] = "spherical"
+    material: Annotated[
+        str | Sequence[str] | None,
+        written_as(TextOrTexts | None),
+        about(
+            "names that materials have in the scene's files, with * and ?; by default all",
+            "Glass",
+            min_length=1,
+        ),
+    ] = None
+
+    def __post_init__(self) -> None:
+        if self.objects is None and self.material is None:
+            raise LidarError(
+                'a material is for nothing: give objects, such as objects: "*", or material, a '
+                "name of the scene's file."
+            )
+        for field_name in ("objects", "material"):
+            given = getattr(self, field_name)
+            if given is None:
+                continue
+            names = (given,) if isinstance(given, str) else tuple(given)
+            if not names or not all(names):
+                raise LidarError(f"{field_name} is {given!r}; it must be names of {field_name}.")
+            object.__setattr__(self, field_name, names)
+        if self.spectrum is not None:
+            if self.spectrum not in (known := reflectances()):
+                there = _materials_like(self.spectrum, [*known])
+                raise LidarError(f"There is no spectrum {self.spectrum!r}.{there}")
+            if self.reflectance is not None:
+                raise LidarError("give either spectrum or reflectance, not both.")
+        if self.reflectance == "texture":
+            if self.transparent != "none":
+                raise LidarError(
+                    f"reflectance texture is for opaque objects: with transparent "
+                    f"{self.transparent}, give a number."
+                )
+        elif self.scale != 1:
+            raise LidarError("scale is a factor of colours: give reflectance texture with it.")
+
+        if self.roughness is None and self.metalness:
+            raise LidarError("metalness needs a roughness: give 0.1 (polished) to 1 (matt).")
+        smooth = self.transparent != "none" or self.specular_reflectance is not None
+        if self.roughness is not None and (self.retro or smooth):
+            raise LidarError(
+                "roughness is for opaque surfaces without retro and specular_reflectance."
+            )
+        self._check_within()
+
+    def _check_within(self) -> None:
+        """Refuse what contradicts the medium within a surface, or the light that passes it."""
+        mirrors = self.specular_reflectance
+        if mirrors is not None and (mirrors == "fresnel") != (self.transparent == "pass"):
+            raise LidarError(
+                f"specular_reflectance is {mirrors!r} with transparent: {self.transparent}; give "
+                "fresnel for what light passes, else 0 to 1."
+            )
+        if self.refractive_index is not None and self.transparent != "pass":
+            raise LidarError("refractive_index is for light that passes: add transparent: pass.")
+        if self.attenuation_per_m and self.refractive_index is None:
+            raise LidarError("attenuation_per_m needs a refractive_index, such as 1.33.")
+        if self.leaf_area_density is None:
+            return
+        if not self._suits_leaves:
+            raise LidarError(
+                "leaf_area_density is for leaves that scatter light: leave out transparent, "
+                "retro, roughness and specular_reflectance, and give reflectance as a number, or a "
+                "spectrum."
+            )
+
+    @property
+    def _suits_leaves(self) -> bool:
+        other = self.transparent != "none" or self.retro or self.roughness is not None
+        return not (other or self.specular_reflectance) and self.reflectance != "texture"
+
+    def check_leaves(self, name: str, voxels: bool) -> None:
+        """Check that it suits an object, by whether that has voxels; LidarError if not."""
+        if voxels and (self.leaf_area_density is not None or not self._suits_leaves):
+            raise LidarError(
+                f"materials: {name!r} is of voxels, whose file has the leaf area: give it an entry "
+                "with a reflectance, or a spectrum, and perhaps a leaf_angle, but nothing else."
+            )
+        if not voxels and self.leaf_angle != "spherical" and self.leaf_area_density is None:
+            raise LidarError(
+                f"materials: {name!r} has a leaf_angle, which needs a leaf_area_density, m²/m³, "
+                "such as 0.8, if it is not of voxels (.vox)."
+            )
+
+    def share(self, wavelength_nm: float) -> float:
+        """Share of light that is scattered; of textures, that of what has no colour."""
+        if self.spectrum is not None:
+            near, far = reflectances()[self.spectrum].shares
+            # The nearer of the two was measured; between them, leaves absorb more than either says.
+            return near if wavelength_nm < (NEAR_NM + FAR_NM) / 2 else far
+        if self.reflectance == "texture":
+            return min(1.0, self.scale * REFLECTANCE)
+        if self.reflectance is None:
+            return (
+                0.0 if self.transparent == "pass" or self.specular_reflectance == 1 else REFLECTANCE
+            )
+        return float(self.reflectance)
+
+    @property
+    def specular(self) -> float:
+        """Share of what is not scattered that is mirrored at right angles; 1 for "fresnel"."""
+        return float(self.specular_reflectance == "fresnel" or self.specular_reflectance or 0)
+
+    def named(self, name: str, materials: Collection[str] = ("",)) -> bool:
+        """Whether this material applies to an object, or some of its faces, of some materials."""
+        return _fits(name, self.objects) and any(_fits(one, self.material) for one in materials)
+
+    @property
+    def for_all(self) -> bool:
+        """Whether this material applies to all faces of all objects."""
+        return self.material is None and self.objects is not None and "*" in self.objects
+
+
+def _fits(name: str, patterns: str | Sequence[str] | None) -> bool:
+    """Whether a name fits one of some patterns, of which None stands for all."""
+    return patterns is None or any(name == one or fnmatchcase(name, one) for one in patterns)
+
+
+def _materials_like(name: str, known: Sequence[str]) -> str:
+    """Name the materials that contain a word, such as «asphalt», or else the nearest, or all."""
+    some = [one for one in known if name.lower() in one.lower()]
+    if len(some) > 1:
+        return f" There are: {'; '.join(some)}."
+    return did_you_mean(name, some or known) or f" There are: {'; '.join(some or known)}."
+
+
+def rows_named(pattern: str, names: Sequence[str]) -> Indices:
+    """Rows of names that are a name, or fit it as a pattern with * and ?."""
+    if not any(sign in pattern for sign in "*?["):
+        return np.array([row for row, name in enumerate(names) if name == pattern], np.intp)
+    fits = re.compile(translate(pattern)).match
+    return np.array([r for r, name in enumerate(names) if name == pattern or fits(name)], np.intp)
+
+
+@dataclass(frozen=True, eq=False)
+class SurfaceKinds:
+    """Kinds of surfaces: each object, or of an object of several materials each of these.
+
+    Parameters
+    ----------
+    names
+        Names of all objects.
+    object
+        int (k,), ascending: row of `names` for each kind. Each object has one kind at least.
+    material
+        Names (k,) that the materials have in the scene's files; "" for none.
+    """
+
+    names: Sequence[str]
+    object: Indices
+    material: Sequence[str]
+
+    @classmethod
+    def of_objects(cls, names: Sequence[str]) -> SurfaceKinds:
+        """Return one kind for each object, without a material."""
+        return cls(names, np.arange(len(names)), ("",) * len(names))
+
+    @cached_property
+    def first(self) -> Indices:
+        """First kind of each object, and the number of kinds: (objects + 1,)."""
+        return np.searchsorted(self.object, np.arange(len(self.names) + 1))
+
+    def of_rows(self, rows: Indices) -> Indices:
+        """Kinds of some objects."""
+        if len(self.object) == len(self.names):
+            return rows
+        starts, stops = self.first[rows], self.first[rows + 1]
+        ranges = [np.arange(start, stop) for start, stop in zip(starts, stops, strict=True)]
+        return np.concatenate([np.zeros(0, np.intp), *ranges])
+
+    def describe(self, kind: int) -> str:
+        """Name of a kind for errors: of its object, and of its material."""
+        name = repr(self.names[self.object[kind]])
+        return f"{name}, material {self.material[kind]!r}" if self.material[kind] else name
+
+
+def first_matches(materials: Sequence[Material], kinds: SurfaceKinds) -> Indices:
+    """First material that is for each kind of surface, -1 for none: (k,).
+
+    LidarError if a material is for nothing in the scene, or hides those after it.
+    """
+    first = np.full(len(kinds.object), -1)
+    known = {name: row for row, name in enumerate(kinds.names)}
+    of_material: dict[str, list[int]] = {}  # {name of a material: its kinds}
+    if any(entry.material is not None for entry in materials):
+        for kind, name in enumerate(kinds.material):
+            if name:
+                of_material.setdefault(name, []).append(kind)
+    for number, entry in enumerate(materials):
+        if entry.for_all and number + 1 < len(materials):
+            raise LidarError(
+                f"materials: the first entry for a surface counts, so that none after number "
+                f'{number + 1}, {{objects: "*"}}, would: put it last.'
+            )
+        matches = _matching_kinds(entry, kinds, known, of_material)
+        first[matches[first[matches] < 0]] = number
+    return first
+
+
+def _matching_kinds(
+    entry: Material,
+    kinds: SurfaceKinds,
+    known: Mapping[str, int],
+    of_material: Mapping[str, Sequence[int]],
+) -> Indices:
+    """Kinds that a material is for; LidarError if a name fits nothing in the scene."""
+    matches: Indices | None = None
+    if entry.objects is not None:
+        rows = [_matching_rows(pattern, kinds.names, known) for pattern in entry.objects]
+        matches = kinds.of_rows(np.concatenate(rows))
+    if entry.material is None:
+        assert matches is not None, "a material is for objects, or for materials"
+        return matches
+    names = [*of_material]
+    with_material: list[int] = []
+    for pattern in entry.material:
+        rows_of_pattern = rows_named(pattern, names)
+        if not len(rows_of_pattern):
+            listed = f" There are {', '.join(names[:5])}{', …' * (len(names) > 5)}."
+            measured = f" For a measured reflectance, write spectrum: {pattern!r}."
+            raise LidarError(
+                f"materials names the material {pattern!r}, but no face of the scene has one of "
+                "that name."
+                + (did_you_mean(pattern, names) or (listed if names else " No face has any."))
+                + measured * (pattern in reflectances())
+            )
+        for row in rows_of_pattern.tolist():
+            with_material += of_material[names[row]]
+    some = np.array(with_material, np.intp)
+    if matches is None:
+        return some
+    both = np.intersect1d(matches, some)
+    if not len(both):
+        raise LidarError(
+            f"materials: no face of {', '.join(map(repr, entry.objects or ()))} has the material "
+            f"{', '.join(map(repr, entry.material))}."
+        )
+    return both
+
+
+def _matching_rows(pattern: str, names: Sequence[str], known: Mapping[str, int]) -> Indices:
+    """Rows of objects that a pattern fits; LidarError if there are none."""
+    if pattern in known and not any(sign in pattern for sign in "*?["):
+        return np.array([known[pattern]])
+    rows = rows_named(pattern, names)
+    if not len(rows):
+        listed = f" There are {', '.join(names[:5])}{', …' * (len(names) > 5)}."
+        raise LidarError(
+            f"materials names {pattern!r}, but no object has that name."
+            + (did_you_mean(pattern, names) or listed)
+        )
+    return rows
+
+
+def with_classes(
+    materials: Sequence[Material], classes: Mapping[int, Sequence[str]], kinds: SurfaceKinds
+) -> list[Material]:
+    """Give objects whose material has no class one by their names: {class: patterns}.
+
+    LidarError if a material is for nothing in the scene.
+    """
+    first = first_matches(materials, kinds)
+    before: list[list[Material]] = [[] for _ in materials]  # what comes before each
+    for semantic_class, patterns in classes.items():
+        for pattern in patterns:
+            rows = rows_named(pattern, kinds.names)
+            of_pattern = kinds.of_rows(rows)
+            for number in np.unique(first[of_pattern]).tolist():
+                entry = materials[number]
+                if number < 0 or entry.semantic_class:
+                    continue
+                some = of_pattern[first[of_pattern] == number]
+                objects = [pattern]
+                if len(some) < len(of_pattern):
+                    of_some = np.unique(kinds.object[some]).tolist()
+                    objects = [escape(kinds.names[row]) for row in of_some]
+                with_its_class = replace(entry, objects=objects, semantic_class=semantic_class)
+                before[number].insert(0, with_its_class)
+    return [
+        made for entry, others in zip(materials, before, strict=True) for made in (*others, entry)
+    ]
+
+
+def with_class(
+    materials: Sequence[Material], semantic_class: int, rows: Indices, kinds: SurfaceKinds
+) -> list[Material]:
+    """Give some objects a class, and leave the rest of their materials.
+
+    LidarError if a material is for nothing in the scene.
+    """
+    first, of_rows = first_matches(materials, kinds), kinds.of_rows(rows)
+    out: list[Material] = []
+    for number in (*range(len(materials)), -1):
+        of_number = np.unique(kinds.object[of_rows[first[of_rows] == number]]).tolist()
+        if of_number:
+            entry = materials[number] if number >= 0 else Material("*")
+            objects = [escape(kinds.names[row]) for row in of_number]
+            out.append(replace(entry, objects=objects, semantic_class=semantic_class))
+        if number >= 0:
+            out.append(materials[number])
+    return out
+
+
+@dataclass(frozen=True, eq=False)
+class MaterialTable:
+    """Materials of kinds of surfaces: each array has one value for each."""
+
+    reflectance: Floats
+    scale: Floats  # of the luminance of colours; 0 where the reflectance is a number
+    roughness: Floats  # 0 for no gloss
+    metalness: Floats
+    retro: Bools
+    passes: Bools
+    specular: Floats  # share of what is not scattered that is mirrored at right angles
+    semantic_class: NDArray[np.uint16]
+    refractive_index: Floats  # within; 0 where light goes straight on
+    attenuation: Floats  # within, 1/m
+    leaf_area: Floats  # density within, m²/m³; 0 for no leaves, 1 for voxels
+    leaf_angle: Indices  # rows of `leaf_angles`
+    leaf_angles: tuple[str | float, ...]
+
+    @classmethod
+    def of(
+        cls,
+        materials: Sequence[Material],
+        kinds: SurfaceKinds,
+        wavelength_nm: float = NEAR_NM,
+        voxels: Bools | None = None,
+    ) -> MaterialTable:
+        """Find the materials of kinds of surfaces: the first that is for a kind counts.
+
+        `voxels` (objects,) says which have voxels, and so leaves of their own; None for none.
+
+        Raises
+        ------
+        LidarError
+            If a name fits nothing, there are materials and a kind has none, or one is not for
+            leaves, and its object has some.
+        """
+        first = first_matches(materials, kinds)
+        without = np.flatnonzero(first < 0)
+        if len(without) and materials:
+            more = f" and {len(without) - 1} more" if without[1:].size else ""
+            raise LidarError(
+                f"materials: no entry names the object {kinds.describe(without[0])}{more}: end "
+                'with one for all the others, such as {objects: "*"}.'
+            )
+        found = [*materials, Material("*")]  # the last is of all, if there are no materials
+        textured = [m.scale * (m.reflectance == "texture") for m in found]
+        angles = tuple(dict.fromkeys(m.leaf_angle for m in found))
+        leaf_area = np.array([m.leaf_area_density or 0.0 for m in found])[first]
+        own = np.zeros(len(first), np.bool_) if voxels is None else voxels[kinds.object]
+        angled = np.array([m.leaf_angle != "spherical" for m in found])[first]
+        for row in np.flatnonzero(own | angled).tolist():
+            name = kinds.names[kinds.object[row]]
+            found[first[row]].check_leaves(name, bool(own[row]))
+        leaf_area[own] = 1.0
+        return cls(
+            np.array([m.share(wavelength_nm) for m in found], np.float64)[first],
+            np.array(textured, np.float64)[first],
+            np.array([m.roughness or 0.0 for m in found])[first],
+            np.array([m.metalness for m in found])[first],
+            np.array([m.retro for m in found], np.bool_)[first],
+            np.array([m.transparent == "pass" for m in found], np.bool_)[first],
+            np.array([m.specular for m in found], np.float64)[first],
+            np.array([m.semantic_class for m in found], np.uint16)[first],
+            np.array([m.refractive_index or 0.0 for m in found])[first],
+            np.array([m.attenuation_per_m for m in found], np.float64)[first],
+            leaf_area,
+            np.array([angles.index(m.leaf_angle) for m in found], np.intp)[first],
+            angles,
+        )
+
+    @property
+    def leafy(self) -> Bools:
+        """Whether surfaces are full of leaves."""
+        return self.leaf_area > 0
+
+    @property
+    def refracts(self) -> Bools:
+        """Whether light is refracted at surfaces."""
+        return self.refractive_index > 0
+
+    @property
+    def textured(self) -> bool:
+        """Whether the colours of a surface are its reflectance."""
+        return bool(self.scale.any())
+
+    def shares(self, rows: Integers, luminance: Floats | None) -> Floats:
+        """Share of light that kinds of surfaces (n,) scatter; `luminance` as of `scattered`."""
+        shares = self.reflectance[rows]
+        if luminance is not None:
+            scale = self.scale[rows]
+            bright = np.minimum(np.maximum(scale * luminance, DARKEST), 1.0)
+            shares = bright if self.scale.all() else np.where(scale > 0, bright, shares)
+        return shares
+
+    def scattered(self, rows: Integers, cosine: Floats, luminance: Floats | None = None) -> Floats:
+        """Share of the light returned by kinds of surfaces (n,): 1 for white at right angles.
+
+        `luminance` (n,) is that of the colours that were hit, if the table is `textured`.
+        """
+        shares = self.shares(rows, luminance)
+        back = shares * np.where(self.retro[rows], RETRO_GAIN, cosine)
+        if self.roughness.any():
+            on = np.flatnonzero(self.roughness[rows])
+            metal, some = self.metalness[rows[on]], shares[on]
+            front = POLISHED * (1 - metal) + some * metal
+            back[on] *= 1 - metal
+            back[on] += front * gloss(cosine[on], self.roughness[rows[on]])
+        return back
+
+
+def gloss(cosine: Floats, roughness: Floats) -> Floats:
+    """Light that facets of a rough surface mirror back to where it came from, of a white diffuser.
+
+    Facets are distributed after Walter et al. 2007 (GGX), with shadowing after Smith, and the width
+    is the square of the roughness, as in glTF 2.0. With light and receiver in one direction, their
+    π D G / (4 cos θ) is what is left here. Multiply it by the reflection at right angles.
+    """
+    width, square = np.square(roughness**2), cosine**2
+    spread = 1 - square * (1 - width)
+    return np.asarray(width / (4 * spread**2 * np.sqrt(square + width * (1 - square))))
+
+
+def fresnel(cosine: Any, index: Any = GLASS_INDEX) -> Any:
+    """Share of unpolarised light that a surface reflects (Fresnel's equations).
+
+    `index` is the refractive index behind the surface over that before it; all light is reflected
+    where it is below 1 and the cosine is small.
+    """
+    inside = np.sqrt(np.maximum(1 - (1 - cosine**2) / (index * index), 0.0))
+    across = (cosine - index * inside) / (cosine + index * inside)
+    along = (inside - index * cosine) / (inside + index * cosine)
+    return (across**2 + along**2) / 2
+
+
+def below_water(cosine: Any, reflectance: Any) -> Any:
+    """Light that matt surfaces below a film of water return, relative to dry ones: (n,).
+
+    ``T² / (n² (1 - p ρ))``: light passes the film's surface twice, with Fresnel's transmittance T;
+    in the water it is spread by n², and the share p is sent back to the ground (Lekner and Dorf
+    1988, Ångström 1925).
+    """
+    return within_water(fresnel(cosine, WATER_INDEX), reflectance)
+
+
+def within_water(mirrored: Any, reflectance: Any) -> Any:
+    """See `below_water`; of light of which the film mirrors a share."""
+    through = (1 - mirrored) / WATER_INDEX
+    return through * through / (1 - WATER_INWARDS * reflectance)
+
+
+def at_right_angles(distance: Any, extinction: float = 0.0) -> Any:
+    """Energy returned by white surfaces hit at right angles, by distance in metres."""
+    distance = np.maximum(distance, NEAREST_M)
+    nearer = np.square(REFERENCE_M / distance)
+    return nearer * exp(-2 * extinction * distance) if extinction else nearer
+
+
+def extinction(visibility_km: float | None, wavelength_nm: float) -> float:
+    """Extinction of the air, 1/m (Kruse, McGlauchlin and McQuistan 1962).
+
+    At the meteorological visibility, a contrast has fallen to 2 %; None is clear air without
+    extinction. The wavelength is that of the laser.
+
+    Examples
+    --------
+    >>> round(1000 * extinction(1.0, 905), 2)  # 1/km in fog
+    2.92
+    """
+    v = visibility_km
+    if v is None:
+        return 0.0
+    q = 1.6 if v > 50 else 1.3 if v > 6 else 0.585 * float(power(v, 1 / 3))
+    return float(3.91 / v * float(power(wavelength_nm / 550, -q)) / 1000)

@@ -1,0 +1,479 @@
+"""Sensor models by name: reads their data files and makes sensors."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import fields, replace
+from fractions import Fraction
+from functools import cache
+from importlib.resources import files
+from importlib.resources.abc import Traversable
+from pathlib import Path
+from statistics import NormalDist
+from typing import Annotated, Any, Literal, NamedTuple
+
+import numpy as np
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, model_validator
+
+from ..base.arrays import Floats
+from ..base.declared import UnitShare
+from ..base.elementary import log1p
+from ..base.errors import LidarError
+from ..base.input_files import read_input_text
+from ..base.validation import checked, sentences
+from ..base.words import did_you_mean
+from ..base.yamlfile import load_yaml
+from .beams import Beams, Duty, Mirror, MirrorMotion, Rate, Spin, Step, Width
+from .calibrations import UNUSABLE, Calibration, read_calibration, said
+from .noise import TARGET_REFLECTANCE, THRESHOLD_SIGMAS, Noise
+from .optics import LIGHT_M_NS, Mode, Optics, Returns
+from .ray_sensors import ListedSensor, Prism, PrismSensor, TurningMirror
+from .sensor import LineSensor, MaxRange, MinRange, Sensor
+
+_BUILT_IN = files("lidarsim.sensor") / "data"
+MODEL_FILES = (".yaml", ".yml")
+Sheet = Literal["ideal", "datasheet"]
+
+
+class _ModelSection(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+
+_BEAMS_MOST = 1_000_000
+
+
+def _numbers(value: Any) -> Any:
+    """Expand {first, last, count} to evenly spaced numbers, both ends included."""
+    if isinstance(value, dict):
+        count = value.get("count")
+        if isinstance(count, int) and count > _BEAMS_MOST:
+            raise ValueError(f"count is {count:,}; a sensor has {_BEAMS_MOST:,} beams at most")
+        try:
+            return np.linspace(value["first"], value["last"], value["count"]).tolist()
+        except (KeyError, TypeError, ValueError):
+            raise ValueError("give numbers, or first, last and count, a whole number") from None
+    return value
+
+
+Numbers = Annotated[tuple[float, ...], BeforeValidator(_numbers)]
+OffsetXYZ = tuple[float, float, float]
+# 55.296 is not exact in binary, nor 500/9 in decimal.
+Exact = Annotated[Fraction, BeforeValidator(lambda value: Fraction(str(value)))]
+Positive = Annotated[float, Field(gt=0)]
+
+
+class BeamTable(_ModelSection):
+    """Beams in the maker's order; see `Beams`."""
+
+    elevation_deg: Numbers = ()
+    azimuth_deg: Numbers = ()
+    time_us: Numbers = ()
+    origin_m: OffsetXYZ | tuple[OffsetXYZ, ...] = ()
+
+    def beams(self) -> Beams:
+        """Make them; one straight ahead if there are no elevations."""
+        count = len(self.elevation_deg)
+        if not count:
+            return Beams(np.zeros(1))
+        return Beams(
+            np.radians(self.elevation_deg),
+            np.radians(self.azimuth_deg),
+            np.multiply(self.time_us, 1000.0),
+            self.origins(count),
+        )
+
+    def origins(self, count: int) -> Floats:
+        """Origins of so many beams: (count, 3), or (0, 3) if there are none."""
+        origin = np.array(self.origin_m, np.float64).reshape(-1, 3)
+        return np.repeat(origin, count, axis=0) if len(origin) == 1 else origin
+
+
+class MirrorPart(_ModelSection):
+    """See `Mirror`."""
+
+    motion: MirrorMotion
+    width_deg: Width
+    duty: Duty = 1.0
+
+
+class RangePrecision(_ModelSection):
+    """Standard deviation of the ranges of a surface, at right angles."""
+
+    sigma_m: Positive
+    range_m: Positive
+    reflectance: Annotated[float, Field(gt=0, le=1)]
+
+
+class Detection(_ModelSection):
+    """Range at which a share of the pulses on a surface, at right angles, return."""
+
+    range_m: Positive
+    reflectance: Annotated[float, Field(gt=0, le=1)] = TARGET_REFLECTANCE
+    probability: Annotated[float, Field(gt=0.001, lt=0.999)]
+
+    @property
+    def threshold_m(self) -> float:
+        """Range at which a surface of 10 % reflectance returns half of the pulses."""
+        same = self.range_m * math.sqrt(TARGET_REFLECTANCE / self.reflectance)
+        needed = 1 + NormalDist().inv_cdf(self.probability) / THRESHOLD_SIGMAS
+        return float(same * math.sqrt(max(needed, 0.0)))
+
+
+# What a data sheet may state: {field of its noise: words}.
+STATED = {
+    "range_m": "precision of ranges",
+    "detection_range_m": "detection range at a reflectance",
+    "angle_deg": "accuracy of angles",
+    "false_alarm_hz": "false alarms",
+}
+
+
+class Performance(_ModelSection):
+    """What a data sheet says of a sensor's noise and returns; see `SensorModel.datasheet`.
+
+    The precision of ranges is either that of `Noise`, by the same names, or that of two surfaces,
+    which say how it depends on energy.
+    """
+
+    range_m: Annotated[float, Field(ge=0)] | None = None
+    range_per_m: Annotated[float, Field(ge=0)] = 0.0
+    range_at_threshold_m: Annotated[float, Field(ge=0)] = 0.0
+    precision: tuple[RangePrecision, RangePrecision] | None = None
+    angle_deg: Annotated[float, Field(ge=0)] | None = None
+    detection: Detection | None = None
+    false_alarms: Annotated[float, Field(ge=0, lt=0.5)] | None = None  # share of pulses
+    dropout: UnitShare = 0.0  # of returns, whatever their energy
+    mode: Mode = "strongest"
+
+    @model_validator(mode="after")
+    def _whole(self) -> Performance:
+        if self.precision and (self.range_m or self.range_per_m or self.range_at_threshold_m):
+            raise ValueError("precision takes the place of the other figures of ranges")
+        for name in ("precision", "false_alarms", "range_at_threshold_m"):
+            if getattr(self, name) and self.detection is None:
+                raise ValueError(f"{name} needs detection")
+        self.noise(1.0)  # LidarError if it cannot be made
+        return self
+
+    def noise(self, gate_s: float) -> Noise:
+        """Return the noise of a sensor whose receiver waits so many seconds for returns."""
+        made = self.model_dump(include={one.name for one in fields(Noise)}, exclude_none=True)
+        if self.detection is not None:
+            made["detection_range_m"] = self.detection.threshold_m
+            if self.precision is not None:
+                near, far = self._by_energy(self.detection.threshold_m)
+                made |= {"range_m": near, "range_at_threshold_m": far}
+        if self.false_alarms is not None:
+            made["false_alarm_hz"] = -float(log1p(-self.false_alarms)) / gate_s
+        return Noise(**made)
+
+    def _by_energy(self, threshold_m: float) -> tuple[float, float]:
+        """Fit the standard deviations of strong returns, and of those at the threshold."""
+        assert self.precision is not None
+        # The threshold over the energy: it grows with the square of the range.
+        weak = [
+            TARGET_REFLECTANCE / one.reflectance * np.square(one.range_m / threshold_m)
+            for one in self.precision
+        ]
+        (x, y), (s, t) = np.square(weak), np.square([one.sigma_m for one in self.precision])
+        slope = (t - s) / (y - x)
+        if not (slope >= 0 and s - slope * x >= 0):
+            raise LidarError("performance.precision does not fall as the energy grows.")
+        return float(np.sqrt(s - slope * x)), float(np.sqrt(slope))
+
+
+class SensorModel(_ModelSection):
+    """Data file of a sensor. `docs/how-to/sensor.md` describes its fields."""
+
+    name: str
+    sources: dict[str, str] = {}
+    axis: Literal["z", "x"] = "z"
+    clockwise: bool = False
+    zero_deg: float = 0.0
+    firing_us: Annotated[Exact, Field(gt=0)] | None = None
+    firings_per_turn: Annotated[int, Field(gt=0)] | None = None
+    rate_hz: Positive = 10.0
+    rates_hz: tuple[Positive, Positive] | None = None
+    range_m: tuple[float, float] | None = None
+    beams: BeamTable = BeamTable()
+    mirror: MirrorPart | None = None
+    prisms: tuple[Prism, ...] = ()
+    turning_mirror: TurningMirror | None = None  # behind the prisms
+    typical: bool = False  # whether units differ: its rays are like those of a unit, not the same
+    optics: Optics = Optics()
+    performance: Performance | None = None
+    listed: bool = False
+
+    @model_validator(mode="after")
+    def _whole(self) -> SensorModel:
+        if (self.firing_us is None) == (self.firings_per_turn is None):
+            raise ValueError("give either firing_us or firings_per_turn")
+        if self.range_m is not None and not 0 <= self.range_m[0] < self.range_m[1]:
+            raise ValueError(
+                f"range_m is {list(self.range_m)}; give the shortest, then the longest"
+            )
+        if any(abs(angle) > 90 for angle in self.beams.elevation_deg):
+            raise ValueError("beams.elevation_deg goes beyond 90 degrees")
+        others = {"axis", "clockwise", "mirror", "zero_deg"}
+        unused = self.model_dump(include=others, exclude_defaults=True)
+        if self.prisms and unused:
+            raise ValueError(f"prisms turn about x: leave {min(unused)} out, and turn the sensor")
+        if self.turning_mirror and not self.prisms:
+            raise ValueError("turning_mirror needs prisms: a mirror that sweeps lines is mirror")
+        self.beams.beams()  # LidarError if it cannot be made
+        return self
+
+    @property
+    def needs_calibration(self) -> bool:
+        """Whether its rays need a calibration file."""
+        return not (self.beams.elevation_deg or self.mirror or self.prisms)
+
+    def datasheet(self) -> Datasheet:
+        """Return its noise and returns; LidarError if its file states no performance."""
+        stated = self.performance
+        if stated is None:
+            raise LidarError(
+                f"{self.name} has no performance in its data file, since no source that could be "
+                "read states it: give noise yourself."
+            )
+        low, high = self.range_m or (0.0, float("inf"))
+        noise = stated.noise(2e-9 * (high - low) / LIGHT_M_NS)
+        subrays = 1 if self.optics.divergence_mrad is None else 7
+        missing = tuple(words for name, words in STATED.items() if not getattr(noise, name))
+        return Datasheet(noise, Returns(stated.mode, subrays=subrays), missing)
+
+    def turn(self, rate_hz: float | None, columns: int | None) -> tuple[float, float]:
+        """Return the firings in a turn, and turns a second."""
+        rate = self.rate_hz if rate_hz is None else rate_hz
+        if self.firing_us is not None:
+            if columns is not None:
+                raise LidarError(
+                    f"{self.name} fires every {float(self.firing_us):g} µs, so its firings a turn "
+                    "follow from rate_hz: leave columns out."
+                )
+            return float(1_000_000 / (self.firing_us * Fraction(str(rate)))), rate
+        assert self.firings_per_turn is not None
+        return self.firings_per_turn if columns is None else columns, rate
+
+
+@cache
+def model_names() -> tuple[str, ...]:
+    """Names of the models that come with the package, in order."""
+    return tuple(sorted(
+        f"{maker.name}/{entry.name.removesuffix('.yaml')}"
+        for maker in _BUILT_IN.iterdir() if maker.is_dir()
+        for entry in maker.iterdir() if entry.name.endswith(".yaml")
+    ))  # fmt: skip
+
+
+def full_name(name: str) -> str:
+    """Name of a model with its maker, where the name alone says which: riegl-vz400."""
+    found = [model for model in model_names() if model.partition("/")[2] == name]
+    return found[0] if len(found) == 1 else name
+
+
+def read_model(name: str | Path) -> SensorModel:
+    """Read a model: one that comes with the package, its maker left out or not, or a file (.yaml).
+
+    Raises
+    ------
+    LidarError
+        If there is none of that name, or the file is not one of a sensor.
+    """
+    if str(name).endswith(MODEL_FILES):
+        return _read(Path(name))
+    known, name = model_names(), full_name(str(name))
+    if name not in known:
+        near = [model for model in known if _plain(name) in _plain(model)][:3]
+        hint = f" Did you mean {' or '.join(map(repr, near))}?" if near else ""
+        names = [*known, *(model.partition("/")[2] for model in known)]
+        raise LidarError(
+            f"There is no sensor model {name!r}.{hint or did_you_mean(name, names)} "
+            "lidarpool sensors lists them; give your own as a file, such as mine.yaml."
+        )
+    return _built_in(name)
+
+
+def _plain(name: str) -> str:
+    """Return letters and digits of a name: «VLP-16» and «velodyne/vlp16» have them in common."""
+    return "".join(filter(str.isalnum, name.lower()))
+
+
+@cache
+def _built_in(name: str) -> SensorModel:
+    return _read(_BUILT_IN / f"{name}.yaml")
+
+
+def _read(path: Path | Traversable) -> SensorModel:
+    try:
+        text = read_input_text(path) if isinstance(path, Path) else path.read_text("utf-8")
+        with sentences(SensorModel, path):
+            return SensorModel.model_validate(load_yaml(text))
+    except UNUSABLE as error:
+        raise LidarError(f"{path} is not a usable model: {said(error)}") from error
+
+
+class Datasheet(NamedTuple):
+    """Noise and returns of a sensor by its data sheet, and what the sheet leaves out."""
+
+    noise: Noise
+    returns: Returns
+    missing: tuple[str, ...]
+
+
+def shown_noise(noise: Noise) -> str:
+    """Fields of noise that are not their defaults, as in a scenario."""
+    shown = (
+        f"{field.name}: {value:.4g}"
+        for field in fields(noise)
+        if (value := getattr(noise, field.name)) != field.default
+    )
+    return ", ".join(shown)
+
+
+@checked
+def load_sensor(
+    model: str | Path | None = None,
+    *,
+    calibration: str | Path | None = None,
+    columns: int | None = None,
+    rate_hz: Rate | None = None,
+    step_deg: Step = 10.0,
+    min_range_m: MinRange | None = None,
+    max_range_m: MaxRange | None = None,
+    performance: Sheet | None = None,
+) -> Sensor:
+    """Make a sensor from a model, or from the calibration of a unit.
+
+    Parameters
+    ----------
+    model
+        Name, such as "velodyne/vlp16", or your own data file (.yaml). With a calibration only,
+        the model whose beams are nearest to it.
+    calibration
+        File of the unit: Velodyne YAML, Ouster metadata, Hesai angle corrections, RoboSense
+        angle.csv, Livox list of rays, or a table of beams; see `read_calibration`.
+    columns
+        Firings in a turn, if the model, or a table of beams, leaves a choice.
+    rate_hz
+        Turns, lines or frames a second.
+    step_deg
+        Part of a turn that is one scan. Ten degrees are 800 rays of a VLP-16 and 3,600 of an
+        OS1-128: a scan then costs little by itself, because batches join consecutive scans, and
+        several workers can share a turn.
+    min_range_m, max_range_m
+        Instead of the model's.
+    performance
+        "datasheet": with noise and returns of its data sheet, for surveys that give none. By
+        default "ideal" of a model by name, and of a file that states no performance.
+
+    Raises
+    ------
+    LidarError
+        If there is no such model, a file cannot be used, or they do not fit together.
+
+    Examples
+    --------
+    >>> sensor = load_sensor("velodyne/vlp16")
+    >>> sensor.name, sensor.channels, round(sensor.head.firings_per_turn, 3)
+    ('Velodyne VLP-16', 16, 1808.449)
+    """
+    unit = None if calibration is None else read_calibration(Path(calibration))
+    if model is not None:
+        described = read_model(model)
+    elif unit is not None:
+        described = _model_of(unit, columns)
+    else:
+        raise LidarError("A sensor needs a model, a calibration, or both.")
+    if unit is not None:
+        described = described.model_copy(update=unit.head)
+    elif described.needs_calibration:
+        raise LidarError(
+            f"{described.name} has no rays of its own: give calibration: FILE "
+            f"({next(iter(described.sources.values()), 'of the unit')})."
+        )
+    firings, rate = described.turn(rate_hz, columns)
+    low, high = described.range_m or (0.0, float("inf"))
+    common: dict[str, Any] = {
+        "min_range_m": low if min_range_m is None else min_range_m,
+        "max_range_m": high if max_range_m is None else max_range_m,
+        "name": _sensor_name(described, unit),
+        "optics": described.optics,
+    }
+    own = described.performance is not None and str(model).endswith(MODEL_FILES)
+    if performance == "datasheet" or (performance is None and own):
+        sheet = described.datasheet()
+        common |= {"noise": sheet.noise, "returns": sheet.returns}
+    head = Spin(firings, step_deg, rate, described.clockwise, described.zero_deg)
+    if unit is not None and (unit.rays is not None or described.listed or described.prisms):
+        return _listed(described, unit, head, common)
+    beams = described.beams.beams() if unit is None else _calibrated(described, unit)
+    if described.prisms:
+        mirror = described.turning_mirror
+        return PrismSensor(beams, head, prisms=described.prisms, mirror=mirror, **common)
+    if described.mirror is not None:
+        mirror_fields = described.mirror.model_dump()
+        head = Mirror(firings, step_deg, rate, head.clockwise, head.zero_deg, **mirror_fields)
+    else:
+        beams = beams.turning(head.radians_per_ns)
+    kind = LineSensor if described.axis == "x" else Sensor
+    return kind(beams.lowest_first(), head, **common)
+
+
+def _sensor_name(described: SensorModel, unit: Calibration | None) -> str:
+    """Return the name of a sensor for reports, with the source of its rays."""
+    if unit is not None:
+        return f"{described.name}, {unit.file}"
+    return f"{described.name}, typical pattern" if described.typical else described.name
+
+
+def _model_of(unit: Calibration, columns: int | None) -> SensorModel:
+    """Find the model whose beams are nearest, else use the file alone."""
+    off = {}  # {model: distance of its elevations from those of the unit, degrees}
+    for name in model_names():
+        ours = read_model(name).beams.elevation_deg
+        if name.startswith(f"{unit.maker}/") and unit.beams and len(ours) == len(unit.beams):
+            theirs = np.degrees(unit.beams.elevation)
+            off[name] = float(np.abs(np.sort(theirs) - np.sort(ours)).max())
+    if off and min(off.values()) < 5:  # units of one model differ by far less
+        return read_model(min(off, key=off.__getitem__))
+    head = {"firings_per_turn": columns} if columns and unit.maker is None else unit.head
+    if not head:
+        raise LidarError(
+            f"{unit.file} fits no known model, and has no firing times: give model:"
+            f"{'' if unit.maker else ', or columns: (firings in a turn),'} as well."
+        )
+    return SensorModel(name=(unit.maker or "beams").title(), sources={}, **head)
+
+
+def _listed(
+    described: SensorModel, unit: Calibration, head: Spin, common: dict[str, Any]
+) -> ListedSensor:
+    """Rays of a unit's list, at the model's rate if the list has no times."""
+    if unit.rays is None or (described.beams.elevation_deg and not described.prisms):
+        raise LidarError(
+            f"{unit.file} does not fit {described.name}: one lists rays, the other beams."
+        )
+    if not unit.head:  # a firing of the model is of all beams, and of the list one ray
+        firings = head.firings_per_turn * len(described.beams.beams())
+        head = replace(head, firings_per_turn=firings)
+    each_ns = 1e9 / (head.firings_per_turn * head.rate_hz)
+    times = unit.shot_ns
+    if times is None:
+        times = each_ns * np.arange(len(unit.rays), dtype=np.float64)
+    cycle_ns = float(times[-1]) + each_ns
+    return ListedSensor(head=head, rays=unit.rays, shot_ns=times, cycle_ns=cycle_ns, **common)
+
+
+def _calibrated(described: SensorModel, unit: Calibration) -> Beams:
+    """Beams of a unit, fired at the times of its model."""
+    beams, table = unit.beams, described.beams
+    assert beams is not None  # a file has beams or rays
+    expected = len(table.elevation_deg) or len(table.time_us)
+    if expected not in (0, len(beams)):
+        raise LidarError(
+            f"{unit.file} has {len(beams)} beams, but {described.name} has {expected}."
+        )
+    times = beams.time_ns if beams.time_ns.any() else np.multiply(table.time_us, 1000.0)
+    origin = beams.origin if beams.origin.any() else table.origins(len(beams))
+    return Beams(beams.elevation, beams.azimuth, times, origin)

@@ -1,0 +1,195 @@
+"""Light of a sensor, and the returns that it reports."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from math import pi, sqrt
+from typing import Annotated, Literal
+
+import numpy as np
+from pydantic import Field
+
+from ..base.declared import about, allowed
+from ..base.elementary_scalars import log_of
+from ..base.errors import LidarError
+from ..base.validation import checked_fields
+from ..base.vectors import hypot
+from .disc import SUBRAYS, Beam, Profile
+from .reflectivity import SCALES
+
+LIGHT_M_NS = 0.299792458  # in vacuum; in air it is slower by 0.03 %
+FWHM = sqrt(8 * log_of(2.0))  # full width at half maximum of a Gaussian, in standard deviations
+WINDOW_SIGMAS = 10  # that an echo takes in a waveform, to both sides together
+CUT = WINDOW_SIGMAS / 2  # standard deviations of the system waveform: beyond, an echo is 0 (4e-6)
+# Standard deviation of the response of a Gaussian receiver times its bandwidth at -3 dB.
+_RESPONSE = sqrt(log_of(2.0)) / (2 * pi)
+
+Processing = Literal["none", "peaks", "gaussian"]
+Mode = Literal["strongest", "first", "last", "dual", "all"]
+
+
+AngleMrad = Annotated[float, Field(ge=0, le=1000)]
+# Full angle of a beam's cone, at 1/e² of its maximum; or two, across and up.
+Divergence = Annotated[
+    AngleMrad | Annotated[Sequence[AngleMrad], Field(min_length=2, max_length=2)],
+    allowed("0 to 1000, or two such: [across, up]"),
+]
+Diameter = Annotated[float, Field(ge=0, le=10)]
+Pulse = Annotated[float, Field(ge=0, le=1e6)]
+Precision = Annotated[float, Field(ge=1e-6, le=1000)]
+
+
+@dataclass(frozen=True)
+@checked_fields
+class Optics:
+    """Light and resolution of a sensor."""
+
+    wavelength_nm: Annotated[
+        float, about("of the laser; 905 if no source states it", ge=200, le=20_000)
+    ] = 905.0
+    divergence_mrad: Annotated[
+        Divergence | None, about("full angle of the beam, or two, across and up; None if unknown")
+    ] = None
+    pulse_ns: Annotated[Pulse, about("length of a pulse")] = 5.0
+    resolution_m: Annotated[
+        Precision | None,
+        about("of reported ranges: default step for rounding positions; None if no source has it"),
+    ] = None
+    beam_profile: Annotated[
+        Profile, about("how light is spread over the beam, where it has sub-rays")
+    ] = "even"
+    exit_diameter_m: Annotated[Diameter, about("width of the beam where it leaves the sensor")] = (
+        0.0
+    )
+    reflectivity: Annotated[
+        Literal[tuple(SCALES)],  # type: ignore[valid-type]
+        about("whose scale the column reflectivity has; Velodyne's if no source states it"),
+    ] = "velodyne"
+
+    def __post_init__(self) -> None:
+        if isinstance(self.divergence_mrad, (Sequence, np.ndarray)):
+            object.__setattr__(self, "divergence_mrad", tuple(self.divergence_mrad))
+
+
+@dataclass(frozen=True)
+@checked_fields
+class Returns:
+    """Sub-rays of a beam, and which of its returns are reported.
+
+    "dual" reports the strongest and the last return, or the two strongest if those are one.
+
+    Raises
+    ------
+    LidarError
+        If there is no such mode, or a number is outside its range.
+    """
+
+    mode: Annotated[
+        Mode, about("returns reported for a pulse; dual: strongest and last", "dual")
+    ] = "strongest"
+    subrays: Annotated[
+        Literal[SUBRAYS],  # type: ignore[valid-type]
+        about("rays in a beam: 1, 7, 19, 37, 61, … 217; auto by performance", 1),
+    ] = 1
+    divergence_mrad: Annotated[
+        Divergence | None,
+        about("full angle of the beam, or two, across and up; by default the sensor's", 3.0),
+    ] = None
+    pulse_ns: Annotated[
+        Pulse | None,
+        about(
+            "length of the pulse, in waveforms at half of its maximum: surfaces less "
+            "than half of it apart are one return; by default the sensor's, or 5",
+            5.0,
+        ),
+    ] = None
+    beam_profile: Annotated[
+        Profile | None,
+        about("how light is spread over the beam; by default the sensor's, or even", "gaussian"),
+    ] = None
+    exit_diameter_m: Annotated[
+        Diameter | None,
+        about("width of the beam where it leaves the sensor; by default the sensor's, or 0", 0.01),
+    ] = None
+    waveform: Annotated[
+        Processing,
+        about(
+            "how returns are found in the waveform: peaks, or gaussian decomposition; "
+            "none: hits within half of the pulse are one return"
+        ),
+    ] = "none"
+    sample_ns: Annotated[
+        float, about("time between two samples of the waveform", ge=0.001, le=1000)
+    ] = 1.0
+    bandwidth_mhz: Annotated[
+        float | None,
+        about(
+            "of the receiver of waveforms, at -3 dB; by default without limit",
+            300.0,
+            ge=0.1,
+            le=1e6,
+        ),
+    ] = None
+
+    def __post_init__(self) -> None:
+        if isinstance(self.divergence_mrad, (Sequence, np.ndarray)):
+            object.__setattr__(self, "divergence_mrad", tuple(self.divergence_mrad))
+
+    def of(self, optics: Optics) -> tuple[float, float]:
+        """Divergence, radians, and least distance of two returns, metres.
+
+        The divergence of an oval beam is that of a round one of the same area.
+
+        Raises
+        ------
+        LidarError
+            If there are sub-rays, and the divergence is unknown.
+        """
+        across, up = self._divergence(optics)
+        wide = across if across == up else float(np.sqrt(across * up))
+        return wide, LIGHT_M_NS * self.length_ns(optics) / 2
+
+    def beam(self, optics: Optics) -> Beam:
+        """Sub-rays of a sensor's beam; raises as `of`."""
+        profile = optics.beam_profile if self.beam_profile is None else self.beam_profile
+        return Beam.of(self.subrays, self._divergence(optics), profile, self.exit_m(optics))
+
+    def exit_m(self, optics: Optics) -> float:
+        """Width of the beam where it leaves the sensor, metres; 0 if it is unknown."""
+        return optics.exit_diameter_m if self.exit_diameter_m is None else self.exit_diameter_m
+
+    def _divergence(self, optics: Optics) -> tuple[float, float]:
+        """Across and up, radians."""
+        wide = optics.divergence_mrad if self.divergence_mrad is None else self.divergence_mrad
+        if wide is None and self.subrays > 1:
+            raise LidarError(
+                f"returns.subrays is {self.subrays}, but the sensor has no divergence: give "
+                "returns.divergence_mrad."
+            )
+        across, up = wide if isinstance(wide, Sequence) else (wide or 0.0, wide or 0.0)
+        return across / 1000, up / 1000
+
+    def length_ns(self, optics: Optics) -> float:
+        """Length of the pulse."""
+        return optics.pulse_ns if self.pulse_ns is None else self.pulse_ns
+
+    def system_ns(self, optics: Optics) -> float:
+        """Return the standard deviation of the system waveform, ns.
+
+        That is the pulse as the receiver sees it: both are Gaussian, and convolved.
+
+        Raises
+        ------
+        LidarError
+            If the samples are too far apart for it.
+        """
+        response = 0.0 if self.bandwidth_mhz is None else 1000 * _RESPONSE / self.bandwidth_mhz
+        sigma = hypot(self.length_ns(optics) / FWHM, response)
+        if not 2 * self.sample_ns <= FWHM * sigma * (1 + 1e-9):
+            raise LidarError(
+                f"returns.sample_ns is {self.sample_ns:g}, and the pulse is {FWHM * sigma:.3g} ns "
+                f"wide in the waveform: sample it twice at least, every {FWHM * sigma / 2:.3g} ns, "
+                "or give a longer pulse_ns."
+            )
+        return sigma

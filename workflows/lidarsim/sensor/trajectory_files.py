@@ -1,0 +1,303 @@
+"""Trajectories from files: TUM, KITTI, tables of named columns, oxts folders, and bags of ROS 2."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Annotated, Literal, NamedTuple
+
+import numpy as np
+from pydantic import Field
+
+from ..base.arrays import Floats
+from ..base.errors import LidarError
+from ..base.tables import column_name, find_header, read_table
+from ..base.textfile import read_text
+from ..base.validation import checked
+from ..base.vectors import turned
+from ..columns.bags import is_bag
+from .bag_trajectories import read_bag
+from .calibrations import said
+from .oxts import OXTS_TIMES, WIDTH, find_oxts, oxts_files, oxts_poses, read_oxts
+from .pose_columns import (
+    ANGLES,
+    POSE_TABLES,
+    POSITION,
+    QUATERNION,
+    REFUSED_COLUMNS,
+    TIME,
+    angles_of,
+    with_yaw,
+)
+from .trajectory import (
+    QUATERNION_SLACK,
+    Beyond,
+    Track,
+    check_rotations,
+    quaternions_of,
+    rotations_of,
+)
+
+TrajectoryFormat = Literal["tum", "kitti", "csv", "oxts", "bag"]
+Seconds = Annotated[float, Field(ge=-1e11, le=1e11)]
+Duration = Annotated[float, Field(gt=0, le=1e9)]
+Latitude = Annotated[float, Field(gt=-90, lt=90)]
+Longitude = Annotated[float, Field(ge=-360, le=360)]
+Height = Annotated[float, Field(ge=-1e5, le=1e6)]
+# Cameras look along z with y down; carriers look along x with z up.
+_CAMERA = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
+# A .trj of HELIOS++ says neither units nor the order of rotations: its survey does.
+_HELIOS = " `lidarpool import` reads a .trj of HELIOS++ with its survey."
+
+
+class Poses(NamedTuple):
+    """Poses of a file."""
+
+    seconds: Floats  # (k,)
+    positions: Floats  # (k, 3): metres
+    quaternions: Floats | None  # (k, 4): x, y, z, w; None if the file has no orientations
+
+
+@checked
+def load_trajectory(
+    path: str | Path,
+    *,
+    format: TrajectoryFormat | None = None,  # noqa: A002 - its name in scenarios
+    times: str | Path | None = None,
+    columns: Mapping[str, str] | None = None,
+    ignore: Sequence[str] = (),
+    topic: str | None = None,
+    origin: tuple[Latitude, Longitude, Height] | None = None,
+    camera_axes: bool | None = None,
+    offset_s: Seconds = 0.0,
+    smooth: bool = False,
+    start_s: Seconds | None = None,
+    duration_s: Duration | None = None,
+    beyond: Beyond = "refuse",
+) -> Track:
+    """Read the trajectory of a carrier.
+
+    Parameters
+    ----------
+    path
+        TUM (rows of time, x, y, z, qx, qy, qz, qw); KITTI (rows of a 3 x 4 matrix); a table with
+        a header, separated by commas, semicolons, tabs or spaces, as EuRoC's data.csv; a folder
+        «oxts» of KITTI; or a bag of ROS 2 (.mcap, .db3 or its folder), which needs
+        ``lidarpool[ros]``. A table has time_s (or time_ns), x, y, z, and qx, qy, qz, qw, or
+        yaw_deg (or heading_deg, clockwise from y), and with it pitch_deg and roll_deg; without
+        them the carrier faces its direction of travel.
+    format
+        "tum", "kitti", "csv", "oxts" or "bag"; by default by the content.
+    times
+        For a KITTI file, or one of rows of oxts: the file with the seconds of its rows.
+    columns
+        For a table, {name as above: name in the file}, if they differ.
+    ignore
+        For a table, names of columns to leave out, with * and ?; a column that is neither used nor
+        named here is an error.
+    topic
+        For a bag with several: a topic of Odometry, PoseStamped, PoseWithCovarianceStamped,
+        TransformStamped or NavSatFix; "/tf:FRAME" for a frame; or two topics, of NavSatFix and of
+        the Imu with its orientation, separated by a space.
+    origin
+        For latitudes and longitudes: those of the world's zero, degrees, and its height, metres.
+        By default the first position.
+    camera_axes
+        Whether to convert poses from camera axes (z ahead, y down) to a carrier's (x ahead,
+        z up); by default for KITTI.
+    offset_s
+        Added to all times.
+    smooth, start_s, duration_s, beyond
+        As of `Track`.
+
+    Raises
+    ------
+    LidarError
+        If it cannot be read, has something that is not understood, or is invalid; the message
+        names the file.
+    """
+    path = Path(path)
+    try:
+        if path.is_dir() or is_bag(path) or format in ("oxts", "bag"):
+            kind, poses = _of_container(path, format, times, topic, origin)
+        else:
+            _refuse_topic(topic)
+            text = read_text(path)
+            kind, poses = _of_text(text, format, times, columns or {}, ignore, origin)
+        if (columns or ignore) and kind != "csv":
+            raise ValueError(f"columns and ignore are of tables with a header, and it is {kind}")
+        if origin is not None and kind not in ("oxts", "bag"):
+            raise ValueError(f"origin is of latitudes and longitudes, and it is {kind}")
+        seconds, positions, quaternions = poses
+        seconds = seconds + offset_s
+        track = Track(seconds, positions, quaternions, smooth, start_s, duration_s, beyond)
+        if camera_axes or (camera_axes is None and kind == "kitti"):
+            track = _from_camera(track)
+        return track
+    except (OSError, ValueError, LidarError) as error:
+        more = _HELIOS if path.suffix.lower() == ".trj" else ""
+        raise LidarError(f"{path} is not a usable trajectory: {said(error)}{more}") from error
+
+
+def files_of_trajectory(path: Path) -> list[Path]:
+    """Return the files that a trajectory is read from: of a folder those in it, else the path."""
+    if not path.is_dir():
+        return [path]
+    if is_bag(path):
+        return sorted(file for file in path.iterdir() if file.is_file())
+    folder = find_oxts(path)
+    return [path] if folder is None else [*oxts_files(folder), folder / OXTS_TIMES]
+
+
+def _refuse_topic(topic: str | None) -> None:
+    if topic is not None:
+        raise ValueError("topic is of bags, and it is none")
+
+
+def _of_container(
+    path: Path,
+    kind: TrajectoryFormat | None,
+    times: str | Path | None,
+    topic: str | None,
+    origin: Sequence[float] | None,
+) -> tuple[str, Poses]:
+    """Read a folder or a bag; return its format and its poses."""
+    if not path.exists():
+        raise FileNotFoundError(2, "No such file or directory")
+    if is_bag(path) and kind in (None, "bag"):
+        if times is not None:
+            raise ValueError("a bag has times of its own: leave out times")
+        return "bag", Poses(*read_bag(path, topic, origin))
+    _refuse_topic(topic)
+    folder = find_oxts(path)
+    if folder is not None and kind in (None, "oxts"):
+        if times is not None:
+            raise ValueError("a folder of oxts has times of its own: leave out times")
+        return "oxts", Poses(*read_oxts(folder, origin))
+    if path.is_file() and kind == "oxts":
+        return _of_text(read_text(path), kind, times, {}, (), origin)
+    raise ValueError(
+        "a folder is one of KITTI, with timestamps.txt and data, or a bag of ROS 2, with "
+        f"metadata.yaml{'' if kind is None else f'; format says {kind}'}"
+    )
+
+
+def _of_text(
+    text: str,
+    kind: TrajectoryFormat | None,
+    times: str | Path | None,
+    columns: Mapping[str, str],
+    ignore: Sequence[str],
+    origin: Sequence[float] | None,
+) -> tuple[str, Poses]:
+    """Read a text file; return its format and its poses."""
+    lines = text.splitlines()
+    if times is not None and kind not in (None, "kitti", "oxts"):
+        raise ValueError(f"times are of KITTI's poses, and format says {kind}")
+    header = find_header(lines, _is_pose_column) if times is None else None
+    if kind == "csv" or (kind in (None, "tum") and header is not None):
+        # Rows of TUM are separated by spaces, and may have their header in a remark.
+        tum = header is not None and header.comment and header.separator is None
+        return "csv", _table(text, columns, ignore, tum or kind == "tum")
+    rows = _numbers(text)
+    width = rows.shape[1]
+    if kind is None:
+        kind = "oxts" if width == WIDTH else "kitti" if times or width == 12 else "tum"
+    if kind == "tum":
+        if width != 8:
+            raise ValueError(
+                f"its rows have {width} numbers and no header: rows of TUM have 8, those of KITTI "
+                "12; give a table a header, as in time_s,x,y,z,yaw_deg"
+            )
+        return kind, Poses(rows[:, 0], rows[:, 1:4], rows[:, 4:])
+    if times is None:
+        raise ValueError("KITTI's poses have no times: give their file as times")
+    try:
+        seconds = _numbers(read_text(Path(times)), 1)[:, 0]
+    except ValueError as error:
+        raise ValueError(f"{times} has no times: {said(error)}") from error
+    expected = WIDTH if kind == "oxts" else 12
+    if width != expected:
+        raise ValueError(f"its rows have {width} numbers, not {expected}")
+    if len(rows) != len(seconds):
+        raise ValueError(f"it has {len(rows)} poses and {times} {len(seconds)} times")
+    if kind == "oxts":
+        return kind, Poses(seconds, *oxts_poses(rows, origin))
+    places = rows.reshape(-1, 3, 4)
+    check_rotations(places[..., :3], slack=2 * QUATERNION_SLACK)
+    return kind, Poses(seconds, places[..., 3], quaternions_of(places[..., :3]))
+
+
+def _is_pose_column(cell: str) -> bool:
+    words = column_name(cell).words
+    return any(
+        words in {column_name(name).words for name in quantity.spellings}
+        for quantity in (TIME, *POSITION, *QUATERNION, *ANGLES)
+    )
+
+
+def _numbers(text: str, columns: int | None = None) -> Floats:
+    """Rows of numbers, by `np.loadtxt`; lines that begin with # are comments."""
+    lines = [line for line in text.splitlines() if line.strip() and line.strip()[0] != "#"]
+    if not lines:
+        raise ValueError("it has no rows of numbers")
+    try:
+        rows = np.loadtxt(lines, ndmin=2)
+    except ValueError as error:
+        if "," in lines[0] or ";" in lines[0]:
+            raise ValueError(
+                "it has no header: name its columns in the first line, as in "
+                "time_s,x,y,z,qx,qy,qz,qw"
+            ) from error
+        raise
+    if columns is not None and rows.shape[1:] != (columns,):
+        raise ValueError(f"its rows have {rows.shape[1]} numbers, not {columns}")
+    return rows
+
+
+def _table(text: str, names: Mapping[str, str], ignore: Sequence[str], tum: bool) -> Poses:
+    """Read a table with a header; `tum` says that bare times are seconds."""
+    quaternion = [quantity.name for quantity in QUATERNION]
+
+    def needed(columns: Mapping[str, Floats]) -> tuple[str, ...]:
+        turns = quaternion if any(name in columns for name in quaternion) else ()
+        return ("time_s", "x", "y", "z", *turns)
+
+    columns = with_yaw(
+        read_table(
+            text,
+            (TIME, *POSITION, *QUATERNION, *ANGLES),
+            required=needed,
+            columns=names,
+            ignore=ignore,
+            formats=POSE_TABLES,
+            refused=REFUSED_COLUMNS,
+            bare={"time_s": "s"} if tum else {},
+        )
+    )
+    seconds = columns["time_s"]
+    positions = np.stack([columns[name] for name in "xyz"], axis=1)
+    angles = [name for name in ("yaw_deg", "pitch_deg", "roll_deg") if name in columns]
+    if "qx" in columns:
+        if angles:
+            raise ValueError(f"it has both a quaternion and {angles[0]}: ignore one of these")
+        turns = np.stack([columns[name] for name in quaternion], axis=1)
+        return Poses(seconds, positions, turns)
+    if not angles:
+        return Poses(seconds, positions, None)
+    if "yaw_deg" not in angles:
+        raise ValueError(
+            f"it has {angles[0]} and neither yaw_deg nor heading_deg: give one, or ignore "
+            f"{angles[0]} to face the direction of travel"
+        )
+    return Poses(seconds, positions, quaternions_of(rotations_of(angles_of(columns, len(seconds)))))
+
+
+def _from_camera(track: Track) -> Track:
+    """Convert poses of a camera in camera axes to those of a carrier."""
+    assert track.quaternions is not None  # of every track
+    x, y, z, w = track.quaternions.T
+    turns = np.stack([z, -x, -y, w], axis=1)  # the axis is rotated, the angle is the same
+    places = turned(track.positions, _CAMERA)
+    return replace(track, positions=places, quaternions=turns)

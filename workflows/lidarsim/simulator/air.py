@@ -1,0 +1,329 @@
+"""Hits in the air: drops, flakes, fog and dust in front of surfaces.
+
+Which particles a beam meets follows from random numbers for each pulse alone. Only those that the
+sensor may detect are drawn: their number is Poisson's, their ranges and diameters are quantiles.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from functools import cache, lru_cache
+from statistics import NormalDist
+from typing import NamedTuple
+
+import numpy as np
+
+from ..base.arrays import Bools, Floats, Indices, Ints
+from ..base.elementary import exp, expm1, geomspace, interp, log1p
+from ..base.elementary_scalars import exp_of
+from ..sensor.materials import MaterialTable
+from ..sensor.noise import THRESHOLD_SIGMAS, Purpose, named_seed, starts
+from ..sensor.weather import FAINTEST, FARTHEST_M, NODES, Air, Particles
+from ..sensor.weather import reach as reach_of
+from .doppler import approach
+from .returns import AIR, OF_RETURNS, SURFACE, Keys, Planes, PulseReturns, joined, numbers, unreal
+from .scene_caster import SceneCaster
+from .step import Memory, PulseBatch, PulseStep, Setup, Sizes
+from .surfaces import Surfaces
+
+QUANTILES = 1 << 16
+TABLES_KEPT = 32  # as a scanner makes its casters again whenever an object is moved
+CELLS_MOST = 255  # pulse lengths of fog
+TAIL_SIGMAS = 6.0
+
+
+class _Seen(NamedTuple):
+    """Particles of one kind that may be detected."""
+
+    counts: Floats  # (k,): cumulative probabilities of 0, 1, … in a beam
+    # By range, (5, QUANTILES): distances before which an equal share is, smallest diameters that
+    # may be detected, mm, 1 - exp(-slope * (largest - smallest)), energies of a particle of 1 mm,
+    # and of one that fills the beam.
+    tables: Floats
+    step: float  # 1 / slope, mm
+
+
+class _Fog(NamedTuple):
+    """Cells of half a pulse's length, from the sensor on."""
+
+    begins: float  # metres
+    cell: float
+    energy: Floats  # (cells,)
+    # Cumulative probabilities that a cell has the highest peak of some first cells: the row of n
+    # cells is n plus them.
+    peaks: Floats
+
+
+class WeatherStep(PulseStep):
+    """Finds where rain, snow, fog and dust return light to one sensor.
+
+    Raises
+    ------
+    LidarError
+        If one of its beams would return from too many particles.
+    """
+
+    effects = "Rain", "Snow", "Fog", "Dust"
+    reads = "ray", "distance", "triangle", "cause", "velocity"
+    writes = *OF_RETURNS, "velocity"
+    purposes = (
+        Purpose.FOG_CELL, Purpose.FOG_PLACE, Purpose.PARTICLES, Purpose.PARTICLE_RANGE,
+        Purpose.PARTICLE_SUBRAY, Purpose.PARTICLE_DIAMETER,
+    )  # fmt: skip
+
+    def __init__(self, setup: Setup, caster: SceneCaster, surfaces: Surfaces) -> None:
+        super().__init__(setup, caster, surfaces)
+        sensor, noise, survey = setup.sensor, setup.noise, setup.survey
+        self._seed, self._wavelength_nm = noise.seed, sensor.optics.wavelength_nm
+        air, least = survey.air(setup.number), FAINTEST * noise.threshold
+        begins, ends = reach_of(sensor.min_range_m, sensor.max_range_m)
+        self._seen = [_seen(air, kind, least, begins, ends) for kind in survey.particles]
+        names = [f"kind {kind}" if kind else "" for kind in range(len(self._seen))]
+        self._seeds = [named_seed(noise.seed, name) for name in names]
+        scatters = survey.scatters(self._wavelength_nm)
+        self._fog = _fog(air, scatters, noise.threshold, begins, ends, setup.gap_m)
+
+    @staticmethod
+    def applies(setup: Setup) -> bool:
+        """See `PulseStep.applies`."""
+        return setup.survey.returns_light
+
+    @staticmethod
+    def added(setup: Setup) -> float:
+        """See `PulseStep.added`."""
+        scatters = setup.survey.scatters(setup.sensor.optics.wavelength_nm)
+        return setup.survey.met(setup.number) + bool(scatters)
+
+    @staticmethod
+    def memory(setup: Setup, sizes: Sizes) -> Memory:
+        """See `PulseStep.memory`: of sub-rays, and of hits in the air."""
+        return Memory(casting=110 * sizes.subrays + 170 * WeatherStep.added(setup) * sizes.beams)
+
+    def apply(self, returns: PulseReturns, batch: PulseBatch) -> PulseReturns:
+        """See `PulseStep.apply`."""
+        drawn = self.found(returns, (batch.start, batch.stop), batch.keys, batch.each)
+        return returns if drawn is None else in_the_air(self.setup, returns, batch, drawn)
+
+    def found(
+        self, hits: PulseReturns, rays: tuple[int, int], keys: Keys, each: int
+    ) -> PulseReturns | None:
+        """Find hits in the air, of beams `rays` with `each` sub-rays, before those of surfaces.
+
+        Hits are in the order of rays, numbered from the first beam's.
+        """
+        count = rays[1] - rays[0]
+        given = keys.scan, np.array(keys.begins, np.int64), rays[0]
+        reach = reached(self.surfaces.at(self._wavelength_nm), self.surfaces, hits, count * each)
+        parts = [
+            part
+            for seen, seed in zip(self._seen, self._seeds, strict=True)
+            if seen is not None
+            for part in _met(seen, seed, count, each, given, reach)
+        ]
+        if self._fog is not None:
+            clouded = self._clouded(hits, reach)
+            parts.append(_in_fog(self._fog, self._seed, count, each, given, clouded))
+        if not parts:
+            return None
+        ray, distance, energy = map(np.concatenate, zip(*parts, strict=True))
+        drawn = unreal(hits, ray, distance, energy, AIR)
+        if len(self._bent(hits)):
+            drawn = drawn.take(~self._within(hits, ray, distance))
+        if parts[1:] or each > 1:
+            drawn = drawn.take(np.argsort(drawn.ray, kind="stable"))
+        return drawn
+
+    def _bent(self, hits: PulseReturns) -> Indices:
+        """Rows of hits where light is refracted; of each ray the first, third, … are entries."""
+        refracts = self.surfaces.at(self._wavelength_nm).refracts
+        if not refracts.any():
+            return np.zeros(0, np.intp)
+        bent = refracts[self.surfaces.kinds(hits.triangle)]
+        return np.flatnonzero(bent if hits.cause is None else bent & (hits.cause == SURFACE))
+
+    def _within(self, hits: PulseReturns, ray: Ints, distance: Floats) -> Bools:
+        """Whether places on rays are within water or glass, where nothing falls: (n,)."""
+        rows = self._bent(hits)
+        bent, where = hits.ray[rows], hits.distance[rows]
+        first, stop = (np.searchsorted(bent, ray, side=side) for side in ("left", "right"))
+        count = np.zeros(len(ray), np.int64)
+        for number in range(int((stop - first).max(initial=0))):
+            some = np.flatnonzero(first + number < stop)
+            count[some] += where[first[some] + number] < distance[some]
+        return np.asarray(count % 2 == 1)
+
+    def _clouded(self, hits: PulseReturns, reach: Floats) -> Floats:
+        """How far fog goes: to surfaces, and to what light is refracted into, but for panes."""
+        rows = self._bent(hits)
+        if not len(rows):
+            return reach
+        ray, where = hits.ray[rows], hits.distance[rows]
+        out = np.full(len(rows), np.inf)
+        same = ray[1:] == ray[:-1]
+        out[:-1][same] = where[1:][same]
+        enters = (numbers(ray) % 2 == 0) & (out - where > self.setup.gap_m)
+        reach = reach.copy()
+        np.minimum.at(reach, ray[enters], where[enters])
+        return reach
+
+
+def reached(materials: MaterialTable, surfaces: Surfaces, hits: PulseReturns, count: int) -> Floats:
+    """How far the light of sub-rays gets, (count,): inf if no surface ends it."""
+    ray, ends, on = hits.ray, hits.distance, materials.passes
+    if on.any():
+        ends = np.where(on[surfaces.kinds(hits.triangle)], np.inf, ends)
+    if hits.cause is not None:
+        rows = np.flatnonzero(hits.cause == SURFACE)
+        ray, ends = ray[rows], ends[rows]
+    reach = np.full(count, np.inf)
+    reach[ray] = ends  # of several, the last
+    return reach
+
+
+def in_the_air(
+    setup: Setup, returns: PulseReturns, batch: PulseBatch, drawn: PulseReturns
+) -> PulseReturns:
+    """Leave hits in the air for `SeparationStep`, or insert them for waveforms."""
+    if returns.velocity is not None:  # the air is at rest
+        rays = batch.here.rays(batch.beams, drawn.ray, batch.window[0])
+        drawn = drawn._replace(velocity=approach(batch.here, drawn.ray, *rays))
+    if setup.in_waveforms or setup.recorded:
+        batch.hits, batch.planes = inserted(returns, batch.planes, drawn)
+        return batch.hits
+    if batch.air is not None:
+        drawn = joined([batch.air, drawn])
+        drawn = drawn.take(np.argsort(drawn.ray, kind="stable"))
+    batch.air = drawn
+    return returns
+
+
+def _met(
+    seen: _Seen, seed: int, beams: int, each: int, given: tuple[int, Ints, int], reach: Floats
+) -> Iterator[tuple[Ints, Floats, Floats]]:
+    """Yield sub-rays, distances and energies of particles of a kind."""
+    from . import pulse_loops  # not before: numba takes half a second to import
+
+    begun = starts(seed, *WeatherStep.purposes[2:])
+    beam, room = 0, 2 * beams + len(seen.counts)
+    while beam < beams:
+        out = np.empty(room, np.int64), *np.empty((2, room))
+        table = seen.step, seen.counts, seen.tables, exponential()
+        beam, count = pulse_loops.particles(beam, beams, each, *table, begun, *given, reach, *out)
+        yield out[0][:count], out[1][:count], out[2][:count]
+
+
+def _in_fog(
+    fog: _Fog, seed: int, beams: int, each: int, given: tuple[int, Ints, int], reach: Floats
+) -> tuple[Ints, Floats, Floats]:
+    """Sub-rays, distances and energies of the peaks of fog."""
+    from . import pulse_loops
+
+    begun = starts(seed, *WeatherStep.purposes[:2])
+    out = np.empty(beams, np.int64), *np.empty((2, beams))
+    table = fog.begins, FARTHEST_M, fog.cell, fog.energy, fog.peaks
+    count = pulse_loops.fog(each, *table, begun, *given, reach, *out)
+    return out[0][:count], out[1][:count], out[2][:count]
+
+
+def inserted(
+    hits: PulseReturns, planes: Planes | None, drawn: PulseReturns
+) -> tuple[PulseReturns, Planes | None]:
+    """Insert hits in the air before the others of their rays."""
+    order = np.argsort(np.concatenate([drawn.ray, hits.ray]), kind="stable")
+    if planes is not None:
+        none = np.zeros((len(drawn.ray), 3))
+        normals, directions = (np.concatenate([none, one])[order] for one in planes)
+        planes = normals, directions
+    return joined([drawn, hits]).take(order), planes
+
+
+@lru_cache(TABLES_KEPT)
+def _seen(air: Air, kind: Particles, energy: float, begins: float, ends: float) -> _Seen | None:
+    """Make the tables of particles that return at least an energy; None if there are none."""
+    found = seen_by_range(air, kind, energy, begins, ends)
+    return found and _Seen(_poisson(found[0]), found[1], 1 / kind.slope)
+
+
+@lru_cache(TABLES_KEPT)
+def seen_by_range(
+    air: Air, kind: Particles, energy: float, begins: float, ends: float
+) -> tuple[float, Floats] | None:
+    """How many particles in a beam return at least an energy, and the tables of `_Seen`."""
+    distance = geomspace(begins, max(ends, begins * 1.001), NODES)
+    some = np.flatnonzero(air.rate(kind, energy, distance) > 0)
+    if not len(some):
+        return None
+    last = min(some[-1] + 1, NODES - 1)
+    distance = geomspace(distance[max(some[0] - 1, 0)], distance[last], NODES)
+    rate = air.rate(kind, energy, distance)
+    parts = (rate[1:] + rate[:-1]) / 2 * np.diff(distance)
+    sums = np.concatenate([[0.0], np.cumsum(parts)])
+    shares = (np.arange(QUANTILES) + 0.5) / QUANTILES
+    distance = single(interp(shares, sums / sums[-1], distance))
+    smallest = np.minimum(air.smallest(kind, energy, distance), kind.largest)
+    larger = -expm1(-kind.slope * (kind.largest - smallest))
+    most = kind.reflectance * air.white(distance)
+    one = most / (1000 * air.width(distance)) ** 2
+    tables = distance, single(smallest), single(larger), single(one), single(most)
+    return float(sums[-1]), np.stack(tables)
+
+
+def _poisson(mean: float) -> Floats:
+    """Cumulative probabilities of 0, 1, … events; the last is 1."""
+    sums, term, count = [], exp_of(-mean), 0
+    total = term
+    while count < mean or 1 - total > 1e-9:
+        sums.append(total)
+        count += 1
+        term *= mean / count
+        total += term
+    return single(np.array([*sums, 1.0]))
+
+
+@lru_cache(TABLES_KEPT)
+def _fog(
+    air: Air, scatters: float, threshold: float, begins: float, ends: float, cell: float
+) -> _Fog | None:
+    """Cells that may be detected; None if there are none."""
+    count = int(min((ends - begins) / cell, CELLS_MOST)) if cell else 0
+    edges = begins + cell * np.arange(count + 1, dtype=np.float64)
+    energy = air.cloud(scatters, edges[:-1], edges[1:])
+    energy = energy[: int(np.sum(np.cumprod(energy >= FAINTEST * threshold)))]
+    if not len(energy):
+        return None
+    peaks = highest(THRESHOLD_SIGMAS * energy / threshold)
+    rows = np.arange(len(energy) + 1)[:, None] + single(peaks)
+    return _Fog(begins, cell, single(energy), rows.reshape(-1))
+
+
+def highest(signals: Floats) -> Floats:
+    """Cumulative probabilities of which of the first n signals is the highest: (k + 1, k).
+
+    The signals (k,) fall, and have noise of standard deviation 1. The row of none is 1.
+    """
+    count = len(signals)
+    out = np.ones((count + 1, count))
+    # The highest is about the first, or somewhat higher.
+    at = signals[0] + np.linspace(-TAIL_SIGMAS, TAIL_SIGMAS, 241)
+    normal = NormalDist()
+    below = np.array([[normal.cdf(x - signal) for x in at] for signal in signals])
+    density = exp(-((at - signals[:, None]) ** 2) / 2) / np.maximum(below, 1e-300)
+    product = np.ones(len(at))
+    for number in range(1, count + 1):
+        product = product * below[number - 1]
+        share = (density[:number] * product).sum(axis=1)
+        out[number, :number] = np.cumsum(share / share.sum())
+        out[number, number - 1 :] = 1.0
+    return out
+
+
+def single(table: Floats) -> Floats:
+    """Round to single precision, in which the error functions of C libraries are the same."""
+    return table.astype(np.float32).astype(np.float64)
+
+
+@cache
+def exponential() -> Floats:
+    """Quantiles of the exponential distribution, of equal shares."""
+    shares = (np.arange(QUANTILES) + 0.5) / QUANTILES
+    return single(-log1p(-shares))

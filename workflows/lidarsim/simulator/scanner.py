@@ -1,0 +1,405 @@
+"""The simulator as a function: one sensor in a scene, sweep by sweep."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import replace
+from itertools import compress
+from typing import Annotated, Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+from pydantic import Field
+
+from raybeam.poses import check_poses
+
+from ..base.arrays import Floats, Floats32
+from ..base.errors import LidarError
+from ..base.validation import checked, shown
+from ..base.words import did_you_mean
+from ..columns.cloud import Cloud
+from ..columns.table import AXES, SCAN, Column
+from ..scene.scene import Scene
+from ..sensor import (
+    Material,
+    Mounted,
+    Noise,
+    Pose,
+    Returns,
+    ScanSpec,
+    Sensor,
+    Stations,
+    Survey,
+    Trajectory,
+)
+from ..sensor.trajectory import CENTRE, pose_of
+from .batch import columns_of
+from .motion import check_trajectory
+from .rig import Rig
+from .scene_caster import check_backend_here
+from .surfaces import warn_of_grey
+
+SCANS_MOST = 1 << 31  # the type of the column `scan`
+START_MOST_S = 9e9  # times are int64, nanoseconds
+Number = Annotated[int, Field(ge=0, lt=SCANS_MOST)]
+Start = Annotated[float | None, Field(ge=0, lt=START_MOST_S)]
+
+
+class Scanner:
+    """A sensor in a scene, which scans when it is called: no cluster, no files.
+
+    It gives the bytes that a survey gives for the same scans: sweep `number` is the turn (or frame)
+    of that number of a survey along the same trajectory, with the same random numbers if the sensor
+    is the survey's first. Scanners of equal names and equal seeds of their noise repeat the random
+    numbers of each other. Threads may share a scanner. A pickled copy gives the same bytes, as in a
+    task of Dask: the copy makes its own trees, and goes on where the scanner was.
+
+    Parameters
+    ----------
+    scene
+        What is scanned.
+    sensor
+        The lidar, or the lidar `Mounted` on a carrier: then poses are the carrier's.
+    name
+        Name of the sensor, which is part of all random numbers: give each sensor of a robot its
+        own. A `Mounted` has a name already.
+    columns, precision_m, coordinates, materials, returns, noise, visibility_km, \
+    fog_lidar_ratio_sr, rain_mm_h, snow_mm_h, dust_mg_m3, wet, \
+    spray_g_m3
+        As of `Survey`.
+    backend
+        "cuda", "embree", "numpy", or "auto" for the first of these that can be used.
+    threads
+        CPU threads to cast with; None for all cores.
+    device
+        Number of the CUDA device; None for the current one.
+
+    Raises
+    ------
+    LidarError
+        If an argument does not fit, or the backend cannot be used here.
+
+    Examples
+    --------
+    >>> from lidarpool import Pose, Scanner, Scene, load_sensor
+    >>> scanner = Scanner(Scene.seed(), load_sensor("velodyne/vlp16"), columns=["range"])
+    >>> scanner.sweep(Pose((0, 0, 1)))
+    <Cloud of 2,270 points: x, y, z, scan, channel, object, range>
+    >>> scanner.ranges([(0, 0, 1), (1, 0, 1)]).shape
+    (2, 1809, 16)
+    """
+
+    @checked
+    def __init__(
+        self,
+        scene: Scene,
+        sensor: Sensor | Mounted,
+        *,
+        name: str = "",
+        columns: Sequence[str | Column] = (),
+        precision_m: float | None = None,
+        coordinates: str = "world",
+        materials: Sequence[Material] = (),
+        returns: Returns | None = None,
+        noise: Noise | None = None,
+        visibility_km: float | None = None,
+        fog_lidar_ratio_sr: float | None = None,
+        rain_mm_h: float = 0.0,
+        snow_mm_h: float = 0.0,
+        dust_mg_m3: float = 0.0,
+        wet: float = 0.0,
+        spray_g_m3: float = 0.0,
+        backend: str = "auto",
+        threads: int | None = None,
+        device: int | None = None,
+    ) -> None:
+        if name and isinstance(sensor, Mounted):
+            raise LidarError(
+                f"name is {name!r}, and a Mounted sensor has a name of its own: give it there, "
+                f"Mounted(sensor, name={name!r})."
+            )
+        survey = Survey(
+            sensors=[sensor if isinstance(sensor, Mounted) else Mounted(sensor, name=name)],
+            poses=[CENTRE],
+            steps=1,
+            precision_m=precision_m,  # type: ignore[arg-type]  # None for the sensor's, as below
+            columns=columns,
+            coordinates=coordinates,
+            materials=materials,
+            returns=returns,  # type: ignore[arg-type]
+            noise=noise,  # type: ignore[arg-type]
+            visibility_km=visibility_km,
+            fog_lidar_ratio_sr=fog_lidar_ratio_sr,
+            rain_mm_h=rain_mm_h,
+            snow_mm_h=snow_mm_h,
+            dust_mg_m3=dust_mg_m3,
+            wet=wet,
+            spray_g_m3=spray_g_m3,
+        )
+        warn_of_grey(scene, survey)
+        self._begin(scene, survey, {"backend": backend, "threads": threads, "device": device})
+
+    def _begin(self, scene: Scene, survey: Survey, options: dict[str, Any]) -> None:
+        """Make the rig; `options` are those of `Rig`."""
+        check_backend_here(options["backend"])
+        try:
+            self._rig = Rig(scene, survey, **options)
+        except ValueError as error:  # of threads or device
+            raise LidarError(str(error)) from error
+        self._actors = list(scene.actors)
+        self._numbers = {name: number for number, name in enumerate(scene.all_names)}
+        # Objects of which all triangles are in instances.
+        self._movable = np.zeros(len(scene.names), np.bool_)
+        if scene.instances is not None:
+            self._movable[scene.instances.owner] = True
+            self._movable[scene.face_object] = False
+        # Sweeps share the caster, and copies are moved in it.
+        self._lock, self._casts, self._moves = threading.Condition(), 0, 0
+        self._unnumbered = 0  # sweeps and images without a number so far
+
+    def __getstate__(self) -> dict[str, Any]:
+        with self._lock:
+            rig = self._rig
+            made_of = {"scene": rig.scene, "survey": rig.survey, "options": rig.options}
+            return {"made_of": made_of, "unnumbered": self._unnumbered}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self._begin(**state["made_of"])
+        self._unnumbered = state["unnumbered"]
+
+    def __repr__(self) -> str:
+        rig = self._rig
+        return f"<Scanner: {rig.survey.sensor.model} in {rig.scene!r}, by {rig.backend}>"
+
+    @property
+    def backend(self) -> str:
+        """Name of the ray-casting backend in use."""
+        return self._rig.backend
+
+    @checked
+    def sweep(
+        self,
+        pose: Pose | Trajectory | Sequence[float],
+        *,
+        number: Number | None = None,
+        start_s: Start = None,
+    ) -> Cloud:
+        """Scan once around.
+
+        Parameters
+        ----------
+        pose
+            Pose of a sensor that stands, or the trajectory of one that moves: each beam is fired
+            from where it is at its own time. In the scene's local coordinates.
+        number
+            Number of the turn, or frame, from 0. It chooses the firings, since a head turns on
+            where its last turn has ended, and the random numbers. Without, the firings and times
+            are those of turn 0, and each call has random numbers of its own.
+        start_s
+            When the turn begins, seconds since the start of the trajectory, and of those of
+            actors. By default when it does in a survey: `number` times the duration of a turn.
+
+        Returns
+        -------
+        Cloud
+            The returns in the order of their rays, with all columns.
+
+        Raises
+        ------
+        LidarError
+            If the trajectory, or that of an actor, does not last as long as the sweep.
+        """
+        path = _path(pose)
+        with self._casting() as rig:
+            specs, late_ns = self._specs(rig, number, start_s, 1)
+            begin_ns, end_ns = _span_ns(rig, specs)
+            if end_ns > path.duration_ns:
+                raise LidarError(
+                    f"The sweep would last from {begin_ns / 1e9:.6g} to {end_ns / 1e9:.6g} s, and "
+                    f"the trajectory lasts {path.duration_ns / 1e9:.6g} s: begin earlier "
+                    "(start_s), or take a longer one."
+                )
+            try:
+                check_trajectory(path)
+            except ValueError as error:
+                raise LidarError(str(error)) from error
+            returns = rig.returns(specs, path, late_ns, tally=False)
+        survey = rig.survey
+        origin = rig.scene.origin if survey.coordinates == "world" else np.zeros(3)
+        table = (SCAN, *(column for column in survey.stored_columns if column not in AXES))
+        part = columns_of([returns])
+        # A device writes to page-locked memory with room for all rays: the next sweep needs it.
+        made = {column.name: part.columns[column.name] for column in table[1:]}
+        own = {name: v if v.flags.owndata else v.copy() for name, v in made.items()}
+        part = replace(part, columns={**part.columns, **own})
+        return part.cloud(table, survey.precision_m, origin)
+
+    @checked
+    def ranges(
+        self, poses: Pose | ArrayLike, *, number: Number | None = None, start_s: Start = None
+    ) -> Floats32:
+        """Ranges that the sensor measures from many poses at one time, as images.
+
+        This is the fastest way to scan: no points are made.
+
+        Parameters
+        ----------
+        poses
+            One pose, or a list; positions (k, 3), metres; or matrices (k, 4, 4) from the axes of
+            the sensor, or of its carrier, to the scene's. The sensor stands at each.
+        number
+            Number of the turn; as of `sweep`. The image of pose i has the random numbers of turn
+            ``number + i``.
+        start_s
+            When the turn begins, for actors; as of `sweep`.
+
+        Returns
+        -------
+        float32 (k, firings, channels)
+            Range of the nearest reported return of each ray, metres; inf where nothing returns.
+
+        Raises
+        ------
+        LidarError
+            If the poses are no such list or array, a number is not finite, or a matrix mirrors or
+            deforms.
+        """
+        positions, rotations = _placed(poses)
+        with self._casting() as rig:
+            specs, _ = self._specs(rig, number, start_s, len(positions))
+            if not len(positions):
+                firings = specs[-1].firings[1] - specs[0].firings[0]
+                return np.empty((0, firings, specs[0].channels), np.float32)
+            rays = sum(spec.ray_count for spec in specs)
+            try:
+                made = check_poses(positions, rotations, rays, rays * len(positions), None)
+            except ValueError as error:
+                raise LidarError(str(error)) from error
+            return rig.ranges(specs, made.positions, made.rotations)
+
+    @checked
+    def move(self, name: str, pose: Pose | Trajectory | Sequence[float]) -> None:
+        """Place an actor or a copy; sweeps that have begun see it where it was.
+
+        Parameters
+        ----------
+        name
+            Of an actor, or of an object that is a `SceneInstance` in the scene, such as a copy of a
+            scenario.
+        pose
+            Where it stands from now on: of its mesh's own axes, in the scene's local coordinates.
+            An instance keeps its scale. An actor may also get a trajectory, which it follows from
+            time 0 on.
+
+        Raises
+        ------
+        LidarError
+            If there is no such actor or instance, an instance would move during a sweep, or a
+            rotation of the trajectory mirrors or deforms.
+        """
+        path = _path(pose)
+        scene = self._rig.scene
+        standing = len(scene.names)
+        number = self._numbers.get(name, -1)
+        if 0 <= number < standing and self._movable[number]:
+            if path.moves:
+                raise LidarError(
+                    f"{name!r} is a SceneInstance, which stands still during a sweep: give a pose, "
+                    "or make it an Actor."
+                )
+            self._move_instance(number, path.pose(0))
+            return
+        if number < standing:
+            names = [*list(self._numbers)[standing:], *compress(scene.names, self._movable)]
+            hint = did_you_mean(name, names) or f" There are {', '.join(names[:5]) or 'none'}."
+            if number >= 0:
+                hint = " It is part of the standing scene: make it an Actor or a SceneInstance."
+            raise LidarError(f"There is no actor or instance {name!r}.{hint}")
+        with self._lock:
+            self._actors[number - standing] = replace(
+                self._actors[number - standing], trajectory=path
+            )
+            self._rig = self._rig.with_actors(tuple(self._actors))
+
+    def _move_instance(self, number: int, pose: Pose) -> None:
+        with self._lock:
+            self._moves += 1  # sweeps that have not begun wait
+            try:
+                self._lock.wait_for(lambda: not self._casts)
+                self._rig = self._rig.moved(number, pose)
+            finally:
+                self._moves -= 1
+                self._lock.notify_all()
+
+    def _specs(
+        self, rig: Rig, number: int | None, start_s: float | None, count: int
+    ) -> tuple[list[ScanSpec], float]:
+        """Return the scans of a turn, and how late it is, nanoseconds; of `count` sweeps."""
+        sensor, ahead = rig.survey.sensor, 0
+        steps = sensor.steps_of_turn(number or 0)
+        if steps.stop > SCANS_MOST:
+            raise LidarError(f"number is {number}; scans are counted up to {SCANS_MOST:,}.")
+        if number is None:
+            with self._lock:
+                ahead = self._unnumbered * len(steps)
+                self._unnumbered += count
+        late_ns = 0 if start_s is None else round(start_s * 1e9 - sensor.turn_ns(number or 0))
+        specs = [
+            ScanSpec(step, 0, sensor.firings(step), late_ns, 0, sensor.channels, ahead)
+            for step in steps
+        ]
+        begin_ns, end_ns = _span_ns(rig, specs)
+        rig.check_actors(begin_ns, end_ns)
+        return specs, late_ns
+
+    @contextmanager
+    def _casting(self) -> Iterator[Rig]:
+        """Rig as it is now; meanwhile instances stay where they are."""
+        with self._lock:
+            self._lock.wait_for(lambda: not self._moves)
+            self._casts += 1
+            rig = self._rig
+        try:
+            yield rig
+        finally:
+            with self._lock:
+                self._casts -= 1
+                self._lock.notify_all()
+
+
+def _span_ns(rig: Rig, specs: list[ScanSpec]) -> tuple[float, float]:
+    """When the first and the last firing of scans begin, nanoseconds."""
+    sensor = rig.survey.sensor
+    ends = np.array([specs[0].firings[0], specs[-1].firings[1] - 1], np.int64)
+    begin, end = (sensor.begins_ns(ends) + (sensor.lead_ns + specs[0].start_ns)).tolist()
+    return begin, end
+
+
+def _path(given: Any) -> Trajectory:
+    path: Trajectory = given if hasattr(given, "poses") else Stations((pose_of("pose", given),))
+    return path
+
+
+def _placed(poses: Any) -> tuple[Floats, Floats | None]:
+    """Positions (k, 3) and rotations (k, 3, 3), or None."""
+    if isinstance(poses, Pose):
+        poses = [poses]
+    if isinstance(poses, Sequence) and any(isinstance(pose, Pose) for pose in poses):
+        made = [pose_of("a pose", pose) for pose in poses]
+        return np.array([pose.position for pose in made]), np.array([pose.turn for pose in made])
+    try:
+        table = np.asarray(poses, np.float64)
+    except (TypeError, ValueError):
+        table = np.zeros(0)
+    if table.shape == (3,) or (table.ndim == 2 and table.shape[1] == 3):
+        return table.reshape(-1, 3), None
+    if table.ndim == 3 and table.shape[1:] == (4, 4):
+        if not np.allclose(table[:, 3], [0, 0, 0, 1]):
+            raise LidarError("The last row of each matrix of poses must be 0, 0, 0, 1.")
+        return table[:, :3, 3], table[:, :3, :3]
+    raise LidarError(
+        f"poses is {shown(poses)} of the shape {table.shape}; it must be a list of Pose, positions "
+        "(k, 3), or matrices (k, 4, 4)."
+    )
