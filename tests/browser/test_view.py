@@ -13,7 +13,7 @@ from lidarpool.columns.ply_format import header, row_type
 from lidarpool.live.server import page_server
 from lidarpool.live.sharing import page_of
 from lidarpool.live.view import View, open_results
-from lidarpool.run.picture_file import PictureContent, sensor_ways
+from lidarpool.run.picture_file import PictureContent, sensor_positions
 from lidarsim.columns.table import OBJECT, SCAN, TABLE
 from lidarsim.scene.actors import Actor, box
 from lidarsim.scene.animation import Animation
@@ -52,7 +52,7 @@ def view(cloud):
     survey = Survey(Sensor.grid(layers=4), steps=SCANS, trajectory=poses)
     hits, rays = np.zeros(scene.triangles, np.int64), np.zeros((0, 2, 3), np.float32)
     pictured = PictureContent(
-        scene, sensor_ways(survey), hits, rays, None, None, (), survey.duration_ns
+        scene, sensor_positions(survey), hits, rays, duration_ns=survey.duration_ns
     )
     sweeps = Sweeps.of(survey, scene)
     assert (len(sweeps), sweeps.scans[-1]) == (10, SCANS)

@@ -14,7 +14,7 @@ from lidarpool import Actor, LidarError, Material, Scanner, Scene, Sensor, Surve
 from lidarpool.export.boxes import Boxes
 from lidarpool.run.picture_file import PictureContent
 from lidarpool.scenario.advice import advice
-from lidarpool.scenario.build import Job, build
+from lidarpool.scenario.build import build
 from lidarpool.scenario.scenario import Scenario
 from lidarsim.columns.cloud import Cloud
 from lidarsim.scene.actors import box, one_mesh, shapes_of
@@ -488,7 +488,7 @@ def drawn_again(actors, path, seconds=3):
     """Actors of a survey of some seconds, of its file of pictures."""
     scene = Scene.from_meshes([FLOOR]).with_actors(actors)
     stands = Track([0, seconds], [[0, 0, 1], [0, 0, 1.0]])
-    pictured, _ = PictureContent.before(Job(scene, Survey(Sensor.grid(), trajectory=stands)))
+    pictured, _ = PictureContent.before_casting(scene, Survey(Sensor.grid(), trajectory=stands))
     full = replace(pictured, hit_counts=np.zeros(pictured.scene.triangles, np.int64))
     full.save(path)
     return PictureContent.load(path).scene.actors

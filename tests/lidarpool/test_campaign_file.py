@@ -11,8 +11,8 @@ import pytest
 import yaml
 
 from lidarpool import Campaign, Job, LidarError, Noise, Scene, Survey
-from lidarpool.scenario.campaign import hashes, is_campaign
-from lidarpool.scenario.campaign_sections import JobRandom
+from lidarpool.scenario.campaign_jobs import file_hashes
+from lidarpool.scenario.campaign_sections import JobRandom, is_campaign
 from lidarpool.scenario.scenario import Scenario
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
@@ -364,10 +364,10 @@ def test_scenarios_as_they_are(folder):
     assert [found.scenario(number).model_dump() for number in every] == [
         Scenario.load(path).model_dump() for path in paths
     ]
-    before = hashes(found.scenario(3).files)
+    before = file_hashes(found.scenario(3).files)
     assert [name for name, _ in before] == ["hall.glb"]
     (folder / "hall.glb").write_bytes(b"another")
-    assert hashes(found.scenario(3).files) != before
+    assert file_hashes(found.scenario(3).files) != before
 
 
 def job(*drawn, **options):

@@ -25,8 +25,7 @@ from lidarpool.export.formats import Format
 from lidarpool.live.view import open_result
 from lidarpool.report.charts import draw_sweep
 from lidarpool.run.picture_file import PICTURE_FILE, PictureContent
-from lidarpool.scenario.build import Job
-from lidarpool.scenario.campaign import find_field
+from lidarpool.scenario.field_paths import find_field
 from lidarpool.scenario.scenario import Scenario
 from lidarsim.base.storage import Storage
 from lidarsim.sweeps.sweeps import SWEEPS_FILE, Sweeps
@@ -219,7 +218,7 @@ def test_the_page_names_them_in_legend_and_filter(saved, scene, sweeps, tmp_path
     survey = Survey(
         Sensor.grid(90, 4), [(0, 0, 1)], materials=[Material("*", semantic_class=3)], classes=NAMES
     )
-    pictured, _ = PictureContent.before(Job(scene, survey))
+    pictured, _ = PictureContent.before_casting(scene, survey)
     pictured = replace(pictured, hit_counts=np.zeros(pictured.scene.triangles, np.int64))
     for beside in (lambda: None, partial(pictured.save, tmp_path / PICTURE_FILE)):
         beside()

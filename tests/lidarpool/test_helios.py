@@ -6,12 +6,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import yaml
 from click.testing import CliRunner
 
 from lidarpool import LidarError
 from lidarpool.cli.scenario_commands import import_
-from lidarpool.importers.helios import import_survey
+from lidarpool.importers.helios import Imported, import_survey
 from lidarpool.scenario.build import build
+from lidarpool.scenario.point_scene import surfels
+from lidarpool.scenario.scenario import Scenario
 from lidarsim.sensor.materials import MaterialTable
 from lidarsim.simulator.rig import Rig
 from raybeam import RayCaster
@@ -42,6 +45,17 @@ def legs(settings, *places, platform='movePerSec_m="10"'):
         f"<scannerSettings {settings}/></leg>"
         for x, y in places or ((0, 0), (3, 4))
     )
+
+
+def import_checked(survey: Path, out: Path) -> Imported:
+    """Import a survey as the command does."""
+    return import_survey(
+        survey, out, check=lambda file: build(Scenario.load(file)), surfels=surfels
+    )
+
+
+def scenario_of(imported: Imported) -> Scenario:
+    return Scenario.load(imported.path)
 
 
 @pytest.fixture
@@ -78,8 +92,8 @@ def imported(survey, tmp_path):
     """Import a survey; return what was written, its scene and survey."""
 
     def run(*given, **named):
-        made = import_survey(survey(*given, **named), tmp_path / "out")
-        built = build(made.scenario)
+        made = import_checked(survey(*given, **named), tmp_path / "out")
+        built = build(scenario_of(made))
         return made, built.scene, built.survey
 
     return run
@@ -264,7 +278,7 @@ def test_the_cloud_of_a_flight_lies_on_the_ground_and_knows_its_legs(imported):
     )
     inside = '<FWFSettings beamSampleQuality="2"/><detectorSettings accuracy_m="0"/>' + inside
     made, scene, of = imported(device, inside, around=template)
-    assert made.scenario.returns.subrays == 7 and made.scenario.noise.range_m == 0
+    assert scenario_of(made).returns.subrays == 7 and scenario_of(made).noise.range_m == 0
     assert made.left_out == ["maxNOR=3 of S/1: all returns of a pulse are kept"]
     (batch,) = Rig(scene, of, "numpy").cast(0, 3)
     columns = {column.name: column.make(batch) for column in of.stored_columns}
@@ -283,7 +297,10 @@ def test_waveform_settings_become_those_of_returns(imported):
     )
     settings = '<FWFSettings binSize_ns="0.3" winSize_ns="1" maxFullwaveRange_ns="100"/>'
     made, _, of = imported(device, settings + legs)
-    assert (made.scenario.returns.waveform, made.scenario.returns.sample_ns) == ("peaks", 0.6)
+    assert (scenario_of(made).returns.waveform, scenario_of(made).returns.sample_ns) == (
+        "peaks",
+        0.6,
+    )
     assert made.left_out == ["maxFullwaveRange_ns: waveforms are as long as their echoes"]
     assert of.returns_each[0].system_ns(of.carried[0].sensor.optics) == pytest.approx(4 / 2.35482)
 
@@ -309,7 +326,7 @@ def test_parts_turn_grow_move_and_fall_as_in_helios(imported):
     # Up is y: (x, y, z) -> (x, -z, y); then x, then z turn, twice as large, onto the ground at 2.
     assert np.allclose(low[1:], [[1, 2, 2], [1, 2, 2]])
     assert np.allclose(high[1:], [[7, 4, 2], [7, 6, 2]])
-    ground = made.scenario.materials[0]
+    ground = scenario_of(made).materials[0]
     assert (ground.objects, ground.reflectance, ground.semantic_class) == (("ground",), 0.3, 2)
     MaterialTable.of(of.materials, built.surface_kinds)  # every object has one
 
@@ -335,7 +352,7 @@ def test_classes_and_reflectances_are_those_of_the_faces(imported):
         GROUND.replace("</scene>", part),
         parts={"house.obj": house, "house.mtl": library},
     )
-    assert "class" in made.scenario.cloud.columns
+    assert "class" in scenario_of(made).cloud.columns
     assert scene.names == ("ground", "House", "Shed")
     kinds, table = scene.surface_kinds, MaterialTable.of(of.materials, scene.surface_kinds)
     rows = zip(kinds.object, kinds.material, table.semantic_class, table.reflectance, strict=True)
@@ -356,7 +373,7 @@ def test_reflectances_are_those_of_spectra_at_the_wavelength(imported, known):
     if known:
         parts["../spectra/loam.txt"] = "Name: loam\n\n1.0\t20.0\n2.0\t40.0 \n"
     made, _, _ = imported(device, legs('pulseFreq_hz="1000"'), parts=parts)
-    assert [m.reflectance for m in made.scenario.materials] == [0.3, None] * known
+    assert [m.reflectance for m in scenario_of(made).materials] == [0.3, None] * known
     assert ("the spectrum 'loam', which is not there" in " ".join(made.left_out)) != known
 
 
@@ -463,11 +480,11 @@ def test_voxels_are_scene_files_where_light_goes_through_them(survey, tmp_path):
     leaf = "newmtl wood\nhelios_reflectance 10\nnewmtl leaf\nhelios_reflectance 50\n"
     parts = {"crown.vox": VOX, "leaf.mtl": leaf}
     device = scanner("rotating", scanAngleMax_deg=60, scanAngleEffectiveMax_deg=60)
-    made = import_survey(
+    made = import_checked(
         survey(device, legs('pulseFreq_hz="1000" scanFreq_hz="30"'), scene, parts=parts),
         tmp_path / "out",
     )
-    built = build(made.scenario)
+    built = build(scenario_of(made))
     assert built.scene.has_voxels.tolist() == [False, True]
     bounds = built.scene.object_bounds[1]
     assert bounds == pytest.approx(np.array([[3, 4, 5], [4, 5, 7]]), abs=0.021)
@@ -494,9 +511,9 @@ def test_points_become_surfels_a_cell_of_voxel_size(survey, tmp_path, separator,
     parts = {"scan.txt": "\n".join(["// x y z", *rows])}
     inside = legs('pulseFreq_hz="1000"', platform='onGround="true"')
     path = survey(LASER, inside, GROUND.replace("</scene>", part), parts=parts)
-    made = import_survey(path, tmp_path / "out")
+    made = import_checked(path, tmp_path / "out")
     assert {p.name for p in made.path.parent.glob("*.glb")} == {"scan-1.glb"}
-    scene = build(made.scenario).scene
+    scene = build(scenario_of(made)).scene
     assert scene.names == ("ground", "scan") and not made.left_out
     low, high = scene.object_bounds[1] + scene.origin
     assert np.allclose([low, high], [[10, 20, 2], [14, 23, 6]], atol=0.25)
@@ -530,7 +547,7 @@ def test_rasters_of_heights_are_scene_files(imported, tmp_path):
     assert np.allclose(bounds, [[105, 5, 8], [125, 25, 12]])  # middles of the pixels
     assert built.triangles == 6  # of cells whose corners all have heights
     assert of.pose(0).position[2] + built.origin[2] == pytest.approx(12.5)  # on the ground
-    assert made.scenario.materials[0].reflectance == 0.3
+    assert scenario_of(made).materials[0].reflectance == 0.3
 
 
 @pytest.mark.parametrize(
@@ -561,7 +578,7 @@ def test_mistakes_are_told_in_a_line_and_nothing_is_written(survey, tmp_path, ch
         text = file.read_text()
         file.write_text(text.replace(*change))
     with pytest.raises(LidarError, match=message) as told:
-        import_survey(path, tmp_path / "out")
+        import_checked(path, tmp_path / "out")
     assert str(told.value).startswith(str(path)) and "\n" not in str(told.value)
     assert [entry.name for entry in tmp_path.iterdir()] == ["helios"]
 
@@ -575,4 +592,21 @@ def test_angular_resolutions_set_the_rates(imported):
     head = of.carried[0].sensor.head
     assert head.firings_per_turn == pytest.approx(720) and head.rate_hz == pytest.approx(50 / 360)
     assert of.ray_count == 100 * 50  # lines half a degree apart, of -48 to 50 degrees by 2
-    assert made.scenario.sensors["leg0"].steps == 5
+    assert scenario_of(made).sensors["leg0"].steps == 5
+
+
+def test_a_scenario_that_the_check_refuses_is_not_written(survey, tmp_path):
+    path = survey(LASER, FLY)
+    checked = []
+
+    def refuse(file: Path) -> None:
+        checked.append(yaml.safe_load(file.read_text()))
+        raise LidarError(f"{file}: no such sensor.")
+
+    with pytest.raises(LidarError) as refused:
+        import_survey(path, tmp_path / "out", check=refuse, surfels=surfels)
+    assert str(refused.value).endswith(
+        f"makes no scenario: {tmp_path / 'out/scenario.yaml'}: no such sensor."
+    )
+    assert list(checked[0]["sensors"]) == ["leg0"]
+    assert [entry.name for entry in tmp_path.iterdir()] == ["helios"]

@@ -16,7 +16,7 @@ from lidarpool.importers.helios import import_survey
 from lidarpool.scenario.build import build
 from lidarpool.scenario.campaign import CampaignSpec
 from lidarpool.scenario.point_scene import SUFFIXES as CLOUDS
-from lidarpool.scenario.point_scene import scene_of_points
+from lidarpool.scenario.point_scene import scene_of_points, surfels
 from lidarpool.scenario.scenario import Scenario
 from lidarsim.base.errors import LidarError
 from lidarsim.base.input_files import open_input, read_input, read_input_text
@@ -65,7 +65,9 @@ READERS = {
     "traffic.xml": traffic,
     "traffic.xml.gz": traffic,
     "copies.csv": copies,
-    "survey.xml": lambda path: import_survey(path, path.with_name("out")),
+    "survey.xml": lambda path: import_survey(
+        path, path.with_name("out"), check=Scenario.load, surfels=surfels
+    ),
 }
 
 

@@ -11,10 +11,11 @@ import numpy as np
 import pytest
 import trimesh
 
-from lidarpool import LidarError, Planning, Pose, Scene, Sensor, Survey, Track
+from lidarpool import LidarError, Pose, Scene, Sensor, Survey, Track
 from lidarpool.columns.cloud_file import CloudFile
 from lidarpool.columns.ply_format import header, row_type
 from lidarpool.live import point_selection as points
+from lidarpool.live.opened import open_finished
 from lidarpool.live.point_selection import (
     TILES,
     Abandoned,
@@ -25,6 +26,7 @@ from lidarpool.live.point_selection import (
     read_scans,
 )
 from lidarpool.live.view import (
+    Downloads,
     ShownSurface,
     View,
     colours_for,
@@ -34,9 +36,14 @@ from lidarpool.live.view import (
     range_image,
     show_view,
 )
-from lidarpool.plan import Plan
 from lidarpool.render.colouring import colours_of as colouring_of
-from lidarpool.run.picture_file import PICTURE_FILE, PictureContent, SensorWay
+from lidarpool.run.picture_file import (
+    PICTURE_FILE,
+    PictureContent,
+    PlannedPath,
+    PlanningPicture,
+    SensorPositions,
+)
 from lidarsim.columns.cloud import Cloud
 from lidarsim.columns.table import CHANNEL, OBJECT, SCAN, TABLE, Column
 from lidarsim.scene.actors import Actor, box
@@ -93,7 +100,7 @@ def test_what_is_no_result_is_refused(tmp_path):
         (tmp_path / "run" / "run").mkdir(parents=True, exist_ok=True)
         (tmp_path / "run" / "run" / "run.db").touch()
         with pytest.raises(LidarError, match=words):
-            show_view(open_result(tmp_path / name), port=0, browser=False)
+            show_view(open_finished([tmp_path / name]), port=0, browser=False)
 
 
 @pytest.fixture(scope="module")
@@ -107,20 +114,26 @@ def pictured():
     rays[:9, 1, 2] = 0.5
     return PictureContent(
         scene,
-        (SensorWay(np.arange(POSES), poses),),
+        (SensorPositions(np.arange(POSES), poses),),
         np.arange(12),
         rays.astype(np.float32),
-        Planning((1, 1), (5, 7), [(1, 6)], 0.5),
-        Plan(np.array([[1.0, 1.0], [5.0, 7.0]]), 7.2, 7.2, 1.0, 0, 1),
-        (),
+        PlanningPicture(
+            start=(1.0, 1.0),
+            target=(5.0, 7.0),
+            centres=np.array([[1.0, 6.0]]),
+            radii=np.array([0.5]),
+            best=PlannedPath(np.array([[1.0, 1.0], [5.0, 7.0]]), 7.2, 7.2, 1.0),
+        ),
     )
 
 
 def seen(scene, places, moves=False):
     """Return what is known of a survey of two seconds with one sensor."""
-    way = SensorWay(np.linspace(0, 2e9, len(places)), np.array(places, float), moves, "", "VLP-16")
+    way = SensorPositions(
+        np.linspace(0, 2e9, len(places)), np.array(places, float), moves, "", "VLP-16"
+    )
     hits, rays = np.zeros(scene.triangles, np.int64), np.zeros((0, 2, 3), np.float32)
-    return PictureContent(scene, [way], hits, rays, None, None, (), 2e9)
+    return PictureContent(scene, [way], hits, rays, duration_ns=2e9)
 
 
 @pytest.fixture
@@ -310,11 +323,13 @@ def test_results_of_unlike_sweeps_are_not_played_and_those_in_sensor_axes_are_re
 @pytest.mark.parametrize("kind", ["ply", "las", "parquet"])
 def test_the_points_that_are_shown_are_written_to_a_file(tmp_path, spun, kind, monkeypatch):
     pytest.importorskip({"las": "laspy", "parquet": "pyarrow"}.get(kind, "numpy"))
-    view = open_result(result_in(tmp_path / "one", spun))
-    assert kind in told(view, "state")[0]["exports"]
+    result = result_in(tmp_path / "one", spun)
     with monkeypatch.context() as without:
         without.setattr("lidarpool.export.formats.find_spec", lambda package: None)
+        view = open_finished([result])
         assert told(view, "state")[0]["exports"] == ["ply"]  # which needs no extra
+    view = open_finished([result])
+    assert kind in told(view, "state")[0]["exports"]
     asked = {"scans": "0-3,36-71", "filter": "ring,0,4;channel,0,4;x,3,3e38"}
     told_, arrays = told(view, "export", format=kind, **asked)
     assert told_ == {"name": f"cloud.{kind}"}
@@ -330,16 +345,16 @@ def test_the_points_that_are_shown_are_written_to_a_file(tmp_path, spun, kind, m
 
 
 def test_what_cannot_be_written_is_told(tmp_path, spun, monkeypatch):
-    view = open_result(result_in(tmp_path / "one", spun))
-    with pytest.raises(ValueError):
+    missing = Mock(side_effect=LidarError("it needs laspy"))
+    formats = Downloads(["ply", "las"], missing)
+    view = open_result(result_in(tmp_path / "one", spun), formats)
+    with pytest.raises(KeyError):
         told(view, "export", format="exe")
     monkeypatch.setattr("lidarpool.live.view.MOST_POINTS", 3)
     assert "20 points are more than 3" in told(view, "export", format="ply")[0]["error"]
-    held = View(HeldPoints(Cloud(np.zeros((1, 3)), {})))
+    held = View(HeldPoints(Cloud(np.zeros((1, 3)), {})), downloads=formats)
     assert not told(held, "state")[0]["exports"], "of a run, some parts are read"
     monkeypatch.undo()
-    missing = Mock(side_effect=LidarError("it needs laspy"))
-    monkeypatch.setattr("lidarpool.live.view.save_cloud", missing)
     assert told(view, "export", format="las")[0] == {"error": "it needs laspy"}
 
 

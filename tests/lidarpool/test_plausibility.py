@@ -12,7 +12,8 @@ from trimesh import Trimesh, creation
 from trimesh.transformations import rotation_matrix
 
 from lidarpool.scenario.build import build
-from lidarpool.scenario.campaign import CampaignSpec, is_campaign
+from lidarpool.scenario.campaign import CampaignSpec
+from lidarpool.scenario.campaign_sections import is_campaign
 from lidarpool.scenario.plausibility import implausibilities
 from lidarpool.scenario.scenario import Scenario
 from lidarsim.scene.generated.city import city

@@ -27,7 +27,13 @@ from lidarpool.cli.commands import cli
 from lidarpool.plan import best
 from lidarpool.plan.trial import run_trial
 from lidarpool.render.picture_page import Page
-from lidarpool.run.picture_file import PICTURE_FILE, PictureContent, SensorWay, sensor_ways
+from lidarpool.report.picture_content import planning_picture
+from lidarpool.run.picture_file import (
+    PICTURE_FILE,
+    PictureContent,
+    SensorPositions,
+    sensor_positions,
+)
 from lidarsim.base.storage import Storage
 from lidarsim.columns.table import Column
 from lidarsim.scene.actors import Actor, box
@@ -53,20 +59,16 @@ def planned() -> PictureContent:
     rays[:, 1] = scene.vertices[:4]
     return PictureContent(
         scene,
-        (SensorWay(np.zeros(2), np.array([[0, 0, 1], [0, 0, 2.0]])),),
+        (SensorPositions(np.zeros(2), np.array([[0, 0, 1], [0, 0, 2.0]])),),
         counts,
         rays,
-        planning,
-        best(trials, planning),
-        tuple(trial.waypoints for trial in trials),
+        planning_picture(planning, best(trials, planning), trials),
     )
 
 
 @pytest.fixture(scope="module")
 def unplanned(planned: PictureContent) -> PictureContent:
-    return PictureContent(
-        planned.scene, planned.sensors, planned.hit_counts, planned.sample_rays, None, None, ()
-    )
+    return PictureContent(planned.scene, planned.sensors, planned.hit_counts, planned.sample_rays)
 
 
 def cloud_at(positions: Any) -> Cloud:
@@ -102,7 +104,7 @@ def test_what_is_pictured_comes_back(planned, unplanned, tmp_path):
         again = PictureContent.load(tmp_path / "a.npz")
         assert again.scene.names == shown.scene.names
         assert np.array_equal(again.hit_counts, shown.hit_counts)
-        assert (again.plan is None) == (shown.plan is None)
+        assert (again.planning is None) == (shown.planning is None)
         again.save(tmp_path / "b.npz")
         assert (tmp_path / "a.npz").read_bytes() == (tmp_path / "b.npz").read_bytes()
 
@@ -117,7 +119,7 @@ def test_what_moves_is_drawn_where_it_is_halfway(tmp_path):
     survey = Survey(trajectory=drive, sensors=[nose])
     none = np.zeros((0, 2, 3), np.float32)
     shown = PictureContent(
-        scene, sensor_ways(survey), np.ones(scene.triangles, np.int64), none, None, None, (), 1e9
+        scene, sensor_positions(survey), np.ones(scene.triangles, np.int64), none, duration_ns=1e9
     )
     again = PictureContent.load(make(tmp_path / "result", shown) / PICTURE_FILE)
     (way,) = again.sensors

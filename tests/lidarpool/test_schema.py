@@ -14,7 +14,8 @@ from jsonschema import Draft202012Validator
 from lidarpool import LidarError
 from lidarpool.base.fingerprint import fingerprint
 from lidarpool.scenario.build import build
-from lidarpool.scenario.campaign import CampaignSpec, is_campaign
+from lidarpool.scenario.campaign import CampaignSpec
+from lidarpool.scenario.campaign_sections import is_campaign
 from lidarpool.scenario.scenario import Scenario
 from lidarpool.scenario.schema import (
     campaign_schema,

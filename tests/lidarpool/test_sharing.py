@@ -22,7 +22,7 @@ from lidarpool.live.sharing import film_of, page_of, share
 from lidarpool.live.view import open_result
 from lidarpool.render.film import ACTOR, SURFACE, Film
 from lidarpool.render.theme import rgb
-from lidarpool.run.picture_file import PICTURE_FILE, PictureContent, sensor_ways
+from lidarpool.run.picture_file import PICTURE_FILE, PictureContent, sensor_positions
 from lidarsim.columns.table import CHANNEL, SCAN
 from lidarsim.scene.actors import Actor, box
 from lidarsim.sweeps.sweeps import SWEEPS_FILE, Sweeps
@@ -52,8 +52,8 @@ def write(folder, moves):
     given = {"trajectory": path} if moves else {"poses": [(0, 0, 2)]}
     survey = Survey(Sensor.grid(layers=4), steps=SCANS, **given)
     hits, rays = np.zeros(scene.triangles, np.int64), np.zeros((0, 2, 3), np.float32)
-    ways = sensor_ways(survey)
-    PictureContent(scene, ways, hits, rays, None, None, (), survey.duration_ns).save(
+    ways = sensor_positions(survey)
+    PictureContent(scene, ways, hits, rays, duration_ns=survey.duration_ns).save(
         folder / PICTURE_FILE
     )
     Sweeps.of(survey, scene).save(folder / SWEEPS_FILE)

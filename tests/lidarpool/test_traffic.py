@@ -12,6 +12,7 @@ from tests.shapes import cast_between, made
 
 from lidarpool import LidarError, Mounted, Pose, Scene, Survey, Track, load_sensor, save_cloud
 from lidarpool.base.fingerprint import fingerprint
+from lidarpool.report.picture_content import picture_content
 from lidarpool.run.picture_file import PictureContent
 from lidarpool.scenario.advice import advice
 from lidarpool.scenario.build import build
@@ -258,7 +259,7 @@ def test_vehicles_of_one_entry_share_a_mesh_also_in_the_file_of_pictures(tmp_pat
         scene=built.scene, survey=survey, hit_counts=np.arange(built.scene.counters), trials=(),
         sample_rays=np.zeros((0, 2, 3)), planning=None, plan=None,
     )  # fmt: skip
-    PictureContent.of(result).save(tmp_path / "p.npz")
+    picture_content(result).save(tmp_path / "p.npz")
     back = PictureContent.load(tmp_path / "p.npz").scene.actors
     assert back[0].mesh.vertices is back[2].mesh.vertices
     assert [actor.name for actor in back] == ["car (a.1)", "Person (p)", "car (a.1)"]

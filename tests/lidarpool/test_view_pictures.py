@@ -22,6 +22,7 @@ from lidarpool.render.pictures import draw_cloud, draw_hits, draw_scene, with_po
 from lidarpool.render.shot import GROUND, SKY, take_shot
 from lidarpool.render.stage import make_axis, nice_step
 from lidarpool.render.theme import object_colours
+from lidarpool.report.picture_content import planning_picture
 from lidarpool.report.result_pictures import draw_path
 from lidarsim.scene.actors import box
 from lidarsim.scene.scene import Scene
@@ -189,11 +190,11 @@ def planned():
         trials=3, particles=60, iterations=40,
     )  # fmt: skip
     trials = [run_trial(planning, k) for k in range(3)]
-    return planning, best(trials, planning), [trial.waypoints for trial in trials]
+    return planning_picture(planning, best(trials, planning), trials)
 
 
 def test_the_path_plot_has_equal_axes_in_world_coordinates(planned):
-    page = draw_path(*planned, np.array([500_003, 4_000_000]), (1600, 1000))
+    page = draw_path(planned, planned.best, np.array([500_003, 4_000_000]), (1600, 1000))
     (axes,) = page.figure.axes
     box = axes.get_window_extent()
     across, up = np.ptp(axes.get_xlim()) / box.width, np.ptp(axes.get_ylim()) / box.height

@@ -18,9 +18,9 @@ from tests.clusters import thread_cluster
 from tests.meshes import PLY
 from tests.rows import quick
 
-import lidarpool.cli.forecast
+import lidarpool.run.forecast
 from lidarpool import Fault, Mounted, Noise, Returns, Sensor, Survey, Track, read_cloud, simulate
-from lidarpool.cli.forecast import forecast
+from lidarpool.run.forecast import forecast
 from lidarpool.run.options import RunOptions
 from lidarpool.scenario.build import build
 from lidarpool.scenario.scenario import Scenario
@@ -199,7 +199,7 @@ def test_what_the_cloud_is_exported_to_counts(check, monkeypatch):
 
 
 def test_all_reasons_are_given_at_once(check, tmp_path, monkeypatch):
-    monkeypatch.setattr(lidarpool.cli.forecast, "MEMORY_LIMIT", 1_000_000)
+    monkeypatch.setattr(lidarpool.run.forecast, "MEMORY_LIMIT", 1_000_000)
     (tmp_path / "out").write_text("")
     outcome = check("--json")
     assert outcome.code == 2

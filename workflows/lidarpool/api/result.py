@@ -135,12 +135,13 @@ class Result(RunResult):
             Whether to open a browser where there is a desktop.
         """
         from ..columns.cloud_file import CloudFile
+        from ..live.opened import downloads
         from ..live.view import View, result_page, wait_for_interrupt
 
         with ExitStack() as stack:
             file = CloudFile(self._cloud_file, self._pictured.own)
             sweeps = None if self.points.sweeps is None else self.points.sweeps()
-            view = View(file, self._pictured, sweeps)
+            view = View(file, self._pictured, sweeps, downloads=downloads())
             stack.enter_context(result_page(view, port=port, browser=browser))
             if cell_display() is None:
                 wait_for_interrupt()
@@ -149,9 +150,9 @@ class Result(RunResult):
 
     @cached_property
     def _pictured(self) -> PictureContent:
-        from ..run.picture_file import PictureContent
+        from ..report.picture_content import picture_content
 
-        return PictureContent.of(self)
+        return picture_content(self)
 
     @cached_property
     def _cloud_file(self) -> Path:

@@ -215,7 +215,8 @@ def run(
 
     from ..report.campaign_output import verify
     from ..run.store import RUN_FOLDER
-    from ..scenario.campaign import CampaignSpec, is_campaign
+    from ..scenario.campaign import CampaignSpec
+    from ..scenario.campaign_sections import is_campaign
     from ..scenario.scenario import Scenario
     from .run_command import run_campaign, run_job, run_scenario
 

@@ -203,8 +203,9 @@ def view(
     from lidarsim.sweeps.sweeps import SWEEPS_FILE
 
     from ..export.folder import local_result
+    from ..live.opened import open_finished, refuse_unfinished
     from ..live.sharing import share
-    from ..live.view import CLOUD, open_results, show_view
+    from ..live.view import CLOUD, show_view
     from ..run.picture_file import PICTURE_FILE
     from .terminal import Terminal
 
@@ -212,11 +213,12 @@ def view(
         raise LidarError("--film and --export take one result: give them one after the other.")
     with ExitStack() as stack:
         files = (CLOUD, PICTURE_FILE, SWEEPS_FILE)
-        made = [stack.enter_context(local_result(result, files)) for result in results]
+        folders = [stack.enter_context(local_result(result, files)) for result in results]
         if film or export:
-            share(made[0], film, export, Terminal())
+            refuse_unfinished(folders[0])
+            share(folders[0], film, export, Terminal().writing)
         else:
-            show_view(open_results(made), port=port, browser=not no_browser)
+            show_view(open_finished(folders), port=port, browser=not no_browser)
 
 
 @click.command()

@@ -130,14 +130,24 @@ def import_(survey: Path, assets: tuple[Path, ...], out: Path | None) -> None:
       lidarpool import survey.xml --assets helios/python/pyhelios -o surveys/wood
     """  # noqa: D301 - click wants the character, not its name
     from ..importers.helios import import_survey
+    from ..scenario.build import build
+    from ..scenario.point_scene import surfels
+    from ..scenario.scenario import Scenario
 
-    made = import_survey(survey, out or Path(survey.stem), assets)
-    sensors, files = len(made.scenario.sensors), len(made.scenario.scene.files)
-    name = click.format_filename(made.path)
-    click.echo(f"{name}: {plural(sensors, 'sensor')}, {plural(files, 'mesh file')}")
-    for line in made.left_out:
+    imported = import_survey(
+        survey,
+        out or Path(survey.stem),
+        assets,
+        check=lambda path: build(Scenario.load(path)),
+        surfels=surfels,
+    )
+    scenario = Scenario.load(imported.path)
+    sensors = plural(len(scenario.sensors), "sensor")
+    files = plural(len(scenario.scene.files), "mesh file")
+    click.echo(f"{click.format_filename(imported.path)}: {sensors}, {files}")
+    for line in imported.left_out:
         click.echo(f"not supported: {line}")
-    click.echo(f"next: lidarpool check {shlex.quote(str(made.path))}")
+    click.echo(f"next: lidarpool check {shlex.quote(str(imported.path))}")
 
 
 @click.command()

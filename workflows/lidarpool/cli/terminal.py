@@ -15,7 +15,8 @@ from distributed import Client
 from rich.console import Console
 
 from ..base.streams import Unheard
-from ..run.progress import Pace, Progress, Screen, Show, Written, bars, rows, standing_still
+from ..base.writing_progress import WritingProgress
+from ..run.progress import Pace, Progress, Screen, Show, bars, rows, standing_still
 from .shared_options import WARNED, set_logs
 
 # Plain lines come after another tenth of the elapsed time, within these bounds, so that a survey
@@ -73,7 +74,7 @@ class Terminal(Screen):
             yield
 
     @contextmanager
-    def writing(self, words: str) -> Iterator[Written]:
+    def writing(self, words: str) -> Iterator[WritingProgress]:
         """Show a bar for each output while the body writes them; in a log, `words` and lines."""
         console = self._console
         if console is not None:
@@ -111,7 +112,7 @@ def _tell(stream: Any, line: str) -> None:
 
 
 class WrittenLines:
-    """Progress of what is written as lines of text in a stream; call it as `Written`."""
+    """Progress of what is written as lines of text in a stream; call it as `WritingProgress`."""
 
     def __init__(self, stream: Any) -> None:
         self.stream = stream

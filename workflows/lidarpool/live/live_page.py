@@ -36,11 +36,13 @@ from ..datasets.job_table import JobRow, Value
 from ..pipeline.messages import Receipt, ScanFrame
 from ..plan import best
 from ..report.charts import draw_results, draw_varied
+from ..report.picture_content import planning_picture
 from ..run.job_points import JobPoints
 from ..run.picture_file import PictureContent
 from ..run.progress import STAGES, Pace, Progress, in_words, standing_still, time_in_words
 from ..run.run_page import JobNow, RunPage
 from ..run.run_result import RunResult
+from .opened import downloads
 from .point_selection import HeldPoints
 from .server import PORT, VIEWER, Answer, Arguments, PageServer, announced, page_server
 from .view import View, open_result, wait_for_interrupt
@@ -206,7 +208,7 @@ class LivePage(RunPage):
         if number not in self._results and self._written is not None:
             names = {job["number"]: job["name"] for job in list(self._ended)}
             file = self._written.local(job_file("folder", names[number], SWEEPS_FILE))
-            self._results[number] = open_result(file.parent)
+            self._results[number] = open_result(file.parent, downloads())
         return self._results[number]
 
     def _of_only(self, job: LiveJob, question: str, *asked: Any) -> Answer:
@@ -455,10 +457,14 @@ class LiveJob:
         """What its page shows, made when it is first asked for."""
         with self._making:
             if self._view is None:
-                job, (pictured, drawn) = self._job, PictureContent.before(self._job)
+                job = self._job
+                planning = planning_picture(job.planning)
+                pictured, drawn = PictureContent.before_casting(job.scene, job.survey, planning)
                 sweeps = Sweeps.of(job.survey, job.scene) if self._whole else None
                 title = f"job {self.name} - lidarpool" if self.name else "lidarpool"
-                self._view = View(HeldPoints(self.cloud), pictured, sweeps, title=title)
+                self._view = View(
+                    HeldPoints(self.cloud), pictured, sweeps, title=title, downloads=downloads()
+                )
                 self._view.hits = lambda: drawn.hits(self.hit_counts())
             return self._view
 

@@ -34,8 +34,6 @@ from raybeam import RayCaster
 from ..base.notebook import cell_display
 from ..columns.cloud_file import CloudFile
 from ..columns.ply_format import AXES
-from ..export.formats import Format, save_cloud
-from ..pipeline.database import FILE
 from ..render.closeup import around_ways, floor_and_cut
 from ..render.colouring import (
     MOST_ENTRIES,
@@ -49,8 +47,13 @@ from ..render.colouring import (
 from ..render.hit_density import HITS_TITLE, hit_colours
 from ..render.surface import apart
 from ..render.theme import mapped, object_colours
-from ..run.picture_file import PICTURE_FILE, PLACES_MOST, PictureContent, SensorWay, ways_of
-from ..run.store import RUN_FOLDER
+from ..run.picture_file import (
+    PICTURE_FILE,
+    PLACES_MOST,
+    PictureContent,
+    SensorPositions,
+    moving_positions,
+)
 from .point_selection import (
     RESULT,
     Eye,
@@ -67,7 +70,6 @@ from .point_selection import (
 from .server import PORT, Answer, Arguments, PageServer, announced, page_server
 
 MOST_POINTS = 20_000_000  # in an answer, and in a download
-EXPORTS = ("ply", "las", "parquet")  # formats of a download
 MOST_RAYS = 150  # more rays would hide the surfaces
 _SAMPLE = 100_000  # points that colour scales and limits are taken from
 _MOST_COLOURINGS = 64  # colour scales that are kept, of columns and filters
@@ -89,6 +91,14 @@ Legend = dict[str, Any]  # what the page is told of it
 CLOUD = "cloud.ply"
 
 
+@dataclass(frozen=True)
+class Downloads:
+    """Formats in which a page offers its points, and the function that writes them."""
+
+    formats: Sequence[str]  # endings of files, such as "las"
+    save: Callable[[Cloud, Path], object]  # writes points in the format of the path's ending
+
+
 @dataclass(eq=False)
 class View:
     """A survey on a page, or a cloud alone.
@@ -102,23 +112,25 @@ class View:
     note: str = ""  # a remark on what is shown
     title: str = "lidarpool"
     results: Sequence[str] = ()  # names, if the points are of several results
-    # Returns those of each triangle, those of actors after the others; by default as pictured.
+    # Returns the hits of each triangle, of actors' triangles last; by default as pictured.
     hits: Callable[[], AnyArray] | None = None
     triangles: int = MOST_TRIANGLES  # of the scene, that are shown
+    downloads: Downloads | None = None  # None if points are not offered as files
 
     def __post_init__(self) -> None:
         self.version = 0  # of the points
         self.rays: Floats32 = np.zeros((0, 2, 3), np.float32)
         self.path: Floats | None = None
-        known = (one.coordinates for one in (self.pictured, self.sweeps) if one is not None)
-        if any(coordinates != "world" for coordinates in known):
+        sources = (source for source in (self.pictured, self.sweeps) if source is not None)
+        if any(source.coordinates != "world" for source in sources):
             self.note = self.note or IN_SENSOR_AXES
         if self.sweeps is not None and self.sweeps.coordinates != "world":
             self.pictured = None
         if (pictured := self.pictured) is not None:
             self.rays = pictured.sample_rays
-            self.path = None if pictured.plan is None else pictured.plan.path
-        self.origin, self._bounds, self._held = self._around()
+            if pictured.planning is not None and pictured.planning.best is not None:
+                self.path = pictured.planning.best.corners
+        self.origin, self._bounds, self._corners = self._extent()
         rest = {column.name: column for column in self.points.table if column not in POSITION}
         self.columns = {"z": Z, "x": X, "y": Y, **rest}  # to colour and filter by
         self._coloured = with_rgb(self.columns)
@@ -137,30 +149,31 @@ class View:
     # -- what is known of the survey -----------------------------------------------------
 
     @cached_property
-    def sensors(self) -> Sequence[SensorWay]:
-        """Positions of the sensors: exact, or those at the beginnings of their sweeps."""
+    def sensors(self) -> Sequence[SensorPositions]:
+        """Positions of the sensors: exact, or at the starts of their sweeps."""
         if self.pictured is not None:
             return self.pictured.sensors
-        sweeps, ways = self.sweeps, []
+        sweeps = self.sweeps
         if sweeps is None:
             return ()
+        sensors: list[SensorPositions] = []
         for number, name in enumerate(sweeps.sensors):
-            own = sweeps.sensor == number
-            places = sweeps.pose.positions[own] - self.origin
+            of_sensor = sweeps.sensor == number
+            local = sweeps.pose.positions[of_sensor] - self.origin
             if sweeps.coordinates != "world":  # each point is in the axes of its sensor
-                places = np.zeros_like(places)
-            moves = len(np.unique(places, axis=0)) > len(places) / 2 > 1
-            ways.append(SensorWay(sweeps.begins_ns[own], places, moves, name))
-        return ways
+                local = np.zeros_like(local)
+            moves = len(np.unique(local, axis=0)) > len(local) / 2 > 1
+            sensors.append(SensorPositions(sweeps.begins_ns[of_sensor], local, moves, name))
+        return sensors
 
     @property
     def actors(self) -> Sequence[Actor]:
-        """What moves through the scene."""
+        """Actors of the scene."""
         return () if self.pictured is None else self.pictured.scene.actors
 
     @property
     def duration_ns(self) -> float:
-        """How long the survey takes, by its own clock; 0 if that is unknown."""
+        """Duration of the survey in nanoseconds; 0 if unknown."""
         if self.pictured is not None and self.pictured.duration_ns:
             return self.pictured.duration_ns
         if self.sweeps is None or not len(self.sweeps):
@@ -185,22 +198,23 @@ class View:
                 return names[column]
         return CAUSES if self.columns.get(column) == TABLE["cause"] else ()
 
-    def _around(self) -> tuple[Floats, Floats, Floats]:
-        """Local origin, box of all that is shown, and what a picture of all has to hold, (k, 3).
+    def _extent(self) -> tuple[Floats, Floats, Floats]:
+        """Return the local origin, the box (2, 3) of the view, and points (k, 3) to be in sight.
 
-        That is corners of the scene, sensors, and both ends of the planning. The box of these is
-        larger: around an object it would be mostly empty.
+        These are corners of the scene, sensors, and both ends of the planning. The corners of the
+        box would be farther apart: around an object the box is mostly empty.
         """
         if self.pictured is None:
             origin, box = _of_points(self.points)
             return origin, box, corners_of(box)
-        scene, planning = self.pictured.scene, self.pictured.planning
-        ways = [way.positions for way in self.pictured.sensors]
-        held = np.concatenate([corners_of(scene.bounds), *ways])
+        scene = self.pictured.scene
+        planning = self.pictured.planning
+        sensors = [sensor.positions for sensor in self.pictured.sensors]
+        corners = np.concatenate([corners_of(scene.bounds), *sensors])
         if planning is not None:
-            level = held[:, 2].min()
-            held = np.vstack([held, [*planning.start, level], [*planning.target, level]])
-        return scene.origin, np.stack([held.min(axis=0), held.max(axis=0)]), held
+            level = corners[:, 2].min()
+            corners = np.vstack([corners, [*planning.start, level], [*planning.target, level]])
+        return scene.origin, np.stack([corners.min(axis=0), corners.max(axis=0)]), corners
 
     # -- answers -------------------------------------------------------------------------
 
@@ -219,13 +233,15 @@ class View:
 
     def _state(self) -> Answer:
         """Tell all but points and surfaces."""
-        near = around_ways(self._bounds, ways_of(self.sensors, self.actors, self.duration_ns))
+        near = around_ways(
+            self._bounds, moving_positions(self.sensors, self.actors, self.duration_ns)
+        )
         box = self._bounds if near is None else near
-        corners = self._held if near is None else corners_of(near)
+        corners = self._corners if near is None else corners_of(near)
         arrays: dict[str, AnyArray] = {"rays": self.rays_shown, "corners": corners}
-        for number, way in enumerate(self.sensors):
-            arrays[f"sensor{number}_times"] = way.times_ns / _NS
-            arrays[f"sensor{number}_places"] = way.positions
+        for number, sensor in enumerate(self.sensors):
+            arrays[f"sensor{number}_times"] = sensor.times_ns / _NS
+            arrays[f"sensor{number}_places"] = sensor.positions
         arrays |= self._actor_arrays()
         if self.sweeps is not None:
             arrays["sweep_scans"] = self.sweeps.scans.astype(np.float64)
@@ -249,7 +265,8 @@ class View:
             "cut": None if near is None else float(near[1, 2]),
             "scene": pictured and colours_for(pictured.scene, pictured.reflectance),
             "sensors": [
-                {"name": way.name, "model": way.model, "moves": way.moves} for way in self.sensors
+                {"name": sensor.name, "model": sensor.model, "moves": sensor.moves}
+                for sensor in self.sensors
             ],
             "actors": [
                 {"name": actor.name, "class": classes.get(number)}
@@ -257,7 +274,7 @@ class View:
             ],
             "classes": {str(k): name for k, name in enumerate(self._names("class")) if name},
             "results": legend_of(colours_of(several, RESULT, self.results))["labels"],
-            "exports": () if isinstance(self.points, HeldPoints) else downloads(),
+            "exports": self._export_formats,
             "actor_colours": as_bytes(object_colours(objects))[statics:].tolist(),
             "statics": statics,
             "duration": self.duration_ns / _NS,
@@ -312,27 +329,38 @@ class View:
 
     def _export(self, asked: Arguments, abandoned: Callable[[], bool]) -> Answer:
         """Write the points for a filter and ranges of scans to a file; of many files, a ZIP."""
-        points, sweeps, kind = self.points, self.sweeps, EXPORTS.index(asked["format"])
+        ending = asked["format"]
+        if self.downloads is None or ending not in self._export_formats:
+            raise KeyError(ending)
+        points = self.points
+        sweeps = self.sweeps
         rows, count = self._finder.find(MOST_POINTS, *self._wanted(asked), None, abandoned)
         if count > MOST_POINTS:
             words = f"{count:,} points are more than {MOST_POINTS:,}: filter or clip them, or use"
             return {"error": f"{words} lidarpool export for all."}, {}
         columns = {column.name: points.values(column.name, rows) for column in points.table}
-        places = np.stack([points.values(axis, rows) for axis in AXES], axis=1)
-        own = tuple(column for column in points.table if column.name not in TABLE)
-        cloud = Cloud(places, columns, own, None if sweeps is None else lambda: sweeps)
+        world = np.stack([points.values(axis, rows) for axis in AXES], axis=1)
+        further = tuple(column for column in points.table if column.name not in TABLE)
+        cloud = Cloud(world, columns, further, None if sweeps is None else lambda: sweeps)
         with TemporaryDirectory(prefix="lidarpool-") as folder:
-            name = f"cloud.{EXPORTS[kind]}"
-            made = Path(folder) / name
+            path = Path(folder) / f"cloud.{ending}"
             try:
-                save_cloud(cloud, made)
+                self.downloads.save(cloud, path)
             except LidarError as error:
                 return {"error": str(error)}, {}
-            if made.is_dir():
-                file, *more = made.iterdir()
-                made = Path(shutil.make_archive(str(made), "zip", made)) if more else file
-                name = made.name if more else name
-            return {"name": name}, {"file": np.fromfile(made, np.uint8)}
+            name = path.name
+            if path.is_dir():
+                file, *others = path.iterdir()
+                path = Path(shutil.make_archive(str(path), "zip", path)) if others else file
+                name = path.name if others else name
+            return {"name": name}, {"file": np.fromfile(path, np.uint8)}
+
+    @property
+    def _export_formats(self) -> Sequence[str]:
+        """Formats of a download; none of a sample that is held of a run under way."""
+        if self.downloads is None or isinstance(self.points, HeldPoints):
+            return ()
+        return self.downloads.formats
 
     def _wanted(self, asked: Arguments) -> tuple[Filter, ScanRanges | None]:
         """Read the filter and the ranges of scans, ``first-last,first-last``, of a question."""
@@ -623,11 +651,6 @@ def result_page(view: View, *, port: int = PORT, browser: bool = True) -> Iterat
         yield page
 
 
-def downloads() -> list[str]:
-    """Name the formats of a download whose packages are installed here."""
-    return [name for name in EXPORTS if Format(name).installed]
-
-
 def wait_for_interrupt(stopped: Event | None = None) -> None:
     """Keep a page open until Ctrl-C, or until its user has stopped it."""
     stopped = stopped or Event()
@@ -644,13 +667,13 @@ def show_view(view: View, *, port: int, browser: bool = True) -> None:
         wait_for_interrupt()
 
 
-def open_results(paths: Sequence[Path]) -> View:
-    """Open results of one place as one view, with the scene, sensors and actors of the first.
+def open_results(paths: Sequence[Path], downloads: Downloads | None = None) -> View:
+    """Open results of a place as a view, with the scene, sensors and actors of the first result.
 
-    They are played if their sweeps are alike. LidarError as of `open_result`, or if points are
-    in the axes of their sensors.
+    The view can be played if the sweeps of all results begin at the same times. LidarError as
+    of `open_result`, or if points are in the axes of their sensors.
     """
-    first, *others = views = [open_result(path) for path in paths]
+    first, *others = views = [open_result(path, downloads) for path in paths]
     if not others:
         return first
     if IN_SENSOR_AXES in (notes := [view.note for view in views]):
@@ -661,35 +684,41 @@ def open_results(paths: Sequence[Path]) -> View:
     names = [path.resolve().name for path in paths]
     names = names if len({*names}) == len(names) else [str(path) for path in paths]
     begins = [() if view.sweeps is None else view.sweeps.begins_ns for view in views]
-    sweeps = first.sweeps if all(np.array_equal(begins[0], one) for one in begins) else None
+    sweeps = first.sweeps if all(np.array_equal(begins[0], times) for times in begins) else None
     points = JoinedPoints([view.points for view in views])
     title = f"{' and '.join(names)} - lidarpool"
-    return View(points, first.pictured, sweeps, " ".join(notes).strip(), title, results=names)
+    return View(
+        points,
+        first.pictured,
+        sweeps,
+        " ".join(notes).strip(),
+        title,
+        results=names,
+        downloads=downloads,
+    )
 
 
-def open_result(path: Path) -> View:
-    """Open a cloud or the folder of a result; with its scene and sweeps if there are any.
+def open_result(path: Path, downloads: Downloads | None = None) -> View:
+    """Open a cloud or the folder of a result, with its scene and sweeps if they are in the folder.
 
-    That these cannot be read is only noted. LidarError if there is no cloud, or a damaged one.
+    A scene or sweeps that cannot be read are noted only. LidarError if there is no cloud, or a
+    damaged cloud.
     """
     title = f"{path.resolve().name} - lidarpool"
     if not path.is_dir():
-        return View(CloudFile(path), title=title)
-    cloud, scene, beside = path / CLOUD, path / PICTURE_FILE, path / SWEEPS_FILE
-    if not cloud.exists() and (path / RUN_FOLDER / FILE).exists():
-        raise LidarError(
-            f"{path} holds an unfinished run: continue it with lidarpool run --resume, where "
-            "--live shows its points."
-        )
+        return View(CloudFile(path), title=title, downloads=downloads)
+    cloud = path / CLOUD
     if not cloud.exists():
         raise LidarError(
             f"{path} holds no {CLOUD}: give the folder of a result (its --out), or a cloud."
         )
+    scene_file = path / PICTURE_FILE
+    sweeps_file = path / SWEEPS_FILE
     pictured, sweeps, note = None, None, ""
     try:
-        sweeps = Sweeps.load(beside) if beside.exists() else None
-        pictured = PictureContent.load(scene) if scene.exists() else None
+        sweeps = Sweeps.load(sweeps_file) if sweeps_file.exists() else None
+        pictured = PictureContent.load(scene_file) if scene_file.exists() else None
     except LidarError as error:
         note = f"The cloud is shown without all that belongs to it. {error}"
     file = CloudFile(cloud, pictured.own if pictured else ())
-    return View(file, pictured, sweeps, note, title)
+    return View(file, pictured, sweeps, note, title, downloads=downloads)

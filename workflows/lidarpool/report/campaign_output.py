@@ -27,7 +27,8 @@ from ..run.conductor import Conductor, Output
 from ..run.job_points import listed
 from ..run.run_result import CampaignRun
 from ..run.store import RUN_FOLDER, RunStore, remove_run
-from ..scenario.campaign import CampaignSpec, hashes
+from ..scenario.campaign import CampaignSpec
+from ..scenario.campaign_jobs import file_hashes
 
 CAMPAIGN_FILE = "campaign.json"  # whose data set this is, and the software that made it
 # Entries of CAMPAIGN_FILE and their types.
@@ -117,7 +118,7 @@ class DataSetOutput(Output[CampaignRun]):
             return None
         if RUN_FOLDER in there:  # a killed run has not removed all of itself
             remove_run(kept)
-        if (files := hashes(self.campaign.files)) != [*map(tuple, self._made["files"])]:
+        if (files := file_hashes(self.campaign.files)) != [*map(tuple, self._made["files"])]:
             write_record(out, {**self._made, "files": files})  # `_look`: no job has an older one
         conductor.screen.tell(f"{out} is complete: nothing is left to do")
         for row in self._rows:
@@ -176,7 +177,7 @@ class DataSetOutput(Output[CampaignRun]):
         run = CampaignRun.of(store.rows(), seconds, store.resumed, sensors=store.sensors, **more)
         record: dict[str, Any] = {"identity": dict(store.identity), "casting": store.casting}
         record |= {"backend": store.backend, "sensors": run.sensors}
-        record |= {"files": hashes(self.campaign.files), "campaign": self.campaign.described}
+        record |= {"files": file_hashes(self.campaign.files), "campaign": self.campaign.described}
         record |= {"shards": [str(self.campaign.shard)], "notes": [*run.notes]}
         write_record(self.dataset.place, record)  # before anything that it tells whose it is
         replace(self.dataset, made_with=store.made_with).write_failed(store.rows())
@@ -296,7 +297,7 @@ def _look(
             whole += 1
             for file in manifest["made_of"]:
                 made.setdefault(tuple(file), []).append(row.name)
-    now = hashes(campaign.files) if campaign is not None and made else []
+    now = file_hashes(campaign.files) if campaign is not None and made else []
     for (name, digest), jobs in made.items():
         if (name, digest) not in now and name in dict(now):
             raise LidarError(

@@ -19,20 +19,19 @@ from lidarsim.sweeps.instruments import INSTRUMENT_FILES, Instruments
 from lidarsim.sweeps.sweeps import SWEEPS_FILE, Sweeps
 
 from ..base.open3d_module import load_open3d
+from ..base.writing_progress import WritingProgress
 from ..columns.parts import StoredCloud
 from ..export.folder import LAST_FILE, result_folder, staging
 from ..export.format_table import EXPORTS, FORMATS
 from ..export.formats import Format, refuse_strangers
 from ..export.navigation_files import write_instruments
 from ..run.conductor import Conductor, Output
-from ..run.picture_file import PICTURE_FILE, PictureContent
-from ..run.progress import Written
+from ..run.picture_file import PICTURE_FILE
 from ..run.run_result import RunResult
 from ..run.writer import LidarWorkers
 from ..scenario.scenario import Scenario
+from .picture_content import picture_content
 from .report import CountedCloud, make_report
-
-ROOM_BYTES = 32 << 20  # room for pictures and report
 
 CLOUD, PAGE, REPORT = FORMATS["ply"].file, "report.html", LAST_FILE
 _DRAWN = tuple(f"{name}.png" for name in PICTURES)
@@ -130,7 +129,7 @@ class SurveyOutput(Output[tuple[RunResult, dict[str, Any]]]):
         result: RunResult,
         then: Callable[[], object] = lambda: None,
         workers: LidarWorkers | None = None,
-        show: Written = lambda *_: None,
+        show: WritingProgress = lambda *_: None,
     ) -> dict[str, Any]:
         """Write cloud, pictures and report into the held place, and return the report.
 
@@ -210,12 +209,12 @@ class SurveyOutput(Output[tuple[RunResult, dict[str, Any]]]):
 
     def _report(
         self, result: RunResult, report: dict[str, Any], cloud: CountedCloud, staged: Path,
-        show: Written,
+        show: WritingProgress,
     ) -> None:  # fmt: skip
         """Write the page, what pictures are drawn of, and the pictures if they are wanted."""
         from .page.rendering import write_page  # jinja2
 
-        shown = PictureContent.of(result)
+        shown = picture_content(result)
         shown.save(staged / PICTURE_FILE)
         write_page(staged / PAGE, report, result, cloud, self.scenario)
         if self.extent == "pictures":

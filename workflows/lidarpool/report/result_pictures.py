@@ -24,8 +24,8 @@ from lidarsim.columns.cloud import Cloud
 from lidarsim.columns.table import TABLE, Z
 from lidarsim.scene.scene import Scene
 
+from ..base.writing_progress import WritingProgress
 from ..columns.cloud_file import CloudFile
-from ..plan import Plan, Planning
 from ..plan.stations import Sight, StationPlan
 from ..render import theme
 from ..render.colouring import with_rgb
@@ -33,8 +33,7 @@ from ..render.picture_page import FONT, Page
 from ..render.pictures import MOST_POINTS, draw_cloud, draw_hits, draw_scene
 from ..render.shot import SIZE, Samples, SurfaceView, take_shot
 from ..render.stage import make_axis, nice_step
-from ..run.picture_file import PictureContent, ways_of
-from ..run.progress import Written
+from ..run.picture_file import PictureContent, PlannedPath, PlanningPicture, moving_positions
 from .page.rendering import put_picture
 
 SIDE_LEAST, SIDE_MOST = 480, 4096  # letters need some pixels; a pixel takes 0.4 kB of memory
@@ -55,7 +54,7 @@ def draw_pictures(
     only: Sequence[str] = (),
     size: tuple[int, int] = SIZE,
     colour: str = Z.name,
-    show: Written = lambda *_: None,
+    show: WritingProgress = lambda *_: None,
 ) -> Iterator[Path]:
     """Draw pictures of a result, those in `only`, into a folder, which is made, and into its page.
 
@@ -111,7 +110,7 @@ def _picture_makers(
             scene.solid(middle),
             np.concatenate([np.empty((0, 3)), *places]) + scene.origin,
             paths=[way.positions for way in shown.sensors if way.moves],
-            around=ways_of(shown.sensors, scene.actors, shown.duration_ns),
+            around=moving_positions(shown.sensors, scene.actors, shown.duration_ns),
             actors=len(scene.actors),
             when=shown.when,
             models=shown.models,
@@ -149,26 +148,26 @@ def _picture_makers(
                 shot(), points(), len(CloudFile(cloud)), light, solid=True
             )
         makers["cloud"] = draw_points
-    planning, plan = shown.planning, shown.plan
-    if planning is not None and plan is not None:
-        makers["path"] = lambda: draw_path(
-            planning, plan, shown.trials, shown.scene.origin[:2], size
-        )
+    planning = shown.planning
+    if planning is not None and planning.best is not None:
+        best = planning.best
+        makers["path"] = lambda: draw_path(planning, best, shown.scene.origin[:2], size)
     return makers
 
 
 def draw_path(
-    planning: Planning, plan: Plan, trials: Sequence[Floats], origin: Floats, size: tuple[int, int]
+    planning: PlanningPicture, path: PlannedPath, origin: Floats, size: tuple[int, int]
 ) -> Page:
-    """Draw a plan from above: obstacles, ends, the trials' paths faint and the best one bold.
+    """Draw a planned path from above, with obstacles, both ends and the paths of the trials.
 
-    `trials` are the corners (w, 2) of their paths; of more than 1000 an evenly spaced sample is
-    drawn. `origin` is x and y of the local origin: the axes have world coordinates.
+    The paths of the trials are faint, the best path is bold. Of more than 1000 trials, an evenly
+    spaced sample is drawn. `origin` (2,) is x and y of the local origin: the axes have world
+    coordinates.
     """
     page = Page(size)
     unit = page.unit
-    best = plan.path
-    every = [np.concatenate([best[:1], trial, best[-1:]]) for trial in trials]
+    best = path.corners
+    every = [np.concatenate([best[:1], trial, best[-1:]]) for trial in path.trials]
     others = [every[k] for k in even_indices(len(every), MOST_TRIALS)]
     (x0, y0), (x1, y1) = _limits(best, others, planning, size).tolist()
     axes = page.chart(FRAME, xlim=(x0, x1), ylim=(y0, y1), aspect="equal")
@@ -203,18 +202,18 @@ def draw_path(
                    mew=0.6 * unit, ms=7 * unit, label="Obstacle")
         )  # fmt: skip
     page.key(key, 7.4)
-    page.title("Planned path", _verdict(plan, every))
+    page.title("Planned path", _verdict(path, every))
     return page
 
 
-def _verdict(plan: Plan, trials: Sequence[Floats]) -> str:
-    """Caption: length, shortest possible, collisions, and the other trials."""
+def _verdict(best: PlannedPath, trials: Sequence[Floats]) -> str:
+    """Return the caption: length, shortest possible length, collisions, and the other trials."""
     shortest = "discs cut the target off"
-    if math.isfinite(plan.shortest_possible) and plan.shortest_possible > 0:
-        shortest = f"shortest possible {plan.shortest_possible:.2f} m ({plan.excess:+.2%})"
-    length = f"length {plan.length:.2f} m · {shortest}"
-    state = "collision-free" if plan.collision_free else "enters a disc"
-    best_of = f"best of {plural(plan.trials, 'trial')}"
+    if math.isfinite(best.shortest_m) and best.shortest_m > 0:
+        shortest = f"shortest possible {best.shortest_m:.2f} m ({best.excess:+.2%})"
+    length = f"length {best.length_m:.2f} m · {shortest}"
+    state = "collision-free" if best.clearance_m >= 0 else "enters a disc"
+    best_of = f"best of {plural(len(trials), 'trial')}"
     if len(trials) > 1:  # equal paths are hidden by the best one
         longest = max(float(np.linalg.norm(np.diff(path, axis=0), axis=1).sum()) for path in trials)
         best_of += f", the longest {longest:.2f} m"
@@ -222,7 +221,7 @@ def _verdict(plan: Plan, trials: Sequence[Floats]) -> str:
 
 
 def _limits(
-    best: Floats, others: Sequence[Floats], planning: Planning, size: tuple[int, int]
+    best: Floats, others: Sequence[Floats], planning: PlanningPicture, size: tuple[int, int]
 ) -> Floats:
     """Lowest and highest corner (2, 2) of the plot, in the page's proportions."""
     reach = planning.radii[:, None]
@@ -235,7 +234,7 @@ def _limits(
     return np.stack([middle - half, middle + half])
 
 
-def _ends(axes: Axes, page: Page, planning: Planning) -> None:
+def _ends(axes: Axes, page: Page, planning: PlanningPicture) -> None:
     """Mark and name start and target."""
     halo = [withStroke(linewidth=2.2 * page.unit, foreground=theme.GROUND)]
     middle = sum(axes.get_xlim()) / 2

@@ -24,10 +24,6 @@ from lidarsim.sensor import Survey, Track
 from lidarsim.sensor.materials import MaterialTable
 from lidarsim.sensor.trajectory import ALWAYS, Beyond, presence_ns
 
-from ..plan import Plan, Planning
-from ..scenario.build import Job
-from .run_result import RunResult
-
 PICTURE_FILE = "pictures.npz"
 
 MODELS_MOST = 4  # sensors named in a picture
@@ -35,11 +31,16 @@ PLACES_MOST = 1000  # positions of a moving sensor or actor
 _FORMAT = 6
 # {name in the file: field of an actor's track}
 _TRACK = {"times": "times_s", "positions": "positions", "quaternions": "quaternions"}
-_PLAN_NUMBERS = ("length", "shortest_possible", "clearance", "trial", "trials")
+# {name in the file: field of a planned path}
+_PATH_LENGTHS = {
+    "length": "length_m",
+    "shortest_possible": "shortest_m",
+    "clearance": "clearance_m",
+}
 
 
 @dataclass(frozen=True, eq=False)
-class SensorWay:
+class SensorPositions:
     """Positions of a sensor over time."""
 
     times_ns: Floats  # (k,), ascending, nanoseconds since the survey's start
@@ -49,7 +50,7 @@ class SensorWay:
     model: str = ""
 
     def at(self, time_ns: float) -> Floats:
-        """Its position at a time, (3,)."""
+        """Return the position at a time, (3,)."""
         if self.moves:
             return np.array([np.interp(time_ns, self.times_ns, x) for x in self.positions.T])
         last = int(np.searchsorted(self.times_ns, time_ns, "right")) - 1
@@ -57,17 +58,41 @@ class SensorWay:
 
 
 @dataclass(frozen=True, eq=False)
+class PlannedPath:
+    """The best path of a search in the plane, as pictures show it."""
+
+    corners: Floats  # (w, 2), from start to target, metres, local coordinates
+    length_m: float
+    shortest_m: float  # length of the shortest path; inf if discs cut off the target
+    clearance_m: float  # least distance to a disc; negative within one, inf without discs
+    trials: Sequence[Floats] = ()  # (w, 2) each: corners of each trial's path between the ends
+
+    @property
+    def excess(self) -> float:
+        """Share by which the path is longer than the shortest path: 0.01 is 1%."""
+        return self.length_m / self.shortest_m - 1
+
+
+@dataclass(frozen=True, eq=False)
+class PlanningPicture:
+    """A search for a path in the plane, as pictures show it; metres, local coordinates."""
+
+    start: tuple[float, float]
+    target: tuple[float, float]
+    centres: Floats  # (m, 2): centres of the discs to keep out of
+    radii: Floats  # (m,): radii of the discs
+    best: PlannedPath | None = None  # None before the end of all trials
+
+
+@dataclass(frozen=True, eq=False)
 class PictureContent:
     """Content of a result's pictures, except the points."""
 
     scene: Scene  # its actors have a thousand places at most, and poses for pictures
-    sensors: Sequence[SensorWay]
+    sensors: Sequence[SensorPositions]
     hit_counts: AnyArray  # (f,): of each triangle, those of actors after the others
     sample_rays: Floats32  # (k, 2, 3): ends of some rays, metres, local coordinates
-    planning: Planning | None
-    plan: Plan | None
-    # (w, 2) each: corners of the paths of all trials between the two ends, metres.
-    trials: Sequence[Floats]
+    planning: PlanningPicture | None = None
     duration_ns: float = 0.0  # of the survey, by its own clock
     own: Sequence[Column] = ()  # columns of the cloud's file that are not in the table of columns
     # (objects,): share of light that each reflects, actors after the others; None if unknown.
@@ -78,54 +103,46 @@ class PictureContent:
     materials: Sequence[str] | None = None  # names of the materials 0, 1, 2, …
 
     @classmethod
-    def of(cls, result: RunResult) -> PictureContent:
-        """Return what the pictures of a result show."""
-        pictured, drawn = cls.before(result)
-        return replace(
-            pictured,
-            hit_counts=drawn.hits(result.hit_counts),
-            sample_rays=result.sample_rays,
-            plan=result.plan,
-            trials=[trial.waypoints for trial in result.trials],
-        )
+    def before_casting(
+        cls, scene: Scene, survey: Survey, planning: PlanningPicture | None = None
+    ) -> tuple[PictureContent, Drawn]:
+        """Return the content that is known before rays are cast, and the scene as it is drawn.
 
-    @classmethod
-    def before(cls, job: Job | RunResult) -> tuple[PictureContent, Drawn]:
-        """Return what is pictured before there is a result, and which counters its hits have."""
-        scene, survey = job.scene, job.survey
-        each = samples_each(scene.actors, PLACES_MOST)
-        actors = tuple(_sampled(actor, survey.duration_ns, each) for actor in scene.actors)
-        ways = sensor_ways(survey)
-        drawn = Drawn.of(cut(scene), near=[way.positions for way in ways])
-        light = survey.carried[0].sensor.optics.wavelength_nm  # of the first sensor
+        The drawn scene turns hits of the scene's triangles into `hit_counts`.
+        """
+        samples = samples_each(scene.actors, PLACES_MOST)
+        actors = tuple(_sampled(actor, survey.duration_ns, samples) for actor in scene.actors)
+        sensors = sensor_positions(survey)
+        drawn = Drawn.of(cut(scene), near=[sensor.positions for sensor in sensors])
+        wavelength_nm = survey.carried[0].sensor.optics.wavelength_nm  # of the first sensor
         kinds = scene.surface_kinds
-        materials = MaterialTable.of(survey.materials, kinds, light, scene.has_voxels)
-        pictured = cls(
-            replace(drawn.scene, actors=actors),
-            ways,
-            np.zeros(0, np.int64),
-            np.zeros((0, 2, 3), np.float32),
-            job.planning,
-            None,
-            (),
-            survey.duration_ns,
-            [replace(c, source="") for c in survey.stored_columns if c.name not in TABLE],
-            materials.reflectance[kinds.first[:-1]],
-            survey.coordinates,
-            scene.triangles,
-            by_value(survey.classes),
-            scene.material_names,
+        materials = MaterialTable.of(survey.materials, kinds, wavelength_nm, scene.has_voxels)
+        content = cls(
+            scene=replace(drawn.scene, actors=actors),
+            sensors=sensors,
+            hit_counts=np.zeros(0, np.int64),
+            sample_rays=np.zeros((0, 2, 3), np.float32),
+            planning=planning,
+            duration_ns=survey.duration_ns,
+            own=[replace(c, source="") for c in survey.stored_columns if c.name not in TABLE],
+            reflectance=materials.reflectance[kinds.first[:-1]],
+            coordinates=survey.coordinates,
+            triangles=scene.triangles,
+            classes=by_value(survey.classes),
+            materials=scene.material_names,
         )
-        return pictured, drawn
+        return content, drawn
 
     @property
     def when(self) -> str:
         """Describe the sensors, and the time of pictures with motion: half of the survey."""
-        sensors, actors = len(self.sensors), len(self.scene.actors)
-        if any(way.moves for way in self.sensors):
+        sensors = len(self.sensors)
+        actors = len(self.scene.actors)
+        if any(sensor.moves for sensor in self.sensors):
             words = f"{plural(sensors, 'sensor')} on {'its' if sensors == 1 else 'their'} way"
         else:
-            words = plural(sum(len(w.positions) for w in self.sensors), "sensor position")
+            positions = sum(len(sensor.positions) for sensor in self.sensors)
+            words = plural(positions, "sensor position")
             if not actors:
                 return words
         words += f" and {plural(actors, 'actor')}" if actors else ""
@@ -134,14 +151,19 @@ class PictureContent:
     @property
     def models(self) -> str:
         """Models of the sensors, with their names if they have any."""
-        words = [f"{way.name}: {way.model}" if way.name else way.model for way in self.sensors]
-        more = len(words) - MODELS_MOST
-        return " · ".join(words[:MODELS_MOST]) + (f" · and {more:,} more" if more > 0 else "")
+        models = [
+            f"{sensor.name}: {sensor.model}" if sensor.name else sensor.model
+            for sensor in self.sensors
+        ]
+        hidden = len(models) - MODELS_MOST
+        if hidden > 0:
+            models[MODELS_MOST:] = [f"and {hidden:,} more"]
+        return " · ".join(models)
 
     def names_of(self, column: Column) -> Sequence[str]:
         """Names of the values 0, 1, 2, … of a column, if any."""
         if column.name == "sensor":
-            return [way.name for way in self.sensors]
+            return [sensor.name for sensor in self.sensors]
         if column == TABLE["cause"]:
             return CAUSES
         names = {
@@ -152,11 +174,11 @@ class PictureContent:
         return names.get(column.name) or ()
 
     def save(self, path: Path) -> None:
-        """Write it as a NumPy archive; the same content gives the same bytes."""
+        """Write the content as a NumPy archive; the same content gives the same bytes."""
         names = {
             "objects": self.scene.names,
             "actors": [actor.name for actor in self.scene.actors],
-            "sensors": [[way.name, way.model, way.moves] for way in self.sensors],
+            "sensors": [[sensor.name, sensor.model, sensor.moves] for sensor in self.sensors],
             "own": [asdict(column) for column in self.own],
             "coordinates": self.coordinates,
             "triangles": self.triangles,
@@ -179,8 +201,9 @@ class PictureContent:
             arrays["reflectance"] = self.reflectance
         if self.scene.colours is not None:
             arrays["colours"] = self.scene.colours.means()
-        for number, way in enumerate(self.sensors):
-            arrays |= {f"sensor{number}_times": way.times_ns, f"sensor{number}": way.positions}
+        for number, sensor in enumerate(self.sensors):
+            arrays[f"sensor{number}_times"] = sensor.times_ns
+            arrays[f"sensor{number}"] = sensor.positions
         for number, actor in enumerate(self.scene.actors):
             track = actor.trajectory
             if not isinstance(track, Track):
@@ -194,44 +217,54 @@ class PictureContent:
             arrays |= {f"mesh{number}_vertices": mesh.vertices, f"mesh{number}_faces": mesh.faces}
             if mesh.colours is not None:
                 arrays[f"mesh{number}_colours"] = mesh.colours.means()
-            if (own := mesh.animation) is not None:  # differences compress to a third of the size
-                steps = np.diff(own.vertices, axis=0, prepend=0)
+            if (animation := mesh.animation) is not None:
+                # Differences compress to a third of the size.
+                steps = np.diff(animation.vertices, axis=0, prepend=0)
                 arrays[f"mesh{number}_steps"] = steps.astype(np.float32)
-                arrays[f"mesh{number}_played"] = [own.step_s, own.speed_m_s or 0, own.repeat]
-        if self.planning is not None and self.plan is not None:
+                arrays[f"mesh{number}_played"] = [
+                    animation.step_s,
+                    animation.speed_m_s or 0,
+                    animation.repeat,
+                ]
+        if (planning := self.planning) is not None and (best := planning.best) is not None:
             arrays |= {
-                "ends": [self.planning.start, self.planning.target],
-                "centres": self.planning.centres,
-                "radii": self.planning.radii,
-                "path": self.plan.path,
-                "waypoints": np.array(self.trials),
+                "ends": [planning.start, planning.target],
+                "centres": planning.centres,
+                "radii": planning.radii,
+                "path": best.corners,
+                "waypoints": np.array(best.trials),
             }
-            arrays |= {name: getattr(self.plan, name) for name in _PLAN_NUMBERS}
+            arrays |= {name: getattr(best, field) for name, field in _PATH_LENGTHS.items()}
         path.write_bytes(packed(arrays))
 
     @classmethod
     def load(cls, path: Path) -> PictureContent:
-        """Read what `save` wrote; LidarError if it is damaged. Nothing in the file is run."""
+        """Read a file that `save` wrote; LidarError if the file is damaged.
+
+        No code in the file is run.
+        """
         with open_archive(path) as archive:
             return cls._from_arrays(archive)
 
     @classmethod
     def _from_arrays(cls, arrays: Mapping[str, Any]) -> PictureContent:
-        if (made := int(arrays["format"])) != _FORMAT:
-            raise ValueError(f"it is of format {made}, not {_FORMAT}")
+        if (version := int(arrays["format"])) != _FORMAT:
+            raise ValueError(f"it is of format {version}, not {_FORMAT}")
         names = json.loads(arrays["names"].tobytes())
-        actors, which = [], arrays["actor_mesh"].tolist()
+        mesh_of_actor = arrays["actor_mesh"].tolist()
         meshes = [
             SceneMesh("", arrays[f"{mesh}_vertices"], arrays[f"{mesh}_faces"],
                  colours=_colours(arrays, f"{mesh}_colours"), animation=_animation(arrays, mesh))
-            for mesh in (f"mesh{number}" for number in range(max(which, default=-1) + 1))
+            for mesh in (f"mesh{number}" for number in range(max(mesh_of_actor, default=-1) + 1))
         ]  # fmt: skip
+        actors = []
         for number, name in enumerate(names["actors"]):
-            times, places, turns = (arrays[f"actor{number}_{part}"] for part in _TRACK)
+            times, positions, rotations = (arrays[f"actor{number}_{part}"] for part in _TRACK)
             beyond: Beyond = "absent" if arrays[f"actor{number}_absent"] else "hold"
-            way = Track(times, places, turns, start_s=0.0, beyond=beyond)
+            track = Track(times, positions, rotations, start_s=0.0, beyond=beyond)
             offset_s = float(arrays.get(f"actor{number}_offset", 0))  # without poses, there is none
-            actors.append(Actor(replace(meshes[which[number]], name=name), way, offset_s))
+            mesh = replace(meshes[mesh_of_actor[number]], name=name)
+            actors.append(Actor(mesh, track, offset_s))
         scene = Scene(
             arrays["vertices"],
             arrays["faces"],
@@ -242,76 +275,92 @@ class PictureContent:
             colours=_colours(arrays, "colours"),
         )
         sensors = [
-            SensorWay(arrays[f"sensor{k}_times"], arrays[f"sensor{k}"], moves, name, model)
+            SensorPositions(arrays[f"sensor{k}_times"], arrays[f"sensor{k}"], moves, name, model)
             for k, (name, model, moves) in enumerate(names["sensors"])
         ]
         counts = arrays["hit_counts"]
         if counts.shape != (scene.triangles,):
             raise ValueError(f"hit_counts of {counts.shape} for {scene.triangles} triangles")
-        planning = plan = None
-        if "path" in arrays:
-            start, target = arrays["ends"]
-            planning = Planning(start, target, arrays["centres"], arrays["radii"])
-            numbers = {name: arrays[name].item() for name in _PLAN_NUMBERS}
-            plan = Plan(path=arrays["path"], **numbers)
-        rays, trials = arrays["sample_rays"], tuple(arrays.get("waypoints", ()))
-        duration, own = float(arrays["duration_ns"]), [Column(**one) for one in names["own"]]
-        fields = "coordinates", "triangles", "classes", "materials"
-        rest = arrays.get("reflectance"), *map(names.get, fields)
-        return cls(scene, sensors, counts, rays, planning, plan, trials, duration, own, *rest)
+        return cls(
+            scene=scene,
+            sensors=sensors,
+            hit_counts=counts,
+            sample_rays=arrays["sample_rays"],
+            planning=_planning(arrays) if "path" in arrays else None,
+            duration_ns=float(arrays["duration_ns"]),
+            own=[Column(**column) for column in names["own"]],
+            reflectance=arrays.get("reflectance"),
+            coordinates=names["coordinates"],
+            triangles=names["triangles"],
+            classes=names.get("classes"),
+            materials=names.get("materials"),
+        )
+
+
+def _planning(arrays: Mapping[str, Any]) -> PlanningPicture:
+    """Return the search and the path that an archive holds."""
+    lengths = {field: arrays[name].item() for name, field in _PATH_LENGTHS.items()}
+    best = PlannedPath(arrays["path"], **lengths, trials=tuple(arrays["waypoints"]))
+    (x0, y0), (x1, y1) = arrays["ends"].tolist()
+    return PlanningPicture((x0, y0), (x1, y1), arrays["centres"], arrays["radii"], best)
 
 
 def _colours(arrays: Mapping[str, Any], name: str) -> Colours | None:
-    """Colours of faces, if there are some."""
+    """Return the colours of faces, if the archive has any."""
     return Colours.of_faces(arrays[name]) if name in arrays else None
 
 
 def _animation(arrays: Mapping[str, Any], mesh: str) -> Animation | None:
-    """Poses of a mesh, if it has some."""
+    """Return the poses of a mesh, if the archive has any."""
     if (steps := arrays.get(f"{mesh}_steps")) is None:
         return None
     step_s, speed, repeat = arrays[f"{mesh}_played"].tolist()
     return Animation(steps.cumsum(0, np.float64), step_s, speed or None, bool(repeat))
 
 
-def sensor_ways(survey: Survey) -> list[SensorWay]:
-    """Positions of each sensor: at each station, or samples of its trajectory."""
-    path, ways, first = survey.path, [], 0
+def sensor_positions(survey: Survey) -> list[SensorPositions]:
+    """Return positions of each sensor: at each station, or samples of the trajectory."""
+    path = survey.path
+    sensors: list[SensorPositions] = []
+    first = 0
     for carried, steps in zip(survey.carried, survey.steps_each, strict=True):
-        end = first + steps * path.stations
-        some: Iterable[int] = range(first, end, steps)  # the first at each station
+        stop = first + steps * path.stations
+        scans: Iterable[int] = range(first, stop, steps)  # the first at each station
         if path.moves:
-            some = np.unique(np.linspace(first, end - 1, PLACES_MOST).astype(int)).tolist()
-        times = np.array([survey.begins_ns(scan) for scan in some])
-        places = np.array([survey.pose(scan).position for scan in some])
-        ways.append(SensorWay(times, places, path.moves, carried.name, carried.sensor.model))
-        first = end
-    return ways
+            scans = np.unique(np.linspace(first, stop - 1, PLACES_MOST).astype(int)).tolist()
+        times = np.array([survey.begins_ns(scan) for scan in scans])
+        positions = np.array([survey.pose(scan).position for scan in scans])
+        sensors.append(
+            SensorPositions(times, positions, path.moves, carried.name, carried.sensor.model)
+        )
+        first = stop
+    return sensors
 
 
-def ways_of(
-    sensors: Sequence[SensorWay], actors: Sequence[Actor], duration_ns: float
+def moving_positions(
+    sensors: Sequence[SensorPositions], actors: Sequence[Actor], duration_ns: float
 ) -> list[Floats]:
-    """Trajectories (k, 3) of moving sensors, else of actors and the sensors; none without motion.
+    """Return the positions (k, 3) of all that a picture of a survey with motion has to show.
 
-    Pictures and pages look at their surroundings.
+    They are the positions of moving sensors, else of actors and sensors; none without motion.
     """
-    moving = [way.positions for way in sensors if way.moves]
+    moving = [sensor.positions for sensor in sensors if sensor.moves]
     if moving or not actors:
         return moving
     times = np.linspace(0, duration_ns, PLACES_MOST)
-    ways = [actor.trajectory.poses(0, times)[0] for actor in actors]
-    return [*(way.positions for way in sensors), *ways]
+    of_actors = [actor.trajectory.poses(0, times)[0] for actor in actors]
+    return [*(sensor.positions for sensor in sensors), *of_actors]
 
 
 def _sampled(actor: Actor, duration_ns: float, count: int) -> Actor:
-    """Return an actor with poses of a survey, whatever its trajectory is."""
-    times, places, turns = actor.samples(duration_ns, count)
+    """Return an actor whose trajectory is sampled at times of a survey."""
+    times, positions, rotations = actor.samples(duration_ns, count)
     beyond: Beyond = "hold" if presence_ns(actor.trajectory) == ALWAYS else "absent"
-    shown = replace(actor, trajectory=Track(times / 1e9, places, turns, start_s=0.0, beyond=beyond))
-    if (own := actor.mesh.animation) is None:
-        return shown
-    # The animation may follow the way, of which the samples lack the part before the survey.
-    missing_s = actor.seconds(times[:1])[0] - shown.seconds(times[:1])[0]
-    mesh = replace(actor.mesh, animation=own.pictured)
-    return replace(shown, mesh=mesh, offset_s=actor.offset_s + float(missing_s[0]))
+    track = Track(times / 1e9, positions, rotations, start_s=0.0, beyond=beyond)
+    sampled = replace(actor, trajectory=track)
+    if (animation := actor.mesh.animation) is None:
+        return sampled
+    # The animation may follow the trajectory, of which the samples lack the part before the survey.
+    missing_s = actor.seconds(times[:1])[0] - sampled.seconds(times[:1])[0]
+    mesh = replace(actor.mesh, animation=animation.pictured)
+    return replace(sampled, mesh=mesh, offset_s=actor.offset_s + float(missing_s[0]))

@@ -13,6 +13,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, TaskID, TextColumn
 from rich.progress import Progress as Bars
 
 from ..base.notebook import cell_display
+from ..base.writing_progress import WritingProgress
 
 # Lines of progress: label, name of the count, and of the total, which is the unit.
 STAGES: tuple[tuple[str, str, str], ...] = (
@@ -49,7 +50,6 @@ class Progress:
 
 
 Show = Callable[[Progress], None]
-Written = Callable[[str, int, int, str], None]  # name of an output, items that are done, all, unit
 
 
 def in_words(rate: float) -> str:
@@ -168,8 +168,8 @@ class Screen:
         """Show what is going on while the body runs."""
         return nullcontext()
 
-    def writing(self, words: str) -> AbstractContextManager[Written]:
-        """Show what is being written while the body runs; gives the function that is told."""
+    def writing(self, words: str) -> AbstractContextManager[WritingProgress]:
+        """Show what is being written while the body runs; give the function to call."""
         return nullcontext(lambda *_: None)
 
     def progress(self) -> AbstractContextManager[Show]:

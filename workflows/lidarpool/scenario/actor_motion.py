@@ -28,7 +28,7 @@ from lidarsim.base.declared import (
     declared,
     one_of,
 )
-from lidarsim.base.errors import LidarError, prefixed
+from lidarsim.base.errors import LidarError, message_of, prefixed
 from lidarsim.base.input_files import open_input
 from lidarsim.base.words import printable
 from lidarsim.base.xmlfile import refuse_entity
@@ -36,7 +36,6 @@ from lidarsim.scene.actors import Actor
 from lidarsim.scene.files.meshfile import ROBOTS
 from lidarsim.scene.scene_mesh import SceneMesh
 from lidarsim.sensor import Mounted, Pose, Track, load_trajectory
-from lidarsim.sensor.calibrations import said
 from lidarsim.sensor.survey import StepCount
 from lidarsim.sensor.trajectory import CLOCK_S, Beyond, InstrumentPose, quaternions_of, rotations_of
 from lidarsim.sensor.trajectory_files import (
@@ -441,7 +440,7 @@ def read_fcd(
     except (OSError, EOFError, zlib.error, ValueError, KeyError, expat.ExpatError) as error:
         raise LidarError(
             f"{path} is not usable as floating car data, which sumo --fcd-output writes: "
-            f"{said(error)}"
+            f"{message_of(error)}"
         ) from error
     there = [one for one in passages if len(one.times_s) > 1 and one.times_s[-1] >= first_s]
     return there, len(known)

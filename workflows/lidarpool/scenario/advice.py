@@ -8,8 +8,7 @@ import numpy as np
 
 from lidarsim.base.words import as_scenario, plural
 from lidarsim.columns.table import VELOCITY
-from lidarsim.scene.files.meshfile import CITYJSON, UNITLESS, wrote_it
-from lidarsim.sensor.faults import faults_of
+from lidarsim.scene.files.meshfile import UNITLESS, wrote_it
 from lidarsim.sensor.materials import MaterialTable
 from lidarsim.sensor.models import STATED
 from lidarsim.sensor.trajectory import presence_ns
@@ -61,7 +60,7 @@ def _writes_bags(scenario: Scenario) -> bool:
 def _of_size(built: Built, side: float) -> str:
     scenario, placing = built.scenario, built.placing
     files = [entry.file for entry in scenario.scene.files if entry.unit is None]
-    files = [file for file in files if not file.lower().endswith(CITYJSON)]  # towns are large
+    files = [file for file in files if file not in built.found.classes]  # towns are large
     unitless = [f for f in files if f.lower().endswith(UNITLESS) and not wrote_it(scenario.path(f))]
     parts = any(file.lower().endswith(".stl") for file in unitless)
     least, large = SMALL_M, LARGE_STL_M if parts else LARGE_M
@@ -138,7 +137,7 @@ def _ended(built: Built) -> Iterator[str]:
     """Tell of frozen sensors without sweeps, and of actors that are not there, or end early."""
     survey, end = built.survey, np.array([built.survey.duration_ns])
     for number, (_, begins, _) in enumerate(survey.sweeps_each):
-        for place, fault in faults_of(survey, number, "frozen").items():
+        for place, fault in survey.faults_of(number, "frozen").items():
             if not fault.during(begins).any():
                 sensor = survey.carried[number].name or "the sensor"
                 yield f"faults[{place}] does not freeze {sensor}: no sweep begins meanwhile"

@@ -17,9 +17,6 @@ from lidarsim.base.errors import LidarError, Mistakes, prefixed
 from lidarsim.base.validation import checked_fields
 from lidarsim.base.words import did_you_mean, plural
 from lidarsim.scene.actors import Actor, check_spray
-from lidarsim.scene.files.cityjson import CLASS_NAMES as CITY_NAMES
-from lidarsim.scene.files.cityjson import CLASSES as CITY_CLASSES
-from lidarsim.scene.files.meshfile import CITYJSON
 from lidarsim.scene.robot import Robot
 from lidarsim.scene.scene import Scene
 from lidarsim.sensor import Material, Mounted, Noise, Pose, Returns, Sensor, Survey, Track
@@ -57,6 +54,9 @@ SEED_POSES = tuple(Pose((0.0, 0.0, height)) for height in (1.0, 2.0, 3.0))
 
 # Of the hits in a scene with the default objects, every so many are kept.
 SEED_KEPT = 5
+
+# Class of buildings by ASPRS LAS: sensors are not placed in objects that a file gives this class.
+BUILDING = 6
 
 # Precision of points in scenes without these, if no sensor states a resolution.
 MESH_PRECISION_M = 0.001
@@ -162,13 +162,13 @@ def build(
             scene,
             sensors[0],
             landscape=bool(found.rasters),
-            city=_has_city(scenario),
+            buildings=found.named(BUILDING),
             narrow=alone and not scenario.sensor.model_fields_set,
         )
         if placing.grid:
             sensors = [replace(sensors[0], sensor=Sensor.grid(**placing.grid))]
     poses = SEED_POSES if placing is None else placing.poses
-    survey_of = partial(_survey, scenario, sensors, track or poses, scene.origin, epsg)
+    survey_of = partial(_survey, scenario, found, sensors, track or poses, scene.origin, epsg)
     actors = _actors(shapes, standing, track)
     vehicles: list[tuple[Actor, VehicleSection]] = []
     if scenario.traffic is not None:
@@ -182,7 +182,7 @@ def build(
     with mistakes.noted():
         with prefixed(scenario.source):
             classes = [entry.semantic_class for _, entry in vehicles]
-            survey = survey_of(_materials(scenario, scene, classes), columns)
+            survey = survey_of(_materials(scenario, found, scene, classes), columns)
         MaterialTable.of(survey.materials, scene.surface_kinds, voxels=scene.has_voxels)
     with mistakes.noted(), prefixed(scenario.source):
         planning = _planning(scenario, scene) if plans else None
@@ -326,95 +326,107 @@ def _vehicles(
     return made
 
 
-def _materials(scenario: Scenario, scene: Scene, vehicles: Sequence[int | None]) -> list[Material]:
-    """Materials by name, with the classes of actors and copies, and of city objects.
+def _materials(
+    scenario: Scenario, findings: Findings, scene: Scene, vehicles: Sequence[int | None]
+) -> list[Material]:
+    """Return materials by name, with the classes of actors, of copies and of objects of files.
 
     `vehicles` are the classes of the last actors of the scene.
     """
-    every, made, kinds = Material("*"), [*scenario.materials], scene.surface_kinds
-    own: list[tuple[str, list[str], int]] = []  # an object, names of all, their class
+    default = Material("*")
+    materials = [*scenario.materials]
+    kinds = scene.surface_kinds
+    classed: list[tuple[str, list[str], int]] = []  # an object, patterns of its names, its class
     for entry in scenario.placed:
         if entry.semantic_class is None:
             continue
-        named = {entry.name: [escape(entry.name)]}
+        patterns = {entry.name: [escape(entry.name)]}
         numbered = f"{escape(entry.name)}.[0-9]*"
         if isinstance(entry, CopiesSection) and len(rows_named(numbered, scene.names)):
-            named[entry.name].append(numbered)
+            patterns[entry.name].append(numbered)
         elif isinstance(entry, ActorSection) and entry.robot:
             links = [a.name for a in scene.actors if a.name.startswith(f"{entry.name}/")]
-            named = {link: [escape(link)] for link in links}
-        own += [(name, names, entry.semantic_class) for name, names in named.items()]
-    if own and not made:
-        made = [every]
-    for name, names, semantic_class in own:
-        # Before those that are for it: an earlier one, for a single copy, counts there.
+            patterns = {link: [escape(link)] for link in links}
+        classed += [(name, names, entry.semantic_class) for name, names in patterns.items()]
+    if classed and not materials:
+        materials = [default]
+    for name, names, semantic_class in classed:
+        # Before the materials of the object: an earlier material, of a single copy, counts there.
         objects = np.concatenate([rows_named(pattern, kinds.names) for pattern in names])
         of_objects = {kinds.material[kind] for kind in kinds.of_rows(objects).tolist()}
-        before = made
-        made = []
-        for material in before:
+        unclassed = materials
+        materials = []
+        for material in unclassed:
             if material.named(name, of_objects):
-                made.append(replace(material, objects=names, semantic_class=semantic_class))
-            made.append(material)
-        if not any(one.material is None and one.named(name) for one in before):
-            made.append(replace(every, objects=names, semantic_class=semantic_class))
+                with_class_of_object = replace(
+                    material, objects=names, semantic_class=semantic_class
+                )
+                materials.append(with_class_of_object)
+            materials.append(material)
+        if not any(material.material is None and material.named(name) for material in unclassed):
+            materials.append(replace(default, objects=names, semantic_class=semantic_class))
     first = len(scene.all_names) - len(vehicles)
-    for semantic_class in sorted({one for one in vehicles if one is not None}):
-        rows = np.array([first + k for k, one in enumerate(vehicles) if one == semantic_class])
-        made = with_class(made or [every], semantic_class, rows, kinds)
-    if _has_city(scenario):
-        made = with_classes(made or [every], CITY_CLASSES, kinds)
-    return made
-
-
-def _has_city(scenario: Scenario) -> bool:
-    return any(entry.file.lower().endswith(CITYJSON) for entry in scenario.scene.files)
+    for semantic_class in sorted({number for number in vehicles if number is not None}):
+        rows = np.array(
+            [first + k for k, number in enumerate(vehicles) if number == semantic_class]
+        )
+        materials = with_class(materials or [default], semantic_class, rows, kinds)
+    if findings.classes:
+        class_patterns = {number: findings.named(number) for number in findings.class_names}
+        materials = with_classes(materials or [default], class_patterns, kinds)
+    return materials
 
 
 def _survey(
-    given: Scenario,
+    scenario: Scenario,
+    findings: Findings,
     carried: Sequence[Mounted],
-    way: Track | Sequence[Pose],
+    carrier: Track | Sequence[Pose],
     origin: Floats,
     epsg: int | None,
     materials: Sequence[Material],
     columns: Sequence[str] = (),
 ) -> Survey:
     """Build the survey along a track, or at poses if the scenario gives none; local coordinates."""
-    needs, cloud = given.output.needs, declared(given.cloud, CloudOptions)
-    cloud["columns"] = (*given.cloud.columns, *needs, *columns)
-    cloud["epsg"] = given.cloud.epsg or epsg
-    if given.scene.has_seed:
+    needs = scenario.output.needs
+    cloud = declared(scenario.cloud, CloudOptions)
+    cloud["columns"] = (*scenario.cloud.columns, *needs, *columns)
+    cloud["epsg"] = scenario.cloud.epsg or epsg
+    if scenario.scene.has_seed:
         cloud["keep_every"] = cloud["keep_every"] or (1 if "ray" in needs else SEED_KEPT)
-    elif not any(one.sensor.optics.resolution_m for one in carried):
+    elif not any(mounted.sensor.optics.resolution_m for mounted in carried):
         cloud["precision_m"] = cloud["precision_m"] or MESH_PRECISION_M
     check_whole((*needs, *columns), cloud["keep_every"] or 1)
-    track = way if isinstance(way, Track) else None
-    poses = () if isinstance(way, Track) else given.poses or way
-    # City objects have classes by their types; a number or name of the scenario's is its own.
-    placed = (*given.placed, *(given.traffic.vehicles if given.traffic else ()))
-    own = {one.semantic_class for one in (*given.materials, *placed)}
-    asked = given.classes or "class" in cloud["columns"]
-    made = {one.semantic_class for one in materials} - own if asked else ()
-    named = {CITY_NAMES[number]: number for number in made if number in CITY_NAMES}
-    named |= {name: number for number, name in given.classes.items()}
-    own_noise = all(one.noise is not None for one in carried)
-    alone = not given.sensors and given.mount is None and carried[0].noise is None
+    track = carrier if isinstance(carrier, Track) else None
+    poses = () if isinstance(carrier, Track) else scenario.poses or carrier
+    # Files give classes to objects; a number or name in the scenario has the scenario's meaning.
+    placed = (*scenario.placed, *(scenario.traffic.vehicles if scenario.traffic else ()))
+    of_scenario = {entry.semantic_class for entry in (*scenario.materials, *placed)}
+    has_classes = scenario.classes or "class" in cloud["columns"]
+    of_files = {material.semantic_class for material in materials} - of_scenario
+    numbers: dict[str, int] = {}  # {name of a class: number}
+    if has_classes:
+        numbers = {
+            name: number for number, name in findings.class_names.items() if number in of_files
+        }
+    numbers |= {name: number for number, name in scenario.classes.items()}
+    own_noise = all(mounted.noise is not None for mounted in carried)
+    alone = not scenario.sensors and scenario.mount is None and carried[0].noise is None
     survey = Survey(
         poses=[replace(p, position=tuple(np.subtract(p.position, origin))) for p in poses],
         trajectory=track,
         **({"sensor": carried[0].sensor} if alone else {"sensors": carried}),
-        steps=given.steps,
+        steps=scenario.steps,
         materials=materials,
-        classes={number: name for name, number in named.items()},
-        returns=Returns(**dict(given.returns)),
-        noise=Noise() if own_noise else Noise(**dict(given.noise)),
-        navigation=given.navigation,
-        faults=given.faults,
-        **declared(given.weather, Weather),
+        classes={number: name for name, number in numbers.items()},
+        returns=Returns(**dict(scenario.returns)),
+        noise=Noise() if own_noise else Noise(**dict(scenario.noise)),
+        navigation=scenario.navigation,
+        faults=scenario.faults,
+        **declared(scenario.weather, Weather),
         **cloud,
     )
-    return with_laser_scans(survey, [one.format for one in given.output.write])
+    return with_laser_scans(survey, [entry.format for entry in scenario.output.write])
 
 
 def _planning(scenario: Scenario, scene: Scene) -> Planning | None:

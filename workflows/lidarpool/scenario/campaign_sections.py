@@ -43,13 +43,13 @@ from lidarsim.base.declared import (
     one_of,
     short,
 )
-from lidarsim.base.errors import LidarError, Mistakes
+from lidarsim.base.errors import LidarError, Mistakes, message_of
+from lidarsim.base.input_files import read_input_text
 from lidarsim.base.tables import ignored_columns
 from lidarsim.base.textfile import read_text
 from lidarsim.base.validation import checked_fields, sections_in, sentences
 from lidarsim.base.words import did_you_mean, printable
-from lidarsim.base.yamlfile import load_yaml
-from lidarsim.sensor.calibrations import said
+from lidarsim.base.yamlfile import load_yaml, read_yaml
 
 from ..datasets.job_table import Value
 from ..export.format_table import DATA_SETS, LAYOUTS
@@ -59,6 +59,8 @@ from .sections import IgnoredColumns, Section, may_be_empty
 SIGMAS = 6.0  # normal numbers are drawn again beyond, one of 500 million
 SHARE_LEAST = 0.01  # of a normal distribution that lies within limits
 
+_CAMPAIGN_SUFFIXES = (".yaml", ".yml")
+_KEYS = re.compile(r"""^(?:["']?(?:base|vary)["']?\s*:|\{)""", re.MULTILINE)  # or one mapping {…}
 _EXACT = Context(prec=40)
 _DIGITS = 12  # that numbers are rounded to, so that tables are readable and hold the exact number
 
@@ -532,7 +534,7 @@ def read_rows(path: Path, kind: Any, ignore: Sequence[str] = ()) -> list[Any]:
     except FileNotFoundError as error:
         raise LidarError(f"{path} does not exist: check the name and the folder.") from error
     except (OSError, ValueError, csv.Error, LidarError) as error:
-        raise LidarError(f"{path} is not a usable table: {said(error)}") from error
+        raise LidarError(f"{path} is not a usable table: {message_of(error)}") from error
     adapter = TypeAdapter(entry)
     mistakes, rows = Mistakes(), []
     for line, row in cells:
@@ -619,3 +621,16 @@ def _entries(kind: Any) -> Iterator[Any]:
     else:
         for inner in args:
             yield from _entries(inner)
+
+
+def is_campaign(path: str | Path) -> bool:
+    """Return whether a file describes a campaign: YAML with the key `base` or `vary`."""
+    path = Path(path)
+    if path.suffix.lower() not in _CAMPAIGN_SUFFIXES:
+        return False
+    try:
+        if not _KEYS.search(read_input_text(path)):
+            return False  # without reading all poses of a scenario as YAML
+        return bool({"base", "vary"} & read_yaml(path).keys())
+    except (OSError, ValueError, LidarError):
+        return False  # the reader of scenarios says what is wrong

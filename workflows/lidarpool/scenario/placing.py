@@ -12,7 +12,6 @@ from numpy.typing import ArrayLike
 
 from lidarsim.base.arrays import Floats
 from lidarsim.base.words import plural
-from lidarsim.scene.files.cityjson import BUILDING, CLASSES
 from lidarsim.scene.floor import heights_at, reaching, room_at
 from lidarsim.scene.scene import Scene
 from lidarsim.scene.simplified import Drawn
@@ -56,7 +55,7 @@ def place(
     carried: Mounted,
     *,
     landscape: bool = False,
-    city: bool = False,
+    buildings: Sequence[str] = (),
     narrow: bool = False,
 ) -> Placing:
     """Choose poses in a scene from mesh files; a landscape is not taken for an object.
@@ -64,8 +63,8 @@ def place(
     In a room or a landscape they are in the middle, or beside what stands there, such as a tree; 1,
     2 and 3 m above the floor or ground, or at a quarter, half and three quarters of the height of
     a lower room. Around an object they are on four sides and above it; a grid to `narrow` is
-    narrowed to it. The buildings of a `city` are not entered: poses are on ground beside them, or
-    around all of them.
+    narrowed to it. Objects whose names fit a pattern of `buildings` are not entered: poses are on
+    ground beside the buildings, or around all of them.
     """
     low, high = scene.bounds + scene.origin
     middle = (low + high) / 2
@@ -74,14 +73,14 @@ def place(
         ground = drawn.vertices[drawn.faces].mean(axis=1) + drawn.origin
         middle = ground[np.argmin(np.hypot(*(ground - middle)[:, :2].T))]
     standing, looker = _standing(drawn, middle), None if landscape else _looker(drawn)
-    if city and len(heights_at(_buildings(drawn), middle[0], middle[1])):
-        standing = _aside(drawn, middle, outdoors=True)
+    if buildings and len(heights_at(_named(drawn, buildings), middle[0], middle[1])):
+        standing = _aside(drawn, middle, buildings)
         is_object = not standing
     else:
         is_object = looker is not None and looker.is_object(looker.views(_local(standing, scene)))
     if not is_object:
         if in_the_way(drawn, _local(standing, scene)):
-            standing = _aside(drawn, middle, outdoors=city) or standing
+            standing = _aside(drawn, middle, buildings) or standing
         return Placing(standing, _inside(looker, _local(standing, scene), scene, carried))
     poses = poses_around(scene, carried)
     far = np.linalg.norm(poses[-1].position - (low + high) / 2)
@@ -133,24 +132,25 @@ def _standing(scene: Scene, at: Floats) -> tuple[Pose, ...]:
     return tuple(Pose((x, y, float(floor + height))) for height in heights)
 
 
-def _buildings(scene: Scene) -> Scene:
-    """Return the triangles of a city's buildings."""
-    rows = [rows_named(pattern, scene.names) for pattern in CLASSES[BUILDING]]
-    own = np.isin(scene.face_object, np.concatenate(rows))
-    return replace(scene, faces=scene.faces[own], face_object=scene.face_object[own])
+def _named(scene: Scene, patterns: Sequence[str]) -> Scene:
+    """Return the triangles of the objects whose names fit one of some patterns."""
+    objects = np.concatenate([rows_named(pattern, scene.names) for pattern in patterns])
+    selected = np.isin(scene.face_object, objects)
+    return replace(scene, faces=scene.faces[selected], face_object=scene.face_object[selected])
 
 
-def _aside(scene: Scene, middle: Floats, *, outdoors: bool = False) -> tuple[Pose, ...]:
-    """Poses beside the middle (3,) of a scene where nothing is in the way; none if there are none.
+def _aside(scene: Scene, middle: Floats, buildings: Sequence[str] = ()) -> tuple[Pose, ...]:
+    """Return free poses beside the middle (3,) of a scene, world coordinates; perhaps none.
 
-    World coordinates. Those `outdoors` are on something, and neither in a building nor on one.
+    In a scene with `buildings`, patterns of names, poses are outdoors: above some surface, and
+    neither in a building nor on a building.
     """
     half = np.ptp(scene.bounds, axis=0) / 2
     reach = np.minimum(half, [max(_ASIDE_M) + 1.0] * 2 + [np.inf])
     local = middle - scene.origin
     near = reaching(scene, local - reach, local + reach)
     around = replace(scene, faces=scene.faces[near], face_object=scene.face_object[near])
-    built = _buildings(around) if outdoors else None
+    built = _named(around, buildings) if buildings else None
     for far in _ASIDE_M:
         for angle in np.arange(8) * np.pi / 4:
             step = far * np.array([np.cos(angle), np.sin(angle), 0.0])

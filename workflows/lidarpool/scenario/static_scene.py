@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -10,13 +10,13 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from lidarsim.base.arrays import Floats
-from lidarsim.base.errors import LidarError, Mistakes, prefixed
+from lidarsim.base.errors import LidarError, Mistakes, message_of, prefixed
 from lidarsim.base.tables import NUMBERS, Quantity, read_table
 from lidarsim.base.textfile import read_text
 from lidarsim.base.words import plural
 from lidarsim.scene.actors import Actor, box, one_mesh
 from lidarsim.scene.files.meshfile import ROBOTS, Objects, load_objects
-from lidarsim.scene.files.scene_graph import Raster
+from lidarsim.scene.files.scene_graph import ObjectClass, Raster
 from lidarsim.scene.files.urdf import load_robot
 from lidarsim.scene.object_names import told_apart
 from lidarsim.scene.robot import Robot
@@ -26,7 +26,6 @@ from lidarsim.scene.scene_mesh import SceneMesh
 from lidarsim.scene.shapes import seed_objects
 from lidarsim.scene.transform import Transform, affine
 from lidarsim.scene.wheels import rolling
-from lidarsim.sensor.calibrations import said
 from lidarsim.sensor.pose_columns import ANGLES, POSITION, REFUSED_COLUMNS, angles_of, with_yaw
 from lidarsim.sensor.trajectory import rotations_of
 
@@ -56,10 +55,30 @@ class Findings:
     remarks: list[str] = field(default_factory=list)  # about axes of files
     sources: dict[str, str] = field(default_factory=dict)  # {file: what it gave}
     rasters: list[tuple[MeshFile, Raster]] = field(default_factory=list)
+    # {file of the scene: {number: class}} of files whose format gives classes to objects
+    classes: dict[str, Mapping[int, ObjectClass]] = field(default_factory=dict)
 
     def copy(self) -> Findings:
         """Return the same, to be added to."""
         return Findings(*(found.copy() for found in vars(self).values()))
+
+    def named(self, number: int) -> tuple[str, ...]:
+        """Return the patterns of the names of objects that files give a class by its number."""
+        patterns = dict.fromkeys(
+            pattern
+            for classes in self.classes.values()
+            if number in classes
+            for pattern in classes[number].patterns
+        )
+        return tuple(patterns)
+
+    @property
+    def class_names(self) -> dict[int, str]:
+        """Names of the classes that files give to objects, by their numbers in ascending order."""
+        names = {
+            number: one.name for classes in self.classes.values() for number, one in classes.items()
+        }
+        return dict(sorted(names.items()))
 
 
 class StaticScene(NamedTuple):
@@ -112,9 +131,11 @@ def read_static_scene(scenario: Scenario) -> StaticScene:
     mistakes = Mistakes()
     for entry in section.files:
         with mistakes.noted():
-            read = shapes.read(entry)
-            meshes += read.standing
-            moving += read.moving
+            objects = shapes.read(entry)
+            meshes += objects.standing
+            moving += objects.moving
+            if objects.classes:
+                found.classes[entry.file] = objects.classes
     mistakes.tell()
     meshes = told_apart(meshes, section.same_names, found.notes.append)
     if section.copies:
@@ -318,7 +339,7 @@ def _of_table(path: Path, table: CopyTable) -> tuple[Floats, Floats, Floats]:
         if "scale" in columns and any(name in columns for name in _SCALES):
             raise ValueError("it has both scale and scales of axes: ignore one")
     except (OSError, ValueError, LidarError) as error:
-        raise LidarError(f"{path} is not a usable table of copies: {said(error)}") from error
+        raise LidarError(f"{path} is not a usable table of copies: {message_of(error)}") from error
     count = len(columns["x"])
     if count > COPIES_MOST:
         raise LidarError(f"{path} has {count:,} rows; at most {COPIES_MOST:,} are allowed.")

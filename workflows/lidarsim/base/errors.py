@@ -16,6 +16,20 @@ class LidarError(Exception):
     """
 
 
+def message_of(error: Exception) -> str:
+    """Return the message of an error as a sentence in one line.
+
+    Examples
+    --------
+    >>> message_of(KeyError("lasers"))
+    "'lasers' is missing."
+    """
+    message = f"{error} is missing" if isinstance(error, KeyError) else str(error)
+    if isinstance(error, OSError) and error.strerror:
+        message = error.strerror
+    return " ".join(message.split()).rstrip(".") + "."
+
+
 @contextmanager
 def explained(what: str, advice: str = "") -> Iterator[None]:
     """Turn an OSError of the body into a LidarError: what failed, why, and what to do."""

@@ -14,14 +14,13 @@ from numpy.typing import ArrayLike
 
 from ..base.arrays import Floats
 from ..base.elementary import interp, sin_cos
-from ..base.errors import LidarError
+from ..base.errors import LidarError, message_of
 from ..base.tables import METRES, RADIANS, Quantity, read_table
 from ..base.textfile import read_text
 from ..base.validation import as_array, checked
 from ..base.vectors import applied, matmul
 from ..base.words import did_you_mean, plural
 from ..sensor import Pose, Stations, Trajectory
-from ..sensor.calibrations import said
 from ..sensor.pose_columns import TIME
 from ..sensor.trajectory import full_poses, presence_ns, velocities
 from .actors import AT_ZERO, Actor, one_mesh
@@ -309,7 +308,9 @@ class Robot:
                 unused=[joint.name for joint in self.joints.values() if not joint.moves],
             )
         except (OSError, ValueError, LidarError) as error:
-            raise LidarError(f"{path} is not a usable table of joints: {said(error)}") from error
+            raise LidarError(
+                f"{path} is not a usable table of joints: {message_of(error)}"
+            ) from error
         if len(table) < 2:
             raise LidarError(
                 f"{path} has values of no joint that moves: name its columns as the joints of "

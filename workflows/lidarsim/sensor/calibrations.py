@@ -14,7 +14,7 @@ import yaml
 
 from ..base.arrays import Floats
 from ..base.elementary import sin_cos
-from ..base.errors import LidarError
+from ..base.errors import LidarError, message_of
 from ..base.textfile import read_text
 from ..base.yamlfile import load_yaml
 from .beams import Beams
@@ -63,14 +63,7 @@ def read_calibration(path: Path) -> Calibration:
             return _ouster(path.name, json.loads(text))
         return _table(path.name, text)
     except UNUSABLE as error:
-        raise LidarError(f"{path} is not a usable calibration: {said(error)}") from error
-
-
-def said(error: Exception) -> str:
-    """Return the message of an error in one line."""
-    words = f"{error} is missing" if isinstance(error, KeyError) else str(error)
-    words = (error.strerror if isinstance(error, OSError) else None) or words
-    return " ".join(words.split()).rstrip(".") + "."
+        raise LidarError(f"{path} is not a usable calibration: {message_of(error)}") from error
 
 
 def _velodyne(name: str, data: Any) -> Calibration:

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from math import inf
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from pydantic import Field
@@ -14,9 +15,7 @@ from ..base.declared import AngleDeg, Ends, Several, Text, Two, UnitShare, about
 from ..base.errors import LidarError, prefixed
 from ..base.validation import checked_fields, without_numpy
 from ..base.words import did_you_mean
-
-if TYPE_CHECKING:
-    from .survey import ScanSpec, Survey
+from .sensor import Sensor
 
 FaultKind = Literal["dirt", "dead_channels", "dropped_packets", "frozen", "time_jump"]
 Time = Annotated[float, Field(ge=0, le=1e9)]  # seconds since the survey's start
@@ -75,64 +74,47 @@ class Fault:
 
     @property
     def span_ns(self) -> tuple[float, float]:
-        """When it begins and ends, nanoseconds since the survey's start."""
+        """Start and end of the fault, nanoseconds since the survey's start."""
         return self.from_s * 1e9, inf if self.to_s is None else self.to_s * 1e9
 
     def during(self, begins_ns: Floats | Ints, ends_ns: Floats | Ints | None = None) -> Bools:
-        """Whether it is there at times (n,), or between them and others."""
+        """Return whether the fault acts at times (n,), or in intervals to `ends_ns` (n,)."""
         ends_ns = begins_ns if ends_ns is None else ends_ns
         begin, end = self.span_ns
         return np.asarray((ends_ns >= begin) & (begins_ns < end))
 
     def jumps_ns(self, times_ns: Floats | Ints) -> Ints:
-        """By how much it shifts stamps at times (n,), nanoseconds."""
+        """Return the shift of stamps at times (n,), nanoseconds."""
         return self.during(times_ns) * np.int64(round((self.by_s or 0) * 1e9))
 
 
-def faults_of(survey: Survey, number: int, *kinds: FaultKind) -> dict[int, Fault]:
-    """Faults of some kinds that a sensor has, by their places in the survey's list."""
-    name, every = survey.carried[number].name, enumerate(survey.faults)
-    return {place: one for place, one in every if one.kind in kinds and one.sensor in (None, name)}
+def check_faults(
+    faults: Sequence[Fault], sensors: Mapping[str, Sensor], duration_ns: float
+) -> None:
+    """Check that faults fit the sensors and the duration of a survey; LidarError if not.
 
-
-def check_faults(survey: Survey) -> None:
-    """Check that faults fit sensors and times of a survey; LidarError if not."""
-    names, lasts_s = [carried.name for carried in survey.carried], survey.duration_ns / 1e9
-    for place, fault in enumerate(survey.faults):
-        with prefixed(f"faults[{place}]"):
-            lidars = [one.sensor for one in survey.carried if fault.sensor in (None, one.name)]
-            if not lidars:
-                known = f" There are {', '.join(names)}." if any(names) else " Leave it out."
-                hint = did_you_mean(str(fault.sensor), names) or known
-                raise LidarError(f"there is no sensor {fault.sensor!r}.{hint}")
-            first_s = max(one.begins_ns(np.zeros(1, np.int64))[0] + one.lead_ns for one in lidars)
-            if fault.kind == "frozen" and fault.from_s <= first_s / 1e9:
-                raise LidarError("a frozen sensor repeats a sweep: give a later from_s.")
-            if fault.from_s > lasts_s:
-                told = f"from_s is {fault.from_s:g}, and the survey lasts {lasts_s:.6g} s"
-                raise LidarError(f"{told}: make from_s smaller.")
-            least, last = min(one.channels for one in lidars), max(fault.channels or (0,))
-            if last >= least:
-                raise LidarError(f"there is no channel {last}, but 0 to {least - 1}.")
-
-
-def sent(survey: Survey, index: int) -> ScanSpec:
-    """Describe what a sensor sends as a scan: the scan itself, or if it is frozen, an older one.
-
-    A sweep that begins while it is frozen repeats the last that began before. Which that is follows
-    from times alone, so it does not matter which scans are cast where.
+    `sensors` are by their names.
     """
-    spec = survey.scan(index)
-    frozen = faults_of(survey, spec.sensor, "frozen").values()
-    if not frozen:
-        return spec
-    firsts, begins, _ = survey.sweeps_each[spec.sensor]
-    own = source = int(np.searchsorted(firsts, index, "right")) - 1
-    while now := [fault for fault in frozen if fault.during(begins[source])]:
-        source = int(np.searchsorted(begins, now[0].from_s * 1e9)) - 1
-    if source == own:
-        return spec
-    # The last sweep at a pose may have fewer scans: then the others are lost, see `LossStep`.
-    older = min(int(firsts[source] + index - firsts[own]), int(firsts[source + 1]) - 1)
-    repeats = int(firsts[source]), int(firsts[own])
-    return replace(survey.scan(older), scan=index, ahead=older - index, repeats=repeats)
+    duration_s = duration_ns / 1e9
+    for number, fault in enumerate(faults):
+        with prefixed(f"faults[{number}]"):
+            faulty = [sensor for name, sensor in sensors.items() if fault.sensor in (None, name)]
+            if not faulty:
+                known = " Leave it out."
+                if any(sensors):
+                    known = f" There are {', '.join(sensors)}."
+                hint = did_you_mean(str(fault.sensor), sensors) or known
+                raise LidarError(f"there is no sensor {fault.sensor!r}.{hint}")
+            first_firing = np.zeros(1, np.int64)
+            starts_ns = [sensor.begins_ns(first_firing)[0] + sensor.lead_ns for sensor in faulty]
+            if fault.kind == "frozen" and fault.from_s <= max(starts_ns) / 1e9:
+                raise LidarError("a frozen sensor repeats a sweep: give a later from_s.")
+            if fault.from_s > duration_s:
+                raise LidarError(
+                    f"from_s is {fault.from_s:g}, and the survey lasts {duration_s:.6g} s: make "
+                    "from_s smaller."
+                )
+            channels = min(sensor.channels for sensor in faulty)
+            highest = max(fault.channels or (0,))
+            if highest >= channels:
+                raise LidarError(f"there is no channel {highest}, but 0 to {channels - 1}.")

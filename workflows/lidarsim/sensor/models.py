@@ -18,13 +18,13 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, model_valida
 from ..base.arrays import Floats
 from ..base.declared import UnitShare
 from ..base.elementary import log1p
-from ..base.errors import LidarError
+from ..base.errors import LidarError, message_of
 from ..base.input_files import read_input_text
 from ..base.validation import checked, sentences
 from ..base.words import did_you_mean
 from ..base.yamlfile import load_yaml
 from .beams import Beams, Duty, Mirror, MirrorMotion, Rate, Spin, Step, Width
-from .calibrations import UNUSABLE, Calibration, read_calibration, said
+from .calibrations import UNUSABLE, Calibration, read_calibration
 from .noise import TARGET_REFLECTANCE, THRESHOLD_SIGMAS, Noise
 from .optics import LIGHT_M_NS, Mode, Optics, Returns
 from .ray_sensors import ListedSensor, Prism, PrismSensor, TurningMirror
@@ -310,7 +310,7 @@ def _read(path: Path | Traversable) -> SensorModel:
         with sentences(SensorModel, path):
             return SensorModel.model_validate(load_yaml(text))
     except UNUSABLE as error:
-        raise LidarError(f"{path} is not a usable model: {said(error)}") from error
+        raise LidarError(f"{path} is not a usable model: {message_of(error)}") from error
 
 
 class Datasheet(NamedTuple):

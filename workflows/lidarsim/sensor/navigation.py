@@ -17,7 +17,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from importlib.util import find_spec
 from itertools import accumulate
-from typing import TYPE_CHECKING, Annotated, NamedTuple
+from typing import Annotated, NamedTuple, Protocol
 
 import numpy as np
 from pydantic import Field, Strict
@@ -31,9 +31,6 @@ from ..base.validation import checked_fields
 from ..base.vectors import applied, hypot, into_axes, length, matmul, turned
 from .noise import Purpose, named_seed, normal
 from .trajectory import AT_CENTRE, CENTRE, Pose, Trajectory, full_poses, velocities
-
-if TYPE_CHECKING:
-    from .survey import Survey
 
 BLOCK = 1 << 14  # samples that are made at a time
 RETURNS_IN_S = 1.0  # after an outage, 37 % of its error are left
@@ -185,6 +182,26 @@ class Fixes(NamedTuple):
     positions: Floats  # (k, 3): metres, the scene's local coordinates
 
 
+class InstrumentedDrive(Protocol):
+    """The properties of a survey that the samples of instruments follow from."""
+
+    @property
+    def navigation(self) -> Navigation | None:
+        """Instruments on the carrier, if any."""
+
+    @property
+    def path(self) -> Trajectory:
+        """Trajectory of the carrier."""
+
+    @property
+    def duration_ns(self) -> float:
+        """Duration in nanoseconds."""
+
+    @property
+    def carrier(self) -> str:
+        """Name of the carrier, for the seeds of its instruments."""
+
+
 def check_navigation(navigation: Navigation, path: Trajectory, epsg: int | None) -> None:
     """Check that instruments can be on a carrier, in a coordinate system; LidarError if not."""
     if path.stations > 1:
@@ -200,19 +217,22 @@ def check_navigation(navigation: Navigation, path: Trajectory, epsg: int | None)
         )
 
 
-def imu_samples(survey: Survey, block: int = BLOCK) -> Iterator[ImuSamples]:
-    """Yield the samples of a survey's IMU, so many at a time; how many changes nothing.
+def imu_samples(drive: InstrumentedDrive, block: int = BLOCK) -> Iterator[ImuSamples]:
+    """Yield the samples of the IMU on a drive, `block` samples at a time.
 
-    A sample ends at each whole multiple of its interval within the survey.
+    A sample ends at each whole multiple of its interval within the drive. Samples do not depend on
+    `block`.
     """
-    navigation, path = survey.navigation, survey.path
+    navigation = drive.navigation
+    path = drive.path
     if navigation is None or navigation.imu is None:
         return
-    imu, seed = navigation.imu, named_seed(navigation.seed, survey.carrier)
+    imu = navigation.imu
+    seed = named_seed(navigation.seed, drive.carrier)
     gyroscope, turn_skew = _of_axes(imu, "gyroscope", seed)
     accelerometer, speed_skew = _of_axes(imu, "accelerometer", seed)
     gravity = np.array([0.0, 0.0, -navigation.gravity_m_s2])
-    count = math.floor(survey.duration_ns * imu.rate_hz / 1e9 + 1e-6)
+    count = math.floor(drive.duration_ns * imu.rate_hz / 1e9 + 1e-6)
     for first in range(0, count, block):
         samples = np.arange(first, min(first + block, count))
         ends: Floats = np.append(samples, samples[-1] + 1) * 1e9 / imu.rate_hz
@@ -241,21 +261,22 @@ def _of_axes(imu: Imu, name: str, seed: int) -> tuple[_Errors, Floats | None]:
     return errors, np.eye(3) + sigma * drawn
 
 
-def fixes(survey: Survey, block: int = BLOCK) -> Iterator[Fixes]:
-    """Yield the positions of a survey's GNSS receiver, so many at a time, from its start on."""
-    navigation, path = survey.navigation, survey.path
+def fixes(drive: InstrumentedDrive, block: int = BLOCK) -> Iterator[Fixes]:
+    """Yield the positions of the GNSS receiver on a drive, `block` positions at a time."""
+    navigation = drive.navigation
+    path = drive.path
     if navigation is None or navigation.gnss is None:
         return
     gnss = navigation.gnss
     errors = _Errors(
-        named_seed(named_seed(navigation.seed, survey.carrier), "gnss"),
+        named_seed(named_seed(navigation.seed, drive.carrier), "gnss"),
         1 / gnss.rate_hz,
         np.array([gnss.horizontal_m, gnss.horizontal_m, gnss.vertical_m]),
         np.array([gnss.drift_horizontal_m, gnss.drift_horizontal_m, gnss.drift_vertical_m]),
         gnss.drift_time_s,
         np.zeros(3),
     )
-    count = math.floor(survey.duration_ns * gnss.rate_hz / 1e9 + 1e-6) + 1
+    count = math.floor(drive.duration_ns * gnss.rate_hz / 1e9 + 1e-6) + 1
     for first in range(0, count, block):
         samples = np.arange(first, min(first + block, count))
         times = np.asarray(samples * 1e9 / gnss.rate_hz, np.float64)

@@ -19,7 +19,7 @@ from ..base.declared import FILLED_IN, Several, about, written_as
 from ..base.errors import LidarError
 from ..base.validation import checked_fields, shown
 from ..columns.table import COORDINATES, OPTIONAL, TABLE, Column, chosen, stored, waveform_column
-from .faults import Fault, check_faults
+from .faults import Fault, FaultKind, check_faults
 from .materials import ClassNames, Material
 from .navigation import Navigation, check_navigation
 from .noise import ALARMS_MOST, Noise
@@ -271,7 +271,8 @@ class Survey(CloudOptions, Weather):
             self._set(steps=STEPS)
         for carried, steps in zip(self.carried, self.steps_each, strict=True):
             self._check_duration(carried.sensor, steps)
-        check_faults(self)
+        sensors = {carried.name: carried.sensor for carried in self.carried}
+        check_faults(self.faults, sensors, self.duration_ns)
 
     def _set(self, **fields: Any) -> None:
         for name, value in fields.items():
@@ -521,6 +522,37 @@ class Survey(CloudOptions, Weather):
         lidar = self.carried[sensor].sensor
         start = station * self.station_ns
         return ScanSpec(index, station, lidar.firings(step), start, sensor, lidar.channels)
+
+    def faults_of(self, sensor: int, *kinds: FaultKind) -> dict[int, Fault]:
+        """Return the faults of some kinds of a sensor, by their indices in `faults`."""
+        name = self.carried[sensor].name
+        return {
+            index: fault
+            for index, fault in enumerate(self.faults)
+            if fault.kind in kinds and fault.sensor in (None, name)
+        }
+
+    def sent_scan(self, index: int) -> ScanSpec:
+        """Describe the scan that a sensor sends as scan `index`: an older scan of a frozen sensor.
+
+        A sweep that begins while the sensor is frozen repeats the last sweep that began before.
+        The older scan follows from times alone, wherever scans are cast.
+        """
+        spec = self.scan(index)
+        frozen = self.faults_of(spec.sensor, "frozen").values()
+        if not frozen:
+            return spec
+        firsts, begins, _ = self.sweeps_each[spec.sensor]
+        sweep = int(np.searchsorted(firsts, index, "right")) - 1
+        source = sweep
+        while active := [fault for fault in frozen if fault.during(begins[source])]:
+            source = int(np.searchsorted(begins, active[0].from_s * 1e9)) - 1
+        if source == sweep:
+            return spec
+        # The last sweep at a pose may have fewer scans: then the others are lost, see `LossStep`.
+        older = min(int(firsts[source] + index - firsts[sweep]), int(firsts[source + 1]) - 1)
+        repeats = int(firsts[source]), int(firsts[sweep])
+        return replace(self.scan(older), scan=index, ahead=older - index, repeats=repeats)
 
     def scans(self) -> Iterator[ScanSpec]:
         """All scans in order."""

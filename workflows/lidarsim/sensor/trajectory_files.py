@@ -11,14 +11,13 @@ import numpy as np
 from pydantic import Field
 
 from ..base.arrays import Floats
-from ..base.errors import LidarError
+from ..base.errors import LidarError, message_of
 from ..base.tables import column_name, find_header, read_table
 from ..base.textfile import read_text
 from ..base.validation import checked
 from ..base.vectors import turned
 from ..columns.bags import is_bag
 from .bag_trajectories import read_bag
-from .calibrations import said
 from .oxts import OXTS_TIMES, WIDTH, find_oxts, oxts_files, oxts_poses, read_oxts
 from .pose_columns import (
     ANGLES,
@@ -137,7 +136,7 @@ def load_trajectory(
         return track
     except (OSError, ValueError, LidarError) as error:
         more = _HELIOS if path.suffix.lower() == ".trj" else ""
-        raise LidarError(f"{path} is not a usable trajectory: {said(error)}{more}") from error
+        raise LidarError(f"{path} is not a usable trajectory: {message_of(error)}{more}") from error
 
 
 def files_of_trajectory(path: Path) -> list[Path]:
@@ -216,7 +215,7 @@ def _of_text(
     try:
         seconds = _numbers(read_text(Path(times)), 1)[:, 0]
     except ValueError as error:
-        raise ValueError(f"{times} has no times: {said(error)}") from error
+        raise ValueError(f"{times} has no times: {message_of(error)}") from error
     expected = WIDTH if kind == "oxts" else 12
     if width != expected:
         raise ValueError(f"its rows have {width} numbers, not {expected}")

@@ -1,4 +1,4 @@
-"""The memory that casting scans takes on a worker, beside that of its rig: an estimate."""
+"""Estimates of the memory that a rig takes on a worker, and that casting scans takes beside it."""
 
 from __future__ import annotations
 
@@ -7,11 +7,12 @@ from functools import partial
 
 import numpy as np
 
+from ..scene.actors import shapes_of
 from ..scene.scene import Scene
 from ..sensor import Survey
 from .device import needs_hits
 from .pulses import CHUNK_RAYS
-from .rig import rays_repeat
+from .rig import PATTERN_RAYS, rays_repeat
 from .step import Memory, Setup, Sizes
 from .steps import steps_of
 
@@ -37,6 +38,36 @@ COLOUR = 16  # of a ray, where its colour is its reflectance
 PAGE_LOCKED, JOINED = 2, 1
 SCAN, STATION = 500, 6000  # their descriptions, poses and small arrays
 TRIANGLE = 16  # a count of hits, twice
+
+# Bytes of a rig, measured on Linux.
+SCENE_TRIANGLE = 80  # of a triangle, in every process that knows the scene
+# The most that a triangle takes while a caster is built: Embree 300, NumPy 350, CUDA 360.
+CASTER_TRIANGLE = 360
+COLOURED_TRIANGLE = 160  # of a triangle with colours
+IMAGE_BYTE = 4  # of each byte of an image
+INSTANCE = 2000  # of an instance, in every process that knows the scene
+POSED_TRIANGLE = 40  # of a triangle in each pose of an animation, beside its vertices: tree's boxes
+PATTERN_RAY = 48  # of a ray of a revolution, and of the pattern made of it
+
+
+def rig_bytes(scene: Scene, survey: Survey) -> int:
+    """Estimate the memory of a rig, in bytes: scene, tree of the caster, patterns of rays."""
+    triangles = (SCENE_TRIANGLE + CASTER_TRIANGLE) * scene.kept_triangles
+    images = {id(image): image.nbytes for mesh in scene.coloured for image in mesh.images}
+    colours = COLOURED_TRIANGLE * sum(map(len, scene.coloured)) + IMAGE_BYTE * sum(images.values())
+    instances = INSTANCE * len(scene.instances or ())
+    patterns = 0
+    for carried in survey.carried:
+        sensor = carried.sensor
+        rays = (sensor.period or 0) * sensor.channels
+        patterns += PATTERN_RAY * min(rays, PATTERN_RAYS)
+    poses = 0
+    meshes, _ = shapes_of(scene.actors)
+    for mesh in meshes:
+        if mesh.animation is not None:
+            vertices = mesh.animation.vertices
+            poses += vertices.nbytes + POSED_TRIANGLE * len(vertices) * len(mesh.faces)
+    return triangles + colours + instances + patterns + poses
 
 
 def cast_bytes(scene: Scene, survey: Survey, scans: int = 1, *, on_device: bool = False) -> int:

@@ -18,7 +18,6 @@ from ..columns.waveforms import column_type
 from ..scene.colours import unpacked
 from ..scene.scene import Scene
 from ..sensor import ScanSpec, Survey
-from ..sensor.faults import faults_of
 from ..sensor.materials import at_right_angles
 from ..sensor.optics import LIGHT_M_NS
 from ..sensor.reflectivity import COUNTS, SCALES
@@ -128,7 +127,7 @@ class BatchPoints:
         if spec.repeats is not None:
             before, now = map(self.survey.begins_ns, spec.repeats)
             stamp = stamp + round(now - before)
-        jumps = faults_of(self.survey, spec.sensor, "time_jump").values()
+        jumps = self.survey.faults_of(spec.sensor, "time_jump").values()
         return sum((one.jumps_ns(stamp) for one in jumps), stamp)
 
     @property

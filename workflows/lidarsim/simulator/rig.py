@@ -17,7 +17,6 @@ from ..base.vectors import turned
 from ..scene.actors import Actor
 from ..scene.scene import Scene
 from ..sensor import Pose, ScanSpec, Sensor, Survey, Trajectory
-from ..sensor.faults import sent
 from .device import DeviceColumns, DevicePoints
 from .motion import Clock, Firings, Poses, check_trajectory, poses_of_firings
 from .points import BatchPoints
@@ -167,7 +166,7 @@ class Rig:
     def cast(self, first: int, stop: int) -> Iterator[BatchPoints | DevicePoints]:
         """Cast scans `first` to `stop` of the survey; yields the returns for each station."""
         run: list[ScanSpec] = []
-        for spec in (sent(self.survey, index) for index in range(first, stop)):
+        for spec in map(self.survey.sent_scan, range(first, stop)):
             here = (spec.sensor, spec.station, spec.firings[0], spec.repeats)
             last = run[-1] if run else spec
             if run and here != (last.sensor, last.station, last.firings[1], last.repeats):

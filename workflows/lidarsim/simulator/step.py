@@ -20,7 +20,7 @@ from ..base.vectors import turned
 from ..columns.table import VELOCITY
 from ..scene.scene import Scene
 from ..sensor import Fault, Noise, Returns, Sensor, Survey
-from ..sensor.faults import FaultKind, faults_of
+from ..sensor.faults import FaultKind
 from ..sensor.noise import Purpose
 from .motion import Firings, Poses
 from .returns import Keys, Planes, PulseReturns
@@ -110,8 +110,8 @@ class Setup:
         return bool(adds or noise.saturation)
 
     def faults(self, *kinds: FaultKind) -> dict[int, Fault]:
-        """Return its faults of some kinds, see `faults_of`."""
-        return faults_of(self.survey, self.number, *kinds)
+        """Return the faults of some kinds of the sensor, see `Survey.faults_of`."""
+        return self.survey.faults_of(self.number, *kinds)
 
 
 class Sizes(NamedTuple):

@@ -9,7 +9,6 @@ import numpy as np
 
 from ..base.arrays import Floats, Floats32, Ints
 from ..sensor import Pose, Survey, Trajectory
-from ..sensor.faults import faults_of, sent
 from ..sensor.trajectory import full_poses, quaternions_of
 from .lidar_traits import LidarTraits
 
@@ -127,9 +126,9 @@ def _cast_at(survey: Survey, number: int) -> tuple[Ints, Floats]:
     per_station = len(firsts) // survey.path.stations
     stations = np.arange(len(firsts)) // per_station
     begins_ns = begins - stations * survey.station_ns
-    if faults_of(survey, number, "frozen"):
+    if survey.faults_of(number, "frozen"):
         for sweep, scan in enumerate(firsts.tolist()):
-            spec = sent(survey, scan)
+            spec = survey.sent_scan(scan)
             if spec.repeats is not None:
                 stations[sweep] = spec.station
                 begins_ns[sweep] = survey.begins_ns(spec.repeats[0]) - spec.start_ns

@@ -21,7 +21,6 @@ from ..columns.table import NORMAL, ORIGIN, TABLE
 from ..scene.scene import Scene
 from ..scene.transform import affine
 from ..sensor import Fault, Sensor, Survey
-from ..sensor.faults import sent
 from ..sensor.plain_data import described, remade
 from ..sensor.survey import nanoseconds
 from ..sensor.trajectory import full_poses, matrices, presence_ns, quaternions_of
@@ -258,7 +257,7 @@ class Sweeps:
                 places.append(positions + rotations @ np.array(mount.position))
                 turns.append(rotations @ turned)
             sensors.append(np.full(len(since) * path.stations, number, np.uint8))
-            shown = [sent(survey, scan) for scan in firsts.tolist()]
+            shown = [survey.sent_scan(scan) for scan in firsts.tolist()]
             older = np.array([one.scan + one.ahead for one in shown])
             first_steps.append((older - firsts[0]) % survey.steps_each[number])
         when, end = (np.concatenate([one[k] for one in each]) for k in (1, 2))

@@ -28,8 +28,11 @@ from lidarsim.scene.simplified import Drawn
 from lidarsim.scene.transform import Transform
 from lidarsim.sensor import Pose
 
-from ...scenario.point_scene import surfels
 from .files import Assets, clean, number, read, rotation
+
+# Makes a mesh of surfels of a file of points: path, points (n, 3) in metres, and the edge in metres
+# of the cubic cells, each of which has one surfel.
+SurfelMaker = Callable[[Path, Floats, float], SceneMesh]
 
 _LOADERS = ("objloader", "detailedvoxels", "geotiffloader", "xyzloader")
 
@@ -53,7 +56,7 @@ class HeliosPart:
         """Values that HELIOS++ reads of the materials of its faces, {name: values}."""
         text = _text(self.file) if self.file.suffix.lower() == ".obj" else ""
         used = {self.material, *re.findall(r"^\s*usemtl\s+(.+?)\s*$", text, re.MULTILINE)}
-        found: dict[str, dict[str, str]] = {}
+        values_of: dict[str, dict[str, str]] = {}  # {name of a material: values}
         named = re.findall(r"^\s*mtllib\s+(.+?)\s*$", text, re.MULTILINE)
         libraries = [self.file.parent / name for name in named]
         libraries += [self.library] if self.library else []
@@ -63,10 +66,10 @@ class HeliosPart:
                 words = line.split()
                 if words[:1] == ["newmtl"] and len(words) > 1:
                     name = line.split(maxsplit=1)[1].strip()  # which may have spaces
-                    values = found.setdefault(name, {})
+                    values = values_of.setdefault(name, {})
                 elif len(words) > 1 and words[0].startswith("helios_"):
                     values[words[0].removeprefix("helios_")] = words[1]
-        return {name: values for name, values in found.items() if name in used}
+        return {name: values for name, values in values_of.items() if name in used}
 
     def kinds(self, spectra: Callable[[str], float | None]) -> dict[str, dict[str, Any]]:
         """Reflectance and class of each material of its faces, {name: entries of a scenario}."""
@@ -88,14 +91,14 @@ class HeliosPart:
 
     @property
     def is_ground(self) -> bool:
-        """Whether platforms and parts can stand on it; on points if they have no material."""
+        """True if platforms and parts can stand on the part, and for points without material."""
         if self.surfels is not None and self.library is None:
             return True
         grounds = (values.get("isGround", "").lower() for values in self.materials.values())
         return any(ground in ("true", "1") for ground in grounds)
 
     def meshes(self) -> tuple[SceneMesh | SceneInstance, ...]:
-        """Read it, in the world."""
+        """Read the meshes of the part, in world coordinates."""
         placed = Transform(self.turn * self.scale, self.offset)
         if (points := self.surfels) is not None:
             return (points.moved(points.name, placed.linear, placed.offset),)
@@ -108,7 +111,7 @@ class HeliosPart:
         )
 
     def entry(self, name: str) -> dict[str, Any]:
-        """Entry of `scene.files`, the file under a name."""
+        """Return the entry of `scene.files` for the part, whose file has a name."""
         angles = Pose.of((0, 0, 0), self.turn)
         degrees = (angles.roll_deg, angles.pitch_deg, angles.yaw_deg)
         placement = {
@@ -122,10 +125,12 @@ class HeliosPart:
 
 
 class HeliosScene:
-    """The parts of a scene, and the ground among them; in a folder `out` surfels of points."""
+    """The parts of a scene, and the ground among them; meshes of points go into a folder `out`."""
 
-    def __init__(self, element: Element, assets: Assets, out: Path) -> None:
-        self._assets, self._out = assets, out
+    def __init__(self, element: Element, assets: Assets, out: Path, surfels: SurfelMaker) -> None:
+        self._assets = assets
+        self._out = out
+        self._surfels = surfels
         self.unread: list[str] = []
         self._missing: set[str] = set()
         self._moving: dict[str, list[str]] = {"dmotion": [], "swap": []}  # parts by their motion
@@ -138,41 +143,49 @@ class HeliosScene:
             raise LidarError(
                 f"{name} has no part that can be read: only those of {' and '.join(_LOADERS)} are."
             )
-        for one in self.parts:
-            if one.falls:
-                self._let_fall(one)
+        for falling in self.parts:
+            if falling.falls:
+                self._let_fall(falling)
 
     def _read(self, part: Element, name: str, assets: Assets) -> Iterator[HeliosPart]:
+        """Read a <part>: one part for each file of its loader, placed by its filters."""
         for tag, moving in self._moving.items():
             if part.find(tag) is not None:
                 moving.append(name)
         files: list[Path] = []
-        up, turn, scale, offset, falls = None, np.eye(3), 1.0, np.zeros(3), False
-        library, material = None, ""
+        up_axis: str | None = None
+        rotated = np.eye(3)
+        scale = 1.0
+        offset = np.zeros(3)
+        falls = False
+        library: Path | None = None
+        material = ""
         points: list[SceneMesh | None] = [None]
         for step in part.findall("filter"):
             kind = step.get("type", "").lower()
-            given = {param.get("key", ""): param for param in step.findall("param")}
-            text = {key: param.get("value", "") for key, param in given.items()}
+            params = {param.get("key", ""): param for param in step.findall("param")}
+            text = {key: param.get("value", "") for key, param in params.items()}
             mode = text.get("intersectionMode", "transmittive").lower()
             if kind == "detailedvoxels" and mode != "transmittive":
-                what = text.get("filepath") or text.get("efilepath", "")
-                self.unread.append(f"{name}, {kind} of {what}: intersectionMode {mode}, left out")
+                files_text = text.get("filepath") or text.get("efilepath", "")
+                self.unread.append(
+                    f"{name}, {kind} of {files_text}: intersectionMode {mode}, left out"
+                )
                 return
             if kind in _LOADERS:
                 files = _files(text, assets)
                 if kind == "objloader":
-                    up = text.get("up")
+                    up_axis = text.get("up")
                 else:
                     material = text.get("matname", "")
                     library = assets.file(text["matfile"]) if "matfile" in text else None
                 if kind == "xyzloader":
-                    points = [_surfels(file, text) for file in files]
+                    points = [self._surfels(file, *_points(file, text)) for file in files]
                     files = [self._out / f"{file.stem}-{name.split()[-1]}.glb" for file in files]
                 if "ladlut" in text:
                     self.unread.append(f"{name}, ladlut: leaf angles are spherical")
             elif kind == "rotate":
-                turn = rotation(given.get("rotation")) @ turn
+                rotated = rotation(params.get("rotation")) @ rotated
             elif kind == "scale":
                 (scale,) = _numbers(text.get("scale", ""), 1)
                 scale = scale or 1.0
@@ -186,10 +199,18 @@ class HeliosScene:
                 )
         if not files:
             raise LidarError("no filter loads a file.")
-        up = up if up in ("y", "z") else None
-        place = up, turn, float(scale)
         for file, mesh in zip(files, cycle(points)):
-            yield HeliosPart(file, *place, offset.copy(), falls, library, material, mesh)
+            yield HeliosPart(
+                file=file,
+                up_axis=up_axis if up_axis in ("y", "z") else None,
+                turn=rotated,
+                scale=float(scale),
+                offset=offset.copy(),
+                falls=falls,
+                library=library,
+                material=material,
+                surfels=mesh,
+            )
 
     @cached_property
     def _ground(self) -> Scene | None:
@@ -197,12 +218,12 @@ class HeliosScene:
         return Drawn.of(Scene.from_meshes(meshes)).scene if meshes else None
 
     def height(self, x: float, y: float) -> float:
-        """Height of the lowest ground at a place; 0 where there is none."""
-        found = np.zeros(0) if self._ground is None else heights_at(self._ground, x, y)
-        if not len(found):
+        """Return the height of the lowest ground at x, y, in metres; 0 without ground."""
+        heights = np.zeros(0) if self._ground is None else heights_at(self._ground, x, y)
+        if not len(heights):
             self._missing.add(f"{x:g}, {y:g}")
             return 0.0
-        return float(found.min())
+        return float(heights.min())
 
     def _let_fall(self, part: HeliosPart) -> None:
         """Move a part up or down so that its lowest point stands on the ground."""
@@ -211,7 +232,7 @@ class HeliosScene:
         part.offset[2] += self.height(x, y) - z
 
     def materials(self, wavelength_nm: float) -> list[dict[str, Any]]:
-        """List what objects are made of, or the faces of objects with several materials."""
+        """Return entries of `materials` for objects, or for faces with several materials."""
         spectra = partial(self._reflectance, wavelength_nm)
         kinds = [part.kinds(spectra) for part in self.parts]
         if not any(kind for of_part in kinds for kind in of_part.values()):
@@ -227,7 +248,7 @@ class HeliosScene:
         return [*entries, {"objects": "*"}]
 
     def _reflectance(self, wavelength_nm: float, name: str) -> float | None:
-        """Reflectance at a wavelength, by the spectrum of a name; None where there is none."""
+        """Return the reflectance at a wavelength by a named spectrum; None without the spectrum."""
         for place in self._assets.places:
             for folder in (place / "spectra", place / "data" / "spectra"):
                 text = _text(folder / f"{name}.txt")
@@ -240,24 +261,24 @@ class HeliosScene:
 
     def left_out(self) -> list[str]:
         """List the unsupported features, after everything was read."""
-        out = []
+        lines = []
         for tag, parts in self._moving.items():
             if len(parts) == 1:
-                out.append(f"<{tag}> of {parts[0]}: it stands as it is at first")
+                lines.append(f"<{tag}> of {parts[0]}: it stands as it is at first")
             elif parts:
                 several = f"{len(parts)} parts, {parts[0]} to {parts[-1]}"
-                out.append(f"<{tag}> of {several}: they stand as they are at first")
-        out += self.unread
+                lines.append(f"<{tag}> of {several}: they stand as they are at first")
+        lines += self.unread
         if self._missing:
-            places = "; ".join(sorted(self._missing))
-            out.append(f"onGround at {places}: no ground there, so z is 0")
-        return out
+            positions = "; ".join(sorted(self._missing))
+            lines.append(f"onGround at {positions}: no ground there, so z is 0")
+        return lines
 
 
 def _entries(
     name: str, mesh: SceneMesh | SceneInstance, kinds: dict[str, dict[str, Any]]
 ) -> list[dict[str, Any]]:
-    """Entries of `materials` for an object, of a part with kinds of materials."""
+    """Return entries of `materials` for an object of a part, whose materials have kinds."""
     shape = mesh.mesh if isinstance(mesh, SceneInstance) else mesh
     objects = escape(name)
     if shape.materials is None:  # of a file without materials, to which the part gives one
@@ -274,7 +295,7 @@ def _entries(
 
 
 def _files(text: dict[str, str], assets: Assets) -> list[Path]:
-    """Files of a loader: by name, or those in a folder whose names an expression fits."""
+    """Return the files of a loader: by name, or in a folder by an expression for names."""
     if "efilepath" not in text:
         return [assets.file(text.get("filepath", ""))]
     folder, _, names = text["efilepath"].rpartition("/")
@@ -282,27 +303,30 @@ def _files(text: dict[str, str], assets: Assets) -> list[Path]:
         fits = re.compile(names)
     except re.error as error:
         raise LidarError(f"efilepath is {text['efilepath']!r}: {error}.") from error
-    for place in assets.places:
-        if (place / folder).is_dir():
-            found = sorted(p for p in (place / folder).iterdir() if fits.fullmatch(p.name))
-            if found:
-                return found
+    for root in assets.places:
+        if (root / folder).is_dir():
+            paths = sorted(p for p in (root / folder).iterdir() if fits.fullmatch(p.name))
+            if paths:
+                return paths
     raise LidarError(f"no file fits the efilepath {text['efilepath']!r}.")
 
 
-def _surfels(path: Path, given: dict[str, str]) -> SceneMesh:
-    """Return the surfels of a file of points, of which a cell of `voxelSize` has one."""
-    separators = dict.fromkeys(map(ord, given.get("separator") or " "), " ")
+def _points(path: Path, settings: dict[str, str]) -> tuple[Floats, float]:
+    """Read a file of points by the settings of an `xyzloader`.
+
+    Return the points (n, 3) and the edge of a surfel's cell, both in metres.
+    """
+    separators = dict.fromkeys(map(ord, settings.get("separator") or " "), " ")
     lines = read(path).decode("utf-8", "replace").translate(separators).splitlines()
     try:
         points = np.loadtxt(lines, comments="//", usecols=(0, 1, 2), ndmin=2)
-        return surfels(path, points, number(given, "voxelSize", 1.0) or 1.0)
     except ValueError as error:
         raise LidarError(f"{path} has rows that are no points: {error}.") from error
+    return points, number(settings, "voxelSize", 1.0) or 1.0
 
 
 def _text(path: Path) -> str:
-    """Content of a file that may be missing; then empty."""
+    """Return the content of a file; empty if the file cannot be read."""
     try:
         return read_input_text(path, "replace")
     except (OSError, ValueError, LidarError):  # a zero in the name
@@ -310,7 +334,7 @@ def _text(path: Path) -> str:
 
 
 def _numbers(text: str, count: int) -> Floats:
-    """Numbers with ; between them."""
+    """Read numbers separated by semicolons."""
     try:
         values = np.array([float(word) for word in text.split(";")])
     except ValueError:

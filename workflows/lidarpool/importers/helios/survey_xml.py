@@ -6,7 +6,7 @@ import os
 import re
 import shutil
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -24,11 +24,9 @@ from lidarsim.sensor import Pose
 from lidarsim.sensor.disc import SUBRAYS
 from lidarsim.sensor.survey import SENSORS_MOST
 
-from ...scenario.build import build
-from ...scenario.scenario import Scenario
 from .files import Assets, clean, number, rotation, vector
 from .scanner_xml import Device, channels, device, unread
-from .scene_xml import HeliosScene
+from .scene_xml import HeliosScene, SurfelMaker
 from .way import Stretch, Way, flown, read_legs, read_way, stood
 
 SCENARIO_FILE = "scenario.yaml"
@@ -38,76 +36,91 @@ _AHEAD = rotation_about((0, 0, 1), -90)
 
 @dataclass
 class Imported:
-    """A written scenario, and the unsupported features of its survey."""
+    """The file of a written scenario, and the unsupported features of its survey."""
 
     path: Path
-    scenario: Scenario
     left_out: list[str]
 
 
 def import_survey(
-    survey: str | Path, out: str | Path, assets: Sequence[str | Path] = ()
+    survey: str | Path,
+    out: str | Path,
+    assets: Sequence[str | Path] = (),
+    *,
+    check: Callable[[Path], object],
+    surfels: SurfelMaker,
 ) -> Imported:
     """Write a HELIOS++ survey as a scenario, into a new folder.
 
-    Beside `scenario.yaml` go data files of its sensors, and the trajectory if it is a file.
+    The folder holds `scenario.yaml`, data files of its sensors, meshes of scanned points, and the
+    trajectory if the survey has a file of poses.
 
     Parameters
     ----------
     survey
-        Its XML file.
+        The XML file of the survey.
     out
         The folder.
     assets
-        Folders where its references start, before the survey's own and those above it.
+        Folders in which referenced files are looked for first, before the folder of the survey and
+        the folders above.
+    check
+        Reads the written `scenario.yaml` and raises a LidarError if it cannot be simulated.
+    surfels
+        Makes a mesh of the points of a file that an `xyzloader` reads.
 
     Raises
     ------
     LidarError
-        If a file is missing or broken, or an essential feature is not supported; nothing is
-        written then.
+        If a file is missing or broken, an essential feature is not supported, or `check` refuses
+        the scenario; nothing is written then.
     """
-    survey, out = Path(survey), Path(out)
+    survey = Path(survey)
+    out = Path(out)
     if out.exists():
         raise LidarError(f"{out} exists: name another folder, --out DIR.")
     try:
-        made = _Import(survey, [Path(folder) for folder in assets], out)
+        survey_import = _Import(survey, [Path(folder) for folder in assets], out, surfels)
     except LidarError as error:
-        told = str(error)
-        told = told if told.startswith(str(survey)) else f"{survey}: {told}"
-        raise LidarError(told) from error
+        message = str(error)
+        if not message.startswith(str(survey)):
+            message = f"{survey}: {message}"
+        raise LidarError(message) from error
     out.parent.mkdir(parents=True, exist_ok=True)
     partial = Path(tempfile.mkdtemp(prefix=f".{out.name}.", dir=out.parent))
     try:
-        for name, text in made.files(out).items():
+        for name, text in survey_import.files(out).items():
             (partial / name).write_text(text, encoding="utf-8", newline="\n")
-        for part in made.scene.parts:
+        for part in survey_import.scene.parts:
             if part.surfels is not None:
                 write_scene(partial / part.file.name, Scene.from_meshes([part.surfels]))
-        scenario = Scenario.load(partial / SCENARIO_FILE)
-        build(scenario)  # with whatever is wrong about it
-        partial.chmod(0o755)  # temporary folders are their owner's alone
+        check(partial / SCENARIO_FILE)
+        partial.chmod(0o755)  # mkdtemp gives a folder to its owner alone
         partial.rename(out)
     except LidarError as error:
-        told = str(error).replace(str(partial), str(out))
-        raise LidarError(f"{survey} makes no scenario: {told}") from error
+        message = str(error).replace(str(partial), str(out))
+        raise LidarError(f"{survey} makes no scenario: {message}") from error
     finally:
         shutil.rmtree(partial, ignore_errors=True)
-    return Imported(out / SCENARIO_FILE, Scenario.load(out / SCENARIO_FILE), made.left_out)
+    return Imported(out / SCENARIO_FILE, survey_import.left_out)
 
 
 class _Import:
-    """A survey that was read whole."""
+    """A survey whose XML files have been read; `files` returns the scenario's files."""
 
-    def __init__(self, survey: Path, folders: Sequence[Path], out: Path) -> None:
-        self._home, self._assets = survey, Assets(survey, folders)
+    def __init__(
+        self, survey: Path, folders: Sequence[Path], out: Path, surfels: SurfelMaker
+    ) -> None:
+        self._home = survey
+        self._assets = Assets(survey, folders)
         element = self._assets.root(survey).find("survey")
         if element is None:
             raise LidarError("it has no <survey>.")
-        self._element, self._name = element, element.get("name") or survey.stem
+        self._element = element
+        self._name = element.get("name") or survey.stem
         self._scanners = channels(self._asset("scanner"))
         self._first = next(iter(self._scanners.values()))
-        self.scene = HeliosScene(self._asset("scene"), self._assets, out)
+        self.scene = HeliosScene(self._asset("scene"), self._assets, out, surfels)
         self._notes: list[str] = []
         self._files: dict[str, dict[str, Any]] = {}  # {name: data of a sensor}
         self._sensors: dict[str, dict[str, Any]] = {}
@@ -135,10 +148,13 @@ class _Import:
         return self._assets.asset(reference, kind, self._home).element
 
     def _carry(self) -> Way:
-        """Read the legs and the platform; make the trajectory, and sensors on it."""
-        survey, assets = self._element, self._assets
+        """Read the legs and the platform; return the trajectory, and fill `_sensors`."""
+        survey = self._element
+        assets = self._assets
         legs = read_legs(survey, assets, self._home, self.scene.height)
-        mount, kind, way = survey.find("scannerMount"), "interpolated", None
+        mount = survey.find("scannerMount")
+        kind = "interpolated"
+        way = None
         if survey.get("platform") == kind:
             base = survey.get("basePlatform")
             if mount is None and base:
@@ -146,7 +162,8 @@ class _Import:
             way = read_way(survey, legs, assets)
         else:
             platform = self._asset("platform")
-            mount, kind = platform.find("scannerMount"), platform.get("type", "").lower()
+            mount = platform.find("scannerMount")
+            kind = platform.get("type", "").lower()
             if kind in ("groundvehicle", "multicopter"):
                 self._notes.append(
                     f"how a {kind} drives: it keeps its speed and goes straight from leg to leg"
@@ -166,50 +183,55 @@ class _Import:
         if way is None and moves:
             way = flown(legs)
         elif way is None:
-            heads = {leg: max(d.head_s or 0.0 for d in of.values()) for leg, of in devices.items()}
+            heads = {
+                leg: max(mounted.head_s or 0.0 for mounted in by_channel.values())
+                for leg, by_channel in devices.items()
+            }
             way = stood(legs, heads)
-        turn, place = rotation(mount), vector(mount)
-        places = {
-            tuple(clean(place + one.place))  # type: ignore[arg-type]
-            for of in devices.values()
-            for one in of.values()
+        mount_rotation = rotation(mount)
+        mount_position = vector(mount)
+        positions = {
+            tuple(clean(mount_position + mounted.place))  # type: ignore[arg-type]
+            for by_channel in devices.values()
+            for mounted in by_channel.values()
         }
-        if len(places) > 1:
+        if len(positions) > 1:
             self._notes.append("places of channels beside each other: all leave from the first's")
-        way.rows[:, 1:4] += min(places, default=(0, 0, 0))
+        way.rows[:, 1:4] += min(positions, default=(0, 0, 0))
         for stretch in way.stretches:
-            for channel, one in devices[stretch.leg].items() if stretch.active else ():
+            for channel, mounted in devices[stretch.leg].items() if stretch.active else ():
                 name = f"leg{stretch.leg}" + (f"-{channel}" if channel else "")
-                self._sensors[name] = self._sensor(one, stretch, turn)
+                self._sensors[name] = self._sensor(mounted, stretch, mount_rotation)
         return way
 
-    def _sensor(self, one: Device, stretch: Stretch, mount: Floats) -> dict[str, Any]:
-        """Entry of `sensors`."""
-        step_deg, steps = one.steps(stretch.seconds)
-        near, far = one.range_m
-        pose = Pose.of((0, 0, 0), _AHEAD @ mount @ one.turn)
+    def _sensor(self, mounted: Device, stretch: Stretch, mount: Floats) -> dict[str, Any]:
+        """Return the entry of `sensors` for a device on a stretch, rotated by its mount (3, 3)."""
+        step_deg, steps = mounted.steps(stretch.seconds)
+        min_range_m, max_range_m = mounted.range_m
+        pose = Pose.of((0, 0, 0), _AHEAD @ mount @ mounted.turn)
         angles = {name: clean(getattr(pose, name)) for name in ("yaw_deg", "pitch_deg", "roll_deg")}
         return {
-            "model": self._file_of(one.data),
+            "model": self._file_of(mounted.data),
             "step_deg": step_deg,
-            **({"min_range_m": clean(near)} if near else {}),
-            **({"max_range_m": clean(far)} if np.isfinite(far) else {}),
+            **({"min_range_m": clean(min_range_m)} if min_range_m else {}),
+            **({"max_range_m": clean(max_range_m)} if np.isfinite(max_range_m) else {}),
             "mount": {name: angle for name, angle in angles.items() if angle},
             "start_s": clean(stretch.start_s),
             "steps": steps,
         }
 
     def _file_of(self, data: dict[str, Any]) -> str:
-        """Name of the file of a sensor; those that are alike share one."""
+        """Return the name of a sensor's file; equal sensors share a file."""
         stem = re.sub(r"[^\w.-]+", "_", str(data["name"])).strip("._").lower() or "sensor"
-        name, number = f"{stem}.yaml", 1
+        name = f"{stem}.yaml"
+        number = 1
         while self._files.setdefault(name, data) != data:
             number += 1
             name = f"{stem}-{number}.yaml"
         return name
 
     def files(self, out: Path) -> dict[str, str]:
-        """Return what goes into the folder `out`: {name: text}."""
+        """Return the text files of the folder `out`: {name: text}."""
         trajectory, files = self._way.written()
         light, range_m = self._light()
         names = [os.path.relpath(part.file.resolve(), out.resolve()) for part in self.scene.parts]
@@ -237,14 +259,19 @@ class _Import:
         return {**files, **sensors, SCENARIO_FILE: text}
 
     def _full_waveform(self) -> dict[str, str]:
-        """FWFSettings of the scanner, and over these those of the survey."""
-        given = self._first.child("FWFSettings"), self._element.find("FWFSettings")
-        return {name: v for one in given if one is not None for name, v in one.attrib.items()}
+        """Return FWFSettings of the scanner; settings of the survey take precedence."""
+        elements = (self._first.child("FWFSettings"), self._element.find("FWFSettings"))
+        settings: dict[str, str] = {}
+        for element in elements:
+            if element is not None:
+                settings.update(element.attrib)
+        return settings
 
     def _light(self) -> tuple[dict[str, Any], dict[str, float]]:
         """Return sections on light, and ranges that the survey sets for its scanner."""
-        scanner, detector = self._first, self._element.find("detectorSettings")
-        own = {} if detector is None else detector.attrib
+        scanner = self._first
+        detector = self._element.find("detectorSettings")
+        detector_settings = {} if detector is None else detector.attrib
         fwf = self._full_waveform()
         quality = number(fwf, "beamSampleQuality", 3.0)
         sections = {
@@ -253,15 +280,23 @@ class _Import:
                 "subrays": SUBRAYS[int(np.clip(quality - 1, 0, len(SUBRAYS) - 1))],
                 **waveform(fwf, scanner.number("pulseLength_ns", 4)),
             },
-            "noise": {"range_m": clean(number(own, "accuracy_m", scanner.number("accuracy_m")))},
+            "noise": {
+                "range_m": clean(
+                    number(detector_settings, "accuracy_m", scanner.number("accuracy_m"))
+                )
+            },
             "weather": {"visibility_km": clean(scanner.number("atmosphericVisibility_km", 23))},
         }
         ranges = {"min_range_m": "rangeMin_m", "max_range_m": "rangeMax_m"}
-        return sections, {ours: number(own, n, 0) for ours, n in ranges.items() if n in own}
+        return sections, {
+            field: number(detector_settings, name, 0)
+            for field, name in ranges.items()
+            if name in detector_settings
+        }
 
 
 def waveform(settings: dict[str, str], pulse_ns: float) -> dict[str, Any]:
-    """Return the fields of `returns` that FWFSettings say, where they say anything of waveforms.
+    """Return the fields of `returns` by FWFSettings; none without settings of waveforms.
 
     HELIOS++ has range over the speed of light for the time, which is half of the time that light
     takes there and back.

@@ -21,24 +21,39 @@ from ...base.words import plural
 from ..colours import Colours, as_bytes
 from ..scene_mesh import SceneMesh
 from .polygons import check_corners, triangulated, with_holes
-from .scene_graph import Content, MeshFileError, Piece, PlacedNode, Wanted, joined, settled
+from .scene_graph import (
+    Content,
+    MeshFileError,
+    ObjectClass,
+    Piece,
+    PlacedNode,
+    Wanted,
+    joined,
+    settled,
+)
 
-# {class of ASPRS LAS 1.4: names of city objects, which begin with their types}; 1 is for what LAS
-# has no class for.
-BUILDING = 6
+# {class of ASPRS LAS 1.4: name, and patterns of city objects, whose names begin with their types};
+# class 1 is for types that have no class in LAS.
 CLASSES = {
-    1: ("CityFurniture *", "CityObjectGroup *", "GenericCityObject *", "OtherConstruction *",
-        "Tunnel* *", "+* *"),
-    2: ("LandUse *", "TINRelief *"),
-    5: ("PlantCover *", "SolitaryVegetationObject *"),
-    BUILDING: ("Building* *",),
-    9: ("WaterBody *", "Waterway *"),
-    10: ("Railway *",),
-    11: ("Road *", "Transport*Square *"),
-    17: ("Bridge* *",),
-}  # fmt: skip
-CLASS_NAMES = {1: "unclassified", 2: "ground", 5: "high vegetation", 6: "building", 9: "water",
-               10: "rail", 11: "road surface", 17: "bridge deck"}  # fmt: skip
+    1: ObjectClass(
+        "unclassified",
+        (
+            "CityFurniture *",
+            "CityObjectGroup *",
+            "GenericCityObject *",
+            "OtherConstruction *",
+            "Tunnel* *",
+            "+* *",
+        ),
+    ),
+    2: ObjectClass("ground", ("LandUse *", "TINRelief *")),
+    5: ObjectClass("high vegetation", ("PlantCover *", "SolitaryVegetationObject *")),
+    6: ObjectClass("building", ("Building* *",)),
+    9: ObjectClass("water", ("WaterBody *", "Waterway *")),
+    10: ObjectClass("rail", ("Railway *",)),
+    11: ObjectClass("road surface", ("Road *", "Transport*Square *")),
+    17: ObjectClass("bridge deck", ("Bridge* *",)),
+}
 
 # How deep surfaces are nested in the boundaries of a geometry.
 _DEPTHS = {
@@ -270,7 +285,9 @@ class _CityFile:
                 "needed: reproject it, for example by cjio FILE crs_reproject EPSG save NEW"
             )
         content = settled(self._placed)
-        content.unit_m, content.up_axis = 1.0, "z"
+        content.unit_m = 1.0
+        content.up_axis = "z"
+        content.classes = CLASSES
         levels = [
             f"{plural(n, 'object')} of LoD {f'{level:g}' if level >= 0 else 'unknown'}"
             for level, n in sorted(self._levels.items(), reverse=True)

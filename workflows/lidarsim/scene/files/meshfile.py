@@ -5,7 +5,7 @@ from __future__ import annotations
 import codecs
 import logging
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from itertools import product
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
@@ -33,7 +33,7 @@ from .gltf import read_gltf
 from .polygon_files import read_obj, read_off, read_ply_mesh, read_stl
 from .rasters import SUFFIXES as RASTERS
 from .rasters import Window, read_raster
-from .scene_graph import Content, MeshFileError, Raster, RigidPart, Wanted
+from .scene_graph import Content, MeshFileError, ObjectClass, Raster, RigidPart, Wanted
 from .threemf import read_3mf
 from .usd import read_usd
 from .vox import read_vox
@@ -117,6 +117,7 @@ class Objects(NamedTuple):
     moving: tuple[Actor, ...] = ()  # each along a `Track`
     summary: str = ""  # objects, triangles, unit, axes and colours
     raster: Raster | None = None  # what was taken of one
+    classes: Mapping[int, ObjectClass] = {}  # {number of ASPRS LAS: class}, of formats with types
 
     def still(self, tell: Callable[[str], None]) -> tuple[SceneMesh | SceneInstance, ...]:
         """Return all of them where they are at first; `tell` is called if that is a loss."""
@@ -235,7 +236,7 @@ def load_objects(
         summary = _summary(all_of_it, unit_m, up, wanted)
     if up_axis is None and content.generator != GENERATOR and OWN.encode() not in data[:_HEAD]:
         _tell_axes(path, content, all_of_it, axes)
-    return objects._replace(summary=summary, raster=content.raster)
+    return objects._replace(summary=summary, raster=content.raster, classes=content.classes)
 
 
 def converted(path: Path) -> str:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Hashable, Iterable, Sequence
+from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache
 from itertools import chain
@@ -39,6 +39,13 @@ class Raster:
     crs: str  # coordinate system of the mesh, as "EPSG:25832" or WKT; empty if it states none
     epsg: int | None
     told: str  # for users
+
+
+class ObjectClass(NamedTuple):
+    """A semantic class that a format gives to its objects."""
+
+    name: str
+    patterns: tuple[str, ...]  # of the names of its objects
 
 
 class MeshFileError(Exception):
@@ -87,6 +94,8 @@ class Content:
     skipped: list[str] = field(default_factory=list)  # names of objects without an area
     notes: list[str] = field(default_factory=list)  # clauses that follow the file's name
     raster: Raster | None = None
+    # {number of ASPRS LAS: class} of formats whose objects have types
+    classes: Mapping[int, ObjectClass] = field(default_factory=dict)
 
 
 @dataclass

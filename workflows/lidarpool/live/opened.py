@@ -1,0 +1,39 @@
+"""Results that the page shows: unfinished runs are refused, points are offered as files."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from lidarsim.base.errors import LidarError
+
+from ..export.formats import Format, save_cloud
+from ..pipeline.database import FILE
+from ..run.store import RUN_FOLDER
+from .view import CLOUD, Downloads, View, open_results
+
+DOWNLOADS = ("ply", "las", "parquet")  # formats that a page offers
+
+
+def downloads() -> Downloads:
+    """Return the formats of a download whose packages are installed, and their writer."""
+    return Downloads([name for name in DOWNLOADS if Format(name).installed], save_cloud)
+
+
+def open_finished(paths: Sequence[Path]) -> View:
+    """Open results of a place as a view whose points can be downloaded; see `open_results`.
+
+    LidarError as of `open_results`, or if a folder holds an unfinished run.
+    """
+    for path in paths:
+        refuse_unfinished(path)
+    return open_results(paths, downloads())
+
+
+def refuse_unfinished(path: Path) -> None:
+    """Raise a LidarError if a folder holds an unfinished run and no cloud."""
+    if not (path / CLOUD).exists() and (path / RUN_FOLDER / FILE).exists():
+        raise LidarError(
+            f"{path} holds an unfinished run: continue it with lidarpool run --resume, where "
+            "--live shows its points."
+        )

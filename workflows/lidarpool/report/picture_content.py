@@ -1,0 +1,43 @@
+"""What pictures show of a run: its planning and its result, as the values that are drawn."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+from ..plan import Plan, Planning, Trial
+from ..run.picture_file import PictureContent, PlannedPath, PlanningPicture
+from ..run.run_result import RunResult
+
+
+def picture_content(result: RunResult) -> PictureContent:
+    """Return the content of the pictures of a result."""
+    planning = planning_picture(result.planning, result.plan, result.trials)
+    content, drawn = PictureContent.before_casting(result.scene, result.survey, planning)
+    return replace(
+        content, hit_counts=drawn.hits(result.hit_counts), sample_rays=result.sample_rays
+    )
+
+
+def planning_picture(
+    planning: Planning | None, plan: Plan | None = None, trials: Sequence[Trial] = ()
+) -> PlanningPicture | None:
+    """Return how pictures show a planning, with its plan and its trials at the end of these."""
+    if planning is None:
+        return None
+    best = None
+    if plan is not None:
+        best = PlannedPath(
+            corners=plan.path,
+            length_m=plan.length,
+            shortest_m=plan.shortest_possible,
+            clearance_m=plan.clearance,
+            trials=[trial.waypoints for trial in trials],
+        )
+    return PlanningPicture(
+        start=planning.start,
+        target=planning.target,
+        centres=planning.centres,
+        radii=planning.radii,
+        best=best,
+    )

@@ -1,0 +1,446 @@
+"""Sources of the jobs of a campaign: a function, scenario files, or bases with other values."""
+
+from __future__ import annotations
+
+import hashlib
+import re
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence, Set
+from contextlib import suppress
+from dataclasses import replace
+from functools import cache, cached_property, partial
+from itertools import chain, combinations, count, islice
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any
+
+import numpy as np
+from pydantic_core import to_json
+
+from lidarsim.base.errors import LidarError, Mistakes, prefixed
+from lidarsim.base.input_files import open_input
+from lidarsim.base.textfile import read_text
+from lidarsim.base.validation import dotted, shown
+from lidarsim.base.words import plural
+
+from ..base.fingerprint import fingerprint
+from ..datasets.job_table import Value
+from ..export.format_table import check_whole
+from .build import Job, build
+from .campaign_sections import (
+    COUNT_MOST,
+    CampaignSection,
+    Choice,
+    JobRandom,
+    is_campaign,
+    read_rows,
+)
+from .field_paths import FieldSteps, find_field, put
+from .scenario import Scenario
+from .sections import file_states
+from .static_scene import SceneCache
+
+_NOISE = "noise.seed"  # path of the seed that differs from job to job
+_UNSAFE = re.compile(r"[^\w.-]+", re.ASCII)  # in a name of files
+
+
+class JobSource:
+    """Makes the jobs of a campaign by their numbers."""
+
+    count: int
+    names: tuple[str, ...] = ()
+    choices: Mapping[str, str] = MappingProxyType({})
+    files: Set[Path] = frozenset()
+    identity: Mapping[str, str]
+
+    def name(self, number: int) -> str:
+        """Return the name of a job in files: four digits or more."""
+        return f"{number:04}"
+
+    def values(self, number: int) -> dict[str, Value]:
+        """Return the values that differ from job to job."""
+        return {}
+
+    def scenario(self, number: int) -> Scenario | None:
+        """Return the scenario of a job; None if a function makes the job."""
+        return None
+
+    def named_in(self, file: Path) -> str:
+        """Return the table and line that name a file, to begin a message; empty without table."""
+        return ""
+
+    def job(
+        self, number: int, cache: SceneCache | None, columns: Sequence[str], fields: Any
+    ) -> Job:
+        """Make a job, with further columns of its cloud and further fields of the job."""
+        scenario = self.scenario(number)
+        assert scenario is not None, "of a file"
+        made_of = file_hashes(scenario.files)
+        built = build(scenario, plans=False, cache=cache, columns=columns)
+        return built.job(values=self.values(number), made_of=made_of, **fields)
+
+
+class FunctionJobs(JobSource):
+    """Jobs that a function of Python makes."""
+
+    def __init__(self, make: Callable[..., Any], count: int, seed: int) -> None:
+        self._make = make
+        self.count = count
+        self._seed = seed
+
+    @cached_property
+    def names(self) -> tuple[str, ...]:  # type: ignore[override]  # made on first use
+        """Names of the values of the first job that can be made."""
+        for number in range(self.count):
+            with suppress(LidarError):  # a job that fails must not end the others
+                return tuple(self._call(number).values)
+        return ()
+
+    @property
+    def identity(self) -> dict[str, str]:  # type: ignore[override]
+        """Hash of the function."""
+        return {"make": fingerprint(self._make)}
+
+    def values(self, number: int) -> dict[str, Value]:
+        """Make a job and return its values."""
+        return dict(self.job(number, None, (), {}).values)
+
+    def job(
+        self, number: int, cache: SceneCache | None, columns: Sequence[str], fields: Any
+    ) -> Job:
+        """Make a job, and check its values; noise without a seed gets a seed of the job."""
+        job = self._call(number)
+        if extra := [name for name in job.values if name not in self.names]:
+            raise LidarError(
+                f"job {number} has the value {extra[0]!r}, which the first has not: give all jobs "
+                "the same names, with None where there is no value."
+            )
+        values: dict[str, Value] = {}
+        for name, value in job.values.items():
+            plain = value.item() if isinstance(value, np.generic) else value
+            if not isinstance(name, str) or not isinstance(plain, Value | None):
+                raise LidarError(
+                    f"job {number} has the value {name!r}: {shown(plain)}; values are numbers, "
+                    "text, True or False, by names."
+                )
+            if plain is not None:
+                values[name] = plain
+        survey = job.survey
+        seed = _noise_seed(self._seed, number)
+        check_whole(columns, survey.keep_every)
+        survey = replace(
+            survey,
+            noise=_seeded(survey.noise, seed),
+            sensors=[
+                replace(mounted, noise=_seeded(mounted.noise, seed)) for mounted in survey.sensors
+            ],
+            columns=(*survey.columns, *columns),
+        )
+        return Job(job.scene, survey, values=values, **fields)
+
+    def _call(self, number: int) -> Job:
+        """Call the function; LidarError if it raises any error or returns no job."""
+        with prefixed(f"job {number}"):
+            try:
+                job = self._make(number, JobRandom(self._seed, number, "make").generator())
+            except LidarError:
+                raise
+            except Exception as error:  # a failure of a job must not end the others
+                message = f"the function raised {type(error).__name__}: {error}"
+                raise LidarError(message) from error
+            if not isinstance(job, Job):
+                raise LidarError(
+                    f"the function returned {shown(job)}; it must return a Job(scene, survey)."
+                )
+        return job
+
+
+class ScenarioJobs(JobSource):
+    """Jobs of scenario and mesh files, one a file."""
+
+    def __init__(self, paths: Sequence[Path]) -> None:
+        if not paths:
+            raise LidarError("a campaign needs a scenario at least: name one or more files.")
+        self.paths = paths
+        self.count = len(paths)
+        mistakes = Mistakes()
+        files: set[Path] = set()
+        fingerprints: list[str] = []
+        for path in paths:
+            with mistakes.noted():
+                if is_campaign(path):
+                    raise LidarError(
+                        f"{path} is a campaign, with jobs of its own: run it by itself."
+                    )
+                scenario = Scenario.load(path)
+                fingerprints.append(_fingerprint(scenario))
+                files.update(scenario.files)
+        mistakes.tell()
+        self.files = files
+        self.identity = {"scenarios": fingerprint(fingerprints)}
+        self._names = _unique([path.stem for path in paths])
+
+    def name(self, number: int) -> str:
+        """Return the name of a job: that of its file."""
+        return self._names[number]
+
+    def scenario(self, number: int) -> Scenario:
+        """Read the scenario of a job."""
+        return Scenario.load(self.paths[number])
+
+
+def _unique(stems: Iterable[str]) -> list[str]:
+    """Return names for files, each once: «hall», «hall-2»."""
+    unique_names: list[str] = []
+    lower_case: set[str] = set()  # some systems do not distinguish capitals
+    for stem in stems:
+        first = _UNSAFE.sub("_", stem).lstrip(".") or "job"
+        names = chain([first], (f"{first}-{number}" for number in count(2)))
+        name = next(name for name in names if name.lower() not in lower_case)
+        lower_case.add(name.lower())
+        unique_names.append(name)
+    return unique_names
+
+
+class VariedJobs(JobSource):
+    """Jobs of a campaign file: its bases with other values."""
+
+    def __init__(self, section: CampaignSection, path: Path) -> None:
+        self._vary = section.vary
+        self._seed = section.seed
+        self._source = str(path)
+        mistakes = Mistakes()
+        self._bases: list[_Base] = []
+        tables: dict[Any, list[Any]] = {}  # {file and kind of entry: entries}
+        for name in section.base:
+            with mistakes.noted(), prefixed(path):
+                file = path.parent / Path(name).expanduser()
+                if is_campaign(file):
+                    raise LidarError(f"base {name!r} is a campaign; give a scenario.")
+                label = f"vary, of {file.name}" if section.base[1:] else "vary"
+                self._bases.append(_Base(file, section.vary, tables, label))
+        mistakes.tell()
+        for base in self._bases:
+            base.check(self._source, mistakes)
+        mistakes.tell()
+        self.files = {path for base in self._bases for path in base.files}
+        self._strides: dict[str, int] = {}  # {path with each: jobs until its value changes}
+        grid = len(self._bases)
+        for text, choice in section.vary.items():
+            if choice.each is not None:
+                self._strides[text] = grid
+                grid *= len(choice.options)
+        drawn = [text for text in section.vary if text not in self._strides]
+        if section.count is None and drawn:
+            raise LidarError(
+                f"{path}: count is missing: {drawn[0]} is drawn, so say how many jobs."
+            )
+        if section.count is None and grid > COUNT_MOST:
+            raise LidarError(
+                f"{path}: count is missing: all values of each are {grid:,} jobs, of at most "
+                f"{COUNT_MOST:,}."
+            )
+        self.count = section.count or grid
+        self.choices = {text: choice.words for text, choice in section.vary.items()}
+        if len(self._bases) > 1:
+            bases = Choice(each=tuple(base.name for base in self._bases))
+            self.choices = {"base": bases.words, **self.choices}
+        self.names = tuple(self.choices)
+
+    @cached_property
+    def identity(self) -> dict[str, str]:  # type: ignore[override]
+        """Hashes of the varied fields, of the bases and of the tables."""
+        return {
+            "vary": fingerprint({t: c.model_dump() for t, c in self._vary.items()}, [*self._vary]),
+            "base": fingerprint([(base.name, _fingerprint(base.scenario)) for base in self._bases]),
+            "tables": fingerprint(to_json([base.tables for base in self._bases])),
+        }
+
+    def named_in(self, file: Path) -> str:
+        """Return the field, table and line that name a file, to begin a message."""
+        tables = {path: text for base in self._bases for text, path in base.table_files.items()}
+        for table, text in tables.items():
+            for number, line in enumerate(read_text(table).splitlines(), 1):
+                if file.name in line and not line.lstrip().startswith("#"):
+                    return f"{text}: {table}, line {number}: "
+        return ""
+
+    def values(self, number: int) -> dict[str, Value]:
+        """Return the values that a job has for the table of jobs."""
+        return self._drawn(number)[0]
+
+    def scenario(self, number: int) -> Scenario:
+        """Return the base of a job with the values of the job."""
+        values, changes = self._drawn(number)
+        base = self._bases[number % len(self._bases)]
+        seed = _noise_seed(self._seed, number)
+        try:
+            return base.changed(changes, f"{self._source}: job {number}", seed)
+        except LidarError as error:
+            listed = ", ".join(f"{name}: {value}" for name, value in values.items())
+            raise LidarError(f"{error}\nIts values are {listed or 'those of the base'}.") from error
+
+    def _drawn(self, number: int) -> tuple[dict[str, Value], dict[str, Any]]:
+        """Draw the values of a job: for the table of jobs, and for the scenario."""
+        base = self._bases[number % len(self._bases)]
+        values: dict[str, Value | None] = {"base": base.name} if len(self._bases) > 1 else {}
+        changes: dict[str, Any] = {}  # {path: value, or rows to be added}
+        for text, choice in self._vary.items():
+            draw = JobRandom(self._seed, number, text)
+            if choice.sample is not None:
+                chosen = draw.integer(*choice.sample.count)
+                table = base.tables[text]
+                rows = [table[i] for i in draw.subset(len(table), chosen)]
+                changes[text] = rows
+                values[text] = chosen
+            elif choice.each is not None:
+                option = number // self._strides[text] % len(choice.options)
+                changes[text], values[text] = choice.options[option]
+            else:
+                changes[text], values[text] = choice.drawn(draw)
+        return {name: value for name, value in values.items() if value is not None}, changes
+
+
+class _Base:
+    """A base scenario, and the fields that the paths of a campaign lead to."""
+
+    def __init__(
+        self, path: Path, vary: Mapping[str, Choice], tables: dict[Any, list[Any]], label: str
+    ) -> None:
+        self._label = label  # for messages
+        self.scenario = Scenario.load(path)
+        self.name = path.name
+        self._vary = vary
+        self._noise, _ = find_field(self.scenario, _NOISE)
+        self._steps: dict[str, FieldSteps] = {}
+        self.tables: dict[str, list[Any]] = {}
+        self.table_files: dict[str, Path] = {}
+        self.files: set[Path] = set()  # that a job may read
+        mistakes = Mistakes()
+        for text, choice in vary.items():
+            with mistakes.noted(), prefixed(label):
+                self._steps[text], kind = find_field(self.scenario, text)
+                if choice.sample is None:
+                    continue
+                self.table_files[text] = table = self.scenario.path(choice.sample.file)
+                with prefixed(text):
+                    ignore = choice.sample.ignore
+                    if (key := (table, repr(kind), ignore)) not in tables:
+                        tables[key] = read_rows(table, kind, ignore)
+                    self.tables[text] = tables[key]
+                    max_rows = choice.sample.count[1]
+                    if max_rows > len(tables[key]):
+                        rows = plural(len(tables[key]), "row")
+                        raise LidarError(f"count is up to {max_rows:,}, and {table} has {rows}.")
+        with mistakes.noted(), prefixed(label):
+            self._check_apart()
+        mistakes.tell()
+
+    def _check_apart(self) -> None:
+        """Refuse paths that lead to the same field, or into a field that is replaced as a whole."""
+        keys = {text: tuple(key for key, _ in steps) for text, steps in self._steps.items()}
+        for first, second in combinations(keys, 2):
+            short, long = sorted((second, first), key=lambda text: len(keys[text]))
+            if keys[short] == keys[long]:
+                raise LidarError(f"{first} and {second} lead to the same field: leave one out.")
+            within = keys[long][: len(keys[short])] == keys[short]
+            if within and self._vary[short].sample is None:
+                raise LidarError(
+                    f"{short} is chosen as a whole, and {long} is a part of it: leave one out."
+                )
+
+    def check(self, source: str, mistakes: Mistakes) -> None:
+        """Note values that are not valid, and find out which files jobs may be made of.
+
+        The first values of all paths are tried together, then the second, and so on; only if
+        something is wrong, each alone, to find out which.
+        """
+        trials = {text: self._trials(text) for text in self._vary}
+        for index in range(max([1, *map(len, trials.values())])):
+            changes = {text: values[index % len(values)] for text, values in trials.items()}
+            try:
+                scenario = self.changed(changes, f"{source}: {self._label}")
+            except LidarError as error:
+                wrong = [line for text in self._vary for line in islice(self._tried(text), 1)]
+                mistakes.lines += [f"{source}: {self._label}: {line}" for line in wrong]
+                mistakes.lines += () if wrong else str(error).splitlines()
+                return
+            self.files.update(scenario.files)
+
+    def _trials(self, text: str) -> list[Any]:
+        """Return values for a path, valid if all jobs are; of a table, all rows in pieces."""
+        choice = self._vary[text]
+        if choice.sample is None:
+            return choice.ends
+        min_rows, max_rows = choice.sample.count
+        table = self.tables[text]
+        starts = range(0, len(table), max(1, max_rows)) if max_rows else ()
+        pieces = [table[start : start + max_rows] for start in starts]
+        return [table[:min_rows], *pieces]
+
+    def _tried(self, text: str) -> Iterator[str]:
+        """Yield lines on the values of a path that are not valid in the base."""
+        choice = self._vary[text]
+        field = dotted([key for key, _ in self._steps[text]])
+        for value in () if choice.sample else choice.ends:
+            try:
+                self.changed({text: value}, "")
+            except LidarError as error:
+                message = str(error).partition("\n")[0].removeprefix(": ")
+                allowed = message.partition("; ")[2] if message.startswith(f"{field} is ") else ""
+                value_line = f"{text} can be {shown(value)}"
+                if allowed:
+                    yield f"{value_line}; {allowed}{choice.hint(allowed)}"
+                else:
+                    yield f"{value_line}: {message}"
+
+    def changed(self, changes: Mapping[str, Any], source: str, noise_seed: int = 0) -> Scenario:
+        """Return the scenario with other values; noise without a seed gets `noise_seed`."""
+
+        def changed(text: str, value: Any) -> Any:
+            if text not in changes:  # the seed
+                return value or noise_seed
+            added = self._vary[text].sample is not None
+            return [*(value or ()), *changes[text]] if added else changes[text]
+
+        all_steps = {text: self._steps[text] for text in changes}
+        if noise_seed:
+            all_steps.setdefault(_NOISE, self._noise)
+        mapping: Any = self.scenario
+        for text, steps in all_steps.items():
+            mapping = put(mapping, steps, partial(changed, text))
+        sections = {str(name): mapping[name] for (name, _), *_ in all_steps.values()}
+        return self.scenario.with_sections(sections, source=source)
+
+
+def _noise_seed(seed: int, number: int) -> int:
+    """Return the seed of the noise of a job, above 0."""
+    return JobRandom(seed, number, _NOISE).bits(63) or 1
+
+
+def _seeded(noise: Any, seed: int) -> Any:
+    """Return noise with a seed, if there is noise and its seed is 0."""
+    return noise if noise is None or noise.seed else replace(noise, seed=seed)
+
+
+def _fingerprint(scenario: Scenario) -> str:
+    """Return the fingerprint of a scenario without its section on the cluster."""
+    return fingerprint(scenario.model_dump(exclude={"pool"}))
+
+
+def file_hashes(files: Iterable[Path]) -> list[tuple[str, str]]:
+    """Return name and SHA-256 of files that can be read, sorted: the same in any folder.
+
+    Files that mesh files refer to (images, buffers) are not read.
+    """
+    pairs = set()
+    for state in file_states(files):
+        with suppress(OSError):
+            pairs.add((state[0].name, _hash(*state)))
+    return sorted(pairs)
+
+
+@cache
+def _hash(path: Path, *_: int) -> str:
+    """Return the SHA-256 of a file, which is read once for each of its states."""
+    with open_input(path) as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
