@@ -19,7 +19,7 @@ from lidarsim.base.words import did_you_mean, plural
 from lidarsim.scene.actors import Actor, check_spray
 from lidarsim.scene.files.cityjson import CLASS_NAMES as CITY_NAMES
 from lidarsim.scene.files.cityjson import CLASSES as CITY_CLASSES
-from lidarsim.scene.files.meshfile import CITYJSON
+from lidarsim.scene.files.more_formats import CITYJSON
 from lidarsim.scene.robot import Robot
 from lidarsim.scene.scene import Scene
 from lidarsim.sensor import Material, Mounted, Noise, Pose, Returns, Sensor, Survey, Track

@@ -36,9 +36,11 @@ from lidarsim.base.validation import (
 )
 from lidarsim.base.words import did_you_mean, plural
 from lidarsim.base.yamlfile import read_yaml
+from lidarsim.scene.files.mesh_formats import plugin_of
 
 from ..base.fingerprint import fingerprint
 from ..base.shard import ALL, Shard
+from ..base.software import plugin_versions
 from ..datasets.job_table import Value
 from ..export.format_table import check_whole
 from ..export.laser_scan import with_laser_scans
@@ -650,12 +652,15 @@ def _print(scenario: Scenario) -> str:
 def hashes(files: Iterable[Path]) -> list[tuple[str, str]]:
     """Name and SHA-256 of files that can be read, in order: the same wherever they are.
 
+    Plug-ins that read mesh files among them have their version and sources in place of the hash.
     Files that mesh files refer to (images, buffers) are not read.
     """
     found = set()
     for state in file_states(files):
         with suppress(OSError):
             found.add((state[0].name, _hash(*state)))
+        if (plugin := plugin_of(state[0])) is not None:
+            found.add((plugin.distribution, plugin_versions([plugin])[plugin]))
     return sorted(found)
 
 
