@@ -22,8 +22,8 @@ from lidarsim.base.errors import LidarError
 from lidarsim.base.input_files import open_input, read_input, read_input_text
 from lidarsim.base.storage import Storage
 from lidarsim.base.yamlfile import read_yaml
-from lidarsim.scene.files.meshfile import CONVERTED, load_meshes
-from lidarsim.scene.files.meshfile import SUFFIXES as MESHES
+from lidarsim.scene.files.mesh_formats import endings
+from lidarsim.scene.files.meshfile import load_meshes
 
 RECORDINGS = (".ply", ".pcd", ".las", ".laz", ".mcap", ".pcap", ".osf")
 TABLES = (".csv", ".tum", ".txt")
@@ -48,7 +48,7 @@ def copies(path):
 
 
 READERS = {
-    **{f"mesh{suffix}": load_meshes for suffix in MESHES},
+    **{f"mesh{suffix}": load_meshes for suffix in endings()},
     **{f"points{suffix}": scene_of_points for suffix in CLOUDS},
     **{f"recording{suffix}": lambda path: compare(path, path) for suffix in RECORDINGS},
     **{f"trajectory{suffix}": load_trajectory for suffix in TABLES},
@@ -134,7 +134,7 @@ def test_folders_are_no_files(tmp_path, name):
     assert "Is a directory" in refused(READERS[name], path)
 
 
-@pytest.mark.parametrize("suffix", CONVERTED)
+@pytest.mark.parametrize("suffix", endings(lambda row: row.advice))
 def test_formats_that_are_not_read_say_what_to_do(tmp_path, suffix):
     path = tmp_path / f"a{suffix}"
     path.write_text("anything")

@@ -1,8 +1,12 @@
 """Every format gives the same objects, and every broken file gives one clear error."""
 
 import gzip
+import importlib
 import re
 import struct
+import subprocess
+import sys
+import types
 
 import numpy as np
 import pytest
@@ -10,8 +14,9 @@ import trimesh
 from tests.meshes import PLY, write
 
 from lidarsim.base.errors import LidarError
-from lidarsim.scene.files import usd
-from lidarsim.scene.files.meshfile import SUFFIXES, load_meshes
+from lidarsim.scene.files import more_formats, rasters, usd
+from lidarsim.scene.files.mesh_formats import endings, known_formats
+from lidarsim.scene.files.meshfile import load_meshes
 from lidarsim.scene.scene import Scene
 from lidarsim.scene.transform import Transform
 
@@ -219,7 +224,7 @@ def test_cuts_and_damage_end_in_meshes_or_in_one_clear_line(tmp_path, two_object
                 content,
                 "broken|cut short|no triangles|is not glTF|no valid JSON|pip install",
             )
-            for suffix in SUFFIXES
+            for suffix in endings()
             for content in (np.random.default_rng(5).bytes(3000), b"no mesh\n" * 20, bytes(2000))
         ],
     ],
@@ -244,3 +249,42 @@ def test_without_the_library_of_openusd_the_error_says_what_to_install(tmp_path,
     monkeypatch.setattr(usd, "find_spec", lambda name: None)
     with pytest.raises(LidarError, match=r'pip install "lidarpool\[usd\]"\.$'):
         load_meshes(write(tmp_path / "m.usda", "#usda 1.0\n"))
+
+
+def test_readers_are_imported_with_the_first_file_of_their_format(tmp_path):
+    path = tmp_path / "m.obj"
+    write(path, OBJ.format(x=0, x1=1))
+    code = (
+        "import sys, lidarsim.scene.scene as scene\n"
+        "known = ('gltf', 'polygon_files', 'dae', 'usd', 'rasters', 'cityjson', 'more_formats')\n"
+        "imported = lambda: [n for n in known if f'lidarsim.scene.files.{n}' in sys.modules]\n"
+        "print(*imported())\n"
+        f"scene.Scene.load({str(path)!r})\n"
+        "print(*imported())"
+    )
+    run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert run.stdout.splitlines() == ["", "polygon_files"]
+
+
+def test_each_format_that_is_read_has_a_reader():
+    rows = [row for row in known_formats() if not row.advice]
+    assert all(callable(row.reader) for row in rows)
+    named = [ending for row in known_formats() for ending in row.endings]
+    assert len(named) == len({*named})
+    assert {*endings(lambda row: row.raster)} == {*rasters.DRIVERS}
+
+
+def test_formats_of_a_package_that_is_not_installed_name_it(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, more_formats.__name__, None)
+    package = more_formats.__name__.partition(".")[0]
+    with pytest.raises(LidarError, match=f"{package} reads more: pip install lidarpool"):
+        load_meshes(write(tmp_path / "m.usd", "#usda 1.0"))
+    assert len(load_meshes(write(tmp_path / "m.obj", OBJ.format(x=0, x1=1)))) == 2
+
+
+def test_a_package_that_lacks_another_one_is_not_taken_as_missing(tmp_path, monkeypatch):
+    broken = types.ModuleType("broken")
+    broken.__getattr__ = lambda name: importlib.import_module("no_such_library")
+    monkeypatch.setitem(sys.modules, more_formats.__name__, broken)
+    with pytest.raises(ModuleNotFoundError, match="no_such_library"):
+        load_meshes(write(tmp_path / "m.usd", "#usda 1.0"))

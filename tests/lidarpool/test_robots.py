@@ -562,7 +562,7 @@ def test_a_robot_alone_stands_still_with_its_joints_at_zero(folder):
     np.testing.assert_allclose(turned[:, 1:], at_zero[:, [0, 2]], atol=1e-6)
     with pytest.raises(LidarError, match="is a robot, which is in metres and Z-up: leave out"):
         build(Scenario.from_data({"scene": [entry | {"unit": "mm"}]}, folder=folder))
-    with pytest.raises(LidarError, match="is a robot: read it with load_robot"):
+    with pytest.raises(LidarError, match="is not read: it is a robot, read it with load_robot"):
         Scene.load(folder / "rover.urdf")
 
 

@@ -40,7 +40,7 @@ from lidarpool.scenario.build import build
 from lidarpool.scenario.campaign_sections import CampaignSection
 from lidarpool.scenario.plausibility import implausibilities
 from lidarpool.scenario.scenario import Scenario
-from lidarsim.scene.files import meshfile, rasters
+from lidarsim.scene.files.mesh_formats import endings
 from lidarsim.sensor.models import SensorModel, model_names, read_model
 
 ROOT = Path(__file__).parents[2]
@@ -102,7 +102,14 @@ def of(*languages: str) -> Any:
 def test_no_code_is_overlooked():
     fences = sum(path.read_text("utf-8").count("\n```") for path in DOCUMENTS)
     assert fences == 2 * len(ALL)  # none has another form
-    assert {block.language for block in ALL} <= {"python", "yaml", "text", "matlab", *_SHELL}
+    assert {block.language for block in ALL} <= {
+        "python",
+        "yaml",
+        "toml",
+        "text",
+        "matlab",
+        *_SHELL,
+    }
 
 
 @pytest.fixture
@@ -382,9 +389,9 @@ def test_numbers_of_formats_and_models_are_those_of_the_code():
     [
         (
             ("how-to/meshes", "how-to/terrain", "how-to/cityjson", "how-to/openusd"),
-            meshfile.SUFFIXES,
+            endings(),
         ),
-        (("how-to/terrain",), rasters.SUFFIXES),
+        (("how-to/terrain",), endings(lambda row: row.raster)),
         (("how-to/point-clouds",), points.SUFFIXES),
     ],
 )

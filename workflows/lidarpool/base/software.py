@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from functools import cache
 from importlib.util import find_spec
 from pathlib import Path
@@ -16,6 +16,7 @@ from distributed import get_worker
 
 from lidarsim._version import __version__
 from lidarsim.base.errors import LidarError
+from lidarsim.base.plugins import Plugin, find_plugin
 from raybeam import backend_build
 
 T = TypeVar("T")
@@ -25,18 +26,23 @@ IMPORTED = time.time()  # in a forked worker, when the fork server imported it
 CLOCKS_S = 5.0  # clocks of a file server and of this machine may differ by so much
 
 
-def software(backend: str = "") -> dict[str, str]:
+def software(backend: str = "", plugins: Iterable[Plugin] = ()) -> dict[str, str]:
     """Describe the software of this process: equal software gives equal bytes.
 
     ``lidarpool`` is its version and a hash of the installed sources. Where it casts with a
-    ray-casting `backend`, ``numpy`` and ``backend`` are versions. Processors do not matter: no byte
-    comes from a function whose last bits depend on them, see `elementary` and `vectors`.
+    ray-casting `backend`, ``numpy`` and ``backend`` are versions. Each of the `plugins` that are
+    used has its distribution, with version and sources, unless this process lacks it. Processors
+    do not matter: no byte comes from a function whose last bits depend on them, see `elementary`
+    and `vectors`.
     """
-    found = {"lidarpool": f"{__version__} (sources {sources()})"}
+    described = {"lidarpool": f"{__version__} (sources {sources()})"}
     if backend:
-        found["numpy"] = np.__version__
-        found["backend"] = f"{backend} {backend_build(backend)}".strip()
-    return found
+        described["numpy"] = np.__version__
+        described["backend"] = f"{backend} {backend_build(backend)}".strip()
+    for plugin in plugins:
+        if (installed := find_plugin(plugin.group, plugin.name)) is not None:
+            described[_entry_of(installed)] = _version_of(installed)
+    return described
 
 
 @cache
@@ -45,30 +51,69 @@ def sources() -> str:
 
     "changed" if files have changed since this process started: it may run code of before.
     """
+    return _hash_of(PACKAGES)
+
+
+@cache
+def _version_of(plugin: Plugin) -> str:
+    """Version of a plug-in's distribution, and the hash of the package that has its module."""
+    return f"{plugin.version} (sources {_hash_of((_package_of(plugin.module),))})"
+
+
+def _package_of(module: str) -> str:
+    """Name of the outermost package of a module that is no namespace, or of the module itself."""
+    parts = module.split(".")
+    for count in range(1, len(parts)):
+        name = ".".join(parts[:count])
+        spec = find_spec(name)
+        if spec is not None and spec.origin is not None:
+            return name
+    return module
+
+
+def _hash_of(packages: Iterable[str]) -> str:
+    """Hash of the files of packages or modules, see `sources`."""
     digest = hashlib.sha256()
-    newest = 0.0
-    for package in PACKAGES:
-        spec = find_spec(package)
-        [root] = spec.submodule_search_locations or [""] if spec else [""]
-        files = [path for path in Path(root).rglob("*") if path.is_file()]
-        for path in sorted(files, key=lambda path: path.relative_to(root).as_posix()):
-            if "__pycache__" in path.parts:
-                continue
+    newest_s = 0.0
+    for package in packages:
+        for name, path in _files_of(package):
             content = path.read_bytes()
-            newest = max(newest, path.stat().st_mtime)
-            name = f"{package}/{path.relative_to(root).as_posix()}"
+            newest_s = max(newest_s, path.stat().st_mtime)
             digest.update(f"{name} {len(content)} ".encode() + content)
-    if newest > min(IMPORTED, psutil.Process().create_time()) + CLOCKS_S:
+    if newest_s > min(IMPORTED, psutil.Process().create_time()) + CLOCKS_S:
         return "changed since the process started"
     return digest.hexdigest()[:8]
 
 
-def software_there(backend: str = "") -> Callable[[], dict[str, str]]:
+def _files_of(package: str) -> Iterator[tuple[str, Path]]:
+    """Yield the files of a package or module, with names that start with the package's."""
+    try:
+        spec = find_spec(package)
+    except ModuleNotFoundError:  # of the package that it is in
+        spec = None
+    if spec is None:
+        return
+    if not spec.submodule_search_locations:
+        if spec.origin is not None:
+            yield package, Path(spec.origin)
+        return
+    root = Path(spec.submodule_search_locations[0])
+    files = {path.relative_to(root).as_posix(): path for path in root.rglob("*") if path.is_file()}
+    for name in sorted(files):
+        if "__pycache__" not in files[name].parts:
+            yield f"{package}/{name}", files[name]
+
+
+def software_there(
+    backend: str = "", plugins: Sequence[Plugin] = ()
+) -> Callable[[], dict[str, str]]:
     """Make a function that describes a worker's software.
 
     It is nested, so that it is sent by value: a worker without the package, or with another
     version, can run it too. Without the package it returns an empty dictionary.
     """
+    # By value as well: classes of this package are sent by name.
+    named = [(one.group, one.name, one.value, one.distribution, one.version) for one in plugins]
 
     def ask() -> dict[str, str]:
         try:
@@ -76,12 +121,19 @@ def software_there(backend: str = "") -> Callable[[], dict[str, str]]:
         except ModuleNotFoundError:
             return {}
         try:
+            from lidarsim.base.plugins import Plugin
+
             from .software import software
         except ModuleNotFoundError:
             return {"lidarpool": __version__}
-        return software(backend)
+        return software(backend, [Plugin(*one) for one in named])
 
     return ask
+
+
+def plugin_versions(plugins: Iterable[Plugin]) -> dict[Plugin, str]:
+    """Return the version and sources of plug-ins that this process uses."""
+    return {plugin: _version_of(plugin) for plugin in plugins}
 
 
 def call_alike(wanted: str, function: Callable[..., T], *arguments: Any) -> T:
@@ -89,14 +141,35 @@ def call_alike(wanted: str, function: Callable[..., T], *arguments: Any) -> T:
 
     `wanted` is ``lidarpool`` in the `software` of the run's driver. LidarError if not.
     """
-    here = software()["lidarpool"]
-    if here != wanted:
+    return _call(software(), {"lidarpool": wanted}, function, *arguments)
+
+
+def call_with_plugins(
+    versions: Mapping[Plugin, str], function: Callable[..., T], *arguments: Any
+) -> T:
+    """Call a function in a task, if its worker has the plug-ins of the run's driver.
+
+    `versions` are those of `plugin_versions`. LidarError if a plug-in differs or is missing.
+    """
+    wanted = {_entry_of(plugin): version for plugin, version in versions.items()}
+    return _call(software(plugins=versions), wanted, function, *arguments)
+
+
+def _call(
+    here: Mapping[str, str], wanted: Mapping[str, str], function: Callable[..., T], *arguments: Any
+) -> T:
+    if differs := difference(here, wanted):
         worker = get_worker()
         raise LidarError(
-            f"worker {worker.name} at {worker.address} has lidarpool {here}, the run {wanted}: "
-            "install the same on both, and start the worker again."
+            f"worker {worker.name} at {worker.address} has {differs}: install the same on both, "
+            "and start the worker again."
         )
     return function(*arguments)
+
+
+def _entry_of(plugin: Plugin) -> str:
+    """Name of a plug-in's entry in `software`."""
+    return f"plug-in {plugin.distribution}"
 
 
 def difference(there: Mapping[str, Any], here: Mapping[str, str]) -> str:

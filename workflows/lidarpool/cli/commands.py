@@ -24,6 +24,7 @@ from lidarsim.base.interrupts import (
     deferred_interrupts,
     interrupt_on_signals,
 )
+from lidarsim.base.plugins import find_plugin, plugins_of
 from lidarsim.base.vocabulary import PATIENCE_S, QUEUE_S, WAIT_S
 from lidarsim.base.words import plural
 
@@ -39,6 +40,7 @@ if TYPE_CHECKING:
     from .terminal import Terminal
 
 PROGRAM = "lidarpool"
+PLUGINS = "lidarpool.commands"  # each is a click.Command
 
 # What `demo` and `run` have in common; each is a field of RunOptions.
 _shown = shared.together(
@@ -115,7 +117,31 @@ def _runs(command: Callable[..., None]) -> Callable[..., None]:
     return prepared
 
 
+class _Commands(click.Group):
+    """The commands of this package and, for names that it has not, those of plug-ins."""
+
+    def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
+        """Return the command of a name; LidarError if its plug-in cannot be used."""
+        command = super().get_command(ctx, cmd_name)
+        if command is None and (plugin := find_plugin(PLUGINS, cmd_name)) is not None:
+            return plugin.load(click.Command)
+        return command
+
+    def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        """Write the commands for the help; plug-ins are named, and not imported."""
+        super().format_commands(ctx, formatter)
+        rows = [
+            (name, " and ".join(f"{plugin.distribution} {plugin.version}" for plugin in plugins))
+            for name, plugins in plugins_of(PLUGINS).items()
+            if name not in self.commands
+        ]
+        if rows:
+            with formatter.section("Commands of plug-ins"):
+                formatter.write_dl(rows)
+
+
 @click.group(
+    cls=_Commands,
     commands=[
         *(init, import_, check, schema, scene, sensors, stations),
         *(view, plot, export, compare, fit),

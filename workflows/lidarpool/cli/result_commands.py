@@ -14,7 +14,7 @@ from lidarsim.base.errors import LidarError
 from lidarsim.base.storage import Storage
 from lidarsim.base.vocabulary import PICTURES, UNITS_M
 
-from ..export.format_table import EXPORTS, FORMATS, LAYOUTS
+from ..export.format_table import EXPORTS, LAYOUTS, row_of
 from . import shared_options as options
 
 
@@ -25,6 +25,20 @@ def _size(text: str) -> tuple[int, int]:
     raise click.BadParameter(
         f"{text!r} is not a picture size: give width x height in pixels, such as 1600x1000."
     )
+
+
+class _FormatName(click.Choice[str]):
+    """A format of the table, or of a plug-in."""
+
+    def __init__(self) -> None:
+        super().__init__(EXPORTS)
+
+    def convert(self, value: str, param: Any, ctx: Any) -> str:
+        """Return the name; an error if there is no such format, or its plug-in cannot be used."""
+        if value in EXPORTS or value == "ply":
+            return super().convert(value, param, ctx)
+        row_of(value)
+        return value
 
 
 @click.command()
@@ -87,10 +101,10 @@ def plot(result: Path | Storage, out: Path | Storage | None, **given: Any) -> No
     "--format",
     "-f",
     "formats",
-    type=click.Choice(list(EXPORTS)),
+    type=_FormatName(),
     multiple=True,
     required=True,
-    help="Format to write; may be given several times.",
+    help="Format to write, also one of a plug-in; may be given several times.",
 )
 @click.option(
     "--layout",
@@ -143,7 +157,7 @@ def export(
         sweeps = Sweeps.load(made / SWEEPS_FILE)
         cloud = CloudFile(made / "cloud.ply")
         # As the layout, for the formats that have the option; refused if none has.
-        choosing = {name for name in formats if FORMATS[name].raw_or_compensated} or {*formats}
+        choosing = {name for name in formats if row_of(name).raw_or_compensated} or {*formats}
         wanted = [
             Format(name, layout, compensated and name in choosing)
             for name in dict.fromkeys(formats)

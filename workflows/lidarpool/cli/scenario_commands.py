@@ -107,7 +107,7 @@ def init(folder: Path, meshes: tuple[Path, ...], of_mesh: dict[str, Any], every:
 
 
 @click.command(name="import")
-@click.argument("survey", metavar="SURVEY.xml", type=click.Path(path_type=Path))
+@click.argument("survey", metavar="SURVEY", type=click.Path(path_type=Path))
 @click.option(
     "--assets",
     metavar="DIR",
@@ -120,34 +120,38 @@ def init(folder: Path, meshes: tuple[Path, ...], of_mesh: dict[str, Any], every:
     "--out", "-o", metavar="DIR", help="Folder for the scenario.  [default: named after the survey]"
 )
 def import_(survey: Path, assets: tuple[Path, ...], out: Path | None) -> None:
-    """Write a HELIOS++ survey as a scenario.
+    """Write a survey of another program as a scenario.
 
-    Unsupported features are listed, one line each. Mesh files stay where they are.
+    Surveys of HELIOS++ are read, and those for which a plug-in is installed. Unsupported features
+    are listed, one line each. Mesh files stay where they are.
 
     \b
     Examples:
       lidarpool import helios/data/surveys/toyblocks/als_toyblocks.xml
       lidarpool import survey.xml --assets helios/python/pyhelios -o surveys/wood
     """  # noqa: D301 - click wants the character, not its name
+    from ..importers.by_plugin import SCENARIO_FILE, import_by, importer_of
     from ..importers.helios import import_survey
     from ..scenario.build import build
     from ..scenario.point_scene import surfels
     from ..scenario.scenario import Scenario
 
-    imported = import_survey(
-        survey,
-        out or Path(survey.stem),
-        assets,
-        check=lambda path: build(Scenario.load(path)),
-        surfels=surfels,
-    )
-    scenario = Scenario.load(imported.path)
+    def check(path: Path) -> None:
+        build(Scenario.load(path))
+
+    folder = out or Path(survey.stem)
+    if (plugin := importer_of(survey)) is not None:
+        left_out = import_by(plugin, survey, folder, assets, check=check)
+    else:
+        left_out = import_survey(survey, folder, assets, check=check, surfels=surfels).left_out
+    file = folder / SCENARIO_FILE
+    scenario = Scenario.load(file)
     sensors = plural(len(scenario.sensors), "sensor")
     files = plural(len(scenario.scene.files), "mesh file")
-    click.echo(f"{click.format_filename(imported.path)}: {sensors}, {files}")
-    for line in imported.left_out:
+    click.echo(f"{click.format_filename(file)}: {sensors}, {files}")
+    for line in left_out:
         click.echo(f"not supported: {line}")
-    click.echo(f"next: lidarpool check {shlex.quote(str(imported.path))}")
+    click.echo(f"next: lidarpool check {shlex.quote(str(file))}")
 
 
 @click.command()
@@ -385,11 +389,17 @@ def sensors(model: str | None, out: Path | None) -> None:
       lidarpool sensors velodyne/vlp16
       lidarpool sensors velodyne/vlp16 --out vlp16.png
     """  # noqa: D301 - click wants the character, not its name
-    from lidarsim.sensor.models import load_sensor, model_names, read_model, shown_noise
+    from lidarsim.sensor.models import (
+        load_sensor,
+        model_names,
+        plugin_model_names,
+        read_model,
+        shown_noise,
+    )
 
     if model is None:
         heads = ("model", "channels", "field of view", "range", "turns a second", "points a second")
-        rows = [heads, *map(_row, model_names())]
+        rows = [heads, *map(_row, (*model_names(), *plugin_model_names()))]
         widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
         for row in rows:
             click.echo("  ".join(map(str.ljust, row, widths)).rstrip())

@@ -201,7 +201,7 @@ class _OpenJob:
                 boxes = Boxes(sizes=sizes, **arrays)
                 self.boxes = boxes.inward(self.sweeps.pose, slice(None))
         entry = Entry(job.number, job.name, job.split)
-        self.reader: Reader = row.load().Reader(place, self.sweeps, entry, written.layout)
+        self.reader: Reader = row.provides("Reader")(place, self.sweeps, entry, written.layout)
 
     def read(self, sweep: int) -> Sweep:
         """Read a sweep."""

@@ -1,44 +1,116 @@
 """The table of formats: what writes and reads each, and what it needs; one row a format.
 
-It is quick to import: help and completion of the command read it.
+It is quick to import: help and completion of the command read it. Other packages add formats as
+plug-ins of the group `GROUP`, whose names are those of the formats.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Collection, Iterable, Mapping
+from contextlib import suppress
+from dataclasses import dataclass, field, replace
+from functools import cache
 from importlib import import_module
+from importlib.util import find_spec
 from typing import Any
 
 from lidarsim.base.errors import LidarError
+from lidarsim.base.plugins import Plugin, find_plugin, plugins_of
+from lidarsim.base.words import did_you_mean
+
+GROUP = "lidarpool.clouds"
 
 
 @dataclass(frozen=True)
 class FormatRow:
-    """What a format is."""
+    """A format of clouds: its module, its files, and what it needs and holds.
 
-    file: str  # or folder, in the folder of a result; an ending chooses the format
-    # Of this room: writes it by `write_NAME(path, cloud, sweeps)`, or by `Pieces`, and reads single
-    # sweeps of data sets by `Reader`.
+    Parameters
+    ----------
+    file
+        File or folder in the folder of a result; an ending chooses the format.
+    module
+        Dotted name of the module that writes it. A class `Reader` there (`export/reading.py`) reads
+        single sweeps of data sets.
+    write
+        Name of the function of the module that writes it, `write(path, cloud, sweeps)`, or with
+        `in_pieces` of a subclass of `Pieces` (`export/pieces.py`), which says what is in which
+        file.
+    in_pieces
+        Whether it has many files, which workers can write.
+    packages
+        Import packages that write it, and `extra`, the extra of lidarpool that installs them.
+    needs
+        Columns that a cloud must have; formats that need `scan` store single sweeps.
+    holds
+        Columns that it can hold; None for all.
+    named
+        Columns that it holds beside those if classes have names.
+    layouts
+        {layout: columns that it needs and holds beside those}, where there are layouts. The
+        function that writes it then takes `layout` and `compensated` as well.
+    raw_or_compensated
+        Whether it has an option for points at the start of the sweep.
+    one_system
+        Whether readers expect all points in one coordinate system.
+    compensates
+        Whether its points are always compensated for motion.
+    laser_scans
+        Whether it has a LaserScan of 2D scanners.
+    inside
+        Of a folder: pattern of the names of its files.
+    data_set
+        Name of the data sets whose jobs are written in it; empty if there are none, as of plug-ins.
+    of_job
+        There: path of a job's file or folder, if it has one, by `Entry`.
+    boxes
+        There: whether its pieces are sweeps, and each comes with its boxes of actors.
+    raw
+        There: whether a sweep has files of its own, which hold rows of numbers.
+    plugin
+        The plug-in that provides the row; filled in when the plug-in is loaded.
+    """
+
+    file: str
     module: str
-    in_pieces: bool = False  # it has many files, which workers can write: `Pieces` says which
-    # What writes it; the extra of lidarpool that installs them has the name of the module.
+    write: str
+    in_pieces: bool = False
     packages: tuple[str, ...] = ()
-    needs: tuple[str, ...] = ()  # columns; formats that need `scan` store single sweeps
-    holds: tuple[str, ...] | None = None  # columns; None for all
-    named: tuple[str, ...] = ()  # columns that it holds beside those if classes have names
-    # {layout: columns that it needs and holds beside those}, where there are layouts
+    extra: str = ""
+    needs: tuple[str, ...] = ()
+    holds: tuple[str, ...] | None = None
+    named: tuple[str, ...] = ()
     layouts: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
-    raw_or_compensated: bool = False  # it has an option for points at the start of the sweep
-    inside: str = ""  # of a folder: pattern of the names of its files
-    data_set: str = ""  # name of the data sets whose jobs are written in it, if there are such
-    of_job: str = ""  # there: place of a job's file or folder, if it has one, by `Entry`
-    boxes: bool = False  # there: its pieces are sweeps, and each comes with its boxes of actors
-    raw: bool = False  # there: a sweep has files of its own, which hold rows of numbers
+    raw_or_compensated: bool = False
+    one_system: bool = False
+    compensates: bool = False
+    laser_scans: bool = False
+    inside: str = ""
+    data_set: str = ""
+    of_job: str = ""
+    boxes: bool = False
+    raw: bool = False
+    plugin: Plugin | None = field(default=None, compare=False)
 
-    def load(self) -> Any:
-        """Import the module."""
-        return import_module(f".{self.module}", __package__)
+    @property
+    def missing_packages(self) -> list[str]:
+        """The packages that write it and are not installed here."""
+        return [package for package in self.packages if find_spec(package) is None]
+
+    def provides(self, name: str) -> Any:
+        """Import the module, and return its function or class of a name.
+
+        Raises
+        ------
+        LidarError
+            If it is that of a plug-in and cannot be imported, or lacks the name.
+        """
+        if self.plugin is None:
+            return getattr(import_module(self.module), name)
+        module = replace(self.plugin, value=self.module).load(object)
+        if not hasattr(module, name):
+            raise self.plugin.lacks(f"{self.module}.{name}")
+        return getattr(module, name)
 
 
 _ALL_RAYS = ("ray", "range")  # and every return: see `check_whole`
@@ -53,68 +125,190 @@ _SURFACES = (
     "normal_x", "normal_y", "normal_z", "incidence_deg", "origin_x", "origin_y", "origin_z",
 )  # fmt: skip
 _E57 = ("intensity", *_COLOURS, *_SURFACES[:3])
-_LAS = ("laspy", "lazrs")
 _LABELS = ("object", "intensity", "class")
 _KITTI_COLUMNS = ("object", "reflectivity", "class")
 _RINGS = ("channel", "intensity")
-_BAG = (
-    False,
-    ("rosbags",),
-    ("scan", "object", "channel"),
-    ("channel", *_COLOURS, "radial_velocity", *_SURFACES, "material"),
-    ("class",),
-    LAYOUTS,
-    True,
-)
+_BAG_COLUMNS = ("channel", *_COLOURS, "radial_velocity", *_SURFACES, "material")
 
-_KITTI = (
+_KITTI_FILES = (
     r"semantic-kitti\.yaml|poses/[^/]+\.txt|"
     r"sequences/[^/]+/((poses|times|calib)\.txt|(velodyne|labels|label_2)/\d+\.(bin|label|txt))"
 )
-_NUSCENES = (
+_NUSCENES_FILES = (
     r"(samples|sweeps)/[^/]+/([^/]+/)?\d+\.pcd\.bin|v1\.0-lidarpool/\w+\.json|maps/none\.png|"
     r"lidarseg/v1\.0-lidarpool/[^/]+\.pcd\.bin"
 )
-_SHARDS = r"shards/([^/]+/)?[^/]+\.tar|offsets/[^/]+\.npz"
-_PARTS = r"part-\d+\.parquet"
+
+
+def _las(name: str) -> FormatRow:
+    return FormatRow(
+        f"cloud.{name}",
+        "lidarpool.export.las",
+        f"write_{name}",
+        packages=("laspy", "lazrs"),
+        extra="las",
+        one_system=True,
+    )
+
+
+def _bag(name: str, file: str, **fields: Any) -> FormatRow:
+    return FormatRow(
+        file,
+        "lidarpool.export.ros",
+        f"write_{name}",
+        packages=("rosbags",),
+        extra="ros",
+        needs=("scan", "object", "channel"),
+        holds=_BAG_COLUMNS,
+        named=("class",),
+        layouts=LAYOUTS,
+        raw_or_compensated=True,
+        laser_scans=True,
+        **fields,
+    )
+
 
 FORMATS = {
     "ply": FormatRow(
-        "cloud.ply", "ply", data_set="folder", of_job="jobs/{name}/cloud.ply"
+        "cloud.ply",
+        "lidarpool.export.ply",
+        "write_ply",
+        data_set="folder",
+        of_job="jobs/{name}/cloud.ply",
     ),
-    "las": FormatRow("cloud.las", "las", False, _LAS),
-    "laz": FormatRow("cloud.laz", "las", False, _LAS),
+    "las": _las("las"),
+    "laz": _las("laz"),
     "parquet": FormatRow(
-        "cloud.parquet", "parquet", True, ("pyarrow",), inside=_PARTS, data_set="parquet",
+        "cloud.parquet",
+        "lidarpool.export.parquet",
+        "Pieces",
+        in_pieces=True,
+        packages=("pyarrow",),
+        extra="parquet",
+        inside=r"part-\d+\.parquet",
+        data_set="parquet",
         of_job="points/job={number}",
     ),
     "pcd": FormatRow(
-        "pcd", "pcd", True, ("pypcd4",), ("scan",), raw_or_compensated=True, inside=r"\d+\.pcd"
+        "pcd",
+        "lidarpool.export.pcd",
+        "Pieces",
+        in_pieces=True,
+        packages=("pypcd4",),
+        extra="pcd",
+        needs=("scan",),
+        raw_or_compensated=True,
+        inside=r"\d+\.pcd",
     ),
     "images": FormatRow(
-        "images", "images", True, (), ("scan", *_ALL_RAYS), inside=r"[^/]+/\d+\.npz",
-        data_set="images", of_job="images/{name}", boxes=True,
+        "images",
+        "lidarpool.export.images",
+        "Pieces",
+        in_pieces=True,
+        needs=("scan", *_ALL_RAYS),
+        inside=r"[^/]+/\d+\.npz",
+        data_set="images",
+        of_job="images/{name}",
+        boxes=True,
     ),
-    "e57": FormatRow("cloud.e57", "e57", False, ("pye57",), ("scan",), _E57),
+    "e57": FormatRow(
+        "cloud.e57",
+        "lidarpool.export.e57",
+        "write_e57",
+        packages=("pye57",),
+        extra="e57",
+        needs=("scan",),
+        holds=_E57,
+        compensates=True,
+    ),
     "kitti": FormatRow(
-        "kitti", "kitti", True, (), ("scan", *_KITTI_COLUMNS), _KITTI_COLUMNS, inside=_KITTI,
-        data_set="kitti", boxes=True, raw=True,
+        "kitti",
+        "lidarpool.export.kitti",
+        "Pieces",
+        in_pieces=True,
+        needs=("scan", *_KITTI_COLUMNS),
+        holds=_KITTI_COLUMNS,
+        compensates=True,
+        inside=_KITTI_FILES,
+        data_set="kitti",
+        boxes=True,
+        raw=True,
     ),
     "nuscenes": FormatRow(
-        "nuscenes", "nuscenes", True, (), ("scan", "object", *_RINGS), _RINGS, ("class",),
-        inside=_NUSCENES, data_set="nuscenes", boxes=True, raw=True,
+        "nuscenes",
+        "lidarpool.export.nuscenes",
+        "Pieces",
+        in_pieces=True,
+        needs=("scan", "object", *_RINGS),
+        holds=_RINGS,
+        named=("class",),
+        compensates=True,
+        inside=_NUSCENES_FILES,
+        data_set="nuscenes",
+        boxes=True,
+        raw=True,
     ),
     "webdataset": FormatRow(
-        "webdataset", "webdataset", True, (), ("scan", *_LABELS), inside=_SHARDS,
-        data_set="webdataset", boxes=True,
+        "webdataset",
+        "lidarpool.export.webdataset",
+        "Pieces",
+        in_pieces=True,
+        needs=("scan", *_LABELS),
+        inside=r"shards/([^/]+/)?[^/]+\.tar|offsets/[^/]+\.npz",
+        data_set="webdataset",
+        boxes=True,
     ),
-    "mcap": FormatRow(
-        "cloud.mcap", "ros", *_BAG, data_set="mcap", of_job="bags/{name}.mcap"
-    ),
-    "rosbag2": FormatRow("rosbag2", "ros", *_BAG, inside=r"metadata\.yaml|rosbag2\w*\.mcap"),
-}  # fmt: skip
+    "mcap": _bag("mcap", "cloud.mcap", data_set="mcap", of_job="bags/{name}.mcap"),
+    "rosbag2": _bag("rosbag2", "rosbag2", inside=r"metadata\.yaml|rosbag2\w*\.mcap"),
+}
 DATA_SETS = {row.data_set: name for name, row in FORMATS.items() if row.data_set}  # {its: of jobs}
 EXPORTS = tuple(name for name in FORMATS if name != "ply")  # what a result has if it is asked for
+
+
+def row_of(name: str) -> FormatRow:
+    """Return the row of a format, of the table or of a plug-in.
+
+    Raises
+    ------
+    LidarError
+        If there is none of that name, or its plug-in cannot be used.
+    """
+    return FORMATS[name] if name in FORMATS else _row_of_plugin(name)
+
+
+@cache
+def _row_of_plugin(name: str) -> FormatRow:
+    plugin = find_plugin(GROUP, name)
+    if plugin is None:
+        names = [*FORMATS, *plugins_of(GROUP)]
+        raise LidarError(
+            f"{name!r} is not a format of clouds; these are: {', '.join(names)}."
+            f"{did_you_mean(name, names)}"
+        )
+    row = plugin.load(FormatRow)
+    if row.data_set:
+        raise LidarError(
+            f"{plugin} has data sets, {row.data_set!r}, which plug-ins cannot have: leave out "
+            "data_set."
+        )
+    if "/" in row.file or row.file in [known.file for known in FORMATS.values()]:
+        raise LidarError(
+            f"{plugin} writes {row.file!r}: name a file or folder that no other format has, and no "
+            "folder above it."
+        )
+    return replace(row, plugin=plugin)
+
+
+def plugin_rows(files: Collection[str]) -> list[FormatRow]:
+    """Return the rows of plug-ins whose file or folder is among some names.
+
+    Plug-ins that cannot be used are left out.
+    """
+    rows: list[FormatRow] = []
+    for name in plugins_of(GROUP) if files else ():
+        with suppress(LidarError):
+            rows += [row for row in [row_of(name)] if row.file in files]
+    return rows
 
 
 def check_whole(needs: Iterable[str], keep_every: int) -> None:

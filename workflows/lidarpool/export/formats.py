@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Collection, Mapping
+from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -21,13 +20,14 @@ from lidarsim.sweeps.sweeps import Sweeps
 
 from ..columns.parts import StoredCloud
 from .folder import staging
-from .format_table import EXPORTS, FORMATS, LAYOUTS, FormatRow
+from .format_table import EXPORTS, FORMATS, LAYOUTS, FormatRow, row_of
 from .laser_scan import COLUMNS as LASER_SCAN_COLUMNS
 from .laser_scan import has_laser_scans
 from .pieces import RangeWorkers, RangeWriter
 
 _ENDINGS = {Path(row.file).suffix: name for name, row in FORMATS.items() if "." in row.file}
 _FILES = "; ".join(f"{name}: {FORMATS[name].file}" for name in EXPORTS)
+_NAMES: dict[str, Any] = {"anyOf": [{"enum": [*FORMATS]}, {"type": "string"}]}  # for editors
 
 
 @dataclass(frozen=True)
@@ -35,10 +35,7 @@ _FILES = "; ".join(f"{name}: {FORMATS[name].file}" for name in EXPORTS)
 class Format:
     """A format that a cloud is exported to; in YAML also just its name."""
 
-    format: Annotated[
-        Literal[tuple(FORMATS)],  # type: ignore[valid-type]
-        about(_FILES),
-    ]
+    format: Annotated[str, about(f"{_FILES}; or of a plug-in", json_schema_extra=_NAMES)]
     layout: Annotated[
         Literal[tuple(LAYOUTS)],  # type: ignore[valid-type]
         about("layout of points in mcap and rosbag2"),
@@ -52,7 +49,8 @@ class Format:
     ] = False
 
     def __post_init__(self) -> None:
-        if self.compensated and not self.row.raw_or_compensated:
+        row = self.row  # LidarError if there is no such format
+        if self.compensated and not row.raw_or_compensated:
             choices = [name for name, row in FORMATS.items() if row.raw_or_compensated]
             raise LidarError(
                 f"compensated is an option of {', '.join(choices)}, not of {self.format}: leave it "
@@ -71,8 +69,8 @@ class Format:
 
     @property
     def row(self) -> FormatRow:
-        """Its row of the table."""
-        return FORMATS[self.format]
+        """The row of the table, or of a plug-in."""
+        return row_of(self.format)
 
     @property
     def _laid_out(self) -> tuple[str, ...]:
@@ -88,7 +86,7 @@ class Format:
         """Names of the cloud's columns that it cannot hold."""
         held, there = self.row.holds, (column.name for column in cloud.table)
         more = self._laid_out + (self.row.named if sweeps.classes else ())
-        if self.row.module == "ros" and has_laser_scans(sweeps):
+        if self.row.laser_scans and has_laser_scans(sweeps):
             more += LASER_SCAN_COLUMNS
         if held is None:
             return [name for name in there if name == "time" and self.compensated]
@@ -104,12 +102,12 @@ class Format:
         """Return a note if the cloud's coordinates are not what readers of the format expect."""
         if coordinates != "sensor":
             return []
-        if self.format in ("las", "laz"):
+        if self.row.one_system:
             return [
                 f"readers of {self.format} expect points in one coordinate system, and with "
                 "cloud.coordinates sensor each is in the sensor's axes at its firing: use world"
             ]
-        if self.compensated or self.format in ("kitti", "nuscenes", "e57"):
+        if self.compensated or self.row.compensates:
             return [
                 f"{self.format} holds points compensated for motion, although cloud.coordinates is "
                 "sensor: they are brought to the start of the sweep"
@@ -117,21 +115,19 @@ class Format:
         return []
 
     @property
-    def _absent(self) -> list[str]:
-        return [package for package in self.row.packages if find_spec(package) is None]
-
-    @property
     def installed(self) -> bool:
         """Whether the packages that write it are installed here."""
-        return not self._absent
+        return not self.row.missing_packages
 
     def check_installed(self) -> None:
         """Check that it can be written here; LidarError if a package is missing."""
-        if self._absent:
+        if missing := self.row.missing_packages:
+            extra = f'"lidarpool[{self.row.extra}]"' if self.row.extra else " ".join(missing)
             raise LidarError(
-                f"The format {self.format} needs {' and '.join(self._absent)}: "
-                f'pip install "lidarpool[{self.row.module}]".'
+                f"The format {self.format} needs {' and '.join(missing)}: pip install {extra}."
             )
+        if self.row.plugin is not None:
+            self.row.provides(self.row.write)
 
     def check(self, path: Path, cloud: CloudLike, *, overwrite: bool = False) -> None:
         """Check the needs of `write` before anything is written, or raise LidarError."""
@@ -140,7 +136,8 @@ class Format:
             raise LidarError(f"The folder {path.parent} does not exist: make it first.")
         if path.exists() and not overwrite:
             raise LidarError(f"{path} exists: give another place with --out, or --overwrite.")
-        refuse_strangers(Storage.at(path.parent), [path.name])
+        if path.name == self.row.file:
+            refuse_strangers(Storage.at(path.parent), [self.row])
         self.check_columns(cloud)
 
     def check_columns(self, cloud: CloudLike) -> None:
@@ -185,7 +182,7 @@ class Format:
                     place = Storage(str(staged), durable=False)
                     self._range_writer(cloud, sweeps, place).write(workers)
                 else:
-                    write = getattr(self.row.load(), f"write_{self.format}")
+                    write = self.row.provides(self.row.write)
                     write(staged, cloud, sweeps, **more)
                 flush(staged)
                 if path.is_dir() or staged.is_dir():  # files replace files atomically
@@ -210,9 +207,11 @@ class Format:
                 raise
 
 
-def refuse_strangers(place: Storage, names: Collection[str]) -> None:
-    """Refuse to replace those of some folders of formats that hold files of others."""
-    for row in (row for row in FORMATS.values() if row.inside and row.file in names):
+def refuse_strangers(place: Storage, rows: Iterable[FormatRow]) -> None:
+    """Refuse to replace those folders of some formats that hold files of others."""
+    for row in rows:
+        if not row.inside:
+            continue
         own = re.compile(rf"{row.file}/(?:{row.inside}|(?:.*/)?\.(?:lidarpool-|writing).*)")
         for name in place.tree(row.file):
             if not own.fullmatch(name):
@@ -246,7 +245,7 @@ def save_cloud(
         Its folder must exist. An existing file is replaced, a folder is not.
     format
         Such as "laz", and for folders of many files "parquet", "pcd", "images", "kitti",
-        "nuscenes", "webdataset" or "rosbag2".
+        "nuscenes", "webdataset" or "rosbag2"; also one of a plug-in.
     layout
         Layout of points in mcap and rosbag2: velodyne, autoware, ouster, or images, which is
         velodyne with range images.

@@ -12,11 +12,12 @@ from typing import Any
 
 from lidarsim.base.arrays import AnyArray
 from lidarsim.base.errors import LidarError
+from lidarsim.base.plugins import Plugin
 from lidarsim.base.storage import Storage
 from lidarsim.columns.cloud import Cloud, CloudLike
 from lidarsim.sweeps.sweeps import MIXED_UP, Sweeps
 
-from .format_table import FORMATS
+from .format_table import row_of
 
 # NumPy, pyarrow and system calls for the disk hold Python's lock at most 6 % of the time.
 THREADS = min(4, os.cpu_count() or 1)
@@ -44,7 +45,7 @@ class Entry:
 
     def place(self, format: str) -> str:  # noqa: A002
         """Name of its file or folder in data sets whose jobs are written in a format."""
-        return FORMATS[format].of_job.format(number=self.number, name=self.name)
+        return row_of(format).of_job.format(number=self.number, name=self.name)
 
 
 class Pieces:
@@ -145,6 +146,12 @@ class RangeWriter:
         pieces.compensated = self.compensated
         return pieces
 
+    @property
+    def plugins(self) -> tuple[Plugin, ...]:
+        """The plug-in of the format, which processes that write ranges need, or none."""
+        plugin = row_of(self.format).plugin
+        return () if plugin is None else (plugin,)
+
     def stop(self) -> None:
         """Let no further range be written."""
         self.place.remove([_MARK])
@@ -178,7 +185,8 @@ def pieces_of(
     entry: Entry | None = None,
 ) -> Pieces:
     """Return the pieces of a cloud in a format of many files, as a job's with an `entry`."""
-    pieces: Pieces = FORMATS[format].load().Pieces(cloud, sweeps, entry)
+    row = row_of(format)
+    pieces: Pieces = row.provides(row.write)(cloud, sweeps, entry)
     return pieces
 
 

@@ -22,7 +22,7 @@ from ..base.open3d_module import load_open3d
 from ..base.writing_progress import WritingProgress
 from ..columns.parts import StoredCloud
 from ..export.folder import LAST_FILE, result_folder, staging
-from ..export.format_table import EXPORTS, FORMATS
+from ..export.format_table import FORMATS, FormatRow, plugin_rows
 from ..export.formats import Format, refuse_strangers
 from ..export.navigation_files import write_instruments
 from ..run.conductor import Conductor, Output
@@ -37,8 +37,7 @@ CLOUD, PAGE, REPORT = FORMATS["ply"].file, "report.html", LAST_FILE
 _DRAWN = tuple(f"{name}.png" for name in PICTURES)
 FILES = (CLOUD, *_DRAWN, PICTURE_FILE, SWEEPS_FILE, PAGE, REPORT)
 _SURVEY = ("scene", "survey")  # what tells one from another
-# What only some results have.
-_FURTHER = (*(FORMATS[name].file for name in EXPORTS), *INSTRUMENT_FILES)
+_OF_FORMATS = {row.file: row for row in FORMATS.values() if row.file != CLOUD}
 
 
 @dataclass(eq=False)
@@ -99,7 +98,7 @@ class SurveyOutput(Output[tuple[RunResult, dict[str, Any]]]):
         if foreign and not overwrite:
             lists = f"{place} holds {foreign[0]}, which no result there lists"
             raise LidarError(f"{lists}: {advice}")
-        refuse_strangers(storage, {*further, *listed})
+        refuse_strangers(storage, _rows({*further, *listed}))
 
     def finish(
         self, conductor: Conductor[tuple[RunResult, dict[str, Any]]]
@@ -168,7 +167,7 @@ class SurveyOutput(Output[tuple[RunResult, dict[str, Any]]]):
             explained(f"The result cannot be written to {place}", advice),
             staging(folder, place) as staged,
         ):
-            refuse_strangers(target, {*further, *earlier})
+            refuse_strangers(target, _rows({*further, *earlier}))
             clear = cache(partial(_clear, target, further, earlier))  # once
             sweeps.save(staged / SWEEPS_FILE)
             if (instruments := sweeps.instruments) is not None:
@@ -200,7 +199,7 @@ class SurveyOutput(Output[tuple[RunResult, dict[str, Any]]]):
                 _move(staged, folder, report["files"], earlier, then)
             else:
                 clear()
-                for name in (*_FURTHER, *FILES):
+                for name in (*_known_further(further), *FILES):
                     if (staged / name).exists():
                         storage.put(staged / name, name)
                 with deferred_interrupts():
@@ -228,6 +227,18 @@ def _further_files(survey: Survey, formats: Sequence[Format]) -> list[str]:
     instruments = Instruments.of(survey)
     measured = [] if instruments is None else instruments.files
     return [*(one.row.file for one in formats), *measured]
+
+
+def _rows(names: Collection[str]) -> list[FormatRow]:
+    """Return the rows of the formats whose file or folder is among some names of a result."""
+    unknown = {*names} - {*FILES, *INSTRUMENT_FILES, *_OF_FORMATS}
+    return [row for file, row in _OF_FORMATS.items() if file in names] + plugin_rows(unknown)
+
+
+def _known_further(names: Collection[str]) -> list[str]:
+    """Return those names that are files or folders of formats or instruments, in order."""
+    measured = [name for name in INSTRUMENT_FILES if name in names]
+    return [row.file for row in _rows(names)] + measured
 
 
 def _earlier(storage: Storage) -> tuple[dict[str, str], frozenset[str]]:
@@ -259,7 +270,7 @@ def _move(
         flush(staged / name)
     with deferred_interrupts():
         _clear(Storage.at(folder), files, earlier)
-        for name in (*_FURTHER, *FILES):
+        for name in (*_known_further(files), *FILES):
             if name in files:
                 (staged / name).replace(folder / name)
         flush(folder)
@@ -272,7 +283,7 @@ def _clear(target: Storage, files: Collection[str], earlier: Collection[str]) ->
     Folders and files of formats only if they are replaced, or the earlier result lists them. If a
     killed run has removed the earlier report, they stay.
     """
-    further = [name for name in _FURTHER if name in files or name in earlier]
+    further = _known_further({*files, *earlier})
     # A path of an earlier run would look like this one's.
     for name in (REPORT, PAGE, *further, *(name for name in FILES if name not in files)):
         target.discard(name)

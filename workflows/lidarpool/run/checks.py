@@ -21,6 +21,7 @@ from poolpart.workers import ask_workers, worker_identities
 from raybeam import available_backends
 
 from ..base.software import difference, software, software_there
+from ..export.formats import Format
 from ..pipeline.failures import JobError
 from ..pipeline.names import COLLECT, GENERATE, GPU, LIDAR, OTHER, SORT
 from ..scenario.build import Job
@@ -162,6 +163,34 @@ def _check_versions(client: Client, workers: Sequence[str]) -> None:
                 f"The worker at {address} has lidarpool {answer['lidarpool']}, here it is "
                 f"{ours}: install the same on both sides, and start the worker again."
             )
+
+
+def check_formats(client: Client, pool: Pool, formats: Iterable[Format]) -> None:
+    """Check that the LIDAR workers can write those formats of plug-ins that they are to write.
+
+    LidarError if one has another version of a plug-in, or cannot import it.
+    """
+    written = [one for one in formats if one.row.in_pieces and one.row.plugin is not None]
+    if not written:
+        return
+    plugins = [one.row.plugin for one in written if one.row.plugin is not None]
+    wanted = software(plugins=plugins)
+    writing = [worker.address for worker in pool if worker.resources.get(LIDAR)]
+    for address, answer in _answers(client, software_there(plugins=plugins), writing).items():
+        if differs := difference(answer, wanted):
+            raise LidarError(
+                f"The worker at {address} has {differs}: install the same on both sides, and start "
+                "the worker again."
+            )
+    can_write = partial(_check_installed, written)
+    for address, answer in ask_workers(client, can_write, writing).items():
+        if isinstance(answer, LidarError):
+            raise LidarError(f"The worker at {address}: {answer}") from answer
+
+
+def _check_installed(formats: Iterable[Format]) -> None:
+    for one in formats:
+        one.check_installed()
 
 
 def common_software(

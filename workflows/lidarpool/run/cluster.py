@@ -17,7 +17,7 @@ from poolpart.task_context import own_client
 
 from ..pipeline.names import GPU, LIDAR, OTHER
 from ..scenario.build import Job
-from .checks import check_workers, find_workers, gpu_note, slots_needed
+from .checks import check_formats, check_workers, find_workers, gpu_note, slots_needed
 from .connection import check_starts_workers, connected, local_client, started_client
 from .options import RunOptions
 from .progress import Screen
@@ -93,6 +93,8 @@ class Cluster:
                 waiting,
                 writing=writing,
             )
+            if store.only is not None:  # jobs of campaigns are written in formats of the table
+                check_formats(client, self._pool, first.outputs)
             store.cast_with(self.backend, self.software)
             if store.only is not None:  # others are checked one by one
                 self.check(store.only.job)

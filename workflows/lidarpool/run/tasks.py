@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any, Generic, TypeVar
 
 from distributed import Future
 
+from lidarsim.base.plugins import Plugin
 from poolpart import Partition
 from poolpart.fetch import fetch_available
 from poolpart.task_locations import TaskLocations, look_for_tasks
 
-from ..base.software import call_alike
+from ..base.software import call_alike, call_with_plugins
 from ..pipeline.task_book import TaskBook
 
 T = TypeVar("T")
@@ -27,10 +28,13 @@ class Tasks(Generic[T]):
         self._client, self.partition, self._sources = partition.client, partition, sources
         self.book = TaskBook()
         self.running: dict[Future, T] = {}  # {future: what it is for}
+        # {plug-in that the tasks use: its version, which their workers must have}
+        self.plugins: Mapping[Plugin, str] = {}
 
     def submit(self, of: T, function: Callable[..., Any], *arguments: Any, **options: Any) -> None:
         """Submit a task; `options` as of `Partition.submit`."""
-        future = self.partition.submit(call_alike, self._sources, function, *arguments, **options)
+        call = (call_with_plugins, self.plugins, function) if self.plugins else (function,)
+        future = self.partition.submit(call_alike, self._sources, *call, *arguments, **options)
         self.running[future] = of
 
     def take_done(self) -> list[tuple[T, Any]]:

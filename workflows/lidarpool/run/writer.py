@@ -19,6 +19,7 @@ from lidarsim.sweeps.sweeps import Sweeps
 from poolpart.fetch import fetch_available
 from poolpart.task_context import own_client
 
+from ..base.software import plugin_versions
 from ..columns.parts import StoredCloud
 from ..datasets.dataset import DataSet, Listing
 from ..datasets.job_table import JobRow
@@ -209,6 +210,7 @@ class LidarWorkers:
         several die of a range, or there is none for too long.
         """
         partition, running = self._tasks.partition, self._tasks.running
+        self._tasks.plugins = plugin_versions(writer.plugins)
         waiting, most = deque(spans), 2 * partition.slots
         written: dict[PieceRange, Range] = {}
         watch = self._cluster.watch([LIDAR])

@@ -33,7 +33,7 @@ from lidarsim.base.input_files import open_input
 from lidarsim.base.words import printable
 from lidarsim.base.xmlfile import refuse_entity
 from lidarsim.scene.actors import Actor
-from lidarsim.scene.files.meshfile import ROBOTS
+from lidarsim.scene.files.more_formats import ROBOTS
 from lidarsim.scene.scene_mesh import SceneMesh
 from lidarsim.sensor import Mounted, Pose, Track, load_trajectory
 from lidarsim.sensor.survey import StepCount

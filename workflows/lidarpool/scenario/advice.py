@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
+from pathlib import Path
 
 import numpy as np
 
 from lidarsim.base.words import as_scenario, plural
 from lidarsim.columns.table import VELOCITY
-from lidarsim.scene.files.meshfile import UNITLESS, wrote_it
+from lidarsim.scene.files.mesh_formats import format_of
+from lidarsim.scene.files.meshfile import wrote_it
 from lidarsim.sensor.materials import MaterialTable
 from lidarsim.sensor.models import STATED
 from lidarsim.sensor.trajectory import presence_ns
@@ -54,14 +56,14 @@ def advice(built: Built) -> list[str]:
 
 
 def _writes_bags(scenario: Scenario) -> bool:
-    return any(entry.row.module == "ros" for entry in scenario.output.write)
+    return any(entry.row.laser_scans for entry in scenario.output.write)
 
 
 def _of_size(built: Built, side: float) -> str:
     scenario, placing = built.scenario, built.placing
     files = [entry.file for entry in scenario.scene.files if entry.unit is None]
     files = [file for file in files if file not in built.found.classes]  # towns are large
-    unitless = [f for f in files if f.lower().endswith(UNITLESS) and not wrote_it(scenario.path(f))]
+    unitless = [file for file in files if _lacks_unit(scenario.path(file))]
     parts = any(file.lower().endswith(".stl") for file in unitless)
     least, large = SMALL_M, LARGE_STL_M if parts else LARGE_M
     if around := placing is not None and placing.around:
@@ -75,6 +77,12 @@ def _of_size(built: Built, side: float) -> str:
         f"that is wrong, give the file's unit ({unit}?) in scene.files, or --unit {unit} with a "
         "mesh file"
     )
+
+
+def _lacks_unit(path: Path) -> bool:
+    """Whether a mesh file states no unit, nor does its format."""
+    row = format_of(path)
+    return row is not None and row.unitless and not wrote_it(path)
 
 
 def _of_colours(built: Built) -> str:

@@ -21,8 +21,10 @@ from lidarsim.base.input_files import open_input
 from lidarsim.base.textfile import read_text
 from lidarsim.base.validation import dotted, shown
 from lidarsim.base.words import plural
+from lidarsim.scene.files.mesh_formats import plugin_of
 
 from ..base.fingerprint import fingerprint
+from ..base.software import plugin_versions
 from ..datasets.job_table import Value
 from ..export.format_table import check_whole
 from .build import Job, build
@@ -430,12 +432,15 @@ def _fingerprint(scenario: Scenario) -> str:
 def file_hashes(files: Iterable[Path]) -> list[tuple[str, str]]:
     """Return name and SHA-256 of files that can be read, sorted: the same in any folder.
 
+    Beside a mesh file that a plug-in reads stand the plug-in's distribution, version and sources.
     Files that mesh files refer to (images, buffers) are not read.
     """
     pairs = set()
     for state in file_states(files):
         with suppress(OSError):
             pairs.add((state[0].name, _hash(*state)))
+        if (plugin := plugin_of(state[0])) is not None:
+            pairs.add((plugin.distribution, plugin_versions([plugin])[plugin]))
     return sorted(pairs)
 
 

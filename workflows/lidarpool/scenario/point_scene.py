@@ -23,7 +23,8 @@ from lidarsim.base.validation import checked
 from lidarsim.base.vocabulary import UNITS_M
 from lidarsim.base.words import printable
 from lidarsim.scene.files.las import las_units, open_las
-from lidarsim.scene.files.meshfile import converted, warn
+from lidarsim.scene.files.mesh_formats import advice_on
+from lidarsim.scene.files.meshfile import warn
 from lidarsim.scene.files.pcd import checked_pcd
 from lidarsim.scene.files.polygon_files import read_ply_points
 from lidarsim.scene.scene import Scene
@@ -148,7 +149,7 @@ def _read(path: Path, unit: str | None, tell: Callable[[str], None]) -> Floats:
     """Return the finite points of a file, (n, 3), metres."""
     suffix = path.suffix.lower()
     if suffix not in SUFFIXES:
-        if advice := converted(path):
+        if advice := advice_on(path):
             raise LidarError(f"{path} is not read: {advice}.")
         raise LidarError(
             f"{path} has the ending {path.suffix or '(none)'}; point clouds are read from "

@@ -18,6 +18,7 @@ from lidarsim.base.yamlfile import read_yaml
 from lidarsim.columns.table import COLOURS
 from lidarsim.sensor import Fault, Material, Navigation
 from lidarsim.sensor.materials import ClassNames
+from lidarsim.sensor.models import plugin_model_file
 from lidarsim.sensor.survey import SENSORS_MOST, CloudOptions, StepCount
 from lidarsim.sensor.trajectory import CENTRE
 from lidarsim.sensor.trajectory_files import files_of_trajectory
@@ -307,6 +308,8 @@ class Scenario(Section):
             files += [section.calibration]
             files += [section.model] if section.has_own_model else []
         paths = [self.path(file) for file in files if file]
+        models = (section.model for section in (self.sensor, *self.sensors.values()))
+        paths += filter(None, map(plugin_model_file, models))
         for trajectory in trajectories:
             if trajectory and trajectory.file:
                 paths += files_of_trajectory(self.path(trajectory.file))

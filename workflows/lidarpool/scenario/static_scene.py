@@ -15,7 +15,8 @@ from lidarsim.base.tables import NUMBERS, Quantity, read_table
 from lidarsim.base.textfile import read_text
 from lidarsim.base.words import plural
 from lidarsim.scene.actors import Actor, box, one_mesh
-from lidarsim.scene.files.meshfile import ROBOTS, Objects, load_objects
+from lidarsim.scene.files.meshfile import Objects, load_objects
+from lidarsim.scene.files.more_formats import ROBOTS
 from lidarsim.scene.files.scene_graph import ObjectClass, Raster
 from lidarsim.scene.files.urdf import load_robot
 from lidarsim.scene.object_names import told_apart

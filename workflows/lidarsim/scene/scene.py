@@ -23,7 +23,7 @@ from .actors import Actor
 from .colours import Colours, within
 from .face_materials import ObjectMaterials
 from .files.meshfile import Objects, OpacityMode, load_objects, warn
-from .files.rasters import Window
+from .files.scene_graph import Window
 from .object_names import SameNames, told_apart, unique_names
 from .scene_instances import Instances, MeshPart, SceneInstance, parts_of
 from .scene_mesh import Cutout, SceneMesh, compacted, points_array, stacked

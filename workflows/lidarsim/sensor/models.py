@@ -10,6 +10,7 @@ from importlib.resources import files
 from importlib.resources.abc import Traversable
 from pathlib import Path
 from statistics import NormalDist
+from types import ModuleType
 from typing import Annotated, Any, Literal, NamedTuple
 
 import numpy as np
@@ -20,6 +21,7 @@ from ..base.declared import UnitShare
 from ..base.elementary import log1p
 from ..base.errors import LidarError, message_of
 from ..base.input_files import read_input_text
+from ..base.plugins import Plugin, find_plugin, plugins_of
 from ..base.validation import checked, sentences
 from ..base.words import did_you_mean
 from ..base.yamlfile import load_yaml
@@ -31,6 +33,8 @@ from .ray_sensors import ListedSensor, Prism, PrismSensor, TurningMirror
 from .sensor import LineSensor, MaxRange, MinRange, Sensor
 
 _BUILT_IN = files("lidarsim.sensor") / "data"
+# Plug-ins are packages with data files, as MAKER/MODEL.yaml; the name of each is that of the maker.
+GROUP = "lidarsim.sensors"
 MODEL_FILES = (".yaml", ".yml")
 Sheet = Literal["ideal", "datasheet"]
 
@@ -259,11 +263,68 @@ class SensorModel(_ModelSection):
 @cache
 def model_names() -> tuple[str, ...]:
     """Names of the models that come with the package, in order."""
-    return tuple(sorted(
-        f"{maker.name}/{entry.name.removesuffix('.yaml')}"
-        for maker in _BUILT_IN.iterdir() if maker.is_dir()
-        for entry in maker.iterdir() if entry.name.endswith(".yaml")
-    ))  # fmt: skip
+    makers = (entry for entry in _BUILT_IN.iterdir() if entry.is_dir())
+    return tuple(sorted(name for maker in makers for name in _names_in(maker)))
+
+
+def _names_in(maker: Traversable) -> list[str]:
+    """Names of the models in the folder of a maker, in order."""
+    files_there = sorted(entry.name for entry in maker.iterdir())
+    return [
+        f"{maker.name}/{file.removesuffix('.yaml')}"
+        for file in files_there
+        if file.endswith(".yaml")
+    ]
+
+
+def plugin_model_names() -> tuple[str, ...]:
+    """Names of the models of plug-ins, in order, but for those that come with the package.
+
+    Raises
+    ------
+    LidarError
+        If a plug-in cannot be used, or two have the same maker.
+    """
+    plugins = [find_plugin(GROUP, maker) for maker in plugins_of(GROUP)]
+    names = [name for plugin in plugins if plugin for name in _names_in(_maker_folder(plugin))]
+    return tuple(name for name in names if name not in model_names())
+
+
+def plugin_of_model(name: str | None) -> Plugin | None:
+    """Return the plug-in that a model of a name is of, or None.
+
+    Raises
+    ------
+    LidarError
+        If two plug-ins have models of its maker.
+    """
+    if not name or name.endswith(MODEL_FILES) or full_name(name) in model_names():
+        return None
+    return find_plugin(GROUP, name.partition("/")[0])
+
+
+def plugin_model_file(name: str | None) -> Path | None:
+    """Return the data file of a plug-in's model; None for other models.
+
+    Raises
+    ------
+    LidarError
+        If the plug-in cannot be used.
+    """
+    plugin = plugin_of_model(name)
+    if plugin is None or name is None:
+        return None
+    file = _maker_folder(plugin) / f"{name.partition('/')[2]}.yaml"
+    return file if isinstance(file, Path) else None  # it may be in an archive
+
+
+def _maker_folder(plugin: Plugin) -> Traversable:
+    """Return the folder with the data files of a plug-in."""
+    package = plugin.load(ModuleType)
+    folder = files(package) / plugin.name if hasattr(package, "__path__") else None
+    if folder is None or not folder.is_dir():
+        raise plugin.lacks(f"the folder {plugin.name} in {plugin.module}")
+    return folder
 
 
 def full_name(name: str) -> str:
@@ -273,25 +334,35 @@ def full_name(name: str) -> str:
 
 
 def read_model(name: str | Path) -> SensorModel:
-    """Read a model: one that comes with the package, its maker left out or not, or a file (.yaml).
+    """Read a model: one that comes with the package or a plug-in, or a file (.yaml).
+
+    The maker may be left out of the name of a model that comes with the package.
 
     Raises
     ------
     LidarError
-        If there is none of that name, or the file is not one of a sensor.
+        If there is none of that name, its plug-in cannot be used, or the file is not one of a
+        sensor.
     """
     if str(name).endswith(MODEL_FILES):
         return _read(Path(name))
-    known, name = model_names(), full_name(str(name))
-    if name not in known:
-        near = [model for model in known if _plain(name) in _plain(model)][:3]
-        hint = f" Did you mean {' or '.join(map(repr, near))}?" if near else ""
-        names = [*known, *(model.partition("/")[2] for model in known)]
-        raise LidarError(
-            f"There is no sensor model {name!r}.{hint or did_you_mean(name, names)} "
-            "lidarpool sensors lists them; give your own as a file, such as mine.yaml."
-        )
-    return _built_in(name)
+    known = model_names()
+    name = full_name(str(name))
+    if name in known:
+        return _built_in(name)
+    plugin = plugin_of_model(name)
+    if plugin is not None:
+        folder = _maker_folder(plugin)
+        known = (*known, *_names_in(folder))
+        if name in known:
+            return _read(folder / f"{name.partition('/')[2]}.yaml")
+    near = [model for model in known if _plain(name) in _plain(model)][:3]
+    hint = f" Did you mean {' or '.join(map(repr, near))}?" if near else ""
+    names = [*known, *(model.partition("/")[2] for model in known)]
+    raise LidarError(
+        f"There is no sensor model {name!r}.{hint or did_you_mean(name, names)} "
+        "lidarpool sensors lists them; give your own as a file, such as mine.yaml."
+    )
 
 
 def _plain(name: str) -> str:

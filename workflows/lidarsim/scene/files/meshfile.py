@@ -1,4 +1,4 @@
-"""Files of scenes, of the formats in `SUFFIXES`, to named meshes in metres, Z-up."""
+"""Files of scenes, of the formats in `mesh_formats`, to named meshes in metres, Z-up."""
 
 from __future__ import annotations
 
@@ -27,72 +27,24 @@ from ..colours import colours_summary
 from ..scene_instances import FARTHEST_M, SceneInstance
 from ..scene_mesh import SceneMesh
 from ..transform import UP_AXES, Transform
-from .cityjson import read_cityjson
-from .dae import read_dae
-from .gltf import read_gltf
-from .polygon_files import read_obj, read_off, read_ply_mesh, read_stl
-from .rasters import SUFFIXES as RASTERS
-from .rasters import Window, read_raster
-from .scene_graph import Content, MeshFileError, ObjectClass, Raster, RigidPart, Wanted
-from .threemf import read_3mf
-from .usd import read_usd
-from .vox import read_vox
-
-CITYJSON = (".json", ".cityjson", ".jsonl")
-
-# A reader gets the content of a file, its path, and what is wanted; read_raster gets the path and
-# options of its own. It raises MeshFileError for unsupported content, and any error for a broken
-# file. All but read_usd and read_raster are our own; their modules say why no library is used.
-_READERS: dict[str, Callable[[bytes, Path, Wanted], Content]] = {
-    ".glb": read_gltf,
-    ".gltf": read_gltf,
-    ".obj": read_obj,
-    ".stl": read_stl,
-    ".ply": read_ply_mesh,
-    ".off": read_off,
-    ".dae": read_dae,
-    ".3mf": read_3mf,
-    ".vox": read_vox,
-    **dict.fromkeys((".usd", ".usda", ".usdc", ".usdz"), read_usd),
-    **dict.fromkeys(CITYJSON, read_cityjson),
-}
-SUFFIXES = (*_READERS, *RASTERS)
-ROBOTS = (".urdf", ".xacro")  # of which `urdf` refuses the latter, with what to do
-_MUJOCO = "a model of MuJoCo becomes OpenUSD by mujoco-usd-converter"
-_POINTS = "make a mesh of it by lidarpool scene points"
-_BLENDER = "export it as .glb, for example from Blender"
-_GAZEBO = (
-    "it is a world or model of Gazebo, convert it to OpenUSD (sdf2usd of gz-usd) or URDF, or name "
-    "the meshes that it names"
+from .mesh_formats import (
+    MeshFormat,
+    endings,
+    endings_for,
+    format_of,
+    missing_packages,
+    plugin_endings,
 )
-_CAD = "it is a CAD model, make a mesh of it, for example .stl or .glb from FreeCAD"
-_RECORDING = (
-    "it is a recording, write its points as .ply, .pcd or .las and make a mesh of these by "
-    "lidarpool scene points"
+from .scene_graph import (
+    Content,
+    MeshFileError,
+    ObjectClass,
+    Raster,
+    RasterOptions,
+    RigidPart,
+    Wanted,
+    Window,
 )
-CONVERTED = {  # {ending of files that are not read as scenes: what to do}
-    **dict.fromkeys((".fbx", ".blend", ".3ds", ".x3d", ".wrl", ".dxf", ".abc"), _BLENDER),
-    **dict.fromkeys((".las", ".laz", ".pcd", ".xyz"), _POINTS),
-    ".pts": f"it is a point cloud, write it as .xyz, .ply or .las and {_POINTS}",
-    ".e57": f"it is a point cloud, write it as .las (pdal translate IN.e57 OUT.las) and {_POINTS}",
-    **dict.fromkeys((".pcap", ".mcap", ".bag", ".db3", ".osf"), _RECORDING),
-    **dict.fromkeys((".sdf", ".world"), _GAZEBO),
-    **dict.fromkeys((".step", ".stp", ".iges", ".igs", ".brep", ".fcstd"), _CAD),
-    **dict.fromkeys(
-        (".dwg", ".skp"), "export it as .dae, .obj or .glb from the program that wrote it"
-    ),
-    **dict.fromkeys(
-        (".ifc", ".ifczip"), "it is a building, make a mesh of it: IfcConvert IN.ifc OUT.glb"
-    ),
-    ".gml": "it is a city model, convert it to CityJSON: citygml-tools to-cityjson IN.gml",
-    ".osm": "it is a map, make a mesh of its buildings, for example by blosm in Blender",
-    ".mjcf": _MUJOCO,
-    ".xml": f"{_MUJOCO}, lidarpool import reads a survey of HELIOS++, and traffic.file of a "
-    "scenario names floating car data of SUMO",
-    ".xodr": "it is a road network, make a mesh of its roads, for example by libOpenDRIVE",
-}
-ANIMATED = (".glb", ".gltf", ".usd", ".usda", ".usdc", ".usdz")
-UNITLESS = (".obj", ".stl", ".ply", ".off")  # formats without a unit
 
 GENERATOR = "lidarpool"  # that files of our own name, .glb as Y-up, others as Z-up
 OWN = "lidarpool: metres, Z-up"  # comment that files of our own without such a name begin with
@@ -155,8 +107,8 @@ def load_objects(
     Parameters
     ----------
     path, unit, up_axis, transform, opacity, colours, materials, assets
-        As of `Scene.load`, with a path of `SUFFIXES` in any case. The unit of a raster is that of
-        its heights.
+        As of `Scene.load`, with an ending of `mesh_formats` in any case. The unit of a raster is
+        that of its heights.
     step_m
         Of a raster: mean heights in a grid of this step, metres; None takes its pixels.
     window
@@ -186,62 +138,91 @@ def load_objects(
         If the file cannot be read completely, or has no triangles.
     """
     path = Path(path)
-    is_raster = path.suffix.lower() in RASTERS
-    data = _bytes_of(path, _HEAD if is_raster else None)
-    raster = {"step_m": step_m, "window": window}
-    if is_raster:
-        if up_axis:
-            raise LidarError(f"{path} is a raster, whose heights are z: leave out up_axis.")
-        raster |= {"unit": unit, "epsg": epsg}
+    row = _readable(path)
+    data = _bytes_of(path, _HEAD if row.from_path else None)
+    raster = RasterOptions(unit, step_m, window, epsg)
+    _check_options(path, row, raster, up_axis, animation)
+    if row.raster:  # whose reader takes the unit
         unit = None
-    elif given := [name for name, value in raster.items() if value is not None]:
-        raise LidarError(
-            f"{path} is no raster: leave out {' and '.join(given)}, or give a raster "
-            f"({' '.join(RASTERS)})."
-        )
-    if animation is not None and path.suffix.lower() not in ANIMATED:
-        raise LidarError(
-            f"{path} has no animations that are read: give a {' or '.join(ANIMATED)}, or leave out "
-            "animation."
-        )
-    folders = tuple(Path(one).resolve() for one in (path.parent, assets) if one is not None)
-    masks = opacity == "mask" and animation is None
-    wanted = Wanted(masks, colours, folders, animation, materials)
-    # Of broken numbers in files: infinite and NaN values are refused.
+    folders = [path.parent] if assets is None else [path.parent, Path(assets)]
+    wanted = Wanted(
+        masks=opacity == "mask" and animation is None,
+        colours=colours,
+        folders=tuple(folder.resolve() for folder in folders),
+        animation=animation,
+        materials=materials,
+        raster=raster,
+    )
+    # Files may have infinite numbers and NaN, which are refused where they matter.
     with np.errstate(all="ignore"):
-        try:
-            content = _read_whole(path, data, wanted, raster)
-        except LidarError as error:
-            raise LidarError(f"{error}{_other_format(path, data)}") from error
+        content = _read_whole(path, row, data, wanted)
         unit_m = UNITS_M[unit] if unit else content.unit_m or 1.0
         up = up_axis or content.up_axis or "z"
-        upright = Transform(UP_AXES[up] * unit_m, np.zeros(3))
-        placed = Transform(np.eye(3), np.zeros(3)) if transform is None else transform
-        places = [upright] if transform is None else [upright, transform]
-        with prefixed(path):
-            standing = tuple(_placed(mesh, path.stem, places) for mesh in content.meshes)
-            moving = tuple(_actor(one, path.stem, upright, placed) for one in content.moving)
-    objects = Objects(standing, moving)
+        objects = _in_world(path, content, Transform(UP_AXES[up] * unit_m, np.zeros(3)), transform)
+    _tell_notes(path, content, tell, unit_given=unit is not None)
+    standing = objects.still(lambda _: None)
+    if not any((o.mesh if isinstance(o, SceneInstance) else o).has_area for o in standing):
+        raise LidarError(f"{path} has no triangle with an area.")
+    if up_axis is None and content.generator != GENERATOR and OWN.encode() not in data[:_HEAD]:
+        _tell_axes(path, content, standing, axes)
+    if content.raster is not None:
+        return objects._replace(summary=content.raster.told, raster=content.raster)
+    summary = _summary(standing, unit_m, up, wanted)
+    return objects._replace(summary=summary, classes=content.classes)
+
+
+def _in_world(
+    path: Path, content: Content, upright: Transform, transform: Transform | None
+) -> Objects:
+    """Place the objects of a file in the world.
+
+    `upright` brings the file's unit and axes to metres and Z-up, before `transform`.
+    """
+    places = [upright] if transform is None else [upright, transform]
+    placed = Transform(np.eye(3), np.zeros(3)) if transform is None else transform
+    with prefixed(path):
+        return Objects(
+            tuple(_placed(mesh, path.stem, places) for mesh in content.meshes),
+            tuple(_actor(part, path.stem, upright, placed) for part in content.moving),
+        )
+
+
+def _tell_notes(
+    path: Path, content: Content, tell: Callable[[str], None], *, unit_given: bool
+) -> None:
+    """Call `tell` with a line on objects that were left out, and with the notes of the reader."""
     if content.skipped:
         names = ", ".join(content.skipped[:3]) + ", …" * (len(content.skipped) > 3)
         tell(f"{path} has objects without an area, which are left out: {names}")
-    for note in (*content.notes, *(() if unit else filter(None, [content.unit_note]))):
+    for note in content.notes:
         tell(f"{path} {note}")
-    all_of_it = objects.still(lambda _: None)
-    if not any((one.mesh if isinstance(one, SceneInstance) else one).has_area for one in all_of_it):
-        raise LidarError(f"{path} has no triangle with an area.")
-    if content.raster is not None:
-        summary = content.raster.told
-    else:
-        summary = _summary(all_of_it, unit_m, up, wanted)
-    if up_axis is None and content.generator != GENERATOR and OWN.encode() not in data[:_HEAD]:
-        _tell_axes(path, content, all_of_it, axes)
-    return objects._replace(summary=summary, raster=content.raster, classes=content.classes)
+    if content.unit_note and not unit_given:
+        tell(f"{path} {content.unit_note}")
 
 
-def converted(path: Path) -> str:
-    """Return what to do with a file of a format that is not read; empty for other files."""
-    return CONVERTED.get(path.suffix.lower(), "")
+def _check_options(
+    path: Path,
+    row: MeshFormat,
+    raster: RasterOptions,
+    up_axis: str | None,
+    animation: str | None,
+) -> None:
+    """Refuse options that a file of a format does not have, or raise LidarError."""
+    if row.raster and up_axis:
+        raise LidarError(f"{path} is a raster, whose heights are z: leave out up_axis.")
+    of_rasters = {"step_m": raster.step_m, "window": raster.window}
+    given = [name for name, value in of_rasters.items() if value is not None]
+    if given and not row.raster:
+        raise LidarError(
+            f"{path} is no raster: leave out {' and '.join(given)}, or give a raster "
+            f"({' '.join(endings(lambda row: row.raster))})."
+        )
+    if animation is not None and not row.animated:
+        animated = endings(lambda row: row.animated)
+        raise LidarError(
+            f"{path} has no animations that are read: give a {' or '.join(animated)}, or leave out "
+            "animation."
+        )
 
 
 def load_meshes(
@@ -318,48 +299,65 @@ def _lies(content: Content, meshes: Sequence[SceneMesh | SceneInstance]) -> str:
     return ""
 
 
-def _read_whole(path: Path, data: bytes, wanted: Wanted, raster: dict[str, Any]) -> Content:
-    """Read any file, a raster with these options: at least one object, or LidarError."""
+def _read_whole(path: Path, row: MeshFormat, data: bytes, wanted: Wanted) -> Content:
+    """Read a file of a format: at least one object, or LidarError."""
     try:
-        for beginning, what in _FOREIGN.items():
-            if re.match(beginning, data):
-                raise MeshFileError(what)
-        suffix = path.suffix.lower()
-        is_raster = suffix in RASTERS
-        content = read_raster(path, **raster) if is_raster else _READERS[suffix](data, path, wanted)
-        if not (content.meshes or content.moving):
-            if content.skipped:
-                raise MeshFileError("has no triangle with an area")
-            raise MeshFileError(
-                "holds no triangles: it is empty, or has only points, lines or other things that "
-                "reflect no light"
-            )
-        return content
+        with prefixed(path):
+            return _content(row, path, data, wanted)
     except MemoryError:
         raise
-    except MeshFileError as refused:
-        raise LidarError(f"{path} {refused}.") from refused
     except LidarError as error:
-        raise LidarError(f"{path}: {error}") from error
+        raise LidarError(f"{error}{_other_format(path, data)}") from error
+    except MeshFileError as error:
+        raise LidarError(f"{path} {error}.{_other_format(path, data)}") from error
     except Exception as error:
+        if row.plugin is not None and isinstance(error, ImportError):
+            raise LidarError(f"{path}: {row.plugin.broken(error)}") from error
         # Readers raise whatever they stumble over: ValueError, IndexError, KeyError, BadZipFile,
         # ParseError, struct.error, …
         reason = printable(str(error)) or type(error).__name__
-        raise LidarError(f"{path} is broken or cut short ({reason}): export it again.") from error
+        raise LidarError(
+            f"{path} is broken or cut short ({reason}): export it again.{_other_format(path, data)}"
+        ) from error
+
+
+def _content(row: MeshFormat, path: Path, data: bytes, wanted: Wanted) -> Content:
+    """Return what a reader finds; MeshFileError for a file of another kind, or without objects."""
+    for beginning, what in _FOREIGN.items():
+        if re.match(beginning, data):
+            raise MeshFileError(what)
+    content = row.reader(data, path, wanted)
+    if row.plugin is not None and not isinstance(content, Content):
+        raise LidarError(f"{row.plugin} read {type(content).__name__}, not Content.")
+    if content.meshes or content.moving:
+        return content
+    if content.skipped:
+        raise MeshFileError("has no triangle with an area")
+    raise MeshFileError(
+        "holds no triangles: it is empty, or has only points, lines or other things that reflect "
+        "no light"
+    )
+
+
+def _readable(path: Path) -> MeshFormat:
+    """Return the format of a file; LidarError if no format that is read has its ending."""
+    row = format_of(path)
+    if row is not None and not row.advice:
+        return row
+    if row is not None:
+        raise LidarError(f"{path} is not read: {row.advice}.")
+    further = "".join(
+        f"; {package} reads more: pip install lidarpool" for package in missing_packages()
+    )
+    raise LidarError(
+        f"{path} has the ending {path.suffix or '(none)'}, which is not a mesh format that can be "
+        f"read; these are: {' '.join([*endings(), *plugin_endings()])} (a scenario has the ending "
+        f".yaml){further}."
+    )
 
 
 def _bytes_of(path: Path, max_bytes: int | None) -> bytes:
-    """Return the content of a file of a known format, or at most `max_bytes` of its start."""
-    suffix = path.suffix.lower()
-    if suffix in ROBOTS:
-        raise LidarError(f"{path} is a robot: read it with load_robot, or by a scenario.")
-    if advice := converted(path):
-        raise LidarError(f"{path} is not read: {advice}.")
-    if suffix not in SUFFIXES:
-        raise LidarError(
-            f"{path} has the ending {path.suffix or '(none)'}, which is not a mesh format that "
-            f"can be read; these are: {' '.join(SUFFIXES)} (a scenario has the ending .yaml)."
-        )
+    """Return the content of a file, or at most `max_bytes` of its start."""
     try:
         with prefixed(path):
             data = read_input(path, max_bytes)
@@ -376,12 +374,12 @@ def _bytes_of(path: Path, max_bytes: int | None) -> bytes:
 
 
 def _like(path: Path) -> str:
-    """Existing mesh file with a similar name."""
+    """Name an existing mesh file with a similar name, in a question; empty if there is none."""
     try:
         beside = [other.name for other in path.parent.iterdir()]
     except OSError:
         return ""
-    return did_you_mean(path.name, [name for name in beside if name.lower().endswith(SUFFIXES)])
+    return did_you_mean(path.name, [name for name in beside if name.lower().endswith(endings())])
 
 
 # Beginnings of files that are not meshes, as expressions.
@@ -389,21 +387,15 @@ _FOREIGN = {
     rb"\x1f\x8b|BZh|\xfd7zXZ\0|7z\xbc\xaf": "is packed: unpack it first",
     rb"(?i)\s*(<!doctype html|<html)": "is a web page: download the file itself",
 }
-# Beginnings by which a file of the wrong ending is recognised, and endings that suit them.
-_BEGINNINGS = {
-    b"glTF": (".glb",), b"ply": (".ply",), b"OFF": (".off",), b"solid ": (".stl",),
-    b"II*\0": (".tif", ".tiff"), b"MM\0*": (".tif", ".tiff"),
-    b"PK\x03\x04": (".3mf", ".usdz"), b"PXR-USDC": (".usdc", ".usd"), b"#usda ": (".usda", ".usd"),
-}  # fmt: skip
 
 
 def _other_format(path: Path, data: bytes) -> str:
     """Name the format by which a refused file begins, in a sentence, if it is another."""
     if data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
         return " It begins like text in UTF-16: save it as UTF-8."
-    for begins, suffixes in _BEGINNINGS.items():
-        if data.startswith(begins) and path.suffix.lower() not in suffixes:
-            return f" It begins like a {' or '.join(suffixes)} file: give it that ending."
+    likely = endings_for(data)
+    if likely and path.suffix.lower() not in likely:
+        return f" It begins like a {' or '.join(likely)} file: give it that ending."
     return ""
 
 

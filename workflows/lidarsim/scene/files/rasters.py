@@ -27,13 +27,12 @@ from ...base.input_files import input_size, read_input
 from ...base.vocabulary import UNITS_M
 from ...base.words import plural
 from ..scene_mesh import SceneMesh
-from .scene_graph import MOST_TRIANGLES, Content, MeshFileError, Raster
+from .scene_graph import MOST_TRIANGLES, Content, MeshFileError, Raster, Wanted, Window
 
-_DRIVERS = {
+DRIVERS = {  # {ending: GDAL's name of the driver}
     ".tif": "GTiff", ".tiff": "GTiff", ".asc": "AAIGrid", ".hgt": "SRTMHGT", ".img": "HFA",
     ".dem": "USGSDEM", ".dt0": "DTED", ".dt1": "DTED", ".dt2": "DTED",
 }  # fmt: skip
-SUFFIXES = (*_DRIVERS,)
 
 _BESIDE_MOST = 65536  # bytes of a file beside a raster
 
@@ -45,7 +44,6 @@ _UNASKED = 5_000_000  # pixels that are taken without a window and a step; more 
 _MOST_READ = 1_000_000_000  # pixels of which a coarser grid is made, which takes two minutes
 _WIDEST_DEG = 12.0  # of longitude in a UTM zone, which is 6 wide
 
-Window = tuple[float, float, float, float]  # lowest x and y, highest x and y
 PixelRange = tuple[int, int]  # half-open
 
 _LOWEST_M, _HIGHEST_M = -12_000.0, 9_000.0  # of the Earth's surface
@@ -59,30 +57,14 @@ _UNIT_NAMES = {  # of heights, as files have them
 }
 
 
-def read_raster(
-    path: Path,
-    *,
-    unit: str | None = None,
-    step_m: float | None = None,
-    window: Window | None = None,
-    epsg: int | None = None,
-) -> Content:
+def read_raster(_data: bytes, path: Path, wanted: Wanted) -> Content:
     """Read the first band as a mesh: a vertex at the middle of each pixel, two triangles a cell.
 
-    Cells with a pixel that has no height are holes. Coordinates are those of `epsg`; else the
-    raster's own if they are in metres, or of the UTM zone of its middle.
-
-    Parameters
-    ----------
-    unit
-        Of the heights.
-    step_m
-        Mean heights in a grid of this step, metres, instead of the pixels.
-    window
-        Lowest and highest x and y of the pixels' middles, in the mesh's coordinates.
-    epsg
-        Code of the coordinate system, one in metres.
+    Cells with a pixel that has no height are holes. Coordinates are those of `epsg` in
+    `wanted.raster`; else the raster's own if they are in metres, or of the UTM zone of its middle.
+    The window has the pixels whose middles are in it.
     """
+    unit, step_m, window, epsg = wanted.raster
     if find_spec("rasterio") is None:
         raise MeshFileError('is a raster, which rasterio reads: pip install "lidarpool[geo]"')
     with ExitStack() as stack:
@@ -121,7 +103,7 @@ def _opened(path: Path) -> Iterator[Any]:
     from rasterio.errors import NotGeoreferencedWarning, RasterioError
     from rasterio.io import MemoryFile
 
-    driver = _DRIVERS[path.suffix.lower()]
+    driver = DRIVERS[path.suffix.lower()]
     folder = f"{path.parent.absolute()}/"
     with ExitStack() as stack:
         stack.enter_context(warnings.catch_warnings())

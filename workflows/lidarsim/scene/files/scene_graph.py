@@ -52,6 +52,18 @@ class MeshFileError(Exception):
     """An error of a mesh file, as a clause that follows its name."""
 
 
+Window = tuple[float, float, float, float]  # lowest x and y, highest x and y
+
+
+class RasterOptions(NamedTuple):
+    """How a raster of heights is read; see `read_raster`."""
+
+    unit: str | None = None  # of its heights; None for that of the file
+    step_m: float | None = None  # step of the grid of mean heights; None takes the pixels
+    window: Window | None = None  # metres, in the coordinate system of the mesh; None takes all
+    epsg: int | None = None  # coordinate system of the mesh; None for one that suits the file
+
+
 class Wanted(NamedTuple):
     """What to read of a mesh file, besides triangles."""
 
@@ -60,6 +72,7 @@ class Wanted(NamedTuple):
     folders: tuple[Path, ...]  # resolved; files that it names are read only from these and below
     animation: str | None = None  # to bake, by its name; "" for the first
     materials: bool = False  # names of the materials of faces
+    raster: RasterOptions = RasterOptions()
 
     def allows(self, file: Path) -> bool:
         """Whether a file that is named may be read."""

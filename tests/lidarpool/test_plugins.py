@@ -1,0 +1,260 @@
+"""Plug-ins of other distributions: what is found, and what is said of those that cannot be used."""
+
+import subprocess
+import sys
+
+import pytest
+from tests.meshes import write
+from tests.plugin_files import write_distribution
+
+from lidarpool import Cloud, load_sensor, save_cloud
+from lidarpool.base.software import difference, plugin_versions, software
+from lidarpool.cli.commands import cli
+from lidarpool.export.format_table import row_of
+from lidarpool.export.formats import Format
+from lidarpool.scenario.campaign import hashes
+from lidarsim.base.errors import LidarError
+from lidarsim.base.plugins import find_plugin, plugins_of
+from lidarsim.scene.files.meshfile import load_meshes
+
+# A mesh of one triangle, whatever is in the file.
+TRIANGLE = """
+import numpy as np
+from lidarpool.mesh_plugins import Content, MeshFormat, SceneMesh
+
+def read(data, path, wanted):
+    mesh = SceneMesh("Triangle", np.eye(3), np.array([[0, 1, 2]]))
+    return Content([mesh], unit_m=1.0, up_axis="z")
+
+FORMAT = MeshFormat((".{ending}",), read)
+"""
+
+
+@pytest.fixture
+def distribution(tmp_path, monkeypatch):
+    """Return what installs a distribution; its modules have a name of their own in each test."""
+
+    def distribution(name, entry_points, modules):
+        folder = tmp_path / "installed" / name
+        monkeypatch.syspath_prepend(write_distribution(folder, name, entry_points, modules))
+
+    return distribution
+
+
+def mesh(distribution, name, ending, text, value=None):
+    module = name.replace("-", "_")
+    value = value or f"{module}:FORMAT"
+    distribution(name, {"lidarsim.meshes": {f".{ending}": value}}, {f"{module}.py": text})
+
+
+# -- names ---------------------------------------------------------------------------------------
+
+
+def test_a_plugin_reads_files_of_its_ending(tmp_path, distribution):
+    mesh(distribution, "plain-mesh", "plain", TRIANGLE.format(ending="plain"))
+    (triangle,) = load_meshes(write(tmp_path / "a.PLAIN", "anything"))
+    assert triangle.name == "Triangle"
+
+
+def test_formats_of_the_table_are_read_without_a_look_at_plugins(tmp_path, distribution):
+    mesh(distribution, "own-obj", "obj", TRIANGLE.format(ending="obj"))
+    with pytest.raises(LidarError, match="holds no triangles"):
+        load_meshes(write(tmp_path / "a.obj", "v 0 0 0\n"))
+
+
+def test_a_plugin_reads_what_the_table_has_only_advice_for(tmp_path, distribution):
+    assert "IfcConvert" in refused(load_meshes, write(tmp_path / "b.ifczip", "anything"))
+    mesh(distribution, "ifc-mesh", "ifc", TRIANGLE.format(ending="ifc"))
+    assert len(load_meshes(write(tmp_path / "b.ifc", "anything"))) == 1
+
+
+def test_an_unknown_ending_lists_those_of_plugins(tmp_path, distribution):
+    mesh(distribution, "listed-mesh", "listed", TRIANGLE.format(ending="listed"))
+    assert " .listed " in refused(load_meshes, write(tmp_path / "a.unlisted", "anything"))
+
+
+def test_two_plugins_of_one_name_are_an_error(tmp_path, distribution):
+    for name in ("twice-a", "twice-b"):
+        mesh(distribution, name, "twice", TRIANGLE.format(ending="twice"))
+    told = refused(load_meshes, write(tmp_path / "a.twice", "anything"))
+    assert "twice-a 0.1 and twice-b 0.1 each provide '.twice' for lidarsim.meshes" in told
+
+
+def test_names_without_a_plugin(distribution):
+    distribution("only-one", {"lidarpool.commands": {"only": "only_one:command"}}, {})
+    assert find_plugin("lidarpool.commands", "other") is None
+    assert list(plugins_of("lidarpool.commands")) == ["only"]
+
+
+# -- plug-ins that cannot be used ----------------------------------------------------------------
+
+
+def refused(function, *arguments, **options):
+    with pytest.raises(LidarError) as caught:
+        function(*arguments, **options)
+    told = str(caught.value)
+    assert "\n" not in told
+    return told
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "value", "message"),
+    [
+        ("lost-library", "import no_such_library", None, "No module named 'no_such_library'"),
+        ("lost-name", "", None, "has no attribute 'FORMAT'"),
+        ("lost-module", "", "no_such_module:FORMAT", "No module named 'no_such_module'"),
+        ("wrong-kind", "FORMAT = {}", None, "is a dict, and lidarsim.meshes takes a MeshFormat"),
+        (
+            "lost-field",
+            "from lidarpool.mesh_plugins import MeshFormat\nFORMAT = MeshFormat()",
+            None,
+            "missing 1 required positional argument: 'endings'",
+        ),
+        (
+            "lost-reader",
+            "from lidarpool.mesh_plugins import MeshFormat\nFORMAT = MeshFormat(('.lost-reader',))",
+            None,
+            "lacks read, which lidarsim.meshes needs",
+        ),
+        (
+            "lost-function",
+            "from lidarpool.mesh_plugins import MeshFormat\n"
+            "FORMAT = MeshFormat(('.lost-function',), 'lost_function:read')",
+            None,
+            "has no attribute 'read'",
+        ),
+        ("other-ending", TRIANGLE.format(ending="other"), None, "is a MeshFormat of .other"),
+        (
+            "late-library",
+            TRIANGLE.format(ending="late-library").replace("mesh =", "import no_such; mesh ="),
+            None,
+            "cannot be imported (No module named 'no_such')",
+        ),
+        (
+            "no-content",
+            TRIANGLE.format(ending="no-content").replace("return ", "return [], "),
+            None,
+            "read tuple, not Content",
+        ),
+    ],
+)
+def test_a_line_names_the_distribution(tmp_path, distribution, name, text, value, message):
+    mesh(distribution, name, name, text, value)
+    told = refused(load_meshes, write(tmp_path / f"a.{name}", "anything"))
+    assert message in told
+    assert f"'.{name}' of the plug-in {name} 0.1" in told
+
+
+def test_formats_of_clouds_that_cannot_be_used(distribution):
+    row = "from lidarpool.cloud_plugins import FormatRow\n"
+    distribution(
+        "half-cloud",
+        {"lidarpool.clouds": {name: f"half_cloud:{name}" for name in ("half", "set", "taken")}},
+        {
+            "half_cloud.py": f"{row}half = FormatRow('half.txt', 'half_cloud', 'write')\n"
+            "set = FormatRow('set', 'half_cloud', 'write', data_set='set')\n"
+            "taken = FormatRow('cloud.ply', 'half_cloud', 'write')"
+        },
+    )
+    assert "half_cloud.write" in refused(Format("half").check_installed)
+    assert "has data sets" in refused(row_of, "set")
+    assert "writes 'cloud.ply'" in refused(row_of, "taken")
+    told = refused(Format, "quarter")
+    assert "'quarter' is not a format of clouds" in told and "half" in told
+
+
+def test_sensors_that_cannot_be_used(distribution):
+    distribution("no-folder", {"lidarsim.sensors": {"nobody": "no_folder"}}, {"no_folder.py": ""})
+    told = refused(load_sensor, "nobody/x1")
+    assert "'nobody' of the plug-in no-folder 0.1 lacks the folder nobody in no_folder" in told
+    distribution(
+        "one-model",
+        {"lidarsim.sensors": {"maker": "one_model"}},
+        {"one_model/maker/x1.yaml": "firing_us: 1"},
+    )
+    assert "Did you mean 'maker/x1'?" in refused(load_sensor, "maker/x2")
+    assert "x1.yaml is not a usable model" in refused(load_sensor, "maker/x1")
+
+
+def test_commands_that_cannot_be_used(distribution, capsys):
+    distribution(
+        "half-command",
+        {"lidarpool.commands": {"half": "half_command:half"}},
+        {"half_command.py": ""},
+    )
+    assert "'half' of the plug-in half-command 0.1" in refused(cli.main, ["half"])
+    with pytest.raises(SystemExit):
+        cli.main(["--help"])
+    assert "half  half-command 0.1" in capsys.readouterr().out
+
+
+# -- what is written -----------------------------------------------------------------------------
+
+
+def test_a_plugin_writes_a_cloud_to_a_file(tmp_path, distribution):
+    distribution(
+        "text-cloud",
+        {"lidarpool.clouds": {"text": "text_cloud:ROW"}},
+        {
+            "text_cloud.py": "from lidarpool.cloud_plugins import FormatRow\n"
+            "ROW = FormatRow('cloud.text', 'text_cloud', 'write', packages=('no_such',))\n"
+            "def write(path, cloud, sweeps): path.write_text(f'{len(cloud)} points')\n"
+        },
+    )
+    cloud = Cloud([[0.0, 0.0, 1.0]], {})
+    told = refused(save_cloud, cloud, tmp_path / "a.text", format="text")
+    assert "needs no_such: pip install no_such" in told
+    object.__setattr__(row_of("text"), "packages", ())
+    save_cloud(cloud, tmp_path / "a.text", format="text")
+    assert (tmp_path / "a.text").read_text() == "1 points"
+
+
+# -- software ------------------------------------------------------------------------------------
+
+
+def test_software_has_the_plugins_that_are_used(tmp_path, distribution):
+    mesh(distribution, "used-mesh", "used", TRIANGLE.format(ending="used"))
+    mesh(distribution, "idle-mesh", "idle", TRIANGLE.format(ending="idle"))
+    plugin = find_plugin("lidarsim.meshes", ".used")
+    described = software(plugins=[plugin])
+    assert described.keys() == {"lidarpool", "plug-in used-mesh"}
+    assert described["plug-in used-mesh"] == plugin_versions([plugin])[plugin]
+    assert described["plug-in used-mesh"].startswith("0.1 (sources ")
+    told = difference(software(), described)
+    assert told.startswith("plug-in used-mesh not installed, the run plug-in used-mesh 0.1")
+
+
+def test_jobs_of_campaigns_know_the_plugins_that_read_their_meshes(tmp_path, distribution):
+    mesh(distribution, "job-mesh", "job", TRIANGLE.format(ending="job"))
+    path = write(tmp_path / "a.job", "anything")
+    names = [name for name, _ in hashes([path])]
+    assert names == ["a.job", "job-mesh"]
+
+
+def test_the_hash_of_a_plugin_is_that_of_its_package(tmp_path):
+    code = (
+        "from lidarsim.base.plugins import find_plugin\n"
+        "from lidarpool.base.software import plugin_versions\n"
+        "print(*plugin_versions([find_plugin('lidarsim.meshes', '.hashed')]).values())"
+    )
+    texts = {"same": "", "other": "# a comment", "again": ""}
+    versions = {}
+    for name, comment in texts.items():
+        folder = write_distribution(
+            tmp_path / name,
+            "hashed",
+            {"lidarsim.meshes": {".hashed": "hashed.meshes:FORMAT"}},
+            {"hashed/__init__.py": "", "hashed/meshes.py": "", "hashed/more.py": comment},
+        )
+        environment = subprocess.os.environ | {
+            "PYTHONPATH": f"{folder}:{subprocess.os.environ['PYTHONPATH']}"
+        }
+        run = subprocess.run(
+            [sys.executable, "-c", code],
+            capture_output=True,
+            text=True,
+            check=True,
+            env=environment,
+        )
+        versions[name] = run.stdout
+    assert versions["same"] == versions["again"] != versions["other"]

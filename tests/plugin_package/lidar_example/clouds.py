@@ -1,0 +1,27 @@
+"""Writes a cloud as a folder of NumPy files, one for each sweep."""
+
+import io
+
+import numpy as np
+
+from lidarpool.cloud_plugins import Cloud, FormatRow, Pieces
+
+ROW = FormatRow(
+    "npy",  # folder in a result
+    "lidar_example.clouds",
+    "SweepFiles",
+    in_pieces=True,
+    needs=("scan",),
+    holds=(),
+    inside=r"\d+\.npy",
+)
+
+
+class SweepFiles(Pieces):
+    """The file of each sweep; workers of a cluster write them."""
+
+    def files(self, number: int, points: Cloud) -> tuple[dict[str, bytes], None]:
+        """Return {name: content} of a sweep: its positions, float32 (n, 3), metres."""
+        file = io.BytesIO()
+        np.save(file, points.positions.astype(np.float32))
+        return {f"{number:06}.npy": file.getvalue()}, None

@@ -1,0 +1,1 @@
+"""Data files of sensors: a folder for each maker."""

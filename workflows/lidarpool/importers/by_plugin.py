@@ -1,0 +1,82 @@
+"""Surveys of other programs as scenarios, by plug-ins."""
+
+from __future__ import annotations
+
+import shutil
+import tempfile
+from collections.abc import Callable, Iterable, Sequence
+from contextlib import suppress
+from pathlib import Path
+from xml.etree.ElementTree import ParseError
+
+from lidarsim.base.errors import LidarError
+from lidarsim.base.input_files import read_input
+from lidarsim.base.plugins import Plugin, find_plugin
+from lidarsim.base.words import printable
+from lidarsim.base.xmlfile import xml_root
+
+# Names are tags of the outermost elements of XML files, without namespaces, or endings of others.
+GROUP = "lidarpool.importers"
+SCENARIO_FILE = "scenario.yaml"
+_HELIOS = "document"  # root of a survey of HELIOS++
+
+# Of a survey, the folder that it writes SCENARIO_FILE and further files into, and folders where
+# references start. It returns the features that are not supported, a line each.
+Importer = Callable[[Path, Path, Sequence[Path]], Iterable[str]]
+
+
+def importer_of(survey: Path) -> Plugin | None:
+    """Return the plug-in that imports a survey; None for surveys of HELIOS++ and unknown files.
+
+    Raises
+    ------
+    LidarError
+        If two plug-ins import it.
+    """
+    name = survey.suffix.lower()
+    with suppress(OSError, LidarError, ParseError, ValueError, LookupError):
+        name = xml_root(read_input(survey)).tag.rpartition("}")[2]  # without its namespace
+    return None if name == _HELIOS else find_plugin(GROUP, name)
+
+
+def import_by(
+    plugin: Plugin,
+    survey: Path,
+    out: Path,
+    assets: Sequence[Path],
+    check: Callable[[Path], object],
+) -> list[str]:
+    """Write a survey as a scenario, completely or not at all, into a new folder `out`.
+
+    `check` reads the scenario and raises LidarError if it cannot be simulated.
+
+    Returns
+    -------
+    The features that are not supported.
+
+    Raises
+    ------
+    LidarError
+        If the folder exists, the plug-in fails, or the scenario is refused.
+    """
+    if out.exists():
+        raise LidarError(f"{out} exists: name another folder, --out DIR.")
+    write: Importer = plugin.load(Callable)  # type: ignore[arg-type]
+    out.parent.mkdir(parents=True, exist_ok=True)
+    partial = Path(tempfile.mkdtemp(prefix=f".{out.name}.", dir=out.parent))
+    try:
+        left_out = [*map(str, write(survey, partial, assets))]
+        if not (partial / SCENARIO_FILE).is_file():
+            raise LidarError(f"{plugin} wrote no {SCENARIO_FILE}.")
+        check(partial / SCENARIO_FILE)
+        partial.chmod(0o755)  # temporary folders are their owner's alone
+        partial.rename(out)
+    except LidarError as error:
+        message = str(error).replace(str(partial), str(out))
+        raise LidarError(f"{survey} makes no scenario: {message}") from error
+    except Exception as error:  # a plug-in may raise anything
+        reason = printable(str(error)) or type(error).__name__
+        raise LidarError(f"{survey} makes no scenario: {plugin} fails ({reason}).") from error
+    finally:
+        shutil.rmtree(partial, ignore_errors=True)
+    return left_out

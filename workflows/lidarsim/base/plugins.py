@@ -1,0 +1,114 @@
+"""Plug-ins: what other distributions add through entry points.
+
+A table of this package answers first. Entry points are looked up only for names that no table has,
+since importing `importlib.metadata` takes 30 ms. Each group is named beside the table that it adds
+to.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cache
+from types import MappingProxyType
+from typing import Any, TypeVar
+
+from .errors import LidarError
+from .words import printable
+
+T = TypeVar("T")
+
+
+@dataclass(frozen=True)
+class Plugin:
+    """An entry point of a distribution; `value` is «module» or «module:attribute»."""
+
+    group: str
+    name: str
+    value: str
+    distribution: str
+    version: str
+
+    def __str__(self) -> str:
+        return f"{self.name!r} of the plug-in {self.distribution} {self.version}"
+
+    @property
+    def module(self) -> str:
+        """Name of the module that provides it."""
+        return self.value.partition(":")[0].strip()
+
+    def load(self, kind: type[T]) -> T:
+        """Import what the plug-in provides.
+
+        Raises
+        ------
+        LidarError
+            If it cannot be imported, or is not of the kind.
+        """
+        thing = _imported(self)
+        if not isinstance(thing, kind):
+            raise LidarError(
+                f"{self} is {_a(type(thing).__name__)}, and {self.group} takes "
+                f"{_a(kind.__name__)}: install another version of {self.distribution}."
+            )
+        return thing
+
+    def lacks(self, field: str) -> LidarError:
+        """Return the error of a plug-in that lacks a field or function."""
+        return LidarError(
+            f"{self} lacks {field}, which {self.group} needs: install another version of "
+            f"{self.distribution}."
+        )
+
+    def broken(self, error: BaseException) -> LidarError:
+        """Return the error of a plug-in that cannot be imported, or whose import failed later."""
+        reason = printable(str(error)) or type(error).__name__
+        return LidarError(
+            f"{self} cannot be imported ({reason}): install what {self.distribution} needs, or "
+            f"uninstall it."
+        )
+
+
+@cache
+def _imported(plugin: Plugin) -> Any:
+    from importlib.metadata import EntryPoint
+
+    try:
+        return EntryPoint(plugin.name, plugin.value, plugin.group).load()
+    except Exception as error:  # a module may raise anything while it is imported
+        raise plugin.broken(error) from error
+
+
+def plugins_of(group: str) -> Mapping[str, tuple[Plugin, ...]]:
+    """Return the plug-ins of a group by name, sorted; several of a name are an error later."""
+    from importlib.metadata import entry_points
+
+    plugins: dict[str, tuple[Plugin, ...]] = {}
+    listed = [
+        Plugin(group, entry.name, entry.value, entry.dist.name, entry.dist.version)
+        for entry in entry_points(group=group)
+        if entry.dist is not None
+    ]
+    for plugin in sorted(listed, key=lambda plugin: (plugin.name, plugin.distribution)):
+        plugins[plugin.name] = (*plugins.get(plugin.name, ()), plugin)
+    return MappingProxyType(plugins)
+
+
+def find_plugin(group: str, name: str) -> Plugin | None:
+    """Return the plug-in of a group with a name, or None.
+
+    Raises
+    ------
+    LidarError
+        If two distributions provide it.
+    """
+    candidates = plugins_of(group).get(name, ())
+    if len(candidates) > 1:
+        both = " and ".join(f"{plugin.distribution} {plugin.version}" for plugin in candidates)
+        raise LidarError(f"{both} each provide {name!r} for {group}: uninstall all but one.")
+    return candidates[0] if candidates else None
+
+
+def _a(noun: str) -> str:
+    """Put the indefinite article before a name: «a dict», «an int»."""
+    return f"an {noun}" if noun[0].lower() in "aeiou" else f"a {noun}"

@@ -1,0 +1,258 @@
+"""Formats of mesh files: one row each, which is found by the ending of a file.
+
+A row names its reader, and the reader's module is imported when the first file of the format is
+read. Rows of further packages are found by the name of their table (`_TABLES`), so that nothing
+here imports these packages. Endings that no table has are looked up among plug-ins of the group
+`GROUP`, whose names are endings.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field, replace
+from functools import cache
+from importlib import import_module
+from itertools import chain
+from pathlib import Path
+
+from ...base.errors import LidarError
+from ...base.plugins import Plugin, find_plugin, plugins_of
+from .scene_graph import Content, Wanted
+
+GROUP = "lidarsim.meshes"
+
+# Content of a file, its path, and what to read besides triangles. It raises `MeshFileError` for
+# content that it does not support, and any other error for a broken file.
+MeshReader = Callable[[bytes, Path, Wanted], Content]
+
+
+@dataclass(frozen=True)
+class MeshFormat:
+    """A format of mesh files: how its files are recognised and read.
+
+    Parameters
+    ----------
+    endings
+        Endings of its files, with a dot and in lower case.
+    read
+        The reader, or its name, "module:function"; None for a format that is not read.
+    advice
+        What to do with a file that is not read, as a clause; empty if the format is read.
+    animated
+        Whether the reader can bake an animation.
+    unitless
+        Whether files state no unit, nor does the format.
+    begins
+        Bytes that files begin with. A file that begins so and has another ending is said to need
+        one of these endings.
+    from_path
+        Whether the reader opens the path itself: it gets the first bytes of the file only.
+    raster
+        Whether files are rasters of heights, whose reader takes `Wanted.raster`.
+    plugin
+        The plug-in that provides the row; filled in when the plug-in is loaded.
+    """
+
+    endings: tuple[str, ...]
+    read: MeshReader | str | None = None
+    advice: str = ""
+    animated: bool = False
+    unitless: bool = False
+    begins: tuple[bytes, ...] = ()
+    from_path: bool = False
+    raster: bool = False
+    plugin: Plugin | None = field(default=None, compare=False)
+
+    @property
+    def reader(self) -> MeshReader:
+        """The function that reads a file; its module is imported if it is named.
+
+        LidarError if it is that of a plug-in and cannot be imported.
+        """
+        assert self.read is not None, "of a format that is read"
+        if not isinstance(self.read, str):
+            return self.read
+        reader: MeshReader
+        if self.plugin is not None:
+            reader = replace(self.plugin, value=self.read).load(Callable)  # type: ignore[arg-type]
+        else:
+            module, _, function = self.read.partition(":")
+            reader = getattr(import_module(module), function)
+        return reader
+
+
+_GLTF = "lidarsim.scene.files.gltf:read_gltf"
+_POLYGONS = "lidarsim.scene.files.polygon_files"
+
+# All readers here are our own; their modules say why no library is used.
+_READ = (
+    MeshFormat((".glb",), _GLTF, animated=True, begins=(b"glTF",)),
+    MeshFormat((".gltf",), _GLTF, animated=True),
+    MeshFormat((".obj",), f"{_POLYGONS}:read_obj", unitless=True),
+    MeshFormat((".stl",), f"{_POLYGONS}:read_stl", unitless=True, begins=(b"solid ",)),
+    MeshFormat((".ply",), f"{_POLYGONS}:read_ply_mesh", unitless=True, begins=(b"ply",)),
+    MeshFormat((".off",), f"{_POLYGONS}:read_off", unitless=True, begins=(b"OFF",)),
+)
+
+# Tables of further packages, each a tuple `MESH_FORMATS`. A package need not be installed.
+_TABLES = ("lidarsim.scene.files.more_formats",)
+
+_POINTS = "make a mesh of it by lidarpool scene points"
+_MUJOCO = "a model of MuJoCo becomes OpenUSD by mujoco-usd-converter"
+
+_NOT_READ = (
+    MeshFormat(
+        (".fbx", ".blend", ".3ds", ".x3d", ".wrl", ".dxf", ".abc"),
+        advice="export it as .glb, for example from Blender",
+    ),
+    MeshFormat((".las", ".laz", ".pcd", ".xyz"), advice=_POINTS),
+    MeshFormat(
+        (".pts",),
+        advice=f"it is a point cloud, write it as .xyz, .ply or .las and {_POINTS}",
+    ),
+    MeshFormat(
+        (".e57",),
+        advice="it is a point cloud, write it as .las (pdal translate IN.e57 OUT.las) and "
+        f"{_POINTS}",
+    ),
+    MeshFormat(
+        (".pcap", ".mcap", ".bag", ".db3", ".osf"),
+        advice="it is a recording, write its points as .ply, .pcd or .las and make a mesh of "
+        "these by lidarpool scene points",
+    ),
+    MeshFormat(
+        (".sdf", ".world"),
+        advice="it is a world or model of Gazebo, convert it to OpenUSD (sdf2usd of gz-usd) or "
+        "URDF, or name the meshes that it names",
+    ),
+    MeshFormat(
+        (".step", ".stp", ".iges", ".igs", ".brep", ".fcstd"),
+        advice="it is a CAD model, make a mesh of it, for example .stl or .glb from FreeCAD",
+    ),
+    MeshFormat(
+        (".dwg", ".skp"),
+        advice="export it as .dae, .obj or .glb from the program that wrote it",
+    ),
+    MeshFormat(
+        (".ifc", ".ifczip"),
+        advice="it is a building, make a mesh of it: IfcConvert IN.ifc OUT.glb",
+    ),
+    MeshFormat(
+        (".gml",),
+        advice="it is a city model, convert it to CityJSON: citygml-tools to-cityjson IN.gml",
+    ),
+    MeshFormat(
+        (".osm",),
+        advice="it is a map, make a mesh of its buildings, for example by blosm in Blender",
+    ),
+    MeshFormat((".mjcf",), advice=_MUJOCO),
+    MeshFormat(
+        (".xml",),
+        advice=f"{_MUJOCO}, lidarpool import reads a survey of HELIOS++, and traffic.file of a "
+        "scenario names floating car data of SUMO",
+    ),
+    MeshFormat(
+        (".xodr",),
+        advice="it is a road network, make a mesh of its roads, for example by libOpenDRIVE",
+    ),
+)
+
+
+def known_formats() -> Iterator[MeshFormat]:
+    """Yield the formats of the tables: those that are read first, then those with advice only."""
+    yield from _formats_read()
+    yield from _NOT_READ
+
+
+def _formats_read() -> Iterator[MeshFormat]:
+    """Yield the formats of this package and of the packages of `_TABLES`."""
+    yield from _READ
+    for name in _TABLES:
+        yield from _table(name) or ()
+
+
+def _table(name: str) -> tuple[MeshFormat, ...] | None:
+    """Return the formats of a further package, or None if the package is not installed."""
+    try:
+        formats: tuple[MeshFormat, ...] = import_module(name).MESH_FORMATS
+    except ModuleNotFoundError as error:
+        if error.name is None or not f"{name}.".startswith(f"{error.name}."):
+            raise  # the package is installed, and another one is missing
+        return None
+    return formats
+
+
+def missing_packages() -> list[str]:
+    """Return the names of packages that would read further formats and are not installed."""
+    return [name.partition(".")[0] for name in _TABLES if _table(name) is None]
+
+
+def format_of(path: str | Path) -> MeshFormat | None:
+    """Return the format of a file by its ending, also one with advice only; None if unknown.
+
+    Raises
+    ------
+    LidarError
+        If it is of a plug-in that cannot be used, or of two.
+    """
+    ending = Path(path).suffix.lower()
+    row = _row(ending, _formats_read())
+    if row is not None:
+        return row
+    plugin = _plugin_of_ending(ending)
+    return _row(ending, iter(_NOT_READ)) if plugin is None else _row_of_plugin(plugin)
+
+
+def _row(ending: str, rows: Iterator[MeshFormat]) -> MeshFormat | None:
+    return next((row for row in rows if ending in row.endings), None)
+
+
+def plugin_of(path: str | Path) -> Plugin | None:
+    """Return the plug-in that reads files with the ending of a path, or None."""
+    ending = Path(path).suffix.lower()
+    return None if _row(ending, _formats_read()) else _plugin_of_ending(ending)
+
+
+@cache
+def _plugin_of_ending(ending: str) -> Plugin | None:
+    return find_plugin(GROUP, ending) if ending else None
+
+
+def _row_of_plugin(plugin: Plugin) -> MeshFormat:
+    """Return the row of a plug-in; LidarError if it cannot be used."""
+    row = plugin.load(MeshFormat)
+    if row.read is None:
+        raise plugin.lacks("read")
+    if plugin.name not in row.endings:
+        raise LidarError(
+            f"{plugin} is a MeshFormat of {' '.join(row.endings)}: name the plug-in after one of "
+            "these endings."
+        )
+    return replace(row, plugin=plugin)
+
+
+def plugin_endings() -> tuple[str, ...]:
+    """Return the endings that plug-ins read."""
+    return tuple(plugins_of(GROUP))
+
+
+def advice_on(path: str | Path) -> str:
+    """Return what to do with a file of a format that is not read; empty for other files."""
+    row = format_of(path)
+    return "" if row is None else row.advice
+
+
+def endings(of: Callable[[MeshFormat], bool] = lambda row: not row.advice) -> tuple[str, ...]:
+    """Return the endings of the known formats that fulfil a condition; by default, that are read.
+
+    Examples
+    --------
+    >>> endings(lambda row: row.unitless)
+    ('.obj', '.stl', '.ply', '.off')
+    """
+    return tuple(chain.from_iterable(row.endings for row in known_formats() if of(row)))
+
+
+def endings_for(data: bytes) -> tuple[str, ...]:
+    """Return the endings of the known formats whose files begin as some content does."""
+    return endings(lambda row: data.startswith(row.begins))
