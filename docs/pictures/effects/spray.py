@@ -10,7 +10,7 @@ import numpy as np
 from docs.pictures.effects._receiver import BLUE, GREY, RED, cloud
 from matplotlib.figure import Figure
 
-from lidarpool import (  # fmt: skip
+from lidarpool import (
     Actor,
     Beams,
     Noise,

@@ -16,11 +16,11 @@ from lidarsim.base.errors import LidarError, Mistakes
 from lidarsim.base.storage import Storage
 from lidarsim.base.words import plural
 
-from ..pipeline.names import GPU
 from ..report.output import SurveyOutput
 from ..run.forecast import forecast
 from ..run.job_source import identity_of
 from ..run.options import RunOptions
+from ..run.pipeline.names import GPU
 from ..scenario.advice import advice
 from ..scenario.build import Job, build
 from ..scenario.campaign import CampaignSpec

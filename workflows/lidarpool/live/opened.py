@@ -8,8 +8,8 @@ from pathlib import Path
 from lidarsim.base.errors import LidarError
 
 from ..export.formats import Format, save_cloud
-from ..pipeline.database import FILE
-from ..run.store import RUN_FOLDER
+from ..run.store.database import FILE
+from ..run.store.run_store import RUN_FOLDER
 from .view import CLOUD, Downloads, View, open_results
 
 DOWNLOADS = ("ply", "las", "parquet")  # formats that a page offers

@@ -25,9 +25,9 @@ from ..export.folder import LAST_FILE, result_folder, staging
 from ..export.format_table import FORMATS, FormatRow, plugin_rows
 from ..export.formats import Format, refuse_strangers
 from ..export.navigation_files import write_instruments
-from ..run.conductor import Conductor, Output
 from ..run.picture_file import PICTURE_FILE
 from ..run.run_result import RunResult
+from ..run.runner import Conductor, Output
 from ..run.writer import LidarWorkers
 from ..scenario.scenario import Scenario
 from .picture_content import picture_content

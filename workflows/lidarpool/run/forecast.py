@@ -37,15 +37,15 @@ from poolpart.probe import visible_gpus
 from raybeam import available_backends
 
 from ..export.navigation_files import instrument_bytes
-from ..pipeline.database import FILE
-from ..pipeline.names import GPU, LIDAR, OTHER
-from ..pipeline.policies import most_scans
 from ..scenario.build import Job
 from ..scenario.empty_cloud import EMPTY, empty_cloud_reason
-from .checks import check_memory, check_workers, find_workers, gpu_note, slots_needed
-from .connection import default_workers
+from .cluster.checks import check_memory, check_workers, find_workers, gpu_note, slots_needed
+from .cluster.connection import default_workers
 from .options import RunOptions
-from .store import RUN_FOLDER
+from .pipeline.names import GPU, LIDAR, OTHER
+from .pipeline.policies import most_scans
+from .store.database import FILE
+from .store.run_store import RUN_FOLDER
 
 # Measured on Linux: a process of ours with Dask loaded.
 PROCESS_BYTES = 300 << 20  # 110 MiB of these for numba, which compiles what calls Embree
