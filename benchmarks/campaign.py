@@ -20,8 +20,8 @@ import numpy as np
 import psutil
 
 from lidarpool import Campaign
-from lidarpool.pipeline.names import GPU
-from lidarpool.run.connection import local_client
+from lidarpool.run.cluster.connection import local_client
+from lidarpool.run.pipeline.names import GPU
 from lidarpool.run.progress import Progress
 
 MIB = 1 << 20

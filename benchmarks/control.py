@@ -21,7 +21,7 @@ from unittest.mock import patch
 import distributed.comm.tcp as tcp
 import numpy as np
 
-import lidarpool.pipeline.policies
+import lidarpool.run.pipeline.policies
 from lidarpool import Scene, Sensor, Survey, simulate
 
 # Messages that come with time and with workers, not with work.
@@ -135,7 +135,7 @@ def count_bytes(scans: int) -> None:
 
 def single_scans() -> Any:
     """Make the batches of runs so small that each has one scan; tasks still have several."""
-    return patch.object(lidarpool.pipeline.policies, "scans_per_batch", lambda *_: 1)
+    return patch.object(lidarpool.run.pipeline.policies, "scans_per_batch", lambda *_: 1)
 
 
 def count_batches(batches: int) -> None:

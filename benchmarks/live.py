@@ -22,12 +22,12 @@ from distributed import Client
 
 from lidarpool import Planning, Scene, Sensor, Survey
 from lidarpool.live.live_page import live_page
-from lidarpool.run.conductor import Conductor, Kept
-from lidarpool.run.connection import local_cluster
+from lidarpool.run.cluster.connection import local_cluster
 from lidarpool.run.job_source import OneJob
 from lidarpool.run.options import RunOptions
 from lidarpool.run.progress import Screen
 from lidarpool.run.run_page import RunPage
+from lidarpool.run.runner import Conductor, Kept
 from lidarpool.scenario.build import Job
 
 NEWS_S = 0.5  # as the page asks

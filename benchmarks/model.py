@@ -20,7 +20,7 @@ from random import Random
 from typing import Any
 
 from benchmarks.scale import GPUS_EACH
-from lidarpool.pipeline.policies import batches_per_task, most_under_way
+from lidarpool.run.pipeline.policies import batches_per_task, most_under_way
 
 GPUS = (10, 20, 50, 100, 200, 500, 1_000, 2_000, 5_000, 10_000)
 HEARTBEATS = 0.07  # share of the scheduler's core; Dask has 200 a second at most

@@ -22,7 +22,7 @@ import numpy as np
 from distributed import Client
 
 from lidarpool import Result, Scene, Sensor, Survey, simulate
-from lidarpool.run.connection import local_cluster
+from lidarpool.run.cluster.connection import local_cluster
 from lidarsim.scene.scene_mesh import SceneMesh
 
 STAGES = ("generate", "intersect", "sort", "collect")

@@ -40,7 +40,7 @@ import dask
 import psutil
 from distributed import Client, Scheduler, Worker, get_worker
 
-import lidarpool.pipeline.rigs
+import lidarpool.run.pipeline.rigs
 from benchmarks.campaign import BASE, CAMPAIGN
 from benchmarks.control import single_scans
 from lidarpool import Campaign, Scene, Sensor, Survey, simulate
@@ -75,13 +75,13 @@ async def _workers(
     if slots is not None:
         kind, threads = slots
         options |= {"resources": {kind: threads}, "nthreads": threads}
-    columns_of = lidarpool.pipeline.rigs.columns_of
+    columns_of = lidarpool.run.pipeline.rigs.columns_of
 
     def slowly(found: Any) -> Any:
         time.sleep(seconds)
         return columns_of(found)
 
-    lidarpool.pipeline.rigs.columns_of = slowly
+    lidarpool.run.pipeline.rigs.columns_of = slowly
     workers = [
         Worker(address, name=f"{kind}{number}", **options) for number in range(first, first + count)
     ]

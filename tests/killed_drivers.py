@@ -11,7 +11,7 @@ from pathlib import Path
 # when it passes a point for the n-th time; a point in capitals stands for a call.
 DRIVERS = """
 import json, os, signal, sys, traceback
-import lidarpool.cli.run_command, lidarpool.pipeline.policies
+import lidarpool.cli.run_command, lidarpool.run.pipeline.policies
 import lidarpool.report.campaign_output as campaign_output
 import lidarpool.report.result_pictures as pictures
 from lidarpool.__main__ import main
@@ -19,8 +19,8 @@ from lidarsim.base.storage import Storage
 from lidarpool.base.tracing import trace_to
 from lidarpool.datasets.dataset import DataSet
 from lidarpool.export.formats import Format
-from lidarpool.pipeline.database import RunDatabase
-from lidarpool.run.store import RunStore
+from lidarpool.run.store.database import RunDatabase
+from lidarpool.run.store.run_store import RunStore
 
 CALLS = {
     "OPEN": (RunDatabase, "__init__"),
@@ -40,7 +40,7 @@ class BlankPage:
     def svg(self): return "<svg></svg>"
 pictures.draw_scene = pictures.draw_hits = BlankPage
 pictures.draw_cloud = pictures.draw_path = BlankPage
-lidarpool.pipeline.policies.scans_per_batch = lambda *_: 10
+lidarpool.run.pipeline.policies.scans_per_batch = lambda *_: 10
 
 def drive(point, times):
     left = [times]

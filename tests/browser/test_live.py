@@ -10,11 +10,11 @@ import pytest
 
 from lidarpool import Scene, Survey
 from lidarpool.live.live_page import live_page
-from lidarpool.run.conductor import Conductor, Kept
-from lidarpool.run.connection import local_client
+from lidarpool.run.cluster.connection import local_client
 from lidarpool.run.job_source import OneJob
 from lidarpool.run.options import RunOptions
 from lidarpool.run.progress import Screen
+from lidarpool.run.runner import Conductor, Kept
 from lidarpool.scenario.build import Job
 
 pytestmark = [pytest.mark.browser, pytest.mark.slow]
@@ -33,7 +33,7 @@ def client():
 @pytest.fixture
 def live(monkeypatch):
     """Return a page, and the job that it follows, a survey of many small batches."""
-    monkeypatch.setattr("lidarpool.pipeline.policies.scans_per_batch", lambda *_: 10)
+    monkeypatch.setattr("lidarpool.run.pipeline.policies.scans_per_batch", lambda *_: 10)
     survey = Survey(poses=[(0, 0, 1 + step / 20) for step in range(SCANS // 36)])
     job = OneJob(Job(Scene.seed(), survey))
     with live_page(port=0, browser=False) as live:

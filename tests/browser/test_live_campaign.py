@@ -9,10 +9,10 @@ import pytest
 from lidarpool import Campaign, Job, Scene, Sensor, Survey
 from lidarpool.live.live_page import live_page
 from lidarpool.report.campaign_output import DataSetOutput
-from lidarpool.run.conductor import Conductor
-from lidarpool.run.connection import local_client
+from lidarpool.run.cluster.connection import local_client
 from lidarpool.run.options import RunOptions
 from lidarpool.run.progress import Screen
+from lidarpool.run.runner import Conductor
 
 pytestmark = [pytest.mark.browser, pytest.mark.slow]
 

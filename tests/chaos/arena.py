@@ -15,7 +15,7 @@ from distributed import Client, SpecCluster
 
 from lidarpool.base.fork_server import start_fork_server
 from lidarpool.base.tracing import trace_to
-from lidarpool.run.connection import local_cluster
+from lidarpool.run.cluster.connection import local_cluster
 from poolpart.deploy import forked_workers
 
 from .events import Board, ChaosPlugin

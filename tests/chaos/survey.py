@@ -17,7 +17,7 @@ import numpy as np
 from tests.shapes import block
 
 from lidarpool import Actor, Planning, Result, Scene, Sensor, Survey, Track, remove_run, simulate
-from lidarpool.pipeline.placement import placement_violations
+from lidarpool.run.pipeline.placement import placement_violations
 
 from .arena import Arena
 from .checker import Verdict, judge

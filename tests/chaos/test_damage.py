@@ -22,8 +22,8 @@ from tests.drives import the_scene, the_sweeps, write_set
 
 from lidarpool import LidarError
 from lidarpool.columns.parts import part_name
-from lidarpool.pipeline.database import RunDatabase
-from lidarpool.pipeline.messages import Receipt
+from lidarpool.run.pipeline.messages import Receipt
+from lidarpool.run.store.database import RunDatabase
 
 DAMAGES = 6  # of each file, for each reader
 

@@ -17,7 +17,7 @@ from tests.chaos.survey import PLANNING, Reference, disturbed, room
 import poolpart.task_locations
 from lidarpool import simulate
 from lidarpool.base.tracing import trace_to
-from lidarpool.pipeline.names import GPU
+from lidarpool.run.pipeline.names import GPU
 
 JOIN_S = 300.0
 STOP_S = 2.0  # for others to take over
@@ -48,7 +48,9 @@ def lonely(arena):
         while not (found := [a for a, w in list(workers.items()) if str(w.name) == name]):
             assert time.monotonic() < deadline, f"{name} did not join"
             time.sleep(0.05)
-        arena.client.run(lambda: bool(import_module("lidarpool.pipeline.stages")), workers=found)
+        arena.client.run(
+            lambda: bool(import_module("lidarpool.run.pipeline.stages")), workers=found
+        )
         arena.withdraw(partition)
         return name
 
@@ -77,7 +79,7 @@ def test_given_up_by_the_scheduler_what_it_does_counts_once(
 @pytest.mark.parametrize("stage", ["collect-0", GPU])
 def test_given_up_by_the_driver_it_does_no_harm(arena, what, known, monkeypatch, stage):
     """The scheduler would take it for dead after five minutes, and wait that long."""
-    monkeypatch.setattr("lidarpool.pipeline.policies.scans_per_batch", lambda *_: 10)
+    monkeypatch.setattr("lidarpool.run.pipeline.policies.scans_per_batch", lambda *_: 10)
     seen, stopped, reasons, continued = [], [], set(), []
 
     def given_up() -> bool:

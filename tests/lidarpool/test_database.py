@@ -14,9 +14,9 @@ from hypothesis import strategies as st
 
 from lidarpool import LidarError
 from lidarpool.columns.parts import part_name
-from lidarpool.pipeline.database import RunDatabase
-from lidarpool.pipeline.messages import Receipt
 from lidarpool.plan import Planning, run_trial
+from lidarpool.run.pipeline.messages import Receipt
+from lidarpool.run.store.database import RunDatabase
 
 SCANS = 20
 
@@ -36,7 +36,7 @@ def receipt(first, stop, rows=7, cells=(0, 0, 0, 1, 1, 1), job=JOB):
 def mark(monkeypatch):
     """Give all runs the same mark."""
     monkeypatch.setattr(
-        "lidarpool.pipeline.database.secrets.token_hex", lambda size: MARK[: 2 * size]
+        "lidarpool.run.store.database.secrets.token_hex", lambda size: MARK[: 2 * size]
     )
 
 
@@ -286,7 +286,7 @@ def test_one_run_at_a_time(db, tmp_path):
     db.commit([receipt(0, 5)])
     code = (
         "import sys; from pathlib import Path\n"
-        "from lidarpool.pipeline.database import RunDatabase\n"
+        "from lidarpool.run.store.database import RunDatabase\n"
         "try: RunDatabase(Path(sys.argv[1]))\n"
         "except Exception as error: print(type(error).__name__, error)\n"
     )

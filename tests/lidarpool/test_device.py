@@ -32,7 +32,7 @@ from lidarpool import (
     Track,
 )
 from lidarpool.columns.parts import pack
-from lidarpool.pipeline import rigs as stage
+from lidarpool.run.pipeline import rigs as stage
 from lidarsim.scene.actors import box
 from lidarsim.scene.colours import Colours
 from lidarsim.scene.shapes import seed_objects

@@ -14,14 +14,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from lidarpool import Scene, Sensor, Survey
-from lidarpool.pipeline import dispatch, driver, policies
-from lidarpool.pipeline import job_state as jobs
-from lidarpool.pipeline.database import RunDatabase
-from lidarpool.pipeline.dispatch import PIECES
-from lidarpool.pipeline.driver import ANNOUNCED, STALL_S, RunDriver
-from lidarpool.pipeline.failures import JobError
-from lidarpool.pipeline.job_state import BatchState, Outcome
-from lidarpool.pipeline.messages import (
+from lidarpool.run.pipeline import batches as jobs
+from lidarpool.run.pipeline import dispatch, policies
+from lidarpool.run.pipeline import pipeline as driver
+from lidarpool.run.pipeline.batches import BatchState, Outcome
+from lidarpool.run.pipeline.dispatch import PIECES
+from lidarpool.run.pipeline.failures import JobError
+from lidarpool.run.pipeline.messages import (
     ColumnsLost,
     Failed,
     Receipt,
@@ -30,8 +29,10 @@ from lidarpool.pipeline.messages import (
     samples_of_scan,
     summary_type,
 )
-from lidarpool.pipeline.placement import TaskRecord
-from lidarpool.pipeline.policies import LATE_S, SPAN, TASK_SECONDS, most_under_way
+from lidarpool.run.pipeline.pipeline import ANNOUNCED, STALL_S, RunDriver
+from lidarpool.run.pipeline.placement import TaskRecord
+from lidarpool.run.pipeline.policies import LATE_S, SPAN, TASK_SECONDS, most_under_way
+from lidarpool.run.store.database import RunDatabase
 from lidarsim.base.storage import Storage
 from poolpart.task_locations import TaskLocations
 

@@ -30,12 +30,12 @@ from lidarpool.live.live_page import (
     live_page,
 )
 from lidarpool.report.campaign_output import DataSetOutput
-from lidarpool.run.conductor import Conductor, Kept
 from lidarpool.run.job_source import OneJob
 from lidarpool.run.options import RunOptions
 from lidarpool.run.progress import Progress, Screen
 from lidarpool.run.run_page import JobNow
-from lidarpool.run.store import RunStore
+from lidarpool.run.runner import Conductor, Kept
+from lidarpool.run.store.run_store import RunStore
 from lidarsim.columns.table import CHANNEL, OBJECT, SCAN
 from poolpart import PartitionStats
 

@@ -7,10 +7,10 @@ from types import SimpleNamespace
 
 import pytest
 
-from lidarpool.pipeline.job_state import Batch, BatchState, Outcome
-from lidarpool.pipeline.names import INTERSECT
-from lidarpool.pipeline.placement import TaskRecord
-from lidarpool.pipeline.policies import (
+from lidarpool.run.pipeline.batches import Batch, BatchState, Outcome
+from lidarpool.run.pipeline.names import INTERSECT
+from lidarpool.run.pipeline.placement import TaskRecord
+from lidarpool.run.pipeline.policies import (
     AHEAD,
     COLLECTING,
     LATE_FACTOR,
@@ -24,7 +24,7 @@ from lidarpool.pipeline.policies import (
     scans_per_batch,
     slots_wanted,
 )
-from lidarpool.pipeline.task_book import MISPLACED_MOST, RECORDS_MOST, StageTotals, TaskBook
+from lidarpool.run.pipeline.task_book import MISPLACED_MOST, RECORDS_MOST, StageTotals, TaskBook
 from poolpart.task_locations import TaskLocations, TaskPlace
 
 A, B = "tcp://a:1", "tcp://b:1"

@@ -17,13 +17,13 @@ from lxml import html
 from PIL import Image
 
 from lidarpool import Cloud, Mounted, Noise, Planning, Result, Returns, Scene, Survey, load_sensor
-from lidarpool.pipeline.names import COLLECT, GENERATE, INTERSECT, SORT
-from lidarpool.pipeline.placement import TaskRecord
-from lidarpool.pipeline.task_book import TaskBook
 from lidarpool.plan import best
 from lidarpool.plan.trial import run_trial
 from lidarpool.report.page.rendering import ROWS_MOST, put_picture, write_page
 from lidarpool.report.report import CountedCloud, make_report
+from lidarpool.run.pipeline.names import COLLECT, GENERATE, INTERSECT, SORT
+from lidarpool.run.pipeline.placement import TaskRecord
+from lidarpool.run.pipeline.task_book import TaskBook
 from lidarpool.run.trials import TRIAL
 from lidarpool.scenario.scenario import Scenario
 from lidarsim.scene.scene_mesh import SceneMesh

@@ -12,8 +12,8 @@ from tests.shapes import Cart, cast_between, tally_of
 
 from lidarpool import Actor, Beams, Column, Mounted, Pose, Scene, Sensor, Spin, Survey, Track
 from lidarpool.columns.parts import pack
-from lidarpool.pipeline import rigs
-from lidarpool.pipeline.failures import naming_scans
+from lidarpool.run.pipeline import rigs
+from lidarpool.run.pipeline.failures import naming_scans
 from lidarsim.scene.actors import box
 from lidarsim.scene.shapes import seed_objects
 from lidarsim.simulator import scene_caster

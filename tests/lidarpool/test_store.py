@@ -14,14 +14,14 @@ import numpy as np
 import pytest
 from tests.committing import commit
 
-import lidarpool.run.remote
-import lidarpool.run.store
+import lidarpool.run.store.remote
+import lidarpool.run.store.run_store
 from lidarpool import Campaign, Job, LidarError, Planning, Scene, Sensor, Survey, remove_run
 from lidarpool.columns.parts import mark_name, part_name, probe_name
 from lidarpool.datasets.job_table import JobRow
 from lidarpool.plan import run_trial
 from lidarpool.run.job_source import OneJob
-from lidarpool.run.store import RunStore
+from lidarpool.run.store.run_store import RunStore
 from lidarsim.base.storage import Storage
 from lidarsim.scene.shapes import seed_objects
 
@@ -142,7 +142,7 @@ def test_another_run_cannot_go_on(other, unfinished):
 
 def test_another_version_cannot_go_on(unfinished, monkeypatch):
     later = {"lidarpool": "0.2 (sources 12345678)"}
-    monkeypatch.setattr(lidarpool.run.store, "software", lambda: later)
+    monkeypatch.setattr(lidarpool.run.store.run_store, "software", lambda: later)
     with pytest.raises(LidarError, match=r"lidarpool \S+ \(sources \w+\), here it is 0\.2"):
         opened(unfinished, resume=True)
 
@@ -636,7 +636,7 @@ def test_storage_that_fails(url, monkeypatch):
     def fail(*_):
         raise OSError("it is full")
 
-    monkeypatch.setattr(lidarpool.run.remote.Storage, "write", fail)
+    monkeypatch.setattr(lidarpool.run.store.remote.Storage, "write", fail)
     with pytest.raises(LidarError, match=f"cannot be kept in {url}: it is full"):
         store.save(now=True)
     with pytest.raises(LidarError, match=rf"Cannot write to {url} \(it is full\)"):

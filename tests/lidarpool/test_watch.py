@@ -5,8 +5,8 @@ from types import SimpleNamespace
 import pytest
 
 from lidarpool import LidarError
-from lidarpool.run import watch
-from lidarpool.run.watch import Watch
+from lidarpool.run.cluster import watch
+from lidarpool.run.cluster.watch import Watch
 from poolpart.task_locations import TaskLocations
 
 

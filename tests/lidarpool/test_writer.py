@@ -8,9 +8,9 @@ import pytest
 
 from lidarpool import Scene, Sensor, Survey
 from lidarpool.datasets.dataset import DataSet
-from lidarpool.pipeline.failures import JobError
 from lidarpool.run import writer
-from lidarpool.run.checks import check_workers
+from lidarpool.run.cluster.checks import check_workers
+from lidarpool.run.pipeline.failures import JobError
 from lidarpool.run.writer import TOGETHER, JobWriter
 from lidarsim.base.storage import Storage
 

@@ -19,14 +19,14 @@ from tests.clusters import thread_cluster
 from tests.daemons import wait_until
 
 import lidarpool.base.fork_server
-import lidarpool.pipeline.long_stages
 import lidarpool.report.campaign_report
 import lidarpool.report.charts
 import lidarpool.report.result_pictures
+import lidarpool.run.pipeline.long_stages
 from lidarpool import Cloud
 from lidarpool.base.tracing import trace_to
 from lidarpool.cli.commands import main
-from lidarpool.run.connection import local_cluster
+from lidarpool.run.cluster.connection import local_cluster
 from poolpart.fetch import fetch_available
 from poolpart.pipe_states import pipes_of
 
@@ -272,9 +272,9 @@ def _no_pictures(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch
 @pytest.fixture
 def all_records(monkeypatch: pytest.MonkeyPatch) -> None:
     """Wait for the records of the long stages: a run does without those that come too late."""
-    monkeypatch.setattr(lidarpool.pipeline.long_stages, "LAST_WORDS_S", 120.0)
+    monkeypatch.setattr(lidarpool.run.pipeline.long_stages, "LAST_WORDS_S", 120.0)
     patient = partial(fetch_available, patience_s=120.0)
-    monkeypatch.setattr(lidarpool.pipeline.long_stages, "fetch_available", patient)
+    monkeypatch.setattr(lidarpool.run.pipeline.long_stages, "fetch_available", patient)
 
 
 @pytest.fixture
@@ -284,4 +284,4 @@ def small_batches(monkeypatch: pytest.MonkeyPatch) -> None:
     By default the machine's speed decides, and a survey of small scans may be under way as a
     whole, or stage 1 have ended, when the driver sees the first frames.
     """
-    monkeypatch.setattr("lidarpool.pipeline.policies.scans_per_batch", lambda *_: 10)
+    monkeypatch.setattr("lidarpool.run.pipeline.policies.scans_per_batch", lambda *_: 10)

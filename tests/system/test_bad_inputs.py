@@ -13,8 +13,8 @@ import trimesh
 from tests.clusters import cluster_of, import_jobqueue, thread_cluster
 from tests.rows import quick
 
-import lidarpool.run.connection
-import lidarpool.run.watch as lidarpool_watch
+import lidarpool.run.cluster.connection
+import lidarpool.run.cluster.watch as lidarpool_watch
 from raybeam import available_backends
 
 BOX = trimesh.creation.box((2, 4, 6))
@@ -118,7 +118,7 @@ def place(tmp_path: Path) -> Path:
 @pytest.fixture
 def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
     """Give up soon; for addresses where nobody answers. On a busy machine a scheduler may not."""
-    monkeypatch.setattr(lidarpool.run.connection, "CONNECT_TIMEOUT_S", 1)
+    monkeypatch.setattr(lidarpool.run.cluster.connection, "CONNECT_TIMEOUT_S", 1)
 
 
 def content(folder: Path) -> dict[str, bytes | None]:

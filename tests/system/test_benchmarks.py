@@ -9,7 +9,7 @@ from distributed import Client
 from tests.clusters import import_jobqueue, thread_cluster
 from tests.cuda_on_host import played_cuda, source_backend  # noqa: F401 - fixtures
 
-import lidarpool.run.cluster
+import lidarpool.run.cluster.cluster
 
 pytestmark = pytest.mark.slow
 
@@ -124,7 +124,7 @@ def test_a_survey_on_a_device(played_cuda, tmp_path, monkeypatch):  # noqa: F811
         ):
             yield c
 
-    monkeypatch.setattr(lidarpool.run.cluster, "local_client", threads)
+    monkeypatch.setattr(lidarpool.run.cluster.cluster, "local_client", threads)
     path = tmp_path / "gpu.json"
     options = ["--quick", "--in-process", "--only", "run", "--json", str(path)]
     assert gpu.main([*options, "--folder", str(tmp_path)]) == 0

@@ -20,7 +20,7 @@ from tests.daemons import wait_until
 from tests.killed_drivers import drive
 from tests.rows import quick
 
-import lidarpool.run.cluster
+import lidarpool.run.cluster.cluster
 import lidarpool.run.writer
 from lidarpool import Campaign, Job, LidarError, Material, Scene, Sensor, Survey, simulate, sweeps
 from lidarpool.base.sealed import sealed, unsealed
@@ -551,7 +551,7 @@ def test_a_campaign_whose_only_job_was_harmed_goes_on(client, here, unwritten, m
         path.unlink()
     for _ in range(2):  # what is to be done again is forgotten first, and nothing else is there
         with monkeypatch.context() as patched, pytest.raises(LidarError, match="no cluster"):
-            patched.setattr(lidarpool.run.cluster, "client_of", refuse)
+            patched.setattr(lidarpool.run.cluster.cluster, "client_of", refuse)
             unwritten.run(here / "ds", client=client, resume=True)
     assert unwritten.run(here / "ds", client=client, resume=True).done == 3
     (here / "ds" / "run").mkdir()  # a run that was killed as it removed itself
@@ -772,7 +772,7 @@ def test_jobs_are_written_here_when_no_worker_has_a_slot_left(files, whole, monk
     """Its last slots went with a worker that does not come back."""
     monkeypatch.setattr(lidarpool.run.writer, "BEGIN_S", 0.05)
     needed = {"GPU": 1, "LIDAR": 3}
-    monkeypatch.setattr(lidarpool.run.cluster, "slots_needed", lambda *_, **__: needed)
+    monkeypatch.setattr(lidarpool.run.cluster.cluster, "slots_needed", lambda *_, **__: needed)
     with (
         thread_cluster({"GPU": 1}, {"LIDAR": 4}) as cluster,
         Client(cluster, set_as_default=False) as client,

@@ -30,7 +30,7 @@ SHORT = "sensor: {layers: 8}\nplanning: {trials: 4, iterations: 20}\n"
 # A run does without the records of stages that end too late on a busy machine.
 PATIENT = """
 from functools import partial
-import lidarpool.pipeline.long_stages as stages
+import lidarpool.run.pipeline.long_stages as stages
 stages.LAST_WORDS_S = 120
 stages.fetch_available = partial(stages.fetch_available, patience_s=120)
 """

@@ -14,9 +14,9 @@ from tests.clusters import cluster_of
 from tests.commands import RunningCommand
 
 from lidarpool import LidarError
-from lidarpool.run import watch
-from lidarpool.run.connection import connected, local_client
-from lidarpool.run.watch import Waiting
+from lidarpool.run.cluster import watch
+from lidarpool.run.cluster.connection import connected, local_client
+from lidarpool.run.cluster.watch import Waiting
 
 
 def test_workers_are_forked_from_one_process_also_in_place_of_others():
@@ -33,8 +33,10 @@ def test_workers_are_forked_from_one_process_also_in_place_of_others():
             time.sleep(0.1)
         (server,) = set(client.run(os.getppid).values())
         assert psutil.Process(server).ppid() == os.getpid()
-        modules = client.run(lambda: {"lidarpool.pipeline.stages", "open3d"} & sys.modules.keys())
-        assert list(modules.values()) == [{"lidarpool.pipeline.stages"}] * 2
+        modules = client.run(
+            lambda: {"lidarpool.run.pipeline.stages", "open3d"} & sys.modules.keys()
+        )
+        assert list(modules.values()) == [{"lidarpool.run.pipeline.stages"}] * 2
     assert set(psutil.Process(server).children()) <= others
     # Those of the user's own processes.
     assert forkserver._forkserver._preload_modules == preload

@@ -8,10 +8,10 @@ from distributed import Client, Worker
 from tests.clusters import thread_cluster
 
 from lidarpool import LidarError, Planning, ScanFrame, Scene, Sensor, Survey, simulate
-from lidarpool.pipeline.driver import RunDriver
-from lidarpool.pipeline.placement import placement_violations
+from lidarpool.run.cluster.watch import WATCH_EVERY_S
+from lidarpool.run.pipeline.pipeline import RunDriver
+from lidarpool.run.pipeline.placement import placement_violations
 from lidarpool.run.trials import TrialPump
-from lidarpool.run.watch import WATCH_EVERY_S
 from poolpart.workers import worker_identities
 
 # Enough batches that the run is still under way when something happens to it.
@@ -54,7 +54,9 @@ def test_frames_come_in_order_and_every_scan_once(
 
 
 def test_a_partition_that_stays_empty_ends_the_run(tmp_path, monkeypatch):
-    monkeypatch.setattr("lidarpool.pipeline.policies.TASK_BATCHES", 1)  # or all would be under way
+    monkeypatch.setattr(
+        "lidarpool.run.pipeline.policies.TASK_BATCHES", 1
+    )  # or all would be under way
 
     def on_frame(frame: ScanFrame) -> None:
         if frame.scan == 60:

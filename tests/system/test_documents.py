@@ -30,7 +30,7 @@ import yaml
 from distributed.cli import dask_scheduler, dask_worker
 from tests.clusters import import_jobqueue
 
-import lidarpool.run.cluster
+import lidarpool.run.cluster.cluster
 from lidarpool import Cloud, LidarError, save_cloud
 from lidarpool.cli.commands import cli
 from lidarpool.datasets.dataset import DATA_SETS
@@ -111,7 +111,7 @@ def in_threads(monkeypatch, cluster_client):
     theirs = partial(distributed.LocalCluster, processes=False, protocol="tcp")
     monkeypatch.setattr(distributed, "LocalCluster", theirs)
     ours = nullcontext(cluster_client)
-    monkeypatch.setattr(lidarpool.run.cluster, "local_client", lambda *_, **__: ours)
+    monkeypatch.setattr(lidarpool.run.cluster.cluster, "local_client", lambda *_, **__: ours)
 
 
 @pytest.mark.parametrize("block", PROGRAMS, ids=lambda block: block.where)

@@ -15,7 +15,7 @@ from tests.daemons import wait_until
 
 import lidarsim.simulator.scene_caster
 from lidarpool import Campaign, Column, Job, Scene, Sensor, Survey, save_cloud, simulate
-from lidarpool.pipeline import rigs
+from lidarpool.run.pipeline import rigs
 from lidarsim.scene.actors import box
 
 SEED, ROOM = Scene.seed(), Scene.from_meshes([box("Room", (8, 6, 3))])

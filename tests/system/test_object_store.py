@@ -24,7 +24,7 @@ from lidarpool.columns.parts import unpack
 from lidarpool.datasets.dataset import job_file
 from lidarpool.datasets.job_table import JobRow
 from lidarpool.export.format_table import DATA_SETS
-from lidarpool.run.store import RunStore
+from lidarpool.run.store.run_store import RunStore
 from lidarsim.base.storage import Storage
 from lidarsim.columns.part_columns import PartColumns
 from lidarsim.sweeps.sweeps import SWEEPS_FILE
@@ -262,7 +262,7 @@ def test_drivers_are_killed_and_the_next_has_nothing_but_the_bucket(
     (here / "s.yaml").write_text(RESUMED)
     whole = ["--out", tmp_path / "whole", "--only", "cloud", "-q", "--scheduler", cluster]
     assert lidarpool("run", here / "s.yaml", *whole).code == 0
-    often = "import lidarpool.run.remote as r, lidarpool.run.run as run\n"
+    often = "import lidarpool.run.store.remote as r, lidarpool.run.run_loop as run\n"
     often += "r.COPY_EVERY_S = r.COPY_REST = run.SAVE_EVERY_S = 0\n"
     run = ["s.yaml", "--out", url, "--resume", "--scheduler", cluster]
     moments = [("COMMIT", 1), ("driver.frame", 100), ("COMMIT", 4), ("OPEN", 1), ("SAVE", 1)]

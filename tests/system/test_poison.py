@@ -8,11 +8,11 @@ from typing import Any
 import pytest
 from distributed import Client
 
-import lidarpool.pipeline.long_stages
-import lidarpool.pipeline.rigs
+import lidarpool.run.pipeline.long_stages
+import lidarpool.run.pipeline.rigs
 import lidarpool.run.trials
 from lidarpool import LidarError, Planning, ScanFrame, Scene, Sensor, Survey, simulate
-from lidarpool.pipeline.failures import words_on_memory
+from lidarpool.run.pipeline.failures import words_on_memory
 
 SURVEY = Survey(Sensor.grid(rays_per_revolution=360, layers=8, step_deg=2), [(0, 0, 1)], steps=180)
 POISON = 57
@@ -58,7 +58,7 @@ def test_a_scan_that_kills_its_worker_is_named_and_all_others_are_kept(
 
 @pytest.mark.slow
 def test_summaries_that_kill_the_sorter_end_the_run(client, sabotage, monkeypatch, left_over):
-    monkeypatch.setattr(lidarpool.pipeline.long_stages, "DEATHS_MOST", 2)
+    monkeypatch.setattr(lidarpool.run.pipeline.long_stages, "DEATHS_MOST", 2)
     sabotage("sort.get", POISON)
     with pytest.raises(LidarError, match=r"stage \w+ was started 3 times, and each time"):
         simulate(Scene.seed(), SURVEY, client=client)

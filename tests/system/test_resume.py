@@ -172,7 +172,7 @@ def test_frames_go_on_where_they_were(cluster_client, tmp_path, monkeypatch, sam
     assert same_cloud(result.cloud, whole.cloud)
 
     # A complete run needs no cluster.
-    monkeypatch.setattr("lidarpool.run.cluster.local_client", None)
+    monkeypatch.setattr("lidarpool.run.cluster.cluster.local_client", None)
     again = simulate(Scene.seed(), SURVEY, folder=folder, resume=True)
     assert again.resumed == SURVEY.scan_count and again.records == ()
     assert again.backend == "embree"

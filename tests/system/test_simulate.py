@@ -13,7 +13,7 @@ from distributed import Client, Queue, Variable
 from tests.shapes import room
 
 from lidarpool import LidarError, Planning, ScanSpec, Sensor, Survey, simulate
-from lidarpool.pipeline.messages import ScanRange
+from lidarpool.run.pipeline.messages import ScanRange
 from lidarpool.scenario.build import build
 from lidarpool.scenario.scenario import Scenario
 from poolpart import Pool
@@ -193,12 +193,12 @@ def raise_at(scan: int | str | None, scan_of=None):
             "preparing the scene on the casting workers failed: .*the mirror is loose",
         ),
         (
-            "lidarpool.pipeline.stages.pack",
+            "lidarpool.run.pipeline.stages.pack",
             raise_at(None),
             r"stage collect failed: scan \d+: FloatingPointError",
         ),
         (
-            "lidarpool.pipeline.messages.StageStart.trace",
+            "lidarpool.run.pipeline.messages.StageStart.trace",
             raise_at("sort", lambda arguments: arguments[0].stage),
             "stage sort failed: the mirror is loose",
         ),

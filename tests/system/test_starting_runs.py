@@ -10,12 +10,12 @@ import pytest
 from distributed import Client
 from tests.clusters import import_jobqueue
 
-import lidarpool.run.checks
+import lidarpool.run.cluster.checks
 import poolpart.deploy.clusters
 from lidarpool import LidarError, ScanFrame, Scene, Sensor, Survey, simulate
-from lidarpool.pipeline.casting_workers import CastingWorkers
-from lidarpool.pipeline.names import GPU, LIDAR
-from lidarpool.run.checks import common_backend
+from lidarpool.run.cluster.checks import common_backend
+from lidarpool.run.pipeline.casting_workers import CastingWorkers
+from lidarpool.run.pipeline.names import GPU, LIDAR
 from poolpart import Pool
 from poolpart.deploy import start_partitions
 from poolpart.workers import worker_identities
@@ -71,7 +71,7 @@ def lose_gpu(monkeypatch) -> Callable[[Callable[[], object]], None]:
                 acts.pop()()
             return common_backend(*arguments)
 
-        monkeypatch.setattr(lidarpool.run.checks, "common_backend", ask)
+        monkeypatch.setattr(lidarpool.run.cluster.checks, "common_backend", ask)
 
     return lose_gpu
 

@@ -10,8 +10,8 @@ from distributed import Client, Security
 from tests.clusters import thread_cluster
 
 from lidarpool import LidarError
-from lidarpool.run.connection import TlsFiles, connected, local_cluster
-from lidarpool.run.watch import Waiting
+from lidarpool.run.cluster.connection import TlsFiles, connected, local_cluster
+from lidarpool.run.cluster.watch import Waiting
 from poolpart import Pool
 
 

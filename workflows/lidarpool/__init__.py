@@ -46,11 +46,11 @@ if TYPE_CHECKING:
     from .export.formats import save_cloud
     from .export.open3d_cloud import to_open3d
     from .export.ply import read_cloud
-    from .pipeline.messages import ScanFrame
     from .plan import Plan, Planning
     from .report.merging import merge
+    from .run.pipeline.messages import ScanFrame
     from .run.run_result import CampaignRun
-    from .run.store import remove_run
+    from .run.store.run_store import remove_run
     from .scenario.build import Job
 
 __all__ = [

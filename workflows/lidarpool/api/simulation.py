@@ -22,15 +22,15 @@ from lidarsim.simulator.scene_caster import check_backend_here
 from ..base.shard import Shard
 from ..export.folder import output_place
 from ..live import page_of
-from ..pipeline.messages import ScanFrame
 from ..plan import Planning
 from ..report.campaign_output import DataSetOutput
-from ..run.conductor import Conductor, Kept
 from ..run.job_source import OneJob
 from ..run.options import RunOptions
+from ..run.pipeline.messages import ScanFrame
 from ..run.progress import Progress, Screen
 from ..run.run_result import CampaignRun, RunResult
-from ..run.store import RUN_FOLDER
+from ..run.runner import Conductor, Kept
+from ..run.store.run_store import RUN_FOLDER
 from ..run.stream import SweepStream
 from ..scenario import campaign as described
 from ..scenario.build import Job

@@ -31,7 +31,7 @@ def start_fork_server() -> bool:
         return False
     server: Any = forkserver._forkserver
     preload, before = server._preload_modules, dict(os.environ)
-    server.set_forkserver_preload(["lidarpool.pipeline.forked"])
+    server.set_forkserver_preload(["lidarpool.run.pipeline.forked"])
     os.environ.update(_ENVIRONMENT)
     try:
         with children_spared():

@@ -34,7 +34,7 @@ from .scenario_commands import check, import_, init, scene, schema, sensors, sta
 from .shared_options import set_logs
 
 if TYPE_CHECKING:
-    from ..run.connection import TlsFiles
+    from ..run.cluster.connection import TlsFiles
     from ..run.options import RunOptions
     from .terminal import Terminal
 
@@ -93,7 +93,7 @@ def _runs(command: Callable[..., None]) -> Callable[..., None]:
             start_fork_server()
         try:
             with deferred_interrupts():  # an interrupted import cannot be repeated
-                from ..run.cluster_file import ClusterFile
+                from ..run.cluster.cluster_file import ClusterFile
                 from ..run.options import RunOptions
                 from . import run_command  # noqa: F401
                 from .terminal import Terminal
@@ -214,7 +214,7 @@ def run(
     from lidarsim.base.storage import Storage
 
     from ..report.campaign_output import verify
-    from ..run.store import RUN_FOLDER
+    from ..run.store.run_store import RUN_FOLDER
     from ..scenario.campaign import CampaignSpec, is_campaign
     from ..scenario.scenario import Scenario
     from .run_command import run_campaign, run_job, run_scenario
@@ -301,7 +301,7 @@ def info(scheduler: str | None, files: TlsFiles, as_json: bool) -> None:
     from raybeam import available_backends
 
     from ..report.report import versions
-    from ..run.connection import connected
+    from ..run.cluster.connection import connected
 
     pool = None
     if scheduler is not None:

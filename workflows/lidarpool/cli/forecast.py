@@ -35,15 +35,15 @@ from poolpart.probe import visible_gpus
 from raybeam import available_backends
 
 from ..export.navigation_files import instrument_bytes
-from ..pipeline.database import FILE
-from ..pipeline.names import GPU, LIDAR, OTHER
-from ..pipeline.policies import most_scans
 from ..report.output import ROOM_BYTES, SurveyOutput
-from ..run.checks import check_memory, check_workers, find_workers, gpu_note, slots_needed
-from ..run.connection import default_workers
+from ..run.cluster.checks import check_memory, check_workers, find_workers, gpu_note, slots_needed
+from ..run.cluster.connection import default_workers
 from ..run.job_source import identity_of
 from ..run.options import RunOptions
-from ..run.store import RUN_FOLDER
+from ..run.pipeline.names import GPU, LIDAR, OTHER
+from ..run.pipeline.policies import most_scans
+from ..run.store.database import FILE
+from ..run.store.run_store import RUN_FOLDER
 from ..scenario.advice import advice
 from ..scenario.build import Job, build
 from ..scenario.campaign import CampaignSpec, is_campaign

@@ -25,11 +25,11 @@ from ..live import page_of
 from ..report.campaign_output import CAMPAIGN_FILE, DataSetOutput, check_same, failures, verify
 from ..report.output import CLOUD, SurveyOutput
 from ..report.report import summary
-from ..run.conductor import Conductor, Kept
 from ..run.job_source import OneJob
 from ..run.options import RunOptions
 from ..run.run_result import RunResult
-from ..run.store import RUN_FOLDER
+from ..run.runner import Conductor, Kept
+from ..run.store.run_store import RUN_FOLDER
 from ..scenario.advice import advice
 from ..scenario.build import Built, Job, build
 from ..scenario.campaign import CampaignSpec

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from lidarsim.scene.scene import Scene
 
     from ..plan.stations import StationPlan
-    from ..run.connection import TlsFiles
+    from ..run.cluster.connection import TlsFiles
     from ..scenario.scenario import Scenario
 
 MOST_COPIED = 20_000_000  # triangles of files that cannot share them
@@ -180,8 +180,8 @@ def check(
       lidarpool check hall.glb --no-plan --scheduler tcp://127.0.0.1:8786 --json
       lidarpool check part.stl --unit mm --sensor ouster/os1-64 --pose 0,0,1.9
     """  # noqa: D301 - click wants the character, not its name
-    from ..run.cluster_file import ClusterFile
-    from ..run.connection import connected
+    from ..run.cluster.cluster_file import ClusterFile
+    from ..run.cluster.connection import connected
     from ..run.options import RunOptions
     from .forecast import look_at
 

@@ -137,7 +137,7 @@ def scheduler(command: Command) -> Command:
     def with_files(*arguments: Any, **given: Any) -> None:
         from lidarsim.base.input_files import input_size
 
-        from ..run.connection import TlsFiles
+        from ..run.cluster.connection import TlsFiles
 
         if given.get("cluster") is not None and given["scheduler"] is not None:
             raise click.UsageError(

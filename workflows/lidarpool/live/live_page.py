@@ -33,14 +33,14 @@ from ..columns.parts import read_part
 from ..datasets.dataset import DataSet, job_file
 from ..datasets.figures import Figures
 from ..datasets.job_table import JobRow, Value
-from ..pipeline.messages import Receipt, ScanFrame
 from ..plan import best
 from ..report.charts import draw_results, draw_varied
-from ..run.job_points import JobPoints
 from ..run.picture_file import PictureContent
+from ..run.pipeline.messages import Receipt, ScanFrame
 from ..run.progress import STAGES, Pace, Progress, in_words, standing_still, time_in_words
 from ..run.run_page import JobNow, RunPage
 from ..run.run_result import RunResult
+from ..run.store.job_under_way import JobPoints
 from .point_selection import HeldPoints
 from .server import PORT, VIEWER, Answer, Arguments, PageServer, announced, page_server
 from .view import View, open_result, wait_for_interrupt

@@ -35,7 +35,6 @@ from ..base.notebook import cell_display
 from ..columns.cloud_file import CloudFile
 from ..columns.ply_format import AXES
 from ..export.formats import Format, save_cloud
-from ..pipeline.database import FILE
 from ..render.closeup import around_ways, floor_and_cut
 from ..render.colouring import (
     MOST_ENTRIES,
@@ -50,7 +49,8 @@ from ..render.hit_density import HITS_TITLE, hit_colours
 from ..render.surface import apart
 from ..render.theme import mapped, object_colours
 from ..run.picture_file import PICTURE_FILE, PLACES_MOST, PictureContent, SensorWay, ways_of
-from ..run.store import RUN_FOLDER
+from ..run.store.database import FILE
+from ..run.store.run_store import RUN_FOLDER
 from .point_selection import (
     RESULT,
     Eye,

@@ -22,11 +22,11 @@ from ..datasets.dataset import INDEX_FILE, OF_JOBS, DataSet, manifest_file
 from ..datasets.job_table import TABLE_FILE, JobRow, read_table, write_table
 from ..datasets.loader import read_index, sweeps
 from ..export.folder import result_folder
-from ..pipeline.database import FILE
-from ..run.conductor import Conductor, Output
-from ..run.job_points import listed
 from ..run.run_result import CampaignRun
-from ..run.store import RUN_FOLDER, RunStore, remove_run
+from ..run.runner import Conductor, Output
+from ..run.store.database import FILE
+from ..run.store.job_under_way import listed
+from ..run.store.run_store import RUN_FOLDER, RunStore, remove_run
 from ..scenario.campaign import CampaignSpec, hashes
 
 CAMPAIGN_FILE = "campaign.json"  # whose data set this is, and the software that made it

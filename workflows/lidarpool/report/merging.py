@@ -27,18 +27,18 @@ from ..datasets.dataset import INDEX_FILE, DataSet, ahead, manifest_file
 from ..datasets.job_table import TABLE_FILE, JobRow, read_table
 from ..datasets.loader import read_index
 from ..export.folder import LAST_FILE, output_place, result_folder
-from ..pipeline.database import FILE, DamagedError, RunDatabase
-from ..pipeline.messages import Receipt
 from ..plan import Trial
-from ..run.conductor import Conductor
-from ..run.job_points import listed
 from ..run.job_source import OneJob
 from ..run.options import RunOptions
+from ..run.pipeline.messages import Receipt
 from ..run.progress import Screen
-from ..run.remote import fetch_database
 from ..run.run_page import RunPage
 from ..run.run_result import CampaignRun, RunResult
-from ..run.store import RUN_FOLDER, parts_of, remove_run, with_sensors
+from ..run.runner import Conductor
+from ..run.store.database import FILE, DamagedError, RunDatabase
+from ..run.store.job_under_way import listed
+from ..run.store.remote import fetch_database
+from ..run.store.run_store import RUN_FOLDER, parts_of, remove_run, with_sensors
 from ..scenario.build import build
 from ..scenario.empty_cloud import NO_POINTS, empty_jobs_warning
 from ..scenario.scenario import Scenario

@@ -24,10 +24,10 @@ from ..export.folder import LAST_FILE, result_folder, staging
 from ..export.format_table import EXPORTS, FORMATS
 from ..export.formats import Format, refuse_strangers
 from ..export.navigation_files import write_instruments
-from ..run.conductor import Conductor, Output
 from ..run.picture_file import PICTURE_FILE, PictureContent
 from ..run.progress import Written
 from ..run.run_result import RunResult
+from ..run.runner import Conductor, Output
 from ..run.writer import LidarWorkers
 from ..scenario.scenario import Scenario
 from .report import CountedCloud, make_report

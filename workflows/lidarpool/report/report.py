@@ -24,9 +24,9 @@ from lidarsim.sensor import Sensor, Survey
 from lidarsim.sensor.survey import CloudOptions
 from lidarsim.sensor.weather import Weather
 
-from ..pipeline.names import COLLECT, EXPORT, GENERATE, INTERSECT, SORT
-from ..pipeline.task_book import StageTotals, union
 from ..plan.planning import Search
+from ..run.pipeline.names import COLLECT, EXPORT, GENERATE, INTERSECT, SORT
+from ..run.pipeline.task_book import StageTotals, union
 from ..run.run_result import RunResult
 from ..run.trials import TRIAL
 

@@ -17,10 +17,10 @@ from lidarsim.sweeps.sweeps import Sweeps
 from ..base.fingerprint import fingerprint
 from ..base.shard import ALL, Shard
 from ..datasets.job_table import JobRow, Value
-from ..pipeline.failures import JobError
 from ..scenario.build import Job
 from ..scenario.campaign import CampaignSpec
 from ..scenario.static_scene import SceneCache
+from .pipeline.failures import JobError
 
 READY = 16  # jobs that are made ahead: small ones are cast several at a time,
 SCENES = 2  # and they have so many scenes at most

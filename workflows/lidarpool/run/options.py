@@ -15,8 +15,8 @@ from lidarsim.base.validation import checked_fields
 from lidarsim.base.vocabulary import PATIENCE_S, WAIT_S
 
 from ..scenario.sections import PoolSection, TaskOptions
-from .cluster_file import ClusterFile
-from .connection import TlsFiles
+from .cluster.cluster_file import ClusterFile
+from .cluster.connection import TlsFiles
 
 
 @dataclass(frozen=True, kw_only=True)

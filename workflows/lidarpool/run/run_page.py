@@ -10,10 +10,10 @@ from poolpart import Partition
 
 from ..datasets.dataset import DataSet
 from ..datasets.job_table import JobRow, Value
-from ..pipeline.messages import Receipt, ScanFrame
-from .job_points import JobPoints
+from .pipeline.messages import Receipt, ScanFrame
 from .progress import Progress
 from .run_result import RunResult
+from .store.job_under_way import JobPoints
 
 
 @dataclass(frozen=True)

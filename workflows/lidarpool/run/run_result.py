@@ -15,9 +15,9 @@ from lidarsim.sensor import Survey
 
 from ..columns.parts import StoredCloud
 from ..datasets.job_table import JobRow
-from ..pipeline.placement import TaskRecord
-from ..pipeline.task_book import StageTotals
 from ..plan import Plan, Planning, Trial
+from .pipeline.placement import TaskRecord
+from .pipeline.task_book import StageTotals
 
 
 @dataclass(frozen=True, eq=False)

@@ -34,22 +34,22 @@ from ..datasets.job_table import JobRow
 from ..datasets.sweep_data import Sweep
 from ..export.boxes import Boxes
 from ..export.kitti import intensity_of
-from ..pipeline.casting_workers import CastingWorkers
-from ..pipeline.database import JobParts
-from ..pipeline.dispatch import Dispatcher
-from ..pipeline.failures import JobError
-from ..pipeline.job_state import JobState
-from ..pipeline.messages import CollectOrder, ColumnsLost, Receipt
-from ..pipeline.names import GPU
 from ..scenario.build import Job
 from ..scenario.campaign import CampaignSpec
 from ..scenario.empty_cloud import empty_cloud_reason
-from .checks import check_workers, find_workers
-from .cluster import client_of
+from .cluster.checks import check_workers, find_workers
+from .cluster.cluster import client_of
+from .cluster.watch import Waiting, Watch
 from .job_source import JobMaker
 from .options import RunOptions
+from .pipeline.batches import JobState
+from .pipeline.casting_workers import CastingWorkers
+from .pipeline.dispatch import Dispatcher
+from .pipeline.failures import JobError
+from .pipeline.messages import CollectOrder, ColumnsLost, Receipt
+from .pipeline.names import GPU
 from .progress import Screen
-from .watch import Waiting, Watch
+from .store.database import JobParts
 
 LONGEST_PAUSE_S = 0.02  # while nothing moves
 

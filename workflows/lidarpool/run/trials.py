@@ -9,10 +9,10 @@ from collections.abc import Sequence
 
 from poolpart.task_locations import TaskLocations
 
-from ..pipeline.failures import raise_if_failed, was_killed
-from ..pipeline.placement import recorded
 from ..plan import Planning, Trial, run_trial
-from .tasks import Tasks
+from .cluster.tasks import Tasks
+from .pipeline.failures import raise_if_failed, was_killed
+from .pipeline.placement import recorded
 
 TRIAL = "trial"
 ROUNDS_MOST = 3  # submissions of a trial whose workers die

@@ -24,14 +24,14 @@ from ..datasets.dataset import DataSet, Listing
 from ..datasets.job_table import JobRow
 from ..export.pieces import PieceRange, RangeWriter
 from ..export.pieces import WrittenRange as Range
-from ..pipeline.casting_workers import share
-from ..pipeline.failures import JobError, raise_if_failed, was_killed
-from ..pipeline.names import EXPORT, LIDAR
-from ..pipeline.placement import Recorder, TaskRecord
-from .cluster import Cluster
+from .cluster.cluster import Cluster
+from .cluster.tasks import Tasks
+from .pipeline.casting_workers import share
+from .pipeline.failures import JobError, raise_if_failed, was_killed
+from .pipeline.names import EXPORT, LIDAR
+from .pipeline.placement import Recorder, TaskRecord
 from .run_result import RunResult
-from .store import RunStore
-from .tasks import Tasks
+from .store.run_store import RunStore
 
 WRITING = 2  # tasks that wait to be done, for each free slot of LIDAR
 TOGETHER, TOGETHER_POINTS = 32, 1_000_000  # jobs that one task writes, and their points

@@ -28,9 +28,9 @@ from lidarsim.base.words import natural, plural, shortened, without_common_prefi
 from lidarsim.sensor import Noise, Returns
 from lidarsim.sensor.weather import Weather
 
-from ...pipeline.placement import TaskRecord
-from ...pipeline.task_book import StageTotals, union
 from ...render.stage import nice_step
+from ...run.pipeline.placement import TaskRecord
+from ...run.pipeline.task_book import StageTotals, union
 from ...run.run_result import RunResult
 from ...scenario.scenario import Scenario
 from ..report import STAGES, CountedCloud, in_order

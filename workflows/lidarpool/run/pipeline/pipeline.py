@@ -18,11 +18,11 @@ from lidarsim.columns.cloud import Cloud
 from lidarsim.scene.scene import Scene
 from lidarsim.sensor import Survey
 
+from ..store.database import RunDatabase
+from .batches import JobState
 from .casting_workers import CastingWorkers
-from .database import RunDatabase
 from .dispatch import Dispatcher
 from .failures import JobError
-from .job_state import JobState
 from .long_stages import LongStages
 from .messages import (
     ColumnsLost,

@@ -30,8 +30,8 @@ from poolpart.fetch import fetch_available, take_held
 from poolpart.pipe import forget_pipes, take_news
 from poolpart.task_locations import TaskLocations, look_for_tasks
 
-from ..base.software import call_alike
-from ..columns.parts import probe_name
+from ...base.software import call_alike
+from ...columns.parts import probe_name
 from .failures import raise_if_failed, storing, was_killed, words_on_memory
 from .messages import CollectOrder, Description, Message, Receipt, StageStart, Summaries
 from .names import COLLECT, GENERATE, SORT

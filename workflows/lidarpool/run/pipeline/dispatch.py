@@ -8,11 +8,11 @@ from collections.abc import Collection, Iterable, Mapping
 
 from poolpart.task_locations import TaskLocations
 
-from ..columns.parts import part_name
+from ...columns.parts import part_name
 from . import policies
+from .batches import Batch, BatchState, JobState, Outcome
 from .casting_workers import CastingWorkers
 from .failures import JobError
-from .job_state import Batch, BatchState, JobState, Outcome
 from .long_stages import LongStages
 from .messages import CollectOrder, ColumnsLost, Receipt, scans_in_words
 from .names import COLLECT, GENERATE, GPU, INTERSECT, LIDAR

@@ -16,20 +16,20 @@ from lidarsim.simulator.scene_caster import check_backend_here
 from ..base.shard import ALL
 from ..datasets.dataset import DataSet
 from ..datasets.job_table import JobRow
-from ..pipeline.database import FILE
-from ..pipeline.messages import ScanFrame
 from ..plan import best
 from ..scenario.build import Job
 from ..scenario.campaign import CampaignSpec
 from ..scenario.empty_cloud import EMPTY, empty_cloud_reason, empty_jobs_warning
-from .cluster import Cluster
+from .cluster.cluster import Cluster
 from .job_source import JobMaker, Jobs, MadeJob, OneJob
 from .options import RunOptions
+from .pipeline.messages import ScanFrame
 from .progress import Screen
-from .run import Run
+from .run_loop import Run
 from .run_page import RunPage
 from .run_result import RunResult
-from .store import RunStore, remove_run
+from .store.database import FILE
+from .store.run_store import RunStore, remove_run
 
 R = TypeVar("R")
 

@@ -15,13 +15,13 @@ from lidarsim.base.errors import LidarError
 from poolpart import Partition, PipeClosed, PipeFailed, PoolError
 from poolpart.task_context import own_client
 
+from ...scenario.build import Job
+from ..options import RunOptions
 from ..pipeline.names import GPU, LIDAR, OTHER
-from ..scenario.build import Job
+from ..progress import Screen
+from ..store.run_store import RunStore
 from .checks import check_workers, find_workers, gpu_note, slots_needed
 from .connection import check_starts_workers, connected, local_client, started_client
-from .options import RunOptions
-from .progress import Screen
-from .store import RunStore
 from .tasks import Tasks
 from .watch import Waiting, Watch
 

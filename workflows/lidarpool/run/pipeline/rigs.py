@@ -28,7 +28,7 @@ from lidarsim.simulator.points import BatchPoints
 from lidarsim.simulator.rig import Rig
 from poolpart import own_device
 
-from ..base.tracing import trace
+from ...base.tracing import trace
 from .failures import naming_scans
 from .messages import BatchRange, samples_of_scan
 from .names import GPU, INTERSECT

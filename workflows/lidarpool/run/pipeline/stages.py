@@ -22,7 +22,7 @@ from poolpart import Pipe, PipeClosed, PipeFailed
 from poolpart.fetch import fetch_available, hold_for_driver
 from poolpart.task_context import telling_departure
 
-from ..columns.parts import pack
+from ...columns.parts import pack
 from .failures import ScanError, naming_scans, storing
 from .messages import (
     CollectOrder,

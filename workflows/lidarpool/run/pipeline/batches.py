@@ -13,8 +13,8 @@ import numpy as np
 from lidarsim.columns.cloud import Cloud
 from lidarsim.sensor import Survey
 
-from ..base.tracing import trace
-from .database import JobParts
+from ...base.tracing import trace
+from ..store.database import JobParts
 from .messages import Receipt, ScanFrame, Summaries, samples_of_scan, summary_type
 from .names import SORT
 

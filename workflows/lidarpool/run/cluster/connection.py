@@ -32,7 +32,7 @@ from poolpart.deploy import forked_workers
 from poolpart.probe import visible_gpus
 from poolpart.rules import check_count
 
-from ..base.fork_server import start_fork_server
+from ...base.fork_server import start_fork_server
 from ..pipeline.names import GPU, LIDAR, OTHER
 from .checks import LOOK_EVERY_S, TooFewWorkersError
 from .cluster_file import ClusterFile

@@ -15,7 +15,7 @@ from pathlib import Path
 from lidarsim.base.errors import LidarError, explained
 from lidarsim.base.storage import Storage
 
-from ..pipeline.database import FILE, RunDatabase
+from .database import FILE, RunDatabase
 
 OWNER = "run.owner"  # the mark of the run that may write the copy
 COPY_EVERY_S = 5.0

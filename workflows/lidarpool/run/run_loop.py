@@ -17,21 +17,21 @@ from lidarsim.simulator.memory import MB, scans_that_fit
 
 from ..datasets.dataset import DataSet
 from ..datasets.job_table import JobRow
-from ..pipeline.casting_workers import CastingWorkers
-from ..pipeline.driver import RunDriver
-from ..pipeline.failures import JobError
-from ..pipeline.job_state import JobState
-from ..pipeline.long_stages import LongStages
-from ..pipeline.messages import ScanFrame
-from ..pipeline.names import GPU, LIDAR, OTHER
-from ..pipeline.task_book import StageTotals
 from ..scenario.build import Job
-from .cluster import Cluster
-from .job_points import JobPoints
+from .cluster.cluster import Cluster
 from .job_source import JobMaker, MadeJob, OneJob, failed_row
+from .pipeline.batches import JobState
+from .pipeline.casting_workers import CastingWorkers
+from .pipeline.failures import JobError
+from .pipeline.long_stages import LongStages
+from .pipeline.messages import ScanFrame
+from .pipeline.names import GPU, LIDAR, OTHER
+from .pipeline.pipeline import RunDriver
+from .pipeline.task_book import StageTotals
 from .progress import Progress, Show
 from .run_page import JobNow, RunPage
-from .store import RunStore
+from .store.job_under_way import JobPoints
+from .store.run_store import RunStore
 from .trials import TrialPump
 from .writer import JobFiles, JobWriter
 

@@ -12,7 +12,7 @@ from collections.abc import Iterable, Mapping, Sequence
 
 from poolpart.task_locations import TaskLocations
 
-from .job_state import Batch, BatchState, Outcome
+from .batches import Batch, BatchState, Outcome
 from .names import COLLECT, INTERSECT
 
 BATCH_SECONDS = 0.2  # casting time that makes a batch worth its overhead

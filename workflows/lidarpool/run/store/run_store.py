@@ -18,23 +18,16 @@ from lidarsim.base.storage import Storage
 from lidarsim.base.validation import checked
 from lidarsim.simulator.scene_caster import AUTO_TAKES
 
-from ..base.fingerprint import fingerprint
-from ..base.shard import shard_in_words
-from ..base.software import software
-from ..columns.parts import mark_name, own_files, scans_of
-from ..datasets.job_table import JobRow
-from ..pipeline.database import (
-    FILE,
-    PARTS_FOLDER,
-    DamagedError,
-    RunDatabase,
-    parts_folder,
-    read_place,
-)
+from ...base.fingerprint import fingerprint
+from ...base.shard import shard_in_words
+from ...base.software import software
+from ...columns.parts import mark_name, own_files, scans_of
+from ...datasets.job_table import JobRow
+from ...scenario.build import Job
+from ..job_source import CONTENT, Jobs, OneJob, identity_of
 from ..pipeline.failures import storing
-from ..scenario.build import Job
-from .job_points import JobPoints
-from .job_source import CONTENT, Jobs, OneJob, identity_of
+from .database import FILE, PARTS_FOLDER, DamagedError, RunDatabase, parts_folder, read_place
+from .job_under_way import JobPoints
 from .remote import OWNER, RemoteRun, fetch_database
 
 PARTS = "parts"  # the folder of the parts, in the run's folder

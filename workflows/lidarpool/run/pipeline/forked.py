@@ -8,8 +8,8 @@ from contextlib import suppress
 
 import distributed.nanny  # noqa: F401
 
-from ..base.fork_server import keep_freed_memory
-from ..plan import trial  # noqa: F401
+from ...base.fork_server import keep_freed_memory
+from ...plan import trial  # noqa: F401
 from . import stages  # noqa: F401
 
 keep_freed_memory()

@@ -17,7 +17,7 @@ from lidarsim.columns.cloud import Cloud
 from lidarsim.columns.part_columns import PartColumns
 from lidarsim.sensor import Pose, Survey
 
-from ..base.tracing import trace
+from ...base.tracing import trace
 from .placement import TaskRecord
 
 BatchRange = tuple[int, int]  # the first scan of a batch, and its end

@@ -20,11 +20,11 @@ from poolpart.task_locations import look_for_tasks
 from poolpart.workers import ask_workers, worker_identities
 from raybeam import available_backends
 
-from ..base.software import difference, software, software_there
+from ...base.software import difference, software, software_there
+from ...scenario.build import Job
+from ...scenario.sections import TaskOptions
 from ..pipeline.failures import JobError
 from ..pipeline.names import COLLECT, GENERATE, GPU, LIDAR, OTHER, SORT
-from ..scenario.build import Job
-from ..scenario.sections import TaskOptions
 from .watch import Waiting, queued
 
 LOOK_EVERY_S = 0.2

@@ -17,15 +17,15 @@ from lidarsim.base.errors import LidarError
 from lidarsim.columns.cloud import Cloud
 from lidarsim.sweeps.sweeps import Sweeps
 
-from ..columns.parts import StoredCloud, read_part, read_tally, unpack
-from ..pipeline.database import JobParts
+from ...columns.parts import StoredCloud, read_part, read_tally, unpack
+from ...scenario.build import Job
+from ..job_source import OneJob
 from ..pipeline.messages import Receipt, samples_of_scan, scans_in_words, summary_type
-from ..scenario.build import Job
-from .job_source import OneJob
-from .progress import Progress
+from ..progress import Progress
+from .database import JobParts
 
 if TYPE_CHECKING:
-    from .store import RunStore
+    from .run_store import RunStore
 
 SAMPLE_RAYS = 400  # of the pictures
 CHECKERS = 4  # threads that check parts; each holds one in memory, twice

@@ -21,9 +21,9 @@ from poolpart.fetch import fetch_available
 from poolpart.task_locations import TaskLocations, look_for_tasks
 from poolpart.workers import worker_identities
 
-from ..base.software import difference, software_there
+from ...base.software import difference, software_there
+from .batches import Outcome
 from .failures import JobError, error_of, raise_if_failed, was_killed, words_on_memory
-from .job_state import Outcome
 from .messages import BatchRange
 from .names import INTERSECT
 from .rigs import CastWork, RigFailed, RigMissing, drop_all, intersect

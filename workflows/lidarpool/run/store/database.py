@@ -25,10 +25,10 @@ import numpy as np
 from lidarsim.base.arrays import Ints
 from lidarsim.base.errors import LidarError
 
-from ..columns.parts import part_name
-from ..datasets.job_table import JOBS_MOST
-from ..plan import Trial
-from .messages import Receipt
+from ...columns.parts import part_name
+from ...datasets.job_table import JOBS_MOST
+from ...plan import Trial
+from ..pipeline.messages import Receipt
 
 FORMAT = 9
 FILE = "run.db"

@@ -11,7 +11,7 @@ from poolpart import Partition
 from poolpart.fetch import fetch_available
 from poolpart.task_locations import TaskLocations, look_for_tasks
 
-from ..base.software import call_alike
+from ...base.software import call_alike
 from ..pipeline.task_book import TaskBook
 
 T = TypeVar("T")
