@@ -27,7 +27,7 @@ from lidarpool.run.job_source import OneJob
 from lidarpool.run.options import RunOptions
 from lidarpool.run.progress import Screen
 from lidarpool.run.run_page import RunPage
-from lidarpool.run.runner import Conductor, Kept
+from lidarpool.run.runner import Kept, Run
 from lidarpool.scenario.build import Job
 
 NEWS_S = 0.5  # as the page asks
@@ -44,7 +44,7 @@ def job(poses: int) -> Job:
 def plain(client: Client, work: Job, page: RunPage | None = None) -> float:
     """Seconds of a survey, without a page by default."""
     screen, options = Screen(lambda progress: None), RunOptions(client=client)
-    return Conductor(OneJob(work), options, Kept(), screen, page or RunPage())().survey_seconds
+    return Run(OneJob(work), options, Kept(), screen, page or RunPage()).execute().survey_seconds
 
 
 def watched(client: Client, work: Job) -> tuple[float, int]:

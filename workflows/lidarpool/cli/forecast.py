@@ -106,7 +106,7 @@ def look_at(
             built = build(read, plans=campaign is None and not no_plan)
             job = built.job()
         with terminal.status("casting some rays"):
-            found = forecast(job, options.with_pool(read.pool, backend), client)
+            found = forecast(job, options.with_pool(read.pool, {"backend": backend}), client)
         found["notes"] += advice(built)
         found["warnings"] += implausibilities(built)
         if campaign is not None:
