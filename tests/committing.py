@@ -31,4 +31,4 @@ def commit(store, first, counts, triangles, hits, job=None):
     store.storage.prepare()
     store.storage.write(name, data)
     receipt = Receipt.of_part(part, job.number, name, len(data))
-    return store.db.commit([receipt]) == [receipt]
+    return bool(store.db.commit([(store.under_way[job.number], receipt)]))

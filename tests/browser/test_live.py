@@ -14,7 +14,7 @@ from lidarpool.run.cluster.connection import local_client
 from lidarpool.run.job_source import OneJob
 from lidarpool.run.options import RunOptions
 from lidarpool.run.progress import Screen
-from lidarpool.run.runner import Conductor, Kept
+from lidarpool.run.runner import Kept, Run
 from lidarpool.scenario.build import Job
 
 pytestmark = [pytest.mark.browser, pytest.mark.slow]
@@ -51,8 +51,8 @@ class Driven:
         self.error, self.most = None, most
         begun = time.monotonic()
         options, screen = RunOptions(client=client), Screen(lambda progress: None)
-        conductor = Conductor(job, options, Kept(), screen, live, self.on_frame)
-        self.conductor = conductor
+        survey_run = Run(job, options, Kept(), screen, live, self.on_frame)
+        self.run = survey_run
 
         def on_frame(frame):
             while self.points.parts.point_count >= self.most:
@@ -64,7 +64,7 @@ class Driven:
 
         def run():
             try:
-                conductor()
+                survey_run.execute()
             except BaseException as error:
                 self.error = error
 
@@ -78,7 +78,7 @@ class Driven:
     @property
     def points(self):
         """What is committed."""
-        return self.conductor.store.only
+        return self.run.store.only
 
     def ended(self):
         """Wait for its end."""

@@ -12,7 +12,7 @@ from lidarpool.report.campaign_output import DataSetOutput
 from lidarpool.run.cluster.connection import local_client
 from lidarpool.run.options import RunOptions
 from lidarpool.run.progress import Screen
-from lidarpool.run.runner import Conductor
+from lidarpool.run.runner import Run
 
 pytestmark = [pytest.mark.browser, pytest.mark.slow]
 
@@ -47,7 +47,7 @@ def test_jobs_are_counted_listed_drawn_and_shown(new_tab, tmp_path):
                 looked.wait(300)
 
         def drive():
-            ended.append(Conductor(campaign, options, output, Screen(hold), live)())
+            ended.append(Run(campaign, options, output, Screen(hold), live).execute())
 
         tab = new_tab(live.page.url)
         tab.wait_for(lambda text: "Heights" in text and "starting" in text)

@@ -22,6 +22,7 @@ from tests.drives import the_scene, the_sweeps, write_set
 
 from lidarpool import LidarError
 from lidarpool.columns.parts import part_name
+from lidarpool.run.pipeline.committed_job import CommittedJob
 from lidarpool.run.pipeline.messages import Receipt
 from lidarpool.run.store.database import RunDatabase
 
@@ -65,17 +66,20 @@ def test_a_damaged_database_is_refused_or_the_same(tmp_path):
     path, copy = tmp_path / "run.db", tmp_path / "copy.db"
 
     def content(database: RunDatabase) -> object:
-        job = database.job(0, 100)
+        job = CommittedJob(0, range(100))
+        database.read(job)
+        summaries = [*map(database.summaries, job.parts.ordered)]
         rows = [*database.job_rows()]
-        return job.ordered, job.unframed(), job.trials, rows, database.meta
+        return job.parts.ordered, summaries, job.trials, rows, database.meta
 
     with closing(RunDatabase(path)) as db:
-        db.job(0, 100)
+        job = CommittedJob(0, range(100))
         mark = db.meta["mark"]
         for first in range(0, 100, 5):
             name = part_name(mark, 0, first, first + 5)
             box = (0, 0, 0, 9, 9, first)
-            db.commit([Receipt(0, first, first + 5, name, 7, 900, 21, box, b"summary" * 9)])
+            part = Receipt(0, first, first + 5, name, 7, 900, 21, box, b"summary" * 9)
+            db.commit([(job, part)])
         db.end_jobs((number, False, {"name": f"{number:04}"}) for number in range(1, 20))
     with closing(RunDatabase(path)) as db:
         expected = content(db)

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import inspect
+from functools import partial
 from pathlib import Path
+from typing import get_type_hints
 
 import numpy as np
 import pytest
@@ -48,7 +50,7 @@ from lidarpool import (
     simulate,
     sweeps,
 )
-from lidarpool.run.options import RunOptions
+from lidarpool.run.options import RunKeywords, RunOptions
 from lidarpool.scenario.sections import PoolSection
 
 POINTS, FACES, OWNERS = np.eye(3), np.array([[0, 1, 2]]), np.zeros(1, int)
@@ -56,6 +58,7 @@ AT = [(0, 0, 1)]
 GRID = Sensor.grid()
 SCENE = Scene.from_meshes([SceneMesh("Car", POINTS, FACES)])
 SCANNER = Scanner(SCENE, GRID, backend="numpy")
+CAMPAIGN = Campaign(lambda number, rng: Job(Scene.seed(), Survey(poses=AT)), 2)
 
 # Of everything public that takes arguments, calls that cannot be meant, and what is answered.
 WRONG = {
@@ -182,8 +185,50 @@ def test_a_scenario_says_how_it_is_run_unless_python_does():
     pool = PoolSection(gpu=3, batch_mb=64, backend="numpy")
     said = RunOptions(live=True).with_pool(pool)
     assert (said.gpu_workers, said.batch_mb, said.backend, said.live) == (3, 64, "numpy", True)
-    given = RunOptions(gpu_workers=2).with_pool(pool, "embree")
+    given = RunOptions(gpu_workers=2).with_pool(pool, {"backend": "embree", "batch_mb": None})
     assert (given.gpu_workers, given.batch_mb, given.backend) == (2, 64, "embree")
+
+
+def test_keywords_are_the_options_of_runs():
+    """But for the place of a result, ways to a cluster, and what only commands do at the end."""
+    keywords, options = get_type_hints(RunKeywords), get_type_hints(RunOptions)
+    assert options.keys() - keywords.keys() == {"out", "stay", "scheduler", "files", "cluster"}
+    assert keywords.keys() <= options.keys()
+    for name, hint in keywords.items():
+        assert hint in (options[name], options[name] | None), name
+
+
+@pytest.mark.parametrize(
+    ("call", "keyword", "says"),
+    [
+        (partial(simulate, Scene.seed(), Survey(poses=AT)), "retry_failed", "simulate() got"),
+        (partial(simulate, Scene.seed(), Survey(poses=AT)), "wait", "Did you mean 'wait_s'?"),
+        (partial(CAMPAIGN.run, "nowhere"), "folder", "run() got"),
+        (CAMPAIGN.stream, "resume", "stream() got"),
+        (CAMPAIGN.stream, "scheduler", "stream() got"),
+    ],
+)
+def test_options_that_a_call_does_not_take_are_refused(call, keyword, says):
+    with pytest.raises(TypeError) as raised:
+        call(**{keyword: True})
+    assert f"unexpected keyword argument {keyword!r}" in str(raised.value)
+    assert says in str(raised.value)
+
+
+@pytest.mark.parametrize(
+    ("options", "says"),
+    [
+        ({"backend": "opencl"}, "backend is 'opencl'; it must be"),
+        ({"batch_mb": 0}, "batch_mb is 0; it must be 1 to 1000000"),
+        ({"client": "tcp://x"}, "client is 'tcp://x'; it must be a Client"),
+        ({"wait_s": -1}, "wait_s is -1; it must be at least 0"),
+    ],
+)
+def test_options_of_runs_are_checked(options, says):
+    for call in (partial(simulate, Scene.seed(), Survey(poses=AT)), CAMPAIGN.stream):
+        with pytest.raises(LidarError) as raised:
+            call(**options)
+        assert says in str(raised.value)
 
 
 def test_nothing_public_is_left_out():
@@ -227,6 +272,5 @@ def test_what_is_like_it_will_do():
     survey = Survey(poses=np.array([[0, 0, 1.0]]), steps=np.int64(3), keep_every=np.uint8(2))
     assert survey.scan_count == 3
     assert Noise(np.float32(0.5), dropout=1).dropout == 1
-    assert isinstance(inspect.signature(simulate).parameters["wait_s"].default, float)
     with pytest.raises(LidarError, match="does not exist"):
         Scene.load(Path("nothing.glb"))

@@ -597,3 +597,10 @@ def test_a_campaign_goes_to_another_process(campaign):
     vary = {"actors": {"sample": {"from": "traffic.csv", "count": [0, 2]}}}
     sent = pickle.loads(pickle.dumps(campaign(vary)))
     assert sent.scenario(3).actors == campaign(vary).scenario(3).actors
+
+
+def test_a_job_computes_its_sweeps_once():
+    job = Job(Scene.seed(), Survey(poses=[(0, 0, 1), (0, 0, 2)]))
+    assert job.sweeps is job.sweeps
+    assert len(job.sweeps) == 2
+    assert job.sweeps.scans[-1] == job.survey.scan_count

@@ -15,6 +15,7 @@ from hypothesis import strategies as st
 from lidarpool import LidarError
 from lidarpool.columns.parts import part_name
 from lidarpool.plan import Planning, run_trial
+from lidarpool.run.pipeline.committed_job import CommittedJob
 from lidarpool.run.pipeline.messages import Receipt
 from lidarpool.run.store.database import RunDatabase
 
@@ -42,10 +43,27 @@ def mark(monkeypatch):
 
 @pytest.fixture
 def db(tmp_path):
-    made = RunDatabase(tmp_path / "run.db")
-    made.job(JOB, SCANS)
-    yield made
-    made.close()
+    database = RunDatabase(tmp_path / "run.db")
+    yield database
+    database.close()
+
+
+@pytest.fixture
+def job(db):
+    """A job of which nothing is committed yet."""
+    return read(db)
+
+
+def read(db, number=JOB):
+    """Read what is committed of a job."""
+    job = CommittedJob(number, range(SCANS))
+    db.read(job)
+    return job
+
+
+def commit(db, job, *receipts):
+    """Commit receipts of a job; returns those that were new."""
+    return [part for _, part in db.commit((job, receipt) for receipt in receipts)]
 
 
 def reopened(db):
@@ -53,16 +71,18 @@ def reopened(db):
     return RunDatabase(db.path)
 
 
-def test_what_is_committed_is_there_once(db):
+def test_what_is_committed_is_there_once(db, job):
     one, two = receipt(0, 5), receipt(10, 12, rows=2)
-    assert db.commit([two, one]) == [two, one]
-    assert db.commit([one]) == []
-    assert db.commit([receipt(0, 5), receipt(0, 4)]) == []
+    assert commit(db, job, two, one) == [two, one]
+    assert commit(db, job, one) == []
+    assert commit(db, job, receipt(0, 5), receipt(0, 4)) == []
     again = reopened(db)
-    for found in (db.job(JOB, SCANS), again.job(JOB, SCANS)):
-        assert [p.name for p in found.ordered] == [one.name, two.name]
-        assert (found.scans_done, found.point_count, found.hits) == (7, 9, 27)
-        assert found.missing(0, SCANS) == [(5, 10), (12, SCANS)] and not found.complete
+    for found in (job, read(again)):
+        parts = found.parts
+        assert [p.name for p in parts.ordered] == [one.name, two.name]
+        assert (parts.scans_done, parts.point_count, parts.hits) == (7, 9, 27)
+        assert parts.missing(0, SCANS) == [(5, 10), (12, SCANS)]
+        assert found.left == SCANS - 7 and not found.scans_complete
     again.close()
 
 
@@ -81,15 +101,17 @@ def test_what_is_committed_is_there_once(db):
 def test_whatever_comes_each_scan_is_of_one_part_or_missing(tmp_path_factory, commits):
     path = tmp_path_factory.mktemp("db") / "run.db"
     db, owners = RunDatabase(path), [{}, {}]
-    jobs = [db.job(number, SCANS) for number in range(2)]
+    jobs = [read(db, number) for number in range(2)]
     for spans in commits:
-        for part in db.commit([receipt(first, stop, job=job) for job, first, stop in spans]):
+        receipts = [(jobs[job], receipt(first, stop, job=job)) for job, first, stop in spans]
+        for job, part in db.commit(receipts):
+            assert job.number == part.job
             for scan in range(part.first, part.stop):
                 assert scan not in owners[part.job]
                 owners[part.job][scan] = part.name
     again = reopened(db)
-    for found in (*jobs, *(again.job(number, SCANS) for number in range(2))):
-        mine = owners[found.number]
+    for job in (*jobs, *(read(again, number) for number in range(2))):
+        mine, found = owners[job.number], job.parts
         assert found.missing(0, SCANS) == runs(set(range(SCANS)) - set(mine))
         assert found.missing(5, 9) == runs(set(range(5, 9)) - set(mine))
         for scan in range(SCANS):
@@ -110,64 +132,65 @@ def runs(scans):
     return list(zip(starts, ends, strict=True))
 
 
-def test_parts_that_are_dropped_are_missing_again(db):
+def test_parts_that_are_dropped_are_missing_again(db, job):
     parts = [receipt(0, 4), receipt(4, 8), receipt(8, 20)]
-    db.commit(parts)
-    db.drop(JOB, [parts[1]])
+    commit(db, job, *parts)
+    db.drop(job, [parts[1]])
     again = reopened(db)
-    for found in (db.job(JOB, SCANS), again.job(JOB, SCANS)):
-        assert found.missing(0, SCANS) == [(4, 8)]
-        assert (found.scans_done, found.point_count, found.hits) == (16, 14, 42)
-    assert again.commit([receipt(4, 6), receipt(6, 8)]) == [receipt(4, 6), receipt(6, 8)]
-    assert found.missing(0, SCANS) == [] and found.complete
+    for found in (job, read(again)):
+        assert found.parts.missing(0, SCANS) == [(4, 8)]
+        counts = found.parts.scans_done, found.parts.point_count, found.parts.hits
+        assert counts == (16, 14, 42)
+    two = receipt(4, 6), receipt(6, 8)
+    assert commit(again, found, *two) == [*two]
+    assert found.parts.missing(0, SCANS) == [] and found.scans_complete
     found.has_frames = True
-    assert not found.complete
+    assert not found.scans_complete
     found.frames = SCANS
-    assert found.complete
+    assert found.scans_complete
     again.close()
 
 
-def test_frames_that_were_handed_out_are_kept_with_the_next_commit(db):
-    job = db.job(JOB, SCANS)
-    db.commit([receipt(0, 4), receipt(4, 8), receipt(12, 16)])
+def test_frames_that_were_handed_out_are_kept_with_the_next_commit(db, job):
+    commit(db, job, receipt(0, 4), receipt(4, 8), receipt(12, 16))
     for scan, firsts in ((4, [4, 12]), (3, [4, 12]), (7, [12])):
         job.frames = scan + 1
         assert [p.first for p in job.unframed()] == firsts
-    db.commit([receipt(8, 12)])
+    commit(db, job, receipt(8, 12))
     job.frames = 10
     again = reopened(db)
-    job = again.job(JOB, SCANS)
+    job = read(again)
     assert job.frames == 8, "those since are handed out once more"
     job.frames = 10
-    again.save_frames()
+    again.save_frames([job])
     last = reopened(again)
-    job = last.job(JOB, SCANS)
+    job = read(last)
     assert job.frames == 10
-    assert [(p.first, p.summaries) for p in job.unframed()] == [(8, b"summary"), (12, b"summary")]
-    assert job.part_of(12).summaries == b"", "nobody needs them in memory"
-    assert job.summaries_of([13, 0, 1, 9]) == [(0, b"summary"), (8, b"summary"), (12, b"summary")]
+    assert [part.first for part in job.unframed()] == [8, 12]
+    assert job.parts.part_of(12).summaries == b"", "nobody needs them in memory"
+    assert [last.summaries(part) for part in job.parts.ordered] == [b"summary"] * 4
     last.close()
 
 
-def test_the_cells_of_all_parts(db):
-    job = db.job(JOB, SCANS)
-    assert job.cells is None
-    db.commit([receipt(0, 1, cells=()), receipt(1, 2, cells=(-5, 0, 3, 0, 9, 4))])
-    assert job.cells.tolist() == [[-5, 0, 3], [0, 9, 4]]
-    db.commit([receipt(2, 3, cells=(0, -7, 3, 1, 1, 2**40))])
-    assert reopened(db).job(JOB, SCANS).cells.tolist() == [[-5, -7, 3], [1, 9, 2**40]]
+def test_the_cells_of_all_parts(db, job):
+    assert job.parts.cells is None
+    commit(db, job, receipt(0, 1, cells=()), receipt(1, 2, cells=(-5, 0, 3, 0, 9, 4)))
+    assert job.parts.cells.tolist() == [[-5, 0, 3], [0, 9, 4]]
+    commit(db, job, receipt(2, 3, cells=(0, -7, 3, 1, 1, 2**40)))
+    assert read(reopened(db)).parts.cells.tolist() == [[-5, -7, 3], [1, 9, 2**40]]
 
 
-def test_values_and_trials_come_back(db):
+def test_values_and_trials_come_back(db, job):
     planning = Planning((0, 0), (9, 1), [(5, 0)], 1.0, trials=2, particles=10, iterations=5)
     trials = [run_trial(planning, number) for number in (1, 0)]
-    db.add_trials(JOB, trials[:1])
-    db.add_trials(JOB, trials[1:])
+    db.add_trials(job, trials[:1])
+    db.add_trials(job, trials[1:])
+    assert job.trials == trials
     db.set(backend="numpy", note="π")
     again = reopened(db)
     assert again.meta["backend"] == "numpy" and again.meta["note"] == "π"
     assert again.begun == {JOB} and again.used
-    found = again.job(JOB, SCANS).trials
+    found = read(again).trials
     assert [t.trial for t in found] == [0, 1]
     for one, two in zip(found, reversed(trials), strict=True):
         assert np.array_equal(one.waypoints, two.waypoints) and one.length == two.length
@@ -177,19 +200,18 @@ def test_values_and_trials_come_back(db):
 # -- jobs ------------------------------------------------------------------------------------------
 
 
-def test_of_a_job_that_has_ended_a_row_is_left(db):
-    other = db.job(9, SCANS)
-    db.commit([receipt(0, 5), receipt(0, 5, job=9)])
+def test_of_a_job_that_has_ended_a_row_is_left(db, job):
+    db.commit([(job, receipt(0, 5)), (read(db, 9), receipt(0, 5, job=9))])
     assert db.begun == {JOB, 9}
     db.end_jobs([(JOB, False, {"points": 3}), (2, True, {"error": "too large"})])
-    assert db.under_way == {9: other} and db.commit([receipt(5, 9)]) == [] and db.failed() == [2]
+    assert db.begun == {9} and db.failed() == [2]
     again = reopened(db)
     for found in (db, again):
         assert [found.ended(number) for number in (0, 2, JOB, 8, 10**6)] == [
             False, True, True, False, False,
         ]  # fmt: skip
         assert found.ended_count == 2
-    assert again.failed() == [2] and again.begun == {9} and again.job(9, SCANS).scans_done == 5
+    assert again.failed() == [2] and again.begun == {9} and read(again, 9).parts.scans_done == 5
     assert [*again.job_rows()] == [{"error": "too large"}, {"points": 3}]
     again.close()
 
@@ -206,17 +228,17 @@ def test_jobs_that_are_forgotten_are_done_again(db):
     again.close()
 
 
-def test_a_job_that_is_restarted_has_nothing(db):
-    job = db.job(JOB, SCANS)
-    db.commit([receipt(0, 5)])
+def test_a_job_that_is_restarted_has_nothing(db, job):
+    commit(db, job, receipt(0, 5))
     job.frames = 5
-    db.save_frames()
-    db.restart(JOB)
-    assert (job.scans_done, job.frames, job.ordered) == (0, 0, []) and db.begun == set()
-    assert db.commit([receipt(0, 6)])
-    db.restart(8)
+    db.save_frames([job])
+    db.restart(job)
+    assert (job.left, job.frames, job.parts.ordered) == (SCANS, 0, []) and db.begun == set()
+    assert commit(db, job, receipt(0, 6))
+    db.restart(read(db, 8))
     again = reopened(db)
-    assert again.job(JOB, SCANS).frames == 0 and again.job(JOB, SCANS).scans_done == 6
+    job = read(again)
+    assert job.frames == 0 and job.parts.scans_done == 6
     again.close()
 
 
@@ -224,7 +246,7 @@ def test_thousands_of_jobs_take_little_memory_and_time(db):
     db.end_jobs((number, number % 1000 == 0, {"points": number}) for number in range(50_000))
     again = reopened(db)
     assert again.ended_count == 50_000 and len(again.failed()) == 50
-    assert not again.under_way and len(again._ended) < 100_000
+    assert not again.begun and len(again._ended) < 100_000
     again.close()
 
 
@@ -261,8 +283,8 @@ DAMAGE = {
 
 
 @pytest.mark.parametrize("damage", DAMAGE)
-def test_a_damaged_file_is_refused_and_left_alone(db, damage):
-    db.commit([receipt(0, 5), receipt(10, 12)])
+def test_a_damaged_file_is_refused_and_left_alone(db, job, damage):
+    commit(db, job, receipt(0, 5), receipt(10, 12))
     db.close()
     DAMAGE[damage](db.path)
     before = db.path.read_bytes()
@@ -270,7 +292,7 @@ def test_a_damaged_file_is_refused_and_left_alone(db, damage):
         pytest.raises(LidarError, match=r"run\.db (is damaged|cannot be written) \(.*\): "),
         closing(RunDatabase(db.path)) as opened,
     ):
-        opened.job(JOB, SCANS)
+        read(opened)
     assert db.path.read_bytes() == before
 
 
@@ -282,8 +304,8 @@ def test_a_file_that_cannot_be_made(tmp_path):
         RunDatabase(tmp_path / "run.db")
 
 
-def test_one_run_at_a_time(db, tmp_path):
-    db.commit([receipt(0, 5)])
+def test_one_run_at_a_time(db, job, tmp_path):
+    commit(db, job, receipt(0, 5))
     code = (
         "import sys; from pathlib import Path\n"
         "from lidarpool.run.store.database import RunDatabase\n"
@@ -299,5 +321,5 @@ def test_one_run_at_a_time(db, tmp_path):
     assert done.stdout.strip() == f"LidarError Another run is using {tmp_path}."
     with pytest.raises(LidarError, match="Another run is using"):  # nor in this process
         RunDatabase(db.path)
-    assert db.commit([receipt(5, 6)])
+    assert commit(db, job, receipt(5, 6))
     reopened(db).close()

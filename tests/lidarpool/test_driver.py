@@ -14,8 +14,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from lidarpool import Scene, Sensor, Survey
-from lidarpool.run.pipeline import batches as jobs
-from lidarpool.run.pipeline import dispatch, policies
+from lidarpool.run.pipeline import batches as job_state
+from lidarpool.run.pipeline import dispatch, pipeline_job, policies
 from lidarpool.run.pipeline import pipeline as driver
 from lidarpool.run.pipeline.batches import BatchState, Outcome
 from lidarpool.run.pipeline.dispatch import PIECES
@@ -29,7 +29,8 @@ from lidarpool.run.pipeline.messages import (
     samples_of_scan,
     summary_type,
 )
-from lidarpool.run.pipeline.pipeline import ANNOUNCED, STALL_S, RunDriver
+from lidarpool.run.pipeline.pipeline import ANNOUNCED, STALL_S, Pipeline
+from lidarpool.run.pipeline.pipeline_job import PipelineJob
 from lidarpool.run.pipeline.placement import TaskRecord
 from lidarpool.run.pipeline.policies import LATE_S, SPAN, TASK_SECONDS, most_under_way
 from lidarpool.run.store.database import RunDatabase
@@ -238,6 +239,13 @@ class Stages:
 SUMMARY = summary_type(samples_of_scan(SCANS))
 
 
+class ReadableJob(PipelineJob):
+    """A job of whose scans there are no points."""
+
+    def points_of_scan(self, scan):
+        return str(scan)
+
+
 class Run:
     """A driver with what it talks to."""
 
@@ -246,6 +254,7 @@ class Run:
         self.db = RunDatabase(folder / "run.db", durable=False)
         self.frames = {}  # {job: its frames}
         self.committed = {}  # {job: its parts}
+        self.under_way = {}  # {number: job}
         self.ended = {}  # {job: why it has failed, None if it has not}
         self.restart()
 
@@ -253,16 +262,18 @@ class Run:
         """Begin with new workers and stages."""
         self.workers = Workers()
         self.stages = Stages(self.storage, self.workers)
-        self.driver = RunDriver(self.workers, self.stages, self.db)
+        self.driver = Pipeline(self.workers, self.stages, self.db, self.db.meta["mark"])
         self.driver.open()
 
     def begin(self, number=0, survey=SURVEY, scene=SCENE, *, frames=True, fit=SCANS):
         parts = self.committed.setdefault(number, [])
         framed = self.frames.setdefault(number, [])
-        return self.driver.begin(
-            number, scene, survey, fit=fit, on_frame=framed.append if frames else None,
-            read=str, on_parts=parts.extend,
-        )  # fmt: skip
+        job = ReadableJob(number, scene, survey, range(survey.scan_count))
+        self.db.read(job)
+        self.under_way[number] = job
+        on_frame = framed.append if frames else None
+        self.driver.begin(job, scans_per_task=fit, on_frame=on_frame, on_parts=parts.extend)
+        return job
 
     def step(self):
         self.driver.step()
@@ -298,9 +309,9 @@ class Run:
         self.driver.finish()
         done = [number for number, error in self.ended.items() if error is None]
         for number in done:
-            parts = self.db.under_way[number]
-            scans = list(parts.scans)
-            if parts.has_frames:
+            job = self.under_way[number]
+            scans = list(job.scans)
+            if job.has_frames:
                 assert [frame.scan for frame in self.frames[number]] == scans
                 assert [frame.hits for frame in self.frames[number]] == scans
             spans = sorted((part.first, part.stop) for part in self.committed[number])
@@ -337,7 +348,7 @@ def run(empty):
 def clock(monkeypatch):
     """A clock for the driver that only goes when it is told to."""
     clock = SimpleNamespace(now=time.monotonic())
-    for module in (driver, dispatch, jobs):
+    for module in (driver, dispatch, job_state, pipeline_job):
         monkeypatch.setattr(module, "time", SimpleNamespace(monotonic=lambda: clock.now))
     return clock
 
@@ -366,7 +377,7 @@ def test_what_an_earlier_run_has_committed_is_not_cast_again(run):
     run.until(lambda: len(run.committed[0]) >= 4)
     done = [(0, part.first, part.stop) for part in run.committed[0]]
     framed = len(run.frames[0])
-    run.db.save_frames()
+    run.db.save_frames([run.job])
     run.db.close()
     run.db = RunDatabase(run.db.path, durable=False)
     run.restart()

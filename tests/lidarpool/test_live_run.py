@@ -32,9 +32,10 @@ from lidarpool.live.live_page import (
 from lidarpool.report.campaign_output import DataSetOutput
 from lidarpool.run.job_source import OneJob
 from lidarpool.run.options import RunOptions
+from lidarpool.run.pipeline.messages import Receipt
 from lidarpool.run.progress import Progress, Screen
-from lidarpool.run.run_page import JobNow
-from lidarpool.run.runner import Conductor, Kept
+from lidarpool.run.runner import Kept, Run
+from lidarpool.run.store.job_under_way import JobUnderWay
 from lidarpool.run.store.run_store import RunStore
 from lidarsim.columns.table import CHANNEL, OBJECT, SCAN
 from poolpart import PartitionStats
@@ -134,8 +135,8 @@ def test_a_run_is_watched_from_its_first_part_to_its_path():
             busy.update(label.split(",")[0] for label, *_ in news(live)["slots"])
 
         options, on_frame = RunOptions(client=client, backend="numpy"), scans.append
-        run = Conductor(job, options, Kept(), Screen(show), live, lambda f: on_frame(f.scan))
-        result = run()
+        run = Run(job, options, Kept(), Screen(show), live, lambda f: on_frame(f.scan))
+        result = run.execute()
         assert scans == [*range(survey.scan_count)]
         told = news(live)
         assert (told["over"], told["points"]) == (True, len(result.points))
@@ -245,11 +246,17 @@ def wait_for_charts(live, count):
         time.sleep(0.05)
 
 
+def status(number, stored):
+    """Status of a job with some of its 40 scans in storage."""
+    survey = Survey(Sensor.grid(), poses=[(0, 0, 1)], steps=40)
+    values = {"height": 2.0, "side": "left"}
+    job = JobUnderWay(Job(SCENE, survey, values=values, name=f"{number}"), range(40), None, None)
+    job.parts.add(Receipt(0, 0, stored, "", 10 * stored, 1, 1, (), b""))
+    return job.status(is_writing=stored > 15)
+
+
 def test_the_page_tells_of_jobs_and_keeps_few_of_them():
-    busy = [
-        JobNow(f"{5000 + k}", {"height": 2.0, "side": "left"}, k, 40, 10 * k, 0.1, writing=k > 15)
-        for k in range(20)
-    ]
+    busy = [status(5000 + k, k) for k in range(20)]
     with campaign_shown(10_000) as live:
         for number in range(5000):
             live.ended(row(number, error="no surface" if number % 100 == 0 else ""))
@@ -267,6 +274,8 @@ def test_the_page_tells_of_jobs_and_keeps_few_of_them():
         assert [job["error"] for job in told["failures"]] == ["no surface"] * FAILED_MOST
         assert len(told["under_way"]) == UNDER_WAY_MOST
         assert [told["under_way"][4][name] for name in ("stored", "scans")] == [4, 40]
+        assert told["under_way"][4]["values"] == ["2", "left"]
+        assert told["under_way"][4]["points"] == 40
         wait_for_charts(live, 2)
         assert not told["over"]
 
@@ -303,7 +312,7 @@ def test_a_campaign_is_watched_to_its_end(tmp_path):
         campaign = Campaign(make, 6, keep="folder", title="Walls")
         output = DataSetOutput(tmp_path / "set", campaign)
         options = RunOptions(client=client, backend="numpy", folder=tmp_path / "set" / "run")
-        run = Conductor(campaign, options, output, Screen(look), live)()
+        run = Run(campaign, options, output, Screen(look), live).execute()
         assert (run.done, len(run.failed)) == (5, 1)
         told = ask(live.page.url, "jobs")
         assert (told["done"], told["failed"], told["over"]) == (5, 1, True)

@@ -31,7 +31,7 @@ A, B = "tcp://a:1", "tcp://b:1"
 
 
 JOB, OTHER, ELSEWHERE = (
-    SimpleNamespace(number=number, scene=scene, fit=100)
+    SimpleNamespace(number=number, scene_name=scene, scans_per_task=100)
     for number, scene in enumerate(("scene", "scene", "another scene"))
 )
 

@@ -78,7 +78,7 @@ def test_a_run_from_its_beginning_to_its_end(folder):
     add(store, 2, 6)
     assert store.kept == "4 of 6 scans" and store.only.progress().points == 12
     add(store, 0, 2)
-    store.only.parts.frames = 6
+    store.only.frames = 6
     assert store.only.complete
     cloud = store.only.points().load()
     assert cloud.scan.tolist() == np.repeat(np.arange(6), 3).tolist()
@@ -158,11 +158,11 @@ def test_a_run_that_has_kept_nothing_is_in_nobodys_way(folder):
 def test_trials_are_gone_on_with_too(folder):
     job = replace(JOB, planning=PLANNING)
     store = opened(folder, job=job)
-    store.db.add_trials(0, [run_trial(PLANNING, 1)])
+    store.db.add_trials(store.only, [run_trial(PLANNING, 1)])
     assert store.kept == "1 of 2 planning trials"
     store.db.close()
     again = opened(folder, resume=True, job=job)
-    assert [trial.trial for trial in again.only.parts.trials] == [1] and not again.only.complete
+    assert [trial.trial for trial in again.only.trials] == [1] and not again.only.complete
 
 
 def part_of(folder, first):
@@ -285,13 +285,13 @@ def test_places_that_cannot_be(tmp_path):
 def test_an_error_tells_how_to_go_on(anywhere):
     store = opened(anywhere)
     add(store, 0, 2)
-    store.only.parts.frames = 1
+    store.only.frames = 1
     with pytest.raises(KeyboardInterrupt) as caught, store.kept_on_error():
         raise KeyboardInterrupt
     (note,) = caught.value.__notes__
     assert note.startswith(f"2 of 6 scans are kept in {anywhere}: continue with --resume")
     again = opened(anywhere, resume=True)
-    assert (again.only.resumed, again.only.parts.frames) == (2, 1)
+    assert (again.only.resumed, again.only.frames) == (2, 1)
 
 
 def test_an_error_before_anything_was_kept_leaves_nothing(anywhere):
@@ -414,7 +414,7 @@ def test_a_survey_and_a_campaign_do_not_take_each_others_folder(left, folder, un
     remove_run(folder)
     store, job = campaign(folder)
     if left == "a job under way":
-        store.points_of(job)
+        store.take_on(job)
         add(store, 0, 2, job)
     else:
         store.end([JobRow(0, "0000")])
@@ -429,14 +429,14 @@ def test_a_survey_and_a_campaign_do_not_take_each_others_folder(left, folder, un
 @pytest.mark.parametrize("change", ["none", "another height", "of unknown content"])
 def test_a_job_under_way_is_gone_on_with_if_its_content_is_the_same(change, folder):
     store, job = campaign(folder)
-    store.points_of(job)
+    store.take_on(job)
     add(store, 0, 2, job)
     if change != "of unknown content":
         store.save()
     store.db.close()
     again, job = campaign(folder, height=2.0 if change == "another height" else 1.0, resume=True)
     same = change == "none"
-    assert again.points_of(job).resumed == (2 if same else 0)
+    assert again.take_on(job).resumed == (2 if same else 0)
     assert any(name.endswith(".npz") for name in again.storage.sizes()) == same
 
 
@@ -450,7 +450,7 @@ def test_a_lost_database_is_made_again_though_drivers_end_meanwhile(folder):
         assert store.begun and not store.kept  # nothing is taken over yet
         if end != "alive":
             store.close() if end == "interrupted" else store.db.close()
-    store.points_of(job)
+    store.take_on(job)
     add(store, 0, 2, job)
     store.close()
     store, _ = campaign(folder, resume=True)
@@ -582,7 +582,7 @@ def test_it_goes_on_from_the_last_copy(remote_run):
     assert (store.only.resumed, store.backend, store.notes) == (4, "numpy", [])
     assert store.only.parts.missing(0, 6) == [(2, 3), (5, 6)], "parts say what is not in the copy"
     assert add(store, 2, 3) and add(store, 5, 6)
-    store.only.parts.frames = 6
+    store.only.frames = 6
     store.save(now=True)
     store.tidy()
     mark = mark_name(store.db.meta["mark"])

@@ -10,7 +10,7 @@ from tests.rows import quick
 
 from lidarpool import LidarError, Planning, ScanFrame, Scene, Sensor, Survey, simulate
 from lidarpool.run.cluster.watch import WATCH_EVERY_S
-from lidarpool.run.pipeline.pipeline import RunDriver
+from lidarpool.run.pipeline.pipeline import Pipeline
 from lidarpool.run.pipeline.placement import placement_violations
 from lidarpool.run.trials import TrialPump
 from poolpart.workers import worker_identities
@@ -123,9 +123,9 @@ def test_an_error_in_the_callback_passes_through_and_stops_the_run(
         assert same_cloud(again.cloud, undisturbed.cloud)
 
 
-@pytest.mark.parametrize("pump", quick((RunDriver,), [RunDriver, TrialPump]))
+@pytest.mark.parametrize("pump", quick((Pipeline,), [Pipeline, TrialPump]))
 def test_an_interrupt_while_starting_leaves_nothing(cluster_client, monkeypatch, pump, left_over):
-    method = "open" if pump is RunDriver else "step"
+    method = "open" if pump is Pipeline else "step"
     original = getattr(pump, method)
 
     def interrupted(self) -> None:

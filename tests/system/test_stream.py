@@ -60,7 +60,7 @@ def same(one: Sweep, two: Sweep, columns: set[str]) -> bool:
 @pytest.fixture(scope="module")
 def expected(local_client: Client) -> list[Sweep]:
     """All sweeps of a campaign that nobody disturbs."""
-    return list(campaign().stream(local_client))
+    return list(campaign().stream(client=local_client))
 
 
 @pytest.mark.parametrize("keep", quick(("kitti",), ["parquet", "kitti", "webdataset"]))
@@ -73,17 +73,17 @@ def test_the_sweeps_are_those_of_the_data_set(cluster_client, client, tmp_path, 
     ):
         varied.run(tmp_path / "ds", client=writers)
     saved = list(lp.sweeps(tmp_path / "ds"))
-    fresh = list(varied.stream(client))
+    fresh = list(varied.stream(client=client))
     assert len(fresh) == len(saved) == 3 * SWEEPS and sum(map(len, fresh)) > 1000
     assert any(sweep.boxes.points.any() for sweep in fresh)
     for one, two in zip(saved, fresh, strict=True):
         assert same(one, two, {*one.columns}) and {*one.columns} <= {*two.columns}
-    chosen = list(varied.stream(cluster_client, split="test", ahead=1))
+    chosen = list(varied.stream(client=cluster_client, split="test", ahead=1))
     saved = list(lp.sweeps(tmp_path / "ds", split="test"))
     assert [one.job for one in chosen] == [one.job for one in saved] != []
     assert all(same(one, two, {*one.columns}) for one, two in zip(saved, chosen, strict=True))
     for _ in range(2):  # epochs of a network
-        items = lp.sweeps(tmp_path / "ds").torch(), varied.stream(client).torch()
+        items = lp.sweeps(tmp_path / "ds").torch(), varied.stream(client=client).torch()
         for one, two in zip(*items, strict=True):
             assert {"points", "intensity", "class", "boxes", "pose"} <= one.keys() <= two.keys()
             assert all(np.array_equal(one[name], two[name]) for name in one)
@@ -100,7 +100,7 @@ def test_normals_and_origins_are_in_the_axes_of_the_points(client):
             job, survey=replace(job.survey, noise=Noise(), columns=columns, precision_m=1e-4)
         )
 
-    for sweep in Campaign(with_vectors, 2, seed=4).stream(client):
+    for sweep in Campaign(with_vectors, 2, seed=4).stream(client=client):
         normal = np.stack([sweep.columns[name] for name in normal_names], axis=1)
         origin = np.stack([sweep.columns[name] for name in origin_names], axis=1)
         ray = sweep.points - origin
@@ -120,7 +120,7 @@ def test_sweeps_of_a_killed_worker_are_cast_again(client, sabotage, expected):
 
     with ThreadPoolExecutor(1) as pool:
         disarmed = pool.submit(disarm)
-        again = list(campaign().stream(client))
+        again = list(campaign().stream(client=client))
         disarmed.result()
     columns = {*expected[0].columns}
     assert all(same(one, two, columns) for one, two in zip(expected, again, strict=True))
@@ -128,7 +128,7 @@ def test_sweeps_of_a_killed_worker_are_cast_again(client, sabotage, expected):
 
 def test_a_pickled_stream_gives_the_same_sweeps(cluster_client, expected):
     """Here, and in a task of its cluster."""
-    data = cloudpickle.dumps(campaign(1).stream(cluster_client))
+    data = cloudpickle.dumps(campaign(1).stream(client=cluster_client))
     columns = {*expected[0].columns}
 
     def read() -> list[Sweep]:
@@ -138,7 +138,7 @@ def test_a_pickled_stream_gives_the_same_sweeps(cluster_client, expected):
     for again in (read(), in_task):
         pairs = zip(expected[:SWEEPS], again, strict=True)
         assert all(same(one, two, columns) for one, two in pairs)
-    assert pickle.loads(pickle.dumps(campaign(1).stream(cluster_client, ahead=3))).ahead == 3
+    assert pickle.loads(pickle.dumps(campaign(1).stream(client=cluster_client, ahead=3))).ahead == 3
 
 
 def test_no_workers_are_started_in_a_task(cluster_client):
@@ -161,7 +161,7 @@ def test_one_that_is_left_early_leaves_nothing(client, left_over):
         return {child.pid for child in psutil.Process().children(recursive=True)} - before
 
     wait_until(lambda: not others())
-    for _ in campaign().stream(client):
+    for _ in campaign().stream(client=client):
         break
     assert left_over(client) == ([], [], [])
 
@@ -181,7 +181,7 @@ def cast() -> Iterator[list[tuple[int, int]]]:
 
 
 def test_casting_waits_for_the_reader(cluster_client, cast):
-    stream = iter(campaign(4).stream(cluster_client, ahead=3))
+    stream = iter(campaign(4).stream(client=cluster_client, ahead=3))
     for read in range(1, 4 * SWEEPS - 3):
         next(stream)
         wait_until(lambda read=read: len(cast) > read)  # without the reader
@@ -195,7 +195,7 @@ def test_jobs_that_fail_are_left_out(cluster_client, caplog):
             raise RuntimeError("no such street")
         return make(number, rng)
 
-    sweeps = list(Campaign(some, 3).stream(cluster_client))
+    sweeps = list(Campaign(some, 3).stream(client=cluster_client))
     assert [sweep.job_number for sweep in sweeps] == [0] * SWEEPS + [2] * SWEEPS
     (told,) = [record.getMessage() for record in caplog.records if "left out" in record.message]
     assert told.startswith("Job 0001 is left out of the stream") and "no such street" in told
@@ -203,7 +203,7 @@ def test_jobs_that_fail_are_left_out(cluster_client, caplog):
 
 def test_the_first_job_without_points_is_named(cluster_client, caplog):
     far = Survey(Sensor.grid(90, 2, step_deg=30), poses=[(0, 0, 10_000)], steps=12)
-    sweeps = list(Campaign(lambda number, rng: Job(SCENE, far), 3).stream(cluster_client))
+    sweeps = list(Campaign(lambda number, rng: Job(SCENE, far), 3).stream(client=cluster_client))
     assert [len(sweep.points) for sweep in sweeps] == [0] * 3
     (told,) = [record.getMessage() for record in caplog.records if "no points" in record.message]
     assert told.startswith("Job 0000 of the stream has no points: no ray hit anything")
@@ -217,20 +217,20 @@ def test_errors_are_told_in_a_line(cluster_client):
         ({"split": "x"}, r"no split 'x'\. It has train, test"),
     ):
         with pytest.raises(LidarError, match=words) as told:
-            campaign(splits={"train": 0.5, "test": 0.5}).stream(cluster_client, **options)
+            campaign(splits={"train": 0.5, "test": 0.5}).stream(client=cluster_client, **options)
         assert "\n" not in str(told.value)
     with (
         thread_cluster({"LIDAR": 1}) as cluster,
         Client(cluster, set_as_default=False) as client,
         pytest.raises(LidarError, match="GPU"),
     ):
-        next(iter(campaign().stream(client, wait_s=0)))
+        next(iter(campaign().stream(client=client, wait_s=0)))
 
 
 def test_a_cluster_that_is_lost_ends_it():
     with thread_cluster({"GPU": 1}) as cluster:
         client = Client(cluster, set_as_default=False)
-        stream = iter(campaign(9).stream(client, ahead=1))
+        stream = iter(campaign(9).stream(client=client, ahead=1))
         next(stream)
         client.close()
         with pytest.raises(LidarError, match="has lost its cluster"):
@@ -241,7 +241,7 @@ def test_a_cluster_that_is_lost_ends_it():
 
 
 def test_torch_divides_jobs_between_ranks(cluster_client, torch):
-    stream = campaign(5).stream(cluster_client, ahead=4)
+    stream = campaign(5).stream(client=cluster_client, ahead=4)
     torch.distributed.is_available = torch.distributed.is_initialized = lambda: True
     torch.distributed.get_world_size = lambda: 2
     for rank, jobs in ((0, (0, 2)), (1, (1, 3))):

@@ -4,16 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Unpack
 
-from distributed import Client
 from pydantic import Field
 
 from lidarsim.base.declared import declared
 from lidarsim.base.errors import LidarError
 from lidarsim.base.storage import Storage
 from lidarsim.base.validation import checked
-from lidarsim.base.vocabulary import PATIENCE_S, WAIT_S
 from lidarsim.base.words import did_you_mean
 from lidarsim.scene.scene import Scene
 from lidarsim.sensor import Survey
@@ -25,16 +23,30 @@ from ..live import page_of
 from ..plan import Planning
 from ..report.campaign_output import DataSetOutput
 from ..run.job_source import OneJob
-from ..run.options import RunOptions
+from ..run.options import RunKeywords, RunOptions, given_options
 from ..run.pipeline.messages import ScanFrame
 from ..run.progress import Progress, Screen
 from ..run.run_result import CampaignRun, RunResult
-from ..run.runner import Conductor, Kept
+from ..run.runner import Kept, Run
 from ..run.store.run_store import RUN_FOLDER
 from ..run.stream import SweepStream
 from ..scenario import campaign as described
 from ..scenario.build import Job
 from .result import Result
+
+# Options that are meaningless in a call: a survey has no data set, a campaign plans no paths, and
+# its run is kept beside the data set; a stream keeps nothing and has no stages 1 and 4.
+_NOT_OF_SURVEYS = ("fresh", "retry_failed", "verify", "overwrite")
+_NOT_OF_CAMPAIGNS = ("folder", "other_workers")
+_NOT_OF_STREAMS = (
+    *_NOT_OF_SURVEYS,
+    *_NOT_OF_CAMPAIGNS,
+    "parts",
+    "resume",
+    "live",
+    "collectors",
+    "queue_capacity",
+)
 
 
 @checked
@@ -43,22 +55,9 @@ def simulate(
     survey: Survey,
     planning: Planning | None = None,
     *,
-    client: Client | None = None,
-    backend: str = "auto",
     on_frame: Callable[[ScanFrame], None] | None = None,
     on_progress: Callable[[Progress], None] | None = None,
-    live: bool = False,
-    queue_capacity: int = 10,
-    collectors: int = 2,
-    batch_mb: int = 256,
-    gpu_workers: int | None = None,
-    other_workers: int | None = None,
-    tls: bool = False,
-    wait_s: float = WAIT_S,
-    patience_s: float = PATIENCE_S,
-    folder: str | Path | None = None,
-    parts: str | Path | None = None,
-    resume: bool = False,
+    **options: Unpack[RunKeywords],
 ) -> Result:
     """Scan a scene on a partitioned cluster, and plan a path at the same time.
 
@@ -68,12 +67,6 @@ def simulate(
         The scene and the survey; poses in the scene's local coordinates.
     planning
         A path to plan on the OTHER partition while the survey runs; None for none.
-    client
-        Client of a cluster whose workers declare the resources GPU, LIDAR and OTHER. Its dashboard
-        has a page of partitions during the run; the log has its address. Without a client, a local
-        cluster is started on the loopback interface and stopped at the end.
-    backend
-        Ray-casting backend of stage 2: auto, cuda, embree or numpy.
     on_frame
         Called with each frame, in scan order, while the survey runs; its points are in storage by
         then, see `ScanFrame.points`. It is called in this thread: a slow callback makes the
@@ -81,6 +74,15 @@ def simulate(
     on_progress
         Called some ten times a second with the progress. Without it there are bars in a notebook
         and at a terminal.
+
+    Other Parameters
+    ----------------
+    client
+        Client of a cluster whose workers declare the resources GPU, LIDAR and OTHER. Its dashboard
+        has a page of partitions during the run; the log has its address. Without a client, a local
+        cluster is started on the loopback interface and stopped at the end.
+    backend
+        Ray-casting backend of stage 2: auto, cuda, embree or numpy.
     live
         Show the run in the browser meanwhile, as `lidarpool run --live` does; in a notebook, in the
         cell. `Result.view` shows the result afterwards.
@@ -134,27 +136,13 @@ def simulate(
     >>> print(len(result.cloud), "points")                            # doctest: +SKIP
     1613 points
     """
-    options = RunOptions(
-        client=client,
-        backend=backend,
-        queue_capacity=queue_capacity,
-        collectors=collectors,
-        batch_mb=batch_mb,
-        gpu_workers=gpu_workers,
-        other_workers=other_workers,
-        tls=tls,
-        wait_s=wait_s,
-        patience_s=patience_s,
-        folder=folder,
-        parts=parts,
-        resume=resume,
-        live=live,
-    )
+    given = given_options("simulate", options, without=_NOT_OF_SURVEYS)
+    run_options = RunOptions(**given)
     jobs = OneJob(Job(scene, survey, planning))
-    if client is None:  # before anything is made in the folder
-        check_backend_here(backend)
-    with page_of(jobs, live) as page:
-        result = Conductor(jobs, options, Kept(), Screen(on_progress), page, on_frame)()
+    if run_options.own:  # before anything is made in the folder
+        check_backend_here(run_options.backend)
+    with page_of(jobs, run_options.live) as page:
+        result = Run(jobs, run_options, Kept(), Screen(on_progress), page, on_frame).execute()
     return Result(**declared(result, RunResult))
 
 
@@ -166,20 +154,9 @@ class Campaign(described.CampaignSpec):  # noqa: D101 - as there
         self,
         out: str | Path,
         *,
-        client: Client | None = None,
-        backend: str | None = None,
         on_progress: Callable[[Progress], None] | None = None,
-        gpu_workers: int | None = None,
-        parts: str | Path | None = None,
-        resume: bool = False,
-        fresh: bool = False,
-        retry_failed: bool = False,
-        verify: bool = False,
-        overwrite: bool = False,
-        live: bool = False,
-        wait_s: float = WAIT_S,
-        patience_s: float = PATIENCE_S,
         shard: tuple[int, int] = (1, 1),
+        **options: Unpack[RunKeywords],
     ) -> CampaignRun:
         """Do the jobs, several at a time, and write the data set.
 
@@ -187,15 +164,20 @@ class Campaign(described.CampaignSpec):  # noqa: D101 - as there
         ----------
         out
             Its folder, or a URL that fsspec opens.
+        on_progress
+            Called some ten times a second. Without it there are bars in a notebook and at a
+            terminal.
+        shard
+            (3, 10): do the third of ten equal shares of the jobs, for `lidarpool.merge`.
+
+        Other Parameters
+        ----------------
         client
             Client of a cluster whose workers declare the resources GPU and LIDAR; without one, a
             local cluster is started. LIDAR needs a slot more than a survey does: jobs are written
             in it.
-        backend
-            Ray-casting backend; by default that of the scenario.
-        on_progress
-            Called some ten times a second. Without it there are bars in a notebook and at a
-            terminal.
+        backend, collectors, queue_capacity, batch_mb
+            As for `simulate`; by default those of the scenario.
         gpu_workers
             Workers of a local cluster that cast; by default as many as the scenario says.
         parts
@@ -215,10 +197,8 @@ class Campaign(described.CampaignSpec):  # noqa: D101 - as there
         live
             Show the jobs in the browser meanwhile, as `lidarpool run --live` does; in a notebook,
             in the cell.
-        wait_s, patience_s
+        tls, wait_s, patience_s
             As for `simulate`.
-        shard
-            (3, 10): do the third of ten equal shares of the jobs, for `lidarpool.merge`.
 
         Returns
         -------
@@ -232,37 +212,21 @@ class Campaign(described.CampaignSpec):  # noqa: D101 - as there
             another campaign or version; one or two lines say which and what to do.
         """
         place = output_place(out)
-        options = RunOptions(
-            out=place,
-            folder=Storage.at(place).below(RUN_FOLDER),
-            client=client,
-            gpu_workers=gpu_workers,
-            parts=parts,
-            resume=resume,
-            fresh=fresh,
-            retry_failed=retry_failed,
-            verify=verify,
-            overwrite=overwrite,
-            live=live,
-            wait_s=wait_s,
-            patience_s=patience_s,
-        ).with_pool(self.pool, backend)
+        given = given_options("run", options, without=_NOT_OF_CAMPAIGNS)
+        folder = Storage.at(place).below(RUN_FOLDER)
+        run_options = RunOptions(out=place, folder=folder, **given).with_pool(self.pool, given)
         jobs = self.of_shard(Shard(*shard))
-        with page_of(jobs, live) as page:
+        with page_of(jobs, run_options.live) as page:
             output = DataSetOutput(place, jobs)
-            return Conductor(jobs, options, output, Screen(on_progress), page)()
+            return Run(jobs, run_options, output, Screen(on_progress), page).execute()
 
     @checked
     def stream(
         self,
-        client: Client | None = None,
         ahead: Annotated[int, Field(ge=1)] = 8,
         *,
         split: str | None = None,
-        backend: str | None = None,
-        gpu_workers: int | None = None,
-        wait_s: float = WAIT_S,
-        patience_s: float = PATIENCE_S,
+        **options: Unpack[RunKeywords],
     ) -> SweepStream:
         """Stream the sweeps of the jobs while they are cast, without a data set.
 
@@ -270,21 +234,33 @@ class Campaign(described.CampaignSpec):  # noqa: D101 - as there
         sensors and time. Points go from the workers to this process, past the scheduler. The sweeps
         of a worker that dies are cast again. A job that fails is left out, and the log says why.
 
-        At most `ahead` sweeps are being cast or wait to be read, which bounds the memory: give
-        twice as many as there are casting workers, or more. `client` is of a cluster whose workers
-        declare the resource GPU; without one, each loop starts a local cluster, and stops it.
-        `split` chooses jobs. The others are as of `run`.
+        Parameters
+        ----------
+        ahead
+            Most sweeps that are being cast or wait to be read, which bounds the memory: give twice
+            as many as there are casting workers, or more.
+        split
+            Only the jobs of this split.
 
-        LidarError if there is no such split; in the loop, if the cluster lacks something or is
-        lost.
+        Other Parameters
+        ----------------
+        client
+            Client of a cluster whose workers declare the resource GPU; without one, each loop
+            starts a local cluster, and stops it.
+        backend, batch_mb, gpu_workers, tls, wait_s, patience_s
+            As for `run`.
+
+        Raises
+        ------
+        LidarError
+            If there is no such split; in the loop, if the cluster lacks something or is lost.
         """
+        given = given_options("stream", options, without=_NOT_OF_STREAMS)
         if split is not None and split not in self.splits:
             known = (
                 did_you_mean(split, self.splits) or f" It has {', '.join(self.splits) or 'none'}."
             )
             raise LidarError(f"The campaign has no split {split!r}.{known}")
         numbers = [n for n in range(self.count) if split in (None, self.split(n))]
-        options = RunOptions(
-            client=client, gpu_workers=gpu_workers, wait_s=wait_s, patience_s=patience_s
-        )
-        return SweepStream(self, numbers, ahead, options.with_pool(self.pool, backend))
+        run_options = RunOptions(**given).with_pool(self.pool, given)
+        return SweepStream(self, numbers, ahead, run_options)

@@ -69,7 +69,7 @@ def look_at(
         with terminal.status("casting some rays"):
             figures = forecast(
                 job,
-                options.with_pool(scenario.pool, backend),
+                options.with_pool(scenario.pool, {"backend": backend}),
                 client,
                 refuse=lambda: _refuse_other_result(job, options),
             )

@@ -28,7 +28,7 @@ from ..report.report import summary
 from ..run.job_source import OneJob
 from ..run.options import RunOptions
 from ..run.run_result import RunResult
-from ..run.runner import Conductor, Kept
+from ..run.runner import Kept, Run
 from ..run.store.run_store import RUN_FOLDER
 from ..scenario.advice import advice
 from ..scenario.build import Built, Job, build
@@ -55,7 +55,7 @@ def run_scenario(
     Of a `shard`, the run stays, and says what it is `made_of`. LidarError if the run fails;
     notes of the error say what was kept.
     """
-    options = options.with_pool(scenario.pool, backend)
+    options = options.with_pool(scenario.pool, {"backend": backend})
     if options.own:  # before reading the scene, which may take long
         check_backend_here(options.backend)
     with terminal.status("reading the scene", logged=False):
@@ -70,7 +70,7 @@ def run_scenario(
     more = {"plans": not no_plan, "extent": extent or "page", "scans": job.survey.scan_count}
     jobs, output = OneJob(job, shard), Kept({**made_of, **more})
     with result_folder(options.out), page_of(jobs, options.live) as page:
-        result = Conductor(jobs, options, output, terminal, page)()
+        result = Run(jobs, options, output, terminal, page).execute()
     points, lines = len(result.points), [*terminal.notes(result.notes)]
     words = shard_in_words(str(shard))
     lines.append(f"{words} in {options.out}: {plural(points, 'point')}, for lidarpool merge")
@@ -94,7 +94,7 @@ def _run_survey(
     extent = extent or "page"
     output = SurveyOutput(options.out, job.survey, job.outputs, extent, built.scenario, judge)
     with page_of(jobs, options.live) as page:
-        result, report = Conductor(jobs, options, output, terminal, page)()
+        result, report = Run(jobs, options, output, terminal, page).execute()
         lines = _of_result(options.out, result, job, report, terminal)
         show(summary(options.out, report), lines, terminal.as_json)
         if options.live and options.stay:
@@ -106,13 +106,13 @@ def run_campaign(
     campaign: CampaignSpec, terminal: Terminal, options: RunOptions, backend: str | None
 ) -> None:
     """Run a campaign, and print a summary; LidarError if it or a job fails."""
-    options = options.with_pool(campaign.pool, backend)
+    options = options.with_pool(campaign.pool, {"backend": backend})
     assert options.out is not None, "commands write"
     for warning in _first_job_warnings(campaign, terminal):
         terminal.warn(warning)
     with page_of(campaign, options.live) as page:
         output = DataSetOutput(options.out, campaign)
-        run = Conductor(campaign, options, output, terminal, page)()
+        run = Run(campaign, options, output, terminal, page).execute()
         names = ("points", "rays", "seconds", "casting_seconds", "resumed", "notes")
         told = {"folder": str(options.out), "jobs": run.done}
         told |= {"failed": [row.name for row in run.failed]}
@@ -186,7 +186,7 @@ def run_job(
             )
         return f"the points are those of job {name} in {place}, bit for bit"
 
-    options = options.with_pool(scenario.pool, backend)
+    options = options.with_pool(scenario.pool, {"backend": backend})
     _run_survey(built, replace(job, number=0), options, terminal, extent, compare)
 
 

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from contextlib import closing
-from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import Any, Protocol, Self
 
 import numpy as np
 import torch
@@ -16,15 +15,37 @@ from lidarsim.base.errors import LidarError
 
 from .sweep_data import Sweep
 
-if TYPE_CHECKING:
-    from .loader import SavedSweeps
+
+class ReadSweeps(Protocol):
+    """Sweeps that can be read by their indices, such as those of a data set."""
+
+    def __len__(self) -> int: ...
+
+    def ahead(self, indices: Iterable[int]) -> Generator[Sweep]:
+        """Read the sweeps of some indices, in this order."""
+        ...
+
+
+class JobStream(Protocol):
+    """Sweeps of some jobs of a campaign, in the order of jobs."""
+
+    @property
+    def numbers(self) -> Sequence[int]:
+        """Numbers of the jobs."""
+        ...
+
+    def of_jobs(self, numbers: Sequence[int]) -> Self:
+        """Return the stream of some of the jobs."""
+        ...
+
+    def __iter__(self) -> Generator[Sweep]: ...
 
 
 class TorchSweeps(torch.utils.data.IterableDataset):
     """Items made of sweeps, divided between ranks, then between the workers of each."""
 
     def __init__(
-        self, sweeps: SavedSweeps, transform: Callable[[Sweep], Any] | None, even: bool
+        self, sweeps: ReadSweeps, transform: Callable[[Sweep], Any] | None, even: bool
     ) -> None:
         self.sweeps, self.transform, self.even = sweeps, transform or tensors, even
         self._rank: tuple[int, int] | None = None
@@ -48,7 +69,7 @@ class TorchSweeps(torch.utils.data.IterableDataset):
 class TorchStream(torch.utils.data.IterableDataset):
     """Items made of the sweeps of a `SweepStream`, whose jobs are divided between ranks."""
 
-    def __init__(self, stream: Any, transform: Callable[[Sweep], Any] | None) -> None:
+    def __init__(self, stream: JobStream, transform: Callable[[Sweep], Any] | None) -> None:
         self.stream, self.transform = stream, transform or tensors
 
     def __iter__(self) -> Iterator[Any]:
@@ -58,8 +79,8 @@ class TorchStream(torch.utils.data.IterableDataset):
                 "the DataLoader num_workers=0."
             )
         (rank, ranks), jobs = _ranks(), self.stream.numbers
-        own = replace(self.stream, numbers=jobs[rank : len(jobs) - len(jobs) % ranks : ranks])
-        with closing(iter(own)) as sweeps:
+        of_rank = self.stream.of_jobs(jobs[rank : len(jobs) - len(jobs) % ranks : ranks])
+        with closing(iter(of_rank)) as sweeps:
             yield from map(self.transform, sweeps)
 
 

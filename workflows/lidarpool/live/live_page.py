@@ -25,7 +25,7 @@ from lidarsim.base.arrays import Floats, Floats32
 from lidarsim.base.errors import LidarError
 from lidarsim.base.storage import Storage
 from lidarsim.columns.cloud import Cloud
-from lidarsim.sweeps.sweeps import SWEEPS_FILE, Sweeps
+from lidarsim.sweeps.sweeps import SWEEPS_FILE
 from poolpart import Partition, PartitionStats
 
 from ..columns.cloud_file import CloudFile
@@ -39,9 +39,9 @@ from ..report.picture_content import planning_picture
 from ..run.picture_file import PictureContent
 from ..run.pipeline.messages import Receipt, ScanFrame
 from ..run.progress import STAGES, Pace, Progress, in_words, standing_still, time_in_words
-from ..run.run_page import JobNow, RunPage
+from ..run.run_page import RunPage
 from ..run.run_result import RunResult
-from ..run.store.job_under_way import JobPoints
+from ..run.store.job_under_way import JobUnderWay
 from .opened import downloads
 from .point_selection import HeldPoints
 from .server import PORT, VIEWER, Answer, Arguments, PageServer, announced, page_server
@@ -78,7 +78,7 @@ class LivePage(RunPage):
         self._loads: deque[tuple[float, dict[str, PartitionStats]]] = deque(maxlen=LOADS_KEPT)
         self._written: Storage | None = None  # folders of jobs, which can be opened
         self._results: dict[int, View] = {}  # {number: what its page shows of a written job}
-        self._under_way: Sequence[JobNow] = ()
+        self._under_way: Sequence[Mapping[str, Any]] = ()
         self._ask_at = self._list_at = 0.0
         self._looked_for = float("-inf")  # when a browser last wanted points of the newest job
         self._reading = CpuShare(READING_SHARE)
@@ -89,11 +89,11 @@ class LivePage(RunPage):
 
     # -- the run's side ------------------------------------------------------------------
 
-    def begun(self, points: JobPoints) -> None:
+    def begun(self, job: JobUnderWay) -> None:
         """Show the only job: what is committed from now on, and the scans of an earlier run."""
-        if points.kept:
-            self._progress = points.progress()
-        self._jobs = {0: LiveJob(points)}
+        if job.kept:
+            self._progress = job.progress()
+        self._jobs = {0: LiveJob(job)}
         self._state = "starting: workers, each with its own Python"
 
     def follow(self, partitions: Mapping[str, Partition], dataset: DataSet | None = None) -> None:
@@ -111,7 +111,9 @@ class LivePage(RunPage):
         """Record a frame, which is displayed unless many others come at once."""
         self._jobs[0].frames.append(frame)
 
-    def on_progress(self, progress: Progress, under_way: Callable[[], Sequence[JobNow]]) -> None:
+    def on_progress(
+        self, progress: Progress, under_way: Callable[[], Sequence[Mapping[str, Any]]]
+    ) -> None:
         """Record the progress; KeyboardInterrupt if a user of the page has stopped the run."""
         if self.stopped.is_set():
             raise KeyboardInterrupt
@@ -129,7 +131,7 @@ class LivePage(RunPage):
             self._under_way = under_way()
         if over:
             self._state = "writing the table and the card"
-        elif progress.cast or any(job.stored for job in self._under_way):
+        elif progress.cast or any(job["stored"] for job in self._under_way):
             self._state = "running"
         if now >= self._ask_at:
             self._ask_at = now + ASK_EVERY_S
@@ -147,16 +149,16 @@ class LivePage(RunPage):
         self._sums.update({ended: 1, "points": row.points, "rays": row.rays})
         self._charts.add(row)
 
-    def look(self, row: JobRow, points: JobPoints) -> None:
+    def look(self, row: JobRow, job: JobUnderWay) -> None:
         """Read points of a job, if a browser shows them and there is time for it."""
         watched = time.monotonic() - self._looked_for <= WATCHED_S and self._reading.due
         if self._count > 1 and self._jobs and not watched:
             return
         with self._reading.taken(LOOK_EVERY_S):
-            job = self._jobs.get(row.number) or LiveJob(points, row.name)
-            job.read_all()
-            if len(job.cloud):
-                jobs = self._jobs | {row.number: job}
+            live = self._jobs.get(row.number) or LiveJob(job, row.name)
+            live.read_all()
+            if len(live.cloud):
+                jobs = self._jobs | {row.number: live}
                 self._jobs = {number: jobs[number] for number in [*jobs][-VIEWS_KEPT:]}
 
     def finish(self, seconds: float, result: RunResult | None = None) -> None:
@@ -251,8 +253,7 @@ class LivePage(RunPage):
             "slots": busy_slots(list(self._loads)),
             "busy": len(under_way),
             "under_way": [
-                vars(job) | {"values": self._words(job.values)}
-                for job in under_way[:UNDER_WAY_MOST]
+                {**job, "values": self._words(job["values"])} for job in under_way[:UNDER_WAY_MOST]
             ],
             "failures": [*reversed(list(self._failures))],
             "ended": [
@@ -372,10 +373,12 @@ class LiveJob:
     sample of the whole result replaces them, so skipped parts do not matter.
     """
 
-    def __init__(self, points: JobPoints, name: str = "", most: int = LIVE_POINTS) -> None:
-        self.name, self._points_of, self._most = name, points, most
-        self._job = points.job
-        self._points = points.points()  # knows what a part holds
+    def __init__(self, under_way: JobUnderWay, name: str = "", most: int = LIVE_POINTS) -> None:
+        self.name = name
+        self._under_way = under_way
+        self._most = most
+        self._job = under_way.job
+        self._points = under_way.points()  # knows what a part holds
         self._waiting: list[str] = []  # names of parts
         self._lock = threading.Lock()
         self._random = np.random.default_rng(0)
@@ -388,7 +391,7 @@ class LiveJob:
         self._making = threading.Lock()
         self._whole = False  # all parts were read
         self._ends = 0  # how often something came at the run's end that the page must ask for
-        self.add(points.parts.ordered)
+        self.add(under_way.parts.ordered)
 
     # -- the run's side ------------------------------------------------------------------
 
@@ -420,7 +423,7 @@ class LiveJob:
     def show_file(self, cloud: Path) -> None:
         """Show the written cloud, with its sweeps: the parts are gone."""
         view = self.view
-        view.sweeps = Sweeps.of(self._job.survey, self._job.scene)
+        view.sweeps = self._job.sweeps
         view.show(CloudFile(cloud, () if view.pictured is None else view.pictured.own))
         self._ends += 1
 
@@ -450,7 +453,7 @@ class LiveJob:
     def hit_counts(self) -> Floats:
         """Hits by counters of the scene, scaled up to all hits if some parts were not read."""
         with self._lock:
-            return np.asarray(self._counts * (self._points_of.parts.hits / max(self._hits, 1)))
+            return np.asarray(self._counts * (self._under_way.parts.hits / max(self._hits, 1)))
 
     @property
     def view(self) -> View:
@@ -460,7 +463,7 @@ class LiveJob:
                 job = self._job
                 planning = planning_picture(job.planning)
                 pictured, drawn = PictureContent.before_casting(job.scene, job.survey, planning)
-                sweeps = Sweeps.of(job.survey, job.scene) if self._whole else None
+                sweeps = job.sweeps if self._whole else None
                 title = f"job {self.name} - lidarpool" if self.name else "lidarpool"
                 self._view = View(
                     HeldPoints(self.cloud), pictured, sweeps, title=title, downloads=downloads()
@@ -476,7 +479,7 @@ class LiveJob:
     def news(self) -> Answer:
         """Tell what is new of the job while it goes on, and at its end."""
         view, frames = self.view, [] if self._ends else list(self.frames)
-        planning, trials = self._job.planning, self._points_of.parts.trials
+        planning, trials = self._job.planning, self._under_way.trials
         is_new = view.path is None and not self._ends
         if planning is not None and is_new and len(trials) >= self._job.trials:
             view.path = best(trials, planning).path

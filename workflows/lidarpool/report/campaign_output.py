@@ -13,7 +13,7 @@ from typing import Any
 
 from lidarsim.base.errors import LidarError, explained
 from lidarsim.base.storage import Storage
-from lidarsim.base.words import plural
+from lidarsim.base.words import listed, plural
 
 from ..base.sealed import sealed, unsealed
 from ..base.shard import ALL, Shard, shard_in_words
@@ -23,9 +23,8 @@ from ..datasets.job_table import TABLE_FILE, JobRow, read_table, write_table
 from ..datasets.loader import read_index, sweeps
 from ..export.folder import result_folder
 from ..run.run_result import CampaignRun
-from ..run.runner import Conductor, Output
+from ..run.runner import Output, Run
 from ..run.store.database import FILE
-from ..run.store.job_under_way import listed
 from ..run.store.run_store import RUN_FOLDER, RunStore, remove_run
 from ..scenario.campaign import CampaignSpec
 from ..scenario.campaign_jobs import file_hashes
@@ -78,13 +77,13 @@ class DataSetOutput(Output[CampaignRun]):
 
     # -- what is there -----------------------------------------------------------------------
 
-    def begin(self, conductor: Conductor[CampaignRun]) -> CampaignRun | None:
+    def begin(self, run: Run[CampaignRun]) -> CampaignRun | None:
         """Refuse or remove a finished data set, or look at it; its sums if nothing is left."""
-        out, options = self.dataset.place, conductor.options
+        out, options = self.dataset.place, run.options
         kept = out.below(RUN_FOLDER)
         there, unfinished = out.entries(), FILE in kept.sizes()
         anew = options.fresh or options.overwrite
-        if not conductor.resume and (anew or not unfinished):
+        if not run.resume and (anew or not unfinished):
             if INDEX_FILE in there and not options.overwrite:
                 raise LidarError(
                     f"{out} holds a finished data set, and one needs a folder of its own: give "
@@ -92,7 +91,7 @@ class DataSetOutput(Output[CampaignRun]):
                 )
             if anew:
                 _remove_dataset(out, kept)
-        if not conductor.resume or CAMPAIGN_FILE not in there or unfinished:
+        if not run.resume or CAMPAIGN_FILE not in there or unfinished:
             return None
         try:
             self._made = check_same(out, self.campaign)
@@ -120,22 +119,22 @@ class DataSetOutput(Output[CampaignRun]):
             remove_run(kept)
         if (files := file_hashes(self.campaign.files)) != [*map(tuple, self._made["files"])]:
             write_record(out, {**self._made, "files": files})  # `_look`: no job has an older one
-        conductor.screen.tell(f"{out} is complete: nothing is left to do")
+        run.screen.tell(f"{out} is complete: nothing is left to do")
         for row in self._rows:
-            conductor.page.ended(row)
-        notes = tuple(conductor.warn_of_empty_jobs(self._rows))
-        run = CampaignRun.of(self._rows, time.monotonic() - conductor.started, notes=notes)
-        conductor.page.finish(run.seconds)
-        return run
+            run.page.ended(row)
+        notes = tuple(run.warn_of_empty_jobs(self._rows))
+        sums = CampaignRun.of(self._rows, time.monotonic() - run.started, notes=notes)
+        run.page.finish(sums.seconds)
+        return sums
 
-    def look(self, conductor: Conductor[CampaignRun]) -> None:
+    def look(self, run: Run[CampaignRun]) -> None:
         """Compare what is there with what the store says is done; take over what it lacks."""
-        store, options, out = conductor.store, conductor.options, self.dataset.place
+        store, options, out = run.store, run.options, self.dataset.place
         if self._made is not None:
             store.cast_with(self._made["backend"], self._made["casting"])
             rows = [row for row in self._rows if row.number in self.campaign.numbers]
             store.adopt(rows, sensors=json.dumps(self._made["sensors"]))
-        elif conductor.resume:
+        elif run.resume:
             store.notes += [self._lost_record] * bool(self._lost_record)
             self._take_over(store)
         dataset_files(out, begun=store.begun or bool(store.kept))  # some were perhaps taken over
@@ -148,7 +147,7 @@ class DataSetOutput(Output[CampaignRun]):
         if self._wrong:
             store.notes.append(f"made again: {listed([*self._wrong.values()])}")
         for row in store.rows():
-            conductor.page.ended(row)
+            run.page.ended(row)
 
     def _take_over(self, store: RunStore) -> None:
         """Take over jobs that are there and the database does not know, if it was lost."""
@@ -166,29 +165,29 @@ class DataSetOutput(Output[CampaignRun]):
 
     # -- the end ------------------------------------------------------------------------------
 
-    def finish(self, conductor: Conductor[CampaignRun]) -> CampaignRun:
+    def finish(self, run: Run[CampaignRun]) -> CampaignRun:
         """Write what all jobs share, and remove the run unless jobs have failed."""
-        store, cast = conductor.store, conductor.run
-        seconds = time.monotonic() - conductor.started
-        more: dict[str, Any] = {"stages": cast.stages if cast else (), "notes": tuple(store.notes)}
-        warnings = conductor.warn_of_empty_jobs(store.rows())
+        store, loop = run.store, run.loop
+        seconds = time.monotonic() - run.started
+        more: dict[str, Any] = {"stages": loop.stages if loop else (), "notes": tuple(store.notes)}
+        warnings = run.warn_of_empty_jobs(store.rows())
         if self.campaign.shard == ALL:  # else the merged data set has this note
             more["notes"] = (*more["notes"], *warnings)
-        run = CampaignRun.of(store.rows(), seconds, store.resumed, sensors=store.sensors, **more)
+        sums = CampaignRun.of(store.rows(), seconds, store.resumed, sensors=store.sensors, **more)
         record: dict[str, Any] = {"identity": dict(store.identity), "casting": store.casting}
-        record |= {"backend": store.backend, "sensors": run.sensors}
+        record |= {"backend": store.backend, "sensors": sums.sensors}
         record |= {"files": file_hashes(self.campaign.files), "campaign": self.campaign.described}
-        record |= {"shards": [str(self.campaign.shard)], "notes": [*run.notes]}
+        record |= {"shards": [str(self.campaign.shard)], "notes": [*sums.notes]}
         write_record(self.dataset.place, record)  # before anything that it tells whose it is
         replace(self.dataset, made_with=store.made_with).write_failed(store.rows())
-        run, _ = write_shared(self.dataset, record, run, store.rows)
-        if run.failed:
+        sums, _ = write_shared(self.dataset, record, sums, store.rows)
+        if sums.failed:
             store.save(now=True)
             store.db.close()
         else:
             store.remove()
-        conductor.page.finish(run.seconds)
-        return run
+        run.page.finish(sums.seconds)
+        return sums
 
 
 class DamagedRecordError(LidarError):
@@ -246,12 +245,13 @@ def with_seconds(place: Storage, rows: list[JobRow]) -> bool:
 def write_shared(
     dataset: DataSet,
     record: Mapping[str, Any],
-    run: CampaignRun,
+    sums: CampaignRun,
     rows: Callable[[], Iterator[JobRow]],
 ) -> tuple[CampaignRun, dict[str, Any]]:
     """Write what all jobs share, and last what says that the data set is complete.
 
-    `record` is for CAMPAIGN_FILE. Returns the run with class names, and the content of report.json.
+    `record` is for CAMPAIGN_FILE. Returns the sums, with names of classes, and the content of
+    report.json.
     """
     # Matplotlib takes as long as all other imports.
     from .campaign_report import write_card
@@ -265,8 +265,9 @@ def write_shared(
     dataset.finish(rows())
     saved = sweeps(place.url)
     picture = draw_sweep(next(iter(saved)), saved.classes) if len(saved) else None
-    run, versions = replace(run, classes=saved.classes), record["casting"] or software()
-    return run, write_card(place, campaign, run, rows(), versions, picture)
+    sums = replace(sums, classes=saved.classes)
+    versions = record["casting"] or software()
+    return sums, write_card(place, campaign, sums, rows(), versions, picture)
 
 
 def _look(
@@ -385,12 +386,12 @@ def _remove_dataset(out: Storage, kept: Storage) -> None:
     remove_run(kept)
 
 
-def failures(run: CampaignRun, most: int = 5) -> str:
+def failures(sums: CampaignRun, most: int = 5) -> str:
     """Name the jobs that have failed, with their values and why."""
-    lines = [f"{plural(len(run.failed), 'job')} failed, the other {run.done:,} are done:"]
-    for row in run.failed[:most]:
+    lines = [f"{plural(len(sums.failed), 'job')} failed, the other {sums.done:,} are done:"]
+    for row in sums.failed[:most]:
         values = ", ".join(f"{name} {value}" for name, value in row.values.items())
         lines.append(f"job {row.name}{f' ({values})' if values else ''}: {row.error}")
-    if (more := len(run.failed) - most) > 0:
+    if (more := len(sums.failed) - most) > 0:
         lines.append(f"and {more:,} more, see jobs.csv")
     return "\n".join(lines) + "\n--retry-failed does these jobs again."

@@ -17,7 +17,7 @@ from typing import Any
 from lidarsim.base.errors import LidarError, Mistakes, explained
 from lidarsim.base.storage import Storage
 from lidarsim.base.validation import checked
-from lidarsim.base.words import plural
+from lidarsim.base.words import listed, plural
 
 from ..base.fingerprint import fingerprint
 from ..base.shard import ALL, Shard
@@ -30,13 +30,13 @@ from ..export.folder import LAST_FILE, output_place, result_folder
 from ..plan import Trial
 from ..run.job_source import OneJob
 from ..run.options import RunOptions
+from ..run.pipeline.committed_job import CommittedJob
 from ..run.pipeline.messages import Receipt
 from ..run.progress import Screen
 from ..run.run_page import RunPage
 from ..run.run_result import CampaignRun, RunResult
-from ..run.runner import Conductor
+from ..run.runner import Run
 from ..run.store.database import FILE, DamagedError, RunDatabase
-from ..run.store.job_under_way import listed
 from ..run.store.remote import fetch_database
 from ..run.store.run_store import RUN_FOLDER, parts_of, remove_run, with_sensors
 from ..scenario.build import build
@@ -210,10 +210,12 @@ def _of_survey(place: Storage, run: Storage) -> _Part:
                 shard = Shard.parse(record["identity"].pop("shard"))
                 scan_count = record["made_of"]["scans"]
                 scans = shard.scans(scan_count)
-                kept = db.job(0, scans.stop, scans.start)
-                if not kept.complete:
+                job = CommittedJob(0, scans)
+                db.read(job)
+                if job.left:
                     raise LookupError("scans are missing")
-                return _Part(place, record, [shard], scan_count, kept.ordered, kept.trials)
+                parts = job.parts.ordered
+                return _Part(place, record, [shard], scan_count, parts, job.trials)
         except DamagedError as error:
             raise LidarError(
                 f"{run.path(FILE)} is damaged: run its shard again with --resume, which makes it "
@@ -429,7 +431,7 @@ def _merge_survey(
     own: dict[str, Any] = {"scenario": built.scenario, "parts": parts, "notes": notes}
     output = _Merged(out, job.survey, job.outputs, told["extent"], **own)
     options = RunOptions(out=out, folder=Storage.at(out).below(RUN_FOLDER), resume=True)
-    return Conductor(jobs, options, output, screen, RunPage())()[1]
+    return Run(jobs, options, output, screen, RunPage()).execute()[1]
 
 
 @dataclass(eq=False)
@@ -440,9 +442,9 @@ class _Merged(SurveyOutput):
     notes: Sequence[str] = ()
     casts = False
 
-    def look(self, conductor: Conductor[tuple[RunResult, dict[str, Any]]]) -> None:
+    def look(self, run: Run[tuple[RunResult, dict[str, Any]]]) -> None:
         """Take all points into the run's store; LidarError names damaged files."""
-        store, damaged = conductor.store, list[str]()
+        store, damaged = run.store, list[str]()
         only, mark = store.only, store.db.meta["mark"]
         assert only is not None, "of a survey"
 
@@ -460,16 +462,17 @@ class _Merged(SurveyOutput):
         for part in self.parts:
             if casting := part.record["casting"]:
                 store.cast_with(part.record["backend"], casting)
-            if part.trials and not only.parts.trials:
-                store.db.add_trials(0, part.trials)
+            if part.trials and not only.trials:
+                store.db.add_trials(only, part.trials)
             source = parts_of(part.place.below(RUN_FOLDER), part.record["parts"])
             left = (one for one in part.points if only.parts.missing(one.first, one.stop))
             for one, receipt in ahead(partial(take, source), left):
-                if receipt is None or not store.db.commit([receipt]):
+                if receipt is None or not store.db.commit([(only, receipt)]):
                     damaged.append(source.path(one.name))
         if damaged:
             raise LidarError(f"missing or damaged: {listed(damaged, NAMED)}; {_AGAIN}.")
-        if not only.parts.trials:  # the first shard, which plans, is missing
+        if not only.trials:  # the first shard, which plans, is missing
             only.job = replace(only.job, planning=None)
-        only.parts.frames, only.resumed = only.parts.scans.stop, 0
+        only.frames = only.scans.stop
+        only.resumed = 0
         store.notes = [*self.notes]

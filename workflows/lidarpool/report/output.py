@@ -27,7 +27,7 @@ from ..export.formats import Format, refuse_strangers
 from ..export.navigation_files import write_instruments
 from ..run.picture_file import PICTURE_FILE
 from ..run.run_result import RunResult
-from ..run.runner import Conductor, Output
+from ..run.runner import Output, Run
 from ..run.writer import LidarWorkers
 from ..scenario.scenario import Scenario
 from .picture_content import picture_content
@@ -67,10 +67,10 @@ class SurveyOutput(Output[tuple[RunResult, dict[str, Any]]]):
         with result_folder(self.place) as self._folder:
             yield
 
-    def begin(self, conductor: Conductor[tuple[RunResult, dict[str, Any]]]) -> None:
+    def begin(self, run: Run[tuple[RunResult, dict[str, Any]]]) -> None:
         """Refuse the result of another survey."""
-        if not conductor.goes_on:
-            self.refuse(lambda: conductor.jobs.identity, overwrite=conductor.options.overwrite)
+        if not run.goes_on:
+            self.refuse(lambda: run.jobs.identity, overwrite=run.options.overwrite)
 
     def refuse(self, identity: Callable[[], Mapping[str, str]], *, overwrite: bool = False) -> None:
         """Refuse a place that holds the result of another survey, or files of no result.
@@ -101,26 +101,26 @@ class SurveyOutput(Output[tuple[RunResult, dict[str, Any]]]):
         refuse_strangers(storage, _rows({*further, *listed}))
 
     def finish(
-        self, conductor: Conductor[tuple[RunResult, dict[str, Any]]]
+        self, run: Run[tuple[RunResult, dict[str, Any]]]
     ) -> tuple[RunResult, dict[str, Any]]:
         """Write the result, and remove the run."""
-        result = conductor.result()
+        result = run.result()
         in_pieces = any(one.row.in_pieces for one in self.formats)
         workers = None
         if not in_pieces:
-            conductor.cluster_stack.close()
-        elif conductor.cluster is not None:
-            workers = LidarWorkers(conductor.cluster)
-        conductor.page.finish(result.seconds, result)
+            run.cluster_stack.close()
+        elif run.cluster is not None:
+            workers = LidarWorkers(run.cluster)
+        run.page.finish(result.seconds, result)
         if note := self.judge(result):
             result = replace(result, notes=(*result.notes, note))
 
         def in_place() -> None:
-            conductor.result_is_in(self.place)
-            conductor.store.remove()
+            run.result_is_in(self.place)
+            run.store.remove()
 
         more = {"cloud": "", "page": " and the report", "pictures": ", the report and the pictures"}
-        with conductor.screen.writing(f"writing the cloud{more[self.extent]}") as show:
+        with run.screen.writing(f"writing the cloud{more[self.extent]}") as show:
             return result, self.write(result, in_place, workers, show)
 
     def write(

@@ -1,1 +1,1 @@
-"""Runs: checks before a run, stored runs, resuming, progress."""
+"""Runs: one way from jobs to results, on a cluster, that can be resumed."""

@@ -1,4 +1,4 @@
-"""The jobs of a run: one that is there, or those of a campaign, made a few ahead."""
+"""The jobs of a run: the only one of a survey, or those of a campaign, made a few ahead."""
 
 from __future__ import annotations
 
@@ -9,16 +9,14 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from queue import Empty, Full, Queue
 from threading import Event, Thread
-from typing import NamedTuple
+from typing import Protocol
 
 from lidarsim.base.errors import LidarError
-from lidarsim.sweeps.sweeps import Sweeps
 
 from ..base.fingerprint import fingerprint
 from ..base.shard import ALL, Shard
 from ..datasets.job_table import JobRow, Value
 from ..scenario.build import Job
-from ..scenario.campaign import CampaignSpec
 from ..scenario.static_scene import SceneCache
 from .pipeline.failures import JobError
 
@@ -39,113 +37,172 @@ def identity_of(job: Job) -> dict[str, str]:
         raise JobError(str(error)) from error
 
 
+class Jobs(Protocol):
+    """The jobs of a run: `OneJob` of a survey, or a campaign."""
+
+    @property
+    def only_job(self) -> Job | None:
+        """The job of a survey, whose points and frames the run returns; None for a campaign."""
+        ...
+
+    @property
+    def shard(self) -> Shard:
+        """The share of the jobs, or of the scans of the only job, that the run does."""
+        ...
+
+    @property
+    def numbers(self) -> range:
+        """Numbers of the jobs that the run does."""
+        ...
+
+    @property
+    def title(self) -> str:
+        """Title of all jobs, for pages; empty for none."""
+        ...
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the values that differ from job to job."""
+        ...
+
+    @property
+    def identity(self) -> Mapping[str, str]:
+        """Hashes of what the results depend on, by name."""
+        ...
+
+    def job(self, number: int, cache: SceneCache | None = None, columns: Sequence[str] = ()) -> Job:
+        """Make a job with some further columns; `cache` has scenes that jobs share."""
+        ...
+
+    def name(self, number: int) -> str:
+        """Return the name of a job in files."""
+        ...
+
+    def split(self, number: int) -> str:
+        """Return the name of a job's split; empty for none."""
+        ...
+
+    def values(self, number: int) -> Mapping[str, Value]:
+        """Return the values of a job that differ from job to job, by name."""
+        ...
+
+
 @dataclass(frozen=True, eq=False)
 class OneJob:
-    """A survey, as the only job of its run, which does the scans of a shard."""
+    """A survey as the only job of its run, of which the run does the scans of a shard."""
 
-    job: Job
+    survey_job: Job
     shard: Shard = ALL
     numbers: range = range(1)
     title: str = ""
     names: tuple[str, ...] = ()
 
     @cached_property
-    def only(self) -> Job:
-        """The job as this shard does it: the first one alone plans the path."""
-        return self.job if self.shard.number == 1 else replace(self.job, planning=None)
+    def only_job(self) -> Job:
+        """The job as this shard does it: the first shard alone plans the path."""
+        job = self.survey_job
+        return job if self.shard.number == 1 else replace(job, planning=None)
 
     @cached_property
     def identity(self) -> Mapping[str, str]:
         """Fingerprints of scene, survey and planning."""
-        return identity_of(self.job)
+        return identity_of(self.survey_job)
+
+    def job(self, number: int, cache: SceneCache | None = None, columns: Sequence[str] = ()) -> Job:
+        """Return the only job, which has its columns."""
+        return self.only_job
+
+    def name(self, number: int) -> str:
+        """Return the name of the only job."""
+        return self.survey_job.name
+
+    def split(self, number: int) -> str:
+        """Return the split of the only job."""
+        return self.survey_job.split
+
+    def values(self, number: int) -> Mapping[str, Value]:
+        """Return the values of the only job."""
+        return self.survey_job.values
 
 
-Jobs = OneJob | CampaignSpec  # what a run does
-
-
-def failed_row(campaign: CampaignSpec, number: int, error: object) -> JobRow:
-    """Row of a job that has failed, perhaps because it cannot be made."""
+def failed_row(jobs: Jobs, number: int, error: object) -> JobRow:
+    """Return the row of a job that has failed, perhaps because it cannot be made."""
     values: Mapping[str, Value] = {}
     with suppress(Exception):  # which is what has failed
-        values = campaign.values(number)
-    name, split = campaign.name(number), campaign.split(number)
-    return JobRow(number, name, split, dict(values), str(error))
-
-
-class MadeJob(NamedTuple):
-    """A job that was made, and its sweeps if it is for a data set: they take a while."""
-
-    job: Job
-    sweeps: Sweeps | None = None
+        values = jobs.values(number)
+    return JobRow(number, jobs.name(number), jobs.split(number), dict(values), str(error))
 
 
 class JobMaker:
-    """Makes jobs of a campaign in a thread, a few ahead; `numbers` are those that are left.
+    """Makes jobs with their sweeps in a thread, a few ahead.
 
-    The data set wants clouds to have these `columns`.
+    `numbers` are those of the jobs that are left, and `columns` names of the columns that the data
+    set needs.
     """
 
-    def __init__(
-        self, campaign: CampaignSpec, numbers: Iterable[int], columns: Sequence[str]
-    ) -> None:
-        self._campaign, self._numbers, self._columns = campaign, numbers, columns
+    def __init__(self, jobs: Jobs, numbers: Iterable[int], columns: Sequence[str]) -> None:
+        self._jobs = jobs
+        self._numbers = numbers
+        self._columns = columns
         self._cache = SceneCache()
-        self._ready: Queue[MadeJob | JobRow | BaseException | None] = Queue(READY)
+        self._ready: Queue[Job | JobRow | BaseException | None] = Queue(READY)
         self._stopped = Event()
         self._full = False  # whether it waits because of the memory of scenes
         self.ended = False  # whether the last was taken
         self._thread = Thread(target=self._work, name="jobs", daemon=True)
         self._thread.start()
 
-    def take(self, *, wait: bool = False) -> MadeJob | JobRow | None:
+    def take(self, *, wait: bool = False) -> Job | JobRow | None:
         """Return the next job, or the row of one that cannot be made.
 
         None if there is none yet, unless it is to `wait`, and after the last.
         """
         try:
-            found = None if self.ended else self._ready.get(block=wait)
+            taken = None if self.ended else self._ready.get(block=wait)
         except Empty:
             return None
-        self.ended |= found is None
-        if isinstance(found, BaseException):
-            raise found
-        return found
+        self.ended |= taken is None
+        if isinstance(taken, BaseException):
+            raise taken
+        return taken
 
     def has(self, jobs: int) -> bool:
-        """Whether so many are ready, or as many as will be until some are taken."""
-        most = self._full or not self._thread.is_alive()
-        return most or self._ready.qsize() >= min(jobs, READY)
+        """Return True if so many jobs are ready, or no more will be until some are taken."""
+        waits = self._full or not self._thread.is_alive()
+        return waits or self._ready.qsize() >= min(jobs, READY)
 
     def _work(self) -> None:
         last: BaseException | None = None
         try:
             for number in self._numbers:
-                if not self._put(self._made(number)):
+                if not self._put(self._make(number)):
                     return
         except BaseException as error:
             last = error
         self._put(last)
 
-    def _made(self, number: int) -> MadeJob | JobRow:
+    def _make(self, number: int) -> Job | JobRow:
         try:
-            job = self._campaign.job(number, self._cache, self._columns)
-            return MadeJob(job, Sweeps.of(job.survey, job.scene))
+            job = self._jobs.job(number, self._cache, self._columns)
+            _ = job.sweeps  # computed in this thread, for they take a while
+            return job
         except MemoryError:
             raise
         except Exception as error:
             # A class of the user's own may raise anything: the other jobs go on.
-            told = str(error) if isinstance(error, LidarError) else repr(error)
-            return failed_row(self._campaign, number, told)
+            reason = str(error) if isinstance(error, LidarError) else repr(error)
+            return failed_row(self._jobs, number, reason)
 
-    def _put(self, found: MadeJob | JobRow | BaseException | None) -> bool:
+    def _put(self, made: Job | JobRow | BaseException | None) -> bool:
+        """Put what was made into the queue; returns False if the maker was stopped before."""
         while not self._stopped.is_set():
-            waiting = [one.job.scene for one in [*self._ready.queue] if isinstance(one, MadeJob)]
-            self._full = len({id(scene.vertices) for scene in waiting}) > SCENES
+            scenes = [ready.scene for ready in [*self._ready.queue] if isinstance(ready, Job)]
+            self._full = len({id(scene.vertices) for scene in scenes}) > SCENES
             if self._full:
                 time.sleep(0.05)
                 continue
             with suppress(Full):
-                self._ready.put(found, timeout=0.1)
+                self._ready.put(made, timeout=0.1)
                 return True
         return False
 

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated
+from types import MappingProxyType
+from typing import Annotated, Any, Literal, TypedDict
 
 from distributed import Client
 from pydantic import Field
@@ -12,7 +14,8 @@ from pydantic import Field
 from lidarsim.base.declared import declared
 from lidarsim.base.storage import Storage
 from lidarsim.base.validation import checked_fields
-from lidarsim.base.vocabulary import PATIENCE_S, WAIT_S
+from lidarsim.base.vocabulary import BACKENDS, PATIENCE_S, WAIT_S
+from lidarsim.base.words import did_you_mean
 
 from ..scenario.sections import PoolSection, TaskOptions
 from .cluster.cluster_file import ClusterFile
@@ -22,9 +25,10 @@ from .cluster.connection import TlsFiles
 @dataclass(frozen=True, kw_only=True)
 @checked_fields
 class RunOptions(TaskOptions):
-    """How jobs are run, on what, and what becomes of an earlier run; the defaults are those of all.
+    """How jobs are run, on what cluster, and what happens to an earlier run.
 
-    Those of Python are described at `simulate` and `Campaign.run`, and are options of commands.
+    In Python they are the `RunKeywords` of `simulate`, `Campaign.run` and `Campaign.stream`, which
+    describe them; the same are options of commands. The defaults are those of all.
     """
 
     out: Path | Storage | None = None  # of the result or data set; None if nothing is written
@@ -49,14 +53,60 @@ class RunOptions(TaskOptions):
     live: bool = False
     stay: bool = True  # of the live page, at the end
 
-    def with_pool(self, pool: PoolSection, backend: str | None = None) -> RunOptions:
-        """Fill in a scenario's section `pool`; a `backend`, and workers that are here, stay."""
-        own = declared(pool, TaskOptions) | {"backend": backend or pool.backend}
-        own["gpu_workers"] = self.gpu_workers or pool.gpu
-        own["other_workers"] = self.other_workers or pool.other
-        return replace(self, **own)
+    def with_pool(
+        self, pool: PoolSection, given: Mapping[str, Any] = MappingProxyType({})
+    ) -> RunOptions:
+        """Fill in a scenario's section `pool`; options that are `given`, and not None, stay."""
+        options = declared(pool, TaskOptions)
+        options |= {name: given[name] for name in options if given.get(name) is not None}
+        options["gpu_workers"] = self.gpu_workers or pool.gpu
+        options["other_workers"] = self.other_workers or pool.other
+        return replace(self, **options)
 
     @property
     def own(self) -> bool:
-        """Whether a cluster of this machine is started for the run."""
+        """True if a cluster of this machine is started for the run."""
         return self.client is None and self.scheduler is None and self.cluster is None
+
+
+class RunKeywords(TypedDict, total=False):
+    """`RunOptions` as keywords of Python.
+
+    The place of a result is a parameter there, and a client stands for the ways to a cluster that
+    commands have.
+    """
+
+    collectors: int
+    queue_capacity: int
+    batch_mb: int
+    backend: Literal[BACKENDS] | None  # type: ignore[valid-type]
+    folder: str | Path | Storage | None
+    parts: str | Path | None
+    resume: bool
+    fresh: bool
+    retry_failed: bool
+    verify: bool
+    overwrite: bool
+    client: Client | None
+    tls: bool
+    gpu_workers: int | None
+    other_workers: int | None
+    wait_s: float
+    patience_s: float
+    live: bool
+
+
+def given_options(
+    call: str, keywords: RunKeywords, without: Collection[str] = ()
+) -> dict[str, Any]:
+    """Return the keywords of a call that are not None.
+
+    TypeError, as Python's, for a keyword that is no option, or is meaningless in this call: those
+    are named in `without`.
+    """
+    accepted = RunKeywords.__annotations__.keys() - set(without)
+    for name in keywords:
+        if name not in accepted:
+            near = did_you_mean(name, accepted)
+            raise TypeError(f"{call}() got an unexpected keyword argument {name!r}.{near}")
+    return {name: value for name, value in keywords.items() if value is not None}

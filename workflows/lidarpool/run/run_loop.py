@@ -1,4 +1,4 @@
-"""Jobs on a cluster: cast several at a time, committed, written, and planned beside."""
+"""The loop of a run: jobs are cast several at a time, committed and written, paths are planned."""
 
 from __future__ import annotations
 
@@ -9,6 +9,8 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import replace
 from functools import partial
+from operator import itemgetter
+from typing import Any
 
 from distributed.client import FutureCancelledError
 
@@ -19,18 +21,17 @@ from ..datasets.dataset import DataSet
 from ..datasets.job_table import JobRow
 from ..scenario.build import Job
 from .cluster.cluster import Cluster
-from .job_source import JobMaker, MadeJob, OneJob, failed_row
-from .pipeline.batches import JobState
+from .job_source import JobMaker, failed_row
 from .pipeline.casting_workers import CastingWorkers
 from .pipeline.failures import JobError
 from .pipeline.long_stages import LongStages
 from .pipeline.messages import ScanFrame
 from .pipeline.names import GPU, LIDAR, OTHER
-from .pipeline.pipeline import RunDriver
+from .pipeline.pipeline import Pipeline
 from .pipeline.task_book import StageTotals
 from .progress import Progress, Show
-from .run_page import JobNow, RunPage
-from .store.job_under_way import JobPoints
+from .run_page import RunPage
+from .store.job_under_way import JobUnderWay
 from .store.run_store import RunStore
 from .trials import TrialPump
 from .writer import JobFiles, JobWriter
@@ -41,11 +42,11 @@ LONGEST_PAUSE_S = 0.05  # while nothing moves
 SPARE = 64  # jobs under way beside two for each GPU slot
 
 
-class Run:
-    """The jobs that are left of a run, on a cluster: the first one, and those of `maker`.
+class RunLoop:
+    """Takes the jobs of a run through the pipeline: the first job, and those of `maker`.
 
-    They are written into a `dataset`; without one there is only one job, whose parts are kept, and
-    whose frames `on_frame` is called with.
+    Jobs are written into a `dataset`. Without a data set there is only one job: its parts are kept,
+    and `on_frame` is called with its frames.
     """
 
     def __init__(
@@ -57,30 +58,36 @@ class Run:
         dataset: DataSet | None,
         on_frame: Callable[[ScanFrame], None],
     ) -> None:
-        self._cluster, self._store, self._page = cluster, store, page
-        self._maker, self._on_frame = maker, on_frame
-        options, run = cluster.options, uuid.uuid4().hex[:8]
+        self._cluster = cluster
+        self._store = store
+        self._page = page
+        self._maker = maker
+        self._on_frame = on_frame
+        options = cluster.options
+        run_id = uuid.uuid4().hex[:8]
+        mark = store.db.meta["mark"]
         stages = LongStages(
             cluster.partitions[LIDAR],
-            run,
+            run_id,
             cluster.software["lidarpool"],
             store.storage,
-            store.db.meta["mark"],
+            mark,
             queue_capacity=options.queue_capacity,
             collectors=options.collectors,
             patience_s=options.patience_s,
         )
         gpus = cluster.partitions[GPU]
-        workers = CastingWorkers(gpus, run, cluster.backend, cluster.software)
-        self._driver = RunDriver(workers, stages, store.db)
+        workers = CastingWorkers(gpus, run_id, cluster.backend, cluster.software)
+        self._pipeline = Pipeline(workers, stages, store.db, mark)
         self._writer: JobWriter | None = None
         if dataset is not None:
             self._writer = JobWriter(cluster.tasks(LIDAR), dataset, store, stages.probe)
         self._trials: TrialPump | None = None
         self._rows: list[JobRow] = []  # of jobs that have ended, and are not yet committed
-        self._scans_begun = self._jobs_begun = 0
+        self._scans_begun = 0
+        self._jobs_begun = 0
         self._remover = ThreadPoolExecutor(1, "remove")
-        self.kept: JobState | None = None  # the job whose parts are kept, once it is committed
+        self._only_committed = False  # True once the only job is, whose parts are kept
         self.times: dict[str, float] = {}  # seconds: {"survey": …, "planning": …}
         self.stages: tuple[StageTotals, ...] = ()
 
@@ -90,117 +97,116 @@ class Run:
     def finished(self) -> bool:
         """True once all jobs have ended."""
         if self._maker is None:
-            return self.kept is not None
+            return self._only_committed
         return self._maker.ended and not self._store.under_way
 
     def step(self) -> bool:
-        """Do what can be done now; returns whether there was anything to do.
+        """Do what can be done now; return False if nothing was to be done.
 
-        LidarError if something fails that all jobs need.
+        LidarError if what all jobs need fails.
         """
         moved = self._admit()
-        moved |= self._driver.step()
-        for state, error in self._driver.take_ended():
+        moved |= self._pipeline.step()
+        for job, error in self._pipeline.take_ended():
             moved = True
             if error is not None:
-                self._fail(state.number, error)
+                self._fail(job.number, error)
             elif self._writer is None:
-                self.kept = state
+                self._only_committed = True
             else:
-                self._writer.add(self._files_of(state))
-        for_all: LidarError | None = None
+                self._writer.add(self._files_of(self._store.under_way[job.number]))
+        error_of_all: LidarError | None = None
         # A stage whose worker has died gets its slot first.
-        slots = 0 if self._driver.stages.lacks_slot else self._cluster.spare
-        more = bool(self._driver.jobs)
-        for files, made in () if self._writer is None else self._writer.step(slots, more=more):
+        slots = 0 if self._pipeline.stages.lacks_slot else self._cluster.spare
+        more = bool(self._pipeline.jobs)
+        for files, outcome in () if self._writer is None else self._writer.step(slots, more=more):
             moved = True
-            if isinstance(made, JobError):
-                self._fail(files.row.number, made)
-            elif isinstance(made, LidarError):
-                for_all = made
+            if isinstance(outcome, JobError):
+                self._fail(files.row.number, outcome)
+            elif isinstance(outcome, LidarError):
+                error_of_all = outcome
             else:
-                self._rows.append(made)
+                self._rows.append(outcome)
         self._commit()
-        if for_all is not None:
-            raise for_all
+        if error_of_all is not None:
+            raise error_of_all
         return moved
 
     def _admit(self) -> bool:
-        """Take on jobs that are ready, if there is room for them."""
-        moved, most = False, SPARE + 2 * self._driver.workers.slot_count
+        """Take on jobs that are ready, if there is room for them; return False if none was."""
+        moved = False
+        max_under_way = SPARE + 2 * self._pipeline.workers.slot_count
         # Small jobs begin together, and go on together: then they share messages and tasks.
-        together = self._driver.dispatcher.per_task if self._driver.jobs else 1
+        together = self._pipeline.dispatcher.per_task if self._pipeline.jobs else 1
         if self._maker is None or not self._maker.has(together):
             return False
-        while self._driver.has_room and len(self._store.under_way) < most:
-            if (found := self._maker.take()) is None:
+        while self._pipeline.has_room and len(self._store.under_way) < max_under_way:
+            if (made := self._maker.take()) is None:
                 break
             moved = True
-            if isinstance(found, JobRow):
-                self._rows.append(found)
+            if isinstance(made, JobRow):
+                self._rows.append(made)
             else:
-                self._begin(found)
+                self._begin(made)
         return moved
 
-    def _begin(self, made: MadeJob) -> None:
-        points = self._store.points_of(made.job)
-        points.sweeps = made.sweeps
+    def _begin(self, job: Job) -> None:
+        """Take a job on, unless its scans are too large for the workers."""
+        under_way = self._store.take_on(job)
         try:
             if self._writer is not None:  # else it was checked before anything was started
-                self._cluster.check(made.job)
-            self._cast(made.job, points)
+                self._cluster.check(job)
+            self._cast(under_way)
         except JobError as error:  # too large for the workers, or it cannot be pickled
-            self._fail(made.job.number, error)
+            self._fail(job.number, error)
 
-    def _cast(self, job: Job, points: JobPoints) -> None:
-        cluster, kept = self._cluster, self._writer is None
-        if kept and job.planning is not None:
-            self._trials = TrialPump(cluster.tasks(OTHER), job.planning, points.parts.trials)
+    def _cast(self, job: JobUnderWay) -> None:
+        """Give a job to the pipeline, and begin its planning."""
+        cluster = self._cluster
+        is_only = self._writer is None
+        planning = job.job.planning
+        if is_only and planning is not None:
+            self._trials = TrialPump(cluster.tasks(OTHER), planning, job.trials)
             self._trials.step()  # first: no slot of OTHER waits for the survey
             self._trials.tasks.partition.want(0)  # from now on its trials wait for workers
         # Of a campaign's job many follow, so that its batches need not be divided among all.
-        left = len(self._store.jobs.numbers) - self._store.db.ended_count
-        self._driver.begin(
-            job.number,
-            job.scene,
-            job.survey,
-            fit=scans_that_fit(
+        jobs_left = len(self._store.jobs.numbers) - self._store.db.ended_count
+        self._pipeline.begin(
+            job,
+            scans_per_task=scans_that_fit(
                 job.scene,
                 job.survey,
                 cluster.options.batch_mb * MB,
                 on_device=cluster.backend == "cuda",
             ),
-            in_all=len(points.parts.scans) * left,
-            on_frame=partial(cluster.call, self._on_frame) if kept else None,
-            read=points.points_of_scan,
-            on_parts=self._page.on_parts if kept else None,
+            scans_of_run=len(job.scans) * jobs_left,
+            on_frame=partial(cluster.call, self._on_frame) if is_only else None,
+            on_parts=self._page.on_parts if is_only else None,
         )
         self._jobs_begun += 1
-        self._scans_begun += len(points.parts.scans)
-        to_come = max(0, left - len(self._store.under_way))
-        self._driver.later = to_come * self._scans_begun // self._jobs_begun
+        self._scans_begun += len(job.scans)
+        to_come = max(0, jobs_left - len(self._store.under_way))
+        self._pipeline.later = to_come * self._scans_begun // self._jobs_begun
 
-    def _files_of(self, state: JobState) -> JobFiles:
+    def _files_of(self, under_way: JobUnderWay) -> JobFiles:
         """Return what a job that is committed is written from."""
-        points = self._store.under_way[state.number]
-        job, sweeps = points.job, points.sweeps
-        assert sweeps is not None, "of a data set"
+        job = under_way.job
         row = JobRow(
             number=job.number,
             name=job.name,
             split=job.split,
             values=dict(job.values),
             scans=job.survey.scan_count,
-            sweeps=len(sweeps),
+            sweeps=len(job.sweeps),
             rays=job.survey.ray_count,
-            hits=points.parts.hits,
-            seconds=state.seconds,
+            hits=under_way.parts.hits,
+            seconds=under_way.seconds,
         )
-        return JobFiles(row, points.points(), sweeps, job.made_of)
+        return JobFiles(row, under_way.points(), job.sweeps, job.made_of)
 
     def _fail(self, number: int, error: LidarError) -> None:
         """Note that a job has failed; if there is only one, so has the run."""
-        if isinstance(self._store.jobs, OneJob):
+        if self._store.only is not None:
             raise error
         self._rows.append(failed_row(self._store.jobs, number, error))
 
@@ -209,13 +215,13 @@ class Run:
         rows, self._rows = self._rows, []
         if not rows:
             return
-        made = self._store.under_way  # a job that could not be made has no points
-        left = [(row, made[row.number]) for row in rows if row.number in made]
+        under_way = self._store.under_way  # without jobs that could not be made
+        left = [(row, under_way[row.number]) for row in rows if row.number in under_way]
         self._store.name_sensors(
             (carried.name or "lidar", f"{sensor.model}, {1e9 / sensor.turn_ns(1):.3g} Hz")
-            for row, points in left
+            for row, job in left
             if row.done
-            for carried in points.job.survey.carried
+            for carried in job.survey.carried
             for sensor in [carried.sensor]
         )
         self._store.end(rows)
@@ -223,42 +229,32 @@ class Run:
             self._page.ended(row)
         self._remover.submit(self._remove, left)
 
-    def _remove(self, ended: Sequence[tuple[JobRow, JobPoints]]) -> None:
-        for row, points in ended:
+    def _remove(self, ended: Sequence[tuple[JobRow, JobUnderWay]]) -> None:
+        """Remove the parts of jobs that have ended, after the page has looked at them."""
+        for row, job in ended:
             with suppress(LidarError, OSError):  # what is left does no harm
                 if row.done:
-                    self._page.look(row, points)
+                    self._page.look(row, job)
             with suppress(LidarError, OSError):
-                self._store.storage.remove([part.name for part in points.parts.ordered])
+                self._store.storage.remove([part.name for part in job.parts.ordered])
 
-    def under_way(self) -> list[JobNow]:
-        """List the jobs that are being cast, and then those that are being written."""
-        writing = {row.number: row for row in self._writer.jobs} if self._writer else {}
-        jobs = [
-            JobNow(
-                name=points.job.name,
-                values=points.job.values,
-                stored=points.parts.scans_done,
-                scans=len(points.parts.scans),
-                points=points.parts.point_count,
-                seconds=0.0 if state is None else state.seconds,
-                writing=number in writing,
-            )
-            for number, points in [*self._store.under_way.items()]
-            for state in [self._driver.jobs.get(number)]
-        ]
-        return sorted(jobs, key=lambda job: job.writing)
+    def under_way(self) -> list[dict[str, Any]]:
+        """Return the states of the jobs that are being cast, and then of those being written."""
+        writing = {row.number for row in self._writer.jobs} if self._writer else set()
+        jobs = [*self._store.under_way.values()]
+        states = [job.status(is_writing=job.number in writing) for job in jobs]
+        return sorted(states, key=itemgetter("writing"))
 
     # -- to the end --------------------------------------------------------------------------
 
-    def cast(self, first: MadeJob, show: Show) -> None:
+    def cast(self, first: Job, show: Show) -> None:
         """Do all jobs; on any error, everything has been stopped."""
-        cluster, driver = self._cluster, self._driver
+        cluster, pipeline = self._cluster, self._pipeline
         try:
             with cluster.partitions_page(), cluster.stopping(self._stop):
-                driver.open()
+                pipeline.open()
                 self._loop(first, show)
-                driver.finish()
+                pipeline.finish()
         finally:
             if self._writer is not None:
                 self._writer.close()
@@ -266,28 +262,28 @@ class Run:
         self._save()
         self._store.save(now=True)
         self._store.tidy()
-        others = [one.tasks.book for one in (self._writer, self._trials) if one is not None]
-        books = [driver.book, *others]
+        tasks_beside = [beside.tasks for beside in (self._writer, self._trials) if beside]
+        books = [pipeline.book, *(tasks.book for tasks in tasks_beside)]
         self.stages = tuple(totals for book in books for totals in book.stages.values())
-        self._store.notes += driver.notes
+        self._store.notes += pipeline.notes
         if self._writer is not None and self._writer.hidden:
             place = self._writer.dataset.place
             note = f"no worker of {LIDAR} sees {place}: the driver wrote the data set"
             self._store.notes.append(note)
 
-    def _loop(self, first: MadeJob, show: Show) -> None:
+    def _loop(self, first: Job, show: Show) -> None:
         """Step everything until all have finished."""
-        driver, started, pause_s = self._driver, time.monotonic(), 0.0
+        pipeline, started, pause_s = self._pipeline, time.monotonic(), 0.0
         self._begin(first)  # and its trials
         watch = self._cluster.watch([GPU, OTHER] if self._trials else [GPU], lasting=[LIDAR])
-        told = saved = float("-inf")
-        beside = [one.tasks for one in (self._writer, self._trials) if one is not None]
-        while not (driver.stages.ended and (self._trials is None or "planning" in self.times)):
+        shown_at = saved_at = float("-inf")
+        tasks_beside = [beside.tasks for beside in (self._writer, self._trials) if beside]
+        while not (pipeline.stages.ended and (self._trials is None or "planning" in self.times)):
             moved = False
-            if not driver.stages.closed:
+            if not pipeline.stages.closed:
                 moved = self.step()
                 if self.finished:
-                    driver.close()
+                    pipeline.close()
                     self.times["survey"] = time.monotonic() - started
                     watch.forget([GPU, LIDAR])
             if self._trials is not None and "planning" not in self.times:
@@ -296,47 +292,50 @@ class Run:
                     self.times["planning"] = time.monotonic() - started
                     watch.forget([OTHER])
             now = time.monotonic()
-            if now - saved >= SAVE_EVERY_S:
-                saved = now
+            if now - saved_at >= SAVE_EVERY_S:
+                saved_at = now
                 self._save()
             watch.look()
-            if now - told >= PROGRESS_EVERY_S or self.finished:
-                told = now
-                waits_for = LIDAR if driver.stages.waiting else ""
-                at = replace(self._progress(), seconds=now - started, waits_for=waits_for)
-                self._cluster.call(show, at)
-                self._cluster.call(self._page.on_progress, at, self.under_way)
+            if now - shown_at >= PROGRESS_EVERY_S or self.finished:
+                shown_at = now
+                waits_for = LIDAR if pipeline.stages.waiting else ""
+                progress = replace(self._progress(), seconds=now - started, waits_for=waits_for)
+                self._cluster.call(show, progress)
+                self._cluster.call(self._page.on_progress, progress, self.under_way)
             pause_s = 0.0 if moved else min(max(0.001, 2 * pause_s), LONGEST_PAUSE_S)
-            if driver.stages.ended:
+            if pipeline.stages.ended:
                 time.sleep(pause_s)
             else:
-                driver.wait(pause_s, [future.key for one in beside for future in one.running])
+                pipeline.wait(
+                    pause_s, [future.key for tasks in tasks_beside for future in tasks.running]
+                )
         self._store.notes += watch.notes
 
     def _save(self) -> None:
+        """Commit the trials that are done, and the number of frames that were handed out."""
         if self._trials is not None and (only := self._store.only) is not None:
-            done = len(only.parts.trials)
-            self._store.db.add_trials(only.job.number, self._trials.trials[done:])
+            self._store.db.add_trials(only, self._trials.trials[len(only.trials) :])
         self._store.save()
 
     def _progress(self) -> Progress:
-        if (points := self._store.only) is None:
+        """Return the counts of the run, without its time."""
+        if (job := self._store.only) is None:
             numbers, ended = self._store.jobs.numbers, self._store.db.ended_count
             return Progress(jobs=len(numbers), jobs_done=ended)
-        progress = points.progress()
-        if self._trials is not None:
-            progress = replace(progress, trials_done=len(self._trials.trials))
-        if (state := self._driver.jobs.get(points.job.number, self.kept)) is None:
+        progress = replace(
+            job.progress(),
+            generated=job.generated - job.scans.start,
+            cast=min(job.resumed + job.cast, len(job.scans)),
+            replayed=job.offered_again,
+        )
+        if self._trials is None:
             return progress
-        cast = min(points.resumed + state.cast, progress.scans)
-        replayed = state.offered_again
-        generated = state.generated - state.parts.scans.start
-        return replace(progress, generated=generated, cast=cast, replayed=replayed)
+        return replace(progress, trials_done=len(self._trials.trials))
 
     def _stop(self, reason: str) -> None:
         """Stop everything, as far as the cluster can be reached."""
-        client, driver, trials = self._cluster.client, self._driver, self._trials
-        steps: list[Callable[[], object]] = [lambda: driver.stop(reason), driver.finish]
+        client, pipeline, trials = self._cluster.client, self._pipeline, self._trials
+        steps: list[Callable[[], object]] = [lambda: pipeline.stop(reason), pipeline.finish]
         if trials is not None:
             steps.append(trials.tasks.cancel)
         for step in steps:

@@ -3,33 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from poolpart import Partition
 
 from ..datasets.dataset import DataSet
-from ..datasets.job_table import JobRow, Value
+from ..datasets.job_table import JobRow
 from .pipeline.messages import Receipt, ScanFrame
 from .progress import Progress
 from .run_result import RunResult
-from .store.job_under_way import JobPoints
-
-
-@dataclass(frozen=True)
-class JobNow:
-    """A job that is being cast or written, at one moment.
-
-    `stored` of its `scans` are in storage, with `points`; `seconds` is the casting time so far.
-    """
-
-    name: str
-    values: Mapping[str, Value]
-    stored: int
-    scans: int
-    points: int
-    seconds: float
-    writing: bool
+from .store.job_under_way import JobUnderWay
 
 
 class RunPage:
@@ -39,7 +23,7 @@ class RunPage:
     what is left of ended jobs.
     """
 
-    def begun(self, points: JobPoints) -> None:
+    def begun(self, job: JobUnderWay) -> None:
         """Show a job from now on, the only one of its run, and what an earlier run has left."""
 
     def follow(self, partitions: Mapping[str, Partition], dataset: DataSet | None = None) -> None:
@@ -51,13 +35,18 @@ class RunPage:
     def on_frame(self, frame: ScanFrame) -> None:
         """Show a frame of the only job."""
 
-    def on_progress(self, progress: Progress, under_way: Callable[[], Sequence[JobNow]]) -> None:
-        """Show the progress; KeyboardInterrupt if a user of the page has stopped the run."""
+    def on_progress(
+        self, progress: Progress, under_way: Callable[[], Sequence[Mapping[str, Any]]]
+    ) -> None:
+        """Show the progress; KeyboardInterrupt if a user of the page has stopped the run.
+
+        `under_way` returns `JobUnderWay.status` of the jobs that are being cast or written.
+        """
 
     def ended(self, row: JobRow) -> None:
         """Show a job that has ended, in this run or an earlier one."""
 
-    def look(self, row: JobRow, points: JobPoints) -> None:
+    def look(self, row: JobRow, job: JobUnderWay) -> None:
         """Read points of a job that is done, before its parts are removed, if they are shown."""
 
     def finish(self, seconds: float, result: RunResult | None = None) -> None:

@@ -1,4 +1,4 @@
-"""Conducts a run from its place to its result: a survey or many, for commands and for Python."""
+"""A run from its place to its result, of a survey or of many: for commands and for Python."""
 
 from __future__ import annotations
 
@@ -18,14 +18,13 @@ from ..datasets.dataset import DataSet
 from ..datasets.job_table import JobRow
 from ..plan import best
 from ..scenario.build import Job
-from ..scenario.campaign import CampaignSpec
 from ..scenario.empty_cloud import EMPTY, empty_cloud_reason, empty_jobs_warning
 from .cluster.cluster import Cluster
-from .job_source import JobMaker, Jobs, MadeJob, OneJob
+from .job_source import JobMaker, Jobs
 from .options import RunOptions
 from .pipeline.messages import ScanFrame
 from .progress import Screen
-from .run_loop import Run
+from .run_loop import RunLoop
 from .run_page import RunPage
 from .run_result import RunResult
 from .store.database import FILE
@@ -35,50 +34,50 @@ R = TypeVar("R")
 
 
 class Output(Generic[R]):
-    """Where what a run makes goes."""
+    """Where the results of a run go."""
 
     dataset: DataSet | None = None  # that jobs are written into; else the only job's parts stay
-    casts = True  # whether scans that are missing are cast
+    casts = True  # False if missing scans are not to be cast
 
     def held(self) -> AbstractContextManager[object]:
         """Lock the place while the body runs."""
         return nullcontext()
 
-    def begin(self, conductor: Conductor[R]) -> R | None:
-        """Refuse what must not be replaced; returns the result if nothing is left to do."""
+    def begin(self, run: Run[R]) -> R | None:
+        """Refuse files that must not be replaced; return the result if nothing is left to do."""
         return None
 
-    def look(self, conductor: Conductor[R]) -> None:
-        """Compare what is there with what the store says is done."""
+    def look(self, run: Run[R]) -> None:
+        """Compare the files of the output with what the store says is done."""
 
-    def finish(self, conductor: Conductor[R]) -> R:
-        """Write what is to be written in the end, and return the result."""
+    def finish(self, run: Run[R]) -> R:
+        """Write the last files, and return the result."""
         raise NotImplementedError
 
 
 @dataclass(frozen=True, eq=False)
 class Kept(Output[RunResult]):
-    """Nothing is written: the points stay in the run's store, and what they are `made_of`."""
+    """Points that stay in the run's store, with a note of what they are `made_of`."""
 
     made_of: Mapping[str, Any] | None = None
 
-    def finish(self, conductor: Conductor[RunResult]) -> RunResult:
+    def finish(self, run: Run[RunResult]) -> RunResult:
         """Return the result of the only job."""
-        result = conductor.result()
+        result = run.result()
         if self.made_of is not None:
             made_of, notes = map(json.dumps, (self.made_of, result.notes))
-            conductor.store.db.set(made_of=made_of, notes=notes)
-            conductor.store.save(now=True)
-        conductor.page.finish(result.seconds, result)
-        conductor.store.db.close()
+            run.store.db.set(made_of=made_of, notes=notes)
+            run.store.save(now=True)
+        run.page.finish(result.seconds, result)
+        run.store.db.close()
         return result
 
 
-class Conductor(Generic[R]):
-    """Does what is left of a run, and has its output written.
+class Run(Generic[R]):
+    """Makes what is left of some jobs, and has their output written.
 
-    Call it once. LidarError if the place holds something else, the cluster lacks something, or
-    a task fails; its notes, and those of an interrupt, say what was kept.
+    Call `execute` once. LidarError if the place holds something else, the cluster lacks
+    something, or a task fails; its notes, and those of an interrupt, say what was kept.
     """
 
     def __init__(
@@ -90,17 +89,22 @@ class Conductor(Generic[R]):
         page: RunPage,
         on_frame: Callable[[ScanFrame], None] | None = None,
     ) -> None:
-        self.jobs, self.options, self.output = jobs, options, output
-        self.screen, self.page, self._on_frame = screen, page, on_frame
+        self.jobs = jobs
+        self.options = options
+        self.output = output
+        self.screen = screen
+        self.page = page
+        self._on_frame = on_frame
         self.started = time.monotonic()
-        self.stack, self.cluster_stack = ExitStack(), ExitStack()  # the latter of the cluster
+        self.stack = ExitStack()
+        self.cluster_stack = ExitStack()  # leaves the cluster
         self.store: RunStore
         self.cluster: Cluster | None = None  # stays None if nothing is left to be cast
-        self.run: Run | None = None
+        self.loop: RunLoop | None = None
         self._maker: JobMaker | None = None  # of all jobs but the first
 
-    def __call__(self) -> R:
-        """Do it."""
+    def execute(self) -> R:
+        """Make what is left, and return the result that the output gives."""
         with self.stack:
             self._hold_place()
             if (result := self.output.begin(self)) is not None:
@@ -117,21 +121,21 @@ class Conductor(Generic[R]):
             return []
         reason = ""
         with suppress(LidarError):  # a file that the job is made of may be gone
-            job = self.jobs.job(empty[0].number) if isinstance(self.jobs, CampaignSpec) else None
-            reason = empty_cloud_reason(job.scene, job.survey) if job else ""
+            job = self.jobs.job(empty[0].number)
+            reason = empty_cloud_reason(job.scene, job.survey)
         warning = empty_jobs_warning(empty, reason)
         self.screen.warn(warning)
         return [warning]
 
     @property
     def goes_on(self) -> bool:
-        """Whether this run goes on with an unfinished one."""
+        """True if this run continues an unfinished one."""
         place = self.options.folder
         return bool(self.resume and place is not None and FILE in Storage.at(place).sizes())
 
     @property
     def resume(self) -> bool:
-        """Whether it may go on with an earlier run."""
+        """True if this run may continue an earlier one."""
         return self.options.resume or self.options.retry_failed or self.options.verify
 
     def _hold_place(self) -> None:
@@ -147,42 +151,45 @@ class Conductor(Generic[R]):
             remove_run(options.folder)
         checking = "checking the points of the earlier run"
         with self.screen.status(checking) if self.goes_on else nullcontext():
-            place = options.folder, options.parts
-            self.store = RunStore(self.jobs, options.backend, *place, resume=self.resume)
-        told = self.store.kept or self.store.notes or self.jobs.shard != ALL  # of a queue's task
-        if options.resume and self.store.only and not told:
-            self.store.notes.append(f"there was nothing to resume in {options.out or place[0]}")
+            self.store = RunStore(
+                self.jobs, options.backend, options.folder, options.parts, resume=self.resume
+            )
+        # The task of a queue resumes its shard whether it has begun or not.
+        explained = self.store.kept or self.store.notes or self.jobs.shard != ALL
+        if options.resume and self.store.only and not explained:
+            place = options.out or options.folder
+            self.store.notes.append(f"there was nothing to resume in {place}")
         self.stack.enter_context(self.store.kept_on_error())
         if self.store.only is not None:
             self.page.begun(self.store.only)
         self.output.look(self)
         self.stack.enter_context(self.cluster_stack)
 
-    def _first_job(self) -> MadeJob | None:
-        """Wait for a job that can be made; None if nothing is left to be cast."""
+    def _first_job(self) -> Job | None:
+        """Return the first job that can be made; None if nothing is left to be cast."""
         if (only := self.store.only) is not None:
-            return None if only.complete or not self.output.casts else MadeJob(only.job)
+            return None if only.complete or not self.output.casts else only.job
         jobs, dataset, db = self.jobs, self.output.dataset, self.store.db
-        assert not isinstance(jobs, OneJob) and dataset is not None, "it is a campaign"
-        left = (number for number in jobs.numbers if not db.ended(number))
-        self._maker = JobMaker(jobs, left, dataset.columns)
+        assert dataset is not None, "a campaign has one"
+        numbers = (number for number in jobs.numbers if not db.ended(number))
+        self._maker = JobMaker(jobs, numbers, dataset.columns)
         self.stack.callback(self._maker.close)
-        while isinstance(found := self._maker.take(wait=True), JobRow):
-            self.store.end([found])
-            self.page.ended(found)
-        return found
+        while isinstance(made := self._maker.take(wait=True), JobRow):
+            self.store.end([made])
+            self.page.ended(made)
+        return made
 
-    def _cast(self, first: MadeJob) -> None:
+    def _cast(self, first: Job) -> None:
         """Cast what is left, on a cluster with the slots that the first job needs."""
         store, options, enter = self.store, self.options, self.cluster_stack.enter_context
         if options.own:
             check_backend_here(store.backend or options.backend, store.advice)
-        self.cluster = Cluster(first.job, store, options, self.screen, enter)
+        self.cluster = Cluster(first, store, options, self.screen, enter)
         dataset = self.output.dataset
         self.page.follow(self.cluster.partitions, dataset)
-        self.run = Run(self.cluster, store, self.page, self._maker, dataset, self._frame)
+        self.loop = RunLoop(self.cluster, store, self.page, self._maker, dataset, self._frame)
         with self.screen.progress() as show:
-            self.run.cast(first, show)
+            self.loop.cast(first, show)
 
     def _frame(self, frame: ScanFrame) -> None:
         self.page.on_frame(frame)
@@ -193,11 +200,12 @@ class Conductor(Generic[R]):
 
     def result(self) -> RunResult:
         """Return the result of the only job, which is committed."""
-        only, run = self.store.only, self.run
+        only, loop = self.store.only, self.loop
         assert only is not None, "there is one"
         job = only.job
-        trials = tuple(sorted(only.parts.trials, key=lambda trial: trial.trial))
-        times, points = run.times if run else {}, only.points()
+        trials = tuple(sorted(only.trials, key=lambda trial: trial.trial))
+        times = loop.times if loop else {}
+        points = only.points()
         if not len(points):
             self._warn_of_empty_cloud(job)
         return RunResult(
@@ -210,16 +218,16 @@ class Conductor(Generic[R]):
             backend=self.store.backend,
             rays=job.survey.ray_count,
             hits=only.parts.hits,
-            stages=run.stages if run else (),
+            stages=loop.stages if loop else (),
             resumed=only.resumed,
             notes=tuple(self.store.notes),
             identity=self.store.identity,
             _hit_counts=only.hit_counts,
             sample_rays=only.sample_rays(),
-            seconds=time.monotonic() - self.started if run else 0.0,
+            seconds=time.monotonic() - self.started if loop else 0.0,
             survey_seconds=times.get("survey", 0.0),
             planning_seconds=times.get("planning", 0.0),
-            replayed=run.kept.offered_again if run and run.kept else 0,
+            replayed=only.offered_again,
         )
 
     def _warn_of_empty_cloud(self, job: Job) -> None:

@@ -10,10 +10,11 @@ import logging
 import time
 import uuid
 from collections import deque
-from collections.abc import Callable, Generator, Sequence
+from collections.abc import Callable, Generator, Mapping, Sequence
 from contextlib import closing
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from importlib.util import find_spec
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -26,7 +27,6 @@ from lidarsim.columns.table import AXES, SCAN
 from lidarsim.columns.waveforms import WAVEFORM
 from lidarsim.simulator.memory import MB, scans_that_fit
 from lidarsim.simulator.scene_caster import check_backend_here
-from lidarsim.sweeps.sweeps import Sweeps
 from poolpart import Partition, PoolError
 from poolpart.fetch import fetch_available
 
@@ -42,14 +42,13 @@ from .cluster.cluster import client_of
 from .cluster.watch import Waiting, Watch
 from .job_source import JobMaker
 from .options import RunOptions
-from .pipeline.batches import JobState
 from .pipeline.casting_workers import CastingWorkers
 from .pipeline.dispatch import Dispatcher
 from .pipeline.failures import JobError
 from .pipeline.messages import CollectOrder, ColumnsLost, Receipt
 from .pipeline.names import GPU
+from .pipeline.pipeline_job import PipelineJob
 from .progress import Screen
-from .store.database import JobParts
 
 LONGEST_PAUSE_S = 0.02  # while nothing moves
 
@@ -60,14 +59,14 @@ logger = logging.getLogger(__name__)
 class SweepStream:
     """The sweeps of some jobs of a campaign, which are cast while they are read.
 
-    Each loop casts all again, with the same result. When it is over or left, its tasks are
-    cancelled and the workers that it has started are stopped. A pickled copy connects to the
+    Each loop casts all sweeps again, with the same result. When a loop is over or left, its tasks
+    are cancelled and the workers that it has started are stopped. A pickled copy connects to the
     scheduler of the client, and in a task of that cluster takes the client of the task's worker.
     """
 
     campaign: CampaignSpec
     numbers: Sequence[int]  # of the jobs
-    ahead: int  # most sweeps that are being cast, or wait to be read
+    ahead: int  # maximum of the sweeps that are being cast or wait to be read
     options: RunOptions
 
     def __getstate__(self) -> dict[str, Any]:
@@ -76,6 +75,10 @@ class SweepStream:
             address = getattr(client.scheduler, "address", "")
             options = replace(options, client=None, scheduler=address)
         return self.__dict__ | {"options": options}
+
+    def of_jobs(self, numbers: Sequence[int]) -> SweepStream:
+        """Return the stream of some of the jobs."""
+        return replace(self, numbers=numbers)
 
     def __iter__(self) -> Generator[Sweep]:
         options, screen = self.options, Screen()
@@ -107,51 +110,54 @@ class SweepStream:
         return TorchStream(self, transform)
 
 
-@dataclass(eq=False)
-class _Streamed:
-    """A job whose sweeps are cast."""
+class StreamedJob(PipelineJob):
+    """A job whose sweeps are cast, with the columns that wait to be read.
 
-    job: Job
-    sweeps: Sweeps
-    state: JobState
-    format: str  # of the data set that a run of the campaign writes
-    begun: int = 0  # sweeps that were given to the dispatcher
-    points: int = 0  # of the sweeps that were taken
-    parts: dict[int, PartColumns] = field(default_factory=dict)  # {first scan: what was cast}
+    Columns are those of `data_format`, of the data set that a run of the campaign writes.
+    """
+
+    def __init__(self, job: Job, data_format: str) -> None:
+        super().__init__(job.number, job.scene, job.survey, range(job.survey.scan_count))
+        self.job = job
+        self.data_format = data_format
+        self.columns: dict[int, PartColumns] = {}  # {first scan: what was cast}
+        self.sweeps_begun = 0  # that were given to the dispatcher
+        self.points_read = 0
 
     def take(self, number: int) -> Sweep | None:
         """Take a sweep; None if not all of it was cast."""
-        at, stop = self.sweeps.scans[number : number + 2].tolist()
+        job, survey, sweeps = self.job, self.survey, self.job.sweeps
+        scan, stop = sweeps.scans[number : number + 2].tolist()
         parts = []
-        while at < stop:
-            if (part := self.parts.get(at)) is None:
+        while scan < stop:
+            if (part := self.columns.get(scan)) is None:
                 return None
             parts.append(part)
-            at = part.stop
+            scan = part.stop
         for part in parts:
-            del self.parts[part.first]
-        job, survey, sweeps = self.job, self.job.survey, self.sweeps
+            del self.columns[part.first]
         origin = job.scene.origin if survey.coordinates == "world" else np.zeros(3)
         # As `StoredCloud` has it.
-        rest = [c for c in survey.stored_columns if c not in AXES and c.name != WAVEFORM]
-        table = (SCAN, *rest)
+        further = [c for c in survey.stored_columns if c not in AXES and c.name != WAVEFORM]
+        table = (SCAN, *further)
         cloud = Cloud.joined([part.cloud(table, survey.precision_m, origin) for part in parts])
-        self.points += len(cloud)
-        places = sweeps.in_sensor(number, cloud.positions).astype(np.float32)
+        self.points_read += len(cloud)
+        positions = sweeps.in_sensor(number, cloud.positions).astype(np.float32)
         in_sensor = sweeps.columns_in_sensor(number, cloud)
         columns = {column.name: np.array(in_sensor[column.name]) for column in table}
-        if self.format == "kitti":  # as its files have it
+        if self.data_format == "kitti":  # as its files have it
             columns["intensity"] = intensity_of(cloud)
         boxes = Boxes.of(sweeps, number, cloud) if sweeps.actors else None
         boxes = boxes and boxes.inward(sweeps.pose, number)
         row = JobRow(job.number, job.name, job.split, job.values)
-        return Sweep.of(row, sweeps, number, (places, columns), boxes)
+        return Sweep.of(row, sweeps, number, (positions, columns), boxes)
 
 
 class _Casting:
-    """What is cast for a stream. It is the stages 1 and 4 that the dispatcher asks."""
+    """Casts the sweeps of a stream; plays stages 1 and 4 for the dispatcher."""
 
-    collectors, collector_count = {"reader": ""}, 1
+    collector_count = 1
+    collectors: Mapping[str, str] = MappingProxyType({"reader": ""})  # {name: address}
 
     def __init__(self, stream: SweepStream, client: Client, waiting: Waiting) -> None:
         self._stream, self._client, options = stream, client, stream.options
@@ -160,14 +166,14 @@ class _Casting:
         )
         partition, run = Partition(GPU, client), uuid.uuid4().hex[:8]
         self._casting = CastingWorkers(partition, run, self._backend, software)
-        self._dispatcher = Dispatcher(self._casting, self, "")  # type: ignore[arg-type]
+        self._dispatcher = Dispatcher(self._casting, self, "")
         self._watch = Watch(client, [GPU], (), options.patience_s)
         self._orders: list[CollectOrder] = []  # of columns to be fetched
         columns = stream.campaign.keep.of_jobs.needs
         self._maker = JobMaker(stream.campaign, stream.numbers, columns)
-        self._jobs: dict[int, _Streamed] = {}  # those that are cast
-        self._next: _Streamed | None = None  # the job whose sweeps are cast next
-        self._coming: deque[tuple[_Streamed, int]] = deque()  # sweeps that are being cast
+        self._jobs: dict[int, StreamedJob] = {}  # those that are cast
+        self._next: StreamedJob | None = None  # the job whose sweeps are cast next
+        self._coming: deque[tuple[StreamedJob, int]] = deque()  # sweeps that are being cast
         self._warned = False  # of a job without points
 
     def send(self, name: str, orders: Sequence[CollectOrder]) -> None:
@@ -185,7 +191,7 @@ class _Casting:
             streamed, number = self._coming[0] if self._coming else (None, 0)
             if streamed is not None and (sweep := streamed.take(number)) is not None:
                 self._coming.popleft()
-                if number + 1 == len(streamed.sweeps):
+                if number + 1 == len(streamed.job.sweeps):
                     self._end(streamed)
                     self._warn_if_empty(streamed)
                 moved = True
@@ -203,17 +209,17 @@ class _Casting:
             self._casting.release()
 
     def _step(self) -> bool:
-        """Do what can be done now; returns whether there was anything to do."""
+        """Do what can be done now; return False if nothing was to be done."""
         moved = self._begin_sweeps()
         moved |= self._dispatcher.check()
         if (seen := self._casting.look()) is not None:
             left = sum(map(len, self._dispatcher.batches.values()))
             self._casting.want(self._dispatcher.slots_wanted(left))
             self._dispatcher.leave_workers(seen)
-        for state, error in [*self._dispatcher.failed.items()]:
-            failed = self._jobs[state.number]
+        for job, error in [*self._dispatcher.failed.items()]:
+            failed = self._jobs[job.number]
             self._end(failed)
-            self._coming = deque(one for one in self._coming if one[0] is not failed)
+            self._coming = deque(coming for coming in self._coming if coming[0] is not failed)
             self._next = None if self._next is failed else self._next
             self._leave_out(failed.job.name, error)
         self._dispatcher.hand_over()
@@ -223,69 +229,68 @@ class _Casting:
         return moved
 
     def _begin_sweeps(self) -> bool:
-        """Have further sweeps cast, as far as the reader may be behind."""
-        before = len(self._coming)
+        """Begin further sweeps, at most `ahead` of the reader; return False if none was."""
+        begun_before = len(self._coming)
         while len(self._coming) < self._stream.ahead and (self._next or self._begin_job()):
             if (streamed := self._next) is not None:  # else the job has failed
-                number, streamed.begun = streamed.begun, streamed.begun + 1
-                self._dispatcher.take(streamed.state, *streamed.sweeps.scans[number:][:2].tolist())
+                number, sweeps = streamed.sweeps_begun, streamed.job.sweeps
+                self._dispatcher.take(streamed, *sweeps.scans[number : number + 2].tolist())
                 self._coming.append((streamed, number))
-                if streamed.begun == len(streamed.sweeps):
+                streamed.sweeps_begun += 1
+                if streamed.sweeps_begun == len(sweeps):
                     self._next = None
-        return len(self._coming) > before
+        return len(self._coming) > begun_before
 
     def _begin_job(self) -> bool:
-        """Take the next job, which may fail; returns whether there is one now."""
+        """Take the next job, which may fail; return False if there is none now."""
         if (made := self._maker.take()) is None:
             return False
         if isinstance(made, JobRow):
             self._leave_out(made.name, made.error)
             return True
-        (job, sweeps), options = made, self._stream.options
-        survey, number = job.survey, job.number
+        job, options = made, self._stream.options
+        streamed = StreamedJob(job, self._stream.campaign.keep.format)
         try:
             check_workers(job, options, self._backend, self._workers)
-            packed, scene = self._casting.add(number, job.scene, survey)
+            packed, scene_name = self._casting.add(job.number, job.scene, job.survey)
         except JobError as error:
             self._leave_out(job.name, error)
             return True
+        streamed.run, streamed.packed, streamed.scene_name = self._casting.run, packed, scene_name
         limit, on_device = options.batch_mb * MB, self._backend == "cuda"
-        fit = scans_that_fit(job.scene, survey, limit, on_device=on_device)
-        parts = JobParts(number, range(survey.scan_count), lambda receipt: b"")  # none is kept
-        run, count = self._casting.run, survey.scan_count
-        named = (run, number, survey, parts, packed, scene, fit, count)
-        assert sweeps is not None, "of a campaign"
-        state = JobState(*named, None, None, None)
-        self._next = _Streamed(job, sweeps, state, self._stream.campaign.keep.format)
-        self._jobs[number] = self._next
+        streamed.scans_per_task = scans_that_fit(job.scene, job.survey, limit, on_device=on_device)
+        streamed.scans_of_run = job.survey.scan_count
+        self._jobs[job.number] = streamed
+        self._next = streamed
         return True
 
     def _fetch(self) -> bool:
         """Fetch the columns of casting tasks from their workers."""
         orders, self._orders = self._orders, []
         for order in orders:
-            found = fetch_available(self._client, [order.key], at=order.worker)
-            if order.key not in found:
+            results = fetch_available(self._client, [order.key], at=order.worker)
+            if order.key not in results:
                 self._dispatcher.lost(ColumnsLost(order.key))
                 continue
-            batches = {(one.job, one.part.first): one for one in found[order.key]}
+            batches = {(batch.job, batch.part.first): batch for batch in results[order.key]}
             receipts = []
             for job, (first, _), name in order.parts:
                 streamed, batch = self._jobs[job], batches[job, first]
-                streamed.parts[first] = batch.part
+                streamed.columns[first] = batch.part
                 receipt = Receipt.of_part(batch.part, job, name, 0, batch.record)
-                receipts.append((streamed.state, receipt))
+                receipts.append((streamed, receipt))
             self._dispatcher.release(receipts)
         return bool(orders)
 
-    def _end(self, streamed: _Streamed) -> None:
+    def _end(self, streamed: StreamedJob) -> None:
+        """Cast nothing more of a job."""
         del self._jobs[streamed.job.number]
-        self._dispatcher.drop(streamed.state)
+        self._dispatcher.drop(streamed)
         self._casting.remove(streamed.job.number)
 
-    def _warn_if_empty(self, streamed: _Streamed) -> None:
+    def _warn_if_empty(self, streamed: StreamedJob) -> None:
         """Warn of the first job without points: to find the reason, rays are cast here."""
-        if streamed.points or self._warned:
+        if streamed.points_read or self._warned:
             return
         self._warned, job = True, streamed.job
         logger.warning(

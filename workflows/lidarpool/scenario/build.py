@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from fnmatch import fnmatchcase
-from functools import partial
+from functools import cached_property, partial
 from glob import escape
 from typing import Any
 
@@ -25,6 +25,7 @@ from lidarsim.sensor.survey import CloudOptions
 from lidarsim.sensor.trajectory import CENTRE
 from lidarsim.sensor.weather import Weather
 from lidarsim.simulator.surfaces import warn_of_grey
+from lidarsim.sweeps.sweeps import Sweeps
 
 from ..export.format_table import check_whole
 from ..export.formats import Format
@@ -124,6 +125,11 @@ class Job:
     def trials(self) -> int:
         """Number of planning trials."""
         return self.planning.trials if self.planning else 0
+
+    @cached_property
+    def sweeps(self) -> Sweeps:
+        """Sweeps of the survey with poses and boxes of actors; seconds for thousands of poses."""
+        return Sweeps.of(self.survey, self.scene)
 
 
 def build(

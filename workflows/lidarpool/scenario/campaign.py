@@ -81,6 +81,7 @@ class CampaignSpec:
     files: Set[Path]  # that its jobs may be made of; some may be missing
     choices: Mapping[str, str]  # {name: how its value is chosen, «0.2 to 20, log_uniform»}
     shard = ALL  # whose jobs a run does
+    only_job: None = None  # a survey has one, as `lidarpool.run.job_source.Jobs` says
 
     @checked
     def __init__(

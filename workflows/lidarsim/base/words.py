@@ -88,3 +88,15 @@ def without_common_prefix(names: Sequence[str]) -> list[str]:
     end = max(prefix.rfind(mark) for mark in "_./: -") + 1
     shorter = [name[end:] for name in names]
     return shorter if all(shorter) else list(names)
+
+
+def listed(names: Sequence[str], most: int = 3) -> str:
+    """Return the first names, and how many more there are.
+
+    Examples
+    --------
+    >>> listed(["a", "b", "c", "d", "e"])
+    'a, b, c and 2 more'
+    """
+    more = len(names) - most
+    return ", ".join(names[:most]) + (f" and {more:,} more" if more > 0 else "")

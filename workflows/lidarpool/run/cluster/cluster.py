@@ -81,7 +81,7 @@ class Cluster:
         try:
             left = first.survey.scan_count * (len(store.jobs.numbers) - store.db.ended_count)
             if store.only is not None:
-                left = len(store.only.parts.scans) - store.only.resumed
+                left = len(store.only.scans) - store.only.resumed
             for name, slots in needed.items():  # partitions may grow with their work
                 self.partitions[name].want(max(slots, left) if name == GPU else slots)
             self._pool, self._casting, self.backend, self.software = find_workers(

@@ -1,1 +1,1 @@
-"""The survey pipeline: four stages on the partitions of a cluster, and their driver."""
+"""The pipeline: four stages on the partitions of a cluster, and the rules of the driver."""

@@ -4,22 +4,42 @@ from __future__ import annotations
 
 import time
 from collections import deque
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from typing import Protocol
 
 from poolpart.task_locations import TaskLocations
 
 from ...columns.parts import part_name
 from . import policies
-from .batches import Batch, BatchState, JobState, Outcome
+from .batches import Batch, BatchState, Outcome
 from .casting_workers import CastingWorkers
 from .failures import JobError
-from .long_stages import LongStages
 from .messages import CollectOrder, ColumnsLost, Receipt, scans_in_words
 from .names import COLLECT, GENERATE, GPU, INTERSECT, LIDAR
+from .pipeline_job import PipelineJob
 from .placement import TaskRecord
 
 ADVISED_AGAIN = 0.2  # change of the scans in an item of stage 1 that is worth a request
 PIECES = 16  # a failing batch is divided into so many
+
+
+class Stages(Protocol):
+    """Stages 1 and 4, as a dispatcher asks them."""
+
+    collector_count: int  # wanted; some may be starting
+
+    @property
+    def collectors(self) -> Mapping[str, str]:
+        """Collectors that take orders: {name: address of the worker}."""
+        ...
+
+    def advise(self, scans: int) -> None:
+        """Have stage 1 put so many scans into an item from now on."""
+        ...
+
+    def send(self, name: str, messages: Sequence[CollectOrder]) -> None:
+        """Send orders to a collector."""
+        ...
 
 
 class Dispatcher:
@@ -29,9 +49,9 @@ class Dispatcher:
     dropped.
     """
 
-    def __init__(self, workers: CastingWorkers, stages: LongStages, mark: str) -> None:
+    def __init__(self, workers: CastingWorkers, stages: Stages, mark: str) -> None:
         self.batches: dict[tuple[int, int], Batch] = {}  # {(job, first scan): batch}
-        self.failed: dict[JobState, JobError] = {}
+        self.failed: dict[PipelineJob, JobError] = {}
         self.advice = 1  # scans that stage 1 was told to put into an item
         self._workers, self._stages, self._mark = workers, stages, mark
         self._tasks: dict[str, list[Batch]] = {}  # {key of a casting task: its batches left}
@@ -40,13 +60,13 @@ class Dispatcher:
         self._total = (0.0, 0)  # casting time of scans, and their number
         self.per_task = 1  # small batches of a task
         # {job: batches that were tried alone before any was cast, each with a worker that died}
-        self._first_deaths: dict[JobState, list[Batch]] = {}
+        self._first_deaths: dict[PipelineJob, list[Batch]] = {}
 
     def at(self, *places: BatchState) -> list[Batch]:
         """Batches in some states."""
         return [batch for batch in self.batches.values() if batch.place in places]
 
-    def _of(self, job: JobState) -> list[Batch]:
+    def _of(self, job: PipelineJob) -> list[Batch]:
         return [batch for batch in self.batches.values() if batch.job is job]
 
     def _within(self, receipt: Receipt) -> list[Batch]:
@@ -66,7 +86,7 @@ class Dispatcher:
         slots, collectors = self._workers.slot_count, self._stages.collector_count
         return policies.most_under_way(slots, collectors, self.per_task)
 
-    def room(self, job: JobState) -> float:
+    def room(self, job: PipelineJob) -> float:
         """Batches that may be taken of a job, by weight; none far ahead of its oldest."""
         # How many batches the newest of all is ahead of the oldest of the job.
         span = max((self._count - batch.number for batch in self._of(job)), default=0)
@@ -79,7 +99,7 @@ class Dispatcher:
         seconds, scans = self._total
         return max(1, policies.slots_wanted(left, seconds / scans if scans else None))
 
-    def _learn(self, records: list[tuple[JobState, TaskRecord]]) -> None:
+    def _learn(self, records: list[tuple[PipelineJob, TaskRecord]]) -> None:
         """Take account of casting times, and advise stage 1 on the scans in one item."""
         for job, record in records:
             job.seconds += record.seconds
@@ -88,22 +108,28 @@ class Dispatcher:
         slots = self._workers.slot_count
         self.per_task = policies.batches_per_task(self._last, slots)
         for job, _ in records[-1:]:
-            wanted = policies.scans_per_batch(self._last, job.fit, job.in_all, slots)
+            wanted = policies.scans_per_batch(
+                self._last, job.scans_per_task, job.scans_of_run, slots
+            )
             if abs(wanted - self.advice) > ADVISED_AGAIN * self.advice:  # it is a request
                 self.advice = wanted
                 self._stages.advise(wanted)
 
     # -- casting ---------------------------------------------------------------------------
 
-    def take(self, job: JobState, first: int, stop: int) -> None:
+    def take(self, job: PipelineJob, first: int, stop: int) -> None:
         """Take scans from stage 1; those that are not committed become batches."""
         first = max(first, job.generated)  # a restarted generator repeats some
         if first < stop:
             job.trace("take", GENERATE, range(first, stop))
         job.generated = max(stop, job.generated)
         for at, end in job.parts.missing(first, stop):
-            for begin in range(at, end, job.fit):  # the size was advised for another job perhaps
-                batch = Batch(job, begin, min(begin + job.fit, end), self._count, self._count)
+            for begin in range(
+                at, end, job.scans_per_task
+            ):  # the size was advised for another job perhaps
+                batch = Batch(
+                    job, begin, min(begin + job.scans_per_task, end), self._count, self._count
+                )
                 self.batches[job.number, begin] = batch
                 self._count += 1
 
@@ -166,7 +192,7 @@ class Dispatcher:
         self._forget(batch)
         del self.batches[batch.job.number, batch.first]
 
-    def drop(self, job: JobState) -> None:
+    def drop(self, job: PipelineJob) -> None:
         """Remove all batches of a job that has ended."""
         for batch in self._of(job):
             self._remove(batch)
@@ -208,7 +234,7 @@ class Dispatcher:
             self._remove(batch)
             self._judge(batch.job)
 
-    def _judge(self, job: JobState) -> None:
+    def _judge(self, job: PipelineJob) -> None:
         """Let a job with condemned batches fail once it has no others."""
         if job.condemned and not self._of(job):
             self.failed.setdefault(job, JobError("\n".join(job.condemned)))
@@ -253,12 +279,9 @@ class Dispatcher:
             self._stages.send(name, messages)
         return bool(orders)
 
-    def stored(self, receipt: Receipt) -> bool:
-        """Whether a part is in storage; one that its worker holds goes there now, if it is left."""
-        if not receipt.held_at or self._stages.store_held(receipt):
-            return True
+    def lost_part(self, receipt: Receipt) -> None:
+        """Have the batches of a part cast again that was lost with the worker that held it."""
         self._collect_in_vain(self._within(receipt), "its part was lost")
-        return False
 
     def lost(self, message: ColumnsLost) -> None:
         """Have batches cast again whose columns could not be fetched."""
@@ -271,7 +294,7 @@ class Dispatcher:
             if batch.place is BatchState.COLLECTING:
                 self._again(batch, reason)
 
-    def release(self, committed: Iterable[tuple[JobState, Receipt]]) -> None:
+    def release(self, committed: Iterable[tuple[PipelineJob, Receipt]]) -> None:
         """Remove the batches of committed parts, and learn from their casting tasks."""
         waited: dict[str, float] = {}  # {collector: when it was given the first of them}
         records = []

@@ -1,4 +1,4 @@
-"""The driver of a run: it offers batches of all jobs, commits parts and hands out frames.
+"""The pipeline: it offers batches of all jobs, commits their parts and hands out their frames.
 
 Everything happens in `step`, called repeatedly from one thread; nothing in it waits for long. There
 is one rule of recovery: uncommitted batches are offered again, and frames that were not handed out
@@ -12,14 +12,10 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterable, Sequence
+from dataclasses import replace
 from itertools import chain
+from typing import Protocol
 
-from lidarsim.columns.cloud import Cloud
-from lidarsim.scene.scene import Scene
-from lidarsim.sensor import Survey
-
-from ..store.database import RunDatabase
-from .batches import JobState
 from .casting_workers import CastingWorkers
 from .dispatch import Dispatcher
 from .failures import JobError
@@ -35,6 +31,7 @@ from .messages import (
     Summaries,
 )
 from .names import COLLECT, GENERATE, SORT
+from .pipeline_job import PipelineJob
 from .task_book import TaskBook
 
 STALL_S = 60.0  # without news from the sorter; then it gets its summaries again
@@ -44,68 +41,81 @@ CLOSING_S = 0.001  # longest wait while the stages end
 ANNOUNCED = 2  # jobs that stage 1 should have before it, however large they are
 
 
-class RunDriver:
-    """Runs jobs on the partitions of a cluster.
+class Commits(Protocol):
+    """Where parts are committed: the run's database."""
 
-    `workers` and `stages` are all that it asks of Dask, so that tests can play the cluster. What is
-    committed in `db` is not cast again.
+    def commit(
+        self, receipts: Iterable[tuple[PipelineJob, Receipt]]
+    ) -> list[tuple[PipelineJob, Receipt]]:
+        """Commit parts of jobs, and return those that are new."""
+        ...
+
+    def summaries(self, part: Receipt) -> bytes:
+        """Return the summaries of the scans of a committed part."""
+        ...
+
+
+class Pipeline:
+    """The four stages, which jobs pass on the partitions of a cluster.
+
+    `workers` and `stages` are all that it asks of Dask, so that tests can play the cluster. Parts
+    are committed in `commits`, and their files have the run's `mark`.
     """
 
-    def __init__(self, workers: CastingWorkers, stages: LongStages, db: RunDatabase) -> None:
-        self.workers, self.stages, self._db = workers, stages, db
-        self.dispatcher = Dispatcher(workers, stages, db.meta["mark"])
-        self.jobs: dict[int, JobState] = {}  # those under way
+    def __init__(
+        self, workers: CastingWorkers, stages: LongStages, commits: Commits, mark: str
+    ) -> None:
+        self.workers = workers
+        self.stages = stages
+        self._commits = commits
+        self.dispatcher = Dispatcher(workers, stages, mark)
+        self.jobs: dict[int, PipelineJob] = {}  # {number: a job that is being cast}
         self.book = TaskBook()  # of stage 2, and in the end of the others
         self.progress = 0  # a number that grows when something is committed or handed out
         self.later = 0  # scans of jobs that are not begun yet
         self._announced: dict[int, int] = {}  # {job: scans}, in the order of stage 1, until taken
-        self._ended: list[tuple[JobState, JobError | None]] = []  # since they were asked for
+        self._ended: list[tuple[PipelineJob, JobError | None]] = []  # until they are taken
 
     # -- jobs --------------------------------------------------------------------------------
 
     def begin(
         self,
-        number: int,
-        scene: Scene,
-        survey: Survey,
+        job: PipelineJob,
         *,
-        fit: int,
-        in_all: int = 0,
+        scans_per_task: int,
+        scans_of_run: int = 0,
         on_frame: Callable[[ScanFrame], None] | None = None,
-        read: Callable[[int], Cloud] | None = None,
         on_parts: Callable[[list[Receipt]], None] | None = None,
-    ) -> JobState:
+    ) -> None:
         """Take a job on; JobError if it cannot be sent to workers.
 
-        So many scans `fit` into the memory of a casting task; `in_all` are those of the whole run,
-        where many jobs are like this one. `on_frame` is called with each frame, in scan order, in
-        the driver's thread; without it there are no frames, and the job is complete when all of it
-        is committed. Frames read their points with `read`. `on_parts` is called with parts that
-        were committed.
+        What is committed of the job is not cast again.
+
+        Parameters
+        ----------
+        scans_per_task
+            Scans that fit into the memory of a casting task.
+        scans_of_run
+            Scans of the whole run, where many jobs are like this one.
+        on_frame
+            Called with each frame, in scan order, in the driver's thread. Without it there are no
+            frames, and the job is complete when all of it is committed.
+        on_parts
+            Called with parts that were committed.
         """
-        packed, scene_name = self.workers.add(number, scene, survey)
-        parts = self._db.job(number, survey.scan_count)
-        parts.has_frames = on_frame is not None
-        job = self.jobs[number] = JobState(
-            self.stages.run,
-            number,
-            survey,
-            parts,
-            packed,
-            scene_name,
-            fit,
-            max(in_all, len(parts.scans)),
-            on_frame,
-            read,
-            on_parts,
-            generated=parts.scans.start,
-        )
-        if not job.left:  # stage 1 need not describe what is committed
-            job.generated = parts.scans.stop
+        job.packed, job.scene_name = self.workers.add(job.number, job.scene, job.survey)
+        job.run = self.stages.run
+        job.scans_per_task = scans_per_task
+        job.scans_of_run = max(scans_of_run, len(job.scans))
+        job.has_frames = on_frame is not None
+        job.on_frame = on_frame
+        job.on_parts = on_parts
+        # Stage 1 need not describe what is committed.
+        job.generated = job.scans.start if job.left else job.scans.stop
+        self.jobs[job.number] = job
         self._describe([job])
         self._sort_again([job])
         self._end_complete([job])
-        return job
 
     @property
     def has_room(self) -> bool:
@@ -116,26 +126,28 @@ class RunDriver:
         if len(self._announced) < ANNOUNCED:
             return True
         jobs = [self.jobs[number] for number in self._announced if number in self.jobs]
-        to_come = sum(-(-(j.parts.scans.stop - j.generated) // min(advice, j.fit)) for j in jobs)
+        to_come = sum(
+            -(-(j.scans.stop - j.generated) // min(advice, j.scans_per_task)) for j in jobs
+        )
         return len(self.dispatcher.batches) + to_come < most
 
-    def take_ended(self) -> list[tuple[JobState, JobError | None]]:
+    def take_ended(self) -> list[tuple[PipelineJob, JobError | None]]:
         """Return the jobs that are complete, or failed by an error, since the last call."""
         ended, self._ended = self._ended, []
         return ended
 
-    def _end(self, job: JobState, error: JobError | None = None) -> None:
+    def _end(self, job: PipelineJob, error: JobError | None = None) -> None:
         """Do nothing more for a job."""
         self.dispatcher.drop(job)
         self.workers.remove(job.number)
         del self.jobs[job.number]
-        if error is not None and job.parts.has_frames:  # the sorter forgets what it has of it
+        if error is not None and job.has_frames:  # the sorter forgets what it has of it
             self.stages.send(SORT, [Summaries(job.number, 0, 0, b"", framed=1, until=1)])
         self._ended.append((job, error))
 
-    def _end_complete(self, jobs: Iterable[JobState]) -> None:
+    def _end_complete(self, jobs: Iterable[PipelineJob]) -> None:
         for job in jobs:
-            if job.parts.complete and job.number in self.jobs:
+            if job.scans_complete and job.number in self.jobs:
                 self._end(job)
 
     @property
@@ -205,16 +217,19 @@ class RunDriver:
 
     def _commit(self, receipts: Sequence[Receipt]) -> None:
         """Commit the receipts of jobs under way."""
-        mine = [receipt for receipt in receipts if receipt.job in self.jobs]
-        new = self._db.commit([*filter(self.dispatcher.stored, mine)])
+        stored = [
+            (self.jobs[receipt.job], receipt)
+            for receipt in receipts
+            if receipt.job in self.jobs and self._is_stored(receipt)
+        ]
+        new = self._commits.commit(stored)
         if not new:
             return
-        self.dispatcher.release([(self.jobs[receipt.job], receipt) for receipt in new])
-        of_jobs: dict[JobState, list[Receipt]] = {}
-        for receipt in new:
+        self.dispatcher.release(new)
+        of_jobs: dict[PipelineJob, list[Receipt]] = {}
+        for job, receipt in new:
             if receipt.record is not None:
                 self.book.add(receipt.record)
-            job = self.jobs[receipt.job]
             job.trace("points", COLLECT, range(receipt.first, receipt.stop))
             of_jobs.setdefault(job, []).append(receipt)
             self.progress += receipt.stop - receipt.first
@@ -223,6 +238,13 @@ class RunDriver:
             if job.on_parts is not None:
                 job.on_parts(parts)
         self._end_complete(of_jobs)
+
+    def _is_stored(self, receipt: Receipt) -> bool:
+        """Return True if a part is in storage; a part that its worker holds goes there now."""
+        if not receipt.held_at or self.stages.store_held(receipt):
+            return True
+        self.dispatcher.lost_part(receipt)
+        return False
 
     # -- looking after workers and stages ------------------------------------------------------
 
@@ -246,12 +268,12 @@ class RunDriver:
         if SORT in started:
             self._sort_again(self.jobs.values())
 
-    def _describe(self, jobs: Iterable[JobState]) -> None:
+    def _describe(self, jobs: Iterable[PipelineJob]) -> None:
         """Have stage 1 describe what is left of jobs; an absent one is told when it is started."""
         orders = [
-            Description(job.number, job.packed, job.generated, job.parts.scans.stop)
+            Description(job.number, job.packed, job.generated, job.scans.stop)
             for job in jobs
-            if job.generated < job.parts.scans.stop
+            if job.generated < job.scans.stop
         ]
         self._announced |= {one.job: one.stop for one in orders}
         if orders:
@@ -268,20 +290,22 @@ class RunDriver:
             return job is None or bool(job.condemned) or self.dispatcher.room(job) > 0
         return False
 
-    def _sort(self, job: JobState, parts: Sequence[Receipt]) -> None:
+    def _sort(self, job: PipelineJob, parts: Sequence[Receipt]) -> None:
         """Send parts to the sorter if they have frames; an absent one gets them when it starts."""
-        if parts and job.parts.has_frames:
-            so_far = job.parts.frames, job.parts.scans.stop
+        if parts and job.has_frames:
+            so_far = job.frames, job.scans.stop
             messages = [Summaries(job.number, p.first, p.stop, p.summaries, *so_far) for p in parts]
             job.trace("handon", SORT, chain.from_iterable(m.scans for m in messages))
             self.stages.send(SORT, messages)
 
-    def _sort_again(self, jobs: Iterable[JobState]) -> None:
+    def _sort_again(self, jobs: Iterable[PipelineJob]) -> None:
         """Send the sorter all that was not handed out of jobs."""
         for job in jobs:
             job.sorted_at = time.monotonic()
-            if job.parts.has_frames:
-                self._sort(job, job.parts.unframed())
+            if job.has_frames:
+                summaries = self._commits.summaries
+                parts = [replace(part, summaries=summaries(part)) for part in job.unframed()]
+                self._sort(job, parts)
 
     # -- the end -----------------------------------------------------------------------------
 

@@ -168,7 +168,7 @@ def _group(batch: Batch) -> object:
     """Return what the batches of a task have in common."""
     if batch.deaths:
         return batch
-    return batch.job.number if batch.divided else batch.job.scene
+    return batch.job.number if batch.divided else batch.job.scene_name
 
 
 def _task(group: deque[Batch], most: float, per_task: int) -> list[Batch]:

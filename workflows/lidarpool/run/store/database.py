@@ -7,28 +7,27 @@ batches again. A job that has ended leaves a row, and its receipts go.
 
 from __future__ import annotations
 
-import bisect
 import json
 import re
 import secrets
 import sqlite3
 import zlib
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
-from dataclasses import replace
-from operator import attrgetter
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
-from lidarsim.base.arrays import Ints
 from lidarsim.base.errors import LidarError
 
 from ...columns.parts import part_name
 from ...datasets.job_table import JOBS_MOST
 from ...plan import Trial
+from ..pipeline.committed_job import CommittedJob
 from ..pipeline.messages import Receipt
+
+J = TypeVar("J", bound=CommittedJob)
 
 FORMAT = 9
 FILE = "run.db"
@@ -62,94 +61,7 @@ _COLUMNS = {
 }
 _OF_DISK = ("locked", "full", "disk i/o", "unable to open", "readonly", "out of memory")
 _OF_JOBS = ("parts", "trials", "frames", "made_of")  # tables about jobs under way
-_FIRST = attrgetter("first")  # the order of parts
 PARTS_FOLDER = re.compile("run-[0-9a-f]{16}")  # names of `parts_folder`
-
-
-class JobParts:
-    """What is committed of a job under way; only its `RunDatabase` adds and removes parts.
-
-    `scans` are all that are to be done, and `read` reads the summaries of a part.
-    """
-
-    def __init__(self, number: int, scans: range, read: Callable[[Receipt], bytes]) -> None:
-        self.number, self.scans, self._read = number, scans, read
-        self.has_frames = False  # whether scans are handed out as frames, too
-        self.clear()
-
-    def clear(self) -> None:
-        """Forget all of it."""
-        self.ordered: list[Receipt] = []  # the parts in scan order, without summaries
-        self.trials: list[Trial] = []
-        self.scans_done = self.point_count = self.hits = 0
-        # One past the last scan that was handed out as a frame, from the first on.
-        self.frames = self.frames_written = self.scans.start
-
-    # -- reading -------------------------------------------------------------------------
-
-    @property
-    def complete(self) -> bool:
-        """Whether all scans are committed, and were handed out if there are frames."""
-        framed = not self.has_frames or self.frames == self.scans.stop
-        return framed and self.scans_done == len(self.scans)
-
-    @property
-    def cells(self) -> Ints | None:
-        """Lowest and highest cell of all points, (2, 3); None without points."""
-        found = [part.cells for part in self.ordered if part.cells]
-        if not found:
-            return None
-        table = np.array(found, np.int64).reshape(-1, 2, 3)
-        return np.stack([table[:, 0].min(axis=0), table[:, 1].max(axis=0)])
-
-    def unframed(self) -> list[Receipt]:
-        """Parts with scans that were not handed out as frames, with summaries, in order."""
-        parts = [part for part in self.ordered[self._at(self.frames) :] if part.stop > self.frames]
-        return [replace(part, summaries=self._read(part)) for part in parts]
-
-    def summaries_of(self, scans: Iterable[int]) -> list[tuple[int, bytes]]:
-        """Summaries of the parts that hold some scans: (first scan, summaries), in order."""
-        parts = {part.first: part for part in map(self.part_of, sorted(scans))}
-        return [(first, self._read(part)) for first, part in parts.items()]
-
-    def part_of(self, scan: int) -> Receipt:
-        """Part of a committed scan; KeyError if it is not committed."""
-        for part in self.ordered[self._at(scan) :][:1]:
-            if scan in part.scans:
-                return part
-        raise KeyError(scan)
-
-    def missing(self, first: int, stop: int) -> list[tuple[int, int]]:
-        """Return the scans from `first` to `stop` that are not committed, as half-open ranges."""
-        absent, at = [], self._at(first)
-        while first < stop and at < len(self.ordered):
-            part = self.ordered[at]
-            if first < part.first:
-                absent.append((first, min(part.first, stop)))
-            first, at = max(first, part.stop), at + 1
-        return [*absent, (first, stop)] if first < stop else absent
-
-    def _at(self, scan: int) -> int:
-        """Index of the last part that begins with a scan or before; 0 if there is none."""
-        return max(0, bisect.bisect_right(self.ordered, scan, key=_FIRST) - 1)
-
-    # -- writing -------------------------------------------------------------------------
-
-    def enter(self, part: Receipt) -> None:
-        """Add a part."""
-        bare = replace(part, summaries=b"", record=None, held_at="")
-        bisect.insort(self.ordered, bare, key=_FIRST)
-        self._count(part, 1)
-
-    def leave(self, part: Receipt) -> None:
-        """Remove a part."""
-        del self.ordered[self._at(part.first)]
-        self._count(part, -1)
-
-    def _count(self, part: Receipt, sign: int) -> None:
-        self.scans_done += sign * len(part.scans)
-        self.point_count += sign * part.rows
-        self.hits += sign * part.hits
 
 
 class DamagedError(LidarError):
@@ -159,9 +71,9 @@ class DamagedError(LidarError):
 class RunDatabase:
     """Committed parts and trials of the jobs of a run, and the jobs that have ended.
 
-    A file that does not exist is made, and begins with the values `new`. Commits survive a power
-    failure if they are `durable`. All methods that write raise LidarError if the disk is full
-    or fails.
+    Jobs under way have what is committed of them in memory, too. A file that does not exist is
+    made, and begins with the values `new`. Commits survive a power failure if they are `durable`.
+    All methods that write raise LidarError if the disk is full or fails.
 
     LidarError if it is damaged, of another version, in use by another run, or cannot be
     written.
@@ -170,7 +82,6 @@ class RunDatabase:
     def __init__(self, path: Path, *, durable: bool = True, **new: str) -> None:
         self.path, self._durable = path, durable
         self.meta: dict[str, str] = {}
-        self.under_way: dict[int, JobParts] = {}  # {number of a job: what is committed of it}
         # Numbers of the jobs that have not ended and of which something is committed.
         self.begun: set[int] = set()
         self.ended_count = 0
@@ -221,18 +132,13 @@ class RunDatabase:
 
     # -- reading -------------------------------------------------------------------------
 
-    def job(self, number: int, stop: int, first: int = 0) -> JobParts:
-        """Return what is committed of a job under way, of its scans from `first` to `stop`."""
-        if (found := self.under_way.get(number)) is not None:
-            return found
-        job = JobParts(number, range(first, stop), self._summaries)
-        if number in self.begun:
+    def read(self, job: CommittedJob) -> None:
+        """Read what is committed of a job, of which nothing was read before."""
+        if job.number in self.begun:
             with _explained(self.path):
                 self._read(job)
-        self.under_way[number] = job
-        return job
 
-    def _read(self, job: JobParts) -> None:
+    def _read(self, job: CommittedJob) -> None:
         number, scans = job.number, job.scans
         query = "SELECT first, stop, rows, size, hits, cells FROM parts WHERE job = ?"
         for first, stop, *counts, cells in self._rows(query, number):
@@ -240,7 +146,7 @@ class RunDatabase:
                 raise ValueError(f"a part has scans {first} to {stop} of {scans}")
             name, box = part_name(self.meta["mark"], number, first, stop), json.loads(cells)
             rows, size, hits = counts
-            job.enter(Receipt(number, first, stop, name, rows, size, hits, tuple(box), b""))
+            job.parts.add(Receipt(number, first, stop, name, rows, size, hits, tuple(box), b""))
         query = "SELECT data FROM trials WHERE job = ? ORDER BY trial"
         for data in (json.loads(text) for (text,) in self._rows(query, number)):
             waypoints = np.array(data.pop("waypoints"), np.float64).reshape(-1, 2)
@@ -276,7 +182,8 @@ class RunDatabase:
             for (data,) in rows:
                 yield json.loads(data)
 
-    def _summaries(self, part: Receipt) -> bytes:
+    def summaries(self, part: Receipt) -> bytes:
+        """Return the summaries of the scans of a committed part."""
         query = "SELECT summaries FROM parts WHERE job = ? AND first = ?"
         with _explained(self.path):
             ((data,),) = self._rows(query, part.job, part.first)
@@ -290,32 +197,33 @@ class RunDatabase:
             self._sql.executemany(_insert("meta", "OR REPLACE"), values.items())
         self.meta |= values
 
-    def commit(self, receipts: Sequence[Receipt]) -> list[Receipt]:
-        """Commit parts of jobs under way in one transaction; returns those that were new.
+    def commit(self, receipts: Iterable[tuple[J, Receipt]]) -> list[tuple[J, Receipt]]:
+        """Commit parts of jobs in one transaction; return those that are new.
 
-        A part with a scan that is committed already is left out.
+        A part with a scan that is committed already is left out. The frames that were handed out of
+        these jobs are committed as well.
         """
-        new: list[Receipt] = []
-        for receipt in receipts:
-            span, job = (receipt.first, receipt.stop), self.under_way.get(receipt.job)
-            if job is not None and job.missing(*span) == [span]:
-                job.enter(receipt)
-                new.append(receipt)
+        new: list[tuple[J, Receipt]] = []
+        for job, part in receipts:
+            span = part.first, part.stop
+            if job.parts.missing(*span) == [span]:
+                job.parts.add(part)
+                new.append((job, part))
         if not new:
             return new
         rows = [
             (p.job, p.first, p.stop, p.rows, p.size, p.hits, json.dumps(p.cells), p.summaries)
-            for p in new
+            for _, p in new
         ]
         try:
             with self._transaction():
                 self._sql.executemany(_insert("parts"), rows)
-                self._write_frames()
+                self._write_frames(job for job, _ in new)
         except BaseException:
-            for receipt in new:
-                self.under_way[receipt.job].leave(receipt)
+            for job, part in new:
+                job.parts.remove(part)
             raise
-        self.begun.update(receipt.job for receipt in new)
+        self.begun.update(job.number for job, _ in new)
         return new
 
     def set_hash(self, number: int, text: str) -> None:
@@ -323,26 +231,29 @@ class RunDatabase:
         with self._transaction():
             self._sql.execute(_insert("made_of", "OR REPLACE"), (number, text))
 
-    def drop(self, number: int, receipts: Sequence[Receipt]) -> None:
+    def drop(self, job: CommittedJob, receipts: Sequence[Receipt]) -> None:
         """Remove parts that are missing in storage, so that their scans are offered again."""
         with self._transaction():
             self._sql.executemany(
                 "DELETE FROM parts WHERE job = ? AND first = ?",
-                [(number, part.first) for part in receipts],
+                [(job.number, part.first) for part in receipts],
             )
         for part in receipts:
-            self.under_way[number].leave(part)
+            job.parts.remove(part)
 
-    def add_trials(self, number: int, trials: Sequence[Trial]) -> None:
-        """Store planning trials of a job under way."""
+    def add_trials(self, job: CommittedJob, trials: Sequence[Trial]) -> None:
+        """Commit planning trials of a job."""
         with self._transaction():
             self._sql.executemany(
                 _insert("trials", "OR IGNORE"),
                 # To the bit: a float is written with the digits that identify it.
-                [(number, t.trial, json.dumps(vars(t), default=np.ndarray.tolist)) for t in trials],
+                [
+                    (job.number, trial.trial, json.dumps(vars(trial), default=np.ndarray.tolist))
+                    for trial in trials
+                ],
             )
-        self.begun.add(number)
-        self.under_way[number].trials += trials
+        self.begun.add(job.number)
+        job.trials += trials
 
     def end_jobs(self, jobs: Iterable[tuple[int, bool, Mapping[str, Any]]]) -> None:
         """Store which jobs have ended or failed, and what is to be known of them; no more is kept.
@@ -357,7 +268,6 @@ class RunDatabase:
         self.begun -= ended.keys()
         for number in ended:
             self._mark_ended(number)
-            self.under_way.pop(number, None)
 
     def forget_jobs(self, numbers: Iterable[int]) -> None:
         """Let some jobs be done again: there are files of them, also if there is nothing else."""
@@ -368,19 +278,19 @@ class RunDatabase:
         for (number,) in forgotten:
             self._mark_ended(number, False)
 
-    def restart(self, number: int) -> None:
+    def restart(self, job: CommittedJob) -> None:
         """Drop all that is committed of a job that has not ended."""
         with self._transaction():
-            self._delete([number])
-        self.begun.discard(number)
-        if (job := self.under_way.get(number)) is not None:
-            job.clear()
+            self._delete([job.number])
+        self.begun.discard(job.number)
+        job.forget_committed()
 
-    def save_frames(self) -> None:
-        """Store how many frames were handed out; each commit does so anyway."""
-        if any(job.frames != job.frames_written for job in self.under_way.values()):
+    def save_frames(self, jobs: Iterable[CommittedJob]) -> None:
+        """Commit how many frames of jobs were handed out; each commit of a part does so anyway."""
+        unsaved = [job for job in jobs if job.frames != job.frames_written]
+        if unsaved:
             with self._transaction():
-                self._write_frames()
+                self._write_frames(unsaved)
 
     def copy(self) -> bytes:
         """Content of the file after the last transaction."""
@@ -405,8 +315,8 @@ class RunDatabase:
         self.ended_count += ended - self._ended[number]
         self._ended[number] = ended
 
-    def _write_frames(self) -> None:
-        for job in self.under_way.values():
+    def _write_frames(self, jobs: Iterable[CommittedJob]) -> None:
+        for job in jobs:
             if job.frames != job.frames_written:
                 row = (job.number, job.frames)
                 self._sql.execute(_insert("frames", "OR REPLACE"), row)

@@ -1,142 +1,130 @@
-"""What a run has of one job: committed parts and trials, and what is read from them."""
+"""A job under way, and what a run reads of its committed parts."""
 
 from __future__ import annotations
 
 import errno
-import os
-from collections.abc import Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Callable
 from functools import partial
-from operator import attrgetter
-from typing import TYPE_CHECKING
+from typing import Any
 
 import numpy as np
 
 from lidarsim.base.arrays import Floats32, Ints
 from lidarsim.base.errors import LidarError
+from lidarsim.base.storage import Storage
 from lidarsim.columns.cloud import Cloud
 from lidarsim.sweeps.sweeps import Sweeps
 
 from ...columns.parts import StoredCloud, read_part, read_tally, unpack
 from ...scenario.build import Job
-from ..job_source import OneJob
-from ..pipeline.messages import Receipt, samples_of_scan, scans_in_words, summary_type
+from ..pipeline.messages import Receipt, samples_of_scan, summary_type
+from ..pipeline.pipeline_job import PipelineJob
 from ..progress import Progress
-from .database import JobParts
-
-if TYPE_CHECKING:
-    from .run_store import RunStore
 
 SAMPLE_RAYS = 400  # of the pictures
-CHECKERS = 4  # threads that check parts; each holds one in memory, twice
-NAMED = 3  # parts, scans or files that a message names
-_SAID = attrgetter("first", "stop", "rows")  # by a receipt, what the part must say as well
 
 
-class JobPoints:
-    """What a run has of one job: its committed parts and trials, and what is read from them."""
+class JobUnderWay(PipelineJob):
+    """A job from its first batch until it is written, with what is read of its parts.
 
-    def __init__(self, store: RunStore, job: Job) -> None:
-        self.job, self._store = job, store
-        only, count = isinstance(store.jobs, OneJob), job.survey.scan_count
-        scans = store.jobs.shard.scans(count) if only else range(count)
-        self.parts: JobParts = store.db.job(job.number, scans.stop, scans.start)
-        self.parts.has_frames = only
-        self.identified = only  # whether it is kept what the job is made of
-        self.sweeps: Sweeps | None = None  # of a job for a data set, once it was made
-        self.resumed = self.parts.scans_done  # scans whose points are of an earlier run
+    Parameters
+    ----------
+    job
+        The job.
+    scans
+        Its scans that are to be done.
+    storage
+        Where its parts are.
+    summaries
+        Returns the summaries of a committed part.
+    has_frames
+        True if scans are handed out as frames, too.
+    keeper
+        What must live as long as the points are in use, for the parts go with it.
+    """
 
-    def check(self, sizes: Mapping[str, int], strays: Sequence[str]) -> None:
-        """Have the scans of missing and damaged parts cast again, and commit parts that are there.
-
-        `sizes` are those of the files in storage, and `strays` names of the job's, of which the
-        database may not know: it was lost, or is a copy of some seconds before.
-        """
-        lost: dict[str, list[Receipt]] = {"missing": [], "damaged": []}
-        known = {part.name for part in self.parts.ordered}
-        unknown = [name for name in strays if name not in known]
-        pool = ThreadPoolExecutor(min(CHECKERS, os.cpu_count() or 1), "check")
-        try:
-            states = pool.map(lambda part: self._state(part, sizes), self.parts.ordered)
-            for part, state in zip(self.parts.ordered, states, strict=True):
-                if state:
-                    lost[state].append(part)
-            for what, parts in lost.items():
-                if parts:
-                    self._drop(what, parts)
-            for receipt in filter(None, pool.map(self.receipt, unknown)):
-                self._store.db.commit([receipt])
-        finally:
-            pool.shutdown(cancel_futures=True)
-        self.resumed = self.parts.scans_done
-
-    def _drop(self, what: str, parts: Sequence[Receipt]) -> None:
-        self._store.db.drop(self.job.number, parts)
-        names = listed([part.name for part in parts])
-        scans = listed([scans_in_words(part.first, part.stop) for part in parts])
-        verb = "was" if len(parts) == 1 else "were"
-        self._store.notes.append(
-            f"cast again: {scans}; {names} {verb} {what} in {self._store.storage.url}"
-        )
-
-    def _state(self, part: Receipt, sizes: Mapping[str, int]) -> str:
-        """Say whether a part is not what its receipt says, to the checksum of each column."""
-        if part.name not in sizes:
-            return "missing"
-        if sizes[part.name] != part.size:
-            return "damaged"
-        found = self.receipt(part.name)
-        return "" if found is not None and _SAID(found) == _SAID(part) else "damaged"
+    def __init__(
+        self,
+        job: Job,
+        scans: range,
+        storage: Storage,
+        summaries: Callable[[Receipt], bytes],
+        *,
+        has_frames: bool = False,
+        keeper: object = None,
+    ) -> None:
+        super().__init__(job.number, job.scene, job.survey, scans, has_frames=has_frames)
+        self.job = job
+        self.storage = storage
+        self.resumed = 0  # scans whose points are of an earlier run
+        self.is_identified = False  # True if the store knows what the job is made of
+        self._summaries = summaries
+        self._keeper = keeper
 
     def receipt(self, name: str) -> Receipt | None:
-        """Receipt of a part in storage; None if it is damaged."""
-        storage = self._store.storage
+        """Return the receipt of a part in storage; None if the part is damaged."""
         try:
-            data = storage.read(name)
-            return Receipt.of_part(unpack(data), self.job.number, name, len(data))
+            data = self.storage.read(name)
+            return Receipt.of_part(unpack(data), self.number, name, len(data))
         except LidarError:
             return None
         except OSError as error:
             if error.errno in (errno.EIO, errno.ENOENT):  # a bad disk; just removed
                 return None
             raise LidarError(
-                f"The part {storage.path(name)} cannot be read: {error.strerror or error}."
+                f"The part {self.storage.path(name)} cannot be read: {error.strerror or error}."
             ) from error
 
     @property
     def kept(self) -> str:
         """Committed scans and trials in words; empty for none."""
         if self.parts.scans_done:
-            return f"{self.parts.scans_done:,} of {len(self.parts.scans):,} scans"
-        if self.parts.trials:
-            return f"{len(self.parts.trials):,} of {self.job.trials:,} planning trials"
+            return f"{self.parts.scans_done:,} of {len(self.scans):,} scans"
+        if self.trials:
+            return f"{len(self.trials):,} of {self.job.trials:,} planning trials"
         return ""
 
     @property
     def complete(self) -> bool:
-        """Whether everything for a result is committed."""
-        return self.parts.complete and len(self.parts.trials) == self.job.trials
+        """True if all scans and planning trials are committed, and all frames were handed out."""
+        return self.scans_complete and len(self.trials) == self.job.trials
 
     def progress(self) -> Progress:
         """Progress of a resumed run at its start."""
-        parts = self.parts
+        framed = self.frames - self.scans.start
         return Progress(
-            scans=len(parts.scans),
-            generated=parts.frames - parts.scans.start,
-            cast=parts.scans_done,
-            framed=parts.frames - parts.scans.start,
-            collected=parts.scans_done,
-            points=parts.point_count,
+            scans=len(self.scans),
+            generated=framed,
+            cast=self.parts.scans_done,
+            framed=framed,
+            collected=self.parts.scans_done,
+            points=self.parts.point_count,
             trials=self.job.trials,
-            trials_done=len(parts.trials),
+            trials_done=len(self.trials),
         )
 
+    def status(self, *, is_writing: bool) -> dict[str, Any]:
+        """Return what a page lists of the job: its name and values, and how far it is.
+
+        `stored` of its `scans` are in storage, with so many `points`; `seconds` is the casting time
+        so far, and `writing` is True while its files are written.
+        """
+        return {
+            "name": self.job.name,
+            "values": self.job.values,
+            "stored": self.parts.scans_done,
+            "scans": len(self.scans),
+            "points": self.parts.point_count,
+            "seconds": self.seconds,
+            "writing": is_writing,
+        }
+
     def points(self) -> StoredCloud:
-        """Points committed so far."""
+        """Return the points that are committed so far."""
         parts, job = self.parts.ordered, self.job
         world = job.survey.coordinates == "world"
         return StoredCloud(
-            self._store.storage,
+            self.storage,
             [part.name for part in parts],
             [part.first for part in parts],
             [part.rows for part in parts],
@@ -144,24 +132,24 @@ class JobPoints:
             self.parts.cells,
             job.survey.precision_m,
             job.scene.origin if world else np.zeros(3),
-            keeper=self._store,
+            keeper=self._keeper,
             sweeps=partial(Sweeps.of, job.survey, job.scene),
         )
 
     def points_of_scan(self, scan: int) -> Cloud:
-        """Points of a committed scan."""
+        """Return the points of a committed scan."""
         part = self.parts.part_of(scan)
-        columns = read_part(self._store.storage, part.name)
-        ends = np.cumsum(columns.counts)
-        at = scan - part.first
-        rows = slice(int(ends[at] - columns.counts[at]), int(ends[at]))
+        columns = read_part(self.storage, part.name)
+        stops = np.cumsum(columns.counts)
+        index = scan - part.first
+        rows = slice(int(stops[index] - columns.counts[index]), int(stops[index]))
         return self.points().cloud_of(columns, rows)
 
     def hit_counts(self) -> Ints:
-        """Hits by counters of the scene, see `Scene.counters`."""
+        """Return the hits by counters of the scene, see `Scene.counters`."""
         counts = np.zeros(self.job.scene.counters, np.int64)
         for part in self.parts.ordered:
-            triangles, hits = read_tally(self._store.storage, part.name)
+            triangles, hits = read_tally(self.storage, part.name)
             counts[triangles] += hits
         return counts
 
@@ -173,18 +161,13 @@ class JobPoints:
         every = max(1, samples * survey.scan_count // SAMPLE_RAYS)
         rays = [np.empty((0, 2, 3), np.float32)]
         every_nth = range(0, survey.scan_count, every)
-        wanted = dict.fromkeys(n for n in every_nth if not self.parts.missing(n, n + 1))
-        for first, data in self.parts.summaries_of(list(wanted)):
-            for scan, summary in enumerate(np.frombuffer(data, kind), first):
+        chosen = {scan for scan in every_nth if not self.parts.missing(scan, scan + 1)}
+        parts = {part.first: part for part in map(self.parts.part_of, sorted(chosen))}
+        for part in parts.values():
+            for scan, summary in enumerate(np.frombuffer(self._summaries(part), kind), part.first):
                 ends = summary["samples"][~np.isnan(summary["samples"][:, 0])]
-                if scan in wanted and len(ends):
+                if scan in chosen and len(ends):
                     start = np.asarray(survey.pose(scan).position, np.float32)
                     starts = np.broadcast_to(start, ends.shape)
                     rays.append(np.stack([starts, ends], axis=1))
         return np.concatenate(rays)
-
-
-def listed(names: Sequence[str], most: int = NAMED) -> str:
-    """Return the first names, and how many more there are."""
-    more = len(names) - most
-    return ", ".join(names[:most]) + (f" and {more:,} more" if more > 0 else "")

@@ -24,15 +24,16 @@ from ...base.software import software
 from ...columns.parts import mark_name, own_files, scans_of
 from ...datasets.job_table import JobRow
 from ...scenario.build import Job
-from ..job_source import CONTENT, Jobs, OneJob, identity_of
+from ..job_source import CONTENT, Jobs, identity_of
 from ..pipeline.failures import storing
 from .database import FILE, PARTS_FOLDER, DamagedError, RunDatabase, parts_folder, read_place
-from .job_under_way import JobPoints
+from .job_under_way import JobUnderWay
+from .part_check import check_parts
 from .remote import OWNER, RemoteRun, fetch_database
 
 PARTS = "parts"  # the folder of the parts, in the run's folder
 RUN_FOLDER = "run"  # the run's folder in the output folder, until the result is complete
-SENSORS_TOLD = 8  # kinds of a sensor that are named
+SENSORS_NAMED = 8  # kinds of a sensor that are named
 _OTHERS = "and others"
 
 # On the command line, and in Python.
@@ -80,18 +81,19 @@ class RunStore:
                 "parts are given a place, and nothing would know of them afterwards: give a "
                 "folder for the run as well."
             )
-        self.jobs, self._wanted = jobs, backend
+        self.jobs = jobs
+        self._requested_backend = backend
         self.lasting = place is not None
         self.notes: list[str] = []  # remarks for the user
-        self.begun = False  # whether it goes on with an earlier run
-        self._gone = False
+        self.begun = False  # True if it continues an earlier run
+        self._removed = False
         self.identity = software() | dict(jobs.identity)
-        self._whose = self.identity | {"shard": str(jobs.shard)}
+        self._run_identity = self.identity | {"shard": str(jobs.shard)}
         self._remote = None
-        kept = Storage.at(tempfile.mkdtemp(prefix="lidarpool-") if place is None else place)
-        self.place = self._folder = kept  # that of the run, and that of its database
-        if not kept.is_local:
-            self._remote = RemoteRun(kept)
+        self.place = Storage.at(tempfile.mkdtemp(prefix="lidarpool-") if place is None else place)
+        self._folder = self.place  # of the database
+        if not self.place.is_local:
+            self._remote = RemoteRun(self.place)
             self._folder = Storage.at(tempfile.mkdtemp(prefix="lidarpool-"))
         folder = self._folder.local()
         if place is None or self._remote:
@@ -99,8 +101,8 @@ class RunStore:
         advice = "make the one that it lies in first, or give another"
         with explained(f"The run's folder {folder} cannot be made", advice):
             folder.mkdir(exist_ok=True)
-        self.under_way: dict[int, JobPoints] = {}  # {number: of a job that is under way}
-        self.only: JobPoints | None = None  # of the only job, of a survey; None for a campaign
+        self.under_way: dict[int, JobUnderWay] = {}  # {number: job}
+        self.only: JobUnderWay | None = None  # the only job, of a survey; None for a campaign
         with ExitStack() as undo:
             undo.callback(self._folder.remove, [], folder=True)
             self.db = self._open(parts, resume)
@@ -113,7 +115,7 @@ class RunStore:
         """Open the database, or a new one if nothing is committed in it."""
         path = _database(self._folder)
         durable = self.lasting and self._remote is None
-        mark, earlier = "", ""  # of a run that has kept nothing, and the place of its parts
+        mark = earlier_parts = ""  # of a run that has kept nothing: mark and place of its parts
         damage: DamagedError | None = None
         try:
             if self._remote:
@@ -124,13 +126,13 @@ class RunStore:
                     self.begun = True
                     return db
                 db.close()
-                mark, earlier = db.meta["mark"], db.meta.get("parts", "")
+                mark, earlier_parts = db.meta["mark"], db.meta.get("parts", "")
         except DamagedError as error:
             damage = error
         except LidarError as error:  # the copy of a database is nobody's business
             raise LidarError(str(error).replace(self._folder.url, self.place.url)) from error
         new = self._marked(parts) if resume else None
-        if new is not None and mark and self._other(new["identity"]):
+        if new is not None and mark and self._difference(new["identity"]):
             new = None  # it has kept nothing
         if new is not None:
             read_place(path)  # an error if it is another program's
@@ -139,16 +141,16 @@ class RunStore:
             lost = f"{FILE} was missing or damaged, and is made again from the parts"
             self.notes += [lost] * (not mark)
         elif damage is not None:
-            told = str(damage).replace(self._folder.url, self.place.url)
-            raise LidarError(told) from damage
+            reason = str(damage).replace(self._folder.url, self.place.url)
+            raise LidarError(reason) from damage
         elif self.lasting:
-            _remove(self.place, parts_of(self.place, earlier), mark)
+            _remove(self.place, parts_of(self.place, earlier_parts), mark)
         path.unlink(missing_ok=True)
         self._folder.prepare()
         if new is None:
             mark = secrets.token_hex(8)
             shared = Storage.at(parts).path(parts_folder(mark)) if parts is not None else ""
-            new = {"mark": mark, "identity": json.dumps(self._whose), "parts": shared}
+            new = {"mark": mark, "identity": json.dumps(self._run_identity), "parts": shared}
         try:
             return RunDatabase(path, durable=durable, **new)
         except LidarError:
@@ -158,17 +160,18 @@ class RunStore:
             raise
 
     def _marked(self, parts: str | Path | Storage | None) -> dict[str, str] | None:
-        """Return what the database of this run began with, as the folder of its parts says it."""
+        """Return the first values of this run's database, from the folder of its parts."""
         places = [self.place.below(PARTS)]
         if parts is not None:
             shared = Storage.at(parts)
-            places = [shared.below(one) for one in shared.entries() if PARTS_FOLDER.fullmatch(one)]
+            folders = filter(PARTS_FOLDER.fullmatch, shared.entries())
+            places = [shared.below(name) for name in folders]
         for place in places:
             for name in place.sizes():
                 with suppress(ValueError, LookupError, TypeError, AttributeError, OSError):
-                    told = json.loads(place.read(name)) if name.endswith("-mark") else {}
-                    if told.pop("place") == self.place.url and name == mark_name(told["mark"]):
-                        return {key: str(value) for key, value in told.items()}
+                    values = json.loads(place.read(name)) if name.endswith("-mark") else {}
+                    if values.pop("place") == self.place.url and name == mark_name(values["mark"]):
+                        return {key: str(value) for key, value in values.items()}
         return None
 
     def _claim(self, resume: bool) -> None:
@@ -182,8 +185,8 @@ class RunStore:
                 self._strays.setdefault(scans[0], []).append(name)
         if self.db.used:
             self._check_same(self.db.meta["identity"])
-        if isinstance(self.jobs, OneJob):
-            self.only = self.under_way[0] = JobPoints(self, self.jobs.only)
+        if (only_job := self.jobs.only_job) is not None:
+            self.only = self._take_on(only_job)
         if self.db.used:
             self._go_on(resume)
         if self._remote:
@@ -193,13 +196,14 @@ class RunStore:
                 self.storage.prepare()
                 self._write_mark()
         if self.only is not None:  # now that the run itself is known to be the same
-            self.only.check(self._sizes, self._strays.get(0, ()))
+            strays = self._strays.get(self.only.number, ())
+            self.notes += check_parts(self.only, self.db, self._sizes, strays)
 
     def _write_mark(self) -> None:
-        kept = ("mark", "identity", "parts", "backend", "casting")
-        told = {name: self.db.meta[name] for name in kept if name in self.db.meta}
-        told["place"] = self.place.url
-        self.storage.write(mark_name(told["mark"]), json.dumps(told).encode())
+        names = ("mark", "identity", "parts", "backend", "casting")
+        values = {name: self.db.meta[name] for name in names if name in self.db.meta}
+        values["place"] = self.place.url
+        self.storage.write(mark_name(values["mark"]), json.dumps(values).encode())
 
     def _go_on(self, resume: bool) -> None:
         """Check that this run may continue the existing one, which is the same."""
@@ -208,33 +212,34 @@ class RunStore:
                 f"{self.place} holds an unfinished run, {self.kept}: continue it with "
                 f"{_RESUME}, or drop it with {_DROP}."
             )
-        if self.backend and self._wanted not in ("auto", self.backend):
+        if self.backend and self._requested_backend not in ("auto", self.backend):
             raise LidarError(
-                f"Backend {self._wanted!r} is asked for, and the scans in {self.place} were "
-                f"cast with {self.backend!r}: continue with that, or drop them with {_DROP}."
+                f"Backend {self._requested_backend!r} is asked for, and the scans in {self.place} "
+                f"were cast with {self.backend!r}: continue with that, or drop them with {_DROP}."
             )
 
-    def _other(self, identity: str) -> str:
-        """Describe the difference of an earlier run in a clause; empty if there is none."""
-        there = json.loads(identity)
-        for name, value in self._whose.items():
-            if there.get(name) != value:
+    def _difference(self, identity: str) -> str:
+        """Return how an earlier run differs, as a clause; empty if it is the same."""
+        earlier = json.loads(identity)
+        for name, value in self._run_identity.items():
+            if earlier.get(name) != value:
                 if name == "shard":
-                    earlier, wanted = map(shard_in_words, (str(there.get(name)), str(value)))
-                    return f"it is {earlier}, not {wanted}"
+                    shards = str(earlier.get(name)), str(value)
+                    earlier_shard, requested_shard = map(shard_in_words, shards)
+                    return f"it is {earlier_shard}, not {requested_shard}"
                 if name in CONTENT:
                     return f"it is of another {name}"
                 if name != "lidarpool":
                     return f"it is of another campaign: its {name} differs"
-                return f"it was written with {name} {there.get(name, 'none')}, here it is {value}"
+                return f"it was written with {name} {earlier.get(name, 'none')}, here it is {value}"
         return ""
 
     def _check_same(self, identity: str) -> None:
-        """Check that the run that is there is the same."""
-        if other := self._other(identity):
+        """Check that an earlier run in this place is the same."""
+        if difference := self._difference(identity):
             raise LidarError(
-                f"The run in {self.place} cannot be continued, {other}. Drop it with {_DROP}, or "
-                "give another folder."
+                f"The run in {self.place} cannot be continued, {difference}. Drop it with {_DROP}, "
+                "or give another folder."
             )
 
     # -- reading ---------------------------------------------------------------------------
@@ -291,22 +296,36 @@ class RunStore:
 
     # -- jobs --------------------------------------------------------------------------------
 
-    def points_of(self, job: Job) -> JobPoints:
-        """Return what is kept of a job under way; parts of an earlier run are checked first."""
-        if (found := self.under_way.get(job.number)) is not None:
-            return found
-        points = self.under_way[job.number] = JobPoints(self, job)
+    def take_on(self, job: Job) -> JobUnderWay:
+        """Return a job under way; parts of an earlier run are checked first."""
+        if job.number in self.under_way:
+            return self.under_way[job.number]
+        under_way = self._take_on(job)
         strays = self._strays.pop(job.number, ())
         if job.number in self.db.begun or strays:
-            known = self.db.hash_of(job.number)
-            points.identified = bool(known) and known == _hash_of(job)
-            if points.identified:
-                points.check(self._sizes, strays)
+            earlier_hash = self.db.hash_of(job.number)
+            under_way.is_identified = bool(earlier_hash) and earlier_hash == _hash_of(job)
+            if under_way.is_identified:
+                self.notes += check_parts(under_way, self.db, self._sizes, strays)
             else:  # files that it is made of have changed, or a run died before it kept the hash
-                self.db.restart(job.number)
+                self.db.restart(under_way)
                 self.storage.remove(strays)
-                points.resumed = 0
-        return points
+                under_way.resumed = 0
+        return under_way
+
+    def _take_on(self, job: Job) -> JobUnderWay:
+        """Return a job with what is committed of it, from now on under way."""
+        is_only = self.jobs.only_job is not None
+        count = job.survey.scan_count
+        scans = self.jobs.shard.scans(count) if is_only else range(count)
+        under_way = JobUnderWay(
+            job, scans, self.storage, self.db.summaries, has_frames=is_only, keeper=self
+        )
+        self.db.read(under_way)
+        under_way.resumed = under_way.parts.scans_done
+        under_way.is_identified = is_only  # by the identity of the run
+        self.under_way[job.number] = under_way
+        return under_way
 
     def end(self, rows: Sequence[JobRow]) -> None:
         """Commit that jobs have ended."""
@@ -341,18 +360,18 @@ class RunStore:
         Where it is time or `now`, copy the database. LidarError if that fails, or another run
         has taken over.
         """
-        for number, points in self.under_way.items():
-            if points.parts.scans_done and not points.complete and not points.identified:
-                points.identified = True
-                self.db.set_hash(number, _hash_of(points.job))
-        self.db.save_frames()
+        for job in self.under_way.values():
+            if job.parts.scans_done and not job.complete and not job.is_identified:
+                job.is_identified = True
+                self.db.set_hash(job.number, _hash_of(job.job))
+        self.db.save_frames(self.under_way.values())
         if self._remote:
             self._remote.save(self.db, now=now)
 
     def tidy(self) -> None:
         """Remove parts that are in no job under way, of dead or superseded collectors."""
         mark = self.db.meta["mark"]
-        of_jobs = [part.name for p in self.under_way.values() for part in p.parts.ordered]
+        of_jobs = [part.name for job in self.under_way.values() for part in job.parts.ordered]
         ours = {mark_name(mark), *of_jobs}
         with suppress(OSError, LidarError):
             self.storage.remove([n for n in own_files(self.storage, mark) if n not in ours])
@@ -361,7 +380,7 @@ class RunStore:
         """Remove the store: the result is in place. Files of others among the parts stay."""
         if self._remote:
             self._remote.check()
-        self._gone = True
+        self._removed = True
         self.db.close()
         _remove(self.place, self.storage, self.db.meta["mark"])
 
@@ -371,7 +390,7 @@ class RunStore:
         try:
             yield
         except BaseException as error:
-            if self._gone or not self.lasting:
+            if self._removed or not self.lasting:
                 raise
             with suppress(LidarError):  # report the first error
                 self.save(now=True)
@@ -396,17 +415,17 @@ class RunStore:
 
 def with_sensors(known: Mapping[str, str], more: Iterable[tuple[str, str]]) -> dict[str, str]:
     """Return {name of a sensor: its kinds in words} with more: the same in whatever order."""
-    found = dict(known)
+    sensors = dict(known)
     for name, words in more:
-        kinds = {*found.get(name, words).split("; "), *words.split("; ")}
-        told = sorted(kinds - {_OTHERS})
-        others = [_OTHERS] * (_OTHERS in kinds or len(told) > SENSORS_TOLD)
-        found[name] = "; ".join([*told[:SENSORS_TOLD], *others])
-    return dict(sorted(found.items()))
+        kinds = {*sensors.get(name, words).split("; "), *words.split("; ")}
+        named = sorted(kinds - {_OTHERS})
+        others = [_OTHERS] * (_OTHERS in kinds or len(named) > SENSORS_NAMED)
+        sensors[name] = "; ".join([*named[:SENSORS_NAMED], *others])
+    return dict(sorted(sensors.items()))
 
 
 def _hash_of(job: Job) -> str:
-    """Hash of what a job is made of; empty if that cannot be told: then it is not resumed."""
+    """Return the hash of a job's inputs; empty if they have none: then it is not resumed."""
     try:
         return fingerprint(identity_of(job))
     except LidarError:
@@ -448,10 +467,10 @@ def remove_run(folder: str | Path | Storage) -> None:
         if not place.is_local:
             fetch_database(place, path)
         try:
-            found = read_place(path)
+            place_of_parts = read_place(path)
         except LidarError as error:
             raise LidarError(str(error).replace(temporary, place.url)) from error
-        mark, parts = found or (None, "")
+        mark, parts = place_of_parts or (None, "")
         _remove(place, parts_of(place, parts), mark)
 
 
@@ -461,6 +480,6 @@ def _remove(place: Storage, parts: Storage, mark: str | None) -> None:
     `mark` is None if the database does not say it: then that in the folder of the parts counts.
     """
     with explained(f"The run in {place} cannot be removed"):
-        own = own_files(parts, mark)  # an error if they are behind a link
-        parts.remove(own, folder=True)
+        names = own_files(parts, mark)  # an error if they are behind a link
+        parts.remove(names, folder=True)
         place.remove([FILE, f"{FILE}-journal", OWNER], folder=True)

@@ -1,0 +1,120 @@
+"""What is committed of a job: its parts in scan order, planning trials, and frames."""
+
+from __future__ import annotations
+
+import bisect
+from dataclasses import replace
+from operator import attrgetter
+
+import numpy as np
+
+from lidarsim.base.arrays import Ints
+
+from ...plan import Trial
+from .messages import Receipt
+
+_FIRST = attrgetter("first")  # the order of parts
+
+
+class CommittedParts:
+    """Receipts of the committed parts of a job, in scan order."""
+
+    def __init__(self) -> None:
+        self.ordered: list[Receipt] = []  # without summaries
+        self.scans_done = 0
+        self.point_count = 0
+        self.hits = 0
+
+    @property
+    def cells(self) -> Ints | None:
+        """Lowest and highest cell of all points, (2, 3); None without points."""
+        cells = [part.cells for part in self.ordered if part.cells]
+        if not cells:
+            return None
+        table = np.array(cells, np.int64).reshape(-1, 2, 3)
+        return np.stack([table[:, 0].min(axis=0), table[:, 1].max(axis=0)])
+
+    def reaching_past(self, scan: int) -> list[Receipt]:
+        """Return the parts that have this scan or later ones, in order."""
+        return [part for part in self.ordered[self._index(scan) :] if part.stop > scan]
+
+    def part_of(self, scan: int) -> Receipt:
+        """Return the part of a committed scan; KeyError if the scan is not committed."""
+        for part in self.ordered[self._index(scan) :][:1]:
+            if scan in part.scans:
+                return part
+        raise KeyError(scan)
+
+    def missing(self, first: int, stop: int) -> list[tuple[int, int]]:
+        """Return the scans from `first` to `stop` that are not committed, as half-open ranges."""
+        absent: list[tuple[int, int]] = []
+        index = self._index(first)
+        while first < stop and index < len(self.ordered):
+            part = self.ordered[index]
+            if first < part.first:
+                absent.append((first, min(part.first, stop)))
+            first = max(first, part.stop)
+            index += 1
+        return [*absent, (first, stop)] if first < stop else absent
+
+    def add(self, part: Receipt) -> None:
+        """Add a part, whose scans are missing."""
+        bare = replace(part, summaries=b"", record=None, held_at="")
+        bisect.insort(self.ordered, bare, key=_FIRST)
+        self._count(part, 1)
+
+    def remove(self, part: Receipt) -> None:
+        """Remove a part."""
+        del self.ordered[self._index(part.first)]
+        self._count(part, -1)
+
+    def _index(self, scan: int) -> int:
+        """Return the index of the last part that begins with a scan or before; 0 for none."""
+        return max(0, bisect.bisect_right(self.ordered, scan, key=_FIRST) - 1)
+
+    def _count(self, part: Receipt, sign: int) -> None:
+        self.scans_done += sign * len(part.scans)
+        self.point_count += sign * part.rows
+        self.hits += sign * part.hits
+
+
+class CommittedJob:
+    """What is committed of a job; only the run's database changes parts and trials.
+
+    Parameters
+    ----------
+    number
+        Number of the job in its run.
+    scans
+        Scans that are to be done.
+    has_frames
+        True if scans are handed out as frames, too.
+    """
+
+    def __init__(self, number: int, scans: range, *, has_frames: bool = False) -> None:
+        self.number = number
+        self.scans = scans
+        self.has_frames = has_frames
+        self.forget_committed()
+
+    def forget_committed(self) -> None:
+        """Forget what is committed."""
+        self.parts = CommittedParts()
+        self.trials: list[Trial] = []
+        self.frames = self.scans.start  # one past the last scan that was handed out as a frame
+        self.frames_written = self.scans.start  # the same, as the database has it
+
+    @property
+    def left(self) -> int:
+        """Number of scans that are not committed."""
+        return len(self.scans) - self.parts.scans_done
+
+    @property
+    def scans_complete(self) -> bool:
+        """True if all scans are committed, and were handed out if the job has frames."""
+        framed = not self.has_frames or self.frames == self.scans.stop
+        return framed and not self.left
+
+    def unframed(self) -> list[Receipt]:
+        """Return the parts with scans that were not handed out as frames, in order."""
+        return self.parts.reaching_past(self.frames)

@@ -1,0 +1,93 @@
+"""A job in the pipeline: which scans are committed, handed out as frames, and cast."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterable
+
+import numpy as np
+
+from lidarsim.columns.cloud import Cloud
+from lidarsim.scene.scene import Scene
+from lidarsim.sensor import Survey
+
+from ...base.tracing import trace
+from .committed_job import CommittedJob
+from .messages import Receipt, ScanFrame, Summaries, samples_of_scan, summary_type
+from .names import SORT
+
+
+class PipelineJob(CommittedJob):
+    """A job in the pipeline; subclasses say where the points of its scans are read.
+
+    Parameters
+    ----------
+    number
+        Number of the job in its run.
+    scene, survey
+        What is scanned, and how.
+    scans
+        Scans that are to be done.
+    has_frames
+        True if scans are handed out as frames, too.
+    """
+
+    def __init__(
+        self, number: int, scene: Scene, survey: Survey, scans: range, *, has_frames: bool = False
+    ) -> None:
+        super().__init__(number, scans, has_frames=has_frames)
+        self.scene = scene
+        self.survey = survey
+        # How the pipeline casts it; `Pipeline.begin` sets these.
+        self.run = ""  # id of the run, for traces
+        self.packed = b""  # the survey, pickled
+        self.scene_name = ""  # jobs of one scene may be cast in one task
+        self.scans_per_task = 1  # that fit into the memory of a casting task
+        self.scans_of_run = 0  # of all jobs, where many are like this one
+        self.on_frame: Callable[[ScanFrame], None] | None = None
+        self.on_parts: Callable[[list[Receipt]], None] | None = None
+        # How far the pipeline is.
+        self.generated = scans.start  # one past the last scan that was taken from stage 1
+        self.cast = 0  # scans that stage 2 has finished
+        self.offered_again = 0  # batches
+        self.seconds = 0.0  # casting time of committed batches
+        self.condemned: list[str] = []  # why scans cannot be done
+        self.sorted_at = time.monotonic()  # when the last frames came
+
+    def points_of_scan(self, scan: int) -> Cloud:
+        """Return the points of a committed scan."""
+        raise NotImplementedError
+
+    def trace(self, event: str, stage: str, scans: Iterable[int], **more: str) -> None:
+        """Report that the driver has reached a point with some scans."""
+        more |= {"run": self.run, "stage": stage}
+        trace(f"driver.{event}", job=self.number, scans=list(scans), **more)
+
+    def hand_out(self, ordered: Summaries) -> int:
+        """Hand out frames; return their number, since some may have been handed out before."""
+        self.sorted_at = time.monotonic()
+        earlier = self.frames
+        survey = self.survey
+        kind = summary_type(samples_of_scan(survey.scan_count))
+        for scan, summary in zip(ordered.scans, np.frombuffer(ordered.data, kind), strict=True):
+            if scan != self.frames:
+                continue
+            assert self.on_frame is not None, "it has frames"
+            samples = summary["samples"]
+            spec = survey.scan(scan)
+            frame = ScanFrame(
+                scan,
+                survey.carried[spec.sensor].name,
+                spec.ray_count,
+                int(summary["hits"]),
+                int(summary["points"]),
+                samples[~np.isnan(samples[:, 0])],
+                survey,
+                self.points_of_scan,
+            )
+            self.trace("frame", SORT, [scan])
+            self.on_frame(frame)
+            # Only now: after an error of the caller the frame is handed out again.
+            self.frames = scan + 1
+            self.trace("release", SORT, [scan])
+        return self.frames - earlier
