@@ -21,6 +21,9 @@ from lidarpool import LidarError, Noise, fit
 from lidarpool.compare.fit import Repeats, smooth_rays, surfaces
 from lidarpool.compare.recordings import Recording, open_recording
 from lidarsim.sensor.models import read_model
+from lidarsim.simulator.angle_noise import angle_errors
+from lidarsim.simulator.detection import detected
+from lidarsim.simulator.range_noise import noisy_ranges
 
 COLOURS = {"recorded": "#1c2430", "data sheet": "#ee7733", "fitted": "#4477aa"}
 
@@ -38,10 +41,10 @@ def simulated(noise: Noise, rays: Any, energy: Any, sweeps: int) -> Any:
     keys = np.arange(len(rays.row))
     out = np.full((sweeps, len(keys)), np.nan)
     for scan in range(sweeps):
-        across, _ = noise.angles(np.full(len(keys), scan), keys)
+        across, _ = angle_errors(noise, np.full(len(keys), scan), keys)
         ranges = rays.distance + rays.slope * across  # along the steepest slope
-        moved = noise.ranges(ranges, energy, np.full(len(keys), scan), keys, 0 * keys)
-        seen = noise.detected(energy, np.full(len(keys), scan), keys, 0 * keys)
+        moved = noisy_ranges(noise, ranges, energy, np.full(len(keys), scan), keys, 0 * keys)
+        seen = detected(noise, energy, np.full(len(keys), scan), keys, 0 * keys)
         out[scan] = np.where(seen, moved, np.nan)
     return out
 

@@ -23,7 +23,9 @@ from lidarpool import (
 from lidarsim.scene.actors import Actor, box
 from lidarsim.scene.robot import Hinge, LinkPath
 from lidarsim.sensor.trajectory import Stations, quaternions_of, rotations_of, velocities
-from lidarsim.simulator.returns import AIR, FALSE_ALARM, PulseReturns
+from lidarsim.simulator.air import AIR
+from lidarsim.simulator.false_alarms import FALSE_ALARM
+from lidarsim.simulator.returns import PulseReturns
 from lidarsim.simulator.rig import Rig
 from lidarsim.simulator.separation import separated
 

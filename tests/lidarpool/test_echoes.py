@@ -41,7 +41,9 @@ from lidarsim.scene.actors import box as cuboid
 from lidarsim.scene.scene_mesh import SceneMesh
 from lidarsim.scene.shapes import seed_objects
 from lidarsim.sensor.materials import extinction, fresnel
-from lidarsim.sensor.noise import Purpose, raw
+from lidarsim.sensor.random_numbers import raw
+from lidarsim.simulator.angle_noise import ACROSS
+from lidarsim.simulator.range_noise import RANGE
 from lidarsim.simulator.returns import PulseReturns
 from lidarsim.simulator.rig import Rig
 from lidarsim.simulator.separation import chosen, separated
@@ -51,13 +53,13 @@ from lidarsim.simulator.separation import chosen, separated
 
 def test_random_numbers_follow_from_what_they_are_for_alone():
     rays = np.arange(1000)
-    one, other = Purpose.RANGE, Purpose.ACROSS
+    one, other = RANGE, ACROSS
     whole = raw(7, one, 3, rays)
     assert np.array_equal(whole[500:], raw(7, one, np.full(500, 3), rays[500:]))
     keys = [(8, one, 3, rays), (7, other, 3, rays), (7, one, 4, rays), (7, one, 3, rays, 1)]
     others = [raw(*key) for key in keys]
     assert len(set(np.concatenate([whole, *others]).tolist())) == 5000
-    zero = SimpleNamespace(value=0)
+    zero = SimpleNamespace(number=0)
     assert raw(0, zero, 0, 0).tolist() == [16294208416658607535], "SplitMix64 of another program"
 
 

@@ -36,8 +36,8 @@ from lidarsim.scene.face_materials import FaceMaterials
 from lidarsim.scene.scene_file import write_scene
 from lidarsim.scene.scene_mesh import Cutout
 from lidarsim.simulator.batch import columns_of
-from lidarsim.simulator.returns import BLOOMING
 from lidarsim.simulator.rig import Rig
+from lidarsim.simulator.stray_light import BLOOMING
 from raybeam import available_backends, registry
 
 CPU = [name for name in ("numpy", "embree") if not available_backends()[name]]

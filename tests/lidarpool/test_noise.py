@@ -27,9 +27,12 @@ from lidarpool import (
     Track,
 )
 from lidarsim.sensor.navigation import fixes, imu_samples
-from lidarsim.sensor.noise import Purpose, named_seed, raw, starts
+from lidarsim.sensor.random_numbers import Purpose, named_seed, raw, starts
 from lidarsim.sensor.weather import Weather, rain, snow
-from lidarsim.simulator import pulse_loops
+from lidarsim.simulator import air_loops, pulse_loops, random_loops, spray_loops
+from lidarsim.simulator.losses import PACKET
+from lidarsim.simulator.range_noise import CHANNEL
+from lidarsim.simulator.recording import SAMPLE, SAMPLES
 from lidarsim.simulator.rig import Rig
 from raybeam.compiled import compiled
 
@@ -80,7 +83,7 @@ def everything():
 
 def test_no_random_number_is_used_twice(monkeypatch):
     """With three kinds of particles: keys that differ have hashes that differ."""
-    drawn, purposes, compiled_bits = {}, {}, compiled()(pulse_loops._bits.py_func)
+    drawn, purposes, compiled_bits = {}, {}, compiled()(random_loops.bits.py_func)
 
     def recorded(seed, purpose, *key):
         bits = raw(seed, purpose, *key)
@@ -104,22 +107,26 @@ def test_no_random_number_is_used_twice(monkeypatch):
                 and getattr(module, known.__name__, None) is known
             ):
                 monkeypatch.setattr(module, known.__name__, other)
-    plain = vars(pulse_loops) | {"_bits": hashed}  # others are compiled without these
-    for name in ("_uniform", "_scan_of", "_column", "particles", "fog", "spray"):
-        plain[name] = FunctionType(getattr(pulse_loops, name).py_func.__code__, plain)
-    for name in ("particles", "fog", "spray"):
-        monkeypatch.setattr(pulse_loops, name, plain[name])
+    for loops, names in ((air_loops, ["particles", "fog"]), (spray_loops, ["_column", "clumps"])):
+        # Others are compiled without these.
+        plain = vars(random_loops) | vars(loops) | {"bits": hashed}
+        functions = [random_loops.uniform, pulse_loops.scan_row, *(vars(loops)[n] for n in names)]
+        for function in functions:
+            code = function.py_func.__code__
+            plain[code.co_name] = FunctionType(code, plain)
+        for name in names:
+            monkeypatch.setattr(loops, name, plain[name])
     kinds = rain(20.0), snow(1.0), rain(5.0)
     monkeypatch.setattr(Weather, "particles", property(lambda _: kinds))
     scene, survey = everything()
     for returns in Rig(scene, survey, "numpy").cast(0, survey.scan_count):
         assert len(returns.radial_velocity) > 1000
     assert len([*imu_samples(survey), *fixes(survey)]) == 2
-    assert {*Purpose} == drawn.keys(), "all are tried"
+    assert {*Purpose.declared.values()} == drawn.keys(), "all are tried"
     each = {purpose: np.concatenate(bits) for purpose, bits in drawn.items()}
     # Windows of one waveform share samples, returns of a channel its error, those of a packet its
     # fate.
-    for again in (Purpose.SAMPLES, Purpose.SAMPLE, Purpose.CHANNEL, Purpose.PACKET):
+    for again in (SAMPLES, SAMPLE, CHANNEL, PACKET):
         each[again] = np.unique(each[again])
     for purpose, bits in each.items():
         assert len(np.unique(bits)) == len(bits), purpose

@@ -32,8 +32,11 @@ from lidarsim.columns.waveforms import WAVEFORM
 from lidarsim.scene.scene_mesh import SceneMesh
 from lidarsim.sensor.noise import THRESHOLD_SIGMAS
 from lidarsim.simulator.batch import columns_of
-from lidarsim.simulator.returns import BLOOMING, CROSSTALK, FALSE_ALARM, SURFACE
+from lidarsim.simulator.crosstalk import CROSSTALK
+from lidarsim.simulator.false_alarms import FALSE_ALARM
+from lidarsim.simulator.returns import SURFACE
 from lidarsim.simulator.rig import Rig
+from lidarsim.simulator.stray_light import BLOOMING
 from raybeam import available_backends
 
 WHITE = [Material("*", reflectance=1.0)]

@@ -2,25 +2,33 @@
 
 from __future__ import annotations
 
+import math
 import re
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
 import pytest
+from tests.shapes import beam_along_x, cast, wall
 
 from lidarpool import Fault, Material, Mounted, Noise, Returns, Scene, Survey, load_sensor
-from lidarsim.sensor.noise import Purpose
+from lidarsim.columns.table import CAUSES
+from lidarsim.sensor.navigation import DRIVEN, OUTAGE, SKEW, WALK, WHITE
+from lidarsim.sensor.random_numbers import Purpose
 from lidarsim.sensor.survey import OPTIONAL_NAMES
-from lidarsim.simulator.returns import PulseReturns
+from lidarsim.simulator.doppler import VELOCITY
+from lidarsim.simulator.losses import DirtStep
+from lidarsim.simulator.paths import CastStep
+from lidarsim.simulator.recording import RecordingStep
+from lidarsim.simulator.returns import SURFACE, PulseReturns, merged, unreal
 from lidarsim.simulator.rig import Rig
-from lidarsim.simulator.steps import STEPS
+from lidarsim.simulator.step import PulseStep, Role
+from lidarsim.simulator.steps import STEPS, add_step, received_causes, remove_step
 
 EFFECTS = Path(__file__).parents[2] / "docs/effects.md"
 # What is no step: figures for steps, a column, and files.
 OTHERS = {"Data sheets", "Radial velocity", "People who walk", "Navigation"}
-OF_OTHERS = {
-    *(Purpose.VELOCITY, Purpose.WHITE, Purpose.DRIVEN, Purpose.WALK, Purpose.SKEW, Purpose.OUTAGE)
-}
+OF_OTHERS = {*(VELOCITY, WHITE, DRIVEN, WALK, SKEW, OUTAGE)}
 
 NOISE = Noise(
     range_m=0.02,
@@ -50,6 +58,7 @@ COMMON = {
     "rain_mm_h": 20,
     "faults": FAULTS,
 }
+RECEIVED = ["blooming", "crosstalk", "false alarm"]  # whose light shows no velocity
 SURVEYS = {
     "hits": Survey(**COMMON, returns=Returns("dual", 7)),
     "waveforms": Survey(**COMMON, returns=Returns("all", 7, waveform="gaussian")),
@@ -67,7 +76,21 @@ def test_random_numbers_belong_to_one_step():
     steps = [step for step in STEPS if step.__name__ != "DetectionStep"]
     used = [purpose for step in steps for purpose in step.purposes]
     assert len(used) == len(set(used))
-    assert {*used, *OF_OTHERS} == set(Purpose)
+    assert {*used, *OF_OTHERS} == {*Purpose.declared.values()}
+    numbers = [purpose.number for purpose in used]
+    # Bytes of clouds depend on these.
+    assert sorted(numbers) == [*range(1, 6), *range(10, 19), *range(20, 24), 30, 31, 50, 51, 60, 61]
+
+
+def test_a_number_of_random_numbers_is_declared_once():
+    with pytest.raises(ValueError, match=r"^random numbers 2 are of .* 'again' needs others$"):
+        Purpose(2, "again")
+
+
+def test_each_cause_is_of_one_step():
+    causes = [cause for step in STEPS for cause in step.causes]
+    assert sorted([SURFACE, *causes]) == [*range(len(CAUSES))]
+    assert sorted(CAUSES[cause] for cause in received_causes()) == RECEIVED
 
 
 def same(one, other):
@@ -82,7 +105,7 @@ class Watched:
     """A step that is applied again, with other values in columns that it does not read."""
 
     def __init__(self, step):
-        self._step, self.of_kept = step, step.of_kept
+        self._step, self.role = step, step.role
 
     def apply(self, returns, batch):
         step, before = self._step, (batch.hits, batch.planes, batch.air)
@@ -121,3 +144,142 @@ def test_steps_read_and_write_what_they_say(name):
 def test_a_survey_without_effects_has_no_steps():
     (pulses,) = Rig(Scene.seed(), Survey(poses=[(0, 0, 1)]), "numpy")._pulses
     assert pulses.steps == []
+
+
+# -- steps of other packages ----------------------------------------------------------------------
+
+ADDED_M, WALL_M, BEAMS = 0.5, 10.0, 8
+SHOWN = "ray", "range", "intensity", "cause"
+
+
+class Everywhere(PulseStep):
+    """A step that applies to every sensor."""
+
+    role = Role.FRAME
+
+    @staticmethod
+    def applies(setup):
+        return True
+
+
+class HalfOfReturns(Everywhere):
+    """Loses the hits of every second beam, and half of the energy of the others."""
+
+    role = Role.CHANGES
+
+    def apply(self, returns, batch):
+        hits = batch.select(np.flatnonzero(returns.ray // batch.each % 2 == 0))
+        batch.hits = hits._replace(energy=hits.energy / 2)
+        return batch.hits
+
+
+class Echo(Everywhere):
+    """Adds a return of each pulse, in front of the wall."""
+
+    role = Role.RECEIVES
+
+    def apply(self, returns, batch):
+        rays = np.arange(batch.start, batch.stop)
+        distance, energy = np.full(len(rays), ADDED_M), np.full(len(rays), 0.125)
+        return merged(returns, unreal(returns, rays, distance, energy, 2))
+
+
+class Aside(Everywhere):
+    """Turns beams to the left by an angle whose tangent is 0.1."""
+
+    role = Role.AIMS | Role.ABOUT_AXIS
+
+    def apply(self, returns, batch):
+        batch.turn(np.tile([0.1, 0.0], (batch.stop - batch.start, 1)))
+        return returns
+
+
+class Farther(Everywhere):
+    """Reports all ranges a metre longer."""
+
+    role = Role.OF_KEPT
+
+    def apply(self, returns, batch):
+        return returns._replace(reported=returns.reported + 1)
+
+
+@contextmanager
+def added(*steps):
+    """Add steps, and remove them at the end."""
+    for step in steps:
+        add_step(step)
+    try:
+        yield
+    finally:
+        for step in steps:
+            remove_step(step)
+
+
+def points(*steps, mode="all", subrays=1, **options):
+    """Points of beams along x, which hit a wall, where steps apply as well."""
+    given = {"returns": Returns(mode, subrays, 1.0), "columns": SHOWN} | options
+    with added(*steps):
+        return cast([wall("Wall", WALL_M)], beam_along_x(BEAMS), **given)
+
+
+@pytest.mark.parametrize("subrays", [1, 7])
+def test_a_foreign_step_that_changes_returns_acts(subrays):
+    plain = points(subrays=subrays)
+    halved = points(HalfOfReturns, subrays=subrays)
+    assert plain["ray"].tolist() == [*range(BEAMS)]
+    assert halved["ray"].tolist() == [*range(0, BEAMS, 2)]
+    assert np.array_equal(halved["intensity"], plain["intensity"][::2] / 2)
+
+
+@pytest.mark.parametrize("subrays", [1, 7])
+@pytest.mark.parametrize(
+    ("mode", "ranges"),
+    [("all", [ADDED_M, WALL_M]), ("first", [ADDED_M]), ("last", [WALL_M])],
+)
+def test_a_foreign_step_that_adds_returns_acts_before_some_are_selected(mode, ranges, subrays):
+    echoes = points(Echo, mode=mode, subrays=subrays)
+    assert echoes["range"] == pytest.approx(ranges * BEAMS, abs=1e-4)
+    causes = {ADDED_M: 2, WALL_M: 0}
+    assert echoes["cause"].tolist() == [causes[metres] for metres in ranges] * BEAMS
+
+
+@pytest.mark.parametrize("subrays", [1, 7])
+def test_a_foreign_step_that_turns_beams_acts(subrays):
+    """On each beam, and beside the noise of angles."""
+    turned = points(Aside, subrays=subrays)
+    assert turned["range"] == pytest.approx([WALL_M * math.sqrt(1.01)] * BEAMS, rel=1e-6)
+    noisy = Noise(angle_deg=0.01)
+    both = points(Aside, subrays=subrays, noise=noisy)["range"]
+    assert both == pytest.approx(turned["range"], abs=0.01)
+    assert len(set(both.tolist())) == BEAMS, "the noise acts as well"
+
+
+@pytest.mark.parametrize("subrays", [1, 7])
+def test_a_foreign_step_of_kept_returns_acts(subrays):
+    farther = points(Farther, subrays=subrays)
+    assert farther["range"] == pytest.approx([WALL_M + 1] * BEAMS, rel=1e-6)
+
+
+def test_foreign_steps_act_together():
+    found = points(Farther, Aside, Echo, HalfOfReturns)
+    wall_m = WALL_M * math.sqrt(1.01)
+    ranges = [ADDED_M + 1, wall_m + 1, ADDED_M + 1] * (BEAMS // 2)
+    assert found["range"] == pytest.approx(ranges, rel=1e-6)
+
+
+def test_a_step_without_a_role_cannot_be_defined():
+    with pytest.raises(TypeError, match=r"^step Silent states no role: set `role` to flags of "):
+        type("Silent", (PulseStep,), {})
+
+
+def test_a_step_where_it_would_not_act_is_refused():
+    for step, before in ((Echo, CastStep), (Echo, RecordingStep), (HalfOfReturns, CastStep)):
+        with pytest.raises(ValueError, match=rf"^step {step.__name__} of Role.* must be after "):
+            add_step(step, before)
+    with pytest.raises(ValueError, match=r"^step Aside of Role.AIMS must be before CastStep"):
+        add_step(Aside, DirtStep)
+    with pytest.raises(ValueError, match=r"^step Everywhere of Role.FRAME cannot be added"):
+        add_step(Everywhere)
+    with pytest.raises(ValueError, match=r"^step DirtStep is among the steps already"):
+        add_step(DirtStep)
+    assert "Echo" not in [step.__name__ for step in STEPS]

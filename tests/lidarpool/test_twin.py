@@ -12,15 +12,20 @@ from tests.shapes import quad
 
 from lidarpool import Beams, Material, Noise, Optics, Returns, Scene, Sensor, Spin, Survey
 from lidarsim.sensor.disc import Beam
-from lidarsim.sensor.noise import Purpose, named_seed, raw, starts
 from lidarsim.sensor.optics import FWHM, LIGHT_M_NS
+from lidarsim.sensor.random_numbers import Purpose, named_seed, raw, starts
 from lidarsim.sensor.weather import Air, spray
-from lidarsim.simulator import pulse_loops
-from lidarsim.simulator.air import WeatherStep, exponential, seen_by_range
-from lidarsim.simulator.returns import AIR, NO_SURFACE, Keys, PulseReturns
+from lidarsim.simulator import spray_loops
+from lidarsim.simulator.air import AIR, WeatherStep, exponential, seen_by_range
+from lidarsim.simulator.detection import detected
+from lidarsim.simulator.pulse_loops import SampledHits
+from lidarsim.simulator.random_loops import RandomKeys
+from lidarsim.simulator.range_noise import noisy_ranges
+from lidarsim.simulator.returns import NO_SURFACE, Keys, PulseReturns
 from lidarsim.simulator.saturation import saturated
 from lidarsim.simulator.separation import Report, separated
-from lidarsim.simulator.step import Setup
+from lidarsim.simulator.spray import SPRAY_DEPTH, SPRAY_DIAMETER, SPRAY_SUBRAY
+from lidarsim.simulator.steps import setup_of
 from lidarsim.simulator.surfaces import Light, Surfaces
 from lidarsim.simulator.waveform import Digitizer, returns_in
 
@@ -113,7 +118,7 @@ def same_returns(found, expected, tolerance=0.0):
 
 def test_random_bits_are_those_of_splitmix64():
     rng = np.random.default_rng(1)
-    for purpose in Purpose:
+    for purpose in Purpose.declared.values():
         seed, scan, ray, number = (rng.integers(2**n, size=1) for n in (63, 40, 32, 8))
         key = int(scan[0]), int(ray[0])
         mine = twin.bits(int(seed[0]), purpose, key, int(number[0]))
@@ -197,8 +202,8 @@ def test_noise_is_that_of_the_twin(noise, tolerance_m):
     rng, ray, number = np.random.default_rng(4), np.arange(2000) // 4, np.arange(2000) % 4
     distance, energy = rng.uniform(0.01, 200, 2000), 0.004 * 10 ** rng.uniform(-0.2, 0.2, 2000)
     assert noise.threshold == (0.1 * twin.energy_of(1, 50, 0) if noise.detection_range_m else 0)
-    seen = noise.detected(energy, *KEYS.of(ray), number)
-    ranges = noise.ranges(distance, energy, *KEYS.of(ray), number)
+    seen = detected(noise, energy, *KEYS.of(ray), number)
+    ranges = noisy_ranges(noise, distance, energy, *KEYS.of(ray), number)
     columns = (column.tolist() for column in (distance, energy, number, ray))
     rows = [(r, e, n, key_of(pulse)) for r, e, n, pulse in zip(*columns, strict=True)]
     assert seen.tolist() == [twin.detected(*row, noise) for _, *row in rows]
@@ -240,7 +245,8 @@ def test_what_the_air_returns_is_as_in_the_twin(weather, each):
     survey = Survey(sensor, poses=[(0, 0, 0)], steps=1, materials=materials, **options)
     corners = (0, 0, 0), (1, 0, 0), (1, 1, 0), (0, 1, 0)
     scene = Scene.from_meshes([quad(name, *corners) for name in ("Wall", "Pane")])
-    caster = WeatherStep(Setup(scene, survey, 0), None, Surfaces(scene, survey.materials))
+    surfaces = Surfaces(scene, survey.materials)
+    caster = WeatherStep(setup_of(scene, survey, 0), None, surfaces)
     # Sub-rays hit nothing, a wall, a pane, or a pane a metre before a wall.
     rng, count = np.random.default_rng(7), 1500
     what, place = rng.integers(0, 4, count * each), rng.uniform(1, 60, count * each)
@@ -249,17 +255,17 @@ def test_what_the_air_returns_is_as_in_the_twin(weather, each):
     second = np.diff(ray, prepend=-1) == 0
     triangle = np.where((what[ray] == 1) | second, 0, 2).astype(np.int32)
     hits = PulseReturns(ray, place[ray] + second, triangle, np.ones(len(ray)))
-    found = caster.found(hits, (FIRST, FIRST + count), KEYS, each)
+    found = caster.sampled(hits, (FIRST, FIRST + count), KEYS, each)
     air, cloud, expected = survey.air(0), caster._fog, []
     for pulse in range(count):
         own, key, drawn = reach[pulse].tolist(), key_of(FIRST + pulse), []
-        for number, (kind, seen) in enumerate(zip(survey.particles, caster._seen, strict=True)):
+        for number, (kind, seen) in enumerate(zip(survey.particles, caster._kinds, strict=True)):
             given = noise.threshold, named_seed(9, "kind 1" if number else ""), key, own
-            drawn += twin.particles(kind, air, *given, (seen.counts, seen.tables[0]))
+            drawn += twin.particles(kind, air, *given, (seen.counts, seen.by_range[0]))
         if cloud is not None:
             table = cloud.peaks.reshape(-1, len(cloud.energy))
             peaks = table - np.arange(len(table))[:, None]
-            drawn += twin.fog(survey.scatters(905.0), air, 9, key, own, 0.5, cloud.cell, peaks)
+            drawn += twin.fog(survey.scatters(905.0), air, 9, key, own, 0.5, cloud.cell_m, peaks)
         drawn.sort(key=lambda one: one.subray)
         expected += [(pulse * each + one.subray, one.distance, one.energy) for one in drawn]
     ray, distance, energy = map(np.array, zip(*expected, strict=True))
@@ -280,12 +286,13 @@ def test_clumps_of_spray_are_those_of_the_twin(each):
     far = np.where(rng.random(count * each) < 0.5, rng.uniform(1, 40, count * each), np.inf)
     hits = np.flatnonzero(far < np.inf)
     place, light = far[hits], np.ones(len(hits))
-    pulse_loops.veil(beam, crossed, each, 0.1, far, hits, place, light)
-    begun = starts(9, Purpose.SPRAY, Purpose.SPRAY_SUBRAY, Purpose.SPRAY_DIAMETER)
-    given = begun, KEYS.scan, KEYS.begins, FIRST, far
-    out, clumps, left = (np.empty(4000, np.int64), *np.empty((2, 4000))), [], []
-    table = each, mean, 1 / kind.slope, tables, exponential()
-    stop, many = pulse_loops.spray(0, beam, crossed, *table, *given, *out)
+    crossings = spray_loops.Crossings(beam, crossed)
+    spray_loops.veil(crossings, each, 0.1, far, SampledHits(hits, place, light))
+    begun = starts(9, SPRAY_DEPTH, SPRAY_SUBRAY, SPRAY_DIAMETER)
+    keys = RandomKeys(begun, KEYS.scan, KEYS.begins, FIRST)
+    out, clumps, left = SampledHits(np.empty(4000, np.int64), *np.empty((2, 4000))), [], []
+    table = spray_loops.ClumpTables(mean, tables, 1 / kind.slope, exponential())
+    stop, many = spray_loops.clumps(0, crossings, each, table, keys, far, out)
     assert stop == len(beam) and many > 300
     for pulse in range(count):
         boxes = [tuple(one) for one in crossed[:, beam == pulse].T.tolist()]

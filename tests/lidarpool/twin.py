@@ -18,8 +18,19 @@ import numpy as np
 from lidarpool import Noise
 from lidarsim.base.arrays import Floats
 from lidarsim.sensor.disc import Beam
-from lidarsim.sensor.noise import Purpose, quantiles
+from lidarsim.sensor.random_numbers import Purpose, quantiles
 from lidarsim.sensor.weather import Air, Particles
+from lidarsim.simulator.air import (
+    FOG_CELL,
+    FOG_PLACE,
+    PARTICLE_DIAMETER,
+    PARTICLE_RANGE,
+    PARTICLE_SUBRAY,
+    PARTICLES,
+)
+from lidarsim.simulator.detection import DETECTION, LOSS
+from lidarsim.simulator.range_noise import RANGE
+from lidarsim.simulator.spray import SPRAY_DEPTH, SPRAY_DIAMETER, SPRAY_SUBRAY
 from lidarsim.simulator.waveform import Digitizer
 
 Vector = tuple[float, ...]
@@ -65,7 +76,7 @@ def bits(seed: int, purpose: Purpose, key: Key, number: int = 0) -> int:
     """Hash to 64 bits, by the last step of SplitMix64 (Steele, Lea and Flood 2014)."""
     scan, pulse = key
     x = 0
-    for step in (seed, purpose.value, scan, 256 * pulse + number + 1):
+    for step in (seed, purpose.number, scan, 256 * pulse + number + 1):
         x = (x + step * 0x9E3779B97F4A7C15) % 2**64
         x = (x ^ (x >> 30)) * 0xBF58476D1CE4E5B9 % 2**64
         x = (x ^ (x >> 27)) * 0x94D049BB133111EB % 2**64
@@ -186,12 +197,12 @@ def saturated(returns: list[Return], full: float, pulse_m: float, waves: bool) -
 
 def detected(energy: float, number: int, key: Key, noise: Noise) -> bool:
     """Whether a return is neither lost nor too faint; `number` counts those of its pulse."""
-    if uniform(noise.seed, Purpose.LOSS, key, number) < noise.dropout:
+    if uniform(noise.seed, LOSS, key, number) < noise.dropout:
         return False
     if not noise.threshold:
         return True
     signal = 5 * (energy / noise.threshold - 1)
-    return signal + normal(noise.seed, Purpose.DETECTION, key, number) > 0
+    return signal + normal(noise.seed, DETECTION, key, number) > 0
 
 
 def reported(returns: list[Return], mode: str) -> list[Return]:
@@ -213,7 +224,7 @@ def range_of(distance: float, energy: float, number: int, key: Key, noise: Noise
         sigma = math.sqrt(sigma * sigma + weak * weak)
     if noise.walk_m:
         distance -= noise.walk_m * math.sqrt(2 * math.log(max(energy / noise.threshold, 1)))
-    return max(distance + sigma * normal(noise.seed, Purpose.RANGE, key, number), 0)
+    return max(distance + sigma * normal(noise.seed, RANGE, key, number), 0)
 
 
 def energy_of(back: float, distance: float, extinction: float) -> float:
@@ -237,11 +248,11 @@ def particles(
     Tables are cumulative probabilities of numbers of particles, and quantiles of ranges.
     """
     counts, ranges = tables
-    for number in range(sum(counts <= uniform(seed, Purpose.PARTICLES, key))):
-        distance = float(ranges[bits(seed, Purpose.PARTICLE_RANGE, key, number) >> 48])
-        subray = bits(seed, Purpose.PARTICLE_SUBRAY, key, number) % len(reach)
+    for number in range(sum(counts <= uniform(seed, PARTICLES, key))):
+        distance = float(ranges[bits(seed, PARTICLE_RANGE, key, number) >> 48])
+        subray = bits(seed, PARTICLE_SUBRAY, key, number) % len(reach)
         if distance < reach[subray]:
-            rank = uniform(seed, Purpose.PARTICLE_DIAMETER, key, number)
+            rank = uniform(seed, PARTICLE_DIAMETER, key, number)
             energy = len(reach) * particle(kind, air, threshold, distance, rank)
             yield Hit(subray, distance, energy, None)
 
@@ -272,7 +283,7 @@ def clumps(
     (mean, ranges), number = table, 0
 
     def depth() -> float:
-        place = ((bits(seed, Purpose.SPRAY, key, number) >> 48) + 0.5) / 65_536
+        place = ((bits(seed, SPRAY_DEPTH, key, number) >> 48) + 0.5) / 65_536
         return float(np.float32(-math.log1p(-place)))
 
     left = depth()
@@ -282,8 +293,8 @@ def clumps(
         while left < (end - place) * rate:
             place += left / rate
             distance = float(ranges[int(place)])
-            subray = bits(seed, Purpose.SPRAY_SUBRAY, key, number) % len(reach)
-            rank = uniform(seed, Purpose.SPRAY_DIAMETER, key, number)
+            subray = bits(seed, SPRAY_SUBRAY, key, number) % len(reach)
+            rank = uniform(seed, SPRAY_DIAMETER, key, number)
             if distance < reach[subray]:
                 energy = len(reach) * particle(kind, air, threshold, distance, rank)
                 yield Hit(subray, distance, energy, None)
@@ -308,8 +319,8 @@ def fog(
     """
     cells = min(math.floor((min(reach[0], 1e4) - begin) / cell), len(peaks) - 1)
     if cells >= 1:
-        highest = sum(peaks[cells] <= uniform(seed, Purpose.FOG_CELL, key))
-        place = begin + (highest + uniform(seed, Purpose.FOG_PLACE, key)) * cell
+        highest = sum(peaks[cells] <= uniform(seed, FOG_CELL, key))
+        place = begin + (highest + uniform(seed, FOG_PLACE, key)) * cell
         steps = (begin + (highest + (k + 0.5) / 100) * cell for k in range(100))
         light = math.pi * back_scatter * cell * sum(white(step, air) for step in steps) / 100
         yield Hit(0, place, len(reach) * light, None)

@@ -10,6 +10,7 @@ from docs.pictures.effects._receiver import BLUE, GREY, RED, ahead, shot, wall
 from matplotlib.figure import Figure
 
 from lidarpool import Material, Noise, Survey
+from lidarsim.simulator.range_noise import range_walk
 
 DRAWS = "effect-range-noise.png"
 NOISE = Noise(0.01, detection_range_m=100, range_at_threshold_m=0.1)
@@ -52,7 +53,7 @@ def picture(path: Path) -> None:
     scatter.minorticks_off()
     scatter.legend(frameon=False, fontsize=8)
     scatter.set_title("noise: walls at 4 to 250 m", fontsize=10)
-    walk.plot(ratio, -100 * WALK.walk(ratio * WALK.threshold), "k-", lw=1, zorder=0,
+    walk.plot(ratio, -100 * range_walk(WALK, ratio * WALK.threshold), "k-", lw=1, zorder=0,
               label="−2 cm · √(2 ln E / T)")  # fmt: skip
     walk.plot([1, 1e6], [0, 0], "k:", lw=1, zorder=0, label="without")
     walk.set(xscale="log", ylabel="mean range − true range, cm")

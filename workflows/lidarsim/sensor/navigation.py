@@ -29,9 +29,14 @@ from ..base.elementary_scalars import exp_of, sin_cos_of
 from ..base.errors import LidarError
 from ..base.validation import checked_fields
 from ..base.vectors import applied, hypot, into_axes, length, matmul, turned
-from .noise import Purpose, named_seed, normal
+from .random_numbers import Purpose, named_seed, normal
 from .trajectory import AT_CENTRE, CENTRE, Pose, Trajectory, full_poses, velocities
 
+WHITE = Purpose(41, "white noise of an instrument")
+DRIVEN = Purpose(42, "steps of its bias")
+WALK = Purpose(43, "steps of its random walk")
+SKEW = Purpose(44, "scale factors of its axes, and angles between them")
+OUTAGE = Purpose(45, "drift where there is no GNSS")
 BLOCK = 1 << 14  # samples that are made at a time
 RETURNS_IN_S = 1.0  # after an outage, 37 % of its error are left
 
@@ -257,7 +262,7 @@ def _of_axes(imu: Imu, name: str, seed: int) -> tuple[_Errors, Floats | None]:
     if not (imu.scale or imu.misalignment_deg):
         return errors, None
     sigma = np.where(np.eye(3, dtype=bool), imu.scale, math.radians(imu.misalignment_deg))
-    drawn = normal(seed, Purpose.SKEW, 0, np.arange(9)).reshape(3, 3)
+    drawn = normal(seed, SKEW, 0, np.arange(9)).reshape(3, 3)
     return errors, np.eye(3) + sigma * drawn
 
 
@@ -299,7 +304,7 @@ def _bridged(imu: Imu, seed: int, number: int, since: Floats, lasts: float) -> F
     """
     grown = np.clip(since, 0, lasts)[:, None]
     left = exp(np.minimum(lasts - since, 0) / RETURNS_IN_S)[:, None]
-    bias, walk = (normal(seed, Purpose.OUTAGE, number, np.arange(3), k) for k in range(2))
+    bias, walk = (normal(seed, OUTAGE, number, np.arange(3), k) for k in range(2))
     by_bias = imu.accelerometer_bias * bias * (grown * grown / 2)
     by_walk = imu.accelerometer_noise_density * walk * (grown * np.sqrt(grown / 3))
     return np.asarray(left * (by_bias + by_walk))
@@ -352,9 +357,9 @@ class _Errors:
         """Return the errors of the next samples (k,): (k, 3)."""
         out = np.zeros((len(samples), 3))
         if self._white.any():
-            out += self._white * self._normal(Purpose.WHITE, samples)
+            out += self._white * self._normal(WHITE, samples)
         if self._bias.any():
-            noise = self._normal(Purpose.DRIVEN, samples)
+            noise = self._normal(DRIVEN, samples)
             noise[samples > 0] *= self._driven
             noise[samples == 0] *= self._bias  # a bias that has been there for long
             kept = self._kept
@@ -367,7 +372,7 @@ class _Errors:
                 out[:, axis] += (values := np.array(list(made))[1:])
                 self._biases[axis] = values[-1]
         if self._walk.any():
-            noise = self._walk * self._normal(Purpose.WALK, samples)
+            noise = self._walk * self._normal(WALK, samples)
             noise[0] += self._walked
             walked = np.cumsum(noise, axis=0)
             self._walked = walked[-1]

@@ -9,48 +9,61 @@ from __future__ import annotations
 from collections.abc import Iterator
 from functools import cache, lru_cache
 from statistics import NormalDist
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from ..base.arrays import Bools, Floats, Indices, Ints
+from ..base.arrays import Bools, Floats, Indices, Ints, owned
 from ..base.elementary import exp, expm1, geomspace, interp, log1p
 from ..base.elementary_scalars import exp_of
+from ..columns.table import CAUSES
 from ..sensor.materials import MaterialTable
-from ..sensor.noise import THRESHOLD_SIGMAS, Purpose, named_seed, starts
+from ..sensor.noise import THRESHOLD_SIGMAS
+from ..sensor.random_numbers import Purpose, named_seed, starts
 from ..sensor.weather import FAINTEST, FARTHEST_M, NODES, Air, Particles
 from ..sensor.weather import reach as reach_of
 from .doppler import approach
-from .returns import AIR, OF_RETURNS, SURFACE, Keys, Planes, PulseReturns, joined, numbers, unreal
+from .returns import OF_RETURNS, SURFACE, Keys, Planes, PulseReturns, joined, numbers, unreal
 from .scene_caster import SceneCaster
-from .step import Memory, PulseBatch, PulseStep, Setup, Sizes
+from .step import Memory, PulseBatch, PulseStep, Role, Setup, Sizes
 from .surfaces import Surfaces
 
+if TYPE_CHECKING:
+    from .pulse_loops import SampledHits
+    from .random_loops import RandomKeys
+
+FOG_CELL = Purpose(10, "cell of fog with the highest peak")
+FOG_PLACE = Purpose(11, "place of the peak in its cell")
+PARTICLES = Purpose(12, "number of particles that a beam meets")
+PARTICLE_RANGE = Purpose(13, "range of a particle")
+PARTICLE_DIAMETER = Purpose(14, "diameter of a particle")
+PARTICLE_SUBRAY = Purpose(15, "sub-ray that meets a particle")
+AIR = CAUSES.index("air")
 QUANTILES = 1 << 16
 TABLES_KEPT = 32  # as a scanner makes its casters again whenever an object is moved
 CELLS_MOST = 255  # pulse lengths of fog
 TAIL_SIGMAS = 6.0
 
 
-class _Seen(NamedTuple):
+class DetectableParticles(NamedTuple):
     """Particles of one kind that may be detected."""
 
-    counts: Floats  # (k,): cumulative probabilities of 0, 1, … in a beam
+    counts: Floats  # (k,): cumulative probabilities of 0, 1, … particles in a beam
     # By range, (5, QUANTILES): distances before which an equal share is, smallest diameters that
     # may be detected, mm, 1 - exp(-slope * (largest - smallest)), energies of a particle of 1 mm,
-    # and of one that fills the beam.
-    tables: Floats
-    step: float  # 1 / slope, mm
+    # and of a particle that fills the beam.
+    by_range: Floats
+    step_mm: float  # 1 / slope: diameter that exp(-1) of the particles exceed
 
 
-class _Fog(NamedTuple):
-    """Cells of half a pulse's length, from the sensor on."""
+class FogCells(NamedTuple):
+    """Cells of half a pulse's length of fog that may be detected, from the sensor on."""
 
-    begins: float  # metres
-    cell: float
+    begin_m: float
+    cell_m: float
     energy: Floats  # (cells,)
-    # Cumulative probabilities that a cell has the highest peak of some first cells: the row of n
-    # cells is n plus them.
+    # Cumulative probabilities that a cell has the highest peak of the first n cells: row n is n
+    # plus the probabilities.
     peaks: Floats
 
 
@@ -60,28 +73,34 @@ class WeatherStep(PulseStep):
     Raises
     ------
     LidarError
-        If one of its beams would return from too many particles.
+        If a beam would return from too many particles.
     """
 
+    role = Role.CHANGES
     effects = "Rain", "Snow", "Fog", "Dust"
     reads = "ray", "distance", "triangle", "cause", "velocity"
     writes = *OF_RETURNS, "velocity"
+    causes = (AIR,)
     purposes = (
-        Purpose.FOG_CELL, Purpose.FOG_PLACE, Purpose.PARTICLES, Purpose.PARTICLE_RANGE,
-        Purpose.PARTICLE_SUBRAY, Purpose.PARTICLE_DIAMETER,
+        FOG_CELL, FOG_PLACE, PARTICLES, PARTICLE_RANGE,
+        PARTICLE_SUBRAY, PARTICLE_DIAMETER,
     )  # fmt: skip
 
     def __init__(self, setup: Setup, caster: SceneCaster, surfaces: Surfaces) -> None:
         super().__init__(setup, caster, surfaces)
-        sensor, noise, survey = setup.sensor, setup.noise, setup.survey
-        self._seed, self._wavelength_nm = noise.seed, sensor.optics.wavelength_nm
-        air, least = survey.air(setup.number), FAINTEST * noise.threshold
+        sensor = setup.sensor
+        noise = setup.noise
+        survey = setup.survey
+        self._seed = noise.seed
+        self._wavelength_nm = sensor.optics.wavelength_nm
+        air = survey.air(setup.number)
+        faintest = FAINTEST * noise.threshold
         begins, ends = reach_of(sensor.min_range_m, sensor.max_range_m)
-        self._seen = [_seen(air, kind, least, begins, ends) for kind in survey.particles]
-        names = [f"kind {kind}" if kind else "" for kind in range(len(self._seen))]
+        self._kinds = [_detectable(air, kind, faintest, begins, ends) for kind in survey.particles]
+        names = [f"kind {kind}" if kind else "" for kind in range(len(self._kinds))]
         self._seeds = [named_seed(noise.seed, name) for name in names]
         scatters = survey.scatters(self._wavelength_nm)
-        self._fog = _fog(air, scatters, noise.threshold, begins, ends, setup.gap_m)
+        self._fog = _fog_cells(air, scatters, noise.threshold, begins, ends, setup.gap_m)
 
     @staticmethod
     def applies(setup: Setup) -> bool:
@@ -101,28 +120,27 @@ class WeatherStep(PulseStep):
 
     def apply(self, returns: PulseReturns, batch: PulseBatch) -> PulseReturns:
         """See `PulseStep.apply`."""
-        drawn = self.found(returns, (batch.start, batch.stop), batch.keys, batch.each)
+        drawn = self.sampled(returns, (batch.start, batch.stop), batch.keys, batch.each)
         return returns if drawn is None else in_the_air(self.setup, returns, batch, drawn)
 
-    def found(
-        self, hits: PulseReturns, rays: tuple[int, int], keys: Keys, each: int
+    def sampled(
+        self, hits: PulseReturns, beams: tuple[int, int], keys: Keys, each: int
     ) -> PulseReturns | None:
-        """Find hits in the air, of beams `rays` with `each` sub-rays, before those of surfaces.
+        """Return hits in the air before those of surfaces, of beams with `each` sub-rays.
 
-        Hits are in the order of rays, numbered from the first beam's.
+        Hits are in the order of rays, numbered from the first beam's; None if there can be none.
         """
-        count = rays[1] - rays[0]
-        given = keys.scan, np.array(keys.begins, np.int64), rays[0]
-        reach = reached(self.surfaces.at(self._wavelength_nm), self.surfaces, hits, count * each)
-        parts = [
-            part
-            for seen, seed in zip(self._seen, self._seeds, strict=True)
-            if seen is not None
-            for part in _met(seen, seed, count, each, given, reach)
-        ]
+        first, stop = beams
+        count = (stop - first) * each
+        reach = reached(self.surfaces.at(self._wavelength_nm), self.surfaces, hits, count)
+        parts: list[SampledHits] = []
+        for kind, seed in zip(self._kinds, self._seeds, strict=True):
+            if kind is not None:
+                random = random_keys(seed, self.purposes[2:], keys, first)
+                parts += _particles(kind, random, each, reach)
         if self._fog is not None:
-            clouded = self._clouded(hits, reach)
-            parts.append(_in_fog(self._fog, self._seed, count, each, given, clouded))
+            random = random_keys(self._seed, self.purposes[:2], keys, first)
+            parts.append(_fog_hits(self._fog, random, each, self._clouded(hits, reach)))
         if not parts:
             return None
         ray, distance, energy = map(np.concatenate, zip(*parts, strict=True))
@@ -197,32 +215,43 @@ def in_the_air(
     return returns
 
 
-def _met(
-    seen: _Seen, seed: int, beams: int, each: int, given: tuple[int, Ints, int], reach: Floats
-) -> Iterator[tuple[Ints, Floats, Floats]]:
-    """Yield sub-rays, distances and energies of particles of a kind."""
-    from . import pulse_loops  # not before: numba takes half a second to import
+def random_keys(seed: int, purposes: tuple[Purpose, ...], keys: Keys, first: int) -> RandomKeys:
+    """Return what the random numbers of beams from number `first` on depend on, for loops."""
+    from .random_loops import RandomKeys
 
-    begun = starts(seed, *WeatherStep.purposes[2:])
-    beam, room = 0, 2 * beams + len(seen.counts)
+    return RandomKeys(starts(seed, *purposes), keys.scan, owned(keys.begins, np.int64), first)
+
+
+def room_for_hits(size: int) -> SampledHits:
+    """Return arrays to which loops write hits."""
+    from .pulse_loops import SampledHits
+
+    return SampledHits(np.empty(size, np.int64), np.empty(size), np.empty(size))
+
+
+def _particles(
+    kind: DetectableParticles, random: RandomKeys, each: int, reach: Floats
+) -> Iterator[SampledHits]:
+    """Yield the hits of particles of a kind, on sub-rays that reach so far, metres."""
+    from . import air_loops  # not before: numba takes half a second to import
+
+    beams = len(reach) // each
+    tables = air_loops.ParticleTables(kind.counts, kind.by_range, kind.step_mm, exponential())
+    beam = 0
     while beam < beams:
-        out = np.empty(room, np.int64), *np.empty((2, room))
-        table = seen.step, seen.counts, seen.tables, exponential()
-        beam, count = pulse_loops.particles(beam, beams, each, *table, begun, *given, reach, *out)
-        yield out[0][:count], out[1][:count], out[2][:count]
+        hits = room_for_hits(2 * beams + len(kind.counts))
+        beam, count = air_loops.particles(beam, beams, each, tables, random, reach, hits)
+        yield hits.first(count)
 
 
-def _in_fog(
-    fog: _Fog, seed: int, beams: int, each: int, given: tuple[int, Ints, int], reach: Floats
-) -> tuple[Ints, Floats, Floats]:
-    """Sub-rays, distances and energies of the peaks of fog."""
-    from . import pulse_loops
+def _fog_hits(fog: FogCells, random: RandomKeys, each: int, reach: Floats) -> SampledHits:
+    """Return the hits of the peaks of fog, on sub-rays that reach so far, metres."""
+    from . import air_loops
 
-    begun = starts(seed, *WeatherStep.purposes[:2])
-    out = np.empty(beams, np.int64), *np.empty((2, beams))
-    table = fog.begins, FARTHEST_M, fog.cell, fog.energy, fog.peaks
-    count = pulse_loops.fog(each, *table, begun, *given, reach, *out)
-    return out[0][:count], out[1][:count], out[2][:count]
+    hits = room_for_hits(len(reach) // each)
+    tables = air_loops.FogTables(fog.begin_m, FARTHEST_M, fog.cell_m, fog.energy, fog.peaks)
+    count = air_loops.fog(each, tables, random, reach, hits)
+    return hits.first(count)
 
 
 def inserted(
@@ -238,17 +267,22 @@ def inserted(
 
 
 @lru_cache(TABLES_KEPT)
-def _seen(air: Air, kind: Particles, energy: float, begins: float, ends: float) -> _Seen | None:
-    """Make the tables of particles that return at least an energy; None if there are none."""
-    found = seen_by_range(air, kind, energy, begins, ends)
-    return found and _Seen(_poisson(found[0]), found[1], 1 / kind.slope)
+def _detectable(
+    air: Air, kind: Particles, energy: float, begins: float, ends: float
+) -> DetectableParticles | None:
+    """Return the particles that return at least an energy; None if there are none."""
+    tables = seen_by_range(air, kind, energy, begins, ends)
+    if tables is None:
+        return None
+    mean, by_range = tables
+    return DetectableParticles(_poisson(mean), by_range, 1 / kind.slope)
 
 
 @lru_cache(TABLES_KEPT)
 def seen_by_range(
     air: Air, kind: Particles, energy: float, begins: float, ends: float
 ) -> tuple[float, Floats] | None:
-    """How many particles in a beam return at least an energy, and the tables of `_Seen`."""
+    """Return how many particles in a beam return enough energy, and their `by_range` table."""
     distance = geomspace(begins, max(ends, begins * 1.001), NODES)
     some = np.flatnonzero(air.rate(kind, energy, distance) > 0)
     if not len(some):
@@ -281,10 +315,10 @@ def _poisson(mean: float) -> Floats:
 
 
 @lru_cache(TABLES_KEPT)
-def _fog(
+def _fog_cells(
     air: Air, scatters: float, threshold: float, begins: float, ends: float, cell: float
-) -> _Fog | None:
-    """Cells that may be detected; None if there are none."""
+) -> FogCells | None:
+    """Return the cells of fog that may be detected; None if there are none."""
     count = int(min((ends - begins) / cell, CELLS_MOST)) if cell else 0
     edges = begins + cell * np.arange(count + 1, dtype=np.float64)
     energy = air.cloud(scatters, edges[:-1], edges[1:])
@@ -293,7 +327,7 @@ def _fog(
         return None
     peaks = highest(THRESHOLD_SIGMAS * energy / threshold)
     rows = np.arange(len(energy) + 1)[:, None] + single(peaks)
-    return _Fog(begins, cell, single(energy), rows.reshape(-1))
+    return FogCells(begins, cell, single(energy), rows.reshape(-1))
 
 
 def highest(signals: Floats) -> Floats:

@@ -1,45 +1,84 @@
-"""Errors of the directions in which beams are sent."""
+"""Errors of the directions in which beams are sent; reported directions have none."""
 
 from __future__ import annotations
 
 import numpy as np
 
+from ..base.arrays import Floats, Integers
 from ..base.elementary import sin_cos
 from ..base.vectors import hypot
-from ..sensor.noise import Purpose
+from ..sensor.noise import Noise
+from ..sensor.random_numbers import Purpose, normal
 from .returns import PulseReturns
-from .step import Memory, PulseBatch, PulseStep, Setup, Sizes
+from .step import Memory, PulseBatch, PulseStep, Role, Setup, Sizes
+
+ACROSS = Purpose(2, "noise of a beam's direction, across")
+UP = Purpose(3, "noise of a beam's direction, up")
 
 
 class AngleNoiseStep(PulseStep):
-    """Casts beams in directions with errors; their reported directions have none."""
+    """Turns each beam by a random angle."""
 
-    effects = ("Errors that last",)
-    purposes = Purpose.ACROSS, Purpose.UP
+    role = Role.AIMS
+    purposes = ACROSS, UP
 
     @staticmethod
     def applies(setup: Setup) -> bool:
         """See `PulseStep.applies`."""
-        return setup.noise.angle_deg > 0 or setup.noise.ripple_deg > 0
+        return setup.noise.angle_deg > 0
 
     @staticmethod
     def memory(setup: Setup, sizes: Sizes) -> Memory:
         """See `PulseStep.memory`."""
-        if setup.several:  # then some beams are turned at a time
-            return Memory()
-        return Memory(kept=32 * sizes.rays, casting=20 * sizes.rays)  # a direction each
+        return turned_beams(setup, sizes)
+
+    def apply(self, returns: PulseReturns, batch: PulseBatch) -> PulseReturns:
+        """See `PulseStep.apply`."""
+        beams = np.arange(batch.start, batch.stop)
+        scan, ray = batch.keys.of(beams)
+        across, up = angle_errors(self.setup.noise, scan, ray)
+        batch.turn(np.column_stack([across, up]))
+        return returns
+
+
+class RippleStep(PulseStep):
+    """Turns beams by an error of azimuth that repeats with the head's revolutions."""
+
+    role = Role.AIMS | Role.ABOUT_AXIS
+    effects = ("Errors that last",)
+
+    @staticmethod
+    def applies(setup: Setup) -> bool:
+        """See `PulseStep.applies`."""
+        return setup.noise.ripple_deg > 0
+
+    @staticmethod
+    def memory(setup: Setup, sizes: Sizes) -> Memory:
+        """See `PulseStep.memory`: nothing more where `AngleNoiseStep` turns the beams as well."""
+        return Memory() if setup.noise.angle_deg else turned_beams(setup, sizes)
 
     def apply(self, returns: PulseReturns, batch: PulseBatch) -> PulseReturns:
         """See `PulseStep.apply`."""
         noise, sensor = self.setup.noise, self.setup.sensor
-        across, up = offsets = np.zeros((2, batch.stop - batch.start))
-        if noise.angle_deg:
-            across[:], up[:] = noise.angles(*batch.keys.of(np.arange(batch.start, batch.stop)))
-        if noise.ripple_deg:
-            azimuth = sensor.head.azimuths(batch.firings.numbers[batch.rows])
-            sin, _ = sin_cos(noise.ripple_cycles * azimuth + np.radians(noise.ripple_phase_deg))
-            # A degree of azimuth is less across a beam, the steeper it looks.
-            level = hypot(*sensor.ahead.T[:2])
-            across += ((np.radians(noise.ripple_deg) * sin)[:, None] * level).reshape(-1)
-        batch.offsets = offsets.T
+        azimuth = sensor.head.azimuths(batch.firings.numbers[batch.rows])
+        sin, _ = sin_cos(noise.ripple_cycles * azimuth + np.radians(noise.ripple_phase_deg))
+        # A degree of azimuth is less across a beam, the steeper the beam looks.
+        level = hypot(*sensor.ahead.T[:2])
+        across = ((np.radians(noise.ripple_deg) * sin)[:, None] * level).reshape(-1)
+        batch.turn(np.column_stack([across, np.zeros(len(across))]))
         return returns
+
+
+def angle_errors(noise: Noise, scan: Integers, ray: Integers) -> tuple[Floats, Floats]:
+    """Return the random errors of beams' angles, across and up: (n,) and (n,), radians."""
+    sigma = np.radians(noise.angle_deg)
+    across = sigma * normal(noise.seed, ACROSS, scan, ray)
+    up = sigma * normal(noise.seed, UP, scan, ray)
+    return across, up
+
+
+def turned_beams(setup: Setup, sizes: Sizes) -> Memory:
+    """Return the memory of beams with directions of their own."""
+    if setup.several:  # then only the beams of a batch are turned at a time
+        return Memory()
+    return Memory(kept=32 * sizes.rays, casting=20 * sizes.rays)

@@ -14,17 +14,21 @@ from ..base.arrays import Floats, Indices, Ints, Ints32, owned
 from ..base.elementary import arccos, exp
 from ..base.elementary_scalars import sin_cos_of
 from ..base.vectors import into_axes, length, products, turned
+from ..columns.table import CAUSES
 from ..sensor import Sensor, Survey
 from ..sensor.materials import at_right_angles
-from ..sensor.noise import Purpose
 from ..sensor.optics import LIGHT_M_NS
+from ..sensor.random_numbers import Purpose
 from ..sensor.survey import begin_ns
+from .detection import passes
 from .motion import Clock, Poses
-from .returns import CROSSTALK, OF_RETURNS, PulseReturns, merged, numbers, unreal
+from .returns import OF_RETURNS, PulseReturns, merged, numbers, unreal
 from .scene_caster import SceneCaster
-from .step import Memory, PulseBatch, PulseStep, Setup, Sizes
+from .step import Memory, PulseBatch, PulseStep, Role, Setup, Sizes
 from .surfaces import Surfaces
 
+OTHER = Purpose(23, "noise of the energy of another sensor's pulse")
+CROSSTALK = CAUSES.index("crosstalk")
 CELL_RAYS = 1 << 6  # rays that are compared with a spot at a time
 FILTER_NM = 20.0  # wavelengths that differ by more do not pass a receiver's filter
 SLACK_NS = 10.0  # by which the time of a pulse at the receiver may be off before it is computed
@@ -48,10 +52,12 @@ class CrosstalkStep(PulseStep):
     while the receiver waits for its own pulse.
     """
 
+    role = Role.RECEIVES
     effects = ("Crosstalk",)
     reads = "ray", "distance"
     writes = OF_RETURNS
-    purposes = (Purpose.OTHER,)
+    causes = (CROSSTALK,)
+    purposes = (OTHER,)
 
     def __init__(self, setup: Setup, caster: SceneCaster, surfaces: Surfaces) -> None:
         super().__init__(setup, caster, surfaces)
@@ -82,8 +88,8 @@ class CrosstalkStep(PulseStep):
         row, distance, energy = self.received(batch.keys.scan, rays, *batch.middles, batch.here)
         order = np.lexsort((distance, row))
         ray, distance, energy = rays[row[order]], distance[order], energy[order]
-        key = *batch.keys.of(ray), numbers(ray)
-        seen = self.setup.noise.passes(Purpose.OTHER, energy, *key)
+        scan, number = batch.keys.of(ray)
+        seen = passes(self.setup.noise, OTHER, energy, scan, number, numbers(ray))
         others = unreal(returns, ray[seen], distance[seen], energy[seen], CROSSTALK)
         return merged(returns, others)
 

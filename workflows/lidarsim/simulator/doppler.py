@@ -11,10 +11,12 @@ import numpy as np
 
 from ..base.arrays import Floats, Integers, Ints, Ints32
 from ..base.vectors import products
+from ..sensor.random_numbers import Purpose
 from .motion import Poses
 from .surfaces import Surfaces
 from .ways import Ways
 
+VELOCITY = Purpose(40, "noise of a return's radial velocity")
 BLOCK_HITS = 1 << 13  # hits that are looked at a time, to fit a cache
 
 

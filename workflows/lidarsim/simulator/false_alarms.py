@@ -4,19 +4,29 @@ from __future__ import annotations
 
 import numpy as np
 
-from ..sensor.noise import Purpose
+from ..base.arrays import Floats, Indices, Integers
+from ..base.elementary import exp, log
+from ..columns.table import CAUSES
+from ..sensor.noise import THRESHOLD_SIGMAS, Noise
 from ..sensor.optics import LIGHT_M_NS
-from .returns import FALSE_ALARM, OF_RETURNS, PulseReturns, merged, unreal
-from .step import Memory, PulseBatch, PulseStep, Setup, Sizes
+from ..sensor.random_numbers import Purpose, uniform
+from .returns import OF_RETURNS, PulseReturns, merged, unreal
+from .step import Memory, PulseBatch, PulseStep, Role, Setup, Sizes
+
+FALSE_ALARM = CAUSES.index("false alarm")
+ALARM = Purpose(20, "time until the next false alarm")
+PEAK = Purpose(21, "energy of a false alarm")
 
 
 class FalseAlarmStep(PulseStep):
     """Adds false alarms to the returns of pulses."""
 
+    role = Role.RECEIVES
     effects = ("False alarms",)
     reads = "ray", "distance"
     writes = OF_RETURNS
-    purposes = Purpose.ALARM, Purpose.PEAK
+    causes = (FALSE_ALARM,)
+    purposes = ALARM, PEAK
 
     @staticmethod
     def applies(setup: Setup) -> bool:
@@ -35,8 +45,40 @@ class FalseAlarmStep(PulseStep):
 
     def apply(self, returns: PulseReturns, batch: PulseBatch) -> PulseReturns:
         """See `PulseStep.apply`."""
-        noise, sensor = self.setup.noise, self.setup.sensor
+        sensor = self.setup.sensor
         rays = np.arange(batch.start, batch.stop)
-        row, since, energy = noise.false_alarms(sensor.gate_s, *batch.keys.of(rays))
-        distance = sensor.min_range_m + since * (LIGHT_M_NS * 1e9 / 2)
+        scan, ray = batch.keys.of(rays)
+        row, since_s, energy = false_alarms(self.setup.noise, sensor.gate_s, scan, ray)
+        distance = sensor.min_range_m + since_s * (LIGHT_M_NS * 1e9 / 2)
         return merged(returns, unreal(returns, rays[row], distance, energy, FALSE_ALARM))
+
+
+def false_alarms(
+    noise: Noise, gate_s: float, scan: Integers, ray: Integers
+) -> tuple[Indices, Floats, Floats]:
+    """Sample false alarms of rays (n,), whose receivers are open for `gate_s` seconds.
+
+    False alarms come at the same rate at all times. Each is a maximum of the receiver's noise above
+    the threshold: maxima of normally distributed noise of a narrow band have a Rayleigh
+    distribution (Rice 1944).
+
+    Returns
+    -------
+    Rows of the rays, the time since the receiver opened, in seconds, and energies: (k,) each.
+    """
+    rows = np.arange(len(ray))
+    since_s = np.zeros(len(ray))
+    alarms: list[tuple[Indices, Floats, Floats]] = []
+    while len(rows) or not alarms:
+        number = len(alarms)
+        # The time until the next false alarm is exponentially distributed.
+        drawn = uniform(noise.seed, ALARM, scan[rows], ray[rows], number)
+        in_gate = np.flatnonzero(drawn > exp(-noise.false_alarm_hz * (gate_s - since_s)))
+        rows = rows[in_gate]
+        since_s = since_s[in_gate] - log(drawn[in_gate]) / noise.false_alarm_hz
+        since_s = np.minimum(since_s, gate_s)
+        share = 1 - uniform(noise.seed, PEAK, scan[rows], ray[rows], number)
+        peak = np.sqrt(1 - 2 / (THRESHOLD_SIGMAS * THRESHOLD_SIGMAS) * log(share))
+        alarms.append((rows, since_s, noise.threshold * peak))
+    row, time_s, energy = map(np.concatenate, zip(*alarms, strict=True))
+    return row, time_s, energy

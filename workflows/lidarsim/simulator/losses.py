@@ -7,14 +7,17 @@ import numpy as np
 from ..base.arrays import owned
 from ..base.elementary import sin_cos
 from ..base.vectors import hypot
-from ..sensor.noise import Purpose, uniform
+from ..sensor.random_numbers import Purpose, uniform
 from .returns import PulseReturns, made
-from .step import PulseBatch, PulseStep, Setup
+from .step import PulseBatch, PulseStep, Role, Setup
+
+PACKET = Purpose(61, "whether a packet is lost")
 
 
 class DirtStep(PulseStep):
     """Takes energy from light that passes a dirty part of the window."""
 
+    role = Role.CHANGES
     effects = ("Faults",)
     reads = "ray", "energy"
     writes = ("energy",)
@@ -51,9 +54,10 @@ class DirtStep(PulseStep):
 class LossStep(PulseStep):
     """Loses returns of dead channels and lost packets, and of scans that a frozen sensor lacks."""
 
+    role = Role.CHANGES
     effects = ("Faults",)
     reads = ("ray",)
-    purposes = (Purpose.PACKET,)
+    purposes = (PACKET,)
 
     @staticmethod
     def applies(setup: Setup) -> bool:
@@ -62,7 +66,7 @@ class LossStep(PulseStep):
 
     def apply(self, returns: PulseReturns, batch: PulseBatch) -> PulseReturns:
         """See `PulseStep.apply`."""
-        from . import pulse_loops  # not before: numba takes half a second to import
+        from . import fault_loops  # not before: numba takes half a second to import
 
         firings, spec, seed = batch.firings, batch.firings.spec, self.setup.noise.seed
         before, now = spec.repeats or (spec.ahead, 0)
@@ -77,8 +81,8 @@ class LossStep(PulseStep):
                 channel[row, made(fault.channels)] = True
             else:
                 packet = firings.numbers // fault.packet
-                drawn = uniform(seed, Purpose.PACKET, spec.station, packet, place)
+                drawn = uniform(seed, PACKET, spec.station, packet, place)
                 firing[row] = drawn < made(fault.share)
         rows, ray = np.empty(len(returns.ray), np.int64), owned(returns.ray, np.int64)
-        count = pulse_loops.left(ray, firings.times(ray), spans, firing, channel, rows)
+        count = fault_loops.remaining(ray, firings.times(ray), spans, firing, channel, rows)
         return returns if count == len(rows) else returns.take(rows[:count])

@@ -25,13 +25,15 @@ from ..base.vectors import applied, products
 from ..scene.scene import Scene
 from ..sensor.leaves import brightness, projection
 from ..sensor.materials import MaterialTable, fresnel
-from ..sensor.noise import Purpose
+from ..sensor.random_numbers import Purpose
 from .motion import Clock, Poses
 from .returns import selected
 from .scene_caster import SceneCaster
 from .surfaces import Surfaces
 from .ways import Ways
 
+LEAF = Purpose(30, "depth of leaves that light gets through")
+CROWN = Purpose(31, "crown of the leaf, of crowns that overlap")
 DEPTH = 8  # media around a place that are known at most
 PROBES_MOST = 256  # surfaces that a search for media around a place passes
 UPWARDS = np.array([0.0123, 0.0345, 0.9993])  # of that search; along no edge of what people model
@@ -354,7 +356,7 @@ class LightInMedia:
             metres = np.where(np.isnan(ends[rows]), metres, ends[rows])
         self.left = self.left - depth
         # Where crowns overlap, a leaf is of one of them in proportion to its density.
-        share = (draw(Purpose.WHICH, ray[rows]) >> np.uint64(11)).astype(np.float64) * 2.0**-53
+        share = (draw(CROWN, ray[rows]) >> np.uint64(11)).astype(np.float64) * 2.0**-53
         place = (sums[rows] <= (share * total[rows])[:, None]).sum(axis=1)
         cosines = self.media.bright(self.around.kinds[rows, place], upright[rows])
         return Leaves(rows, metres, self.around.triangles[rows, place], cosines)

@@ -14,7 +14,7 @@ from .device import needs_hits
 from .pulses import CHUNK_RAYS
 from .rig import PATTERN_RAYS, rays_repeat
 from .step import Memory, Setup, Sizes
-from .steps import steps_of
+from .steps import setup_of, steps_of
 
 MB = 1_000_000
 
@@ -77,10 +77,10 @@ def cast_bytes(scene: Scene, survey: Survey, scans: int = 1, *, on_device: bool 
     they needed as much as others. `on_device` says that a CUDA device casts the rays; its own
     memory, some 300 MB, does not count.
     """
-    each = [Setup(scene, survey, number) for number in range(len(survey.carried))]
-    on_device = on_device and not any(map(steps_of, each))
-    most = max(_bytes(setup, scans, on_device) for setup in each)
-    return int(most) + TRIANGLE * scene.counters
+    setups = [setup_of(scene, survey, number) for number in range(len(survey.carried))]
+    on_device = on_device and not any(map(steps_of, setups))
+    peak = max(_bytes(setup, scans, on_device) for setup in setups)
+    return int(peak) + TRIANGLE * scene.counters
 
 
 def _bytes(setup: Setup, scans: int, on_device: bool) -> float:

@@ -20,11 +20,14 @@ from ..scene.scene import Scene
 from ..sensor import ScanSpec, Survey
 from ..sensor.materials import at_right_angles
 from ..sensor.optics import LIGHT_M_NS
+from ..sensor.random_numbers import normal
 from ..sensor.reflectivity import COUNTS, SCALES
-from .doppler import radial_velocities
+from .doppler import VELOCITY, radial_velocities
 from .motion import Firings, Poses
+from .paths import GHOST
 from .pulses import Scanned
-from .returns import BLOOMING, CROSSTALK, FALSE_ALARM, GHOST, made
+from .returns import made
+from .steps import received_causes
 from .surfaces import Surfaces, light_of
 
 BLOCK_HITS = 1 << 16  # that are looked at a time
@@ -456,11 +459,12 @@ class BatchPoints:
                 self._times,
             )
             if found.cause is not None:
-                velocity[np.isin(found.cause, (FALSE_ALARM, CROSSTALK, BLOOMING))] = np.nan
+                velocity[np.isin(found.cause, received_causes())] = np.nan
         noise = self.survey.noise_each[self.specs[0].sensor]
         if noise.velocity_m_s:
             scan = self.scan.astype(np.int64) + self.specs[0].ahead
-            velocity = noise.velocities(velocity, scan, self.ray, self.return_number)
+            drawn = normal(noise.seed, VELOCITY, scan, self.ray, self.return_number)
+            velocity = velocity + noise.velocity_m_s * drawn
         return velocity
 
     @property

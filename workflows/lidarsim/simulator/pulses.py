@@ -18,8 +18,8 @@ from .doppler import radial_velocities
 from .motion import Firings, Poses
 from .returns import NO_SURFACE, Keys, PulseReturns, joined, made
 from .scene_caster import SceneCaster
-from .step import Emitter, PulseBatch, PulseStep, Setup
-from .steps import steps_of
+from .step import Emitter, PulseBatch, PulseStep, Role
+from .steps import setup_of, steps_of
 from .surfaces import Surfaces, light_of
 
 CHUNK_RAYS = 1 << 17  # sub-rays that are cast at a time
@@ -39,7 +39,7 @@ class PulseCaster:
     def __init__(
         self, number: int, caster: SceneCaster, scene: Scene, survey: Survey, surfaces: Surfaces
     ) -> None:
-        self._setup = setup = Setup(scene, survey, number)
+        self._setup = setup = setup_of(scene, survey, number)
         self._caster, self._surfaces = caster, surfaces
         self.emitter = Emitter(setup)
         self.steps: list[PulseStep] = [step(setup, caster, surfaces) for step in steps_of(setup)]
@@ -76,7 +76,7 @@ class PulseCaster:
             found = self._once(whole, groups, tally)
         returns = found.returns
         for step in self.steps:
-            if step.of_kept:
+            if Role.OF_KEPT in step.role:
                 returns = step.apply(returns, whole)
         return self._in_range(found._replace(returns=returns), groups)
 
@@ -114,7 +114,7 @@ class PulseCaster:
         """Take the pulses of a batch through all steps."""
         returns = PulseReturns.none()
         for step in self.steps:
-            if not step.of_kept:
+            if Role.OF_KEPT not in step.role:
                 returns = step.apply(returns, batch)
         return returns
 
@@ -122,7 +122,7 @@ class PulseCaster:
         """Cast rays with one return each; compute energies only for kept ones, and if needed."""
         setup, poses = self._setup, batch.poses
         for step in self.steps:
-            if not step.of_kept:  # noise of angles
+            if Role.AIMS in step.role:
                 step.apply(PulseReturns.none(), batch)
         found = self._caster.scan(
             batch.beams,

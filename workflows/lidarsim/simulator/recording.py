@@ -8,22 +8,26 @@ from numpy.typing import NDArray
 from ..base.arrays import Floats, Ints
 from ..base.elementary import exp
 from ..columns.waveforms import SILENT, ZERO, record
-from ..sensor.noise import THRESHOLD_SIGMAS, Purpose, normal, raw
+from ..sensor.noise import THRESHOLD_SIGMAS
 from ..sensor.optics import CUT
+from ..sensor.random_numbers import Purpose, normal, raw
 from .returns import Keys, PulseReturns, made, numbers
-from .step import Memory, PulseBatch, PulseStep, Setup, Sizes
+from .step import Memory, PulseBatch, PulseStep, Role, Setup, Sizes
 from .waveform import Digitizer
 
+SAMPLES = Purpose(50, "stream of the samples of a waveform")
+SAMPLE = Purpose(51, "noise of a sample")
 BLOCK_SAMPLES = 1 << 20  # that are made at a time
 
 
 class RecordingStep(PulseStep):
     """Records the waveforms of returns, with the noise of the receiver."""
 
+    role = Role.CHANGES
     effects = ("Waveforms",)
     reads = "ray", "distance"
     writes = ("waveform",)
-    purposes = Purpose.SAMPLES, Purpose.SAMPLE
+    purposes = SAMPLES, SAMPLE
 
     @staticmethod
     def applies(setup: Setup) -> bool:
@@ -72,9 +76,9 @@ class RecordingStep(PulseStep):
             samples = _window(hits, digitizer, each, begins[block], low[block], high[block], count)
             if noise.threshold:
                 scan, ray = here.of(beam[block])
-                stream = raw(noise.seed, Purpose.SAMPLES, scan, ray)[:, None]
+                stream = raw(noise.seed, SAMPLES, scan, ray)[:, None]
                 number = begins[block, None] + np.arange(count)
-                drawn = normal(noise.seed, Purpose.SAMPLE, stream, number >> 8, number & 255)
+                drawn = normal(noise.seed, SAMPLE, stream, number >> 8, number & 255)
                 samples += (noise.threshold / THRESHOLD_SIGMAS) * drawn
             steps, exponents = digitised(np.minimum(samples, noise.full))
             low_row, high_row = np.searchsorted(window, [start, start + size])

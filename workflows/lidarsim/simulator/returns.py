@@ -26,7 +26,7 @@ from ..scene.colours import GREY, packed
 T = TypeVar("T")
 
 NO_SURFACE = -1  # triangle and object of what is no surface
-SURFACE, AIR, FALSE_ALARM, CROSSTALK, BLOOMING, GHOST, SPRAY = range(len(CAUSES))
+SURFACE = CAUSES.index("surface")
 
 
 def selected(columns: Iterable[Any], rows: Any) -> Iterator[Any]:

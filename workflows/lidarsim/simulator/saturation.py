@@ -9,7 +9,7 @@ from ..base.elementary import log
 from ..base.elementary_scalars import log_of
 from ..sensor.optics import FWHM, LIGHT_M_NS
 from .returns import PulseReturns, made
-from .step import Memory, PulseBatch, PulseStep, Setup, Sizes
+from .step import Memory, PulseBatch, PulseStep, Role, Setup, Sizes
 
 _TO_M = LIGHT_M_NS / 4  # half of a width, in range
 
@@ -17,6 +17,7 @@ _TO_M = LIGHT_M_NS / 4  # half of a width, in range
 class SaturationStep(PulseStep):
     """Clips and widens the pulses that fill the receiver, and joins them with what they hide."""
 
+    role = Role.RECEIVES
     effects = ("Saturation",)
     reads = "ray", "distance", "energy", "width", "amplitude"
     writes = "distance", "energy", "width", "amplitude"
@@ -47,22 +48,29 @@ def saturated(returns: PulseReturns, full: float, pulse_ns: float) -> PulseRetur
     width at half maximum, `pulse_ns` unless a return has a width. With widths, as in waveforms, the
     range of a clipped return is that of its leading edge.
     """
-    from . import pulse_loops  # not before: numba takes half a second to import
+    from . import saturation_loops  # not before: numba takes half a second to import
 
-    height, waves = returns.height, returns.width is not None
-    usual = made(returns.width) if waves else np.full(len(height), pulse_ns)
-    whole = np.where(usual > 0, usual, pulse_ns)  # what has no echo has the width 0
-    wide = whole * np.sqrt(1 + log(np.maximum(height / full, 1)) / log_of(2.0))
-    front, back = returns.distance - _TO_M * wide, returns.distance + _TO_M * wide
-    early = _TO_M * (wide - whole) if waves else 0.0
-    distance = np.maximum(returns.distance - early, 0)
-    clipped, there = height > full, np.empty(len(height), np.bool_)
-    energy = made(returns.energy).copy()
-    pulse_loops.filled(
-        owned(returns.ray, np.int64), clipped, owned(height), front, back, distance, energy, there
+    height = returns.height
+    in_waveforms = returns.width is not None
+    width = made(returns.width) if in_waveforms else np.full(len(height), pulse_ns)
+    unclipped = np.where(width > 0, width, pulse_ns)  # what has no echo has the width 0
+    widened = unclipped * np.sqrt(1 + log(np.maximum(height / full, 1)) / log_of(2.0))
+    early_m = _TO_M * (widened - unclipped) if in_waveforms else 0.0
+    echoes = saturation_loops.Echoes(
+        ray=owned(returns.ray, np.int64),
+        full=height > full,
+        height=owned(height),
+        front=returns.distance - _TO_M * widened,
+        back=returns.distance + _TO_M * widened,
+        distance=np.maximum(returns.distance - early_m, 0),
+        energy=made(returns.energy).copy(),
     )
-    width = np.where(clipped, (back - front) / (2 * _TO_M), usual)
-    amplitude = np.minimum(height, full)
+    left = np.empty(len(height), np.bool_)
+    saturation_loops.join_full(echoes, left)
+    joined_ns = (echoes.back - echoes.front) / (2 * _TO_M)
     return returns._replace(
-        distance=distance, energy=energy, width=width, amplitude=amplitude
-    ).take(there)
+        distance=echoes.distance,
+        energy=echoes.energy,
+        width=np.where(echoes.full, joined_ns, width),
+        amplitude=np.minimum(height, full),
+    ).take(left)

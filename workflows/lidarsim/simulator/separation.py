@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from ..base.arrays import AnyArray, Bools, owned
+from ..base.arrays import Bools, owned
 from ..scene.colours import GREY, packed
 from ..sensor.disc import neighbours
-from ..sensor.noise import THRESHOLD_SIGMAS, Noise, Purpose, quantiles, starts
+from ..sensor.noise import THRESHOLD_SIGMAS, Noise
 from ..sensor.optics import Mode
-from .returns import (
-    AIR,
+from ..sensor.random_numbers import quantiles, starts
+from .detection import DETECTION, LOSS
+from .returns import (  # fmt: skip
     NO_SURFACE,
     OF_RETURNS,
     SURFACE,
@@ -23,9 +24,13 @@ from .returns import (
     selected,
     unreal,
 )
-from .step import PulseBatch, PulseStep, Setup
+from .step import PulseBatch, PulseStep, Role, Setup
 
-MODES: tuple[Mode, ...] = "all", "first", "last", "strongest", "dual"  # as of `pulse_loops`
+if TYPE_CHECKING:
+    from .pulse_loops import Neighbours
+    from .separation_loops import SubrayHits
+
+MODES: tuple[Mode, ...] = "all", "first", "last", "strongest", "dual"  # as of `separation_loops`
 _NONE = np.zeros(0)
 
 
@@ -33,7 +38,7 @@ class Report(NamedTuple):
     """Which returns are detected and reported."""
 
     mode: Mode = "all"
-    noise: Noise | None = None  # which loses some; None if all are detected
+    noise: Noise | None = None  # by which returns are lost; None if all are detected
     keys: Keys | None = None
     first: int = 0  # number of the first beam for the keys
 
@@ -48,70 +53,100 @@ def separated(
 ) -> PulseReturns:
     """Make returns of hits: those of a beam within a distance of the next are one return.
 
-    So are hits of neighbouring sub-rays on one surface, however far apart they are: a beam that
-    grazes a road illuminates all of the road between them. A return's energy is the sum over its
-    hits, its distance and velocity their means weighted by energy, its triangle and colour those of
-    the strongest. Hits without energy are dropped.
+    So are hits of neighbouring sub-rays on one surface, however far apart the hits are: a beam that
+    grazes a road illuminates all of the road between them. The energy of a return is the sum over
+    the hits, the distance and velocity are means weighted by energy, the triangle and colour are
+    those of the strongest hit. Hits without energy are dropped.
 
     The hits of all sub-rays, `each` of a beam, are in the order of rays; `gap_m` is half of the
     pulse's length. Returns are in the order of beams and distances; their `ray` is the beam.
     """
-    from . import pulse_loops  # not before: numba takes half a second to import
+    from . import random_loops, separation_loops  # not before: numba takes half a second to import
 
-    flies = PulseReturns.none()._replace(energy=_NONE) if air is None else air
+    drops = PulseReturns.none()._replace(energy=_NONE) if air is None else air
     mode, noise, keys, first = report or Report()
-    begun, table, limits = np.zeros(0, np.uint64), _NONE, (0.0, 0.0, THRESHOLD_SIGMAS)
-    if noise is not None and noise.loses:
-        begun, table = starts(noise.seed, Purpose.LOSS, Purpose.DETECTION), quantiles()
-        limits = noise.dropout, noise.threshold, THRESHOLD_SIGMAS
-    speeds = _NONE if hits.velocity is None else hits.velocity
-    begins, scan = (np.zeros(1), 0) if keys is None else (keys.begins, keys.scan)
-    most = len(hits.ray) + len(flies.ray)
-    winds = _NONE if hits.velocity is None or flies.velocity is None else flies.velocity
-    whole, real = np.empty((2, most), np.int64), np.empty((3, most))
-    count = pulse_loops.returns(
-        each, gap_m, MODES.index(mode),
-        owned(hits.ray, np.int64), owned(hits.distance), owned(made(hits.energy)),
-        hits.triangle != NO_SURFACE, owned(speeds),
-        owned(flies.ray, np.int64), owned(flies.distance), owned(made(flies.energy)), owned(winds),
-        *surfaces_of(each, planes), *map(float, limits), begun, table, scan,
-        owned(begins, np.int64), first, whole, real,
-    )  # fmt: skip
-    beam, row = whole[:, :count].copy()
-    distance, energy, velocity = real[:, :count].copy()
+    moves = hits.velocity is not None
+    size = len(hits.ray) + len(drops.ray)
+    made_returns = separation_loops.MadeReturns(
+        beam=np.empty(size, np.int64),
+        row=np.empty(size, np.int64),
+        distance=np.empty(size),
+        energy=np.empty(size),
+        velocity=np.empty(size),
+    )
+    detects = noise is not None and noise.loses
+    count = separation_loops.returns(
+        _subray_hits(hits, hits.triangle != NO_SURFACE, moves=moves),
+        _subray_hits(drops, np.zeros(0, np.bool_), moves=moves),
+        neighbours_of(each, planes),
+        separation_loops.Receiver(
+            subrays=each,
+            gap_m=gap_m,
+            mode=MODES.index(mode),
+            dropout=float(noise.dropout) if noise is not None and detects else 0.0,
+            threshold=float(noise.threshold) if noise is not None and detects else 0.0,
+            threshold_sigmas=THRESHOLD_SIGMAS,
+            quantiles=quantiles() if detects else _NONE,
+        ),
+        random_loops.RandomKeys(
+            starts=starts(noise.seed, LOSS, DETECTION)
+            if noise is not None and detects
+            else np.zeros(0, np.uint64),
+            scan=0 if keys is None else keys.scan,
+            begins=np.zeros(1, np.int64) if keys is None else owned(keys.begins, np.int64),
+            first=first,
+        ),
+        made_returns,
+    )
+    beam, row, distance, energy, velocity = made_returns.first(count)
     if len(hits.ray):
         columns = hits.triangle, hits.colour, hits.cause
         triangle, *more = selected(columns, np.maximum(row, 0))
-        found = PulseReturns(beam, distance, triangle, energy, *more)
+        returns = PulseReturns(beam, distance, triangle, energy, *more)
     else:
-        found = unreal(hits, beam, distance, energy, AIR)
-    if len(flies.ray):
-        some = np.flatnonzero(row < 0)
-        cause = np.full(count, SURFACE, np.uint8) if found.cause is None else found.cause
-        cause[some], found.triangle[some] = made(flies.cause)[-1 - row[some]], NO_SURFACE
-        if found.colour is not None:
-            found.colour[some] = packed(GREY[0])[0]
-        found = found._replace(cause=cause)
-    return found._replace(
-        ray=beam + first,
-        velocity=None if hits.velocity is None else velocity,
+        returns = unreal(hits, beam, distance, energy, SURFACE)
+    if len(drops.ray):
+        from_air = np.flatnonzero(row < 0)
+        cause = np.full(count, SURFACE, np.uint8) if returns.cause is None else returns.cause
+        cause[from_air] = made(drops.cause)[-1 - row[from_air]]
+        returns.triangle[from_air] = NO_SURFACE
+        if returns.colour is not None:
+            returns.colour[from_air] = packed(GREY[0])[0]
+        returns = returns._replace(cause=cause)
+    return returns._replace(ray=beam + first, velocity=velocity if moves else None)
+
+
+def _subray_hits(hits: PulseReturns, solid: Bools, *, moves: bool) -> SubrayHits:
+    """Return hits as loops take them, with velocities if returns have some."""
+    from .separation_loops import SubrayHits
+
+    velocity = hits.velocity if moves else None
+    return SubrayHits(
+        ray=owned(hits.ray, np.int64),
+        distance=owned(hits.distance),
+        energy=owned(made(hits.energy)),
+        velocity=_NONE if velocity is None else owned(velocity),
+        solid=solid,
     )
 
 
-def surfaces_of(each: int, planes: Planes | None) -> tuple[AnyArray, ...]:
-    """Return neighbours among sub-rays, and planes of hits, as loops take them; or none."""
-    pairs, normals, directions = np.zeros((0, 2), np.int64), np.zeros((0, 3)), np.zeros((0, 3))
-    if planes is not None and each > 1:
-        (normals, directions), pairs = planes, neighbours(each)
-    return owned(pairs, np.int64), owned(normals.T), owned(directions.T)
+def neighbours_of(each: int, planes: Planes | None) -> Neighbours:
+    """Return where surfaces may continue, as loops take it: without planes nowhere."""
+    from .pulse_loops import Neighbours
+
+    if planes is None or each == 1:
+        return Neighbours(np.zeros((0, 2), np.int64), np.zeros((3, 0)), np.zeros((3, 0)))
+    normals, directions = planes
+    return Neighbours(owned(neighbours(each), np.int64), owned(normals.T), owned(directions.T))
 
 
 class SeparationStep(PulseStep):
     """Makes returns of hits by their distances; one loop detects and reports them as well."""
 
+    role = Role.FRAME
     reads = "ray", "distance", "triangle", "energy", "velocity"
     writes = *OF_RETURNS, "velocity"
-    purposes = Purpose.LOSS, Purpose.DETECTION
+    purposes = LOSS, DETECTION
 
     @staticmethod
     def applies(setup: Setup) -> bool:
@@ -129,12 +164,13 @@ class SeparationStep(PulseStep):
 class SelectionStep(PulseStep):
     """Reports some of a pulse's returns, after those that waveforms and receivers made."""
 
+    role = Role.FRAME
     reads = "ray", "energy", "amplitude"
 
     @staticmethod
     def applies(setup: Setup) -> bool:
         """See `PulseStep.applies`."""
-        return setup.in_waveforms or setup.receives_more
+        return setup.receives_more
 
     def apply(self, returns: PulseReturns, batch: PulseBatch) -> PulseReturns:
         """See `PulseStep.apply`."""
@@ -142,9 +178,10 @@ class SelectionStep(PulseStep):
 
 
 def chosen(returns: PulseReturns, mode: Mode) -> Bools:
-    """Whether a mode reports each return: (n,)."""
-    from . import pulse_loops
+    """Return whether a mode reports each return: (n,)."""
+    from . import separation_loops
 
-    there, number = np.empty(len(returns.ray), np.bool_), MODES.index(mode)
-    pulse_loops.reported(owned(returns.ray, np.int64), owned(returns.height), number, there)
-    return there
+    shown = np.empty(len(returns.ray), np.bool_)
+    ray = owned(returns.ray, np.int64)
+    separation_loops.reported(ray, owned(returns.height), MODES.index(mode), shown)
+    return shown

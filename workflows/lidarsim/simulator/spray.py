@@ -7,24 +7,33 @@ long as its way. It stays where it is, and what is in it falls to the ground.
 from __future__ import annotations
 
 import math
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from raybeam.moving import near_boxes
 
-from ..base.arrays import Floats, Ints, owned
+from ..base.arrays import Floats, owned
 from ..base.vectors import into_axes, length
+from ..columns.table import CAUSES
 from ..scene.actors import check_spray
-from ..sensor.noise import Purpose, starts
+from ..sensor.random_numbers import Purpose
 from ..sensor.weather import FAINTEST, LARGE, reach, spray
-from .air import exponential, in_the_air, reached, seen_by_range
+from .air import exponential, in_the_air, random_keys, reached, room_for_hits, seen_by_range
 from .motion import along_rings
-from .returns import OF_RETURNS, SPRAY, PulseReturns, joined, made, unreal
+from .returns import OF_RETURNS, PulseReturns, joined, made, unreal
 from .scene_caster import SceneCaster
-from .step import Memory, PulseBatch, PulseStep, Setup, Sizes
+from .step import Memory, PulseBatch, PulseStep, Role, Setup, Sizes
 from .surfaces import Surfaces
 from .ways import Ways
 
+if TYPE_CHECKING:
+    from .spray_loops import Crossings
+
+SPRAY_DEPTH = Purpose(16, "depth of spray until the next clump")
+SPRAY_SUBRAY = Purpose(17, "sub-ray that meets a clump")
+SPRAY_DIAMETER = Purpose(18, "diameter of a drop of spray")
+SPRAY = CAUSES.index("spray")
 BOX_NS, BOXES = 1e8, 10  # time between boxes of a vehicle, and how many are there at a time
 # For how long, and when exp(-1) of it is left, as drops of a few tenths of a millimetre fall.
 LASTS_NS, DECAY_NS = BOXES * BOX_NS, 4e8
@@ -41,10 +50,12 @@ class SprayStep(PulseStep):
         If an actor that raises spray has no size.
     """
 
+    role = Role.CHANGES
     effects = ("Spray",)
     reads = "ray", "distance", "triangle", "energy", "cause", "velocity"
     writes = *OF_RETURNS, "velocity"
-    purposes = Purpose.SPRAY, Purpose.SPRAY_SUBRAY, Purpose.SPRAY_DIAMETER
+    causes = (SPRAY,)
+    purposes = SPRAY_DEPTH, SPRAY_SUBRAY, SPRAY_DIAMETER
 
     def __init__(self, setup: Setup, caster: SceneCaster, surfaces: Surfaces) -> None:
         super().__init__(setup, caster, surfaces)
@@ -53,9 +64,8 @@ class SprayStep(PulseStep):
         air, span = survey.air(setup.number), reach(sensor.min_range_m, sensor.max_range_m)
         kind = spray(survey.spray_g_m3)
         self._extinction, self._step = kind.extinction / LARGE, 1 / kind.slope
-        self._seen = seen_by_range(air, kind, FAINTEST * noise.threshold, *span)
+        self._clumps = seen_by_range(air, kind, FAINTEST * noise.threshold, *span)
         self._materials = surfaces.at(sensor.optics.wavelength_nm)
-        self._begun = starts(noise.seed, *self.purposes)
         # Of each actor the lowest corner of its mesh, and halves of its sides: (a, 2, 3).
         meshes = [actor.mesh.vertices for actor in setup.scene.actors]
         self._sizes = np.array([(one.min(axis=0), np.ptp(one, axis=0) / 2) for one in meshes])
@@ -79,50 +89,60 @@ class SprayStep(PulseStep):
 
     def apply(self, returns: PulseReturns, batch: PulseBatch) -> PulseReturns:
         """See `PulseStep.apply`."""
-        if self._seen is None:
+        if self._clumps is None:
             return returns
-        from . import pulse_loops
+        from . import pulse_loops, spray_loops  # not before: numba takes half a second to import
 
-        keys, each, parts, row = batch.keys, batch.each, list[PulseReturns](), 0
+        each = batch.each
         count = (batch.stop - batch.start) * each
-        far = reached(self._materials, self.surfaces, returns, count)
-        beam, crossed = self._crossings(batch, far.reshape(-1, each).max(axis=1))
-        if not len(beam):
+        reach_m = reached(self._materials, self.surfaces, returns, count)
+        crossings = self._crossings(batch, reach_m.reshape(-1, each).max(axis=1))
+        if not len(crossings.beam):
             return returns
-        energy, ray = made(returns.energy).copy(), returns.ray.astype(np.int64)
-        pulse_loops.veil(beam, crossed, each, self._extinction, far, ray, returns.distance, energy)
+        energy = made(returns.energy).copy()
+        ray = returns.ray.astype(np.int64)
+        veiled = pulse_loops.SampledHits(ray, owned(returns.distance), energy)
+        spray_loops.veil(crossings, each, self._extinction, reach_m, veiled)
         batch.hits = returns = returns._replace(energy=energy)
-        given = self._begun, keys.scan, np.array(keys.begins, np.int64), batch.start, far
-        tables = each, self._seen[0], self._step, self._seen[1], exponential()
-        while row < len(beam):
-            out = np.empty(1024 + len(beam), np.int64), *np.empty((2, 1024 + len(beam)))
-            row, count = pulse_loops.spray(row, beam, crossed, *tables, *given, *out)
-            parts.append(unreal(returns, out[0][:count], out[1][:count], out[2][:count], SPRAY))
-        drawn = joined(parts)
-        drawn = drawn.take(np.argsort(drawn.ray, kind="stable"))
-        return in_the_air(self.setup, returns, batch, drawn)
+        mean, by_range = self._clumps
+        tables = spray_loops.ClumpTables(mean, by_range, self._step, exponential())
+        random = random_keys(self.setup.noise.seed, self.purposes, batch.keys, batch.start)
+        parts: list[PulseReturns] = []
+        row = 0
+        while row < len(crossings.beam):
+            hits = room_for_hits(1024 + len(crossings.beam))
+            row, count = spray_loops.clumps(row, crossings, each, tables, random, reach_m, hits)
+            parts.append(unreal(returns, *hits.first(count), cause=SPRAY))
+        clumps = joined(parts)
+        clumps = clumps.take(np.argsort(clumps.ray, kind="stable"))
+        return in_the_air(self.setup, returns, batch, clumps)
 
-    def _crossings(self, batch: PulseBatch, far: Floats) -> tuple[Ints, Floats]:
-        """Where beams, which get so far (n,), cross boxes: see `pulse_loops.crossings`.
+    def _crossings(self, batch: PulseBatch, far: Floats) -> Crossings:
+        """Return where beams, which get so far (n,), cross boxes.
 
         Those of a beam follow each other, in the order of vehicles and times.
         """
-        from . import pulse_loops
+        from . import spray_loops
 
-        assert self._seen is not None
+        assert self._clumps is not None
         place = along_rings(np.arange(batch.stop - batch.start), self.setup.sensor.channels)
         times = batch.here.times(place * batch.each)
         boxes, there, density = self._boxes(batch.here.ways, times.min(), times.max())
         rays = np.concatenate([one.T.take(place, axis=1) for one in batch.middles])
-        far = np.minimum(far[place], self._seen[1][0, -1])
+        far = np.minimum(far[place], self._clumps[1][0, -1])
         cell, which, size = near_boxes(rays, times, boxes, there, float(far.max()))
         order = np.argsort(cell, kind="stable")
-        pairs = cell[order], which[order], boxes, there, density, LASTS_NS, DECAY_NS
-        room, count = 0, 1 + size * len(cell) // 4
+        pairs = spray_loops.CellPairs(cell[order], which[order], size)
+        spray_boxes = spray_loops.SprayBoxes(boxes, there, density, LASTS_NS, DECAY_NS)
+        room = 0
+        count = 1 + size * len(cell) // 4
         while room < count:  # mostly, some rays of a cell meet a box
-            room, beam, found = count, np.empty(count, np.int64), np.empty((3, count))
-            count = pulse_loops.crossings(rays, times, far, size, *pairs, beam, found)
-        return place[beam[:count]], owned(found[:, :count])
+            room = count
+            crossings = spray_loops.Crossings(np.empty(room, np.int64), np.empty((3, room)))
+            count = spray_loops.cross(rays, times, far, pairs, spray_boxes, crossings)
+        return spray_loops.Crossings(
+            place[crossings.beam[:count]], owned(crossings.spans[:, :count])
+        )
 
     def _boxes(self, ways: Ways, begin: float, end: float) -> tuple[Floats, Floats, Floats]:
         """Boxes of spray, and when they are there, as of `near_boxes`; their densities (b,)."""

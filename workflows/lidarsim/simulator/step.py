@@ -1,13 +1,15 @@
-"""What a step of the simulation is: one effect, which changes the returns of some pulses.
+"""Steps of the simulation: a step is one effect on the pulses of a sensor.
 
-`steps.py` has the list of steps. Each is a class that says when it applies, what it reads and
-writes, which random numbers are its own, and how much memory it takes.
+`steps.py` lists the steps in their order. A step is a class that declares its role, when it
+applies, the columns that it reads and writes, its random numbers and its memory. Nothing else
+decides whether a step acts: how rays are cast follows from the roles of the steps that apply.
 """
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
+from enum import Flag, auto
 from functools import cached_property
 from typing import ClassVar, NamedTuple
 
@@ -15,26 +17,39 @@ import numpy as np
 
 from raybeam import Pattern, SubRays
 
-from ..base.arrays import Floats, Ints
+from ..base.arrays import Floats, Indices, Ints
 from ..base.vectors import turned
 from ..columns.table import VELOCITY
 from ..scene.scene import Scene
 from ..sensor import Fault, Noise, Returns, Sensor, Survey
 from ..sensor.faults import FaultKind
-from ..sensor.noise import Purpose
+from ..sensor.random_numbers import Purpose
 from .motion import Firings, Poses
 from .returns import Keys, Planes, PulseReturns
 from .scene_caster import SceneCaster
 from .surfaces import Surfaces
 
 
+class Role(Flag):
+    """What a step does to pulses; each step declares at least one flag."""
+
+    AIMS = auto()  # turns beams before they are cast
+    ABOUT_AXIS = auto()  # turns them in azimuth and elevation of the head, not in any two axes
+    CHANGES = auto()  # a ray may then have no return, several, another energy or a waveform
+    RECEIVES = auto()  # likewise, by returns that the receiver adds or joins before it selects
+    OF_KEPT = auto()  # acts on the returns that are kept, of all batches together
+    FRAME = auto()  # casts rays, makes returns of hits or selects returns, for the other steps
+
+
 @dataclass(frozen=True, eq=False)
 class Setup:
-    """One sensor of a survey in a scene: what steps are chosen by."""
+    """One sensor of a survey in a scene, by which steps are chosen."""
 
     scene: Scene
     survey: Survey
     number: int  # of the sensor
+    # Roles of all steps that apply, but for `Role.FRAME`; None while these steps are chosen.
+    roles: Role | None
 
     @property
     def sensor(self) -> Sensor:
@@ -43,17 +58,17 @@ class Setup:
 
     @property
     def noise(self) -> Noise:
-        """Its noise."""
+        """Noise of the sensor."""
         return self.survey.noise_each[self.number]
 
     @property
     def reporting(self) -> Returns:
-        """Its beam, and which returns it reports."""
+        """Beam of the sensor, and which returns are reported."""
         return self.survey.returns_each[self.number]
 
     @property
     def gap_m(self) -> float:
-        """Half of its pulse's length, metres."""
+        """Half of the pulse's length, metres."""
         return self.reporting.of(self.sensor.optics)[1]
 
     @property
@@ -69,7 +84,7 @@ class Setup:
 
     @property
     def passing(self) -> bool:
-        """Whether light goes on behind a surface, or off it."""
+        """Whether light goes on through surfaces or off surfaces."""
         glass = any(m.transparent == "pass" for m in self.survey.materials)
         return glass or self.mirroring or self.leafy
 
@@ -96,18 +111,27 @@ class Setup:
     @property
     def several(self) -> bool:
         """Whether a ray that hits something may have no return, or several; else it has one."""
-        noise, reporting = self.noise, self.reporting
-        dark = any(m.reflectance == 0 for m in self.survey.materials)
-        beam = reporting.subrays > 1 or self.in_waveforms or self.recorded > 0
-        lost = bool(self.faults("dirt", "dead_channels", "dropped_packets", "frozen"))
-        return beam or lost or noise.loses or self.passing or dark
+        if self.has(Role.CHANGES | Role.RECEIVES):
+            return True
+        dark = any(material.reflectance == 0 for material in self.survey.materials)
+        return self.reporting.subrays > 1 or self.passing or dark or self.noise.loses
 
     @property
     def receives_more(self) -> bool:
         """Whether the receiver adds to the returns of a pulse or joins some, before it selects."""
-        noise = self.noise
-        adds = noise.false_alarm_hz or noise.stray_light or noise.crosstalk
-        return bool(adds or noise.saturation)
+        return self.has(Role.RECEIVES)
+
+    def has(self, roles: Role) -> bool:
+        """Return whether a step that applies has one of some roles.
+
+        Raises
+        ------
+        RuntimeError
+            If the steps are not chosen yet.
+        """
+        if self.roles is None:
+            raise RuntimeError("only a step of Role.FRAME may apply because others do")
+        return bool(self.roles & roles)
 
     def faults(self, *kinds: FaultKind) -> dict[int, Fault]:
         """Return the faults of some kinds of the sensor, see `Survey.faults_of`."""
@@ -115,25 +139,25 @@ class Setup:
 
 
 class Sizes(NamedTuple):
-    """How many there are of what takes memory, if all rays hit something."""
+    """Numbers of what takes memory, if all rays hit something."""
 
     rays: int
-    beams: float  # that are cast at a time
-    subrays: int  # and sub-rays of them
+    beams: float  # cast at a time
+    subrays: int  # of the beams that are cast at a time
     returns: float  # of all rays
-    points: float  # of these, that are kept
+    points: float  # returns that are kept
 
 
 class Memory(NamedTuple):
-    """Bytes that casting takes."""
+    """Peak memory of casting, in bytes."""
 
     kept: float = 0.0  # until columns are made
     casting: float = 0.0  # while some beams are cast
-    counting: float = 0.0  # and then, while all returns are counted and thinned out
+    counting: float = 0.0  # then, while all returns are counted and thinned out
 
 
 class Emitter:
-    """Gives beams of a sensor their sub-rays."""
+    """Divides the beams of a sensor into sub-rays."""
 
     def __init__(self, setup: Setup) -> None:
         self.beam = setup.reporting.beam(setup.sensor.optics)
@@ -142,7 +166,7 @@ class Emitter:
         # across it and towards it.
         axis = turned(np.array([[0.0, 0, 1]]), setup.sensor.axes)
         self._axis = turned(axis, carried.mount.rotation)[0]
-        self._about_axis = self.beam.oval or setup.noise.ripple_deg > 0
+        self._about_axis = self.beam.oval or setup.has(Role.ABOUT_AXIS)
 
     def __len__(self) -> int:
         return len(self.beam)
@@ -155,9 +179,9 @@ class Emitter:
         *,
         by_head: bool = False,
     ) -> Pattern:
-        """Give beams sub-rays, or those of some rows, with offsets of their angles, radians.
+        """Return the sub-rays of beams, or of some rows, with offsets of angles, radians.
 
-        `by_head` says that they are in the axes of the head, and not in those of the carrier.
+        `by_head` says that the beams are in the axes of the head, not in those of the carrier.
         """
         if len(self) == 1 and offsets is None:
             return pattern
@@ -171,17 +195,34 @@ class PulseBatch:
     """Consecutive beams, and what steps leave for later ones."""
 
     keys: Keys
-    start: int  # number of the first beam, counted as the keys' are
-    stop: int
-    pattern: Pattern  # of the beams
-    first: int  # row of the first of them in it
+    start: int  # number of the first beam, counted as in the keys
+    stop: int  # one past the last
+    pattern: Pattern  # rays of beams
+    first: int  # row of the beam with number 0 in the pattern
     poses: Poses  # of all beams of the keys
-    firings: Firings  # of these
+    firings: Firings  # of all beams of the keys
     emitter: Emitter
     offsets: Floats | None = None  # of the beams' angles, (n, 2), radians
-    hits: PulseReturns | None = None  # of all sub-rays
-    planes: Planes | None = None  # of these
-    air: PulseReturns | None = None  # hits in the air, which are not among them
+    hits: PulseReturns | None = None  # of all sub-rays with surfaces
+    planes: Planes | None = None  # of `hits`
+    air: PulseReturns | None = None  # hits in the air, which are not among `hits`
+
+    def turn(self, offsets: Floats) -> None:
+        """Add angles to the directions of the beams before they are cast, (n, 2), radians.
+
+        With `Role.ABOUT_AXIS` these are angles of azimuth and elevation, else across and up.
+        """
+        before = np.zeros((self.stop - self.start, 2)) if self.offsets is None else self.offsets
+        self.offsets = before + offsets
+
+    def select(self, rows: Indices) -> PulseReturns:
+        """Leave some of the hits of sub-rays, and their planes; returns the hits that are left."""
+        assert self.hits is not None
+        self.hits = self.hits.take(rows)
+        if self.planes is not None:
+            normals, directions = self.planes
+            self.planes = normals[rows], directions[rows]
+        return self.hits
 
     @property
     def each(self) -> int:
@@ -190,20 +231,20 @@ class PulseBatch:
 
     @cached_property
     def beams(self) -> Pattern:
-        """Sub-rays of the beams, and maybe those of others."""
+        """Sub-rays of the beams, and maybe of other beams."""
         rows = np.arange(self.first + self.start, self.first + self.stop)
         some = None if self.offsets is None else rows
         return self.emitter.divided(self.pattern, self.offsets, some, by_head=self.poses.by_head)
 
     @property
     def rows(self) -> slice:
-        """Rows of the beams' firings; a batch begins and ends with one."""
+        """Rows of the beams' firings; a batch begins and ends with a firing."""
         each = self.firings.sensor.channels
         return slice(self.start // each, self.stop // each)
 
     @property
     def window(self) -> tuple[int, int]:
-        """The first of the sub-rays in `beams`, and behind the last."""
+        """First row of the sub-rays in `beams`, and one past the last."""
         row = 0 if self.offsets is not None else (self.first + self.start) * self.each
         return row, row + (self.stop - self.start) * self.each
 
@@ -221,13 +262,21 @@ class PulseBatch:
 
 
 class PulseStep(ABC):
-    """An effect on pulses. It is made where it applies, and then applied to batch after batch."""
+    """An effect on pulses, made once for each sensor to which it applies.
 
+    A subclass without a `role` is a TypeError: nothing would know when to apply the step.
+    """
+
+    role: ClassVar[Role]
     effects: ClassVar[tuple[str, ...]] = ()  # sections of docs/effects.md about it
     reads: ClassVar[tuple[str, ...]] = ()  # columns of returns
     writes: ClassVar[tuple[str, ...]] = ()
-    purposes: ClassVar[tuple[Purpose, ...]] = ()  # of its random numbers
-    of_kept: ClassVar[bool] = False  # whether it works on the returns that are kept, batch by batch
+    causes: ClassVar[tuple[int, ...]] = ()  # values of `cause` of the returns that the step adds
+    purposes: ClassVar[tuple[Purpose, ...]] = ()  # of the random numbers of the step
+
+    def __init_subclass__(cls) -> None:
+        if not getattr(cls, "role", None):
+            raise TypeError(f"step {cls.__name__} states no role: set `role` to flags of `Role`")
 
     def __init__(self, setup: Setup, caster: SceneCaster, surfaces: Surfaces) -> None:
         self.setup, self.caster, self.surfaces = setup, caster, surfaces
@@ -235,18 +284,22 @@ class PulseStep(ABC):
     @staticmethod
     @abstractmethod
     def applies(setup: Setup) -> bool:
-        """Whether it is there; else it costs nothing and changes no byte."""
+        """Return whether the step acts on a sensor; else it costs nothing and changes no byte."""
 
     @staticmethod
     def added(setup: Setup) -> float:
-        """Count the returns that it adds to those of a pulse, on average."""
+        """Return how many returns the step adds to a pulse, on average."""
         return 0.0
 
     @staticmethod
     def memory(setup: Setup, sizes: Sizes) -> Memory:
-        """Memory that it takes."""
+        """Return the memory that the step takes, in bytes."""
         return Memory()
 
     @abstractmethod
     def apply(self, returns: PulseReturns, batch: PulseBatch) -> PulseReturns:
-        """Return the returns as they are after it."""
+        """Return the returns of a batch as they are after the step.
+
+        Before returns are made of hits, these are the hits of sub-rays. A step that changes the
+        hits assigns them to `batch.hits` as well, and selects some by `batch.select`.
+        """

@@ -12,25 +12,31 @@ import numpy as np
 
 from ..base.arrays import Bools, Floats, Integers, Ints, Ints32, owned
 from ..base.vectors import into_axes, length, products, turned
+from ..columns.table import CAUSES
 from ..scene.scene import Scene
-from ..sensor.noise import Purpose
-from .returns import BLOOMING, OF_RETURNS, PulseReturns, merged, unreal
+from ..sensor.random_numbers import Purpose
+from .detection import passes
+from .returns import OF_RETURNS, PulseReturns, merged, unreal
 from .scene_caster import SceneCaster
-from .step import Memory, PulseBatch, PulseStep, Setup, Sizes
+from .step import Memory, PulseBatch, PulseStep, Role, Setup, Sizes
 from .surfaces import Surfaces, light_of
 
+STRAY = Purpose(22, "noise of stray light's energy")
+BLOOMING = CAUSES.index("blooming")
 TRIANGLES_NEAR = 4  # of a cluster are asked where a ray is nearest to them
 CLUSTER_M = 1.0  # triangles of retro-reflectors so near to each other are looked for at a time
-FAINTEST = 0.1  # of the threshold: less is never detected, see `Noise.detected`
+FAINTEST = 0.1  # of the threshold: less is never detected, see `detected`
 
 
 class StrayLightStep(PulseStep):
     """Adds the light of retro-reflectors that beams beside them receive."""
 
+    role = Role.RECEIVES
     effects = ("Blooming",)
     reads = "ray", "distance"
     writes = OF_RETURNS
-    purposes = (Purpose.STRAY,)
+    causes = (BLOOMING,)
+    purposes = (STRAY,)
 
     def __init__(self, setup: Setup, caster: SceneCaster, surfaces: Surfaces) -> None:
         super().__init__(setup, caster, surfaces)
@@ -81,7 +87,7 @@ class StrayLightStep(PulseStep):
                 rows = np.flatnonzero(new)
                 ends[rows] = into_axes(ends[rows], turns[rows].transpose(0, 2, 1))
         row = np.flatnonzero(best > faintest)
-        row = row[noise.passes(Purpose.STRAY, best[row], *batch.keys.of(rays[row]))]
+        row = row[passes(noise, STRAY, best[row], *batch.keys.of(rays[row]))]
         distance = np.sqrt(products(ends[row].T, ends[row].T))
         within = (distance >= low) & (distance <= high)
         row, distance = row[within], distance[within]

@@ -5,19 +5,23 @@
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 
 from raybeam.compiled import compiled, inlined, stage
 
+from ..base.arrays import Bools, Floats, Ints
 from ..base.elementary_loops import exp, log
 from ..sensor.optics import CUT
-from .pulse_loops import _joined
+from .pulse_loops import continue_surfaces
 
 # All in standard deviations of the system waveform.
 # Hits within this are one echo in closed form: position and height err by 1e-3 at most.
 NARROW = 0.25
-MEET = 1.0  # planes of neighbouring hits that meet as closely are one surface, see `_joined`
+MEET = (
+    1.0  # planes of neighbouring hits that meet as closely are one surface, see `continue_surfaces`
+)
 APART = 6.0  # Gaussians that are farther apart are fitted separately
 CLOSE = 1.0  # Gaussians that are nearer are one return
 
@@ -29,6 +33,52 @@ GAIN, ENOUGH = 1e-3, 1e-9  # share of the squares that a step must gain, and squ
 MOVES = 2.0  # standard deviations that a fit may move from its first guess
 HIGHEST = 1.2  # of the highest sample: a Gaussian between two samples may be higher
 _AREA = math.sqrt(2 * math.pi)
+
+
+class WaveMarks(NamedTuple):
+    """Marks of hits by beam, then by distance: (n,) each."""
+
+    solid: Bools  # whether a surface was hit
+    new: Bools  # whether a waveform or a return begins here
+    apart: Bools  # whether the surface of the hit before does not continue
+    searched: Bools  # whether a surface was hit, of waveforms that may be searched
+    every: Bools  # True
+
+
+class WaveLight(NamedTuple):
+    """Light of hits by beam, then by distance: (n,) each."""
+
+    energy: Floats
+    velocity: Floats  # radial, m/s; empty if returns have none
+
+
+class WaveEchoes(NamedTuple):
+    """Echoes of hits in waveforms that were searched, see `search`."""
+
+    number: Ints  # (n,): number of the echo of which a hit is part, or -1
+    shapes: Floats  # (3, n): time of the echo, samples, its energy and width
+
+
+class MadeWaveReturns(NamedTuple):
+    """Arrays to which returns are written: (k,) each."""
+
+    beam: Ints
+    row: Ints  # of the strongest hit
+    distance: Floats  # metres
+    energy: Floats
+    velocity: Floats  # radial, m/s
+    width: Floats  # of the system waveform's
+
+    def first(self, count: int) -> MadeWaveReturns:
+        """Return copies of the first returns, which a loop has written."""
+        return MadeWaveReturns(
+            self.beam[:count].copy(),
+            self.row[:count].copy(),
+            self.distance[:count].copy(),
+            self.energy[:count].copy(),
+            self.velocity[:count].copy(),
+            self.width[:count].copy(),
+        )
 
 
 @stage
@@ -276,39 +326,49 @@ def _end(beam, begin):
 
 
 @compiled()
-def divide(beam, sigma_m, hits, planes, new, parts):
+def divide(beam, sigma_m, hits, marks, subrays, neighbours, parts):
     """Mark where waveforms begin, and write those to be searched to `parts` (k, 2); how many.
 
-    Hits that are together, and yet not narrow, are searched unless they are on one surface.
+    Hits that are together, and yet not narrow, are searched unless they are on one surface. `beam`
+    is that of each of `hits`, which are `PulseHits`; `marks` are `WaveMarks`.
     """
-    sub, far, hard, row, still, some, every = hits
-    each, pairs, normals, directions, table, changes = planes
-    count, begin = 0, 0
+    distance = hits.distance
+    new = marks.new
+    apart = marks.apart
+    searched = marks.searched
+    count = 0
+    begin = 0
     while begin < len(beam):
-        end, before, first = _end(beam, begin), count, begin
+        end = _end(beam, begin)
+        before = count
+        first = begin
         for k in range(begin, end):
-            new[k] = k == begin or far[k] - far[k - 1] > 2 * CUT * sigma_m
-            still[k], some[k] = True, False
+            new[k] = k == begin or distance[k] - distance[k - 1] > 2 * CUT * sigma_m
+            apart[k] = True
+            searched[k] = False
         for k in range(begin + 1, end + 1):
             if k < end and not new[k]:
                 continue
-            if far[k - 1] - far[first] > NARROW * sigma_m:
-                parts[count, 0], parts[count, 1] = first, k
+            if distance[k - 1] - distance[first] > NARROW * sigma_m:
+                parts[count, 0] = first
+                parts[count, 1] = k
                 count += 1
-                for one in range(first, k):
-                    some[one] = hard[one]
+                for hit in range(first, k):
+                    searched[hit] = marks.solid[hit]
             first = k
-        if count > before and len(pairs):
-            _joined(
-                begin, end, every, still, sub, far, some, row, MEET * sigma_m, each, pairs,
-                normals, directions, table, changes,
-            )  # fmt: skip
-        last, count = count, before
+        if count > before and len(neighbours.pairs):
+            continue_surfaces(
+                begin, end, marks.every, apart, searched, hits, MEET * sigma_m, subrays, neighbours
+            )
+        last = count
+        count = before
         for part in range(before, last):
-            first, end_of = parts[part, 0], parts[part, 1]
-            for k in range(first + 1, end_of):
-                if still[k]:
-                    parts[count, 0], parts[count, 1] = first, end_of
+            first = parts[part, 0]
+            end_of_part = parts[part, 1]
+            for k in range(first + 1, end_of_part):
+                if apart[k]:
+                    parts[count, 0] = first
+                    parts[count, 1] = end_of_part
                     count += 1
                     break
         begin = end
@@ -325,14 +385,13 @@ def room_for(length):
 
 
 @compiled()
-def search(when, share, parts, digits, new, echo, found, room):
+def search(when, share, parts, sampling, new, echoes, room):
     """Find the echoes of hits in waveforms, from `parts[k, 0]` to `parts[k, 1]` in each.
 
-    `digits` are the standard deviation of the system waveform in samples, and whether waveforms are
-    decomposed into Gaussians. Writes which echo each hit is part of, or -1, and its row of `found`,
-    time, energy and width (3, n), and marks hits that begin one.
+    `sampling` is the standard deviation of the system waveform in samples, and whether waveforms
+    are decomposed into Gaussians. Writes `WaveEchoes`, and marks hits that begin an echo.
     """
-    sigma, decomposes = digits
+    sigma, decomposes = sampling
     before, many = 0, np.int64(2 * CUT * sigma) + 1
     w, rows, until, at, lines, memory = room
     for part in range(len(parts)):
@@ -348,54 +407,69 @@ def search(when, share, parts, digits, new, echo, found, room):
             key, number = np.int64(np.rint(when[k] * 1024)) - 1024 * low, 0
             while number < count - 1 and until[number] < key:
                 number += 1
-            echo[k] = before + number if count else -1
+            echoes.number[k] = before + number if count else -1
             for row in range(3):
-                found[row, k] = rows[row, number]
+                echoes.shapes[row, k] = rows[row, number]
             if k > begin:
-                new[k] = echo[k] != echo[k - 1]
+                new[k] = echoes.number[k] != echoes.number[k - 1]
         before += count
 
 
 @compiled()
-def returns(beam, sigma_m, per_m, hits, planes, new, light, speed, echo, found, whole, real):
-    """Make the returns of waveforms of beams, see `waveform.returns_in`; returns how many.
+def returns(beam, digitizer_m, hits, marks, subrays, neighbours, light, echoes, made):
+    """Make the returns of waveforms of beams, see `waveform.returns_in`; returns their number.
 
-    Writes beams and rows of the strongest hits to `whole` (2, k); distances, energies, velocities,
-    and widths, of the system waveform's, to `real` (4, k).
+    `digitizer_m` are the standard deviation of the system waveform in range and the samples in a
+    metre; `hits` are `PulseHits`, `marks` `WaveMarks`, `light` `WaveLight`, `echoes` `WaveEchoes`,
+    and `made` `MadeWaveReturns`.
     """
-    sub, far, hard, row, _, _, _ = hits
-    each, pairs, normals, directions, table, changes = planes
-    count, begin = 0, 0
+    sigma_m, per_m = digitizer_m
+    energy = light.energy
+    velocity = light.velocity
+    distance = hits.distance
+    number = echoes.number
+    new = marks.new
+    count = 0
+    begin = 0
     while begin < len(beam):
-        end, several = _end(beam, begin), False
+        end = _end(beam, begin)
+        several = False
         for k in range(begin + 1, end):
             several |= new[k]
-        if several and len(pairs):
-            _joined(
-                begin, end, new, new, sub, far, hard, row, MEET * sigma_m, each, pairs, normals,
-                directions, table, changes,
-            )  # fmt: skip
+        if several and len(neighbours.pairs):
+            continue_surfaces(
+                begin, end, new, new, marks.solid, hits, MEET * sigma_m, subrays, neighbours
+            )
         for k in range(begin + 1, end + 1):
             if k < end and not new[k]:
                 continue
-            best, sum_, mean, drift, spread = begin, 0.0, 0.0, 0.0, 0.0
-            for number in range(begin, k):
-                sum_ += light[number]
-                mean += light[number] * far[number]
-                if len(speed):
-                    drift += light[number] * speed[number]
-                if light[number] > light[best]:
-                    best = number
-            mean /= sum_
-            for number in range(begin, k):
-                off = (far[number] - mean) / sigma_m
-                spread += light[number] * (off * off)
-            whole[0, count], whole[1, count] = beam[begin], row[best, 0]
-            real[0, count], real[1, count], real[2, count] = mean, sum_ / each, drift / sum_
-            real[3, count] = math.sqrt(1 + spread / sum_)
-            if echo[begin] >= 0 and echo[begin] == echo[k - 1]:  # nothing else is on its surface
-                real[0, count] = found[0, begin] / per_m
-                real[1, count], real[3, count] = found[1, begin], found[2, begin]
+            best = begin
+            sum_energy = 0.0
+            mean_m = 0.0
+            sum_velocity = 0.0
+            spread = 0.0
+            for hit in range(begin, k):
+                sum_energy += energy[hit]
+                mean_m += energy[hit] * distance[hit]
+                if len(velocity):
+                    sum_velocity += energy[hit] * velocity[hit]
+                if energy[hit] > energy[best]:
+                    best = hit
+            mean_m /= sum_energy
+            for hit in range(begin, k):
+                off = (distance[hit] - mean_m) / sigma_m
+                spread += energy[hit] * (off * off)
+            made.beam[count] = beam[begin]
+            made.row[count] = hits.row[best, 0]
+            made.distance[count] = mean_m
+            made.energy[count] = sum_energy / subrays
+            made.velocity[count] = sum_velocity / sum_energy
+            made.width[count] = math.sqrt(1 + spread / sum_energy)
+            # An echo with nothing else on its surface.
+            if number[begin] >= 0 and number[begin] == number[k - 1]:
+                made.distance[count] = echoes.shapes[0, begin] / per_m
+                made.energy[count] = echoes.shapes[1, begin]
+                made.width[count] = echoes.shapes[2, begin]
             count += 1
             begin = k
     return count

@@ -14,16 +14,16 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..base.arrays import Floats, owned
-from ..sensor.noise import Purpose
 from ..sensor.optics import CUT, FWHM, LIGHT_M_NS
-from .returns import NO_SURFACE, OF_RETURNS, Planes, PulseReturns, made, numbers
-from .separation import surfaces_of
-from .step import PulseBatch, PulseStep, Setup
+from .returns import NO_SURFACE, OF_RETURNS, Planes, PulseReturns, made
+from .separation import neighbours_of
+from .step import PulseBatch, PulseStep, Role, Setup
 
 
 class WaveformStep(PulseStep):
     """Finds returns in the waveforms of pulses."""
 
+    role = Role.CHANGES | Role.RECEIVES
     effects = ("Waveforms",)
     reads = "ray", "distance", "triangle", "energy", "velocity"
     writes = *OF_RETURNS, "velocity", "width", "amplitude"
@@ -37,23 +37,6 @@ class WaveformStep(PulseStep):
         """See `PulseStep.apply`."""
         found = returns_in(returns, Digitizer.of(self.setup), batch.each, batch.planes)
         return found._replace(ray=batch.start + found.ray)
-
-
-class DetectionStep(PulseStep):
-    """Loses weak returns of waveforms, and a share of all; `SeparationStep` does that itself."""
-
-    reads = "ray", "amplitude"
-    purposes = Purpose.LOSS, Purpose.DETECTION
-
-    @staticmethod
-    def applies(setup: Setup) -> bool:
-        """See `PulseStep.applies`."""
-        return setup.noise.loses and setup.in_waveforms
-
-    def apply(self, returns: PulseReturns, batch: PulseBatch) -> PulseReturns:
-        """See `PulseStep.apply`."""
-        key = *batch.keys.of(returns.ray), numbers(returns.ray)
-        return returns.take(self.setup.noise.detected(returns.height, *key))
 
 
 @dataclass(frozen=True)
@@ -102,43 +85,70 @@ def returns_in(
 ) -> PulseReturns:
     """Make returns of the waveforms of beams; arguments and order as of `separated`.
 
-    Hits that lie close together, or on one surface (see `pulse_loops`), are one Gaussian with their
-    mean and variance. Other waveforms are sampled and searched. The triangle and colour of a return
-    are those of its strongest hit.
+    Hits that lie close together, or on one surface (see `pulse_loops.continue_surfaces`), are one
+    Gaussian with their mean and variance. Other waveforms are sampled and searched. The triangle
+    and colour of a return are those of its strongest hit.
     """
-    from . import wave_loops  # not before: numba takes half a second to import
+    from . import pulse_loops, wave_loops  # not before: numba takes half a second to import
 
-    columns = owned(hits.ray, np.int64), owned(hits.distance), owned(made(hits.energy))
-    row = np.empty((len(hits.ray), 2), np.int64)
-    count, many = wave_loops.ordered(each, *columns, row)
-    order = (row := row[:count])[:, 0]
-    sub, far, light = (column[order] for column in columns)
-    speed = np.zeros(0) if hits.velocity is None else hits.velocity[order]
-    beam, hard = sub // each, hits.triangle[order] != NO_SURFACE
-    new, still, some = np.empty((3, count), np.bool_)
-    echo, found = np.full(count, -1), np.empty((3, count))
-    whole, real = np.empty((2, count), np.int64), np.empty((4, count))
-    scratch = np.empty(many * each, np.int64), np.empty(many + 1, np.int64)
-    surfaces = each, *surfaces_of(each, planes), *scratch
-    mine = sub, far, hard, row, still, some, np.ones(count, np.bool_)
-    parts = np.empty((count, 2), np.int64)
-    parts = parts[: wave_loops.divide(beam, digitizer.sigma_m, mine, surfaces, new, parts)]
-    if len(parts):
-        longest = float((far[parts[:, 1] - 1] - far[parts[:, 0]]).max()) * digitizer.per_m
-        room = wave_loops.room_for(int(longest) + 2 * digitizer.reach + 8)
-        digits, when = (digitizer.sigma, digitizer.decomposes), far * digitizer.per_m
-        wave_loops.search(when, light / each, parts, digits, new, echo, found, room)
-    sizes = digitizer.sigma_m, digitizer.per_m
-    count = wave_loops.returns(
-        beam, *sizes, mine, surfaces, new, light, owned(speed), echo, found, whole, real
+    ray = owned(hits.ray, np.int64)
+    distance = owned(hits.distance)
+    energy = owned(made(hits.energy))
+    row = np.empty((len(ray), 2), np.int64)
+    count, hits_most = wave_loops.ordered(each, ray, distance, energy, row)
+    row = row[:count]
+    order = row[:, 0]
+    light = wave_loops.WaveLight(
+        energy[order], np.zeros(0) if hits.velocity is None else owned(hits.velocity[order])
     )
-    beam, row = whole[:, :count].copy()
-    distance, energy, velocity, width = real[:, :count].copy()
-    return hits.take(row)._replace(
-        ray=beam,
-        distance=distance,
-        energy=energy,
-        velocity=None if hits.velocity is None else velocity,
-        width=(wide := width * (FWHM * digitizer.sigma_ns)),
-        amplitude=digitizer.amplitude(energy, wide),
+    pulse_hits = pulse_loops.PulseHits(
+        subray=ray[order],
+        distance=distance[order],
+        row=row,
+        subray_hits=np.empty(hits_most * each, np.int64),
+        changes=np.empty(hits_most + 1, np.int64),
+    )
+    marks = wave_loops.WaveMarks(
+        solid=hits.triangle[order] != NO_SURFACE,
+        new=np.empty(count, np.bool_),
+        apart=np.empty(count, np.bool_),
+        searched=np.empty(count, np.bool_),
+        every=np.ones(count, np.bool_),
+    )
+    echoes = wave_loops.WaveEchoes(np.full(count, -1), np.empty((3, count)))
+    beam = pulse_hits.subray // each
+    neighbours = neighbours_of(each, planes)
+    parts = np.empty((count, 2), np.int64)
+    parts_count = wave_loops.divide(
+        beam, digitizer.sigma_m, pulse_hits, marks, each, neighbours, parts
+    )
+    parts = parts[:parts_count]
+    if len(parts):
+        lengths_m = pulse_hits.distance[parts[:, 1] - 1] - pulse_hits.distance[parts[:, 0]]
+        longest = int(float(lengths_m.max()) * digitizer.per_m)
+        room = wave_loops.room_for(longest + 2 * digitizer.reach + 8)
+        sampling = (digitizer.sigma, digitizer.decomposes)
+        when = pulse_hits.distance * digitizer.per_m
+        wave_loops.search(when, light.energy / each, parts, sampling, marks.new, echoes, room)
+    returns = wave_loops.MadeWaveReturns(
+        beam=np.empty(count, np.int64),
+        row=np.empty(count, np.int64),
+        distance=np.empty(count),
+        energy=np.empty(count),
+        velocity=np.empty(count),
+        width=np.empty(count),
+    )
+    digitizer_m = (digitizer.sigma_m, digitizer.per_m)
+    count = wave_loops.returns(
+        beam, digitizer_m, pulse_hits, marks, each, neighbours, light, echoes, returns
+    )
+    returns = returns.first(count)
+    width = returns.width * (FWHM * digitizer.sigma_ns)
+    return hits.take(returns.row)._replace(
+        ray=returns.beam,
+        distance=returns.distance,
+        energy=returns.energy,
+        velocity=None if hits.velocity is None else returns.velocity,
+        width=width,
+        amplitude=digitizer.amplitude(returns.energy, width),
     )

@@ -1,0 +1,31 @@
+"""A loop over returns that faults of a sensor take: see losses.py."""
+
+# mypy: disable-error-code="no-untyped-def"
+
+from __future__ import annotations
+
+from raybeam.compiled import compiled
+
+
+@compiled()
+def remaining(ray, times, spans, firing, channel, rows):
+    """Write the rows of returns that no fault takes; returns their number.
+
+    Faults act in `spans` (f, 2) of times. They take the returns of some firings, (f, firings), and
+    channels, (f, channels).
+    """
+    channels = channel.shape[1]
+    count = 0
+    number = 0
+    begin = 0
+    for k in range(len(ray)):
+        while ray[k] >= begin + channels:  # rays follow each other
+            number += 1
+            begin += channels
+        lost = False
+        for f in range(len(spans)):
+            if spans[f, 0] <= times[k] < spans[f, 1]:
+                lost |= firing[f, number] or channel[f, ray[k] - begin]
+        rows[count] = k
+        count += int(not lost)
+    return count
