@@ -105,6 +105,24 @@ def _as_before(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None
             signal.signal(number, handler)
 
 
+@pytest.fixture(scope="session")
+def cluster() -> Iterator[str]:
+    """Address of a cluster whose workers are threads of this process, with the slots of one run."""
+    from tests.clusters import thread_cluster  # the kernels can be tested without Dask
+
+    with thread_cluster({"GPU": 1}, {"LIDAR": 4}, {"OTHER": 1}) as cluster:
+        yield cluster.scheduler_address
+
+
+@pytest.fixture(scope="session")
+def cluster_client(cluster: str) -> Iterator[Any]:
+    """Client of the cluster whose workers are threads, for surveys of a test."""
+    from distributed import Client
+
+    with Client(cluster, set_as_default=False) as client:
+        yield client
+
+
 @pytest.fixture
 def torch(monkeypatch: pytest.MonkeyPatch) -> Iterator[types.ModuleType]:
     """A module in place of PyTorch, whose tensors are arrays."""

@@ -242,7 +242,7 @@ def vectors(cloud, name):
 
 
 @pytest.mark.parametrize("far_m", [0.0, 500_000.0])
-def test_normals_incidence_and_origins_of_a_ramp(far_m):
+def test_normals_incidence_and_origins_of_a_ramp(cluster_client, far_m):
     # A plane that rises to the east by 30 degrees, and a sensor that drives 3 m above it.
     slope = np.tan(np.radians(30))
     x = np.array([-90.0, 90, 90, -90])
@@ -259,7 +259,7 @@ def test_normals_incidence_and_origins_of_a_ramp(far_m):
         columns=["time", *SURFACE],
         precision_m=1e-4,
     )
-    cloud = simulate(scene, survey).cloud
+    cloud = simulate(scene, survey, client=cluster_client).cloud
     assert len(cloud) > 30
     # One triangle winds the other way: normals are on the side that the sensor sees.
     np.testing.assert_allclose(
@@ -276,15 +276,17 @@ def test_normals_incidence_and_origins_of_a_ramp(far_m):
     assert np.ptp(expected) > 30
 
 
-def test_normals_and_origins_in_the_sensors_axes():
+def test_normals_and_origins_in_the_sensors_axes(cluster_client):
     half = np.sqrt(0.5)
     track = Track([0, 1], [[0, 0, 1], [2, 1, 1]], [[0, 0, 0, 1], [0, 0, half, half]])
     mounted = Mounted(Sensor.grid(360, 4), Pose((1, 0, 0.5), 30.0, 10.0), "front")
     survey = Survey(
         sensors=[mounted], trajectory=track, steps=72, columns=SURFACE, precision_m=1e-4
     )
-    world = simulate(Scene.seed(), survey).cloud
-    inside = simulate(Scene.seed(), replace(survey, coordinates="sensor")).cloud
+    world = simulate(Scene.seed(), survey, client=cluster_client).cloud
+    inside = simulate(
+        Scene.seed(), replace(survey, coordinates="sensor"), client=cluster_client
+    ).cloud
     # Scalar products of rays and normals, and lengths, are the same in all axes.
     for axis in "xyz":
         np.testing.assert_array_equal(inside[f"origin_{axis}"], 0)
@@ -302,13 +304,13 @@ def test_normals_and_origins_in_the_sensors_axes():
         )
 
 
-def test_what_is_no_surface_has_neither_normal_nor_incidence():
+def test_what_is_no_surface_has_neither_normal_nor_incidence(cluster_client):
     survey = Survey(
         Sensor.grid(720, 16, 30.0, step_deg=360), poses=[(0, 0, 1)], steps=1, rain_mm_h=80,
         columns=["cause", *SURFACE], noise=Noise(detection_range_m=60),
         returns=Returns("all", subrays=7, divergence_mrad=3),
     )  # fmt: skip
-    cloud = simulate(Scene.seed(), survey).cloud
+    cloud = simulate(Scene.seed(), survey, client=cluster_client).cloud
     in_air = cloud["cause"] > 0
     assert 10 < in_air.sum() < len(cloud)
     for name in SURFACE[:4]:
@@ -316,7 +318,7 @@ def test_what_is_no_surface_has_neither_normal_nor_incidence():
     assert np.isfinite(vectors(cloud, "origin")).all()
 
 
-def test_a_ghost_has_no_normal_and_a_frozen_sensor_takes_normals_along():
+def test_a_ghost_has_no_normal_and_a_frozen_sensor_takes_normals_along(cluster_client):
     mirror = SceneMesh("Mirror", [[5, -9, -9], [5, 9, -9], [5, 9, 9.0]], [[0, 1, 2]])
     behind = SceneMesh("Wall", [[-5, -9, -9], [-5, 9, -9], [-5, 9, 9.0]], [[0, 1, 2]])
     scene = Scene.from_meshes([mirror, behind])
@@ -325,7 +327,7 @@ def test_a_ghost_has_no_normal_and_a_frozen_sensor_takes_normals_along():
         columns=["cause", *SURFACE], returns=Returns("all"),
         materials=[Material("Mirror", 0.3, specular_reflectance=1), Material("*")],
     )  # fmt: skip
-    cloud = simulate(scene, survey).cloud
+    cloud = simulate(scene, survey, client=cluster_client).cloud
     ghosts = cloud["cause"] == 5
     assert ghosts.sum() > 20
     np.testing.assert_array_equal(np.isnan(vectors(cloud, "normal")).any(axis=1), ghosts)
@@ -337,7 +339,7 @@ def test_a_ghost_has_no_normal_and_a_frozen_sensor_takes_normals_along():
         Sensor.grid(360, 8, step_deg=360), trajectory=track, steps=10, columns=SURFACE,
         faults=[Fault("frozen", 0.15)],
     )  # fmt: skip
-    cloud = simulate(Scene.from_meshes([behind]), frozen).cloud
+    cloud = simulate(Scene.from_meshes([behind]), frozen, client=cluster_client).cloud
     first, last = (cloud[cloud["scan"] == scan] for scan in (1, 9))
     assert len(first) == len(last) > 20
     turn = frozen.pose(9).rotation @ frozen.pose(1).rotation.T

@@ -540,9 +540,10 @@ def test_copies_have_their_class_on_all_materials(house):
     assert found["Annex.2", "Glass"] == found["Annex.2", "Brick"] == (8, 0.5)
 
 
-def test_names_of_materials_are_in_reports_and_files(house, tmp_path):
+def test_names_of_materials_are_in_reports_and_files(cluster_client, house, tmp_path):
     scene = Scene.load(house, materials=True)
-    result = simulate(scene, replace(survey(), columns=(*COLUMNS, "time", "intensity")))
+    what = replace(survey(), columns=(*COLUMNS, "time", "intensity"))
+    result = simulate(scene, what, client=cluster_client)
     cloud = result.cloud
     result.report(tmp_path / "out")
     report = json.loads((tmp_path / "out/report.json").read_text())

@@ -307,14 +307,14 @@ def test_packets_of_a_velodyne_are_sweeps(tmp_path):
         open_recording(tmp_path / "room.pcap")
 
 
-def test_a_result_is_fitted_as_a_cloud_and_as_files(tmp_path):
+def test_a_result_is_fitted_as_a_cloud_and_as_files(cluster_client, tmp_path):
     from lidarpool import Scene, Survey, simulate
 
     survey = Survey(
         Sensor.grid(360, 16, vertical_fov_deg=40, max_range_m=120), poses=[(0, 0, 0)] * 4,
         steps=36, columns=["intensity"], noise=NOISE, precision_m=1e-4,
     )  # fmt: skip
-    cloud = simulate(street(), survey).cloud
+    cloud = simulate(street(), survey, client=cluster_client).cloud
     Format("pcd").write(tmp_path / "sweeps", cloud, Sweeps.of(survey, Scene.seed()))
     for found in (fit(cloud), fit(tmp_path / "sweeps", white=1.0)):
         one = found.figures["figures"]["range_m"]

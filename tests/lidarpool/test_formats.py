@@ -737,7 +737,7 @@ SURFACE = ["normal_x", "normal_y", "normal_z", "incidence_deg", "origin_x", "ori
 
 
 @pytest.fixture(scope="module")
-def drive():
+def drive(cluster_client):
     """Points of a tilted sensor on a moving and turning carrier among the default objects."""
     half = np.sqrt(0.5)
     track = Track([0, 1], [[0, 0, 1], [2, 1, 1]], [[0, 0, 0, 1], [0, 0, half, half]])
@@ -746,7 +746,7 @@ def drive():
         sensors=[sensor], trajectory=track, steps=72,
         columns=["time", "range", "ray", "intensity", "class", *SURFACE], precision_m=1e-4,
     )  # fmt: skip
-    return simulate(Scene.seed(), survey).cloud
+    return simulate(Scene.seed(), survey, client=cluster_client).cloud
 
 
 def test_normals_and_origins_follow_the_points_into_the_sensors_axes(drive, tmp_path):

@@ -15,7 +15,6 @@ from typing import Any
 import numpy as np
 import pytest
 from distributed import Client, Worker, WorkerPlugin
-from tests.clusters import thread_cluster
 from tests.daemons import wait_until
 
 import lidarpool.base.fork_server
@@ -54,13 +53,6 @@ def client(local_client: Client) -> Client:
 
     wait_until(all_answer)
     return local_client
-
-
-@pytest.fixture(scope="session")
-def cluster_client(cluster: str) -> Iterator[Client]:
-    """Client of the cluster whose workers are threads."""
-    with Client(cluster, set_as_default=False) as client:
-        yield client
 
 
 class _Saboteur(WorkerPlugin):
@@ -105,13 +97,6 @@ def same_cloud() -> Callable[[Cloud, Cloud], bool]:
         )
 
     return same
-
-
-@pytest.fixture(scope="session")
-def cluster() -> Iterator[str]:
-    """Address of a cluster whose workers are threads of this process, with the slots of one run."""
-    with thread_cluster({"GPU": 1}, {"LIDAR": 4}, {"OTHER": 1}) as cluster:
-        yield cluster.scheduler_address
 
 
 @pytest.fixture
