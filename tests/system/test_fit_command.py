@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from benchmarks.fit_coverage import recorded, street
 from pypcd4 import PointCloud
+from tests.clusters import thread_cluster
 
 from lidarpool import Noise
 from lidarsim.scene.files.polygon_files import read_ply_columns
@@ -56,7 +57,9 @@ def test_the_sensor_that_is_written_has_the_noise_of_the_recording(
     (tmp_path / "campaign.yaml").write_text(
         "base: survey.yaml\nkeep: kitti\nvary: {sensor.performance: {each: [null, ideal]}}\n"
     )
-    done = lidarpool("run", tmp_path / "campaign.yaml", "--out", tmp_path / "set", "-q")
+    with thread_cluster({"GPU": 1}, {"LIDAR": 5}) as slots:
+        where = ["--out", tmp_path / "set", "--scheduler", slots.scheduler_address]
+        done = lidarpool("run", tmp_path / "campaign.yaml", *where, "-q")
     assert done.code == 0, done.err
     files = sorted((tmp_path / "set/sequences").glob("*/velodyne/*.bin"))
     fitted, ideal = (file.stat().st_size // 16 for file in files)
