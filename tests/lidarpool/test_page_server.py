@@ -17,7 +17,7 @@ import pytest
 from tests.pages import ask
 
 from lidarpool.live.point_selection import Abandoned
-from lidarpool.live.server import SLOW_AT_ONCE, SLOW_WAITING, STALL_S, announced, page_server
+from lidarpool.live.server import SLOW_AT_ONCE, SLOW_WAITING, announced, page_server
 
 # Another user's process: asks for addresses, prints their status and whether it saw anything.
 STRANGER = """
@@ -212,15 +212,14 @@ def test_others_are_answered_while_slow_questions_wait(large, question):
         assert source.most == SLOW_AT_ONCE
 
 
-def test_a_search_is_answered_while_nobody_reads_large_answers(large):
+def test_a_search_is_answered_while_nobody_reads_large_answers(large, monkeypatch):
     page, source = large
+    monkeypatch.setattr("lidarpool.live.server.STALL_S", 600.0)
     with unread(page, SLOW_AT_ONCE + SLOW_WAITING, "points?most=20000000"):
         while source.now < SLOW_AT_ONCE:
             time.sleep(0.01)
         source.ready.set()
-        started = time.monotonic()
-        ask(page.url, "points", most=9, filter="z,0,1")
-        assert time.monotonic() - started < STALL_S / 2
+        ask(page.url, "points", most=9, filter="z,0,1")  # within the time that `ask` waits
 
 
 def test_an_answer_that_is_not_read_ends(large, monkeypatch):
