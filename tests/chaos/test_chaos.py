@@ -1,9 +1,14 @@
 """The short versions of `python -m tests.chaos` and of its soak."""
 
+import signal
+import subprocess
+import sys
+
 import pytest
 from tests.chaos.__main__ import Campaign
-from tests.chaos.events import KINDS, Fault
-from tests.chaos.points import WORKER_POINTS
+from tests.chaos.events import CLIENT, KINDS, Fault
+from tests.chaos.nemesis import make_plan
+from tests.chaos.points import DRIVER_POINTS, WORKER_POINTS
 from tests.chaos.soak import draw, soak
 from tests.chaos.survey import disturbed, reference
 
@@ -65,4 +70,28 @@ def test_a_soak_leaves_nothing_and_loses_nothing(arena, what, tmp_path):
     assert (tmp_path / "soak.png").stat().st_size > 0
 
 
-WORKER, DRIVER = ("cast.start", "cast.end"), ("driver.take",)
+def test_clients_die_where_stages_have_pipes():
+    plan = make_plan(SEED, 200, WORKER_POINTS, DRIVER_POINTS, scans=360)
+    faults = [fault for fault in plan if fault.kind == CLIENT]
+    assert {fault.point for fault in faults} >= {"generate.put", "sort.get", "collect.get"}
+    assert not any(fault.point.startswith("intersect.") for fault in faults)
+    assert {fault.partition for fault in faults} == {"", "LIDAR"}
+
+
+WAIT_AT_PIPE = """
+import sys
+from distributed import Client
+from poolpart import Pipe
+from tests.chaos.events import die_at_pipe
+client = Client(processes=False, dashboard_address=None)
+pipe = Pipe("pipe", 1, client).create()
+pipe.put(1)
+die_at_pipe()
+pipe.put(2) if sys.argv[1] == "put" else list(pipe)
+"""
+
+
+@pytest.mark.parametrize("end", ["put", "get"])
+def test_a_client_dies_while_it_waits_at_a_pipe(end):
+    program = [sys.executable, "-c", WAIT_AT_PIPE, end]
+    assert subprocess.run(program, check=False).returncode == -signal.SIGKILL
