@@ -80,6 +80,24 @@ def add_step(step: type[PulseStep], before: type[PulseStep] | None = None) -> No
     ValueError
         If the step would have no effect at its position, is of `Role.FRAME`, or is among the
         steps already.
+
+    Examples
+    --------
+    >>> class Dimmer(PulseStep):
+    ...     role = Role.CHANGES
+    ...     reads = writes = ("energy",)
+    ...
+    ...     @staticmethod
+    ...     def applies(setup):
+    ...         return setup.sensor.max_range_m > 100
+    ...
+    ...     def apply(self, returns, batch):
+    ...         batch.hits = returns._replace(energy=returns.energy / 2)
+    ...         return batch.hits
+    >>> add_step(Dimmer)
+    >>> STEPS.index(Dimmer) == STEPS.index(SeparationStep) - 1
+    True
+    >>> remove_step(Dimmer)
     """
     if step in STEPS:
         raise ValueError(f"step {step.__name__} is among the steps already")
