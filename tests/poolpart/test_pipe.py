@@ -11,6 +11,7 @@ import pytest
 from distributed import Client, Queue, Variable
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from tests.daemons import wait_until
 from tests.poolpart.helpers import LONG_S
 
 from poolpart import Pipe, PipeClosed, PipeFailed
@@ -53,6 +54,12 @@ OPERATIONS = st.lists(
     ),
     max_size=30,
 )
+
+
+def wait_for_waiters(client, counts):
+    """Wait until so many requests wait at each pipe: {pipe: number}."""
+    queues = client.cluster.scheduler.extensions["queues"].queues
+    wait_until(lambda: all(len(queues[p.name].waiters) == n for p, n in counts.items()))
 
 
 @given(operations=OPERATIONS, capacity=st.integers(1, 4))
@@ -137,7 +144,7 @@ def test_failing_wakes_both_ends_with_the_reason(client, make_pipe, pool):
     full.put("x")
     waiting = [pool.submit(other_end(empty).get), pool.submit(other_end(empty).get_all)]
     waiting += [pool.submit(other_end(full).put, number) for number in range(3)]
-    time.sleep(0.05)
+    wait_for_waiters(client, {empty: 2, full: 3})
     assert not any(future.done() for future in waiting)
     for pipe in (empty, full):
         pipe.fail("the disk is full")
@@ -242,7 +249,7 @@ def test_a_put_that_waits_for_room_hears_at_once(client, make_pipe, monkeypatch,
     pipe.put("first")
     with ThreadPoolExecutor(1) as thread:
         waiting = thread.submit(pipe.put, "second")
-        time.sleep(0.2)
+        wait_for_waiters(client, {pipe: 1})
         assert not waiting.done()
         start = time.monotonic()
         change(Pipe(pipe.name, 1, client))
@@ -416,11 +423,11 @@ def test_a_queue_of_another_client_puts_and_gets_the_same_items(client, other, m
     pipe = make_pipe(client)
     queue = Queue(pipe.name, other)
     waiting = pool.submit(pipe.get, LONG_S)
-    time.sleep(0.05)
+    wait_for_waiters(client, {pipe: 1})
     queue.put({"plain": (1, b"2")})
     assert waiting.result(LONG_S) == {"plain": (1, b"2")}
     waiting = pool.submit(queue.get, LONG_S)
-    time.sleep(0.05)
+    wait_for_waiters(client, {pipe: 1})
     pipe.put({1, 2})  # pickled, and unpickled by the other client
     assert waiting.result(LONG_S) == {1, 2}
     pipe.put("first")
@@ -439,12 +446,12 @@ def test_a_queue_waits_for_room_as_well(client, other, make_pipe, pool):
     queue = Queue(pipe.name, other)
     pipe.put(1)
     waiting = pool.submit(queue.put, 2)
-    time.sleep(0.05)
+    wait_for_waiters(client, {pipe: 1})
     assert not waiting.done()
     assert pipe.poll() == [1]
     waiting.result(LONG_S)
     waiting = pool.submit(pipe.put, 3)
-    time.sleep(0.05)
+    wait_for_waiters(client, {pipe: 1})
     assert not waiting.done()
     assert queue.get() == 2
     waiting.result(LONG_S)
@@ -473,7 +480,7 @@ def test_waits_of_a_queue_end_with_the_pipe(client, other, make_pipe, pool, end)
     full.put(1)
     waiting = [pool.submit(Queue(empty.name, other).get, LONG_S)]
     waiting += [pool.submit(Queue(full.name, other).put, 2, LONG_S)]
-    time.sleep(0.05)
+    wait_for_waiters(client, {empty: 1, full: 1})
     for pipe in (empty, full):
         pipe.fail("the disk is full") if end == "fail" else getattr(pipe, end)()
     message = {"close": "is closed", "fail": "the disk is full", "delete": "was deleted"}[end]
@@ -512,7 +519,7 @@ def test_the_variable_is_the_state(client, other, make_pipe, pool):
     pipe.close()
     assert len(variable.get()["closed_by"]) == 1
     waiting = pool.submit(pipe.get, LONG_S)
-    time.sleep(0.05)
+    wait_for_waiters(client, {pipe: 1})
     variable.set({**variable.get(), "closed": True})
     with pytest.raises(PipeClosed):
         waiting.result(LONG_S)
@@ -555,7 +562,7 @@ def test_who_deletes_the_queue_or_the_variable_deletes_the_pipe(
     pipe = make_pipe(client)
     queue = Queue(pipe.name, other)
     waiting = [pool.submit(other_end(pipe).get), pool.submit(queue.get)]
-    time.sleep(0.05)
+    wait_for_waiters(client, {pipe: 2})
     if kind is Variable:
         Variable(pipe.name, other).delete()
     else:

@@ -200,7 +200,7 @@ def breaking(where: str) -> Callable[[int, np.random.Generator], Job]:
 WORDS = {"cast": "no direction", "describe": "ZeroDivisionError: no such step"}
 
 
-@pytest.mark.parametrize("where", [*WORDS])
+@pytest.mark.parametrize("where", quick(("cast",), WORDS))
 def test_a_sensor_that_raises_in_a_worker_fails_its_job_only(client, tmp_path, where, left_over):
     run = Campaign(breaking(where), 4, keep="folder").run(tmp_path / "ds", client=client)
     assert [row.name for row in run.failed] == ["0001"] and run.done == 3
@@ -332,7 +332,7 @@ HARM = {
 }
 
 
-@pytest.mark.parametrize("harm", quick(("cut", "manifest flipped"), HARM))
+@pytest.mark.parametrize("harm", quick(("manifest flipped",), HARM))
 def test_a_damaged_job_is_named_and_made_again(files, finished, whole, lidarpool, slots, harm):
     change, name = HARM[harm]
     run = ["run", files / "c.yaml", "--scheduler", slots, "--out", files / "ds"]
@@ -351,6 +351,7 @@ def test_a_damaged_job_is_named_and_made_again(files, finished, whole, lidarpool
     assert not (files / "ds" / "run").exists()
 
 
+@pytest.mark.slow
 def test_jobs_of_an_unfinished_campaign_are_looked_at(client, tmp_path):
     there = tmp_path / "there"
     campaign = Campaign(third_if(there, []), 4, keep="kitti")
@@ -778,6 +779,7 @@ def test_two_at_once_share_the_slots(other, files, whole, monkeypatch):
     assert other == "survey" or (found.done == 6 and bytes_of(files / "ds2") == whole)
 
 
+@pytest.mark.slow
 def test_jobs_are_written_here_when_no_worker_has_a_slot_left(files, whole, monkeypatch):
     """Its last slots went with a worker that does not come back."""
     monkeypatch.setattr(lidarpool.run.writer, "BEGIN_S", 0.05)

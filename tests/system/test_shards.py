@@ -646,6 +646,7 @@ def _another_shard_in_the_folder(survey: Path, lidarpool: Callable[..., Any], sl
     assert content(survey / "part-2").keys() == before.keys()
 
 
+@pytest.mark.slow
 def test_killed_drivers_of_a_shard_leave_the_same_points(tmp_path, slots):
     (tmp_path / "s.yaml").write_text(SURVEY)
     run = ["s.yaml", "-q", "--scheduler", slots]
@@ -658,6 +659,7 @@ def test_killed_drivers_of_a_shard_leave_the_same_points(tmp_path, slots):
     assert content(tmp_path / "all") == content(tmp_path / "one")
 
 
+@pytest.mark.slow
 def test_the_first_shard_plans_though_it_has_no_scans(tmp_path, lidarpool, slots):
     (tmp_path / "s.yaml").write_text(SURVEY.replace("steps: 25", "steps: 1"))  # two scans
     run = ["run", tmp_path / "s.yaml", "-q", "--scheduler", slots, "--only", "cloud"]

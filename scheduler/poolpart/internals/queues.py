@@ -60,8 +60,9 @@ class Waiters:
         """Do not set the event any more."""
         self._events.discard(event)
 
-    def __bool__(self) -> bool:
-        return bool(self._events)
+    def __len__(self) -> int:
+        """Return the number of requests that wait."""
+        return len(self._events)
 
 
 async def wait_until(
