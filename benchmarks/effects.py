@@ -17,7 +17,7 @@ from typing import Any
 from docs.pictures.effects._catalogue import load_effects
 from docs.pictures.effects._street import survey_without
 
-from lidarsim.scene.generated.city import city
+from lidarscenes.procedural.city import city
 from lidarsim.simulator.batch import columns_of
 from lidarsim.simulator.rig import Rig
 

@@ -19,11 +19,11 @@ import numpy as np
 from benchmarks.realism import TURN_S, cases
 from PIL import Image
 
-from lidarpool.render.camera import Camera
-from lidarpool.render.colouring import TURBO
-from lidarpool.render.pictures import splat
-from lidarpool.render.surface import unit
-from lidarsim.scene.generated.city import city
+from lidarscenes.procedural.city import city
+from lidarview.render.camera import Camera
+from lidarview.render.colouring import TURBO
+from lidarview.render.pictures import splat
+from lidarview.render.surface import unit
 
 SIZE, BACK = (720, 405), np.array([14, 17, 22, 255]) / 255
 EYE, TARGET = np.array([-38.0, -30.0, 34.0]), np.array([4.0, 4.0, 0.0])

@@ -11,10 +11,10 @@ from click.testing import CliRunner
 
 from lidarpool import LidarError
 from lidarpool.cli.scenario_commands import import_
-from lidarpool.importers.helios import Imported, import_survey
 from lidarpool.scenario.build import build
 from lidarpool.scenario.point_scene import surfels
 from lidarpool.scenario.scenario import Scenario
+from lidarscenes.helios import Imported, import_survey
 from lidarsim.sensor.materials import MaterialTable
 from lidarsim.simulator.rig import Rig
 from raybeam import RayCaster

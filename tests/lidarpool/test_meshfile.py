@@ -13,8 +13,9 @@ import pytest
 import trimesh
 from tests.meshes import PLY, write
 
+from lidarscenes.files import formats as more_formats
+from lidarscenes.files import rasters, usd
 from lidarsim.base.errors import LidarError
-from lidarsim.scene.files import more_formats, rasters, usd
 from lidarsim.scene.files.mesh_formats import endings, known_formats
 from lidarsim.scene.files.meshfile import load_meshes
 from lidarsim.scene.scene import Scene

@@ -20,7 +20,7 @@ from lidarsim.scene.files.meshfile import load_meshes
 # A mesh of one triangle, whatever is in the file.
 TRIANGLE = """
 import numpy as np
-from lidarpool.mesh_plugins import Content, MeshFormat, SceneMesh
+from lidarsim.plugins import Content, MeshFormat, SceneMesh
 
 def read(data, path, wanted):
     mesh = SceneMesh("Triangle", np.eye(3), np.array([[0, 1, 2]]))
@@ -106,19 +106,19 @@ def refused(function, *arguments, **options):
         ("wrong-kind", "FORMAT = {}", None, "is a dict, and lidarsim.meshes takes a MeshFormat"),
         (
             "lost-field",
-            "from lidarpool.mesh_plugins import MeshFormat\nFORMAT = MeshFormat()",
+            "from lidarsim.plugins import MeshFormat\nFORMAT = MeshFormat()",
             None,
             "missing 1 required positional argument: 'endings'",
         ),
         (
             "lost-reader",
-            "from lidarpool.mesh_plugins import MeshFormat\nFORMAT = MeshFormat(('.lost-reader',))",
+            "from lidarsim.plugins import MeshFormat\nFORMAT = MeshFormat(('.lost-reader',))",
             None,
             "lacks read, which lidarsim.meshes needs",
         ),
         (
             "lost-function",
-            "from lidarpool.mesh_plugins import MeshFormat\n"
+            "from lidarsim.plugins import MeshFormat\n"
             "FORMAT = MeshFormat(('.lost-function',), 'lost_function:read')",
             None,
             "has no attribute 'read'",
@@ -146,7 +146,7 @@ def test_a_line_names_the_distribution(tmp_path, distribution, name, text, value
 
 
 def test_formats_of_clouds_that_cannot_be_used(distribution):
-    row = "from lidarpool.cloud_plugins import FormatRow\n"
+    row = "from lidarpool.plugins import FormatRow\n"
     distribution(
         "half-cloud",
         {"lidarpool.clouds": {name: f"half_cloud:{name}" for name in ("half", "set", "taken")}},
@@ -196,7 +196,7 @@ def test_a_plugin_writes_a_cloud_to_a_file(tmp_path, distribution):
         "text-cloud",
         {"lidarpool.clouds": {"text": "text_cloud:ROW"}},
         {
-            "text_cloud.py": "from lidarpool.cloud_plugins import FormatRow\n"
+            "text_cloud.py": "from lidarpool.plugins import FormatRow\n"
             "ROW = FormatRow('cloud.text', 'text_cloud', 'write', packages=('no_such',))\n"
             "def write(path, cloud, sweeps): path.write_text(f'{len(cloud)} points')\n"
         },

@@ -37,7 +37,14 @@ class Distribution:
 DISTRIBUTIONS = {
     "lidarpool": Distribution(
         ".",
-        ("kernels/raybeam", "scheduler/poolpart", "workflows/lidarsim", "workflows/lidarpool"),
+        (
+            "kernels/raybeam",
+            "scheduler/poolpart",
+            "workflows/lidarsim",
+            "workflows/lidarscenes",
+            "workflows/lidarview",
+            "workflows/lidarpool",
+        ),
         without=frozenset({"raybeam", "poolpart", "lidarsim", "pytest"}),
     ),
     "raybeam": Distribution(

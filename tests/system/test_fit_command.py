@@ -9,8 +9,8 @@ from pypcd4 import PointCloud
 from tests.clusters import thread_cluster
 
 from lidarpool import Noise
+from lidarscenes.writers.scene_file import write_scene
 from lidarsim.scene.files.polygon_files import read_ply_columns
-from lidarsim.scene.scene_file import write_scene
 
 pytest.importorskip("scipy", reason="the extra fit is not installed")
 

@@ -16,6 +16,7 @@ from lidarpool import (
     read_cloud,
     save_cloud,
     simulate,
+    to_dask,
     to_open3d,
 )
 
@@ -96,7 +97,7 @@ def test_a_result_tells_of_itself_and_its_points_become_frames_and_clouds(result
     )
     assert result._repr_html_().count("<tr>") == len(told.splitlines())
     cloud = result.cloud
-    frame, lazy = cloud.to_dataframe(), result.points.to_dask()
+    frame, lazy = cloud.to_dataframe(), to_dask(result.points)
     assert list(frame) == [*"xyz", "scan", "channel", "object", "brightness", *frame.columns[7:]]
     np.testing.assert_array_equal(frame["z"], cloud.positions[:, 2])
     assert lazy.npartitions == sum(rows > 0 for rows in result.points.rows)

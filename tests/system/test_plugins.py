@@ -110,7 +110,7 @@ def test_a_worker_that_joins_with_another_version_does_no_task(cluster_client):
 # A format that only the process of the tests can import.
 HERE_ALONE = """
 from multiprocessing import parent_process
-from lidarpool.cloud_plugins import FormatRow, Pieces
+from lidarpool.plugins import FormatRow, Pieces
 
 if parent_process() is not None:
     raise ImportError("no library")

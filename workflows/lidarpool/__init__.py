@@ -6,12 +6,12 @@ from typing import TYPE_CHECKING, Any
 from lidarsim._version import __version__
 
 if TYPE_CHECKING:
+    from lidarscenes.robots.robot import Robot
+    from lidarscenes.robots.urdf import load_robot
     from lidarsim.base.errors import LidarError
     from lidarsim.columns.cloud import Cloud
     from lidarsim.columns.table import Column
     from lidarsim.scene.actors import Actor
-    from lidarsim.scene.files.urdf import load_robot
-    from lidarsim.scene.robot import Robot
     from lidarsim.scene.scene import Scene
     from lidarsim.scene.scene_instances import SceneInstance
     from lidarsim.scene.scene_mesh import SceneMesh
@@ -37,6 +37,7 @@ if TYPE_CHECKING:
     from lidarsim.sensor.trajectory_files import load_trajectory
     from lidarsim.simulator import Scanner
 
+    from .api.dask_frames import to_dask
     from .api.result import Result
     from .api.simulation import Campaign, simulate
     from .compare.comparison import Comparison, compare
@@ -101,6 +102,7 @@ __all__ = [
     "save_cloud",
     "simulate",
     "sweeps",
+    "to_dask",
     "to_open3d",
 ]
 
@@ -108,6 +110,7 @@ __all__ = [
 # is asked for: importing all takes a second, and the command sees to its signals before that
 # (`__main__.py`).
 _MODULES = {
+    ".api.dask_frames": ("to_dask",),
     ".api.result": ("Result",),
     ".api.simulation": ("Campaign", "simulate"),
     ".datasets.loader": ("sweeps",),
@@ -123,8 +126,8 @@ _MODULES = {
     ".run.run_result": ("CampaignRun",),
     ".run.store.run_store": ("remove_run",),
     ".scenario.build": ("Job",),
-    "lidarsim.scene.robot": ("Robot",),
-    "lidarsim.scene.files.urdf": ("load_robot",),
+    "lidarscenes.robots.robot": ("Robot",),
+    "lidarscenes.robots.urdf": ("load_robot",),
 }
 
 

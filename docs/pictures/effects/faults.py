@@ -12,7 +12,7 @@ from docs.pictures.effects._street import survey_without
 from matplotlib.figure import Figure
 
 from lidarpool import Fault, Scene, Sensor, Survey, Track
-from lidarsim.scene.generated.city import city
+from lidarscenes.procedural.city import city
 from lidarsim.simulator.rig import Rig
 
 DRAWS = "effect-faults.png"

@@ -4,7 +4,7 @@ import io
 
 import numpy as np
 
-from lidarpool.cloud_plugins import Cloud, FormatRow, Pieces
+from lidarpool.plugins import Cloud, FormatRow, Pieces
 
 ROW = FormatRow(
     "npy",  # folder in a result

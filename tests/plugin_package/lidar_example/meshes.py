@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 
-from lidarpool.mesh_plugins import Content, MeshFileError, MeshFormat, SceneMesh, Wanted
+from lidarsim.plugins import Content, MeshFileError, MeshFormat, SceneMesh, Wanted
 
 CORNERS = np.array([(x, y, z) for z in (0, 1) for y in (-0.5, 0.5) for x in (-0.5, 0.5)])
 SIDES = np.array(

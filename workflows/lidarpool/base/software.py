@@ -21,7 +21,7 @@ from raybeam import backend_build
 
 T = TypeVar("T")
 
-PACKAGES = ("lidarpool", "lidarsim", "poolpart", "raybeam")
+PACKAGES = ("lidarpool", "lidarscenes", "lidarsim", "lidarview", "poolpart", "raybeam")
 IMPORTED = time.time()  # in a forked worker, when the fork server imported it
 CLOCKS_S = 5.0  # clocks of a file server and of this machine may differ by so much
 

@@ -14,8 +14,9 @@ import click
 from distributed import Client
 from rich.console import Console
 
+from lidarsim.base.writing_progress import WritingProgress
+
 from ..base.streams import Unheard
-from ..base.writing_progress import WritingProgress
 from ..run.progress import Pace, Progress, Screen, Show, bars, rows, standing_still
 from .shared_options import WARNED, set_logs
 

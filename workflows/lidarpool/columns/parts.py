@@ -14,7 +14,7 @@ import re
 import zipfile
 from bisect import bisect_right
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -26,7 +26,7 @@ from lidarsim.base.errors import LidarError
 from lidarsim.base.input_files import open_input
 from lidarsim.base.sampling import even_indices
 from lidarsim.base.storage import Storage, target_of
-from lidarsim.columns.cloud import CHUNK_POINTS, Cloud, Shown, need_packages
+from lidarsim.columns.cloud import CHUNK_POINTS, Cloud, Shown
 from lidarsim.columns.part_columns import PartColumns, positions_of
 from lidarsim.columns.table import AXES, SCAN, Column
 from lidarsim.columns.waveforms import WAVEFORM
@@ -257,31 +257,6 @@ class StoredCloud(Shown):
             before += self.rows[i]
             clouds.append(self.cloud_of(read_part(self.storage, self.names[i]), inside))
         return Cloud.joined(clouds) if clouds else self.load()
-
-    def to_dask(self) -> Any:
-        """Return a Dask DataFrame of all columns, a partition for each part.
-
-        The computing workers must see the parts, and the result must be kept until then.
-
-        Raises
-        ------
-        LidarError
-            If pandas or pyarrow, which Dask's dataframes need, is not installed.
-        """
-        need_packages("pandas", "pyarrow")
-        import dask.dataframe as dd
-
-        # Without the scene, which would go to all workers.
-        bare = replace(self, names=(), firsts=(), rows=(), cells=None, keeper=None, sweeps=None)
-        filled = [name for name, rows in zip(self.names, self.rows, strict=True) if rows]
-        empty = bare.load().to_dataframe()
-        if not filled:
-            return dd.from_pandas(empty, npartitions=1)
-        return dd.from_map(bare.frame_of, filled, meta=empty)
-
-    def frame_of(self, name: str) -> Any:
-        """Return a pandas DataFrame of a part."""
-        return self.cloud_of(read_part(self.storage, name)).to_dataframe()
 
     def load(self) -> Cloud:
         """Read the whole cloud into memory."""

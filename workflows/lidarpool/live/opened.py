@@ -6,11 +6,11 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from lidarsim.base.errors import LidarError
+from lidarview.viewer.view import CLOUD, Downloads, View, open_results
 
 from ..export.formats import Format, save_cloud
 from ..run.store.database import FILE
 from ..run.store.run_store import RUN_FOLDER
-from .view import CLOUD, Downloads, View, open_results
 
 DOWNLOADS = ("ply", "las", "parquet")  # formats that a page offers
 

@@ -14,18 +14,18 @@ from lidarsim.base.errors import LidarError, explained
 from lidarsim.base.interrupts import deferred_interrupts
 from lidarsim.base.storage import Storage, flush
 from lidarsim.base.vocabulary import PICTURES
+from lidarsim.base.writing_progress import WritingProgress
 from lidarsim.sensor import Survey
 from lidarsim.sweeps.instruments import INSTRUMENT_FILES, Instruments
 from lidarsim.sweeps.sweeps import SWEEPS_FILE, Sweeps
+from lidarview.picture_file import PICTURE_FILE
 
 from ..base.open3d_module import load_open3d
-from ..base.writing_progress import WritingProgress
 from ..columns.parts import StoredCloud
 from ..export.folder import LAST_FILE, result_folder, staging
 from ..export.format_table import FORMATS, FormatRow, plugin_rows
 from ..export.formats import Format, refuse_strangers
 from ..export.navigation_files import write_instruments
-from ..run.picture_file import PICTURE_FILE
 from ..run.run_result import RunResult
 from ..run.runner import Output, Run
 from ..run.writer import LidarWorkers

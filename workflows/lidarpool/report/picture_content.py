@@ -5,8 +5,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 
+from lidarview.picture_file import PictureContent, PlannedPath, PlanningPicture
+
 from ..plan import Plan, Planning, Trial
-from ..run.picture_file import PictureContent, PlannedPath, PlanningPicture
 from ..run.run_result import RunResult
 
 

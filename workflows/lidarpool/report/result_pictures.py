@@ -20,20 +20,20 @@ from lidarsim.base.errors import LidarError, explained
 from lidarsim.base.sampling import even_indices
 from lidarsim.base.vocabulary import PICTURES
 from lidarsim.base.words import did_you_mean, plural
+from lidarsim.base.writing_progress import WritingProgress
 from lidarsim.columns.cloud import Cloud
+from lidarsim.columns.cloud_file import CloudFile
 from lidarsim.columns.table import TABLE, Z
 from lidarsim.scene.scene import Scene
+from lidarview.picture_file import PictureContent, PlannedPath, PlanningPicture, moving_positions
+from lidarview.render import theme
+from lidarview.render.colouring import with_rgb
+from lidarview.render.picture_page import FONT, Page
+from lidarview.render.pictures import MOST_POINTS, draw_cloud, draw_hits, draw_scene
+from lidarview.render.shot import SIZE, Samples, SurfaceView, take_shot
+from lidarview.render.stage import make_axis, nice_step
 
-from ..base.writing_progress import WritingProgress
-from ..columns.cloud_file import CloudFile
 from ..plan.stations import Sight, StationPlan
-from ..render import theme
-from ..render.colouring import with_rgb
-from ..render.picture_page import FONT, Page
-from ..render.pictures import MOST_POINTS, draw_cloud, draw_hits, draw_scene
-from ..render.shot import SIZE, Samples, SurfaceView, take_shot
-from ..render.stage import make_axis, nice_step
-from ..run.picture_file import PictureContent, PlannedPath, PlanningPicture, moving_positions
 from .page.rendering import put_picture
 
 SIDE_LEAST, SIDE_MOST = 480, 4096  # letters need some pixels; a pixel takes 0.4 kB of memory

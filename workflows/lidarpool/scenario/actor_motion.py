@@ -17,6 +17,7 @@ from xml.parsers import expat
 import numpy as np
 from pydantic import Strict, model_validator
 
+from lidarscenes.files.formats import ROBOTS
 from lidarsim.base.arrays import Floats
 from lidarsim.base.declared import (
     Several,
@@ -33,7 +34,6 @@ from lidarsim.base.input_files import open_input
 from lidarsim.base.words import printable
 from lidarsim.base.xmlfile import refuse_entity
 from lidarsim.scene.actors import Actor
-from lidarsim.scene.files.more_formats import ROBOTS
 from lidarsim.scene.scene_mesh import SceneMesh
 from lidarsim.sensor import Mounted, Pose, Track, load_trajectory
 from lidarsim.sensor.survey import StepCount

@@ -13,7 +13,7 @@ from ..sensor.noise import THRESHOLD_SIGMAS, Noise
 from ..sensor.optics import Mode
 from ..sensor.random_numbers import quantiles, starts
 from .detection import DETECTION, LOSS
-from .returns import (  # fmt: skip
+from .returns import (
     NO_SURFACE,
     OF_RETURNS,
     SURFACE,

@@ -95,7 +95,7 @@ _READ = (
 )
 
 # Tables of further packages, each a tuple `MESH_FORMATS`. A package need not be installed.
-_TABLES = ("lidarsim.scene.files.more_formats",)
+_TABLES = ("lidarscenes.files.formats",)
 
 _POINTS = "make a mesh of it by lidarpool scene points"
 _MUJOCO = "a model of MuJoCo becomes OpenUSD by mujoco-usd-converter"

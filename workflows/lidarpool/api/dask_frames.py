@@ -1,0 +1,45 @@
+"""Points of a result as Dask's dataframes."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+from lidarsim.base.validation import checked
+from lidarsim.columns.cloud import need_packages
+
+from ..columns.parts import StoredCloud, read_part
+
+
+@checked
+def to_dask(points: StoredCloud) -> Any:
+    """Return a Dask DataFrame of all columns of points in parts, a partition for each part.
+
+    The computing workers must see the parts, and the result must be kept until the frame is
+    computed.
+
+    Parameters
+    ----------
+    points
+        `Result.points`.
+
+    Raises
+    ------
+    LidarError
+        If pandas or pyarrow, which Dask's dataframes need, is not installed.
+    """
+    need_packages("pandas", "pyarrow")
+    import dask.dataframe as dd
+
+    # Without the scene, which would go to all workers, and without parts.
+    template = replace(points, names=(), firsts=(), rows=(), cells=None, keeper=None, sweeps=None)
+    filled = [name for name, rows in zip(points.names, points.rows, strict=True) if rows]
+    empty = template.load().to_dataframe()
+    if not filled:
+        return dd.from_pandas(empty, npartitions=1)
+    return dd.from_map(_frame_of_part, filled, points=template, meta=empty)
+
+
+def _frame_of_part(name: str, points: StoredCloud) -> Any:
+    """Return a pandas DataFrame of a part."""
+    return points.cloud_of(read_part(points.storage, name)).to_dataframe()

@@ -1,1 +1,0 @@
-"""Surveys of other programs as scenarios."""

@@ -1,7 +1,0 @@
-"""What plug-ins that read mesh files import; docs/how-to/plugins.md has an example."""
-
-from lidarsim.scene.files.mesh_formats import MeshFormat
-from lidarsim.scene.files.scene_graph import Content, MeshFileError, Wanted
-from lidarsim.scene.scene_mesh import SceneMesh
-
-__all__ = ["Content", "MeshFileError", "MeshFormat", "SceneMesh", "Wanted"]

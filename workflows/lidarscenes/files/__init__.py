@@ -1,0 +1,1 @@
+"""Readers of OpenUSD, Collada, 3MF, MagicaVoxel, rasters of heights and CityJSON."""

@@ -1,0 +1,35 @@
+"""Mesh formats beyond those of the core: `mesh_formats` finds this table by its name."""
+
+from __future__ import annotations
+
+from lidarsim.scene.files.mesh_formats import MeshFormat
+
+CITYJSON = (".json", ".cityjson", ".jsonl")
+ROBOTS = (".urdf", ".xacro")  # of which `urdf` refuses the latter, with what to do
+
+_USD = "lidarscenes.files.usd:read_usd"
+_RASTER = "lidarscenes.files.rasters:read_raster"
+_ZIP = b"PK\x03\x04"
+_CRATE = b"PXR-USDC"  # binary OpenUSD
+_USD_TEXT = b"#usda "
+
+MESH_FORMATS = (
+    MeshFormat((".dae",), "lidarscenes.files.dae:read_dae"),
+    MeshFormat((".3mf",), "lidarscenes.files.threemf:read_3mf", begins=(_ZIP,)),
+    MeshFormat((".vox",), "lidarscenes.files.vox:read_vox"),
+    MeshFormat((".usd",), _USD, animated=True, begins=(_CRATE, _USD_TEXT)),
+    MeshFormat((".usda",), _USD, animated=True, begins=(_USD_TEXT,)),
+    MeshFormat((".usdc",), _USD, animated=True, begins=(_CRATE,)),
+    MeshFormat((".usdz",), _USD, animated=True, begins=(_ZIP,)),
+    MeshFormat(CITYJSON, "lidarscenes.files.cityjson:read_cityjson"),
+    MeshFormat(
+        (".tif", ".tiff"), _RASTER, from_path=True, raster=True, begins=(b"II*\0", b"MM\0*")
+    ),
+    MeshFormat(
+        (".asc", ".hgt", ".img", ".dem", ".dt0", ".dt1", ".dt2"),
+        _RASTER,
+        from_path=True,
+        raster=True,
+    ),
+    MeshFormat(ROBOTS, advice="it is a robot, read it with load_robot, or by a scenario"),
+)
