@@ -103,7 +103,7 @@ def test_no_random_number_is_used_twice(monkeypatch):
     for name, module in [*sys.modules.items()]:
         for known, other in ((raw, recorded), (starts, begun)):
             if (
-                name.startswith(("lidarpool", "lidarsim"))
+                name.startswith(("lidarpool", "lidarscenes", "lidarsim"))
                 and getattr(module, known.__name__, None) is known
             ):
                 monkeypatch.setattr(module, known.__name__, other)

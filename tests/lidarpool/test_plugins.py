@@ -12,7 +12,7 @@ from lidarpool.base.software import difference, plugin_versions, software
 from lidarpool.cli.commands import cli
 from lidarpool.export.format_table import row_of
 from lidarpool.export.formats import Format
-from lidarpool.scenario.campaign import hashes
+from lidarpool.scenario.campaign_jobs import file_hashes
 from lidarsim.base.errors import LidarError
 from lidarsim.base.plugins import find_plugin, plugins_of
 from lidarsim.scene.files.meshfile import load_meshes
@@ -227,7 +227,7 @@ def test_software_has_the_plugins_that_are_used(tmp_path, distribution):
 def test_jobs_of_campaigns_know_the_plugins_that_read_their_meshes(tmp_path, distribution):
     mesh(distribution, "job-mesh", "job", TRIANGLE.format(ending="job"))
     path = write(tmp_path / "a.job", "anything")
-    names = [name for name, _ in hashes([path])]
+    names = [name for name, _ in file_hashes([path])]
     assert names == ["a.job", "job-mesh"]
 
 

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import lidarscenes
 import lidarsim
 import raybeam
 from lidarpool import Actor, Material, Noise, Returns, Scanner, Scene, Track, load_sensor
@@ -27,17 +28,18 @@ vecmat
 FUNCTIONS = {*NAMES.split()}
 SOURCES = {
     f"{package.__name__}/{path.relative_to(root).as_posix()}": path
-    for package in (lidarsim, raybeam)
+    for package in (lidarscenes, lidarsim, raybeam)
     for root in (Path(package.__file__).parent,)
     for path in sorted(root.rglob("*.py"))
 }
 # What no byte of a cloud depends on, or what one process makes for all.
 EXCEPTIONS = {
-    "lidarsim/scene/generated/": "scenes are made once, and read by all",
+    "lidarscenes/helios/": "surveys are imported once",
+    "lidarscenes/procedural/": "scenes are made once, and read by all",
+    "lidarscenes/writers/": "scenes are written once, and read by all",
     "lidarsim/scene/simplified.py": "for pictures and planning",
-    "lidarsim/scene/surroundings.py": "for pictures and planning",
     "lidarsim/sweeps/": "files of sweeps are written by one process for all",
-    "lidarsim/scene/files/usd_child.py": "OpenUSD computes places itself; the rest are checks",
+    "lidarscenes/files/usd_child.py": "OpenUSD computes places itself; the rest are checks",
 }
 
 
