@@ -59,7 +59,7 @@ def test_jobs_are_of_the_partition_that_has_work_and_go_when_it_is_done(queue, w
         assert queue.submitted.count("FIX-0") == 1
         assert len(Partition("FIX", client)) == 1
         assert sorted(queue.submitted) == ["FIX-0", "GPU-0", "GPU-1", "GPU-2"]
-        assert list(queue.workers) == ["0"]
+        wait_until(lambda: list(queue.workers) == ["0"])
         # Later ones have names of their own.
         assert gpu.submit(worker_name).result(LONG_S) == "GPU-3"
         assert Pool.from_client(client).partitions().keys() == {"FIX", "GPU", "IO"}
