@@ -23,8 +23,8 @@ from matplotlib.lines import Line2D
 from matplotlib.ticker import MaxNLocator
 from tests.daemons import LOOPBACK, Slurm, slurm
 
-from lidarpool.render import theme
-from lidarpool.render.picture_page import FONT, Page
+from lidarview.render import theme
+from lidarview.render.picture_page import FONT, Page
 from poolpart import Partition
 from poolpart.deploy import start_partitions
 

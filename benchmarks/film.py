@@ -18,11 +18,11 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from lidarpool.render.camera import Camera
-from lidarpool.render.colouring import TURBO
-from lidarpool.render.pictures import splat
-from lidarpool.render.surface import unit
-from lidarsim.scene.generated.city import city
+from lidarscenes.procedural.city import city
+from lidarview.render.camera import Camera
+from lidarview.render.colouring import TURBO
+from lidarview.render.pictures import splat
+from lidarview.render.surface import unit
 
 from .realism import TURN_S, cases
 

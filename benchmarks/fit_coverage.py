@@ -18,8 +18,8 @@ import numpy as np
 from lidarpool import LidarError, Noise, Scanner, Scene, Sensor
 from lidarpool.compare.fit import fit
 from lidarpool.compare.recordings import Recording
-from lidarsim.scene.generated.city import city
-from lidarsim.scene.generated.plants import all_trees, placed
+from lidarscenes.procedural.city import city
+from lidarscenes.procedural.plants import all_trees, placed
 from lidarsim.scene.scene_mesh import SceneMesh
 
 SWEEPS, COLUMNS, LAYERS, FARTHEST_M = 12, 360, 16, 120.0

@@ -22,10 +22,10 @@ import numpy as np
 import lidarsim.simulator.device
 from lidarpool import Scene, Survey, Track, load_sensor
 from lidarpool.columns.parts import pack
+from lidarscenes.procedural.city import city
 from lidarsim.base.storage import Storage
 from lidarsim.columns.part_columns import PartColumns
 from lidarsim.scene.actors import Actor, box
-from lidarsim.scene.generated.city import city
 from lidarsim.simulator.batch import columns_of
 from lidarsim.simulator.rig import Rig
 from raybeam import Outbox

@@ -17,7 +17,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from lidarsim.scene.generated.terrain import terrain
+from lidarscenes.procedural.terrain import terrain
 from lidarsim.scene.shapes import revolve, seed_objects
 from raybeam import RayCaster, available_backends
 

@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidarpool import Scene, Sensor, Survey
-from lidarsim.scene.generated.city import city
-from lidarsim.scene.generated.terrain import terrain
+from lidarscenes.procedural.city import city
+from lidarscenes.procedural.terrain import terrain
 from raybeam import RayCaster
 
 Float = NDArray[np.float64]

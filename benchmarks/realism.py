@@ -31,9 +31,9 @@ from lidarpool import (
     Track,
     load_sensor,
 )
+from lidarscenes.procedural.city import city
 from lidarsim.scene.actors import box, one_mesh
 from lidarsim.scene.files.meshfile import load_objects
-from lidarsim.scene.generated.city import city
 from lidarsim.scene.scene_mesh import SceneMesh
 from lidarsim.simulator.batch import columns_of
 from lidarsim.simulator.rig import Rig

@@ -29,7 +29,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidarpool import Noise, Scanner, Scene, Sensor, Track, load_sensor
-from lidarsim.scene.generated.city import city
+from lidarscenes.procedural.city import city
 from raybeam import Pattern, RayCaster, available_backends
 
 from .raycast import CLOCKS, environment

@@ -30,8 +30,8 @@ from typing import Any
 import numpy as np
 
 from lidarpool import Beams, Noise, Returns, Scene, Sensor, Spin, Survey, Track, load_sensor
+from lidarscenes.procedural.city import city
 from lidarsim.scene.actors import Actor, box
-from lidarsim.scene.generated.city import city
 from lidarsim.simulator.points import BatchPoints
 from lidarsim.simulator.rig import Rig
 from raybeam import available_backends

@@ -29,7 +29,7 @@ MESH = "city.glb"
 
 def poses(count: int) -> list[tuple[float, float, float]]:
     """Places along streets, at the height of a car's roof."""
-    from lidarsim.scene.generated.city import city
+    from lidarscenes.procedural.city import city
 
     low, high = city(TRIANGLES).bounds
     rng = np.random.default_rng(0)
@@ -82,8 +82,8 @@ def scan_count(rays: int) -> int:
 
 def scenario(rays: int, folder: Path) -> Path:
     """Write mesh and scenario of the same survey."""
-    from lidarsim.scene.generated.city import city
-    from lidarsim.scene.scene_file import write_scene
+    from lidarscenes.procedural.city import city
+    from lidarscenes.writers.scene_file import write_scene
 
     write_scene(folder / MESH, city(TRIANGLES))
     data = {

@@ -18,7 +18,7 @@ from PIL import Image
 from pxr import Gf, Sdf, Usd, UsdGeom, UsdShade, Vt
 from rasterio.transform import from_origin
 
-from lidarsim.scene.generated.plants import SPECIES, tree
+from lidarscenes.procedural.plants import SPECIES, tree
 
 Array = NDArray[np.float64]
 

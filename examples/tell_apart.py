@@ -14,7 +14,7 @@ from matplotlib.colors import ListedColormap
 from matplotlib.figure import Figure
 
 import lidarpool as lp
-from lidarsim.scene.generated.city import city
+from lidarscenes.procedural.city import city
 
 CLASSES = ("ground", "building", "car", "tree or lamp")  # 1 to 4 in the column `class`
 COLOURS = ListedColormap(("#aab2bb", "#4477aa", "#ee7733", "#44aa77"))

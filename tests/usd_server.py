@@ -14,7 +14,7 @@ from typing import Any
 
 
 class UsdServer:
-    """Takes the place of `subprocess.Popen` for `lidarsim.scene.files.usd`."""
+    """Takes the place of `subprocess.Popen` for `lidarscenes.files.usd`."""
 
     def __init__(self) -> None:
         pipes: Any = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}

@@ -23,7 +23,7 @@ from typing import Any
 
 from benchmarks import effects
 from lidarpool import Survey, load_sensor
-from lidarsim.scene.generated.city import city
+from lidarscenes.procedural.city import city
 from lidarsim.simulator.batch import columns_of
 from lidarsim.simulator.rig import Rig
 

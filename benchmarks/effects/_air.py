@@ -14,11 +14,11 @@ from numpy.typing import NDArray
 
 from benchmarks.effects.__main__ import survey_without
 from lidarpool import Noise, Returns, Scene, SceneMesh, Survey
-from lidarpool.render.theme import INK, LINE, MUTED, OBJECT_COLOURS, SENSOR
-from lidarsim.scene.generated.city import city
+from lidarscenes.procedural.city import city
 from lidarsim.sensor.noise import THRESHOLD_SIGMAS
 from lidarsim.sensor.weather import FAINTEST
 from lidarsim.simulator.rig import Rig
+from lidarview.render.theme import INK, LINE, MUTED, OBJECT_COLOURS, SENSOR
 
 NOISE = Noise(detection_range_m=90)
 SURFACE, AIR, CURVE = "#8b96a5", SENSOR, INK

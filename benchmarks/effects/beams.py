@@ -14,9 +14,9 @@ from matplotlib.patches import Ellipse
 from numpy.typing import NDArray
 
 from lidarpool import Beams, Returns, Scene, SceneMesh, Sensor, Spin, Survey
-from lidarpool.render.theme import INK, LINE, MUTED, OBJECT_COLOURS
 from lidarsim.sensor.disc import Beam
 from lidarsim.simulator.rig import Rig
+from lidarview.render.theme import INK, LINE, MUTED, OBJECT_COLOURS
 from raybeam import pattern_rays
 
 DRAWS = "effect-beams.png"

@@ -8,11 +8,11 @@ from pathlib import Path
 import numpy as np
 
 from lidarpool import Actor, Mounted, Noise, Pose, Survey, Track, load_sensor
-from lidarpool.render import theme
-from lidarpool.render.colouring import DIVERGING
-from lidarsim.scene.generated.cars import MODELS, car
-from lidarsim.scene.generated.city import city
+from lidarscenes.procedural.cars import MODELS, car
+from lidarscenes.procedural.city import city
 from lidarsim.simulator.rig import Rig
+from lidarview.render import theme
+from lidarview.render.colouring import DIVERGING
 
 DRAWS = "effect-doppler.png"
 DARK = "#3a3f47"

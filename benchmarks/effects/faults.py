@@ -12,7 +12,7 @@ from benchmarks.effects.__main__ import survey_without
 from benchmarks.effects._air import save
 from benchmarks.effects._receiver import BLUE, GREY, RED, wall
 from lidarpool import Fault, Scene, Sensor, Survey, Track
-from lidarsim.scene.generated.city import city
+from lidarscenes.procedural.city import city
 from lidarsim.simulator.rig import Rig
 
 DRAWS = "effect-faults.png"

@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 
 from lidarpool import Gnss, Imu, Navigation, Survey
-from lidarpool.render import theme
 from lidarsim.sensor.navigation import fixes, imu_samples
+from lidarview.render import theme
 
 DRAWS = "effect-navigation.png"
 HOURS = 4

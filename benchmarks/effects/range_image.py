@@ -14,8 +14,8 @@ from matplotlib.lines import Line2D
 
 from lidarpool import Material, Noise, Survey, load_sensor
 from lidarpool.export.formats import Format
+from lidarscenes.procedural.city import city
 from lidarsim.columns.table import SCAN
-from lidarsim.scene.generated.city import city
 from lidarsim.scene.scene import Scene
 from lidarsim.simulator.batch import columns_of
 from lidarsim.simulator.rig import Rig

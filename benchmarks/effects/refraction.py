@@ -10,10 +10,10 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from lidarpool import Beams, Material, Scene, SceneMesh, Sensor, Spin, Survey
-from lidarpool.render.theme import INK, LINE, MUTED, OBJECT_COLOURS
-from lidarpool.render.theme import SENSOR as RED
 from lidarsim.sensor.materials import fresnel
 from lidarsim.simulator.rig import Rig
+from lidarview.render.theme import INK, LINE, MUTED, OBJECT_COLOURS
+from lidarview.render.theme import SENSOR as RED
 
 DRAWS = "effect-refraction.png"
 HEIGHT, DEPTH, INDEX, LOSS = 3.0, 2.0, 1.33, 0.15

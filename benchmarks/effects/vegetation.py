@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 
 from benchmarks.effects.refraction import box
 from lidarpool import Beams, Material, Noise, Scene, SceneMesh, Sensor, Spin, Survey
-from lidarpool.render.theme import INK, LINE, MUTED, OBJECT_COLOURS
 from lidarsim.sensor.leaves import projection
 from lidarsim.simulator.rig import Rig
+from lidarview.render.theme import INK, LINE, MUTED, OBJECT_COLOURS
 
 DRAWS = "effect-vegetation.png"
 DENSITY, HIGH = 0.6, 3.0  # m²/m³, and metres of a canopy: a leaf area index of 1.8

@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 
 from lidarpool import Actor, Scanner, Scene, Sensor, Survey, Track
-from lidarpool.render.colouring import DIVERGING
 from lidarsim.scene.actors import box, one_mesh
 from lidarsim.scene.files.meshfile import load_objects
+from lidarview.render.colouring import DIVERGING
 
 DRAWS = "effect-walkers.png"
 PERSON = Path(__file__).parents[2] / "examples" / "pedestrian.glb"

@@ -10,10 +10,10 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 from lidarpool import Beams, Material, Optics, Pose, Returns, Scene, SceneMesh, Sensor, Spin, Survey
+from lidarscenes.procedural.plants import SPECIES, tree
 from lidarsim.columns.cloud import Cloud
 from lidarsim.columns.table import AXES, SCAN
 from lidarsim.columns.waveforms import WAVEFORM
-from lidarsim.scene.generated.plants import SPECIES, tree
 from lidarsim.sensor.optics import FWHM, LIGHT_M_NS
 from lidarsim.simulator.batch import columns_of
 from lidarsim.simulator.rig import Rig

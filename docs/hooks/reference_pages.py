@@ -14,8 +14,8 @@ from pydantic import TypeAdapter
 from pydantic.warnings import UnsupportedFieldAttributeWarning
 
 from lidarpool.cli.commands import cli
-from lidarpool.columns.ply_format import held_type
 from lidarpool.scenario.schema import campaign_schema, scenario_schema
+from lidarsim.columns.ply_format import held_type
 from lidarsim.columns.table import ALWAYS, AXES, OPTIONAL, SCAN, Column
 
 # Sections in the order of a scenario file, and what stands in the sections of another.

@@ -8,16 +8,16 @@ import numpy as np
 import pytest
 
 from lidarpool import Column, Scene, Sensor, Survey, Track
-from lidarpool.columns.cloud_file import CloudFile
-from lidarpool.columns.ply_format import header, row_type
-from lidarpool.live.server import page_server
-from lidarpool.live.sharing import page_of
-from lidarpool.live.view import View, open_results
-from lidarpool.run.picture_file import PictureContent, sensor_ways
+from lidarsim.columns.cloud_file import CloudFile
+from lidarsim.columns.ply_format import header, row_type
 from lidarsim.columns.table import OBJECT, SCAN, TABLE
 from lidarsim.scene.actors import Actor, box
 from lidarsim.scene.animation import Animation
 from lidarsim.sweeps.sweeps import Sweeps
+from lidarview.picture_file import PictureContent, sensor_ways
+from lidarview.viewer.server import page_server
+from lidarview.viewer.sharing import page_of
+from lidarview.viewer.view import View, open_results
 
 pytestmark = [pytest.mark.browser, pytest.mark.slow]
 

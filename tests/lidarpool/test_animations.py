@@ -12,7 +12,6 @@ from tests.shapes import made
 
 from lidarpool import Actor, LidarError, Material, Scanner, Scene, Sensor, Survey, Track, save_cloud
 from lidarpool.export.boxes import Boxes
-from lidarpool.run.picture_file import PictureContent
 from lidarpool.scenario.advice import advice
 from lidarpool.scenario.build import Job, build
 from lidarpool.scenario.scenario import Scenario
@@ -24,6 +23,7 @@ from lidarsim.scene.scene_mesh import SceneMesh
 from lidarsim.scene.wheels import rolling
 from lidarsim.sensor.trajectory import matrices
 from lidarsim.sweeps.sweeps import Sweeps
+from lidarview.picture_file import PictureContent
 
 KINDS = {"f": 5126, "B": 5121, "H": 5123}
 SHAPES = {1: "SCALAR", 3: "VEC3", 4: "VEC4", 16: "MAT4"}

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from benchmarks import raycast, realism, scanner, trees
 
-from lidarsim.scene.generated.city import city
-from lidarsim.scene.scene_file import write_scene
+from lidarscenes.procedural.city import city
+from lidarscenes.writers.scene_file import write_scene
 
 
 @pytest.mark.slow

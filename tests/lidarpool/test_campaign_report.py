@@ -12,9 +12,9 @@ import pytest
 from lidarpool import LidarError
 from lidarpool.datasets.figures import Figures
 from lidarpool.datasets.job_table import JobRow
-from lidarpool.render.picture_page import Page
 from lidarpool.report.campaign_report import write_card
 from lidarsim.base.storage import Storage
+from lidarview.render.picture_page import Page
 
 NAMES = ("visibility", "model", "night")
 EVIL = '<script>alert(1)</script> | `x` $\\frac{1 [a](b) \u202e "'

@@ -22,14 +22,14 @@ from lidarpool.datasets.dataset import DataSet
 from lidarpool.datasets.job_table import JobRow, write_table
 from lidarpool.export.format_table import DATA_SETS
 from lidarpool.export.formats import Format
-from lidarpool.live.view import open_result
 from lidarpool.report.charts import draw_sweep
-from lidarpool.run.picture_file import PICTURE_FILE, PictureContent
 from lidarpool.scenario.build import Job
 from lidarpool.scenario.campaign import find_field
 from lidarpool.scenario.scenario import Scenario
 from lidarsim.base.storage import Storage
 from lidarsim.sweeps.sweeps import SWEEPS_FILE, Sweeps
+from lidarview.picture_file import PICTURE_FILE, PictureContent
+from lidarview.viewer.view import open_result
 
 NAMES = {3: "road", 7: "Straße", 20: "pole, or a sign at one", 299: "car"}
 

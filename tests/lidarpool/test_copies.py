@@ -11,8 +11,8 @@ from lidarpool import LidarError, Pose
 from lidarpool.base.fingerprint import fingerprint
 from lidarpool.scenario.build import build
 from lidarpool.scenario.scenario import Scenario
+from lidarscenes.writers.scene_file import write_scene
 from lidarsim.scene.scene import Scene
-from lidarsim.scene.scene_file import write_scene
 from lidarsim.scene.scene_mesh import SceneMesh
 from lidarsim.sensor.materials import MaterialTable
 

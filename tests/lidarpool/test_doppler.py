@@ -20,8 +20,8 @@ from lidarpool import (
     Track,
     load_sensor,
 )
+from lidarscenes.robots.robot import Hinge, LinkPath
 from lidarsim.scene.actors import Actor, box
-from lidarsim.scene.robot import Hinge, LinkPath
 from lidarsim.sensor.trajectory import Stations, quaternions_of, rotations_of, velocities
 from lidarsim.simulator.returns import AIR, FALSE_ALARM, PulseReturns
 from lidarsim.simulator.rig import Rig

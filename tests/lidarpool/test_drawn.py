@@ -7,11 +7,11 @@ import pytest
 from tests.shapes import block, level
 
 from lidarpool import Scene
-from lidarpool.render.closeup import ShownPart, floor_and_cut
+from lidarscenes.procedural.plants import SPECIES, placed, tree
 from lidarsim.scene.actors import box
-from lidarsim.scene.generated.plants import SPECIES, placed, tree
 from lidarsim.scene.scene_mesh import Cutout, SceneMesh, triangle_areas
 from lidarsim.scene.simplified import PART_LEAST, Drawn, cut
+from lidarview.render.closeup import ShownPart, floor_and_cut
 from raybeam import RayCaster
 
 

@@ -30,10 +30,10 @@ from lidarpool import (
 )
 from lidarpool.scenario.build import build
 from lidarpool.scenario.scenario import Scenario
+from lidarscenes.writers.scene_file import write_scene
 from lidarsim.columns.table import SCAN
 from lidarsim.scene.actors import one_mesh
 from lidarsim.scene.face_materials import FaceMaterials
-from lidarsim.scene.scene_file import write_scene
 from lidarsim.scene.scene_mesh import Cutout
 from lidarsim.simulator.batch import columns_of
 from lidarsim.simulator.returns import BLOOMING

@@ -33,9 +33,9 @@ from lidarpool import (
     save_cloud,
 )
 from lidarpool.export.formats import Format
+from lidarscenes.procedural.city import city
 from lidarsim.base.yamlfile import load_yaml
 from lidarsim.columns.table import SCAN
-from lidarsim.scene.generated.city import city
 from lidarsim.sensor.beams import Beams, Mirror
 from lidarsim.sensor.sensor import LineSensor
 from lidarsim.simulator.batch import columns_of

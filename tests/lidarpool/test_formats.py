@@ -41,7 +41,6 @@ from lidarpool import (
     simulate,
 )
 from lidarpool.base.open3d_module import load_open3d
-from lidarpool.columns.cloud_file import CloudFile
 from lidarpool.export import las as las_module
 from lidarpool.export import parquet, pieces
 from lidarpool.export.boxes import Boxes
@@ -52,6 +51,7 @@ from lidarpool.export.ros import START_NS
 from lidarsim.base.storage import Storage
 from lidarsim.base.yamlfile import load_yaml
 from lidarsim.columns.bags import point_columns
+from lidarsim.columns.cloud_file import CloudFile
 from lidarsim.columns.table import COLOURS, TABLE
 from lidarsim.scene.actors import Actor, box
 from lidarsim.sensor.trajectory import matrices

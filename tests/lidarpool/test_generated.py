@@ -11,12 +11,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from lidarpool import LidarError
-from lidarsim.scene.generated.cars import MODELS, all_cars
-from lidarsim.scene.generated.city import city
-from lidarsim.scene.generated.city_kinds import all_kinds
-from lidarsim.scene.generated.plants import SCALES, SPECIES, tree
-from lidarsim.scene.generated.terrain import terrain
-from lidarsim.scene.scene_file import write_scene
+from lidarscenes.procedural.cars import MODELS, all_cars
+from lidarscenes.procedural.city import city
+from lidarscenes.procedural.city_kinds import all_kinds
+from lidarscenes.procedural.plants import SCALES, SPECIES, tree
+from lidarscenes.procedural.terrain import terrain
+from lidarscenes.writers.scene_file import write_scene
 from lidarsim.scene.scene_mesh import triangle_areas
 from lidarsim.scene.shapes import SEED_POSITIONS, revolve, seed_objects
 from raybeam import RayCaster

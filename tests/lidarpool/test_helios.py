@@ -10,8 +10,8 @@ from click.testing import CliRunner
 
 from lidarpool import LidarError
 from lidarpool.cli.scenario_commands import import_
-from lidarpool.importers.helios import import_survey
 from lidarpool.scenario.build import build
+from lidarscenes.helios import import_survey
 from lidarsim.sensor.materials import MaterialTable
 from lidarsim.simulator.rig import Rig
 from raybeam import RayCaster

@@ -29,9 +29,9 @@ from lidarpool import (
 from lidarpool.export.formats import Format
 from lidarpool.scenario.build import build
 from lidarpool.scenario.scenario import Scenario
+from lidarscenes.procedural.city import city
 from lidarsim.base.yamlfile import load_yaml
 from lidarsim.columns.table import SCAN
-from lidarsim.scene.generated.city import city
 from lidarsim.sensor.beams import Mirror
 from lidarsim.sensor.models import model_names, read_model
 from lidarsim.sensor.plain_data import described, remade

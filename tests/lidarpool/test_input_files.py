@@ -12,12 +12,12 @@ import pytest
 import trimesh
 
 from lidarpool import compare, load_robot, load_sensor, load_trajectory, read_cloud
-from lidarpool.importers.helios import import_survey
 from lidarpool.scenario.build import build
 from lidarpool.scenario.campaign import CampaignSpec
 from lidarpool.scenario.point_scene import SUFFIXES as CLOUDS
 from lidarpool.scenario.point_scene import scene_of_points
 from lidarpool.scenario.scenario import Scenario
+from lidarscenes.helios import import_survey
 from lidarsim.base.errors import LidarError
 from lidarsim.base.input_files import open_input, read_input, read_input_text
 from lidarsim.base.storage import Storage

@@ -18,7 +18,6 @@ from tests.pages import ask
 from tests.shapes import box
 
 from lidarpool import Campaign, Column, Job, Planning, Scene, Sensor, Survey
-from lidarpool.columns.ply_format import header, row_type
 from lidarpool.datasets.job_table import JobRow
 from lidarpool.live.live_page import (
     ENDED_MOST,
@@ -36,6 +35,7 @@ from lidarpool.run.progress import Progress, Screen
 from lidarpool.run.run_page import JobNow
 from lidarpool.run.runner import Conductor, Kept
 from lidarpool.run.store.run_store import RunStore
+from lidarsim.columns.ply_format import header, row_type
 from lidarsim.columns.table import CHANNEL, OBJECT, SCAN
 from poolpart import PartitionStats
 
@@ -209,7 +209,7 @@ def test_a_run_brings_no_page_and_no_pictures_before_it_needs_them():
     """Matplotlib takes a second."""
     code = "import sys, lidarpool.cli.run_command; print(*sys.modules, sep='\\n')"
     told = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    pages = {"lidarpool.live.server", "matplotlib", "open3d", "lidarpool.live.live_page"}
+    pages = {"lidarview.viewer.server", "matplotlib", "open3d", "lidarpool.live.live_page"}
     assert pages.isdisjoint(told.stdout.split())
 
 

@@ -12,10 +12,10 @@ from tests.lidarpool.test_gltf import glb
 from tests.meshes import write
 
 from lidarpool import LidarError, Pose, Scanner, Scene
+from lidarscenes.writers.scene_file import write_scene
 from lidarsim.base import allowance
 from lidarsim.scene.actors import Actor
 from lidarsim.scene.files.meshfile import load_meshes
-from lidarsim.scene.scene_file import write_scene
 from lidarsim.scene.scene_instances import SceneInstance
 from lidarsim.scene.scene_mesh import Cutout, SceneMesh
 from lidarsim.sensor import Sensor

@@ -9,8 +9,8 @@ import pytest
 import trimesh
 from tests.meshes import PLY, write
 
+from lidarscenes.files import usd
 from lidarsim.base.errors import LidarError
-from lidarsim.scene.files import usd
 from lidarsim.scene.files.meshfile import SUFFIXES, load_meshes
 from lidarsim.scene.scene import Scene
 from lidarsim.scene.transform import Transform

@@ -16,8 +16,8 @@ import numpy as np
 import pytest
 from tests.pages import ask
 
-from lidarpool.live.point_selection import Abandoned
-from lidarpool.live.server import SLOW_AT_ONCE, SLOW_WAITING, STALL_S, announced, page_server
+from lidarview.viewer.point_selection import Abandoned
+from lidarview.viewer.server import SLOW_AT_ONCE, SLOW_WAITING, STALL_S, announced, page_server
 
 # Another user's process: asks for addresses, prints their status and whether it saw anything.
 STRANGER = """
@@ -132,7 +132,7 @@ def test_what_a_browser_is_started_with_is_good_once(served):
 @pytest.mark.parametrize("in_notebook", [False, True])
 def test_other_pages_frame_it_in_notebooks_only_and_learn_no_address(monkeypatch, in_notebook):
     display = object() if in_notebook else None
-    monkeypatch.setattr("lidarpool.live.server.cell_display", lambda: display)
+    monkeypatch.setattr("lidarview.viewer.server.cell_display", lambda: display)
     source = Secrets()
     with page_server(source.answer, 0) as page:
         for what in ("", "job/7/", "secret"):
@@ -223,7 +223,7 @@ def test_a_search_is_answered_while_nobody_reads_large_answers(large):
 def test_an_answer_that_is_not_read_ends(large, monkeypatch):
     page, source = large
     source.ready.set()
-    monkeypatch.setattr("lidarpool.live.server.STALL_S", 0.5)
+    monkeypatch.setattr("lidarview.viewer.server.STALL_S", 0.5)
     with unread(page, 2 * SLOW_AT_ONCE, "points?most=20000000"):
         time.sleep(0.2)
         started = time.monotonic()
@@ -256,7 +256,7 @@ def test_a_cell_shows_the_page_and_says_how_else_to_reach_it(served, monkeypatch
     cells = []
     cell = types.SimpleNamespace(update=cells.append)
     display = types.SimpleNamespace(HTML=str, display=lambda html, **_: cells.append(html) or cell)
-    monkeypatch.setattr("lidarpool.live.server.cell_display", lambda: display)
+    monkeypatch.setattr("lidarview.viewer.server.cell_display", lambda: display)
     monkeypatch.delenv("JUPYTERHUB_SERVICE_PREFIX", raising=False)
     if hub:
         monkeypatch.setenv("JUPYTERHUB_SERVICE_PREFIX", "/user/ada/")

@@ -12,10 +12,18 @@ import pytest
 import trimesh
 
 from lidarpool import LidarError, Planning, Pose, Scene, Sensor, Survey, Track
-from lidarpool.columns.cloud_file import CloudFile
-from lidarpool.columns.ply_format import header, row_type
-from lidarpool.live import point_selection as points
-from lidarpool.live.point_selection import (
+from lidarpool.plan import Plan
+from lidarsim.columns.cloud import Cloud
+from lidarsim.columns.cloud_file import CloudFile
+from lidarsim.columns.ply_format import header, row_type
+from lidarsim.columns.table import CHANNEL, OBJECT, SCAN, TABLE, Column
+from lidarsim.scene.actors import Actor, box
+from lidarsim.scene.colours import Colours, as_bytes
+from lidarsim.sweeps.sweeps import SWEEPS_FILE, Sweeps
+from lidarview.picture_file import PICTURE_FILE, PictureContent, SensorWay
+from lidarview.render.colouring import colours_of as colouring_of
+from lidarview.viewer import point_selection as points
+from lidarview.viewer.point_selection import (
     TILES,
     Abandoned,
     Eye,
@@ -24,7 +32,7 @@ from lidarpool.live.point_selection import (
     PointFinder,
     read_scans,
 )
-from lidarpool.live.view import (
+from lidarview.viewer.view import (
     ShownSurface,
     View,
     colours_for,
@@ -34,14 +42,6 @@ from lidarpool.live.view import (
     range_image,
     show_view,
 )
-from lidarpool.plan import Plan
-from lidarpool.render.colouring import colours_of as colouring_of
-from lidarpool.run.picture_file import PICTURE_FILE, PictureContent, SensorWay
-from lidarsim.columns.cloud import Cloud
-from lidarsim.columns.table import CHANNEL, OBJECT, SCAN, TABLE, Column
-from lidarsim.scene.actors import Actor, box
-from lidarsim.scene.colours import Colours, as_bytes
-from lidarsim.sweeps.sweeps import SWEEPS_FILE, Sweeps
 
 POSES = 25
 NOWHERE = np.zeros((0, 3), np.float32)
@@ -333,13 +333,13 @@ def test_what_cannot_be_written_is_told(tmp_path, spun, monkeypatch):
     view = open_result(result_in(tmp_path / "one", spun))
     with pytest.raises(ValueError):
         told(view, "export", format="exe")
-    monkeypatch.setattr("lidarpool.live.view.MOST_POINTS", 3)
+    monkeypatch.setattr("lidarview.viewer.view.MOST_POINTS", 3)
     assert "20 points are more than 3" in told(view, "export", format="ply")[0]["error"]
     held = View(HeldPoints(Cloud(np.zeros((1, 3)), {})))
     assert not told(held, "state")[0]["exports"], "of a run, some parts are read"
     monkeypatch.undo()
     missing = Mock(side_effect=LidarError("it needs laspy"))
-    monkeypatch.setattr("lidarpool.live.view.save_cloud", missing)
+    monkeypatch.setattr("lidarview.viewer.view.save_cloud", missing)
     assert told(view, "export", format="las")[0] == {"error": "it needs laspy"}
 
 
@@ -439,7 +439,7 @@ def test_damaged_pictures_are_noted_and_the_cloud_is_shown(cloud, capsys, monkey
         assert captured.out.startswith("http://127.0.0.1:")  # the address is the result
         asked.append(captured.err + captured.out)
 
-    monkeypatch.setattr("lidarpool.live.view.wait_for_interrupt", look)
+    monkeypatch.setattr("lidarview.viewer.view.wait_for_interrupt", look)
     (cloud.parent / PICTURE_FILE).write_bytes(b"PK\x03\x04junk")
     show_view(open_result(cloud.parent), port=0, browser=False)
     (said,) = asked

@@ -18,15 +18,15 @@ from lidarpool.scenario.build import build
 from lidarpool.scenario.placing import place, poses_around
 from lidarpool.scenario.plausibility import implausibilities
 from lidarpool.scenario.scenario import Scenario
-from lidarsim.scene.floor import room_at
-from lidarsim.scene.generated.city import city
-from lidarsim.scene.generated.plants import SPECIES, tree
-from lidarsim.scene.generated.terrain import terrain
+from lidarscenes.procedural.city import city
+from lidarscenes.procedural.floor import room_at
+from lidarscenes.procedural.plants import SPECIES, tree
+from lidarscenes.procedural.surroundings import Surroundings, in_the_way
+from lidarscenes.procedural.terrain import terrain
+from lidarscenes.writers.scene_file import write_scene
 from lidarsim.scene.scene import Scene
-from lidarsim.scene.scene_file import write_scene
 from lidarsim.scene.scene_instances import SceneInstance
 from lidarsim.scene.scene_mesh import SceneMesh
-from lidarsim.scene.surroundings import Surroundings, in_the_way
 from lidarsim.scene.transform import Transform
 from lidarsim.sensor import Mounted, Sensor, Survey
 from lidarsim.sensor.models import load_sensor

@@ -15,10 +15,10 @@ from lidarpool.scenario.build import build
 from lidarpool.scenario.campaign import CampaignSpec, is_campaign
 from lidarpool.scenario.plausibility import implausibilities
 from lidarpool.scenario.scenario import Scenario
-from lidarsim.scene.generated.city import city
-from lidarsim.scene.paint import painted
+from lidarscenes.procedural.city import city
+from lidarscenes.procedural.paint import painted
+from lidarscenes.writers.scene_file import write_scene
 from lidarsim.scene.scene import Scene
-from lidarsim.scene.scene_file import write_scene
 from lidarsim.scene.scene_mesh import SceneMesh
 
 EXAMPLES = Path(__file__).parents[2] / "examples"

@@ -26,13 +26,13 @@ from lidarpool import (
 from lidarpool.cli.commands import cli
 from lidarpool.plan import best
 from lidarpool.plan.trial import run_trial
-from lidarpool.render.picture_page import Page
-from lidarpool.run.picture_file import PICTURE_FILE, PictureContent, SensorWay, sensor_ways
 from lidarsim.base.storage import Storage
 from lidarsim.columns.table import Column
 from lidarsim.scene.actors import Actor, box
 from lidarsim.scene.scene_mesh import SceneMesh
 from lidarsim.scene.shapes import seed_objects
+from lidarview.picture_file import PICTURE_FILE, PictureContent, SensorWay, sensor_ways
+from lidarview.render.picture_page import Page
 
 SMALL = ("--size", "480x480")
 NAMES = ("Kübel\x00", "a\udc80", "")  # as files may have them

@@ -8,8 +8,8 @@ from lidarpool import Cloud, Noise, Pose, Scanner, Scene, load_sensor, save_clou
 from lidarpool.base.open3d_module import load_open3d
 from lidarpool.cli.scenario_commands import scene as command
 from lidarpool.scenario.point_scene import scene_of_points
+from lidarscenes.writers.scene_file import write_scene
 from lidarsim.base.errors import LidarError
-from lidarsim.scene.scene_file import write_scene
 
 GRID = np.mgrid[0:4:40j, 0:3:30j].reshape(2, -1).T
 FAR = (500_000.0, 5_000_000.0, 100.0)

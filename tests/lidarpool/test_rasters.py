@@ -14,8 +14,8 @@ from lidarpool.cli.commands import cli
 from lidarpool.scenario.advice import advice
 from lidarpool.scenario.build import build
 from lidarpool.scenario.scenario import Scenario
+from lidarscenes.files import rasters
 from lidarsim.base.errors import LidarError
-from lidarsim.scene.files import rasters
 from lidarsim.scene.files.meshfile import load_meshes, load_objects
 from lidarsim.sensor import Sensor
 from lidarsim.simulator.scanner import Scanner

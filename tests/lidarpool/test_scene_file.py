@@ -13,11 +13,11 @@ from click.testing import CliRunner
 
 from lidarpool import LidarError, Scene
 from lidarpool.cli.scenario_commands import scene as command
+from lidarscenes.procedural.city import city
+from lidarscenes.writers.scene_file import write_scene
 from lidarsim.scene.actors import box
 from lidarsim.scene.colours import WHITE, Colours
 from lidarsim.scene.files.meshfile import load_meshes
-from lidarsim.scene.generated.city import city
-from lidarsim.scene.scene_file import write_scene
 from lidarsim.scene.scene_instances import SceneInstance
 from lidarsim.scene.scene_mesh import Cutout
 

@@ -13,19 +13,19 @@ from click.testing import CliRunner
 from PIL import Image
 from tests.pages import unpacked
 
-import lidarpool.live.sharing
-import lidarpool.render.film
+import lidarview.render.film
+import lidarview.viewer.sharing
 from lidarpool import LidarError, Scene, Sensor, Survey, Track
 from lidarpool.cli.commands import cli
-from lidarpool.columns.ply_format import header, row_type
-from lidarpool.live.sharing import film_of, page_of, share
-from lidarpool.live.view import open_result
-from lidarpool.render.film import ACTOR, SURFACE, Film
-from lidarpool.render.theme import rgb
-from lidarpool.run.picture_file import PICTURE_FILE, PictureContent, sensor_ways
+from lidarsim.columns.ply_format import header, row_type
 from lidarsim.columns.table import CHANNEL, SCAN
 from lidarsim.scene.actors import Actor, box
 from lidarsim.sweeps.sweeps import SWEEPS_FILE, Sweeps
+from lidarview.picture_file import PICTURE_FILE, PictureContent, sensor_ways
+from lidarview.render.film import ACTOR, SURFACE, Film
+from lidarview.render.theme import rgb
+from lidarview.viewer.sharing import film_of, page_of, share
+from lidarview.viewer.view import open_result
 
 COUNT, SCANS = 3600, 360
 RED = np.array([1.0, 0.0, 0.0, 1.0])
@@ -35,8 +35,8 @@ FLOOR = np.array([[[-50, -50, 0], [50, -50, 0], [0, 80, 0.0]]])
 @pytest.fixture(autouse=True)
 def small(monkeypatch):
     """Draw small pictures, which are fast."""
-    monkeypatch.setattr(lidarpool.render.film, "SIZE", (96, 54))
-    monkeypatch.setattr(lidarpool.render.film, "_FOCAL", 92.2)
+    monkeypatch.setattr(lidarview.render.film, "SIZE", (96, 54))
+    monkeypatch.setattr(lidarview.render.film, "_FOCAL", 92.2)
 
 
 def write(folder, moves):
@@ -142,7 +142,7 @@ def test_a_film_moves_and_is_the_same_each_time(drive, tmp_path, suffix):
 
 
 def test_a_film_that_would_be_too_large_is_narrower(drive, monkeypatch):
-    monkeypatch.setattr(lidarpool.live.sharing, "_FILM_BYTES", 400_000)
+    monkeypatch.setattr(lidarview.viewer.sharing, "_FILM_BYTES", 400_000)
     made = film_of(open_result(drive), ".gif")
     assert len(made) < 400_000
     (drive / "a.gif").write_bytes(made)
@@ -193,13 +193,13 @@ def test_a_page_with_less_room_has_fewer_points_where_they_are_dense(drive, monk
         rows[name] = dense[:, axis]
     (drive / "cloud.ply").write_bytes(header(rows.dtype, len(rows)) + rows.tobytes())
     whole = len(page_of(open_result(drive)))
-    monkeypatch.setattr(lidarpool.live.sharing, "_PAGE_BYTES", whole - 200_000)
+    monkeypatch.setattr(lidarview.viewer.sharing, "_PAGE_BYTES", whole - 200_000)
     page = page_of(open_result(drive))
     assert len(page) <= whole - 200_000
     places = answers(page)["cloud?"]["arrays"]["positions"]
     far = [np.linalg.norm(some, axis=1) > 15 for some in (places, dense)]
     assert 1000 < len(places) < 40_000 and far[0].mean() > 1.02 * far[1].mean()
-    monkeypatch.setattr(lidarpool.live.sharing, "_PAGE_BYTES", 500_000)
+    monkeypatch.setattr(lidarview.viewer.sharing, "_PAGE_BYTES", 500_000)
     with pytest.raises(LidarError, match="Even without points"):
         page_of(open_result(drive))
 

@@ -12,7 +12,6 @@ from tests.shapes import cast_between, made
 
 from lidarpool import LidarError, Mounted, Pose, Scene, Survey, Track, load_sensor, save_cloud
 from lidarpool.base.fingerprint import fingerprint
-from lidarpool.run.picture_file import PictureContent
 from lidarpool.scenario.advice import advice
 from lidarpool.scenario.build import build
 from lidarpool.scenario.scenario import Scenario
@@ -21,6 +20,7 @@ from lidarsim.scene.actors import Actor, box
 from lidarsim.simulator.rig import Rig
 from lidarsim.simulator.surfaces import Surfaces
 from lidarsim.sweeps.sweeps import Sweeps
+from lidarview.picture_file import PictureContent
 
 FLOOR = box("Floor", (60, 60, 0.01))
 COLUMNS = ["time", "range", "triangle", "intensity", "class"]

@@ -17,16 +17,16 @@ from tests.shapes import block, quad
 
 from lidarpool import Cloud, LidarError
 from lidarpool.plan import Planning, best, run_trial
-from lidarpool.render.hit_density import hit_density
-from lidarpool.render.pictures import draw_cloud, draw_hits, draw_scene, with_points
-from lidarpool.render.shot import GROUND, SKY, take_shot
-from lidarpool.render.stage import make_axis, nice_step
-from lidarpool.render.theme import object_colours
 from lidarpool.report.result_pictures import draw_path
 from lidarsim.scene.actors import box
 from lidarsim.scene.scene import Scene
 from lidarsim.scene.scene_mesh import SceneMesh
 from lidarsim.scene.shapes import seed_objects
+from lidarview.render.hit_density import hit_density
+from lidarview.render.pictures import draw_cloud, draw_hits, draw_scene, with_points
+from lidarview.render.shot import GROUND, SKY, take_shot
+from lidarview.render.stage import make_axis, nice_step
+from lidarview.render.theme import object_colours
 
 SIZE = (320, 200)
 LEFT = slice(0, int(0.8 * SIZE[0]))  # columns beside the legend

@@ -25,9 +25,9 @@ from lidarpool import (
 )
 from lidarpool.scenario.build import build
 from lidarpool.scenario.scenario import Scenario
+from lidarscenes.writers.scene_file import write_scene
 from lidarsim.scene.actors import one_mesh
 from lidarsim.scene.files.meshfile import load_meshes
-from lidarsim.scene.scene_file import write_scene
 from lidarsim.scene.scene_mesh import SceneMesh, Voxels
 from lidarsim.scene.transform import Transform
 from lidarsim.sensor.leaves import projection

@@ -23,9 +23,9 @@ from lidarpool.cli.forecast import forecast
 from lidarpool.run.options import RunOptions
 from lidarpool.scenario.build import build
 from lidarpool.scenario.scenario import Scenario
+from lidarscenes.writers.scene_file import write_scene
 from lidarsim.scene.actors import box
 from lidarsim.scene.scene import Scene
-from lidarsim.scene.scene_file import write_scene
 from lidarsim.scene.scene_mesh import Cutout, SceneMesh
 from lidarsim.simulator.rig import Rig
 from lidarsim.simulator.sampling import sample_survey

@@ -40,7 +40,8 @@ from lidarpool.scenario.build import build
 from lidarpool.scenario.campaign_sections import CampaignSection
 from lidarpool.scenario.plausibility import implausibilities
 from lidarpool.scenario.scenario import Scenario
-from lidarsim.scene.files import meshfile, rasters
+from lidarscenes.files import rasters
+from lidarsim.scene.files import meshfile
 from lidarsim.sensor.models import SensorModel, model_names, read_model
 
 ROOT = Path(__file__).parents[2]

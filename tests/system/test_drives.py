@@ -10,8 +10,8 @@ import pytest
 from lidarpool import Campaign, Mounted, Pose, Scene, Sensor, Survey, Track, read_cloud, simulate
 from lidarpool.scenario.build import build
 from lidarpool.scenario.scenario import Scenario
-from lidarsim.scene.generated.city import city
-from lidarsim.scene.scene_file import write_scene
+from lidarscenes.procedural.city import city
+from lidarscenes.writers.scene_file import write_scene
 from lidarsim.simulator.rig import Rig
 
 ROOT = Path(__file__).parents[2]

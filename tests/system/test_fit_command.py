@@ -8,8 +8,8 @@ from benchmarks.fit_coverage import recorded, street
 from pypcd4 import PointCloud
 
 from lidarpool import Noise
+from lidarscenes.writers.scene_file import write_scene
 from lidarsim.scene.files.polygon_files import read_ply_columns
-from lidarsim.scene.scene_file import write_scene
 
 pytest.importorskip("scipy", reason="the extra fit is not installed")
 

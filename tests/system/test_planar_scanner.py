@@ -14,7 +14,7 @@ from tests.clusters import thread_cluster
 from tests.shapes import room
 
 from lidarpool import LidarError, Sensor, read_cloud
-from lidarsim.scene.scene_file import write_scene
+from lidarscenes.writers.scene_file import write_scene
 
 SCANNER: dict[str, Any] = {
     "scene": "room.ply",

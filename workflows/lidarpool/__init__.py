@@ -6,12 +6,12 @@ from typing import TYPE_CHECKING, Any
 from lidarsim._version import __version__
 
 if TYPE_CHECKING:
+    from lidarscenes.robots.robot import Robot
+    from lidarscenes.robots.urdf import load_robot
     from lidarsim.base.errors import LidarError
     from lidarsim.columns.cloud import Cloud
     from lidarsim.columns.table import Column
     from lidarsim.scene.actors import Actor
-    from lidarsim.scene.files.urdf import load_robot
-    from lidarsim.scene.robot import Robot
     from lidarsim.scene.scene import Scene
     from lidarsim.scene.scene_instances import SceneInstance
     from lidarsim.scene.scene_mesh import SceneMesh

@@ -14,15 +14,15 @@ from pathlib import Path
 from tempfile import TemporaryDirectory, mkdtemp
 from typing import TYPE_CHECKING, Any
 
+from lidarsim.base.notebook import cell_display
 from lidarsim.base.validation import checked
 from lidarsim.base.words import plural
 
-from ..base.notebook import cell_display
 from ..export.formats import save_cloud
 from ..run.run_result import RunResult
 
 if TYPE_CHECKING:
-    from ..run.picture_file import PictureContent
+    from lidarview.picture_file import PictureContent
 
 # In a notebook: what is drawn of a result, and how large in pixels; scaled down by much, their
 # letters could not be read.
@@ -134,8 +134,8 @@ class Result(RunResult):
         browser
             Whether to open a browser where there is a desktop.
         """
-        from ..columns.cloud_file import CloudFile
-        from ..live.view import View, result_page, wait_for_interrupt
+        from lidarsim.columns.cloud_file import CloudFile
+        from lidarview.viewer.view import View, result_page, wait_for_interrupt
 
         with ExitStack() as stack:
             file = CloudFile(self._cloud_file, self._pictured.own)
@@ -149,7 +149,7 @@ class Result(RunResult):
 
     @cached_property
     def _pictured(self) -> PictureContent:
-        from ..run.picture_file import PictureContent
+        from lidarview.picture_file import PictureContent
 
         return PictureContent.of(self)
 

@@ -59,11 +59,12 @@ def plot(result: Path | Storage, out: Path | Storage | None, **given: Any) -> No
       lidarpool plot lidarpool-out
       lidarpool plot lidarpool-out --only cloud --colour intensity --size 2400x1500 --out figures
     """  # noqa: D301 - click wants the character, not its name
+    from lidarview.picture_file import PICTURE_FILE, PictureContent
+
     from ..base.fork_server import keep_freed_memory
     from ..export.folder import local_folder, local_result, send
     from ..report.output import CLOUD, PAGE
     from ..report.result_pictures import draw_pictures
-    from ..run.picture_file import PICTURE_FILE, PictureContent
 
     place = result if out is None else out
     with local_result(result, (PICTURE_FILE, CLOUD, PAGE)) as made:
@@ -121,10 +122,10 @@ def export(
       lidarpool export lidarpool-out --format laz
       lidarpool export lidarpool-out --format mcap --layout autoware --out bags
     """  # noqa: D301 - click wants the character, not its name
+    from lidarsim.columns.cloud_file import CloudFile
     from lidarsim.sweeps.instruments import INSTRUMENT_FILES
     from lidarsim.sweeps.sweeps import SWEEPS_FILE, Sweeps
 
-    from ..columns.cloud_file import CloudFile
     from ..export.folder import local_result, result_folder, send
     from ..export.formats import Format
 
@@ -201,11 +202,11 @@ def view(
       lidarpool view drive --film drive.gif --export drive.html
     """  # noqa: D301 - click wants the character, not its name
     from lidarsim.sweeps.sweeps import SWEEPS_FILE
+    from lidarview.picture_file import PICTURE_FILE
+    from lidarview.viewer.sharing import share
+    from lidarview.viewer.view import CLOUD, open_results, show_view
 
     from ..export.folder import local_result
-    from ..live.sharing import share
-    from ..live.view import CLOUD, open_results, show_view
-    from ..run.picture_file import PICTURE_FILE
     from .terminal import Terminal
 
     if (film or export) and len(results) > 1:

@@ -129,7 +129,7 @@ def import_(survey: Path, assets: tuple[Path, ...], out: Path | None) -> None:
       lidarpool import helios/data/surveys/toyblocks/als_toyblocks.xml
       lidarpool import survey.xml --assets helios/python/pyhelios -o surveys/wood
     """  # noqa: D301 - click wants the character, not its name
-    from ..importers.helios import import_survey
+    from lidarscenes.helios import import_survey
 
     made = import_survey(survey, out or Path(survey.stem), assets)
     sensors, files = len(made.scenario.sensors), len(made.scenario.scene.files)
@@ -274,7 +274,7 @@ def city(out: Path, triangles: int, seed: int, overwrite: bool, trees: int, cars
       lidarpool scene city city.ply --triangles 10000000 --seed 7
       lidarpool scene city green.glb --trees 500 --cars 200
     """  # noqa: D301 - click wants the character, not its name
-    from lidarsim.scene.generated.city import city as make
+    from lidarscenes.procedural.city import city as make
 
     _write(out, lambda: make(triangles, seed, trees, cars), overwrite, paint=True)
 
@@ -292,7 +292,7 @@ def terrain(out: Path, triangles: int, seed: int, side: float, overwrite: bool, 
       lidarpool scene terrain small.obj --triangles 20000 --side 100
       lidarpool scene terrain woods.glb --trees 10000
     """  # noqa: D301 - click wants the character, not its name
-    from lidarsim.scene.generated.terrain import terrain as make
+    from lidarscenes.procedural.terrain import terrain as make
 
     _write(out, lambda: make(triangles, seed, side, trees), overwrite, paint=True)
 
@@ -341,8 +341,8 @@ def points(
 
 def _write(out: Path, make: Callable[[], Scene], overwrite: bool, paint: bool = False) -> None:
     """Make a scene and write it to a file; `paint` gives a generated scene its colours."""
-    from lidarsim.scene.paint import painted
-    from lidarsim.scene.scene_file import check_target, write_scene
+    from lidarscenes.procedural.paint import painted
+    from lidarscenes.writers.scene_file import check_target, write_scene
 
     check_target(out)
     if out.exists() and not overwrite:
@@ -401,7 +401,9 @@ def sensors(model: str | None, out: Path | None) -> None:
     if out is None:
         click.echo(f"to draw its beams: lidarpool sensors {shlex.quote(model)} --out beams.png")
         return
-    from ..render.beam_picture import draw_beams  # imports Matplotlib, which figures do not need
+    from lidarview.render.beam_picture import (
+        draw_beams,  # imports Matplotlib, which figures do not need
+    )
 
     draw_beams(out, load_sensor(model))
     click.echo(click.format_filename(out))

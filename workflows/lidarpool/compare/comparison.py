@@ -21,13 +21,13 @@ from lidarsim.base.validation import checked
 from lidarsim.base.vocabulary import UNITS_M
 from lidarsim.base.words import plural
 from lidarsim.columns.cloud import Cloud
+from lidarview.render import theme
+from lidarview.render.picture_page import Page
 
 from ..base.open3d_module import load_open3d
 from ..columns.parts import StoredCloud
 from ..datasets.figures import rank_correlation
 from ..export.folder import result_folder, staging
-from ..render import theme
-from ..render.picture_page import Page
 from ..report.page.rendering import millimetres, rendered
 from .range_image import RangeImages, paired_images, range_images
 from .recordings import Recording, Turn, open_recording

@@ -27,11 +27,11 @@ from lidarsim.sensor.models import MODEL_FILES, Performance, SensorModel, read_m
 from lidarsim.sensor.noise import TARGET_REFLECTANCE, THRESHOLD_SIGMAS
 from lidarsim.sensor.ray_sensors import ListedSensor
 from lidarsim.simulator import Scanner
+from lidarview.render import theme
+from lidarview.render.picture_page import Page, label_logarithms
 
 from ..base.open3d_module import load_open3d
 from ..columns.parts import StoredCloud
-from ..render import theme
-from ..render.picture_page import Page, label_logarithms
 from ..report.page.rendering import rendered
 from .range_image import range_images
 from .recordings import Recording, open_recording

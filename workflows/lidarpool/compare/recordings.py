@@ -23,13 +23,13 @@ from lidarsim.base.vocabulary import UNITS_M
 from lidarsim.base.words import did_you_mean, natural
 from lidarsim.columns.bags import POINT_CLOUD, open_bag, point_columns
 from lidarsim.columns.cloud import CHUNK_POINTS, Cloud, CloudLike
+from lidarsim.columns.cloud_file import CloudFile
 from lidarsim.scene.files.las import las_units, open_las
 from lidarsim.scene.files.pcd import checked_pcd
 from lidarsim.scene.files.polygon_files import read_ply_columns
 from lidarsim.sweeps.sweeps import SWEEPS_FILE, Placed, Sweeps
 
 from ..base.fingerprint import fingerprint
-from ..columns.cloud_file import CloudFile
 from ..columns.parts import StoredCloud
 from ..datasets.dataset import INDEX_FILE
 from ..datasets.loader import sweeps

@@ -13,13 +13,13 @@ from lidarsim.base.errors import LidarError
 from lidarsim.base.validation import checked
 from lidarsim.base.words import printable
 from lidarsim.columns.cloud import CHUNK_POINTS, Cloud, CloudLike
+from lidarsim.columns.cloud_file import CloudFile
+from lidarsim.columns.ply_format import AXES, as_held, header, layout, mapped_rows, row_type
 from lidarsim.columns.table import AXES as POSITION
 from lidarsim.columns.table import NORMAL, TABLE, check_names
 from lidarsim.sweeps.sweeps import AS_FIRED, SWEEPS_FILE, Sweeps
 
 from ..base.open3d_module import load_open3d
-from ..columns.cloud_file import CloudFile
-from ..columns.ply_format import AXES, as_held, header, layout, mapped_rows, row_type
 from . import reading
 
 # Positions are stored in single precision if the error is below this part of the precision.

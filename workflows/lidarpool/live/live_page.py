@@ -25,25 +25,33 @@ from lidarsim.base.arrays import Floats, Floats32
 from lidarsim.base.errors import LidarError
 from lidarsim.base.storage import Storage
 from lidarsim.columns.cloud import Cloud
+from lidarsim.columns.cloud_file import CloudFile
 from lidarsim.sweeps.sweeps import SWEEPS_FILE, Sweeps
+from lidarview.picture_file import PictureContent
+from lidarview.viewer.point_selection import HeldPoints
+from lidarview.viewer.server import (
+    PORT,
+    VIEWER,
+    Answer,
+    Arguments,
+    PageServer,
+    announced,
+    page_server,
+)
+from lidarview.viewer.view import View, open_result, wait_for_interrupt
 from poolpart import Partition, PartitionStats
 
-from ..columns.cloud_file import CloudFile
 from ..columns.parts import read_part
 from ..datasets.dataset import DataSet, job_file
 from ..datasets.figures import Figures
 from ..datasets.job_table import JobRow, Value
 from ..plan import best
 from ..report.charts import draw_results, draw_varied
-from ..run.picture_file import PictureContent
 from ..run.pipeline.messages import Receipt, ScanFrame
 from ..run.progress import STAGES, Pace, Progress, in_words, standing_still, time_in_words
 from ..run.run_page import JobNow, RunPage
 from ..run.run_result import RunResult
 from ..run.store.job_under_way import JobPoints
-from .point_selection import HeldPoints
-from .server import PORT, VIEWER, Answer, Arguments, PageServer, announced, page_server
-from .view import View, open_result, wait_for_interrupt
 
 DRAWING_SHARE = 0.06  # of a core, for charts: they take half a second to a second
 READING_SHARE = 0.05  # of a core, for points

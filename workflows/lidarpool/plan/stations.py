@@ -10,10 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
+from lidarscenes.procedural.floor import SLAB_M
 from lidarsim.base.arrays import Bools, Floats, Ints
 from lidarsim.base.errors import LidarError
 from lidarsim.base.validation import checked
-from lidarsim.scene.floor import SLAB_M
 from lidarsim.scene.scene import Scene
 from lidarsim.scene.simplified import Drawn
 from lidarsim.sensor import Sensor, Spin

@@ -11,11 +11,11 @@ from typing import Any
 
 from lidarsim.base.errors import LidarError, explained
 from lidarsim.base.storage import Storage
+from lidarview.render.picture_page import Page
 
 from ..datasets.figures import Figures
 from ..datasets.job_table import JobRow
 from ..export.folder import LAST_FILE
-from ..render.picture_page import Page
 from ..run.run_result import CampaignRun
 from .charts import draw_results, draw_varied
 from .page.rendering import rendered

@@ -14,12 +14,12 @@ from lidarsim.base.arrays import Bools, Floats
 from lidarsim.base.sampling import even_indices
 from lidarsim.base.words import plural, shortened
 from lidarsim.columns.table import TABLE, Z, by_value
+from lidarview.render import theme
+from lidarview.render.colouring import colours_of
+from lidarview.render.picture_page import FONT, Page, label_logarithms
 
 from ..datasets.figures import Figures, Varied
 from ..datasets.sweep_data import Sweep
-from ..render import theme
-from ..render.colouring import colours_of
-from ..render.picture_page import FONT, Page, label_logarithms
 from .page.rendering import NARROW
 
 WIDTH = 1600

@@ -17,6 +17,7 @@ from lidarsim.base.vocabulary import PICTURES
 from lidarsim.sensor import Survey
 from lidarsim.sweeps.instruments import INSTRUMENT_FILES, Instruments
 from lidarsim.sweeps.sweeps import SWEEPS_FILE, Sweeps
+from lidarview.picture_file import PICTURE_FILE, PictureContent
 
 from ..base.open3d_module import load_open3d
 from ..columns.parts import StoredCloud
@@ -24,7 +25,6 @@ from ..export.folder import LAST_FILE, result_folder, staging
 from ..export.format_table import EXPORTS, FORMATS
 from ..export.formats import Format, refuse_strangers
 from ..export.navigation_files import write_instruments
-from ..run.picture_file import PICTURE_FILE, PictureContent
 from ..run.progress import Written
 from ..run.run_result import RunResult
 from ..run.runner import Conductor, Output

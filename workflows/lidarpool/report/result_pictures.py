@@ -21,19 +21,19 @@ from lidarsim.base.sampling import even_indices
 from lidarsim.base.vocabulary import PICTURES
 from lidarsim.base.words import did_you_mean, plural
 from lidarsim.columns.cloud import Cloud
+from lidarsim.columns.cloud_file import CloudFile
 from lidarsim.columns.table import TABLE, Z
 from lidarsim.scene.scene import Scene
+from lidarview.picture_file import PictureContent, ways_of
+from lidarview.render import theme
+from lidarview.render.colouring import with_rgb
+from lidarview.render.picture_page import FONT, Page
+from lidarview.render.pictures import MOST_POINTS, draw_cloud, draw_hits, draw_scene
+from lidarview.render.shot import SIZE, Samples, SurfaceView, take_shot
+from lidarview.render.stage import make_axis, nice_step
 
-from ..columns.cloud_file import CloudFile
 from ..plan import Plan, Planning
 from ..plan.stations import Sight, StationPlan
-from ..render import theme
-from ..render.colouring import with_rgb
-from ..render.picture_page import FONT, Page
-from ..render.pictures import MOST_POINTS, draw_cloud, draw_hits, draw_scene
-from ..render.shot import SIZE, Samples, SurfaceView, take_shot
-from ..render.stage import make_axis, nice_step
-from ..run.picture_file import PictureContent, ways_of
 from ..run.progress import Written
 from .page.rendering import put_picture
 

@@ -12,7 +12,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, TaskID, TextColumn
 from rich.progress import Progress as Bars
 
-from ..base.notebook import cell_display
+from lidarsim.base.notebook import cell_display
 
 # Lines of progress: label, name of the count, and of the total, which is the unit.
 STAGES: tuple[tuple[str, str, str], ...] = (

@@ -11,16 +11,16 @@ from typing import Any
 
 import numpy as np
 
+from lidarscenes.files.cityjson import CLASS_NAMES as CITY_NAMES
+from lidarscenes.files.cityjson import CLASSES as CITY_CLASSES
+from lidarscenes.robots.robot import Robot
 from lidarsim.base.arrays import Floats
 from lidarsim.base.declared import declared
 from lidarsim.base.errors import LidarError, Mistakes, prefixed
 from lidarsim.base.validation import checked_fields
 from lidarsim.base.words import did_you_mean, plural
 from lidarsim.scene.actors import Actor, check_spray
-from lidarsim.scene.files.cityjson import CLASS_NAMES as CITY_NAMES
-from lidarsim.scene.files.cityjson import CLASSES as CITY_CLASSES
 from lidarsim.scene.files.meshfile import CITYJSON
-from lidarsim.scene.robot import Robot
 from lidarsim.scene.scene import Scene
 from lidarsim.sensor import Material, Mounted, Noise, Pose, Returns, Sensor, Survey, Track
 from lidarsim.sensor.materials import MaterialTable, rows_named, with_class, with_classes

@@ -10,13 +10,13 @@ import numpy as np
 import yaml
 from numpy.typing import ArrayLike
 
+from lidarscenes.files.cityjson import BUILDING, CLASSES
+from lidarscenes.procedural.floor import heights_at, reaching, room_at
+from lidarscenes.procedural.surroundings import Surroundings, in_the_way, is_open
 from lidarsim.base.arrays import Floats
 from lidarsim.base.words import plural
-from lidarsim.scene.files.cityjson import BUILDING, CLASSES
-from lidarsim.scene.floor import heights_at, reaching, room_at
 from lidarsim.scene.scene import Scene
 from lidarsim.scene.simplified import Drawn
-from lidarsim.scene.surroundings import Surroundings, in_the_way, is_open
 from lidarsim.sensor import Mounted, Pose, Sensor
 from lidarsim.sensor.materials import rows_named
 

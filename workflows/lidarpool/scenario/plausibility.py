@@ -7,12 +7,12 @@ from typing import NamedTuple
 
 import numpy as np
 
+from lidarscenes.procedural.surroundings import Surroundings
 from lidarsim.base.arrays import Bools, Floats
 from lidarsim.base.sampling import even_indices
 from lidarsim.base.words import as_scenario
 from lidarsim.scene.actors import Actor
 from lidarsim.scene.scene import Scene
-from lidarsim.scene.surroundings import Surroundings
 from lidarsim.sensor import Survey, Track
 from lidarsim.sensor.sensor import LineSensor
 from lidarsim.sensor.trajectory import full_poses, matrices, quaternions_of, velocities

@@ -9,6 +9,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from lidarscenes.robots.robot import Robot
+from lidarscenes.robots.urdf import load_robot
 from lidarsim.base.arrays import Floats
 from lidarsim.base.errors import LidarError, Mistakes, prefixed
 from lidarsim.base.tables import NUMBERS, Quantity, read_table
@@ -17,9 +19,7 @@ from lidarsim.base.words import plural
 from lidarsim.scene.actors import Actor, box, one_mesh
 from lidarsim.scene.files.meshfile import ROBOTS, Objects, load_objects
 from lidarsim.scene.files.scene_graph import Raster
-from lidarsim.scene.files.urdf import load_robot
 from lidarsim.scene.object_names import told_apart
-from lidarsim.scene.robot import Robot
 from lidarsim.scene.scene import Scene
 from lidarsim.scene.scene_instances import SceneInstance
 from lidarsim.scene.scene_mesh import SceneMesh

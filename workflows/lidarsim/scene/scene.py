@@ -11,6 +11,8 @@ from pathlib import Path
 
 import numpy as np
 
+from lidarscenes.files.rasters import Window
+
 from ..base.arrays import Bools, Floats, Ints32
 from ..base.errors import LidarError
 from ..base.validation import as_array, checked, checked_fields, shown
@@ -23,7 +25,6 @@ from .actors import Actor
 from .colours import Colours, within
 from .face_materials import ObjectMaterials
 from .files.meshfile import Objects, OpacityMode, load_objects, warn
-from .files.rasters import Window
 from .object_names import SameNames, told_apart, unique_names
 from .scene_instances import Instances, MeshPart, SceneInstance, parts_of
 from .scene_mesh import Cutout, SceneMesh, compacted, points_array, stacked

@@ -27,8 +27,8 @@ from lidarsim.base.storage import Storage
 from lidarsim.base.words import natural, plural, shortened, without_common_prefix
 from lidarsim.sensor import Noise, Returns
 from lidarsim.sensor.weather import Weather
+from lidarview.render.stage import nice_step
 
-from ...render.stage import nice_step
 from ...run.pipeline.placement import TaskRecord
 from ...run.pipeline.task_book import StageTotals, union
 from ...run.run_result import RunResult

@@ -12,6 +12,14 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
+from lidarscenes.files.cityjson import read_cityjson
+from lidarscenes.files.dae import read_dae
+from lidarscenes.files.rasters import SUFFIXES as RASTERS
+from lidarscenes.files.rasters import Window, read_raster
+from lidarscenes.files.threemf import read_3mf
+from lidarscenes.files.usd import read_usd
+from lidarscenes.files.vox import read_vox
+
 from ...base.arrays import Floats
 from ...base.elementary import cbrt
 from ...base.errors import LidarError, prefixed
@@ -27,16 +35,9 @@ from ..colours import colours_summary
 from ..scene_instances import FARTHEST_M, SceneInstance
 from ..scene_mesh import SceneMesh
 from ..transform import UP_AXES, Transform
-from .cityjson import read_cityjson
-from .dae import read_dae
 from .gltf import read_gltf
 from .polygon_files import read_obj, read_off, read_ply_mesh, read_stl
-from .rasters import SUFFIXES as RASTERS
-from .rasters import Window, read_raster
 from .scene_graph import Content, MeshFileError, Raster, RigidPart, Wanted
-from .threemf import read_3mf
-from .usd import read_usd
-from .vox import read_vox
 
 CITYJSON = (".json", ".cityjson", ".jsonl")
 

@@ -1,0 +1,336 @@
+"""COLLADA files, .dae, after its specification 1.4.1 by the Khronos Group (2008).
+
+This is not pycollada, which drops geometry with a material, a skin or a morph that it does not
+resolve, holes in polygons and offsets of accessors, refuses comments, pictures without paths and
+odd colours, and keeps single precision; nor assimp 5.4, which refused twice as many of 661 public
+files, skips missing geometries, keeps single precision, and ends the process if nodes contain each
+other. Only triangles are read, and the diffuse colours and images of materials; not lights, cameras
+and animations.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from functools import cache
+from pathlib import Path
+from urllib.parse import unquote
+from xml.etree.ElementTree import Element
+
+import numpy as np
+
+from lidarsim.base.allowance import Allowance
+from lidarsim.base.arrays import Bytes, Floats, Ints
+from lidarsim.base.vectors import length, matmul
+from lidarsim.base.xmlfile import xml_root
+from lidarsim.scene.colours import Colours, as_bytes
+from lidarsim.scene.files.companions import image_file
+from lidarsim.scene.files.polygons import check_corners, fanned, triangulated, unrolled, with_holes
+from lidarsim.scene.files.scene_graph import (
+    SMALLER,
+    Content,
+    MeshFileError,
+    Node,
+    Piece,
+    Wanted,
+    instances,
+    joined,
+    settled,
+)
+from lidarsim.scene.masks import MaskError, MaskNotes, Texture, Wrap, read_colours, remembered
+from lidarsim.scene.scene_mesh import SceneMesh
+from lidarsim.scene.transform import affine, rotation_about
+
+_WRAPS: dict[str, Wrap] = {"CLAMP": "clamp", "BORDER": "clamp", "MIRROR": "mirror"}
+_SURFACES = ("triangles", "polylist", "polygons", "tristrips", "trifans")
+
+
+def read_dae(data: bytes, path: Path, wanted: Wanted) -> Content:
+    """Read the visual scene of a file; colours and names are those of its materials."""
+    root = xml_root(data)
+    for element in root.iter():
+        element.tag = element.tag.rpartition("}")[2]
+    if root.tag != "COLLADA":
+        raise MeshFileError(f"is XML, but not COLLADA: it begins with <{root.tag[:40]}>")
+    allowance = Allowance(len(data), SMALLER)
+    paint = _Effects(path, wanted, allowance) if wanted.colours else None
+    document = _Document(root, allowance, paint, named=wanted.materials)
+    content = settled(instances(document.roots(), document.node, path.stem))
+    content.notes = paint.notes.lines() if paint else []
+    unit = root.find("asset/unit[@meter]")
+    if unit is not None:
+        content.unit_m = float(unit.attrib["meter"])
+        if not 0 < content.unit_m < np.inf:
+            raise ValueError(f"its unit is {content.unit_m} metres")
+    axis = (root.findtext("asset/up_axis") or "").strip()
+    content.up_axis = axis[:1].lower() if axis in ("X_UP", "Z_UP") else "y"  # by its standard
+    return content
+
+
+class _Document:
+    """Elements by their ids; each geometry is read once."""
+
+    def __init__(
+        self, root: Element, allowance: Allowance, paint: _Effects | None, *, named: bool
+    ) -> None:
+        self._root, self._allowance, self._paint = root, allowance, paint
+        self._named = named  # whether names of materials are wanted
+        # By kind, too: some programs give a scene and a node in it the same id.
+        self._ids: dict[tuple[str, str], Element] = {}
+        for element in root.iter():
+            self._ids.setdefault((element.tag, element.get("id", "")), element)
+        self._geometry = cache(self._read_geometry)
+        self._points = cache(self._read_points)
+        self._floats = cache(_numbers)
+
+    def roots(self) -> list[Element]:
+        """Visual scene of the file; by default the first."""
+        shown = self._root.find("scene/instance_visual_scene")
+        if shown is not None:
+            return [self._target(shown, "visual_scene")]
+        return self._root.findall("library_visual_scenes/visual_scene")[:1]
+
+    def node(self, element: Element) -> Node:
+        """<node>, or the <visual_scene> around all."""
+        meshes: list[SceneMesh] = []
+        children = []
+        matrix = np.eye(4)
+        for child in element:
+            if child.tag == "node":
+                children.append(child)
+            elif child.tag == "instance_node":
+                children.append(self._target(child, "node"))
+            elif child.tag == "instance_geometry":
+                bound = self._bound(child) if self._paint or self._named else ()
+                meshes += self._geometry(self._target(child, "geometry"), bound)
+            elif child.tag == "instance_controller":
+                raise MeshFileError(
+                    "moves vertices by a skin (a skeleton) or a morph, which is not supported: "
+                    "apply it, then export"
+                )
+            elif child.tag in _STEPS:
+                matrix = matmul(matrix, _STEPS[child.tag](_numbers(child)))
+            elif child.tag == "skew":
+                raise MeshFileError("shears objects by <skew>, which is not supported: apply it")
+        name = element.get("name", "") if element.tag == "node" else ""
+        return Node(name, matrix, meshes, children)
+
+    def _target(self, element: Element, kind: str) -> Element:
+        """Element of a kind that another one names."""
+        url = element.get("source", element.get("url", ""))
+        found = self._ids.get((kind, url[1:]), self._ids.get((kind, unquote(url[1:]))))
+        if found is None or not url.startswith("#"):
+            raise MeshFileError(
+                f"has an <{element.tag}> of {url[:80]!r}, which is not in the file: export it again"
+            )
+        return found
+
+    def _read_geometry(
+        self, geometry: Element, bound: tuple[tuple[str, Element], ...]
+    ) -> list[SceneMesh]:
+        """One mesh of all primitives, which differ by material only; none without triangles.
+
+        `bound` are symbols of materials, and the elements for which they stand.
+        """
+        name = geometry.get("name") or geometry.get("id") or ""
+        for kind in ("convex_mesh", "brep"):
+            if geometry.find(kind) is not None:
+                raise MeshFileError(f"has a <{kind}>, which is not read: export it as triangles")
+        materials = dict(bound)
+        pieces = (
+            self._piece(primitive, materials.get(primitive.get("material", "")))._replace(
+                material=self._material_name(primitive, materials)
+            )
+            for primitive in geometry.findall("mesh/*")
+            if primitive.tag in _SURFACES
+        )
+        return joined(name, pieces, self._allowance)
+
+    def _material_name(self, primitive: Element, materials: Mapping[str, Element]) -> str:
+        """Name of the material of a primitive, if names are wanted; else, or for none, empty."""
+        symbol = primitive.get("material", "")
+        if not self._named or not symbol:
+            return ""
+        bound = materials.get(symbol)
+        return symbol if bound is None else bound.get("name") or bound.get("id") or symbol
+
+    def _bound(self, instance: Element) -> tuple[tuple[str, Element], ...]:
+        """Materials that an instance of a geometry gives to its symbols."""
+        entries = instance.findall("bind_material/technique_common/instance_material")
+        found = [
+            (entry.get("symbol", ""), self._ids.get(("material", entry.get("target", "")[1:])))
+            for entry in entries
+        ]
+        return tuple((symbol, material) for symbol, material in found if material is not None)
+
+    def _piece(self, primitive: Element, material: Element | None) -> Piece:
+        """Triangles of a primitive, in the colours of a material."""
+        points, offset, stride = self._inputs(primitive)
+        lists = [e for e in primitive.iter() if e.tag in ("p", "h")]
+        numbers = map(_integers, lists)
+        tables = [row[: len(row) // stride * stride].reshape(-1, stride) for row in numbers]
+        corners = np.concatenate([np.zeros((0, stride), np.int64), *tables])
+        ends = np.cumsum([0, *map(len, tables)])
+        own_corners = {e: np.arange(*ends[at : at + 2]) for at, e in enumerate(lists)}
+        check_corners(corners[:, offset], len(points))
+        made = _faces(primitive, points[corners[:, offset]], own_corners.__getitem__)
+        own = np.concatenate([np.zeros((0, 3), np.int64), *made])
+        faces, colours = corners[:, offset][own], None
+        if self._paint and material is not None and len(faces):
+            with self._paint.notes.without_colour(material.get("name") or material.get("id") or ""):
+                url = material.find("instance_effect[@url]")
+                assert url is not None
+                shade = self._paint.shade(self._target(url, "effect"), self._ids)
+                if isinstance(shade, Texture):
+                    uv, at = self._coordinates(primitive)
+                    colours = shade.colours(uv, corners[:, at][own])
+                elif shade is not None:
+                    colours = Colours.plain(shade, len(faces))
+        return Piece(points, faces, colours=colours)
+
+    def _coordinates(self, primitive: Element) -> tuple[Floats, int]:
+        """Texture coordinates (c, 2) of a primitive, and the place of their numbers in <p>."""
+        inputs = [e for e in primitive.findall("input") if e.get("semantic") == "TEXCOORD"]
+        if not inputs:
+            raise MaskError("texture coordinates are missing")
+        first = min(inputs, key=lambda entry: int(entry.get("set", 0)))
+        s, t = self._rows(self._target(first, "source"))[:, :2].T
+        return np.column_stack([s, 1 - t]), int(first.get("offset", 0))
+
+    def _inputs(self, primitive: Element) -> tuple[Floats, int, int]:
+        """Points of a primitive; place of their numbers in <p>, and numbers of each corner."""
+        stride, found = 0, None
+        for entry in primitive.findall("input"):
+            offset = int(entry.get("offset", 0))
+            stride = max(stride, offset + 1)
+            if entry.get("semantic") == "VERTEX":
+                found = self._points(self._target(entry, "vertices")), offset
+        if found is None:
+            raise ValueError(f"<{primitive.tag}> has no vertices")
+        return *found, stride
+
+    def _read_points(self, vertices: Element) -> Floats:
+        """Positions (v, 3) of <vertices>."""
+        entry = vertices.find("input[@semantic='POSITION']")
+        if entry is None:
+            raise ValueError("<vertices> without positions")
+        source = self._target(entry, "source")
+        rows = self._rows(source)
+        accessor = source.findall("technique_common/accessor/param")
+        # Skip a parameter without a name.
+        names = [parameter.get("name") for parameter in accessor]
+        columns = [names.index(axis) for axis in "XYZ" if axis in names]
+        if len(columns) != 3:
+            return rows[:, :3]
+        self._allowance.take(24 * len(rows))
+        return rows[:, columns]
+
+    def _rows(self, source: Element) -> Floats:
+        """Numbers (count, stride) of a <source>."""
+        accessor = source.find("technique_common/accessor")
+        if accessor is None:
+            raise ValueError("positions without <accessor>")
+        numbers = self._floats(self._target(accessor, "float_array"))
+        count, stride = int(accessor.get("count", 0)), int(accessor.get("stride", 1))
+        offset = int(accessor.get("offset", 0))
+        if min(count, offset, stride - 1) < 0 or offset + count * stride > len(numbers):
+            raise ValueError(
+                f"{count:,} positions of {stride} numbers announced, {len(numbers):,} numbers there"
+            )
+        return numbers[offset : offset + count * stride].reshape(count, stride)
+
+
+class _Effects:
+    """Diffuse colours of effects, whose images are read once."""
+
+    def __init__(self, path: Path, wanted: Wanted, allowance: Allowance) -> None:
+        self.notes = MaskNotes()
+        self._path, self._wanted, self._allowance = path, wanted, allowance
+        self._texture = remembered(self._read_texture)
+
+    def shade(self, effect: Element, ids: dict[tuple[str, str], Element]) -> Texture | Bytes | None:
+        """Image or colour, (1, 1, 3), of an effect; None if it has none."""
+        diffuse = effect.find(".//technique/*/diffuse")
+        if diffuse is None:
+            return None
+        texture, colour = diffuse.find("texture"), diffuse.findtext("color")
+        if texture is None:
+            if colour is None:
+                return None
+            return as_bytes(np.array(colour.split()[:3], np.float64)).reshape(1, 1, 3)
+        # A sampler's surface names an image; some programs leave out one or both of them.
+        parameters = {e.get("sid", ""): e for e in effect.iter("newparam")}
+        name, along, across = texture.get("texture", ""), "", ""
+        for _ in range(2):
+            if (found := parameters.get(name)) is not None:
+                along = found.findtext(".//wrap_s", along)
+                across = found.findtext(".//wrap_t", across)
+                named = found.findtext(".//source") or found.findtext(".//init_from") or ""
+                linked = found.find(".//instance_image")
+                name = named.strip() if linked is None else linked.get("url", "")[1:]
+        image = ids.get(("image", name))
+        if image is None:
+            raise MaskError(f"its image {name[-80:]!r} is not in the file")
+        file = image.findtext("init_from/ref") or image.findtext("init_from") or ""
+        return self._texture((file.strip(), along, across))
+
+    def _read_texture(self, key: tuple[str, str, str]) -> Texture:
+        name, *wraps = key
+        file = image_file(self._path, name, self._wanted, self._allowance)
+        along, across = (_WRAPS.get(wrap, "repeat") for wrap in wraps)
+        image = read_colours(file, self._allowance, self.notes)
+        return Texture(image, (along, across), self._allowance)
+
+
+def _faces(
+    primitive: Element, points: Floats, corners: Callable[[Element], Ints]
+) -> Iterator[Ints]:
+    """Triangles (t, 3) of a primitive, piece by piece; `corners` are those of a <p> or <h>."""
+    lists = [corners(p) for p in primitive.findall("p")]
+    if primitive.tag == "triangles":
+        yield from (some[: len(some) // 3 * 3].reshape(-1, 3) for some in lists)
+    elif primitive.tag == "tristrips":
+        yield from map(unrolled, lists)
+    elif primitive.tag == "trifans":
+        yield from map(fanned, lists)
+    elif primitive.tag == "polylist" and lists:
+        sizes = np.array((primitive.findtext("vcount") or "").split(), np.int64)
+        some = np.concatenate(lists)
+        if (sizes < 0).any() or sizes.sum() != len(some):
+            raise ValueError(f"polygons of {sizes.sum():,} corners, {len(some):,} are there")
+        yield triangulated(points, some, sizes)
+    elif primitive.tag == "polygons":
+        if lists:
+            sizes = np.array([len(some) for some in lists])
+            yield triangulated(points, np.concatenate(lists), sizes)
+        for holed in primitive.findall("ph"):
+            yield with_holes(points, [corners(ring) for ring in holed])
+
+
+def _integers(element: Element) -> Ints:
+    return np.array((element.text or "").split(), np.int64)
+
+
+def _numbers(element: Element) -> Floats:
+    return np.array((element.text or "").split(), np.float64)
+
+
+def _rotate(numbers: Floats) -> Floats:
+    """Rotation about an axis, in degrees; some programs write no axis."""
+    *axis, degrees = numbers
+    return affine(rotation_about(axis, degrees) if np.any(axis) else np.eye(3), np.zeros(3))
+
+
+def _look_at(numbers: Floats) -> Floats:
+    eye, target, up = numbers.reshape(3, 3)
+    z = (eye - target) / length(eye - target)
+    x = np.cross(up, z) / length(np.cross(up, z))
+    return affine(np.stack([x, np.cross(z, x), z], axis=1), eye)
+
+
+_STEPS = {
+    "translate": lambda numbers: affine(np.eye(3), numbers),
+    "rotate": _rotate,
+    "scale": lambda numbers: np.diag([*numbers, 1.0]),
+    "matrix": lambda numbers: numbers.reshape(4, 4),
+    "lookat": _look_at,
+}

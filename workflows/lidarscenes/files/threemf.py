@@ -1,0 +1,253 @@
+"""3MF files, after its core specification and its production and materials extensions.
+
+By the 3MF Consortium (2018).
+
+This is not trimesh, which follows nested components only to some depth and confuses parts of inner
+files; nor assimp 5.4, which reads no parts of inner files, ignores required extensions, and ends
+the process on a property index that is out of range.
+"""
+
+from __future__ import annotations
+
+import io
+import re
+import zipfile
+from array import array
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+from xml.parsers import expat
+
+import numpy as np
+
+from lidarsim.base.allowance import Allowance
+from lidarsim.base.arrays import Floats
+from lidarsim.base.words import plural
+from lidarsim.base.xmlfile import refuse_entity
+from lidarsim.scene.colours import GREY, Colours
+from lidarsim.scene.face_materials import FaceMaterials
+from lidarsim.scene.files.scene_graph import (
+    SMALLER,
+    Content,
+    MeshFileError,
+    Node,
+    Wanted,
+    instances,
+    settled,
+)
+from lidarsim.scene.scene_mesh import SceneMesh
+
+_UNITS_M = {
+    "micron": 1e-6,
+    "millimeter": 1e-3,
+    "centimeter": 1e-2,
+    "inch": 0.0254,
+    "foot": 0.3048,
+    "meter": 1.0,
+}
+# Required extensions that do not change shapes, or that are supported here.
+_READ = re.compile(r"/(material|production|securecontent)/")
+
+_PIECE = 1 << 20
+_OBJECT_BYTES = 1000  # of an object or its placement, which a few letters make
+
+_COLOUR = re.compile(r"#([0-9A-Fa-f]{6})([0-9A-Fa-f]{2})?")  # sRGB, and an alpha that is not read
+
+_Key = tuple[str, str]  # inner file and number of an object
+
+
+@dataclass
+class _MeshObject:
+    name: str
+    vertices: array[float] = field(default_factory=lambda: array("d"))
+    faces: array[int] = field(default_factory=lambda: array("q"))
+    components: list[_Placement] = field(default_factory=list)
+    # Group of colours, and number in it, of triangles that name none.
+    usual: tuple[str, str] = ("", "0")
+    # Of corners, where they are read.
+    shades: array[int] = field(default_factory=lambda: array("B"))
+    materials: list[str] = field(default_factory=list)  # of triangles, where names are wanted
+
+    @cached_property
+    def meshes(self) -> list[SceneMesh]:
+        """The mesh; none without triangles."""
+        if not self.faces:
+            return []
+        vertices = np.frombuffer(self.vertices, np.float64).reshape(-1, 3)
+        faces, colours = np.frombuffer(self.faces, np.int64).reshape(-1, 3), None
+        corners = np.frombuffer(self.shades, np.uint8).reshape(-1, 3, 3)
+        if (corners != GREY).any():
+            colours = Colours.of_corners(corners)
+        materials = None
+        if self.materials:
+            names = tuple(dict.fromkeys(self.materials))
+            rows = {name: row for row, name in enumerate(names)}
+            index = np.array([rows[name] for name in self.materials], np.int32)
+            materials = FaceMaterials(names, index if names[1:] else None)
+            materials = materials if any(names) else None
+        return [SceneMesh(self.name, vertices, faces, colours=colours, materials=materials)]
+
+
+@dataclass(frozen=True, eq=False)
+class _Placement:
+    key: _Key
+    name: str
+    matrix: Floats
+
+
+def read_3mf(data: bytes, path: Path, wanted: Wanted) -> Content:
+    """Read the build items of a file, and colours of base materials and colour groups."""
+    with zipfile.ZipFile(io.BytesIO(data)) as archive:
+        package = _Package(archive, Allowance(len(data), SMALLER), wanted)
+        root = package.model(package.start())
+
+        def node(place: _Placement) -> Node:
+            made = package.object(place.key)
+            return Node(place.name or made.name, place.matrix, made.meshes, made.components)
+
+        content = settled(instances(root.items, node, path.stem))
+    content.unit_m, content.up_axis = _UNITS_M[root.unit], "z"
+    if bare := sum(model.bare for model in package.models.values()):
+        words = plural(bare, "triangle")
+        content.notes.append(f"has textures or lacks colours, which leaves {words} grey")
+    return content
+
+
+class _Package:
+    """The inner files of an archive, each read when an object of it is placed."""
+
+    def __init__(self, archive: zipfile.ZipFile, allowance: Allowance, wanted: Wanted) -> None:
+        self._archive, self._allowance, self._wanted = archive, allowance, wanted
+        self.models: dict[str, _Model] = {}
+
+    def start(self) -> str:
+        """Inner file of the model that is to be built."""
+        names = self._archive.namelist()
+        relations = ""
+        if "_rels/.rels" in names:
+            relations = b"".join(self._pieces("_rels/.rels")).decode()
+        for relation in re.findall(r"<Relationship\b[^>]*", relations):
+            target = re.search(r'\bTarget\s*=\s*["\']/?([^"\']+)', relation)
+            if target and re.search(r'/3dmodel["\']', relation):
+                return target[1]
+        for name in names:
+            if name.lower() == "3d/3dmodel.model":
+                return name
+        raise ValueError("a ZIP archive without 3D/3dmodel.model")
+
+    def model(self, name: str) -> _Model:
+        name = name.lstrip("/")
+        if name not in self.models:
+            pieces = self._pieces(name)
+            self.models[name] = _Model(name, pieces, self._allowance, self._wanted)
+        return self.models[name]
+
+    def _pieces(self, name: str) -> Iterator[bytes]:
+        """Content of an inner file, which is never longer than announced."""
+        entry = self._archive.getinfo(name)
+        if entry.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
+            raise MeshFileError("is packed by a method other than Deflate: export it again")
+        self._allowance.take(entry.file_size)
+        with self._archive.open(entry) as file:
+            while piece := file.read(_PIECE):
+                yield piece
+
+    def object(self, key: _Key) -> _MeshObject:
+        objects = self.model(key[0]).objects
+        if key[1] not in objects:
+            raise ValueError(f"object {key[1][:20]!r} is placed, but missing")
+        return objects[key[1]]
+
+
+class _Model:
+    """Objects of an inner file, and its build items.
+
+    The parser makes no tree, which would take ten times the file's size.
+    """
+
+    def __init__(
+        self, name: str, text: Iterable[bytes], allowance: Allowance, wanted: Wanted
+    ) -> None:
+        self.unit = "millimeter"
+        self.bare = 0  # triangles whose colours are not here
+        self._colours, self._named = wanted.colours, wanted.materials
+        self._groups: dict[str, list[bytes]] = {}  # {number of a group: its colours}
+        self._group: list[bytes] = []
+        self._names: dict[str, list[str]] = {}  # {number of a group: names of its materials}
+        self._names_of_group: list[str] = []
+        self.objects: dict[str, _MeshObject] = {}
+        self.items: list[_Placement] = []
+        self._name, self._allowance = name, allowance
+        self._object = _MeshObject("")
+        # Without namespaces, because slicers omit the declaration of some.
+        parser = expat.ParserCreate()
+        parser.StartElementHandler = self._begin
+        parser.EntityDeclHandler = refuse_entity
+        for piece in text:
+            parser.Parse(piece)
+        parser.Parse(b"", True)
+
+    def _begin(self, tag: str, attributes: dict[str, str]) -> None:
+        tag = tag.rpartition(":")[2]
+        if tag == "vertex":
+            self._object.vertices.extend([float(attributes[axis]) for axis in "xyz"])
+        elif tag == "triangle":
+            self._object.faces.extend([int(attributes[corner]) for corner in ("v1", "v2", "v3")])
+            if self._colours:
+                self._shade(attributes)
+            if self._named:
+                self._object.materials.append(self._material(attributes))
+        elif tag in ("basematerials", "colorgroup"):
+            self._group = self._groups.setdefault(attributes["id"], [])
+            self._names_of_group = self._names.setdefault(attributes["id"], [])
+        elif tag in ("base", "color"):
+            found = _COLOUR.fullmatch(attributes.get("displaycolor", attributes.get("color", "")))
+            self._group.append(bytes.fromhex(found[1]) if found else GREY.tobytes())
+            self._names_of_group.append(attributes.get("name", ""))
+        elif tag == "object":
+            self._allowance.take(_OBJECT_BYTES)
+            self._object = _MeshObject(attributes.get("name", ""))
+            self._object.usual = attributes.get("pid", ""), attributes.get("pindex", "0")
+            self.objects[attributes["id"]] = self._object
+        elif tag == "component":
+            self._object.components.append(self._placement(attributes))
+        elif tag == "item":
+            self.items.append(self._placement(attributes))
+        elif tag == "model":
+            self.unit = attributes.get("unit", self.unit)
+            for prefix in attributes.get("requiredextensions", "").split():
+                extension = attributes.get(f"xmlns:{prefix}", prefix)
+                if not _READ.search(extension):
+                    raise MeshFileError(f"needs {extension[:80]}, which is not supported")
+        elif tag in ("beamlattice", "booleanshape", "levelset"):
+            raise MeshFileError(f"has a <{tag}>, which is not supported: export it as triangles")
+
+    def _material(self, attributes: dict[str, str]) -> str:
+        """Name of the material of a triangle, that of its first corner; empty for none."""
+        group, number = self._object.usual
+        place = int(attributes.get("p1", number))
+        names = self._names.get(attributes.get("pid", group), [])
+        return names[place] if 0 <= place < len(names) else ""
+
+    def _shade(self, attributes: dict[str, str]) -> None:
+        """Add the colours of a triangle's corners, grey if it has none."""
+        group, number = self._object.usual
+        group, first = attributes.get("pid", group), attributes.get("p1", number)
+        places = [int(attributes.get(name, first)) for name in ("p1", "p2", "p3")]
+        colours = self._groups.get(group, [])
+        known = all(0 <= place < len(colours) for place in places)
+        self.bare += bool(group) and not known
+        for place in places:
+            self._object.shades.frombytes(colours[place] if known else GREY.tobytes())
+
+    def _placement(self, attributes: dict[str, Any]) -> _Placement:
+        self._allowance.take(_OBJECT_BYTES)
+        path = next((v for k, v in attributes.items() if k.rpartition(":")[2] == "path"), "")
+        matrix = np.eye(4)
+        if "transform" in attributes:
+            numbers = np.array(attributes["transform"].split(), np.float64)
+            matrix[:3] = numbers.reshape(4, 3).T
+        key = path.lstrip("/") or self._name, attributes["objectid"]
+        return _Placement(key, attributes.get("partnumber", ""), matrix)

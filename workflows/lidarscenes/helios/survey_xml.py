@@ -1,0 +1,276 @@
+"""A survey of HELIOS++ as a scenario: one sensor for each leg that scans, on one trajectory."""
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+import tempfile
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+from xml.etree.ElementTree import Element
+
+import numpy as np
+import yaml
+
+from lidarpool.scenario.build import build
+from lidarpool.scenario.scenario import Scenario
+from lidarsim.base.arrays import Floats
+from lidarsim.base.errors import LidarError, prefixed
+from lidarsim.scene.scene import Scene
+from lidarsim.scene.transform import rotation_about
+from lidarsim.sensor import Pose
+from lidarsim.sensor.disc import SUBRAYS
+from lidarsim.sensor.survey import SENSORS_MOST
+
+from ..writers.scene_file import write_scene
+from .files import Assets, clean, number, rotation, vector
+from .scanner_xml import Device, channels, device, unread
+from .scene_xml import HeliosScene
+from .way import Stretch, Way, flown, read_legs, read_way, stood
+
+SCENARIO_FILE = "scenario.yaml"
+# Carriers look along x, the platforms of HELIOS++ along y.
+_AHEAD = rotation_about((0, 0, 1), -90)
+
+
+@dataclass
+class Imported:
+    """A written scenario, and the unsupported features of its survey."""
+
+    path: Path
+    scenario: Scenario
+    left_out: list[str]
+
+
+def import_survey(
+    survey: str | Path, out: str | Path, assets: Sequence[str | Path] = ()
+) -> Imported:
+    """Write a HELIOS++ survey as a scenario, into a new folder.
+
+    Beside `scenario.yaml` go data files of its sensors, and the trajectory if it is a file.
+
+    Parameters
+    ----------
+    survey
+        Its XML file.
+    out
+        The folder.
+    assets
+        Folders where its references start, before the survey's own and those above it.
+
+    Raises
+    ------
+    LidarError
+        If a file is missing or broken, or an essential feature is not supported; nothing is
+        written then.
+    """
+    survey, out = Path(survey), Path(out)
+    if out.exists():
+        raise LidarError(f"{out} exists: name another folder, --out DIR.")
+    try:
+        made = _Import(survey, [Path(folder) for folder in assets], out)
+    except LidarError as error:
+        told = str(error)
+        told = told if told.startswith(str(survey)) else f"{survey}: {told}"
+        raise LidarError(told) from error
+    out.parent.mkdir(parents=True, exist_ok=True)
+    partial = Path(tempfile.mkdtemp(prefix=f".{out.name}.", dir=out.parent))
+    try:
+        for name, text in made.files(out).items():
+            (partial / name).write_text(text, encoding="utf-8", newline="\n")
+        for part in made.scene.parts:
+            if part.surfels is not None:
+                write_scene(partial / part.file.name, Scene.from_meshes([part.surfels]))
+        scenario = Scenario.load(partial / SCENARIO_FILE)
+        build(scenario)  # with whatever is wrong about it
+        partial.chmod(0o755)  # temporary folders are their owner's alone
+        partial.rename(out)
+    except LidarError as error:
+        told = str(error).replace(str(partial), str(out))
+        raise LidarError(f"{survey} makes no scenario: {told}") from error
+    finally:
+        shutil.rmtree(partial, ignore_errors=True)
+    return Imported(out / SCENARIO_FILE, Scenario.load(out / SCENARIO_FILE), made.left_out)
+
+
+class _Import:
+    """A survey that was read whole."""
+
+    def __init__(self, survey: Path, folders: Sequence[Path], out: Path) -> None:
+        self._home, self._assets = survey, Assets(survey, folders)
+        element = self._assets.root(survey).find("survey")
+        if element is None:
+            raise LidarError("it has no <survey>.")
+        self._element, self._name = element, element.get("name") or survey.stem
+        self._scanners = channels(self._asset("scanner"))
+        self._first = next(iter(self._scanners.values()))
+        self.scene = HeliosScene(self._asset("scene"), self._assets, out)
+        self._notes: list[str] = []
+        self._files: dict[str, dict[str, Any]] = {}  # {name: data of a sensor}
+        self._sensors: dict[str, dict[str, Any]] = {}
+        self._way = self._carry()
+        if not self._sensors:
+            raise LidarError("no leg scans anything.")
+        if len(self._sensors) > SENSORS_MOST:
+            raise LidarError(
+                f"{len(self._sensors)} legs and channels scan; a scenario has {SENSORS_MOST} "
+                "sensors at most."
+            )
+        self._materials = self.scene.materials(self._first.number("wavelength_nm", 1064))
+        if element.get("legRandomOffset", "false") in ("true", "1"):
+            self._notes.append("legRandomOffset: legs are where they say")
+        if number(element, "numRuns", 1) > 1:
+            self._notes.append("numRuns: it is one run")
+        if number(self._full_waveform(), "maxFullwaveRange_ns", 0) > 0:
+            self._notes.append("maxFullwaveRange_ns: waveforms are as long as their echoes")
+        unsupported = (line for scanner in self._scanners.values() for line in unread(scanner))
+        self.left_out = list(dict.fromkeys([*self._notes, *unsupported, *self.scene.left_out()]))
+
+    def _asset(self, kind: str) -> Element:
+        if not (reference := self._element.get(kind)):
+            raise LidarError(f"its <survey> names no {kind}.")
+        return self._assets.asset(reference, kind, self._home).element
+
+    def _carry(self) -> Way:
+        """Read the legs and the platform; make the trajectory, and sensors on it."""
+        survey, assets = self._element, self._assets
+        legs = read_legs(survey, assets, self._home, self.scene.height)
+        mount, kind, way = survey.find("scannerMount"), "interpolated", None
+        if survey.get("platform") == kind:
+            base = survey.get("basePlatform")
+            if mount is None and base:
+                mount = assets.asset(base, "platform", self._home).element.find("scannerMount")
+            way = read_way(survey, legs, assets)
+        else:
+            platform = self._asset("platform")
+            mount, kind = platform.find("scannerMount"), platform.get("type", "").lower()
+            if kind in ("groundvehicle", "multicopter"):
+                self._notes.append(
+                    f"how a {kind} drives: it keeps its speed and goes straight from leg to leg"
+                )
+            noisy = [e.tag for parent in (platform, survey) for e in parent if "Noise" in e.tag]
+            if noisy:
+                self._notes.append(f"noise of the platform: {', '.join(noisy)}")
+        moves = kind in ("linearpath", "groundvehicle", "multicopter")
+        devices: dict[int, dict[str, Device]] = {}  # {leg: {channel: …}}
+        for leg in legs[:-1] if moves else legs:  # the last one is only where a way ends
+            with prefixed(f"leg {leg.number}"):
+                if leg.active:
+                    devices[leg.number] = {
+                        channel: device(scanner, leg.scanner)
+                        for channel, scanner in self._scanners.items()
+                    }
+        if way is None and moves:
+            way = flown(legs)
+        elif way is None:
+            heads = {leg: max(d.head_s or 0.0 for d in of.values()) for leg, of in devices.items()}
+            way = stood(legs, heads)
+        turn, place = rotation(mount), vector(mount)
+        places = {
+            tuple(clean(place + one.place))  # type: ignore[arg-type]
+            for of in devices.values()
+            for one in of.values()
+        }
+        if len(places) > 1:
+            self._notes.append("places of channels beside each other: all leave from the first's")
+        way.rows[:, 1:4] += min(places, default=(0, 0, 0))
+        for stretch in way.stretches:
+            for channel, one in devices[stretch.leg].items() if stretch.active else ():
+                name = f"leg{stretch.leg}" + (f"-{channel}" if channel else "")
+                self._sensors[name] = self._sensor(one, stretch, turn)
+        return way
+
+    def _sensor(self, one: Device, stretch: Stretch, mount: Floats) -> dict[str, Any]:
+        """Entry of `sensors`."""
+        step_deg, steps = one.steps(stretch.seconds)
+        near, far = one.range_m
+        pose = Pose.of((0, 0, 0), _AHEAD @ mount @ one.turn)
+        angles = {name: clean(getattr(pose, name)) for name in ("yaw_deg", "pitch_deg", "roll_deg")}
+        return {
+            "model": self._file_of(one.data),
+            "step_deg": step_deg,
+            **({"min_range_m": clean(near)} if near else {}),
+            **({"max_range_m": clean(far)} if np.isfinite(far) else {}),
+            "mount": {name: angle for name, angle in angles.items() if angle},
+            "start_s": clean(stretch.start_s),
+            "steps": steps,
+        }
+
+    def _file_of(self, data: dict[str, Any]) -> str:
+        """Name of the file of a sensor; those that are alike share one."""
+        stem = re.sub(r"[^\w.-]+", "_", str(data["name"])).strip("._").lower() or "sensor"
+        name, number = f"{stem}.yaml", 1
+        while self._files.setdefault(name, data) != data:
+            number += 1
+            name = f"{stem}-{number}.yaml"
+        return name
+
+    def files(self, out: Path) -> dict[str, str]:
+        """Return what goes into the folder `out`: {name: text}."""
+        trajectory, files = self._way.written()
+        light, range_m = self._light()
+        names = [os.path.relpath(part.file.resolve(), out.resolve()) for part in self.scene.parts]
+        entries = zip(self.scene.parts, names, strict=True)
+        classes = ["class"] if any("class" in entry for entry in self._materials) else []
+        data = {
+            "scene": {"files": [part.entry(Path(name).as_posix()) for part, name in entries]},
+            "trajectory": trajectory,
+            "sensors": {name: sensor | range_m for name, sensor in self._sensors.items()},
+            **({"materials": self._materials} if self._materials else {}),
+            **light,
+            "cloud": {
+                "keep_every": 1,
+                "precision_m": 0.001,
+                "columns": ["time", "range", "intensity", "return_number", "returns", *classes],
+            },
+            "planning": {"enabled": False},
+        }
+        head = [
+            f"From the HELIOS++ survey {self._name!r} by lidarpool import.",
+            *(f"Not supported: {line}." for line in self.left_out),
+        ]
+        text = "".join(f"# {line}\n" for line in head) + _dumped(data)
+        sensors = {name: _dumped(sensor) for name, sensor in self._files.items()}
+        return {**files, **sensors, SCENARIO_FILE: text}
+
+    def _full_waveform(self) -> dict[str, str]:
+        """FWFSettings of the scanner, and over these those of the survey."""
+        given = self._first.child("FWFSettings"), self._element.find("FWFSettings")
+        return {name: v for one in given if one is not None for name, v in one.attrib.items()}
+
+    def _light(self) -> tuple[dict[str, Any], dict[str, float]]:
+        """Return sections on light, and ranges that the survey sets for its scanner."""
+        scanner, detector = self._first, self._element.find("detectorSettings")
+        own = {} if detector is None else detector.attrib
+        fwf = self._full_waveform()
+        quality = number(fwf, "beamSampleQuality", 3.0)
+        sections = {
+            "returns": {
+                "mode": "first" if scanner.number("maxNOR") == 1 else "all",
+                "subrays": SUBRAYS[int(np.clip(quality - 1, 0, len(SUBRAYS) - 1))],
+                **waveform(fwf, scanner.number("pulseLength_ns", 4)),
+            },
+            "noise": {"range_m": clean(number(own, "accuracy_m", scanner.number("accuracy_m")))},
+            "weather": {"visibility_km": clean(scanner.number("atmosphericVisibility_km", 23))},
+        }
+        ranges = {"min_range_m": "rangeMin_m", "max_range_m": "rangeMax_m"}
+        return sections, {ours: number(own, n, 0) for ours, n in ranges.items() if n in own}
+
+
+def waveform(settings: dict[str, str], pulse_ns: float) -> dict[str, Any]:
+    """Return the fields of `returns` that FWFSettings say, where they say anything of waveforms.
+
+    HELIOS++ has range over the speed of light for the time, which is half of the time that light
+    takes there and back.
+    """
+    if "binSize_ns" not in settings and "winSize_ns" not in settings:
+        return {}
+    sample_ns = 2 * number(settings, "binSize_ns", 0.25)
+    return {"waveform": "peaks", "sample_ns": clean(min(sample_ns, pulse_ns / 2))}
+
+
+def _dumped(data: dict[str, Any]) -> str:
+    return yaml.safe_dump(data, sort_keys=False, default_flow_style=None, width=100)

@@ -1,0 +1,124 @@
+"""Cars of a few hundred triangles: a body with recessed windows on four wheels."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from lidarsim.base.arrays import Floats, Ints
+from lidarsim.scene.scene_mesh import SceneMesh, stacked
+
+from .city_kinds import loft, lying, regular
+
+_RECESS_M, _FRAME = 0.03, 0.12  # of a window: depth, and share of its width that is frame
+
+
+@dataclass(frozen=True)
+class Model:
+    """Outline of a car that faces x, from the front to the back; metres.
+
+    A station is (x, half width, height of the belt line, height of the roof); without a cabin the
+    two heights are nearly the same. Windows are beside and between the stations of the cabin.
+    """
+
+    name: str
+    stations: tuple[tuple[float, float, float, float], ...]
+    glazed: range  # stations after which there are windows
+    axles: tuple[float, float]
+    wheel_m: float = 0.33  # radius
+
+
+MODELS = (
+    Model(
+        "Saloon",
+        (
+            (2.28, 0.62, 0.6, 0.62), (2.1, 0.82, 0.72, 0.76), (1.0, 0.89, 0.88, 0.94),
+            (0.28, 0.9, 0.92, 1.4), (-0.45, 0.9, 0.93, 1.46), (-1.2, 0.9, 0.94, 1.38),
+            (-1.75, 0.88, 0.95, 1.02), (-2.2, 0.82, 0.9, 0.96), (-2.32, 0.7, 0.62, 0.64),
+        ),
+        range(2, 6),
+        (1.4, -1.35),
+    ),
+    Model(
+        "Estate",
+        (
+            (2.3, 0.62, 0.6, 0.62), (2.12, 0.83, 0.74, 0.78), (1.05, 0.9, 0.9, 0.96),
+            (0.35, 0.91, 0.94, 1.45), (-0.45, 0.91, 0.95, 1.5), (-1.3, 0.91, 0.96, 1.49),
+            (-1.95, 0.9, 0.97, 1.42), (-2.3, 0.86, 0.97, 1.02), (-2.4, 0.75, 0.6, 0.62),
+        ),
+        range(2, 7),
+        (1.42, -1.4),
+    ),
+    Model(
+        "Panel van",
+        (
+            (2.48, 0.7, 0.7, 0.72), (2.35, 0.9, 0.95, 1.0), (1.75, 0.96, 1.12, 1.2),
+            (1.1, 0.98, 1.15, 1.9), (0.2, 0.98, 1.15, 2.02), (-1.0, 0.98, 1.15, 2.04),
+            (-2.4, 0.97, 1.15, 2.0), (-2.48, 0.92, 1.0, 1.86),
+        ),
+        range(2, 4),
+        (1.55, -1.5),
+        0.35,
+    ),
+)  # fmt: skip
+
+
+def car(model: Model) -> SceneMesh:
+    """Make a car that stands on z = 0 around the origin.
+
+    Examples
+    --------
+    >>> saloon = car(MODELS[0])
+    >>> saloon.name, 400 < len(saloon.faces) < 800
+    ('Saloon', True)
+    """
+    wheel = loft(regular(12, model.wheel_m), [(-0.11, 0.03), (-0.08, 0), (0.08, 0), (0.11, 0.03)])
+    track = max(half for _, half, _, _ in model.stations) - 0.1
+    down = -wheel.vertices[:, 1].min()
+    wheels = [lying(wheel).moved(x, y, down) for x in model.axles for y in (-track, track)]
+    return SceneMesh(model.name, *stacked([_body(model), *wheels]))
+
+
+def all_cars() -> tuple[SceneMesh, ...]:
+    """Make a car of each of `MODELS`."""
+    return tuple(car(model) for model in MODELS)
+
+
+def _body(model: Model) -> tuple[Floats, Ints]:
+    """Rings of eight corners around the stations, joined by quadrangles."""
+    rings = []
+    for x, half, belt, roof in model.stations:
+        top = half * (0.74 if roof - belt > 0.2 else 0.86)
+        low = 0.62 * model.wheel_m
+        right = [(0.9 * half, low), (half, 0.55 * belt), (0.97 * half, belt), (top, roof)]
+        rings.append([(x, -y, z) for y, z in right] + [(x, y, z) for y, z in right[::-1]])
+    ring = np.array(rings)
+    quads: list[Floats] = []
+    for k in range(len(ring) - 1):
+        for side in range(8):
+            after = (side + 1) % 8
+            quad = ring[[k, k + 1, k + 1, k], [after, after, side, side]]
+            # 2 and 4 are beside the belt line, 3 is the roof, or a windscreen if it slopes.
+            slopes = abs(ring[k, 3, 2] - ring[k + 1, 3, 2]) > 0.25
+            glass = k in model.glazed and (side in (2, 4) or (side == 3 and slopes))
+            quads += _window(quad) if glass else [quad]
+    for end, turn in ((ring[0], -1), (ring[-1], 1)):
+        quads += [end[[a, b, 7 - b, 7 - a][::turn]] for a, b in ((0, 1), (1, 2), (2, 3))]
+    corners = np.array(quads)
+    number = np.arange(4 * len(corners)).reshape(-1, 4)
+    return corners.reshape(-1, 3), np.concatenate([number[:, :3], number[:, [0, 2, 3]]])
+
+
+def _window(quad: Floats) -> list[Floats]:
+    """Frame of four quadrangles, the sides of a recess, and the pane."""
+    middle = quad.mean(axis=0)
+    normal = np.cross(quad[2] - quad[0], quad[3] - quad[1])
+    hole = quad + _FRAME * (middle - quad)
+    pane = hole - _RECESS_M * normal / np.linalg.norm(normal)
+    out = [pane]
+    for k in range(4):
+        after = (k + 1) % 4
+        out.append(np.array([quad[k], quad[after], hole[after], hole[k]]))
+        out.append(np.array([hole[k], hole[after], pane[after], pane[k]]))
+    return out

@@ -1,0 +1,214 @@
+"""Trees as a lidar sees them: trunk, branches, twigs, and leaves as single triangles.
+
+A stem carries branches, branches carry twigs and twigs leaves, by the proportions of a species, as
+of Weber and Penn (1995). A leaf's triangle is larger than a leaf: so few stand for all of a tree.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from lidarsim.base.arrays import Floats, Ints
+from lidarsim.scene.scene_instances import SceneInstance
+from lidarsim.scene.scene_mesh import SceneMesh, stacked
+
+SCALES = (0.7, 1.3)  # least and most of trees in a scene
+MOST_TREES = 100_000  # readers of mesh files take 200,000 nodes
+_STEM_SIDES, _BRANCH_SIDES, _TWIG_SIDES = 7, 4, 3
+_STEM_STEPS, _BRANCH_STEPS = 8, 3
+_GOLDEN_ANGLE = np.pi * (3 - np.sqrt(5))
+
+
+@dataclass(frozen=True)
+class Species:
+    """Proportions of a tree; heights of the crown are shares, from its lowest branch to the top."""
+
+    name: str
+    height_m: float
+    trunk_m: float  # radius above the roots
+    bare: float  # share of the height without branches
+    crown: tuple[float, ...]  # lengths of branches, metres, at equal steps up the crown
+    angle_deg: tuple[float, float]  # of branches from the vertical, lowest and highest
+    rise_deg: float  # how far a branch turns up from its foot to its end
+    branches: int
+    twigs: int  # of a branch
+    leaves: int  # of a twig
+    leaf_m: tuple[float, float]  # length and width of their triangles
+    hang: float = 0.0  # how much twigs and leaves hang
+    conifer: bool = False
+
+
+SPECIES = (
+    Species(
+        "Oak", 12, 0.36, bare=0.2, crown=(4.2, 5.2, 5.0, 3.8, 1.5), angle_deg=(85, 15), rise_deg=25,
+        branches=48, twigs=10, leaves=13, leaf_m=(0.3, 0.24),
+    ),
+    Species(
+        "Maple", 9, 0.2, bare=0.26, crown=(2.4, 3.3, 3.2, 2.4, 1.0), angle_deg=(70, 10),
+        rise_deg=20, branches=40, twigs=10, leaves=13, leaf_m=(0.26, 0.22),
+    ),
+    Species(
+        "Birch", 11, 0.15, bare=0.22, crown=(2.1, 2.4, 2.1, 1.5, 0.5), angle_deg=(50, 15),
+        rise_deg=-20, branches=46, twigs=8, leaves=14, leaf_m=(0.22, 0.15), hang=0.9,
+    ),
+    Species(
+        "Spruce", 15, 0.22, bare=0.13, crown=(3.1, 2.5, 1.8, 1.1, 0.15), angle_deg=(94, 60),
+        rise_deg=14, branches=84, twigs=8, leaves=9, leaf_m=(0.36, 0.15), hang=0.35, conifer=True,
+    ),
+    Species(
+        "Pine", 14, 0.24, bare=0.5, crown=(2.3, 3.0, 2.8, 2.2, 1.0), angle_deg=(85, 25),
+        rise_deg=18, branches=34, twigs=10, leaves=15, leaf_m=(0.28, 0.14), conifer=True,
+    ),
+)  # fmt: skip
+
+
+def tree(species: Species, seed: int = 0, root_m: float = 0.1) -> SceneMesh:
+    """Make a tree that stands on (0, 0, 0).
+
+    Parameters
+    ----------
+    species
+        One of `SPECIES`, or proportions of one's own.
+    seed
+        The same seed gives the same tree.
+    root_m
+        How far the trunk goes on below the ground, metres, above 0; for slopes some more.
+
+    Examples
+    --------
+    >>> oak = tree(SPECIES[0])
+    >>> oak.name, 5_000 < len(oak.faces) < 20_000
+    ('Oak', True)
+    """
+    rng = np.random.default_rng(seed)
+    stem, radii = _stem(species, root_m, rng)
+    branches, thick = _branches(species, stem, radii, rng)
+    twigs = _twigs(species, branches, rng)
+    thin = np.tile([0.25 * thick.mean(), 0.004], (len(twigs), 1))
+    parts = [
+        _tubes(stem[None], radii[None], _STEM_SIDES),
+        _tubes(branches, thick, _BRANCH_SIDES),
+        _tubes(twigs, thin, _TWIG_SIDES),
+        _leaves(species, twigs, rng),
+    ]
+    return SceneMesh(species.name, *stacked(parts))
+
+
+def all_trees(seed: int, root_m: float) -> tuple[SceneMesh, ...]:
+    """Make a tree of each of `SPECIES`."""
+    return tuple(tree(species, seed, root_m) for species in SPECIES)
+
+
+def placed(
+    meshes: Sequence[SceneMesh], kind: Ints, places: Floats, yaw: Floats, scale: Floats
+) -> list[SceneInstance]:
+    """Place meshes upright: `kind` (n,) at places (n, 3), turned by `yaw` (n,), and scaled (n,)."""
+    matrices = np.tile(np.eye(4), (len(kind), 1, 1))
+    cos, sin = scale * np.cos(yaw), scale * np.sin(yaw)
+    matrices[:, 0, 0], matrices[:, 0, 1] = cos, -sin
+    matrices[:, 1, 0], matrices[:, 1, 1] = sin, cos
+    matrices[:, 2, 2], matrices[:, :3, 3] = scale, places
+    return [SceneInstance(meshes[k], matrix) for k, matrix in zip(kind, matrices, strict=True)]
+
+
+def _stem(species: Species, root_m: float, rng: np.random.Generator) -> tuple[Floats, Floats]:
+    """Points (k, 3) from the root to the top, and radii (k,)."""
+    share = np.linspace(0, 1, _STEM_STEPS)
+    sway = np.cumsum(rng.normal(0, 0.012 * species.height_m, (_STEM_STEPS, 2)), axis=0)
+    sway = (sway - sway[0]) * share[:, None]
+    above = np.column_stack([sway, 0.97 * share * species.height_m])
+    radii = species.trunk_m * (1 - share) ** 0.8 + 0.01
+    radii[0] *= 1.35
+    flare = [[above[1, 0] / 10, above[1, 1] / 10, 0.06 * species.height_m]]
+    points = np.concatenate([[[0, 0, -root_m]], above[:1], flare, above[1:]])
+    return points, np.concatenate([[1.3 * radii[0]], radii[:1], [species.trunk_m], radii[1:]])
+
+
+def _branches(
+    species: Species, stem: Floats, radii: Floats, rng: np.random.Generator
+) -> tuple[Floats, Floats]:
+    """Points (n, k, 3) of the branches, and radii (n, k)."""
+    n = species.branches
+    # As many where they are long as fill the crown evenly.
+    steps = np.linspace(0, 1, 50)
+    lengths = np.interp(steps, np.linspace(0, 1, len(species.crown)), species.crown)
+    below = np.cumsum(lengths**1.5)
+    share = np.interp((np.arange(n) + rng.uniform(0, 1, n)) / n, below / below[-1], steps)
+    height = species.height_m * (species.bare + (0.97 - species.bare) * share)
+    foot = np.stack([np.interp(height, stem[:, 2], axis) for axis in stem.T], axis=1)
+    around = _GOLDEN_ANGLE * np.arange(n) + rng.normal(0, 0.3, n)
+    length = np.interp(share, steps, lengths) * rng.uniform(0.75, 1.08, n)
+    low, high = np.radians(species.angle_deg)
+    lean = low + (high - low) * share + rng.normal(0, 0.12, n)
+    points = [foot]
+    for step in range(_BRANCH_STEPS):
+        tilt = lean - np.radians(species.rise_deg) * step / (_BRANCH_STEPS - 1)
+        tilt = tilt + rng.normal(0, 0.1, n)
+        turn = around + rng.normal(0, 0.15, n) * step
+        along = [np.sin(tilt) * np.cos(turn), np.sin(tilt) * np.sin(turn), np.cos(tilt)]
+        points.append(points[-1] + np.stack(along, axis=1) * (length / _BRANCH_STEPS)[:, None])
+    # Half as thick as the stem there, at most in proportion to the length.
+    thick = np.minimum(0.5 * np.interp(height, stem[:, 2], radii), 0.006 + 0.022 * length)
+    return np.stack(points, axis=1), thick[:, None] * np.linspace(1, 0.25, _BRANCH_STEPS + 1)
+
+
+def _twigs(species: Species, branches: Floats, rng: np.random.Generator) -> Floats:
+    """Return ends of the twigs, (n, 2, 3), which spread from the outer part of each branch."""
+    n, m = len(branches), species.twigs
+    at = np.sort(rng.uniform(0.2, 1, (n, m)), axis=1)
+    at[:, -1] = 1
+    place = at * _BRANCH_STEPS
+    step = np.minimum(place.astype(np.int64), _BRANCH_STEPS - 1)
+    row = np.arange(n)[:, None]
+    begin, end = branches[row, step], branches[row, step + 1]
+    foot = begin + (end - begin) * (place - step)[..., None]
+    along = _unit(_unit(end - begin) + 0.75 * rng.normal(size=(n, m, 3)) - [0, 0, species.hang])
+    reach = np.linalg.norm(branches[:, -1] - branches[:, 0], axis=1)[:, None]
+    length = np.maximum(0.4, 0.45 * reach * (1.3 - at)) * rng.uniform(0.7, 1.2, (n, m))
+    return np.stack([foot, foot + along * length[..., None]], axis=2).reshape(-1, 2, 3)
+
+
+def _leaves(species: Species, twigs: Floats, rng: np.random.Generator) -> tuple[Floats, Ints]:
+    """Triangles around the twigs, each by itself."""
+    n, m = len(twigs), species.leaves
+    long, wide = species.leaf_m
+    along = twigs[:, 1:] - twigs[:, :1]
+    foot = twigs[:, :1] + along * rng.uniform(0.15, 1.05, (n, m, 1))
+    foot = foot + rng.normal(0, 0.4 * long, (n, m, 3))
+    ahead = _unit(_unit(along) + 0.8 * rng.normal(size=(n, m, 3)) - [0, 0, species.hang])
+    across = _unit(np.cross(ahead, rng.normal([0, 0, 0.8], 1, (n, m, 3))))
+    size = rng.uniform(0.75, 1.25, (n, m, 1))
+    tip, side = foot + ahead * long * size, across * wide / 2 * size
+    corners = np.stack([foot - side, foot + side, tip], axis=2).reshape(-1, 3)
+    return corners, np.arange(len(corners)).reshape(-1, 3)
+
+
+def _tubes(paths: Floats, radii: Floats, sides: int) -> tuple[Floats, Ints]:
+    """Open tubes along paths (n, k, 3) with radii (n, k)."""
+    n, k = radii.shape
+    along = _unit(np.gradient(paths, axis=1))
+    # The same axis for a whole tube, so that it is not twisted.
+    upright = np.abs(along[:, :1, 2:]) > 0.8
+    first = _unit(np.cross(along, np.where(upright, [1.0, 0, 0], [0, 0, 1.0])))
+    second = np.cross(along, first)
+    angle = 2 * np.pi * np.arange(sides)[:, None] / sides
+    round_ = np.cos(angle) * first[:, :, None] + np.sin(angle) * second[:, :, None]
+    points = paths[:, :, None] + radii[..., None, None] * round_
+    here = np.arange(n * k * sides).reshape(n, k, sides)
+    beside = np.roll(here, -1, axis=2)
+    corners = [
+        here[:, :-1],
+        beside[:, :-1],
+        beside[:, 1:],
+        here[:, :-1],
+        beside[:, 1:],
+        here[:, 1:],
+    ]
+    return points.reshape(-1, 3), np.stack(corners, axis=-1).reshape(-1, 3)
+
+
+def _unit(vectors: Floats) -> Floats:
+    return vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)

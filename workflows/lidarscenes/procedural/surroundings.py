@@ -1,0 +1,210 @@
+"""Whether a scene is a place to stand in, or an object to look at from outside."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from lidarsim.base.arrays import Bools, Floats
+from lidarsim.scene.scene import Scene
+from raybeam import RayCaster, available_backends
+
+from .floor import reaching
+
+RAYS = 1000  # from each position, and from outside
+HAND_M = 0.1  # surfaces nearer than this are in the way
+CLEAR_M = 0.5  # around a sensor in a place
+BLOCK_FACES = 1 << 18  # triangles whose areas are added up at a time
+
+# Shares of rays. Of those that look down from 1, 2 and 3 m above a patch of ground, 0.4 meet it if
+# it is 5 m wide.
+_GROUND, _SKY, _ENCLOSED, _CLOSED, _UPRIGHT, _FLOOR = 0.4, 0.3, 0.95, 0.8, 0.9, 0.3
+# Openness, from which a surface is not closed; and that of leaves at most.
+_OPEN, _LEAVES = 0.1, 0.4
+# A closed body whose inside has a floor and upright walls is a room of these sizes.
+_WIDE_M, _HIGH_M = 2.0, 15.0
+# The room of a scene spans this share of the scene along each axis; smaller bodies are in it.
+_SPANS = 1 / 3
+# Directions by their z: up to 10 degrees above the horizon, within 60 degrees of straight up, and
+# within 30 degrees of straight down. Shares of such rays that meet what covers a position.
+_RAISED, _UPWARD, _DOWNWARD, _COVERED, _WIDELY_COVERED = 0.17, 0.5, -0.87, 0.9, 0.95
+# A body is around a position; a flat surface, however near, takes half of the directions.
+_AROUND = 0.6
+
+
+def in_the_way(scene: Scene, positions: ArrayLike) -> bool:
+    """Whether there is a surface within `CLEAR_M` of one of some local positions (k, 3)."""
+    at = np.asarray(positions, np.float64).reshape(-1, 3)
+    near = reaching(scene, at.min(axis=0) - CLEAR_M, at.max(axis=0) + CLEAR_M)
+    if not len(near):
+        return False
+    caster = RayCaster(scene.vertices, scene.faces[near], "numpy")
+    around = np.tile(directions_around(RAYS), (len(at), 1))
+    return bool(caster.cast(np.repeat(at, RAYS, axis=0), around, t_max=CLEAR_M).hit.any())
+
+
+@dataclass(frozen=True, eq=False)
+class Views:
+    """What rays in all directions meet from some positions."""
+
+    directions: Floats  # (n, 3), unit vectors
+    distance: Floats  # (n,), metres; infinite where there is nothing
+    back: Bools  # (n,), whether the back of a triangle was hit
+    normals: Floats  # (n, 3), unit normals of the triangles hit; 0 where there is nothing
+    heights: Floats  # (n,), local z of the hits
+
+    @property
+    def hit(self) -> Bools:
+        """Which rays meet a surface that is not within a hand's breadth: (n,)."""
+        return np.isfinite(self.distance) & (self.distance > HAND_M)
+
+    @property
+    def in_a_body(self) -> bool:
+        """Whether there are surfaces around, of which only backs are to see."""
+        around = np.mean(np.isfinite(self.distance)) > _AROUND
+        return bool(around and self.hit.any() and np.mean(self.back[self.hit]) > 1 - 1 / RAYS)
+
+
+class Surroundings:
+    """Casts a few thousand rays to see what is around a position in a scene without actors."""
+
+    def __init__(self, scene: Scene) -> None:
+        self._scene = scene
+        # Never CUDA, whose context would stay in this process.
+        backend = "numpy" if available_backends()["embree"] else "embree"
+        self._caster = RayCaster(scene.vertices, scene.faces, backend)
+
+    def views(self, positions: ArrayLike) -> Views:
+        """Look in all directions from local positions (k, 3)."""
+        at = np.asarray(positions, np.float64).reshape(-1, 3)
+        around = directions_around(RAYS)
+        return self.cast(np.repeat(at, RAYS, axis=0), np.tile(around, (len(at), 1)))
+
+    def outside(self) -> Views:
+        """Look at the scene from all around it."""
+        low, high = self._scene.bounds
+        across = float(np.linalg.norm(high - low))
+        towards = -directions_around(RAYS)
+        # Parallel rays would meet thin things seldom: aim at a grid of points in the box.
+        shares = np.stack([np.arange(RAYS) * step % 1.0 for step in (0.755, 0.57, 0.431)], axis=1)
+        return self.cast(low + shares * (high - low) - 2 * across * towards, towards)
+
+    def is_object(self, seen: Views) -> bool:
+        """Whether a scene is an object, judged by the views from where a sensor would stand in it.
+
+        It is one if almost nothing is seen from there, or if all sides of the scene look outward
+        and the positions are within it: not on ground, and not in a room with a floor.
+        """
+        down = seen.directions[:, 2] < 0
+        below, above = np.mean(seen.hit[down]), np.mean(seen.hit[~down])
+        if below < _GROUND and above < _GROUND:
+            return True
+        outside = self.outside()
+        back = np.mean(outside.back[outside.hit])
+        if back > 1 - _CLOSED:
+            # A terrain from below, or the walls of a room. Of leaves and surfels, half are seen
+            # from behind; ground of surfels is below the sensor only.
+            leaves = back < _CLOSED and _openness(self._scene) < _LEAVES and above >= _SKY
+            return bool(leaves and not _has_floor(seen))
+        if np.mean(np.isfinite(seen.distance)) < _ENCLOSED:
+            ground = np.mean((seen.hit & ~seen.back)[down]) >= _GROUND
+            # Of a machine with openings there is something above the sensor, too.
+            return not (ground and (above < _SKY or _has_floor(seen)))
+        return not self._is_room(seen)
+
+    def in_a_body(self, position: ArrayLike) -> bool:
+        """Whether a local position (3,) is inside a closed body, which is not the room of a scene.
+
+        A body that stands on the ground may lack a bottom.
+        """
+        views = self.views(position)
+        hit_points = views.distance[views.hit, None] * views.directions[views.hit]
+        sides = np.ptp(hit_points, axis=0) if len(hit_points) else np.zeros(3)
+        spans = bool((sides >= _SPANS * np.ptp(self._scene.bounds, axis=0)).all())
+        if views.in_a_body:
+            return not (spans and self._is_room(views))
+        raised = views.directions[:, 2] > _RAISED
+        closed = np.isfinite(views.distance[raised]).all() and views.hit[raised].any()
+        return bool(closed and not spans and np.mean(views.back[raised & views.hit]) > 1 - 1 / RAYS)
+
+    def is_covered(self, position: ArrayLike) -> bool:
+        """Whether a local position (3,) is under the scene: with nothing below, and ground above.
+
+        Of ground without a thickness the back is above. Under other things, such as a bridge, the
+        position is lower than the whole scene, and these things are above in almost all directions.
+        """
+        views = self.views(position)
+        up, met = views.directions[:, 2], np.isfinite(views.distance)
+        if met[up < _DOWNWARD].any():
+            return False
+        above = up > _UPWARD
+        backs = views.back[above & met]
+        if np.mean(met[above]) >= _COVERED and np.mean(backs) >= _COVERED:
+            return True
+        lower = np.asarray(position, np.float64).reshape(3)[2] < self._scene.bounds[0, 2]
+        return bool(lower and np.mean(met[up > _RAISED]) >= _WIDELY_COVERED)
+
+    def _is_room(self, seen: Views) -> bool:
+        """Whether what encloses some positions is a room, though all sides look outward."""
+        if not _has_floor(seen):
+            return False
+        if np.mean(seen.back) < 1 - _CLOSED:  # walls of some thickness
+            return True
+        upright = np.abs(seen.normals[:, 2]) < 0.01
+        sides = np.ptp(self._scene.bounds, axis=0)
+        fits = sides[:2].min() >= _WIDE_M and sides[2] <= _HIGH_M
+        return bool(fits and np.mean(_is_level(seen) | upright) >= _UPRIGHT)
+
+    def cast(self, origins: Floats, directions: Floats) -> Views:
+        """See what rays from local origins (n, 3) along unit directions (n, 3) meet."""
+        hits = self._caster.cast(origins, directions)
+        a, b, c = self._scene.vertices[self._scene.faces[hits.triangle]].transpose(1, 0, 2)
+        normals = np.cross(b - a, c - a)
+        normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-300)
+        normals[~hits.hit] = 0.0
+        heights = origins[:, 2] + np.where(hits.hit, hits.distance, 0.0) * directions[:, 2]
+        back = (normals * directions).sum(axis=1) > 0
+        return Views(directions, hits.distance, back, normals, heights)
+
+
+def _is_level(seen: Views) -> Bools:
+    return np.asarray(np.abs(seen.normals[:, 2]) > 0.99)
+
+
+def _has_floor(seen: Views) -> bool:
+    """Whether rays that go steeply down meet level surfaces of about one height."""
+    steep = (seen.directions[:, 2] < -0.7) & np.isfinite(seen.distance)
+    heights = seen.heights[steep & _is_level(seen)]
+    floor = np.sum(np.abs(heights - np.median(heights)) < 0.3) if len(heights) else 0
+    return int(floor) >= _FLOOR * int(np.sum(steep))
+
+
+def is_open(scene: Scene) -> bool:
+    """Whether a scene's surfaces are far from closed, as a terrain's; needs no rays."""
+    return _openness(scene) > _OPEN
+
+
+def _openness(scene: Scene) -> float:
+    """Length of the sum of all areas as vectors along the normals, over the area: 0 to 1.
+
+    Those of a closed surface add up to nothing.
+    """
+    total, area = np.zeros(3), 0.0
+    for begin in range(0, len(scene.faces), BLOCK_FACES):
+        a, b, c = scene.vertices[scene.faces[begin : begin + BLOCK_FACES]].transpose(1, 0, 2)
+        areas = np.cross(b - a, c - a)
+        total += areas.sum(axis=0)
+        area += float(np.linalg.norm(areas, axis=1).sum())
+    return float(np.linalg.norm(total)) / max(area, 1e-300)
+
+
+def directions_around(count: int) -> Floats:
+    """Make unit vectors (count, 3), evenly spread over a sphere: Fibonacci's spiral."""
+    numbers: Any = np.arange(count) + 0.5
+    z = 1 - 2 * numbers / count
+    turn = np.pi * (1 + np.sqrt(5)) * numbers
+    flat = np.sqrt(1 - z * z)
+    return np.stack([flat * np.cos(turn), flat * np.sin(turn), z], axis=1)

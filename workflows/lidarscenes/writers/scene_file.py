@@ -1,0 +1,95 @@
+"""Scenes as mesh files."""
+
+from __future__ import annotations
+
+import os
+from itertools import groupby
+from pathlib import Path
+
+import numpy as np
+import trimesh
+from trimesh.exchange.obj import export_obj
+from trimesh.exchange.ply import export_ply
+
+from lidarsim.base.errors import LidarError, explained
+from lidarsim.base.storage import Storage
+from lidarsim.scene.files.meshfile import OWN
+from lidarsim.scene.scene import Scene
+from lidarsim.scene.scene_instances import SceneInstance
+from lidarsim.scene.scene_mesh import stacked
+from lidarsim.scene.simplified import Drawn
+
+from .glb_file import glb_of
+
+SUFFIXES = (".ply", ".glb", ".obj")
+
+
+def write_scene(path: str | Path, scene: Scene) -> Path:
+    """Write a scene to a mesh file that `Scene.load` can read.
+
+    A .ply holds one object without a name; .glb and .obj keep objects and names. Masks and colours
+    are kept in .glb only: in the others, triangles are solid and grey. Where a triangle has both a
+    mask and a texture, its colour is the texture's mean. All store metres; .glb is Y-up, by its
+    standard, the others are Z-up. Coordinates are those of the world; .ply and .glb have single
+    precision, .glb from the scene's origin. A comment, or the generator of .glb, tells
+    `load_meshes` who wrote it. An existing file is replaced only by a complete one.
+
+    Raises
+    ------
+    LidarError
+        As for `check_target`, if the disk is full, or a .ply is too coarse for so far a scene.
+    """
+    path = Path(path)
+    check_target(path)
+    data = _encoded(path.suffix.lower(), scene)
+    with explained(f"{path} cannot be written"):
+        Storage.at(path.parent, durable=False).write(path.name, data)
+    return path
+
+
+def check_target(path: Path) -> None:
+    """Check that a scene can be written to a path, before it is made.
+
+    Raises
+    ------
+    LidarError
+        If the ending is not one of `SUFFIXES`, or the folder is missing or not writable.
+    """
+    if path.suffix.lower() not in SUFFIXES:
+        raise LidarError(
+            f"{path} has the ending {path.suffix or '(none)'}; "
+            f"scenes are written as {', '.join(SUFFIXES)}."
+        )
+    if not path.parent.is_dir():
+        raise LidarError(f"The folder {path.parent} does not exist: make it first.")
+    if path.is_dir() or not os.access(path.parent, os.W_OK):
+        raise LidarError(f"{path} cannot be written: choose another place.")
+
+
+def _encoded(suffix: str, scene: Scene) -> bytes:
+    """Content of a file of one of `SUFFIXES`."""
+    if scene.has_voxels.any():
+        name = scene.all_names[scene.has_voxels.argmax()]
+        raise LidarError(f"{name!r} is of voxels, which cannot be written: name its .vox file.")
+    if suffix == ".ply":
+        if scene.origin.any():
+            step = np.spacing(np.float32(np.abs(scene.origin).max()))
+            x, y, _ = scene.origin
+            raise LidarError(
+                f"A .ply would have coordinates in steps of {step:.2g} m around x {x:.0f}, "
+                f"y {y:.0f}, because they are in single precision: write a .glb or .obj."
+            )
+        drawn = Drawn.of(scene, scene.triangles).scene
+        whole = trimesh.Trimesh(drawn.vertices + drawn.origin, drawn.faces, process=False)
+        data = bytes(export_ply(whole, vertex_normal=False))
+        head, _, rest = data.partition(b"\ncomment ")
+        return head + f"\ncomment {OWN}\n".encode() + rest.partition(b"\n")[2]
+    if suffix == ".glb":
+        return glb_of(scene)
+    objects = trimesh.Scene()
+    for name, parts in groupby(scene.meshes(), lambda one: one.name):
+        flat = [one.flat() if isinstance(one, SceneInstance) else one for one in parts]
+        vertices, faces = stacked((mesh.vertices, mesh.faces) for mesh in flat)
+        objects.add_geometry(trimesh.Trimesh(vertices, faces, process=False), name, name)
+    text = export_obj(objects, include_normals=False, include_texture=False)
+    return f"# {OWN}\n{text}".encode()

@@ -1,0 +1,125 @@
+"""The layout of our point clouds as binary PLY: the header, and a row for each point."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..base.arrays import AnyArray, Records
+from ..base.errors import LidarError, explained
+from ..base.input_files import open_input
+from .table import Column
+
+AXES = ("x", "y", "z")
+
+_MAGIC = "ply\nformat binary_little_endian 1.0\n"
+_HEADER_LIMIT, _COMMENTS_LIMIT = 65_536, 1 << 25
+_PLY_TYPES = {
+    "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1",
+    "short": "<i2", "int16": "<i2", "ushort": "<u2", "uint16": "<u2",
+    "int": "<i4", "int32": "<i4", "uint": "<u4", "uint32": "<u4",
+    "float": "<f4", "float32": "<f4", "double": "<f8", "float64": "<f8",
+}  # fmt: skip
+
+
+# Types that Open3D writes; others become wider ones.
+_HELD = {"u1": "u1", "u2": "<u2", "i1": "<i4", "i2": "<i4", "i4": "<i4", "f4": "<f4", "f8": "<f8",
+         "u4": "<f8", "i8": "<f8", "u8": "<f8"}  # fmt: skip
+_NAMES = {"<f4": "float", "<f8": "double", "<i4": "int", "<u2": "uint16", "|u1": "uchar"}
+_EXACT = 2**53  # whole numbers up to here are exact in double precision
+
+
+def held_type(column: Column) -> np.dtype[Any]:
+    """Type of a column in a file."""
+    return np.dtype(_HELD.get(np.dtype(column.dtype).str[1:], "<f8"))
+
+
+def as_held(column: Column, values: AnyArray) -> AnyArray:
+    """Values of a column in its type in a file; LidarError if one would not be exact."""
+    wanted = held_type(column)
+    if wanted == np.float64 and values.dtype.kind in "iu" and len(values):
+        largest = max(abs(int(values.min())), abs(int(values.max())))
+        if largest > _EXACT:
+            raise LidarError(
+                f"Column {column.name!r} holds {largest}, and a PLY file holds whole numbers up to "
+                f"{_EXACT} exactly: leave the column out."
+            )
+    return values.astype(wanted, copy=False)
+
+
+def row_type(real: np.dtype[np.floating], table: Sequence[Column]) -> np.dtype[np.void]:
+    """Row of a file whose positions are of type `real`, in the order of the table.
+
+    Of the size of a row that Open3D writes, in an order of its own: it keeps columns in a hash
+    table.
+    """
+    kind = "<f8" if real == np.float64 else "<f4"
+    return np.dtype([(axis, kind) for axis in AXES] + [(c.in_files, held_type(c)) for c in table])
+
+
+def header(row: np.dtype[np.void], count: int, comments: str = "") -> bytes:
+    """Header of a file of `count` points, in the words of Open3D; `comments` are whole lines."""
+    lines = [f"property {_NAMES[row[name].str]} {name}" for name in row.names or ()]
+    lines = ["comment Created by Open3D", f"{comments}element vertex {count}", *lines]
+    return (_MAGIC + "\n".join([*lines, "end_header\n"])).encode()
+
+
+def layout(path: Path) -> tuple[int, int, np.dtype[np.void]]:
+    """Find the start of the points of a PLY file, their number, and the type of a row.
+
+    Raises
+    ------
+    OSError
+        If the file cannot be read.
+    ValueError
+        If it is not a complete binary PLY file with our properties; the message is a clause.
+    """
+    with open_input(path) as file:
+        size = os.fstat(file.fileno()).st_size
+        data = file.read(_HEADER_LIMIT)
+        if b"end_header\n" not in data:  # names of many classes, perhaps
+            data += file.read(_COMMENTS_LIMIT)
+    head, found, _ = data.partition(b"end_header\n")
+    text = head.decode("ascii", errors="replace")
+    if not found or not text.startswith(_MAGIC):
+        raise ValueError("it has no header of a binary little-endian PLY file")
+    count, dtype = _parse_header(text)
+    start = len(head) + len(found)
+    announced = start + count * dtype.itemsize
+    if size != announced:
+        raise ValueError(f"{count:,} points in {announced:,} bytes announced, {size:,} bytes there")
+    return start, count, dtype
+
+
+def mapped_rows(path: Path) -> Records:
+    """Return the points of a PLY file, a row each, which stay on the disk until they are used.
+
+    LidarError if the file cannot be read, or is not a complete binary PLY file with our
+    properties.
+    """
+    try:
+        with explained(f"{path} cannot be read"):
+            start, count, dtype = layout(path)
+            # An empty file cannot be mapped.
+            return np.memmap(path, dtype, "r", start, (count,)) if count else np.empty(0, dtype)
+    except ValueError as error:
+        raise LidarError(f"{path} is not a point cloud of lidarpool: {error}.") from error
+
+
+def _parse_header(text: str) -> tuple[int, np.dtype[np.void]]:
+    """Take number and type of the rows from a header; ValueError if they are not ours."""
+    elements = [line.split() for line in text.splitlines() if line.startswith("element")]
+    properties = [line.split() for line in text.splitlines() if line.startswith("property")]
+    if len(elements) != 1 or elements[0][1] != "vertex" or not elements[0][-1].isdigit():
+        raise ValueError("it holds more than points, or no points")
+    if any(len(entry) != 3 or entry[1] not in _PLY_TYPES for entry in properties):
+        raise ValueError("it has list properties or unknown types")
+    dtype = np.dtype([(name, _PLY_TYPES[kind]) for _, kind, name in properties])
+    missing = {*AXES} - set(dtype.names or ())
+    if missing:
+        raise ValueError(f"it lacks {', '.join(sorted(missing))}")
+    return int(elements[0][-1]), dtype

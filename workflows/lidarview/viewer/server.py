@@ -1,0 +1,334 @@
+"""Serves a page to browsers of this machine: files, and answers to what the page asks for.
+
+The page asks with GET and gives orders with POST. Its address holds a random token; other addresses
+are answered with 404, so that only who knows the token sees the page or orders anything: no other
+user of the machine, and no website. All addresses within the page are relative, so that it also
+works behind a proxy.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import logging
+import os
+import secrets
+import socket
+import sys
+import threading
+import webbrowser
+from collections.abc import AsyncIterator, Callable, Iterator, Mapping
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import asynccontextmanager, contextmanager, suppress
+from dataclasses import dataclass, field
+from hmac import compare_digest
+from html import escape
+from importlib.resources import files
+from typing import Any
+
+import click
+from tornado.httpserver import HTTPServer
+from tornado.iostream import StreamClosedError
+from tornado.web import Application, HTTPError, RequestHandler, StaticFileHandler
+
+from lidarsim.base.arrays import AnyArray
+from lidarsim.base.notebook import cell_display
+
+from .point_selection import Abandoned
+
+HOST = "127.0.0.1"
+PORT = 8080  # or the next that is free
+VIEWER = "index.html"
+_PORTS_TRIED = 100
+
+_HUB = "JUPYTERHUB_SERVICE_PREFIX"  # in the environment of kernels of a hub: where its user's is
+
+SLOW_AT_ONCE = 2  # slow answers of a kind that are made or sent at a time
+SLOW_WAITING = 16  # slow questions of a kind that wait; further ones get status 503
+LARGE_POINTS = 1_000_000  # an answer of more points is large
+LONG_TEXT = 1_000  # letters: a question for points of longer lists is slow
+STALL_S = 20.0  # without a byte that the browser reads; then its connection is closed
+
+_ALIGNED = 8  # bytes, that arrays begin at multiples of
+_PIECE = 1 << 20  # bytes that are written at a time
+
+_LOGGER = logging.getLogger(__name__)
+
+Arguments = Mapping[str, str]
+Answer = tuple[dict[str, Any], dict[str, AnyArray]]  # what is written as JSON, and arrays
+
+
+# Answers a question with its arguments: KeyError or ValueError if there is no such question or an
+# argument is wrong; Abandoned if the function it is given says that nobody waits any more.
+Source = Callable[[str, Arguments, Callable[[], bool]], Answer]
+
+
+def bundle(header: dict[str, Any], arrays: Mapping[str, AnyArray]) -> list[bytes]:
+    """Write JSON and arrays as one message.
+
+    It begins with the length of the JSON text, uint32, which lists the arrays: name, type, shape,
+    and first byte after the text. All numbers are little-endian.
+    """
+    listed: list[Any] = []
+    pieces: list[bytes] = []
+    at = 0
+    for name, values in arrays.items():
+        little = values.astype(values.dtype.newbyteorder("<"), order="C", copy=False)
+        listed.append([name, little.dtype.name, list(little.shape), at])
+        room = -little.nbytes % _ALIGNED
+        pieces += [little.tobytes(), bytes(room)]
+        at += little.nbytes + room
+    text = json.dumps(header | {"arrays": listed}, allow_nan=False).encode()
+    text += b" " * (-(len(text) + 4) % _ALIGNED)
+    return [len(text).to_bytes(4, "little"), text, *pieces]
+
+
+def is_large(what: str, asked: Arguments) -> bool:
+    """Whether an answer may have millions of points: then it holds memory until it is read.
+
+    ValueError if the number of points is no number.
+    """
+    kind = what.rpartition("/")[2]
+    return kind == "export" or (kind == "points" and int(asked.get("most", 0)) > LARGE_POINTS)
+
+
+def is_search(what: str, asked: Arguments) -> bool:
+    """Whether an answer may take seconds because all points are searched."""
+    long_lists = len(asked.get("scans", "")) > LONG_TEXT
+    return what.rpartition("/")[2] == "points" and (bool(asked.get("filter")) or long_lists)
+
+
+class SlowQuestions:
+    """Answers few slow questions of a kind at a time, in threads of their own.
+
+    An answer has its turn until the browser has read it, so that few large ones are in memory.
+    Large answers and searches are two kinds: large ones that nobody reads delay no search.
+    """
+
+    def __init__(self) -> None:
+        self.threads = ThreadPoolExecutor(SLOW_AT_ONCE, "lidarpool-page-slow")
+        self._free = asyncio.Semaphore(SLOW_AT_ONCE)
+        self._waiting = 0
+
+    @asynccontextmanager
+    async def turn(self) -> AsyncIterator[None]:
+        """Wait for a turn, which lasts as long as the body; HTTPError if too many wait."""
+        if self._waiting >= SLOW_WAITING:
+            raise HTTPError(503, "too many slow questions wait")
+        self._waiting += 1
+        try:
+            await self._free.acquire()
+        finally:
+            self._waiting -= 1
+        try:
+            yield
+        finally:
+            self._free.release()
+
+
+class _Guarded(RequestHandler):
+    """Answers who knows the page's token."""
+
+    def set_default_headers(self) -> None:
+        self.clear_header("Server")
+        self.set_header("Cache-Control", "no-store")
+        self.set_header("Referrer-Policy", "no-referrer")  # the address holds the token
+        # The page of a campaign frames those of its jobs. The cell of a notebook, whose address is
+        # unknown here, frames any of them.
+        if not self.settings["in_notebook"]:
+            self.set_header("Content-Security-Policy", "frame-ancestors 'self'")
+
+    def prepare(self) -> None:
+        """Answer 404 without the token, and lead there from an address that is good once."""
+        page: PageServer = self.settings["page"]
+        token = self.request.path.split("/")[1]
+        if token in page.good_once:
+            page.good_once.remove(token)
+            self.redirect(page.url)
+        elif not compare_digest(page.token.encode(), token.encode()):
+            raise HTTPError(404)
+
+    def log_exception(self, *error: Any) -> None:
+        """Log what is our fault only."""
+        if not isinstance(error[1], HTTPError):
+            _LOGGER.error("the page's question was not answered", exc_info=error)
+
+
+class _File(_Guarded, StaticFileHandler):
+    """Sends a file that the page consists of."""
+
+
+class _Question(_Guarded):
+    """Answers one question. `source` may take long: it is asked in a thread of its own.
+
+    Slow questions of a kind wait for one another, others are answered meanwhile.
+    """
+
+    def initialize(self, source: Source, stop: Callable[[], None] | None) -> None:
+        self._source, self._stop = source, stop
+        self._gone = threading.Event()
+
+    async def get(self, what: str) -> None:
+        asked = {name: self.get_query_argument(name) for name in self.request.query_arguments}
+        try:
+            slow: SlowQuestions | None = None
+            if is_large(what, asked):
+                slow = self.settings["large"]
+            elif is_search(what, asked):
+                slow = self.settings["searches"]
+            if slow is not None:
+                async with slow.turn():
+                    await self._answer(slow.threads, what, asked)
+            else:
+                await self._answer(None, what, asked)
+        except (KeyError, ValueError) as error:
+            raise HTTPError(404, "%s", repr(error)) from error
+        except (Abandoned, StreamClosedError):
+            return
+
+    async def _answer(
+        self, threads: ThreadPoolExecutor | None, what: str, asked: Arguments
+    ) -> None:
+        """Make an answer in a thread and send it; Abandoned if the browser has left."""
+        if self._gone.is_set():
+            raise Abandoned
+
+        def pieces() -> list[bytes]:
+            return bundle(*self._source(what, asked, self._gone.is_set))
+
+        answer = await asyncio.get_running_loop().run_in_executor(threads, pieces)
+        self.set_header("Content-Type", "application/octet-stream")
+        for piece in answer:
+            for at in range(0, len(piece), _PIECE):
+                self.write(piece[at : at + _PIECE])
+                try:
+                    await asyncio.wait_for(self.flush(), STALL_S)
+                except TimeoutError as error:
+                    self.detach().close()
+                    raise Abandoned from error
+
+    def post(self, what: str) -> None:
+        if what != "stop" or self._stop is None:
+            raise HTTPError(404)
+        self._stop()
+
+    def on_connection_close(self) -> None:
+        self._gone.set()
+
+
+@dataclass(frozen=True)
+class PageServer:
+    """A page that is served on 127.0.0.1."""
+
+    port: int
+    token: str = field(default_factory=secrets.token_urlsafe, repr=False)
+    good_once: list[str] = field(default_factory=list, repr=False)  # tokens of single use
+
+    @property
+    def url(self) -> str:
+        """Its address, which ends with "/"."""
+        return f"http://{HOST}:{self.port}/{self.token}/"
+
+    def once(self) -> str:
+        """Return an address that leads to the page once.
+
+        Other users of the machine see what a browser is started with.
+        """
+        self.good_once.append(secrets.token_urlsafe())
+        return f"http://{HOST}:{self.port}/{self.good_once[-1]}/"
+
+
+@contextmanager
+def page_server(
+    source: Source, port: int = PORT, stop: Callable[[], None] | None = None, *, index: str = VIEWER
+) -> Iterator[PageServer]:
+    """Serve a page while the body runs, in a thread of its own, on a port or the next free one.
+
+    A `port` of 0 is for any; `stop` is called when a user of the page orders to stop. `index` is
+    the page's file; the viewer of a job is at ``job/NUMBER/``, and asks what begins with that.
+    """
+    bound = _bound(port)
+    folder = str(files(__package__) / "page")
+    page, viewer = ({"path": folder, "default_filename": name} for name in (index, VIEWER))
+    bound.setblocking(False)
+    made = PageServer(bound.getsockname()[1])
+    running: Future[asyncio.AbstractEventLoop] = Future()
+    ended = asyncio.Event()
+
+    async def serve() -> None:
+        handlers: list[Any] = [
+            (r"/[^/]+/(|\w[\w.]*\.(?:css|js))", _File, page),
+            (r"/[^/]+/job/\d+/(|\w[\w.]*\.(?:css|js))", _File, viewer),
+            (r"/[^/]+/(.*)", _Question, {"source": source, "stop": stop}),
+        ]
+        application = Application(handlers, log_function=lambda _: None)
+        application.settings |= {
+            "large": SlowQuestions(),
+            "searches": SlowQuestions(),
+            "page": made,
+            "in_notebook": cell_display() is not None,
+        }
+        server = HTTPServer(application)
+        server.add_socket(bound)
+        loop = asyncio.get_running_loop()
+        loop.set_default_executor(ThreadPoolExecutor(2, "lidarpool-page"))
+        running.set_result(loop)
+        await ended.wait()
+        server.stop()
+        await server.close_all_connections()
+
+    thread = threading.Thread(target=lambda: asyncio.run(serve()), name="page", daemon=True)
+    thread.start()
+    loop = running.result()
+    try:
+        yield made
+    finally:
+        loop.call_soon_threadsafe(ended.set)
+        thread.join()
+
+
+def _bound(port: int) -> socket.socket:
+    for tried in range(port, min(port + _PORTS_TRIED, 65_536)) if port else ():
+        with suppress(OSError):
+            return socket.create_server((HOST, tried), backlog=128)
+    return socket.create_server((HOST, 0), backlog=128)
+
+
+@contextmanager
+def announced(
+    page: PageServer, words: str, browser: bool, *, on_stdout: bool = False
+) -> Iterator[None]:
+    """Print a page's address while the body runs, or show the page in the cell of a notebook.
+
+    The address is on stderr, beside the progress of a run, or `on_stdout` where it is the result.
+    `browser`: open one where there is a desktop, and no notebook.
+    """
+    display = cell_display()
+    if display is None:
+        click.echo(words, err=not on_stdout)
+        if browser:
+            open_browser(page.once())
+        yield
+        return
+    url, words = page.url, escape(words)
+    if hub := os.environ.get(_HUB):  # in a frame, 127.0.0.1 would be the reader's own machine
+        url = f"{hub.rstrip('/')}/proxy/{page.port}/{page.token}/"
+        words += (
+            " It is shown through jupyter-server-proxy; without that, connect with ssh -L "
+            f"{page.port}:{HOST}:{page.port} and the machine's name, and open the address."
+        )
+    link = f'<a href="{url}" target="_blank">{words}</a>'
+    below = f'<iframe src="{url}" style="width:100%;height:640px;border:0"></iframe>'
+    shown = display.display(display.HTML(f"{link}<br>{below}"), display_id=True)
+    try:
+        yield
+    finally:
+        shown.update(display.HTML(""))
+
+
+def open_browser(url: str) -> None:
+    """Open a page if there is a desktop to open it on."""
+    desktop = "DISPLAY" in os.environ or "WAYLAND_DISPLAY" in os.environ
+    if "SSH_CONNECTION" in os.environ or (sys.platform.startswith("linux") and not desktop):
+        return  # else a browser in the terminal would take it over
+    webbrowser.open(url)

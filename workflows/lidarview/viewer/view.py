@@ -1,0 +1,695 @@
+"""What a page shows of a survey: its answers to the page's questions; the command `view`."""
+
+from __future__ import annotations
+
+import math
+import shutil
+import threading
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from threading import Event
+from typing import Any
+
+import click
+import numpy as np
+
+from lidarpool.export.formats import Format, save_cloud
+from lidarpool.run.store.database import FILE
+from lidarpool.run.store.run_store import RUN_FOLDER
+from lidarsim.base.arrays import AnyArray, Bytes, Floats, Floats32, Ints
+from lidarsim.base.errors import LidarError
+from lidarsim.base.notebook import cell_display
+from lidarsim.base.words import plural
+from lidarsim.columns.cloud import Cloud
+from lidarsim.columns.cloud_file import CloudFile
+from lidarsim.columns.ply_format import AXES
+from lidarsim.columns.table import AXES as POSITION
+from lidarsim.columns.table import CAUSES, NO_SURFACE, OBJECT, TABLE, Column, X, Y, Z, by_value
+from lidarsim.scene.actors import Actor, samples_each, shapes_of
+from lidarsim.scene.colours import as_bytes
+from lidarsim.scene.scene import Scene
+from lidarsim.scene.simplified import simplified
+from lidarsim.sensor.trajectory import presence_ns
+from lidarsim.sweeps.sweeps import SWEEPS_FILE, Sweeps
+from raybeam import RayCaster
+
+from ..picture_file import PICTURE_FILE, PLACES_MOST, PictureContent, SensorWay, ways_of
+from ..render.closeup import around_ways, floor_and_cut
+from ..render.colouring import (
+    MOST_ENTRIES,
+    TURBO,
+    Colouring,
+    colours_of,
+    values_of,
+    with_rgb,
+    word_of,
+)
+from ..render.hit_density import HITS_TITLE, hit_colours
+from ..render.surface import apart
+from ..render.theme import mapped, object_colours
+from .point_selection import (
+    RESULT,
+    Eye,
+    Filter,
+    HeldPoints,
+    JoinedPoints,
+    PointFinder,
+    Points,
+    ScanRanges,
+    corners_of,
+    positions,
+    read_scans,
+)
+from .server import PORT, Answer, Arguments, PageServer, announced, page_server
+
+MOST_POINTS = 20_000_000  # in an answer, and in a download
+EXPORTS = ("ply", "las", "parquet")  # formats of a download
+MOST_RAYS = 150  # more rays would hide the surfaces
+_SAMPLE = 100_000  # points that colour scales and limits are taken from
+_MOST_COLOURINGS = 64  # colour scales that are kept, of columns and filters
+_HITS_SAMPLE = 500_000  # points that tell where on large triangles the hits are
+_MOST_NAMES = 2000  # in a menu
+_IMAGE_WIDTH, _IMAGE_ROWS = 1024, 128  # most columns; rows of sensors with few or many channels
+_NO_GAPS = 0.9  # columns of a range image, as a share of a sensor's steps of azimuth
+_FEW, _MANY = 4, 512
+_DOWNWARDS = -0.7  # sine of the elevation
+_NARROW = math.radians(300)  # a sensor that sees less is no spinning one
+_NS = 1e9
+IN_SENSOR_AXES = "Points are in the axes of their sensor, where the scene does not fit."
+MOST_TRIANGLES = 300_000  # 50 bytes each, whenever their colours have changed
+MOST_PIECES = 60_000  # that large ones are divided into, where hits are shown
+_INWARDS = 1e-4  # of the scene's diagonal
+_MOST_INWARDS_OF = 200.0  # metres: some centimetres are enough for any scene
+MOST_LABELS = 1000  # in a legend
+Legend = dict[str, Any]  # what the page is told of it
+CLOUD = "cloud.ply"
+
+
+@dataclass(eq=False)
+class View:
+    """A survey on a page, or a cloud alone.
+
+    The scene is left out of a result whose points are in the axes of their sensors.
+    """
+
+    points: Points
+    pictured: PictureContent | None = None
+    sweeps: Sweeps | None = None
+    note: str = ""  # a remark on what is shown
+    title: str = "lidarpool"
+    results: Sequence[str] = ()  # names, if the points are of several results
+    # Returns those of each triangle, those of actors after the others; by default as pictured.
+    hits: Callable[[], AnyArray] | None = None
+    triangles: int = MOST_TRIANGLES  # of the scene, that are shown
+
+    def __post_init__(self) -> None:
+        self.version = 0  # of the points
+        self.rays: Floats32 = np.zeros((0, 2, 3), np.float32)
+        self.path: Floats | None = None
+        known = (one.coordinates for one in (self.pictured, self.sweeps) if one is not None)
+        if any(coordinates != "world" for coordinates in known):
+            self.note = self.note or IN_SENSOR_AXES
+        if self.sweeps is not None and self.sweeps.coordinates != "world":
+            self.pictured = None
+        if (pictured := self.pictured) is not None:
+            self.rays = pictured.sample_rays
+            self.path = None if pictured.plan is None else pictured.plan.path
+        self.origin, self._bounds, self._held = self._around()
+        rest = {column.name: column for column in self.points.table if column not in POSITION}
+        self.columns = {"z": Z, "x": X, "y": Y, **rest}  # to colour and filter by
+        self._coloured = with_rgb(self.columns)
+        self._lock = threading.Lock()
+        self._surface: ShownSurface | None = None
+        self._range_limits: dict[int, tuple[float, float]] = {}  # {sensor: ends of the scale}
+        self.show(self.points)
+
+    def show(self, points: Points) -> None:
+        """Show other points."""
+        self.points = points
+        self._finder = PointFinder(points, self.origin)
+        self._colourings: dict[tuple[str, Filter], Colouring] = {}
+        self.version += 1
+
+    # -- what is known of the survey -----------------------------------------------------
+
+    @cached_property
+    def sensors(self) -> Sequence[SensorWay]:
+        """Positions of the sensors: exact, or those at the beginnings of their sweeps."""
+        if self.pictured is not None:
+            return self.pictured.sensors
+        sweeps, ways = self.sweeps, []
+        if sweeps is None:
+            return ()
+        for number, name in enumerate(sweeps.sensors):
+            own = sweeps.sensor == number
+            places = sweeps.pose.positions[own] - self.origin
+            if sweeps.coordinates != "world":  # each point is in the axes of its sensor
+                places = np.zeros_like(places)
+            moves = len(np.unique(places, axis=0)) > len(places) / 2 > 1
+            ways.append(SensorWay(sweeps.begins_ns[own], places, moves, name))
+        return ways
+
+    @property
+    def actors(self) -> Sequence[Actor]:
+        """What moves through the scene."""
+        return () if self.pictured is None else self.pictured.scene.actors
+
+    @property
+    def duration_ns(self) -> float:
+        """How long the survey takes, by its own clock; 0 if that is unknown."""
+        if self.pictured is not None and self.pictured.duration_ns:
+            return self.pictured.duration_ns
+        if self.sweeps is None or not len(self.sweeps):
+            return 0.0
+        begins = np.unique(self.sweeps.begins_ns)
+        return float(begins[-1] + (np.diff(begins).min() if len(begins) > 1 else 0))
+
+    def _names(self, column: str) -> Sequence[str]:
+        """Names of the values 0, 1, 2, … of a column, if any."""
+        if column == RESULT.name and self.results:
+            return self.results
+        if self.pictured is not None and column in self.columns:
+            return self.pictured.names_of(self.columns[column])
+        if (known := self.sweeps) is not None:
+            names: dict[str, Sequence[str]] = {
+                "sensor": known.sensors,
+                "object": (*known.objects, *known.actors),
+                "class": by_value(known.classes),
+                "material": known.materials,
+            }
+            if column in names:
+                return names[column]
+        return CAUSES if self.columns.get(column) == TABLE["cause"] else ()
+
+    def _around(self) -> tuple[Floats, Floats, Floats]:
+        """Local origin, box of all that is shown, and what a picture of all has to hold, (k, 3).
+
+        That is corners of the scene, sensors, and both ends of the planning. The box of these is
+        larger: around an object it would be mostly empty.
+        """
+        if self.pictured is None:
+            origin, box = _of_points(self.points)
+            return origin, box, corners_of(box)
+        scene, planning = self.pictured.scene, self.pictured.planning
+        ways = [way.positions for way in self.pictured.sensors]
+        held = np.concatenate([corners_of(scene.bounds), *ways])
+        if planning is not None:
+            level = held[:, 2].min()
+            held = np.vstack([held, [*planning.start, level], [*planning.target, level]])
+        return scene.origin, np.stack([held.min(axis=0), held.max(axis=0)]), held
+
+    # -- answers -------------------------------------------------------------------------
+
+    def answer(self, what: str, asked: Arguments, abandoned: Callable[[], bool]) -> Answer:
+        """Answer a question of the page."""
+        answers: Mapping[str, Callable[[Arguments, Callable[[], bool]], Answer]] = {
+            "state": lambda *_: self._state(),
+            "points": self._points,
+            "point": lambda asked, _: self._point(int(asked["row"])),
+            "column": lambda asked, _: self._column(asked["name"]),
+            "surface": lambda asked, _: self._scene(asked["colour"]),
+            "range": lambda asked, _: self._range(int(asked["sweep"])),
+            "export": self._export,
+        }
+        return answers[what](asked, abandoned)
+
+    def _state(self) -> Answer:
+        """Tell all but points and surfaces."""
+        near = around_ways(self._bounds, ways_of(self.sensors, self.actors, self.duration_ns))
+        box = self._bounds if near is None else near
+        corners = self._held if near is None else corners_of(near)
+        arrays: dict[str, AnyArray] = {"rays": self.rays_shown, "corners": corners}
+        for number, way in enumerate(self.sensors):
+            arrays[f"sensor{number}_times"] = way.times_ns / _NS
+            arrays[f"sensor{number}_places"] = way.positions
+        arrays |= self._actor_arrays()
+        if self.sweeps is not None:
+            arrays["sweep_scans"] = self.sweeps.scans.astype(np.float64)
+            arrays["sweep_begins"] = self.sweeps.begins_ns / _NS
+            arrays["sweep_sensor"] = self.sweeps.sensor
+        pictured, objects = self.pictured, len(self._names("object"))
+        statics = objects - len(self.actors)
+        classes, several = self._classes_of_objects(), np.arange(len(self.results))
+        header = {
+            "title": self.title,
+            "version": self.version,
+            "points": len(self.points),
+            "columns": [
+                {"name": name, "unit": "s" if column.unit == "ns" else column.unit,
+                 "meaning": column.meaning} for name, column in self.columns.items()
+            ],
+            "colours": [*self._coloured],
+            "origin": self.origin.tolist(),
+            "box": box.tolist(),
+            "bounds": self._bounds.tolist(),
+            "cut": None if near is None else float(near[1, 2]),
+            "scene": pictured and colours_for(pictured.scene, pictured.reflectance),
+            "sensors": [
+                {"name": way.name, "model": way.model, "moves": way.moves} for way in self.sensors
+            ],
+            "actors": [
+                {"name": actor.name, "class": classes.get(number)}
+                for number, actor in enumerate(self.actors, statics)
+            ],
+            "classes": {str(k): name for k, name in enumerate(self._names("class")) if name},
+            "results": legend_of(colours_of(several, RESULT, self.results))["labels"],
+            "exports": () if isinstance(self.points, HeldPoints) else downloads(),
+            "actor_colours": as_bytes(object_colours(objects))[statics:].tolist(),
+            "statics": statics,
+            "duration": self.duration_ns / _NS,
+            "path": self.planned,
+            "note": self.note,
+        }  # fmt: skip
+        return header, arrays
+
+    def _actor_arrays(self) -> dict[str, AnyArray]:
+        """Meshes, with their poses if they deform, and where and in which pose each actor is."""
+        meshes, shapes = shapes_of(self.actors)
+        arrays: dict[str, AnyArray] = {"actor_mesh": shapes.astype(np.int32)}  # no int64 in pages
+        for k, mesh in enumerate(meshes):
+            arrays[f"mesh{k}_corners"] = mesh.vertices[mesh.faces].astype(np.float32)
+            if mesh.colours is not None:  # at the corners
+                arrays[f"mesh{k}_colours"] = mesh.colours.means().repeat(3, axis=0)
+            if mesh.animation is not None:
+                arrays[f"mesh{k}_poses"] = mesh.animation.vertices.astype(np.float32)
+                arrays[f"mesh{k}_faces"] = mesh.faces.astype(np.int32)
+        each = samples_each(self.actors, PLACES_MOST)
+        for k, actor in enumerate(self.actors):
+            times, places, turns = actor.samples(self.duration_ns, each)
+            arrays |= {f"actor{k}_times": times / _NS, f"actor{k}_places": places}
+            arrays[f"actor{k}_turns"] = turns
+            arrays[f"actor{k}_there"] = np.array(presence_ns(actor.trajectory)) / _NS
+            if (own := actor.mesh.animation) is not None:  # after the last pose, pages begin again
+                frames, last = actor.seconds(times)[0] / own.step_s, len(own.vertices) - 1 - 1e-6
+                arrays[f"actor{k}_frames"] = frames if own.repeat else frames.clip(0, last)
+        return arrays
+
+    @property
+    def rays_shown(self) -> Floats32:
+        """Not too many rays, (n, 2, 3)."""
+        return self.rays[:: len(self.rays) // MOST_RAYS + 1]
+
+    @property
+    def planned(self) -> dict[str, Any] | None:
+        """The planned path and its obstacles, if there is one."""
+        planning = None if self.pictured is None else self.pictured.planning
+        if self.path is None or planning is None:
+            return None
+        discs = np.column_stack([planning.centres, planning.radii])
+        return {"corners": self.path.tolist(), "discs": discs.tolist()}
+
+    def _classes_of_objects(self) -> dict[int, int]:
+        """{object: class} of some points."""
+        if not {"object", "class"} <= self.columns.keys():
+            return {}
+        rows, _ = self._finder.find(_SAMPLE)
+        columns = (self.points.values(name, rows).tolist() for name in ("object", "class"))
+        return dict(zip(*columns, strict=True))
+
+    def _export(self, asked: Arguments, abandoned: Callable[[], bool]) -> Answer:
+        """Write the points for a filter and ranges of scans to a file; of many files, a ZIP."""
+        points, sweeps, kind = self.points, self.sweeps, EXPORTS.index(asked["format"])
+        rows, count = self._finder.find(MOST_POINTS, *self._wanted(asked), None, abandoned)
+        if count > MOST_POINTS:
+            words = f"{count:,} points are more than {MOST_POINTS:,}: filter or clip them, or use"
+            return {"error": f"{words} lidarpool export for all."}, {}
+        columns = {column.name: points.values(column.name, rows) for column in points.table}
+        places = np.stack([points.values(axis, rows) for axis in AXES], axis=1)
+        own = tuple(column for column in points.table if column.name not in TABLE)
+        cloud = Cloud(places, columns, own, None if sweeps is None else lambda: sweeps)
+        with TemporaryDirectory(prefix="lidarpool-") as folder:
+            name = f"cloud.{EXPORTS[kind]}"
+            made = Path(folder) / name
+            try:
+                save_cloud(cloud, made)
+            except LidarError as error:
+                return {"error": str(error)}, {}
+            if made.is_dir():
+                file, *more = made.iterdir()
+                made = Path(shutil.make_archive(str(made), "zip", made)) if more else file
+                name = made.name if more else name
+            return {"name": name}, {"file": np.fromfile(made, np.uint8)}
+
+    def _wanted(self, asked: Arguments) -> tuple[Filter, ScanRanges | None]:
+        """Read the filter and the ranges of scans, ``first-last,first-last``, of a question."""
+        wanted = Filter.read(asked.get("filter", ""), list(self.columns))
+        return wanted, read_scans(asked["scans"]) if "scans" in asked else None
+
+    def _points(self, asked: Arguments, abandoned: Callable[[], bool]) -> Answer:
+        """Points for a filter, ranges of scans and a camera, and their colours."""
+        finder, version = self._finder, self.version
+        wanted, scans = self._wanted(asked)
+        name = asked["colour"]
+        column = self._coloured[name]
+        eye = Eye.read(asked["eye"]) if "eye" in asked else None
+        most = max(1, min(int(asked["most"]), MOST_POINTS))
+        rows, count = finder.find(most, wanted, scans, eye, abandoned)
+        colouring = self._colouring(finder, name, wanted, abandoned)
+        values = values_of(column, lambda one: finder.points.values(one, rows))
+        colours = np.full((len(rows), 4), 255, np.uint8)
+        colours[:, :3] = as_bytes(colouring.paint(values))
+        legend: Legend = legend_of(colouring) | {"column": name, "meaning": column.meaning}
+        arrays: dict[str, AnyArray] = {
+            "positions": (positions(finder.points, rows) - self.origin).astype(np.float32),
+            "colours": colours,
+            "rows": rows.astype(np.uint32),
+        }
+        shown = legend if len(finder.points) else None
+        return {"version": version, "count": count, "legend": shown}, arrays
+
+    def _colouring(
+        self, finder: PointFinder, name: str, wanted: Filter, abandoned: Callable[[], bool]
+    ) -> Colouring:
+        """Colour scale for all points that a filter keeps, whatever scans are shown."""
+        known = self._colourings
+        colouring = known.get((name, wanted))
+        if colouring is None:
+            rows, _ = finder.find(_SAMPLE, wanted, None, None, abandoned)
+            column = self._coloured[name]
+            values = values_of(column, lambda one: finder.points.values(one, rows))
+            colouring = colours_of(values, column, self._names(name))
+            with self._lock:
+                while len(known) >= _MOST_COLOURINGS:
+                    del known[next(iter(known))]  # the oldest
+                known[name, wanted] = colouring
+        return colouring
+
+    def _column(self, name: str) -> Answer:
+        """Tell what a column can be filtered by: its limits, or its labels."""
+        column = self.columns[name]
+        values = self._finder.points.values(name, self._finder.find(_SAMPLE)[0])
+        values = values[np.isfinite(values)]
+        names, found = self._names(name), np.unique(values)
+        few = len(found) <= (_MOST_NAMES if names else MOST_ENTRIES) and name != "scan"
+        if column.kind == "label" and len(found) and few:
+            labels = [
+                [word_of(value, column, names), value] for value in found.astype(np.int64).tolist()
+            ]
+            return {"labels": labels}, {}
+        unit = _NS if column.unit == "ns" else 1.0
+        low, high = (float(found[0]), float(found[-1])) if len(found) else (0.0, 1.0)
+        whole = values.dtype.kind in "iu" and unit == 1.0
+        return {"low": low / unit, "high": high / unit, "unit": unit, "whole": whole}, {}
+
+    def _point(self, row: int) -> Answer:
+        """Tell the position of a point, world coordinates, and all its columns in words."""
+        points = self.points
+        if not 0 <= row < len(points):
+            raise KeyError(row)
+        one = np.array([row])
+        shown = [
+            [column.name, self._in_words(column, points.values(column.name, one)[0])]
+            for column in self.columns.values()
+            if column not in POSITION
+        ]
+        place = [float(points.values(axis, one)[0]) for axis in AXES]
+        return {"place": place, "columns": shown}, {}
+
+    def _in_words(self, column: Column, value: Any) -> str:
+        names = self._names(column.name)
+        if column == OBJECT and value < 0:
+            return NO_SURFACE
+        if column.kind == "label" and 0 <= value < len(names):
+            return names[int(value)] or str(value)
+        if column.unit == "ns":
+            return f"{int(value) / 1e9:.9f} s"
+        number = f"{value:.6g}" if np.issubdtype(type(value), np.floating) else f"{value}"
+        return f"{number} {column.unit}".rstrip()
+
+    def _scene(self, colour: str) -> Answer:
+        """Triangles of the scene in their colours; where its floor is, and where to cut it open."""
+        pictured = self.pictured
+        if pictured is None:
+            raise KeyError("surface")
+        with self._lock:  # one browser after the other: it may take long, once
+            surface = self._surface = self._surface or ShownSurface(
+                pictured.scene, pictured.reflectance, self.triangles
+            )
+        counts, places = pictured.hit_counts, np.zeros((0, 3), np.float32)
+        if colour == "hits":
+            counts = counts if self.hits is None else self.hits()
+            counts = counts[: len(pictured.scene.faces)]
+            rows, _ = self._finder.find(_HITS_SAMPLE)
+            if "object" in self.columns:  # some points on static objects, local
+                owners = self._finder.points.values("object", rows)
+                rows = rows[(owners >= 0) & (owners < len(pictured.scene.names))]
+            places = (positions(self._finder.points, rows) - self.origin).astype(np.float32)
+        arrays, legend = surface.coloured(colour, counts, places)
+        return {"legend": legend} | self._look_around, arrays
+
+    @cached_property
+    def _look_around(self) -> dict[str, float | None]:
+        """Height of the floor; and where to cut a building if the sensors stand in one."""
+        surface, pictured = self._surface, self.pictured
+        poses = [way.positions for way in self.sensors if len(way.positions)]
+        if surface is None or pictured is None or not poses:
+            return {"floor": None, "roof_cut": None}
+        scene = surface.coarse
+        caster = RayCaster(scene.vertices, scene.faces)
+        floor, cut = floor_and_cut(scene, caster, np.concatenate(poses))
+        return {"floor": floor, "roof_cut": cut}
+
+    def _range(self, sweep: int) -> Answer:
+        """Range image of a sweep: rows are channels from above, columns go from left to right."""
+        sweeps, finder = self.sweeps, self._finder
+        if sweeps is None or not 0 <= sweep < len(sweeps):
+            raise KeyError(sweep)
+        first, last = (int(scan) for scan in sweeps.scans[sweep : sweep + 2])
+        rows, _ = finder.find(MOST_POINTS, scans=((first, last - 1),))
+        image, limits = np.zeros((1, 1, 4), np.uint8), (0.0, 1.0)
+        number = int(sweeps.sensor[sweep])
+        if len(rows):
+            places = sweeps.in_sensor(sweep, positions(finder.points, rows))
+            channels = None
+            if "channel" in self.columns:
+                channels = finder.points.values("channel", rows).astype(np.int64)
+            ranges = np.linalg.norm(places, axis=1)
+            if number not in self._range_limits:  # one scale for all sweeps of a sensor
+                low, high = np.percentile(ranges, [1, 99])
+                self._range_limits[number] = float(low), float(high)
+            limits = self._range_limits[number]
+            image = range_image(places, ranges, channels, limits)
+        return {"low": limits[0], "high": limits[1], "sensor": number}, {"image": image}
+
+
+def range_image(
+    places: Floats, ranges: Floats, channels: Ints | None, limits: tuple[float, float]
+) -> Bytes:
+    """Range image of points in their sensor's axes, RGBA (rows, columns, 4), the nearest ahead.
+
+    Rows are channels, the highest above, or steps of elevation if the sensor has few or very
+    many. Columns are steps of azimuth from left to right. A sensor that looks down has one row,
+    of angles across its way. Empty pixels are transparent.
+    """
+    downwards = float(np.median(places[:, 2] / np.maximum(ranges, 1e-9))) < _DOWNWARDS
+    azimuth = np.arctan2(places[:, 1], -places[:, 2] if downwards else places[:, 0])
+    left, right = float(azimuth.max()), float(azimuth.min())
+    if left - right > _NARROW:
+        left, right = math.pi, -math.pi
+    if downwards:
+        count, line = 1, np.zeros(len(places), np.int64)
+    elif channels is not None and _FEW <= (count := int(channels.max()) + 1) <= _MANY:
+        line = count - 1 - channels
+    else:
+        elevation = np.arcsin(places[:, 2] / np.maximum(ranges, 1e-9))
+        span = float(np.ptp(elevation)) or 1.0
+        count = _IMAGE_ROWS
+        line = ((elevation.max() - elevation) * ((count - 1) / span)).astype(np.int64)
+    fullest = azimuth[line == np.bincount(line).argmax()]
+    each = float(np.ptp(fullest)) / len(fullest)  # between two points; columns are wider than that
+    width = int(np.clip(_NO_GAPS * (left - right) / max(each, 1e-9), 32, _IMAGE_WIDTH))
+    across = ((left - azimuth) * (width / max(left - right, 1e-9))).astype(np.int64)
+    image = np.zeros((count, width, 4), np.uint8)
+    order = np.argsort(-ranges, kind="stable")  # the nearest is written last
+    low, high = limits
+    shade = np.clip((ranges - low) / max(high - low, 1e-9), 0, 1)
+    colours = np.full((len(ranges), 4), 255, np.uint8)
+    colours[:, :3] = as_bytes(mapped("viridis_r", shade))
+    image[line[order], np.minimum(across, width - 1)[order]] = colours[order]
+    return image
+
+
+def _of_points(points: Points) -> tuple[Floats, Floats]:
+    """Origin in whole metres near the points, and their box without a few outliers."""
+    places = positions(points, PointFinder(points, np.zeros(3)).find(_SAMPLE)[0])
+    if not len(places):
+        return np.zeros(3), np.array([[-1.0, -1.0, 0.0], [1.0, 1.0, 1.0]])
+    box = np.percentile(places, [0.5, 99.5], axis=0)
+    origin = np.where(np.abs(box[0]) > 10_000, np.round(box[0]), 0.0)
+    return origin, box - origin
+
+
+class ShownSurface:
+    """A scene's triangles, or a simplified mesh of at most so many, in the chosen colours.
+
+    Vertices in the same cell of a grid are merged (Rossignac and Borrel, 1993), and hits of a
+    triangle that vanishes go to one beside it. `reflectance` is the share of the light that each
+    object reflects, (objects,), if it is known.
+    """
+
+    def __init__(
+        self, scene: Scene, reflectance: Floats | None = None, most: int = MOST_TRIANGLES
+    ) -> None:
+        self.coarse, self._reflectance = scene, reflectance
+        # (f,): which triangle stands for each of the scene; -1 where nothing is left.
+        self._stands = np.arange(len(scene.faces))
+        if len(scene.faces) > most:
+            self.coarse, self._stands = simplified(scene, most)
+        self._objects = self.coarse.face_object.astype(np.int32)  # as browsers have them
+        size = float(np.linalg.norm(np.ptp(scene.bounds, axis=0)))
+        moved = apart(self.coarse, self._objects, _INWARDS * min(size, _MOST_INWARDS_OF))
+        self.corners = moved.vertices[moved.faces].astype(np.float32)  # (f, 3, 3)
+
+    def coloured(
+        self, by: str, hit_counts: AnyArray, points: Floats32
+    ) -> tuple[dict[str, AnyArray], Legend | None]:
+        """Corners (k, 3, 3), objects (k,), colours (k, 3, 3) at the corners; and their legend.
+
+        `by` is one of `colours_for` the scene; "hits" needs the hits (f,) of its triangles, and
+        some of the hit points, (n, 3). There are no colours for "grey": the page has its own.
+        """
+        arrays: dict[str, AnyArray] = {"corners": self.corners, "objects": self._objects}
+        legend: Legend | None = None
+        if by == "hits":
+            left = self._stands >= 0
+            hits = np.bincount(self._stands[left], hit_counts[left], len(self.corners))
+            most = len(self.corners) + MOST_PIECES
+            made = hit_colours(self.coarse, self.corners, hits.astype(float), points, most)
+            arrays["corners"], owner, colours, (low, high) = made
+            arrays |= {"objects": self._objects[owner], "colours": as_bytes(colours)}
+            named = (low, (low * high) ** 0.5, high)
+            marks = [f"{n:.2g}" if n < 10 else f"{n:,.0f}" for n in named]
+            return arrays, scale_legend(HITS_TITLE, marks) if hits.any() else None
+        if by == "object":
+            colouring = colours_of(self._objects, OBJECT, self.coarse.names)
+            colours, legend = colouring.paint(self._objects), legend_of(colouring)
+        elif by == "reflectance" and self._reflectance is not None:
+            colours = mapped("gray", 0.1 + 0.9 * self._reflectance[self._objects])
+            greys = mapped("gray", np.linspace(0.1, 1.0, 9))
+            legend = scale_legend("reflectance", ("0", "0.5", "1"), greys)
+        elif by == "colour" and self.coarse.colours is not None:
+            colours = self.coarse.colours.means() / 255
+        else:
+            return arrays, None
+        corners = as_bytes(colours).repeat(3, axis=0).reshape(-1, 3, 3)
+        return arrays | {"colours": corners}, legend
+
+
+def colours_for(scene: Scene, reflectance: Floats | None) -> tuple[str, ...]:
+    """List the ways to colour a scene, with or without known reflectance, and its own colours."""
+    own = ("colour",) if scene.coloured else ()
+    more = ("reflectance",) if reflectance is not None and len(np.unique(reflectance)) > 1 else ()
+    return ("grey", "hits", "object", *more, *own)
+
+
+def legend_of(colouring: Colouring) -> Legend:
+    """Legend of colours: a scale with numbers, or labels with their values."""
+    if colouring.limits is None:
+        labels = [
+            [name, as_bytes(colour).tolist(), value]
+            for (name, colour), value in zip(colouring.labels, colouring.values, strict=True)
+        ]
+        more = len(labels) - MOST_LABELS
+        return {"labels": labels[:MOST_LABELS], "more": max(more, 0), "column": colouring.name}
+    low, high = colouring.limits
+    title = f"{colouring.name}, {colouring.unit}" if colouring.unit else colouring.name
+    title += f": {colouring.meaning}" if colouring.meaning else ""
+    if colouring.logarithmic:
+        marks = [f"{at:.2g}" for at in (low, (low * high) ** 0.5, high)]
+    else:  # as many digits as a bar of this span needs, and never -0
+        digits = int(np.clip(np.ceil(1 - np.log10(high - low)), 0, 6)) if high > low else 2
+        marks = [f"{round(at, digits) + 0.0:,.{digits}f}" for at in (low, (low + high) / 2, high)]
+    return scale_legend(title, marks, colouring.scale[::15])
+
+
+def scale_legend(title: str, marks: Sequence[str], colours: Floats = TURBO[::15]) -> Legend:
+    """Legend of a scale of colours (n, 3), with evenly spread marks."""
+    return {"title": title, "marks": list(marks), "colours": as_bytes(colours).tolist()}
+
+
+@contextmanager
+def result_page(view: View, *, port: int = PORT, browser: bool = True) -> Iterator[PageServer]:
+    """Serve the page of a result while the body runs; see `announced`."""
+    shows = f"shows {plural(len(view.points), 'point')}"
+    shows += "" if cell_display() else "; Ctrl-C ends it"
+    with (
+        page_server(view.answer, port) as page,
+        announced(page, f"{page.url} {shows}", browser, on_stdout=True),
+    ):
+        yield page
+
+
+def downloads() -> list[str]:
+    """Name the formats of a download whose packages are installed here."""
+    return [name for name in EXPORTS if Format(name).installed]
+
+
+def wait_for_interrupt(stopped: Event | None = None) -> None:
+    """Keep a page open until Ctrl-C, or until its user has stopped it."""
+    stopped = stopped or Event()
+    with suppress(KeyboardInterrupt):
+        while not stopped.wait(0.2):  # one without limit is not left on Ctrl-C everywhere
+            pass
+
+
+def show_view(view: View, *, port: int, browser: bool = True) -> None:
+    """Show a view until Ctrl-C; see `result_page`."""
+    if view.note:
+        click.echo(f"note: {view.note}", err=True)
+    with result_page(view, port=port, browser=browser):
+        wait_for_interrupt()
+
+
+def open_results(paths: Sequence[Path]) -> View:
+    """Open results of one place as one view, with the scene, sensors and actors of the first.
+
+    They are played if their sweeps are alike. LidarError as of `open_result`, or if points are
+    in the axes of their sensors.
+    """
+    first, *others = views = [open_result(path) for path in paths]
+    if not others:
+        return first
+    if IN_SENSOR_AXES in (notes := [view.note for view in views]):
+        raise LidarError(
+            f"{paths[notes.index(IN_SENSOR_AXES)]} has points in the axes of its sensors, which "
+            "fit no other result: show it alone, or run it with cloud.coordinates: world."
+        )
+    names = [path.resolve().name for path in paths]
+    names = names if len({*names}) == len(names) else [str(path) for path in paths]
+    begins = [() if view.sweeps is None else view.sweeps.begins_ns for view in views]
+    sweeps = first.sweeps if all(np.array_equal(begins[0], one) for one in begins) else None
+    points = JoinedPoints([view.points for view in views])
+    title = f"{' and '.join(names)} - lidarpool"
+    return View(points, first.pictured, sweeps, " ".join(notes).strip(), title, results=names)
+
+
+def open_result(path: Path) -> View:
+    """Open a cloud or the folder of a result; with its scene and sweeps if there are any.
+
+    That these cannot be read is only noted. LidarError if there is no cloud, or a damaged one.
+    """
+    title = f"{path.resolve().name} - lidarpool"
+    if not path.is_dir():
+        return View(CloudFile(path), title=title)
+    cloud, scene, beside = path / CLOUD, path / PICTURE_FILE, path / SWEEPS_FILE
+    if not cloud.exists() and (path / RUN_FOLDER / FILE).exists():
+        raise LidarError(
+            f"{path} holds an unfinished run: continue it with lidarpool run --resume, where "
+            "--live shows its points."
+        )
+    if not cloud.exists():
+        raise LidarError(
+            f"{path} holds no {CLOUD}: give the folder of a result (its --out), or a cloud."
+        )
+    pictured, sweeps, note = None, None, ""
+    try:
+        sweeps = Sweeps.load(beside) if beside.exists() else None
+        pictured = PictureContent.load(scene) if scene.exists() else None
+    except LidarError as error:
+        note = f"The cloud is shown without all that belongs to it. {error}"
+    file = CloudFile(cloud, pictured.own if pictured else ())
+    return View(file, pictured, sweeps, note, title)
