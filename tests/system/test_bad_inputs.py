@@ -19,7 +19,7 @@ from raybeam import available_backends
 
 BOX = trimesh.creation.box((2, 4, 6))
 
-# One of each kind; what else is wrong with files is asked in tests/lidarpool.
+# One of each kind; what else is wrong with files is asked in the tests of each package.
 # {case: (name of the file, its content, what the message says)}
 FILES: dict[str, tuple[str, bytes | None, str]] = {
     "empty mesh": ("hall.stl", b"", "hall.stl is empty"),
@@ -36,7 +36,7 @@ FILES: dict[str, tuple[str, bytes | None, str]] = {
     ),
 }
 
-# What comes back of a pulse; what numbers cannot be is asked in tests/lidarpool/test_echoes.py.
+# What comes back of a pulse; what numbers cannot be is asked in tests/lidarsim/test_echoes.py.
 # {content of a scenario: what the message says}
 RETURNS = {
     "materials: [{objects: V*, reflectance: 0.3}]": "no entry names the object",

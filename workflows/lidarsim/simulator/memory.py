@@ -24,7 +24,7 @@ MB = 1_000_000
 # differ by 30 MB at most (2026-11-22, Linux, NumPy 2.4). The estimate was 1.02 to 1.5 times that;
 # 1.64 if two returns of a pulse may be reported and there is one, 0.8 if there are always two. The
 # peak of the process (VmHWM) was 16 % above tracemalloc's at most, and mostly below.
-# tests/lidarpool/test_memory.py measures some of it again. Steps say their own, of that.
+# tests/lidarsim/test_memory.py measures some of it again. Steps say their own, of that.
 RAY = 28  # its hit
 RAY_MADE, RAY_MADE_KEPT = 92, 32  # if it is not repeated: while it is made, and after that
 RAY_AMONG_BODIES = 70  # in a scene with instances or actors

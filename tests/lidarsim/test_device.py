@@ -13,10 +13,10 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from tests.cuda_on_host import HOST, source_backend  # noqa: F401 - a fixture
-from tests.lidarpool.test_memory import MANY
-from tests.lidarpool.test_memory import SCENE as SPHERE
-from tests.lidarpool.test_rig import CART, SURVEYS, TURNED
-from tests.lidarpool.test_rig import COLUMNS as RIG_COLUMNS
+from tests.lidarsim.test_memory import MANY
+from tests.lidarsim.test_memory import SCENE as SPHERE
+from tests.lidarsim.test_rig import CART, SURVEYS, TURNED
+from tests.lidarsim.test_rig import COLUMNS as RIG_COLUMNS
 from tests.shapes import cast_between
 
 from lidarpool import (

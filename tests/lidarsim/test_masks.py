@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import trimesh
 from PIL import Image
-from tests.lidarpool.test_gltf import glb
+from tests.lidarsim.test_gltf import glb
 from tests.meshes import write
 
 from lidarpool import LidarError, Pose, Scanner, Scene

@@ -7,7 +7,7 @@ import tracemalloc
 
 import numpy as np
 import pytest
-from tests.lidarpool.test_vegetation import ALL_ON, AT, GROUND, MANY, cast, rays
+from tests.lidarsim.test_vegetation import ALL_ON, AT, GROUND, MANY, cast, rays
 from tests.rows import quick
 from tests.shapes import CPU, Cart, ball, box, cast_between
 

@@ -6,8 +6,8 @@ import math
 
 import numpy as np
 import pytest
-from tests.lidarpool import twin
-from tests.lidarpool.twin import Hit
+from tests.lidarsim import twin
+from tests.lidarsim.twin import Hit
 from tests.shapes import quad
 
 from lidarpool import Beams, Material, Noise, Optics, Returns, Scene, Sensor, Spin, Survey
