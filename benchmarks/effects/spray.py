@@ -10,7 +10,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from benchmarks.effects._receiver import BLUE, GREY, RED, cloud
-from lidarpool import (
+from lidarpool import (  # fmt: skip
     Actor,
     Beams,
     Noise,

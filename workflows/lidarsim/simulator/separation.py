@@ -11,7 +11,7 @@ from ..scene.colours import GREY, packed
 from ..sensor.disc import neighbours
 from ..sensor.noise import THRESHOLD_SIGMAS, Noise, Purpose, quantiles, starts
 from ..sensor.optics import Mode
-from .returns import (
+from .returns import (  # fmt: skip
     AIR,
     NO_SURFACE,
     OF_RETURNS,
