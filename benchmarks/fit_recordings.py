@@ -1,15 +1,17 @@
 """Fits half of the sweeps of recordings, and compares noise and losses with the other half.
 
-python -m benchmarks.fit_recordings [--picture FILE.png] RECORDING=MODEL[,WHITE] …
+python -m benchmarks.fit_recordings [--picture FILE.png] RECORDING[=MODEL[,WHITE]] …
 
 The simulator's noise is drawn at the ranges, energies and slopes of the other half's rays: by the
-model's data sheet, and as fitted.
+model's data sheet, and as fitted. Recordings that `fit` refuses have a row with the reason. Without
+a model, the sensor is that of the recording, without a data sheet.
 """
 
 from __future__ import annotations
 
 import argparse
 import warnings
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -55,8 +57,14 @@ def deviations(ranges: Any) -> Any:
     return 1000 * steps[np.isfinite(steps)]
 
 
-def compared(recording: Recording, model: str, white: float | None) -> tuple[dict[str, Any], ...]:
-    """Deviations (n,) and shares of lost pulses, recorded and simulated; scatter of intensity."""
+def compared(
+    recording: Recording, model: str | None, white: float | None
+) -> tuple[dict[str, Any], ...]:
+    """Deviations (n,) and shares of lost pulses, recorded and simulated; scatter of intensity.
+
+    LidarError if a half cannot be fitted.
+    """
+    Repeats.read(recording)  # refuses a sensor that moves, which halves may not show
     found = fit(half(recording, 0), model=model, white=white)
     other = Repeats.read(half(recording, 1))
     rays = smooth_rays(other, other.sigma, 0.002)
@@ -66,10 +74,10 @@ def compared(recording: Recording, model: str, white: float | None) -> tuple[dic
     energy = np.maximum(rays.light / (white or recording.white or 100), 1 / 400)
     energy = energy * (10 / rays.distance) ** 2
     fitted = found.model.datasheet().noise
-    try:
-        sheet = read_model(model).datasheet().noise
-    except LidarError:
-        sheet = Noise()
+    sheet = Noise()
+    if model is not None:
+        with suppress(LidarError):  # the model states no performance
+            sheet = read_model(model).datasheet().noise
     cell = rays.row, rays.column
     recorded = other.ranges[:, *cell].astype(float)
     recorded -= turn[cell] * np.nan_to_num(other.aside[:, *cell])
@@ -80,12 +88,13 @@ def compared(recording: Recording, model: str, white: float | None) -> tuple[dic
     steps = np.abs(np.diff(light, axis=0)) / np.sqrt(2) / np.maximum(rays.light, 1)
     spread = {"recorded": float(np.nanmedian(steps) / 0.6745)}
     lost = {name: float(np.isnan(one).mean()) for name, one in ranges.items()}
+    lost["recorded"] = 1 - rays.returns.sum() / rays.trials.sum()  # without gaps
     return {name: deviations(one) for name, one in ranges.items()}, lost, spread
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("recordings", nargs="+", metavar="RECORDING=MODEL[,WHITE]")
+    parser.add_argument("recordings", nargs="+", metavar="RECORDING[=MODEL[,WHITE]]")
     parser.add_argument("--picture", type=Path)
     given = parser.parse_args()
     figure = Figure(figsize=(3.2 * len(given.recordings), 2.8), layout="constrained")
@@ -94,21 +103,26 @@ def main() -> None:
     for number, text in enumerate(given.recordings):
         path, _, model = text.partition("=")
         model, _, white = model.partition(",")
-        recording = open_recording(path)
-        off, lost, spread = compared(recording, model, float(white) if white else None)
+        try:
+            recording = open_recording(path)
+            off, lost, spread = compared(recording, model or None, float(white) if white else None)
+        except LidarError as error:
+            print(f"| {Path(path).name} | refused | {error} | | |", flush=True)
+            continue
         axes = figure.add_subplot(1, len(given.recordings), number + 1)
         limit = 1.5 * np.quantile(np.abs(off["recorded"]), 0.98)
         for name, values in off.items():
             low, middle, high = np.quantile(np.abs(values), (0.5, 0.95, 0.99))
             seen = f"{100 * spread[name]:.1f} %" if name in spread else "0"
             print(f"| {Path(path).name} | {name} | {low:.1f}, {middle:.1f}, {high:.1f} "
-                  f"| {100 * lost[name]:.2f} % | {seen} |")  # fmt: skip
+                  f"| {100 * lost[name]:.2f} % | {seen} |", flush=True)  # fmt: skip
             if values.any():  # without noise there is nothing to draw
                 share = np.full(len(values), 1 / len(values))
                 axes.hist(values, 61, range=(-limit, limit), weights=share, histtype="step",
                           color=COLOURS[name], label=name)  # fmt: skip
         axes.set(title=f"{Path(path).name}\n{model}", xlabel="deviation, mm", yticks=[])
-    figure.axes[0].legend(fontsize=7, frameon=False)
+    if figure.axes:
+        figure.axes[0].legend(fontsize=7, frameon=False)
     if given.picture:
         figure.savefig(given.picture, dpi=110)
 

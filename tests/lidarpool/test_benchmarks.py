@@ -7,7 +7,7 @@ import shutil
 
 import numpy as np
 import pytest
-from benchmarks import raycast, realism, scanner, trees
+from benchmarks import odometry, raycast, realism, scanner, trees
 
 from lidarscenes.procedural.city import city
 from lidarscenes.writers.scene_file import write_scene
@@ -75,3 +75,18 @@ def test_what_is_real_is_measured_beside_what_is_bare(capsys):
     rows = json.loads(capsys.readouterr().out)["rows"]
     assert rows["bare"]["times"] == 1 and all(row["points"] > 500 for row in rows.values())
     assert {"3 boxes, moving", "19 sub-rays", "rain", "fog", "snow", "all"} <= rows.keys()
+
+
+@pytest.mark.slow
+def test_odometry_deskews_a_bag_as_one_of_a_driver():
+    """KISS-ICP moves points to their true positions, from which points as fired are far."""
+    pytest.importorskip("kiss_icp", reason="KISS-ICP is not installed")
+    distances = odometry.measured("velodyne/vlp16", 14, 20_000)
+    assert distances[True].median < distances[False].median / 3
+    assert distances[False].median > 0.2
+
+
+def test_odometry_without_kiss_icp_says_what_to_install(monkeypatch, capsys):
+    monkeypatch.setattr(odometry, "find_spec", lambda name: None)
+    assert odometry.main(["--quick"]) == 1
+    assert "pip install kiss-icp" in capsys.readouterr().err

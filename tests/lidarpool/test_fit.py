@@ -94,8 +94,11 @@ def test_bias_of_channels_against_planes_and_against_the_scene():
     made = recorded(Noise(range_m=0.01, seed=2), bias)
     for scene in (None, street()):
         rows = fit(made, scene=scene).figures["channels"]
-        for row in rows:
-            one, true = row["bias_m"], bias[row["ring"]]
+        known = [row for row in rows if row["bias_m"]]
+        assert len(known) == (16 if scene else 9)  # seven rings meet a single plane
+        middle = 0 if scene else bias[[row["ring"] for row in known]].mean()
+        for row in known:
+            one, true = row["bias_m"], bias[row["ring"]] - middle
             assert abs(one["value"] - true) < max(one["high"] - one["low"], 0.002), row
     found = fit(made, scene=street()).figures["curves"]
     assert len(found["lost_by_range"]) > 3 and found["lost_by_range"][0]["value"] < 0.01
@@ -110,14 +113,15 @@ def test_beams_that_begin_beside_zero_bias_no_ring():
     made = [scanner.sweep((0, 0, 0), number=k) for k in range(4)]
     found = fit(Recording("os1", 4, lambda k: (made[k].positions, made[k].columns, None)))
     bias = [row["bias_m"]["value"] for row in found.figures["channels"] if row["bias_m"]]
-    assert len(bias) > 20 and np.abs(bias).max() < 0.001
+    assert len(bias) > 15 and np.abs(bias).max() < 0.001
 
 
 def test_a_single_sweep_tells_bias_alone(recording):
     single = fit(replace(recording, count=1))
     assert not single.figures["figures"] and "there is a single sweep" in repr(single)
     assert single.model.performance is None
-    assert sum(row["bias_m"] is not None for row in single.figures["channels"]) > 10
+    known = [row for row in single.figures["channels"] if row["bias_m"]]
+    assert len(known) > 8  # the others meet a single plane
 
 
 def drive(scene, height_m, step_m, yaw_deg=0.0, sweeps=6):
@@ -196,12 +200,138 @@ def test_gaps_and_sweeps_cut_short_are_no_lost_pulses():
 
     fitted = fit(replace(whole, read=holed))
     figures = fitted.figures["figures"]
-    assert figures["dropout"]["value"] < 1e-4
+    lost = figures["dropout"]
+    assert lost["value"] < 1e-4
+    assert 0 <= lost["low"] <= lost["value"] < lost["high"] < 1e-3  # also of no lost pulse
     assert figures["range_m"]["low"] < NOISE.range_m < figures["range_m"]["high"]
     assert "% of the sweeps are gaps, of lost packets or sweeps cut short" in repr(fitted)
     lossy = recorded(replace(NOISE, dropout=0.1))
     figures = fit(replace(lossy, read=lossy.read)).figures["figures"]
     assert figures["dropout"]["low"] < 0.1 < figures["dropout"]["high"]
+
+
+def test_two_sweeps_tell_a_large_share_of_lost_pulses():
+    """Rays without any return are unknown: what is lost of the known rays is less."""
+    lossy = recorded(replace(NOISE, dropout=0.3), sweeps=2)
+    lost = fit(lossy).figures["figures"]["dropout"]
+    assert lost["value"] == pytest.approx(0.3, abs=0.02)
+    assert lost["low"] < 0.3 < lost["high"]
+
+
+def with_points(recording, chosen, points_of):
+    """Keep the chosen points of each sweep, and add others: points (n, 3) of rings (n,)."""
+
+    def read(number):
+        points, columns, pose = recording.read(number)
+        kept = chosen(number, points, columns["channel"])
+        added, rings, light = points_of(number)
+        return (
+            np.concatenate([points[kept], added]),
+            {
+                "channel": np.append(columns["channel"][kept], rings),
+                "intensity": np.append(columns["intensity"][kept], light),
+            },
+            pose,
+        )
+
+    return replace(recording, read=read)
+
+
+def directions_of(rings, columns):
+    """Return unit vectors (n, 3) of the rings and columns of the simulated sensor."""
+    azimuth = np.radians(columns)
+    elevation = np.radians(np.linspace(-20, 20, 16)[rings])
+    flat = np.cos(elevation)
+    return np.stack([flat * np.cos(azimuth), flat * np.sin(azimuth), np.sin(elevation)], axis=1)
+
+
+def test_rings_of_false_alarms_alone_are_of_the_same_sensor(recording):
+    """The upper half of the rings looks at the sky, and has no return in some sweeps."""
+    share = 0.002
+
+    def alarms(number):
+        rng = np.random.default_rng(number + 40)
+        rings, columns = np.nonzero(rng.random((16, 360)) < share)
+        upper = rings >= 8
+        rings = rings[upper]
+        away = directions_of(rings, columns[upper])
+        return away * rng.uniform(1, 120, (len(rings), 1)), rings, np.full(len(rings), 0.001)
+
+    lower = with_points(recording, lambda number, points, rings: rings < 8, alarms)
+    of_sweeps = [len(np.unique(lower.read(k)[1]["channel"])) for k in range(lower.count)]
+    assert max(of_sweeps[:3]) < 14
+    fitted = fit(lower)
+    assert len(fitted.figures["channels"]) == 16
+    estimate = fitted.figures["figures"]["false_alarms"]
+    assert estimate["low"] < share < estimate["high"] < 2 * share
+
+
+def test_what_a_single_sweep_covers_tells_no_false_alarms(recording):
+    """A third of the turn is in the first sweep only, and few of the returns there repeat."""
+
+    def covered(number, points, rings):
+        azimuth = np.degrees(np.arctan2(points[:, 1], points[:, 0])) % 360
+        return (azimuth > 120) | (number == 0)
+
+    def nothing(number):
+        return np.zeros((0, 3)), np.zeros(0, int), np.zeros(0)
+
+    figures = fit(with_points(recording, covered, nothing)).figures["figures"]
+    assert "false_alarms" not in figures
+
+
+def test_points_on_the_sensors_cover_tell_nothing(recording):
+    """Half of the pulses of four rings return from 1 cm, and are brighter than all others."""
+
+    def cover(number):
+        rng = np.random.default_rng(number)
+        rings, columns = np.nonzero(rng.random((4, 360)) < 0.5)
+        near = directions_of(rings + 12, columns) * rng.normal(0.01, 0.002, (len(rings), 1))
+        return near, rings + 12, np.full(len(rings), 1e5)
+
+    figures = fit(with_points(recording, lambda number, points, rings: rings < 12, cover)).figures[
+        "figures"
+    ]
+    assert figures["dropout"]["low"] < NOISE.dropout < figures["dropout"]["high"]
+    assert figures["range_m"]["low"] < NOISE.range_m < figures["range_m"]["high"]
+
+
+def test_ranges_that_drift_are_refused():
+    """3 mm a sweep, less than their noise, as of a sensor that warms up; no motion explains it."""
+    steady = recorded(Noise(range_m=0.006, angle_deg=0.02, dropout=0.02, seed=3))
+    assert fit(steady).figures["figures"]["range_m"]["value"] == pytest.approx(0.006, rel=0.1)
+
+    def longer(number):
+        points, columns, pose = steady.read(number)
+        ranges = np.linalg.norm(points, axis=1, keepdims=True)
+        return points * (1 + 0.003 * number / ranges), columns, pose
+
+    with pytest.raises(LidarError, match=r"ranges that drift: .* in 6 sweeps"):
+        fit(replace(steady, read=longer))
+
+
+def test_rings_that_meet_surfaces_steeply_have_no_bias(recording):
+    """The ground alone, at 70° to 80°."""
+
+    def nothing(number):
+        return np.zeros((0, 3)), np.zeros(0, int), np.zeros(0)
+
+    ground = with_points(recording, lambda number, points, rings: points[:, 2] < -1.6, nothing)
+    fitted = fit(ground)
+    channels = fitted.figures["channels"]
+    assert channels and all(row["bias_m"] is None for row in channels)
+    assert fitted.figures["figures"]["dropout"]["value"] == pytest.approx(0.02, rel=0.2)
+
+
+def test_bias_of_rings_is_as_uncertain_as_the_planes_are():
+    """Things beside the walls of this hall tilt the planes that are found."""
+    truth, fitted = trial(30, where="hall")
+    held = [
+        estimate["low"] <= truth[name] <= estimate["high"]
+        for name, estimate in fitted.items()
+        if name.startswith("bias_m")
+    ]
+    assert len(held) > 10 and np.mean(held) > 0.85
 
 
 @pytest.mark.parametrize("where", PLACES)

@@ -5,8 +5,11 @@ Files are read with programs that are not of this project.
 
 from __future__ import annotations
 
+import json
+import tarfile
 from dataclasses import dataclass, replace
 from functools import cache
+from io import BytesIO
 from typing import ClassVar
 
 import laspy
@@ -254,6 +257,37 @@ def test_ply_and_parquet_say_which_frame_their_points_have(tmp_path, coordinates
     save_cloud(cloud, tmp_path / "cloud.parquet")
     metadata = pq.read_schema(tmp_path / "cloud.parquet/part-00000.parquet").metadata
     assert metadata[b"coordinates"].decode() == coordinates
+
+
+@pytest.mark.parametrize("coordinates", ["world", "sensor"])
+def test_samples_for_training_are_in_the_sensors_axes_and_say_so(tmp_path, coordinates):
+    """Their pose takes compensated points to the world, whatever the frame of the cloud."""
+    made = Drive("velodyne/vlp16")
+    world = made.cloud()
+    cloud = made.cloud(coordinates)
+    words = "start of the sweep" if coordinates == "world" else "firing of each"
+    save_cloud(cloud, tmp_path / "tars", format="webdataset")
+    save_cloud(cloud, tmp_path / "images", format="images")
+    (shard,) = (tmp_path / "tars").rglob("*.tar")
+    with tarfile.open(shard) as tar:
+        files = {member.name: tar.extractfile(member).read() for member in tar}
+    for sweep, points in enumerate(world.sweeps().points(world)):
+        said = json.loads(files[f"lidar-{sweep:06}.json"])["frame"]
+        arrays = {
+            name: np.load(BytesIO(files[f"lidar-{sweep:06}.{name}.npy"]))
+            for name in ("points", "pose")
+        }
+        with np.load(tmp_path / f"images/lidar/{sweep:06}.npz") as image:
+            assert str(image["frame"]) == said
+            returned = np.isfinite(image["range"].T)
+            placed = np.stack([image[axis].T[returned] for axis in "xyz"], axis=1)
+            np.testing.assert_array_equal(image["pose"], arrays["pose"])
+        np.testing.assert_array_equal(placed, arrays["points"])
+        assert f"sensor's axes at the {words}" in said
+        pose = arrays["pose"]
+        in_world = placed @ pose[:3, :3].T + pose[:3, 3]
+        alike = np.allclose(in_world, points.positions, atol=5e-5)
+        assert alike is (coordinates == "world")
 
 
 @pytest.mark.parametrize("format_name", ["pcd", "mcap"])

@@ -11,7 +11,15 @@ import yaml
 from click.testing import CliRunner
 from tests.shapes import beam_along_x, cast, wall
 
-from lidarpool import LidarError, Material, Mounted, Noise, Returns, Survey, load_sensor
+from lidarpool import (  # fmt: skip
+    LidarError,
+    Material,
+    Mounted,
+    Noise,
+    Returns,
+    Survey,
+    load_sensor,
+)
 from lidarpool.cli.scenario_commands import sensors
 from lidarpool.scenario.advice import advice
 from lidarpool.scenario.build import build

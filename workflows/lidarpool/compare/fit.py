@@ -53,6 +53,7 @@ _FEW, _POINTS = 30, 14  # rays that a figure or a point of a curve needs; points
 _AIM = 0.002  # scatter of directions that does not make outliers before it is known, radians
 _LEAST_M = 0.001  # error of the mean range of a ray, however often it is measured
 _HEAD_M = 0.1  # how far from zero the beams of a head may meet
+_NEAREST_M = 0.1  # nearer points are of the sensor's cover, or of what lies on it
 _FLAT = 1.7  # tangent of incidence: beyond, noise of directions makes mean ranges longer
 _DARKEST = 1 / 400  # reflectance of what is reported as 0
 MOST_VALUES = 1 << 24  # returns in memory; of more sweeps than these make, some are read
@@ -60,6 +61,8 @@ _REPEATED = 0.8  # least share of a ray's returns that belong to one surface
 _STILL_M = 0.02  # shift of a sensor, metres, from which on it moves
 _STILL_RAD = 0.003  # the same of its yaw
 _CHANGED_M = 0.1  # median change of ranges, from sweep to sweep, of a place that changes
+_DRIFT, _DRIFT_M = 1.5, 0.002  # growth of changes over many sweeps from which on ranges drift
+_CALM = 0.8  # share of the changes, the smallest ones, that tell the scatter
 _AGREEING = 0.5  # least share of the rays that a motion changes and explains
 _PAIRS, _YAW_M = 8, 10.0  # pairs of sweeps for the motion; distance at which yaw counts, metres
 _ROUGH_M, _SHIFT_M = 0.02, 0.5  # noise of ranges, and motion, for which rays are weighted, metres
@@ -70,8 +73,10 @@ _KINK_M, _KINK = 0.01, 0.001  # by how much a surface may leave its plane within
 _SIGMAS = 6.0  # a return beyond these is of something that moves
 _STEEPEST = 5.7  # tangent of incidence: beyond, a beam meets several surfaces
 _BESIDE_M, _BESIDE = 0.3, 0.5  # how far surfaces may be from the scene's, and share of these
+_FOREIGN = 0.1  # share of a sweep's points in rings of no other sweep, of another sensor
 _OTHER_DEG = 2.0  # a ring that is farther from all beams of a model is not one of them
-_Z, _STEP = 1.959964, 1e-3  # of 95 %; of logarithms, for derivatives
+_CERTAIN, _Z = 0.95, 1.959964  # probability of intervals, and its quantile
+_STEP = 1e-3  # of logarithms, for derivatives
 # Chances of a variance above which a ray is left out: certainly, and at most.
 _REJECTED, _TRIMMED = 1e-4, 0.1
 _PATCH_ROWS, _PATCHES = 4, 36  # rings of a patch of rays; patches of a turn
@@ -82,8 +87,12 @@ _WRONG = 0.03  # relative error of the variances of steep or far rays
 _OUTLIER = 3.0  # quotient of a variance and the expected one that counts at most
 _SPAN, _TILT = 2.0, 0.3  # least quotient of ranges, and tangent of incidence, that tell noise
 _WEAK_RAYS, _RING_RAYS = 30, 20  # rays with losses that a threshold needs; that of a ring's bias
-_SKY = (7, 31)  # rows and columns of which no ray returns twice, around a ray into the sky
+# Rings and degrees of azimuth around a ray into the sky of which no ray returns twice: in smaller
+# gaps between leaves, leaves return once.
+_SKY_RINGS, _SKY_DEG = 7, 36.0
+_SKY_PULSES = 1000  # pulses into the sky that a share of false alarms needs
 _PLANES, _PLANE_M, _PLANE_RAYS, _PLANE_POINTS, _EVEN, _GAP = 8, 0.05, 300, 20_000, 0.4, 0.1
+_FAR_SIGMAS, _NEAR_SIGMAS = 4.0, 2.0  # beyond, points are not of their planes
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -252,11 +261,23 @@ class Estimate(NamedTuple):
         return cls.of(values.mean(), values.var() / len(values))
 
     @classmethod
-    def ratio(cls, parts: Ints, wholes: Ints) -> Estimate:
-        """Make one of the sum of parts (n,) over that of wholes (n,)."""
-        share = parts.sum() / wholes.sum()
-        spread = ((parts - share * wholes) ** 2).sum() / wholes.sum() ** 2
-        return cls.of(share, spread)
+    def share(cls, parts: Floats, wholes: Ints) -> Estimate:
+        """Estimate the sum of parts (n,) over that of wholes (n,), such as pulses lost of pulses.
+
+        The interval is that of Clopper and Pearson for as many independent pulses as explain the
+        scatter of the n shares; it is not empty if the share is 0.
+        """
+        from scipy.stats import beta
+
+        total = float(wholes.sum())
+        share = float(parts.sum()) / total
+        square = float(((parts - share * wholes) ** 2).sum()) / total**2
+        binomial = share * (1 - share) / total
+        count = total * binomial / square if square > binomial > 0 else total
+        tail = (1 - _CERTAIN) / 2
+        low = beta.ppf(tail, share * count, (1 - share) * count + 1) if share > 0 else 0.0
+        high = beta.isf(tail, share * count + 1, (1 - share) * count) if share < 1 else 1.0
+        return cls(share, float(low), float(high))
 
     def known_within(self, share: float) -> bool:
         """Whether the half of the interval is at most this share of the value."""
@@ -308,25 +329,38 @@ class Repeats:
         if len(numbers) < recording.count:
             notes.append(f"{len(numbers):,} of {recording.count:,} sweeps are used, evenly chosen")
         values = np.full((4, len(numbers), *shape), np.nan, np.float32)
+        rings = cells.rings
+        elevation = cells.elevation_deg
         for k, number in enumerate(numbers.tolist()):
             if not len(turn := recording.turn(number)):
                 continue
             with prefixed(name):
                 found = range_images(turn, own, (f"sweep {number}", "another"), cells.step_deg)
-                other = len(found.rings) > 1.2 * len(cells.rings)
+                returned = np.isfinite(found.images[0, 0])
+                # Rings of false alarms alone may have no return in the first sweeps.
+                foreign = returned[~np.isin(found.rings, cells.rings)].sum()
+                other = foreign > _FOREIGN * returned.sum()
                 if other or found.hidden[0] > cells.hidden[0] + 0.25:
                     raise LidarError(f"sweep {number} is of another sensor, or another mode.")
-            _, rows, there = np.intersect1d(found.rings, cells.rings, return_indices=True)
+            unseen = ~np.isin(found.rings, rings)
+            rings = np.append(rings, found.rings[unseen])
+            elevation = np.append(elevation, found.elevation_deg[unseen])
+            blank = np.full((4, len(numbers), unseen.sum(), shape[1]), np.nan, np.float32)
+            values = np.concatenate([values, blank], axis=2) if unseen.any() else values
+            _, rows, there = np.intersect1d(found.rings, rings, return_indices=True)
             columns = round(found.begin_deg / found.step_deg) + np.arange(found.images.shape[-1])
             values[:, k, there[:, None], columns % shape[1]] = found.images[0][:, rows]
-        values = values[:, np.isfinite(values[0]).any(axis=(1, 2))]
+        order = np.argsort(-elevation, kind="stable")
+        rings = rings[order]
+        elevation = elevation[order]
+        values = values[:, np.isfinite(values[0]).any(axis=(1, 2))][:, :, order]
         covered = covered_cells(np.isfinite(values[0]))
         if (gaps := 1 - covered[:, np.isfinite(values[0]).any(axis=0)].mean()) > 0.5 / covered.size:
             notes.append(
                 f"{100 * gaps:.2g} % of the sweeps are gaps, of lost packets or sweeps cut short, "
                 "and count as no lost pulses"
             )
-        level = cells.elevation_deg[:, None]
+        level = elevation[:, None]
         first = np.radians(cells.step_deg * np.arange(shape[1]))
         aside = (np.radians(values[2]) - first + np.pi) % (2 * np.pi) - np.pi
         risen = np.radians(values[3] - level)
@@ -338,7 +372,7 @@ class Repeats:
         ways = [np.cos(up) * np.cos(turned), np.cos(up) * np.sin(turned), np.sin(up)]
         sigma = rough_scatter(values[0])
         repeats = cls(
-            cells.rings, cells.elevation_deg, np.stack(ways, axis=-1),
+            rings, elevation, np.stack(ways, axis=-1),
             values[0], values[1], aside - mean, sigma,
             covered.sum(axis=0), tuple(notes),
         )  # fmt: skip
@@ -391,7 +425,7 @@ def surfaces(repeats: Repeats, distance: Floats, blur: Floats) -> Surfaces:
         change = length * (ways - normal)
         slope = np.linalg.norm(change, axis=-1)
         allowed = _KINK_M + _KINK * distance + 5 * blur
-        smooth = slope < _STEEPEST * distance
+        smooth = (slope < _STEEPEST * distance) & (distance > _NEAREST_M)
         near, wide = (ahead + back) / 2, (far + rear) / 2
         for beside, times in ((near, 1), (wide, 2), (above, 2), (below, 2)):
             smooth &= np.abs(((beside - points) * normal).sum(axis=-1)) < times * allowed
@@ -407,7 +441,9 @@ def covered_cells(returned: Bools) -> Bools:
     """
     share = (returned.sum(axis=0) + 0.5) / (len(returned) + 1)
     chance = np.where(share > _SELDOM, np.log1p(-share), 0.0)
-    columns = _long_runs(np.asarray(~returned.any(axis=1)), chance.sum(axis=0))
+    # Columns without a return in any ring are gaps also where few sweeps return at all.
+    sparse = np.log1p(-returned.sum(axis=0) / (len(returned) + 1))
+    columns = _long_runs(np.asarray(~returned.any(axis=1)), sparse.sum(axis=0))
     rings = _long_runs(~returned, chance)
     return ~(columns[:, None] | rings)
 
@@ -459,6 +495,15 @@ def check_stands(repeats: Repeats, name: str, period_ns: float | None) -> None:
             f"{name} is of a sensor that moves, by {told} from sweep to sweep: give sweeps of a "
             "sensor that stands, or one sweep for the bias of its rings."
         )
+    lag = count // 2
+    step_m = range_scatter(repeats, 1)
+    drift_m = range_scatter(repeats, lag)
+    if drift_m > _DRIFT * step_m + _DRIFT_M:
+        raise LidarError(
+            f"{name} has ranges that drift: smooth surfaces change by {step_m:.2g} m from sweep to "
+            f"sweep, but by {drift_m:.2g} m in {lag} sweeps, so the sensor or the place moves, "
+            "or the sensor warms up: give sweeps of a warm sensor that stands."
+        )
     changes = np.abs(np.diff(repeats.ranges, axis=0))
     if (change := _median(changes, (0, 1, 2))) > _CHANGED_M:
         raise LidarError(
@@ -480,11 +525,16 @@ class SensorMotion(NamedTuple):
         return self.shift_m > _STILL_M or self.yaw_rad > _STILL_RAD
 
 
-def sensor_motion(repeats: Repeats, first: int, second: int) -> SensorMotion:
-    """Fit the shift and the yaw of the sensor between two sweeps to the changes of ranges.
+class RangeChanges(NamedTuple):
+    """Changes of the ranges of smooth surfaces from a sweep to another."""
 
-    A plane n · x = c is nearer by n · s / (n · d) in the direction d after a shift s.
-    """
+    plane: Surfaces  # of the first sweep
+    chosen: Bools  # (r, c): rays that meet smooth surfaces, not steeply, in both sweeps
+    change: Floats  # (r, c): metres, without that of shifted azimuths
+
+
+def range_changes(repeats: Repeats, first: int, second: int) -> RangeChanges:
+    """Compare the ranges of two sweeps where the first meets smooth surfaces."""
     distance = repeats.ranges[first].astype(np.float64)
     # Changes of ranges from sweep to sweep tell no noise if the sensor moves.
     plane = surfaces(repeats, distance, np.full_like(distance, _ROUGH_M))
@@ -492,6 +542,30 @@ def sensor_motion(repeats: Repeats, first: int, second: int) -> SensorMotion:
         turned = repeats.aside[second] - repeats.aside[first]
         change = repeats.ranges[second] - distance - plane.turn * turned
         chosen = plane.smooth & np.isfinite(change) & (plane.slope < _FLAT * distance)
+    return RangeChanges(plane, chosen, change)
+
+
+def range_scatter(repeats: Repeats, lag: int) -> float:
+    """Return the typical change of the range of a smooth surface in `lag` sweeps, metres.
+
+    It is a mean without the largest changes: ranges may be rounded to more than their noise.
+    """
+    scatter = []
+    for first in even_indices(repeats.sweeps - lag, _PAIRS).tolist():
+        changes = range_changes(repeats, first, first + lag)
+        sizes = np.sort(np.abs(changes.change[changes.chosen]))
+        if len(sizes) >= _FEW:
+            scatter.append(sizes[: round(_CALM * len(sizes))].mean())
+    return float(np.median(scatter)) if scatter else 0.0
+
+
+def sensor_motion(repeats: Repeats, first: int, second: int) -> SensorMotion:
+    """Fit the shift and the yaw of the sensor between two sweeps to the changes of ranges.
+
+    A plane n · x = c is nearer by n · s / (n · d) in the direction d after a shift s.
+    """
+    distance = repeats.ranges[first].astype(np.float64)
+    plane, chosen, change = range_changes(repeats, first, second)
     if chosen.sum() < _FEW:
         return SensorMotion(0.0, 0.0)
     change, far = change[chosen], distance[chosen]
@@ -612,11 +686,16 @@ def fit_performance(
     """
     light = np.nan_to_num(rays.light) if energy is None else energy
     strong, threshold = light >= np.median(light), None
-    for _ in range(3):  # the threshold tells what loses nothing by energy
-        dropout = Estimate.ratio((rays.trials - rays.returns)[strong], rays.trials[strong])
-        if energy is not None:
-            threshold = fit_threshold(energy, rays.returns, rays.trials, dropout.value)
-            strong = energy > 2 * threshold.value if threshold else strong
+    dropout = lost_share(rays, strong)
+    for _ in range(3):
+        if energy is None:
+            break
+        lost = dropout.value if dropout else 0.0
+        threshold = fit_threshold(energy, rays.returns, rays.trials, lost)
+        if threshold is None:
+            break
+        strong = energy > 2 * threshold.value  # what loses nothing by energy
+        dropout = lost_share(rays, strong) or dropout
     figures, sigma, deviance = fit_scatter(rays, "range_per_m", rays.distance, 1)
     if energy is not None and threshold is not None:
         other = fit_scatter(rays, "range_at_threshold_m", threshold.value / energy, 2)
@@ -629,7 +708,23 @@ def fit_performance(
         figures["detection_range_m"] = threshold.power(-0.5, 10 * np.sqrt(TARGET_REFLECTANCE))
     if alarms := alarm_share(repeats):
         figures["false_alarms"] = alarms
-    return figures | {"dropout": dropout}, sigma
+    if dropout is not None:
+        figures["dropout"] = dropout
+    return figures, sigma
+
+
+def lost_share(rays: Rays, chosen: Bools) -> Estimate | None:
+    """Estimate the share of pulses that chosen rays (k,) lose; None if these are too few.
+
+    A ray is known only by its returns, which therefore tell no share. The other sweeps do: each
+    return in turn is the one that makes the ray known.
+    """
+    chosen = chosen & (rays.trials > 1)
+    if chosen.sum() < _FEW:
+        return None
+    returns = rays.returns[chosen]
+    trials = rays.trials[chosen]
+    return Estimate.share((trials - returns) * returns / (trials - 1), returns)
 
 
 def fit_scatter(
@@ -768,52 +863,82 @@ def fit_threshold(energy: Floats, count: Ints, trials: Ints, dropout: float) -> 
 
 
 def alarm_share(repeats: Repeats) -> Estimate | None:
-    """Share of pulses into the sky that return; None without sky, or with two sweeps.
+    """Share of pulses into the sky that return; None with little sky, or with two sweeps.
 
-    A pulse is one into the sky if no other of its ray returns, and no ray beside it repeats.
+    A pulse is one into the sky if no other of its ray returns, and no ray beside it repeats, of
+    three pulses or more.
     """
     from scipy.ndimage import maximum_filter
     from scipy.stats import binomtest
 
     count = np.isfinite(repeats.ranges).sum(axis=0)
     # Weak surfaces, which return seldom, are beside those that return more often.
-    sky = maximum_filter(count, size=_SKY, mode=("nearest", "wrap")) <= 1
+    size = _SKY_RINGS, round(_SKY_DEG / 360 * count.shape[1])
+    repeated = maximum_filter(count, size=size, mode=("nearest", "wrap")) > 1
+    sky = ~repeated & (repeats.trials > 2)
     alarms = int((count[sky] == 1).sum())
     trials = int(repeats.trials[sky & (count == 0)].sum()) + alarms
-    if not trials or repeats.sweeps < 3:
+    if trials < _SKY_PULSES:
         return None
     return Estimate(alarms / trials, *map(float, binomtest(alarms, trials).proportion_ci()))
 
 
 def ring_bias(rays: Rays, directions: Floats, blur: Floats) -> dict[int, Estimate]:
-    """By how much the ranges of each row differ from those of all, on large planes: {row: metres}.
+    """Estimate by how much the ranges of rows differ from the mean of all: {row: metres}.
 
-    Planes u · x = 1 and offsets b are fitted at once: 1 / r = u · d − b / r², times r². Ranges have
-    standard deviations `blur` (k,), metres.
+    Large planes u · x = 1 and offsets b of the rows are fitted at once: 1 / r = u · d − b / r²,
+    times r². Ranges have standard deviations `blur` (k,), metres. A row that lies in a single plane
+    has no offset. Intervals hold noise and errors of the planes, which are not quite plane: by what
+    offsets change without the farther points, and without each plane (jackknife; Efron, 1982).
     """
     if not len(rays.row):
         return {}
     some = even_indices(len(rays.row), _PLANE_POINTS)
     plane = _planes(rays.distance[some, None] * directions[some])
-    many = np.bincount(rays.row[some[plane >= 0]], minlength=rays.row.max() + 1)[rays.row[some]]
-    some, plane = (one[(plane >= 0) & (many >= _RING_RAYS)] for one in (some, plane))
+    count = np.zeros((rays.row.max() + 1, plane.max() + 2), np.int64)
+    np.add.at(count, (rays.row[some], plane), 1)  # the last column is of points in no plane
+    crossing = (count[:, :-1] >= _RING_RAYS).sum(axis=1) > 1
+    chosen = (plane >= 0) & crossing[rays.row[some]]
+    some = some[chosen]
+    plane = plane[chosen]
     rows, place = np.unique(rays.row[some], return_inverse=True)
     if len(rows) < 3:
         return {}
+    _, plane = np.unique(plane, return_inverse=True)
+    planes = plane.max() + 1
     distance = rays.distance[some] / blur[some]
-    planes = np.eye(plane.max() + 1)[plane][:, :, None] * directions[some][:, None]
-    planes = planes.reshape(len(some), -1) * rays.distance[some, None] ** 2
-    design = np.hstack([planes, -np.eye(len(rows))[place]]) / blur[some, None]
-    off = np.zeros(len(some))
+    normals = np.eye(planes)[plane][:, :, None] * directions[some][:, None]
+    normals = normals.reshape(len(some), -1) * rays.distance[some, None] ** 2
+    design = np.hstack([normals, -np.eye(len(rows))[place]]) / blur[some, None]
+    # One offset of all is nearly the same as other planes: the mean of the rows is 0.
+    centred = np.eye(len(rows)) - 1 / len(rows)
+    solution, kept = _without_outliers(design, distance, _FAR_SIGMAS)
+    offsets = centred @ solution[3 * planes :]
+    nearer, _ = _without_outliers(design, distance, _NEAR_SIGMAS)
+    used = design[kept]
+    covariance = _sandwich(used, distance[kept] - used @ solution)[3 * planes :, 3 * planes :]
+    moved = centred @ nearer[3 * planes :] - offsets
+    replicates = [
+        centred @ np.linalg.lstsq(design[rest], distance[rest], rcond=None)[0][3 * planes :]
+        for rest in (kept & (plane != number) for number in range(planes))
+    ]
+    spread = np.diag(centred @ covariance @ centred) + moved**2
+    spread += (planes - 1) * np.var(replicates, axis=0)
+    estimates = zip(rows.tolist(), offsets, spread, strict=True)
+    return {row: Estimate.of(*estimate) for row, *estimate in estimates}
+
+
+def _without_outliers(design: Floats, values: Floats, sigmas: float) -> tuple[Floats, Bools]:
+    """Solve least squares without residuals beyond some standard deviations.
+
+    Returns the solution, and which equations (k,) are used.
+    """
+    off = np.zeros(len(values))
     for _ in range(4):
-        kept = np.abs(off) <= 4 * 1.4826 * np.median(np.abs(off))
-        solved = np.linalg.lstsq(design[kept], distance[kept], rcond=None)[0]
-        off, used = distance - design @ solved, design[kept]
-    # One offset of all is nearly the same as other planes: the mean of the rings is 0.
-    centred = np.hstack([np.zeros((len(rows), planes.shape[1])), np.eye(len(rows)) - 1 / len(rows)])
-    spread = np.diag(centred @ _sandwich(used, off[kept]) @ centred.T)
-    found = zip(rows.tolist(), centred @ solved, spread, strict=True)
-    return {row: Estimate.of(*one) for row, *one in found}
+        kept = np.abs(off) <= sigmas * 1.4826 * np.median(np.abs(off))
+        solution = np.linalg.lstsq(design[kept], values[kept], rcond=None)[0]
+        off = values - design @ solution
+    return solution, kept
 
 
 def _planes(points: Floats) -> Ints:

@@ -371,8 +371,11 @@ def _of_ouster(path: Path, name: str, sensor: str | None, light: str | None) -> 
             columns[one.lower()] = scan.field(one)[ring, column]
         return place(scan)[ring, column], columns, None
 
+    def times() -> Iterator[float]:
+        return (float(scan.timestamp[scan.timestamp > 0].min(initial=0)) for scan in scans())
+
     white = _WHITE if light in (None, "reflectivity") else None
-    return _streamed(name, scans, points, light, white=white)
+    return _streamed(name, scans, points, light, white=white, times=times)
 
 
 def _of_velodyne(path: Path, name: str, light: str | None) -> Recording:
@@ -395,7 +398,11 @@ def _of_velodyne(path: Path, name: str, light: str | None) -> Recording:
         return _places(columns), columns, None
 
     packets = partial(decoder.read_pcap, str(path), as_pcl_structs=True)
-    return _streamed(name, packets, points, light, white=None if light else _WHITE)
+
+    def times() -> Iterator[float]:
+        return (1e9 * sweep.stamp.host for sweep in packets())
+
+    return _streamed(name, packets, points, light, white=None if light else _WHITE, times=times)
 
 
 def _streamed(

@@ -15,7 +15,7 @@ from lidarsim.base.arrays import AnyArray, Ints, Ints32
 from lidarsim.base.errors import LidarError
 from lidarsim.columns.cloud import Cloud, CloudLike
 from lidarsim.sensor import Sensor
-from lidarsim.sweeps.sweeps import MIXED_UP, Fired, Sweeps, plain_names
+from lidarsim.sweeps.sweeps import AS_FIRED, COMPENSATED, MIXED_UP, Fired, Sweeps, plain_names
 
 from . import pieces, reading
 from .boxes import Boxes
@@ -105,8 +105,9 @@ class Pieces(pieces.Pieces):
     In a data set, `images/JOB/NAME/000000.npz`. Arrays are images, (channels, firings): `range`
     and all columns of the points of first returns, and with the number of the return behind the
     name (`range2`) of others; of all rays `time`, `azimuth` and `elevation`; `x`, `y` and `z` in
-    metres in the sensor's axes when the sweep began. Beside these, `scan` of each firing, and
-    `pose` (4, 4), from the sensor's axes when the sweep began to the world's.
+    metres in the sensor's axes when the sweep began. Beside these, `scan` of each firing, `pose`
+    (4, 4), from the sensor's axes when the sweep began to the world's, and `frame`, the axes of the
+    points in words.
     """
 
     def __init__(self, cloud: CloudLike, sweeps: Sweeps, entry: Entry | None = None) -> None:
@@ -123,12 +124,13 @@ class Pieces(pieces.Pieces):
         columns = {name: values for name, values in columns.items() if name not in _OF_RAYS}
         columns |= dict(zip("xyz", inside.T, strict=True))
         arrays: dict[str, Any] = image.of_rays()
+        arrays["pose"] = sweeps.pose.matrix(number)
+        arrays["frame"] = np.array(AS_FIRED if sweeps.coordinates == "sensor" else COMPENSATED)
         for name, values in columns.items():
             for plane, made in enumerate(image.filled(values)):
                 if (key := _key(name, plane)) in arrays:
                     raise LidarError(f"Two arrays of an image would be {key!r}: rename one.")
                 arrays[key] = made
-        arrays["pose"] = sweeps.pose.matrix(number)
         boxes = Boxes.of(sweeps, number, points) if sweeps.actors and self.entry else None
         return {_file(sweeps, self.folders, number): packed(arrays)}, boxes
 
@@ -144,7 +146,7 @@ class Reader(reading.Reader):
         """Return the points of a sweep, in the order of their rays."""
         file = self.files(sweep)[0]
         with open_archive(self.place.path(file), partial(self.place.read, file)) as images:
-            del images["pose"], images["scan"]
+            del images["pose"], images["scan"], images["frame"]
         planes = next(n for n in count(1) if _key("range", n) not in images)
         further = {_key(name, plane) for name in images for plane in range(1, planes)}
         there = ~np.isnan(np.stack([images[_key("range", plane)] for plane in range(planes)]))

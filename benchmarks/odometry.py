@@ -1,0 +1,152 @@
+"""Plays a bag of a drive through KISS-ICP, with its deskewing on and off.
+
+python -m benchmarks.odometry [--quick] [--sweeps 64] [--model ouster/os1-64]
+
+A car drives along a street of the generated city and turns left. A bag holds each point in the
+sensor's axes at its firing, as drivers publish it; KISS-ICP (Vizzo et al., 2023) estimates the
+motion and moves the points of a sweep to its end. The table has the distances of these points from
+their true positions. With deskewing they are small only if the bag's points are not compensated.
+
+It needs KISS-ICP (pip install kiss-icp) and lidarpool[ros].
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import tempfile
+from dataclasses import replace
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from lidarpool import Mounted, Pose, Scene, Survey, Track, load_sensor, save_cloud
+from lidarscenes.procedural.city import city
+from lidarsim.columns.cloud import Cloud
+from lidarsim.columns.table import SCAN
+from lidarsim.simulator.batch import columns_of
+from lidarsim.simulator.rig import Rig
+from lidarsim.sweeps.sweeps import Sweeps
+
+SPEED_MPS, RADIUS_M, STRAIGHT_M = 6.0, 9.0, 14.0
+RAMP_M = 3.0  # half of the path on which the curvature begins and ends
+STEP_S = 0.05  # between poses of the track
+SWEEP_S, STEPS_PER_SWEEP = 0.1, 36  # of the sensors at 10 Hz
+HEIGHT_M = 1.9  # of the sensor above the ground
+VOXEL_M, MAX_RANGE_M = 1.0, 200.0
+WARM_UP = 6  # sweeps in which KISS-ICP knows no motion yet
+
+
+class Distances(NamedTuple):
+    """Distances of deskewed points from their true positions, metres."""
+
+    median: float
+    percentile_95: float
+
+
+def left_turn(duration_s: float) -> Track:
+    """Make a drive at constant speed: straight ahead, a left turn by 90°, and straight ahead."""
+    times_s = np.arange(0, duration_s + 2 * STEP_S, STEP_S)
+    turned = STRAIGHT_M + RADIUS_M * np.pi / 2
+    corners = np.add.outer((STRAIGHT_M, turned), (-RAMP_M, RAMP_M)).ravel()
+    yaw_rate = np.interp(
+        SPEED_MPS * times_s, corners, np.array([0, 1, 1, 0]) * SPEED_MPS / RADIUS_M
+    )
+    yaw = np.cumsum(yaw_rate) * STEP_S
+    zero = np.zeros_like(yaw)
+    velocity = SPEED_MPS * np.stack([np.cos(yaw), np.sin(yaw), zero], axis=1)
+    positions = np.cumsum(velocity, axis=0) * STEP_S + (-20.0, -3.0, 0.0)
+    quaternions = np.stack([zero, zero, np.sin(yaw / 2), np.cos(yaw / 2)], axis=1)
+    return Track(times_s, positions, quaternions, smooth=True)
+
+
+def survey_of(model: str, sweeps: int) -> Survey:
+    """Make the survey of a sensor on a car, with some sweeps."""
+    sensor = load_sensor(model)
+    track = left_turn(sweeps * SWEEP_S + SWEEP_S)
+    return Survey(
+        sensors=[Mounted(sensor, Pose((0, 0, HEIGHT_M)), "lidar")],
+        trajectory=track,
+        steps=STEPS_PER_SWEEP * sweeps,
+        columns=("time", "intensity"),
+        precision_m=1e-4,
+    )
+
+
+def cloud_of(survey: Survey, scene: Scene) -> Cloud:
+    """Cast a survey in this process."""
+    rig = Rig(scene, survey, "embree")
+    part = columns_of(list(rig.cast(0, survey.scan_count)))
+    cloud = part.cloud((SCAN, *survey.stored_columns[3:]), survey.precision_m, scene.origin)
+    sweeps = Sweeps.of(survey, scene)
+    return replace(cloud, sweeps=lambda: sweeps)
+
+
+def true_points(survey: Survey, cloud: Cloud) -> list[Any]:
+    """Return the points of each sweep in the sensor's axes at the end of the sweep, (n, 3) each."""
+    sweeps = cloud.sweeps()
+    points = []
+    for number, sweep in enumerate(sweeps.points(cloud)):
+        end = survey.path.pose(0, float(sweeps.ends_ns[number]))
+        sensor = end.then(survey.carried[0].mount)
+        points.append((sweep.positions - np.array(sensor.position)) @ sensor.turn)
+    return points
+
+
+def distances(bag: Path, expected: list[Any], *, deskew: bool) -> Distances:
+    """Play a bag through KISS-ICP, and compare the points of its sweeps with the expected ones."""
+    from kiss_icp.config.parser import load_config
+    from kiss_icp.datasets.rosbag import RosbagDataset
+    from kiss_icp.kiss_icp import KissICP
+
+    config = load_config(None)
+    config.data.deskew = deskew
+    config.data.max_range = MAX_RANGE_M
+    config.data.min_range = 0.0
+    config.mapping.voxel_size = VOXEL_M
+    odometry = KissICP(config)
+    data = RosbagDataset(bag, "/lidar/points")
+    errors_m = []
+    for number in range(len(data)):
+        points, _ = odometry.register_frame(*data[number])
+        if number >= WARM_UP:
+            errors_m.append(np.linalg.norm(np.asarray(points) - expected[number], axis=1))
+    return Distances(*np.quantile(np.concatenate(errors_m), (0.5, 0.95)).tolist())
+
+
+def measured(model: str, sweeps: int, triangles: int) -> dict[bool, Distances]:
+    """Simulate a drive, write the drive as a bag, and play it: {whether deskewed: distances}."""
+    survey = survey_of(model, sweeps)
+    cloud = cloud_of(survey, city(triangles))
+    expected = true_points(survey, cloud)
+    with tempfile.TemporaryDirectory() as folder:
+        bag = Path(folder) / "drive"
+        save_cloud(cloud, bag, format="rosbag2")
+        return {deskew: distances(bag, expected, deskew=deskew) for deskew in (True, False)}
+
+
+def main(arguments: list[str] | None = None) -> int:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--quick", action="store_true", help="a toy size, for tests")
+    parser.add_argument("--sweeps", type=int, default=64)
+    parser.add_argument("--model", default="ouster/os1-64")
+    given = parser.parse_args(arguments)
+    if find_spec("kiss_icp") is None:
+        print("This needs KISS-ICP: pip install kiss-icp.", file=sys.stderr)
+        return 1
+    if given.quick:
+        given.sweeps = 14
+        given.model = "velodyne/vlp16"
+    results = measured(given.model, given.sweeps, 20_000 if given.quick else 200_000)
+    print("| deskewing | median, m | 95 %, m |")
+    print("|---|--:|--:|")
+    for deskew, errors in results.items():
+        words = "on" if deskew else "off"
+        print(f"| {words} | {errors.median:.4f} | {errors.percentile_95:.4f} |")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
