@@ -22,6 +22,8 @@ from raybeam import backend_build
 T = TypeVar("T")
 
 PACKAGES = ("lidarpool", "lidarscenes", "lidarsim", "lidarview", "poolpart", "raybeam")
+# Files beside a package in a checkout, which an installed package lacks.
+_OF_DISTRIBUTION = ("pyproject.toml", "README.md", "LICENSE")
 IMPORTED = time.time()  # in a forked worker, when the fork server imported it
 CLOCKS_S = 5.0  # clocks of a file server and of this machine may differ by so much
 
@@ -100,7 +102,7 @@ def _files_of(package: str) -> Iterator[tuple[str, Path]]:
     root = Path(spec.submodule_search_locations[0])
     files = {path.relative_to(root).as_posix(): path for path in root.rglob("*") if path.is_file()}
     for name in sorted(files):
-        if "__pycache__" not in files[name].parts:
+        if "__pycache__" not in files[name].parts and name not in _OF_DISTRIBUTION:
             yield f"{package}/{name}", files[name]
 
 
