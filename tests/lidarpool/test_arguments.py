@@ -49,6 +49,8 @@ from lidarpool import (
     save_cloud,
     simulate,
     sweeps,
+    to_dask,
+    to_open3d,
 )
 from lidarpool.run.options import RunKeywords, RunOptions
 from lidarpool.scenario.sections import PoolSection
@@ -152,6 +154,11 @@ WRONG = {
         (SCENE, Survey(poses=AT), (25, 25), "Planning(("),
     ],
     sweeps: [(3, "place is 3"), ("nowhere", "no data set of lidarpool")],
+    to_dask: [
+        (3, "points is 3"),
+        (Cloud(POINTS, {}), "it must be a StoredCloud"),
+    ],
+    to_open3d: [(3, "cloud is 3"), ("a.ply", "it must be a Cloud")],
 }
 
 

@@ -28,6 +28,7 @@ from lidarsim.sensor.disc import SUBRAYS, Beam
 from lidarsim.sensor.ray_sensors import PrismSensor
 from lidarsim.sensor.sensor import LineSensor
 from lidarsim.simulator.rig import Rig
+from raybeam import pattern_rays
 
 
 def plane(point, normal, size=4000.0):
@@ -268,7 +269,7 @@ def test_ranges_on_a_slanted_plane_scatter_by_the_second_moment(profile, lean_de
     survey = Survey(Sensor(Beams(np.zeros(1)), Spin(1, 360)), poses=[(0, 0, 0)], returns=returns)
     (pulses,) = (rig := rig_of([mesh], survey))._pulses
     beams = pulses.emitter.divided(rig.pattern(0, 0, 1))
-    _, directions = beams.rays(np.arange(61), (0, 0, 0))
+    _, directions = pattern_rays(beams, np.arange(61), (0, 0, 0))
     spread = rig._caster.caster.cast(np.zeros((61, 3)), directions).distance
     assert spread.std() == pytest.approx(50 * math.tan(lean) * 2e-3 / 4, rel=0.01)
 

@@ -148,6 +148,7 @@ def test_no_workers_are_started_in_a_task(cluster_client):
     task = cluster_client.submit(run, resources={"OTHER": 1}, pure=False)
     with pytest.raises(LidarError, match="which in a task of Dask cannot be done: give client"):
         task.result(timeout=300)
+    task.release()  # the error has frames that hold it
 
 
 def test_one_that_is_left_early_leaves_nothing(client, left_over):

@@ -6,11 +6,13 @@ from typing import Any
 
 import numpy as np
 
+from lidarsim.base.validation import checked
 from lidarsim.columns.cloud import Cloud
 
 from ..base.open3d_module import load_open3d
 
 
+@checked
 def to_open3d(cloud: Cloud) -> Any:
     """Return an `open3d.t.geometry.PointCloud` of all columns, by their names in files.
 
