@@ -19,9 +19,10 @@ from .arrays import AnyArray
 from .errors import LidarError, explained, prefixed
 from .input_files import read_input
 
-# Head of an array of numbers in format 1.0 of NumPy, after ten bytes with its length at their end.
+# Head of an array of numbers or text in format 1.0 of NumPy, after ten bytes that end with its
+# length.
 _HEADER = re.compile(
-    rb"\{'descr': '([<>|][a-zV]\d+)', 'fortran_order': (False|True), "
+    rb"\{'descr': '([<>|][a-zUV]\d+)', 'fortran_order': (False|True), "
     rb"'shape': \(((?:\d+, ?)*\d*)\), \} *\n"
 )
 _AGAIN = "get it again, or read it on a machine with more memory"
@@ -89,14 +90,14 @@ def _content(data: bytes, entry: zipfile.ZipInfo) -> bytes | memoryview:
 
 
 def read_npy(content: bytes | memoryview, name: str) -> AnyArray:
-    """Read an array of numbers from the content of a file of NumPy; errors as of `read_arrays`.
+    """Read an array of numbers or text from a file of NumPy; errors as of `read_arrays`.
 
     Archives are read by several threads. NumPy's reader parses headers with `ast`, which failed now
     and then in threads of Python 3.11: "AST constructor recursion depth mismatch".
     """
     start = 10 + int.from_bytes(content[8:10], "little")
     if (header := _HEADER.fullmatch(content, 10, start)) is None:
-        raise ValueError(f"{name} is not an array of numbers")
+        raise ValueError(f"{name} is not an array of numbers or text")
     kind = np.dtype(header[1].decode())
     shape = tuple(int(count) for count in header[3].split(b",") if count.strip())
     data = bytearray(memoryview(content)[start:])

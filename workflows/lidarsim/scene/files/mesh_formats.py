@@ -8,6 +8,7 @@ here imports these packages. Endings that no table has are looked up among plug-
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from functools import cache
@@ -213,9 +214,14 @@ def plugin_of(path: str | Path) -> Plugin | None:
     return None if _row(ending, _formats_read()) else _plugin_of_ending(ending)
 
 
-@cache
 def _plugin_of_ending(ending: str) -> Plugin | None:
-    return find_plugin(GROUP, ending) if ending else None
+    return _installed_plugin(ending, tuple(sys.path)) if ending else None
+
+
+@cache
+def _installed_plugin(ending: str, folders: tuple[str, ...]) -> Plugin | None:
+    """Return the plug-in of an ending among the distributions in `folders`, which is `sys.path`."""
+    return find_plugin(GROUP, ending)
 
 
 def _row_of_plugin(plugin: Plugin) -> MeshFormat:
