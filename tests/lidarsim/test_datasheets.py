@@ -11,7 +11,7 @@ import yaml
 from click.testing import CliRunner
 from tests.shapes import beam_along_x, cast, wall
 
-from lidarpool import (  # fmt: skip
+from lidarpool import (
     LidarError,
     Material,
     Mounted,
