@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import os
+import time
 from collections.abc import Mapping
 from pathlib import Path
+
+BEFORE_ANY_PROCESS_S = time.time() - 86_400.0
 
 
 def write_distribution(
@@ -25,4 +29,6 @@ def write_distribution(
         file = folder / path
         file.parent.mkdir(parents=True, exist_ok=True)
         file.write_text(text)
+        # A process that started before its sources changed does not know which of them it runs.
+        os.utime(file, (BEFORE_ANY_PROCESS_S, BEFORE_ANY_PROCESS_S))
     return folder

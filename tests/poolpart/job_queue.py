@@ -58,6 +58,12 @@ class Queue:
             for worker_name in names
         ]
 
+    async def release(self) -> None:
+        """Start the jobs that wait, and from now on each job at once."""
+        self.held = False
+        for number in list(self.waiting):
+            await self.begin(number)
+
     async def close(self, job: Any, number: str, command: str) -> None:
         if number in self.waiting:
             self.cancelled.append(self.waiting.pop(number))

@@ -184,7 +184,7 @@ def test_a_worker_whose_job_was_cancelled_too_late_gets_no_task(queue, wait_unti
         client.sync(queue.begin, number)
         wait_until(lambda: not scheduler.workers)
         assert not task.done()
-        queue.held = False
+        client.sync(queue.release)  # another job may have been submitted by now
         gpu.adapt(0, 2, idle_s=IDLE_S)
         assert task.result(LONG_S) == "GPU-1"
 
