@@ -122,7 +122,8 @@ class RayCaster:
         engine = choose(backend)
         self._scene, self._transforms = check_instances(instances)
         self._engine = engine(self._scene, threads, device)
-        self._moved, self._lock = False, threading.Lock()
+        self._moved = False
+        self._lock = threading.Lock()
 
     def __repr__(self) -> str:
         many = f" in {self.instance_count} instances" if self._scene.nested else ""

@@ -63,7 +63,9 @@ class Poses:
     def of(self, ray: Ints, room: Floats) -> RayPoses:
         """Look up the poses of rays (m,), into `room`, (18, m)."""
         pose = ray // self.rays
-        delay, rates, velocities = np.zeros(1), None, None
+        delay = np.zeros(1)
+        rates = None
+        velocities = None
         if self.motion is not None:
             delay = self.motion.delays.take(ray - pose * self.rays)
             velocities = self._each(self.motion.velocities, pose, room[12:15])
@@ -102,7 +104,8 @@ class RayPoses:
         """
         if self.rotations is not None:
             x, y, z = vectors
-            vectors, product = np.empty_like(vectors), np.empty_like(x)
+            vectors = np.empty_like(vectors)
+            product = np.empty_like(x)
             for out, (a, b, c) in zip(vectors, self.rotations.reshape(3, 3, -1), strict=True):
                 np.multiply(x, a, out=out)
                 out += np.multiply(y, b, out=product)

@@ -129,7 +129,8 @@ class Groups:
     """
 
     def __init__(self, begins: Ints, every: int) -> None:
-        self._begins, self.every = begins, every
+        self._begins = begins
+        self.every = every
         self.hits = np.zeros(len(begins), np.int64)  # of each group, so far
 
     def spans(self, start: int, stop: int) -> tuple[slice, Ints]:

@@ -11,7 +11,9 @@ from lidarsim.simulator.ways import Ways
 class Circle:
     """A user's own."""
 
-    stations, moves, duration_ns = 1, True, np.inf
+    stations = 1
+    moves = True
+    duration_ns = np.inf
 
     def poses(self, station, times_ns):
         angle = times_ns / 1e9
@@ -71,7 +73,9 @@ def test_a_trajectory_may_give_lists_or_one_pose_for_all(as_lists):
     """As NumPy would take them."""
 
     class Still:
-        stations, moves, duration_ns = 1, True, np.inf
+        stations = 1
+        moves = True
+        duration_ns = np.inf
 
         def poses(self, station, times_ns):
             if as_lists:

@@ -96,7 +96,11 @@ def read_legs(
 
 def flown(legs: Sequence[Leg]) -> Way:
     """Go straight from each leg to the next, each at its speed, and turn on the spot."""
-    rows, stretches, clock, here, yaw = [], [], 0.0, legs[0].place, _FACING_Y_DEG
+    rows = []
+    stretches = []
+    clock = 0.0
+    here = legs[0].place
+    yaw = _FACING_Y_DEG
     for leg, after in pairwise(legs):
         way = after.place - here
         length = float(np.linalg.norm(way))
@@ -111,7 +115,8 @@ def flown(legs: Sequence[Leg]) -> Way:
         there = here + way * (seconds * speed / length)
         rows += [[clock, *here, yaw], [clock + seconds, *there, yaw]]
         stretches.append(Stretch(leg.number, leg.active, clock, seconds))
-        clock, here = clock + seconds + _BETWEEN_S, there
+        clock = clock + seconds + _BETWEEN_S
+        here = there
     if not rows:
         raise LidarError("its platform moves, and no two legs are at different places.")
     rows.append([clock + _AFTER_S, *here, yaw])
@@ -120,7 +125,9 @@ def flown(legs: Sequence[Leg]) -> Way:
 
 def stood(legs: Sequence[Leg], heads: dict[int, float]) -> Way:
     """Stand at each leg until its head has turned: {number of a leg: seconds}."""
-    rows, stretches, clock = [], [], 0.0
+    rows = []
+    stretches = []
+    clock = 0.0
     for leg in legs:
         if not leg.active:
             continue

@@ -71,7 +71,8 @@ def velocities_of_ends(
     triangle: Ints32, times: Floats | Ints,
 ) -> Floats:  # fmt: skip
     """Return the velocities of where rays end, m/s: (n, 3); arguments as of `radial_velocities`."""
-    directions, out = rays[1], np.empty(rays[1].shape)
+    directions = rays[1]
+    out = np.empty(rays[1].shape)
     origins = np.broadcast_to(rays[0], out.shape)
     for begin in range(0, len(out), BLOCK_HITS):
         block = slice(begin, begin + BLOCK_HITS)

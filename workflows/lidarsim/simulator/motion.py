@@ -38,7 +38,8 @@ class Clock:
         """Return the firing times of rays (n,): (n,)."""
         from . import surface_loops  # not before: numba takes half a second to import
 
-        out, tables = np.empty(len(ray)), (owned(self.begins), owned(self.delays))
+        out = np.empty(len(ray))
+        tables = (owned(self.begins), owned(self.delays))
         surface_loops.times(owned(ray, np.int64), self.start, self.subrays, *tables, out)
         return out
 
@@ -100,7 +101,8 @@ class Poses:
 
     def part(self, start: int, stop: int, subrays: int) -> Poses:
         """Poses of the sub-rays of rays `start` to `stop`; `start` is the first of a pose."""
-        each, motion = self.rays_per_pose, self.motion
+        each = self.rays_per_pose
+        motion = self.motion
         clock, carrier = (
             None if one is None else replace(one, start=start, subrays=subrays)
             for one in (self.clock, self.carrier)
@@ -179,7 +181,8 @@ def poses_of_firings(
     positions = raybeam.poses.by_number(positions)
     turns = np.broadcast_to(np.eye(3), (len(times), 3, 3)) if turns is None else turns
     turns = raybeam.poses.by_number(turns)
-    spins, rotations = sensor.spins(firings[:-1]), turns[:-1]
+    spins = sensor.spins(firings[:-1])
+    rotations = turns[:-1]
     if spins is not None:
         mount = carried.mount
         if any(mount.position):
@@ -209,7 +212,8 @@ def spun(rotations: Floats, spins: Floats) -> Floats:
     """Products of matrices (k, 3, 3) and turns about z, their cosines and sines (2, k)."""
     (cos, sin), out = spins, np.empty((3, 3, spins.shape[1])).transpose(2, 0, 1)
     for row in range(3):
-        x, y = rotations[:, row, 0], rotations[:, row, 1]
+        x = rotations[:, row, 0]
+        y = rotations[:, row, 1]
         out[:, row, 0] = x * cos + y * sin
         out[:, row, 1] = y * cos - x * sin
     out[:, :, 2] = rotations[:, :, 2]
@@ -223,7 +227,8 @@ def _turned_by(before: Floats, after: Floats) -> Floats:
     """
     out = np.empty((3, len(before))).T
     for axis in range(3):
-        one, other = (axis + 1) % 3, (axis + 2) % 3
+        one = (axis + 1) % 3
+        other = (axis + 2) % 3
         cross = before[:, one] * after[:, other] - before[:, other] * after[:, one]
         out[:, axis] = ((cross[:, 0] + cross[:, 1]) + cross[:, 2]) / 2
     return out

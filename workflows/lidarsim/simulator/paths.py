@@ -133,8 +133,10 @@ class CastStep(PulseStep):
 
     def __init__(self, setup: Setup, caster: SceneCaster, surfaces: Surfaces) -> None:
         super().__init__(setup, caster, surfaces)
-        survey, sensor = setup.survey, setup.sensor
-        self._light, self._seed = light_of(survey, sensor), setup.noise.seed
+        survey = setup.survey
+        sensor = setup.sensor
+        self._light = light_of(survey, sensor)
+        self._seed = setup.noise.seed
         table = surfaces.at(sensor.optics.wavelength_nm)
         filled = table.leafy.any() or table.refracts.any()
         air = self._light.extinction

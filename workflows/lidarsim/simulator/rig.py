@@ -66,7 +66,9 @@ class Rig:
     def _assemble(
         self, scene: Scene, survey: Survey, options: dict[str, Any], like: SceneCaster | None
     ) -> None:
-        self.scene, self.survey, self.options = scene, survey, options
+        self.scene = scene
+        self.survey = survey
+        self.options = options
         self._ways = Ways.of(scene.actors)
         wavelengths = {carried.sensor.optics.wavelength_nm for carried in survey.carried}
         self._surfaces = Surfaces(scene, tuple(survey.materials), sorted(wavelengths))
@@ -155,7 +157,8 @@ class Rig:
         """Rays of firings `first` to `stop` of a sensor, in the axes of its carrier."""
         firings = np.arange(first, stop, dtype=np.int64)
         carried = self.survey.carried[number]
-        mount, origins = carried.mount, carried.sensor.origins(firings)
+        mount = carried.mount
+        origins = carried.sensor.origins(firings)
         directions = turned(carried.sensor.directions(firings).reshape(-1, 3), mount.rotation)
         if origins is not None:
             origins = turned(origins.reshape(-1, 3), mount.rotation)
@@ -184,11 +187,13 @@ class Rig:
         The carrier is `late_ns` further on its path than the firings' own times say. Hits of each
         triangle are counted if `tally`.
         """
-        number, survey = specs[0].sensor, self.survey
+        number = specs[0].sensor
+        survey = self.survey
         whole, by_head = self._repeated(number, path.moves)
         carried = survey.carried[number]
         channels = carried.sensor.channels
-        first, stop = specs[0].firings[0], specs[-1].firings[1]
+        first = specs[0].firings[0]
+        stop = specs[-1].firings[1]
         if path.moves or by_head:
             poses = poses_of_firings(carried, path, specs[0].station, first, stop, late_ns)
         else:
@@ -201,9 +206,11 @@ class Rig:
             carrier = Clock(begins, carried.sensor.beams.time_ns, Ways((path,)))
             poses = replace(poses, carrier=carrier, station=specs[0].station)
         if whole is not None:
-            pattern, start = whole, first * channels % len(whole)
+            pattern = whole
+            start = first * channels % len(whole)
         else:
-            pattern, start = self.pattern(number, first, stop), 0
+            pattern = self.pattern(number, first, stop)
+            start = 0
         window = (start, start + (stop - first) * channels)
         groups = np.array([spec.firings[0] - first for spec in specs]) * channels
         if self._device is not None:
@@ -230,7 +237,8 @@ class Rig:
         """
         number = specs[0].sensor
         sensor = self.survey.carried[number].sensor
-        first, stop = specs[0].firings[0], specs[-1].firings[1]
+        first = specs[0].firings[0]
+        stop = specs[-1].firings[1]
         pattern = self._rays_of(number, first, stop)
         begin_rays = np.array([spec.firings[0] - first for spec in specs]) * sensor.channels
         rays = len(pattern)
@@ -257,7 +265,8 @@ class Rig:
         """Rays of some firings in the axes of the carrier."""
         sensor = self.survey.carried[number].sensor
         if sensor.period:
-            first, stop = first % sensor.period, first % sensor.period + stop - first
+            stop = first % sensor.period + stop - first
+            first = first % sensor.period
         made = self._firings.get((number, first, stop))
         if made is None:
             if len(self._firings) >= KEPT:

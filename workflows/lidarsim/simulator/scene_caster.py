@@ -67,7 +67,8 @@ class SceneCaster:
     def __init__(
         self, scene: Scene, surfaces: Surfaces, like: SceneCaster | None = None, **options: Any
     ) -> None:
-        self._surfaces, self._shared = surfaces, scene.instances
+        self._surfaces = surfaces
+        self._shared = scene.instances
         self._begins: Ints32 | None = None  # of each body of the caster
         self._faces = faces = len(scene.faces)
         if self._shared is not None:
@@ -92,7 +93,8 @@ class SceneCaster:
         first = self.caster.instance_count - len(shared)
         for row in rows:
             self.caster.move(first + int(row), shared.transforms[row])
-        self._surfaces, self._shared = surfaces, shared
+        self._surfaces = surfaces
+        self._shared = shared
 
     def counters(self) -> tuple[Ints, int]:
         """Return counters of bodies as `RayCaster.visit` takes them, see `Scene.counters`."""
@@ -131,7 +133,9 @@ class SceneCaster:
         found = self.caster.scan(pattern, **common)
         if self._begins is not None:
             found = replace(found, triangle=found.triangle + self._begins[found.instance])
-        ray, distance, triangle = found.ray.astype(np.int64), found.distance, found.triangle
+        ray = found.ray.astype(np.int64)
+        distance = found.distance
+        triangle = found.triangle
         if self._shapes is not None:
             scan = check_scan(pattern, **common)
             ray, distance, triangle = self._with_actors(found, scan, poses)
@@ -146,7 +150,9 @@ class SceneCaster:
         if keep_every > 1:
             place = np.arange(len(ray)) - np.repeat(cuts[:-1], counts)
             kept = np.flatnonzero(place % keep_every == 0)
-            ray, distance, triangle = ray[kept], distance[kept], triangle[kept]
+            ray = ray[kept]
+            distance = distance[kept]
+            triangle = triangle[kept]
         none = np.zeros(len(ray), np.int32)
         return ScanReturns(ray.astype(np.uint32), distance, triangle, counts, counted, none)
 
@@ -170,7 +176,8 @@ class SceneCaster:
         before = np.full(len(scan), np.inf)
         before[found.ray] = found.distance
         on, numbers = self._nearest(scan, poses, before)
-        ray, distance = np.empty(len(scan), np.int64), np.empty(len(scan))
+        ray = np.empty(len(scan), np.int64)
+        distance = np.empty(len(scan))
         triangle = np.empty(len(scan), np.int32)
         given = found.ray, found.triangle, *on, *numbers
         count = surface_loops.merge(*given, ray, distance, triangle)
@@ -180,7 +187,8 @@ class SceneCaster:
         """Find the nearest hits of rays on actors."""
         hits, (parts, shape, firsts) = self._nearest(scan, poses)
         ray = np.flatnonzero(hits.body >= 0)
-        body, triangle = hits.body[ray], hits.triangle[ray]
+        body = hits.body[ray]
+        triangle = hits.triangle[ray]
         triangle = triangle + parts[shape[body], hits.instance[ray]] + firsts[body]
         return OtherHits(ray.astype(np.uint32), hits.distance[ray], triangle)
 

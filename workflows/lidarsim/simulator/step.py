@@ -279,7 +279,9 @@ class PulseStep(ABC):
             raise TypeError(f"step {cls.__name__} states no role: set `role` to flags of `Role`")
 
     def __init__(self, setup: Setup, caster: SceneCaster, surfaces: Surfaces) -> None:
-        self.setup, self.caster, self.surfaces = setup, caster, surfaces
+        self.setup = setup
+        self.caster = caster
+        self.surfaces = surfaces
 
     @staticmethod
     @abstractmethod

@@ -95,7 +95,8 @@ class Ways(tuple[Trajectory, ...]):
         """
         from . import surface_loops  # not before: numba takes half a second to import
 
-        tracks, out = self._tracks, np.empty((12, len(number)))
+        tracks = self._tracks
+        out = np.empty((12, len(number)))
         if not len(number):
             return out
         given = owned(number, np.int64), owned(times_ns)
@@ -124,7 +125,8 @@ class Ways(tuple[Trajectory, ...]):
         """
         from . import surface_loops
 
-        number, times = owned(number, np.int64), owned(times_ns)
+        number = owned(number, np.int64)
+        times = owned(times_ns)
         first, run = np.empty((2, len(number)), np.int64)
         some = first[: surface_loops.runs(number, times, first, run)]
         return self.table(number[some], times[some]), run
