@@ -11,9 +11,9 @@ import numpy as np
 from raybeam import (
     Instance,
     Mesh,
-    Motion,
     Opacity,
     Pattern,
+    PoseMotion,
     RayCaster,
     Scan,
     check_scan,
@@ -149,7 +149,7 @@ def moving(here: Here) -> Rows:
     pattern, (positions, rotations) = Pattern(directions), track(len(directions) // beams)
     positions[:, 2] = MIDDLE[2]
     speeds = np.gradient(positions, 1e-4, axis=0)
-    motion = Motion(np.linspace(0, 5e-5, beams), speeds, np.full_like(speeds, 0.3))
+    motion = PoseMotion(np.linspace(0, 5e-5, beams), speeds, np.full_like(speeds, 0.3))
     middle = len(positions) // 2
     scans = {
         "still": check_scan(pattern, positions[middle], rotations[middle]),
@@ -225,7 +225,7 @@ def _different(casters: list[RayCaster], sample: Float, origin: Float) -> dict[s
     spots = origin + 1e-3 * np.arange(len(sample))[:, None]
     turns = np.broadcast_to(turn, (len(spots), 3, 3))
     rates = np.full_like(spots, 0.3)
-    motion = Motion(np.zeros(1) + 2e-5, rates, rates)
+    motion = PoseMotion(np.zeros(1) + 2e-5, rates, rates)
     pattern = Pattern(sample, 0.01 * sample)
     moving = check_scan(pattern, spots, turns, rays_per_pose=1, motion=motion, tally=True)
     for name, scan in {"scan": check_scan(pattern, origin, turn), "moving scan": moving}.items():

@@ -16,7 +16,7 @@ from .device import DeviceHits, OtherHits
 from .hits import Counted, Hits, ScanReturns
 from .instances import Instance, Mesh, check_instances, check_transform, place
 from .pattern import Pattern
-from .poses import Motion, Poses
+from .poses import PoseMotion, Poses
 from .rays import check_rays
 from .registry import choose
 from .scan import Scan, check_scan
@@ -242,7 +242,7 @@ class RayCaster:
         keep_every: int = 1,
         groups: ArrayLike | None = None,
         tally: bool = False,
-        motion: Motion | None = None,
+        motion: PoseMotion | None = None,
         room: Floats | None = None,
     ) -> ScanReturns:
         """Cast a pattern of rays from one pose or from many: the fastest way for a lidar.

@@ -41,7 +41,7 @@ _LIKE = 0.02  # between the cosines of patterns for which the same way is the fa
 _PLANS = 16  # kept
 
 
-class _Way(NamedTuple):
+class _RayGrouping(NamedTuple):
     """How rays are grouped, see `embree_packets`."""
 
     step: int
@@ -50,7 +50,7 @@ class _Way(NamedTuple):
     coherence: float = _COHERENCE
 
 
-_IN_TURN = _Way(1, 16, 1)
+_IN_TURN = _RayGrouping(1, 16, 1)
 
 
 class EmbreeBackend(Backend):
@@ -250,7 +250,7 @@ class EmbreeBackend(Backend):
             plan = self._plans[len(scan.pattern), each] = _Plan(scan, each)
         return plan
 
-    def _cast(self, cast: Cast, start: int, stop: int, way: _Way = _IN_TURN) -> Part:
+    def _cast(self, cast: Cast, start: int, stop: int, way: _RayGrouping = _IN_TURN) -> Part:
         """Hits of rays `start` to `stop`, in their order, numbered from `start`."""
         n = stop - start
         ray = np.empty(n, np.uint32)
@@ -297,27 +297,29 @@ class _Plan:
         self._beams = ref(np.asarray(scan.pattern.directions.base))  # which its copies share
         many = scan.pattern.each
         steps = {1, scan.pattern.step * many, each} - {0}
-        spreads = {step: _spread(scan, _Way(step, 16, 1)) for step in steps}
+        spreads = {step: _spread(scan, _RayGrouping(step, 16, 1)) for step in steps}
         self._step = max(spreads, key=lambda step: spreads[step])
         self._spread = spreads[self._step]
         self.ways = [_IN_TURN]
         if self._spread > _COHERENCE:
-            ways = {_Way(self._step, high, wide) for high, wide in _SHAPES if wide <= self._step}
+            ways = {
+                _RayGrouping(self._step, high, wide) for high, wide in _SHAPES if wide <= self._step
+            }
             if many > 1:  # those of a beam, which differ least, go together
-                ways = {_IN_TURN} | {_Way(step, *_SHAPES[-1]) for step in steps if step > 4}
+                ways = {_IN_TURN} | {_RayGrouping(step, *_SHAPES[-1]) for step in steps if step > 4}
             self.ways = [
                 way
                 for way in sorted(ways)
                 if way.step * way.high <= _MOST and _spread(scan, way) > _COHERENCE
             ] or self.ways
-            self.ways.append(_Way(1, 16, 1, 2.0))
+            self.ways.append(_RayGrouping(1, 16, 1, 2.0))
         self._trials: list[list[float]] = []  # times of each way, as shares of the shortest
 
     def fits(self, scan: Scan) -> bool:
         """Whether the rays of a scan are as close together as those for which this was made."""
         if self._beams() is scan.pattern.directions.base:
             return True
-        return abs(_spread(scan, _Way(self._step, 16, 1)) - self._spread) < _LIKE
+        return abs(_spread(scan, _RayGrouping(self._step, 16, 1)) - self._spread) < _LIKE
 
     def pieces(self, start: int, stop: int) -> Iterator[tuple[int, int, bool]]:
         """Parts of rays `start` to `stop`, and whether to try all ways there."""
@@ -334,7 +336,7 @@ class _Plan:
                 yield start, end, False
             start = end
 
-    def choose(self, cast: Callable[[_Way], object]) -> None:
+    def choose(self, cast: Callable[[_RayGrouping], object]) -> None:
         """Cast a part, which is in the caches by now, in each way; the last time, choose one."""
         ways = self.ways
         marks = [time.perf_counter()]
@@ -349,7 +351,7 @@ class _Plan:
             self.ways = [ways[int(np.median(self._trials, axis=0).argmin())]]
 
 
-def _spread(scan: Scan, way: _Way) -> float:
+def _spread(scan: Scan, way: _RayGrouping) -> float:
     """Mean over some groups of the least cosine between their first ray and some others."""
     lanes = np.array([0, 5, 10, 15])
     lags = way.step * (lanes // way.wide) + lanes % way.wide

@@ -15,7 +15,7 @@ _SLACK = 2e-9  # on products of a rotation's rows
 
 
 @dataclass(frozen=True, eq=False)
-class Motion:
+class PoseMotion:
     """Motion of a lidar while it fires the rays of a pose one after the other.
 
     Parameters
@@ -55,7 +55,7 @@ class Poses:
     positions: Floats
     rotations: Floats | None
     rays: int
-    motion: Motion | None = None
+    motion: PoseMotion | None = None
 
     def __len__(self) -> int:
         return len(self.positions)
@@ -131,7 +131,7 @@ def check_poses(
     rotations: ArrayLike | None,
     rays_per_pose: int | None,
     rays: int,
-    motion: Motion | None = None,
+    motion: PoseMotion | None = None,
 ) -> Poses:
     """Check the poses for so many rays; `RayCaster.scan` describes arguments and errors.
 
@@ -167,17 +167,17 @@ def check_poses(
     )
 
 
-def _check_motion(motion: Motion, poses: int, rays: int) -> Motion:
+def _check_motion(motion: PoseMotion, poses: int, rays: int) -> PoseMotion:
     arrays = []
     for name, shape in (("delays", (rays,)), ("velocities", (poses, 3)), ("rates", (poses, 3))):
         array = by_number(np.asarray(getattr(motion, name), dtype=np.float64))
         if array.shape != shape or not np.isfinite(array).all():
             raise ValueError(
-                f"Motion.{name} must be {shape} finite numbers for {poses:,} poses of {rays:,} "
+                f"PoseMotion.{name} must be {shape} finite numbers for {poses:,} poses of {rays:,} "
                 f"rays; given: {array.shape}."
             )
         arrays.append(array)
-    return Motion(*arrays)
+    return PoseMotion(*arrays)
 
 
 def _check_rotations(rotations: ArrayLike) -> Floats:

@@ -9,10 +9,10 @@ from raybeam import (
     Deforming,
     Instance,
     Mesh,
-    Motion,
     Moving,
     Opacity,
     Pattern,
+    PoseMotion,
     RayCaster,
     check_scan,
     hits_on,
@@ -107,7 +107,7 @@ def scans(kind, rays=RAYS):
         places = np.linspace([-5, 0, 0], [5, 1, 0], firings)
         velocity = np.tile([5.0, 0, 0], (firings, 1))
         rate = np.tile([0, 0, 0.5], (firings, 1))
-        motion = Motion(np.linspace(0, 1e-4, 16), velocity, rate)
+        motion = PoseMotion(np.linspace(0, 1e-4, 16), velocity, rate)
         each = {"rotations": turns, "rays_per_pose": 16, "motion": motion}
     pattern = Pattern(directions, origins)
     scan = check_scan(pattern, places, t_min=0.5, t_max=200, **each)

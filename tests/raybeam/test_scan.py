@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from raybeam import Motion, Pattern, RayCaster, pattern_rays
+from raybeam import Pattern, PoseMotion, RayCaster, pattern_rays
 from raybeam.rays import Rays, unit_directions
 
 TRIANGLE = [[0, 0, 0], [1, 0, 0], [0, 1, 0]], [[0, 1, 2]]
@@ -71,7 +71,7 @@ CASES = {
 
 def motion_of(rng, poses, rays):
     speeds, rates = rng.normal(size=(2, poses, 3))
-    return Motion(rng.uniform(0, 1e-3, rays), 50 * speeds, rates)
+    return PoseMotion(rng.uniform(0, 1e-3, rays), 50 * speeds, rates)
 
 
 def case_of(name, scale=1.0):

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from raybeam import (
-    Motion,
     Moving,
     Pattern,
+    PoseMotion,
     RayCaster,
     SubRays,
     check_scan,
@@ -48,7 +48,7 @@ def poses(rng, kind, rays):
     many = {"positions": rng.normal(scale=0.1, size=(len(turns), 3)), "rotations": turns}
     # It turns so slowly that its directions remain unit vectors, which `cast` leaves as they are.
     velocities, rates = rng.normal(size=(2, len(turns), 3))
-    motion = Motion(rng.uniform(0, 1e-3, 49), velocities, 1e-9 * rates)
+    motion = PoseMotion(rng.uniform(0, 1e-3, 49), velocities, 1e-9 * rates)
     return {**many, "rays_per_pose": 49, "motion": motion if kind == "moves" else None}
 
 

@@ -21,7 +21,7 @@ from ..sensor.optics import LIGHT_M_NS
 from ..sensor.random_numbers import Purpose
 from ..sensor.survey import begin_ns
 from .detection import passes
-from .motion import Clock, Poses
+from .motion import CastPoses, Clock
 from .returns import OF_RETURNS, PulseReturns, merged, numbers, unreal
 from .scene_caster import SceneCaster
 from .step import Memory, PulseBatch, PulseStep, Role, Setup, Sizes
@@ -97,7 +97,7 @@ class CrosstalkStep(PulseStep):
         return merged(returns, others)
 
     def received(
-        self, scan: int, rays: Ints, origins: Floats, directions: Floats, poses: Poses
+        self, scan: int, rays: Ints, origins: Floats, directions: Floats, poses: CastPoses
     ) -> tuple[Indices, Floats, Floats]:
         """Find pulses of other sensors that consecutive rays (n,) receive.
 
@@ -179,7 +179,7 @@ class CrosstalkStep(PulseStep):
         return spot, low, np.minimum(stop[spot], (cell + 1) * CELL_RAYS)
 
     def _spots(
-        self, other: int, station: int, start_ns: int, span: tuple[float, float], poses: Poses
+        self, other: int, station: int, start_ns: int, span: tuple[float, float], poses: CastPoses
     ) -> _Spots:
         """Where the pulses of another sensor hit something, fired within a span of time."""
         carried = self._survey.carried[other]
@@ -199,7 +199,7 @@ class CrosstalkStep(PulseStep):
             ahead = into_axes(ahead, back)
             starts = into_axes(starts, back)
         starts = starts + np.repeat(places, sensor.channels, axis=0)
-        now = Poses(np.zeros(3), clock=Clock(fired + start_ns, np.zeros(1), poses.ways))
+        now = CastPoses(np.zeros(3), clock=Clock(fired + start_ns, np.zeros(1), poses.ways))
         low = sensor.min_range_m
         high = sensor.max_range_m
         found = self.caster.scan(Pattern(ahead, starts), now, t_min=low, t_max=high)

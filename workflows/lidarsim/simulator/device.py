@@ -25,7 +25,7 @@ from ..columns.table import AXES, CHANNEL, OBJECT, TABLE, Column
 from ..scene.scene import Scene
 from ..sensor import ScanSpec, Survey
 from ..sensor.materials import NEAREST_M, REFERENCE_M, RETRO_GAIN
-from .motion import Poses
+from .motion import CastPoses
 from .points import BatchPoints
 from .pulses import Scanned
 from .returns import SURFACE, PulseReturns
@@ -136,7 +136,7 @@ class DeviceColumns:
         self,
         specs: list[ScanSpec],
         pattern: Pattern,
-        poses: Poses,
+        poses: CastPoses,
         window: tuple[int, int],
         groups: Ints,
     ) -> DevicePoints:

@@ -26,11 +26,11 @@ from ..scene.scene import Scene
 from ..sensor.leaves import brightness, projection
 from ..sensor.materials import MaterialTable, fresnel
 from ..sensor.random_numbers import Purpose
-from .motion import Clock, Poses
+from .actor_trajectories import ActorTrajectories
+from .motion import CastPoses, Clock
 from .returns import selected
 from .scene_caster import SceneCaster
 from .surfaces import Surfaces
-from .ways import Ways
 
 LEAF = Purpose(30, "depth of leaves that light gets through")
 CROWN = Purpose(31, "crown of the leaf, of crowns that overlap")
@@ -48,7 +48,7 @@ class Rays(NamedTuple):
     origins: Floats  # (n, 3)
     directions: Floats  # (n, 3)
     times: Floats  # (n,)
-    ways: Ways
+    ways: ActorTrajectories
 
 
 @dataclass
@@ -225,7 +225,7 @@ class Media:
         return found
 
     def _search(
-        self, caster: SceneCaster, origins: Floats, times: Floats, ways: Ways
+        self, caster: SceneCaster, origins: Floats, times: Floats, ways: ActorTrajectories
     ) -> MediaStack:
         """Look upwards: a medium that light leaves without having entered it is around it."""
         surfaces = self._surfaces
@@ -238,7 +238,7 @@ class Media:
             if not len(rows):
                 break
             light = Pattern(np.broadcast_to(up, origins.shape), origins)
-            now = Poses(np.zeros(3), clock=Clock(times, np.zeros(1), ways))
+            now = CastPoses(np.zeros(3), clock=Clock(times, np.zeros(1), ways))
             hits = caster.scan(light, now)
             rows = rows[hits.ray]
             times = times[hits.ray]

@@ -1,4 +1,4 @@
-"""Poses of a carrier at each firing, and its motion until the next."""
+"""CastPoses of a carrier at each firing, and its motion until the next."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ from typing import Any
 import numpy as np
 
 import raybeam.poses
-from raybeam import Motion, Pattern, pattern_rays
+from raybeam import Pattern, PoseMotion, pattern_rays
 
 from ..base.arrays import Floats, Indices, Integers, Ints, owned
 from ..base.vectors import into_axes, matmul
 from ..sensor import Mounted, ScanSpec, Sensor, Trajectory
 from ..sensor.trajectory import velocities
-from .ways import Ways
+from .actor_trajectories import ActorTrajectories
 
 RING = 16  # neighbours along a ring
 
@@ -30,7 +30,7 @@ class Clock:
 
     begins: Floats  # (f,): of each firing
     delays: Floats  # (m,): of each ray of a firing
-    ways: Ways  # of the actors, or that of the carrier
+    ways: ActorTrajectories  # of the actors, or that of the carrier
     start: int = 0  # first ray
     subrays: int = 1  # of each ray
 
@@ -60,19 +60,21 @@ class Firings:
 
     def times(self, ray: Integers) -> Ints:
         """Return the firing times of rays (n,), nanoseconds since the survey's start: (n,)."""
-        clock = Clock(self.sensor.begins_ns(self.numbers), self.sensor.beams.time_ns, Ways())
+        clock = Clock(
+            self.sensor.begins_ns(self.numbers), self.sensor.beams.time_ns, ActorTrajectories()
+        )
         times = clock.of(ray)
         return self.spec.start_ns + np.rint(times, out=times).astype(np.int64)
 
 
 @dataclass(frozen=True)
-class Poses:
-    """Poses of rays for `RayCaster.scan`: of the sensor's head, or else of its carrier."""
+class CastPoses:
+    """CastPoses of rays for `RayCaster.scan`: of the sensor's head, or else of its carrier."""
 
     positions: Floats
     rotations: Floats | None = None
     rays_per_pose: int | None = None
-    motion: Motion | None = None
+    motion: PoseMotion | None = None
     clock: Clock | None = None
     by_head: bool = False
     carrier: Clock | None = None  # if it moves; for its velocities
@@ -91,16 +93,16 @@ class Poses:
         }
 
     @property
-    def ways(self) -> Ways:
+    def ways(self) -> ActorTrajectories:
         """Trajectories of the actors."""
-        return Ways() if self.clock is None else self.clock.ways
+        return ActorTrajectories() if self.clock is None else self.clock.ways
 
     def times(self, ray: Integers) -> Floats:
         """Return firing times of rays, nanoseconds since the survey's start; for actors."""
         return np.zeros(len(ray)) if self.clock is None else self.clock.of(ray)
 
-    def part(self, start: int, stop: int, subrays: int) -> Poses:
-        """Poses of the sub-rays of rays `start` to `stop`; `start` is the first of a pose."""
+    def part(self, start: int, stop: int, subrays: int) -> CastPoses:
+        """CastPoses of the sub-rays of rays `start` to `stop`; `start` is the first of a pose."""
         each = self.rays_per_pose
         motion = self.motion
         clock, carrier = (
@@ -112,7 +114,7 @@ class Poses:
         poses = slice(start // each, -(-stop // each))
         if motion is not None:
             late = np.repeat(motion.delays, subrays)
-            motion = Motion(late, motion.velocities[poses], motion.rates[poses])
+            motion = PoseMotion(late, motion.velocities[poses], motion.rates[poses])
         rotations = None if self.rotations is None else self.rotations[poses]
         return replace(
             self,
@@ -162,8 +164,8 @@ def check_trajectory(path: Trajectory) -> None:
 
 def poses_of_firings(
     carried: Mounted, path: Trajectory, station: int, first: int, stop: int, late_ns: float = 0.0
-) -> Poses:
-    """Poses of a sensor's beams in firings `first` to `stop`.
+) -> CastPoses:
+    """CastPoses of a sensor's beams in firings `first` to `stop`.
 
     If a head turns all beams, they are poses of the head, and the rays of one firing serve for
     all. Else they are poses of the carrier.
@@ -199,13 +201,13 @@ def poses_of_firings(
         places = places + into_axes(centre, rotations.transpose(0, 2, 1))
     delays = (sensor.beams.time_ns - sensor.lead_ns) / 1e9
     if not path.moves or not delays.any():
-        return Poses(places, rotations, sensor.channels, by_head=spins is not None)
+        return CastPoses(places, rotations, sensor.channels, by_head=spins is not None)
     seconds = np.diff(times)[:, None] / 1e9
     seconds[seconds == 0] = np.inf  # a last firing at the very end: it stands
     velocities = np.diff(positions, axis=0) / seconds
     rates = _turned_by(turns[:-1], turns[1:]) / seconds
-    motion = Motion(delays, velocities, rates)
-    return Poses(places, rotations, sensor.channels, motion, by_head=spins is not None)
+    motion = PoseMotion(delays, velocities, rates)
+    return CastPoses(places, rotations, sensor.channels, motion, by_head=spins is not None)
 
 
 def spun(rotations: Floats, spins: Floats) -> Floats:

@@ -23,7 +23,7 @@ from ..sensor.optics import LIGHT_M_NS
 from ..sensor.random_numbers import normal
 from ..sensor.reflectivity import COUNTS, SCALES
 from .doppler import VELOCITY, radial_velocities
-from .motion import Firings, Poses
+from .motion import CastPoses, Firings
 from .paths import GHOST
 from .pulses import Scanned
 from .returns import made
@@ -50,7 +50,7 @@ class BatchPoints:
         found: Scanned,  # rays are numbered from 0 at the first firing
         pattern: Pattern,
         start: int,  # number of ray 0 within the pattern
-        poses: Poses,
+        poses: CastPoses,
     ) -> None:
         self.scene = scene
         self.survey = survey

@@ -15,7 +15,7 @@ from ..base.arrays import Ints, owned
 from ..scene.scene import Scene
 from ..sensor import Survey
 from .doppler import radial_velocities
-from .motion import Firings, Poses
+from .motion import CastPoses, Firings
 from .returns import NO_SURFACE, Keys, PulseReturns, joined, made
 from .scene_caster import SceneCaster
 from .step import Emitter, PulseBatch, PulseStep, Role
@@ -49,7 +49,7 @@ class PulseCaster:
         self,
         scan: int,
         pattern: Pattern,
-        poses: Poses,
+        poses: CastPoses,
         window: tuple[int, int],
         groups: Ints,
         firings: Firings,

@@ -17,13 +17,13 @@ from ..base.vectors import turned
 from ..scene.actors import Actor
 from ..scene.scene import Scene
 from ..sensor import Pose, ScanSpec, Sensor, Survey, Trajectory
+from .actor_trajectories import ActorTrajectories
 from .device import DeviceColumns, DevicePoints
-from .motion import Clock, Firings, Poses, check_trajectory, poses_of_firings
+from .motion import CastPoses, Clock, Firings, check_trajectory, poses_of_firings
 from .points import BatchPoints
 from .pulses import PulseCaster
 from .scene_caster import SceneCaster
 from .surfaces import Surfaces
-from .ways import Ways
 
 PATTERN_RAYS = 20_000_000  # rays of a head's period that are kept; 24 bytes each
 IMAGE_RAYS = 1 << 20  # rays of images that are cast at a time
@@ -69,7 +69,7 @@ class Rig:
         self.scene = scene
         self.survey = survey
         self.options = options
-        self._ways = Ways.of(scene.actors)
+        self._ways = ActorTrajectories.of(scene.actors)
         wavelengths = {carried.sensor.optics.wavelength_nm for carried in survey.carried}
         self._surfaces = Surfaces(scene, tuple(survey.materials), sorted(wavelengths))
         self._caster = SceneCaster(scene, self._surfaces, like, **options)
@@ -110,7 +110,7 @@ class Rig:
         """Return the same rig with other trajectories of the actors; the trees are shared."""
         rig = copy(self)
         rig.scene = self.scene.with_actors(actors)
-        rig._ways = Ways.of(actors)
+        rig._ways = ActorTrajectories.of(actors)
         return rig
 
     def check_actors(self, begin_ns: float, end_ns: float) -> None:
@@ -198,12 +198,12 @@ class Rig:
             poses = poses_of_firings(carried, path, specs[0].station, first, stop, late_ns)
         else:
             pose = path.pose(specs[0].station)
-            poses = Poses(np.array(pose.position), pose.rotation)
+            poses = CastPoses(np.array(pose.position), pose.rotation)
         fired = Firings.of(carried.sensor, specs)
         poses = self._timed(poses, fired)
         if path.moves:
             begins = carried.sensor.begins_ns(fired.numbers) + late_ns
-            carrier = Clock(begins, carried.sensor.beams.time_ns, Ways((path,)))
+            carrier = Clock(begins, carried.sensor.beams.time_ns, ActorTrajectories((path,)))
             poses = replace(poses, carrier=carrier, station=specs[0].station)
         if whole is not None:
             pattern = whole
@@ -219,7 +219,7 @@ class Rig:
         found = self._pulses[number].scan(scan, pattern, poses, window, groups, fired, tally=tally)
         return BatchPoints(self.scene, survey, self._surfaces, specs, found, pattern, start, poses)
 
-    def _timed(self, poses: Poses, fired: Firings) -> Poses:
+    def _timed(self, poses: CastPoses, fired: Firings) -> CastPoses:
         """Return poses of firings with the times that actors need."""
         if not self.scene.actors:
             return poses
@@ -248,7 +248,9 @@ class Rig:
             block = slice(begin, begin + each)
             image = out[block].reshape(-1)
             count = len(image) // rays
-            poses = Poses(positions[block], None if rotations is None else rotations[block], rays)
+            poses = CastPoses(
+                positions[block], None if rotations is None else rotations[block], rays
+            )
             fired = Firings.of(sensor, specs, count)
             poses = self._timed(poses, fired)
             groups = (rays * np.arange(count)[:, None] + begin_rays).reshape(-1)

@@ -35,9 +35,9 @@ from ..base.words import did_you_mean
 from ..scene.actors import Actor, shapes_of
 from ..scene.scene import Scene
 from ..scene.scene_instances import Instances, MeshPart, parts_of
-from .motion import Clock, Poses
+from .actor_trajectories import ActorTrajectories
+from .motion import CastPoses, Clock
 from .surfaces import Surfaces
-from .ways import Ways
 
 AUTO_TAKES = "Backend 'auto' takes one that works."
 SHORT = 1e-3  # of the distance: a ray that ends so much before a point has reached it
@@ -111,7 +111,7 @@ class SceneCaster:
     def scan(
         self,
         pattern: Pattern,
-        poses: Poses,
+        poses: CastPoses,
         *,
         window: tuple[int, int] | None = None,
         t_min: float = 0.0,
@@ -157,18 +157,23 @@ class SceneCaster:
         return ScanReturns(ray.astype(np.uint32), distance, triangle, counts, counted, none)
 
     def free(
-        self, origins: Floats, towards: Floats, distance: Floats, times: Floats, ways: Ways
+        self,
+        origins: Floats,
+        towards: Floats,
+        distance: Floats,
+        times: Floats,
+        ways: ActorTrajectories,
     ) -> Bools:
         """Whether nothing stands before points (n, 3), seen from origins, at times (n,)."""
         free = np.ones(len(distance), np.bool_)
         if len(distance):
-            now = Poses(np.zeros(3), clock=Clock(times, np.zeros(1), ways))
+            now = CastPoses(np.zeros(3), clock=Clock(times, np.zeros(1), ways))
             found = self.scan(Pattern(towards / distance[:, None], origins), now)
             free[found.ray] = found.distance > distance[found.ray] * (1 - SHORT)
         return free
 
     def _with_actors(
-        self, found: ScanReturns, scan: Scan, poses: Poses
+        self, found: ScanReturns, scan: Scan, poses: CastPoses
     ) -> tuple[Ints, Floats, Ints32]:
         """Rays, distances and triangles of all hits, those on actors among them."""
         from . import surface_loops  # not before: numba takes half a second to import
@@ -183,7 +188,7 @@ class SceneCaster:
         count = surface_loops.merge(*given, ray, distance, triangle)
         return ray[:count], distance[:count], triangle[:count]
 
-    def on_actors(self, scan: Scan, poses: Poses) -> OtherHits:
+    def on_actors(self, scan: Scan, poses: CastPoses) -> OtherHits:
         """Find the nearest hits of rays on actors."""
         hits, (parts, shape, firsts) = self._nearest(scan, poses)
         ray = np.flatnonzero(hits.body >= 0)
@@ -193,7 +198,7 @@ class SceneCaster:
         return OtherHits(ray.astype(np.uint32), hits.distance[ray], triangle)
 
     def _nearest(
-        self, scan: Scan, poses: Poses, before: Floats | None = None
+        self, scan: Scan, poses: CastPoses, before: Floats | None = None
     ) -> tuple[Nearest, tuple[Ints32, Indices, Ints32]]:
         """Nearest hits on actors, before distances (n,), and what makes their triangles' numbers.
 

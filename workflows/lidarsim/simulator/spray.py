@@ -19,13 +19,13 @@ from ..columns.table import CAUSES
 from ..scene.actors import check_spray
 from ..sensor.random_numbers import Purpose
 from ..sensor.weather import FAINTEST, LARGE, reach, spray
+from .actor_trajectories import ActorTrajectories
 from .air import exponential, in_the_air, random_keys, reached, room_for_hits, seen_by_range
 from .motion import along_rings
 from .returns import OF_RETURNS, PulseReturns, joined, made, unreal
 from .scene_caster import SceneCaster
 from .step import Memory, PulseBatch, PulseStep, Role, Setup, Sizes
 from .surfaces import Surfaces
-from .ways import Ways
 
 if TYPE_CHECKING:
     from .spray_loops import Crossings
@@ -153,7 +153,9 @@ class SprayStep(PulseStep):
             place[crossings.beam[:count]], owned(crossings.spans[:, :count])
         )
 
-    def _boxes(self, ways: Ways, begin: float, end: float) -> tuple[Floats, Floats, Floats]:
+    def _boxes(
+        self, ways: ActorTrajectories, begin: float, end: float
+    ) -> tuple[Floats, Floats, Floats]:
         """Boxes of spray, and when they are there, as of `near_boxes`; their densities (b,)."""
         numbers = np.arange(math.floor(begin / BOX_NS) - BOXES, math.floor(end / BOX_NS) + 1)
         some = np.array([number for number in self._raising if ways[number].moves], np.int64)

@@ -20,8 +20,8 @@ from ..scene.scene import Scene
 from ..sensor import Sensor, Survey
 from ..sensor.materials import NEAR_NM, Material, MaterialTable, at_right_angles, first_matches
 from ..sensor.trajectory import velocities
+from .actor_trajectories import ActorTrajectories
 from .voxels import Grids
-from .ways import Ways
 
 _log = logging.getLogger(__name__)
 
@@ -153,7 +153,7 @@ class Surfaces:
         to_kept = owned(self._to_kept, np.int64)
         return begins, owned(self.owners, np.int32), owner, firsts, to_kept, self._standing
 
-    def normals(self, triangle: Integers, times: Floats | Ints, ways: Ways) -> Floats:
+    def normals(self, triangle: Integers, times: Floats | Ints, ways: ActorTrajectories) -> Floats:
         """Return the unit normals of triangles (n,): (n, 3), in single precision.
 
         Those of actors are rotated by the pose on their ways at the times (n,), nanoseconds.
@@ -166,7 +166,7 @@ class Surfaces:
         directions: Floats,
         table: MaterialTable,
         times: Floats | Ints,
-        ways: Ways,
+        ways: ActorTrajectories,
     ) -> tuple[Floats, Floats, Ints32, Floats]:
         """Return normals (3, n), products with directions, kinds of surfaces, light sent back."""
         from . import surface_loops  # not before: numba takes half a second to import
@@ -196,7 +196,7 @@ class Surfaces:
         distance: Floats,
         light: Light,
         times: Floats | Ints,
-        ways: Ways,
+        ways: ActorTrajectories,
         colours: UInts32 | None = None,
     ) -> Lit:
         """How rays (n,) with unit directions (n, 3) meet triangles; others as of `energy`."""
@@ -218,7 +218,7 @@ class Surfaces:
         return Lit(normals.T, along, kinds, back, film)
 
     def _bent(
-        self, rows: Indices, actors: Integers, times: Floats | Ints, ways: Ways
+        self, rows: Indices, actors: Integers, times: Floats | Ints, ways: ActorTrajectories
     ) -> tuple[Floats, Floats, Floats]:
         """Corners of triangles of actors that deform, at times, their velocities, and at rest.
 
@@ -237,7 +237,7 @@ class Surfaces:
             rest[own] = mesh.vertices[vertex]
         return corners, speeds, rest
 
-    def _on_actors(self, triangle: Integers, ways: Ways) -> tuple[Indices, Integers]:
+    def _on_actors(self, triangle: Integers, ways: ActorTrajectories) -> tuple[Indices, Integers]:
         """Rows of triangles (n,) that belong to actors, and to which; none without `ways`."""
         if not ways:
             return _NONE, _NONE
@@ -245,7 +245,7 @@ class Surfaces:
         return rows, self.objects(triangle[rows]) - self._standing
 
     def colours(
-        self, triangle: Integers, points: Floats, times: Floats | Ints, ways: Ways
+        self, triangle: Integers, points: Floats, times: Floats | Ints, ways: ActorTrajectories
     ) -> UInts32:
         """Colours of points (n, 3) on triangles (n,), packed; others as for `normals`."""
         if self._lookup is None:
@@ -256,7 +256,9 @@ class Surfaces:
             out[block] = self._colours(triangle[block], points[block], times[block], ways)
         return out
 
-    def _colours(self, triangle: Integers, points: Floats, times: Any, ways: Ways) -> UInts32:
+    def _colours(
+        self, triangle: Integers, points: Floats, times: Any, ways: ActorTrajectories
+    ) -> UInts32:
         assert self._lookup is not None
         rows, _, which = self._find(triangle)
         on = np.flatnonzero(which >= 0)
@@ -277,7 +279,7 @@ class Surfaces:
         return self._lookup.at(rows, points)
 
     def velocities(
-        self, triangle: Integers, points: Floats, times: Floats | Ints, ways: Ways
+        self, triangle: Integers, points: Floats, times: Floats | Ints, ways: ActorTrajectories
     ) -> Floats:
         """Velocities of points (n, 3) on triangles (n,), m/s: (n, 3); others as for `normals`."""
         out = np.zeros((len(triangle), 3))
