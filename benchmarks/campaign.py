@@ -55,7 +55,8 @@ class Samples:
         self.driver: list[float] = []
         self.lidar: list[float] = []
         self.seconds = 0.0
-        self._me, self._worker = psutil.Process(), psutil.Process(lidar)
+        self._me = psutil.Process()
+        self._worker = psutil.Process(lidar)
         self._next = 0.0
 
     @property
@@ -87,7 +88,8 @@ def measure(jobs: int, rays: int, layers: int, folder: Path) -> tuple[dict[str, 
         pids = client.run(lambda dask_worker: (dask_worker.state.total_resources, os.getpid()))
         lidar = next(pid for resources, pid in pids.values() if resources.get("LIDAR"))
         casting = sum(bool(resources.get(GPU)) for resources, _ in pids.values())
-        samples, used = Samples(lidar), time.process_time()
+        samples = Samples(lidar)
+        used = time.process_time()
         run = campaign.run(folder / "dataset", client=client, on_progress=samples)
         used = time.process_time() - used
     wall = samples.seconds

@@ -67,8 +67,11 @@ _here: ContextVar[str] = ContextVar("_here", default="")  # address at this end 
 @contextmanager
 def counting() -> Iterator[Counted]:
     """Count what this process sends and receives while the body runs."""
-    counted, to_frames, from_frames = Counted(), tcp.to_frames, tcp.from_frames
-    read, write = tcp.TCP.read, tcp.TCP.write
+    counted = Counted()
+    to_frames = tcp.to_frames
+    from_frames = tcp.from_frames
+    read = tcp.TCP.read
+    write = tcp.TCP.write
 
     async def sent(message: Any, *args: Any, **kwargs: Any) -> Any:
         frames = await to_frames(message, *args, **kwargs)
@@ -123,7 +126,9 @@ def count_bytes(scans: int) -> None:
             f"{sum(work[side].values()) / 1e6:.2f} MB in and out of the scheduler, the scene's "
             f"among them, and {upkeep / 1e6:.2f} MB of heartbeats and set-up"
         )
-    one, more, points = work["every 5th point"], work["twice the scans"], work["all points"]
+    one = work["every 5th point"]
+    more = work["twice the scans"]
+    points = work["all points"]
     for kind, count in (more - one).most_common(5):
         print(f"    {kind:24} {count / scans:6.1f} bytes a further scan")
     added = (sum(more.values()) - sum(one.values())) / scans

@@ -22,7 +22,10 @@ from lidarscenes.procedural.city import city
 from lidarscenes.procedural.plants import all_trees, placed
 from lidarsim.scene.scene_mesh import SceneMesh
 
-SWEEPS, COLUMNS, LAYERS, FARTHEST_M = 12, 360, 16, 120.0
+SWEEPS = 12
+COLUMNS = 360
+LAYERS = 16
+FARTHEST_M = 120.0
 PLACES = ("room", "street", "hall", "forest")
 
 
@@ -59,14 +62,23 @@ def place(name: str, seed: int) -> tuple[Scene, tuple[float, float, float]]:
         at = at[np.hypot(*at[:, :2].T) > 2.5]
         trees = all_trees(0, 0.2)
         kind = rng.integers(0, len(trees), len(at))
-        yaw, scale = rng.uniform(0, 2 * np.pi, len(at)), rng.uniform(0.6, 1.2, len(at))
+        yaw = rng.uniform(0, 2 * np.pi, len(at))
+        scale = rng.uniform(0.6, 1.2, len(at))
         return Scene.from_meshes([ground, *placed(trees, kind, at, yaw, scale)]), (0, 0, 1.6)
     if name == "room":
-        x, y, z = rng.uniform(5, 9), rng.uniform(4, 7), rng.uniform(2.4, 3.2)
-        things, size, height = 8, 0.8, 1.2
+        x = rng.uniform(5, 9)
+        y = rng.uniform(4, 7)
+        z = rng.uniform(2.4, 3.2)
+        things = 8
+        size = 0.8
+        height = 1.2
     else:
-        x, y, z = rng.uniform(30, 60), rng.uniform(18, 35), rng.uniform(7, 10)
-        things, size, height = 24, 2.5, 5.0
+        x = rng.uniform(30, 60)
+        y = rng.uniform(18, 35)
+        z = rng.uniform(7, 10)
+        things = 24
+        size = 2.5
+        height = 5.0
     meshes = [box("shell", (-x / 2, -y / 2, 0), (x / 2, y / 2, z))]
     for number in range(things):
         a, b = rng.uniform(-0.45, 0.45, 2) * (x, y)
@@ -108,7 +120,8 @@ def recorded(
         arrays = dict(np.load(cache))
 
     def read(number: int) -> Any:
-        points, channel = arrays[f"points{number}"], arrays[f"channel{number}"]
+        points = arrays[f"points{number}"]
+        channel = arrays[f"channel{number}"]
         ranges = np.linalg.norm(points, axis=1)
         errors = np.broadcast_to(bias, LAYERS)[channel]
         columns = {"channel": channel, "intensity": arrays[f"intensity{number}"]}

@@ -47,7 +47,8 @@ def make(folder, points):
     survey = Survey(Sensor.grid(360, 4), trajectory=track, steps=36 * TURNS, columns=COLUMNS)
     Sweeps.of(survey, Scene.seed()).save(folder / "sweeps.npz")
     rng = np.random.default_rng(1)
-    scan, around = np.arange(points) * (36 * TURNS) // points, np.arange(points) * 1e-3
+    scan = np.arange(points) * (36 * TURNS) // points
+    around = np.arange(points) * 1e-3
     places = np.stack([50 * np.cos(around), 50 * np.sin(around), rng.uniform(0, 5, points)], 1)
     columns = {"scan": scan, "channel": rng.integers(0, 64, points), "object": scan // 9 % 7}
     columns |= {"time": scan * 2_777_777, "class": scan // 9 % 5}
@@ -58,18 +59,21 @@ def make(folder, points):
 
 def export(name, folder, out):
     """Export as `lidarpool export` does."""
-    cloud, sweeps = CloudFile(folder / "cloud.ply"), Sweeps.load(folder / "sweeps.npz")
+    cloud = CloudFile(folder / "cloud.ply")
+    sweeps = Sweeps.load(folder / "sweeps.npz")
     Format(name).write(out, cloud, sweeps)
 
 
 def las(rows, out):
-    header, names = laspy.LasHeader(version="1.4", point_format=6), rows.dtype.names[3:]
+    header = laspy.LasHeader(version="1.4", point_format=6)
+    names = rows.dtype.names[3:]
     header.scales = np.full(3, 0.001)
     more = [name for name in names if name != "intensity"]
     header.add_extra_dims([laspy.ExtraBytesParams(name, rows.dtype[name]) for name in more])
     data = laspy.LasData(header)
     data.xyz = np.stack([rows[axis] for axis in "xyz"], axis=1)
-    data.intensity, data.gps_time = rows["intensity"] * 65_535, rows["time"] / 1e9
+    data.intensity = rows["intensity"] * 65_535
+    data.gps_time = rows["time"] / 1e9
     for name in more:
         data[name] = rows[name]
     data.write(out, do_compress=out.suffix == ".laz")
@@ -87,14 +91,16 @@ def e57(rows, out):
 
 
 def mcap(rows, out):
-    store, kind = get_typestore(Stores.ROS2_HUMBLE), "sensor_msgs/msg/PointCloud2"
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    kind = "sensor_msgs/msg/PointCloud2"
     stamp = store.types["builtin_interfaces/msg/Time"](0, 0)
     header = store.types["std_msgs/msg/Header"](stamp, "lidar")
     point = np.dtype([(n, "f4") for n in ("x", "y", "z", "intensity", "time")] + [("ring", "u2")])
     with Writer(out, version=9, storage_plugin=StoragePlugin.MCAP) as bag:
         topic = bag.add_connection("/points", kind, typestore=store)
         for number, turn in enumerate(np.array_split(rows, TURNS)):
-            packed, size = turn[list(point.names)].astype(point).view("u1"), len(turn)
+            packed = turn[list(point.names)].astype(point).view("u1")
+            size = len(turn)
             message = store.types[kind](header, 1, size, [], False, 22, 22 * size, packed, True)
             bag.write(topic, number, store.serialize_cdr(message, kind))
 
@@ -128,7 +134,8 @@ def script(name, folder, out):
 
 def measured(write, *given):
     """Processor seconds of a call in this process, and the most memory in MB."""
-    most, done = [0], threading.Event()
+    most = [0]
+    done = threading.Event()
 
     def watch():
         while not done.wait(0.02):

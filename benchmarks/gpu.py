@@ -140,7 +140,8 @@ def measured(name: str, sizes: Sizes, folder: str) -> Iterator[dict[str, Any]]:
     """Measure a section in this process: its rows so far, again and again."""
     module, seconds = SECTIONS[name]
     rows: dict[str, Any] = {}
-    before, end = clocks(), time.monotonic() + seconds
+    before = clocks()
+    end = time.monotonic() + seconds
     try:
         section = getattr(importlib.import_module(f".{module}", __package__), name)
         cupy = choose("cuda")._library()  # type: ignore[attr-defined]
@@ -208,7 +209,8 @@ def main(arguments: list[str] | None = None) -> int:
         print(f"Nothing was measured: {reason}.", file=sys.stderr)
         return 2
     options = ["--folder", chosen.folder, *(["--quick"] if chosen.quick else [])]
-    end, results = time.monotonic() + chosen.seconds, {}
+    end = time.monotonic() + chosen.seconds
+    results = {}
 
     def keep(name: str, rows: dict[str, Any]) -> None:
         results[name] = rows

@@ -15,7 +15,9 @@ from typing import Any
 
 import numpy as np
 
-_LEAST, _MOST = 3, 50  # times that something is measured
+# times that something is measured
+_LEAST = 3
+_MOST = 50
 _CLOCKS = ("clocks.sm", "clocks.mem", "temperature.gpu", "power.draw", "pcie.link.gen.current")
 
 
@@ -59,7 +61,8 @@ def milliseconds(here: Here, launch: Callable[[], object]) -> dict[str, float]:
     launch()
 
     def once() -> float:
-        start, stop = events(), events()
+        start = events()
+        stop = events()
         start.record()
         launch()
         stop.record()
@@ -85,7 +88,8 @@ def wall_milliseconds(here: Here, call: Callable[[], object]) -> dict[str, float
 
 
 def _repeated(here: Here, once: Callable[[], float]) -> dict[str, float]:
-    end, times = time.monotonic() + here.sizes.seconds, [once()]
+    end = time.monotonic() + here.sizes.seconds
+    times = [once()]
     while len(times) < _LEAST or (len(times) < _MOST and time.monotonic() < end):
         times.append(once())
     return {"ms": statistics.median(times), "least_ms": min(times), "greatest_ms": max(times)}
@@ -122,8 +126,10 @@ def pinned(cupy: Any, count: int) -> Any:
 
 def to_pinned(here: Here) -> float:
     """GB/s of a plain copy from the device to page-locked memory: all that the bus gives."""
-    cupy, count = here.cupy, here.sizes.copied
-    array, out = cupy.zeros(count, np.uint8), pinned(cupy, count)
+    cupy = here.cupy
+    count = here.sizes.copied
+    array = cupy.zeros(count, np.uint8)
+    out = pinned(cupy, count)
     stream = cupy.cuda.get_current_stream()
     copy = milliseconds(here, lambda: array.get(stream=stream, out=out, blocking=False))
     return count / copy["ms"] / 1e6
@@ -131,7 +137,8 @@ def to_pinned(here: Here) -> float:
 
 def device(here: Here) -> Iterator[tuple[str, dict[str, Any]]]:
     """Tell what the device is, and how fast it copies."""
-    cupy, count = here.cupy, here.sizes.copied
+    cupy = here.cupy
+    count = here.sizes.copied
     runtime = cupy.cuda.runtime
     about = runtime.getDeviceProperties(cupy.cuda.Device().id)
     major, minor = divmod(runtime.driverGetVersion(), 1000)
@@ -149,12 +156,11 @@ def device(here: Here) -> Iterator[tuple[str, dict[str, Any]]]:
             "date": time.strftime("%Y-%m-%d"),
         },
     )
-    array, plain, source = (
-        cupy.zeros(count, np.uint8),
-        np.zeros(count, np.uint8),
-        pinned(cupy, count),
-    )
-    other, stream = cupy.empty_like(array), cupy.cuda.get_current_stream()
+    array = cupy.zeros(count, np.uint8)
+    plain = np.zeros(count, np.uint8)
+    source = pinned(cupy, count)
+    other = cupy.empty_like(array)
+    stream = cupy.cuda.get_current_stream()
     calls = {
         "from pinned": (milliseconds, lambda: array.set(source, stream=stream)),
         "to touched": (wall_milliseconds, lambda: array.get(out=plain)),

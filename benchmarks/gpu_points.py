@@ -66,7 +66,9 @@ def timed(rig: Rig, rays: int, seconds: float) -> dict[str, Any]:
     """Make batches for so many seconds."""
     made = batches(rig, rays)
     part = next(made)()
-    times, points, start = [], 0, time.perf_counter()
+    times = []
+    points = 0
+    start = time.perf_counter()
     while len(times) < 3 or time.perf_counter() - start < seconds:
         began = time.perf_counter()
         points += len(next(made)())
@@ -84,8 +86,10 @@ def timed(rig: Rig, rays: int, seconds: float) -> dict[str, Any]:
 @contextmanager
 def watched(cupy: Any, rig: Rig) -> Iterator[Split]:
     """Take the times of kernels and of copies of columns."""
-    split, engine = Split(cupy), rig._caster.caster._engine
-    run, kernel = engine._run, lidarsim.simulator.device._kernel  # type: ignore[attr-defined]
+    split = Split(cupy)
+    engine = rig._caster.caster._engine
+    run = engine._run  # type: ignore[attr-defined]
+    kernel = lidarsim.simulator.device._kernel
     send = Outbox.send
 
     def running(name: str, *given: Any) -> None:
@@ -114,8 +118,10 @@ def watched(cupy: Any, rig: Rig) -> Iterator[Split]:
 
 def columns(here: Here) -> Rows:
     """Points a second into host memory: a plain survey, larger batches, and ten actors."""
-    sizes, bus = here.sizes, to_pinned(here)
-    scene, plain = city(sizes.cities[-1]), survey(sizes)
+    sizes = here.sizes
+    bus = to_pinned(here)
+    scene = city(sizes.cities[-1])
+    plain = survey(sizes)
     rig = Rig(scene, plain, "cuda")
     for name, rays in {"plain": sizes.batch, "larger batches": 8 * sizes.batch}.items():
         row = timed(rig, rays, 3 * sizes.seconds)
@@ -127,7 +133,8 @@ def columns(here: Here) -> Rows:
             yield f"chunks of {chunk:,} rays", timed(rig, sizes.batch, sizes.seconds)
     with watched(here.cupy, rig) as split:
         count = 10
-        made, start = batches(rig, sizes.batch), time.perf_counter()
+        made = batches(rig, sizes.batch)
+        start = time.perf_counter()
         for _ in range(count):
             next(made)()
         wall = 1e3 * (time.perf_counter() - start) / count
@@ -137,7 +144,8 @@ def columns(here: Here) -> Rows:
     yield "every fifth point", timed(Rig(scene, fifth, "cuda"), sizes.batch, sizes.seconds)
     row = timed(Rig(traffic(scene), plain, "cuda"), sizes.batch, 3 * sizes.seconds)
     yield "ten actors", row
-    few, turn = city(min(sizes.cities)), plain.scan_count // 2
+    few = city(min(sizes.cities))
+    turn = plain.scan_count // 2
     rigs = (Rig(few, plain, backend) for backend in ("cuda", "numpy"))
     mine, other = (columns_of(list(rig.cast(turn, turn + 1))) for rig in rigs)
     wrong = sum(int((mine.columns[n] != other.columns[n]).sum()) for n in other.columns)
@@ -165,7 +173,8 @@ def durable(here: Here) -> Rows:
 
 def _written(here: Here, rig: Rig, storage: Storage, threads: int) -> dict[str, float]:
     """Cast in this thread, and make and write parts in others, as collectors do."""
-    room, sizes = threading.Semaphore(2 * threads), []
+    room = threading.Semaphore(2 * threads)
+    sizes = []
 
     def write(part: PartColumns, name: str) -> None:
         try:
@@ -175,7 +184,9 @@ def _written(here: Here, rig: Rig, storage: Storage, threads: int) -> dict[str, 
         finally:
             room.release()
 
-    made, points, written = batches(rig, here.sizes.batch), 0, []
+    made = batches(rig, here.sizes.batch)
+    points = 0
+    written = []
     next(made)()
     start = time.perf_counter()
     with ThreadPoolExecutor(threads) as pool:
@@ -197,9 +208,11 @@ def sharing(here: Here) -> Rows:
         both = [pool.submit(timed, rig, here.sizes.batch, here.sizes.seconds) for _ in range(2)]
         yield "2 threads", {"mpoints_s": sum(found.result()["mpoints_s"] for found in both)}
     del rig
-    context, totals = multiprocessing.get_context(START), []
+    context = multiprocessing.get_context(START)
+    totals = []
     for count in (1, 2):
-        barrier, out = context.Barrier(count), context.Queue()
+        barrier = context.Barrier(count)
+        out = context.Queue()
         started = [
             context.Process(target=_share, args=(here.sizes, barrier, out)) for _ in range(count)
         ]
@@ -235,7 +248,8 @@ def run(here: Here) -> Rows:
             result = simulate(
                 city(here.sizes.cities[-1]), given, backend="cuda", folder=Path(folder) / "run"
             )
-            wall, points = time.perf_counter() - start, len(result.points)
+            wall = time.perf_counter() - start
+            points = len(result.points)
             row = {"rays": result.rays, "points": points, "wall_s": wall}
             row["mpoints_s"] = points / result.survey_seconds / 1e6
             row["grays_s"] = result.rays / result.survey_seconds / 1e9

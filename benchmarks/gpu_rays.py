@@ -11,9 +11,9 @@ import numpy as np
 from raybeam import (
     Instance,
     Mesh,
-    Motion,
     Opacity,
     Pattern,
+    PoseMotion,
     RayCaster,
     Scan,
     check_scan,
@@ -99,7 +99,8 @@ def built(mesh: Faces) -> tuple[RayCaster, dict[str, Any]]:
     """Make a caster: NumPy checks the mesh and makes the tree."""
     start = time.perf_counter()
     caster = RayCaster(*mesh, backend="cuda")
-    took, tables = time.perf_counter() - start, caster._engine._meshes  # type: ignore[attr-defined]
+    took = time.perf_counter() - start  # type: ignore[attr-defined]
+    tables = caster._engine._meshes
     size = sum(table.nbytes for table in tables) / caster.face_count
     return caster, {"triangles": caster.face_count, "seconds": took, "bytes_a_triangle": size}
 
@@ -127,7 +128,8 @@ def kernels(here: Here) -> Rows:
 
 def brute_force(here: Here, caster: RayCaster, directions: Float) -> dict[str, float]:
     """Rate of every ray against every triangle, on so many rays that it takes a moment."""
-    cupy, engine = here.cupy, caster._engine
+    cupy = here.cupy
+    engine = caster._engine
     triangles = engine._meshes[1]  # type: ignore[attr-defined]
     n = int(np.clip(4e10 / caster.face_count, 1024, len(directions)))
     part = cupy.asarray(np.ascontiguousarray(directions[:n]))
@@ -141,12 +143,13 @@ def brute_force(here: Here, caster: RayCaster, directions: Float) -> dict[str, f
 
 def moving(here: Here) -> Rows:
     """Compare a pose for each firing, and motion within each, with a pose for each revolution."""
-    caster, beams = RayCaster(*city(here.sizes.cities[-1]), backend="cuda"), 128
+    caster = RayCaster(*city(here.sizes.cities[-1]), backend="cuda")
+    beams = 128
     directions = beam_directions(beams, here.sizes.rays * here.sizes.poses)
     pattern, (positions, rotations) = Pattern(directions), track(len(directions) // beams)
     positions[:, 2] = MIDDLE[2]
     speeds = np.gradient(positions, 1e-4, axis=0)
-    motion = Motion(np.linspace(0, 5e-5, beams), speeds, np.full_like(speeds, 0.3))
+    motion = PoseMotion(np.linspace(0, 5e-5, beams), speeds, np.full_like(speeds, 0.3))
     middle = len(positions) // 2
     scans = {
         "still": check_scan(pattern, positions[middle], rotations[middle]),
@@ -222,7 +225,7 @@ def _different(casters: list[RayCaster], sample: Float, origin: Float) -> dict[s
     spots = origin + 1e-3 * np.arange(len(sample))[:, None]
     turns = np.broadcast_to(turn, (len(spots), 3, 3))
     rates = np.full_like(spots, 0.3)
-    motion = Motion(np.zeros(1) + 2e-5, rates, rates)
+    motion = PoseMotion(np.zeros(1) + 2e-5, rates, rates)
     pattern = Pattern(sample, 0.01 * sample)
     moving = check_scan(pattern, spots, turns, rays_per_pose=1, motion=motion, tally=True)
     for name, scan in {"scan": check_scan(pattern, origin, turn), "moving scan": moving}.items():
@@ -268,7 +271,8 @@ def large(here: Here) -> Rows:
     caster = RayCaster(*city(here.sizes.cities[0]), backend="cuda")
     times = -(-here.sizes.many // len(directions))
     poses = np.broadcast_to(MIDDLE, (times, 3))
-    window, kept = (0, times * len(directions)), 1009
+    window = (0, times * len(directions))
+    kept = 1009
     scan = check_scan(
         Pattern(directions), poses, window=window, rays_per_pose=len(directions), keep_every=kept
     )

@@ -42,7 +42,8 @@ def six_objects() -> Mesh:
 def city(triangles: int, seed: int = 0) -> Mesh:
     """Streets of box-shaped buildings with panelled faces on flat ground, about `triangles`."""
     rng = np.random.default_rng(seed)
-    panels, pitch = 4, 20.0
+    panels = 4
+    pitch = 20.0
     # Odd: there is a crossing at (pitch / 2, pitch / 2), where sensors stand.
     side = 2 * round((np.sqrt(triangles / (5 * 2 * panels**2 + 2)) - 1) / 2) + 1
     line = np.linspace(-1, 1, panels + 1)
@@ -83,7 +84,8 @@ def beam_directions(beams: int, rays: int) -> Float:
     azimuth = np.linspace(0, 2 * np.pi, max(1, rays // beams), endpoint=False)[:, None]
     elevation = np.radians(np.linspace(-15, 45, beams))
     flat = np.cos(elevation)
-    x, y = np.cos(azimuth) * flat, np.sin(azimuth) * flat
+    x = np.cos(azimuth) * flat
+    y = np.sin(azimuth) * flat
     return np.stack([x, y, np.broadcast_to(np.sin(elevation), x.shape)], axis=-1).reshape(-1, 3)
 
 
@@ -93,12 +95,14 @@ def track(firings: int) -> tuple[Float, Float]:
     It is tilted by 2 degrees, so that no rotation is about an axis.
     """
     part = np.linspace(-0.5, 0.5, firings)
-    yaw, tilt = np.radians(5) * part, np.radians(2)
+    yaw = np.radians(5) * part
+    tilt = np.radians(2)
     rotations = np.zeros((firings, 3, 3))
     rotations[:, 0, 0] = rotations[:, 1, 1] = np.cos(yaw)
     rotations[:, 1, 0] = np.sin(yaw)
     rotations[:, 0, 1] = -rotations[:, 1, 0]
     rotations[:, 2, 2] = 1
-    c, s = np.cos(tilt), np.sin(tilt)
+    c = np.cos(tilt)
+    s = np.sin(tilt)
     positions = np.column_stack([10 + part, 10 + 0.3 * part, np.full(firings, 20.0)])
     return positions, rotations @ np.array([[1, 0, 0], [0, c, -s], [0, s, c]])

@@ -54,7 +54,8 @@ def mujoco(here: Here, where: str = "cuda:0") -> Rows:
     vertices, faces = city(here.sizes.cities[0])
     once = revolution(here.sizes.rays)
     scan = revolutions(here, once)
-    origins, rays = scan.poses.positions, np.tile(once, (here.sizes.poses, 1))
+    origins = scan.poses.positions
+    rays = np.tile(once, (here.sizes.poses, 1))
     job = {"vertices": vertices, "faces": faces, "origins": origins, "directions": rays}
     theirs = mujoco_lidar_caster(job, "warp", where)
     ours = RayCaster(vertices, faces, backend="cuda")

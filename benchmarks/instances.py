@@ -24,7 +24,9 @@ from .gpu_scenes import beam_directions
 
 Float = NDArray[np.float64]
 
-_BEAMS, _POSES, _APART = 64, 8, 8.0
+_BEAMS = 64
+_POSES = 8
+_APART = 8.0
 _GROUND = np.array([[-1.0, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]]), [[0, 1, 2], [0, 2, 3]]
 
 
@@ -40,13 +42,16 @@ def places(trees: int) -> Float:
     """Make transforms (trees, 3, 4): a square grid, each tree turned and of its own size."""
     rng = np.random.default_rng(2)
     side = int(np.ceil(np.sqrt(trees)))
-    angle, size = rng.uniform(0, 2 * np.pi, trees), rng.uniform(0.8, 1.2, trees)
+    angle = rng.uniform(0, 2 * np.pi, trees)
+    size = rng.uniform(0.8, 1.2, trees)
     number = np.arange(trees)
     out = np.zeros((trees, 3, 4))
     out[:, 0, 0] = out[:, 1, 1] = size * np.cos(angle)
     out[:, 1, 0] = size * np.sin(angle)
-    out[:, 0, 1], out[:, 2, 2] = -out[:, 1, 0], size
-    out[:, 0, 3], out[:, 1, 3] = _APART * (number % side), _APART * (number // side)
+    out[:, 0, 1] = -out[:, 1, 0]
+    out[:, 2, 2] = size
+    out[:, 0, 3] = _APART * (number % side)
+    out[:, 1, 3] = _APART * (number // side)
     out[:, :2, 3] -= _APART * (side - 1) / 2
     return out
 
@@ -60,11 +65,13 @@ def peak() -> float:
 
 def measure(trees: int, leaves: int, shared: bool, rays: int, backend: str) -> dict[str, Any]:
     """Build a forest and scan it; call this in a new process."""
-    one, matrices = tree(leaves), places(trees)
+    one = tree(leaves)
+    matrices = places(trees)
     reach = _APART * np.sqrt(trees) + 50
     ground = np.diag([reach, reach, 1.0, 1.0])
     RayCaster(*_GROUND, backend, threads=1)  # loads the backend
-    before, start = peak(), time.process_time()
+    before = peak()
+    start = time.process_time()
     if shared:
         mesh = Mesh(*one)
         instances = [Instance(mesh, matrix) for matrix in matrices]
@@ -78,11 +85,13 @@ def measure(trees: int, leaves: int, shared: bool, rays: int, backend: str) -> d
         del points, faces
         caster = RayCaster(*whole, backend, threads=1)
         del whole
-    built, memory = time.process_time() - start, peak() - before
+    built = time.process_time() - start
+    memory = peak() - before
     pattern = Pattern(beam_directions(_BEAMS, rays))
     rng = np.random.default_rng(3)
     spots = np.column_stack([rng.uniform(-30, 30, (_POSES, 2)), np.full(_POSES, 2.0)])
-    taken, hits = [], 0
+    taken = []
+    hits = 0
     for spot in (spots[0], *spots):  # the first one twice: to warm up
         start = time.process_time()
         hits += int(caster.scan(pattern, spot).hits.sum())

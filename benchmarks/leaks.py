@@ -59,7 +59,8 @@ def closed_meshes(triangles: int) -> Iterator[Closed]:
 def terrain_box(triangles: int) -> Closed:
     """Fractal ground under a lid of the same grid, with walls around."""
     ground = terrain(triangles // 2)
-    points, faces = np.array(ground.vertices), np.array(ground.faces)
+    points = np.array(ground.vertices)
+    faces = np.array(ground.faces)
     n = len(points)
     lid = points.copy()
     lid[:, 2] = points[:, 2].max() + 50

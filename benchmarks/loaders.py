@@ -33,7 +33,10 @@ from lidarsim.base.storage import Storage
 from lidarsim.scene.actors import Actor, box
 from lidarsim.sweeps.sweeps import Sweeps
 
-POINTS, TURNS, JOBS, ROUNDS = 30_000, 20, 6, 15
+POINTS = 30_000
+TURNS = 20
+JOBS = 6
+ROUNDS = 15
 
 
 def webdataset(place):
@@ -66,7 +69,8 @@ def parquet(place):
     import pyarrow.dataset
 
     for folder in (place / "points").iterdir():
-        table, scan = pyarrow.dataset.dataset(folder), pyarrow.dataset.field("scan")
+        table = pyarrow.dataset.dataset(folder)
+        scan = pyarrow.dataset.field("scan")
         scans = np.load(place / f"sweeps/{int(folder.name[4:]):04}.npz")["scans"]
         for first, stop in pairwise(scans):
             rows = table.to_table(filter=(scan >= first) & (scan < stop), use_threads=False)
@@ -84,12 +88,16 @@ PEERS = {webdataset: "webdataset", kitti: "pykitti", nuscenes: "nuscenes", parqu
 
 def write(place, name):
     """Write a data set of sweeps past a car."""
-    track, scans = lp.Track([0, 60], [[0, 0, 1], [60, 5, 1]]), TURNS * 36
+    track = lp.Track([0, 60], [[0, 0, 1], [60, 5, 1]])
+    scans = TURNS * 36
     car = Actor(box("Car 1", (4, 2, 1.5)), lp.Track([0, 60], [[5, 5, 0], [9, 5, 0]]))
     scene = lp.Scene.seed().with_actors((car,))
     sweeps = Sweeps.of(lp.Survey(lp.Sensor.grid(360, 4), trajectory=track, steps=scans), scene)
-    rng, count, data = np.random.default_rng(1), TURNS * POINTS, DataSet(Storage.at(place), name)
-    rows, columns = np.arange(count), {"scan": np.arange(count) * scans // count}
+    rng = np.random.default_rng(1)
+    count = TURNS * POINTS
+    data = DataSet(Storage.at(place), name)
+    rows = np.arange(count)
+    columns = {"scan": np.arange(count) * scans // count}
     columns |= {"ray": rows % 40, "channel": rows % 4, "class": rng.integers(0, 30, count)}
     columns |= {"object": rng.integers(0, len(scene.all_names), count)}
     columns |= {"intensity": rng.random(count, np.float32), "time": columns["scan"] * 1000}

@@ -67,8 +67,11 @@ def batches_a_second(
     free: Counter[Any] = Counter()  # {process: when it is free}
     idle = [0.0] * (cores or 0)  # when each core is free: a heap
     slots = [[0.0] * gpus for _ in range(shards)]  # when each slot is free: heaps
-    vary, number, done = Random(1).uniform, count(), 0
-    most, begin = shards * most_under_way(gpus, collectors_of(gpus)), 0.0
+    vary = Random(1).uniform
+    number = count()
+    done = 0
+    most = shards * most_under_way(gpus, collectors_of(gpus))
+    begin = 0.0
     events = [(0.0, next(number), n % shards, 0) for n in range(most)]
     while done < ROUNDS * most:
         now, _, shard, step = heapq.heappop(events)
@@ -160,14 +163,16 @@ def main(arguments: list[str] | None = None) -> dict[str, Any]:
     rows = [row for file in chosen.read for row in json.loads(file.read_text()).items()]
     read = {name: row for name, row in rows if "busy" in row}
     for name, row in read.items():
-        gpus, shards = int(row["gpus"]), int(row["shards"])
+        gpus = int(row["gpus"])
+        shards = int(row["shards"])
         rate = batches_a_second(gpus, row["seconds"], costs, chosen.cores, shards)
         print(f"{name}: {row['a_second']:.0f} a second, by the model {rate:.0f}")
     figures = {}
     for gpus in (200, 1_000, 10_000):
         for seconds in SECONDS:
             rate = batches_a_second(gpus, seconds, costs)
-            by, shards = limit(gpus, seconds, costs), schedulers(gpus, seconds, costs)
+            by = limit(gpus, seconds, costs)
+            shards = schedulers(gpus, seconds, costs)
             figures[f"{gpus} GPUs, batches of {seconds:g} s"] = rate, by, shards
             print(
                 f"{gpus:6,} GPUs, {seconds:3g} s: {rate:7.1f} batches/s, {by}; {shards} schedulers"

@@ -30,12 +30,17 @@ from lidarsim.simulator.batch import columns_of
 from lidarsim.simulator.rig import Rig
 from lidarsim.sweeps.sweeps import Sweeps
 
-SPEED_MPS, RADIUS_M, STRAIGHT_M = 6.0, 9.0, 14.0
+SPEED_MPS = 6.0
+RADIUS_M = 9.0
+STRAIGHT_M = 14.0
 RAMP_M = 3.0  # half of the path on which the curvature begins and ends
 STEP_S = 0.05  # between poses of the track
-SWEEP_S, STEPS_PER_SWEEP = 0.1, 36  # of the sensors at 10 Hz
+# of the sensors at 10 Hz
+SWEEP_S = 0.1
+STEPS_PER_SWEEP = 36
 HEIGHT_M = 1.9  # of the sensor above the ground
-VOXEL_M, MAX_RANGE_M = 1.0, 200.0
+VOXEL_M = 1.0
+MAX_RANGE_M = 200.0
 WARM_UP = 6  # sweeps in which KISS-ICP knows no motion yet
 
 

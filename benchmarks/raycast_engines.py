@@ -100,7 +100,8 @@ class BruteForce(Engine):
     def prepare(self, job: Job) -> Cast:
         """See `Engine.prepare`."""
         first, second, third = (job.vertices[job.faces[:, k]] for k in range(3))
-        edge, other = second - first, third - first
+        edge = second - first
+        other = third - first
         step = len(job.directions) // self.rays(job)
         some = (job.directions @ job.rotation.T)[::step][: self.rays(job)]
         away = job.origins[0] - first
@@ -112,11 +113,9 @@ class BruteForce(Engine):
             p = np.cross(direction, other)
             with np.errstate(divide="ignore", invalid="ignore"):
                 inverse = 1 / (edge * p).sum(axis=1)
-                u, v, t = (
-                    (away * p).sum(axis=1) * inverse,
-                    (q @ direction) * inverse,
-                    height * inverse,
-                )
+                u = (away * p).sum(axis=1) * inverse
+                v = (q @ direction) * inverse
+                t = height * inverse
             return bool(((u >= 0) & (v >= 0) & (u + v <= 1) & (t > 0)).any())
 
         return lambda: sum(map(one, some))

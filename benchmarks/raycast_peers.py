@@ -63,7 +63,8 @@ class Open3DWhole(Open3D):
             rays = np.hstack([np.tile(origin, (len(directions), 1)), directions])
             tensor = open3d.core.Tensor(rays.astype(np.float32))
             answer = scene.cast_rays(tensor, nthreads=self.threads)
-            t, triangle = answer["t_hit"].numpy(), answer["primitive_ids"].numpy()
+            t = answer["t_hit"].numpy()
+            triangle = answer["primitive_ids"].numpy()
             hit = np.isfinite(t)
             points = origin + t[hit, None] * directions[hit]
             return len(points) if len(triangle[hit]) == len(points) else -1
@@ -182,7 +183,8 @@ def _chunks(job: Job, origins: Any, chunk: int) -> list[NDArray[np.float32]]:
     chunks = []
     for origin in origins:
         rays = np.empty((len(directions), 6), np.float32)
-        rays[:, :3], rays[:, 3:] = origin, directions
+        rays[:, :3] = origin
+        rays[:, 3:] = directions
         chunks += [rays[start : start + chunk] for start in range(0, len(rays), chunk)]
     return chunks
 

@@ -59,7 +59,8 @@ class Job:
 
 def _turned(degrees: float) -> Float:
     """Rotation of a sensor that is not set up level: about z, then a little about x."""
-    a, b = np.radians(degrees), np.radians(2.0)
+    a = np.radians(degrees)
+    b = np.radians(2.0)
     about_z = np.array([[np.cos(a), -np.sin(a), 0], [np.sin(a), np.cos(a), 0], [0, 0, 1]])
     about_x = np.array([[1, 0, 0], [0, np.cos(b), -np.sin(b)], [0, np.sin(b), np.cos(b)]])
     return about_z @ about_x
@@ -100,7 +101,8 @@ def city_job(triangles: int, rays: int) -> Job:
 
 def positions_job(triangles: int, rays: int, *, inside: bool) -> Job:
     """Make a city, the sensor at places in streets, or in buildings, where all rays hit."""
-    scene, sensor = city(triangles), _lidar(rays)
+    scene = city(triangles)
+    sensor = _lidar(rays)
     low, high = scene.bounds
     random = np.random.default_rng(0)
     places = np.full((24, 3), low[2] + 2)

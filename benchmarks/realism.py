@@ -42,7 +42,9 @@ from raybeam import available_backends
 from .raycast import environment
 
 PLACE = (0.0, 0.0, 1.9)
-SPEED_M_S, TURN_S, FIELD_M = 20.0, 0.1, (5.0, 60.0)
+SPEED_M_S = 20.0
+TURN_S = 0.1
+FIELD_M = (5.0, 60.0)
 COLUMNS = ("time", "range", "intensity", "class", "sensor")
 COUNTS = (10, 100, 300)
 SURVEY: dict[str, Any] = {"poses": [PLACE], "steps": 5 * 36, "columns": COLUMNS}
@@ -53,19 +55,22 @@ FAULTS = (
     Fault("frozen", 0.35),
     Fault("time_jump", 0.2, by_s=0.05),
 )
-PERSON, PEOPLE_M = Path(__file__).parents[1] / "examples" / "pedestrian.glb", (4.0, 30.0)
+PERSON = Path(__file__).parents[1] / "examples" / "pedestrian.glb"
+PEOPLE_M = (4.0, 30.0)
 
 
 def fine_box(triangles: int) -> SceneMesh:
     """Make the box of a car of so many triangles, at least."""
     mesh = box("Car", (4.5, 1.8, 1.5))
-    vertices, faces = mesh.vertices, mesh.faces
+    vertices = mesh.vertices
+    faces = mesh.faces
     while len(faces) < triangles:  # each in four
         corners = vertices[faces]
         middles = (corners + np.roll(corners, -1, axis=1)) / 2
         (a, b, c), (p, q, r) = corners.transpose(1, 0, 2), middles.transpose(1, 0, 2)
         corners = np.stack([a, p, r, p, b, q, r, q, c, p, q, r], axis=1).reshape(-1, 3)
-        vertices, faces = corners, np.arange(len(corners)).reshape(-1, 3)
+        vertices = corners
+        faces = np.arange(len(corners)).reshape(-1, 3)
     return SceneMesh("Car", vertices, faces)
 
 
@@ -106,7 +111,8 @@ def cases(scene: Scene, backend: str, counts: tuple[int, ...], sensor: str) -> d
     lidar = load_sensor(sensor)
     weather = {"rain": {"rain_mm_h": 10.0}, "snow": {"snow_mm_h": 2.0}}
     weather["fog"] = {"visibility_km": 0.2, "fog_lidar_ratio_sr": 20.0}
-    plain, fine = box("Car", (4.5, 1.8, 1.5)), fine_box(1_000)
+    plain = box("Car", (4.5, 1.8, 1.5))
+    fine = fine_box(1_000)
     way = Track([0, 1], [PLACE, (PLACE[0] + SPEED_M_S, *PLACE[1:])])
 
     def case(actors: list[Actor], where: Any = PLACE, **options: Any) -> Any:
@@ -160,7 +166,8 @@ def cases(scene: Scene, backend: str, counts: tuple[int, ...], sensor: str) -> d
 
 def turns(scene: Scene, survey: Survey, backend: str) -> Any:
     """Make a function that casts a turn of a survey, of five, and makes its columns."""
-    rig, scans = Rig(scene, survey, backend, threads=1), survey.scan_count // 5
+    rig = Rig(scene, survey, backend, threads=1)
+    scans = survey.scan_count // 5
 
     def turn(number: int) -> range:
         part = columns_of([*rig.cast(number * scans, (number + 1) * scans)])

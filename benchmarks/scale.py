@@ -125,7 +125,8 @@ def divide(client: Client) -> tuple[list[Partition], float]:
     """Divide all workers into four partitions; gives those and the seconds it took."""
     start = time.perf_counter()
     rest = Pool.from_client(client)
-    each, parts = len(rest) // len(NAMES), []
+    each = len(rest) // len(NAMES)
+    parts = []
     for name in NAMES[:-1]:
         part, rest = rest.partition(name, n_workers=each)
         parts.append(part)
@@ -186,7 +187,9 @@ def measure(workers: int, tasks: int) -> dict[str, Any]:
         }
         by_submit(parts[0], workers)  # the first tasks import things
         for way, (run, share) in WAYS.items():
-            start, driver, before = time.perf_counter(), time.process_time(), cpu_s(scheduler)
+            start = time.perf_counter()
+            driver = time.process_time()
+            before = cpu_s(scheduler)
             names = {part.name: run(part, math.ceil(share * tasks / len(parts))) for part in parts}
             wall = time.perf_counter() - start
             done = sum(map(len, names.values()))
@@ -204,7 +207,9 @@ def measure(workers: int, tasks: int) -> dict[str, Any]:
 
 
 MINUTE_S = 60.0
-GPUS_EACH, TOGETHER = 20, 25  # GPU workers for a collector, and in a process
+# GPU workers for a collector, and in a process
+GPUS_EACH = 20
+TOGETHER = 25
 ROOM = Scene.from_meshes([box("Room", (8, 6, 3))])
 
 
@@ -218,7 +223,8 @@ class Counts:
     """Processor time of each kind of process for a receipt, or job, from a fifth of them on."""
 
     def __init__(self, all_of_them: int, processes: dict[str, list[psutil.Process]]) -> None:
-        self._all, self._processes = all_of_them, {"driver": [psutil.Process()], **processes}
+        self._all = all_of_them
+        self._processes = {"driver": [psutil.Process()], **processes}
         before = self._cpu_s()
         time.sleep(2)
         self._idle = {name: (s - before[name]) / 2 for name, s in self._cpu_s().items()}
@@ -298,7 +304,8 @@ def measure_shards(shards: int, *of_each: Any) -> dict[str, float]:
 def measure_jobs(jobs: int) -> dict[str, float]:
     """Run a campaign of tiny jobs; its figures."""
     with casting_cluster(4, 0.0) as (client, processes), tempfile.TemporaryDirectory() as folder:
-        file, data = Path(folder) / "campaign.yaml", Path(folder) / "data"
+        file = Path(folder) / "campaign.yaml"
+        data = Path(folder) / "data"
         file.with_name("base.yaml").write_text(BASE % (100, 10))
         file.write_text(CAMPAIGN % 20)
         Campaign.load(file).run(Path(folder) / "first", client=client)

@@ -121,7 +121,8 @@ class Open3D:
     def __init__(self, scene: Scene, ours: Ours) -> None:
         import open3d
 
-        self.core, self.ours = open3d.core, ours
+        self.core = open3d.core
+        self.ours = ours
         self.scene = open3d.t.geometry.RaycastingScene(nthreads=1)
         self.scene.add_triangles(
             self.core.Tensor(scene.vertices.astype(np.float32)),
@@ -133,7 +134,8 @@ class Open3D:
 
     def ranges(self, poses: Float) -> Any:
         """Make images."""
-        count, matrices = len(self.rays), poses.astype(np.float32)
+        count = len(self.rays)
+        matrices = poses.astype(np.float32)
         turns = matrices[:, :3, :3].transpose(0, 2, 1)
         rays = np.empty((len(poses), count, 6), np.float32)
         rays[..., :3] = matrices[:, None, :3, 3]
@@ -151,7 +153,8 @@ def measure(
     case: str, backend: str, scene: Scene, robots: int, rounds: int, clock: str, python: str
 ) -> dict[str, Any]:
     """Time all ways of one case."""
-    now, count = CLOCKS[clock], robots if case == "robots" else 1
+    now = CLOCKS[clock]
+    count = robots if case == "robots" else 1
     ours = Ours(scene, sensor_of(case), backend)
     ways: dict[str, Callable[[Float], Any]] = {
         "cast": ours.cast,
@@ -249,7 +252,9 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--json", type=Path, help="write the results here")
     chosen = parser.parse_args(arguments)
     if chosen.quick:
-        chosen.triangles, chosen.robots, chosen.rounds = 10_000, 20, 2
+        chosen.triangles = 10_000
+        chosen.robots = 20
+        chosen.rounds = 2
     if not chosen.peers:
         print("mujoco-lidar: not installed; --peers names a Python that has it")
     elif subprocess.run(
@@ -258,9 +263,11 @@ def main(arguments: list[str] | None = None) -> int:
         parser.error(f"{chosen.peers} lacks peers: pip install mujoco-lidar mujoco warp-lang")
     backends = {name: why for name, why in available_backends().items() if not why}
     backend = chosen.backend or next(iter(backends))
-    scene, results = city(chosen.triangles), []
+    scene = city(chosen.triangles)
+    results = []
     for case in chosen.case or CASES:
-        robots, rounds = chosen.robots, chosen.rounds
+        robots = chosen.robots
+        rounds = chosen.rounds
         row = measure(case, backend, scene, robots, rounds, chosen.clock, chosen.peers)
         results.append(row)
         show(row)

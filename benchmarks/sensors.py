@@ -54,7 +54,8 @@ def track(shift: tuple[float, float] = (0.0, 0.0), speed: float = 1.0) -> Track:
 
 def bend(rate_deg: float = 30.0) -> Track:
     """Make the way along the street with a carrier that turns, to the left."""
-    straight, half = track(), np.radians(rate_deg) * np.array([-0.5, 0.5]) / 2
+    straight = track()
+    half = np.radians(rate_deg) * np.array([-0.5, 0.5]) / 2
     turns = np.stack([0 * half, 0 * half, np.sin(half), np.cos(half)], axis=1)
     return replace(straight, quaternions=turns)
 
@@ -275,9 +276,13 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--peers", default="", metavar="PYTHON", help="that has the peers")
     parser.add_argument("--json", type=Path, help="write the results here")
     chosen = parser.parse_args(arguments)
-    share, rounds, triangles = 1.0, chosen.rounds, chosen.triangles
+    share = 1.0
+    rounds = chosen.rounds
+    triangles = chosen.triangles
     if chosen.quick:
-        share, rounds, triangles = 0.02, 2, 2_000
+        share = 0.02
+        rounds = 2
+        triangles = 2_000
     python = chosen.peers
     for peer in PEERS if python else ():
         module = {"pyhelios3d": "pyhelios"}.get(peer, peer)
@@ -289,7 +294,8 @@ def main(arguments: list[str] | None = None) -> int:
     for name, why in available_backends().items():
         if why:
             print(f"{name} is left out: {why}")
-    scene, results = city(triangles), []
+    scene = city(triangles)
+    results = []
     for backend in chosen.backend or backends:
         for name in chosen.model or MODELS:
             results.append(measure(name, backend, scene, share, rounds, chosen.clock, python))

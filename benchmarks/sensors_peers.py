@@ -46,7 +46,8 @@ def mujoco_caster(job: Job) -> Callable[[], int]:
     beams = len(job["directions"]) // len(origins)
     rays = np.ascontiguousarray(job["directions"].reshape(len(origins), 3 * beams))
     far = float(job.get("far", 1e10))
-    geom, distance = np.empty((len(origins), beams), np.int32), np.empty((len(origins), beams))
+    geom = np.empty((len(origins), beams), np.int32)
+    distance = np.empty((len(origins), beams))
 
     def cast() -> int:
         for k in range(len(origins)):
@@ -77,7 +78,8 @@ def mujoco_lidar_caster(job: Job, backend: str, device: str = "cpu") -> Callable
     poses = np.tile(np.eye(4), (places, 1, 1))
     poses[:, :3, 3] = job["origins"]
     x, y, z = job["directions"].reshape(places, -1, 3).transpose(2, 0, 1)
-    azimuths, elevations = np.arctan2(y, x), np.arctan2(z, np.hypot(x, y))
+    azimuths = np.arctan2(y, x)
+    elevations = np.arctan2(z, np.hypot(x, y))
 
     def cast() -> int:
         hits = 0
@@ -94,12 +96,14 @@ def helios_caster(job: Job) -> Callable[[], int]:
     """Let it make a spinning scan of its own, with as many rays, on the same way."""
     from pyhelios import Context, LiDARCloud
 
-    context, cloud = Context(), LiDARCloud()
+    context = Context()
+    cloud = LiDARCloud()
     context.addTrianglesFromArrays(
         job["vertices"].astype(np.float32), job["faces"].astype(np.int32)
     )
     cloud.disableMessages()
-    firings, seconds = len(job["origins"]), float(job["seconds"])
+    firings = len(job["origins"])
+    seconds = float(job["seconds"])
     cloud.addScanSpinning(
         job["elevations"].tolist(),
         2 * np.pi * float(job["turned"]) / firings,

@@ -21,8 +21,11 @@ from pathlib import Path
 
 import numpy as np
 
-RAYS_PER_TURN, LAYERS, FOV_DEG = 1800, 64, 50.0
-KEEP_EVERY, PRECISION_M = 5, 0.01
+RAYS_PER_TURN = 1800
+LAYERS = 64
+FOV_DEG = 50.0
+KEEP_EVERY = 5
+PRECISION_M = 0.01
 TRIANGLES = 100_000
 MESH = "city.glb"
 
@@ -60,7 +63,8 @@ def script(rays: int, out: Path) -> None:
     for scan, pose in enumerate(poses(scan_count(rays))):
         table[:, :3] = pose
         answer = caster.cast_rays(o3d.core.Tensor(table))
-        t, face = answer["t_hit"].numpy(), answer["primitive_ids"].numpy()
+        t = answer["t_hit"].numpy()
+        face = answer["primitive_ids"].numpy()
         hit = np.flatnonzero(np.isfinite(t))[::KEEP_EVERY]
         points = np.asarray(pose) + directions[hit] * t[hit, None]
         columns["positions"].append(np.round(points, 2))
@@ -115,9 +119,11 @@ def timed(side: str, rays: int, folder: Path) -> tuple[float, float]:
     }[side]
     if side != "script":
         command += ["--no-plan", "--out", str(out)]
-    before, began = resource.getrusage(resource.RUSAGE_CHILDREN), time.perf_counter()
+    before = resource.getrusage(resource.RUSAGE_CHILDREN)
+    began = time.perf_counter()
     subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
-    wall, after = time.perf_counter() - began, resource.getrusage(resource.RUSAGE_CHILDREN)
+    wall = time.perf_counter() - began
+    after = resource.getrusage(resource.RUSAGE_CHILDREN)
     cpu = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
     return wall, cpu
 

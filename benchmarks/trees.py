@@ -62,7 +62,8 @@ def count(library: ctypes.CDLL, layout: Layout, mesh: LocalMesh, job: Job) -> di
     """Cast a job's rays; what was seen a ray, and the share that hit."""
     directions = np.ascontiguousarray(job.directions @ job.rotation.T)
     n = len(directions)
-    distance, place = np.empty(n), np.empty(n, np.int32)
+    distance = np.empty(n)
+    place = np.empty(n, np.int32)
     places = lay_out_places(plain(mesh), layout.roots)
     where = (places.frame, places.top, places.instances)
     before = _seen(library)

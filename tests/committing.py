@@ -16,7 +16,8 @@ def commit(store, first, counts, triangles, hits, job=None):
     """
     rng = np.random.default_rng(first)
     job = job or store.only.job
-    counts, survey = np.array(counts), job.survey
+    counts = np.array(counts)
+    survey = job.survey
     columns = {
         c.name: rng.integers(0, 2, counts.sum()).astype(c.dtype) for c in survey.stored_columns
     }
@@ -24,7 +25,8 @@ def commit(store, first, counts, triangles, hits, job=None):
     of_scans[0] = sum(hits)
     ends = np.zeros((len(counts), samples_of_scan(survey.scan_count), 3), np.float32)
     ends[..., 0] = first
-    triangles, hits = np.int32(triangles), np.int64(hits)
+    triangles = np.int32(triangles)
+    hits = np.int64(hits)
     part = PartColumns(first, counts, columns, triangles, hits, of_scans, ends)
     data = bytes(pack(part))
     name = part_name(store.db.meta["mark"], job.number, first, part.stop)

@@ -211,7 +211,8 @@ class SourceBackend(CudaBackend):
 def compiled(compiler, folder, code, options):
     """Kernels made a library for the CPU."""
     number = len(list(folder.iterdir()))
-    source, library = folder / f"{number}.cpp", folder / f"{number}.so"
+    source = folder / f"{number}.cpp"
+    library = folder / f"{number}.so"
     names = re.findall(r"^KERNEL (\w+)\(", code, re.M)
     runs = "".join(f"RUN({name})\n" for name in names)
     source.write_text(f'#include "launch.h"\n{code}\n{runs}')

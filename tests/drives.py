@@ -14,7 +14,9 @@ from lidarsim.base.storage import Storage
 from lidarsim.scene.actors import Actor, box
 from lidarsim.sweeps.sweeps import Sweeps
 
-TURNS, SCANS = 3, 36  # of a sensor, of a turn
+# of a sensor, of a turn
+TURNS = 3
+SCANS = 36
 SPLITS = ["train"] * 4 + ["val", "test"]
 
 

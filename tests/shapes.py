@@ -55,7 +55,8 @@ def ball(name, radius, centre=(0, 0, 0), fineness=4):
 
 def room(offset=(0, 0, 0)):
     """A closed room of 10 by 8 by 6 metres around the offset, each side an object."""
-    low, high = np.array([-5.0, -4.0, -3.0]), np.array([5.0, 4.0, 3.0])
+    low = np.array([-5.0, -4.0, -3.0])
+    high = np.array([5.0, 4.0, 3.0])
     corners = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)])
     corners = low + corners * (high - low) + offset
     quads = {

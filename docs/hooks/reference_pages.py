@@ -184,9 +184,11 @@ def _columns_table(columns: tuple[Column, ...]) -> str:
     heads = ("column", "in files", "type", "in PLY", "unit", "coordinates", "")
     rows = ["| " + " | ".join(heads) + " |", "|---" * len(heads) + "|"]
     for column in columns:
-        kind, held = np.dtype(column.dtype).name, held_type(column).name
+        kind = np.dtype(column.dtype).name
+        held = held_type(column).name
         if column in AXES:
-            kind, held = "float64", "float32; float64 where needed"
+            kind = "float64"
+            held = "float32; float64 where needed"
         cells = (column.in_files, kind, held, column.unit, column.coordinates, column.meaning)
         rows.append(f"| `{column.name}` | " + " | ".join(cell or "–" for cell in cells) + " |")
     return "\n".join(rows) + "\n"

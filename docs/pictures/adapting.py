@@ -83,7 +83,8 @@ def record(folder: Path) -> list[Sample]:
                 parts = {name: Partition(name, client) for name in NAMES}
                 while not len(parts["IO"]):
                     time.sleep(0.1)
-                began, over = time.monotonic(), threading.Event()
+                began = time.monotonic()
+                over = threading.Event()
 
                 def watch() -> None:
                     while not over.wait(LOOK_S):

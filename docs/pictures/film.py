@@ -25,8 +25,10 @@ from lidarview.render.colouring import TURBO
 from lidarview.render.pictures import splat
 from lidarview.render.surface import unit
 
-SIZE, BACK = (720, 405), np.array([14, 17, 22, 255]) / 255
-EYE, TARGET = np.array([-38.0, -30.0, 34.0]), np.array([4.0, 4.0, 0.0])
+SIZE = (720, 405)
+BACK = np.array([14, 17, 22, 255]) / 255
+EYE = np.array([-38.0, -30.0, 34.0])
+TARGET = np.array([4.0, 4.0, 0.0])
 RAISED = 12.0  # metres above the ground with the last colour
 
 
@@ -70,7 +72,8 @@ def main(arguments: list[str] | None = None) -> int:
     )
     caster.start()
     here.recv()
-    start, frames = time.perf_counter(), []
+    start = time.perf_counter()
+    frames = []
     here.send("go")
     for _ in range(options.sweeps):
         points = np.frombuffer(here.recv_bytes(), np.float32).reshape(-1, 3)

@@ -10,7 +10,7 @@ from .moving import Moving, hits_on
 from .opacity import Opacity
 from .pattern import Pattern
 from .pattern_rays import pattern_rays
-from .poses import Motion
+from .poses import PoseMotion
 from .registry import available_backends, backend_build
 from .scan import Scan, check_scan
 from .sub_rays import SubRays, any_axes
@@ -22,12 +22,12 @@ __all__ = [
     "Hits",
     "Instance",
     "Mesh",
-    "Motion",
     "Moving",
     "Opacity",
     "OtherHits",
     "Outbox",
     "Pattern",
+    "PoseMotion",
     "RayCaster",
     "Scan",
     "ScanReturns",

@@ -16,7 +16,7 @@ from .device import DeviceHits, OtherHits
 from .hits import Counted, Hits, ScanReturns
 from .instances import Instance, Mesh, check_instances, check_transform, place
 from .pattern import Pattern
-from .poses import Motion, Poses
+from .poses import PoseMotion, Poses
 from .rays import check_rays
 from .registry import choose
 from .scan import Scan, check_scan
@@ -122,7 +122,8 @@ class RayCaster:
         engine = choose(backend)
         self._scene, self._transforms = check_instances(instances)
         self._engine = engine(self._scene, threads, device)
-        self._moved, self._lock = False, threading.Lock()
+        self._moved = False
+        self._lock = threading.Lock()
 
     def __repr__(self) -> str:
         many = f" in {self.instance_count} instances" if self._scene.nested else ""
@@ -241,7 +242,7 @@ class RayCaster:
         keep_every: int = 1,
         groups: ArrayLike | None = None,
         tally: bool = False,
-        motion: Motion | None = None,
+        motion: PoseMotion | None = None,
         room: Floats | None = None,
     ) -> ScanReturns:
         """Cast a pattern of rays from one pose or from many: the fastest way for a lidar.

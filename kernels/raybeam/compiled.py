@@ -73,7 +73,9 @@ def _stamp(path: Path) -> tuple[int, ...]:
     return tuple(number for stat in stats for number in (stat.st_mtime_ns, stat.st_size))
 
 
-_WAIT_S, _STEP_S = 60.0, 0.02  # in all, for processes that compile: one may have been stopped
+# in all, for processes that compile: one may have been stopped
+_WAIT_S = 60.0
+_STEP_S = 0.02
 _held = [0]  # how often the lock is held, by the thread that has numba's lock
 _patience = [_WAIT_S]  # which a process that was waited for in vain has used up
 
@@ -85,7 +87,8 @@ def _in_turn(folder: str) -> Iterator[None]:
     A hundred workers that start with an empty folder compile each loop once.
     """
     with global_compiler_lock:  # of the threads; compiling one loop may compile another
-        file, collects = None, gc.isenabled()
+        file = None
+        collects = gc.isenabled()
         gc.disable()  # an eighth of the time: numba keeps most of the many objects that it makes
         try:
             if fcntl is not None and not _held[0]:
@@ -118,7 +121,8 @@ def _kept(made: Any, function: Any) -> Any:
         return made
     made.enable_caching()
     made._cache._cache_file._source_stamp = _stamp(Path(function.__code__.co_filename))
-    alone, folder = made.compile, made._cache._cache_path
+    alone = made.compile
+    folder = made._cache._cache_path
 
     def compile_in_turn(*signature: Any) -> Any:
         with _in_turn(folder):

@@ -66,8 +66,10 @@ class Nearest(NamedTuple):
 
 def strike(cast: Callable[[Rays], Part], crossing: Crossing, nearest: Nearest) -> None:
     """Take rays to the axes of bodies, `cast` them there, and note nearer hits."""
-    row, poses = crossing.row, crossing.poses[:, crossing.number]
-    starts, ways = crossing.rays[:3, row] - poses[:3], crossing.rays[3:, row]
+    row = crossing.row
+    poses = crossing.poses[:, crossing.number]
+    starts = crossing.rays[:3, row] - poses[:3]
+    ways = crossing.rays[3:, row]
     turns = poses[3:].reshape(3, 3, -1).transpose(1, 0, 2)
     starts, ways = (
         np.stack([(x * a + y * b) + z * c for a, b, c in turns]) for x, y, z in (starts, ways)
@@ -77,11 +79,14 @@ def strike(cast: Callable[[Rays], Part], crossing: Crossing, nearest: Nearest) -
     # Directions of a sensor that turns during a pose are not quite of unit length.
     x, y, z = ways[:, ray]
     distance = distance / np.sqrt((x * x + y * y) + z * z)
-    row, body = row[ray], crossing.body[ray]
+    row = row[ray]
+    body = crossing.body[ray]
     before = nearest.distance[row]
     first = (distance == before) & (body < nearest.body[row])
     nearer = np.flatnonzero((distance < before) | first)
     nearer = nearer[np.lexsort((-body[nearer], -distance[nearer]))]  # the last of a ray remains
     row = row[nearer]
-    nearest.distance[row], nearest.body[row] = distance[nearer], body[nearer]
-    nearest.instance[row], nearest.triangle[row] = instance[nearer], triangle[nearer]
+    nearest.distance[row] = distance[nearer]
+    nearest.body[row] = body[nearer]
+    nearest.instance[row] = instance[nearer]
+    nearest.triangle[row] = triangle[nearer]

@@ -79,7 +79,8 @@ class CudaBackend(Backend):
         self._cupy = cupy = self._library()
         self._device = _device(cupy, device)
         made = lay_out(scene.meshes)
-        self._roots, self._stack = made.roots, made.stack
+        self._roots = made.roots
+        self._stack = made.stack
         self._masked = made.masks is not None
         with self._device:
             masks = made.masks or Masks(*NO_MASKS)
@@ -115,7 +116,8 @@ class CudaBackend(Backend):
 
     def closest(self, rays: Rays) -> Found:
         """See `Backend.closest`."""
-        cp, n = self._cupy, len(rays)
+        cp = self._cupy
+        n = len(rays)
         with self._device:
             stride = np.int32(0 if len(rays.origins) == 1 else 3)
             origins, directions = map(np.ascontiguousarray, (rays.origins, rays.directions))
@@ -124,7 +126,8 @@ class CudaBackend(Backend):
             found = self._cast("cast_table", n, (*table, np.int64(n), *limits))
             groups = Groups(np.zeros(1, np.int64), 1)
             ray, *hits, instance = self._packed(found, 0, groups, 1.0, self._uncounted, self._none)
-            u, v = cp.empty(len(ray)), cp.empty(len(ray))
+            u = cp.empty(len(ray))
+            v = cp.empty(len(ray))
             frame, _, instances = self._places
             scene = (self._meshes[2], frame, instances)
             given = (*scene, *table, ray, *found[1:], np.int64(len(ray)))
@@ -154,7 +157,9 @@ class CudaBackend(Backend):
         others: OtherHits | None = None,
     ) -> tuple[Ints, Counted | None]:
         """See `RayCaster.visit`."""
-        cp, scene, groups = self._cupy, self._scene, Groups(scan.groups, scan.keep_every)
+        cp = self._cupy
+        scene = self._scene
+        groups = Groups(scan.groups, scan.keep_every)
         with self._device:
             counting = self._uncounted
             if scan.tally:
@@ -169,7 +174,9 @@ class CudaBackend(Backend):
 
     def sweep(self, sweep: Swept, nearest: Nearest) -> None:
         """See `Backend.sweep`."""
-        cp, n, kept = self._cupy, len(sweep.when), cast(tuple[AnyArray, ...], nearest)
+        cp = self._cupy
+        n = len(sweep.when)
+        kept = cast(tuple[AnyArray, ...], nearest)
         limits = (np.float64(t * self._scene.frame.scale) for t in sweep.limits)
         with self._device:
             rays, when, body, poses, boxes = map(cp.asarray, sweep[:5])
@@ -194,24 +201,31 @@ class CudaBackend(Backend):
         span = slice(*np.searchsorted(others.ray, [start, start + n]))
         tables = (others.ray[span], others.distance[span], others.triangle[span])
         ray, metres, triangle = map(self._cupy.asarray, tables)
-        count, scale = np.int64(len(ray)), np.float64(self._scene.frame.scale)
+        count = np.int64(len(ray))
+        scale = np.float64(self._scene.frame.scale)
         self._run("replace", len(ray), ray, metres, count, np.int64(start), scale, *found[:2])
         return metres, triangle, np.int32(len(self._scene.mesh))
 
     def _rays(self, start: int, rays: tuple[Any, ...], ray: Any) -> tuple[Any, Any]:
         """Make starts and directions of rays of a chunk, on the device."""
-        cp, n = self._cupy, len(ray)
-        origins, directions = cp.empty((3, n)), cp.empty((3, n))
+        cp = self._cupy
+        n = len(ray)
+        origins = cp.empty((3, n))
+        directions = cp.empty((3, n))
         numbers = ray, np.int64(start), np.int64(n)
         self._run("make_rays", n, *rays[:-3], *numbers, origins, directions)
         return origins, directions
 
     def _made(self, scan: Scan) -> Iterator[tuple[int, int, tuple[Any, ...]]]:
         """Chunks of a scan: number of the first ray, how many, and arguments for cast_pattern."""
-        cp, poses, unused = self._cupy, scan.poses, np.zeros(1)
+        cp = self._cupy
+        poses = scan.poses
+        unused = np.zeros(1)
         limits = [np.float64(t * self._scene.frame.scale) for t in (scan.t_min, scan.t_max)]
-        shifted, turned = scan.pattern.origins is not None, poses.rotations is not None
-        tables, rows = self._resident(scan.pattern), len(scan.pattern)
+        shifted = scan.pattern.origins is not None
+        turned = poses.rotations is not None
+        tables = self._resident(scan.pattern)
+        rows = len(scan.pattern)
         for start, stop in scan.chunks(self.chunk):
             n = stop - start
             pose, skip = divmod(start, poses.rays)
@@ -230,7 +244,8 @@ class CudaBackend(Backend):
 
     def _motion(self, poses: Poses, span: slice) -> tuple[Any, ...]:
         """Arguments for cast_pattern: delays, rates of some poses, and whether there are any."""
-        cp, motion = self._cupy, poses.motion
+        cp = self._cupy
+        motion = poses.motion
         if motion is None:
             return cp.asarray(np.zeros(1)), cp.asarray(np.zeros(1)), np.int32(0)
         rates = np.concatenate([motion.velocities[span], motion.rates[span]], axis=1)
@@ -249,7 +264,8 @@ class CudaBackend(Backend):
 
     def _cast(self, kernel: str, n: int, rays: tuple[Any, ...]) -> tuple[Any, Any, Any]:
         """Local distance, table row and instance of the closest hit of each ray, on the device."""
-        t, place = self._cupy.empty(n), self._cupy.empty(n, np.int32)
+        t = self._cupy.empty(n)
+        place = self._cupy.empty(n, np.int32)
         instance = self._cupy.empty(n if self._scene.nested else 1, np.int32)
         self._run(kernel, n, *self._meshes, *self._places, *rays, t, place, instance)
         return t, place, instance
@@ -269,7 +285,8 @@ class CudaBackend(Backend):
         `pack`. Returns numbers of the rays, from `start` on, distances, the caller's
         triangles, and instances.
         """
-        cp, n = self._cupy, len(found[1])
+        cp = self._cupy
+        n = len(found[1])
         # Closed up by sums in ray order, not by atomics: the same bytes on every run.
         ends = cp.cumsum(found[1] != -1, dtype=np.int32)
         span, begins = groups.spans(start, start + n)

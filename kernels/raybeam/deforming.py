@@ -57,7 +57,8 @@ class Deforming:
         """Vertices, faces and the tree, see `deforming_loops.strike`."""
         from . import deforming_loops as loops
 
-        vertices, faces = np.ascontiguousarray(self.vertices), np.ascontiguousarray(self.faces)
+        vertices = np.ascontiguousarray(self.vertices)
+        faces = np.ascontiguousarray(self.faces)
         box = self.box
         local = (vertices[0] - box.mean(axis=0)) / max(float(np.ptp(box, axis=0).max()), 1e-300)
         tree = build_tree(local[faces], loops.WIDTH, _LEAF_SIZE)

@@ -23,9 +23,11 @@ def fit(vertices, faces, order, child, pad, boxes):  # type: ignore[no-untyped-d
         for node in range(len(child) - 1, -1, -1):  # children come after their parents
             for c in range(WIDTH):
                 code = np.int64(child[node, c])
-                first, count = ~code >> LEAF_BITS, (~code & ((1 << LEAF_BITS) - 1)) + 1
+                first = ~code >> LEAF_BITS
+                count = (~code & ((1 << LEAF_BITS) - 1)) + 1
                 for axis in range(3):
-                    low, high = np.inf, -np.inf
+                    low = np.inf
+                    high = -np.inf
                     if code > 0:
                         for k in range(WIDTH):
                             low = min(low, np.float64(boxes[i, code, axis, k]))
@@ -34,10 +36,12 @@ def fit(vertices, faces, order, child, pad, boxes):  # type: ignore[no-untyped-d
                         for place in range(first, first + count):
                             for corner in range(3):
                                 vertex = faces[order[place], corner]
-                                one, two = vertices[i, vertex, axis], vertices[i + 1, vertex, axis]
+                                one = vertices[i, vertex, axis]
+                                two = vertices[i + 1, vertex, axis]
                                 low = min(low, min(one, two) - pad)
                                 high = max(high, max(one, two) + pad)
-                    boxes[i, node, axis, c], boxes[i, node, 3 + axis, c] = low, high
+                    boxes[i, node, axis, c] = low
+                    boxes[i, node, 3 + axis, c] = high
 
 
 @stage
@@ -46,11 +50,15 @@ def _enter(box, x, y, z, u, v, w, end, enters):  # type: ignore[no-untyped-def]
 
     `box` and `enters` are addresses; u, v, w are the inverse of the ray's direction.
     """
-    side, out = float32s(box), float64s(enters)
+    side = float32s(box)
+    out = float64s(enters)
     for c in range(WIDTH):
-        a, d = (side[c] - x) * u, (side[3 * WIDTH + c] - x) * u
-        b, e = (side[WIDTH + c] - y) * v, (side[4 * WIDTH + c] - y) * v
-        f, g = (side[2 * WIDTH + c] - z) * w, (side[5 * WIDTH + c] - z) * w
+        a = (side[c] - x) * u
+        d = (side[3 * WIDTH + c] - x) * u
+        b = (side[WIDTH + c] - y) * v
+        e = (side[4 * WIDTH + c] - y) * v
+        f = (side[2 * WIDTH + c] - z) * w
+        g = (side[5 * WIDTH + c] - z) * w
         begin = max(max(min(a, d), min(b, e)), max(min(f, g), 0.0))
         stop = min(min(max(a, d), max(b, e)), min(max(f, g), end))
         out[c] = begin if begin <= stop else np.inf
@@ -86,23 +94,35 @@ def strike(  # type: ignore[no-untyped-def]
 
     The tree is one of tree.py, whose `boxes` are those of `fit`.
     """
-    stack, waits, enters = np.empty(_STACK, np.int64), np.empty(_STACK), np.empty(WIDTH)
-    t_min, t_max, last = limits[0], limits[1], np.int64(len(vertices) - 2)
+    stack = np.empty(_STACK, np.int64)
+    waits = np.empty(_STACK)
+    enters = np.empty(WIDTH)
+    t_min = limits[0]
+    t_max = limits[1]
+    last = np.int64(len(vertices) - 2)
     for n in range(len(row)):
-        k, p = row[n], number[n]
+        k = row[n]
+        p = number[n]
         turn = turn_of(poses, p)
-        x, y, z = rays[0, k] - poses[0, p], rays[1, k] - poses[1, p], rays[2, k] - poses[2, p]
+        x = rays[0, k] - poses[0, p]
+        y = rays[1, k] - poses[1, p]
+        z = rays[2, k] - poses[2, p]
         x, y, z = taken(turn, x, y, z)
         u, v, w = taken(turn, rays[3, k], rays[4, k], rays[5, k])
-        i, j, h = _inverse(u), _inverse(v), _inverse(w)
+        i = _inverse(u)
+        j = _inverse(v)
+        h = _inverse(w)
         axis, a, b, c, d, e, f = shear(x, y, z, u, v, w)
         ray = a, b, c, d, e, f
         frame = np.int64(max(frames[n], 0.0))
         frame = frame if frame < last else last
         share = min(max(frames[n] - frame, 0.0), 1.0)
         at = boxes.ctypes.data + _BOX * len(child) * frame
-        best, found, top = min(distance[k], t_max), np.int64(-1), 1
-        stack[0], waits[0] = 0, 0.0
+        best = min(distance[k], t_max)
+        found = np.int64(-1)
+        top = 1
+        stack[0] = 0
+        waits[0] = 0.0
         while top:
             top -= 1
             node = stack[top]
@@ -111,15 +131,18 @@ def strike(  # type: ignore[no-untyped-def]
             _enter(at + _BOX * node, x, y, z, i, j, h, best, enters.ctypes.data)
             below = top
             for slot in range(WIDTH):
-                code, enter = np.int64(child[node, slot]), enters[slot]
+                code = np.int64(child[node, slot])
+                enter = enters[slot]
                 if code == 0 or enter > best:
                     continue
                 if code > 0:  # the nearest comes last
                     place = top
                     while place > below and waits[place - 1] < enter:
-                        stack[place], waits[place] = stack[place - 1], waits[place - 1]
+                        stack[place] = stack[place - 1]
+                        waits[place] = waits[place - 1]
                         place -= 1
-                    stack[place], waits[place] = code, enter
+                    stack[place] = code
+                    waits[place] = enter
                     top += 1
                     continue
                 first = ~code >> LEAF_BITS
@@ -134,7 +157,10 @@ def strike(  # type: ignore[no-untyped-def]
                     if det == 0 or not within(a, b, c) or not t_min <= t <= best:
                         continue
                     if t < best or found < 0 or own < found:
-                        best, found = t, own
+                        best = t
+                        found = own
         if found >= 0 and (best < distance[k] or (best == distance[k] and body[n] < bodies[k])):
-            distance[k], bodies[k] = best, body[n]
-            instance[k], triangle[k] = 0, found
+            distance[k] = best
+            bodies[k] = body[n]
+            instance[k] = 0
+            triangle[k] = found

@@ -34,12 +34,14 @@ _SHARE = 1 << 13  # rays that a thread takes at a time, where there are several
 _COHERENCE = 0.94
 _SHAPES = ((16, 1), (8, 2), (4, 4))  # rays along a ring and across, that go together
 _MOST = 1 << 15  # rays of a block
-_TRIALS, _TRIED = 5, 1 << 10  # parts that are cast in each way to choose the fastest, and rays
+# parts that are cast in each way to choose the fastest, and rays
+_TRIALS = 5
+_TRIED = 1 << 10
 _LIKE = 0.02  # between the cosines of patterns for which the same way is the fastest
 _PLANS = 16  # kept
 
 
-class _Way(NamedTuple):
+class _RayGrouping(NamedTuple):
     """How rays are grouped, see `embree_packets`."""
 
     step: int
@@ -48,7 +50,7 @@ class _Way(NamedTuple):
     coherence: float = _COHERENCE
 
 
-_IN_TURN = _Way(1, 16, 1)
+_IN_TURN = _RayGrouping(1, 16, 1)
 
 
 class EmbreeBackend(Backend):
@@ -92,13 +94,15 @@ class EmbreeBackend(Backend):
         )
         self._plans: dict[tuple[int, int], _Plan] = {}
         self._strikes: tuple[list[float], list[float]] = [], []  # seconds a ray, see `strike`
-        self._loops, self._memory = embree_packets, embree_memory
+        self._loops = embree_packets
+        self._memory = embree_memory
         self._corners = [np.ascontiguousarray(mesh.corners) for mesh in scene.meshes]
         self._meshes = np.zeros(len(scene.meshes), embree_memory.MESH)
         for record, mesh, corners in zip(self._meshes, scene.meshes, self._corners, strict=True):
             record["corners"] = corners.ctypes.data
             if (opacity := mesh.opacity) is not None:
-                record["uv"], record["mask"] = opacity.uv.ctypes.data, opacity.mask.ctypes.data
+                record["uv"] = opacity.uv.ctypes.data
+                record["mask"] = opacity.mask.ctypes.data
                 record["high"], record["wide"] = opacity.mask.shape
         self._index = np.concatenate([mesh.index for mesh in scene.meshes])
         masked = any(mesh.opacity is not None for mesh in scene.meshes)
@@ -110,19 +114,28 @@ class EmbreeBackend(Backend):
             single = embree_exact.plain_proposer(1)
         cast = np.zeros(1, embree_memory.CAST)
         cast["scene"] = (self._instances or trees[0]).address
-        cast["mesh"], cast["masked"] = self._meshes.ctypes.data, masked
+        cast["mesh"] = self._meshes.ctypes.data
+        cast["masked"] = masked
         cast["packets"][0, : len(packets)] = [one.address for one in packets]
-        cast["single"], cast["decide"] = single.address, embree_exact.decide.address
-        cast["nearby"], cast["width"] = embree_exact.nearby.address, width
-        cast["coherence"], cast["index"] = _COHERENCE, self._index.ctypes.data
-        self._trees, self._base = trees, cast  # which keep what has an address
+        cast["single"] = single.address
+        cast["decide"] = embree_exact.decide.address
+        cast["nearby"] = embree_exact.nearby.address
+        cast["width"] = width
+        cast["coherence"] = _COHERENCE
+        cast["index"] = self._index.ctypes.data
+        # which keep what has an address
+        self._trees = trees
+        self._base = cast
         self.place(scene)
 
     def place(self, scene: Scene) -> None:
         """See `Backend.place`."""
         super().place(scene)
-        frame, base = scene.frame, self._base
-        base["centre"], base["scale"], base["low"] = frame.centre, frame.scale, frame.low
+        frame = scene.frame
+        base = self._base
+        base["centre"] = frame.centre
+        base["scale"] = frame.scale
+        base["low"] = frame.low
         base["upper"] = frame.high
         if self._instances is not None:
             self._instances.place(scene)
@@ -131,7 +144,8 @@ class EmbreeBackend(Backend):
             records["matrix"] = scene.matrices
             records["mesh"] = self._meshes.ctypes.data + self._meshes.itemsize * scene.mesh
             records["first"] = first[scene.mesh]
-            self._records, self._base["instances"] = records, records.ctypes.data
+            self._records = records
+            self._base["instances"] = records.ctypes.data
 
     def closest(self, rays: Rays) -> Found:
         """See `Backend.closest`."""
@@ -151,7 +165,8 @@ class EmbreeBackend(Backend):
         """See `Backend.strike`."""
         from .embree_bodies import strike
 
-        own, limits = self._base.copy(), crossing.limits
+        own = self._base.copy()
+        limits = crossing.limits
         own["t_min"], own["t_max"] = (limit * self._scene.frame.scale for limit in limits)
         own["scratch"], _ = self._memory.own.memory(0)
         given = crossing.row, crossing.body, crossing.number
@@ -162,14 +177,16 @@ class EmbreeBackend(Backend):
         alone = len(single) < len(packets)
         if tried:  # by the medians
             alone = sorted(single)[_TRIALS // 2] < sorted(packets)[_TRIALS // 2]
-        own["coherence"], start = 2.0 if alone else _COHERENCE, time.perf_counter()
+        own["coherence"] = 2.0 if alone else _COHERENCE
+        start = time.perf_counter()
         strike(own, crossing.rays, row, body, number, crossing.poses, crossing.box, *nearest)
         if not tried and len(row) >= _TRIED:
             self._strikes[bool(alone)].append((time.perf_counter() - start) / len(row))
 
     def parts(self, scan: Scan) -> Iterator[tuple[int, int, Part]]:
         """See `Backend.parts`."""
-        cast, plan = self._of_scan(scan), self._plan(scan)
+        cast = self._of_scan(scan)
+        plan = self._plan(scan)
         for start, stop in scan.chunks(self.chunk):
             for begin, end, tried in plan.pieces(start, stop):
                 yield begin, end, self._cast(cast, begin, end, plan.ways[0])
@@ -180,17 +197,20 @@ class EmbreeBackend(Backend):
         """Prepare to cast rays that are not of a pattern."""
         one = len(rays.origins) == 1
         origins, at = (None, rays.origins) if one else (rays.origins, np.zeros((1, 3)))
-        cast, poses = self._memory.Cast(self._base), Poses(at, None, max(len(rays), 1))
+        cast = self._memory.Cast(self._base)
+        poses = Poses(at, None, max(len(rays), 1))
         cast.take(rays.directions, origins, poses, 0)
         self._reach(cast, poses, origins, (rays.t_min, rays.t_max))
         return cast
 
     def _of_scan(self, scan: Scan) -> Cast:
         """Prepare to cast a scan."""
-        pattern, cast = scan.pattern, self._memory.Cast(self._base)
+        pattern = scan.pattern
+        cast = self._memory.Cast(self._base)
         aside = cast.take_pattern(pattern, scan.poses, scan.first)
         if scan.room is not None:
-            cast.record["ways"], cast.record["all"] = scan.room[-3:].ctypes.data, len(scan)
+            cast.record["ways"] = scan.room[-3:].ctypes.data
+            cast.record["all"] = len(scan)
             if len(scan.room) > 3:
                 cast.record["starts"] = scan.room.ctypes.data
                 if cast.record["still"]:
@@ -207,7 +227,9 @@ class EmbreeBackend(Backend):
         aside: float = 0.0,
     ) -> None:
         """Note limits, and whether all rays start near the scene, so far `aside` of their beam."""
-        motion, frame, record = poses.motion, self._scene.frame, cast.record
+        motion = poses.motion
+        frame = self._scene.frame
+        record = cast.record
         reach = float(np.abs(frame.to_local(poses.positions)).max(initial=0))
         reach += 2 * aside * frame.scale
         if origins is not None:
@@ -228,19 +250,27 @@ class EmbreeBackend(Backend):
             plan = self._plans[len(scan.pattern), each] = _Plan(scan, each)
         return plan
 
-    def _cast(self, cast: Cast, start: int, stop: int, way: _Way = _IN_TURN) -> Part:
+    def _cast(self, cast: Cast, start: int, stop: int, way: _RayGrouping = _IN_TURN) -> Part:
         """Hits of rays `start` to `stop`, in their order, numbered from `start`."""
         n = stop - start
-        ray, distance, triangle = np.empty(n, np.uint32), np.empty(n), np.empty(n, np.int32)
+        ray = np.empty(n, np.uint32)
+        distance = np.empty(n)
+        triangle = np.empty(n, np.int32)
         instance = (np.empty if self._scene.nested else np.zeros)(n, np.int32)
 
         def part(begin: int) -> Part:
-            own, at = cast.record.copy(), begin - start
-            own["step"], own["high"], own["wide"] = way.step, way.high, way.wide
-            own["coherence"], own["before"] = way.coherence, start
+            own = cast.record.copy()
+            at = begin - start
+            own["step"] = way.step
+            own["high"] = way.high
+            own["wide"] = way.wide
+            own["coherence"] = way.coherence
+            own["before"] = start
             own["scratch"], own["room"] = self._memory.own.memory(way.step * way.high)
-            own["ray"], own["distance"] = ray[at:].ctypes.data, distance[at:].ctypes.data
-            own["triangle"], own["instance"] = triangle[at:].ctypes.data, instance[at:].ctypes.data
+            own["ray"] = ray[at:].ctypes.data
+            own["distance"] = distance[at:].ctypes.data
+            own["triangle"] = triangle[at:].ctypes.data
+            own["instance"] = instance[at:].ctypes.data
             count = self._loops.trace(own, begin, min(begin + share, stop))
             here = slice(at, at + count)
             return ray[here], distance[here], triangle[here], instance[here]
@@ -251,7 +281,8 @@ class EmbreeBackend(Backend):
             share = n
             return part(start)
         if self._process != os.getpid():  # a fork, which has none of its parent's threads
-            self._threads, self._process = ThreadPoolExecutor(self._count, "embree"), os.getpid()
+            self._threads = ThreadPoolExecutor(self._count, "embree")
+            self._process = os.getpid()
         return joined(list(self._threads.map(part, range(start, stop, share))))
 
 
@@ -266,27 +297,29 @@ class _Plan:
         self._beams = ref(np.asarray(scan.pattern.directions.base))  # which its copies share
         many = scan.pattern.each
         steps = {1, scan.pattern.step * many, each} - {0}
-        spreads = {step: _spread(scan, _Way(step, 16, 1)) for step in steps}
+        spreads = {step: _spread(scan, _RayGrouping(step, 16, 1)) for step in steps}
         self._step = max(spreads, key=lambda step: spreads[step])
         self._spread = spreads[self._step]
         self.ways = [_IN_TURN]
         if self._spread > _COHERENCE:
-            ways = {_Way(self._step, high, wide) for high, wide in _SHAPES if wide <= self._step}
+            ways = {
+                _RayGrouping(self._step, high, wide) for high, wide in _SHAPES if wide <= self._step
+            }
             if many > 1:  # those of a beam, which differ least, go together
-                ways = {_IN_TURN} | {_Way(step, *_SHAPES[-1]) for step in steps if step > 4}
+                ways = {_IN_TURN} | {_RayGrouping(step, *_SHAPES[-1]) for step in steps if step > 4}
             self.ways = [
                 way
                 for way in sorted(ways)
                 if way.step * way.high <= _MOST and _spread(scan, way) > _COHERENCE
             ] or self.ways
-            self.ways.append(_Way(1, 16, 1, 2.0))
+            self.ways.append(_RayGrouping(1, 16, 1, 2.0))
         self._trials: list[list[float]] = []  # times of each way, as shares of the shortest
 
     def fits(self, scan: Scan) -> bool:
         """Whether the rays of a scan are as close together as those for which this was made."""
         if self._beams() is scan.pattern.directions.base:
             return True
-        return abs(_spread(scan, _Way(self._step, 16, 1)) - self._spread) < _LIKE
+        return abs(_spread(scan, _RayGrouping(self._step, 16, 1)) - self._spread) < _LIKE
 
     def pieces(self, start: int, stop: int) -> Iterator[tuple[int, int, bool]]:
         """Parts of rays `start` to `stop`, and whether to try all ways there."""
@@ -303,9 +336,10 @@ class _Plan:
                 yield start, end, False
             start = end
 
-    def choose(self, cast: Callable[[_Way], object]) -> None:
+    def choose(self, cast: Callable[[_RayGrouping], object]) -> None:
         """Cast a part, which is in the caches by now, in each way; the last time, choose one."""
-        ways, marks = self.ways, [time.perf_counter()]
+        ways = self.ways
+        marks = [time.perf_counter()]
         if len(ways) == 1:  # another thread has chosen meanwhile
             return
         for way in ways:
@@ -317,7 +351,7 @@ class _Plan:
             self.ways = [ways[int(np.median(self._trials, axis=0).argmin())]]
 
 
-def _spread(scan: Scan, way: _Way) -> float:
+def _spread(scan: Scan, way: _RayGrouping) -> float:
     """Mean over some groups of the least cosine between their first ray and some others."""
     lanes = np.array([0, 5, 10, 15])
     lags = way.step * (lanes // way.wide) + lanes % way.wide

@@ -15,26 +15,43 @@ from .rays import UNIT_SLACK
 
 _OX, _OY, _OZ, _DX, _DY, _DZ = map(at, ("ox", "oy", "oz", "dx", "dy", "dz"))
 _ENTRY, _REAL, _T, _KEY = map(at, ("entry", "real", "t", "key"))
-_ROW, _FULL = at("row"), at("straight")  # row in the `Crossing`, length of the direction
+# row in the `Crossing`, length of the direction
+_ROW = at("row")
+_FULL = at("straight")
 _VALID_AT = offset("valid")
-_f64_1, _f64_2 = types.float64[::1], types.float64[:, ::1]
-_i64_1, _i32_1 = types.int64[::1], types.int32[::1]
+_f64_1 = types.float64[::1]
+_f64_2 = types.float64[:, ::1]
+_i64_1 = types.int64[::1]
+_i32_1 = types.int32[::1]
 
 
 @inlined
 def _put(cast, floats, lane, x, y, z, u, v, w):  # type: ignore[no-untyped-def]
     """Make a ray, in metres in the axes of its body, one of the group; returns its length."""
-    scale, centre, low, high = cast.scale, cast.centre, cast.low, cast.upper
+    scale = cast.scale
+    centre = cast.centre
+    low = cast.low
+    high = cast.upper
     squared = (u * u + v * v) + w * w
     length = np.sqrt(squared)
     if abs(squared - 1) > UNIT_SLACK:
         most = max(abs(u), max(abs(v), abs(w)))
-        u, v, w = u / most, v / most, w / most
+        u = u / most
+        v = v / most
+        w = w / most
         rest = np.sqrt((u * u + v * v) + w * w)
-        u, v, w = u / rest, v / rest, w / rest
-    x, y, z = (x - centre[0]) * scale, (y - centre[1]) * scale, (z - centre[2]) * scale
-    floats[_OX + lane], floats[_OY + lane], floats[_OZ + lane] = x, y, z
-    floats[_DX + lane], floats[_DY + lane], floats[_DZ + lane] = u, v, w
+        u = u / rest
+        v = v / rest
+        w = w / rest
+    x = (x - centre[0]) * scale
+    y = (y - centre[1]) * scale
+    z = (z - centre[2]) * scale
+    floats[_OX + lane] = x
+    floats[_OY + lane] = y
+    floats[_OZ + lane] = z
+    floats[_DX + lane] = u
+    floats[_DY + lane] = v
+    floats[_DZ + lane] = w
     floats[_ENTRY + lane] = entered_at(low, high, (x, y, z), (u, v, w))
     return length
 
@@ -42,7 +59,9 @@ def _put(cast, floats, lane, x, y, z, u, v, w):  # type: ignore[no-untyped-def]
 @inlined
 def _fill_up(scratch, filled):  # type: ignore[no-untyped-def]
     """Make the rest of a group copies of its first ray."""
-    numbers, floats, valid = int64s(scratch), float64s(scratch), int32s(scratch + _VALID_AT)
+    numbers = int64s(scratch)
+    floats = float64s(scratch)
+    valid = int32s(scratch + _VALID_AT)
     for lane in range(LANES):
         numbers[_REAL + lane] = np.int64(lane < filled)
         valid[lane] = np.int32(-1) if lane < filled else np.int32(0)
@@ -61,17 +80,24 @@ def strike(  # type: ignore[no-untyped-def]
 ):
     """Cast the rays of a `Crossing` with one `CAST`, and note in a `Nearest` what they hit."""
     cast = casts[0]
-    scratch, t_max, metre = cast.scratch, cast.t_max, 1.0 / cast.scale
-    numbers, floats, index = int64s(scratch), float64s(scratch), int32s(cast.index)
+    scratch = cast.scratch
+    t_max = cast.t_max
+    metre = 1.0 / cast.scale
+    numbers = int64s(scratch)
+    floats = float64s(scratch)
+    index = int32s(cast.index)
     sides = sides_of(float64s(box.ctypes.data))
     prepare(cast)
     done = 0
     while done < len(row):
         filled = 0
         while filled < LANES and done < len(row):
-            k, p = row[done], number[done]
+            k = row[done]
+            p = number[done]
             turn = turn_of(poses, p)
-            x, y, z = rays[0, k] - poses[0, p], rays[1, k] - poses[1, p], rays[2, k] - poses[2, p]
+            x = rays[0, k] - poses[0, p]
+            y = rays[1, k] - poses[1, p]
+            z = rays[2, k] - poses[2, p]
             x, y, z = taken(turn, x, y, z)
             u, v, w = taken(turn, rays[3, k], rays[4, k], rays[5, k])
             if passes(sides, PADS_M, distance[k], x, y, z, u, v, w):
@@ -83,13 +109,20 @@ def strike(  # type: ignore[no-untyped-def]
         if filled == 0 or not cast_group(casts.ctypes.data, filled, 0):
             continue
         for lane in range(filled):
-            t, key, n = floats[_T + lane], numbers[_KEY + lane], numbers[_ROW + lane]
-            k, own, far = row[n], body[n], t * metre / floats[_FULL + lane]
+            t = floats[_T + lane]
+            key = numbers[_KEY + lane]
+            n = numbers[_ROW + lane]
+            k = row[n]
+            own = body[n]
+            far = t * metre / floats[_FULL + lane]
             nearer = far < distance[k] or (far == distance[k] and own < bodies[k])
             if key < 0 or t > t_max or not nearer:
                 continue
-            place, instance[k] = key & (NUMBER - 1), 0
+            place = key & (NUMBER - 1)
+            instance[k] = 0
             if cast.instances != 0:
                 instance[k] = key // NUMBER
                 place += int64s(cast.instances + RECORD * (key // NUMBER))[FIRST_PLACE]
-            distance[k], bodies[k], triangle[k] = far, own, index[place]
+            distance[k] = far
+            bodies[k] = own
+            triangle[k] = index[place]

@@ -35,20 +35,37 @@ from .triangle_loops import areas, shear, within
 
 llvmlite.binding.load_library_permanently(str(find()))  # compiled code names its functions
 
-_MESH, _INSTANCES, _MASKED = at("mesh"), at("instances"), at("masked")
-_T_MIN, _T_MAX, _LANE = at("t_min"), at("t_max"), at("lane")
-_SCENE, _NEARBY = at("scene"), at("nearby")
-_ARGUMENTS, _ARGUMENTS_AT = at("arguments"), offset("arguments")
-_SINGLE_AT, _PACKET, _QUERY_AT = offset("single"), at("packet"), offset("query")
+_MESH = at("mesh")
+_INSTANCES = at("instances")
+_MASKED = at("masked")
+_T_MIN = at("t_min")
+_T_MAX = at("t_max")
+_LANE = at("lane")
+_SCENE = at("scene")
+_NEARBY = at("nearby")
+_ARGUMENTS = at("arguments")
+_ARGUMENTS_AT = offset("arguments")
+_SINGLE_AT = offset("single")
+_PACKET = at("packet")
+_QUERY_AT = offset("query")
 _QUERY_CONTEXT_AT = offset("query_context")
 _OX, _OY, _OZ, _DX, _DY, _DZ = map(at, ("ox", "oy", "oz", "dx", "dy", "dz"))
 _ENTRY, _AXIS, _U, _V, _W = map(at, ("entry", "axis", "u", "v", "w"))
 _SX, _SY, _SZ, _INSIDE, _LENGTH = map(at, ("sx", "sy", "sz", "inside", "length"))
-_ROUGH, _ONE, _OTHER = at("rough"), at("one"), at("other")
-_ROUGH_32, _ONE_32, _OTHER_32 = at("rough_32"), at("one_32"), at("other_32")
-_T, _KEY, _SURE, _CORNERS = at("t"), at("key"), at("sure"), at("corners")
+_ROUGH = at("rough")
+_ONE = at("one")
+_OTHER = at("other")
+_ROUGH_32 = at("rough_32")
+_ONE_32 = at("one_32")
+_OTHER_32 = at("other_32")
+_T = at("t")
+_KEY = at("key")
+_SURE = at("sure")
+_CORNERS = at("corners")
 
-COHERENT, CALL_FILTER = 1 << 16, 1 << 1  # RTCRayQueryFlags
+# RTCRayQueryFlags
+COHERENT = 1 << 16
+CALL_FILTER = 1 << 1
 
 # Local units. Ten times the error of a float32 distance, unless the ray grazes: so much farther
 # Embree goes on to look for triangles.
@@ -83,7 +100,9 @@ def entered(m, ox, oy, oz, dx, dy, dz):  # type: ignore[no-untyped-def]
 @inlined
 def given(floats, lane):  # type: ignore[no-untyped-def]
     """Origin and direction of a ray, local to the scene."""
-    x, y, z = floats[_OX + lane], floats[_OY + lane], floats[_OZ + lane]
+    x = floats[_OX + lane]
+    y = floats[_OY + lane]
+    z = floats[_OZ + lane]
     return x, y, z, floats[_DX + lane], floats[_DY + lane], floats[_DZ + lane]
 
 
@@ -92,14 +111,19 @@ def keep_sheared(numbers, floats, lane, ox, oy, oz, dx, dy, dz):  # type: ignore
     """Note what `shear` says of a ray."""
     axis, u, v, w, sx, sy, sz = shear(ox, oy, oz, dx, dy, dz)
     numbers[_AXIS + lane] = axis
-    floats[_U + lane], floats[_V + lane], floats[_W + lane] = u, v, w
-    floats[_SX + lane], floats[_SY + lane], floats[_SZ + lane] = sx, sy, sz
+    floats[_U + lane] = u
+    floats[_V + lane] = v
+    floats[_W + lane] = w
+    floats[_SX + lane] = sx
+    floats[_SY + lane] = sy
+    floats[_SZ + lane] = sz
 
 
 @stage
 def shear_all(scratch):  # type: ignore[no-untyped-def]
     """Note what `shear` says of all rays of a group."""
-    numbers, floats = int64s(scratch), float64s(scratch)
+    numbers = int64s(scratch)
+    floats = float64s(scratch)
     for lane in range(LANES):
         keep_sheared(numbers, floats, lane, *given(floats, lane))
 
@@ -114,7 +138,8 @@ def _mesh_of(mesh, instances, numbers, floats, lane, key):  # type: ignore[no-un
     if numbers[_INSIDE + lane] != number:
         ox, oy, oz, dx, dy, dz, length = entered(float64s(address), *given(floats, lane))
         keep_sheared(numbers, floats, lane, ox, oy, oz, dx, dy, dz)
-        floats[_LENGTH + lane], numbers[_INSIDE + lane] = length, number
+        floats[_LENGTH + lane] = length
+        numbers[_INSIDE + lane] = number
     return int64s(address)[memory.MESH_OF]
 
 
@@ -133,7 +158,9 @@ def corners_of(table, place, axis):  # type: ignore[no-untyped-def]
 
 @inlined
 def _sheared(floats, lane):  # type: ignore[no-untyped-def]
-    u, v, w = floats[_U + lane], floats[_V + lane], floats[_W + lane]
+    u = floats[_U + lane]
+    v = floats[_V + lane]
+    w = floats[_W + lane]
     return u, v, w, floats[_SX + lane], floats[_SY + lane], floats[_SZ + lane]
 
 
@@ -147,9 +174,14 @@ def _clearly(a, b, c, det):  # type: ignore[no-untyped-def]
 @stage
 def _stopped(mesh, place, a, b, c, det):  # type: ignore[no-untyped-def]
     """Whether the mask of a mesh stops a ray in a triangle, as `Masks.opaque`."""
-    uv, mask, height, width = float32s(mesh[1]), uint8s(mesh[2]), mesh[3], mesh[4]
+    uv = float32s(mesh[1])
+    mask = uint8s(mesh[2])
+    height = mesh[3]
+    width = mesh[4]
     k = 6 * place
-    p, q, r = a / det, b / det, c / det
+    p = a / det
+    q = b / det
+    r = c / det
     u = (p * np.float64(uv[k]) + q * np.float64(uv[k + 2])) + r * np.float64(uv[k + 4])
     v = (p * np.float64(uv[k + 1]) + q * np.float64(uv[k + 3])) + r * np.float64(uv[k + 5])
     column = min(np.int64((u - np.floor(u)) * width), width - 1)
@@ -190,13 +222,20 @@ def plain_proposer(count: int, part: int = 0) -> Any:
 
     @callback(types.void(types.CPointer(types.int64)))
     def propose(arguments):  # type: ignore[no-untyped-def]
-        valid, scratch, hits = int32s(arguments[0]), arguments[2], int32s(arguments[4])
+        valid = int32s(arguments[0])
+        scratch = arguments[2]
+        hits = int32s(arguments[4])
         lane = int64s(scratch)[_LANE] if count == 1 else begin
-        singles, integers = float32s(scratch), int32s(scratch)
+        singles = float32s(scratch)
+        integers = int32s(scratch)
         for k in range(count):
-            far, own = packet + 8 * count + k, lane + k
-            asked, rough, nearest = valid[k] != 0, singles[far], singles[_ROUGH_32 + own]
-            one, other = integers[_ONE_32 + own], integers[_OTHER_32 + own]
+            far = packet + 8 * count + k
+            own = lane + k
+            asked = valid[k] != 0
+            rough = singles[far]
+            nearest = singles[_ROUGH_32 + own]
+            one = integers[_ONE_32 + own]
+            other = integers[_OTHER_32 + own]
             place = hits[5 * count + k]
             closer = asked & (rough < nearest)
             clearly = asked & (rough < nearest - np.float32(MARGIN))
@@ -225,21 +264,29 @@ def propose(arguments):  # type: ignore[no-untyped-def]
     hits, and the number of rays. Embree asks about one triangle at a time, for some rays. Where a
     mask lets a ray through, Embree goes on.
     """
-    valid, scratch = int32s(arguments[0]), arguments[2]
-    rays, hits = float32s(arguments[3]), int32s(arguments[4])
+    valid = int32s(arguments[0])
+    scratch = arguments[2]
+    rays = float32s(arguments[3])
+    hits = int32s(arguments[4])
     count = arguments[5] & 0xFFFFFFFF
-    numbers, floats = int64s(scratch), float64s(scratch)
-    mesh, instances, masked = numbers[_MESH], numbers[_INSTANCES], numbers[_MASKED]
+    numbers = int64s(scratch)
+    floats = float64s(scratch)
+    mesh = numbers[_MESH]
+    instances = numbers[_INSTANCES]
+    masked = numbers[_MASKED]
     for k in range(count):
         if valid[k] == 0:
             continue
-        lane, key = numbers[_LANE] + k, _key(hits, count, k, instances)
+        lane = numbers[_LANE] + k
+        key = _key(hits, count, k, instances)
         if masked and _transparent(mesh, instances, numbers, floats, lane, key):
             valid[k] = 0
             continue
-        rough, nearest = np.float64(rays[8 * count + k]), floats[_ROUGH + lane]
+        rough = np.float64(rays[8 * count + k])
+        nearest = floats[_ROUGH + lane]
         if rough < nearest - MARGIN:
-            numbers[_ONE + lane], numbers[_OTHER + lane] = key, -1
+            numbers[_ONE + lane] = key
+            numbers[_OTHER + lane] = -1
         else:  # a third is too many
             numbers[_OTHER + lane] = key if numbers[_OTHER + lane] == -1 else -2
         if rough < nearest:
@@ -252,8 +299,10 @@ def propose(arguments):  # type: ignore[no-untyped-def]
 @stage
 def _consider(scratch, lane, key):  # type: ignore[no-untyped-def]
     """Keep a triangle if it is the closest hit so far; whether the ray clearly passes inside."""
-    numbers, floats = int64s(scratch), float64s(scratch)
-    mesh, instances = numbers[_MESH], numbers[_INSTANCES]
+    numbers = int64s(scratch)
+    floats = float64s(scratch)
+    mesh = numbers[_MESH]
+    instances = numbers[_INSTANCES]
     a, b, c, det, t, _ = _tested(mesh, instances, numbers, floats, lane, key)
     nearest = floats[_T + lane]
     if (
@@ -263,15 +312,18 @@ def _consider(scratch, lane, key):  # type: ignore[no-untyped-def]
         and (t < nearest or (t == nearest and key < numbers[_KEY + lane]))
         and not (numbers[_MASKED] and _transparent(mesh, instances, numbers, floats, lane, key))
     ):
-        floats[_T + lane], numbers[_KEY + lane] = t, key
+        floats[_T + lane] = t
+        numbers[_KEY + lane] = key
     return _clearly(a, b, c, det)
 
 
 @callback(types.boolean(types.CPointer(types.int64)))
 def nearby(arguments):  # type: ignore[no-untyped-def]
     """Consider a triangle near a point; `arguments` is an RTCPointQueryFunctionArguments."""
-    scratch, instance = arguments[1], int32s(arguments[3])[32]
-    numbers, key = int64s(scratch), arguments[2] & (NUMBER - 1)
+    scratch = arguments[1]
+    instance = int32s(arguments[3])[32]
+    numbers = int64s(scratch)
+    key = arguments[2] & (NUMBER - 1)
     if numbers[_INSTANCES] != 0:
         key += NUMBER * instance
     _consider(scratch, numbers[_LANE], key)
@@ -285,23 +337,37 @@ def decide(arguments):  # type: ignore[no-untyped-def]
     At an edge, Embree may propose any one of the triangles that share it, or one that float64 has
     beside the ray. Then all triangles that are near that point are considered.
     """
-    valid, scratch = int32s(arguments[0]), arguments[2]
-    ray, hit, normal = float32s(arguments[3]), int32s(arguments[4]), float32s(arguments[4])
-    numbers, floats = int64s(scratch), float64s(scratch)
-    lane, entry = numbers[_LANE], floats[_ENTRY + numbers[_LANE]]
+    valid = int32s(arguments[0])
+    scratch = arguments[2]
+    ray = float32s(arguments[3])
+    hit = int32s(arguments[4])
+    normal = float32s(arguments[4])
+    numbers = int64s(scratch)
+    floats = float64s(scratch)
+    lane = numbers[_LANE]
+    entry = floats[_ENTRY + numbers[_LANE]]
     nearest = floats[_T + lane]
     clear = _consider(scratch, lane, _key(hit, 1, 0, numbers[_INSTANCES]))
     # Float32 is so far off along the ray: more where it grazes.
-    x, y, z, dx, dy, dz = normal[0], normal[1], normal[2], ray[4], ray[5], ray[6]
+    x = normal[0]
+    y = normal[1]
+    z = normal[2]
+    dx = ray[4]
+    dy = ray[5]
+    dz = ray[6]
     steep = abs(x * dx + y * dy + z * dz)
     full = np.sqrt((x * x + y * y + z * z) * (dx * dx + dy * dy + dz * dz))
     off = 2 * MARGIN * (max(full / steep, 1.0) if steep > _GRAZES * full else 1 / _GRAZES)
     if not clear:
-        query, along = float32s(scratch + _QUERY_AT), entry + ray[8]
+        query = float32s(scratch + _QUERY_AT)
+        along = entry + ray[8]
         ox, oy, oz, dx, dy, dz = given(floats, lane)
-        query[0], query[1] = np.float32(ox + along * dx), np.float32(oy + along * dy)
-        query[2], query[4] = np.float32(oz + along * dz), np.float32(off)
-        where, context = scratch + _QUERY_AT, scratch + _QUERY_CONTEXT_AT
+        query[0] = np.float32(ox + along * dx)
+        query[1] = np.float32(oy + along * dy)
+        query[2] = np.float32(oz + along * dz)
+        query[4] = np.float32(off)
+        where = scratch + _QUERY_AT
+        context = scratch + _QUERY_CONTEXT_AT
         _point_query(numbers[_SCENE], where, context, numbers[_NEARBY], scratch)
     if floats[_T + lane] < nearest:
         ray[8] = np.float32(floats[_T + lane] - entry + off)
@@ -319,17 +385,24 @@ def _sure(floats, lane, t_min, a, b, c, det, t):  # type: ignore[no-untyped-def]
 @inlined
 def verify(mesh, instances, numbers, floats, lane):  # type: ignore[no-untyped-def]
     """Write to `t`, `key` and `sure` what the test says of a ray's candidates."""
-    t, key, sure, t_min = np.inf, np.int64(-1), True, floats[_T_MIN]
-    one, other = numbers[_ONE + lane], numbers[_OTHER + lane]
+    t = np.inf
+    key = np.int64(-1)
+    sure = True
+    t_min = floats[_T_MIN]
+    one = numbers[_ONE + lane]
+    other = numbers[_OTHER + lane]
     if one >= 0:
         a, b, c, det, t, _ = _tested(mesh, instances, numbers, floats, lane, one)
-        key, sure = one, _sure(floats, lane, t_min, a, b, c, det, t)
+        key = one
+        sure = _sure(floats, lane, t_min, a, b, c, det, t)
         if other >= 0:
             a, b, c, det, t_2, _ = _tested(mesh, instances, numbers, floats, lane, other)
             sure = sure and _sure(floats, lane, t_min, a, b, c, det, t_2)
             if t_2 < t or (t_2 == t and other < one):
-                t, key = t_2, other
-    floats[_T + lane], numbers[_KEY + lane] = t, key
+                t = t_2
+                key = other
+    floats[_T + lane] = t
+    numbers[_KEY + lane] = key
     numbers[_SURE + lane] = np.int64(sure and other != -2)
 
 
@@ -339,7 +412,8 @@ def _copy(table, numbers, floats, candidate):  # type: ignore[no-untyped-def]
 
     Reads from far apart come first, which the processor overlaps, then vector instructions.
     """
-    axis, differ = numbers[_AXIS], np.int64(0)
+    axis = numbers[_AXIS]
+    differ = np.int64(0)
     for lane in range(LANES):
         differ |= numbers[_AXIS + lane] ^ axis
     if differ:
@@ -374,22 +448,28 @@ def _areas_of(floats, lane):  # type: ignore[no-untyped-def]
 @stage
 def _verify_first(scratch, t_min):  # type: ignore[no-untyped-def]
     """Test the first candidates of a group, whose corners have been copied."""
-    numbers, floats = int64s(scratch), float64s(scratch)
+    numbers = int64s(scratch)
+    floats = float64s(scratch)
     for lane in range(LANES):
         a, b, c, det, t = _areas_of(floats, lane)
-        one, sure = numbers[_ONE + lane], _sure(floats, lane, t_min, a, b, c, det, t)
-        floats[_T + lane], numbers[_KEY + lane] = t if one >= 0 else np.inf, one
+        one = numbers[_ONE + lane]
+        sure = _sure(floats, lane, t_min, a, b, c, det, t)
+        floats[_T + lane] = t if one >= 0 else np.inf
+        numbers[_KEY + lane] = one
         numbers[_SURE + lane] = np.int64((one < 0) | (sure & (numbers[_OTHER + lane] != -2)))
 
 
 @stage
 def _verify_second(scratch, t_min):  # type: ignore[no-untyped-def]
     """Test the second candidates of a group, whose corners have been copied."""
-    numbers, floats = int64s(scratch), float64s(scratch)
+    numbers = int64s(scratch)
+    floats = float64s(scratch)
     for lane in range(LANES):
         a, b, c, det, t = _areas_of(floats, lane)
-        sure, nearest = _sure(floats, lane, t_min, a, b, c, det, t), floats[_T + lane]
-        other, key = numbers[_OTHER + lane], numbers[_KEY + lane]
+        sure = _sure(floats, lane, t_min, a, b, c, det, t)
+        nearest = floats[_T + lane]
+        other = numbers[_OTHER + lane]
+        key = numbers[_KEY + lane]
         nearer = (other >= 0) & ((t < nearest) | ((t == nearest) & (other < key)))
         floats[_T + lane] = t if nearer else nearest
         numbers[_KEY + lane] = other if nearer else key
@@ -403,8 +483,11 @@ def verify_all(table, scratch, t_min):  # type: ignore[no-untyped-def]
     Numbers that are the same for all rays are arguments: a load of one would keep loops from
     becoming vector instructions.
     """
-    numbers, floats = int64s(scratch), float64s(scratch)
-    singles, integers, second = float32s(scratch), int32s(scratch), np.int64(0)
+    numbers = int64s(scratch)
+    floats = float64s(scratch)
+    singles = float32s(scratch)
+    integers = int32s(scratch)
+    second = np.int64(0)
     for lane in range(LANES):
         floats[_ROUGH + lane] = singles[_ROUGH_32 + lane]
         numbers[_ONE + lane] = integers[_ONE_32 + lane]
@@ -427,18 +510,30 @@ def begun(o, d, entry):  # type: ignore[no-untyped-def]
 @stage
 def single(scene, scratch, lane, reach, aside, up):  # type: ignore[no-untyped-def]
     """Cast one ray of a group by itself; Embree sees one along an axis moved, aside and up."""
-    numbers, floats = int64s(scratch), float64s(scratch)
-    ray, whole = float32s(scratch + _SINGLE_AT), int32s(scratch + _SINGLE_AT)
+    numbers = int64s(scratch)
+    floats = float64s(scratch)
+    ray = float32s(scratch + _SINGLE_AT)
+    whole = int32s(scratch + _SINGLE_AT)
     entry = floats[_ENTRY + lane]
     ox, oy, oz, dx, dy, dz = given(floats, lane)
-    ray[0], ray[1], ray[2] = begun(ox, dx, entry), begun(oy, dy, entry), begun(oz, dz, entry)
+    ray[0] = begun(ox, dx, entry)
+    ray[1] = begun(oy, dy, entry)
+    ray[2] = begun(oz, dz, entry)
     ray[3] = np.float32(max(floats[_T_MIN] - entry - MARGIN, 0.0))
-    ray[4], ray[5], ray[6], ray[7] = np.float32(dx), np.float32(dy), np.float32(dz), np.float32(0)
+    ray[4] = np.float32(dx)
+    ray[5] = np.float32(dy)
+    ray[6] = np.float32(dz)
+    ray[7] = np.float32(0)
     ray[8] = np.float32(min(reach - entry + MARGIN, FAR))
     axis = 0 if abs(ray[4]) > 0.5 else (1 if abs(ray[5]) > 0.5 else 2)
     ray[(axis + 1) % 3] += np.float32(aside)
     ray[(axis + 2) % 3] += np.float32(up)
-    whole[9], whole[10], whole[11], whole[18], whole[19], whole[20] = -1, 0, 0, -1, -1, -1
+    whole[9] = -1
+    whole[10] = 0
+    whole[11] = 0
+    whole[18] = -1
+    whole[19] = -1
+    whole[20] = -1
     numbers[_LANE] = lane
     _intersect_1(scene, scratch + _SINGLE_AT, scratch + _ARGUMENTS_AT)
     numbers[_LANE] = 0
@@ -451,11 +546,14 @@ def decided(scene, scratch, lane, reach):  # type: ignore[no-untyped-def]
     Embree does not see what touches a ray along an axis with the upper side of its box (0 * inf in
     its test of boxes). So it is shown eight such rays around it, too.
     """
-    numbers, floats = int64s(scratch), float64s(scratch)
+    numbers = int64s(scratch)
+    floats = float64s(scratch)
     flags = int32s(scratch + _ARGUMENTS_AT)
-    floats[_T + lane], numbers[_KEY + lane] = np.inf, -1
+    floats[_T + lane] = np.inf
+    numbers[_KEY + lane] = -1
     flags[0] = CALL_FILTER
-    aside, up = 0.0, 0.0
+    aside = 0.0
+    up = 0.0
     for k in range(9 if along(floats, lane) else 1):
         single(scene, scratch, lane, reach, aside, up)
         one = MARGIN if k & 1 else -MARGIN
@@ -467,5 +565,7 @@ def decided(scene, scratch, lane, reach):  # type: ignore[no-untyped-def]
 @inlined
 def along(floats, lane):  # type: ignore[no-untyped-def]
     """Whether a ray is along an axis."""
-    x, y, z = floats[_DX + lane], floats[_DY + lane], floats[_DZ + lane]
+    x = floats[_DX + lane]
+    y = floats[_DY + lane]
+    z = floats[_DZ + lane]
     return (abs(x) + abs(y)) + abs(z) < _STRAIGHT

@@ -16,9 +16,13 @@ from .instances import Scene
 from .mesh import LocalMesh
 
 # Constants of rtcore.h.
-_TRIANGLES, _INSTANCE = 0, 121
-_FLOAT3, _FLOAT3X4_ROWS, _UINT3 = 0x9003, 0x9134, 0x5003
-_INDEX, _VERTEX = 0, 1
+_TRIANGLES = 0
+_INSTANCE = 121
+_FLOAT3 = 0x9003
+_FLOAT3X4_ROWS = 0x9134
+_UINT3 = 0x5003
+_INDEX = 0
+_VERTEX = 1
 _HIGH_QUALITY = 2
 _ROBUST = 1 << 2  # rays between two triangles hit one of them
 _FILTER_IN_ARGUMENTS = 1 << 3
@@ -45,7 +49,8 @@ def find() -> Path:
 def library() -> ctypes.CDLL:
     """Load the library."""
     loaded = ctypes.CDLL(str(find()))
-    pointer, number = ctypes.c_void_p, ctypes.c_uint
+    pointer = ctypes.c_void_p
+    number = ctypes.c_uint
     signatures: dict[str, tuple[object, list[object]]] = {
         "rtcNewDevice": (pointer, [ctypes.c_char_p]),
         "rtcGetDeviceProperty": (ctypes.c_ssize_t, [pointer, ctypes.c_int]),
@@ -71,7 +76,8 @@ def library() -> ctypes.CDLL:
     }
     for name, (result, arguments) in signatures.items():
         function = getattr(loaded, name)
-        function.restype, function.argtypes = result, arguments
+        function.restype = result
+        function.argtypes = arguments
     return loaded
 
 
@@ -165,7 +171,8 @@ class EmbreeInstances(EmbreeScene):
 
     def __init__(self, scene: Scene, meshes: list[EmbreeMesh], threads: int | None) -> None:
         super().__init__(threads)
-        embree, self._meshes = library(), meshes
+        embree = library()
+        self._meshes = meshes
         self._transforms: Floats = np.full((len(scene.mesh), 3, 4), np.nan)
         for number, mesh in enumerate(scene.mesh.tolist()):
             geometry = embree.rtcNewGeometry(self._device, _INSTANCE)
@@ -175,7 +182,8 @@ class EmbreeInstances(EmbreeScene):
 
     def place(self, scene: Scene) -> None:
         """Move the instances to their places in a scene."""
-        embree, transforms = library(), scene.to_scene()
+        embree = library()
+        transforms = scene.to_scene()
         for number in np.flatnonzero((transforms != self._transforms).any(axis=(1, 2))).tolist():
             geometry = embree.rtcGetGeometry(self.address, number)
             matrix = np.ascontiguousarray(transforms[number], np.float32)

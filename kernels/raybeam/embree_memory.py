@@ -81,7 +81,10 @@ INSTANCE = np.dtype(
         ("first", "i8"),  # the mesh's first place in `index`
     ]
 )
-MESH_OF, FIRST_PLACE, RECORD = 12, 13, INSTANCE.itemsize  # of these: numbers before, and bytes
+# of these: numbers before, and bytes
+MESH_OF = 12
+FIRST_PLACE = 13
+RECORD = INSTANCE.itemsize
 
 SCRATCH = np.dtype(
     [
@@ -154,9 +157,12 @@ def pointer(kind: Any) -> Any:
     return read
 
 
-int32s, int64s = pointer(types.int32), pointer(types.int64)
-float32s, float64s = pointer(types.float32), pointer(types.float64)
-uint8s, uint32s = pointer(types.uint8), pointer(types.uint32)
+int32s = pointer(types.int32)
+int64s = pointer(types.int64)
+float32s = pointer(types.float32)
+float64s = pointer(types.float64)
+uint8s = pointer(types.uint8)
+uint32s = pointer(types.uint32)
 
 CASTS = types.Array(numba.from_dtype(CAST), 1, "C")  # of one cast
 casts_at = pointer(CASTS.dtype)
@@ -178,7 +184,9 @@ class Cast:
 
     def take(self, directions: Floats, origins: Floats | None, poses: Poses, first: int) -> None:
         """Note what rays are made of: beams (n, 3), poses, and the row of ray 0."""
-        record, motion, turns = self.record, poses.motion, poses.rotations
+        record = self.record
+        motion = poses.motion
+        turns = poses.rotations
         record["directions"] = self.keep(directions.T)
         record["origins"] = self.keep(None if origins is None else origins.T)
         record["positions"] = self.keep(poses.positions.T)
@@ -187,14 +195,18 @@ class Cast:
             record["delays"] = self.keep(motion.delays)
             record["velocities"] = self.keep(motion.velocities.T)
             record["rates"] = self.keep(motion.rates.T)
-        record["rows"], record["poses"], record["each"] = len(directions), len(poses), poses.rays
-        record["first"], record["subrays"] = first, 1
+        record["rows"] = len(directions)
+        record["poses"] = len(poses)
+        record["each"] = poses.rays
+        record["first"] = first
+        record["subrays"] = 1
         record["still"] = len(poses) == 1 and origins is None and motion is None
 
     def take_pattern(self, pattern: Pattern, poses: Poses, first: int) -> float:
         """Note what rays of a pattern are made of; how far off their beams they start, metres."""
         self.take(pattern.directions, pattern.origins, poses, first)
-        sub_rays, record = pattern.sub_rays, self.record
+        sub_rays = pattern.sub_rays
+        record = self.record
         if sub_rays is None:
             return 0.0
         record["subrays"] = len(sub_rays)
@@ -202,7 +214,8 @@ class Cast:
         record["begins"] = sub_rays.starts is not None
         record["offsets"] = self.keep(pattern.offsets)
         if sub_rays.axis is not None:
-            record["about"], record["axis"] = 1, sub_rays.axis
+            record["about"] = 1
+            record["axis"] = sub_rays.axis
         if sub_rays.starts is None:
             return 0.0
         record["still"] = 0
@@ -213,7 +226,8 @@ class _Own(threading.local):
     """Memory of a thread, since threads of one worker may cast at the same time."""
 
     def __init__(self) -> None:
-        self._scratch, self._room = np.zeros(SCRATCH.itemsize // 8 + 8, np.int64), np.zeros(0)
+        self._scratch = np.zeros(SCRATCH.itemsize // 8 + 8, np.int64)
+        self._room = np.zeros(0)
 
     def memory(self, rays: int) -> tuple[int, int]:
         """Addresses of the scratch memory, a multiple of 64, and of room for rays of a block."""

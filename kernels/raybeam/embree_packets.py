@@ -19,16 +19,39 @@ from .embree_memory import LANES, NUMBER, at, casts_at, float32s, float64s, int3
 from .embree_rays import begin, localise, make, set_out
 from .triangle_loops import areas, shear
 
-_ARGUMENTS, _ARGUMENTS_AT, _FILTER = at("arguments"), offset("arguments"), at("arguments") + 2
-_VALID_AT, _PACKET, _PACKET_AT = offset("valid"), at("packet"), offset("packet")
-_TILE, _LANE, _RAY, _REAL, _ENTRY = at("tile"), at("lane"), at("ray"), at("real"), at("entry")
+_ARGUMENTS = at("arguments")
+_ARGUMENTS_AT = offset("arguments")
+_FILTER = at("arguments") + 2
+_VALID_AT = offset("valid")
+_PACKET = at("packet")
+_PACKET_AT = offset("packet")
+_TILE = at("tile")
+_LANE = at("lane")
+_RAY = at("ray")
+_REAL = at("real")
+_ENTRY = at("entry")
 _OX, _OY, _OZ, _DX, _DY, _DZ = map(at, ("ox", "oy", "oz", "dx", "dy", "dz"))
-_MESH, _INSTANCES, _MASKED = at("mesh"), at("instances"), at("masked")
-_T_MIN, _T_MAX, _SCENE, _NEARBY = at("t_min"), at("t_max"), at("scene"), at("nearby")
-_INSIDE, _ROUGH, _ONE, _OTHER = at("inside"), at("rough"), at("one"), at("other")
-_ROUGH_32, _ONE_32, _OTHER_32 = at("rough_32"), at("one_32"), at("other_32")
-_T, _KEY, _SURE, _POSE = at("t"), at("key"), at("sure"), at("pose")
-f64_1, f64_2, i32_1 = types.float64[::1], types.float64[:, ::1], types.int32[::1]
+_MESH = at("mesh")
+_INSTANCES = at("instances")
+_MASKED = at("masked")
+_T_MIN = at("t_min")
+_T_MAX = at("t_max")
+_SCENE = at("scene")
+_NEARBY = at("nearby")
+_INSIDE = at("inside")
+_ROUGH = at("rough")
+_ONE = at("one")
+_OTHER = at("other")
+_ROUGH_32 = at("rough_32")
+_ONE_32 = at("one_32")
+_OTHER_32 = at("other_32")
+_T = at("t")
+_KEY = at("key")
+_SURE = at("sure")
+_POSE = at("pose")
+f64_1 = types.float64[::1]
+f64_2 = types.float64[:, ::1]
+i32_1 = types.int32[::1]
 _FIELDS = 22  # numbers of a ray of a packet
 
 _intersect_4, _intersect_8, _intersect_16 = (
@@ -42,13 +65,21 @@ _intersect_4, _intersect_8, _intersect_16 = (
 @inlined
 def prepare(cast):  # type: ignore[no-untyped-def]
     """Write to the scratch memory what all rays share."""
-    scratch, width = cast.scratch, cast.width
-    numbers, floats, rays = int64s(scratch), float64s(scratch), float32s(scratch)
+    scratch = cast.scratch
+    width = cast.width
+    numbers = int64s(scratch)
+    floats = float64s(scratch)
+    rays = float32s(scratch)
     whole = int32s(scratch)
     numbers[0] = -1  # no instance
-    numbers[_MESH], numbers[_INSTANCES], numbers[_MASKED] = cast.mesh, cast.instances, cast.masked
-    floats[_T_MIN], floats[_T_MAX], numbers[_LANE] = cast.t_min, cast.t_max, 0
-    numbers[_SCENE], numbers[_NEARBY] = cast.scene, cast.nearby
+    numbers[_MESH] = cast.mesh
+    numbers[_INSTANCES] = cast.instances
+    numbers[_MASKED] = cast.masked
+    floats[_T_MIN] = cast.t_min
+    floats[_T_MAX] = cast.t_max
+    numbers[_LANE] = 0
+    numbers[_SCENE] = cast.scene
+    numbers[_NEARBY] = cast.nearby
     numbers[_ARGUMENTS] = np.int64(-1) << 32 | exact.CALL_FILTER | exact.COHERENT  # all features
     numbers[_ARGUMENTS + 1] = scratch
     numbers[_ARGUMENTS + 3] = numbers[_ARGUMENTS + 4] = 0
@@ -58,7 +89,8 @@ def prepare(cast):  # type: ignore[no-untyped-def]
             for k in range(ray, ray + width):
                 rays[k + 3 * width] = np.float32(max(cast.t_min - exact.MARGIN, 0.0))
                 rays[k + 7 * width] = np.float32(0)
-                whole[k + 9 * width], whole[k + 10 * width] = -1, 0
+                whole[k + 9 * width] = -1
+                whole[k + 10 * width] = 0
                 whole[k + 11 * width] = 0
                 for field in (18, 19, 20):
                     whole[k + field * width] = -1
@@ -67,7 +99,9 @@ def prepare(cast):  # type: ignore[no-untyped-def]
 @inlined
 def _apart(floats, coherence):  # type: ignore[no-untyped-def]
     """Whether some rays of a group differ too much from the first."""
-    x, y, z = floats[_DX], floats[_DY], floats[_DZ]
+    x = floats[_DX]
+    y = floats[_DY]
+    z = floats[_DZ]
     for lane in (5, 10, LANES - 1):
         if x * floats[_DX + lane] + y * floats[_DY + lane] + z * floats[_DZ + lane] < coherence:
             return True
@@ -80,10 +114,12 @@ def _filler(width: int) -> Any:
     @stage
     def fill(scratch, t_min, t_max, fixed):  # type: ignore[no-untyped-def]
         """Origins and distances from which hits count, if not `fixed`; directions and reaches."""
-        rays, floats = float32s(scratch), float64s(scratch)
+        rays = float32s(scratch)
+        floats = float64s(scratch)
         if not fixed:
             for lane in range(LANES):
-                k, entry = _PACKET + (_FIELDS - 1) * (lane & -width) + lane, floats[_ENTRY + lane]
+                k = _PACKET + (_FIELDS - 1) * (lane & -width) + lane
+                entry = floats[_ENTRY + lane]
                 rays[k] = exact.begun(floats[_OX + lane], floats[_DX + lane], entry)
                 rays[k + width] = exact.begun(floats[_OY + lane], floats[_DY + lane], entry)
                 rays[k + 2 * width] = exact.begun(floats[_OZ + lane], floats[_DZ + lane], entry)
@@ -116,9 +152,12 @@ def _fill(scratch, width, t_min, t_max, fixed):  # type: ignore[no-untyped-def]
 @stage
 def _reals(scratch, first, wide, step, count):  # type: ignore[no-untyped-def]
     """Take those rays of a group that there are, and copies of its first; returns their number."""
-    numbers, valid, real = int64s(scratch), int32s(scratch + _VALID_AT), np.int64(0)
+    numbers = int64s(scratch)
+    valid = int32s(scratch + _VALID_AT)
+    real = np.int64(0)
     for lane in range(LANES):
-        right, ray = first + (lane & (wide - 1)), first + numbers[_TILE + lane]
+        right = first + (lane & (wide - 1))
+        ray = first + numbers[_TILE + lane]
         there = (right < step) & (ray < count)
         numbers[_RAY + lane] = ray if there else first
         numbers[_REAL + lane] = np.int64(there)
@@ -130,21 +169,27 @@ def _reals(scratch, first, wide, step, count):  # type: ignore[no-untyped-def]
 @stage
 def _reset(scratch, plain):  # type: ignore[no-untyped-def]
     """Forget what filters have found."""
-    singles, integers = float32s(scratch), int32s(scratch)
+    singles = float32s(scratch)
+    integers = int32s(scratch)
     for lane in range(LANES):
         singles[_ROUGH_32 + lane] = np.float32(np.inf)
         integers[_ONE_32 + lane] = integers[_OTHER_32 + lane] = np.int32(-1)
     if not plain:
-        numbers, floats = int64s(scratch), float64s(scratch)
+        numbers = int64s(scratch)
+        floats = float64s(scratch)
         for lane in range(LANES):
-            floats[_ROUGH + lane], numbers[_INSIDE + lane] = np.inf, -1
+            floats[_ROUGH + lane] = np.inf
+            numbers[_INSIDE + lane] = -1
             numbers[_ONE + lane] = numbers[_OTHER + lane] = -1
 
 
 @stage
 def _found(scratch):  # type: ignore[no-untyped-def]
     """How many rays of a group have a candidate in a plain scene, and how many go along an axis."""
-    floats, integers, found, straight = float64s(scratch), int32s(scratch), np.int64(0), np.int64(0)
+    floats = float64s(scratch)
+    integers = int32s(scratch)
+    found = np.int64(0)
+    straight = np.int64(0)
     for lane in range(LANES):
         found += np.int64(integers[_ONE_32 + lane] >= 0)
     for lane in range(LANES):
@@ -155,8 +200,10 @@ def _found(scratch):  # type: ignore[no-untyped-def]
 @stage
 def _one_by_one(scene, scratch, proposer, t_max):  # type: ignore[no-untyped-def]
     """Cast the rays of a group one by one."""
-    numbers, flags = int64s(scratch), int32s(scratch + _ARGUMENTS_AT)
-    flags[0], numbers[_FILTER] = exact.CALL_FILTER, proposer
+    numbers = int64s(scratch)
+    flags = int32s(scratch + _ARGUMENTS_AT)
+    flags[0] = exact.CALL_FILTER
+    numbers[_FILTER] = proposer
     for lane in range(LANES):
         if numbers[_REAL + lane]:
             exact.single(scene, scratch, lane, t_max, 0.0, 0.0)
@@ -167,9 +214,16 @@ def _one_by_one(scene, scratch, proposer, t_max):  # type: ignore[no-untyped-def
 def _cast_group(address, real, fixed):  # type: ignore[no-untyped-def]
     """Write to `t` and `key` what the rays of a group hit; 0 if none hits anything."""
     cast = carray(casts_at(address), 1)[0]
-    scene, width, mesh, instances = cast.scene, cast.width, cast.mesh, cast.instances
-    scratch, t_min, t_max, masked = cast.scratch, cast.t_min, cast.t_max, cast.masked
-    numbers, floats = int64s(scratch), float64s(scratch)
+    scene = cast.scene
+    width = cast.width
+    mesh = cast.mesh
+    instances = cast.instances
+    scratch = cast.scratch
+    t_min = cast.t_min
+    t_max = cast.t_max
+    masked = cast.masked
+    numbers = int64s(scratch)
+    floats = float64s(scratch)
     plain = instances == 0 and not masked
     _reset(scratch, plain)
     if masked and instances == 0:  # `propose` looks at masks
@@ -184,7 +238,8 @@ def _cast_group(address, real, fixed):  # type: ignore[no-untyped-def]
             _intersect_16(scratch + _VALID_AT, scene, scratch + _PACKET_AT, arguments)
         else:
             for part in range(LANES // width):
-                numbers[_FILTER], numbers[_LANE] = cast.packets[part], part * width
+                numbers[_FILTER] = cast.packets[part]
+                numbers[_LANE] = part * width
                 asked = scratch + _VALID_AT + 4 * part * width
                 rays = scratch + _PACKET_AT + 4 * _FIELDS * part * width
                 if width == 8:
@@ -220,22 +275,36 @@ def trace(casts, start, stop):  # type: ignore[no-untyped-def]
     `casts` is one `CAST`.
     """
     cast = casts[0]
-    address, scratch, instances = casts.ctypes.data, cast.scratch, cast.instances
-    t_max, still, near = cast.t_max, cast.still != 0, cast.near != 0
-    step, high, wide, before = cast.step, cast.high, cast.wide, cast.before
+    address = casts.ctypes.data
+    scratch = cast.scratch
+    instances = cast.instances
+    t_max = cast.t_max
+    still = cast.still != 0
+    near = cast.near != 0
+    step = cast.step
+    high = cast.high
+    wide = cast.wide
+    before = cast.before
     shift = 0 if wide == 1 else (1 if wide == 2 else 2)
-    metre, index, indexed = 1.0 / cast.scale, int32s(cast.index), cast.index != 0
-    numbers, floats = int64s(scratch), float64s(scratch)
+    metre = 1.0 / cast.scale
+    index = int32s(cast.index)
+    indexed = cast.index != 0
+    numbers = int64s(scratch)
+    floats = float64s(scratch)
     span = step * high
-    distances, places = float64s(cast.room), int32s(cast.room + 8 * span)
+    distances = float64s(cast.room)
+    places = int32s(cast.room + 8 * span)
     numbered = int32s(cast.room + 12 * span)
-    out_ray, out_metres = memory.uint32s(cast.ray), float64s(cast.distance)
-    out_triangle, out_instance = int32s(cast.triangle), int32s(cast.instance)
+    out_ray = memory.uint32s(cast.ray)
+    out_metres = float64s(cast.distance)
+    out_triangle = int32s(cast.triangle)
+    out_instance = int32s(cast.instance)
     prepare(cast)
     fixed = np.int64(still and near)
     for lane in range(LANES):
         numbers[_TILE + lane] = (lane >> shift) * step + (lane & (wide - 1))
-        numbers[_POSE + lane], floats[_ENTRY + lane] = 0, 0.0
+        numbers[_POSE + lane] = 0
+        floats[_ENTRY + lane] = 0.0
     if still:
         set_out(cast, scratch)
         localise(cast, scratch)
@@ -254,8 +323,11 @@ def trace(casts, start, stop):  # type: ignore[no-untyped-def]
                 continue
             for back in range(LANES):  # copies of the first come before it
                 lane = LANES - 1 - back
-                to, t, key = numbers[_RAY + lane], floats[_T + lane], numbers[_KEY + lane]
-                distances[to], places[to] = t, key if t <= t_max else -1
+                to = numbers[_RAY + lane]
+                t = floats[_T + lane]
+                key = numbers[_KEY + lane]
+                distances[to] = t
+                places[to] = key if t <= t_max else -1
                 if instances != 0:
                     numbered[to] = key // NUMBER
         for k in range(count):
@@ -266,7 +338,8 @@ def trace(casts, start, stop):  # type: ignore[no-untyped-def]
                 record = int64s(instances + memory.RECORD * numbered[k])
                 place = (place & (NUMBER - 1)) + record[memory.FIRST_PLACE]
                 out_instance[kept] = numbered[k]
-            out_ray[kept], out_metres[kept] = block - before + k, distances[k] * metre
+            out_ray[kept] = block - before + k
+            out_metres[kept] = distances[k] * metre
             out_triangle[kept] = index[place] if indexed else place
             kept += 1
     return kept
@@ -278,23 +351,35 @@ def weigh(casts, origins, directions, place, instance, u, v):  # type: ignore[no
 
     The hits' `place`, in all meshes' corners, and `instance` are those that `trace` wrote.
     """
-    mesh, instances = casts[0].mesh, casts[0].instances
+    mesh = casts[0].mesh
+    instances = casts[0].instances
     for k in range(len(place)):
-        o, to = origins[k if len(origins) > 1 else 0], directions[k]
-        ox, oy, oz, dx, dy, dz = o[0], o[1], o[2], to[0], to[1], to[2]
-        at, mesh_at = np.int64(place[k]), mesh
+        o = origins[k if len(origins) > 1 else 0]
+        to = directions[k]
+        ox = o[0]
+        oy = o[1]
+        oz = o[2]
+        dx = to[0]
+        dy = to[1]
+        dz = to[2]
+        at = np.int64(place[k])
+        mesh_at = mesh
         if instances != 0:
             address = instances + memory.RECORD * np.int64(instance[k])
             record = int64s(address)
-            mesh_at, at = record[memory.MESH_OF], at - record[memory.FIRST_PLACE]
+            mesh_at = record[memory.MESH_OF]
+            at = at - record[memory.FIRST_PLACE]
             ox, oy, oz, dx, dy, dz, _ = exact.entered(float64s(address), ox, oy, oz, dx, dy, dz)
         axis, p, q, r, sx, sy, sz = shear(ox, oy, oz, dx, dy, dz)
         triangle = exact.corners_of(float64s(int64s(mesh_at)[0]), at, axis)
         a, b, c, det, _ = areas(triangle, (p, q, r, sx, sy, sz))
         sign = -1.0 if det < 0 else 1.0  # outside by float32's rounding: at the edge
-        a, b, c = max(sign * a, 0.0), max(sign * b, 0.0), max(sign * c, 0.0)
+        a = max(sign * a, 0.0)
+        b = max(sign * b, 0.0)
+        c = max(sign * c, 0.0)
         total = (a + b) + c
-        u[k], v[k] = b / total, c / total
+        u[k] = b / total
+        v[k] = c / total
 
 
 # Whether this process compiled the loops; otherwise it loaded what an earlier one had kept.

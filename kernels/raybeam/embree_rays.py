@@ -18,8 +18,12 @@ from .poses import Poses
 
 _OX, _OY, _OZ, _DX, _DY, _DZ = map(at, ("ox", "oy", "oz", "dx", "dy", "dz"))
 _RAY, _ROW, _POSE, _WITHIN = map(at, ("ray", "row", "pose", "within"))
-_STRAIGHT, _ACROSS, _UP = at("straight"), at("across"), at("up")
-_ASIDE, _ABOVE, _ENTRY = at("aside"), at("above"), at("entry")
+_STRAIGHT = at("straight")
+_ACROSS = at("across")
+_UP = at("up")
+_ASIDE = at("aside")
+_ABOVE = at("above")
+_ENTRY = at("entry")
 _TINY = 2.0**-60  # replaces a direction component of zero, to avoid 0 * inf
 
 
@@ -42,11 +46,17 @@ def any_axes(x, y, z):  # type: ignore[no-untyped-def]
 def axes_about(x, y, z, axis):  # type: ignore[no-untyped-def]
     """As `sub_rays.axes_about`, of one direction."""
     a, b, c = axis
-    p, q, r = b * z - c * y, c * x - a * z, a * y - b * x
+    p = b * z - c * y
+    q = c * x - a * z
+    r = a * y - b * x
     length = np.sqrt((p * p + q * q) + r * r)
     least = max(length, 1e-300)
-    p, q, r = p / least, q / least, r / least
-    u, v, w = y * r - z * q, z * p - x * r, x * q - y * p
+    p = p / least
+    q = q / least
+    r = r / least
+    u = y * r - z * q
+    v = z * p - x * r
+    w = x * q - y * p
     if length < 1e-6:
         p, q, r, u, v, w = any_axes(x, y, z)
     return p, q, r, u, v, w
@@ -55,7 +65,8 @@ def axes_about(x, y, z, axis):  # type: ignore[no-untyped-def]
 @stage
 def _rows(scratch, first, total):  # type: ignore[no-untyped-def]
     """Find the rows of the rays of a group; `first` is that of the block's first, of `total`."""
-    numbers, most = int64s(scratch), np.int64(0)
+    numbers = int64s(scratch)
+    most = np.int64(0)
     for lane in range(LANES):
         row = first + numbers[_RAY + lane]
         numbers[_ROW + lane] = row - total if row >= total else row
@@ -73,24 +84,30 @@ def _poses(scratch, pose, within, each):  # type: ignore[no-untyped-def]
     for lane in range(LANES):
         inside = within + numbers[_RAY + lane]
         later = whole_times(inside, each)
-        numbers[_POSE + lane], numbers[_WITHIN + lane] = pose + later, inside - later * each
+        numbers[_POSE + lane] = pose + later
+        numbers[_WITHIN + lane] = inside - later * each
 
 
 @stage
 def _shares(scratch, shares, offsets, directions, rows, subrays):  # type: ignore[no-untyped-def]
     """Look up the beams of a group's sub-rays, and what share each has of across and up."""
-    numbers, floats, table = int64s(scratch), float64s(scratch), float64s(shares)
-    ahead, more = float64s(directions), float64s(offsets)
+    numbers = int64s(scratch)
+    floats = float64s(scratch)
+    table = float64s(shares)
+    ahead = float64s(directions)
+    more = float64s(offsets)
     for lane in range(LANES):
         row = numbers[_ROW + lane]
         beam = whole_times(row, subrays)
         k = row - beam * subrays
         numbers[_ROW + lane] = beam
         floats[_STRAIGHT + lane] = table[k]
-        floats[_ACROSS + lane], floats[_UP + lane] = table[subrays + k], table[2 * subrays + k]
+        floats[_ACROSS + lane] = table[subrays + k]
+        floats[_UP + lane] = table[2 * subrays + k]
         floats[_ASIDE + lane] = table[3 * subrays + k]
         floats[_ABOVE + lane] = table[4 * subrays + k]
-        floats[_DX + lane], floats[_DY + lane] = ahead[beam], ahead[rows + beam]
+        floats[_DX + lane] = ahead[beam]
+        floats[_DY + lane] = ahead[rows + beam]
         floats[_DZ + lane] = ahead[2 * rows + beam]
     if offsets:
         for lane in range(LANES):
@@ -99,20 +116,26 @@ def _shares(scratch, shares, offsets, directions, rows, subrays):  # type: ignor
             up = floats[_UP + lane] + more[rows + beam]
             straight = 1 / np.sqrt((1 + across * across) + up * up)
             floats[_STRAIGHT + lane] = straight
-            floats[_ACROSS + lane], floats[_UP + lane] = across * straight, up * straight
+            floats[_ACROSS + lane] = across * straight
+            floats[_UP + lane] = up * straight
 
 
 @inlined
 def _spread(floats, lane, begins, axes):  # type: ignore[no-untyped-def]
     """Turn the direction of a beam to that of its sub-ray, and note where that starts."""
-    x, y, z = floats[_DX + lane], floats[_DY + lane], floats[_DZ + lane]
+    x = floats[_DX + lane]
+    y = floats[_DY + lane]
+    z = floats[_DZ + lane]
     a, b, c, d, e, f = axes
-    straight, across, up = floats[_STRAIGHT + lane], floats[_ACROSS + lane], floats[_UP + lane]
+    straight = floats[_STRAIGHT + lane]
+    across = floats[_ACROSS + lane]
+    up = floats[_UP + lane]
     floats[_DX + lane] = (straight * x + across * a) + up * d
     floats[_DY + lane] = (straight * y + across * b) + up * e
     floats[_DZ + lane] = (straight * z + across * c) + up * f
     if begins:
-        aside, above = floats[_ASIDE + lane], floats[_ABOVE + lane]
+        aside = floats[_ASIDE + lane]
+        above = floats[_ABOVE + lane]
         floats[_OX + lane] = aside * a + above * d
         floats[_OY + lane] = aside * b + above * e
         floats[_OZ + lane] = aside * c + above * f
@@ -122,7 +145,9 @@ def _spread(floats, lane, begins, axes):  # type: ignore[no-untyped-def]
 def _spread_any(scratch, begins):  # type: ignore[no-untyped-def]
     floats = float64s(scratch)
     for lane in range(LANES):
-        x, y, z = floats[_DX + lane], floats[_DY + lane], floats[_DZ + lane]
+        x = floats[_DX + lane]
+        y = floats[_DY + lane]
+        z = floats[_DZ + lane]
         _spread(floats, lane, begins, any_axes(x, y, z))
 
 
@@ -130,7 +155,9 @@ def _spread_any(scratch, begins):  # type: ignore[no-untyped-def]
 def _spread_about(scratch, begins, a, b, c):  # type: ignore[no-untyped-def]
     floats = float64s(scratch)
     for lane in range(LANES):
-        x, y, z = floats[_DX + lane], floats[_DY + lane], floats[_DZ + lane]
+        x = floats[_DX + lane]
+        y = floats[_DY + lane]
+        z = floats[_DZ + lane]
         _spread(floats, lane, begins, axes_about(x, y, z, (a, b, c)))
 
 
@@ -148,10 +175,21 @@ def _divided(cast, scratch):  # type: ignore[no-untyped-def]
 @stage
 def _turn_by(scratch, matrix, x, y, z):  # type: ignore[no-untyped-def]
     """Rotate the vectors of a group, whose columns begin at x, y and z, by one matrix."""
-    floats, m = float64s(scratch), float64s(matrix)
-    a, b, c, d, e, f, g, h, i = m[0], m[1], m[2], m[3], m[4], m[5], m[6], m[7], m[8]
+    floats = float64s(scratch)
+    m = float64s(matrix)
+    a = m[0]
+    b = m[1]
+    c = m[2]
+    d = m[3]
+    e = m[4]
+    f = m[5]
+    g = m[6]
+    h = m[7]
+    i = m[8]
     for lane in range(LANES):
-        p, q, r = floats[x + lane], floats[y + lane], floats[z + lane]
+        p = floats[x + lane]
+        q = floats[y + lane]
+        r = floats[z + lane]
         floats[x + lane] = (p * a + q * b) + r * c
         floats[y + lane] = (p * d + q * e) + r * f
         floats[z + lane] = (p * g + q * h) + r * i
@@ -160,12 +198,23 @@ def _turn_by(scratch, matrix, x, y, z):  # type: ignore[no-untyped-def]
 @stage
 def _turn_each(scratch, poses, rotations, x, y, z):  # type: ignore[no-untyped-def]
     """Rotate the vectors of a group to the mesh's axes, each by its own pose."""
-    numbers, floats, matrices = int64s(scratch), float64s(scratch), float64s(rotations)
+    numbers = int64s(scratch)
+    floats = float64s(scratch)
+    matrices = float64s(rotations)
     for lane in range(LANES):
-        p, q, r, k = floats[x + lane], floats[y + lane], floats[z + lane], numbers[_POSE + lane]
-        a, b, c = matrices[k], matrices[k + poses], matrices[k + 2 * poses]
-        d, e, f = matrices[k + 3 * poses], matrices[k + 4 * poses], matrices[k + 5 * poses]
-        g, h, i = matrices[k + 6 * poses], matrices[k + 7 * poses], matrices[k + 8 * poses]
+        p = floats[x + lane]
+        q = floats[y + lane]
+        r = floats[z + lane]
+        k = numbers[_POSE + lane]
+        a = matrices[k]
+        b = matrices[k + poses]
+        c = matrices[k + 2 * poses]
+        d = matrices[k + 3 * poses]
+        e = matrices[k + 4 * poses]
+        f = matrices[k + 5 * poses]
+        g = matrices[k + 6 * poses]
+        h = matrices[k + 7 * poses]
+        i = matrices[k + 8 * poses]
         floats[x + lane] = (p * a + q * b) + r * c
         floats[y + lane] = (p * d + q * e) + r * f
         floats[z + lane] = (p * g + q * h) + r * i
@@ -183,12 +232,19 @@ def _turn(cast, scratch, x, y, z):  # type: ignore[no-untyped-def]
 @stage
 def _drift(scratch, poses, delays, rates, x, y, z):  # type: ignore[no-untyped-def]
     """Turn the vectors of a group by the motion of their poses."""
-    numbers, floats = int64s(scratch), float64s(scratch)
-    after, rate = float64s(delays), float64s(rates)
+    numbers = int64s(scratch)
+    floats = float64s(scratch)
+    after = float64s(delays)
+    rate = float64s(rates)
     for lane in range(LANES):
-        p, q, r = floats[x + lane], floats[y + lane], floats[z + lane]
-        k, delay = numbers[_POSE + lane], after[numbers[_WITHIN + lane]]
-        a, b, c = rate[k], rate[k + poses], rate[k + 2 * poses]
+        p = floats[x + lane]
+        q = floats[y + lane]
+        r = floats[z + lane]
+        k = numbers[_POSE + lane]
+        delay = after[numbers[_WITHIN + lane]]
+        a = rate[k]
+        b = rate[k + poses]
+        c = rate[k + 2 * poses]
         floats[x + lane] = p + delay * (b * r - c * q)
         floats[y + lane] = q + delay * (c * p - a * r)
         floats[z + lane] = r + delay * (a * q - b * p)
@@ -220,7 +276,8 @@ def make(cast, scratch, block):  # type: ignore[no-untyped-def]
             _note(scratch, cast.starts + 8 * block[3], cast.all, _OX)
         localise(cast, scratch)
     if cast.near == 0:
-        low, high = cast.low, cast.upper
+        low = cast.low
+        high = cast.upper
         for lane in range(LANES):
             o = floats[_OX + lane], floats[_OY + lane], floats[_OZ + lane]
             d = floats[_DX + lane], floats[_DY + lane], floats[_DZ + lane]
@@ -230,7 +287,8 @@ def make(cast, scratch, block):  # type: ignore[no-untyped-def]
 @inlined
 def begin(cast, block):  # type: ignore[no-untyped-def]
     """Row, pose, number within the pose, and number of a ray."""
-    total, each = cast.rows * cast.subrays, cast.each
+    total = cast.rows * cast.subrays
+    each = cast.each
     pose = block // each
     return (cast.first + block) % total, pose, block - pose * each, block
 
@@ -238,27 +296,35 @@ def begin(cast, block):  # type: ignore[no-untyped-def]
 @stage
 def _note(scratch, to, count, x):  # type: ignore[no-untyped-def]
     """Write the vectors of a group, whose columns begin at x, among those of all rays."""
-    numbers, floats, out = int64s(scratch), float64s(scratch), float64s(to)
+    numbers = int64s(scratch)
+    floats = float64s(scratch)
+    out = float64s(to)
     for lane in range(LANES):
         k = numbers[_RAY + lane]
-        out[k], out[k + count] = floats[x + lane], floats[x + LANES + lane]
+        out[k] = floats[x + lane]
+        out[k + count] = floats[x + LANES + lane]
         out[k + 2 * count] = floats[x + 2 * LANES + lane]
 
 
 @stage
 def _look_up(scratch, directions, rows):  # type: ignore[no-untyped-def]
     """Look up the directions of a group."""
-    numbers, floats, given = int64s(scratch), float64s(scratch), float64s(directions)
+    numbers = int64s(scratch)
+    floats = float64s(scratch)
+    given = float64s(directions)
     for lane in range(LANES):
         row = numbers[_ROW + lane]
-        floats[_DX + lane], floats[_DY + lane] = given[row], given[rows + row]
+        floats[_DX + lane] = given[row]
+        floats[_DY + lane] = given[rows + row]
         floats[_DZ + lane] = given[2 * rows + row]
 
 
 @stage
 def _add(scratch, table, count, number):  # type: ignore[no-untyped-def]
     """Add vectors of a table, of `count` of them those with the `number` of each ray, to starts."""
-    numbers, floats, given = int64s(scratch), float64s(scratch), float64s(table)
+    numbers = int64s(scratch)
+    floats = float64s(scratch)
+    given = float64s(table)
     for lane in range(LANES):
         k = numbers[number + lane]
         floats[_OX + lane] += given[k]
@@ -269,10 +335,13 @@ def _add(scratch, table, count, number):  # type: ignore[no-untyped-def]
 @stage
 def _move(scratch, delays, velocities, poses):  # type: ignore[no-untyped-def]
     """Move the starts of rays by the motion of their poses."""
-    numbers, floats = int64s(scratch), float64s(scratch)
-    after, speed = float64s(delays), float64s(velocities)
+    numbers = int64s(scratch)
+    floats = float64s(scratch)
+    after = float64s(delays)
+    speed = float64s(velocities)
     for lane in range(LANES):
-        k, delay = numbers[_POSE + lane], after[numbers[_WITHIN + lane]]
+        k = numbers[_POSE + lane]
+        delay = after[numbers[_WITHIN + lane]]
         floats[_OX + lane] += delay * speed[k]
         floats[_OY + lane] += delay * speed[k + poses]
         floats[_OZ + lane] += delay * speed[k + 2 * poses]
@@ -297,7 +366,8 @@ def localise(cast, scratch):  # type: ignore[no-untyped-def]
 @inlined
 def set_out(cast, scratch):  # type: ignore[no-untyped-def]
     """Write where a group's rays start, metres; sub-rays may have starts already."""
-    floats, begins = float64s(scratch), cast.shares != 0 and cast.begins != 0
+    floats = float64s(scratch)
+    begins = cast.shares != 0 and cast.begins != 0
     if not begins:
         for lane in range(LANES):
             floats[_OX + lane] = floats[_OY + lane] = floats[_OZ + lane] = 0.0
@@ -335,9 +405,12 @@ def entered_at(low, high, o, d):  # type: ignore[no-untyped-def]
 @compiled(types.void(memory.CASTS, types.int64[::1], types.float64[:, ::1], types.float64[:, ::1]))
 def _gather(casts, rays, origins, directions):  # type: ignore[no-untyped-def]
     """Make rays with these numbers; origins are not written if there is no room for any."""
-    cast, count, begins = casts[0], len(rays), origins.shape[1] > 0
+    cast = casts[0]
+    count = len(rays)
+    begins = origins.shape[1] > 0
     scratch = cast.scratch
-    numbers, floats = int64s(scratch), float64s(scratch)
+    numbers = int64s(scratch)
+    floats = float64s(scratch)
     for lane in range(LANES):
         numbers[_POSE + lane] = 0
     for start in range(0, count, LANES):
@@ -349,10 +422,12 @@ def _gather(casts, rays, origins, directions):  # type: ignore[no-untyped-def]
         make(cast, scratch, begin(cast, first))
         for lane in range(min(LANES, count - start)):
             k = start + lane
-            directions[0, k], directions[1, k] = floats[_DX + lane], floats[_DY + lane]
+            directions[0, k] = floats[_DX + lane]
+            directions[1, k] = floats[_DY + lane]
             directions[2, k] = floats[_DZ + lane]
             if begins:
-                origins[0, k], origins[1, k] = floats[_OX + lane], floats[_OY + lane]
+                origins[0, k] = floats[_OX + lane]
+                origins[1, k] = floats[_OY + lane]
                 origins[2, k] = floats[_OZ + lane]
 
 
@@ -364,7 +439,9 @@ def rays_of(pattern: Pattern, first: int, ray: Ints, poses: Poses) -> tuple[Floa
     cast = memory.Cast(np.zeros(1, memory.CAST))
     record = cast.record
     cast.take_pattern(pattern, poses, first)
-    record["scale"], record["near"] = 1.0, 1  # metres
+    # metres
+    record["scale"] = 1.0
+    record["near"] = 1
     record["scratch"], _ = memory.own.memory(0)
     origins = np.empty((3, 0 if record["still"] else len(ray)))
     directions = np.empty((3, len(ray)))

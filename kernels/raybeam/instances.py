@@ -253,13 +253,15 @@ def place(meshes: tuple[LocalMesh, ...], mesh: Indices, transforms: Floats) -> S
         (n, 3, 4), checked.
     """
     frames = [one.frame for one in meshes]
-    turn, move = transforms[:, :, :3], transforms[:, :, 3]
+    turn = transforms[:, :, :3]
+    move = transforms[:, :, 3]
     scale = np.array([frame.scale for frame in frames])[mesh]
     # Middle of each mesh's coordinates in the scene, metres: large numbers are subtracted first.
     centre = _product(turn, np.array([frame.centre for frame in frames])[mesh]) + move
     low = np.array([frame.low for frame in frames])[mesh] / scale[:, None]
     high = np.array([frame.high for frame in frames])[mesh] / scale[:, None]
-    shift, half = _product(turn, (low + high) / 2), _product(np.abs(turn), (high - low) / 2)
+    shift = _product(turn, (low + high) / 2)
+    half = _product(np.abs(turn), (high - low) / 2)
     middles = centre + shift
     origin, unit = middle((middles - half).min(axis=0), (middles + half).max(axis=0))
     at = ((centre - origin) + shift) * unit

@@ -97,7 +97,8 @@ def lay_out_places(scene: Scene, roots: Ints) -> Places:
     instances[:, :12] = scene.matrices
     frames = [mesh.frame for mesh in scene.meshes]
     boxes = np.array([[*frame.low, *frame.high] for frame in frames])
-    instances[:, 12:18], instances[:, 18] = boxes[scene.mesh], roots[scene.mesh]
+    instances[:, 12:18] = boxes[scene.mesh]
+    instances[:, 18] = roots[scene.mesh]
     instances[:, 19] = scene.mesh
     # One more: the top's root waits like the others.
     return Places(_nodes(tree), instances, scene.frame.table, _stack_need(tree) + 1)
@@ -131,10 +132,13 @@ def _records(corners: Floats) -> Floats32:
     distance, at most 4, for the last one. The numbers below are these with some margin.
     """
     first = corners[:, 0]
-    edge, other = corners[:, 1] - first, corners[:, 2] - first
+    edge = corners[:, 1] - first
+    other = corners[:, 2] - first
     e, g = (np.sqrt((side * side).sum(axis=1)) for side in (edge, other))
     out = np.empty((len(corners), 3, 4), np.float32)
-    out[:, 0, :3], out[:, 1, :3], out[:, 2, :3] = first, edge, other
+    out[:, 0, :3] = first
+    out[:, 1, :3] = edge
+    out[:, 2, :3] = other
     out[:, 0, 3] = _UNIT * g * (48 + 24 * e) + _FLOOR
     out[:, 1, 3] = _UNIT * e * (56 + 24 * g) + _FLOOR
     out[:, 2, 3] = _UNIT * e * g * 144 + _FLOOR

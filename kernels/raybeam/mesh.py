@@ -140,9 +140,11 @@ def local_mesh(vertices: ArrayLike, faces: ArrayLike, opacity: Opacity | None = 
         raise ValueError("No triangle of the mesh has an area: there is nothing to hit.")
     face_count = len(rows)
     if len(index) < face_count:
-        rows, corners = rows[solid], corners[solid]
+        rows = rows[solid]
+        corners = corners[solid]
     hit = corners.reshape(-1, 3)
-    low, high = hit.min(axis=0) - PAD, hit.max(axis=0) + PAD
+    low = hit.min(axis=0) - PAD
+    high = hit.max(axis=0) + PAD
     frame = Frame(centre, scale, low, high)
     checked = None if opacity is None else check_opacity(opacity, face_count, index)
     return LocalMesh(frame, points, rows, corners, index, face_count, checked)

@@ -98,8 +98,10 @@ def hits_on(
     for start, stop in scan.chunks(_CHUNK):
         ray = np.arange(start, stop, dtype=np.int64)
         if scan.room is None:
-            made, rays = scan.rays(start, stop), np.empty((6, len(ray)))
-            rays[:3], rays[3:] = made.origins.T, made.directions.T
+            made = scan.rays(start, stop)
+            rays = np.empty((6, len(ray)))
+            rays[:3] = made.origins.T
+            rays[3:] = made.directions.T
         else:  # where the caster has written them
             rays = np.ascontiguousarray(scan.room[:, start:stop])
         _Chunk(loops, moving, scan, rays, times(ray), found.part(start, stop)).cast()
@@ -121,7 +123,8 @@ def near_boxes(
     wide = loops.cells_of(rays, times, loops.CELL * loops.WIDE)
     radius = np.sqrt((boxes[:, 3:] ** 2).sum(axis=1))
     sizes = np.column_stack([radius, np.full(len(boxes), loops.PADS_M), there])
-    number, looks = np.zeros((len(cells), 2), np.int64), boxes[:, None].copy()
+    number = np.zeros((len(cells), 2), np.int64)
+    looks = boxes[:, None].copy()
     parts = [np.zeros((2, 0), np.int64)]
     for first in range(0, len(boxes), _BOXES):
         some = slice(first, first + _BOXES)
@@ -137,12 +140,18 @@ class _Chunk:
     def __init__(
         self, loops: Any, moving: Moving, scan: Scan, rays: Floats, times: Floats, nearest: Nearest
     ) -> None:
-        self._loops, self._moving, self._scan = loops, moving, scan
-        self._rays, self._times, self._nearest = rays, times, nearest
+        self._loops = loops
+        self._moving = moving
+        self._scan = scan
+        self._rays = rays
+        self._times = times
+        self._nearest = nearest
 
     def cast(self) -> None:
         """Note the nearest hits on all bodies."""
-        loops, moving, times = self._loops, self._moving, self._times
+        loops = self._loops
+        moving = self._moving
+        times = self._times
         first, last = moving.there.T
         bodies = np.flatnonzero((first <= times.max()) & (last >= times.min()))
         swept = np.array([shape.on_device for shape in moving.shapes])[moving.shape[bodies]]
@@ -159,22 +168,26 @@ class _Chunk:
         order = np.argsort((way**2).sum(axis=1), kind="stable")
         reach = float(self._nearest.distance.max())
         cell, which = loops.meet(wide, cells, number, looks[order], sizes[order], reach)
-        body, spans = bodies[order][which], cells[:, loops.BEGIN : loops.END + 1]
+        body = bodies[order][which]
+        spans = cells[:, loops.BEGIN : loops.END + 1]
         for start in range(0, len(cell), _PAIRS):
             some = slice(start, start + _PAIRS)
             self._cast_at(cell[some], spans[cell[some]].T, body[some])
 
     def _sweep(self, bodies: Ints) -> None:
         """Note the nearest hits on bodies whose shapes are on a device."""
-        moving, scan = self._moving, self._scan
+        moving = self._moving
+        scan = self._scan
         at, when = np.unique(self._times, return_inverse=True)
         step = max(1, _POSES // (SPAN * len(bodies))) * SPAN
         for one in np.unique(moving.shape[bodies]).tolist():
-            shape, own = moving.shapes[one], bodies[moving.shape[bodies] == one]
+            shape = moving.shapes[one]
+            own = bodies[moving.shape[bodies] == one]
             assert isinstance(shape, RayCaster)
             for start in range(0, len(at), step):
                 rows = np.flatnonzero((when >= start) & (when < start + step))
-                first, last = int(rows[0]), int(rows[-1]) + 1
+                first = int(rows[0])
+                last = int(rows[-1]) + 1
                 poses, boxes = self._swept(one, own, at[start : start + step])
                 rays = np.ascontiguousarray(self._rays[:, first:last])
                 number = (when[first:last] - start).astype(np.int32)
@@ -185,14 +198,18 @@ class _Chunk:
         """Poses and boxes of bodies of one shape at times, see `Swept`."""
         from .moving_loops import PADS_M
 
-        moving, many = self._moving, len(bodies)
-        body, time = np.tile(bodies, len(times)), np.repeat(times, many)
+        moving = self._moving
+        many = len(bodies)
+        body = np.tile(bodies, len(times))
+        time = np.repeat(times, many)
         first, last = moving.there[body].T
         there = (first <= time) & (time <= last)
-        poses, corners = np.full((len(body), 12), np.nan), np.full((2, len(body), 3), np.nan)
+        poses = np.full((len(body), 12), np.nan)
+        corners = np.full((2, len(body), 3), np.nan)
         if there.any():
             table = moving.poses(body[there], time[there])
-            poses[there], turns = table.T, _rotations(table)
+            poses[there] = table.T
+            turns = _rotations(table)
             middle = table[:3].T + _turned(turns, moving.middle[[shape]])
             half = _turned(np.abs(turns), moving.half[[shape]]) + PADS_M
             corners[:, there] = middle - half, middle + half
@@ -203,8 +220,11 @@ class _Chunk:
 
     def _looks(self, bodies: Ints, cells: Floats) -> tuple[Ints, Floats, Floats]:
         """Bodies, looked at a few times, see `meet`."""
-        loops, moving, shape = self._loops, self._moving, self._moving.shape[bodies]
-        first, last = cells[:, loops.BEGIN].min(), cells[:, loops.END].max()
+        loops = self._loops
+        moving = self._moving
+        shape = self._moving.shape[bodies]
+        first = cells[:, loops.BEGIN].min()
+        last = cells[:, loops.END].max()
         steps = max(1, len(cells) // _LOOKS)
         step = (last - first) / steps
         spans = (cells[:, loops.BEGIN : loops.END + 1] - first) / (step or 1)
@@ -225,13 +245,18 @@ class _Chunk:
 
     def _cast_at(self, cell: Indices, spans: Floats, body: Ints) -> None:
         """Cast the rays of cells, of some spans of time, on bodies, one each."""
-        loops, moving, times, rays = self._loops, self._moving, self._times, self._rays
-        shape, boxes = moving.shape[body], moving.boxes.reshape(-1, 6)
+        loops = self._loops
+        moving = self._moving
+        times = self._times
+        rays = self._rays
+        shape = moving.shape[body]
+        boxes = moving.boxes.reshape(-1, 6)
         begins, ends = np.clip(spans, *moving.there[body].T)
         new = (np.diff(body, prepend=-1) != 0) | (np.diff(begins, prepend=np.nan) != 0)
         number = np.cumsum(new) - 1  # several cells of a body may begin at one time
         poses = moving.poses(body[new], begins[new])
-        pads, straddles = np.full(len(cell), loops.PADS_M), spans[1] > spans[0]
+        pads = np.full(len(cell), loops.PADS_M)
+        straddles = spans[1] > spans[0]
         late = np.flatnonzero(straddles)
         if len(late):  # the box is larger by what happens until the cell's end
             change = np.abs(moving.poses(body[late], ends[late]) - poses[:, number[late]])
@@ -239,20 +264,26 @@ class _Chunk:
             pads[late] += 2 * (change[:3].sum(axis=0) + size * change[3:].sum(axis=0))
         given = cell, number, poses, boxes, shape, pads
         row, pair = loops.through(rays, self._nearest.distance, *given)
-        body, number = body[pair], number[pair]
+        body = body[pair]
+        number = number[pair]
         if len(late):  # each of their rays at its own time, when the body may not be there
             first, last = moving.there[body].T
             there = np.flatnonzero((first <= times[row]) & (times[row] <= last))
-            row, body, number, pair = row[there], body[there], number[there], pair[there]
+            row = row[there]
+            body = body[there]
+            number = number[there]
+            pair = pair[there]
             some = np.flatnonzero(straddles[pair])
             number[some] = poses.shape[1] + np.arange(len(some))
             poses = np.concatenate([poses, moving.poses(body[some], times[row[some]])], axis=1)
-        limits, shape = (self._scan.t_min, self._scan.t_max), moving.shape[body]
+        limits = (self._scan.t_min, self._scan.t_max)
+        shape = moving.shape[body]
         several = len(moving.shapes) > 1
         for one in np.unique(shape).tolist() if several else [0]:
             own = shape == one if several else slice(None)
             which = row[own], body[own], number[own]
-            cast, frame = moving.shapes[one], _NONE
+            cast = moving.shapes[one]
+            frame = _NONE
             if isinstance(cast, Deforming):
                 assert moving.frames is not None, "of bodies that deform"
                 frame = moving.frames(which[1], times[which[0]])

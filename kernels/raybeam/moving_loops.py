@@ -8,11 +8,21 @@ from .arrays import Floats, Indices, Ints
 from .compiled import compiled, inlined, stage
 from .embree_memory import float64s, int64s
 
-CELL, WIDE = 64, 16  # rays, and cells of a wide one
+# rays, and cells of a wide one
+CELL = 64
+WIDE = 16
 PADS_M = 1e-3  # around a box, and 2e-6 of how far away it is: far more than rounding
 # Columns of cells: axis and half angle of the cone, ball around the origins, first and last time,
 # normal of the plane that the rays lie near, and the sine of the greatest angle to it.
-AXIS, COSINE, SINE, MIDDLE, SPREAD, BEGIN, END, NORMAL, OFF = 0, 3, 4, 5, 8, 9, 10, 11, 14
+AXIS = 0
+COSINE = 3
+SINE = 4
+MIDDLE = 5
+SPREAD = 8
+BEGIN = 9
+END = 10
+NORMAL = 11
+OFF = 14
 _TINY = 1e-300
 
 
@@ -22,46 +32,86 @@ def cells_of(rays, times, size):  # type: ignore[no-untyped-def]
     count = -(-len(times) // size)
     out = np.empty((count, 15))
     for c in range(count):
-        begin, end = c * size, min((c + 1) * size, len(times))
+        begin = c * size
+        end = min((c + 1) * size, len(times))
         ax = ay = az = px = py = pz = 0.0
         first = last = times[begin]
         for k in range(begin, end):
-            ax, ay, az = ax + rays[3, k], ay + rays[4, k], az + rays[5, k]
-            px, py, pz = px + rays[0, k], py + rays[1, k], pz + rays[2, k]
-            first, last = min(first, times[k]), max(last, times[k])
+            ax = ax + rays[3, k]
+            ay = ay + rays[4, k]
+            az = az + rays[5, k]
+            px = px + rays[0, k]
+            py = py + rays[1, k]
+            pz = pz + rays[2, k]
+            first = min(first, times[k])
+            last = max(last, times[k])
         length = max(np.sqrt(ax * ax + ay * ay + az * az), _TINY)
-        ax, ay, az = ax / length, ay / length, az / length
+        ax = ax / length
+        ay = ay / length
+        az = az / length
         n = end - begin
-        px, py, pz = px / n, py / n, pz / n
-        x, y, z = rays[3, begin], rays[4, begin], rays[5, begin]
-        dx, dy, dz = rays[3, end - 1], rays[4, end - 1], rays[5, end - 1]
-        nx, ny, nz = y * dz - z * dy, z * dx - x * dz, x * dy - y * dx
+        px = px / n
+        py = py / n
+        pz = pz / n
+        x = rays[3, begin]
+        y = rays[4, begin]
+        z = rays[5, begin]
+        dx = rays[3, end - 1]
+        dy = rays[4, end - 1]
+        dz = rays[5, end - 1]
+        nx = y * dz - z * dy
+        ny = z * dx - x * dz
+        nz = x * dy - y * dx
         length = max(np.sqrt(nx * nx + ny * ny + nz * nz), _TINY)
-        nx, ny, nz = nx / length, ny / length, nz / length
-        cosine, far, off = 1.0, 0.0, 0.0
+        nx = nx / length
+        ny = ny / length
+        nz = nz / length
+        cosine = 1.0
+        far = 0.0
+        off = 0.0
         for k in range(begin, end):
             side = nx * rays[3, k] + ny * rays[4, k] + nz * rays[5, k]
             off = max(off, abs(side))
             along = ax * rays[3, k] + ay * rays[4, k] + az * rays[5, k]
             cosine = min(cosine, along)
-            x, y, z = rays[0, k] - px, rays[1, k] - py, rays[2, k] - pz
+            x = rays[0, k] - px
+            y = rays[1, k] - py
+            z = rays[2, k] - pz
             far = max(far, x * x + y * y + z * z)
         cosine = max(cosine, -1.0)
-        out[c, 0], out[c, 1], out[c, 2] = ax, ay, az
-        out[c, 3], out[c, 4] = cosine, np.sqrt(1 - cosine * cosine)
-        out[c, 5], out[c, 6], out[c, 7], out[c, 8] = px, py, pz, np.sqrt(far)
-        out[c, 9], out[c, 10] = first, last
-        out[c, 11], out[c, 12], out[c, 13], out[c, 14] = nx, ny, nz, off
+        out[c, 0] = ax
+        out[c, 1] = ay
+        out[c, 2] = az
+        out[c, 3] = cosine
+        out[c, 4] = np.sqrt(1 - cosine * cosine)
+        out[c, 5] = px
+        out[c, 6] = py
+        out[c, 7] = pz
+        out[c, 8] = np.sqrt(far)
+        out[c, 9] = first
+        out[c, 10] = last
+        out[c, 11] = nx
+        out[c, 12] = ny
+        out[c, 13] = nz
+        out[c, 14] = off
     return out
 
 
 @inlined
 def _may_meet(cell, look, size, reach):  # type: ignore[no-untyped-def]
     """Whether rays of a cell may meet a body."""
-    radius, slack, first, last = size[0], size[1], size[2], size[3]
-    x, y, z = look[0] - cell[5], look[1] - cell[6], look[2] - cell[7]
-    nx, ny, nz = cell[11], cell[12], cell[13]
-    off, wide = abs(x * nx + y * ny + z * nz), abs(x) + abs(y) + abs(z)
+    radius = size[0]
+    slack = size[1]
+    first = size[2]
+    last = size[3]
+    x = look[0] - cell[5]
+    y = look[1] - cell[6]
+    z = look[2] - cell[7]
+    nx = cell[11]
+    ny = cell[12]
+    nz = cell[13]
+    off = abs(x * nx + y * ny + z * nz)
+    wide = abs(x) + abs(y) + abs(z)
     most = radius + slack + cell[8] + 1e-6 * wide
     if off > most + (wide + most) * cell[14]:  # which needs no root
         return False
@@ -89,11 +139,15 @@ def _may_meet(cell, look, size, reach):  # type: ignore[no-untyped-def]
 def _meet(wide, cells, number, looks, sizes, reach, out):  # type: ignore[no-untyped-def]
     found = 0
     # Pointers: views of arrays would be counted, which takes longer than the comparisons.
-    cell, broad, look = cells.ctypes.data, wide.ctypes.data, looks.ctypes.data
+    cell = cells.ctypes.data
+    broad = wide.ctypes.data
+    look = looks.ctypes.data
     for b in range(len(sizes)):
-        size, own = float64s(sizes.ctypes.data + 32 * b), look + 96 * looks.shape[1] * b
+        size = float64s(sizes.ctypes.data + 32 * b)
+        own = look + 96 * looks.shape[1] * b
         for w in range(len(wide)):
-            begin, end = w * WIDE, min((w + 1) * WIDE, len(cells))
+            begin = w * WIDE
+            end = min((w + 1) * WIDE, len(cells))
             first = number[begin, 0]
             if number[end - 1, 1] - first <= 1:  # which sizes allow for
                 at = float64s(own + 96 * first)
@@ -105,7 +159,8 @@ def _meet(wide, cells, number, looks, sizes, reach, out):  # type: ignore[no-unt
                     at = float64s(own + 96 * first)
                     if not _may_meet(float64s(cell + 120 * c), at, size, reach):
                         continue
-                out[0, found], out[1, found] = c, b
+                out[0, found] = c
+                out[1, found] = b
                 found += 1
     return found
 
@@ -160,7 +215,8 @@ def sides_of(box):  # type: ignore[no-untyped-def]
 @inlined
 def _between(low, high, o, d, enters, leaves):  # type: ignore[no-untyped-def]
     inverse = 1 / (d if abs(d) >= _TINY else _TINY)
-    low, high = (low - o) * inverse, (high - o) * inverse
+    low = (low - o) * inverse
+    high = (high - o) * inverse
     return max(enters, min(low, high)), min(leaves, max(low, high))
 
 
@@ -181,7 +237,9 @@ def _passing(rays, n, ends, place, turn, sides, pad, out):  # type: ignore[no-un
 
     `rays` is their address in (6, n), `ends` and `out` are those of float64 and int64 (`CELL`,).
     """
-    ray, end, found = float64s(rays), float64s(ends), int64s(out)
+    ray = float64s(rays)
+    end = float64s(ends)
+    found = int64s(out)
     px, py, pz = place
     for k in range(CELL):
         x, y, z = taken(turn, ray[k] - px, ray[n + k] - py, ray[2 * n + k] - pz)
@@ -194,16 +252,22 @@ def _passing(rays, n, ends, place, turn, sides, pad, out):  # type: ignore[no-un
     "i8[:, ::1])"
 )
 def _through(rays, ends, cell, number, poses, boxes, shape, pads, passed, out):  # type: ignore[no-untyped-def]
-    found, count = 0, rays.shape[1]
+    found = 0
+    count = rays.shape[1]
     for pair in range(len(cell)):
-        begin, end = cell[pair] * CELL, min((cell[pair] + 1) * CELL, len(ends))
-        sides, pose = sides_of(float64s(boxes.ctypes.data + 48 * shape[pair])), number[pair]
+        begin = cell[pair] * CELL
+        end = min((cell[pair] + 1) * CELL, len(ends))
+        sides = sides_of(float64s(boxes.ctypes.data + 48 * shape[pair]))
+        pose = number[pair]
         first = min(begin, count - CELL)
-        place, turn = (poses[0, pose], poses[1, pose], poses[2, pose]), turn_of(poses, pose)
-        ray, own = rays.ctypes.data + 8 * first, ends.ctypes.data + 8 * first
+        place = (poses[0, pose], poses[1, pose], poses[2, pose])
+        turn = turn_of(poses, pose)
+        ray = rays.ctypes.data + 8 * first
+        own = ends.ctypes.data + 8 * first
         _passing(ray, count, own, place, turn, sides, pads[pair], passed.ctypes.data)
         for k in range(begin, end):
-            out[0, found], out[1, found] = k, pair
+            out[0, found] = k
+            out[1, found] = pair
             found += passed[k - first]
     return found
 
@@ -217,7 +281,8 @@ def through(
     Boxes (s, 6), `shape` of which (m,), have the poses (12, p) of a `number` (m,) and are larger by
     `pads` (m,); rays (6, n) end at `ends`.
     """
-    cell, shape = np.ascontiguousarray(cell), np.ascontiguousarray(shape)
+    cell = np.ascontiguousarray(cell)
+    shape = np.ascontiguousarray(shape)
     pairs = np.empty((2, len(cell) * CELL), np.int64)
     if len(ends) < CELL:  # the loop over a cell has a constant length
         rays = np.concatenate([rays, np.zeros((6, CELL - len(ends)))], axis=1)

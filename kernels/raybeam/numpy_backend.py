@@ -203,12 +203,15 @@ class NumpyBackend(Backend):
         """See `Backend.closest`."""
         frame = self._scene.frame
         origins = np.broadcast_to(frame.to_local(rays.origins), rays.directions.shape)
-        t_min, t_max = rays.t_min * frame.scale, rays.t_max * frame.scale
+        t_min = rays.t_min * frame.scale
+        t_max = rays.t_max * frame.scale
         entry, leave = clip(frame.low, frame.high, origins, rays.directions)
         row = np.flatnonzero((entry <= leave) & (entry <= t_max + PAD) & (leave >= t_min - PAD))
-        t, key = np.full(len(row), t_max), np.full(len(row), -1, np.int64)
+        t = np.full(len(row), t_max)
+        key = np.full(len(row), -1, np.int64)
         best = _Best(t, key, np.zeros(len(row)), np.zeros(len(row)))
-        origins, directions = origins[row], rays.directions[row]
+        origins = origins[row]
+        directions = rays.directions[row]
         bundle = _bundle(origins, directions, entry[row], t_max)
         if self._scene.nested:
             self._top.walk(
@@ -251,15 +254,18 @@ class NumpyBackend(Backend):
         for chosen in np.split(order, ends[:-1]):
             now = leaves.only(chosen)
             now = now.only(np.flatnonzero(now.enter <= rays.limit.take(now.ray)))
-            ray, instance = now.ray, now.node >> LEAF_BITS
+            ray = now.ray
+            instance = now.node >> LEAF_BITS
             at, to, length = self._scene.enter(instance, origins[ray], directions[ray])
-            low, high = self._low[:, instance], self._high[:, instance]
+            low = self._low[:, instance]
+            high = self._high[:, instance]
             entry, leave = clip(low, high, at, to)
             t_max = best.t[ray] * length
             met = np.flatnonzero(
                 (entry <= leave) & (entry <= t_max + PAD) & (leave >= t_min * length - PAD)
             )
-            ray, instance = ray[met], instance[met]
+            ray = ray[met]
+            instance = instance[met]
             visit = _Visit(ray, instance << _SHIFT, length[met])
             inside = _bundle(at[met], to[met], entry[met], t_max[met], visit)
             self._walk(inside, self._roots[self._scene.mesh[instance]], best, t_min)
@@ -275,7 +281,8 @@ class NumpyBackend(Backend):
         a, b, c, det, t = exact.intersect(rays.sheared, row, self._corners, place)
         ray = row
         if rays.visit is not None:
-            ray, t = rays.visit.ray[row], t / rays.visit.length[row]
+            ray = rays.visit.ray[row]
+            t = t / rays.visit.length[row]
         ok = np.flatnonzero(exact.inside(a, b, c, det) & (t >= t_min) & (t <= best.t.take(ray)))
         if self._masks is not None:
             instance = 0 if rays.visit is None else rays.visit.key[row[ok]] >> _SHIFT
@@ -284,18 +291,28 @@ class NumpyBackend(Backend):
             ok = ok[self._masks.opaque(mesh, place[ok], *weights)]
         if not len(ok):
             return
-        row, ray, key, t = row[ok], ray[ok], self._face[place[ok]].astype(np.int64), t[ok]
+        row = row[ok]
+        ray = ray[ok]
+        key = self._face[place[ok]].astype(np.int64)
+        t = t[ok]
         if rays.visit is not None:
             key += rays.visit.key[row]
         order = np.lexsort((key, t, ray))
         order = order[np.diff(ray[order], prepend=-1) != 0]  # the closest of each ray
-        row, ray, key, t = row[order], ray[order], key[order], t[order]
+        row = row[order]
+        ray = ray[order]
+        key = key[order]
+        t = t[order]
         old = best.key[ray]
         # At equal distance the lowest key wins; a ray without a hit has t_max, which counts too.
         better = (t < best.t[ray]) | (old < 0) | (key < old)
-        row, ray, ok = row[better], ray[better], ok[order][better]
-        best.t[ray], best.key[ray] = t[better], key[better]
-        best.u[ray], best.v[ray] = b[ok] / det[ok], c[ok] / det[ok]
+        row = row[better]
+        ray = ray[better]
+        ok = ok[order][better]
+        best.t[ray] = t[better]
+        best.key[ray] = key[better]
+        best.u[ray] = b[ok] / det[ok]
+        best.v[ray] = c[ok] / det[ok]
         reach = best.t[ray] if rays.visit is None else best.t[ray] * rays.visit.length[row]
         rays.limit[row] = _limit(reach, rays.entry[row])
 

@@ -53,7 +53,8 @@ class LocalOpacity:
 
 def check_opacity(opacity: Opacity, face_count: int, index: Ints32) -> LocalOpacity:
     """Check an opacity and select the triangles `index`; ValueError if it is invalid."""
-    mask, uv = np.asarray(opacity.mask), np.asarray(opacity.uv)
+    mask = np.asarray(opacity.mask)
+    uv = np.asarray(opacity.uv)
     if mask.dtype != np.bool_ or mask.ndim != 2 or not mask.size:
         raise ValueError(
             f"mask must be bool of shape (h, w), at least one element, not {mask.dtype} "
@@ -111,7 +112,9 @@ class Masks:
         stopped = height == 0
         (k,) = np.nonzero(height)
         uv = self.uv[place[k] + shift[k]].astype(np.float64)
-        p, q, r = a[k] / det[k], b[k] / det[k], c[k] / det[k]
+        p = a[k] / det[k]
+        q = b[k] / det[k]
+        r = c[k] / det[k]
         u = (p * uv[:, 0] + q * uv[:, 2]) + r * uv[:, 4]
         v = (p * uv[:, 1] + q * uv[:, 3]) + r * uv[:, 5]
         column = np.minimum(((u - np.floor(u)) * width[k]).astype(np.int64), width[k] - 1)
@@ -125,7 +128,8 @@ def join_masks(opacities: list[LocalOpacity | None], orders: list[Ints32]) -> Ma
 
     A mask that meshes share, as the same memory, is there once.
     """
-    uv, mask = [np.zeros((0, 6), np.float32)], [np.zeros(0, np.uint8)]
+    uv = [np.zeros((0, 6), np.float32)]
+    mask = [np.zeros(0, np.uint8)]
     records = np.zeros((len(orders), 4), np.int64)
     begins: dict[tuple[int, tuple[int, ...]], int] = {}  # {address and shape: first element}
     triangles = rows = elements = 0

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 
 from .arrays import Floats, Ints
 from .pattern import Pattern
-from .poses import Motion, Poses, check_poses
+from .poses import PoseMotion, Poses, check_poses
 from .sub_rays import spread
 
 _BLOCK_RAYS = 1 << 14  # rays that are computed at a time: their arrays stay in a core's cache
@@ -25,7 +25,7 @@ def pattern_rays(
     *,
     start: int = 0,
     rays_per_pose: int | None = None,
-    motion: Motion | None = None,
+    motion: PoseMotion | None = None,
 ) -> tuple[Floats, Floats]:
     """Return origins and directions, in the mesh's axes, of some of the rays that a scan casts.
 

@@ -22,7 +22,8 @@ from .sweep import divide
 _RADIUS = 8  # neighbours looked at on either side; twice as many gain 1 to 2 % of the tree's cost
 # Clusters that are left to the sweep: so many, but at most an eighth of all boxes if those are
 # enough. Four times as many gain nothing, a quarter loses a twentieth.
-_MOST, _ENOUGH = 1 << 14, 1 << 10
+_MOST = 1 << 14
+_ENOUGH = 1 << 10
 _GRID_BITS = 21  # a coordinate; three of them fill 63 bits
 
 
@@ -64,9 +65,12 @@ def build(low: Floats32, high: Floats32) -> BinaryTree:
     n = low.shape[1]
     order = np.argsort(_morton(low, high), kind="stable").astype(np.int32)
     all_low, all_high = np.empty((2, 3, 2 * n - 1), np.float32)
-    all_low[:, :n], all_high[:, :n] = low, high
+    all_low[:, :n] = low
+    all_high[:, :n] = high
     left, right = np.full((2, 2 * n - 1), -1, np.int32)
-    low, high, ids = low[:, order], high[:, order], order
+    low = low[:, order]
+    high = high[:, order]
+    ids = order
     rounds: list[tuple[int, int]] = []
     count = np.ones(2 * n - 1, np.int32)
     made = n
@@ -76,15 +80,19 @@ def build(low: Floats32, high: Floats32) -> BinaryTree:
         new = np.arange(made, made + len(first), dtype=np.int32)
         rounds.append((made, made + len(first)))
         made += len(first)
-        left[new], right[new] = ids[first], ids[second]
+        left[new] = ids[first]
+        right[new] = ids[second]
         count[new] = count[left[new]] + count[right[new]]
         low[:, first] = np.minimum(low[:, first], low[:, second])
         high[:, first] = np.maximum(high[:, first], high[:, second])
-        all_low[:, new], all_high[:, new] = low[:, first], high[:, first]
+        all_low[:, new] = low[:, first]
+        all_high[:, new] = high[:, first]
         ids[first] = new
         stay = np.ones(len(ids), np.bool_)
         stay[second] = False
-        low, high, ids = low[:, stay], high[:, stay], ids[stay]
+        low = low[:, stay]
+        high = high[:, stay]
+        ids = ids[stay]
     children, upper = _crown(low, high, count[ids], ids, made)
     left[made:], right[made:] = children.T
     for start, stop in upper:
@@ -114,7 +122,8 @@ def _crown(
         number = np.where(nodes >= 0, ids[nodes], below - 1 - nodes)
         children.append(number.astype(np.int32))
         rounds.append((made, made + len(nodes)))
-        below, made = made, made + len(nodes)
+        below = made
+        made = made + len(nodes)
     return np.concatenate(children), rounds
 
 

@@ -15,7 +15,7 @@ _SLACK = 2e-9  # on products of a rotation's rows
 
 
 @dataclass(frozen=True, eq=False)
-class Motion:
+class PoseMotion:
     """Motion of a lidar while it fires the rays of a pose one after the other.
 
     Parameters
@@ -55,7 +55,7 @@ class Poses:
     positions: Floats
     rotations: Floats | None
     rays: int
-    motion: Motion | None = None
+    motion: PoseMotion | None = None
 
     def __len__(self) -> int:
         return len(self.positions)
@@ -63,7 +63,9 @@ class Poses:
     def of(self, ray: Ints, room: Floats) -> RayPoses:
         """Look up the poses of rays (m,), into `room`, (18, m)."""
         pose = ray // self.rays
-        delay, rates, velocities = np.zeros(1), None, None
+        delay = np.zeros(1)
+        rates = None
+        velocities = None
         if self.motion is not None:
             delay = self.motion.delays.take(ray - pose * self.rays)
             velocities = self._each(self.motion.velocities, pose, room[12:15])
@@ -102,7 +104,8 @@ class RayPoses:
         """
         if self.rotations is not None:
             x, y, z = vectors
-            vectors, product = np.empty_like(vectors), np.empty_like(x)
+            vectors = np.empty_like(vectors)
+            product = np.empty_like(x)
             for out, (a, b, c) in zip(vectors, self.rotations.reshape(3, 3, -1), strict=True):
                 np.multiply(x, a, out=out)
                 out += np.multiply(y, b, out=product)
@@ -128,7 +131,7 @@ def check_poses(
     rotations: ArrayLike | None,
     rays_per_pose: int | None,
     rays: int,
-    motion: Motion | None = None,
+    motion: PoseMotion | None = None,
 ) -> Poses:
     """Check the poses for so many rays; `RayCaster.scan` describes arguments and errors.
 
@@ -164,17 +167,17 @@ def check_poses(
     )
 
 
-def _check_motion(motion: Motion, poses: int, rays: int) -> Motion:
+def _check_motion(motion: PoseMotion, poses: int, rays: int) -> PoseMotion:
     arrays = []
     for name, shape in (("delays", (rays,)), ("velocities", (poses, 3)), ("rates", (poses, 3))):
         array = by_number(np.asarray(getattr(motion, name), dtype=np.float64))
         if array.shape != shape or not np.isfinite(array).all():
             raise ValueError(
-                f"Motion.{name} must be {shape} finite numbers for {poses:,} poses of {rays:,} "
+                f"PoseMotion.{name} must be {shape} finite numbers for {poses:,} poses of {rays:,} "
                 f"rays; given: {array.shape}."
             )
         arrays.append(array)
-    return Motion(*arrays)
+    return PoseMotion(*arrays)
 
 
 def _check_rotations(rotations: ArrayLike) -> Floats:

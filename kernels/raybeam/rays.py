@@ -80,7 +80,8 @@ def check_origins(origins: ArrayLike, rays: int) -> AnyArray:
 
 def check_interval(t_min: float, t_max: float) -> tuple[float, float]:
     """Return both as floats; raises ValueError unless ``0 <= t_min <= t_max``."""
-    t_min, t_max = float(t_min), float(t_max)
+    t_min = float(t_min)
+    t_max = float(t_max)
     if not (0 <= t_min < np.inf and t_min <= t_max):
         raise ValueError(
             f"t_min is {t_min} and t_max {t_max}: distances must be finite, at least 0, "

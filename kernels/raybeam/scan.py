@@ -13,7 +13,7 @@ from .arrays import Floats, Indices, Integers, Ints, Ints32
 from .hits import Part, ScanReturns, joined
 from .pattern import Pattern
 from .pattern_rays import checked_rays
-from .poses import Motion, Poses, check_poses
+from .poses import PoseMotion, Poses, check_poses
 from .rays import Rays, check_interval
 
 _MOST_RAYS = 1 << 32  # of a scan, so that `ScanReturns` can number them
@@ -88,7 +88,7 @@ def check_scan(
     keep_every: int = 1,
     groups: ArrayLike | None = None,
     tally: bool = False,
-    motion: Motion | None = None,
+    motion: PoseMotion | None = None,
     room: Floats | None = None,
 ) -> Scan:
     """Check the arguments of `RayCaster.scan`, which describes them and the errors."""
@@ -129,7 +129,8 @@ class Groups:
     """
 
     def __init__(self, begins: Ints, every: int) -> None:
-        self._begins, self.every = begins, every
+        self._begins = begins
+        self.every = every
         self.hits = np.zeros(len(begins), np.int64)  # of each group, so far
 
     def spans(self, start: int, stop: int) -> tuple[slice, Ints]:

@@ -38,7 +38,8 @@ class SubRays:
         """Shares of a unit vector ahead, across and up: (m,) each; `offsets` (2, m) add angles."""
         across, up = self.angles[subray].T
         if offsets is not None:
-            across, up = across + offsets[0], up + offsets[1]
+            across = across + offsets[0]
+            up = up + offsets[1]
         straight = 1 / np.sqrt((1 + across * across) + up * up)
         return straight, across * straight, up * straight
 

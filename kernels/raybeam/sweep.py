@@ -62,7 +62,8 @@ def divide(low: Floats32, high: Floats32, weight: Floats) -> list[Indices]:
         if len(levels) < _LEVELS:
             axis, split = _cheapest(low, high, weight, level, node)
         else:
-            axis, split = np.zeros_like(level.start), (level.start + level.stop) // 2 - 1
+            axis = np.zeros_like(level.start)
+            split = (level.start + level.stop) // 2 - 1
         children, level = _divided(level, node, axis, split)
         levels.append(children)
     return levels
@@ -83,7 +84,9 @@ def _cheapest(
         dearest = np.maximum.reduceat(np.where(np.isinf(cost), -np.inf, cost), level.start)
         place = np.where(dearest <= least, (level.start + level.stop) // 2 - 1, place)
         better = least < best
-        best[better], axis[better], split[better] = least[better], k, place[better]
+        best[better] = least[better]
+        axis[better] = k
+        split[better] = place[better]
     return axis, split
 
 

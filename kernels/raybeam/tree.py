@@ -88,7 +88,9 @@ def join(trees: list[WideTree]) -> tuple[WideTree, Ints]:
     roots = np.cumsum([0, *(len(tree.child) for tree in trees)])
     if len(trees) == 1:
         return trees[0], roots[:1]
-    children, orders, first = [], [], 0
+    children = []
+    orders = []
+    first = 0
     for tree, root in zip(trees, roots[:-1], strict=True):
         leaves = tree.child - (first << LEAF_BITS)
         children.append(np.where(tree.child < 0, leaves, tree.child + root))
@@ -112,7 +114,8 @@ def _leaves(tree: ploc.BinaryTree, leaf_size: int) -> tuple[Ints32, Bools]:
     cost = area.copy()
     leaf = np.ones(len(area), np.bool_)
     for start, stop in tree.rounds:
-        left, right = tree.left[start:stop], tree.right[start:stop]
+        left = tree.left[start:stop]
+        right = tree.right[start:stop]
         count[start:stop] = count[left] + count[right]
         whole = area[start:stop] * count[start:stop]
         split = area[start:stop] + cost[left] + cost[right]
@@ -126,7 +129,8 @@ def _positions(tree: ploc.BinaryTree, count: Ints32) -> Ints32:
     """Where each node's triangles begin when they are listed from left to right."""
     first = np.zeros(len(count), np.int32)
     for start, stop in reversed(tree.rounds):
-        left, right = tree.left[start:stop], tree.right[start:stop]
+        left = tree.left[start:stop]
+        right = tree.right[start:stop]
         first[left] = first[start:stop]
         first[right] = first[start:stop] + count[left]
     return first
@@ -141,7 +145,9 @@ def _widen(
 ) -> WideTree:
     """Nodes of up to `width` children: level by level, the largest child is opened first."""
     area = np.where(leaf, -1, tree.area)
-    lows, highs, children = [], [], []
+    lows = []
+    highs = []
+    children = []
     roots = np.array([len(leaf) - 1])
     total = 1
     while len(roots):
@@ -171,7 +177,8 @@ def _open(tree: ploc.BinaryTree, area: Floats32, roots: Indices, width: int) -> 
         size = np.where(slots >= 0, area[slots], -1)
         widest = np.argmax(size, axis=1)
         can = size[row, widest] > 0
-        rows, places = row[can], widest[can]
+        rows = row[can]
+        places = widest[can]
         opened = slots[rows, places]
         slots[rows, places] = tree.left[opened]
         slots[rows, free] = tree.right[opened]

@@ -92,9 +92,14 @@ def intersect(
     """
     flat = corners.reshape(-1)
     base = triangle * 9
-    at_x, at_y, at_z = base + rays.kx[ray], base + rays.ky[ray], base + rays.kz[ray]
-    ox, oy, oz = rays.ox[ray], rays.oy[ray], rays.oz[ray]
-    sx, sy = rays.sx[ray], rays.sy[ray]
+    at_x = base + rays.kx[ray]
+    at_y = base + rays.ky[ray]
+    at_z = base + rays.kz[ray]
+    ox = rays.ox[ray]
+    oy = rays.oy[ray]
+    oz = rays.oz[ray]
+    sx = rays.sx[ray]
+    sy = rays.sy[ray]
     x: list[Floats] = []
     y: list[Floats] = []
     z: list[Floats] = []

@@ -8,7 +8,9 @@ from .compiled import inlined
 @inlined
 def shear(ox, oy, oz, dx, dy, dz):  # type: ignore[no-untyped-def]
     """Longest axis of a ray, origin with that axis last, and shear."""
-    ax, ay, az = abs(dx), abs(dy), abs(dz)
+    ax = abs(dx)
+    ay = abs(dy)
+    az = abs(dz)
     first = ax >= ay and ax >= az
     second = not first and ay >= az
     along = dx if first else (dy if second else dz)
@@ -25,10 +27,15 @@ def areas(corners, ray):  # type: ignore[no-untyped-def]
     """Signed areas, their sum, and the distance."""
     u, v, w, sx, sy, sz = ray
     (px, py, pz), (qx, qy, qz), (rx, ry, rz) = corners
-    z0, z1, z2 = pz - w, qz - w, rz - w
-    x0, y0 = (px - u) - sx * z0, (py - v) - sy * z0
-    x1, y1 = (qx - u) - sx * z1, (qy - v) - sy * z1
-    x2, y2 = (rx - u) - sx * z2, (ry - v) - sy * z2
+    z0 = pz - w
+    z1 = qz - w
+    z2 = rz - w
+    x0 = (px - u) - sx * z0
+    y0 = (py - v) - sy * z0
+    x1 = (qx - u) - sx * z1
+    y1 = (qy - v) - sy * z1
+    x2 = (rx - u) - sx * z2
+    y2 = (ry - v) - sy * z2
     a = x2 * y1 - y2 * x1
     b = x0 * y2 - y0 * x2
     c = x1 * y0 - y1 * x0

@@ -48,9 +48,11 @@ class Driven:
     """
 
     def __init__(self, client, live, job, most=1):
-        self.error, self.most = None, most
+        self.error = None
+        self.most = most
         begun = time.monotonic()
-        options, screen = RunOptions(client=client), Screen(lambda progress: None)
+        options = RunOptions(client=client)
+        screen = Screen(lambda progress: None)
         survey_run = Run(job, options, Kept(), screen, live, self.on_frame)
         self.run = survey_run
 
@@ -101,7 +103,8 @@ def points_in(text):
 
 def test_points_grow_until_all_are_there(client, live, new_tab, tmp_path):
     live, job = live
-    tab, other = opened(new_tab, live), opened(new_tab, live)
+    tab = opened(new_tab, live)
+    other = opened(new_tab, live)
     run = Driven(client, live, job)
     try:
         first = tab.wait_for(points_in)

@@ -16,7 +16,8 @@ from lidarpool.run.runner import Run
 
 pytestmark = [pytest.mark.browser, pytest.mark.slow]
 
-COUNT, FAILS = 8, 3
+COUNT = 8
+FAILS = 3
 DRAWN = """(() => {
   const page = document.querySelector('#frames iframe')?.contentDocument;
   return !!page && !page.getElementById('hint').textContent;
@@ -32,7 +33,8 @@ def make(number, rng):
 
 
 def test_jobs_are_counted_listed_drawn_and_shown(new_tab, tmp_path):
-    campaign, looked = Campaign(make, COUNT, keep="folder", title="Heights"), threading.Event()
+    campaign = Campaign(make, COUNT, keep="folder", title="Heights")
+    looked = threading.Event()
     ended = []
     with (
         local_client({"LIDAR": 5}, gpu_workers=1) as client,

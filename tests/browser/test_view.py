@@ -21,7 +21,8 @@ from lidarview.viewer.view import View, open_results
 
 pytestmark = [pytest.mark.browser, pytest.mark.slow]
 
-COUNT, SCANS = 30_000, 360
+COUNT = 30_000
+SCANS = 360
 PICTURE = "lidarpool.picture"
 WET = Column("wetness", "float32", "%", "how wet it is", source="wetness")
 
@@ -31,7 +32,9 @@ def spiral(path, column):
     turn = np.linspace(0, 20 * np.pi, COUNT)
     rows = np.zeros(COUNT, row_type(np.dtype(np.float32), (SCAN, column)))
     rows[column.name] = np.linspace(0, 100, COUNT)
-    rows["x"], rows["y"], rows["z"] = 9 * np.cos(turn), 9 * np.sin(turn), turn / 8
+    rows["x"] = 9 * np.cos(turn)
+    rows["y"] = 9 * np.sin(turn)
+    rows["z"] = turn / 8
     rows["scan"] = np.arange(COUNT) * SCANS // COUNT
     path.write_bytes(header(rows.dtype, COUNT) + rows.tobytes())
     return path
@@ -50,7 +53,8 @@ def view(cloud):
     scene = replace(scene, actors=(Actor(box("Van", (4, 2, 2)), track),))
     poses = Track([0, 2], [[0, -9, 4], [0, 9, 4.0]])
     survey = Survey(Sensor.grid(layers=4), steps=SCANS, trajectory=poses)
-    hits, rays = np.zeros(scene.triangles, np.int64), np.zeros((0, 2, 3), np.float32)
+    hits = np.zeros(scene.triangles, np.int64)
+    rays = np.zeros((0, 2, 3), np.float32)
     pictured = PictureContent(
         scene, sensor_positions(survey), hits, rays, duration_ns=survey.duration_ns
     )

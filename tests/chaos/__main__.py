@@ -53,7 +53,8 @@ class Campaign:
 
     def play(self, arena: Arena, known: Reference) -> Outcome:
         """Make one run, with the next faults."""
-        faults, self.waiting = self.waiting[:FAULTS_PER_RUN], self.waiting[FAULTS_PER_RUN:]
+        faults = self.waiting[:FAULTS_PER_RUN]
+        self.waiting = self.waiting[FAULTS_PER_RUN:]
         options = {
             "queue_capacity": self._chance.choice((2, 10)),
             "collectors": self._chance.choice((1, 2, 2)),

@@ -78,7 +78,8 @@ class Arena:
     """A cluster of two workers of each kind, in processes of their own, and a driver."""
 
     def __init__(self, folder: Path, seed: int) -> None:
-        self.folder, self._chance = folder, random.Random(seed)
+        self.folder = folder
+        self._chance = random.Random(seed)
         (folder / "base.yaml").write_text(BASE)
         (folder / "c.yaml").write_text(CAMPAIGN)
         (folder / "cluster").mkdir()
@@ -168,7 +169,8 @@ class Arena:
     def _lead_away(self, out: str, tally: Tally) -> None:
         """Put a link to a stranger's folder there: a driver refuses it, and touches nothing."""
         link = self.folder / out / self._chance.choice(LINKS)
-        stranger, aside = self.folder / "stranger", self.folder / "aside"
+        stranger = self.folder / "stranger"
+        aside = self.folder / "aside"
         stranger.mkdir(exist_ok=True)
         (stranger / "thesis.txt").write_text("mine")
         link.parent.mkdir(exist_ok=True)
@@ -218,7 +220,8 @@ def main(arguments: list[str] | None = None) -> int:
     options = parser.parse_args(arguments)
     seed = random.SystemRandom().randrange(10**6) if options.seed is None else options.seed
     print(f"seed {seed}", flush=True)
-    tally, started = Tally(), time.monotonic()
+    tally = Tally()
+    started = time.monotonic()
     with tempfile.TemporaryDirectory(prefix="chaos-", ignore_cleanup_errors=True) as folder:
         arena = Arena(Path(folder), seed)
         try:

@@ -98,7 +98,8 @@ def judge(
 
 def _out_of_order(order: Sequence[int]) -> list[int]:
     """Scans that came after a later one."""
-    found, highest = [], -1
+    found = []
+    highest = -1
     for scan in order:
         if scan < highest:
             found.append(scan)
@@ -136,7 +137,8 @@ def _compare_rows(
     duplicated: list[str],
     unexpected: list[str],
 ) -> None:
-    there, wanted = Counter(map(int, rows)), Counter(map(int, expected_rows))
+    there = Counter(map(int, rows))
+    wanted = Counter(map(int, expected_rows))
     for scan in sorted(there.keys() | wanted.keys()):
         if scan not in wanted:
             unexpected.append(f"scan {scan} (cloud: {there[scan]} rows of none)")

@@ -111,7 +111,8 @@ class Resumed:
     """Resumes a data set, or a run, with a cluster of threads."""
 
     def __init__(self, client: Client, source: Path) -> None:
-        self._client, self._source = client, source
+        self._client = client
+        self._source = source
 
     def campaign(self, place: Path) -> str:
         """Resume a campaign."""
@@ -256,7 +257,8 @@ def targets(folder: Path, client: Client) -> list[Target]:
     with redirect_stdout(StringIO()), redirect_stderr(StringIO()):
         cli.main([*run, "--out", str(wholes["result"])], standalone_mode=False)
         for number in (1, 2):
-            out, shard = wholes["runs"] / f"part-{number}", f"{number}/2"
+            out = wholes["runs"] / f"part-{number}"
+            shard = f"{number}/2"
             cli.main([*run, "--out", str(out), "--shard", shard], standalone_mode=False)
     campaign = Campaign.load(folder / "c.yaml")
     campaign.run(wholes["set"], client=client, overwrite=True)
@@ -285,7 +287,8 @@ def targets(folder: Path, client: Client) -> list[Target]:
 
 def fuzz(count: int, seed: int, seconds: float = float("inf"), tell: bool = False) -> Outcome:
     """Damage files until each had `count` damages, in an order by chance, or the time is over."""
-    chance, outcome = random.Random(seed), Outcome()
+    chance = random.Random(seed)
+    outcome = Outcome()
     with (
         tempfile.TemporaryDirectory(prefix="damage-") as folder,
         thread_cluster(*SLOTS) as cluster,

@@ -51,7 +51,9 @@ HOLD_S = 5.0  # longest time that a point is held for somebody else to carry a f
 PIPE_WAIT_S = 10.0  # longest time until a worker of the LIDAR stages waits at a pipe
 # Functions of poolpart/pipe.py in which a thread waits for the scheduler's answer.
 REQUESTS = {pipe._ask.__code__, pipe._ask_until.__code__}
-_EVENTS, _ARMED, _FIRED = "events", "armed", "fired"
+_EVENTS = "events"
+_ARMED = "armed"
+_FIRED = "fired"
 
 
 @dataclass(frozen=True)
@@ -170,8 +172,10 @@ class Sink:
         strike: Callable[[Fired], None],
         pauses: Mapping[str, float] | None = None,
     ) -> None:
-        self.board, self.worker = board, worker
-        self.strike, self.pauses = strike, dict(pauses or {})
+        self.board = board
+        self.worker = worker
+        self.strike = strike
+        self.pauses = dict(pauses or {})
 
     def __call__(self, point: str, fields: Mapping[str, Any]) -> None:
         scans = fields.get("scans", ())
@@ -237,7 +241,8 @@ class ChaosPlugin(WorkerPlugin):
     name = "chaos"
 
     def __init__(self, folder: str, pauses: Mapping[str, float] | None = None) -> None:
-        self.folder, self.pauses = folder, dict(pauses or {})
+        self.folder = folder
+        self.pauses = dict(pauses or {})
 
     def setup(self, worker: Any) -> None:
         """Listen to this worker's points, for as long as its process lasts.

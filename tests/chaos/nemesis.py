@@ -115,7 +115,9 @@ class Nemesis:
     """
 
     def __init__(self, arena: Arena, faults: Sequence[Fault], parts: Path, stranger: Path) -> None:
-        self.arena, self.parts, self.stranger = arena, parts, stranger
+        self.arena = arena
+        self.parts = parts
+        self.stranger = stranger
         self.faults = {fault.number: fault for fault in faults}
         self.done: Counter[tuple[str, str]] = Counter()  # {(kind, point): times}
         self.left: list[Fault] = []  # afterwards: those that were not carried out

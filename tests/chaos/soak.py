@@ -58,7 +58,8 @@ class Soaked:
 def soak(arena: Arena, what: Survey, expected: Reference, seed: int) -> Soaked:
     """Survey while workers are killed all the time."""
     memory: list[tuple[float, float]] = []
-    over, started = threading.Event(), time.monotonic()
+    over = threading.Event()
+    started = time.monotonic()
 
     def watch() -> None:
         while not over.wait(SAMPLE_EVERY_S):
@@ -109,7 +110,8 @@ def draw(soaked: Soaked, path: Path) -> None:
     axes = figure.subplots()
     axes.plot(*zip(*soaked.memory, strict=True))
     axes.set(xlabel="seconds", ylabel="resident memory, MiB", ylim=(0, None))
-    verdict, faults = soaked.outcome.verdict, soaked.outcome.done.total()
+    verdict = soaked.outcome.verdict
+    faults = soaked.outcome.done.total()
     axes.set_title(f"{verdict.expected} scans, {faults} workers killed")
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path, dpi=120)

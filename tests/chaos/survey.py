@@ -24,7 +24,8 @@ from .checker import Verdict, judge
 from .events import DAMAGE, LINK, Fault
 from .nemesis import Nemesis
 
-STEPS, POSES = 360, 2
+STEPS = 360
+POSES = 2
 # Seconds a scan for which the generator is held, so that there is time for things to go wrong.
 PAUSES = {"generate.put": 0.006}
 PLANNING = Planning((25, 25), (-30, -20), [(0, 0)], 2.0, trials=12, particles=60, iterations=60)
@@ -143,7 +144,8 @@ def disturbed(
         if result is not None and not {DAMAGE, LINK}.isdisjoint(kind for kind, _ in nemesis.done):
             arena.wait_until_whole()
             mended = again(resume=True)
-            cloud, same = mended.cloud, digest(mended) == known.digest
+            cloud = mended.cloud
+            same = digest(mended) == known.digest
             remove_run(place)
         else:
             cloud = None if result is None else result.cloud

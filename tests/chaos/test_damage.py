@@ -50,7 +50,8 @@ READERS = {"sweeps": read_sweeps, "verify": read_all, "view": shown}
 def test_files_of_a_data_set_are_read_right_or_refused(dataset, name):
     reader: Reader = READERS[name]
     whole = dataset / "jobs/00" if name == "view" else dataset
-    outcome, chance = Outcome(), random.Random(7)
+    outcome = Outcome()
+    chance = random.Random(7)
     for file in files_of(whole):
         if name == "sweeps" and file.suffix == ".ply":  # compared by --verify alone
             continue
@@ -63,7 +64,8 @@ def test_files_of_a_data_set_are_read_right_or_refused(dataset, name):
 
 def test_a_damaged_database_is_refused_or_the_same(tmp_path):
     """Each flipped bit: SQLite itself does not notice those in values."""
-    path, copy = tmp_path / "run.db", tmp_path / "copy.db"
+    path = tmp_path / "run.db"
+    copy = tmp_path / "copy.db"
 
     def content(database: RunDatabase) -> object:
         job = CommittedJob(0, range(100))
@@ -83,7 +85,9 @@ def test_a_damaged_database_is_refused_or_the_same(tmp_path):
         db.end_jobs((number, False, {"name": f"{number:04}"}) for number in range(1, 20))
     with closing(RunDatabase(path)) as db:
         expected = content(db)
-    data, chance, refused = path.read_bytes(), random.Random(7), 0
+    data = path.read_bytes()
+    chance = random.Random(7)
+    refused = 0
     for _ in range(100):
         copy.write_bytes(damaged(data, chance))
         try:

@@ -80,7 +80,10 @@ def test_given_up_by_the_scheduler_what_it_does_counts_once(
 def test_given_up_by_the_driver_it_does_no_harm(arena, what, known, monkeypatch, stage):
     """The scheduler would take it for dead after five minutes, and wait that long."""
     monkeypatch.setattr("lidarpool.run.pipeline.policies.scans_per_batch", lambda *_: 10)
-    seen, stopped, reasons, continued = [], [], set(), []
+    seen = []
+    stopped = []
+    reasons = set()
+    continued = []
 
     def given_up() -> bool:
         if stage == GPU:

@@ -20,8 +20,10 @@ def scheduler_state(client: Client) -> dict[str, Any]:
 
 def _look(dask_scheduler: Any) -> dict[str, Any]:
     extensions = dask_scheduler.extensions
-    queues, variables = extensions["queues"], extensions["variables"]
-    events, locks = extensions.get("events"), extensions.get("semaphores")
+    queues = extensions["queues"]
+    variables = extensions["variables"]
+    events = extensions.get("events")
+    locks = extensions.get("semaphores")
     return {
         "tasks": sorted(map(str, dask_scheduler.tasks)),
         "unrunnable": sorted(str(task.key) for task in dask_scheduler.unrunnable),

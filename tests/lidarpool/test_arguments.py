@@ -55,7 +55,9 @@ from lidarpool import (
 from lidarpool.run.options import RunKeywords, RunOptions
 from lidarpool.scenario.sections import PoolSection
 
-POINTS, FACES, OWNERS = np.eye(3), np.array([[0, 1, 2]]), np.zeros(1, int)
+POINTS = np.eye(3)
+FACES = np.array([[0, 1, 2]])
+OWNERS = np.zeros(1, int)
 AT = [(0, 0, 1)]
 GRID = Sensor.grid()
 SCENE = Scene.from_meshes([SceneMesh("Car", POINTS, FACES)])
@@ -198,7 +200,8 @@ def test_a_scenario_says_how_it_is_run_unless_python_does():
 
 def test_keywords_are_the_options_of_runs():
     """But for the place of a result, ways to a cluster, and what only commands do at the end."""
-    keywords, options = get_type_hints(RunKeywords), get_type_hints(RunOptions)
+    keywords = get_type_hints(RunKeywords)
+    options = get_type_hints(RunOptions)
     assert options.keys() - keywords.keys() == {"out", "stay", "scheduler", "files", "cluster"}
     assert keywords.keys() <= options.keys()
     for name, hint in keywords.items():

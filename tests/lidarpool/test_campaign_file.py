@@ -225,7 +225,8 @@ def test_names_may_be_given_to_values(campaign):
     )
     files = {"in": "hall.glb", "out": "yard.glb"}
     for number in range(12):
-        made, own = found.scenario(number), found.values(number)
+        made = found.scenario(number)
+        own = found.values(number)
         assert made.scene.files[0].file == files[own["scene"]]
         assert made.weather.visibility_km == own.get("weather.visibility_km")
     assert values(found, "cloud.columns")[:2] == ['["time"]', '["range", "time"]']

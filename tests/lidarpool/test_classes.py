@@ -149,7 +149,8 @@ def test_bags_tell_late_listeners_and_label_the_points(saved, scene, sweeps, lay
 
 
 def test_formats_hold_classes_that_have_names(scene, sweeps):
-    cloud, plain = points_of(scene, 0), replace(sweeps, classes={})
+    cloud = points_of(scene, 0)
+    plain = replace(sweeps, classes={})
     for name in ("nuscenes", "mcap", "rosbag2"):
         assert "class" in Format(name).left_out(cloud, plain)
         assert "class" not in Format(name).left_out(cloud, sweeps)

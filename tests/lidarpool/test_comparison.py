@@ -20,13 +20,15 @@ from lidarpool.datasets.figures import rank_correlation
 from lidarpool.export.formats import Format
 from lidarsim.sweeps.sweeps import Sweeps
 
-RINGS, COLUMNS = 16, 720
+RINGS = 16
+COLUMNS = 720
 ELEVATION = np.linspace(-15, 15, RINGS)
 CELLS = RINGS * COLUMNS
 
 
 def directions(azimuth_deg, elevation_deg):
-    azimuth, elevation = np.radians(azimuth_deg), np.radians(elevation_deg)
+    azimuth = np.radians(azimuth_deg)
+    elevation = np.radians(elevation_deg)
     return np.stack(
         [np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth),
          np.sin(elevation) + 0 * azimuth], axis=-1,
@@ -82,7 +84,8 @@ def test_an_offset_is_the_residual_of_each_ring():
 
 
 def test_noise_is_found_as_it_was_put_in():
-    sigma, rng = 0.02, np.random.default_rng(5)
+    sigma = 0.02
+    rng = np.random.default_rng(5)
     noisy = cloud(RANGES + rng.normal(0, sigma, RANGES.shape))
     told = of_image(noisy, cloud())["residual"]
     # Four standard deviations of each estimate.
@@ -101,9 +104,12 @@ def test_lost_returns_are_counted_in_each_cell():
     sky[12:, 100:400] = True
     in_a, in_b = (~sky & (rng.uniform(size=sky.shape) >= share) for share in (0.2, 0.1))
     told = of_image(cloud(there=in_a), cloud(there=in_b))["no_return"]
-    both, only_a, only_b = ((~in_a & ~in_b).sum(), (~in_a & in_b).sum(), (in_a & ~in_b).sum())
+    both = (~in_a & ~in_b).sum()
+    only_a = (~in_a & in_b).sum()
+    only_b = (in_a & ~in_b).sum()
     assert (told["in_both"], told["in_a_only"], told["in_b_only"]) == (both, only_a, only_b)
-    precision, recall = both / (~in_a).sum(), both / (~in_b).sum()
+    precision = both / (~in_a).sum()
+    recall = both / (~in_b).sum()
     assert told["precision"] == precision and told["recall"] == recall
     assert told["f1"] == pytest.approx(2 * precision * recall / (precision + recall))
     # With sky alone in B, and a share p lost of the other cells in A: sky / (sky + p (all - sky)).
@@ -133,7 +139,8 @@ def test_distances_between_parallel_planes():
     x, y = np.meshgrid(np.arange(60) * 0.5, np.arange(50) * 0.5)
     plane = np.stack([x.ravel(), y.ravel(), np.zeros(x.size)], axis=1)
     far = np.array([650_000.0, 5_600_000.0, 100.0])  # of UTM
-    a, b = Cloud(plane + far, {}), Cloud(plane + far + [0, 0, 0.03], {})
+    a = Cloud(plane + far, {})
+    b = Cloud(plane + far + [0, 0, 0.03], {})
     told = compare(a, b, distances_m=(0.05, 0.02)).figures
     for way in ("a_to_b", "b_to_a"):
         assert told["distances"][way]["points"] == 3000
@@ -181,7 +188,8 @@ def test_the_step_is_found_where_most_returns_are_lost():
 
 
 def test_the_first_of_several_returns_counts():
-    first, second = cloud(), cloud(RANGES + 3)
+    first = cloud()
+    second = cloud(RANGES + 3)
     dual = Cloud.joined([second, first])
     image = of_image(dual, first)
     assert image["residual"]["rmse_m"] < 1e-6
@@ -336,7 +344,8 @@ def test_sweeps_are_matched_by_time(written, tmp_path):
 
 def test_one_of_several_sensors_is_chosen(tmp_path):
     scene = the_scene()
-    of, made = the_sweeps(scene), points_of(scene, 0)
+    of = the_sweeps(scene)
+    made = points_of(scene, 0)
     for name in ("ply", "mcap"):
         form = Format(name, compensated=name == "mcap")
         form.write(tmp_path / form.row.file, made, of)
@@ -391,7 +400,8 @@ def test_a_thinned_result_has_no_lost_returns(written, tmp_path):
 @pytest.mark.parametrize("told", ["time", "ray", "neither"])
 def test_results_with_the_same_rays_are_paired_by_ray(tmp_path, told):
     """A carrier that moves sees one cell by several rays; two returns of a ray are told apart."""
-    rng, speed = np.random.default_rng(2), 8.0
+    rng = np.random.default_rng(2)
+    speed = 8.0
     track = lidarpool.Track([0, 1], [[0, 0, 1], [speed, 0, 1]])
     survey = Survey(SENSOR, trajectory=track, steps=36, precision_m=1e-4)
     sweeps = Sweeps.of(survey, Scene.seed())
@@ -403,7 +413,8 @@ def test_results_with_the_same_rays_are_paired_by_ray(tmp_path, told):
     columns = {"scan": firing // 10, "channel": channel, "object": 0 * ray, "intensity": 0.0 * ray}
     if told != "neither":
         columns[told] = ray % (10 * LAYERS) if told == "ray" else firing * 277_778
-    noise, there = 0.01 * rng.normal(size=len(ray)), rng.uniform(size=len(ray)) > 0.1
+    noise = 0.01 * rng.normal(size=len(ray))
+    there = rng.uniform(size=len(ray)) > 0.1
     there |= np.arange(len(ray)) % 2 == 0  # of A's second returns, a tenth is lost
     for name, errors, kept in (("a", noise, there), ("b", 0 * noise, there | True)):
         (tmp_path / name).mkdir()
@@ -433,7 +444,8 @@ def test_results_with_the_same_rays_are_paired_by_ray(tmp_path, told):
 )
 def test_cut_and_garbled_files_are_a_line(written, tmp_path, name):
     folder, *_ = written
-    path, whole = tmp_path / Path(name).name, (folder / name).read_bytes()
+    path = tmp_path / Path(name).name
+    whole = (folder / name).read_bytes()
     rng = np.random.default_rng(0)
     garbled = bytearray(whole)
     for place in rng.integers(0, min(len(whole), 400), 60):

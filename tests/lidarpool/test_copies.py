@@ -128,7 +128,8 @@ def test_scattered_copies_stand_on_what_is_seen_from_above(made):
 def test_without_a_name_they_stand_on_the_highest_surface_and_stay_in_a_rectangle(made):
     scene = made(TREE | {"scatter": {"count": 100, "within": [5, -5, 15, 5], "yaw_deg": 0}}).scene
     at = places(scene)
-    low, high = at[:, 0] < 10, at[:, 0] > 10
+    low = at[:, 0] < 10
+    high = at[:, 0] > 10
     assert low.sum() > 20 and np.abs(at[low, 2] - height(at[low, :2])).max() < 1e-6
     assert high.sum() > 20 and np.allclose(at[high, 2], 8)
     assert np.abs(at[:, 1]).max() <= 5 and at[:, 0].min() >= 5 and at[:, 0].max() <= 15
@@ -182,7 +183,8 @@ def test_materials_and_classes_are_those_of_the_names(made):
 def test_a_file_is_read_once_for_all_entries(made, monkeypatch):
     from lidarpool.scenario import static_scene as module
 
-    read, plain = [], module.load_objects
+    read = []
+    plain = module.load_objects
     monkeypatch.setattr(
         module, "load_objects", lambda path, **more: read.append(path.name) or plain(path, **more)
     )

@@ -72,7 +72,8 @@ def reopened(db):
 
 
 def test_what_is_committed_is_there_once(db, job):
-    one, two = receipt(0, 5), receipt(10, 12, rows=2)
+    one = receipt(0, 5)
+    two = receipt(10, 12, rows=2)
     assert commit(db, job, two, one) == [two, one]
     assert commit(db, job, one) == []
     assert commit(db, job, receipt(0, 5), receipt(0, 4)) == []
@@ -100,7 +101,8 @@ def test_what_is_committed_is_there_once(db, job):
 )
 def test_whatever_comes_each_scan_is_of_one_part_or_missing(tmp_path_factory, commits):
     path = tmp_path_factory.mktemp("db") / "run.db"
-    db, owners = RunDatabase(path), [{}, {}]
+    db = RunDatabase(path)
+    owners = [{}, {}]
     jobs = [read(db, number) for number in range(2)]
     for spans in commits:
         receipts = [(jobs[job], receipt(first, stop, job=job)) for job, first, stop in spans]
@@ -111,7 +113,8 @@ def test_whatever_comes_each_scan_is_of_one_part_or_missing(tmp_path_factory, co
                 owners[part.job][scan] = part.name
     again = reopened(db)
     for job in (*jobs, *(read(again, number) for number in range(2))):
-        mine, found = owners[job.number], job.parts
+        mine = owners[job.number]
+        found = job.parts
         assert found.missing(0, SCANS) == runs(set(range(SCANS)) - set(mine))
         assert found.missing(5, 9) == runs(set(range(5, 9)) - set(mine))
         for scan in range(SCANS):

@@ -83,7 +83,8 @@ def test_parquet_is_one_table_of_partitions(written, job):
     table = pyarrow.dataset.dataset(place / "points", partitioning="hive").to_table()
     frame = table.to_pandas()
     for number in (0, 1, 7):
-        cloud, rows = job(number), frame[frame.job == number]
+        cloud = job(number)
+        rows = frame[frame.job == number]
         np.testing.assert_allclose(rows[["x", "y", "z"]], cloud.positions)
         np.testing.assert_array_equal(rows["class"], cloud["class"])
     assert len(frame) == sum(len(job(number)) for number in (0, 1, 7))
@@ -118,10 +119,12 @@ def test_nuscenes_has_a_scene_for_each_job(written, job, sweeps):
     # Chains stay within their scene.
     samples = {row["token"]: row for row in tables["sample"]}
     for scene in tables["scene"]:
-        token, count = scene["first_sample_token"], 0
+        token = scene["first_sample_token"]
+        count = 0
         while token:
             assert samples[token]["scene_token"] == scene["token"]
-            token, count = samples[token]["next"], count + 1
+            token = samples[token]["next"]
+            count = count + 1
         assert count == scene["nbr_samples"] == TURNS
     cloud = job(7)
     rows = np.fromfile(place / "samples/rear_left/007/000002.pcd.bin", "<f4").reshape(-1, 5)
@@ -145,7 +148,8 @@ def test_the_same_job_has_the_same_bytes_and_can_be_undone(written, job, sweeps,
     moved.write_job(JobRow(1, "001"), job(1), sweeps)
     assert files_of(place) == before
     only = tmp_path / "only"
-    other, listing = DataSet(Storage.at(only), format), Listing(str(only))
+    other = DataSet(Storage.at(only), format)
+    listing = Listing(str(only))
     for number in (7, 0):
         other.write_job(JobRow(number, f"{number:03}"), job(number), sweeps)
     before = files_of(only)
@@ -234,7 +238,8 @@ def test_a_manifest_says_what_became_of_a_job_and_what_made_it(job, sweeps, tmp_
 def test_parquet_with_as_many_files_as_sweeps(scene, sweeps, job, tmp_path):
     """One of each: a file of Parquet is not a sweep, and has no boxes of actors."""
     one = Survey(Sensor.grid(360, 4), [(0, 0, 1)], steps=SCANS)
-    only, cloud = Sweeps.of(one, scene), job(0)
+    only = Sweeps.of(one, scene)
+    cloud = job(0)
     cloud = cloud[cloud.scan < SCANS]
     assert len(only) == 1 and only.actors
     DataSet(Storage.at(tmp_path), "parquet").write_job(JobRow(0, "0"), cloud, only)

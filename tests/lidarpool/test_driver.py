@@ -128,7 +128,10 @@ class Workers:
 class Stages:
     """Long stages that do something when they are told to."""
 
-    run, collector_count, waiting, notes = "0a1b2c3d", 2, False, ()
+    run = "0a1b2c3d"
+    collector_count = 2
+    waiting = False
+    notes = ()
     closed = False
 
     def __init__(self, storage, workers):
@@ -144,7 +147,8 @@ class Stages:
         self.failure = ""
         self.wanted = True  # whether scans are taken
         self.changes = ({}, ["generate", "sort", *self.collectors])
-        self._storage, self._workers = storage, workers
+        self._storage = storage
+        self._workers = workers
         self._following = Counter()  # {job: the scan that the sorter waits for}
 
     # what the driver asks for
@@ -153,15 +157,18 @@ class Stages:
         self._storage.prepare()
 
     def look(self, progress):
-        changes, self.changes = self.changes, ({}, [])
+        changes = self.changes
+        self.changes = ({}, [])
         if "generate" in changes[1]:
             self.described.clear()
         if "sort" in changes[1]:
-            self.unsorted, self._following = [], Counter()
+            self.unsorted = []
+            self._following = Counter()
         return changes
 
     def wait(self, seconds, keys, *, scans, linger_s=0.0):
-        self.wanted, self.linger_s = scans, linger_s
+        self.wanted = scans
+        self.linger_s = linger_s
 
     def send(self, name, messages):
         known = {"generate": self.described, "sort": self.unsorted}
@@ -477,7 +484,8 @@ def test_a_sorter_that_says_nothing_gets_all_again(run, clock):
 
 
 def test_small_batches_are_cast_and_collected_several_at_a_time(run):
-    run.stages.advice, run.stages.seconds = 1, TASK_SECONDS / 3.5
+    run.stages.advice = 1
+    run.stages.seconds = TASK_SECONDS / 3.5
     run.until(lambda: run.committed[0])
     run.until(lambda: len(run.at(BatchState.WAITING)) >= 10, idle="cast")
     run.end()
@@ -511,7 +519,8 @@ def striking(run, stage, poison, deaths=None, job=0):
 
 @pytest.mark.parametrize("stage", ["intersect", "collect"])
 def test_a_scan_that_kills_its_workers_is_isolated_and_named(run, stage):
-    poison, deaths = 23, []
+    poison = 23
+    deaths = []
     run.stages.advice = 20
     run.until(striking(run, stage, poison, deaths))
     message = f"scan {poison} kills the worker that runs stage {stage}: 3 workers died, one after"
@@ -616,7 +625,8 @@ def test_whatever_dies_each_scan_arrives_once_in_order(tmp_path_factory, chance)
 
 @pytest.mark.parametrize("advice", [1, 7, SCANS])
 def test_a_scene_that_kills_whoever_casts_it_is_told_after_a_few_deaths(run, advice):
-    run.stages.advice, deaths = advice, []
+    run.stages.advice = advice
+    deaths = []
 
     def strike():
         for worker in {run.workers.casts[key][1] for key in run.workers.open}:
@@ -688,7 +698,8 @@ def test_a_job_that_is_committed_ends_at_once(empty):
 
 def begin_tiny(run, count, scenes=(SCENE,), fit=1000):
     """Begin jobs of one batch each, once it is known that these are quickly cast."""
-    run.stages.advice, run.stages.seconds = 5, TASK_SECONDS / 16.5
+    run.stages.advice = 5
+    run.stages.seconds = TASK_SECONDS / 16.5
     run.begin(count, TINY, frames=False)
     run.until(lambda: run.ended)
     for number in range(count):
@@ -746,8 +757,10 @@ def test_a_scan_that_kills_its_workers_is_found_among_tiny_jobs(empty, stage):
 
 
 def test_stage_1_always_has_jobs_before_it_and_few_of_them(empty):
-    begun, most = 0, 0
-    empty.stages.advice, empty.stages.seconds = 5, 0.001
+    begun = 0
+    most = 0
+    empty.stages.advice = 5
+    empty.stages.seconds = 0.001
     empty.stages.advise = lambda scans: None
 
     def begin():

@@ -75,7 +75,8 @@ def test_what_is_the_same_has_the_same():
     assert fingerprint(table.T) == fingerprint(table.T.copy()) != fingerprint(table)
     assert fingerprint(table[::2]) == fingerprint(table[::2].copy())
     assert fingerprint(np.zeros((0, 3))) != fingerprint(np.zeros((0, 4)))
-    box, used = Box(1), Box(1)
+    box = Box(1)
+    used = Box(1)
     assert used.half and fingerprint(box) == fingerprint(used), "what follows from its fields"
     used.note = "not a field, but its own"
     assert fingerprint(box) != fingerprint(used)

@@ -98,7 +98,8 @@ def test_bias_of_channels_against_planes_and_against_the_scene():
         assert len(known) == (16 if scene else 9)  # seven rings meet a single plane
         middle = 0 if scene else bias[[row["ring"] for row in known]].mean()
         for row in known:
-            one, true = row["bias_m"], bias[row["ring"]] - middle
+            one = row["bias_m"]
+            true = bias[row["ring"]] - middle
             assert abs(one["value"] - true) < max(one["high"] - one["low"], 0.002), row
     found = fit(made, scene=street()).figures["curves"]
     assert len(found["lost_by_range"]) > 3 and found["lost_by_range"][0]["value"] < 0.01
@@ -412,7 +413,8 @@ def test_packets_of_a_velodyne_are_sweeps(tmp_path):
     """A VLP-16 in the middle of a round room of 5 m, whose channels report 50 of 100."""
     pytest.importorskip("velodyne_decoder")
     head = struct.pack("<IHHiIII", 0xA1B2C3D4, 2, 4, 0, 0, 65535, 1)
-    blocks, frames = 12, [head]
+    blocks = 12
+    frames = [head]
     for number in range(76 * 4):
         data = b""
         for block in range(blocks):

@@ -162,7 +162,8 @@ def check_rings(ring, xyz, sensor):
 def check_autoware(rows, model):
     """As nebula's decoders: azimuths clockwise from x, of Hesai from y; distances from zero."""
     x, y, z = xyz_of(rows).T
-    azimuth, elevation = rows["azimuth"].astype(float), rows["elevation"].astype(float)
+    azimuth = rows["azimuth"].astype(float)
+    elevation = rows["elevation"].astype(float)
     assert azimuth.min() >= 0 and azimuth.max() <= np.float32(2 * np.pi)
     level = rows["distance"] * np.cos(elevation)
     if model.startswith("hesai"):
@@ -186,9 +187,11 @@ def check_ouster(rows, sensor):
     """
     beams = sensor.beams
     beam = len(beams) - 1 - rows["ring"].astype(int)
-    offset, height = 0.0, 0.0
+    offset = 0.0
+    height = 0.0
     if "ouster" in sensor.name.lower():
-        offset, height = np.hypot(*beams.origin[0, :2]), beams.origin[0, 2]
+        offset = np.hypot(*beams.origin[0, :2])
+        height = beams.origin[0, 2]
     x, y, z = xyz_of(rows).T
     slant = rows["range"] / 1000 - offset
     if not beams.origin.any() or offset:
@@ -353,7 +356,8 @@ def test_kitti_has_reflectivity_from_0_to_1_at_every_range(tmp_path):
 @pytest.mark.parametrize("coordinates", ["world", "sensor"])
 def test_compensated_formats_are_so_whatever_the_clouds_frame(tmp_path, name, coordinates):
     made = Drive("velodyne/vlp16")
-    world, cloud = made.cloud(), made.cloud(coordinates)
+    world = made.cloud()
+    cloud = made.cloud(coordinates)
     save_cloud(cloud, tmp_path / "out", format=name)
     for sweep, points in enumerate(world.sweeps().points(world)):
         start = made.survey.pose(36 * sweep)
@@ -484,7 +488,8 @@ def flight(duration_s=7.0) -> Track:
     turned = np.clip((times - half + 1.5) / 3, 0, 1) * np.pi
     speeds = 60 * np.stack([np.cos(turned), np.sin(turned), 0 * turned], axis=1)
     places = np.cumsum(speeds, axis=0) * (times[1] - times[0]) + (0, 0, 500)
-    roll, pitch = np.radians(8 * np.sin(2 * times)), np.radians(3 * np.cos(times))
+    roll = np.radians(8 * np.sin(2 * times))
+    pitch = np.radians(3 * np.cos(times))
     quaternions = [
         product(product(about(2, yaw), about(1, down)), about(0, lean))
         for yaw, down, lean in zip(turned, pitch, roll, strict=True)
@@ -494,7 +499,8 @@ def flight(duration_s=7.0) -> Track:
 
 def about(axis, angle):
     out = np.zeros(4)
-    out[axis], out[3] = np.sin(angle / 2), np.cos(angle / 2)
+    out[axis] = np.sin(angle / 2)
+    out[3] = np.cos(angle / 2)
     return out
 
 
@@ -624,7 +630,8 @@ def test_parquet_and_ply_are_in_the_world_and_their_columns_fit(tmp_path):
     table = pq.read_table(tmp_path / "cloud.parquet")
     assert table.schema.metadata[b"coordinates"] == b"world"
     columns = {name: table[name].to_numpy() for name in table.column_names}
-    azimuth, elevation = np.radians(columns["azimuth"]), np.radians(columns["elevation"])
+    azimuth = np.radians(columns["azimuth"])
+    elevation = np.radians(columns["elevation"])
     rays = [np.cos(azimuth) * np.cos(elevation), np.sin(azimuth) * np.cos(elevation),
             np.sin(elevation)]  # fmt: skip
     inside = np.stack(rays, axis=1) * columns["range"][:, None]

@@ -235,7 +235,11 @@ def test_bags_have_points_frames_and_a_clock(
     written, cloud, survey, sweeps, name, layout, step, tmp_path
 ):
     store = get_typestore(Stores.ROS2_HUMBLE)
-    clouds, frames, fixed, boxes, clocks = {}, {}, {}, [], []
+    clouds = {}
+    frames = {}
+    fixed = {}
+    boxes = []
+    clocks = []
     with AnyReader([written(name, layout)], default_typestore=store) as bag:
         for connection, when, data in bag.messages():
             message = bag.deserialize(data, connection.msgtype)
@@ -273,8 +277,10 @@ def test_bags_have_points_frames_and_a_clock(
     place = box.pose.position
     np.testing.assert_allclose([place.x, place.y, place.z], [5.6, 5, 0.75], atol=1e-12)
     assert (box.scale.x, box.scale.y, box.scale.z) == (4, 2, 1.5)
-    sweep, when = 2, START_NS + 200_000_000
-    message, points = clouds["/front/points", when], of_sweep(cloud, sweep)
+    sweep = 2
+    when = START_NS + 200_000_000
+    message = clouds["/front/points", when]
+    points = of_sweep(cloud, sweep)
     assert (message.point_step, message.header.frame_id) == (step, "front")
     kinds = {2: "u1", 4: "u2", 6: "u4", 7: "f4"}
     row = np.dtype({
@@ -417,7 +423,8 @@ def test_what_cannot_be_written_is_one_line_and_leaves_nothing(
 def test_a_file_that_cannot_grow_is_one_line_and_leaves_nothing(cloud, sweeps, tmp_path, name):
     import resource
 
-    one, before = Format(name), resource.getrlimit(resource.RLIMIT_FSIZE)
+    one = Format(name)
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (2000, before[1]))  # as a full disk does
     try:
         with pytest.raises(LidarError, match="cannot be written") as told:
@@ -431,7 +438,8 @@ def test_a_file_that_cannot_grow_is_one_line_and_leaves_nothing(cloud, sweeps, t
 @pytest.mark.parametrize("method", ["write_points", "close"])
 def test_an_interrupt_waits_for_what_lazrs_writes(cloud, sweeps, tmp_path, monkeypatch, method):
     """An exception within a write of lazrs would become one of lazrs."""
-    done, write = [], getattr(laspy.LasWriter, method)
+    done = []
+    write = getattr(laspy.LasWriter, method)
 
     def interrupted(writer, *points):
         if not done:
@@ -540,7 +548,9 @@ def test_boxes_of_tilted_sensors_hold_the_points_of_one_turn(scene, tmp_path, ti
         Mounted(Sensor.grid(360, 4), mount, name) for mount, name in zip(mounts, "ab", strict=True)
     ]
     survey = Survey(sensors=sensors, poses=[(0, 0, 0)], steps=36)
-    sweeps, rng, scan = Sweeps.of(survey, scene), np.random.default_rng(3), np.repeat([25, 61], 200)
+    sweeps = Sweeps.of(survey, scene)
+    rng = np.random.default_rng(3)
+    scan = np.repeat([25, 61], 200)
     when = np.rint([survey.begins_ns(one) for one in scan])
     scan_ns = survey.begins_ns(1) - survey.begins_ns(0)
     when += 0 if timed else scan_ns / 2  # the middle of the scan is all that is known
@@ -599,7 +609,8 @@ def test_a_cloud_is_saved_twice_with_the_same_bytes(cloud, sweeps, tmp_path, nam
 
 
 def test_a_cloud_is_saved_in_the_format_of_its_ending(cloud, sweeps, tmp_path):
-    bare, known = cloud, replace(cloud, sweeps=lambda: sweeps)
+    bare = cloud
+    known = replace(cloud, sweeps=lambda: sweeps)
     (tmp_path / "a.laz").write_text("an earlier one")
     assert save_cloud(bare, tmp_path / "a.laz") == []
     las = laspy.read(tmp_path / "a.laz")
@@ -670,7 +681,8 @@ def test_workers_and_threads_write_the_same_files(sweeps, cloud, tmp_path, name,
     monkeypatch.setattr(parquet, "CHUNK_POINTS", 1000)
     monkeypatch.setattr(pieces, "RANGE_PIECES", 1)
     Format(name).write(tmp_path / "threads", cloud, sweeps)
-    ranges, sent = [], []
+    ranges = []
+    sent = []
 
     def workers(writer, spans):
         ranges.extend(spans)
@@ -691,7 +703,9 @@ def test_workers_and_threads_write_the_same_files(sweeps, cloud, tmp_path, name,
 
 
 def test_an_interrupt_leaves_nothing_of_what_threads_write(sweeps, cloud, tmp_path, monkeypatch):
-    write, main, once = Storage.write, threading.main_thread().ident, threading.Lock()
+    write = Storage.write
+    main = threading.main_thread().ident
+    once = threading.Lock()
 
     def interrupted(storage, name, data):
         if name.endswith(".bin") and once.acquire(blocking=False):
@@ -771,7 +785,8 @@ def test_normals_and_origins_follow_the_points_into_the_sensors_axes(drive, tmp_
         assert not {*save_cloud(drive, tmp_path / name, **options)} & {*SURFACE}, name
     ply = load_open3d().io.read_point_cloud(str(tmp_path / "c.ply"))
     np.testing.assert_allclose(np.asarray(ply.normals), normals, atol=1e-7)
-    las, frame = laspy.read(tmp_path / "c.las"), pd.read_parquet(tmp_path / "c.parquet")
+    las = laspy.read(tmp_path / "c.las")
+    frame = pd.read_parquet(tmp_path / "c.parquet")
     for column, file, table in zip(
         SURFACE,
         ["NormalX", "NormalY", "NormalZ", *SURFACE[3:]],
@@ -783,7 +798,8 @@ def test_normals_and_origins_follow_the_points_into_the_sensors_axes(drive, tmp_
 
     sweeps = drive.sweeps()
     second = drive[drive["scan"] >= 36]
-    turn, place = sweeps.pose.turns[1], sweeps.pose.positions[1]
+    turn = sweeps.pose.turns[1]
+    place = sweeps.pose.positions[1]
     pcd = PointCloud.from_path(tmp_path / "pcd/000001.pcd")
     types = get_typestore(Stores.ROS2_HUMBLE)
     with AnyReader([tmp_path / "c.mcap"], default_typestore=types) as bag:

@@ -111,8 +111,10 @@ def made(tmp_path_factory):
 
     def make(name):
         if name not in kept:
-            survey, folder = SURVEYS[name], tmp_path_factory.mktemp("images") / "images"
-            cloud, sweeps = cloud_of(survey), Sweeps.of(survey, SCENE)
+            survey = SURVEYS[name]
+            folder = tmp_path_factory.mktemp("images") / "images"
+            cloud = cloud_of(survey)
+            sweeps = Sweeps.of(survey, SCENE)
             Format("images").write(folder, cloud, sweeps)
             kept[name] = cloud, sweeps, images_of(folder)
         return kept[name]
@@ -206,7 +208,8 @@ SENSORS = [name for name in model_names() if not read_model(name).needs_calibrat
 
 @pytest.mark.parametrize("name", [*SENSORS, "listed"])
 def test_a_described_sensor_fires_the_same_rays(name):
-    sensor, arrays = LISTED if name == "listed" else load_sensor(name), {}
+    sensor = LISTED if name == "listed" else load_sensor(name)
+    arrays = {}
     told = json.loads(json.dumps(described((sensor,), arrays)))
     (again,) = remade(told, arrays)
     firings = np.arange(*sensor.firings(3))
@@ -229,7 +232,8 @@ def test_what_cannot_be_an_image_says_so(tmp_path):
     with pytest.raises(LidarError, match="keep_every 1 and the column ray"):
         Format("images").write(tmp_path / "i", cloud, Sweeps.of(thinned, SCENE))
     own = replace(SURVEYS["still"], sensor=Upward(GRID.beams, GRID.head), trajectory=None)
-    cloud, sweeps = cloud_of(own), Sweeps.of(own, SCENE)
+    cloud = cloud_of(own)
+    sweeps = Sweeps.of(own, SCENE)
     Format("images").write(tmp_path / "own", cloud, sweeps)
     sweeps.save(tmp_path / "sweeps.npz")
     with pytest.raises(LidarError, match="of your own they are written with the run only"):

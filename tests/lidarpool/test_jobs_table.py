@@ -164,7 +164,8 @@ def cloud_of(count, dtype=np.float64):
 
 @given(st.lists(st.integers(0, 500), max_size=8))
 def test_hash_and_classes_do_not_depend_on_the_division(cuts):
-    cloud, tally = cloud_of(500), Tally()
+    cloud = cloud_of(500)
+    tally = Tally()
     edges = [0, *sorted(cuts), 500]
     for first, stop in pairwise(edges):
         tally.add(cloud[first:stop])

@@ -122,7 +122,9 @@ def test_a_run_is_watched_from_its_first_part_to_its_path():
     planning = Planning((25, 25), (-30, -20), [(0, 0)], 2.0, trials=2, iterations=20)
     survey = Survey(poses=[(0, 0, 1), (0, 0, 3)], columns=["intensity", WETNESS])
     job = OneJob(Job(SCENE, survey, planning))
-    seen, busy, scans = [], set(), []
+    seen = []
+    busy = set()
+    scans = []
     with (
         thread_cluster({"GPU": 1}, {"LIDAR": 4}, {"OTHER": 1}) as cluster,
         Client(cluster, set_as_default=False) as client,
@@ -134,7 +136,8 @@ def test_a_run_is_watched_from_its_first_part_to_its_path():
             seen.append(progress)
             busy.update(label.split(",")[0] for label, *_ in news(live)["slots"])
 
-        options, on_frame = RunOptions(client=client, backend="numpy"), scans.append
+        options = RunOptions(client=client, backend="numpy")
+        on_frame = scans.append
         run = Run(job, options, Kept(), Screen(show), live, lambda f: on_frame(f.scan))
         result = run.execute()
         assert scans == [*range(survey.scan_count)]

@@ -34,7 +34,9 @@ class Box:
     """What it needs of `gymnasium.spaces.Box`."""
 
     def __init__(self, low, high):
-        self.low, self.high, self.shape = low, high, low.shape
+        self.low = low
+        self.high = high
+        self.shape = low.shape
 
 
 @pytest.fixture
@@ -44,7 +46,8 @@ def gymnasium(monkeypatch):
         import gymnasium as _  # noqa: F401
     except ImportError:
         stand_in = ModuleType("gymnasium")
-        stand_in.Env, stand_in.spaces = Env, SimpleNamespace(Box=Box)
+        stand_in.Env = Env
+        stand_in.spaces = SimpleNamespace(Box=Box)
         monkeypatch.setitem(sys.modules, "gymnasium", stand_in)
 
 
@@ -60,7 +63,8 @@ def test_a_robot_reaches_its_goal_by_its_ranges(capsys):
 
 def test_a_node_publishes_what_a_bag_holds(tmp_path):
     node = runpy.run_path(str(EXAMPLES / "ros2_scanner.py"), run_name="ros2_scanner")
-    scene, pose = Scene.seed(), Pose((0.5, 0.2, 1), 30)
+    scene = Scene.seed()
+    pose = Pose((0.5, 0.2, 1), 30)
     cloud = node["scanner_of"](scene, "velodyne/vlp16").sweep(pose)
     store = get_typestore(Stores.ROS2_HUMBLE)
     types = store.types

@@ -136,7 +136,8 @@ def test_a_part_that_cannot_be_read_is_named(storage, read):
 
 
 def test_a_run_owns_what_has_its_mark_where_the_folder_has_it_too(storage):
-    mark, other = "0123456789abcdef", "fedcba9876543210"
+    mark = "0123456789abcdef"
+    other = "fedcba9876543210"
     part = part_name(mark, 3, 5, 120)
     temporary = f".lidarpool-tmp-{part}-0a1b2c3d"
     own = {part, temporary, probe_name(mark, "0a1b2c3d")}
@@ -160,7 +161,8 @@ def test_a_run_owns_what_has_its_mark_where_the_folder_has_it_too(storage):
 
 def stored_cloud(storage, counts):
     """Write a part for each list of counts; the cloud, and its parts."""
-    parts, first = [], 0
+    parts = []
+    first = 0
     for number, of_scans in enumerate(counts):
         parts.append(part_of(first, of_scans))
         storage.write(f"{number}.npz", pack(parts[-1]))

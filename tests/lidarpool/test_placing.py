@@ -65,7 +65,8 @@ def test_an_object_is_seen_from_around_it_and_only_from_outside(name, far):
     placed = place(scene, GRID)
     assert placed.around and "looks like an object" in placed.note and len(placed.poses) == 5
     poses = [np.subtract(pose.position, scene.origin) for pose in placed.poses]
-    middle, sides = scene.bounds.mean(axis=0), np.ptp(scene.bounds, axis=0)
+    middle = scene.bounds.mean(axis=0)
+    sides = np.ptp(scene.bounds, axis=0)
     far_m = np.linalg.norm(poses - middle, axis=1)
     np.testing.assert_allclose(far_m, 1.5 * np.linalg.norm(sides), rtol=0.01)
     local = [
@@ -77,7 +78,8 @@ def test_an_object_is_seen_from_around_it_and_only_from_outside(name, far):
         returns = list(rig.cast(36 * number, 36 * (number + 1)))
         assert sum(map(len, returns)) > 100, "each pose sees the object"
         points += [one.positions for one in returns]
-    low, high = np.concatenate(points).min(axis=0), np.concatenate(points).max(axis=0)
+    low = np.concatenate(points).min(axis=0)
+    high = np.concatenate(points).max(axis=0)
     # No pose sees the underside.
     assert ((high - low)[:2] > 0.9 * sides[:2]).all()
     assert high[2] > scene.bounds[1, 2] - 0.1 * sides[2]
@@ -202,7 +204,8 @@ def test_a_narrow_sensor_is_farther_away_and_tilted():
         assert (x > 0).all()
         elevations = np.degrees(np.arcsin(z))
         assert elevations.min() > -25 and elevations.max() < 15
-    ship, short = scene_of(creation.box((90, 14, 20))), Mounted(load_sensor("ouster/os0-32"))
+    ship = scene_of(creation.box((90, 14, 20)))
+    short = Mounted(load_sensor("ouster/os0-32"))
     far = [np.linalg.norm(pose.position) for pose in poses_around(ship, short)]
     assert min(far) > 56 and max(far) < short.sensor.max_range_m
 

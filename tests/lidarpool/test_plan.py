@@ -43,7 +43,8 @@ scene = st.lists(
 @given(discs=scene)
 def test_random_scenes(discs):
     array = np.array(discs, float)
-    centres, radii = array[:, :2], array[:, 2]
+    centres = array[:, :2]
+    radii = array[:, 2]
     ends = np.array([DEFAULT.start, DEFAULT.target])
     assume((segment_distances(ends, ends, centres) > radii + 0.1).all())
     planning = Planning(DEFAULT.start, DEFAULT.target, centres, radii)
@@ -195,7 +196,9 @@ def test_bad_values_are_named(fields, message):
 
 
 # By symmetry twice the way to the origin, where the inner tangent crosses.
-FAR, NEAR, RADIUS = 10.0, math.hypot(5, 3.5), 4.0
+FAR = 10.0
+NEAR = math.hypot(5, 3.5)
+RADIUS = 4.0
 ACROSS = 2 * (
     math.sqrt(FAR**2 - RADIUS**2)
     + math.sqrt(NEAR**2 - RADIUS**2)
@@ -238,7 +241,8 @@ def test_lengths_by_formula(name):
 def test_a_closed_ring_of_discs_has_no_way_out(enclosed):
     angles = np.linspace(0, 2 * np.pi, 8, endpoint=False)
     ring = 3 * np.stack([np.cos(angles), np.sin(angles)], axis=1) + enclosed
-    closed, ajar = np.full(8, 1.2), np.full(8, 1.1)
+    closed = np.full(8, 1.2)
+    ajar = np.full(8, 1.1)
     assert shortest_path_length((0, 0), (9, 9), ring, closed) == math.inf
     assert 9 * math.sqrt(2) <= shortest_path_length((0, 0), (9, 9), ring, ajar) < 14
 

@@ -139,7 +139,8 @@ def test_a_faulty_write_leaves_the_earlier_result(tmp_path, monkeypatch, fault):
 def test_a_disk_without_room_is_told_the_size_of_the_file(tmp_path, monkeypatch, count):
     """Written in pieces of 300 points, the file needs room for itself and one of them."""
     monkeypatch.setattr(ply, "CHUNK_POINTS", 300)
-    path, free = tmp_path / "c.ply", 0
+    path = tmp_path / "c.ply"
+    free = 0
     usage = shutil.disk_usage(tmp_path)
     monkeypatch.setattr(shutil, "disk_usage", lambda _: usage._replace(free=free))
     with pytest.raises(LidarError, match="could not be written: it takes") as caught:

@@ -26,7 +26,8 @@ def written(path, points):
     elif path.suffix in (".las", ".laz"):
         laspy = pytest.importorskip("laspy", reason="laspy is an extra")
         las = laspy.LasData(laspy.LasHeader(version="1.4", point_format=6))
-        las.header.offsets, las.header.scales = points[0].round(), [1e-6] * 3
+        las.header.offsets = points[0].round()
+        las.header.scales = [1e-6] * 3
         las.x, las.y, las.z = points.T
         las.write(str(path))
     else:
@@ -53,13 +54,15 @@ def test_all_formats_give_surfels_in_the_plane_of_the_points(tmp_path, name):
 
 def test_points_in_one_voxel_become_one_surfel(tmp_path):
     path = written(tmp_path / "a.ply", plane())
-    few, many = scene_of_points(path, voxel_m=0.5), scene_of_points(path)
+    few = scene_of_points(path, voxel_m=0.5)
+    many = scene_of_points(path)
     assert 50 <= len(few.faces) / 2 <= 100
     assert 400 < len(many.faces) / 2 < len(GRID), "by default about the spacing of the points"
 
 
 def test_a_place_scanned_again_has_the_ranges_of_the_real_one(tmp_path):
-    real, sensor = Scene.seed(), load_sensor("ouster/os1-64")
+    real = Scene.seed()
+    sensor = load_sensor("ouster/os1-64")
     scanner = Scanner(real, sensor, noise=Noise(range_m=0.005))
     sweeps = [scanner.sweep(Pose((x, y, 2))) for x, y in ((0, 0), (3, 2), (-2, 3))]
     points = np.concatenate([sweep.positions for sweep in sweeps])
@@ -144,7 +147,8 @@ def test_a_huge_number_of_records_is_refused_at_once(tmp_path):
 
 
 def test_the_command(tmp_path):
-    path, out = written(tmp_path / "a.ply", plane()), tmp_path / "b.glb"
+    path = written(tmp_path / "a.ply", plane())
+    out = tmp_path / "b.glb"
     arguments = ["points", str(path), str(out)]
     CliRunner().invoke(command, [*arguments, "--voxel-m", "0.001"], catch_exceptions=False)
     assert Scene.load(out).triangles == 2 * len(GRID)
@@ -157,7 +161,8 @@ def test_the_command(tmp_path):
 
 @pytest.mark.parametrize("name", ["room-scan", "building-3", "tree-1", "car-2", "ground", "scan"])
 def test_only_generated_scenes_are_painted(tmp_path, name):
-    path, out = written(tmp_path / f"{name}.ply", plane()), tmp_path / "b.glb"
+    path = written(tmp_path / f"{name}.ply", plane())
+    out = tmp_path / "b.glb"
     CliRunner().invoke(command, ["points", str(path), str(out)], catch_exceptions=False)
     scene = Scene.load(out, colours=True)
     assert scene.names == (name,)

@@ -27,7 +27,8 @@ from lidarpool.run.pipeline.policies import (
 from lidarpool.run.pipeline.task_book import MISPLACED_MOST, RECORDS_MOST, StageTotals, TaskBook
 from poolpart.task_locations import TaskLocations, TaskPlace
 
-A, B = "tcp://a:1", "tcp://b:1"
+A = "tcp://a:1"
+B = "tcp://b:1"
 
 
 JOB, OTHER, ELSEWHERE = (
@@ -184,7 +185,8 @@ def record(number: int, resources: tuple[str, ...] = ("GPU",), every: float = 1.
 
 
 def test_totals_are_exact_however_many_tasks_there_are():
-    book, count = TaskBook(), 5 * RECORDS_MOST
+    book = TaskBook()
+    count = 5 * RECORDS_MOST
     for number in range(count):
         book.add(record(number))
     totals = book.stages["intersect"]

@@ -43,7 +43,8 @@ def records(workers: int = 1, tasks: int = 20, prefix: str = "") -> list[TaskRec
     """Tasks of a run of ten seconds: three long ones, short ones, and trials."""
 
     def record(stage: str, partition: str, worker: str, start: float, stop: float) -> TaskRecord:
-        name, items = f"{prefix}{partition}-{worker}", 1 if stage == TRIAL else 6
+        name = f"{prefix}{partition}-{worker}"
+        items = 1 if stage == TRIAL else 6
         return TaskRecord(stage, partition, name, (partition,), start, stop, items=items)
 
     long = [(GENERATE, 1, 5), (SORT, 1.5, 6), (COLLECT, 1.6, 6.1), (COLLECT, 1.7, 6.2)]
@@ -58,7 +59,8 @@ def records(workers: int = 1, tasks: int = 20, prefix: str = "") -> list[TaskRec
 
 
 def scene_of(names: Sequence[str]) -> Scene:
-    corners, faces = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]], float), np.array([[0, 1, 2]])
+    corners = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]], float)
+    faces = np.array([[0, 1, 2]])
     return Scene.from_meshes(
         [SceneMesh(name, corners + 2 * k, faces) for k, name in enumerate(names)]
     )
@@ -128,7 +130,8 @@ def write(tmp_path: Path) -> Callable[..., tuple[str, dict[str, Any]]]:
             | changes
         )
         drawn = PICTURES if plan else PICTURES[:4]
-        page, numbers = tmp_path / "report.html", counted(result.points, len(scene.names))
+        page = tmp_path / "report.html"
+        numbers = counted(result.points, len(scene.names))
         report = make_report(result, numbers)
         write_page(page, report, result, numbers, scenario)
         for name in drawn:

@@ -160,10 +160,8 @@ def test_short_forms_say_the_same(scenario):
     )
     one, other = (fingerprint(build(scenario(text)).survey) for text in (short, long))
     assert one == other
-    short, long = (
-        "sensor: vlp16\nmount: [0, 0, 2]",
-        ("sensor: {model: velodyne/vlp16}\nmount: {position: [0, 0, 2]}"),
-    )
+    short = "sensor: vlp16\nmount: [0, 0, 2]"
+    long = "sensor: {model: velodyne/vlp16}\nmount: {position: [0, 0, 2]}"
     one, other = (fingerprint(build(scenario(text)).survey) for text in (short, long))
     assert one == other
 
@@ -423,7 +421,9 @@ def test_a_mesh_alone_is_scanned_below_its_ceiling_and_whole(tmp_path, height, e
     ],
 )
 def test_it_is_told_that_gltf_was_turned_and_what_to_say(tmp_path, size, generator, entry, says):
-    width, height, depth = size[0], size[1], size[2]
+    width = size[0]
+    height = size[1]
+    depth = size[2]
     mesh_file(tmp_path / "hall.glb", (width, height, depth), 0, generator=generator, version="2.0")
     made = Scenario.from_data({"scene": {"files": [entry]}}, folder=tmp_path)
     told = [note for note in advice(build(made)) if "up_axis" in note]

@@ -105,7 +105,8 @@ def test_a_run_from_its_beginning_to_its_end(folder):
 def test_without_a_folder_all_goes_with_the_last_user_of_the_points():
     store = opened()
     add(store, 0, 6)
-    points, folder = store.only.points(), store.place.local()
+    points = store.only.points()
+    folder = store.place.local()
     del store
     gc.collect()
     assert len(points.load()) == 18
@@ -462,7 +463,8 @@ def test_a_lost_database_is_made_again_though_drivers_end_meanwhile(folder):
 
 
 def test_a_link_with_the_name_of_a_part_is_no_part(unfinished, tmp_path):
-    part, victim = part_of(unfinished, 0), tmp_path / "victim"
+    part = part_of(unfinished, 0)
+    victim = tmp_path / "victim"
     part.rename(victim)
     part.symlink_to(victim)
     store = opened(unfinished, resume=True)

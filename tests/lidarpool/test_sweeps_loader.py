@@ -330,7 +330,8 @@ def test_torch_gets_tensors(written, torch):
     data = lidarpool.sweeps(written("kitti"), shuffle=3)
     items = list(data.torch())
     assert [item["job"] for item in items] == [sweep.job for sweep in data]
-    item, sweep = items[0], data[0]
+    item = items[0]
+    sweep = data[0]
     np.testing.assert_array_equal(item["points"], sweep.points)
     np.testing.assert_array_equal(item["class"], sweep.classes)
     assert item["class"].dtype == np.int64 and item["points"].dtype == np.float32

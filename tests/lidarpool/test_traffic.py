@@ -97,7 +97,8 @@ def test_labels_and_frames_are_of_actors_that_are_there(sweeps_of_three, tmp_pat
 
     save_cloud(cloud, tmp_path / "a.mcap", layout="velodyne")
     store = get_typestore(Stores.ROS2_HUMBLE)
-    shown, frames = [], []
+    shown = []
+    frames = []
     with rosbags.AnyReader([tmp_path / "a.mcap"], default_typestore=store) as bag:
         for connection, _, data in bag.messages():
             message = bag.deserialize(data, connection.msgtype)

@@ -34,7 +34,9 @@ def look(monkeypatch):
         clock.now = seconds
         watching.look()
 
-    look.watching, look.told, look.coming = watching, told, 0
+    look.watching = watching
+    look.told = told
+    look.coming = 0
     look(0)
     return look
 

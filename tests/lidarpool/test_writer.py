@@ -18,7 +18,8 @@ from lidarsim.base.storage import Storage
 @pytest.fixture
 def jobs(tmp_path, monkeypatch):
     """A writer whose tasks never end, and the numbers of jobs in each of them."""
-    written, clock = [], SimpleNamespace(now=0.0)
+    written = []
+    clock = SimpleNamespace(now=0.0)
     monkeypatch.setattr(writer, "time", SimpleNamespace(monotonic=lambda: clock.now))
     tasks = SimpleNamespace(
         running={}, take_done=list, take_failed=list, cancel=list,
@@ -52,7 +53,8 @@ def test_jobs_wait_a_moment_to_be_written_with_others(jobs):
 
 
 def test_the_worker_with_the_least_memory_for_a_slot_is_named():
-    scene, sensor = Scene.seed(), Sensor.grid(rays_per_revolution=3600, layers=64, step_deg=360)
+    scene = Scene.seed()
+    sensor = Sensor.grid(rays_per_revolution=3600, layers=64, step_deg=360)
     job = SimpleNamespace(scene=scene, survey=Survey(sensor, [(0, 0, 1)], steps=1))
     tasks = SimpleNamespace(batch_mb=1)
     workers = [

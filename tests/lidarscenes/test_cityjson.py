@@ -83,7 +83,8 @@ def test_holes_and_faces_that_are_not_convex(tmp_path):
 
 def test_the_highest_lod_of_each_object_and_none_twice(tmp_path):
     footprint = geometry("MultiSurface", [[SIDES[0]]], "0")
-    block, fine = geometry(lod=1.3), geometry(lod="2.2")
+    block = geometry(lod=1.3)
+    fine = geometry(lod="2.2")
     objects = {
         "whole": thing(footprint, block, children=["part"]),
         "part": thing(block, fine, kind="BuildingPart", parents=["whole"]),
@@ -111,7 +112,8 @@ def test_templates_are_placed_and_large_ones_shared(tmp_path):
         rows = [*turn, 0, 0, 0, 1]
         return geometry("GeometryInstance", [x], template=0, transformationMatrix=rows)
 
-    upright, scaled = [1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 5], [2, 0, 0, 0, 0, 2, 0, 0, 0, 0, 2, 0]
+    upright = [1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 5]
+    scaled = [2, 0, 0, 0, 0, 2, 0, 0, 0, 0, 2, 0]
     objects = {
         "t1": thing(placed(1, upright), kind="SolitaryVegetationObject"),
         "t2": thing(placed(2, scaled), kind="SolitaryVegetationObject"),

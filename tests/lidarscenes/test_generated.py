@@ -21,7 +21,8 @@ from lidarsim.scene.scene_mesh import triangle_areas
 from lidarsim.scene.shapes import SEED_POSITIONS, revolve, seed_objects
 from raybeam import RayCaster
 
-TREES, CARS = [species.name for species in SPECIES], [model.name for model in MODELS]
+TREES = [species.name for species in SPECIES]
+CARS = [model.name for model in MODELS]
 
 
 @pytest.mark.parametrize("triangles", [1_000, 20_000, 1_000_000])
@@ -135,7 +136,8 @@ def test_it_is_a_height_field_without_holes():
 
 
 def test_trees_stand_on_ground_that_is_not_steep():
-    plain, scene = terrain(80_000, 1, 200.0), terrain(80_000, 1, 200.0, trees=400)
+    plain = terrain(80_000, 1, 200.0)
+    scene = terrain(80_000, 1, 200.0, trees=400)
     assert scene.vertices.tobytes() == plain.vertices.tobytes()
     kinds = {name.partition(".")[0] for name in scene.names[1:]}
     assert len(scene.names) == 401 and kinds == {species.name for species in SPECIES}
@@ -182,7 +184,8 @@ def test_terrains_out_of_range(wrong):
 def test_a_tree_has_a_trunk_and_leaves_around_it(species):
     made = tree(species, 7, root_m=0.5)
     assert 5_000 < len(made.faces) < 20_000
-    low, high = made.vertices.min(axis=0), made.vertices.max(axis=0)
+    low = made.vertices.min(axis=0)
+    high = made.vertices.max(axis=0)
     assert low[2] == pytest.approx(-0.5, abs=0.1)
     assert SCALES[0] * high[2] > 6 and SCALES[1] * high[2] < 21
     root = made.vertices[made.vertices[:, 2] < 0]

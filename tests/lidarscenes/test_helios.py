@@ -101,7 +101,8 @@ def imported(survey, tmp_path):
 
 def about(axis, degrees):
     """Rotation by the formula of Rodrigues, written out another way than in the importer."""
-    c, s = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
+    c = np.cos(np.radians(degrees))
+    s = np.sin(np.radians(degrees))
     x, y, z = axis
     cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
     return c * np.eye(3) + s * cross + (1 - c) * np.outer(axis, axis)
@@ -109,7 +110,8 @@ def about(axis, degrees):
 
 def fired(made, number, firings):
     """Directions in the world of firings of a sensor: (k, channels, 3)."""
-    carried, path = made.carried[number], made.path
+    carried = made.carried[number]
+    path = made.path
     firings = np.asarray(firings)
     _, turns = path.poses(0, carried.sensor.begins_ns(firings))
     mount = np.eye(3) if carried.mount.rotation is None else carried.mount.rotation
@@ -177,7 +179,9 @@ def test_a_swinging_mirror_and_fibres_are_those_of_helios(imported, tmp_path):
 
 @pytest.mark.parametrize("angles", [(18, -18), (-18, 18), (12, 15, -3)])
 def test_prisms_are_those_of_helios(imported, angles):
-    rates, index, incident = (-77.7, 121.6, 30.1), 1.51, np.array([-0.05, 1, 0.02])
+    rates = (-77.7, 121.6, 30.1)
+    index = 1.51
+    incident = np.array([-0.05, 1, 0.02])
     values = {f"rotorFreq{i + 1}_Hz": rate for i, rate in enumerate(rates)}
     values |= {f"angle{i + 1}_deg": angle for i, angle in enumerate(angles)}
     values |= {f"refrIndex{i + 1}": index for i in range(3)}
@@ -193,14 +197,16 @@ def test_prisms_are_those_of_helios(imported, angles):
     for pulse in PULSES:
         ray = incident / np.linalg.norm(incident)
         for wedge, rate in zip(angles, rates, strict=False):
-            angle, tilt = 2 * np.pi * rate * pulse / 1000, np.radians(wedge)
+            angle = 2 * np.pi * rate * pulse / 1000
+            tilt = np.radians(wedge)
             slope = np.array([np.sin(angle), 0, np.cos(angle)]) * np.sin(tilt)
             faces = [slope - np.cos(tilt) * Y, -Y]
             order = 1 if wedge > 0 else -1
             for face, ratio in zip(faces[::order], (1 / index, index), strict=True):
                 ray = refracted(ray, face, ratio)
         rays.append(ray)
-    platform, mount = about(Z, np.degrees(np.arctan2(4, 3)) - 90), about(Z, 80) @ about(X, -90)
+    platform = about(Z, np.degrees(np.arctan2(4, 3)) - 90)
+    mount = about(Z, 80) @ about(X, -90)
     turn = platform @ mount @ about(Z, 20) @ about(X, 10)
     assert np.allclose(fired(of, 0, PULSES)[:, 0], np.array(rays) @ turn.T, atol=1e-9)
 
@@ -354,7 +360,8 @@ def test_classes_and_reflectances_are_those_of_the_faces(imported):
     )
     assert "class" in scenario_of(made).cloud.columns
     assert scene.names == ("ground", "House", "Shed")
-    kinds, table = scene.surface_kinds, MaterialTable.of(of.materials, scene.surface_kinds)
+    kinds = scene.surface_kinds
+    table = MaterialTable.of(of.materials, scene.surface_kinds)
     rows = zip(kinds.object, kinds.material, table.semantic_class, table.reflectance, strict=True)
     found = {(kinds.names[owner], name): (int(c), float(share)) for owner, name, c, share in rows}
     assert found == {

@@ -26,14 +26,17 @@ if find_spec("rasterio") is not None:
     from rasterio.transform import Affine, from_origin
     from rasterio.warp import transform
 
-X0, Y0 = 500_000, 5_500_000  # of the upper left corner
+# of the upper left corner
+X0 = 500_000
+Y0 = 5_500_000
 SLOPE = np.arange(48.0).reshape(6, 8)
 
 
 def write(path, heights=SLOPE, *, crs="EPSG:25832", place=None, mask=None, units=None, **options):
     """Write a raster, by default of pixels of 2 m; `options` are rasterio's, and tags."""
     heights = np.asarray(heights)
-    scale, tags = options.pop("scale", None), options.pop("tags", {})
+    scale = options.pop("scale", None)
+    tags = options.pop("tags", {})
     place = from_origin(X0, Y0, 2, 2) if place is None else place or None
     rows, columns = heights.shape
     with (
@@ -50,7 +53,8 @@ def write(path, heights=SLOPE, *, crs="EPSG:25832", place=None, mask=None, units
         if units:
             file.units = [units]
         if scale:
-            file.scales, file.offsets = [scale[0]], [scale[1]]
+            file.scales = [scale[0]]
+            file.offsets = [scale[1]]
     return path
 
 
@@ -109,7 +113,9 @@ def test_rotated_and_sheared_rasters(tmp_path, mirrored):
 
 def test_pixels_without_height_are_holes(tmp_path):
     heights = SLOPE.astype(np.float32)
-    heights[2, 2], heights[0, 7], heights[5, 0] = -9999, np.nan, np.inf
+    heights[2, 2] = -9999
+    heights[0, 7] = np.nan
+    heights[5, 0] = np.inf
     mesh, taken, notes = read(write(tmp_path / "m.tif", heights, nodata=-9999))
     assert len(mesh.faces) == 2 * (35 - 4 - 1 - 1) and len(mesh.vertices) == 48 - 3
     assert mesh.bounds[:, 2].tolist() == [0, 47] and notes == []
@@ -160,7 +166,8 @@ def test_degrees_become_metres_of_the_utm_zone(tmp_path):
     assert taken.epsg == 32721 and " from EPSG:4326" in taken.told
     x, y, z = mesh.vertices.T
     longitude, latitude = map(np.array, transform("EPSG:32721", "EPSG:4326", x, y))
-    column, row = (longitude + 58.5) * 1200, (-34.5 - latitude) * 1200
+    column = (longitude + 58.5) * 1200
+    row = (-34.5 - latitude) * 1200
     np.testing.assert_allclose(z, 3 * (column - 0.5) - 2 * (row - 0.5), atol=1e-6)
     assert len(mesh.faces) == 2 * 39 * 59
     middle = mesh.bounds.mean(axis=0)
@@ -170,7 +177,8 @@ def test_degrees_become_metres_of_the_utm_zone(tmp_path):
     coarse, *_ = read(tmp_path / "m.tif", step_m=300)
     x, y, z = coarse.vertices[np.abs(coarse.vertices[:, :2] - middle[:2]).max(axis=1) < 1000].T
     longitude, latitude = map(np.array, transform("EPSG:32721", "EPSG:4326", x, y))
-    column, row = (longitude + 58.5) * 1200, (-34.5 - latitude) * 1200
+    column = (longitude + 58.5) * 1200
+    row = (-34.5 - latitude) * 1200
     np.testing.assert_allclose(z, 3 * (column - 0.5) - 2 * (row - 0.5), atol=0.3)
     wide = write(tmp_path / "wide.tif", crs="EPSG:4326", place=from_origin(-10, 50, 5, 1))
     with pytest.raises(LidarError, match=r"spans 40 degrees.*give cloud\.epsg"):

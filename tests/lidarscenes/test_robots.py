@@ -48,7 +48,9 @@ def visual(shape, origin=""):
 
 def turn(axis, angle):
     """Rotation (4, 4) about x, y or z, written out."""
-    c, s, out = np.cos(angle), np.sin(angle), np.eye(4)
+    c = np.cos(angle)
+    s = np.sin(angle)
+    out = np.eye(4)
     i, j = {"x": (1, 2), "y": (2, 0), "z": (0, 1)}[axis]
     out[[i, i, j, j], [i, j, i, j]] = c, -s, s, c
     return out
@@ -274,7 +276,9 @@ def test_xacro_other_files_and_garbled_copies(tmp_path):
         load_robot(tmp_path / "arm.urdf.xacro")
     with pytest.raises(LidarError, match="cannot be read"):
         load_robot(tmp_path / "none.urdf")
-    whole, rng, read = (EXAMPLES / "rover.urdf").read_bytes(), np.random.default_rng(0), 0
+    whole = (EXAMPLES / "rover.urdf").read_bytes()
+    rng = np.random.default_rng(0)
+    read = 0
     for _ in range(150):
         data = bytearray(whole)
         for at in rng.integers(0, len(data), rng.integers(1, 4)):
@@ -304,7 +308,9 @@ def test_what_is_left_out_is_told(tmp_path):
 
 
 def test_tables_of_joints(tmp_path):
-    robot, table, notes = robot_of(tmp_path, *ARM), tmp_path / "joints.csv", []
+    robot = robot_of(tmp_path, *ARM)
+    table = tmp_path / "joints.csv"
+    notes = []
     table.write_text("time_ns;pan;effort\n0;0;1\n1000000000;1;1\n")
     (*_, tip) = robot.actors(joints=table, ignore=["effort"], tell=notes.append)
     assert np.allclose(tip.trajectory.pose(0, 5e8).position, tip_at(0.5, 0)[:3, 3])
@@ -365,7 +371,8 @@ def rover_at(name, time_ns):
     (at[:3, 3],), (at[:3, :3],) = DRIVE.poses(0, np.array([time_ns]))
     value = {joint: np.interp(time_ns / 1e9, MOTION["time_s"], MOTION[joint]) for joint in MOTION}
     if "wheel" in name:
-        right, rear = "right" in name, "rear" in name
+        right = "right" in name
+        rear = "rear" in name
         at = at @ shift(0.34 - 0.68 * rear, 0.34 - 0.68 * right, 0.18)
         return at if right else at @ turn("y", value["front_left"])
     chain = {

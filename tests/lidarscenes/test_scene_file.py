@@ -43,7 +43,8 @@ def test_round_trip(tmp_path, suffix):
 def test_colours_come_back_from_a_glb_file(tmp_path):
     """A texture, colours of corners, a plain colour, none; instances; and a mask with a colour."""
     rng = np.random.default_rng(3)
-    cube, faces = box("Cube", (1, 1, 1)), np.zeros(12, np.int32)
+    cube = box("Cube", (1, 1, 1))
+    faces = np.zeros(12, np.int32)
     image = rng.integers(0, 256, (8, 4, 3)).astype(np.uint8)
     uv = rng.uniform(-1, 2, (12, 3, 2)).astype(np.float32)
     corners = rng.integers(0, 256, (12, 3, 3)).astype(np.uint8)

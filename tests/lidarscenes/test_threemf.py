@@ -83,7 +83,9 @@ def test_colours_of_base_materials_and_colour_groups(tmp_path):
     path.write_bytes(packed({"3D/3dmodel.model": model('<item objectid="2"/>', objects=objects)}))
     notes = []
     (mesh,) = load_meshes(path, colours=True, tell=notes.append)
-    first, last, base = [1, 2, 3], [255, 254, 253], [255, 128, 0]
+    first = [1, 2, 3]
+    last = [255, 254, 253]
+    base = [255, 128, 0]
     expected = [[base] * 3, [last] * 3, [first, last, first], [[10, 20, 30]] * 3]
     grey = [[[188] * 3] * 3] * 2
     assert mesh.colours.corners.tolist() == expected + grey

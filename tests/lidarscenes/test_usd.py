@@ -184,7 +184,8 @@ def test_moving_prims_are_actors(tmp_path):
         body = np.sort(found["Car"].round(9), axis=0)
         want = quad * [1, -2, 3] + [x, 0, 0]
         np.testing.assert_allclose(body, np.sort(np.concatenate([want, want]), axis=0), atol=1e-6)
-        c, s = np.cos(np.radians(turn)), np.sin(np.radians(turn))
+        c = np.cos(np.radians(turn))
+        s = np.sin(np.radians(turn))
         turned = quad @ [[c, s, 0], [-s, c, 0], [0, 0, 1]] + [x, 0, 0]
         np.testing.assert_allclose(found["Wheel"], turned, atol=1e-3)
     # Its axes and its path follow the placement and the unit.
@@ -204,7 +205,8 @@ def test_moving_prims_are_actors(tmp_path):
 
 
 def turned_about_z(points, degrees):
-    c, s = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
+    c = np.cos(np.radians(degrees))
+    s = np.sin(np.radians(degrees))
     return points @ [[c, s, 0], [-s, c, 0], [0, 0, 1]]
 
 
@@ -264,7 +266,8 @@ def test_files_elsewhere_are_read_if_their_folder_is_named(tmp_path):
 
 
 def test_skeletons_bend_their_meshes_but_in_instances(tmp_path):
-    still, raised = "((1,0,0,0), (0,1,0,0), (0,0,1,0), (0,0,{},1))".format, "5"
+    still = "((1,0,0,0), (0,1,0,0), (0,0,1,0), (0,0,{},1))".format
+    raised = "5"
     bones = f"""uniform token[] joints = ["a"]
     uniform matrix4d[] bindTransforms = [{still(0)}]
     uniform matrix4d[] restTransforms = [{still(raised)}]
@@ -444,7 +447,8 @@ def test_instances_prims_and_points_that_move_are_in_animations(tmp_path):
     ],
 )  # fmt: skip
 def test_unusable_animations_are_refused_in_a_line(tmp_path, stage, text, name, message):
-    path, stage = tmp_path / "m.usda", f"{METRES}\n{stage}"
+    path = tmp_path / "m.usda"
+    stage = f"{METRES}\n{stage}"
     if text is None:
         person(path, stage=stage)
     else:
@@ -674,7 +678,11 @@ def test_garbled_files_give_errors_or_meshes(tmp_path, changes):
 SENSOR = Sensor.grid(rays_per_revolution=4, layers=1, vertical_fov_deg=10, step_deg=90)
 # Four places on the quad: lower left, lower right, upper left, upper right.
 SPOTS = [(0.5, 0.75), (1.5, 0.75), (0.5, 2.25), (1.5, 2.25)]
-RED, GREEN, BLUE, DARK, GREY = [200, 0, 0], [0, 200, 0], [0, 0, 200], [90, 90, 90], [188] * 3
+RED = [200, 0, 0]
+GREEN = [0, 200, 0]
+BLUE = [0, 0, 200]
+DARK = [90, 90, 90]
+GREY = [188] * 3
 PIXELS = np.array([[[*RED, 255], [*GREEN, 0]], [[*BLUE, 255], [*DARK, 0]]], np.uint8)
 PICTURE = [BLUE, DARK, RED, GREEN]  # at the spots
 
@@ -808,7 +816,8 @@ def test_materials_of_subsets_parents_collections_and_instances(folder):
     )  # fmt: skip
     two = [material(IMAGE), material(plain, name="G")]
     path = write(folder / "m.usda", *two, prim("Q", text=halves + ST + subset, meta=BIND))
-    lower, upper = seen(path)[0][1], seen(path)[0][2]
+    lower = seen(path)[0][1]
+    upper = seen(path)[0][2]
     assert (lower, upper) == (DARK, [0, 255, 0])
     world = f"rel material:binding = </G>\n{prim('Q')}"
     assert seen(write(folder / "m.usda", *two, prim("W", "Xform", world, BIND)))[0][0] == upper

@@ -84,7 +84,8 @@ def test_rain_takes_what_was_published(mm_h):
 @pytest.mark.parametrize("mm_h", [0.5, 1.0, 3.0])
 def test_snow_falls_as_fast_as_flakes_do(mm_h):
     """The water in the air of Gunn and Marshall, and what reaches the ground: 1 m/s."""
-    kind, density = snow(mm_h), 0.1
+    kind = snow(mm_h)
+    density = 0.1
     water = density * math.pi / 6 * kind.number * 6 / kind.slope**4 * 1e-9  # m³ in m³
     assert mm_h / 1000 / 3600 / water == pytest.approx(1.0, rel=0.08)
 
@@ -274,7 +275,8 @@ def test_spray_lies_where_the_car_was():
     )
     found = sprayed(car(way), sensor=around, spray_g_m3=1000.0, columns=(*COLUMNS, "azimuth"))
     some = found["cause"] == SPRAY
-    angle, far = np.radians(found["azimuth"][some]), found["range"][some]
+    angle = np.radians(found["azimuth"][some])
+    far = found["range"][some]
     assert some.sum() > 100 and (np.abs(far - 10) < 1.2).all()
     assert angle.max() < 1.5 and angle.min() < 0.8, "the car is at 1.5 rad and later"
 
@@ -295,7 +297,8 @@ def test_a_flat_actor_raises_no_spray():
 
 def test_fog_returns_what_hahner_et_al_have():
     """β = 0.046 / MOR; the pulse receives half of its length of it, less what the fog takes."""
-    visibility_km, length = 0.1, 0.299792458 * 10 / 2
+    visibility_km = 0.1
+    length = 0.299792458 * 10 / 2
     sensor = beams(wavelength_nm=550, min_range_m=1.0, pulse_ns=10)
     found = cast(
         sensor=sensor,
@@ -304,8 +307,10 @@ def test_fog_returns_what_hahner_et_al_have():
         returns=Returns("all"),
     )
     mor = 1000 * visibility_km * math.log(20) / 3.91  # of a contrast of 5 % instead of 2 %
-    alpha, beta = math.log(20) / mor, 0.046 / mor
-    begin, end = 1.0, 1.0 + length
+    alpha = math.log(20) / mor
+    beta = 0.046 / mor
+    begin = 1.0
+    end = 1.0 + length
     energy = math.pi * beta * (math.exp(-2 * alpha * begin) - math.exp(-2 * alpha * end))
     energy /= 2 * alpha
     first = found["range"] < end

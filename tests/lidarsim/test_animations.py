@@ -41,7 +41,8 @@ class File:
 
     def stored(self, numbers, kind="f", width=1, **more):
         array = np.array(numbers, kind)
-        views, accessors = self.header["bufferViews"], self.header["accessors"]
+        views = self.header["bufferViews"]
+        accessors = self.header["accessors"]
         views.append({"buffer": 0, "byteOffset": len(self.body), "byteLength": array.nbytes})
         self.body += array.tobytes() + bytes(-array.nbytes % 4)
         accessors.append({"bufferView": len(views) - 1, "componentType": KINDS[kind],
@@ -49,7 +50,8 @@ class File:
         return len(accessors) - 1
 
     def moved(self, node, path, keys, values, how="LINEAR"):
-        found, width = self.header["animations"][0], {"weights": 1, "rotation": 4}.get(path, 3)
+        found = self.header["animations"][0]
+        width = {"weights": 1, "rotation": 4}.get(path, 3)
         sampler = {"input": self.stored(keys), "output": self.stored(values, width=width)}
         found["samplers"].append(sampler | {"interpolation": how})
         target = {"node": node, "path": path}
@@ -92,7 +94,8 @@ def skinned():
         {"children": [2], "translation": [3, 0, 0], "rotation": [0.6, 0, 0, 0.8]},
         {"translation": [0, 1, 0]},
     ]
-    header["scenes"], header["scene"] = [{"nodes": [0, 1]}], 0
+    header["scenes"] = [{"nodes": [0, 1]}]
+    header["scene"] = 0
     return made
 
 
@@ -118,7 +121,8 @@ def between(keys, values, at, how):
         return ((2 * u**3 - 3 * u**2 + 1) * p + long * (u**3 - 2 * u**2 + u) * out
                 + (3 * u**2 - 2 * u**3) * q + long * (u**3 - u**2) * into)  # fmt: skip
     if values.shape[1] == 4:
-        p, q = values[k], values[k + 1]
+        p = values[k]
+        q = values[k + 1]
         q = q if p @ q >= 0 else -q
         angle = np.arccos(min(p @ q, 1.0))
         if angle < 1e-6:
@@ -134,7 +138,8 @@ def expected(at, how, turns, moves, scales, weights):
     inner[:3, :3] = quaternion(*turn / np.linalg.norm(turn)) * between(KEYS, scales, at, how)
     inner[:3, 3] = between(KEYS, moves, at, how)
     outer = np.eye(4)
-    outer[:3, :3], outer[:3, 3] = quaternion(0.6, 0, 0, 0.8), [3, 0, 0]
+    outer[:3, :3] = quaternion(0.6, 0, 0, 0.8)
+    outer[:3, 3] = [3, 0, 0]
     back = np.eye(4)
     back[1, 3] = -1
     joints = outer, outer @ inner @ back
@@ -150,11 +155,10 @@ def expected(at, how, turns, moves, scales, weights):
 @pytest.mark.parametrize("how", ["LINEAR", "STEP", "CUBICSPLINE"])
 def test_skins_targets_and_nodes_are_where_the_specification_says(tmp_path, how):
     """At five times, by an evaluation of one vertex at a time."""
-    made, random = skinned(), np.random.default_rng(1)
-    scales, weights = (
-        [[1, 1, 1], [1, 2, 1], [0.5, 1, 1], [1, 1, 1]],
-        [[0, 1], [1, 0], [0, 0], [1, 1]],
-    )
+    made = skinned()
+    random = np.random.default_rng(1)
+    scales = [[1, 1, 1], [1, 2, 1], [0.5, 1, 1], [1, 1, 1]]
+    weights = [[0, 1], [1, 0], [0, 0], [1, 1]]
     given = {"rotation": TURNS, "translation": MOVES, "scale": scales, "weights": weights}
     if how == "CUBICSPLINE":  # with tangents before and after each
         for path, v in given.items():
@@ -252,7 +256,8 @@ def test_where_the_node_of_a_skin_is_does_not_matter(tmp_path):
 
 def test_a_chain_of_many_joints(tmp_path):
     """Each turns by a part of 90°: the last one goes around a circle's quarter."""
-    made, count = skinned(), 200
+    made = skinned()
+    count = 200
     first = np.eye(4)[None].repeat(count, axis=0)
     first[:, 3, 1] = -np.arange(count) / count  # columns
     attributes = made.header["meshes"][0]["primitives"][0]["attributes"]
@@ -340,7 +345,8 @@ def test_normals_are_those_of_the_moment():
         Track([0, 9], [[5, 0, 0], [5, 0, 0.0]], [[0, 0, 0, 1]] * 2),
     )
     scene = Scene.from_meshes([FLOOR]).with_actors([actor])
-    columns, grey = ["reflectance", "object", "time"], Material("*", reflectance=0.5)
+    columns = ["reflectance", "object", "time"]
+    grey = Material("*", reflectance=0.5)
     scanner = Scanner(scene, Sensor.grid(720, 3), columns=columns, materials=[grey])
     for start in (0.05, 0.3, 0.55):
         found = scanner.sweep((0, 0, 0), start_s=start)
@@ -362,7 +368,8 @@ def test_the_rate_follows_the_way_and_who_stands_keeps_the_pose(walker):
     np.testing.assert_allclose(seconds, [0.1, 0.1, 0.35, 0.6, 0.6, 0.6, 0.35, 0.1])
     np.testing.assert_allclose(rates, [0, 0.5, 0.5, 0, 0, -0.5, -0.5, 0])
     frames, passing = actor.played(times)
-    duration, step = walker.animation.duration_s, walker.animation.step_s
+    duration = walker.animation.duration_s
+    step = walker.animation.step_s
     np.testing.assert_allclose(frames * step, np.mod(seconds, duration))
     np.testing.assert_allclose(passing * step, rates)
     by_time = replace(walker, animation=replace(walker.animation, speed_m_s=None, repeat=False))
@@ -373,7 +380,8 @@ def test_the_rate_follows_the_way_and_who_stands_keeps_the_pose(walker):
 
 def test_the_person_of_the_examples_walks_without_sliding(walker):
     """1.75 m tall; where a foot is flat on the ground, it goes back by 1.4 m/s."""
-    poses, step = walker.animation.vertices, walker.animation.step_s
+    poses = walker.animation.vertices
+    step = walker.animation.step_s
     assert 1_500 < len(walker.faces) < 4_000 and 1.0 < walker.animation.duration_s < 1.2
     assert np.abs(poses[:, :, 2].min(axis=1)).max() < 0.01
     assert (np.abs(poses[:, :, 2].max(axis=1) - 1.71) < 0.03).all()
@@ -392,7 +400,8 @@ def test_copies_share_their_poses_and_backends_agree(walker):
     scene = Scene.from_meshes([FLOOR]).with_actors(actors)
     survey = Survey(Sensor.grid(500, 24), [(0, 0, 1)], steps=36, keep_every=1,
                     columns=["radial_velocity", "time", "intensity"])  # fmt: skip
-    one, other = made(survey, scene, "embree"), made(survey, scene, "numpy")
+    one = made(survey, scene, "embree")
+    other = made(survey, scene, "numpy")
     for name, values in one.items():
         assert np.array_equal(values, other[name]), name
     own = one["object"] > 0
@@ -425,7 +434,8 @@ def test_boxes_hold_the_points_of_people_who_walk(walker, tmp_path):
     survey = Survey(Sensor.grid(900, 40), [(0, 0, 1)], steps=36 * 4, keep_every=1,
                     columns=["time", "intensity", "reflectivity", "class"],
                     materials=[Material("Person*", semantic_class=7), Material("*")])  # fmt: skip
-    sweeps, found = Sweeps.of(survey, scene), made(survey, scene, "embree")
+    sweeps = Sweeps.of(survey, scene)
+    found = made(survey, scene, "embree")
     assert sweeps.actor_bounds.shape == (2, 4, 2, 3)
     positions = np.stack([found.pop(axis) for axis in "xyz"], axis=1) * survey.precision_m
     begins = [survey.begins_ns(scan) for scan in range(survey.scan_count)]
@@ -433,7 +443,8 @@ def test_boxes_hold_the_points_of_people_who_walk(walker, tmp_path):
     cloud = Cloud(positions, found, sweeps=lambda: sweeps)
     sizes = []
     for number, points in enumerate(sweeps.points(cloud)):
-        boxes, own = Boxes.of(sweeps, number, points), points["object"] == 1
+        boxes = Boxes.of(sweeps, number, points)
+        own = points["object"] == 1
         assert own.sum() > 50 and set(points["class"][own]) == {7}
         # An actor's way in half a sweep, as of others, and the rounding of points.
         assert points_in(boxes, 0, points.positions[own], np.array([0.06, 0.01, 0.01])).all()
@@ -456,7 +467,8 @@ def test_boxes_hold_the_points_of_people_who_walk(walker, tmp_path):
     from rosbags.typesys import Stores, get_typestore
 
     save_cloud(cloud, tmp_path / "a.mcap", layout="velodyne")
-    store, scales = get_typestore(Stores.ROS2_HUMBLE), []
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    scales = []
     with rosbags.AnyReader([tmp_path / "a.mcap"], default_typestore=store) as bag:
         for connection, _, data in bag.messages():
             if connection.topic == "/actors":
@@ -512,7 +524,8 @@ def test_pictures_of_a_saved_result_show_people_as_they_walk(walker, tmp_path):
     assert len({id(actor.mesh.animation) for actor in again}) == 3, "copies share their poses"
     for time_ns in (0, 0.7e9, 1.49e9, 1.7e9, 2.4e9, 2.9e9):
         for one, other in zip(actors, again, strict=True):
-            want, found = one.placed(time_ns).vertices, other.placed(time_ns).vertices
+            want = one.placed(time_ns).vertices
+            found = other.placed(time_ns).vertices
             there = np.ptp(want, axis=0).any()
             assert there == np.ptp(found, axis=0).any()
             # The pose is within 1/1024 m; halves of it, and a way between a thousand places.

@@ -75,7 +75,8 @@ def carrier(row, parent="map"):
 
 def fix(row, origin, status=0):
     # One degree of latitude and longitude, of the ellipsoid of WGS 84.
-    a, e2 = 6378137.0, 0.00669437999014
+    a = 6378137.0
+    e2 = 0.00669437999014
     sine = np.sin(np.radians(origin[0]))
     north_m = a * (1 - e2) / (1 - e2 * sine**2) ** 1.5
     east_m = a / np.sqrt(1 - e2 * sine**2) * np.cos(np.radians(origin[0]))

@@ -76,7 +76,8 @@ def test_surfaces_on_both_sides_of_an_edge_get_their_shares(angle_deg, offset):
     """The light of a beam, on a near wall that ends at an edge and on a far one."""
     at = offset * 1e-3 * 5  # the beam has a radius of 1 mrad
     near = wall("Near", 5, y=(at, 60), z=(-60, 60))
-    cosine, sine = math.cos(math.radians(angle_deg)), math.sin(math.radians(angle_deg))
+    cosine = math.cos(math.radians(angle_deg))
+    sine = math.sin(math.radians(angle_deg))
     turned = near.vertices @ [[1, 0, 0], [0, cosine, sine], [0, -sine, cosine]]
     materials = [Material("Near", 0.2), Material("Far", 0.8)]  # as bright both, at 5 and 10 m
     meshes = [SceneMesh("Near", turned, near.faces), wall("Far", 10)]
@@ -150,7 +151,8 @@ def test_a_road_is_one_return_behind_glass_and_in_a_mirror():
 
 def _turn(degrees):
     """A rotation about the vertical, for rows."""
-    c, s = math.cos(math.radians(degrees)), math.sin(math.radians(degrees))
+    c = math.cos(math.radians(degrees))
+    s = math.sin(math.radians(degrees))
     return np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]])
 
 
@@ -173,7 +175,8 @@ def test_a_shelf_that_is_grazed_and_the_wall_behind_it_are_two_returns(subrays):
 @pytest.mark.parametrize("subrays", [7, 61])
 def test_slanted_surfaces_one_behind_the_other_are_two_returns(subrays):
     """The near one covers half of the beam."""
-    near, far = plane((20, 0, 0), (1, 0, -3)), plane((24, 0, 0), (1, 0, -3))
+    near = plane((20, 0, 0), (1, 0, -3))
+    far = plane((24, 0, 0), (1, 0, -3))
     near.vertices[:, 1] = np.maximum(near.vertices[:, 1], 0)
     beam = Returns("all", subrays=subrays, divergence_mrad=3)
     assert cast([near, far], returns=beam)["returns"].tolist() == [2, 2]
@@ -282,7 +285,8 @@ def edge(offset_rad):
     return [wall("Near", 10, z=(-50, 10 * offset_rad)), wall("Far", 20)]
 
 
-HEAD, PLAIN = Spin(4, 360), Beams(np.zeros(1))
+HEAD = Spin(4, 360)
+PLAIN = Beams(np.zeros(1))
 SENSORS = {
     "spinning": Sensor(PLAIN, HEAD),
     "beside its axis": Sensor(Beams(np.zeros(1), origin=[[0, 0, 1e-6]]), HEAD),
@@ -296,7 +300,8 @@ SENSORS = {
 @pytest.mark.parametrize("mounted", [False, True])
 def test_the_oval_lies_in_the_axes_of_the_sensor(name, roll_deg, width, mounted):
     """4 mrad up and 12 mrad across; a sensor that is rolled takes its beam with it."""
-    sensor, roll = SENSORS[name], Pose((0, 0, 0), 0, 0, roll_deg)
+    sensor = SENSORS[name]
+    roll = Pose((0, 0, 0), 0, 0, roll_deg)
     where = {"sensors": [Mounted(sensor, roll)], "poses": [(0, 0, 0)]} if mounted else {"at": roll}
     share = nearer(edge(0.25 * width), None if mounted else sensor, **where)
     assert share == pytest.approx(normal_share(1), abs=0.03)
@@ -317,7 +322,8 @@ def test_the_oval_turns_with_the_head_and_with_a_carrier_that_moves():
         ring = np.stack([radius * np.cos(angle), radius * np.sin(angle)], axis=1)
         low_ring = np.column_stack([ring, np.full(128, low)])
         points = np.concatenate([low_ring, np.add(low_ring, (0, 0, 40))])
-        one, other = np.arange(128), np.roll(np.arange(128), -1)
+        one = np.arange(128)
+        other = np.roll(np.arange(128), -1)
         faces = [[one, other, other + 128], [one, other + 128, one + 128]]
         tubes.append(SceneMesh(name, points, np.concatenate([np.stack(f, axis=1) for f in faces])))
     (batch,) = rig_of(tubes, survey).cast(0, 1)
@@ -332,7 +338,8 @@ def test_the_oval_of_a_line_scanner_lies_across_its_line():
     """Azimuths are about x: across the flight is across, along it is up."""
     sensor = LineSensor(Beams(np.zeros(1)), Spin(1, 360))
     for axis, width in ((0, 4e-3), (1, 12e-3)):
-        low, high = np.full(2, -50.0), np.full(2, 50.0)
+        low = np.full(2, -50.0)
+        high = np.full(2, 50.0)
         high[axis] = 10 * width / 4
         corners = [[low[0], low[1]], [high[0], low[1]], [high[0], high[1]], [low[0], high[1]]]
         step = quad("Near", *np.column_stack([corners, np.full(4, -10.0)]))

@@ -159,10 +159,12 @@ end_header
 def test_colours_of_vertices_are_bytes_or_shares(tmp_path, kind, rgb):
     rows = [f"{place} {rgb}\n" for place in ("0 0 0", "1 0 0", "0 1 0")]
     if kind == "obj":
-        path, text = tmp_path / "m.obj", "".join(f"v {row}" for row in rows) + "f 1 2 3\n"
+        path = tmp_path / "m.obj"
+        text = "".join(f"v {row}" for row in rows) + "f 1 2 3\n"
     else:
         names = "".join(f"property {kind} {name}\n" for name in ("red", "green", "blue"))
-        path, text = tmp_path / "m.ply", PLY.format(names) + "".join(rows) + "3 0 1 2\n"
+        path = tmp_path / "m.ply"
+        text = PLY.format(names) + "".join(rows) + "3 0 1 2\n"
     write(path, text)
     assert Scene.load(path, colours=True).colours.means().tolist() == [[255, 128, 0]]
 
@@ -411,7 +413,8 @@ def test_light_and_bytes_are_one_another(rows):
 
 def test_a_material_has_the_reflectance_of_the_nearer_wavelength():
     scene = Scene.from_meshes([SceneMesh("Ground", *hills()[:2])])
-    snow, white = Material("*", spectrum="snow, melting"), Material("*", 1.0)
+    snow = Material("*", spectrum="snow, melting")
+    white = Material("*", 1.0)
     for nm, share in ((850.0, 0.70), (1064.0, 0.70), (1550.0, 0.01), (1600.0, 0.01)):
         sensor = replace(SENSOR, optics=replace(SENSOR.optics, wavelength_nm=nm))
         found, full = (
@@ -434,7 +437,8 @@ def test_a_gloss_adds_to_diffuse_light_and_replaces_that_of_metals():
     for roughness, metalness in ((0.2, 0.0), (0.5, 0.5), (1.0, 1.0)):
         _, found = returned(reflectance=0.3, roughness=roughness, metalness=metalness)
         # Cook and Torrance's D F G / (4 cos² θ), for light and receiver in one direction.
-        a, front = roughness**2, 0.04 * (1 - metalness) + 0.3 * metalness
+        a = roughness**2
+        front = 0.04 * (1 - metalness) + 0.3 * metalness
         d = a**2 / (np.pi * (cosine**2 * (a**2 - 1) + 1) ** 2)
         tangent = np.sqrt(1 - cosine**2) / cosine
         g = 1 / (1 + 2 * (np.sqrt(1 + (a * tangent) ** 2) - 1) / 2)

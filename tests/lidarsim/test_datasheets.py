@@ -119,13 +119,16 @@ def test_a_file_that_states_its_performance_is_used_with_it_unless_it_shall_be_i
     )
     file = tmp_path / "mine.yaml"
     file.write_text(text)
-    sheet, other, at = read_model(file).datasheet(), Noise(range_m=0.5), {"poses": [(0, 0, 1)]}
+    sheet = read_model(file).datasheet()
+    other = Noise(range_m=0.5)
+    at = {"poses": [(0, 0, 1)]}
     assert sheet.noise == Noise(range_m=0.02, dropout=0.1) and sheet.returns.mode == "last"
     given = {"sensor": str(file), "noise": {"dropout": 0, "seed": 3}}
     assert carried(**given) == [(Noise(range_m=0.02, seed=3), sheet.returns)]
     ideal = {"sensor": {"model": str(file), "performance": "ideal"}}
     assert carried(**ideal) == [(Noise(), Returns())]
-    sensor, named = load_sensor(file), load_sensor("ouster/os1-64")
+    sensor = load_sensor(file)
+    named = load_sensor("ouster/os1-64")
     for survey in (Survey(sensor, **at), Survey(sensors=[Mounted(sensor)], **at)):
         assert (survey.noise_each, survey.returns_each) == ((sheet.noise,), (sheet.returns,))
     both = Survey(sensors=[Mounted(sensor, name="a"), Mounted(named, name="b")], **at)

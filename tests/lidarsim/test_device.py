@@ -221,7 +221,8 @@ def test_columns_of_actors(scene, name, scenes, backend):
 
 
 def test_a_casting_task_gives_the_part_that_numpy_gives(scenes, backend, monkeypatch):
-    survey, spans = MADE["on the move"], [(0, 9), (9, 28)]
+    survey = MADE["on the move"]
+    spans = [(0, 9), (9, 28)]
     monkeypatch.setattr(stage, "Recorder", lambda *_: SimpleNamespace(done=lambda scans: None))
     tasks = []
     for name in (backend, "numpy"):
@@ -230,7 +231,8 @@ def test_a_casting_task_gives_the_part_that_numpy_gives(scenes, backend, monkeyp
         done = stage.intersect([stage.CastWork(0, "a run", spans)], (), None, None)
         tasks.append(pickle.loads(pickle.dumps(done, protocol=5)))
     for mine, other in zip(*tasks, strict=True):
-        samples, exact = mine.part.samples, other.part.samples
+        samples = mine.part.samples
+        exact = other.part.samples
         assert pack(mine.part) == pack(replace(other.part, samples=samples))
         assert np.allclose(samples, exact, rtol=0, atol=survey.precision_m, equal_nan=True)
 

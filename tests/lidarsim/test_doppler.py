@@ -29,7 +29,9 @@ from lidarsim.simulator.returns import PulseReturns
 from lidarsim.simulator.rig import Rig
 from lidarsim.simulator.separation import separated
 
-SPEED, RADIUS = 25.0, 50.0  # of the train
+# of the train
+SPEED = 25.0
+RADIUS = 50.0
 RATE = SPEED / RADIUS
 
 
@@ -80,7 +82,8 @@ def test_a_train_on_a_circle_passes_a_still_sensor():
     survey = Survey(sensor, poses=[(40, 12, 1)], steps=10, columns=["radial_velocity"])
     scene = Scene.from_meshes([wall_around()]).with_actors([train])
     returns = found_of(Rig(scene, survey, "numpy"))
-    ends, ahead = true_ends(returns), returns.directions
+    ends = true_ends(returns)
+    ahead = returns.directions
     on_train = returns.object == 1
     assert on_train.sum() > 500
     about = np.cross([0, 0, RATE], ends)
@@ -153,7 +156,8 @@ def test_actors_that_wait_do_not_move():
 def test_a_mirror_that_moves_counts_twice():
     # The virtual image of a wall, in a mirror that comes nearer.
     way = Track([0, 2], [[10, 0, 0], [4, 0, 0]], np.tile([0, 0, 0, 1.0], (2, 1)))
-    mirror, behind = Actor(wall("Mirror", 0, (-9, 9), (-9, 9)), way), wall("Wall", -20)
+    mirror = Actor(wall("Mirror", 0, (-9, 9), (-9, 9)), way)
+    behind = wall("Wall", -20)
     sensor = Sensor.grid(180, 3, 20.0, step_deg=360)
     survey = Survey(
         sensor, poses=[(0, 0, 0)], steps=1, columns=["radial_velocity"],

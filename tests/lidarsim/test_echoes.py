@@ -53,7 +53,8 @@ from lidarsim.simulator.separation import chosen, separated
 
 def test_random_numbers_follow_from_what_they_are_for_alone():
     rays = np.arange(1000)
-    one, other = RANGE, ACROSS
+    one = RANGE
+    other = ACROSS
     whole = raw(7, one, 3, rays)
     assert np.array_equal(whole[500:], raw(7, one, np.full(500, 3), rays[500:]))
     keys = [(8, one, 3, rays), (7, other, 3, rays), (7, one, 4, rays), (7, one, 3, rays, 1)]

@@ -19,7 +19,8 @@ WITHIN = np.concatenate([np.sin(RNG.uniform(-1.6, 1.6, COUNT)), np.minimum(AROUN
 QUARTERS = np.rint(10.0 ** RNG.uniform(0, 14, COUNT)) * (np.pi / 2)
 ANGLES = np.concatenate([10.0 ** RNG.uniform(-10, 14, COUNT), QUARTERS, -QUARTERS[:9], [0.0, -0.0]])
 SMALL = np.concatenate([RNG.uniform(-0.9, 9, COUNT), 10.0 ** RNG.uniform(-300, -1, COUNT)])
-INF, NAN = np.inf, np.nan
+INF = np.inf
+NAN = np.nan
 
 RANGES = {
     "sin": (ANGLES,),
@@ -37,7 +38,8 @@ NAMES = {"arctan2": "atan2", "arcsin": "asin", "arccos": "acos"}
 
 @pytest.mark.parametrize(("name", "limit"), [(name, 4 if "1" in name else 2) for name in RANGES])
 def test_it_is_within_units_of_the_last_place(name, limit):
-    given, exact = RANGES[name], getattr(mpmath, NAMES.get(name, name))
+    given = RANGES[name]
+    exact = getattr(mpmath, NAMES.get(name, name))
     found = getattr(elementary, name)(*given)
     with mpmath.workprec(2200):
         for value, *numbers in zip(found.tolist(), *(x.tolist() for x in given), strict=True):
@@ -106,6 +108,7 @@ def test_matrices():
         matmul(some, inverse(some)), np.tile(np.eye(3), (50, 1, 1)), atol=1e-9
     )
     np.testing.assert_allclose(determinant(some), np.linalg.det(some), atol=1e-12)
-    line, plane = np.outer([1, 2, 3.0], [0.3, 0.7, 0.1]), some[0] @ np.diag([1, 1, 0.0])
+    line = np.outer([1, 2, 3.0], [0.3, 0.7, 0.1])
+    plane = some[0] @ np.diag([1, 1, 0.0])
     given = np.stack([some[0], np.diag([1, 1e-9, 1e-12]), plane, line, np.eye(3) * 1e-200])
     assert rank(given).tolist() == [3, 3, 2, 1, 3]

@@ -203,8 +203,10 @@ def test_meshes_of_one_material_have_no_array_of_faces(tmp_path):
 def gltf(folder):
     """Two primitives of two materials in one mesh, a third without a name."""
     mesh = front(materials=("Brick", "Glass"))
-    points, data = mesh.vertices[:, [0, 2, 1]] * (1, 1, -1), bytearray()
-    views, accessors = [], []
+    points = mesh.vertices[:, [0, 2, 1]] * (1, 1, -1)
+    data = bytearray()
+    views = []
+    accessors = []
     for rows, kind, target in (
         (points.astype("<f4"), "VEC3", 5126),
         (mesh.faces[:2].astype("<u4").reshape(-1, 1), "SCALAR", 5125),
@@ -430,7 +432,8 @@ def test_light_passes_through_the_faces_of_glass_alone():
 
 
 def test_a_part_of_a_mesh_holds_water_if_its_faces_are_closed():
-    pool, rim = block("Pool", (2, 2, 2)), block("Rim", (0.5, 0.5, 0.5), (0, 5, 0))
+    pool = block("Pool", (2, 2, 2))
+    rim = block("Rim", (0.5, 0.5, 0.5), (0, 5, 0))
     mesh = one_mesh(
         "Pool",
         [

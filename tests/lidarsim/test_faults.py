@@ -95,10 +95,8 @@ def test_batches_and_backends_do_not_matter(place):
 def test_other_sensors_keep_their_points(kind):
     two = [Mounted(LIDAR, name="left"), Mounted(LIDAR, Pose((1, 0, 0)), name="right")]
     survey = Survey(sensors=two, poses=[(0, 0, 0)], steps=108, columns=COLUMNS)
-    before, after = (
-        cast(survey),
-        cast(replace(survey, faults=[replace(FAULTS[kind], sensor="right")])),
-    )
+    before = cast(survey)
+    after = cast(replace(survey, faults=[replace(FAULTS[kind], sensor="right")]))
     kept = [rows(columns, columns["scan"] < 108) for columns in (before, after)]
     assert same(*kept) and not same(before, after)
 
@@ -106,7 +104,8 @@ def test_other_sensors_keep_their_points(kind):
 def test_dirt_takes_energy_in_its_sector_while_it_is_there(bare):
     found = cast(replace(STANDING, faults=[FAULTS["dirt"]]))
     assert same(found, bare, but=["intensity"])
-    azimuth, time = (bare["azimuth"] + 180) % 360 - 180, bare["time"] / 1e9
+    azimuth = (bare["azimuth"] + 180) % 360 - 180
+    time = bare["time"] / 1e9
     dirty = (np.abs(azimuth) <= 20) & (time >= 0.05) & (time < 0.2)
     assert 0.02 < dirty.mean() < 0.1
     expected = bare["intensity"] * np.where(dirty, 0.3, 1)
@@ -168,7 +167,8 @@ def test_packets_are_lost_as_a_whole(bare):
     ]
     (every, all_points), (there, points) = packets
     assert np.array_equal(points, all_points[np.isin(every, there)])
-    lost, count = 1 - len(there) / len(every), len(every)
+    lost = 1 - len(there) / len(every)
+    count = len(every)
     assert abs(lost - 0.2) < 4.5 * np.sqrt(0.2 * 0.8 / count)
     other = cast(replace(survey, noise=Noise(seed=1)))
     assert not np.array_equal(other["scan"], cast(survey)["scan"])
@@ -192,7 +192,8 @@ def test_a_frozen_sensor_sends_the_last_sweep_again(bare):
 def test_a_frozen_sensor_takes_its_points_along():
     """They stay where they were in its axes: in the world, they move as it does."""
     survey = replace(DRIVE, faults=[FAULTS["frozen"]], precision_m=0.001)
-    sweeps, found = Sweeps.of(survey, ROOM), cast(survey)
+    sweeps = Sweeps.of(survey, ROOM)
+    found = cast(survey)
     places = np.stack([found[axis] for axis in "xyz"], axis=1) * survey.precision_m
     inside = [
         sweeps.in_sensor(
@@ -223,7 +224,8 @@ def test_a_time_jump_shifts_stamps_alone(bare):
 
 def test_images_find_the_rays_of_frozen_sweeps():
     survey = replace(DRIVE, faults=[FAULTS["frozen"]], keep_every=1)
-    sweeps, found = Sweeps.of(survey, ROOM), cast(survey)
+    sweeps = Sweeps.of(survey, ROOM)
+    found = cast(survey)
     some = rows(found, (found["scan"] >= 2 * SWEEP) & (found["scan"] < 3 * SWEEP))
     points = Cloud(np.zeros((len(some["scan"]), 3)), {name: some[name] for name in ("scan", "ray")})
     image = Image.of(sweeps, 2, points)
@@ -233,7 +235,8 @@ def test_images_find_the_rays_of_frozen_sweeps():
 
 def clouds(survey, scene):
     """Sweeps of a survey and their points."""
-    sweeps, found = Sweeps.of(survey, scene), cast(survey, scene=scene)
+    sweeps = Sweeps.of(survey, scene)
+    found = cast(survey, scene=scene)
     places = np.stack([found.pop(axis) for axis in "xyz"], axis=1) * survey.precision_m
     return sweeps, Cloud(places, found)
 
@@ -266,7 +269,8 @@ def test_bags_have_wrong_stamps_and_boxes_true_places(tmp_path):
     crate = Actor(block("Crate", (1, 1, 1)), Track([0, 1], [(3, 0, 0), (3, 2, 0)]))
     scene = ROOM.with_actors([crate])
     survey = replace(STANDING, columns=(*COLUMNS, "class"))
-    bags, boxes = [], []
+    bags = []
+    boxes = []
     for faults in ((), [Fault("time_jump", 0.1, by_s=-7.5)]):
         sweeps, cloud = clouds(replace(survey, faults=faults), scene)
         boxes.append([Boxes.of(sweeps, k, points) for k, points in enumerate(sweeps.points(cloud))])

@@ -23,15 +23,18 @@ CEILING = level("Ceiling", 3, 9)
 
 def turned(name, angle, middle=4.0):
     """A square wall that a beam along x meets at an angle, turned about z."""
-    x, y = 2 * math.sin(angle), 2 * math.cos(angle)
-    a, b = (middle + x, y), (middle - x, -y)
+    x = 2 * math.sin(angle)
+    y = 2 * math.cos(angle)
+    a = (middle + x, y)
+    b = (middle - x, -y)
     return quad(name, (*a, -2), (*b, -2), (*b, 2), (*a, 2))
 
 
 def across(name, angle, by=7.0, middle=4.0):
     """A wall that the light off such a square meets at right angles."""
     ahead = np.array([-math.cos(2 * angle), math.sin(2 * angle), 0])
-    aside, up = np.array([-ahead[1], ahead[0], 0]), np.array([0, 0, 1.0])
+    aside = np.array([-ahead[1], ahead[0], 0])
+    up = np.array([0, 0, 1.0])
     place = np.array([middle, 0, 0]) + by * ahead
     return quad(
         name, *(place + 0.3 * (a * aside + b * up) for a, b in ((-1, -1), (1, -1), (1, 1), (-1, 1)))
@@ -172,7 +175,8 @@ def road(wet, down_deg, backend="numpy", **options):
 @pytest.mark.parametrize("wet", [0.5, 1.0])
 @pytest.mark.parametrize("down_deg", [5, 20, 50])
 def test_a_wet_road_is_darker_and_mirrors(backend, wet, down_deg):
-    found, dry = road(wet, down_deg, backend), road(0.0, down_deg, backend)
+    found = road(wet, down_deg, backend)
+    dry = road(0.0, down_deg, backend)
     assert (dry["object"] == 0).all() and (dry["cause"] == 0).all()
     steep = np.array([math.sin(math.radians(down_deg))])
     darker = 1 - wet + wet * below_water(steep, np.full(1, 0.2))[0]
@@ -188,7 +192,8 @@ def test_a_wet_road_is_darker_and_mirrors(backend, wet, down_deg):
 
 
 def test_wet_roads_vanish_at_grazing_angles_before_dry_ones():
-    noise, counts = Noise(detection_range_m=60), []
+    noise = Noise(detection_range_m=60)
+    counts = []
     sensor = fan(-10, -1, 400)
     for wet in (0.0, 1.0):
         one = Survey(sensor, poses=[(0, 0, 2)], steps=1, wet=wet, noise=noise, columns=COLUMNS)

@@ -15,7 +15,8 @@ from lidarsim.scene.scene import Scene
 
 laspy = pytest.importorskip("laspy", reason="laspy is an extra")
 
-FOOT, US_FOOT = 0.3048, 12 / 39.37
+FOOT = 0.3048
+US_FOOT = 12 / 39.37
 EAST, NORTH = np.mgrid[300:304:40j, 200:203:30j].reshape(2, -1)
 PLACE = np.column_stack([EAST, NORTH, (EAST - 300) / 2 + 10])  # metres
 
@@ -28,7 +29,8 @@ PROJCS = (
     'PARAMETER["false_easting",984250],UNIT["%s",%s],AXIS["Easting",EAST],AXIS["Northing",NORTH]]'
 )
 VERT_CS = 'VERT_CS["NAVD88",VERT_DATUM["NAVD 1988",2005],UNIT["%s",%s],AXIS["Up",UP]]'
-US_UNIT, FOOT_UNIT = ("US survey foot", "0.304800609601219"), ("foot", "0.3048")
+US_UNIT = ("US survey foot", "0.304800609601219")
+FOOT_UNIT = ("foot", "0.3048")
 METRE_UNIT = ("metre", "1")
 WKT2 = (
     'COMPOUNDCRS["of two",PROJCRS["plane",BASEGEOGCRS["NAD83",DATUM["NAD83",ELLIPSOID["GRS 1980",'

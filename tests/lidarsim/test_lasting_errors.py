@@ -14,14 +14,16 @@ from lidarpool.scenario.scenario import Scenario
 from lidarsim.simulator.batch import columns_of
 from lidarsim.simulator.rig import Rig
 
-CHANNELS, TURNS = 100, 4
+CHANNELS = 100
+TURNS = 4
 SENSOR = Sensor.grid(40, CHANNELS, 20, step_deg=90, horizontal_fov_deg=40)
 WALL = Scene.from_meshes([wall("Wall", 30)])
 SURVEY = Survey(SENSOR, poses=[(0, 0, 0)], steps=TURNS, columns=["range", "time", "azimuth"])
 
 
 def cast(survey, size=10_000, backend="numpy"):
-    rig, stop = Rig(WALL, survey, backend, threads=1), survey.scan_count
+    rig = Rig(WALL, survey, backend, threads=1)
+    stop = survey.scan_count
     parts = [
         columns_of([*rig.cast(first, min(first + size, stop))]).columns
         for first in range(0, stop, size)

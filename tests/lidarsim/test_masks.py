@@ -90,8 +90,10 @@ def seen(scene, backend="numpy"):
 
 def check(scene, solid, stops, backend="numpy"):
     """Check that of the hits of a solid scene those remain where `stops(u, v)` says so."""
-    want, got = seen(solid, backend), seen(scene, backend)
-    u, v = (want[:, 1] + 2) / 4, (2 - want[:, 2]) / 4
+    want = seen(solid, backend)
+    got = seen(scene, backend)
+    u = (want[:, 1] + 2) / 4
+    v = (2 - want[:, 2]) / 4
     near = np.abs(np.column_stack([u, v]) * 24 % 1 - 0.5).max(axis=1) > 0.49  # of an edge
     kept = stops(u, v) | near
     left = stops(u, v) & ~near
@@ -159,12 +161,14 @@ def test_mirrored_instances_and_many_places(tmp_path, backend):
     scene = load(tmp_path / "m.glb", header, body)
     assert len(scene.instances.parts) == 1 and len(scene.instances) == 3
     solid = load(tmp_path / "m.glb", header, body, opacity="ignore")
-    want, got = seen(solid, backend), seen(scene, backend)
+    want = seen(solid, backend)
+    got = seen(scene, backend)
     assert set(want[:, 0].round(2)) == {4, 7}  # nearest of three, and beside it
     assert set(got[:, 0].round(2)) == {4, 5, 7}
     first = got[np.isclose(got[:, 0], 4)]
     inside = np.abs(np.column_stack([first[:, 1], first[:, 2]]) % 1 - 0.5).max(axis=1) < 0.49
-    u, v = (2 - first[inside, 1]) / 4, (2 - first[inside, 2]) / 4
+    u = (2 - first[inside, 1]) / 4
+    v = (2 - first[inside, 2]) / 4
     assert texel(u, v).all() and inside.sum() > 100
 
 

@@ -69,9 +69,11 @@ def test_formats_agree(tmp_path, two_objects, suffix):
     names = {"two"}
     source = mesh
     if suffix in (".glb", ".3mf"):
-        source, names = two_objects, {"Box A", "Ball"}
+        source = two_objects
+        names = {"Box A", "Ball"}
     if suffix == ".obj":
-        source, names = two_objects, {"box", "ball"}
+        source = two_objects
+        names = {"box", "ball"}
     path = write(tmp_path / f"two{suffix.upper()}", export(source, suffix))
     meshes = load_meshes(path, unit="m", up_axis="z")
     assert {mesh.name for mesh in meshes} == names
@@ -174,7 +176,8 @@ def test_cuts_and_damage_end_in_meshes_or_in_one_clear_line(tmp_path, two_object
     content = export(source, "_stl_ascii" if suffix == "ascii" else suffix)
     path = write(tmp_path / f"m{'.stl' if suffix == 'ascii' else suffix}", content)
     whole = sum(len(mesh.faces) for mesh in load_meshes(path))
-    size, rng = len(content), np.random.default_rng(7)
+    size = len(content)
+    rng = np.random.default_rng(7)
     cuts = {*np.linspace(0, size - 1, 25).astype(int).tolist(), *range(size - 8, size)}
     cut = [content[:at] for at in cuts]
     refused = []

@@ -23,12 +23,14 @@ def angles(directions):
 
 @pytest.mark.parametrize("name", READY)
 def test_every_model_makes_a_sensor(name):
-    model, sensor = read_model(name), load_sensor(name)
+    model = read_model(name)
+    sensor = load_sensor(name)
     name = f"{model.name}, typical pattern" if model.typical else model.name
     assert sensor.name == name and all(model.sources.values())
     assert model.range_m == (sensor.min_range_m, sensor.max_range_m)
     firings = np.arange(200_000, 200_500)
-    directions, times = sensor.directions(firings), sensor.times_ns(firings)
+    directions = sensor.directions(firings)
+    times = sensor.times_ns(firings)
     assert directions.shape == (500, sensor.channels, 3)
     assert np.abs((directions**2).sum(axis=-1) - 1).max() < 1e-14, "rays are not made again"
     assert (np.diff(sensor.beams.elevation) >= 0).all(), "channel 0 is the lowest"
@@ -85,7 +87,8 @@ def test_an_ouster_gives_the_points_of_its_own_look_up_table():
     }
     sensor = load_sensor("ouster/os1-32", columns=512)
     for (row, column), point in table.items():
-        firing, channel = np.array([column]), 31 - row
+        firing = np.array([column])
+        channel = 31 - row
         start = sensor.origins(firing)[0, channel]
         ours = start + sensor.directions(firing)[0, channel] * (20 - 0.015806)
         assert np.abs(ours - point).max() < 1e-9
@@ -95,7 +98,10 @@ def test_an_ouster_gives_the_points_of_its_own_look_up_table():
 
 def test_an_hdl64_has_beams_that_leave_beside_the_axis(tmp_path):
     """Points of a laser along the lines that Velodyne's driver computes, at two distances."""
-    vert, rot, up, left = -0.3966, 0.0726, 0.16, -0.026
+    vert = -0.3966
+    rot = 0.0726
+    up = 0.16
+    left = -0.026
     laser = {
         "laser_id": 0,
         "vert_correction": vert,
@@ -110,7 +116,8 @@ def test_an_hdl64_has_beams_that_leave_beside_the_axis(tmp_path):
     sensor = load_sensor(model, calibration=file)
     assert sensor.name == "One, unit.yaml"
     firing = np.array([40])
-    start, along = sensor.origins(firing)[0, 0], sensor.directions(firing)[0, 0]
+    start = sensor.origins(firing)[0, 0]
+    along = sensor.directions(firing)[0, 0]
     turned = np.radians(40) - rot
     for distance in (0.0, 30.0):
         level = distance * np.cos(vert) - up * np.sin(vert)
@@ -153,7 +160,8 @@ def test_a_prism_that_reflects_all_light_is_refused():
 
 
 def test_an_airborne_scanner_sweeps_across_below(tmp_path):
-    mirror, polygon = load_sensor("airborne/leica-als50-ii"), load_sensor("airborne/riegl-vq780i")
+    mirror = load_sensor("airborne/leica-als50-ii")
+    polygon = load_sensor("airborne/riegl-vq780i")
     x, y, z = mirror.directions(np.array([0, 1875, 3750, 937]))[:, 0].T
     assert np.allclose(x, 0) and (z < -0.9).all()
     assert np.allclose(np.degrees(np.arctan2(y, -z)), [-20, 20, -20, 0], atol=0.02)
@@ -192,7 +200,8 @@ def hesai(name="hesai/xt32", off=0.1, count=None):
 
 def test_a_calibration_finds_its_model(tmp_path):
     file = write(tmp_path, "pandar.csv", hesai())
-    sensor, nominal = load_sensor(calibration=file), load_sensor("hesai/xt32")
+    sensor = load_sensor(calibration=file)
+    nominal = load_sensor("hesai/xt32")
     assert sensor.name == "Hesai PandarXT-32, pandar.csv"
     assert np.allclose(np.degrees(sensor.beams.elevation - nominal.beams.elevation), 0.1)
     assert np.array_equal(sensor.beams.time_ns, nominal.beams.time_ns)
@@ -216,10 +225,14 @@ def test_ousters_metadata_old_and_new(tmp_path, new):
             "lidar_data_format": {"pixels_per_column": 3},
             "config_params": {"lidar_mode": "512x20"},
         }
-        columns, rate, origin = 512, 20, [0.0167, 0, 0.040195]
+        columns = 512
+        rate = 20
+        origin = [0.0167, 0, 0.040195]
     else:
         data = {**beams, "lidar_mode": "2048x10", "lidar_origin_to_beam_origin_mm": 15.806}
-        columns, rate, origin = 2048, 10, [0.015806, 0, 0.03618]
+        columns = 2048
+        rate = 10
+        origin = [0.015806, 0, 0.03618]
     sensor = load_sensor(calibration=write(tmp_path, "os.json", json.dumps(data)))
     assert sensor.channels == 2, "beams that are all zero are not there"
     assert (sensor.head.firings_per_turn, sensor.head.rate_hz) == (columns, rate)

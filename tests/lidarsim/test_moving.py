@@ -69,7 +69,8 @@ def test_raw_points_are_off_by_metres_and_deskewed_ones_on_the_wall(wall, model)
 def way(*steps, **options):
     """A trajectory of (seconds, x, y, z, yaw in degrees)."""
     seconds, x, y, z, yaw = np.array(steps, np.float64).T
-    half, zero = np.radians(yaw) / 2, np.zeros(len(yaw))
+    half = np.radians(yaw) / 2
+    zero = np.zeros(len(yaw))
     turns = np.stack([zero, zero, np.sin(half), np.cos(half)], axis=1)
     return Track(seconds, np.stack([x, y, z], axis=1), turns, **options)
 

@@ -75,7 +75,9 @@ def agrees(values, rate_hz, expected, spread=1.5):
     for size in (1, 8, 64, 512, 4096):
         found, count = allan(values, size)
         tau = size / rate_hz
-        pooled, terms = found.mean(), found.size * count  # three axes are independent
+        # three axes are independent
+        pooled = found.mean()
+        terms = found.size * count
         if terms < 30:
             continue
         assert abs(pooled / expected(tau, size) - 1) < 4.5 * np.sqrt(2 * spread / terms), size
@@ -120,7 +122,8 @@ def markov(sigma, time):
 
 
 def test_allan_variance_of_a_bias_that_wanders():
-    sigma, time = 5e-3, 10.0
+    sigma = 5e-3
+    time = 10.0
     imu = Imu(rate_hz=RATE, gyroscope_bias=sigma, gyroscope_bias_time_s=time)
     rates = joined(imu_samples(standing(16_000, imu=imu)), "rates")
     formula = markov(sigma, time)
@@ -157,7 +160,8 @@ def test_axes_have_constant_scales_and_angles():
     """Of many units: a rotation about z shows the scale of one gyroscope and two angles."""
     half = np.linspace(0, 0.5, 11)
     turns = np.stack([0 * half, 0 * half, np.sin(half), np.cos(half)], axis=1)
-    path, found = Track(np.linspace(0, 1, 11), np.zeros((11, 3)), turns), []
+    path = Track(np.linspace(0, 1, 11), np.zeros((11, 3)), turns)
+    found = []
     imu = Imu(rate_hz=10, scale=0.01, misalignment_deg=0.3)
     for seed in range(400):
         moving = Moving(Navigation(imu=imu, seed=seed), path, path.duration_ns)
@@ -182,7 +186,8 @@ def test_positions_drift_during_outages_and_return():
         runs = [standing(40, imu=imu, gnss=gnss, seed=seed) for seed in range(500)]
         errors = np.concatenate([joined(fixes(run), "positions") for run in runs], axis=1)
         t = np.clip(np.arange(81) / 2 - 10, 0, 15)
-        bias, walk = imu.accelerometer_bias, imu.accelerometer_noise_density
+        bias = imu.accelerometer_bias
+        walk = imu.accelerometer_noise_density
         expected = np.hypot(bias * t**2 / 2, walk * np.sqrt(t**3 / 3))
         expected *= np.exp(-np.clip(np.arange(81) / 2 - 25, 0, None))
         assert not errors[:21].any() and expected[50] > 1
@@ -222,13 +227,16 @@ def exponential(vector):
 
 @pytest.mark.parametrize("smooth", [False, True], ids=["linear", "smooth"])
 def test_dead_reckoning_finds_the_way_of_the_imu(smooth):
-    path, mount, rate = tumbling(smooth), Pose((1.0, -0.5, 0.3), 30, 20, 10), 400.0
+    path = tumbling(smooth)
+    mount = Pose((1.0, -0.5, 0.3), 30, 20, 10)
+    rate = 400.0
     survey = Moving(Navigation(imu=Imu(rate_hz=rate, mount=mount)), path, path.duration_ns)
     samples = list(imu_samples(survey))
     times = np.arange(len(joined(samples, "rates")) + 1) / rate * 1e9
     places, turns = path.poses(0, times)
     truth = places + turns @ np.array(mount.position)
-    here, place = turns[0] @ mount.rotation, truth[0]
+    here = turns[0] @ mount.rotation
+    place = truth[0]
     early, late = path.poses(0, np.array([0.0, 100.0]))
     speed = (early[1] - early[0] + (late[1] - late[0]) @ np.array(mount.position)) / 1e-7
     worst = 0.0
@@ -236,7 +244,8 @@ def test_dead_reckoning_finds_the_way_of_the_imu(smooth):
         zip(joined(samples, "rates"), joined(samples, "forces"), strict=True)
     ):
         change = (here @ exponential(rates / rate / 2) @ force - [0, 0, GRAVITY]) / rate
-        place, speed = place + (speed + change / 2) / rate, speed + change
+        place = place + (speed + change / 2) / rate
+        speed = speed + change
         here = here @ exponential(rates / rate)
         worst = max(worst, np.abs(place - truth[number + 1]).max())
     assert np.abs(here - turns[-1] @ mount.rotation).max() < 1e-10
@@ -260,10 +269,12 @@ def test_pieces_do_not_matter():
         accelerometer_noise_density=0.01, accelerometer_bias=0.1, accelerometer_random_walk=0.01,
     )  # fmt: skip
     gnss = Gnss(rate_hz=20, horizontal_m=1, drift_vertical_m=2, outages=[(2, 4), (5, 6)])
-    path, imu = tumbling(True), replace(imu, scale=1e-3, misalignment_deg=0.1)
+    path = tumbling(True)
+    imu = replace(imu, scale=1e-3, misalignment_deg=0.1)
     survey = Moving(Navigation(imu=imu, gnss=gnss, seed=9), path, path.duration_ns)
     for samples in (imu_samples, fixes):
-        whole, pieces = [*samples(survey)], [*samples(survey, 7)]
+        whole = [*samples(survey)]
+        pieces = [*samples(survey, 7)]
         assert len(pieces) > 10 * len(whole)
         for name in whole[0]._fields:
             assert joined(whole, name).tobytes() == joined(pieces, name).tobytes()

@@ -83,7 +83,9 @@ def everything():
 
 def test_no_random_number_is_used_twice(monkeypatch):
     """With three kinds of particles: keys that differ have hashes that differ."""
-    drawn, purposes, compiled_bits = {}, {}, compiled()(random_loops.bits.py_func)
+    drawn = {}
+    purposes = {}
+    compiled_bits = compiled()(random_loops.bits.py_func)
 
     def recorded(seed, purpose, *key):
         bits = raw(seed, purpose, *key)
@@ -146,7 +148,8 @@ def test_ranges_that_noise_moves_out_of_the_sensors_range_are_no_returns(keep_ev
     walls = Scene.from_meshes([wall("Far", 60.0), wall("Near", -0.7)])
     sensor = Sensor.grid(360, 1, 0, step_deg=360, min_range_m=0.5, max_range_m=60.1)
     unlimited = Sensor.grid(360, 1, 0, step_deg=360, min_range_m=0.0)
-    noise, options = Noise(0.3, seed=3), {"columns": ["range"], "keep_every": keep_every}
+    noise = Noise(0.3, seed=3)
+    options = {"columns": ["range"], "keep_every": keep_every}
     made = []
     for lidar in (unlimited, sensor):
         survey = Survey(lidar, poses=[(0, 0, 0)], steps=1, noise=noise, **options)

@@ -206,7 +206,8 @@ def test_a_shape_is_filled_wherever_its_outline_begins(name):
         vertices = placed(shape, turn=0.3)
         faces = cut(vertices)
         assert len(faces) == len(shape) - 2
-        whole, parts = area_vector(vertices), area_vectors(vertices, faces)
+        whole = area_vector(vertices)
+        parts = area_vectors(vertices, faces)
         np.testing.assert_allclose(parts.sum(axis=0), whole, atol=1e-12)
         # No triangle faces the other way, so that none lies outside of the outline.
         assert (parts @ whole > -1e-12).all()
@@ -245,7 +246,8 @@ def test_an_unusual_outline_is_filled(name):
     for direction, shift, scale in itertools.product((1, -1), (0.0, 5e6), (1e-6, 1, 1e6)):
         vertices = placed(shape[::direction])[:, [0, 2, 1]] * scale
         faces = cut(vertices + shift * scale)
-        whole, parts = area_vector(vertices), area_vectors(vertices, faces)
+        whole = area_vector(vertices)
+        parts = area_vectors(vertices, faces)
         np.testing.assert_allclose(np.linalg.norm(parts, axis=1).sum(), area * scale**2)
         assert (parts @ whole >= 0).all()
 

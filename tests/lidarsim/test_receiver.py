@@ -177,12 +177,14 @@ def test_walk_is_that_of_the_whole_pulse():
 
 def test_recorded_samples_are_clipped():
     options = {"columns": PULSES, "waveform_samples": 60, "materials": WHITE, "poses": [(0, 0, 0)]}
-    scene, beam = Scene.from_meshes([wall("W", 10)]), Returns(waveform="peaks")
+    scene = Scene.from_meshes([wall("W", 10)])
+    beam = Returns(waveform="peaks")
     survey = Survey(beam_along_x(), noise=FULL, returns=beam, steps=1, **options)
     part = columns_of(list(Rig(scene, survey, "numpy").cast(0, 1)))
     table = (SCAN, *(c for c in survey.stored_columns if c not in AXES and c.name != WAVEFORM))
     waves = part.cloud(table, survey.precision_m, np.zeros(3)).waveforms
-    samples, full_at = waves.samples[0], 50 * THRESHOLD
+    samples = waves.samples[0]
+    full_at = 50 * THRESHOLD
     assert samples.max() == pytest.approx(full_at, rel=1e-3)
     above = np.flatnonzero(samples > full_at / 2)
     assert abs(len(above) - width_ns(1 / full_at)) < 1.5, "samples are 1 ns apart"
@@ -288,7 +290,8 @@ def window(step_deg=0.1, half_deg=4.0, max_range_m=200.0):
 
 def off_square(ahead, x, half):
     """Angles in degrees between directions and the nearest point of a square across x."""
-    y, z = ahead[:, 1] / ahead[:, 0] * x, ahead[:, 2] / ahead[:, 0] * x
+    y = ahead[:, 1] / ahead[:, 0] * x
+    z = ahead[:, 2] / ahead[:, 0] * x
     off = np.full(len(ahead), np.inf)
     edge = np.linspace(-half, half, 401)
     for side in (-half, half):
@@ -355,7 +358,8 @@ def test_a_wall_as_far_away_as_the_sign_hides_the_stray_light():
 def test_instances_and_actors_bloom_like_meshes():
     noise = Noise(detection_range_m=FAR, stray_light=3e-6)
     sensor, _ = window()
-    here, ground = sign(), wall("W", -50)
+    here = sign()
+    ground = wall("W", -50)
     alone = SceneMesh("S", here.vertices - [20, 0, 0], here.faces)
     survey = Survey(
         sensor, [(0, 0, 0)], 1, noise=noise, materials=SIGN, columns=COLUMNS, keep_every=1
@@ -413,7 +417,8 @@ def ring(radius=30.0, sides=720):
     low = np.stack([np.cos(angle), np.sin(angle), np.full(sides + 1, -1)], axis=1)
     high = low * [1, 1, -1]
     vertices = np.concatenate([low, high]) * [radius, radius, 20.0]
-    a, b = np.arange(sides), np.arange(sides) + 1
+    a = np.arange(sides)
+    b = np.arange(sides) + 1
     faces = [np.stack([a, b, a + sides + 1], 1), np.stack([b, b + sides + 1, a + sides + 1], 1)]
     return SceneMesh("R", vertices, np.concatenate(faces))
 
@@ -450,14 +455,18 @@ def test_other_wavelengths_and_hidden_spots_are_not_seen():
 
 
 def test_counts_of_sensors_that_turn_against_each_other_are_those_of_all_pairs():
-    turns, f, g = 7, 20_000, 19_700
+    turns = 7
+    f = 20_000
+    g = 19_700
     one = spinning(firings=f)
     other = replace(spinning(), head=Spin(g, 360, 9.63, clockwise=True))
     found, rig, survey = two(one, other, [ring()], steps=turns)
     count = int((found["cause"] == CROSSTALK).sum())
     # All pairs of pulses: light of the other arrives while the receiver waits, from what it sees.
-    i, j = np.arange(f * turns), np.arange(g * turns)
-    fired, arrives = one.head.times_ns(i), other.head.times_ns(j) + 60 / 0.299792458
+    i = np.arange(f * turns)
+    j = np.arange(g * turns)
+    fired = one.head.times_ns(i)
+    arrives = other.head.times_ns(j) + 60 / 0.299792458
     first = np.searchsorted(arrives, fired)
     stop = np.searchsorted(arrives, fired + 300 / 0.299792458)
     row = np.repeat(i, stop - first)

@@ -26,7 +26,8 @@ def seen(reflectance, distance, maker="velodyne", *, retro=False, **options):
 
 @pytest.mark.parametrize("maker", SCALES)
 def test_scales_are_inverted_exactly(maker):
-    scale, codes = SCALES[maker], np.arange(256)
+    scale = SCALES[maker]
+    codes = np.arange(256)
     reflectances = scale.reflectances(codes)
     assert (np.diff(reflectances) > 0).all() and reflectances[0] == 0
     assert reflectances[-1] == pytest.approx(scale.most)

@@ -23,7 +23,10 @@ def ray(nadir_deg=90.0, **options):
 
 # -- a pool --------------------------------------------------------------------------------------
 
-HEIGHT, DEPTH, INDEX, LOSS = 4.0, 2.0, 1.33, 0.1
+HEIGHT = 4.0
+DEPTH = 2.0
+INDEX = 1.33
+LOSS = 0.1
 
 
 def pool(nadir_deg):
@@ -94,10 +97,8 @@ def test_the_surface_of_water_may_scatter_light_too():
 @pytest.mark.parametrize("surface", [SURFACE, box("Water", (-80, -80, -9), (80, 80, 0))])
 def test_a_sensor_under_water(surface):
     """It sees what is in the water n times as far, and above 48.8 degrees the floor mirrored."""
-    floor, wall = (
-        box("Floor", (-90, -90, -9), (90, 90, -4)),
-        box("Wall", (30, -90, 5), (31, 90, 90)),
-    )
+    floor = box("Floor", (-90, -90, -9), (90, 90, -4))
+    wall = box("Wall", (30, -90, 5), (31, 90, 90))
     materials = [Material("Water", **WATER), Material("*", 0.5)]
     found = cast([surface, floor], ray(0), (0, 0, -1), materials=materials)
     assert found["range"] == pytest.approx([1.33 * 3], abs=4e-4)
@@ -123,7 +124,8 @@ def test_a_sensor_under_water(surface):
 @pytest.mark.parametrize("turn_deg", [0.0, 40.0])
 def test_a_thick_pane_shifts_light_and_makes_the_way_longer(turn_deg, backend):
     """A pane of 0.2 m in front of a wall that is 60 m away."""
-    thick, angle = 0.2, math.radians(turn_deg)
+    thick = 0.2
+    angle = math.radians(turn_deg)
     within = math.asin(math.sin(angle) / 1.5)
     pane = trimesh.creation.box((thick, 18, 18))
     pane.apply_transform(trimesh.transformations.rotation_matrix(angle, (0, 0, 1)))
@@ -150,10 +152,8 @@ def test_a_thick_pane_shifts_light_and_makes_the_way_longer(turn_deg, backend):
 
 def test_water_in_a_tank_of_glass():
     """Glass within which there is water, from air to air: three indices."""
-    tank, water = (
-        box("Tank", (5, -3, -3), (9, 3, 3)),
-        box("Filling", (5.1, -2.9, -2.9), (8.9, 2.9, 2.9)),
-    )
+    tank = box("Tank", (5, -3, -3), (9, 3, 3))
+    water = box("Filling", (5.1, -2.9, -2.9), (8.9, 2.9, 2.9))
     wall = box("Wall", (20, -9, -9), (21, 9, 9))
     glass = Material("Tank", transparent="pass", refractive_index=1.5)
     materials = [Material("Filling", **WATER), glass, Material("*", 0.5)]

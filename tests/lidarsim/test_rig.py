@@ -72,7 +72,8 @@ def scene():
 
 
 def about_z(angle):
-    c, s = np.cos(angle), np.sin(angle)
+    c = np.cos(angle)
+    s = np.sin(angle)
     return np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
 
 
@@ -80,7 +81,9 @@ def rays_of_scan(survey, scan):
     """Origins, directions in the scene and in the sensor, and times of a scan's rays."""
     spec = survey.scan(scan)
     carried = survey.carried[spec.sensor]
-    head, beams, mount = carried.sensor.head, carried.sensor.beams, carried.mount
+    head = carried.sensor.head
+    beams = carried.sensor.beams
+    mount = carried.mount
     seat = np.eye(3) if mount.rotation is None else mount.rotation
     rows = []
     for firing in range(*spec.firings):

@@ -138,7 +138,8 @@ def test_sweeps_are_those_that_exporters_find():
 def test_another_start_is_another_time_on_the_same_trajectory(scene):
     scanner = Scanner(scene.with_actors([]), VLP16, columns=["time"], backend="numpy")
     later = replace(BEND, start_s=0.25, duration_s=None)
-    one, other = scanner.sweep(later, start_s=0.5, number=3), scanner.sweep(BEND, start_s=0.75)
+    one = scanner.sweep(later, start_s=0.5, number=3)
+    other = scanner.sweep(BEND, start_s=0.75)
     assert len(one) > 1000 and not np.array_equal(one.scan, other.scan)
     other = scanner.sweep(BEND, start_s=0.75, number=3)
     assert np.array_equal(one.positions, other.positions)
@@ -244,7 +245,8 @@ def test_poses_can_be_given_in_several_forms(scene):
     assert np.array_equal(scanner.ranges(places.tolist()), images)
     assert np.array_equal(scanner.ranges([Pose((0, 0, 1)), (1, -1, 2)]), images)
     matrix = np.eye(4)
-    matrix[:3, :3], matrix[:3, 3] = HERE.rotation, HERE.position
+    matrix[:3, :3] = HERE.rotation
+    matrix[:3, 3] = HERE.position
     assert np.array_equal(scanner.ranges(matrix[None]), scanner.ranges(HERE))
     assert same(scanner.sweep((0, 0, 1)), scanner.sweep(Pose((0, 0, 1))))
     assert scanner.ranges(np.empty((0, 3))).shape == (0, 120, 8)
@@ -266,7 +268,9 @@ def test_an_actor_stands_where_it_was_put(scene):
 @pytest.mark.parametrize("physics", [{}, PHYSICS], ids=["plain", "all effects"])
 def test_a_moved_actor_is_like_one_that_was_there_before(scene, physics):
     """In cast, normals, and energies."""
-    clouds, images, way = [], [], Track([0, 1], [[4, -3, 0], [5, 3, 0]])
+    clouds = []
+    images = []
+    way = Track([0, 1], [[4, -3, 0], [5, 3, 0]])
     for first in (CAR.trajectory, way):
         car = Actor(CAR.mesh, first)
         scanner = Scanner(
@@ -321,7 +325,8 @@ def with_copies(scene, crate=None, *grates):
 @pytest.mark.parametrize("backend", ["numpy", "embree"])
 @pytest.mark.parametrize("physics", [{}, PHYSICS], ids=["plain", "all effects"])
 def test_a_moved_copy_is_like_one_that_was_there_before(scene, physics, backend):
-    crate, grates = Pose((6, -2, 0.5), 70, 5), [Pose((-4, 3, 1), 20), Pose((-5, 3, 0), 5, 0, 30)]
+    crate = Pose((6, -2, 0.5), 70, 5)
+    grates = [Pose((-4, 3, 1), 20), Pose((-5, 3, 0), 5, 0, 30)]
     options = {"columns": COLUMNS, "backend": backend, **physics}
     moved = Scanner(with_copies(scene), GRID, **options)
     before = moved.sweep(HERE, number=2)  # fills what is kept
@@ -416,7 +421,9 @@ def test_positions_are_those_of_the_world_or_of_the_sensor(scene):
 class Mirrored:
     """A trajectory of a user, whose rotations mirror."""
 
-    stations, moves, duration_ns = 1, True, 1e9
+    stations = 1
+    moves = True
+    duration_ns = 1e9
 
     def pose(self, station, time_ns=0.0):
         return Pose((0, 0, 1))

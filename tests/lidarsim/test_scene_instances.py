@@ -129,7 +129,8 @@ def test_instances_and_their_copies_are_scanned_alike(placed, far, actor, physic
     mine, theirs = np.array(both).T
     alike = one["object"][mine] == other["object"][theirs]
     assert alike.mean() > 0.995
-    mine, theirs = mine[alike], theirs[alike]
+    mine = mine[alike]
+    theirs = theirs[alike]
     off = np.abs(one["range"][mine].astype(float) - other["range"][theirs])
     assert (off < 1e-5).mean() > 0.99 if "returns" in physics else (off < 1e-5).all()
     near = np.isclose(one["intensity"][mine], other["intensity"][theirs], rtol=1e-4)

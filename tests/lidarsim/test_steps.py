@@ -105,10 +105,12 @@ class Watched:
     """A step that is applied again, with other values in columns that it does not read."""
 
     def __init__(self, step):
-        self._step, self.role = step, step.role
+        self._step = step
+        self.role = step.role
 
     def apply(self, returns, batch):
-        step, before = self._step, (batch.hits, batch.planes, batch.air)
+        step = self._step
+        before = (batch.hits, batch.planes, batch.air)
         made = step.apply(returns, batch)
         after = batch.hits, batch.planes, batch.air
         new = {name for name, one in made._asdict().items() if one is not None}
@@ -125,7 +127,8 @@ class Watched:
             again = step.apply(changed, batch)
             batch.hits, batch.planes, batch.air = after
             for column in {*PulseReturns._fields} - {name}:
-                one, other = getattr(made, column), getattr(again, column)
+                one = getattr(made, column)
+                other = getattr(again, column)
                 assert same(one, other), (type(step), name, column)
         return made
 
@@ -148,7 +151,9 @@ def test_a_survey_without_effects_has_no_steps():
 
 # -- steps of other packages ----------------------------------------------------------------------
 
-ADDED_M, WALL_M, BEAMS = 0.5, 10.0, 8
+ADDED_M = 0.5
+WALL_M = 10.0
+BEAMS = 8
 SHOWN = "ray", "range", "intensity", "cause"
 
 
@@ -180,7 +185,8 @@ class Echo(Everywhere):
 
     def apply(self, returns, batch):
         rays = np.arange(batch.start, batch.stop)
-        distance, energy = np.full(len(rays), ADDED_M), np.full(len(rays), 0.125)
+        distance = np.full(len(rays), ADDED_M)
+        energy = np.full(len(rays), 0.125)
         return merged(returns, unreal(returns, rays, distance, energy, 2))
 
 

@@ -63,7 +63,8 @@ def test_another_process_may_see_the_same_place(storage):
 def test_a_file_is_whole_or_not_there(storage):
     """As long as it is written, nothing of it is seen under its name."""
     storage.prepare()
-    seen, done = set(), threading.Event()
+    seen = set()
+    done = threading.Event()
 
     def look():
         while not done.is_set():
@@ -91,7 +92,8 @@ def test_a_write_that_fails_leaves_nothing(tmp_path):
 
 
 def test_only_files_of_killed_writers_are_tidied_away(tmp_path):
-    outside, folder = tmp_path / "outside", tmp_path / "folder"
+    outside = tmp_path / "outside"
+    folder = tmp_path / "folder"
     left = ".lidarpool-tmp-a.bin-0a1b2c3d"
     theirs = [".tmp-a.bin", ".lidarpool-tmp-notes", f"{left}.bak", "a.bin"]
     for place in (outside, folder / "in"):
@@ -129,7 +131,8 @@ USES = {
 
 @pytest.mark.parametrize("use", [*USES])
 def test_nothing_goes_through_a_link_below_the_named_folder(use, tmp_path):
-    named, theirs = tmp_path / "named", tmp_path / "theirs"
+    named = tmp_path / "named"
+    theirs = tmp_path / "theirs"
     (theirs / "in").mkdir(parents=True)
     (theirs / "file").write_text("12")
     (tmp_path / "out").mkdir()
@@ -258,7 +261,8 @@ def test_a_file_of_another_storage_is_taken_or_copied(places, tmp_path, monkeypa
 
 
 def test_a_file_is_copied_where_there_are_no_links(tmp_path, monkeypatch):
-    source, target = Storage.at(tmp_path), Storage.at(tmp_path / "there")
+    source = Storage.at(tmp_path)
+    target = Storage.at(tmp_path / "there")
     source.write("a", b"new")
     target.prepare()
 

@@ -54,16 +54,20 @@ def test_a_track_is_at_its_poses_and_evenly_turned_between(smooth):
 
 def stopping():
     """A smooth way of uneven steps with two stops, one of which it turns at."""
-    times, places, turns = TIMES - TIMES[0], PLACES.copy(), TURNS.copy()
+    times = TIMES - TIMES[0]
+    places = PLACES.copy()
+    turns = TURNS.copy()
     places[4:6], turns[5], places[8:11] = places[4], turns[4], places[8]
     return Track(times, places, turns, smooth=True)
 
 
 def test_a_smooth_way_has_no_jumps_of_velocity_and_acceleration():
-    track, step = stopping(), 1e-6
+    track = stopping()
+    step = 1e-6
     at = track.times_s[1:-1, None] + step * np.array([-2, -1, 0, 1, 2])
     found = np.concatenate(velocities(track, 0, at.ravel() * 1e9), axis=1).reshape(*at.shape, 6)
-    before, after = (found[:, 2] - found[:, 0]) / 2, (found[:, 4] - found[:, 2]) / 2
+    before = (found[:, 2] - found[:, 0]) / 2
+    after = (found[:, 4] - found[:, 2]) / 2
     for part in (slice(3), slice(3, 6)):
         most = np.abs(before[..., part]).max()
         assert most > 30 * step
@@ -72,7 +76,8 @@ def test_a_smooth_way_has_no_jumps_of_velocity_and_acceleration():
 
 def test_between_equal_poses_a_smooth_carrier_stands_still():
     track = stopping()
-    poses, speeds = track.poses, track.velocities
+    poses = track.poses
+    speeds = track.velocities
     for first, last, turns in ((4, 5, False), (8, 10, True)):
         at = np.linspace(*track.times_s[[first, last]], 99) * 1e9
         places, rotations = poses(0, at)
@@ -223,7 +228,8 @@ class TestSurveys:
             self.track.poses(0, np.array([2e9]))
 
     def test_sensors_come_one_after_the_other_each_with_its_rate(self):
-        slow, fast = Sensor.grid(rate_hz=5), Sensor.grid(layers=16, rate_hz=20, step_deg=90)
+        slow = Sensor.grid(rate_hz=5)
+        fast = Sensor.grid(layers=16, rate_hz=20, step_deg=90)
         mount = Pose((1, 2, 0.5), yaw_deg=90)
         mounted = [Mounted(slow, name="slow"), Mounted(fast, mount, "fast")]
         survey = Survey(sensors=mounted, trajectory=self.track)
@@ -239,7 +245,8 @@ class TestSurveys:
         assert "sensor" in [column.name for column in survey.stored_columns]
 
     def test_stations_wait_for_the_slowest(self):
-        slow, fast = Sensor.grid(rate_hz=5), Sensor.grid(rate_hz=20)
+        slow = Sensor.grid(rate_hz=5)
+        fast = Sensor.grid(rate_hz=20)
         mounted = [Mounted(slow, name="slow"), Mounted(fast, name="fast")]
         survey = Survey(sensors=mounted, poses=[(0, 0, 1), (9, 0, 1)])
         starts = [survey.scan(k).start_ns for k in (0, 36, 72, 108)]
@@ -301,7 +308,8 @@ def test_each_sensor_may_start_later_and_take_steps_of_its_own():
     late = Mounted(Sensor(head=head, start_ns=2e9), name="late", steps=20)
     survey = Survey(trajectory=way, sensors=[Mounted(Sensor(head=head), name="all"), late])
     assert survey.steps_each == (1000, 20)
-    first, last = survey.scan(1000), survey.scan(1019)
+    first = survey.scan(1000)
+    last = survey.scan(1019)
     assert (first.sensor, first.firings, last.firings) == (1, (0, 10), (190, 200))
     assert survey.begins_ns(1000) == 2e9 and survey.begins_ns(1019) == pytest.approx(2.19e9)
     assert survey.pose(1000).position == pytest.approx((4, 0, 1))

@@ -10,10 +10,12 @@ from lidarpool.scenario.build import build
 from lidarpool.scenario.scenario import Scenario
 
 # Of x 0 to 10 m, z 1 m; the values of a case are those of both rows.
-HEAD, ROWS = "time_s,x,y,z", ("0,0,0,1", "1,10,0,1")
+HEAD = "time_s,x,y,z"
+ROWS = ("0,0,0,1", "1,10,0,1")
 TURN = Pose((0, 0, 1), yaw_deg=40, pitch_deg=5, roll_deg=-3)
 HALF = np.radians(40) / 2
-SINE, COSINE = np.sin(HALF), np.cos(HALF)
+SINE = np.sin(HALF)
+COSINE = np.cos(HALF)
 
 
 @pytest.fixture
@@ -212,7 +214,8 @@ def oxts(tmp_path):
 
 
 def test_oxts_of_kitti(oxts):
-    radius, scale = 6378137.0, np.cos(np.radians(49))
+    radius = 6378137.0
+    scale = np.cos(np.radians(49))
 
     def mercator(latitude, longitude):
         north = np.log(np.tan((90 + latitude) * np.pi / 360))

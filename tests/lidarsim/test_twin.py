@@ -48,7 +48,8 @@ def layers_of(rng, kind, ahead):
     """Surfaces that sub-rays meet: of each their ranges, NaN beyond its horizon, and normals."""
 
     def plane(steepest_deg, at=40.0):
-        angle, turn = math.radians(rng.uniform(0, steepest_deg)), rng.uniform(0, 2 * math.pi)
+        angle = math.radians(rng.uniform(0, steepest_deg))
+        turn = rng.uniform(0, 2 * math.pi)
         across = math.sin(angle) * np.array([math.cos(turn), math.sin(turn)])
         normal = np.array([-math.cos(angle), *across])
         along = ahead @ normal
@@ -71,16 +72,21 @@ def layers_of(rng, kind, ahead):
 
 def pulses_of(seed, each, airy=False, count=1000):
     """Pulses of so many sub-rays: {number: hits}; half may have some in the air."""
-    rng, surface = np.random.default_rng(seed), 0
+    rng = np.random.default_rng(seed)
+    surface = 0
     ahead = np.column_stack([np.ones(each), Beam.of(each, (0.02, 0.02)).angles])
     ahead /= np.linalg.norm(ahead, axis=1)[:, None]
     pulses = {}
     for pulse in range(count):
-        kind, drops = rng.choice(KINDS), airy and rng.random() < 0.5
-        layers, hits = layers_of(rng, kind, ahead), []
+        kind = rng.choice(KINDS)
+        drops = airy and rng.random() < 0.5
+        layers = layers_of(rng, kind, ahead)
+        hits = []
         for subray in range(each):
             for _ in range(rng.integers(0, 3) if drops else 0):
-                place, energy = rng.integers(8, 56) / 4, rng.integers(0, 9) / 8  # often equal
+                # often equal
+                place = rng.integers(8, 56) / 4
+                energy = rng.integers(0, 9) / 8
                 hits.append(Hit(subray, place, energy, None, velocity=rng.normal()))
             for far, normals in layers:
                 if not math.isnan(far[subray]) and rng.random() < 0.95:
@@ -134,7 +140,8 @@ def test_returns_are_those_of_the_twin(each, airy, planes):
     pulses = pulses_of(each, each, airy)
     hits, normals = columns_of(pulses, each)
     solid = hits.triangle != NO_SURFACE
-    ground, flies = hits.take(solid), hits.take(~solid)
+    ground = hits.take(solid)
+    flies = hits.take(~solid)
     given = tuple(one[solid] for one in normals) if planes else None
     air = flies._replace(cause=np.full(len(flies.ray), AIR)) if airy else None
     found = separated(ground, GAP, each, given, air)
@@ -151,13 +158,16 @@ def test_returns_are_those_of_the_twin(each, airy, planes):
 @pytest.mark.parametrize("full", [0.01, 0.1])
 def test_saturation_is_that_of_the_twin(full, waves):
     """Within 1e-9: logarithms round. Most pulses are clipped, and some returns joined."""
-    pulses, digitizer = pulses_of(30, 7, airy=True), Digitizer(2.0, 1.0, decomposes=False)
+    pulses = pulses_of(30, 7, airy=True)
+    digitizer = Digitizer(2.0, 1.0, decomposes=False)
     hits, planes = columns_of(pulses, 7)
     if waves:
-        returns, width_ns = returns_in(hits, digitizer, 7, planes), FWHM * digitizer.sigma_ns
+        returns = returns_in(hits, digitizer, 7, planes)
+        width_ns = FWHM * digitizer.sigma_ns
         given = {k: twin.waveform_returns(own, digitizer, 7, True) for k, own in pulses.items()}
     else:
-        solid, width_ns = hits.triangle != NO_SURFACE, 2 * GAP / LIGHT_M_NS
+        solid = hits.triangle != NO_SURFACE
+        width_ns = 2 * GAP / LIGHT_M_NS
         ground = tuple(one[solid] for one in planes)
         flies = hits.take(~solid)
         flies = flies._replace(cause=np.full(len(flies.ray), AIR))
@@ -177,12 +187,14 @@ def test_saturation_is_that_of_the_twin(full, waves):
 @pytest.mark.parametrize("losses", [{}, {"dropout": 0.2}, {"detection_range_m": 4.0}])
 def test_reported_returns_are_those_of_the_twin(mode, losses):
     """All columns to the bit; equally strong returns are among them."""
-    pulses, noise = pulses_of(2, 7), Noise(**losses, seed=5)
+    pulses = pulses_of(2, 7)
+    noise = Noise(**losses, seed=5)
     hits, planes = columns_of(pulses, 7)
     found = separated(hits, GAP, 7, planes, report=Report(mode, noise, KEYS, FIRST))
     expected = {}
     for pulse, own in pulses.items():
-        key, returns = key_of(FIRST + pulse), twin.separated(own, GAP, 7, True)
+        key = key_of(FIRST + pulse)
+        returns = twin.separated(own, GAP, 7, True)
         seen = [one for k, one in enumerate(returns) if twin.detected(one.energy, k, key, noise)]
         expected[FIRST + pulse] = twin.reported(seen, mode)
     counts = same_returns(found, expected)
@@ -199,8 +211,11 @@ def test_reported_returns_are_those_of_the_twin(mode, losses):
 )
 def test_noise_is_that_of_the_twin(noise, tolerance_m):
     """To the bit but for range walk, whose logarithm is the product's own."""
-    rng, ray, number = np.random.default_rng(4), np.arange(2000) // 4, np.arange(2000) % 4
-    distance, energy = rng.uniform(0.01, 200, 2000), 0.004 * 10 ** rng.uniform(-0.2, 0.2, 2000)
+    rng = np.random.default_rng(4)
+    ray = np.arange(2000) // 4
+    number = np.arange(2000) % 4
+    distance = rng.uniform(0.01, 200, 2000)
+    energy = 0.004 * 10 ** rng.uniform(-0.2, 0.2, 2000)
     assert noise.threshold == (0.1 * twin.energy_of(1, 50, 0) if noise.detection_range_m else 0)
     seen = detected(noise, energy, *KEYS.of(ray), number)
     ranges = noisy_ranges(noise, distance, energy, *KEYS.of(ray), number)
@@ -215,11 +230,15 @@ def test_noise_is_that_of_the_twin(noise, tolerance_m):
 def test_energies_are_those_of_the_twin(extinction):
     """For given cosines to the bit, but for the exponential; cosines within 1e-6."""
     rng = np.random.default_rng(6)
-    corners, materials = rng.normal(size=(2, 3, 3)), (Material("0", 0.3), RETRO)
+    corners = rng.normal(size=(2, 3, 3))
+    materials = (Material("0", 0.3), RETRO)
     meshes = [quad(f"{k}", a, b, c, c + a - b) for k, (a, b, c) in enumerate(corners)]
-    surfaces, light = Surfaces(Scene.from_meshes(meshes), materials), Light(905.0, extinction)
-    wall, distance = rng.integers(0, 2, 1000), rng.uniform(0.5, 200, 1000)
-    ahead, normals = rng.normal(size=(1000, 3)), np.cross(*np.diff(corners, axis=1).swapaxes(0, 1))
+    surfaces = Surfaces(Scene.from_meshes(meshes), materials)
+    light = Light(905.0, extinction)
+    wall = rng.integers(0, 2, 1000)
+    distance = rng.uniform(0.5, 200, 1000)
+    ahead = rng.normal(size=(1000, 3))
+    normals = np.cross(*np.diff(corners, axis=1).swapaxes(0, 1))
     ahead, normals = (v / np.linalg.norm(v, axis=1)[:, None] for v in (ahead, normals))
     triangle = (2 * wall + rng.integers(0, 2, 1000)).astype(np.int32)
     lit = surfaces.lit(triangle, ahead, distance, light, np.zeros(1000), ())
@@ -248,17 +267,23 @@ def test_what_the_air_returns_is_as_in_the_twin(weather, each):
     surfaces = Surfaces(scene, survey.materials)
     caster = WeatherStep(setup_of(scene, survey, 0), None, surfaces)
     # Sub-rays hit nothing, a wall, a pane, or a pane a metre before a wall.
-    rng, count = np.random.default_rng(7), 1500
-    what, place = rng.integers(0, 4, count * each), rng.uniform(1, 60, count * each)
+    rng = np.random.default_rng(7)
+    count = 1500
+    what = rng.integers(0, 4, count * each)
+    place = rng.uniform(1, 60, count * each)
     reach = np.where(what == 1, place, np.where(what == 3, place + 1, np.inf)).reshape(count, each)
     ray = np.repeat(np.arange(count * each), [0, 1, 1, 2] @ (what == np.arange(4)[:, None]))
     second = np.diff(ray, prepend=-1) == 0
     triangle = np.where((what[ray] == 1) | second, 0, 2).astype(np.int32)
     hits = PulseReturns(ray, place[ray] + second, triangle, np.ones(len(ray)))
     found = caster.sampled(hits, (FIRST, FIRST + count), KEYS, each)
-    air, cloud, expected = survey.air(0), caster._fog, []
+    air = survey.air(0)
+    cloud = caster._fog
+    expected = []
     for pulse in range(count):
-        own, key, drawn = reach[pulse].tolist(), key_of(FIRST + pulse), []
+        own = reach[pulse].tolist()
+        key = key_of(FIRST + pulse)
+        drawn = []
         for number, (kind, seen) in enumerate(zip(survey.particles, caster._kinds, strict=True)):
             given = noise.threshold, named_seed(9, "kind 1" if number else ""), key, own
             drawn += twin.particles(kind, air, *given, (seen.counts, seen.by_range[0]))
@@ -277,20 +302,26 @@ def test_what_the_air_returns_is_as_in_the_twin(weather, each):
 @pytest.mark.parametrize("each", [1, 7])
 def test_clumps_of_spray_are_those_of_the_twin(each):
     """Sub-rays and ranges to the bit, energies as those of drops; and what spray takes."""
-    rng, count, noise = np.random.default_rng(8), 300, Noise(detection_range_m=100.0, seed=9)
-    kind, air = spray(50.0), Air(0.0, 0.01, 0.003, 10.0)
+    rng = np.random.default_rng(8)
+    count = 300
+    noise = Noise(detection_range_m=100.0, seed=9)
+    kind = spray(50.0)
+    air = Air(0.0, 0.01, 0.003, 10.0)
     mean, tables = seen_by_range(air, kind, noise.threshold / 2, 0.5, 150.0)
     beam = np.sort(rng.integers(0, count, 500))
     low = rng.uniform(0, 30, 500)
     crossed = np.stack([low, low + rng.uniform(0, 4, 500), rng.uniform(0, 2, 500)])
     far = np.where(rng.random(count * each) < 0.5, rng.uniform(1, 40, count * each), np.inf)
     hits = np.flatnonzero(far < np.inf)
-    place, light = far[hits], np.ones(len(hits))
+    place = far[hits]
+    light = np.ones(len(hits))
     crossings = spray_loops.Crossings(beam, crossed)
     spray_loops.veil(crossings, each, 0.1, far, SampledHits(hits, place, light))
     begun = starts(9, SPRAY_DEPTH, SPRAY_SUBRAY, SPRAY_DIAMETER)
     keys = RandomKeys(begun, KEYS.scan, KEYS.begins, FIRST)
-    out, clumps, left = SampledHits(np.empty(4000, np.int64), *np.empty((2, 4000))), [], []
+    out = SampledHits(np.empty(4000, np.int64), *np.empty((2, 4000)))
+    clumps = []
+    left = []
     table = spray_loops.ClumpTables(mean, tables, 1 / kind.slope, exponential())
     stop, many = spray_loops.clumps(0, crossings, each, table, keys, far, out)
     assert stop == len(beam) and many > 300
@@ -324,7 +355,8 @@ def test_peaks_of_waveforms_are_those_of_the_twin(each, planes):
 @pytest.mark.parametrize("each", [1, 7, 19])
 def test_decomposition_gives_pulses_back(each):
     """Energies of pulses within a hundredth; narrow echoes 3 sigma from others within 1 mm."""
-    digitizer, compared = Digitizer(2.0, 1.0, decomposes=True), 0
+    digitizer = Digitizer(2.0, 1.0, decomposes=True)
+    compared = 0
     pulses = pulses_of(20 + each, each, airy=True, count=300)
     found = returns_in(columns_of(pulses, each)[0], digitizer, each)
     for pulse, own in pulses.items():

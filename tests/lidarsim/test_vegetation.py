@@ -96,10 +96,8 @@ def test_projections_of_known_leaves():
 @pytest.mark.parametrize("nadir_deg", [0.0, 50.0])
 def test_gaps_of_a_canopy_are_those_of_its_leaf_area_index(leaf_angle, nadir_deg):
     """Within 1 %: a layer of 3 m with 0.6 m²/m³, a leaf area index of 1.8."""
-    canopy, floor = (
-        box("Leaves", (-90, -90, 0), (90, 90, 3)),
-        box("F", (-99, -99, -2), (99, 99, -1)),
-    )
+    canopy = box("Leaves", (-90, -90, 0), (90, 90, 3))
+    floor = box("F", (-99, -99, -2), (99, 99, -1))
     materials = [Material("Leaves", leaf_area_density=0.6, leaf_angle=leaf_angle), GROUND]
     found = cast([canopy, floor], rays(nadir_deg=nadir_deg), (0.3, 0.1, 10), materials=materials)
     cosine = math.cos(math.radians(nadir_deg))
@@ -113,7 +111,8 @@ def test_gaps_of_a_canopy_are_those_of_its_leaf_area_index(leaf_angle, nadir_deg
 
 
 def test_leaves_are_as_bright_as_they_face_the_light():
-    canopy, floor = box("Leaves", (-9, -9, 0), (9, 9, 3)), box("F", (-9, -9, -2), (9, 9, -1))
+    canopy = box("Leaves", (-9, -9, 0), (9, 9, 3))
+    floor = box("F", (-9, -9, -2), (9, 9, -1))
     leaves = Material("Leaves", 0.5, leaf_area_density=1.0, leaf_angle="planophile")
     found = cast([canopy, floor], rays(2000, 0.0), (0, 0, 10), materials=[leaves, GROUND])
     on = found["object"] == 0
@@ -133,7 +132,8 @@ def test_leaves_are_as_bright_as_they_face_the_light():
 
 def test_moved_and_turned_crowns_hold_the_same_leaves():
     """Instances, mirrored ones too, and actors; and meshes whose triangles wind inwards."""
-    crown, wall = ball("Crown", 1.0), box("Wall", (9, -9, -9), (10, 9, 9))
+    crown = ball("Crown", 1.0)
+    wall = box("Wall", (9, -9, -9), (10, 9, 9))
     materials = [Material("Crown", leaf_area_density=0.8), GROUND]
     inwards = SceneMesh("Crown", crown.vertices * 2 + (4, 0, 0), crown.faces[:, ::-1])
     mirrored = np.diag([2.0, -2, 2, 1])
@@ -217,12 +217,17 @@ def test_a_wood_of_crowns_that_overlap_anyhow():
     """From within and outside, gaps are those of the chords of all ellipsoids, added up."""
     rng = np.random.default_rng(3)
     unit = trimesh.creation.icosphere(4, 1.0007)  # of the volume of the sphere
-    kinds, meshes, materials, crowns = ("spherical", "planophile", 0.5), [], [], []
+    kinds = ("spherical", "planophile", 0.5)
+    meshes = []
+    materials = []
+    crowns = []
     for number in range(24):
-        centre, radii = rng.uniform(-5, 5, 3), rng.uniform(0.8, 3, 3)
+        centre = rng.uniform(-5, 5, 3)
+        radii = rng.uniform(0.8, 3, 3)
         inwards = np.array(unit.faces)[:, :: -1 if number % 4 == 0 else 1]
         meshes.append(SceneMesh(f"C{number}", np.array(unit.vertices) * radii + centre, inwards))
-        thick, kind = float(rng.uniform(0.05, 0.4)), kinds[number % 3]
+        thick = float(rng.uniform(0.05, 0.4))
+        kind = kinds[number % 3]
         materials.append(Material(f"C{number}", leaf_area_density=thick, leaf_angle=kind))
         crowns.append((centre, radii, thick, kind))
     meshes.append(ball("Sky", 60.0, fineness=2))
@@ -231,12 +236,16 @@ def test_a_wood_of_crowns_that_overlap_anyhow():
     survey = Survey(sensor, poses=places.tolist(), steps=1, materials=[*materials, Material("*")])
     rig = Rig(Scene.from_meshes(meshes), survey, CPU[-1])
     ahead = sensor.directions(np.arange(100)).reshape(-1, 3)
-    off, variance = 0.0, 0.0
+    off = 0.0
+    variance = 0.0
     for place, batch in zip(places, rig.cast(0, 8), strict=True):
         tau = np.zeros(len(ahead))
         for centre, radii, thick, kind in crowns:
-            start, way = (place - centre) / radii, ahead / radii
-            a, b, c = (way**2).sum(axis=1), way @ start, start @ start - 1
+            start = (place - centre) / radii
+            way = ahead / radii
+            a = (way**2).sum(axis=1)
+            b = way @ start
+            c = start @ start - 1
             root = np.sqrt(np.maximum(b * b - a * c, 0))
             chord = np.maximum((root - b) / a, 0) - np.maximum((-root - b) / a, 0)
             tau += projection(kind, np.abs(ahead[:, 2])) * thick * chord

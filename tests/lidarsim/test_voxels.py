@@ -207,7 +207,8 @@ def test_gaps_and_depths_of_layers_follow_beer_and_lambert(tmp_path, backend):
     mesh = tree(tmp_path / "T.vox", density, low=(-20, -20, 0))
     floor = box("Floor", (-99, -99, -2), (99, 99, -1))
     materials = [Material("T", leaf_angle="erectophile"), GROUND]
-    sensor, slant = rays(nadir_deg=40.0), 1 / math.cos(math.radians(40))
+    sensor = rays(nadir_deg=40.0)
+    slant = 1 / math.cos(math.radians(40))
     found = cast([mesh, floor], sensor, (-5, 0.02, 10), backend=backend, materials=materials)
     crossing = projection("erectophile", np.array([1 / slant]))[0] * slant
     assert (found["object"] == 1).mean() == pytest.approx(
@@ -228,11 +229,13 @@ def test_random_grids_stop_what_the_integral_says(tmp_path):
     """From outside and within, in all directions: the mean gap within three standard deviations."""
     draw = np.random.default_rng(4)
     density = draw.uniform(0, 0.6, (7, 5, 6)) * (draw.random((7, 5, 6)) < 0.5)
-    low, size = np.array([-3.0, -2.0, -1.0]), 0.8
+    low = np.array([-3.0, -2.0, -1.0])
+    size = 0.8
     mesh = tree(tmp_path / "T.vox", density, low=low, size=size, skip=(0,))
     sensor = Sensor(Beams(np.radians(np.linspace(-70, 70, 12))), Spin(25, 360))
     ahead = sensor.directions(np.arange(25)).reshape(-1, 3)
-    off, variance = 0.0, 0.0
+    off = 0.0
+    variance = 0.0
     for place in [(-6.0, 0.3, 0.7), (0.31, 0.2, 1.3), (1.0, 0.0, 6.0)]:
         tau = optical_depth(density, low, size, np.array(place), ahead, steps=20_000, reach=20)
         survey = Survey(sensor, poses=[place] * 40, steps=1, materials=[GROUND])
@@ -277,7 +280,9 @@ def test_crowns_and_grids_that_overlap_add_up(tmp_path):
     wall = box("Wall", (20, -9, -9), (21, 9, 9))
     materials = [Material("Ivy", leaf_area_density=0.4), GROUND]
     found = cast([one, two, ivy, wall], rays(), AT, materials=materials)
-    before, among, behind = 0.1 * 2, 0.6 * 2, 0.3 * 2
+    before = 0.1 * 2
+    among = 0.6 * 2
+    behind = 0.3 * 2
     stop = math.exp(-before) * (1 - math.exp(-among))
     shares = (found["object"][:, None] == np.arange(4)).mean(axis=0)
     assert shares[0] == pytest.approx(1 - math.exp(-before) + stop / 6, rel=0.03)
@@ -290,7 +295,8 @@ def test_crowns_and_grids_that_overlap_add_up(tmp_path):
 # -- the same bits -------------------------------------------------------------------------------
 
 
-STANDS, MOVES = {"poses": [Pose((0, 0, 1), 10, 5, -3), (4, 0, 1)]}, {"trajectory": Cart()}
+STANDS = {"poses": [Pose((0, 0, 1), 10, 5, -3), (4, 0, 1)]}
+MOVES = {"trajectory": Cart()}
 
 
 @pytest.mark.parametrize("path", quick((MOVES,), (STANDS, MOVES)))

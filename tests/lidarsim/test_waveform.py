@@ -78,7 +78,8 @@ def test_a_weak_echo_beside_a_strong_one_is_given_back(apart, weak):
 def test_hits_close_together_are_one_echo_in_closed_form():
     for decomposes in (False, True):
         place, energy, width = found(0.2, decomposes)
-        mean, share = 0.2 * 1.4 / 3.4, 2 * 1.4 / 3.4**2
+        mean = 0.2 * 1.4 / 3.4
+        share = 2 * 1.4 / 3.4**2
         assert place == pytest.approx([mean])
         assert energy == pytest.approx([3.4])
         assert width == pytest.approx([5 * math.sqrt(1 + share * 0.2**2)])
@@ -90,7 +91,8 @@ def test_hits_close_together_are_one_echo_in_closed_form():
 def tilted(degrees):
     """A wall across x, 20 m away, turned about z."""
     a = math.radians(degrees)
-    across, up = np.array([-math.sin(a), math.cos(a), 0]), np.array([0, 0, 1.0])
+    across = np.array([-math.sin(a), math.cos(a), 0])
+    up = np.array([0, 0, 1.0])
     middle = np.array([20.0, 0, 0])
     corners = [
         middle + s * 30 * across + t * 30 * up for s, t in ((-1, -1), (1, -1), (1, 1), (-1, 1))
@@ -300,12 +302,14 @@ def test_las_files_hold_waveforms_that_lead_to_the_points(tmp_path, ending):
     told = {
         vlr.record_id - 99: vlr.parsed_record for vlr in las.header.vlrs.get("WaveformPacketVlr")
     }
-    waves, several = cloud.waveforms, 0
+    waves = cloud.waveforms
+    several = 0
     for row in range(0, len(cloud), 7):
         kind = told[las.wavepacket_index[row]]
         assert (kind.bits_per_sample, kind.number_of_samples) == (16, 48)
         assert kind.temporal_sample_spacing == 1000
-        offset, size = las.wavepacket_offset[row], las.wavepacket_size[row]
+        offset = las.wavepacket_offset[row]
+        size = las.wavepacket_size[row]
         raw = np.frombuffer(data, "<u2", 48, start + offset)
         assert size == 96
         samples = kind.digitizer_offset + kind.digitizer_gain * raw.astype(float)

@@ -176,7 +176,8 @@ def saturated(returns: list[Return], full: float, pulse_m: float, waves: bool) -
     for last, one in enumerate(returns):
         usual = one.width * pulse_m / 2
         half = usual * math.sqrt(1 + math.log2(max(heights[last] / full, 1)))
-        front, back = one.distance - half, one.distance + half
+        front = one.distance - half
+        back = one.distance + half
         before = [*left][::-1]
         left[last] = replace(one, distance=front + usual) if waves else one, front, back
         for j in before:
@@ -186,7 +187,8 @@ def saturated(returns: list[Return], full: float, pulse_m: float, waves: bool) -
             (whole, front, back), (more, nearer, farther) = left[high], left.pop(low)
             if heights[low] > full:
                 whole = replace(whole, distance=min(whole.distance, more.distance))
-                front, back = min(front, nearer), max(back, farther)
+                front = min(front, nearer)
+                back = max(back, farther)
             left[high] = replace(whole, energy=whole.energy + more.energy), front, back
             last = high
     return [
@@ -341,16 +343,20 @@ def sampled(hits: list[Hit], sigma: float, per_m: float, subrays: int) -> tuple[
 
 def peaks(begin: int, wave: list[float], sigma: float) -> list[Echo]:
     """Find maxima, of a hundredth of the highest at least, by Gaussians through three samples."""
-    end, least = len(wave), max(wave) / 100
+    end = len(wave)
+    least = max(wave) / 100
     tops = [s for s in range(1, end - 1) if wave[s - 1] < wave[s] >= max(wave[s + 1], least)]
     lows = [min(range(a + 1, b), key=wave.__getitem__) for a, b in pairwise([*tops, end])]
     found = []
     for at, before, low in zip(tops, [-1, *lows], lows, strict=False):
-        height, beside = wave[at], 0.0
+        height = wave[at]
+        beside = 0.0
         if wave[at - 1] > 0 and wave[at + 1] > 0:  # the parabola through their logarithms
             left, here, right = (math.log(one) for one in wave[at - 1 : at + 2])
-            curve, slope = left - 2 * here + right, (right - left) / 2
-            beside, height = -slope / curve, math.exp(here - slope * slope / (2 * curve))
+            curve = left - 2 * here + right
+            slope = (right - left) / 2
+            beside = -slope / curve
+            height = math.exp(here - slope * slope / (2 * curve))
         # The area between the lowest samples to both sides.
         energy = total(wave[before + 1 : low + 1]) / (sigma * ROOT)
         found.append((begin + low, begin + at + beside, energy, energy / height))
@@ -365,9 +371,11 @@ def waveform_returns(
     Hits within a quarter of a standard deviation are one echo with their mean and variance, and so
     are those of one surface; echoes are searched for among others.
     """
-    sigma, sigma_m = digitizer.sigma, digitizer.sigma_ns * LIGHT_M_NS / 2
+    sigma = digitizer.sigma
+    sigma_m = digitizer.sigma_ns * LIGHT_M_NS / 2
     per_m = 2 / LIGHT_M_NS / digitizer.sample_ns
-    planes, found = planes and subrays > 1, []
+    planes = planes and subrays > 1
+    found = []
     hits = sorted((hit for hit in hits if hit.energy > 0), key=lambda hit: hit.distance)
     begins = apart(hits, 10 * sigma_m)
     groups = divided(hits, begins)
@@ -386,7 +394,8 @@ def waveform_returns(
     if planes:
         begins -= bridged(hits, sigma_m, subrays)
     for group in divided(hits, begins):
-        one, echo = one_return(group, subrays), echo_of.get(group[0])
+        one = one_return(group, subrays)
+        echo = echo_of.get(group[0])
         squares = (hit.energy * ((hit.distance - one.distance) / sigma_m) ** 2 for hit in group)
         width = math.sqrt(1 + total(squares) / (one.energy * subrays))
         if echo is not None and echo is echo_of.get(group[-1]):  # it belongs to no other surface

@@ -70,12 +70,11 @@ def test_what_masks_leave_is_drawn(repeats):
     corners = np.array([[0.0, 0, 0], [2, 0, 0], [2, 1, 0], [0, 1, 0]])
     faces = np.array([[0, 1, 2], [0, 2, 3]])
     uv = (corners[faces, :2] / [2, 1] * repeats).astype(np.float32)
-    wall, card = (
-        SceneMesh("Wall", corners, faces),
-        SceneMesh("Card", corners, faces, (Cutout(mask, uv),)),
-    )
+    wall = SceneMesh("Wall", corners, faces)
+    card = SceneMesh("Card", corners, faces, (Cutout(mask, uv),))
     scene = Scene.from_meshes([wall, card])
-    drawn, before = Drawn.of(cut(scene)), Drawn.of(scene)
+    drawn = Drawn.of(cut(scene))
+    before = Drawn.of(scene)
     own = drawn.scene.faces[drawn.scene.face_object == 1]
     a, b, c = drawn.scene.vertices[own].transpose(1, 0, 2)
     areas = np.cross(b - a, c - a) / 2
@@ -107,7 +106,8 @@ def test_what_is_wide_is_cut_and_what_stands_outside_is_left_out():
         block("other hut", (4, 4, 3), (100, 10, 1.5)),
     ])  # fmt: skip
     cut = ShownPart.whole(scene).cut(np.array([[-30.0, -20, 0], [30, 20, 27]]))
-    part, shares = cut.scene, cut.shares
+    part = cut.scene
+    shares = cut.shares
     there = {scene.names[k] for k in np.unique(part.face_object)}
     assert there == {"ground", "tower", "hut"}
     assert part.bounds == pytest.approx(np.array([[-30, -20, 0], [30, 20, 27]]))

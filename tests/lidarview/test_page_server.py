@@ -37,7 +37,8 @@ class Secrets:
 
     def __init__(self):
         self.ordered = []
-        self.asked, self.abandoned = threading.Event(), threading.Event()
+        self.asked = threading.Event()
+        self.abandoned = threading.Event()
 
     def answer(self, what, asked, abandoned):
         if what == "slow":
@@ -162,7 +163,8 @@ class Large:
     """A source of points: each answer waits for `ready`, and has 40 MB."""
 
     def __init__(self):
-        self.ready, self._lock = threading.Event(), threading.Lock()
+        self.ready = threading.Event()
+        self._lock = threading.Lock()
         self.now = self.most = 0  # answers that are being made, and most at a time
 
     def answer(self, what, asked, abandoned):

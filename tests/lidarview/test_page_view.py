@@ -132,7 +132,8 @@ def seen(scene, places, moves=False):
     way = SensorPositions(
         np.linspace(0, 2e9, len(places)), np.array(places, float), moves, "", "VLP-16"
     )
-    hits, rays = np.zeros(scene.triangles, np.int64), np.zeros((0, 2, 3), np.float32)
+    hits = np.zeros(scene.triangles, np.int64)
+    rays = np.zeros((0, 2, 3), np.float32)
     return PictureContent(scene, [way], hits, rays, duration_ns=2e9)
 
 
@@ -140,7 +141,8 @@ def seen(scene, places, moves=False):
 def cloud(tmp_path):
     """Return a file of 10,000 points on the room's walls and ceiling."""
     local = np.random.default_rng(0).uniform((0, 0, 0), (6, 8, 3), (10_000, 3))
-    local[::2, 0], local[1::2, 2] = 0.0, 3.0
+    local[::2, 0] = 0.0
+    local[1::2, 2] = 3.0
     return write(tmp_path / "cloud.ply", local + ORIGIN)
 
 
@@ -183,7 +185,9 @@ def test_colours_are_those_of_the_legend_whatever_is_shown(cloud, pictured):
 
 def test_points_are_shown_in_their_own_colours(tmp_path):
     rows = np.zeros(300, [*((a, "<f8") for a in "xyz"), *((c, "|u1") for c in ("red", "green"))])
-    rows["x"], rows["red"], rows["green"] = np.arange(300), np.arange(300) % 256, 9
+    rows["x"] = np.arange(300)
+    rows["red"] = np.arange(300) % 256
+    rows["green"] = 9
     path = tmp_path / "cloud.ply"
     path.write_bytes(header(rows.dtype, 300) + rows.tobytes())
     assert "rgb" not in told(open_result(path), "state")[0]["colours"], "blue is missing"
@@ -256,7 +260,8 @@ def sweeping(path, sweeps):
     """Write a cloud of each sweep's number as its points' x, ten points a sweep."""
     scans = np.repeat(sweeps.scans[:-1], 10)
     rows = np.zeros(len(scans), row_type(np.dtype(np.float32), (SCAN, CHANNEL, OBJECT)))
-    rows["scan"], rows["ring"] = scans, np.tile(np.arange(10) % 8, len(sweeps))
+    rows["scan"] = scans
+    rows["ring"] = np.tile(np.arange(10) % 8, len(sweeps))
     rows["x"] = np.repeat(np.arange(len(sweeps)), 10) + 2
     path.write_bytes(header(rows.dtype, len(rows)) + rows.tobytes())
 
@@ -298,9 +303,10 @@ def test_several_results_are_one_view_with_a_colour_each_and_are_played_together
     one = open_result(both[0])
     assert len(view.points) == 2 * len(one.points)
     for asked in ({}, {"scans": "0-3,40-44"}, {"filter": "x,3,3"}):
-        of_one, of_both = places(one, **asked), places(view, **asked)
+        of_one = places(one, **asked)
+        of_both = places(view, **asked)
         assert sorted(of_both.tolist()) == sorted(2 * of_one.tolist()), asked
-        (last,) = (f"{asked.get('filter', 'x,-9,9')};result,1,1",)
+        last = f"{asked.get('filter', 'x,-9,9')};result,1,1"
         assert places(view, **(asked | {"filter": last})).tolist() == of_one.tolist(), asked
     rows = told(view, "points", colour="scan", most=ALL)[1]["rows"]
     again = [one.points.values("scan", slice(None))] * 2
@@ -362,7 +368,8 @@ def test_a_range_image_has_channels_from_above_and_azimuth_from_left_to_right():
     turn = np.radians(np.arange(180, -180, -1.0))
     ring = np.stack([np.cos(turn), np.sin(turn), 0 * turn], axis=1)
     spots = np.concatenate([5 * ring, 9 * ring + [0, 0, 1]])
-    away, channels = np.linalg.norm(spots, axis=1), np.repeat([0, 7], 360)
+    away = np.linalg.norm(spots, axis=1)
+    channels = np.repeat([0, 7], 360)
     image = range_image(spots, away, channels, (5.0, 9.0))
     assert image.shape[0] == 8 and 300 < image.shape[1] <= 432
     assert (image[[0, 7], :, 3] > 0).mean() > 0.8
@@ -402,7 +409,10 @@ def test_columns_of_other_programs_can_be_coloured_and_filtered_by(tmp_path):
     """A cloud without scans, far from zero, with columns of one value or none."""
     rows = np.zeros(20, [*((a, "<f8") for a in "xyz"), ("their", "<f4"), ("2-a", "|u1"),
                          ("nothing", "<f4"), ("big", "<f8")])  # fmt: skip
-    rows["x"], rows["nothing"], rows["big"], rows["their"] = 5e6, np.nan, 1e18, np.arange(20)
+    rows["x"] = 5e6
+    rows["nothing"] = np.nan
+    rows["big"] = 1e18
+    rows["their"] = np.arange(20)
     lines = [*(f"property double {a}" for a in "xyz"), "property float their", "property uchar 2-a",
              "property float nothing", "property double big"]  # fmt: skip
     head = ["ply", "format binary_little_endian 1.0", "element vertex 20", *lines, "end_header", ""]
@@ -424,7 +434,8 @@ def test_columns_of_other_programs_can_be_coloured_and_filtered_by(tmp_path):
 def test_causes_and_no_surface_are_told_in_words(tmp_path, pictured):
     row = row_type(np.dtype(np.float64), (SCAN, CHANNEL, OBJECT, TABLE["cause"]))
     rows = np.zeros(6, row)
-    rows["object"], rows["cause"] = np.arange(6) % 2 - 1, 1 - np.arange(6) % 2
+    rows["object"] = np.arange(6) % 2 - 1
+    rows["cause"] = 1 - np.arange(6) % 2
     (tmp_path / "air.ply").write_bytes(header(row, 6) + rows.tobytes())
     file = CloudFile(tmp_path / "air.ply")
     for view in (View(file, pictured), open_result(tmp_path / "air.ply")):
@@ -471,7 +482,8 @@ def test_many_triangles_become_few_that_keep_shape_and_hits():
     assert np.allclose(corners.max(axis=0), scene.vertices.max(axis=0), atol=0.5)
     first = scene.face_object == 0  # of six objects, far from each other
     arrays, legend = surface.coloured("hits", np.where(first, 3, 0), NOWHERE)
-    corners, colours = arrays["corners"], arrays["colours"]
+    corners = arrays["corners"]
+    colours = arrays["colours"]
     middles = corners.mean(axis=1)
     low, high = scene.object_bounds[0]
     there = ((middles > low - 1) & (middles < high + 1)).all(axis=1)
@@ -543,13 +555,15 @@ ALL_ROWS = slice(None)
 def along_y(y=0.0, parallel=False):
     """Return a camera at (0, y, 0) that looks along y, 90° high and twice as wide; z is up."""
     view = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, y], [0, 0, 0, 1]])
-    near, far = 0.1, 1000.0
+    near = 0.1
+    far = 1000.0
     if parallel:  # 10 metres high
         lens = np.diag([1 / 10, 1 / 5, -2 / (far - near), 1.0])
         lens[2, 3] = -(far + near) / (far - near)
     else:
         lens = np.diag([0.5, 1.0, -(far + near) / (far - near), 0.0])
-        lens[2, 3], lens[3, 2] = -2 * far * near / (far - near), -1.0
+        lens[2, 3] = -2 * far * near / (far - near)
+        lens[3, 2] = -1.0
     columns = (lens @ view).T.ravel()
     return Eye.read(",".join(map(repr, columns.tolist())))
 
@@ -607,7 +621,10 @@ class Read:
     """A file that notes the blocks that are read of it."""
 
     def __init__(self, file):
-        self._file, self.table, self.rows_of, self.blocks = file, file.table, file.rows_of, set()
+        self._file = file
+        self.table = file.table
+        self.rows_of = file.rows_of
+        self.blocks = set()
 
     def __len__(self):
         return len(self._file)

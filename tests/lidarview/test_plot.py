@@ -217,7 +217,8 @@ def test_folders_that_cannot_be_used(result, tmp_path):
 
 
 def test_a_picture_takes_the_place_of_a_link(tmp_path):
-    theirs, link = tmp_path / "theirs.png", tmp_path / "cloud.png"
+    theirs = tmp_path / "theirs.png"
+    link = tmp_path / "cloud.png"
     theirs.write_bytes(b"of another")
     link.symlink_to(theirs)
     Page((300, 200)).save(link)
@@ -225,8 +226,10 @@ def test_a_picture_takes_the_place_of_a_link(tmp_path):
 
 
 def test_intensity_and_true_colour_are_drawn(unplanned, tmp_path):
-    result, at = make(tmp_path / "result", unplanned), unplanned.scene.vertices
-    zeros, byte = np.zeros(len(at), np.int32), np.full(len(at), 200, np.uint8)
+    result = make(tmp_path / "result", unplanned)
+    at = unplanned.scene.vertices
+    zeros = np.zeros(len(at), np.int32)
+    byte = np.full(len(at), 200, np.uint8)
     columns = dict.fromkeys(("scan", "channel", "object"), zeros)
     columns |= {"intensity": zeros + 1.0, "red": byte, "green": byte}
     save_cloud(Cloud(at, columns), result / "cloud.ply")

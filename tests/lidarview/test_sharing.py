@@ -27,7 +27,8 @@ from lidarview.render.theme import rgb
 from lidarview.viewer.sharing import film_of, page_of, share
 from lidarview.viewer.view import open_result
 
-COUNT, SCANS = 3600, 360
+COUNT = 3600
+SCANS = 360
 RED = np.array([1.0, 0.0, 0.0, 1.0])
 FLOOR = np.array([[[-50, -50, 0], [50, -50, 0], [0, 80, 0.0]]])
 
@@ -43,15 +44,19 @@ def write(folder, moves):
     """Write a result: a floor scanned in ten turns from a sensor, while a van passes."""
     turn = np.linspace(0, 20 * np.pi, COUNT)
     rows = np.zeros(COUNT, row_type(np.dtype(np.float32), (SCAN, CHANNEL)))
-    rows["x"], rows["y"], rows["z"] = 9 * np.cos(turn), 9 * np.sin(turn), turn / 30
-    rows["scan"], rows["ring"] = np.arange(COUNT) * SCANS // COUNT, np.arange(COUNT) % 7
+    rows["x"] = 9 * np.cos(turn)
+    rows["y"] = 9 * np.sin(turn)
+    rows["z"] = turn / 30
+    rows["scan"] = np.arange(COUNT) * SCANS // COUNT
+    rows["ring"] = np.arange(COUNT) % 7
     (folder / "cloud.ply").write_bytes(header(rows.dtype, COUNT) + rows.tobytes())
     van = Actor(box("Van", (4, 2, 2)), Track([0, 1], [[-9, 0, 0.1], [9, 0, 0.1]]))
     scene = replace(Scene.from_meshes([box("Floor", (40, 40, 0.1))]), actors=(van,) * moves)
     path = Track([0, 2], [[0, -9, 2], [0, 9, 2.0]])
     given = {"trajectory": path} if moves else {"poses": [(0, 0, 2)]}
     survey = Survey(Sensor.grid(layers=4), steps=SCANS, **given)
-    hits, rays = np.zeros(scene.triangles, np.int64), np.zeros((0, 2, 3), np.float32)
+    hits = np.zeros(scene.triangles, np.int64)
+    rays = np.zeros((0, 2, 3), np.float32)
     ways = sensor_positions(survey)
     PictureContent(scene, ways, hits, rays, duration_ns=survey.duration_ns).save(
         folder / PICTURE_FILE
@@ -205,7 +210,8 @@ def test_a_page_with_less_room_has_fewer_points_where_they_are_dense(drive, monk
 
 
 def test_wrong_names_and_results_without_points_are_refused(drive, tmp_path):
-    film, page = tmp_path / "film.mp4", tmp_path / "page.htm"
+    film = tmp_path / "film.mp4"
+    page = tmp_path / "page.htm"
     with pytest.raises(LidarError, match=r"film.mp4 does not end with .gif or .webp"):
         share(drive, film, None)
     with pytest.raises(LidarError, match=r"page.htm does not end with .html"):

@@ -32,7 +32,8 @@ from lidarview.render.theme import object_colours
 SIZE = (320, 200)
 LEFT = slice(0, int(0.8 * SIZE[0]))  # columns beside the legend
 POSES = np.array([[0, 0, 1], [0, 0, 2.0]])
-NONE, NOWHERE = np.empty((0, 2, 3)), np.empty((0, 3))
+NONE = np.empty((0, 2, 3))
+NOWHERE = np.empty((0, 3))
 
 
 @pytest.fixture(scope="module")
@@ -197,7 +198,8 @@ def test_the_path_plot_has_equal_axes_in_world_coordinates(planned):
     page = draw_path(planned, planned.best, np.array([500_003, 4_000_000]), (1600, 1000))
     (axes,) = page.figure.axes
     box = axes.get_window_extent()
-    across, up = np.ptp(axes.get_xlim()) / box.width, np.ptp(axes.get_ylim()) / box.height
+    across = np.ptp(axes.get_xlim()) / box.width
+    up = np.ptp(axes.get_ylim()) / box.height
     assert across == pytest.approx(up)
     assert axes.get_xlim()[0] <= -30 and axes.get_xlim()[1] >= 25
     offset = int(re.sub(r"\D", "", axes.get_xlabel()))  # x − 499 970 (m)
@@ -290,9 +292,11 @@ def closest_hit(scene, eye, ray):
 
 
 def test_each_pixel_shows_the_nearest_thing(row, row_shot):
-    camera, stage = row_shot.camera, row_shot.stage
+    camera = row_shot.camera
+    stage = row_shot.stage
     rng = np.random.default_rng(3)
-    columns, rows = rng.integers(0, SIZE[0], 150), rng.integers(0, SIZE[1], 150)
+    columns = rng.integers(0, SIZE[0], 150)
+    rows = rng.integers(0, SIZE[1], 150)
     kinds = set()
     for column, line in zip(columns, rows, strict=True):
         ray = camera.rays([[column + 0.5, line + 0.5]])[0]
@@ -300,7 +304,8 @@ def test_each_pixel_shows_the_nearest_thing(row, row_shot):
         flat = (stage.level - camera.eye[2]) / ray[2]
         place = camera.eye[:2] + flat * ray[:2]
         if flat < distance and ((place > stage.ground[0]) & (place < stage.ground[1])).all():
-            distance, triangle = flat, GROUND
+            distance = flat
+            triangle = GROUND
         kinds.add(row.face_object[triangle] if triangle >= 0 else int(triangle))
         assert row_shot.depth[line, column] == pytest.approx(distance, rel=1e-5)
     assert kinds == {0, 1, 2, GROUND, SKY}
@@ -336,7 +341,8 @@ def test_the_inside_of_a_closed_hall_is_shown():
     row_shot = take_shot(scene, poses, size=SIZE, backend="numpy")
     _, seen = row_shot.visible(np.concatenate([poses, [[2, -4, 1.85], [-3, -5, 0.35]]]))
     assert seen.all(), "sensors, the crate's top and the floor"
-    far_wall, near_wall = row_shot.camera.axes[2] * 5, -row_shot.camera.axes[2] * 5
+    far_wall = row_shot.camera.axes[2] * 5
+    near_wall = -row_shot.camera.axes[2] * 5
     wall = (
         np.array([np.sign(far_wall[0]) * 5.69, 3.0, 1.5]),
         np.array([np.sign(near_wall[0]) * 5.69, 3.0, 1.5]),

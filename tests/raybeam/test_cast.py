@@ -159,13 +159,15 @@ def test_nearly_in_the_plane_stays_beside_the_triangle(caster):
         corners = rng.normal(size=(3, 3))
         weights = rng.dirichlet([1, 1, 1], (100, 2))
         start, end = np.einsum("nkc,cx->knx", weights, corners)
-        origins, directions = start - 3 * (end - start), end - start
+        origins = start - 3 * (end - start)
+        directions = end - start
         hits = caster(corners, [[0, 1, 2]]).cast(origins, directions)
         axis = np.argmax(np.abs(directions), axis=1)[:, None]
         unit = directions / np.linalg.norm(directions, axis=1, keepdims=True)
         points = origins + np.where(hits.hit, hits.distance, 0)[:, None] * unit
         along = np.take_along_axis(points, axis, axis=1)[:, 0][hits.hit]
-        low, high = corners.min(axis=0)[axis[:, 0]], corners.max(axis=0)[axis[:, 0]]
+        low = corners.min(axis=0)[axis[:, 0]]
+        high = corners.max(axis=0)[axis[:, 0]]
         assert (along >= low[hits.hit] - 1e-9).all()
         assert (along <= high[hits.hit] + 1e-9).all()
         met += len(along)
@@ -211,7 +213,8 @@ def test_far_origins_lose_nothing(caster, shapes):
 def test_any_unit_of_length(caster, shapes, size):
     vertices, faces = shapes["vase"](20, 20)
     rng = np.random.default_rng(8)
-    origins, directions = 0.1 * rng.normal(size=(300, 3)), rng.normal(size=(300, 3))
+    origins = 0.1 * rng.normal(size=(300, 3))
+    directions = rng.normal(size=(300, 3))
     want = caster(vertices, faces).cast(origins, directions)
     got = caster(vertices * size, faces).cast(origins * size, directions)
     np.testing.assert_array_equal(got.triangle, want.triangle)

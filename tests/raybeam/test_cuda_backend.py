@@ -13,7 +13,8 @@ from raybeam.scan import check_scan
 def test_arrays_are_kept_until_the_device_has_read_them(source_backend, shapes, monkeypatch):
     """Some devices read the host's memory only when the stream comes to it."""
     mesh = local_mesh(*shapes["soup"]("random", count=3000))
-    unread, read = [], []
+    unread = []
+    read = []
 
     def synchronize(self):
         read.extend(given() is not None for given in unread)

@@ -43,7 +43,8 @@ def vase(request, kernels, shapes, monkeypatch):
 
 def visited(caster, scan, counters=None, others=None):
     """Rays, distances, triangles and instances, and origins and directions, by the device."""
-    found, rays = [], []
+    found = []
+    rays = []
 
     def use(hits):
         found.append(hits.get())

@@ -23,7 +23,9 @@ def exact(corners, origin, direction):
     The ray hits strictly inside where the least weight is positive (weights and sum are turned
     to be positive for a hit), and passes through an edge or corner where it is zero.
     """
-    a, b, c = corners[:, 0] - origin, corners[:, 1] - origin, corners[:, 2] - origin
+    a = corners[:, 0] - origin
+    b = corners[:, 1] - origin
+    c = corners[:, 2] - origin
     weights = np.stack([np.cross(c, b), np.cross(a, c), np.cross(b, a)]) @ direction
     total = weights.sum(axis=0)
     sign = np.where(total < 0, -1, 1)

@@ -29,7 +29,11 @@ def transforms(rng, count, kind):
 
 def flattened(meshes, numbers, matrices):
     """All instances as one mesh; and of each face, its instance and its row there."""
-    vertices, faces, instance, row, start = [], [], [], [], 0
+    vertices = []
+    faces = []
+    instance = []
+    row = []
+    start = 0
     for number, (mesh, matrix) in enumerate(zip(numbers, matrices, strict=True)):
         points, triangles = meshes[mesh]
         vertices.append(points @ matrix[:, :3].T + matrix[:, 3])
@@ -115,7 +119,8 @@ def test_embree_has_the_bits_of_numpy(forest):
 def test_scans_and_tallies_of_many_instances(backend, shapes):
     """2,000 instances of two meshes, cast as a scan and ray by ray."""
     rng = np.random.default_rng(6)
-    small, first = shapes["cube"](), shapes["sphere"](8, 12)
+    small = shapes["cube"]()
+    first = shapes["sphere"](8, 12)
     meshes = [Mesh(*small), Mesh(*first), Mesh(*small)]
     numbers = rng.integers(1, 3, 2_000)
     numbers[0] = 2

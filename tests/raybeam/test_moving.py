@@ -9,10 +9,10 @@ from raybeam import (
     Deforming,
     Instance,
     Mesh,
-    Motion,
     Moving,
     Opacity,
     Pattern,
+    PoseMotion,
     RayCaster,
     check_scan,
     hits_on,
@@ -21,7 +21,8 @@ from raybeam import (
 from raybeam import moving as module
 from raybeam.pattern_rays import checked_rays
 
-RAYS, PERIOD = 3_000, 0.1
+RAYS = 3_000
+PERIOD = 0.1
 FLAT = np.array([[-1.0, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]]), [[0, 1, 2], [0, 2, 3]]
 
 
@@ -52,7 +53,8 @@ class Bodies:
         assert (self.there[body, 0] <= times).all() and (times <= self.there[body, 1]).all()
         places = self.start[body] + times[:, None] * self.speed[body]
         places[:, 2] += np.sin(30 * times)
-        angle, axis = self.rate[body] * times, self.axis[body]
+        angle = self.rate[body] * times
+        axis = self.axis[body]
         cross = np.cross(np.eye(3), axis[:, None])
         spin = np.sin(angle)[:, None, None] * cross
         turns = np.eye(3) + spin + (1 - np.cos(angle))[:, None, None] * (cross @ cross)
@@ -82,13 +84,17 @@ def fan(count):
 
 def scans(kind, rays=RAYS):
     """Scan, times of its rays, and where its bodies are."""
-    random, far = np.random.default_rng(5), np.zeros(3)
-    directions, each = random.normal(size=(rays, 3)), {}
-    origins, places = None, far
+    random = np.random.default_rng(5)
+    far = np.zeros(3)
+    directions = random.normal(size=(rays, 3))
+    each = {}
+    origins = None
+    places = far
     if kind == "far":
         far = np.array([690_000.0, 5_335_000, 500])
     if kind in ("fan", "far", "moving", "paused"):
-        directions, places = fan(rays), far
+        directions = fan(rays)
+        places = far
     if kind == "apart":
         origins = random.uniform(-20, 20, (rays, 3))
     if kind == "moving":
@@ -96,10 +102,12 @@ def scans(kind, rays=RAYS):
         angle = 0.02 * np.arange(firings)
         turns = np.tile(np.eye(3), (firings, 1, 1))
         turns[:, 0, 0] = turns[:, 1, 1] = np.cos(angle)
-        turns[:, 1, 0], turns[:, 0, 1] = np.sin(angle), -np.sin(angle)
+        turns[:, 1, 0] = np.sin(angle)
+        turns[:, 0, 1] = -np.sin(angle)
         places = np.linspace([-5, 0, 0], [5, 1, 0], firings)
-        velocity, rate = np.tile([5.0, 0, 0], (firings, 1)), np.tile([0, 0, 0.5], (firings, 1))
-        motion = Motion(np.linspace(0, 1e-4, 16), velocity, rate)
+        velocity = np.tile([5.0, 0, 0], (firings, 1))
+        rate = np.tile([0, 0, 0.5], (firings, 1))
+        motion = PoseMotion(np.linspace(0, 1e-4, 16), velocity, rate)
         each = {"rotations": turns, "rays_per_pose": 16, "motion": motion}
     pattern = Pattern(directions, origins)
     scan = check_scan(pattern, places, t_min=0.5, t_max=200, **each)
@@ -117,7 +125,8 @@ def by_all(moving, scan, times):
     for body, (first, last) in enumerate(moving.there):
         rows = np.flatnonzero((first <= times) & (times <= last))
         poses = moving.poses(np.full(len(rows), body), times[rows])
-        places, turns = poses[:3].T, poses[3:].reshape(3, 3, -1).transpose(2, 0, 1)
+        places = poses[:3].T
+        turns = poses[3:].reshape(3, 3, -1).transpose(2, 0, 1)
         starts = np.broadcast_to(origins, directions.shape)[rows] - places
         local = [
             np.stack([(x * a + y * b) + z * c for a, b, c in turns.transpose(2, 1, 0)], axis=1)
@@ -170,7 +179,8 @@ def test_only_hits_before_what_stands_there_count(backend):
     moving = Bodies(24, 1).moving(backend)
     hits = hits_on(moving, scan, lambda ray: times[ray])
     ray = rays_of(hits)
-    ends, third = hits.distance.copy(), ray[::3]
+    ends = hits.distance.copy()
+    third = ray[::3]
     ends[third] = np.nextafter(hits.distance[third], np.inf)
     ends[ray[2::3]] /= 2
     before = hits_on(moving, scan, lambda ray: times[ray], ends)
@@ -180,8 +190,11 @@ def test_only_hits_before_what_stands_there_count(backend):
 
 def test_of_equal_distances_the_first_body_counts(backend):
     bodies = Bodies(4, 1)
-    bodies.start[:], bodies.speed[:], bodies.rate[:] = [5, 0, 0], 0, 0
-    bodies.there[:], bodies.shape[:] = [-np.inf, np.inf], 0
+    bodies.start[:] = [5, 0, 0]
+    bodies.speed[:] = 0
+    bodies.rate[:] = 0
+    bodies.there[:] = [-np.inf, np.inf]
+    bodies.shape[:] = 0
     scan, times, _ = scans("fan")
     hits = hits_on(bodies.moving(backend), scan, lambda ray: times[ray])
     assert len(rays_of(hits)) > 50 and hits.body.max() == 0
@@ -190,7 +203,8 @@ def test_of_equal_distances_the_first_body_counts(backend):
 def test_most_rays_are_not_looked_at(monkeypatch):
     """As many as pass through boxes, of 24 bodies."""
     scan, times, _ = scans("fan")
-    moving, asked = Bodies(24, 1).moving("numpy"), []
+    moving = Bodies(24, 1).moving("numpy")
+    asked = []
     strike = RayCaster.strike
 
     def noted(caster, crossing, nearest):
@@ -230,7 +244,8 @@ def test_no_loop_is_compiled_with_fast_mathematics():
 
 def test_bodies_that_deform_are_hit_where_they_are_at_the_time_of_each_ray():
     """Each ray, body and triangle compared by itself: the same bits, and of ties the lowest."""
-    bodies, random = Bodies(9, seed=4, around=(6.0, 0, 3), speed=3.0), np.random.default_rng(5)
+    bodies = Bodies(9, seed=4, around=(6.0, 0, 3), speed=3.0)
+    random = np.random.default_rng(5)
     points, faces = ball()
     frames = points * random.uniform(0.6, 1.4, (6, 1, 3)) + random.normal(0, 0.05, (6, 1, 3))
     frames[:, :, 2] += 0.3 * np.sin(3 * points[:, 0] + np.arange(6)[:, None])
@@ -255,7 +270,8 @@ def test_bodies_that_deform_are_hit_where_they_are_at_the_time_of_each_ray():
         own = np.flatnonzero((first <= times) & (times <= last))
         pose = bodies.poses(np.full(len(own), body), times[own])
         turns = pose[3:].reshape(3, 3, -1).transpose(1, 0, 2)
-        start, ahead = np.array([[-9], [0.2], [0]]) - pose[:3], directions[own].T
+        start = np.array([[-9], [0.2], [0]]) - pose[:3]
+        ahead = directions[own].T
         start, ahead = (
             np.stack([(x * a + y * b) + z * c for a, b, c in turns]).T for x, y, z in (start, ahead)
         )
@@ -271,7 +287,8 @@ def test_bodies_that_deform_are_hit_where_they_are_at_the_time_of_each_ray():
             hit = triangle.inside(a, b, c, det) & (t >= 0.3) & (t <= 30)
             nearest = np.where(hit, t, np.inf)
             if nearest.min() < expected[0][ray]:
-                expected[0][ray], expected[1][ray] = nearest.min(), body
+                expected[0][ray] = nearest.min()
+                expected[1][ray] = body
                 expected[2][ray] = nearest.argmin()
     hit = np.isfinite(expected[0])
     assert 300 < hit.sum() < RAYS and len({*expected[1].tolist()}) > 5

@@ -15,14 +15,16 @@ from raybeam import Instance, Mesh, Pattern, RayCaster, available_backends
 if reason := available_backends()["embree"]:
     pytest.skip(f"embree: {reason}", allow_module_level=True)
 
-RINGS, FIRINGS = 24, 600
+RINGS = 24
+FIRINGS = 600
 
 
 def lidar():
     """Directions of a turn, firing by firing (n, 3)."""
     azimuth = 2 * np.pi * np.arange(FIRINGS)[:, None] / FIRINGS
     elevation = np.radians(np.linspace(-40, 30, RINGS))
-    x, y = np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth)
+    x = np.cos(elevation) * np.cos(azimuth)
+    y = np.cos(elevation) * np.sin(azimuth)
     return np.stack([x, y, np.broadcast_to(np.sin(elevation), x.shape)], axis=-1).reshape(-1, 3)
 
 
@@ -43,14 +45,16 @@ def mesh(request, shapes):
 def found(caster, directions, order, **options):
     """Distance and triangle of each ray, cast in some order from near the middle."""
     returns = caster.scan(Pattern(directions[order]), [0.05, 0.1, 0.4], **options)
-    distance, triangle = np.full(len(directions), np.inf), np.full(len(directions), -1)
+    distance = np.full(len(directions), np.inf)
+    triangle = np.full(len(directions), -1)
     distance[order[returns.ray]] = returns.distance
     triangle[order[returns.ray]] = returns.triangle
     return distance, triangle
 
 
 def test_neighbours_have_no_effect(mesh):
-    directions, rng = lidar(), np.random.default_rng(2)
+    directions = lidar()
+    rng = np.random.default_rng(2)
     caster = RayCaster(*mesh, "embree", threads=1)
     straight = np.arange(len(directions))
     want = found(caster, directions, straight)
@@ -85,14 +89,16 @@ def sheet(cells):
 
 def ties(backend):
     """Hash of the hits of rays that meet several triangles at one distance, many at edges."""
-    rng, found = np.random.default_rng(8), hashlib.sha256()
+    rng = np.random.default_rng(8)
+    found = hashlib.sha256()
     points, faces = soup(rng)
     thrice = np.concatenate([faces, np.roll(faces, 1, axis=1), faces[:, ::-1]])
     (fine, small), (coarse, large) = sheet(20), sheet(7)
     both = np.concatenate([coarse, fine]), np.concatenate([large, small + len(coarse)])[::-1]
     places = [np.diag([1.0, k, k, 1]) for k in (1, -1)]
     stack = [Instance(Mesh(*m), p) for m in ((fine, small), both) for p in places]
-    down, around = np.broadcast_to([0, 0, -1.0], fine.shape), rng.normal(size=(4_000, 3))
+    down = np.broadcast_to([0, 0, -1.0], fine.shape)
+    around = rng.normal(size=(4_000, 3))
     for caster, start, directions in (
         (RayCaster(points, rng.permutation(thrice), backend), [0.05, 0.1, 0.4], around),
         (RayCaster(*both, backend), np.add(fine, [0, 0, 3]), down),
@@ -144,9 +150,10 @@ def test_forked_processes_cast_too():
 
 
 def test_which_rays_go_together_changes_nothing(mesh):
-    """Ways to group rays are tried in turn, until one is known to be the fastest."""
+    """ActorTrajectories to group rays are tried in turn, until one is known to be the fastest."""
     caster = RayCaster(*mesh, backend="embree", threads=1)
-    given, where = Pattern(lidar()), [0.05, 0.1, 0.4]
+    given = Pattern(lidar())
+    where = [0.05, 0.1, 0.4]
     expected = RayCaster(*mesh, backend="numpy").scan(given, where)
     for window in [(0, len(given))] * 5 + [(k, k + 700) for k in range(0, 13_000, 611)]:
         returns = caster.scan(Pattern(lidar()), where, window=window)

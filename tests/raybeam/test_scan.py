@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from raybeam import Motion, Pattern, RayCaster, pattern_rays
+from raybeam import Pattern, PoseMotion, RayCaster, pattern_rays
 from raybeam.rays import Rays, unit_directions
 
 TRIANGLE = [[0, 0, 0], [1, 0, 0], [0, 1, 0]], [[0, 1, 2]]
@@ -17,8 +17,10 @@ def rotations(count, seed=0):
 
 def made(case, window):
     """Origins and directions of a scan's rays, ray by ray as the interface tells it."""
-    directions, origins = unit_directions(case["directions"]), case["origins"]
-    at, to = [], []
+    directions = unit_directions(case["directions"])
+    origins = case["origins"]
+    at = []
+    to = []
     for number in range(window[1] - window[0]):
         row = (window[0] + number) % len(directions)
         pose = number // case["each"] if len(case["positions"]) > 1 else 0
@@ -32,7 +34,8 @@ def made(case, window):
             )
         at_pose = place = case["positions"][pose]
         if (motion := case["motion"]) is not None:
-            late, rate = motion.delays[number % case["each"]], motion.rates[pose]
+            late = motion.delays[number % case["each"]]
+            rate = motion.rates[pose]
             d, o = (v if v is None else drifted(v, late, rate) for v in (d, o))
             place = at_pose + late * motion.velocities[pose]
         if o is not None:
@@ -68,7 +71,7 @@ CASES = {
 
 def motion_of(rng, poses, rays):
     speeds, rates = rng.normal(size=(2, poses, 3))
-    return Motion(rng.uniform(0, 1e-3, rays), 50 * speeds, rates)
+    return PoseMotion(rng.uniform(0, 1e-3, rays), 50 * speeds, rates)
 
 
 def case_of(name, scale=1.0):
@@ -97,7 +100,8 @@ def hits_of(caster, origins, directions, *limits):
     if len(directions) and np.abs((directions**2).sum(axis=1) - 1).max() > 1e-14:
         # Those that drift: not quite of unit length, which `cast` would make them.
         found = caster._engine.closest(Rays(origins, directions, *(limits or (0.0, np.inf))))
-        ray, distance = found.ray.astype(np.uint32), found.t / caster._scene.frame.scale
+        ray = found.ray.astype(np.uint32)
+        distance = found.t / caster._scene.frame.scale
         return SimpleNamespace(ray=ray, distance=distance, triangle=found.triangle)
     hits = caster.cast(origins, directions, *limits)
     ray = np.flatnonzero(hits.hit).astype(np.uint32)
@@ -106,7 +110,8 @@ def hits_of(caster, origins, directions, *limits):
 
 def same(got, want):
     for name in ("ray", "triangle", "distance"):
-        mine, other = getattr(got, name), getattr(want, name)
+        mine = getattr(got, name)
+        other = getattr(want, name)
         assert mine.dtype == other.dtype
         np.testing.assert_array_equal(mine, other, err_msg=name)
 
@@ -133,7 +138,8 @@ def check(caster, case, windows, limits):
 @pytest.mark.parametrize("name", CASES)
 def test_rays_are_those_of_the_interface(caster, shapes, name):
     """Windows past the pattern's end, with and without limits, from near and from far."""
-    vase, case = caster(*shapes["vase"]()), case_of(name)
+    vase = caster(*shapes["vase"]())
+    case = case_of(name)
     check(vase, case, [(0, 2400), (123, 123)], (0.0, np.inf))
     check(vase, case, [(937, 1003), (2999, 5000)], (0.5, 1.5))
     case = case_of(name, 3e3)
@@ -160,8 +166,11 @@ def test_scans_may_be_cut_anywhere(caster, shapes, name, monkeypatch):
 
 
 def test_positions_and_rotations_may_be_one_for_all(caster, shapes):
-    vase, case = caster(*shapes["vase"]()), case_of("firings")
-    pattern, place, turn = Pattern(case["directions"]), case["positions"], case["rotations"]
+    vase = caster(*shapes["vase"]())
+    case = case_of("firings")
+    pattern = Pattern(case["directions"])
+    place = case["positions"]
+    turn = case["rotations"]
     for positions, turns in ((place, turn[3]), (place[3], turn), (place[3:4], turn)):
         got = vase.scan(pattern, positions, turns, window=(0, 2400), rays_per_pose=40)
         full = np.broadcast_to(positions, (60, 3)), np.broadcast_to(turns, (60, 3, 3))
@@ -173,7 +182,8 @@ def test_positions_and_rotations_may_be_one_for_all(caster, shapes):
 @pytest.mark.parametrize("name", ["firings, lever arms", "on the move, lever arms"])
 def test_pattern_shorter_than_a_chunk(caster, shapes, name, rays, first):
     """A pattern of one firing, over and over; also that of each pose."""
-    vase, case = caster(*shapes["vase"]()), case_of(name)
+    vase = caster(*shapes["vase"]())
+    case = case_of(name)
     case["directions"], case["origins"] = case["directions"][:rays], case["origins"][:rays]
     got = scanned(vase, case, (first, 2100))
     assert len(got) > 900
@@ -185,7 +195,8 @@ GROUPS = [[0], [0, 1000, 2000], [0, 0, 13, 13, 14, 1999, 2390, 2400]]
 
 def thinned(want, groups, every, rays):
     """Hits of each group, and rows of those to keep, group by group."""
-    hits, keep = [], []
+    hits = []
+    keep = []
     for begin, end in zip(groups, [*groups[1:], rays], strict=True):
         rows = np.flatnonzero((want.ray >= begin) & (want.ray < end))
         hits.append(len(rows))
@@ -204,7 +215,8 @@ def thinned(want, groups, every, rays):
     ],
 )
 def test_thinning_keeps_what_the_whole_has(caster, shapes, name, limits, monkeypatch):
-    vase, case = caster(*shapes["vase"]()), case_of(name)
+    vase = caster(*shapes["vase"]())
+    case = case_of(name)
     given = {"window": (300, 2700), "t_min": limits[0], "t_max": limits[1]}
     whole = scanned(vase, case, **given)
     want_tally = np.bincount(whole.triangle, minlength=vase.face_count)

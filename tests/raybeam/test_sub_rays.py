@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from raybeam import (
-    Motion,
     Moving,
     Pattern,
+    PoseMotion,
     RayCaster,
     SubRays,
     check_scan,
@@ -16,14 +16,17 @@ from raybeam import (
 from raybeam.pattern_rays import plain_rays
 from raybeam.poses import check_poses
 
-RINGS, FIRINGS = 7, 45
+RINGS = 7
+FIRINGS = 45
 
 
 def beams():
     """Directions firing by firing (n, 3), one of them straight up."""
-    turn, steps = 2 * np.pi * np.arange(FIRINGS) / FIRINGS, np.linspace(-60, 90, RINGS)
+    turn = 2 * np.pi * np.arange(FIRINGS) / FIRINGS
+    steps = np.linspace(-60, 90, RINGS)
     azimuth, elevation = np.meshgrid(turn, np.radians(steps), indexing="ij")
-    x, y = np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth)
+    x = np.cos(elevation) * np.cos(azimuth)
+    y = np.cos(elevation) * np.sin(azimuth)
     return np.stack([x, y, np.sin(elevation)], axis=-1).reshape(-1, 3)
 
 
@@ -45,7 +48,7 @@ def poses(rng, kind, rays):
     many = {"positions": rng.normal(scale=0.1, size=(len(turns), 3)), "rotations": turns}
     # It turns so slowly that its directions remain unit vectors, which `cast` leaves as they are.
     velocities, rates = rng.normal(size=(2, len(turns), 3))
-    motion = Motion(rng.uniform(0, 1e-3, 49), velocities, 1e-9 * rates)
+    motion = PoseMotion(rng.uniform(0, 1e-3, 49), velocities, 1e-9 * rates)
     return {**many, "rays_per_pose": 49, "motion": motion if kind == "moves" else None}
 
 
@@ -58,7 +61,8 @@ def test_a_scan_has_the_bits_of_rays_made_one_by_one(backend, shapes, place, kin
     for count in (1, 7, 19):
         given = pattern(rng, count, kind)
         where = poses(rng, place, len(given))
-        start, stop = 5, len(given) - 3
+        start = 5
+        stop = len(given) - 3
         returns = caster.scan(given, **where, window=(start, stop))
         ray = np.arange(stop - start)
         hits = caster.cast(*pattern_rays(given, ray, **where, start=start))
@@ -113,7 +117,8 @@ def test_sub_rays_hit_what_moves(shapes, kind):
     """Bodies that stand are hit where the same shape is."""
     rng = np.random.default_rng(8)
     shape = RayCaster(*(mesh := shapes["vase"]()), backend="numpy")
-    given, where = pattern(rng, 7, kind), poses(rng, "moves", 7 * len(beams()))
+    given = pattern(rng, 7, kind)
+    where = poses(rng, "moves", 7 * len(beams()))
     corners = np.array([mesh[0].min(axis=0), mesh[0].max(axis=0)])
 
     def stand(bodies, times):

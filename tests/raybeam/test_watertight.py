@@ -7,7 +7,8 @@ from benchmarks import seams
 from raybeam import RayCaster, available_backends
 
 # A point inside each of the meshes, and how far it may be moved.
-INSIDE, ROOM = np.array([0.05, 0.1, 0.4]), 0.05
+INSIDE = np.array([0.05, 0.1, 0.4])
+ROOM = 0.05
 
 
 def turned(points):
@@ -49,7 +50,8 @@ def test_no_ray_escapes(exact_caster, shapes, name, count):
 def test_no_ray_comes_through_from_outside(exact_caster, shapes):
     """A ray aimed from outside at a seam of the near side hits there or grazes by."""
     vertices, faces = shapes["sphere"]()
-    vertices, origin = turned(vertices), np.array([3.0, 1, 2])
+    vertices = turned(vertices)
+    origin = np.array([3.0, 1, 2])
     rng = np.random.default_rng(5)
     directions = seams.seam_rays(vertices, faces, origin, 20_000, rng)
     unit = directions / np.linalg.norm(directions, axis=1, keepdims=True)

@@ -61,7 +61,9 @@ class _Saboteur(WorkerPlugin):
     name = "saboteur"
 
     def __init__(self, point: str, scan: int, armed: Path) -> None:
-        self.point, self.scan, self.armed = point, scan, armed
+        self.point = point
+        self.scan = scan
+        self.armed = armed
 
     def setup(self, worker: Worker) -> None:
         trace_to(self._strike)

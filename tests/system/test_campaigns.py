@@ -111,7 +111,8 @@ def job(sensor: Sensor, number: int, **survey: Any) -> Job:
 
 @pytest.mark.parametrize("keep", quick(("kitti",), ["kitti", "nuscenes"]))
 def test_names_of_classes_are_in_the_data_set_and_its_card(client, tmp_path, keep):
-    names, sensor = {40: "road", 10: "car"}, Sensor.grid(360, 20, step_deg=4)
+    names = {40: "road", 10: "car"}
+    sensor = Sensor.grid(360, 20, step_deg=4)
 
     def make_named(number: int, rng: np.random.Generator) -> Job:
         return job(sensor, number, materials=[Material("*", semantic_class=40)], classes=names)
@@ -286,7 +287,8 @@ def third_if(there: Path, made: list[int]) -> Callable[[int, np.random.Generator
 
 
 def test_failed_jobs_are_done_again_and_no_others(client, tmp_path):
-    there, made = tmp_path / "there", []
+    there = tmp_path / "there"
+    made = []
     campaign = Campaign(third_if(there, made), 4, keep="folder")
     run = campaign.run(tmp_path / "ds", client=client)
     assert [row.number for row in run.failed] == [2] and run.done == 3
@@ -474,7 +476,8 @@ def full_disk(slots, tmp_path_factory):
                 raise OSError(28, "No space left on device")
         return made
 
-    campaign, ds = Campaign(make, 3, keep="folder"), tmp_path_factory.mktemp("full") / "ds"
+    campaign = Campaign(make, 3, keep="folder")
+    ds = tmp_path_factory.mktemp("full") / "ds"
     with (
         Client(slots, set_as_default=False) as client,
         pytest.MonkeyPatch.context() as patched,
@@ -531,7 +534,8 @@ def three(slots, full_disk, tmp_path_factory):
     "where", quick(("run", "jobs/0001"), ["run", "run/parts", "jobs", "jobs/0001", ".jobs"])
 )
 def test_nothing_behind_a_link_is_touched(client, here, unwritten, three, where):
-    link, stranger = here / "ds" / where, here / "stranger"
+    link = here / "ds" / where
+    stranger = here / "stranger"
     before = lead_away(link, stranger)
     for how in ("resume", "fresh"):
         with pytest.raises(LidarError) as caught:
@@ -575,7 +579,8 @@ LOST = {
 @pytest.mark.parametrize("lost", quick(("half of it",), LOST))
 def test_finished_jobs_are_known_without_the_database(client, here, unwritten, lost):
     ds = here / "ds"
-    before, known = bytes_of(ds), len([*(ds / ".jobs").iterdir()])
+    before = bytes_of(ds)
+    known = len([*(ds / ".jobs").iterdir()])
     LOST[lost](ds / "run")
     with pytest.raises(LidarError, match=r"run\.db is damaged|needs a folder of its own"):
         unwritten.run(ds, client=client)
@@ -753,7 +758,8 @@ def test_two_at_once_share_the_slots(other, files, whole, monkeypatch):
     """There are slots for the stages of both, and none for writing."""
     monkeypatch.setattr(lidarpool.run.writer, "BEGIN_S", 0.5)
     campaign = Campaign.load(files / "c.yaml")
-    scene, survey = Scene.seed(), job(SENSOR, 3).survey
+    scene = Scene.seed()
+    survey = job(SENSOR, 3).survey
     running = threading.Event()
 
     def watched(progress: Progress) -> None:

@@ -73,7 +73,8 @@ def demo(tmp_path_factory) -> Demo:
 
 def listened_on(pid: int) -> list[str]:
     """Addresses on which a process and its children listen now, one a socket."""
-    driver, found = psutil.Process(pid), []
+    driver = psutil.Process(pid)
+    found = []
     for process in (driver, *driver.children(recursive=True)):
         with suppress(psutil.Error):  # it has ended meanwhile
             found += [c.laddr.ip for c in process.net_connections() if c.status == "LISTEN"]
@@ -81,7 +82,8 @@ def listened_on(pid: int) -> list[str]:
 
 
 def test_the_demo_makes_all_files_and_says_so(demo):
-    out, ended = demo.out, demo.ended
+    out = demo.out
+    ended = demo.ended
     assert ended.returncode == 0, ended.stderr
     assert names_in(out) == {*MADE}
     for name in MADE[1:5]:
@@ -260,7 +262,8 @@ def test_pictures_are_drawn_if_they_are_asked_for_or_later(run, lidarpool, tmp_p
 @pytest.mark.parametrize("words", [["--version"], ["--help"], ["run", "--help"], [None]])
 def test_help_and_completion_load_nothing_of_a_run(words):
     """What a run needs takes a second to import."""
-    environment, python = {**os.environ}, [sys.executable, "-X", "importtime", *COMMAND[1:]]
+    environment = {**os.environ}
+    python = [sys.executable, "-X", "importtime", *COMMAND[1:]]
     if words == [None]:  # the Tab key
         words = []
         environment["_LIDARPOOL_COMPLETE"] = "bash_complete"

@@ -90,7 +90,8 @@ def declared(name: str) -> dict:
 
 @pytest.mark.parametrize("name", PARTS)
 def test_a_part_wants_what_the_whole_wants(name):
-    whole, part = declared(WHOLE)["project"], declared(name)["project"]
+    whole = declared(WHOLE)["project"]
+    part = declared(name)["project"]
     extras = whole["optional-dependencies"]
     foreign = {text for text in part["dependencies"] if Requirement(text).name not in PARTS}
     assert foreign < set(whole["dependencies"])

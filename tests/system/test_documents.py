@@ -274,7 +274,8 @@ def leaves(data: dict[str, Any], above: str = "") -> Iterator[str]:
 
 @pytest.mark.slow
 def test_the_tutorial_from_beginning_to_end(tmp_path, lidarpool):
-    told, ran = "", 0
+    told = ""
+    ran = 0
     for block in blocks_of(ROOT / "docs/tutorial.md"):
         if block.reason or block.language == "python":
             continue
@@ -291,7 +292,8 @@ def test_the_tutorial_from_beginning_to_end(tmp_path, lidarpool):
                 outcome = lidarpool(*words[1:])
                 assert outcome.code == 0, outcome.err
                 assert "warning: " not in outcome.out + outcome.err
-                told, ran = outcome.out + outcome.err, ran + 1
+                told = outcome.out + outcome.err
+                ran = ran + 1
     assert ran == 6
     for name in ("cloud.ply", "report.html"):
         assert (tmp_path / "hall/result" / name).stat().st_size > 1000

@@ -82,7 +82,8 @@ def test_the_drive_of_three_sensors_and_ten_actors_can_be_made(tmp_path):
     for name in ("city-drive.yaml", "car.obj", "pedestrian.glb"):
         (tmp_path / name).write_bytes((ROOT / "examples" / name).read_bytes())
     built = build(Scenario.load(tmp_path / "city-drive.yaml"))
-    scene, survey = built.scene, built.survey
+    scene = built.scene
+    survey = built.survey
     assert [carried.name for carried in survey.carried] == ["roof", "left", "right"]
     assert len(scene.actors) == 10
     assert 15e6 < survey.ray_count < 15.2e6
@@ -128,7 +129,8 @@ def test_a_drive_with_actors_on_a_cluster(town, lidarpool, cluster):
     assert points["Pedestrian"] > 0 and points["Oncoming car"] > 0
     cloud = read_cloud(out / "cloud.ply")
     built = build(Scenario.load(town / "drive.yaml"))
-    scene, survey = built.scene, built.survey
+    scene = built.scene
+    survey = built.survey
     batches = list(Rig(scene, survey, report["backend"]).cast(0, survey.scan_count))
     for column in survey.stored_columns[3:]:
         made = np.concatenate([column.make(batch) for batch in batches])

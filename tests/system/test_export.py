@@ -85,7 +85,8 @@ def test_a_run_writes_what_its_scenario_asks_for_and_a_result_is_exported(
 
 
 def test_instruments_have_files_and_topics_of_the_same_numbers(cluster, lidarpool, tmp_path):
-    out, scenario = tmp_path / "out", tmp_path / "s.yaml"
+    out = tmp_path / "out"
+    scenario = tmp_path / "s.yaml"
     text = SCENARIO.replace("[ply, laz, {format: mcap, layout: ouster}, kitti]", "[mcap]")
     navigation = "navigation: {imu: {gyroscope_bias: 1.0e-3}, gnss: {horizontal_m: 0.1}}\n"
     scenario.write_text(text + navigation)
@@ -132,7 +133,8 @@ def test_what_is_no_result_or_has_been_cut_is_one_line(lidarpool, tmp_path):
 
 
 def test_an_interrupt_says_which_formats_are_written(lidarpool, tmp_path, monkeypatch):
-    scene, survey = Scene.seed(), Survey(poses=[(0, 0, 1)], columns=["intensity"])
+    scene = Scene.seed()
+    survey = Survey(poses=[(0, 0, 1)], columns=["intensity"])
     Sweeps.of(survey, scene).save(tmp_path / "sweeps.npz")
     columns = {name: np.zeros(3) for name in ("scan", "channel", "object", "intensity")}
     save_cloud(Cloud(np.zeros((3, 3)), columns), tmp_path / "cloud.ply")
@@ -166,7 +168,9 @@ def test_a_worker_that_cannot_write_is_one_line_and_nothing_is_lost(
         write(storage, name, data)
 
     monkeypatch.setattr(pieces, "RANGE_PIECES", 1)
-    run, write, out = many_files(lidarpool, tmp_path, cluster), Storage.write, tmp_path / "out"
+    run = many_files(lidarpool, tmp_path, cluster)
+    write = Storage.write
+    out = tmp_path / "out"
     (tmp_path / "s.yaml").write_text((tmp_path / "s.yaml").read_text().replace("0.3", "0.5"))
     with monkeypatch.context() as patch:
         patch.setattr(Storage, "write", full)

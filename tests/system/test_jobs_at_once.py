@@ -18,7 +18,8 @@ from lidarpool import Campaign, Column, Job, Scene, Sensor, Survey, save_cloud, 
 from lidarpool.run.pipeline import rigs
 from lidarsim.scene.actors import box
 
-SEED, ROOM = Scene.seed(), Scene.from_meshes([box("Room", (8, 6, 3))])
+SEED = Scene.seed()
+ROOM = Scene.from_meshes([box("Room", (8, 6, 3))])
 SENSOR = Sensor.grid(rays_per_revolution=900, layers=8, step_deg=2)
 
 pytestmark = pytest.mark.usefixtures("small_batches")
@@ -87,7 +88,8 @@ def test_jobs_of_a_scene_share_its_trees_and_others_that_fail_do_no_harm(
     client, tmp_path, left_over, monkeypatch
 ):
     before = {*rigs._kept}  # of other tests of this process
-    trees, build = [], lidarsim.simulator.scene_caster.RayCaster
+    trees = []
+    build = lidarsim.simulator.scene_caster.RayCaster
     monkeypatch.setattr(
         lidarsim.simulator.scene_caster,
         "RayCaster",

@@ -132,7 +132,8 @@ def test_a_result_goes_to_the_bucket(cluster, lidarpool, tmp_path, environment):
 @pytest.mark.slow
 def test_workers_put_files_of_sweeps_there(cluster, lidarpool, tmp_path, environment, monkeypatch):
     (tmp_path / "s.yaml").write_text(SCENARIO + "output: {write: [nuscenes]}\n")
-    url, here = f"{BUCKET}/results/sweeps", tmp_path / "here"
+    url = f"{BUCKET}/results/sweeps"
+    here = tmp_path / "here"
     Storage.at(f"{url}/nuscenes").write("v1.0-lidarpool/map.json", b"of an earlier result")
     run = ["run", tmp_path / "s.yaml", "--scheduler", cluster, "--only", "cloud", "-q"]
     run += ["--overwrite", "--out"]
@@ -163,7 +164,9 @@ def test_workers_put_files_of_sweeps_there(cluster, lidarpool, tmp_path, environ
 @pytest.mark.slow
 @pytest.mark.parametrize("format", DATA_SETS)
 def test_a_data_set_is_written_and_read_in_the_bucket(environment, tmp_path, format):  # noqa: A002
-    scene, url, here = the_scene(), f"{BUCKET}/sets/{format}", tmp_path / "here"
+    scene = the_scene()
+    url = f"{BUCKET}/sets/{format}"
+    here = tmp_path / "here"
     sweeps = the_sweeps(scene)
     data = write_set(url, format, scene, sweeps)
     write_set(here, format, scene, sweeps)
@@ -192,7 +195,8 @@ def test_a_data_set_is_written_and_read_in_the_bucket(environment, tmp_path, for
 
 @pytest.mark.parametrize("format", ["kitti", "parquet"])  # which pyarrow reads
 def test_forks_read_a_data_set_that_their_parent_has_opened(environment, format):  # noqa: A002
-    scene, url = the_scene(), f"{BUCKET}/forks/{format}"
+    scene = the_scene()
+    url = f"{BUCKET}/forks/{format}"
     write_set(url, format, scene, the_sweeps(scene))
     data = package.sweeps(url, shuffle=2)
     alone = [sweep.points.tobytes() for sweep in data]
@@ -257,7 +261,8 @@ def test_without_credentials_or_rights(lidarpool, environment, monkeypatch, tmp_
 def test_drivers_are_killed_and_the_next_has_nothing_but_the_bucket(
     cluster, environment, lidarpool, tmp_path
 ):
-    url, here = f"{BUCKET}/results/killed", tmp_path / "here"
+    url = f"{BUCKET}/results/killed"
+    here = tmp_path / "here"
     here.mkdir()
     (here / "s.yaml").write_text(RESUMED)
     whole = ["--out", tmp_path / "whole", "--only", "cloud", "-q", "--scheduler", cluster]

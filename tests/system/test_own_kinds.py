@@ -53,7 +53,8 @@ class Tilted(Sensor):
 
     def directions(self, firings):
         x, y, z = np.moveaxis(super().directions(firings), -1, 0)
-        c, s = np.cos(np.radians(self.tilt_deg)), np.sin(np.radians(self.tilt_deg))
+        c = np.cos(np.radians(self.tilt_deg))
+        s = np.sin(np.radians(self.tilt_deg))
         return np.stack([x, c * y - s * z, s * y + c * z], axis=-1)
 
 
@@ -78,7 +79,8 @@ def result(local_client):
 
 def test_points_lie_where_the_sensors_own_geometry_says(result):
     """Its rays are made again here, and end at the ranges that were found."""
-    cloud, wanted = result.cloud, survey()
+    cloud = result.cloud
+    wanted = survey()
     assert result.rays == wanted.ray_count == 2 * 30 * 40 * 12
     assert len(cloud) == result.hits > 1000
     firings = cloud["time"] % (30 * 40 * 50_000) // 50_000
@@ -97,7 +99,8 @@ def test_a_result_tells_of_itself_and_its_points_become_frames_and_clouds(result
     )
     assert result._repr_html_().count("<tr>") == len(told.splitlines())
     cloud = result.cloud
-    frame, lazy = cloud.to_dataframe(), to_dask(result.points)
+    frame = cloud.to_dataframe()
+    lazy = to_dask(result.points)
     assert list(frame) == [*"xyz", "scan", "channel", "object", "brightness", *frame.columns[7:]]
     np.testing.assert_array_equal(frame["z"], cloud.positions[:, 2])
     assert lazy.npartitions == sum(rows > 0 for rows in result.points.rows)

@@ -59,7 +59,8 @@ def messages(path: Path) -> list[tuple[str, Any]]:
 
 def expected(angles: np.ndarray, yaw_deg: float, x: float) -> np.ndarray:
     """Distances (n,) to the sides of the room of 10 by 8 m, from (x, 0)."""
-    cos, sin = np.cos(angles + np.radians(yaw_deg)), np.sin(angles + np.radians(yaw_deg))
+    cos = np.cos(angles + np.radians(yaw_deg))
+    sin = np.sin(angles + np.radians(yaw_deg))
     with np.errstate(divide="ignore"):
         across = np.where(cos > 0, 5 - x, -5 - x) / cos
         return np.minimum(across, np.where(sin > 0, 4, -4) / sin)

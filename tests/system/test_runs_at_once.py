@@ -86,7 +86,8 @@ def test_two_surveys_and_a_foreign_user_do_not_see_each_other(same_cloud):
 
     def be_foreign() -> tuple[list[int], list[int]]:
         """Know nothing of partitions: an own client, own tasks, an own queue."""
-        results, taken = [], []
+        results = []
+        taken = []
         with Client(address, set_as_default=False) as client:
             queue = Queue("foreign", client=client)
             for count in range(20):

@@ -29,7 +29,8 @@ CAR = Actor(box("Car", (4.5, 1.8, 1.5)), Track([0, 1], [[-5, 3, 0], [5, 3, 0]]))
 
 def test_sweeps_of_a_moving_sensor_are_those_of_a_run(cluster_client, same_cloud):
     scene = Scene.seed().with_actors([CAR])
-    sensor, track = load_sensor("velodyne/vlp16"), Track([0, 0.5], [[-4, -1, 1], [4, -1, 1]])
+    sensor = load_sensor("velodyne/vlp16")
+    track = Track([0, 0.5], [[-4, -1, 1], [4, -1, 1]])
     survey = Survey(sensor, trajectory=track, steps=72, **OPTIONS)
     cloud = simulate(scene, survey, client=cluster_client).cloud
     assert (cloud["object"] == 6).any() and (cloud["returns"] == 2).any()

@@ -109,7 +109,8 @@ def content(folder: Path) -> dict[str, Any]:
     found: dict[str, Any] = {}
     for path in sorted(path for path in folder.rglob("*") if path.is_file()):
         assert not path.is_symlink()
-        name, data = path.relative_to(folder).as_posix(), path.read_bytes()
+        name = path.relative_to(folder).as_posix()
+        data = path.read_bytes()
         if name == "report.json":
             found[name] = without_times(json.loads(data))
         elif name == "campaign.json":
@@ -129,7 +130,8 @@ def content(folder: Path) -> dict[str, Any]:
 
 @pytest.mark.parametrize("kept", quick(("folder",), DATA_SETS))
 def test_shards_of_a_campaign_have_the_files_of_one_run(campaigns, tmp_path, kept):
-    folder, out = campaigns(kept), tmp_path / "ds"
+    folder = campaigns(kept)
+    out = tmp_path / "ds"
     report = merge([folder / f"part-{number}" for number in (3, 1, 2)], out)
     assert content(out) == content(folder / "one")
     assert report["jobs"] == {"described": 7, "done": 7, "failed": 0, "resumed": 0}
@@ -195,7 +197,8 @@ def test_damaged_files_are_named_and_the_next_merge_takes_them(
     parts, campaigns, tmp_path, damage, slots
 ):
     DAMAGE[damage](parts[1])
-    out, name = tmp_path / "ds", NAMED.get(damage, "0001/cloud.ply")
+    out = tmp_path / "ds"
+    name = NAMED.get(damage, "0001/cloud.ply")
     with pytest.raises(LidarError, match=f"damaged.*part-2/.*{name}; run"):
         merge(parts, out)
     assert not (out / "dataset.json").exists() and (out / ".jobs/0000.json").exists()
@@ -203,7 +206,8 @@ def test_damaged_files_are_named_and_the_next_merge_takes_them(
         campaign = Campaign.load(parts[0].parent / "c.yaml")
         campaign.run(parts[1], client=client, verify=True, shard=(2, 3))
     merge(parts, out)
-    made, whole = content(out), content(campaigns("folder") / "one")
+    made = content(out)
+    whole = content(campaigns("folder") / "one")
     notes = made.pop("report.json")["notes"]
     assert notes[0].startswith("made again: job 0001")
     assert made["campaign.json"].pop("notes") == notes and not whole["campaign.json"].pop("notes")
@@ -224,7 +228,8 @@ def test_a_data_set_that_is_given_by_another_name_keeps_its_files(parts, tmp_pat
 
 def test_a_shard_is_never_made_the_whole(parts):
     before = content(parts[0].parent)
-    inside, around = parts[0] / "below/ds", parts[0].parent
+    inside = parts[0] / "below/ds"
+    around = parts[0].parent
     for out, relation in ((parts[0], "is one of"), (inside, "lies in"), (around, "holds")):
         with pytest.raises(LidarError, match=f"--out {out} {relation} the shard"):
             merge(parts, out)
@@ -251,12 +256,14 @@ TABLE_EDITS = {
 
 @pytest.mark.parametrize("edit", quick(("a foreign number", "seconds"), TABLE_EDITS))
 def test_a_table_of_jobs_is_only_compared(parts, campaigns, tmp_path, edit, slots):
-    table, out = parts[1] / "jobs.csv", tmp_path / "ds"
+    table = parts[1] / "jobs.csv"
+    out = tmp_path / "ds"
     whole = table.read_text()
     table.write_text(TABLE_EDITS[edit](whole))
     assert table.read_text() != whole
     merge(parts, out)
-    made, expected = content(out), content(campaigns("folder") / "one")
+    made = content(out)
+    expected = content(campaigns("folder") / "one")
     notes = json.loads((out / "report.json").read_text())["notes"]
     assert [note[:50] for note in notes] == [f"{table} is damaged or edited: the rows"[:50]]
     for name in ("jobs.csv", "jobs.parquet", *(name for name in made if "jobs/" in name)):
@@ -303,7 +310,8 @@ def test_a_damaged_record_of_a_campaign_is_named_and_made_again(parts, tmp_path,
 
 
 def test_a_manifest_that_names_files_elsewhere_is_damaged(parts, tmp_path):
-    path, out = parts[1] / ".jobs/0001.json", tmp_path / "below/ds"
+    path = parts[1] / ".jobs/0001.json"
+    out = tmp_path / "below/ds"
     (parts[1].parent / "stranger").write_text("of others")
     manifest = json.loads(path.read_text())
     del manifest["crc"]
@@ -423,7 +431,8 @@ def test_shards_are_added_later(parts, campaigns, tmp_path):
 
 
 def test_a_campaign_that_has_grown_is_merged_into_the_same_place(parts, tmp_path, slots):
-    out, file = tmp_path / "ds", parts[0].parent / "c.yaml"
+    out = tmp_path / "ds"
+    file = parts[0].parent / "c.yaml"
     merge(parts, out)
     shutil.copytree(parts[1], tmp_path / "earlier")
     change(file, "count: 7", "count: 9")
@@ -468,7 +477,8 @@ def test_jobs_that_shards_have_retried_stay_done_in_the_data_set(tmp_path, slots
         survey = Survey(Sensor.grid(36, 4), poses=[(0, 0, 1)], noise=Noise(range_m=0.02))
         return Job(Scene.from_meshes([box("Car", (4, 2, 3))]), survey)
 
-    campaign, out = Campaign(make, 2), tmp_path / "ds"
+    campaign = Campaign(make, 2)
+    out = tmp_path / "ds"
     parts = [tmp_path / "part-1", tmp_path / "part-2"]
     with Client(slots, set_as_default=False) as client:
         some = {"client": client, "backend": "numpy"}

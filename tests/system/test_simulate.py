@@ -36,7 +36,8 @@ def test_every_ray_from_within_a_closed_room_hits_its_sides(client):
     assert result.hits == result.rays == survey.ray_count == len(cloud)
     inside = np.abs(cloud.positions) <= [5.005, 4.005, 3.005]
     assert inside.all()
-    axis, side = {0: (0, -5), 1: (0, 5), 2: (1, -4), 3: (1, 4), 4: (2, -3), 5: (2, 3)}, cloud.object
+    axis = {0: (0, -5), 1: (0, 5), 2: (1, -4), 3: (1, 4), 4: (2, -3), 5: (2, 3)}
+    side = cloud.object
     for number, (k, value) in axis.items():
         assert np.abs(cloud.positions[side == number, k] - value).max() <= 0.005 + 1e-9
     # 60 steps of 7 degrees are more than one revolution, so sectors wrap around.
@@ -88,7 +89,8 @@ def queue_sizes(plain, names):
 def test_another_client_watches_the_queues_and_variables_of_the_default_survey(client, plain):
     """Stage 1 is ahead of the driver at the start; stages 3 and 4 are while it handles a frame."""
     job = build(Scenario())
-    sizes, states = Counter(), {}
+    sizes = Counter()
+    states = {}
 
     def look():
         names = Pool.from_client(plain).pipes()
@@ -133,7 +135,8 @@ def test_another_client_watches_the_queues_and_variables_of_the_default_survey(c
 @pytest.mark.every_nth(3)
 @pytest.mark.parametrize("kind", ["scans", "news", "generate-0", "sort-1", "collect-0-2"])
 def test_a_pipe_that_another_client_closes_ends_the_run_with_its_name(client, plain, kind):
-    closed, items = [], []
+    closed = []
+    items = []
 
     def close(_):
         names = [name for name in Pool.from_client(plain).pipes() if name.endswith(f"-{kind}")]

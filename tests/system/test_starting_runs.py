@@ -136,7 +136,8 @@ def test_what_a_starting_run_waits_for_and_what_not(outside, lose_gpu):
 
 
 def test_jobs_that_die_before_their_workers_connect_end_a_run(monkeypatch, tmp_path):
-    jobs, submitted = import_jobqueue().slurm.SLURMJob, []
+    jobs = import_jobqueue().slurm.SLURMJob
+    submitted = []
 
     async def submit(job: object, path: str) -> str:
         submitted.append(path)

@@ -21,7 +21,9 @@ from lidarsim.simulator.rig import Rig
 from lidarview.render.theme import INK, LINE, MUTED, OBJECT_COLOURS, SENSOR
 
 NOISE = Noise(detection_range_m=90)
-SURFACE, AIR, CURVE = "#8b96a5", SENSOR, INK
+SURFACE = "#8b96a5"
+AIR = SENSOR
+CURVE = INK
 TURNS = 20
 
 Real = NDArray[np.float64]
@@ -49,7 +51,8 @@ def page(title: str, weather: dict[str, Any], around_m: float) -> tuple[Figure, 
     """Draw the street from above without and with the weather; return an empty third plot."""
     figure = Figure((13.5, 4.7), dpi=100, layout="constrained")
     clear, wet, right = figure.subplots(1, 3, width_ratios=[1, 1, 1.25])
-    scene, survey = city(20_000), on(survey_without())
+    scene = city(20_000)
+    survey = on(survey_without())
     for axes, options, words in ((clear, {}, "clear air"), (wet, weather, title)):
         cloud = points(scene, replace(survey, **options))
         air = cloud["cause"] == 1

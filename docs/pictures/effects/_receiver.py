@@ -10,7 +10,9 @@ from numpy.typing import NDArray
 from lidarpool import Beams, Noise, Optics, Scene, SceneMesh, Sensor, Spin, Survey
 from lidarsim.simulator.rig import Rig
 
-BLUE, RED, GREY = "#1f5fa8", "#c8502b", "#8a8a8a"
+BLUE = "#1f5fa8"
+RED = "#c8502b"
+GREY = "#8a8a8a"
 WIDE_RAD = 0.01  # beam of the sensors that hear each other
 
 

@@ -111,7 +111,8 @@ def picture(path: Path) -> None:
     made = Beam.of(19, (OVAL[0] / 1000, OVAL[1] / 1000), "gaussian", EXIT_M)
     assert made.starts is not None
     for axis, (label, colour) in enumerate((("across", ROUND), ("up", WIDE))):
-        waist, half = EXIT_M / 2, OVAL[axis] / 2000
+        waist = EXIT_M / 2
+        half = OVAL[axis] / 2000
         widths.loglog(
             ranges, 2e3 * np.hypot(waist, half * ranges), color=colour, lw=1.2,
             label=f"{label}: 2 √(w0² + (θR/2)²)",

@@ -27,7 +27,8 @@ def on(survey: Survey) -> Survey:
 
 def picture(path: Path) -> None:
     """Draw a sign with and without stray light, and the share of rays that receive some."""
-    across, up = np.arange(-4, 4.01, STEP_DEG), np.arange(-3, 3.01, STEP_DEG)
+    across = np.arange(-4, 4.01, STEP_DEG)
+    up = np.arange(-3, 3.01, STEP_DEG)
     grid = np.meshgrid(np.radians(up), np.radians(across), indexing="ij")
     beams = Beams(grid[0].reshape(-1), grid[1].reshape(-1))
     sensor = Sensor(beams, Spin(1, 360), 0.5, 150.0)

@@ -16,13 +16,17 @@ from lidarsim.sensor.optics import Mode
 
 DRAWS = "effect-crosstalk.png"
 NOISE = Noise(detection_range_m=100, crosstalk=True)
-TURNS, FIRINGS, OTHER_HZ = 10, 20_000, 9.63
+TURNS = 10
+FIRINGS = 20_000
+OTHER_HZ = 9.63
 LIGHT_M_NS = 0.299792458
 
 
 def on(survey: Survey) -> Survey:
     """Switch it on, with a second sensor of the same kind, whose scans are cast as well."""
-    sensor, third_ns = survey.sensor, 1e9 / 3 / 10  # of a turn
+    # of a turn
+    sensor = survey.sensor
+    third_ns = 1e9 / 3 / 10
     sensors = [
         Mounted(sensor, name="one", noise=NOISE),
         Mounted(replace(sensor, start_ns=third_ns), Pose((1.5, 0, 0)), name="other"),
@@ -34,7 +38,8 @@ def heard(
     meshes: list[SceneMesh], away: float, wide_mrad: float, mode: Mode = "strongest"
 ) -> dict[str, NDArray[Any]]:
     """Cast a sensor that hears another, so many metres away, in a field of view so wide."""
-    one, other = turning(FIRINGS), turning(FIRINGS - 300, OTHER_HZ, clockwise=True)
+    one = turning(FIRINGS)
+    other = turning(FIRINGS - 300, OTHER_HZ, clockwise=True)
     one = replace(one, optics=replace(one.optics, divergence_mrad=wide_mrad))
     survey = Survey(
         sensors=[
@@ -58,7 +63,9 @@ def picture(path: Path) -> None:
     figure = Figure((9, 3.9), layout="constrained", dpi=110)
     above, counts = figure.subplots(1, 2, width_ratios=[1.25, 1])
     found = heard(room(25, 15), 8.0, 1000 * WIDE_RAD)
-    x, y, wrong = 0.01 * found["x"], 0.01 * found["y"], found["cause"] == 3
+    x = 0.01 * found["x"]
+    y = 0.01 * found["y"]
+    wrong = found["cause"] == 3
     above.plot(x[~wrong], y[~wrong], ".", ms=0.6, color=GREY)
     above.plot(x[wrong], y[wrong], ".", ms=4, color=RED, label=f"{wrong.sum()} pulses of B")
     for place, name in ((-4, "A"), (4, "B")):

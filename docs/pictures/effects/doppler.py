@@ -16,10 +16,13 @@ from lidarview.render.colouring import DIVERGING
 
 DRAWS = "effect-doppler.png"
 DARK = "#3a3f47"
-SPEED, NOISE = 8.0, 0.05  # metres a second: of the sensor's car, and of the measurement
+# metres a second: of the sensor's car, and of the measurement
+SPEED = 8.0
+NOISE = 0.05
 # Start, speed and direction (degrees) of the other cars.
 OTHERS = (((21, 3, 0), 10.0, 180), ((-3, 16, 0), 6.0, -90), ((14, -3, 0), 13.0, 0))
-HEIGHT, REACH = 1.9, 36.0
+HEIGHT = 1.9
+REACH = 36.0
 
 
 def on(survey: Survey) -> Survey:
@@ -57,8 +60,10 @@ def picture(path: Path) -> None:
         noise=Noise(velocity_m_s=NOISE),
     )
     (found,) = Rig(scene.with_actors(cars), survey).cast(0, 36)
-    positions, velocity = found.positions, found.radial_velocity
-    moving, azimuth = found.object >= standing, np.radians(found.azimuth)
+    positions = found.positions
+    velocity = found.radial_velocity
+    moving = found.object >= standing
+    azimuth = np.radians(found.azimuth)
     azimuth = np.degrees((azimuth + np.pi) % (2 * np.pi) - np.pi)
     figure = Figure(figsize=(10.4, 5.0), dpi=90, layout="constrained")
     left, right = figure.subplots(1, 2, width_ratios=(1.12, 1))

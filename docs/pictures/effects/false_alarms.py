@@ -13,7 +13,9 @@ from lidarpool import Material, Noise, Returns, Survey, load_sensor
 
 DRAWS = "effect-false-alarms.png"
 NOISE = Noise(detection_range_m=100, false_alarm_hz=2e4)
-GATE_M, WALL_M, RAYS = 150.0, 90.0, 60_000
+GATE_M = 150.0
+WALL_M = 90.0
+RAYS = 60_000
 LIGHT_M_S = 299_792_458.0
 
 
@@ -38,7 +40,8 @@ def picture(path: Path) -> None:
     above.set_title("one turn of a VLP-16 in a yard, 20 kHz", fontsize=10)
     mean = 2 * NOISE.false_alarm_hz / LIGHT_M_S  # a metre
     edges = np.linspace(0, GATE_M, 31)
-    middle, step = (edges[1:] + edges[:-1]) / 2, edges[1]
+    middle = (edges[1:] + edges[:-1]) / 2
+    step = edges[1]
     for mode, colour, label in (("all", BLUE, "all returns"), ("first", RED, "first returns")):
         seen = shot(
             [wall("W", WALL_M)],

@@ -19,7 +19,8 @@ DRAWS = "effect-faults.png"
 DIRT = Fault("dirt", azimuth_deg=(60, 130), elevation_deg=(-25, 5), transmission=0.3)
 DEAD = Fault("dead_channels", channels=[20, 21, 40])
 LOST = Fault("dropped_packets", share=0.1, packet=16)
-SPEED_M_S, SECONDS = 5.0, 4.0
+SPEED_M_S = 5.0
+SECONDS = 4.0
 
 
 def on(survey: Survey) -> Survey:
@@ -29,7 +30,8 @@ def on(survey: Survey) -> Survey:
 
 def image(survey: Survey) -> np.ndarray:
     """Intensities of a turn, channels by firings; NaN without a return."""
-    first, stop = survey.scan(0).firings[0], survey.scan(survey.scan_count - 1).firings[1]
+    first = survey.scan(0).firings[0]
+    stop = survey.scan(survey.scan_count - 1).firings[1]
     out = np.full((survey.sensor.channels, stop - first), np.nan)
     for found in Rig(city(20_000), survey).cast(0, survey.scan_count):
         out[found.channel, found.firing - first] = found.intensity

@@ -14,7 +14,8 @@ from lidarsim.scene.actors import box
 from lidarsim.sensor.materials import fresnel
 
 DRAWS = "effect-ghosts.png"
-PAINT, DIRT = 0.04, 0.1
+PAINT = 0.04
+DIRT = 0.1
 
 
 def on(survey: Survey) -> Survey:
@@ -70,7 +71,8 @@ def picture(path: Path) -> None:
     degrees = np.arange(8, 88, 4)
     for angle in np.radians(degrees):
         off = np.array([-np.cos(2 * angle), np.sin(2 * angle)])
-        side, off = 0.3 * np.array([-off[1], off[0]]), np.array([10, 0]) + 6 * off
+        side = 0.3 * np.array([-off[1], off[0]])
+        off = np.array([10, 0]) + 6 * off
         edge = 3 * np.array([np.sin(angle), np.cos(angle)])
         glazing = upright("Window", (10 + edge[0], edge[1]), (10 - edge[0], -edge[1]))
         beside = upright("Beside", tuple(off + side), tuple(off - side))

@@ -78,7 +78,8 @@ def ripple(cycles: int) -> tuple[np.ndarray, np.ndarray]:
     """Azimuths of beams, and by how much they are cast beside them: by ranges of a slanted wall."""
     noise = Noise(ripple_deg=NOISE.ripple_deg, ripple_cycles=cycles)
     corner = np.array([[-30, -8, -9], [30, -8, -9], [30, -8, 9], [-30, -8, 9.0]])
-    azimuths, errors_deg = [], []
+    azimuths = []
+    errors_deg = []
     for turn in range(0, 360, 45):
         angle = np.radians(turn)
         spin = np.array([[np.cos(angle), -np.sin(angle), 0], [np.sin(angle), np.cos(angle), 0]])

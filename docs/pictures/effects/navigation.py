@@ -44,7 +44,8 @@ def allan(values: np.ndarray, size: int) -> tuple[float, int]:
 
 def parts(tau: np.ndarray) -> dict[str, np.ndarray]:
     """Allan deviations of the three processes (IEEE Std 952-1997, annex C)."""
-    sigma, time = IMU.gyroscope_bias, IMU.gyroscope_bias_time_s
+    sigma = IMU.gyroscope_bias
+    time = IMU.gyroscope_bias_time_s
     bracket = 1 - time / (2 * tau) * (3 - 4 * np.exp(-tau / time) + np.exp(-2 * tau / time))
     return {
         r"white noise, $N/\sqrt{\tau}$": IMU.gyroscope_noise_density / np.sqrt(tau),

@@ -22,7 +22,8 @@ from lidarsim.simulator.rig import Rig
 from lidarsim.sweeps.sweeps import Sweeps
 
 DRAWS = "effect-range-image.png"
-SKY, LOST = "#dfe5ec", "#e0182d"
+SKY = "#dfe5ec"
+LOST = "#e0182d"
 MATERIALS = (
     *(Material(f"{tree}*", 0.45) for tree in ("Birch", "Maple", "Oak", "Pine", "Spruce")),
     Material("building-*", 0.35),
@@ -80,7 +81,8 @@ def picture(path: Path) -> None:
             np.where(lost, 1.0, np.nan), cmap=ListedColormap([LOST]), extent=extent,
             aspect="auto", interpolation="nearest",
         )  # fmt: skip
-        rays, returned = ranges.size, int(np.isfinite(ranges).sum())
+        rays = ranges.size
+        returned = int(np.isfinite(ranges).sum())
         axes.set_title(
             f"{title}: {rays:,} rays, {returned:,} returns, {int((~hits).sum()):,} hit nothing"
             + (f", {int(lost.sum()):,} lost" if lost.any() else ""),

@@ -33,7 +33,9 @@ def picture(path: Path) -> None:
     figure = Figure((9, 3.7), layout="constrained", dpi=110)
     scatter, walk = figure.subplots(1, 2)
     for name, (material, colour, places) in kinds.items():
-        energies, sigmas, shifts = [], [], []
+        energies = []
+        sigmas = []
+        shifts = []
         for place in places:
             made = [wall("W", place)]
             found = shot(made, ahead(RAYS), NOISE, materials=[material])

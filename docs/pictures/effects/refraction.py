@@ -16,8 +16,13 @@ from lidarview.render.theme import INK, LINE, MUTED, OBJECT_COLOURS
 from lidarview.render.theme import SENSOR as RED
 
 DRAWS = "effect-refraction.png"
-HEIGHT, DEPTH, INDEX, LOSS = 3.0, 2.0, 1.33, 0.15
-FLOOR, WALL, BLUE = 0.4, 0.5, OBJECT_COLOURS[4]
+HEIGHT = 3.0
+DEPTH = 2.0
+INDEX = 1.33
+LOSS = 0.15
+FLOOR = 0.4
+WALL = 0.5
+BLUE = OBJECT_COLOURS[4]
 NADIRS = np.radians(np.linspace(-72, 72, 289))
 SCANNER = Sensor(Beams(np.abs(NADIRS) - np.pi / 2, np.where(NADIRS < 0, np.pi, 0.0)), Spin(1, 360))
 
@@ -79,7 +84,8 @@ def picture(path: Path) -> None:
     section.plot(x, z, ".", ms=5, mew=0, color=RED, zorder=5, label="with refraction")
     angles = np.linspace(0, np.radians(58), 60)
     within = np.arcsin(np.sin(angles) / INDEX)
-    air, water = HEIGHT / np.cos(angles), DEPTH / np.cos(within)
+    air = HEIGHT / np.cos(angles)
+    water = DEPTH / np.cos(within)
     seen = air + INDEX * water
     for side in (-1, 1):
         some = np.abs(HEIGHT * np.tan(angles) + DEPTH * np.tan(within)) < (5 if side < 0 else 2)
@@ -89,7 +95,8 @@ def picture(path: Path) -> None:
         )  # fmt: skip
     for nadir in np.radians([-20, -40]):
         down = np.arcsin(np.sin(nadir) / INDEX)
-        top, foot = HEIGHT * np.tan(nadir), HEIGHT * np.tan(nadir) + DEPTH * np.tan(down)
+        top = HEIGHT * np.tan(nadir)
+        foot = HEIGHT * np.tan(nadir) + DEPTH * np.tan(down)
         section.plot([0, top, foot], [HEIGHT, 0, -DEPTH], color=OBJECT_COLOURS[1], lw=1, zorder=3)
         far = HEIGHT / np.cos(nadir) + INDEX * DEPTH / np.cos(down)
         ends = [top, far * np.sin(nadir)], [0, HEIGHT - far * np.cos(nadir)]
@@ -104,7 +111,8 @@ def picture(path: Path) -> None:
     plain = [box("Water", (-80, -80, -DEPTH - 0.5), (80, 80, 0)), floor]
     angles = np.radians(np.linspace(0, 72, 100))
     within = np.arcsin(np.sin(angles) / INDEX)
-    air, water = HEIGHT / np.cos(angles), DEPTH / np.cos(within)
+    air = HEIGHT / np.cos(angles)
+    water = DEPTH / np.cos(within)
     tilt = np.cos(angles) / np.cos(within)
     area = (water + INDEX * air) * (tilt * water + INDEX * air / tilt)
     passes = 1 - fresnel(np.cos(angles), INDEX)

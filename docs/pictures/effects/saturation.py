@@ -48,7 +48,8 @@ def _told_apart(name: str, place: float) -> tuple[float, float]:
     """Signal over saturation of a plate before a wall, and how far behind it that is seen."""
     beam = Returns("all", subrays=61, divergence_mrad=1)
     options = {"materials": MATERIALS[name], "returns": beam, "columns": COLUMNS}
-    near, far = 0.1, 10.0
+    near = 0.1
+    far = 10.0
     while far - near > 0.005:
         behind = (near + far) / 2
         meshes = [wall(name, place, y=(-50, 0.0)), wall("Wall", place + behind)]

@@ -29,7 +29,9 @@ from lidarsim.sensor.weather import spray
 
 DRAWS = "effect-spray.png"
 WEATHER = {"wet": 1.0, "spray_g_m3": 20.0}
-NOISE, SPEED, SPRAY = Noise(detection_range_m=90), 25.0, 6
+NOISE = Noise(detection_range_m=90)
+SPEED = 25.0
+SPRAY = 6
 
 
 def on(survey: Survey) -> Survey:
@@ -73,7 +75,9 @@ def picture(path: Path) -> None:
     views["above"].set_title("a lorry at 90 km/h, 20 g/m³, from above", fontsize=10)
     views["aside"].set_title("from the side", fontsize=10)
     # Beams across the way, 8 m from its middle, at places behind the lorry.
-    count, behind, shares = 4000, np.arange(0.5, 28, 0.75), []
+    count = 4000
+    behind = np.arange(0.5, 28, 0.75)
+    shares = []
     ahead = Sensor(Beams(np.zeros(count), np.full(count, math.pi / 2)), Spin(1, 360), 0.5, 60.0,
                    optics=Optics(divergence_mrad=3.0))  # fmt: skip
     rear = replace(scene, actors=(lorry("Lorry", (4.5, 8), -1.5),))
@@ -90,7 +94,8 @@ def picture(path: Path) -> None:
         shares.append((cloud(rear, one)["cause"] == SPRAY).sum() / count)
     axes = views["right"]
     axes.plot(behind, shares, "o", ms=4, color=BLUE, label="simulated")
-    kind, air = spray(20.0), one.air(0)
+    kind = spray(20.0)
+    air = one.air(0)
     span = np.linspace(8 - 1.25, 8 + 1.25, 200)
     most = float(np.trapezoid(air.rate(kind, NOISE.threshold, span), span))
     along = np.linspace(0, 28, 1000)

@@ -19,9 +19,12 @@ from lidarsim.simulator.rig import Rig
 from lidarview.render.theme import INK, LINE, MUTED, OBJECT_COLOURS
 
 DRAWS = "effect-vegetation.png"
-DENSITY, HIGH = 0.6, 3.0  # m²/m³, and metres of a canopy: a leaf area index of 1.8
+# m²/m³, and metres of a canopy: a leaf area index of 1.8
+DENSITY = 0.6
+HIGH = 3.0
 KINDS = {"planophile": 0, "spherical": 2, "erectophile": 1}
-GREEN, BROWN = OBJECT_COLOURS[2], OBJECT_COLOURS[7]
+GREEN = OBJECT_COLOURS[2]
+BROWN = OBJECT_COLOURS[7]
 RAYS = 50_000
 
 Real = NDArray[np.float64]
@@ -58,7 +61,8 @@ def section(axes: Any, leaves: Material, title: str) -> None:
     """Draw a slice of a tree from the side; the sensor is 9 m to the left."""
     head = Beams(np.radians(np.linspace(-14, 50, 160)))
     scan = cast(tree(), Sensor(head, Spin(2400, 360)), (-9, 0, 2), [leaves, Material("*", 0.3)])
-    place, which = scan.positions, scan.object
+    place = scan.positions
+    which = scan.object
     slice_ = (np.abs(place[:, 1]) < 0.6) & (place[:, 0] < 9)
     for number, colour in ((2, MUTED), (0, GREEN), (1, BROWN)):
         some = slice_ & (which == number)
@@ -88,14 +92,17 @@ def picture(path: Path) -> None:
     """Draw it."""
     figure = Figure((13.5, 5.2), dpi=100, layout="constrained")
     grid = figure.add_gridspec(2, 3, width_ratios=[1.05, 1, 1])
-    above, below = figure.add_subplot(grid[0, 0]), figure.add_subplot(grid[1, 0])
-    gaps, depths = figure.add_subplot(grid[:, 1]), figure.add_subplot(grid[:, 2])
+    above = figure.add_subplot(grid[0, 0])
+    below = figure.add_subplot(grid[1, 0])
+    gaps = figure.add_subplot(grid[:, 1])
+    depths = figure.add_subplot(grid[:, 2])
     section(above, Material("Crown", 0.5), "solid crown, a slice of 1.2 m")
     leaves = Material("Crown", 0.5, leaf_area_density=0.6)
     section(below, leaves, "leaves, 0.6 m²/m³")
     below.set(xlabel="x (m)")
 
-    zeniths, tilts = np.linspace(0, 80, 81), np.arange(0, 81, 10.0)
+    zeniths = np.linspace(0, 80, 81)
+    tilts = np.arange(0, 81, 10.0)
     for kind, colour in KINDS.items():
         cosine = np.cos(np.radians(zeniths))
         tau = projection(kind, cosine) * DENSITY * HIGH / cosine

@@ -14,7 +14,11 @@ from lidarview.render.colouring import DIVERGING
 
 DRAWS = "effect-walkers.png"
 PERSON = Path(__file__).parents[3] / "examples" / "pedestrian.glb"
-AWAY, SPEED, SECONDS, RATE_HZ = 9.0, 1.4, 2.2, 25  # m at first, m/s towards the sensor
+# m at first, m/s towards the sensor
+AWAY = 9.0
+SPEED = 1.4
+SECONDS = 2.2
+RATE_HZ = 25
 DARK = "#3a3f47"
 
 

@@ -27,7 +27,8 @@ def picture(path: Path) -> None:
     views = figure.subplot_mosaic([["dry", "right"], ["wet", "right"]], width_ratios=[1.5, 1])
     corners = np.array([[-90, -90, -2], [90, -90, -2], [90, 90, -2], [-90, 90, -2.0]])
     road = SceneMesh("Road", corners, np.array([[0, 1, 2], [0, 2, 3]]))
-    sign, house = wall("Sign", 9, (-0.6, 0.6), (0.3, 1.3)), wall("House", 30, z=(-2, 3))
+    sign = wall("Sign", 9, (-0.6, 0.6), (0.3, 1.3))
+    house = wall("House", 30, z=(-2, 3))
     scene = Scene.from_meshes([road, sign, house])
     beams = Beams(np.radians(np.arange(-60, 8.5, 0.2)))
     survey = Survey(
@@ -37,8 +38,10 @@ def picture(path: Path) -> None:
         precision_m=0.001,
     )  # fmt: skip
     for name, share in (("dry", 0.0), ("wet", 1.0)):
-        found, axes = cloud(scene, replace(survey, wet=share)), views[name]
-        x, z = found["x"], found["z"] + 2
+        found = cloud(scene, replace(survey, wet=share))
+        axes = views[name]
+        x = found["x"]
+        z = found["z"] + 2
         ghost = found["cause"] == 5
         for which, colour, label in ((~ghost, GREY, "surfaces"), (ghost, RED, "ghosts")):
             shown = f"{label}: {which.sum():,}"
@@ -52,7 +55,8 @@ def picture(path: Path) -> None:
             shown = once["reflectance"][:: len(x) // 400]
             views["right"].plot(steep, shown, "o", ms=4, color=BLUE)
     angle = np.radians(np.linspace(0, 89.5, 400))
-    dry, axes = ROAD * np.cos(angle), views["right"]
+    dry = ROAD * np.cos(angle)
+    axes = views["right"]
     axes.plot(np.degrees(angle), dry, color=GREY, label="dry: ρ cos θ")
     wet = dry * below_water(np.cos(angle), np.full(len(angle), ROAD))
     axes.plot(np.degrees(angle), wet, color=BLUE, label="wet: ρ cos θ T² / (n² (1 − p ρ))")

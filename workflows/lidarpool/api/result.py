@@ -26,7 +26,8 @@ if TYPE_CHECKING:
 
 # In a notebook: what is drawn of a result, and how large in pixels; scaled down by much, their
 # letters could not be read.
-_SHOWN, _SIZE = ("hits", "cloud"), (800, 500)
+_SHOWN = ("hits", "cloud")
+_SIZE = (800, 500)
 
 
 @dataclass(frozen=True, eq=False, repr=False)

@@ -30,7 +30,8 @@ def start_fork_server() -> bool:
     if sys.platform != "linux":
         return False
     server: Any = forkserver._forkserver
-    preload, before = server._preload_modules, dict(os.environ)
+    preload = server._preload_modules
+    before = dict(os.environ)
     server.set_forkserver_preload(["lidarpool.run.pipeline.forked"])
     os.environ.update(_ENVIRONMENT)
     try:

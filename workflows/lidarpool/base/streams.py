@@ -14,7 +14,8 @@ class Unheard:
     """
 
     def __init__(self, stream: TextIO, gone: type[OSError] = OSError) -> None:
-        self._stream, self._gone = stream, gone
+        self._stream = stream
+        self._gone = gone
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self._stream, name)

@@ -68,10 +68,12 @@ def run_scenario(
         return
     assert options.out is not None, "commands write"
     more = {"plans": not no_plan, "extent": extent or "page", "scans": job.survey.scan_count}
-    jobs, output = OneJob(job, shard), Kept({**made_of, **more})
+    jobs = OneJob(job, shard)
+    output = Kept({**made_of, **more})
     with result_folder(options.out), page_of(jobs, options.live) as page:
         result = Run(jobs, options, output, terminal, page).execute()
-    points, lines = len(result.points), [*terminal.notes(result.notes)]
+    points = len(result.points)
+    lines = [*terminal.notes(result.notes)]
     words = shard_in_words(str(shard))
     lines.append(f"{words} in {options.out}: {plural(points, 'point')}, for lidarpool merge")
     told = {"folder": str(options.out), "shard": str(shard), "points": points}
@@ -160,7 +162,8 @@ def run_job(
     other software, or its files there are damaged.
     """
     assert options.out is not None, "commands write"
-    place, name = Storage.at(options.out), campaign.name(number)
+    place = Storage.at(options.out)
+    name = campaign.name(number)
     dataset = DataSet(place, **asdict(campaign.keep))
     of_dataset = CAMPAIGN_FILE in place.entries()
     if of_dataset:
@@ -170,7 +173,8 @@ def run_job(
         options = replace(options, out=out, folder=Storage.at(out).below(RUN_FOLDER))
     scenario = campaign.scenario(number)
     assert scenario is not None, "of a file"
-    built, job = build(scenario, plans=False), campaign.job(number, columns=dataset.columns)
+    built = build(scenario, plans=False)
+    job = campaign.job(number, columns=dataset.columns)
     for warning in implausibilities(built):
         terminal.warn(warning)
 

@@ -32,7 +32,8 @@ if TYPE_CHECKING:
     from ..scenario.scenario import Scenario
 
 MOST_COPIED = 20_000_000  # triangles of files that cannot share them
-PLAN_FILE, PICTURE_FILE = "stations.yaml", "stations.png"
+PLAN_FILE = "stations.yaml"
+PICTURE_FILE = "stations.png"
 _OBJECTS_TOLD = 12
 
 
@@ -72,15 +73,18 @@ def init(folder: Path, meshes: tuple[Path, ...], of_mesh: dict[str, Any], every:
 
     if not meshes and {"unit", "up_axis"} & of_mesh.keys():
         raise click.UsageError("--unit and --up-axis say how to read a mesh: name it with --mesh.")
-    target, data = folder / SCENARIO_FILE, mesh_data(meshes, folder, of_mesh)
-    note, notes = "", []
+    target = folder / SCENARIO_FILE
+    data = mesh_data(meshes, folder, of_mesh)
+    note = ""
+    notes = []
     if data and not target.exists():
         # From here: the scenario's folder need not be there yet.
         read = Scenario.from_data(mesh_data(meshes, Path(), of_mesh), source=str(target))
         built = build(read, plans=False)
         notes = advice(built)
         if (placing := built.placing) is not None:
-            note, data["poses"] = placing.note, [as_entry(pose) for pose in placing.poses]
+            note = placing.note
+            data["poses"] = [as_entry(pose) for pose in placing.poses]
             data |= {"sensor": dict(placing.grid)} if placing.grid else {}
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -455,7 +459,8 @@ def _row(name: str) -> tuple[str, ...]:
         view = f"360° x {min(beams.elevation_deg):.1f}° to {max(beams.elevation_deg):.1f}°"
     if model.typical:
         view += ", typical"
-    turns, points = " to ".join(f"{one:g}" for one in rates), f"{firings * rate * channels:,.0f}"
+    turns = " to ".join(f"{one:g}" for one in rates)
+    points = f"{firings * rate * channels:,.0f}"
     return name, f"{channels:,}", view, f"{low:g} to {high:g} m", turns, points
 
 
@@ -522,7 +527,8 @@ def stations(
       lidarpool stations hall.glb --sensor riegl-vz400 --coverage 95%
       lidarpool stations hall/scenario.yaml --sensor riegl-vz400 --count 6 --out hall/stations
     """  # noqa: D301 - click wants the character, not its name
-    count, coverage = given["count"], given["coverage"]
+    count = given["count"]
+    coverage = given["coverage"]
     if count is not None and coverage is not None:
         raise click.UsageError("--count and --coverage both say when to stop: give one of them.")
     from lidarsim.sensor.models import full_name, load_sensor
@@ -541,7 +547,8 @@ def stations(
         raise LidarError(f"{there[0]} exists: give another folder, --out, or --overwrite.")
     model = full_name(model)
     sensor = load_sensor(model)
-    read, terminal = Scenario.load(scene), Terminal(quiet=as_json)
+    read = Scenario.load(scene)
+    terminal = Terminal(quiet=as_json)
     with terminal.status("reading the scene", logged=False):
         built = build(read, plans=False)
     with terminal.status("looking from all places", logged=False):
@@ -639,7 +646,8 @@ def _plan_lines(plan: StationPlan, names: tuple[str, ...]) -> Iterator[str]:
     wide = max(6, *(len(label) for label, _ in groups))
     yield f"{'object':<{wide}}  can be seen   covered"
     for label, those in groups:
-        visible, covered = plan.visible_m2[those].sum(), plan.covered_m2[those].sum()
+        visible = plan.visible_m2[those].sum()
+        covered = plan.covered_m2[those].sum()
         yield f"{label:<{wide}} {visible:9,.1f} m² {covered / visible:9.1%}"
     blind = len(names) - len(order)
     if blind:

@@ -151,8 +151,10 @@ class PlainLines:
         if due:
             least, most = PLAIN_EVERY_S
             self._next = now + min(max(least, now / 10), most)
-        scans, done = progress.scans, min(progress.collected, progress.framed)
-        whole, trials = f"{scans:,} scans, {progress.points:,} points", progress.trials
+        scans = progress.scans
+        done = min(progress.collected, progress.framed)
+        whole = f"{scans:,} scans, {progress.points:,} points"
+        trials = progress.trials
         for what, count, total, unit, all_ in (
             ("survey", done, scans, f"scans, {progress.points:,} points", whole),
             ("planning", progress.trials_done, trials, "trials", f"{trials:,} trials"),

@@ -224,12 +224,15 @@ class StoredCloud(Shown):
             if rows <= first:
                 first -= rows
                 continue
-            cloud, first = self.cloud_of(read_part(self.storage, name), slice(first, None)), 0
+            cloud = self.cloud_of(read_part(self.storage, name), slice(first, None))
+            first = 0
             self.tell(len(cloud))
             while count + len(cloud) >= points:
                 cut = points - count
                 yield Cloud.joined([*held, cloud[:cut]])
-                cloud, held, count = cloud[cut:], [], 0
+                cloud = cloud[cut:]
+                held = []
+                count = 0
             if len(cloud):
                 held.append(cloud)
                 count += len(cloud)
@@ -251,7 +254,8 @@ class StoredCloud(Shown):
         opened = [filled[i] for i in even_indices(len(filled), parts)]
         total = sum(self.rows[i] for i in opened)
         picked = even_indices(total, most)
-        clouds, before = [], 0
+        clouds = []
+        before = 0
         for i in opened:
             inside = picked[(picked >= before) & (picked < before + self.rows[i])] - before
             before += self.rows[i]

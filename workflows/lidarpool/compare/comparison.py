@@ -39,13 +39,20 @@ RESIDUALS = ("bias_m", "rmse_m", "median_m", "mad_m", "p05_m", "p95_m")
 # Points (n, 3) of a cloud, and their distances (n,) to the other.
 Above = tuple[Floats, Floats]
 WIDTH = 1600
-LEFT, RIGHT = 0.075, 0.845  # of charts, as shares of the width
+# of charts, as shares of the width
+LEFT = 0.075
+RIGHT = 0.845
 MOST_DOTS = 120_000
-A, B = "#4477aa", "#ee7733"
-ONLY_A, ONLY_B = theme.rgb("#2ca25f"), theme.rgb("#101418")  # no colours of residuals
+A = "#4477aa"
+B = "#ee7733"
+# no colours of residuals
+ONLY_A = theme.rgb("#2ca25f")
+ONLY_B = theme.rgb("#101418")
 NONE = theme.rgb("#c8cbd0")  # within images, whatever the page's colours
 LACKS = ("only A has a return", "only B has a return", "no return")
-RANGES, DIFFERENCES, FAR = "viridis", "RdBu_r", "plasma"
+RANGES = "viridis"
+DIFFERENCES = "RdBu_r"
+FAR = "plasma"
 SCALE = 6.0  # end of the scale of residuals, in median absolute deviations: about four sigma
 CELLS = ("in_both", "in_a_only", "in_b_only", "returns_in_both")  # without a return, or with
 CLOSEST_M = 0.001  # end of the scale of distances
@@ -271,7 +278,8 @@ class _Comparing:
         for text in images.notes:
             self.note(text)
         self.images = self.images or images
-        row, values = images.row, images.compared
+        row = images.row
+        values = images.compared
         in_a, in_b = np.isfinite(values[:, 0])
         neither, _ = np.nonzero(~images.there[0] & ~images.there[1])
         states = [neither, row[~in_a & in_b], row[in_a & ~in_b], row[in_a & in_b]]
@@ -296,12 +304,15 @@ class _Comparing:
         (to_b, *of_points), (to_a, *_) = (
             tuple(map(np.concatenate, zip(*found, strict=True))) for found in self.pairs
         )
-        residuals, image, of = np.empty(0), None, "nearest points"
+        residuals = np.empty(0)
+        image = None
+        of = "nearest points"
         mine, theirs = (light[to_b <= self.within[0]] for light in of_points)
         if self.images is not None:
             cells = tuple(map(np.concatenate, zip(*self.cells, strict=True)))
             residuals, rings, mine, theirs = cells
-            image, of = self._of_images(residuals, rings), self.images.paired_by
+            image = self._of_images(residuals, rings)
+            of = self.images.paired_by
         known = np.isfinite(mine) & np.isfinite(theirs)
         lights = mine[known], theirs[known]
         correlation = rank_correlation(*lights)
@@ -369,7 +380,8 @@ def _residuals(values: Floats) -> dict[str, Any]:
     if not len(values):
         return {"cells": 0, **dict.fromkeys(RESIDUALS)}
     low, median, high = np.quantile(values, (0.05, 0.5, 0.95)).tolist()
-    mad, rmse = np.median(np.abs(values - median)), np.sqrt(np.mean(values**2))
+    mad = np.median(np.abs(values - median))
+    rmse = np.sqrt(np.mean(values**2))
     figures = map(float, (values.mean(), rmse, median, mad, low, high))
     return {"cells": len(values), **dict(zip(RESIDUALS, figures, strict=True))}
 
@@ -405,7 +417,9 @@ def draw_ranges(found: Comparison) -> Page:
     assert images is not None
     rows = len(images.rings)
     high = int(np.clip(2.2 * rows, 90, 300))  # pixels of an image
-    top, gap, below = 150, 62, 90
+    top = 150
+    gap = 62
+    below = 90
     height = top + 3 * high + 2 * gap + below
     page = Page((WIDTH, height))
     page.title(
@@ -427,7 +441,8 @@ def draw_ranges(found: Comparison) -> Page:
         else:
             painted = theme.mapped(DIFFERENCES, scale(1000 * np.nan_to_num(residual)).data)
             painted[~in_a & ~in_b] = NONE
-            painted[in_a & ~in_b], painted[~in_a & in_b] = ONLY_A, ONLY_B
+            painted[in_a & ~in_b] = ONLY_A
+            painted[~in_a & in_b] = ONLY_B
             axes.set_xlabel("azimuth, °")
             for text, colour in zip(LACKS, (ONLY_A, ONLY_B, NONE), strict=True):
                 axes.plot([], [], "s", color=colour, ms=4, label=text)
@@ -542,7 +557,8 @@ def draw_above(found: Comparison) -> Page:
     low = np.min([np.quantile(points[:, :2], 0.01, axis=0) for points, _ in above], axis=0)
     high = np.max([np.quantile(points[:, :2], 0.99, axis=0) for points, _ in above], axis=0)
     side = 1.06 * max(float((high - low).max()), 1e-3) / 2
-    wide, tall = 0.36, 0.36 * WIDTH / height
+    wide = 0.36
+    tall = 0.36 * WIDTH / height
     everything = np.concatenate([distances for _, distances in above])
     most = max(float(np.quantile(everything, 0.99)), 10 * CLOSEST_M)
     least = max(CLOSEST_M, min(float(np.quantile(everything, 0.05)), most / 10))

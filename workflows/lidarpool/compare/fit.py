@@ -49,7 +49,9 @@ _CHARTS = {
     "uneven_deg": ("elevation, °", "spread of azimuths, 0.001°", 1000),
 }
 _RANGES = ("range_m", "range_per_m", "range_at_threshold_m")  # noise of ranges
-_FEW, _POINTS = 30, 14  # rays that a figure or a point of a curve needs; points of a curve
+# rays that a figure or a point of a curve needs; points of a curve
+_FEW = 30
+_POINTS = 14
 _AIM = 0.002  # scatter of directions that does not make outliers before it is known, radians
 _LEAST_M = 0.001  # error of the mean range of a ray, however often it is measured
 _HEAD_M = 0.1  # how far from zero the beams of a head may meet
@@ -61,38 +63,67 @@ _REPEATED = 0.8  # least share of a ray's returns that belong to one surface
 _STILL_M = 0.02  # shift of a sensor, metres, from which on it moves
 _STILL_RAD = 0.003  # the same of its yaw
 _CHANGED_M = 0.1  # median change of ranges, from sweep to sweep, of a place that changes
-_DRIFT, _DRIFT_M = 1.5, 0.002  # growth of changes over many sweeps from which on ranges drift
+# growth of changes over many sweeps from which on ranges drift
+_DRIFT = 1.5
+_DRIFT_M = 0.002
 _CALM = 0.8  # share of the changes, the smallest ones, that tell the scatter
 _AGREEING = 0.5  # least share of the rays that a motion changes and explains
-_PAIRS, _YAW_M = 8, 10.0  # pairs of sweeps for the motion; distance at which yaw counts, metres
-_ROUGH_M, _SHIFT_M = 0.02, 0.5  # noise of ranges, and motion, for which rays are weighted, metres
+# pairs of sweeps for the motion; distance at which yaw counts, metres
+_PAIRS = 8
+_YAW_M = 10.0
+# noise of ranges, and motion, for which rays are weighted, metres
+_ROUGH_M = 0.02
+_SHIFT_M = 0.5
 _AROUND = 5  # rays on either side whose scatter counts
 _SELDOM = 0.3  # a cell that returns in fewer sweeps tells no gap
 _CHANCE = -16.0  # logarithm of the chance of a run of lost pulses that is a gap instead
-_KINK_M, _KINK = 0.01, 0.001  # by how much a surface may leave its plane within four columns
+# by how much a surface may leave its plane within four columns
+_KINK_M = 0.01
+_KINK = 0.001
 _SIGMAS = 6.0  # a return beyond these is of something that moves
 _STEEPEST = 5.7  # tangent of incidence: beyond, a beam meets several surfaces
-_BESIDE_M, _BESIDE = 0.3, 0.5  # how far surfaces may be from the scene's, and share of these
+# how far surfaces may be from the scene's, and share of these
+_BESIDE_M = 0.3
+_BESIDE = 0.5
 _FOREIGN = 0.1  # share of a sweep's points in rings of no other sweep, of another sensor
 _OTHER_DEG = 2.0  # a ring that is farther from all beams of a model is not one of them
-_CERTAIN, _Z = 0.95, 1.959964  # probability of intervals, and its quantile
+# probability of intervals, and its quantile
+_CERTAIN = 0.95
+_Z = 1.959964
 _STEP = 1e-3  # of logarithms, for derivatives
 # Chances of a variance above which a ray is left out: certainly, and at most.
-_REJECTED, _TRIMMED = 1e-4, 0.1
-_PATCH_ROWS, _PATCHES = 4, 36  # rings of a patch of rays; patches of a turn
+_REJECTED = 1e-4
+_TRIMMED = 0.1
+# rings of a patch of rays; patches of a turn
+_PATCH_ROWS = 4
+_PATCHES = 36
 _FRONTAL = 1.0  # tangent of incidence: below, noise is hardly that of directions
-_FRONTAL_RAYS, _FRONTAL_SHARE = 100, 0.05  # least number, and share, of such rays
+# least number, and share, of such rays
+_FRONTAL_RAYS = 100
+_FRONTAL_SHARE = 0.05
 _KNOWN = 0.75  # half of the interval of a figure of noise, over its value, at most
 _WRONG = 0.03  # relative error of the variances of steep or far rays
 _OUTLIER = 3.0  # quotient of a variance and the expected one that counts at most
-_SPAN, _TILT = 2.0, 0.3  # least quotient of ranges, and tangent of incidence, that tell noise
-_WEAK_RAYS, _RING_RAYS = 30, 20  # rays with losses that a threshold needs; that of a ring's bias
+# least quotient of ranges, and tangent of incidence, that tell noise
+_SPAN = 2.0
+_TILT = 0.3
+# rays with losses that a threshold needs; that of a ring's bias
+_WEAK_RAYS = 30
+_RING_RAYS = 20
 # Rings and degrees of azimuth around a ray into the sky of which no ray returns twice: in smaller
 # gaps between leaves, leaves return once.
-_SKY_RINGS, _SKY_DEG = 7, 36.0
+_SKY_RINGS = 7
+_SKY_DEG = 36.0
 _SKY_PULSES = 1000  # pulses into the sky that a share of false alarms needs
-_PLANES, _PLANE_M, _PLANE_RAYS, _PLANE_POINTS, _EVEN, _GAP = 8, 0.05, 300, 20_000, 0.4, 0.1
-_FAR_SIGMAS, _NEAR_SIGMAS = 4.0, 2.0  # beyond, points are not of their planes
+_PLANES = 8
+_PLANE_M = 0.05
+_PLANE_RAYS = 300
+_PLANE_POINTS = 20_000
+_EVEN = 0.4
+_GAP = 0.1
+# beyond, points are not of their planes
+_FAR_SIGMAS = 4.0
+_NEAR_SIGMAS = 2.0
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -163,7 +194,10 @@ def fit(
     if not isinstance(recording, Recording):
         recording = open_recording(recording, sensor, intensity, name="the recording")
     repeats = Repeats.read(recording)
-    sigma, count, curves, expected = repeats.sigma.copy(), len(repeats.ranges), {}, None
+    sigma = repeats.sigma.copy()
+    count = len(repeats.ranges)
+    curves = {}
+    expected = None
     if scene is not None:
         expected = _cast(repeats, scene if isinstance(scene, Scene) else Scene.load(scene), pose)
         off = np.abs(_median(repeats.ranges, 0) - expected)
@@ -188,15 +222,18 @@ def fit(
             found, sigma[rays.row, rays.column] = fit_performance(repeats, rays, energy)
     aim = np.radians(found["angle_deg"].value) if "angle_deg" in found else 0.0
     tilted = np.where(rays.freedom > 0, rays.variance, np.nan)
-    own, light = tilted - (aim * rays.slope) ** 2, rays.light if energy is None else energy
+    own = tilted - (aim * rays.slope) ** 2
+    light = rays.light if energy is None else energy
     curves["noise_by_range"] = _curve(rays.distance, own, 0.5)
     curves["noise_by_light"] = _curve(light, own, 0.5)
     curves["noise_by_tilt"] = _curve(np.degrees(np.arctan(rays.slope / rays.distance)), tilted, 0.5)
     curves["returned_by_light"] = _curve(light, rays.returns / rays.trials) if count > 1 else []
     curves["light_by_range"] = _curve(rays.distance, rays.light)
-    base, name = read_model(model) if model else _recorded(repeats), Path(recording.name).name
+    base = read_model(model) if model else _recorded(repeats)
+    name = Path(recording.name).name
     source = f"fitted by lidarpool {__version__} to {name}, {plural(repeats.sweeps, 'sweep')}"
-    fitted, notes = _with(base, found, source) if found else base, list(repeats.notes)
+    fitted = _with(base, found, source) if found else base
+    notes = list(repeats.notes)
     off = np.abs(repeats.elevation_deg[:, None] - (base.beams.elevation_deg or np.inf))
     if not base.needs_calibration and off.min(axis=1).max() > _OTHER_DEG:
         notes.append(f"the recorded rings are not those of {base.name}: check --model")
@@ -314,7 +351,8 @@ class Repeats:
 
         LidarError if it has no sweeps with points and rings, or they are of several sensors.
         """
-        name, notes = recording.name, list(recording.notes)
+        name = recording.name
+        notes = list(recording.notes)
         if recording.thinned:
             raise LidarError(f"{notes[0]}.")
         if recording.whole or not recording.count:
@@ -368,7 +406,8 @@ class Repeats:
             np.nansum(one, axis=0) / np.maximum(np.isfinite(one).sum(axis=0), 1)
             for one in (aside, risen)
         )
-        turned, up = first + mean, np.radians(level) + rise
+        turned = first + mean
+        up = np.radians(level) + rise
         ways = [np.cos(up) * np.cos(turned), np.cos(up) * np.sin(turned), np.sin(up)]
         sigma = rough_scatter(values[0])
         repeats = cls(
@@ -393,7 +432,8 @@ def rough_scatter(ranges: Floats32) -> Floats:
     Surfaces that are weak or steep scatter more than others of a ring.
     """
     changes = np.abs(np.diff(ranges, axis=0)) / (0.6745 * np.sqrt(2))
-    ring, ray = _median(changes, (0, 2))[:, None], _median(changes, 0)
+    ring = _median(changes, (0, 2))[:, None]
+    ray = _median(changes, 0)
     reach = range(-_AROUND, _AROUND + 1)
     around = _median(np.stack([np.roll(ray, by, axis=1) for by in reach]), 0)
     ring = np.where(np.isnan(ring), _KINK_M, np.maximum(ring, 1e-4))
@@ -411,7 +451,8 @@ class Surfaces(NamedTuple):
 
 def surfaces(repeats: Repeats, distance: Floats, blur: Floats) -> Surfaces:
     """Find slopes and edges of a range image (r, c), whose ranges have errors of `blur` metres."""
-    points, rows = distance[..., None] * repeats.directions, np.arange(len(distance))
+    points = distance[..., None] * repeats.directions
+    rows = np.arange(len(distance))
     with np.errstate(invalid="ignore", divide="ignore"):
         beams = points - _meeting(points)
         length = np.linalg.norm(beams, axis=-1, keepdims=True)
@@ -426,7 +467,8 @@ def surfaces(repeats: Repeats, distance: Floats, blur: Floats) -> Surfaces:
         slope = np.linalg.norm(change, axis=-1)
         allowed = _KINK_M + _KINK * distance + 5 * blur
         smooth = (slope < _STEEPEST * distance) & (distance > _NEAREST_M)
-        near, wide = (ahead + back) / 2, (far + rear) / 2
+        near = (ahead + back) / 2
+        wide = (far + rear) / 2
         for beside, times in ((near, 1), (wide, 2), (above, 2), (below, 2)):
             smooth &= np.abs(((beside - points) * normal).sum(axis=-1)) < times * allowed
     turn = change[..., 1] * ways[..., 0] - change[..., 0] * ways[..., 1]
@@ -568,7 +610,8 @@ def sensor_motion(repeats: Repeats, first: int, second: int) -> SensorMotion:
     plane, chosen, change = range_changes(repeats, first, second)
     if chosen.sum() < _FEW:
         return SensorMotion(0.0, 0.0)
-    change, far = change[chosen], distance[chosen]
+    change = change[chosen]
+    far = distance[chosen]
     # Normals are of points two columns away on either side: those of near points are inexact.
     inexact = _ROUGH_M / (np.sqrt(10) * far * 2 * np.pi / distance.shape[1])
     noise = np.hypot(_ROUGH_M + _KINK * far, _SHIFT_M * inexact)
@@ -584,7 +627,8 @@ def sensor_motion(repeats: Repeats, first: int, second: int) -> SensorMotion:
         told = np.abs(explained) > limit
         if told.sum() < _FEW or (off < np.abs(explained) / 2)[told].mean() < _AGREEING:
             continue
-        shift_m, yaw_rad = float(np.linalg.norm(motion[:3])), float(abs(motion[3])) / _YAW_M
+        shift_m = float(np.linalg.norm(motion[:3]))
+        yaw_rad = float(abs(motion[3])) / _YAW_M
         return SensorMotion(
             shift_m if shift_m > _STILL_M else 0.0, yaw_rad if yaw_rad > _STILL_RAD else 0.0
         )
@@ -614,8 +658,10 @@ def _rigid_motion(design: Floats, change: Floats, noise: Floats) -> Floats:
 def _meeting(points: Floats) -> Floats:
     """Where the beams of each row of points (r, c, 3) meet, (r, 1, 3): on the axis, near zero."""
     with warnings.catch_warnings(action="ignore"):
-        far, up = np.hypot(points[..., 0], points[..., 1]), points[..., 2]
-        middle, off = np.nanmean(far, axis=1), far - np.nanmean(far, axis=1, keepdims=True)
+        far = np.hypot(points[..., 0], points[..., 1])
+        up = points[..., 2]
+        middle = np.nanmean(far, axis=1)
+        off = far - np.nanmean(far, axis=1, keepdims=True)
         tangent = np.nansum(off * up, axis=1) / np.nansum(off**2, axis=1)
         height = np.nanmean(up, axis=1) - tangent * middle
     known = np.abs(height) < _HEAD_M  # also false of NaN
@@ -645,7 +691,8 @@ def smooth_rays(
     explain are left out, and rays with many of them. Slopes are those of a scene's ranges
     `expected` (r, c), if they are known.
     """
-    middle, there = _median(repeats.ranges, 0), np.isfinite(repeats.ranges).sum(axis=0)
+    middle = _median(repeats.ranges, 0)
+    there = np.isfinite(repeats.ranges).sum(axis=0)
     blur = repeats.sigma / np.sqrt(np.maximum(there, 1))
     turn, slope, smooth, _ = surfaces(repeats, middle, blur)
     if expected is not None:
@@ -657,7 +704,8 @@ def smooth_rays(
     images = repeats.ranges, repeats.light, repeats.aside
     ranges, light, aside = (one[:, row, column].astype(np.float64) for one in images)
     ranges -= turn[cell] * aside
-    slope, returns = slope[cell], there[cell]
+    slope = slope[cell]
+    returns = there[cell]
     limit = np.where(returns > 1, _SIGMAS * np.hypot(sigma[cell], aim * slope), np.inf)
     kept = np.abs(ranges - middle[cell]) <= limit
     used = kept.sum(axis=0)
@@ -685,7 +733,8 @@ def fit_performance(
     by range or by energy, whichever is likelier.
     """
     light = np.nan_to_num(rays.light) if energy is None else energy
-    strong, threshold = light >= np.median(light), None
+    strong = light >= np.median(light)
+    threshold = None
     dropout = lost_share(rays, strong)
     for _ in range(3):
         if energy is None:
@@ -771,7 +820,8 @@ def fit_scatter(
         wrong = _WRONG * np.where(quantity > np.median(quantity), 1.0, -1.0)
         biased, _ = _trimmed(expected, theta, variance * (1 + wrong), freedom, _TRIMMED, patch)
         spreads += (biased - theta) ** 2
-    names, roots = ("range_m", growth, "angle_deg"), (1 / power, 1 / power, 0.5)
+    names = ("range_m", growth, "angle_deg")
+    roots = (1 / power, 1 / power, 0.5)
     scales = np.sqrt(usual) / np.array([1, unit, np.radians(steep)])
     figures = {
         names[k]: Estimate.of(value, square).power(roots[k], scales[k])
@@ -824,7 +874,8 @@ def _sandwich(design: Floats, off: Floats, patch: Ints | None = None) -> Floats:
 
     Residuals of one patch (k,), such as of a surface, may be alike.
     """
-    inverse, score = np.linalg.pinv(design.T @ design, hermitian=True), design * off[:, None]
+    inverse = np.linalg.pinv(design.T @ design, hermitian=True)
+    score = design * off[:, None]
     if patch is not None:
         _, patch = np.unique(patch, return_inverse=True)
         sums = np.zeros((patch.max() + 1, score.shape[1]))
@@ -945,7 +996,8 @@ def _planes(points: Floats) -> Ints:
     """Tell the number of the large plane that each point (n, 3) lies in; -1 for none."""
     o3d = load_open3d()
     o3d.utility.random.seed(0)
-    number, left = np.full(len(points), -1), np.arange(len(points))
+    number = np.full(len(points), -1)
+    left = np.arange(len(points))
     for _ in range(_PLANES):
         if len(left) < _PLANE_RAYS:
             break
@@ -1011,7 +1063,8 @@ def _curve(x: Floats, values: Floats, power: float = 1.0) -> list[dict[str, floa
 
 def _drawn(figures: Mapping[str, Any]) -> Page:
     """Draw the curves and rings, with their intervals."""
-    rows, curves = figures["channels"], dict(figures["curves"])
+    rows = figures["channels"]
+    curves = dict(figures["curves"])
     for name in ("noise_m", "bias_m", "uneven_deg"):
         curves[name] = [{"x": one["elevation_deg"], **one[name]} for one in rows if one[name]]
     shown = [name for name in _CHARTS if curves.get(name)]

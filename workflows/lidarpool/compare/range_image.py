@@ -159,15 +159,18 @@ def range_images(
     B that is nearest. LidarError if one has no rings, is not in the axes of its sensor, or they
     are not of sensors with the same rings; a clause without a full stop.
     """
-    first, second = _Polar.of(a, names[0]), _Polar.of(b, names[1])
+    first = _Polar.of(a, names[0])
+    second = _Polar.of(b, names[1])
     rings, elevation, rows_a, rows_b, notes = _common(first, second, names)
     count = len(rings)
     steps = [first.step(), second.step()]
     alike = abs(steps[0] / steps[1] - 1) < _ALIKE
     step = azimuth_deg or (steps[1] if alike else max(steps))
-    phases_a, phases_b = first.phases(rows_a, count, step), second.phases(rows_b, count, step)
+    phases_a = first.phases(rows_a, count, step)
+    phases_b = second.phases(rows_b, count, step)
     own, other = (phases_b, phases_a) if alike or steps[0] < steps[1] else (phases_a, phases_b)
-    blocks, middle = np.arange(_BLOCKS), np.where(np.isnan(own), other, own)
+    blocks = np.arange(_BLOCKS)
+    middle = np.where(np.isnan(own), other, own)
     for row in middle:  # from block to block as the head turns on
         known = np.flatnonzero(~np.isnan(row))
         row[:] = np.interp(blocks, known, np.unwrap(row[known], period=1))
@@ -207,12 +210,14 @@ def paired_images(
     for k, turn, own in ((0, a, ray[: len(a)]), (1, b, ray[len(a) :])):
         values[k, 0, own] = np.linalg.norm(turn.points, axis=1)
         values[k, 1, own] = np.nan if turn.light is None else turn.light
-    points, rings = np.concatenate([a.points, b.points])[first], np.append(a.rings, b.rings)[first]
+    points = np.concatenate([a.points, b.points])[first]
+    rings = np.append(a.rings, b.rings)[first]
     every = Turn(points, rings, np.arange(len(first), dtype=np.float64))
     found = range_images(every, every, names, azimuth_deg)
     shown = np.nan_to_num(found.images[0, 1], nan=-1).astype(int)
     row = (rings[:, None] == found.rings).argmax(axis=1)
-    images, compared = values[..., shown], values[:, :2, :-1]
+    images = values[..., shown]
+    compared = values[:, :2, :-1]
     return replace(found, images=images, row=row, compared=compared, paired_by="rays")
 
 
@@ -235,7 +240,8 @@ def _common(
     near = max(_spacing(b.elevation) / 2, 0.05)
     of_a = apart.argmin(axis=0)
     of_b = np.flatnonzero(apart[of_a].argmin(axis=1) == np.arange(len(b.rings)))
-    of_a, notes = of_a[of_b], []
+    of_a = of_a[of_b]
+    notes = []
     for sign in (1, -1):
         zero = int(np.median(b.rings[of_b] - sign * a.rings[of_a]))
         numbers = sign * a.rings + zero
@@ -273,9 +279,11 @@ def _field(seen: Indices, columns: int, step: float) -> tuple[Ints, float]:
     gaps = np.diff(seen, append=seen[:1] + columns)
     widest = int(gaps.argmax())
     if gaps[widest] * step < _SECTOR_DEG:  # all around, from straight behind
-        first, count = round(180 / step), columns
+        first = round(180 / step)
+        count = columns
     else:
-        first, count = int(seen[(widest + 1) % len(seen)]), columns - int(gaps[widest]) + 1
+        first = int(seen[(widest + 1) % len(seen)])
+        count = columns - int(gaps[widest]) + 1
     order = (first + np.arange(count)) % columns
     begin = first * step
     return order, begin - 360 if begin >= 180 - step / 2 else begin

@@ -157,7 +157,8 @@ def open_recording(
         if unit is not None:
             raise LidarError(f"{name} is in metres: leave out its unit, {unit!r}.")
         return _of_cloud(name, place, place.sweeps, sensor, light)
-    path, name = Path(place), str(place)
+    path = Path(place)
+    name = str(place)
     if unit is None:
         return _of_path(path, name, sensor, light, None)
     if path.suffix.lower() not in _UNIT_SUFFIXES:

@@ -151,7 +151,8 @@ class DataSet:
             If a package or column is missing, the cloud is not of these sweeps, or the place
             cannot be written to.
         """
-        name, one = row.name, self._of_jobs
+        name = row.name
+        one = self._of_jobs
         entry = Entry(row.number, name, row.split, row.values)
         one.check_installed()
         tally = Tally.of(cloud)
@@ -237,7 +238,9 @@ class DataSet:
 
     def _indexed(self, jobs: Iterable[JobRow], index: SealedWriter) -> Iterator[dict[str, Any]]:
         """Yield the manifest of each job that is done, and add it to the index, with names."""
-        comma, named = "", dict[int, dict[str, None]]()  # {class: names that jobs have for it}
+        # {class: names that jobs have for it}
+        comma = ""
+        named = dict[int, dict[str, None]]()
         for job, (manifest, wrong) in self.look(jobs):
             if wrong:
                 told = f"Job {job.name} of {self.place} is not whole: its {wrong}."
@@ -290,10 +293,12 @@ class DataSet:
         manifest has, and the first file there that is missing, damaged or of jobs of another
         `identity`, else "". OSError if a place cannot be read or written to.
         """
-        here, there = self._looker(), replace(self, place=place)
+        here = self._looker()
+        there = replace(self, place=place)
 
         def take(name: str) -> tuple[JobRow | None, str]:
-            manifest, last = there._manifest(name), manifest_file(name)
+            manifest = there._manifest(name)
+            last = manifest_file(name)
             if not manifest or manifest["made_with"].get("identity") != identity:
                 return None, place.path(last)
             row = JobRow.of(manifest["row"])

@@ -18,7 +18,9 @@ from lidarsim.base.words import shortened, without_common_prefix
 
 from .job_table import JobRow
 
-FAILED_MOST, SLOWEST_MOST = 200, 10  # jobs that are kept whole
+# jobs that are kept whole
+FAILED_MOST = 200
+SLOWEST_MOST = 10
 _COUNTS = ("scans", "sweeps", "rays", "hits", "points")
 MOST_LABELS = 12  # bars; the rarest labels share the last one
 _BINS = 24  # at most
@@ -79,7 +81,8 @@ class Varied:
         if high - low <= 30 and (there == np.round(there)).all():
             return np.arange(low - 0.5, high + 1)
         if low == high:
-            low, high = low - 0.5, high + 0.5
+            low = low - 0.5
+            high = high + 0.5
         bins = int(np.clip(2 * np.sqrt(len(there)), 6, _BINS))
         # Half of a logarithmic distribution lies below the geometric mean of its limits.
         middle = (np.sqrt(max(low, 0.0) * high) * (low + high) / 2) ** 0.5
@@ -180,7 +183,8 @@ class Figures:
         return [self._varied(name) for name in self._values]
 
     def _varied(self, name: str) -> Varied:
-        values, labels = np.array(self._values[name]), dict(self._labels[name])
+        values = np.array(self._values[name])
+        labels = dict(self._labels[name])
         known = np.isfinite(values)
         values[~known] = np.nan
         if not labels:
@@ -212,7 +216,8 @@ class Figures:
 
     def described(self) -> Iterator[dict[str, Any]]:
         """Yield the figures of each varied quantity."""
-        done, points = ~self.failures, self.each("points")
+        done = ~self.failures
+        points = self.each("points")
         for varied in self.varied:
             known = done & np.isfinite(varied.values)
             there = varied.there

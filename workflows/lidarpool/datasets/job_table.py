@@ -34,7 +34,8 @@ from lidarsim.columns.cloud import Cloud, CloudLike
 
 Value = bool | int | float | str
 
-TABLE_FILE, PARQUET_FILE = "jobs.csv", "jobs.parquet"
+TABLE_FILE = "jobs.csv"
+PARQUET_FILE = "jobs.parquet"
 AGAIN = "run the campaign again with --resume, which writes it anew"
 ROW_GROUP = 2_000  # rows of jobs.parquet in memory at a time
 JOBS_MOST = 100_000_000  # of a campaign: a larger number is not that of a job
@@ -255,7 +256,8 @@ def read_table(place: Storage, checksum: Sequence[int] | None = None) -> Iterato
         reader = csv.reader(file, strict=True)
         try:
             header = [_unshielded(name) for name in next(reader, [])]
-            first, last = len(_HEAD), header.index("error")
+            first = len(_HEAD)
+            last = header.index("error")
             tail = header[last : last + len(_TAIL)]
             if header[:first] != [*_HEAD] or tail != [*_TAIL]:
                 raise ValueError("it is not a table of jobs")
@@ -323,7 +325,8 @@ def _row(header: Sequence[str], names: Sequence[str], cells: Sequence[str]) -> J
     """Read a row of jobs.csv; ValueError if it is none."""
     if len(cells) != len(header):
         raise ValueError(f"{len(cells)} cells in {len(header)} columns")
-    first, stop = len(_HEAD), len(_HEAD) + len(names)
+    first = len(_HEAD)
+    stop = len(_HEAD) + len(names)
     fixed = dict(zip(header[:first], cells, strict=False))
     fixed |= dict(zip(header[stop:], cells[stop:], strict=True))
     kinds = _HEAD | _TAIL

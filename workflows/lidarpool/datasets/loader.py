@@ -63,7 +63,9 @@ class SavedSweeps:
     def __init__(
         self, place: Storage, written: Format, runs: Sequence[_Run], shuffle: int | None
     ) -> None:
-        self._place, self._written, self._runs = place, written, runs
+        self._place = place
+        self._written = written
+        self._runs = runs
         self._ends = np.cumsum([run.count for run in runs], dtype=np.int64)
         self._order = None  # int64 (n,): 8 bytes for each sweep
         if shuffle is not None:
@@ -173,7 +175,8 @@ class SavedSweeps:
         """Return a job that is open in this thread."""
         local = self._local
         if getattr(local, "process", None) != os.getpid():  # a fork shares the positions of files
-            local.process, local.jobs = os.getpid(), OrderedDict()
+            local.process = os.getpid()
+            local.jobs = OrderedDict()
         jobs: OrderedDict[int, _OpenJob] = local.jobs
         if job.number not in jobs:
             jobs[job.number] = _OpenJob(self._place, self._written, job)
@@ -187,7 +190,9 @@ class _OpenJob:
     """What is kept of a job while its sweeps are read."""
 
     def __init__(self, place: Storage, written: Format, job: JobRow) -> None:
-        self.place, self.job, row = place, job, written.row
+        self.place = place
+        self.job = job
+        row = written.row
         name = job_file(row.data_set, job.name, SWEEPS_FILE)
         self.sweeps = Sweeps.load(place.path(name), partial(place.read, name))
         self.boxes: Boxes | None = None

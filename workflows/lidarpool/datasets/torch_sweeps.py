@@ -47,7 +47,9 @@ class TorchSweeps(torch.utils.data.IterableDataset):
     def __init__(
         self, sweeps: ReadSweeps, transform: Callable[[Sweep], Any] | None, even: bool
     ) -> None:
-        self.sweeps, self.transform, self.even = sweeps, transform or tensors, even
+        self.sweeps = sweeps
+        self.transform = transform or tensors
+        self.even = even
         self._rank: tuple[int, int] | None = None
 
     def __getstate__(self) -> dict[str, Any]:
@@ -70,7 +72,8 @@ class TorchStream(torch.utils.data.IterableDataset):
     """Items made of the sweeps of a `SweepStream`, whose jobs are divided between ranks."""
 
     def __init__(self, stream: JobStream, transform: Callable[[Sweep], Any] | None) -> None:
-        self.stream, self.transform = stream, transform or tensors
+        self.stream = stream
+        self.transform = transform or tensors
 
     def __iter__(self) -> Iterator[Any]:
         if torch.utils.data.get_worker_info() is not None:

@@ -36,7 +36,8 @@ class Boxes:
         actor = points["object"].astype(np.int64) - len(sweeps.objects)
         rows = np.flatnonzero(actor >= 0)
         counts = np.bincount(actor[rows], minlength=count)
-        begin, end = sweeps.begins_ns[sweep], sweeps.ends_ns[sweep]
+        begin = sweeps.begins_ns[sweep]
+        end = sweeps.ends_ns[sweep]
         if "time" in points.columns and not any(fault.by_s for fault in sweeps.faults):
             share = (points["time"][rows] - begin) / max(end - begin, 1.0)
         else:

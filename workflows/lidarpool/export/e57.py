@@ -73,7 +73,8 @@ class _WithNormals(pye57.E57):
 @contextmanager
 def _normal_fields() -> Iterator[None]:
     """Have pye57 write fields of normals."""
-    known, library = pye57.e57.SUPPORTED_POINT_FIELDS, pye57.e57.libe57
+    known = pye57.e57.SUPPORTED_POINT_FIELDS
+    library = pye57.e57.libe57
 
     def vector_node(image_file: Any, prototype: Any, codecs: Any) -> Any:
         for field in _FIELDS:
@@ -86,13 +87,15 @@ def _normal_fields() -> Iterator[None]:
     try:
         yield
     finally:
-        pye57.e57.SUPPORTED_POINT_FIELDS, pye57.e57.libe57 = known, library
+        pye57.e57.SUPPORTED_POINT_FIELDS = known
+        pye57.e57.libe57 = library
 
 
 @contextmanager
 def _named_by(content: str) -> Iterator[None]:
     """Derive the GUIDs of a file and its scans from a text: pye57 draws random ones."""
-    numbers, drawn = count(), pye57.e57.uuid
+    numbers = count()
+    drawn = pye57.e57.uuid
     pye57.e57.uuid = SimpleNamespace(
         uuid4=lambda: uuid.uuid5(uuid.NAMESPACE_OID, f"{content} {next(numbers)}")
     )

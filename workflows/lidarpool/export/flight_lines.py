@@ -147,7 +147,8 @@ class FlightLines:
     @cached_property
     def _sources(self) -> Ints:
         """Number of the source of each sweep, from 1: (n,)."""
-        sweeps, source = self.sweeps, self._stations.copy()
+        sweeps = self.sweeps
+        source = self._stations.copy()
         for sensor, lidar in enumerate(sweeps.lidars):
             rows = np.flatnonzero(sweeps.sensor == sensor)
             if lidar.lines is not None and len(sweeps.knots) and sweeps.stations == 1:

@@ -84,7 +84,8 @@ class Format:
 
     def left_out(self, cloud: CloudLike, sweeps: Sweeps) -> list[str]:
         """Names of the cloud's columns that it cannot hold."""
-        held, there = self.row.holds, (column.name for column in cloud.table)
+        held = self.row.holds
+        there = (column.name for column in cloud.table)
         more = self._laid_out + (self.row.named if sweeps.classes else ())
         if self.row.laser_scans and has_laser_scans(sweeps):
             more += LASER_SCAN_COLUMNS

@@ -44,7 +44,8 @@ class Image:
 
         LidarError if they are not in order, or it is unknown which rays there were.
         """
-        fired, number = fired_of(sweeps), int(sweeps.sensor[sweep])
+        fired = fired_of(sweeps)
+        number = int(sweeps.sensor[sweep])
         sensor = fired.sensors[number]
         scans = np.arange(*sweeps.scans[sweep : sweep + 2])
         steps = range(fired.steps[sweep], fired.steps[sweep] + len(scans))

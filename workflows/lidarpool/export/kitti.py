@@ -55,7 +55,8 @@ class Pieces(pieces.Pieces):
     def files(self, number: int, points: Cloud) -> tuple[dict[str, Data], Boxes | None]:
         """Return the files of a sweep, and its boxes where there are actors."""
         sweeps = self.sweeps
-        folder, name = self.sequences[sweeps.sensor[number]], f"{sweeps.numbers[number]:06}"
+        folder = self.sequences[sweeps.sensor[number]]
+        name = f"{sweeps.numbers[number]:06}"
         rows = np.empty((len(points), 4), "<f4")
         rows[:, :3] = sweeps.compensated(number, points)
         rows[:, 3] = intensity_of(points)
@@ -77,7 +78,8 @@ class Pieces(pieces.Pieces):
         files: dict[str, bytes] = {}
         for sensor, (folder, camera) in enumerate(zip(self.sequences, self.cameras, strict=True)):
             own = sweeps.sensor == sensor
-            turns, places = matrices(sweeps.pose.quaternions[own]), sweeps.pose.positions[own]
+            turns = matrices(sweeps.pose.quaternions[own])
+            places = sweeps.pose.positions[own]
             first = camera @ turns[0].T
             rows = np.concatenate(
                 [first @ turns @ camera.T, ((places - places[0]) @ first.T)[..., None]], axis=2

@@ -43,7 +43,8 @@ _LEAP_S = 18  # that GPS time is ahead of UTC since 2017, the earliest start
 _ADJUSTED_S = 1e9  # that adjusted standard GPS time is behind GPS time
 _EVLR = Struct("<H16sHQ32s")  # head of an extended variable length record
 # Of the header: where the waveform packets and the first such record begin, and their number.
-_WAVES_AT, _WAVES = 227, Struct("<QQI")
+_WAVES_AT = 227
+_WAVES = Struct("<QQI")
 _VLR_MOST = 65_535  # bytes of a variable length record
 _TEXT_AREA = 3  # number of the record with a description in words
 _FRAMES = {"world": IN_WORLD, "sensor": AS_FIRED}

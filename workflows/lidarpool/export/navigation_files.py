@@ -25,7 +25,9 @@ _IMU = (
 _PLACE = ("time_ns", "x_m", "y_m", "z_m")
 _GEODETIC = ("latitude_deg", "longitude_deg", "height_m")
 
-_ROW_BYTES, _MESSAGE_BYTES = 120, 500  # of a sample, at most: in its file, and in a bag
+# of a sample, at most: in its file, and in a bag
+_ROW_BYTES = 120
+_MESSAGE_BYTES = 500
 
 
 def instrument_bytes(survey: Survey, bags: int) -> int:

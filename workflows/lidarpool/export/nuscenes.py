@@ -24,7 +24,8 @@ from .boxes import Boxes
 from .pieces import Data, Entry, as_data
 
 VERSION = "v1.0-lidarpool"
-_SCENE, _LOG = "scene-0001", "survey"
+_SCENE = "scene-0001"
+_LOG = "survey"
 _DATE = "1980-01-06"  # surveys begin at time 0 of no date
 _DAY_US = 86_400_000_000
 _MAP = "maps/none.png"
@@ -67,7 +68,9 @@ class Pieces(pieces.Pieces):
         inside = self.sweeps.compensated(number, points)
         light = np.clip(points["intensity"], 0, 1) * 255
         rows = np.empty((len(points), 5), "<f4")
-        rows[:, :3], rows[:, 3], rows[:, 4] = inside, light, points["channel"]
+        rows[:, :3] = inside
+        rows[:, 3] = light
+        rows[:, 4] = points["channel"]
         files = {self.names[number]: as_data(rows)}
         if self.labels:
             named = np.isin(points["class"], [n for n in self.sweeps.classes if n < 256])
@@ -167,7 +170,8 @@ def merge(place: Storage, jobs: Iterable[Mapping[str, Any]]) -> None:
             name: stack.enter_context(place.writing(f"{VERSION}/{name}.json")) for name in _TABLES
         }
         before: dict[str, bytes] = {}  # what comes before the next row
-        kinds, classes = dict[str, dict[str, Any]](), dict[int, str]()
+        kinds = dict[str, dict[str, Any]]()
+        classes = dict[int, str]()
 
         def write(tables: Mapping[str, Iterable[dict[str, Any]]]) -> None:
             for name, rows in tables.items():
@@ -204,7 +208,8 @@ class _Tables:
     """Tables of a survey; what its rows are called by follows from the survey, and from the job."""
 
     def __init__(self, sweeps: Sweeps, entry: Entry | None) -> None:
-        self.sweeps, self._entry = sweeps, entry
+        self.sweeps = sweeps
+        self._entry = entry
         self._scene = _SCENE if entry is None else entry.name
         self._salt = f"{'' if entry is None else f'{entry.name} '}{fingerprint(sweeps)}"
         self.rows: dict[str, list[dict[str, Any]]] = {"attribute": [], "visibility": []}

@@ -31,7 +31,8 @@ class Pieces(pieces.Pieces):
         as_fired = "time" in points.columns and not self.compensated
         place_points = sweeps.as_fired if as_fired else sweeps.compensated
         inside = place_points(number, points)
-        names, arrays = ["x", "y", "z"], list(inside.T.astype(np.float32))
+        names = ["x", "y", "z"]
+        arrays = list(inside.T.astype(np.float32))
         columns_of = sweeps.columns_as_fired if as_fired else sweeps.columns_compensated
         columns = columns_of(number, points)
         coloured = {*COLOURS} <= {*columns}

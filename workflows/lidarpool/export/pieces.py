@@ -21,7 +21,9 @@ from .format_table import row_of
 
 # NumPy, pyarrow and system calls for the disk hold Python's lock at most 6 % of the time.
 THREADS = min(4, os.cpu_count() or 1)
-RANGE_POINTS, RANGE_PIECES = 1_000_000, 100  # of a range at most: what a killed worker costs
+# of a range at most: what a killed worker costs
+RANGE_POINTS = 1_000_000
+RANGE_PIECES = 100
 _MARK = ".writing"  # a file in the folder while ranges are written
 
 
@@ -58,7 +60,9 @@ class Pieces:
     compensated = False  # by request, where a format also holds points as they were fired
 
     def __init__(self, cloud: CloudLike, sweeps: Sweeps, entry: Entry | None = None) -> None:
-        self.cloud, self.sweeps, self.entry = cloud, sweeps, entry
+        self.cloud = cloud
+        self.sweeps = sweeps
+        self.entry = entry
 
     def __len__(self) -> int:
         return len(self.sweeps)
@@ -81,7 +85,8 @@ class Pieces:
 
     def write(self, place: Storage, first: int, stop: int) -> WrittenRange:
         """Write the files of some pieces, one piece in memory at a time; OSError if that fails."""
-        count, made = 0, []
+        count = 0
+        made = []
         for number, points in enumerate(self.read(first, stop), first):
             files, more = self.files(number, points)
             for name, data in files.items():

@@ -122,7 +122,8 @@ def real_type(bounds: AnyFloats, precision_m: float) -> np.dtype[np.floating]:
 
 def _check_room(path: Path, head: bytes, count: int, row_bytes: int) -> None:
     """Check that the disk has room for a file of so many points, and for a piece beside it."""
-    size, piece = len(head) + count * row_bytes, min(count, CHUNK_POINTS) * row_bytes
+    size = len(head) + count * row_bytes
+    piece = min(count, CHUNK_POINTS) * row_bytes
     free = shutil.disk_usage(path.parent).free
     if free < size + piece:
         raise LidarError(

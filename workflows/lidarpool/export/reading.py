@@ -28,7 +28,10 @@ class Reader:
     """Reads the points of a job's sweeps in any order, in one thread."""
 
     def __init__(self, place: Storage, sweeps: Sweeps, entry: Entry, layout: str) -> None:
-        self.place, self.sweeps, self.entry, self.layout = place, sweeps, entry, layout
+        self.place = place
+        self.sweeps = sweeps
+        self.entry = entry
+        self.layout = layout
         self._copies: Path | None = None
         self.last = ""  # file of rows that was read last, for errors
 
@@ -69,7 +72,8 @@ class Reader:
 
     def rows(self, name: str, row: np.dtype[Any], count: int | None = None) -> AnyArray:
         """Read a file of rows; ValueError if it ends within one, or has not `count`."""
-        before, self.last = self.last, name
+        before = self.last
+        self.last = name
         if self.place.is_local:
             with io.FileIO(self.place.path(name)) as file:
                 data = np.empty(os.fstat(file.fileno()).st_size, np.uint8)

@@ -45,7 +45,9 @@ UNKNOWN, LAST, FIRST, STRONGEST, FIRST_WEAK, LAST_WEAK = range(6)
 IDENTICAL, SECOND, _, FIRST_STRONGEST, LAST_STRONGEST = range(6, 11)
 _OF_ONE_RETURN = {"strongest": STRONGEST, "first": FIRST, "last": LAST}
 
-WORLD, CARRIER = "map", "base_link"  # frames
+# frames
+WORLD = "map"
+CARRIER = "base_link"
 _INSTRUMENTS = "imu", "gnss"
 # Of a survey without a date: at time 0, tf2 would take the newest frames for all times.
 START_NS = 1_000_000_000_000_000_000
@@ -425,7 +427,8 @@ def _return_types(points: Cloud, mode: str) -> AnyArray:
     count = len(points)
     if mode in _OF_ONE_RETURN:
         return np.full(count, _OF_ONE_RETURN[mode])
-    number, returns = points["return_number"], points["returns"]
+    number = points["return_number"]
+    returns = points["returns"]
     types = np.full(count, UNKNOWN)
     types[number == 2] = SECOND
     types[number == 1] = FIRST
@@ -500,7 +503,8 @@ class _Messages:
             else [np.eye(3).ravel() * variance for variance in there.imu.variances]
         )
         for time, *numbers in there.rows(IMU_FILE):
-            time_ns, values = start_ns + int(time), [*map(float, numbers)]
+            time_ns = start_ns + int(time)
+            values = [*map(float, numbers)]
             message = imu(
                 self.header(frame, time_ns), turn(0.0, 0.0, 0.0, 1.0), unknown,
                 vector(*values[:3]), rate, vector(*values[3:]), force,
@@ -527,7 +531,8 @@ class _Messages:
 
     def laser_scan(self, rays: ScanRays, frame: str, time_ns: int) -> Any:
         """LaserScan of a sweep of a 2D scanner."""
-        first, last = float(rays.angles[0]), float(rays.angles[-1])
+        first = float(rays.angles[0])
+        last = float(rays.angles[-1])
         (scan,) = self.kinds("sensor_msgs", "LaserScan")
         return scan(
             self.header(frame, time_ns), first, last, (last - first) / (len(rays.angles) - 1),
@@ -545,11 +550,13 @@ class _Messages:
 
     def markers(self, boxes: Boxes, actors: list[str], time_ns: int) -> Any:
         """Boxes of actors as a sensor saw them, in place of those that another saw before."""
-        types, names = self._types, ("Point", "Quaternion", "Pose", "Vector3")
+        types = self._types
+        names = ("Point", "Quaternion", "Pose", "Vector3")
         point, turn, pose, vector = self.kinds("geometry_msgs", *names)
         marker, mesh = self.kinds("visualization_msgs", "Marker", "MeshFile")
         image = types["sensor_msgs/msg/CompressedImage"]
-        header, none = self.header(WORLD, time_ns), np.empty(0, np.uint8)
+        header = self.header(WORLD, time_ns)
+        none = np.empty(0, np.uint8)
         orange = types["std_msgs/msg/ColorRGBA"](1, 0.6, 0, 0.4)
         always = types["builtin_interfaces/msg/Duration"](0, 0)
         return types["visualization_msgs/msg/MarkerArray"]([

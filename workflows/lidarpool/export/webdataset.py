@@ -53,16 +53,19 @@ class Pieces(pieces.Pieces):
 
     def write(self, place: Storage, first: int, stop: int) -> WrittenRange:
         """Write the tar files of some ranges, one in memory at a time; OSError if that fails."""
-        count, made = 0, []
+        count = 0
+        made = []
         for begin, end in self.spans():
-            tar, start = io.BytesIO(), begin
+            tar = io.BytesIO()
+            start = begin
             inside = self.read(begin, end) if first <= begin < stop else ()
             for number, points in enumerate(inside, begin):
                 boxes = Boxes.of(self.sweeps, number, points) if self.sweeps.actors else None
                 sample = b"".join(self._members(number, points, boxes))
                 if tar.tell() and tar.tell() + len(sample) > SHARD_MOST:
                     self._put(place, start, tar)
-                    tar, start = io.BytesIO(), number
+                    tar = io.BytesIO()
+                    start = number
                 self.offsets[number] = start, tar.tell(), tar.tell() + len(sample)
                 tar.write(sample)
                 count += len(points)
@@ -85,7 +88,8 @@ class Pieces(pieces.Pieces):
 
     def _members(self, number: int, points: Cloud, boxes: Boxes | None) -> Iterator[bytes]:
         """Yield the files of a sample, each behind its header."""
-        sweeps, entry = self.sweeps, self.entry
+        sweeps = self.sweeps
+        entry = self.entry
         there = SweepBoxes.of(sweeps, boxes and boxes.inward(sweeps.pose, number))
         columns = sweeps.columns_in_sensor(number, points)
         arrays = {

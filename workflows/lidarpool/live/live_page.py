@@ -62,7 +62,10 @@ LIST_EVERY_S = 0.5  # jobs under way
 ASK_EVERY_S = 1.0  # how busy the partitions are
 LOADS_KEPT = 6  # answers to that, over which it is averaged
 WATCHED_S = 10.0  # after a question somebody looks at the page
-ENDED_MOST, FAILED_MOST, UNDER_WAY_MOST = 10, 6, 12  # rows of the table
+# rows of the table
+ENDED_MOST = 10
+FAILED_MOST = 6
+UNDER_WAY_MOST = 12
 VIEWS_KEPT = 4  # jobs whose points are kept: a browser may show, or ask for, an earlier one
 LIVE_POINTS = 150_000  # in the browser at a time
 PARTS_NOTED = 64  # parts that wait to be read; of more, every second is skipped
@@ -77,11 +80,17 @@ class LivePage(RunPage):
 
     def __init__(self, jobs: int, names: Sequence[str], title: str) -> None:
         self.stopped = threading.Event()  # by a user of the page; --resume continues
-        self._count, self._names, self._title = jobs, names, title
+        self._count = jobs
+        self._names = names
+        self._title = title
         self._charts = Charts(names, jobs)
-        self._state, self._over = "starting", False
+        self._state = "starting"
+        self._over = False
         self._progress: Progress | None = None
-        self._pace, self._rate, self._left = Pace(), "", ""  # what is left is a time
+        # what is left is a time
+        self._pace = Pace()
+        self._rate = ""
+        self._left = ""
         self._partitions: Mapping[str, Partition] = {}
         self._loads: deque[tuple[float, dict[str, PartitionStats]]] = deque(maxlen=LOADS_KEPT)
         self._written: Storage | None = None  # folders of jobs, which can be opened
@@ -125,10 +134,13 @@ class LivePage(RunPage):
         """Record the progress; KeyboardInterrupt if a user of the page has stopped the run."""
         if self.stopped.is_set():
             raise KeyboardInterrupt
-        self._progress, now = progress, time.monotonic()
-        counts, unit = (progress.collected, progress.scans), ""
+        self._progress = progress
+        now = time.monotonic()
+        counts = (progress.collected, progress.scans)
+        unit = ""
         if progress.jobs:
-            counts, unit = (progress.jobs_done, progress.jobs), " jobs"
+            counts = (progress.jobs_done, progress.jobs)
+            unit = " jobs"
         if rate := self._pace.rate(progress.seconds, counts[0]):
             each, rate = ("min", 60 * rate) if unit and rate < 1 else ("s", rate)
             self._rate = f"{in_words(rate)}{unit}/{each}"
@@ -176,9 +188,11 @@ class LivePage(RunPage):
         if self._progress is not None:
             points = self._progress.points if result is None else len(result.points)
             self._progress = replace(self._progress, seconds=seconds, points=points)
-        self._under_way, self._left = (), ""
+        self._under_way = ()
+        self._left = ""
         self._loads.clear()
-        self._state, self._over = "done", True
+        self._state = "done"
+        self._over = True
 
     def stay(self, cloud: Path | None = None) -> None:
         """Keep the page until Ctrl-C or its button.
@@ -203,7 +217,8 @@ class LivePage(RunPage):
         found = re.fullmatch(r"(?:job/(\d+)/)?(\w+)", what)
         if found is None:
             raise KeyError(what)
-        number, question = int(found[1] or 0), found[2]
+        number = int(found[1] or 0)
+        question = found[2]
         if self._count > 1:
             with self._reading.taken():
                 return self._view_of(number).answer(question, asked, abandoned)
@@ -236,8 +251,11 @@ class LivePage(RunPage):
         return header, arrays
 
     def _news(self) -> dict[str, Any]:
-        progress, under_way, jobs = self._progress, self._under_way, self._jobs
-        state, newest = self._state, next(reversed(jobs), None)
+        progress = self._progress
+        under_way = self._under_way
+        jobs = self._jobs
+        state = self._state
+        newest = next(reversed(jobs), None)
         if not self._over:
             if self.stopped.is_set():
                 state = "stopping"
@@ -299,7 +317,8 @@ class CpuShare:
     """A share of a core that something may take; processor time, since waiting does not count."""
 
     def __init__(self, share: float) -> None:
-        self._share, self._at = share, 0.0
+        self._share = share
+        self._at = 0.0
 
     @property
     def due(self) -> bool:
@@ -325,10 +344,13 @@ class Charts:
     """
 
     def __init__(self, names: Sequence[str], count: int) -> None:
-        self._figures, self._count = Figures(names), count
-        self._lock, self._drawing = threading.Lock(), threading.Lock()
+        self._figures = Figures(names)
+        self._count = count
+        self._lock = threading.Lock()
+        self._drawing = threading.Lock()
         self._share = CpuShare(DRAWING_SHARE)
-        self._drawn, self._svg = 0, ""
+        self._drawn = 0
+        self._svg = ""
 
     def add(self, row: JobRow) -> None:
         """Count a job."""
@@ -338,7 +360,8 @@ class Charts:
     def version(self, over: bool) -> int:
         """Return how many jobs `drawn` draws, or has drawn if it is not yet time to do it again."""
         with self._lock:
-            jobs, done = self._figures.jobs, self._figures.done
+            jobs = self._figures.jobs
+            done = self._figures.done
         is_due = self._share.due and done
         return jobs if over or (is_due and jobs < self._count) else self._drawn
 
@@ -366,7 +389,8 @@ def live_page(
     browser: bool = True,
 ) -> Iterator[LivePage]:
     """Serve the page of a run while the body runs; see `announced`."""
-    live, index = LivePage(jobs, names, title), VIEWER if jobs == 1 else "jobs.html"
+    live = LivePage(jobs, names, title)
+    index = VIEWER if jobs == 1 else "jobs.html"
     with (
         page_server(live.answer, port, live.stopped.set, index=index) as live.page,
         announced(live.page, f"live page: {live.page.url}", browser),
@@ -421,7 +445,8 @@ class LiveJob:
         if result is not None:
             with self._lock:
                 self._waiting = []
-                self._counts, self._hits = result.hit_counts, result.hits
+                self._counts = result.hit_counts
+                self._hits = result.hits
                 self.cloud = result.points.sample(self._most, PARTS_NOTED)
             self._show()
             self.view.rays = result.sample_rays
@@ -440,7 +465,8 @@ class LiveJob:
     def gather(self) -> None:
         """Read some of the waiting parts, without those that cannot be read: the run says so."""
         with self._lock:
-            names, self._waiting = self._waiting[:PARTS_AT_ONCE], self._waiting[PARTS_AT_ONCE:]
+            names = self._waiting[:PARTS_AT_ONCE]
+            self._waiting = self._waiting[PARTS_AT_ONCE:]
             clouds = [self.cloud]
             for name in names:
                 with suppress(LidarError):
@@ -486,8 +512,10 @@ class LiveJob:
 
     def news(self) -> Answer:
         """Tell what is new of the job while it goes on, and at its end."""
-        view, frames = self.view, [] if self._ends else list(self.frames)
-        planning, trials = self._job.planning, self._under_way.trials
+        view = self.view
+        frames = [] if self._ends else list(self.frames)
+        planning = self._job.planning
+        trials = self._under_way.trials
         is_new = view.path is None and not self._ends
         if planning is not None and is_new and len(trials) >= self._job.trials:
             view.path = best(trials, planning).path

@@ -37,7 +37,8 @@ class PathCost:
 
     def __init__(self, centres: Floats, radii: Floats, waypoints: int, particles: int) -> None:
         self._points = np.zeros((waypoints + 2, 2, particles), np.float32)
-        self._points[0, 0], self._points[-1, 0] = -0.5, 0.5
+        self._points[0, 0] = -0.5
+        self._points[-1, 0] = 0.5
         # (waypoints, 2, particles), contiguous. Write to it, then call `evaluate`.
         self.waypoints: Floats32 = self._points[1:-1]
         # The fixed part of the penalty for entering discs.
@@ -91,7 +92,8 @@ class _Workspace:
         discs = min(len(radii), max(1, _BLOCK_ELEMENTS // (segments * width)))  # at a time
         self._parts = [slice(i, i + discs) for i in range(0, len(radii), discs or 1)]
         doubled = (2 * centres).astype(np.float32)
-        self._x, self._y = doubled[:, 0, None, None], doubled[:, 1, None, None]
+        self._x = doubled[:, 0, None, None]
+        self._y = doubled[:, 1, None, None]
         self._squared_radii = (4 * radii**2).astype(np.float32)[:, None]
         self._weights = (_SLOPE / (4 * radii)).astype(np.float32)[:, None]
         # (x and y, segment, particle)
@@ -104,13 +106,17 @@ class _Workspace:
         # (disc, segment, particle)
         self._along, self._across, self._spare = (singles(discs, segments, width) for _ in range(3))
         self._prices = singles(1 + discs, width)  # of the discs before, and of each of these
-        self._price, self._entered = singles(width), np.empty(width, np.bool_)
+        self._price = singles(width)
+        self._entered = np.empty(width, np.bool_)
         self._zeros = np.zeros(width, np.float32)  # as an array, see above
 
     def evaluate(self, points: Floats32, cost: Floats32, entry_price: float) -> None:
         """Write to `cost`, (width,), the costs of paths through `points`, (k + 2, 2, width)."""
-        direction, products, length = self._direction, self._products, self._length
-        first, last = points[:-1].transpose(1, 0, 2), points[1:].transpose(1, 0, 2)
+        direction = self._direction
+        products = self._products
+        length = self._length
+        first = points[:-1].transpose(1, 0, 2)
+        last = points[1:].transpose(1, 0, 2)
         np.subtract(last, first, out=direction)
         np.add(direction[0], _NOTHING, out=direction[0])
         np.square(direction, out=products)
@@ -119,7 +125,8 @@ class _Workspace:
         np.add.reduce(length, axis=0, out=cost)
         if not self._parts:
             return
-        middle, price = self._middle, self._price
+        middle = self._middle
+        price = self._price
         np.divide(direction, length, out=direction)
         np.add(last, first, out=middle)
         np.multiply(middle, direction, out=products)
@@ -136,9 +143,13 @@ class _Workspace:
 
     def _add_price(self, discs: slice) -> None:
         """Add to `_price` the penalty for entering some discs."""
-        x, y, squared_radii = self._x[discs], self._y[discs], self._squared_radii[discs]
+        x = self._x[discs]
+        y = self._y[discs]
+        squared_radii = self._squared_radii[discs]
         count = len(x)
-        along, across, spare = self._along[:count], self._across[:count], self._spare[:count]
+        along = self._along[:count]
+        across = self._across[:count]
+        spare = self._spare[:count]
         (east, north), prices = self._direction, self._prices[: 1 + count]
 
         np.multiply(x, east, out=along)

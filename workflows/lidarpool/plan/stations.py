@@ -24,7 +24,9 @@ LEAST_GAIN = 0.01  # of what can be seen, that each adds if no number and no cov
 _PLACES = 600  # about so many candidates, in a scene without obstacles
 _PLACES_MOST = 50_000
 _LEAST_SPACING_M = 0.5
-_POINTS, _OBJECT_POINTS = 20_000, 60  # samples by area; at least so many of each object, if few
+# samples by area; at least so many of each object, if few
+_POINTS = 20_000
+_OBJECT_POINTS = 60
 _CLEAR_M = 0.3  # nothing is nearer to the instrument, nor this close above it
 _STEP_M = 0.2  # what is lower than this is stepped on
 _FOOT_M = 0.01  # a ray that starts so far above the floor does not hit it
@@ -40,7 +42,8 @@ class Sight:
     """
 
     def __init__(self, scene: Scene, sensor: Sensor, slant_deg: float) -> None:
-        self.sensor, self.slant_deg = sensor, slant_deg
+        self.sensor = sensor
+        self.slant_deg = slant_deg
         self.caster = RayCaster(scene.vertices, scene.faces)
         # Single precision of ray casters, and of points in pictures.
         self._slack = max(2e-3, 2e-5 * float(np.linalg.norm(np.ptp(scene.bounds, axis=0))))
@@ -56,7 +59,8 @@ class Sight:
                 f"{sensor.model} does not look all around, as it has to on a station: give "
                 "another sensor, such as terrestrial/riegl-vz400."
             )
-        self._lowest, self._highest = float(z.min()) - 1e-9, float(z.max()) + 1e-9
+        self._lowest = float(z.min()) - 1e-9
+        self._highest = float(z.max()) + 1e-9
 
     def sides(self, station: Floats, points: Floats, normals: Floats) -> NDArray[np.int8]:
         """Return which side of surfaces a station (3,) sees at points (n, 3): int8 (n,).
@@ -163,7 +167,9 @@ def plan_stations(
             f"Nothing is visible from {len(places):,} places at {height_m:g} m: check the unit of "
             "the scene, the range of the sensor, and the slant."
         )
-    seen, owner, area = seen[:, visible], np.tile(owner, 2)[visible], np.tile(area, 2)[visible]
+    seen = seen[:, visible]
+    owner = np.tile(owner, 2)[visible]
+    area = np.tile(area, 2)[visible]
     least = LEAST_GAIN if count is None and coverage is None else 0.0
     chosen, shares, covered = _greedy(seen, area, count or STATIONS_MOST, coverage or 1.0, least)
     objects = len(scene.names)

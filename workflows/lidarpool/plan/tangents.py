@@ -115,13 +115,16 @@ def _all_tangents(centres: Floats, radii: Floats) -> _Tangents:
     i, j = np.triu_indices(len(radii), k=1)
     between = centres[j] - centres[i]
     distance = np.sqrt((between**2).sum(axis=1))
-    circles, contacts = [], []
+    circles = []
+    contacts = []
     for side in (1.0, -1.0):
         # Equality is a point on a circle's edge, or two circles that touch; rounding may not
         # tell them apart. Side -1 of a point is its side 1 over again.
         fits = distance * (1 + _TOLERANCE) >= np.abs(radii[i] - side * radii[j])
         fits &= (distance > 0) & ((radii[j] > 0) | (side > 0))
-        first, second, gap = i[fits], j[fits], distance[fits, None]
+        first = i[fits]
+        second = j[fits]
+        gap = distance[fits, None]
         unit = between[fits] / gap
         across = np.stack([-unit[:, 1], unit[:, 0]], axis=1)
         cosine = np.clip((radii[first] - side * radii[second])[:, None] / gap, -1.0, 1.0)
@@ -141,7 +144,8 @@ def _unblocked(tangents: _Tangents, centres: Floats, radii: Floats, tolerance: f
     free = []
     for begin in range(0, len(tangents.circles), _TANGENTS_AT_ONCE):
         part = slice(begin, begin + _TANGENTS_AT_ONCE)
-        ends, own = tangents.contacts[part], tangents.circles[part]
+        ends = tangents.contacts[part]
+        own = tangents.circles[part]
         enters = segment_distances(ends[:, 0], ends[:, 1], centres) < radii - tolerance
         np.put_along_axis(enters, own, False, axis=1)  # it touches these two by construction
         free.append(~enters.any(axis=1))

@@ -67,7 +67,8 @@ def with_ends(planning: Planning, waypoints: Floats) -> Floats:
 
 def prepare_swarm(planning: Planning, axes: PathAxes, seed: int) -> Swarm:
     """Return the swarm of `planning`, spread as widely as a way around the discs may reach."""
-    centres, radii = axes.to_local(planning.centres), planning.radii / axes.unit_m
+    centres = axes.to_local(planning.centres)
+    radii = planning.radii / axes.unit_m
     cost = PathCost(centres, radii, planning.waypoints, planning.particles)
     line = np.array([[-0.5, 0.0], [0.5, 0.0]])
     edges = segment_distances(line[:1], line[1:], centres)[0] + radii

@@ -79,9 +79,11 @@ class DataSetOutput(Output[CampaignRun]):
 
     def begin(self, run: Run[CampaignRun]) -> CampaignRun | None:
         """Refuse or remove a finished data set, or look at it; its sums if nothing is left."""
-        out, options = self.dataset.place, run.options
+        out = self.dataset.place
+        options = run.options
         kept = out.below(RUN_FOLDER)
-        there, unfinished = out.entries(), FILE in kept.sizes()
+        there = out.entries()
+        unfinished = FILE in kept.sizes()
         anew = options.fresh or options.overwrite
         if not run.resume and (anew or not unfinished):
             if INDEX_FILE in there and not options.overwrite:
@@ -129,7 +131,9 @@ class DataSetOutput(Output[CampaignRun]):
 
     def look(self, run: Run[CampaignRun]) -> None:
         """Compare what is there with what the store says is done; take over what it lacks."""
-        store, options, out = run.store, run.options, self.dataset.place
+        store = run.store
+        options = run.options
+        out = self.dataset.place
         if self._made is not None:
             store.cast_with(self._made["backend"], self._made["casting"])
             rows = [row for row in self._rows if row.number in self.campaign.numbers]
@@ -167,7 +171,8 @@ class DataSetOutput(Output[CampaignRun]):
 
     def finish(self, run: Run[CampaignRun]) -> CampaignRun:
         """Write what all jobs share, and remove the run unless jobs have failed."""
-        store, loop = run.store, run.loop
+        store = run.store
+        loop = run.loop
         seconds = time.monotonic() - run.started
         more: dict[str, Any] = {"stages": loop.stages if loop else (), "notes": tuple(store.notes)}
         warnings = run.warn_of_empty_jobs(store.rows())
@@ -257,7 +262,8 @@ def write_shared(
     from .campaign_report import write_card
     from .charts import draw_sweep
 
-    campaign, place = record["campaign"], dataset.place
+    campaign = record["campaign"]
+    place = dataset.place
     with explained(f"{place} cannot be written"):
         place.remove([INDEX_FILE])  # it has the checksum of the table
     write_table(place, campaign["names"], rows)
@@ -280,7 +286,8 @@ def _look(
 
     LidarError if a file of the campaign is another than the one that whole jobs are made of.
     """
-    whole, wrong = 0, dict[int, str]()
+    whole = 0
+    wrong = dict[int, str]()
     made: dict[tuple[str, str], list[str]] = {}  # {name and hash of a file: jobs made of it}
     with explained(f"{dataset.place} cannot be read"):
         for row, (manifest, difference) in dataset.look(rows, contents=contents):

@@ -21,7 +21,10 @@ from .charts import draw_results, draw_varied
 from .page.rendering import rendered
 from .report import stage_figures
 
-CARD, PAGE, PICTURES, SPLITS = "README.md", "report.html", "pictures", "splits"
+CARD = "README.md"
+PAGE = "report.html"
+PICTURES = "pictures"
+SPLITS = "splits"
 VALUES_SHOWN = 12  # of a quantity with labels
 _CAPTIONS = {
     "job": "One of the jobs.",

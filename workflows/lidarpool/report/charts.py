@@ -26,16 +26,27 @@ WIDTH = 1600
 MOST_VARIED = 8  # quantities in a picture
 ACROSS = 4  # of them side by side
 MOST_DOTS = 5_000
-DOT, BAR = "#5b8fd0", "#7aa5d8"
-LEFT, RIGHT, TOP = 118, 40, 186  # pixels around the charts
+DOT = "#5b8fd0"
+BAR = "#7aa5d8"
+# pixels around the charts
+LEFT = 118
+RIGHT = 40
+TOP = 186
 BETWEEN = 78  # columns of charts
-COUNTS, GAP, AGAINST, BELOW = 120, 20, 340, 60  # heights: histogram, dots, and labels under them
+# heights: histogram, dots, and labels under them
+COUNTS = 120
+GAP = 20
+AGAINST = 340
+BELOW = 60
 SLANTED = 56  # more below slanted labels
 ABOVE = 76  # from one row of charts to the next
 MIDDLE = (10, 50, 90)  # percentiles of the points of jobs with near values
 MOST_COLOURS = 6  # labels that have colours of their own
-_GROUPS, _GROUP = 12, 8  # of jobs, by value, whose medians are drawn: so many, of at least so many
-SWEEP_SIZE, SWEEP_DOTS = (1600, 1000), 150_000
+# of jobs, by value, whose medians are drawn: so many, of at least so many
+_GROUPS = 12
+_GROUP = 8
+SWEEP_SIZE = (1600, 1000)
+SWEEP_DOTS = 150_000
 SWEEP_FRAME = (90, 60, 1210, 750)  # left, bottom, width, height of the drawing, pixels
 SWEEP_SHARE = 0.97  # of the points that are within the drawing
 SWEEP_VALUES = 4  # that are named
@@ -57,7 +68,8 @@ def draw_varied(figures: Figures) -> Page | None:
     below = BELOW + SLANTED * any(scale.slanted(wide) for scale in scales)
     high = COUNTS + GAP + AGAINST + below
     page = Page((WIDTH, TOP + rows * high + (rows - 1) * ABOVE))
-    points, failures = figures.each("points"), figures.failures
+    points = figures.each("points")
+    failures = figures.failures
     limits = _limits(points[~failures])
     telling = _most_telling(scales, points, ~failures)
     colours = np.tile(theme.rgb(DOT), (len(points), 1))
@@ -67,7 +79,8 @@ def draw_varied(figures: Figures) -> Page | None:
         colours[known] = some[telling.values[known].astype(np.intp)]
     for number, scale in enumerate(scales):
         row, column = divmod(number, across)
-        left, top = LEFT + column * (wide + BETWEEN), TOP + row * (high + ABOVE)
+        left = LEFT + column * (wide + BETWEEN)
+        top = TOP + row * (high + ABOVE)
         upper = _chart(page, left, top, wide, COUNTS)
         lower = _chart(page, left, top + COUNTS + GAP, wide, AGAINST)
         bars = some if scale is telling else [BAR]
@@ -133,7 +146,8 @@ def draw_results(figures: Figures) -> Page | None:
             Varied("rays that hit, per cent", 100 * hits / rays),
             Varied("casting a job, all its tasks, s", seconds),
         )
-    high, top = 250, 128
+    high = 250
+    top = 128
     page = Page((WIDTH, top + high + 92))
     wide = (WIDTH - LEFT - RIGHT - BETWEEN * 2) / 3
     for column, quantity in enumerate(quantities):
@@ -170,7 +184,8 @@ def _tick(value: float, _: object = None) -> str:
 def _draw_counts(axes: Axes, scale: Varied, failures: Bools, colours: Iterable[Any]) -> None:
     """Draw a histogram, its bars in `colours`, and in front of it that of failed jobs."""
     wide = 0.7 if scale.labels else 1.0  # labels are apart, since they have no order
-    edges, failed = scale.edges.tolist(), scale.values[failures & np.isfinite(scale.values)]
+    edges = scale.edges.tolist()
+    failed = scale.values[failures & np.isfinite(scale.values)]
     counts, *_ = axes.hist(scale.there, edges, rwidth=wide)
     for bar, colour in zip(axes.patches, cycle(colours)):
         bar.set_facecolor(colour)
@@ -222,7 +237,8 @@ def _limits(points: Floats) -> tuple[float, float]:
     """Limits of an axis of points: from 0, unless all jobs have nearly the same."""
     if not len(points):
         return 0.0, 1.0
-    low, high = float(points.min()), float(points.max())
+    low = float(points.min())
+    high = float(points.max())
     if low > 0.6 * high:
         aside = 0.2 * (high - low) or 0.5 * high
         return low - aside, high + aside

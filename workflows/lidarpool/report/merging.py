@@ -124,10 +124,12 @@ def merge(
         If shards are missing, damaged, given twice, unfinished, of another run or other software:
         it names them.
     """
-    place, screen = output_place(str(out)), screen or Screen()
+    place = output_place(str(out))
+    screen = screen or Screen()
     places = {_real(one): one for one in map(Storage.at, shards)}
     _check_apart(Storage.at(place), places)
-    parts, mistakes = list[_Part](), Mistakes()
+    parts = list[_Part]()
+    mistakes = Mistakes()
     for one in places.values():
         with mistakes.noted():
             parts.append(_read(one))
@@ -135,7 +137,8 @@ def merge(
     with suppress(LidarError):  # the result would have the place of the shard's points
         if "made_of" in _read(Storage.at(place)).record:
             told = f"{place} holds a shard of a survey: give another folder with --out."
-            parts, mistakes.lines = [], [told]
+            parts = []
+            mistakes.lines = [told]
     if not (partial and parts):
         mistakes.tell()
     if "made_of" in parts[0].record:
@@ -173,7 +176,8 @@ def _check_apart(out: Storage, places: Mapping[str, Storage]) -> None:
 def _read(place: Storage) -> _Part:
     """Read a finished shard, or data set of several; LidarError if it is none, or damaged."""
     with explained(f"{place} cannot be read"):
-        files, run = place.sizes(), place.below(RUN_FOLDER)
+        files = place.sizes()
+        run = place.below(RUN_FOLDER)
         if {CAMPAIGN_FILE, INDEX_FILE, LAST_FILE} <= files.keys():
             return _of_dataset(place)
         if FILE in run.sizes():
@@ -228,8 +232,10 @@ def _check(parts: Sequence[_Part], partial: bool, own: _Part | None = None) -> l
 
     Others may have what is in `own`, too. LidarError names the parts that are wrong.
     """
-    mistakes, wanted = Mistakes(), software()
-    first, seen = "the software here", dict[int, _Part]()
+    mistakes = Mistakes()
+    wanted = software()
+    first = "the software here"
+    seen = dict[int, _Part]()
     for part in sorted(parts, key=lambda part: not part.record["casting"]):
         common = part.common
         if part.shards == [ALL] and part is not own and len(parts) > 1 + bool(own):
@@ -239,7 +245,8 @@ def _check(parts: Sequence[_Part], partial: bool, own: _Part | None = None) -> l
             told = f"{part.place} and {first} differ in {differs[0]}"
             mistakes.lines.append(f"{told}: merge shards of one run and of the same software.")
         elif len(common) > len(wanted):
-            wanted, first = common, str(part.place)
+            wanted = common
+            first = str(part.place)
         for shard in part.shards if part is not own else ():
             if (other := seen.setdefault(shard.number, part)) is not part:
                 twice = f"shard {shard} is in {other.place} and in {part.place}"
@@ -258,7 +265,8 @@ def _check(parts: Sequence[_Part], partial: bool, own: _Part | None = None) -> l
 
 def _missing(parts: Sequence[_Part]) -> list[Shard]:
     """List the shards that are not there, or lack jobs by which the campaign has grown."""
-    of, parts = parts[-1].shards[0].of, sorted(parts, key=lambda part: part.whole)
+    of = parts[-1].shards[0].of
+    parts = sorted(parts, key=lambda part: part.whole)
     have = {shard.number: len(part.done(shard)) for part in parts for shard in part.shards}
     have.setdefault(1, -1)  # which plans the path, even if it has no scans
     every = (Shard(number, of) for number in range(1, of + 1))
@@ -273,7 +281,8 @@ def _merge_dataset(
     dataset_files(out, begun=begun)
     own = _of_dataset(out, of=parts[0].shards[0].of) if begun else None
     known = [own, *parts] if own else parts
-    notes, sensors = _check(known, partial, own), dict[str, str]()
+    notes = _check(known, partial, own)
+    sensors = dict[str, str]()
     for part in known:
         sensors = with_sensors(sensors, part.record["sensors"].items())
     cast = next((part for part in known if part.record["casting"]), parts[0])
@@ -296,7 +305,8 @@ def _merge_dataset(
             damaged += _lacking(known, _merged(files))
         if damaged:
             raise LidarError(f"missing or damaged: {listed(damaged, NAMED)}; {_AGAIN}.")
-        lacking, there = _missing(known), {shard for part in known for shard in part.shards}
+        lacking = _missing(known)
+        there = {shard for part in known for shard in part.shards}
         record["shards"] = [*map(str, sorted(there.difference(lacking)) if lacking else [ALL])]
         if empty := [row for row in _merged(files) if row.done and not row.points]:
             notes.append(empty_jobs_warning(empty, ""))
@@ -327,7 +337,8 @@ class _RowFile:
         ranges = [part.done(shard) for shard in part.shards]
         with self._path.open("wb") as file:
             for row in rows:
-                path, number = part.place.path(manifest_file(row.name)), row.number
+                path = part.place.path(manifest_file(row.name))
+                number = row.number
                 if not any(number in numbers for numbers in ranges):
                     raise LidarError(
                         f"{path} is of job {number}, which is not in shard "
@@ -416,7 +427,8 @@ def _merge_survey(
     screen: Screen,
 ) -> dict[str, Any]:
     """Make the survey again, and write its result from the points of all parts."""
-    notes, record = _check(parts, partial), parts[0].record
+    notes = _check(parts, partial)
+    record = parts[0].record
     told = record["made_of"]
     path = Path(scenario or told["path"])
     if not path.exists():
@@ -444,8 +456,10 @@ class _Merged(SurveyOutput):
 
     def look(self, run: Run[tuple[RunResult, dict[str, Any]]]) -> None:
         """Take all points into the run's store; LidarError names damaged files."""
-        store, damaged = run.store, list[str]()
-        only, mark = store.only, store.db.meta["mark"]
+        store = run.store
+        damaged = list[str]()
+        only = store.only
+        mark = store.db.meta["mark"]
         assert only is not None, "of a survey"
 
         def take(source: Storage, one: Receipt) -> Receipt | None:

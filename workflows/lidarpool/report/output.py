@@ -33,7 +33,9 @@ from ..scenario.scenario import Scenario
 from .picture_content import picture_content
 from .report import CountedCloud, make_report
 
-CLOUD, PAGE, REPORT = FORMATS["ply"].file, "report.html", LAST_FILE
+CLOUD = FORMATS["ply"].file
+PAGE = "report.html"
+REPORT = LAST_FILE
 _DRAWN = tuple(f"{name}.png" for name in PICTURES)
 FILES = (CLOUD, *_DRAWN, PICTURE_FILE, SWEEPS_FILE, PAGE, REPORT)
 _SURVEY = ("scene", "survey")  # what tells one from another
@@ -80,7 +82,8 @@ class SurveyOutput(Output[tuple[RunResult, dict[str, Any]]]):
         be read, or a file that this result would replace and that no report there lists, each
         unless `overwrite`; or a folder that would be replaced and holds files of others.
         """
-        place, storage = self.place, Storage.at(self.place)
+        place = self.place
+        storage = Storage.at(self.place)
         advice = "give another folder with --out, or replace it with --overwrite (in Python "
         advice += "overwrite=True)."
         with explained(f"{place} cannot be read"):
@@ -143,7 +146,9 @@ class SurveyOutput(Output[tuple[RunResult, dict[str, Any]]]):
 
         LidarError if a file cannot be written.
         """
-        place, folder, formats = self.place, self._folder, self.formats
+        place = self.place
+        folder = self._folder
+        formats = self.formats
         storage = place if isinstance(place, Storage) else None
         target = Storage.at(storage or folder)
         _, earlier = _earlier(target)
@@ -152,7 +157,8 @@ class SurveyOutput(Output[tuple[RunResult, dict[str, Any]]]):
 
         def points(file: str) -> StoredCloud:
             """Return the points, which tell how far a file is while they are read."""
-            count, done = len(result.points), 0
+            count = len(result.points)
+            done = 0
 
             def tell(more: int) -> None:
                 nonlocal done

@@ -65,7 +65,8 @@ class CountedCloud:
 
     def __init__(self, cloud: CloudLike, objects: int, materials: int = 0) -> None:
         self._cloud = cloud
-        self.by_object, self.no_surface = np.zeros(objects, np.int64), 0
+        self.by_object = np.zeros(objects, np.int64)
+        self.no_surface = 0
         self.by_class = np.zeros(1 << 16, np.int64)
         self.by_material = np.zeros(materials, np.int64)
         self.limits: dict[str, tuple[float, float]] = {}
@@ -119,10 +120,12 @@ class CountedCloud:
         """Points per square metre of what was read, the median over the surfaces; None without."""
         if not self._cells.any():
             return None
-        cells, side = self._cells.reshape(3 * (_CELLS,)), self._side
+        cells = self._cells.reshape(3 * (_CELLS,))
+        side = self._side
         while (median := float(np.median(cells[cells > 0]))) < _ENOUGH and len(cells) > 1:
             half = len(cells) // 2  # larger cells: those without points between sparse ones count
-            cells, side = cells.reshape(half, 2, half, 2, half, 2).sum((1, 3, 5)), 2 * side
+            cells = cells.reshape(half, 2, half, 2, half, 2).sum((1, 3, 5))
+            side = 2 * side
         return median / side**2
 
 
@@ -140,7 +143,8 @@ def make_report(result: RunResult, cloud: CountedCloud) -> dict[str, Any]:
 
     Lengths are in metres, times in seconds; infinite and unknown values are None.
     """
-    scene, survey = result.scene, result.survey
+    scene = result.scene
+    survey = result.survey
     tasks: dict[str, dict[str, int]] = {}  # by the partition where they ran, and by stage
     for stage in result.stages:
         for name, count in stage.resources.items():
@@ -301,7 +305,8 @@ def overlap_seconds(totals: Iterable[StageTotals]) -> float:
 
 def _planning(result: RunResult) -> dict[str, Any] | None:
     """Describe the planning and its result, in world coordinates, as in the scenario."""
-    plan, planning = result.plan, result.planning
+    plan = result.plan
+    planning = result.planning
     if plan is None or planning is None:
         return None
     origin = result.scene.origin[:2]

@@ -36,12 +36,15 @@ from lidarview.render.stage import make_axis, nice_step
 from ..plan.stations import Sight, StationPlan
 from .page.rendering import put_picture
 
-SIDE_LEAST, SIDE_MOST = 480, 4096  # letters need some pixels; a pixel takes 0.4 kB of memory
+# letters need some pixels; a pixel takes 0.4 kB of memory
+SIDE_LEAST = 480
+SIDE_MOST = 4096
 _LIGHT = ("reflectance", "intensity")  # columns for the picture of intensity, the better first
 SIDES_RATIO = 2  # longer side to shorter, at most, or legends do not fit
 FRAME = (0.085, 0.115, 0.70, 0.755)  # left, bottom, width, height of the plot on the page
 MOST_TRIALS = 1000
-PATH_COLOUR, TRIAL_COLOUR = "#d6336c", "#5b8fd0"
+PATH_COLOUR = "#d6336c"
+TRIAL_COLOUR = "#5b8fd0"
 COVERED, UNCOVERED, HIDDEN = range(3)  # hidden from all candidates
 COLOURS = np.stack([theme.rgb(c) for c in ("#5b9bd5", "#ee7733", theme.CLAY)])
 _BLOCK = 4  # pixels a side
@@ -61,8 +64,10 @@ def draw_pictures(
     All have the same viewpoint, and the cloud the colours of the column `colour`. There is none of
     a path that was not planned, nor of points in the axes of their sensors: the scene is in others.
     """
-    cloud, page = result / "cloud.ply", Path(folder) / "report.html"
-    least, most = min(size), max(size)
+    cloud = result / "cloud.ply"
+    page = Path(folder) / "report.html"
+    least = min(size)
+    most = max(size)
     if least < SIDE_LEAST or most > SIDE_MOST or most > SIDES_RATIO * least:
         raise LidarError(
             f"A picture cannot be {size[0]} x {size[1]} pixels: give width and height of "
@@ -85,7 +90,8 @@ def draw_pictures(
     names = only or [*makers]
     for number, name in enumerate(names):
         show("pictures", number, len(names), "pictures")
-        path, picture = Path(folder) / f"{name}.png", makers[name]()
+        path = Path(folder) / f"{name}.png"
+        picture = makers[name]()
         picture.save(path)
         if page.exists():
             put_picture(page, name, picture.svg())
@@ -226,7 +232,8 @@ def _limits(
     """Lowest and highest corner (2, 2) of the plot, in the page's proportions."""
     reach = planning.radii[:, None]
     shown = np.concatenate([best, *others, planning.centres - reach, planning.centres + reach])
-    low, high = shown.min(axis=0), shown.max(axis=0)
+    low = shown.min(axis=0)
+    high = shown.max(axis=0)
     width = np.maximum(high - low, 1e-3) * 1.1
     room = np.array([FRAME[2] * size[0], FRAME[3] * size[1]])
     half = room * (width / room).max() / 2

@@ -27,7 +27,8 @@ STAGES: tuple[tuple[str, str, str], ...] = (
 
 # The first items are slow, because workers warm up: the time left is shown after this share of
 # items, or after this time.
-SURE_SHARE, SURE_S = 0.05, 20.0
+SURE_SHARE = 0.05
+SURE_S = 20.0
 
 
 @dataclass(frozen=True)
@@ -84,7 +85,8 @@ class Pace:
 
     def told(self, seconds: float, count: int, whole: int) -> str:
         """Rate and time left; empty until something has been counted."""
-        rate, left = self.rate(seconds, count), self.left(seconds, count, whole)
+        rate = self.rate(seconds, count)
+        left = self.left(seconds, count, whole)
         return f"{in_words(rate)}/s{f'  {left} left' if left else ''}" if rate else ""
 
 
@@ -123,7 +125,8 @@ def bars(console: Console) -> Iterator[Show]:
 
         def show(progress: Progress) -> None:
             for label, count, unit in STAGES:
-                done, total = getattr(progress, count), getattr(progress, unit)
+                done = getattr(progress, count)
+                total = getattr(progress, unit)
                 if total:
                     pace = paces[label].told(progress.seconds, done, total)
                     if unit == "scans" and done < total:

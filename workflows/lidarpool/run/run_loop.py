@@ -212,7 +212,8 @@ class RunLoop:
 
     def _commit(self) -> None:
         """Commit that jobs have ended, and remove what is left of them."""
-        rows, self._rows = self._rows, []
+        rows = self._rows
+        self._rows = []
         if not rows:
             return
         under_way = self._store.under_way  # without jobs that could not be made
@@ -249,7 +250,8 @@ class RunLoop:
 
     def cast(self, first: Job, show: Show) -> None:
         """Do all jobs; on any error, everything has been stopped."""
-        cluster, pipeline = self._cluster, self._pipeline
+        cluster = self._cluster
+        pipeline = self._pipeline
         try:
             with cluster.partitions_page(), cluster.stopping(self._stop):
                 pipeline.open()
@@ -273,7 +275,9 @@ class RunLoop:
 
     def _loop(self, first: Job, show: Show) -> None:
         """Step everything until all have finished."""
-        pipeline, started, pause_s = self._pipeline, time.monotonic(), 0.0
+        pipeline = self._pipeline
+        started = time.monotonic()
+        pause_s = 0.0
         self._begin(first)  # and its trials
         watch = self._cluster.watch([GPU, OTHER] if self._trials else [GPU], lasting=[LIDAR])
         shown_at = saved_at = float("-inf")
@@ -320,7 +324,8 @@ class RunLoop:
     def _progress(self) -> Progress:
         """Return the counts of the run, without its time."""
         if (job := self._store.only) is None:
-            numbers, ended = self._store.jobs.numbers, self._store.db.ended_count
+            numbers = self._store.jobs.numbers
+            ended = self._store.db.ended_count
             return Progress(jobs=len(numbers), jobs_done=ended)
         progress = replace(
             job.progress(),
@@ -334,7 +339,9 @@ class RunLoop:
 
     def _stop(self, reason: str) -> None:
         """Stop everything, as far as the cluster can be reached."""
-        client, pipeline, trials = self._cluster.client, self._pipeline, self._trials
+        client = self._cluster.client
+        pipeline = self._pipeline
+        trials = self._trials
         steps: list[Callable[[], object]] = [lambda: pipeline.stop(reason), pipeline.finish]
         if trials is not None:
             steps.append(trials.tasks.cancel)

@@ -133,12 +133,18 @@ class CampaignRun:
         cls, rows: Iterable[JobRow], seconds: float, resumed: int | None = None, **more: Any
     ) -> CampaignRun:
         """Sum up the rows of a campaign, all of which are of an earlier run by default."""
-        failed, done, points, rays, casting = [], 0, 0, 0, 0.0
+        failed = []
+        done = 0
+        points = 0
+        rays = 0
+        casting = 0.0
         for row in rows:
             if row.error:
                 failed.append(row)
             else:
-                done, points, rays = done + 1, points + row.points, rays + row.rays
+                done = done + 1
+                points = points + row.points
+                rays = rays + row.rays
                 casting += row.seconds
         known = done if resumed is None else resumed
         return cls(tuple(failed), done, points, rays, casting, known, seconds, **more)

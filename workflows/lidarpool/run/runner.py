@@ -169,7 +169,9 @@ class Run(Generic[R]):
         """Return the first job that can be made; None if nothing is left to be cast."""
         if (only := self.store.only) is not None:
             return None if only.complete or not self.output.casts else only.job
-        jobs, dataset, db = self.jobs, self.output.dataset, self.store.db
+        jobs = self.jobs
+        dataset = self.output.dataset
+        db = self.store.db
         assert dataset is not None, "a campaign has one"
         numbers = (number for number in jobs.numbers if not db.ended(number))
         self._maker = JobMaker(jobs, numbers, dataset.columns)
@@ -181,7 +183,9 @@ class Run(Generic[R]):
 
     def _cast(self, first: Job) -> None:
         """Cast what is left, on a cluster with the slots that the first job needs."""
-        store, options, enter = self.store, self.options, self.cluster_stack.enter_context
+        store = self.store
+        options = self.options
+        enter = self.cluster_stack.enter_context
         if options.own:
             check_backend_here(store.backend or options.backend, store.advice)
         self.cluster = Cluster(first, store, options, self.screen, enter)
@@ -200,7 +204,8 @@ class Run(Generic[R]):
 
     def result(self) -> RunResult:
         """Return the result of the only job, which is committed."""
-        only, loop = self.store.only, self.loop
+        only = self.store.only
+        loop = self.loop
         assert only is not None, "there is one"
         job = only.job
         trials = tuple(sorted(only.trials, key=lambda trial: trial.trial))

@@ -81,7 +81,8 @@ class SweepStream:
         return replace(self, numbers=numbers)
 
     def __iter__(self) -> Generator[Sweep]:
-        options, screen = self.options, Screen()
+        options = self.options
+        screen = Screen()
         if options.own:
             check_backend_here(options.backend)
         waiting = Waiting(options.wait_s, screen.tell)
@@ -126,7 +127,9 @@ class StreamedJob(PipelineJob):
 
     def take(self, number: int) -> Sweep | None:
         """Take a sweep; None if not all of it was cast."""
-        job, survey, sweeps = self.job, self.survey, self.job.sweeps
+        job = self.job
+        survey = self.survey
+        sweeps = self.job.sweeps
         scan, stop = sweeps.scans[number : number + 2].tolist()
         parts = []
         while scan < stop:
@@ -160,11 +163,14 @@ class _Casting:
     collectors: Mapping[str, str] = MappingProxyType({"reader": ""})  # {name: address}
 
     def __init__(self, stream: SweepStream, client: Client, waiting: Waiting) -> None:
-        self._stream, self._client, options = stream, client, stream.options
+        self._stream = stream
+        self._client = client
+        options = stream.options
         _, self._workers, self._backend, software = find_workers(
             client, {GPU: 1}, options.backend, waiting=waiting
         )
-        partition, run = Partition(GPU, client), uuid.uuid4().hex[:8]
+        partition = Partition(GPU, client)
+        run = uuid.uuid4().hex[:8]
         self._casting = CastingWorkers(partition, run, self._backend, software)
         self._dispatcher = Dispatcher(self._casting, self, "")
         self._watch = Watch(client, [GPU], (), options.patience_s)
@@ -233,7 +239,8 @@ class _Casting:
         begun_before = len(self._coming)
         while len(self._coming) < self._stream.ahead and (self._next or self._begin_job()):
             if (streamed := self._next) is not None:  # else the job has failed
-                number, sweeps = streamed.sweeps_begun, streamed.job.sweeps
+                number = streamed.sweeps_begun
+                sweeps = streamed.job.sweeps
                 self._dispatcher.take(streamed, *sweeps.scans[number : number + 2].tolist())
                 self._coming.append((streamed, number))
                 streamed.sweeps_begun += 1
@@ -248,7 +255,8 @@ class _Casting:
         if isinstance(made, JobRow):
             self._leave_out(made.name, made.error)
             return True
-        job, options = made, self._stream.options
+        job = made
+        options = self._stream.options
         streamed = StreamedJob(job, self._stream.campaign.keep.format)
         try:
             check_workers(job, options, self._backend, self._workers)
@@ -256,8 +264,11 @@ class _Casting:
         except JobError as error:
             self._leave_out(job.name, error)
             return True
-        streamed.run, streamed.packed, streamed.scene_name = self._casting.run, packed, scene_name
-        limit, on_device = options.batch_mb * MB, self._backend == "cuda"
+        streamed.run = self._casting.run
+        streamed.packed = packed
+        streamed.scene_name = scene_name
+        limit = options.batch_mb * MB
+        on_device = self._backend == "cuda"
         streamed.scans_per_task = scans_that_fit(job.scene, job.survey, limit, on_device=on_device)
         streamed.scans_of_run = job.survey.scan_count
         self._jobs[job.number] = streamed
@@ -266,7 +277,8 @@ class _Casting:
 
     def _fetch(self) -> bool:
         """Fetch the columns of casting tasks from their workers."""
-        orders, self._orders = self._orders, []
+        orders = self._orders
+        self._orders = []
         for order in orders:
             results = fetch_available(self._client, [order.key], at=order.worker)
             if order.key not in results:
@@ -275,7 +287,8 @@ class _Casting:
             batches = {(batch.job, batch.part.first): batch for batch in results[order.key]}
             receipts = []
             for job, (first, _), name in order.parts:
-                streamed, batch = self._jobs[job], batches[job, first]
+                streamed = self._jobs[job]
+                batch = batches[job, first]
                 streamed.columns[first] = batch.part
                 receipt = Receipt.of_part(batch.part, job, name, 0, batch.record)
                 receipts.append((streamed, receipt))
@@ -292,7 +305,8 @@ class _Casting:
         """Warn of the first job without points: to find the reason, rays are cast here."""
         if streamed.points_read or self._warned:
             return
-        self._warned, job = True, streamed.job
+        self._warned = True
+        job = streamed.job
         logger.warning(
             "Job %s of the stream has no points: %s. Further jobs without points are not named.",
             job.name,

@@ -26,7 +26,8 @@ class TrialPump:
     """
 
     def __init__(self, tasks: Tasks[int], planning: Planning, done: Sequence[Trial] = ()) -> None:
-        self.tasks, self.planning = tasks, planning
+        self.tasks = tasks
+        self.planning = planning
         self.trials: list[Trial] = list(done)
         self._run_id = uuid.uuid4().hex[:8]
         known = {trial.trial for trial in done}
@@ -77,7 +78,8 @@ class TrialPump:
 
     def _leave_silent_workers(self) -> None:
         """Rerun trials whose workers are silent or have gone."""
-        seen, running = self._look(), self.tasks.running
+        seen = self._look()
+        running = self.tasks.running
         heard = sorted(seen.members - seen.silent)
         # A trial bound to a worker that has gone waits for ever.
         waiting = {key for key, place in seen.tasks.items() if place.state == "no-worker"}

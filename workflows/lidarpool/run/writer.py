@@ -35,7 +35,9 @@ from .run_result import RunResult
 from .store.run_store import RunStore
 
 WRITING = 2  # tasks that wait to be done, for each free slot of LIDAR
-TOGETHER, TOGETHER_POINTS = 32, 1_000_000  # jobs that one task writes, and their points
+# jobs that one task writes, and their points
+TOGETHER = 32
+TOGETHER_POINTS = 1_000_000
 GATHER_S = 0.25  # that a job waits for others to be written with
 BEGIN_S = 10.0  # for any job to begin to be written; then the driver writes one
 
@@ -96,7 +98,9 @@ class JobWriter:
         store: RunStore,
         of_parts: tuple[str, bytes],
     ) -> None:
-        self.tasks, place, mark = tasks, dataset.place, store.db.meta["mark"]
+        self.tasks = tasks
+        place = dataset.place
+        mark = store.db.meta["mark"]
         self.dataset = replace(dataset, made_with=store.made_with)
         # What a killed run leaves of it is removed as that of any killed writer.
         probe = (f"{TEMPORARY}dataset-{mark[:8]}", mark.encode())
@@ -201,7 +205,8 @@ class LidarWorkers:
     """Has the workers of LIDAR write ranges of files."""
 
     def __init__(self, cluster: Cluster) -> None:
-        self._cluster, self._tasks = cluster, cluster.tasks(LIDAR)
+        self._cluster = cluster
+        self._tasks = cluster.tasks(LIDAR)
 
     def __call__(self, writer: RangeWriter, spans: Sequence[PieceRange]) -> dict[PieceRange, Range]:
         """Write ranges; returns what was written of those whose workers see the folder.
@@ -209,9 +214,11 @@ class LidarWorkers:
         The range of a worker that dies is written by another. LidarError if one cannot write,
         several die of a range, or there is none for too long.
         """
-        partition, running = self._tasks.partition, self._tasks.running
+        partition = self._tasks.partition
+        running = self._tasks.running
         self._tasks.plugins = plugin_versions(writer.plugins)
-        waiting, most = deque(spans), 2 * partition.slots
+        waiting = deque(spans)
+        most = 2 * partition.slots
         written: dict[PieceRange, Range] = {}
         watch = self._cluster.watch([LIDAR])
         # Workers fetch it from the one that has it: as an argument of the tasks it would make Dask

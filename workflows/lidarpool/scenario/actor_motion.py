@@ -196,7 +196,8 @@ class TrajectorySection(Section):
         if len(pieces) == 1 and self.beyond == "absent":
             return replace(pieces[0], beyond="absent")
         assert way.start_s is not None  # of every track
-        begin, end = way.start_s, way.start_s + way.duration_ns / 1e9
+        begin = way.start_s
+        end = way.start_s + way.duration_ns / 1e9
         for piece in pieces:
             if piece.times_s[0] <= begin + CLOCK_S and end - CLOCK_S <= piece.times_s[-1]:
                 return replace(piece, beyond=way.beyond)
@@ -401,17 +402,20 @@ def read_fcd(
     known_attributes = set(_KNOWN)
     passages: list[Passage] = []
     known: dict[tuple[str, str], tuple[int, Passage]] = {}  # {who: last step, passage}
-    step, time = -1, -math.inf
+    step = -1
+    time = -math.inf
     vehicle: tuple[str, str] | None = None  # place of the last one of the time step
     try:
         for tag, at in _elements(path):
             if tag == "timestep":
-                before, time = time, float(at["time"])
+                before = time
+                time = float(at["time"])
                 if not before < time < math.inf:
                     raise ValueError(f"the time {time} does not come after the one before")
                 if before > last_s:  # the first time step after the last time is needed as well
                     break
-                step, vehicle = step + 1, None
+                step = step + 1
+                vehicle = None
             elif tag in _MOVING and step >= 0:
                 if not at.keys() <= known_attributes:
                     known_attributes |= _ignored(tag, at.keys() - known_attributes, ignore)
@@ -506,7 +510,8 @@ def actors_of(
         x, y, angle, z, slope = np.array(one.rows).reshape(-1, len(_ROW)).T
         fronts = np.column_stack([x, y, z]) + section.translation
         if follows:
-            fronts[:, 2], slope = section.translation[2], 0 * slope
+            fronts[:, 2] = section.translation[2]
+            slope = 0 * slope
         # Angles are clockwise from north, and slopes positive uphill.
         turns = rotations_of(np.column_stack([90.0 - angle, -slope, np.zeros(len(x))]))
         # SUMO places the middle of the front bumper.

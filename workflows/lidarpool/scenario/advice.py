@@ -23,7 +23,11 @@ from .sections import SensorSection
 # Sizes of scenes in metres are between these. An .stl is mostly a part, in millimetres; an object
 # to look at from outside is rarely longer than a bus. glTF is in metres, and some exporters write
 # millimetres.
-LARGE_M, LARGE_STL_M, LARGE_OBJECT_M, LARGE_STATED_M, SMALL_M = 500.0, 20.0, 10.0, 100.0, 0.2
+LARGE_M = 500.0
+LARGE_STL_M = 20.0
+LARGE_OBJECT_M = 10.0
+LARGE_STATED_M = 100.0
+SMALL_M = 0.2
 FINE = 100  # a scene is at least so many steps of the precision long
 
 
@@ -33,11 +37,13 @@ def advice(built: Built) -> list[str]:
     Also on objects that were left out, on files whose axes were guessed, on poses that were chosen,
     on figures that data sheets lack, and on settings without effect.
     """
-    notes, remarks = built.found.notes, built.found.remarks
+    notes = built.found.notes
+    remarks = built.found.remarks
     axes = [f"{remark} (--up-axis AXIS with a mesh file)" for remark in remarks[:1]]
     if remarks[1:]:
         axes = [f"{axes[0]}; {plural(len(remarks) - 1, 'more file')}, too"]
-    side, step = float(np.ptp(built.scene.bounds, axis=0).max()), built.survey.precision_m
+    side = float(np.ptp(built.scene.bounds, axis=0).max())
+    step = built.survey.precision_m
     every = built.survey.keep_every
     placed = "" if built.placing is None else built.placing.note
     likely = filter(None, (_of_size(built, side), placed, _of_colours(built)))
@@ -60,14 +66,17 @@ def _writes_bags(scenario: Scenario) -> bool:
 
 
 def _of_size(built: Built, side: float) -> str:
-    scenario, placing = built.scenario, built.placing
+    scenario = built.scenario
+    placing = built.placing
     files = [entry.file for entry in scenario.scene.files if entry.unit is None]
     files = [file for file in files if file not in built.found.classes]  # towns are large
     unitless = [file for file in files if _lacks_unit(scenario.path(file))]
     parts = any(file.lower().endswith(".stl") for file in unitless)
-    least, large = SMALL_M, LARGE_STL_M if parts else LARGE_M
+    least = SMALL_M
+    large = LARGE_STL_M if parts else LARGE_M
     if around := placing is not None and placing.around:
-        least, large = 0.0, LARGE_OBJECT_M if unitless else LARGE_STATED_M
+        least = 0.0
+        large = LARGE_OBJECT_M if unitless else LARGE_STATED_M
     if not (unitless or (around and files)) or least <= side <= large:
         return ""
     unit = "mm" if side > large else "km"
@@ -94,7 +103,8 @@ def _of_colours(built: Built) -> str:
             "a column or reflectance: texture needs colours, but nothing in the scene has any, "
             "so that all is grey"
         )
-    names, kinds = scene.all_names, scene.surface_kinds
+    names = scene.all_names
+    kinds = scene.surface_kinds
     table = MaterialTable.of(built.survey.materials, kinds, voxels=scene.has_voxels)
     textured = np.zeros(len(names), np.bool_)
     textured[kinds.object[table.scale > 0]] = True
@@ -109,7 +119,8 @@ def _of_colours(built: Built) -> str:
 
 def _of_datasheets(built: Built) -> Iterator[str]:
     """Name what the data sheets of sensors do not state, and the scenario does not give."""
-    scenario, given = built.scenario, built.scenario.noise.model_fields_set
+    scenario = built.scenario
+    given = built.scenario.noise.model_fields_set
     sections: Mapping[str, SensorSection] = scenario.sensors or {"": scenario.sensor}
     for section, carried in zip(sections.values(), built.survey.carried, strict=True):
         lacking = (name for name in STATED if not getattr(carried.noise, name, True))
@@ -134,7 +145,8 @@ def _without_effect(scenario: Scenario) -> Iterator[str]:
         yield "weather.spray_g_m3 needs actors or traffic that move, and there are none"
     if scenario.noise.stray_light and not any(entry.retro for entry in scenario.materials):
         yield "noise.stray_light needs materials with retro: true, and there are none"
-    way, imu = scenario.trajectory, scenario.navigation and scenario.navigation.imu
+    way = scenario.trajectory
+    imu = scenario.navigation and scenario.navigation.imu
     if imu and way and way.interpolation == "linear" and len(way.points) != 2:
         yield "navigation.imu has jumps at linear poses: give trajectory.interpolation: smooth"
     if scenario.noise.velocity_m_s and VELOCITY not in scenario.cloud.columns:
@@ -143,7 +155,8 @@ def _without_effect(scenario: Scenario) -> Iterator[str]:
 
 def _ended(built: Built) -> Iterator[str]:
     """Tell of frozen sensors without sweeps, and of actors that are not there, or end early."""
-    survey, end = built.survey, np.array([built.survey.duration_ns])
+    survey = built.survey
+    end = np.array([built.survey.duration_ns])
     for number, (_, begins, _) in enumerate(survey.sweeps_each):
         for place, fault in survey.faults_of(number, "frozen").items():
             if not fault.during(begins).any():

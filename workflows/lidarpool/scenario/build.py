@@ -103,7 +103,8 @@ class Job:
     made_of: Sequence[tuple[str, str]] = ()
 
     def __post_init__(self) -> None:
-        scene, survey = self.scene, self.survey
+        scene = self.scene
+        survey = self.survey
         MaterialTable.of(survey.materials, scene.surface_kinds, voxels=scene.has_voxels)
         # The cells of the cloud's precision that the scene spans have numbers of 32 bits.
         reach = float(np.abs(scene.bounds).max(initial=0.0))
@@ -156,8 +157,12 @@ def build(
         If a file cannot be read, or fields do not fit together or the scene.
     """
     static = read_static_scene(scenario) if cache is None else cache.find(scenario)
-    found, scene, standing = static.found.copy(), static.scene, static.standing
-    shapes, epsg, way = Shapes(scenario, found), _common_epsg(scenario, found), scenario.trajectory
+    found = static.found.copy()
+    scene = static.scene
+    standing = static.standing
+    shapes = Shapes(scenario, found)
+    epsg = _common_epsg(scenario, found)
+    way = scenario.trajectory
     with prefixed(scenario.source):
         track = None if way is None else way.track(scenario.path, standing)
         sensors = _mounted(shapes)
@@ -184,7 +189,8 @@ def build(
             vehicles = _vehicles(scenario.traffic, shapes, standing, start_s, duration_s)
     if actors or vehicles:
         scene = scene.with_actors([*scene.actors, *actors, *(actor for actor, _ in vehicles)])
-    mistakes, planning = Mistakes(), None
+    mistakes = Mistakes()
+    planning = None
     with mistakes.noted():
         with prefixed(scenario.source):
             classes = [entry.semantic_class for _, entry in vehicles]
@@ -242,7 +248,9 @@ def _mounted(shapes: Shapes) -> list[Mounted]:
     """Return the sensors on their carrier."""
     scenario = shapes.scenario
     sections: Mapping[str, SensorSection] = scenario.sensors or {"": scenario.sensor}
-    path, noise, returns = scenario.path, scenario.noise, scenario.returns
+    path = scenario.path
+    noise = scenario.noise
+    returns = scenario.returns
     return [
         section.mounted(path, _mount(section, shapes), noise, returns, name)
         for name, section in sections.items()
@@ -288,7 +296,8 @@ def _joints(entry: ActorSection, scenario: Scenario) -> dict[str, Any]:
 
 def _actors(shapes: Shapes, standing: Standing, track: Track | None) -> list[Actor]:
     """Build the actors; their trajectories begin with that of the survey."""
-    scenario, out = shapes.scenario, list[Actor]()
+    scenario = shapes.scenario
+    out = list[Actor]()
     with prefixed(scenario.source):
         ways = [e.way(scenario.path, standing, track) for e in scenario.actors]
     for entry, way in zip(scenario.actors, ways, strict=True):
@@ -304,7 +313,8 @@ def _actors(shapes: Shapes, standing: Standing, track: Track | None) -> list[Act
 
 def _links(entry: ActorSection, robot: Robot, way: Track, shapes: Shapes) -> Sequence[Actor]:
     """Actors of a robot, without the links that sensors are mounted on."""
-    tell, links = shapes.found.notes.append, shapes.scenario.links
+    tell = shapes.found.notes.append
+    links = shapes.scenario.links
     without = links.intersection(robot.meshes) if entry.is_carrier else ()
     for link in sorted(without):
         tell(f"{entry.name}: link {link} is left out: a sensor is mounted on it")
@@ -316,7 +326,8 @@ def _vehicles(
     section: TrafficSection, shapes: Shapes, standing: Standing, start_s: float, duration_s: float
 ) -> list[tuple[Actor, VehicleSection]]:
     """Vehicles and persons that are there during the survey, each with its entry."""
-    begin, found = start_s - section.offset_s, shapes.found
+    begin = start_s - section.offset_s
+    found = shapes.found
     file = shapes.scenario.path(section.file)
     passages, count = read_fcd(file, begin, begin + duration_s, section.ignore)
     made = actors_of(section, passages, shapes.of, standing, start_s)
@@ -438,15 +449,18 @@ def _survey(
 def _planning(scenario: Scenario, scene: Scene) -> Planning | None:
     """Build the planning in local coordinates; None if the scenario asks for none."""
     section, (x0, y0, _) = scenario.planning, scene.origin
-    start, target = section.start, section.target
+    start = section.start
+    target = section.target
     if scenario.scene.has_seed:
-        start, target = start or SEED_START, target or SEED_TARGET
+        start = start or SEED_START
+        target = target or SEED_TARGET
     if section.enabled is False or start is None or target is None:
         return None
     discs, labels = _discs(scenario, scene)
     discs[:, 2] += section.clearance_m
     wide = np.flatnonzero(discs[:, 2])  # upright lines have no area
-    discs, labels = discs[wide], [labels[i] for i in wide]
+    discs = discs[wide]
+    labels = [labels[i] for i in wide]
     begin, last = [(x - x0, y - y0) for x, y in (start, target)]
     for end, point in (("start", begin), ("target", last)):
         inside = np.hypot(*(discs[:, :2] - point).T) < discs[:, 2]

@@ -536,7 +536,8 @@ def read_rows(path: Path, kind: Any, ignore: Sequence[str] = ()) -> list[Any]:
     except (OSError, ValueError, csv.Error, LidarError) as error:
         raise LidarError(f"{path} is not a usable table: {message_of(error)}") from error
     adapter = TypeAdapter(entry)
-    mistakes, rows = Mistakes(), []
+    mistakes = Mistakes()
+    rows = []
     for line, row in cells:
         where = f"{path}, line {line}"
         with mistakes.noted(), sentences(model, where):

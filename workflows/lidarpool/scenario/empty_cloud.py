@@ -64,7 +64,8 @@ def _limits(survey: Survey, ranges: Floats) -> Iterator[str]:
     """Say which limits of range exclude the surfaces; nothing if some are within the limits."""
     lower = [carried.sensor.min_range_m for carried in survey.carried]
     upper = [carried.sensor.max_range_m for carried in survey.carried]
-    near, far = ranges < min(lower), ranges > max(upper)
+    near = ranges < min(lower)
+    far = ranges > max(upper)
     if not (near | far).all():
         return
     if near.any():

@@ -29,7 +29,8 @@ class Standing:
     """
 
     def __init__(self, scene: Scene | None, objects: Indices | None = None) -> None:
-        self._scene, self._objects = scene, objects
+        self._scene = scene
+        self._objects = objects
         self._parts: dict[tuple[str, ...], Standing] = {}  # {names: of these objects}
 
     @property
@@ -39,7 +40,8 @@ class Standing:
 
     def only(self, names: Sequence[str]) -> Standing:
         """Return the same of some objects; LidarError if there is nothing to stand on."""
-        key, scene = tuple(names), self._scene
+        key = tuple(names)
+        scene = self._scene
         if key in self._parts:
             return self._parts[key]
         if scene is None:
@@ -65,13 +67,16 @@ class Standing:
     def _tops(self) -> tuple[Floats, Ints32]:
         """Triangles that face up, local (f, 3, 3), and their objects (f,)."""
         assert self._scene is not None
-        drawn, shared = self._scene, self._scene.instances
+        drawn = self._scene
+        shared = self._scene.instances
         if shared and (self._objects is None or np.isin(shared.owner, self._objects).any()):
             drawn = Drawn.of(drawn).scene
-        corners, owner = drawn.vertices[drawn.faces], drawn.face_object
+        corners = drawn.vertices[drawn.faces]
+        owner = drawn.face_object
         if self._objects is not None:
             own = np.isin(owner, self._objects)
-            corners, owner = corners[own], owner[own]
+            corners = corners[own]
+            owner = owner[own]
         (ax, ay), (bx, by) = ((corners[:, k] - corners[:, 0]).T[:2] for k in (1, 2))
         up = ax * by - ay * bx > 0
         return corners[up], owner[up]
@@ -98,11 +103,13 @@ class Standing:
 
     def under(self, places: Floats) -> tuple[Floats, Ints32]:
         """Heights below places (n, 2), world metres, nan for none; and their objects, -1."""
-        heights, objects = np.full(len(places), np.nan), np.full(len(places), -1, np.int32)
+        heights = np.full(len(places), np.nan)
+        objects = np.full(len(places), -1, np.int32)
         if self._scene is None or not len(self._tops[0]):
             return heights, objects
         corners, owner = self._tops
-        origin, top = self._scene.origin, float(corners[..., 2].max()) + 1.0
+        origin = self._scene.origin
+        top = float(corners[..., 2].max()) + 1.0
         origins = np.column_stack([places - origin[:2], np.full(len(places), top)])
         hits = self._caster.cast(origins, np.broadcast_to([0.0, 0.0, -1.0], origins.shape))
         on = hits.hit

@@ -20,24 +20,31 @@ from lidarsim.sensor import Mounted, Pose, Sensor
 from lidarsim.sensor.materials import rows_named
 
 # Heights above a floor; and the least distance from the ceiling.
-_HEIGHTS_M, _BELOW_M = (1.0, 2.0, 3.0), 0.2
+_HEIGHTS_M = (1.0, 2.0, 3.0)
+_BELOW_M = 0.2
 
 # Distances from the middle that are tried in turn if something is in the way there, or a building.
 _ASIDE_M = (2.0, 4.0, 8.0, 16.0, 32.0, 64.0)
 
 # Poses around an object: azimuths, which see two sides of a box each; degrees above its middle; and
 # distance from its middle, in its diagonals, the least and the most.
-_AZIMUTHS_DEG, _ABOVE_DEG, _FAR = (45, 135, 225, 315), 20.0, (1.5, 3.0)
+_AZIMUTHS_DEG = (45, 135, 225, 315)
+_ABOVE_DEG = 20.0
+_FAR = (1.5, 3.0)
 _LOOKED_AT = 1000  # firings that tell a sensor's field of view
 _FACING_DEG = 45.0  # rays of that field
 
 # A grid around an object has about so many points, but not more rays; of all poses. Rays that are
 # tried are so many in a row, and the field of view is so much wider than the object.
-_POINTS, _RAYS_MOST, _TRIED, _MARGIN = 100_000, 5_000_000, 64, 1.02
+_POINTS = 100_000
+_RAYS_MOST = 5_000_000
+_TRIED = 64
+_MARGIN = 1.02
 
 # Larger scenes are not looked at, nor sheets such as terrains of more triangles than the second,
 # and instances have no more: a tree takes 300 bytes and some microseconds a triangle.
-_TRIANGLES_MOST, _SHEETS_MOST = 2_000_000, 200_000
+_TRIANGLES_MOST = 2_000_000
+_SHEETS_MOST = 200_000
 
 
 @dataclass(frozen=True)
@@ -72,7 +79,8 @@ def place(
     if landscape and not len(heights_at(drawn, middle[0], middle[1])):  # a hole
         ground = drawn.vertices[drawn.faces].mean(axis=1) + drawn.origin
         middle = ground[np.argmin(np.hypot(*(ground - middle)[:, :2].T))]
-    standing, looker = _standing(drawn, middle), None if landscape else _looker(drawn)
+    standing = _standing(drawn, middle)
+    looker = None if landscape else _looker(drawn)
     if buildings and len(heights_at(_named(drawn, buildings), middle[0], middle[1])):
         standing = _aside(drawn, middle, buildings)
         is_object = not standing
@@ -91,7 +99,8 @@ def place(
     )
     grid = _narrowed(drawn, looker, poses) if narrow and looker else {}
     if grid:
-        width, height = grid["horizontal_fov_deg"], grid["vertical_fov_deg"]
+        width = grid["horizontal_fov_deg"]
+        height = grid["vertical_fov_deg"]
         note += (
             f"; as no sensor is given, a grid of {grid['rays_per_revolution']:,} x "
             f"{grid['layers']:,} rays from each, over {width:g} x {height:g} degrees around it"
@@ -211,7 +220,8 @@ def poses_around(scene: Scene, carried: Mounted) -> tuple[Pose, ...]:
     too narrow for the whole scene, nearer if that is out of its range.
     """
     low, high = scene.bounds + scene.origin
-    middle, diagonal = (low + high) / 2, float(np.linalg.norm(high - low))
+    middle = (low + high) / 2
+    diagonal = float(np.linalg.norm(high - low))
     sensor, (down, up) = carried.sensor, _field_deg(carried)
     half = np.radians(max(up - down, 1e-3) / 2)
     far = max(diagonal * float(np.clip(0.5 / np.sin(half), *_FAR)), sensor.min_range_m + diagonal)

@@ -28,13 +28,19 @@ NOISE_SHARE = 0.1  # of the range
 
 # Orientation against the direction of travel: angles of this size are no drift of a vehicle, if
 # they are constant, which is the length of the mean of unit vectors with these angles.
-_ASKEW_DEG, _CONSTANT = 30.0, 0.95
-_MOVES_M_S, _TRAVELS_M = 0.1, 2.0  # below these speeds and lengths directions of travel are noise
+_ASKEW_DEG = 30.0
+_CONSTANT = 0.95
+# below these speeds and lengths directions of travel are noise
+_MOVES_M_S = 0.1
+_TRAVELS_M = 2.0
 # Cosines of tilt, on the average: a carrier that is level, and one that lies on its side.
-_LEVEL, _TILTED = 0.9, 0.5
+_LEVEL = 0.9
+_TILTED = 0.5
 # A path that rises and falls by more than so many metres and this share of its length, while it
 # stays within a share of that height along x or y, has another axis up.
-_RISE_M, _RISE_SHARE, _FLAT = 5.0, 0.3, 0.1
+_RISE_M = 5.0
+_RISE_SHARE = 0.3
+_FLAT = 0.1
 
 _POSITIONS = 24  # that are looked around from
 _TIMES = 20_000  # of a trajectory that are looked at
@@ -70,7 +76,8 @@ def implausibilities(built: Built) -> list[str]:
     Poses that were chosen for the user are not judged. Some thousand rays are cast in scenes that
     are not too large.
     """
-    scene, survey = built.scene, built.survey
+    scene = built.scene
+    survey = built.survey
     chosen = built.scenario.poses is None and built.scenario.trajectory is None
     places = [] if chosen else _places(survey)
     positions = np.array([place.position for place in places]).reshape(-1, 3)
@@ -91,7 +98,8 @@ def implausibilities(built: Built) -> list[str]:
 
 def _places(survey: Survey) -> list[_Place]:
     """Return some positions of the sensors, in local coordinates."""
-    path, mounts = survey.path, [carried.mount for carried in survey.carried]
+    path = survey.path
+    mounts = [carried.mount for carried in survey.carried]
     if path.moves:
         times = np.linspace(0, min(path.duration_ns, survey.duration_ns), _POSITIONS)
         stations = [(0, time) for time in times.tolist()]
@@ -201,7 +209,8 @@ def _motion(survey: Survey) -> _Motion:
     else:
         knots = np.linspace(0.0, end_ns, _TIMES)
     rows = even_indices(len(knots) - 1, _TIMES)
-    times, durations_s = (knots[rows] + knots[rows + 1]) / 2, np.diff(knots)[rows] / 1e9
+    times = (knots[rows] + knots[rows + 1]) / 2
+    durations_s = np.diff(knots)[rows] / 1e9
     return _Motion(times, durations_s, *full_poses(path, 0, times), *velocities(path, 0, times))
 
 
@@ -220,7 +229,8 @@ def _flies(scene: Scene, survey: Survey, looker: Surroundings | None, positions:
 def _of_speed(motion: _Motion, *, flies: bool) -> Iterator[str]:
     """Warn of speeds and angular rates that carriers do not have."""
     limit, what = (AIR_SPEED_M_S, "in the air") if flies else (GROUND_SPEED_M_S, "on the ground")
-    speeds, rates = motion.speeds, np.degrees(np.linalg.norm(motion.rates, axis=1))
+    speeds = motion.speeds
+    rates = np.degrees(np.linalg.norm(motion.rates, axis=1))
     if (speeds > limit).any():
         fastest = int(speeds.argmax())
         yield (
@@ -305,7 +315,8 @@ class _Facing(NamedTuple):
     def of(cls, motion: _Motion, rotations: Floats) -> _Facing:
         """Measure the orientation by rotations (k, 3, 3) along a path."""
         level = float(np.average(rotations[:, 2, 2], weights=motion.durations_s))
-        ahead, travel = rotations[:, :2, 0], motion.velocities[:, :2]
+        ahead = rotations[:, :2, 0]
+        travel = motion.velocities[:, :2]
         speeds = np.linalg.norm(travel, axis=1)
         metres = np.where(speeds > _MOVES_M_S, speeds * motion.durations_s, 0.0)
         if metres.sum() < _TRAVELS_M:

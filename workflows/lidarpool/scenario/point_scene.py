@@ -35,7 +35,8 @@ from ..base.open3d_module import load_open3d
 
 # Chosen on scans of a city, from 7 to 30 neighbours and 0.7 to 1.4: more of either closes more gaps
 # between points, and makes surfels reach farther beyond edges.
-_NEIGHBOURS, _EXTENT = 12, 0.85
+_NEIGHBOURS = 12
+_EXTENT = 0.85
 _MOST_VOXELS = 3  # that half a surfel is long: distant and stray points have no neighbours
 _SAMPLE = 20_000  # points whose neighbours tell the spacing
 _NEAREST = 9  # a point itself, and the eight around it on a square grid

@@ -248,13 +248,16 @@ class Scenario(Section):
             made = Scenario.model_validate(data)
         given = {name: getattr(made, name) for name in made.model_fields_set}
         scenario = self.model_copy(update=given)
-        scenario._folder, scenario._source = self._folder if folder is None else folder, source
+        scenario._folder = self._folder if folder is None else folder
+        scenario._source = source
         scenario._check()
         return scenario
 
     def _check(self) -> None:
         """Raise LidarError if fields do not fit together."""
-        mistakes, wrong, planning = Mistakes(), [], self.planning
+        mistakes = Mistakes()
+        wrong = []
+        planning = self.planning
         # The default objects have a start and a target.
         lacking = 0 if self.scene.has_seed else [planning.start, planning.target].count(None)
         if planning.enabled and lacking:

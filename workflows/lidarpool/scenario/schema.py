@@ -103,7 +103,8 @@ def short_scenario(data: Mapping[str, Any], note: str) -> str:
 
     `data` is what `mesh_data` returns, `note` a remark on its poses.
     """
-    lines, data = [_FEW, ""], {"scene": "seed"} | dict(data)
+    lines = [_FEW, ""]
+    data = {"scene": "seed"} | dict(data)
     for name, (example, words) in _SECTIONS.items():
         given = name in data
         code = f"{name}: {on_one_line(data[name])}" if given else f"# {name}: {example}"
@@ -117,7 +118,8 @@ def scenario_template(data: Mapping[str, Any], note: str) -> str:
 
     `data` is what `mesh_data` returns, in place of some of them, `note` a remark on its poses.
     """
-    lines, given = [_EVERY], dict(data)
+    lines = [_EVERY]
+    given = dict(data)
     if isinstance(given.get("sensor"), str):
         given["sensor"] = {"model": given["sensor"]}
     for name, field in Scenario.model_fields.items():

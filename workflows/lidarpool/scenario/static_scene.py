@@ -94,7 +94,8 @@ class SceneCache:
     """The static scenes that scenarios had last, for others that have the same."""
 
     def __init__(self, most: int = 4) -> None:
-        self._most, self._kept = most, dict[object, StaticScene]()
+        self._most = most
+        self._kept = dict[object, StaticScene]()
 
     def find(self, scenario: Scenario) -> StaticScene:
         """Return the static scene of a scenario, which is read if it is not kept."""
@@ -125,7 +126,8 @@ def read_static_scene(scenario: Scenario) -> StaticScene:
     LidarError
         If a file cannot be read, or copies have no place.
     """
-    section, found = scenario.scene, Findings()
+    section = scenario.scene
+    found = Findings()
     shapes = Shapes(scenario, found)
     meshes: list[SceneMesh | SceneInstance] = list(seed_objects()) if section.has_seed else []
     moving: list[Actor] = []
@@ -153,13 +155,15 @@ class Shapes:
     """Meshes and robots of a scenario, each file read once; `found` is added to."""
 
     def __init__(self, scenario: Scenario, found: Findings) -> None:
-        self.scenario, self.found = scenario, found
+        self.scenario = scenario
+        self.found = found
         self._made: dict[Any, SceneMesh] = {}  # {file or size: mesh}
         self._robots: dict[MeshFile, Robot] = {}
 
     def of(self, entry: ShapeSection) -> SceneMesh:
         """Return the mesh of a copy, an actor or vehicles, under any name."""
-        shape, made = entry.file or entry.box or (1.0, 1.0, 1.0), self._made
+        shape = entry.file or entry.box or (1.0, 1.0, 1.0)
+        made = self._made
         animation, wheels = (getattr(entry, name, None) for name in ("animation", "wheels"))
         played = animation and (animation.name, animation.speed_m_s, animation.repeat)
         key = shape, played, wheels
@@ -182,18 +186,21 @@ class Shapes:
     def robot(self, entry: MeshFile) -> Robot:
         """Return the robot of a file; LidarError if it cannot be used."""
         if entry not in self._robots:
-            path, tell = self.scenario.path(entry.file), self.found.notes.append
+            path = self.scenario.path(entry.file)
+            tell = self.found.notes.append
             colours = self.scenario.coloured
             named = self.scenario.names_materials
             made = load_robot(
                 path, opacity=entry.opacity, colours=colours, materials=named, tell=tell
             )
-            self._robots[entry], self.found.sources[entry.file] = made, made.summary
+            self._robots[entry] = made
+            self.found.sources[entry.file] = made.summary
         return self._robots[entry]
 
     def read(self, entry: MeshFile, animation: str | None = None) -> Objects:
         """Read the objects of a file, with an animation; LidarError if it cannot be used."""
-        scenario, found = self.scenario, self.found
+        scenario = self.scenario
+        found = self.found
         with prefixed(scenario.source):
             transform = entry.transform()
         if entry.file.lower().endswith(ROBOTS):
@@ -222,7 +229,8 @@ class Shapes:
                 f"{self.scenario.path(entry.file)} is a robot, which is in metres and Z-up: leave "
                 f"out {' and '.join(other)}."
             )
-        robot, tell = self.robot(entry), self.found.notes.append
+        robot = self.robot(entry)
+        tell = self.found.notes.append
         if robot.moving:
             tell(f"{entry.file} has its joints at zero; joints of an actor move them")
         links = Objects((), robot.actors(tell=tell)).still(lambda _: None)
@@ -231,7 +239,8 @@ class Shapes:
 
 def _copies(shapes: Shapes, base: list[SceneMesh | SceneInstance]) -> list[SceneInstance]:
     """Place the copies; they stand on other objects and on the ground, not on one another."""
-    scenario, section = shapes.scenario, shapes.scenario.scene
+    scenario = shapes.scenario
+    section = shapes.scenario.scene
     scene = Scene.from_meshes(base) if base else None
     if section.ground is not None and (base or _copied_to(section)):
         scene = Scene.from_meshes([*base, _ground(section, scene)])
@@ -278,7 +287,8 @@ DRAWN = 1 << 14  # places that are drawn at a time
 DRAWS_MOST = 200  # places that are drawn for each copy, if not fewer than
 DRAWS_LEAST = 1 << 21
 
-_PLACE, _ANGLES = ("x", "y", "z"), ("yaw_deg", "pitch_deg", "roll_deg")
+_PLACE = ("x", "y", "z")
+_ANGLES = ("yaw_deg", "pitch_deg", "roll_deg")
 _SCALES = ("scale_x", "scale_y", "scale_z")
 _COPY_COLUMNS = (
     *POSITION,
@@ -407,7 +417,8 @@ class _TakenPlaces:
         apart = self._apart
         if not apart:
             return True
-        column, row = int(x // apart), int(y // apart)
+        column = int(x // apart)
+        row = int(y // apart)
         for i in (column - 1, column, column + 1):
             for j in (row - 1, row, row + 1):
                 for u, v in self._taken.get((i, j), ()):

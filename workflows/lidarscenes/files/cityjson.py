@@ -116,8 +116,10 @@ class _CityFile:
     """
 
     def __init__(self, head: _Json, allowance: Allowance, wanted: Wanted) -> None:
-        self._head, self._allowance = head, allowance
-        self._colours, self._named = wanted.colours, wanted.materials
+        self._head = head
+        self._allowance = allowance
+        self._colours = wanted.colours
+        self._named = wanted.materials
         version = str(head.get("version"))
         if not re.match(r"1\.[01]|2\.0", version):
             raise MeshFileError(
@@ -152,7 +154,8 @@ class _CityFile:
             if not found or best < parts.get(key, -np.inf):
                 continue
             self._levels[best] += 1
-            name, surfaces = f"{objects[key]['type']} {key}", []
+            name = f"{objects[key]['type']} {key}"
+            surfaces = []
             for level, geometry in found:
                 if level == best and geometry["type"] == "GeometryInstance":
                     self._place(name, geometry, points)
@@ -194,7 +197,9 @@ class _CityFile:
 
         All polygons of a document are cut at once, which takes a tenth of the time.
         """
-        corners, sizes = [np.zeros(0, np.int64)], []  # of polygons without holes
+        # of polygons without holes
+        corners = [np.zeros(0, np.int64)]
+        sizes = []
         owners: list[tuple[int, int]] = []  # of each its object and material
         cut: list[Ints] = []  # triangles of those with holes
         cut_owners: list[tuple[int, int]] = []
@@ -217,7 +222,8 @@ class _CityFile:
                 check_corners(corners[-1], len(points))
             except (ArithmeticError, AttributeError, LookupError, TypeError, ValueError) as error:
                 raise ValueError(f"{name[:80]!r}: {error}") from error
-        at, each = np.concatenate(corners), np.array(sizes, np.int64)
+        at = np.concatenate(corners)
+        each = np.array(sizes, np.int64)
         self._allowance.take(100 * len(at))
         # With corners of its own for each polygon, a triangle tells which one it is of.
         simple = triangulated(points[at], np.arange(len(at)), each)
@@ -229,13 +235,15 @@ class _CityFile:
         if not len(faces):
             return [[] for _ in wanted]
         order = np.lexsort(owner.T[::-1])
-        faces, owner = faces[order], owner[order]
+        faces = faces[order]
+        owner = owner[order]
         begins = np.flatnonzero(np.diff(owner, axis=0, prepend=-2).any(axis=1))
         pieces: list[list[Piece]] = [[] for _ in wanted]
         for some, (number, material) in zip(
             np.split(faces, begins[1:]), owner[begins].tolist(), strict=True
         ):
-            painted, named = None, ""
+            painted = None
+            named = ""
             if material >= 0:
                 entry = document["appearance"]["materials"][material]
                 if self._colours:

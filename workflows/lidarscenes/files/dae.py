@@ -72,7 +72,9 @@ class _Document:
     def __init__(
         self, root: Element, allowance: Allowance, paint: _Effects | None, *, named: bool
     ) -> None:
-        self._root, self._allowance, self._paint = root, allowance, paint
+        self._root = root
+        self._allowance = allowance
+        self._paint = paint
         self._named = named  # whether names of materials are wanted
         # By kind, too: some programs give a scene and a node in it the same id.
         self._ids: dict[tuple[str, str], Element] = {}
@@ -174,7 +176,8 @@ class _Document:
         check_corners(corners[:, offset], len(points))
         made = _faces(primitive, points[corners[:, offset]], own_corners.__getitem__)
         own = np.concatenate([np.zeros((0, 3), np.int64), *made])
-        faces, colours = corners[:, offset][own], None
+        faces = corners[:, offset][own]
+        colours = None
         if self._paint and material is not None and len(faces):
             with self._paint.notes.without_colour(material.get("name") or material.get("id") or ""):
                 url = material.find("instance_effect[@url]")
@@ -198,7 +201,8 @@ class _Document:
 
     def _inputs(self, primitive: Element) -> tuple[Floats, int, int]:
         """Points of a primitive; place of their numbers in <p>, and numbers of each corner."""
-        stride, found = 0, None
+        stride = 0
+        found = None
         for entry in primitive.findall("input"):
             offset = int(entry.get("offset", 0))
             stride = max(stride, offset + 1)
@@ -230,7 +234,8 @@ class _Document:
         if accessor is None:
             raise ValueError("positions without <accessor>")
         numbers = self._floats(self._target(accessor, "float_array"))
-        count, stride = int(accessor.get("count", 0)), int(accessor.get("stride", 1))
+        count = int(accessor.get("count", 0))
+        stride = int(accessor.get("stride", 1))
         offset = int(accessor.get("offset", 0))
         if min(count, offset, stride - 1) < 0 or offset + count * stride > len(numbers):
             raise ValueError(
@@ -244,7 +249,9 @@ class _Effects:
 
     def __init__(self, path: Path, wanted: Wanted, allowance: Allowance) -> None:
         self.notes = MaskNotes()
-        self._path, self._wanted, self._allowance = path, wanted, allowance
+        self._path = path
+        self._wanted = wanted
+        self._allowance = allowance
         self._texture = remembered(self._read_texture)
 
     def shade(self, effect: Element, ids: dict[tuple[str, str], Element]) -> Texture | Bytes | None:
@@ -252,14 +259,17 @@ class _Effects:
         diffuse = effect.find(".//technique/*/diffuse")
         if diffuse is None:
             return None
-        texture, colour = diffuse.find("texture"), diffuse.findtext("color")
+        texture = diffuse.find("texture")
+        colour = diffuse.findtext("color")
         if texture is None:
             if colour is None:
                 return None
             return as_bytes(np.array(colour.split()[:3], np.float64)).reshape(1, 1, 3)
         # A sampler's surface names an image; some programs leave out one or both of them.
         parameters = {e.get("sid", ""): e for e in effect.iter("newparam")}
-        name, along, across = texture.get("texture", ""), "", ""
+        name = texture.get("texture", "")
+        along = ""
+        across = ""
         for _ in range(2):
             if (found := parameters.get(name)) is not None:
                 along = found.findtext(".//wrap_s", along)

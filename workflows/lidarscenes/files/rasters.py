@@ -53,9 +53,12 @@ _WIDEST_DEG = 12.0  # of longitude in a UTM zone, which is 6 wide
 
 PixelRange = tuple[int, int]  # half-open
 
-_LOWEST_M, _HIGHEST_M = -12_000.0, 9_000.0  # of the Earth's surface
+# of the Earth's surface
+_LOWEST_M = -12_000.0
+_HIGHEST_M = 9_000.0
 _NO_DATA = -9999.0  # which many programs write without saying so in the file
-_FOOT_M, _US_FOOT_M = 0.3048, 1200 / 3937
+_FOOT_M = 0.3048
+_US_FOOT_M = 1200 / 3937
 _UNIT_NAMES = {  # of heights, as files have them
     **dict.fromkeys(("m", "metre", "meter", "metres", "meters"), 1.0),
     **dict.fromkeys(("ft", "foot", "feet", "international foot"), _FOOT_M),
@@ -81,7 +84,8 @@ def read_raster(_data: bytes, path: Path, wanted: Wanted) -> Content:
         grid = _RasterGrid(source, place, own, _target(source, place, own, epsg))
         chosen = step_m is not None or window is not None
         if step_m is not None:
-            grid, window = stack.enter_context(_coarser(grid, step_m, window)), None
+            grid = stack.enter_context(_coarser(grid, step_m, window))
+            window = None
         columns, rows = grid.part(window)
         _check_size(grid, columns, rows, path.name, chosen=chosen)
         band = grid.file.read(1, window=(rows, columns), masked=True)
@@ -285,7 +289,8 @@ class _RasterGrid:
     @cached_property
     def pixel_m(self) -> float:
         """Side of a square as large as the pixel in the middle, metres."""
-        column, row = np.array([0.0, 1.0, 0.0]), np.array([0.0, 0.0, 1.0])
+        column = np.array([0.0, 1.0, 0.0])
+        row = np.array([0.0, 0.0, 1.0])
         x, y = self.at(column + self.file.width // 2, row + self.file.height // 2)
         return math.sqrt(abs((x[1] - x[0]) * (y[2] - y[0]) - (x[2] - x[0]) * (y[1] - y[0])))
 
@@ -332,7 +337,8 @@ def _coarser(grid: _RasterGrid, step_m: float, window: Window | None) -> Iterato
     low, high = grid.reach
     if window is not None:
         grid.check_overlap(window)
-        low, high = np.maximum(low, window[:2]), np.minimum(high, window[2:])
+        low = np.maximum(low, window[:2])
+        high = np.minimum(high, window[2:])
     if (count := float(np.prod((high - low) / grid.pixel_m))) > _MOST_READ:
         raise MeshFileError(
             f"would be made coarser from {count:,.0f} pixels, of at most {_MOST_READ:,}: give a "

@@ -76,7 +76,8 @@ class _MeshObject:
         if not self.faces:
             return []
         vertices = np.frombuffer(self.vertices, np.float64).reshape(-1, 3)
-        faces, colours = np.frombuffer(self.faces, np.int64).reshape(-1, 3), None
+        faces = np.frombuffer(self.faces, np.int64).reshape(-1, 3)
+        colours = None
         corners = np.frombuffer(self.shades, np.uint8).reshape(-1, 3, 3)
         if (corners != GREY).any():
             colours = Colours.of_corners(corners)
@@ -108,7 +109,8 @@ def read_3mf(data: bytes, path: Path, wanted: Wanted) -> Content:
             return Node(place.name or made.name, place.matrix, made.meshes, made.components)
 
         content = settled(instances(root.items, node, path.stem))
-    content.unit_m, content.up_axis = _UNITS_M[root.unit], "z"
+    content.unit_m = _UNITS_M[root.unit]
+    content.up_axis = "z"
     if bare := sum(model.bare for model in package.models.values()):
         words = plural(bare, "triangle")
         content.notes.append(f"has textures or lacks colours, which leaves {words} grey")
@@ -119,7 +121,9 @@ class _Package:
     """The inner files of an archive, each read when an object of it is placed."""
 
     def __init__(self, archive: zipfile.ZipFile, allowance: Allowance, wanted: Wanted) -> None:
-        self._archive, self._allowance, self._wanted = archive, allowance, wanted
+        self._archive = archive
+        self._allowance = allowance
+        self._wanted = wanted
         self.models: dict[str, _Model] = {}
 
     def start(self) -> str:
@@ -172,14 +176,16 @@ class _Model:
     ) -> None:
         self.unit = "millimeter"
         self.bare = 0  # triangles whose colours are not here
-        self._colours, self._named = wanted.colours, wanted.materials
+        self._colours = wanted.colours
+        self._named = wanted.materials
         self._groups: dict[str, list[bytes]] = {}  # {number of a group: its colours}
         self._group: list[bytes] = []
         self._names: dict[str, list[str]] = {}  # {number of a group: names of its materials}
         self._names_of_group: list[str] = []
         self.objects: dict[str, _MeshObject] = {}
         self.items: list[_Placement] = []
-        self._name, self._allowance = name, allowance
+        self._name = name
+        self._allowance = allowance
         self._object = _MeshObject("")
         # Without namespaces, because slicers omit the declaration of some.
         parser = expat.ParserCreate()
@@ -234,7 +240,8 @@ class _Model:
     def _shade(self, attributes: dict[str, str]) -> None:
         """Add the colours of a triangle's corners, grey if it has none."""
         group, number = self._object.usual
-        group, first = attributes.get("pid", group), attributes.get("p1", number)
+        group = attributes.get("pid", group)
+        first = attributes.get("p1", number)
         places = [int(attributes.get(name, first)) for name in ("p1", "p2", "p3")]
         colours = self._groups.get(group, [])
         known = all(0 <= place < len(colours) for place in places)

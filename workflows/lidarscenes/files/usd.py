@@ -123,7 +123,8 @@ def _frames(path: Path, wanted: Wanted, allowance: Allowance) -> Generator[_Fram
         assert child.stdout
         try:
             while line := child.stdout.readline():
-                frame, arrays = json.loads(line), []
+                frame = json.loads(line)
+                arrays = []
                 for kind, shape in frame["arrays"]:
                     size = np.dtype(kind).itemsize * math.prod(shape)
                     if frame["what"] == "image":
@@ -157,7 +158,8 @@ def _mesh(
     name = frame["name"]
     allowance.take(24 * len(arrays[2]) + 4 * 8 * len(arrays[1]))
     sizes, corners, points, holes = arrays[:4]
-    sizes, corners = sizes.astype(np.int64), corners.astype(np.int64)
+    sizes = sizes.astype(np.int64)
+    corners = corners.astype(np.int64)
     if (sizes < 0).any() or sizes.sum() != len(corners):
         raise ValueError(
             f"{name!r} has polygons of {sizes.sum():,} corners, {len(corners):,} are there"
@@ -194,7 +196,9 @@ def _shape(
 
 
 def _outline(frame: dict[str, Any]) -> SceneMesh | None:
-    name, kind, size = frame["name"], frame["kind"], frame["sizes"]
+    name = frame["name"]
+    kind = frame["kind"]
+    size = frame["sizes"]
     axis = "XYZ".index(size.get("axis", "Z"))
     if min(value for value in size.values() if not isinstance(value, str)) <= 0:
         return None
@@ -225,8 +229,10 @@ def _content(
 ) -> Content:
     """Place meshes by the nodes of a scene."""
     matrices, *more = arrays
-    matrices, moving = matrices.copy(), frame["moving"]
-    motions, copies = more[: len(moving)], more[len(moving) :]
+    matrices = matrices.copy()
+    moving = frame["moving"]
+    motions = more[: len(moving)]
+    copies = more[len(moving) :]
     nodes = frame["nodes"]
 
     def node(key: Any) -> Node:
@@ -301,7 +307,8 @@ def _named(places: list[PlacedNode]) -> list[PlacedNode]:
 
 def _with_notes(content: Content, stage: dict[str, Any], counts: dict[str, int]) -> Content:
     """Add units, axes and notes."""
-    content.unit_m, content.up_axis = stage["unit_m"], stage["up_axis"]
+    content.unit_m = stage["unit_m"]
+    content.up_axis = stage["up_axis"]
     if not 0 < stage["unit_m"] < np.inf:
         raise ValueError(f"its unit is {stage['unit_m']} metres")
     if stage["up_axis"] not in UP_AXES:

@@ -29,7 +29,9 @@ from pxr import Ar, Gf, Sdf, Tf, Usd, UsdGeom, UsdShade, UsdSkel, UsdUtils
 LONGEST_S = 300  # from one mesh to the next; broken files may take for ever
 
 _RIGID = 1e-4  # how much the square of a scale may change
-_MOST_M, _MOST_RAD = 1e-5, 1e-4  # how far the path of what moves may be off between poses
+# how far the path of what moves may be off between poses
+_MOST_M = 1e-5
+_MOST_RAD = 1e-4
 _PROBES = (0.1459, 0.382, 0.618, 0.8541)  # shares of the time between two; of no repeating turns
 _DEPTH = 12  # times that the time between two samples is halved
 _LINKS = 8  # of shaders that compute texture coordinates
@@ -56,7 +58,10 @@ class StageNodes:
     """
 
     def __init__(self, stage: Any, most: dict[str, int], looks: Looks, write: Any) -> None:
-        self._stage, self._left, self._looks, self._write = stage, most, looks, write
+        self._stage = stage
+        self._left = most
+        self._looks = looks
+        self._write = write
         self._time = looks.time
         self._numbers: dict[tuple[Any, ...], int] = {}  # {key: number}
         self._todo: list[tuple[Any, ...]] = []
@@ -124,7 +129,8 @@ class StageNodes:
             moves = not still and self._any_below(prim.GetPrototype(), _varies)
             instance = str(prim.GetPath()) if moves else self._looks.inherited(prim)
         for child in prim.GetFilteredChildren(Usd.TraverseInstanceProxies(_SHOWN)):
-            place, number = UsdGeom.Xformable(child), self._number(child, unwanted, still, instance)
+            place = UsdGeom.Xformable(child)
+            number = self._number(child, unwanted, still, instance)
             motion = None
             if place and place.TransformMightBeTimeVarying():
                 if not still:
@@ -260,7 +266,9 @@ class _Row:
 
     def __init__(self, prim: Any, code: float) -> None:
         matrix = UsdGeom.Imageable(prim).ComputeLocalToWorldTransform(code)
-        self.code, self.place = code, np.array(matrix).T  # of row vectors, in OpenUSD
+        # of row vectors, in OpenUSD
+        self.code = code
+        self.place = np.array(matrix).T
         self.turn = matrix.RemoveScaleShear().ExtractRotationQuat()
 
 
@@ -285,7 +293,9 @@ class Looks:
 
     def __init__(self, asked: dict[str, Any], write: Any) -> None:
         self.time = Usd.TimeCode.Default()
-        self._masks, self._colours, self._write = asked["masks"], asked["colours"], write
+        self._masks = asked["masks"]
+        self._colours = asked["colours"]
+        self._write = write
         self._named = asked["materials"]
         self._folders = tuple(os.path.join(folder, "") for folder in asked["folders"])  # noqa: PTH118
         self._images: dict[str, int] = {}  # {path: number}
@@ -345,7 +355,8 @@ class Looks:
 
     def _material(self, material: Any) -> tuple[int | None, list[str]]:
         """Write a material; its number, None if it says nothing, and names of what it reads."""
-        shader, kind = None, ""
+        shader = None
+        kind = ""
         for context in ("", "mdl", "mtlx"):
             shader = material.ComputeSurfaceSource(context)[0]
             if shader:
@@ -400,7 +411,8 @@ class Looks:
         attributes = UsdShade.Utils.GetValueProducingAttributes(given) if given else ()
         if not attributes:
             return None
-        value, shader = attributes[0].Get(self.time), UsdShade.Shader(attributes[0].GetPrim())
+        value = attributes[0].Get(self.time)
+        shader = UsdShade.Shader(attributes[0].GetPrim())
         if UsdShade.Utils.GetType(attributes[0].GetName()) != UsdShade.AttributeType.Output:
             return None if value is None else {"value": _numbers(value)}
         kind = str(shader.GetIdAttr().Get())
@@ -437,12 +449,14 @@ class Looks:
                 break
             names = ("rotation", "scale", "translation")
             turn, scale, offset = (_constant(shader.GetInput(name)) for name in names)
-            c, s = math.cos(math.radians(turn or 0)), math.sin(math.radians(turn or 0))
+            c = math.cos(math.radians(turn or 0))
+            s = math.sin(math.radians(turn or 0))
             along, across = scale or (1, 1)
             # Scaled, rotated anticlockwise, moved; of row vectors.
             own = np.array([[along * c, along * s, 0], [-across * s, across * c, 0], [0, 0, 1]])
             own[2, :2] = offset or (0, 0)
-            matrix, given = own @ matrix, shader.GetInput("in")
+            matrix = own @ matrix
+            given = shader.GetInput("in")
         return {"unread": "its texture coordinates are computed in a way that is not read"}
 
     def _image(self, asset: Any) -> int:
@@ -511,7 +525,8 @@ def _has_surface(prim: Any) -> bool:
 
 def _played(stage: Any, asked: dict[str, Any]) -> tuple[list[Any], list[Any], list[float]]:
     """Animations, attributes that move, and time codes of poses: one if no animation is asked."""
-    name, rate_hz = asked["animation"], stage.GetTimeCodesPerSecond()
+    name = asked["animation"]
+    rate_hz = stage.GetTimeCodesPerSecond()
     while name is not None and (found := [one for one in stage.Traverse() if one.IsInstance()]):
         for prim in found:
             prim.SetInstanceable(False)  # nothing bends what is in them
@@ -647,7 +662,8 @@ def main(path: str, asked: dict[str, Any]) -> None:
 
 
 if __name__ == "__main__":
-    file, wanted = sys.argv[1], json.loads(sys.argv[2])
+    file = sys.argv[1]
+    wanted = json.loads(sys.argv[2])
     signal.alarm(LONGEST_S)
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
     _, most_memory = resource.getrlimit(resource.RLIMIT_DATA)

@@ -46,8 +46,10 @@ class _Use(NamedTuple):
 
     @classmethod
     def of(cls, source: ColourSource) -> _Use:
-        scale, bias = tuple(source.get("scale", (1,) * 4)), tuple(source.get("bias", (0,) * 4))
-        raw, wraps = source.get("raw", False), tuple(source["wraps"])
+        scale = tuple(source.get("scale", (1,) * 4))
+        bias = tuple(source.get("bias", (0,) * 4))
+        raw = source.get("raw", False)
+        wraps = tuple(source["wraps"])
         return cls(source["image"], source["channels"], scale, bias, raw, wraps)
 
     def light(self, channel: str) -> Floats:
@@ -70,7 +72,8 @@ class Look:
     def __init__(
         self, frame: dict[str, Any], arrays: list[AnyArray], places: dict[str, Ints]
     ) -> None:
-        self._arrays, self._places = arrays, places
+        self._arrays = arrays
+        self._places = places
         self._values: dict[str, tuple[str, int]] = frame.get("values", {})
 
     def coordinates(self, source: ColourSource, rows: Ints) -> tuple[Floats, Ints]:
@@ -96,7 +99,8 @@ class Look:
         if name not in self._values:
             raise MaskError(f"its mesh has no {name!r}")
         interpolation, number = self._values[name]
-        values, corners = self._arrays[number], self._places.get(interpolation)
+        values = self._arrays[number]
+        corners = self._places.get(interpolation)
         if corners is None:
             raise MaskError("its shape has no texture coordinates that are read")
         if values.shape[1] != width or not corners[rows].max(initial=-1) < len(values):
@@ -108,7 +112,8 @@ class UsdMaterials:
     """Images and materials by their numbers, and what they make of triangles."""
 
     def __init__(self, allowance: Allowance, wanted: Wanted) -> None:
-        self._allowance, self.coloured = allowance, wanted.colours
+        self._allowance = allowance
+        self.coloured = wanted.colours
         self._named = wanted.materials
         self._images: dict[int, tuple[str, bytes]] = {}  # {number: (why it is not read, content)}
         self._materials: dict[int | None, dict[str, Any]] = {None: {"name": "displayColor"}}
@@ -183,7 +188,8 @@ class UsdMaterials:
     def _read_mask(self, key: tuple[_Use, float]) -> Texture | Literal["glass"] | None:
         """Mask of an image; «glass» if it is nowhere opaque, None if everywhere."""
         use, least = key
-        channel, content = use.channels[0], self._image(use.image)
+        channel = use.channels[0]
+        content = self._image(use.image)
         if channel == "a":
             opacity = read_opacity(content, self._allowance)
             opacity = np.full((1, 1), 255, np.uint8) if opacity is None else opacity

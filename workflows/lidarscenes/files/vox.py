@@ -37,7 +37,8 @@ def read_vox(data: bytes, path: Path, wanted: Wanted) -> Content:
         raise MeshFileError("has no row of names that begins with i j k")
     text = data[: found.start()].decode("utf-8", "replace")
     head = {k.lower(): v for k, v in re.findall(r"#[ \t]*([\w-]+)[ \t]*[:=]([^#\n]*)", text)}
-    columns, rows = found[0].decode("utf-8", "replace").split(), data[found.end() :]
+    columns = found[0].decode("utf-8", "replace").split()
+    rows = data[found.end() :]
     if len(last := rows[rows.rstrip().rfind(b"\n") :].split()) < len(columns):
         raise MeshFileError(f"is cut short: its last row has {len(last)} of {len(columns)} numbers")
     shape, low, size = _grid(head)
@@ -50,12 +51,14 @@ def read_vox(data: bytes, path: Path, wanted: Wanted) -> Content:
     if not full.any():
         raise MeshFileError(f"has no voxel whose {columns[column]} is above 0")
     places = places[full].astype(np.int64)
-    first, stop = places.min(axis=0), places.max(axis=0) + 1
+    first = places.min(axis=0)
+    stop = places.max(axis=0) + 1
     Allowance(len(data), "take larger voxels, or a part").take(4 * int(np.prod(stop - first)))
     grid = np.zeros(stop - first, np.float32)
     grid[tuple((places - first).T)] = density[full]
     low = low + first * size
-    sides, margin = (stop - first) * size, _MARGIN * size.min()
+    sides = (stop - first) * size
+    margin = _MARGIN * size.min()
     shell = box(path.stem, tuple(sides + 2 * margin))
     middle = low + sides * (0.5, 0.5, 0) - (0, 0, margin)
     voxels = Voxels(grid, np.column_stack([np.diag(size), low]))
@@ -81,7 +84,9 @@ def _grid(head: dict[str, str]) -> tuple[Floats, Floats, Floats]:
             raise MeshFileError(f"has no header #{name} with three numbers")
         return values
 
-    low, high, split = three("min_corner"), three("max_corner"), three("split")
+    low = three("min_corner")
+    high = three("max_corner")
+    split = three("split")
     if (split != np.floor(split)).any() or (split < 1).any() or (split > VOXELS_MOST).any():
         raise MeshFileError(
             f"has #split {_in_words(split)}; it must be whole numbers of 1 to {VOXELS_MOST:,}"

@@ -149,7 +149,8 @@ def device(scanner: HeliosScanner, settings: dict[str, str]) -> Device:
                 f"never to {start + range_deg:g}."
             )
         head = head if axis[2] > 0 else -head
-        data, turn = line.turning(head, tilt), _HEAD
+        data = line.turning(head, tilt)
+        turn = _HEAD
     else:
         data, turn = line.standing() if line else _OPTICS[optics](scanner, settings, pulses)
         turn = rotation(emitter) @ turn
@@ -211,8 +212,10 @@ class _Line:
         low = number(settings, "verticalAngleMin_deg", -half)
         high = number(settings, "verticalAngleMax_deg", half)
         if high - low > 2 * wide + _SLACK:  # HELIOS++ 1 leaves such pulses out, 2 refuses them
-            low, high = max(low, -wide), min(high, wide)
-        step, of_all = 2 * most * scan_hz / pulse_hz, ceil(pulse_hz / scan_hz - _SLACK)
+            low = max(low, -wide)
+            high = min(high, wide)
+        step = 2 * most * scan_hz / pulse_hz
+        of_all = ceil(pulse_hz / scan_hz - _SLACK)
         # Angles above `low`, up to `high`; a line begins anew before it is all round.
         first = floor((low + most) / step + _SLACK) + 1
         last = min(floor((high + most) / step + _SLACK), of_all - 1)
@@ -317,7 +320,8 @@ def _prisms(scanner: HeliosScanner, settings: dict[str, str], pulse_hz: float) -
     made: dict[str, Any] = {"firing_us": _us(1, pulse_hz), "rate_hz": _FRAME_HZ, "prisms": prisms}
     if (incident := scanner.child("incidentBeam")) is not None:
         x, y, z = _PRISM.T @ vector(incident)
-        elevation, azimuth = np.arctan2(z, np.hypot(x, y)), np.arctan2(y, x)
+        elevation = np.arctan2(z, np.hypot(x, y))
+        azimuth = np.arctan2(y, x)
         made["beams"] = {
             "elevation_deg": [clean(np.degrees(elevation))],
             "azimuth_deg": [clean(np.degrees(azimuth))],
@@ -347,7 +351,8 @@ def _scan_hz(
 ) -> float:
     """Lines a second, within the scanner's limits."""
     rate_hz = number(settings, "scanFreq_hz", 0) if wished is None else wished
-    least, most = scanner.number("scanFreqMin_Hz"), scanner.number("scanFreqMax_Hz") or np.inf
+    least = scanner.number("scanFreqMin_Hz")
+    most = scanner.number("scanFreqMax_Hz") or np.inf
     if not least <= rate_hz <= most or rate_hz <= 0:
         raise LidarError(
             f"{scanner.name} cannot scan at scanFreq_hz {rate_hz:g}: {least:g} to {most:g}, above "

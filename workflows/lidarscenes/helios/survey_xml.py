@@ -27,7 +27,7 @@ from ..writers.scene_file import write_scene
 from .files import Assets, clean, number, rotation, vector
 from .scanner_xml import Device, channels, device, unread
 from .scene_xml import HeliosScene, SurfelMaker
-from .way import Stretch, Way, flown, read_legs, read_way, stood
+from .trajectory import HeliosTrajectory, Stretch, flown, read_legs, read_way, stood
 
 SCENARIO_FILE = "scenario.yaml"
 # Carriers look along x, the platforms of HELIOS++ along y.
@@ -147,7 +147,7 @@ class _Import:
             raise LidarError(f"its <survey> names no {kind}.")
         return self._assets.asset(reference, kind, self._home).element
 
-    def _carry(self) -> Way:
+    def _carry(self) -> HeliosTrajectory:
         """Read the legs and the platform; return the trajectory, and fill `_sensors`."""
         survey = self._element
         assets = self._assets

@@ -11,7 +11,9 @@ from lidarsim.scene.scene_mesh import SceneMesh, stacked
 
 from .city_kinds import loft, lying, regular
 
-_RECESS_M, _FRAME = 0.03, 0.12  # of a window: depth, and share of its width that is frame
+# of a window: depth, and share of its width that is frame
+_RECESS_M = 0.03
+_FRAME = 0.12
 
 
 @dataclass(frozen=True)

@@ -35,9 +35,13 @@ PAVEMENT, BUILDING, TREE, CAR, LAMP = range(len(CLASSES))
 
 _GROUND_SHARE = 0.03  # of the triangles, at least
 _MARGIN_M = 12.0
-_STREET_M, _AVENUE_M, _AVENUE_EVERY = 13.0, 24.0, 4
+_STREET_M = 13.0
+_AVENUE_M = 24.0
+_AVENUE_EVERY = 4
 _BLOCK_M = ((60.0, 100.0), (46.0, 62.0))  # along x, along y
-_PAVEMENT_M, _KERB_M = 3.5, 0.15  # width and height
+# width and height
+_PAVEMENT_M = 3.5
+_KERB_M = 0.15
 _LOT_M = 16.5
 _PARKS = 0.09  # share of the blocks
 
@@ -167,8 +171,10 @@ def _scene(solids: list[Solid], things: AnyArray, ground: Solid) -> Scene:
 def _copies(solid: Solid, things: AnyArray) -> Floats:
     """Vertices of a solid at every place: (things, v, 3)."""
     out = solid.vertices * things["scale"][:, None]
-    cos, sin = np.cos(things["yaw"])[:, None], np.sin(things["yaw"])[:, None]
-    x, y = out[..., 0].copy(), out[..., 1].copy()
+    cos = np.cos(things["yaw"])[:, None]
+    sin = np.sin(things["yaw"])[:, None]
+    x = out[..., 0].copy()
+    y = out[..., 1].copy()
     out[..., 0] = x * cos - y * sin
     out[..., 1] = x * sin + y * cos
     out += things["place"][:, None]
@@ -221,7 +227,9 @@ class _CityBlocks:
         order = np.argsort(np.hypot(*middle.T), kind="stable")
         park = self._rng.random(len(middle)) < _PARKS
         park[:4] = False  # never at the centre
-        self._middle, self._size, self._park = middle[order], size[order], park
+        self._middle = middle[order]
+        self._size = size[order]
+        self._park = park
 
     def things(self) -> AnyArray:
         """All things, block by block, within a block in random order after its pavement."""
@@ -251,9 +259,13 @@ class _CityBlocks:
     ) -> AnyArray:
         """Rows of one class, `kind` being counted within its group."""
         out = np.empty(len(block), _THING)
-        out["kind"], out["owner"], out["block"] = self._start[group] + kind, owner, block
-        out["place"][:, :2], out["place"][:, 2] = xy, z
-        out["yaw"], out["scale"] = yaw, scale
+        out["kind"] = self._start[group] + kind
+        out["owner"] = owner
+        out["block"] = block
+        out["place"][:, :2] = xy
+        out["place"][:, 2] = z
+        out["yaw"] = yaw
+        out["scale"] = scale
         return out
 
     def _lots(self) -> list[AnyArray]:
@@ -264,7 +276,8 @@ class _CityBlocks:
         across = np.maximum(2, np.round(inner[:, 0] / _LOT_M)).astype(np.int64)
         block = np.repeat(built, 2 * across)
         number = np.arange(len(block)) - np.repeat(np.cumsum(2 * across) - 2 * across, 2 * across)
-        column, back = number // 2, number % 2
+        column = number // 2
+        back = number % 2
         lot = np.repeat(
             np.column_stack([inner[:, 0] / across, inner[:, 1] / 2]), 2 * across, axis=0
         )
@@ -276,7 +289,8 @@ class _CityBlocks:
         reach = 60 + 0.3 * np.hypot(*self._middle.T).max()
         near = np.exp(-((np.hypot(*self._middle[block].T) / reach) ** 2))
         tower = rng.random(len(block)) < 0.9 * near
-        t, h = np.flatnonzero(tower), np.flatnonzero(~tower)
+        t = np.flatnonzero(tower)
+        h = np.flatnonzero(~tower)
         tall = np.clip(near[t] * rng.uniform(0.2, 1.15, len(t)), 0, 0.999)
         shapes = 4
         floors = (tall * (self._count["tower"] // shapes)).astype(np.int64)
@@ -310,7 +324,8 @@ class _CityBlocks:
         return self._trees(block, xy)
 
     def _trees(self, block: Ints, xy: Floats) -> AnyArray:
-        rng, n = self._rng, len(block)
+        rng = self._rng
+        n = len(block)
         kind = rng.integers(self._count["tree"], size=n)
         size = rng.uniform(0.75, 1.3, (n, 1)) * rng.uniform(0.9, 1.1, (n, 3))
         return self._rows(TREE, "tree", kind, block, xy, rng.uniform(0, 2 * np.pi, n), size)
@@ -319,7 +334,8 @@ class _CityBlocks:
         self, owner: int, *, inwards: float, spacing: float, chance: float
     ) -> AnyArray:
         """Rows of one class along all four edges of each block, with gaps."""
-        rng, n = self._rng, len(self._middle)
+        rng = self._rng
+        n = len(self._middle)
         block = np.tile(np.arange(n), 4)
         yaw = np.repeat(np.array([-0.5, 0.0, 0.5, 1.0]) * np.pi, n)  # outwards over the edge
         along_x = np.repeat([True, False, True, False], n)
@@ -330,7 +346,8 @@ class _CityBlocks:
         edge = np.repeat(np.arange(4 * n), count)
         step = np.arange(len(edge)) - np.repeat(np.cumsum(count) - count, count)
         there = rng.random(len(edge)) < chance
-        edge, step = edge[there], step[there]
+        edge = edge[there]
+        step = step[there]
         shift = (step - (count[edge] - 1) / 2) * spacing
         out = np.column_stack([np.cos(yaw[edge]), np.sin(yaw[edge])])
         left = out[:, ::-1] * [-1, 1]

@@ -14,12 +14,18 @@ from .plants import SCALES, SPECIES, all_trees, placed
 MOST_CARS = 50_000
 
 # Along the edge of a block: metres between places, from the edge inwards, and free at the corners.
-_TREE_APART_M, _TREE_INWARDS_M, _TREE_CORNER_M = 7.0, 1.3, 5.0
-_CAR_APART_M, _CAR_INWARDS_M, _CAR_CORNER_M = 6.5, -1.3, 8.0
+_TREE_APART_M = 7.0
+_TREE_INWARDS_M = 1.3
+_TREE_CORNER_M = 5.0
+_CAR_APART_M = 6.5
+_CAR_INWARDS_M = -1.3
+_CAR_CORNER_M = 8.0
 _CAR_SHIFT_M = 0.5  # at most, either way
 _RIGHT_WAY = 0.9  # share of cars with the kerb at their right
 _STREET_REACH_M = 3.5  # crowns at streets leave the middle of the carriageway free
-_YARD_M, _YARD_MIDDLE = 6.0, 0.4  # one tree at most in the middle part of a cell
+# one tree at most in the middle part of a cell
+_YARD_M = 6.0
+_YARD_MIDDLE = 0.4
 _STREETS_FIRST = 4.0  # how much rather a place at a street is taken
 _LAMP_M = 1.5  # from a trunk
 _ROOT_M = 0.1
@@ -48,7 +54,9 @@ def street_trees(
     meshes = all_trees(seed, _ROOT_M)
     reach = np.array([np.abs(mesh.vertices[:, :2]).max() * 2**0.5 for mesh in meshes])
     least = np.where([species.conifer for species in SPECIES], np.inf, reach) * SCALES[0]
-    places, rooms, streets = [], [], []
+    places = []
+    rooms = []
+    streets = []
     for (middle, size), box, posts in zip(blocks, boxes, lamps, strict=True):
         street, _ = _along(size, _TREE_APART_M, _TREE_INWARDS_M, _TREE_CORNER_M)
         yard = _yard(size, rng)
@@ -81,12 +89,14 @@ def parked_cars(blocks: Floats, count: int, seed: int) -> list[SceneInstance]:
         If they do not fit.
     """
     rng = np.random.default_rng([seed, count])
-    places, ways = [], []
+    places = []
+    ways = []
     for middle, size in blocks:
         xy, yaw = _along(size, _CAR_APART_M, _CAR_INWARDS_M, _CAR_CORNER_M)
         places.append(middle + xy)
         ways.append(yaw)
-    xy, way = np.concatenate(places), np.concatenate(ways)
+    xy = np.concatenate(places)
+    way = np.concatenate(ways)
     chosen = _choose(np.ones(len(xy)), count, "cars", rng)
     way = way[chosen]
     ahead = np.column_stack([np.cos(way), np.sin(way)])
@@ -109,12 +119,15 @@ def _choose(weights: Floats, count: int, what: str, rng: np.random.Generator) ->
 
 def _along(size: Floats, apart: float, inwards: float, corner: float) -> tuple[Floats, Floats]:
     """Places (n, 2) along the edges of a block around zero, and yaw (n,) with it at the right."""
-    places, yaws = [], []
+    places = []
+    yaws = []
     for turn in range(4):
-        length, deep = size[turn % 2], size[1 - turn % 2] / 2 - inwards
+        length = size[turn % 2]
+        deep = size[1 - turn % 2] / 2 - inwards
         n = int((length - 2 * corner) / apart) + 1
         shift = (np.arange(n) - (n - 1) / 2) * apart
-        cos, sin = np.cos(turn * np.pi / 2), np.sin(turn * np.pi / 2)
+        cos = np.cos(turn * np.pi / 2)
+        sin = np.sin(turn * np.pi / 2)
         # The edge at the block's lower side, turned.
         places.append(np.column_stack([cos * shift + sin * deep, sin * shift - cos * deep]))
         yaws.append(np.full(n, turn * np.pi / 2 + np.pi))

@@ -83,7 +83,8 @@ def _with_plant_room(tower: Solid, floors: int) -> Solid:
 def _stepped(floors: int) -> Solid:
     """Three parts, each narrower than the one below."""
     counts = [floors - 2 * (floors // 3), floors // 3, floors // 3]
-    parts, base = [], 0.0
+    parts = []
+    base = 0.0
     for step, count in enumerate(counts):
         parts.append(loft(rectangle(18, 16), _storeys(count, base, 2.0 * step)))
         base += count * FLOOR_M
@@ -143,7 +144,8 @@ def _broadleaf(rng: np.random.Generator, tall: float) -> Solid:
 def _conifer(tiers: int) -> Solid:
     parts = [loft(regular(6, 0.2), [(0, 0), (1.4, 0)])]
     for tier in range(tiers):
-        radius, base = 2.0 - 1.3 * tier / tiers, 1.1 + 1.7 * tier
+        radius = 2.0 - 1.3 * tier / tiers
+        base = 1.1 + 1.7 * tier
         parts.append(loft(regular(9, radius), [(base, 0), (base + 2.6, radius * 0.93)]))
     return joined(parts)
 
@@ -230,7 +232,8 @@ def gable(width: float, depth: float, eaves: float, rise: float, hip: float = 0.
 
     The ends of the ridge stay behind those of the eaves by `hip`. Eight triangles.
     """
-    x, y = width / 2, depth / 2
+    x = width / 2
+    y = depth / 2
     ridge = [[hip - x, 0, rise], [x - hip, 0, rise]]
     corners = [[-x, -y, 0], [x, -y, 0], [x, y, 0], [-x, y, 0], *ridge]
     faces = [[0, 1, 5], [0, 5, 4], [2, 3, 4], [2, 4, 5], [1, 2, 5], [3, 0, 4], [0, 2, 1], [0, 3, 2]]

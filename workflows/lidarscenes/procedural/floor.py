@@ -56,5 +56,6 @@ def _crossings(scene: Scene, at: Floats) -> tuple[Floats, Bools]:
 
 def _areas(p: Floats, q: Floats, at: Floats) -> Floats:
     """Twice the areas of p, q and a place from above, positive where they turn left: (f,)."""
-    to_p, to_q = p[:, :2] - at, q[:, :2] - at
+    to_p = p[:, :2] - at
+    to_q = q[:, :2] - at
     return np.asarray(to_p[:, 0] * to_q[:, 1] - to_p[:, 1] * to_q[:, 0])

@@ -27,7 +27,10 @@ _PALETTE = tuple(
     np.array([[[*bytes.fromhex(one)]]], np.uint8) for some in _PAINTS.values() for one in some
 )
 _TRUNK_M = 0.6  # crowns begin higher
-_UP, _FLAT, _STEEP = 0.2, 0.98, 0.65  # of normals along z: roofs, level ones; of ground: rock
+# of normals along z: roofs, level ones; of ground: rock
+_UP = 0.2
+_FLAT = 0.98
+_STEEP = 0.65
 
 
 def painted(scene: Scene) -> Scene:
@@ -44,7 +47,8 @@ def painted(scene: Scene) -> Scene:
     (ax, bx), (ay, by), (az, bz) = ((axis[1] - axis[0], axis[2] - axis[0]) for axis in (x, y, z))
     normal = ax * by - ay * bx
     up = normal / np.sqrt((ay * bz - az * by) ** 2 + (az * bx - ax * bz) ** 2 + normal**2 + 1e-20)
-    lowest, foot = z.min(axis=0), np.full(len(kinds), np.inf, np.float32)
+    lowest = z.min(axis=0)
+    foot = np.full(len(kinds), np.inf, np.float32)
     np.minimum.at(foot, owner, lowest)
     above = lowest - foot[owner]
     image = np.array(paints, np.int32)[owner]
@@ -63,7 +67,8 @@ def painted(scene: Scene) -> Scene:
         for number, part in enumerate(shared.parts):
             # A leaf shares no corner with others; cars have none.
             leaf = np.bincount(part.faces.ravel())[part.faces].max(axis=1) == 1
-            cars, leaves = _PAINTS["car"], _PAINTS["tree"]
+            cars = _PAINTS["car"]
+            leaves = _PAINTS["tree"]
             of_car = np.full(len(leaf), _FIRST["car"] + number % len(cars))
             of_tree = np.where(leaf, _FIRST["tree"] + number % len(leaves), _FIRST["bark"])
             own = (of_tree if leaf.any() else of_car).astype(np.int32)

@@ -17,8 +17,11 @@ from lidarsim.scene.scene_mesh import SceneMesh, stacked
 
 SCALES = (0.7, 1.3)  # least and most of trees in a scene
 MOST_TREES = 100_000  # readers of mesh files take 200,000 nodes
-_STEM_SIDES, _BRANCH_SIDES, _TWIG_SIDES = 7, 4, 3
-_STEM_STEPS, _BRANCH_STEPS = 8, 3
+_STEM_SIDES = 7
+_BRANCH_SIDES = 4
+_TWIG_SIDES = 3
+_STEM_STEPS = 8
+_BRANCH_STEPS = 3
 _GOLDEN_ANGLE = np.pi * (3 - np.sqrt(5))
 
 
@@ -107,10 +110,14 @@ def placed(
 ) -> list[SceneInstance]:
     """Place meshes upright: `kind` (n,) at places (n, 3), turned by `yaw` (n,), and scaled (n,)."""
     matrices = np.tile(np.eye(4), (len(kind), 1, 1))
-    cos, sin = scale * np.cos(yaw), scale * np.sin(yaw)
-    matrices[:, 0, 0], matrices[:, 0, 1] = cos, -sin
-    matrices[:, 1, 0], matrices[:, 1, 1] = sin, cos
-    matrices[:, 2, 2], matrices[:, :3, 3] = scale, places
+    cos = scale * np.cos(yaw)
+    sin = scale * np.sin(yaw)
+    matrices[:, 0, 0] = cos
+    matrices[:, 0, 1] = -sin
+    matrices[:, 1, 0] = sin
+    matrices[:, 1, 1] = cos
+    matrices[:, 2, 2] = scale
+    matrices[:, :3, 3] = places
     return [SceneInstance(meshes[k], matrix) for k, matrix in zip(kind, matrices, strict=True)]
 
 
@@ -157,13 +164,15 @@ def _branches(
 
 def _twigs(species: Species, branches: Floats, rng: np.random.Generator) -> Floats:
     """Return ends of the twigs, (n, 2, 3), which spread from the outer part of each branch."""
-    n, m = len(branches), species.twigs
+    n = len(branches)
+    m = species.twigs
     at = np.sort(rng.uniform(0.2, 1, (n, m)), axis=1)
     at[:, -1] = 1
     place = at * _BRANCH_STEPS
     step = np.minimum(place.astype(np.int64), _BRANCH_STEPS - 1)
     row = np.arange(n)[:, None]
-    begin, end = branches[row, step], branches[row, step + 1]
+    begin = branches[row, step]
+    end = branches[row, step + 1]
     foot = begin + (end - begin) * (place - step)[..., None]
     along = _unit(_unit(end - begin) + 0.75 * rng.normal(size=(n, m, 3)) - [0, 0, species.hang])
     reach = np.linalg.norm(branches[:, -1] - branches[:, 0], axis=1)[:, None]
@@ -173,7 +182,8 @@ def _twigs(species: Species, branches: Floats, rng: np.random.Generator) -> Floa
 
 def _leaves(species: Species, twigs: Floats, rng: np.random.Generator) -> tuple[Floats, Ints]:
     """Triangles around the twigs, each by itself."""
-    n, m = len(twigs), species.leaves
+    n = len(twigs)
+    m = species.leaves
     long, wide = species.leaf_m
     along = twigs[:, 1:] - twigs[:, :1]
     foot = twigs[:, :1] + along * rng.uniform(0.15, 1.05, (n, m, 1))
@@ -181,7 +191,8 @@ def _leaves(species: Species, twigs: Floats, rng: np.random.Generator) -> tuple[
     ahead = _unit(_unit(along) + 0.8 * rng.normal(size=(n, m, 3)) - [0, 0, species.hang])
     across = _unit(np.cross(ahead, rng.normal([0, 0, 0.8], 1, (n, m, 3))))
     size = rng.uniform(0.75, 1.25, (n, m, 1))
-    tip, side = foot + ahead * long * size, across * wide / 2 * size
+    tip = foot + ahead * long * size
+    side = across * wide / 2 * size
     corners = np.stack([foot - side, foot + side, tip], axis=2).reshape(-1, 3)
     return corners, np.arange(len(corners)).reshape(-1, 3)
 

@@ -21,16 +21,27 @@ BLOCK_FACES = 1 << 18  # triangles whose areas are added up at a time
 
 # Shares of rays. Of those that look down from 1, 2 and 3 m above a patch of ground, 0.4 meet it if
 # it is 5 m wide.
-_GROUND, _SKY, _ENCLOSED, _CLOSED, _UPRIGHT, _FLOOR = 0.4, 0.3, 0.95, 0.8, 0.9, 0.3
+_GROUND = 0.4
+_SKY = 0.3
+_ENCLOSED = 0.95
+_CLOSED = 0.8
+_UPRIGHT = 0.9
+_FLOOR = 0.3
 # Openness, from which a surface is not closed; and that of leaves at most.
-_OPEN, _LEAVES = 0.1, 0.4
+_OPEN = 0.1
+_LEAVES = 0.4
 # A closed body whose inside has a floor and upright walls is a room of these sizes.
-_WIDE_M, _HIGH_M = 2.0, 15.0
+_WIDE_M = 2.0
+_HIGH_M = 15.0
 # The room of a scene spans this share of the scene along each axis; smaller bodies are in it.
 _SPANS = 1 / 3
 # Directions by their z: up to 10 degrees above the horizon, within 60 degrees of straight up, and
 # within 30 degrees of straight down. Shares of such rays that meet what covers a position.
-_RAISED, _UPWARD, _DOWNWARD, _COVERED, _WIDELY_COVERED = 0.17, 0.5, -0.87, 0.9, 0.95
+_RAISED = 0.17
+_UPWARD = 0.5
+_DOWNWARD = -0.87
+_COVERED = 0.9
+_WIDELY_COVERED = 0.95
 # A body is around a position; a flat surface, however near, takes half of the directions.
 _AROUND = 0.6
 
@@ -99,7 +110,8 @@ class Surroundings:
         and the positions are within it: not on ground, and not in a room with a floor.
         """
         down = seen.directions[:, 2] < 0
-        below, above = np.mean(seen.hit[down]), np.mean(seen.hit[~down])
+        below = np.mean(seen.hit[down])
+        above = np.mean(seen.hit[~down])
         if below < _GROUND and above < _GROUND:
             return True
         outside = self.outside()
@@ -137,7 +149,8 @@ class Surroundings:
         position is lower than the whole scene, and these things are above in almost all directions.
         """
         views = self.views(position)
-        up, met = views.directions[:, 2], np.isfinite(views.distance)
+        up = views.directions[:, 2]
+        met = np.isfinite(views.distance)
         if met[up < _DOWNWARD].any():
             return False
         above = up > _UPWARD
@@ -192,7 +205,8 @@ def _openness(scene: Scene) -> float:
 
     Those of a closed surface add up to nothing.
     """
-    total, area = np.zeros(3), 0.0
+    total = np.zeros(3)
+    area = 0.0
     for begin in range(0, len(scene.faces), BLOCK_FACES):
         a, b, c = scene.vertices[scene.faces[begin : begin + BLOCK_FACES]].transpose(1, 0, 2)
         areas = np.cross(b - a, c - a)

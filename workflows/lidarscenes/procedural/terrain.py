@@ -23,13 +23,18 @@ _ROUGHNESS = 0.5  # height of each octave over that of the one before
 _RELIEF = 0.16  # greatest height over the side's length
 
 # One tree at most in a cell, at the flattest of some places in its middle part.
-_CELL_M, _MOST_CELLS, _TRIED, _MIDDLE = 5.0, 1_000, 4, 0.4
+_CELL_M = 5.0
+_MOST_CELLS = 1_000
+_TRIED = 4
+_MIDDLE = 0.4
 _STEEPEST = np.tan(np.radians(40.0))
 _ROOT_M = 0.6
 _EDGE_M = 5.0  # of the terrain, without trees
 _GLADE_M = 12.0  # without trees around the middle, where a sensor stands by default
 # Size of woods, and in cells at least; how much denser than between them, as an exponent.
-_WOODS_M, _WOOD_CELLS, _DENSER = 120.0, 20, 5.0
+_WOODS_M = 120.0
+_WOOD_CELLS = 20
+_DENSER = 5.0
 
 
 @checked
@@ -71,10 +76,12 @@ def terrain(
     """
     rows = int(np.sqrt(triangles / 2))
     columns = triangles // (2 * rows)
-    x, y = np.linspace(0, 1, columns + 1), np.linspace(0, 1, rows + 1)
+    x = np.linspace(0, 1, columns + 1)
+    y = np.linspace(0, 1, rows + 1)
     height = _heights(x, y, np.random.default_rng(seed))
     points = np.empty((columns + 1, rows + 1, 3))
-    points[..., 0], points[..., 1] = (x[:, None] - 0.5) * side_m, (y - 0.5) * side_m
+    points[..., 0] = (x[:, None] - 0.5) * side_m
+    points[..., 1] = (y - 0.5) * side_m
     points[..., 2] = height * side_m
     faces = grid_faces(columns, rows).reshape(-1, 3)
     ground = SceneMesh("terrain", points.reshape(-1, 3), faces)
@@ -92,7 +99,8 @@ def _woods(heights: Floats, side_m: float, count: int, seed: int) -> list[SceneI
     tried = (number.reshape(-1, 2) + inside) / max(cells, 1)
     height, slope = _ground_at(heights, side_m, tried)
     best = slope.argmin(axis=0), np.arange(cells * cells)
-    share, height = tried[best], height[best]
+    share = tried[best]
+    height = height[best]
     places = np.column_stack([(share - 0.5) * side_m, height])
     fits = slope[best] <= _STEEPEST
     fits &= np.hypot(*places.T[:2]) > _GLADE_M
@@ -111,7 +119,8 @@ def _woods(heights: Floats, side_m: float, count: int, seed: int) -> list[SceneI
     kind = np.where(
         conifer, rng.choice(np.flatnonzero(kinds), count), rng.choice(np.flatnonzero(~kinds), count)
     )
-    turn, scale = rng.uniform(0, 2 * np.pi, count), rng.uniform(*SCALES, count)
+    turn = rng.uniform(0, 2 * np.pi, count)
+    scale = rng.uniform(*SCALES, count)
     return placed(all_trees(seed, _ROOT_M), kind, places[chosen], turn, scale)
 
 
@@ -120,8 +129,10 @@ def _ground_at(heights: Floats, side_m: float, share: Floats) -> tuple[Floats, F
     size = np.array(heights.shape) - 1
     at = share * size
     i, j = np.moveaxis(np.minimum(at.astype(np.int64), size - 1), -1, 0)
-    u, v = at[..., 0] - i, at[..., 1] - j
-    low, high = heights[i, j], heights[i + 1, j + 1]
+    u = at[..., 0] - i
+    v = at[..., 1] - j
+    low = heights[i, j]
+    high = heights[i + 1, j + 1]
     corner = np.where(u >= v, heights[i + 1, j], heights[i, j + 1])
     along_u = np.where(u >= v, corner - low, high - corner)
     along_v = np.where(u >= v, high - corner, corner - low)
@@ -161,8 +172,10 @@ def _noise(x: Floats, y: Floats, rng: np.random.Generator) -> Floats:
     shape = (int(x.max()) + 2, int(y.max()) + 2)
     angle = rng.uniform(0, 2 * np.pi, shape)
     slopes = np.cos(angle), np.sin(angle)
-    i, j = x.astype(np.int64), y.astype(np.int64)
-    u, v = (x - i)[:, None], (y - j)[None, :]
+    i = x.astype(np.int64)
+    j = y.astype(np.int64)
+    u = (x - i)[:, None]
+    v = (y - j)[None, :]
     blend_u, blend_v = (t * t * t * (t * (6 * t - 15) + 10) for t in (u, v))
     out = np.zeros((len(x), len(y)))
     for right in (0, 1):

@@ -222,7 +222,8 @@ class Robot:
         for joint in chain:
             place = matmul(place, joint.origin)
             if joint.moves:
-                value, slides = values[joint.name], joint.kind == "prismatic"
+                value = values[joint.name]
+                slides = joint.kind == "prismatic"
                 if np.ptp(value):
                     hinges.append(Hinge(place, joint.axis, slides, value))
                     place = np.eye(4)
@@ -278,7 +279,8 @@ class Robot:
                 table[one.name] = factor * table[other] + offset
         for name, joint in joints.items():
             low, high = joint.limits or (-np.inf, np.inf)
-            least, most = table[name].min(), table[name].max()
+            least = table[name].min()
+            most = table[name].max()
             if least < low - 1e-6 or most > high + 1e-6:
                 tell(
                     f"{self.name}: joint {name} goes from {least:.4g} to {most:.4g}, beyond its "
@@ -406,12 +408,14 @@ class LinkPath:
         within = (appears <= times_ns) & (times_ns <= leaves)
         times_ns = np.clip(times_ns, *self.presence_ns)  # elsewhere poses do not count
         positions, rotations = full_poses(self.base, station, times_ns)
-        place, turn = positions.T, rotations.transpose(1, 2, 0)
+        place = positions.T
+        turn = rotations.transpose(1, 2, 0)
         velocity = rate = np.zeros((3, len(times_ns)))
         if moving:
             velocity, rate = (part.T for part in velocities(self.base, station, times_ns))
         at = times_ns / 1e9 + self.start_s
-        low, high = at.min(initial=np.inf), at.max(initial=-np.inf)
+        low = at.min(initial=np.inf)
+        high = at.max(initial=-np.inf)
         first, last = self.times_s[[0, -1]]
         if self.hinges and max(first - low, high - last) > _LATE_S:
             raise LidarError(
@@ -423,7 +427,8 @@ class LinkPath:
             place, turn = _then(place, turn, hinge.before)
             value = interp(at, self.times_s, hinge.values)
             if moving:
-                start, velocity = place, velocity + np.cross(rate, place - start, axis=0)
+                velocity = velocity + np.cross(rate, place - start, axis=0)
+                start = place
                 along = _times(turn, hinge.axis[:, None, None] * self._slopes(hinge, at))[:, 0]
             if hinge.slides:
                 place = place + _times(turn, hinge.axis[:, None, None] * value)[:, 0]

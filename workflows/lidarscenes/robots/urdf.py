@@ -182,7 +182,9 @@ def _joint(element: Element, links: Collection[str]) -> tuple[str, Joint]:
         if link not in links:
             raise LidarError(f"its {which} {link!r} is no link of the file.")
         ends.append(link)
-    axis, limits, mimic = np.array([1.0, 0.0, 0.0]), None, None
+    axis = np.array([1.0, 0.0, 0.0])
+    limits = None
+    mimic = None
     if kind in MOVING:
         axis = _numbers(element.find("axis"), "xyz", 3, "1 0 0")
         if not (size := length(axis)) > 1e-9:
@@ -265,7 +267,8 @@ class _Looks:
             shape = next(iter(visual.find("geometry") or ()), None)
             if shape is None:
                 raise LidarError("a <visual> has no <geometry>.")
-            place, colour = _place(visual), self._colour(visual)
+            place = _place(visual)
+            colour = self._colour(visual)
             scale, parts = self._shape(shape)
             if not scale.all():
                 self._flat.append(link)

@@ -96,7 +96,8 @@ class _Writer:
     def _primitives(self, mesh: SceneMesh) -> list[dict[str, Any]]:
         """Return opaque triangles by their images, then those of each mask."""
         first = len(mesh.faces) - sum(len(cut.uv) for cut in mesh.cutouts)
-        colours, out = mesh.colours, []
+        colours = mesh.colours
+        out = []
         image = np.full(first, -1) if colours is None else colours.image[:first]
         names: tuple[str, ...] = ("",)
         index = np.zeros(len(mesh.faces), np.int32)
@@ -109,7 +110,8 @@ class _Writer:
             rows = np.flatnonzero((image == number) & (index[:first] == of_material))
             one = uv = tints = None
             if colours is not None:
-                shown, one = colours.take(rows), colours.images[number]
+                shown = colours.take(rows)
+                one = colours.images[number]
                 uv = None if one.size == 3 else shown.uv
                 if shown.corners is not None and (shown.corners < 255).any():
                     tints = shown.corners

@@ -10,7 +10,9 @@ import psutil
 
 from .errors import LidarError
 
-TIMES, LEAST = 100, 256 * 2**20  # of the file's bytes, and bytes of a small one
+# of the file's bytes, and bytes of a small one
+TIMES = 100
+LEAST = 256 * 2**20
 _CONTROL_GROUPS = Path("/sys/fs/cgroup")
 _PREFIXES = {"Pi": 2**50, "Ti": 2**40, "Gi": 2**30, "Mi": 2**20, "ki": 2**10}
 _SHARE = 4  # of the memory: a scene is copied while its objects are placed and joined
@@ -39,7 +41,8 @@ class Allowance:
 
     def __init__(self, size: int, advice: str) -> None:
         self.taken = 0
-        self._size, self._advice = size, advice
+        self._size = size
+        self._advice = advice
         self._files: set[Path] = set()
 
     @property
@@ -96,9 +99,11 @@ def _control_group_limits() -> list[int]:
     for line in memberships:
         _, controllers, group = line.split(":", 2)
         if not controllers:
-            top, file_name = _CONTROL_GROUPS, "memory.max"
+            top = _CONTROL_GROUPS
+            file_name = "memory.max"
         elif "memory" in controllers.split(","):
-            top, file_name = _CONTROL_GROUPS / "memory", "memory.limit_in_bytes"
+            top = _CONTROL_GROUPS / "memory"
+            file_name = "memory.limit_in_bytes"
         else:
             continue
         folder = top / group.lstrip("/")

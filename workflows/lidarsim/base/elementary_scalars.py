@@ -70,7 +70,8 @@ def exp_of(x: float) -> float:
     within = x if x < 710.0 else 710.0
     within = within if within > -746.0 else -746.0  # not a number, either
     k = math.floor(within * 1.4426950408889634 + 0.5)
-    high, low = within - k * 6.93147180369123816490e-01, k * 1.90821492927058770002e-10
+    high = within - k * 6.93147180369123816490e-01
+    low = k * 1.90821492927058770002e-10
     y = high - low
     t = y * y
     c = 6.61375632143793436117e-05 + t * (
@@ -89,7 +90,8 @@ def log_of(x: float) -> float:
         return x if x > 0.0 or x != x else (-math.inf if x == 0.0 else math.nan)
     y, k = math.frexp(x)
     if y < 0.7071067811865476:
-        y, k = 2.0 * y, k - 1
+        y = 2.0 * y
+        k = k - 1
     f = y - 1.0
     s = f / (2.0 + f)
     z = s * s
@@ -106,15 +108,21 @@ def arctan2_of(y: float, x: float) -> float:
     """Angle of a vector (x, y), radians; of the vector 0 that of the signs."""
     if x != x or y != y:
         return math.nan
-    far, near = max(abs(x), abs(y)), min(abs(x), abs(y))
+    far = max(abs(x), abs(y))
+    near = min(abs(x), abs(y))
     t = near / far if 0.0 < far < math.inf else (1.0 if near == math.inf else 0.0)
-    begin, rest = 0.0, 0.0  # arctan 1/2 and 1, in two parts
+    # arctan 1/2 and 1, in two parts
+    begin = 0.0
+    rest = 0.0
     if t > 0.6875:
-        begin, rest, t = 0.7853981633974483, 3.061616997868383e-17, (near - far) / (near + far)
+        begin = 0.7853981633974483
+        rest = 3.061616997868383e-17
+        t = (near - far) / (near + far)
         if near == math.inf:
             t = 0.0
     elif t > 0.4375:
-        begin, rest = 0.4636476090008061, 2.2698777452961687e-17
+        begin = 0.4636476090008061
+        rest = 2.2698777452961687e-17
         t = (2.0 * near - far) / (2.0 * far + near)
     z = t * t
     w = z * z

@@ -258,7 +258,8 @@ class Storage:
         size = crc = 0
         with self._reading(name) as file:
             while piece := file.read(_PIECE):
-                size, crc = size + len(piece), zlib.crc32(piece, crc)
+                size = size + len(piece)
+                crc = zlib.crc32(piece, crc)
         return [size, crc]
 
     def put(self, path: Path, name: str) -> None:

@@ -123,7 +123,8 @@ def column_name(cell: str) -> ColumnName:
     """Split a name in a header into its words and its unit."""
     text = cell.strip()
     if (bracketed := _BRACKETS.fullmatch(text)) is not None:
-        stem, unit = bracketed[1], bracketed[2].lower()
+        stem = bracketed[1]
+        unit = bracketed[2].lower()
         return ColumnName(stem, _letters(stem), _UNITS.get(unit, unit))
     suffixed = _SUFFIX.fullmatch(_CAMEL.sub("_", text))
     if suffixed is not None and (unit := suffixed[2].lower()) in _UNITS and unit.isalpha():
@@ -294,7 +295,9 @@ class _ColumnReader:
         exact: Mapping[str, Quantity],
     ) -> None:
         self.cells = [cell.lstrip("#%").strip() for cell in header.cells]
-        self.quantities, self.spellings, self.exact = quantities, spellings, exact
+        self.quantities = quantities
+        self.spellings = spellings
+        self.exact = exact
         # {name of a quantity: index of its column, and the unit; None if no header states it}
         self.assigned: dict[str, tuple[int, str | None]] = {}
         self.left_out: set[int] = set()  # indices of columns
@@ -393,7 +396,8 @@ class _ColumnReader:
 
     def _add(self, quantity: Quantity, number: int, unit: str | None) -> None:
         if (earlier := self.assigned.get(quantity.name)) is not None:
-            one, other = self.cells[earlier[0]], self.cells[number]
+            one = self.cells[earlier[0]]
+            other = self.cells[number]
             if one == other:
                 raise ValueError(f"it has the column {one!r} twice")
             raise ValueError(

@@ -100,7 +100,9 @@ _SCALARS: dict[Any, tuple[Callable[..., Any], Collection[str]]] = {
     NoneType: (core_schema.none_schema, ()),
 }
 _LETTERS = 160  # of a value that is shown
-_LINE, _VALUE = 119, 64  # most characters of all, and of the value of a field
+# most characters of all, and of the value of a field
+_LINE = 119
+_VALUE = 64
 
 
 def checked(function: Callable[P, R]) -> Callable[P, R]:
@@ -219,7 +221,8 @@ def _schema(hint: Any, limits: Mapping[str, Any] = MappingProxyType({})) -> Any:
 
     Of a class there must be an instance, of a protocol its attributes; arrays are not checked here.
     """
-    origin, args = get_origin(hint), get_args(hint)
+    origin = get_origin(hint)
+    args = get_args(hint)
     if origin is Annotated:
         schema = _schema(args[0], _limits(hint, (*_LIMITS, *_LENGTHS, "allow_inf_nan")))
         wraps: list[Any] = [n.func for n in hint.__metadata__ if isinstance(n, WrapValidator)]
@@ -322,7 +325,9 @@ def _sentence(
     near: str,
     show: Callable[[Any], str],
 ) -> str:
-    at, kind, given = dotted(place), details[0]["type"], details[0]["input"]
+    at = dotted(place)
+    kind = details[0]["type"]
+    given = details[0]["input"]
     if kind == "value_error":
         message = str(details[0]["ctx"]["error"])
         return f"{at}: {message}" if at else message
@@ -341,7 +346,8 @@ def _sentence(
 
 def _allowed(detail: ErrorDetails, hint: Any, in_python: bool) -> str:
     """Return what a value must do: «be 1 to 10»; examples are Python."""
-    kind, context = detail["type"], detail.get("ctx", {})
+    kind = detail["type"]
+    context = detail.get("ctx", {})
     if kind == "is_instance_of":
         name = str(context["class"]).rpartition(".")[2]
         such = f", such as {_EXAMPLES[name]}" if name in _EXAMPLES else ""
@@ -384,7 +390,8 @@ def field_hint(name: str, known: Collection[str], root: Any) -> str:
     """
     if (other := _ALIKE.get(name)) in known:
         return f" Did you mean {other!r}?"
-    level, owners = [("", root)], list[tuple[str, Any]]()
+    level = [("", root)]
+    owners = list[tuple[str, Any]]()
     while level and not owners:
         level = [
             (f"{place}.{inner}", kind)
@@ -430,7 +437,8 @@ def fields_of(section: Any) -> Fields:
 
 @cache
 def _of_dataclass(section: Any) -> Fields:
-    hints, made = get_type_hints(section, include_extras=True), FieldInfo.from_annotated_attribute
+    hints = get_type_hints(section, include_extras=True)
+    made = FieldInfo.from_annotated_attribute
     return {one.name: made(hints[one.name], one) for one in dataclass_fields(section)}
 
 
@@ -471,10 +479,13 @@ def shown(value: object) -> str:
 
 def one_line(thing: Any) -> str:
     """`repr` of a dataclass: the fields that differ from their defaults, as far as a line holds."""
-    name, kept, left_out = type(thing).__name__, list[str](), False
+    name = type(thing).__name__
+    kept = list[str]()
+    left_out = False
     fields = sorted(dataclass_fields(thing), key=lambda f: (f.name != "name", bool(f.kw_only)))
     for field in fields:
-        value, make = getattr(thing, field.name), field.default_factory
+        value = getattr(thing, field.name)
+        make = field.default_factory
         default = field.default if make is MISSING else make()
         if not field.repr or (not isinstance(value, np.ndarray) and (value == default) is True):
             continue

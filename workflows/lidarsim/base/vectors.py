@@ -48,7 +48,8 @@ def products(one: Floats, other: Floats) -> Floats:
 
 def matmul(one: ArrayLike, other: ArrayLike) -> Floats:
     """Products of small matrices (..., i, j) and (..., j, k): (..., i, k)."""
-    one, other = np.asarray(one, np.float64), np.asarray(other, np.float64)
+    one = np.asarray(one, np.float64)
+    other = np.asarray(other, np.float64)
     out: Floats = one[..., :, 0, None] * other[..., None, 0, :]
     for column in range(1, one.shape[-1]):
         out += one[..., :, column, None] * other[..., None, column, :]
@@ -98,7 +99,8 @@ def rank(matrices: Floats) -> Ints:
     largest = np.abs(matrices).reshape(shape).max(axis=-1)
     unit = matrices / np.where(largest > 0, largest, 1)[..., None, None]
     cofactors, size = adjugates(unit)
-    lengths, areas = length(unit.reshape(shape)), length(cofactors.reshape(shape))
+    lengths = length(unit.reshape(shape))
+    areas = length(cofactors.reshape(shape))
     thin = ~(areas > _FLAT * lengths * lengths)
     flat = thin | ~(np.abs(size) > _FLAT * lengths * areas)
     return np.asarray(3 - flat.astype(np.int64) - thin)

@@ -247,7 +247,8 @@ def need_packages(*packages: str) -> None:
 
 def _fitting(column: Column, values: ArrayLike) -> AnyArray:
     """Convert `values` to the column's type; LidarError if a cast would wrap around."""
-    given, wanted = np.asarray(values), np.dtype(column.dtype)
+    given = np.asarray(values)
+    wanted = np.dtype(column.dtype)
     cast = given.astype(wanted, copy=False)
     if cast is not given and wanted.kind in "iu" and not np.array_equal(cast, given):
         limits = np.iinfo(wanted)

@@ -17,7 +17,8 @@ from .table import Column
 AXES = ("x", "y", "z")
 
 _MAGIC = "ply\nformat binary_little_endian 1.0\n"
-_HEADER_LIMIT, _COMMENTS_LIMIT = 65_536, 1 << 25
+_HEADER_LIMIT = 65_536
+_COMMENTS_LIMIT = 1 << 25
 _PLY_TYPES = {
     "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1",
     "short": "<i2", "int16": "<i2", "ushort": "<u2", "uint16": "<u2",

@@ -21,7 +21,9 @@ from .scene_instances import SceneInstance, parts_of
 from .scene_mesh import SceneMesh, stacked
 
 SAMPLES_MOST = 200_000  # poses of all actors
-WAY_POSES, LONG_NS = 10_001, 1e12  # by which ways of unknown classes are measured
+# by which ways of unknown classes are measured
+WAY_POSES = 10_001
+LONG_NS = 1e12
 AT_ZERO = Stations((CENTRE,))
 
 

@@ -49,7 +49,8 @@ class Animation:
     def __post_init__(self) -> None:
         poses = as_array("vertices of an animation", self.vertices)
         object.__setattr__(self, "vertices", np.ascontiguousarray(poses))
-        shape, speed = np.shape(self.vertices), self.speed_m_s
+        shape = np.shape(self.vertices)
+        speed = self.speed_m_s
         good = len(shape) == 3 and shape[0] > 1 and shape[1] > 0 and shape[2] == 3
         good = good and self.step_s > 0 and (speed is None or speed > 0)
         if not good or not np.isfinite(self.vertices).all():
@@ -74,7 +75,8 @@ class Animation:
         begin = frames.astype(np.int64).clip(0, len(self.vertices) - 2)
         share = (frames - begin)[:, None, None]
         begin = begin if isinstance(vertex, slice) else begin[:, None]
-        here, then = self.vertices[begin, vertex], self.vertices[begin + 1, vertex]
+        here = self.vertices[begin, vertex]
+        then = self.vertices[begin + 1, vertex]
         return (1 - share) * here + share * then, then - here
 
     @cached_property
@@ -96,13 +98,16 @@ class Animation:
         ends = ends if self.repeat else ends.clip(0, last)
         first = np.floor(ends[0]).astype(np.int64)
         steps = np.ceil(ends[1]).astype(np.int64) - first  # 0 while it keeps a pose
-        lows, highs = self.vertices.min(axis=1), self.vertices.max(axis=1)
-        low, high = np.full((len(first), 3), np.inf), np.full((len(first), 3), -np.inf)
+        lows = self.vertices.min(axis=1)
+        highs = self.vertices.max(axis=1)
+        low = np.full((len(first), 3), np.inf)
+        high = np.full((len(first), 3), -np.inf)
         for step in range(max(1, min(int(steps.max(initial=0)), last))):
             begin = first + np.minimum(step, (steps - 1).clip(0))
             begin = begin % last if self.repeat else begin
             for frame in (begin, begin + (steps > 0)):
-                low, high = np.minimum(low, lows[frame]), np.maximum(high, highs[frame])
+                low = np.minimum(low, lows[frame])
+                high = np.maximum(high, highs[frame])
         return np.stack([low, high], axis=1)
 
     def moved(self, linear: Floats, offset: Floats) -> Animation:

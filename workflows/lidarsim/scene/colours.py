@@ -115,7 +115,8 @@ class Colours:
 
     def means(self) -> Bytes:
         """Mean colour of each face, in linear light, of four places on it, or of 100: (f, 3)."""
-        out, steps = np.empty((len(self), 3), np.uint8), 10 if len(self) <= FEW_FACES else 2
+        out = np.empty((len(self), 3), np.uint8)
+        steps = 10 if len(self) <= FEW_FACES else 2
         # The middles of the pieces into which lines beside the edges cut it.
         i, j = (n.ravel() for n in np.mgrid[:steps, :steps])
         upright = np.stack([i, j], axis=1)[i + j < steps] + 1 / 3
@@ -123,7 +124,8 @@ class Colours:
         places = np.concatenate([upright, turned]) / steps
         for begin in range(0, len(self), BLOCK_FACES):
             some = self.take(slice(begin, begin + BLOCK_FACES))
-            lookup, rows = Lookup(some, [_UNIT.repeat(len(some), axis=0)]), np.arange(len(some))
+            lookup = Lookup(some, [_UNIT.repeat(len(some), axis=0)])
+            rows = np.arange(len(some))
             light = np.zeros((len(some), 3))
             for along, across in places.tolist():
                 found = lookup.at(rows, np.tile([along, across, 0.0], (len(some), 1)))
@@ -153,7 +155,8 @@ class Lookup:
     """
 
     def __init__(self, colours: Colours, corners: Iterable[Floats]) -> None:
-        images, tints = colours.images, colours.corners
+        images = colours.images
+        tints = colours.corners
         self._image = colours.image
         self._texels = np.concatenate([packed(one.reshape(-1, 3)) for one in images])
         sizes = np.array([one.shape[:2] for one in images], np.int64)
@@ -164,7 +167,9 @@ class Lookup:
         # have these, as planes of the position.
         own = (counts > 1)[self._image]
         tinted = np.zeros(0, np.bool_) if tints is None else (tints != 255).any(axis=(1, 2))
-        textures, lights, at = [np.zeros((0, 8))], [np.zeros((0, 12))], 0
+        textures = [np.zeros((0, 8))]
+        lights = [np.zeros((0, 12))]
+        at = 0
         for block in corners:
             rows = slice(at, at + len(block))
             if colours.uv is not None:
@@ -217,7 +222,8 @@ class _Planes(NamedTuple):
         place = self.place.take(rows)
         if not self.everywhere:
             on = np.flatnonzero(place >= 0)
-            place, points = place[on], points[:, on]
+            place = place[on]
+            points = points[:, on]
         x, y, z = points
         out = np.empty((self.slopes.shape[1] // 4, len(x)))
         slopes = self.slopes.take(place, axis=0).T.reshape(len(out), 4, len(x))
@@ -238,11 +244,13 @@ def _planes(corners: Floats, values: Floats) -> Floats:
     normal = np.cross(b - a, c - a)
     area = (normal * normal).sum(axis=1, keepdims=True)
     scale = np.divide(1, area, out=np.zeros_like(area), where=area > _FLAT)
-    along_b, along_c = np.cross(c - a, normal) * scale, np.cross(normal, b - a) * scale
+    along_b = np.cross(c - a, normal) * scale
+    along_c = np.cross(normal, b - a) * scale
     out = np.empty((len(corners), values.shape[2], 4))
     for value, (first, second, third) in enumerate(values.transpose(2, 1, 0)):
         slope = (second - first)[:, None] * along_b + (third - first)[:, None] * along_c
-        out[:, value, :3], out[:, value, 3] = slope, first - (slope * a).sum(axis=1)
+        out[:, value, :3] = slope
+        out[:, value, 3] = first - (slope * a).sum(axis=1)
     return out.reshape(len(corners), 4 * values.shape[2])
 
 

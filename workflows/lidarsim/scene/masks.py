@@ -153,7 +153,8 @@ class Texture:
     def __init__(
         self, image: Bools | Bytes, wraps: tuple[Wrap, Wrap], allowance: Allowance
     ) -> None:
-        self._wraps, self._allowance = wraps, allowance
+        self._wraps = wraps
+        self._allowance = allowance
         _take(allowance, image.size)
         for axis, wrap in zip((1, 0), wraps, strict=True):
             if wrap == "mirror":  # repeats with its mirror image
@@ -206,10 +207,13 @@ class Texture:
         places[(places > -slack) & (places < 0)] = 0
         places[(places > 1) & (places < 1 + slack)] = 1
         # Triangles wholly beyond an edge are in its last texels, or the first ones beyond.
-        most, least = places.max(axis=1), places.min(axis=1)
-        places[most <= 0], places[least >= 1] = 0.5 / size, 1 - 0.5 / size
+        most = places.max(axis=1)
+        least = places.min(axis=1)
+        places[most <= 0] = 0.5 / size
+        places[least >= 1] = 1 - 0.5 / size
         if black:
-            places[most < 0], places[least > 1] = -0.5 / size, 1 + 0.5 / size
+            places[most < 0] = -0.5 / size
+            places[least > 1] = 1 + 0.5 / size
         before = max(0, int(np.ceil(-places.min() * size)))
         after = max(0, int(np.ceil((places.max() - 1) * size)))
         if not before and not after:

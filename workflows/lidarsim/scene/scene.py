@@ -269,14 +269,16 @@ class Scene:
                 else:
                     shared.append((number, part, matrix))
         sizes = [len(mesh.faces) for _, mesh in plain]
-        points, most = sum(len(mesh.vertices) for _, mesh in plain), np.iinfo(np.int32).max
+        points = sum(len(mesh.vertices) for _, mesh in plain)
+        most = np.iinfo(np.int32).max
         triangles = sum(sizes) + sum(len(parts[part].faces) for _, part, _ in shared)
         if max(points, triangles) > most:
             raise LidarError(
                 f"The scene has {points} vertices and {triangles} triangles; at most {most} of "
                 "each can be numbered."
             )
-        vertices, faces = np.zeros((0, 3)), np.zeros((0, 3), np.int64)
+        vertices = np.zeros((0, 3))
+        faces = np.zeros((0, 3), np.int64)
         if plain:
             vertices, faces = stacked((mesh.vertices, mesh.faces) for _, mesh in plain)
         instances = None

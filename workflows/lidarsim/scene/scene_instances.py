@@ -181,7 +181,8 @@ class Instances:
     def placed(self) -> Iterator[tuple[Indices, Floats]]:
         """Vertices of some instances (k,) of one part, local to the scene: (k, 3, v)."""
         for number in np.unique(self.part):
-            part, rows = self.parts[number], np.flatnonzero(self.part == number)
+            part = self.parts[number]
+            rows = np.flatnonzero(self.part == number)
             step = max(1, BLOCK_POINTS // len(part.vertices))
             for begin in range(0, len(rows), step):
                 some = rows[begin : begin + step]
@@ -237,7 +238,8 @@ def scale_of(matrix: Floats) -> Floats:
     """
     turn = matrix
     for _ in range(_ROUNDS):
-        before, turn = turn, (turn + inverse(turn).T) / 2
+        before = turn
+        turn = (turn + inverse(turn).T) / 2
         if (turn == before).all():
             break
     scaled = matmul(turn.T, matrix)

@@ -153,7 +153,9 @@ class SceneMesh:
 
     def moved(self, name: str, linear: Floats, offset: Floats) -> SceneMesh:
         """Return a renamed copy at p -> linear @ p + offset, with faces still outward."""
-        faces, cutouts, colours = self.faces, self.cutouts, self.colours
+        faces = self.faces
+        cutouts = self.cutouts
+        colours = self.colours
         if determinant(linear) < 0:
             faces = faces[:, ::-1]
             cutouts = tuple(replace(cut, uv=cut.uv[:, ::-1]) for cut in cutouts)
@@ -165,7 +167,8 @@ class SceneMesh:
 
 
 def _check_voxels(name: str, voxels: Voxels) -> None:
-    density, matrix = voxels.density, voxels.matrix
+    density = voxels.density
+    matrix = voxels.matrix
     well = density.dtype == np.float32 and density.ndim == 3 and density.size > 0
     well = well and max(density.shape) <= VOXELS_MOST
     well = well and bool(0 <= density.min() <= density.max() <= DENSEST)
@@ -193,7 +196,9 @@ def _check_cutouts(name: str, cutouts: tuple[Cutout, ...], faces: int) -> None:
 
 def stacked(parts: Iterable[tuple[AnyArray, AnyArray]]) -> tuple[AnyArray, AnyArray]:
     """Vertices and faces of several (vertices, faces), one after the other."""
-    vertices, faces, first = [], [], 0
+    vertices = []
+    faces = []
+    first = 0
     for points, corners in parts:
         vertices.append(points)
         faces.append(corners + first)

@@ -96,7 +96,8 @@ def revolve(profile: ArrayLike, segments: int, name: str = "Revolved") -> SceneM
 def capsule(radius: float, height: float, segments: int, name: str) -> SceneMesh:
     """Make a ball around zero that is drawn apart at its equator by a height, which may be zero."""
     angles = np.linspace(-np.pi / 2, np.pi / 2, segments // 2 + 1)
-    ball, up = radius * np.stack(sin_cos(angles)[::-1], axis=1), [0, height / 2]
+    ball = radius * np.stack(sin_cos(angles)[::-1], axis=1)
+    up = [0, height / 2]
     middle = segments // 4
     profile = np.concatenate([ball[: middle + bool(height)] - up, ball[middle:] + up])
     return revolve(profile, segments, name)
@@ -112,8 +113,12 @@ def _revolved_faces(rings: int, segments: int) -> Ints:
     """Faces over `rings` circles of `segments` vertices, the poles being the last two vertices."""
     grid = np.arange(rings * segments).reshape(rings, segments)
     following = np.roll(grid, -1, axis=1)
-    low, low_next, high, high_next = grid[:-1], following[:-1], grid[1:], following[1:]
-    first, last = rings * segments, rings * segments + 1
+    low = grid[:-1]
+    low_next = following[:-1]
+    high = grid[1:]
+    high_next = following[1:]
+    first = rings * segments
+    last = rings * segments + 1
     bands = [
         np.stack([low, low_next, high_next], axis=-1).reshape(-1, 3),
         np.stack([low, high_next, high], axis=-1).reshape(-1, 3),

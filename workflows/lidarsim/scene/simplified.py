@@ -15,7 +15,9 @@ from .scene_mesh import stacked, triangle_areas
 
 DRAWN_TRIANGLES = 2_000_000  # of instances; of more, each gets its share of fewer
 PART_LEAST = 32  # triangles of a simplified part
-CUT_TRIANGLES, CUT_STEPS = 50_000, 128  # of a part with a mask, and of a triangle's edge
+# of a part with a mask, and of a triangle's edge
+CUT_TRIANGLES = 50_000
+CUT_STEPS = 128
 _PLACES = 200  # to which distances are measured
 
 
@@ -41,12 +43,15 @@ class Drawn:
             return cls(scene, np.arange(faces), same=True)
         shares = _shares(shared, most, near)
         meshes = [(scene.vertices, scene.faces)]
-        owners, counters = [scene.face_object], [np.arange(faces)]
+        owners = [scene.face_object]
+        counters = [np.arange(faces)]
         colours = [scene.colours]
         mirrored = np.linalg.det(shared.transforms[:, :, :3]) < 0
         for number, share in sorted(set(zip(shared.part.tolist(), shares.tolist(), strict=True))):
             part = shared.parts[number]
-            vertices, own, kept = part.vertices, part.faces, np.arange(len(part.faces))
+            vertices = part.vertices
+            own = part.faces
+            kept = np.arange(len(part.faces))
             size = max(PART_LEAST, int(len(own) * share))
             if size < len(own):
                 vertices, own, kept = _fewer(part, size)
@@ -109,7 +114,8 @@ def _cut(part: MeshPart, most: float) -> MeshPart:
     places = np.random.default_rng(0).dirichlet(np.ones(3), (len(part.faces), len(pieces)))
     u, v = np.einsum("fpc,pck,fkx->xfp", places, corners, part.uv.astype(np.float64), optimize=True)
     height, width = part.mask.shape
-    row, column = (v % 1 * height).astype(int), (u % 1 * width).astype(int)
+    row = (v % 1 * height).astype(int)
+    column = (u % 1 * width).astype(int)
     opaque = part.mask[np.minimum(row, height - 1), np.minimum(column, width - 1)]
     opaque[0, 0] |= not opaque.any()  # no part is empty
     face, piece = np.nonzero(opaque)
@@ -188,7 +194,8 @@ def _merged(points: Floats, corners: Ints32, most: int) -> tuple[Floats, Ints32,
     does.
     """
     area = float(triangle_areas(points[corners]).sum())
-    cell, low = (2 * area / most) ** 0.5, points.min(axis=0)
+    cell = (2 * area / most) ** 0.5
+    low = points.min(axis=0)
     while True:
         at = np.floor((points - low) / cell).astype(np.int64)
         _, merged, counts = np.unique(_numbered(at), return_inverse=True, return_counts=True)

@@ -27,7 +27,9 @@ UP_AXES = {
 def affine(linear: Floats, offset: Floats) -> Floats:
     """Matrices (..., 4, 4) of p -> linear @ p + offset: (..., 3, 3) and (..., 3)."""
     out = np.zeros((*np.shape(offset)[:-1], 4, 4))
-    out[..., :3, :3], out[..., :3, 3], out[..., 3, 3] = linear, offset, 1
+    out[..., :3, :3] = linear
+    out[..., :3, 3] = offset
+    out[..., 3, 3] = 1
     return out
 
 
@@ -60,7 +62,8 @@ class Transform:
     offset: Floats
 
     def __post_init__(self) -> None:
-        linear, offset = as_array("linear", self.linear), as_array("offset", self.offset)
+        linear = as_array("linear", self.linear)
+        offset = as_array("offset", self.offset)
         if linear.shape != (3, 3) or offset.shape != (3,):
             raise LidarError(
                 f"A transform needs a (3, 3) matrix and 3 offsets, not {linear.shape} and "

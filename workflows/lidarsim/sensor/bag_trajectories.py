@@ -28,7 +28,8 @@ _POSES: dict[str, Callable[[Any], Any]] = {
     "geometry_msgs/msg/PoseWithCovarianceStamped": lambda message: message.pose.pose,
     "geometry_msgs/msg/TransformStamped": lambda message: message.transform,
 }
-_GNSS, _IMU = "sensor_msgs/msg/NavSatFix", "sensor_msgs/msg/Imu"
+_GNSS = "sensor_msgs/msg/NavSatFix"
+_IMU = "sensor_msgs/msg/Imu"
 _FRAMES = "tf2_msgs/msg/TFMessage"
 _STATIC = "/tf_static"
 _SAME = 1e-6  # between numbers of a pose that is sent twice
@@ -119,9 +120,11 @@ def _stamp_ns(header: Any) -> int:
 
 def _in_order(times_ns: Sequence[int], rows: Sequence[Sequence[float]]) -> tuple[Ints, Floats]:
     """Return times and rows in the order of time; rows that are sent twice count once."""
-    times, table = np.array(times_ns, np.int64), np.array(rows, np.float64)
+    times = np.array(times_ns, np.int64)
+    table = np.array(rows, np.float64)
     order = np.argsort(times, kind="stable")
-    times, table = times[order], table[order]
+    times = times[order]
+    table = table[order]
     close = np.abs(table[1:] - table[:-1]).max(axis=1) <= _SAME
     again = np.append(False, (np.diff(times) == 0) & close)
     return times[~again], table[~again]
@@ -129,7 +132,10 @@ def _in_order(times_ns: Sequence[int], rows: Sequence[Sequence[float]]) -> tuple
 
 def _topic_poses(bag: Reader, topic: str, pose_of: Callable[[Any], Any]) -> TimedPoses:
     """Return the poses of a topic, by the stamps of their headers."""
-    stamps, times, rows, frames = [], [], [], set()
+    stamps = []
+    times = []
+    rows = []
+    frames = set()
     for _, time_ns, message in messages_of(bag, [topic]):
         stamps.append(_stamp_ns(message.header))
         times.append(time_ns)
@@ -148,7 +154,8 @@ def _gnss_poses(
     bag: Reader, kinds: Mapping[str, str], topic: str, imu: str, origin: Origin
 ) -> TimedPoses:
     """Return positions of a GNSS receiver, with the orientations of an IMU if the bag has some."""
-    times_ns, fixes = [], []
+    times_ns = []
+    fixes = []
     for _, _, fix in messages_of(bag, [topic]):
         place = [fix.latitude, fix.longitude, fix.altitude]
         if fix.status.status >= 0 and np.isfinite(place).all():
@@ -218,7 +225,8 @@ def _edges_of(bag: Reader, kinds: Mapping[str, str]) -> dict[str, _Edge]:
 
 def _chain(edges: Mapping[str, _Edge], frame: str) -> list[_Edge]:
     """Return the edges from a frame upwards to the root."""
-    chain, passed = [], set[str]()
+    chain = []
+    passed = set[str]()
     while frame in edges:
         if frame in passed:
             raise LidarError(f"its frame {frame!r} is above itself.")
@@ -247,7 +255,8 @@ def _frame_poses(edges: Mapping[str, _Edge], frame: str) -> TimedPoses:
     moving = [times for times, _ in tables if len(times) > 1]
     if not moving:
         raise LidarError(f"its frame {frame!r} has one pose, and a trajectory needs two.")
-    first, last = max(times[0] for times in moving), min(times[-1] for times in moving)
+    first = max(times[0] for times in moving)
+    last = min(times[-1] for times in moving)
     times = moving[0][(moving[0] >= first) & (moving[0] <= last)]
     if len(times) < 2:
         raise LidarError(f"the frames above {frame!r} have no poses at the same time.")
@@ -263,7 +272,8 @@ def _frame_poses(edges: Mapping[str, _Edge], frame: str) -> TimedPoses:
 def _edge_poses(edge_times: Ints, rows: Floats, times: Ints) -> tuple[Floats, Floats]:
     """Return positions (k, 3) and rotations (k, 3, 3) at times (k,), ns, within those of rows."""
     if len(edge_times) == 1:  # a static frame
-        edge_times, rows = edge_times + np.arange(2), rows.repeat(2, axis=0)
+        edge_times = edge_times + np.arange(2)
+        rows = rows.repeat(2, axis=0)
         times = np.broadcast_to(edge_times[0], len(times))
     seconds = (edge_times - edge_times[0]) / 1e9
     track = Track(seconds, rows[:, :3], rows[:, 3:])

@@ -60,7 +60,8 @@ class Fault:
         for name, value in self.words().items():  # labels have them as JSON
             listed = np.iterable(value) and not isinstance(value, str)
             object.__setattr__(self, name, without_numpy(tuple(value) if listed else value))
-        own, given = _OWN[self.kind], self.words().keys() - {"kind", "from_s", "to_s", "sensor"}
+        own = _OWN[self.kind]
+        given = self.words().keys() - {"kind", "from_s", "to_s", "sensor"}
         for name in sorted((given ^ {*own}) - {one for one in own if one.endswith("_deg")}):
             advice = f"leave {name} out" if name in given else f"give {name}"
             takes = f"takes {', '.join(own)}" if own else "has times only"

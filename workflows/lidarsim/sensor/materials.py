@@ -35,7 +35,9 @@ WATER_INDEX = 1.328
 # of Fresnel's reflection outside, over a half space (Lekner and Dorf 1988).
 WATER_INWARDS = 0.4702
 NEAREST_M = 1e-3  # energies do not grow below this distance
-NEAR_NM, FAR_NM = 905.0, 1550.0  # wavelengths of the table of reflectances
+# wavelengths of the table of reflectances
+NEAR_NM = 905.0
+FAR_NM = 1550.0
 POLISHED = 0.04  # share that plastics, paints and wet surfaces reflect at right angles, n = 1.5
 DARKEST = 1e-3  # least reflectance of a colour, so that every hit is a return
 
@@ -339,7 +341,8 @@ class SurfaceKinds:
         """Kinds of some objects."""
         if len(self.object) == len(self.names):
             return rows
-        starts, stops = self.first[rows], self.first[rows + 1]
+        starts = self.first[rows]
+        stops = self.first[rows + 1]
         ranges = [np.arange(start, stop) for start, stop in zip(starts, stops, strict=True)]
         return np.concatenate([np.zeros(0, np.intp), *ranges])
 
@@ -463,7 +466,8 @@ def with_class(
 
     LidarError if a material is for nothing in the scene.
     """
-    first, of_rows = first_matches(materials, kinds), kinds.of_rows(rows)
+    first = first_matches(materials, kinds)
+    of_rows = kinds.of_rows(rows)
     out: list[Material] = []
     for number in (*range(len(materials)), -1):
         of_number = np.unique(kinds.object[of_rows[first[of_rows] == number]]).tolist()
@@ -579,7 +583,8 @@ class MaterialTable:
         back = shares * np.where(self.retro[rows], RETRO_GAIN, cosine)
         if self.roughness.any():
             on = np.flatnonzero(self.roughness[rows])
-            metal, some = self.metalness[rows[on]], shares[on]
+            metal = self.metalness[rows[on]]
+            some = shares[on]
             front = POLISHED * (1 - metal) + some * metal
             back[on] *= 1 - metal
             back[on] += front * gloss(cosine[on], self.roughness[rows[on]])
@@ -593,7 +598,8 @@ def gloss(cosine: Floats, roughness: Floats) -> Floats:
     is the square of the roughness, as in glTF 2.0. With light and receiver in one direction, their
     π D G / (4 cos θ) is what is left here. Multiply it by the reflection at right angles.
     """
-    width, square = np.square(roughness**2), cosine**2
+    width = np.square(roughness**2)
+    square = cosine**2
     spread = 1 - square * (1 - width)
     return np.asarray(width / (4 * spread**2 * np.sqrt(square + width * (1 - square))))
 

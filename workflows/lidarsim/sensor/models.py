@@ -538,7 +538,8 @@ def _listed(
 
 def _calibrated(described: SensorModel, unit: Calibration) -> Beams:
     """Beams of a unit, fired at the times of its model."""
-    beams, table = unit.beams, described.beams
+    beams = unit.beams
+    table = described.beams
     assert beams is not None  # a file has beams or rays
     expected = len(table.elevation_deg) or len(table.time_us)
     if expected not in (0, len(beams)):

@@ -255,9 +255,11 @@ def imu_samples(drive: InstrumentedDrive, block: int = BLOCK) -> Iterator[ImuSam
 
 def _of_axes(imu: Imu, name: str, seed: int) -> tuple[_Errors, Floats | None]:
     """Return the errors of an IMU's three gyroscopes, or the like, and their axes (3, 3)."""
-    names, seed = ("noise_density", "bias", "bias_time_s", "random_walk"), named_seed(seed, name)
+    names = ("noise_density", "bias", "bias_time_s", "random_walk")
+    seed = named_seed(seed, name)
     density, bias, time_s, walk = (getattr(imu, f"{name}_{one}") for one in names)
-    white, three = density * math.sqrt(imu.rate_hz), np.ones(3)
+    white = density * math.sqrt(imu.rate_hz)
+    three = np.ones(3)
     errors = _Errors(seed, 1 / imu.rate_hz, three * white, three * bias, time_s, three * walk)
     if not (imu.scale or imu.misalignment_deg):
         return errors, None
@@ -290,7 +292,8 @@ def fixes(drive: InstrumentedDrive, block: int = BLOCK) -> Iterator[Fixes]:
         for number, (begin, end) in enumerate(gnss.outages):
             if navigation.imu is None:
                 there = (times < begin * 1e9) | (times >= end * 1e9)
-                times, places = times[there], places[there]
+                times = times[there]
+                places = places[there]
             else:
                 ends = times / 1e9 - begin, end - begin
                 places += _bridged(navigation.imu, errors.seed, number, *ends)
@@ -347,7 +350,9 @@ class _Errors:
         walk: Floats,  # (3,): of the random walk in a second
     ) -> None:
         self.seed = seed
-        self._white, self._bias, self._walk = white, bias, walk * math.sqrt(step_s)
+        self._white = white
+        self._bias = bias
+        self._walk = walk * math.sqrt(step_s)
         self._kept = exp_of(-step_s / bias_time_s)
         self._driven = bias * math.sqrt(1 - self._kept * self._kept)
         self._biases: Floats = np.zeros(3)  # of the last sample
@@ -398,7 +403,8 @@ def geodetic(positions: Floats, origin: tuple[float, float, float]) -> Floats:
     origin
         Latitude, longitude and height.
     """
-    lat, lon = math.radians(origin[0]), math.radians(origin[1])
+    lat = math.radians(origin[0])
+    lon = math.radians(origin[1])
     (sp, cp), (sl, cl) = sin_cos_of(lat), sin_cos_of(lon)
     wide = _A / math.sqrt(1 - _E2 * sp * sp)
     east, north, up = positions.T
@@ -445,5 +451,7 @@ def _cartesian(places: Floats) -> Floats:
     return np.column_stack([level * cl, level * sl, (across * (1 - _E2) + height) * sp])
 
 
-_A, _F = 6378137.0, 1 / 298.257223563  # of WGS 84
+# of WGS 84
+_A = 6378137.0
+_F = 1 / 298.257223563
 _E2 = _F * (2 - _F)

@@ -208,9 +208,11 @@ class Sensor:
         low = high = number * each
         back = ahead = 1
         while low and turn(low) >= number:
-            low, back = max(0, low - back), 2 * back
+            low = max(0, low - back)
+            back = 2 * back
         while turn(high) < number:
-            high, ahead = high + ahead, 2 * ahead
+            high = high + ahead
+            ahead = 2 * ahead
         return bisect_left(range(high + 1), number, lo=low, key=turn)
 
     def directions(self, firings: Ints) -> Floats:

@@ -26,13 +26,17 @@ def knots_of(times: Floats, values: Floats) -> Floats:
     # Equal second derivatives on both sides: v[i] + before[i] v[i - 1] + after[i] v[i + 1] = given
     rows = np.zeros((2 + len(values), 32 + len(times) + 32))
     own = rows[:, 32:-32]
-    before, after, first = own[0], own[1], own[2:]
+    before = own[0]
+    after = own[1]
+    first = own[2:]
     before[1:-1] = steps[1:] / (steps[1:] + steps[:-1]) / 2
     after[1:-1] = 0.5 - before[1:-1]
     first[:, 1:-1] = 3 * (before[1:-1] * slopes[:, :-1] + after[1:-1] * slopes[:, 1:])
     for end, few in ((0, np.s_[:4]), (-1, np.s_[:-5:-1])):
         # The slope there of the cubic through four (Newton).
-        time, part, factor = times[few], values[:, few], 1.0
+        time = times[few]
+        part = values[:, few]
+        factor = 1.0
         for count in range(1, len(time)):
             part = np.diff(part) / (time[count:] - time[:-count])
             first[:, end] += factor * part[:, 0]
@@ -44,7 +48,8 @@ def knots_of(times: Floats, values: Floats) -> Floats:
         left, right = (rows[:, 32 + k : 32 + k + len(times)] for k in (-far, far))
         scale = 1 - before * left[1] - after * right[0]
         found = (first - before * left[2:] - after * right[2:]) / scale
-        before[:], after[:] = -before * left[0] / scale, -after * right[1] / scale
+        before[:] = -before * left[0] / scale
+        after[:] = -after * right[1] / scale
         first[:] = found
     second = np.zeros_like(first)
     second[:, :-1] = (6 * slopes - 4 * first[:, :-1] - 2 * first[:, 1:]) / steps
@@ -64,7 +69,8 @@ def on_curve(
     step = steps.take(used)
     powers = np.stack([step / step, step, step * step / 2])[:, None]
     (p, v, a), (q, w, b) = (knots.take(used + k, axis=2) * powers for k in (0, 1))
-    share, change = since / step.repeat(counts), q - p
+    share = since / step.repeat(counts)
+    change = q - p
     value, slope = np.zeros((2, len(p), len(segment)))
     # Of the polynomial in the share of the segment, by Horner.
     c = 10 * change - 6 * v - 4 * w - 3 * a + b

@@ -352,7 +352,8 @@ class Survey(CloudOptions, Weather):
     def _check_air(self, number: int) -> None:
         """Check that a sensor says what it detects, and that this is not too much."""
         carried = self.carried[number]
-        sensor, name = carried.sensor, f" of {carried.name}" if carried.name else ""
+        sensor = carried.sensor
+        name = f" of {carried.name}" if carried.name else ""
         if self.noise_each[number].detection_range_m is None:
             lacks = "is not given" if carried.noise is None else "its data sheet does not state"
             guess = sensor.max_range_m / 2 if sensor.max_range_m < np.inf else 100
@@ -375,7 +376,8 @@ class Survey(CloudOptions, Weather):
 
     def _check_duration(self, sensor: Sensor, steps: int) -> None:
         """Check that the trajectory lasts as long as a sensor, and that its numbers do not end."""
-        needed, there = _end_ns(sensor, steps) / 1e9, self.path.duration_ns / 1e9
+        needed = _end_ns(sensor, steps) / 1e9
+        there = self.path.duration_ns / 1e9
         if needed > there:
             raise LidarError(
                 f"steps {steps} take until {needed:.6g} s and the trajectory lasts {there:.6g} s, "
@@ -445,8 +447,10 @@ class Survey(CloudOptions, Weather):
         """Count drops and flakes that a pulse of a sensor may return from, on the average."""
         if not self.particles:
             return 0.0
-        sensor, least = self.carried[number].sensor, FAINTEST * self.noise_each[number].threshold
-        air, span = self.air(number), reach(sensor.min_range_m, sensor.max_range_m)
+        sensor = self.carried[number].sensor
+        least = FAINTEST * self.noise_each[number].threshold
+        air = self.air(number)
+        span = reach(sensor.min_range_m, sensor.max_range_m)
         return sum(air.met(kind, least, *span) for kind in self.particles)
 
     @cached_property
@@ -480,9 +484,12 @@ class Survey(CloudOptions, Weather):
     @cached_property
     def sweeps_each(self) -> tuple[tuple[Ints, Floats, Floats], ...]:
         """First scans of each sensor's sweeps, and when their first and last firings begin, ns."""
-        out, stations = [], np.arange(self.path.stations)[:, None]
+        out = []
+        stations = np.arange(self.path.stations)[:, None]
         for number, carried in enumerate(self.carried):
-            sensor, steps, base = carried.sensor, self.steps_each[number], self._firsts[number]
+            sensor = carried.sensor
+            steps = self.steps_each[number]
+            base = self._firsts[number]
             firsts = np.flatnonzero(np.diff(sensor.turns(np.arange(steps)), prepend=-1))
             begins = [sensor.firings(step)[0] for step in firsts.tolist()]
             ends = [sensor.firings(step - 1)[1] - 1 for step in [*firsts[1:].tolist(), steps]]
@@ -573,7 +580,8 @@ class Survey(CloudOptions, Weather):
 
 def _check_noise(noise: Noise, sensor: Sensor) -> None:
     """Check that a sensor can have its noise, and that false alarms are not too many."""
-    biases, channels = noise.channel_bias_m, sensor.channels
+    biases = noise.channel_bias_m
+    channels = sensor.channels
     if isinstance(biases, Sequence) and len(biases) != channels:
         raise LidarError(
             f"noise.channel_bias_m has {len(biases)} numbers; {sensor.model} needs {channels}: "

@@ -20,7 +20,8 @@ from .spline import knots_of, on_curve
 QUATERNION_SLACK = 1e-3  # tolerance of a quaternion's length, which files round
 # Times since 1970 are coarser than a nanosecond in double precision, and the beams of the last
 # firing are fired a little after its pose.
-CLOCK_S, _FIRING_S = 1e-6, 1e-3
+CLOCK_S = 1e-6
+_FIRING_S = 1e-3
 
 _ROUNDS = 8  # of the power iteration: rotations are rounded by 2e-3 at most
 _STEP_NS = 5e5  # half of what difference quotients are taken over
@@ -81,7 +82,8 @@ class Pose:
             yaw = arctan2(rotation[1, 0], rotation[0, 0])
             roll = arctan2(rotation[2, 1], rotation[2, 2])
         else:  # straight up or down: yaw and roll have the same axis
-            yaw, roll = arctan2(-rotation[0, 1], rotation[1, 1]), np.zeros(())
+            yaw = arctan2(-rotation[0, 1], rotation[1, 1])
+            roll = np.zeros(())
         return cls(place, *np.degrees([yaw, pitch, roll]).tolist())
 
 
@@ -244,7 +246,8 @@ class Stations:
 
     def poses(self, station: int, times_ns: Floats) -> tuple[Floats, Floats | None]:
         """See `Trajectory.poses`."""
-        pose, count = self.at[station], len(times_ns)
+        pose = self.at[station]
+        count = len(times_ns)
         rotation = pose.rotation
         turned = None if rotation is None else np.broadcast_to(rotation, (count, 3, 3))
         return np.broadcast_to(np.array(pose.position), (count, 3)), turned
@@ -406,7 +409,8 @@ class Track:
             q, p = on_curve(*self._spline, segment, since, True)
             # 2 p conjugate(q); the length of q may be any, and change.
             turn = q[6] * p[3:6] - p[6] * q[3:6] - np.cross(p[3:6], q[3:6], axis=0)
-            speeds, rates = p[:3], 2 * turn / (q[3:] ** 2).sum(axis=0)
+            speeds = p[:3]
+            rates = 2 * turn / (q[3:] ** 2).sum(axis=0)
         else:
             speeds, rates = (self.segments[k].take(segment, axis=1) for k in (1, 4))
         return (speeds * within).T, (rates * within).T
@@ -414,8 +418,10 @@ class Track:
     def _at(self, times_ns: Floats) -> tuple[Indices, Floats, Bools]:
         """Return segments of times (k,), seconds since these began, and whether it moves then."""
         assert self.start_s is not None  # set above
-        times, at = self.times_s, times_ns / 1e9 + self.start_s
-        low, high = at.min(initial=np.inf), at.max(initial=-np.inf)
+        times = self.times_s
+        at = times_ns / 1e9 + self.start_s
+        low = at.min(initial=np.inf)
+        high = at.max(initial=-np.inf)
         gap = max(times[0] - low, high - times[-1])
         within = np.ones(len(at), np.bool_)
         if self.beyond != "refuse":

@@ -50,7 +50,7 @@ _CAMERA = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 _HELIOS = " `lidarpool import` reads a .trj of HELIOS++ with its survey."
 
 
-class Poses(NamedTuple):
+class PoseTable(NamedTuple):
     """Poses of a file."""
 
     seconds: Floats  # (k,)
@@ -160,20 +160,20 @@ def _of_container(
     times: str | Path | None,
     topic: str | None,
     origin: Sequence[float] | None,
-) -> tuple[str, Poses]:
+) -> tuple[str, PoseTable]:
     """Read a folder or a bag; return its format and its poses."""
     if not path.exists():
         raise FileNotFoundError(2, "No such file or directory")
     if is_bag(path) and kind in (None, "bag"):
         if times is not None:
             raise ValueError("a bag has times of its own: leave out times")
-        return "bag", Poses(*read_bag(path, topic, origin))
+        return "bag", PoseTable(*read_bag(path, topic, origin))
     _refuse_topic(topic)
     folder = find_oxts(path)
     if folder is not None and kind in (None, "oxts"):
         if times is not None:
             raise ValueError("a folder of oxts has times of its own: leave out times")
-        return "oxts", Poses(*read_oxts(folder, origin))
+        return "oxts", PoseTable(*read_oxts(folder, origin))
     if path.is_file() and kind == "oxts":
         return _of_text(read_text(path), kind, times, {}, (), origin)
     raise ValueError(
@@ -189,7 +189,7 @@ def _of_text(
     columns: Mapping[str, str],
     ignore: Sequence[str],
     origin: Sequence[float] | None,
-) -> tuple[str, Poses]:
+) -> tuple[str, PoseTable]:
     """Read a text file; return its format and its poses."""
     lines = text.splitlines()
     if times is not None and kind not in (None, "kitti", "oxts"):
@@ -209,7 +209,7 @@ def _of_text(
                 f"its rows have {width} numbers and no header: rows of TUM have 8, those of KITTI "
                 "12; give a table a header, as in time_s,x,y,z,yaw_deg"
             )
-        return kind, Poses(rows[:, 0], rows[:, 1:4], rows[:, 4:])
+        return kind, PoseTable(rows[:, 0], rows[:, 1:4], rows[:, 4:])
     if times is None:
         raise ValueError("KITTI's poses have no times: give their file as times")
     try:
@@ -222,10 +222,10 @@ def _of_text(
     if len(rows) != len(seconds):
         raise ValueError(f"it has {len(rows)} poses and {times} {len(seconds)} times")
     if kind == "oxts":
-        return kind, Poses(seconds, *oxts_poses(rows, origin))
+        return kind, PoseTable(seconds, *oxts_poses(rows, origin))
     places = rows.reshape(-1, 3, 4)
     check_rotations(places[..., :3], slack=2 * QUATERNION_SLACK)
-    return kind, Poses(seconds, places[..., 3], quaternions_of(places[..., :3]))
+    return kind, PoseTable(seconds, places[..., 3], quaternions_of(places[..., :3]))
 
 
 def _is_pose_column(cell: str) -> bool:
@@ -255,7 +255,7 @@ def _numbers(text: str, columns: int | None = None) -> Floats:
     return rows
 
 
-def _table(text: str, names: Mapping[str, str], ignore: Sequence[str], tum: bool) -> Poses:
+def _table(text: str, names: Mapping[str, str], ignore: Sequence[str], tum: bool) -> PoseTable:
     """Read a table with a header; `tum` says that bare times are seconds."""
     quaternion = [quantity.name for quantity in QUATERNION]
 
@@ -282,15 +282,17 @@ def _table(text: str, names: Mapping[str, str], ignore: Sequence[str], tum: bool
         if angles:
             raise ValueError(f"it has both a quaternion and {angles[0]}: ignore one of these")
         turns = np.stack([columns[name] for name in quaternion], axis=1)
-        return Poses(seconds, positions, turns)
+        return PoseTable(seconds, positions, turns)
     if not angles:
-        return Poses(seconds, positions, None)
+        return PoseTable(seconds, positions, None)
     if "yaw_deg" not in angles:
         raise ValueError(
             f"it has {angles[0]} and neither yaw_deg nor heading_deg: give one, or ignore "
             f"{angles[0]} to face the direction of travel"
         )
-    return Poses(seconds, positions, quaternions_of(rotations_of(angles_of(columns, len(seconds)))))
+    return PoseTable(
+        seconds, positions, quaternions_of(rotations_of(angles_of(columns, len(seconds))))
+    )
 
 
 def _from_camera(track: Track) -> Track:

@@ -28,13 +28,18 @@ SNOW_LIDAR_RATIO_SR = 25.0  # of ice clouds (Young and Vaughan 2009)
 DUST_M2_G = 0.6  # mass extinction of mineral dust (Ansmann et al. 2019: 0.57 to 0.63)
 DUST_LIDAR_RATIO_SR = 60.0  # Haarig et al. 2022: 46 to 50 at 532 nm, 57 to 69 at 1064 nm
 DROPS_LIDAR_RATIO_SR = 18.8  # of clean droplets (O'Connor et al. 2004)
-SPRAY_DROP_MM, CLUMP_MM, CLUMP_LARGEST_MM = 0.2, 20.0, 100.0  # diameters, of clumps the mean
+# diameters, of clumps the mean
+SPRAY_DROP_MM = 0.2
+CLUMP_MM = 20.0
+CLUMP_LARGEST_MM = 100.0
 EXIT_M = 0.01  # the beam's diameter at the sensor, if it is unknown: 5 to 13 mm
 NODES = 4096  # ranges at which tables and integrals are made
 # Share of the detection threshold below which particles are left out: 0.6 % of those that return
 # half of it are detected. That misses 2 % of the returns from rain, and 0.3 % of those from snow.
 FAINTEST = 0.5
-NEAREST_M, FARTHEST_M = 0.1, 1e4  # where particles are looked for
+# where particles are looked for
+NEAREST_M = 0.1
+FARTHEST_M = 1e4
 LEAST_LEFT = 1e-200  # of the light, so that one can divide by it
 LARGE = 2.0  # light that a large particle takes, in its cross-sections: half of it by diffraction
 
@@ -136,7 +141,8 @@ class Particles(NamedTuple):
     @property
     def extinction(self) -> float:
         """Extinction, 1/m: all take light in proportion to their cross-sections."""
-        slope, x = self.slope, self.slope * self.largest
+        slope = self.slope
+        x = self.slope * self.largest
         squares = 2 / (slope * slope * slope) * (1 - exp_of(-x) * (1 + x + x * x / 2))
         return LARGE * math.pi / 4 * self.number * squares * 1e-6
 
@@ -251,6 +257,7 @@ class Air(NamedTuple):
 
     def cloud(self, backscatter: float, begins: Floats, ends: Floats) -> Floats:
         """Energies that fog or dust returns from slabs that fill the beam, by Simpson's rule."""
-        middle, slab = (begins + ends) / 2, ends - begins
+        middle = (begins + ends) / 2
+        slab = ends - begins
         mean = (self.white(begins) + 4 * self.white(middle) + self.white(ends)) / 6
         return np.asarray(math.pi * backscatter * slab * mean)

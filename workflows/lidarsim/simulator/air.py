@@ -162,7 +162,8 @@ class WeatherStep(PulseStep):
     def _within(self, hits: PulseReturns, ray: Ints, distance: Floats) -> Bools:
         """Whether places on rays are within water or glass, where nothing falls: (n,)."""
         rows = self._bent(hits)
-        bent, where = hits.ray[rows], hits.distance[rows]
+        bent = hits.ray[rows]
+        where = hits.distance[rows]
         first, stop = (np.searchsorted(bent, ray, side=side) for side in ("left", "right"))
         count = np.zeros(len(ray), np.int64)
         for number in range(int((stop - first).max(initial=0))):
@@ -175,7 +176,8 @@ class WeatherStep(PulseStep):
         rows = self._bent(hits)
         if not len(rows):
             return reach
-        ray, where = hits.ray[rows], hits.distance[rows]
+        ray = hits.ray[rows]
+        where = hits.distance[rows]
         out = np.full(len(rows), np.inf)
         same = ray[1:] == ray[:-1]
         out[:-1][same] = where[1:][same]
@@ -187,12 +189,15 @@ class WeatherStep(PulseStep):
 
 def reached(materials: MaterialTable, surfaces: Surfaces, hits: PulseReturns, count: int) -> Floats:
     """How far the light of sub-rays gets, (count,): inf if no surface ends it."""
-    ray, ends, on = hits.ray, hits.distance, materials.passes
+    ray = hits.ray
+    ends = hits.distance
+    on = materials.passes
     if on.any():
         ends = np.where(on[surfaces.kinds(hits.triangle)], np.inf, ends)
     if hits.cause is not None:
         rows = np.flatnonzero(hits.cause == SURFACE)
-        ray, ends = ray[rows], ends[rows]
+        ray = ray[rows]
+        ends = ends[rows]
     reach = np.full(count, np.inf)
     reach[ray] = ends  # of several, the last
     return reach
@@ -304,7 +309,9 @@ def seen_by_range(
 
 def _poisson(mean: float) -> Floats:
     """Cumulative probabilities of 0, 1, … events; the last is 1."""
-    sums, term, count = [], exp_of(-mean), 0
+    sums = []
+    term = exp_of(-mean)
+    count = 0
     total = term
     while count < mean or 1 - total > 1e-9:
         sums.append(total)

@@ -59,7 +59,8 @@ class RippleStep(PulseStep):
 
     def apply(self, returns: PulseReturns, batch: PulseBatch) -> PulseReturns:
         """See `PulseStep.apply`."""
-        noise, sensor = self.setup.noise, self.setup.sensor
+        noise = self.setup.noise
+        sensor = self.setup.sensor
         azimuth = sensor.head.azimuths(batch.firings.numbers[batch.rows])
         sin, _ = sin_cos(noise.ripple_cycles * azimuth + np.radians(noise.ripple_phase_deg))
         # A degree of azimuth is less across a beam, the steeper the beam looks.

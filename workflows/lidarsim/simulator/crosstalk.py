@@ -21,7 +21,7 @@ from ..sensor.optics import LIGHT_M_NS
 from ..sensor.random_numbers import Purpose
 from ..sensor.survey import begin_ns
 from .detection import passes
-from .motion import Clock, Poses
+from .motion import CastPoses, Clock
 from .returns import OF_RETURNS, PulseReturns, merged, numbers, unreal
 from .scene_caster import SceneCaster
 from .step import Memory, PulseBatch, PulseStep, Role, Setup, Sizes
@@ -61,7 +61,8 @@ class CrosstalkStep(PulseStep):
 
     def __init__(self, setup: Setup, caster: SceneCaster, surfaces: Surfaces) -> None:
         super().__init__(setup, caster, surfaces)
-        self._survey, self._sensor = setup.survey, setup.sensor
+        self._survey = setup.survey
+        self._sensor = setup.sensor
         wide, _ = setup.reporting.of(self._sensor.optics)
         self._cosine = sin_cos_of(wide / 2)[1]
         nm = self._sensor.optics.wavelength_nm
@@ -87,14 +88,16 @@ class CrosstalkStep(PulseStep):
         rays = np.arange(batch.start, batch.stop)
         row, distance, energy = self.received(batch.keys.scan, rays, *batch.middles, batch.here)
         order = np.lexsort((distance, row))
-        ray, distance, energy = rays[row[order]], distance[order], energy[order]
+        ray = rays[row[order]]
+        distance = distance[order]
+        energy = energy[order]
         scan, number = batch.keys.of(ray)
         seen = passes(self.setup.noise, OTHER, energy, scan, number, numbers(ray))
         others = unreal(returns, ray[seen], distance[seen], energy[seen], CROSSTALK)
         return merged(returns, others)
 
     def received(
-        self, scan: int, rays: Ints, origins: Floats, directions: Floats, poses: Poses
+        self, scan: int, rays: Ints, origins: Floats, directions: Floats, poses: CastPoses
     ) -> tuple[Indices, Floats, Floats]:
         """Find pulses of other sensors that consecutive rays (n,) receive.
 
@@ -106,7 +109,8 @@ class CrosstalkStep(PulseStep):
         """
         from . import stray_loops  # not before: numba takes half a second to import
 
-        spec, sensor = self._survey.scan(scan), self._sensor
+        spec = self._survey.scan(scan)
+        sensor = self._sensor
         firing, channel = np.divmod(rays, sensor.channels)
         firing = firing + spec.firings[0]
         fired = sensor.begins_ns(firing) + sensor.beams.time_ns[channel]
@@ -124,7 +128,10 @@ class CrosstalkStep(PulseStep):
             limits = self._cosine, sensor.min_range_m, sensor.max_range_m
             given = *map(owned, (fired, origins, directions, spots.time, spots.place)), *limits
             count = stray_loops.received(*pairs, order, *given, row, spot, distance, far)
-            row, spot, distance, far = row[:count], spot[:count], distance[:count], far[:count]
+            row = row[:count]
+            spot = spot[:count]
+            distance = distance[:count]
+            far = far[:count]
             towards = spots.place[spot] - origins[row]
             when = fired[row] + spec.start_ns
             free = self.caster.free(origins[row], towards, far, when, poses.ways)
@@ -166,15 +173,17 @@ class CrosstalkStep(PulseStep):
         spot, cell = _expanded(first // CELL_RAYS, np.where(stop > first, -(-stop // CELL_RAYS), 0))
         off = arccos(np.clip(products(axes[cell].T, away[spot].T) / far[spot], -1, 1))
         seen = ~(off > opening[cell] + opening_m[spot])
-        spot, cell = spot[seen], cell[seen]
+        spot = spot[seen]
+        cell = cell[seen]
         low = np.maximum(first[spot], cell * CELL_RAYS)
         return spot, low, np.minimum(stop[spot], (cell + 1) * CELL_RAYS)
 
     def _spots(
-        self, other: int, station: int, start_ns: int, span: tuple[float, float], poses: Poses
+        self, other: int, station: int, start_ns: int, span: tuple[float, float], poses: CastPoses
     ) -> _Spots:
         """Where the pulses of another sensor hit something, fired within a span of time."""
-        carried, path = self._survey.carried[other], self._survey.path
+        carried = self._survey.carried[other]
+        path = self._survey.path
         sensor: Sensor = carried.sensor
         firings = np.arange(*_fired_in(sensor, self._survey.steps_each[other], span))
         begins = sensor.begins_ns(firings)
@@ -187,12 +196,15 @@ class CrosstalkStep(PulseStep):
         places, turns = path.poses(station, np.minimum(begins + sensor.lead_ns, path.duration_ns))
         if turns is not None:
             back = np.repeat(turns.transpose(0, 2, 1), sensor.channels, axis=0)
-            ahead, starts = into_axes(ahead, back), into_axes(starts, back)
+            ahead = into_axes(ahead, back)
+            starts = into_axes(starts, back)
         starts = starts + np.repeat(places, sensor.channels, axis=0)
-        now = Poses(np.zeros(3), clock=Clock(fired + start_ns, np.zeros(1), poses.ways))
-        low, high = sensor.min_range_m, sensor.max_range_m
+        now = CastPoses(np.zeros(3), clock=Clock(fired + start_ns, np.zeros(1), poses.ways))
+        low = sensor.min_range_m
+        high = sensor.max_range_m
         found = self.caster.scan(Pattern(ahead, starts), now, t_min=low, t_max=high)
-        ray, distance = found.ray.astype(np.int64), found.distance
+        ray = found.ray.astype(np.int64)
+        distance = found.distance
         times = fired[ray] + start_ns
         return _Spots(
             fired[ray] + distance / LIGHT_M_NS,
@@ -204,12 +216,14 @@ class CrosstalkStep(PulseStep):
 
     def _energy(self, spots: _Spots, spot: Indices, towards: Floats, far: Floats) -> Floats:
         """Energies that are received of spots: (n,), as of a sensor's own pulses."""
-        surfaces, nm = self.surfaces, self._sensor.optics.wavelength_nm
+        surfaces = self.surfaces
+        nm = self._sensor.optics.wavelength_nm
         triangle = spots.triangle[spot]
         cosine = np.abs(products(spots.normal[spot].T, towards.T)) / far
         # The air on the way there and back.
         both = self._survey.extinction(self._sensor) * (spots.distance[spot] + far)
-        kinds, table = surfaces.kinds(triangle), surfaces.at(nm)
+        kinds = surfaces.kinds(triangle)
+        table = surfaces.at(nm)
         # A retro-reflector sends the light of a sensor back to that one alone.
         share = table.reflectance[kinds] * ~table.retro[kinds]
         return np.asarray(share * cosine * at_right_angles(far) * exp(-both))
@@ -224,7 +238,8 @@ def _expanded(first: Indices, stop: Indices) -> tuple[Indices, Indices]:
 
 def _fired_in(sensor: Sensor, steps: int, span: tuple[float, float]) -> tuple[int, int]:
     """First firing within a span of time, and one past the last."""
-    last, begins = range(sensor.firings(steps - 1)[1]), partial(begin_ns, sensor)
+    last = range(sensor.firings(steps - 1)[1])
+    begins = partial(begin_ns, sensor)
     early = span[0] - float(sensor.beams.time_ns.max())  # its slowest beam is in the span
     return bisect_left(last, early, key=begins), bisect_left(last, span[1], key=begins)
 

@@ -25,7 +25,7 @@ from ..columns.table import AXES, CHANNEL, OBJECT, TABLE, Column
 from ..scene.scene import Scene
 from ..sensor import ScanSpec, Survey
 from ..sensor.materials import NEAREST_M, REFERENCE_M, RETRO_GAIN
-from .motion import Poses
+from .motion import CastPoses
 from .points import BatchPoints
 from .pulses import Scanned
 from .returns import SURFACE, PulseReturns
@@ -106,9 +106,12 @@ class DeviceColumns:
     def __init__(
         self, caster: SceneCaster, scene: Scene, survey: Survey, surfaces: Surfaces
     ) -> None:
-        self._caster, self._scene, self._surfaces = caster, scene, surfaces
+        self._caster = caster
+        self._scene = scene
+        self._surfaces = surfaces
         self.survey = survey
-        wanted, able = {column.name for column in survey.stored_columns}, _able(scene, survey)
+        wanted = {column.name for column in survey.stored_columns}
+        able = _able(scene, survey)
         self.all_hits = needs_hits(scene, survey)
         if self.all_hits and scene.actors:
             able -= {*_ENERGIES}
@@ -124,20 +127,24 @@ class DeviceColumns:
     def moved(self, scene: Scene, surfaces: Surfaces) -> DeviceColumns:
         """Return the same after instances have moved; what has not changed stays on the device."""
         made = copy(self)
-        made._scene, made._surfaces, made._turns = scene, surfaces, None
+        made._scene = scene
+        made._surfaces = surfaces
+        made._turns = None
         return made
 
     def returns(
         self,
         specs: list[ScanSpec],
         pattern: Pattern,
-        poses: Poses,
+        poses: CastPoses,
         window: tuple[int, int],
         groups: Ints,
     ) -> DevicePoints:
         """Cast scans, see `Rig.returns`."""
-        survey, sensor = self.survey, self.survey.carried[specs[0].sensor].sensor
-        every, reach = survey.keep_every, (sensor.min_range_m, sensor.max_range_m)
+        survey = self.survey
+        sensor = self.survey.carried[specs[0].sensor].sensor
+        every = survey.keep_every
+        reach = (sensor.min_range_m, sensor.max_range_m)
         scan = check_scan(
             pattern, **poses.given, window=window, t_min=reach[0], t_max=reach[1],
             keep_every=every, groups=groups, tally=True,
@@ -158,13 +165,15 @@ class DeviceColumns:
         if self.some_hits:
             for column in self.energies:
                 columns[column.name][making.rows] = column.make(returns)
-        counts, on_host = -(-hits // every), returns if self.all_hits else None
+        counts = -(-hits // every)
+        on_host = returns if self.all_hits else None
         return DevicePoints(self._scene, survey, specs, counts, hits, tally, columns, on_host)
 
     def tables(self, cupy: Any) -> tuple[Any, ...]:
         """Tables of the surfaces for columns.cu, on the caster's device; see there."""
         if self._sent is None:
-            surfaces, materials = self._surfaces, self._surfaces.materials
+            surfaces = self._surfaces
+            materials = self._surfaces.materials
             normals = surfaces.unit_normals if self.energies else np.zeros((1, 3), np.float32)
             tables = (
                 self.bodies, surfaces.owners, normals, materials.reflectance,
@@ -182,7 +191,10 @@ class _Making:
     def __init__(
         self, maker: DeviceColumns, specs: list[ScanSpec], groups: Ints, most: int
     ) -> None:
-        self._maker, self._specs, self._groups, self._most = maker, specs, groups, most
+        self._maker = maker
+        self._specs = specs
+        self._groups = groups
+        self._most = most
         self._begun: _Begun | None = None
         self._count = 0
         self._on_actors: list[tuple[AnyArray, ...]] = [_NO_HITS]  # rows, and as `_HITS`
@@ -192,7 +204,8 @@ class _Making:
         if not len(hits):
             return
         begun = self._begun = self._begun or self._begin(hits.cupy)
-        cp, count = hits.cupy, np.int64(len(hits))
+        cp = hits.cupy
+        count = np.int64(len(hits))
         asked = {*begun.out, *([_TRIANGLE] if begun.hits else [])}
         made = {c: cp.empty(len(hits) if c in asked else 1, c.dtype) for c in _MADE}
         wanted = np.int32(sum(1 << _MADE.index(column) for column in asked))
@@ -236,8 +249,10 @@ class _Making:
 
     def _begin(self, cupy: Any) -> _Begun:
         """Send what the kernel reads besides hits."""
-        maker, specs = self._maker, self._specs
-        survey, sensor = maker.survey, maker.survey.carried[specs[0].sensor].sensor
+        maker = self._maker
+        specs = self._specs
+        survey = maker.survey
+        sensor = maker.survey.carried[specs[0].sensor].sensor
         bodies, owners, normals, reflectance, retro, classes, turns = maker.tables(cupy)
         firings = np.arange(specs[0].firings[0], specs[-1].firings[1], dtype=np.int64)
         outbox = Outbox(cupy)

@@ -12,15 +12,15 @@ import numpy as np
 from ..base.arrays import Floats, Integers, Ints, Ints32
 from ..base.vectors import products
 from ..sensor.random_numbers import Purpose
-from .motion import Poses
+from .actor_trajectories import ActorTrajectories
+from .motion import CastPoses
 from .surfaces import Surfaces
-from .ways import Ways
 
 VELOCITY = Purpose(40, "noise of a return's radial velocity")
 BLOCK_HITS = 1 << 13  # hits that are looked at a time, to fit a cache
 
 
-def approach(poses: Poses, ray: Integers, origins: Floats, directions: Floats) -> Floats:
+def approach(poses: CastPoses, ray: Integers, origins: Floats, directions: Floats) -> Floats:
     """How fast rays (n,) grow because their origins move, m/s: (n,); what stands still has that.
 
     Origins and unit directions are (n, 3), in the scene's axes.
@@ -38,7 +38,7 @@ def approach(poses: Poses, ray: Integers, origins: Floats, directions: Floats) -
 
 def radial_velocities(
     surfaces: Surfaces,
-    poses: Poses,
+    poses: CastPoses,
     ray: Integers,
     rays: tuple[Floats, Floats],
     distance: Floats,
@@ -67,11 +67,12 @@ def radial_velocities(
 
 
 def velocities_of_ends(
-    surfaces: Surfaces, ways: Ways, rays: tuple[Floats, Floats], distance: Floats,
+    surfaces: Surfaces, ways: ActorTrajectories, rays: tuple[Floats, Floats], distance: Floats,
     triangle: Ints32, times: Floats | Ints,
 ) -> Floats:  # fmt: skip
     """Return the velocities of where rays end, m/s: (n, 3); arguments as of `radial_velocities`."""
-    directions, out = rays[1], np.empty(rays[1].shape)
+    directions = rays[1]
+    out = np.empty(rays[1].shape)
     origins = np.broadcast_to(rays[0], out.shape)
     for begin in range(0, len(out), BLOCK_HITS):
         block = slice(begin, begin + BLOCK_HITS)

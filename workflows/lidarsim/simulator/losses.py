@@ -29,7 +29,8 @@ class DirtStep(PulseStep):
 
     def apply(self, returns: PulseReturns, batch: PulseBatch) -> PulseReturns:
         """See `PulseStep.apply`."""
-        sensor, beams = self.setup.sensor, np.arange(batch.start, batch.stop)
+        sensor = self.setup.sensor
+        beams = np.arange(batch.start, batch.stop)
         share = np.ones(len(beams))
         x, y, z = sensor.directions(batch.firings.numbers[batch.rows]).reshape(-1, 3).T
         for one in self.setup.faults("dirt").values():
@@ -68,7 +69,9 @@ class LossStep(PulseStep):
         """See `PulseStep.apply`."""
         from . import fault_loops  # not before: numba takes half a second to import
 
-        firings, spec, seed = batch.firings, batch.firings.spec, self.setup.noise.seed
+        firings = batch.firings
+        spec = batch.firings.spec
+        seed = self.setup.noise.seed
         before, now = spec.repeats or (spec.ahead, 0)
         if spec.ahead != before - now:
             return returns.take(np.zeros(0, np.intp))
@@ -83,6 +86,7 @@ class LossStep(PulseStep):
                 packet = firings.numbers // fault.packet
                 drawn = uniform(seed, PACKET, spec.station, packet, place)
                 firing[row] = drawn < made(fault.share)
-        rows, ray = np.empty(len(returns.ray), np.int64), owned(returns.ray, np.int64)
+        rows = np.empty(len(returns.ray), np.int64)
+        ray = owned(returns.ray, np.int64)
         count = fault_loops.remaining(ray, firings.times(ray), spans, firing, channel, rows)
         return returns if count == len(rows) else returns.take(rows[:count])

@@ -26,11 +26,11 @@ from ..scene.scene import Scene
 from ..sensor.leaves import brightness, projection
 from ..sensor.materials import MaterialTable, fresnel
 from ..sensor.random_numbers import Purpose
-from .motion import Clock, Poses
+from .actor_trajectories import ActorTrajectories
+from .motion import CastPoses, Clock
 from .returns import selected
 from .scene_caster import SceneCaster
 from .surfaces import Surfaces
-from .ways import Ways
 
 LEAF = Purpose(30, "depth of leaves that light gets through")
 CROWN = Purpose(31, "crown of the leaf, of crowns that overlap")
@@ -48,7 +48,7 @@ class Rays(NamedTuple):
     origins: Floats  # (n, 3)
     directions: Floats  # (n, 3)
     times: Floats  # (n,)
-    ways: Ways
+    ways: ActorTrajectories
 
 
 @dataclass
@@ -84,7 +84,8 @@ class MediaStack:
         """Leave a medium each; returns which were known."""
         same = self.kinds[rows] == kinds[:, None]
         known = same.any(axis=1)
-        rows, place = rows[known], same[known].argmax(axis=1)
+        rows = rows[known]
+        place = same[known].argmax(axis=1)
         column = np.arange(DEPTH)
         column = column + (column >= place[:, None])
         for table in (self.kinds, self.triangles):
@@ -157,12 +158,15 @@ class Media:
     def __init__(
         self, scene: Scene, surfaces: Surfaces, table: MaterialTable, air: float = 0.0
     ) -> None:
-        self._surfaces, self.air = surfaces, air  # its extinction, 1/m
+        # its extinction, 1/m
+        self._surfaces = surfaces
+        self.air = air
         self.filled = table.leafy | table.refracts  # whether surfaces hold a medium
         self.leafy = bool(table.leafy.any())
         self.bends = bool(table.refracts.any())
         self.mirrors = table.refracts & (table.specular > 0)  # and where it is refracted
-        self.grids, self.instances = surfaces.grids, surfaces.instances
+        self.grids = surfaces.grids
+        self.instances = surfaces.instances
         owners = surfaces.material_kinds.object
         self.gridded = np.append(scene.has_voxels[owners], False)
         self._angles = table.leaf_angles
@@ -201,7 +205,8 @@ class Media:
         within = np.zeros(len(light.origins), np.bool_)
         if not len(within):
             return found
-        least, most = light.origins.min(axis=0), light.origins.max(axis=0)
+        least = light.origins.min(axis=0)
+        most = light.origins.max(axis=0)
         near = ((self._bounds[:, 0] <= most) & (self._bounds[:, 1] >= least)).all(axis=1)
         for low, high in self._bounds[near]:
             within |= ((light.origins >= low) & (light.origins <= high)).all(axis=1)
@@ -209,29 +214,34 @@ class Media:
         if not len(rows):
             return found
         # Most rays start where the one before did.
-        origins, times = light.origins[rows], light.times[rows]
+        origins = light.origins[rows]
+        times = light.times[rows]
         new = np.ones(len(rows), np.bool_)
         new[1:] = (np.diff(origins, axis=0) != 0).any(axis=1) | (np.diff(times) != 0)
         there = self._search(caster, origins[new], times[new], light.ways)
         which = np.cumsum(new) - 1
-        found.kinds[rows], found.triangles[rows] = there.kinds[which], there.triangles[which]
+        found.kinds[rows] = there.kinds[which]
+        found.triangles[rows] = there.triangles[which]
         return found
 
     def _search(
-        self, caster: SceneCaster, origins: Floats, times: Floats, ways: Ways
+        self, caster: SceneCaster, origins: Floats, times: Floats, ways: ActorTrajectories
     ) -> MediaStack:
         """Look upwards: a medium that light leaves without having entered it is around it."""
         surfaces = self._surfaces
-        around, entered = MediaStack.none(len(origins)), MediaStack.none(len(origins))
+        around = MediaStack.none(len(origins))
+        entered = MediaStack.none(len(origins))
         up = UPWARDS / np.sqrt((UPWARDS**2).sum())
-        rows, away = np.arange(len(origins)), caster.clear_m / up[2]
+        rows = np.arange(len(origins))
+        away = caster.clear_m / up[2]
         for _ in range(PROBES_MOST):
             if not len(rows):
                 break
             light = Pattern(np.broadcast_to(up, origins.shape), origins)
-            now = Poses(np.zeros(3), clock=Clock(times, np.zeros(1), ways))
+            now = CastPoses(np.zeros(3), clock=Clock(times, np.zeros(1), ways))
             hits = caster.scan(light, now)
-            rows, times = rows[hits.ray], times[hits.ray]
+            rows = rows[hits.ray]
+            times = times[hits.ray]
             origins = origins[hits.ray] + (hits.distance[:, None] + away) * up
             kinds = surfaces.kinds(hits.triangle)
             normals = surfaces.normals(hits.triangle, times, ways)
@@ -267,8 +277,10 @@ class Media:
     ) -> MediaStack:
         """Media behind surfaces (n,), which light meets at the cosines `along`."""
         behind = around[np.arange(len(kinds))]
-        enters, filled = self.sides(kinds, along), self.filled[kinds]
-        comes, goes = np.flatnonzero(filled & enters), np.flatnonzero(filled & ~enters)
+        enters = self.sides(kinds, along)
+        filled = self.filled[kinds]
+        comes = np.flatnonzero(filled & enters)
+        goes = np.flatnonzero(filled & ~enters)
         behind.enter(comes, kinds[comes], triangles[comes])
         behind.leave(goes, kinds[goes])
         return behind
@@ -369,7 +381,8 @@ class LightInMedia:
         Those that it has are for a density of 1. Returns the rows of light in grids, how far it
         gets, and the optical depth that is left then, as of `Grids.through`.
         """
-        grids, around = self.media.grids, self.around
+        grids = self.media.grids
+        around = self.around
         assert grids is not None and self.left is not None
         gridded = self.media.gridded[around.kinds]
         rows = np.flatnonzero(gridded.any(axis=1))
@@ -415,7 +428,8 @@ class LightInMedia:
         Directions behind them (n, 3), shares of light that pass, or are mirrored where light is
         refracted (n,), and whether all is reflected, with directions as if there were no surface.
         """
-        before, self.around = self.around, self.media.behind(self.around, kinds, triangles, along)
+        before = self.around
+        self.around = self.media.behind(self.around, kinds, triangles, along)
         if self.differentials is None:
             return directions, 1.0, np.zeros(len(kinds), np.bool_)
         ratio = self.media.index(self.around) / self.differentials.index

@@ -26,17 +26,26 @@ MB = 1_000_000
 # peak of the process (VmHWM) was 16 % above tracemalloc's at most, and mostly below.
 # tests/lidarsim/test_memory.py measures some of it again. Steps say their own, of that.
 RAY = 28  # its hit
-RAY_MADE, RAY_MADE_KEPT = 92, 32  # if it is not repeated: while it is made, and after that
+# if it is not repeated: while it is made, and after that
+RAY_MADE = 92
+RAY_MADE_KEPT = 32
 RAY_AMONG_BODIES = 70  # in a scene with instances or actors
-POSE, POSE_KEPT = 140, 100  # of a firing that has its own: while it is made, and after that
+# of a firing that has its own: while it is made, and after that
+POSE = 140
+POSE_KEPT = 100
 RETURNS = 1.5  # of a pulse, where all or two are reported; 1.1 to 1.6 in generated woods
 RETURNS_LEAFY = 3.8  # where all are, and each sub-ray meets a leaf by itself; 3.3 in a high canopy
-POINT, POINT_BYTE = 64, 3.2  # a point, and each byte of its columns: their sources are float64
+# a point, and each byte of its columns: their sources are float64
+POINT = 64
+POINT_BYTE = 3.2
 COLOUR = 16  # of a ray, where its colour is its reflectance
 # Copies of what a device has made: CuPy rounds page-locked memory up to powers of two, and columns
 # of several runs of scans, by station and sensor, are joined.
-PAGE_LOCKED, JOINED = 2, 1
-SCAN, STATION = 500, 6000  # their descriptions, poses and small arrays
+PAGE_LOCKED = 2
+JOINED = 1
+# their descriptions, poses and small arrays
+SCAN = 500
+STATION = 6000
 TRIANGLE = 16  # a count of hits, twice
 
 # Bytes of a rig, measured on Linux.
@@ -85,7 +94,10 @@ def cast_bytes(scene: Scene, survey: Survey, scans: int = 1, *, on_device: bool 
 
 def _bytes(setup: Setup, scans: int, on_device: bool) -> float:
     """Memory that so many scans of one sensor take, without counts of hits."""
-    scene, survey, sensor, steps = setup.scene, setup.survey, setup.sensor, steps_of(setup)
+    scene = setup.scene
+    survey = setup.survey
+    sensor = setup.sensor
+    steps = steps_of(setup)
     columns = sum(np.dtype(column.dtype).itemsize for column in survey.stored_columns)
     first, stop = sensor.firings(0)
     firings = (stop - first) * scans
@@ -115,7 +127,8 @@ def _bytes(setup: Setup, scans: int, on_device: bool) -> float:
 
 def _returns(setup: Setup) -> float:
     """Count the reported returns of a pulse that hits something, on average."""
-    subrays, mode = setup.reporting.subrays, setup.reporting.mode
+    subrays = setup.reporting.subrays
+    mode = setup.reporting.mode
     more = [step.added(setup) for step in steps_of(setup)]
     added = {"all": sum(more), "dual": sum(min(one, 1.0) for one in more)}.get(mode, 0.0)
     if mode not in ("all", "dual") or not (subrays > 1 or setup.passing):

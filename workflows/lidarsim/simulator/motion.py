@@ -1,4 +1,4 @@
-"""Poses of a carrier at each firing, and its motion until the next."""
+"""CastPoses of a carrier at each firing, and its motion until the next."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ from typing import Any
 import numpy as np
 
 import raybeam.poses
-from raybeam import Motion, Pattern, pattern_rays
+from raybeam import Pattern, PoseMotion, pattern_rays
 
 from ..base.arrays import Floats, Indices, Integers, Ints, owned
 from ..base.vectors import into_axes, matmul
 from ..sensor import Mounted, ScanSpec, Sensor, Trajectory
 from ..sensor.trajectory import velocities
-from .ways import Ways
+from .actor_trajectories import ActorTrajectories
 
 RING = 16  # neighbours along a ring
 
@@ -30,7 +30,7 @@ class Clock:
 
     begins: Floats  # (f,): of each firing
     delays: Floats  # (m,): of each ray of a firing
-    ways: Ways  # of the actors, or that of the carrier
+    ways: ActorTrajectories  # of the actors, or that of the carrier
     start: int = 0  # first ray
     subrays: int = 1  # of each ray
 
@@ -38,7 +38,8 @@ class Clock:
         """Return the firing times of rays (n,): (n,)."""
         from . import surface_loops  # not before: numba takes half a second to import
 
-        out, tables = np.empty(len(ray)), (owned(self.begins), owned(self.delays))
+        out = np.empty(len(ray))
+        tables = (owned(self.begins), owned(self.delays))
         surface_loops.times(owned(ray, np.int64), self.start, self.subrays, *tables, out)
         return out
 
@@ -59,19 +60,21 @@ class Firings:
 
     def times(self, ray: Integers) -> Ints:
         """Return the firing times of rays (n,), nanoseconds since the survey's start: (n,)."""
-        clock = Clock(self.sensor.begins_ns(self.numbers), self.sensor.beams.time_ns, Ways())
+        clock = Clock(
+            self.sensor.begins_ns(self.numbers), self.sensor.beams.time_ns, ActorTrajectories()
+        )
         times = clock.of(ray)
         return self.spec.start_ns + np.rint(times, out=times).astype(np.int64)
 
 
 @dataclass(frozen=True)
-class Poses:
-    """Poses of rays for `RayCaster.scan`: of the sensor's head, or else of its carrier."""
+class CastPoses:
+    """CastPoses of rays for `RayCaster.scan`: of the sensor's head, or else of its carrier."""
 
     positions: Floats
     rotations: Floats | None = None
     rays_per_pose: int | None = None
-    motion: Motion | None = None
+    motion: PoseMotion | None = None
     clock: Clock | None = None
     by_head: bool = False
     carrier: Clock | None = None  # if it moves; for its velocities
@@ -90,17 +93,18 @@ class Poses:
         }
 
     @property
-    def ways(self) -> Ways:
+    def ways(self) -> ActorTrajectories:
         """Trajectories of the actors."""
-        return Ways() if self.clock is None else self.clock.ways
+        return ActorTrajectories() if self.clock is None else self.clock.ways
 
     def times(self, ray: Integers) -> Floats:
         """Return firing times of rays, nanoseconds since the survey's start; for actors."""
         return np.zeros(len(ray)) if self.clock is None else self.clock.of(ray)
 
-    def part(self, start: int, stop: int, subrays: int) -> Poses:
-        """Poses of the sub-rays of rays `start` to `stop`; `start` is the first of a pose."""
-        each, motion = self.rays_per_pose, self.motion
+    def part(self, start: int, stop: int, subrays: int) -> CastPoses:
+        """CastPoses of the sub-rays of rays `start` to `stop`; `start` is the first of a pose."""
+        each = self.rays_per_pose
+        motion = self.motion
         clock, carrier = (
             None if one is None else replace(one, start=start, subrays=subrays)
             for one in (self.clock, self.carrier)
@@ -110,7 +114,7 @@ class Poses:
         poses = slice(start // each, -(-stop // each))
         if motion is not None:
             late = np.repeat(motion.delays, subrays)
-            motion = Motion(late, motion.velocities[poses], motion.rates[poses])
+            motion = PoseMotion(late, motion.velocities[poses], motion.rates[poses])
         rotations = None if self.rotations is None else self.rotations[poses]
         return replace(
             self,
@@ -160,8 +164,8 @@ def check_trajectory(path: Trajectory) -> None:
 
 def poses_of_firings(
     carried: Mounted, path: Trajectory, station: int, first: int, stop: int, late_ns: float = 0.0
-) -> Poses:
-    """Poses of a sensor's beams in firings `first` to `stop`.
+) -> CastPoses:
+    """CastPoses of a sensor's beams in firings `first` to `stop`.
 
     If a head turns all beams, they are poses of the head, and the rays of one firing serve for
     all. Else they are poses of the carrier.
@@ -179,7 +183,8 @@ def poses_of_firings(
     positions = raybeam.poses.by_number(positions)
     turns = np.broadcast_to(np.eye(3), (len(times), 3, 3)) if turns is None else turns
     turns = raybeam.poses.by_number(turns)
-    spins, rotations = sensor.spins(firings[:-1]), turns[:-1]
+    spins = sensor.spins(firings[:-1])
+    rotations = turns[:-1]
     if spins is not None:
         mount = carried.mount
         if any(mount.position):
@@ -196,20 +201,21 @@ def poses_of_firings(
         places = places + into_axes(centre, rotations.transpose(0, 2, 1))
     delays = (sensor.beams.time_ns - sensor.lead_ns) / 1e9
     if not path.moves or not delays.any():
-        return Poses(places, rotations, sensor.channels, by_head=spins is not None)
+        return CastPoses(places, rotations, sensor.channels, by_head=spins is not None)
     seconds = np.diff(times)[:, None] / 1e9
     seconds[seconds == 0] = np.inf  # a last firing at the very end: it stands
     velocities = np.diff(positions, axis=0) / seconds
     rates = _turned_by(turns[:-1], turns[1:]) / seconds
-    motion = Motion(delays, velocities, rates)
-    return Poses(places, rotations, sensor.channels, motion, by_head=spins is not None)
+    motion = PoseMotion(delays, velocities, rates)
+    return CastPoses(places, rotations, sensor.channels, motion, by_head=spins is not None)
 
 
 def spun(rotations: Floats, spins: Floats) -> Floats:
     """Products of matrices (k, 3, 3) and turns about z, their cosines and sines (2, k)."""
     (cos, sin), out = spins, np.empty((3, 3, spins.shape[1])).transpose(2, 0, 1)
     for row in range(3):
-        x, y = rotations[:, row, 0], rotations[:, row, 1]
+        x = rotations[:, row, 0]
+        y = rotations[:, row, 1]
         out[:, row, 0] = x * cos + y * sin
         out[:, row, 1] = y * cos - x * sin
     out[:, :, 2] = rotations[:, :, 2]
@@ -223,7 +229,8 @@ def _turned_by(before: Floats, after: Floats) -> Floats:
     """
     out = np.empty((3, len(before))).T
     for axis in range(3):
-        one, other = (axis + 1) % 3, (axis + 2) % 3
+        one = (axis + 1) % 3
+        other = (axis + 2) % 3
         cross = before[:, one] * after[:, other] - before[:, other] * after[:, one]
         out[:, axis] = ((cross[:, 0] + cross[:, 1]) + cross[:, 2]) / 2
     return out

@@ -19,14 +19,14 @@ from ..columns.table import CAUSES, COLOURS
 from ..scene.colours import luminance
 from ..sensor.random_numbers import Purpose, raw
 from ..sensor.weather import FAINTEST
+from .actor_trajectories import ActorTrajectories
 from .doppler import approach, velocities_of_ends
 from .media import CROWN, LEAF, Draw, LightInMedia, Media, Rays, depths
-from .motion import Clock, Poses, along_rings
+from .motion import CastPoses, Clock, along_rings
 from .returns import OF_RETURNS, SURFACE, PulseReturns, joined, selected
 from .scene_caster import SceneCaster
 from .step import Memory, PulseBatch, PulseStep, Role, Setup, Sizes
 from .surfaces import Surfaces, light_of
-from .ways import Ways
 
 GHOST = CAUSES.index("ghost")
 PASSES_MOST = 16  # surfaces that light passes before it is dropped
@@ -133,8 +133,10 @@ class CastStep(PulseStep):
 
     def __init__(self, setup: Setup, caster: SceneCaster, surfaces: Surfaces) -> None:
         super().__init__(setup, caster, surfaces)
-        survey, sensor = setup.survey, setup.sensor
-        self._light, self._seed = light_of(survey, sensor), setup.noise.seed
+        survey = setup.survey
+        sensor = setup.sensor
+        self._light = light_of(survey, sensor)
+        self._seed = setup.noise.seed
         table = surfaces.at(sensor.optics.wavelength_nm)
         filled = table.leafy.any() or table.refracts.any()
         air = self._light.extinction
@@ -354,12 +356,12 @@ class CastStep(PulseStep):
         )
         return self._behind(onward, ends)
 
-    def _cast_again(self, onward: OnwardLight, ways: Ways) -> CastLight:
+    def _cast_again(self, onward: OnwardLight, ways: ActorTrajectories) -> CastLight:
         """Cast the light behind surfaces; returns what meets something in the sensor's range."""
         light, clear, path = onward
         farthest_m = self.setup.sensor.max_range_m
         # Light takes no time: it travels 300 m in a microsecond.
-        now = Poses(np.zeros(3), clock=Clock(light.times, np.zeros(1), ways))
+        now = CastPoses(np.zeros(3), clock=Clock(light.times, np.zeros(1), ways))
         hits = self.caster.scan(path, now, t_max=self._reach)
         rows = hits.ray
         cast = CastLight(light.take(rows), clear[rows], hits.distance, hits.triangle)

@@ -23,7 +23,7 @@ from ..sensor.optics import LIGHT_M_NS
 from ..sensor.random_numbers import normal
 from ..sensor.reflectivity import COUNTS, SCALES
 from .doppler import VELOCITY, radial_velocities
-from .motion import Firings, Poses
+from .motion import CastPoses, Firings
 from .paths import GHOST
 from .pulses import Scanned
 from .returns import made
@@ -50,9 +50,10 @@ class BatchPoints:
         found: Scanned,  # rays are numbered from 0 at the first firing
         pattern: Pattern,
         start: int,  # number of ray 0 within the pattern
-        poses: Poses,
+        poses: CastPoses,
     ) -> None:
-        self.scene, self.survey = scene, survey
+        self.scene = scene
+        self.survey = survey
         self.carried = survey.carried[specs[0].sensor]
         self.sensor = self.carried.sensor
         self.specs = specs
@@ -61,9 +62,12 @@ class BatchPoints:
         hits = np.zeros(0, np.int64) if found.tally is None else found.tally
         triangles = np.flatnonzero(hits)
         self.tally = triangles, hits[triangles]
-        self.found, self.hits = found.returns, found.hits  # (scans,): of each, kept or not
+        # (scans,): of each, kept or not
+        self.found = found.returns
+        self.hits = found.hits
         self._surfaces = surfaces
-        self._pattern, self._start = pattern, start
+        self._pattern = pattern
+        self._start = start
         self._poses = poses
         self._fired = Firings.of(self.sensor, specs)
 
@@ -126,7 +130,8 @@ class BatchPoints:
     @cached_property
     def time(self) -> Ints:
         """Time of the ray as the sensor states it, nanoseconds since the survey's start."""
-        spec, stamp = self.specs[0], self._fired_ns
+        spec = self.specs[0]
+        stamp = self._fired_ns
         if spec.repeats is not None:
             before, now = map(self.survey.begins_ns, spec.repeats)
             stamp = stamp + round(now - before)
@@ -220,7 +225,8 @@ class BatchPoints:
             with np.errstate(invalid="raise"):
                 cells[:] = np.rint(scaled, out=scaled).T
         except FloatingPointError:
-            far, step = np.abs(scaled).max() * self.survey.precision_m, self.survey.precision_m
+            far = np.abs(scaled).max() * self.survey.precision_m
+            step = self.survey.precision_m
             raise LidarError(
                 f"precision_m {step} is too fine for points {far:.0f} m from the "
                 f"origin: use at least {far / 2e9:.2g}."
@@ -332,8 +338,10 @@ class BatchPoints:
         NaN where there is no surface, of leaves within a crown, and of ghosts, whose rays arrive
         from elsewhere.
         """
-        triangle, surfaces = self.found.triangle, self._surfaces
-        normals, cosines = np.full((len(self), 3), np.nan), np.full(len(self), np.nan)
+        triangle = self.found.triangle
+        surfaces = self._surfaces
+        normals = np.full((len(self), 3), np.nan)
+        cosines = np.full(len(self), np.nan)
         on_surface = triangle >= 0
         if self.found.cause is not None:
             on_surface &= self.found.cause != GHOST
@@ -345,7 +353,8 @@ class BatchPoints:
             facing = surfaces.normals(triangle[block], self._times[block], self._poses.ways)
             along = products(facing.T, self.directions[block].T)
             facing[along > 0] *= -1
-            normals[block], cosines[block] = facing, np.abs(along)
+            normals[block] = facing
+            cosines[block] = np.abs(along)
         return normals, cosines
 
     @cached_property
@@ -386,7 +395,8 @@ class BatchPoints:
             found = self.found.triangle[some], self.directions[some], self.found.distance[some]
             more = None if colours is None else colours[some]
             lit = self._surfaces.lit(*found, light, self._times[some], self._poses.ways, more)
-            along[some], energy[some] = lit.along, lit.energy
+            along[some] = lit.along
+            energy[some] = lit.energy
         return along, energy
 
     @cached_property
@@ -447,7 +457,8 @@ class BatchPoints:
     @cached_property
     def radial_velocity(self) -> Floats:
         """How fast the range grows, m/s, with noise; NaN of what no light returned from."""
-        found, velocity = self.found, self.found.velocity
+        found = self.found
+        velocity = self.found.velocity
         if velocity is None:
             velocity = radial_velocities(
                 self._surfaces,

@@ -15,7 +15,7 @@ from ..base.arrays import Ints, owned
 from ..scene.scene import Scene
 from ..sensor import Survey
 from .doppler import radial_velocities
-from .motion import Firings, Poses
+from .motion import CastPoses, Firings
 from .returns import NO_SURFACE, Keys, PulseReturns, joined, made
 from .scene_caster import SceneCaster
 from .step import Emitter, PulseBatch, PulseStep, Role
@@ -40,7 +40,8 @@ class PulseCaster:
         self, number: int, caster: SceneCaster, scene: Scene, survey: Survey, surfaces: Surfaces
     ) -> None:
         self._setup = setup = setup_of(scene, survey, number)
-        self._caster, self._surfaces = caster, surfaces
+        self._caster = caster
+        self._surfaces = surfaces
         self.emitter = Emitter(setup)
         self.steps: list[PulseStep] = [step(setup, caster, surfaces) for step in steps_of(setup)]
 
@@ -48,7 +49,7 @@ class PulseCaster:
         self,
         scan: int,
         pattern: Pattern,
-        poses: Poses,
+        poses: CastPoses,
         window: tuple[int, int],
         groups: Ints,
         firings: Firings,
@@ -59,7 +60,8 @@ class PulseCaster:
 
         The others are arguments of `RayCaster.scan`, where each group is a scan.
         """
-        first, rays = window[0], window[1] - window[0]
+        first = window[0]
+        rays = window[1] - window[0]
 
         def batch(start: int, stop: int) -> PulseBatch:
             keys = Keys(scan, groups)
@@ -85,7 +87,8 @@ class PulseCaster:
 
         The counts and the numbers of the other returns are as if the removed ones were undetected.
         """
-        returns, sensor = scanned.returns, self._setup.sensor
+        returns = scanned.returns
+        sensor = self._setup.sensor
         if returns.reported is returns.distance or returns.reported is None:  # without noise
             return scanned
         in_range = returns.reported >= sensor.min_range_m
@@ -120,7 +123,8 @@ class PulseCaster:
 
     def _once(self, batch: PulseBatch, groups: Ints, tally: bool) -> Scanned:
         """Cast rays with one return each; compute energies only for kept ones, and if needed."""
-        setup, poses = self._setup, batch.poses
+        setup = self._setup
+        poses = batch.poses
         for step in self.steps:
             if Role.AIMS in step.role:
                 step.apply(PulseReturns.none(), batch)
@@ -141,9 +145,13 @@ class PulseCaster:
 
     def _lit(self, returns: PulseReturns, batch: PulseBatch) -> PulseReturns:
         """Make what depends on the directions in which rays were cast."""
-        surfaces, setup, poses = self._surfaces, self._setup, batch.poses
+        surfaces = self._surfaces
+        setup = self._setup
+        poses = batch.poses
         origins, directions = rays = poses.rays(batch.beams, returns.ray, batch.window[0])
-        times, distance, triangle = poses.times(returns.ray), returns.distance, returns.triangle
+        times = poses.times(returns.ray)
+        distance = returns.distance
+        triangle = returns.triangle
         colour = velocity = None
         if setup.moving:
             given = returns.ray, rays, distance, triangle, times
@@ -161,8 +169,10 @@ class PulseCaster:
         """Count the returns of each scan and thin them out."""
         from . import pulse_loops  # not before: numba takes half a second to import
 
-        every, most = self._setup.survey.keep_every, len(returns.ray)
-        hits, rows = np.zeros(len(groups), np.int64), np.empty(most, np.int64)
+        every = self._setup.survey.keep_every
+        most = len(returns.ray)
+        hits = np.zeros(len(groups), np.int64)
+        rows = np.empty(most, np.int64)
         number, each = np.empty((2, most), np.uint8)
         given = owned(returns.ray, np.int64), owned(groups, np.int64), every
         count = pulse_loops.counted(*given, hits, rows, number, each)
@@ -175,6 +185,7 @@ class PulseCaster:
         )
         if not tally:
             return Scanned(thinned, hits, None)
-        surfaces, some = self._surfaces, returns.triangle[returns.triangle != NO_SURFACE]
+        surfaces = self._surfaces
+        some = returns.triangle[returns.triangle != NO_SURFACE]
         counted = np.bincount(surfaces.counter(some), minlength=surfaces.counters)
         return Scanned(thinned, hits, counted)

@@ -49,9 +49,13 @@ class RecordingStep(PulseStep):
         samples.
         """
         assert batch.hits is not None  # as there are sub-rays
-        hits, each, noise = batch.hits, batch.each, self.setup.noise
-        digitizer, count = Digitizer.of(self.setup), self.setup.recorded
-        beams, keys = returns.ray - batch.start, batch.keys
+        hits = batch.hits
+        each = batch.each
+        noise = self.setup.noise
+        digitizer = Digitizer.of(self.setup)
+        count = self.setup.recorded
+        beams = returns.ray - batch.start
+        keys = batch.keys
         here = Keys(keys.scan, keys.begins - batch.start)
         out = np.zeros(len(beams), record(count))
         out["sample_ps"] = round(1000 * digitizer.sample_ns)
@@ -66,7 +70,8 @@ class RecordingStep(PulseStep):
             begin[rows] = np.where(shared, begin[rows - 1], first[rows])
         new = (place == 0) | (np.diff(begin, prepend=-1) != 0)
         window = np.cumsum(new) - 1
-        beam, begins = beams[new], begin[new]
+        beam = beams[new]
+        begins = begin[new]
         low, high = (np.searchsorted(hits.ray, (beam + step) * each) for step in (0, 1))
         unit = max(count, each * (2 * digitizer.reach + 1))
         size = max(1, BLOCK_SAMPLES // unit)

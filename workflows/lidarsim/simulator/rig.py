@@ -17,13 +17,13 @@ from ..base.vectors import turned
 from ..scene.actors import Actor
 from ..scene.scene import Scene
 from ..sensor import Pose, ScanSpec, Sensor, Survey, Trajectory
+from .actor_trajectories import ActorTrajectories
 from .device import DeviceColumns, DevicePoints
-from .motion import Clock, Firings, Poses, check_trajectory, poses_of_firings
+from .motion import CastPoses, Clock, Firings, check_trajectory, poses_of_firings
 from .points import BatchPoints
 from .pulses import PulseCaster
 from .scene_caster import SceneCaster
 from .surfaces import Surfaces
-from .ways import Ways
 
 PATTERN_RAYS = 20_000_000  # rays of a head's period that are kept; 24 bytes each
 IMAGE_RAYS = 1 << 20  # rays of images that are cast at a time
@@ -66,8 +66,10 @@ class Rig:
     def _assemble(
         self, scene: Scene, survey: Survey, options: dict[str, Any], like: SceneCaster | None
     ) -> None:
-        self.scene, self.survey, self.options = scene, survey, options
-        self._ways = Ways.of(scene.actors)
+        self.scene = scene
+        self.survey = survey
+        self.options = options
+        self._ways = ActorTrajectories.of(scene.actors)
         wavelengths = {carried.sensor.optics.wavelength_nm for carried in survey.carried}
         self._surfaces = Surfaces(scene, tuple(survey.materials), sorted(wavelengths))
         self._caster = SceneCaster(scene, self._surfaces, like, **options)
@@ -108,7 +110,7 @@ class Rig:
         """Return the same rig with other trajectories of the actors; the trees are shared."""
         rig = copy(self)
         rig.scene = self.scene.with_actors(actors)
-        rig._ways = Ways.of(actors)
+        rig._ways = ActorTrajectories.of(actors)
         return rig
 
     def check_actors(self, begin_ns: float, end_ns: float) -> None:
@@ -155,7 +157,8 @@ class Rig:
         """Rays of firings `first` to `stop` of a sensor, in the axes of its carrier."""
         firings = np.arange(first, stop, dtype=np.int64)
         carried = self.survey.carried[number]
-        mount, origins = carried.mount, carried.sensor.origins(firings)
+        mount = carried.mount
+        origins = carried.sensor.origins(firings)
         directions = turned(carried.sensor.directions(firings).reshape(-1, 3), mount.rotation)
         if origins is not None:
             origins = turned(origins.reshape(-1, 3), mount.rotation)
@@ -184,26 +187,30 @@ class Rig:
         The carrier is `late_ns` further on its path than the firings' own times say. Hits of each
         triangle are counted if `tally`.
         """
-        number, survey = specs[0].sensor, self.survey
+        number = specs[0].sensor
+        survey = self.survey
         whole, by_head = self._repeated(number, path.moves)
         carried = survey.carried[number]
         channels = carried.sensor.channels
-        first, stop = specs[0].firings[0], specs[-1].firings[1]
+        first = specs[0].firings[0]
+        stop = specs[-1].firings[1]
         if path.moves or by_head:
             poses = poses_of_firings(carried, path, specs[0].station, first, stop, late_ns)
         else:
             pose = path.pose(specs[0].station)
-            poses = Poses(np.array(pose.position), pose.rotation)
+            poses = CastPoses(np.array(pose.position), pose.rotation)
         fired = Firings.of(carried.sensor, specs)
         poses = self._timed(poses, fired)
         if path.moves:
             begins = carried.sensor.begins_ns(fired.numbers) + late_ns
-            carrier = Clock(begins, carried.sensor.beams.time_ns, Ways((path,)))
+            carrier = Clock(begins, carried.sensor.beams.time_ns, ActorTrajectories((path,)))
             poses = replace(poses, carrier=carrier, station=specs[0].station)
         if whole is not None:
-            pattern, start = whole, first * channels % len(whole)
+            pattern = whole
+            start = first * channels % len(whole)
         else:
-            pattern, start = self.pattern(number, first, stop), 0
+            pattern = self.pattern(number, first, stop)
+            start = 0
         window = (start, start + (stop - first) * channels)
         groups = np.array([spec.firings[0] - first for spec in specs]) * channels
         if self._device is not None:
@@ -212,7 +219,7 @@ class Rig:
         found = self._pulses[number].scan(scan, pattern, poses, window, groups, fired, tally=tally)
         return BatchPoints(self.scene, survey, self._surfaces, specs, found, pattern, start, poses)
 
-    def _timed(self, poses: Poses, fired: Firings) -> Poses:
+    def _timed(self, poses: CastPoses, fired: Firings) -> CastPoses:
         """Return poses of firings with the times that actors need."""
         if not self.scene.actors:
             return poses
@@ -230,7 +237,8 @@ class Rig:
         """
         number = specs[0].sensor
         sensor = self.survey.carried[number].sensor
-        first, stop = specs[0].firings[0], specs[-1].firings[1]
+        first = specs[0].firings[0]
+        stop = specs[-1].firings[1]
         pattern = self._rays_of(number, first, stop)
         begin_rays = np.array([spec.firings[0] - first for spec in specs]) * sensor.channels
         rays = len(pattern)
@@ -240,7 +248,9 @@ class Rig:
             block = slice(begin, begin + each)
             image = out[block].reshape(-1)
             count = len(image) // rays
-            poses = Poses(positions[block], None if rotations is None else rotations[block], rays)
+            poses = CastPoses(
+                positions[block], None if rotations is None else rotations[block], rays
+            )
             fired = Firings.of(sensor, specs, count)
             poses = self._timed(poses, fired)
             groups = (rays * np.arange(count)[:, None] + begin_rays).reshape(-1)
@@ -257,7 +267,8 @@ class Rig:
         """Rays of some firings in the axes of the carrier."""
         sensor = self.survey.carried[number].sensor
         if sensor.period:
-            first, stop = first % sensor.period, first % sensor.period + stop - first
+            stop = first % sensor.period + stop - first
+            first = first % sensor.period
         made = self._firings.get((number, first, stop))
         if made is None:
             if len(self._firings) >= KEPT:

@@ -49,7 +49,8 @@ def sample_survey(scene: Scene, survey: Survey, backend: str = "auto") -> dict[s
     for batch in _batches(Rig(scene, sampled, backend), firsts, stops):
         every = getattr(sampled.carried[batch.specs[0].sensor].sensor, "every", 1)
         rays = sum(spec.ray_count for spec in batch.specs)
-        cast, whole = cast + rays, whole + rays * every
+        cast = cast + rays
+        whole = whole + rays * every
         hits += int(batch.hits.sum()) * every
         points += int(np.ceil(batch.hits * every / survey.keep_every).sum())
     share = survey.ray_count / whole
@@ -127,7 +128,8 @@ class _FewRays(Sensor):
         """Take one of so many rays, but some of each scan, though it may have a firing less."""
         first, stop = sensor.firings(0)
         every = max(1, min(every, (stop - first) * sensor.channels // 2))
-        near, far = sensor.min_range_m, sensor.max_range_m
+        near = sensor.min_range_m
+        far = sensor.max_range_m
         beams = Beams(np.zeros(1))
         return cls(beams, sensor.head, near, far, "", sensor.optics, 0.0, sensor, every)
 

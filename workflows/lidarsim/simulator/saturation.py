@@ -34,7 +34,8 @@ class SaturationStep(PulseStep):
 
     def apply(self, returns: PulseReturns, batch: PulseBatch) -> PulseReturns:
         """See `PulseStep.apply`."""
-        setup, optics = self.setup, self.setup.sensor.optics
+        setup = self.setup
+        optics = self.setup.sensor.optics
         pulse_ns = setup.reporting.length_ns(optics)
         if setup.in_waveforms:
             pulse_ns = FWHM * setup.reporting.system_ns(optics)

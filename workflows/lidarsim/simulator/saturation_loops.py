@@ -45,7 +45,8 @@ def join_full(echoes, left):
                 continue
             hidden = j
             if height[j] >= height[last]:
-                last, hidden = j, last
+                hidden = last
+                last = j
             left[hidden] = False
             echoes.energy[last] += echoes.energy[hidden]
             if full[hidden]:

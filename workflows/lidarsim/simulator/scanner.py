@@ -156,7 +156,9 @@ class Scanner:
             self._movable[scene.instances.owner] = True
             self._movable[scene.face_object] = False
         # Sweeps share the caster, and copies are moved in it.
-        self._lock, self._casts, self._moves = threading.Condition(), 0, 0
+        self._lock = threading.Condition()
+        self._casts = 0
+        self._moves = 0
         self._unnumbered = 0  # sweeps and images without a number so far
 
     def __getstate__(self) -> dict[str, Any]:
@@ -337,7 +339,8 @@ class Scanner:
         self, rig: Rig, number: int | None, start_s: float | None, count: int
     ) -> tuple[list[ScanSpec], float]:
         """Return the scans of a turn, and how late it is, nanoseconds; of `count` sweeps."""
-        sensor, ahead = rig.survey.sensor, 0
+        sensor = rig.survey.sensor
+        ahead = 0
         steps = sensor.steps_of_turn(number or 0)
         if steps.stop > SCANS_MOST:
             raise LidarError(f"number is {number}; scans are counted up to {SCANS_MOST:,}.")

@@ -35,9 +35,9 @@ from ..base.words import did_you_mean
 from ..scene.actors import Actor, shapes_of
 from ..scene.scene import Scene
 from ..scene.scene_instances import Instances, MeshPart, parts_of
-from .motion import Clock, Poses
+from .actor_trajectories import ActorTrajectories
+from .motion import CastPoses, Clock
 from .surfaces import Surfaces
-from .ways import Ways
 
 AUTO_TAKES = "Backend 'auto' takes one that works."
 SHORT = 1e-3  # of the distance: a ray that ends so much before a point has reached it
@@ -67,7 +67,8 @@ class SceneCaster:
     def __init__(
         self, scene: Scene, surfaces: Surfaces, like: SceneCaster | None = None, **options: Any
     ) -> None:
-        self._surfaces, self._shared = surfaces, scene.instances
+        self._surfaces = surfaces
+        self._shared = scene.instances
         self._begins: Ints32 | None = None  # of each body of the caster
         self._faces = faces = len(scene.faces)
         if self._shared is not None:
@@ -92,7 +93,8 @@ class SceneCaster:
         first = self.caster.instance_count - len(shared)
         for row in rows:
             self.caster.move(first + int(row), shared.transforms[row])
-        self._surfaces, self._shared = surfaces, shared
+        self._surfaces = surfaces
+        self._shared = shared
 
     def counters(self) -> tuple[Ints, int]:
         """Return counters of bodies as `RayCaster.visit` takes them, see `Scene.counters`."""
@@ -109,7 +111,7 @@ class SceneCaster:
     def scan(
         self,
         pattern: Pattern,
-        poses: Poses,
+        poses: CastPoses,
         *,
         window: tuple[int, int] | None = None,
         t_min: float = 0.0,
@@ -131,7 +133,9 @@ class SceneCaster:
         found = self.caster.scan(pattern, **common)
         if self._begins is not None:
             found = replace(found, triangle=found.triangle + self._begins[found.instance])
-        ray, distance, triangle = found.ray.astype(np.int64), found.distance, found.triangle
+        ray = found.ray.astype(np.int64)
+        distance = found.distance
+        triangle = found.triangle
         if self._shapes is not None:
             scan = check_scan(pattern, **common)
             ray, distance, triangle = self._with_actors(found, scan, poses)
@@ -146,23 +150,30 @@ class SceneCaster:
         if keep_every > 1:
             place = np.arange(len(ray)) - np.repeat(cuts[:-1], counts)
             kept = np.flatnonzero(place % keep_every == 0)
-            ray, distance, triangle = ray[kept], distance[kept], triangle[kept]
+            ray = ray[kept]
+            distance = distance[kept]
+            triangle = triangle[kept]
         none = np.zeros(len(ray), np.int32)
         return ScanReturns(ray.astype(np.uint32), distance, triangle, counts, counted, none)
 
     def free(
-        self, origins: Floats, towards: Floats, distance: Floats, times: Floats, ways: Ways
+        self,
+        origins: Floats,
+        towards: Floats,
+        distance: Floats,
+        times: Floats,
+        ways: ActorTrajectories,
     ) -> Bools:
         """Whether nothing stands before points (n, 3), seen from origins, at times (n,)."""
         free = np.ones(len(distance), np.bool_)
         if len(distance):
-            now = Poses(np.zeros(3), clock=Clock(times, np.zeros(1), ways))
+            now = CastPoses(np.zeros(3), clock=Clock(times, np.zeros(1), ways))
             found = self.scan(Pattern(towards / distance[:, None], origins), now)
             free[found.ray] = found.distance > distance[found.ray] * (1 - SHORT)
         return free
 
     def _with_actors(
-        self, found: ScanReturns, scan: Scan, poses: Poses
+        self, found: ScanReturns, scan: Scan, poses: CastPoses
     ) -> tuple[Ints, Floats, Ints32]:
         """Rays, distances and triangles of all hits, those on actors among them."""
         from . import surface_loops  # not before: numba takes half a second to import
@@ -170,22 +181,24 @@ class SceneCaster:
         before = np.full(len(scan), np.inf)
         before[found.ray] = found.distance
         on, numbers = self._nearest(scan, poses, before)
-        ray, distance = np.empty(len(scan), np.int64), np.empty(len(scan))
+        ray = np.empty(len(scan), np.int64)
+        distance = np.empty(len(scan))
         triangle = np.empty(len(scan), np.int32)
         given = found.ray, found.triangle, *on, *numbers
         count = surface_loops.merge(*given, ray, distance, triangle)
         return ray[:count], distance[:count], triangle[:count]
 
-    def on_actors(self, scan: Scan, poses: Poses) -> OtherHits:
+    def on_actors(self, scan: Scan, poses: CastPoses) -> OtherHits:
         """Find the nearest hits of rays on actors."""
         hits, (parts, shape, firsts) = self._nearest(scan, poses)
         ray = np.flatnonzero(hits.body >= 0)
-        body, triangle = hits.body[ray], hits.triangle[ray]
+        body = hits.body[ray]
+        triangle = hits.triangle[ray]
         triangle = triangle + parts[shape[body], hits.instance[ray]] + firsts[body]
         return OtherHits(ray.astype(np.uint32), hits.distance[ray], triangle)
 
     def _nearest(
-        self, scan: Scan, poses: Poses, before: Floats | None = None
+        self, scan: Scan, poses: CastPoses, before: Floats | None = None
     ) -> tuple[Nearest, tuple[Ints32, Indices, Ints32]]:
         """Nearest hits on actors, before distances (n,), and what makes their triangles' numbers.
 

@@ -19,13 +19,13 @@ from ..columns.table import CAUSES
 from ..scene.actors import check_spray
 from ..sensor.random_numbers import Purpose
 from ..sensor.weather import FAINTEST, LARGE, reach, spray
+from .actor_trajectories import ActorTrajectories
 from .air import exponential, in_the_air, random_keys, reached, room_for_hits, seen_by_range
 from .motion import along_rings
 from .returns import OF_RETURNS, PulseReturns, joined, made, unreal
 from .scene_caster import SceneCaster
 from .step import Memory, PulseBatch, PulseStep, Role, Setup, Sizes
 from .surfaces import Surfaces
-from .ways import Ways
 
 if TYPE_CHECKING:
     from .spray_loops import Crossings
@@ -34,10 +34,15 @@ SPRAY_DEPTH = Purpose(16, "depth of spray until the next clump")
 SPRAY_SUBRAY = Purpose(17, "sub-ray that meets a clump")
 SPRAY_DIAMETER = Purpose(18, "diameter of a drop of spray")
 SPRAY = CAUSES.index("spray")
-BOX_NS, BOXES = 1e8, 10  # time between boxes of a vehicle, and how many are there at a time
+# time between boxes of a vehicle, and how many are there at a time
+BOX_NS = 1e8
+BOXES = 10
 # For how long, and when exp(-1) of it is left, as drops of a few tenths of a millimetre fall.
-LASTS_NS, DECAY_NS = BOXES * BOX_NS, 4e8
-FULL_M_S, LEAST_M_S = 25.0, 3.0  # speeds: of the stated density, and below which there is none
+LASTS_NS = BOXES * BOX_NS
+DECAY_NS = 4e8
+# speeds: of the stated density, and below which there is none
+FULL_M_S = 25.0
+LEAST_M_S = 3.0
 STEP_NS = 5e5  # for velocities
 
 
@@ -59,11 +64,15 @@ class SprayStep(PulseStep):
 
     def __init__(self, setup: Setup, caster: SceneCaster, surfaces: Surfaces) -> None:
         super().__init__(setup, caster, surfaces)
-        survey, sensor, noise = setup.survey, setup.sensor, setup.noise
+        survey = setup.survey
+        sensor = setup.sensor
+        noise = setup.noise
         check_spray(setup.scene.actors)
-        air, span = survey.air(setup.number), reach(sensor.min_range_m, sensor.max_range_m)
+        air = survey.air(setup.number)
+        span = reach(sensor.min_range_m, sensor.max_range_m)
         kind = spray(survey.spray_g_m3)
-        self._extinction, self._step = kind.extinction / LARGE, 1 / kind.slope
+        self._extinction = kind.extinction / LARGE
+        self._step = 1 / kind.slope
         self._clumps = seen_by_range(air, kind, FAINTEST * noise.threshold, *span)
         self._materials = surfaces.at(sensor.optics.wavelength_nm)
         # Of each actor the lowest corner of its mesh, and halves of its sides: (a, 2, 3).
@@ -144,18 +153,24 @@ class SprayStep(PulseStep):
             place[crossings.beam[:count]], owned(crossings.spans[:, :count])
         )
 
-    def _boxes(self, ways: Ways, begin: float, end: float) -> tuple[Floats, Floats, Floats]:
+    def _boxes(
+        self, ways: ActorTrajectories, begin: float, end: float
+    ) -> tuple[Floats, Floats, Floats]:
         """Boxes of spray, and when they are there, as of `near_boxes`; their densities (b,)."""
         numbers = np.arange(math.floor(begin / BOX_NS) - BOXES, math.floor(end / BOX_NS) + 1)
         some = np.array([number for number in self._raising if ways[number].moves], np.int64)
-        actor, born = np.repeat(some, len(numbers)), np.tile(BOX_NS * numbers, len(some))
+        actor = np.repeat(some, len(numbers))
+        born = np.tile(BOX_NS * numbers, len(some))
         since, last = ways.presence_ns[actor].T
         at = np.maximum(born, np.maximum(since, 0.0) + STEP_NS)  # it came as it goes then
         rows = np.flatnonzero((born <= end) & (at <= last))
-        actor, born, at = actor[rows], born[rows], at[rows]
+        actor = actor[rows]
+        born = born[rows]
+        at = at[rows]
         places, turns = ways.poses(actor, at)
         speed = (places - ways.poses(actor, at - STEP_NS)[0]) / (STEP_NS / 1e9)
-        metres, sides = length(speed), turns.transpose(0, 2, 1)
+        metres = length(speed)
+        sides = turns.transpose(0, 2, 1)
         low, half = self._sizes[actor].transpose(1, 0, 2).copy()
         half[:, 0] = metres * (BOX_NS / 2e9)
         middle = places + speed * ((born - at) / 1e9)[:, None] + into_axes(low + half, sides)

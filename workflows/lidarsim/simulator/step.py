@@ -24,7 +24,7 @@ from ..scene.scene import Scene
 from ..sensor import Fault, Noise, Returns, Sensor, Survey
 from ..sensor.faults import FaultKind
 from ..sensor.random_numbers import Purpose
-from .motion import Firings, Poses
+from .motion import CastPoses, Firings
 from .returns import Keys, Planes, PulseReturns
 from .scene_caster import SceneCaster
 from .surfaces import Surfaces
@@ -199,7 +199,7 @@ class PulseBatch:
     stop: int  # one past the last
     pattern: Pattern  # rays of beams
     first: int  # row of the beam with number 0 in the pattern
-    poses: Poses  # of all beams of the keys
+    poses: CastPoses  # of all beams of the keys
     firings: Firings  # of all beams of the keys
     emitter: Emitter
     offsets: Floats | None = None  # of the beams' angles, (n, 2), radians
@@ -249,8 +249,8 @@ class PulseBatch:
         return row, row + (self.stop - self.start) * self.each
 
     @cached_property
-    def here(self) -> Poses:
-        """Poses of the sub-rays."""
+    def here(self) -> CastPoses:
+        """CastPoses of the sub-rays."""
         return self.poses.part(self.start, self.stop, self.each)
 
     @cached_property
@@ -279,7 +279,9 @@ class PulseStep(ABC):
             raise TypeError(f"step {cls.__name__} states no role: set `role` to flags of `Role`")
 
     def __init__(self, setup: Setup, caster: SceneCaster, surfaces: Surfaces) -> None:
-        self.setup, self.caster, self.surfaces = setup, caster, surfaces
+        self.setup = setup
+        self.caster = caster
+        self.surfaces = surfaces
 
     @staticmethod
     @abstractmethod

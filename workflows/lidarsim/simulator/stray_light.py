@@ -59,17 +59,25 @@ class StrayLightStep(PulseStep):
             return returns
         from . import stray_loops  # not before: numba takes half a second to import
 
-        rays, poses = np.arange(batch.start, batch.stop), batch.here
+        rays = np.arange(batch.start, batch.stop)
+        poses = batch.here
         origins, directions = batch.middles
         times = poses.times((rays - batch.start) * batch.each)
-        best, ends = np.zeros(len(rays)), np.zeros((len(rays), 3))  # seen from the origins
-        noise, sensor, extinction = self.setup.noise, self.setup.sensor, self._light.extinction
-        low, high, faintest = sensor.min_range_m, sensor.max_range_m, FAINTEST * noise.threshold
+        # seen from the origins
+        best = np.zeros(len(rays))
+        ends = np.zeros((len(rays), 3))
+        noise = self.setup.noise
+        sensor = self.setup.sensor
+        extinction = self._light.extinction
+        low = sensor.min_range_m
+        high = sensor.max_range_m
+        faintest = FAINTEST * noise.threshold
         limits = low, noise.stray_light, faintest, extinction
         few = np.zeros(TRIANGLES_NEAR, np.int64)
         table = self.surfaces.at(self._light.wavelength_nm)
         for actor, retros in groupby(self._retros, key=lambda retro: retro.actor):
-            turns, places = None, np.zeros(3)
+            turns = None
+            places = np.zeros(3)
             if actor is not None:
                 places, turns = poses.ways[actor].poses(0, times)
             seen = into_axes(origins - places, turns), into_axes(directions, turns)
@@ -90,7 +98,8 @@ class StrayLightStep(PulseStep):
         row = row[passes(noise, STRAY, best[row], *batch.keys.of(rays[row]))]
         distance = np.sqrt(products(ends[row].T, ends[row].T))
         within = (distance >= low) & (distance <= high)
-        row, distance = row[within], distance[within]
+        row = row[within]
+        distance = distance[within]
         free = self.caster.free(origins[row], ends[row], distance, times[row], poses.ways)
         free &= ~self._beside(returns, rays[row], distance)
         row = row[free]
@@ -127,7 +136,8 @@ class _Retro:
 
 def _retros(scene: Scene, surfaces: Surfaces) -> Iterator[_Retro]:
     """Retro-reflectors of a scene, its instances and actors."""
-    retro, owners = surfaces.materials.retro, surfaces.material_kinds.object
+    retro = surfaces.materials.retro
+    owners = surfaces.material_kinds.object
     of_object = np.zeros(len(scene.all_names), np.bool_)  # whether an object has some
     of_object[owners[retro]] = True
 

@@ -32,19 +32,29 @@ def cones(starts, ahead, out):
     """Write cones around cells of rays (3, n), (c, 5): axis, half angle, and how far they move."""
     count = starts.shape[1]
     for c in range(len(out)):
-        begin, end = c * CELL_RAYS, min((c + 1) * CELL_RAYS, count)
+        begin = c * CELL_RAYS
+        end = min((c + 1) * CELL_RAYS, count)
         x = y = z = far = 0.0
         for k in range(begin, end):
-            x, y, z = x + ahead[0, k], y + ahead[1, k], z + ahead[2, k]
-            a, b = starts[0, k] - starts[0, begin], starts[1, k] - starts[1, begin]
+            x = x + ahead[0, k]
+            y = y + ahead[1, k]
+            z = z + ahead[2, k]
+            a = starts[0, k] - starts[0, begin]
+            b = starts[1, k] - starts[1, begin]
             d = starts[2, k] - starts[2, begin]
             far = max(far, (a * a + b * b) + d * d)
         length = max(math.sqrt((x * x + y * y) + z * z), 1e-9)
-        x, y, z, least = x / length, y / length, z / length, 1.0
+        x = x / length
+        y = y / length
+        z = z / length
+        least = 1.0
         for k in range(begin, end):
             least = min(least, (x * ahead[0, k] + y * ahead[1, k]) + z * ahead[2, k])
-        out[c, 0], out[c, 1], out[c, 2] = x, y, z
-        out[c, 3], out[c, 4] = _angle(least), math.sqrt(far)
+        out[c, 0] = x
+        out[c, 1] = y
+        out[c, 2] = z
+        out[c, 3] = _angle(least)
+        out[c, 4] = math.sqrt(far)
 
 
 @stage
@@ -59,15 +69,23 @@ def _nearest(corners, t, ray):
     for one in range(3):
         other = one + 1 if one < 2 else 0
         # Of the two corners: seen from the start, depth, and place on a plane at a distance of 1.
-        px, py, pz = corners[t, one, 0] - ox, corners[t, one, 1] - oy, corners[t, one, 2] - oz
-        qx, qy, qz = corners[t, other, 0] - ox, corners[t, other, 1] - oy, corners[t, other, 2] - oz
-        p, q = (px * dx + py * dy) + pz * dz, (qx * dx + qy * dy) + qz * dz
+        px = corners[t, one, 0] - ox
+        py = corners[t, one, 1] - oy
+        pz = corners[t, one, 2] - oz
+        qx = corners[t, other, 0] - ox
+        qy = corners[t, other, 1] - oy
+        qz = corners[t, other, 2] - oz
+        p = (px * dx + py * dy) + pz * dz
+        q = (qx * dx + qy * dy) + qz * dz
         if not (p > 0 and q > 0):
             return -1.0, place
-        x, y = ((px * a + py * b) + pz * c) / p, ((px * d + py * e) + pz * f) / p
-        u, v = ((qx * a + qy * b) + qz * c) / q - x, ((qx * d + qy * e) + qz * f) / q - y
+        x = ((px * a + py * b) + pz * c) / p
+        y = ((px * d + py * e) + pz * f) / p
+        u = ((qx * a + qy * b) + qz * c) / q - x
+        v = ((qx * d + qy * e) + qz * f) / q - y
         turn = x * v - y * u
-        left, right = left and turn >= 0, right and turn <= 0
+        left = left and turn >= 0
+        right = right and turn <= 0
         along = min(max(-(x * u + y * v) / max(u * u + v * v, 1e-300), 0.0), 1.0)
         off = math.sqrt((x + along * u) * (x + along * u) + (y + along * v) * (y + along * v))
         if off < best:
@@ -87,13 +105,18 @@ def leaks(starts, ahead, cells, corners, middles, middle, radius, back, few, nea
     point of the triangles that is nearest to a ray by angle, which is written to `ends` (n, 3). Of
     many triangles, those nearest to a ray are asked, as many as `few` has room for.
     """
-    count, triangles = starts.shape[1], len(corners)
+    count = starts.shape[1]
+    triangles = len(corners)
     for c in range(len(cells)):
-        begin, end = c * CELL_RAYS, min((c + 1) * CELL_RAYS, count)
-        x, y = middle[0] - starts[0, begin], middle[1] - starts[1, begin]
-        z, size = middle[2] - starts[2, begin], radius + cells[c, 4]
+        begin = c * CELL_RAYS
+        end = min((c + 1) * CELL_RAYS, count)
+        x = middle[0] - starts[0, begin]
+        y = middle[1] - starts[1, begin]
+        z = middle[2] - starts[2, begin]
+        size = radius + cells[c, 4]
         far = math.sqrt((x * x + y * y) + z * z)
-        wide, off = math.pi, 0.0
+        wide = math.pi
+        off = 0.0
         if far > size:
             sine = size / far
             wide = arctan2(sine, math.sqrt((1 - sine) * (1 + sine)))
@@ -106,9 +129,15 @@ def leaks(starts, ahead, cells, corners, middles, middle, radius, back, few, nea
             continue
         _, cosine = sin_cos(min(reach, math.pi))
         for k in range(begin, end):
-            x, y, z = middle[0] - starts[0, k], middle[1] - starts[1, k], middle[2] - starts[2, k]
-            ox, oy, oz = starts[0, k], starts[1, k], starts[2, k]
-            dx, dy, dz = ahead[0, k], ahead[1, k], ahead[2, k]
+            x = middle[0] - starts[0, k]
+            y = middle[1] - starts[1, k]
+            z = middle[2] - starts[2, k]
+            ox = starts[0, k]
+            oy = starts[1, k]
+            oz = starts[2, k]
+            dx = ahead[0, k]
+            dy = ahead[1, k]
+            dz = ahead[2, k]
             if (x * dx + y * dy) + z * dz < cosine * math.sqrt((x * x + y * y) + z * z):
                 continue
             chosen = min(triangles, len(few))
@@ -121,11 +150,14 @@ def leaks(starts, ahead, cells, corners, middles, middle, radius, back, few, nea
                         taken = False
                         for before in range(number):
                             taken |= few[before] == t
-                        x, y, z = middles[t, 0] - ox, middles[t, 1] - oy, middles[t, 2] - oz
+                        x = middles[t, 0] - ox
+                        y = middles[t, 1] - oy
+                        z = middles[t, 2] - oz
                         towards = (x * dx + y * dy) + z * dz
                         towards = towards / math.sqrt((x * x + y * y) + z * z)
                         if not taken and towards > most:
-                            most, few[number] = towards, t
+                            most = towards
+                            few[number] = t
             for number in range(chosen):
                 t = few[number]
                 off, place = _nearest(corners, t, (ox, oy, oz, dx, dy, dz))
@@ -140,8 +172,11 @@ def leaks(starts, ahead, cells, corners, middles, middle, radius, back, few, nea
                     back[t] * at_right_angles(distance, extinction)
                 )
                 if energy > best[k]:
-                    best[k], new[k] = energy, True
-                    ends[k, 0], ends[k, 1], ends[k, 2] = x, y, z
+                    best[k] = energy
+                    new[k] = True
+                    ends[k, 0] = x
+                    ends[k, 1] = y
+                    ends[k, 2] = z
 
 
 @compiled()
@@ -157,12 +192,16 @@ def received(spots, low, high, order, fired, starts, ahead, times, places, cosin
         s = spots[pair]
         for k in range(low[pair], high[pair]):
             r = order[k]
-            x, y = places[s, 0] - starts[r, 0], places[s, 1] - starts[r, 1]
+            x = places[s, 0] - starts[r, 0]
+            y = places[s, 1] - starts[r, 1]
             z = places[s, 2] - starts[r, 2]
             away = math.sqrt((x * x + y * y) + z * z)
             along = (x * ahead[r, 0] + y * ahead[r, 1]) + z * ahead[r, 2]
             seems = (times[s] + away / LIGHT_M_NS - fired[r]) * (LIGHT_M_NS / 2)
             if away > 0 and along >= cosine * away and nearest_m <= seems <= farthest_m:
-                row[count], spot[count], distance[count], far[count] = r, s, seems, away
+                row[count] = r
+                spot[count] = s
+                distance[count] = seems
+                far[count] = away
                 count += 1
     return count

@@ -27,7 +27,8 @@ def _product(x, y, z, a, b, c):
 @inlined
 def _instance(t, begins):
     """Find the last instance whose triangles begin at or before one, by halves."""
-    low, high = 0, len(begins) - 1
+    low = 0
+    high = len(begins) - 1
     while high - low > 1:
         middle = (low + high) // 2
         if begins[middle] <= t:
@@ -44,17 +45,23 @@ def find(triangle, begins, owners, shared, firsts, to_kept, standing, rows, obje
     Triangles of instances begin at `begins`, whose last is where those of actors begin; `shared`
     and `firsts` are objects and first rows of instances.
     """
-    plain, actors = begins[0], begins[-1]
+    plain = begins[0]
+    actors = begins[-1]
     for k in range(len(triangle)):
-        t, which[k] = np.int64(triangle[k]), -1
+        t = np.int64(triangle[k])
+        which[k] = -1
         if t < plain:
-            rows[k], objects[k] = t, owners[t]
+            rows[k] = t
+            objects[k] = owners[t]
         elif t >= actors:
             owner = owners[t - (actors - plain)]
-            rows[k], objects[k] = t + to_kept[owner - standing], owner
+            rows[k] = t + to_kept[owner - standing]
+            objects[k] = owner
         else:
             low = _instance(t, begins)
-            rows[k], objects[k], which[k] = firsts[low] + t - begins[low], shared[low], low
+            rows[k] = firsts[low] + t - begins[low]
+            objects[k] = shared[low]
+            which[k] = low
 
 
 @compiled()
@@ -70,18 +77,28 @@ def meet(
     of an array is made: it would be counted, which takes five times as long as all the rest.
     """
     for k in range(len(rows)):
-        row, i, kind = rows[k], which[k], kinds[k]
+        row = rows[k]
+        i = which[k]
+        kind = kinds[k]
         if row >= 0:
-            x, y, z = table[row, 0], table[row, 1], table[row, 2]
+            x = table[row, 0]
+            y = table[row, 1]
+            z = table[row, 2]
         else:
-            x, y, z = own[~row, 0], own[~row, 1], own[~row, 2]
-        x, y, z = np.float64(x), np.float64(y), np.float64(z)
+            x = own[~row, 0]
+            y = own[~row, 1]
+            z = own[~row, 2]
+        x = np.float64(x)
+        y = np.float64(y)
+        z = np.float64(z)
         if i >= 0:  # in one order of rounding, that of columns.cu
             a = _product(turns[i, 0, 0], turns[i, 0, 1], turns[i, 0, 2], x, y, z)
             b = _product(turns[i, 1, 0], turns[i, 1, 1], turns[i, 1, 2], x, y, z)
             c = _product(turns[i, 2, 0], turns[i, 2, 1], turns[i, 2, 2], x, y, z)
             length = np.sqrt((a * a + b * b) + c * c)
-            x, y, z = a / length, b / length, c / length
+            x = a / length
+            y = b / length
+            z = c / length
         if len(run) and run[k] >= 0:
             p = run[k]
             x, y, z = (
@@ -90,7 +107,9 @@ def meet(
                 _product(poses[9, p], poses[10, p], poses[11, p], x, y, z),
             )
         cosine = _product(x, y, z, directions[0, k], directions[1, k], directions[2, k])
-        normals[0, k], normals[1, k], normals[2, k] = x, y, z
+        normals[0, k] = x
+        normals[1, k] = y
+        normals[2, k] = z
         along[k] = cosine
         back[k] = reflectance[kind] * (RETRO_GAIN if retro[kind] else abs(cosine))
 
@@ -141,8 +160,10 @@ def onward(
     count = 0
     for j in range(len(on)):
         k = on[j]
-        kind, cosine = kinds[k], abs(along[k])
-        first, grazing = specular[kind], 1 - min(cosine, 1.0)
+        kind = kinds[k]
+        cosine = abs(along[k])
+        first = specular[kind]
+        grazing = 1 - min(cosine, 1.0)
         square = grazing * grazing
         mirrors = first + (1 - first) * (grazing * (square * square)) if first > 0 else 0.0
         if passes[kind]:
@@ -154,7 +175,9 @@ def onward(
             goes = (1 - wet) * goes + wet * fresnel(cosine, WATER_INDEX)
         goes = before[k] * (goes * goes)
         if goes * (brightest * at_right_angles(distance[k], extinction)) > faintest:
-            on[count], off[count], share[count] = k, off[j], goes
+            on[count] = k
+            off[count] = off[j]
+            share[count] = goes
             count += 1
     return count
 
@@ -166,18 +189,26 @@ def set_off(origins, directions, step, away, starts, ahead):
         for axis in range(3):
             end = origins[axis, k] + step[k] * directions[axis, k]
             starts[axis, k] = end + away[k] * ahead[axis, k]
-        x, y, z = ahead[0, k], ahead[1, k], ahead[2, k]
+        x = ahead[0, k]
+        y = ahead[1, k]
+        z = ahead[2, k]
         if abs((x * x + y * y) + z * z - 1) > UNIT_SLACK:  # as `Pattern` does, for all at a time
             most = max(max(abs(x), abs(y)), abs(z))
-            x, y, z = x / most, y / most, z / most
+            x = x / most
+            y = y / most
+            z = z / most
             length = np.sqrt((x * x + y * y) + z * z)
-            ahead[0, k], ahead[1, k], ahead[2, k] = x / length, y / length, z / length
+            ahead[0, k] = x / length
+            ahead[1, k] = y / length
+            ahead[2, k] = z / length
 
 
 @compiled()
 def times(ray, start, subrays, begins, delays, out):
     """Write when rays are fired, of which `subrays` are of a beam, from beam `start` on."""
-    low, firing, each = 0, -1, len(delays)
+    low = 0
+    firing = -1
+    each = len(delays)
     for k in range(len(ray)):  # they follow each other
         beam = start + ray[k] // subrays
         if firing < 0 or not low <= beam < low + each:
@@ -195,16 +226,19 @@ def merge(
     `nearest` and those after it are as of `raybeam.crossing.Nearest`, of all rays; triangles of
     bodies begin at `firsts`, and those of their `parts` from there, by `shape`.
     """
-    i, count = 0, 0
+    i = 0
+    count = 0
     for k in range(len(body)):
-        own, hit = body[k], i < len(ray) and ray[i] == k
+        own = body[k]
+        hit = i < len(ray) and ray[i] == k
         if own >= 0:
             out_triangle[count] = on_body[k] + parts[shape[own], instance[k]] + firsts[own]
         elif hit:
             out_triangle[count] = triangle[i]
         i += int(hit)
         if hit or own >= 0:
-            out[count], out_m[count] = k, nearest[k]
+            out[count] = k
+            out_m[count] = nearest[k]
             count += 1
     return count
 
@@ -215,7 +249,8 @@ def runs(number, times, first, run):
 
     In a run, actors and times are equal; numbers below 0 are in none.
     """
-    count, last = 0, -1
+    count = 0
+    last = -1
     for k in range(len(number)):
         run[k] = -1
         if number[k] < 0:
@@ -223,7 +258,8 @@ def runs(number, times, first, run):
         if last < 0 or number[k] != number[last] or times[k] != times[last]:
             first[count] = k
             count += 1
-        run[k], last = count - 1, k
+        run[k] = count - 1
+        last = k
     return count
 
 
@@ -244,16 +280,21 @@ def on_tracks(
                 out[part, k] = out[part, k - 1]
             continue
         at = times_ns[k] / 1e9 + limits[0, way]
-        low, high, strict = limits[1, way], limits[2, way], limits[3, way]
+        low = limits[1, way]
+        high = limits[2, way]
+        strict = limits[3, way]
         if max(low - at, at - high) > strict:
             return k
         if strict == np.inf:
             at = min(max(at, low), high)
-        segment, room = first[way], count[way] - 1  # the last that has begun, by halves
+        # the last that has begun, by halves
+        segment = first[way]
+        room = count[way] - 1
         while room:
             half = (room + 1) // 2
             if times[segment + half] <= at:
-                segment, room = segment + half, room - half
+                segment = segment + half
+                room = room - half
             else:
                 room = half - 1
         since = at - times[segment]

@@ -20,8 +20,8 @@ from ..scene.scene import Scene
 from ..sensor import Sensor, Survey
 from ..sensor.materials import NEAR_NM, Material, MaterialTable, at_right_angles, first_matches
 from ..sensor.trajectory import velocities
+from .actor_trajectories import ActorTrajectories
 from .voxels import Grids
-from .ways import Ways
 
 _log = logging.getLogger(__name__)
 
@@ -30,7 +30,8 @@ BLOCK_FACES = 1 << 18  # triangles whose normals are made at a time
 BLOCK_HITS = 1 << 14  # hits whose colours are looked up at a time, to fit a cache
 
 
-_NONE, _NO_NORMALS = np.zeros(0, np.intp), np.zeros((0, 3), np.float32)
+_NONE = np.zeros(0, np.intp)
+_NO_NORMALS = np.zeros((0, 3), np.float32)
 
 
 class Light(NamedTuple):
@@ -83,7 +84,8 @@ class Surfaces:
         materials: tuple[Material, ...],
         wavelengths: Iterable[float] = (NEAR_NM,),
     ) -> None:
-        self._scene, self._materials = scene, materials
+        self._scene = scene
+        self._materials = materials
         self._standing = len(scene.names)  # objects
         self.counters = scene.counters
         kinds = scene.surface_kinds
@@ -122,7 +124,8 @@ class Surfaces:
         """Return the same with some of the scene's instances in other places."""
         assert scene.instances is not None
         made = copy(self)
-        made._scene, made._turns = scene, self._turns.copy()
+        made._scene = scene
+        made._turns = self._turns.copy()
         made._turns[rows] = _turns(scene.instances.transforms[rows])
         made.grids = self.grids and self.grids.moved(scene.instances)
         return made
@@ -139,15 +142,18 @@ class Surfaces:
     @cached_property
     def _numbers(self) -> tuple[Any, ...]:
         """Numbers of triangles, objects and instances, see `surface_loops.find`."""
-        shared, none = self._scene.instances, np.zeros(0, np.int64)
+        shared = self._scene.instances
+        none = np.zeros(0, np.int64)
         placed = (
             (none, none) if shared is None else (shared.owner, self._first_of_part[shared.part])
         )
-        owner, firsts = owned(placed[0], np.int32), owned(placed[1], np.int64)
-        begins, to_kept = owned(self._begins, np.int64), owned(self._to_kept, np.int64)
+        owner = owned(placed[0], np.int32)
+        firsts = owned(placed[1], np.int64)
+        begins = owned(self._begins, np.int64)
+        to_kept = owned(self._to_kept, np.int64)
         return begins, owned(self.owners, np.int32), owner, firsts, to_kept, self._standing
 
-    def normals(self, triangle: Integers, times: Floats | Ints, ways: Ways) -> Floats:
+    def normals(self, triangle: Integers, times: Floats | Ints, ways: ActorTrajectories) -> Floats:
         """Return the unit normals of triangles (n,): (n, 3), in single precision.
 
         Those of actors are rotated by the pose on their ways at the times (n,), nanoseconds.
@@ -160,12 +166,13 @@ class Surfaces:
         directions: Floats,
         table: MaterialTable,
         times: Floats | Ints,
-        ways: Ways,
+        ways: ActorTrajectories,
     ) -> tuple[Floats, Floats, Ints32, Floats]:
         """Return normals (3, n), products with directions, kinds of surfaces, light sent back."""
         from . import surface_loops  # not before: numba takes half a second to import
 
-        poses, run = np.zeros((12, 0)), np.zeros(0, np.int64)
+        poses = np.zeros((12, 0))
+        run = np.zeros(0, np.int64)
         rows, objects, which = self._find(triangle)
         kinds = self._kinds_of(rows, objects)
         own = _NO_NORMALS
@@ -174,7 +181,8 @@ class Surfaces:
             poses, run = ways.runs(actors, owned(times))
             if len(on := ways.deforming(actors)):
                 corners, *_ = self._bent(rows[on], actors[on], times[on], ways)
-                own, rows[on] = _normals(corners), ~np.arange(len(on))
+                own = _normals(corners)
+                rows[on] = ~np.arange(len(on))
         normals, (along, back) = np.empty((3, len(rows))), np.empty((2, len(rows)))
         given = self._turns, self.unit_normals, own, run, poses, table.reflectance, table.retro
         hits = rows, kinds, which, owned(directions.T)
@@ -188,7 +196,7 @@ class Surfaces:
         distance: Floats,
         light: Light,
         times: Floats | Ints,
-        ways: Ways,
+        ways: ActorTrajectories,
         colours: UInts32 | None = None,
     ) -> Lit:
         """How rays (n,) with unit directions (n, 3) meet triangles; others as of `energy`."""
@@ -201,7 +209,8 @@ class Surfaces:
             back = table.scattered(kinds, np.abs(along), bright)
         film = None
         if light.wet:
-            film, dry = np.empty(len(along), np.bool_), table.passes | table.leafy
+            film = np.empty(len(along), np.bool_)
+            dry = table.passes | table.leafy
             shares = table.shares(kinds, bright)
             given = normals[2], along, kinds, dry, shares, LEVEL, light.wet
             surface_loops.soak(*given, film, back)
@@ -209,7 +218,7 @@ class Surfaces:
         return Lit(normals.T, along, kinds, back, film)
 
     def _bent(
-        self, rows: Indices, actors: Integers, times: Floats | Ints, ways: Ways
+        self, rows: Indices, actors: Integers, times: Floats | Ints, ways: ActorTrajectories
     ) -> tuple[Floats, Floats, Floats]:
         """Corners of triangles of actors that deform, at times, their velocities, and at rest.
 
@@ -219,14 +228,16 @@ class Surfaces:
         frames, rates = ways.played(actors, times)
         shapes = self._shape[actors]
         for one in np.unique(shapes).tolist():
-            mesh, own = self._meshes[one], np.flatnonzero(shapes == one)
+            mesh = self._meshes[one]
+            own = np.flatnonzero(shapes == one)
             assert mesh.animation is not None
             vertex = mesh.faces[rows[own] - self._firsts[one]]
             corners[own], moves = mesh.animation.at(frames[own], vertex)
-            speeds[own], rest[own] = moves * rates[own, None, None], mesh.vertices[vertex]
+            speeds[own] = moves * rates[own, None, None]
+            rest[own] = mesh.vertices[vertex]
         return corners, speeds, rest
 
-    def _on_actors(self, triangle: Integers, ways: Ways) -> tuple[Indices, Integers]:
+    def _on_actors(self, triangle: Integers, ways: ActorTrajectories) -> tuple[Indices, Integers]:
         """Rows of triangles (n,) that belong to actors, and to which; none without `ways`."""
         if not ways:
             return _NONE, _NONE
@@ -234,7 +245,7 @@ class Surfaces:
         return rows, self.objects(triangle[rows]) - self._standing
 
     def colours(
-        self, triangle: Integers, points: Floats, times: Floats | Ints, ways: Ways
+        self, triangle: Integers, points: Floats, times: Floats | Ints, ways: ActorTrajectories
     ) -> UInts32:
         """Colours of points (n, 3) on triangles (n,), packed; others as for `normals`."""
         if self._lookup is None:
@@ -245,7 +256,9 @@ class Surfaces:
             out[block] = self._colours(triangle[block], points[block], times[block], ways)
         return out
 
-    def _colours(self, triangle: Integers, points: Floats, times: Any, ways: Ways) -> UInts32:
+    def _colours(
+        self, triangle: Integers, points: Floats, times: Any, ways: ActorTrajectories
+    ) -> UInts32:
         assert self._lookup is not None
         rows, _, which = self._find(triangle)
         on = np.flatnonzero(which >= 0)
@@ -266,20 +279,22 @@ class Surfaces:
         return self._lookup.at(rows, points)
 
     def velocities(
-        self, triangle: Integers, points: Floats, times: Floats | Ints, ways: Ways
+        self, triangle: Integers, points: Floats, times: Floats | Ints, ways: ActorTrajectories
     ) -> Floats:
         """Velocities of points (n, 3) on triangles (n,), m/s: (n, 3); others as for `normals`."""
         out = np.zeros((len(triangle), 3))
         moving, actor = self._on_actors(triangle, ways)
         for number in np.unique(actor).tolist():
-            way, rows = ways[number], moving[actor == number]
+            way = ways[number]
+            rows = moving[actor == number]
             if way.moves:
                 at = times[rows].astype(np.float64)
                 places, _ = way.poses(0, at)
                 velocity, rate = velocities(way, 0, at)
                 out[rows] = velocity + np.cross(rate, points[rows] - places)
         if len(bent := ways.deforming(actor)):
-            rows, own = moving[bent], actor[bent]
+            rows = moving[bent]
+            own = actor[bent]
             at = times[rows].astype(np.float64)
             places, turns = ways.poses(own, at)
             corners, speeds, _ = self._bent(self._find(triangle[rows])[0], own, at, ways)
@@ -387,7 +402,8 @@ class Surfaces:
         A surface with several names is one surface where one entry is for all of them: closed, if
         it holds a medium.
         """
-        kinds, first = self.material_kinds, first_matches(self._materials, self.material_kinds)
+        kinds = self.material_kinds
+        first = first_matches(self._materials, self.material_kinds)
         keys = np.stack([kinds.object, first], axis=1)
         _, rows, which = np.unique(keys, axis=0, return_index=True, return_inverse=True)
         return rows[which.reshape(-1)].astype(np.int32)
@@ -431,7 +447,8 @@ class Surfaces:
 
         They point inwards if they are closed and have a negative volume.
         """
-        table, scene = self.materials, self._scene
+        table = self.materials
+        scene = self._scene
         closed = np.ones(len(table.reflectance), np.bool_)
         volume = np.zeros(len(closed))
         for number in np.flatnonzero(table.leafy | table.refracts).tolist():
@@ -496,7 +513,8 @@ class Surfaces:
         """
         if not self.media:
             return self._scene.vertices
-        vertices, inwards = self._scene.vertices.copy(), self.solids[1]
+        vertices = self._scene.vertices.copy()
+        inwards = self.solids[1]
         for number in self.media:
             faces = self._faces_of(number)
             if not len(faces):
@@ -509,7 +527,8 @@ class Surfaces:
             normals = np.cross(b - a, c - a) * (-1 if inwards[number] else 1)
             normals /= np.maximum(length(normals)[:, None], 1e-300)
             # Each vertex goes where all of its triangles are so much further out, or nearly.
-            squares, sums = np.zeros((len(places), 3, 3)), np.zeros((len(places), 3))
+            squares = np.zeros((len(places), 3, 3))
+            sums = np.zeros((len(places), 3))
             np.add.at(squares, corners, (normals[:, :, None] * normals[:, None])[:, None])
             np.add.at(sums, corners, normals[:, None])
             squares += 1e-3 * np.eye(3)
@@ -571,9 +590,14 @@ def _normals(corners: Floats) -> Floats32:
 def _weights(corners: Floats, points: Floats) -> Floats:
     """Weights (n, 3) of the corners (n, 3, 3) of triangles at points (n, 3) on them."""
     a, b, c = corners.transpose(1, 2, 0)
-    one, other, to = b - a, c - a, points.T - a
-    square, both, square_2 = products(one, one), products(one, other), products(other, other)
-    along, along_2 = products(to, one), products(to, other)
+    one = b - a
+    other = c - a
+    to = points.T - a
+    square = products(one, one)
+    both = products(one, other)
+    square_2 = products(other, other)
+    along = products(to, one)
+    along_2 = products(to, other)
     area = np.maximum(square * square_2 - both * both, 1e-300)
     v = (square_2 * along - both * along_2) / area
     w = (square * along_2 - both * along) / area
@@ -586,7 +610,8 @@ def _closed(vertices: Floats, faces: Integers) -> bool:
     # Vertices of flat shading are one for each triangle.
     _, same = np.unique(vertices[used], axis=0, return_inverse=True)
     corners = same.reshape(-1)[corners.reshape(-1)].reshape(-1, 3).astype(np.int64)
-    ahead, after = corners.reshape(-1), np.roll(corners, -1, axis=1).reshape(-1)
+    ahead = corners.reshape(-1)
+    after = np.roll(corners, -1, axis=1).reshape(-1)
     some = ahead != after
     there, back = (
         np.sort(one[some] * len(used) + other[some])

@@ -45,7 +45,8 @@ class Grids:
 
     def _place(self, shared: Instances) -> None:
         """Find what takes places in the scene to those in the grid of each instance."""
-        self._part, to = shared.part, shared.transforms
+        self._part = shared.part
+        to = shared.transforms
         matrices = self._matrices[self._part]
         self._origins = applied(to[:, :, :3], matrices[:, :, 3]) + to[:, :, 3]
         self._back = inverse(matmul(to[:, :, :3], matrices[:, :, :3]))
@@ -88,7 +89,8 @@ class Grids:
             found = [self.through(*(values[block] for values in given)) for block in blocks]
             metres, rest, there = map(np.concatenate, zip(*found, strict=True))
             return metres, rest, there
-        metres, rest = np.full(len(left), np.inf), np.full(len(left), -np.inf)
+        metres = np.full(len(left), np.inf)
+        rest = np.full(len(left), -np.inf)
         there = np.zeros(which.shape)
         back = self._back[which].transpose(2, 3, 1, 0)  # (axis, axis, k, n)
         x, y, z = (starts[:, None] - self._origins[which]).transpose(2, 1, 0)
@@ -106,7 +108,9 @@ class Grids:
         shift = np.where(level | (which.T < 0), np.inf, ((step > 0) - place) * pace)
         pace[level] = 0
         crossing = np.where(which < 0, 0, crossing).T
-        rows, at, left = np.arange(len(left)), np.zeros(len(left)), left.copy()
+        rows = np.arange(len(left))
+        at = np.zeros(len(left))
+        left = left.copy()
         while len(rows):
             density, inside = self._density(cell, size, first)
             density *= crossing
@@ -133,7 +137,9 @@ class Grids:
                 cell, step, pace, shift, size, border = (
                     array[:, :, on] for array in (cell, step, pace, shift, size, border)
                 )
-                first, crossing, rows = first[:, on], crossing[:, on], rows[on]
+                first = first[:, on]
+                crossing = crossing[:, on]
+                rows = rows[on]
                 ahead, even, left, length = (a[on] for a in (ahead, even, left, length))
             cell = np.where(border <= ahead, cell + step, cell)
             at = np.maximum(ahead, 0)  # the first may be before the start, by rounding

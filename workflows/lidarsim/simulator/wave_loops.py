@@ -29,7 +29,9 @@ FAINT = 0.01  # of the strongest echo around: weaker ones are not found
 CURVED = 0.005  # of the greatest curvature of that, likewise for Gaussians
 TOGETHER = 4  # Gaussians that are fitted together at most
 STEPS = 30  # of Levenberg and Marquardt at most
-GAIN, ENOUGH = 1e-3, 1e-9  # share of the squares that a step must gain, and squares that are none
+# share of the squares that a step must gain, and squares that are none
+GAIN = 1e-3
+ENOUGH = 1e-9
 MOVES = 2.0  # standard deviations that a fit may move from its first guess
 HIGHEST = 1.2  # of the highest sample: a Gaussian between two samples may be higher
 _AREA = math.sqrt(2 * math.pi)
@@ -104,12 +106,15 @@ def _peaks(w, length, low, top, sigma, until, found):
     Their times and heights are those of the Gaussian through three samples, their energies the
     areas between the lowest samples to both sides. Rows of `found` are times, energies and widths.
     """
-    count, begin, s = 0, 0, 1
+    count = 0
+    begin = 0
+    s = 1
     while s < length - 1:
         if not (w[s] > w[s - 1] and w[s] >= w[s + 1] and w[s] >= FAINT * top):
             s += 1
             continue
-        at, last = s, s
+        at = s
+        last = s
         s += 1
         while s < length:  # to the next, or the end
             if w[s] < w[last]:
@@ -120,20 +125,22 @@ def _peaks(w, length, low, top, sigma, until, found):
         area = 0.0
         for k in range(begin, last + 1):
             area += w[k]
-        height, beside = w[at], 0.0
+        height = w[at]
+        beside = 0.0
         if w[at - 1] > 0 and w[at + 1] > 0:
-            before, here, behind = log(w[at - 1]), log(w[at]), log(w[at + 1])
+            before = log(w[at - 1])
+            here = log(w[at])
+            behind = log(w[at + 1])
             curve = min(before - 2 * here + behind, -1e-12)
             beside = min(max((before - behind) / (2 * curve), -0.5), 0.5)
             height = exp(here - (behind - before) * (behind - before) / (8 * curve))
         energy = area / (sigma * _AREA)
         until[count] = 1024 * last
-        found[0, count], found[1, count], found[2, count] = (
-            at + low + beside,
-            energy,
-            energy / height,
-        )
-        begin, count = last + 1, count + 1
+        found[0, count] = at + low + beside
+        found[1, count] = energy
+        found[2, count] = energy / height
+        begin = last + 1
+        count = count + 1
     return count
 
 
@@ -143,13 +150,17 @@ def _misses(x, y, samples, peaks, count, rest, slopes):
     for s in range(samples):
         rest[s] = y[s]
     for k in range(count):
-        height, place, width = peaks[0, k], peaks[1, k], peaks[2, k]
+        height = peaks[0, k]
+        place = peaks[1, k]
+        width = peaks[2, k]
         for s in range(samples):
             z = (x[s] - place) / width
             bell = exp(-0.5 * (z * z))
             rest[s] -= height * bell
             slope = height * bell * z / width
-            slopes[k, s], slopes[count + k, s], slopes[2 * count + k, s] = bell, slope, slope * z
+            slopes[k, s] = bell
+            slopes[count + k, s] = slope
+            slopes[2 * count + k, s] = slope * z
     cost = 0.0
     for s in range(samples):
         cost += rest[s] * rest[s]
@@ -200,7 +211,8 @@ def _fitted(x, y, samples, count, memory):
     for row in range(3):
         for k in range(count):
             guess[row, k] = best[row, k]
-    widest, damping = max((x[samples - 1] - x[0]) / (4 * count), 1.5), 1e-3
+    widest = max((x[samples - 1] - x[0]) / (4 * count), 1.5)
+    damping = 1e-3
     cost = _misses(x, y, samples, best, count, rest, slopes)
     for _ in range(STEPS):
         _step(rest, slopes, samples, count, damping, lower, step)
@@ -215,7 +227,9 @@ def _fitted(x, y, samples, count, memory):
         ends = ends or now <= ENOUGH or damping >= 1e6
         if better:
             for k in range(count):
-                best[0, k], best[1, k], best[2, k] = trial[0, k], trial[1, k], trial[2, k]
+                best[0, k] = trial[0, k]
+                best[1, k] = trial[1, k]
+                best[2, k] = trial[2, k]
             rest, new_rest, slopes, new_slopes = new_rest, rest, new_slopes, slopes
             cost = now
         if ends:
@@ -241,42 +255,60 @@ def _gaussians(w, length, low, top, sigma, until, found, at, lines, memory):
         if low_point and w[s] >= FAINT * top and -bent[s] * (sigma * sigma) >= CURVED * top:
             at[count] = s
             count += 1
-    begin, first = 0, 0  # of a piece that is fitted by itself: its first Gaussian and sample
+    # of a piece that is fitted by itself: its first Gaussian and sample
+    begin = 0
+    first = 0
     while begin < count:
         stop = begin + 1
         while stop < count and stop - begin < TOGETHER and at[stop] - at[stop - 1] <= APART * sigma:
             stop += 1
         end = (at[stop] + at[stop - 1]) // 2 + 1 if stop < count else length
-        origin, sums, whole = at[begin], 0.0, 0.0
+        origin = at[begin]
+        sums = 0.0
+        whole = 0.0
         for s in range(first, end):
-            x[s - first], y[s - first] = (s - origin) / sigma, w[s] / top
+            x[s - first] = (s - origin) / sigma
+            y[s - first] = w[s] / top
             sums += w[s]
         for k in range(begin, stop):
             fit[0, k - begin] = min(w[at[k]], -bent[at[k]] * (sigma * sigma)) / top
-            fit[1, k - begin], fit[2, k - begin] = (at[k] - origin) / sigma, 1.0
+            fit[1, k - begin] = (at[k] - origin) / sigma
+            fit[2, k - begin] = 1.0
         _fitted(x, y, end - first, stop - begin, memory)
         for k in range(stop - begin):
             whole += fit[0, k] * fit[2, k]
         for k in range(begin, stop):
             # What is beyond a cut, no sample tells; so energies are those of the piece together.
             height[k] = fit[0, k - begin] * (sums / whole / (sigma * _AREA))
-            time[k], width[k] = fit[1, k - begin] * sigma + (origin + low), fit[2, k - begin]
-        begin, first = stop, end
+            time[k] = fit[1, k - begin] * sigma + (origin + low)
+            width[k] = fit[2, k - begin]
+        begin = stop
+        first = end
     # Each by its time, also where a fit went beyond its piece; those that are close are one.
     kept = 0
     for k in range(count):
         if not height[k] >= FAINT * top:
             continue
-        a, b, c, place = time[k], height[k], width[k], kept
+        a = time[k]
+        b = height[k]
+        c = width[k]
+        place = kept
         while place > 0 and time[place - 1] > a:
-            time[place], height[place] = time[place - 1], height[place - 1]
+            time[place] = time[place - 1]
+            height[place] = height[place - 1]
             width[place] = width[place - 1]
             place -= 1
-        time[place], height[place], width[place] = a, b, c
+        time[place] = a
+        height[place] = b
+        width[place] = c
         kept += 1
-    out, begin = 0, 0
+    out = 0
+    begin = 0
     while begin < kept:
-        stop, energy, position, spread = begin, 0.0, 0.0, 0.0
+        stop = begin
+        energy = 0.0
+        position = 0.0
+        spread = 0.0
         while stop == begin or (stop < kept and time[stop] - time[stop - 1] < CLOSE * sigma):
             energy += height[stop] * width[stop]
             position += height[stop] * width[stop] * time[stop]
@@ -285,12 +317,15 @@ def _gaussians(w, length, low, top, sigma, until, found, at, lines, memory):
         for k in range(begin, stop):
             off = (time[k] - position) / sigma
             spread += height[k] * width[k] * (width[k] * width[k] + off * off)
-        found[0, out], found[1, out], found[2, out] = position, energy, math.sqrt(spread / energy)
+        found[0, out] = position
+        found[1, out] = energy
+        found[2, out] = math.sqrt(spread / energy)
         if out:
             middle = (found[0, out - 1] + position) / 2
             until[out - 1] = np.int64(np.rint(middle * 1024)) - 1024 * low
         until[out] = 1024 * length
-        begin, out = stop, out + 1
+        begin = stop
+        out = out + 1
     return out
 
 
@@ -300,12 +335,16 @@ def ordered(each, ray, distance, energy, row):
 
     The second number is that of the hits of a beam, at most.
     """
-    count, begin, most, beam = 0, 0, 0, -1
+    count = 0
+    begin = 0
+    most = 0
+    beam = -1
     for k in range(len(ray)):
         if not energy[k] > 0:
             continue
         if ray[k] // each != beam:
-            begin, beam = count, ray[k] // each
+            begin = count
+            beam = ray[k] // each
         place = count
         while place > begin and distance[row[place - 1, 0]] > distance[k]:
             row[place, 0] = row[place - 1, 0]
@@ -377,10 +416,13 @@ def divide(beam, sigma_m, hits, marks, subrays, neighbours, parts):
 
 def room_for(length):
     """Make scratch memory for waveforms of so many samples, see `search`."""
-    fits, size = np.empty((3, 3, TOGETHER)), 3 * TOGETHER
-    slopes, rest = np.empty((2, size, length)), np.empty((2, length))
+    fits = np.empty((3, 3, TOGETHER))
+    size = 3 * TOGETHER
+    slopes = np.empty((2, size, length))
+    rest = np.empty((2, length))
     memory = *fits, np.empty((size, size)), *slopes, *rest, np.empty(size)
-    marks, lines = np.empty((2, length), np.int64), np.empty((7, length))
+    marks = np.empty((2, length), np.int64)
+    lines = np.empty((7, length))
     return lines[0], np.empty((3, length)), *marks, (*lines[1:],), memory
 
 
@@ -392,10 +434,12 @@ def search(when, share, parts, sampling, new, echoes, room):
     are decomposed into Gaussians. Writes `WaveEchoes`, and marks hits that begin an echo.
     """
     sigma, decomposes = sampling
-    before, many = 0, np.int64(2 * CUT * sigma) + 1
+    before = 0
+    many = np.int64(2 * CUT * sigma) + 1
     w, rows, until, at, lines, memory = room
     for part in range(len(parts)):
-        begin, stop = parts[part, 0], parts[part, 1]
+        begin = parts[part, 0]
+        stop = parts[part, 1]
         low = np.int64(math.ceil(when[begin] - CUT * sigma)) - 1
         length = np.int64(math.ceil(when[stop - 1] - CUT * sigma)) + many - low + 1
         top = _sampled(when, share, begin, stop, sigma, many, low, w, length)
@@ -404,7 +448,8 @@ def search(when, share, parts, sampling, new, echoes, room):
         else:
             count = _peaks(w, length, low, top, sigma, until, rows)
         for k in range(begin, stop):
-            key, number = np.int64(np.rint(when[k] * 1024)) - 1024 * low, 0
+            key = np.int64(np.rint(when[k] * 1024)) - 1024 * low
+            number = 0
             while number < count - 1 and until[number] < key:
                 number += 1
             echoes.number[k] = before + number if count else -1

@@ -56,7 +56,8 @@ class LidarTraits:
     @classmethod
     def of(cls, sensor: Sensor, mode: str) -> LidarTraits:
         """Return the traits of a sensor, whose class may be a user's."""
-        head, beams = sensor.head, sensor.beams
+        head = sensor.head
+        beams = sensor.beams
         spins = isinstance(head, Spin) and not isinstance(head, Mirror)
         delays = beams.time_ns
         offset_m = 0.0

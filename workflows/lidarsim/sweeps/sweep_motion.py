@@ -62,7 +62,9 @@ def _turned(vectors: Floats, quaternions: Floats, sign: float) -> Floats:
     """
     (a, b, c), w = sign * quaternions[:3], quaternions[3]
     x, y, z = vectors.T
-    p, q, r = 2 * (b * z - c * y), 2 * (c * x - a * z), 2 * (a * y - b * x)
+    p = 2 * (b * z - c * y)
+    q = 2 * (c * x - a * z)
+    r = 2 * (a * y - b * x)
     rows = [
         x + w * p + (b * r - c * q),
         y + w * q + (c * p - a * r),

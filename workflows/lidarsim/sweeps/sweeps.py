@@ -175,7 +175,8 @@ class Sweeps:
         firing_ns = self.lidars[self.sensor[sweep]].firing_ns if self.lidars else 0.0
         span_ns = self.ends_ns[sweep] - self.begins_ns[sweep] + firing_ns
         knots = self.knots[sweep] if len(self.knots) else np.empty((0, 7), np.float32)
-        place, turn = self.pose.positions[sweep], self.pose.turns[sweep]
+        place = self.pose.positions[sweep]
+        turn = self.pose.turns[sweep]
         return poses_at(knots, place, turn, since_ns / max(span_ns, 1.0))
 
     def since_ns(self, sweep: int, points: Cloud) -> Floats:
@@ -183,7 +184,8 @@ class Sweeps:
 
         Jumps of the sensor's clock are taken out again.
         """
-        begin_ns, end_ns = self.begins_ns[sweep], self.ends_ns[sweep]
+        begin_ns = self.begins_ns[sweep]
+        end_ns = self.ends_ns[sweep]
         first, stop = self.scans[sweep : sweep + 2]
         by_scan = (points["scan"] + 0.5 - first) / (stop - first) * (end_ns - begin_ns)
         if "time" not in points.columns:
@@ -191,7 +193,8 @@ class Sweeps:
         stamps = points["time"].astype(np.int64)
         sensors = None, self.sensors[self.sensor[sweep]] if self.sensors else None
         jumps = [one for one in self.faults if one.kind == "time_jump" and one.sensor in sensors]
-        since, gap = stamps - begin_ns, np.full(len(stamps), np.inf)
+        since = stamps - begin_ns
+        gap = np.full(len(stamps), np.inf)
         for count in range(1 + len(jumps)) if jumps else ():
             for faults in combinations(jumps, count):
                 candidate = stamps - sum(round((fault.by_s or 0) * 1e9) for fault in faults)
@@ -245,7 +248,11 @@ class Sweeps:
     def of(cls, survey: Survey, scene: Scene) -> Sweeps:
         """Return the sweeps of a survey of a scene."""
         path = survey.path
-        sensors, places, turns, mounts, first_steps = [], [], [], [], []
+        sensors = []
+        places = []
+        turns = []
+        mounts = []
+        first_steps = []
         each = survey.sweeps_each
         for number, carried in enumerate(survey.carried):
             (firsts, begins, _), mount = each[number], carried.mount
@@ -261,7 +268,8 @@ class Sweeps:
             older = np.array([one.scan + one.ahead for one in shown])
             first_steps.append((older - firsts[0]) % survey.steps_each[number])
         when, end = (np.concatenate([one[k] for one in each]) for k in (1, 2))
-        actor_poses, there = [], []
+        actor_poses = []
+        there = []
         for actor in scene.actors:
             at, turned_by = full_poses(actor.trajectory, 0, np.append(when, end))
             actor_poses.append(_placed(at + scene.origin, turned_by))
@@ -313,7 +321,8 @@ class Sweeps:
     def faults_in(self, sweep: int) -> tuple[Fault, ...]:
         """Return the faults that are in a sweep: at some time of it, or if frozen, as it begins."""
         sensors = None, self.sensors[self.sensor[sweep]]
-        begin, end = self.begins_ns[sweep], self.ends_ns[sweep]
+        begin = self.begins_ns[sweep]
+        end = self.ends_ns[sweep]
         own = (one for one in self.faults if one.sensor in sensors)
         return tuple(one for one in own if one.during(begin, None if one.kind == "frozen" else end))
 
@@ -332,7 +341,8 @@ class Sweeps:
         """
         held: list[Cloud] = []
         empty = Cloud(np.empty((0, 3)), {c.name: np.empty(0, c.dtype) for c in cloud.table})
-        current, stop = first, len(self) if stop is None else stop
+        current = first
+        stop = len(self) if stop is None else stop
         for chunk in cloud.chunks(_PIECE, cloud.row_of(int(self.scans[first])) if first else 0):
             sweep = np.searchsorted(self.scans, chunk["scan"], "right") - 1
             if sweep[0] < current or sweep[-1] >= len(self) or (np.diff(sweep) < 0).any():
@@ -342,13 +352,15 @@ class Sweeps:
             for start, after in pairwise([*starts, end]):
                 while current < sweep[start]:
                     yield Cloud.joined(held) if held else empty
-                    held, current = [], current + 1
+                    held = []
+                    current = current + 1
                 held.append(chunk[start:after])
             if end < len(sweep):
                 break
         while current < stop:
             yield Cloud.joined(held) if held else empty
-            held, current = [], current + 1
+            held = []
+            current = current + 1
 
     def save(self, path: Path) -> None:
         """Write it as a NumPy archive; OSError if it cannot be written."""

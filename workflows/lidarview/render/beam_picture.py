@@ -26,19 +26,24 @@ def draw_beams(path: Path, sensor: Sensor) -> None:
     """
     page = Page(SIZE)
     turn = round(getattr(sensor.head, "firings_per_turn", 1000))
-    down, many = isinstance(sensor, LineSensor), sensor.channels > 1
+    down = isinstance(sensor, LineSensor)
+    many = sensor.channels > 1
     firings = np.arange(FIRINGS if many else 2 * turn if down else turn)
-    times, unit = sensor.times_ns(firings).reshape(-1) / 1e3, "µs"
+    times = sensor.times_ns(firings).reshape(-1) / 1e3
+    unit = "µs"
     if times.max() > 9999:
-        times, unit = times / 1e3, "ms"
+        times = times / 1e3
+        unit = "ms"
     x, y, z = sensor.directions(firings).reshape(-1, 3).T
     if down:
-        across, up = times, np.degrees(np.arctan2(y, -z))
+        across = times
+        up = np.degrees(np.arctan2(y, -z))
         labels = f"time, {unit}", "angle, degrees"
     else:
         middle = np.degrees(np.arctan2(y[0], x[0]))  # no jump where azimuths pass 180 degrees
         azimuth = np.degrees(np.arctan2(y, x))
-        across, up = (azimuth - middle + 180) % 360 - 180 + middle, np.degrees(np.arcsin(z))
+        across = (azimuth - middle + 180) % 360 - 180 + middle
+        up = np.degrees(np.arcsin(z))
         labels = "azimuth, degrees", "elevation, degrees"
     shape = "auto" if many or down else "equal"
     axes = page.chart((0.075, 0.12, 0.75, 0.73), aspect=shape, xlabel=labels[0], ylabel=labels[1])

@@ -67,7 +67,8 @@ def fit_camera(
     touch the frame: left, top, right and bottom as fractions of the image.
     """
     corners = np.asarray(points, dtype=np.float64)
-    low, high = corners.min(axis=0), corners.max(axis=0)
+    low = corners.min(axis=0)
+    high = corners.max(axis=0)
     azimuth, elevation = np.radians([azimuth_deg, elevation_deg])
     ahead = np.array([np.cos(azimuth), np.sin(azimuth), 0.0])
     back = ahead * np.cos(elevation) + np.array([0.0, 0.0, np.sin(elevation)])
@@ -75,7 +76,8 @@ def fit_camera(
     axes = np.stack([right, np.cross(back, right), -back])
     eye = (low + high) / 2 + back * 7.0 * np.linalg.norm(high - low) / 2
     flat, _ = Camera(eye, axes, 1.0, np.zeros(2), size).project(corners)
-    least, most = flat.min(axis=0), flat.max(axis=0)
+    least = flat.min(axis=0)
+    most = flat.max(axis=0)
     start, end = np.array(frame).reshape(2, 2)
     middle = (start + end) * size / 2
     focal = float(((end - start) * size / (most - least)).min())

@@ -16,11 +16,14 @@ from .surface import spiral
 
 # Margin on each side of a trajectory: a share of its diagonal, times its height above the scene's
 # lowest point, and least metres.
-_SHARE, _HEIGHTS, _LEAST_M = 0.35, 2.0, 25.0
+_SHARE = 0.35
+_HEIGHTS = 2.0
+_LEAST_M = 25.0
 _MOST = 0.5  # share of the scene's ground from which all of it is shown
 
 _ROOFED = 0.7  # share of steep rays from a sensor that hit the scene if there is a roof
-_STEEP_DEG, _RAYS = 60.0, 64
+_STEEP_DEG = 60.0
+_RAYS = 64
 _ROUGH = 0.5  # spread of what is above a sensor over its height there: more is a tree's crown
 _TOUCHES = 1e-3  # of the scene's diagonal: a sensor on a surface does not stand under it
 _PLACES = 8  # that are asked
@@ -34,7 +37,8 @@ def around_ways(bounds: Floats, ways: Sequence[Floats]) -> Floats | None:
     if not ways:
         return None
     places = np.concatenate(ways)
-    low, high = places.min(axis=0), places.max(axis=0)
+    low = places.min(axis=0)
+    high = places.max(axis=0)
     length = float(np.linalg.norm((high - low)[:2]))
     room = max(_SHARE * length, _HEIGHTS * float(high[2] - bounds[0, 2]), _LEAST_M)
     box = np.stack([low - room, high + room]).clip(*bounds)
@@ -56,7 +60,8 @@ def floor_and_cut(
     near = _TOUCHES * float(np.linalg.norm(np.ptp(scene.bounds, axis=0)))
     found = caster.cast(np.repeat(some, _RAYS, axis=0), np.tile(rays, (len(some), 1)), t_min=near)
     above = found.distance.reshape(-1, _RAYS) * rays[:, 2]
-    met, cut = np.isfinite(above), None
+    met = np.isfinite(above)
+    cut = None
     if (
         met.mean() >= _ROOFED
         and np.median([_rough(a[m]) for a, m in zip(above, met, strict=True)]) <= _ROUGH
@@ -100,12 +105,14 @@ class ShownPart:
         narrow = ((boxes[:, 1] - boxes[:, 0]) <= (box[1] - box[0])[:2]).all(axis=1)
         inside = ((middle >= box[0, :2]) & (middle <= box[1, :2])).all(axis=1)
         whole = np.flatnonzero((narrow & inside)[scene.face_object])
-        vertices, own = scene.vertices, np.flatnonzero(~narrow[scene.face_object])
+        vertices = scene.vertices
+        own = np.flatnonzero(~narrow[scene.face_object])
         faces = scene.faces[own].astype(np.int64)
         for axis in (0, 1):
             for sign, limit in ((1.0, box[1, axis]), (-1.0, box[0, axis])):
                 vertices, faces, own = _clipped(vertices, faces, own, axis, sign, limit)
-        faces, own = np.concatenate([scene.faces[whole], faces]), np.append(whole, own)
+        faces = np.concatenate([scene.faces[whole], faces])
+        own = np.append(whole, own)
         vertices, faces, own = _clipped(vertices, faces, own, 2, 1.0, box[1, 2])
         if not len(faces):
             return self
@@ -130,7 +137,8 @@ def _clipped(
     beyond = sign * (vertices[:, axis] - limit)
     out = beyond[faces] > 0  # (f, 3)
     count = out.sum(axis=1)
-    kept, origins = [faces[count == 0]], [parents[count == 0]]
+    kept = [faces[count == 0]]
+    origins = [parents[count == 0]]
     for number in (1, 2):  # corners that are beyond
         rows = np.flatnonzero(count == number)
         # The corner that is alone comes first.

@@ -23,7 +23,9 @@ _SPREAD = (0.5, 99.5)  # percentiles at the ends of a colour scale
 _GREY = 0.5
 # The scale is logarithmic if numbers differ by the first factor and the median is this low in their
 # range, or if numbers without a unit, such as intensities, differ by the second factor.
-_WIDE, _SKEWED, _MANIFOLD = 10.0, 0.1, 30.0
+_WIDE = 10.0
+_SKEWED = 0.1
+_MANIFOLD = 30.0
 _TIMES = (("s", 1e9), ("ms", 1e6), ("µs", 1e3))  # units for nanoseconds
 
 
@@ -96,25 +98,33 @@ def colours_of(values: AnyArray, column: Column, names: Sequence[str] = ()) -> C
             kept = tuple(found.tolist())
             return Colouring(label, column.name, "", column.meaning, labels=labels, values=kept)
         spread = (0, 100)
-    known, unit, size = np.isfinite(values), column.unit, 1.0
-    middle, low, high = 0.5, 0.0, 1.0
+    known = np.isfinite(values)
+    unit = column.unit
+    size = 1.0
+    middle = 0.5
+    low = 0.0
+    high = 1.0
     if known.any():
         numbers = values[known].astype(np.float64)
         low, middle, high = np.percentile(numbers, [spread[0], 50, spread[1]])
     if unit == "ns":
         span = high - low
         unit, size = next((entry for entry in _TIMES if span >= 0.1 * entry[1]), ("ns", 1.0))
-        low, middle, high = low / size, middle / size, high / size
+        low = low / size
+        middle = middle / size
+        high = high / size
     scale = TURBO
     if unit == "m/s" and values.dtype.kind == "f":
         high = max(-low, high)
-        low, scale = -high, DIVERGING
+        low = -high
+        scale = DIVERGING
     skewed = high > _WIDE * low and middle - low < _SKEWED * (high - low)
     logarithmic = bool(low > 0 and (skewed or (not unit and high > _MANIFOLD * low)))
     ends = np.log([low, high]) if logarithmic else (low, high)
 
     def shade(values: AnyArray) -> Floats:
-        known, numbers = np.isfinite(values), values.astype(np.float64) / size
+        known = np.isfinite(values)
+        numbers = values.astype(np.float64) / size
         if logarithmic:
             numbers = np.log(np.clip(numbers, low, high))
         scaled = (numbers - ends[0]) * (255 / (ends[1] - ends[0] if high > low else 1.0))

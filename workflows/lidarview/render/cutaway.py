@@ -52,7 +52,8 @@ class Cutaway:
     def removes(self, points: Floats, triangle: Ints) -> Bools:
         """Whether hits at points (n, 3) on triangles (n,) are removed."""
         owner = self.surface.scene.face_object[triangle]
-        low, high = self.core[owner, 0], self.core[owner, 1]
+        low = self.core[owner, 0]
+        high = self.core[owner, 1]
         beside = (points[:, :2] < low[:, :2]) | (points[:, :2] > high[:, :2])
         out: Bools = self.surrounds[owner] & (beside.any(axis=1) | (points[:, 2] > high[:, 2]))
         which = np.flatnonzero(out)
@@ -105,7 +106,8 @@ def cast_through(
     hits = surface.caster.cast(eye, directions)
     distance = np.array(hits.distance, dtype=np.float64)
     triangle = np.array(hits.triangle, dtype=np.int64)
-    u, v = np.array(hits.u, dtype=np.float64), np.array(hits.v, dtype=np.float64)
+    u = np.array(hits.u, dtype=np.float64)
+    v = np.array(hits.v, dtype=np.float64)
     if cutaway is None:
         return distance, triangle, u, v
     live = np.flatnonzero(triangle >= 0)
@@ -117,7 +119,9 @@ def cast_through(
         start = distance[live] * (1 + 1e-6)
         again = surface.caster.cast(eye + start[:, None] * directions[live], directions[live])
         distance[live] = start + again.distance
-        triangle[live], u[live], v[live] = again.triangle, again.u, again.v
+        triangle[live] = again.triangle
+        u[live] = again.u
+        v[live] = again.v
         live = live[triangle[live] >= 0]
     return distance, triangle, u, v
 

@@ -19,13 +19,25 @@ from .theme import rgb
 
 SIZE = (960, 540)  # pixels
 BACK, SURFACE, ACTOR = (np.append(rgb(c), 1.0) for c in ("#0e1116", "#5b6570", "#eac9a0"))
-_RED, _WHITE, _FAR_OUT = "#ff4d5e", "#ffffff", 4000  # the way; Pillow draws no endless lines
+# the way; Pillow draws no endless lines
+_RED = "#ff4d5e"
+_WHITE = "#ffffff"
+_FAR_OUT = 4000
 _FOCAL = 922.0  # pixels: 55 degrees across
-_BEHIND, _ABOVE, _AHEAD = 1.7, 0.95, 1.6  # times the range: the camera, and what it looks at
+# times the range: the camera, and what it looks at
+_BEHIND = 1.7
+_ABOVE = 0.95
+_AHEAD = 1.6
 _HEADING = 0.12  # of the film, before and after, tells where the carrier is heading
-_AWAY, _SLOPE = 1.25, 0.62  # of a camera that circles: times the size, and up for a metre away
-_NEAR, _HAZE = 0.3, 6.0  # times the focus: nearer surfaces are left out, farther ones vanish
-_OLD, _FADES = 0.42, 3.0  # brightness of old points; frames in which new ones come near it
+# of a camera that circles: times the size, and up for a metre away
+_AWAY = 1.25
+_SLOPE = 0.62
+# times the focus: nearer surfaces are left out, farther ones vanish
+_NEAR = 0.3
+_HAZE = 6.0
+# brightness of old points; frames in which new ones come near it
+_OLD = 0.42
+_FADES = 3.0
 _DOT = 2.3  # half pixels: the radius of points
 _NOISE = 0.02  # of the distance, that a point may lie beside its surface
 
@@ -51,8 +63,10 @@ class Film:
 
         Old points in front of all surfaces are left out: there was an actor that has moved on.
         """
-        random, born = np.random.default_rng(0), np.empty(0)
-        points, paint = np.empty((0, 3)), np.empty((0, 4))
+        random = np.random.default_rng(0)
+        born = np.empty(0)
+        points = np.empty((0, 3))
+        paint = np.empty((0, 4))
         still = [_shape(self.still, SURFACE)] if len(self.still) else []
         eyes, targets, places, focus = self._sights()
         for number, (moment, part) in enumerate(zip(self.moments_ns, self.parts, strict=True)):
@@ -83,7 +97,9 @@ class Film:
                 pen.ellipse((x - 5, y - 5, x + 5, y + 5), _RED, _WHITE, 2)
             yield np.asarray(frame)
             kept = (born < number) | (random.random(len(born)) < self.kept)
-            points, paint, born = points[kept], paint[kept], born[kept]
+            points = points[kept]
+            paint = paint[kept]
+            born = born[kept]
 
     def _sights(self) -> tuple[Floats, Floats, Floats, float]:
         """Of each frame: eye, target and carrier, if any, (k, 3); metres to what is looked at."""
@@ -91,7 +107,8 @@ class Film:
         if self.way is None:
             turn = 2 * np.pi * np.arange(count) / count - 1.1
             away = unit(np.stack([np.cos(turn), np.sin(turn), np.full(count, _SLOPE)], axis=1))
-            far, middle = _AWAY * float(np.linalg.norm(np.ptp(self.box, 0))), self.box.mean(axis=0)
+            far = _AWAY * float(np.linalg.norm(np.ptp(self.box, 0)))
+            middle = self.box.mean(axis=0)
             return middle + far * away, np.tile(middle, (count, 1)), np.empty((0, 3)), far
         reach = _HEADING * self.moments_ns[-1]
         early, now, late = (
@@ -121,7 +138,8 @@ def _surfaces(
     start = _NEAR * focus / forward
     if camera.eye[2] > top:  # rays begin where the scene is cut
         start = np.maximum(start, (top - camera.eye[2]) / np.minimum(rays[:, 2], -1e-6))
-    depth, image = np.full(len(rays), np.inf), np.tile(BACK, (len(rays), 1))
+    depth = np.full(len(rays), np.inf)
+    image = np.tile(BACK, (len(rays), 1))
     for caster, normals, colour in shapes:
         hits = caster.cast(camera.eye + start[:, None] * rays, rays)
         found = np.flatnonzero(hits.distance + start < depth)

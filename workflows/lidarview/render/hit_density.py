@@ -51,7 +51,8 @@ def hit_colours(
     """
     whole = hit_density(scene, hits)
     pieces, owner, areas, found = _divided(corners, hits > 0, points, most)
-    read, density = np.isfinite(found), whole[owner]
+    read = np.isfinite(found)
+    density = whole[owner]
     if found[read].any():
         each = (density * areas)[read].sum() / (found * areas)[read].sum()
         density[read] = each * found[read]
@@ -96,7 +97,8 @@ def _rounds(hits: Floats) -> int:
 
 def _share(faces: Ints32, hits: Floats, area: Floats, vertices: int) -> Floats:
     """Spread hits (f,) over the triangles that share a corner, in proportion to area (f,)."""
-    given, room = np.zeros(vertices), np.zeros(vertices)
+    given = np.zeros(vertices)
+    room = np.zeros(vertices)
     for corner in faces.T:
         given += np.bincount(corner, weights=hits / 3, minlength=vertices)
         room += np.bincount(corner, weights=area, minlength=vertices)
@@ -111,7 +113,8 @@ def _density_range(density: Floats, areas: Floats) -> tuple[float, float]:
 
     Few hits are on surfaces with less, and little area has more.
     """
-    low, high = 1.0, 10.0
+    low = 1.0
+    high = 10.0
     if (density * areas).any():
         low, high = (
             np.percentile(density, end, weights=weights, method="inverted_cdf")
@@ -140,14 +143,18 @@ def _divided(
 
     Returns pieces, owners and areas, and points per square metre, NaN for whole triangles.
     """
-    owner, areas = np.arange(len(pieces)), triangle_areas(pieces)
-    found, busy = np.full(len(pieces), np.nan), hit & bool(len(points))
+    owner = np.arange(len(pieces))
+    areas = triangle_areas(pieces)
+    found = np.full(len(pieces), np.nan)
+    busy = hit & bool(len(points))
     if not busy.any():
         return pieces, owner, areas, found
     low = np.minimum(points.min(axis=0), pieces.min(axis=(0, 1)))
-    width, one = float(_longest(pieces)[1].max()), np.ones(len(points))
+    width = float(_longest(pieces)[1].max())
+    one = np.ones(len(points))
     for _ in range(_LEVELS):
-        there, middles = hit[owner], pieces.mean(axis=1)
+        there = hit[owner]
+        middles = pieces.mean(axis=1)
         near = _WeightGrid(points, one, width, low).around(middles[busy])
         room = _WeightGrid(middles[there], areas[there], width, low).around(middles[busy])
         # Where there are few points, this is the last time that they are counted.
@@ -178,14 +185,16 @@ class _WeightGrid:
     """Sums of weights (n,) of places (n, 3) in the cells of a grid."""
 
     def __init__(self, places: Floats32, weights: Floats, width: float, low: Floats32) -> None:
-        self._width, self._low = width, low
+        self._width = width
+        self._low = low
         cells = np.floor((places - low) / width).astype(np.int64)
         self._keys, cells = np.unique(_keys(cells), return_inverse=True)
         self._sums = np.bincount(cells, weights)
 
     def around(self, places: Floats32) -> Floats:
         """Sum (n,) at each place, interpolated between the eight cells that are nearest to it."""
-        at, total = (places - self._low) / self._width - 0.5, np.zeros(len(places))
+        at = (places - self._low) / self._width - 0.5
+        total = np.zeros(len(places))
         cells = np.floor(at).astype(np.int64)
         part = at - cells
         for step in itertools.product((0, 1), repeat=3):
@@ -209,7 +218,8 @@ def _longest(pieces: Floats32) -> tuple[Indices, Floats32]:
 
 def _halved(pieces: Floats32) -> tuple[Floats32, Floats32]:
     """Cut each piece through the middle of its longest edge."""
-    rows, edge = np.arange(len(pieces)), _longest(pieces)[0]
+    rows = np.arange(len(pieces))
+    edge = _longest(pieces)[0]
     a, b, c = (pieces[rows, (edge + k) % 3] for k in range(3))
     middle = (a + b) / 2
     return np.stack([a, middle, c], axis=1), np.stack([middle, b, c], axis=1)

@@ -14,12 +14,16 @@ from .cutaway import Cutaway, blocked
 from .surface import Surface, dot, spiral
 
 STRIDE = 2  # shadows are computed at every second pixel of every second row
-SKY_LIGHTS, SUN_LIGHTS = 24, 4
+SKY_LIGHTS = 24
+SUN_LIGHTS = 4
 TURNS = 0.12, 0.02  # radians from a grid point's light to its neighbour's, of the sky and the sun
 SUN_RADIUS = 0.045  # radians: ten times the real one, for soft edges
 SUN_SHARE = 0.4  # share of the light on open horizontal ground
 THIN = 0.5  # openness of surfaces too thin for a grid point
-AMBIENT, SKY, SUN = 0.24, 0.54, 0.36  # brightness of a surface that faces them
+# brightness of a surface that faces them
+AMBIENT = 0.24
+SKY = 0.54
+SUN = 0.36
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,15 +114,18 @@ def make_light_map(
     """
     sun = _sun_direction(camera)
     there = np.isfinite(position[..., 0])
-    at, facing = position[there].astype(np.float64), normal[there].astype(np.float64)
+    at = position[there].astype(np.float64)
+    facing = normal[there].astype(np.float64)
     # Rays start half a pixel off the surface, so that it does not shade itself.
     at += 0.5 * camera.footprint(np.sqrt(dot(at - camera.eye, at - camera.eye)))[:, None] * facing
     # Neighbours rotate the lights differently, and are averaged: like four times as many lights.
     row, column = np.nonzero(there)
     number = row % 2 + 2 * (column % 2)
-    full, open_ = np.full(len(at), 1e-9), np.full(len(at), 1e-9)
+    full = np.full(len(at), 1e-9)
+    open_ = np.full(len(at), 1e-9)
     for (x, y, z), strength, turn in zip(*_lights(sun), strict=True):
-        cos, sin = np.cos(turn * np.arange(4))[number], np.sin(turn * np.arange(4))[number]
+        cos = np.cos(turn * np.arange(4))[number]
+        sin = np.sin(turn * np.arange(4))[number]
         towards = np.stack([cos * x - sin * y, sin * x + cos * y, np.full_like(cos, z)], axis=1)
         falls = strength * np.clip(dot(facing, towards), 0, None)
         lit = np.flatnonzero(falls)
@@ -136,7 +143,8 @@ def _lights(sun: Floats) -> tuple[Floats, Floats, Floats]:
     The strengths (k,) of sky and sun together are 1 on level ground; turns (k,) in radians.
     """
     n = np.arange(SUN_LIGHTS)
-    turn, radius = 2 * np.pi * 0.6180339887 * n, SUN_RADIUS * np.sqrt((n + 0.5) / SUN_LIGHTS)
+    turn = 2 * np.pi * 0.6180339887 * n
+    radius = SUN_RADIUS * np.sqrt((n + 0.5) / SUN_LIGHTS)
     side = np.cross(sun, [0.0, 0.0, 1.0])
     side /= np.linalg.norm(side)
     disc = np.cos(turn)[:, None] * side + np.sin(turn)[:, None] * np.cross(side, sun)

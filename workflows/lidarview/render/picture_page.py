@@ -35,11 +35,15 @@ FONT = "DejaVu Sans"  # comes with matplotlib
 MANY_POSES = 40  # more sensors than this are small dots
 PATH_PIECES = 200  # of which the way of a sensor is drawn
 MOST_NAMES = 12  # of actors beside what they name
-NAME_ABOVE, NAME_ROOM = 26.0, (150.0, 26.0)  # pixels of a picture 1600 wide
+# pixels of a picture 1600 wide
+NAME_ABOVE = 26.0
+NAME_ROOM = (150.0, 26.0)
 LEGEND_ROWS = 30
 # Of the numbers along the axes, in pixels of a picture 1600 wide.
 TICK = 7.0  # length of a tick mark
-BESIDE, BELOW = 14.0, 24.0  # from an edge to the numbers right or left of it, and under it
+# from an edge to the numbers right or left of it, and under it
+BESIDE = 14.0
+BELOW = 24.0
 LETTER = 12.0  # width of a digit
 TITLE = 32.0  # from the numbers to the title
 APART = 34.0  # numbers stand at least this far apart
@@ -59,7 +63,8 @@ class Page:
 
         The returned axes have the shot's pixels as coordinates.
         """
-        colours, opacity = image[..., :3], image[..., 3:]
+        colours = image[..., :3]
+        opacity = image[..., 3:]
         plain = np.divide(colours, opacity, out=np.zeros_like(colours), where=opacity > 0)
         bytes_ = np.round(255 * np.concatenate([plain, opacity], axis=2)).astype(np.uint8)
         self.figure.figimage(bytes_, zorder=-1)
@@ -119,7 +124,8 @@ class Page:
                 solid_capstyle="round",
             )  # fmt: skip
             self.lines(axes, shot, np.stack([some[:-1], some[1:]], axis=1), 1.8, 0.9)
-        poses, many = shot.sensors, len(shot.sensors) > MANY_POSES
+        poses = shot.sensors
+        many = len(shot.sensors) > MANY_POSES
         pixels, seen = shot.visible(poses)
         if not many:
             feet = np.column_stack([poses[:, :2], np.full(len(poses), shot.stage.level)])
@@ -136,7 +142,8 @@ class Page:
 
         Of a robot, whose links are called ROBOT/LINK, the first has its name.
         """
-        boxes, taken = shot.scene.object_bounds, np.empty((0, 2))
+        boxes = shot.scene.object_bounds
+        taken = np.empty((0, 2))
         some = np.arange(len(boxes) - shot.actors, len(boxes))
         # Absent ones are one point.
         there = np.isfinite(boxes).all(axis=(1, 2)) & (np.ptp(boxes, axis=1) > 0).any(axis=1)
@@ -150,7 +157,9 @@ class Page:
         halo = [withStroke(linewidth=1.6 * self.unit, foreground=theme.PAGE)]
         places, seen = shot.visible(tops)
         for k in np.argsort(-places[:, 1]).tolist():  # those in front first
-            pixel, name, colour = places[k], names[k], theme.INK if seen[k] else theme.LINE
+            pixel = places[k]
+            name = names[k]
+            colour = theme.INK if seen[k] else theme.LINE
             place = pixel - (0, NAME_ABOVE * self.unit)
             while (np.abs(taken - place) < np.array(NAME_ROOM) * self.unit).all(axis=1).any():
                 place = place - (0, NAME_ROOM[1] * self.unit)
@@ -167,7 +176,9 @@ class Page:
         """Write numbers from 1 on the sensors' markers; on white for those that are hidden."""
         pixels, seen = shot.visible(shot.sensors)
         for rank, k in enumerate(np.argsort(pixels[:, 1]).tolist()):  # those in front last
-            x, y, above = float(pixels[k, 0]), float(pixels[k, 1]), 8 + rank / len(pixels)
+            x = float(pixels[k, 0])
+            y = float(pixels[k, 1])
+            above = 8 + rank / len(pixels)
             face, ink = (theme.SENSOR, theme.PAGE) if seen[k] else (theme.PAGE, theme.SENSOR)
             axes.scatter(
                 [x], [y], s=62 * self.unit**2, facecolors=face, edgecolors=ink,
@@ -189,7 +200,8 @@ class Page:
 
     def chart(self, frame: tuple[float, float, float, float], **given: Any) -> Axes:
         """Axes with a grid in a frame: left, bottom, width and height as fractions of the page."""
-        axes, small = self.figure.add_axes(frame), 0.6 * self.unit
+        axes = self.figure.add_axes(frame)
+        small = 0.6 * self.unit
         axes.set(facecolor=theme.GROUND, axisbelow=True, **given)
         axes.grid(color=theme.LINE, lw=0.5 * self.unit)
         axes.spines[:].set(color=theme.LINE, linewidth=small)

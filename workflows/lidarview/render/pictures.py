@@ -21,9 +21,13 @@ from .picture_page import LEGEND_ROWS, Page, whole_of
 from .shot import SurfaceView
 
 MOST_POINTS = 1_000_000  # of a cloud are drawn; a picture has a few more pixels
-MOST_HITS, MOST_PIECES = 200_000, 100_000  # to count, and to colour
+# to count, and to colour
+MOST_HITS = 200_000
+MOST_PIECES = 100_000
 SOLID = 5.0  # half pixels that a point covers at least where gaps are closed
-MOST_RAYS, MOST_OF_MOVING = 600, 150  # more from one trajectory would hide the surfaces
+# more from one trajectory would hide the surfaces
+MOST_RAYS = 600
+MOST_OF_MOVING = 150
 # An object that covers this much of the ground is a floor or a hall.
 SURROUNDING = 0.6
 
@@ -135,7 +139,8 @@ def _kinds(names: Sequence[str], actors: int) -> tuple[Ints, list[str]]:
     """
     if len(names) <= LEGEND_ROWS:
         return np.arange(len(names)), list(names)
-    known, found = {*names}, dict[str, int]()
+    known = {*names}
+    found = dict[str, int]()
     kinds = []
     for k, name in enumerate(names):
         stem, _, number = name.rpartition(".")
@@ -208,7 +213,8 @@ def splat(image: Floats32, pixels: Floats, colours: AnyFloats, radius: float) ->
     inner = fine[margin : margin + 2 * height, margin : margin + 2 * width]
     inner[:] = _packed(image).repeat(2, axis=0).repeat(2, axis=1)
     column, row = (2 * pixels.T).astype(np.int64) + margin
-    middle, colour = row * wide + column, _packed(colours)
+    middle = row * wide + column
+    colour = _packed(colours)
     disc = [
         (dx * dx + dy * dy, dy * wide + dx)
         for dy in range(-reach, reach + 1)

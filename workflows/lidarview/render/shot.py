@@ -26,10 +26,13 @@ from .surface import Surface, apart, unit
 SIZE = (1600, 1000)  # pixels of a finished picture
 # Where the scene is: the title is above it, legend and colour bar are right of it.
 FRAME = (0.08, 0.115, 0.79, 0.91)
-SKY, GROUND = -1, -2  # instead of a triangle
+# instead of a triangle
+SKY = -1
+GROUND = -2
 STEPS = 700  # points along a line where its visibility is tested
 # Of the scene's diagonal: between objects that touch, and to the pieces of a triangle.
-_APART, _NEAR = 5e-6, 1e-6
+_APART = 5e-6
+_NEAR = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
@@ -119,7 +122,8 @@ class SurfaceView:
 
         The first piece of each triangle has its number, and `owner` (k,) says whose each is.
         """
-        cut, back = np.append(np.bincount(owner) > 1, [False, False]), _NEAR * self.stage.size
+        cut = np.append(np.bincount(owner) > 1, [False, False])
+        back = _NEAR * self.stage.size
         number = np.flatnonzero(cut[owner])
         if not len(number):
             return self
@@ -127,7 +131,8 @@ class SurfaceView:
         caster = RayCaster(corners, np.arange(len(corners)).reshape(-1, 3))
 
         def find(samples: Samples) -> Samples:
-            piece, weights = samples.triangle.copy(), samples.weights.copy()
+            piece = samples.triangle.copy()
+            weights = samples.weights.copy()
             some = np.flatnonzero(cut[piece])
             place = samples.position[some].astype(np.float64)
             ahead = unit(place - self.camera.eye)
@@ -213,7 +218,8 @@ def take_shot(
     bounds = part.scene.bounds
     step = _APART * float(np.linalg.norm(np.ptp(bounds, 0)))
     part = uncut = replace(part, scene=apart(part.scene, part.scene.face_object, step))
-    surface, cut = Surface.of(part.scene, backend), None
+    surface = Surface.of(part.scene, backend)
+    cut = None
     if box is not None and len(everywhere):
         _, cut = floor_and_cut(part.scene, surface.caster, everywhere)
     if cut is not None:
@@ -227,11 +233,13 @@ def take_shot(
         when += f" · drawn: {wide:,.0f} × {deep:,.0f} m around what moves, below z = {top:,.0f} m"
     stage = _stage(bounds, everywhere, scene.origin)
     # Moving objects are on the ground, between other objects.
-    camera, reach = _camera(stage, size, 48.0 if paths or actors else 33.0), np.inf
+    camera = _camera(stage, size, 48.0 if paths or actors else 33.0)
+    reach = np.inf
     cutaway = plan_cutaway(surface, everywhere, camera.eye)
     if cutaway is not None:
         # From higher up more of the floor is visible between objects.
-        camera, reach = _camera(stage, size, 42.0), 0.15 * stage.size
+        camera = _camera(stage, size, 42.0)
+        reach = 0.15 * stage.size
         cutaway = replace(cutaway, eye=camera.eye)
 
     def see(pixels: Floats) -> Samples:
@@ -243,7 +251,9 @@ def take_shot(
         normal[hit] = surface.normals(triangle[hit], u[hit], v[hit], directions[hit])
         ground = _ground_distance(stage, camera.eye, directions)
         nearer = ground < distance
-        distance[nearer], triangle[nearer], normal[nearer] = ground[nearer], GROUND, (0, 0, 1)
+        distance[nearer] = ground[nearer]
+        triangle[nearer] = GROUND
+        normal[nearer] = (0, 0, 1)
         with np.errstate(invalid="ignore"):
             position = (camera.eye + distance[:, None] * directions).astype(np.float32)
         position[triangle == SKY] = np.nan
@@ -337,7 +347,8 @@ def _edges(whole: Samples, scene: Scene, camera: Camera) -> Bools:
     tolerance = plane_tolerance(camera, whole.position, 1)
     for here, beside in ((number[:, :-1], number[:, 1:]), (number[:-1], number[1:])):
         some = surface[here] | surface[beside]
-        a, b = here[some], beside[some]
+        a = here[some]
+        b = beside[some]
         spot = whole.position[b], whole.normal[b], tolerance[a]
         same = alike(whole.position[a], whole.normal[a], *spot) > 0.3
         differs = (kind[a] != kind[b]) | ~same & (kind[a] != SKY)

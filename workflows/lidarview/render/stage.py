@@ -49,7 +49,8 @@ class PlotBox:
         widest = float((high - low).max()) or 1.0
         # A flat or pointlike box gets some width, so that there is something to look at.
         pad = np.maximum(np.array([0.15, 0.15, 0.0]) * widest - (high - low), 0) / 2
-        low, high = low - pad, high + pad
+        low = low - pad
+        high = high + pad
         high[2] = max(high[2], low[2] + 0.02 * widest)
         margin = 0.05 * widest
         ground = np.stack([low[:2] - margin, high[:2] + margin])

@@ -67,7 +67,9 @@ def apart(scene: Scene, objects: Integers, step: float) -> Scene:
     normals = unit(np.cross(b - a, c - a))
     place = _places(scene, objects)
     count = int(place.max(initial=-1)) + 1
-    mean, whole, inwards = np.zeros((count, 3)), np.full(count, 1e-30), np.zeros(count)
+    mean = np.zeros((count, 3))
+    whole = np.full(count, 1e-30)
+    inwards = np.zeros(count)
     around = zip((a, b, c), (b, c, a), (c, a, b), place[scene.faces].T, strict=True)
     for here, left, right, corner in around:
         angle = np.arccos(np.clip(dot(unit(left - here), unit(right - here)), -1, 1))
@@ -101,7 +103,8 @@ def dot(a: AnyFloats, b: AnyFloats) -> AnyFloats:
 def spiral(count: int, lowest: float = 0.0, highest: float = 1.0) -> Floats:
     """Spread unit vectors (count, 3) over the sphere between two heights: a golden spiral."""
     n = np.arange(count)
-    turn, up = 2 * np.pi * 0.6180339887 * n, lowest + (highest - lowest) * (n + 0.5) / count
+    turn = 2 * np.pi * 0.6180339887 * n
+    up = lowest + (highest - lowest) * (n + 0.5) / count
     level = np.sqrt(1 - up * up)
     return np.stack([level * np.cos(turn), level * np.sin(turn), up], axis=1)
 

@@ -11,9 +11,14 @@ from numpy.typing import ArrayLike
 
 from lidarsim.base.arrays import Floats
 
-PAGE, GROUND, LINE = "#ffffff", "#f1f3f5", "#c3cad3"
-INK, MUTED = "#1c2430", "#5d6876"
-CLAY, UNSEEN, SENSOR = "#d9dde2", "#c9ccd1", "#e0182d"
+PAGE = "#ffffff"
+GROUND = "#f1f3f5"
+LINE = "#c3cad3"
+INK = "#1c2430"
+MUTED = "#5d6876"
+CLAY = "#d9dde2"
+UNSEEN = "#c9ccd1"
+SENSOR = "#e0182d"
 VEIL = 0.085  # of MUTED over the page: the ground in a rendered picture
 # In pictures within a page, the page's style says what these are.
 STYLED = {

@@ -22,7 +22,8 @@ ScanRanges = tuple[tuple[int, int], ...]  # first and last scan of each range
 
 BLOCK = 1 << 15  # rows that are read at a time
 _FIRST_LOOK = 200_000  # points that tell how many are where in the picture
-_ACROSS, _DOWN = 48, 27
+_ACROSS = 48
+_DOWN = 27
 TILES = _ACROSS * _DOWN  # parts of a picture
 _KEPT = 0.8  # of the points, as often as they are too many
 
@@ -31,7 +32,8 @@ class HeldPoints:
     """Points in memory, in any order of their scans."""
 
     def __init__(self, cloud: Cloud) -> None:
-        self._cloud, self.table = cloud, cloud.table
+        self._cloud = cloud
+        self.table = cloud.table
 
     def __len__(self) -> int:
         return len(self._cloud)
@@ -164,7 +166,8 @@ class Eye:
         """Part of the picture of each point (n, 3): (n,); -1 outside."""
         at, inside = self.seen(places)
         across, down = (np.clip(at, -1, 0.9999).T + 1) / 2
-        column, row = (across * _ACROSS).astype(np.int64), (down * _DOWN).astype(np.int64)
+        column = (across * _ACROSS).astype(np.int64)
+        row = (down * _DOWN).astype(np.int64)
         return np.where(inside, row * _ACROSS + column, -1)
 
     def may_see(self, box: Floats) -> bool:
@@ -209,7 +212,8 @@ class PointFinder:
     """
 
     def __init__(self, points: Points, origin: Floats) -> None:
-        self.points, self._origin = points, origin
+        self.points = points
+        self._origin = origin
         self._boxes = np.full((-(-len(points) // BLOCK), 2, 3), np.nan)  # NaN for unread blocks
 
     def find(
@@ -275,12 +279,16 @@ class PointFinder:
         shares: Floats | None = None,
     ) -> tuple[Ints, int]:
         """Read blocks one after the other; the points that are kept become fewer on the way."""
-        random, thin, found, kept = np.random.default_rng(0), 1.0, 0, [np.empty(0, np.int64)]
+        random = np.random.default_rng(0)
+        thin = 1.0
+        found = 0
+        kept = [np.empty(0, np.int64)]
         for low, high in ranges:
             for number in range(low // BLOCK, -(-high // BLOCK)):
                 if abandoned():
                     raise Abandoned
-                first, last = max(low, number * BLOCK), min(high, (number + 1) * BLOCK)
+                first = max(low, number * BLOCK)
+                last = min(high, (number + 1) * BLOCK)
                 box = self._boxes[number]
                 is_read = not np.isnan(box[0, 0])
                 if eye is not None and is_read and not eye.may_see(box):

@@ -165,7 +165,8 @@ class _Question(_Guarded):
     """
 
     def initialize(self, source: Source, stop: Callable[[], None] | None) -> None:
-        self._source, self._stop = source, stop
+        self._source = source
+        self._stop = stop
         self._gone = threading.Event()
 
     async def get(self, what: str) -> None:
@@ -310,7 +311,8 @@ def announced(
             open_browser(page.once())
         yield
         return
-    url, words = page.url, escape(words)
+    url = page.url
+    words = escape(words)
     if hub := os.environ.get(_HUB):  # in a frame, 127.0.0.1 would be the reader's own machine
         url = f"{hub.rstrip('/')}/proxy/{page.port}/{page.token}/"
         words += (

@@ -75,9 +75,12 @@ _SAMPLE = 100_000  # points that colour scales and limits are taken from
 _MOST_COLOURINGS = 64  # colour scales that are kept, of columns and filters
 _HITS_SAMPLE = 500_000  # points that tell where on large triangles the hits are
 _MOST_NAMES = 2000  # in a menu
-_IMAGE_WIDTH, _IMAGE_ROWS = 1024, 128  # most columns; rows of sensors with few or many channels
+# most columns; rows of sensors with few or many channels
+_IMAGE_WIDTH = 1024
+_IMAGE_ROWS = 128
 _NO_GAPS = 0.9  # columns of a range image, as a share of a sensor's steps of azimuth
-_FEW, _MANY = 4, 512
+_FEW = 4
+_MANY = 512
 _DOWNWARDS = -0.7  # sine of the elevation
 _NARROW = math.radians(300)  # a sensor that sees less is no spinning one
 _NS = 1e9
@@ -247,9 +250,11 @@ class View:
             arrays["sweep_scans"] = self.sweeps.scans.astype(np.float64)
             arrays["sweep_begins"] = self.sweeps.begins_ns / _NS
             arrays["sweep_sensor"] = self.sweeps.sensor
-        pictured, objects = self.pictured, len(self._names("object"))
+        pictured = self.pictured
+        objects = len(self._names("object"))
         statics = objects - len(self.actors)
-        classes, several = self._classes_of_objects(), np.arange(len(self.results))
+        classes = self._classes_of_objects()
+        several = np.arange(len(self.results))
         header = {
             "title": self.title,
             "version": self.version,
@@ -301,7 +306,8 @@ class View:
             arrays[f"actor{k}_turns"] = turns
             arrays[f"actor{k}_there"] = np.array(presence_ns(actor.trajectory)) / _NS
             if (own := actor.mesh.animation) is not None:  # after the last pose, pages begin again
-                frames, last = actor.seconds(times)[0] / own.step_s, len(own.vertices) - 1 - 1e-6
+                frames = actor.seconds(times)[0] / own.step_s
+                last = len(own.vertices) - 1 - 1e-6
                 arrays[f"actor{k}_frames"] = frames if own.repeat else frames.clip(0, last)
         return arrays
 
@@ -369,7 +375,8 @@ class View:
 
     def _points(self, asked: Arguments, abandoned: Callable[[], bool]) -> Answer:
         """Points for a filter, ranges of scans and a camera, and their colours."""
-        finder, version = self._finder, self.version
+        finder = self._finder
+        version = self.version
         wanted, scans = self._wanted(asked)
         name = asked["colour"]
         column = self._coloured[name]
@@ -411,7 +418,8 @@ class View:
         column = self.columns[name]
         values = self._finder.points.values(name, self._finder.find(_SAMPLE)[0])
         values = values[np.isfinite(values)]
-        names, found = self._names(name), np.unique(values)
+        names = self._names(name)
+        found = np.unique(values)
         few = len(found) <= (_MOST_NAMES if names else MOST_ENTRIES) and name != "scan"
         if column.kind == "label" and len(found) and few:
             labels = [
@@ -457,7 +465,8 @@ class View:
             surface = self._surface = self._surface or ShownSurface(
                 pictured.scene, pictured.reflectance, self.triangles
             )
-        counts, places = pictured.hit_counts, np.zeros((0, 3), np.float32)
+        counts = pictured.hit_counts
+        places = np.zeros((0, 3), np.float32)
         if colour == "hits":
             counts = counts if self.hits is None else self.hits()
             counts = counts[: len(pictured.scene.faces)]
@@ -472,7 +481,8 @@ class View:
     @cached_property
     def _look_around(self) -> dict[str, float | None]:
         """Height of the floor; and where to cut a building if the sensors stand in one."""
-        surface, pictured = self._surface, self.pictured
+        surface = self._surface
+        pictured = self.pictured
         poses = [way.positions for way in self.sensors if len(way.positions)]
         if surface is None or pictured is None or not poses:
             return {"floor": None, "roof_cut": None}
@@ -483,12 +493,14 @@ class View:
 
     def _range(self, sweep: int) -> Answer:
         """Range image of a sweep: rows are channels from above, columns go from left to right."""
-        sweeps, finder = self.sweeps, self._finder
+        sweeps = self.sweeps
+        finder = self._finder
         if sweeps is None or not 0 <= sweep < len(sweeps):
             raise KeyError(sweep)
         first, last = (int(scan) for scan in sweeps.scans[sweep : sweep + 2])
         rows, _ = finder.find(MOST_POINTS, scans=((first, last - 1),))
-        image, limits = np.zeros((1, 1, 4), np.uint8), (0.0, 1.0)
+        image = np.zeros((1, 1, 4), np.uint8)
+        limits = (0.0, 1.0)
         number = int(sweeps.sensor[sweep])
         if len(rows):
             places = sweeps.in_sensor(sweep, positions(finder.points, rows))
@@ -515,11 +527,14 @@ def range_image(
     """
     downwards = float(np.median(places[:, 2] / np.maximum(ranges, 1e-9))) < _DOWNWARDS
     azimuth = np.arctan2(places[:, 1], -places[:, 2] if downwards else places[:, 0])
-    left, right = float(azimuth.max()), float(azimuth.min())
+    left = float(azimuth.max())
+    right = float(azimuth.min())
     if left - right > _NARROW:
-        left, right = math.pi, -math.pi
+        left = math.pi
+        right = -math.pi
     if downwards:
-        count, line = 1, np.zeros(len(places), np.int64)
+        count = 1
+        line = np.zeros(len(places), np.int64)
     elif channels is not None and _FEW <= (count := int(channels.max()) + 1) <= _MANY:
         line = count - 1 - channels
     else:
@@ -562,7 +577,8 @@ class ShownSurface:
     def __init__(
         self, scene: Scene, reflectance: Floats | None = None, most: int = MOST_TRIANGLES
     ) -> None:
-        self.coarse, self._reflectance = scene, reflectance
+        self.coarse = scene
+        self._reflectance = reflectance
         # (f,): which triangle stands for each of the scene; -1 where nothing is left.
         self._stands = np.arange(len(scene.faces))
         if len(scene.faces) > most:
@@ -594,7 +610,8 @@ class ShownSurface:
             return arrays, scale_legend(HITS_TITLE, marks) if hits.any() else None
         if by == "object":
             colouring = colours_of(self._objects, OBJECT, self.coarse.names)
-            colours, legend = colouring.paint(self._objects), legend_of(colouring)
+            colours = colouring.paint(self._objects)
+            legend = legend_of(colouring)
         elif by == "reflectance" and self._reflectance is not None:
             colours = mapped("gray", 0.1 + 0.9 * self._reflectance[self._objects])
             greys = mapped("gray", np.linspace(0.1, 1.0, 9))
@@ -714,7 +731,9 @@ def open_result(path: Path, downloads: Downloads | None = None) -> View:
         )
     scene_file = path / PICTURE_FILE
     sweeps_file = path / SWEEPS_FILE
-    pictured, sweeps, note = None, None, ""
+    pictured = None
+    sweeps = None
+    note = ""
     try:
         sweeps = Sweeps.load(sweeps_file) if sweeps_file.exists() else None
         pictured = PictureContent.load(scene_file) if scene_file.exists() else None

@@ -43,7 +43,8 @@ _THIN = 1.2  # least width of a bar, in units
 _GAP = 0.6  # bars nearer than this are drawn as one
 TimeSpan = tuple[float, float]
 WorkerTasks = dict[tuple[str, str], list[TaskRecord]]  # {(worker, stage): their tasks}
-MINUS, NARROW = "\N{MINUS SIGN}", "\N{NARROW NO-BREAK SPACE}"
+MINUS = "\N{MINUS SIGN}"
+NARROW = "\N{NARROW NO-BREAK SPACE}"
 _SPACES = f"\n\t\N{NO-BREAK SPACE}{NARROW}"  # not printable to Python, and harmless
 
 
@@ -216,7 +217,8 @@ def make_timeline(stages: Sequence[StageTotals]) -> dict[str, Any] | None:
             nlargest(ROWS_MOST, tasks, key=lambda key: busy[key]),
             key=lambda key: (natural(key[0]), [*STAGES].index(key[1])),
         ):
-            some, work = tasks[worker, stage], duration(busy[worker, stage])
+            some = tasks[worker, stage]
+            work = duration(busy[worker, stage])
             words = f"{STAGES[stage]}, {plural(len(some), 'task')}, {work}"
             rows.append(row(worker, stage, words, ((task.start, task.stop) for task in some)))
         groups.append({"title": partition, "detail": detail, "rows": rows})

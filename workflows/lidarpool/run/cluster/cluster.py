@@ -72,7 +72,8 @@ class Cluster:
             options.cluster.require(needed)
         waiting = Waiting(options.wait_s, screen.tell)
         self.client = client = enter(client_of(options, needed, waiting, screen))
-        self.options, self._screen = options, screen
+        self.options = options
+        self._screen = screen
         # For errors about a lost cluster; a client that was never connected is refused below.
         self.address: str = getattr(client.scheduler, "address", "")
         if client.asynchronous:

@@ -24,7 +24,8 @@ from ..pipeline.names import GPU, LIDAR, OTHER
 
 # A scheduler that SSH has started outlives a driver that was killed: it ends when it has been
 # without tasks for so long. And a host that does not answer is given up after so long.
-_IDLE, _CONNECT = "1h", "30s"
+_IDLE = "1h"
+_CONNECT = "30s"
 
 
 class WorkerGroup(BaseModel):

@@ -25,7 +25,9 @@ class Tasks(Generic[T]):
     """
 
     def __init__(self, partition: Partition, sources: str) -> None:
-        self._client, self.partition, self._sources = partition.client, partition, sources
+        self._client = partition.client
+        self.partition = partition
+        self._sources = sources
         self.book = TaskBook()
         self.running: dict[Future, T] = {}  # {future: what it is for}
         # {plug-in that the tasks use: its version, which their workers must have}

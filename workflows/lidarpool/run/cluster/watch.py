@@ -27,7 +27,8 @@ class Waiting:
     """
 
     def __init__(self, seconds: float = 0.0, tell: Callable[[str], None] = lambda words: None):
-        self.seconds, self._tell = seconds, tell
+        self.seconds = seconds
+        self._tell = tell
         self._told = float("-inf")
 
     @cached_property
@@ -73,7 +74,9 @@ class Watch:
         patience_s: float = PATIENCE_S,
         tell: Callable[[str], None] = lambda words: None,
     ) -> None:
-        self.client, self.lasting, self._tell = client, frozenset(lasting), tell
+        self.client = client
+        self.lasting = frozenset(lasting)
+        self._tell = tell
         # {partition: how long it may be without workers}
         self._waits = {name: Waiting(patience_s, tell) for name in (*names, *self.lasting)}
         self._looked = float("-inf")
@@ -90,7 +93,9 @@ class Watch:
         if now - self._looked < WATCH_EVERY_S:
             return
         self._looked = now
-        there, paused = set(), set()  # partitions with workers, and with those that take no tasks
+        # partitions with workers, and with those that take no tasks
+        there = set()
+        paused = set()
         for worker in worker_identities(self.client).values():
             for name in self._waits.keys() & worker["resources"].keys():
                 if worker["status"] == "running" or name in self.lasting:

@@ -62,4 +62,5 @@ class Batch:
 
     def move(self, place: BatchState) -> None:
         """Record its new state."""
-        self.place, self.since = place, time.monotonic()
+        self.place = place
+        self.since = time.monotonic()

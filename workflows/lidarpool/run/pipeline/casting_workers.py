@@ -72,8 +72,11 @@ class CastingWorkers:
     def __init__(
         self, partition: Partition, run: str, backend: str, software: Mapping[str, str]
     ) -> None:
-        self._client, self._partition, self.run = partition.client, partition, run
-        self._backend, self._software = backend, dict(software)
+        self._client = partition.client
+        self._partition = partition
+        self.run = run
+        self._backend = backend
+        self._software = dict(software)
         # {job: what its rig is made of: a plan, and the scene's still part, which others may share}
         self._jobs: dict[int, tuple[_Packed, _Packed]] = {}
         # Of jobs, and those used last; what packs them keeps what they are known by.

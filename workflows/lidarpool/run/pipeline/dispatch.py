@@ -53,7 +53,9 @@ class Dispatcher:
         self.batches: dict[tuple[int, int], Batch] = {}  # {(job, first scan): batch}
         self.failed: dict[PipelineJob, JobError] = {}
         self.advice = 1  # scans that stage 1 was told to put into an item
-        self._workers, self._stages, self._mark = workers, stages, mark
+        self._workers = workers
+        self._stages = stages
+        self._mark = mark
         self._tasks: dict[str, list[Batch]] = {}  # {key of a casting task: its batches left}
         self._count = 0  # of batches so far
         self._last: deque[tuple[float, int]] = deque(maxlen=64)  # casting time and scans of batches
@@ -71,7 +73,9 @@ class Dispatcher:
 
     def _within(self, receipt: Receipt) -> list[Batch]:
         """Batches whose scans are all in a part."""
-        job, first, stop = receipt.job, receipt.first, receipt.stop
+        job = receipt.job
+        first = receipt.first
+        stop = receipt.stop
         found = self.batches.get((job, first))
         if found is not None and found.stop == stop:
             return [found]
@@ -83,7 +87,8 @@ class Dispatcher:
     @property
     def most(self) -> int:
         """Batches that may be under way, by weight."""
-        slots, collectors = self._workers.slot_count, self._stages.collector_count
+        slots = self._workers.slot_count
+        collectors = self._stages.collector_count
         return policies.most_under_way(slots, collectors, self.per_task)
 
     def room(self, job: PipelineJob) -> float:
@@ -145,7 +150,9 @@ class Dispatcher:
             key = self._workers.cast(spans, worker)
             self._tasks[key] = task
             for batch in task:
-                batch.key, batch.worker, batch.collector = key, worker, ""
+                batch.key = key
+                batch.worker = worker
+                batch.collector = ""
                 batch.move(BatchState.CASTING)
                 batch.job.trace("submit", INTERSECT, batch.scans)
         return bool(chosen)
@@ -173,7 +180,8 @@ class Dispatcher:
 
     def leave_workers(self, seen: TaskLocations) -> None:
         """Offer batches again whose workers died, are silent, late, or take no tasks."""
-        prepared, late_s = len(self._workers.slots), policies.late_after_s(self._last)
+        prepared = len(self._workers.slots)
+        late_s = policies.late_after_s(self._last)
         for batch in [*self.batches.values()]:
             if why := policies.loss(batch, seen, prepared, time.monotonic(), late_s):
                 self._again(batch, why.value)
@@ -201,7 +209,8 @@ class Dispatcher:
 
     def _forget(self, batch: Batch) -> None:
         """Drop a batch's casting task, unless others of the same task need it."""
-        key, batch.key = batch.key, ""
+        key = batch.key
+        batch.key = ""
         if (left := self._tasks.get(key)) is not None:
             left.remove(batch)
             if not left:
@@ -246,7 +255,8 @@ class Dispatcher:
         """
         deaths = self._first_deaths.setdefault(batch.job, [])
         deaths[:] = [o for o in deaths if o.stop <= batch.first or batch.stop <= o.first] + [batch]
-        batch.order, self._count = self._count, self._count + 1
+        batch.order = self._count
+        self._count = self._count + 1
         if len(deaths) >= policies.KILLS_MOST:
             names = ", ".join(scans_in_words(one.first, one.stop) for one in deaths)
             error = JobError(
@@ -268,7 +278,9 @@ class Dispatcher:
         for task, name in policies.handovers(there, self._stages.collectors):
             parts = []
             for batch in task:
-                batch.collector, number, first = name, batch.job.number, batch.first
+                batch.collector = name
+                number = batch.job.number
+                first = batch.first
                 batch.move(BatchState.COLLECTING)
                 batch.job.trace("handon", COLLECT, batch.scans)
                 part = part_name(self._mark, number, first, batch.stop)

@@ -84,9 +84,12 @@ class LongStages:
         collectors: int,
         patience_s: float,
     ) -> None:
-        self.client, self.partition, self.run = partition.client, partition, run
+        self.client = partition.client
+        self.partition = partition
+        self.run = run
         self.collector_count = collectors
-        self._sources, self._storage = sources, storage
+        self._sources = sources
+        self._storage = storage
         self._lock_name = f"lidarpool-start-{partition.name}"
         self._patience_s = patience_s
         self._names = [GENERATE, SORT, *(f"{COLLECT}-{number}" for number in range(collectors))]
@@ -197,7 +200,9 @@ class LongStages:
 
     def _start_all(self) -> None:
         # All or none, and under a lock: two runs might each get slots that the other needs.
-        seen, now, needed = self._look(), time.monotonic(), len(self._names)
+        seen = self._look()
+        now = time.monotonic()
+        needed = len(self._names)
         free = {address: count for address, count in seen.free.items() if count > 0}
         if sum(free.values()) < needed:
             self.waiting = seen.slots >= needed
@@ -247,7 +252,8 @@ class LongStages:
             return {}, ()
         self._looked_at = now
         if progress > self._progress:
-            self._progress, self._deaths = progress, {}
+            self._progress = progress
+            self._deaths = {}
         if not self._tasks:
             self._start()
             return {}, [*self._tasks]
@@ -316,7 +322,8 @@ class LongStages:
         """
         worker = max(free, key=lambda address: (free[address], address))
         free[worker] -= 1
-        number, self._submitted = self._submitted, self._submitted + 1
+        number = self._submitted
+        self._submitted = self._submitted + 1
         earlier = self._tasks.get(name)
         if earlier is not None:
             forget_pipes(self.client, [earlier.inlet.name])

@@ -132,10 +132,12 @@ class Receipt(Scans):
     ) -> Receipt:
         """Make the receipt of a part, from what the part itself says."""
         summaries = np.zeros(len(part.counts), summary_type(part.samples.shape[1]))
-        summaries["hits"], summaries["points"] = part.scan_hits, part.counts
+        summaries["hits"] = part.scan_hits
+        summaries["points"] = part.counts
         summaries["samples"] = part.samples
         box = () if (cells := part.cells) is None else tuple(cells.ravel().tolist())
-        hits, data = int(part.scan_hits.sum()), summaries.tobytes()
+        hits = int(part.scan_hits.sum())
+        data = summaries.tobytes()
         return cls(job, part.first, part.stop, name, len(part), size, hits, box, data, record)
 
 

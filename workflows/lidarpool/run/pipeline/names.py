@@ -1,6 +1,8 @@
 """Names of the stages and of the partitions that they run on; a leaf module."""
 
-GPU, LIDAR, OTHER = "GPU", "LIDAR", "OTHER"
+GPU = "GPU"
+LIDAR = "LIDAR"
+OTHER = "OTHER"
 
 GENERATE = "generate"  # 1, on LIDAR: one long task
 INTERSECT = "intersect"  # 2, on GPU: a short task for each batch

@@ -36,7 +36,9 @@ from .task_book import TaskBook
 
 STALL_S = 60.0  # without news from the sorter; then it gets its summaries again
 WAIT_S = 0.05  # for news, where there is nothing else to do
-LINGER_S, MOST_LINGERING = 0.004, 25  # of a wait, for more news: for each job or batch of a task
+# of a wait, for more news: for each job or batch of a task
+LINGER_S = 0.004
+MOST_LINGERING = 25
 CLOSING_S = 0.001  # longest wait while the stages end
 ANNOUNCED = 2  # jobs that stage 1 should have before it, however large they are
 
@@ -120,7 +122,8 @@ class Pipeline:
     @property
     def has_room(self) -> bool:
         """Whether another job should begin, so that stage 1 always has scans to describe."""
-        most, advice = self.dispatcher.most, self.dispatcher.advice
+        most = self.dispatcher.most
+        advice = self.dispatcher.advice
         if len(self.jobs) >= most:
             return False
         if len(self._announced) < ANNOUNCED:
@@ -133,7 +136,8 @@ class Pipeline:
 
     def take_ended(self) -> list[tuple[PipelineJob, JobError | None]]:
         """Return the jobs that are complete, or failed by an error, since the last call."""
-        ended, self._ended = self._ended, []
+        ended = self._ended
+        self._ended = []
         return ended
 
     def _end(self, job: PipelineJob, error: JobError | None = None) -> None:
@@ -167,7 +171,8 @@ class Pipeline:
 
         LidarError if something fails that all jobs need.
         """
-        messages, self.stages.inbox = self.stages.inbox, []
+        messages = self.stages.inbox
+        self.stages.inbox = []
         moved = bool(messages)
         self._commit([message for message in messages if isinstance(message, Receipt)])
         for message in messages:
@@ -186,7 +191,8 @@ class Pipeline:
         if self.stages.closed:
             self.stages.wait(min(seconds, CLOSING_S), [], scans=False)
         else:
-            seconds, keys = max(seconds, WAIT_S), [*self.workers.pending, *keys]
+            seconds = max(seconds, WAIT_S)
+            keys = [*self.workers.pending, *keys]
             # Small jobs and batches come in dozens, and while there are many of them nobody waits
             # for one. Each step costs a millisecond or two, whatever has come.
             small = max(len(self.jobs), self.dispatcher.per_task)

@@ -45,7 +45,8 @@ class Recorder:
     """Records time and worker of the current task; `done` returns the record."""
 
     def __init__(self, stage: str, partition: str) -> None:
-        self.stage, self.partition = stage, partition
+        self.stage = stage
+        self.partition = partition
         self.start = time.time()
         # The clock may be set while the task runs; its time must not become hours, or negative.
         self._begun = time.perf_counter()

@@ -80,7 +80,8 @@ class RunDatabase:
     """
 
     def __init__(self, path: Path, *, durable: bool = True, **new: str) -> None:
-        self.path, self._durable = path, durable
+        self.path = path
+        self._durable = durable
         self.meta: dict[str, str] = {}
         # Numbers of the jobs that have not ended and of which something is committed.
         self.begun: set[int] = set()
@@ -139,12 +140,14 @@ class RunDatabase:
                 self._read(job)
 
     def _read(self, job: CommittedJob) -> None:
-        number, scans = job.number, job.scans
+        number = job.number
+        scans = job.scans
         query = "SELECT first, stop, rows, size, hits, cells FROM parts WHERE job = ?"
         for first, stop, *counts, cells in self._rows(query, number):
             if not scans.start <= first < stop <= scans.stop:
                 raise ValueError(f"a part has scans {first} to {stop} of {scans}")
-            name, box = part_name(self.meta["mark"], number, first, stop), json.loads(cells)
+            name = part_name(self.meta["mark"], number, first, stop)
+            box = json.loads(cells)
             rows, size, hits = counts
             job.parts.add(Receipt(number, first, stop, name, rows, size, hits, tuple(box), b""))
         query = "SELECT data FROM trials WHERE job = ? ORDER BY trial"
@@ -376,7 +379,8 @@ def parts_folder(mark: str) -> str:
 
 def _checked_place(meta: Mapping[str, str]) -> tuple[str, str]:
     """Mark and place of parts of a database's values; ValueError if they are not of a run."""
-    mark, place = meta["mark"], meta.get("parts", "")
+    mark = meta["mark"]
+    place = meta.get("parts", "")
     if not re.fullmatch("[0-9a-f]{16}", mark):
         raise ValueError(f"{mark!r} is not the mark of a run")
     if place and not place.endswith(f"/{parts_folder(mark)}"):

@@ -121,7 +121,8 @@ class JobUnderWay(PipelineJob):
 
     def points(self) -> StoredCloud:
         """Return the points that are committed so far."""
-        parts, job = self.parts.ordered, self.job
+        parts = self.parts.ordered
+        job = self.job
         world = job.survey.coordinates == "world"
         return StoredCloud(
             self.storage,

@@ -126,7 +126,8 @@ class RunStore:
                     self.begun = True
                     return db
                 db.close()
-                mark, earlier_parts = db.meta["mark"], db.meta.get("parts", "")
+                mark = db.meta["mark"]
+                earlier_parts = db.meta.get("parts", "")
         except DamagedError as error:
             damage = error
         except LidarError as error:  # the copy of a database is nobody's business

@@ -88,7 +88,9 @@ def read_gltf(data: bytes, path: Path, wanted: Wanted) -> Content:
         content = settled(instances(_roots(header), reader.node, path.stem))
     else:
         content = reader.baked(wanted.animation)
-    content.unit_m, content.up_axis, content.turned = 1.0, "y", "as glTF asks"
+    content.unit_m = 1.0
+    content.up_axis = "y"
+    content.turned = "as glTF asks"
     content.notes = [*reader.notes.lines(), *reader.still()]
     content.generator = str(header.get("asset", {}).get("generator", ""))
     return content
@@ -151,7 +153,9 @@ class _Reader:
         size: int,
         wanted: Wanted,
     ) -> None:
-        self._header, self._body, self._path = header, body, path
+        self._header = header
+        self._body = body
+        self._path = path
         self._wanted = wanted
         self._allowance = Allowance(size, SMALLER if wanted.animation is None else SHORTER)
         self._same: dict[str, int] = {}  # {primitives of a mesh: the first with these}
@@ -216,19 +220,23 @@ class _Reader:
     def node(self, index: int) -> Node:
         """Node `index`; without a name it gets that of its mesh."""
         found = self._part("nodes", index)
-        name, meshes, copies = str(found.get("name") or ""), list[SceneMesh](), None
+        name = str(found.get("name") or "")
+        meshes = list[SceneMesh]()
+        copies = None
         if "mesh" in found:
             name = name or str(self._part("meshes", found["mesh"]).get("name") or "")
             # Some programs write a mesh for each node, all of the same accessors.
             content = json.dumps(self._part("meshes", found["mesh"])["primitives"], sort_keys=True)
-            skin, weights = found.get("skin"), self._weights(index, found)
+            skin = found.get("skin")
+            weights = self._weights(index, found)
             if skin is None and not any(weights):
                 meshes = self._mesh(self._same.setdefault(content, found["mesh"]))
             else:
                 meshes = self._bent(found["mesh"], weights, skin)
             if instancing := found.get("extensions", {}).get(_INSTANCING):
                 copies = self._copies(instancing.get("attributes", {}))
-        children, skinned = found.get("children", ()), "skin" in found
+        children = found.get("children", ())
+        skinned = "skin" in found
         return Node(name, self._local(index), meshes, children, copies, skinned)
 
     def _copies(self, attributes: dict[str, Any]) -> Floats | None:
@@ -251,7 +259,8 @@ class _Reader:
 
     def still(self) -> list[str]:
         """Return a note on what moves in the file, and stands still here."""
-        bent, found = self._bent.cache_info().currsize, len(self._header.get("animations", ()))
+        bent = self._bent.cache_info().currsize
+        found = len(self._header.get("animations", ()))
         meshes = f", of {plural(bent, 'bent mesh', 'bent meshes')}" * bool(bent)
         if self._channels:
             cut = any(m.get("alphaMode") in _CUT for m in self._header.get("materials", ()))
@@ -274,14 +283,16 @@ class _Reader:
 
     def _world(self, index: int) -> Floats:
         """Matrix (4, 4) from a node's coordinates to those of the scene."""
-        path, worlds = [index], self._worlds
+        path = [index]
+        worlds = self._worlds
         while path[-1] not in worlds and path[-1] in self._parents:
             path.append(self._parents[path[-1]])
             if len(path) > len(self._parents) + 1:
                 raise ValueError("nodes contain each other")
         for at in reversed(path):
             if at not in worlds:
-                own, above = self._local(at), self._parents.get(at)
+                own = self._local(at)
+                above = self._parents.get(at)
                 worlds[at] = own if above is None else matmul(worlds[above], own)
         return worlds[index]
 
@@ -327,7 +338,8 @@ class _Reader:
 
     def _skinned(self, vertices: Floats, at: dict[str, Any], joints: Floats) -> Floats:
         """Blend places of vertices (v, 3) by the joints that hold them."""
-        blend, total = np.zeros((len(vertices), 4, 4)), np.zeros(len(vertices))
+        blend = np.zeros((len(vertices), 4, 4))
+        total = np.zeros(len(vertices))
         sets = (name.removeprefix("JOINTS") for name in sorted(at) if name.startswith("JOINTS_"))
         for number in sets:
             rows = self._accessor(at[f"JOINTS{number}"]).astype(np.int64)
@@ -345,7 +357,8 @@ class _Reader:
         return np.asarray(moved)
 
     def _primitive(self, primitive: dict[str, Any]) -> Piece:
-        position, index = primitive["attributes"].get("POSITION"), primitive.get("indices")
+        position = primitive["attributes"].get("POSITION")
+        index = primitive.get("indices")
         packed = primitive.get("extensions", {}).get(_DRACO)
         if position is None:
             return Piece(np.empty((0, 3)), np.empty((0, 3), np.int64))
@@ -379,7 +392,9 @@ class _Reader:
 
     def _coloured(self, primitive: dict[str, Any], faces: Ints, mesh: Any) -> Colours | None:
         """Colours of triangles; None if they have none."""
-        number, corners, colours = primitive.get("material"), None, None
+        number = primitive.get("material")
+        corners = None
+        colours = None
         if not self._allowance.fits(FACE_BYTES * len(faces)):
             raise MaskError("there are too many triangles")
         if "COLOR_0" in primitive["attributes"]:
@@ -516,7 +531,8 @@ class _Reader:
     def _read_accessor(self, index: int) -> AnyArray:
         """Numbers (count, width) of an accessor; those of a buffer are not copied."""
         accessor = self._part("accessors", index)
-        count, width = _natural(accessor["count"]), _WIDTHS[accessor["type"]]
+        count = _natural(accessor["count"])
+        width = _WIDTHS[accessor["type"]]
         kind = np.dtype(_TYPES[accessor["componentType"]])
         sparse = accessor.get("sparse")
         if sparse:
@@ -528,7 +544,8 @@ class _Reader:
         else:
             raise ValueError(f"accessor {index} has no content")
         if sparse:
-            changed, values = sparse["indices"], sparse["values"]
+            changed = sparse["indices"]
+            values = sparse["values"]
             where = np.dtype(_TYPES[changed["componentType"]])
             rows = self._array(changed, where, sparse["count"], 1)[:, 0]
             numbers = numbers.copy()
@@ -602,7 +619,8 @@ def _extension(part: dict[str, Any], name: str) -> dict[str, Any]:
 
 def _base_of(material: dict[str, Any]) -> tuple[dict[str, Any] | None, Sequence[float]]:
     """Use of the texture of a material's base colour, if it has one, and its factors."""
-    usual, glossy = material.get("pbrMetallicRoughness", {}), _extension(material, _GLOSSY)
+    usual = material.get("pbrMetallicRoughness", {})
+    glossy = _extension(material, _GLOSSY)
     info = usual.get("baseColorTexture") or glossy.get("diffuseTexture")
     return info, usual.get("baseColorFactor") or glossy.get("diffuseFactor") or (1, 1, 1, 1)
 

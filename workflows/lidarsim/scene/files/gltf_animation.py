@@ -44,11 +44,13 @@ def played(
     """Return what an animation moves, at times (t,); `read` gives the numbers of an accessor."""
     found: AnimatedNodes = {}
     for channel in animation["channels"]:
-        target, sampler = channel["target"], animation["samplers"][channel["sampler"]]
+        target = channel["target"]
+        sampler = animation["samplers"][channel["sampler"]]
         if "node" not in target or target["path"] not in (*WIDTHS, "weights"):
             continue  # of extensions, which move nothing that reflects light
         keys = read(sampler["input"])[:, 0].astype(np.float64)
-        kind, path = sampler.get("interpolation", "LINEAR"), target["path"]
+        kind = sampler.get("interpolation", "LINEAR")
+        path = target["path"]
         values = read(sampler["output"]).astype(np.float64)
         values = values.reshape(len(keys), _VALUES[kind], -1)
         if values.shape[2] != WIDTHS.get(path, values.shape[2]):
@@ -69,7 +71,8 @@ def _sampled(keys: Floats, values: Floats, at_s: Floats, kind: str, turns: bool)
         found = np.where(share < 1, one, other)
     elif kind == "CUBICSPLINE":
         out, into = (values[k, at] * seconds[:, None] for k, at in ((begin, 2), (end, 0)))
-        square, cube = share * share, share * share * share
+        square = share * share
+        cube = share * share * share
         bend = (cube - 2 * square + share) * out + (cube - square) * into
         found = (2 * cube - 3 * square + 1) * one + (3 * square - 2 * cube) * other + bend
     elif turns:

@@ -17,13 +17,20 @@ from ...base.errors import LidarError
 
 # Records of LASF_Projection, by ASPRS LAS 1.4.
 _WKT = 2112
-_GEO_KEYS, _GEO_DOUBLES = 34735, 34736
+_GEO_KEYS = 34735
+_GEO_DOUBLES = 34736
 
 # GeoTIFF keys, by OGC GeoTIFF 1.1.
-_MODEL_TYPE, _GEODETIC_CRS = 1024, 2048
-_PROJECTED_CRS, _LINEAR_UNIT, _LINEAR_UNIT_SIZE = 3072, 3076, 3077
-_VERTICAL_CRS, _VERTICAL_UNIT = 4096, 4099
-_GEOGRAPHIC, _GEOCENTRIC = 2, 3  # models
+_MODEL_TYPE = 1024
+_GEODETIC_CRS = 2048
+_PROJECTED_CRS = 3072
+_LINEAR_UNIT = 3076
+_LINEAR_UNIT_SIZE = 3077
+_VERTICAL_CRS = 4096
+_VERTICAL_UNIT = 4099
+# models
+_GEOGRAPHIC = 2
+_GEOCENTRIC = 3
 _USER_DEFINED = 32767
 
 _EPSG_UNITS = {  # {EPSG code: (name, metres)}
@@ -252,7 +259,8 @@ def _units_of_keys(keys: Mapping[int, float]) -> CoordinateUnits | None:
     ):
         code = int(keys.get(_GEODETIC_CRS, 0))
         raise LidarError(f"its coordinates are angles, or geocentric (EPSG:{code}): {_PROJECT}.")
-    unit, heights = _unit_of_code(keys.get(_LINEAR_UNIT)), None
+    unit = _unit_of_code(keys.get(_LINEAR_UNIT))
+    heights = None
     if keys.get(_LINEAR_UNIT) == _USER_DEFINED and _LINEAR_UNIT_SIZE in keys:
         unit = CoordinateUnit("of its own", keys[_LINEAR_UNIT_SIZE])
     if projected not in (0, _USER_DEFINED) and unit is None:

@@ -276,10 +276,13 @@ def _tell_axes(
     axes: Callable[[str], None] | None,
 ) -> None:
     if content.turned and content.up_axis == "y":
-        why, other = _lies(content, meshes), "z"
+        why = _lies(content, meshes)
+        other = "z"
         done = f"was turned from Y-up to Z-up, {content.turned}{why}"
     elif path.suffix.lower() == ".obj":  # the one without axes that is Y-up as often as not
-        done, why, other = "states no axes and is taken as Z-up", "", "y"
+        done = "states no axes and is taken as Z-up"
+        why = ""
+        other = "y"
     else:
         return
     (axes or (warn if why else lambda note: _log.info(as_python(note))))(
@@ -422,7 +425,8 @@ def _actor(one: RigidPart, stem: str, upright: Transform, placed: Transform) -> 
     """
     name = printable(one.name) or printable(stem)
     unit_m, scale = (cbrt(determinant(place.linear)) for place in (upright, placed))
-    axes, turn = upright.linear / unit_m, placed.linear / scale
+    axes = upright.linear / unit_m
+    turn = placed.linear / scale
     if np.abs(matmul(turn, turn.T) - np.eye(3)).max() > _EVEN:
         raise LidarError(
             f"Object {name!r} moves, and its placement scales it unevenly: give one factor."

@@ -85,7 +85,8 @@ class MtlMaterials:
 
     def __init__(self, mesh: Path, size: int, libraries: Sequence[bytes], wanted: Wanted) -> None:
         self.notes = MaskNotes()
-        self._mesh, self._wanted = mesh, wanted
+        self._mesh = mesh
+        self._wanted = wanted
         self._allowance = Allowance(size, SMALLER)
         self._opacity, self._mask = remembered(self._read_opacity), remembered(self._read_mask)
         self._image = remembered(self._read_image)

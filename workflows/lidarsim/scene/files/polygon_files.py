@@ -47,7 +47,8 @@ class _ObjPolygons:
 
     def triangles(self, vertices: Floats) -> tuple[Ints, Ints, Ints]:
         """Vertices (t, 3), texture coordinates (t, 3) and materials (t,) of triangles."""
-        corners, sizes = _ints(self.corners), _ints(self.sizes)
+        corners = _ints(self.corners)
+        sizes = _ints(self.sizes)
         check_corners(corners, len(vertices))
         if not self.kinds:  # as a whole, without materials
             own = triangulated(vertices, corners, sizes)
@@ -65,16 +66,22 @@ def read_obj(data: bytes, path: Path, wanted: Wanted) -> Content:
     masks, triangles are solid; without these, colours and wanted materials, neither files of
     materials nor images are read.
     """
-    masks, colours = wanted.masks, wanted.colours
+    masks = wanted.masks
+    colours = wanted.colours
     text = data.replace(b"\r\n", b"\n").replace(b"\r", b"\n")
     text = text.replace(b"\\\n", b" ").replace(b"\t", b" ")
     divider = b"o" if re.search(rb"^ *o ", text, re.MULTILINE) else b"g"
     libraries = _obj_names(b"mtllib", text) if masks or colours else []
     materials = MtlMaterials(path, len(data), libraries, wanted)
     dressed = materials.has_masks or colours or wanted.materials
-    numbers, coordinates, tints = array("d"), array("d"), array("d")
+    numbers = array("d")
+    coordinates = array("d")
+    tints = array("d")
     parts = {(path.stem, 0): _ObjPolygons()}  # {(name, number of the line 'o'): polygons}
-    part, kind, kinds = parts[path.stem, 0], 0, {b"": 0}  # {material: its number}
+    # {material: its number}
+    part = parts[path.stem, 0]
+    kind = 0
+    kinds = {b"": 0}
     for line in text.split(b"\n"):
         key, _, rest = line.lstrip(b" ").partition(b" ")
         if key == b"v":
@@ -104,12 +111,14 @@ def read_obj(data: bytes, path: Path, wanted: Wanted) -> Content:
     tinted = None
     if colours and len(tints) == len(numbers):
         tinted = as_bytes(_shares(np.frombuffer(tints).reshape(-1, 3)))
-    names, meshes = list(kinds), list[SceneMesh]()
+    names = list(kinds)
+    meshes = list[SceneMesh]()
     for (name, _), part in parts.items():
         faces, at, kind_of = part.triangles(vertices)
         pieces = []
         for number in np.unique(kind_of).tolist():
-            rows, material = np.flatnonzero(kind_of == number), names[number]
+            rows = np.flatnonzero(kind_of == number)
+            material = names[number]
             cutout = materials.cutout(material, uv, at[rows])
             corners_of = None if tinted is None else tinted[faces[rows]]
             shown = materials.colours(material, uv, at[rows], corners_of)
@@ -185,7 +194,10 @@ def read_off(data: bytes, path: Path, wanted: Wanted) -> Content:
             f"{points:,} vertices and {polygons:,} faces announced, each in a line of its own, and "
             f"{len(lines):,} lines there"
         )
-    numbers, tints, corners, sizes = array("d"), array("d"), array("q"), array("q")
+    numbers = array("d")
+    tints = array("d")
+    corners = array("q")
+    sizes = array("q")
     coloured = wanted.colours and found is not None and found[0].upper() == b"COFF"
     for line in lines[:points]:
         if len(line) < 3:
@@ -200,7 +212,8 @@ def read_off(data: bytes, path: Path, wanted: Wanted) -> Content:
         corners.extend(map(int, line[1 : size + 1]))
         sizes.append(size)
     vertices = np.frombuffer(numbers).reshape(-1, 3)
-    faces, shown = triangulated(vertices, _ints(corners), _ints(sizes)), None
+    faces = triangulated(vertices, _ints(corners), _ints(sizes))
+    shown = None
     if coloured and len(tints) == len(numbers):
         shown = _tinted(_shares(np.frombuffer(tints).reshape(-1, 3)), faces)
     return Content(joined(path.stem, [Piece(vertices, faces, None, shown)]))
@@ -298,10 +311,12 @@ def read_ply_mesh(data: bytes, path: Path, wanted: Wanted) -> Content:
     corners = numbers.astype(np.int64)
     if not np.array_equal(corners, numbers):
         raise ValueError("vertex indices of faces are not whole numbers")
-    faces, shown = triangulated(vertices, corners, sizes), None
+    faces = triangulated(vertices, corners, sizes)
+    shown = None
     if wanted.colours and all(name in rows["vertex"] for name in _PLY_COLOURS):
         given = np.stack([rows["vertex"][name][0] for name in _PLY_COLOURS], axis=1)
-        given, kind = given.astype(np.float64), np.dtype(types["vertex"]["red"][0])
+        given = given.astype(np.float64)
+        kind = np.dtype(types["vertex"]["red"][0])
         # Integers of four bytes hold 0 to 255, too.
         small = kind.kind in "iu" and kind.itemsize < 4
         shown = _tinted(given / np.iinfo(kind).max if small else _shares(given), faces)
@@ -384,7 +399,8 @@ def _element_rows(
     element: _Element, order: str, body: bytes, at: int
 ) -> tuple[dict[str, tuple[AnyArray, Ints]], int]:
     """Numbers and lengths of all properties, and the end of the rows."""
-    count, names = element.count, list(element.properties)
+    count = element.count
+    names = list(element.properties)
     kinds = {name: np.dtype(order + kind) for name, (kind, _) in element.properties.items()}
     first, end = (
         _ply_row(element, kinds, order, body, at) if count else ([(at, 1)] * len(names), at)
@@ -430,7 +446,8 @@ def _ply_row(
             (n,) = struct.unpack_from(order + np.dtype(length).char, body, at)
             if n < 0 or n != int(n):
                 raise ValueError(f"a list has the length {n}")
-            at, n = at + int(length[1]), int(n)
+            at = at + int(length[1])
+            n = int(n)
         out.append((at, n))
         at += n * kinds[name].itemsize
     if at > len(body):

@@ -86,7 +86,8 @@ def with_holes(vertices: Floats, rings: list[Ints]) -> Ints:
     outline = points[: len(rings[0])]
     normal = _newell(outline)
     drop = int(np.abs(normal).argmax())
-    across, up = (drop + 1) % 3, (drop + 2) % 3
+    across = (drop + 1) % 3
+    up = (drop + 2) % 3
     if normal[drop] < 0:  # the clipper's triangles run anticlockwise, whatever the polygon does
         across, up = up, across
     return corners[_clipped(points[:, [across, up]], [len(ring) for ring in rings])]

@@ -24,7 +24,8 @@ from ..scene_mesh import Cutout, SceneMesh, compacted, stacked
 from .polygons import check_corners
 
 # What helps if a file unpacks to too much, without and with an animation.
-SMALLER, SHORTER = "export it in parts, or as .ply", "shorten its animation or simplify its mesh"
+SMALLER = "export it in parts, or as .ply"
+SHORTER = "shorten its animation or simplify its mesh"
 # A mesh becomes one of instances if that saves so many triangles; single triangles are cast faster.
 SHARED_TRIANGLES = 100_000
 MOST_NODES = 200_000  # most nodes of a scene, counting every instance
@@ -145,7 +146,8 @@ def instances(roots: Iterable[Any], node_of: Callable[[Any], Node], stem: str) -
         If nodes contain each other without end, or there are some hundred thousand places.
     """
     node_of = cache(node_of)
-    placed, begun = [], 0
+    placed = []
+    begun = 0
     stack: list[Any] = [(key, np.eye(4), ()) for key in reversed(list(roots))]
     while stack:
         key, above, path = stack.pop()
@@ -223,12 +225,16 @@ def baked(poses: Iterable[Content], times_s: Sequence[float], allowance: Allowan
     """Join poses of the same meshes, at times that are even, to one content that is animated."""
     if not times_s[-1] > times_s[0]:
         raise MeshFileError("has an animation without a duration: give it two keys")
-    content, moves, count, taken = Content(()), list[Floats](), len(times_s), 0
+    content = Content(())
+    moves = list[Floats]()
+    count = len(times_s)
+    taken = 0
     for number, pose in zip(range(count), poses, strict=False):
         now = [mesh.vertices for mesh in pose.meshes if isinstance(mesh, SceneMesh)]
         if not number:
             allowance.take(count * sum(vertices.nbytes for vertices in now))
-            content, taken = pose, allowance.taken
+            content = pose
+            taken = allowance.taken
             moves = [np.empty((count, *vertices.shape)) for vertices in now]
         allowance.taken = taken
         if list(map(len, now)) != [len(own[0]) for own in moves]:

@@ -54,7 +54,7 @@ class Stretch:
 
 
 @dataclass
-class Way:
+class HeliosTrajectory:
     """Poses of a carrier, and the stretches of its legs.
 
     `rows` hold seconds, x, y, z and yaw in degrees, or quaternions x, y, z, w in its place.
@@ -94,9 +94,13 @@ def read_legs(
     return legs
 
 
-def flown(legs: Sequence[Leg]) -> Way:
+def flown(legs: Sequence[Leg]) -> HeliosTrajectory:
     """Go straight from each leg to the next, each at its speed, and turn on the spot."""
-    rows, stretches, clock, here, yaw = [], [], 0.0, legs[0].place, _FACING_Y_DEG
+    rows = []
+    stretches = []
+    clock = 0.0
+    here = legs[0].place
+    yaw = _FACING_Y_DEG
     for leg, after in pairwise(legs):
         way = after.place - here
         length = float(np.linalg.norm(way))
@@ -111,16 +115,19 @@ def flown(legs: Sequence[Leg]) -> Way:
         there = here + way * (seconds * speed / length)
         rows += [[clock, *here, yaw], [clock + seconds, *there, yaw]]
         stretches.append(Stretch(leg.number, leg.active, clock, seconds))
-        clock, here = clock + seconds + _BETWEEN_S, there
+        clock = clock + seconds + _BETWEEN_S
+        here = there
     if not rows:
         raise LidarError("its platform moves, and no two legs are at different places.")
     rows.append([clock + _AFTER_S, *here, yaw])
-    return Way(np.array(rows), stretches)
+    return HeliosTrajectory(np.array(rows), stretches)
 
 
-def stood(legs: Sequence[Leg], heads: dict[int, float]) -> Way:
+def stood(legs: Sequence[Leg], heads: dict[int, float]) -> HeliosTrajectory:
     """Stand at each leg until its head has turned: {number of a leg: seconds}."""
-    rows, stretches, clock = [], [], 0.0
+    rows = []
+    stretches = []
+    clock = 0.0
     for leg in legs:
         if not leg.active:
             continue
@@ -137,10 +144,10 @@ def stood(legs: Sequence[Leg], heads: dict[int, float]) -> Way:
     if not rows:
         raise LidarError("no leg scans anything.")
     rows.append([clock + _AFTER_S, *rows[-1][1:]])
-    return Way(np.array(rows), stretches)
+    return HeliosTrajectory(np.array(rows), stretches)
 
 
-def read_way(survey: Element, legs: Sequence[Leg], assets: Assets) -> Way:
+def read_way(survey: Element, legs: Sequence[Leg], assets: Assets) -> HeliosTrajectory:
     """Read the file of an interpolated platform; each leg is a stretch of it."""
     files = {leg.platform.get("trajectory", "") for leg in legs}
     if len(files) != 1 or "" in files:
@@ -171,7 +178,7 @@ def read_way(survey: Element, legs: Sequence[Leg], assets: Assets) -> Way:
     places = [columns[axis] for axis in "xyz"]
     quaternions = quaternions_of(turns @ about(_Z, _FACING_Y_DEG))
     rows = np.column_stack([times - times[0], *places, quaternions])
-    return Way(np.vstack([rows, rows[-1] + [_AFTER_S, *7 * [0]]]), stretches)
+    return HeliosTrajectory(np.vstack([rows, rows[-1] + [_AFTER_S, *7 * [0]]]), stretches)
 
 
 def _turned(kind: str, roll: float, pitch: float, yaw: float) -> Floats:

@@ -5,13 +5,15 @@ import pytest
 
 from lidarpool import LidarError, Pose, Track
 from lidarsim.sensor import Stations
-from lidarsim.simulator.ways import Ways
+from lidarsim.simulator.actor_trajectories import ActorTrajectories
 
 
 class Circle:
     """A user's own."""
 
-    stations, moves, duration_ns = 1, True, np.inf
+    stations = 1
+    moves = True
+    duration_ns = np.inf
 
     def poses(self, station, times_ns):
         angle = times_ns / 1e9
@@ -27,7 +29,7 @@ def track(seed, **options):
     return Track(times, random.normal(size=(count, 3)), turns, **options)
 
 
-WAYS = Ways(
+WAYS = ActorTrajectories(
     [
         *(track(seed, beyond="hold") for seed in range(6)),
         track(7, smooth=True, beyond="hold"),
@@ -39,7 +41,9 @@ WAYS = Ways(
 )
 
 
-@pytest.mark.parametrize("members", [WAYS, Ways(WAYS[:6]), Ways(WAYS[7:9])])
+@pytest.mark.parametrize(
+    "members", [WAYS, ActorTrajectories(WAYS[:6]), ActorTrajectories(WAYS[7:9])]
+)
 @pytest.mark.parametrize("each", [1, 5])
 def test_poses_are_those_of_each_trajectory(members, each):
     random = np.random.default_rng(0)
@@ -53,7 +57,7 @@ def test_poses_are_those_of_each_trajectory(members, each):
 
 
 def test_a_time_outside_is_refused_as_by_the_trajectory():
-    ways = Ways([*WAYS, track(3)])
+    ways = ActorTrajectories([*WAYS, track(3)])
     last = ways[-1].duration_ns
     ways.poses(np.array([len(WAYS)]), np.array([last]))
     with pytest.raises(LidarError, match=r"The trajectory goes from .* 1 s outside"):
@@ -61,9 +65,9 @@ def test_a_time_outside_is_refused_as_by_the_trajectory():
 
 
 def test_there_may_be_none():
-    positions, rotations = Ways().poses(np.zeros(0, np.intp), np.zeros(0))
+    positions, rotations = ActorTrajectories().poses(np.zeros(0, np.intp), np.zeros(0))
     assert positions.shape == (0, 3) and rotations.shape == (0, 3, 3)
-    assert Ways().presence_ns.shape == (0, 2)
+    assert ActorTrajectories().presence_ns.shape == (0, 2)
 
 
 @pytest.mark.parametrize("as_lists", [False, True])
@@ -71,12 +75,14 @@ def test_a_trajectory_may_give_lists_or_one_pose_for_all(as_lists):
     """As NumPy would take them."""
 
     class Still:
-        stations, moves, duration_ns = 1, True, np.inf
+        stations = 1
+        moves = True
+        duration_ns = np.inf
 
         def poses(self, station, times_ns):
             if as_lists:
                 return [[1.0, 2.0, 3.0]] * len(times_ns), [np.eye(3).tolist()] * len(times_ns)
             return np.array([1.0, 2.0, 3.0]), np.eye(3)
 
-    places, turns = Ways([Still()]).poses(np.zeros(2, int), np.array([0.0, 1.0]))
+    places, turns = ActorTrajectories([Still()]).poses(np.zeros(2, int), np.array([0.0, 1.0]))
     assert places.tolist() == [[1, 2, 3]] * 2 and np.array_equal(turns, [np.eye(3)] * 2)

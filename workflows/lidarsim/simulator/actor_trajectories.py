@@ -1,4 +1,4 @@
-"""Poses of many actors at once: asked for one by one, they take longer than casting does."""
+"""CastPoses of many actors at once: asked for one by one, they take longer than casting does."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from ..sensor import Track, Trajectory
 from ..sensor.trajectory import Stations, presence_ns
 
 
-class _Tracks(NamedTuple):
+class _TrackTable(NamedTuple):
     """The straight tracks among trajectories, their segments one behind the other."""
 
     member: Ints  # (w,): number among the tracks of each trajectory, -1 for others
@@ -52,13 +52,13 @@ def _pieces_of(way: Trajectory) -> _Pieces | None:
     return _Pieces(np.zeros(2), 0.0, np.inf, parts)
 
 
-class Ways(tuple[Trajectory, ...]):
+class ActorTrajectories(tuple[Trajectory, ...]):
     """Trajectories of actors."""
 
     animated: Mapping[int, Actor] = MappingProxyType({})  # {number: actor that deforms}
 
     @classmethod
-    def of(cls, actors: Iterable[Actor]) -> Ways:
+    def of(cls, actors: Iterable[Actor]) -> ActorTrajectories:
         """Return those of actors, and how these deform."""
         found = list(actors)
         made = cls(actor.trajectory for actor in found)
@@ -84,7 +84,7 @@ class Ways(tuple[Trajectory, ...]):
         return np.array([presence_ns(way) for way in self], np.float64).reshape(-1, 2)
 
     def table(self, number: Integers, times_ns: Floats) -> Floats:
-        """Poses of trajectories `number` (n,) at times (n,): positions, and rotations by rows.
+        """CastPoses of trajectories `number` (n,) at times (n,): positions, and rotations by rows.
 
         They are (12, n), and have the bits of `Trajectory.poses`.
 
@@ -95,7 +95,8 @@ class Ways(tuple[Trajectory, ...]):
         """
         from . import surface_loops  # not before: numba takes half a second to import
 
-        tracks, out = self._tracks, np.empty((12, len(number)))
+        tracks = self._tracks
+        out = np.empty((12, len(number)))
         if not len(number):
             return out
         given = owned(number, np.int64), owned(times_ns)
@@ -113,24 +114,25 @@ class Ways(tuple[Trajectory, ...]):
         return out
 
     def poses(self, number: Integers, times_ns: Floats) -> tuple[Floats, Floats]:
-        """Poses as of `table`: positions (n, 3), rotations (n, 3, 3)."""
+        """CastPoses as of `table`: positions (n, 3), rotations (n, 3, 3)."""
         table = self.table(number, times_ns)
         return table[:3].T, table[3:].reshape(3, 3, -1).transpose(2, 0, 1)
 
     def runs(self, number: Integers, times_ns: Floats) -> tuple[Floats, Ints]:
-        """Poses as of `table`, one for rows of one trajectory and time: (12, m), and which (n,).
+        """CastPoses as of `table`, one for rows of one trajectory and time: (12, m), and which (n,).
 
         Numbers below 0 have none, which is -1.
         """
         from . import surface_loops
 
-        number, times = owned(number, np.int64), owned(times_ns)
+        number = owned(number, np.int64)
+        times = owned(times_ns)
         first, run = np.empty((2, len(number)), np.int64)
         some = first[: surface_loops.runs(number, times, first, run)]
         return self.table(number[some], times[some]), run
 
     @cached_property
-    def _tracks(self) -> _Tracks:
+    def _tracks(self) -> _TrackTable:
         pieces = [_pieces_of(way) for way in self]
         straight = np.array([piece is not None for piece in pieces], np.bool_)
         member = np.where(straight, np.cumsum(straight) - 1, -1)
@@ -145,7 +147,7 @@ class Ways(tuple[Trajectory, ...]):
         limits = [
             (track.start_s, track.times_s[0], track.times_s[-1], track.slack_s) for track in tracks
         ]
-        return _Tracks(
+        return _TrackTable(
             member,
             np.cumsum(segments) - segments,
             segments,
