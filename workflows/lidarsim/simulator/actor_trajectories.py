@@ -1,4 +1,4 @@
-"""CastPoses of many actors at once: asked for one by one, they take longer than casting does."""
+"""Poses of many actors at once: asked for one by one, they take longer than casting does."""
 
 from __future__ import annotations
 
@@ -84,7 +84,7 @@ class ActorTrajectories(tuple[Trajectory, ...]):
         return np.array([presence_ns(way) for way in self], np.float64).reshape(-1, 2)
 
     def table(self, number: Integers, times_ns: Floats) -> Floats:
-        """CastPoses of trajectories `number` (n,) at times (n,): positions, and rotations by rows.
+        """Poses of trajectories `number` (n,) at times (n,): positions, and rotations by rows.
 
         They are (12, n), and have the bits of `Trajectory.poses`.
 
@@ -114,12 +114,12 @@ class ActorTrajectories(tuple[Trajectory, ...]):
         return out
 
     def poses(self, number: Integers, times_ns: Floats) -> tuple[Floats, Floats]:
-        """CastPoses as of `table`: positions (n, 3), rotations (n, 3, 3)."""
+        """Poses as of `table`: positions (n, 3), rotations (n, 3, 3)."""
         table = self.table(number, times_ns)
         return table[:3].T, table[3:].reshape(3, 3, -1).transpose(2, 0, 1)
 
     def runs(self, number: Integers, times_ns: Floats) -> tuple[Floats, Ints]:
-        """CastPoses as of `table`, one for rows of one trajectory and time: (12, m), and which (n,).
+        """Poses as of `table`, one for rows of one trajectory and time: (12, m), and which (n,).
 
         Numbers below 0 have none, which is -1.
         """

@@ -1,4 +1,4 @@
-"""CastPoses of a carrier at each firing, and its motion until the next."""
+"""Poses of a carrier at each firing, and its motion until the next."""
 
 from __future__ import annotations
 
@@ -69,7 +69,7 @@ class Firings:
 
 @dataclass(frozen=True)
 class CastPoses:
-    """CastPoses of rays for `RayCaster.scan`: of the sensor's head, or else of its carrier."""
+    """Poses of rays for `RayCaster.scan`: of the sensor's head, or else of its carrier."""
 
     positions: Floats
     rotations: Floats | None = None
@@ -102,7 +102,7 @@ class CastPoses:
         return np.zeros(len(ray)) if self.clock is None else self.clock.of(ray)
 
     def part(self, start: int, stop: int, subrays: int) -> CastPoses:
-        """CastPoses of the sub-rays of rays `start` to `stop`; `start` is the first of a pose."""
+        """Poses of the sub-rays of rays `start` to `stop`; `start` is the first of a pose."""
         each = self.rays_per_pose
         motion = self.motion
         clock, carrier = (
@@ -165,7 +165,7 @@ def check_trajectory(path: Trajectory) -> None:
 def poses_of_firings(
     carried: Mounted, path: Trajectory, station: int, first: int, stop: int, late_ns: float = 0.0
 ) -> CastPoses:
-    """CastPoses of a sensor's beams in firings `first` to `stop`.
+    """Poses of a sensor's beams in firings `first` to `stop`.
 
     If a head turns all beams, they are poses of the head, and the rays of one firing serve for
     all. Else they are poses of the carrier.

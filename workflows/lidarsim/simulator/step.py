@@ -250,7 +250,7 @@ class PulseBatch:
 
     @cached_property
     def here(self) -> CastPoses:
-        """CastPoses of the sub-rays."""
+        """Poses of the sub-rays."""
         return self.poses.part(self.start, self.stop, self.each)
 
     @cached_property
