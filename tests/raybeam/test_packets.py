@@ -150,7 +150,7 @@ def test_forked_processes_cast_too():
 
 
 def test_which_rays_go_together_changes_nothing(mesh):
-    """ActorTrajectories to group rays are tried in turn, until one is known to be the fastest."""
+    """Groupings of rays are tried in turn, until one is known to be the fastest."""
     caster = RayCaster(*mesh, backend="embree", threads=1)
     given = Pattern(lidar())
     where = [0.05, 0.1, 0.4]
