@@ -65,7 +65,7 @@ def name_of(triangles: int) -> str:
 def rates(here: Here, caster: RayCaster, scan: Scan) -> dict[str, Any]:
     """Time a scan: the cast alone, closing up, and all until hits are on the host."""
     engine: Any = caster._engine
-    parts = list(engine._made(scan))
+    parts = list(engine._chunks(scan))
     found = [engine._cast("cast_pattern", n, rays) for _, n, rays in parts]
     hits = sum(int((place >= 0).sum()) for _, place, _ in found)
 
@@ -76,7 +76,7 @@ def rates(here: Here, caster: RayCaster, scan: Scan) -> dict[str, Any]:
     def pack() -> None:
         groups = Groups(scan.groups, 1)
         for (start, _, _), hit in zip(parts, found, strict=True):
-            engine._packed(hit, start, groups, 1.0, engine._uncounted, engine._none)
+            engine._pack(hit, start, groups, 1.0, engine._no_counters, engine._no_other_hits)
 
     times = {
         "cast": milliseconds(here, cast),
@@ -190,11 +190,11 @@ def instances(here: Here) -> Rows:
     scan = revolutions(here, revolution(here.sizes.rays))
     for masked in (False, True):
         start = time.perf_counter()
-        caster = RayCaster.of(forest(*here.sizes.forest, masked), backend="cuda")
+        caster = RayCaster.from_instances(forest(*here.sizes.forest, masked), backend="cuda")
         took = {"build_s": time.perf_counter() - start, "triangles": caster.face_count}
         yield "forest, masked" if masked else "forest", {**took, **rates(here, caster, scan)}
         [_, one] = forest(1, here.sizes.forest[1], masked)
-        alone = RayCaster.of([Instance(one.mesh)], backend="cuda")
+        alone = RayCaster.from_instances([Instance(one.mesh)], backend="cuda")
         near = check_scan(Pattern(revolution(here.sizes.rays)), [0, 0, 6])
         yield "one tree, masked" if masked else "one tree", rates(here, alone, near)
 
@@ -212,7 +212,7 @@ def bits(here: Here) -> Rows:
         "forest, masked": (forest(25, 2000, True), crown),
     }
     for name, (scene, origin) in scenes.items():
-        casters = [RayCaster.of(scene, backend) for backend in ("cuda", "numpy")]
+        casters = [RayCaster.from_instances(scene, backend) for backend in ("cuda", "numpy")]
         yield name, _different(casters, sample, origin)
 
 

@@ -76,7 +76,7 @@ def measure(trees: int, leaves: int, shared: bool, rays: int, backend: str) -> d
         mesh = Mesh(*one)
         instances = [Instance(mesh, matrix) for matrix in matrices]
         given = [Instance(Mesh(*_GROUND), ground), *instances]
-        caster = RayCaster.of(given, backend, threads=1)
+        caster = RayCaster.from_instances(given, backend, threads=1)
     else:
         points = [one[0] @ m[:, :3].T + m[:, 3] for m in matrices]
         faces = [one[1] + k * len(one[0]) for k in range(trees)]

@@ -27,7 +27,7 @@ import numpy as np
 
 from raybeam import cuda_backend, ploc
 from raybeam.instances import plain
-from raybeam.layout import Layout, lay_out, lay_out_places
+from raybeam.layout import Layout, lay_out, lay_out_instances
 from raybeam.mesh import LocalMesh, local_mesh
 
 from .raycast_scenes import Job, jobs
@@ -64,7 +64,7 @@ def count(library: ctypes.CDLL, layout: Layout, mesh: LocalMesh, job: Job) -> di
     n = len(directions)
     distance = np.empty(n)
     place = np.empty(n, np.int32)
-    places = lay_out_places(plain(mesh), layout.roots)
+    places = lay_out_instances(plain(mesh), layout.roots)
     where = (places.frame, places.top, places.instances)
     before = _seen(library)
     hits = 0
@@ -113,7 +113,7 @@ def measure(library: ctypes.CDLL, job: Job) -> dict[str, Any]:
 
 def _laid_out(mesh: LocalMesh, left: tuple[int, int]) -> Layout:
     """Lay out a mesh with so many clusters left to the sweep."""
-    with patch.object(ploc, "_MOST", left[0]), patch.object(ploc, "_ENOUGH", left[1]):
+    with patch.object(ploc, "_MAX_CLUSTERS", left[0]), patch.object(ploc, "_MIN_CLUSTERS", left[1]):
         return lay_out((mesh,))
 
 

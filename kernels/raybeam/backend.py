@@ -12,7 +12,7 @@ import numpy as np
 from .arrays import Floats, Integers, Ints, Ints32
 from .crossing import Crossing, Nearest, Swept, strike
 from .device import DeviceHits, OtherHits
-from .hits import Counted, Hits, Part, ScanReturns, joined
+from .hits import Counted, Hits, Part, ScanReturns, join_hits
 from .instances import Scene
 from .rays import Rays
 from .scan import Collector, Scan
@@ -23,8 +23,8 @@ class BackendUnavailable(RuntimeError):  # noqa: N818 - a state, not a mishap
 
 
 @dataclass(frozen=True)
-class Found:
-    """Closest hits of a chunk of rays, misses left out, in ray order.
+class ClosestHits:
+    """Closest hits of a chunk of rays, without misses, in ray order.
 
     Attributes
     ----------
@@ -33,7 +33,7 @@ class Found:
     t
         float64 (k,): distance in local units.
     triangle
-        int32 (k,): row of its mesh's `faces`.
+        int32 (k,): row of the `faces` of the mesh.
     u, v
         float64 (k,): weights of the second and third corner.
     instance
@@ -49,17 +49,18 @@ class Found:
 
 
 class Backend(ABC):
-    """One engine, bound to the meshes of a scene.
+    """A ray casting engine, bound to the meshes of a scene.
 
-    A backend is made with the scene, the most CPU threads to use (None for its own choice) and
-    the number of the CUDA device (None for the current one); it ignores those it does not need.
-    It builds the trees of the meshes once, and calls `place` for what depends on where they are.
-    It must implement `closest`; it may override `scan` to be faster.
+    A backend is created with the scene, the maximum number of CPU threads (None for the default of
+    the backend) and the number of the CUDA device (None for the current device); a backend without
+    threads or device ignores the number. The constructor builds the trees of the meshes, and calls
+    `update_scene` for all that depends on transforms. A backend must implement `closest`; it may
+    override `scan` to be faster.
     """
 
     name: ClassVar[str]
-    # Most rays of a call of `closest`: limits the memory. A ray's result does not depend on its
-    # chunk.
+    # Maximum rays of a call of `closest`: limits the memory. The result of a ray does not depend
+    # on its chunk.
     chunk: ClassVar[int]
 
     on_device: ClassVar[bool] = False  # whether hits can stay on a CUDA device, see `visit`
@@ -67,85 +68,90 @@ class Backend(ABC):
     @classmethod
     @abstractmethod
     def missing(cls) -> str:
-        """Why this backend cannot be used here and what to install; "" when it can."""
+        """Return why this backend cannot be used and the remedy; "" if usable."""
 
     @classmethod
     def build(cls) -> str:
-        """Versions, and the like, that its bits depend on, beside NumPy's; "" for none."""
+        """Return the versions that the bits of results depend on, besides NumPy's; "" for none."""
         return ""
 
     def __init__(self, scene: Scene, threads: int | None, device: int | None) -> None:
         self._scene = scene
 
-    def place(self, scene: Scene) -> None:
-        """Take another scene of the same instances, some of which have moved."""
+    def update_scene(self, scene: Scene) -> None:
+        """Replace the scene by a scene of the same instances with new transforms."""
         self._scene = scene
 
     @abstractmethod
-    def closest(self, rays: Rays) -> Found:
-        """Closest hits of at most `chunk` rays."""
+    def closest(self, rays: Rays) -> ClosestHits:
+        """Return the closest hits of at most `chunk` rays."""
 
     def nearest(self, rays: Rays) -> Part:
-        """Closest hits of rays, without weights, misses left out, in ray order."""
+        """Return the closest hits of rays, without weights and misses, in ray order."""
         parts: list[Part] = []
         for start in range(0, len(rays), self.chunk):
-            found = self.closest(rays.part(start, start + self.chunk))
-            ray = found.ray.astype(np.uint32) + np.uint32(start)
-            distance = found.t / self._scene.frame.scale
-            parts.append((ray, distance, found.triangle, found.instance))
-        return joined(parts)
+            hits = self.closest(rays.part(start, start + self.chunk))
+            ray = hits.ray.astype(np.uint32) + np.uint32(start)
+            distance = hits.t / self._scene.frame.scale
+            parts.append((ray, distance, hits.triangle, hits.instance))
+        return join_hits(parts)
 
     def strike(self, crossing: Crossing, nearest: Nearest) -> None:
-        """Note where rays hit bodies of this shape, if that is nearer."""
+        """Cast rays on bodies of this shape, and write nearer hits to `nearest`."""
         strike(self.nearest, crossing, nearest)
 
     def sweep(self, sweep: Swept, nearest: Nearest) -> None:
-        """Note where rays hit bodies of this shape, if that is nearer, on the device."""
+        """Cast rays on bodies of this shape on the device, and write nearer hits to `nearest`."""
         raise BackendUnavailable(f"Backend {self.name!r} has no device: use strike.")
 
     def cast(self, rays: Rays) -> Hits:
-        """Closest hit of every ray."""
+        """Return the closest hit of every ray, misses included."""
         n = len(rays)
         hits = Hits(
             np.full(n, np.inf), np.full(n, -1, np.int32), np.zeros(n), np.zeros(n),
             np.full(n, -1, np.int32),
         )  # fmt: skip
         for start in range(0, n, self.chunk):
-            found = self.closest(rays.part(start, start + self.chunk))
-            row = start + found.ray.astype(np.int64)
-            hits.distance[row] = found.t / self._scene.frame.scale
-            hits.triangle[row] = found.triangle
-            hits.u[row] = found.u
-            hits.v[row] = found.v
-            hits.instance[row] = found.instance
+            chunk_hits = self.closest(rays.part(start, start + self.chunk))
+            row = start + chunk_hits.ray.astype(np.int64)
+            hits.distance[row] = chunk_hits.t / self._scene.frame.scale
+            hits.triangle[row] = chunk_hits.triangle
+            hits.u[row] = chunk_hits.u
+            hits.v[row] = chunk_hits.v
+            hits.instance[row] = chunk_hits.instance
         return hits
 
     def scan(self, scan: Scan) -> ScanReturns:
-        """Closest hits of a scan's rays: the kept ones, and counts of all."""
+        """Return the kept hits of the rays of a scan, and counts of all hits."""
         collector = Collector(scan, self._scene.face_count)
         for start, stop, (ray, distance, triangle, instance) in self.parts(scan):
             if scan.tally:
                 collector.tally(self._scene.tally_rows(instance, triangle))
-            kept = collector.keep(ray, start, stop)
-            collector.add(start, ray[kept], distance[kept], triangle[kept], instance[kept])
+            selected = collector.keep(ray, start, stop)
+            collector.add(
+                start, ray[selected], distance[selected], triangle[selected], instance[selected]
+            )
         return collector.result()
 
     def parts(self, scan: Scan) -> Iterator[tuple[int, int, Part]]:
-        """Rays of a scan, from one to another in ray order, and their hits, numbered from these."""
+        """Yield start and stop of each part of a scan, and its hits, numbered from start."""
         for start, stop in scan.chunks(self.chunk):
-            found = self.closest(scan.rays(start, stop))
-            distance = found.t / self._scene.frame.scale
-            ray = found.ray.astype(np.uint32, copy=False)
-            yield start, stop, (ray, distance, found.triangle, found.instance)
+            hits = self.closest(scan.rays(start, stop))
+            distance = hits.t / self._scene.frame.scale
+            ray = hits.ray.astype(np.uint32, copy=False)
+            yield start, stop, (ray, distance, hits.triangle, hits.instance)
 
     def visit(
         self,
         scan: Scan,
         use: Callable[[DeviceHits], object],
         counters: tuple[Ints, int] | None = None,
-        others: OtherHits | None = None,
+        other_hits: OtherHits | None = None,
     ) -> tuple[Ints, Counted | None]:
-        """See `RayCaster.visit`."""
+        """Cast a scan, and pass its hits to `use` on the device, as `RayCaster.visit` does.
+
+        BackendUnavailable if this backend has no device.
+        """
         raise BackendUnavailable(
             f"Hits of backend {self.name!r} are on no device: use scan, or backend='cuda'."
         )

@@ -14,7 +14,7 @@ from .backend import Backend
 from .crossing import Crossing, Nearest, Swept
 from .device import DeviceHits, OtherHits
 from .hits import Counted, Hits, ScanReturns
-from .instances import Instance, Mesh, check_instances, check_transform, place
+from .instances import Instance, Mesh, check_instances, check_transform, nested_scene
 from .pattern import Pattern
 from .poses import PoseMotion, Poses
 from .rays import check_rays
@@ -23,7 +23,7 @@ from .scan import Scan, check_scan
 
 
 class RayCaster:
-    """Closest hits of rays with a triangle mesh, or with instances of meshes: see `of`.
+    """Caster of rays at a triangle mesh, or at instances of meshes (`from_instances`).
 
     Both sides of a triangle count. A ray in a triangle's plane does not hit that triangle. A
     ray through an edge or a corner hits every triangle there, so closed meshes do not leak.
@@ -36,11 +36,11 @@ class RayCaster:
     faces
         (f, 3) integers, rows of `vertices`. A triangle without an area is never hit.
     backend
-        "cuda", "embree", "numpy", or "auto" for the first of these that can be used.
+        "cuda", "embree", "numpy", or "auto" for the first of these three that can be used.
     threads
-        Most CPU threads to cast with; None leaves it to the backend.
+        Maximum number of CPU threads; None for the default of the backend.
     device
-        Number of the CUDA device; None for the current one. Other backends ignore it.
+        Number of the CUDA device; None for the current device. Other backends ignore the number.
 
     Raises
     ------
@@ -69,7 +69,7 @@ class RayCaster:
         self._start([Instance(Mesh(vertices, faces))], backend, threads, device)
 
     @classmethod
-    def of(
+    def from_instances(
         cls,
         instances: Sequence[Instance],
         backend: str = "auto",
@@ -77,9 +77,9 @@ class RayCaster:
         threads: int | None = None,
         device: int | None = None,
     ) -> RayCaster:
-        """Make a caster for instances of meshes, which are numbered from 0 as they are given.
+        """Create a caster for instances of meshes, numbered from 0 in the given order.
 
-        Each mesh gets one tree, so memory and time to build grow with the meshes. A single
+        Each mesh has a single tree, so memory and build time grow with the meshes. A single
         instance without a transform is the same as its mesh alone.
 
         Parameters
@@ -87,7 +87,7 @@ class RayCaster:
         instances
             At least one.
         backend, threads, device
-            As of `RayCaster`.
+            As for `RayCaster`.
 
         Raises
         ------
@@ -95,13 +95,14 @@ class RayCaster:
             If there is no instance, or a transform is not an invertible, finite (3, 4) or (4, 4)
             matrix; the message has the instance's number.
         BackendUnavailable
-            As of `RayCaster`.
+            If the requested backend cannot be used; the message says what to install.
 
         Examples
         --------
         >>> mesh = Mesh([[0, 0, 0], [1, 0, 0], [0, 1, 0]], [[0, 1, 2]])
         >>> above = [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 2]]
-        >>> caster = RayCaster.of([Instance(mesh), Instance(mesh, above)], backend="numpy")
+        >>> instances = [Instance(mesh), Instance(mesh, above)]
+        >>> caster = RayCaster.from_instances(instances, backend="numpy")
         >>> hits = caster.cast([0.25, 0.25, 3], [[0, 0, -1]])
         >>> hits.distance.tolist(), hits.instance.tolist()
         ([1.0], [1])
@@ -126,8 +127,8 @@ class RayCaster:
         self._lock = threading.Lock()
 
     def __repr__(self) -> str:
-        many = f" in {self.instance_count} instances" if self._scene.nested else ""
-        return f"RayCaster({self.face_count} triangles{many}, backend={self.backend!r})"
+        instances = f" in {self.instance_count} instances" if self._scene.nested else ""
+        return f"RayCaster({self.face_count} triangles{instances}, backend={self.backend!r})"
 
     @property
     def backend(self) -> str:
@@ -136,12 +137,12 @@ class RayCaster:
 
     @property
     def on_device(self) -> bool:
-        """Whether hits can stay on a CUDA device, see `visit`."""
+        """Whether hits can stay on a CUDA device, for `visit`."""
         return self._engine.on_device
 
     @property
     def face_count(self) -> int:
-        """Number of triangles of all meshes, including those without an area."""
+        """Number of triangles of all meshes, triangles without an area included."""
         return self._scene.face_count
 
     @property
@@ -150,25 +151,28 @@ class RayCaster:
         return len(self._scene.mesh)
 
     def strike(self, crossing: Crossing, nearest: Nearest) -> None:
-        """See `Backend.strike`."""
+        """Cast rays on bodies of this shape, and write nearer hits to `nearest`."""
         self.engine.strike(crossing, nearest)
 
     def sweep(self, sweep: Swept, nearest: Nearest) -> None:
-        """See `Backend.sweep`."""
+        """Cast rays on bodies of this shape on the device, and write nearer hits to `nearest`.
+
+        BackendUnavailable if this backend has no device.
+        """
         self.engine.sweep(sweep, nearest)
 
     def move(self, number: int, transform: ArrayLike) -> None:
-        """Give an instance another transform; casts that begin after this see it there.
+        """Set another transform of an instance, for all later casts.
 
         Only the tree over the instances is built anew, once for all moves before a cast. The
-        results are those of a new caster. No cast of this caster may be under way.
+        results equal the results of a new caster. No cast of this caster may be under way.
 
         Parameters
         ----------
         number
-            Of the instance.
+            Number of the instance.
         transform
-            As of `Instance`.
+            (3, 4) or (4, 4), as for `Instance`.
 
         Raises
         ------
@@ -184,7 +188,7 @@ class RayCaster:
         if not self._scene.nested:
             raise ValueError(
                 "A single mesh without a transform stays in its place: make the caster with "
-                "RayCaster.of([Instance(mesh, numpy.eye(4))]) to move it."
+                "RayCaster.from_instances([Instance(mesh, numpy.eye(4))]) to move it."
             )
         matrix = check_transform(index(number), transform)
         with self._lock:
@@ -193,11 +197,11 @@ class RayCaster:
 
     @property
     def engine(self) -> Backend:
-        """The engine, with all instances in their places."""
+        """The engine, after an update for all instances that have moved."""
         with self._lock:
             if self._moved:
-                self._scene = place(self._scene.meshes, self._scene.mesh, self._transforms)
-                self._engine.place(self._scene)
+                self._scene = nested_scene(self._scene.meshes, self._scene.mesh, self._transforms)
+                self._engine.update_scene(self._scene)
                 self._moved = False
         return self._engine
 
@@ -208,7 +212,7 @@ class RayCaster:
         t_min: float = 0.0,
         t_max: float = np.inf,
     ) -> Hits:
-        """Closest hit of every ray.
+        """Return the closest hit of every ray.
 
         Parameters
         ----------
@@ -245,19 +249,19 @@ class RayCaster:
         motion: PoseMotion | None = None,
         room: Floats | None = None,
     ) -> ScanReturns:
-        """Cast a pattern of rays from one pose or from many: the fastest way for a lidar.
+        """Cast a pattern of rays from a pose or a series of poses: the fastest cast of a lidar.
 
         Rays are numbered from 0 at the window's start. `pattern_rays` returns the rays.
 
         Parameters
         ----------
         pattern
-            Rays in the sensor's axes, checked once; the cuda backend keeps and rotates them on
-            the device.
+            Rays in the sensor's axes, checked once; the cuda backend keeps and rotates the
+            directions on the device.
         positions
             (3,) or (k, 3), metres; or poses from `check_poses`, which replace the next arguments.
         rotations
-            (3, 3) or (k, 3, 3) from the sensor's axes to the mesh's; None if they are the same.
+            (3, 3) or (k, 3, 3) from the sensor's axes to the mesh's; None if the axes are equal.
         window
             Rows ``start <= row < stop`` of the pattern to cast; None for all. Beyond its end the
             pattern repeats: row r is row ``r % len(pattern)``.
@@ -265,19 +269,19 @@ class RayCaster:
             Ray i is cast from pose ``i // rays_per_pose``: the number of beams, if a moving
             lidar has a pose for each firing. A single pose applies to all rays.
         t_min, t_max
-            As in `cast`.
+            Hits with ``t_min <= distance <= t_max`` count, metres.
         keep_every
             Keep the first and then every n-th hit of each group, in ray order.
         groups
-            Ascending numbers of the first rays of groups, beginning with 0: scans that are cast
-            together. None for one group.
+            Ascending numbers of the first rays of groups, from 0: scans that are cast together.
+            None for a single group.
         tally
-            Count the hits of each triangle, including those that are not kept.
+            Count the hits of each triangle, hits that are not kept included.
         motion
             How the lidar moves within each pose, if its rays have different delays.
         room
-            float64 (6, rays), contiguous: origins and directions of all rays are written there, as
-            `pattern_rays` makes them; (3, rays) for directions alone. None for nowhere.
+            float64 (6, rays), contiguous: output for origins and directions of all rays, as
+            `pattern_rays` returns; (3, rays) for directions alone. None for no output.
 
         Raises
         ------
@@ -292,8 +296,8 @@ class RayCaster:
         >>> caster = RayCaster([[0, 0, 0], [9, 0, 0], [0, 9, 0]], [[0, 1, 2]], backend="numpy")
         >>> down = Pattern([[0, 0, -1], [0.1, 0, -1]])
         >>> track = [[1, 1, 3], [2, 1, 3], [3, 1, 3]]
-        >>> found = caster.scan(down, track, window=(0, 6), rays_per_pose=2, keep_every=2)
-        >>> found.ray.tolist(), found.hits.tolist()
+        >>> hits = caster.scan(down, track, window=(0, 6), rays_per_pose=2, keep_every=2)
+        >>> hits.ray.tolist(), hits.hits.tolist()
         ([0, 2, 4], [6])
         """
         return self.engine.scan(
@@ -318,35 +322,36 @@ class RayCaster:
         scan: Scan,
         use: Callable[[DeviceHits], object],
         counters: tuple[Ints, int] | None = None,
-        others: OtherHits | None = None,
+        other_hits: OtherHits | None = None,
     ) -> tuple[Ints, Counted | None]:
-        """Cast a scan, and use its hits on the CUDA device where they are.
+        """Cast a scan, and pass its hits to a function on the CUDA device.
 
         Parameters
         ----------
         scan
-            From `check_scan`, whose arguments are those of `RayCaster.scan`.
+            From `check_scan`, which has the arguments of `RayCaster.scan`.
         use
-            Called with the kept hits of some rays after the other, in ray order, on the caster's
-            device. Its arrays may be used after the call.
+            Called with the kept hits of consecutive parts of the scan, in ray order, on the
+            caster's device. The arrays may be used after the call.
         counters
             Table and length of the scan's tally. The table is int64 (instances, 2): hits of
             triangle t of instance i count in row ``table[i, 0] + table[i, 1] * t``. None for the
             rows of `ScanReturns.tally`.
-        others
-            Hits that replace those of the caster that are farther. They count as an instance more
-            than there are: with a tally, the table of the counters needs a row for them.
+        other_hits
+            Hits that replace farther hits of the caster. They count as an additional instance
+            after the last: with a tally, the table of the counters needs a row for it.
 
         Returns
         -------
         hits
-            As of `ScanReturns`.
+            int64 (g,): number of hits of each group, kept or not.
         counted
-            The counters that are not 0, and their hits: int64 (k,) each; None without a tally.
+            Numbers of the counters that are not 0, and their hits: int64 (k,) each; None without
+            a tally.
 
         Raises
         ------
         BackendUnavailable
             If this caster's backend is not cuda.
         """
-        return self.engine.visit(scan, use, counters, others)
+        return self.engine.visit(scan, use, counters, other_hits)

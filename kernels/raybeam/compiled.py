@@ -1,4 +1,4 @@
-"""Loops that numba compiles; without it they are plain Python, a hundred times slower."""
+"""Loops that numba compiles; without numba, plain Python a hundred times slower."""
 
 from __future__ import annotations
 
@@ -27,16 +27,16 @@ except ImportError:
     njit = None
 
 
-def _keeps() -> bool:
-    """Whether numba has a folder for compiled code; else each process compiles it in 20 s."""
+def _has_cache() -> bool:
+    """Return whether numba has a folder for compiled code; else each process compiles for 20 s."""
     try:
-        njit(cache=True)(_keeps)
+        njit(cache=True)(_has_cache)
     except (RuntimeError, TypeError):  # neither beside this file nor in the user's home; no numba
         return False
     return True
 
 
-_KEEPS = _keeps()
+_HAS_CACHE = _has_cache()
 
 
 @cache
@@ -73,23 +73,22 @@ def _stamp(path: Path) -> tuple[int, ...]:
     return tuple(number for stat in stats for number in (stat.st_mtime_ns, stat.st_size))
 
 
-# in all, for processes that compile: one may have been stopped
-_WAIT_S = 60.0
+_WAIT_S = 60.0  # in all, for processes that compile: a process may have been stopped
 _STEP_S = 0.02
-_held = [0]  # how often the lock is held, by the thread that has numba's lock
-_patience = [_WAIT_S]  # which a process that was waited for in vain has used up
+_held = [0]  # depth of nested holds of the lock, by the thread that has numba's lock
+_patience = [_WAIT_S]  # rest of the wait in this process; 0 after a wait in vain
 
 
 @contextmanager
-def _in_turn(folder: str) -> Iterator[None]:
-    """Let one process compile at a time: the others, on any machine, then load what it kept.
+def _compile_lock(folder: str) -> Iterator[None]:
+    """Let a single process compile at a time; further processes then load the compiled code.
 
-    A hundred workers that start with an empty folder compile each loop once.
+    A hundred workers, on any machines, that start with an empty folder compile each loop once.
     """
     with global_compiler_lock:  # of the threads; compiling one loop may compile another
         file = None
         collects = gc.isenabled()
-        gc.disable()  # an eighth of the time: numba keeps most of the many objects that it makes
+        gc.disable()  # an eighth of the time: numba keeps most of the objects of a compilation
         try:
             if fcntl is not None and not _held[0]:
                 Path(folder).mkdir(parents=True, exist_ok=True)
@@ -115,35 +114,35 @@ def _in_turn(folder: str) -> Iterator[None]:
                 file.close()
 
 
-def _kept(made: Any, function: Any) -> Any:
-    """Let compiled code be loaded if this very version of the package had compiled it."""
-    if not _KEEPS:
-        return made
-    made.enable_caching()
-    made._cache._cache_file._source_stamp = _stamp(Path(function.__code__.co_filename))
-    alone = made.compile
-    folder = made._cache._cache_path
+def _cached(dispatcher: Any, function: Any) -> Any:
+    """Cache compiled code on disk, for processes with the same sources of the package."""
+    if not _HAS_CACHE:
+        return dispatcher
+    dispatcher.enable_caching()
+    dispatcher._cache._cache_file._source_stamp = _stamp(Path(function.__code__.co_filename))
+    compile_now = dispatcher.compile
+    folder = dispatcher._cache._cache_path
 
     def compile_in_turn(*signature: Any) -> Any:
-        with _in_turn(folder):
-            return alone(*signature)
+        with _compile_lock(folder):
+            return compile_now(*signature)
 
-    made.compile = compile_in_turn
-    return made
+    dispatcher.compile = compile_in_turn
+    return dispatcher
 
 
 def compiled(*signature: Any) -> Callable[[Any], Any]:
-    """Compile a function of a signature of numba's; without one when it is called first."""
+    """Compile a function for signatures of numba; without a signature, on the first call."""
     if njit is None:
         return lambda function: function
 
     def make(function: Any) -> Any:
-        made = _kept(
+        dispatcher = _cached(
             njit(nogil=True, error_model="numpy", no_cfunc_wrapper=True)(function), function
         )
-        for one in signature:
-            made.compile(one)
-        return made
+        for types in signature:
+            dispatcher.compile(types)
+        return dispatcher
 
     return make
 
@@ -152,42 +151,44 @@ def callback(signature: Any) -> Callable[[Any], Any]:
     """Compile a function that C calls."""
 
     def make(function: Any) -> Any:
-        kind = signature.args, signature.return_type
-        made = _kept(CFunc(function, kind, {}, {"error_model": "numpy"}), function)
-        made.compile()
-        return made
+        kinds = (signature.args, signature.return_type)
+        c_function = _cached(CFunc(function, kinds, {}, {"error_model": "numpy"}), function)
+        c_function.compile()
+        return c_function
 
     return make
 
 
-def external(name: str, made: Any) -> Any:
-    """Let compiled functions call a callback by its address, under a name."""
-    add_symbol(name, made.address)
-    return ExternalFunction(name, made._sig)
+def external(name: str, c_function: Any) -> Any:
+    """Return a function that compiled code can call, for a callback, under a name."""
+    add_symbol(name, c_function.address)
+    return ExternalFunction(name, c_function._sig)
 
 
 def inlined(function: Any) -> Any:
-    """Let a function become part of compiled ones."""
+    """Compile a function as a part of its compiled callers."""
     return _inner(function, forceinline=True)
 
 
 def stage(function: Any) -> Any:
-    """Compile a function by itself before others call it: so its loops become vector instructions.
+    """Compile a function apart from its callers, so that its loops become vector instructions.
 
-    As a part of a longer function they do not.
+    As parts of a longer function the loops do not.
     """
     return _inner(function)
 
 
 def _inner(function: Any, **options: Any) -> Any:
-    """Compile a function that only compiled ones may call: from Python, call its `py_func`.
+    """Compile a function that only compiled functions may call; Python may call its `py_func`.
 
     Wrappers for Python would take long to compile, and so would a version for each literal number.
     """
     if njit is None:
         return function
     wrappers = {"no_cfunc_wrapper": True, "no_cpython_wrapper": True}
-    made = njit(error_model="numpy", **wrappers, **options)(function)
-    found = made.get_call_template
-    made.get_call_template = lambda args, more: found(tuple(map(unliteral, args)), more)
-    return made
+    dispatcher = njit(error_model="numpy", **wrappers, **options)(function)
+    get_template = dispatcher.get_call_template
+    dispatcher.get_call_template = lambda args, keywords: get_template(
+        tuple(map(unliteral, args)), keywords
+    )
+    return dispatcher

@@ -1,4 +1,4 @@
-"""Rays that pass through boxes of bodies that move, and the nearest hits found so far."""
+"""Rays that pass through the boxes of moving bodies, and the nearest hits so far."""
 
 from __future__ import annotations
 
@@ -7,43 +7,95 @@ from typing import NamedTuple
 
 import numpy as np
 
-from .arrays import Floats, Ints, Ints32
+from .arrays import Floats, Indices, Ints, Ints32
 from .hits import Part
 from .rays import Rays
 
 
 class Crossing(NamedTuple):
-    """Rays that pass through the boxes of bodies of one shape."""
+    """Pairs of a ray and a body of a common shape, where the ray passes through the body's box.
 
-    rays: Floats  # (6, n): origins and directions of all rays that are cast together, in metres
-    row: Ints  # (m,): rays that pass, one after the other for each body,
-    body: Ints  # (m,): the bodies,
-    number: Ints  # (m,): and which of the poses these have then
-    poses: Floats  # (12, p): positions, and rotations from the body's axes by rows
-    box: Floats  # (6,): low and high corner of the shape
-    limits: tuple[float, float]  # t_min and t_max
-    frame: Floats  # (m,): of a shape that deforms, its frame then; (0,) of others
+    Attributes
+    ----------
+    rays
+        float64 (6, n): origins, metres, and directions of all rays of the cast.
+    row
+        int64 (m,): row in `rays` of each pair's ray; the pairs of a body follow each other.
+    body
+        int64 (m,): number of each pair's body.
+    pose
+        int64 (m,): column in `poses` of the body's pose at the time of the ray.
+    poses
+        float64 (12, p): positions, metres, and rotations from the body's axes by rows.
+    box
+        float64 (6,): lower and upper corner of the shape, in its axes, metres.
+    limits
+        Closest and farthest distance of a hit, metres.
+    frame
+        float64 (m,): frame of a deforming shape at the time of the ray; (0,) for a rigid shape.
+    """
+
+    rays: Floats
+    row: Ints
+    body: Ints
+    pose: Ints
+    poses: Floats
+    box: Floats
+    limits: tuple[float, float]
+    frame: Floats
+
+    def contiguous(self) -> Crossing:
+        """Return a copy whose rows, bodies and poses are contiguous, for compiled loops."""
+        return self._replace(
+            row=np.ascontiguousarray(self.row),
+            body=np.ascontiguousarray(self.body),
+            pose=np.ascontiguousarray(self.pose),
+        )
 
 
 class Swept(NamedTuple):
-    """Rays and bodies of one shape, with their poses at all times of the rays."""
+    """Rays and bodies of a common shape, with the poses of the bodies at all times of the rays.
 
-    rays: Floats  # (6, n): as of `Crossing`
-    when: Ints32  # (n,): number of each ray's time; one beyond the `t` times meets no body
-    body: Ints  # (b,)
-    poses: Floats  # (t, b, 12): as of `Crossing`; NaN where a body is not there
-    boxes: Floats  # (t / SPAN, b, 6): corners of what holds them during that many times
+    Attributes
+    ----------
+    rays
+        float64 (6, n): origins, metres, and directions.
+    time_index
+        int32 (n,): number of each ray's time; a number beyond the t times meets no body.
+    body
+        int64 (b,): numbers of the bodies.
+    poses
+        float64 (t, b, 12): position, metres, and rotation from the body's axes by rows; NaN while
+        a body is absent.
+    boxes
+        float64 (t / SPAN, b, 6): lower and upper corner of the box around a body's boxes during
+        `SPAN` times, metres.
+    limits
+        Closest and farthest distance of a hit, metres.
+    """
+
+    rays: Floats
+    time_index: Ints32
+    body: Ints
+    poses: Floats
+    boxes: Floats
     limits: tuple[float, float]
 
 
-SPAN = 32  # as in intersect.cu
+SPAN = 32  # times of a box of `Swept`; as in intersect.cu
 
 
 class Nearest(NamedTuple):
-    """What rays (n,) hit nearest on bodies that move; of equal distances, the first body.
+    """Nearest hits of rays (n,) on moving bodies; of equal distances, the lowest body.
 
-    distance float64 metres, before which hits count if there is none yet; body int64, -1 for none;
-    instance and triangle of its shape int32.
+    Attributes
+    ----------
+    distance
+        float64 (n,): metres; the distance before which hits count for a ray without a hit.
+    body
+        int64 (n,): number of the body, -1 for no hit.
+    instance, triangle
+        int32 (n,): instance and triangle of the body's shape.
     """
 
     distance: Floats
@@ -52,41 +104,51 @@ class Nearest(NamedTuple):
     triangle: Ints32
 
     @classmethod
-    def of(cls, ends: Floats) -> Nearest:
-        """Nothing is hit yet by rays that end at distances (n,)."""
-        n = len(ends)
-        return cls(ends, np.full(n, -1), np.zeros(n, np.int32), np.zeros(n, np.int32))
+    def without_hits(cls, limits: Floats) -> Nearest:
+        """Create rays without a hit; hits count before distances `limits` (n,), metres."""
+        n = len(limits)
+        return cls(limits, np.full(n, -1), np.zeros(n, np.int32), np.zeros(n, np.int32))
 
     def part(self, start: int, stop: int) -> Nearest:
-        """Take those of some rays, which share their memory."""
+        """Return the hits of rays `start` to `stop`, as views of the same memory."""
+        span = slice(start, stop)
         distance, body, instance, triangle = self
-        some = slice(start, stop)
-        return Nearest(distance[some], body[some], instance[some], triangle[some])
+        return Nearest(distance[span], body[span], instance[span], triangle[span])
 
 
 def strike(cast: Callable[[Rays], Part], crossing: Crossing, nearest: Nearest) -> None:
-    """Take rays to the axes of bodies, `cast` them there, and note nearer hits."""
-    row = crossing.row
-    poses = crossing.poses[:, crossing.number]
-    starts = crossing.rays[:3, row] - poses[:3]
-    ways = crossing.rays[3:, row]
-    turns = poses[3:].reshape(3, 3, -1).transpose(1, 0, 2)
-    starts, ways = (
-        np.stack([(x * a + y * b) + z * c for a, b, c in turns]) for x, y, z in (starts, ways)
-    )
-    met = cast(Rays(starts.T, ways.T, *crossing.limits))
-    ray, distance, triangle, instance = met
+    """Cast the rays of a crossing in the bodies' axes, and write nearer hits to `nearest`."""
+    rays = _in_body_axes(crossing)
+    ray, distance, triangle, instance = cast(rays)
     # Directions of a sensor that turns during a pose are not quite of unit length.
-    x, y, z = ways[:, ray]
+    x, y, z = rays.directions.T[:, ray]
     distance = distance / np.sqrt((x * x + y * y) + z * z)
-    row = row[ray]
+    row = crossing.row[ray]
     body = crossing.body[ray]
-    before = nearest.distance[row]
-    first = (distance == before) & (body < nearest.body[row])
-    nearer = np.flatnonzero((distance < before) | first)
-    nearer = nearer[np.lexsort((-body[nearer], -distance[nearer]))]  # the last of a ray remains
+    nearer = _nearer_hits(nearest, row, distance, body)
     row = row[nearer]
     nearest.distance[row] = distance[nearer]
     nearest.body[row] = body[nearer]
     nearest.instance[row] = instance[nearer]
     nearest.triangle[row] = triangle[nearer]
+
+
+def _in_body_axes(crossing: Crossing) -> Rays:
+    """Return the ray of each pair, relative to the body's position and in the body's axes."""
+    poses = crossing.poses[:, crossing.pose]
+    origins = crossing.rays[:3, crossing.row] - poses[:3]
+    directions = crossing.rays[3:, crossing.row]
+    inverse = poses[3:].reshape(3, 3, -1).transpose(1, 0, 2)
+    origins, directions = (
+        np.stack([(x * a + y * b) + z * c for a, b, c in inverse])
+        for x, y, z in (origins, directions)
+    )
+    return Rays(origins.T, directions.T, *crossing.limits)
+
+
+def _nearer_hits(nearest: Nearest, row: Ints, distance: Floats, body: Ints) -> Indices:
+    """Return the hits (m,) that are nearer than known hits, the nearest of each ray last."""
+    limit = nearest.distance[row]
+    lower_body = (distance == limit) & (body < nearest.body[row])
+    nearer = np.flatnonzero((distance < limit) | lower_body)
+    return nearer[np.lexsort((-body[nearer], -distance[nearer]))]

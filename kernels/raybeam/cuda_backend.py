@@ -12,27 +12,27 @@ from weakref import WeakKeyDictionary
 import numpy as np
 
 from .arrays import AnyArray, Ints
-from .backend import Backend, Found
+from .backend import Backend, ClosestHits
 from .crossing import Nearest, Swept
 from .device import DeviceHits, OtherHits, to_device
-from .hits import Counted, Part, ScanReturns, joined
+from .hits import Counted, Part, ScanReturns, join_hits
 from .instances import Scene
-from .layout import lay_out, lay_out_places
+from .layout import lay_out, lay_out_instances
 from .opacity import Masks
 from .pattern import Pattern
 from .poses import Poses
 from .rays import Rays
 from .scan import Groups, Scan
 
-_BLOCK = 128  # threads; the kernels are bound to it
+_BLOCK = 128  # threads, as in intersect.cu
 _STACK_STEP = 32
 # Tables that are not read where all triangles are opaque.
 NO_MASKS = np.zeros((1, 6), np.float32), np.zeros(1, np.uint8), np.zeros((1, 4), np.int64)
-_MOST_INT = (1 << 31) - 1  # rays of a pose for intersect.cu: more than a chunk has
+_MAX_INT = (1 << 31) - 1  # rays of a pose for intersect.cu: more than the rays of a chunk
 
 
 class CudaBackend(Backend):
-    """The traversal of intersect.cu, one thread a ray; only kept hits leave the device.
+    """The traversal of intersect.cu, a thread for each ray; only kept hits leave the device.
 
     Kernels and copies use the thread's current stream, and every call ends with a copy to the
     host, for which CuPy waits: when it returns, the device no longer uses the call's memory.
@@ -52,7 +52,7 @@ class CudaBackend(Backend):
 
     @classmethod
     def missing(cls) -> str:
-        """See `Backend.missing`."""
+        """Return why CuPy or CUDA cannot be used and the remedy; "" if usable."""
         if importlib.util.find_spec("cupy") is None:
             return "CuPy is not installed: pip install cupy-cuda12x or cupy-cuda13x"
         try:
@@ -68,8 +68,8 @@ class CudaBackend(Backend):
         try:
             cupy.cuda.nvrtc.getVersion()
         except RuntimeError as error:
-            said = str(error).partition("\n")[0]
-            return f"CuPy finds no compiler ({said}): pip install 'cupy-cuda13x[ctk]', or 12x"
+            reason = str(error).partition("\n")[0]
+            return f"CuPy finds no compiler ({reason}): pip install 'cupy-cuda13x[ctk]', or 12x"
         if not _headers():
             return "CuPy finds no CUDA headers: pip install 'cupy-cuda13x[ctk]', or 12x"
         return ""
@@ -78,71 +78,87 @@ class CudaBackend(Backend):
         super().__init__(scene, threads, device)
         self._cupy = cupy = self._library()
         self._device = _device(cupy, device)
-        made = lay_out(scene.meshes)
-        self._roots = made.roots
-        self._stack = made.stack
-        self._masked = made.masks is not None
+        layout = lay_out(scene.meshes)
+        self._roots = layout.roots
+        self._stack = layout.stack
+        self._masked = layout.masks is not None
         with self._device:
-            masks = made.masks or Masks(*NO_MASKS)
-            tables = (made.nodes, made.triangles, made.corners, made.faces)
-            given = (*tables, masks.uv, masks.mask, masks.records)
-            self._meshes = tuple(to_device(cupy, table) for table in given)
-            nothing = (to_device(cupy, np.zeros(2, np.int64)), np.int32(0))
-            self._uncounted = (*nothing, cupy.zeros(1, np.int64))
-            self._none = cupy.zeros(1), cupy.zeros(1, np.int32), np.int32(0)
+            masks = layout.masks or Masks(*NO_MASKS)
+            tables: tuple[AnyArray, ...] = (
+                layout.nodes, layout.triangles, layout.corners, layout.faces,
+                masks.uv, masks.mask, masks.records,
+            )  # fmt: skip
+            self._meshes = tuple(to_device(cupy, table) for table in tables)
+            no_table = to_device(cupy, np.zeros(2, np.int64))
+            self._no_counters = no_table, np.int32(0), cupy.zeros(1, np.int64)
+            self._no_other_hits = cupy.zeros(1), cupy.zeros(1, np.int32), np.int32(0)
         # {pattern: its directions on the device, and its origins if it has any}
         self._patterns: WeakKeyDictionary[Pattern, tuple[Any, ...]] = WeakKeyDictionary()
-        self.place(scene)
+        self.update_scene(scene)
 
-    def place(self, scene: Scene) -> None:
-        """See `Backend.place`."""
-        super().place(scene)
-        made = lay_out_places(scene, self._roots)
+    def update_scene(self, scene: Scene) -> None:
+        """Replace the scene by a scene of the same instances with new transforms."""
+        super().update_scene(scene)
+        layout = lay_out_instances(scene, self._roots)
         with self._device:
             # In steps, so that scenes share compiled kernels.
-            stack = -(-max(self._stack + made.stack, 1) // _STACK_STEP) * _STACK_STEP
+            stack = -(-max(self._stack + layout.stack, 1) // _STACK_STEP) * _STACK_STEP
             self._module = _compiled(
                 self._cupy, self._device.id, flags(stack, scene.nested, self._masked)
             )
-            given = (made.frame, made.top, made.instances)
-            self._places = tuple(to_device(self._cupy, table) for table in given)
+            tables = (layout.frame, layout.top, layout.instances)
+            self._instance_tables = tuple(to_device(self._cupy, table) for table in tables)
 
     @staticmethod
     def _library() -> Any:
-        """CuPy, loaded on first use; tests replace it."""
+        """Load CuPy on first use; tests replace the module."""
         import cupy
 
         return cupy
 
-    def closest(self, rays: Rays) -> Found:
-        """See `Backend.closest`."""
-        cp = self._cupy
+    def closest(self, rays: Rays) -> ClosestHits:
+        """Return the closest hits of at most `chunk` rays."""
         n = len(rays)
         with self._device:
-            stride = np.int32(0 if len(rays.origins) == 1 else 3)
-            origins, directions = map(np.ascontiguousarray, (rays.origins, rays.directions))
-            table = (cp.asarray(origins), stride, cp.asarray(directions))
+            table = self._ray_table(rays)
             limits = (np.float64(t * self._scene.frame.scale) for t in (rays.t_min, rays.t_max))
-            found = self._cast("cast_table", n, (*table, np.int64(n), *limits))
+            hits = self._cast("cast_table", n, (*table, np.int64(n), *limits))
             groups = Groups(np.zeros(1, np.int64), 1)
-            ray, *hits, instance = self._packed(found, 0, groups, 1.0, self._uncounted, self._none)
-            u = cp.empty(len(ray))
-            v = cp.empty(len(ray))
-            frame, _, instances = self._places
-            scene = (self._meshes[2], frame, instances)
-            given = (*scene, *table, ray, *found[1:], np.int64(len(ray)))
-            self._run("weigh_table", len(ray), *given, u, v)
-            return Found(*(array.get() for array in (ray, *hits, u, v, instance)))
+            packed = self._pack(hits, 0, groups, 1.0, self._no_counters, self._no_other_hits)
+            u, v = self._weights(hits, table, packed[0])
+            ray, distance, triangle, instance = packed
+            columns = (ray, distance, triangle, u, v, instance)
+            return ClosestHits(*(array.get() for array in columns))
+
+    def _ray_table(self, rays: Rays) -> tuple[Any, np.int32, Any]:
+        """Copy rays to the device; return origins, step between origins, and directions."""
+        origins, directions = map(np.ascontiguousarray, (rays.origins, rays.directions))
+        step = np.int32(0 if len(rays.origins) == 1 else 3)
+        return self._cupy.asarray(origins), step, self._cupy.asarray(directions)
+
+    def _weights(
+        self, hits: tuple[Any, Any, Any], table: tuple[Any, np.int32, Any], ray: Any
+    ) -> tuple[Any, Any]:
+        """Return the weights of the second and third corner of the hits of rays (k,)."""
+        count = len(ray)
+        u = self._cupy.empty(count)
+        v = self._cupy.empty(count)
+        frame, _, instances = self._instance_tables
+        scene = (self._meshes[2], frame, instances)
+        _, row, instance = hits
+        arguments = (*scene, *table, ray, row, instance, np.int64(count))
+        self._run("weigh_table", count, *arguments, u, v)
+        return u, v
 
     def scan(self, scan: Scan) -> ScanReturns:
-        """See `Backend.scan`."""
-        if scan.pattern.sub_rays is not None:  # which the kernel does not make
+        """Return the kept hits of the rays of a scan, and counts of all hits."""
+        if scan.pattern.sub_rays is not None:  # the kernel has no sub-rays
             return super().scan(scan)
         if scan.room is not None:
-            scan.rays(0, len(scan))  # which writes them
-        kept: list[Part] = []
-        hits, counted = self.visit(scan, lambda found: kept.append(found.get()))
-        ray, distance, triangle, instance = joined(kept)
+            scan.rays(0, len(scan))  # writes the rays
+        parts: list[Part] = []
+        hits, counted = self.visit(scan, lambda part: parts.append(part.get()))
+        ray, distance, triangle, instance = join_hits(parts)
         tally = None
         if counted is not None:
             tally = np.zeros(self._scene.face_count, np.int64)
@@ -154,60 +170,62 @@ class CudaBackend(Backend):
         scan: Scan,
         use: Callable[[DeviceHits], object],
         counters: tuple[Ints, int] | None = None,
-        others: OtherHits | None = None,
+        other_hits: OtherHits | None = None,
     ) -> tuple[Ints, Counted | None]:
-        """See `RayCaster.visit`."""
+        """Cast a scan, and pass its hits to `use` on the device, as `RayCaster.visit` does."""
         cp = self._cupy
         scene = self._scene
         groups = Groups(scan.groups, scan.keep_every)
         with self._device:
-            counting = self._uncounted
+            counting = self._no_counters
             if scan.tally:
                 table, size = (scene.counters, scene.face_count) if counters is None else counters
                 counting = to_device(cp, table), np.int32(1), cp.zeros(size, np.int64)
-            for start, n, rays in self._made(scan):
-                found = self._cast("cast_pattern", n, rays)
-                replaced = self._replaced(found, start, n, others)
-                kept = self._packed(found, start, groups, scene.frame.scale, counting, replaced)
-                use(DeviceHits(*kept, cp, partial(self._rays, start, rays)))
-            return groups.hits, self._counted(counting[2]) if scan.tally else None
+            for start, n, rays in self._chunks(scan):
+                hits = self._cast("cast_pattern", n, rays)
+                replacing = self._replace(hits, start, n, other_hits)
+                packed = self._pack(hits, start, groups, scene.frame.scale, counting, replacing)
+                use(DeviceHits(*packed, cp, partial(self._rays, start, rays)))
+            return groups.hits, self._nonzero_counters(counting[2]) if scan.tally else None
 
     def sweep(self, sweep: Swept, nearest: Nearest) -> None:
-        """See `Backend.sweep`."""
+        """Cast rays on bodies of this shape on the device, and write nearer hits to `nearest`."""
         cp = self._cupy
-        n = len(sweep.when)
-        kept = cast(tuple[AnyArray, ...], nearest)
+        n = len(sweep.time_index)
+        columns = cast(tuple[AnyArray, ...], nearest)
         limits = (np.float64(t * self._scene.frame.scale) for t in sweep.limits)
         with self._device:
-            rays, when, body, poses, boxes = map(cp.asarray, sweep[:5])
-            found = [cp.asarray(column) for column in kept]
-            numbers = body, np.int32(len(body)), poses, boxes, np.int32(len(poses))
-            given = rays, when, np.int64(n), *numbers, *limits
-            self._run("cast_bodies", n, *self._meshes, *self._places, *given, *found)
-            for column, out in zip(found, kept, strict=True):
-                out[:] = column.get()
+            rays, time_index, body, poses, boxes = map(cp.asarray, sweep[:5])
+            hits = [cp.asarray(column) for column in columns]
+            self._run(
+                "cast_bodies", n, *self._meshes, *self._instance_tables, rays, time_index,
+                np.int64(n), body, np.int32(len(body)), poses, boxes, np.int32(len(poses)),
+                *limits, *hits,
+            )  # fmt: skip
+            for column, target in zip(hits, columns, strict=True):
+                target[:] = column.get()
 
-    def _counted(self, tally: Any) -> Counted:
-        """Copy to the host what was counted: most rows of a tally are 0."""
+    def _nonzero_counters(self, tally: Any) -> Counted:
+        """Copy the counters that are not 0 to the host, a small part of a tally."""
         rows = self._cupy.flatnonzero(tally)
         return rows.get(), tally[rows].get()
 
-    def _replaced(
-        self, found: tuple[Any, Any, Any], start: int, n: int, others: OtherHits | None
+    def _replace(
+        self, hits: tuple[Any, Any, Any], start: int, n: int, other_hits: OtherHits | None
     ) -> tuple[Any, ...]:
-        """Let other hits replace those of a cast that are farther; arguments of `pack`."""
-        if others is None:
-            return self._none
-        span = slice(*np.searchsorted(others.ray, [start, start + n]))
-        tables = (others.ray[span], others.distance[span], others.triangle[span])
+        """Replace hits of a cast behind `other_hits`; return arguments of the kernel `pack`."""
+        if other_hits is None:
+            return self._no_other_hits
+        span = slice(*np.searchsorted(other_hits.ray, [start, start + n]))
+        tables = (other_hits.ray[span], other_hits.distance[span], other_hits.triangle[span])
         ray, metres, triangle = map(self._cupy.asarray, tables)
         count = np.int64(len(ray))
         scale = np.float64(self._scene.frame.scale)
-        self._run("replace", len(ray), ray, metres, count, np.int64(start), scale, *found[:2])
+        self._run("replace", len(ray), ray, metres, count, np.int64(start), scale, *hits[:2])
         return metres, triangle, np.int32(len(self._scene.mesh))
 
     def _rays(self, start: int, rays: tuple[Any, ...], ray: Any) -> tuple[Any, Any]:
-        """Make starts and directions of rays of a chunk, on the device."""
+        """Return origins and directions, (3, k), of rays of a chunk, on the device."""
         cp = self._cupy
         n = len(ray)
         origins = cp.empty((3, n))
@@ -216,95 +234,110 @@ class CudaBackend(Backend):
         self._run("make_rays", n, *rays[:-3], *numbers, origins, directions)
         return origins, directions
 
-    def _made(self, scan: Scan) -> Iterator[tuple[int, int, tuple[Any, ...]]]:
-        """Chunks of a scan: number of the first ray, how many, and arguments for cast_pattern."""
-        cp = self._cupy
-        poses = scan.poses
-        unused = np.zeros(1)
-        limits = [np.float64(t * self._scene.frame.scale) for t in (scan.t_min, scan.t_max)]
-        shifted = scan.pattern.origins is not None
-        turned = poses.rotations is not None
+    def _chunks(self, scan: Scan) -> Iterator[tuple[int, int, tuple[Any, ...]]]:
+        """Yield first ray, number of rays, and arguments of cast_pattern, chunk by chunk."""
+        scale = self._scene.frame.scale
+        limits = [np.float64(t * scale) for t in (scan.t_min, scan.t_max)]
         tables = self._resident(scan.pattern)
         rows = len(scan.pattern)
         for start, stop in scan.chunks(self.chunk):
-            n = stop - start
-            pose, skip = divmod(start, poses.rays)
-            span = slice(pose, -(-stop // poses.rays))
-            matrices = unused if poses.rotations is None else poses.rotations[span]
-            # `asarray` keeps the order of memory, and poses are stored by component.
-            places = [
-                cp.asarray(np.ascontiguousarray(a)) for a in (poses.positions[span], matrices)
-            ]
-            motion = self._motion(poses, span)
-            counts = (min(number, _MOST_INT) for number in (poses.rays - skip, poses.rays))
-            flags = (np.int32(flag) for flag in (*counts, turned, shifted))
             window = (np.int64(rows), np.int64((scan.first + start) % rows))
-            given = (*places, tables[0], tables[-1], *window)
-            yield start, n, (*given, *flags, *motion, np.int64(n), *limits)
+            arguments = (
+                *self._pose_tables(scan.poses, start, stop), tables[0], tables[-1], *window,
+                *self._pattern_flags(scan, start), *self._motion(scan.poses, start, stop),
+                np.int64(stop - start), *limits,
+            )  # fmt: skip
+            yield start, stop - start, arguments
 
-    def _motion(self, poses: Poses, span: slice) -> tuple[Any, ...]:
-        """Arguments for cast_pattern: delays, rates of some poses, and whether there are any."""
+    def _pose_tables(self, poses: Poses, start: int, stop: int) -> list[Any]:
+        """Return arguments of cast_pattern: positions and rotations of rays `start` to `stop`."""
+        span = _pose_span(poses, start, stop)
+        matrices = np.zeros(1) if poses.rotations is None else poses.rotations[span]
+        # `asarray` keeps the order of memory, and poses are stored by component.
+        return [
+            self._cupy.asarray(np.ascontiguousarray(table))
+            for table in (poses.positions[span], matrices)
+        ]
+
+    def _pattern_flags(self, scan: Scan, start: int) -> list[np.int32]:
+        """Return arguments of cast_pattern: rays of the first pose, of each pose, and flags.
+
+        The flags say whether there are rotations, and whether there are origins.
+        """
+        poses = scan.poses
+        first_count = poses.rays - start % poses.rays
+        has_rotations = poses.rotations is not None
+        has_origins = scan.pattern.origins is not None
+        counts = (min(first_count, _MAX_INT), min(poses.rays, _MAX_INT))
+        return [np.int32(number) for number in (*counts, has_rotations, has_origins)]
+
+    def _motion(self, poses: Poses, start: int, stop: int) -> tuple[Any, ...]:
+        """Return arguments of cast_pattern: delays, rates of poses, and whether there is motion."""
         cp = self._cupy
         motion = poses.motion
         if motion is None:
             return cp.asarray(np.zeros(1)), cp.asarray(np.zeros(1)), np.int32(0)
+        span = _pose_span(poses, start, stop)
         rates = np.concatenate([motion.velocities[span], motion.rates[span]], axis=1)
         return cp.asarray(motion.delays), cp.asarray(np.ascontiguousarray(rates)), np.int32(1)
 
     def _resident(self, pattern: Pattern) -> tuple[Any, ...]:
-        """Directions and origins of a pattern on the device, (3, n) each, one row for each axis."""
-        kept = self._patterns.get(pattern)
-        if kept is None:
-            given = (pattern.directions, pattern.origins)
+        """Return directions, and origins if any, of a pattern on the device: (3, n) each."""
+        tables = self._patterns.get(pattern)
+        if tables is None:
+            arrays = (pattern.directions, pattern.origins)
             # If two threads come here, the second copy is kept, and both are right.
-            kept = self._patterns[pattern] = tuple(
-                to_device(self._cupy, table.T) for table in given if table is not None
+            tables = self._patterns[pattern] = tuple(
+                to_device(self._cupy, array.T) for array in arrays if array is not None
             )
-        return kept
+        return tables
 
     def _cast(self, kernel: str, n: int, rays: tuple[Any, ...]) -> tuple[Any, Any, Any]:
-        """Local distance, table row and instance of the closest hit of each ray, on the device."""
+        """Return local distance, table row and instance of closest hits, on the device."""
         t = self._cupy.empty(n)
-        place = self._cupy.empty(n, np.int32)
+        row = self._cupy.empty(n, np.int32)
         instance = self._cupy.empty(n if self._scene.nested else 1, np.int32)
-        self._run(kernel, n, *self._meshes, *self._places, *rays, t, place, instance)
-        return t, place, instance
+        self._run(kernel, n, *self._meshes, *self._instance_tables, *rays, t, row, instance)
+        return t, row, instance
 
-    def _packed(
+    def _pack(
         self,
-        found: tuple[Any, Any, Any],
+        hits: tuple[Any, Any, Any],
         start: int,
         groups: Groups,
         scale: float,
         counting: tuple[Any, np.int32, Any],
-        others: tuple[Any, ...],
+        other_hits: tuple[Any, ...],
     ) -> tuple[Any, Any, Any, Any]:
-        """Count the hits of a cast and close up those that are kept, all on the device.
+        """Count the hits of a cast, and close up the hits to keep, all on the device.
 
-        Distances are divided by `scale`. `counting` and `others` are arguments of the kernel
-        `pack`. Returns numbers of the rays, from `start` on, distances, the caller's
-        triangles, and instances.
+        Distances are divided by `scale`. `counting` and `other_hits` are arguments of the kernel
+        `pack`. Returns numbers of the rays, from `start` on, distances, the caller's triangles, and
+        instances.
         """
         cp = self._cupy
-        n = len(found[1])
+        n = len(hits[1])
         # Closed up by sums in ray order, not by atomics: the same bytes on every run.
-        ends = cp.cumsum(found[1] != -1, dtype=np.int32)
-        span, begins = groups.spans(start, start + n)
-        cuts = np.append(0, ends[cp.asarray(np.append(begins, n) - 1)].get()).astype(np.int64)
-        leave, number = groups.count(span, np.diff(cuts))
-        before = np.cumsum(number) - number
-        table = np.minimum([np.append(0, begins), cuts[:-1] + leave, before], _MOST_INT)
+        sums = cp.cumsum(hits[1] != -1, dtype=np.int32)
+        span, later_starts = groups.spans(start, start + n)
+        cuts = np.append(0, sums[cp.asarray(np.append(later_starts, n) - 1)].get())
+        cuts = cuts.astype(np.int64)
+        first_kept, kept_counts = groups.count(span, np.diff(cuts))
+        offsets = np.cumsum(kept_counts) - kept_counts
+        starts = np.append(0, later_starts)
+        table = np.minimum([starts, cuts[:-1] + first_kept, offsets], _MAX_INT)
         kinds = (np.uint32, np.float64, np.int32, np.int32)
-        kept = tuple(cp.empty(int(number.sum()), kind) for kind in kinds)
+        packed = tuple(cp.empty(int(kept_counts.sum()), kind) for kind in kinds)
         self._run(
-            "pack", n, self._meshes[3], *found, ends, np.int64(n), np.float64(scale),
-            np.int64(start), *others, cp.asarray(table.astype(np.int32)), np.int32(len(number)),
-            np.int32(min(groups.every, _MOST_INT)), *counting, *kept,
+            "pack", n, self._meshes[3], *hits, sums, np.int64(n), np.float64(scale),
+            np.int64(start), *other_hits, cp.asarray(table.astype(np.int32)),
+            np.int32(len(kept_counts)), np.int32(min(groups.keep_every, _MAX_INT)), *counting,
+            *packed,
         )  # fmt: skip
-        return kept
+        return packed
 
     def _run(self, kernel: str, threads: int, *arguments: Any) -> None:
-        """Launch a kernel with one thread for each item; does nothing without items.
+        """Launch a kernel with a thread for each item, unless there are none.
 
         A grid has one dimension, of fewer than 2**31 blocks: room for 2**38 items.
         """
@@ -313,44 +346,49 @@ class CudaBackend(Backend):
             self._module.get_function(kernel)(grid, (_BLOCK,), arguments)
 
 
+def _pose_span(poses: Poses, start: int, stop: int) -> slice:
+    """Return the range of the poses of rays `start` to `stop`."""
+    return slice(start // poses.rays, -(-stop // poses.rays))
+
+
 def source() -> str:
-    """Text of intersect.cu, with its name for the compiler's messages."""
+    """Return the text of intersect.cu, with its name for the compiler's messages."""
     text = importlib.resources.files(__package__).joinpath("intersect.cu").read_text("utf-8")
     return f'#line 1 "intersect.cu"\n{text}'
 
 
 def flags(stack: int, nested: bool, masked: bool) -> tuple[str, ...]:
-    """Compiler options of intersect.cu.
+    """Return the compiler options of intersect.cu.
 
-    `stack` is the most nodes that wait in a traversal; `nested` says whether there are instances,
-    `masked` whether parts of triangles are transparent.
+    `stack` is the maximum of nodes that wait in a traversal; `nested` is true for instances,
+    `masked` if parts of triangles are transparent.
     """
-    kinds = f"-DNESTED={int(nested)}", f"-DMASKED={int(masked)}"
-    return "-std=c++17", "-fmad=false", f"-DSTACK={stack}", *kinds
+    scene_flags = (f"-DNESTED={int(nested)}", f"-DMASKED={int(masked)}")
+    return ("-std=c++17", "-fmad=false", f"-DSTACK={stack}", *scene_flags)
 
 
 @lru_cache(maxsize=64)
 def _compiled(cupy: Any, device: int, flags: tuple[str, ...]) -> Any:
-    """Compile the kernels for the current device, whose number is `device`, once."""
+    """Compile the kernels for the current device, with the number `device`, once."""
     module = cupy.RawModule(code=source(), options=flags)
     module.compile()
     return module
 
 
 def _headers() -> bool:
-    """Whether CuPy will find the headers of CUDA, without which it compiles nothing.
+    """Return whether CuPy will find the headers of CUDA, which compilation needs.
 
     Runtime containers have a driver and a compiler, but no headers.
     """
     try:
         from cuda.pathfinder import find_nvidia_header_directory
-    except ImportError:  # this version of CuPy finds them in another way
+    except ImportError:  # this version of CuPy searches elsewhere
         return True
     return find_nvidia_header_directory("cudart") is not None
 
 
 def _device(cupy: Any, number: int | None) -> Any:
-    """Return the device of that number, or the current one; ValueError if it does not exist."""
+    """Return the device with a number, or the current device; ValueError for a wrong number."""
     count = cupy.cuda.runtime.getDeviceCount()
     if number is not None and not 0 <= number < count:
         raise ValueError(f"There is no CUDA device {number}: this process sees {count}, from 0.")

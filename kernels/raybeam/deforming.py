@@ -1,21 +1,24 @@
-"""Meshes whose vertices move: each ray meets the mesh as it is at the ray's own time.
+"""Meshes whose vertices move: each ray meets the mesh in its shape at the time of the ray.
 
-A tree over the triangles, made once, serves for all times: between two frames each vertex moves
-straight, so the boxes around the triangles at both hold them in between, too. All backends cast
-these meshes in one loop on the CPU (deforming_loops.py), with the test of triangle.py.
+A tree over the triangles, built once, serves for all times: between two frames each vertex moves
+straight, so a box around a triangle at both frames holds the triangle in between, too. All backends
+cast these meshes in a loop on the CPU (deforming_loops.py), with the test of triangle.py.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
 from .arrays import Floats, Ints
 from .crossing import Crossing, Nearest
 from .tree import build_tree
+
+if TYPE_CHECKING:
+    from .deforming_loops import DeformingTree
 
 _PAD = 1e-6  # of the mesh's size, around boxes: far more than rounding to float32
 _LEAF_SIZE = 4
@@ -25,36 +28,38 @@ _LEAF_SIZE = 4
 class Deforming:
     """A mesh whose vertices move straight from frame to frame: a shape of `Moving`.
 
-    Frame 1.5 is half way from the second. Before the first and after the last it stays as it is.
+    Frame 1.5 is halfway between the second and the third. Before the first and after the last frame
+    the mesh keeps its shape.
 
     Attributes
     ----------
     vertices
-        float64 (f, v, 3), metres: at least two frames.
+        float64 (f, v, 3): vertices at each frame, metres; at least two frames.
     faces
-        int64 (t, 3).
+        int64 (t, 3): rows of the vertices of each triangle.
     """
 
     vertices: Floats
     faces: Ints
-    on_device: ClassVar[bool] = False  # as of `RayCaster`
+    on_device: ClassVar[bool] = False  # see `RayCaster.on_device`
 
     @property
     def box(self) -> Floats:
-        """Low and high corner of all frames: (2, 3)."""
+        """Lower and upper corner of the box around all frames: (2, 3), metres."""
         return np.stack([self.vertices.min(axis=(0, 1)), self.vertices.max(axis=(0, 1))])
 
     def strike(self, crossing: Crossing, nearest: Nearest) -> None:
-        """See `RayCaster.strike`; of equally close triangles the lowest is hit."""
+        """Cast rays on bodies of this shape, and write nearer hits to `nearest`.
+
+        Of equally close triangles the lowest is hit.
+        """
         from . import deforming_loops as loops
 
-        given = map(np.ascontiguousarray, (crossing.row, crossing.body, crossing.number))
-        frames = crossing.poses, crossing.frame, np.array(crossing.limits, np.float64)
-        loops.strike(crossing.rays, *given, *frames, *self._tables, *nearest)
+        loops.strike(crossing.contiguous(), self._tree, nearest)
 
     @cached_property
-    def _tables(self) -> tuple[Any, ...]:
-        """Vertices, faces and the tree, see `deforming_loops.strike`."""
+    def _tree(self) -> DeformingTree:
+        """The mesh and its tree for the compiled loop."""
         from . import deforming_loops as loops
 
         vertices = np.ascontiguousarray(self.vertices)
@@ -65,4 +70,4 @@ class Deforming:
         boxes = np.empty((len(vertices) - 1, len(tree.child), 6, loops.WIDTH), np.float32)
         pad = _PAD * float(np.abs(box).max())
         loops.fit(vertices, faces, tree.order, tree.child, pad, boxes)
-        return vertices, faces, tree.order, tree.child, boxes
+        return loops.DeformingTree(vertices, faces, tree.order, tree.child, boxes)

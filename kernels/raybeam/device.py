@@ -1,4 +1,4 @@
-"""Hits that stay on a CUDA device, and the way of arrays from there to the host."""
+"""Hits that stay on a CUDA device, and the copy of arrays from the device to the host."""
 
 from __future__ import annotations
 
@@ -13,21 +13,21 @@ from numpy.typing import DTypeLike
 from .arrays import AnyArray, Floats, Ints32, UInts32
 from .hits import Part
 
-_UNDER_WAY = 2  # copies: one runs while the arrays of the next are made
+_MAX_PENDING = 2  # copies: a copy runs while the arrays of the next are computed
 
 
 @dataclass(frozen=True, eq=False)
 class DeviceHits:
-    """Kept hits of some rays of a scan, as CuPy arrays on the current device and stream.
+    """Kept hits of a part of a scan, as CuPy arrays on the current device and stream.
 
     Attributes
     ----------
     ray, distance, triangle, instance
         (k,): as in `ScanReturns`.
     cupy
-        The module, for arrays and kernels of your own.
+        The module, for further arrays and kernels.
     make_rays
-        Function of numbers of rays that returns their origins and directions, see `rays`.
+        Function of numbers of rays that returns origins and directions, see `rays`.
     """
 
     ray: Any
@@ -41,9 +41,9 @@ class DeviceHits:
         return len(self.ray)
 
     def rays(self) -> tuple[Any, Any]:
-        """Origins, metres, and unit directions of the rays: float64 (3, k) on the device.
+        """Compute origins, metres, and unit directions of the rays: float64 (3, k) on the device.
 
-        They have the bits of `pattern_rays`.
+        Both have the bits of `pattern_rays`.
         """
         return self.make_rays(self.ray)
 
@@ -54,7 +54,7 @@ class DeviceHits:
 
 @dataclass(frozen=True, eq=False)
 class OtherHits:
-    """Hits of a scan's rays on surfaces that the caster does not know, such as those that move.
+    """Hits of a scan's rays on surfaces outside the caster, such as moving bodies.
 
     Attributes
     ----------
@@ -63,7 +63,7 @@ class OtherHits:
     distance
         float64 (k,): metres.
     triangle
-        int32 (k,): any number.
+        int32 (k,): any number of a triangle.
     """
 
     ray: UInts32
@@ -72,7 +72,7 @@ class OtherHits:
 
 
 def to_device(cupy: Any, array: AnyArray) -> Any:
-    """Copy an array to the current device, and wait for that: any stream may read it then.
+    """Copy an array to the current device, and wait: any stream may read the copy then.
 
     A device that reads ordinary memory itself, as Grace Hopper does, may still read after `set`
     returns: hence the wait, after which the caller may release the array.
@@ -88,7 +88,7 @@ def to_device(cupy: Any, array: AnyArray) -> Any:
 
 
 class Outbox:
-    """Copies arrays to the host in a stream of its own, while the device goes on.
+    """Queue of copies of arrays to the host, in a separate stream, while the device goes on.
 
     Parameters
     ----------
@@ -100,30 +100,34 @@ class Outbox:
         self._cupy = cupy
         self._stream = cupy.cuda.Stream(non_blocking=True)
         # Events after copies, and arrays that the device still reads.
-        self._under_way: deque[tuple[Any, Sequence[Any]]] = deque()
+        self._pending: deque[tuple[Any, Sequence[Any]]] = deque()
 
     def room(self, count: int, kind: DTypeLike) -> AnyArray:
-        """Make an array (count,) in page-locked memory, to which the device writes by itself.
+        """Return an array (count,) in page-locked memory, to which the device can write directly.
 
-        It goes back to CuPy's pool when the last view of it has gone.
+        The memory goes back to CuPy's pool when the last view of it has gone.
         """
         size = count * np.dtype(kind).itemsize
         memory = self._cupy.cuda.alloc_pinned_memory(max(size, 1))
         return np.frombuffer(memory, kind, count)
 
     def send(self, pairs: Sequence[tuple[Any, AnyArray]]) -> None:
-        """Begin to copy arrays that the current stream makes: pairs of one here, one in `room`."""
+        """Start to copy arrays that the current stream computes: pairs of source and target.
+
+        Targets are arrays from `room`.
+        """
         self._stream.wait_event(self._cupy.cuda.get_current_stream().record())
-        for given, out in pairs:
-            given.get(stream=self._stream, out=out, blocking=False)
-        self._under_way.append((self._stream.record(), pairs))
-        self._wait(_UNDER_WAY)
+        for source, target in pairs:
+            source.get(stream=self._stream, out=target, blocking=False)
+        self._pending.append((self._stream.record(), pairs))
+        self._wait(_MAX_PENDING)
 
     def wait(self) -> None:
-        """Wait until all copies are done."""
+        """Wait until all copies have ended."""
         self._wait(0)
 
-    def _wait(self, most: int) -> None:
-        while len(self._under_way) > most:
-            done, _ = self._under_way.popleft()
-            done.synchronize()
+    def _wait(self, max_pending: int) -> None:
+        """Wait until at most `max_pending` copies remain."""
+        while len(self._pending) > max_pending:
+            copied, _ = self._pending.popleft()
+            copied.synchronize()

@@ -15,9 +15,9 @@ import numpy as np
 
 from . import embree_library
 from .arrays import Floats
-from .backend import Backend, Found
+from .backend import Backend, ClosestHits
 from .crossing import Crossing, Nearest
-from .hits import Part, joined
+from .hits import Part, join_hits
 from .instances import Scene
 from .mesh import NEAR
 from .pattern_rays import checked_rays
@@ -28,57 +28,71 @@ from .scan import Scan
 if TYPE_CHECKING:
     from .embree_memory import Cast
 
-_SHARE = 1 << 13  # rays that a thread takes at a time, where there are several
+_SHARE = 1 << 13  # rays that a thread casts at a time, if there are several threads
 # Cosine of 20 degrees. Packets of 16 rays within that are cast four to six times as fast as single
-# rays, wider ones more slowly.
+# rays, wider packets more slowly.
 _COHERENCE = 0.94
-_SHAPES = ((16, 1), (8, 2), (4, 4))  # rays along a ring and across, that go together
-_MOST = 1 << 15  # rays of a block
-# parts that are cast in each way to choose the fastest, and rays
-_TRIALS = 5
-_TRIED = 1 << 10
-_LIKE = 0.02  # between the cosines of patterns for which the same way is the fastest
-_PLANS = 16  # kept
+_SHAPES = ((16, 1), (8, 2), (4, 4))  # rays of a group along a ring, and rings
+_MAX_BLOCK = 1 << 15  # rays of a block
+_TRIALS = 5  # parts that are cast in each grouping to choose the fastest
+_TRIAL_RAYS = 1 << 10  # rays of such a part, at least
+_SIMILAR = 0.02  # maximum difference of the coherence of patterns with the same fastest grouping
+_MAX_PLANS = 16
 
 
 class _RayGrouping(NamedTuple):
-    """How rays are grouped, see `embree_packets`."""
+    """How rays are grouped, see `embree_packets`.
+
+    Attributes
+    ----------
+    step
+        Rays from a ray to its neighbour along a ring.
+    rays_along, rays_across
+        Rays of a ring in a group, and rings of a group.
+    coherence
+        A group with a smaller cosine between two rays is cast ray by ray.
+    """
 
     step: int
-    high: int
-    wide: int
+    rays_along: int
+    rays_across: int
     coherence: float = _COHERENCE
 
+    @property
+    def block(self) -> int:
+        """Number of rays of a block."""
+        return self.step * self.rays_along
 
-_IN_TURN = _RayGrouping(1, 16, 1)
+
+_CONSECUTIVE = _RayGrouping(1, 16, 1)
 
 
 class EmbreeBackend(Backend):
     """Embree's candidates, of which the watertight test in float64 takes the closest.
 
-    A triangle that Embree does not propose is not found. It decides in float32, and does not see
-    surfaces that are nearer to the ray's start than about 1e-6 of the scene's size, nor some of
-    those whose rim a ray meets within that. Casting and building the tree use the given number of
-    threads.
+    A triangle that Embree does not propose is missed. Embree decides in float32, and does not see
+    surfaces that are nearer to the ray's origin than about 1e-6 of the scene's size, nor some
+    surfaces whose rim a ray meets within that distance. Casting and building the tree use the given
+    number of threads.
     """
 
     name: ClassVar[str] = "embree"
-    chunk: ClassVar[int] = 1 << 17  # 20 bytes each; parts of a longer scan are copied together
+    chunk: ClassVar[int] = 1 << 17  # rays, of 20 bytes; parts of a longer scan are copied together
 
     @classmethod
     def missing(cls) -> str:
-        """See `Backend.missing`."""
+        """Return why Embree or numba cannot be used and the remedy; "" if usable."""
         if importlib.util.find_spec("numba") is None:
             return "numba is not installed: pip install numba"
         try:
-            embree_library.library()
+            embree_library.load_library()
         except (ImportError, OSError) as error:
             return f"Embree does not load ({error}): pip install embreex"
         return ""
 
     @classmethod
     def build(cls) -> str:
-        """See `Backend.build`: embreex and its copy of Embree."""
+        """Return the versions of embreex and of its copy of Embree."""
         return embree_library.build()
 
     def __init__(self, scene: Scene, threads: int | None = None, device: int | None = None) -> None:
@@ -86,14 +100,15 @@ class EmbreeBackend(Backend):
 
         super().__init__(scene, threads, device)
         self._count = threads or os.cpu_count() or 1
-        self._threads = ThreadPoolExecutor(self._count, "embree")  # which start when needed
+        self._threads = ThreadPoolExecutor(self._count, "embree")  # threads start on first use
         self._process = os.getpid()
         trees = [embree_library.EmbreeMesh(mesh, threads) for mesh in scene.meshes]
         self._instances = (
             embree_library.EmbreeInstances(scene, trees, threads) if scene.nested else None
         )
         self._plans: dict[tuple[int, int], _Plan] = {}
-        self._strikes: tuple[list[float], list[float]] = [], []  # seconds a ray, see `strike`
+        # Seconds a ray of calls of `strike`: in packets, and ray by ray.
+        self._strike_times: tuple[list[float], list[float]] = [], []
         self._loops = embree_packets
         self._memory = embree_memory
         self._corners = [np.ascontiguousarray(mesh.corners) for mesh in scene.meshes]
@@ -103,7 +118,7 @@ class EmbreeBackend(Backend):
             if (opacity := mesh.opacity) is not None:
                 record["uv"] = opacity.uv.ctypes.data
                 record["mask"] = opacity.mask.ctypes.data
-                record["high"], record["wide"] = opacity.mask.shape
+                record["mask_height"], record["mask_width"] = opacity.mask.shape
         self._index = np.concatenate([mesh.index for mesh in scene.meshes])
         masked = any(mesh.opacity is not None for mesh in scene.meshes)
         width = embree_library.packet_width()
@@ -116,29 +131,28 @@ class EmbreeBackend(Backend):
         cast["scene"] = (self._instances or trees[0]).address
         cast["mesh"] = self._meshes.ctypes.data
         cast["masked"] = masked
-        cast["packets"][0, : len(packets)] = [one.address for one in packets]
+        cast["packets"][0, : len(packets)] = [proposer.address for proposer in packets]
         cast["single"] = single.address
         cast["decide"] = embree_exact.decide.address
         cast["nearby"] = embree_exact.nearby.address
         cast["width"] = width
         cast["coherence"] = _COHERENCE
         cast["index"] = self._index.ctypes.data
-        # which keep what has an address
-        self._trees = trees
+        self._trees = trees  # keeps the addresses in the record valid
         self._base = cast
-        self.place(scene)
+        self.update_scene(scene)
 
-    def place(self, scene: Scene) -> None:
-        """See `Backend.place`."""
-        super().place(scene)
+    def update_scene(self, scene: Scene) -> None:
+        """Replace the scene by a scene of the same instances with new transforms."""
+        super().update_scene(scene)
         frame = scene.frame
         base = self._base
         base["centre"] = frame.centre
         base["scale"] = frame.scale
-        base["low"] = frame.low
-        base["upper"] = frame.high
+        base["lower"] = frame.lower
+        base["upper"] = frame.upper
         if self._instances is not None:
-            self._instances.place(scene)
+            self._instances.update_scene(scene)
             first = np.cumsum([0, *(len(corners) for corners in self._corners[:-1])])
             records = np.zeros(len(scene.mesh), self._memory.INSTANCE)
             records["matrix"] = scene.matrices
@@ -147,111 +161,122 @@ class EmbreeBackend(Backend):
             self._records = records
             self._base["instances"] = records.ctypes.data
 
-    def closest(self, rays: Rays) -> Found:
-        """See `Backend.closest`."""
-        cast = self._of_rays(rays)
+    def closest(self, rays: Rays) -> ClosestHits:
+        """Return the closest hits of at most `chunk` rays."""
+        cast = self._ray_cast(rays)
         cast.record["index"] = 0
-        ray, distance, place, instance = self._cast(cast, 0, len(rays))
+        ray, distance, row, instance = self._cast(cast, 0, len(rays))
         u, v = np.empty((2, len(ray)))
         origins = self._scene.frame.to_local(rays.origins)
         if len(origins) > 1:
             origins = np.ascontiguousarray(origins[ray])
         directions = np.ascontiguousarray(rays.directions[ray])
-        self._loops.weigh(cast.record, origins, directions, place, instance, u, v)
+        self._loops.weigh(cast.record, origins, directions, row, instance, u, v)
         t = distance * self._scene.frame.scale  # a power of two
-        return Found(ray, t, self._index[place], u, v, instance)
+        return ClosestHits(ray, t, self._index[row], u, v, instance)
 
     def strike(self, crossing: Crossing, nearest: Nearest) -> None:
-        """See `Backend.strike`."""
+        """Cast rays on bodies of this shape, and write nearer hits to `nearest`."""
         from .embree_bodies import strike
 
-        own = self._base.copy()
-        limits = crossing.limits
-        own["t_min"], own["t_max"] = (limit * self._scene.frame.scale for limit in limits)
-        own["scratch"], _ = self._memory.own.memory(0)
-        given = crossing.row, crossing.body, crossing.number
-        row, body, number = map(np.ascontiguousarray, given)
+        record = self._base.copy()
+        scale = self._scene.frame.scale
+        record["t_min"], record["t_max"] = (limit * scale for limit in crossing.limits)
+        record["scratch"], _ = self._memory.thread_memory.addresses(0)
         # Threads may time calls at the same time: each list has enough, whatever the order.
-        packets, single = self._strikes
-        tried = min(len(packets), len(single)) >= _TRIALS
-        alone = len(single) < len(packets)
-        if tried:  # by the medians
-            alone = sorted(single)[_TRIALS // 2] < sorted(packets)[_TRIALS // 2]
-        own["coherence"] = 2.0 if alone else _COHERENCE
+        packets, single = self._strike_times
+        decided = min(len(packets), len(single)) >= _TRIALS
+        use_single = len(single) < len(packets)
+        if decided:  # by the medians
+            use_single = sorted(single)[_TRIALS // 2] < sorted(packets)[_TRIALS // 2]
+        record["coherence"] = 2.0 if use_single else _COHERENCE
+        pairs = crossing.contiguous()
         start = time.perf_counter()
-        strike(own, crossing.rays, row, body, number, crossing.poses, crossing.box, *nearest)
-        if not tried and len(row) >= _TRIED:
-            self._strikes[bool(alone)].append((time.perf_counter() - start) / len(row))
+        strike(record, pairs, nearest)
+        count = len(crossing.row)
+        if not decided and count >= _TRIAL_RAYS:
+            self._strike_times[bool(use_single)].append((time.perf_counter() - start) / count)
 
     def parts(self, scan: Scan) -> Iterator[tuple[int, int, Part]]:
-        """See `Backend.parts`."""
-        cast = self._of_scan(scan)
+        """Yield start and stop of each part of a scan, and its hits, numbered from start."""
+        cast = self._scan_cast(scan)
         plan = self._plan(scan)
         for start, stop in scan.chunks(self.chunk):
-            for begin, end, tried in plan.pieces(start, stop):
-                yield begin, end, self._cast(cast, begin, end, plan.ways[0])
-                if tried:
+            for begin, end, is_trial in plan.pieces(start, stop):
+                yield begin, end, self._cast(cast, begin, end, plan.groupings[0])
+                if is_trial:
                     plan.choose(partial(self._cast, cast, begin, end))
 
-    def _of_rays(self, rays: Rays) -> Cast:
-        """Prepare to cast rays that are not of a pattern."""
-        one = len(rays.origins) == 1
-        origins, at = (None, rays.origins) if one else (rays.origins, np.zeros((1, 3)))
+    def _ray_cast(self, rays: Rays) -> Cast:
+        """Return the cast of rays that are not of a pattern."""
+        origins: Floats | None = rays.origins
+        position = np.zeros((1, 3))
+        if len(rays.origins) == 1:
+            position = rays.origins
+            origins = None
         cast = self._memory.Cast(self._base)
-        poses = Poses(at, None, max(len(rays), 1))
-        cast.take(rays.directions, origins, poses, 0)
-        self._reach(cast, poses, origins, (rays.t_min, rays.t_max))
+        poses = Poses(position, None, max(len(rays), 1))
+        cast.set_beams(rays.directions, origins, poses, 0)
+        self._set_limits(cast, poses, origins, (rays.t_min, rays.t_max))
         return cast
 
-    def _of_scan(self, scan: Scan) -> Cast:
-        """Prepare to cast a scan."""
+    def _scan_cast(self, scan: Scan) -> Cast:
+        """Return the cast of a scan."""
         pattern = scan.pattern
         cast = self._memory.Cast(self._base)
-        aside = cast.take_pattern(pattern, scan.poses, scan.first)
+        max_offset = cast.set_pattern(pattern, scan.poses, scan.first)
         if scan.room is not None:
-            cast.record["ways"] = scan.room[-3:].ctypes.data
-            cast.record["all"] = len(scan)
+            cast.record["directions_out"] = scan.room[-3:].ctypes.data
+            cast.record["ray_count"] = len(scan)
             if len(scan.room) > 3:
-                cast.record["starts"] = scan.room.ctypes.data
-                if cast.record["still"]:
+                cast.record["origins_out"] = scan.room.ctypes.data
+                if cast.record["shares_origin"]:
                     scan.room[:3] = scan.poses.positions.T
-        self._reach(cast, scan.poses, pattern.origins, (scan.t_min, scan.t_max), aside)
+        self._set_limits(cast, scan.poses, pattern.origins, (scan.t_min, scan.t_max), max_offset)
         return cast
 
-    def _reach(
+    def _set_limits(
         self,
         cast: Cast,
         poses: Poses,
         origins: Floats | None,
         limits: tuple[float, float],
-        aside: float = 0.0,
+        max_offset: float = 0.0,
     ) -> None:
-        """Note limits, and whether all rays start near the scene, so far `aside` of their beam."""
+        """Write the limits of distances, and whether all rays start near the scene, to a cast.
+
+        `origins` are of beams, relative to the sensor; sub-rays start at most `max_offset` metres
+        from their beam.
+        """
         motion = poses.motion
         frame = self._scene.frame
         record = cast.record
         reach = float(np.abs(frame.to_local(poses.positions)).max(initial=0))
-        reach += 2 * aside * frame.scale
+        reach += 2 * max_offset * frame.scale
         if origins is not None:
             reach += 2 * float(np.abs(origins).max(initial=0)) * frame.scale
         if motion is not None:
-            way = np.abs(motion.delays).max(initial=0) * np.abs(motion.velocities).max(initial=0)
-            reach += 2 * float(way) * frame.scale
-        record["near"] = reach < NEAR
+            max_delay = np.abs(motion.delays).max(initial=0)
+            path = max_delay * np.abs(motion.velocities).max(initial=0)
+            reach += 2 * float(path) * frame.scale
+        record["starts_near"] = reach < NEAR
         record["t_min"], record["t_max"] = (limit * frame.scale for limit in limits)
 
     def _plan(self, scan: Scan) -> _Plan:
-        """Ways to group the rays of a scan: those that were the fastest for others like it."""
-        each = scan.poses.rays if len(scan.poses) > 1 else 0
-        plan = self._plans.get((len(scan.pattern), each))
+        """Return the plan of similar scans, with their fastest groupings, or a new plan."""
+        rays_per_pose = scan.poses.rays if len(scan.poses) > 1 else 0
+        key = (len(scan.pattern), rays_per_pose)
+        plan = self._plans.get(key)
         if plan is None or not plan.fits(scan):
-            if len(self._plans) >= _PLANS:
+            if len(self._plans) >= _MAX_PLANS:
                 self._plans.clear()
-            plan = self._plans[len(scan.pattern), each] = _Plan(scan, each)
+            plan = self._plans[key] = _Plan(scan, rays_per_pose)
         return plan
 
-    def _cast(self, cast: Cast, start: int, stop: int, way: _RayGrouping = _IN_TURN) -> Part:
-        """Hits of rays `start` to `stop`, in their order, numbered from `start`."""
+    def _cast(
+        self, cast: Cast, start: int, stop: int, grouping: _RayGrouping = _CONSECUTIVE
+    ) -> Part:
+        """Return the hits of rays `start` to `stop`, in their order, numbered from `start`."""
         n = stop - start
         ray = np.empty(n, np.uint32)
         distance = np.empty(n)
@@ -259,106 +284,112 @@ class EmbreeBackend(Backend):
         instance = (np.empty if self._scene.nested else np.zeros)(n, np.int32)
 
         def part(begin: int) -> Part:
-            own = cast.record.copy()
-            at = begin - start
-            own["step"] = way.step
-            own["high"] = way.high
-            own["wide"] = way.wide
-            own["coherence"] = way.coherence
-            own["before"] = start
-            own["scratch"], own["room"] = self._memory.own.memory(way.step * way.high)
-            own["ray"] = ray[at:].ctypes.data
-            own["distance"] = distance[at:].ctypes.data
-            own["triangle"] = triangle[at:].ctypes.data
-            own["instance"] = instance[at:].ctypes.data
-            count = self._loops.trace(own, begin, min(begin + share, stop))
-            here = slice(at, at + count)
-            return ray[here], distance[here], triangle[here], instance[here]
+            record = cast.record.copy()
+            row = begin - start
+            scratch, block_memory = self._memory.thread_memory.addresses(grouping.block)
+            record["scratch"] = scratch
+            record["block_memory"] = block_memory
+            record["step"] = grouping.step
+            record["rays_along"] = grouping.rays_along
+            record["rays_across"] = grouping.rays_across
+            record["coherence"] = grouping.coherence
+            record["first_ray"] = start
+            record["ray"] = ray[row:].ctypes.data
+            record["distance"] = distance[row:].ctypes.data
+            record["triangle"] = triangle[row:].ctypes.data
+            record["instance"] = instance[row:].ctypes.data
+            count = self._loops.trace(record, begin, min(begin + share, stop))
+            hits = slice(row, row + count)
+            return ray[hits], distance[hits], triangle[hits], instance[hits]
 
-        span = way.step * way.high
-        share = max(_SHARE // span, 1) * span
+        share = max(_SHARE // grouping.block, 1) * grouping.block
         if self._count == 1 or n <= share:
             share = n
             return part(start)
-        if self._process != os.getpid():  # a fork, which has none of its parent's threads
+        if self._process != os.getpid():  # a fork, which has no threads of its parent
             self._threads = ThreadPoolExecutor(self._count, "embree")
             self._process = os.getpid()
-        return joined(list(self._threads.map(part, range(start, stop, share))))
+        return join_hits(list(self._threads.map(part, range(start, stop, share))))
 
 
 class _Plan:
-    """Ways to group the rays of a pattern, of which the fastest is found while they are cast.
+    """Groupings of the rays of a pattern, of which the fastest is chosen during casts.
 
-    Rays of a group are of a ring, or of some neighbouring rings, or each is cast by itself: what is
-    fastest depends on the scene. All are tried on the same parts. No way changes a result.
+    A group has rays of a ring, or of some neighbouring rings, or each ray is cast by itself: which
+    grouping is fastest depends on the scene. All are tried on the same parts. No grouping changes a
+    result.
     """
 
-    def __init__(self, scan: Scan, each: int) -> None:
-        self._beams = ref(np.asarray(scan.pattern.directions.base))  # which its copies share
-        many = scan.pattern.each
-        steps = {1, scan.pattern.step * many, each} - {0}
-        spreads = {step: _spread(scan, _RayGrouping(step, 16, 1)) for step in steps}
-        self._step = max(spreads, key=lambda step: spreads[step])
-        self._spread = spreads[self._step]
-        self.ways = [_IN_TURN]
-        if self._spread > _COHERENCE:
-            ways = {
-                _RayGrouping(self._step, high, wide) for high, wide in _SHAPES if wide <= self._step
+    def __init__(self, scan: Scan, rays_per_pose: int) -> None:
+        self._beams = ref(np.asarray(scan.pattern.directions.base))  # shared by copies of a pattern
+        subrays = scan.pattern.subrays_per_beam
+        steps = {1, scan.pattern.step * subrays, rays_per_pose} - {0}
+        coherences = {step: _coherence(scan, _RayGrouping(step, 16, 1)) for step in steps}
+        self._step = max(coherences, key=lambda step: coherences[step])
+        self._coherence = coherences[self._step]
+        self.groupings = [_CONSECUTIVE]
+        if self._coherence > _COHERENCE:
+            groupings = {
+                _RayGrouping(self._step, rays_along, rays_across)
+                for rays_along, rays_across in _SHAPES
+                if rays_across <= self._step
             }
-            if many > 1:  # those of a beam, which differ least, go together
-                ways = {_IN_TURN} | {_RayGrouping(step, *_SHAPES[-1]) for step in steps if step > 4}
-            self.ways = [
-                way
-                for way in sorted(ways)
-                if way.step * way.high <= _MOST and _spread(scan, way) > _COHERENCE
-            ] or self.ways
-            self.ways.append(_RayGrouping(1, 16, 1, 2.0))
-        self._trials: list[list[float]] = []  # times of each way, as shares of the shortest
+            if subrays > 1:  # the sub-rays of a beam, which differ least, form groups
+                squares = {_RayGrouping(step, *_SHAPES[-1]) for step in steps if step > 4}
+                groupings = {_CONSECUTIVE} | squares
+            self.groupings = [
+                grouping
+                for grouping in sorted(groupings)
+                if grouping.block <= _MAX_BLOCK and _coherence(scan, grouping) > _COHERENCE
+            ] or self.groupings
+            self.groupings.append(_RayGrouping(1, 16, 1, 2.0))
+        self._trials: list[list[float]] = []  # times of the groupings, as shares of the shortest
 
     def fits(self, scan: Scan) -> bool:
-        """Whether the rays of a scan are as close together as those for which this was made."""
+        """Return whether the rays of a scan are as coherent as the rays of this plan."""
         if self._beams() is scan.pattern.directions.base:
             return True
-        return abs(_spread(scan, _RayGrouping(self._step, 16, 1)) - self._spread) < _LIKE
+        grouping = _RayGrouping(self._step, 16, 1)
+        return abs(_coherence(scan, grouping) - self._coherence) < _SIMILAR
 
     def pieces(self, start: int, stop: int) -> Iterator[tuple[int, int, bool]]:
-        """Parts of rays `start` to `stop`, and whether to try all ways there."""
+        """Yield start and stop of parts of rays, and whether to try all groupings on a part."""
         part = -(-(stop - start) // _TRIALS)
         while start < stop:
-            if len(self.ways) > 1:
-                blocks = max(way.step * way.high for way in self.ways)
-                end = min(start + max(blocks, _TRIED), stop)
-                yield start, end, True
-                start, end = end, min(max(end, start + part), stop)
-            else:
-                end = stop
+            end = stop
+            if len(self.groupings) > 1:
+                block = max(grouping.block for grouping in self.groupings)
+                trial_end = min(start + max(block, _TRIAL_RAYS), stop)
+                yield start, trial_end, True
+                end = min(max(trial_end, start + part), stop)
+                start = trial_end
             if start < end:
                 yield start, end, False
             start = end
 
     def choose(self, cast: Callable[[_RayGrouping], object]) -> None:
-        """Cast a part, which is in the caches by now, in each way; the last time, choose one."""
-        ways = self.ways
+        """Time the cast of a part, now in the caches, in each grouping; at last keep the best."""
+        groupings = self.groupings
         marks = [time.perf_counter()]
-        if len(ways) == 1:  # another thread has chosen meanwhile
+        if len(groupings) == 1:  # another thread has chosen meanwhile
             return
-        for way in ways:
-            cast(way)
+        for grouping in groupings:
+            cast(grouping)
             marks.append(time.perf_counter())
         times = np.diff(marks)
         self._trials.append(list(times / times.min()))
         if len(self._trials) >= _TRIALS:
-            self.ways = [ways[int(np.median(self._trials, axis=0).argmin())]]
+            self.groupings = [groupings[int(np.median(self._trials, axis=0).argmin())]]
 
 
-def _spread(scan: Scan, way: _RayGrouping) -> float:
-    """Mean over some groups of the least cosine between their first ray and some others."""
+def _coherence(scan: Scan, grouping: _RayGrouping) -> float:
+    """Return the mean over sampled groups of the smallest cosine between first and further rays."""
     lanes = np.array([0, 5, 10, 15])
-    lags = way.step * (lanes // way.wide) + lanes % way.wide
-    room = len(scan) - int(lags[-1])
-    if room <= 0:
+    lags = grouping.step * (lanes // grouping.rays_across) + lanes % grouping.rays_across
+    last_start = len(scan) - int(lags[-1])
+    if last_start <= 0:
         return -1.0
-    ray = np.linspace(0, room - 1, 32).astype(np.int64)[:, None] + lags
+    ray = np.linspace(0, last_start - 1, 32).astype(np.int64)[:, None] + lags
     _, directions = checked_rays(scan.pattern, scan.first, ray.reshape(-1), scan.poses)
     packets = directions.reshape(-1, len(lags), 3)
     return float((packets[:, 1:] * packets[:, :1]).sum(axis=2).min(axis=1).mean())

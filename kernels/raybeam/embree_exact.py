@@ -2,10 +2,10 @@
 
 A filter function, which Embree calls for each triangle that it finds in float32, notes the closest
 and another that float32 cannot tell from it (`propose`); both then pass the watertight test of
-triangle.py. Embree is told of a distance that is a little farther than the closest, so it goes on
-to propose such triangles. A ray of which that says too little, or that passes at an edge, is cast
-again by itself, and the test is applied to every triangle that is proposed, and at an edge to all
-that are near (`decide`). Of equally close triangles the lowest wins. So a ray's result does not
+triangle.py. Embree receives a distance that is a little farther than the closest, so it goes on to
+propose such triangles. A ray with more candidates, or a ray that passes at an edge, is cast again
+by itself, and the test is applied to every triangle that is proposed, and at an edge to all
+triangles nearby (`decide`). Of equally close triangles the lowest wins. So a ray's result does not
 depend on the rays that share its packet, nor on the processor's instructions, and has the bits of
 the other backends. At an instance, the test takes the ray to the mesh's coordinates in float64
 itself, as instances.py says.
@@ -28,40 +28,50 @@ from numba import types
 
 from . import embree_memory as memory
 from .compiled import callback, inlined, stage
-from .embree_library import find
-from .embree_memory import LANES, NUMBER, at, float32s, float64s, int32s, int64s, offset, uint8s
+from .embree_library import find_library
+from .embree_memory import (
+    LANES,
+    NUMBER,
+    byte_offset,
+    field_index,
+    float32s,
+    float64s,
+    int32s,
+    int64s,
+    uint8s,
+)
 from .mesh import NEAR
-from .triangle_loops import areas, shear, within
+from .triangle_loops import PlaneHit, areas, same_sign, shear
 
-llvmlite.binding.load_library_permanently(str(find()))  # compiled code names its functions
+llvmlite.binding.load_library_permanently(str(find_library()))  # compiled code names its functions
 
-_MESH = at("mesh")
-_INSTANCES = at("instances")
-_MASKED = at("masked")
-_T_MIN = at("t_min")
-_T_MAX = at("t_max")
-_LANE = at("lane")
-_SCENE = at("scene")
-_NEARBY = at("nearby")
-_ARGUMENTS = at("arguments")
-_ARGUMENTS_AT = offset("arguments")
-_SINGLE_AT = offset("single")
-_PACKET = at("packet")
-_QUERY_AT = offset("query")
-_QUERY_CONTEXT_AT = offset("query_context")
-_OX, _OY, _OZ, _DX, _DY, _DZ = map(at, ("ox", "oy", "oz", "dx", "dy", "dz"))
-_ENTRY, _AXIS, _U, _V, _W = map(at, ("entry", "axis", "u", "v", "w"))
-_SX, _SY, _SZ, _INSIDE, _LENGTH = map(at, ("sx", "sy", "sz", "inside", "length"))
-_ROUGH = at("rough")
-_ONE = at("one")
-_OTHER = at("other")
-_ROUGH_32 = at("rough_32")
-_ONE_32 = at("one_32")
-_OTHER_32 = at("other_32")
-_T = at("t")
-_KEY = at("key")
-_SURE = at("sure")
-_CORNERS = at("corners")
+_MESH = field_index("mesh")
+_INSTANCES = field_index("instances")
+_MASKED = field_index("masked")
+_T_MIN = field_index("t_min")
+_T_MAX = field_index("t_max")
+_LANE = field_index("lane")
+_SCENE = field_index("scene")
+_NEARBY = field_index("nearby")
+_ARGUMENTS = field_index("arguments")
+_ARGUMENTS_AT = byte_offset("arguments")
+_SINGLE_AT = byte_offset("single")
+_PACKET = field_index("packet")
+_QUERY_AT = byte_offset("query")
+_QUERY_CONTEXT_AT = byte_offset("query_context")
+_OX, _OY, _OZ, _DX, _DY, _DZ = map(field_index, ("ox", "oy", "oz", "dx", "dy", "dz"))
+_ENTRY, _AXIS, _U, _V, _W = map(field_index, ("entry", "axis", "u", "v", "w"))
+_SX, _SY, _SZ, _INSIDE, _LENGTH = map(field_index, ("sx", "sy", "sz", "inside", "length"))
+_ROUGH = field_index("rough")
+_FIRST = field_index("first_candidate")
+_SECOND = field_index("second_candidate")
+_ROUGH_32 = field_index("rough_32")
+_FIRST_32 = field_index("first_32")
+_SECOND_32 = field_index("second_32")
+_T = field_index("t")
+_KEY = field_index("key")
+_SURE = field_index("sure")
+_CORNERS = field_index("corners")
 
 # RTCRayQueryFlags
 COHERENT = 1 << 16
@@ -70,9 +80,9 @@ CALL_FILTER = 1 << 1
 # Local units. Ten times the error of a float32 distance, unless the ray grazes: so much farther
 # Embree goes on to look for triangles.
 MARGIN = 2.0**-19
-FAR = 8.0  # more than the diagonal of any scene
+MAX_DISTANCE = 8.0  # more than the diagonal of any scene
 
-_GRAZES = 2.0**-10  # sine of the least angle to a triangle that `decide` allows for
+_GRAZES = 2.0**-10  # sine of the smallest angle to a triangle that `decide` allows for
 _RIM = 2.0**-20  # share of a triangle's height: far more than what float64 rounds
 _STRAIGHT = 1 + 2.0**-20  # sum of a direction's components, so near to an axis
 
@@ -85,8 +95,8 @@ _point_query = types.ExternalFunction(
 
 
 @stage
-def entered(m, ox, oy, oz, dx, dy, dz):  # type: ignore[no-untyped-def]
-    """Take a ray to an instance's coordinates, as `Scene.enter`; also returns its length."""
+def enter_instance(m, ox, oy, oz, dx, dy, dz):  # type: ignore[no-untyped-def]
+    """Transform a ray to an instance's coordinates, as `Scene.enter`; also return its length."""
     x = (m[0] * dx + m[1] * dy) + m[2] * dz
     y = (m[4] * dx + m[5] * dy) + m[6] * dz
     z = (m[8] * dx + m[9] * dy) + m[10] * dz
@@ -98,8 +108,8 @@ def entered(m, ox, oy, oz, dx, dy, dz):  # type: ignore[no-untyped-def]
 
 
 @inlined
-def given(floats, lane):  # type: ignore[no-untyped-def]
-    """Origin and direction of a ray, local to the scene."""
+def scene_ray(floats, lane):  # type: ignore[no-untyped-def]
+    """Return origin and direction of a ray of the group, local to the scene."""
     x = floats[_OX + lane]
     y = floats[_OY + lane]
     z = floats[_OZ + lane]
@@ -107,9 +117,9 @@ def given(floats, lane):  # type: ignore[no-untyped-def]
 
 
 @inlined
-def keep_sheared(numbers, floats, lane, ox, oy, oz, dx, dy, dz):  # type: ignore[no-untyped-def]
-    """Note what `shear` says of a ray."""
-    axis, u, v, w, sx, sy, sz = shear(ox, oy, oz, dx, dy, dz)
+def store_shear(numbers, floats, lane, ray):  # type: ignore[no-untyped-def]
+    """Write the shear of a ray, by its origin and direction, to the scratch memory."""
+    axis, u, v, w, sx, sy, sz = shear(*ray)
     numbers[_AXIS + lane] = axis
     floats[_U + lane] = u
     floats[_V + lane] = v
@@ -121,34 +131,34 @@ def keep_sheared(numbers, floats, lane, ox, oy, oz, dx, dy, dz):  # type: ignore
 
 @stage
 def shear_all(scratch):  # type: ignore[no-untyped-def]
-    """Note what `shear` says of all rays of a group."""
+    """Write the shear of all rays of a group to the scratch memory."""
     numbers = int64s(scratch)
     floats = float64s(scratch)
     for lane in range(LANES):
-        keep_sheared(numbers, floats, lane, *given(floats, lane))
+        store_shear(numbers, floats, lane, scene_ray(floats, lane))
 
 
 @stage
 def _mesh_of(mesh, instances, numbers, floats, lane, key):  # type: ignore[no-untyped-def]
-    """Address of the record of a key's mesh; the ray is taken to the mesh's coordinates."""
+    """Return the address of the `MESH` of a key; transform the ray to the mesh's coordinates."""
     if instances == 0:
         return mesh
     number = key // NUMBER
     address = instances + memory.RECORD * number
     if numbers[_INSIDE + lane] != number:
-        ox, oy, oz, dx, dy, dz, length = entered(float64s(address), *given(floats, lane))
-        keep_sheared(numbers, floats, lane, ox, oy, oz, dx, dy, dz)
+        ox, oy, oz, dx, dy, dz, length = enter_instance(float64s(address), *scene_ray(floats, lane))
+        store_shear(numbers, floats, lane, (ox, oy, oz, dx, dy, dz))
         floats[_LENGTH + lane] = length
         numbers[_INSIDE + lane] = number
     return int64s(address)[memory.MESH_OF]
 
 
 @inlined
-def corners_of(table, place, axis):  # type: ignore[no-untyped-def]
-    """Corners of a triangle, each with the axis last."""
+def corners_of(table, triangle, axis):  # type: ignore[no-untyped-def]
+    """Return the three corners of a triangle, each with the axis last."""
     x = axis + 1 if axis < 2 else 0
     y = x + 1 if x < 2 else 0
-    k = 9 * place
+    k = 9 * triangle
     return (
         (table[k + x], table[k + y], table[k + axis]),
         (table[k + 3 + x], table[k + 3 + y], table[k + 3 + axis]),
@@ -157,7 +167,8 @@ def corners_of(table, place, axis):  # type: ignore[no-untyped-def]
 
 
 @inlined
-def _sheared(floats, lane):  # type: ignore[no-untyped-def]
+def _load_shear(floats, lane):  # type: ignore[no-untyped-def]
+    """Return the sheared ray that `store_shear` wrote."""
     u = floats[_U + lane]
     v = floats[_V + lane]
     w = floats[_W + lane]
@@ -165,23 +176,24 @@ def _sheared(floats, lane):  # type: ignore[no-untyped-def]
 
 
 @inlined
-def _clearly(a, b, c, det):  # type: ignore[no-untyped-def]
-    """Whether a ray passes inside, and not at an edge or a corner, which others may share."""
+def _is_clearly_inside(hit):  # type: ignore[no-untyped-def]
+    """Return whether a ray passes inside a triangle, away from shared edges and corners."""
+    a, b, c, det, _ = hit
     rim = _RIM * det * det
     return (a * det > rim) & (b * det > rim) & (c * det > rim)
 
 
 @stage
-def _stopped(mesh, place, a, b, c, det):  # type: ignore[no-untyped-def]
-    """Whether the mask of a mesh stops a ray in a triangle, as `Masks.opaque`."""
+def _is_opaque(mesh, triangle, hit):  # type: ignore[no-untyped-def]
+    """Return whether the mask of a mesh stops a ray in a triangle, as `Masks.opaque`."""
     uv = float32s(mesh[1])
     mask = uint8s(mesh[2])
     height = mesh[3]
     width = mesh[4]
-    k = 6 * place
-    p = a / det
-    q = b / det
-    r = c / det
+    k = 6 * triangle
+    p = hit.a / hit.det
+    q = hit.b / hit.det
+    r = hit.c / hit.det
     u = (p * np.float64(uv[k]) + q * np.float64(uv[k + 2])) + r * np.float64(uv[k + 4])
     v = (p * np.float64(uv[k + 1]) + q * np.float64(uv[k + 3])) + r * np.float64(uv[k + 5])
     column = min(np.int64((u - np.floor(u)) * width), width - 1)
@@ -190,60 +202,64 @@ def _stopped(mesh, place, a, b, c, det):  # type: ignore[no-untyped-def]
 
 
 @stage
-def _tested(mesh, instances, numbers, floats, lane, key):  # type: ignore[no-untyped-def]
-    """Areas of a triangle, their sum, the distance, as in triangle.py, and the mesh's record."""
+def _intersect(mesh, instances, numbers, floats, lane, key):  # type: ignore[no-untyped-def]
+    """Return the `PlaneHit` of a ray and a triangle by key, and the `MESH` of the triangle."""
     record = int64s(_mesh_of(mesh, instances, numbers, floats, lane, key))
-    place = key & (NUMBER - 1)
-    corners = corners_of(float64s(record[0]), place, numbers[_AXIS + lane])
-    a, b, c, det, t = areas(corners, _sheared(floats, lane))
+    triangle = key & (NUMBER - 1)
+    corners = corners_of(float64s(record[0]), triangle, numbers[_AXIS + lane])
+    hit = areas(corners, _load_shear(floats, lane))
     if instances != 0:
-        t = t / floats[_LENGTH + lane]
-    return a, b, c, det, t, record
+        t = hit.t / floats[_LENGTH + lane]
+        hit = PlaneHit(hit.a, hit.b, hit.c, hit.det, t)
+    return hit, record
 
 
 @stage
-def _transparent(mesh, instances, numbers, floats, lane, key):  # type: ignore[no-untyped-def]
-    """Whether a mask lets a ray through a triangle."""
-    a, b, c, det, _, record = _tested(mesh, instances, numbers, floats, lane, key)
+def _is_transparent(mesh, instances, numbers, floats, lane, key):  # type: ignore[no-untyped-def]
+    """Return whether a mask lets a ray through a triangle."""
+    hit, record = _intersect(mesh, instances, numbers, floats, lane, key)
     if record[3] == 0:
         return False
-    return det == 0 or not _stopped(record, key & (NUMBER - 1), a, b, c, det)
+    return hit.det == 0 or not _is_opaque(record, key & (NUMBER - 1), hit)
 
 
 @cache
 def plain_proposer(count: int, part: int = 0) -> Any:
-    """As `propose`, in a scene without instances and masks, for one size of packets.
+    """Return a filter function like `propose`, for packets of `count` rays in a plain scene.
 
-    With a constant number of rays, and all numbers at constant distances from one address, the
-    loop becomes a few vector instructions. `part` is the number of the packet in its group.
+    A plain scene has no instances and masks. With a constant number of rays, and all numbers at
+    constant distances from a single address, the loop becomes a few vector instructions. `part` is
+    the number of the packet in its group.
     """
-    packet = at("single") if count == 1 else _PACKET + 22 * count * part
-    begin = part * count
+    packet = field_index("single") if count == 1 else _PACKET + 22 * count * part
+    first_lane = part * count
 
     @callback(types.void(types.CPointer(types.int64)))
-    def propose(arguments):  # type: ignore[no-untyped-def]
+    def propose(arguments):  # type: ignore[no-untyped-def]  # noqa: PLR0914 - a compiled loop
         valid = int32s(arguments[0])
         scratch = arguments[2]
         hits = int32s(arguments[4])
-        lane = int64s(scratch)[_LANE] if count == 1 else begin
+        lane = int64s(scratch)[_LANE] if count == 1 else first_lane
         singles = float32s(scratch)
         integers = int32s(scratch)
         for k in range(count):
-            far = packet + 8 * count + k
-            own = lane + k
-            asked = valid[k] != 0
-            rough = singles[far]
-            nearest = singles[_ROUGH_32 + own]
-            one = integers[_ONE_32 + own]
-            other = integers[_OTHER_32 + own]
-            place = hits[5 * count + k]
-            closer = asked & (rough < nearest)
-            clearly = asked & (rough < nearest - np.float32(MARGIN))
-            second = place if other == -1 else np.int32(-2)  # a third is too many
-            singles[far] = rough + np.float32(MARGIN) if closer else rough
-            singles[_ROUGH_32 + own] = rough if closer else nearest
-            integers[_ONE_32 + own] = place if clearly else one
-            integers[_OTHER_32 + own] = np.int32(-1) if clearly else (second if asked else other)
+            reach_index = packet + 8 * count + k
+            ray_lane = lane + k
+            is_asked = valid[k] != 0
+            rough = singles[reach_index]
+            nearest = singles[_ROUGH_32 + ray_lane]
+            first = integers[_FIRST_32 + ray_lane]
+            known_second = integers[_SECOND_32 + ray_lane]
+            triangle = hits[5 * count + k]
+            closer = is_asked & (rough < nearest)
+            clearly = is_asked & (rough < nearest - np.float32(MARGIN))
+            new_second = triangle if known_second == -1 else np.int32(-2)  # a third is too many
+            singles[reach_index] = rough + np.float32(MARGIN) if closer else rough
+            singles[_ROUGH_32 + ray_lane] = rough if closer else nearest
+            integers[_FIRST_32 + ray_lane] = triangle if clearly else first
+            integers[_SECOND_32 + ray_lane] = (
+                np.int32(-1) if clearly else (new_second if is_asked else known_second)
+            )
             valid[k] = np.int32(-1) if closer else np.int32(0)
 
     return propose
@@ -251,18 +267,18 @@ def plain_proposer(count: int, part: int = 0) -> Any:
 
 @inlined
 def _key(hits, count, k, instances):  # type: ignore[no-untyped-def]
-    """Key of the triangle that Embree asks about, from its RTCHitN."""
+    """Return the key of the triangle that Embree asks about, from its RTCHitN."""
     key = np.int64(hits[5 * count + k])
     return key + NUMBER * hits[7 * count + k] if instances != 0 else key
 
 
 @callback(types.void(types.CPointer(types.int64)))
 def propose(arguments):  # type: ignore[no-untyped-def]
-    """Filter function: keep the closest triangle, and another that float32 cannot tell from it.
+    """Keep the closest triangle, and a second within the error of float32: a filter function.
 
     `arguments` is an RTCFilterFunctionNArguments: addresses of mask, user data, context, rays and
-    hits, and the number of rays. Embree asks about one triangle at a time, for some rays. Where a
-    mask lets a ray through, Embree goes on.
+    hits, and the number of rays. Embree asks about a single triangle, for some rays of the packet.
+    Where a mask lets a ray through, Embree goes on.
     """
     valid = int32s(arguments[0])
     scratch = arguments[2]
@@ -279,16 +295,16 @@ def propose(arguments):  # type: ignore[no-untyped-def]
             continue
         lane = numbers[_LANE] + k
         key = _key(hits, count, k, instances)
-        if masked and _transparent(mesh, instances, numbers, floats, lane, key):
+        if masked and _is_transparent(mesh, instances, numbers, floats, lane, key):
             valid[k] = 0
             continue
         rough = np.float64(rays[8 * count + k])
         nearest = floats[_ROUGH + lane]
         if rough < nearest - MARGIN:
-            numbers[_ONE + lane] = key
-            numbers[_OTHER + lane] = -1
+            numbers[_FIRST + lane] = key
+            numbers[_SECOND + lane] = -1
         else:  # a third is too many
-            numbers[_OTHER + lane] = key if numbers[_OTHER + lane] == -1 else -2
+            numbers[_SECOND + lane] = key if numbers[_SECOND + lane] == -1 else -2
         if rough < nearest:
             floats[_ROUGH + lane] = rough
             rays[8 * count + k] = np.float32(rough + MARGIN)
@@ -298,28 +314,29 @@ def propose(arguments):  # type: ignore[no-untyped-def]
 
 @stage
 def _consider(scratch, lane, key):  # type: ignore[no-untyped-def]
-    """Keep a triangle if it is the closest hit so far; whether the ray clearly passes inside."""
+    """Keep a triangle if closest so far; return whether the ray clearly passes inside."""
     numbers = int64s(scratch)
     floats = float64s(scratch)
     mesh = numbers[_MESH]
     instances = numbers[_INSTANCES]
-    a, b, c, det, t, _ = _tested(mesh, instances, numbers, floats, lane, key)
+    hit, _ = _intersect(mesh, instances, numbers, floats, lane, key)
+    t = hit.t
     nearest = floats[_T + lane]
     if (
-        det != 0
-        and within(a, b, c)
+        hit.det != 0
+        and same_sign(hit.a, hit.b, hit.c)
         and floats[_T_MIN] <= t <= floats[_T_MAX]
         and (t < nearest or (t == nearest and key < numbers[_KEY + lane]))
-        and not (numbers[_MASKED] and _transparent(mesh, instances, numbers, floats, lane, key))
+        and not (numbers[_MASKED] and _is_transparent(mesh, instances, numbers, floats, lane, key))
     ):
         floats[_T + lane] = t
         numbers[_KEY + lane] = key
-    return _clearly(a, b, c, det)
+    return _is_clearly_inside(hit)
 
 
 @callback(types.boolean(types.CPointer(types.int64)))
 def nearby(arguments):  # type: ignore[no-untyped-def]
-    """Consider a triangle near a point; `arguments` is an RTCPointQueryFunctionArguments."""
+    """Test a triangle near a point; `arguments` is an RTCPointQueryFunctionArguments."""
     scratch = arguments[1]
     instance = int32s(arguments[3])[32]
     numbers = int64s(scratch)
@@ -330,12 +347,41 @@ def nearby(arguments):  # type: ignore[no-untyped-def]
     return False  # the distance of interest stays
 
 
+@inlined
+def _distance_error(ray, normal):  # type: ignore[no-untyped-def]
+    """Return the error of float32 along a ray at a triangle: larger where the ray grazes."""
+    x = normal[0]
+    y = normal[1]
+    z = normal[2]
+    dx = ray[4]
+    dy = ray[5]
+    dz = ray[6]
+    steep = abs(x * dx + y * dy + z * dz)
+    full = np.sqrt((x * x + y * y + z * z) * (dx * dx + dy * dy + dz * dz))
+    return 2 * MARGIN * (max(full / steep, 1.0) if steep > _GRAZES * full else 1 / _GRAZES)
+
+
+@inlined
+def _consider_nearby(scratch, lane, distance, radius):  # type: ignore[no-untyped-def]
+    """Test all triangles within a radius of the point at a distance along a ray."""
+    numbers = int64s(scratch)
+    query = float32s(scratch + _QUERY_AT)
+    ox, oy, oz, dx, dy, dz = scene_ray(float64s(scratch), lane)
+    query[0] = np.float32(ox + distance * dx)
+    query[1] = np.float32(oy + distance * dy)
+    query[2] = np.float32(oz + distance * dz)
+    query[4] = np.float32(radius)
+    query_address = scratch + _QUERY_AT
+    context_address = scratch + _QUERY_CONTEXT_AT
+    _point_query(numbers[_SCENE], query_address, context_address, numbers[_NEARBY], scratch)
+
+
 @callback(types.void(types.CPointer(types.int64)))
 def decide(arguments):  # type: ignore[no-untyped-def]
-    """Filter function for single rays: accept what is closer in float64.
+    """Accept a closer triangle by the test in float64: a filter function for single rays.
 
-    At an edge, Embree may propose any one of the triangles that share it, or one that float64 has
-    beside the ray. Then all triangles that are near that point are considered.
+    At an edge, Embree may propose any of the triangles that share the edge, or a triangle that is
+    beside the ray in float64. Then all triangles near that point are tested.
     """
     valid = int32s(arguments[0])
     scratch = arguments[2]
@@ -348,69 +394,52 @@ def decide(arguments):  # type: ignore[no-untyped-def]
     entry = floats[_ENTRY + numbers[_LANE]]
     nearest = floats[_T + lane]
     clear = _consider(scratch, lane, _key(hit, 1, 0, numbers[_INSTANCES]))
-    # Float32 is so far off along the ray: more where it grazes.
-    x = normal[0]
-    y = normal[1]
-    z = normal[2]
-    dx = ray[4]
-    dy = ray[5]
-    dz = ray[6]
-    steep = abs(x * dx + y * dy + z * dz)
-    full = np.sqrt((x * x + y * y + z * z) * (dx * dx + dy * dy + dz * dz))
-    off = 2 * MARGIN * (max(full / steep, 1.0) if steep > _GRAZES * full else 1 / _GRAZES)
+    error = _distance_error(ray, normal)
     if not clear:
-        query = float32s(scratch + _QUERY_AT)
-        along = entry + ray[8]
-        ox, oy, oz, dx, dy, dz = given(floats, lane)
-        query[0] = np.float32(ox + along * dx)
-        query[1] = np.float32(oy + along * dy)
-        query[2] = np.float32(oz + along * dz)
-        query[4] = np.float32(off)
-        where = scratch + _QUERY_AT
-        context = scratch + _QUERY_CONTEXT_AT
-        _point_query(numbers[_SCENE], where, context, numbers[_NEARBY], scratch)
+        _consider_nearby(scratch, lane, entry + ray[8], error)
     if floats[_T + lane] < nearest:
-        ray[8] = np.float32(floats[_T + lane] - entry + off)
+        ray[8] = np.float32(floats[_T + lane] - entry + error)
     else:
         valid[0] = 0
 
 
 @inlined
-def _sure(floats, lane, t_min, a, b, c, det, t):  # type: ignore[no-untyped-def]
-    """Whether a ray hits a triangle as float32 has it."""
-    off = abs(t - floats[_ENTRY + lane] - floats[_ROUGH + lane])
-    return _clearly(a, b, c, det) & (t >= t_min) & (off <= 1.5 * MARGIN)
+def _is_sure(floats, lane, t_min, hit):  # type: ignore[no-untyped-def]
+    """Return whether a ray clearly hits a triangle, at the distance of float32."""
+    error = abs(hit.t - floats[_ENTRY + lane] - floats[_ROUGH + lane])
+    return _is_clearly_inside(hit) & (hit.t >= t_min) & (error <= 1.5 * MARGIN)
 
 
 @inlined
 def verify(mesh, instances, numbers, floats, lane):  # type: ignore[no-untyped-def]
-    """Write to `t`, `key` and `sure` what the test says of a ray's candidates."""
+    """Test the candidates of a ray, and write the closer hit to `t`, `key` and `sure`."""
     t = np.inf
     key = np.int64(-1)
     sure = True
     t_min = floats[_T_MIN]
-    one = numbers[_ONE + lane]
-    other = numbers[_OTHER + lane]
-    if one >= 0:
-        a, b, c, det, t, _ = _tested(mesh, instances, numbers, floats, lane, one)
-        key = one
-        sure = _sure(floats, lane, t_min, a, b, c, det, t)
-        if other >= 0:
-            a, b, c, det, t_2, _ = _tested(mesh, instances, numbers, floats, lane, other)
-            sure = sure and _sure(floats, lane, t_min, a, b, c, det, t_2)
-            if t_2 < t or (t_2 == t and other < one):
-                t = t_2
-                key = other
+    first = numbers[_FIRST + lane]
+    second = numbers[_SECOND + lane]
+    if first >= 0:
+        hit, _ = _intersect(mesh, instances, numbers, floats, lane, first)
+        t = hit.t
+        key = first
+        sure = _is_sure(floats, lane, t_min, hit)
+        if second >= 0:
+            hit, _ = _intersect(mesh, instances, numbers, floats, lane, second)
+            sure = sure and _is_sure(floats, lane, t_min, hit)
+            if hit.t < t or (hit.t == t and second < first):
+                t = hit.t
+                key = second
     floats[_T + lane] = t
     numbers[_KEY + lane] = key
-    numbers[_SURE + lane] = np.int64(sure and other != -2)
+    numbers[_SURE + lane] = np.int64(sure and second != -2)
 
 
 @inlined
 def _copy(table, numbers, floats, candidate):  # type: ignore[no-untyped-def]
-    """Copy the corners of the candidates of a group, each with the ray's axis last.
+    """Copy the corners of the candidates of a group, with the axis of the ray last.
 
-    Reads from far apart come first, which the processor overlaps, then vector instructions.
+    Scattered reads come first, which the processor overlaps, then vector instructions.
     """
     axis = numbers[_AXIS]
     differ = np.int64(0)
@@ -427,22 +456,22 @@ def _copy(table, numbers, floats, candidate):  # type: ignore[no-untyped-def]
         x = axis + 1 if axis < 2 else 0
         y = x + 1 if x < 2 else 0
         for lane in range(LANES):
-            place = 9 * max(numbers[candidate + lane], 0)
+            base = 9 * max(numbers[candidate + lane], 0)
             for k in range(3):
-                to = _CORNERS + 3 * LANES * k + lane
-                floats[to] = table[place + 3 * k + x]
-                floats[to + LANES] = table[place + 3 * k + y]
-                floats[to + 2 * LANES] = table[place + 3 * k + axis]
+                target = _CORNERS + 3 * LANES * k + lane
+                floats[target] = table[base + 3 * k + x]
+                floats[target + LANES] = table[base + 3 * k + y]
+                floats[target + 2 * LANES] = table[base + 3 * k + axis]
 
 
 @inlined
 def _areas_of(floats, lane):  # type: ignore[no-untyped-def]
-    """As `areas`, of the triangle that `_copy` copied for a ray."""
+    """Return the `PlaneHit` of a ray and the triangle that `_copy` copied for the ray."""
     k = _CORNERS + lane
     p = floats[k], floats[k + LANES], floats[k + 2 * LANES]
     q = floats[k + 3 * LANES], floats[k + 4 * LANES], floats[k + 5 * LANES]
     r = floats[k + 6 * LANES], floats[k + 7 * LANES], floats[k + 8 * LANES]
-    return areas((p, q, r), _sheared(floats, lane))
+    return areas((p, q, r), _load_shear(floats, lane))
 
 
 @stage
@@ -451,12 +480,12 @@ def _verify_first(scratch, t_min):  # type: ignore[no-untyped-def]
     numbers = int64s(scratch)
     floats = float64s(scratch)
     for lane in range(LANES):
-        a, b, c, det, t = _areas_of(floats, lane)
-        one = numbers[_ONE + lane]
-        sure = _sure(floats, lane, t_min, a, b, c, det, t)
-        floats[_T + lane] = t if one >= 0 else np.inf
-        numbers[_KEY + lane] = one
-        numbers[_SURE + lane] = np.int64((one < 0) | (sure & (numbers[_OTHER + lane] != -2)))
+        hit = _areas_of(floats, lane)
+        first = numbers[_FIRST + lane]
+        sure = _is_sure(floats, lane, t_min, hit)
+        floats[_T + lane] = hit.t if first >= 0 else np.inf
+        numbers[_KEY + lane] = first
+        numbers[_SURE + lane] = np.int64((first < 0) | (sure & (numbers[_SECOND + lane] != -2)))
 
 
 @stage
@@ -465,86 +494,87 @@ def _verify_second(scratch, t_min):  # type: ignore[no-untyped-def]
     numbers = int64s(scratch)
     floats = float64s(scratch)
     for lane in range(LANES):
-        a, b, c, det, t = _areas_of(floats, lane)
-        sure = _sure(floats, lane, t_min, a, b, c, det, t)
+        hit = _areas_of(floats, lane)
+        t = hit.t
+        sure = _is_sure(floats, lane, t_min, hit)
         nearest = floats[_T + lane]
-        other = numbers[_OTHER + lane]
+        second = numbers[_SECOND + lane]
         key = numbers[_KEY + lane]
-        nearer = (other >= 0) & ((t < nearest) | ((t == nearest) & (other < key)))
+        nearer = (second >= 0) & ((t < nearest) | ((t == nearest) & (second < key)))
         floats[_T + lane] = t if nearer else nearest
-        numbers[_KEY + lane] = other if nearer else key
-        numbers[_SURE + lane] &= np.int64((other < 0) | sure)
+        numbers[_KEY + lane] = second if nearer else key
+        numbers[_SURE + lane] &= np.int64((second < 0) | sure)
 
 
 @stage
 def verify_all(table, scratch, t_min):  # type: ignore[no-untyped-def]
-    """As `verify`, of all rays of a group in a plain scene without masks.
+    """Test the candidates of all rays of a group as `verify` does, in a plain scene without masks.
 
-    Numbers that are the same for all rays are arguments: a load of one would keep loops from
-    becoming vector instructions.
+    Numbers that all rays share are arguments: a load would keep loops from becoming vector
+    instructions.
     """
     numbers = int64s(scratch)
     floats = float64s(scratch)
     singles = float32s(scratch)
     integers = int32s(scratch)
-    second = np.int64(0)
+    second_count = np.int64(0)
     for lane in range(LANES):
         floats[_ROUGH + lane] = singles[_ROUGH_32 + lane]
-        numbers[_ONE + lane] = integers[_ONE_32 + lane]
-        numbers[_OTHER + lane] = integers[_OTHER_32 + lane]
-        second += np.int64(integers[_OTHER_32 + lane] >= 0)
+        numbers[_FIRST + lane] = integers[_FIRST_32 + lane]
+        numbers[_SECOND + lane] = integers[_SECOND_32 + lane]
+        second_count += np.int64(integers[_SECOND_32 + lane] >= 0)
     shear_all(scratch)
-    _copy(table, numbers, floats, _ONE)
+    _copy(table, numbers, floats, _FIRST)
     _verify_first(scratch, t_min)
-    if second:
-        _copy(table, numbers, floats, _OTHER)
+    if second_count:
+        _copy(table, numbers, floats, _SECOND)
         _verify_second(scratch, t_min)
 
 
 @inlined
-def begun(o, d, entry):  # type: ignore[no-untyped-def]
-    """Start of a ray for Embree; near the scene, if float64 cannot place it."""
+def embree_origin(o, d, entry):  # type: ignore[no-untyped-def]
+    """Return a coordinate of the origin for Embree, at most `NEAR` from the scene's centre."""
     return np.float32(min(max(o + entry * d, -NEAR), NEAR))
 
 
 @stage
-def single(scene, scratch, lane, reach, aside, up):  # type: ignore[no-untyped-def]
-    """Cast one ray of a group by itself; Embree sees one along an axis moved, aside and up."""
+def cast_single(scene, scratch, lane, reach, aside, up):  # type: ignore[no-untyped-def]
+    """Cast a single ray of a group, shifted for Embree across its axis by `aside` and `up`."""
     numbers = int64s(scratch)
     floats = float64s(scratch)
     ray = float32s(scratch + _SINGLE_AT)
-    whole = int32s(scratch + _SINGLE_AT)
+    integers = int32s(scratch + _SINGLE_AT)
     entry = floats[_ENTRY + lane]
-    ox, oy, oz, dx, dy, dz = given(floats, lane)
-    ray[0] = begun(ox, dx, entry)
-    ray[1] = begun(oy, dy, entry)
-    ray[2] = begun(oz, dz, entry)
+    ox, oy, oz, dx, dy, dz = scene_ray(floats, lane)
+    ray[0] = embree_origin(ox, dx, entry)
+    ray[1] = embree_origin(oy, dy, entry)
+    ray[2] = embree_origin(oz, dz, entry)
     ray[3] = np.float32(max(floats[_T_MIN] - entry - MARGIN, 0.0))
     ray[4] = np.float32(dx)
     ray[5] = np.float32(dy)
     ray[6] = np.float32(dz)
     ray[7] = np.float32(0)
-    ray[8] = np.float32(min(reach - entry + MARGIN, FAR))
+    ray[8] = np.float32(min(reach - entry + MARGIN, MAX_DISTANCE))
     axis = 0 if abs(ray[4]) > 0.5 else (1 if abs(ray[5]) > 0.5 else 2)
     ray[(axis + 1) % 3] += np.float32(aside)
     ray[(axis + 2) % 3] += np.float32(up)
-    whole[9] = -1
-    whole[10] = 0
-    whole[11] = 0
-    whole[18] = -1
-    whole[19] = -1
-    whole[20] = -1
+    integers[9] = -1
+    integers[10] = 0
+    integers[11] = 0
+    integers[18] = -1
+    integers[19] = -1
+    integers[20] = -1
     numbers[_LANE] = lane
     _intersect_1(scene, scratch + _SINGLE_AT, scratch + _ARGUMENTS_AT)
     numbers[_LANE] = 0
 
 
 @stage
-def decided(scene, scratch, lane, reach):  # type: ignore[no-untyped-def]
-    """Write to `t` and `key` what a ray hits of which `propose` could not be sure.
+def cast_until_sure(scene, scratch, lane, reach):  # type: ignore[no-untyped-def]
+    """Cast a ray that `propose` was not sure of with `decide`; write the hit to `t` and `key`.
 
-    Embree does not see what touches a ray along an axis with the upper side of its box (0 * inf in
-    its test of boxes). So it is shown eight such rays around it, too.
+    Embree misses triangles that touch a ray along an axis with the upper side of their box (0 * inf
+    in its test of boxes). So eight more rays around a ray along an axis are cast, too.
     """
     numbers = int64s(scratch)
     floats = float64s(scratch)
@@ -554,17 +584,17 @@ def decided(scene, scratch, lane, reach):  # type: ignore[no-untyped-def]
     flags[0] = CALL_FILTER
     aside = 0.0
     up = 0.0
-    for k in range(9 if along(floats, lane) else 1):
-        single(scene, scratch, lane, reach, aside, up)
-        one = MARGIN if k & 1 else -MARGIN
-        other = 0.4 * (MARGIN if k & 2 else -MARGIN)
-        aside, up = (one, other) if k & 4 else (other, one)
+    for k in range(9 if is_along_axis(floats, lane) else 1):
+        cast_single(scene, scratch, lane, reach, aside, up)
+        small_shift = MARGIN if k & 1 else -MARGIN
+        smaller_shift = 0.4 * (MARGIN if k & 2 else -MARGIN)
+        aside, up = (small_shift, smaller_shift) if k & 4 else (smaller_shift, small_shift)
     flags[0] = CALL_FILTER | COHERENT
 
 
 @inlined
-def along(floats, lane):  # type: ignore[no-untyped-def]
-    """Whether a ray is along an axis."""
+def is_along_axis(floats, lane):  # type: ignore[no-untyped-def]
+    """Return whether a ray runs along an axis."""
     x = floats[_DX + lane]
     y = floats[_DY + lane]
     z = floats[_DZ + lane]

@@ -33,8 +33,8 @@ _WIDTHS = ((34, 16), (33, 8), (32, 4))
 _ENDINGS = (".dylib", ".dll")
 
 
-def find() -> Path:
-    """Path of the library; ImportError if there is none."""
+def find_library() -> Path:
+    """Return the path of the library; ImportError if not installed."""
     try:
         shipped = files("embreex") or []
     except PackageNotFoundError:
@@ -46,9 +46,9 @@ def find() -> Path:
 
 
 @cache
-def library() -> ctypes.CDLL:
-    """Load the library."""
-    loaded = ctypes.CDLL(str(find()))
+def load_library() -> ctypes.CDLL:
+    """Load the library, once, with the signatures of its functions."""
+    loaded = ctypes.CDLL(str(find_library()))
     pointer = ctypes.c_void_p
     number = ctypes.c_uint
     signatures: dict[str, tuple[object, list[object]]] = {
@@ -82,9 +82,9 @@ def library() -> ctypes.CDLL:
 
 
 def device(threads: int | None = None) -> int:
-    """Device of this process that builds trees with so many threads.
+    """Return the device of this process that builds trees with a number of threads.
 
-    A forked process makes its own, since threads do not survive a fork.
+    A forked process has a new device, since threads do not survive a fork.
     """
     return _device(os.getpid(), threads, os.environ.get("RAYBEAM_EMBREE_ISA", ""))
 
@@ -93,70 +93,71 @@ def device(threads: int | None = None) -> int:
 def _device(process: int, threads: int | None, isa: str) -> int:
     options = [f"threads={threads}"] if threads else []
     options += [f"isa={isa}"] if isa else []
-    made: int | None = library().rtcNewDevice(",".join(options).encode())
-    if made is None:
+    device: int | None = load_library().rtcNewDevice(",".join(options).encode())
+    if device is None:
         raise RuntimeError(f"Embree makes no device ({','.join(options) or 'default'}).")
-    return made
+    return device
 
 
 def packet_width() -> int:
-    """Rays of the widest packets that the processor casts at once; 1 for none."""
-    ask = library().rtcGetDeviceProperty
+    """Return the number of rays of the widest packets of this processor; 1 without packets."""
+    ask = load_library().rtcGetDeviceProperty
     return next((width for number, width in _WIDTHS if ask(device(), number)), 1)
 
 
 def build() -> str:
-    """Version of embreex, the hash of its copy of Embree, and whether it fuses multiply and add.
+    """Return embreex's version, its Embree's hash, and a note if there is no fused multiply-add.
 
-    Without, on processors of before AVX2, Embree misses other rays at open rims. Wider vectors
-    change nothing.
+    Without fused multiply-add, on processors before AVX2, Embree misses other rays at open rims.
+    Wider vectors change nothing.
     """
     from llvmlite.binding import get_host_cpu_features  # takes long to import
 
-    [shipped] = [file for file in files("embreex") or () if file.name == find().name]
+    [shipped] = [file for file in files("embreex") or () if file.name == find_library().name]
     digest = shipped.hash.value[:8] if shipped.hash else ""
     fused = packet_width() > 4 and get_host_cpu_features().get("avx2", True)
     return f"{version('embreex')} ({digest}{'' if fused else ', without FMA'})"
 
 
 class EmbreeScene:
-    """A tree of Embree.
+    """A scene of Embree: a tree over geometries.
 
     Attributes
     ----------
     address
-        Of the RTCScene, for compiled code.
+        Address of the RTCScene, for compiled code.
     """
 
     def __init__(self, threads: int | None) -> None:
         self._device = device(threads)
-        self.address: int = library().rtcNewScene(self._device)
-        finalize(self, library().rtcReleaseScene, self.address)
-        library().rtcSetSceneFlags(self.address, _ROBUST | _FILTER_IN_ARGUMENTS)
-        library().rtcSetSceneBuildQuality(self.address, _HIGH_QUALITY)
+        self.address: int = load_library().rtcNewScene(self._device)
+        finalize(self, load_library().rtcReleaseScene, self.address)
+        load_library().rtcSetSceneFlags(self.address, _ROBUST | _FILTER_IN_ARGUMENTS)
+        load_library().rtcSetSceneBuildQuality(self.address, _HIGH_QUALITY)
 
-    def _commit(self, what: str) -> None:
-        embree = library()
+    def _commit(self, contents: str) -> None:
+        """Build the tree; MemoryError, which names the contents, if Embree cannot."""
+        embree = load_library()
         embree.rtcCommitScene(self.address)
         if embree.rtcGetDeviceError(self._device):
             message = embree.rtcGetDeviceLastErrorMessage(self._device) or b""
-            raise MemoryError(f"Embree cannot build the tree of {what}: {message.decode()}")
+            raise MemoryError(f"Embree cannot build the tree of {contents}: {message.decode()}")
 
 
 class EmbreeMesh(EmbreeScene):
-    """Embree's tree over a mesh; MemoryError if Embree cannot build it."""
+    """Embree's tree over a mesh; MemoryError if the build fails."""
 
     def __init__(self, mesh: LocalMesh, threads: int | None) -> None:
         super().__init__(threads)
-        embree = library()
+        embree = load_library()
         geometry = embree.rtcNewGeometry(self._device, _TRIANGLES)
-        for kind, form, rows in (
+        for kind, layout, rows in (
             (_VERTEX, _FLOAT3, np.ascontiguousarray(mesh.points, np.float32)),
             (_INDEX, _UINT3, np.ascontiguousarray(mesh.rows, np.uint32)),
         ):
-            room = embree.rtcSetNewGeometryBuffer(geometry, kind, 0, form, 12, len(rows))
-            if room:
-                ctypes.memmove(room, rows.ctypes.data, rows.nbytes)
+            buffer = embree.rtcSetNewGeometryBuffer(geometry, kind, 0, layout, 12, len(rows))
+            if buffer:
+                ctypes.memmove(buffer, rows.ctypes.data, rows.nbytes)
         embree.rtcCommitGeometry(geometry)
         embree.rtcAttachGeometry(self.address, geometry)
         embree.rtcReleaseGeometry(geometry)
@@ -164,14 +165,14 @@ class EmbreeMesh(EmbreeScene):
 
 
 class EmbreeInstances(EmbreeScene):
-    """Embree's tree over instances of meshes; MemoryError if Embree cannot build it.
+    """Embree's tree over the instances of a scene; MemoryError if the build fails.
 
-    The instances are those of a scene, and not in their places before `place`.
+    The instances have no transforms before `update_scene`.
     """
 
     def __init__(self, scene: Scene, meshes: list[EmbreeMesh], threads: int | None) -> None:
         super().__init__(threads)
-        embree = library()
+        embree = load_library()
         self._meshes = meshes
         self._transforms: Floats = np.full((len(scene.mesh), 3, 4), np.nan)
         for number, mesh in enumerate(scene.mesh.tolist()):
@@ -180,9 +181,9 @@ class EmbreeInstances(EmbreeScene):
             embree.rtcAttachGeometryByID(self.address, geometry, number)
             embree.rtcReleaseGeometry(geometry)
 
-    def place(self, scene: Scene) -> None:
-        """Move the instances to their places in a scene."""
-        embree = library()
+    def update_scene(self, scene: Scene) -> None:
+        """Set the transforms of the instances to the transforms of a scene, and build the tree."""
+        embree = load_library()
         transforms = scene.to_scene()
         for number in np.flatnonzero((transforms != self._transforms).any(axis=(1, 2))).tolist():
             geometry = embree.rtcGetGeometry(self.address, number)

@@ -1,4 +1,4 @@
-"""What the compiled loops around Embree read and write: one cast, and a thread's scratch memory."""
+"""Memory of the compiled loops around Embree: the record of a cast, and scratch of a thread."""
 
 from __future__ import annotations
 
@@ -14,15 +14,15 @@ from .arrays import AnyArray, Floats
 from .pattern import Pattern
 from .poses import Poses
 
-LANES = 16  # rays that go together; Embree takes them at once, or in two or four packets
+LANES = 16  # rays of a group; Embree takes a group at once, or in two or four packets
 
-# One cast: addresses of what the loops read, and numbers. Addresses are 0 for what there is not.
+# A cast: addresses of arrays that the loops read or write, and numbers. Address 0: no array.
 CAST = np.dtype(
     [
         ("scene", "i8"),  # the RTCScene
         ("scratch", "i8"),  # `SCRATCH`, at a multiple of 64
-        ("mesh", "i8"),  # `MESH` of a plain scene
-        ("instances", "i8"),  # `INSTANCE` of each; 0 in a plain scene
+        ("mesh", "i8"),  # `MESH` records
+        ("instances", "i8"),  # `INSTANCE` records; 0 in a plain scene
         ("masked", "i8"),  # whether any mesh has an opacity
         ("packets", "i8", 4),  # filters for the packets of a group
         ("single", "i8"),  # filter for single rays
@@ -32,58 +32,60 @@ CAST = np.dtype(
         ("origins", "i8"),  # float64 (3, rows), metres
         ("positions", "i8"),  # float64 (3, poses)
         ("rotations", "i8"),  # float64 (9, poses)
-        ("delays", "i8"),  # float64 (each,)
+        ("delays", "i8"),  # float64 (rays_per_pose,)
         ("velocities", "i8"),  # float64 (3, poses)
         ("rates", "i8"),  # float64 (3, poses)
         ("rows", "i8"),
         ("poses", "i8"),
-        ("each", "i8"),  # rays of a pose
+        ("rays_per_pose", "i8"),
         ("first", "i8"),  # row of ray 0, counted in sub-rays
-        ("subrays", "i8"),  # of each row
-        ("shares", "i8"),  # float64 (5, subrays): ahead, across, up, and starts
-        ("offsets", "i8"),  # float64 (2, rows): angles, added to those in `shares`
-        ("about", "i8"),  # whether across and up are those about `axis`
-        ("begins", "i8"),  # whether sub-rays have starts of their own
+        ("subrays", "i8"),  # sub-rays of each row
+        ("shares", "i8"),  # float64 (5, subrays): `SubRays.loop_table`
+        ("offsets", "i8"),  # float64 (2, rows): angles, added to the angles in `shares`
+        ("has_axis", "i8"),  # whether across and up are defined by `axis`
+        ("has_starts", "i8"),  # whether sub-rays start off their beam's origin
         ("axis", "f8", 3),
-        ("centre", "f8", 3),  # these four of the `Frame`
+        ("centre", "f8", 3),  # the next four fields are the scene's `Frame`
         ("scale", "f8"),
-        ("low", "f8", 3),
+        ("lower", "f8", 3),
         ("upper", "f8", 3),
-        ("near", "i8"),  # whether all rays start near the scene's box
-        ("still", "i8"),  # whether all rays start at the position of one pose
-        ("step", "i8"),  # rays to the next one of a ring
-        ("high", "i8"),  # so many of a ring are in a group
-        ("wide", "i8"),  # and so many neighbours of each
-        ("width", "i8"),  # rays that Embree takes at once, 1 for no packets
+        ("starts_near", "i8"),  # whether all rays start near the scene's box
+        ("shares_origin", "i8"),  # whether all rays start at the position of one pose
+        ("step", "i8"),  # rays from a ray to its neighbour along a ring
+        ("rays_along", "i8"),  # rays of a ring in a group
+        ("rays_across", "i8"),  # rings of a group
+        ("width", "i8"),  # rays of a packet of Embree, 1 for no packets
         ("coherence", "f8"),  # a group with a smaller cosine between two rays is cast ray by ray
         ("t_min", "f8"),  # local
         ("t_max", "f8"),
-        ("index", "i8"),  # int32: the caller's triangle of each place; if 0, places are written
-        ("room", "i8"),  # float64, then twice int32: for the rays of a block
-        ("before", "i8"),  # the ray whose number is written as 0
-        ("ray", "i8"),  # what is written of hits: uint32
+        ("index", "i8"),  # int32: triangle of the caller by row of the corners; 0 to write rows
+        ("block_memory", "i8"),  # float64, then twice int32: hits of the rays of a block
+        ("first_ray", "i8"),  # the ray whose number is written as 0
+        ("ray", "i8"),  # output of hits: uint32
         ("distance", "i8"),  # float64, metres
         ("triangle", "i8"),  # int32
         ("instance", "i8"),  # int32
-        ("starts", "i8"),  # float64 (3, all) of all rays, if they are wanted: origins, metres
-        ("ways", "i8"),  # and directions
-        ("all", "i8"),
+        ("origins_out", "i8"),  # output of rays, float64 (3, ray_count): origins, metres
+        ("directions_out", "i8"),  # output of rays, float64 (3, ray_count): directions
+        ("ray_count", "i8"),
     ]
 )  # fmt: skip
 
-# Of a mesh: addresses of its corners, and of the uv and the mask of its opacity; the mask's height,
+# A mesh: addresses of its corners, and of the uv and the mask of its opacity; the mask's height,
 # 0 if the mesh is opaque, and width.
-MESH = np.dtype([("corners", "i8"), ("uv", "i8"), ("mask", "i8"), ("high", "i8"), ("wide", "i8")])
+MESH = np.dtype(
+    [("corners", "i8"), ("uv", "i8"), ("mask", "i8"), ("mask_height", "i8"), ("mask_width", "i8")]
+)
 INSTANCE = np.dtype(
     [
         ("matrix", "f8", 12),  # to the mesh's coordinates
         ("mesh", "i8"),  # address of the `MESH`
-        ("first", "i8"),  # the mesh's first place in `index`
+        ("first", "i8"),  # the mesh's first row in `index`
     ]
 )
-# of these: numbers before, and bytes
+# Of `INSTANCE`: position of the fields `mesh` and `first`, in numbers, and size, in bytes.
 MESH_OF = 12
-FIRST_PLACE = 13
+FIRST_ROW = 13
 RECORD = INSTANCE.itemsize
 
 SCRATCH = np.dtype(
@@ -105,7 +107,7 @@ SCRATCH = np.dtype(
         ("query_context", "i8", 28),
         ("tile", "i8", LANES),  # rays of a group, counted from its first
         ("ray", "i8", LANES),  # the same, counted from the first of the block
-        ("real", "i8", LANES),  # whether there is one; if not, it is a copy
+        ("real", "i8", LANES),  # whether the lane has a ray of the cast, not a copy of another ray
         ("ox", "f8", LANES), ("oy", "f8", LANES), ("oz", "f8", LANES),  # local
         ("dx", "f8", LANES), ("dy", "f8", LANES), ("dz", "f8", LANES),
         ("entry", "f8", LANES),  # distance of the start that Embree sees from the origin
@@ -116,12 +118,12 @@ SCRATCH = np.dtype(
         ("u", "f8", LANES), ("v", "f8", LANES), ("w", "f8", LANES),
         ("sx", "f8", LANES), ("sy", "f8", LANES), ("sz", "f8", LANES),
         ("inside", "i8", LANES), ("length", "f8", LANES),
-        # What filters have found: the least distance in float32, its triangle, and another that is
-        # as near; -1 for none, -2 for several. The same in 32 bits for plain scenes.
-        ("rough", "f8", LANES), ("one", "i8", LANES), ("other", "i8", LANES),
-        ("rough_32", "f4", LANES), ("one_32", "i4", LANES), ("other_32", "i4", LANES),
+        # Candidates of the filters: the shortest distance in float32, its triangle, and a second
+        # triangle that is as near; -1 for none, -2 for several. In 32 bits for plain scenes.
+        ("rough", "f8", LANES), ("first_candidate", "i8", LANES), ("second_candidate", "i8", LANES),
+        ("rough_32", "f4", LANES), ("first_32", "i4", LANES), ("second_32", "i4", LANES),
         # The closest triangle that the ray hits, by key: row of the mesh's corners, and `NUMBER`
-        # times the instance's number. Of equally close ones that of the lowest key.
+        # times the instance's number. Of equally close triangles, the lowest key.
         ("t", "f8", LANES), ("key", "i8", LANES), ("sure", "i8", LANES),
         ("corners", "f8", 9 * LANES),  # of a triangle of each ray
         ("row", "i8", LANES), ("pose", "i8", LANES), ("within", "i8", LANES),
@@ -133,19 +135,19 @@ SCRATCH = np.dtype(
 NUMBER = np.int64(1) << 32  # of keys
 
 
-def offset(name: str) -> int:
-    """Where a field of the scratch memory begins, in bytes."""
+def byte_offset(name: str) -> int:
+    """Return the offset of a field of the scratch memory, in bytes."""
     return int(SCRATCH.fields[name][1])  # type: ignore[index]
 
 
-def at(name: str) -> int:
-    """Where a field of the scratch memory begins, in units of its own numbers."""
+def field_index(name: str) -> int:
+    """Return the offset of a field of the scratch memory, in numbers of the field's type."""
     field = SCRATCH[name]
-    return offset(name) // (field.subdtype[0] if field.subdtype else field).itemsize
+    return byte_offset(name) // (field.subdtype[0] if field.subdtype else field).itemsize
 
 
 def pointer(kind: Any) -> Any:
-    """Make a function of compiled code that takes an address for a pointer to numbers."""
+    """Create a compiled function that converts an address to a pointer to numbers."""
 
     @intrinsic
     def read(context: Any, address: Any) -> Any:
@@ -164,77 +166,87 @@ float64s = pointer(types.float64)
 uint8s = pointer(types.uint8)
 uint32s = pointer(types.uint32)
 
-CASTS = types.Array(numba.from_dtype(CAST), 1, "C")  # of one cast
+CASTS = types.Array(numba.from_dtype(CAST), 1, "C")
 casts_at = pointer(CASTS.dtype)
 
 
 class Cast:
-    """A `CAST`, and the arrays whose addresses it has."""
+    """A `CAST` record, and references to the arrays whose addresses are in the record."""
 
     def __init__(self, base: AnyArray) -> None:
         self.record = base.copy()
-        self._kept: list[AnyArray] = []
+        self._arrays: list[AnyArray] = []
 
-    def keep(self, array: AnyArray | None) -> int:
-        """Address of an array, in float64 and contiguous; 0 for none."""
+    def address_of(self, array: AnyArray | None) -> int:
+        """Return the address of an array, converted to contiguous float64; 0 for None."""
         if array is None:
             return 0
-        self._kept.append(np.ascontiguousarray(array, np.float64))
-        return self._kept[-1].ctypes.data
+        self._arrays.append(np.ascontiguousarray(array, np.float64))
+        return self._arrays[-1].ctypes.data
 
-    def take(self, directions: Floats, origins: Floats | None, poses: Poses, first: int) -> None:
-        """Note what rays are made of: beams (n, 3), poses, and the row of ray 0."""
+    def set_beams(
+        self, directions: Floats, origins: Floats | None, poses: Poses, first: int
+    ) -> None:
+        """Write beams (n, 3), poses and the row of ray 0 to the record."""
         record = self.record
         motion = poses.motion
-        turns = poses.rotations
-        record["directions"] = self.keep(directions.T)
-        record["origins"] = self.keep(None if origins is None else origins.T)
-        record["positions"] = self.keep(poses.positions.T)
-        record["rotations"] = self.keep(None if turns is None else np.moveaxis(turns, 0, -1))
+        rotations = poses.rotations
+        record["directions"] = self.address_of(directions.T)
+        record["origins"] = self.address_of(None if origins is None else origins.T)
+        record["positions"] = self.address_of(poses.positions.T)
+        record["rotations"] = self.address_of(
+            None if rotations is None else np.moveaxis(rotations, 0, -1)
+        )
         if motion is not None:
-            record["delays"] = self.keep(motion.delays)
-            record["velocities"] = self.keep(motion.velocities.T)
-            record["rates"] = self.keep(motion.rates.T)
+            record["delays"] = self.address_of(motion.delays)
+            record["velocities"] = self.address_of(motion.velocities.T)
+            record["rates"] = self.address_of(motion.rates.T)
         record["rows"] = len(directions)
         record["poses"] = len(poses)
-        record["each"] = poses.rays
+        record["rays_per_pose"] = poses.rays
         record["first"] = first
         record["subrays"] = 1
-        record["still"] = len(poses) == 1 and origins is None and motion is None
+        record["shares_origin"] = len(poses) == 1 and origins is None and motion is None
 
-    def take_pattern(self, pattern: Pattern, poses: Poses, first: int) -> float:
-        """Note what rays of a pattern are made of; how far off their beams they start, metres."""
-        self.take(pattern.directions, pattern.origins, poses, first)
+    def set_pattern(self, pattern: Pattern, poses: Poses, first: int) -> float:
+        """Write a pattern, poses and the row of ray 0; return the maximum offset of a start.
+
+        The offset is the distance of a sub-ray's start from its beam's origin, metres.
+        """
+        self.set_beams(pattern.directions, pattern.origins, poses, first)
         sub_rays = pattern.sub_rays
         record = self.record
         if sub_rays is None:
             return 0.0
         record["subrays"] = len(sub_rays)
-        record["shares"] = self.keep(sub_rays.table(pattern.offsets))
-        record["begins"] = sub_rays.starts is not None
-        record["offsets"] = self.keep(pattern.offsets)
+        record["shares"] = self.address_of(sub_rays.loop_table(pattern.offsets))
+        record["has_starts"] = sub_rays.starts is not None
+        record["offsets"] = self.address_of(pattern.offsets)
         if sub_rays.axis is not None:
-            record["about"] = 1
+            record["has_axis"] = 1
             record["axis"] = sub_rays.axis
         if sub_rays.starts is None:
             return 0.0
-        record["still"] = 0
+        record["shares_origin"] = 0
         return float(np.abs(sub_rays.starts).max())
 
 
-class _Own(threading.local):
-    """Memory of a thread, since threads of one worker may cast at the same time."""
+class _ThreadMemory(threading.local):
+    """Scratch memory of each thread, since threads of a worker may cast at the same time."""
 
     def __init__(self) -> None:
         self._scratch = np.zeros(SCRATCH.itemsize // 8 + 8, np.int64)
-        self._room = np.zeros(0)
+        self._block_memory = np.zeros(0)
 
-    def memory(self, rays: int) -> tuple[int, int]:
-        """Addresses of the scratch memory, a multiple of 64, and of room for rays of a block."""
-        if len(self._room) < 2 * rays:
-            self._room = np.zeros(2 * rays)
+    def addresses(self, rays: int) -> tuple[int, int]:
+        """Return addresses of the scratch memory, a multiple of 64, and of memory for a block.
+
+        `rays` is the number of rays of the block.
+        """
+        if len(self._block_memory) < 2 * rays:
+            self._block_memory = np.zeros(2 * rays)
         address = self._scratch.ctypes.data
-        return address + -address % 64, self._room.ctypes.data
+        return address + -address % 64, self._block_memory.ctypes.data
 
 
-own = _Own()
+thread_memory = _ThreadMemory()

@@ -1,9 +1,11 @@
-"""Rays of a pattern, made sixteen at a time in compiled loops, with the operations of `plain_rays`.
+"""Rays of a pattern, sixteen at a time in compiled loops, with the operations of `plain_rays`.
 
 Each step is a loop over the rays of a group that becomes a few vector instructions.
 """
 
 from __future__ import annotations
+
+from typing import NamedTuple
 
 import numpy as np
 from numba import types
@@ -11,31 +13,50 @@ from numba import types
 from . import embree_memory as memory
 from .arrays import Floats, Ints
 from .compiled import compiled, inlined, stage
-from .embree_memory import LANES, at, float64s, int64s
+from .embree_memory import LANES, field_index, float64s, int64s
 from .mesh import NEAR
 from .pattern import Pattern
 from .poses import Poses
 
-_OX, _OY, _OZ, _DX, _DY, _DZ = map(at, ("ox", "oy", "oz", "dx", "dy", "dz"))
-_RAY, _ROW, _POSE, _WITHIN = map(at, ("ray", "row", "pose", "within"))
-_STRAIGHT = at("straight")
-_ACROSS = at("across")
-_UP = at("up")
-_ASIDE = at("aside")
-_ABOVE = at("above")
-_ENTRY = at("entry")
+_OX, _OY, _OZ, _DX, _DY, _DZ = map(field_index, ("ox", "oy", "oz", "dx", "dy", "dz"))
+_RAY, _ROW, _POSE, _WITHIN = map(field_index, ("ray", "row", "pose", "within"))
+_STRAIGHT = field_index("straight")
+_ACROSS = field_index("across")
+_UP = field_index("up")
+_ASIDE = field_index("aside")
+_ABOVE = field_index("above")
+_ENTRY = field_index("entry")
 _TINY = 2.0**-60  # replaces a direction component of zero, to avoid 0 * inf
 
 
+class BlockStart(NamedTuple):
+    """The first ray of a block.
+
+    Attributes
+    ----------
+    row
+        Row in the pattern, counted in sub-rays.
+    pose, within
+        Number of the pose, and number of the ray within the pose.
+    ray
+        Number of the ray.
+    """
+
+    row: int
+    pose: int
+    within: int
+    ray: int
+
+
 @inlined
-def whole_times(number, other):  # type: ignore[no-untyped-def]
-    """How many times a whole number is in another, both below 2^52: faster than `//`, and exact."""
-    return np.int64(np.float64(number) / np.float64(other))
+def exact_quotient(number, divisor):  # type: ignore[no-untyped-def]
+    """Return ``number // divisor``, for whole numbers from 0 to 2^52: exact, faster than `//`."""
+    return np.int64(np.float64(number) / np.float64(divisor))
 
 
 @inlined
 def any_axes(x, y, z):  # type: ignore[no-untyped-def]
-    """As `sub_rays.any_axes`, of one direction."""
+    """Return the two axes across a unit direction of `sub_rays.any_axes`, as six numbers."""
     sign = -1.0 if z < 0 else 1.0
     a = -1.0 / (sign + z)
     b = x * y * a
@@ -44,16 +65,16 @@ def any_axes(x, y, z):  # type: ignore[no-untyped-def]
 
 @inlined
 def axes_about(x, y, z, axis):  # type: ignore[no-untyped-def]
-    """As `sub_rays.axes_about`, of one direction."""
+    """Return the two axes across a unit direction of `sub_rays.axes_about`, as six numbers."""
     a, b, c = axis
     p = b * z - c * y
     q = c * x - a * z
     r = a * y - b * x
     length = np.sqrt((p * p + q * q) + r * r)
-    least = max(length, 1e-300)
-    p = p / least
-    q = q / least
-    r = r / least
+    norm = max(length, 1e-300)
+    p = p / norm
+    q = q / norm
+    r = r / norm
     u = y * r - z * q
     v = z * p - x * r
     w = x * q - y * p
@@ -63,42 +84,45 @@ def axes_about(x, y, z, axis):  # type: ignore[no-untyped-def]
 
 
 @stage
-def _rows(scratch, first, total):  # type: ignore[no-untyped-def]
-    """Find the rows of the rays of a group; `first` is that of the block's first, of `total`."""
+def _find_rows(scratch, first, total):  # type: ignore[no-untyped-def]
+    """Write the rows of a group's rays; `first` is the row of the block's first ray, of `total`."""
     numbers = int64s(scratch)
-    most = np.int64(0)
+    max_row = np.int64(0)
     for lane in range(LANES):
         row = first + numbers[_RAY + lane]
         numbers[_ROW + lane] = row - total if row >= total else row
     for lane in range(LANES):
-        most = max(most, numbers[_ROW + lane])
-    if most >= total:  # a short pattern that repeats
+        max_row = max(max_row, numbers[_ROW + lane])
+    if max_row >= total:  # a short pattern that repeats
         for lane in range(LANES):
             numbers[_ROW + lane] %= total
 
 
 @stage
-def _poses(scratch, pose, within, each):  # type: ignore[no-untyped-def]
-    """Find the poses of rays, and their numbers within; given are those of the block's first."""
+def _find_poses(scratch, pose, within, rays_per_pose):  # type: ignore[no-untyped-def]
+    """Write the poses of a group's rays, and the numbers of the rays within their poses.
+
+    `pose` and `within` are the numbers of the block's first ray.
+    """
     numbers = int64s(scratch)
     for lane in range(LANES):
         inside = within + numbers[_RAY + lane]
-        later = whole_times(inside, each)
+        later = exact_quotient(inside, rays_per_pose)
         numbers[_POSE + lane] = pose + later
-        numbers[_WITHIN + lane] = inside - later * each
+        numbers[_WITHIN + lane] = inside - later * rays_per_pose
 
 
 @stage
-def _shares(scratch, shares, offsets, directions, rows, subrays):  # type: ignore[no-untyped-def]
-    """Look up the beams of a group's sub-rays, and what share each has of across and up."""
+def _look_up_subrays(scratch, shares, offsets, directions, rows, subrays):  # type: ignore[no-untyped-def]
+    """Write the beam directions of a group's sub-rays, and the shares across and up of each."""
     numbers = int64s(scratch)
     floats = float64s(scratch)
     table = float64s(shares)
-    ahead = float64s(directions)
-    more = float64s(offsets)
+    beam_directions = float64s(directions)
+    beam_offsets = float64s(offsets)
     for lane in range(LANES):
         row = numbers[_ROW + lane]
-        beam = whole_times(row, subrays)
+        beam = exact_quotient(row, subrays)
         k = row - beam * subrays
         numbers[_ROW + lane] = beam
         floats[_STRAIGHT + lane] = table[k]
@@ -106,14 +130,14 @@ def _shares(scratch, shares, offsets, directions, rows, subrays):  # type: ignor
         floats[_UP + lane] = table[2 * subrays + k]
         floats[_ASIDE + lane] = table[3 * subrays + k]
         floats[_ABOVE + lane] = table[4 * subrays + k]
-        floats[_DX + lane] = ahead[beam]
-        floats[_DY + lane] = ahead[rows + beam]
-        floats[_DZ + lane] = ahead[2 * rows + beam]
+        floats[_DX + lane] = beam_directions[beam]
+        floats[_DY + lane] = beam_directions[rows + beam]
+        floats[_DZ + lane] = beam_directions[2 * rows + beam]
     if offsets:
         for lane in range(LANES):
             beam = numbers[_ROW + lane]
-            across = floats[_ACROSS + lane] + more[beam]
-            up = floats[_UP + lane] + more[rows + beam]
+            across = floats[_ACROSS + lane] + beam_offsets[beam]
+            up = floats[_UP + lane] + beam_offsets[rows + beam]
             straight = 1 / np.sqrt((1 + across * across) + up * up)
             floats[_STRAIGHT + lane] = straight
             floats[_ACROSS + lane] = across * straight
@@ -121,8 +145,8 @@ def _shares(scratch, shares, offsets, directions, rows, subrays):  # type: ignor
 
 
 @inlined
-def _spread(floats, lane, begins, axes):  # type: ignore[no-untyped-def]
-    """Turn the direction of a beam to that of its sub-ray, and note where that starts."""
+def _spread_lane(floats, lane, has_starts, axes):  # type: ignore[no-untyped-def]
+    """Replace the direction of a beam by its sub-ray's, and write the sub-ray's start."""
     x = floats[_DX + lane]
     y = floats[_DY + lane]
     z = floats[_DZ + lane]
@@ -133,7 +157,7 @@ def _spread(floats, lane, begins, axes):  # type: ignore[no-untyped-def]
     floats[_DX + lane] = (straight * x + across * a) + up * d
     floats[_DY + lane] = (straight * y + across * b) + up * e
     floats[_DZ + lane] = (straight * z + across * c) + up * f
-    if begins:
+    if has_starts:
         aside = floats[_ASIDE + lane]
         above = floats[_ABOVE + lane]
         floats[_OX + lane] = aside * a + above * d
@@ -142,39 +166,40 @@ def _spread(floats, lane, begins, axes):  # type: ignore[no-untyped-def]
 
 
 @stage
-def _spread_any(scratch, begins):  # type: ignore[no-untyped-def]
+def _spread_any(scratch, has_starts):  # type: ignore[no-untyped-def]
+    """Write the sub-rays of a group, across the axes of `any_axes`."""
     floats = float64s(scratch)
     for lane in range(LANES):
         x = floats[_DX + lane]
         y = floats[_DY + lane]
         z = floats[_DZ + lane]
-        _spread(floats, lane, begins, any_axes(x, y, z))
+        _spread_lane(floats, lane, has_starts, any_axes(x, y, z))
 
 
 @stage
-def _spread_about(scratch, begins, a, b, c):  # type: ignore[no-untyped-def]
+def _spread_about(scratch, has_starts, a, b, c):  # type: ignore[no-untyped-def]
+    """Write the sub-rays of a group, across the axes of `axes_about`."""
     floats = float64s(scratch)
     for lane in range(LANES):
         x = floats[_DX + lane]
         y = floats[_DY + lane]
         z = floats[_DZ + lane]
-        _spread(floats, lane, begins, axes_about(x, y, z, (a, b, c)))
+        _spread_lane(floats, lane, has_starts, axes_about(x, y, z, (a, b, c)))
 
 
 @inlined
-def _divided(cast, scratch):  # type: ignore[no-untyped-def]
-    """Make the directions of sub-rays, and note where they start, off their beams' starts."""
-    given = cast.shares, cast.offsets, cast.directions, cast.rows, cast.subrays
-    _shares(scratch, *given)
-    if cast.about:
-        _spread_about(scratch, cast.begins, cast.axis[0], cast.axis[1], cast.axis[2])
+def _make_subrays(cast, scratch):  # type: ignore[no-untyped-def]
+    """Write the directions of a group's sub-rays, and starts relative to the beams' origins."""
+    _look_up_subrays(scratch, cast.shares, cast.offsets, cast.directions, cast.rows, cast.subrays)
+    if cast.has_axis:
+        _spread_about(scratch, cast.has_starts, cast.axis[0], cast.axis[1], cast.axis[2])
     else:
-        _spread_any(scratch, cast.begins)
+        _spread_any(scratch, cast.has_starts)
 
 
 @stage
-def _turn_by(scratch, matrix, x, y, z):  # type: ignore[no-untyped-def]
-    """Rotate the vectors of a group, whose columns begin at x, y and z, by one matrix."""
+def _rotate_by_one(scratch, matrix, x, y, z):  # type: ignore[no-untyped-def]
+    """Rotate the vectors of a group by a matrix; x, y and z are the columns of the vectors."""
     floats = float64s(scratch)
     m = float64s(matrix)
     a = m[0]
@@ -196,8 +221,8 @@ def _turn_by(scratch, matrix, x, y, z):  # type: ignore[no-untyped-def]
 
 
 @stage
-def _turn_each(scratch, poses, rotations, x, y, z):  # type: ignore[no-untyped-def]
-    """Rotate the vectors of a group to the mesh's axes, each by its own pose."""
+def _rotate_by_poses(scratch, poses, rotations, x, y, z):  # type: ignore[no-untyped-def]  # noqa: PLR0914 - a compiled loop
+    """Rotate the vectors of a group to the mesh's axes, by the pose of each ray."""
     numbers = int64s(scratch)
     floats = float64s(scratch)
     matrices = float64s(rotations)
@@ -221,27 +246,27 @@ def _turn_each(scratch, poses, rotations, x, y, z):  # type: ignore[no-untyped-d
 
 
 @inlined
-def _turn(cast, scratch, x, y, z):  # type: ignore[no-untyped-def]
-    """Rotate the vectors of a group to the mesh's axes."""
+def _rotate(cast, scratch, x, y, z):  # type: ignore[no-untyped-def]
+    """Rotate the vectors of a group to the mesh's axes; x, y and z are their columns."""
     if cast.poses == 1:
-        _turn_by(scratch, cast.rotations, x, y, z)
+        _rotate_by_one(scratch, cast.rotations, x, y, z)
     else:
-        _turn_each(scratch, cast.poses, cast.rotations, x, y, z)
+        _rotate_by_poses(scratch, cast.poses, cast.rotations, x, y, z)
 
 
 @stage
-def _drift(scratch, poses, delays, rates, x, y, z):  # type: ignore[no-untyped-def]
-    """Turn the vectors of a group by the motion of their poses."""
+def _apply_rates(scratch, poses, delays, rates, x, y, z):  # type: ignore[no-untyped-def]
+    """Rotate the vectors of a group by the angular rates of their poses."""
     numbers = int64s(scratch)
     floats = float64s(scratch)
-    after = float64s(delays)
+    delay_of_ray = float64s(delays)
     rate = float64s(rates)
     for lane in range(LANES):
         p = floats[x + lane]
         q = floats[y + lane]
         r = floats[z + lane]
         k = numbers[_POSE + lane]
-        delay = after[numbers[_WITHIN + lane]]
+        delay = delay_of_ray[numbers[_WITHIN + lane]]
         a = rate[k]
         b = rate[k + poses]
         c = rate[k + 2 * poses]
@@ -251,105 +276,106 @@ def _drift(scratch, poses, delays, rates, x, y, z):  # type: ignore[no-untyped-d
 
 
 @inlined
-def make(cast, scratch, block):  # type: ignore[no-untyped-def]
-    """Make the rays of a group, whose numbers in the block are in its memory.
+def make_group(cast, scratch, block):  # type: ignore[no-untyped-def]
+    """Compute the rays of a group, by their numbers within a block in the scratch memory.
 
-    `block` is what `begin` says of the block's first ray.
+    `block` is the `BlockStart` of the block.
     """
     floats = float64s(scratch)
-    _rows(scratch, block[0], cast.rows * cast.subrays)
-    if cast.still == 0:
-        _poses(scratch, block[1], block[2], cast.each)
+    _find_rows(scratch, block.row, cast.rows * cast.subrays)
+    if cast.shares_origin == 0:
+        _find_poses(scratch, block.pose, block.within, cast.rays_per_pose)
     if cast.shares != 0:
-        _divided(cast, scratch)
+        _make_subrays(cast, scratch)
     else:
         _look_up(scratch, cast.directions, cast.rows)
     if cast.rotations != 0:
-        _turn(cast, scratch, _DX, _DY, _DZ)
+        _rotate(cast, scratch, _DX, _DY, _DZ)
     if cast.delays != 0:
-        _drift(scratch, cast.poses, cast.delays, cast.rates, _DX, _DY, _DZ)
-    if cast.ways != 0:
-        _note(scratch, cast.ways + 8 * block[3], cast.all, _DX)
-    if cast.still == 0:
-        set_out(cast, scratch)
-        if cast.starts != 0:
-            _note(scratch, cast.starts + 8 * block[3], cast.all, _OX)
+        _apply_rates(scratch, cast.poses, cast.delays, cast.rates, _DX, _DY, _DZ)
+    if cast.directions_out != 0:
+        _write_vectors(scratch, cast.directions_out + 8 * block.ray, cast.ray_count, _DX)
+    if cast.shares_origin == 0:
+        write_origins(cast, scratch)
+        if cast.origins_out != 0:
+            _write_vectors(scratch, cast.origins_out + 8 * block.ray, cast.ray_count, _OX)
         localise(cast, scratch)
-    if cast.near == 0:
-        low = cast.low
-        high = cast.upper
+    if cast.starts_near == 0:
+        lower = cast.lower
+        upper = cast.upper
         for lane in range(LANES):
             o = floats[_OX + lane], floats[_OY + lane], floats[_OZ + lane]
             d = floats[_DX + lane], floats[_DY + lane], floats[_DZ + lane]
-            floats[_ENTRY + lane] = entered_at(low, high, o, d)
+            floats[_ENTRY + lane] = entry_distance(lower, upper, o, d)
 
 
 @inlined
-def begin(cast, block):  # type: ignore[no-untyped-def]
-    """Row, pose, number within the pose, and number of a ray."""
+def block_start(cast, block):  # type: ignore[no-untyped-def]
+    """Return the `BlockStart` of the ray `block`."""
     total = cast.rows * cast.subrays
-    each = cast.each
-    pose = block // each
-    return (cast.first + block) % total, pose, block - pose * each, block
+    rays_per_pose = cast.rays_per_pose
+    pose = block // rays_per_pose
+    within = block - pose * rays_per_pose
+    return BlockStart((cast.first + block) % total, pose, within, block)
 
 
 @stage
-def _note(scratch, to, count, x):  # type: ignore[no-untyped-def]
-    """Write the vectors of a group, whose columns begin at x, among those of all rays."""
+def _write_vectors(scratch, address, count, x):  # type: ignore[no-untyped-def]
+    """Write the vectors of a group, from column x on, to the output (3, count) of all rays."""
     numbers = int64s(scratch)
     floats = float64s(scratch)
-    out = float64s(to)
+    vectors = float64s(address)
     for lane in range(LANES):
         k = numbers[_RAY + lane]
-        out[k] = floats[x + lane]
-        out[k + count] = floats[x + LANES + lane]
-        out[k + 2 * count] = floats[x + 2 * LANES + lane]
+        vectors[k] = floats[x + lane]
+        vectors[k + count] = floats[x + LANES + lane]
+        vectors[k + 2 * count] = floats[x + 2 * LANES + lane]
 
 
 @stage
 def _look_up(scratch, directions, rows):  # type: ignore[no-untyped-def]
-    """Look up the directions of a group."""
+    """Write the directions of a group's rays, by their rows in the pattern."""
     numbers = int64s(scratch)
     floats = float64s(scratch)
-    given = float64s(directions)
+    beam_directions = float64s(directions)
     for lane in range(LANES):
         row = numbers[_ROW + lane]
-        floats[_DX + lane] = given[row]
-        floats[_DY + lane] = given[rows + row]
-        floats[_DZ + lane] = given[2 * rows + row]
+        floats[_DX + lane] = beam_directions[row]
+        floats[_DY + lane] = beam_directions[rows + row]
+        floats[_DZ + lane] = beam_directions[2 * rows + row]
 
 
 @stage
-def _add(scratch, table, count, number):  # type: ignore[no-untyped-def]
-    """Add vectors of a table, of `count` of them those with the `number` of each ray, to starts."""
+def _add_to_origins(scratch, table, count, field):  # type: ignore[no-untyped-def]
+    """Add vectors of a table (3, count) to the origins; `field` has the number of each vector."""
     numbers = int64s(scratch)
     floats = float64s(scratch)
-    given = float64s(table)
+    vectors = float64s(table)
     for lane in range(LANES):
-        k = numbers[number + lane]
-        floats[_OX + lane] += given[k]
-        floats[_OY + lane] += given[k + count]
-        floats[_OZ + lane] += given[k + 2 * count]
+        k = numbers[field + lane]
+        floats[_OX + lane] += vectors[k]
+        floats[_OY + lane] += vectors[k + count]
+        floats[_OZ + lane] += vectors[k + 2 * count]
 
 
 @stage
-def _move(scratch, delays, velocities, poses):  # type: ignore[no-untyped-def]
-    """Move the starts of rays by the motion of their poses."""
+def _apply_velocities(scratch, delays, velocities, poses):  # type: ignore[no-untyped-def]
+    """Move the origins of a group's rays by the velocities of their poses."""
     numbers = int64s(scratch)
     floats = float64s(scratch)
-    after = float64s(delays)
-    speed = float64s(velocities)
+    delay_of_ray = float64s(delays)
+    velocity = float64s(velocities)
     for lane in range(LANES):
         k = numbers[_POSE + lane]
-        delay = after[numbers[_WITHIN + lane]]
-        floats[_OX + lane] += delay * speed[k]
-        floats[_OY + lane] += delay * speed[k + poses]
-        floats[_OZ + lane] += delay * speed[k + 2 * poses]
+        delay = delay_of_ray[numbers[_WITHIN + lane]]
+        floats[_OX + lane] += delay * velocity[k]
+        floats[_OY + lane] += delay * velocity[k + poses]
+        floats[_OZ + lane] += delay * velocity[k + 2 * poses]
 
 
 @stage
 def _localise(scratch, x, y, z, scale):  # type: ignore[no-untyped-def]
-    """Take the starts of rays to local coordinates."""
+    """Convert the origins of a group's rays to coordinates about a centre x, y, z."""
     floats = float64s(scratch)
     for lane in range(LANES):
         floats[_OX + lane] = (floats[_OX + lane] - x) * scale
@@ -359,55 +385,58 @@ def _localise(scratch, x, y, z, scale):  # type: ignore[no-untyped-def]
 
 @inlined
 def localise(cast, scratch):  # type: ignore[no-untyped-def]
-    """Take the starts of a group's rays to local coordinates."""
+    """Convert the origins of a group's rays to local coordinates."""
     _localise(scratch, cast.centre[0], cast.centre[1], cast.centre[2], cast.scale)
 
 
 @inlined
-def set_out(cast, scratch):  # type: ignore[no-untyped-def]
-    """Write where a group's rays start, metres; sub-rays may have starts already."""
+def write_origins(cast, scratch):  # type: ignore[no-untyped-def]
+    """Write the origins of a group's rays, metres, to which starts of sub-rays are added."""
     floats = float64s(scratch)
-    begins = cast.shares != 0 and cast.begins != 0
-    if not begins:
+    has_starts = cast.shares != 0 and cast.has_starts != 0
+    if not has_starts:
         for lane in range(LANES):
-            floats[_OX + lane] = floats[_OY + lane] = floats[_OZ + lane] = 0.0
+            floats[_OX + lane] = 0.0
+            floats[_OY + lane] = 0.0
+            floats[_OZ + lane] = 0.0
     if cast.origins != 0:
-        _add(scratch, cast.origins, cast.rows, _ROW)
-    if cast.origins != 0 or begins:
+        _add_to_origins(scratch, cast.origins, cast.rows, _ROW)
+    if cast.origins != 0 or has_starts:
         if cast.rotations != 0:
-            _turn(cast, scratch, _OX, _OY, _OZ)
+            _rotate(cast, scratch, _OX, _OY, _OZ)
         if cast.delays != 0:
-            _drift(scratch, cast.poses, cast.delays, cast.rates, _OX, _OY, _OZ)
-    _add(scratch, cast.positions, cast.poses, _POSE)
+            _apply_rates(scratch, cast.poses, cast.delays, cast.rates, _OX, _OY, _OZ)
+    _add_to_origins(scratch, cast.positions, cast.poses, _POSE)
     if cast.delays != 0:
-        _move(scratch, cast.delays, cast.velocities, cast.poses)
+        _apply_velocities(scratch, cast.delays, cast.velocities, cast.poses)
 
 
 @inlined
-def _clip(low, high, o, d, entry):  # type: ignore[no-untyped-def]
-    along = d
+def _clip_axis(lower, upper, o, d, entry):  # type: ignore[no-untyped-def]
+    """Return the larger of `entry` and the distance at which a ray enters a slab."""
+    component = d
     if abs(d) < _TINY:
-        along = -_TINY if d < 0 else _TINY
-    return max(entry, min((low - o) / along, (high - o) / along))
+        component = -_TINY if d < 0 else _TINY
+    return max(entry, min((lower - o) / component, (upper - o) / component))
 
 
 @inlined
-def entered_at(low, high, o, d):  # type: ignore[no-untyped-def]
-    """Distance at which a ray from far away comes near the scene's box; 0 from near."""
+def entry_distance(lower, upper, o, d):  # type: ignore[no-untyped-def]
+    """Return the distance at which a remote ray enters the scene's box; 0 for a ray nearby."""
     entry = 0.0
     if max(max(abs(o[0]), abs(o[1])), abs(o[2])) > NEAR:
-        entry = _clip(low[0], high[0], o[0], d[0], entry)
-        entry = _clip(low[1], high[1], o[1], d[1], entry)
-        entry = _clip(low[2], high[2], o[2], d[2], entry)
+        entry = _clip_axis(lower[0], upper[0], o[0], d[0], entry)
+        entry = _clip_axis(lower[1], upper[1], o[1], d[1], entry)
+        entry = _clip_axis(lower[2], upper[2], o[2], d[2], entry)
     return entry
 
 
 @compiled(types.void(memory.CASTS, types.int64[::1], types.float64[:, ::1], types.float64[:, ::1]))
-def _gather(casts, rays, origins, directions):  # type: ignore[no-untyped-def]
-    """Make rays with these numbers; origins are not written if there is no room for any."""
+def _make_rays(casts, rays, origins, directions):  # type: ignore[no-untyped-def]
+    """Write the directions (3, m), and origins unless (3, 0), of rays with numbers (m,)."""
     cast = casts[0]
     count = len(rays)
-    begins = origins.shape[1] > 0
+    writes_origins = origins.shape[1] > 0
     scratch = cast.scratch
     numbers = int64s(scratch)
     floats = float64s(scratch)
@@ -419,31 +448,34 @@ def _gather(casts, rays, origins, directions):  # type: ignore[no-untyped-def]
             first = min(first, rays[k])
         for lane in range(LANES):
             numbers[_RAY + lane] = rays[min(start + lane, count - 1)] - first
-        make(cast, scratch, begin(cast, first))
+        make_group(cast, scratch, block_start(cast, first))
         for lane in range(min(LANES, count - start)):
             k = start + lane
             directions[0, k] = floats[_DX + lane]
             directions[1, k] = floats[_DY + lane]
             directions[2, k] = floats[_DZ + lane]
-            if begins:
+            if writes_origins:
                 origins[0, k] = floats[_OX + lane]
                 origins[1, k] = floats[_OY + lane]
                 origins[2, k] = floats[_OZ + lane]
 
 
-def rays_of(pattern: Pattern, first: int, ray: Ints, poses: Poses) -> tuple[Floats | None, Floats]:
-    """Return rays, see `pattern_rays.checked_rays`: origins and directions, (3, n) each.
+def compiled_rays(
+    pattern: Pattern, first: int, ray: Ints, poses: Poses
+) -> tuple[Floats | None, Floats]:
+    """Return origins and directions, float64 (3, m), of rays with numbers (m,).
 
-    None for origins that are all the position of the pose.
+    Arguments are those of `pattern_rays.checked_rays`. Origins are None if all rays start at the
+    position of a single pose.
     """
     cast = memory.Cast(np.zeros(1, memory.CAST))
     record = cast.record
-    cast.take_pattern(pattern, poses, first)
+    cast.set_pattern(pattern, poses, first)
     # metres
     record["scale"] = 1.0
-    record["near"] = 1
-    record["scratch"], _ = memory.own.memory(0)
-    origins = np.empty((3, 0 if record["still"] else len(ray)))
+    record["starts_near"] = 1
+    record["scratch"], _ = memory.thread_memory.addresses(0)
+    origins = np.empty((3, 0 if record["shares_origin"] else len(ray)))
     directions = np.empty((3, len(ray)))
-    _gather(record, np.ascontiguousarray(ray), origins, directions)
-    return None if record["still"] else origins, directions
+    _make_rays(record, np.ascontiguousarray(ray), origins, directions)
+    return None if record["shares_origin"] else origins, directions

@@ -8,7 +8,7 @@ import numpy as np
 
 from .arrays import Bools, Floats, Ints, Ints32, UInts32
 
-# Ray, distance, triangle and instance of some hits, as in `ScanReturns`.
+# Ray, distance, triangle and instance of hits, as in `ScanReturns`.
 Part = tuple[UInts32, Floats, Ints32, Ints32]
 
 # Numbers of the counters of a tally that are not 0, ascending, and their hits.
@@ -26,8 +26,7 @@ class Hits:
         a miss.
     triangle
         int32 (n,): row of the `faces` of the mesh that is hit; -1 for a miss. Of triangles at
-        exactly the same distance, that of the lowest instance is reported, and of those the
-        lowest row.
+        exactly the same distance, the lowest instance is reported, and in it the lowest row.
     u, v
         float64 (n,): barycentric weights of the triangle's second and third corner; the first
         corner's is ``1 - u - v``. 0 for a miss.
@@ -46,7 +45,7 @@ class Hits:
 
     @property
     def hit(self) -> Bools:
-        """Which rays hit something: (n,)."""
+        """Mask (n,) of the rays that hit a triangle."""
         return self.triangle >= 0
 
 
@@ -83,8 +82,8 @@ class ScanReturns:
         return len(self.ray)
 
 
-def joined(parts: list[Part]) -> Part:
-    """Join hits that were found in parts, in that order; a single part is not copied."""
+def join_hits(parts: list[Part]) -> Part:
+    """Join the hits of parts, in order; a single part is not copied."""
     if len(parts) == 1:
         return parts[0]
     nothing = np.zeros(0, np.int32)

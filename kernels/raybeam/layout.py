@@ -20,22 +20,22 @@ _FLOOR = 1e-35  # products of tiny edges are off by less where float32 underflow
 
 @dataclass(frozen=True)
 class Layout:
-    """Tables of meshes; see the head of intersect.cu for what their columns hold.
+    """Tables of meshes; the head of intersect.cu describes the columns.
 
     Attributes
     ----------
     nodes
-        float32 (m, 32).
+        float32 (m, 32): nodes of the trees.
     triangles
-        float32 (k, 12).
+        float32 (k, 12): corner, edges and error bounds of each triangle.
     corners
-        float64 (k, 9).
+        float64 (k, 9): local corners of each triangle.
     faces
-        int32 (k,).
+        int32 (k,): row of each triangle in the `faces` of its mesh.
     roots
-        int64 (meshes,): the node at which the tree of each mesh begins.
+        int64 (meshes,): root of the tree of each mesh.
     stack
-        Most nodes that can wait during a traversal of a mesh.
+        Maximum nodes that wait during a traversal of a mesh.
     masks
         Opacities of the triangles, in the same order; None if all are opaque.
     """
@@ -50,19 +50,19 @@ class Layout:
 
 
 @dataclass(frozen=True)
-class Places:
-    """Tables that say where the meshes are.
+class InstanceTables:
+    """Tables of the instances of meshes.
 
     Attributes
     ----------
     top
         float32 (m, 32): nodes over the instances.
     instances
-        float64 (n, 20).
+        float64 (n, 20): matrix, box, root and mesh of each instance.
     frame
-        float64 (10,), of the scene.
+        float64 (10,): `Frame.table` of the scene.
     stack
-        Most nodes of `top` that can wait.
+        Maximum nodes of `top` that wait.
     """
 
     top: Floats32
@@ -72,7 +72,7 @@ class Places:
 
 
 def lay_out(meshes: tuple[LocalMesh, ...]) -> Layout:
-    """Build the trees over meshes and flatten all."""
+    """Build the trees over meshes, and return all tables of the meshes."""
     trees = [build_tree(mesh.corners, _WIDTH, _LEAF_SIZE) for mesh in meshes]
     tree, roots = join(trees)
     corners = [mesh.corners[t.order] for mesh, t in zip(meshes, trees, strict=True)]
@@ -88,36 +88,40 @@ def lay_out(meshes: tuple[LocalMesh, ...]) -> Layout:
     )
 
 
-def lay_out_places(scene: Scene, roots: Ints) -> Places:
-    """Build the tree over the instances; a plain scene has none, and tables that are not read."""
+def lay_out_instances(scene: Scene, roots: Ints) -> InstanceTables:
+    """Build the tree over the instances, and return the tables; dummies for a plain scene."""
     if scene.matrices is None:
-        return Places(np.zeros((1, 32), np.float32), np.zeros((1, 20)), scene.frame.table, 0)
+        return InstanceTables(
+            np.zeros((1, 32), np.float32), np.zeros((1, 20)), scene.frame.table, 0
+        )
     tree = build_top(scene.boxes, _WIDTH)
     instances = np.zeros((len(scene.mesh), 20))
     instances[:, :12] = scene.matrices
     frames = [mesh.frame for mesh in scene.meshes]
-    boxes = np.array([[*frame.low, *frame.high] for frame in frames])
+    boxes = np.array([[*frame.lower, *frame.upper] for frame in frames])
     instances[:, 12:18] = boxes[scene.mesh]
     instances[:, 18] = roots[scene.mesh]
     instances[:, 19] = scene.mesh
-    # One more: the top's root waits like the others.
-    return Places(_nodes(tree), instances, scene.frame.table, _stack_need(tree) + 1)
+    # One more for the root of the top.
+    return InstanceTables(_nodes(tree), instances, scene.frame.table, _stack_need(tree) + 1)
 
 
 def _joined(tables: list[AnyArray]) -> AnyArray:
+    """Return the concatenation of tables; a single table is not copied."""
     return tables[0] if len(tables) == 1 else np.concatenate(tables)
 
 
 def _nodes(tree: WideTree) -> Floats32:
-    out = np.zeros((len(tree.child), 8, _WIDTH), np.float32)
-    out[:, 0:3] = tree.low
-    out[:, 3:6] = tree.high
-    out[:, 6] = tree.child.view(np.float32)
-    return out.reshape(-1, 32)
+    """Return the nodes of a tree as rows of 32 numbers: boxes, children, and padding."""
+    table = np.zeros((len(tree.child), 8, _WIDTH), np.float32)
+    table[:, 0:3] = tree.lower
+    table[:, 3:6] = tree.upper
+    table[:, 6] = tree.child.view(np.float32)
+    return table.reshape(-1, 32)
 
 
 def _records(corners: Floats) -> Floats32:
-    """First corner, two edges, and bounds of the test's rounding errors.
+    """Return first corner, two edges, and bounds of the test's rounding errors, by triangle.
 
     With u = 2**-24, coordinates within [-1, 1], unit directions d, edges e and g, and
     t = origin - corner, each of which is rounded to float32 first:
@@ -129,34 +133,34 @@ def _records(corners: Floats) -> Floats32:
     - ``g . (t x e)`` by 40 u |e| |g|.
 
     A comparison with `det` adds its error twice (its sign may be wrong as well), times the
-    distance, at most 4, for the last one. The numbers below are these with some margin.
+    distance, at most 4, for the last one. The numbers below are these with a margin.
     """
     first = corners[:, 0]
-    edge = corners[:, 1] - first
-    other = corners[:, 2] - first
-    e, g = (np.sqrt((side * side).sum(axis=1)) for side in (edge, other))
-    out = np.empty((len(corners), 3, 4), np.float32)
-    out[:, 0, :3] = first
-    out[:, 1, :3] = edge
-    out[:, 2, :3] = other
-    out[:, 0, 3] = _UNIT * g * (48 + 24 * e) + _FLOOR
-    out[:, 1, 3] = _UNIT * e * (56 + 24 * g) + _FLOOR
-    out[:, 2, 3] = _UNIT * e * g * 144 + _FLOOR
-    return out.reshape(-1, 12)
+    first_edge = corners[:, 1] - first
+    second_edge = corners[:, 2] - first
+    e, g = (np.sqrt((side * side).sum(axis=1)) for side in (first_edge, second_edge))
+    table = np.empty((len(corners), 3, 4), np.float32)
+    table[:, 0, :3] = first
+    table[:, 1, :3] = first_edge
+    table[:, 2, :3] = second_edge
+    table[:, 0, 3] = _UNIT * g * (48 + 24 * e) + _FLOOR
+    table[:, 1, 3] = _UNIT * e * (56 + 24 * g) + _FLOOR
+    table[:, 2, 3] = _UNIT * e * g * 144 + _FLOOR
+    return table.reshape(-1, 12)
 
 
 def _stack_need(tree: WideTree) -> int:
-    """Most nodes that wait on any descent: all children but one of each node above."""
-    used = (tree.low[:, 0] <= tree.high[:, 0]).sum(axis=1)
+    """Return the maximum of waiting nodes on a descent: siblings at each level above."""
+    used = (tree.lower[:, 0] <= tree.upper[:, 0]).sum(axis=1)
     waiting = np.zeros(len(tree.child), np.int64)  # in the order of processing
     level = np.array([0])
-    most = 0
+    max_waiting = 0
     while len(level):
         waiting[level] += np.maximum(used[level] - 1, 0)
-        most = max(most, int(waiting[level].max()))
+        max_waiting = max(max_waiting, int(waiting[level].max()))
         child = tree.child[level]
         inner = child > 0
         below = child[inner]
         waiting[below] = np.broadcast_to(waiting[level][:, None], child.shape)[inner]
         level = below
-    return most
+    return max_waiting

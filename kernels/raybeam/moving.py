@@ -1,12 +1,12 @@
-"""Bodies that move while rays are cast: which rays come near one, and where they hit it.
+"""Bodies that move while rays are cast: the rays that come near each body, and their hits.
 
-No tree is ever built again. Rays that follow each other are fired nearly together: the cone around
-each cell of them, and the plane of a fan, is compared with the ball around each body, on its way
-while rays are fired; where they meet, each ray is compared with the body's box, as it is when the
-cell is fired. The rays that pass are taken to the body's axes at their own time, and cast there, at
-near bodies first. The comparisons are loops of moving_loops.py, and decide no hit.
+No tree is ever built again. Consecutive rays are fired nearly at the same time: the cone around
+each cell of rays, and the plane of a fan, is compared with the sphere around each body, along its
+path while rays are fired; where the two meet, each ray is compared with the body's box, at its pose
+when the cell is fired. The remaining rays are transformed to the body's axes at their own time, and
+cast there, at near bodies first. The comparisons are loops of moving_loops.py, and decide no hit.
 
-A CUDA device compares each ray with a box around each body's way, and has the body's poses at all
+A CUDA device compares each ray with a box around each body's path, and has the body's poses at all
 times of the rays.
 """
 
@@ -15,22 +15,25 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from .arrays import Floats, Indices, Ints
+from .arrays import Bools, Floats, Indices, Ints
 from .caster import RayCaster
 from .crossing import SPAN, Crossing, Nearest, Swept
 from .deforming import Deforming
 from .scan import Scan
 
+if TYPE_CHECKING:
+    from .moving_loops import BodySamples
+
 _CHUNK = 1 << 17  # rays at a time
-_PAIRS = 1 << 14  # of cells and bodies at a time
-_POSES = 1 << 18  # on a device: 25 MB
-_BOXES = 128  # that stand, at a time
-_LOOKS = 256  # cells for each look at the bodies
-_NONE = np.zeros(0)
+_PAIRS = 1 << 14  # pairs of cells and bodies at a time
+_POSES = 1 << 18  # poses on a device at a time: 25 MB
+_BOXES = 128  # static boxes at a time
+_CELLS_PER_SAMPLE = 256  # cells for each sample of the bodies' boxes
+_NO_FRAMES = np.zeros(0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,100 +45,159 @@ class Moving:
     shapes
         Casters of the shapes, each in its own axes, and meshes that deform.
     boxes
-        float64 (s, 2, 3): low and high corners of the shapes, in all frames.
+        float64 (s, 2, 3): lower and upper corners of the shapes, over all frames.
     shape
-        intp (b,): which one each body has.
-    there
-        float64 (b, 2): first and last time when each is there.
+        intp (b,): number of each body's shape.
+    presence
+        float64 (b, 2): first and last time at which each body is present.
     poses
-        Called with numbers of bodies (m,) and times (m,); gives (12, m): positions, metres, and
-        rotations from the body's axes, by rows.
+        Function of numbers of bodies (m,) and times (m,) that returns poses (12, m): positions,
+        metres, and rotations from the body's axes, by rows.
     frames
-        Of bodies that deform, called as `poses`: gives their frames (m,), see `Deforming`.
+        Function of numbers of deforming bodies (m,) and times (m,) that returns their frames (m,),
+        see `Deforming`.
     """
 
     shapes: tuple[RayCaster | Deforming, ...]
     boxes: Floats
     shape: Indices
-    there: Floats
+    presence: Floats
     poses: Callable[[Ints, Floats], Floats]
     frames: Callable[[Ints, Floats], Floats] | None = None
 
     @cached_property
     def middle(self) -> Floats:
-        """Middles of the boxes (s, 3)."""
+        """Centres of the shapes' boxes (s, 3), metres."""
         return np.asarray(self.boxes.mean(axis=1))
 
     @cached_property
     def half(self) -> Floats:
-        """Halves of their sides (s, 3)."""
+        """Halves of the sides of the shapes' boxes (s, 3), metres."""
         return (self.boxes[:, 1] - self.boxes[:, 0]) / 2
 
     @cached_property
     def radius(self) -> Floats:
-        """Radii of the balls around them (s,)."""
+        """Radii of the spheres around the shapes' boxes (s,), metres."""
         return np.asarray(np.sqrt((self.half**2).sum(axis=1)))
+
+    def is_present(self, body: Ints, times: Floats) -> Bools:
+        """Return a mask (m,) of the bodies (m,) that are present at times (m,)."""
+        first, last = self.presence[body].T
+        return np.asarray((first <= times) & (times <= last))
 
 
 def hits_on(
-    moving: Moving, scan: Scan, times: Callable[[Ints], Floats], before: Floats | None = None
+    moving: Moving, scan: Scan, times: Callable[[Ints], Floats], limits: Floats | None = None
 ) -> Nearest:
-    """Find the nearest hit of each ray of a scan on a body.
+    """Return the nearest hit of each ray of a scan on a body.
 
     Parameters
     ----------
     moving, scan
         Bodies and rays.
     times
-        Gives the times of rays (m,).
-    before
-        float64 (n,): distances before which hits count; None for all within the scan's.
+        Function of numbers of rays (m,) that returns their times (m,).
+    limits
+        float64 (n,): distances before which hits count, metres; None for the limit of the scan.
     """
-    from . import moving_loops as loops  # not before: numba takes half a second to import
+    from . import moving_loops as loops  # numba takes half a second to import
 
     end = float(np.nextafter(scan.t_max, np.inf))  # t_max counts
-    found = Nearest.of(np.full(len(scan), end) if before is None else np.minimum(before, end))
+    nearest = Nearest.without_hits(
+        np.full(len(scan), end) if limits is None else np.minimum(limits, end)
+    )
     for start, stop in scan.chunks(_CHUNK):
         ray = np.arange(start, stop, dtype=np.int64)
         if scan.room is None:
-            made = scan.rays(start, stop)
+            scan_rays = scan.rays(start, stop)
             rays = np.empty((6, len(ray)))
-            rays[:3] = made.origins.T
-            rays[3:] = made.directions.T
-        else:  # where the caster has written them
+            rays[:3] = scan_rays.origins.T
+            rays[3:] = scan_rays.directions.T
+        else:  # the caster has written the rays
             rays = np.ascontiguousarray(scan.room[:, start:stop])
-        _Chunk(loops, moving, scan, rays, times(ray), found.part(start, stop)).cast()
-    return found
+        _Chunk(loops, moving, scan, rays, times(ray), nearest.part(start, stop)).cast()
+    return nearest
 
 
 def near_boxes(
-    rays: Floats, times: Floats, boxes: Floats, there: Floats, reach: float
+    rays: Floats, times: Floats, boxes: Floats, presence: Floats, reach: float
 ) -> tuple[Indices, Indices, int]:
-    """Find cells of rays (6, n) at times (n,) that may meet boxes that stand, before `reach`.
+    """Return pairs of a cell of rays and a static box that may meet.
 
-    Boxes (b, 12) are middles, and halves of their sides as vectors; each is there from a time to
-    another, (b, 2). Returns numbers of cells and boxes, (k,) each, by box, then cell, and how many
-    rays a cell has.
+    Parameters
+    ----------
+    rays
+        float64 (6, n): origins, metres, and directions.
+    times
+        float64 (n,): time of each ray.
+    boxes
+        float64 (b, 12): centres, and halves of the sides as vectors, metres.
+    presence
+        float64 (b, 2): first and last time at which each box is present.
+    reach
+        Greatest distance at which a ray ends, metres.
+
+    Returns
+    -------
+    cell, box
+        int64 (k,): numbers of cells and boxes, by box, then by cell.
+    size
+        Number of rays of a cell.
     """
     from . import moving_loops as loops
 
     cells = loops.cells_of(rays, times, loops.CELL)
-    wide = loops.cells_of(rays, times, loops.CELL * loops.WIDE)
+    wide_cells = loops.cells_of(rays, times, loops.CELL * loops.WIDE)
     radius = np.sqrt((boxes[:, 3:] ** 2).sum(axis=1))
-    sizes = np.column_stack([radius, np.full(len(boxes), loops.PADS_M), there])
-    number = np.zeros((len(cells), 2), np.int64)
-    looks = boxes[:, None].copy()
+    spheres = np.column_stack([radius, np.full(len(boxes), loops.PADS_M), presence])
+    sample_of_cell = np.zeros((len(cells), 2), np.int64)
+    sampled = boxes[:, None].copy()
     parts = [np.zeros((2, 0), np.int64)]
     for first in range(0, len(boxes), _BOXES):
-        some = slice(first, first + _BOXES)
-        cell, box = loops.meet(wide, cells, number, looks[some], sizes[some], reach)
+        span = slice(first, first + _BOXES)
+        samples = loops.BodySamples(sample_of_cell, sampled[span], spheres[span])
+        cell, box = loops.cells_near_bodies(wide_cells, cells, samples, reach)
         parts.append(np.stack([cell, box + first]))
     cell, box = np.concatenate(parts, axis=1)
     return cell, box, loops.CELL
 
 
+class _CellPoses(NamedTuple):
+    """Pairs of a cell and a body, with the pose of the body for each.
+
+    Attributes
+    ----------
+    cell, body
+        int64 (m,): number of the cell, and of the body.
+    pose
+        int64 (m,): column in `poses` at the first time of the cell.
+    poses
+        float64 (12, p): positions, metres, and rotations from the bodies' axes by rows.
+    pads
+        float64 (m,): margin around the body's box for its motion during the cell, metres.
+    straddles
+        bool (m,): whether the rays of the cell have different times.
+    """
+
+    cell: Indices
+    body: Ints
+    pose: Ints
+    poses: Floats
+    pads: Floats
+    straddles: Bools
+
+
+class _RayPairs(NamedTuple):
+    """Pairs of a ray and a body whose box the ray passes, see `Crossing`."""
+
+    row: Ints  # (m,)
+    body: Ints  # (m,)
+    pose: Ints  # (m,)
+    poses: Floats  # (12, p)
+
+
 class _Chunk:
-    """Some rays of a scan, their times, and what they hit."""
+    """Consecutive rays of a scan, their times, and their nearest hits."""
 
     def __init__(
         self, loops: Any, moving: Moving, scan: Scan, rays: Floats, times: Floats, nearest: Nearest
@@ -148,152 +210,182 @@ class _Chunk:
         self._nearest = nearest
 
     def cast(self) -> None:
-        """Note the nearest hits on all bodies."""
-        loops = self._loops
+        """Write the nearest hits on all bodies."""
         moving = self._moving
-        times = self._times
-        first, last = moving.there.T
-        bodies = np.flatnonzero((first <= times.max()) & (last >= times.min()))
-        swept = np.array([shape.on_device for shape in moving.shapes])[moving.shape[bodies]]
-        if swept.any():
-            self._sweep(bodies[swept])
-            bodies = bodies[~swept]
-        if not len(bodies):
-            return
-        cells = loops.cells_of(self._rays, times, loops.CELL)
-        wide = loops.cells_of(self._rays, times, loops.CELL * loops.WIDE)
-        number, looks, sizes = self._looks(bodies, cells)
-        # Near bodies come first, and rays end at them.
-        way = looks[:, 0, :3] - cells[0, loops.MIDDLE : loops.MIDDLE + 3]
-        order = np.argsort((way**2).sum(axis=1), kind="stable")
+        first, last = moving.presence.T
+        bodies = np.flatnonzero((first <= self._times.max()) & (last >= self._times.min()))
+        on_device = np.array([shape.on_device for shape in moving.shapes])[moving.shape[bodies]]
+        if on_device.any():
+            self._sweep(bodies[on_device])
+            bodies = bodies[~on_device]
+        if len(bodies):
+            self._cast_near_cells(bodies)
+
+    def _cast_near_cells(self, bodies: Ints) -> None:
+        """Cast the cells that come near bodies, at near bodies first, where rays then end."""
+        loops = self._loops
+        cells = loops.cells_of(self._rays, self._times, loops.CELL)
+        wide_cells = loops.cells_of(self._rays, self._times, loops.CELL * loops.WIDE)
+        samples = self._samples(bodies, cells)
+        centres = samples.boxes[:, 0, :3] - cells[0, loops.MIDDLE : loops.MIDDLE + 3]
+        order = np.argsort((centres**2).sum(axis=1), kind="stable")
+        samples = samples._replace(boxes=samples.boxes[order], spheres=samples.spheres[order])
         reach = float(self._nearest.distance.max())
-        cell, which = loops.meet(wide, cells, number, looks[order], sizes[order], reach)
-        body = bodies[order][which]
+        cell, sampled_body = loops.cells_near_bodies(wide_cells, cells, samples, reach)
+        body = bodies[order][sampled_body]
         spans = cells[:, loops.BEGIN : loops.END + 1]
         for start in range(0, len(cell), _PAIRS):
-            some = slice(start, start + _PAIRS)
-            self._cast_at(cell[some], spans[cell[some]].T, body[some])
+            pairs = slice(start, start + _PAIRS)
+            self._cast_pairs(cell[pairs], spans[cell[pairs]].T, body[pairs])
 
     def _sweep(self, bodies: Ints) -> None:
-        """Note the nearest hits on bodies whose shapes are on a device."""
+        """Write the nearest hits on bodies whose shapes are on a device."""
         moving = self._moving
-        scan = self._scan
-        at, when = np.unique(self._times, return_inverse=True)
+        limits = (self._scan.t_min, self._scan.t_max)
+        times, time_index = np.unique(self._times, return_inverse=True)
         step = max(1, _POSES // (SPAN * len(bodies))) * SPAN
-        for one in np.unique(moving.shape[bodies]).tolist():
-            shape = moving.shapes[one]
-            own = bodies[moving.shape[bodies] == one]
+        for number in np.unique(moving.shape[bodies]).tolist():
+            shape = moving.shapes[number]
+            shape_bodies = bodies[moving.shape[bodies] == number]
             assert isinstance(shape, RayCaster)
-            for start in range(0, len(at), step):
-                rows = np.flatnonzero((when >= start) & (when < start + step))
-                first = int(rows[0])
-                last = int(rows[-1]) + 1
-                poses, boxes = self._swept(one, own, at[start : start + step])
-                rays = np.ascontiguousarray(self._rays[:, first:last])
-                number = (when[first:last] - start).astype(np.int32)
-                given = Swept(rays, number, own, poses, boxes, (scan.t_min, scan.t_max))
-                shape.sweep(given, self._nearest.part(first, last))
+            for start in range(0, len(times), step):
+                rows = np.flatnonzero((time_index >= start) & (time_index < start + step))
+                span = slice(int(rows[0]), int(rows[-1]) + 1)
+                poses, boxes = self._swept(number, shape_bodies, times[start : start + step])
+                rays = np.ascontiguousarray(self._rays[:, span])
+                row_times = (time_index[span] - start).astype(np.int32)
+                swept = Swept(rays, row_times, shape_bodies, poses, boxes, limits)
+                shape.sweep(swept, self._nearest.part(span.start, span.stop))
 
     def _swept(self, shape: int, bodies: Ints, times: Floats) -> tuple[Floats, Floats]:
-        """Poses and boxes of bodies of one shape at times, see `Swept`."""
+        """Return poses (t, b, 12) and boxes of bodies of a shape at times (t,), see `Swept`."""
         from .moving_loops import PADS_M
 
         moving = self._moving
-        many = len(bodies)
         body = np.tile(bodies, len(times))
-        time = np.repeat(times, many)
-        first, last = moving.there[body].T
-        there = (first <= time) & (time <= last)
+        time = np.repeat(times, len(bodies))
+        present = moving.is_present(body, time)
         poses = np.full((len(body), 12), np.nan)
         corners = np.full((2, len(body), 3), np.nan)
-        if there.any():
-            table = moving.poses(body[there], time[there])
-            poses[there] = table.T
-            turns = _rotations(table)
-            middle = table[:3].T + _turned(turns, moving.middle[[shape]])
-            half = _turned(np.abs(turns), moving.half[[shape]]) + PADS_M
-            corners[:, there] = middle - half, middle + half
-        low, high = corners.reshape(2, -1, many, 3)
+        if present.any():
+            table = moving.poses(body[present], time[present])
+            poses[present] = table.T
+            rotations = _rotations(table)
+            centres = table[:3].T + _rotated(rotations, moving.middle[[shape]])
+            half = _rotated(np.abs(rotations), moving.half[[shape]]) + PADS_M
+            corners[:, present] = centres - half, centres + half
+        lower, upper = corners.reshape(2, -1, len(bodies), 3)
         spans = np.arange(0, len(times), SPAN)
-        boxes = np.fmin.reduceat(low, spans), np.fmax.reduceat(high, spans)
-        return poses.reshape(-1, many, 12), np.concatenate(boxes, axis=2)
+        boxes = np.fmin.reduceat(lower, spans), np.fmax.reduceat(upper, spans)
+        return poses.reshape(-1, len(bodies), 12), np.concatenate(boxes, axis=2)
 
-    def _looks(self, bodies: Ints, cells: Floats) -> tuple[Ints, Floats, Floats]:
-        """Bodies, looked at a few times, see `meet`."""
+    def _samples(self, bodies: Ints, cells: Floats) -> BodySamples:
+        """Return the boxes of bodies at equal steps of time over the cells, see `BodySamples`."""
         loops = self._loops
         moving = self._moving
-        shape = self._moving.shape[bodies]
-        first = cells[:, loops.BEGIN].min()
-        last = cells[:, loops.END].max()
-        steps = max(1, len(cells) // _LOOKS)
+        spans = cells[:, loops.BEGIN : loops.END + 1]
+        first = spans[:, 0].min()
+        last = spans[:, 1].max()
+        steps = max(1, len(cells) // _CELLS_PER_SAMPLE)
         step = (last - first) / steps
-        spans = (cells[:, loops.BEGIN : loops.END + 1] - first) / (step or 1)
-        number = spans.astype(np.int64).clip(0, steps)
-        at = np.clip(np.linspace(first, last, steps + 1), *moving.there[bodies].T[:, :, None])
-        many = np.repeat(bodies, steps + 1)
-        table = moving.poses(many, at.ravel())
-        rotations = _rotations(table)
-        middles = table[:3].T + _turned(rotations, moving.middle[moving.shape[many]])
-        halves = rotations.transpose(0, 2, 1) * moving.half[moving.shape[many]][..., None]
-        looks = np.empty((len(bodies), steps + 1, 12))
-        looks[..., :3] = middles.reshape(len(bodies), -1, 3)
-        looks[..., 3:] = halves.reshape(len(bodies), -1, 9)
-        change = np.abs(np.diff(looks, axis=1))
+        sample_of_cell = ((spans - first) / (step or 1)).astype(np.int64).clip(0, steps)
+        times = np.linspace(first, last, steps + 1)
+        times = np.clip(times, *moving.presence[bodies].T[:, :, None])
+        boxes = self._sampled_boxes(bodies, times)
+        change = np.abs(np.diff(boxes, axis=1))
         slack = 2 * change.sum(axis=2).max(axis=1) + loops.PADS_M
-        sizes = np.column_stack([moving.radius[shape], slack, moving.there[bodies]])
-        return number, looks, sizes
+        radius = moving.radius[moving.shape[bodies]]
+        spheres = np.column_stack([radius, slack, moving.presence[bodies]])
+        samples: BodySamples = loops.BodySamples(sample_of_cell, boxes, spheres)
+        return samples
 
-    def _cast_at(self, cell: Indices, spans: Floats, body: Ints) -> None:
-        """Cast the rays of cells, of some spans of time, on bodies, one each."""
+    def _sampled_boxes(self, bodies: Ints, times: Floats) -> Floats:
+        """Return the boxes (b, s, 12) of bodies (b,) at times (b, s), see `BodySamples`."""
+        moving = self._moving
+        body = np.repeat(bodies, times.shape[1])
+        table = moving.poses(body, times.ravel())
+        rotations = _rotations(table)
+        shape = moving.shape[body]
+        centres = table[:3].T + _rotated(rotations, moving.middle[shape])
+        halves = rotations.transpose(0, 2, 1) * moving.half[shape][..., None]
+        boxes = np.empty((*times.shape, 12))
+        boxes[..., :3] = centres.reshape(len(bodies), -1, 3)
+        boxes[..., 3:] = halves.reshape(len(bodies), -1, 9)
+        return boxes
+
+    def _cast_pairs(self, cell: Indices, spans: Floats, body: Ints) -> None:
+        """Cast cells (m,), whose first and last times are spans (2, m), on bodies (m,)."""
+        cell_poses = self._cell_poses(cell, spans, body)
+        pairs = self._passing_rays(cell_poses)
+        moving = self._moving
+        boxes = moving.boxes.reshape(-1, 6)
+        limits = (self._scan.t_min, self._scan.t_max)
+        shape = moving.shape[pairs.body]
+        several = len(moving.shapes) > 1
+        for number in np.unique(shape).tolist() if several else [0]:
+            rows = shape == number if several else slice(None)
+            row = pairs.row[rows]
+            body = pairs.body[rows]
+            caster = moving.shapes[number]
+            frame = _NO_FRAMES
+            if isinstance(caster, Deforming):
+                assert moving.frames is not None, "of bodies that deform"
+                frame = moving.frames(body, self._times[row])
+            crossing = Crossing(
+                self._rays, row, body, pairs.pose[rows], pairs.poses, boxes[number], limits, frame
+            )
+            caster.strike(crossing, self._nearest)
+
+    def _cell_poses(self, cell: Indices, spans: Floats, body: Ints) -> _CellPoses:
+        """Return the pose of each body (m,) at the first time of a cell (m,), and its margin."""
+        moving = self._moving
+        starts, stops = np.clip(spans, *moving.presence[body].T)
+        new = (np.diff(body, prepend=-1) != 0) | (np.diff(starts, prepend=np.nan) != 0)
+        pose = np.cumsum(new) - 1  # consecutive cells of a body may have the same first time
+        poses = moving.poses(body[new], starts[new])
+        pads = np.full(len(cell), self._loops.PADS_M)
+        straddles = spans[1] > spans[0]
+        late = np.flatnonzero(straddles)
+        if len(late):  # a margin for the motion until the cell's last time
+            change = np.abs(moving.poses(body[late], stops[late]) - poses[:, pose[late]])
+            size = np.abs(moving.boxes).max(axis=(1, 2))[moving.shape[body[late]]]
+            pads[late] += 2 * (change[:3].sum(axis=0) + size * change[3:].sum(axis=0))
+        return _CellPoses(cell, body, pose, poses, pads, straddles)
+
+    def _passing_rays(self, pairs: _CellPoses) -> _RayPairs:
+        """Return the rays of cells that pass through bodies' boxes, and their poses.
+
+        A ray of a cell with several times has the pose at its own time.
+        """
         loops = self._loops
         moving = self._moving
         times = self._times
-        rays = self._rays
-        shape = moving.shape[body]
+        shape = moving.shape[pairs.body]
+        cell_pairs = loops.CellPairs(pairs.cell, pairs.pose, shape, pairs.pads)
         boxes = moving.boxes.reshape(-1, 6)
-        begins, ends = np.clip(spans, *moving.there[body].T)
-        new = (np.diff(body, prepend=-1) != 0) | (np.diff(begins, prepend=np.nan) != 0)
-        number = np.cumsum(new) - 1  # several cells of a body may begin at one time
-        poses = moving.poses(body[new], begins[new])
-        pads = np.full(len(cell), loops.PADS_M)
-        straddles = spans[1] > spans[0]
-        late = np.flatnonzero(straddles)
-        if len(late):  # the box is larger by what happens until the cell's end
-            change = np.abs(moving.poses(body[late], ends[late]) - poses[:, number[late]])
-            size = np.abs(moving.boxes).max(axis=(1, 2))[shape[late]]
-            pads[late] += 2 * (change[:3].sum(axis=0) + size * change[3:].sum(axis=0))
-        given = cell, number, poses, boxes, shape, pads
-        row, pair = loops.through(rays, self._nearest.distance, *given)
-        body = body[pair]
-        number = number[pair]
-        if len(late):  # each of their rays at its own time, when the body may not be there
-            first, last = moving.there[body].T
-            there = np.flatnonzero((first <= times[row]) & (times[row] <= last))
-            row = row[there]
-            body = body[there]
-            number = number[there]
-            pair = pair[there]
-            some = np.flatnonzero(straddles[pair])
-            number[some] = poses.shape[1] + np.arange(len(some))
-            poses = np.concatenate([poses, moving.poses(body[some], times[row[some]])], axis=1)
-        limits = (self._scan.t_min, self._scan.t_max)
-        shape = moving.shape[body]
-        several = len(moving.shapes) > 1
-        for one in np.unique(shape).tolist() if several else [0]:
-            own = shape == one if several else slice(None)
-            which = row[own], body[own], number[own]
-            cast = moving.shapes[one]
-            frame = _NONE
-            if isinstance(cast, Deforming):
-                assert moving.frames is not None, "of bodies that deform"
-                frame = moving.frames(which[1], times[which[0]])
-            crossing = Crossing(rays, *which, poses, boxes[one], limits, frame)
-            cast.strike(crossing, self._nearest)
+        row, pair = loops.rays_through_boxes(
+            self._rays, self._nearest.distance, cell_pairs, pairs.poses, boxes
+        )
+        body = pairs.body[pair]
+        pose = pairs.pose[pair]
+        if not pairs.straddles.any():
+            return _RayPairs(row, body, pose, pairs.poses)
+        # A body may be present at the cell's first time, and absent at the time of a ray.
+        present = np.flatnonzero(moving.is_present(body, times[row]))
+        row = row[present]
+        body = body[present]
+        pose = pose[present]
+        late = np.flatnonzero(pairs.straddles[pair[present]])
+        pose[late] = pairs.poses.shape[1] + np.arange(len(late))
+        late_poses = moving.poses(body[late], times[row[late]])
+        return _RayPairs(row, body, pose, np.concatenate([pairs.poses, late_poses], axis=1))
 
 
 def _rotations(poses: Floats) -> Floats:
+    """Return rotations (m, 3, 3) of poses (12, m)."""
     return poses[3:].reshape(3, 3, -1).transpose(2, 0, 1)
 
 
-def _turned(rotations: Floats, vectors: Floats) -> Floats:
+def _rotated(rotations: Floats, vectors: Floats) -> Floats:
+    """Return vectors (m, 3) or (1, 3) rotated by matrices (m, 3, 3), in a fixed order."""
     return (rotations * vectors[:, None, :]).sum(axis=2)

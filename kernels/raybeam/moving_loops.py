@@ -1,19 +1,22 @@
-"""Loops of moving.py, which compare rays with bodies."""
+"""Loops of moving.py, which compare rays with moving bodies."""
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
+from numba import types
 
 from .arrays import Floats, Indices, Ints
 from .compiled import compiled, inlined, stage
+from .crossing import Crossing, Nearest
 from .embree_memory import float64s, int64s
 
-# rays, and cells of a wide one
-CELL = 64
-WIDE = 16
-PADS_M = 1e-3  # around a box, and 2e-6 of how far away it is: far more than rounding
-# Columns of cells: axis and half angle of the cone, ball around the origins, first and last time,
-# normal of the plane that the rays lie near, and the sine of the greatest angle to it.
+CELL = 64  # rays of a cell
+WIDE = 16  # cells of a wide cell
+PADS_M = 1e-3  # around a box, and 2e-6 of its distance: far more than rounding
+# Columns of cells: axis and half angle of the cone, sphere around the origins, first and last time,
+# normal of the plane that the rays lie near, and the sine of the greatest angle to the plane.
 AXIS = 0
 COSINE = 3
 SINE = 4
@@ -24,13 +27,71 @@ END = 10
 NORMAL = 11
 OFF = 14
 _TINY = 1e-300
+_f64_1 = types.float64[::1]
+_f64_2 = types.float64[:, ::1]
+_i64_1 = types.int64[::1]
+_i64_2 = types.int64[:, ::1]
+_i32_1 = types.int32[::1]
+
+
+class BodySamples(NamedTuple):
+    """Boxes of bodies, sampled at steps of time.
+
+    Attributes
+    ----------
+    sample_of_cell
+        int64 (c, 2): number of the sample at the first and at the last time of each cell of rays.
+    boxes
+        float64 (b, s, 12): centres of the bodies' boxes, and halves of their sides as vectors,
+        metres.
+    spheres
+        float64 (b, 4): radius of the sphere around the box, how far the box may be from a sample
+        during a step, metres, and first and last time at which the body is present.
+    """
+
+    sample_of_cell: Ints
+    boxes: Floats
+    spheres: Floats
+
+
+class CellPairs(NamedTuple):
+    """Pairs of a cell of rays and a body.
+
+    Attributes
+    ----------
+    cell
+        int64 (m,): number of the cell.
+    pose
+        int64 (m,): column of the body's pose in a table.
+    shape
+        int64 (m,): number of the body's shape.
+    pads
+        float64 (m,): margin around the body's box, metres.
+    """
+
+    cell: Ints
+    pose: Ints
+    shape: Ints
+    pads: Floats
+
+
+def named_tuple(kind: type, *fields: types.Type) -> types.Type:
+    """Return the numba type of a NamedTuple with fields of these types."""
+    return types.BaseTuple.from_types(fields, kind)
+
+
+_SAMPLES = named_tuple(BodySamples, _i64_2, types.float64[:, :, ::1], _f64_2)
+_PAIRS = named_tuple(CellPairs, _i64_1, _i64_1, _i64_1, _f64_1)
+LIMITS = types.UniTuple(types.float64, 2)
+CROSSING = named_tuple(Crossing, _f64_2, _i64_1, _i64_1, _i64_1, _f64_2, _f64_1, LIMITS, _f64_1)
+NEAREST = named_tuple(Nearest, _f64_1, _i64_1, _i32_1, _i32_1)
 
 
 @compiled("f8[:, ::1](f8[:, ::1], f8[::1], i8)")
-def cells_of(rays, times, size):  # type: ignore[no-untyped-def]
-    """Cells of so many rays (6, n) at times (n,): (c, 15)."""
+def cells_of(rays, times, size):  # type: ignore[no-untyped-def]  # noqa: PLR0914, PLR0915 - a compiled loop
+    """Return the cells (c, 15) of each `size` consecutive rays (6, n), fired at times (n,)."""
     count = -(-len(times) // size)
-    out = np.empty((count, 15))
+    cells = np.empty((count, 15))
     for c in range(count):
         begin = c * size
         end = min((c + 1) * size, len(times))
@@ -67,131 +128,136 @@ def cells_of(rays, times, size):  # type: ignore[no-untyped-def]
         ny = ny / length
         nz = nz / length
         cosine = 1.0
-        far = 0.0
-        off = 0.0
+        max_squared = 0.0
+        max_sine = 0.0
         for k in range(begin, end):
             side = nx * rays[3, k] + ny * rays[4, k] + nz * rays[5, k]
-            off = max(off, abs(side))
-            along = ax * rays[3, k] + ay * rays[4, k] + az * rays[5, k]
-            cosine = min(cosine, along)
+            max_sine = max(max_sine, abs(side))
+            along_axis = ax * rays[3, k] + ay * rays[4, k] + az * rays[5, k]
+            cosine = min(cosine, along_axis)
             x = rays[0, k] - px
             y = rays[1, k] - py
             z = rays[2, k] - pz
-            far = max(far, x * x + y * y + z * z)
+            max_squared = max(max_squared, x * x + y * y + z * z)
         cosine = max(cosine, -1.0)
-        out[c, 0] = ax
-        out[c, 1] = ay
-        out[c, 2] = az
-        out[c, 3] = cosine
-        out[c, 4] = np.sqrt(1 - cosine * cosine)
-        out[c, 5] = px
-        out[c, 6] = py
-        out[c, 7] = pz
-        out[c, 8] = np.sqrt(far)
-        out[c, 9] = first
-        out[c, 10] = last
-        out[c, 11] = nx
-        out[c, 12] = ny
-        out[c, 13] = nz
-        out[c, 14] = off
-    return out
+        cells[c, 0] = ax
+        cells[c, 1] = ay
+        cells[c, 2] = az
+        cells[c, 3] = cosine
+        cells[c, 4] = np.sqrt(1 - cosine * cosine)
+        cells[c, 5] = px
+        cells[c, 6] = py
+        cells[c, 7] = pz
+        cells[c, 8] = np.sqrt(max_squared)
+        cells[c, 9] = first
+        cells[c, 10] = last
+        cells[c, 11] = nx
+        cells[c, 12] = ny
+        cells[c, 13] = nz
+        cells[c, 14] = max_sine
+    return cells
 
 
 @inlined
-def _may_meet(cell, look, size, reach):  # type: ignore[no-untyped-def]
-    """Whether rays of a cell may meet a body."""
-    radius = size[0]
-    slack = size[1]
-    first = size[2]
-    last = size[3]
-    x = look[0] - cell[5]
-    y = look[1] - cell[6]
-    z = look[2] - cell[7]
+def _may_meet(cell, box, sphere, reach):  # type: ignore[no-untyped-def]  # noqa: PLR0914 - a compiled loop
+    """Return whether rays of a cell may meet a body; arguments are pointers, see `BodySamples`."""
+    radius = sphere[0]
+    slack = sphere[1]
+    first = sphere[2]
+    last = sphere[3]
+    x = box[0] - cell[5]
+    y = box[1] - cell[6]
+    z = box[2] - cell[7]
     nx = cell[11]
     ny = cell[12]
     nz = cell[13]
-    off = abs(x * nx + y * ny + z * nz)
-    wide = abs(x) + abs(y) + abs(z)
-    most = radius + slack + cell[8] + 1e-6 * wide
-    if off > most + (wide + most) * cell[14]:  # which needs no root
+    plane_distance = abs(x * nx + y * ny + z * nz)
+    distance_bound = abs(x) + abs(y) + abs(z)
+    reach_bound = radius + slack + cell[8] + 1e-6 * distance_bound
+    if (
+        plane_distance > reach_bound + (distance_bound + reach_bound) * cell[14]
+    ):  # which needs no root
         return False
-    far = np.sqrt(x * x + y * y + z * z)
-    more = slack + cell[8] + 1e-6 * far
-    size = radius + more
-    if far - size > reach or cell[10] < first or cell[9] > last:
+    distance = np.sqrt(x * x + y * y + z * z)
+    margin = slack + cell[8] + 1e-6 * distance
+    radius = radius + margin
+    if distance - radius > reach or cell[10] < first or cell[9] > last:
         return False
     side = 0.0
     for k in range(3, 12, 3):
-        side += abs(look[k] * nx + look[k + 1] * ny + look[k + 2] * nz)
-    if off - (far + size) * cell[14] > side + more:
+        side += abs(box[k] * nx + box[k + 1] * ny + box[k + 2] * nz)
+    if plane_distance - (distance + radius) * cell[14] > side + margin:
         return False
-    if far > size:
-        sine = size / far
+    if distance > radius:
+        sine = radius / distance
         cosine = np.sqrt(1 - sine * sine)
         if cell[4] * cosine + cell[3] * sine >= 0:  # within a half turn
-            edge = far * (cell[3] * cosine - cell[4] * sine)
-            return x * cell[0] + y * cell[1] + z * cell[2] >= edge - 1e-6 * far
+            edge = distance * (cell[3] * cosine - cell[4] * sine)
+            return x * cell[0] + y * cell[1] + z * cell[2] >= edge - 1e-6 * distance
     return True
 
 
 # Loops write to arrays that are long enough: numba takes 8 s to compile slices and copies.
-@compiled("i8(f8[:, ::1], f8[:, ::1], i8[:, ::1], f8[:, :, ::1], f8[:, ::1], f8, i8[:, ::1])")
-def _meet(wide, cells, number, looks, sizes, reach, out):  # type: ignore[no-untyped-def]
-    found = 0
+@compiled(types.int64(_f64_2, _f64_2, _SAMPLES, types.float64, _i64_2))
+def _pair_cells(wide_cells, cells, samples, reach, pairs):  # type: ignore[no-untyped-def]  # noqa: PLR0914 - a compiled loop
+    """Write pairs of a cell and a body that may meet; return their number."""
+    sample_of_cell, boxes, spheres = samples
+    count = 0
     # Pointers: views of arrays would be counted, which takes longer than the comparisons.
     cell = cells.ctypes.data
-    broad = wide.ctypes.data
-    look = looks.ctypes.data
-    for b in range(len(sizes)):
-        size = float64s(sizes.ctypes.data + 32 * b)
-        own = look + 96 * looks.shape[1] * b
-        for w in range(len(wide)):
+    wide_cell = wide_cells.ctypes.data
+    box = boxes.ctypes.data
+    for b in range(len(spheres)):
+        sphere = float64s(spheres.ctypes.data + 32 * b)
+        body_boxes = box + 96 * boxes.shape[1] * b
+        for w in range(len(wide_cells)):
             begin = w * WIDE
             end = min((w + 1) * WIDE, len(cells))
-            first = number[begin, 0]
-            if number[end - 1, 1] - first <= 1:  # which sizes allow for
-                at = float64s(own + 96 * first)
-                if not _may_meet(float64s(broad + 120 * w), at, size, reach):
+            first = sample_of_cell[begin, 0]
+            if sample_of_cell[end - 1, 1] - first <= 1:  # the slack of spheres covers a step
+                sampled_box = float64s(body_boxes + 96 * first)
+                if not _may_meet(float64s(wide_cell + 120 * w), sampled_box, sphere, reach):
                     continue
             for c in range(begin, end):
-                first = number[c, 0]
-                if number[c, 1] - first <= 1:
-                    at = float64s(own + 96 * first)
-                    if not _may_meet(float64s(cell + 120 * c), at, size, reach):
+                first = sample_of_cell[c, 0]
+                if sample_of_cell[c, 1] - first <= 1:
+                    sampled_box = float64s(body_boxes + 96 * first)
+                    if not _may_meet(float64s(cell + 120 * c), sampled_box, sphere, reach):
                         continue
-                out[0, found] = c
-                out[1, found] = b
-                found += 1
-    return found
+                pairs[0, count] = c
+                pairs[1, count] = b
+                count += 1
+    return count
 
 
-def meet(
-    wide: Floats, cells: Floats, number: Ints, looks: Floats, sizes: Floats, reach: float
+def cells_near_bodies(
+    wide_cells: Floats, cells: Floats, samples: BodySamples, reach: float
 ) -> tuple[Indices, Indices]:
-    """Cells whose rays may meet bodies, and these; by body, then by cell.
+    """Return pairs of a cell and a body that its rays may meet, by body, then by cell.
 
     Parameters
     ----------
-    wide, cells
-        Cells `WIDE` times as wide, of which many need no closer look, and cells.
-    number
-        int64 (c, 2): looks at the bodies when a cell begins and ends.
-    looks
-        (b, looks, 12): middles of the bodies' boxes, and halves of their sides as vectors.
-    sizes
-        (b, 4): radii of the balls around them, how much a look may be wrong, first and last time
-        when they are there.
+    wide_cells, cells
+        float64 (w, 15) and (c, 15), from `cells_of`: cells of `WIDE` times as many rays, most of
+        which rule out all their cells at once, and cells of `CELL` rays.
+    samples
+        The bodies.
     reach
-        Rays end before.
+        Greatest distance at which a ray ends, metres.
+
+    Returns
+    -------
+    cell, body
+        int64 (k,): rows of `cells`, and of the arrays of `samples`.
     """
-    pairs = np.empty((2, len(cells) * len(sizes)), np.int64)
-    found = _meet(wide, cells, number, looks, sizes, reach, pairs)
-    return pairs[0, :found], pairs[1, :found]
+    pairs = np.empty((2, len(cells) * len(samples.spheres)), np.int64)
+    count = _pair_cells(wide_cells, cells, samples, reach, pairs)
+    return pairs[0, :count], pairs[1, :count]
 
 
 @inlined
-def turn_of(poses, p):  # type: ignore[no-untyped-def]
-    """Rotation of a pose, by rows."""
+def pose_rotation(poses, p):  # type: ignore[no-untyped-def]
+    """Return the rotation of a pose, by rows."""
     return (
         (poses[3, p], poses[4, p], poses[5, p]),
         (poses[6, p], poses[7, p], poses[8, p]),
@@ -200,93 +266,110 @@ def turn_of(poses, p):  # type: ignore[no-untyped-def]
 
 
 @inlined
-def taken(turn, x, y, z):  # type: ignore[no-untyped-def]
-    """Take a vector to the axes of a pose."""
-    (a, b, c), (d, e, f), (g, h, i) = turn
+def to_body_axes(rotation, x, y, z):  # type: ignore[no-untyped-def]
+    """Return a vector in the axes of a body, by the rotation of its pose."""
+    (a, b, c), (d, e, f), (g, h, i) = rotation
     return (x * a + y * d) + z * g, (x * b + y * e) + z * h, (x * c + y * f) + z * i
 
 
 @inlined
-def sides_of(box):  # type: ignore[no-untyped-def]
-    """Low and high corner of a box at a pointer."""
+def box_corners(box):  # type: ignore[no-untyped-def]
+    """Return the lower and the upper corner of a box at a pointer."""
     return (box[0], box[1], box[2]), (box[3], box[4], box[5])
 
 
 @inlined
-def _between(low, high, o, d, enters, leaves):  # type: ignore[no-untyped-def]
+def _clip_axis(slab, o, d, interval):  # type: ignore[no-untyped-def]
+    """Return the part of an interval of distances along a ray that lies within a slab."""
+    enters, leaves = interval
     inverse = 1 / (d if abs(d) >= _TINY else _TINY)
-    low = (low - o) * inverse
-    high = (high - o) * inverse
-    return max(enters, min(low, high)), min(leaves, max(low, high))
+    lower = (slab[0] - o) * inverse
+    upper = (slab[1] - o) * inverse
+    return max(enters, min(lower, upper)), min(leaves, max(lower, upper))
 
 
 @inlined
-def passes(sides, pad, end, x, y, z, dx, dy, dz):  # type: ignore[no-untyped-def]
-    """Whether a ray passes through a box before its end."""
-    (a, b, c), (d, e, f) = sides
+def passes_box(corners, pad, reach, origin, direction):  # type: ignore[no-untyped-def]
+    """Return whether a ray passes through a box, larger by `pad`, before the distance `reach`."""
+    (a, b, c), (d, e, f) = corners
+    x, y, z = origin
     pad += 2e-6 * (abs(x) + abs(y) + abs(z))
-    enters, leaves = _between(a - pad, d + pad, x, dx, -np.inf, np.inf)
-    enters, leaves = _between(b - pad, e + pad, y, dy, enters, leaves)
-    enters, leaves = _between(c - pad, f + pad, z, dz, enters, leaves)
-    return (enters <= leaves) & (leaves >= 0) & (enters * (1 - 1e-6) <= end)
+    interval = _clip_axis((a - pad, d + pad), x, direction[0], (-np.inf, np.inf))
+    interval = _clip_axis((b - pad, e + pad), y, direction[1], interval)
+    enters, leaves = _clip_axis((c - pad, f + pad), z, direction[2], interval)
+    return (enters <= leaves) & (leaves >= 0) & (enters * (1 - 1e-6) <= reach)
 
 
 @stage
-def _passing(rays, n, ends, place, turn, sides, pad, out):  # type: ignore[no-untyped-def]
-    """Write whether the rays of a cell pass through a box at a place.
+def _test_cell(rays, n, reaches, pose, corners, pad, passing):  # type: ignore[no-untyped-def]
+    """Write whether each ray of a cell passes through a box at a pose.
 
-    `rays` is their address in (6, n), `ends` and `out` are those of float64 and int64 (`CELL`,).
+    `rays` is the address of the first ray in (6, n), `reaches` and `passing` are addresses of
+    float64 and int64 (`CELL`,); `pose` is a position and a rotation by rows.
     """
     ray = float64s(rays)
-    end = float64s(ends)
-    found = int64s(out)
-    px, py, pz = place
+    reach = float64s(reaches)
+    passes = int64s(passing)
+    (px, py, pz), rotation = pose
     for k in range(CELL):
-        x, y, z = taken(turn, ray[k] - px, ray[n + k] - py, ray[2 * n + k] - pz)
-        u, v, w = taken(turn, ray[3 * n + k], ray[4 * n + k], ray[5 * n + k])
-        found[k] = np.int64(passes(sides, pad, end[k], x, y, z, u, v, w))
+        origin = to_body_axes(rotation, ray[k] - px, ray[n + k] - py, ray[2 * n + k] - pz)
+        direction = to_body_axes(rotation, ray[3 * n + k], ray[4 * n + k], ray[5 * n + k])
+        passes[k] = np.int64(passes_box(corners, pad, reach[k], origin, direction))
 
 
-@compiled(
-    "i8(f8[:, ::1], f8[::1], i8[::1], i8[::1], f8[:, ::1], f8[:, ::1], i8[::1], f8[::1], i8[::1], "
-    "i8[:, ::1])"
-)
-def _through(rays, ends, cell, number, poses, boxes, shape, pads, passed, out):  # type: ignore[no-untyped-def]
-    found = 0
+@compiled(types.int64(_f64_2, _f64_1, _PAIRS, _f64_2, _f64_2, _i64_1, _i64_2))
+def _pair_rays(rays, reaches, pairs, poses, boxes, passing, ray_pairs):  # type: ignore[no-untyped-def]  # noqa: PLR0914 - a compiled loop
+    """Write the rays that pass through boxes, and the number of each's pair; return their count."""
+    cell, pose_of_pair, shape, pads = pairs
+    written = 0
     count = rays.shape[1]
     for pair in range(len(cell)):
         begin = cell[pair] * CELL
-        end = min((cell[pair] + 1) * CELL, len(ends))
-        sides = sides_of(float64s(boxes.ctypes.data + 48 * shape[pair]))
-        pose = number[pair]
+        end = min((cell[pair] + 1) * CELL, len(reaches))
+        corners = box_corners(float64s(boxes.ctypes.data + 48 * shape[pair]))
+        p = pose_of_pair[pair]
         first = min(begin, count - CELL)
-        place = (poses[0, pose], poses[1, pose], poses[2, pose])
-        turn = turn_of(poses, pose)
+        pose = (poses[0, p], poses[1, p], poses[2, p]), pose_rotation(poses, p)
         ray = rays.ctypes.data + 8 * first
-        own = ends.ctypes.data + 8 * first
-        _passing(ray, count, own, place, turn, sides, pads[pair], passed.ctypes.data)
+        reach = reaches.ctypes.data + 8 * first
+        _test_cell(ray, count, reach, pose, corners, pads[pair], passing.ctypes.data)
         for k in range(begin, end):
-            out[0, found] = k
-            out[1, found] = pair
-            found += passed[k - first]
-    return found
+            ray_pairs[0, written] = k
+            ray_pairs[1, written] = pair
+            written += passing[k - first]
+    return written
 
 
-def through(
-    rays: Floats, ends: Floats, cell: Indices, number: Ints, poses: Floats, boxes: Floats,
-    shape: Ints, pads: Floats,
-) -> tuple[Indices, Indices]:  # fmt: skip
-    """Rays of cells (m,) that pass through boxes, and their numbers of cell and box.
+def rays_through_boxes(
+    rays: Floats, reaches: Floats, pairs: CellPairs, poses: Floats, boxes: Floats
+) -> tuple[Indices, Indices]:
+    """Return the rays of cells that pass through boxes of bodies, and the pair of each.
 
-    Boxes (s, 6), `shape` of which (m,), have the poses (12, p) of a `number` (m,) and are larger by
-    `pads` (m,); rays (6, n) end at `ends`.
+    Parameters
+    ----------
+    rays
+        float64 (6, n): origins, metres, and directions.
+    reaches
+        float64 (n,): distance at which each ray ends, metres.
+    pairs
+        Pairs of a cell and a body.
+    poses
+        float64 (12, p): positions, metres, and rotations from the bodies' axes by rows.
+    boxes
+        float64 (s, 6): lower and upper corner of the box of each shape, metres.
+
+    Returns
+    -------
+    ray, pair
+        int64 (k,): numbers of rays and pairs, by pair, then by ray.
     """
-    cell = np.ascontiguousarray(cell)
-    shape = np.ascontiguousarray(shape)
-    pairs = np.empty((2, len(cell) * CELL), np.int64)
-    if len(ends) < CELL:  # the loop over a cell has a constant length
-        rays = np.concatenate([rays, np.zeros((6, CELL - len(ends)))], axis=1)
-        ends = np.concatenate([ends, np.full(CELL - len(ends), np.nan)])  # nothing is before
-    passed = np.empty(CELL, np.int64)
-    found = _through(rays, ends, cell, number, poses, boxes, shape, pads, passed, pairs)
-    return pairs[0, :found], pairs[1, :found]
+    cell = np.ascontiguousarray(pairs.cell)
+    pairs = pairs._replace(cell=cell, shape=np.ascontiguousarray(pairs.shape))
+    ray_pairs = np.empty((2, len(cell) * CELL), np.int64)
+    if len(reaches) < CELL:  # the loop over a cell has a constant length
+        rays = np.concatenate([rays, np.zeros((6, CELL - len(reaches)))], axis=1)
+        # No distance is before NaN.
+        reaches = np.concatenate([reaches, np.full(CELL - len(reaches), np.nan)])
+    passing = np.empty(CELL, np.int64)
+    count = _pair_rays(rays, reaches, pairs, poses, boxes, passing, ray_pairs)
+    return ray_pairs[0, :count], ray_pairs[1, :count]

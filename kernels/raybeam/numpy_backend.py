@@ -18,7 +18,7 @@ import numpy as np
 
 from . import triangle as exact
 from .arrays import Bools, Floats, Floats32, Indices, Ints
-from .backend import Backend, Found
+from .backend import Backend, ClosestHits
 from .instances import Scene
 from .mesh import TINY, clip
 from .opacity import join_masks
@@ -35,16 +35,16 @@ _SLACK = 2.0**-20  # margin of distance limits in float32: far more than their r
 
 @dataclass
 class _Best:
-    """Closest hits so far; one entry a ray.
+    """Closest hits so far, or candidates; an entry for each ray.
 
     Attributes
     ----------
     t
         Distance, local to the scene.
     key
-        int64: ``instance << 32 | triangle``, so that the lowest wins at equal distance; -1: none.
+        int64: ``instance << 32 | triangle``, so that the lowest wins at equal distance; -1: no hit.
     u, v
-        Weights.
+        Weights of the second and third corner.
     """
 
     t: Floats
@@ -54,11 +54,42 @@ class _Best:
 
 
 @dataclass(frozen=True)
+class _Query:
+    """Rays of a call of `closest` that meet the scene's box, and their closest hits.
+
+    Attributes
+    ----------
+    origins, directions
+        float64 (n, 3), local to the scene; unit directions.
+    t_min
+        Closest distance of a hit, local to the scene.
+    best
+        Closest hits so far, (n,).
+    """
+
+    origins: Floats
+    directions: Floats
+    t_min: float
+    best: _Best
+
+
+@dataclass(frozen=True)
 class _Visit:
-    """Which rays are at which instances, and what their directions' lengths were: (m,) each."""
+    """Rays at instances.
+
+    Attributes
+    ----------
+    ray
+        (m,): number of the ray in the query.
+    key
+        int64 (m,): key of triangle 0 of the instance, see `_Best`.
+    length
+        float64 (m,): length of the direction in the mesh's coordinates, before it was made a unit
+        vector.
+    """
 
     ray: Indices
-    key: Ints  # of triangle 0
+    key: Ints
     length: Floats
 
 
@@ -69,8 +100,8 @@ class _Packet:
     Attributes
     ----------
     entry
-        float64 (n,): where the ray enters the box, 0 if it starts inside. The float32
-        part starts there, so that its rounding errors do not grow with the distance to the
+        float64 (n,): distance at which the ray enters the box, 0 from inside. The float32 part
+        starts there, so that its rounding errors do not grow with the distance to the
         box.
     scaled_origin, inverse
         float32 (3, n): ``origin / direction`` and ``1 / direction``.
@@ -81,13 +112,13 @@ class _Packet:
     sheared
         The rays for the exact test.
     visit
-        Where the rays come from, if they are at instances.
+        The rays and instances, for rays in the coordinates of meshes.
     """
 
     entry: Floats
     scaled_origin: Floats32
     inverse: Floats32
-    near: Indices
+    near_side: Indices
     limit: Floats32
     sheared: exact.ShearedRays
     visit: _Visit | None = None
@@ -95,84 +126,85 @@ class _Packet:
 
 @dataclass(frozen=True)
 class _Pairs:
-    """Rays that are to visit nodes, and where each enters the node's box; (m,) each."""
+    """Pairs of a ray and a node to visit, and the distance at which the box is entered: (m,)."""
 
     ray: Indices
     node: Indices
     enter: Floats32
 
-    def only(self, rows: Indices) -> _Pairs:
-        """Select pairs; as many rows as there are pairs select all of them."""
+    def select(self, rows: Indices) -> _Pairs:
+        """Return the pairs in rows; rows are distinct, so as many rows as pairs select all."""
         if len(rows) == len(self.ray):
             return self
         return _Pairs(self.ray.take(rows), self.node.take(rows), self.enter.take(rows))
 
 
 class _Nodes:
-    """Boxes of a tree, or of several one after the other."""
+    """Boxes of a tree, or of several trees in sequence."""
 
     def __init__(self, tree: WideTree) -> None:
         self._count = len(tree.child)
         # planes[axis]: lower planes of all nodes, then upper ones: row node + side * nodes
         self._planes = [
-            np.concatenate([tree.low[:, axis], tree.high[:, axis]]) for axis in range(3)
+            np.concatenate([tree.lower[:, axis], tree.upper[:, axis]]) for axis in range(3)
         ]
         self._child = tree.child.astype(np.intp)
 
     def walk(self, rays: _Packet, root: Indices, test: Callable[[_Pairs], None]) -> None:
-        """Take each ray down from its root, and call `test` with pairs of a ray and a leaf.
+        """Traverse the tree from the root of each ray, and call `test` with pairs of ray and leaf.
 
-        The number of such a pair's node says what the leaf holds. `test` lowers `rays.limit`.
+        The node of such a pair is the code of a leaf: first triangle and number of triangles.
+        `test` lowers `rays.limit`.
         """
         blocks = [_Pairs(np.arange(len(root)), root, np.zeros(len(root), np.float32))]
         while blocks:
             pairs = blocks.pop()
             if len(pairs.ray) > _BLOCK:
                 order = np.argpartition(pairs.enter, _BLOCK)
-                blocks.append(pairs.only(order[_BLOCK:]))
-                pairs = pairs.only(order[:_BLOCK])
+                blocks.append(pairs.select(order[_BLOCK:]))
+                pairs = pairs.select(order[:_BLOCK])
             # Hits in front of some boxes may have been found since the block was made.
-            pairs = pairs.only(np.flatnonzero(pairs.enter <= rays.limit.take(pairs.ray)))
+            pairs = pairs.select(np.flatnonzero(pairs.enter <= rays.limit.take(pairs.ray)))
             enter, meets = self._meets(rays, pairs.ray, pairs.node)
-            met = np.flatnonzero(meets)
-            child = self._child.take(pairs.node, axis=0).reshape(-1).take(met)
-            pairs = _Pairs(pairs.ray.take(met // _WIDTH), child, enter.take(met))
-            leaves = pairs.only(np.flatnonzero(child < 0))
+            met_slots = np.flatnonzero(meets)
+            child = self._child.take(pairs.node, axis=0).reshape(-1).take(met_slots)
+            pairs = _Pairs(pairs.ray.take(met_slots // _WIDTH), child, enter.take(met_slots))
+            leaves = pairs.select(np.flatnonzero(child < 0))
             if len(leaves.ray):
                 test(_Pairs(leaves.ray, ~leaves.node, leaves.enter))
             inner = np.flatnonzero(child >= 0)
             if len(inner):
-                blocks.append(pairs.only(inner))
+                blocks.append(pairs.select(inner))
 
     def _meets(self, rays: _Packet, ray: Indices, node: Indices) -> tuple[Floats32, Bools]:
-        """Where rays enter children's boxes, and whether before they leave: (m * width,) each."""
+        """Return entry distances of children's boxes, and a mask of hit boxes: (m * width,)."""
         enter = np.zeros((len(ray), _WIDTH), np.float32)
         leave = np.empty_like(enter)
         leave[:] = rays.limit.take(ray)[:, None]
         for axis, planes in enumerate(self._planes):
-            side = rays.near[axis].take(ray)
+            side = rays.near_side[axis].take(ray)
             inverse = rays.inverse[axis].take(ray)[:, None]
             shift = rays.scaled_origin[axis].take(ray)[:, None]
-            near = planes.take(node + side * self._count, axis=0)
-            near *= inverse
-            near -= shift
-            np.maximum(enter, near, out=enter)
-            far = planes.take(node + (1 - side) * self._count, axis=0)
-            far *= inverse
-            far -= shift
-            np.minimum(leave, far, out=leave)
+            entry_distance = planes.take(node + side * self._count, axis=0)
+            entry_distance *= inverse
+            entry_distance -= shift
+            np.maximum(enter, entry_distance, out=enter)
+            exit_distance = planes.take(node + (1 - side) * self._count, axis=0)
+            exit_distance *= inverse
+            exit_distance -= shift
+            np.minimum(leave, exit_distance, out=leave)
         return enter.reshape(-1), (enter <= leave).reshape(-1)
 
 
 class NumpyBackend(Backend):
-    """Bounding volume hierarchy, traversed by many rays at a time on one thread."""
+    """Bounding volume hierarchy, traversed by blocks of rays on a single thread."""
 
     name: ClassVar[str] = "numpy"
     chunk: ClassVar[int] = 1 << 16
 
     @classmethod
     def missing(cls) -> str:
-        """See `Backend.missing`."""
+        """Return "": NumPy is always usable."""
         return ""
 
     def __init__(self, scene: Scene, threads: int | None = None, device: int | None = None) -> None:
@@ -187,43 +219,40 @@ class NumpyBackend(Backend):
         corners = all_corners[0] if len(meshes) == 1 else np.concatenate(all_corners)
         self._corners = np.ascontiguousarray(corners[tree.order])
         self._face = np.concatenate([mesh.index for mesh in meshes])[tree.order]
-        self.place(scene)
+        self.update_scene(scene)
 
-    def place(self, scene: Scene) -> None:
-        """See `Backend.place`."""
-        super().place(scene)
+    def update_scene(self, scene: Scene) -> None:
+        """Replace the scene by a scene of the same instances with new transforms."""
+        super().update_scene(scene)
         if scene.nested:
             self._top = _Nodes(build_top(scene.boxes, _WIDTH))
-            # Box of each instance's mesh: (3, n)
+            # Corners of the box of each instance's mesh: (3, n)
             frames = [mesh.frame for mesh in scene.meshes]
-            self._low = np.array([frame.low for frame in frames])[scene.mesh].T
-            self._high = np.array([frame.high for frame in frames])[scene.mesh].T
+            self._lower = np.array([frame.lower for frame in frames])[scene.mesh].T
+            self._upper = np.array([frame.upper for frame in frames])[scene.mesh].T
 
-    def closest(self, rays: Rays) -> Found:
-        """See `Backend.closest`."""
+    def closest(self, rays: Rays) -> ClosestHits:
+        """Return the closest hits of at most `chunk` rays."""
         frame = self._scene.frame
         origins = np.broadcast_to(frame.to_local(rays.origins), rays.directions.shape)
         t_min = rays.t_min * frame.scale
         t_max = rays.t_max * frame.scale
-        entry, leave = clip(frame.low, frame.high, origins, rays.directions)
+        entry, leave = clip(frame.lower, frame.upper, origins, rays.directions)
         row = np.flatnonzero((entry <= leave) & (entry <= t_max + PAD) & (leave >= t_min - PAD))
-        t = np.full(len(row), t_max)
-        key = np.full(len(row), -1, np.int64)
-        best = _Best(t, key, np.zeros(len(row)), np.zeros(len(row)))
-        origins = origins[row]
-        directions = rays.directions[row]
-        bundle = _bundle(origins, directions, entry[row], t_max)
+        count = len(row)
+        best = _Best(
+            np.full(count, t_max), np.full(count, -1, np.int64), np.zeros(count), np.zeros(count)
+        )
+        query = _Query(origins[row], rays.directions[row], t_min, best)
+        packet = _packet(query.origins, query.directions, entry[row], t_max)
+        roots = np.zeros(count, np.intp)
         if self._scene.nested:
-            self._top.walk(
-                bundle,
-                np.zeros(len(row), np.intp),
-                lambda leaves: self._visit(leaves, origins, directions, bundle, best, t_min),
-            )
+            self._top.walk(packet, roots, lambda leaves: self._visit(query, packet, leaves))
         else:
-            self._walk(bundle, np.zeros(len(row), np.intp), best, t_min)
+            self._walk(query, packet, roots)
         hit = best.key >= 0
         key = best.key[hit]
-        return Found(
+        return ClosestHits(
             row[hit],
             best.t[hit],
             key.astype(np.int32),
@@ -232,108 +261,124 @@ class NumpyBackend(Backend):
             (key >> _SHIFT).astype(np.int32),
         )
 
-    def _walk(self, rays: _Packet, root: Indices, best: _Best, t_min: float) -> None:
-        self._nodes.walk(rays, root, lambda leaves: self._test(rays, best, t_min, leaves))
+    def _walk(self, query: _Query, rays: _Packet, root: Indices) -> None:
+        """Cast rays into the trees of meshes with these roots, and write closer hits."""
+        self._nodes.walk(rays, root, lambda leaves: self._test(query, rays, leaves))
 
-    def _visit(
-        self,
-        leaves: _Pairs,
-        origins: Floats,
-        directions: Floats,
-        rays: _Packet,
-        best: _Best,
-        t_min: float,
-    ) -> None:
+    def _visit(self, query: _Query, rays: _Packet, leaves: _Pairs) -> None:
         """Cast rays into the meshes of instances, round by round: for each ray the nearest."""
-        order = np.lexsort((leaves.enter, leaves.ray))
-        starts = np.flatnonzero(np.diff(leaves.ray[order], prepend=-1))
-        counts = np.diff(starts, append=len(order))
-        turn = np.arange(len(order)) - np.repeat(starts, counts)
-        order = order[np.argsort(turn, kind="stable")]
-        ends = np.cumsum(np.bincount(turn))
-        for chosen in np.split(order, ends[:-1]):
-            now = leaves.only(chosen)
-            now = now.only(np.flatnonzero(now.enter <= rays.limit.take(now.ray)))
-            ray = now.ray
-            instance = now.node >> LEAF_BITS
-            at, to, length = self._scene.enter(instance, origins[ray], directions[ray])
-            low = self._low[:, instance]
-            high = self._high[:, instance]
-            entry, leave = clip(low, high, at, to)
-            t_max = best.t[ray] * length
-            met = np.flatnonzero(
-                (entry <= leave) & (entry <= t_max + PAD) & (leave >= t_min * length - PAD)
-            )
-            ray = ray[met]
-            instance = instance[met]
-            visit = _Visit(ray, instance << _SHIFT, length[met])
-            inside = _bundle(at[met], to[met], entry[met], t_max[met], visit)
-            self._walk(inside, self._roots[self._scene.mesh[instance]], best, t_min)
-            rays.limit[ray] = _limit(best.t[ray], rays.entry[ray])
+        for chosen in _rounds(leaves):
+            pairs = leaves.select(chosen)
+            pairs = pairs.select(np.flatnonzero(pairs.enter <= rays.limit.take(pairs.ray)))
+            instance = pairs.node >> LEAF_BITS
+            inner_rays = self._inner_rays(query, pairs.ray, instance)
+            visit = inner_rays.visit
+            assert visit is not None
+            root = self._roots[self._scene.mesh[visit.key >> _SHIFT]]
+            self._walk(query, inner_rays, root)
+            rays.limit[visit.ray] = _limit(query.best.t[visit.ray], rays.entry[visit.ray])
 
-    def _test(self, rays: _Packet, best: _Best, t_min: float, leaves: _Pairs) -> None:
-        """Test rays against the triangles of leaves and keep what is closer."""
-        count = (leaves.node & ((1 << LEAF_BITS) - 1)) + 1
-        first = leaves.node >> LEAF_BITS
-        row = np.repeat(leaves.ray, count)
-        step = np.arange(len(row)) - np.repeat(np.cumsum(count) - count, count)
-        place = np.repeat(first, count) + step
-        a, b, c, det, t = exact.intersect(rays.sheared, row, self._corners, place)
+    def _inner_rays(self, query: _Query, ray: Indices, instance: Indices) -> _Packet:
+        """Return rays (m,) in the coordinates of instances (m,), if they meet the mesh's box."""
+        origins, directions, length = self._scene.enter(
+            instance, query.origins[ray], query.directions[ray]
+        )
+        entry, leave = clip(self._lower[:, instance], self._upper[:, instance], origins, directions)
+        t_max = query.best.t[ray] * length
+        rows = np.flatnonzero(
+            (entry <= leave) & (entry <= t_max + PAD) & (leave >= query.t_min * length - PAD)
+        )
+        visit = _Visit(ray[rows], instance[rows] << _SHIFT, length[rows])
+        return _packet(origins[rows], directions[rows], entry[rows], t_max[rows], visit)
+
+    def _test(self, query: _Query, rays: _Packet, leaves: _Pairs) -> None:
+        """Test rays against the triangles of leaves, and write closer hits."""
+        row, position = _leaf_pairs(leaves)
+        hits = exact.intersect(rays.sheared, row, self._corners, position)
+        t = hits.t
         ray = row
         if rays.visit is not None:
             ray = rays.visit.ray[row]
             t = t / rays.visit.length[row]
-        ok = np.flatnonzero(exact.inside(a, b, c, det) & (t >= t_min) & (t <= best.t.take(ray)))
+        passes = exact.inside(hits.a, hits.b, hits.c, hits.det)
+        hit = np.flatnonzero(passes & (t >= query.t_min) & (t <= query.best.t.take(ray)))
         if self._masks is not None:
-            instance = 0 if rays.visit is None else rays.visit.key[row[ok]] >> _SHIFT
-            mesh = np.broadcast_to(self._scene.mesh[instance], len(ok))
-            weights = (weight[ok] for weight in (a, b, c, det))
-            ok = ok[self._masks.opaque(mesh, place[ok], *weights)]
-        if not len(ok):
+            instance = 0 if rays.visit is None else rays.visit.key[row[hit]] >> _SHIFT
+            mesh = np.broadcast_to(self._scene.mesh[instance], len(hit))
+            weights = (weight[hit] for weight in hits[:4])
+            hit = hit[self._masks.opaque(mesh, position[hit], *weights)]
+        if not len(hit):
             return
-        row = row[ok]
-        ray = ray[ok]
-        key = self._face[place[ok]].astype(np.int64)
-        t = t[ok]
+        row = row[hit]
+        key = self._face[position[hit]].astype(np.int64)
         if rays.visit is not None:
             key += rays.visit.key[row]
-        order = np.lexsort((key, t, ray))
-        order = order[np.diff(ray[order], prepend=-1) != 0]  # the closest of each ray
-        row = row[order]
-        ray = ray[order]
-        key = key[order]
-        t = t[order]
-        old = best.key[ray]
-        # At equal distance the lowest key wins; a ray without a hit has t_max, which counts too.
-        better = (t < best.t[ray]) | (old < 0) | (key < old)
-        row = row[better]
-        ray = ray[better]
-        ok = ok[order][better]
-        best.t[ray] = t[better]
-        best.key[ray] = key[better]
-        best.u[ray] = b[ok] / det[ok]
-        best.v[ray] = c[ok] / det[ok]
-        reach = best.t[ray] if rays.visit is None else best.t[ray] * rays.visit.length[row]
-        rays.limit[row] = _limit(reach, rays.entry[row])
+        u = hits.b[hit] / hits.det[hit]
+        v = hits.c[hit] / hits.det[hit]
+        _write_closer(query.best, rays, row, _Best(t[hit], key, u, v))
 
 
-def _bundle(
+def _leaf_pairs(leaves: _Pairs) -> tuple[Indices, Indices]:
+    """Return rays, and positions of triangles, of all pairs of a ray and a triangle of a leaf."""
+    count = (leaves.node & ((1 << LEAF_BITS) - 1)) + 1
+    first = leaves.node >> LEAF_BITS
+    row = np.repeat(leaves.ray, count)
+    step = np.arange(len(row)) - np.repeat(np.cumsum(count) - count, count)
+    return row, np.repeat(first, count) + step
+
+
+def _rounds(leaves: _Pairs) -> list[Indices]:
+    """Return rows of pairs by round: the nearest leaf of each ray, the second nearest, ..."""
+    order = np.lexsort((leaves.enter, leaves.ray))
+    starts = np.flatnonzero(np.diff(leaves.ray[order], prepend=-1))
+    counts = np.diff(starts, append=len(order))
+    rank = np.arange(len(order)) - np.repeat(starts, counts)
+    order = order[np.argsort(rank, kind="stable")]
+    stops = np.cumsum(np.bincount(rank))
+    return np.split(order, stops[:-1])
+
+
+def _write_closer(best: _Best, rays: _Packet, row: Indices, hits: _Best) -> None:
+    """Write hits (m,) of the rays `row` (m,) of a packet that are closer, and lower the limits."""
+    ray = row if rays.visit is None else rays.visit.ray[row]
+    order = np.lexsort((hits.key, hits.t, ray))
+    order = order[np.diff(ray[order], prepend=-1) != 0]  # the closest of each ray
+    ray = ray[order]
+    t = hits.t[order]
+    key = hits.key[order]
+    known_key = best.key[ray]
+    # At equal distance the lowest key wins; a ray without a hit has t_max, which counts too.
+    closer = (t < best.t[ray]) | (known_key < 0) | (key < known_key)
+    row = row[order][closer]
+    ray = ray[closer]
+    best.t[ray] = t[closer]
+    best.key[ray] = key[closer]
+    best.u[ray] = hits.u[order][closer]
+    best.v[ray] = hits.v[order][closer]
+    reach = best.t[ray] if rays.visit is None else best.t[ray] * rays.visit.length[row]
+    rays.limit[row] = _limit(reach, rays.entry[row])
+
+
+def _packet(
     origins: Floats,
     directions: Floats,
     entry: Floats,
     t_max: Floats | float,
     visit: _Visit | None = None,
 ) -> _Packet:
-    # If the ray is too far away for float64 to place the start, it stays near the scene.
+    """Prepare rays (n, 3), local to the scene or a mesh, for traversal."""
+    # If the ray is too far away for float64 to compute the start, the start stays near the scene.
     start = np.clip(origins + entry[:, None] * directions, -2, 2).T.astype(np.float32)
-    along = directions.T.astype(np.float32)
-    along = np.where(np.abs(along) < TINY, np.copysign(np.float32(TINY), along), along)
-    inverse = np.float32(1) / along
+    components = directions.T.astype(np.float32)
+    components = np.where(
+        np.abs(components) < TINY, np.copysign(np.float32(TINY), components), components
+    )
+    inverse = np.float32(1) / components
     return _Packet(
         entry,
         start * inverse,
         inverse,
-        (along < 0).astype(np.intp),
+        (components < 0).astype(np.intp),
         _limit(np.broadcast_to(t_max, len(entry)), entry),
         exact.shear(origins, directions),
         visit,
@@ -341,6 +386,6 @@ def _bundle(
 
 
 def _limit(t: Floats, entry: Floats) -> Floats32:
-    """Distances from `entry` in float32, never less than the exact ones."""
-    left = (t - entry) * (1 + _SLACK) + _SLACK
-    return np.clip(left, -_ACROSS, _ACROSS).astype(np.float32)
+    """Return distances from `entry` as float32, never less than the exact distances."""
+    remaining = (t - entry) * (1 + _SLACK) + _SLACK
+    return np.clip(remaining, -_ACROSS, _ACROSS).astype(np.float32)

@@ -1,7 +1,7 @@
 """Masks that make parts of triangles transparent: leaves, fences, nets.
 
 A triangle that a ray passes inside counts only where the mask is true. All backends compute the
-place in the mask in float64 with the operations of `Masks.opaque`, in that order.
+position in the mask in float64 with the operations of `Masks.opaque`, in that order.
 """
 
 from __future__ import annotations
@@ -13,12 +13,12 @@ from numpy.typing import ArrayLike
 
 from .arrays import Bools, Bytes, Floats, Floats32, Indices, Ints, Ints32
 
-_FARTHEST = 2.0**31  # of texture coordinates, so that none is infinite at a ray
+_MAX_COORDINATE = 2.0**31  # of texture coordinates, so that none is infinite at a ray
 
 
 @dataclass(frozen=True, eq=False)
 class Opacity:
-    """Where the triangles of a mesh are opaque.
+    """Mask of the opaque parts of the triangles of a mesh.
 
     Attributes
     ----------
@@ -52,7 +52,7 @@ class LocalOpacity:
 
 
 def check_opacity(opacity: Opacity, face_count: int, index: Ints32) -> LocalOpacity:
-    """Check an opacity and select the triangles `index`; ValueError if it is invalid."""
+    """Check an opacity and select the triangles `index`; ValueError if invalid."""
     mask = np.asarray(opacity.mask)
     uv = np.asarray(opacity.uv)
     if mask.dtype != np.bool_ or mask.ndim != 2 or not mask.size:
@@ -65,13 +65,14 @@ def check_opacity(opacity: Opacity, face_count: int, index: Ints32) -> LocalOpac
             f"uv must be real numbers of shape ({face_count}, 3, 2), three corners for each face, "
             f"not {uv.dtype} {uv.shape}."
         )
-    bad = np.flatnonzero(~(np.abs(uv) < _FARTHEST).all(axis=(1, 2)))
-    if len(bad):
+    invalid = np.flatnonzero(~(np.abs(uv) < _MAX_COORDINATE).all(axis=(1, 2)))
+    if len(invalid):
         raise ValueError(
-            f"uv of face {bad[0]} is {uv[bad[0]].tolist()}: expected finite numbers within 2**31."
+            f"uv of face {invalid[0]} is {uv[invalid[0]].tolist()}: expected finite numbers within "
+            "2**31."
         )
     single = uv[index].astype(np.float32).reshape(-1, 6)
-    # Devices may flush what is not normal.
+    # Devices may flush subnormal numbers.
     single[np.abs(single) < np.finfo(np.float32).tiny] = 0
     return LocalOpacity(np.ascontiguousarray(mask).view(np.uint8), single)
 
@@ -83,12 +84,12 @@ class Masks:
     Attributes
     ----------
     uv
-        float32 (q, 6), of the triangles of meshes that have an opacity.
+        float32 (q, 6): uv of the triangles of all meshes that have an opacity.
     mask
         uint8 (e,): all masks, by rows.
     records
-        int64 (meshes, 4): what to add to a triangle's place for its row of `uv`, the mask's first
-        element, height and width; height 0 for a mesh that is opaque everywhere.
+        int64 (meshes, 4): offset from a triangle's position to its row of `uv`, the mask's first
+        element, height and width; height 0 for an opaque mesh.
     """
 
     uv: Floats32
@@ -96,52 +97,54 @@ class Masks:
     records: Ints
 
     def opaque(
-        self, mesh: Indices, place: Indices, a: Floats, b: Floats, c: Floats,
+        self, mesh: Indices, position: Indices, a: Floats, b: Floats, c: Floats,
         det: Floats,
     ) -> Bools:  # fmt: skip
-        """Whether rays that pass inside triangles are stopped there: (m,).
+        """Return a mask (m,) of the rays inside triangles that meet an opaque part.
 
         Parameters
         ----------
-        mesh, place
-            (m,): number of the mesh, place of the triangle among those of all meshes.
+        mesh, position
+            (m,): number of the mesh, position of the triangle in the tables of all meshes.
         a, b, c, det
-            (m,): as `triangle.intersect` returns them.
+            (m,): areas and their sum, from `triangle.intersect`.
         """
         shift, first, height, width = self.records[mesh].T
         stopped = height == 0
-        (k,) = np.nonzero(height)
-        uv = self.uv[place[k] + shift[k]].astype(np.float64)
-        p = a[k] / det[k]
-        q = b[k] / det[k]
-        r = c[k] / det[k]
+        (masked,) = np.nonzero(height)
+        uv = self.uv[position[masked] + shift[masked]].astype(np.float64)
+        p = a[masked] / det[masked]
+        q = b[masked] / det[masked]
+        r = c[masked] / det[masked]
         u = (p * uv[:, 0] + q * uv[:, 2]) + r * uv[:, 4]
         v = (p * uv[:, 1] + q * uv[:, 3]) + r * uv[:, 5]
-        column = np.minimum(((u - np.floor(u)) * width[k]).astype(np.int64), width[k] - 1)
-        row = np.minimum(((v - np.floor(v)) * height[k]).astype(np.int64), height[k] - 1)
-        stopped[k] = self.mask[first[k] + row * width[k] + column] != 0
+        column = np.minimum(((u - np.floor(u)) * width[masked]).astype(np.int64), width[masked] - 1)
+        row = np.minimum(((v - np.floor(v)) * height[masked]).astype(np.int64), height[masked] - 1)
+        stopped[masked] = self.mask[first[masked] + row * width[masked] + column] != 0
         return stopped
 
 
 def join_masks(opacities: list[LocalOpacity | None], orders: list[Ints32]) -> Masks | None:
-    """Join the opacities of meshes, whose triangles have these orders; None if there is none.
+    """Join the opacities of meshes, with triangles in given orders; None if all are opaque.
 
-    A mask that meshes share, as the same memory, is there once.
+    A mask that meshes share, as the same memory, is stored once.
     """
     uv = [np.zeros((0, 6), np.float32)]
     mask = [np.zeros(0, np.uint8)]
     records = np.zeros((len(orders), 4), np.int64)
-    begins: dict[tuple[int, tuple[int, ...]], int] = {}  # {address and shape: first element}
+    first_elements: dict[
+        tuple[int, tuple[int, ...]], int
+    ] = {}  # {address and shape: first element}
     triangles = rows = elements = 0
-    for record, one, order in zip(records, opacities, orders, strict=True):
-        if one is not None:
-            key = one.mask.ctypes.data, one.mask.shape
-            if key not in begins:
-                begins[key] = elements
-                mask.append(one.mask.reshape(-1))
-                elements += one.mask.size
-            record[:] = rows - triangles, begins[key], *one.mask.shape
-            uv.append(one.uv[order])
+    for record, opacity, order in zip(records, opacities, orders, strict=True):
+        if opacity is not None:
+            key = opacity.mask.ctypes.data, opacity.mask.shape
+            if key not in first_elements:
+                first_elements[key] = elements
+                mask.append(opacity.mask.reshape(-1))
+                elements += opacity.mask.size
+            record[:] = rows - triangles, first_elements[key], *opacity.mask.shape
+            uv.append(opacity.uv[order])
             rows += len(order)
         triangles += len(order)
     return Masks(np.concatenate(uv), np.concatenate(mask), records) if rows else None

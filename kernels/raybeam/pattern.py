@@ -13,13 +13,13 @@ from .poses import Poses
 from .rays import check_origins, unit_directions
 from .sub_rays import SubRays
 
-_MOST_STEP = 1 << 10  # beams of a lidar, by far
+_MAX_STEP = 1 << 10  # more than the beams of any lidar
 
 
 class Pattern:
-    """Rays that are cast many times, for example one revolution of a lidar.
+    """Rays that are cast repeatedly, for example a revolution of a lidar.
 
-    They are checked and normalised once; a backend may keep its own copy on its device.
+    Rays are checked and normalised once; a backend may keep a copy on its device.
 
     Parameters
     ----------
@@ -29,10 +29,11 @@ class Pattern:
         (n, 3), metres, in the sensor's axes: start of each ray relative to the sensor's position;
         (3,) for all rays; None if all start at that position.
     sub_rays
-        Sub-rays of each direction, one after the other: these are the rays, made when they are
-        cast. None for one ray of each direction.
+        Sub-rays of each direction, in sequence: these become the rays, computed during a cast.
+        None for a single ray of each direction.
     offsets
-        (n, 2): angles across and up, radians, that are added to those of the sub-rays of each.
+        (n, 2): angles across and up, radians, added to the angles of the sub-rays of each
+        direction.
 
     Raises
     ------
@@ -70,59 +71,64 @@ class Pattern:
     def divided(
         self, sub_rays: SubRays, offsets: Floats | None = None, rows: Ints | None = None
     ) -> Pattern:
-        """Return the beams, or those of some rows (m,), with sub-rays; they are not checked again.
+        """Return a copy with sub-rays, of all beams or of the rows (m,), without another check.
 
-        After its last row the pattern repeats.
-        `offsets` (m, 2) are as of `Pattern`.
+        After its last row the pattern repeats. `offsets` (m, 2) are angles across and up of each
+        beam, radians, added to the angles of its sub-rays.
         """
-        _ = self.step  # which the copies keep: it takes as long as 10,000 rays
-        made = copy(self)
+        _ = self.step  # computed here for all copies: takes as long as 10,000 rays
+        pattern = copy(self)
         if rows is not None:
-            made._directions = self._directions.take(rows, axis=1, mode="wrap")
+            pattern._directions = self._directions.take(rows, axis=1, mode="wrap")
             if self._origins is not None:
-                made._origins = self._origins.take(rows, axis=1, mode="wrap")
-        made.sub_rays = sub_rays
-        made.offsets = None if offsets is None else np.ascontiguousarray(offsets.T)
-        return made
+                pattern._origins = self._origins.take(rows, axis=1, mode="wrap")
+        pattern.sub_rays = sub_rays
+        pattern.offsets = None if offsets is None else np.ascontiguousarray(offsets.T)
+        return pattern
 
     def __len__(self) -> int:
-        return self._directions.shape[1] * self.each
+        return self._directions.shape[1] * self.subrays_per_beam
 
     def __repr__(self) -> str:
-        many = "" if self.sub_rays is None else f", {self.each} sub-rays each"
         beams = self._directions.shape[1]
-        return f"Pattern({beams} directions{'' if self._origins is None else ', origins'}{many})"
+        origins = "" if self._origins is None else ", origins"
+        sub_rays = "" if self.sub_rays is None else f", {self.subrays_per_beam} sub-rays each"
+        return f"Pattern({beams} directions{origins}{sub_rays})"
 
     @property
-    def each(self) -> int:
-        """Rays of each direction."""
+    def subrays_per_beam(self) -> int:
+        """Number of rays of each direction."""
         return 1 if self.sub_rays is None else len(self.sub_rays)
 
     @property
     def directions(self) -> Floats:
-        """Unit vectors (n, 3), of beams, read-only; transposed, they are contiguous."""
+        """Unit vectors (n, 3) of the beams, read-only; the transposed array is contiguous."""
         return self._directions.T
 
     @property
     def origins(self) -> Floats | None:
-        """Starts of beams (n, 3), metres, read-only and contiguous as `directions`; or None."""
+        """Origins of the beams (n, 3), metres, read-only, transposed contiguous; or None."""
         return None if self._origins is None else self._origins.T
 
     @cached_property
     def step(self) -> int:
-        """Rows from a ray to its neighbour along a ring: the step at which rays differ least."""
+        """Rows from a ray to its neighbour along a ring: the step of least difference."""
         rows = self._directions.shape[1]
-        steps = np.arange(1, min(rows // 32, _MOST_STEP) + 1)
+        steps = np.arange(1, min(rows // 32, _MAX_STEP) + 1)
         if not len(steps):
             return 1
         samples = np.arange(32) * (rows // 32)
-        apart = samples[:, None] + np.array([[1], [8], [15]])[:, :, None] * steps  # (3, 32, steps)
-        cosines = np.zeros(apart.shape)
+        compared = (
+            samples[:, None] + np.array([[1], [8], [15]])[:, :, None] * steps
+        )  # (3, 32, steps)
+        cosines = np.zeros(compared.shape)
         for axis in self._directions:
-            cosines += axis[samples][:, None] * axis[apart % rows]
+            cosines += axis[samples][:, None] * axis[compared % rows]
         return int(steps[np.argmax(cosines.min(axis=0).mean(axis=0))])
 
-    def starts_at_once(self, poses: Poses) -> bool:
-        """Whether all rays start at one position."""
-        apart = self._origins is not None or (self.sub_rays and self.sub_rays.starts is not None)
-        return len(poses) == 1 and poses.motion is None and not apart
+    def shares_origin(self, poses: Poses) -> bool:
+        """Return whether all rays start at a single position."""
+        own_origins = self._origins is not None or (
+            self.sub_rays and self.sub_rays.starts is not None
+        )
+        return len(poses) == 1 and poses.motion is None and not own_origins

@@ -1,4 +1,4 @@
-"""Origins and directions of the rays of a pattern, for whoever wants them outside of a cast."""
+"""Origins and directions of the rays of a pattern, as a cast computes them."""
 
 from __future__ import annotations
 
@@ -27,9 +27,9 @@ def pattern_rays(
     rays_per_pose: int | None = None,
     motion: PoseMotion | None = None,
 ) -> tuple[Floats, Floats]:
-    """Return origins and directions, in the mesh's axes, of some of the rays that a scan casts.
+    """Return origins and directions, in the mesh's axes, of numbered rays of a scan.
 
-    The rays have the same bits as those that `RayCaster.scan` casts, in any batch.
+    The rays have the same bits as the rays that `RayCaster.scan` casts, in any batch.
 
     Parameters
     ----------
@@ -38,14 +38,14 @@ def pattern_rays(
     numbers
         (m,) whole numbers: rays numbered as in `ScanReturns`, from 0 at the window's start.
     positions, rotations, rays_per_pose, motion
-        Those given to `RayCaster.scan`.
+        As for `RayCaster.scan`.
     start
         Start of the window.
 
     Returns
     -------
     origins
-        float64 (m, 3), or (1, 3) when all are the same, metres.
+        float64 (m, 3), or (1, 3) if all rays share an origin, metres.
     directions
         float64 (m, 3), unit vectors.
 
@@ -76,52 +76,61 @@ def pattern_rays(
 
 
 def checked_rays(pattern: Pattern, first: int, ray: Ints, poses: Poses) -> tuple[Floats, Floats]:
-    """Return rays as `pattern_rays` does, without checks; in compiled loops if numba is installed.
+    """Return origins and directions of rays without checks, by compiled loops if possible.
 
-    `first` is the start of the window; `ray` (m,) are numbers of rays.
+    `first` is the row of ray 0; `ray` (m,) are numbers of rays. Shapes are those of
+    `pattern_rays`.
     """
     if not (_numba_is_installed() and len(ray)):
         return plain_rays(pattern, first, ray, poses)
-    from . import embree_rays  # here, because numba takes half a second to import
+    from . import embree_rays  # numba takes half a second to import
 
-    origins, directions = embree_rays.rays_of(pattern, first, ray, poses)
+    origins, directions = embree_rays.compiled_rays(pattern, first, ray, poses)
     return (poses.positions if origins is None else origins.T), directions.T
 
 
 def plain_rays(pattern: Pattern, first: int, ray: Ints, poses: Poses) -> tuple[Floats, Floats]:
-    """Return rays as `checked_rays` does, by NumPy.
+    """Return origins and directions of rays as `checked_rays` does, by NumPy.
 
     Vectors are rotated to the mesh's axes, then translated: ``((x a + y b) + z c) + p``; if the
     lidar moves within a pose, ``v + t (w x v)`` and ``p + t u`` follow each step.
     """
-    sub_rays = pattern.sub_rays
-    share_origin = pattern.starts_at_once(poses)
+    shares_origin = pattern.shares_origin(poses)
     origins, directions = np.empty((2, 3, len(ray)))
     scratch = np.empty((18, min(len(ray), _BLOCK_RAYS)))
     for start in range(0, len(ray), _BLOCK_RAYS):
         block = slice(start, start + _BLOCK_RAYS)
         numbers = ray[block]
-        row = first + numbers
-        ray_poses = poses.of(numbers, scratch[:, : len(numbers)])
-        row -= row // len(pattern) * len(pattern)  # takes half as long as the remainder
-        beam = row // pattern.each
-        direction = _columns(pattern.directions.T, beam)
-        offset = None  # of the ray's start from the sensor's position
-        if sub_rays is not None:
-            angles = None if pattern.offsets is None else pattern.offsets[:, beam]
-            sub_ray = row - beam * len(sub_rays)
-            direction, offset = spread(sub_rays, direction, sub_ray, angles)
-        directions[:, block] = ray_poses.turned(direction)
-        if share_origin:
+        ray_poses = poses.look_up(numbers, scratch[:, : len(numbers)])
+        direction, offset = _sensor_rays(pattern, first + numbers)
+        directions[:, block] = ray_poses.rotated(direction)
+        if shares_origin:
             continue
         origin = ray_poses.positions
-        if pattern.origins is not None:
-            beam_origin = _columns(pattern.origins.T, beam)
-            offset = beam_origin if offset is None else beam_origin + offset
         if offset is not None:
-            origin = ray_poses.turned(offset) + origin
-        origins[:, block] = ray_poses.moved(origin)
-    return (poses.positions if share_origin else origins.T), directions.T
+            origin = ray_poses.rotated(offset) + origin
+        origins[:, block] = ray_poses.translated(origin)
+    return (poses.positions if shares_origin else origins.T), directions.T
+
+
+def _sensor_rays(pattern: Pattern, row: Ints) -> tuple[Floats, Floats | None]:
+    """Return directions (3, m), and offsets of origins (3, m), in the sensor's axes.
+
+    `row` (m,) are rows of rays, which may be beyond the end of the pattern. Offsets are relative
+    to the sensor's position, metres; None for zero.
+    """
+    row = row - row // len(pattern) * len(pattern)  # takes half as long as the remainder
+    beam = row // pattern.subrays_per_beam
+    direction = _columns(pattern.directions.T, beam)
+    offset = None
+    sub_rays = pattern.sub_rays
+    if sub_rays is not None:
+        angles = None if pattern.offsets is None else pattern.offsets[:, beam]
+        direction, offset = spread(sub_rays, direction, row - beam * len(sub_rays), angles)
+    if pattern.origins is not None:
+        beam_origin = _columns(pattern.origins.T, beam)
+        offset = beam_origin if offset is None else beam_origin + offset
+    return direction, offset
 
 
 @cache

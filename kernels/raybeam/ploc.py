@@ -1,8 +1,8 @@
 """A binary bounding volume hierarchy: clustered below, swept at the top.
 
 Parallel locally-ordered clustering, Meister and Bittner (2018): boxes are sorted along a space
-filling curve; then each looks at its neighbours in that order, and pairs that are each other's
-best partner (least area of the common box) are merged. Every step is a few operations on whole
+filling curve; then each box is compared with its neighbours in that order, and pairs of mutual
+best partners (least area of the common box) are merged. Every step is a few operations on whole
 arrays. Near the root, few clusters are left and neighbours on the curve are seldom the best:
 clustering to the end cost rays a fifth to a half more nodes in cities. So the last clusters are
 divided from the root down, by a full sweep with the surface area heuristic (sweep.py), which takes
@@ -20,135 +20,175 @@ from .arrays import Floats32, Indices, Ints32
 from .sweep import divide
 
 _RADIUS = 8  # neighbours looked at on either side; twice as many gain 1 to 2 % of the tree's cost
-# Clusters that are left to the sweep: so many, but at most an eighth of all boxes if those are
-# enough. Four times as many gain nothing, a quarter loses a twentieth.
-_MOST = 1 << 14
-_ENOUGH = 1 << 10
+# Clusters that are left to the sweep: an eighth of all boxes, within these limits. Four times the
+# maximum gains nothing, a quarter loses a twentieth.
+_MAX_CLUSTERS = 1 << 14
+_MIN_CLUSTERS = 1 << 10
 _GRID_BITS = 21  # a coordinate; three of them fill 63 bits
 
 
 @dataclass(frozen=True)
 class BinaryTree:
-    """Nodes 0 to n-1 are the n boxes given, n to 2n-2 inner ones; the last is the root.
+    """Nodes 0 to n-1 are the n boxes, n to 2n-2 inner nodes; the last is the root.
 
     Attributes
     ----------
     low, high
         float32 (3, 2n-1): boxes.
     left, right
-        int32 (2n-1,): children; -1 for the boxes given.
+        int32 (2n-1,): children; -1 for boxes.
     rounds
-        Ranges of inner nodes that were made together: children always belong to an earlier
+        Ranges of inner nodes that were created together: children always belong to an earlier
         range than their parent.
     """
 
-    low: Floats32
-    high: Floats32
-    left: Ints32
-    right: Ints32
+    lower: Floats32
+    upper: Floats32
+    first_child: Ints32
+    second_child: Ints32
     rounds: tuple[tuple[int, int], ...]
 
     @property
     def area(self) -> Floats32:
         """Half the surface of each node's box: (2n-1,)."""
-        return _half_area(self.high - self.low)
+        return _half_area(self.upper - self.lower)
 
 
-def build(low: Floats32, high: Floats32) -> BinaryTree:
+@dataclass
+class _Clusters:
+    """Clusters that have no parent yet, in the order of the space filling curve.
+
+    Attributes
+    ----------
+    lower, upper
+        float32 (3, m): boxes.
+    node
+        int32 (m,): node of each cluster.
+    """
+
+    lower: Floats32
+    upper: Floats32
+    node: Ints32
+
+    def merge(self, first: Indices, second: Indices) -> None:
+        """Extend the boxes of clusters `first` by their partners `second`."""
+        self.lower[:, first] = np.minimum(self.lower[:, first], self.lower[:, second])
+        self.upper[:, first] = np.maximum(self.upper[:, first], self.upper[:, second])
+
+    def remove(self, position: Indices) -> None:
+        """Remove clusters at positions (k,)."""
+        remains = np.ones(len(self.node), np.bool_)
+        remains[position] = False
+        self.lower = self.lower[:, remains]
+        self.upper = self.upper[:, remains]
+        self.node = self.node[remains]
+
+
+class _Nodes:
+    """Arrays of all nodes of a `BinaryTree` of n boxes, and the boxes under each: (2n-1,)."""
+
+    def __init__(self, lower: Floats32, upper: Floats32) -> None:
+        n = lower.shape[1]
+        self.lower, self.upper = np.empty((2, 3, 2 * n - 1), np.float32)
+        self.lower[:, :n] = lower
+        self.upper[:, :n] = upper
+        self.first_child, self.second_child = np.full((2, 2 * n - 1), -1, np.int32)
+        self.count = np.ones(2 * n - 1, np.int32)
+
+    def merge(self, clusters: _Clusters, next_node: int, first: Indices, second: Indices) -> None:
+        """Create nodes, from `next_node` on, of pairs of clusters, and replace the clusters."""
+        new = np.arange(next_node, next_node + len(first), dtype=np.int32)
+        self.first_child[new] = clusters.node[first]
+        self.second_child[new] = clusters.node[second]
+        self.count[new] = self.count[self.first_child[new]] + self.count[self.second_child[new]]
+        clusters.merge(first, second)
+        self.lower[:, new] = clusters.lower[:, first]
+        self.upper[:, new] = clusters.upper[:, first]
+        clusters.node[first] = new
+        clusters.remove(second)
+
+    def fit(self, start: int, stop: int) -> None:
+        """Compute the boxes of nodes `start` to `stop` from their children."""
+        children = self.first_child[start:stop], self.second_child[start:stop]
+        self.lower[:, start:stop] = np.minimum(*(self.lower[:, child] for child in children))
+        self.upper[:, start:stop] = np.maximum(*(self.upper[:, child] for child in children))
+
+
+def build(lower: Floats32, upper: Floats32) -> BinaryTree:
     """Build a tree over n boxes, n at least 1.
 
     Parameters
     ----------
-    low, high
-        float32 (3, n): least and greatest coordinates, within [-2, 2].
+    lower, upper
+        float32 (3, n): corners of the boxes, within [-2, 2].
     """
-    n = low.shape[1]
-    order = np.argsort(_morton(low, high), kind="stable").astype(np.int32)
-    all_low, all_high = np.empty((2, 3, 2 * n - 1), np.float32)
-    all_low[:, :n] = low
-    all_high[:, :n] = high
-    left, right = np.full((2, 2 * n - 1), -1, np.int32)
-    low = low[:, order]
-    high = high[:, order]
-    ids = order
+    n = lower.shape[1]
+    order = np.argsort(_morton(lower, upper), kind="stable").astype(np.int32)
+    nodes = _Nodes(lower, upper)
+    clusters = _Clusters(lower[:, order], upper[:, order], order)
     rounds: list[tuple[int, int]] = []
-    count = np.ones(2 * n - 1, np.int32)
-    made = n
-    left_over = min(_MOST, max(_ENOUGH, n // 8))
-    while len(ids) > left_over:
-        first, second = _partners(low, high)
-        new = np.arange(made, made + len(first), dtype=np.int32)
-        rounds.append((made, made + len(first)))
-        made += len(first)
-        left[new] = ids[first]
-        right[new] = ids[second]
-        count[new] = count[left[new]] + count[right[new]]
-        low[:, first] = np.minimum(low[:, first], low[:, second])
-        high[:, first] = np.maximum(high[:, first], high[:, second])
-        all_low[:, new] = low[:, first]
-        all_high[:, new] = high[:, first]
-        ids[first] = new
-        stay = np.ones(len(ids), np.bool_)
-        stay[second] = False
-        low = low[:, stay]
-        high = high[:, stay]
-        ids = ids[stay]
-    children, upper = _crown(low, high, count[ids], ids, made)
-    left[made:], right[made:] = children.T
-    for start, stop in upper:
-        both = left[start:stop], right[start:stop]
-        all_low[:, start:stop] = np.minimum(*(all_low[:, child] for child in both))
-        all_high[:, start:stop] = np.maximum(*(all_high[:, child] for child in both))
-    return BinaryTree(all_low, all_high, left, right, (*rounds, *upper))
+    next_node = n
+    max_clusters = min(_MAX_CLUSTERS, max(_MIN_CLUSTERS, n // 8))
+    while len(clusters.node) > max_clusters:
+        first, second = _partners(clusters.lower, clusters.upper)
+        nodes.merge(clusters, next_node, first, second)
+        rounds.append((next_node, next_node + len(first)))
+        next_node += len(first)
+    children, crown_rounds = _crown(clusters, nodes.count[clusters.node], next_node)
+    nodes.first_child[next_node:], nodes.second_child[next_node:] = children.T
+    for start, stop in crown_rounds:
+        nodes.fit(start, stop)
+    all_rounds = (*rounds, *crown_rounds)
+    return BinaryTree(nodes.lower, nodes.upper, nodes.first_child, nodes.second_child, all_rounds)
 
 
 def _crown(
-    low: Floats32,
-    high: Floats32,
-    count: Ints32,
-    ids: Ints32,
-    made: int,
+    clusters: _Clusters, count: Ints32, next_node: int
 ) -> tuple[Ints32, list[tuple[int, int]]]:
-    """Children (m - 1, 2) of the nodes above the last m clusters, the root last, and rounds.
+    """Return children (m - 1, 2) of the nodes above the last m clusters, root last, and rounds.
 
-    `count` and `ids` (m,) say how many boxes are in each cluster, and which node it is; `made` is
-    the number of the next node.
+    `count` (m,) is the number of boxes of each cluster, `next_node` the number of the next node.
     """
-    levels = divide(low, high, count.astype(np.float64))
+    levels = divide(clusters.lower, clusters.upper, count.astype(np.float64))
     children = [np.zeros((0, 2), np.int32)]
     rounds: list[tuple[int, int]] = []
-    below = made  # start of the level below
+    below = next_node  # start of the level below
     for nodes in reversed(levels):
-        number = np.where(nodes >= 0, ids[nodes], below - 1 - nodes)
+        number = np.where(nodes >= 0, clusters.node[nodes], below - 1 - nodes)
         children.append(number.astype(np.int32))
-        rounds.append((made, made + len(nodes)))
-        below = made
-        made = made + len(nodes)
+        rounds.append((next_node, next_node + len(nodes)))
+        below = next_node
+        next_node = next_node + len(nodes)
     return np.concatenate(children), rounds
 
 
-def _partners(low: Floats32, high: Floats32) -> tuple[Indices, Indices]:
-    """Pairs of positions that are each other's nearest, the lower one first."""
-    n = low.shape[1]
-    here = np.arange(n)
+def _partners(lower: Floats32, upper: Floats32) -> tuple[Indices, Indices]:
+    """Return pairs of positions of mutual best partners, the lower position first."""
+    n = lower.shape[1]
+    position = np.arange(n)
     # If all candidates are equally good, as among copies of one triangle, partners must still
     # match: start from the pairs (0, 1), (2, 3), ... and replace them only by better ones.
-    best = np.minimum(here ^ 1, n - 1)
+    best = np.minimum(position ^ 1, n - 1)
     cost = np.full(n, np.inf, np.float32)
-    even = here[: n - 1 : 2]
+    even = position[: n - 1 : 2]
     cost[even] = _half_area(
-        np.maximum(high[:, even], high[:, even + 1]) - np.minimum(low[:, even], low[:, even + 1])
+        np.maximum(upper[:, even], upper[:, even + 1])
+        - np.minimum(lower[:, even], lower[:, even + 1])
     )
     cost[even + 1] = cost[even]
     for step in range(1, min(_RADIUS, n - 1) + 1):
         area = _half_area(
-            np.maximum(high[:, :-step], high[:, step:]) - np.minimum(low[:, :-step], low[:, step:])
+            np.maximum(upper[:, :-step], upper[:, step:])
+            - np.minimum(lower[:, :-step], lower[:, step:])
         )
-        for mine, other in ((here[:-step], here[step:]), (here[step:], here[:-step])):
-            less = area < cost[mine]
-            cost[mine[less]] = area[less]
-            best[mine[less]] = other[less]
-    first = np.flatnonzero((best[best] == here) & (here < best))
+        for cluster, neighbour in (
+            (position[:-step], position[step:]),
+            (position[step:], position[:-step]),
+        ):
+            cheaper = area < cost[cluster]
+            cost[cluster[cheaper]] = area[cheaper]
+            best[cluster[cheaper]] = neighbour[cheaper]
+    first = np.flatnonzero((best[best] == position) & (position < best))
     if 16 * len(first) < n:  # long chains of ever better partners: do not merge one by one
         first = even
         return first, first + 1
@@ -156,21 +196,22 @@ def _partners(low: Floats32, high: Floats32) -> tuple[Indices, Indices]:
 
 
 def _half_area(size: Floats32) -> Floats32:
+    """Return half the surface of boxes with sides (3, n)."""
     x, y, z = size
     return x * y + y * z + z * x
 
 
-def _morton(low: Floats32, high: Floats32) -> NDArray[np.uint64]:
-    """Position of each box's middle along a Z-order curve."""
-    middle = low.astype(np.float64) + high
-    start = middle.min(axis=1, keepdims=True)
-    extent = float((middle - start).max()) or 1.0
-    cell = ((middle - start) * ((2**_GRID_BITS - 1) / extent)).astype(np.uint64)
+def _morton(lower: Floats32, upper: Floats32) -> NDArray[np.uint64]:
+    """Return the position of each box's centre along a Z-order curve."""
+    centre = lower.astype(np.float64) + upper
+    start = centre.min(axis=1, keepdims=True)
+    extent = float((centre - start).max()) or 1.0
+    cell = ((centre - start) * ((2**_GRID_BITS - 1) / extent)).astype(np.uint64)
     return _spread(cell[0]) << np.uint64(2) | _spread(cell[1]) << np.uint64(1) | _spread(cell[2])
 
 
 def _spread(bits: NDArray[np.uint64]) -> NDArray[np.uint64]:
-    """Two zero bits after each of the 21 lowest bits."""
+    """Return numbers with two zero bits after each of the 21 lowest bits."""
     for shift, mask in (
         (32, 0x1F00000000FFFF),
         (16, 0x1F0000FF0000FF),

@@ -8,7 +8,7 @@ from operator import index
 import numpy as np
 from numpy.typing import ArrayLike
 
-from .arrays import AnyArray, Floats, Indices, Ints
+from .arrays import AnyArray, Bools, Floats, Indices, Ints
 from .rays import finite_rows, real_rows, refuse_rows
 
 _SLACK = 2e-9  # on products of a rotation's rows
@@ -16,18 +16,18 @@ _SLACK = 2e-9  # on products of a rotation's rows
 
 @dataclass(frozen=True, eq=False)
 class PoseMotion:
-    """Motion of a lidar while it fires the rays of a pose one after the other.
+    """Motion of a lidar during the rays of a pose, which are fired in sequence.
 
     Parameters
     ----------
     delays
         float64 (m,): delay of each of the m rays of a pose after the pose's time, seconds.
     velocities
-        float64 (k, 3): of each pose, metres a second along the mesh's axes.
+        float64 (k, 3): velocity at each pose, metres a second along the mesh's axes.
     rates
-        float64 (k, 3): of each pose, radians a second about the mesh's axes. A vector v becomes
-        ``v + delay * cross(rate, v)``: off by (delay * rate)^2 / 2, which is 2e-9 for 36 us at
-        100 degrees a second.
+        float64 (k, 3): angular rate at each pose, radians a second about the mesh's axes. A
+        vector v becomes ``v + delay * cross(rate, v)``: off by (delay * rate)^2 / 2, which is 2e-9
+        for 36 us at 100 degrees a second.
     """
 
     delays: Floats
@@ -44,12 +44,12 @@ class Poses:
     positions
         float64 (k, 3), metres.
     rotations
-        float64 (k, 3, 3) from the sensor's axes to the mesh's; None if those are the same. Each
+        float64 (k, 3, 3) from the sensor's axes to the mesh's; None if the axes are the same. Each
         matrix entry is contiguous over the poses, as are the components of positions and motion.
     rays
         Rays of a pose, at least 1: ray i belongs to pose ``i // rays``.
     motion
-        Within each pose; None if the lidar stands still for all of its rays.
+        Motion within each pose; None if the lidar stands still during the rays of a pose.
     """
 
     positions: Floats
@@ -60,36 +60,48 @@ class Poses:
     def __len__(self) -> int:
         return len(self.positions)
 
-    def of(self, ray: Ints, room: Floats) -> RayPoses:
-        """Look up the poses of rays (m,), into `room`, (18, m)."""
+    def look_up(self, ray: Ints, room: Floats) -> RayPoses:
+        """Look up the poses of rays (m,), into the memory `room`, float64 (18, m)."""
         pose = ray // self.rays
         delay = np.zeros(1)
         rates = None
         velocities = None
         if self.motion is not None:
             delay = self.motion.delays.take(ray - pose * self.rays)
-            velocities = self._each(self.motion.velocities, pose, room[12:15])
+            velocities = self._per_ray(self.motion.velocities, pose, room[12:15])
             if self.motion.rates.any():
-                rates = self._each(self.motion.rates, pose, room[15:])
+                rates = self._per_ray(self.motion.rates, pose, room[15:])
         rotations = self.rotations
         if rotations is not None:
-            rotations = self._each(rotations, pose, room[:9])
+            rotations = self._per_ray(rotations, pose, room[:9])
         return RayPoses(
-            self._each(self.positions, pose, room[9:12]), rotations, delay, velocities, rates
+            self._per_ray(self.positions, pose, room[9:12]), rotations, delay, velocities, rates
         )
 
-    def _each(self, table: Floats, pose: Indices, room: Floats) -> Floats:
+    def _per_ray(self, table: Floats, pose: Indices, room: Floats) -> Floats:
         columns = np.moveaxis(table, 0, -1).reshape(-1, len(self))
         if len(self) == 1:
             return columns
-        for column, out in zip(columns, room, strict=True):
-            column.take(pose, out=out, mode="clip")  # other modes use a buffer
+        for column, row in zip(columns, room, strict=True):
+            column.take(pose, out=row, mode="clip")  # other modes use a buffer
         return room
 
 
 @dataclass(frozen=True, eq=False)
 class RayPoses:
-    """Poses of m rays, see `Poses`: (numbers, m), or (numbers, 1) if all rays share one."""
+    """Poses of m rays: arrays (components, m), or (components, 1) if all rays share a pose.
+
+    Attributes
+    ----------
+    positions
+        float64 (3, m), metres.
+    rotations
+        float64 (9, m): matrices by rows, from the sensor's axes to the mesh's; None if equal.
+    delay
+        float64 (m,) or (1,): delay of each ray after the time of its pose, seconds.
+    velocities, rates
+        float64 (3, m): as in `PoseMotion`; None if the lidar does not move, or does not rotate.
+    """
 
     positions: Floats
     rotations: Floats | None
@@ -97,8 +109,8 @@ class RayPoses:
     velocities: Floats | None
     rates: Floats | None
 
-    def turned(self, vectors: Floats) -> Floats:
-        """Rotate vectors (3, m) to the mesh's axes, with a fixed order of rounding.
+    def rotated(self, vectors: Floats) -> Floats:
+        """Rotate vectors (3, m) from the sensor's axes to the mesh's, in a fixed order of rounding.
 
         ``matrices @ vectors`` would do, but its last bit depends on the machine's BLAS.
         """
@@ -106,112 +118,130 @@ class RayPoses:
             x, y, z = vectors
             vectors = np.empty_like(vectors)
             product = np.empty_like(x)
-            for out, (a, b, c) in zip(vectors, self.rotations.reshape(3, 3, -1), strict=True):
-                np.multiply(x, a, out=out)
-                out += np.multiply(y, b, out=product)
-                out += np.multiply(z, c, out=product)
+            for component, (a, b, c) in zip(vectors, self.rotations.reshape(3, 3, -1), strict=True):
+                np.multiply(x, a, out=component)
+                component += np.multiply(y, b, out=product)
+                component += np.multiply(z, c, out=product)
         if self.rates is None:
             return vectors
-        (x, y, z), (a, b, c) = vectors, self.rates
+        x, y, z = vectors
+        a, b, c = self.rates
         crosses = np.stack([b * z - c * y, c * x - a * z, a * y - b * x])
         crosses *= self.delay
         crosses += vectors
         return crosses
 
-    def moved(self, places: Floats) -> Floats:
-        """Move positions (3, m), or (3, 1), by the delays of their rays."""
+    def translated(self, positions: Floats) -> Floats:
+        """Move positions (3, m), or (3, 1), by the velocity during the delay of each ray."""
         if self.velocities is None:
-            return places
-        pairs = zip(places, self.velocities, strict=True)
-        return np.stack([place + self.delay * speed for place, speed in pairs])
+            return positions
+        pairs = zip(positions, self.velocities, strict=True)
+        return np.stack([position + self.delay * velocity for position, velocity in pairs])
 
 
 def check_poses(
     positions: ArrayLike | Poses,
     rotations: ArrayLike | None,
     rays_per_pose: int | None,
-    rays: int,
+    ray_count: int,
     motion: PoseMotion | None = None,
 ) -> Poses:
-    """Check the poses for so many rays; `RayCaster.scan` describes arguments and errors.
+    """Check the poses of a number of rays; ValueError for an invalid pose, or too few poses.
 
-    `Poses` instead of positions have been checked before.
+    `RayCaster.scan` describes the arguments. `Poses` in place of positions have been checked
+    before, and are returned as such.
     """
     if isinstance(positions, Poses):
         return positions
-    places = real_rows("positions", positions)
-    refuse_rows("Position", places, finite_rows, "finite coordinates")
-    turns = None if rotations is None else _check_rotations(rotations)
-    count = max(len(places), 1 if turns is None else len(turns))
-    for given in (places, turns):
-        if given is not None and len(given) not in (1, count):
+    position_rows = real_rows("positions", positions)
+    refuse_rows("Position", position_rows, finite_rows, "finite coordinates")
+    matrices = None if rotations is None else _check_rotations(rotations)
+    count = max(len(position_rows), 1 if matrices is None else len(matrices))
+    for table in (position_rows, matrices):
+        if table is not None and len(table) not in (1, count):
             raise ValueError(
-                f"There are {len(places)} positions and {0 if turns is None else len(turns)} "
-                "rotations: give one for all poses, or one for each."
+                f"There are {len(position_rows)} positions and "
+                f"{0 if matrices is None else len(matrices)} rotations: give one for all poses, "
+                "or one for each."
             )
     if rays_per_pose is None and count > 1:
         raise ValueError(
             f"There are {count:,} poses: rays_per_pose must say how many rays each of them has."
         )
-    each = max(rays, 1) if rays_per_pose is None else index(rays_per_pose)
-    if each < 1 or count * each < rays:
+    rays_of_pose = max(ray_count, 1) if rays_per_pose is None else index(rays_per_pose)
+    if rays_of_pose < 1 or count * rays_of_pose < ray_count:
         raise ValueError(
-            f"{count:,} poses of {each:,} rays are not enough for {rays:,} rays: "
+            f"{count:,} poses of {rays_of_pose:,} rays are not enough for {ray_count:,} rays: "
             "give more poses, more rays_per_pose, or a smaller window."
         )
     return Poses(
-        np.broadcast_to(by_number(places), (count, 3)),
-        None if turns is None else np.broadcast_to(turns, (count, 3, 3)),
-        each,
-        None if motion is None else _check_motion(motion, count, each),
+        np.broadcast_to(by_component(position_rows), (count, 3)),
+        None if matrices is None else np.broadcast_to(matrices, (count, 3, 3)),
+        rays_of_pose,
+        None if motion is None else _check_motion(motion, count, rays_of_pose),
     )
 
 
-def _check_motion(motion: PoseMotion, poses: int, rays: int) -> PoseMotion:
+def _check_motion(motion: PoseMotion, pose_count: int, ray_count: int) -> PoseMotion:
     arrays = []
-    for name, shape in (("delays", (rays,)), ("velocities", (poses, 3)), ("rates", (poses, 3))):
-        array = by_number(np.asarray(getattr(motion, name), dtype=np.float64))
+    for name, shape in (
+        ("delays", (ray_count,)),
+        ("velocities", (pose_count, 3)),
+        ("rates", (pose_count, 3)),
+    ):
+        array = by_component(np.asarray(getattr(motion, name), dtype=np.float64))
         if array.shape != shape or not np.isfinite(array).all():
             raise ValueError(
-                f"PoseMotion.{name} must be {shape} finite numbers for {poses:,} poses of {rays:,} "
-                f"rays; given: {array.shape}."
+                f"PoseMotion.{name} must be {shape} finite numbers for {pose_count:,} poses of "
+                f"{ray_count:,} rays; given: {array.shape}."
             )
         arrays.append(array)
     return PoseMotion(*arrays)
 
 
 def _check_rotations(rotations: ArrayLike) -> Floats:
-    """Rotation matrices (k, 3, 3) in float64; ValueError for one that deforms or mirrors."""
-    matrices = by_number(real_rows("rotations", rotations, (3, 3)))
-    # Written out for all matrices at once: products one by one take longer than casting their rays.
-    # NaN compares as false.
+    """Return rotations (k, 3, 3) as float64; ValueError for a matrix that deforms or mirrors."""
+    matrices = by_component(real_rows("rotations", rotations, (3, 3)))
+    # Written out for all matrices at once: a product of each matrix takes longer than casting
+    # the rays. NaN compares as false.
     rows = matrices.transpose(1, 2, 0)
-    good = np.ones(len(matrices), np.bool_)
     with np.errstate(over="ignore", invalid="ignore"):
-        for one in range(3):
-            for other in range(one, 3):
-                (a, b, c), (d, e, f) = rows[one], rows[other]
-                product = (a * d + b * e) + c * f
-                good &= np.abs(product - (one == other)) <= _SLACK
-        (a, b, c), (d, e, f), (g, h, i) = rows
-        determinants = (a * (e * i - f * h) - b * (d * i - f * g)) + c * (d * h - e * g)
-        mirrored = good & ~(determinants > 0)
-        good &= ~mirrored
-    bad = np.flatnonzero(~good)
-    if len(bad) and mirrored[bad[0]]:
+        orthonormal = _are_orthonormal(rows)
+        mirrored = orthonormal & ~(_determinants(rows) > 0)
+    invalid = np.flatnonzero(~orthonormal | mirrored)
+    if not len(invalid):
+        return matrices
+    first = invalid[0]
+    if mirrored[first]:
         raise ValueError(
-            f"Rotation {bad[0]} is {matrices[bad[0]].tolist()}, which mirrors: expected the "
-            f"determinant 1 ({len(bad)} of {len(matrices)} are no rotations)."
+            f"Rotation {first} is {matrices[first].tolist()}, which mirrors: expected the "
+            f"determinant 1 ({len(invalid)} of {len(matrices)} are no rotations)."
         )
-    if len(bad):
-        raise ValueError(
-            f"Rotation {bad[0]} is {matrices[bad[0]].tolist()}: expected orthonormal rows, which "
-            f"turn the sensor's axes to the mesh's ({len(bad)} of {len(matrices)} are like that)."
-        )
-    return matrices
+    raise ValueError(
+        f"Rotation {first} is {matrices[first].tolist()}: expected orthonormal rows, which "
+        f"turn the sensor's axes to the mesh's ({len(invalid)} of {len(matrices)} are like that)."
+    )
 
 
-def by_number(table: AnyArray) -> Floats:
-    """Table (k, ...) in float64, each number contiguous over the k entries."""
-    last = np.moveaxis(table, 0, -1)
-    return np.moveaxis(np.ascontiguousarray(last, dtype=np.float64), -1, 0)
+def _are_orthonormal(rows: Floats) -> Bools:
+    """Return a mask (k,) of the matrices, by rows (3, 3, k), whose rows are orthonormal."""
+    orthonormal = np.ones(rows.shape[2], np.bool_)
+    for first in range(3):
+        for second in range(first, 3):
+            a, b, c = rows[first]
+            d, e, f = rows[second]
+            product = (a * d + b * e) + c * f
+            orthonormal &= np.abs(product - (first == second)) <= _SLACK
+    return orthonormal
+
+
+def _determinants(rows: Floats) -> Floats:
+    """Return the determinants (k,) of matrices by rows (3, 3, k)."""
+    (a, b, c), (d, e, f), (g, h, i) = rows
+    return np.asarray((a * (e * i - f * h) - b * (d * i - f * g)) + c * (d * h - e * g))
+
+
+def by_component(table: AnyArray) -> Floats:
+    """Return a table (k, ...) as float64, each component contiguous over the k entries."""
+    components_first = np.moveaxis(table, 0, -1)
+    return np.moveaxis(np.ascontiguousarray(components_first, dtype=np.float64), -1, 0)

@@ -25,11 +25,11 @@ class Rays:
     Attributes
     ----------
     origins
-        (n, 3), or (1, 3) when all rays share one, metres.
+        (n, 3), or (1, 3) if all rays share an origin, metres.
     directions
         (n, 3), of any length but zero.
     t_min, t_max
-        Hits nearer or farther than this are not reported, metres; both ends count.
+        Closest and farthest distance of a reported hit, metres; both limits count.
     """
 
     origins: Floats
@@ -41,9 +41,9 @@ class Rays:
         return len(self.directions)
 
     def part(self, start: int, stop: int) -> Rays:
-        """Rays `start` to `stop` for engines: in float64, directions as unit vectors.
+        """Convert rays `start` to `stop` for an engine: float64, directions as unit vectors.
 
-        They are converted part by part, so that a cast needs memory for one part only.
+        Rays are converted part by part, so that a cast needs memory for a single part only.
         """
         origins = self.origins if len(self.origins) == 1 else self.origins[start:stop]
         directions = _float64(self.directions[start:stop])
@@ -51,7 +51,7 @@ class Rays:
 
 
 def check_rays(origins: ArrayLike, directions: ArrayLike, t_min: float, t_max: float) -> Rays:
-    """Check the rays given; raises ValueError for invalid ones.
+    """Check the rays of a caller; ValueError for an invalid ray.
 
     Parameters
     ----------
@@ -66,20 +66,20 @@ def check_rays(origins: ArrayLike, directions: ArrayLike, t_min: float, t_max: f
     return Rays(check_origins(origins, len(table)), table, *check_interval(t_min, t_max))
 
 
-def check_origins(origins: ArrayLike, rays: int) -> AnyArray:
-    """Origins (n, 3) as given, or one (1, 3); ValueError for other shapes."""
-    start = real_rows("origins", origins)
-    if len(start) not in (1, rays):
+def check_origins(origins: ArrayLike, ray_count: int) -> AnyArray:
+    """Return checked origins (n, 3), or (1, 3) if shared; ValueError for another shape."""
+    rows = real_rows("origins", origins)
+    if len(rows) not in (1, ray_count):
         raise ValueError(
-            f"There are {len(start)} origins and {rays} directions: "
+            f"There are {len(rows)} origins and {ray_count} directions: "
             "give one origin for all rays, or one for each."
         )
-    refuse_rows("Origin", start, finite_rows, "finite coordinates")
-    return start
+    refuse_rows("Origin", rows, finite_rows, "finite coordinates")
+    return rows
 
 
 def check_interval(t_min: float, t_max: float) -> tuple[float, float]:
-    """Return both as floats; raises ValueError unless ``0 <= t_min <= t_max``."""
+    """Return the two limits as floats; ValueError unless ``0 <= t_min <= t_max``."""
     t_min = float(t_min)
     t_max = float(t_max)
     if not (0 <= t_min < np.inf and t_min <= t_max):
@@ -91,9 +91,9 @@ def check_interval(t_min: float, t_max: float) -> tuple[float, float]:
 
 
 def unit_directions(directions: ArrayLike) -> Floats:
-    """Directions as new float64 unit vectors (n, 3); raises ValueError for zero, NaN and inf.
+    """Return directions as new float64 unit vectors (n, 3); ValueError for zero, NaN and inf.
 
-    Their memory is in columns, so that the transposed array is contiguous.
+    The memory is in columns, so that the transposed array is contiguous.
     Each row's result depends only on that row, so that batches may be cut anywhere.
     """
     table = real_rows("directions", directions)
@@ -102,72 +102,71 @@ def unit_directions(directions: ArrayLike) -> Floats:
     if _are_units(columns):
         return columns.T
     _refuse_directions(table)
-    out = np.empty((3, len(table))).T
+    result = np.empty((3, len(table))).T
     for start in range(0, len(table), _BLOCK):
-        out[start : start + _BLOCK] = _normalised(_float64(table[start : start + _BLOCK]))
-    return out
+        result[start : start + _BLOCK] = _normalised(_float64(table[start : start + _BLOCK]))
+    return result
 
 
 def _normalised(table: Floats) -> Floats:
-    """Normalise checked directions; returns the same array if they are unit vectors already."""
+    """Normalise checked directions (n, 3); return the same array if all are unit vectors."""
     x, y, z = table.T
     # No einsum or norm: those may fuse multiply and add, so the last bit would depend on the
     # machine.
     with np.errstate(over="ignore", under="ignore"):
         squared = (x * x + y * y) + z * z
-    off = np.abs(squared - 1) > UNIT_SLACK
-    if not off.any():
+    not_unit = np.abs(squared - 1) > UNIT_SLACK
+    if not not_unit.any():
         return table
-    rows = table[off]
+    rows = table[not_unit]
     # Squares of 1e200 or 1e-200 overflow or underflow.
     rows = rows / np.abs(rows).max(axis=1, keepdims=True)
     x, y, z = rows.T
-    out = table.copy()
-    out[off] = rows / np.sqrt((x * x + y * y) + z * z)[:, None]
-    return out
+    result = table.copy()
+    result[not_unit] = rows / np.sqrt((x * x + y * y) + z * z)[:, None]
+    return result
 
 
 def real_rows(name: str, values: ArrayLike, shape: tuple[int, ...] = (3,)) -> AnyArray:
-    """Real numbers (n, *shape), copied only if they are no array; a single row may omit n."""
-    given = np.asarray(values)
-    if given.shape == shape:
-        given = given[None]
-    if given.dtype.kind not in "fiu" or not given.ndim or given.shape[1:] != shape:
+    """Return real numbers (n, *shape), copied only if no array; a single row may omit n."""
+    rows = np.asarray(values)
+    if rows.shape == shape:
+        rows = rows[None]
+    if rows.dtype.kind not in "fiu" or not rows.ndim or rows.shape[1:] != shape:
         expected = ", ".join(map(str, shape))
         raise ValueError(
-            f"{name} must be real numbers of shape (n, {expected}), "
-            f"not {given.dtype} {given.shape}."
+            f"{name} must be real numbers of shape (n, {expected}), not {rows.dtype} {rows.shape}."
         )
-    return given
+    return rows
 
 
 def finite_rows(block: Floats) -> Bools:
-    """Whether each row (n, 3) has only finite numbers: (n,)."""
+    """Return a mask (n,) of the rows (n, 3) that have only finite numbers."""
     x, y, z = np.isfinite(block).T
     return x & y & z
 
 
 def refuse_rows(
-    what: str,
+    subject: str,
     table: AnyArray,
-    good: Callable[[Floats], Bools],
+    is_valid: Callable[[Floats], Bools],
     expected: str,
 ) -> None:
-    """Raise ValueError for the first row that is not good."""
-    bad = [np.zeros(0, np.intp)]
+    """Raise ValueError for the first row that is not valid; the message counts the invalid rows."""
+    invalid = [np.zeros(0, np.intp)]
     for start in range(0, len(table), _BLOCK):
         block = _float64(table[start : start + _BLOCK])
-        bad.append(np.flatnonzero(~good(block)) + start)
-    rows = np.concatenate(bad)
+        invalid.append(np.flatnonzero(~is_valid(block)) + start)
+    rows = np.concatenate(invalid)
     if len(rows):
         raise ValueError(
-            f"{what} {rows[0]} is {_float64(table[rows[0]]).tolist()}: expected {expected} "
+            f"{subject} {rows[0]} is {_float64(table[rows[0]]).tolist()}: expected {expected} "
             f"({len(rows)} of {len(table)} rows are like that)."
         )
 
 
 def _are_units(columns: Floats) -> bool:
-    """Whether all vectors (3, n) are finite unit vectors: then there is no more to be checked."""
+    """Return whether all vectors (3, n) are finite unit vectors, which need no further check."""
     x, y, z = columns
     with np.errstate(over="ignore", under="ignore", invalid="ignore"):
         squared = x * x

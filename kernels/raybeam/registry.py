@@ -1,4 +1,4 @@
-"""The list of engines, and choosing one."""
+"""The list of engines, and the choice of an engine."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ _BACKENDS: tuple[type[Backend], ...] = (CudaBackend, EmbreeBackend, NumpyBackend
 
 
 def available_backends() -> dict[str, str]:
-    """Backends by name, fastest first: "" for a usable one, else why it is not usable.
+    """Return all backends by name, fastest first: "" if usable, else the reason and a remedy.
 
     Examples
     --------
@@ -23,27 +23,27 @@ def available_backends() -> dict[str, str]:
 
 
 def backend_build(name: str) -> str:
-    """Describe what the bits of a backend depend on, beside NumPy's version.
+    """Return the versions that the bits of a backend's results depend on, besides NumPy's.
 
-    Two processes in which these and NumPy's are the same give the same hits, to the bit.
+    Two processes with equal versions of these and of NumPy give the same hits, to the bit.
 
     Raises
     ------
     ValueError, BackendUnavailable
-        As of `RayCaster`, if there is no such backend here.
+        If there is no backend of that name, or the backend cannot be used on this machine.
     """
     return choose(name).build()
 
 
 def choose(name: str) -> type[Backend]:
-    """Return the backend of that name, or for "auto" the first that can be used.
+    """Return the backend with a name; for "auto", the first backend that can be used.
 
     Raises
     ------
     ValueError
         If there is no backend of that name.
     BackendUnavailable
-        If it cannot be used on this machine.
+        If the backend cannot be used on this machine.
     """
     if name == "auto":
         return next(backend for backend in _BACKENDS if not backend.missing())

@@ -10,13 +10,13 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from .arrays import Floats, Indices, Integers, Ints, Ints32
-from .hits import Part, ScanReturns, joined
+from .hits import Part, ScanReturns, join_hits
 from .pattern import Pattern
 from .pattern_rays import checked_rays
 from .poses import PoseMotion, Poses, check_poses
 from .rays import Rays, check_interval
 
-_MOST_RAYS = 1 << 32  # of a scan, so that `ScanReturns` can number them
+_MAX_RAYS = 1 << 32  # of a scan, so that `ScanReturns` can number them
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,22 +28,22 @@ class Scan:
     pattern
         Rays in the sensor's axes.
     first
-        The pattern's row of ray 0; after its last row the pattern repeats.
+        Row of ray 0 in the pattern, which repeats after its last row.
     count
         Number of rays.
     poses
-        Of all rays.
+        Poses of all rays.
     t_min, t_max
-        Hits nearer or farther than this are not reported, metres; both ends count.
+        Closest and farthest distance of a reported hit, metres; both limits count.
     keep_every
         Keep the hits of each group whose number is a multiple of this.
     groups
-        int64 (g,): numbers of the rays at which groups begin; ascending, the first is 0.
+        int64 (g,): number of the first ray of each group; ascending, from 0.
     tally
         Whether to count hits by triangle.
     room
-        float64 (6, count): where origins and directions of all rays are written; (3, count) for
-        directions alone, None for nowhere.
+        float64 (6, count): output for origins and directions of all rays; (3, count) for
+        directions alone, None for no output.
     """
 
     pattern: Pattern
@@ -61,12 +61,12 @@ class Scan:
         return self.count
 
     def chunks(self, size: int) -> Iterator[tuple[int, int]]:
-        """Half-open ranges of rays, at most `size` each, in ray order."""
+        """Yield half-open ranges of at most `size` rays, in ray order."""
         for start in range(0, self.count, size):
             yield start, min(start + size, self.count)
 
     def rays(self, start: int, stop: int) -> Rays:
-        """Rays `start` to `stop`, with the bits of `pattern_rays`."""
+        """Compute rays `start` to `stop`, with the bits of `pattern_rays`; fill `room` if any."""
         ray = np.arange(start, stop, dtype=np.int64)
         origins, directions = checked_rays(self.pattern, self.first, ray, self.poses)
         if self.room is not None:
@@ -91,7 +91,7 @@ def check_scan(
     motion: PoseMotion | None = None,
     room: Floats | None = None,
 ) -> Scan:
-    """Check the arguments of `RayCaster.scan`, which describes them and the errors."""
+    """Check the arguments of a scan; `RayCaster.scan` describes arguments and errors."""
     start, stop = (0, len(pattern)) if window is None else map(index, window)
     if not 0 <= start <= stop or (stop > start and not len(pattern)):
         raise ValueError(
@@ -99,9 +99,9 @@ def check_scan(
             "expected 0 <= start <= stop."
         )
     count = stop - start
-    if count > _MOST_RAYS:
+    if count > _MAX_RAYS:
         raise ValueError(
-            f"{count:,} rays are more than the {_MOST_RAYS:,} that one call can number: "
+            f"{count:,} rays are more than the {_MAX_RAYS:,} that one call can number: "
             "scan smaller windows."
         )
     if index(keep_every) < 1:
@@ -120,34 +120,53 @@ def check_scan(
 
 
 class Groups:
-    """Groups of a scan's rays: their hits are counted, and every n-th of each group is kept.
+    """Counts of the hits in each group of rays of a scan, of which every n-th hit is kept.
 
     Parameters
     ----------
-    begins, every
-        `groups` and `keep_every` of `Scan`.
+    starts
+        int64 (g,): number of the first ray of each group; ascending, from 0.
+    keep_every
+        n: the first and then every n-th hit of a group is kept.
     """
 
-    def __init__(self, begins: Ints, every: int) -> None:
-        self._begins = begins
-        self.every = every
-        self.hits = np.zeros(len(begins), np.int64)  # of each group, so far
+    def __init__(self, starts: Ints, keep_every: int) -> None:
+        self._starts = starts
+        self.keep_every = keep_every
+        self.hits = np.zeros(len(starts), np.int64)  # of each group, so far
 
     def spans(self, start: int, stop: int) -> tuple[slice, Ints]:
-        """Find the groups of rays `start` to `stop`, and the first ray of all but the first.
+        """Find the groups that rays `start` to `stop` belong to.
 
-        The rays are counted from `start`.
+        Returns
+        -------
+        groups
+            Range of the groups.
+        later_starts
+            int64: first ray of each of these groups but the first, counted from `start`.
         """
-        first = int(np.searchsorted(self._begins, start, side="right")) - 1
-        last = int(np.searchsorted(self._begins, stop, side="left"))
-        return slice(first, last), self._begins[first + 1 : last] - start
+        first = int(np.searchsorted(self._starts, start, side="right")) - 1
+        last = int(np.searchsorted(self._starts, stop, side="left"))
+        return slice(first, last), self._starts[first + 1 : last] - start
 
     def count(self, groups: slice, counts: Ints) -> tuple[Ints, Ints]:
-        """Count hits of groups in a chunk; of each: the first that is kept, and how many are."""
-        before = self.hits[groups].copy()  # of the first group, in the chunks before this one
+        """Count the hits of groups in a chunk, and find the hits to keep.
+
+        Parameters
+        ----------
+        groups, counts
+            Range of the groups (g), and their numbers of hits in the chunk, int64 (g,).
+
+        Returns
+        -------
+        first_kept, kept_counts
+            int64 (g,): index among each group's hits in the chunk of the first hit to keep, and
+            the number of hits to keep.
+        """
+        earlier_hits = self.hits[groups].copy()  # in the chunks before; not 0 for the first group
         self.hits[groups] += counts
-        leave = -before % self.every
-        return leave, np.maximum(-((leave - counts) // self.every), 0)
+        first_kept = -earlier_hits % self.keep_every
+        return first_kept, np.maximum(-((first_kept - counts) // self.keep_every), 0)
 
 
 class Collector(Groups):
@@ -156,7 +175,7 @@ class Collector(Groups):
     Parameters
     ----------
     scan
-        Says what to keep and what to count.
+        The scan, with the selection of hits to keep and the tally to count.
     face_count
         Rows of the tally.
 
@@ -172,10 +191,10 @@ class Collector(Groups):
     def __init__(self, scan: Scan, face_count: int) -> None:
         super().__init__(scan.groups, scan.keep_every)
         self._tally = np.zeros(face_count, np.int64) if scan.tally else None
-        self._kept: list[Part] = []
+        self._parts: list[Part] = []
 
     def keep(self, ray: Integers, start: int, stop: int) -> slice | Indices:
-        """Count the hits of rays `start` to `stop` and select those to keep.
+        """Count the hits of rays `start` to `stop`, and select the hits to keep.
 
         Parameters
         ----------
@@ -186,21 +205,21 @@ class Collector(Groups):
         -------
         The selection of kept hits: rows of `ray`, or all.
         """
-        groups, begins = self.spans(start, stop)
-        cuts = np.searchsorted(ray, begins.astype(ray.dtype))
+        groups, later_starts = self.spans(start, stop)
+        cuts = np.searchsorted(ray, later_starts.astype(ray.dtype))
         cuts = np.concatenate([[0], cuts, [len(ray)]])
-        leave, number = self.count(groups, np.diff(cuts))
-        if self.every == 1:
+        first_kept, kept_counts = self.count(groups, np.diff(cuts))
+        if self.keep_every == 1:
             return slice(None)
-        if len(leave) == 1:
-            return np.arange(leave[0], len(ray), self.every)
-        offset = cuts[:-1] + leave - self.every * (np.cumsum(number) - number)
-        rows: Indices = np.repeat(offset, number)
-        rows += self.every * np.arange(len(rows))
+        if len(first_kept) == 1:
+            return np.arange(first_kept[0], len(ray), self.keep_every)
+        offset = cuts[:-1] + first_kept - self.keep_every * (np.cumsum(kept_counts) - kept_counts)
+        rows: Indices = np.repeat(offset, kept_counts)
+        rows += self.keep_every * np.arange(len(rows))
         return rows
 
     def tally(self, rows: Integers) -> None:
-        """Count all hits of a chunk by their rows in the tally, if requested."""
+        """Count the hits of a chunk by their rows (m,) in the tally, if there is a tally."""
         if self._tally is not None:
             np.add.at(self._tally, rows.astype(np.intp), 1)
 
@@ -212,12 +231,12 @@ class Collector(Groups):
         triangle: Ints32,
         instance: Ints32,
     ) -> None:
-        """Add kept hits of a chunk, whose rays are counted from `start`."""
-        number = ray.astype(np.uint32, copy=False)
-        number = number + np.uint32(start) if start else number
-        self._kept.append((number, distance, triangle, instance))
+        """Add the kept hits of a chunk; numbers of rays `ray` are counted from `start`."""
+        ray_number = ray.astype(np.uint32, copy=False)
+        ray_number = ray_number + np.uint32(start) if start else ray_number
+        self._parts.append((ray_number, distance, triangle, instance))
 
     def result(self) -> ScanReturns:
         """Return the result of all chunks."""
-        ray, distance, triangle, instance = joined(self._kept)
+        ray, distance, triangle, instance = join_hits(self._parts)
         return ScanReturns(ray, distance, triangle, self.hits, self._tally, instance)

@@ -1,4 +1,4 @@
-"""Sub-rays of a beam, made from its direction when they are cast."""
+"""Sub-rays of a beam, computed from the direction of the beam during a cast."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ class SubRays:
     angles
         float64 (k, 2): tangents of the angles off the beam's direction, across and up.
     starts
-        float64 (k, 2): where sub-rays start, across and up, metres off the beam's start; None if
-        all start there.
+        float64 (k, 2): origin of each sub-ray, across and up from the beam's origin, metres; None
+        if sub-rays start at the beam's origin.
     axis
         float64 (3,): the axis about which "across" points counter-clockwise, and towards which "up"
         points, in the sensor's axes; None if any two axes across the beam will do.
@@ -35,7 +35,10 @@ class SubRays:
     def shares(
         self, subray: Indices | slice = slice(None), offsets: Floats | None = None
     ) -> tuple[Floats, Floats, Floats]:
-        """Shares of a unit vector ahead, across and up: (m,) each; `offsets` (2, m) add angles."""
+        """Return the components of unit vectors ahead, across and up: (m,) each.
+
+        `offsets` (2, m) are angles across and up, radians, added to the angles of each sub-ray.
+        """
         across, up = self.angles[subray].T
         if offsets is not None:
             across = across + offsets[0]
@@ -43,57 +46,77 @@ class SubRays:
         straight = 1 / np.sqrt((1 + across * across) + up * up)
         return straight, across * straight, up * straight
 
-    def table(self, offsets: Floats | None) -> Floats:
-        """Shares, or the angles if there are offsets, and starts: (5, k), as loops read them."""
-        out = np.zeros((5, len(self)))
-        out[:3] = self.shares()
+    def loop_table(self, offsets: Floats | None) -> Floats:
+        """Return the table (5, k) that compiled loops read: shares, or angles, and starts.
+
+        Rows are shares ahead, across and up, and starts across and up. With `offsets` the shares
+        differ by beam: rows 1 and 2 are then angles.
+        """
+        rows = np.zeros((5, len(self)))
+        rows[:3] = self.shares()
         if offsets is not None:  # shares differ by beam
-            out[1:3] = self.angles.T
+            rows[1:3] = self.angles.T
         if self.starts is not None:
-            out[3:] = self.starts.T
-        return out
+            rows[3:] = self.starts.T
+        return rows
 
 
 def spread(
     sub_rays: SubRays, ahead: Floats, subray: Indices, offsets: Floats | None
 ) -> tuple[Floats, Floats | None]:
-    """Directions (3, m) of sub-rays of beams (3, m), and where they start off the beams' starts.
+    """Return directions (3, m) of sub-rays, and their origins relative to the beams' origins.
 
-    `offsets` (2, m) are added to the angles of each.
+    Parameters
+    ----------
+    sub_rays
+        Sub-rays of every beam.
+    ahead
+        (3, m): direction of the beam of each sub-ray.
+    subray
+        (m,): number of each sub-ray within its beam.
+    offsets
+        (2, m): angles across and up, radians, added to the angles of each sub-ray; or None.
+
+    Returns
+    -------
+    directions
+        (3, m), unit vectors.
+    starts
+        (3, m), metres; None if sub-rays start at the beam's origin.
     """
-    straight, one, other = sub_rays.shares(subray, offsets)
+    straight, across, up = sub_rays.shares(subray, offsets)
     axis = sub_rays.axis
     first, second = any_axes(ahead) if axis is None else axes_about(ahead, axis)
-    out = (straight * ahead + one * first) + other * second
+    directions = (straight * ahead + across * first) + up * second
     if sub_rays.starts is None:
-        return out, None
+        return directions, None
     aside, above = sub_rays.starts[subray].T
-    return out, aside * first + above * second
+    return directions, aside * first + above * second
 
 
 def any_axes(directions: Floats) -> tuple[Floats, Floats]:
-    """Two axes across unit directions (3, n): those of Duff et al. 2017, which always exist."""
+    """Return two axes across unit directions (3, n), by Duff et al. 2017: defined everywhere."""
     x, y, z = directions
     sign = np.where(z < 0, -1.0, 1.0)
     a = -1.0 / (sign + z)
     b = x * y * a
-    one = np.stack([1 + sign * x * x * a, sign * b, -sign * x])
-    return one, np.stack([b, sign + y * y * a, -y])
+    first = np.stack([1 + sign * x * x * a, sign * b, -sign * x])
+    return first, np.stack([b, sign + y * y * a, -y])
 
 
 def axes_about(directions: Floats, axis: Floats) -> tuple[Floats, Floats]:
-    """Axes across unit directions (3, n): counter-clockwise about an axis (3,), and towards it.
+    """Return axes across unit directions (3, n): counter-clockwise about an axis, and upward.
 
-    Straight along the axis, they are those of `any_axes`.
+    For directions parallel to the axis (3,), the two are the axes of `any_axes`.
     """
     x, y, z = directions
     a, b, c = axis
     across = np.stack([b * z - c * y, c * x - a * z, a * y - b * x])
     p, q, r = across
     length = np.sqrt((p * p + q * q) + r * r)
-    p, q, r = one = across / np.maximum(length, 1e-300)
-    other = np.stack([y * r - z * q, z * p - x * r, x * q - y * p])
-    along = length < 1e-6
-    if along.any():
-        one[:, along], other[:, along] = any_axes(directions[:, along])
-    return one, other
+    p, q, r = unit_across = across / np.maximum(length, 1e-300)
+    upward = np.stack([y * r - z * q, z * p - x * r, x * q - y * p])
+    parallel = length < 1e-6
+    if parallel.any():
+        unit_across[:, parallel], upward[:, parallel] = any_axes(directions[:, parallel])
+    return unit_across, upward

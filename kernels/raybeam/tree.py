@@ -1,4 +1,4 @@
-"""The tree for traversal: a binary hierarchy made wide and flat.
+"""The tree for traversal: a wide, flat form of a binary hierarchy.
 
 Boxes are rounded and padded outwards, so that a test of a ray against them in float32 never
 loses a triangle that the ray meets in exact arithmetic:
@@ -25,7 +25,7 @@ LEAF_BITS = 3
 
 @dataclass(frozen=True)
 class WideTree:
-    """Nodes with up to `width` children each; node 0 is the root.
+    """Nodes with up to `width` children; node 0 is the root.
 
     Attributes
     ----------
@@ -34,13 +34,13 @@ class WideTree:
         inverted box, which no ray hits.
     child
         int32 (m, width): number of a node, or ``~(first << LEAF_BITS | count - 1)`` for a leaf
-        that holds the triangles ``order[first : first + count]``; 0 in an empty place.
+        that holds the triangles ``order[first : first + count]``; 0 in an empty slot.
     order
         int32 (k,): triangles in the order of the leaves.
     """
 
-    low: Floats32
-    high: Floats32
+    lower: Floats32
+    upper: Floats32
     child: Ints32
     order: Ints32
 
@@ -51,15 +51,15 @@ def build_tree(corners: Floats, width: int, leaf_size: int) -> WideTree:
     Parameters
     ----------
     corners
-        float64 (k, c, 3): local corners; of a box, the least and the greatest.
+        float64 (k, c, 3): local corners; of a box, the lower and the upper corner.
     width
-        Most children of a node.
+        Maximum children of a node.
     leaf_size
-        Most triangles of a leaf, at most ``1 << LEAF_BITS``.
+        Maximum triangles of a leaf, up to ``1 << LEAF_BITS``.
     """
-    low = np.ascontiguousarray((corners.min(axis=1) - PAD).T, dtype=np.float32)
-    high = np.ascontiguousarray((corners.max(axis=1) + PAD).T, dtype=np.float32)
-    binary = ploc.build(low, high)
+    lower = np.ascontiguousarray((corners.min(axis=1) - PAD).T, dtype=np.float32)
+    upper = np.ascontiguousarray((corners.max(axis=1) + PAD).T, dtype=np.float32)
+    binary = ploc.build(lower, upper)
     count, leaf = _leaves(binary, leaf_size)
     first = _positions(binary, count)
     n = len(corners)
@@ -70,18 +70,18 @@ def build_tree(corners: Floats, width: int, leaf_size: int) -> WideTree:
 
 
 def build_top(boxes: Floats, width: int) -> WideTree:
-    """Build a tree over instances' boxes (n, 2, 3), as `build_tree`, for one box a leaf.
+    """Build a tree over instances' boxes (n, 2, 3), with a single box in each leaf.
 
-    Its leaves' places are the instances' own numbers.
+    Leaves have the number of an instance in place of a position in `order`.
     """
     tree = build_tree(boxes, width, 1)
     number = tree.order[np.maximum(~tree.child, 0) >> LEAF_BITS]
     child = np.where(tree.child < 0, ~(number << LEAF_BITS), tree.child)
-    return WideTree(tree.low, tree.high, child, np.arange(len(boxes), dtype=np.int32))
+    return WideTree(tree.lower, tree.upper, child, np.arange(len(boxes), dtype=np.int32))
 
 
 def join(trees: list[WideTree]) -> tuple[WideTree, Ints]:
-    """Put trees one after the other; returns them as one, and the root of each.
+    """Join trees in sequence; return the joint tree, and the root of each.
 
     Triangles are numbered over all trees, in order.
     """
@@ -97,15 +97,15 @@ def join(trees: list[WideTree]) -> tuple[WideTree, Ints]:
         orders.append(tree.order + first)
         first += len(tree.order)
     return WideTree(
-        np.concatenate([tree.low for tree in trees]),
-        np.concatenate([tree.high for tree in trees]),
+        np.concatenate([tree.lower for tree in trees]),
+        np.concatenate([tree.upper for tree in trees]),
         np.concatenate(children).astype(np.int32),
         np.concatenate(orders).astype(np.int32),
     ), roots[:-1]
 
 
 def _leaves(tree: ploc.BinaryTree, leaf_size: int) -> tuple[Ints32, Bools]:
-    """Triangles under each node, and whether it is cheaper as one leaf.
+    """Return the number of triangles under each node, and whether a leaf is cheaper.
 
     By the surface area heuristic, with equal costs of triangle and box tests.
     """
@@ -114,25 +114,25 @@ def _leaves(tree: ploc.BinaryTree, leaf_size: int) -> tuple[Ints32, Bools]:
     cost = area.copy()
     leaf = np.ones(len(area), np.bool_)
     for start, stop in tree.rounds:
-        left = tree.left[start:stop]
-        right = tree.right[start:stop]
-        count[start:stop] = count[left] + count[right]
-        whole = area[start:stop] * count[start:stop]
-        split = area[start:stop] + cost[left] + cost[right]
-        keep = (count[start:stop] <= leaf_size) & (whole <= split)
-        leaf[start:stop] = keep
-        cost[start:stop] = np.where(keep, whole, split)
+        first_child = tree.first_child[start:stop]
+        second_child = tree.second_child[start:stop]
+        count[start:stop] = count[first_child] + count[second_child]
+        leaf_cost = area[start:stop] * count[start:stop]
+        split_cost = area[start:stop] + cost[first_child] + cost[second_child]
+        is_cheaper = (count[start:stop] <= leaf_size) & (leaf_cost <= split_cost)
+        leaf[start:stop] = is_cheaper
+        cost[start:stop] = np.where(is_cheaper, leaf_cost, split_cost)
     return count, leaf
 
 
 def _positions(tree: ploc.BinaryTree, count: Ints32) -> Ints32:
-    """Where each node's triangles begin when they are listed from left to right."""
+    """Return the position of each node's first triangle, with all triangles in tree order."""
     first = np.zeros(len(count), np.int32)
     for start, stop in reversed(tree.rounds):
-        left = tree.left[start:stop]
-        right = tree.right[start:stop]
-        first[left] = first[start:stop]
-        first[right] = first[start:stop] + count[left]
+        first_child = tree.first_child[start:stop]
+        second_child = tree.second_child[start:stop]
+        first[first_child] = first[start:stop]
+        first[second_child] = first[start:stop] + count[first_child]
     return first
 
 
@@ -143,43 +143,43 @@ def _widen(
     order: Ints32,
     width: int,
 ) -> WideTree:
-    """Nodes of up to `width` children: level by level, the largest child is opened first."""
+    """Return nodes of up to `width` children: level by level, the largest child is opened first."""
     area = np.where(leaf, -1, tree.area)
-    lows = []
-    highs = []
+    lowers = []
+    uppers = []
     children = []
     roots = np.array([len(leaf) - 1])
     total = 1
     while len(roots):
         slots = _open(tree, area, roots, width)
         used = slots >= 0
-        lows.append(np.where(used, tree.low[:, slots], np.inf).astype(np.float32))
-        highs.append(np.where(used, tree.high[:, slots], -np.inf).astype(np.float32))
+        lowers.append(np.where(used, tree.lower[:, slots], np.inf).astype(np.float32))
+        uppers.append(np.where(used, tree.upper[:, slots], -np.inf).astype(np.float32))
         inner = used & ~leaf[slots]
         child = np.where(used, code[slots], 0).astype(np.int32)
         roots = slots[inner]
         child[inner] = np.arange(total, total + len(roots), dtype=np.int32)
         total += len(roots)
         children.append(child)
-    low = np.concatenate(lows, axis=1).transpose(1, 0, 2)
-    high = np.concatenate(highs, axis=1).transpose(1, 0, 2)
+    lower = np.concatenate(lowers, axis=1).transpose(1, 0, 2)
+    upper = np.concatenate(uppers, axis=1).transpose(1, 0, 2)
     return WideTree(
-        np.ascontiguousarray(low), np.ascontiguousarray(high), np.concatenate(children), order
+        np.ascontiguousarray(lower), np.ascontiguousarray(upper), np.concatenate(children), order
     )
 
 
 def _open(tree: ploc.BinaryTree, area: Floats32, roots: Indices, width: int) -> Indices:
-    """Binary nodes below each root, at most `width`; -1 fills up: (len(roots), width)."""
-    slots = np.full((len(roots), width), -1)
-    slots[:, 0] = roots
+    """Return up to `width` binary nodes below each root, filled up by -1: (len(roots), width)."""
+    children = np.full((len(roots), width), -1)
+    children[:, 0] = roots
     row = np.arange(len(roots))
     for free in range(1, width):
-        size = np.where(slots >= 0, area[slots], -1)
+        size = np.where(children >= 0, area[children], -1)
         widest = np.argmax(size, axis=1)
-        can = size[row, widest] > 0
-        rows = row[can]
-        places = widest[can]
-        opened = slots[rows, places]
-        slots[rows, places] = tree.left[opened]
-        slots[rows, free] = tree.right[opened]
-    return slots
+        can_open = size[row, widest] > 0
+        rows = row[can_open]
+        opened_slots = widest[can_open]
+        opened = children[rows, opened_slots]
+        children[rows, opened_slots] = tree.first_child[opened]
+        children[rows, free] = tree.second_child[opened]
+    return children

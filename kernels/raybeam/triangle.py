@@ -15,6 +15,7 @@ intersect.cu does the same operations in the same order, so its distances have t
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -23,16 +24,16 @@ from .arrays import Bools, Floats, Indices
 
 @dataclass(frozen=True)
 class ShearedRays:
-    """Rays prepared for the test; every array has one entry a ray.
+    """Rays prepared for the test; every array has an entry for each ray.
 
     Attributes
     ----------
     kx, ky, kz
-        Axes in cyclic order; kz is the one along which the ray advances most.
+        Axes in cyclic order; the ray advances most along kz.
     ox, oy, oz
         Local origin along those axes.
     sx, sy, sz
-        The shear: direction along kx, ky over that along kz, and 1 over that along kz.
+        The shear: direction along kx, ky over direction along kz, and 1 over direction along kz.
     """
 
     kx: Indices
@@ -46,13 +47,34 @@ class ShearedRays:
     sz: Floats
 
 
+class PlaneHits(NamedTuple):
+    """Where the lines of rays (m,) meet the planes of triangles.
+
+    Attributes
+    ----------
+    a, b, c
+        float64 (m,): weights of the three corners times `det`. The ray passes inside if none is
+        negative or none is positive, see `inside`.
+    det
+        float64 (m,): ``(a + b) + c``; zero if the ray runs in the triangle's plane.
+    t
+        float64 (m,): distance in local units; meaningless where `det` is zero.
+    """
+
+    a: Floats
+    b: Floats
+    c: Floats
+    det: Floats
+    t: Floats
+
+
 def shear(origins: Floats, directions: Floats) -> ShearedRays:
     """Prepare rays with local origins (n, 3) and unit directions (n, 3)."""
     kz = np.argmax(np.abs(directions), axis=1)
     kx = (kz + 1) % 3
     ky = (kz + 2) % 3
     row = np.arange(len(directions))
-    along = directions[row, kz]
+    component = directions[row, kz]
     return ShearedRays(
         kx,
         ky,
@@ -60,16 +82,14 @@ def shear(origins: Floats, directions: Floats) -> ShearedRays:
         origins[row, kx],
         origins[row, ky],
         origins[row, kz],
-        directions[row, kx] / along,
-        directions[row, ky] / along,
-        1 / along,
+        directions[row, kx] / component,
+        directions[row, ky] / component,
+        1 / component,
     )
 
 
-def intersect(
-    rays: ShearedRays, ray: Indices, corners: Floats, triangle: Indices
-) -> tuple[Floats, Floats, Floats, Floats, Floats]:
-    """Signed areas and distance of pairs of a ray and a triangle.
+def intersect(rays: ShearedRays, ray: Indices, corners: Floats, triangle: Indices) -> PlaneHits:
+    """Compute signed areas and distance of pairs of a ray and a triangle.
 
     Parameters
     ----------
@@ -79,22 +99,28 @@ def intersect(
         (m,): the pairs.
     corners
         (k, 3, 3): local corners of all triangles.
+    """
+    x, y, z = _sheared_corners(rays, ray, corners, triangle)
+    a = x[2] * y[1] - y[2] * x[1]
+    b = x[0] * y[2] - y[0] * x[2]
+    c = x[1] * y[0] - y[1] * x[0]
+    det = (a + b) + c
+    with np.errstate(divide="ignore", invalid="ignore"):
+        t = (((a * z[0] + b * z[1]) + c * z[2]) / det) * rays.sz[ray]
+    return PlaneHits(a, b, c, det, t)
 
-    Returns
-    -------
-    a, b, c
-        (m,): the weights of the three corners times `det`. The ray passes inside when none is
-        negative or none is positive, see `inside`.
-    det
-        (m,): ``(a + b) + c``; zero when the ray runs in the triangle's plane.
-    t
-        (m,): distance in local units; meaningless where `det` is zero.
+
+def _sheared_corners(
+    rays: ShearedRays, ray: Indices, corners: Floats, triangle: Indices
+) -> tuple[list[Floats], list[Floats], list[Floats]]:
+    """Return the coordinates of the three corners of triangles (m,), relative to rays (m,).
+
+    Three lists by corner: x and y across the ray, by the shear, and z along kz; (m,) each.
     """
     flat = corners.reshape(-1)
-    base = triangle * 9
-    at_x = base + rays.kx[ray]
-    at_y = base + rays.ky[ray]
-    at_z = base + rays.kz[ray]
+    row_x = triangle * 9 + rays.kx[ray]
+    row_y = triangle * 9 + rays.ky[ray]
+    row_z = triangle * 9 + rays.kz[ray]
     ox = rays.ox[ray]
     oy = rays.oy[ray]
     oz = rays.oz[ray]
@@ -104,20 +130,14 @@ def intersect(
     y: list[Floats] = []
     z: list[Floats] = []
     for corner in (0, 3, 6):
-        depth = flat.take(at_z + corner) - oz
-        x.append((flat.take(at_x + corner) - ox) - sx * depth)
-        y.append((flat.take(at_y + corner) - oy) - sy * depth)
+        depth = flat.take(row_z + corner) - oz
+        x.append((flat.take(row_x + corner) - ox) - sx * depth)
+        y.append((flat.take(row_y + corner) - oy) - sy * depth)
         z.append(depth)
-    a = x[2] * y[1] - y[2] * x[1]
-    b = x[0] * y[2] - y[0] * x[2]
-    c = x[1] * y[0] - y[1] * x[0]
-    det = (a + b) + c
-    with np.errstate(divide="ignore", invalid="ignore"):
-        t = (((a * z[0] + b * z[1]) + c * z[2]) / det) * rays.sz[ray]
-    return a, b, c, det, t
+    return x, y, z
 
 
 def inside(a: Floats, b: Floats, c: Floats, det: Floats) -> Bools:
-    """Whether the ray's line passes through the triangle, its edges and corners included."""
-    one_side = ((a >= 0) & (b >= 0) & (c >= 0)) | ((a <= 0) & (b <= 0) & (c <= 0))
-    return one_side & (det != 0)
+    """Return whether the line of a ray passes through a triangle, edges and corners included."""
+    same_sign = ((a >= 0) & (b >= 0) & (c >= 0)) | ((a <= 0) & (b <= 0) & (c <= 0))
+    return same_sign & (det != 0)

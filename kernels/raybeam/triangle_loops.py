@@ -2,29 +2,59 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 from .compiled import inlined
+
+
+class PlaneHit(NamedTuple):
+    """Where the line of a ray meets the plane of a triangle.
+
+    Attributes
+    ----------
+    a, b, c
+        Signed areas: weights of the three corners times `det`.
+    det
+        ``(a + b) + c``; 0 if the ray runs in the plane.
+    t
+        Distance in local units; meaningless if `det` is 0.
+    """
+
+    a: float
+    b: float
+    c: float
+    det: float
+    t: float
 
 
 @inlined
 def shear(ox, oy, oz, dx, dy, dz):  # type: ignore[no-untyped-def]
-    """Longest axis of a ray, origin with that axis last, and shear."""
+    """Return the longest axis of a ray, its origin with that axis last, and its shear."""
     ax = abs(dx)
     ay = abs(dy)
     az = abs(dz)
-    first = ax >= ay and ax >= az
-    second = not first and ay >= az
-    along = dx if first else (dy if second else dz)
-    p = dy if first else (dz if second else dx)
-    q = dz if first else (dx if second else dy)
-    u = oy if first else (oz if second else ox)
-    v = oz if first else (ox if second else oy)
-    w = ox if first else (oy if second else oz)
-    return 0 if first else (1 if second else 2), u, v, w, p / along, q / along, 1.0 / along
+    along_x = ax >= ay and ax >= az
+    along_y = not along_x and ay >= az
+    component = dx if along_x else (dy if along_y else dz)
+    p = dy if along_x else (dz if along_y else dx)
+    q = dz if along_x else (dx if along_y else dy)
+    u = oy if along_x else (oz if along_y else ox)
+    v = oz if along_x else (ox if along_y else oy)
+    w = ox if along_x else (oy if along_y else oz)
+    return (
+        0 if along_x else (1 if along_y else 2),
+        u,
+        v,
+        w,
+        p / component,
+        q / component,
+        1.0 / component,
+    )
 
 
 @inlined
-def areas(corners, ray):  # type: ignore[no-untyped-def]
-    """Signed areas, their sum, and the distance."""
+def areas(corners, ray):  # type: ignore[no-untyped-def]  # noqa: PLR0914 - a compiled loop
+    """Return the `PlaneHit` of a triangle, by corners with the axis last, and a sheared ray."""
     u, v, w, sx, sy, sz = ray
     (px, py, pz), (qx, qy, qz), (rx, ry, rz) = corners
     z0 = pz - w
@@ -40,10 +70,10 @@ def areas(corners, ray):  # type: ignore[no-untyped-def]
     b = x0 * y2 - y0 * x2
     c = x1 * y0 - y1 * x0
     det = (a + b) + c
-    return a, b, c, det, (((a * z0 + b * z1) + c * z2) / det) * sz
+    return PlaneHit(a, b, c, det, (((a * z0 + b * z1) + c * z2) / det) * sz)
 
 
 @inlined
-def within(a, b, c):  # type: ignore[no-untyped-def]
-    """Whether all areas have one sign."""
+def same_sign(a, b, c):  # type: ignore[no-untyped-def]
+    """Return whether no area is negative, or none is positive."""
     return ((a >= 0) & (b >= 0) & (c >= 0)) | ((a <= 0) & (b <= 0) & (c <= 0))

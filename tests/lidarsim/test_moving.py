@@ -179,18 +179,19 @@ def test_no_ray_meets_an_actor_that_is_not_asked_about_it(street, monkeypatch, n
     found = made(survey, scene)
     asked = []
 
-    def every_ray(rays, ends, cell, *_):
+    def every_ray(rays, reaches, pairs, *_):
         asked.append(1)
+        cell = pairs.cell
         row = (cell[:, None] * moving_loops.CELL + np.arange(moving_loops.CELL)).ravel()
         pair = np.repeat(np.arange(len(cell)), moving_loops.CELL)
-        return row[row < len(ends)], pair[row < len(ends)]
+        return row[row < len(reaches)], pair[row < len(reaches)]
 
-    def every_cell(wide, cells, number, looks, *_):
-        bodies = len(looks)
+    def every_cell(wide_cells, cells, samples, reach):
+        bodies = len(samples.boxes)
         return np.tile(np.arange(len(cells)), bodies), np.repeat(np.arange(bodies), len(cells))
 
-    monkeypatch.setattr(moving_loops, "through", every_ray)
-    monkeypatch.setattr(moving_loops, "meet", every_cell)
+    monkeypatch.setattr(moving_loops, "rays_through_boxes", every_ray)
+    monkeypatch.setattr(moving_loops, "cells_near_bodies", every_cell)
     every = made(survey, scene)
     assert asked
     assert (every["object"] == len(scene.names)).sum() > (0 if name == "turned" else 100)

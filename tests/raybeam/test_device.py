@@ -36,7 +36,7 @@ def vase(request, kernels, shapes, monkeypatch):
     apart = np.eye(4)[:3].copy()
     apart[:, 3] = 0.5, 0.2, -0.3
     placed = [Instance(mesh)] if request.param == "plain" else [Instance(mesh, apart)] * 3
-    caster = RayCaster.of(placed, kernels)
+    caster = RayCaster.from_instances(placed, kernels)
     monkeypatch.setattr(type(caster._engine), "chunk", 333)
     return caster
 

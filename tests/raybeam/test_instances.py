@@ -79,7 +79,7 @@ def test_as_the_same_triangles_in_one_mesh(backend, forest, kind, offset):
     instances, meshes, numbers, matrices = forest(kind, offset=offset)
     vertices, faces, instance, row = flattened(meshes, numbers, matrices)
     origins, directions = rays(np.random.default_rng(1), 5_000)
-    got = RayCaster.of(instances, backend).cast(origins + offset, directions)
+    got = RayCaster.from_instances(instances, backend).cast(origins + offset, directions)
     want = RayCaster(vertices, faces, backend).cast(origins + offset, directions)
     assert 0.3 < want.hit.mean() < 0.95
     assert (got.hit != want.hit).sum() <= (2 if backend == "embree" else 0)
@@ -97,7 +97,7 @@ def test_as_the_same_triangles_in_one_mesh(backend, forest, kind, offset):
 def test_kernels_have_the_bits_of_numpy(kernels, forest, kind):
     instances, *_ = forest(kind, 2)
     origins, directions = rays(np.random.default_rng(3), 5_000, 30.0)
-    numpy, other = (RayCaster.of(instances, name) for name in ("numpy", kernels))
+    numpy, other = (RayCaster.from_instances(instances, name) for name in ("numpy", kernels))
     for limits in ((0, np.inf), (4, 9)):
         want = numpy.cast(origins, directions, *limits)
         assert want.hit.sum() > 50
@@ -110,8 +110,8 @@ def test_embree_has_the_bits_of_numpy(forest):
         pytest.skip(f"embree: {reason}")
     instances, *_ = forest("sheared", 4)
     origins, directions = rays(np.random.default_rng(5), 100_000)
-    want = RayCaster.of(instances, "numpy").cast(origins, directions)
-    got = RayCaster.of(instances, "embree").cast(origins, directions)
+    want = RayCaster.from_instances(instances, "numpy").cast(origins, directions)
+    got = RayCaster.from_instances(instances, "embree").cast(origins, directions)
     differ = np.any([getattr(got, name) != getattr(want, name) for name in FIELDS], axis=0)
     assert differ.sum() <= 3
 
@@ -126,7 +126,7 @@ def test_scans_and_tallies_of_many_instances(backend, shapes):
     numbers[0] = 2
     matrices = transforms(rng, 2_000, "uneven") * [1, 1, 1, 5]
     instances = [Instance(meshes[k], m) for k, m in zip(numbers, matrices, strict=True)]
-    caster = RayCaster.of(instances, backend, threads=1)
+    caster = RayCaster.from_instances(instances, backend, threads=1)
     assert (caster.instance_count, caster.face_count) == (2_000, 12 + len(first[1]))
     directions = rng.normal(size=(3_000, 3))
     hits = caster.cast([0, 0, 0], directions)
@@ -151,18 +151,20 @@ def test_ties_go_to_the_lowest_instance_and_then_to_the_lowest_triangle(backend)
     down = np.broadcast_to([0, 0, -1.0], (3, 3))
     for meshes in ((one, one, other), (one, other, one), (other, other, other)):
         instances = [Instance(m, p) for m, p in zip(meshes, places, strict=True)]
-        hits = RayCaster.of(instances, backend).cast(origins, down)
+        hits = RayCaster.from_instances(instances, backend).cast(origins, down)
         assert hits.distance.tolist() == [2, 2, 2]
         assert hits.instance.tolist() == [1, 1, 1]
         in_one = [0, 1, 0] if meshes[1] is one else [1, 0, 1]
         assert hits.triangle.tolist() == in_one
-        swapped = RayCaster.of([instances[0], *instances[:0:-1]], backend).cast(origins, down)
+        swapped = RayCaster.from_instances([instances[0], *instances[:0:-1]], backend).cast(
+            origins, down
+        )
         assert swapped.instance.tolist() == [1, 1, 1]
 
 
 def test_moved_instances_are_found_where_a_new_caster_finds_them(backend, forest):
     instances, *_ = forest("uneven", 8)
-    caster = RayCaster.of(instances, backend)
+    caster = RayCaster.from_instances(instances, backend)
     origins, directions = rays(np.random.default_rng(9), 3_000, 30.0)
     before = caster.cast(origins, directions)
     # The last one goes far away, so the scene's coordinates change.
@@ -171,7 +173,7 @@ def test_moved_instances_are_found_where_a_new_caster_finds_them(backend, forest
         instances[number] = Instance(instances[number].mesh, place)
     after = caster.cast(origins, directions)
     assert (after.instance != before.instance).any()
-    same(after, RayCaster.of(instances, backend).cast(origins, directions))
+    same(after, RayCaster.from_instances(instances, backend).cast(origins, directions))
     with pytest.raises(IndexError, match="instance 40"):
         caster.move(40, np.eye(4))
     with pytest.raises(ValueError, match="instance 5 is singular"):
@@ -184,13 +186,15 @@ def test_closed_meshes_do_not_leak(exact_backend, shapes):
     rng = np.random.default_rng(10)
     vertices, faces = shapes["vase"](24, 24)
     matrices = transforms(rng, 3, "sheared")
-    caster = RayCaster.of([Instance(Mesh(vertices, faces), m) for m in matrices], exact_backend)
+    caster = RayCaster.from_instances(
+        [Instance(Mesh(vertices, faces), m) for m in matrices], exact_backend
+    )
     ends = vertices[faces[rng.integers(len(faces), size=3_000)][:, :2]]
     part = np.clip(rng.uniform(-0.5, 1.5, (3_000, 1)), 0, 1)
     for number, matrix in enumerate(matrices):
         inside = matrix[:, :3] @ [0.05, 0.1, 0.4] + matrix[:, 3]
         targets = (ends[:, 0] * part + ends[:, 1] * (1 - part)) @ matrix[:, :3].T + matrix[:, 3]
-        alone = RayCaster.of([Instance(Mesh(vertices, faces), matrix)], exact_backend)
+        alone = RayCaster.from_instances([Instance(Mesh(vertices, faces), matrix)], exact_backend)
         assert alone.cast(inside, targets - inside).hit.all()
         assert caster.cast(inside, targets - inside).hit.all(), number
 
@@ -199,7 +203,7 @@ def test_an_instance_without_a_transform_is_its_mesh(backend, shapes):
     mesh = shapes["vase"](20, 20)
     origins, directions = rays(np.random.default_rng(11), 2_000, 4.0)
     plain = RayCaster(*mesh, backend)
-    alone = RayCaster.of([Instance(Mesh(*mesh))], backend)
+    alone = RayCaster.from_instances([Instance(Mesh(*mesh))], backend)
     want = plain.cast(origins, directions)
     same(alone.cast(origins, directions), want)
     assert (want.instance == np.where(want.hit, 0, -1)).all()
@@ -213,7 +217,9 @@ def test_meshes_much_smaller_and_larger_than_the_scene(exact_backend, shapes, sc
     vertices, faces = shapes["sphere"](12, 18)
     place = np.column_stack([np.eye(3) * 0.5 / scale, [400, 300, 2]])
     far = Instance(Mesh(*shapes["cube"]()), shift(-500, -500, 0))
-    caster = RayCaster.of([far, Instance(Mesh(vertices * scale, faces), place)], exact_backend)
+    caster = RayCaster.from_instances(
+        [far, Instance(Mesh(vertices * scale, faces), place)], exact_backend
+    )
     rng = np.random.default_rng(12)
     targets = rng.normal(size=(500, 3))
     targets = 0.4 * targets / np.linalg.norm(targets, axis=1, keepdims=True)
@@ -240,6 +246,6 @@ def test_meshes_much_smaller_and_larger_than_the_scene(exact_backend, shapes, sc
 def test_refused(transform, words):
     mesh = Mesh([[0, 0, 0], [1, 0, 0], [0, 1, 0]], [[0, 1, 2]])
     with pytest.raises(ValueError, match=words):
-        RayCaster.of([Instance(mesh), Instance(mesh, transform)], "numpy")
+        RayCaster.from_instances([Instance(mesh), Instance(mesh, transform)], "numpy")
     with pytest.raises(ValueError, match="at least one"):
-        RayCaster.of([], "numpy")
+        RayCaster.from_instances([], "numpy")

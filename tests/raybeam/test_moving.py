@@ -45,12 +45,12 @@ class Bodies:
         self.axis = random.normal(size=(count, 3))
         self.axis /= np.linalg.norm(self.axis, axis=1)[:, None]
         self.rate = random.uniform(-10, 10, count)
-        self.there = np.tile([-np.inf, np.inf], (count, 1))
-        self.there[::3] = [0.3 * PERIOD, 0.7 * PERIOD]
+        self.presence = np.tile([-np.inf, np.inf], (count, 1))
+        self.presence[::3] = [0.3 * PERIOD, 0.7 * PERIOD]
         self.shape = random.integers(0, 3, count)
 
     def poses(self, body, times):
-        assert (self.there[body, 0] <= times).all() and (times <= self.there[body, 1]).all()
+        assert (self.presence[body, 0] <= times).all() and (times <= self.presence[body, 1]).all()
         places = self.start[body] + times[:, None] * self.speed[body]
         places[:, 2] += np.sin(30 * times)
         angle = self.rate[body] * times
@@ -64,9 +64,11 @@ class Bodies:
         mask = np.array([[False, True], [True, False]])
         uv = np.array([[0, 0], [1, 0], [1, 1], [0, 0], [1, 1], [0, 1]], np.float32).reshape(2, 3, 2)
         shapes = [Mesh(*ball()), Mesh(*FLAT, Opacity(mask, uv)), Mesh(*FLAT)]
-        casters = [RayCaster.of([Instance(mesh)], backend, threads=1) for mesh in shapes]
+        casters = [
+            RayCaster.from_instances([Instance(mesh)], backend, threads=1) for mesh in shapes
+        ]
         boxes = np.array([[[-2, -1, -0.7], [2, 1, 0.7]], *2 * [[[-1.0, -1, 0], [1, 1, 0]]]])
-        return Moving(tuple(casters), boxes, self.shape, self.there, self.poses)
+        return Moving(tuple(casters), boxes, self.shape, self.presence, self.poses)
 
 
 def table(places, turns):
@@ -122,7 +124,7 @@ def by_all(moving, scan, times):
     """Nearest hits, of each ray cast by itself at every body that is there."""
     origins, directions = checked_rays(scan.pattern, scan.first, np.arange(len(scan)), scan.poses)
     best = {}
-    for body, (first, last) in enumerate(moving.there):
+    for body, (first, last) in enumerate(moving.presence):
         rows = np.flatnonzero((first <= times) & (times <= last))
         poses = moving.poses(np.full(len(rows), body), times[rows])
         places = poses[:3].T
@@ -193,7 +195,7 @@ def test_of_equal_distances_the_first_body_counts(backend):
     bodies.start[:] = [5, 0, 0]
     bodies.speed[:] = 0
     bodies.rate[:] = 0
-    bodies.there[:] = [-np.inf, np.inf]
+    bodies.presence[:] = [-np.inf, np.inf]
     bodies.shape[:] = 0
     scan, times, _ = scans("fan")
     hits = hits_on(bodies.moving(backend), scan, lambda ray: times[ray])
@@ -257,7 +259,7 @@ def test_bodies_that_deform_are_hit_where_they_are_at_the_time_of_each_ray():
         return (offsets[body] + 60 * times) % 5
 
     kinds = np.zeros(9, np.intp)
-    moving = Moving((shape,), shape.box[None], kinds, bodies.there, bodies.poses, frame)
+    moving = Moving((shape,), shape.box[None], kinds, bodies.presence, bodies.poses, frame)
     directions = bodies.start[random.integers(0, 9, RAYS)] + random.normal(0, 1.5, (RAYS, 3))
     directions += [9, -0.2, 0]
     directions /= np.linalg.norm(directions, axis=1)[:, None]
@@ -266,7 +268,7 @@ def test_bodies_that_deform_are_hit_where_they_are_at_the_time_of_each_ray():
     found = hits_on(moving, scan, lambda ray: times[ray])
     expected = np.full(RAYS, np.inf), np.full(RAYS, -1), np.zeros(RAYS)
     for body in range(9):
-        first, last = bodies.there[body]
+        first, last = bodies.presence[body]
         own = np.flatnonzero((first <= times) & (times <= last))
         pose = bodies.poses(np.full(len(own), body), times[own])
         turns = pose[3:].reshape(3, 3, -1).transpose(1, 0, 2)

@@ -33,7 +33,7 @@ def casters(shapes, kind, backends):
     places = np.concatenate([turns, rng.uniform(-20, 20, (30, 3, 1))], axis=2)
     forest = [Instance(meshes[k % 3], place) for k, place in enumerate(places)]
     for instances in ([Instance(mesh)], forest):
-        yield [RayCaster.of(instances, name) for name in backends]
+        yield [RayCaster.from_instances(instances, name) for name in backends]
 
 
 def rays(count):
@@ -52,7 +52,7 @@ def test_a_ray_passes_where_the_mask_is_false(backend, place, repeats):
     uv = repeats * SQUARE[HALVES][:, :, :2] - [7, 2]
     leaf = Mesh(SQUARE, HALVES, Opacity(mask, uv))
     floor = Instance(Mesh(SQUARE * 40 - [20, 20, 1], HALVES))
-    caster = RayCaster.of([floor, Instance(leaf, place)], backend)
+    caster = RayCaster.from_instances([floor, Instance(leaf, place)], backend)
     across, down = (np.arange(k * repeats) for k in (5, 4))
     x, y = np.meshgrid((across + 0.4) / (5 * repeats), (down + 0.7) / (4 * repeats))
     size = [1, 1] if place is None else [2, -3]
@@ -94,7 +94,7 @@ def test_a_mask_that_is_true_everywhere_changes_no_bit(backend, shapes):
     assert want.hit.sum() > 1_000
     for opaque in (True, False):
         mesh = Mesh(vertices, faces, Opacity(np.full((3, 4), opaque), uv))
-        hits = RayCaster.of([Instance(mesh)], backend).cast(origins, directions)
+        hits = RayCaster.from_instances([Instance(mesh)], backend).cast(origins, directions)
         if opaque:
             same(hits, want)
         else:
@@ -112,7 +112,9 @@ def test_meshes_that_share_a_mask_keep_it_once(backend):
         opacities = [Opacity(one, uv) for one in masks]
         joined = join_masks([check_opacity(one, 2, order) for one in opacities], [order] * 2)
         meshes = [Mesh(SQUARE, HALVES, one) for one in opacities]
-        return joined.mask.size, RayCaster.of(list(map(Instance, meshes, places)), backend)
+        return joined.mask.size, RayCaster.from_instances(
+            list(map(Instance, meshes, places)), backend
+        )
 
     (once, shared), (twice, copied) = caster([mask, mask]), caster([mask, mask.copy()])
     assert (once, twice) == (mask.size, 2 * mask.size)

@@ -102,8 +102,8 @@ def ties(backend):
     for caster, start, directions in (
         (RayCaster(points, rng.permutation(thrice), backend), [0.05, 0.1, 0.4], around),
         (RayCaster(*both, backend), np.add(fine, [0, 0, 3]), down),
-        (RayCaster.of(stack, backend), np.add(fine, [0, 0, 3]), down),
-        (RayCaster.of(stack, backend), np.add(fine / 2, [0.025, 0, 3]), down),
+        (RayCaster.from_instances(stack, backend), np.add(fine, [0, 0, 3]), down),
+        (RayCaster.from_instances(stack, backend), np.add(fine / 2, [0.025, 0, 3]), down),
     ):
         hits = caster.cast(start, directions)
         for column in (hits.distance, hits.triangle, hits.instance):
@@ -111,7 +111,7 @@ def ties(backend):
     # Neighbours in packets, in a plain scene and among instances.
     for caster in (
         RayCaster(points, rng.permutation(thrice), backend),
-        RayCaster.of(stack, backend),
+        RayCaster.from_instances(stack, backend),
     ):
         for window in [(0, RINGS * FIRINGS)] * 4 + [(7, 5_000)]:
             returns = caster.scan(Pattern(lidar()), [0.05, 0.1, 0.4], window=window)

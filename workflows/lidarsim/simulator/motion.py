@@ -180,9 +180,9 @@ def poses_of_firings(
     firings = np.arange(first, stop + 1, dtype=np.int64)
     times = np.minimum(sensor.begins_ns(firings) + sensor.lead_ns + late_ns, path.duration_ns)
     positions, turns = path.poses(station, times)
-    positions = raybeam.poses.by_number(positions)
+    positions = raybeam.poses.by_component(positions)
     turns = np.broadcast_to(np.eye(3), (len(times), 3, 3)) if turns is None else turns
-    turns = raybeam.poses.by_number(turns)
+    turns = raybeam.poses.by_component(turns)
     spins = sensor.spins(firings[:-1])
     rotations = turns[:-1]
     if spins is not None:

@@ -219,7 +219,7 @@ def _caster_of(scene: Scene, vertices: Floats, options: dict[str, Any]) -> RayCa
     own = [Instance(Mesh(vertices, scene.faces))] if len(scene.faces) else []
     meshes = [_mesh_of(part) for part in scene.instances.parts]
     placed = zip(scene.instances.part, scene.instances.transforms, strict=True)
-    return RayCaster.of(
+    return RayCaster.from_instances(
         [*own, *(Instance(meshes[part], matrix) for part, matrix in placed)], **options
     )
 
@@ -246,7 +246,7 @@ def _shapes(
     casters = tuple(
         Deforming(mesh.animation.vertices, mesh.faces)
         if mesh.animation
-        else RayCaster.of([Instance(_mesh_of(part)) for part in own], **options)
+        else RayCaster.from_instances([Instance(_mesh_of(part)) for part in own], **options)
         for mesh, own in zip(meshes, parts, strict=True)
     )
     boxes = np.array([(mesh.animation or mesh).bounds for mesh in meshes])
