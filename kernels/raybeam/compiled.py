@@ -85,7 +85,7 @@ def _compile_lock(folder: str) -> Iterator[None]:
 
     A hundred workers, on any machines, that start with an empty folder compile each loop once.
     """
-    with global_compiler_lock:  # of the threads; compiling one loop may compile another
+    with global_compiler_lock:  # for threads; compiling a loop may compile further loops
         file = None
         collects = gc.isenabled()
         gc.disable()  # an eighth of the time: numba keeps most of the objects of a compilation

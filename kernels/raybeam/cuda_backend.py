@@ -36,8 +36,8 @@ class CudaBackend(Backend):
 
     Kernels and copies use the thread's current stream, and every call ends with a copy to the
     host, for which CuPy waits: when it returns, the device no longer uses the call's memory.
-    Tables and patterns outlive a call; their creation is waited for, so that threads with other
-    streams may use them. All calls switch to the caster's device and back.
+    Tables and patterns outlive a call; a call waits for their creation, so that threads with other
+    streams may use both. All calls switch to the caster's device and back.
 
     NumPy builds the tree (layout.py). Building it on the device took as much code as the
     traversal, and saved a worker two seconds for each million triangles, once.

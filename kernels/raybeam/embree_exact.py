@@ -7,8 +7,8 @@ propose such triangles. A ray with more candidates, or a ray that passes at an e
 by itself, and the test is applied to every triangle that is proposed, and at an edge to all
 triangles nearby (`decide`). Of equally close triangles the lowest wins. So a ray's result does not
 depend on the rays that share its packet, nor on the processor's instructions, and has the bits of
-the other backends. At an instance, the test takes the ray to the mesh's coordinates in float64
-itself, as instances.py says.
+the other backends. At an instance, the test transforms the ray to the mesh's coordinates in
+float64 itself, as instances.py describes.
 
 The test follows after all rays of a group: a filter that read the corners of each candidate waited
 for memory, a third of the time in a terrain of two million triangles. At open borders, some rays
@@ -83,7 +83,7 @@ MARGIN = 2.0**-19
 MAX_DISTANCE = 8.0  # more than the diagonal of any scene
 
 _GRAZES = 2.0**-10  # sine of the smallest angle to a triangle that `decide` allows for
-_RIM = 2.0**-20  # share of a triangle's height: far more than what float64 rounds
+_RIM = 2.0**-20  # share of a triangle's height: far more than rounding in float64
 _STRAIGHT = 1 + 2.0**-20  # sum of a direction's components, so near to an axis
 
 _intersect_1 = types.ExternalFunction(

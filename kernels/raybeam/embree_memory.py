@@ -50,7 +50,7 @@ CAST = np.dtype(
         ("lower", "f8", 3),
         ("upper", "f8", 3),
         ("starts_near", "i8"),  # whether all rays start near the scene's box
-        ("shares_origin", "i8"),  # whether all rays start at the position of one pose
+        ("shares_origin", "i8"),  # whether all rays start at the position of a single pose
         ("step", "i8"),  # rays from a ray to its neighbour along a ring
         ("rays_along", "i8"),  # rays of a ring in a group
         ("rays_across", "i8"),  # rings of a group
@@ -96,7 +96,7 @@ SCRATCH = np.dtype(
         ("masked", "i8"),
         ("t_min", "f8"),
         ("t_max", "f8"),
-        ("lane", "i8"),  # first ray of a packet, or the single one
+        ("lane", "i8"),  # first ray of a packet, or the single ray
         ("scene", "i8"),
         ("nearby", "i8"),
         ("arguments", "i8", 8),  # RTCIntersectArguments
@@ -112,8 +112,8 @@ SCRATCH = np.dtype(
         ("dx", "f8", LANES), ("dy", "f8", LANES), ("dz", "f8", LANES),
         ("entry", "f8", LANES),  # distance of the start that Embree sees from the origin
         # The longest axis of the direction, the origin with that axis last, and the shear, see
-        # triangle.py; then the instance in whose coordinates they are, -1 for none yet, and the
-        # length of the direction there.
+        # triangle.py; the instance of these coordinates, -1 for none yet; and the length of the
+        # direction in the instance's coordinates.
         ("axis", "i8", LANES),
         ("u", "f8", LANES), ("v", "f8", LANES), ("w", "f8", LANES),
         ("sx", "f8", LANES), ("sy", "f8", LANES), ("sz", "f8", LANES),

@@ -65,7 +65,7 @@ class ScanReturns:
         int64 (g,): number of hits of each group, kept or not.
     tally
         int64 (face_count,): hits of each triangle, kept or not, whichever instance shows it: the
-        rows of all meshes one after the other, in the order in which instances use them. None if
+        rows of all meshes in sequence, in the order in which instances use the meshes. None if
         not requested.
     instance
         int32 (k,): as in `Hits`.
@@ -86,7 +86,7 @@ def join_hits(parts: list[Part]) -> Part:
     """Join the hits of parts, in order; a single part is not copied."""
     if len(parts) == 1:
         return parts[0]
-    nothing = np.zeros(0, np.int32)
-    parts = [(np.zeros(0, np.uint32), np.zeros(0), nothing, nothing), *parts]
+    no_ints = np.zeros(0, np.int32)
+    parts = [(np.zeros(0, np.uint32), np.zeros(0), no_ints, no_ints), *parts]
     ray, distance, triangle, instance = map(np.concatenate, zip(*parts, strict=True))
     return ray, distance, triangle, instance

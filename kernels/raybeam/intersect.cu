@@ -1,49 +1,49 @@
 // Closest hits of rays with triangles: traversal of a four-wide bounding volume hierarchy.
 //
-// Compiled by NVRTC, which has no standard headers, so there are none here; the tests compile the
-// same text for the CPU. One thread a ray, blocks of 128 threads, a grid of one dimension.
-// Defined on the command line: STACK, the most nodes that can wait; NESTED, 1 for a scene with
-// instances, 0 for a plain one: one mesh, in its place; MASKED, 1 where parts of triangles are
-// transparent, else 0. A scene pays nothing for what it has not.
+// Compiled by NVRTC, which has no standard headers: no header is included; the tests compile the
+// same text for the CPU. A thread for each ray, blocks of 128 threads, a grid of one dimension.
+// Defined on the command line: STACK, the maximum of nodes that wait; NESTED, 1 for a scene with
+// instances, 0 for a plain scene: a mesh without a transform; MASKED, 1 if parts of triangles are
+// transparent, else 0. A scene without instances or masks does not pay for these.
 //
 // Threads are independent: no shared memory, no barriers, no votes of a warp, no atomics but for
-// counts, so it does not matter which of them run together. Offsets into tables are 64 bits wide; an
+// counts, so it does not matter which threads run together. Offsets into tables are 64 bits wide; an
 // int is enough for the rest: there are fewer than 2^28 triangles, so rows shifted by LEAF_BITS fit,
 // and the greatest code of a leaf is not DONE. A chunk of rays is far below 2^31 (cuda_backend.py).
-// Tables of float4 are allocations of their own, which the device aligns to 256 bytes.
+// Tables of float4 are separate allocations, which the device aligns to 256 bytes.
 //
 // CuPy adds -ftz=true: subnormal floats are flushed to zero. The bands below allow for that (FLOOR
 // of layout.py), and nodes never come near it: a box is as wide as its padding.
 //
 // All lengths are local: coordinates within [-1, 1], see mesh.py; the scene and each mesh have
-// coordinates of their own, see instances.py. layout.py makes the tables, those of all meshes one
-// after the other:
-//   nodes      8 float4 (one 128-byte line) a node: low x, y, z of four children, then high x, y,
-//              z, then the children's codes as integer bits, then nothing. A code >= 0 is a
-//              node, a negative one ~(first << 3 | count - 1) the triangles of a leaf. An empty
+// separate local coordinates, see instances.py. layout.py computes the tables, with all meshes in
+// sequence:
+//   nodes      8 float4 (one 128-byte line) a node: lower x, y, z of four children, then upper x, y,
+//              z, then the children's codes as integer bits, then padding. A code >= 0 is a
+//              node, a negative code ~(first << 3 | count - 1) the triangles of a leaf. An empty
 //              slot has an inverted box.
 //   triangles  3 float4 a triangle, in the order of the leaves: corner and band of b, edge to
 //              the second corner and band of c, edge to the third and band of t.
 //   corners    9 doubles a triangle, in the same order.
 //   faces      the caller's number of each triangle.
 //   uvs, masks, opacity  as in `Masks` of opacity.py.
-//   frame      10 doubles: centre (3), scale, low corner of the scene's box (3), high corner (3).
-//   top        as nodes, over the instances: a leaf holds one, by its number.
-//   instances  20 doubles each: matrix from the scene to the mesh, by rows (12), low corner of the
-//              mesh's box (3), high corner (3), the mesh's first node, its number.
+//   frame      10 doubles: centre (3), scale, lower corner of the scene's box (3), upper corner (3).
+//   top        as nodes, over the instances: a leaf holds the number of an instance.
+//   instances  20 doubles each: matrix from the scene to the mesh, by rows (12), lower corner of the
+//              mesh's box (3), upper corner (3), the mesh's first node, its number.
 //
-// Two tests a triangle. `may_hit` is Moeller and Trumbore (1997) in float, with bands as wide as
+// Two tests for each triangle. `may_hit` is Moeller and Trumbore (1997) in float, with bands as wide as
 // its rounding errors can be, so it never loses a hit; it rejects nearly all other triangles.
 // `decide` is the watertight test of triangle.py in double, operation by operation: compiled
 // without fused multiply-add (-fmad=false) its results have the same bits as NumPy's. The float
 // part has explicit fma.
 //
-// Comparisons are written so that one with NaN is false, and false means "no hit".
+// Comparisons are written so that a comparison with NaN is false, and false means "no hit".
 
 typedef long long Count;
 
-// Five blocks of 128 threads to a multiprocessor, four with instances, one less for bodies: aiming
-// at more, nvcc spills registers for sm_90 or sm_120.
+// Five blocks of 128 threads to a multiprocessor, four with instances, one less for bodies: with
+// more, nvcc spills registers for sm_90 or sm_120.
 #define BLOCKS (NESTED ? 4 : 5)
 #define KERNEL extern "C" __global__ void __launch_bounds__(128, BLOCKS)
 
@@ -58,7 +58,7 @@ typedef long long Count;
 #define SLACK 9.5367431640625e-07f  // 2^-20: on limits in float, far more than their rounding
 #define ACROSS 4.0                  // more than the diagonal of any scene
 #define RECORD 20                   // doubles of an instance
-#define SPAN 32                     // times for each box of a body on its way
+#define SPAN 32                     // times for each box of a moving body
 #define UNIT_SLACK 1e-14            // see rays.py
 
 struct Scene {
@@ -79,12 +79,12 @@ struct Ray {
     double ox, oy, oz, dx, dy, dz;
 };
 
-// What `decide` found: weights of the corners times det, and distance.
+// Result of `decide`: weights of the corners times det, and distance.
 struct Exact {
     double a, b, c, det, t;
 };
 
-// ---- where rays come from ----
+// ---- rays ----
 
 __device__ __forceinline__ void place_origin(const Scene& scene, const double* origin, Ray& ray)
 {
@@ -94,7 +94,7 @@ __device__ __forceinline__ void place_origin(const Scene& scene, const double* o
     ray.oz = (origin[2] - f[2]) * f[3];
 }
 
-// Origins and directions from memory; one origin for all where stride is 0, else 3.
+// Origins and directions from memory; a shared origin if stride is 0, else 3.
 struct TableRays {
     const double* origins;
     int stride;
@@ -113,7 +113,7 @@ struct TableRays {
 };
 
 // Rays of a pattern of `rows` rays, each rotated and moved by its pose. Ray i is
-// row (first + i) modulo rows. The first pose has `left` rays, each of the others `each`.
+// row (first + i) modulo rows. The first pose has `left` rays, later poses have `each`.
 struct PatternRays {
     const double* positions;   // 3 a pose
     const double* rotations;   // 9 a pose, by rows; not read where `turned` is 0
@@ -147,7 +147,7 @@ struct PatternRays {
         z = c;
     }
 
-    // Start of a ray in metres, and its direction.
+    // Compute the origin of a ray, metres, and its direction.
     __device__ __forceinline__ void make(Count i, double* at, double* to) const
     {
         Count row = first + i;
@@ -198,8 +198,8 @@ struct PatternRays {
     }
 };
 
-// Rays in the axes of a body that moves, where that is at the ray's time: `pose` is its position, and
-// its rotation from its axes, by rows.
+// Rays in the axes of a moving body at the ray's time: `pose` is the position of the body, and the
+// rotation from the body's axes, by rows.
 struct BodyRays {
     const double* rays;  // 6 rows of `count`: origins in metres, and directions
     Count count;
@@ -213,7 +213,7 @@ struct BodyRays {
         c = (x * r[2] + y * r[5]) + z * r[8];
     }
 
-    // Make a ray; returns the length that its direction had, as `strike` of crossing.py.
+    // Compute a ray; return the length of its direction, as `strike` of crossing.py.
     __device__ __forceinline__ double make(const Scene& scene, Count i, Ray& ray) const
     {
         double at[3];
@@ -248,8 +248,8 @@ struct BodyRays {
     }
 };
 
-// Take a ray from the scene's to an instance's coordinates. Returns the length that its direction
-// had there, with the operations of `Scene.enter`.
+// Transform a ray from the scene's to an instance's coordinates. Return the length of its direction
+// there, with the operations of `Scene.enter`.
 __device__ __forceinline__ double enter_mesh(const Scene& scene, int instance, Ray& ray)
 {
     if (!NESTED) return 1.0;
@@ -307,7 +307,7 @@ __device__ __forceinline__ bool decide(const Scene& scene, const Ray& ray, int p
     return (above || below) && out.det != 0;
 }
 
-// Whether the mesh's mask stops a ray that passes inside a triangle, as `Masks.opaque`.
+// Return whether the mesh's mask stops a ray that passes inside a triangle, as `Masks.opaque`.
 __device__ __forceinline__ bool opaque(const Scene& scene, int mesh, int place, const Exact& hit)
 {
     const Count* record = scene.opacity + 4 * (Count)mesh;
@@ -325,17 +325,17 @@ __device__ __forceinline__ bool opaque(const Scene& scene, int mesh, int place, 
 
 // ---- traversal ----
 
-// The ray in float, from where it enters the box of the scene, or of an instance's mesh.
+// The ray in float, from its entry into the box of the scene, or of an instance's mesh.
 struct Walk {
     float ox, oy, oz, dx, dy, dz;  // start and direction
     float ix, iy, iz;              // 1 / direction
     float sx, sy, sz;              // start / direction
-    int nx, ny, nz;                // which float4 of a node holds the planes met first
+    int nx, ny, nz;                // float4 of a node that holds the nearer planes
     double entry;                  // distance of the start from the origin
-    float from, to;                // hits outside of these, from the start, do not count
+    float from, to;                // limits of the distance of a hit from the start
 };
 
-// A limit in float, from the start of the traversal, that is never less than the exact one.
+// Return a limit in float, from the start of the traversal, never less than the exact limit.
 __device__ __forceinline__ float limit(double t, double entry)
 {
     const double left = (t - entry) * (1.0 + SLACK) + SLACK;
@@ -352,8 +352,8 @@ __device__ __forceinline__ void clip(
     leave = fmin(leave, fmax(one, two));
 }
 
-// A coordinate of the traversal's start. If it is too far away for double to place it, it stays
-// near the scene.
+// Return a coordinate of the traversal's start, near the scene even if the ray is too far away for
+// double to compute the start.
 __device__ __forceinline__ float start(double o, double d, double entry)
 {
     return (float)fmin(fmax(o + entry * d, -2.0), 2.0);
@@ -364,7 +364,7 @@ __device__ __forceinline__ float reciprocal(float d)
     return 1.0f / (fabsf(d) < (float)TINY ? (d < 0.0f ? -(float)TINY : (float)TINY) : d);
 }
 
-// Prepare the traversal; false when the ray misses the box, which is 6 doubles.
+// Prepare the traversal; return false if the ray misses the box (6 doubles).
 __device__ __forceinline__ bool begin(
     const double* low, const Ray& ray, double t_min, double t_max, Walk& w)
 {
@@ -400,7 +400,8 @@ __device__ __forceinline__ bool begin(
     return true;
 }
 
-// Where the ray enters a child's box; a large number when it does not, or only beyond `to`.
+// Return the distance at which the ray enters a child's box; a large number for a miss, or beyond
+// `to`.
 __device__ __forceinline__ float enter(
     const Walk& w, float nx, float ny, float nz, float fx, float fy, float fz)
 {
@@ -411,7 +412,7 @@ __device__ __forceinline__ float enter(
     return near <= far ? near : 1e30f;
 }
 
-// Put the nearer of two children first.
+// Swap two children if the second is nearer.
 __device__ __forceinline__ void order(float& t0, int& c0, float& t1, int& c1)
 {
     const bool swap = t1 < t0;
@@ -448,8 +449,8 @@ __device__ __forceinline__ int pop(const Waiting* stack, int& top, int bottom, f
     return DONE;
 }
 
-// Test a node's children; the nearest one hit is next, the others wait. Those below `bottom` are
-// not of this walk.
+// Test a node's children; the nearest child that is hit is next, further children wait. Nodes below
+// `bottom` on the stack belong to another walk.
 __device__ __forceinline__ int descend(
     const float4* nodes, int node, const Walk& w, Waiting* stack, int& top, int bottom)
 {
@@ -465,7 +466,7 @@ __device__ __forceinline__ int descend(
     int c0 = __float_as_int(codes.x), c1 = __float_as_int(codes.y);
     int c2 = __float_as_int(codes.z), c3 = __float_as_int(codes.w);
     const bool met0 = t0 < 1e30f, met1 = t1 < 1e30f, met2 = t2 < 1e30f, met3 = t3 < 1e30f;
-    // Most often all rays of a warp hit one child or none: then there is nothing to sort.
+    // Usually all rays of a warp hit a single child or none: no sort is needed then.
     if (met0 + met1 + met2 + met3 > 1) {
         order(t0, c0, t1, c1);
         order(t2, c2, t3, c3);
@@ -519,8 +520,7 @@ __device__ __forceinline__ bool may_hit(const float4* record, const Walk& w, Gue
     return true;
 }
 
-// Finds the closest hit: distance local to the scene, place in the tables (-1: none yet), and
-// instance.
+// The closest hit so far: distance local to the scene, row in the tables (-1: no hit), and instance.
 //
 // The test that decides costs as much as several nodes, and the rays of a warp reach their triangles
 // at different times. So triangles that may be the closest wait until all rays of the warp are done,
@@ -533,7 +533,7 @@ struct Closest {
 
     __device__ __forceinline__ Closest(double t_max) : t(t_max), place(-1), instance(0), one(-1), two(-1) {}
 
-    // Add a triangle; false when there is no room for another.
+    // Add a triangle; return false if there is no room for a further triangle.
     __device__ __forceinline__ bool offer(int at, const Guess& guess, Walk& w)
     {
         // A mask may let the ray through.
@@ -550,7 +550,7 @@ struct Closest {
         return one < 0 || two < 0;
     }
 
-    // Decide on the waiting triangles of an instance.
+    // Test the waiting triangles of an instance in double.
     template <class Rays>
     __device__ __forceinline__ void settle(
         const Scene& scene, const Rays& rays, Count i, int inside, double t_min, Walk& w)
@@ -607,7 +607,7 @@ __device__ __forceinline__ void visit(
                 Guess guess;
                 if (may_hit(scene.triangles + 3 * (Count)place, w, guess))
                     room = best.offer(place, guess, w);
-                // The rest of the leaf, one triangle on and one less.
+                // The rest of the leaf: a later first triangle, and a smaller count.
                 const bool more = leaf & ((1 << LEAF_BITS) - 1);
                 node = more ? ~(leaf + (1 << LEAF_BITS) - 1) : pop(stack, top, bottom, w.to);
             }
@@ -616,8 +616,8 @@ __device__ __forceinline__ void visit(
     } while (node != DONE);
 }
 
-// Go on from the nodes of the top that wait to the next instance, the nearest that the ray may hit;
-// DONE if there is none.
+// Return the root of the next instance from the waiting nodes of the top, the nearest that the ray
+// may hit; DONE if none is left.
 //
 // The ray is prepared again: keeping it while an instance is visited takes twice the registers.
 template <class Rays>
@@ -651,7 +651,7 @@ __device__ __forceinline__ void walk(
 // ---- kernels: scene, rays in, hits out ----
 
 // Closest hits of rays from memory: local distance, row of the tables, and instance, which is
-// written only for scenes that have any; the row is -1 for a miss, of which nothing else is written.
+// written only for scenes with instances; for a miss only the row, -1, is written.
 KERNEL cast_table(
     const float4* __restrict__ nodes, const float4* __restrict__ triangles,
     const double* __restrict__ corners, const int* __restrict__ faces,
@@ -708,9 +708,9 @@ KERNEL cast_pattern(
 #define BLOCKS (NESTED ? 3 : 4)
 
 // Nearer hits of rays on bodies of the scene's shape, which move, as `strike` of crossing.py. Ray i
-// meets them at time when[i], if that is one of `times`: the pose of body k at time t, 12 doubles, is
-// at t * body_count + k, and begins with NaN where the body is not there. `boxes` are what holds it
-// during SPAN times, low and high corner. `nearest_...` are read and written.
+// meets the bodies at time when[i], if below `times`: the pose of body k at time t, 12 doubles, is
+// at t * body_count + k, and begins with NaN while the body is absent. `boxes` hold a body
+// during SPAN times: lower and upper corner. `nearest_...` are read and written.
 KERNEL cast_bodies(
     const float4* __restrict__ nodes, const float4* __restrict__ triangles,
     const double* __restrict__ corners, const int* __restrict__ faces,
@@ -758,7 +758,7 @@ KERNEL cast_bodies(
 #undef BLOCKS
 #define BLOCKS (NESTED ? 4 : 5)
 
-// Weights of the second and third corner for hits of cast_table, one a ray that is listed.
+// Weights of the second and third corner for hits of cast_table, for each listed ray.
 KERNEL weigh_table(
     const double* __restrict__ corners, const double* __restrict__ frame,
     const double* __restrict__ instances,
@@ -779,7 +779,7 @@ KERNEL weigh_table(
     v[k] = hit.c / hit.det;
 }
 
-// ---- what becomes of the hits ----
+// ---- output of the hits ----
 
 // Hits of other surfaces, at most one a ray, take the place of those that are farther, divided by
 // `scale`: place becomes -2 - k for hit k.
@@ -798,7 +798,7 @@ KERNEL replace(
 //
 // `ends` are the inclusive sums of hits up to each ray. Of each group of rays, the first kept hit
 // and every n-th after it are kept. `groups` has three rows of `group_count`: the first ray of each,
-// the first hit to keep, and the place of that among all that are kept; it is not read where `every`
+// the first hit to keep, and the position of that hit among all kept hits; it is not read where `every`
 // is 1. `counters`, not read where `counting` is 0, are two numbers for each instance: hits of its
 // triangle t are counted in row first + step * t of `tally`, whether they are kept or not.
 KERNEL pack(
@@ -838,7 +838,7 @@ KERNEL pack(
     which[k] = in;
 }
 
-// Starts in metres and directions of the rays that are listed, counted from `start`: (3, count) each,
+// Origins in metres and directions of the listed rays, counted from `start`: (3, count) each,
 // with the bits of `pattern_rays`.
 KERNEL make_rays(
     const double* __restrict__ positions, const double* __restrict__ rotations,

@@ -35,7 +35,7 @@ class Frame:
     centre
         float64 (3,), metres: subtracted from points.
     scale
-        Local units in one metre, a power of two.
+        Local units in a metre, a power of two.
     low, high
         float64 (3,): corners of the box around the triangles, local, padded as in the tree.
     """

@@ -27,7 +27,7 @@ from .tree import LEAF_BITS, PAD, WideTree, build_top, build_tree, join
 
 _WIDTH = 8
 _LEAF_SIZE = 4
-_BLOCK = 1 << 15  # pairs: a step's arrays take about 6 MiB; smaller ones need more calls
+_BLOCK = 1 << 15  # pairs: a step's arrays take about 6 MiB; smaller blocks need more calls
 _ACROSS = 4.0  # local units: more than the diagonal of any scene
 _SHIFT = 32  # of the instance in keys of hits, see `_Best`
 _SLACK = 2.0**-20  # margin of distance limits in float32: far more than their rounding

@@ -6,7 +6,7 @@ best partners (least area of the common box) are merged. Every step is a few ope
 arrays. Near the root, few clusters are left and neighbours on the curve are seldom the best:
 clustering to the end cost rays a fifth to a half more nodes in cities. So the last clusters are
 divided from the root down, by a full sweep with the surface area heuristic (sweep.py), which takes
-a tenth of a second for them.
+a tenth of a second.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ _RADIUS = 8  # neighbours looked at on either side; twice as many gain 1 to 2 % 
 # maximum gains nothing, a quarter loses a twentieth.
 _MAX_CLUSTERS = 1 << 14
 _MIN_CLUSTERS = 1 << 10
-_GRID_BITS = 21  # a coordinate; three of them fill 63 bits
+_GRID_BITS = 21  # a coordinate; three coordinates fill 63 bits
 
 
 @dataclass(frozen=True)
@@ -167,7 +167,7 @@ def _partners(lower: Floats32, upper: Floats32) -> tuple[Indices, Indices]:
     n = lower.shape[1]
     position = np.arange(n)
     # If all candidates are equally good, as among copies of one triangle, partners must still
-    # match: start from the pairs (0, 1), (2, 3), ... and replace them only by better ones.
+    # match: start from the pairs (0, 1), (2, 3), ... and accept only better partners.
     best = np.minimum(position ^ 1, n - 1)
     cost = np.full(n, np.inf, np.float32)
     even = position[: n - 1 : 2]
@@ -189,7 +189,9 @@ def _partners(lower: Floats32, upper: Floats32) -> tuple[Indices, Indices]:
             cost[cluster[cheaper]] = area[cheaper]
             best[cluster[cheaper]] = neighbour[cheaper]
     first = np.flatnonzero((best[best] == position) & (position < best))
-    if 16 * len(first) < n:  # long chains of ever better partners: do not merge one by one
+    if (
+        16 * len(first) < n
+    ):  # long chains of ever better partners: do not merge a single pair a round
         first = even
         return first, first + 1
     return first, best[first]

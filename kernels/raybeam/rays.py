@@ -111,7 +111,7 @@ def unit_directions(directions: ArrayLike) -> Floats:
 def _normalised(table: Floats) -> Floats:
     """Normalise checked directions (n, 3); return the same array if all are unit vectors."""
     x, y, z = table.T
-    # No einsum or norm: those may fuse multiply and add, so the last bit would depend on the
+    # No einsum or norm, which may fuse multiply and add, so the last bit would depend on the
     # machine.
     with np.errstate(over="ignore", under="ignore"):
         squared = (x * x + y * y) + z * z

@@ -16,7 +16,7 @@ from .pattern_rays import checked_rays
 from .poses import PoseMotion, Poses, check_poses
 from .rays import Rays, check_interval
 
-_MAX_RAYS = 1 << 32  # of a scan, so that `ScanReturns` can number them
+_MAX_RAYS = 1 << 32  # of a scan: numbers of rays in `ScanReturns` have 32 bits
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,7 +36,7 @@ class Scan:
     t_min, t_max
         Closest and farthest distance of a reported hit, metres; both limits count.
     keep_every
-        Keep the hits of each group whose number is a multiple of this.
+        Number n: the first and then every n-th hit of each group is kept.
     groups
         int64 (g,): number of the first ray of each group; ascending, from 0.
     tally

@@ -3,7 +3,7 @@
 From the root down, every node is divided where the heuristic is least, over all positions between
 its boxes sorted along each of the three axes. No builder that uses only boxes gives better trees in
 general; bins, as in Embree, are a few per cent worse. All nodes of a level are divided together, in
-some tens of operations on whole arrays.
+tens of operations on whole arrays.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from .arrays import Floats, Floats32, Indices
 
 _APART = 8.0  # more than the distance of boxes within [-2, 2]
 # Levels that are divided by the heuristic; deeper ones are halved. Boxes that shrink along a line
-# would be split off one by one, and as many nodes would wait in a traversal.
+# would be split off singly, and as many nodes would wait in a traversal.
 _LEVELS = 32
 
 
@@ -107,7 +107,7 @@ def _costs(
 
 def _areas(lower: Floats32, upper: Floats32, node: Indices) -> Floats:
     """Return half the surface of the box around each position's box and its node's boxes before."""
-    # Shifted apart node by node, so that one pass over all nodes restarts at each.
+    # Shifted apart node by node, so that a single pass over all nodes restarts at each node.
     shift = _APART * node
     x, y, z = (
         np.maximum.accumulate(b + shift) - shift - (np.minimum.accumulate(a - shift) + shift)

@@ -1,6 +1,6 @@
 """The tree for traversal: a wide, flat form of a binary hierarchy.
 
-Boxes are rounded and padded outwards, so that a test of a ray against them in float32 never
+Boxes are rounded and padded outwards, so that a test of a ray and a box in float32 never
 loses a triangle that the ray meets in exact arithmetic:
 
 With u = 2**-24, local coordinates and origins within [-1, 1] and unit directions, a plane's

@@ -2,7 +2,7 @@
 
 It is the watertight test of Woop, Benthin and Wald (2013), "Watertight Ray/Triangle
 Intersection": corners are taken relative to the ray's origin and sheared so that the ray runs
-along one axis; three signed areas in the plane across it then show whether the ray passes inside.
+along an axis; three signed areas in the plane across that axis then show whether the ray passes inside.
 Shearing a corner does not depend on its triangle, and the sign of ``a * b - c * d`` is right or
 zero in floating point as long as no multiply-add is fused. Because zero counts as inside, triangles
 that share an edge or a corner leave no gap, whatever the rounding. (Signed volumes of Plücker
@@ -31,7 +31,7 @@ class ShearedRays:
     kx, ky, kz
         Axes in cyclic order; the ray advances most along kz.
     ox, oy, oz
-        Local origin along those axes.
+        Local origin along kx, ky, kz.
     sx, sy, sz
         The shear: direction along kx, ky over direction along kz, and 1 over direction along kz.
     """
