@@ -141,7 +141,7 @@ class MeshFile(Section):
         """Return the placement in the world."""
         if self.matrix is not None:
             return Transform.from_matrix(self.matrix)
-        return Transform.place(self.translation, self.rotation_deg, self.scale)
+        return Transform.from_parts(self.translation, self.rotation_deg, self.scale)
 
 
 MeshEntry = Annotated[MeshFile, by_text("file", MeshFile)]

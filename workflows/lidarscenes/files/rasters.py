@@ -31,7 +31,7 @@ from lidarsim.scene.files.scene_graph import (
     Content,
     MeshFileError,
     Raster,
-    Wanted,
+    ReadOptions,
     Window,
 )
 from lidarsim.scene.scene_mesh import SceneMesh
@@ -67,7 +67,7 @@ _UNIT_NAMES = {  # of heights, as files have them
 }
 
 
-def read_raster(_data: bytes, path: Path, wanted: Wanted) -> Content:
+def read_raster(_data: bytes, path: Path, wanted: ReadOptions) -> Content:
     """Read the first band as a mesh: a vertex at the middle of each pixel, two triangles a cell.
 
     Cells with a pixel that has no height are holes. Coordinates are those of `epsg` in

@@ -17,7 +17,7 @@ from lidarsim.scene.files.meshfile import OWN
 from lidarsim.scene.scene import Scene
 from lidarsim.scene.scene_instances import SceneInstance
 from lidarsim.scene.scene_mesh import stacked
-from lidarsim.scene.simplified import Drawn
+from lidarsim.scene.simplified import SimplifiedScene
 
 from .glb_file import glb_of
 
@@ -79,7 +79,7 @@ def _encoded(suffix: str, scene: Scene) -> bytes:
                 f"A .ply would have coordinates in steps of {step:.2g} m around x {x:.0f}, "
                 f"y {y:.0f}, because they are in single precision: write a .glb or .obj."
             )
-        drawn = Drawn.of(scene, scene.triangles).scene
+        drawn = SimplifiedScene.from_scene(scene, scene.triangles).scene
         whole = trimesh.Trimesh(drawn.vertices + drawn.origin, drawn.faces, process=False)
         data = bytes(export_ply(whole, vertex_normal=False))
         head, _, rest = data.partition(b"\ncomment ")

@@ -7,10 +7,10 @@ from urllib.parse import unquote
 
 from ...base.allowance import Allowance
 from ..masks import MaskError
-from .scene_graph import MeshFileError, Wanted
+from .scene_graph import MeshFileError, ReadOptions
 
 
-def named_file(mesh: Path, name: str, wanted: Wanted, *, moved: bool = True) -> Path | None:
+def named_file(mesh: Path, name: str, wanted: ReadOptions, *, moved: bool = True) -> Path | None:
     """Find a file that a mesh file names; None if it is not there.
 
     Names may be escaped, as URIs are by the standard but not by all programs, have backslashes, or
@@ -40,7 +40,7 @@ def named_file(mesh: Path, name: str, wanted: Wanted, *, moved: bool = True) -> 
     return None
 
 
-def image_file(mesh: Path, name: str, wanted: Wanted, allowance: Allowance) -> Path:
+def image_file(mesh: Path, name: str, wanted: ReadOptions, allowance: Allowance) -> Path:
     """Find an image that a mesh file names, as `named_file`, and count its bytes with the file's.
 
     Raises

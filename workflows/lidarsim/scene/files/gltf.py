@@ -43,7 +43,7 @@ from ..masks import (
 )
 from ..scene_mesh import SceneMesh
 from .companions import image_file, named_file
-from .gltf_animation import WIDTHS, AnimatedNodes, chosen, keys_of, played
+from .gltf_animation import WIDTHS, AnimatedNodes, find_animation, keys_of, sample_channels
 from .polygons import check_corners, fanned, unrolled
 from .scene_graph import (
     MOST_NODES,
@@ -53,11 +53,11 @@ from .scene_graph import (
     MeshFileError,
     Node,
     Piece,
-    Wanted,
-    baked,
-    instances,
-    joined,
-    settled,
+    ReadOptions,
+    bake_animation,
+    join_pieces,
+    placed_content,
+    placed_nodes,
 )
 
 # Extensions that do not change shapes, or that are supported here.
@@ -76,7 +76,7 @@ V = TypeVar("V")
 _WRAPS: dict[Any, Wrap] = {33071: "clamp", 33648: "mirror"}
 
 
-def read_gltf(data: bytes, path: Path, wanted: Wanted) -> Content:
+def read_gltf(data: bytes, path: Path, wanted: ReadOptions) -> Content:
     """Read the default scene of a file, or all nodes if it has no scenes.
 
     Without masks, triangles are solid; without these and colours, no image is read.
@@ -85,7 +85,7 @@ def read_gltf(data: bytes, path: Path, wanted: Wanted) -> Content:
     _check(header)
     reader = _Reader(header, body, path, len(data), wanted)
     if wanted.animation is None:
-        content = settled(instances(_roots(header), reader.node, path.stem))
+        content = placed_content(placed_nodes(_roots(header), reader.node, path.stem))
     else:
         content = reader.baked(wanted.animation)
     content.unit_m = 1.0
@@ -151,7 +151,7 @@ class _Reader:
         body: bytes,
         path: Path,
         size: int,
-        wanted: Wanted,
+        wanted: ReadOptions,
     ) -> None:
         self._header = header
         self._body = body
@@ -178,16 +178,16 @@ class _Reader:
 
     def baked(self, name: str) -> Content:
         """Read the scene with an animation, from its first key to its last."""
-        animation = chosen(self._header.get("animations", []), name)
+        animation = find_animation(self._header.get("animations", []), name)
         first, last = keys_of(animation, self._accessor)
         count = max(1, math.ceil((last - first) * RATE_HZ))
         self._allowance.take(32 * (count + 1) * (1 + len(animation["channels"])))
         times_s = np.linspace(first, last, count + 1)
-        return baked(self._poses(animation, times_s), times_s.tolist(), self._allowance)
+        return bake_animation(self._poses(animation, times_s), times_s.tolist(), self._allowance)
 
     def _poses(self, animation: dict[str, Any], times_s: Floats) -> Generator[Content]:
         """Content at each time of an animation, in colours at the first."""
-        self._channels = played(animation, times_s, self._accessor)
+        self._channels = sample_channels(animation, times_s, self._accessor)
         if not self._channels:
             raise MeshFileError("has an animation that moves no node: choose another")
         for index, _ in self._channels:
@@ -197,7 +197,7 @@ class _Reader:
             for kept in (self._local, self._joints, self._bent):  # of the frame before
                 kept.cache_clear()
             self._worlds.clear()
-            yield settled(instances(roots, self.node, self._path.stem), copy_all=True)
+            yield placed_content(placed_nodes(roots, self.node, self._path.stem), copy_all=True)
             self._wanted = self._wanted._replace(colours=False)
 
     def _read_local(self, index: int) -> Floats:
@@ -323,7 +323,7 @@ class _Reader:
                 vertices = self._skinned(vertices, primitive["attributes"], joints)
             return made._replace(vertices=vertices)
 
-        return joined(name, map(piece, surfaces), self._allowance)
+        return join_pieces(name, map(piece, surfaces), self._allowance)
 
     def _read_joints(self, skin: int) -> Floats:
         """Matrices (j, 4, 4) of a skin's joints, from its mesh to the scene; glTF 2.0, 3.7.3."""
@@ -442,7 +442,7 @@ class _Reader:
         """Return a piece with the mask of its material."""
         number = primitive.get("material")
         if number is not None and self._wanted.masks and len(piece.faces):
-            with self.notes.instead(self._material_name(number)):
+            with self.notes.without_mask(self._material_name(number)):
                 if found := self._texture(number):
                     texture, info = found
                     uv = self._coordinates(info, primitive, mesh)

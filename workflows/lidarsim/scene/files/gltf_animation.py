@@ -19,7 +19,7 @@ _VALUES = {"LINEAR": 1, "STEP": 1, "CUBICSPLINE": 3}  # {interpolation: values o
 AnimatedNodes = dict[tuple[int, str], Floats]  # {(node, what): its values at each time, (t, width)}
 
 
-def chosen(animations: list[dict[str, Any]], name: str) -> dict[str, Any]:
+def find_animation(animations: list[dict[str, Any]], name: str) -> dict[str, Any]:
     """Return the animation of a name, or of a number for those without names; "" for the first."""
     names = [str(one.get("name") or number) for number, one in enumerate(animations)]
     if not names:
@@ -38,7 +38,7 @@ def keys_of(animation: Mapping[str, Any], read: Callable[[Any], AnyArray]) -> tu
     return min((t[0] for t in times), default=0.0), max((t[-1] for t in times), default=0.0)
 
 
-def played(
+def sample_channels(
     animation: Mapping[str, Any], at_s: Floats, read: Callable[[Any], AnyArray]
 ) -> AnimatedNodes:
     """Return what an animation moves, at times (t,); `read` gives the numbers of an accessor."""

@@ -18,13 +18,13 @@ from pathlib import Path
 
 from ...base.errors import LidarError
 from ...base.plugins import Plugin, find_plugin, plugins_of
-from .scene_graph import Content, Wanted
+from .scene_graph import Content, ReadOptions
 
 GROUP = "lidarsim.meshes"
 
 # Content of a file, its path, and what to read besides triangles. It raises `MeshFileError` for
 # content that it does not support, and any other error for a broken file.
-MeshReader = Callable[[bytes, Path, Wanted], Content]
+MeshReader = Callable[[bytes, Path, ReadOptions], Content]
 
 
 @dataclass(frozen=True)
@@ -49,7 +49,7 @@ class MeshFormat:
     from_path
         Whether the reader opens the path itself: it gets the first bytes of the file only.
     raster
-        Whether files are rasters of heights, whose reader takes `Wanted.raster`.
+        Whether files are rasters of heights, whose reader takes `ReadOptions.raster`.
     plugin
         The plug-in that provides the row; filled in when the plug-in is loaded.
     """

@@ -22,9 +22,9 @@ from ...base.vocabulary import UNITS_M
 from ...base.words import as_python, did_you_mean, plural, printable
 from ...sensor import Track
 from ...sensor.trajectory import quaternions_of
-from ..actors import Actor, one_mesh
+from ..actors import Actor, join_meshes
 from ..colours import colours_summary
-from ..scene_instances import FARTHEST_M, SceneInstance
+from ..scene_instances import MAX_COORDINATE_M, SceneInstance
 from ..scene_mesh import SceneMesh
 from ..transform import UP_AXES, Transform
 from .mesh_formats import (
@@ -41,8 +41,8 @@ from .scene_graph import (
     ObjectClass,
     Raster,
     RasterOptions,
+    ReadOptions,
     RigidPart,
-    Wanted,
     Window,
 )
 
@@ -65,19 +65,19 @@ def warn(note: str) -> None:
 class Objects(NamedTuple):
     """Objects of a mesh file, in world coordinates."""
 
-    standing: tuple[SceneMesh | SceneInstance, ...]
-    moving: tuple[Actor, ...] = ()  # each along a `Track`
+    static: tuple[SceneMesh | SceneInstance, ...]
+    actors: tuple[Actor, ...] = ()  # each along a `Track`
     summary: str = ""  # objects, triangles, unit, axes and colours
     raster: Raster | None = None  # what was taken of one
     classes: Mapping[int, ObjectClass] = {}  # {number of ASPRS LAS: class}, of formats with types
 
-    def still(self, tell: Callable[[str], None]) -> tuple[SceneMesh | SceneInstance, ...]:
+    def at_start(self, tell: Callable[[str], None]) -> tuple[SceneMesh | SceneInstance, ...]:
         """Return all of them where they are at first; `tell` is called if that is a loss."""
-        if self.moving:
-            names = ", ".join(actor.name for actor in self.moving[:3])
-            names += ", …" * (len(self.moving) > 3)
+        if self.actors:
+            names = ", ".join(actor.name for actor in self.actors[:3])
+            names += ", …" * (len(self.actors) > 3)
             tell(f"{names}: taken where they are at first, and still")
-        return (*self.standing, *map(_at_first, self.moving))
+        return (*self.static, *map(_at_first, self.actors))
 
 
 @checked
@@ -145,7 +145,7 @@ def load_objects(
     if row.raster:  # whose reader takes the unit
         unit = None
     folders = [path.parent] if assets is None else [path.parent, Path(assets)]
-    wanted = Wanted(
+    wanted = ReadOptions(
         masks=opacity == "mask" and animation is None,
         colours=colours,
         folders=tuple(folder.resolve() for folder in folders),
@@ -160,7 +160,7 @@ def load_objects(
         up = up_axis or content.up_axis or "z"
         objects = _in_world(path, content, Transform(UP_AXES[up] * unit_m, np.zeros(3)), transform)
     _tell_notes(path, content, tell, unit_given=unit is not None)
-    standing = objects.still(lambda _: None)
+    standing = objects.at_start(lambda _: None)
     if not any((o.mesh if isinstance(o, SceneInstance) else o).has_area for o in standing):
         raise LidarError(f"{path} has no triangle with an area.")
     if up_axis is None and content.generator != GENERATOR and OWN.encode() not in data[:_HEAD]:
@@ -230,11 +230,11 @@ def load_meshes(
 ) -> tuple[SceneMesh | SceneInstance, ...]:
     """Read all objects of a mesh file, as `load_objects`, and let them stand."""
     found = load_objects(path, tell=tell, **options)
-    return found.still(lambda line: tell(f"{path} moves {line}"))
+    return found.at_start(lambda line: tell(f"{path} moves {line}"))
 
 
 def _summary(
-    meshes: Sequence[SceneMesh | SceneInstance], unit_m: float, up_axis: str, wanted: Wanted
+    meshes: Sequence[SceneMesh | SceneInstance], unit_m: float, up_axis: str, wanted: ReadOptions
 ) -> str:
     """Say what a file gave: «4 objects, 38 triangles, in m, Y-up, 1 texture»."""
     shapes = [one.mesh if isinstance(one, SceneInstance) else one for one in meshes]
@@ -263,7 +263,7 @@ def _summary(
     return ", ".join(words)
 
 
-def wrote_it(path: Path) -> bool:
+def written_by_lidarpool(path: Path) -> bool:
     """Whether lidarpool wrote a mesh file of a format without a unit: it is in metres."""
     with open_input(path) as file:
         return OWN.encode() in file.read(_HEAD)
@@ -302,7 +302,7 @@ def _lies(content: Content, meshes: Sequence[SceneMesh | SceneInstance]) -> str:
     return ""
 
 
-def _read_whole(path: Path, row: MeshFormat, data: bytes, wanted: Wanted) -> Content:
+def _read_whole(path: Path, row: MeshFormat, data: bytes, wanted: ReadOptions) -> Content:
     """Read a file of a format: at least one object, or LidarError."""
     try:
         with prefixed(path):
@@ -324,7 +324,7 @@ def _read_whole(path: Path, row: MeshFormat, data: bytes, wanted: Wanted) -> Con
         ) from error
 
 
-def _content(row: MeshFormat, path: Path, data: bytes, wanted: Wanted) -> Content:
+def _content(row: MeshFormat, path: Path, data: bytes, wanted: ReadOptions) -> Content:
     """Return what a reader finds; MeshFileError for a file of another kind, or without objects."""
     for beginning, what in _FOREIGN.items():
         if re.match(beginning, data):
@@ -410,7 +410,7 @@ def _placed(
     for place in places:
         one = one.moved(name, place.linear, place.offset)
     reach = np.abs(_corners(one)).max()
-    if reach > FARTHEST_M:
+    if reach > MAX_COORDINATE_M:
         raise LidarError(
             f"Object {one.name!r} reaches {reach:.3g} m from the origin, farther than anything "
             "on Earth: check its unit and placement."
@@ -433,13 +433,13 @@ def _actor(one: RigidPart, stem: str, upright: Transform, placed: Transform) -> 
         )
     objects = [part.moved(name, scale * upright.linear, np.zeros(3)) for part in one.objects]
     positions = turned(one.positions, matmul(placed.linear, upright.linear)) + placed.offset
-    if not np.abs(positions).max() <= FARTHEST_M:
+    if not np.abs(positions).max() <= MAX_COORDINATE_M:
         raise LidarError(
             f"Object {name!r} moves farther than anything on Earth: check its unit and placement."
         )
     turns = quaternions_of(matmul(matmul(matmul(turn, axes), one.rotations), axes.T))
     track = Track(one.times_s, positions, turns, start_s=0.0, beyond="hold")
-    return Actor(one_mesh(name, objects), track)
+    return Actor(join_meshes(name, objects), track)
 
 
 def _at_first(actor: Actor) -> SceneMesh:

@@ -16,10 +16,10 @@ from ...base.arrays import Bytes, Floats, Ints
 from ...base.input_files import InputFileError, read_input
 from ...base.words import as_text
 from ..colours import Colours, as_bytes
-from ..masks import HALF, MaskNotes, Texture, Wrap, read_colours, read_opacity, remembered
+from ..masks import HALF_OPACITY, MaskNotes, Texture, Wrap, read_colours, read_opacity, remembered
 from ..scene_mesh import Cutout
 from .companions import image_file, named_file
-from .scene_graph import SMALLER, MeshFileError, Wanted
+from .scene_graph import SMALLER, MeshFileError, ReadOptions
 
 # Options of images, and the words that follow each; -o, -s and -t have one to three numbers.
 _OPTION = re.compile(
@@ -83,7 +83,9 @@ class MtlMaterials:
     counts for nothing, since some programs write black there.
     """
 
-    def __init__(self, mesh: Path, size: int, libraries: Sequence[bytes], wanted: Wanted) -> None:
+    def __init__(
+        self, mesh: Path, size: int, libraries: Sequence[bytes], wanted: ReadOptions
+    ) -> None:
         self.notes = MaskNotes()
         self._mesh = mesh
         self._wanted = wanted
@@ -107,7 +109,7 @@ class MtlMaterials:
         """Cut the mask of a material out of triangles, whose corners (k, 3) have some of `vt`."""
         if not self._wanted.masks or name not in self._entries:
             return None
-        with self.notes.instead(as_text(name)):
+        with self.notes.without_mask(as_text(name)):
             images = self._entries[name].images
             if texture := self._texture(as_text(name), images):
                 image = images.get(b"map_d") or images[b"map_kd"]
@@ -143,9 +145,9 @@ class MtlMaterials:
                     try:
                         yield self._content(path)
                     except InputFileError as error:
-                        self.notes.gone.append(f"{name} ({error.strerror})")
+                        self.notes.missing_files.append(f"{name} ({error.strerror})")
                     except OSError:
-                        self.notes.gone.append(name)
+                        self.notes.missing_files.append(name)
 
     def _content(self, path: Path | None) -> bytes:
         if path is None or path.stat().st_size > _MOST_BYTES:
@@ -181,7 +183,7 @@ class MtlMaterials:
         opacity = self._opacity((name, grey))
         if opacity is None:
             return "solid"
-        mask = np.float32(255 * base) + np.float32(gain) * opacity >= HALF
+        mask = np.float32(255 * base) + np.float32(gain) * opacity >= HALF_OPACITY
         if mask.all() or not mask.any():
             return "solid" if mask.all() else "glass"
         return Texture(mask, (wrap, wrap), self._allowance)

@@ -24,7 +24,7 @@ from ..colours import Colours, as_bytes
 from ..scene_mesh import SceneMesh
 from .mtl import MtlMaterials
 from .polygons import check_corners, triangulated
-from .scene_graph import Content, MeshFileError, Piece, Wanted, joined
+from .scene_graph import Content, MeshFileError, Piece, ReadOptions, join_pieces
 
 
 def _ints(numbers: array[int]) -> Ints:
@@ -58,7 +58,7 @@ class _ObjPolygons:
         return corners[own], _ints(self.places)[own], kinds[own[:, 0]]
 
 
-def read_obj(data: bytes, path: Path, wanted: Wanted) -> Content:
+def read_obj(data: bytes, path: Path, wanted: ReadOptions) -> Content:
     """Read a Wavefront file: an object for each name after 'o', or 'g' without any 'o'.
 
     A repeated name begins another object after 'o', and continues the group after 'g', as the
@@ -124,7 +124,7 @@ def read_obj(data: bytes, path: Path, wanted: Wanted) -> Content:
             shown = materials.colours(material, uv, at[rows], corners_of)
             named = as_text(material) if wanted.materials else ""
             pieces.append(Piece(vertices, faces[rows], cutout, shown, named))
-        meshes += joined(name, pieces)
+        meshes += join_pieces(name, pieces)
     return Content(meshes, notes=materials.notes.lines())
 
 
@@ -177,7 +177,7 @@ def _shown(line: bytes) -> str:
 _OFF = re.compile(rb"(?:ST)?C?N?OFF(?![A-Z])", re.IGNORECASE)
 
 
-def read_off(data: bytes, path: Path, wanted: Wanted) -> Content:
+def read_off(data: bytes, path: Path, wanted: ReadOptions) -> Content:
     """Read an Object File Format file: one mesh; colours are those of vertices (COFF)."""
     text = re.sub(rb"#[^\r\n]*", b"", data).lstrip()
     found = _OFF.match(text)
@@ -216,7 +216,7 @@ def read_off(data: bytes, path: Path, wanted: Wanted) -> Content:
     shown = None
     if coloured and len(tints) == len(numbers):
         shown = _tinted(_shares(np.frombuffer(tints).reshape(-1, 3)), faces)
-    return Content(joined(path.stem, [Piece(vertices, faces, None, shown)]))
+    return Content(join_pieces(path.stem, [Piece(vertices, faces, None, shown)]))
 
 
 def _shares(colours: Floats) -> Floats:
@@ -232,7 +232,7 @@ def _tinted(shares: Floats, faces: Ints) -> Colours:
 # -- .stl ----------------------------------------------------------------------------------------
 
 
-def read_stl(data: bytes, path: Path, wanted: Wanted) -> Content:
+def read_stl(data: bytes, path: Path, wanted: ReadOptions) -> Content:
     """Read a stereolithography file: one mesh if binary, one for each solid if text."""
     announced = int.from_bytes(data[80:84], "little")
     # A few more bytes may follow; in a text file the number does not fit.
@@ -287,7 +287,7 @@ class _Element:
     properties: dict[str, tuple[str, str]] = field(default_factory=dict)
 
 
-def read_ply_mesh(data: bytes, path: Path, wanted: Wanted) -> Content:
+def read_ply_mesh(data: bytes, path: Path, wanted: ReadOptions) -> Content:
     """Read a Stanford polygon file: text or binary, faces of any mixture.
 
     Colours are red, green and blue of its vertices: integers, or real numbers from 0 to 1 or 255.
@@ -320,7 +320,7 @@ def read_ply_mesh(data: bytes, path: Path, wanted: Wanted) -> Content:
         # Integers of four bytes hold 0 to 255, too.
         small = kind.kind in "iu" and kind.itemsize < 4
         shown = _tinted(given / np.iinfo(kind).max if small else _shares(given), faces)
-    return Content(joined(path.stem, [Piece(vertices, faces, None, shown)]))
+    return Content(join_pieces(path.stem, [Piece(vertices, faces, None, shown)]))
 
 
 def read_ply_points(data: bytes) -> Floats:

@@ -65,7 +65,7 @@ class RasterOptions(NamedTuple):
     epsg: int | None = None  # coordinate system of the mesh; None for one that suits the file
 
 
-class Wanted(NamedTuple):
+class ReadOptions(NamedTuple):
     """What to read of a mesh file, besides triangles."""
 
     masks: bool
@@ -134,7 +134,9 @@ class PlacedNode(NamedTuple):
     path: tuple[str, ...] = ()  # names of the nodes that it is in, of the innermost few
 
 
-def instances(roots: Iterable[Any], node_of: Callable[[Any], Node], stem: str) -> list[PlacedNode]:
+def placed_nodes(
+    roots: Iterable[Any], node_of: Callable[[Any], Node], stem: str
+) -> list[PlacedNode]:
     """Find all places of meshes in a scene graph; a node may be in several others.
 
     `roots` are keys of the outermost nodes, and `node_of` returns the node of a key. An instance is
@@ -172,7 +174,7 @@ def instances(roots: Iterable[Any], node_of: Callable[[Any], Node], stem: str) -
     return placed
 
 
-def settled(placed: Sequence[PlacedNode], *, copy_all: bool = False) -> Content:
+def placed_content(placed: Sequence[PlacedNode], *, copy_all: bool = False) -> Content:
     """Make instances of meshes that many places share, and copy the others to their places.
 
     Meshes with masks are not copied either, since each copy would have a part of its own. With
@@ -221,7 +223,9 @@ def settled(placed: Sequence[PlacedNode], *, copy_all: bool = False) -> Content:
     return content
 
 
-def baked(poses: Iterable[Content], times_s: Sequence[float], allowance: Allowance) -> Content:
+def bake_animation(
+    poses: Iterable[Content], times_s: Sequence[float], allowance: Allowance
+) -> Content:
     """Join poses of the same meshes, at times that are even, to one content that is animated."""
     if not times_s[-1] > times_s[0]:
         raise MeshFileError("has an animation without a duration: give it two keys")
@@ -257,7 +261,7 @@ class Piece(NamedTuple):
     material: str = ""  # name of the material of all its faces, if names are wanted
 
 
-def joined(
+def join_pieces(
     name: str, pieces: Iterable[Piece], allowance: Allowance | None = None
 ) -> list[SceneMesh]:
     """Join pieces to one mesh, those with masks last; none without faces.
@@ -284,8 +288,10 @@ def joined(
         cutouts.append(Cutout(cuts[0].mask, np.concatenate([cut.uv for cut in cuts])))
     ordered = [*chain(solid, *masked.values())]
     sizes = [len(one.faces) for one in ordered]
-    coloured = colours.joined([one.colours for one in ordered], sizes)
-    named = face_materials.joined([FaceMaterials.named(one.material) for one in ordered], sizes)
+    coloured = colours.join_colours([one.colours for one in ordered], sizes)
+    named = face_materials.join_materials(
+        [FaceMaterials.named(one.material) for one in ordered], sizes
+    )
     parts = stacked((one.vertices, one.faces) for one in ordered)
     return [SceneMesh(name, *parts, tuple(cutouts), coloured, materials=named)]
 
