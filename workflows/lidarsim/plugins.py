@@ -4,4 +4,4 @@ from .scene.files.mesh_formats import MeshFormat
 from .scene.files.scene_graph import Content, MeshFileError, ReadOptions
 from .scene.scene_mesh import SceneMesh
 
-__all__ = ["Content", "MeshFileError", "MeshFormat", "SceneMesh", "ReadOptions"]
+__all__ = ["Content", "MeshFileError", "MeshFormat", "ReadOptions", "SceneMesh"]

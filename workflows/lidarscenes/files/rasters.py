@@ -27,7 +27,7 @@ from lidarsim.base.input_files import input_size, read_input
 from lidarsim.base.vocabulary import UNITS_M
 from lidarsim.base.words import plural
 from lidarsim.scene.files.scene_graph import (
-    MOST_TRIANGLES,
+    MAX_TRIANGLES,
     Content,
     MeshFileError,
     Raster,
@@ -377,7 +377,7 @@ def _check_size(
     """
     sides = np.array([columns[1] - columns[0], rows[1] - rows[0]])
     count = int(np.prod(sides.astype(object)))
-    room = most = min(memory_share() // _PIXEL_BYTES, MOST_TRIANGLES // 2)
+    room = most = min(memory_share() // _PIXEL_BYTES, MAX_TRIANGLES // 2)
     if not chosen:
         most = min(most, _UNASKED)
     if count <= most:

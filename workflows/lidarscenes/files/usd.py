@@ -34,7 +34,7 @@ from lidarsim.scene.files.companions import outside
 from lidarsim.scene.files.gltf_animation import find_animation
 from lidarsim.scene.files.polygons import triangulated
 from lidarsim.scene.files.scene_graph import (
-    MOST_NODES,
+    MAX_NODES,
     SHORTER,
     SMALLER,
     Content,
@@ -56,7 +56,7 @@ from lidarsim.scene.transform import UP_AXES
 
 from .usd_materials import Look, UsdMaterials, dressed
 
-_MOST = {"prims and copies": MOST_NODES, "poses of what moves": 1_000_000, "moving objects": 10_000}
+_MOST = {"prims and copies": MAX_NODES, "poses of what moves": 1_000_000, "moving objects": 10_000}
 _BASE = 512 * 2**20  # bytes that usd-core takes for any file
 _LATEST_S = 9e8
 _SEGMENTS = 64  # around spheres, cylinders, cones and capsules

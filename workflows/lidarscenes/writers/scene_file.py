@@ -13,7 +13,7 @@ from trimesh.exchange.ply import export_ply
 
 from lidarsim.base.errors import LidarError, explained
 from lidarsim.base.storage import Storage
-from lidarsim.scene.files.meshfile import OWN
+from lidarsim.scene.files.meshfile import FORMAT_COMMENT
 from lidarsim.scene.scene import Scene
 from lidarsim.scene.scene_instances import SceneInstance
 from lidarsim.scene.scene_mesh import stacked
@@ -83,7 +83,7 @@ def _encoded(suffix: str, scene: Scene) -> bytes:
         whole = trimesh.Trimesh(drawn.vertices + drawn.origin, drawn.faces, process=False)
         data = bytes(export_ply(whole, vertex_normal=False))
         head, _, rest = data.partition(b"\ncomment ")
-        return head + f"\ncomment {OWN}\n".encode() + rest.partition(b"\n")[2]
+        return head + f"\ncomment {FORMAT_COMMENT}\n".encode() + rest.partition(b"\n")[2]
     if suffix == ".glb":
         return glb_of(scene)
     objects = trimesh.Scene()
@@ -92,4 +92,4 @@ def _encoded(suffix: str, scene: Scene) -> bytes:
         vertices, faces = stacked((mesh.vertices, mesh.faces) for mesh in flat)
         objects.add_geometry(trimesh.Trimesh(vertices, faces, process=False), name, name)
     text = export_obj(objects, include_normals=False, include_texture=False)
-    return f"# {OWN}\n{text}".encode()
+    return f"# {FORMAT_COMMENT}\n{text}".encode()

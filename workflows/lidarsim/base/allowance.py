@@ -40,7 +40,7 @@ class Allowance:
     """
 
     def __init__(self, size: int, advice: str) -> None:
-        self.taken = 0
+        self.used_bytes = 0
         self._size = size
         self._advice = advice
         self._files: set[Path] = set()
@@ -62,17 +62,17 @@ class Allowance:
 
     def fits(self, count: int) -> bool:
         """Whether so many bytes more may be taken."""
-        return self.taken + count <= self.limit
+        return self.used_bytes + count <= self.limit
 
     def take(self, count: int) -> None:
         """Take so many bytes, before they are made.
 
         LidarError if that is more than the limit.
         """
-        self.taken += count
-        if self.taken > self.limit:
+        self.used_bytes += count
+        if self.used_bytes > self.limit:
             raise LidarError(
-                f"it has {bytes_of(self._size)} and would unpack to {bytes_of(self.taken)} or "
+                f"it has {bytes_of(self._size)} and would unpack to {bytes_of(self.used_bytes)} or "
                 f"more, of at most {bytes_of(self.limit)}: {self._advice}."
             )
 

@@ -422,7 +422,9 @@ class Scene:
             np.append(self.face_object, owners),
             self.all_names,
             self.origin,
-            colours=coloured.joined([self.colours, *(mesh.colours for mesh in meshes)], sizes),
+            colours=coloured.join_colours(
+                [self.colours, *(mesh.colours for mesh in meshes)], sizes
+            ),
         )
 
     def meshes(self) -> tuple[SceneMesh | SceneInstance, ...]:

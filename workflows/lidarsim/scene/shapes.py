@@ -110,7 +110,7 @@ def cylinder(radius: float, height: float, segments: int, name: str) -> SceneMes
 
 
 def _revolved_faces(rings: int, segments: int) -> Ints:
-    """Return the faces over `rings` circles of `segments` vertices, and two poles as last vertices."""
+    """Return faces over `rings` circles of `segments` vertices; the last two vertices are poles."""
     grid = np.arange(rings * segments).reshape(rings, segments)
     following = np.roll(grid, -1, axis=1)
     lower = grid[:-1]

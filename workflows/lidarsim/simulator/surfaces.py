@@ -306,7 +306,8 @@ class Surfaces:
     def _lookup(self) -> Lookup | None:
         """Colours of the triangles that are kept once; None if there are none."""
         bodies = self._kept
-        colours = join_colours([colours for _, _, colours in bodies], [len(f) for _, f, _ in bodies])
+        sizes = [len(faces) for _, faces, _ in bodies]
+        colours = join_colours([colours for _, _, colours in bodies], sizes)
         if colours is None:
             return None
         corners = (
