@@ -150,7 +150,7 @@ class _Node:
     nodes: list[_Node] = field(default_factory=list)
 
     def child(self, keywords: set[str]) -> _Node | None:
-        """Return the first node within that has one of the keywords, or None."""
+        """Return the first child node with a keyword of a set, or None."""
         return next((node for node in self.nodes if node.keyword in keywords), None)
 
 

@@ -43,9 +43,9 @@ class MeshFormat:
         Whether the reader can bake an animation.
     unitless
         Whether files state no unit, nor does the format.
-    begins
-        Bytes that files begin with. A file that begins so and has another ending is said to need
-        one of these endings.
+    signatures
+        Bytes at the start of files. The error of a file with such a start and another ending
+        advises to use one of these endings.
     from_path
         Whether the reader opens the path itself: it gets the first bytes of the file only.
     raster
@@ -245,7 +245,7 @@ def plugin_endings() -> tuple[str, ...]:
 
 
 def advice_on(path: str | Path) -> str:
-    """Return the advice on a file of a format that is not read; empty for other files."""
+    """Return the advice on a file of a format that is not read; empty for formats that are."""
     row = format_of(path)
     return "" if row is None else row.advice
 

@@ -322,7 +322,7 @@ def _seems_to_lie(content: Content, meshes: Sequence[SceneMesh | SceneInstance])
 
 
 def _read(path: Path, row: MeshFormat, data: bytes, options: ReadOptions) -> Content:
-    """Read a file of a format with at least one object; LidarError for any error of the file."""
+    """Read a file of a format with at least one object; LidarError for all errors."""
     try:
         with prefixed(path):
             return _checked_content(row, path, data, options)

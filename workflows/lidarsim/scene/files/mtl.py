@@ -56,7 +56,7 @@ class _Image:
         return "clamp" if clamped else "repeat"
 
     def coordinates(self, vt: Floats) -> Floats:
-        """Return coordinates (c, 2) on the image, v growing downwards, from the file's `vt` (c, 2)."""
+        """Return coordinates (c, 2) on the image, v downwards, from the file's `vt` (c, 2)."""
         scale_u, scale_v = self._numbers(b"-s", 1)
         offset_u, offset_v = self._numbers(b"-o", 0)
         u = vt[:, 0] * scale_u + offset_u
@@ -147,7 +147,7 @@ class MtlMaterials:
         return colours
 
     def _files(self, libraries: Sequence[bytes]) -> Iterator[bytes]:
-        """Yield the contents of the files that lines name: a file a line, or several between spaces."""
+        """Yield the contents of the files that lines name: a file, or several between spaces."""
         read: set[Path | None] = set()
         for names in map(as_text, libraries):
             for name in [names] if self._file(names) else names.split():
@@ -162,7 +162,7 @@ class MtlMaterials:
                         self.notes.missing_files.append(name)
 
     def _content(self, path: Path | None) -> bytes:
-        """Return the content of a file of materials; OSError if it is missing or too large."""
+        """Return the content of a file of materials; OSError for a missing or large file."""
         if path is None or path.stat().st_size > _MAX_BYTES:
             raise FileNotFoundError
         return read_input(path)

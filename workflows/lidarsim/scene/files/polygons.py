@@ -55,18 +55,21 @@ def triangulated(vertices: Floats, corners: Ints, sizes: Ints) -> Ints:
         triangle_rows = stops[polygons, None] - (size - 2) + np.arange(size - 2)
         triangles[triangle_rows] = fanned(polygon_corners)
         if size > 4:
-            for i in np.flatnonzero(
-                _reflex_corners(vertices[polygon_corners]).any(axis=1)
-            ).tolist():
-                clipped = with_holes(vertices, [polygon_corners[i]])
-                if len(clipped) < size - 2 and _leaves_gaps(
-                    vertices[polygon_corners[i]], vertices[clipped]
-                ):
-                    clipped = polygon_corners[i][_all_triangles(vertices[polygon_corners[i]])]
+            has_reflex = _reflex_corners(vertices[polygon_corners]).any(axis=1)
+            for i in np.flatnonzero(has_reflex).tolist():
+                clipped = _clipped_polygon(vertices, polygon_corners[i])
                 if len(clipped):  # else neither polygon nor fan have an area
                     triangles[triangle_rows[i]] = -1
                     triangles[triangle_rows[i, : len(clipped)]] = clipped
     return triangles[triangles[:, 0] >= 0]
+
+
+def _clipped_polygon(vertices: Floats, corners: Ints) -> Ints:
+    """Return the triangles (t, 3) of a polygon with reflex corners; none without an area."""
+    clipped = with_holes(vertices, [corners])
+    if len(clipped) < len(corners) - 2 and _leaves_gaps(vertices[corners], vertices[clipped]):
+        return np.asarray(corners[_all_triangles(vertices[corners])])
+    return clipped
 
 
 def _from_reflex_corner(vertices: Floats, rows: Ints) -> Ints:
