@@ -113,7 +113,8 @@ class PictureContent:
         samples = samples_per_actor(scene.actors, PLACES_MOST)
         actors = tuple(_sampled(actor, survey.duration_ns, samples) for actor in scene.actors)
         sensors = sensor_positions(survey)
-        drawn = SimplifiedScene.from_scene(cut_masks(scene), near_positions=[sensor.positions for sensor in sensors])
+        positions = [sensor.positions for sensor in sensors]
+        drawn = SimplifiedScene.from_scene(cut_masks(scene), near_positions=positions)
         wavelength_nm = survey.carried[0].sensor.optics.wavelength_nm  # of the first sensor
         kinds = scene.surface_kinds
         materials = MaterialTable.of(survey.materials, kinds, wavelength_nm, scene.has_voxels)

@@ -20,7 +20,7 @@ from uuid import uuid4
 
 import numpy as np
 
-from lidarsim.base.allowance import LEAST, bytes_of, memory_share
+from lidarsim.base.allowance import MIN_LIMIT_BYTES, bytes_of, memory_share
 from lidarsim.base.arrays import AnyArray, Bools, Floats
 from lidarsim.base.elementary import decade
 from lidarsim.base.input_files import input_size, read_input
@@ -120,7 +120,7 @@ def _opened(path: Path) -> Iterator[Any]:
         stack.enter_context(warnings.catch_warnings())
         warnings.simplefilter("ignore", NotGeoreferencedWarning)
         alone = {"GDAL_PAM_ENABLED": False, "GDAL_DISABLE_READDIR_ON_OPEN": "EMPTY_DIR"}
-        stack.enter_context(rasterio.Env(GDAL_CACHEMAX=LEAST, **alone))
+        stack.enter_context(rasterio.Env(GDAL_CACHEMAX=MIN_LIMIT_BYTES, **alone))
         try:
             if driver == "GTiff":  # which may be larger than the memory, and reads a window
                 input_size(path)

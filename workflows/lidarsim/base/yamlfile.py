@@ -30,7 +30,7 @@ class _Loader(yaml.SafeLoader):
     def compose_node(self, parent: yaml.Node | None, index: Any) -> yaml.Node | None:
         """Compose a node; an alias counts as often as it is used."""
         event: Any = self.peek_event()
-        before = self._allowance.taken
+        before = self._allowance.used_bytes
         self._allowance.take(_NODE_BYTES)
         node: Any = super().compose_node(parent, index)
         if isinstance(event, yaml.AliasEvent):
@@ -40,7 +40,7 @@ class _Loader(yaml.SafeLoader):
                 raise yaml.composer.ComposerError(None, None, problem, mark)
             self._allowance.take(self._taken[node])
         elif event.anchor is not None:
-            self._taken[node] = self._allowance.taken - before
+            self._taken[node] = self._allowance.used_bytes - before
         return node
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
