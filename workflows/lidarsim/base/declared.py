@@ -81,7 +81,7 @@ def by_text(field: str, kind: Any) -> Any:
 
 
 def one_of(*fields: str) -> Any:
-    """Check that a section has exactly one value of the given fields."""
+    """Check that a section has exactly a single value among given fields."""
     *first_fields, last_field = fields
     if first_fields[1:]:
         words = f"one of {', '.join(first_fields)} and"

@@ -8,7 +8,7 @@ from .arrays import Ints
 
 
 def even_indices(count: int, max_count: int) -> Ints:
-    """Return at most `max_count` indices below `count`, ascending, an index from each of equal parts.
+    """Return at most `max_count` indices below `count`, ascending, of equal parts.
 
     All indices are returned if `count` is at most `max_count`; else the choice within each part is
     random, and the same each time: of points ordered by scan and ray, every n-th could be of few
