@@ -612,7 +612,7 @@ def test_bad_files_are_refused_in_a_line(tmp_path, capfd, text, message):
 
 
 def test_few_lines_do_not_make_millions_of_objects(tmp_path):
-    count = nodes.MOST_NODES + 1
+    count = nodes.MAX_NODES + 1
     text = f"int[] protoIndices = [{'0,' * count}]\nrel prototypes = </F/K>\n" + prim("K")
     text += f"point3f[] positions = [{'(0,0,0),' * count}]\n"
     with pytest.raises(LidarError, match="more than 200,000 prims and copies"):
@@ -637,8 +637,8 @@ def test_a_library_that_dies_or_wants_too_much_ends_itself_only(tmp_path, monkey
             write(tmp_path / "m.usda", prim("Quad", text=QUAD + f"int[] a = [{'1,' * 10**6}]"))
         )
     monkeypatch.undo()
-    monkeypatch.setattr(allowance, "LEAST", 1000)
-    monkeypatch.setattr(allowance, "TIMES", 0.01)
+    monkeypatch.setattr(allowance, "MIN_LIMIT_BYTES", 1000)
+    monkeypatch.setattr(allowance, "UNPACKED_TIMES", 0.01)
     with pytest.raises(LidarError, match="would unpack to"):
         load_meshes(
             write(
