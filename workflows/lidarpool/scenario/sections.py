@@ -14,8 +14,8 @@ from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Fie
 from lidarsim.base.declared import (
     AngleDeg,
     Coordinate,
-    MinMax,
     Four,
+    MinMax,
     Seed,
     Several,
     Text,

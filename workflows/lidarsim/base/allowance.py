@@ -75,7 +75,7 @@ class Allowance:
 
 @cache
 def memory() -> int:
-    """Memory that this process may use, bytes.
+    """Return the memory that this process may use, bytes.
 
     The minimum of the machine's memory and the limits of control groups and of `ulimit -m`.
     """

@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike
 from .arrays import Floats, owned
 from .elementary_scalars import arctan2_of, exp_of, log_of, sin_cos_of
 
-_FEW = 1 << 12  # numbers: some 20 ms
+_MAX_INTERPRETED = 1 << 12  # numbers that Python computes, in about 20 ms
 
 
 def sin_cos(x: ArrayLike) -> tuple[Floats, Floats]:
@@ -124,7 +124,7 @@ def _apply(
     arrays = [np.asarray(array, np.float64) for array in arguments]
     shape = arrays[0].shape
     output = np.empty((results, arrays[0].size))
-    if arrays[0].size <= _FEW and "numba" not in sys.modules:
+    if arrays[0].size <= _MAX_INTERPRETED and "numba" not in sys.modules:
         for k, numbers in enumerate(
             zip(*(array.ravel().tolist() for array in arrays), strict=True)
         ):

@@ -124,7 +124,7 @@ class Colours:
         The mean is that of 4 points of the face, or of 100 if there are few faces.
         """
         mean_colours = np.empty((len(self), 3), np.uint8)
-        steps = 10 if len(self) <= FEW_FACES else 2
+        steps = 10 if len(self) <= MAX_DENSE_FACES else 2
         # Centres of the pieces into which lines parallel to the edges cut a face.
         i, j = (n.ravel() for n in np.mgrid[:steps, :steps])
         upright = np.stack([i, j], axis=1)[i + j < steps] + 1 / 3
@@ -142,7 +142,7 @@ class Colours:
         return mean_colours
 
 
-FEW_FACES = 20_000
+MAX_DENSE_FACES = 20_000  # of meshes whose colours are averaged from 100 points a face
 _UNIT = np.array([[[0.0, 0, 0], [1, 0, 0], [0, 1, 0]]])
 
 

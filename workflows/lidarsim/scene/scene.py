@@ -33,7 +33,7 @@ from .shapes import seed_objects
 from .transform import Transform
 
 # Single precision, which ray casters use, resolves a millimetre up to this distance.
-FAR_FROM_ZERO_M = 10_000.0
+MAX_LOCAL_COORDINATE_M = 10_000.0
 
 _log = logging.getLogger(__name__)
 
@@ -531,7 +531,7 @@ def local_origin(vertices: Floats) -> Floats:
     gives the same coordinates.
     """
     middle = (vertices.min(axis=0) + vertices.max(axis=0)) / 2
-    if np.abs(middle).max() <= FAR_FROM_ZERO_M:
+    if np.abs(middle).max() <= MAX_LOCAL_COORDINATE_M:
         return np.zeros(3)
     return np.round(middle)
 

@@ -320,13 +320,13 @@ def join_pieces(
 
 def _compacted_piece(piece: Piece, allowance: Allowance | None) -> Piece:
     """Return a piece without unused vertices, which many pieces may share."""
-    vertices, faces, cutout, painted, material = piece
+    vertices, faces, cutout, face_colours, material = piece
     check_corners(faces, len(vertices))
     if allowance is not None:
         extra = 0 if cutout is None else cutout.uv.nbytes
-        extra += 0 if painted is None else 40 * len(faces)
+        extra += 0 if face_colours is None else 40 * len(faces)
         allowance.take(faces.nbytes + extra)
     vertices, faces = compacted(vertices, faces)
     if allowance is not None:
         allowance.take(24 * len(vertices))  # in double precision
-    return Piece(vertices, faces, cutout, painted, material)
+    return Piece(vertices, faces, cutout, face_colours, material)
