@@ -32,7 +32,7 @@ from lidarpool import (
     load_sensor,
 )
 from lidarscenes.procedural.city import city
-from lidarsim.scene.actors import box, one_mesh
+from lidarsim.scene.actors import box, join_meshes
 from lidarsim.scene.files.meshfile import load_objects
 from lidarsim.scene.scene_mesh import SceneMesh
 from lidarsim.simulator.batch import columns_of
@@ -94,7 +94,7 @@ def cars(count: int, mesh: SceneMesh, seed: int) -> list[Actor]:
 
 def people(count: int, seed: int, *, walking: bool) -> list[Actor]:
     """Make copies of one person around the sensor, at 1.4 m/s, each in another phase."""
-    mesh = one_mesh("Person", load_objects(PERSON, animation="Walk").standing)
+    mesh = join_meshes("Person", load_objects(PERSON, animation="Walk").static)
     assert mesh.animation is not None
     mesh = replace(mesh, animation=replace(mesh.animation, speed_m_s=1.4) if walking else None)
     random = np.random.default_rng(seed)

@@ -62,7 +62,7 @@ def read(path, **options):
     """Return the mesh, what was taken, and the notes."""
     notes = []
     found = load_objects(path, tell=notes.append, **options)
-    (mesh,) = found.standing
+    (mesh,) = found.static
     return mesh, found.raster, [note.removeprefix(f"{path} ") for note in notes]
 
 

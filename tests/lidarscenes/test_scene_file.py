@@ -63,7 +63,7 @@ def test_colours_come_back_from_a_glb_file(tmp_path):
     card = replace(cube, name="Card", cutouts=(Cutout(mask, uv),), colours=Colours.plain(red, 12))
     copies = np.tile(np.eye(4), (3, 1, 1))
     copies[:, 0, 3] = 5, 9, 13
-    placed = SceneInstance.several(replace(meshes[4], name="Copy"), copies, "Copy")
+    placed = SceneInstance.from_matrices(replace(meshes[4], name="Copy"), copies, "Copy")
     path = write_scene(tmp_path / "all.glb", Scene.from_meshes([*meshes, card, *placed]))
     wanted = {mesh.name: (mesh, np.zeros(3)) for mesh in [*meshes, card]}
     names = ("Copy", "Copy.2", "Copy.3")

@@ -189,7 +189,7 @@ def test_moving_prims_are_actors(tmp_path):
         turned = quad @ [[c, s, 0], [-s, c, 0], [0, 0, 1]] + [x, 0, 0]
         np.testing.assert_allclose(found["Wheel"], turned, atol=1e-3)
     # Its axes and its path follow the placement and the unit.
-    place = Transform.place((0, 0, 7), (0, 0, 90), 2)
+    place = Transform.from_parts((0, 0, 7), (0, 0, 90), 2)
     found = vertices(path, 0.5, unit="ft", transform=place)["Wheel"]
     local = (turned_about_z(quad, 180) + np.array([3, 0, 0])) * 0.3048
     expected = turned_about_z(2 * local, 90) + np.array([0, 0, 7])
@@ -237,7 +237,7 @@ def test_what_moves_otherwise_stands_and_is_noted(tmp_path):
     built = build(Scenario.load(path))
     assert not built.scene.actors and built.scene.bounds[0, 0] == 1
     assert "nothing stands in the scene" in advice(built)[0]
-    uneven = Transform.place(scale=(1, 2, 1))
+    uneven = Transform.from_parts(scale=(1, 2, 1))
     with pytest.raises(LidarError, match="'Car' moves, and its placement scales it unevenly"):
         Scene.load(path, transform=uneven)
 
@@ -370,7 +370,7 @@ def evaluated(path, code, animation=None):
 
 def played(path, name, code, first=1, rate_hz=24):
     """Vertices of the first object at a time code of an animation."""
-    own = load_objects(path, animation=name).standing[0].animation
+    own = load_objects(path, animation=name).static[0].animation
     return own.at(np.atleast_1d((code - first) / rate_hz / own.step_s))[0]
 
 
@@ -380,7 +380,7 @@ def test_actors_play_animations_as_usdskel_evaluates_them(tmp_path, name):
     turns = sampled("rotateZ", t1=0, t40=90) + order("rotateZ")
     moves = sampled("translate", t1="(1, 0, 0)", t30="(0, 2, 0)") + order("translate")
     path = person(tmp_path / "m.usda", bones=moves, skin=turns)
-    own = load_objects(path, animation=name).standing[0].animation
+    own = load_objects(path, animation=name).static[0].animation
     assert own.vertices.shape == (99, 6, 3) and own.duration_s == pytest.approx(39 / 24)
     for frame in (0, 1, 47, 98):
         expected = evaluated(path, 1 + 39 * frame / 98, name)
@@ -403,7 +403,7 @@ def test_what_stands_is_bent_at_the_first_time_also_between_samples(tmp_path):
     (tmp_path / "blocked.usda").write_text(text.replace("13: [", "6: None, 13: ["))
     blocked, _ = told(tmp_path / "blocked.usda")
     assert not np.allclose(blocked[0].vertices, objects[0].vertices)
-    own = load_objects(path, animation="").standing[0].animation
+    own = load_objects(path, animation="").static[0].animation
     assert own.duration_s == pytest.approx(11.7 / 24)
     np.testing.assert_allclose(own.vertices[-1], evaluated(path, 19), atol=2e-6)
 
@@ -422,7 +422,7 @@ def test_instances_prims_and_points_that_move_are_in_animations(tmp_path):
     path = write(tmp_path / "m.usda", prim("Flag", text=text), wheel, *men, stage=stage)
     found = load_objects(path, animation="Walk")
     assert not found.moving
-    flag, wheel, *both = (one.animation.vertices for one in found.standing)
+    flag, wheel, *both = (one.animation.vertices for one in found.static)
     np.testing.assert_allclose(flag[45], [(0, 0, 0), (1, 0, 0), (1, 1, 3), (0, 1, 1.5)])
     np.testing.assert_allclose(wheel[15, 1], [0, 2, 0], atol=1e-9)
     for x, one in zip((0, 5), both, strict=True):
@@ -430,7 +430,7 @@ def test_instances_prims_and_points_that_move_are_in_animations(tmp_path):
         np.testing.assert_allclose(one[24], want, atol=2e-6)
     # Without skeletons it has no name.
     path = write(tmp_path / "flag.usda", prim("Flag", text=text), stage=stage)
-    assert load_objects(path, animation="").standing[0].animation.vertices.shape == (61, 4, 3)
+    assert load_objects(path, animation="").static[0].animation.vertices.shape == (61, 4, 3)
 
 
 @pytest.mark.parametrize(
@@ -612,7 +612,7 @@ def test_bad_files_are_refused_in_a_line(tmp_path, capfd, text, message):
 
 
 def test_few_lines_do_not_make_millions_of_objects(tmp_path):
-    count = nodes.MOST_NODES + 1
+    count = nodes.MAX_NODES + 1
     text = f"int[] protoIndices = [{'0,' * count}]\nrel prototypes = </F/K>\n" + prim("K")
     text += f"point3f[] positions = [{'(0,0,0),' * count}]\n"
     with pytest.raises(LidarError, match="more than 200,000 prims and copies"):
@@ -637,8 +637,8 @@ def test_a_library_that_dies_or_wants_too_much_ends_itself_only(tmp_path, monkey
             write(tmp_path / "m.usda", prim("Quad", text=QUAD + f"int[] a = [{'1,' * 10**6}]"))
         )
     monkeypatch.undo()
-    monkeypatch.setattr(allowance, "LEAST", 1000)
-    monkeypatch.setattr(allowance, "TIMES", 0.01)
+    monkeypatch.setattr(allowance, "MIN_LIMIT_BYTES", 1000)
+    monkeypatch.setattr(allowance, "UNPACKED_TIMES", 0.01)
     with pytest.raises(LidarError, match="would unpack to"):
         load_meshes(
             write(

@@ -184,8 +184,8 @@ def test_bombs_take_little_memory_and_say_what_they_are(bombs):
 
 @pytest.mark.parametrize("suffix", [".glb", ".3mf"])
 def test_honest_files_are_far_below_the_limit(tmp_path, monkeypatch, suffix):
-    monkeypatch.setattr(allowance, "LEAST", 0)
-    monkeypatch.setattr(allowance, "TIMES", 50)
+    monkeypatch.setattr(allowance, "MIN_LIMIT_BYTES", 0)
+    monkeypatch.setattr(allowance, "UNPACKED_TIMES", 50)
     path = tmp_path / f"ball{suffix}"
     trimesh.creation.icosphere(5).export(path)
     assert len(load_meshes(path)[0].faces) == 20480

@@ -16,8 +16,8 @@ from lidarpool.scenario.advice import advice
 from lidarpool.scenario.build import build
 from lidarpool.scenario.scenario import Scenario
 from lidarsim.columns.cloud import Cloud
-from lidarsim.scene.actors import box, one_mesh, shapes_of
-from lidarsim.scene.animation import PICTURED, Animation
+from lidarsim.scene.actors import box, distinct_meshes, join_meshes
+from lidarsim.scene.animation import MAX_PICTURED_VERTICES, Animation
 from lidarsim.scene.files.meshfile import load_objects
 from lidarsim.scene.scene_mesh import SceneMesh
 from lidarsim.scene.wheels import rolling
@@ -170,7 +170,7 @@ def test_skins_targets_and_nodes_are_where_the_specification_says(tmp_path, how)
             2 if path != "weights" else 0, path, KEYS, np.array(values, "f").reshape(-1), how
         )
     found = load_objects(made.write(tmp_path / "m.gltf"), animation="Move", up_axis="z")
-    mesh = one_mesh("Strip", found.standing)
+    mesh = join_meshes("Strip", found.static)
     poses = mesh.animation.vertices
     assert poses.shape == (61, 5, 3) and mesh.animation.step_s == pytest.approx(1 / 60)
     for frame in (0, 7, 30, 52, 60):
@@ -186,7 +186,7 @@ def test_a_wheel_of_a_file_turns_as_animated_even_if_it_shrinks_to_nothing(tmp_p
     made.moved(0, "rotation", [0, 1], [0, 0, 0, 1, 0, 0, 1, 0])
     made.moved(0, "scale", [0, 0.5, 1], [1, 1, 1, 0, 0, 0, 1, 1, 1])
     found = load_objects(made.write(tmp_path / "m.gltf"), animation="", up_axis="z")
-    poses = found.standing[0].animation.vertices
+    poses = found.static[0].animation.vertices
     start = poses[0] - 9
     np.testing.assert_allclose(poses[30], 9 + 0 * start, atol=1e-6)
     np.testing.assert_allclose(poses[60], 9 + start * [-1, -1, 1], atol=1e-5)
@@ -250,7 +250,7 @@ def test_where_the_node_of_a_skin_is_does_not_matter(tmp_path):
         if shrinks:
             made.moved(0, "scale", [0.25, 0.75, 1.25], [1, 1, 1, 0, 0, 0, 1, 1, 1])
         found = load_objects(made.write(tmp_path / "m.gltf"), animation="Move")
-        poses.append(found.standing[0].animation.vertices)
+        poses.append(found.static[0].animation.vertices)
     assert np.array_equal(*poses)
 
 
@@ -275,7 +275,7 @@ def test_a_chain_of_many_joints(tmp_path):
     for joint in range(1, count + 1):
         made.moved(joint, "rotation", [0, 1], [0, 0, 0, 1, 0, 0, np.sin(half), np.cos(half)])
     found = load_objects(made.write(tmp_path / "m.gltf"), animation="Move", up_axis="z")
-    poses = found.standing[0].animation.vertices
+    poses = found.static[0].animation.vertices
     np.testing.assert_allclose(poses[0], CORNERS, atol=1e-4)
     tip = np.array([0, (count - 1) / count, 0])
     x, y, z = (CORNERS - tip).T
@@ -298,7 +298,7 @@ FLOOR = replace(
 @pytest.fixture(scope="module")
 def walker():
     """The example's person, whose animation is made for 1.4 m/s."""
-    mesh = one_mesh("Walker", load_objects(PERSON, animation="Walk").standing)
+    mesh = join_meshes("Walker", load_objects(PERSON, animation="Walk").static)
     return replace(mesh, animation=replace(mesh.animation, speed_m_s=1.4))
 
 
@@ -395,7 +395,7 @@ def test_the_person_of_the_examples_walks_without_sliding(walker):
 def test_copies_share_their_poses_and_backends_agree(walker):
     ways = [Track([0, 1], [[x, y, 0], [x, y + 1.4, 0]]) for x, y in ((4, 0), (-5, 2), (3, -6))]
     actors = [Actor(replace(walker, name=f"W{k}"), way, k / 3) for k, way in enumerate(ways)]
-    meshes, which = shapes_of(actors)
+    meshes, which = distinct_meshes(actors)
     assert len(meshes) == 1 and which.tolist() == [0, 0, 0]
     scene = Scene.from_meshes([FLOOR]).with_actors(actors)
     survey = Survey(Sensor.grid(500, 24), [(0, 0, 1)], steps=36, keep_every=1,
@@ -489,7 +489,7 @@ def test_boxes_are_as_large_as_the_poses_between_two_times(repeat):
         times = np.unique([begin, *inner, end])
         ways = np.append(times[:-1] + 1e-9, times[1:] - 1e-9) if len(times) > 1 else times
         frames = animation.frames(ways)
-        shown = animation.at(frames)[0]
+        shown = animation.vertices_at(frames)[0]
         kept = animation.vertices[np.append(np.floor(frames), np.ceil(frames)).astype(int)]
         for poses, sign in ((shown, 1), (kept, -1)):  # it holds the first, and no more than these
             corners = np.stack([poses.min(axis=(0, 1)), poses.max(axis=(0, 1))])
@@ -540,7 +540,7 @@ def test_poses_of_many_vertices_are_fewer_in_pictures(tmp_path):
     faces = np.stack([np.arange(2), np.arange(2) + 1, np.arange(2) + 2], axis=1)
     mesh = SceneMesh("Ring", points, faces, animation=Animation(poses, 1 / 60, repeat=False))
     (ring,) = drawn_again([Actor(mesh)], tmp_path / "p.npz")
-    assert ring.mesh.animation.vertices.shape == (PICTURED // 50_000, 50_000, 3)
+    assert ring.mesh.animation.vertices.shape == (MAX_PICTURED_VERTICES // 50_000, 50_000, 3)
     for time_ns in (0, 0.77e9, 2e9, 2.5e9):
         want = points * (1 + min(time_ns / 2e9, 1))
         np.testing.assert_allclose(ring.placed(time_ns).vertices, want, atol=1e-3)
@@ -582,11 +582,11 @@ def test_wheels_turn_by_speed_over_radius():
     parts = [box("Body", (4, 1.6, 1)), ring("wheel_front", 0.3, [1.2, 0.8, 0.3]),
              ring("wheel_rear", 0.6, [-1.2, 0.8, 0.6])]  # fmt: skip
     notes = []
-    mesh = one_mesh("Car", rolling(parts, ["wheel*"], notes.append))
+    mesh = join_meshes("Car", rolling(parts, ["wheel*"], notes.append))
     assert not notes and mesh.animation.duration_s == pytest.approx(2 * np.pi * 0.6)
     actor = Actor(mesh, Track([0, 10], [[0, 0, 0], [50, 0, 0]]))
     frames, rates = actor.played(np.array([0.1, 0.37]) * 1e9)
-    places, moves = mesh.animation.at(frames)
+    places, moves = mesh.animation.vertices_at(frames)
     velocity = moves * rates[:, None, None] + [5, 0, 0]
     assert np.array_equal(velocity[:, :8], np.full((2, 8, 3), [5.0, 0, 0]))
     for wheel, radius, middle in ((slice(8, 56), 0.3, 1.2), (slice(56, 104), 0.6, -1.2)):

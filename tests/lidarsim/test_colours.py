@@ -303,7 +303,7 @@ def test_faces_without_a_material_may_precede_those_with_one(tmp_path):
 
 
 def test_large_images_are_made_smaller(tmp_path, monkeypatch, caplog):
-    monkeypatch.setattr(masks, "SIDE_MOST", 36)
+    monkeypatch.setattr(masks, "MAX_SIDE_PIXELS", 36)
     header, body = opaque(png())
     write(tmp_path / "m.glb", glb(header, body))
     (picture,) = Scene.load(tmp_path / "m.glb", colours=True).colours.images

@@ -32,7 +32,7 @@ from lidarpool.scenario.build import build
 from lidarpool.scenario.scenario import Scenario
 from lidarscenes.writers.scene_file import write_scene
 from lidarsim.columns.table import SCAN
-from lidarsim.scene.actors import one_mesh
+from lidarsim.scene.actors import join_meshes
 from lidarsim.scene.face_materials import FaceMaterials
 from lidarsim.scene.scene_mesh import Cutout
 from lidarsim.simulator.batch import columns_of
@@ -390,7 +390,7 @@ def test_instances_share_the_materials_of_their_mesh():
 
 def test_actors_have_materials_and_one_mesh_keeps_them():
     wheel = replace(block("Wheel", (0.5, 0.2, 0.5)), materials=FaceMaterials(("Rubber",)))
-    body = one_mesh("Car", [front("Body"), wheel])
+    body = join_meshes("Car", [front("Body"), wheel])
     assert body.materials.names == ("Brick", "Glass", "Rubber")
     assert np.bincount(body.materials.index).tolist() == [2, 2, len(wheel.faces)]
     actor = Actor(front(), Track([0, 1], [[0, 0, 0], [0, 1e-4, 0]], [[0, 0, 0, 1]] * 2))
@@ -434,7 +434,7 @@ def test_light_passes_through_the_faces_of_glass_alone():
 def test_a_part_of_a_mesh_holds_water_if_its_faces_are_closed():
     pool = block("Pool", (2, 2, 2))
     rim = block("Rim", (0.5, 0.5, 0.5), (0, 5, 0))
-    mesh = one_mesh(
+    mesh = join_meshes(
         "Pool",
         [
             replace(pool, materials=FaceMaterials(("Water",))),

@@ -290,7 +290,7 @@ def test_an_image_beside_is_read_and_too_large_ones_are_not(tmp_path, monkeypatc
         return path
 
     header["images"] = [{"uri": bomb(tmp_path / "large.png", 3000).name}]
-    monkeypatch.setattr(allowance, "LEAST", 1000)
+    monkeypatch.setattr(allowance, "MIN_LIMIT_BYTES", 1000)
     assert not load(tmp_path / "m.glb", header, body).masked
     assert "Leaf (large.png has too many pixels)" in caplog.text
     monkeypatch.setattr(Image, "MAX_IMAGE_PIXELS", 1000)

@@ -152,7 +152,7 @@ def test_a_scene_farther_than_anything_on_earth(tmp_path):
 def test_mirrored_objects_keep_their_outside(tmp_path, two_objects):
     mesh = two_objects.to_mesh()
     path = write(tmp_path / "t.ply", mesh.export(file_type="ply"))
-    mirrored = load_meshes(path, transform=Transform.place(scale=(-1, 1, 1)))[0]
+    mirrored = load_meshes(path, transform=Transform.from_parts(scale=(-1, 1, 1)))[0]
     assert trimesh.Trimesh(mirrored.vertices, mirrored.faces, process=False).volume == (
         pytest.approx(mesh.volume)
     )

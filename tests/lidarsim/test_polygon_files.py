@@ -15,7 +15,7 @@ from tests.meshes import PLY, write
 
 from lidarsim.base.errors import LidarError
 from lidarsim.scene.files.meshfile import load_meshes
-from lidarsim.scene.files.polygons import MOST_CORNERS, triangulated, with_holes
+from lidarsim.scene.files.polygons import MAX_CORNERS, triangulated, with_holes
 
 CORNERS = np.array([[0, 0, 0], [2, 0, 0], [2, 2, 0], [0, 2, 0], [1, 1, 3]], dtype=float)
 ROOF = [[0, 3, 2, 1], [0, 1, 4], [1, 2, 4], [2, 3, 4], [3, 0, 4]]  # a square under four triangles
@@ -288,8 +288,8 @@ def test_corners_that_are_not_there():
 
 
 def test_an_outline_without_end_is_refused_unless_it_is_convex():
-    angles = np.linspace(0, 2 * np.pi, MOST_CORNERS + 1, endpoint=False)
+    angles = np.linspace(0, 2 * np.pi, MAX_CORNERS + 1, endpoint=False)
     circle = np.stack([np.cos(angles), np.sin(angles), 0 * angles], axis=1)
-    assert len(cut(circle)) == MOST_CORNERS - 1
+    assert len(cut(circle)) == MAX_CORNERS - 1
     with pytest.raises(ValueError, match="is not convex: triangulate it"):
         cut(circle * (1 + 0.5 * (np.arange(len(angles)) % 2))[:, None])

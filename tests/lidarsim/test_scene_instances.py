@@ -23,7 +23,7 @@ from lidarpool import (
     load_sensor,
 )
 from lidarsim.columns.table import SCAN
-from lidarsim.scene.actors import box, one_mesh
+from lidarsim.scene.actors import box, join_meshes
 from lidarsim.scene.scene_mesh import Cutout
 from lidarsim.scene.shapes import seed_objects
 from lidarsim.simulator.batch import columns_of
@@ -37,7 +37,7 @@ GRATE = SceneMesh(
     np.array([[0, 1, 2], [0, 2, 3]]),
     (Cutout(np.array([[True, False]]), np.array([[[0, 0], [2, 0], [2, 2]]], np.float32)),),
 )
-BUSH = one_mesh("Bush", [box("Stem", (1, 2, 1)), GRATE])  # solid and with holes
+BUSH = join_meshes("Bush", [box("Stem", (1, 2, 1)), GRATE])  # solid and with holes
 MESHES = (SPHERE, box("Crate", (2, 1, 1.5)), BUSH)
 CAR = Actor(box("Car", (4.5, 1.8, 1.5)), Track([0, 1], [[6, -3, 0], [6, 7, 0]]))
 PHYSICS = [
@@ -149,7 +149,7 @@ def test_instances_can_be_given_by_a_pose():
 
 def test_several_instances_are_refused_as_one_is():
     flat = np.tile(np.eye(4), (3, 1, 1))
-    assert [one.name for one in SceneInstance.several(SPHERE, flat, "V")] == ["V"] * 3
+    assert [one.name for one in SceneInstance.from_matrices(SPHERE, flat, "V")] == ["V"] * 3
     flat[1, 2, 2] = 0
     with pytest.raises(LidarError, match="flattens the mesh"):
-        SceneInstance.several(SPHERE, flat, "V")
+        SceneInstance.from_matrices(SPHERE, flat, "V")

@@ -226,7 +226,7 @@ def header(shape):
     ids=range(9),
 )
 def test_others_are_refused_in_a_line(tmp_path, monkeypatch, data, words):
-    monkeypatch.setattr(allowance, "LEAST", 2**20)
+    monkeypatch.setattr(allowance, "MIN_LIMIT_BYTES", 2**20)
     path = tmp_path / "0000.npz"
     path.write_bytes(data)
     for read in (None, path.read_bytes):

@@ -26,7 +26,7 @@ from lidarpool import (
 from lidarpool.scenario.build import build
 from lidarpool.scenario.scenario import Scenario
 from lidarscenes.writers.scene_file import write_scene
-from lidarsim.scene.actors import one_mesh
+from lidarsim.scene.actors import join_meshes
 from lidarsim.scene.files.meshfile import load_meshes
 from lidarsim.scene.scene_mesh import SceneMesh, Voxels
 from lidarsim.scene.transform import Transform
@@ -349,8 +349,8 @@ def test_what_voxels_cannot_do_is_refused(tmp_path):
     with pytest.raises(LidarError, match="'T' is of voxels, which cannot move"):
         Actor(mesh)
     with pytest.raises(LidarError, match="'X' has voxels, and cannot be joined"):
-        one_mesh("X", [mesh, mesh])
-    assert one_mesh("X", [mesh]).voxels is not None
+        join_meshes("X", [mesh, mesh])
+    assert join_meshes("X", [mesh]).voxels is not None
     with pytest.raises(LidarError, match="'T' is of voxels, which cannot be written"):
         write_scene(tmp_path / "out.glb", Scene.from_meshes([mesh]))
     for density, matrix in [

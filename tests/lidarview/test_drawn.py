@@ -10,7 +10,7 @@ from lidarpool import Scene
 from lidarscenes.procedural.plants import SPECIES, placed, tree
 from lidarsim.scene.actors import box
 from lidarsim.scene.scene_mesh import Cutout, SceneMesh, triangle_areas
-from lidarsim.scene.simplified import PART_LEAST, Drawn, cut
+from lidarsim.scene.simplified import MIN_PART_TRIANGLES, SimplifiedScene, cut_masks
 from lidarview.render.closeup import ShownPart, floor_and_cut
 from raybeam import RayCaster
 
@@ -30,7 +30,7 @@ def sizes(drawn):
 
 @pytest.mark.parametrize("most", [40_000, 8_000])
 def test_fewer_triangles_cover_about_as_much(avenue, most):
-    drawn = Drawn.of(avenue, most)
+    drawn = SimplifiedScene.from_scene(avenue, most)
     assert 0.9 * most < len(drawn.scene.faces) <= most
     assert np.ptp(sizes(drawn)) == 0
     area = triangle_areas(drawn.scene.vertices[drawn.scene.faces]).sum()
@@ -46,17 +46,17 @@ def test_fewer_triangles_cover_about_as_much(avenue, most):
 
 def test_what_is_near_the_sensors_has_more_triangles(avenue):
     place = np.array([[200.0, 3, 2], [205, 3, 2]])
-    drawn = Drawn.of(avenue, 40_000, [place])
+    drawn = SimplifiedScene.from_scene(avenue, 40_000, [place])
     some = sizes(drawn)
     assert some[20] == len(avenue.instances.parts[0].faces)
     assert (np.diff(some[:20]) >= 0).all() and (np.diff(some[21:]) <= 0).all()
     assert some.min() == 500 and some.sum() <= 40_000 < 2 * some.sum()
-    assert Drawn.of(avenue, 40_000, [np.zeros((0, 3))]).scene.triangles <= 40_000
-    assert sizes(Drawn.of(avenue, 100, [place])).min() == PART_LEAST
+    assert SimplifiedScene.from_scene(avenue, 40_000, [np.zeros((0, 3))]).scene.triangles <= 40_000
+    assert sizes(SimplifiedScene.from_scene(avenue, 100, [place])).min() == MIN_PART_TRIANGLES
 
 
 def test_hits_are_shared_by_area(avenue):
-    drawn = Drawn.of(avenue, 40_000, [np.zeros((1, 3))])
+    drawn = SimplifiedScene.from_scene(avenue, 40_000, [np.zeros((1, 3))])
     counts = np.arange(40.0)
     hits = drawn.hits(counts)
     assert np.bincount(drawn.scene.face_object, hits) == pytest.approx(counts)
@@ -73,8 +73,8 @@ def test_what_masks_leave_is_drawn(repeats):
     wall = SceneMesh("Wall", corners, faces)
     card = SceneMesh("Card", corners, faces, (Cutout(mask, uv),))
     scene = Scene.from_meshes([wall, card])
-    drawn = Drawn.of(cut(scene))
-    before = Drawn.of(scene)
+    drawn = SimplifiedScene.from_scene(cut_masks(scene))
+    before = SimplifiedScene.from_scene(scene)
     own = drawn.scene.faces[drawn.scene.face_object == 1]
     a, b, c = drawn.scene.vertices[own].transpose(1, 0, 2)
     areas = np.cross(b - a, c - a) / 2
@@ -86,14 +86,14 @@ def test_what_masks_leave_is_drawn(repeats):
     counts = np.array([3.0, 4, 5])
     shared = np.bincount(drawn.counter, drawn.hits(counts))
     assert np.allclose(shared, np.bincount(before.counter, before.hits(counts)))
-    assert cut(Scene.from_meshes([wall])).faces.shape == (2, 3)
+    assert cut_masks(Scene.from_meshes([wall])).faces.shape == (2, 3)
 
 
 def test_a_card_that_is_transparent_everywhere_stays_a_speck():
     uv = np.zeros((1, 3, 2), np.float32)
     cutout = Cutout(np.zeros((2, 2), bool), uv)
     scene = Scene.from_meshes([SceneMesh("Card", np.eye(3), np.arange(3)[None], (cutout,))])
-    drawn = Drawn.of(cut(scene)).scene
+    drawn = SimplifiedScene.from_scene(cut_masks(scene)).scene
     assert len(drawn.faces) == 1 and np.ptp(drawn.vertices, axis=0).max() < 0.1
 
 

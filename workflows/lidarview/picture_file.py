@@ -14,12 +14,12 @@ from lidarsim.base.archives import open_archive, packed
 from lidarsim.base.arrays import AnyArray, Floats, Floats32
 from lidarsim.base.words import plural
 from lidarsim.columns.table import CAUSES, TABLE, Column, by_value
-from lidarsim.scene.actors import Actor, samples_each, shapes_of
+from lidarsim.scene.actors import Actor, distinct_meshes, samples_per_actor
 from lidarsim.scene.animation import Animation
 from lidarsim.scene.colours import Colours
 from lidarsim.scene.scene import Scene
 from lidarsim.scene.scene_mesh import SceneMesh
-from lidarsim.scene.simplified import Drawn, cut
+from lidarsim.scene.simplified import SimplifiedScene, cut_masks
 from lidarsim.sensor import Survey, Track
 from lidarsim.sensor.materials import MaterialTable
 from lidarsim.sensor.trajectory import ALWAYS, Beyond, presence_ns
@@ -105,15 +105,16 @@ class PictureContent:
     @classmethod
     def before_casting(
         cls, scene: Scene, survey: Survey, planning: PlanningPicture | None = None
-    ) -> tuple[PictureContent, Drawn]:
+    ) -> tuple[PictureContent, SimplifiedScene]:
         """Return the content that is known before rays are cast, and the scene as it is drawn.
 
         The drawn scene turns hits of the scene's triangles into `hit_counts`.
         """
-        samples = samples_each(scene.actors, PLACES_MOST)
+        samples = samples_per_actor(scene.actors, PLACES_MOST)
         actors = tuple(_sampled(actor, survey.duration_ns, samples) for actor in scene.actors)
         sensors = sensor_positions(survey)
-        drawn = Drawn.of(cut(scene), near=[sensor.positions for sensor in sensors])
+        positions = [sensor.positions for sensor in sensors]
+        drawn = SimplifiedScene.from_scene(cut_masks(scene), near_positions=positions)
         wavelength_nm = survey.carried[0].sensor.optics.wavelength_nm  # of the first sensor
         kinds = scene.surface_kinds
         materials = MaterialTable.of(survey.materials, kinds, wavelength_nm, scene.has_voxels)
@@ -212,7 +213,7 @@ class PictureContent:
             arrays[f"actor{number}_absent"] = track.beyond == "absent"
             if actor.mesh.animation is not None:
                 arrays[f"actor{number}_offset"] = actor.offset_s
-        meshes, arrays["actor_mesh"] = shapes_of(self.scene.actors)
+        meshes, arrays["actor_mesh"] = distinct_meshes(self.scene.actors)
         for number, mesh in enumerate(meshes):
             arrays |= {f"mesh{number}_vertices": mesh.vertices, f"mesh{number}_faces": mesh.faces}
             if mesh.colours is not None:

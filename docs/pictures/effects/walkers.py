@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from lidarpool import Actor, Scanner, Scene, Sensor, Survey, Track
-from lidarsim.scene.actors import box, one_mesh
+from lidarsim.scene.actors import box, join_meshes
 from lidarsim.scene.files.meshfile import load_objects
 from lidarview.render.colouring import DIVERGING
 
@@ -32,7 +32,7 @@ def picture(path: Path) -> None:
     from matplotlib.colors import ListedColormap
     from matplotlib.figure import Figure
 
-    mesh = one_mesh("Person", load_objects(PERSON, animation="Walk").standing)
+    mesh = join_meshes("Person", load_objects(PERSON, animation="Walk").static)
     assert mesh.animation is not None
     mesh = replace(mesh, animation=replace(mesh.animation, speed_m_s=SPEED))
     way = Track([0, SECONDS + 1], [[AWAY, 0, 0], [AWAY - SPEED * (SECONDS + 1), 0, 0]])

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 
-from lidarsim.plugins import Content, MeshFileError, MeshFormat, SceneMesh, Wanted
+from lidarsim.plugins import Content, MeshFileError, MeshFormat, ReadOptions, SceneMesh
 
 CORNERS = np.array([(x, y, z) for z in (0, 1) for y in (-0.5, 0.5) for x in (-0.5, 0.5)])
 SIDES = np.array(
@@ -13,7 +13,7 @@ SIDES = np.array(
 FACES = np.concatenate([SIDES[:, [0, 1, 2]], SIDES[:, [0, 2, 3]]])
 
 
-def read(data: bytes, path: Path, wanted: Wanted) -> Content:
+def read(data: bytes, path: Path, options: ReadOptions) -> Content:
     """Return a box for each line."""
     meshes = []
     for number, line in enumerate(data.decode().splitlines(), 1):

@@ -15,7 +15,7 @@ from lidarsim.base.arrays import Bools, Floats, Ints
 from lidarsim.base.errors import LidarError
 from lidarsim.base.validation import checked
 from lidarsim.scene.scene import Scene
-from lidarsim.scene.simplified import Drawn
+from lidarsim.scene.simplified import SimplifiedScene
 from lidarsim.sensor import Sensor, Spin
 from raybeam import RayCaster
 
@@ -152,7 +152,7 @@ def plan_stations(
     """
     if count is not None and coverage is not None:
         raise LidarError("count and coverage both say when to stop: give one of them.")
-    scene = Drawn.of(scene).scene
+    scene = SimplifiedScene.from_scene(scene).scene
     sight = Sight(scene, sensor, slant_deg)
     if spacing_m is None:
         spacing_m = _spacing(scene)

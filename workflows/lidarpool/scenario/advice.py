@@ -10,7 +10,7 @@ import numpy as np
 from lidarsim.base.words import as_scenario, plural
 from lidarsim.columns.table import VELOCITY
 from lidarsim.scene.files.mesh_formats import format_of
-from lidarsim.scene.files.meshfile import wrote_it
+from lidarsim.scene.files.meshfile import written_by_lidarpool
 from lidarsim.sensor.materials import MaterialTable
 from lidarsim.sensor.models import STATED
 from lidarsim.sensor.trajectory import presence_ns
@@ -91,7 +91,7 @@ def _of_size(built: Built, side: float) -> str:
 def _lacks_unit(path: Path) -> bool:
     """Whether a mesh file states no unit, nor does its format."""
     row = format_of(path)
-    return row is not None and row.unitless and not wrote_it(path)
+    return row is not None and row.unitless and not written_by_lidarpool(path)
 
 
 def _of_colours(built: Built) -> str:

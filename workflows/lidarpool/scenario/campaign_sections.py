@@ -30,7 +30,7 @@ from pydantic import (
 )
 
 from lidarsim.base.declared import (
-    Ends,
+    MinMax,
     Seed,
     Several,
     Text,
@@ -192,7 +192,7 @@ class Normal(Section):
     mean: Annotated[float, about("mean")]
     std: Annotated[float, about("standard deviation", gt=0)]
     limits: Annotated[
-        Ends[float] | None,
+        MinMax[float] | None,
         about("least and largest number; by default 6 standard deviations", [0, 1]),
     ] = None
 
@@ -227,7 +227,7 @@ class Sample(Section):
         ),
     ]
     count: Annotated[
-        Ends[Annotated[int, Field(ge=0)]],
+        MinMax[Annotated[int, Field(ge=0)]],
         short(lambda v: type(v) is int, lambda v: [v, v], int | list[int]),
         about("how many rows a job has: a number, or [least, largest]"),
     ]
@@ -241,17 +241,17 @@ class Choice(Section):
     """How a value is chosen for each job: one of these."""
 
     uniform: Annotated[
-        Ends[float] | None, about("a number between two, all equally likely", [0.5, 2])
+        MinMax[float] | None, about("a number between two, all equally likely", [0.5, 2])
     ] = None
     log_uniform: Annotated[
-        Ends[Annotated[float, Field(gt=0)]] | None,
+        MinMax[Annotated[float, Field(gt=0)]] | None,
         about("a number between two above 0, its logarithm uniform", [0.2, 20]),
     ] = None
     normal: Annotated[
         Normal | None, about("a normally distributed number", {"mean": 0, "std": 1})
     ] = None
     integer: Annotated[
-        Ends[int] | None, about("a whole number between two, both included", [1, 6])
+        MinMax[int] | None, about("a whole number between two, both included", [1, 6])
     ] = None
     choice: Annotated[
         Options,

@@ -12,7 +12,7 @@ from lidarsim.base.arrays import Floats, Indices, Ints32
 from lidarsim.base.errors import LidarError
 from lidarsim.base.words import did_you_mean
 from lidarsim.scene.scene import Scene
-from lidarsim.scene.simplified import Drawn
+from lidarsim.scene.simplified import SimplifiedScene
 from lidarsim.sensor import Track
 from lidarsim.sensor.materials import rows_named
 from lidarsim.sensor.trajectory import quaternions_of
@@ -70,7 +70,7 @@ class Standing:
         drawn = self._scene
         shared = self._scene.instances
         if shared and (self._objects is None or np.isin(shared.owner, self._objects).any()):
-            drawn = Drawn.of(drawn).scene
+            drawn = SimplifiedScene.from_scene(drawn).scene
         corners = drawn.vertices[drawn.faces]
         owner = drawn.face_object
         if self._objects is not None:

@@ -15,7 +15,7 @@ from lidarscenes.procedural.surroundings import Surroundings, in_the_way, is_ope
 from lidarsim.base.arrays import Floats
 from lidarsim.base.words import plural
 from lidarsim.scene.scene import Scene
-from lidarsim.scene.simplified import Drawn
+from lidarsim.scene.simplified import SimplifiedScene
 from lidarsim.sensor import Mounted, Pose, Sensor
 from lidarsim.sensor.materials import rows_named
 
@@ -254,7 +254,7 @@ def _field_deg(carried: Mounted) -> tuple[float, float]:
 
 def _simple(scene: Scene, near: ArrayLike) -> Scene:
     """Copy instances to their places, with fewer triangles far from local positions (k, 3)."""
-    return Drawn.of(scene, _SHEETS_MOST, [np.reshape(near, (-1, 3))]).scene
+    return SimplifiedScene.from_scene(scene, _SHEETS_MOST, [np.reshape(near, (-1, 3))]).scene
 
 
 def _looker(scene: Scene) -> Surroundings | None:

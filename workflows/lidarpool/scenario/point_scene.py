@@ -28,7 +28,7 @@ from lidarsim.scene.files.meshfile import warn
 from lidarsim.scene.files.pcd import checked_pcd
 from lidarsim.scene.files.polygon_files import read_ply_points
 from lidarsim.scene.scene import Scene
-from lidarsim.scene.scene_instances import FARTHEST_M
+from lidarsim.scene.scene_instances import MAX_COORDINATE_M
 from lidarsim.scene.scene_mesh import SceneMesh
 
 from ..base.open3d_module import load_open3d
@@ -172,7 +172,7 @@ def _read(path: Path, unit: str | None, tell: Callable[[str], None]) -> Floats:
             f"{path} has {len(points)} points, and at least {_NEIGHBOURS} are needed: it is empty, "
             "cut short, or no point cloud."
         )
-    if (reach := np.abs(points).max()) > FARTHEST_M:
+    if (reach := np.abs(points).max()) > MAX_COORDINATE_M:
         raise LidarError(
             f"{path} reaches {reach:.3g} m from zero, farther than anything on Earth: it is "
             "broken, or in another unit (--unit, in Python unit=)."

@@ -14,8 +14,8 @@ from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Fie
 from lidarsim.base.declared import (
     AngleDeg,
     Coordinate,
-    Ends,
     Four,
+    MinMax,
     Seed,
     Several,
     Text,
@@ -141,7 +141,7 @@ class MeshFile(Section):
         """Return the placement in the world."""
         if self.matrix is not None:
             return Transform.from_matrix(self.matrix)
-        return Transform.place(self.translation, self.rotation_deg, self.scale)
+        return Transform.from_parts(self.translation, self.rotation_deg, self.scale)
 
 
 MeshEntry = Annotated[MeshFile, by_text("file", MeshFile)]
@@ -204,7 +204,7 @@ class Scatter(Section):
         float, about("least distance between two, seen from above, metres", ge=0, le=1e6)
     ] = 0.0
     scale: Annotated[
-        Ends[Annotated[float, Field(gt=0, le=1e9)]], about("least and largest factor")
+        MinMax[Annotated[float, Field(gt=0, le=1e9)]], about("least and largest factor")
     ] = (1, 1)
     yaw_deg: Annotated[AngleDeg | None, about("of all of them; by default each has its own")] = None
     seed: Annotated[Seed, about("another seed gives other places")] = 0

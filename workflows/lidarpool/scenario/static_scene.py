@@ -17,10 +17,10 @@ from lidarsim.base.errors import LidarError, Mistakes, message_of, prefixed
 from lidarsim.base.tables import NUMBERS, Quantity, read_table
 from lidarsim.base.textfile import read_text
 from lidarsim.base.words import plural
-from lidarsim.scene.actors import Actor, box, one_mesh
+from lidarsim.scene.actors import Actor, box, join_meshes
 from lidarsim.scene.files.meshfile import Objects, load_objects
 from lidarsim.scene.files.scene_graph import ObjectClass, Raster
-from lidarsim.scene.object_names import told_apart
+from lidarsim.scene.object_names import resolve_same_names
 from lidarsim.scene.scene import Scene
 from lidarsim.scene.scene_instances import SceneInstance
 from lidarsim.scene.scene_mesh import SceneMesh
@@ -135,19 +135,19 @@ def read_static_scene(scenario: Scenario) -> StaticScene:
     for entry in section.files:
         with mistakes.noted():
             objects = shapes.read(entry)
-            meshes += objects.standing
-            moving += objects.moving
+            meshes += objects.static
+            moving += objects.actors
             if objects.classes:
                 found.classes[entry.file] = objects.classes
     mistakes.tell()
-    meshes = told_apart(meshes, section.same_names, found.notes.append)
+    meshes = resolve_same_names(meshes, section.same_names, found.notes.append)
     if section.copies:
         meshes += _copies(shapes, meshes)
     objects = Objects(tuple(meshes), tuple(moving))
     if section.ground is not None:
-        below = Scene.from_meshes(meshes or objects.still(lambda _: None))
-        objects = objects._replace(standing=(*meshes, _ground(section, below)))
-    scene = Scene.of_objects(objects, found.notes.append)
+        below = Scene.from_meshes(meshes or objects.at_start(lambda _: None))
+        objects = objects._replace(static=(*meshes, _ground(section, below)))
+    scene = Scene.from_objects(objects, found.notes.append)
     return StaticScene(scene, Standing(scene), found)
 
 
@@ -173,11 +173,11 @@ class Shapes:
                 return made.setdefault(key, box(name, shape))
             read = self.read(shape, animation and (animation.name or ""))
             path = self.scenario.path(shape.file)
-            still = read.still(lambda line: self.found.notes.append(f"{path} moves {line}"))
+            still = read.at_start(lambda line: self.found.notes.append(f"{path} moves {line}"))
             if wheels is not None:
                 with prefixed(path):
                     still = (*rolling(still, wheels, self.found.notes.append),)
-            mesh = made[key] = one_mesh(name, still)
+            mesh = made[key] = join_meshes(name, still)
             if animation is not None and mesh.animation is not None:
                 own = {"speed_m_s": animation.speed_m_s, "repeat": animation.repeat}
                 made[key] = replace(mesh, animation=replace(mesh.animation, **own))
@@ -233,7 +233,7 @@ class Shapes:
         tell = self.found.notes.append
         if robot.moving:
             tell(f"{entry.file} has its joints at zero; joints of an actor move them")
-        links = Objects((), robot.actors(tell=tell)).still(lambda _: None)
+        links = Objects((), robot.actors(tell=tell)).at_start(lambda _: None)
         return Objects(tuple(o.moved(o.name, transform.linear, transform.offset) for o in links))
 
 
@@ -331,7 +331,7 @@ def copies_of(
                 f"at least {SCALE_LEAST:g}."
             )
     matrices = affine(rotations_of(angles) * scales[:, None], places)
-    return SceneInstance.several(mesh, matrices, entry.name)
+    return SceneInstance.from_matrices(mesh, matrices, entry.name)
 
 
 def _of_table(path: Path, table: CopyTable) -> tuple[Floats, Floats, Floats]:

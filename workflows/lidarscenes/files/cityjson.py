@@ -26,9 +26,9 @@ from lidarsim.scene.files.scene_graph import (
     ObjectClass,
     Piece,
     PlacedNode,
-    Wanted,
-    joined,
-    settled,
+    ReadOptions,
+    join_pieces,
+    placed_content,
 )
 from lidarsim.scene.scene_mesh import SceneMesh
 
@@ -73,7 +73,7 @@ _PARTS = "convert it to CityJSONSeq (.jsonl), which is read line by line, or exp
 _Json = dict[str, Any]
 
 
-def read_cityjson(data: bytes, path: Path, wanted: Wanted) -> Content:
+def read_cityjson(data: bytes, path: Path, wanted: ReadOptions) -> Content:
     """Read the highest level of detail of each city object; a .jsonl line by line."""
     allowance = Allowance(len(data), _PARTS)
 
@@ -115,7 +115,7 @@ class _CityFile:
         The file, or the first line of a sequence.
     """
 
-    def __init__(self, head: _Json, allowance: Allowance, wanted: Wanted) -> None:
+    def __init__(self, head: _Json, allowance: Allowance, wanted: ReadOptions) -> None:
         self._head = head
         self._allowance = allowance
         self._colours = wanted.colours
@@ -252,7 +252,7 @@ class _CityFile:
                 named = str(entry.get("name") or "") if self._named else ""
             pieces[number].append(Piece(points, some, None, painted, named))
         return [
-            joined(name, some, self._allowance)
+            join_pieces(name, some, self._allowance)
             for (name, _), some in zip(wanted, pieces, strict=True)
         ]
 
@@ -292,7 +292,7 @@ class _CityFile:
                 f"has coordinates in degrees{f' (EPSG:{epsg})' if epsg else ''}, and metres are "
                 "needed: reproject it, for example by cjio FILE crs_reproject EPSG save NEW"
             )
-        content = settled(self._placed)
+        content = placed_content(self._placed)
         content.unit_m = 1.0
         content.up_axis = "z"
         content.classes = CLASSES

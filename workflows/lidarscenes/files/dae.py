@@ -31,10 +31,10 @@ from lidarsim.scene.files.scene_graph import (
     MeshFileError,
     Node,
     Piece,
-    Wanted,
-    instances,
-    joined,
-    settled,
+    ReadOptions,
+    join_pieces,
+    placed_content,
+    placed_nodes,
 )
 from lidarsim.scene.masks import MaskError, MaskNotes, Texture, Wrap, read_colours, remembered
 from lidarsim.scene.scene_mesh import SceneMesh
@@ -44,7 +44,7 @@ _WRAPS: dict[str, Wrap] = {"CLAMP": "clamp", "BORDER": "clamp", "MIRROR": "mirro
 _SURFACES = ("triangles", "polylist", "polygons", "tristrips", "trifans")
 
 
-def read_dae(data: bytes, path: Path, wanted: Wanted) -> Content:
+def read_dae(data: bytes, path: Path, wanted: ReadOptions) -> Content:
     """Read the visual scene of a file; colours and names are those of its materials."""
     root = xml_root(data)
     for element in root.iter():
@@ -54,7 +54,7 @@ def read_dae(data: bytes, path: Path, wanted: Wanted) -> Content:
     allowance = Allowance(len(data), SMALLER)
     paint = _Effects(path, wanted, allowance) if wanted.colours else None
     document = _Document(root, allowance, paint, named=wanted.materials)
-    content = settled(instances(document.roots(), document.node, path.stem))
+    content = placed_content(placed_nodes(document.roots(), document.node, path.stem))
     content.notes = paint.notes.lines() if paint else []
     unit = root.find("asset/unit[@meter]")
     if unit is not None:
@@ -145,7 +145,7 @@ class _Document:
             for primitive in geometry.findall("mesh/*")
             if primitive.tag in _SURFACES
         )
-        return joined(name, pieces, self._allowance)
+        return join_pieces(name, pieces, self._allowance)
 
     def _material_name(self, primitive: Element, materials: Mapping[str, Element]) -> str:
         """Name of the material of a primitive, if names are wanted; else, or for none, empty."""
@@ -247,7 +247,7 @@ class _Document:
 class _Effects:
     """Diffuse colours of effects, whose images are read once."""
 
-    def __init__(self, path: Path, wanted: Wanted, allowance: Allowance) -> None:
+    def __init__(self, path: Path, wanted: ReadOptions, allowance: Allowance) -> None:
         self.notes = MaskNotes()
         self._path = path
         self._wanted = wanted

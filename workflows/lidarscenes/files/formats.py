@@ -15,15 +15,15 @@ _USD_TEXT = b"#usda "
 
 MESH_FORMATS = (
     MeshFormat((".dae",), "lidarscenes.files.dae:read_dae"),
-    MeshFormat((".3mf",), "lidarscenes.files.threemf:read_3mf", begins=(_ZIP,)),
+    MeshFormat((".3mf",), "lidarscenes.files.threemf:read_3mf", signatures=(_ZIP,)),
     MeshFormat((".vox",), "lidarscenes.files.vox:read_vox"),
-    MeshFormat((".usd",), _USD, animated=True, begins=(_CRATE, _USD_TEXT)),
-    MeshFormat((".usda",), _USD, animated=True, begins=(_USD_TEXT,)),
-    MeshFormat((".usdc",), _USD, animated=True, begins=(_CRATE,)),
-    MeshFormat((".usdz",), _USD, animated=True, begins=(_ZIP,)),
+    MeshFormat((".usd",), _USD, animated=True, signatures=(_CRATE, _USD_TEXT)),
+    MeshFormat((".usda",), _USD, animated=True, signatures=(_USD_TEXT,)),
+    MeshFormat((".usdc",), _USD, animated=True, signatures=(_CRATE,)),
+    MeshFormat((".usdz",), _USD, animated=True, signatures=(_ZIP,)),
     MeshFormat(CITYJSON, "lidarscenes.files.cityjson:read_cityjson"),
     MeshFormat(
-        (".tif", ".tiff"), _RASTER, from_path=True, raster=True, begins=(b"II*\0", b"MM\0*")
+        (".tif", ".tiff"), _RASTER, from_path=True, raster=True, signatures=(b"II*\0", b"MM\0*")
     ),
     MeshFormat(
         (".asc", ".hgt", ".img", ".dem", ".dt0", ".dt1", ".dt2"),

@@ -20,18 +20,18 @@ from uuid import uuid4
 
 import numpy as np
 
-from lidarsim.base.allowance import LEAST, bytes_of, memory_share
+from lidarsim.base.allowance import MIN_LIMIT_BYTES, bytes_of, memory_share
 from lidarsim.base.arrays import AnyArray, Bools, Floats
 from lidarsim.base.elementary import decade
 from lidarsim.base.input_files import input_size, read_input
 from lidarsim.base.vocabulary import UNITS_M
 from lidarsim.base.words import plural
 from lidarsim.scene.files.scene_graph import (
-    MOST_TRIANGLES,
+    MAX_TRIANGLES,
     Content,
     MeshFileError,
     Raster,
-    Wanted,
+    ReadOptions,
     Window,
 )
 from lidarsim.scene.scene_mesh import SceneMesh
@@ -67,7 +67,7 @@ _UNIT_NAMES = {  # of heights, as files have them
 }
 
 
-def read_raster(_data: bytes, path: Path, wanted: Wanted) -> Content:
+def read_raster(_data: bytes, path: Path, wanted: ReadOptions) -> Content:
     """Read the first band as a mesh: a vertex at the middle of each pixel, two triangles a cell.
 
     Cells with a pixel that has no height are holes. Coordinates are those of `epsg` in
@@ -120,7 +120,7 @@ def _opened(path: Path) -> Iterator[Any]:
         stack.enter_context(warnings.catch_warnings())
         warnings.simplefilter("ignore", NotGeoreferencedWarning)
         alone = {"GDAL_PAM_ENABLED": False, "GDAL_DISABLE_READDIR_ON_OPEN": "EMPTY_DIR"}
-        stack.enter_context(rasterio.Env(GDAL_CACHEMAX=LEAST, **alone))
+        stack.enter_context(rasterio.Env(GDAL_CACHEMAX=MIN_LIMIT_BYTES, **alone))
         try:
             if driver == "GTiff":  # which may be larger than the memory, and reads a window
                 input_size(path)
@@ -377,7 +377,7 @@ def _check_size(
     """
     sides = np.array([columns[1] - columns[0], rows[1] - rows[0]])
     count = int(np.prod(sides.astype(object)))
-    room = most = min(memory_share() // _PIXEL_BYTES, MOST_TRIANGLES // 2)
+    room = most = min(memory_share() // _PIXEL_BYTES, MAX_TRIANGLES // 2)
     if not chosen:
         most = min(most, _UNASKED)
     if count <= most:

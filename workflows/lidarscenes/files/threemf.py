@@ -33,9 +33,9 @@ from lidarsim.scene.files.scene_graph import (
     Content,
     MeshFileError,
     Node,
-    Wanted,
-    instances,
-    settled,
+    ReadOptions,
+    placed_content,
+    placed_nodes,
 )
 from lidarsim.scene.scene_mesh import SceneMesh
 
@@ -98,7 +98,7 @@ class _Placement:
     matrix: Floats
 
 
-def read_3mf(data: bytes, path: Path, wanted: Wanted) -> Content:
+def read_3mf(data: bytes, path: Path, wanted: ReadOptions) -> Content:
     """Read the build items of a file, and colours of base materials and colour groups."""
     with zipfile.ZipFile(io.BytesIO(data)) as archive:
         package = _Package(archive, Allowance(len(data), SMALLER), wanted)
@@ -108,7 +108,7 @@ def read_3mf(data: bytes, path: Path, wanted: Wanted) -> Content:
             made = package.object(place.key)
             return Node(place.name or made.name, place.matrix, made.meshes, made.components)
 
-        content = settled(instances(root.items, node, path.stem))
+        content = placed_content(placed_nodes(root.items, node, path.stem))
     content.unit_m = _UNITS_M[root.unit]
     content.up_axis = "z"
     if bare := sum(model.bare for model in package.models.values()):
@@ -120,7 +120,7 @@ def read_3mf(data: bytes, path: Path, wanted: Wanted) -> Content:
 class _Package:
     """The inner files of an archive, each read when an object of it is placed."""
 
-    def __init__(self, archive: zipfile.ZipFile, allowance: Allowance, wanted: Wanted) -> None:
+    def __init__(self, archive: zipfile.ZipFile, allowance: Allowance, wanted: ReadOptions) -> None:
         self._archive = archive
         self._allowance = allowance
         self._wanted = wanted
@@ -172,7 +172,7 @@ class _Model:
     """
 
     def __init__(
-        self, name: str, text: Iterable[bytes], allowance: Allowance, wanted: Wanted
+        self, name: str, text: Iterable[bytes], allowance: Allowance, wanted: ReadOptions
     ) -> None:
         self.unit = "millimeter"
         self.bare = 0  # triangles whose colours are not here

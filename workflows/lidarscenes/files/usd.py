@@ -31,10 +31,10 @@ from lidarsim.scene.actors import box
 from lidarsim.scene.animation import RATE_HZ
 from lidarsim.scene.face_materials import FaceMaterials
 from lidarsim.scene.files.companions import outside
-from lidarsim.scene.files.gltf_animation import chosen
+from lidarsim.scene.files.gltf_animation import find_animation
 from lidarsim.scene.files.polygons import triangulated
 from lidarsim.scene.files.scene_graph import (
-    MOST_NODES,
+    MAX_NODES,
     SHORTER,
     SMALLER,
     Content,
@@ -42,12 +42,12 @@ from lidarsim.scene.files.scene_graph import (
     Node,
     Piece,
     PlacedNode,
+    ReadOptions,
     RigidPart,
-    Wanted,
-    baked,
-    instances,
-    joined,
-    settled,
+    bake_animation,
+    join_pieces,
+    placed_content,
+    placed_nodes,
 )
 from lidarsim.scene.scene_instances import SceneInstance, scale_of
 from lidarsim.scene.scene_mesh import SceneMesh
@@ -56,7 +56,7 @@ from lidarsim.scene.transform import UP_AXES
 
 from .usd_materials import Look, UsdMaterials, dressed
 
-_MOST = {"prims and copies": MOST_NODES, "poses of what moves": 1_000_000, "moving objects": 10_000}
+_MOST = {"prims and copies": MAX_NODES, "poses of what moves": 1_000_000, "moving objects": 10_000}
 _BASE = 512 * 2**20  # bytes that usd-core takes for any file
 _LATEST_S = 9e8
 _SEGMENTS = 64  # around spheres, cylinders, cones and capsules
@@ -64,7 +64,7 @@ _SEGMENTS = 64  # around spheres, cylinders, cones and capsules
 _Frame = tuple[dict[str, Any], list[AnyArray]]
 
 
-def read_usd(data: bytes, path: Path, wanted: Wanted) -> Content:
+def read_usd(data: bytes, path: Path, wanted: ReadOptions) -> Content:
     """Read all prims of a scene that are shown, at its first time, and how they move."""
     if find_spec("pxr") is None:
         raise MeshFileError('is OpenUSD, which usd-core reads: pip install "lidarpool[usd]"')
@@ -76,12 +76,16 @@ def read_usd(data: bytes, path: Path, wanted: Wanted) -> Content:
         contents = _contents(frames, stage, path.stem, wanted, allowance)
         if wanted.animation is None:
             return next(contents)
-        chosen(stage["animations"], wanted.animation)
-        return baked(contents, stage["times_s"], allowance)
+        find_animation(stage["animations"], wanted.animation)
+        return bake_animation(contents, stage["times_s"], allowance)
 
 
 def _contents(
-    frames: Iterator[_Frame], stage: dict[str, Any], stem: str, wanted: Wanted, allowance: Allowance
+    frames: Iterator[_Frame],
+    stage: dict[str, Any],
+    stem: str,
+    wanted: ReadOptions,
+    allowance: Allowance,
 ) -> Iterator[Content]:
     """Yield the content of each pose."""
     materials = UsdMaterials(allowance, wanted)
@@ -101,7 +105,7 @@ def _contents(
                 materials.coloured = False  # all poses have the colours of the first
 
 
-def _frames(path: Path, wanted: Wanted, allowance: Allowance) -> Generator[_Frame]:
+def _frames(path: Path, wanted: ReadOptions, allowance: Allowance) -> Generator[_Frame]:
     """Read a file in a process of its own, and give what that writes."""
     script = Path(__file__).with_name("usd_child.py")
     memory = memory_share() + _BASE
@@ -174,7 +178,7 @@ def _mesh(
         else:
             outlines = corners[np.repeat(solid, sizes)]
             pieces = iter([Piece(vertices, triangulated(vertices, outlines, sizes[solid]))])
-        return joined(name, pieces, allowance)
+        return join_pieces(name, pieces, allowance)
     except ValueError as error:
         raise ValueError(f"{name!r}: {error}") from error
 
@@ -250,15 +254,15 @@ def _content(
             children += [(copied, places, row) for row in rows]
         return Node(name, matrices[key], meshes.get(mesh, ()), children)
 
-    placed = _named(instances(frame["roots"], node, stem))
-    content = settled(placed, copy_all=len(frame["times_s"]) > 1)
+    placed = _named(placed_nodes(frame["roots"], node, stem))
+    content = placed_content(placed, copy_all=len(frame["times_s"]) > 1)
     for number, motion in zip(moving, motions, strict=True):
         # Its mesh has the scale, since actors have none.
         matrices[number] = np.eye(4)
         stretch = matrices[number, :3, :3]
         places = motion[:, 1:].reshape(-1, 3, 4)
         stretch[:] = scale_of(places[0, :, :3])
-        found = settled(instances([number], node, stem))
+        found = placed_content(placed_nodes([number], node, stem))
         content.skipped += found.skipped
         if found.meshes:
             shared = [one.mesh for one in found.meshes if isinstance(one, SceneInstance)]

@@ -12,7 +12,7 @@ from lidarsim.base.arrays import AnyArray, Bools, Floats, Ints
 from lidarsim.base.vectors import matmul
 from lidarsim.scene.colours import LINEAR, Colours, as_srgb
 from lidarsim.scene.files.polygons import check_corners, triangulated
-from lidarsim.scene.files.scene_graph import Piece, Wanted
+from lidarsim.scene.files.scene_graph import Piece, ReadOptions
 from lidarsim.scene.masks import (
     FACE_BYTES,
     MaskError,
@@ -111,7 +111,7 @@ class Look:
 class UsdMaterials:
     """Images and materials by their numbers, and what they make of triangles."""
 
-    def __init__(self, allowance: Allowance, wanted: Wanted) -> None:
+    def __init__(self, allowance: Allowance, wanted: ReadOptions) -> None:
         self._allowance = allowance
         self.coloured = wanted.colours
         self._named = wanted.materials
@@ -157,7 +157,7 @@ class UsdMaterials:
         """Mask that a material gives triangles; None if they are solid."""
         material = self._materials[number]
         source = material.get("opacity", {"value": 1.0})
-        with self.notes.instead(material["name"]):
+        with self.notes.without_mask(material["name"]):
             if "unread" in source:
                 raise MaskError(source["unread"])
             mask: Texture | Literal["glass"] | None = None

@@ -12,8 +12,8 @@ from lidarsim.base.allowance import Allowance
 from lidarsim.base.arrays import Floats
 from lidarsim.base.words import plural
 from lidarsim.scene.actors import box
-from lidarsim.scene.files.scene_graph import Content, MeshFileError, Wanted
-from lidarsim.scene.scene_mesh import DENSEST, VOXELS_MOST, SceneMesh, Voxels
+from lidarsim.scene.files.scene_graph import Content, MeshFileError, ReadOptions
+from lidarsim.scene.scene_mesh import MAX_LEAF_DENSITY, MAX_VOXELS, SceneMesh, Voxels
 
 DENSITY = "PadBVTotal"
 _OFF = 2  # voxels by which the corners may contradict the counts; HELIOS++'s own writer makes 1.5
@@ -22,7 +22,7 @@ _OFF = 2  # voxels by which the corners may contradict the counts; HELIOS++'s ow
 _MARGIN = 0.02
 
 
-def read_vox(data: bytes, path: Path, wanted: Wanted) -> Content:
+def read_vox(data: bytes, path: Path, wanted: ReadOptions) -> Content:
     """Read a voxel file: one object, a box around all voxels with leaves.
 
     The first voxel begins at `min_corner`, and each has the edge `res`, as in HELIOS++. Voxels that
@@ -87,9 +87,9 @@ def _grid(head: dict[str, str]) -> tuple[Floats, Floats, Floats]:
     low = three("min_corner")
     high = three("max_corner")
     split = three("split")
-    if (split != np.floor(split)).any() or (split < 1).any() or (split > VOXELS_MOST).any():
+    if (split != np.floor(split)).any() or (split < 1).any() or (split > MAX_VOXELS).any():
         raise MeshFileError(
-            f"has #split {_in_words(split)}; it must be whole numbers of 1 to {VOXELS_MOST:,}"
+            f"has #split {_in_words(split)}; it must be whole numbers of 1 to {MAX_VOXELS:,}"
         )
     size = three("res", 3) if "res" in head else (high - low) / split
     if not (size > 0).all():
@@ -126,11 +126,11 @@ def _check(where: Floats, density: Floats, shape: Floats) -> None:
     again = np.diff(np.sort((where[:, 0] * ny + where[:, 1]) * nz + where[:, 2])) == 0
     if again.any():
         raise MeshFileError(f"has {plural(int(again.sum()), 'row')} of voxels that it had before")
-    bad = (density < 0) | (density > DENSEST)
+    bad = (density < 0) | (density > MAX_LEAF_DENSITY)
     if bad.any():
         raise MeshFileError(
             f"has {density[bad][0]:g} m²/m³ in voxel {_in_words(where[bad][0])}; a density is 0 to "
-            f"{DENSEST:g}"
+            f"{MAX_LEAF_DENSITY:g}"
         )
 
 

@@ -17,13 +17,13 @@ import numpy as np
 from lidarsim.base.arrays import Floats
 from lidarsim.base.errors import LidarError, prefixed
 from lidarsim.base.input_files import read_input_text
-from lidarsim.scene.actors import one_mesh
+from lidarsim.scene.actors import join_meshes
 from lidarsim.scene.files.meshfile import load_meshes
 from lidarsim.scene.object_names import unique_names
 from lidarsim.scene.scene import Scene
 from lidarsim.scene.scene_instances import SceneInstance
 from lidarsim.scene.scene_mesh import SceneMesh
-from lidarsim.scene.simplified import Drawn
+from lidarsim.scene.simplified import SimplifiedScene
 from lidarsim.scene.transform import Transform
 from lidarsim.sensor import Pose
 
@@ -215,7 +215,7 @@ class HeliosScene:
     @cached_property
     def _ground(self) -> Scene | None:
         meshes = [mesh for part in self.parts if part.is_ground for mesh in part.meshes()]
-        return Drawn.of(Scene.from_meshes(meshes)).scene if meshes else None
+        return SimplifiedScene.from_scene(Scene.from_meshes(meshes)).scene if meshes else None
 
     def height(self, x: float, y: float) -> float:
         """Return the height of the lowest ground at x, y, in metres; 0 without ground."""
@@ -227,7 +227,7 @@ class HeliosScene:
 
     def _let_fall(self, part: HeliosPart) -> None:
         """Move a part up or down so that its lowest point stands on the ground."""
-        points = one_mesh("", part.meshes()).vertices
+        points = join_meshes("", part.meshes()).vertices
         x, y, z = points[points[:, 2].argmin()].tolist()
         part.offset[2] += self.height(x, y) - z
 

@@ -20,7 +20,7 @@ from lidarsim.base.textfile import read_text
 from lidarsim.base.validation import as_array, checked
 from lidarsim.base.vectors import applied, matmul
 from lidarsim.base.words import did_you_mean, plural
-from lidarsim.scene.actors import AT_ZERO, Actor, one_mesh
+from lidarsim.scene.actors import AT_ZERO, Actor, join_meshes
 from lidarsim.scene.scene_mesh import SceneMesh
 from lidarsim.scene.transform import rotation_about
 from lidarsim.sensor import Pose, Stations, Trajectory
@@ -206,7 +206,9 @@ class Robot:
                     if link not in without:
                         moved = mesh.moved(link, place[:3, :3], place[:3, 3])
                         parts.setdefault(body, []).append(moved)
-            self._made[without] = {body: one_mesh(names[body], own) for body, own in parts.items()}
+            self._made[without] = {
+                body: join_meshes(names[body], own) for body, own in parts.items()
+            }
         return self._made[without]
 
     def _path(

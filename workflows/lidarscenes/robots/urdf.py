@@ -25,7 +25,7 @@ from lidarsim.base.validation import checked, shown
 from lidarsim.base.vectors import length
 from lidarsim.base.words import printable
 from lidarsim.base.xmlfile import xml_root
-from lidarsim.scene.actors import box, one_mesh
+from lidarsim.scene.actors import box, join_meshes
 from lidarsim.scene.colours import Colours, as_bytes
 from lidarsim.scene.face_materials import FaceMaterials
 from lidarsim.scene.files.meshfile import OpacityMode, load_meshes, warn
@@ -116,7 +116,7 @@ def load_robot(
         for link in order:
             with prefixed(f"link {link!r}"):
                 if parts := list(looks.of(link, links[link])):
-                    meshes[link] = one_mesh(link, parts)
+                    meshes[link] = join_meshes(link, parts)
         looks.tell_rest()
         if not meshes:
             raise LidarError("no link has a <visual> with triangles: there is nothing to see.")

@@ -13,11 +13,11 @@ from trimesh.exchange.ply import export_ply
 
 from lidarsim.base.errors import LidarError, explained
 from lidarsim.base.storage import Storage
-from lidarsim.scene.files.meshfile import OWN
+from lidarsim.scene.files.meshfile import FORMAT_COMMENT
 from lidarsim.scene.scene import Scene
 from lidarsim.scene.scene_instances import SceneInstance
 from lidarsim.scene.scene_mesh import stacked
-from lidarsim.scene.simplified import Drawn
+from lidarsim.scene.simplified import SimplifiedScene
 
 from .glb_file import glb_of
 
@@ -79,11 +79,11 @@ def _encoded(suffix: str, scene: Scene) -> bytes:
                 f"A .ply would have coordinates in steps of {step:.2g} m around x {x:.0f}, "
                 f"y {y:.0f}, because they are in single precision: write a .glb or .obj."
             )
-        drawn = Drawn.of(scene, scene.triangles).scene
+        drawn = SimplifiedScene.from_scene(scene, scene.triangles).scene
         whole = trimesh.Trimesh(drawn.vertices + drawn.origin, drawn.faces, process=False)
         data = bytes(export_ply(whole, vertex_normal=False))
         head, _, rest = data.partition(b"\ncomment ")
-        return head + f"\ncomment {OWN}\n".encode() + rest.partition(b"\n")[2]
+        return head + f"\ncomment {FORMAT_COMMENT}\n".encode() + rest.partition(b"\n")[2]
     if suffix == ".glb":
         return glb_of(scene)
     objects = trimesh.Scene()
@@ -92,4 +92,4 @@ def _encoded(suffix: str, scene: Scene) -> bytes:
         vertices, faces = stacked((mesh.vertices, mesh.faces) for mesh in flat)
         objects.add_geometry(trimesh.Trimesh(vertices, faces, process=False), name, name)
     text = export_obj(objects, include_normals=False, include_texture=False)
-    return f"# {OWN}\n{text}".encode()
+    return f"# {FORMAT_COMMENT}\n{text}".encode()

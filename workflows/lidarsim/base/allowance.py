@@ -1,4 +1,4 @@
-"""How much memory the content of a file may take: a few lines can unpack to any amount."""
+"""Limits on the memory that the content of a file may take: a few lines can unpack to any size."""
 
 from __future__ import annotations
 
@@ -10,16 +10,15 @@ import psutil
 
 from .errors import LidarError
 
-# of the file's bytes, and bytes of a small one
-TIMES = 100
-LEAST = 256 * 2**20
+UNPACKED_TIMES = 100  # of the file's bytes
+MIN_LIMIT_BYTES = 256 * 2**20  # for small files
 _CONTROL_GROUPS = Path("/sys/fs/cgroup")
 _PREFIXES = {"Pi": 2**50, "Ti": 2**40, "Gi": 2**30, "Mi": 2**20, "ki": 2**10}
 _SHARE = 4  # of the memory: a scene is copied while its objects are placed and joined
 
 
 class Allowance:
-    """Memory that the content of a file may take, and what it has taken of it.
+    """Memory that the content of a file may take, and the bytes taken so far.
 
     The limit is 100 times the file's size or 256 MiB, whichever is larger, and at most a quarter of
     the memory.
@@ -27,9 +26,9 @@ class Allowance:
     Parameters
     ----------
     size
-        Of the file, bytes.
+        Size of the file, bytes.
     advice
-        What the user can do if the content is larger; ends the error.
+        Advice to the user if the content is larger, at the end of the error.
 
     Examples
     --------
@@ -40,48 +39,45 @@ class Allowance:
     """
 
     def __init__(self, size: int, advice: str) -> None:
-        self.taken = 0
+        self.used_bytes = 0
         self._size = size
         self._advice = advice
         self._files: set[Path] = set()
 
     @property
     def limit(self) -> int:
-        """Bytes."""
-        return min(max(TIMES * self._size, LEAST), memory_share())
+        """Limit, bytes."""
+        return min(max(UNPACKED_TIMES * self._size, MIN_LIMIT_BYTES), memory_share())
 
     def grow(self, size: int) -> None:
-        """Count data of another file with it."""
+        """Add the size of further data of the file, bytes."""
         self._size += size
 
     def add_file(self, file: Path) -> None:
-        """Count another file with it, which it names, once however often it names it."""
+        """Add the size of a file that the file names, once for each file."""
         if file not in self._files:
             self._files.add(file)
             self.grow(file.stat().st_size)
 
     def fits(self, count: int) -> bool:
-        """Whether so many bytes more may be taken."""
-        return self.taken + count <= self.limit
+        """Return True if a number of further bytes may be taken."""
+        return self.used_bytes + count <= self.limit
 
     def take(self, count: int) -> None:
-        """Take so many bytes, before they are made.
-
-        LidarError if that is more than the limit.
-        """
-        self.taken += count
-        if self.taken > self.limit:
+        """Take a number of bytes, before they are allocated; LidarError above the limit."""
+        self.used_bytes += count
+        if self.used_bytes > self.limit:
             raise LidarError(
-                f"it has {bytes_of(self._size)} and would unpack to {bytes_of(self.taken)} or "
+                f"it has {bytes_of(self._size)} and would unpack to {bytes_of(self.used_bytes)} or "
                 f"more, of at most {bytes_of(self.limit)}: {self._advice}."
             )
 
 
 @cache
 def memory() -> int:
-    """Memory that this process may use, bytes.
+    """Return the memory that this process may use, bytes.
 
-    The least of the machine's memory and the limits of control groups and of `ulimit -m`.
+    The minimum of the machine's memory and the limits of control groups and of `ulimit -m`.
     """
     return min([psutil.virtual_memory().total, *_control_group_limits(), *_resident_limit()])
 
@@ -127,7 +123,7 @@ def _resident_limit() -> list[int]:
 
 
 def memory_share() -> int:
-    """Most bytes that the objects of a file may take."""
+    """Return the maximum memory of the objects of a file, bytes."""
     return memory() // _SHARE
 
 

@@ -1,4 +1,4 @@
-"""Archives of arrays: what this package writes, and reads again."""
+"""Archives of arrays, as this package writes and reads them."""
 
 from __future__ import annotations
 
@@ -25,12 +25,12 @@ _HEADER = re.compile(
     rb"\{'descr': '([<>|][a-zUV]\d+)', 'fortran_order': (False|True), "
     rb"'shape': \(((?:\d+, ?)*\d*)\), \} *\n"
 )
-_AGAIN = "get it again, or read it on a machine with more memory"
+_ADVICE = "get it again, or read it on a machine with more memory"
 
 
 def packed(arrays: Mapping[str, Any]) -> bytes:
     """Return an archive of arrays: the same arrays give the same bytes."""
-    memory = io.BytesIO()  # NumPy leaves its own file open if it cannot write it
+    memory = io.BytesIO()  # NumPy leaves a file open if writing fails
     np.savez_compressed(memory, **arrays)
     return memory.getvalue()
 
@@ -39,14 +39,14 @@ def packed(arrays: Mapping[str, Any]) -> bytes:
 def open_archive(
     path: Path | str, read: Callable[[], bytes] | None = None
 ) -> Iterator[dict[str, Any]]:
-    """Read an archive for the body, whose errors become LidarError; nothing in it is run.
+    """Read an archive, without running code, for the body, whose errors become LidarError.
 
-    With `read`, which returns the content of the file, the path is only its name in errors.
+    With `read`, which returns the content of the file, the path is only a name in errors.
     """
     try:
         with explained(f"{path} cannot be read"), prefixed(path):
             data = read() if read else read_input(path)
-            yield read_arrays(data, Allowance(len(data), _AGAIN))
+            yield read_arrays(data, Allowance(len(data), _ADVICE))
     except LidarError:
         raise
     except Exception as error:  # zipfile, zlib, NumPy and Scene have many
@@ -60,8 +60,8 @@ def open_archive(
 def read_arrays(data: bytes, allowance: Allowance | None = None) -> dict[str, AnyArray]:
     """Read all arrays of an archive, and compare their checksums.
 
-    They are taken from `allowance`. LidarError if they are more; any exception if the archive
-    is damaged.
+    The bytes of the arrays are taken from `allowance`. LidarError if they exceed the allowance; any
+    exception if the archive is damaged.
     """
     with zipfile.ZipFile(io.BytesIO(data)) as archive:
         entries = archive.infolist()
@@ -75,22 +75,29 @@ def read_arrays(data: bytes, allowance: Allowance | None = None) -> dict[str, An
 
 
 def _content(data: bytes, entry: zipfile.ZipInfo) -> bytes | memoryview:
-    """Return the content of a file in an archive: zipfile takes far longer than to unpack it."""
-    at = entry.header_offset + 30
-    length, extra = (int.from_bytes(data[at - k : at - k + 2], "little") for k in (4, 2))
-    content: bytes | memoryview = memoryview(data)[at + length + extra :][: entry.compress_size]
+    """Return the content of a file in an archive; ValueError for a damaged file.
+
+    zipfile takes far longer to find the file than to unpack it.
+    """
+    name_start = entry.header_offset + 30
+    length, extra = (
+        int.from_bytes(data[name_start - k : name_start - k + 2], "little") for k in (4, 2)
+    )
+    content: bytes | memoryview = memoryview(data)[name_start + length + extra :][
+        : entry.compress_size
+    ]
     if entry.compress_type == zipfile.ZIP_DEFLATED:
         content = zlib.decompressobj(-zlib.MAX_WBITS).decompress(content, entry.file_size + 1)
     elif entry.compress_type != zipfile.ZIP_STORED:
         raise ValueError(f"{entry.filename} is compressed by a method other than Deflate")
-    same = data[at : at + length] == entry.orig_filename.encode()
-    if not same or len(content) != entry.file_size or zlib.crc32(content) != entry.CRC:
+    same_name = data[name_start : name_start + length] == entry.orig_filename.encode()
+    if not same_name or len(content) != entry.file_size or zlib.crc32(content) != entry.CRC:
         raise ValueError(f"{entry.filename} is damaged")
     return content
 
 
 def read_npy(content: bytes | memoryview, name: str) -> AnyArray:
-    """Read an array of numbers or text from a file of NumPy; errors as of `read_arrays`.
+    """Read an array of numbers or text from a file of NumPy; ValueError for a damaged file.
 
     Archives are read by several threads. NumPy's reader parses headers with `ast`, which failed now
     and then in threads of Python 3.11: "AST constructor recursion depth mismatch".

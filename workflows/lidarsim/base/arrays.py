@@ -1,4 +1,4 @@
-"""Types of arrays, by what they hold."""
+"""Types of arrays, by their elements."""
 
 from __future__ import annotations
 
@@ -22,5 +22,5 @@ AnyArray = NDArray[Any]
 
 
 def owned(array: AnyArray, kind: type = np.float64) -> AnyArray:
-    """Give an array as compiled loops take it: of one type, contiguous and not read-only."""
+    """Return an array for compiled loops: of a given type, contiguous and writable."""
     return np.require(array, kind, ["C", "W"])

@@ -1,4 +1,4 @@
-"""Declarations of quantities that users set: what a scenario file needs beyond Python's types.
+"""Declarations of quantities that users set, with descriptions and limits for scenario files.
 
 A quantity is a field of a dataclass: `Annotated[type, told(description, limits)] = default`.
 `checked_fields` lets the dataclass refuse values outside the limits, and be a section of a
@@ -26,7 +26,7 @@ from pydantic_core import PydanticCustomError
 UnitShare = Annotated[float, Field(ge=0, le=1)]
 Seed = Annotated[int, Field(ge=0, le=2**63 - 1)]
 Text = Annotated[str, Field(min_length=1)]
-# Nothing on Earth is farther from the origin of its map.
+# No point on Earth is farther from the origin of its map.
 Coordinate = Annotated[float, Field(ge=-1e8, le=1e8)]
 AngleDeg = Annotated[float, Field(ge=-36_000, le=36_000)]
 
@@ -40,60 +40,64 @@ Triple = Three[Coordinate]
 
 
 def _in_order(value: Any, handler: Callable[[Any], Any]) -> Any:
-    ends = handler(value)
-    if not 0 <= ends[1] - ends[0] < inf:
+    """Validate two finite numbers in ascending order."""
+    limits = handler(value)
+    if not 0 <= limits[1] - limits[0] < inf:
         raise must_be("[least, largest]")
-    return ends
+    return limits
 
 
-Ends = Annotated[Two[T], WrapValidator(_in_order)]  # least and largest number
+MinMax = Annotated[Two[T], WrapValidator(_in_order)]  # least and largest number
 
 # A field that may be empty in a scenario, because lidarpool then fills it in.
 FILLED_IN = GetPydanticSchema(lambda kind, handler: handler(kind | None))
 
 
 def about(description: str, *examples: Any, **limits: Any) -> Any:
-    """Describe a field; one whose default is computed has examples."""
+    """Describe a field; a field with a computed default has examples."""
     return Field(description=description, examples=[*examples] or None, **limits)
 
 
-def declared(thing: Any, by: type) -> dict[str, Any]:
-    """Values that a thing has for the fields of one of its bases: {name: value}."""
-    return {field.name: getattr(thing, field.name) for field in fields(by)}
+def declared(instance: Any, base: type) -> dict[str, Any]:
+    """Return the values of an instance for the fields of a base class: {name: value}."""
+    return {field.name: getattr(instance, field.name) for field in fields(base)}
 
 
 def written_as(kind: Any) -> GetPydanticSchema:
-    """Let a scenario have another type for a field than Python."""
+    """Give a field a type in scenarios that differs from its type in Python."""
     return GetPydanticSchema(lambda _, handler: handler.generate_schema(kind))
 
 
 def short(is_short: Callable[[Any], bool], long: Callable[[Any], Any], allowed: Any) -> Any:
-    """Expand a short form in a scenario; `allowed` is its type, for the schema."""
+    """Expand the short form of a value in scenarios; `allowed` is its type, for the schema."""
     return BeforeValidator(
         lambda value: long(value) if is_short(value) else value, json_schema_input_type=allowed
     )
 
 
 def by_text(field: str, kind: Any) -> Any:
-    """Let a scenario give just the text of one field of a section: «hall.glb»."""
+    """Accept the text of a single field in place of a section: «hall.glb»."""
     return short(is_text, lambda value: {field: value}, Text | kind)
 
 
 def one_of(*fields: str) -> Any:
-    """Let a section have exactly one of some fields."""
-    *others, last = fields
-    words = f"one of {', '.join(others)} and" if others[1:] else f"either {others[0]} or"
+    """Check that a section has exactly a single value among given fields."""
+    *first_fields, last_field = fields
+    if first_fields[1:]:
+        words = f"one of {', '.join(first_fields)} and"
+    else:
+        words = f"either {first_fields[0]} or"
 
-    def one(section: Any) -> Any:
+    def check(section: Any) -> Any:
         if sum(bool(getattr(section, field)) for field in fields) != 1:
-            raise ValueError(f"give {words} {last}.")
+            raise ValueError(f"give {words} {last_field}.")
         return section
 
-    return model_validator(mode="after")(one)
+    return model_validator(mode="after")(check)
 
 
 def allowed(words: str) -> WrapValidator:
-    """Say what a field of several kinds takes, in one line instead of pydantic's for each."""
+    """Replace pydantic's errors for a field of several types by a line: «be a number or text»."""
 
     def validated(value: Any, handler: Callable[[Any], Any]) -> Any:
         try:
@@ -105,15 +109,15 @@ def allowed(words: str) -> WrapValidator:
 
 
 def must_be(words: str) -> PydanticCustomError:
-    """Return an error of a validator that says what is allowed; the value is said before it."""
+    """Return a validator's error on the allowed values; messages name the value before."""
     return PydanticCustomError("allowed", "Input should be {words}", {"words": words})
 
 
 def is_text(value: Any) -> bool:
-    """Whether a value is text."""
+    """Return True if a value is text."""
     return isinstance(value, str)
 
 
-# A list of texts, or one of them without the list.
+# A list of texts, or a single text.
 Texts = Several[Text]
 TextOrTexts = Annotated[Texts, short(is_text, lambda v: [v], Text | Texts)]

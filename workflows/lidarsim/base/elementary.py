@@ -1,8 +1,8 @@
 """Sine, exponential, logarithm and the like of arrays, with the same bits on every processor.
 
 Functions of NumPy and of C libraries differ in their last bits between versions and processors.
-Those of this module apply `elementary_scalars` to each number: compiled, or in Python for few
-numbers, since numba takes half a second to import.
+The functions of this module apply `elementary_scalars` to each number: compiled, or in Python for
+few numbers, since numba takes half a second to import.
 """
 
 from __future__ import annotations
@@ -17,77 +17,78 @@ from numpy.typing import ArrayLike
 from .arrays import Floats, owned
 from .elementary_scalars import arctan2_of, exp_of, log_of, sin_cos_of
 
-_FEW = 1 << 12  # numbers: some 20 ms
+_MAX_INTERPRETED = 1 << 12  # numbers that Python computes, in about 20 ms
 
 
 def sin_cos(x: ArrayLike) -> tuple[Floats, Floats]:
-    """Sines and cosines of angles in radians, of any shape."""
-    sine, cosine = _each("sin_cos", sin_cos_of, 2, x)
+    """Return sines and cosines of angles in radians, of any shape."""
+    sine, cosine = _apply("sin_cos", sin_cos_of, 2, x)
     return sine, cosine
 
 
 def sin(x: ArrayLike) -> Floats:
-    """Sines of angles in radians."""
+    """Return sines of angles in radians."""
     return sin_cos(x)[0]
 
 
 def cos(x: ArrayLike) -> Floats:
-    """Cosines of angles in radians."""
+    """Return cosines of angles in radians."""
     return sin_cos(x)[1]
 
 
 def exp(x: ArrayLike) -> Floats:
-    """Exponentials."""
-    return _each("exp", exp_of, 1, x)[0]
+    """Return exponentials of numbers."""
+    return _apply("exp", exp_of, 1, x)[0]
 
 
 def log(x: ArrayLike) -> Floats:
-    """Natural logarithms."""
-    return _each("log", log_of, 1, x)[0]
+    """Return natural logarithms of numbers."""
+    return _apply("log", log_of, 1, x)[0]
 
 
 def arctan2(y: ArrayLike, x: ArrayLike) -> Floats:
-    """Angles of vectors (x, y), radians."""
-    return _each("arctan2", arctan2_of, 1, *np.broadcast_arrays(y, x))[0]
+    """Return angles of vectors (x, y), radians."""
+    return _apply("arctan2", arctan2_of, 1, *np.broadcast_arrays(y, x))[0]
 
 
 def arcsin(x: ArrayLike) -> Floats:
-    """Angles with these sines, radians."""
+    """Return angles of given sines, radians."""
     x = np.asarray(x, np.float64)
     return arctan2(x, np.sqrt((1 - x) * (1 + x)))
 
 
 def arccos(x: ArrayLike) -> Floats:
-    """Angles with these cosines, radians."""
+    """Return angles of given cosines, radians."""
     x = np.asarray(x, np.float64)
     return arctan2(np.sqrt((1 - x) * (1 + x)), x)
 
 
 def log1p(x: ArrayLike) -> Floats:
-    """Logarithms of 1 + x, exact for small x too (Kahan 1982)."""
+    """Return logarithms of 1 + x, exact for small x too (Kahan 1982)."""
     x = np.asarray(x, np.float64)
-    near = 1 + x
-    off = near - 1
-    return np.asarray(np.where(off == 0, x, log(near) * (x / np.where(off == 0, 1, off))))[()]
+    argument = 1 + x
+    rounded = argument - 1
+    scale = x / np.where(rounded == 0, 1, rounded)
+    return np.asarray(np.where(rounded == 0, x, log(argument) * scale))[()]
 
 
 def expm1(x: ArrayLike) -> Floats:
-    """Exponentials of x, less 1, exact for small x too (Kahan 1982)."""
+    """Return exponentials of x, minus 1, exact for small x too (Kahan 1982)."""
     x = np.asarray(x, np.float64)
-    near = exp(x)
-    plain = (near == 1) | (near < 0.5) | (near > 2)
-    less = near - 1
-    found = less * (x / np.where(plain, 1, log(near)))
-    return np.where(near == 1, x, np.where(plain, less, found))[()]
+    exponential = exp(x)
+    is_plain = (exponential == 1) | (exponential < 0.5) | (exponential > 2)
+    difference = exponential - 1
+    corrected = difference * (x / np.where(is_plain, 1, log(exponential)))
+    return np.where(exponential == 1, x, np.where(is_plain, difference, corrected))[()]
 
 
 def power(x: ArrayLike, exponent: float) -> Floats:
-    """Powers of numbers above 0, or 0; of a large exponent less exact."""
+    """Return powers of numbers from 0 up; powers of a large exponent are less exact."""
     return exp(exponent * log(x))
 
 
 def cbrt(x: ArrayLike) -> Floats:
-    """Cube roots of numbers other than 0; those of cubes are exact."""
+    """Return cube roots of numbers except 0; roots of cubes are exact."""
     size = np.abs(x)
     root = power(size, 1 / 3)
     root = root - (root * root * root - size) / (3 * root * root)  # Newton's method
@@ -95,41 +96,41 @@ def cbrt(x: ArrayLike) -> Floats:
 
 
 def geomspace(start: float, stop: float, count: int) -> Floats:
-    """Return numbers (count,) from one to another above 0 that have one ratio."""
-    out = start * exp(np.linspace(0, float(log(stop / start)), count))
-    out[-1] = stop
-    return out
+    """Return numbers (count,) from `start` to `stop`, both above 0, of a constant ratio."""
+    numbers = start * exp(np.linspace(0, float(log(stop / start)), count))
+    numbers[-1] = stop
+    return numbers
 
 
-def interp(x: ArrayLike, at: Floats, values: Floats) -> Floats:
-    """Return values between those at ascending places (k,), and the first or last beyond."""
+def interp(x: ArrayLike, knots: Floats, values: Floats) -> Floats:
+    """Interpolate values (k,) at ascending knots (k,); the first or last value beyond the knots."""
     x = np.asarray(x, np.float64)
-    row = np.clip(np.searchsorted(at, x, "right") - 1, 0, max(len(at) - 2, 0))
-    with np.errstate(divide="ignore", invalid="ignore"):  # between equal places, of no use
-        slopes = np.diff(values, append=values[-1]) / np.diff(at, append=np.inf)
-    found = (x - at[row]) * slopes[row] + values[row]
-    return np.where(x < at[0], values[0], np.where(x >= at[-1], values[-1], found))
+    row = np.clip(np.searchsorted(knots, x, "right") - 1, 0, max(len(knots) - 2, 0))
+    with np.errstate(divide="ignore", invalid="ignore"):  # slopes between equal knots are not used
+        slopes = np.diff(values, append=values[-1]) / np.diff(knots, append=np.inf)
+    interpolated = (x - knots[row]) * slopes[row] + values[row]
+    return np.where(x < knots[0], values[0], np.where(x >= knots[-1], values[-1], interpolated))
 
 
 def decade(x: float) -> int:
-    """Exponent of the largest power of ten that is at most a number above 0, of 16 digits."""
+    """Return the exponent of the largest power of ten up to a number above 0, of 16 digits."""
     return int(f"{x:.15e}".partition("e")[2])
 
 
-def _each(
-    name: str, one: Callable[..., Any], results: int, *given: ArrayLike
+def _apply(
+    name: str, function: Callable[..., Any], results: int, *arguments: ArrayLike
 ) -> tuple[Floats, ...]:
-    """Call a function for each number, and give arrays of the shape of the first argument."""
-    arrays = [np.asarray(array, np.float64) for array in given]
+    """Apply a function to each number; results have the shape of the first argument."""
+    arrays = [np.asarray(array, np.float64) for array in arguments]
     shape = arrays[0].shape
-    out = np.empty((results, arrays[0].size))
-    if arrays[0].size <= _FEW and "numba" not in sys.modules:
+    output = np.empty((results, arrays[0].size))
+    if arrays[0].size <= _MAX_INTERPRETED and "numba" not in sys.modules:
         for k, numbers in enumerate(
             zip(*(array.ravel().tolist() for array in arrays), strict=True)
         ):
-            out[:, k] = one(*numbers)
+            output[:, k] = function(*numbers)
     else:
         from . import elementary_loops
 
-        getattr(elementary_loops, name + "_each")(*map(owned, map(np.ravel, arrays)), *out)
-    return tuple(row.reshape(shape)[()] for row in out)
+        getattr(elementary_loops, name + "_each")(*map(owned, map(np.ravel, arrays)), *output)
+    return tuple(row.reshape(shape)[()] for row in output)

@@ -16,27 +16,27 @@ arctan2 = inlined(elementary_scalars.arctan2_of)
 
 @compiled()
 def sin_cos_each(x, sine, cosine):
-    """Sines and cosines of numbers (n,)."""
+    """Write sines and cosines of numbers (n,)."""
     for k in range(len(x)):
         sine[k], cosine[k] = sin_cos(x[k])
 
 
 @compiled()
-def exp_each(x, out):
-    """Exponentials of numbers (n,)."""
+def exp_each(x, result):
+    """Write exponentials of numbers (n,)."""
     for k in range(len(x)):
-        out[k] = exp(x[k])
+        result[k] = exp(x[k])
 
 
 @compiled()
-def log_each(x, out):
-    """Logarithms of numbers (n,)."""
+def log_each(x, result):
+    """Write logarithms of numbers (n,)."""
     for k in range(len(x)):
-        out[k] = log(x[k])
+        result[k] = log(x[k])
 
 
 @compiled()
-def arctan2_each(y, x, out):
-    """Angles of vectors (n,) and (n,)."""
+def arctan2_each(y, x, result):
+    """Write angles of vectors with coordinates y (n,) and x (n,)."""
     for k in range(len(x)):
-        out[k] = arctan2(y[k], x[k])
+        result[k] = arctan2(y[k], x[k])

@@ -5,19 +5,19 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-MISTAKES_TOLD = 20
+MAX_MISTAKES = 20
 
 
 class LidarError(Exception):
     """An error that the user can correct: bad input, a missing partition, a full disk.
 
-    The message is one or two lines that say what was given, what was expected and what to
-    do. The command prints it without a traceback and exits with code 2.
+    The message says in one or two lines what was given, what was expected and what to do. The
+    command prints the message without a traceback and exits with code 2.
     """
 
 
 def message_of(error: Exception) -> str:
-    """Return the message of an error as a sentence in one line.
+    """Return the message of an error as a sentence in a line.
 
     Examples
     --------
@@ -31,43 +31,43 @@ def message_of(error: Exception) -> str:
 
 
 @contextmanager
-def explained(what: str, advice: str = "") -> Iterator[None]:
-    """Turn an OSError of the body into a LidarError: what failed, why, and what to do."""
+def explained(failure: str, advice: str = "") -> Iterator[None]:
+    """Turn an OSError of the body into a LidarError: the failure, the reason, and advice."""
     try:
         yield
     except OSError as error:
         why = error.strerror or error
-        told = f"{what} ({why}): {advice}." if advice else f"{what}: {why}."
-        raise LidarError(told) from error
+        message = f"{failure} ({why}): {advice}." if advice else f"{failure}: {why}."
+        raise LidarError(message) from error
 
 
 @contextmanager
-def prefixed(what: object) -> Iterator[None]:
-    """Begin a LidarError of the body with what it is about: «leg 3: …»."""
+def prefixed(subject: object) -> Iterator[None]:
+    """Start a LidarError of the body with its subject: «leg 3: …»."""
     try:
         yield
     except LidarError as error:
-        raise LidarError(f"{what}: {error}") from error
+        raise LidarError(f"{subject}: {error}") from error
 
 
 class Mistakes:
-    """Collects errors and reports them together."""
+    """Collector of errors, which reports all errors together."""
 
     def __init__(self) -> None:
         self.lines: list[str] = []
 
     @contextmanager
     def noted(self) -> Iterator[None]:
-        """Note a LidarError of the body, and go on behind it."""
+        """Note a LidarError of the body, and continue after the body."""
         try:
             yield
         except LidarError as error:
             self.lines.append(str(error))
 
     def tell(self) -> None:
-        """Raise LidarError with a line for each, if anything was wrong."""
+        """Raise LidarError with a line for each error, if there are errors."""
         lines = list(dict.fromkeys(self.lines))
-        if len(lines) > MISTAKES_TOLD:
-            lines[MISTAKES_TOLD:] = [f"And {len(lines) - MISTAKES_TOLD:,} more."]
+        if len(lines) > MAX_MISTAKES:
+            lines[MAX_MISTAKES:] = [f"And {len(lines) - MAX_MISTAKES:,} more."]
         if lines:
             raise LidarError("\n".join(lines))

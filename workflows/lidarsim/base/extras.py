@@ -1,4 +1,4 @@
-"""Libraries that are extras: whether one is installed, and what its errors mean."""
+"""Libraries that are extras: checks for their installation, and errors as sentences."""
 
 from __future__ import annotations
 
@@ -10,10 +10,13 @@ from .errors import LidarError, explained, prefixed
 from .words import printable
 
 
-def need(package: str, extra: str, what: str) -> None:
-    """LidarError if the package of an extra, which does what is said, is not installed."""
+def need(package: str, extra: str, purpose: str) -> None:
+    """Check that the package of an extra is installed; LidarError if not.
+
+    `purpose` starts the error: «clouds are read».
+    """
     if find_spec(package) is None:
-        raise LidarError(f'{what} by {package}: pip install "lidarpool[{extra}]".')
+        raise LidarError(f'{purpose} by {package}: pip install "lidarpool[{extra}]".')
 
 
 @contextmanager
@@ -24,6 +27,6 @@ def reading(name: str) -> Iterator[None]:
             yield
     except LidarError:
         raise
-    except Exception as error:  # libraries raise whatever they stumble over
+    except Exception as error:  # libraries raise errors of any class
         reason = printable(str(error).partition("\n")[0]) or type(error).__name__
         raise LidarError(f"{name} is broken or cut short ({reason}).") from error

@@ -17,7 +17,7 @@ from .errors import LidarError
 # Opening a pipe waits for a writer, and opening a terminal may make it that of the process. Both
 # flags only matter if the path changes its kind between the check and the opening.
 _FLAGS = os.O_RDONLY | sum(getattr(os, name, 0) for name in ("O_NONBLOCK", "O_NOCTTY", "O_BINARY"))
-_KINDS = {  # {format of a mode: what the path leads to}
+_KINDS = {  # {file type in the mode: name}
     stat.S_IFIFO: "a pipe",
     stat.S_IFSOCK: "a socket",
     stat.S_IFCHR: "a device",
@@ -28,9 +28,9 @@ _LFS_MAX_BYTES = 1024  # of a pointer, by the specification of Git LFS
 
 
 class InputFileError(OSError):
-    """An error of a path that leads to no plain file with content of its own.
+    """An error of a path that does not lead to a plain file with content.
 
-    `strerror` is one line that says what the path leads to and what to do.
+    `strerror` is a line that says what the path leads to and what to do.
     """
 
     def __init__(self, path: str | Path, reason: str) -> None:
@@ -50,7 +50,7 @@ def open_input(path: str | Path) -> BufferedReader:
     InputFileError
         If the path leads to a pipe, a socket or a device, or if the file is a Git LFS pointer.
     OSError
-        If the path leads to a folder or to nothing, or the file cannot be opened.
+        If the path leads to a folder or does not exist, or the file cannot be opened.
     """
     _check_kind(path, Path(path).stat().st_mode)
     handle = os.open(path, _FLAGS)
@@ -70,7 +70,7 @@ def open_input(path: str | Path) -> BufferedReader:
 
 
 def _check_kind(path: str | Path, mode: int) -> None:
-    """Raise an OSError that says what a path leads to, unless to a plain file."""
+    """Check that a path leads to a plain file, by its mode; OSError if not."""
     if stat.S_ISDIR(mode):
         raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
     if not stat.S_ISREG(mode):
@@ -79,7 +79,7 @@ def _check_kind(path: str | Path, mode: int) -> None:
 
 
 def input_size(path: str | Path) -> int:
-    """Return the size of a plain file in bytes; errors as of `open_input`."""
+    """Return the size of a plain file in bytes; OSError if the file cannot be opened."""
     with open_input(path) as file:
         return os.fstat(file.fileno()).st_size
 
@@ -92,7 +92,7 @@ def check_input(path: str | Path) -> int:
     LidarError
         If the file is larger than the memory.
     OSError
-        As of `open_input`.
+        If the file is not a plain file, or cannot be read.
     """
     size = input_size(path)
     if size > memory():
@@ -111,7 +111,7 @@ def read_input(path: str | Path, max_bytes: int | None = None) -> bytes:
     LidarError
         If the file is read as a whole and is larger than the memory.
     OSError
-        As of `open_input`.
+        If the file is not a plain file, or cannot be read.
     """
     size = check_input(path) if max_bytes is None else max_bytes
     with open_input(path) as file:
@@ -121,7 +121,16 @@ def read_input(path: str | Path, max_bytes: int | None = None) -> bytes:
 def read_input_text(path: str | Path, errors: str = "strict") -> str:
     """Read a text file in UTF-8 without its byte order mark; lines end with a newline alone.
 
-    `errors` is that of `bytes.decode`. Raises as `read_input`, and ValueError for other encodings.
+    `errors` is passed to `bytes.decode`.
+
+    Raises
+    ------
+    ValueError
+        If the file is not in UTF-8.
+    LidarError
+        If the file is larger than the memory.
+    OSError
+        If the file cannot be read.
     """
     text = read_input(path).decode("utf-8-sig", errors)
     return text.replace("\r\n", "\n").replace("\r", "\n")

@@ -1,4 +1,4 @@
-"""Ctrl-C, SIGTERM, SIGHUP: the first stops cleanly, the second at once; workers get none."""
+"""Ctrl-C, SIGTERM, SIGHUP: the first stops cleanly, the second at once, without workers."""
 
 from __future__ import annotations
 
@@ -20,8 +20,9 @@ UNTOUCHED = f"{STOPPED}, and the output folder is as it was."
 # From the keyboard, from a job manager, and from a terminal that is closed.
 _SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 _IMPATIENT_S = 1.0  # a second signal sooner than this counts as the first
-_AGAIN_S = 0.01
-_WEAK = {weakref.__file__, weakref.WeakSet.add.__code__.co_filename}  # callbacks of references
+_RETRY_S = 0.01
+# Files with the callbacks of weak references.
+_WEAK = {weakref.__file__, weakref.WeakSet.add.__code__.co_filename}
 
 
 class _Interrupt:
@@ -32,10 +33,10 @@ class _Interrupt:
 
     def __call__(self, number: int, frame: FrameType | None) -> None:
         if self.first_at is None:
-            if _drops_errors(frame):  # a little later, from a thread
+            if _drops_errors(frame):  # send the signal again, a little later, from a thread
                 main = threading.main_thread().ident
-                # Also out of a lock that it waits for.
-                threading.Timer(_AGAIN_S, signal.pthread_kill, (main, signal.SIGINT)).start()
+                # A signal to the thread also interrupts its waiting for a lock.
+                threading.Timer(_RETRY_S, signal.pthread_kill, (main, signal.SIGINT)).start()
                 return
             self.first_at = time.monotonic()
             raise KeyboardInterrupt
@@ -44,7 +45,7 @@ class _Interrupt:
 
 
 def _drops_errors(frame: FrameType | None) -> bool:
-    """Whether an object may be being finalised: Python drops errors raised there."""
+    """Return True if an object may be being finalised: Python drops errors raised there."""
     while frame is not None:
         code = frame.f_code
         if code.co_name == "__del__" or code.co_filename in _WEAK:
@@ -54,16 +55,17 @@ def _drops_errors(frame: FrameType | None) -> bool:
 
 
 def end_on_signals() -> None:
-    """Let these signals end the process at once, while nothing has been started."""
+    """Let the signals end the process at once, as long as no work has started."""
     _on_signals(lambda number, frame: _exit(f"lidarpool: {UNTOUCHED}\n".encode()))
 
 
 def interrupt_on_signals() -> None:
-    """Turn these signals into KeyboardInterrupt; a second one ends the process at once."""
+    """Turn the first signal into KeyboardInterrupt; a second signal ends the process at once."""
     _on_signals(_Interrupt())
 
 
 def _on_signals(handler: Callable[[int, FrameType | None], object]) -> None:
+    """Handle the signals by a handler, except signals that `nohup` ignores."""
     for number in _SIGNALS:
         # With `nohup` a run survives the closing of its terminal.
         if signal.getsignal(number) is not signal.SIG_IGN or number == signal.SIGINT:
@@ -71,6 +73,7 @@ def _on_signals(handler: Callable[[int, FrameType | None], object]) -> None:
 
 
 def _exit(message: bytes) -> NoReturn:
+    """End the process at once, with a message on stderr."""
     with suppress(OSError):  # the terminal may be gone
         os.write(2, message)
     os._exit(INTERRUPTED)
@@ -78,33 +81,33 @@ def _exit(message: bytes) -> NoReturn:
 
 @contextmanager
 def deferred_interrupts() -> Iterator[None]:
-    """Hold signals back while the body runs, then raise KeyboardInterrupt if there was one.
+    """Defer signals while the body runs, then raise KeyboardInterrupt for the first signal.
 
-    For indivisible actions: starting processes, stopping them, moving a result into place. Only
-    the main thread of a program gets signals; elsewhere this does nothing. A second signal to an
-    interrupted program is not held back.
+    For indivisible actions: starting and stopping processes, moving a result to its folder. Only
+    the main thread of a program gets signals; in other threads, the body just runs. A second signal
+    to an interrupted program is not deferred.
     """
     if threading.current_thread() is not threading.main_thread():
         yield
         return
-    seen: list[int] = []
-    before = {n: signal.getsignal(n) for n in _SIGNALS}
-    # Handlers that raise nothing cannot break the body, and the user is impatient. A handler from
-    # outside of Python (None) could not be restored.
-    held = [
+    signals: list[int] = []
+    handlers = {n: signal.getsignal(n) for n in _SIGNALS}
+    # A handler that has seen a first signal raises no errors, and the user is impatient. A handler
+    # from outside of Python (None) could not be restored.
+    deferred = [
         number
-        for number, handler in before.items()
+        for number, handler in handlers.items()
         if handler not in (None, signal.SIG_IGN) and getattr(handler, "first_at", None) is None
     ]
-    for number in held:
-        signal.signal(number, lambda number, _: seen.append(number))
+    for number in deferred:
+        signal.signal(number, lambda number, _: signals.append(number))
     try:
         yield
     finally:
-        for number in held:
-            signal.signal(number, before[number])
-        if seen:
-            signal.raise_signal(seen[0])
+        for number in deferred:
+            signal.signal(number, handlers[number])
+        if signals:
+            signal.raise_signal(signals[0])
 
 
 @contextmanager
@@ -116,11 +119,11 @@ def children_spared() -> Iterator[None]:
     nannies. A blocked signal stays blocked in later threads and processes, also in a worker that a
     nanny restarts.
     """
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGHUP, signal.SIGQUIT})
+    mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGHUP, signal.SIGQUIT})
     try:
-        # It starts with the first process, and starting it unblocks SIGINT.
+        # The tracker would start with the first process, and starting it unblocks SIGINT.
         resource_tracker.ensure_running()
         signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
         yield
     finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+        signal.pthread_sigmask(signal.SIG_SETMASK, mask)

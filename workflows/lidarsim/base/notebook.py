@@ -1,4 +1,4 @@
-"""Detects notebooks, and displays in their cells."""
+"""Detection of notebooks, for displays in their cells."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import Any
 
 
 def cell_display() -> Any:
-    """Return `IPython.display` where what is printed goes to the cell of a notebook, else None."""
+    """Return `IPython.display` in a notebook, whose cells show printed text, else None."""
     if "ipykernel" not in sys.modules:
         return None
     from IPython import display, get_ipython

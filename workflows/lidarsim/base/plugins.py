@@ -1,4 +1,4 @@
-"""Plug-ins: what other distributions add through entry points.
+"""Plug-ins: extensions by other distributions through entry points.
 
 A table of this package answers first. Entry points are looked up only for names that no table has,
 since importing `importlib.metadata` takes 30 ms. Each group is named beside the table that it adds
@@ -34,24 +34,24 @@ class Plugin:
 
     @property
     def module(self) -> str:
-        """Name of the module that provides it."""
+        """Name of the module that provides the plug-in."""
         return self.value.partition(":")[0].strip()
 
     def load(self, kind: type[T]) -> T:
-        """Import what the plug-in provides.
+        """Import and return the value of the plug-in.
 
         Raises
         ------
         LidarError
-            If it cannot be imported, or is not of the kind.
+            If the value cannot be imported, or is not of the kind.
         """
-        thing = _imported(self)
-        if not isinstance(thing, kind):
+        value = _imported(self)
+        if not isinstance(value, kind):
             raise LidarError(
-                f"{self} is {_a(type(thing).__name__)}, and {self.group} takes "
+                f"{self} is {_a(type(value).__name__)}, and {self.group} takes "
                 f"{_a(kind.__name__)}: install another version of {self.distribution}."
             )
-        return thing
+        return value
 
     def lacks(self, field: str) -> LidarError:
         """Return the error of a plug-in that lacks a field or function."""
@@ -71,6 +71,7 @@ class Plugin:
 
 @cache
 def _imported(plugin: Plugin) -> Any:
+    """Return the value of a plug-in; LidarError if the import fails."""
     from importlib.metadata import EntryPoint
 
     try:
@@ -80,7 +81,7 @@ def _imported(plugin: Plugin) -> Any:
 
 
 def plugins_of(group: str) -> Mapping[str, tuple[Plugin, ...]]:
-    """Return the plug-ins of a group by name, sorted; several of a name are an error later."""
+    """Return the plug-ins of a group by name, sorted; several plug-ins may share a name."""
     from importlib.metadata import entry_points
 
     plugins: dict[str, tuple[Plugin, ...]] = {}
@@ -100,12 +101,12 @@ def find_plugin(group: str, name: str) -> Plugin | None:
     Raises
     ------
     LidarError
-        If two distributions provide it.
+        If two distributions provide a plug-in of the name.
     """
     candidates = plugins_of(group).get(name, ())
     if len(candidates) > 1:
-        both = " and ".join(f"{plugin.distribution} {plugin.version}" for plugin in candidates)
-        raise LidarError(f"{both} each provide {name!r} for {group}: uninstall all but one.")
+        providers = " and ".join(f"{plugin.distribution} {plugin.version}" for plugin in candidates)
+        raise LidarError(f"{providers} each provide {name!r} for {group}: uninstall all but one.")
     return candidates[0] if candidates else None
 
 

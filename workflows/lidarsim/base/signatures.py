@@ -1,4 +1,4 @@
-"""Signatures that people can read, of functions and dataclasses whose annotations hold more."""
+"""Readable signatures of functions and dataclasses whose annotations hold limits."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ class _WithoutMetadata(ast.NodeTransformer):
     """Replaces ``Annotated[X, …]`` by ``X``."""
 
     def visit_Subscript(self, node: ast.Subscript) -> ast.AST:
-        """Return the type of an annotated one; others as they are."""
+        """Return the type of an `Annotated[…]` node, or the node itself."""
         self.generic_visit(node)
         annotated = isinstance(node.value, ast.Name) and node.value.id == "Annotated"
         return node.slice.elts[0] if annotated and isinstance(node.slice, ast.Tuple) else node
@@ -39,7 +39,8 @@ def readable(signature: inspect.Signature) -> inspect.Signature:
     <Signature (count: int, name: str | None = None)>
     """
     parameters = [
-        one.replace(annotation=_plain(one.annotation)) for one in signature.parameters.values()
+        parameter.replace(annotation=_plain(parameter.annotation))
+        for parameter in signature.parameters.values()
     ]
     return signature.replace(
         parameters=parameters, return_annotation=_plain(signature.return_annotation)
@@ -47,6 +48,7 @@ def readable(signature: inspect.Signature) -> inspect.Signature:
 
 
 def _plain(annotation: Any) -> Any:
+    """Return an annotation without metadata, texts without quotes."""
     if not isinstance(annotation, str):
         return annotation
     if _ANNOTATED in annotation:
@@ -55,18 +57,18 @@ def _plain(annotation: Any) -> Any:
 
 
 class ReadableSignature:
-    """The attribute ``__signature__`` of a class: that of its ``__init__``, made when asked for."""
+    """The attribute ``__signature__`` of a class: the signature of its ``__init__``, lazily."""
 
     def __get__(self, instance: object, owner: type) -> inspect.Signature:
         if instance is not None:
             raise AttributeError("__signature__")
-        made = inspect.signature(owner.__init__)  # type: ignore[misc]
-        _, *parameters = made.parameters.values()
-        return readable(made.replace(parameters=parameters)).replace(
+        signature = inspect.signature(owner.__init__)  # type: ignore[misc]
+        _, *parameters = signature.parameters.values()
+        return readable(signature.replace(parameters=parameters)).replace(
             return_annotation=inspect.Signature.empty
         )
 
 
 def annotated(function: Callable[..., Any]) -> bool:
-    """Whether an annotation of a function holds more than a type."""
-    return any(_ANNOTATED in str(one) for one in function.__annotations__.values())
+    """Return True if an annotation of a function holds more than a type."""
+    return any(_ANNOTATED in str(annotation) for annotation in function.__annotations__.values())

@@ -1,4 +1,4 @@
-"""Storage of runs and results: a folder, or any place that fsspec opens.
+"""Storage of runs and results: a folder, or any URL that fsspec opens.
 
 Files appear completely or not at all: in a folder they are written under a temporary name and
 renamed, and an object store shows only complete objects.
@@ -23,43 +23,44 @@ from typing import IO, Any
 from .errors import LidarError
 from .input_files import open_input
 
-_PIECE = 1 << 20  # bytes in memory of a file that is checked
-TEMPORARY = ".lidarpool-tmp-"  # begins the name of an unfinished file
-WRITING = ".lidarpool-writing-"  # begins the name of a folder of unfinished files
-_LEFT = re.compile(rf"(?:{re.escape(TEMPORARY)}(.+)-|{re.escape(WRITING)})[0-9a-f]{{8}}")
+_BLOCK_BYTES = 1 << 20  # read at a time of a file that is copied or checked
+TEMPORARY = ".lidarpool-tmp-"  # prefix of the name of an unfinished file
+WRITING = ".lidarpool-writing-"  # prefix of the name of a folder of unfinished files
+_LEFTOVER = re.compile(rf"(?:{re.escape(TEMPORARY)}(.+)-|{re.escape(WRITING)})[0-9a-f]{{8}}")
 
 
 def target_of(name: str) -> str:
-    """Name of the file that a temporary file was written for; other names are their own."""
-    found = _LEFT.fullmatch(name)
-    return found[1] or name if found else name
+    """Return the name of the file for which a temporary file was written, or the name itself."""
+    match = _LEFTOVER.fullmatch(name)
+    return match[1] or name if match else name
 
 
-def is_url(place: str | Path) -> bool:
-    """Whether a place is a URL, not a path."""
-    return "://" in str(place)
+def is_url(location: str | Path) -> bool:
+    """Return True if a location is a URL, not a path."""
+    return "://" in str(location)
 
 
 @dataclass(frozen=True)
 class Storage:
     """A folder of files, by path or URL; small when pickled.
 
-    Nothing is opened, written or removed through a link below the folder that the user named. A
-    link in place of a file that is written or removed goes, not what it leads to.
+    Files are not opened, written or removed through a link below the folder that the user named.
+    Writing or removing a file that is a link replaces or removes the link, not its target.
 
-    Its methods raise OSError if the storage fails, and LidarError if it cannot be opened or
-    there is such a link.
+    The methods raise OSError if the storage fails, and LidarError if the storage cannot be opened
+    or a path leads through such a link.
 
     Parameters
     ----------
     url
-        A folder's path, or a URL such as ``s3://bucket/folder``. The library of that kind of
-        storage finds the credentials.
+        A folder's path, or a URL such as ``s3://bucket/folder``. The library of the storage finds
+        the credentials.
     durable
         Whether files must survive a power failure: flushing takes milliseconds for each file, and
         is not needed for a temporary folder.
     named
-        The folder that the user named, this or one above, which may be a link; "" follows all.
+        The folder that the user named, this folder or a parent, which may be a link; "" follows all
+        links.
     """
 
     url: str
@@ -67,15 +68,15 @@ class Storage:
     named: str = ""
 
     @classmethod
-    def at(cls, place: str | Path | Storage, *, durable: bool = True) -> Storage:
-        """Storage at a path that the user named, made absolute, or a URL; a storage as it is.
+    def at(cls, location: str | Path | Storage, *, durable: bool = True) -> Storage:
+        """Return the storage at a path that the user named, or at a URL; a storage is returned.
 
-        LidarError if the URL holds a password, which would get into databases and reports, or
-        only a scheme.
+        LidarError if the URL has a password, which would get into databases and reports, or only
+        a scheme.
         """
-        if isinstance(place, Storage):
-            return place
-        text = str(place)
+        if isinstance(location, Storage):
+            return location
+        text = str(location)
         if not is_url(text):
             path = str(Path(text).absolute())
             return cls(path, durable, path)
@@ -94,41 +95,41 @@ class Storage:
 
     @property
     def is_local(self) -> bool:
-        """Whether it is a folder in a local file system."""
+        """True for a folder in a local file system."""
         return not is_url(self.url)
 
     def below(self, name: str) -> Storage:
-        """Open a folder in it, which need not exist."""
+        """Return the storage of a folder below, which need not exist."""
         if self.is_local:
             self.local(name)
         return replace(self, url=f"{self.url}/{name}")
 
     def local(self, name: str | Path = "") -> Path:
-        """Path of a file or folder in a local file system, by default its own, to open it."""
+        """Return the path of a file or folder in a local folder, or of the folder itself."""
         path = Path(self.url, name)
-        for part in (path, *path.parents) if self.named else ():
-            if len(str(part)) <= len(self.named):
+        for ancestor in (path, *path.parents) if self.named else ():
+            if len(str(ancestor)) <= len(self.named):
                 break
-            if part.is_symlink():
+            if ancestor.is_symlink():
                 raise LidarError(
-                    f"{part} is a link, and nothing behind a link in {self.named} is opened, "
+                    f"{ancestor} is a link, and nothing behind a link in {self.named} is opened, "
                     "written or deleted: remove it, or put there what it leads to."
-                ) from OSError(errno.ELOOP, os.strerror(errno.ELOOP))  # it fails all alike
+                ) from OSError(errno.ELOOP, os.strerror(errno.ELOOP))  # for every caller
         return path
 
     def _target(self, name: str) -> Path:
-        """Path of a file or folder that is replaced or removed."""
+        """Return the path of a file or folder to replace or remove."""
         path = Path(name)
         return self.local(path.parent) / path.name
 
     @contextmanager
     def _remote(self) -> Iterator[tuple[Any, str]]:
-        """File system and folder of a URL; any error of its library becomes an OSError."""
+        """Return file system and folder of a URL; errors of its library become OSError."""
         try:
             if self._opened[0] != os.getpid():  # a fork cannot use its parent's connections
                 self.__dict__.pop("_opened", None)
             _, system, folder = self._opened
-            system.invalidate_cache()  # other processes write there, too
+            system.invalidate_cache()  # other processes write to the storage, too
             yield system, folder
         except (OSError, LidarError):
             raise
@@ -137,7 +138,7 @@ class Storage:
 
     @cached_property
     def _opened(self) -> tuple[int, Any, str]:
-        """The process that has opened it, file system and folder."""
+        """Process that has opened the storage, file system and folder."""
         try:
             import fsspec
         except ImportError as error:
@@ -159,11 +160,11 @@ class Storage:
         return Storage, (self.url, self.durable, self.named)
 
     def path(self, name: str) -> str:
-        """Path or URL of a file, for messages."""
+        """Return the path or URL of a file, for messages."""
         return f"{self.url}/{name}"
 
     def prepare(self, name: str | Path = "") -> None:
-        """Make the folder, or one in it."""
+        """Make the folder, or a folder below."""
         if self.is_local:
             self.local(name).mkdir(parents=True, exist_ok=True)
             return
@@ -173,7 +174,7 @@ class Storage:
                 system.makedirs(f"{folder}/{name}".rstrip("/"), exist_ok=True)
 
     def claim(self) -> None:
-        """Make the folder; LidarError if files cannot be written and removed there."""
+        """Make the folder; LidarError if files cannot be written and removed."""
         name = f"{TEMPORARY}{secrets.token_hex(4)}"
         try:
             self.prepare()
@@ -189,9 +190,9 @@ class Storage:
                 "its library finds, and at its address."
             ) from error
 
-    def write(self, name: str, data: Any) -> None:
-        """Write bytes, or a list of them, completely or not at all; flush them if durable."""
-        pieces = data if isinstance(data, list) else [data]
+    def write(self, name: str, content: Any) -> None:
+        """Write bytes, or a list of bytes, completely or not at all; flush if durable."""
+        pieces = content if isinstance(content, list) else [content]
         if self.is_local:
             with self._replacing(self._target(name)) as file:
                 file.writelines(pieces)
@@ -201,9 +202,9 @@ class Storage:
 
     @contextmanager
     def writing(self, name: str) -> Iterator[IO[bytes]]:
-        """Write a file bit by bit: it appears once the body has ended without an error.
+        """Open a file for writing, which appears once the body has ended without an error.
 
-        Folders in its name are made.
+        Folders in the name are made.
         """
         if self.is_local:
             target = self._target(name)
@@ -219,6 +220,7 @@ class Storage:
 
     @contextmanager
     def _replacing(self, target: Path) -> Iterator[IO[bytes]]:
+        """Open a temporary file that replaces a file after the body."""
         temporary = target.with_name(f"{TEMPORARY}{target.name}-{secrets.token_hex(4)}")
         try:
             with temporary.open("xb") as file:
@@ -235,7 +237,7 @@ class Storage:
             flush(target.parent)
 
     def read(self, name: str, first: int = 0, stop: int | None = None) -> bytes:
-        """Read a file, or its bytes from `first` to `stop`; fewer if it ends before."""
+        """Read a file, or its bytes from `first` to `stop`, or to its end."""
         if self.is_local:
             with open_input(self.local(name)) as file:
                 file.seek(first)
@@ -254,10 +256,10 @@ class Storage:
                 yield file
 
     def checksum(self, name: str) -> list[int]:
-        """Bytes of a file and their CRC-32, read a piece at a time."""
+        """Return the size of a file in bytes and its CRC-32."""
         size = crc = 0
         with self._reading(name) as file:
-            while piece := file.read(_PIECE):
+            while piece := file.read(_BLOCK_BYTES):
                 size = size + len(piece)
                 crc = zlib.crc32(piece, crc)
         return [size, crc]
@@ -275,55 +277,55 @@ class Storage:
         with self._remote() as (system, folder):
             system.get_file(f"{folder}/{name}", str(path))
 
-    def take(self, place: Storage, name: str, own: str) -> None:
-        """Have a file of another storage here, completely or not at all, by a name of its `own`.
+    def take(self, source: Storage, name: str, new_name: str) -> None:
+        """Copy a file of another storage, completely or not at all, to a name in this storage.
 
-        It is linked (a hard link), or an object store copies it, where that is possible.
+        Where possible, the file is linked (a hard link), or an object store copies it.
         """
-        if self.is_local and place.is_local:
-            self.remove([own])
-            with suppress(OSError):  # another disk, or one without links: it is copied
-                os.link(place.local(name), self._target(own))
+        if self.is_local and source.is_local:
+            self.remove([new_name])
+            with suppress(OSError):  # on another disk, or on a disk without links, copy the file
+                os.link(source.local(name), self._target(new_name))
                 return
-        with place._remote() as (other, folder), self._remote() as (system, own_folder):
-            if other is system and not self.is_local:
-                system.cp_file(f"{folder}/{name}", f"{own_folder}/{own}")
+        with source._remote() as (source_system, folder), self._remote() as (system, target_folder):
+            if source_system is system and not self.is_local:
+                system.cp_file(f"{folder}/{name}", f"{target_folder}/{new_name}")
                 return
-        with place._reading(name) as source, self.writing(own) as file:
-            shutil.copyfileobj(source, file, _PIECE)
+        with source._reading(name) as source_file, self.writing(new_name) as file:
+            shutil.copyfileobj(source_file, file, _BLOCK_BYTES)
 
     def sees(self, name: str, data: bytes) -> bool:
-        """Whether a file has this content, so that this process sees the same place."""
+        """Return True if a file has this content: then this process sees the same storage."""
         try:
             return self.read(name) == data
         except Exception:  # any error of a storage or its missing library
             return False
 
     def sizes(self) -> dict[str, int]:
-        """All plain files and their sizes in bytes; none without the folder."""
+        """Return all plain files and their sizes, bytes; {} if the folder is missing."""
         return {name: size for name, size in self.entries().items() if size is not None}
 
     def entries(self) -> dict[str, int | None]:
-        """Everything in the folder: {name: bytes of a file, None for a folder or link}.
+        """Return all entries of the folder: {name: bytes of a file, None for a folder or link}.
 
-        A missing folder is empty.
+        A missing folder has no entries.
         """
-        found: dict[str, int | None] = {}
+        sizes: dict[str, int | None] = {}
         if self.is_local:
             with suppress(FileNotFoundError), os.scandir(self.local()) as entries:
                 for entry in entries:
                     with suppress(FileNotFoundError):  # just renamed or removed
                         plain = entry.is_file(follow_symlinks=False)
-                        found[entry.name] = entry.stat().st_size if plain else None
-            return found
+                        sizes[entry.name] = entry.stat().st_size if plain else None
+            return sizes
         with suppress(FileNotFoundError), self._remote() as (system, folder):
-            for one in system.ls(folder, detail=True):
-                plain = one["type"] == "file" and not one.get("islink")
-                found[one["name"].rpartition("/")[2]] = (one["size"] or 0) if plain else None
-        return found
+            for info in system.ls(folder, detail=True):
+                plain = info["type"] == "file" and not info.get("islink")
+                sizes[info["name"].rpartition("/")[2]] = (info["size"] or 0) if plain else None
+        return sizes
 
     def remove(self, names: Iterable[str], *, folder: bool = False) -> None:
-        """Remove files; no error for missing ones. Then the `folder` itself, if it is empty."""
+        """Remove files, of which any may be missing; with `folder`, remove the empty folder too."""
         for name in names:
             if self.is_local:
                 self._target(name).unlink(missing_ok=True)
@@ -335,28 +337,28 @@ class Storage:
                 self.local().rmdir()
 
     def tree(self, name: str = "") -> list[str]:
-        """Names, as of `read`, of all files in a folder and below; LidarError for a link."""
+        """Return the names of all files in a folder and below; LidarError for a link."""
         if self.is_local:
-            found: list[Path] = []
+            paths_below: list[Path] = []
             for folder, folders, files in os.walk(self.local(name)):
-                paths = [Path(folder, one) for one in (*files, *folders)]
+                paths = [Path(folder, entry) for entry in (*files, *folders)]
                 for path in filter(Path.is_symlink, paths):
                     self.local(path)
-                found += paths[: len(files)]
-            return [path.relative_to(self.url).as_posix() for path in found]
+                paths_below += paths[: len(files)]
+            return [path.relative_to(self.url).as_posix() for path in paths_below]
         with self._remote() as (system, folder):
             below = system.find(f"{folder}/{name}".rstrip("/"))
-            return [one.removeprefix(f"{folder}/") for one in below]
+            return [entry.removeprefix(f"{folder}/") for entry in below]
 
     def prune(self, names: Collection[str]) -> None:
-        """Remove files in folders in it, in this order, and the folders that are then empty."""
+        """Remove files below, in this order, and then the folders without further files."""
         self.remove(names)
         folders = {str(folder) for name in names for folder in Path(name).parents}
         for folder in sorted(folders - {"."}, key=len, reverse=True):
             self.below(folder).remove([], folder=True)
 
     def discard(self, name: str) -> None:
-        """Remove a file, or a folder with its content, if it exists."""
+        """Remove a file or a folder with its content, which may be missing."""
         if self.is_local:
             path = self._target(name)
             if path.is_dir() and not path.is_symlink():
@@ -368,10 +370,10 @@ class Storage:
                 system.rm(f"{folder}/{name}", recursive=True)
 
     def tidy(self, *, deep: bool = True) -> None:
-        """Remove what killed writers have left in a folder of this machine, and below if `deep`."""
+        """Remove the files of killed writers in a local folder, and in folders below if `deep`."""
         for folder, folders, files in os.walk(self.local()) if self.is_local else ():
             for path in (Path(folder, name) for name in (*folders, *files)):
-                if _LEFT.fullmatch(path.name) and not path.is_symlink():
+                if _LEFTOVER.fullmatch(path.name) and not path.is_symlink():
                     self.discard(path.relative_to(self.url).as_posix())
             if not deep:
                 break

@@ -1,4 +1,4 @@
-"""Tables of numbers with a header: spellings of their columns, and the units that headers state.
+"""Tables of numbers with a header: spellings of columns, and units that headers state.
 
 A column is either understood, with its unit, or named by the user to be ignored, or the table is
 refused: a column that is silently left out may be the one that turns the sensor.
@@ -19,7 +19,7 @@ import numpy as np
 from .arrays import Floats
 from .words import did_you_mean, printable
 
-# {unit: how many of it are one of the first unit}
+# {unit: number of these units in the first unit}
 SECONDS = {"s": 1.0, "ms": 1e3, "us": 1e6, "ns": 1e9}
 METRES = {"m": 1.0, "cm": 1e2, "mm": 1e3, "km": 1e-3}
 DEGREES = {"deg": 1.0, "rad": np.pi / 180}
@@ -62,12 +62,12 @@ class Quantity:
     spellings
         Names in headers, without a unit; case, spaces, underscores, hyphens and dots are ignored.
     units
-        Units that a header may state, as `SECONDS`; values are returned in the first.
+        Units that a header may state, such as `SECONDS`; values are returned in the first unit.
     bare
-        Unit of a column whose header states none; None to refuse such a column.
+        Unit of a column whose header states no unit; None to refuse such a column.
     evident_above
-        A column without a stated unit is refused if all its values are nearer to zero than this
-        and some is not zero: they may have another unit.
+        A column without a stated unit is refused if its largest magnitude is above zero and at most
+        this number: the values may have another unit.
     exact
         Names with the same letters in another case are the only other spellings.
     """
@@ -91,9 +91,9 @@ class TableFormat:
     marker
         A column that only this format has.
     bare
-        {quantity: its unit, if the header states none}.
+        {quantity: unit, if the header states no unit}.
     unused
-        Columns that the specification defines and that nothing here uses, with * and ?.
+        Columns that the specification defines and that readers do not use, with * and ?.
     """
 
     name: str
@@ -108,7 +108,7 @@ class Header(NamedTuple):
     cells: list[str]  # names of the columns, as the file has them
     separator: str | None  # None for spaces
     body: int  # index of the line after the header, or of the first row
-    comment: bool  # True if the header is a remark that begins with #
+    comment: bool  # True if the header is a remark that starts with #
 
 
 class ColumnName(NamedTuple):
@@ -135,7 +135,7 @@ def column_name(cell: str) -> ColumnName:
 def ignored_columns(names: Sequence[str], ignore: Sequence[str]) -> set[int]:
     """Return the indices of the columns that patterns with * and ? name, in any case.
 
-    ValueError for a pattern that names none.
+    ValueError for a pattern that matches no column.
     """
     indices = set[int]()
     for pattern in ignore:
@@ -151,17 +151,18 @@ def ignored_columns(names: Sequence[str], ignore: Sequence[str]) -> set[int]:
 
 
 def _letters(name: str) -> str:
+    """Return a name without case and separators."""
     return _BETWEEN.sub("", name).lower()
 
 
 def find_header(
-    lines: Sequence[str], known: Callable[[str], bool] = lambda name: True
+    lines: Sequence[str], is_known: Callable[[str], bool] = lambda name: True
 ) -> Header | None:
-    """Return the header of a table, or None if it has none.
+    """Return the header of a table, or None without a header.
 
     The header is the first line that is neither empty nor a remark, if it has a word among its
-    cells. Else it is the last remark before the numbers that has as many names as these, of which
-    half, or four, are `known`.
+    cells. Else the header is the last remark before the numbers that has as many names as the rows
+    have numbers, and `is_known` half of the names, or four.
     """
     body = next((i for i, line in enumerate(lines) if not _is_remark(line)), len(lines))
     if body < len(lines) and not _all_numbers(lines[body]):
@@ -174,21 +175,24 @@ def find_header(
         cells = _cells(names, _separator_of(names))
         separator = _separator_of(lines[body]) if body < len(lines) else _separator_of(names)
         count = len(_cells(lines[body], separator)) if body < len(lines) else len(cells)
-        if cells and len(cells) == count and sum(map(known, cells)) >= min(4, count / 2):
+        if cells and len(cells) == count and sum(map(is_known, cells)) >= min(4, count / 2):
             return Header(cells, separator, body, True)
     return None
 
 
 def _is_remark(line: str) -> bool:
+    """Return True for an empty line or a remark."""
     return not line.strip() or line.lstrip().startswith("#")
 
 
 def _all_numbers(line: str) -> bool:
+    """Return True if all cells of a line are numbers or empty."""
     cells = [cell for cell in _cells(line, _separator_of(line)) if cell]
     return all(map(_is_number, cells))
 
 
 def _is_number(cell: str) -> bool:
+    """Return True for a number, also infinite or NaN."""
     try:
         float(cell)
     except ValueError:
@@ -197,6 +201,7 @@ def _is_number(cell: str) -> bool:
 
 
 def _is_finite(cell: str) -> bool:
+    """Return True for a finite number."""
     return _is_number(cell) and bool(np.isfinite(float(cell)))
 
 
@@ -208,6 +213,7 @@ def _separator_of(line: str) -> str | None:
 
 
 def _cells(line: str, separator: str | None) -> list[str]:
+    """Return the cells of a line without quotes."""
     if separator is None:
         return [word.strip('"') for word in _WORD.findall(line)]
     (cells,) = csv.reader([line], delimiter=separator, skipinitialspace=True)
@@ -234,22 +240,22 @@ def read_table(
         A header, and rows; commas, semicolons, tabs or spaces separate the cells, and lines that
         begin with # are remarks.
     quantities
-        What columns may hold.
+        Quantities that columns may hold.
     required
-        Returns the names of the quantities that a table with some columns must have.
+        Returns the names of the quantities that a table with the given columns must have.
     columns
         {name of a quantity, with its unit: name in the file}, for other spellings; None where users
         cannot give it, so that messages do not name it.
     ignore
         Names of columns to leave out, with * and ?.
     formats
-        Formats with columns of their own.
+        Formats with specified columns.
     unused
-        Further columns to accept and leave out, without a word.
+        Further columns to accept and leave out silently.
     refused
         {spelling: why such a column cannot be used}.
     bare
-        {quantity: unit of a column whose header states none}.
+        {quantity: unit of a column whose header states no unit}.
 
     Returns
     -------
@@ -263,24 +269,24 @@ def read_table(
         not known, or a cell holds no finite number.
     """
     lines = text.splitlines()
-    spellings = {_letters(name): one for one in quantities for name in one.spellings}
-    exact = {one.name.lower(): one for one in quantities if one.exact}
-    exact |= {one.name: one for one in quantities if one.exact}
+    spellings = {_letters(name): quantity for quantity in quantities for name in quantity.spellings}
+    exact = {quantity.name.lower(): quantity for quantity in quantities if quantity.exact}
+    exact |= {quantity.name: quantity for quantity in quantities if quantity.exact}
     header = find_header(
         lines, lambda cell: column_name(cell).words in spellings or cell.lower() in exact
     )
     if header is None:
-        example = ",".join(one.name for one in quantities[:4])
+        example = ",".join(quantity.name for quantity in quantities[:4])
         raise ValueError(f"it has no header: name its columns in its first line, as in {example}")
     reader = _ColumnReader(header, quantities, spellings, exact)
     reader.choose(columns)
     reader.leave_out(ignore)
     reader.assign(formats, unused, refused or {}, bare or {})
     names = {name: number for name, (number, _) in reader.assigned.items()}
-    needed = required(dict.fromkeys(names, np.empty(0)))
-    if missing := next((name for name in needed if name not in names), None):
+    required_names = required(dict.fromkeys(names, np.empty(0)))
+    if missing := next((name for name in required_names if name not in names), None):
         raise ValueError(f"it has no column {missing!r}; it has {_listed(header.cells)}")
-    values = _numbers(lines, header, names, [*needed, *(columns or {})])
+    values = _numbers(lines, header, names, [*required_names, *(columns or {})])
     return {name: reader.converted(name, values[:, i]) for i, name in enumerate(reader.assigned)}
 
 
@@ -312,26 +318,28 @@ class _ColumnReader:
         return None if quantity is None else (quantity, name.unit)
 
     def choose(self, columns: Mapping[str, str] | None) -> None:
-        """Assign the columns that the user names; None if users cannot name any."""
+        """Assign the columns that the user names; None if users cannot name columns."""
         self.can_choose = columns is not None
-        for ours, theirs in (columns or {}).items():
-            known = self.quantity_of(ours)
-            if known is None:
-                raise ValueError(f"columns names {ours!r}; possible names are {self.possible}")
-            quantity, unit = known
-            wanted = theirs.lstrip("#%").strip()
-            matches = [i for i, cell in enumerate(self.cells) if cell == wanted] or [
-                i for i, cell in enumerate(self.cells) if cell.lower() == wanted.lower()
+        for name, file_name in (columns or {}).items():
+            match = self.quantity_of(name)
+            if match is None:
+                raise ValueError(f"columns names {name!r}; possible names are {self.possible}")
+            quantity, unit = match
+            spelling = file_name.lstrip("#%").strip()
+            matches = [i for i, cell in enumerate(self.cells) if cell == spelling] or [
+                i for i, cell in enumerate(self.cells) if cell.lower() == spelling.lower()
             ]
             if not matches:
-                raise ValueError(f"it has no column {theirs!r}; it has {_listed(self.cells)}")
+                raise ValueError(f"it has no column {file_name!r}; it has {_listed(self.cells)}")
             if len(matches) > 1:
-                raise ValueError(f"it has the column {theirs!r} {len(matches)} times")
-            stated = column_name(wanted).unit
+                raise ValueError(f"it has the column {file_name!r} {len(matches)} times")
+            stated = column_name(spelling).unit
             if unit is not None and stated in quantity.units and stated != unit:
-                raise ValueError(f"columns reads {theirs!r} as {ours}: the header states {stated}")
+                raise ValueError(
+                    f"columns reads {file_name!r} as {name}: the header states {stated}"
+                )
             if unit is None:
-                unit = self._unit(quantity, theirs, stated, {})
+                unit = self._unit(quantity, file_name, stated, {})
             self._add(quantity, matches[0], unit)
 
     def leave_out(self, ignore: Sequence[str]) -> None:
@@ -345,79 +353,84 @@ class _ColumnReader:
         refused: Mapping[str, str],
         bare: Mapping[str, str],
     ) -> None:
-        """Assign the other columns by their names; ValueError for one that is not known."""
-        chosen = {number for number, _ in self.assigned.values()} | self.left_out
+        """Assign the remaining columns by their names; ValueError for an unknown column."""
+        chosen = {index for index, _ in self.assigned.values()} | self.left_out
         words = [column_name(cell).words for cell in self.cells]
-        forms = [one for one in formats if _letters(one.marker) in words]
-        patterns = [_letters(name) for one in forms for name in one.unused]
+        matching = [form for form in formats if _letters(form.marker) in words]
+        patterns = [_letters(name) for form in matching for name in form.unused]
         patterns += [_letters(name) for name in unused]
-        units = {**bare, **{name: unit for one in forms for name, unit in one.bare.items()}}
+        units = dict(bare)
+        for form in matching:
+            units.update(form.bare)
         unknown = []
-        for number, cell in enumerate(self.cells):
-            if number in chosen or not cell or re.fullmatch(r"unnamed: \d+", cell.lower()):
+        for index, cell in enumerate(self.cells):
+            if index in chosen or not cell or re.fullmatch(r"unnamed: \d+", cell.lower()):
                 continue  # columns without a name are checked with the rows
-            if (known := self.quantity_of(cell)) is not None:
-                quantity, unit = known
-                self._add(quantity, number, self._unit(quantity, cell, unit, units))
-            elif reason := next((refused[w] for w in refused if _letters(w) == words[number]), ""):
+            if (match := self.quantity_of(cell)) is not None:
+                quantity, unit = match
+                self._add(quantity, index, self._unit(quantity, cell, unit, units))
+            elif reason := next((refused[w] for w in refused if _letters(w) == words[index]), ""):
                 raise ValueError(f"its column {cell!r} {reason}")
-            elif not any(fnmatchcase(words[number], pattern) for pattern in patterns):
+            elif not any(fnmatchcase(words[index], pattern) for pattern in patterns):
                 unknown.append(cell)
         if unknown:
             columns = "columns are" if len(unknown) > 1 else "column is"
-            it = "them" if len(unknown) > 1 else "it"
-            hint = did_you_mean(unknown[0], [one.name for one in self.quantities])
+            pronoun = "them" if len(unknown) > 1 else "it"
+            hint = did_you_mean(unknown[0], [quantity.name for quantity in self.quantities])
             raise ValueError(
                 f"its {columns} not known: {_listed(unknown)}.{hint} Known are {self.possible}: "
-                f"rename {it}, or give ignore: [{_listed(unknown)}] to leave {it} out"
+                f"rename {pronoun}, or give ignore: [{_listed(unknown)}] to leave {pronoun} out"
             )
 
     def _unit(
         self, quantity: Quantity, cell: str, unit: str | None, units: Mapping[str, str]
     ) -> str | None:
-        """Return the unit of a column; None if it is the bare one, which is yet to be checked."""
+        """Return the unit of a column, or None for the bare unit, which is yet to be checked."""
         if unit is not None:
             if unit not in quantity.units:
-                known = " or ".join(one or "none" for one in quantity.units)
-                raise ValueError(f"its column {cell!r} has the unit {unit!r}: give it in {known}")
+                units_read = " or ".join(name or "none" for name in quantity.units)
+                raise ValueError(
+                    f"its column {cell!r} has the unit {unit!r}: give it in {units_read}"
+                )
             return unit
         if (implied := units.get(quantity.name)) is not None:
             return implied
         if quantity.bare is None:
-            first, *others = quantity.units
+            first, *other_units = quantity.units
             stem = quantity.name.removesuffix(f"_{first}")
             choice = f", or give columns: {{{quantity.name}: {cell}}}" * self.can_choose
+            names = " or ".join(f"{stem}_{other_unit}" for other_unit in other_units)
             raise ValueError(
                 f"its column {printable(cell)!r} has no unit: call it {quantity.name}, in "
-                f"{_UNIT_WORDS[first]}{choice}; "
-                f"{' or '.join(f'{stem}_{other}' for other in others)} is read as well"
+                f"{_UNIT_WORDS[first]}{choice}; {names} is read as well"
             )
         return None
 
-    def _add(self, quantity: Quantity, number: int, unit: str | None) -> None:
+    def _add(self, quantity: Quantity, index: int, unit: str | None) -> None:
+        """Assign a column to a quantity; ValueError if the quantity has a column."""
         if (earlier := self.assigned.get(quantity.name)) is not None:
-            one = self.cells[earlier[0]]
-            other = self.cells[number]
-            if one == other:
-                raise ValueError(f"it has the column {one!r} twice")
+            earlier_cell = self.cells[earlier[0]]
+            cell = self.cells[index]
+            if earlier_cell == cell:
+                raise ValueError(f"it has the column {earlier_cell!r} twice")
             raise ValueError(
-                f"its columns {one!r} and {other!r} are both {quantity.name}: give ignore: "
-                f"[{other}] to leave one out"
+                f"its columns {earlier_cell!r} and {cell!r} are both {quantity.name}: give ignore: "
+                f"[{cell}] to leave one out"
             )
-        self.assigned[quantity.name] = number, unit
+        self.assigned[quantity.name] = index, unit
 
     def converted(self, name: str, values: Floats) -> Floats:
         """Convert the values of a quantity to its first unit."""
-        number, unit = self.assigned[name]
-        quantity = next(one for one in self.quantities if one.name == name)
+        index, unit = self.assigned[name]
+        quantity = next(quantity for quantity in self.quantities if quantity.name == name)
         if unit is None:
             unit = quantity.bare
             largest = np.abs(values).max(initial=0.0)
             if 0 < largest <= quantity.evident_above:
                 stem = name.removesuffix(f"_{unit}")
-                names = " or ".join(f"{stem}_{one}" for one in quantity.units)
+                names = " or ".join(f"{stem}_{unit_name}" for unit_name in quantity.units)
                 raise ValueError(
-                    f"its column {self.cells[number]!r} has no unit, and values up to "
+                    f"its column {self.cells[index]!r} has no unit, and values up to "
                     f"{largest:.3g} may have any: call it {names}"
                 )
         assert unit is not None  # set above
@@ -426,24 +439,29 @@ class _ColumnReader:
 
     @property
     def possible(self) -> str:
-        """Names of the quantities, with the other units of each."""
+        """Names of the quantities, with the names for further units."""
         names = []
         for quantity in self.quantities:
-            first, *others = quantity.units
+            first, *other_units = quantity.units
             stem = quantity.name.removesuffix(f"_{first}")
-            units = [] if quantity.bare == first else [f"{stem}_{other}" for other in others]
+            units = (
+                []
+                if quantity.bare == first
+                else [f"{stem}_{other_unit}" for other_unit in other_units]
+            )
             names.append(f"{quantity.name} (or {', '.join(units)})" if units else quantity.name)
         return ", ".join(names)
 
 
 def _listed(cells: Sequence[str]) -> str:
+    """Return the first names of columns in a row, with an ellipsis for the rest."""
     return ", ".join(printable(cell) for cell in cells[:_SHOWN]) + ", …" * (len(cells) > _SHOWN)
 
 
 def _numbers(
-    lines: Sequence[str], header: Header, names: Mapping[str, int], needed: Sequence[str]
+    lines: Sequence[str], header: Header, names: Mapping[str, int], required_names: Sequence[str]
 ) -> Floats:
-    """Return the numbers of some columns, (rows, columns); ValueError names a bad cell."""
+    """Return the numbers of the named columns, (rows, columns); ValueError names a bad cell."""
     body = lines[header.body :]
     rows = [line for line in body if not _is_remark(line)]
     if not rows:
@@ -463,10 +481,10 @@ def _numbers(
         for number, cells in _rows_of(lines, header):
             for name, index in names.items():
                 if not _is_finite(cells[index]):
-                    more = "" if name in needed else ", or ignore the column"
+                    alternative = "" if name in required_names else ", or ignore the column"
                     raise ValueError(
                         f"its column {header.cells[index]!r} has {cells[index]!r} in line "
-                        f"{number}: give a number in every line{more}"
+                        f"{number}: give a number in every line{alternative}"
                     ) from error
         raise
     return np.asarray(values, np.float64)
@@ -480,7 +498,7 @@ def _rows_of(lines: Sequence[str], header: Header) -> Iterator[tuple[int, list[s
 
 
 def _check_widths(lines: Sequence[str], header: Header) -> None:
-    """Check that each row has as many cells as the header; one empty cell more may end it."""
+    """Check that each row has as many cells as the header; a row may end with an empty cell."""
     width = len(header.cells)
     for number, line in enumerate(islice(lines, header.body, None), header.body + 1):
         if _is_remark(line):
@@ -498,7 +516,7 @@ def _check_widths(lines: Sequence[str], header: Header) -> None:
 
 
 def _check_unnamed(rows: Sequence[str], header: Header) -> None:
-    """Refuse a column without a name, unless it is empty or numbers the rows from 0."""
+    """Check that columns without a name are empty or number the rows from 0; ValueError if not."""
     for index, cell in enumerate(header.cells):
         if cell and not re.fullmatch(r"unnamed: \d+", cell.lower()):
             continue

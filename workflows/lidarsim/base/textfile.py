@@ -1,4 +1,4 @@
-"""Text files, and what a file is that holds no text."""
+"""Text files, and names of the formats of files that hold no text."""
 
 from __future__ import annotations
 
@@ -6,8 +6,8 @@ from pathlib import Path
 
 from .input_files import open_input, read_input
 
-_FIRST = 4096  # bytes that tell text from other content
-# First bytes of files that are no text: what each is, and what to do.
+_START_BYTES = 4096  # bytes that tell text from other content
+# {first bytes of a file that is no text: format and advice}
 _KINDS = {
     b"\x89MCAP0\r\n": "a bag (MCAP): give it the ending .mcap",
     b"SQLite format 3": "a database (SQLite), as bags of ROS 2 are: give it the ending .db3, or "
@@ -32,14 +32,14 @@ def read_text(path: Path) -> str:
     Raises
     ------
     ValueError
-        If the file is empty, or is no text; the message says what it is.
+        If the file is empty, or is no text; the message names the format.
     LidarError
         If the file is larger than the memory.
     OSError
-        As of `open_input`.
+        If the file is not a plain file, or cannot be read.
     """
     with open_input(path) as file:
-        first = file.read(_FIRST)
+        first = file.read(_START_BYTES)
     kind = next((kind for magic, kind in _KINDS.items() if first.startswith(magic)), None)
     if kind is not None:
         raise ValueError(f"it is {kind}; a text file is expected")

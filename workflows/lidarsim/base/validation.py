@@ -1,4 +1,4 @@
-"""Validation of what users give, in Python and in files, by pydantic; its errors as sentences."""
+"""Validation of arguments and files by pydantic, whose errors become sentences."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ C = TypeVar("C", bound=type)
 Fields = Mapping[str, FieldInfo]
 FieldPath = tuple[int | str, ...]
 
-# No others, finite numbers, no conversion of text to numbers.
+# No further fields, finite numbers, no conversion of text to numbers.
 STRICT = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False)
 
 # {class: an example}
@@ -70,7 +70,7 @@ _EXAMPLES = {
     "Survey": "Survey(poses=[(0, 0, 1)])",
     "Trajectory": "load_trajectory('drive.tum')",
 }
-# {kind of pydantic's error, or class: what is allowed}
+# {kind of pydantic's error, or class: allowed values}
 _ALLOWED = {
     "bool_type": "true or false",
     "callable_type": "a function",
@@ -88,9 +88,12 @@ _ALLOWED = {
 _ITEMS = {float: "numbers", int: "whole numbers", str: "text"}  # of lists
 _LENGTHS = ("min_length", "max_length")
 _LIMITS = {"ge": "at least", "gt": "above", "le": "at most", "lt": "below"}
-_ALIKE = {"position": "translation", "translation": "position"}  # too unlike for `did_you_mean`
+_SYNONYMS = {
+    "position": "translation",
+    "translation": "position",
+}  # too different for `did_you_mean`
 _PLAIN = (bool, int, float, str, bytes, NoneType, list, tuple, dict)
-# {class: what makes its schema, and the limits that it takes}
+# {class: function that makes its schema, and the limits that the function takes}
 _SCALARS: dict[Any, tuple[Callable[..., Any], Collection[str]]] = {
     bool: (core_schema.bool_schema, ()),
     int: (core_schema.int_schema, _LIMITS),
@@ -99,45 +102,44 @@ _SCALARS: dict[Any, tuple[Callable[..., Any], Collection[str]]] = {
     datetime: (core_schema.datetime_schema, ()),
     NoneType: (core_schema.none_schema, ()),
 }
-_LETTERS = 160  # of a value that is shown
-# most characters of all, and of the value of a field
-_LINE = 119
-_VALUE = 64
+_MAX_LETTERS = 160  # of a value in a message
+_MAX_LINE = 119  # letters of a `repr`
+_MAX_VALUE = 64  # letters of the value of a field
 
 
 def checked(function: Callable[P, R]) -> Callable[P, R]:
-    """Let a function refuse arguments that do not fit their annotations; they stay as they are.
+    """Let a function refuse arguments that do not fit their annotations; values are not changed.
 
     Raises
     ------
     LidarError
-        From the function: the argument, its value, and what it must be.
+        From the function: the argument, its value, and the allowed values.
     """
 
     @wraps(function)
-    def refusing(*args: P.args, **kwargs: P.kwargs) -> R:
-        # Python reports too many, too few and unknown ones.
-        _check(function, {**dict(zip(_usual(function), args, strict=False)), **kwargs})
+    def checked_function(*args: P.args, **kwargs: P.kwargs) -> R:
+        # Python reports too many, too few and unknown arguments.
+        _check(function, {**dict(zip(_defaults(function), args, strict=False)), **kwargs})
         return function(*args, **kwargs)
 
     if annotated(function):
-        refusing.__signature__ = readable(inspect.signature(function))  # type: ignore[attr-defined]
-    return refusing
+        checked_function.__signature__ = readable(inspect.signature(function))  # type: ignore[attr-defined]
+    return checked_function
 
 
 def checked_fields(cls: C) -> C:
     """Let a dataclass refuse values that do not fit their annotations, also in subclasses.
 
-    In a section of a file it is a section itself, of the same fields. Its `repr` is one line, and
-    its signature has types without limits.
+    In a section of a file the dataclass is a section itself, of the same fields. Its `repr` is one
+    line, and its signature has types without limits.
 
-    Apply it before `dataclass`, which calls `__post_init__` only if the class has one.
+    Apply the decorator before `dataclass`, which calls `__post_init__` only if the class has one.
     """
-    after: Callable[[Any], None] = getattr(cls, "__post_init__", lambda self: None)
+    post_init: Callable[[Any], None] = getattr(cls, "__post_init__", lambda self: None)
 
     def __post_init__(self: Any) -> None:  # noqa: N807
         _check(cls, vars(self))
-        after(self)
+        post_init(self)
 
     cls.__post_init__ = __post_init__  # type: ignore[attr-defined]
     cls.__signature__ = ReadableSignature()  # type: ignore[attr-defined]
@@ -153,62 +155,66 @@ def checked_fields(cls: C) -> C:
 
 
 def _section(_: type, source: Any, handler: GetCoreSchemaHandler) -> core_schema.CoreSchema:
-    """Make a dataclass a section of files: of its fields as a mapping, or an instance."""
+    """Return the schema of a dataclass as a section: a mapping of its fields, or an instance."""
     schema = handler(source)
-    own: Any = handler.resolve_ref_schema(schema)
-    own["strict"] = False  # strict ones take only instances
+    inner_schema: Any = handler.resolve_ref_schema(schema)
+    inner_schema["strict"] = False  # a strict schema takes only instances
 
-    def made(value: Any, inner: Callable[[Any], Any]) -> Any:
+    def converted(value: Any, validate: Callable[[Any], Any]) -> Any:
         try:
-            return inner(value)
-        except LidarError as error:  # of `__post_init__`
+            return validate(value)
+        except LidarError as error:  # from `__post_init__`
             raise ValueError(str(error)) from error
 
-    return core_schema.no_info_wrap_validator_function(made, schema)
+    return core_schema.no_info_wrap_validator_function(converted, schema)
 
 
-def _check(thing: Any, given: Mapping[str, Any]) -> None:
-    """Refuse values, other than defaults, that do not fit the annotations of a thing."""
-    usual = _usual(thing)
-    given = {
-        name: bool(value) if isinstance(value, np.bool_) else value  # to pydantic, else a number
-        for name, value in given.items()
-        if value is not usual.get(name, usual)
+def _check(target: Any, values: Mapping[str, Any]) -> None:
+    """Check that values, except defaults, fit the annotations of a function or dataclass."""
+    defaults = _defaults(target)
+    values = {
+        name: bool(value)
+        if isinstance(value, np.bool_)
+        else value  # pydantic takes NumPy's for a number
+        for name, value in values.items()
+        if value is not defaults.get(name, defaults)
     }
-    if not given:
+    if not values:
         return
-    validator, hints = _python(thing)
+    validator, hints = _validator(target)
     try:
-        validator.validate_python(given)
+        validator.validate_python(values)
     except ValidationError:
         try:
-            validator.validate_python(without_numpy(given))
+            validator.validate_python(without_numpy(values))
         except ValidationError as error:
             raise LidarError(_argument_error(error, hints)) from None
 
 
 def without_numpy(value: Any) -> Any:
-    """Return numbers and lists of Python in place of those of NumPy, which will do as well."""
+    """Return a value with NumPy's numbers and arrays replaced by Python's numbers and lists."""
     if isinstance(value, (np.generic, np.ndarray)) and value.ndim < 2:
         return value.tolist()
     if isinstance(value, dict):
-        return {key: without_numpy(one) for key, one in value.items()}
+        return {key: without_numpy(item) for key, item in value.items()}
     return type(value)(map(without_numpy, value)) if type(value) in (list, tuple) else value
 
 
 @cache
-def _usual(thing: Any) -> dict[str, Any]:
-    """Defaults of the parameters of a function, or the fields of a dataclass."""
-    if isinstance(thing, type):
-        return {field.name: field.default for field in dataclass_fields(thing)}
-    return {name: one.default for name, one in inspect.signature(thing).parameters.items()}
+def _defaults(target: Any) -> dict[str, Any]:
+    """Return the defaults of the parameters of a function, or of the fields of a dataclass."""
+    if isinstance(target, type):
+        return {field.name: field.default for field in dataclass_fields(target)}
+    return {
+        name: parameter.default for name, parameter in inspect.signature(target).parameters.items()
+    }
 
 
 @cache
-def _python(thing: Any) -> tuple[SchemaValidator, dict[str, Any]]:
-    """Return what validates the arguments of a function, or the fields of a dataclass."""
-    known = get_type_hints(thing, include_extras=True)
-    hints = {name: known[name] for name in _usual(thing) if name in known}
+def _validator(target: Any) -> tuple[SchemaValidator, dict[str, Any]]:
+    """Return the validator and annotations of the arguments or fields of a target."""
+    annotations = get_type_hints(target, include_extras=True)
+    hints = {name: annotations[name] for name in _defaults(target) if name in annotations}
     # Without `TypeAdapter`, whose import takes longer than all else of the first `Scanner`.
     field = partial(core_schema.typed_dict_field, required=False)
     config = core_schema.CoreConfig(strict=True, allow_inf_nan=False)
@@ -217,9 +223,9 @@ def _python(thing: Any) -> tuple[SchemaValidator, dict[str, Any]]:
 
 
 def _schema(hint: Any, limits: Mapping[str, Any] = MappingProxyType({})) -> Any:
-    """Make pydantic's schema of an annotation in Python.
+    """Return pydantic's schema of an annotation in Python.
 
-    Of a class there must be an instance, of a protocol its attributes; arrays are not checked here.
+    A class takes its instances, a protocol all objects with its attributes; arrays are not checked.
     """
     origin = get_origin(hint)
     args = get_args(hint)
@@ -228,45 +234,47 @@ def _schema(hint: Any, limits: Mapping[str, Any] = MappingProxyType({})) -> Any:
         wraps: list[Any] = [n.func for n in hint.__metadata__ if isinstance(n, WrapValidator)]
         return reduce(lambda s, w: core_schema.no_info_wrap_validator_function(w, s), wraps, schema)
     if origin in (Union, UnionType):
-        return core_schema.union_schema([_schema(one, limits) for one in args])
+        return core_schema.union_schema([_schema(arg, limits) for arg in args])
     if origin in (Sequence, Collection, Iterable, tuple):
-        items = [_schema(one) for one in args if one is not ...]
+        items = [_schema(arg) for arg in args if arg is not ...]
         if core_schema.any_schema() in items:
             return items[0]
-        more = None if origin is tuple and ... not in args else 0
+        variadic_index = None if origin is tuple and ... not in args else 0
         lengths = {name: limit for name, limit in limits.items() if name in _LENGTHS}
-        listed = core_schema.tuple_schema(items, variadic_item_index=more, strict=False, **lengths)
-        return core_schema.no_info_wrap_validator_function(_once, listed)
+        items_schema = core_schema.tuple_schema(
+            items, variadic_item_index=variadic_index, strict=False, **lengths
+        )
+        return core_schema.no_info_wrap_validator_function(_unless_iterator, items_schema)
     if origin is Literal:
         return core_schema.literal_schema([*args])
     if hint in _SCALARS:
-        make, takes = _SCALARS[hint]
-        return make(**{name: limit for name, limit in limits.items() if name in takes})
+        make, limit_names = _SCALARS[hint]
+        return make(**{name: limit for name, limit in limits.items() if name in limit_names})
     if origin is Callable:
         return core_schema.callable_schema()
     if hint is Any or not isinstance(origin or hint, type) or origin is np.ndarray:
         return core_schema.any_schema()
     if getattr(hint, "_is_protocol", False):
-        return core_schema.no_info_plain_validator_function(_having(hint))
+        return core_schema.no_info_plain_validator_function(_attribute_check(hint))
     return core_schema.is_instance_schema(os.PathLike if hint is Path else origin or hint)
 
 
-def _once(value: Any, handler: Callable[[Any], Any]) -> Any:
-    # An iterator can be read only once: leave it to the function.
+def _unless_iterator(value: Any, handler: Callable[[Any], Any]) -> Any:
+    """Validate a value, except an iterator, which only the function may read."""
     return value if isinstance(value, Iterator) else handler(value)
 
 
-def _having(protocol: type) -> Callable[[Any], Any]:
-    """Return what refuses values without the attributes of a protocol."""
+def _attribute_check(protocol: type) -> Callable[[Any], Any]:
+    """Return a validator that refuses values without the attributes of a protocol."""
     names = [name for name in vars(protocol) if not name.startswith("_")]
 
-    def having(value: Any) -> Any:
-        # Of the class first: a property may take its time.
+    def with_attributes(value: Any) -> Any:
+        # The class first, since a property of the instance may take long.
         if not all(hasattr(type(value), name) or hasattr(value, name) for name in names):
             raise PydanticKnownError("is_instance_of", {"class": protocol.__name__})
         return value
 
-    return having
+    return with_attributes
 
 
 @contextmanager
@@ -284,80 +292,90 @@ def sentences(section: Any, source: object = "") -> Iterator[None]:
 def validation_errors(error: ValidationError, section: Any) -> Iterator[str]:
     """Yield a line for each error in a file: field, value given, values allowed.
 
-    For a name that is no field, one like it is suggested, and the sections that have it are named.
+    For an unknown field, a similar name is suggested, and the sections with the field are named.
     """
-    found = {detail["loc"]: detail for detail in error.errors(include_url=False)}
-    alike: dict[Any, list[FieldPath]] = {}  # {field and kind of mistake: where it was made}
-    for place, detail in found.items():
-        # Of a list in which all entries are wrong pydantic says that it has none.
-        within = (other[: len(place)] == place != other for other in found)
-        if detail["type"] == "too_short" and any(within):
+    details_by_path = {detail["loc"]: detail for detail in error.errors(include_url=False)}
+    groups: dict[Any, list[FieldPath]] = {}  # {field and kind of mistake: paths}
+    for path, detail in details_by_path.items():
+        # pydantic reports a list in which all entries are wrong as empty, too.
+        deeper = (other_path[: len(path)] == path != other_path for other_path in details_by_path)
+        if detail["type"] == "too_short" and any(deeper):
             continue
-        field = tuple(step for step in place if not isinstance(step, int))
-        alike.setdefault((field, detail["type"]), []).append(place)
-    for first, *others in alike.values():
-        more = f" {plural(len(others), 'more entry', 'more entries')} like it." if others else ""
-        hint, known = _at(first, section)
-        near = field_hint(str(first[-1]), known, section) if first else ""
-        yield _sentence(first, [found[first]], hint, near, _in_file) + more
+        field = tuple(step for step in path if not isinstance(step, int))
+        groups.setdefault((field, detail["type"]), []).append(path)
+    for first, *further_paths in groups.values():
+        count_note = (
+            f" {plural(len(further_paths), 'more entry', 'more entries')} like it."
+            if further_paths
+            else ""
+        )
+        hint, fields = _annotation_at(first, section)
+        advice = field_hint(str(first[-1]), fields, section) if first else ""
+        yield _sentence(first, [details_by_path[first]], hint, advice, _in_file) + count_note
 
 
 def _in_file(value: Any) -> str:
+    """Return a value as in a YAML file, for messages."""
     plain = str(value).lower() if isinstance(value, bool) else shown(value)
     return "empty" if value is None else plain
 
 
 def _argument_error(error: ValidationError, hints: Mapping[str, Any]) -> str:
-    """Return what is wrong with the first wrong argument; of a union, with all of its kinds."""
-    places: dict[FieldPath, list[ErrorDetails]] = {}
+    """Return a sentence on the first wrong argument, with all alternatives of a union."""
+    details_by_entry: dict[FieldPath, list[ErrorDetails]] = {}
     for detail in error.errors(include_url=False):
         name, *steps = detail["loc"]
         entry = (name, *(step for step in steps if isinstance(step, int)))
-        places.setdefault(entry, []).append(detail)
-    place, details = next(iter(places.items()))
-    return _sentence(place, details, hints[str(place[0])], "", shown)
+        details_by_entry.setdefault(entry, []).append(detail)
+    path, details = next(iter(details_by_entry.items()))
+    return _sentence(path, details, hints[str(path[0])], "", shown)
 
 
 def _sentence(
-    place: FieldPath,
+    path: FieldPath,
     details: Sequence[ErrorDetails],
     hint: Any,
-    near: str,
+    advice: str,
     show: Callable[[Any], str],
 ) -> str:
-    at = dotted(place)
+    """Return a sentence on the errors of a value: location, value and allowed values.
+
+    `advice` follows if the value is an unknown field. `show` formats the value.
+    """
+    location = dotted(path)
     kind = details[0]["type"]
-    given = details[0]["input"]
+    value = details[0]["input"]
     if kind == "value_error":
         message = str(details[0]["ctx"]["error"])
-        return f"{at}: {message}" if at else message
+        return f"{location}: {message}" if location else message
     if kind in ("extra_forbidden", "invalid_key", "unexpected_keyword_argument"):
-        return f"{at} is not a field.{near}"
+        return f"{location} is not a field.{advice}"
     if kind == "missing":
-        return f"{at} is missing; it must be given."
-    allowed = dict.fromkeys(_allowed(detail, hint, show is not _in_file) for detail in details)
-    near = ""
-    if kind == "literal_error" and isinstance(given, str):
-        near = did_you_mean(given, re.findall(r"'([^']*)'", details[0]["ctx"]["expected"]))
-    return f"{at} is {show(given)}; it must {' or '.join(allowed)}.{near}".replace(
+        return f"{location} is missing; it must be given."
+    in_python = show is not _in_file
+    requirements = dict.fromkeys(_requirement(detail, hint, in_python) for detail in details)
+    advice = ""
+    if kind == "literal_error" and isinstance(value, str):
+        advice = did_you_mean(value, re.findall(r"'([^']*)'", details[0]["ctx"]["expected"]))
+    return f"{location} is {show(value)}; it must {' or '.join(requirements)}.{advice}".replace(
         " or be ", " or "
     )
 
 
-def _allowed(detail: ErrorDetails, hint: Any, in_python: bool) -> str:
-    """Return what a value must do: «be 1 to 10»; examples are Python."""
+def _requirement(detail: ErrorDetails, hint: Any, in_python: bool) -> str:
+    """Return the requirement on a value: «be 1 to 10»; examples only `in_python`."""
     kind = detail["type"]
     context = detail.get("ctx", {})
     if kind == "is_instance_of":
         name = str(context["class"]).rpartition(".")[2]
-        such = f", such as {_EXAMPLES[name]}" if name in _EXAMPLES else ""
-        return f"be {_ALLOWED.get(name) or _with_article(name)}{such}"
+        example = f", such as {_EXAMPLES[name]}" if name in _EXAMPLES else ""
+        return f"be {_ALLOWED.get(name) or _with_article(name)}{example}"
     if kind in ("list_type", "tuple_type"):
         inner = [*classes_in(hint)]
-        of = next((f" of {_ITEMS[one]}" for one in inner if one in _ITEMS), "")
-        examples = [_EXAMPLES[one.__name__] for one in inner if one.__name__ in _EXAMPLES]
-        such = f", such as [{examples[0]}]" if examples and not of and in_python else ""
-        return f"be a list{of}{such}"
+        items = next((f" of {_ITEMS[kind]}" for kind in inner if kind in _ITEMS), "")
+        examples = [_EXAMPLES[kind.__name__] for kind in inner if kind.__name__ in _EXAMPLES]
+        example = f", such as [{examples[0]}]" if examples and not items and in_python else ""
+        return f"be a list{items}{example}"
     if not _LIMITS.keys().isdisjoint(context):
         limits = _limits(hint)
         return f"be {_range(limits if context.items() <= limits.items() else context)}"
@@ -366,9 +384,9 @@ def _allowed(detail: ErrorDetails, hint: Any, in_python: bool) -> str:
 
 
 def _limits(hint: Any, names: Iterable[str] = _LIMITS) -> dict[str, Any]:
-    """Limits in an annotation, as pydantic's `Field` has them: {name: limit}."""
+    """Return the limits in an annotation, named as in pydantic's `Field`: {name: limit}."""
     inner = get_args(hint)[:1] if get_origin(hint) is Annotated else get_args(hint)
-    limits = {name: limit for one in inner for name, limit in _limits(one, names).items()}
+    limits = {name: limit for arg in inner for name, limit in _limits(arg, names).items()}
     for note in getattr(hint, "__metadata__", ()):
         for limit in (note, *getattr(note, "metadata", ())):
             limits |= {name: getattr(limit, name) for name in names if hasattr(limit, name)}
@@ -376,145 +394,159 @@ def _limits(hint: Any, names: Iterable[str] = _LIMITS) -> dict[str, Any]:
 
 
 def _range(limits: Mapping[str, Any]) -> str:
+    """Return limits as text: «1 to 10», «at least 1, below 10»."""
     numbers = {name: limit if limit % 1 else int(limit) for name, limit in limits.items()}
     if numbers.keys() == {"ge", "le"}:
         return f"{numbers['ge']} to {numbers['le']}"
     return ", ".join(f"{_LIMITS[name]} {number}" for name, number in numbers.items())
 
 
-def field_hint(name: str, known: Collection[str], root: Any) -> str:
-    """Advise on a name that a section lacks: one like it of the `known`, and where it is a field.
+def field_hint(name: str, field_names: Collection[str], root: Any) -> str:
+    """Return advice on an unknown field: a similar field name, and sections with such a field.
 
-    `root` is the section of the whole file. Of the sections with such a field, the outermost are
-    named, and none that is derived from another of them.
+    `field_names` are the fields of the section, and `root` is the section of the whole file. Only
+    the outermost sections with the field are named, without classes derived from each other.
     """
-    if (other := _ALIKE.get(name)) in known:
-        return f" Did you mean {other!r}?"
+    if (synonym := _SYNONYMS.get(name)) in field_names:
+        return f" Did you mean {synonym!r}?"
     level = [("", root)]
     owners = list[tuple[str, Any]]()
     while level and not owners:
         level = [
-            (f"{place}.{inner}", kind)
-            for place, outer in level
-            for inner, field in _named(outer).items()
-            if not any(isinstance(note, GetPydanticSchema) for note in field.metadata)  # of Python
+            (f"{section_path}.{inner}", kind)
+            for section_path, outer in level
+            for inner, field in _fields_by_name(outer).items()
+            if not any(
+                isinstance(note, GetPydanticSchema) for note in field.metadata
+            )  # a field of Python only
             for kind in sections_in(field.annotation)
         ]
-        owners = [(place[1:], kind) for place, kind in level if name in _named(kind)]
+        owners = [
+            (section_path[1:], kind)
+            for section_path, kind in level
+            if name in _fields_by_name(kind)
+        ]
     kinds = {kind for _, kind in owners}
-    places = [place for place, kind in owners if kinds.isdisjoint(kind.__mro__[1:])]
-    listed = " and ".join(filter(None, [", ".join(places[:-1]), *places[-1:]]))
-    near = did_you_mean(name, known)
-    if not places:
-        return near
+    section_paths = [
+        section_path for section_path, kind in owners if kinds.isdisjoint(kind.__mro__[1:])
+    ]
+    listed = " and ".join(filter(None, [", ".join(section_paths[:-1]), *section_paths[-1:]]))
+    suggestion = did_you_mean(name, field_names)
+    if not section_paths:
+        return suggestion
     return (
-        f"{near} Or {name} of {listed}?" if near else f" It is a field of {listed}: write it there."
+        f"{suggestion} Or {name} of {listed}?"
+        if suggestion
+        else f" It is a field of {listed}: write it there."
     )
 
 
-def _at(place: FieldPath, hint: Any) -> tuple[Any, Fields]:
-    """Return the annotation at a place in a file, and the fields of the section around it."""
-    known: Fields = {}
-    inner = _named(hint)
-    for step in place:
-        known = inner
-        if step in known:
-            hint = known[str(step)].rebuild_annotation()
-            inner = _named(hint)
-    return hint, known
+def _annotation_at(path: FieldPath, hint: Any) -> tuple[Any, Fields]:
+    """Return the annotation at a path in a file, and the fields of the section around."""
+    fields: Fields = {}
+    inner = _fields_by_name(hint)
+    for step in path:
+        fields = inner
+        if step in fields:
+            hint = fields[str(step)].rebuild_annotation()
+            inner = _fields_by_name(hint)
+    return hint, fields
 
 
-def _named(hint: Any) -> Fields:
-    """Fields of the sections in an annotation, by their names in a file."""
+def _fields_by_name(hint: Any) -> Fields:
+    """Return the fields of the sections in an annotation: {name in a file: field}."""
     fields = (pair for kind in sections_in(hint) for pair in fields_of(kind).items())
     return {field.alias or name: field for name, field in fields}
 
 
 def fields_of(section: Any) -> Fields:
-    """Fields of a section of files: {attribute: field}."""
-    return getattr(section, "model_fields", None) or _of_dataclass(section)
+    """Return the fields of a section of files: {attribute: field}."""
+    return getattr(section, "model_fields", None) or _dataclass_fields(section)
 
 
 @cache
-def _of_dataclass(section: Any) -> Fields:
+def _dataclass_fields(section: Any) -> Fields:
+    """Return the fields of a dataclass: {attribute: field}."""
     hints = get_type_hints(section, include_extras=True)
-    made = FieldInfo.from_annotated_attribute
-    return {one.name: made(hints[one.name], one) for one in dataclass_fields(section)}
+    make_field = FieldInfo.from_annotated_attribute
+    return {field.name: make_field(hints[field.name], field) for field in dataclass_fields(section)}
 
 
 def is_section(kind: Any) -> bool:
-    """Whether a class is a section of files: a model, or a dataclass with `checked_fields`."""
+    """Return True for a section of files: a model, or a dataclass with `checked_fields`."""
     return hasattr(kind, "model_fields") or hasattr(kind, "__pydantic_config__")
 
 
 def sections_in(annotation: Any) -> Iterator[Any]:
-    """Sections in an annotation, such as `tuple[Section, ...] | None`."""
+    """Yield the sections in an annotation, such as `tuple[Section, ...] | None`."""
     return filter(is_section, classes_in(annotation))
 
 
 def classes_in(annotation: Any) -> Iterator[type]:
-    """Classes in an annotation, such as `tuple[Class, ...] | None`."""
+    """Yield the classes in an annotation, such as `tuple[Class, ...] | None`."""
     if isinstance(annotation, type) and not get_args(annotation):
         yield annotation
     for inner in get_args(annotation):
         yield from classes_in(inner)
 
 
-def dotted(place: Sequence[int | str]) -> str:
-    """Location as poses[0].position."""
-    steps = (f"[{step}]" if isinstance(step, int) else f".{step}" for step in place)
+def dotted(path: Sequence[int | str]) -> str:
+    """Return a path as text: poses[0].position."""
+    steps = (f"[{step}]" if isinstance(step, int) else f".{step}" for step in path)
     return "".join(steps).removeprefix(".")
 
 
 def shown(value: object) -> str:
-    """Show a value: plain values cut to a readable length, others by their type."""
+    """Return a value as text: a plain value, cut to a readable length, else its type."""
     if not isinstance(value, _PLAIN):
         return "an array" if isinstance(value, np.ndarray) else _with_article(type(value).__name__)
     short = reprlib.Repr()
     short.maxstring = short.maxother = short.maxlong = 60
     short.maxlevel = 3  # YAML aliases make deeply nested lists of a few letters
-    text = " ".join(short.repr(value).split())  # arrays in it have lines
-    return text if len(text) <= _LETTERS else f"{text[:_LETTERS]}…"
+    text = " ".join(short.repr(value).split())  # arrays within have several lines
+    return text if len(text) <= _MAX_LETTERS else f"{text[:_MAX_LETTERS]}…"
 
 
-def one_line(thing: Any) -> str:
-    """`repr` of a dataclass: the fields that differ from their defaults, as far as a line holds."""
-    name = type(thing).__name__
-    kept = list[str]()
+def one_line(instance: Any) -> str:
+    """Return the `repr` of a dataclass: fields that differ from their defaults, within a line."""
+    name = type(instance).__name__
+    texts = list[str]()
     left_out = False
-    fields = sorted(dataclass_fields(thing), key=lambda f: (f.name != "name", bool(f.kw_only)))
+    fields = sorted(dataclass_fields(instance), key=lambda f: (f.name != "name", bool(f.kw_only)))
     for field in fields:
-        value = getattr(thing, field.name)
+        value = getattr(instance, field.name)
         make = field.default_factory
         default = field.default if make is MISSING else make()
         if not field.repr or (not isinstance(value, np.ndarray) and (value == default) is True):
             continue
         text = f"{field.name}={_short(value)}"
-        if fits := len(f"{name}({', '.join([*kept, text, '…'])})") <= _LINE:
-            kept.append(text)
+        if fits := len(f"{name}({', '.join([*texts, text, '…'])})") <= _MAX_LINE:
+            texts.append(text)
         left_out |= not fits
-    return f"{name}({', '.join(kept + ['…'] * left_out)})"
+    return f"{name}({', '.join(texts + ['…'] * left_out)})"
 
 
 def _short(value: Any) -> str:
+    """Return the value of a field as short text."""
     if isinstance(value, np.ndarray):
         return f"{value.dtype}{value.shape}"
     if is_dataclass(value) and (name := getattr(value, "name", "")):
         return f"{type(value).__name__}({name!r})"
-    if len(text := repr(value)) <= _VALUE and "\n" not in text:
+    if len(text := repr(value)) <= _MAX_VALUE and "\n" not in text:
         return text
     if isinstance(value, Collection) and not isinstance(value, (str, bytes)):
-        kinds = {type(one).__name__ for one in value}
+        kinds = {type(item).__name__ for item in value}
         return f"[{len(value)} {kinds.pop() if len(kinds) == 1 else 'items'}]"
-    return f"{type(value).__name__}(…)" if is_dataclass(value) else f"{text[: _VALUE - 1]}…"
+    return f"{type(value).__name__}(…)" if is_dataclass(value) else f"{text[: _MAX_VALUE - 1]}…"
 
 
 def _with_article(name: str) -> str:
+    """Return a name of a class with the indefinite article."""
     return f"{'an' if name[0].lower() in 'aeio' else 'a'} {name}"
 
 
 def as_array(name: str, values: ArrayLike, dtype: DTypeLike = np.float64) -> AnyArray:
-    """Return values as an array of numbers; LidarError if they are not numbers."""
+    """Return values as an array of numbers; LidarError for values that are not numbers."""
     try:
         return np.asarray(values, dtype)
     except (TypeError, ValueError, OverflowError) as error:

@@ -13,12 +13,12 @@ from numpy.typing import ArrayLike
 
 from .arrays import Floats, Ints
 
-# As in numpy.linalg.matrix_rank, with room for what cofactors round.
+# As in numpy.linalg.matrix_rank, with a margin for the rounding of cofactors.
 _FLAT = 16 * 2.0**-52
 
 
 def turned(vectors: Floats, rotation: Floats | None) -> Floats:
-    """Rotate vectors (n, 3) by a matrix (k, 3): (n, k); by None they stay."""
+    """Rotate vectors (n, 3) by a matrix (k, 3) to (n, k); None returns the same vectors."""
     if rotation is None:
         return vectors
     x, y, z = vectors.T
@@ -26,43 +26,44 @@ def turned(vectors: Floats, rotation: Floats | None) -> Floats:
 
 
 def into_axes(vectors: Floats, rotations: Floats | None) -> Floats:
-    """Rotate vectors (m, 3) from the scene's axes to those of rotations (m, 3, 3), one each."""
+    """Rotate vectors (m, 3) from the scene frame into frames of rotations (m, 3, 3)."""
     if rotations is None:
         return vectors
     x, y, z = vectors.T
-    out = np.empty(vectors.shape[::-1]).T
+    rotated = np.empty(vectors.shape[::-1]).T
     for axis in range(3):
         a, b, c = (rotations[:, row, axis] for row in range(3))
-        out[:, axis] = (x * a + y * b) + z * c
-    return out
+        rotated[:, axis] = (x * a + y * b) + z * c
+    return rotated
 
 
-def products(one: Floats, other: Floats) -> Floats:
-    """Scalar products of vectors (3, ...): (...)."""
-    (x, y, z), (a, b, c) = one, other
+def products(first: Floats, second: Floats) -> Floats:
+    """Return the scalar products (...) of vectors (3, ...)."""
+    x, y, z = first
+    a, b, c = second
     product = x * a
     product += y * b
     product += z * c
     return np.asarray(product)
 
 
-def matmul(one: ArrayLike, other: ArrayLike) -> Floats:
-    """Products of small matrices (..., i, j) and (..., j, k): (..., i, k)."""
-    one = np.asarray(one, np.float64)
-    other = np.asarray(other, np.float64)
-    out: Floats = one[..., :, 0, None] * other[..., None, 0, :]
-    for column in range(1, one.shape[-1]):
-        out += one[..., :, column, None] * other[..., None, column, :]
-    return out
+def matmul(first: ArrayLike, second: ArrayLike) -> Floats:
+    """Return the products (..., i, k) of small matrices (..., i, j) and (..., j, k)."""
+    first = np.asarray(first, np.float64)
+    second = np.asarray(second, np.float64)
+    product: Floats = first[..., :, 0, None] * second[..., None, 0, :]
+    for column in range(1, first.shape[-1]):
+        product += first[..., :, column, None] * second[..., None, column, :]
+    return product
 
 
 def applied(matrices: ArrayLike, vectors: ArrayLike) -> Floats:
-    """Products of matrices (..., i, j) and vectors (..., j): (..., i)."""
+    """Return the products (..., i) of matrices (..., i, j) and vectors (..., j)."""
     return matmul(matrices, np.asarray(vectors)[..., None])[..., 0]
 
 
 def length(vectors: Floats) -> Any:
-    """Lengths of vectors (..., k): (...)."""
+    """Return the lengths (...) of vectors (..., k)."""
     squares = vectors * vectors
     total = squares[..., 0]
     for axis in range(1, squares.shape[-1]):
@@ -71,30 +72,30 @@ def length(vectors: Floats) -> Any:
 
 
 def hypot(x: Any, y: Any) -> Any:
-    """Lengths of vectors (x, y)."""
+    """Return the lengths of vectors (x, y)."""
     return np.sqrt(x * x + y * y)
 
 
 def adjugates(matrices: Floats) -> tuple[Floats, Floats]:
-    """Adjugates of matrices (..., 3, 3), by cofactors, and determinants (...)."""
+    """Return the adjugates (..., 3, 3) of matrices, by cofactors, and the determinants (...)."""
     a, b, c = (matrices[..., row, :] for row in range(3))
-    found = np.stack([np.cross(b, c), np.cross(c, a), np.cross(a, b)], axis=-1)
-    return found, applied(a[..., None, :], found[..., 0])[..., 0]
+    adjugate = np.stack([np.cross(b, c), np.cross(c, a), np.cross(a, b)], axis=-1)
+    return adjugate, applied(a[..., None, :], adjugate[..., 0])[..., 0]
 
 
 def inverse(matrices: Floats) -> Floats:
-    """Inverses of matrices (..., 3, 3), which have some."""
-    found, determinant = adjugates(matrices)
-    return np.asarray(found / determinant[..., None, None])
+    """Return the inverses of invertible matrices (..., 3, 3)."""
+    adjugate, determinant = adjugates(matrices)
+    return np.asarray(adjugate / determinant[..., None, None])
 
 
 def determinant(matrices: Floats) -> Floats:
-    """Compute the determinants (...) of matrices (..., 3, 3)."""
+    """Return the determinants (...) of matrices (..., 3, 3)."""
     return adjugates(matrices)[1]
 
 
 def rank(matrices: Floats) -> Ints:
-    """Ranks of matrices (..., 3, 3), as far as rounding tells, from 1 on: (...)."""
+    """Return the ranks (...), at least 1, of matrices (..., 3, 3), up to rounding errors."""
     shape = (*matrices.shape[:-2], 9)
     largest = np.abs(matrices).reshape(shape).max(axis=-1)
     unit = matrices / np.where(largest > 0, largest, 1)[..., None, None]

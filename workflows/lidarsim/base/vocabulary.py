@@ -8,7 +8,7 @@ from __future__ import annotations
 BACKENDS = ("auto", "cuda", "embree", "numpy")
 PICTURES = ("scene", "hits", "intensity", "cloud", "path")  # drawn pictures
 
-# Metres in one of each unit.
+# Metres in each unit.
 UNITS_M = {
     "um": 1e-6,
     "mm": 1e-3,
@@ -22,6 +22,6 @@ UNITS_M = {
     "mi": 1609.344,
 }
 
-WAIT_S = 10.0  # for partitions that are empty at the start of a run
-QUEUE_S = 3600.0  # for either, where workers are jobs in a queue
-PATIENCE_S = 60.0  # for partitions that become empty; a nanny needs a few seconds
+WAIT_S = 10.0  # wait for partitions that are empty at the start of a run
+QUEUE_S = 3600.0  # for both waits, if workers are jobs in a queue
+PATIENCE_S = 60.0  # wait for partitions that become empty; a nanny needs a few seconds

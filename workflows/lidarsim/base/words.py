@@ -8,20 +8,20 @@ import re
 from collections.abc import Iterable, Sequence
 
 
-def did_you_mean(word: str, known: Iterable[str]) -> str:
-    """Return " Did you mean 'x'?", or nothing where no known word is near.
+def did_you_mean(word: str, candidates: Iterable[str]) -> str:
+    """Return " Did you mean 'x'?" for the most similar candidate, or empty.
 
     Examples
     --------
     >>> did_you_mean("layer", ["layers", "step_deg"])
     " Did you mean 'layers'?"
     """
-    lower = {name.lower(): name for name in known}
-    near = difflib.get_close_matches(word.lower(), lower, n=1, cutoff=0.6)
-    return f" Did you mean {lower[near[0]]!r}?" if near else ""
+    lower = {name.lower(): name for name in candidates}
+    matches = difflib.get_close_matches(word.lower(), lower, n=1, cutoff=0.6)
+    return f" Did you mean {lower[matches[0]]!r}?" if matches else ""
 
 
-# In a note, a setting; and the calls of Python that take those of a section.
+# A setting in a note, and the calls of Python that take the settings of a section.
 _SETTING = re.compile(r'<(file|scene|cloud|materials)\.(\w+)=("?)(\w+)\3>')
 _CALLS = {
     "file": "Scene.load(path",
@@ -42,19 +42,19 @@ def as_scenario(note: str) -> str:
     return _SETTING.sub(lambda m: form.get(m[1], f"{{}}: {{}} in {m[1]}").format(m[2], m[4]), note)
 
 
-def plural(number: float, what: str, several: str = "") -> str:
+def plural(number: float, noun: str, plural_noun: str = "") -> str:
     """Return number and noun: «1 worker», «1,200 workers»."""
-    return f"{number:,} {what if number == 1 else several or what + 's'}"
+    return f"{number:,} {noun if number == 1 else plural_noun or noun + 's'}"
 
 
 def natural(name: str) -> list[tuple[int, str]]:
-    """Sort key: GPU-2 before GPU-10."""
+    """Return a sort key by which GPU-2 comes before GPU-10."""
     pieces = re.split(r"(\d+)", name)
     return [(int(p), "") if p.isdecimal() else (-1, p) for p in pieces]
 
 
 def as_text(name: bytes) -> str:
-    """Name in UTF-8, or in Latin-1 from old programs."""
+    """Decode a name in UTF-8, or in Latin-1 from old programs."""
     try:
         return name.decode("utf-8")
     except UnicodeDecodeError:
@@ -62,16 +62,16 @@ def as_text(name: bytes) -> str:
 
 
 def printable(text: str) -> str:
-    """Text from a file as one line of 200 letters at most, without control characters."""
-    kept = "".join(c if c.isprintable() else " " for c in text)
-    return " ".join(kept.split())[:200]
+    """Return text from a file in a line of at most 200 letters, without control characters."""
+    cleaned = "".join(letter if letter.isprintable() else " " for letter in text)
+    return " ".join(cleaned.split())[:200]
 
 
-def shortened(name: str, most: int = 18) -> str:
-    """Shorten a name with more letters than `most` in its middle; show control characters."""
+def shortened(name: str, max_letters: int = 18) -> str:
+    """Shorten a name in its middle to `max_letters`; show control characters."""
     name = "".join(letter if letter.isprintable() else "\ufffd" for letter in name)
-    tail = (most - 1) // 2
-    return name if len(name) <= most else f"{name[: most - 1 - tail]}…{name[-tail:]}"
+    tail = (max_letters - 1) // 2
+    return name if len(name) <= max_letters else f"{name[: max_letters - 1 - tail]}…{name[-tail:]}"
 
 
 def without_common_prefix(names: Sequence[str]) -> list[str]:
@@ -84,19 +84,19 @@ def without_common_prefix(names: Sequence[str]) -> list[str]:
     """
     if len(names) < 3:
         return list(names)
-    prefix = os.path.commonprefix(list(names))  # noqa: RUF071 - of letters, as is wanted
+    prefix = os.path.commonprefix(list(names))  # noqa: RUF071 - the prefix of letters
     end = max(prefix.rfind(mark) for mark in "_./: -") + 1
     shorter = [name[end:] for name in names]
     return shorter if all(shorter) else list(names)
 
 
-def listed(names: Sequence[str], most: int = 3) -> str:
-    """Return the first names, and how many more there are.
+def listed(names: Sequence[str], max_names: int = 3) -> str:
+    """Return the first names, and the number of further names.
 
     Examples
     --------
     >>> listed(["a", "b", "c", "d", "e"])
     'a, b, c and 2 more'
     """
-    more = len(names) - most
-    return ", ".join(names[:most]) + (f" and {more:,} more" if more > 0 else "")
+    further = len(names) - max_names
+    return ", ".join(names[:max_names]) + (f" and {further:,} more" if further > 0 else "")

@@ -1,6 +1,6 @@
-"""How the progress of writing an output is shown."""
+"""Type of functions that show the progress of writing an output."""
 
 from collections.abc import Callable
 
-# Shows how much of an output is written: its name, items that are done, all items, their unit.
+# Shows the progress of an output: name, number of items done, number of all items, their unit.
 WritingProgress = Callable[[str, int, int, str], None]

@@ -1,4 +1,4 @@
-"""XML files, without entities: a few of them expand to any length."""
+"""XML files without entities: a few entities expand to any length."""
 
 from __future__ import annotations
 
@@ -7,32 +7,34 @@ from xml.etree import ElementTree
 from xml.etree.ElementTree import Element
 from xml.parsers import expat
 
-_PIECE = 1 << 16
+_BLOCK_BYTES = 1 << 16
 
 
 def xml_root(data: bytes) -> Element:
-    """Root element of a file, without comments.
+    """Return the root element of a file, without comments.
 
     Raises
     ------
     ValueError
-        If it declares entities; `ElementTree.ParseError` if it is not XML.
+        If the file declares entities.
+    ElementTree.ParseError
+        If the file is not XML.
     """
     parser = expat.ParserCreate()
-    begun: list[str] = []
+    tags: list[str] = []
     parser.EntityDeclHandler = refuse_entity
-    parser.StartElementHandler = lambda tag, attributes: begun.append(tag)
+    parser.StartElementHandler = lambda tag, attributes: tags.append(tag)
     try:
-        for start in range(0, len(data), _PIECE):
-            parser.Parse(data[start : start + _PIECE])
-            if begun:  # declarations come before it
+        for start in range(0, len(data), _BLOCK_BYTES):
+            parser.Parse(data[start : start + _BLOCK_BYTES])
+            if tags:  # declarations come before the first element
                 break
     except expat.ExpatError:
-        pass  # told below
+        pass  # ElementTree raises the error below
     return ElementTree.fromstring(data)
 
 
-def refuse_entity(name: str, *rest: object) -> NoReturn:
+def refuse_entity(name: str, *details: object) -> NoReturn:
     """Handle the declaration of an entity: raise ValueError.
 
     Expat itself stops an expansion only at a hundred times the file, of text; elements take thirty

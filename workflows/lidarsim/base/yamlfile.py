@@ -12,48 +12,49 @@ from .allowance import Allowance
 from .errors import LidarError, prefixed
 from .input_files import read_input_text
 
-_NODE_BYTES = 500  # of a value, while the loader has it
+_NODE_BYTES = 500  # memory of a value in the loader
 
 
 class _Loader(yaml.SafeLoader):
-    """SafeLoader that refuses keys given twice, and aliases that repeat too much.
+    """SafeLoader that refuses duplicate keys, and aliases that repeat too much.
 
-    PyYAML silently takes the last of two keys. It keeps one object for all aliases of a value, but
-    merging them, and every look at them, takes as long as if they were written out.
+    PyYAML silently takes the last of two keys. Aliases of a value share an object, but merging or
+    reading aliases takes as long as if they were written out.
     """
 
     def __init__(self, text: str) -> None:
         super().__init__(text)
         self._allowance = Allowance(len(text), "write less, or without aliases (*name)")
-        self._taken: dict[yaml.Node, int] = {}  # by values with an anchor, aliases written out
+        # {value with an anchor: bytes with aliases written out}
+        self._node_bytes: dict[yaml.Node, int] = {}
 
     def compose_node(self, parent: yaml.Node | None, index: Any) -> yaml.Node | None:
-        """Compose a node; an alias counts as often as it is used."""
+        """Compose a node; each use of an alias counts towards the memory."""
         event: Any = self.peek_event()
-        before = self._allowance.taken
+        used_bytes = self._allowance.used_bytes
         self._allowance.take(_NODE_BYTES)
         node: Any = super().compose_node(parent, index)
         if isinstance(event, yaml.AliasEvent):
-            if node not in self._taken:
+            if node not in self._node_bytes:
                 mark: Any = event.start_mark
                 problem = f"{event.anchor!r} contains itself"
                 raise yaml.composer.ComposerError(None, None, problem, mark)
-            self._allowance.take(self._taken[node])
+            self._allowance.take(self._node_bytes[node])
         elif event.anchor is not None:
-            self._taken[node] = self._allowance.taken - before
+            self._node_bytes[node] = self._allowance.used_bytes - used_bytes
         return node
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
-        """Build a mapping; ConstructorError, with the place, for a key given twice."""
-        seen: set[str] = set()
+        """Build a mapping; ConstructorError, with the line, for a duplicate key."""
+        keys: set[str] = set()
         for key, _ in node.value:
             if not isinstance(key, yaml.ScalarNode):
                 continue
-            if key.value in seen:
+            if key.value in keys:
                 raise yaml.constructor.ConstructorError(
                     None, None, f"{key.value!r} is given twice", key.start_mark
                 )
-            seen.add(key.value)
+            keys.add(key.value)
         return super().construct_mapping(node, deep)
 
 
@@ -71,9 +72,11 @@ def load_yaml(text: str) -> Any:
     Raises
     ------
     LidarError
-        If it has too many values, with aliases written out; yaml.YAMLError if it is not YAML;
-        ValueError, OverflowError or RecursionError for a number, a date or a depth that Python
-        cannot hold.
+        If the text has too many values, with aliases written out.
+    yaml.YAMLError
+        If the text is not YAML.
+    ValueError, OverflowError, RecursionError
+        For a number, a date or a depth that Python cannot represent.
     """
     loader = _Loader(text)
     try:
@@ -85,7 +88,7 @@ def load_yaml(text: str) -> Any:
 def read_yaml(
     path: Path, form: str = "a scenario has sections (scene:, sensor:, poses:, …)"
 ) -> dict[str, Any]:
-    """Read a YAML file that holds one mapping; `form` says in errors what that looks like.
+    """Read a YAML file of a mapping; `form` describes the expected mapping in errors.
 
     Raises
     ------
@@ -102,8 +105,8 @@ def read_yaml(
         raise LidarError(f"{path} cannot be read: {error.strerror or error}.") from error
     except yaml.MarkedYAMLError as error:
         mark = error.problem_mark or error.context_mark
-        where = f", line {mark.line + 1}" if mark else ""
-        raise LidarError(f"{path}{where}: {error.problem or 'not valid YAML'}.") from error
+        line = f", line {mark.line + 1}" if mark else ""
+        raise LidarError(f"{path}{line}: {error.problem or 'not valid YAML'}.") from error
     except (yaml.YAMLError, ValueError, OverflowError, RecursionError) as error:
         # ValueError: not UTF-8, or a date or number that Python cannot hold, such as 2026-99-99.
         reason = " ".join(str(error).partition(";")[0].split())[:200]

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 
@@ -16,15 +17,23 @@ from ..base.vectors import length, products, turned
 from ..sensor import Stations, Track, Trajectory
 from ..sensor.trajectory import CENTRE, check_rotations, full_poses, presence_ns, quaternions_of
 from . import face_materials
-from .colours import joined
+from .colours import join_colours
 from .scene_instances import SceneInstance, parts_of
 from .scene_mesh import SceneMesh, stacked
 
-SAMPLES_MOST = 200_000  # poses of all actors
-# by which ways of unknown classes are measured
-WAY_POSES = 10_001
-LONG_NS = 1e12
+MAX_SAMPLES = 200_000  # poses of all actors
+# Poses and longest duration by which trajectories of unknown classes are measured.
+TRAJECTORY_POSES = 10_001
+MAX_DURATION_NS = 1e12
 AT_ZERO = Stations((CENTRE,))
+
+
+class ActorSamples(NamedTuple):
+    """Poses of an actor at a few times."""
+
+    times_ns: Floats  # (k,), nanoseconds since the survey's start
+    positions: Floats  # (k, 3), metres, local
+    quaternions: Floats  # (k, 4)
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,14 +44,15 @@ class Actor:
     Parameters
     ----------
     mesh
-        Its triangles in its own axes (x ahead, z up), and its name.
+        Triangles in the frame of the actor (x ahead, z up), and the name of the actor.
     trajectory
-        Poses of its axes, in the scene's local coordinates; its only station begins with the
-        survey. By default it stands at zero, until `Scanner.move` moves it.
+        Poses of the actor's frame, in the scene's local coordinates; the only station starts with
+        the survey. By default the actor is static at zero, until `Scanner.move` moves it.
     offset_s
-        Where in the mesh's animation it is as the survey, or by speed the way, begins, seconds.
+        Time in the mesh's animation at the start of the survey, or, if the animation is played by
+        speed, at the start of the trajectory, seconds.
     spray
-        Whether it raises spray where the weather has some, and it moves.
+        Whether the actor raises spray while it moves, if the weather has spray.
 
     Raises
     ------
@@ -64,36 +74,36 @@ class Actor:
             self._check_first_pose()
 
     def _check_first_pose(self) -> None:
-        """Check the first rotation of a trajectory of another class, which may be a user's."""
+        """Check the first rotation of a trajectory of a class that may be a user's."""
         first_ns = max(presence_ns(self.trajectory)[0], 0.0)
         try:
             _, rotations = full_poses(self.trajectory, 0, np.array([first_ns]))
-        except LidarError:  # it does not cover this time, which `check` says
+        except LidarError:  # the trajectory does not cover this time: `check` reports the error
             return
         with prefixed(f"Actor {self.name!r}"):
             check_rotations(np.asarray(rotations, np.float64))
 
     @property
     def name(self) -> str:
-        """Its name."""
+        """Name of the actor, which is the name of its mesh."""
         return self.mesh.name
 
     def placed(self, time_ns: float) -> SceneMesh:
-        """Its mesh at a time, in the scene's local coordinates; one point if it is absent."""
+        """Return the mesh at a time, in the scene's local coordinates; a point while absent."""
         positions, rotations = self.trajectory.poses(0, np.array([time_ns]))
         vertices = self.mesh.vertices
         if (animation := self.mesh.animation) is not None:
-            vertices = animation.at(self.played(np.array([time_ns]))[0])[0][0]
+            vertices = animation.vertices_at(self.played(np.array([time_ns]))[0])[0][0]
         vertices = turned(vertices, None if rotations is None else rotations[0])
         first, last = presence_ns(self.trajectory)
         vertices = vertices if first <= time_ns <= last else 0 * vertices
-        # Masks do not show.
+        # Pictures, which call this, do not show masks.
         return SceneMesh(
             self.name, vertices + positions[0], self.mesh.faces, colours=self.mesh.colours
         )
 
     def played(self, times_ns: Floats) -> tuple[Floats, Floats]:
-        """Return frames of its animation at times (k,), nanoseconds, and frames a second then."""
+        """Return frames (k,) of the animation at times (k,), nanoseconds, and frames per second."""
         seconds, rates = self.seconds(times_ns)
         animation = self.mesh.animation
         assert animation is not None
@@ -101,67 +111,73 @@ class Actor:
             rates = rates * ((seconds >= 0) & (seconds < animation.duration_s))
         return animation.frames(seconds), rates / animation.step_s
 
-    def bounds_between(self, begins_ns: Floats, ends_ns: Floats) -> Floats:
-        """Boxes of all its poses between times (k,), nanoseconds, in its own axes: (k, 2, 3)."""
+    def bounds_between(self, starts_ns: Floats, stops_ns: Floats) -> Floats:
+        """Return boxes of all poses between times (k,), ns, in the actor's frame: (k, 2, 3)."""
         if (animation := self.mesh.animation) is None:
-            return self.mesh.bounds[None].repeat(len(begins_ns), axis=0)
-        times = np.linspace(begins_ns, ends_ns, 5)  # it may go there and back
-        seconds = self.seconds(times.reshape(-1))[0].reshape(times.shape)
+            return self.mesh.bounds[None].repeat(len(starts_ns), axis=0)
+        times_ns = np.linspace(starts_ns, stops_ns, 5)  # the actor may drive forward and back
+        seconds = self.seconds(times_ns.reshape(-1))[0].reshape(times_ns.shape)
         return animation.bounds_between(seconds.min(axis=0), seconds.max(axis=0))
 
     def seconds(self, times_ns: Floats) -> tuple[Floats, Floats]:
-        """Seconds of its animation at times (k,), nanoseconds, and how many a second pass then."""
+        """Return times (k,) in the animation, seconds, at times (k,), ns, and their rates (k,).
+
+        A rate is the seconds of animation that pass in a second of the survey.
+        """
         animation = self.mesh.animation
         assert animation is not None
         if (speed := animation.speed_m_s) is None:
             return times_ns / 1e9 + self.offset_s, np.ones(len(times_ns))
-        at, metres = self._way
-        speeds = np.diff(metres, prepend=metres[0], append=metres[-1])
-        speeds[1:-1] /= np.diff(at) / 1e9
-        passing = speeds[np.searchsorted(at, times_ns, "right")]
-        return interp(times_ns, at, metres) / speed + self.offset_s, passing / speed
+        passed_ns, distances_m = self._travelled
+        speeds = np.diff(distances_m, prepend=distances_m[0], append=distances_m[-1])
+        speeds[1:-1] /= np.diff(passed_ns) / 1e9
+        rates = speeds[np.searchsorted(passed_ns, times_ns, "right")] / speed
+        return interp(times_ns, passed_ns, distances_m) / speed + self.offset_s, rates
 
     @cached_property
-    def _way(self) -> tuple[Floats, Floats]:
-        """Times (k,), nanoseconds, and how far it has gone by then, metres; back is negative.
+    def _travelled(self) -> tuple[Floats, Floats]:
+        """Times (k,), ns, and the distances (k,) travelled until these times, metres.
 
-        Before and after it stands.
+        Distances driven backward count as negative. The actor is static before the first and after
+        the last time.
         """
-        way = self.trajectory
-        if not way.moves:
+        trajectory = self.trajectory
+        if not trajectory.moves:
             return np.zeros(1), np.zeros(1)
-        if isinstance(way, Track):
-            times = (way.times_s - (way.start_s or 0.0)) * 1e9
+        if isinstance(trajectory, Track):
+            times_ns = (trajectory.times_s - (trajectory.start_s or 0.0)) * 1e9
         else:
-            times = np.linspace(0, min(way.duration_ns, LONG_NS), WAY_POSES)
-        positions, rotations = way.poses(0, times.clip(*presence_ns(way)))
+            times_ns = np.linspace(
+                0, min(trajectory.duration_ns, MAX_DURATION_NS), TRAJECTORY_POSES
+            )
+        positions, rotations = trajectory.poses(0, times_ns.clip(*presence_ns(trajectory)))
         steps = np.diff(positions, axis=0)
-        metres = length(steps)
+        steps_m = length(steps)
         if rotations is not None:
-            back = products(steps.T, rotations[:-1, :, 0].T) < 0
-            metres = np.where(back, -metres, metres)
-        return times, np.append(0.0, np.cumsum(metres))
+            backward = products(steps.T, rotations[:-1, :, 0].T) < 0
+            steps_m = np.where(backward, -steps_m, steps_m)
+        return times_ns, np.append(0.0, np.cumsum(steps_m))
 
-    def samples(self, duration_ns: float, count: int) -> tuple[Floats, Floats, Floats]:
-        """Return times (k,), nanoseconds, positions (k, 3) and quaternions (k, 4), for drawings.
+    def samples(self, duration_ns: float, count: int) -> ActorSamples:
+        """Return poses at `count` times, for drawings.
 
-        They are even over the part of a survey of `duration_ns` in which it is in the scene.
+        Times are even over the part of a survey of `duration_ns` in which the actor is present.
         """
         appears, leaves = presence_ns(self.trajectory)
         first = max(appears, 0.0)
-        times = np.linspace(first, max(min(leaves, duration_ns), first + 1e6), count)
-        positions, rotations = full_poses(self.trajectory, 0, times)
-        return times, positions, quaternions_of(rotations)
+        times_ns = np.linspace(first, max(min(leaves, duration_ns), first + 1e6), count)
+        positions, rotations = full_poses(self.trajectory, 0, times_ns)
+        return ActorSamples(times_ns, positions, quaternions_of(rotations))
 
-    def check(self, begin_ns: float, end_ns: float) -> None:
-        """Check that its trajectory covers a time; LidarError if not."""
+    def check(self, start_ns: float, stop_ns: float) -> None:
+        """Check that the trajectory covers times from start to stop, ns; LidarError if not."""
         try:
-            self.trajectory.poses(0, np.array([begin_ns, end_ns], np.float64))
+            self.trajectory.poses(0, np.array([start_ns, stop_ns], np.float64))
         except LidarError as error:
-            words = str(error).rstrip(".")
+            reason = str(error).rstrip(".")
             raise LidarError(
-                f"Actor {self.name!r}: {words}: let its trajectory begin before the first scan and "
-                "end after the last."
+                f"Actor {self.name!r}: {reason}: let its trajectory begin before the first scan "
+                "and end after the last."
             ) from error
 
 
@@ -175,58 +191,67 @@ def check_spray(actors: Iterable[Actor]) -> None:
             )
 
 
-def samples_each(actors: Sequence[Actor], most: int) -> int:
-    """Return how many poses of each actor a drawing keeps: `most` of each, fewer of many actors."""
-    return max(20, min(most, SAMPLES_MOST // max(len(actors), 1)))
+def samples_per_actor(actors: Sequence[Actor], max_samples: int) -> int:
+    """Return the poses per actor that a drawing keeps: `max_samples`, or fewer for many actors."""
+    return max(20, min(max_samples, MAX_SAMPLES // max(len(actors), 1)))
 
 
-def shapes_of(actors: Iterable[Actor]) -> tuple[list[SceneMesh], Indices]:
-    """Meshes (m,) of actors, each once, and which of them each actor (a,) has.
+def distinct_meshes(actors: Iterable[Actor]) -> tuple[list[SceneMesh], Indices]:
+    """Return the distinct meshes (m,) of actors, and the index (a,) of each actor's mesh.
 
     Meshes are the same if they share their arrays, which pickling preserves.
     """
-    numbers: dict[tuple[int, ...], int] = {}  # {ids of the arrays: number of the mesh}
+    mesh_indices: dict[tuple[int, ...], int] = {}  # {ids of the arrays: number of the mesh}
     meshes: list[SceneMesh] = []
-    which = []
+    indices = []
     for mesh in (actor.mesh for actor in actors):
-        parts = (
+        arrays = (
             mesh.vertices, mesh.faces, mesh.colours, mesh.materials, mesh.animation, *mesh.cutouts,
         )  # fmt: skip
-        number = numbers.setdefault(tuple(map(id, parts)), len(meshes))
-        if number == len(meshes):
+        index = mesh_indices.setdefault(tuple(map(id, arrays)), len(meshes))
+        if index == len(meshes):
             meshes.append(mesh)
-        which.append(number)
-    return meshes, np.array(which, np.intp)
+        indices.append(index)
+    return meshes, np.array(indices, np.intp)
 
 
-def one_mesh(name: str, objects: Iterable[SceneMesh | SceneInstance]) -> SceneMesh:
-    """Join objects to one; masks are kept, and the animation of some, without the masks."""
-    flat = [one.flat() if isinstance(one, SceneInstance) else one for one in objects]
+def join_meshes(name: str, objects: Iterable[SceneMesh | SceneInstance]) -> SceneMesh:
+    """Join objects to a mesh in world coordinates; masks are kept, unless a mesh is animated.
+
+    Raises
+    ------
+    LidarError
+        If a mesh with voxels would be joined to another mesh.
+    """
+    flat = [item.flat() if isinstance(item, SceneInstance) else item for item in objects]
     if any(part.voxels is not None for part in flat):
         if flat[1:]:
             raise LidarError(f"{name!r} has voxels, and cannot be joined to other objects.")
         return replace(flat[0], name=name)
     if any(mesh.animation for mesh in flat):
-        return _one_animated(name, flat)
+        return _join_animated(name, flat)
     parts = [part for mesh in flat for part in parts_of(mesh)]
-    parts.sort(key=lambda part: part.mask is not None)  # those with masks last
+    parts.sort(key=lambda part: part.mask is not None)  # parts with masks last
     vertices, faces = stacked((part.vertices, part.faces) for part in parts)
-    cutouts = [cut for mesh in flat for cut in mesh.cutouts]
+    cutouts = [cutout for mesh in flat for cutout in mesh.cutouts]
     sizes = [len(part.faces) for part in parts]
-    colours = joined([part.colours for part in parts], sizes)
-    materials = face_materials.joined([part.materials for part in parts], sizes)
+    colours = join_colours([part.colours for part in parts], sizes)
+    materials = face_materials.join_materials([part.materials for part in parts], sizes)
     return SceneMesh(name, vertices, faces, tuple(cutouts), colours, materials=materials)
 
 
-def _one_animated(name: str, meshes: Sequence[SceneMesh]) -> SceneMesh:
-    """Join meshes of which some have poses of one animation."""
+def _join_animated(name: str, meshes: Sequence[SceneMesh]) -> SceneMesh:
+    """Join meshes that are static or have poses of the same animation."""
     first = next(mesh.animation for mesh in meshes if mesh.animation)
-    still = (len(first.vertices), 1, 1)
-    poses = [m.animation.vertices if m.animation else np.tile(m.vertices, still) for m in meshes]
+    repeats = (len(first.vertices), 1, 1)
+    poses = [
+        mesh.animation.vertices if mesh.animation else np.tile(mesh.vertices, repeats)
+        for mesh in meshes
+    ]
     animation = replace(first, vertices=np.concatenate(poses, axis=1))
     sizes = [len(mesh.faces) for mesh in meshes]
-    colours = joined([mesh.colours for mesh in meshes], sizes)
-    materials = face_materials.joined([mesh.materials for mesh in meshes], sizes)
+    colours = join_colours([mesh.colours for mesh in meshes], sizes)
+    materials = face_materials.join_materials([mesh.materials for mesh in meshes], sizes)
     parts = stacked((mesh.vertices, mesh.faces) for mesh in meshes)
     return SceneMesh(name, *parts, colours=colours, animation=animation, materials=materials)
 

@@ -12,8 +12,9 @@ from ..base.errors import LidarError
 from ..base.validation import as_array, checked_fields
 from ..base.vectors import turned
 
-RATE_HZ = 60.0  # of poses that are baked, at least
-PICTURED = 500_000  # most vertices in all poses of a mesh in pictures; a walk's compress to 1.4 B
+RATE_HZ = 60.0  # of baked poses, at least
+# Vertices in all poses of a mesh in pictures; the vertices of a walk compress to 1.4 bytes each.
+MAX_PICTURED_VERTICES = 500_000
 
 
 @dataclass(frozen=True, eq=False)
@@ -21,24 +22,26 @@ PICTURED = 500_000  # most vertices in all poses of a mesh in pictures; a walk's
 class Animation:
     """Poses of a mesh, evenly spaced, between which its vertices move straight.
 
-    Actors of one mesh share it; each plays it by its own clock, see `Actor.played`.
+    Actors of the same mesh share the animation; each plays it by its own clock, see
+    `Actor.played`.
 
     Parameters
     ----------
     vertices
-        float64 (f, v, 3): the mesh's vertices in at least two poses, metres, in its own axes.
+        float64 (f, v, 3): the mesh's vertices in at least two poses, metres, in the mesh's frame.
     step_s
-        From each pose to the next, seconds.
+        Time from each pose to the next, seconds.
     speed_m_s
-        Speed of an actor that plays it as fast as it was made: at half of that it plays half as
-        fast, and an actor that stands stays as it is. None plays it by time.
+        Speed of an actor that plays the animation in real time, m/s: an actor of half the speed
+        plays at half the rate, and a static actor keeps its pose. None plays by time.
     repeat
-        Whether it begins again, else its last pose remains.
+        Whether the animation starts again after its end; else the last pose remains.
 
     Raises
     ------
     LidarError
-        If there are no two poses, a number is not finite, or the step or speed is not above 0.
+        If there are less than two poses, a number is not finite, or the step or speed is not
+        above 0.
     """
 
     vertices: Floats
@@ -51,9 +54,9 @@ class Animation:
         object.__setattr__(self, "vertices", np.ascontiguousarray(poses))
         shape = np.shape(self.vertices)
         speed = self.speed_m_s
-        good = len(shape) == 3 and shape[0] > 1 and shape[1] > 0 and shape[2] == 3
-        good = good and self.step_s > 0 and (speed is None or speed > 0)
-        if not good or not np.isfinite(self.vertices).all():
+        valid = len(shape) == 3 and shape[0] > 1 and shape[1] > 0 and shape[2] == 3
+        valid = valid and self.step_s > 0 and (speed is None or speed > 0)
+        if not valid or not np.isfinite(self.vertices).all():
             raise LidarError(
                 "An animation has finite vertices (f, v, 3) of two poses at least, and a step and "
                 f"speed above 0; given: {shape}, {self.step_s} s, {speed} m/s."
@@ -61,56 +64,64 @@ class Animation:
 
     @property
     def duration_s(self) -> float:
-        """From the first to the last pose."""
+        """Time from the first to the last pose, seconds."""
         return (len(self.vertices) - 1) * self.step_s
 
     def frames(self, seconds: Floats) -> Floats:
-        """Return frames (n,) at seconds since the first pose: 1.5 is half way from the second."""
+        """Return frames (n,) at seconds (n,) since the first pose.
+
+        Frame 1.5 is half way from the second pose to the third.
+        """
         last = len(self.vertices) - 1
         frames = seconds / self.step_s
         return np.mod(frames, last) if self.repeat else np.clip(frames, 0, last)
 
-    def at(self, frames: Floats, vertex: Indices | slice = slice(None)) -> tuple[Floats, Floats]:
-        """Return vertices of numbers (n, k), or all, at frames (n,), and their steps: (n, k, 3)."""
-        begin = frames.astype(np.int64).clip(0, len(self.vertices) - 2)
-        share = (frames - begin)[:, None, None]
-        begin = begin if isinstance(vertex, slice) else begin[:, None]
-        here = self.vertices[begin, vertex]
-        then = self.vertices[begin + 1, vertex]
-        return (1 - share) * here + share * then, then - here
+    def vertices_at(
+        self, frames: Floats, vertex: Indices | slice = slice(None)
+    ) -> tuple[Floats, Floats]:
+        """Return vertices (n, k, 3) at frames (n,), and their steps (n, k, 3) to the next pose.
+
+        `vertex` (n, k) selects vertices by their indices.
+        """
+        first_pose = frames.astype(np.int64).clip(0, len(self.vertices) - 2)
+        share = (frames - first_pose)[:, None, None]
+        first_pose = first_pose if isinstance(vertex, slice) else first_pose[:, None]
+        start = self.vertices[first_pose, vertex]
+        stop = self.vertices[first_pose + 1, vertex]
+        return (1 - share) * start + share * stop, stop - start
 
     @cached_property
     def pictured(self) -> Animation:
-        """The same for pictures: fewer poses if they have many vertices, rounded to 1/1024 m."""
-        steps = min(len(self.vertices), max(PICTURED // self.vertices.shape[1], 2)) - 1
-        poses, _ = self.at(np.linspace(0, len(self.vertices) - 1, steps + 1))
+        """Animation for pictures: fewer poses of many vertices, rounded to 1/1024 m."""
+        steps = min(len(self.vertices), max(MAX_PICTURED_VERTICES // self.vertices.shape[1], 2)) - 1
+        poses, _ = self.vertices_at(np.linspace(0, len(self.vertices) - 1, steps + 1))
         return replace(self, vertices=np.round(1024 * poses) / 1024, step_s=self.duration_s / steps)
 
     @cached_property
     def bounds(self) -> Floats:
-        """Corners of the box of all poses: (2, 3)."""
+        """Lowest and highest corner of all poses, metres: (2, 3)."""
         return np.stack([self.vertices.min(axis=(0, 1)), self.vertices.max(axis=(0, 1))])
 
     def bounds_between(self, first_s: Floats, last_s: Floats) -> Floats:
-        """Boxes of all poses between seconds (n,) since the first pose: (n, 2, 3)."""
+        """Return boxes of all poses between seconds (n,) since the first pose: (n, 2, 3)."""
         last = len(self.vertices) - 1
-        ends = np.stack([first_s, last_s]) / self.step_s
-        ends = ends if self.repeat else ends.clip(0, last)
-        first = np.floor(ends[0]).astype(np.int64)
-        steps = np.ceil(ends[1]).astype(np.int64) - first  # 0 while it keeps a pose
-        lows = self.vertices.min(axis=1)
-        highs = self.vertices.max(axis=1)
-        low = np.full((len(first), 3), np.inf)
-        high = np.full((len(first), 3), -np.inf)
+        limits = np.stack([first_s, last_s]) / self.step_s
+        limits = limits if self.repeat else limits.clip(0, last)
+        first = np.floor(limits[0]).astype(np.int64)
+        steps = np.ceil(limits[1]).astype(np.int64) - first  # 0 while the animation keeps a pose
+        pose_lower = self.vertices.min(axis=1)
+        pose_upper = self.vertices.max(axis=1)
+        lower = np.full((len(first), 3), np.inf)
+        upper = np.full((len(first), 3), -np.inf)
         for step in range(max(1, min(int(steps.max(initial=0)), last))):
-            begin = first + np.minimum(step, (steps - 1).clip(0))
-            begin = begin % last if self.repeat else begin
-            for frame in (begin, begin + (steps > 0)):
-                low = np.minimum(low, lows[frame])
-                high = np.maximum(high, highs[frame])
-        return np.stack([low, high], axis=1)
+            pose = first + np.minimum(step, (steps - 1).clip(0))
+            pose = pose % last if self.repeat else pose
+            for frame in (pose, pose + (steps > 0)):
+                lower = np.minimum(lower, pose_lower[frame])
+                upper = np.maximum(upper, pose_upper[frame])
+        return np.stack([lower, upper], axis=1)
 
     def moved(self, linear: Floats, offset: Floats) -> Animation:
-        """Return it with all vertices at p -> linear @ p + offset."""
+        """Return the animation with all vertices at p -> linear @ p + offset."""
         points = turned(self.vertices.reshape(-1, 3), linear) + offset
         return replace(self, vertices=points.reshape(self.vertices.shape))

@@ -16,7 +16,7 @@ from ..base.errors import LidarError
 from ..base.vectors import matmul
 from ..base.words import plural
 
-# What has no colour is grey, of half of the light, as the default reflectance is.
+# Faces without a colour are grey, of half of the light, as the default reflectance is.
 GREY = np.full((1, 1, 3), 188, np.uint8)
 WHITE = np.full((1, 1, 3), 255, np.uint8)
 WEIGHTS = np.array([0.2126, 0.7152, 0.0722])  # luminance of linear light, ITU-R BT.709
@@ -30,32 +30,32 @@ _EDGES = (LINEAR[:-1] + LINEAR[1:]) / 2
 
 
 def as_srgb(linear: ArrayLike) -> Bytes:
-    """Nearest sRGB bytes of linear light, 0 to 1, of any shape."""
+    """Return the nearest sRGB bytes of linear light, 0 to 1, of any shape."""
     return np.searchsorted(_EDGES, np.asarray(linear, np.float64)).astype(np.uint8)
 
 
 def as_bytes(shares: ArrayLike) -> Bytes:
-    """Bytes of shares of sRGB, 0 to 1, of any shape; NaN is 0."""
-    known = np.nan_to_num(np.asarray(shares, np.float64))
-    return np.rint(255 * np.clip(known, 0, 1)).astype(np.uint8)
+    """Return the bytes of sRGB values, 0 to 1, of any shape; NaN gives 0."""
+    finite_shares = np.nan_to_num(np.asarray(shares, np.float64))
+    return np.rint(255 * np.clip(finite_shares, 0, 1)).astype(np.uint8)
 
 
 @dataclass(frozen=True, eq=False)
 class Colours:
-    """Colours of the faces of a mesh, in sRGB as files have them.
+    """Colours of the faces of a mesh, in sRGB, as in files.
 
     Attributes
     ----------
     images
-        uint8 (h, w, 3) each. One of a single element is a plain colour.
+        uint8 (h, w, 3) each. An image of a single element is a plain colour.
     image
-        int32 (f,): which of them each face has.
+        int32 (f,): index of each face's image.
     uv
         float32 (f, 3, 2): texture coordinates of the corners, see `Cutout`; None if there are only
         plain colours.
     corners
-        uint8 (f, 3, 3): colours of the corners, by which those of the images are multiplied in
-        linear light; None for white.
+        uint8 (f, 3, 3): colours of the corners, by which the colours of the images are multiplied
+        in linear light; None for white.
     """
 
     images: tuple[Bytes, ...]
@@ -68,175 +68,186 @@ class Colours:
 
     @classmethod
     def plain(cls, colour: Bytes, faces: int) -> Colours:
-        """One colour, (1, 1, 3), for all faces."""
+        """Return the same colour (1, 1, 3) for all faces."""
         return cls((colour,), np.zeros(faces, np.int32))
 
     @classmethod
     def of_corners(cls, corners: Bytes) -> Colours:
-        """Give each corner of each face a colour of its own, (f, 3, 3)."""
+        """Return colours (f, 3, 3) of the corners of each face."""
         return cls((WHITE,), np.zeros(len(corners), np.int32), corners=corners)
 
     @classmethod
     def of_faces(cls, colours: Bytes) -> Colours:
-        """Give each face a colour of its own, (f, 3)."""
+        """Return a plain colour for each face, from colours (f, 3)."""
         return cls.of_corners(colours[:, None].repeat(3, axis=1))
 
     def take(self, rows: Integers | slice) -> Colours:
-        """Select faces."""
+        """Return the colours of selected faces."""
         uv = None if self.uv is None else self.uv[rows]
         corners = None if self.corners is None else self.corners[rows]
         return Colours(self.images, self.image[rows], uv, corners)
 
     def divided(self, rows: Integers, weights: Floats) -> Colours:
-        """Colours of pieces of faces (k,), whose corners have these weights of theirs (k, 3, 3)."""
-        whole = self.take(rows)
-        uv = None if whole.uv is None else matmul(weights, whole.uv).astype(np.float32)
-        corners = None if whole.corners is None else matmul(weights, whole.corners).astype(np.uint8)
-        return replace(whole, uv=uv, corners=corners)
+        """Return the colours of pieces of the faces `rows` (k,).
+
+        `weights` (k, 3, 3) are the barycentric coordinates of the corners of each piece in its
+        face.
+        """
+        faces = self.take(rows)
+        uv = None if faces.uv is None else matmul(weights, faces.uv).astype(np.float32)
+        corners = None if faces.corners is None else matmul(weights, faces.corners).astype(np.uint8)
+        return replace(faces, uv=uv, corners=corners)
 
     def mirrored(self) -> Colours:
-        """Reverse the order of the corners."""
+        """Return the colours with the corners of each face in reverse order."""
         uv = None if self.uv is None else self.uv[:, ::-1]
         corners = None if self.corners is None else self.corners[:, ::-1]
         return replace(self, uv=uv, corners=corners)
 
     def check(self, name: str, faces: int) -> None:
-        """Check the shapes for so many faces of an object; LidarError if they are wrong."""
+        """Check that the shapes fit a number of faces of an object; LidarError if not."""
         shapes = [(self.image, (faces,)), (self.uv, (faces, 3, 2)), (self.corners, (faces, 3, 3))]
-        well = all(one is None or one.shape == shape for one, shape in shapes)
-        well &= all(one.dtype == np.uint8 and one.shape[2:] == (3,) for one in self.images)
-        well &= all(one.size == 3 or (one.size > 3 and self.uv is not None) for one in self.images)
-        well &= self.uv is None or bool(np.isfinite(self.uv).all())
-        if not well or not within(self.image, len(self.images)):
+        valid = all(array is None or array.shape == shape for array, shape in shapes)
+        for image in self.images:
+            valid &= image.dtype == np.uint8 and image.shape[2:] == (3,)
+            valid &= image.size == 3 or (image.size > 3 and self.uv is not None)
+        valid &= self.uv is None or bool(np.isfinite(self.uv).all())
+        if not valid or not are_indices(self.image, len(self.images)):
             raise LidarError(
                 f"The colours of {name!r} do not fit its {faces} faces: images are uint8 "
                 "(h, w, 3), image (f,), uv (f, 3, 2), finite, and corners (f, 3, 3)."
             )
 
     def means(self) -> Bytes:
-        """Mean colour of each face, in linear light, of four places on it, or of 100: (f, 3)."""
-        out = np.empty((len(self), 3), np.uint8)
-        steps = 10 if len(self) <= FEW_FACES else 2
-        # The middles of the pieces into which lines beside the edges cut it.
+        """Return the mean colour of each face, in linear light, (f, 3).
+
+        The mean is that of 4 points of the face, or of 100 if there are few faces.
+        """
+        mean_colours = np.empty((len(self), 3), np.uint8)
+        steps = 10 if len(self) <= MAX_DENSE_FACES else 2
+        # Centres of the pieces into which lines parallel to the edges cut a face.
         i, j = (n.ravel() for n in np.mgrid[:steps, :steps])
         upright = np.stack([i, j], axis=1)[i + j < steps] + 1 / 3
-        turned = np.stack([i, j], axis=1)[i + j < steps - 1] + 2 / 3
-        places = np.concatenate([upright, turned]) / steps
-        for begin in range(0, len(self), BLOCK_FACES):
-            some = self.take(slice(begin, begin + BLOCK_FACES))
-            lookup = Lookup(some, [_UNIT.repeat(len(some), axis=0)])
-            rows = np.arange(len(some))
-            light = np.zeros((len(some), 3))
-            for along, across in places.tolist():
-                found = lookup.at(rows, np.tile([along, across, 0.0], (len(some), 1)))
-                light += LINEAR[unpacked(found)]
-            out[begin : begin + BLOCK_FACES] = as_srgb(light / len(places))
-        return out
+        inverted = np.stack([i, j], axis=1)[i + j < steps - 1] + 2 / 3
+        points = np.concatenate([upright, inverted]) / steps
+        for start in range(0, len(self), BLOCK_FACES):
+            block = self.take(slice(start, start + BLOCK_FACES))
+            lookup = Lookup(block, [_UNIT.repeat(len(block), axis=0)])
+            rows = np.arange(len(block))
+            light = np.zeros((len(block), 3))
+            for u, v in points.tolist():
+                colours = lookup.colours_at(rows, np.tile([u, v, 0.0], (len(block), 1)))
+                light += LINEAR[unpacked(colours)]
+            mean_colours[start : start + BLOCK_FACES] = as_srgb(light / len(points))
+        return mean_colours
 
 
-FEW_FACES = 20_000
+MAX_DENSE_FACES = 20_000  # of meshes whose colours are averaged from 100 points a face
 _UNIT = np.array([[[0.0, 0, 0], [1, 0, 0], [0, 1, 0]]])
 
 
-def within(numbers: Ints32, count: int) -> bool:
-    """Whether numbers of any shape are those of so many things, from 0 up."""
-    return not numbers.size or bool(0 <= numbers.min() <= numbers.max() < count)
+def are_indices(indices: Ints32, count: int) -> bool:
+    """Return True if all numbers, of any shape, are indices from 0 up and below `count`."""
+    return not indices.size or bool(0 <= indices.min() <= indices.max() < count)
 
 
 class Lookup:
-    """Colours by the number of a face and a point on it; images are kept as one table.
+    """Lookup of colours by the index of a face and a point on the face, in a table of all texels.
 
     Parameters
     ----------
     colours
-        Of f faces.
+        Colours of f faces.
     corners
-        (k, 3, 3) each: corners of the faces, one block after the other.
+        (k, 3, 3) each: corners of the faces, block by block.
     """
 
     def __init__(self, colours: Colours, corners: Iterable[Floats]) -> None:
         images = colours.images
         tints = colours.corners
         self._image = colours.image
-        self._texels = np.concatenate([packed(one.reshape(-1, 3)) for one in images])
-        sizes = np.array([one.shape[:2] for one in images], np.int64)
+        self._texels = np.concatenate([packed(image.reshape(-1, 3)) for image in images])
+        sizes = np.array([image.shape[:2] for image in images], np.int64)
         self._height, self._width = sizes.T
         counts = sizes.prod(axis=1)
         self._first = np.cumsum([0, *counts[:-1]])
-        # Faces with images have texture coordinates, and those with colours at their corners
-        # have these, as planes of the position.
-        own = (counts > 1)[self._image]
+        # Texture coordinates of faces with images, and colours of corners, are stored as planes:
+        # linear functions of the position.
+        textured = (counts > 1)[self._image]
         tinted = np.zeros(0, np.bool_) if tints is None else (tints != 255).any(axis=(1, 2))
         textures = [np.zeros((0, 8))]
         lights = [np.zeros((0, 12))]
-        at = 0
+        start = 0
         for block in corners:
-            rows = slice(at, at + len(block))
+            rows = slice(start, start + len(block))
             if colours.uv is not None:
-                uv = colours.uv[rows][own[rows]]
-                textures.append(_planes(block[own[rows]], uv.astype(np.float64)))
+                uv = colours.uv[rows][textured[rows]]
+                textures.append(_planes(block[textured[rows]], uv.astype(np.float64)))
             if tints is not None:
                 light = LINEAR[tints[rows][tinted[rows]]]
                 lights.append(_planes(block[tinted[rows]], light))
-            at += len(block)
-        self._texture = _Planes.of(own, textures)
-        self._light = _Planes.of(tinted, lights)
+            start += len(block)
+        self._texture = _Planes.joined(textured, textures)
+        self._light = _Planes.joined(tinted, lights)
 
-    def at(self, rows: Integers, points: Floats) -> UInts32:
-        """Colours of points (n, 3) on faces (n,), packed; of images the nearest element."""
+    def colours_at(self, rows: Integers, points: Floats) -> UInts32:
+        """Return the packed colours (n,) of points (n, 3) on faces (n,); of images, the texel."""
         image = self._image.take(rows)
-        at = self._first.take(image)
-        place = np.ascontiguousarray(points.T)
+        texel = self._first.take(image)
+        positions = np.ascontiguousarray(points.T)
         if self._texture is not None:
-            on, (u, v) = self._texture.at(rows, place)
-            image = image[on]
+            selected, (u, v) = self._texture.values_at(rows, positions)
+            image = image[selected]
             width = self._width.take(image)
             row = _element(v, self._height.take(image))
-            at[on] += row * width + _element(u, width)
-        found = self._texels.take(at)
+            texel[selected] += row * width + _element(u, width)
+        colours = self._texels.take(texel)
         if self._light is not None:
-            on, light = self._light.at(rows, place)
-            tinted = LINEAR[unpacked(found[on])] * np.clip(light.T, 0, 1)
-            found[on] = packed(as_srgb(tinted))
-        return found
+            selected, light = self._light.values_at(rows, positions)
+            tinted = LINEAR[unpacked(colours[selected])] * np.clip(light.T, 0, 1)
+            colours[selected] = packed(as_srgb(tinted))
+        return colours
 
 
 class _Planes(NamedTuple):
     """Values on faces that are linear in the position."""
 
-    place: Ints32  # (f,): row of `slopes` that each face has; -1 for none
-    slopes: Floats  # (k, 4 w): of each of w values, along x, y and z, and at zero
-    everywhere: bool
+    rows: Ints32  # (f,): row of `slopes` of each face; -1 for faces without values
+    slopes: Floats  # (k, 4 w): for each of w values, slopes along x, y and z, and value at zero
+    everywhere: bool  # all faces have values
 
     @classmethod
-    def of(cls, there: Bools, blocks: list[Floats]) -> _Planes | None:
-        """Join blocks (k, 4 w), of the faces (f,) that have some; None if there are none."""
-        if not there.any():
+    def joined(cls, has_values: Bools, blocks: list[Floats]) -> _Planes | None:
+        """Join blocks of slopes (k, 4 w) of the faces that have values; None if no face has."""
+        if not has_values.any():
             return None
-        place = np.where(there, np.cumsum(there) - 1, -1).astype(np.int32)
-        return cls(place, np.concatenate(blocks), bool(there.all()))
+        slope_rows = np.where(has_values, np.cumsum(has_values) - 1, -1).astype(np.int32)
+        return cls(slope_rows, np.concatenate(blocks), bool(has_values.all()))
 
-    def at(self, rows: Integers, points: Floats) -> tuple[Any, Floats]:
-        """Which of the faces (n,) have values, and the values at points (3, n): (w, m)."""
-        on: Any = slice(None)
-        place = self.place.take(rows)
+    def values_at(self, rows: Integers, points: Floats) -> tuple[Any, Floats]:
+        """Return the selection of the faces (n,) with values, and the values at points (3, n).
+
+        The selection is a slice of all, or indices (m,); the values are (w, m).
+        """
+        selected: Any = slice(None)
+        slope_rows = self.rows.take(rows)
         if not self.everywhere:
-            on = np.flatnonzero(place >= 0)
-            place = place[on]
-            points = points[:, on]
+            selected = np.flatnonzero(slope_rows >= 0)
+            slope_rows = slope_rows[selected]
+            points = points[:, selected]
         x, y, z = points
-        out = np.empty((self.slopes.shape[1] // 4, len(x)))
-        slopes = self.slopes.take(place, axis=0).T.reshape(len(out), 4, len(x))
-        for value, (a, b, c, d) in zip(out, slopes, strict=True):
-            np.multiply(a, x, out=value)
-            value += b * y
-            value += c * z
-            value += d
-        return on, out
+        values = np.empty((self.slopes.shape[1] // 4, len(x)))
+        slopes = self.slopes.take(slope_rows, axis=0).T.reshape(len(values), 4, len(x))
+        for row, (a, b, c, d) in zip(values, slopes, strict=True):
+            np.multiply(a, x, out=row)
+            row += b * y
+            row += c * z
+            row += d
+        return selected, values
 
 
 def _planes(corners: Floats, values: Floats) -> Floats:
-    """Slopes of values (k, 3, w) between corners (k, 3, 3): (k, 4 w), see `_Planes`.
+    """Return the slopes (k, 4 w) of `_Planes` for values (k, 3, w) at corners (k, 3, 3).
 
     Flat triangles, which are not hit, have the value of their first corner.
     """
@@ -246,40 +257,40 @@ def _planes(corners: Floats, values: Floats) -> Floats:
     scale = np.divide(1, area, out=np.zeros_like(area), where=area > _FLAT)
     along_b = np.cross(c - a, normal) * scale
     along_c = np.cross(normal, b - a) * scale
-    out = np.empty((len(corners), values.shape[2], 4))
-    for value, (first, second, third) in enumerate(values.transpose(2, 1, 0)):
+    planes = np.empty((len(corners), values.shape[2], 4))
+    for column, (first, second, third) in enumerate(values.transpose(2, 1, 0)):
         slope = (second - first)[:, None] * along_b + (third - first)[:, None] * along_c
-        out[:, value, :3] = slope
-        out[:, value, 3] = first - (slope * a).sum(axis=1)
-    return out.reshape(len(corners), 4 * values.shape[2])
+        planes[:, column, :3] = slope
+        planes[:, column, 3] = first - (slope * a).sum(axis=1)
+    return planes.reshape(len(corners), 4 * values.shape[2])
 
 
-def _element(place: Floats, size: Ints) -> Ints:
-    """Which of so many elements of an image that repeats a texture coordinate is in: (n,)."""
-    within = place - np.floor(place)
-    within *= size
-    return np.minimum(within.astype(np.int64), size - 1)
+def _element(coordinate: Floats, size: Ints) -> Ints:
+    """Return the row or column (n,) of a repeating image that contains a texture coordinate."""
+    position = coordinate - np.floor(coordinate)
+    position *= size
+    return np.minimum(position.astype(np.int64), size - 1)
 
 
 def packed(colours: Bytes) -> UInts32:
-    """Colours (n, 3) as one number each, red in its lowest byte."""
-    out = np.zeros((len(colours), 4), np.uint8)
-    out[:, :3] = colours
-    return out.view("<u4")[:, 0]
+    """Return colours (n, 3) packed into a number each (n,), red in the lowest byte."""
+    channels = np.zeros((len(colours), 4), np.uint8)
+    channels[:, :3] = colours
+    return channels.view("<u4")[:, 0]
 
 
 def unpacked(colours: UInts32) -> Bytes:
-    """Undo `packed`."""
+    """Return the colours (n, 3) of packed colours (n,)."""
     return np.ascontiguousarray(colours, "<u4").view(np.uint8).reshape(-1, 4)[:, :3]
 
 
 def as_float(red: Bytes, green: Bytes, blue: Bytes) -> Floats32:
-    """Colours (n,) as PCL and ROS have them in a field `rgb`: the bits 0x00RRGGBB as a float."""
+    """Return colours (n,) as in the field `rgb` of PCL and ROS: bits 0x00RRGGBB as a float."""
     return packed(np.column_stack([blue, green, red])).view("<f4")
 
 
 def luminance(colours: UInts32) -> Floats:
-    """Luminance (n,) of packed colours in linear light, 0 to 1."""
+    """Return the luminance (n,) of packed colours in linear light, 0 to 1."""
     red, green, blue = map(np.take, _SHARES, unpacked(colours).T)
     return np.asarray(red + green + blue)
 
@@ -287,46 +298,51 @@ def luminance(colours: UInts32) -> Floats:
 _SHARES = WEIGHTS[:, None] * LINEAR
 
 
-def joined(parts: Sequence[Colours | None], sizes: Iterable[int]) -> Colours | None:
-    """Colours of meshes of so many faces, one after the other; grey where there are none."""
+def join_colours(parts: Sequence[Colours | None], sizes: Iterable[int]) -> Colours | None:
+    """Join the colours of meshes in order; None if no mesh has colours.
+
+    `sizes` are the numbers of faces of the meshes; a mesh without colours becomes grey.
+    """
     if not any(part is not None for part in parts):
         return None
-    whole = [
+    coloured = [
         Colours.plain(GREY, size) if part is None else part
         for part, size in zip(parts, sizes, strict=True)
     ]
-    numbers: dict[int, int] = {}  # {id of an image: its number}
+    image_numbers: dict[int, int] = {}  # {id of an image: its number}
     images: list[Bytes] = []
-    image = []
-    for part in whole:
-        for one in part.images:
-            if id(one) not in numbers:
-                numbers[id(one)] = len(images)
-                images.append(one)
-        image.append(np.array([numbers[id(one)] for one in part.images], np.int32)[part.image])
-    uv = corners = None
-    if any(part.uv is not None for part in whole):
+    image_indices = []  # (f,) of each mesh
+    for part in coloured:
+        for pixels in part.images:
+            if id(pixels) not in image_numbers:
+                image_numbers[id(pixels)] = len(images)
+                images.append(pixels)
+        part_numbers = [image_numbers[id(pixels)] for pixels in part.images]
+        image_indices.append(np.array(part_numbers, np.int32)[part.image])
+    uv = None
+    corners = None
+    if any(part.uv is not None for part in coloured):
         uv = np.concatenate(
-            [np.zeros((len(p), 3, 2), np.float32) if p.uv is None else p.uv for p in whole]
+            [np.zeros((len(p), 3, 2), np.float32) if p.uv is None else p.uv for p in coloured]
         )
-    if any(part.corners is not None for part in whole):
+    if any(part.corners is not None for part in coloured):
         corners = np.concatenate(
             [np.full((len(p), 3, 3), 255, np.uint8) if p.corners is None else p.corners
-             for p in whole]
+             for p in coloured]
         )  # fmt: skip
-    return Colours(tuple(images), np.concatenate(image), uv, corners)
+    return Colours(tuple(images), np.concatenate(image_indices), uv, corners)
 
 
 def colours_summary(parts: Iterable[Colours | None]) -> str:
-    """Say what the colours of meshes are: «2 textures, 1 plain colour, colours of vertices»."""
-    there = [part for part in parts if part is not None]
+    """Return a summary of colours: «2 textures, 1 plain colour, colours of vertices»."""
+    coloured = [part for part in parts if part is not None]
     kinds = {
         id(part.images[number]): "texture" if part.images[number].size > 3 else "plain colour"
-        for part in there
+        for part in coloured
         for number in np.unique(part.image)
         if part.images[number] is not WHITE
     }
     counts = Counter(kinds.values())
     words = [plural(counts[kind], kind) for kind in ("texture", "plain colour") if counts[kind]]
-    words += ["colours of vertices"] * any(part.corners is not None for part in there)
+    words += ["colours of vertices"] * any(part.corners is not None for part in coloured)
     return ", ".join(words) or "no colours"

@@ -9,7 +9,7 @@ import numpy as np
 
 from ..base.arrays import Integers, Ints32
 from ..base.errors import LidarError
-from .colours import within
+from .colours import are_indices
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,20 +29,20 @@ class FaceMaterials:
 
     @classmethod
     def named(cls, name: str) -> FaceMaterials | None:
-        """Return one material for all faces; None without a name."""
+        """Return the same material for all faces; None without a name."""
         return cls((name,)) if name else None
 
     def take(self, rows: Integers | slice) -> FaceMaterials:
-        """Select faces; the names stay."""
+        """Return the materials of selected faces; the names stay."""
         return self if self.index is None else FaceMaterials(self.names, self.index[rows])
 
     def check(self, name: str, faces: int) -> None:
-        """Check that they are those of a number of faces; LidarError if not."""
+        """Check that names are distinct, and rows fit a number of faces; LidarError if not."""
         index = self.index
         fits = len(self.names) > 0 and len(set(self.names)) == len(self.names)
         if index is not None:
             fits = fits and index.shape == (faces,) and index.dtype == np.int32
-            fits = fits and within(index, len(self.names))
+            fits = fits and are_indices(index, len(self.names))
         if not fits:
             raise LidarError(
                 f"The materials of {name!r} do not fit its {faces} faces: names are distinct, and "
@@ -57,25 +57,32 @@ class ObjectMaterials:
     Attributes
     ----------
     names
-        Names of the materials of each object; none for an object without materials.
+        Names of the materials of each object; () for an object without materials.
     index
-        int32 (f,) of the scene's faces: row of the names of the face's object; None if all faces
-        have the first. Parts of instances have their own.
+        int32 (f,) for the scene's faces: row of the names of the face's object; None if all faces
+        have the first name. Parts of instances have an index of their own.
     """
 
     names: tuple[tuple[str, ...], ...]
     index: Ints32 | None = None
 
     @classmethod
-    def of(
+    def from_meshes(
         cls,
         objects: Sequence[FaceMaterials | None],
         meshes: Sequence[FaceMaterials | None],
         sizes: Sequence[int],
     ) -> ObjectMaterials | None:
-        """Return those of objects; None if no object has any.
+        """Return the materials of a scene; None if no object has materials.
 
-        `meshes` are those of the scene's faces, of some numbers of faces, one after the other.
+        Parameters
+        ----------
+        objects
+            Materials of each object.
+        meshes
+            Materials of the meshes that form the scene's faces, in order.
+        sizes
+            Number of faces of each mesh.
         """
         if not any(materials is not None for materials in objects):
             return None
@@ -91,7 +98,7 @@ class ObjectMaterials:
         return cls(names, np.concatenate(rows))
 
     def of_object(self, owner: int, faces: Integers) -> FaceMaterials | None:
-        """Materials of some of the scene's faces, which an object has."""
+        """Return the materials of the scene's `faces` (k,), which belong to the object `owner`."""
         if not self.names[owner]:
             return None
         single = self.index is None or len(self.names[owner]) == 1
@@ -100,12 +107,17 @@ class ObjectMaterials:
         )
 
 
-def joined(parts: Sequence[FaceMaterials | None], sizes: Iterable[int]) -> FaceMaterials | None:
-    """Materials of meshes of some numbers of faces, one after the other; None for no name."""
+def join_materials(
+    parts: Sequence[FaceMaterials | None], sizes: Iterable[int]
+) -> FaceMaterials | None:
+    """Join the materials of meshes in order; None if no mesh has materials.
+
+    `sizes` are the numbers of faces of the meshes; faces without a material get the name "".
+    """
     if not any(part is not None for part in parts):
         return None
-    numbers: dict[str, int] = {}  # {name: its row}
-    index: list[Ints32] = []
+    numbers: dict[str, int] = {}  # {name: row}
+    index: list[Ints32] = []  # (f,) of each mesh
     for part, size in zip(parts, sizes, strict=True):
         names = ("",) if part is None else part.names
         rows = [numbers.setdefault(name, len(numbers)) for name in names]

@@ -1,4 +1,4 @@
-"""Images of materials: where their triangles stop light, and colours."""
+"""Images of materials: masks, which say where triangles stop light, and colours."""
 
 from __future__ import annotations
 
@@ -18,14 +18,15 @@ from ..base.arrays import AnyArray, Bools, Bytes, Floats, Floats32, Ints
 from ..base.input_files import InputFileError, open_input
 from ..base.words import printable
 from .colours import Colours
-from .scene_mesh import UV_MOST, Cutout
+from .scene_mesh import MAX_UV, Cutout
 
-FORMATS = ("PNG", "JPEG", "WEBP", "BMP", "GIF", "TGA")  # Pillow has more, some run programs
-HALF = 128  # least 8-bit opacity that stops light, unless a file states another
-PIXEL_BYTES = 10  # of an image while it is decoded
-FACE_BYTES = 120  # of a triangle while its texture coordinates are made
-NAMED = 3  # materials that a note names
-SIDE_MOST = 4096  # pixels of an image of colours; larger ones are made smaller
+# Further formats of Pillow are left out, since some run programs.
+FORMATS = ("PNG", "JPEG", "WEBP", "BMP", "GIF", "TGA")
+HALF_OPACITY = 128  # least 8-bit opacity that stops light, unless a file states a cutoff
+PIXEL_BYTES = 10  # memory of a pixel while its image is decoded
+FACE_BYTES = 120  # memory of a triangle while its texture coordinates are computed
+_MAX_NAMED = 3  # materials that a note names
+MAX_SIDE_PIXELS = 4096  # width and height of an image of colours; larger images are reduced
 
 Wrap = Literal["repeat", "mirror", "clamp", "black"]  # or transparent, in a mask
 K = TypeVar("K", bound=Hashable)
@@ -33,20 +34,20 @@ V = TypeVar("V")
 
 
 class MaskError(Exception):
-    """Why a mask cannot be read, as a clause."""
+    """The reason why a mask cannot be read, as a clause."""
 
 
 def read_opacity(image: Path | bytes, allowance: Allowance, *, grey: bool = False) -> Bytes | None:
-    """Opacity of an image: its alpha channel, or else, with `grey`, its brightness.
+    """Return the opacity of an image: its alpha channel, or else, with `grey`, its brightness.
 
     Returns
     -------
-    (h, w), 0 to 255; None if it has no alpha channel, or one that is opaque everywhere.
+    (h, w), 0 to 255; None without an alpha channel, or if it is opaque everywhere.
 
     Raises
     ------
     MaskError
-        If it cannot be decoded, or takes more than allowed.
+        If the image cannot be decoded, or takes more memory than allowed.
     """
     with _opened(image) as opened:
         if not (grey or opened.has_transparency_data):
@@ -56,40 +57,40 @@ def read_opacity(image: Path | bytes, allowance: Allowance, *, grey: bool = Fals
             raise _TooLargeError
         allowance.take(pixels)
         if opened.has_transparency_data:
-            whole = opened if "A" in opened.getbands() else opened.convert("RGBA")
-            alpha = np.asarray(whole.getchannel("A"))
+            rgba = opened if "A" in opened.getbands() else opened.convert("RGBA")
+            alpha = np.asarray(rgba.getchannel("A"))
             if alpha.min() < 255:
                 return alpha
         return np.asarray(_of_bytes(opened).convert("L")) if grey else None
 
 
 def read_colours(image: Path | bytes, allowance: Allowance, notes: MaskNotes) -> Bytes:
-    """Colours of an image: (h, w, 3), sRGB.
+    """Return the colours of an image: (h, w, 3), sRGB.
 
-    It is made smaller if it is more than `SIDE_MOST` wide or high, and noted.
+    An image that is more than `MAX_SIDE_PIXELS` wide or high is reduced, which `notes` records.
 
     Raises
     ------
     MaskError
-        As `read_opacity`.
+        If the image cannot be decoded, or takes more memory than allowed.
     """
     with _opened(image) as opened:
         if not allowance.fits(PIXEL_BYTES * opened.width * opened.height):
             raise _TooLargeError
-        made = _of_bytes(opened).convert("RGB")
-        if max(made.size) > SIDE_MOST:
-            notes.large.append(f"{made.width:,} x {made.height:,}")
-            made.thumbnail((SIDE_MOST, SIDE_MOST), Image.Resampling.BOX)
-        allowance.take(3 * made.width * made.height)
-        return np.asarray(made)
+        rgb = _of_bytes(opened).convert("RGB")
+        if max(rgb.size) > MAX_SIDE_PIXELS:
+            notes.reduced_sizes.append(f"{rgb.width:,} x {rgb.height:,}")
+            rgb.thumbnail((MAX_SIDE_PIXELS, MAX_SIDE_PIXELS), Image.Resampling.BOX)
+        allowance.take(3 * rgb.width * rgb.height)
+        return np.asarray(rgb)
 
 
 @contextmanager
 def _opened(image: Path | bytes) -> Iterator[Image.Image]:
-    """Open an image; MaskError for whatever is wrong with it, also in the body."""
+    """Open an image for the body; MaskError for all errors, also in the body."""
     name = image.name if isinstance(image, Path) else "its image"
     try:
-        # Pillow warns of images that it reads all the same, and of those that are too large.
+        # Pillow warns of images that it reads all the same, and of images that are too large.
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             warnings.simplefilter("error", Image.DecompressionBombWarning)
@@ -105,7 +106,7 @@ def _opened(image: Path | bytes) -> Iterator[Image.Image]:
     except InputFileError as error:
         raise MaskError(f"{name} is no image: {error.strerror}") from error
     except Exception as error:
-        # Decoders raise whatever they stumble over: OSError, SyntaxError, struct.error, …
+        # Decoders raise errors of any class: OSError, SyntaxError, struct.error, …
         raise MaskError(f"{name} cannot be decoded") from error
 
 
@@ -117,37 +118,37 @@ def remembered(read: Callable[[K], V]) -> Callable[[K], V]:
     """Cache a function, and its MaskErrors."""
 
     @cache
-    def tried(key: K) -> V | MaskError:
+    def result_or_error(key: K) -> V | MaskError:
         try:
             return read(key)
         except MaskError as error:
             return error
 
-    def once(key: K) -> V:
-        found = tried(key)
-        if isinstance(found, MaskError):
-            raise MaskError(str(found))
-        return found
+    def read_once(key: K) -> V:
+        result = result_or_error(key)
+        if isinstance(result, MaskError):
+            raise MaskError(str(result))
+        return result
 
-    return once
+    return read_once
 
 
 def _of_bytes(image: Image.Image) -> Image.Image:
-    """Image of 8 bits from one of 16, which Pillow would clip."""
+    """Return an image of 8 bits; Pillow would clip an image of 16 bits."""
     if not image.mode.startswith("I;16"):
         return image
     return Image.fromarray((np.asarray(image) >> 8).astype(np.uint8))
 
 
 class Texture:
-    """A mask or an image, and how it goes on beyond its edges, along u and along v.
+    """A mask or an image, and its continuation beyond the edges, along u and along v.
 
-    Materials should share it, since every one takes memory.
+    Materials should share textures, since each texture takes memory.
 
     Raises
     ------
     MaskError
-        If it takes more than allowed.
+        If the texture takes more memory than allowed.
     """
 
     def __init__(
@@ -157,37 +158,42 @@ class Texture:
         self._allowance = allowance
         _take(allowance, image.size)
         for axis, wrap in zip((1, 0), wraps, strict=True):
-            if wrap == "mirror":  # repeats with its mirror image
+            if wrap == "mirror":  # the image and its mirror image repeat
                 _take(allowance, 2 * image.size)
                 image = np.concatenate([image, np.flip(image, axis)], axis)
         self._image = image
 
     def cutout(self, coordinates: AnyArray, corners: Ints) -> Cutout:
-        """Cut it out of triangles, see `on`."""
-        return Cutout(*self.on(coordinates, corners))
+        """Return the texture as the mask of triangles, see `map_to_triangles`."""
+        return Cutout(*self.map_to_triangles(coordinates, corners))
 
     def colours(self, coordinates: AnyArray, corners: Ints) -> Colours:
-        """Colour triangles with it, see `on`."""
-        image, uv = self.on(coordinates, corners)
+        """Return the texture as the colours of triangles, see `map_to_triangles`."""
+        image, uv = self.map_to_triangles(coordinates, corners)
         return Colours((image,), np.zeros(len(uv), np.int32), uv)
 
-    def on(self, coordinates: AnyArray, corners: Ints) -> tuple[AnyArray, Floats32]:
-        """Put it on triangles, as in glTF.
+    def map_to_triangles(self, coordinates: AnyArray, corners: Ints) -> tuple[AnyArray, Floats32]:
+        """Return a repeating image, and texture coordinates (k, 3, 2), as in glTF.
 
-        `coordinates` are (c, 2), and `corners` (k, 3) which of them each triangle has. Returns it
-        such that it repeats, and texture coordinates (k, 3, 2).
+        Parameters
+        ----------
+        coordinates
+            Texture coordinates (c, 2).
+        corners
+            (k, 3): rows of `coordinates` of the corners of each triangle.
 
         Raises
         ------
         MaskError
-            If they are missing, infinite, too large, or too far beyond a mask that does not repeat.
+            If texture coordinates are missing, infinite, too large, or too far beyond an image that
+            does not repeat.
         """
         if not len(coordinates) or not 0 <= corners.min() <= corners.max() < len(coordinates):
             raise MaskError("texture coordinates are missing")
         if not self._allowance.fits(FACE_BYTES * len(corners)):
             raise MaskError("there are too many triangles")
         uv = coordinates[corners].astype(np.float64)
-        if not (np.abs(uv) < UV_MOST / 2).all():  # half, for what rounding adds
+        if not (np.abs(uv) < MAX_UV / 2).all():  # half, for what rounding adds
             raise MaskError("texture coordinates are infinite or too large")
         image = self._image
         for column, wrap in enumerate(self._wraps):
@@ -197,92 +203,104 @@ class Texture:
                 image = self._continued(image, uv[..., column], 1 - column, wrap == "black")
         return image, uv.astype(np.float32)
 
-    def _continued(self, image: AnyArray, places: Floats, axis: int, black: bool) -> AnyArray:
-        """Continue an image as far as `places` (k, 3), which are changed, ask for it.
+    def _continued(self, image: AnyArray, coordinates: Floats, axis: int, black: bool) -> AnyArray:
+        """Continue an image, by its edges or black, up to all coordinates (k, 3).
 
-        By its edges, or black. A hundredth of a texel is the rounding of a program.
+        The coordinates are changed to fit the continued image. They may exceed the image by a
+        hundredth of a texel, which is the rounding of programs.
         """
         size = image.shape[axis]
         slack = 0.01 / size
-        places[(places > -slack) & (places < 0)] = 0
-        places[(places > 1) & (places < 1 + slack)] = 1
-        # Triangles wholly beyond an edge are in its last texels, or the first ones beyond.
-        most = places.max(axis=1)
-        least = places.min(axis=1)
-        places[most <= 0] = 0.5 / size
-        places[least >= 1] = 1 - 0.5 / size
+        coordinates[(coordinates > -slack) & (coordinates < 0)] = 0
+        coordinates[(coordinates > 1) & (coordinates < 1 + slack)] = 1
+        # Triangles wholly beyond an edge are in its last texels, or the first texels beyond.
+        upper = coordinates.max(axis=1)
+        lower = coordinates.min(axis=1)
+        coordinates[upper <= 0] = 0.5 / size
+        coordinates[lower >= 1] = 1 - 0.5 / size
         if black:
-            places[most < 0] = -0.5 / size
-            places[least > 1] = 1 + 0.5 / size
-        before = max(0, int(np.ceil(-places.min() * size)))
-        after = max(0, int(np.ceil((places.max() - 1) * size)))
-        if not before and not after:
+            coordinates[upper < 0] = -0.5 / size
+            coordinates[lower > 1] = 1 + 0.5 / size
+        texels_before = max(0, int(np.ceil(-coordinates.min() * size)))
+        texels_after = max(0, int(np.ceil((coordinates.max() - 1) * size)))
+        if not texels_before and not texels_after:
             return image
-        whole = size + before + after
-        _take(self._allowance, image.size // size * whole)
+        continued_size = size + texels_before + texels_after
+        _take(self._allowance, image.size // size * continued_size)
         widths = [(0, 0)] * image.ndim
-        widths[axis] = before, after
-        places *= size / whole
-        places += before / whole
+        widths[axis] = texels_before, texels_after
+        coordinates *= size / continued_size
+        coordinates += texels_before / continued_size
         return np.pad(image, widths, mode="constant" if black else "edge")
 
 
 def _take(allowance: Allowance, count: int) -> None:
+    """Take bytes of an image from the allowance; MaskError if the image is too large."""
     if not allowance.fits(count):
         raise MaskError("its image would be too large")
     allowance.take(count)
 
 
 class MaskNotes:
-    """What the materials of a file have that is no mask or colour, by their names."""
+    """Notes on masks and colours of a file's materials that are not read as stated."""
 
     def __init__(self) -> None:
-        self.unread: dict[str, str] = {}  # {material: why its triangles are solid}
-        self.grey: dict[str, str] = {}  # {material: why its triangles have no colour}
-        self.glass: dict[str, None] = {}  # in order
-        self.large: list[str] = []  # sizes of images of colours that are made smaller
-        self.gone: list[str] = []  # files of materials that are not there
+        self.mask_errors: dict[str, str] = {}  # {material: why its triangles are solid}
+        self.colour_errors: dict[str, str] = {}  # {material: why its triangles have no colour}
+        self.glass: dict[str, None] = {}  # {transparent material without holes: None}, in order
+        self.reduced_sizes: list[str] = []  # sizes of images of colours that are reduced
+        self.missing_files: list[str] = []  # files of materials that cannot be read
 
-    def instead(self, material: str) -> AbstractContextManager[None]:
-        """Note errors within a `with` block; the triangles can be read all the same."""
-        return _noted(self.unread, material)
+    def without_mask(self, material: str) -> AbstractContextManager[None]:
+        """Note MaskErrors of the body; the triangles are solid then."""
+        return _noted(self.mask_errors, material)
 
     def without_colour(self, material: str) -> AbstractContextManager[None]:
-        """Note errors within a `with` block; the triangles have no colour then."""
-        return _noted(self.grey, material)
+        """Note errors of the body; the triangles have no colour then."""
+        return _noted(self.colour_errors, material)
 
     def lines(self) -> list[str]:
         """Return notes, as clauses that follow the file's name."""
-        out = []
-        if self.gone:
-            out.append(f"names materials in {_some(self.gone)}, which cannot be read: all is solid")
-        for found, what, so in (
-            (self.unread, "masks", "are solid"), (self.grey, "colours", "lack them")
+        notes = []
+        if self.missing_files:
+            files = _listed(self.missing_files)
+            notes.append(f"names materials in {files}, which cannot be read: all is solid")
+        for reasons, kind, consequence in (
+            (self.mask_errors, "masks", "are solid"), (self.colour_errors, "colours", "lack them")
         ):  # fmt: skip
-            if found:
-                shown = _some([f"{name} ({why})" for name, why in found.items()])
-                out.append(f"has {what} that cannot be read, so that these materials {so}: {shown}")
-        if self.large:
-            sizes = _some(self.large)
-            out.append(f"has images of {sizes} pixels, taken at {SIDE_MOST:,} at most on a side")
+            if reasons:
+                shown = _listed([f"{name} ({why})" for name, why in reasons.items()])
+                notes.append(
+                    f"has {kind} that cannot be read, so that these materials {consequence}: "
+                    f"{shown}"
+                )
+        if self.reduced_sizes:
+            sizes = _listed(self.reduced_sizes)
+            notes.append(
+                f"has images of {sizes} pixels, taken at {MAX_SIDE_PIXELS:,} at most on a side"
+            )
         if self.glass:
-            out.append(
-                f"has transparent materials without holes, taken as solid: {_some([*self.glass])}; "
+            names = _listed([*self.glass])
+            notes.append(
+                f"has transparent materials without holes, taken as solid: {names}; "
                 '<materials.transparent="pass"> makes objects glass'
             )
-        return out
+        return notes
 
 
 @contextmanager
-def _noted(unread: dict[str, str], material: str) -> Iterator[None]:
-    """Note errors as what is wrong with a material."""
+def _noted(reasons: dict[str, str], material: str) -> Iterator[None]:
+    """Note errors of the body in `reasons` of materials: the first of each material."""
     try:
         yield
     except MaskError as error:
-        unread.setdefault(material, str(error))
+        reasons.setdefault(material, str(error))
     except Exception:
-        unread.setdefault(material, "it is broken")
+        reasons.setdefault(material, "it is broken")
 
 
-def _some(names: list[str]) -> str:
-    return ", ".join(printable(name) for name in names[:NAMED]) + ", …" * (len(names) > NAMED)
+def _listed(names: list[str]) -> str:
+    """Return the first names in a row, with an ellipsis for the rest."""
+    return ", ".join(printable(name) for name in names[:_MAX_NAMED]) + ", …" * (
+        len(names) > _MAX_NAMED
+    )

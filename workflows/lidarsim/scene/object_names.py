@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 from typing import Literal
 
 from ..base.words import plural
-from .actors import one_mesh
+from .actors import join_meshes
 from .scene_instances import SceneInstance
 from .scene_mesh import SceneMesh
 
@@ -15,19 +15,19 @@ SameNames = Literal["number", "join"]
 _MAX_SHOWN = 3
 
 
-def told_apart(
+def resolve_same_names(
     objects: Sequence[SceneMesh | SceneInstance],
     same_names: SameNames,
     tell: Callable[[str], None],
 ) -> list[SceneMesh | SceneInstance]:
-    """Return the objects of scene files, as a scene takes them.
+    """Return the objects of scene files, joined by name if `same_names` is "join".
 
     Parameters
     ----------
     objects
-        In world coordinates, in the order of the files.
+        Objects in world coordinates, in the order of the files.
     same_names
-        With "join", all objects of a name become one object, at the place of the first. With
+        With "join", all objects of a name become one object, in the order of the first. With
         "number", the objects stay, and a scene numbers their names: Wall, Wall.2.
     tell
         Called with a line on names that a scene numbers.
@@ -39,12 +39,13 @@ def told_apart(
     """
     if same_names == "join":
         groups: dict[str, list[SceneMesh | SceneInstance]] = {}
-        for one in objects:
-            groups.setdefault(one.name, []).append(one)
+        for item in objects:
+            groups.setdefault(item.name, []).append(item)
         return [
-            group[0] if len(group) == 1 else one_mesh(name, group) for name, group in groups.items()
+            group[0] if len(group) == 1 else join_meshes(name, group)
+            for name, group in groups.items()
         ]
-    names = [one.name for one in objects]
+    names = [item.name for item in objects]
     pairs = zip(names, unique_names(names), strict=True)
     if numbered := [unique for name, unique in pairs if unique != name]:
         shown = ", ".join(numbered[:_MAX_SHOWN]) + ", …" * (len(numbered) > _MAX_SHOWN)
@@ -57,22 +58,22 @@ def told_apart(
 
 
 def unique_names(names: Sequence[str]) -> tuple[str, ...]:
-    """Make names unique by numbering repeated ones: Shelf, then Shelf.2.
+    """Return unique names, with a number for repeated names: Shelf, then Shelf.2.
 
     Examples
     --------
     >>> unique_names(["Shelf", "Shelf", "Shelf.2", "Shelf"])
     ('Shelf', 'Shelf.3', 'Shelf.2', 'Shelf.4')
     """
-    given = set(names)
-    taken: set[str] = set()
-    numbers: dict[str, int] = {}  # {name: the last number given to it}
-    out = []
+    all_names = set(names)
+    used: set[str] = set()
+    numbers: dict[str, int] = {}  # {name: last number used for the name}
+    numbered = []
     for name in names:
         unique = name
-        while unique in taken or (unique != name and unique in given):
+        while unique in used or (unique != name and unique in all_names):
             numbers[name] = numbers.get(name, 1) + 1
             unique = f"{name}.{numbers[name]}"
-        taken.add(unique)
-        out.append(unique)
-    return tuple(out)
+        used.add(unique)
+        numbered.append(unique)
+    return tuple(numbered)

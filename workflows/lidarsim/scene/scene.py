@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from copy import copy
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
+from itertools import chain
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
-from ..base.arrays import Bools, Floats, Ints32
+from ..base.arrays import Bools, Floats, Indices, Ints32
 from ..base.errors import LidarError
 from ..base.validation import as_array, checked, checked_fields, shown
 from ..base.vectors import hypot
@@ -20,18 +22,18 @@ from ..sensor import Pose, Track
 from ..sensor.materials import SurfaceKinds
 from . import colours as coloured
 from .actors import Actor
-from .colours import Colours, within
+from .colours import Colours, are_indices
 from .face_materials import ObjectMaterials
 from .files.meshfile import Objects, OpacityMode, load_objects, warn
 from .files.scene_graph import Window
-from .object_names import SameNames, told_apart, unique_names
+from .object_names import SameNames, resolve_same_names, unique_names
 from .scene_instances import Instances, MeshPart, SceneInstance, parts_of
 from .scene_mesh import Cutout, SceneMesh, compacted, points_array, stacked
 from .shapes import seed_objects
 from .transform import Transform
 
 # Single precision, which ray casters use, resolves a millimetre up to this distance.
-FAR_FROM_ZERO_M = 10_000.0
+MAX_LOCAL_COORDINATE_M = 10_000.0
 
 _log = logging.getLogger(__name__)
 
@@ -39,11 +41,11 @@ _log = logging.getLogger(__name__)
 @dataclass(frozen=True, eq=False)
 @checked_fields
 class Scene:
-    """Triangles to scan, and the object of each.
+    """Triangles to scan, and the object of each triangle.
 
     Coordinates are local: world = `vertices` + `origin`. The origin is zero unless the scene
-    lies farther than 10 km from zero (georeferenced data); then it is a point of whole metres
-    in the scene's middle, so that single precision is enough for the local coordinates.
+    lies farther than 10 km from zero (georeferenced data); then the origin is a point of whole
+    metres in the scene's middle, so that single precision is enough for the local coordinates.
 
     Parameters
     ----------
@@ -58,14 +60,14 @@ class Scene:
     origin
         float64 (3,), whole metres.
     actors
-        Moving objects, numbered after the others.
+        Moving objects, numbered after the static objects.
     instances
-        Triangles that are kept once and are in several places, or have a mask; they are numbered
-        after `faces`, instance by instance. Those of actors follow.
+        Triangles that are stored once and are at several positions, or have a mask; they are
+        numbered after `faces`, instance by instance. The triangles of actors follow.
     colours
-        Of `faces`; None if they have none.
+        Colours of `faces`, or None.
     materials
-        Names of the materials of the objects; None if they have none.
+        Names of the materials of the objects, or None.
 
     Raises
     ------
@@ -95,16 +97,16 @@ class Scene:
         (origin,) = points_array("the scene's origin", [as_array("origin", self.origin)])
         if faces.ndim != 2 or faces.shape[1:] != (3,) or not (len(faces) or self.instances):
             raise LidarError(f"A scene needs triangles, faces of (f, 3), not {faces.shape}.")
-        if not within(faces, len(vertices)):
+        if not are_indices(faces, len(vertices)):
             raise LidarError(f"Faces must name the {len(vertices)} vertices, from 0 up.")
-        if owners.shape != faces.shape[:1] or not within(owners, len(self.names)):
+        if owners.shape != faces.shape[:1] or not are_indices(owners, len(self.names)):
             raise LidarError(
                 f"face_object must give one of the {len(self.names)} objects, from 0 up, for "
                 f"each of the {len(faces)} faces."
             )
         arrays = {"vertices": vertices, "faces": faces, "face_object": owners, "origin": origin}
         for name, array in arrays.items():
-            if array.flags.writeable:  # else it is another scene's, and known by its identity
+            if array.flags.writeable:  # else another scene shares the array, by its identity
                 array = array.view()
                 array.flags.writeable = False
             object.__setattr__(self, name, array)
@@ -148,11 +150,11 @@ class Scene:
         path
             The file; its objects keep their names.
         unit
-            Length unit of the file: um, mm, cm, dm, m, km, in, ft, yd or mi. None takes what
-            the file states (.dae, .3mf, .usd, .glb and .gltf), else metres.
+            Length unit of the file: um, mm, cm, dm, m, km, in, ft, yd or mi. None takes the unit
+            that the file states (.dae, .3mf, .usd, .glb and .gltf), else metres.
         up_axis
-            Axis of the file that points up: x, y or z. None takes what the file (.dae, .usd) or
-            its format states (y of .glb and .gltf), else z.
+            Axis of the file that points up: x, y or z. None takes the axis that the file (.dae,
+            .usd) or its format states (y of .glb and .gltf), else z.
         transform
             Placement of the mesh in the world, in metres, after unit and up axis: a
             `lidarsim.scene.transform.Transform`.
@@ -166,24 +168,24 @@ class Scene:
             Whether faces keep the names of their materials (.glb, .gltf, .obj, .dae, .3mf, .usd,
             CityJSON), by which `Material` may choose them.
         step_m, window, epsg
-            Of a raster: see `lidarsim.scene.files.meshfile.load_objects`.
+            Options of a raster: see `lidarsim.scene.files.meshfile.load_objects`.
         assets
-            A folder: files that the file names are read from here and below, and from its own
-            folder and below.
+            A folder: further files that the scene file names are read from this folder and from
+            the folder of the scene file, and from the folders below.
         same_names
-            With "number", objects that have the name of another one get a number: Wall, Wall.2.
-            With "join", all objects of a name are one object.
+            With "number", objects of the same name get a number: Wall, Wall.2. With "join", all
+            objects of a name are one object.
 
         Returns
         -------
-        Objects of .usd that move are its actors, if others stand.
+        The scene. Objects of .usd that move are actors of the scene, if it has static objects.
 
         Raises
         ------
         LidarError
             If the file cannot be read completely, or has no triangles.
         """
-        found = load_objects(
+        objects = load_objects(
             path,
             unit=unit,
             up_axis=up_axis,
@@ -196,186 +198,146 @@ class Scene:
             epsg=epsg,
             assets=assets,
         )
-        standing = told_apart(found.standing, same_names, lambda note: warn(f"{path}: {note}"))
-        return cls.of_objects(found._replace(standing=tuple(standing)))
+        static = resolve_same_names(
+            objects.static, same_names, lambda note: warn(f"{path}: {note}")
+        )
+        return cls.from_objects(objects._replace(static=tuple(static)))
 
     @classmethod
-    def of_objects(cls, objects: Objects, tell: Callable[[str], None] = _log.warning) -> Scene:
-        """Make a scene of the objects of mesh files; `tell` is called if none stands."""
-        if not objects.standing:
+    def from_objects(cls, objects: Objects, tell: Callable[[str], None] = _log.warning) -> Scene:
+        """Make a scene of the objects of mesh files.
+
+        If no object is static, the actors become static objects at their first pose, and `tell` is
+        called with a line on the loss.
+        """
+        if not objects.static:
             lost = "nothing stands in the scene, and without that nothing moves: "
-            return cls.from_meshes(objects.still(lambda line: tell(lost + line)))
-        scene = cls.from_meshes(objects.standing)
-        local = []
-        for actor in objects.moving:
+            return cls.from_meshes(objects.at_start(lambda line: tell(lost + line)))
+        scene = cls.from_meshes(objects.static)
+        actors = []
+        for actor in objects.actors:
             track = actor.trajectory
             assert isinstance(track, Track)
             track = replace(track, positions=track.positions - scene.origin)
-            local.append(replace(actor, trajectory=track))
-        return scene.with_actors(local) if local else scene
+            actors.append(replace(actor, trajectory=track))
+        return scene.with_actors(actors) if actors else scene
 
     @classmethod
     @checked
     def from_meshes(cls, meshes: Iterable[SceneMesh | SceneInstance]) -> Scene:
-        """Make a scene of objects, each mesh one object.
+        """Make a scene of meshes; each mesh becomes an object.
 
         Parameters
         ----------
         meshes
-            In world coordinates, or instances of meshes, whose triangles are kept once. Duplicate
-            names are numbered: Shelf, Shelf.2.
+            Meshes in world coordinates, or instances of meshes, whose triangles are stored once.
+            Duplicate names are numbered: Shelf, Shelf.2.
 
         Raises
         ------
         LidarError
-            If there are none, or more vertices or triangles than 32 bits can count.
+            If there are no meshes, or more vertices or triangles than 32 bits can count.
         """
         objects = list(meshes)
-        for one in objects:
-            if not isinstance(one, (SceneMesh, SceneInstance)):
-                raise LidarError(
-                    f"meshes holds {shown(one)}; each must be a SceneMesh(name, vertices, faces), "
-                    "or a SceneInstance of one."
-                )
-        if not objects:
-            raise LidarError("A scene needs at least one object with triangles.")
-        plain: list[tuple[int, SceneMesh]] = []  # (object, mesh without masks and voxels)
-        shared: list[tuple[int, int, Floats]] = []  # (object, part, matrix)
-        parts: list[MeshPart] = []
-        known: dict[SceneMesh, list[int]] = {}  # {mesh of instances: its parts}
-        for number, one in enumerate(objects):
-            if isinstance(one, SceneMesh) and not one.cutouts and one.voxels is None:
-                plain.append((number, one))
-                continue
-            mesh, matrix = (
-                (one, np.eye(4)) if isinstance(one, SceneMesh) else (one.mesh, one.matrix)
-            )
-            if mesh not in known:
-                made = list(parts_of(mesh))
-                known[mesh] = list(range(len(parts), len(parts) + len(made)))
-                parts += made
-            for part in known[mesh]:
-                if isinstance(one, SceneMesh) and parts[part].mask is None and one.voxels is None:
-                    solid = parts[part]
-                    corners = solid.faces.astype(np.int64)
-                    mesh = SceneMesh(
-                        one.name,
-                        solid.vertices,
-                        corners,
-                        colours=solid.colours,
-                        materials=solid.materials,
-                    )
-                    plain.append((number, mesh))
-                else:
-                    shared.append((number, part, matrix))
-        sizes = [len(mesh.faces) for _, mesh in plain]
-        points = sum(len(mesh.vertices) for _, mesh in plain)
-        most = np.iinfo(np.int32).max
-        triangles = sum(sizes) + sum(len(parts[part].faces) for _, part, _ in shared)
-        if max(points, triangles) > most:
-            raise LidarError(
-                f"The scene has {points} vertices and {triangles} triangles; at most {most} of "
-                "each can be numbered."
-            )
+        _check_objects(objects)
+        split = _split_by_kind(objects)
+        _check_counts(split)
+        sizes = [len(mesh.faces) for mesh in split.meshes]
         vertices = np.zeros((0, 3))
         faces = np.zeros((0, 3), np.int64)
-        if plain:
-            vertices, faces = stacked((mesh.vertices, mesh.faces) for _, mesh in plain)
-        instances = None
-        ends = [vertices]
-        if shared:
-            owners, used, matrices = zip(*shared, strict=True)
-            transforms = np.array(matrices)[:, :3]
-            instances = Instances(
-                tuple(parts), np.array(used, np.intp), transforms, np.array(owners, np.int32)
-            )
-            ends.append(instances.bounds.reshape(-1, 3))
-        origin = local_origin(np.concatenate(ends))
+        if split.meshes:
+            vertices, faces = stacked((mesh.vertices, mesh.faces) for mesh in split.meshes)
+        instances = split.instances()
+        corners = [vertices]
+        if instances is not None:
+            corners.append(instances.bounds.reshape(-1, 3))
+        origin = local_origin(np.concatenate(corners))
         if instances is not None and origin.any():
-            transforms = transforms - np.pad(origin[:, None], ((0, 0), (3, 0)))
-            bounds = instances.bounds - origin
-            instances = replace(instances, transforms=transforms)
-            vars(instances)["bounds"] = bounds  # which take time
+            instances = instances.relative_to(origin)
         return cls(
             vertices=vertices - origin,
             faces=faces.astype(np.int32),
-            face_object=np.repeat(np.array([n for n, _ in plain], np.int32), sizes),
-            names=unique_names([one.name for one in objects]),
+            face_object=np.repeat(np.array(split.mesh_owners, np.int32), sizes),
+            names=unique_names([item.name for item in objects]),
             origin=origin,
             instances=instances,
-            colours=coloured.joined([mesh.colours for _, mesh in plain], sizes),
-            materials=ObjectMaterials.of(
-                [(one if isinstance(one, SceneMesh) else one.mesh).materials for one in objects],
-                [mesh.materials for _, mesh in plain],
+            colours=coloured.join_colours([mesh.colours for mesh in split.meshes], sizes),
+            materials=ObjectMaterials.from_meshes(
+                [
+                    (item if isinstance(item, SceneMesh) else item.mesh).materials
+                    for item in objects
+                ],
+                [mesh.materials for mesh in split.meshes],
                 sizes,
             ),
         )
 
     def with_actors(self, actors: Iterable[Actor]) -> Scene:
-        """Return the same scene with other actors; the triangles are not copied.
+        """Return a scene of the same triangles, which are not copied, with new actors.
 
         Raises
         ------
         LidarError
-            If something is no actor.
+            If `actors` holds anything but actors.
         """
-        found = tuple(actors)
-        for actor in found:
+        actors = tuple(actors)
+        for actor in actors:
             if not isinstance(actor, Actor):
                 raise LidarError(
                     f"actors holds {shown(actor)}; each must be an Actor(mesh, trajectory)."
                 )
         scene = copy(self)
-        object.__setattr__(scene, "actors", found)
+        object.__setattr__(scene, "actors", actors)
         return scene
 
     def moved(self, owner: int, pose: Pose) -> Scene:
-        """Return the same scene with the instances of an object at a pose of their mesh's axes.
+        """Return the same scene with the instances of the object `owner` at another pose.
 
-        They keep their scale; the pose is in local coordinates.
+        The pose is that of the mesh's frame in local coordinates. The instances keep their scale.
         """
         assert self.instances is not None
         scene = copy(self)
-        for made_before in ("bounds", "object_bounds", "footprints"):
-            vars(scene).pop(made_before, None)
+        for cached in ("bounds", "object_bounds", "footprints"):
+            vars(scene).pop(cached, None)
         moved = self.instances.moved(owner, np.array(pose.position), pose.turn)
         object.__setattr__(scene, "instances", moved)
         return scene
 
     @property
     def all_names(self) -> tuple[str, ...]:
-        """Names of all objects, actors after the others."""
+        """Names of all objects; actors follow the static objects."""
         if not self.actors:
             return self.names
         return unique_names((*self.names, *(actor.name for actor in self.actors)))
 
     @property
     def surface_kinds(self) -> SurfaceKinds:
-        """Kinds of surfaces: objects, actors after the others, by the materials of their faces."""
+        """Kinds of surfaces: a kind for each material of each object, actors last."""
         names = self.all_names
-        of_objects = [()] * len(self.names) if self.materials is None else self.materials.names
-        of_actors = [
+        static = [()] * len(self.names) if self.materials is None else self.materials.names
+        moving = [
             () if actor.mesh.materials is None else actor.mesh.materials.names
             for actor in self.actors
         ]
-        materials = [of_one or ("",) for of_one in (*of_objects, *of_actors)]
-        if all(len(of_one) == 1 for of_one in materials):
+        materials = [object_materials or ("",) for object_materials in (*static, *moving)]
+        counts = [len(object_materials) for object_materials in materials]
+        if max(counts, default=1) == 1:
             return SurfaceKinds(names, np.arange(len(names)), [name for (name,) in materials])
-        owners = np.repeat(np.arange(len(names)), [len(of_one) for of_one in materials])
-        return SurfaceKinds(names, owners, [name for of_one in materials for name in of_one])
+        owners = np.repeat(np.arange(len(names)), counts)
+        return SurfaceKinds(names, owners, list(chain.from_iterable(materials)))
 
     @property
     def has_mixed_objects(self) -> bool:
-        """Whether an object has faces of several materials."""
-        of_objects = () if self.materials is None else self.materials.names
-        of_actors = (actor.mesh.materials for actor in self.actors)
-        return any(len(names) > 1 for names in of_objects) or any(
-            materials is not None and len(materials.names) > 1 for materials in of_actors
+        """True if an object has faces of several materials."""
+        static = () if self.materials is None else self.materials.names
+        moving = (actor.mesh.materials for actor in self.actors)
+        return any(len(names) > 1 for names in static) or any(
+            materials is not None and len(materials.names) > 1 for materials in moving
         )
 
     @property
     def material_names(self) -> tuple[str, ...]:
-        """Names of all materials of faces, each once: what the column `material` counts."""
+        """Distinct names of all materials of faces; the column `material` numbers these names."""
         return tuple(name for name in dict.fromkeys(self.surface_kinds.material) if name)
 
     @property
@@ -384,61 +346,62 @@ class Scene:
         owners = set()
         if (shared := self.instances) is not None:
             owners = set(shared.owners(lambda part: part.mask is not None).tolist())
-        own = len(self.names)
-        owners |= {own + i for i, actor in enumerate(self.actors) if actor.mesh.cutouts}
+        first_actor = len(self.names)
+        owners |= {first_actor + i for i, actor in enumerate(self.actors) if actor.mesh.cutouts}
         return tuple(name for i, name in enumerate(self.all_names) if i in owners)
 
     @property
     def coloured(self) -> list[Colours]:
-        """Colours of all that has some: the faces, parts of instances, actors."""
+        """Colours of the faces, of the parts of instances and of the actors, without None."""
         parts = self.instances.parts if self.instances else ()
-        found = [self.colours, *(part.colours for part in parts)]
-        found += [actor.mesh.colours for actor in self.actors]
-        return [colours for colours in found if colours is not None]
+        colours = [self.colours, *(part.colours for part in parts)]
+        colours += [actor.mesh.colours for actor in self.actors]
+        return [mesh_colours for mesh_colours in colours if mesh_colours is not None]
 
     @property
     def has_colours(self) -> Bools:
-        """Whether each object, actors after the others, has a colour: (objects,)."""
-        found = np.zeros(len(self.all_names), np.bool_)
-        if (own := self.colours) is not None:
-            grey = np.array([image is coloured.GREY for image in own.images])
-            found[self.face_object[~grey[own.image]]] = True
+        """True for each object with a colour, actors after the static objects: (objects,)."""
+        has_colour = np.zeros(len(self.all_names), np.bool_)
+        if (colours := self.colours) is not None:
+            grey = np.array([image is coloured.GREY for image in colours.images])
+            has_colour[self.face_object[~grey[colours.image]]] = True
         if (shared := self.instances) is not None:
-            found[shared.owners(lambda part: part.colours is not None)] = True
-        found[len(self.names) :] = [actor.mesh.colours is not None for actor in self.actors]
-        return found
+            has_colour[shared.owners(lambda part: part.colours is not None)] = True
+        has_colour[len(self.names) :] = [actor.mesh.colours is not None for actor in self.actors]
+        return has_colour
 
     @property
     def has_voxels(self) -> Bools:
-        """Whether each object, actors after the others, has voxels: (objects,)."""
-        found = np.zeros(len(self.names) + len(self.actors), np.bool_)
+        """True for each object with voxels, actors after the static objects: (objects,)."""
+        has_voxels = np.zeros(len(self.names) + len(self.actors), np.bool_)
         if (shared := self.instances) is not None:
-            found[shared.owners(lambda part: part.voxels is not None)] = True
-        return found
+            has_voxels[shared.owners(lambda part: part.voxels is not None)] = True
+        return has_voxels
 
     @property
     def triangles(self) -> int:
-        """Number of triangles, including those of instances and actors."""
+        """Number of triangles, including triangles of instances and actors."""
         shared = self.instances.triangles if self.instances else 0
         return len(self.faces) + shared + sum(len(actor.mesh.faces) for actor in self.actors)
 
     @property
     def kept_triangles(self) -> int:
-        """Number of triangles in memory, those that instances share once; without actors."""
+        """Number of triangles in memory, without actors; instances count their part once."""
         parts = self.instances.parts if self.instances else ()
         return len(self.faces) + sum(len(part.faces) for part in parts)
 
     @property
     def counters(self) -> int:
-        """Length of a count of hits: of each triangle, and of each instance as a whole.
+        """Number of hit counters: a counter for each triangle and for each instance.
 
-        Those of instances follow `faces`; those of the actors' triangles come last.
+        The counters of instances follow the counters of `faces`; the counters of the actors'
+        triangles come last.
         """
         shared = len(self.instances) if self.instances else 0
         return len(self.faces) + shared + sum(len(actor.mesh.faces) for actor in self.actors)
 
     def solid(self, time_ns: float) -> Scene:
-        """All triangles at a time, those of actors after the others; there are no instances.
+        """Return a scene of `faces` and the actors' triangles at a time, without instances.
 
         Parameters
         ----------
@@ -459,80 +422,94 @@ class Scene:
             np.append(self.face_object, owners),
             self.all_names,
             self.origin,
-            colours=coloured.joined([self.colours, *(mesh.colours for mesh in meshes)], sizes),
+            colours=coloured.join_colours(
+                [self.colours, *(mesh.colours for mesh in meshes)], sizes
+            ),
         )
 
     def meshes(self) -> tuple[SceneMesh | SceneInstance, ...]:
         """Return the objects that have triangles, in world coordinates and in order.
 
-        Of an object with masks, each part is one.
+        An object with masks gives a mesh or instance for each part.
         """
+        by_object: list[list[SceneMesh | SceneInstance]] = [[] for _ in self.names]
         order = np.argsort(self.face_object, kind="stable")
-        ends = np.cumsum(np.bincount(self.face_object, minlength=len(self.names)))[:-1]
-        out: list[list[SceneMesh | SceneInstance]] = [[] for _ in self.names]
-        for name, rows, found in zip(self.names, np.split(order, ends), out, strict=True):
+        stops = np.cumsum(np.bincount(self.face_object, minlength=len(self.names)))[:-1]
+        for owner, rows in enumerate(np.split(order, stops)):
             if len(rows):
-                points, faces = compacted(self.vertices, self.faces[rows])
-                own = self.colours and self.colours.take(rows)
-                owner = int(self.face_object[rows[0]])
-                named = None if self.materials is None else self.materials.of_object(owner, rows)
-                mesh = SceneMesh(name, points + self.origin, faces, colours=own, materials=named)
-                found.append(mesh)
+                by_object[owner].append(self._mesh_of_faces(owner, rows))
         if (shared := self.instances) is not None:
             meshes = [
-                SceneMesh(
-                    self.names[shared.owner[np.argmax(shared.part == number)]],
-                    part.vertices,
-                    part.faces.astype(np.int64),
-                    () if part.mask is None or part.uv is None else (Cutout(part.mask, part.uv),),
-                    part.colours,
-                    part.voxels,
-                    materials=part.materials,
-                )
-                for number, part in enumerate(shared.parts)
+                self._mesh_of_shared_part(shared, index) for index in range(len(shared.parts))
             ]
-            for number, matrix, owner in zip(
+            for index, matrix, owner in zip(
                 shared.part, shared.transforms, shared.owner, strict=True
             ):
-                placed = Transform(matrix[:, :3], matrix[:, 3] + self.origin)
-                out[owner].append(SceneInstance(meshes[number], placed, self.names[owner]))
-        return tuple(one for found in out for one in found)
+                transform = Transform(matrix[:, :3], matrix[:, 3] + self.origin)
+                instance = SceneInstance(meshes[index], transform, self.names[owner])
+                by_object[owner].append(instance)
+        return tuple(item for items in by_object for item in items)
+
+    def _mesh_of_faces(self, owner: int, rows: Indices) -> SceneMesh:
+        """Return the faces (k,) of an object as a mesh in world coordinates."""
+        points, faces = compacted(self.vertices, self.faces[rows])
+        return SceneMesh(
+            self.names[owner],
+            points + self.origin,
+            faces,
+            colours=self.colours and self.colours.take(rows),
+            materials=None if self.materials is None else self.materials.of_object(owner, rows),
+        )
+
+    def _mesh_of_shared_part(self, shared: Instances, index: int) -> SceneMesh:
+        """Return a part of instances as a mesh, named by the first object that has the part."""
+        part = shared.parts[index]
+        cutouts = () if part.mask is None or part.uv is None else (Cutout(part.mask, part.uv),)
+        return SceneMesh(
+            self.names[shared.owner[np.argmax(shared.part == index)]],
+            part.vertices,
+            part.faces.astype(np.int64),
+            cutouts,
+            part.colours,
+            part.voxels,
+            materials=part.materials,
+        )
 
     @cached_property
     def bounds(self) -> Floats:
-        """Lowest and highest corner of the triangles, local coordinates: (2, 3)."""
-        ends = self._own_bounds
+        """Lowest and highest corner of the triangles, local coordinates, metres: (2, 3)."""
+        corners = self._face_bounds
         if self.instances:
-            ends = np.concatenate([ends, self.instances.bounds.reshape(-1, 3)])
-        return np.stack([ends.min(axis=0), ends.max(axis=0)])
+            corners = np.concatenate([corners, self.instances.bounds.reshape(-1, 3)])
+        return np.stack([corners.min(axis=0), corners.max(axis=0)])
 
     @cached_property
-    def _own_bounds(self) -> Floats:
-        """Bounds of `faces` alone: (2, 3), or (0, 3) if there are none."""
-        there = np.zeros(len(self.vertices), np.bool_)
-        there[self.faces] = True
-        used = self.vertices[there]
+    def _face_bounds(self) -> Floats:
+        """Lowest and highest corner of `faces` alone: (2, 3), or (0, 3) without faces."""
+        is_used = np.zeros(len(self.vertices), np.bool_)
+        is_used[self.faces] = True
+        used = self.vertices[is_used]
         return np.stack([used.min(axis=0), used.max(axis=0)]) if len(used) else used
 
     @cached_property
     def object_bounds(self) -> Floats:
-        """Lowest and highest corner of each object, local coordinates: (objects, 2, 3).
+        """Lowest and highest corner of each object, local coordinates, metres: (objects, 2, 3).
 
         An object without triangles has (+inf, -inf).
         """
         corners = self.vertices[self.faces]
-        low = np.full((len(self.names), 3), np.inf)
-        high = np.full((len(self.names), 3), -np.inf)
-        np.minimum.at(low, self.face_object, corners.min(axis=1))
-        np.maximum.at(high, self.face_object, corners.max(axis=1))
+        lower = np.full((len(self.names), 3), np.inf)
+        upper = np.full((len(self.names), 3), -np.inf)
+        np.minimum.at(lower, self.face_object, corners.min(axis=1))
+        np.maximum.at(upper, self.face_object, corners.max(axis=1))
         if (shared := self.instances) is not None:
-            np.minimum.at(low, shared.owner, shared.bounds[:, 0])
-            np.maximum.at(high, shared.owner, shared.bounds[:, 1])
-        return np.stack([low, high], axis=1)
+            np.minimum.at(lower, shared.owner, shared.bounds[:, 0])
+            np.maximum.at(upper, shared.owner, shared.bounds[:, 1])
+        return np.stack([lower, upper], axis=1)
 
     @cached_property
     def footprints(self) -> Floats:
-        """Circle around each object seen from above, local: (objects, 3) as x, y, radius.
+        """Circle around each object seen from above: x, y, radius, local, metres: (objects, 3).
 
         The circle is centred on the object's bounding rectangle and reaches its farthest
         vertex: exact for discs and rectangles, at most 1.42 times too wide for other outlines.
@@ -548,12 +525,115 @@ class Scene:
 
 
 def local_origin(vertices: Floats) -> Floats:
-    """Choose the origin for world coordinates (v, 3): zero, or whole metres in their middle.
+    """Return the origin for world coordinates (v, 3): zero, or whole metres in their middle.
 
-    Whole metres are exact in double precision, so that subtracting and adding them again gives the
-    same coordinates.
+    Whole metres are exact in double precision, so that subtracting and adding the origin again
+    gives the same coordinates.
     """
     middle = (vertices.min(axis=0) + vertices.max(axis=0)) / 2
-    if np.abs(middle).max() <= FAR_FROM_ZERO_M:
+    if np.abs(middle).max() <= MAX_LOCAL_COORDINATE_M:
         return np.zeros(3)
     return np.round(middle)
+
+
+class _PlacedPart(NamedTuple):
+    """A mesh part placed in a scene."""
+
+    owner: int  # index of the object
+    part: int  # index of the part
+    matrix: Floats  # (4, 4), from the part's coordinates to the world
+
+
+@dataclass
+class _SplitObjects:
+    """Objects of a scene: meshes whose triangles are copied, and parts that instances share."""
+
+    meshes: list[SceneMesh] = field(default_factory=list)  # without masks and voxels
+    mesh_owners: list[int] = field(default_factory=list)  # index of each mesh's object
+    parts: list[MeshPart] = field(default_factory=list)
+    placed_parts: list[_PlacedPart] = field(default_factory=list)
+
+    def add_mesh(self, owner: int, mesh: SceneMesh) -> None:
+        """Add a mesh whose triangles are copied into the scene."""
+        self.meshes.append(mesh)
+        self.mesh_owners.append(owner)
+
+    def instances(self) -> Instances | None:
+        """Return the placed parts in world coordinates, or None if there are no placed parts."""
+        if not self.placed_parts:
+            return None
+        owners, parts, matrices = zip(*self.placed_parts, strict=True)
+        return Instances(
+            tuple(self.parts),
+            np.array(parts, np.intp),
+            np.array(matrices)[:, :3],
+            np.array(owners, np.int32),
+        )
+
+
+def _check_objects(objects: Sequence[object]) -> None:
+    """Check that there are objects, each a mesh or an instance; LidarError if not."""
+    for item in objects:
+        if not isinstance(item, (SceneMesh, SceneInstance)):
+            raise LidarError(
+                f"meshes holds {shown(item)}; each must be a SceneMesh(name, vertices, faces), "
+                "or a SceneInstance of one."
+            )
+    if not objects:
+        raise LidarError("A scene needs at least one object with triangles.")
+
+
+def _split_by_kind(objects: Sequence[SceneMesh | SceneInstance]) -> _SplitObjects:
+    """Split objects into meshes to copy, and parts of meshes to place as instances.
+
+    Meshes with masks or voxels are divided into parts, as instances are. A part without a mask of
+    a mesh that is no instance is copied.
+    """
+    split = _SplitObjects()
+    part_indices: dict[SceneMesh, range] = {}
+    for owner, item in enumerate(objects):
+        single = isinstance(item, SceneMesh)
+        if isinstance(item, SceneMesh):
+            if not item.cutouts and item.voxels is None:
+                split.add_mesh(owner, item)
+                continue
+            mesh = item
+            matrix = np.eye(4)
+        else:
+            mesh = item.mesh
+            matrix = item.matrix
+        if mesh not in part_indices:
+            first = len(split.parts)
+            split.parts += parts_of(mesh)
+            part_indices[mesh] = range(first, len(split.parts))
+        for index in part_indices[mesh]:
+            part = split.parts[index]
+            if single and part.mask is None and part.voxels is None:
+                split.add_mesh(owner, _mesh_of_part(item.name, part))
+            else:
+                split.placed_parts.append(_PlacedPart(owner, index, matrix))
+    return split
+
+
+def _mesh_of_part(name: str, part: MeshPart) -> SceneMesh:
+    """Return a part without a mask as a mesh."""
+    return SceneMesh(
+        name,
+        part.vertices,
+        part.faces.astype(np.int64),
+        colours=part.colours,
+        materials=part.materials,
+    )
+
+
+def _check_counts(split: _SplitObjects) -> None:
+    """Check that 32 bits can number the vertices and triangles of objects; LidarError if not."""
+    vertices = sum(len(mesh.vertices) for mesh in split.meshes)
+    triangles = sum(len(mesh.faces) for mesh in split.meshes)
+    triangles += sum(len(split.parts[placed.part].faces) for placed in split.placed_parts)
+    max_count = np.iinfo(np.int32).max
+    if max(vertices, triangles) > max_count:
+        raise LidarError(
+            f"The scene has {vertices} vertices and {triangles} triangles; at most {max_count} of "
+            "each can be numbered."
+        )

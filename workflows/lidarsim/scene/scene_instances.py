@@ -1,10 +1,10 @@
-"""Meshes in many places, each kept once."""
+"""Meshes at many positions, each stored once."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from copy import copy
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import NamedTuple
 
@@ -22,32 +22,32 @@ from .face_materials import FaceMaterials
 from .scene_mesh import Cutout, SceneMesh, Voxels, compacted
 from .transform import Transform, affine
 
-# Nothing on Earth is farther from the origin of its map; see also `sections.Coordinate`.
-FARTHEST_M = 1e8
-_ROUNDS = 64  # of Newton's method at most
+# No point on Earth is farther from the origin of its map; see also `sections.Coordinate`.
+MAX_COORDINATE_M = 1e8
+_MAX_ITERATIONS = 64  # of Newton's method at most
 BLOCK_POINTS = 1 << 15  # points that are placed at a time, to fit a cache
 
 
 @dataclass(frozen=True, eq=False)
 @checked_fields
 class SceneInstance:
-    """A mesh in a place; any number of instances share one.
+    """A mesh placed in the world; any number of instances share a mesh.
 
     Parameters
     ----------
     mesh
-        In its own axes.
+        The mesh, in its own frame.
     transform
-        A pose of the mesh's axes in world coordinates. Or (4, 4), takes the mesh's coordinates to
-        the world's, metres: it may turn, move, mirror and scale, also unevenly. Or a
-        `lidarsim.scene.transform.Transform`.
+        Pose of the mesh's frame in world coordinates. Or a matrix (4, 4) from the mesh's
+        coordinates to the world's, metres: it may rotate, move, mirror and scale, also unevenly.
+        Or a `lidarsim.scene.transform.Transform`.
     name
-        Of the object; by default the mesh's.
+        Name of the object; by default the name of the mesh.
 
     Raises
     ------
     LidarError
-        If the transform is not that of a place, or flattens the mesh.
+        If the transform is not affine or finite, or flattens the mesh.
     """
 
     mesh: SceneMesh
@@ -55,76 +55,84 @@ class SceneInstance:
     name: str = ""
 
     def __post_init__(self) -> None:
-        given = self.transform
-        if isinstance(given, Pose):
-            given = Transform(given.turn, np.array(given.position))
-        placed = given if isinstance(given, Transform) else Transform.from_matrix(given)
-        check_near(placed.offset)
-        object.__setattr__(self, "transform", affine(placed.linear, placed.offset))
+        transform = self.transform
+        if isinstance(transform, Pose):
+            transform = Transform(transform.turn, np.array(transform.position))
+        if not isinstance(transform, Transform):
+            transform = Transform.from_matrix(transform)
+        check_coordinate(transform.offset)
+        object.__setattr__(self, "transform", affine(transform.linear, transform.offset))
         object.__setattr__(self, "name", self.name or self.mesh.name)
 
     @classmethod
-    def several(cls, mesh: SceneMesh, transforms: Floats, name: str) -> list[SceneInstance]:
-        """Instances of a mesh at (n, 4, 4), checked all at once; LidarError as of one."""
+    def from_matrices(cls, mesh: SceneMesh, transforms: Floats, name: str) -> list[SceneInstance]:
+        """Return instances of a mesh at matrices (n, 4, 4), which are checked all at once.
+
+        Raises
+        ------
+        LidarError
+            If `SceneInstance` refuses one of the matrices.
+        """
         linear = transforms[:, :3, :3]
-        well = np.isfinite(transforms).all() and (np.abs(transforms[:, :3, 3]) <= FARTHEST_M).all()
-        if not well or (rank(linear) < 3).any():
+        offsets = transforms[:, :3, 3]
+        valid = np.isfinite(transforms).all() and (np.abs(offsets) <= MAX_COORDINATE_M).all()
+        if not valid or (rank(linear) < 3).any():
             for matrix in transforms:
                 cls(mesh, matrix, name)
-        made = [object.__new__(cls) for _ in transforms]
-        for one, matrix in zip(made, transforms, strict=True):
-            vars(one).update(mesh=mesh, transform=matrix, name=name)
-        return made
+        instances = [object.__new__(cls) for _ in transforms]
+        for instance, matrix in zip(instances, transforms, strict=True):
+            vars(instance).update(mesh=mesh, transform=matrix, name=name)
+        return instances
 
     @property
     def matrix(self) -> Floats:
-        """Its transform as a matrix, (4, 4)."""
+        """The transform as a matrix, (4, 4)."""
         return np.asarray(self.transform)
 
     def moved(self, name: str, linear: Floats, offset: Floats) -> SceneInstance:
-        """Return it under a name, its place taken through p -> linear @ p + offset."""
-        place = applied(linear, self.matrix[:3, 3]) + offset
-        return SceneInstance(self.mesh, affine(matmul(linear, self.matrix[:3, :3]), place), name)
+        """Return a renamed instance whose frame is moved by p -> linear @ p + offset."""
+        position = applied(linear, self.matrix[:3, 3]) + offset
+        return SceneInstance(self.mesh, affine(matmul(linear, self.matrix[:3, :3]), position), name)
 
     def flat(self) -> SceneMesh:
-        """Its triangles where they are."""
+        """Return the mesh in world coordinates."""
         return self.mesh.moved(self.name, self.matrix[:3, :3], self.matrix[:3, 3])
 
 
-def check_near(position: Floats) -> None:
-    """Check that a place (3,) is on Earth; LidarError if it is farther than `FARTHEST_M`."""
-    if not (np.abs(position) <= FARTHEST_M).all():
+def check_coordinate(position: Floats) -> None:
+    """Check that a position (3,) is within `MAX_COORDINATE_M` of zero; LidarError if not."""
+    if not (np.abs(position) <= MAX_COORDINATE_M).all():
         raise LidarError(
             f"An instance cannot be at {np.asarray(position).tolist()}: give metres within "
-            f"{FARTHEST_M:g} of zero."
+            f"{MAX_COORDINATE_M:g} of zero."
         )
 
 
 class MeshPart(NamedTuple):
-    """Triangles that instances share, all opaque or all with one mask."""
+    """Triangles that instances share: all opaque, or all with the same mask."""
 
-    vertices: Floats  # (v, 3), in the axes of their mesh
+    vertices: Floats  # (v, 3), in the frame of the mesh
     faces: Ints32  # (f, 3)
     mask: Bools | None = None  # (h, w), see `Cutout`
     uv: Floats32 | None = None  # (f, 3, 2)
     colours: Colours | None = None
-    voxels: Voxels | None = None  # leaves within
-    materials: FaceMaterials | None = None  # all names of their mesh
+    voxels: Voxels | None = None  # leaves within the surface
+    materials: FaceMaterials | None = None  # with all names of the mesh
 
 
 def parts_of(mesh: SceneMesh) -> Iterator[MeshPart]:
-    """Divide a mesh by its masks; the triangles stay in order."""
+    """Yield the parts of a mesh, divided by its masks; the triangles stay in order."""
     start = len(mesh.faces) - sum(len(cut.uv) for cut in mesh.cutouts)
 
     def part(first: int, stop: int, cut: Cutout | None = None) -> MeshPart:
-        some = slice(first, stop)
+        rows = slice(first, stop)
         return MeshPart(
-            *_used(mesh.vertices, mesh.faces[some]),
+            *_compacted(mesh.vertices, mesh.faces[rows]),
             mask=None if cut is None else cut.mask,
             uv=None if cut is None else cut.uv,
-            colours=mesh.colours and mesh.colours.take(some),
+            colours=mesh.colours and mesh.colours.take(rows),
             voxels=mesh.voxels,
-            materials=mesh.materials and mesh.materials.take(some),
+            materials=mesh.materials and mesh.materials.take(rows),
         )
 
     if start:
@@ -134,25 +142,26 @@ def parts_of(mesh: SceneMesh) -> Iterator[MeshPart]:
         start += len(cut.uv)
 
 
-def _used(vertices: Floats, faces: Ints) -> tuple[Floats, Ints32]:
+def _compacted(vertices: Floats, faces: Ints) -> tuple[Floats, Ints32]:
+    """Return the vertices that faces use, and the renumbered faces as int32."""
     points, corners = compacted(vertices, faces)
     return points, corners.astype(np.int32)
 
 
 @dataclass(frozen=True, eq=False)
 class Instances:
-    """Parts of meshes in their places.
+    """Parts of meshes, and the instances that place the parts in a scene.
 
     Attributes
     ----------
     parts
-        Each once.
+        Parts, each once.
     part
-        intp (n,): number of each instance's part.
+        intp (n,): index of each instance's part.
     transforms
-        float64 (n, 3, 4): from the axes of the part to the scene's local coordinates.
+        float64 (n, 3, 4): from the frame of the part to the scene's local coordinates.
     owner
-        int32 (n,): object of each instance.
+        int32 (n,): index of each instance's object.
     """
 
     parts: tuple[MeshPart, ...]
@@ -165,83 +174,93 @@ class Instances:
 
     @cached_property
     def sizes(self) -> Ints:
-        """Triangles of each instance, (n,)."""
+        """Number of triangles of each instance, (n,)."""
         return np.array([len(part.faces) for part in self.parts], np.int64)[self.part]
 
     @property
     def triangles(self) -> int:
-        """Triangles of all instances."""
+        """Number of triangles of all instances."""
         return int(self.sizes.sum())
 
-    def owners(self, wanted: Callable[[MeshPart], bool]) -> Ints32:
-        """Objects of the instances whose part is wanted."""
-        some = np.array([wanted(part) for part in self.parts], np.bool_)
-        return self.owner[some[self.part]]
+    def owners(self, condition: Callable[[MeshPart], bool]) -> Ints32:
+        """Return the objects of the instances whose part fulfils a condition."""
+        fulfilled = np.array([condition(part) for part in self.parts], np.bool_)
+        return self.owner[fulfilled[self.part]]
 
     def placed(self) -> Iterator[tuple[Indices, Floats]]:
-        """Vertices of some instances (k,) of one part, local to the scene: (k, 3, v)."""
+        """Yield blocks of instances (k,) of the same part, and their vertices: (k, 3, v), local."""
         for number in np.unique(self.part):
             part = self.parts[number]
             rows = np.flatnonzero(self.part == number)
             step = max(1, BLOCK_POINTS // len(part.vertices))
-            for begin in range(0, len(rows), step):
-                some = rows[begin : begin + step]
-                points = np.empty((len(some), 3, len(part.vertices)))
+            for start in range(0, len(rows), step):
+                block = rows[start : start + step]
+                points = np.empty((len(block), 3, len(part.vertices)))
                 x, y, z = part.vertices.T
                 # Element by element, which has the same bits everywhere, unlike a product of
                 # matrices, and is faster.
                 for row in range(3):
-                    a, b, c, d = self.transforms[some, row].T[:, :, None]
+                    a, b, c, d = self.transforms[block, row].T[:, :, None]
                     points[:, row] = a * x + b * y + c * z + d
-                yield some, points
+                yield block, points
 
     @cached_property
     def bounds(self) -> Floats:
-        """Lowest and highest corner of each instance, local: (n, 2, 3)."""
-        out = np.empty((len(self), 2, 3))
+        """Lowest and highest corner of each instance, local, metres: (n, 2, 3)."""
+        corners = np.empty((len(self), 2, 3))
         for rows, points in self.placed():
-            out[rows] = np.stack([points.min(axis=2), points.max(axis=2)], axis=1)
-        return out
+            corners[rows] = np.stack([points.min(axis=2), points.max(axis=2)], axis=1)
+        return corners
 
     def reach(self, centres: Floats) -> Floats:
-        """Farthest that each instance is from a point of its own (n, 2), seen from above: (n,)."""
-        out = np.empty(len(self))
+        """Return the radius (n,), seen from above, of each instance around its centre (n, 2)."""
+        radii = np.empty(len(self))
         for rows, points in self.placed():
             x, y = np.moveaxis(points[:, :2] - centres[rows, :, None], 1, 0)
-            out[rows] = np.sqrt((x * x + y * y).max(axis=1))
-        return out
+            radii[rows] = np.sqrt((x * x + y * y).max(axis=1))
+        return radii
 
-    def moved(self, owner: int, position: Floats, turn: Floats) -> Instances:
-        """Return them with those of an object in another place, at their present scale."""
-        check_near(position)
+    def relative_to(self, origin: Floats) -> Instances:
+        """Return the instances in coordinates relative to an origin (3,)."""
+        bounds = self.bounds - origin
+        shift = np.pad(origin[:, None], ((0, 0), (3, 0)))
+        instances = replace(self, transforms=self.transforms - shift)
+        vars(instances)["bounds"] = bounds  # shifted, since computing bounds again takes time
+        return instances
+
+    def moved(self, owner: int, position: Floats, rotation: Floats) -> Instances:
+        """Return the instances with all instances of the object `owner` at another pose.
+
+        The moved instances keep their scale. LidarError if the position is too far from zero.
+        """
+        check_coordinate(position)
         rows = np.flatnonzero(self.owner == owner)
         transforms = self.transforms.copy()
         for row in rows:
             transforms[row] = np.column_stack(
-                [matmul(turn, scale_of(transforms[row, :, :3])), position]
+                [matmul(rotation, scale_of(transforms[row, :, :3])), position]
             )
-        made = copy(self)
-        object.__setattr__(made, "transforms", transforms)
-        if "bounds" in vars(self):  # those of all take long
-            some = Instances(self.parts, self.part[rows], transforms[rows], self.owner[rows])
-            bounds = vars(made)["bounds"] = self.bounds.copy()
-            bounds[rows] = some.bounds
-        return made
+        instances = copy(self)
+        object.__setattr__(instances, "transforms", transforms)
+        if "bounds" in vars(self):  # computing the bounds of all instances takes long
+            moved_rows = Instances(self.parts, self.part[rows], transforms[rows], self.owner[rows])
+            bounds = vars(instances)["bounds"] = self.bounds.copy()
+            bounds[rows] = moved_rows.bounds
+        return instances
 
 
 def scale_of(matrix: Floats) -> Floats:
-    """Take the rotation off a matrix (3, 3), by polar decomposition: what it scales and mirrors.
+    """Return the scaling and mirroring (3, 3) of a matrix (3, 3), by polar decomposition.
 
-    The rotation is found by Newton's method (Higham 1986).
-
-    It is rounded to 12 digits: a factor of 1.4 stays one however often something is moved.
+    The rotation is found by Newton's method (Higham 1986). The result is rounded to 12 digits, so
+    that a factor of 1.4 stays 1.4 however often an instance is moved.
     """
-    turn = matrix
-    for _ in range(_ROUNDS):
-        before = turn
-        turn = (turn + inverse(turn).T) / 2
-        if (turn == before).all():
+    rotation = matrix
+    for _ in range(_MAX_ITERATIONS):
+        previous = rotation
+        rotation = (rotation + inverse(rotation).T) / 2
+        if (rotation == previous).all():
             break
-    scaled = matmul(turn.T, matrix)
-    scaled = (scaled + scaled.T) / 2 * np.sign(determinant(turn))
-    return np.asarray(np.round(scaled, 11 - decade(float(np.abs(scaled).max()))) + 0.0)
+    scale = matmul(rotation.T, matrix)
+    scale = (scale + scale.T) / 2 * np.sign(determinant(rotation))
+    return np.asarray(np.round(scale, 11 - decade(float(np.abs(scale).max()))) + 0.0)

@@ -17,14 +17,14 @@ from .animation import Animation
 from .colours import Colours
 from .face_materials import FaceMaterials
 
-UV_MOST = 1 << 30  # texture coordinates beyond this have no digits left
-VOXELS_MOST = 10_000  # along each axis: light takes as many steps
-DENSEST = 1e4  # leaf area density, m²/m³
+MAX_UV = 1 << 30  # texture coordinates beyond this have no digits left
+MAX_VOXELS = 10_000  # along each axis: light takes as many steps
+MAX_LEAF_DENSITY = 1e4  # leaf area density, m²/m³
 
 
 @dataclass(frozen=True, eq=False)
 class Cutout:
-    """What faces stop light only in part: leaves on cards, a wire fence.
+    """A mask of faces that stop light only in part: leaves on cards, a wire fence.
 
     Attributes
     ----------
@@ -42,22 +42,22 @@ class Cutout:
 
 @dataclass(frozen=True, eq=False)
 class Voxels:
-    """Leaves within a closed surface, by a grid of their densities; there are none beyond it.
+    """Leaf densities in a grid within a closed surface; there are no leaves outside the surface.
 
     Attributes
     ----------
     density
         float32 (nx, ny, nz): one-sided leaf area, m²/m³, finite and not negative.
     matrix
-        float64 (3, 4): takes places in the grid, in which voxels have the edge 1 and the first one
-        begins at zero, to coordinates of the mesh.
+        float64 (3, 4): from grid coordinates, in which voxels have the edge 1 and the first voxel
+        starts at zero, to coordinates of the mesh.
     """
 
     density: Floats32
     matrix: Floats
 
     def moved(self, linear: Floats, offset: Floats) -> Voxels:
-        """Return it at p -> linear @ p + offset; the densities are shared, and stay per m³."""
+        """Return the voxels at p -> linear @ p + offset; densities are shared, and stay per m³."""
         shift = np.pad(offset[:, None], ((0, 0), (3, 0)))
         return Voxels(self.density, matmul(linear, self.matrix) + shift)
 
@@ -65,7 +65,7 @@ class Voxels:
 @dataclass(frozen=True, eq=False)
 @checked_fields
 class SceneMesh:
-    """Triangles of one object, in world coordinates.
+    """Triangles of an object, in world coordinates.
 
     Parameters
     ----------
@@ -76,16 +76,18 @@ class SceneMesh:
     faces
         int64 (f, 3), indices into `vertices`, at least one face.
     cutouts
-        Of the last faces, one cutout after the other.
+        Cutouts of the last faces, cutout by cutout.
     colours
-        Of the faces, see `lidarsim.scene.colours.Colours`; None if it has none.
+        Colours of the faces, see `lidarsim.scene.colours.Colours`, or None.
     voxels
-        Densities of leaves within its surface, which is closed then and has no cutouts.
+        Densities of leaves within the surface of the mesh, which is closed then and has no
+        cutouts.
     animation
-        How its vertices move where an actor has it; elsewhere it stands as `vertices` say.
+        Motion of the vertices if an actor has the mesh; elsewhere the mesh is static, as
+        `vertices`.
     materials
-        Names of the materials of the faces, see `lidarsim.scene.face_materials.FaceMaterials`;
-        None if they have none.
+        Names of the materials of the faces, see `lidarsim.scene.face_materials.FaceMaterials`, or
+        None.
 
     Raises
     ------
@@ -139,12 +141,12 @@ class SceneMesh:
 
     @cached_property
     def bounds(self) -> Floats:
-        """Lowest and highest corner of its vertices, (2, 3)."""
+        """Lowest and highest corner of the vertices, metres, (2, 3)."""
         return np.stack([self.vertices.min(axis=0), self.vertices.max(axis=0)])
 
     @cached_property
     def has_area(self) -> bool:
-        """Whether rays can hit a triangle of it, in some pose if it is animated."""
+        """True if rays can hit a triangle of the mesh, or if the mesh is animated."""
         blocks = (
             self.vertices[self.faces[i : i + 65536]] for i in range(0, len(self.faces), 65536)
         )
@@ -167,64 +169,67 @@ class SceneMesh:
 
 
 def _check_voxels(name: str, voxels: Voxels) -> None:
+    """Check shapes, types and values of the voxels of a mesh; LidarError if they are wrong."""
     density = voxels.density
     matrix = voxels.matrix
-    well = density.dtype == np.float32 and density.ndim == 3 and density.size > 0
-    well = well and max(density.shape) <= VOXELS_MOST
-    well = well and bool(0 <= density.min() <= density.max() <= DENSEST)
-    well = well and matrix.shape == (3, 4) and bool(np.isfinite(matrix).all())
-    if not well or rank(matrix[:, :3]) < 3:
+    valid = density.dtype == np.float32 and density.ndim == 3 and density.size > 0
+    valid = valid and max(density.shape) <= MAX_VOXELS
+    valid = valid and bool(0 <= density.min() <= density.max() <= MAX_LEAF_DENSITY)
+    valid = valid and matrix.shape == (3, 4) and bool(np.isfinite(matrix).all())
+    if not valid or rank(matrix[:, :3]) < 3:
         raise LidarError(
             f"The voxels of {name!r} are {density.dtype} {density.shape}, with a matrix "
-            f"{matrix.shape}; they must be float32 (nx, ny, nz), {VOXELS_MOST:,} at most along "
-            f"each axis, of 0 to {DENSEST:g} m²/m³, and the matrix finite (3, 4), invertible."
+            f"{matrix.shape}; they must be float32 (nx, ny, nz), {MAX_VOXELS:,} at most along "
+            f"each axis, of 0 to {MAX_LEAF_DENSITY:g} m²/m³, and the matrix finite (3, 4), "
+            "invertible."
         )
 
 
 def _check_cutouts(name: str, cutouts: tuple[Cutout, ...], faces: int) -> None:
+    """Check shapes, types and values of the cutouts of a mesh; LidarError if they are wrong."""
     for cut in cutouts:
-        well = cut.mask.dtype == np.bool_ and cut.mask.ndim == 2 and cut.mask.size > 0
-        well = well and cut.uv.shape[1:] == (3, 2) and len(cut.uv) > 0
-        if not well or not (np.abs(cut.uv) < UV_MOST).all():
+        valid = cut.mask.dtype == np.bool_ and cut.mask.ndim == 2 and cut.mask.size > 0
+        valid = valid and cut.uv.shape[1:] == (3, 2) and len(cut.uv) > 0
+        if not valid or not (np.abs(cut.uv) < MAX_UV).all():
             raise LidarError(
                 f"A cutout of {name!r} has a mask {cut.mask.dtype} {cut.mask.shape} and uv "
-                f"{cut.uv.shape}; they must be bool (h, w), and (k, 3, 2) within {UV_MOST:,}."
+                f"{cut.uv.shape}; they must be bool (h, w), and (k, 3, 2) within {MAX_UV:,}."
             )
-    if (cut_out := sum(len(cut.uv) for cut in cutouts)) > faces:
-        raise LidarError(f"{name!r} has {faces} faces, and cutouts of {cut_out}.")
+    if (cutout_faces := sum(len(cut.uv) for cut in cutouts)) > faces:
+        raise LidarError(f"{name!r} has {faces} faces, and cutouts of {cutout_faces}.")
 
 
 def stacked(parts: Iterable[tuple[AnyArray, AnyArray]]) -> tuple[AnyArray, AnyArray]:
-    """Vertices and faces of several (vertices, faces), one after the other."""
+    """Concatenate pairs of vertices (v, 3) and faces (f, 3), with faces renumbered."""
     vertices = []
     faces = []
-    first = 0
+    offset = 0
     for points, corners in parts:
         vertices.append(points)
-        faces.append(corners + first)
-        first += len(points)
+        faces.append(corners + offset)
+        offset += len(points)
     return np.concatenate(vertices), np.concatenate(faces)
 
 
 def compacted(vertices: AnyArray, faces: Integers) -> tuple[AnyArray, Ints]:
-    """Vertices that faces use, in order, and the faces with their new numbers."""
+    """Return the vertices that faces use, in order, and the faces with the new numbers."""
     if faces.size < len(vertices):
         used, corners = np.unique(faces, return_inverse=True)
         return vertices[used], corners.reshape(-1, 3)
-    there = np.zeros(len(vertices), np.bool_)
-    there[faces] = True
-    if there.all():
+    is_used = np.zeros(len(vertices), np.bool_)
+    is_used[faces] = True
+    if is_used.all():
         return vertices, np.asarray(faces, np.int64)
-    return vertices[there], (np.cumsum(there) - 1)[faces]
+    return vertices[is_used], (np.cumsum(is_used) - 1)[faces]
 
 
 def points_array(name: str, points: ArrayLike) -> Floats:
-    """`points` as a contiguous float64 (n, 3) array of finite numbers.
+    """Return `points` as a contiguous float64 (n, 3) array of finite numbers.
 
     Raises
     ------
     LidarError
-        If it is not that; the message starts with `name`.
+        If the shape is wrong, or a number is NaN or infinite; the message names the object `name`.
     """
     array = np.ascontiguousarray(as_array(f"vertices of {name!r}", points))
     if array.ndim != 2 or array.shape[1] != 3:
@@ -239,7 +244,7 @@ def points_array(name: str, points: ArrayLike) -> Floats:
 
 
 def triangle_areas(corners: AnyFloats) -> Floats:
-    """Areas (n,) of triangles with these corners (n, 3, 3)."""
+    """Return the areas (n,) of triangles from their corners (n, 3, 3)."""
     sides = corners[:, 1:] - corners[:, :1]
     doubled = length(np.cross(sides[:, 0], sides[:, 1]))
     return np.asarray(doubled / 2, np.float64)

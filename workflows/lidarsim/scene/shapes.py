@@ -1,4 +1,4 @@
-"""Generated objects: surfaces of revolution, and the six of the default survey."""
+"""Generated objects: surfaces of revolution, and the six objects of the default survey."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ SEED_POSITIONS = (
 )
 
 # Control polygons from the lower pole to the upper one: (radius, height) in metres. The first
-# and the last leg are level, so that the surface is smooth where it meets the axis; a doubled
+# and the last leg are level, so that the surface is smooth at the axis; a doubled
 # point makes a tighter bend. The widest radius is stretched to SEED_RADIUS_M afterwards.
 SEED_OUTLINES: dict[str, tuple[tuple[float, float], ...]] = {
     "Vase": (
@@ -74,27 +74,27 @@ def revolve(profile: ArrayLike, segments: int, name: str = "Revolved") -> SceneM
     """Rotate a profile about the z axis to a closed surface.
 
     `profile` (n, 2), n >= 3, has radius and height in metres, from the lower pole on the axis round
-    the outside to the upper pole. The radii of the two ends are taken as zero, those between must
-    be positive. There are at least 3 `segments` around the axis.
+    the outside to the upper pole. The radii of the first and last point are taken as zero, all
+    other radii must be positive. There are at least 3 `segments` around the axis.
 
-    The mesh has `2 * (n - 2) * segments` triangles, outward normals, one vertex at each pole and
-    none doubled at the seam: it is watertight if the profile does not cross itself.
+    The mesh has `2 * (n - 2) * segments` triangles, outward normals, a single vertex at each pole
+    and no duplicates at the seam: it is watertight if the profile does not cross itself.
     """
     line = np.asarray(profile, dtype=np.float64)
     rings = len(line) - 2
     azimuth = 2 * np.pi * np.arange(segments) / segments
     radius, height = line[1:-1].T
-    around = np.empty((rings, segments, 3))
-    around[..., 0] = radius[:, None] * cos(azimuth)
-    around[..., 1] = radius[:, None] * sin(azimuth)
-    around[..., 2] = height[:, None]
+    circles = np.empty((rings, segments, 3))
+    circles[..., 0] = radius[:, None] * cos(azimuth)
+    circles[..., 1] = radius[:, None] * sin(azimuth)
+    circles[..., 2] = height[:, None]
     poles = [[0.0, 0.0, line[0, 1]], [0.0, 0.0, line[-1, 1]]]
-    vertices = np.concatenate([around.reshape(-1, 3), poles])
+    vertices = np.concatenate([circles.reshape(-1, 3), poles])
     return SceneMesh(name, vertices, _revolved_faces(rings, segments))
 
 
 def capsule(radius: float, height: float, segments: int, name: str) -> SceneMesh:
-    """Make a ball around zero that is drawn apart at its equator by a height, which may be zero."""
+    """Make a ball around zero, stretched at its equator by a height, which may be zero, metres."""
     angles = np.linspace(-np.pi / 2, np.pi / 2, segments // 2 + 1)
     ball = radius * np.stack(sin_cos(angles)[::-1], axis=1)
     up = [0, height / 2]
@@ -110,21 +110,21 @@ def cylinder(radius: float, height: float, segments: int, name: str) -> SceneMes
 
 
 def _revolved_faces(rings: int, segments: int) -> Ints:
-    """Faces over `rings` circles of `segments` vertices, the poles being the last two vertices."""
+    """Return faces over `rings` circles of `segments` vertices; the last two vertices are poles."""
     grid = np.arange(rings * segments).reshape(rings, segments)
     following = np.roll(grid, -1, axis=1)
-    low = grid[:-1]
-    low_next = following[:-1]
-    high = grid[1:]
-    high_next = following[1:]
-    first = rings * segments
-    last = rings * segments + 1
+    lower = grid[:-1]
+    lower_next = following[:-1]
+    upper = grid[1:]
+    upper_next = following[1:]
+    lower_pole = rings * segments
+    upper_pole = rings * segments + 1
     bands = [
-        np.stack([low, low_next, high_next], axis=-1).reshape(-1, 3),
-        np.stack([low, high_next, high], axis=-1).reshape(-1, 3),
+        np.stack([lower, lower_next, upper_next], axis=-1).reshape(-1, 3),
+        np.stack([lower, upper_next, upper], axis=-1).reshape(-1, 3),
     ]
-    bottom = np.stack([np.full(segments, first), following[0], grid[0]], axis=-1)
-    top = np.stack([np.full(segments, last), grid[-1], following[-1]], axis=-1)
+    bottom = np.stack([np.full(segments, lower_pole), following[0], grid[0]], axis=-1)
+    top = np.stack([np.full(segments, upper_pole), grid[-1], following[-1]], axis=-1)
     return np.concatenate([bottom, *bands, top])
 
 
@@ -136,9 +136,9 @@ def smooth(outline: ArrayLike, rounds: int = 5) -> Floats:
     """
     line = np.asarray(outline, dtype=np.float64)
     for _ in range(rounds):
-        near = 0.75 * line[:-1] + 0.25 * line[1:]
-        far = 0.25 * line[:-1] + 0.75 * line[1:]
-        cut = np.stack([near, far], axis=1).reshape(-1, line.shape[1])
+        quarter = 0.75 * line[:-1] + 0.25 * line[1:]
+        three_quarters = 0.25 * line[:-1] + 0.75 * line[1:]
+        cut = np.stack([quarter, three_quarters], axis=1).reshape(-1, line.shape[1])
         line = np.concatenate([line[:1], cut, line[-1:]])
     return line
 
@@ -146,6 +146,6 @@ def smooth(outline: ArrayLike, rounds: int = 5) -> Floats:
 def resample(line: ArrayLike, count: int) -> Floats:
     """Place points (count, d) at equal distances along a polyline (n, d), both ends included."""
     points = np.asarray(line, dtype=np.float64)
-    along = np.concatenate([[0.0], np.cumsum(length(np.diff(points, axis=0)))])
-    at = np.linspace(0.0, along[-1], count)
-    return np.stack([interp(at, along, column) for column in points.T], axis=1)
+    distances = np.concatenate([[0.0], np.cumsum(length(np.diff(points, axis=0)))])
+    even_distances = np.linspace(0.0, distances[-1], count)
+    return np.stack([interp(even_distances, distances, column) for column in points.T], axis=1)

@@ -1,118 +1,161 @@
-"""Scenes as pictures and plans need them: all triangles, instances simplified if they are many."""
+"""Scenes for pictures and plans: all triangles, with instances simplified if they are many."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
 from ..base.arrays import AnyArray, Floats, Indices, Ints, Ints32
-from .colours import Colours, joined
+from .colours import Colours, join_colours
 from .scene import Scene
 from .scene_instances import Instances, MeshPart
 from .scene_mesh import stacked, triangle_areas
 
-DRAWN_TRIANGLES = 2_000_000  # of instances; of more, each gets its share of fewer
-PART_LEAST = 32  # triangles of a simplified part
-# of a part with a mask, and of a triangle's edge
-CUT_TRIANGLES = 50_000
-CUT_STEPS = 128
-_PLACES = 200  # to which distances are measured
+DRAWN_TRIANGLES = 2_000_000  # of all instances; parts of more triangles are simplified
+MIN_PART_TRIANGLES = 32  # of a simplified part
+CUT_TRIANGLES = 50_000  # pieces of a part with a mask
+CUT_STEPS = 128  # pieces along the edge of a triangle
+_MAX_POSITIONS = 200  # to which distances are measured
 
 
 @dataclass(frozen=True, eq=False)
-class Drawn:
-    """A scene without instances, and which counter of hits its triangles have.
+class SimplifiedScene:
+    """A scene without instances, whose triangles know their hit counters.
 
-    `scene` is the `same` if that has no instances. `counter` is intp (f,), see `Scene.counters`.
+    Attributes
+    ----------
+    scene
+        The scene; the original scene if that has no instances.
+    counter
+        intp (f,): hit counter of each triangle, see `Scene.counters`.
+    is_original
+        Whether `scene` is the original scene.
     """
 
     scene: Scene
     counter: Indices
-    same: bool = False
+    is_original: bool = False
 
     @classmethod
-    def of(cls, scene: Scene, most: int = DRAWN_TRIANGLES, near: Sequence[Floats] = ()) -> Drawn:
-        """Copy all instances to their places, with at most about so many triangles.
+    def from_scene(
+        cls,
+        scene: Scene,
+        max_triangles: int = DRAWN_TRIANGLES,
+        near_positions: Sequence[Floats] = (),
+    ) -> SimplifiedScene:
+        """Copy all instances to their positions, with at most about `max_triangles` in total.
 
-        Those close to places `near`, (k, 3) each, local coordinates, have more of them.
+        Instances close to `near_positions`, (k, 3) each, local, keep more triangles.
         """
-        faces = len(scene.faces)
         if (shared := scene.instances) is None:
-            return cls(scene, np.arange(faces), same=True)
-        shares = _shares(shared, most, near)
-        meshes = [(scene.vertices, scene.faces)]
-        owners = [scene.face_object]
-        counters = [np.arange(faces)]
-        colours = [scene.colours]
-        mirrored = np.linalg.det(shared.transforms[:, :, :3]) < 0
-        for number, share in sorted(set(zip(shared.part.tolist(), shares.tolist(), strict=True))):
-            part = shared.parts[number]
-            vertices = part.vertices
-            own = part.faces
-            kept = np.arange(len(part.faces))
-            size = max(PART_LEAST, int(len(own) * share))
-            if size < len(own):
-                vertices, own, kept = _fewer(part, size)
-            shown = part.colours and Colours.of_faces(part.colours.take(kept).means())
-            for row in np.flatnonzero((shared.part == number) & (shares == share)):
-                matrix = shared.transforms[row]
-                corners = own[:, ::-1] if mirrored[row] else own
-                meshes.append((vertices @ matrix[:, :3].T + matrix[:, 3], corners))
-                owners.append(np.full(len(own), shared.owner[row]))
-                counters.append(np.full(len(own), faces + row))
-                colours.append(shown)
-        vertices, triangles = stacked(meshes)
-        owner = np.concatenate(owners).astype(np.int32)
-        coloured = joined(colours, map(len, owners))
-        drawn = Scene(
-            vertices, triangles, owner, scene.names, scene.origin, scene.actors, colours=coloured
-        )
-        return cls(drawn, np.concatenate(counters))
+            return cls(scene, np.arange(len(scene.faces)), is_original=True)
+        shares = _triangle_shares(shared, max_triangles, near_positions)
+        copies = _CopiedInstances(scene)
+        for index, share in sorted(set(zip(shared.part.tolist(), shares.tolist(), strict=True))):
+            part = _drawn_part(shared.parts[index], share)
+            for row in np.flatnonzero((shared.part == index) & (shares == share)):
+                copies.add(part, shared, int(row))
+        return cls(copies.scene(), np.concatenate(copies.counters))
 
     def hits(self, counts: AnyArray) -> AnyArray:
-        """Hits of each triangle that is drawn, from counters; those of actors follow."""
-        if self.same:
+        """Return the hits of each triangle, and of the actors' triangles, from hit counters."""
+        if self.is_original:
             return counts
         area = triangle_areas(self.scene.vertices[self.scene.faces]) + np.finfo(np.float64).tiny
         share = area / np.bincount(self.counter, area, len(counts))[self.counter]
-        moving = sum(len(actor.mesh.faces) for actor in self.scene.actors)
-        return np.append(counts[self.counter] * share, counts[len(counts) - moving :])
+        actor_triangles = sum(len(actor.mesh.faces) for actor in self.scene.actors)
+        return np.append(counts[self.counter] * share, counts[len(counts) - actor_triangles :])
 
 
-def cut(scene: Scene) -> Scene:
-    """Return a scene for pictures: in place of triangles with masks small ones, where it is opaque.
+class _DrawnPart(NamedTuple):
+    """A part of instances, perhaps simplified, for drawings."""
 
-    Its counters are the same.
+    vertices: Floats  # (v, 3)
+    faces: Ints32  # (f, 3)
+    colours: Colours | None  # a plain colour for each face
+
+
+class _CopiedInstances:
+    """Triangles of a scene, and copies of its instances' triangles."""
+
+    def __init__(self, scene: Scene) -> None:
+        self._scene = scene
+        self._meshes = [(scene.vertices, scene.faces)]
+        self._owners = [scene.face_object]
+        self._colours = [scene.colours]
+        self.counters = [np.arange(len(scene.faces))]
+        assert scene.instances is not None
+        self._mirrored = np.linalg.det(scene.instances.transforms[:, :, :3]) < 0
+
+    def add(self, part: _DrawnPart, shared: Instances, row: int) -> None:
+        """Copy a part to the instance `row`."""
+        matrix = shared.transforms[row]
+        count = len(part.faces)
+        corners = part.faces[:, ::-1] if self._mirrored[row] else part.faces
+        self._meshes.append((part.vertices @ matrix[:, :3].T + matrix[:, 3], corners))
+        self._owners.append(np.full(count, shared.owner[row]))
+        self._colours.append(part.colours)
+        self.counters.append(np.full(count, len(self._scene.faces) + row))
+
+    def scene(self) -> Scene:
+        """Return the scene of all triangles, with the actors, without instances."""
+        vertices, faces = stacked(self._meshes)
+        return Scene(
+            vertices,
+            faces,
+            np.concatenate(self._owners).astype(np.int32),
+            self._scene.names,
+            self._scene.origin,
+            self._scene.actors,
+            colours=join_colours(self._colours, map(len, self._owners)),
+        )
+
+
+def _drawn_part(part: MeshPart, share: float) -> _DrawnPart:
+    """Return a part with a share of its triangles, and the mean colour of each triangle."""
+    vertices = part.vertices
+    faces = part.faces
+    rows = np.arange(len(part.faces))
+    count = max(MIN_PART_TRIANGLES, int(len(faces) * share))
+    if count < len(faces):
+        vertices, faces, rows = _simplified_part(part, count)
+    colours = part.colours and Colours.of_faces(part.colours.take(rows).means())
+    return _DrawnPart(vertices, faces, colours)
+
+
+def cut_masks(scene: Scene) -> Scene:
+    """Return a scene for pictures, with small opaque triangles in place of masked triangles.
+
+    The hit counters stay the same.
     """
     shared = scene.instances
     masked = sum(part.mask is not None for part in shared.parts) if shared else 0
     if shared is None or not masked:
         return scene
-    places = np.bincount(shared.part, minlength=len(shared.parts))
+    instance_counts = np.bincount(shared.part, minlength=len(shared.parts))
     parts = tuple(
-        _cut(part, min(CUT_TRIANGLES, DRAWN_TRIANGLES / (masked * count)))
-        for part, count in zip(shared.parts, places.tolist(), strict=True)
+        _cut_part(part, min(CUT_TRIANGLES, DRAWN_TRIANGLES / (masked * count)))
+        for part, count in zip(shared.parts, instance_counts.tolist(), strict=True)
     )
     return replace(scene, instances=replace(shared, parts=parts))
 
 
-def _cut(part: MeshPart, most: float) -> MeshPart:
-    """Divide a part with a mask into about so many pieces, and keep those that are opaque.
+def _cut_part(part: MeshPart, max_pieces: float) -> MeshPart:
+    """Divide a part with a mask into about `max_pieces`, and return the opaque pieces.
 
-    A piece is asked at a random place: the share that is kept is right, however fine the mask.
+    The mask is sampled at a random point of each piece: the share of opaque pieces is right,
+    however fine the mask.
     """
     if part.mask is None or part.uv is None:
         return part
-    steps = int(np.clip((most / len(part.faces)) ** 0.5, 1, CUT_STEPS))  # of an edge
-    i, j = (n.ravel() for n in np.mgrid[:steps, :steps])
-    # Those beyond the diagonal are turned by 180 degrees, into the gaps between the others.
-    first = np.stack([[i, j], [i + 1, j], [i, j + 1]], axis=-1).transpose(1, 2, 0)
-    pieces = np.where((i + j < steps)[:, None, None], first, steps - first)
-    corners = np.concatenate([pieces, steps - pieces.sum(axis=2, keepdims=True)], axis=2) / steps
-    places = np.random.default_rng(0).dirichlet(np.ones(3), (len(part.faces), len(pieces)))
-    u, v = np.einsum("fpc,pck,fkx->xfp", places, corners, part.uv.astype(np.float64), optimize=True)
+    steps = int(np.clip((max_pieces / len(part.faces)) ** 0.5, 1, CUT_STEPS))
+    corners = _piece_corners(steps)
+    weights = np.random.default_rng(0).dirichlet(np.ones(3), (len(part.faces), len(corners)))
+    uv = part.uv.astype(np.float64)
+    u, v = np.einsum("fpc,pck,fkx->xfp", weights, corners, uv, optimize=True)
     height, width = part.mask.shape
     row = (v % 1 * height).astype(int)
     column = (u % 1 * width).astype(int)
@@ -126,107 +169,157 @@ def _cut(part: MeshPart, most: float) -> MeshPart:
     )
 
 
-def _shares(shared: Instances, most: int, near: Sequence[Floats]) -> Floats:
-    """Share of its triangles that each instance has in a drawing, (n,).
+def _piece_corners(steps: int) -> Floats:
+    """Return barycentric corners (steps², 3, 3) of the pieces of a triangle, `steps` an edge."""
+    i, j = (n.ravel() for n in np.mgrid[:steps, :steps])
+    # Pieces beyond the diagonal are rotated by 180 degrees, into the gaps between the others.
+    first = np.stack([[i, j], [i + 1, j], [i, j + 1]], axis=-1).transpose(1, 2, 0)
+    pieces = np.where((i + j < steps)[:, None, None], first, steps - first)
+    return np.asarray(
+        np.concatenate([pieces, steps - pieces.sum(axis=2, keepdims=True)], axis=2) / steps
+    )
 
-    Half of all are shared evenly, the others by the square of the distance to the nearest place:
-    then all have about one size in a picture taken from there.
+
+def _triangle_shares(
+    shared: Instances, max_triangles: int, near_positions: Sequence[Floats]
+) -> Floats:
+    """Return the share of its triangles that each instance keeps in a drawing, (n,).
+
+    Half of the triangles are shared evenly, the other half by the square of the distance to the
+    nearest position: then all triangles have about the same size in a picture from there.
     """
-    even = min(1.0, most / shared.triangles)
-    places = np.concatenate([np.empty((0, 3)), *near])
-    if even == 1 or not len(places):
-        return np.full(len(shared), even)
+    even_share = min(1.0, max_triangles / shared.triangles)
+    positions = np.concatenate([np.empty((0, 3)), *near_positions])
+    if even_share == 1 or not len(positions):
+        return np.full(len(shared), even_share)
     middles = shared.bounds.mean(axis=1)
     distance = np.full(len(shared), np.inf)
-    for place in places[:: len(places) // _PLACES + 1]:
-        np.minimum(distance, np.linalg.norm(middles - place, axis=1), out=distance)
+    for position in positions[:: len(positions) // _MAX_POSITIONS + 1]:
+        np.minimum(distance, np.linalg.norm(middles - position, axis=1), out=distance)
     distance += 1e-3
-    full = distance.max()  # up to this distance they have all
+    full_distance = distance.max()  # up to this distance instances keep all triangles
     while True:
-        # In steps of four: each step is another mesh.
-        shares = np.maximum(4.0 ** np.floor(np.log2(np.minimum(full / distance, 1))), even / 2)
-        if shares @ shared.sizes <= most:
+        # In steps of four, since each step makes another mesh.
+        near_share = 4.0 ** np.floor(np.log2(np.minimum(full_distance / distance, 1)))
+        shares = np.maximum(near_share, even_share / 2)
+        if shares @ shared.sizes <= max_triangles:
             return shares
-        full *= 0.9
+        full_distance *= 0.9
 
 
-def _fewer(part: MeshPart, most: int) -> tuple[Floats, Ints32, Indices]:
-    """Vertices and at most so many faces that stand for a part, and which each was.
+class _SimplifiedPart(NamedTuple):
+    """A part of fewer triangles."""
 
-    Of many small pieces, as a tree's leaves are, merged vertices would leave little. There the
-    largest triangles stay, as of trunk and boughs, and a choice of the others, made larger for all
-    of them (Cook et al., 2007); long ones less, which would stick out.
+    vertices: Floats  # (v, 3)
+    faces: Ints32  # (k, 3)
+    rows: Indices  # (k,), the original face of each face
+
+
+def _simplified_part(part: MeshPart, max_triangles: int) -> _SimplifiedPart:
+    """Return a part with at most `max_triangles`, which looks like the original.
+
+    If a part has many small pieces, such as the leaves of a tree, merging vertices would leave
+    little. There the largest triangles stay, as of trunk and boughs, and a random choice of the
+    others, enlarged to stand for all small triangles (Cook et al., 2007); long triangles are
+    enlarged less, since they would stick out.
     """
-    pieces = len(np.unique(part.vertices, axis=0)) > len(part.faces)  # half as many in one surface
-    vertices, faces, kept, _ = _merged(part.vertices, part.faces, most)
-    if not pieces and len(kept) >= most // 4:
-        return vertices, faces[kept], kept
+    # A single surface has half as many vertices as faces.
+    has_pieces = len(np.unique(part.vertices, axis=0)) > len(part.faces)
+    merged = _merge_vertices(part.vertices, part.faces, max_triangles)
+    if not has_pieces and len(merged.rows) >= max_triangles // 4:
+        return _SimplifiedPart(merged.vertices, merged.faces[merged.rows], merged.rows)
     corners = part.vertices[part.faces]
     order = np.argsort(-triangle_areas(corners), kind="stable")
-    large, small = np.split(order, [most // 4])
-    some = np.random.default_rng(0).choice(small, most - len(large), replace=False)
-    scale = np.ones(most)
-    long = np.linalg.norm(corners[some] - np.roll(corners[some], 1, axis=1), axis=2).max(axis=1)
-    scale[len(large) :] = (len(small) / len(some)) ** 0.5 * np.minimum(1, np.median(long) / long)
-    kept = np.append(large, some)
-    chosen = corners[kept]
-    middle = chosen.mean(axis=1, keepdims=True)
-    larger = middle + (chosen - middle) * np.maximum(1, scale)[:, None, None]
-    return larger.reshape(-1, 3), np.arange(3 * most, dtype=np.int32).reshape(-1, 3), kept
+    large, small = np.split(order, [max_triangles // 4])
+    sampled = np.random.default_rng(0).choice(small, max_triangles - len(large), replace=False)
+    edges = corners[sampled] - np.roll(corners[sampled], 1, axis=1)
+    longest = np.linalg.norm(edges, axis=2).max(axis=1)
+    scale = np.ones(max_triangles)
+    scale[len(large) :] = (len(small) / len(sampled)) ** 0.5 * np.minimum(
+        1, np.median(longest) / longest
+    )
+    rows = np.append(large, sampled)
+    middle = corners[rows].mean(axis=1, keepdims=True)
+    enlarged = middle + (corners[rows] - middle) * np.maximum(1, scale)[:, None, None]
+    faces = np.arange(3 * max_triangles, dtype=np.int32).reshape(-1, 3)
+    return _SimplifiedPart(enlarged.reshape(-1, 3), faces, rows)
 
 
-def simplified(scene: Scene, most: int) -> tuple[Scene, Ints]:
-    """Give a scene of fewer triangles; and for each triangle of this one which stands for it.
+def simplified(scene: Scene, max_triangles: int) -> tuple[Scene, Ints]:
+    """Return a scene of at most `max_triangles`, and the substitute (f,) of each original triangle.
 
-    That is -1 where nothing is left of a small object.
+    The substitute is the triangle of the new scene that stands for the original triangle, or -1
+    for small objects that vanish.
     """
-    vertices, faces, kept, stands = _merged(scene.vertices, scene.faces, most)
-    owners = scene.face_object[kept]
-    colours = scene.colours and scene.colours.take(kept)
-    made = Scene(vertices, faces[kept], owners, scene.names, scene.origin, colours=colours)
-    return made, stands
+    merged = _merge_vertices(scene.vertices, scene.faces, max_triangles)
+    owners = scene.face_object[merged.rows]
+    colours = scene.colours and scene.colours.take(merged.rows)
+    faces = merged.faces[merged.rows]
+    coarse = Scene(merged.vertices, faces, owners, scene.names, scene.origin, colours=colours)
+    return coarse, merged.substitutes
 
 
-def _merged(points: Floats, corners: Ints32, most: int) -> tuple[Floats, Ints32, Indices, Ints]:
+class _MergedMesh(NamedTuple):
+    """A mesh whose vertices in the same cell of a grid are merged."""
+
+    vertices: Floats  # (v, 3)
+    faces: Ints32  # (f, 3), all faces, with the new vertices
+    rows: Indices  # (k,), faces to keep: with an area, and each only once
+    substitutes: Ints  # (f,), index into `rows` of the face that stands for each face; -1 for none
+
+
+def _merge_vertices(points: Floats, corners: Ints32, max_triangles: int) -> _MergedMesh:
     """Merge vertices in the same cell of a grid (Rossignac and Borrel, 1993).
 
-    Returns vertices, faces (f, 3), those that are kept, at most so many, and what `simplified`
-    does.
+    Cells are as small as `max_triangles`, the number of faces to keep, allows.
     """
     area = float(triangle_areas(points[corners]).sum())
-    cell = (2 * area / most) ** 0.5
-    low = points.min(axis=0)
+    cell = (2 * area / max_triangles) ** 0.5
     while True:
-        at = np.floor((points - low) / cell).astype(np.int64)
-        _, merged, counts = np.unique(_numbered(at), return_inverse=True, return_counts=True)
+        merged, counts = _cells(points, cell)
         faces = merged[corners].astype(np.int32)
-        first, second, third = faces.T
-        flat = (first == second) | (second == third) | (third == first)
-        wide = np.flatnonzero(~flat)
-        _, owner, same = np.unique(
-            _numbered(np.sort(faces[wide], axis=1)), return_index=True, return_inverse=True
-        )
-        if len(owner) <= most:
+        collapsed = (faces == np.roll(faces, 1, axis=1)).any(axis=1)
+        full = np.flatnonzero(~collapsed)
+        keys = _row_numbers(np.sort(faces[full], axis=1))
+        _, distinct, group = np.unique(keys, return_index=True, return_inverse=True)
+        if len(distinct) <= max_triangles:
             break
         cell *= 1.3
     vertices = np.stack([np.bincount(merged, axis) / counts for axis in points.T], axis=1)
-    kept = wide[owner]
-    stands = np.full(len(faces), -1, np.int64)
-    stands[wide] = same
-    near = np.full(len(vertices), -1, np.int64)  # a triangle at each vertex
-    near[faces[kept].ravel()] = np.repeat(np.arange(len(kept)), 3)
-    small = np.flatnonzero(flat)
-    stands[small] = near[faces[small]].max(axis=1)
-    return vertices, faces, kept, stands
+    rows = full[distinct]
+    substitutes = np.full(len(faces), -1, np.int64)
+    substitutes[full] = group
+    face_at_vertex = _face_at_vertex(faces[rows], len(vertices))
+    substitutes[collapsed] = face_at_vertex[faces[collapsed]].max(axis=1)
+    return _MergedMesh(vertices, faces, rows, substitutes)
 
 
-def _numbered(rows: AnyArray) -> Ints:
-    """Numbers (n,) of rows of natural numbers (n, 3), in their order: sorted fast, unlike rows."""
-    number = np.zeros(len(rows), np.int64)
+def _face_at_vertex(faces: Ints32, vertex_count: int) -> Ints:
+    """Return a face at each vertex (v,), -1 at vertices without faces."""
+    face_at_vertex = np.full(vertex_count, -1, np.int64)
+    face_at_vertex[faces.ravel()] = np.repeat(np.arange(len(faces)), 3)
+    return face_at_vertex
+
+
+def _cells(points: Floats, cell: float) -> tuple[Ints, Ints]:
+    """Return the number (n,) of each point's cell in a grid, and the points of each cell (c,)."""
+    columns = np.floor((points - points.min(axis=0)) / cell).astype(np.int64)
+    _, merged, counts = np.unique(_row_numbers(columns), return_inverse=True, return_counts=True)
+    return merged, counts
+
+
+def _row_numbers(rows: AnyArray) -> Ints:
+    """Return numbers (n,) in the order of rows (n, 3) of natural numbers, as faster sort keys."""
+    row_numbers = np.zeros(len(rows), np.int64)
     for column in rows.T.astype(np.int64):
-        small = [
-            np.unique(one, return_inverse=True)[1] if one.max(initial=0) >= 1 << 31 else one
-            for one in (number, column)
-        ]
-        number = small[0] * (int(small[1].max(initial=0)) + 1) + small[1]
-    return number
+        leading = _compact(row_numbers)
+        trailing = _compact(column)
+        row_numbers = leading * (int(trailing.max(initial=0)) + 1) + trailing
+    return row_numbers
+
+
+def _compact(numbers: Ints) -> Ints:
+    """Return numbers in the same order below 2³¹, so that a product of two fits 64 bits."""
+    if numbers.max(initial=0) >= 1 << 31:
+        return np.unique(numbers, return_inverse=True)[1]
+    return numbers

@@ -25,20 +25,20 @@ UP_AXES = {
 
 
 def affine(linear: Floats, offset: Floats) -> Floats:
-    """Matrices (..., 4, 4) of p -> linear @ p + offset: (..., 3, 3) and (..., 3)."""
-    out = np.zeros((*np.shape(offset)[:-1], 4, 4))
-    out[..., :3, :3] = linear
-    out[..., :3, 3] = offset
-    out[..., 3, 3] = 1
-    return out
+    """Return matrices (..., 4, 4) of p -> linear @ p + offset, from (..., 3, 3) and (..., 3)."""
+    matrices = np.zeros((*np.shape(offset)[:-1], 4, 4))
+    matrices[..., :3, :3] = linear
+    matrices[..., :3, 3] = offset
+    matrices[..., 3, 3] = 1
+    return matrices
 
 
 def rotation_about(axis: ArrayLike, degrees: float) -> Floats:
-    """Rotation (3, 3) about an axis, which has a length (Rodrigues 1840)."""
+    """Return the rotation (3, 3) about an axis that is not zero (Rodrigues 1840)."""
     cross = np.cross(np.eye(3), np.array(axis) / length(np.array(axis, np.float64)))
     sine, cosine = sin_cos_of(math.radians(degrees))
-    turn: Floats = sine * cross + (1 - cosine) * matmul(cross, cross)
-    return np.eye(3) + turn
+    rotation: Floats = sine * cross + (1 - cosine) * matmul(cross, cross)
+    return np.eye(3) + rotation
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,30 +78,30 @@ class Transform:
 
     @property
     def keeps_xy(self) -> bool:
-        """Whether x and y stay as they are."""
+        """True if x and y stay as they are."""
         return not self.offset[:2].any() and bool((self.linear[:2] == np.eye(3)[:2]).all())
 
     @classmethod
-    def place(
+    def from_parts(
         cls,
         translation: tuple[float, float, float] = (0.0, 0.0, 0.0),
         rotation_deg: tuple[float, float, float] = (0.0, 0.0, 0.0),
         scale: float | tuple[float, float, float] = 1.0,
     ) -> Transform:
-        """Scale, then rotate about the world's x, y and z axes in this order, then move.
+        """Make a transform that scales, then rotates about the world's x, y and z axes, then moves.
 
         Parameters
         ----------
         translation
-            Metres.
+            Translation, metres.
         rotation_deg
-            Degrees about x, y and z.
+            Rotations about x, y and z in this order, degrees.
         scale
-            One factor, or one for each axis; not zero.
+            A factor for all axes, or three factors; not zero.
         """
         roll, pitch, yaw = rotation_deg
-        turn = Pose((0.0, 0.0, 0.0), yaw_deg=yaw, pitch_deg=pitch, roll_deg=roll).turn
-        return cls(turn * np.broadcast_to(scale, 3), np.array(translation))
+        rotation = Pose((0.0, 0.0, 0.0), yaw_deg=yaw, pitch_deg=pitch, roll_deg=roll).turn
+        return cls(rotation * np.broadcast_to(scale, 3), np.array(translation))
 
     @classmethod
     def from_matrix(cls, matrix: ArrayLike) -> Transform:

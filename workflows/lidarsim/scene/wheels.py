@@ -8,6 +8,7 @@ from fnmatch import fnmatchcase
 
 import numpy as np
 
+from ..base.arrays import Floats
 from ..base.elementary import sin_cos
 from ..base.errors import LidarError
 from ..base.words import did_you_mean
@@ -15,26 +16,28 @@ from .animation import Animation
 from .scene_instances import SceneInstance
 from .scene_mesh import SceneMesh
 
-_TURN = 64  # poses of a wheel: between two of them it is 0.12 % smaller
-_TURNS_MOST = 10  # of the smallest one in a turn of the largest: poses of all are kept as often
-_ROUND = 0.05  # how much length and height of a wheel may differ
+_POSES_PER_REVOLUTION = 64  # between two poses, a wheel is 0.12 % smaller
+# Revolutions of the smallest wheel in a revolution of the largest: all wheels have as many poses.
+_MAX_REVOLUTIONS = 10
+_ROUNDNESS = 0.05  # difference between length and height of a wheel, relative to the height
 
 
 def rolling(
     objects: Sequence[SceneMesh | SceneInstance], wheels: Sequence[str], tell: Callable[[str], None]
 ) -> list[SceneMesh]:
-    """Turn wheels about their middles, once while an actor drives their circumference.
+    """Animate wheels, which roll along x and rotate about y around their middles.
 
-    They roll along x, about y. Smaller ones turn a whole number of times meanwhile.
+    The largest wheels make a revolution while an actor drives their circumference; smaller wheels
+    make a whole number of revolutions meanwhile.
 
     Parameters
     ----------
     objects
-        Of a file; the others stay as they are.
+        Objects of a file; all but the wheels stay as they are.
     wheels
         Names of the objects that are wheels, with * and ?.
     tell
-        Called with a line on wheels that are not round, or small beside others.
+        Called with a line on wheels that are not round, or are small beside other wheels.
 
     Returns
     -------
@@ -43,41 +46,61 @@ def rolling(
     Raises
     ------
     LidarError
-        If no object has one of the names, or none of them is round.
+        If no object has one of the names, or no object with such a name is round.
     """
-    flat = [one.flat() if isinstance(one, SceneInstance) else one for one in objects]
-    names = [one.name for one in flat]
+    meshes = [item.flat() if isinstance(item, SceneInstance) else item for item in objects]
+    _check_names(wheels, [mesh.name for mesh in meshes])
+    radii, notes = _radii(meshes, wheels)
+    if not radii:
+        raise LidarError(f"no object that wheels names can turn: {notes[0]}.")
+    largest = max(radii.values())
+    revolutions = {index: round(largest / radius) for index, radius in radii.items()}
+    for index in [index for index, count in revolutions.items() if count > _MAX_REVOLUTIONS]:
+        smaller = f"{revolutions.pop(index)} times smaller than the largest"
+        notes.append(f"{meshes[index].name} is {smaller}, and does not turn")
+    for line in notes:
+        tell(line)
+    steps = _POSES_PER_REVOLUTION * max(revolutions.values())
+    step_s = 2 * np.pi * largest / steps
+    for index, count in revolutions.items():
+        vertices = _rotated_vertices(meshes[index], count, steps)
+        animation = Animation(vertices, step_s, 1.0)
+        meshes[index] = replace(meshes[index], cutouts=(), animation=animation)
+    return meshes
+
+
+def _check_names(wheels: Sequence[str], names: Sequence[str]) -> None:
+    """Check that each pattern of `wheels` matches a name of an object; LidarError if not."""
     for wheel in wheels:
         if not any(fnmatchcase(name, wheel) for name in names):
             hint = did_you_mean(wheel, names) or f" There are {', '.join(names[:5])}."
             raise LidarError(f"wheels names {wheel!r}, but no object has that name.{hint}")
+
+
+def _radii(
+    meshes: Sequence[SceneMesh], wheels: Sequence[str]
+) -> tuple[dict[int, float], list[str]]:
+    """Return the radii of round wheels, {index of the mesh: metres}, and notes on oval wheels."""
     radii: dict[int, float] = {}
-    still: list[str] = []  # notes on wheels that are not round
-    for number, one in enumerate(flat):
-        if any(fnmatchcase(one.name, wheel) for wheel in wheels):
-            length, _, height = np.ptp(one.bounds, axis=0).tolist()
-            if abs(length - height) > _ROUND * height or not height:
-                still.append(
-                    f"{one.name} has no axle, and does not turn: it is {length:.3g} m long and "
+    notes: list[str] = []
+    for index, mesh in enumerate(meshes):
+        if any(fnmatchcase(mesh.name, wheel) for wheel in wheels):
+            length, _, height = np.ptp(mesh.bounds, axis=0).tolist()
+            if abs(length - height) > _ROUNDNESS * height or not height:
+                notes.append(
+                    f"{mesh.name} has no axle, and does not turn: it is {length:.3g} m long and "
                     f"{height:.3g} m high, not round about y"
                 )
             else:
-                radii[number] = height / 2
-    if not radii:
-        raise LidarError(f"no object that wheels names can turn: {still[0]}.")
-    largest = max(radii.values())
-    turns = {number: round(largest / radius) for number, radius in radii.items()}
-    for number in [number for number, own in turns.items() if own > _TURNS_MOST]:
-        smaller = f"{turns.pop(number)} times smaller than the largest"
-        still.append(f"{flat[number].name} is {smaller}, and does not turn")
-    for line in still:
-        tell(line)
-    count = _TURN * max(turns.values())
-    for number, own in turns.items():
-        middle = flat[number].bounds.mean(axis=0)
-        sine, cosine = np.array(sin_cos(2 * np.pi * own * np.linspace(0, 1, count + 1)))[..., None]
-        x, y, z = (flat[number].vertices - middle).T
-        poses = np.stack([cosine * x + sine * z, y + 0 * sine, cosine * z - sine * x], axis=2)
-        animation = Animation(poses + middle, 2 * np.pi * largest / count, 1.0)
-        flat[number] = replace(flat[number], cutouts=(), animation=animation)
-    return flat
+                radii[index] = height / 2
+    return radii, notes
+
+
+def _rotated_vertices(mesh: SceneMesh, revolutions: int, steps: int) -> Floats:
+    """Return the vertices (steps + 1, v, 3) of a mesh that rotates about its middle, about y."""
+    middle = mesh.bounds.mean(axis=0)
+    angles = 2 * np.pi * revolutions * np.linspace(0, 1, steps + 1)
+    sine, cosine = np.array(sin_cos(angles))[..., None]
+    x, y, z = (mesh.vertices - middle).T
+    poses = np.stack([cosine * x + sine * z, y + 0 * sine, cosine * z - sine * x], axis=2)
+    return np.asarray(poses + middle)

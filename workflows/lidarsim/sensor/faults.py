@@ -11,7 +11,7 @@ import numpy as np
 from pydantic import Field
 
 from ..base.arrays import Bools, Floats, Ints
-from ..base.declared import AngleDeg, Ends, Several, Text, Two, UnitShare, about
+from ..base.declared import AngleDeg, MinMax, Several, Text, Two, UnitShare, about
 from ..base.errors import LidarError, prefixed
 from ..base.validation import checked_fields, without_numpy
 from ..base.words import did_you_mean
@@ -50,7 +50,7 @@ class Fault:
     sensor: Annotated[Text | None, about("its sensor's name; by default all have it")] = None
     transmission: Annotated[UnitShare | None, about("of dirt: of energy, out and back")] = None
     azimuth_deg: Annotated[Two[AngleDeg] | None, about("of dirt: counter-clockwise")] = None
-    elevation_deg: Annotated[Ends[AngleDeg] | None, about("of dirt: lowest and highest")] = None
+    elevation_deg: Annotated[MinMax[AngleDeg] | None, about("of dirt: lowest and highest")] = None
     channels: Annotated[Channels | None, about("dead ones; 0 is the lowest")] = None
     share: Annotated[UnitShare | None, about("of packets that are lost")] = None
     packet: Annotated[Count | None, about("consecutive firings in a packet")] = None

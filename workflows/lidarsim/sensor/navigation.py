@@ -23,7 +23,7 @@ import numpy as np
 from pydantic import Field, Strict
 
 from ..base.arrays import Floats, Ints
-from ..base.declared import Ends, Seed, Several, UnitShare, about
+from ..base.declared import MinMax, Seed, Several, UnitShare, about
 from ..base.elementary import arctan2, exp, sin_cos
 from ..base.elementary_scalars import exp_of, sin_cos_of
 from ..base.errors import LidarError
@@ -122,7 +122,7 @@ class Gnss:
     drift_vertical_m: Annotated[Deviation, about("the same, up")] = 0.0
     drift_time_s: Annotated[Correlation, about("correlation time of the drift")] = 600.0
     outages: Annotated[
-        Several[Ends[Span]],
+        Several[MinMax[Span]],
         about("begins and ends, seconds; the IMU bridges them, without one no positions are there"),
     ] = ()
     origin: Annotated[

@@ -7,7 +7,7 @@ from functools import partial
 
 import numpy as np
 
-from ..scene.actors import shapes_of
+from ..scene.actors import distinct_meshes
 from ..scene.scene import Scene
 from ..sensor import Survey
 from .device import needs_hits
@@ -71,7 +71,7 @@ def rig_bytes(scene: Scene, survey: Survey) -> int:
         rays = (sensor.period or 0) * sensor.channels
         patterns += PATTERN_RAY * min(rays, PATTERN_RAYS)
     poses = 0
-    meshes, _ = shapes_of(scene.actors)
+    meshes, _ = distinct_meshes(scene.actors)
     for mesh in meshes:
         if mesh.animation is not None:
             vertices = mesh.animation.vertices

@@ -32,7 +32,7 @@ from ..base.arrays import Bools, Floats, Indices, Ints, Ints32
 from ..base.errors import LidarError
 from ..base.interrupts import deferred_interrupts
 from ..base.words import did_you_mean
-from ..scene.actors import Actor, shapes_of
+from ..scene.actors import Actor, distinct_meshes
 from ..scene.scene import Scene
 from ..scene.scene_instances import Instances, MeshPart, parts_of
 from .actor_trajectories import ActorTrajectories
@@ -238,7 +238,7 @@ def _shapes(
     """
     if not actors:
         return None
-    meshes, shape = shapes_of(actors)
+    meshes, shape = distinct_meshes(actors)
     parts = [[*parts_of(mesh)] for mesh in meshes]
     firsts = np.zeros((len(meshes), max(map(len, parts))), np.int32)
     for row, own in zip(firsts, parts, strict=True):

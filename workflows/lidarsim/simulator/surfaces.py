@@ -13,8 +13,8 @@ import numpy as np
 
 from ..base.arrays import Bools, Floats, Floats32, Indices, Integers, Ints, Ints32, UInts32, owned
 from ..base.vectors import applied, into_axes, inverse, length, products
-from ..scene.actors import shapes_of
-from ..scene.colours import GREY, Colours, Lookup, joined, luminance, packed
+from ..scene.actors import distinct_meshes
+from ..scene.colours import GREY, Colours, Lookup, join_colours, luminance, packed
 from ..scene.face_materials import FaceMaterials
 from ..scene.scene import Scene
 from ..sensor import Sensor, Survey
@@ -100,7 +100,7 @@ class Surfaces:
         # Where the triangles of each instance begin, and those of actors.
         self._begins = plain + np.cumsum([0, *sizes])
         moving = [len(actor.mesh.faces) for actor in scene.actors]
-        self._meshes, self._shape = shapes_of(scene.actors)
+        self._meshes, self._shape = distinct_meshes(scene.actors)
         self._firsts = firsts = plain + np.cumsum([0, *(len(mesh.faces) for mesh in self._meshes)])
         # What leads from a triangle of an actor to its row among those that are kept once.
         self._to_kept = firsts[self._shape] - self._begins[-1] - np.cumsum([0, *moving])[:-1]
@@ -232,7 +232,7 @@ class Surfaces:
             own = np.flatnonzero(shapes == one)
             assert mesh.animation is not None
             vertex = mesh.faces[rows[own] - self._firsts[one]]
-            corners[own], moves = mesh.animation.at(frames[own], vertex)
+            corners[own], moves = mesh.animation.vertices_at(frames[own], vertex)
             speeds[own] = moves * rates[own, None, None]
             rest[own] = mesh.vertices[vertex]
         return corners, speeds, rest
@@ -276,7 +276,7 @@ class Surfaces:
                 on = moving[bent]
                 corners, _, rest = self._bent(rows[on], actor[bent], times[on], ways)
                 points[on] = applied(rest.transpose(0, 2, 1), _weights(corners, points[on]))
-        return self._lookup.at(rows, points)
+        return self._lookup.colours_at(rows, points)
 
     def velocities(
         self, triangle: Integers, points: Floats, times: Floats | Ints, ways: ActorTrajectories
@@ -306,7 +306,8 @@ class Surfaces:
     def _lookup(self) -> Lookup | None:
         """Colours of the triangles that are kept once; None if there are none."""
         bodies = self._kept
-        colours = joined([colours for _, _, colours in bodies], [len(f) for _, f, _ in bodies])
+        sizes = [len(faces) for _, faces, _ in bodies]
+        colours = join_colours([colours for _, _, colours in bodies], sizes)
         if colours is None:
             return None
         corners = (

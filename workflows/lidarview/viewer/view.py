@@ -26,7 +26,7 @@ from lidarsim.columns.cloud_file import CloudFile
 from lidarsim.columns.ply_format import AXES
 from lidarsim.columns.table import AXES as POSITION
 from lidarsim.columns.table import CAUSES, NO_SURFACE, OBJECT, TABLE, Column, X, Y, Z, by_value
-from lidarsim.scene.actors import Actor, samples_each, shapes_of
+from lidarsim.scene.actors import Actor, distinct_meshes, samples_per_actor
 from lidarsim.scene.colours import as_bytes
 from lidarsim.scene.scene import Scene
 from lidarsim.scene.simplified import simplified
@@ -290,7 +290,7 @@ class View:
 
     def _actor_arrays(self) -> dict[str, AnyArray]:
         """Meshes, with their poses if they deform, and where and in which pose each actor is."""
-        meshes, shapes = shapes_of(self.actors)
+        meshes, shapes = distinct_meshes(self.actors)
         arrays: dict[str, AnyArray] = {"actor_mesh": shapes.astype(np.int32)}  # no int64 in pages
         for k, mesh in enumerate(meshes):
             arrays[f"mesh{k}_corners"] = mesh.vertices[mesh.faces].astype(np.float32)
@@ -299,7 +299,7 @@ class View:
             if mesh.animation is not None:
                 arrays[f"mesh{k}_poses"] = mesh.animation.vertices.astype(np.float32)
                 arrays[f"mesh{k}_faces"] = mesh.faces.astype(np.int32)
-        each = samples_each(self.actors, PLACES_MOST)
+        each = samples_per_actor(self.actors, PLACES_MOST)
         for k, actor in enumerate(self.actors):
             times, places, turns = actor.samples(self.duration_ns, each)
             arrays |= {f"actor{k}_times": times / _NS, f"actor{k}_places": places}

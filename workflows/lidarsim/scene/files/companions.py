@@ -7,29 +7,31 @@ from urllib.parse import unquote
 
 from ...base.allowance import Allowance
 from ..masks import MaskError
-from .scene_graph import MeshFileError, Wanted
+from .scene_graph import MeshFileError, ReadOptions
 
 
-def named_file(mesh: Path, name: str, wanted: Wanted, *, moved: bool = True) -> Path | None:
-    """Find a file that a mesh file names; None if it is not there.
+def named_file(
+    mesh: Path, name: str, options: ReadOptions, *, allow_moved: bool = True
+) -> Path | None:
+    """Return the path of a file that a mesh file names, or None if the file does not exist.
 
     Names may be escaped, as URIs are by the standard but not by all programs, have backslashes, or
-    be of another machine: then their last part counts, if files may be `moved`. A pipe is no file,
-    because reading it would wait for ever.
+    be of another machine: then their last part counts, if `allow_moved`. A pipe does not count as
+    a file, since reading a pipe would wait for ever.
 
     Raises
     ------
     MeshFileError
-        If it is only in folders that are not allowed.
+        If the file is only in folders that are not allowed.
     """
     name = name.strip().removeprefix("file://")
     windows = PureWindowsPath(unquote(name))
     refused = False
-    last = windows.name if moved else ""
-    for one in filter(None, (name, unquote(name), windows.as_posix(), last)):
-        target = mesh.parent.resolve() / one
+    base_name = windows.name if allow_moved else ""
+    for candidate in filter(None, (name, unquote(name), windows.as_posix(), base_name)):
+        target = mesh.parent.resolve() / candidate
         try:
-            if not wanted.allows(target):
+            if not options.allows(target):
                 refused = True
             elif target.is_file():
                 return target
@@ -40,16 +42,16 @@ def named_file(mesh: Path, name: str, wanted: Wanted, *, moved: bool = True) -> 
     return None
 
 
-def image_file(mesh: Path, name: str, wanted: Wanted, allowance: Allowance) -> Path:
-    """Find an image that a mesh file names, as `named_file`, and count its bytes with the file's.
+def image_file(mesh: Path, name: str, options: ReadOptions, allowance: Allowance) -> Path:
+    """Return the path of an image that a mesh file names, and add its bytes to the allowance.
 
     Raises
     ------
     MaskError
-        If it is not there, or only in folders that are not allowed.
+        If the image does not exist, or is only in folders that are not allowed.
     """
     try:
-        file = named_file(mesh, name, wanted)
+        file = named_file(mesh, name, options)
     except MeshFileError as error:
         raise MaskError(str(error)) from error
     if file is None:
@@ -59,7 +61,7 @@ def image_file(mesh: Path, name: str, wanted: Wanted, allowance: Allowance) -> P
 
 
 def outside(name: str) -> str:
-    """Say that a file may not be read, as a clause."""
+    """Return a clause on a file that may not be read."""
     return (
         f"takes data from {name[-80:]!r}, but only files in its own folder are read: name a folder "
         "that holds that file as assets"

@@ -1,9 +1,9 @@
 """glTF 2.0 files, .glb and .gltf, after the specification by the Khronos Group (2021).
 
-This is not trimesh 5.2, which puts a node of several parents into one place, loses what hangs on a
-camera, ignores sparse and normalised positions, skins and required extensions, and reads neither
-fans nor files without scenes; nor assimp, which skips what it cannot read. Only triangles are read,
-and of materials where they are transparent, and their base colours.
+trimesh 5.2 is not used, since it places a node of several parents only once, loses the children of
+a camera, ignores sparse and normalised positions, skins and required extensions, and reads neither
+fans nor files without scenes; nor is assimp, which skips content that it cannot read. Only
+triangles are read, and masks and base colours of materials.
 """
 
 from __future__ import annotations
@@ -43,21 +43,21 @@ from ..masks import (
 )
 from ..scene_mesh import SceneMesh
 from .companions import image_file, named_file
-from .gltf_animation import WIDTHS, AnimatedNodes, chosen, keys_of, played
+from .gltf_animation import WIDTHS, AnimatedNodes, find_animation, keys_of, sample_channels
 from .polygons import check_corners, fanned, unrolled
 from .scene_graph import (
-    MOST_NODES,
+    MAX_NODES,
     SHORTER,
     SMALLER,
     Content,
     MeshFileError,
     Node,
     Piece,
-    Wanted,
-    baked,
-    instances,
-    joined,
-    settled,
+    ReadOptions,
+    bake_animation,
+    join_pieces,
+    placed_content,
+    placed_nodes,
 )
 
 # Extensions that do not change shapes, or that are supported here.
@@ -76,22 +76,22 @@ V = TypeVar("V")
 _WRAPS: dict[Any, Wrap] = {33071: "clamp", 33648: "mirror"}
 
 
-def read_gltf(data: bytes, path: Path, wanted: Wanted) -> Content:
-    """Read the default scene of a file, or all nodes if it has no scenes.
+def read_gltf(data: bytes, path: Path, options: ReadOptions) -> Content:
+    """Read the default scene of a file, or all nodes of a file without scenes.
 
-    Without masks, triangles are solid; without these and colours, no image is read.
+    Without the option masks, triangles are solid; without masks and colours, no image is read.
     """
     header, body = _chunks(data)
     _check(header)
-    reader = _Reader(header, body, path, len(data), wanted)
-    if wanted.animation is None:
-        content = settled(instances(_roots(header), reader.node, path.stem))
+    reader = _Reader(header, body, path, len(data), options)
+    if options.animation is None:
+        content = placed_content(placed_nodes(_roots(header), reader.node, path.stem))
     else:
-        content = reader.baked(wanted.animation)
+        content = reader.animated_content(options.animation)
     content.unit_m = 1.0
     content.up_axis = "y"
     content.turned = "as glTF asks"
-    content.notes = [*reader.notes.lines(), *reader.still()]
+    content.notes = [*reader.notes.lines(), *reader.motion_notes()]
     content.generator = str(header.get("asset", {}).get("generator", ""))
     return content
 
@@ -100,7 +100,7 @@ _OLD = "is glTF 1.0, which is not supported: convert it to glTF 2.0"
 
 
 def _chunks(data: bytes) -> tuple[dict[str, Any], bytes]:
-    """JSON object, and the binary buffer of a .glb."""
+    """Return the JSON object, and the binary buffer of a .glb."""
     body = b""
     if data[:4] == b"glTF" and len(data) >= 20:
         version, total, size = struct.unpack_from("<III", data, 4)
@@ -122,7 +122,7 @@ def _chunks(data: bytes) -> tuple[dict[str, Any], bytes]:
 
 
 def _check(header: dict[str, Any]) -> None:
-    """Refuse other versions, and extensions that cannot be read."""
+    """Check that a file is glTF 2.0 and requires no unknown extension; MeshFileError if not."""
     # Version 1.0 names parts, instead of numbering them.
     if str(header.get("asset", {}).get("version", "2")).startswith("1") or isinstance(
         header.get("nodes"), dict
@@ -134,7 +134,7 @@ def _check(header: dict[str, Any]) -> None:
 
 
 def _roots(header: dict[str, Any]) -> list[int]:
-    """Find the outermost nodes."""
+    """Return the indices of the outermost nodes."""
     nodes = header.get("nodes", ())
     if scenes := header.get("scenes"):
         return list(scenes[header.get("scene", 0)].get("nodes", ()))
@@ -143,7 +143,7 @@ def _roots(header: dict[str, Any]) -> list[int]:
 
 
 class _Reader:
-    """Nodes, meshes, accessors and buffers by their numbers, each read once."""
+    """Reader of nodes, meshes, accessors and buffers by their indices; each is read once."""
 
     def __init__(
         self,
@@ -151,157 +151,162 @@ class _Reader:
         body: bytes,
         path: Path,
         size: int,
-        wanted: Wanted,
+        options: ReadOptions,
     ) -> None:
         self._header = header
         self._body = body
         self._path = path
-        self._wanted = wanted
-        self._allowance = Allowance(size, SMALLER if wanted.animation is None else SHORTER)
-        self._same: dict[str, int] = {}  # {primitives of a mesh: the first with these}
+        self._options = options
+        self._allowance = Allowance(size, SMALLER if options.animation is None else SHORTER)
+        self._first_meshes: dict[str, int] = {}  # {primitives: first mesh with these primitives}
         nodes = header.get("nodes", ())
         self._parents = {
             child: index for index, node in enumerate(nodes) for child in node.get("children", ())
         }
-        self._bent = cache(self._read_bent)  # keys are (mesh, weights of its targets, skin)
-        self._mesh = cache(partial(self._read_bent, weights=(), skin=None))
+        self._posed = cache(self._read_posed)  # keys are (mesh, weights of its targets, skin)
+        self._mesh = cache(partial(self._read_posed, weights=(), skin=None))
         self._accessor = cache(self._read_accessor)
-        self._beside, self._buffer = cache(self._read_beside), cache(self._read_buffer)
-        self._texture, self._opacity = cache(self._read_texture), remembered(self._read_opacity)
+        self._buffer_file = cache(self._read_buffer_file)
+        self._buffer = cache(self._read_buffer)
+        self._texture = cache(self._read_texture)
+        self._opacity = remembered(self._read_opacity)
         self._mask = remembered(self._read_mask)
-        self._base, self._shades = remembered(self._read_base), remembered(self._read_shades)
+        self._base = remembered(self._read_base)
+        self._tinted = remembered(self._read_tinted)
         self.notes = MaskNotes()
         self._channels: AnimatedNodes = {}
         self._frame = 0
-        self._local, self._joints = cache(self._read_local), cache(self._read_joints)
-        self._worlds: dict[int, Floats] = {}  # {node: matrix to the scene}, of a frame
+        self._local = cache(self._read_local)
+        self._joints = cache(self._read_joints)
+        self._worlds: dict[int, Floats] = {}  # {node: matrix to the scene}, at the frame
 
-    def baked(self, name: str) -> Content:
-        """Read the scene with an animation, from its first key to its last."""
-        animation = chosen(self._header.get("animations", []), name)
+    def animated_content(self, name: str) -> Content:
+        """Read the scene with meshes animated by an animation, from its first key to its last."""
+        animation = find_animation(self._header.get("animations", []), name)
         first, last = keys_of(animation, self._accessor)
         count = max(1, math.ceil((last - first) * RATE_HZ))
         self._allowance.take(32 * (count + 1) * (1 + len(animation["channels"])))
         times_s = np.linspace(first, last, count + 1)
-        return baked(self._poses(animation, times_s), times_s.tolist(), self._allowance)
+        return bake_animation(self._poses(animation, times_s), times_s.tolist(), self._allowance)
 
     def _poses(self, animation: dict[str, Any], times_s: Floats) -> Generator[Content]:
-        """Content at each time of an animation, in colours at the first."""
-        self._channels = played(animation, times_s, self._accessor)
+        """Yield the content at each time of an animation; only the first has colours."""
+        self._channels = sample_channels(animation, times_s, self._accessor)
         if not self._channels:
             raise MeshFileError("has an animation that moves no node: choose another")
         for index, _ in self._channels:
             self._part("nodes", index)
         roots = _roots(self._header)
         for self._frame in range(len(times_s)):
-            for kept in (self._local, self._joints, self._bent):  # of the frame before
-                kept.cache_clear()
+            for cached in (self._local, self._joints, self._posed):  # hold the previous frame
+                cached.cache_clear()
             self._worlds.clear()
-            yield settled(instances(roots, self.node, self._path.stem), copy_all=True)
-            self._wanted = self._wanted._replace(colours=False)
+            yield placed_content(placed_nodes(roots, self.node, self._path.stem), copy_all=True)
+            self._options = self._options._replace(colours=False)
 
     def _read_local(self, index: int) -> Floats:
-        """Matrix (4, 4) of a node, at the frame of the animation if there is one."""
+        """Return the matrix (4, 4) of a node, at the frame of the animation, if any."""
         node = self._part("nodes", index)
-        moved = {
-            what: self._channels[index, what][self._frame]
-            for what in WIDTHS
-            if (index, what) in self._channels
+        animated = {
+            path: self._channels[index, path][self._frame]
+            for path in WIDTHS
+            if (index, path) in self._channels
         }
-        if moved and "matrix" in node:
+        if animated and "matrix" in node:
             raise ValueError(f"node {index} is animated, and has a matrix")
-        return _matrix({**node, **moved})
+        return _matrix({**node, **animated})
 
     def _part(self, kind: str, index: Any) -> dict[str, Any]:
-        """Part of the file by its number; a negative one would count from the end."""
+        """Return a part of the file by its index; ValueError for a negative index."""
         part: dict[str, Any] = self._header[kind][_natural(index)]
         return part
 
     def node(self, index: int) -> Node:
-        """Node `index`; without a name it gets that of its mesh."""
-        found = self._part("nodes", index)
-        name = str(found.get("name") or "")
+        """Return a node; a node without a name gets the name of its mesh."""
+        data = self._part("nodes", index)
+        name = str(data.get("name") or "")
         meshes = list[SceneMesh]()
         copies = None
-        if "mesh" in found:
-            name = name or str(self._part("meshes", found["mesh"]).get("name") or "")
+        if "mesh" in data:
+            name = name or str(self._part("meshes", data["mesh"]).get("name") or "")
             # Some programs write a mesh for each node, all of the same accessors.
-            content = json.dumps(self._part("meshes", found["mesh"])["primitives"], sort_keys=True)
-            skin = found.get("skin")
-            weights = self._weights(index, found)
+            content = json.dumps(self._part("meshes", data["mesh"])["primitives"], sort_keys=True)
+            skin = data.get("skin")
+            weights = self._weights(index, data)
             if skin is None and not any(weights):
-                meshes = self._mesh(self._same.setdefault(content, found["mesh"]))
+                meshes = self._mesh(self._first_meshes.setdefault(content, data["mesh"]))
             else:
-                meshes = self._bent(found["mesh"], weights, skin)
-            if instancing := found.get("extensions", {}).get(_INSTANCING):
+                meshes = self._posed(data["mesh"], weights, skin)
+            if instancing := data.get("extensions", {}).get(_INSTANCING):
                 copies = self._copies(instancing.get("attributes", {}))
-        children = found.get("children", ())
-        skinned = "skin" in found
+        children = data.get("children", ())
+        skinned = "skin" in data
         return Node(name, self._local(index), meshes, children, copies, skinned)
 
     def _copies(self, attributes: dict[str, Any]) -> Floats | None:
-        """Matrices (k, 4, 4) of the copies of a node's mesh; None if it has one place."""
-        named = ("TRANSLATION", "ROTATION", "SCALE")
-        indices = {name: attributes[name] for name in named if name in attributes}
+        """Return matrices (k, 4, 4) of the copies of a node's mesh, or None without copies."""
+        names = ("TRANSLATION", "ROTATION", "SCALE")
+        indices = {name: attributes[name] for name in names if name in attributes}
         if not indices:
             return None
-        counts = [_natural(self._part("accessors", at)["count"]) for at in indices.values()]
+        counts = [_natural(self._part("accessors", index)["count"]) for index in indices.values()]
         if len({*counts}) > 1:
             raise ValueError(f"the attributes of {_INSTANCING} have {counts} rows")
-        if counts[0] > MOST_NODES:
+        if counts[0] > MAX_NODES:
             raise MeshFileError(
-                f"places a mesh {counts[0]:,} times by {_INSTANCING}, of at most {MOST_NODES:,}: "
+                f"places a mesh {counts[0]:,} times by {_INSTANCING}, of at most {MAX_NODES:,}: "
                 "export it in parts"
             )
         self._allowance.take(2 * 128 * counts[0])
-        rows = {name: self._accessor(at).astype(np.float64) for name, at in indices.items()}
-        return _matrices(*(rows.get(name) for name in named))
+        rows = {name: self._accessor(index).astype(np.float64) for name, index in indices.items()}
+        return _matrices(*(rows.get(name) for name in names))
 
-    def still(self) -> list[str]:
-        """Return a note on what moves in the file, and stands still here."""
-        bent = self._bent.cache_info().currsize
-        found = len(self._header.get("animations", ()))
-        meshes = f", of {plural(bent, 'bent mesh', 'bent meshes')}" * bool(bent)
+    def motion_notes(self) -> list[str]:
+        """Return notes on animations that are not played, or on masks of an animated scene."""
+        posed_count = self._posed.cache_info().currsize
+        animation_count = len(self._header.get("animations", ()))
+        meshes = f", of {plural(posed_count, 'bent mesh', 'bent meshes')}" * bool(posed_count)
         if self._channels:
-            cut = any(m.get("alphaMode") in _CUT for m in self._header.get("materials", ()))
-            return ["is animated, so it is solid where its images are transparent"] * cut
-        if not found:
+            has_masks = any(m.get("alphaMode") in _CUT for m in self._header.get("materials", ()))
+            return ["is animated, so it is solid where its images are transparent"] * has_masks
+        if not animation_count:
             return []
-        told = "all stands still; actors move by animation: NAME"
-        return [f"has {plural(found, 'animation')}{meshes}: {told}"]
+        advice = "all stands still; actors move by animation: NAME"
+        return [f"has {plural(animation_count, 'animation')}{meshes}: {advice}"]
 
     def _weights(self, index: int, node: dict[str, Any]) -> tuple[float, ...]:
-        """Weights of the morph targets of a node's mesh."""
+        """Return the weights of the morph targets of a node's mesh."""
         mesh = self._part("meshes", node["mesh"])
         if not any("targets" in primitive for primitive in mesh["primitives"]):
             return ()
-        if (moved := self._channels.get((index, "weights"))) is not None:
-            if moved.shape[1] not in [len(one.get("targets", ())) for one in mesh["primitives"]]:
-                raise ValueError(f"node {index} has {moved.shape[1]} animated weights")
-            return tuple(moved[self._frame].tolist())
+        if (animated := self._channels.get((index, "weights"))) is not None:
+            counts = [len(primitive.get("targets", ())) for primitive in mesh["primitives"]]
+            if animated.shape[1] not in counts:
+                raise ValueError(f"node {index} has {animated.shape[1]} animated weights")
+            return tuple(animated[self._frame].tolist())
         return tuple(map(float, node.get("weights", mesh.get("weights", ()))))
 
     def _world(self, index: int) -> Floats:
-        """Matrix (4, 4) from a node's coordinates to those of the scene."""
+        """Return the matrix (4, 4) from a node's coordinates to the scene's."""
         path = [index]
         worlds = self._worlds
         while path[-1] not in worlds and path[-1] in self._parents:
             path.append(self._parents[path[-1]])
             if len(path) > len(self._parents) + 1:
                 raise ValueError("nodes contain each other")
-        for at in reversed(path):
-            if at not in worlds:
-                own = self._local(at)
-                above = self._parents.get(at)
-                worlds[at] = own if above is None else matmul(worlds[above], own)
+        for node in reversed(path):
+            if node not in worlds:
+                local = self._local(node)
+                parent = self._parents.get(node)
+                worlds[node] = local if parent is None else matmul(worlds[parent], local)
         return worlds[index]
 
-    def _read_bent(
+    def _read_posed(
         self, index: int, weights: tuple[float, ...], skin: int | None
     ) -> list[SceneMesh]:
-        """Return a mesh with its morph targets; of a skin, in the coordinates of the scene.
+        """Return a mesh with morph targets applied; with a skin, in the scene's coordinates.
 
-        Its primitives, which differ by material only, are one.
+        All primitives, which differ by material only, are joined.
         """
         mesh = self._part("meshes", index)
         surfaces = [p for p in mesh["primitives"] if p.get("mode", 4) >= 4]
@@ -309,54 +314,59 @@ class _Reader:
         joints = None if skin is None else self._joints(skin)
 
         def piece(primitive: dict[str, Any]) -> Piece:
-            made = self._primitive(primitive)
-            if not len(made.faces) or (joints is None and not any(weights)):
-                return made
+            unposed = self._primitive(primitive)
+            if not len(unposed.faces) or (joints is None and not any(weights)):
+                return unposed
             if _DRACO in primitive.get("extensions", {}):
                 raise MeshFileError(f"bends what is packed with {_DRACO}: export it without")
-            self._allowance.take(600 * len(made.vertices))  # of matrices and points, for a time
-            vertices = made.vertices.astype(np.float64)
+            self._allowance.take(600 * len(unposed.vertices))  # of temporary matrices and points
+            vertices = unposed.vertices.astype(np.float64)
             for weight, target in zip(weights, primitive.get("targets", ()), strict=False):
                 if weight and "POSITION" in target:
                     vertices += weight * self._accessor(target["POSITION"])
             if joints is not None:
                 vertices = self._skinned(vertices, primitive["attributes"], joints)
-            return made._replace(vertices=vertices)
+            return unposed._replace(vertices=vertices)
 
-        return joined(name, map(piece, surfaces), self._allowance)
+        return join_pieces(name, map(piece, surfaces), self._allowance)
 
     def _read_joints(self, skin: int) -> Floats:
-        """Matrices (j, 4, 4) of a skin's joints, from its mesh to the scene; glTF 2.0, 3.7.3."""
-        found = self._part("skins", skin)
-        if not found.get("joints"):
+        """Return matrices (j, 4, 4) of a skin's joints, from mesh to scene; glTF 2.0, 3.7.3."""
+        skin_data = self._part("skins", skin)
+        if not skin_data.get("joints"):
             raise MeshFileError("has a skin without joints: export it again, or without the skin")
-        worlds = np.array([self._world(joint) for joint in found["joints"]])
-        if (bound := found.get("inverseBindMatrices")) is not None:
-            columns = self._accessor(bound).astype(np.float64)[: len(worlds)]
+        worlds = np.array([self._world(joint) for joint in skin_data["joints"]])
+        if (inverse := skin_data.get("inverseBindMatrices")) is not None:
+            columns = self._accessor(inverse).astype(np.float64)[: len(worlds)]
             worlds = matmul(worlds, columns.reshape(len(worlds), 4, 4).transpose(0, 2, 1))
         return worlds
 
-    def _skinned(self, vertices: Floats, at: dict[str, Any], joints: Floats) -> Floats:
-        """Blend places of vertices (v, 3) by the joints that hold them."""
+    def _skinned(self, vertices: Floats, attributes: dict[str, Any], joints: Floats) -> Floats:
+        """Return vertices (v, 3) moved by the weighted joints (j, 4, 4) of each vertex."""
         blend = np.zeros((len(vertices), 4, 4))
         total = np.zeros(len(vertices))
-        sets = (name.removeprefix("JOINTS") for name in sorted(at) if name.startswith("JOINTS_"))
+        sets = (
+            name.removeprefix("JOINTS") for name in sorted(attributes) if name.startswith("JOINTS_")
+        )
         for number in sets:
-            rows = self._accessor(at[f"JOINTS{number}"]).astype(np.int64)
-            weights = self._accessor(at[f"WEIGHTS{number}"]).astype(np.float64)
+            rows = self._accessor(attributes[f"JOINTS{number}"]).astype(np.int64)
+            weights = self._accessor(attributes[f"WEIGHTS{number}"]).astype(np.float64)
             for joint, weight in zip(rows.T, weights.T, strict=True):
                 if joint.max(initial=0) >= len(joints):
                     raise ValueError(f"a vertex has joint {joint.max()} of {len(joints)}")
                 blend += weight[:, None, None] * joints[joint]
                 total += weight
-        loose = np.flatnonzero(total <= 0)  # other readers give these to their first joint
-        blend[loose] = joints[self._accessor(at["JOINTS_0"])[loose, 0].astype(np.int64)]
-        total[loose] = 1.0
+        unweighted = np.flatnonzero(total <= 0)  # other readers move these by the first joint
+        blend[unweighted] = joints[
+            self._accessor(attributes["JOINTS_0"])[unweighted, 0].astype(np.int64)
+        ]
+        total[unweighted] = 1.0
         blend /= total[:, None, None]
         moved = applied(blend[:, :3, :3], vertices) + blend[:, :3, 3]
         return np.asarray(moved)
 
     def _primitive(self, primitive: dict[str, Any]) -> Piece:
+        """Return the triangles of a primitive, with mask, colours and material."""
         position = primitive["attributes"].get("POSITION")
         index = primitive.get("indices")
         packed = primitive.get("extensions", {}).get(_DRACO)
@@ -366,7 +376,7 @@ class _Reader:
             mesh = _unpacked(bytes(self._view(packed["bufferView"])), self._allowance)
             vertices = np.asarray(mesh.points).reshape(-1, 3)
             faces = np.asarray(mesh.faces, np.int64).reshape(-1, 3)
-            return self._dressed(Piece(vertices, faces), primitive, mesh)
+            return self._with_material(Piece(vertices, faces), primitive, mesh)
         vertices = self._accessor(position)
         mode = primitive.get("mode", 4)
         # The corners, and the triangles of strips and fans, before they are checked.
@@ -379,19 +389,19 @@ class _Reader:
             faces = corners[: len(corners) // 3 * 3].reshape(-1, 3)
         else:
             faces = unrolled(corners) if mode == 5 else fanned(corners)
-        return self._dressed(Piece(vertices, faces), primitive)
+        return self._with_material(Piece(vertices, faces), primitive)
 
-    def _dressed(self, piece: Piece, primitive: dict[str, Any], mesh: Any = None) -> Piece:
-        """Return a piece with mask, colours and material; `mesh` is unpacked by Draco."""
-        if self._wanted.materials and (number := primitive.get("material")) is not None:
+    def _with_material(self, piece: Piece, primitive: dict[str, Any], mesh: Any = None) -> Piece:
+        """Return a piece with mask, colours and material; `mesh` is the mesh unpacked by Draco."""
+        if self._options.materials and (number := primitive.get("material")) is not None:
             piece = piece._replace(material=self._material_name(number))
-        if self._wanted.colours and len(piece.faces):
+        if self._options.colours and len(piece.faces):
             with self.notes.without_colour(self._material_name(primitive.get("material"))):
-                piece = piece._replace(colours=self._coloured(primitive, piece.faces, mesh))
-        return self._cut(piece, primitive, mesh)
+                piece = piece._replace(colours=self._face_colours(primitive, piece.faces, mesh))
+        return self._with_mask(piece, primitive, mesh)
 
-    def _coloured(self, primitive: dict[str, Any], faces: Ints, mesh: Any) -> Colours | None:
-        """Colours of triangles; None if they have none."""
+    def _face_colours(self, primitive: dict[str, Any], faces: Ints, mesh: Any) -> Colours | None:
+        """Return the colours of a primitive's triangles, or None."""
         number = primitive.get("material")
         corners = None
         colours = None
@@ -413,43 +423,48 @@ class _Reader:
         return colours and replace(colours, corners=corners)
 
     def _read_base(self, number: int) -> tuple[Texture | Bytes, dict[str, Any]]:
-        """Return the texture of a material's base colour, and its use, or one colour (1, 1, 3)."""
+        """Return the texture of a material's base colour and its texture info.
+
+        The base colour of a material without a texture is a plain colour (1, 1, 3).
+        """
         material = self._part("materials", number)
         info, factor = _base_of(material)
-        light = tuple(float(np.clip(one, 0, 1)) for one in factor[:3])
+        light = tuple(float(np.clip(component, 0, 1)) for component in factor[:3])
         if len(light) < 3:
             raise MaskError("its factor is not red, green and blue")
         if info is None:
             return as_srgb(light).reshape(1, 1, 3), {}
         texture = self._part("textures", info["index"])
-        return self._shades((_image_of(texture), light, *self._wraps(texture))), info
+        return self._tinted((_image_of(texture), light, *self._wraps(texture))), info
 
-    def _read_shades(self, key: tuple[int, tuple[float, ...], Wrap, Wrap]) -> Texture:
-        """Texture of an image, by which a colour is multiplied, and how it goes on."""
-        image, light, along, across = key
-        found = self._image(image, partial(read_colours, notes=self.notes))
+    def _read_tinted(self, key: tuple[int, tuple[float, ...], Wrap, Wrap]) -> Texture:
+        """Return the texture of a tinted image; keys are (image, linear tint, wraps)."""
+        image, light, wrap_u, wrap_v = key
+        colours = self._image(image, partial(read_colours, notes=self.notes))
         if light != (1.0, 1.0, 1.0):
             scaled = [as_srgb(LINEAR * share) for share in light]
-            found = np.stack([by[found[..., k]] for k, by in enumerate(scaled)], axis=-1)
-        return Texture(found, (along, across), self._allowance)
+            colours = np.stack([table[colours[..., k]] for k, table in enumerate(scaled)], axis=-1)
+        return Texture(colours, (wrap_u, wrap_v), self._allowance)
 
     def _wraps(self, texture: dict[str, Any]) -> tuple[Wrap, Wrap]:
+        """Return the continuation of a texture beyond its edges, along u and along v."""
         sampler = self._part("samplers", texture["sampler"]) if "sampler" in texture else {}
-        along, across = (_WRAPS.get(sampler.get(name), "repeat") for name in ("wrapS", "wrapT"))
-        return along, across
+        wrap_u, wrap_v = (_WRAPS.get(sampler.get(name), "repeat") for name in ("wrapS", "wrapT"))
+        return wrap_u, wrap_v
 
-    def _cut(self, piece: Piece, primitive: dict[str, Any], mesh: Any) -> Piece:
+    def _with_mask(self, piece: Piece, primitive: dict[str, Any], mesh: Any) -> Piece:
         """Return a piece with the mask of its material."""
         number = primitive.get("material")
-        if number is not None and self._wanted.masks and len(piece.faces):
-            with self.notes.instead(self._material_name(number)):
-                if found := self._texture(number):
-                    texture, info = found
+        if number is not None and self._options.masks and len(piece.faces):
+            with self.notes.without_mask(self._material_name(number)):
+                if mask := self._texture(number):
+                    texture, info = mask
                     uv = self._coordinates(info, primitive, mesh)
                     piece = piece._replace(cutout=texture.cutout(uv, piece.faces))
         return piece
 
     def _material_name(self, number: Any) -> str:
+        """Return the name of a material, or "material 3" for a material without a name."""
         try:
             name = str(self._part("materials", number).get("name") or "")
         except (ValueError, KeyError, IndexError, TypeError, AttributeError):
@@ -457,7 +472,7 @@ class _Reader:
         return name[:80] or f"material {str(number)[:20]}"
 
     def _read_texture(self, number: int) -> tuple[Texture, dict[str, Any]] | None:
-        """Texture of a material, and its use of it; None if the material is solid."""
+        """Return the mask of a material and its texture info; None for a solid material."""
         material = self._part("materials", number)
         mode = material.get("alphaMode", "OPAQUE")
         if mode not in _CUT:
@@ -467,59 +482,59 @@ class _Reader:
         info, factor = _base_of(material)
         cutoff = material.get("alphaCutoff", 0.5) if mode == "MASK" else 0.5
         passing = np.flatnonzero(np.arange(256) / 255 * factor[3] >= cutoff)
-        least = int(passing[0]) if len(passing) else 256
+        min_alpha = int(passing[0]) if len(passing) else 256
         texture = {} if info is None else self._part("textures", info["index"])
         image = -1 if info is None else _image_of(texture)
         opacity = None if info is None else self._opacity(image)
-        if info is None or opacity is None or (mode == "BLEND" and opacity.max() < least):
-            if least > 255 or opacity is not None:
+        if info is None or opacity is None or (mode == "BLEND" and opacity.max() < min_alpha):
+            if min_alpha > 255 or opacity is not None:
                 self.notes.glass[self._material_name(number)] = None
             return None
-        if opacity.min() >= least:
+        if opacity.min() >= min_alpha:
             return None
-        return self._mask((image, least, *self._wraps(texture))), info
+        return self._mask((image, min_alpha, *self._wraps(texture))), info
 
     def _read_mask(self, key: tuple[int, int, Wrap, Wrap]) -> Texture:
-        """Texture of an image, its least alpha that stops light, and how it goes on."""
-        image, least, along, across = key
+        """Return the mask of an image; keys are (image, least alpha that stops light, wraps)."""
+        image, min_alpha, wrap_u, wrap_v = key
         opacity = self._opacity(image)
         assert opacity is not None
-        return Texture(opacity >= least, (along, across), self._allowance)
+        return Texture(opacity >= min_alpha, (wrap_u, wrap_v), self._allowance)
 
     def _read_opacity(self, index: int) -> Bytes | None:
-        """Opacity of an image; None if it is opaque everywhere."""
+        """Return the opacity of an image; None for an opaque image."""
         return self._image(index, read_opacity)
 
     def _image(self, index: int, read: Callable[[Path | bytes, Allowance], V]) -> V:
-        """Decode an image."""
+        """Return an image, decoded by `read`."""
         image = self._part("images", index)
         if "bufferView" in image:
             return read(bytes(self._view(image["bufferView"])), self._allowance)
         uri = image["uri"]
         if uri.startswith("data:"):
             return read(_inline(uri), self._allowance)
-        return read(image_file(self._path, uri, self._wanted, self._allowance), self._allowance)
+        return read(image_file(self._path, uri, self._options, self._allowance), self._allowance)
 
     def _coordinates(self, info: dict[str, Any], primitive: dict[str, Any], mesh: Any) -> Any:
-        """Texture coordinates (v, 2) of a primitive."""
-        moved = _extension(info, "KHR_texture_transform")
-        name = f"TEXCOORD_{moved.get('texCoord', info.get('texCoord', 0))}"
+        """Return the texture coordinates (v, 2) of a primitive for a texture info."""
+        transform = _extension(info, "KHR_texture_transform")
+        name = f"TEXCOORD_{transform.get('texCoord', info.get('texCoord', 0))}"
         if name not in primitive["attributes"]:
             raise MaskError("texture coordinates are missing")
         uv = self._attribute(name, primitive, mesh)
         if uv.shape[1] != 2:
             raise MaskError("its texture coordinates are not pairs")
-        if moved:
-            # Of KHR_texture_transform: scaled, rotated anticlockwise as v grows down, moved.
-            turn = float(moved.get("rotation", 0))
-            s, c = sin_cos_of(turn)
+        if transform:
+            # KHR_texture_transform scales, rotates anticlockwise as v grows down, then moves.
+            angle = float(transform.get("rotation", 0))
+            s, c = sin_cos_of(angle)
             self._allowance.take(32 * len(uv))
-            uv = uv * np.array(moved.get("scale", (1, 1)), np.float64)
-            uv = matmul(uv, [[c, -s], [s, c]]) + np.array(moved.get("offset", (0, 0)))
+            uv = uv * np.array(transform.get("scale", (1, 1)), np.float64)
+            uv = matmul(uv, [[c, -s], [s, c]]) + np.array(transform.get("offset", (0, 0)))
         return uv
 
     def _attribute(self, name: str, primitive: dict[str, Any], mesh: Any) -> AnyArray:
-        """Numbers (v, width) of the vertices of a primitive."""
+        """Return an attribute (v, width) of the vertices of a primitive."""
         accessor = primitive["attributes"][name]
         if mesh is None:
             return self._accessor(accessor)
@@ -529,7 +544,7 @@ class _Reader:
         return self._normalised(rows) if normal else rows
 
     def _read_accessor(self, index: int) -> AnyArray:
-        """Numbers (count, width) of an accessor; those of a buffer are not copied."""
+        """Return the numbers (count, width) of an accessor, if possible without a copy."""
         accessor = self._part("accessors", index)
         count = _natural(accessor["count"])
         width = _WIDTHS[accessor["type"]]
@@ -546,24 +561,24 @@ class _Reader:
         if sparse:
             changed = sparse["indices"]
             values = sparse["values"]
-            where = np.dtype(_TYPES[changed["componentType"]])
-            rows = self._array(changed, where, sparse["count"], 1)[:, 0]
+            index_type = np.dtype(_TYPES[changed["componentType"]])
+            rows = self._array(changed, index_type, sparse["count"], 1)[:, 0]
             numbers = numbers.copy()
             numbers[rows] = self._array(values, kind, sparse["count"], width)
         return self._normalised(numbers) if accessor.get("normalized") else numbers
 
     def _normalised(self, numbers: AnyArray) -> AnyArray:
-        """Fractions that integers stand for; glTF 2.0, 3.6.2.2."""
+        """Return the fractions that integers encode; glTF 2.0, 3.6.2.2."""
         if numbers.dtype.kind not in "iu":
             return numbers
         self._allowance.take(8 * numbers.size)
         return np.maximum(numbers / np.iinfo(numbers.dtype).max, -1.0)
 
-    def _array(self, at: dict[str, Any], kind: np.dtype[Any], count: int, width: int) -> Any:
-        """Numbers (count, width) of a buffer view, from `at['byteOffset']` on."""
+    def _array(self, part: dict[str, Any], kind: np.dtype[Any], count: int, width: int) -> Any:
+        """Return numbers (count, width) of a buffer view, from `part['byteOffset']` on."""
         row = kind.itemsize * width
-        stride = self._part("bufferViews", at["bufferView"]).get("byteStride", row)
-        view = self._view(at["bufferView"])[at.get("byteOffset", 0) :]
+        stride = self._part("bufferViews", part["bufferView"]).get("byteStride", row)
+        view = self._view(part["bufferView"])[part.get("byteOffset", 0) :]
         if not count:
             return np.empty((0, width), kind)
         if stride * (count - 1) + row > len(view):
@@ -571,11 +586,13 @@ class _Reader:
         return np.ndarray((count, width), kind, view, strides=(stride, kind.itemsize))
 
     def _view(self, index: int) -> memoryview:
+        """Return the bytes of a buffer view."""
         view = self._part("bufferViews", index)
-        begin = view.get("byteOffset", 0)
-        return memoryview(self._buffer(view["buffer"]))[begin : begin + view["byteLength"]]
+        start = view.get("byteOffset", 0)
+        return memoryview(self._buffer(view["buffer"]))[start : start + view["byteLength"]]
 
     def _read_buffer(self, index: int) -> bytes:
+        """Return the bytes of a buffer, of the file itself, a data URI or a further file."""
         buffer = self._part("buffers", index)
         uri = buffer.get("uri")
         if uri is None:
@@ -585,7 +602,7 @@ class _Reader:
         elif uri.startswith("data:"):
             content = _inline(uri)
         else:
-            content = self._beside(uri)
+            content = self._buffer_file(uri)
         if len(content) < buffer["byteLength"]:
             raise MeshFileError(
                 f"takes {buffer['byteLength']:,} bytes from {uri[:80] if uri else 'itself'!r}, "
@@ -593,9 +610,9 @@ class _Reader:
             )
         return content
 
-    def _read_beside(self, uri: str) -> bytes:
-        """Read a buffer file."""
-        target = named_file(self._path, uri, self._wanted, moved=False)
+    def _read_buffer_file(self, uri: str) -> bytes:
+        """Return the bytes of a buffer file."""
+        target = named_file(self._path, uri, self._options, allow_moved=False)
         if target is None:
             raise MeshFileError(
                 f"takes data from {uri[:80]!r}, a file that is not there: put it beside, or export "
@@ -606,19 +623,20 @@ class _Reader:
 
 
 def _inline(uri: str) -> bytes:
-    """Content of a data URI."""
+    """Return the content of a data URI."""
     kind, _, text = uri.partition(",")
     content = unquote_to_bytes(text)
     return base64.b64decode(content) if kind.endswith(";base64") else content
 
 
 def _extension(part: dict[str, Any], name: str) -> dict[str, Any]:
-    found: dict[str, Any] = part.get("extensions", {}).get(name, {})
-    return found
+    """Return the data of an extension of a part, or {}."""
+    extension: dict[str, Any] = part.get("extensions", {}).get(name, {})
+    return extension
 
 
 def _base_of(material: dict[str, Any]) -> tuple[dict[str, Any] | None, Sequence[float]]:
-    """Use of the texture of a material's base colour, if it has one, and its factors."""
+    """Return the texture info of a material's base colour, or None, and the colour's factors."""
     usual = material.get("pbrMetallicRoughness", {})
     glossy = _extension(material, _GLOSSY)
     info = usual.get("baseColorTexture") or glossy.get("diffuseTexture")
@@ -626,7 +644,7 @@ def _base_of(material: dict[str, Any]) -> tuple[dict[str, Any] | None, Sequence[
 
 
 def _image_of(texture: dict[str, Any]) -> int:
-    """Return the number of a texture's image, of those in formats that can be read."""
+    """Return the index of a texture's image in a format that can be read."""
     index = texture.get("source", _extension(texture, "EXT_texture_webp").get("source"))
     if index is None:
         raise MaskError("its image is in a format that cannot be read")
@@ -634,22 +652,22 @@ def _image_of(texture: dict[str, Any]) -> int:
 
 
 def _natural(number: Any) -> int:
-    """Check a count or an index; a negative index would count from the end."""
+    """Return a count or an index; ValueError for a negative number or no integer."""
     if type(number) is not int or number < 0:
         raise ValueError(f"{number!r} is given as an index or a count")
     return number
 
 
 def _matrix(node: dict[str, Any]) -> Floats:
-    """Matrix (4, 4) of a node, from its columns or from translation, rotation and scale."""
+    """Return the matrix (4, 4) of a node: of columns, or of translation, rotation and scale."""
     if "matrix" in node:
         return np.array(node["matrix"], np.float64).reshape(4, 4).T
     rows = (
         np.array([node[name]], np.float64) if name in node else None
         for name in ("translation", "rotation", "scale")
     )
-    made = _matrices(*rows)
-    return np.eye(4) if made is None else made[0]
+    transforms = _matrices(*rows)
+    return np.eye(4) if transforms is None else transforms[0]
 
 
 def _matrices(
@@ -657,23 +675,23 @@ def _matrices(
     rotation: Floats | None,
     scale: Floats | None,
 ) -> Floats | None:
-    """Matrices (k, 4, 4) of translations (k, 3), quaternions (k, 4) and scales (k, 3)."""
-    rows = next((one for one in (translation, rotation, scale) if one is not None), None)
+    """Return matrices (k, 4, 4) from translations (k, 3), quaternions (k, 4) and scales (k, 3)."""
+    rows = next((part for part in (translation, rotation, scale) if part is not None), None)
     if rows is None:
         return None
-    out = np.tile(np.eye(4), (len(rows), 1, 1))
+    transforms = np.tile(np.eye(4), (len(rows), 1, 1))
     if rotation is not None:
         unit = rotation / length(rotation)[:, None]
-        out[:, :3, :3] = matrices(unit)
+        transforms[:, :3, :3] = matrices(unit)
     if scale is not None:
-        out[:, :3, :3] *= scale[:, None]
+        transforms[:, :3, :3] *= scale[:, None]
     if translation is not None:
-        out[:, :3, 3] = translation
-    return out
+        transforms[:, :3, 3] = translation
+    return transforms
 
 
 def _unpacked(data: bytes, allowance: Allowance) -> Any:
-    """Mesh that is packed with Draco."""
+    """Return a mesh that is packed with Draco."""
     try:
         import DracoPy
     except ImportError as error:
@@ -685,9 +703,9 @@ def _unpacked(data: bytes, allowance: Allowance) -> Any:
 
 
 def _draco_counts(data: bytes) -> tuple[int, int]:
-    """Two counts of faces and vertices that a Draco mesh announces, as its format 2.2 stores them.
+    """Return the numbers of faces and vertices that a Draco mesh of format 2.2 announces.
 
-    The decoder makes them all, though a few bytes can stand for any number.
+    The decoder allocates as many, though a few bytes can announce any number.
     """
     magic, version, kind, method, flags = struct.unpack_from("<5sHBBH", data)
     if magic != b"DRACO" or kind != 1 or method > 1:
@@ -696,10 +714,11 @@ def _draco_counts(data: bytes) -> tuple[int, int]:
         raise MeshFileError(
             "has Draco data of another version than 2.2, or with metadata: export it again"
         )
-    # Numbers of seven bits a byte, the least first; the second method has a byte more before them.
+    # Numbers of seven bits a byte, lowest first; the second method has a byte more before these.
     first, second = re.findall(rb"(?s)[\x80-\xff]*[\0-\x7f]", data[11 + method : 31])[:2]
     return _varint(first), _varint(second)
 
 
 def _varint(data: bytes) -> int:
-    return sum((byte & 0x7F) << 7 * at for at, byte in enumerate(data))
+    """Return a number stored as seven bits a byte, lowest first."""
+    return sum((byte & 0x7F) << 7 * position for position, byte in enumerate(data))

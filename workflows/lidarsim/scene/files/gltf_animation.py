@@ -1,4 +1,4 @@
-"""Animations of glTF 2.0: what samplers say at a time (specification, 3.11 and appendix C)."""
+"""Animations of glTF 2.0: values of samplers at times (specification, 3.11 and appendix C)."""
 
 from __future__ import annotations
 
@@ -13,41 +13,60 @@ from ...base.vectors import length
 from ...base.words import did_you_mean
 from .scene_graph import MeshFileError
 
-WIDTHS = {"translation": 3, "rotation": 4, "scale": 3}  # numbers of a node; the rest are weights
+# {path of a target: numbers of its value}; further paths are weights.
+WIDTHS = {"translation": 3, "rotation": 4, "scale": 3}
 _VALUES = {"LINEAR": 1, "STEP": 1, "CUBICSPLINE": 3}  # {interpolation: values of a key}
 
-AnimatedNodes = dict[tuple[int, str], Floats]  # {(node, what): its values at each time, (t, width)}
+AnimatedNodes = dict[tuple[int, str], Floats]  # {(node, path): values at each time, (t, width)}
 
 
-def chosen(animations: list[dict[str, Any]], name: str) -> dict[str, Any]:
-    """Return the animation of a name, or of a number for those without names; "" for the first."""
-    names = [str(one.get("name") or number) for number, one in enumerate(animations)]
+def find_animation(animations: list[dict[str, Any]], name: str) -> dict[str, Any]:
+    """Return the animation of a name, or of a number for a nameless animation; "" for the first.
+
+    Raises
+    ------
+    MeshFileError
+        If there is no such animation.
+    """
+    names = [str(animation.get("name") or number) for number, animation in enumerate(animations)]
     if not names:
         raise MeshFileError("has no animations: export it with them, or leave out animation")
     if name and name not in names:
-        near = did_you_mean(name, names).strip() or f"there are {', '.join(names[:8])}"
-        raise MeshFileError(f"has no animation {name!r} ({near})")
+        hint = did_you_mean(name, names).strip() or f"there are {', '.join(names[:8])}"
+        raise MeshFileError(f"has no animation {name!r} ({hint})")
     return animations[names.index(name) if name else 0]
 
 
 def keys_of(animation: Mapping[str, Any], read: Callable[[Any], AnyArray]) -> tuple[float, float]:
-    """Return the first and last time of all keys; `read` gives the numbers of an accessor."""
+    """Return the first and last time of all keys; `read` returns the numbers of an accessor.
+
+    Raises
+    ------
+    ValueError
+        If times do not ascend.
+    """
     times = [read(sampler["input"])[:, 0].astype(np.float64) for sampler in animation["samplers"]]
     if any((np.diff(t) <= 0).any() or not np.isfinite(t).all() for t in times):
         raise ValueError("times of an animation do not ascend")
     return min((t[0] for t in times), default=0.0), max((t[-1] for t in times), default=0.0)
 
 
-def played(
+def sample_channels(
     animation: Mapping[str, Any], at_s: Floats, read: Callable[[Any], AnyArray]
 ) -> AnimatedNodes:
-    """Return what an animation moves, at times (t,); `read` gives the numbers of an accessor."""
-    found: AnimatedNodes = {}
+    """Return the values of animated nodes at times (t,); `read` returns an accessor's numbers.
+
+    Raises
+    ------
+    ValueError
+        If keys have a wrong number of values.
+    """
+    channels: AnimatedNodes = {}
     for channel in animation["channels"]:
         target = channel["target"]
         sampler = animation["samplers"][channel["sampler"]]
         if "node" not in target or target["path"] not in (*WIDTHS, "weights"):
-            continue  # of extensions, which move nothing that reflects light
+            continue  # targets of extensions do not reflect light
         keys = read(sampler["input"])[:, 0].astype(np.float64)
         kind = sampler.get("interpolation", "LINEAR")
         path = target["path"]
@@ -55,40 +74,49 @@ def played(
         values = values.reshape(len(keys), _VALUES[kind], -1)
         if values.shape[2] != WIDTHS.get(path, values.shape[2]):
             raise ValueError(f"keys of a {path} have {values.shape[2]} numbers, not {WIDTHS[path]}")
-        found[target["node"], path] = _sampled(keys, values, at_s, kind, path == "rotation")
-    return found
+        channels[target["node"], path] = _sampled(keys, values, at_s, kind, path == "rotation")
+    return channels
 
 
-def _sampled(keys: Floats, values: Floats, at_s: Floats, kind: str, turns: bool) -> Floats:
-    """Values (t, w) at times (t,) of keys (k,), with their tangents: (k, 3 or 1, w)."""
-    begin = np.searchsorted(keys, at_s, "right") - 1
-    begin = begin.clip(0, max(len(keys) - 2, 0))
-    end = np.minimum(begin + 1, len(keys) - 1)
-    seconds = np.where(end > begin, keys[end] - keys[begin], 1.0)
-    share = ((at_s - keys[begin]) / seconds).clip(0, 1)[:, None]
-    one, other = (values[k, values.shape[1] // 2] for k in (begin, end))
+def _sampled(keys: Floats, values: Floats, at_s: Floats, kind: str, are_rotations: bool) -> Floats:
+    """Return values (t, w) at times (t,), between values (k, 1 or 3, w) at key times (k,).
+
+    A spline has three values at each key: tangent in, value, tangent out.
+    """
+    start = np.searchsorted(keys, at_s, "right") - 1
+    start = start.clip(0, max(len(keys) - 2, 0))
+    stop = np.minimum(start + 1, len(keys) - 1)
+    seconds = np.where(stop > start, keys[stop] - keys[start], 1.0)
+    share = ((at_s - keys[start]) / seconds).clip(0, 1)[:, None]
+    start_values, stop_values = (values[k, values.shape[1] // 2] for k in (start, stop))
     if kind == "STEP":
-        found = np.where(share < 1, one, other)
+        sampled = np.where(share < 1, start_values, stop_values)
     elif kind == "CUBICSPLINE":
-        out, into = (values[k, at] * seconds[:, None] for k, at in ((begin, 2), (end, 0)))
+        start_slope = values[start, 2] * seconds[:, None]
+        stop_slope = values[stop, 0] * seconds[:, None]
         square = share * share
         cube = share * share * share
-        bend = (cube - 2 * square + share) * out + (cube - square) * into
-        found = (2 * cube - 3 * square + 1) * one + (3 * square - 2 * cube) * other + bend
-    elif turns:
-        found = _slerp(share, one, other)
+        bend = (cube - 2 * square + share) * start_slope + (cube - square) * stop_slope
+        sampled = (
+            (2 * cube - 3 * square + 1) * start_values
+            + (3 * square - 2 * cube) * stop_values
+            + bend
+        )
+    elif are_rotations:
+        sampled = _slerp(share, start_values, stop_values)
     else:
-        found = (1 - share) * one + share * other
-    return found / length(found)[:, None] if turns else found
+        sampled = (1 - share) * start_values + share * stop_values
+    return sampled / length(sampled)[:, None] if are_rotations else sampled
 
 
-def _slerp(u: Floats, one: Floats, other: Floats) -> Floats:
-    """Quaternions (t, 4) at shares (t, 1) of the shorter turn (Shoemake, 1985)."""
-    one, other = (q / length(q)[:, None] for q in (one, other))
-    other = np.where((one * other).sum(axis=1, keepdims=True) < 0, -other, other)
-    angle = 2 * arctan2(length(other - one), length(other + one))[:, None]
+def _slerp(u: Floats, start: Floats, stop: Floats) -> Floats:
+    """Return quaternions (t, 4) at shares (t, 1) of the shorter rotation (Shoemake, 1985)."""
+    start, stop = (q / length(q)[:, None] for q in (start, stop))
+    stop = np.where((start * stop).sum(axis=1, keepdims=True) < 0, -stop, stop)
+    angle = 2 * arctan2(length(stop - start), length(stop + start))[:, None]
     sine = sin(angle)
     small = sine < 1e-9
     sine = np.where(small, 1.0, sine)
-    first = np.where(small, 1 - u, sin((1 - u) * angle) / sine)
-    return np.asarray(first * one + np.where(small, u, sin(u * angle) / sine) * other)
+    start_share = np.where(small, 1 - u, sin((1 - u) * angle) / sine)
+    stop_share = np.where(small, u, sin(u * angle) / sine)
+    return np.asarray(start_share * start + stop_share * stop)

@@ -90,6 +90,7 @@ def _projection_records(file: BinaryIO) -> Iterator[tuple[int, bytes]]:
 def _records(
     file: BinaryIO, start: int, count: int, head: struct.Struct
 ) -> Iterator[tuple[int, bytes]]:
+    """Yield the numbers and contents of records of `_PROJECTION` among records from `start` on."""
     for _ in range(count):
         file.seek(start)
         data = file.read(head.size)
@@ -104,8 +105,8 @@ def _records(
 def _layout(file: BinaryIO) -> tuple[int, int, int]:
     """Return the size of the header, the offset of the points, and the number of VLRs.
 
-    ValueError if they contradict each other or the size of the file: laspy would go through four
-    thousand million records.
+    ValueError if the numbers contradict each other or the size of the file: laspy would go through
+    four thousand million records.
     """
     header_size, points_start, records = _unpacked(file, *_LAYOUT)
     size = os.fstat(file.fileno()).st_size

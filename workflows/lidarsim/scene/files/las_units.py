@@ -87,7 +87,7 @@ class CoordinateUnits:
         return self.factors == (1.0, 1.0, 1.0)
 
     def note(self) -> str:
-        """Return a clause that says what was converted; empty for metres."""
+        """Return a clause on the conversion to metres; empty for metres."""
         if self.metric:
             return ""
         if not self.vertical_stated:
@@ -150,11 +150,20 @@ class _Node:
     nodes: list[_Node] = field(default_factory=list)
 
     def child(self, keywords: set[str]) -> _Node | None:
+        """Return the first child node with a keyword of a set, or None."""
         return next((node for node in self.nodes if node.keyword in keywords), None)
 
 
 def wkt_units(text: str) -> CoordinateUnits:
-    """Return the units of a coordinate system in WKT 1 or 2; errors as of `units_of`."""
+    """Return the units of a coordinate system in WKT 1 or 2.
+
+    Raises
+    ------
+    LidarError
+        If coordinates are angles, or have a unit that cannot be known.
+    ValueError
+        If the text is no WKT.
+    """
     node = _parsed(text)
     if node.keyword == "BOUNDCRS":  # a system, and its transformation to another one
         source = node.child({"SOURCECRS"})
@@ -220,6 +229,7 @@ def _third_unit(system: _Node) -> CoordinateUnit | None:
 
 
 def _unit_of(node: _Node) -> CoordinateUnit:
+    """Return the unit of length of a node; LidarError without a length in metres."""
     name, *factors = node.values
     metres = float(factors[0]) if factors else 0.0
     if not 1e-6 <= metres <= 1e6:
@@ -243,6 +253,7 @@ def _geo_keys(records: Mapping[int, bytes]) -> dict[int, float]:
 
 
 def _key_values(data: bytes, count: int, doubles: bytes) -> Iterator[tuple[int, float]]:
+    """Yield the GeoTIFF keys that have numbers, and the numbers."""
     for number in range(count):
         key, location, _, value = struct.unpack_from("<4H", data, 8 + 8 * number)
         if location == 0:
@@ -252,6 +263,7 @@ def _key_values(data: bytes, count: int, doubles: bytes) -> Iterator[tuple[int, 
 
 
 def _units_of_keys(keys: Mapping[int, float]) -> CoordinateUnits | None:
+    """Return the units that GeoTIFF keys state, or None without a projection."""
     model = keys.get(_MODEL_TYPE)
     projected = int(keys.get(_PROJECTED_CRS, 0))
     if model in (_GEOGRAPHIC, _GEOCENTRIC) or (
@@ -282,7 +294,7 @@ def _units_of_keys(keys: Mapping[int, float]) -> CoordinateUnits | None:
 
 
 def _unit_of_code(code: float | None) -> CoordinateUnit | None:
-    """Return the unit of an EPSG code; None for none, or for one that another key defines."""
+    """Return the unit of an EPSG code; None without a code, or for a user-defined unit."""
     if code is None or code in (0, _USER_DEFINED):
         return None
     if int(code) not in _EPSG_UNITS:

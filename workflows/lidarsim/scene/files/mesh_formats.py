@@ -1,4 +1,4 @@
-"""Formats of mesh files: one row each, which is found by the ending of a file.
+"""Formats of mesh files: a row for each format, which is found by the ending of a file.
 
 A row names its reader, and the reader's module is imported when the first file of the format is
 read. Rows of further packages are found by the name of their table (`_TABLES`), so that nothing
@@ -18,13 +18,13 @@ from pathlib import Path
 
 from ...base.errors import LidarError
 from ...base.plugins import Plugin, find_plugin, plugins_of
-from .scene_graph import Content, Wanted
+from .scene_graph import Content, ReadOptions
 
 GROUP = "lidarsim.meshes"
 
-# Content of a file, its path, and what to read besides triangles. It raises `MeshFileError` for
+# Reader of the content of a file, with its path and options. It raises `MeshFileError` for
 # content that it does not support, and any other error for a broken file.
-MeshReader = Callable[[bytes, Path, Wanted], Content]
+MeshReader = Callable[[bytes, Path, ReadOptions], Content]
 
 
 @dataclass(frozen=True)
@@ -38,18 +38,18 @@ class MeshFormat:
     read
         The reader, or its name, "module:function"; None for a format that is not read.
     advice
-        What to do with a file that is not read, as a clause; empty if the format is read.
+        Advice on files of a format that is not read, as a clause; empty if the format is read.
     animated
         Whether the reader can bake an animation.
     unitless
         Whether files state no unit, nor does the format.
-    begins
-        Bytes that files begin with. A file that begins so and has another ending is said to need
-        one of these endings.
+    signatures
+        Bytes at the start of files. The error of a file with such a start and another ending
+        advises to use one of these endings.
     from_path
         Whether the reader opens the path itself: it gets the first bytes of the file only.
     raster
-        Whether files are rasters of heights, whose reader takes `Wanted.raster`.
+        Whether files are rasters of heights, whose reader takes `ReadOptions.raster`.
     plugin
         The plug-in that provides the row; filled in when the plug-in is loaded.
     """
@@ -59,16 +59,16 @@ class MeshFormat:
     advice: str = ""
     animated: bool = False
     unitless: bool = False
-    begins: tuple[bytes, ...] = ()
+    signatures: tuple[bytes, ...] = ()
     from_path: bool = False
     raster: bool = False
     plugin: Plugin | None = field(default=None, compare=False)
 
     @property
     def reader(self) -> MeshReader:
-        """The function that reads a file; its module is imported if it is named.
+        """Function that reads a file; a reader given by its name is imported.
 
-        LidarError if it is that of a plug-in and cannot be imported.
+        LidarError if the reader of a plug-in cannot be imported.
         """
         assert self.read is not None, "of a format that is read"
         if not isinstance(self.read, str):
@@ -85,14 +85,14 @@ class MeshFormat:
 _GLTF = "lidarsim.scene.files.gltf:read_gltf"
 _POLYGONS = "lidarsim.scene.files.polygon_files"
 
-# All readers here are our own; their modules say why no library is used.
+# The modules of the readers say why no library is used.
 _READ = (
-    MeshFormat((".glb",), _GLTF, animated=True, begins=(b"glTF",)),
+    MeshFormat((".glb",), _GLTF, animated=True, signatures=(b"glTF",)),
     MeshFormat((".gltf",), _GLTF, animated=True),
     MeshFormat((".obj",), f"{_POLYGONS}:read_obj", unitless=True),
-    MeshFormat((".stl",), f"{_POLYGONS}:read_stl", unitless=True, begins=(b"solid ",)),
-    MeshFormat((".ply",), f"{_POLYGONS}:read_ply_mesh", unitless=True, begins=(b"ply",)),
-    MeshFormat((".off",), f"{_POLYGONS}:read_off", unitless=True, begins=(b"OFF",)),
+    MeshFormat((".stl",), f"{_POLYGONS}:read_stl", unitless=True, signatures=(b"solid ",)),
+    MeshFormat((".ply",), f"{_POLYGONS}:read_ply_mesh", unitless=True, signatures=(b"ply",)),
+    MeshFormat((".off",), f"{_POLYGONS}:read_off", unitless=True, signatures=(b"OFF",)),
 )
 
 # Tables of further packages, each a tuple `MESH_FORMATS`. A package need not be installed.
@@ -160,7 +160,7 @@ _NOT_READ = (
 
 
 def known_formats() -> Iterator[MeshFormat]:
-    """Yield the formats of the tables: those that are read first, then those with advice only."""
+    """Yield the formats of the tables: formats that are read, then formats with advice only."""
     yield from _formats_read()
     yield from _NOT_READ
 
@@ -189,12 +189,12 @@ def missing_packages() -> list[str]:
 
 
 def format_of(path: str | Path) -> MeshFormat | None:
-    """Return the format of a file by its ending, also one with advice only; None if unknown.
+    """Return the format of a file by its ending, also a format with advice only, or None.
 
     Raises
     ------
     LidarError
-        If it is of a plug-in that cannot be used, or of two.
+        If two plug-ins have the ending, or the plug-in cannot be used.
     """
     ending = Path(path).suffix.lower()
     row = _row(ending, _formats_read())
@@ -205,6 +205,7 @@ def format_of(path: str | Path) -> MeshFormat | None:
 
 
 def _row(ending: str, rows: Iterator[MeshFormat]) -> MeshFormat | None:
+    """Return the first format with an ending, or None."""
     return next((row for row in rows if ending in row.endings), None)
 
 
@@ -215,6 +216,7 @@ def plugin_of(path: str | Path) -> Plugin | None:
 
 
 def _plugin_of_ending(ending: str) -> Plugin | None:
+    """Return the plug-in of an ending, or None."""
     return _installed_plugin(ending, tuple(sys.path)) if ending else None
 
 
@@ -225,7 +227,7 @@ def _installed_plugin(ending: str, folders: tuple[str, ...]) -> Plugin | None:
 
 
 def _row_of_plugin(plugin: Plugin) -> MeshFormat:
-    """Return the row of a plug-in; LidarError if it cannot be used."""
+    """Return the format of a plug-in; LidarError for a plug-in that cannot be used."""
     row = plugin.load(MeshFormat)
     if row.read is None:
         raise plugin.lacks("read")
@@ -243,22 +245,24 @@ def plugin_endings() -> tuple[str, ...]:
 
 
 def advice_on(path: str | Path) -> str:
-    """Return what to do with a file of a format that is not read; empty for other files."""
+    """Return the advice on a file of a format that is not read; empty for formats that are."""
     row = format_of(path)
     return "" if row is None else row.advice
 
 
-def endings(of: Callable[[MeshFormat], bool] = lambda row: not row.advice) -> tuple[str, ...]:
-    """Return the endings of the known formats that fulfil a condition; by default, that are read.
+def endings(
+    condition: Callable[[MeshFormat], bool] = lambda row: not row.advice,
+) -> tuple[str, ...]:
+    """Return the endings of the known formats that fulfil a condition; by default, formats read.
 
     Examples
     --------
     >>> endings(lambda row: row.unitless)
     ('.obj', '.stl', '.ply', '.off')
     """
-    return tuple(chain.from_iterable(row.endings for row in known_formats() if of(row)))
+    return tuple(chain.from_iterable(row.endings for row in known_formats() if condition(row)))
 
 
 def endings_for(data: bytes) -> tuple[str, ...]:
-    """Return the endings of the known formats whose files begin as some content does."""
-    return endings(lambda row: data.startswith(row.begins))
+    """Return the endings of the known formats whose files have the same start as `data`."""
+    return endings(lambda row: data.startswith(row.signatures))

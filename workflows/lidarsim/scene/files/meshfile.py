@@ -1,4 +1,4 @@
-"""Files of scenes, of the formats in `mesh_formats`, to named meshes in metres, Z-up."""
+"""Reading of scene files, in the formats of `mesh_formats`, as named meshes in metres, Z-up."""
 
 from __future__ import annotations
 
@@ -22,9 +22,9 @@ from ...base.vocabulary import UNITS_M
 from ...base.words import as_python, did_you_mean, plural, printable
 from ...sensor import Track
 from ...sensor.trajectory import quaternions_of
-from ..actors import Actor, one_mesh
+from ..actors import Actor, join_meshes
 from ..colours import colours_summary
-from ..scene_instances import FARTHEST_M, SceneInstance
+from ..scene_instances import MAX_COORDINATE_M, SceneInstance
 from ..scene_mesh import SceneMesh
 from ..transform import UP_AXES, Transform
 from .mesh_formats import (
@@ -41,16 +41,18 @@ from .scene_graph import (
     ObjectClass,
     Raster,
     RasterOptions,
+    ReadOptions,
     RigidPart,
-    Wanted,
     Window,
 )
 
-GENERATOR = "lidarpool"  # that files of our own name, .glb as Y-up, others as Z-up
-OWN = "lidarpool: metres, Z-up"  # comment that files of our own without such a name begin with
+# Generator that files written by lidarpool name: .glb is Y-up, others are Z-up.
+GENERATOR = "lidarpool"
+# Comment at the start of files written by lidarpool in formats without a generator.
+FORMAT_COMMENT = "lidarpool: metres, Z-up"
 
-_EVEN = 1e-6  # how much the square of a scale may differ between axes
-_HEAD = 200  # bytes of a file that such a comment is in
+_MAX_UNEVENNESS = 1e-6  # difference between axes of the square of a scale
+_HEAD_BYTES = 200  # bytes of a file that contain such a comment
 
 OpacityMode = Literal["mask", "ignore"]
 
@@ -65,19 +67,22 @@ def warn(note: str) -> None:
 class Objects(NamedTuple):
     """Objects of a mesh file, in world coordinates."""
 
-    standing: tuple[SceneMesh | SceneInstance, ...]
-    moving: tuple[Actor, ...] = ()  # each along a `Track`
+    static: tuple[SceneMesh | SceneInstance, ...]
+    actors: tuple[Actor, ...] = ()  # each along a `Track`
     summary: str = ""  # objects, triangles, unit, axes and colours
-    raster: Raster | None = None  # what was taken of one
+    raster: Raster | None = None  # description, if the file is a raster
     classes: Mapping[int, ObjectClass] = {}  # {number of ASPRS LAS: class}, of formats with types
 
-    def still(self, tell: Callable[[str], None]) -> tuple[SceneMesh | SceneInstance, ...]:
-        """Return all of them where they are at first; `tell` is called if that is a loss."""
-        if self.moving:
-            names = ", ".join(actor.name for actor in self.moving[:3])
-            names += ", …" * (len(self.moving) > 3)
+    def at_start(self, tell: Callable[[str], None]) -> tuple[SceneMesh | SceneInstance, ...]:
+        """Return the static objects, and the actors as static objects at their first pose.
+
+        `tell` is called with a line on the actors, if there are actors.
+        """
+        if self.actors:
+            names = ", ".join(actor.name for actor in self.actors[:3])
+            names += ", …" * (len(self.actors) > 3)
             tell(f"{names}: taken where they are at first, and still")
-        return (*self.standing, *map(_at_first, self.moving))
+        return (*self.static, *map(_mesh_at_start, self.actors))
 
 
 @checked
@@ -100,36 +105,37 @@ def load_objects(
 ) -> Objects:
     """Read all objects of a mesh file.
 
-    Every place of a mesh in a scene graph is an object, named by its node; large meshes with many
-    places are instances. Files without names give one object named by the file. Objects that their
-    nodes scale to zero, and instances of meshes without an area, are left out.
+    Every placed mesh of a scene graph is an object, named by its node; large meshes that are placed
+    several times are instances. Files without names give an object named by the file. Objects that
+    their nodes scale to zero, and instances of meshes without an area, are left out.
 
     Parameters
     ----------
     path, unit, up_axis, transform, opacity, colours, materials, assets
-        As of `Scene.load`, with an ending of `mesh_formats` in any case. The unit of a raster is
-        that of its heights.
+        See `Scene.load`; the path has an ending of `mesh_formats`, in upper or lower case. The unit
+        of a raster is the unit of its heights.
     step_m
         Of a raster: mean heights in a grid of this step, metres; None takes its pixels.
     window
-        Of a raster: lowest x and y, highest x and y of what is taken, metres in the coordinate
+        Of a raster: lowest x and y, highest x and y of the area to read, metres in the coordinate
         system of the result.
     epsg
-        Code of the coordinate system that a raster is brought to, one in metres. None keeps its
-        own if it is in metres, else takes the UTM zone of its middle.
+        Code of the coordinate system to which a raster is transformed, in metres. None keeps the
+        system of the file if it is in metres, else takes the UTM zone of the raster's middle.
     animation
-        Name of the animation that its meshes have, or its number if it has none; "" for the first,
-        in .usd for what is bound. Such meshes have no masks. None leaves all as it stands.
+        Name of the animation to play by the meshes, or the number of an animation without a name;
+        "" for the first, in .usd for the bound animation. Animated meshes have no masks. None
+        leaves all meshes static.
     tell
         Called with a line on objects left out, on images that cannot be read, on materials that
         may be glass, or on a reference system; by default this module's logger warns.
     axes
-        Called with a line on axes that a file did not state, or that were turned; by default this
-        module's logger has it, as a warning if the scene seems to lie on its side.
+        Called with a line on axes that a file did not state, or that were rotated; by default this
+        module's logger gets the line, as a warning if the scene seems to lie on its side.
 
     Returns
     -------
-    Objects that stand and, of .usd, that move, in world coordinates. All arithmetic is in double
+    Static objects and, of .usd, actors, in world coordinates. All arithmetic is in double
     precision; .glb, .gltf and binary .stl store single precision.
 
     Raises
@@ -138,14 +144,14 @@ def load_objects(
         If the file cannot be read completely, or has no triangles.
     """
     path = Path(path)
-    row = _readable(path)
-    data = _bytes_of(path, _HEAD if row.from_path else None)
+    row = _format_to_read(path)
+    data = _bytes_of(path, _HEAD_BYTES if row.from_path else None)
     raster = RasterOptions(unit, step_m, window, epsg)
     _check_options(path, row, raster, up_axis, animation)
-    if row.raster:  # whose reader takes the unit
+    if row.raster:  # the reader of rasters converts the unit itself
         unit = None
     folders = [path.parent] if assets is None else [path.parent, Path(assets)]
-    wanted = Wanted(
+    options = ReadOptions(
         masks=opacity == "mask" and animation is None,
         colours=colours,
         folders=tuple(folder.resolve() for folder in folders),
@@ -155,19 +161,25 @@ def load_objects(
     )
     # Files may have infinite numbers and NaN, which are refused where they matter.
     with np.errstate(all="ignore"):
-        content = _read_whole(path, row, data, wanted)
+        content = _read(path, row, data, options)
         unit_m = UNITS_M[unit] if unit else content.unit_m or 1.0
-        up = up_axis or content.up_axis or "z"
-        objects = _in_world(path, content, Transform(UP_AXES[up] * unit_m, np.zeros(3)), transform)
+        axis = up_axis or content.up_axis or "z"
+        objects = _in_world(
+            path, content, Transform(UP_AXES[axis] * unit_m, np.zeros(3)), transform
+        )
     _tell_notes(path, content, tell, unit_given=unit is not None)
-    standing = objects.still(lambda _: None)
-    if not any((o.mesh if isinstance(o, SceneInstance) else o).has_area for o in standing):
+    meshes = objects.at_start(lambda _: None)
+    if not any((o.mesh if isinstance(o, SceneInstance) else o).has_area for o in meshes):
         raise LidarError(f"{path} has no triangle with an area.")
-    if up_axis is None and content.generator != GENERATOR and OWN.encode() not in data[:_HEAD]:
-        _tell_axes(path, content, standing, axes)
+    if (
+        up_axis is None
+        and content.generator != GENERATOR
+        and FORMAT_COMMENT.encode() not in data[:_HEAD_BYTES]
+    ):
+        _tell_axes(path, content, meshes, axes)
     if content.raster is not None:
-        return objects._replace(summary=content.raster.told, raster=content.raster)
-    summary = _summary(standing, unit_m, up, wanted)
+        return objects._replace(summary=content.raster.summary, raster=content.raster)
+    summary = _summary(meshes, unit_m, axis, options)
     return objects._replace(summary=summary, classes=content.classes)
 
 
@@ -176,14 +188,14 @@ def _in_world(
 ) -> Objects:
     """Place the objects of a file in the world.
 
-    `upright` brings the file's unit and axes to metres and Z-up, before `transform`.
+    `upright` converts the file's unit and axes to metres and Z-up, before `transform`.
     """
-    places = [upright] if transform is None else [upright, transform]
-    placed = Transform(np.eye(3), np.zeros(3)) if transform is None else transform
+    transforms = [upright] if transform is None else [upright, transform]
+    placement = Transform(np.eye(3), np.zeros(3)) if transform is None else transform
     with prefixed(path):
         return Objects(
-            tuple(_placed(mesh, path.stem, places) for mesh in content.meshes),
-            tuple(_actor(part, path.stem, upright, placed) for part in content.moving),
+            tuple(_placed_object(mesh, path.stem, transforms) for mesh in content.meshes),
+            tuple(_actor_of_part(part, path.stem, upright, placement) for part in content.moving),
         )
 
 
@@ -207,14 +219,14 @@ def _check_options(
     up_axis: str | None,
     animation: str | None,
 ) -> None:
-    """Refuse options that a file of a format does not have, or raise LidarError."""
+    """Check that a format has the options that are set; LidarError if not."""
     if row.raster and up_axis:
         raise LidarError(f"{path} is a raster, whose heights are z: leave out up_axis.")
     of_rasters = {"step_m": raster.step_m, "window": raster.window}
-    given = [name for name, value in of_rasters.items() if value is not None]
-    if given and not row.raster:
+    raster_options = [name for name, value in of_rasters.items() if value is not None]
+    if raster_options and not row.raster:
         raise LidarError(
-            f"{path} is no raster: leave out {' and '.join(given)}, or give a raster "
+            f"{path} is no raster: leave out {' and '.join(raster_options)}, or give a raster "
             f"({' '.join(endings(lambda row: row.raster))})."
         )
     if animation is not None and not row.animated:
@@ -228,45 +240,45 @@ def _check_options(
 def load_meshes(
     path: str | Path, *, tell: Callable[[str], None] = warn, **options: Any
 ) -> tuple[SceneMesh | SceneInstance, ...]:
-    """Read all objects of a mesh file, as `load_objects`, and let them stand."""
-    found = load_objects(path, tell=tell, **options)
-    return found.still(lambda line: tell(f"{path} moves {line}"))
+    """Read all objects of a mesh file as static objects; see `load_objects` for `options`."""
+    objects = load_objects(path, tell=tell, **options)
+    return objects.at_start(lambda line: tell(f"{path} moves {line}"))
 
 
 def _summary(
-    meshes: Sequence[SceneMesh | SceneInstance], unit_m: float, up_axis: str, wanted: Wanted
+    meshes: Sequence[SceneMesh | SceneInstance], unit_m: float, up_axis: str, options: ReadOptions
 ) -> str:
-    """Say what a file gave: «4 objects, 38 triangles, in m, Y-up, 1 texture»."""
-    shapes = [one.mesh if isinstance(one, SceneInstance) else one for one in meshes]
-    shared = [mesh for one, mesh in zip(meshes, shapes, strict=True) if one is not mesh]
+    """Return a summary of a file: «4 objects, 38 triangles, in m, Y-up, 1 texture»."""
+    meshes_once = [item.mesh if isinstance(item, SceneInstance) else item for item in meshes]
+    shared = [mesh for item, mesh in zip(meshes, meshes_once, strict=True) if item is not mesh]
     words = [plural(len(meshes), "object")]
     if shared:
-        of = plural(len({id(mesh) for mesh in shared}), "mesh", "meshes")
-        words.append(f"{len(shared):,} of them instances of {of}")
+        mesh_count = plural(len({id(mesh) for mesh in shared}), "mesh", "meshes")
+        words.append(f"{len(shared):,} of them instances of {mesh_count}")
     words += [
         " x ".join(map(str, mesh.voxels.density.shape)) + " voxels"
-        for mesh in shapes
+        for mesh in meshes_once
         if mesh.voxels is not None
     ]
     names = [name for name, metres in UNITS_M.items() if metres == unit_m]
     words += [
-        plural(sum(len(mesh.faces) for mesh in shapes), "triangle"),
+        plural(sum(len(mesh.faces) for mesh in meshes_once), "triangle"),
         f"in {names[0] if names else f'units of {unit_m:g} m'}",
         f"{up_axis.upper()}-up",
     ]
-    if wanted.colours:
-        words.append(colours_summary(mesh.colours for mesh in shapes))
-    if wanted.materials:
-        named = [mesh.materials.names for mesh in shapes if mesh.materials is not None]
-        distinct = {name for of_mesh in named for name in of_mesh if name}
+    if options.colours:
+        words.append(colours_summary(mesh.colours for mesh in meshes_once))
+    if options.materials:
+        materials = [mesh.materials for mesh in meshes_once if mesh.materials is not None]
+        distinct = {name for mesh_materials in materials for name in mesh_materials.names if name}
         words.append(plural(len(distinct), "named material"))
     return ", ".join(words)
 
 
-def wrote_it(path: Path) -> bool:
-    """Whether lidarpool wrote a mesh file of a format without a unit: it is in metres."""
+def written_by_lidarpool(path: Path) -> bool:
+    """Return True if lidarpool wrote a file of a format without a unit, which is in metres then."""
     with open_input(path) as file:
-        return OWN.encode() in file.read(_HEAD)
+        return FORMAT_COMMENT.encode() in file.read(_HEAD_BYTES)
 
 
 def _tell_axes(
@@ -275,38 +287,45 @@ def _tell_axes(
     meshes: Sequence[SceneMesh | SceneInstance],
     axes: Callable[[str], None] | None,
 ) -> None:
+    """Call `axes` with a line on axes that a file does not state, or that were rotated."""
     if content.turned and content.up_axis == "y":
-        why = _lies(content, meshes)
-        other = "z"
-        done = f"was turned from Y-up to Z-up, {content.turned}{why}"
-    elif path.suffix.lower() == ".obj":  # the one without axes that is Y-up as often as not
-        done = "states no axes and is taken as Z-up"
-        why = ""
-        other = "y"
+        doubt = _seems_to_lie(content, meshes)
+        other_axis = "z"
+        statement = f"was turned from Y-up to Z-up, {content.turned}{doubt}"
+    elif path.suffix.lower() == ".obj":  # without axes, and Y-up as often as not
+        statement = "states no axes and is taken as Z-up"
+        doubt = ""
+        other_axis = "y"
     else:
         return
-    (axes or (warn if why else lambda note: _log.info(as_python(note))))(
-        f'{path.name} {done}; if it lies on its side, give <file.up_axis="{other}">; any '
-        "up_axis ends this note"
+    note = (
+        f'{path.name} {statement}; if it lies on its side, give <file.up_axis="{other_axis}">; set '
+        "up_axis to silence this note"
     )
+    if axes is not None:
+        axes(note)
+    elif doubt:
+        warn(note)
+    else:
+        _log.info(as_python(note))
 
 
-def _lies(content: Content, meshes: Sequence[SceneMesh | SceneInstance]) -> str:
-    """Say why a file rotated from Y-up seems to have been Z-up; empty if it does not."""
+def _seems_to_lie(content: Content, meshes: Sequence[SceneMesh | SceneInstance]) -> str:
+    """Return the reason why a file rotated from Y-up seems to have been Z-up, or empty."""
     if "trimesh" in content.generator:
         return ", and trimesh wrote it, which keeps the axes that it is given"
-    low = np.min([_corners(mesh).min(axis=0) for mesh in meshes], axis=0)
-    x, y, z = np.max([_corners(mesh).max(axis=0) for mesh in meshes], axis=0) - low
+    lower = np.min([_corners(mesh).min(axis=0) for mesh in meshes], axis=0)
+    x, y, z = np.max([_corners(mesh).max(axis=0) for mesh in meshes], axis=0) - lower
     if 2 * y < min(x, z):
         return f", and is {x:,.3g} m wide, {z:,.3g} m high and {y:,.3g} m thick now"
     return ""
 
 
-def _read_whole(path: Path, row: MeshFormat, data: bytes, wanted: Wanted) -> Content:
-    """Read a file of a format: at least one object, or LidarError."""
+def _read(path: Path, row: MeshFormat, data: bytes, options: ReadOptions) -> Content:
+    """Read a file of a format with at least one object; LidarError for all errors."""
     try:
         with prefixed(path):
-            return _content(row, path, data, wanted)
+            return _checked_content(row, path, data, options)
     except MemoryError:
         raise
     except LidarError as error:
@@ -316,7 +335,7 @@ def _read_whole(path: Path, row: MeshFormat, data: bytes, wanted: Wanted) -> Con
     except Exception as error:
         if row.plugin is not None and isinstance(error, ImportError):
             raise LidarError(f"{path}: {row.plugin.broken(error)}") from error
-        # Readers raise whatever they stumble over: ValueError, IndexError, KeyError, BadZipFile,
+        # Readers raise errors of any class: ValueError, IndexError, KeyError, BadZipFile,
         # ParseError, struct.error, …
         reason = printable(str(error)) or type(error).__name__
         raise LidarError(
@@ -324,12 +343,12 @@ def _read_whole(path: Path, row: MeshFormat, data: bytes, wanted: Wanted) -> Con
         ) from error
 
 
-def _content(row: MeshFormat, path: Path, data: bytes, wanted: Wanted) -> Content:
-    """Return what a reader finds; MeshFileError for a file of another kind, or without objects."""
-    for beginning, what in _FOREIGN.items():
+def _checked_content(row: MeshFormat, path: Path, data: bytes, options: ReadOptions) -> Content:
+    """Read the content of a file; MeshFileError for a foreign file, or without objects."""
+    for beginning, problem in _FOREIGN.items():
         if re.match(beginning, data):
-            raise MeshFileError(what)
-    content = row.reader(data, path, wanted)
+            raise MeshFileError(problem)
+    content = row.reader(data, path, options)
     if row.plugin is not None and not isinstance(content, Content):
         raise LidarError(f"{row.plugin} read {type(content).__name__}, not Content.")
     if content.meshes or content.moving:
@@ -342,7 +361,7 @@ def _content(row: MeshFormat, path: Path, data: bytes, wanted: Wanted) -> Conten
     )
 
 
-def _readable(path: Path) -> MeshFormat:
+def _format_to_read(path: Path) -> MeshFormat:
     """Return the format of a file; LidarError if no format that is read has its ending."""
     row = format_of(path)
     if row is not None and not row.advice:
@@ -366,7 +385,7 @@ def _bytes_of(path: Path, max_bytes: int | None) -> bytes:
             data = read_input(path, max_bytes)
     except (FileNotFoundError, NotADirectoryError) as error:
         raise LidarError(
-            f"{path} does not exist: check the name and the folder.{_like(path)}"
+            f"{path} does not exist: check the name and the folder.{_similar_name(path)}"
         ) from error
     except (OSError, ValueError) as error:  # a NUL in the name
         reason = getattr(error, "strerror", None) or error
@@ -376,16 +395,16 @@ def _bytes_of(path: Path, max_bytes: int | None) -> bytes:
     return data.removeprefix(codecs.BOM_UTF8)  # the byte order mark of text editors
 
 
-def _like(path: Path) -> str:
-    """Name an existing mesh file with a similar name, in a question; empty if there is none."""
+def _similar_name(path: Path) -> str:
+    """Return a question with the name of a similar mesh file in the folder, or empty."""
     try:
-        beside = [other.name for other in path.parent.iterdir()]
+        names = [file.name for file in path.parent.iterdir()]
     except OSError:
         return ""
-    return did_you_mean(path.name, [name for name in beside if name.lower().endswith(endings())])
+    return did_you_mean(path.name, [name for name in names if name.lower().endswith(endings())])
 
 
-# Beginnings of files that are not meshes, as expressions.
+# {expression for the start of a file that is no mesh: advice}
 _FOREIGN = {
     rb"\x1f\x8b|BZh|\xfd7zXZ\0|7z\xbc\xaf": "is packed: unpack it first",
     rb"(?i)\s*(<!doctype html|<html)": "is a web page: download the file itself",
@@ -393,7 +412,7 @@ _FOREIGN = {
 
 
 def _other_format(path: Path, data: bytes) -> str:
-    """Name the format by which a refused file begins, in a sentence, if it is another."""
+    """Return a sentence on the format that a refused file starts like, or empty."""
     if data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
         return " It begins like text in UTF-16: save it as UTF-8."
     likely = endings_for(data)
@@ -402,55 +421,57 @@ def _other_format(path: Path, data: bytes) -> str:
     return ""
 
 
-def _placed(
-    one: SceneMesh | SceneInstance, stem: str, places: Sequence[Transform]
+def _placed_object(
+    item: SceneMesh | SceneInstance, stem: str, transforms: Sequence[Transform]
 ) -> SceneMesh | SceneInstance:
-    """Object in the world, with a name that is safe for terminals and files."""
-    name = printable(one.name) or printable(stem)
-    for place in places:
-        one = one.moved(name, place.linear, place.offset)
-    reach = np.abs(_corners(one)).max()
-    if reach > FARTHEST_M:
+    """Return an object in the world, with a name that is safe for terminals and files."""
+    name = printable(item.name) or printable(stem)
+    for transform in transforms:
+        item = item.moved(name, transform.linear, transform.offset)
+    reach = np.abs(_corners(item)).max()
+    if reach > MAX_COORDINATE_M:
         raise LidarError(
-            f"Object {one.name!r} reaches {reach:.3g} m from the origin, farther than anything "
+            f"Object {item.name!r} reaches {reach:.3g} m from the origin, farther than anything "
             "on Earth: check its unit and placement."
         )
-    return one
+    return item
 
 
-def _actor(one: RigidPart, stem: str, upright: Transform, placed: Transform) -> Actor:
-    """Return what moves as an actor, with its axes turned as those of the file are.
+def _actor_of_part(part: RigidPart, stem: str, upright: Transform, placement: Transform) -> Actor:
+    """Return a moving part as an actor, with its frame rotated as the axes of the file are.
 
-    Its mesh has all scales, since a trajectory turns and moves only.
+    The mesh of the actor has all scales, since a trajectory only rotates and moves.
     """
-    name = printable(one.name) or printable(stem)
-    unit_m, scale = (cbrt(determinant(place.linear)) for place in (upright, placed))
+    name = printable(part.name) or printable(stem)
+    unit_m, scale = (cbrt(determinant(transform.linear)) for transform in (upright, placement))
     axes = upright.linear / unit_m
-    turn = placed.linear / scale
-    if np.abs(matmul(turn, turn.T) - np.eye(3)).max() > _EVEN:
+    rotation = placement.linear / scale
+    if np.abs(matmul(rotation, rotation.T) - np.eye(3)).max() > _MAX_UNEVENNESS:
         raise LidarError(
             f"Object {name!r} moves, and its placement scales it unevenly: give one factor."
         )
-    objects = [part.moved(name, scale * upright.linear, np.zeros(3)) for part in one.objects]
-    positions = turned(one.positions, matmul(placed.linear, upright.linear)) + placed.offset
-    if not np.abs(positions).max() <= FARTHEST_M:
+    objects = [item.moved(name, scale * upright.linear, np.zeros(3)) for item in part.objects]
+    linear = matmul(placement.linear, upright.linear)
+    positions = turned(part.positions, linear) + placement.offset
+    if not np.abs(positions).max() <= MAX_COORDINATE_M:
         raise LidarError(
             f"Object {name!r} moves farther than anything on Earth: check its unit and placement."
         )
-    turns = quaternions_of(matmul(matmul(matmul(turn, axes), one.rotations), axes.T))
-    track = Track(one.times_s, positions, turns, start_s=0.0, beyond="hold")
-    return Actor(one_mesh(name, objects), track)
+    rotations = matmul(matmul(matmul(rotation, axes), part.rotations), axes.T)
+    track = Track(part.times_s, positions, quaternions_of(rotations), start_s=0.0, beyond="hold")
+    return Actor(join_meshes(name, objects), track)
 
 
-def _at_first(actor: Actor) -> SceneMesh:
+def _mesh_at_start(actor: Actor) -> SceneMesh:
+    """Return the mesh of an actor at its first pose."""
     positions, rotations = actor.trajectory.poses(0, np.zeros(1))
-    turn = np.eye(3) if rotations is None else rotations[0]
-    return actor.mesh.moved(actor.name, turn, positions[0])
+    rotation = np.eye(3) if rotations is None else rotations[0]
+    return actor.mesh.moved(actor.name, rotation, positions[0])
 
 
-def _corners(one: SceneMesh | SceneInstance) -> Floats:
-    """Points that an object lies between, in the world."""
-    if isinstance(one, SceneMesh):
-        return (one.animation or one).bounds
-    box = np.array(list(product(*one.mesh.bounds.T)))
-    return np.asarray(turned(box, one.matrix[:3, :3]) + one.matrix[:3, 3])
+def _corners(item: SceneMesh | SceneInstance) -> Floats:
+    """Return points (k, 3) in the world whose bounds contain an object."""
+    if isinstance(item, SceneMesh):
+        return (item.animation or item).bounds
+    box = np.array(list(product(*item.mesh.bounds.T)))
+    return np.asarray(turned(box, item.matrix[:3, :3]) + item.matrix[:3, 3])

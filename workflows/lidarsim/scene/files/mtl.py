@@ -16,10 +16,10 @@ from ...base.arrays import Bytes, Floats, Ints
 from ...base.input_files import InputFileError, read_input
 from ...base.words import as_text
 from ..colours import Colours, as_bytes
-from ..masks import HALF, MaskNotes, Texture, Wrap, read_colours, read_opacity, remembered
+from ..masks import HALF_OPACITY, MaskNotes, Texture, Wrap, read_colours, read_opacity, remembered
 from ..scene_mesh import Cutout
 from .companions import image_file, named_file
-from .scene_graph import SMALLER, MeshFileError, Wanted
+from .scene_graph import SMALLER, MeshFileError, ReadOptions
 
 # Options of images, and the words that follow each; -o, -s and -t have one to three numbers.
 _OPTION = re.compile(
@@ -28,47 +28,50 @@ _OPTION = re.compile(
     re.IGNORECASE,
 )
 _WITHOUT_ALPHA = (".jpg", ".jpeg")
-_MOST_BYTES = 1 << 26  # of a file of materials
+_MAX_BYTES = 1 << 26  # of a file of materials
 
 
 @dataclass
 class _Image:
-    """An image of a material, as a line names it."""
+    """An image of a material, with the options of its line."""
 
     name: str
     options: dict[bytes, list[bytes]] = field(default_factory=dict)
 
     @classmethod
-    def of(cls, words: bytes) -> _Image:
-        """Read the line after its first word."""
+    def parse(cls, words: bytes) -> _Image:
+        """Parse the words of a line after the keyword."""
         options: dict[bytes, list[bytes]] = {}
-        at = 0
-        while found := _OPTION.match(words, at):
-            key, given = (part for part in found.groups() if part is not None)
-            options[key.lower()] = given.split()
-            at = found.end()
-        return cls(as_text(words[at:].strip()), options)
+        offset = 0
+        while match := _OPTION.match(words, offset):
+            key, option_words = (part for part in match.groups() if part is not None)
+            options[key.lower()] = option_words.split()
+            offset = match.end()
+        return cls(as_text(words[offset:].strip()), options)
 
     @property
     def wrap(self) -> Wrap:
-        """How it goes on beyond its edges."""
+        """Continuation of the image beyond its edges."""
         clamped = [word.lower() for word in self.options.get(b"-clamp", [])] == [b"on"]
         return "clamp" if clamped else "repeat"
 
     def coordinates(self, vt: Floats) -> Floats:
-        """Texture coordinates (c, 2) on it, of which v grows downwards, from those of the file."""
-        (su, sv), (ou, ov) = self._numbers(b"-s", 1), self._numbers(b"-o", 0)
-        return np.column_stack([vt[:, 0] * su + ou, 1 - (vt[:, 1] * sv + ov)])
+        """Return coordinates (c, 2) on the image, v downwards, from the file's `vt` (c, 2)."""
+        scale_u, scale_v = self._numbers(b"-s", 1)
+        offset_u, offset_v = self._numbers(b"-o", 0)
+        u = vt[:, 0] * scale_u + offset_u
+        v = 1 - (vt[:, 1] * scale_v + offset_v)
+        return np.column_stack([u, v])
 
-    def _numbers(self, option: bytes, usual: float) -> list[float]:
-        """Two numbers of an option."""
-        given = [float(word) for word in self.options.get(option, [])]
-        return (given + [usual] * 2)[:2]
+    def _numbers(self, option: bytes, default: float) -> list[float]:
+        """Return two numbers of an option; missing numbers have a default."""
+        numbers = [float(word) for word in self.options.get(option, [])]
+        return (numbers + [default] * 2)[:2]
 
 
 @dataclass
 class _Entry:
-    """What a file says of a material."""
+    """Images and colour of a material in a file."""
 
     images: dict[bytes, _Image] = field(default_factory=dict)  # {b"map_d": image}
     colour: Bytes | None = None  # uint8 (1, 1, 3)
@@ -77,18 +80,21 @@ class _Entry:
 class MtlMaterials:
     """Masks and colours of the materials of a .obj file, each read once.
 
-    They are in files named by the lines `libraries`. Masks are the images `map_d`, or else the
-    alpha channels of `map_Kd`. Constant opacities, `d` and `Tr`, count for nothing: some programs
-    write one for the other. Colours are the images `map_Kd`, or else `Kd`; with an image, `Kd`
-    counts for nothing, since some programs write black there.
+    The materials are in files named by the lines `libraries`. Masks are the images `map_d`, or else
+    the alpha channels of `map_Kd`. Constant opacities, `d` and `Tr`, are ignored: some programs
+    mistake `d` for `Tr`. Colours are the images `map_Kd`, or else `Kd`; with an image, `Kd` is
+    ignored, since some programs write black there.
     """
 
-    def __init__(self, mesh: Path, size: int, libraries: Sequence[bytes], wanted: Wanted) -> None:
+    def __init__(
+        self, mesh: Path, size: int, libraries: Sequence[bytes], options: ReadOptions
+    ) -> None:
         self.notes = MaskNotes()
         self._mesh = mesh
-        self._wanted = wanted
+        self._options = options
         self._allowance = Allowance(size, SMALLER)
-        self._opacity, self._mask = remembered(self._read_opacity), remembered(self._read_mask)
+        self._opacity = remembered(self._read_opacity)
+        self._mask = remembered(self._read_mask)
         self._image = remembered(self._read_image)
         self._entries: dict[bytes, _Entry] = {}
         for data in self._files(libraries):
@@ -96,18 +102,21 @@ class MtlMaterials:
 
     @property
     def has_masks(self) -> bool:
-        """Whether a material may have a mask, for which texture coordinates are needed."""
-        return self._wanted.masks and any(
+        """True if a material may have a mask, which needs texture coordinates."""
+        return self._options.masks and any(
             key == b"map_d" or not image.name.lower().endswith(_WITHOUT_ALPHA)
             for entry in self._entries.values()
             for key, image in entry.images.items()
         )
 
     def cutout(self, name: bytes, vt: Floats, corners: Ints) -> Cutout | None:
-        """Cut the mask of a material out of triangles, whose corners (k, 3) have some of `vt`."""
-        if not self._wanted.masks or name not in self._entries:
+        """Return the mask of a material for triangles, or None.
+
+        `vt` (c, 2) are texture coordinates, and `corners` (k, 3) rows of `vt`.
+        """
+        if not self._options.masks or name not in self._entries:
             return None
-        with self.notes.instead(as_text(name)):
+        with self.notes.without_mask(as_text(name)):
             images = self._entries[name].images
             if texture := self._texture(as_text(name), images):
                 image = images.get(b"map_d") or images[b"map_kd"]
@@ -117,23 +126,28 @@ class MtlMaterials:
     def colours(
         self, name: bytes, vt: Floats, corners: Ints, tints: Bytes | None
     ) -> Colours | None:
-        """Colours of triangles: of an image, or of their corners (k, 3, 3), or a plain one."""
+        """Return the colours of triangles, or None.
+
+        Colours are of the material's image, else of the corners, `tints` (k, 3, 3), else the plain
+        colour of the material. `vt` (c, 2) are texture coordinates, and `corners` (k, 3) rows of
+        `vt`.
+        """
         entry = self._entries.get(name, _Entry())
-        if not self._wanted.colours:
+        if not self._options.colours:
             return None
-        found = None
+        colours = None
         if (image := entry.images.get(b"map_kd")) is not None:
             with self.notes.without_colour(as_text(name)):
                 texture = self._image((image.name, image.wrap))
-                found = texture.colours(image.coordinates(vt), corners)
+                colours = texture.colours(image.coordinates(vt), corners)
         elif tints is not None:
-            found = Colours.of_corners(tints)
+            colours = Colours.of_corners(tints)
         elif entry.colour is not None:
-            found = Colours.plain(entry.colour, len(corners))
-        return found
+            colours = Colours.plain(entry.colour, len(corners))
+        return colours
 
     def _files(self, libraries: Sequence[bytes]) -> Iterator[bytes]:
-        """Content of the files that lines name: each one, or several between spaces."""
+        """Yield the contents of the files that lines name: a file, or several between spaces."""
         read: set[Path | None] = set()
         for names in map(as_text, libraries):
             for name in [names] if self._file(names) else names.split():
@@ -143,29 +157,31 @@ class MtlMaterials:
                     try:
                         yield self._content(path)
                     except InputFileError as error:
-                        self.notes.gone.append(f"{name} ({error.strerror})")
+                        self.notes.missing_files.append(f"{name} ({error.strerror})")
                     except OSError:
-                        self.notes.gone.append(name)
+                        self.notes.missing_files.append(name)
 
     def _content(self, path: Path | None) -> bytes:
-        if path is None or path.stat().st_size > _MOST_BYTES:
+        """Return the content of a file of materials; OSError for a missing or large file."""
+        if path is None or path.stat().st_size > _MAX_BYTES:
             raise FileNotFoundError
         return read_input(path)
 
     def _file(self, name: str) -> Path | None:
-        """File of materials."""
+        """Return the path of a file of materials, or None."""
         with suppress(MeshFileError):
-            return named_file(self._mesh, name, self._wanted)
+            return named_file(self._mesh, name, self._options)
         return None
 
     def _texture(self, name: str, images: dict[bytes, _Image]) -> Texture | None:
+        """Return the mask of a material, or None for a solid material."""
         colour = images.get(b"map_kd")
         image = images.get(b"map_d", colour)
         if image is None:
             return None
         if image is colour and image.name.lower().endswith(_WITHOUT_ALPHA):
             return None
-        # Some programs name the same image twice: then its brightness is its colour's.
+        # Some programs name the same image twice: then its brightness belongs to its colour.
         grey = image is not colour and not (colour and colour.name == image.name)
         base, gain = map(float, image.options.get(b"-mm", (0, 1)))
         texture = self._mask((image.name, grey, base, gain, image.wrap))
@@ -176,40 +192,42 @@ class MtlMaterials:
     def _read_mask(
         self, key: tuple[str, bool, float, float, Wrap]
     ) -> Texture | Literal["solid", "glass"]:
-        """Mask of an image, or what it makes of a material."""
+        """Return the mask of an image, or the kind of a material without a mask."""
         name, grey, base, gain, wrap = key
         opacity = self._opacity((name, grey))
         if opacity is None:
             return "solid"
-        mask = np.float32(255 * base) + np.float32(gain) * opacity >= HALF
+        mask = np.float32(255 * base) + np.float32(gain) * opacity >= HALF_OPACITY
         if mask.all() or not mask.any():
             return "solid" if mask.all() else "glass"
         return Texture(mask, (wrap, wrap), self._allowance)
 
     def _read_opacity(self, key: tuple[str, bool]) -> Bytes | None:
+        """Return the opacity of an image, or None; keys are (name, whether brightness counts)."""
         name, grey = key
-        file = image_file(self._mesh, name, self._wanted, self._allowance)
+        file = image_file(self._mesh, name, self._options, self._allowance)
         return read_opacity(file, self._allowance, grey=grey)
 
     def _read_image(self, key: tuple[str, Wrap]) -> Texture:
+        """Return the texture of an image of colours; keys are (name, continuation)."""
         name, wrap = key
-        file = image_file(self._mesh, name, self._wanted, self._allowance)
+        file = image_file(self._mesh, name, self._options, self._allowance)
         image = read_colours(file, self._allowance, self.notes)
         return Texture(image, (wrap, wrap), self._allowance)
 
 
 def _read_mtl(data: bytes) -> dict[bytes, _Entry]:
-    """Find what a file says of materials."""
+    """Return the materials of a file: {name: entry}."""
     entries: dict[bytes, _Entry] = {}
     entry = _Entry()
     text = data.removeprefix(b"\xef\xbb\xbf")  # the mark of some editors on Windows
     for line in text.replace(b"\r", b"\n").replace(b"\t", b" ").split(b"\n"):
-        key, _, rest = line.strip().partition(b" ")
+        key, _, value = line.strip().partition(b" ")
         if key == b"newmtl":
-            entry = entries.setdefault(rest.strip(), _Entry())
-        elif key.lower() in (b"map_d", b"map_kd") and rest.strip():
-            entry.images[key.lower()] = _Image.of(rest)
+            entry = entries.setdefault(value.strip(), _Entry())
+        elif key.lower() in (b"map_d", b"map_kd") and value.strip():
+            entry.images[key.lower()] = _Image.parse(value)
         elif key == b"Kd":
-            with suppress(ValueError):  # of spectra, which nobody writes
-                entry.colour = as_bytes([*map(float, rest.split()[:3])]).reshape(1, 1, 3)
+            with suppress(ValueError):  # spectra, which programs do not write
+                entry.colour = as_bytes([*map(float, value.split()[:3])]).reshape(1, 1, 3)
     return entries

@@ -12,154 +12,214 @@ import re
 import struct
 from array import array
 from dataclasses import dataclass, field
+from functools import cached_property
 from itertools import chain
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from ...base.arrays import AnyArray, Floats, Ints
+from ...base.arrays import AnyArray, Bytes, Floats, Ints
 from ...base.words import as_text
 from ..colours import Colours, as_bytes
 from ..scene_mesh import SceneMesh
 from .mtl import MtlMaterials
 from .polygons import check_corners, triangulated
-from .scene_graph import Content, MeshFileError, Piece, Wanted, joined
+from .scene_graph import Content, MeshFileError, Piece, ReadOptions, join_pieces
 
 
 def _ints(numbers: array[int]) -> Ints:
+    """Return an array of Python as an array of NumPy, without a copy."""
     return np.frombuffer(numbers, np.int64)
+
+
+def _int_array() -> array[int]:
+    return array("q")
+
+
+def _float_array() -> array[float]:
+    return array("d")
 
 
 # -- .obj ----------------------------------------------------------------------------------------
 
-_MOST = 1 << 62  # texture coordinates that a number may name
+_MAX_COORDINATE = 1 << 62  # texture coordinates that a number may name
+
+
+class _ObjTriangles(NamedTuple):
+    """Triangles of an object."""
+
+    vertices: Ints  # (t, 3), rows of the vertices
+    coordinates: Ints  # (t, 3), rows of the texture coordinates
+    materials: Ints  # (t,)
 
 
 @dataclass
 class _ObjPolygons:
-    """Polygons of one object, while they are read; lists of Python would take ten times as much."""
+    """Polygons of an object during reading, as arrays: lists take ten times as much memory."""
 
-    corners: array[int] = field(default_factory=lambda: array("q"))  # vertices, from 0
-    places: array[int] = field(default_factory=lambda: array("q"))  # their texture coordinates
-    sizes: array[int] = field(default_factory=lambda: array("q"))  # corners of each polygon
-    kinds: array[int] = field(default_factory=lambda: array("q"))  # its material, a number
+    corners: array[int] = field(default_factory=_int_array)  # rows of vertices
+    coordinates: array[int] = field(default_factory=_int_array)  # rows of texture coordinates
+    sizes: array[int] = field(default_factory=_int_array)  # corners of each polygon
+    materials: array[int] = field(default_factory=_int_array)  # number of each polygon's material
 
-    def triangles(self, vertices: Floats) -> tuple[Ints, Ints, Ints]:
-        """Vertices (t, 3), texture coordinates (t, 3) and materials (t,) of triangles."""
+    def triangles(self, vertices: Floats) -> _ObjTriangles:
+        """Return the triangles of the polygons, with `vertices` (v, 3)."""
         corners = _ints(self.corners)
         sizes = _ints(self.sizes)
         check_corners(corners, len(vertices))
-        if not self.kinds:  # as a whole, without materials
-            own = triangulated(vertices, corners, sizes)
-            return own, own, np.zeros(len(own), np.int64)
-        own = triangulated(vertices[corners], np.arange(len(corners)), sizes)
-        kinds = np.repeat(_ints(self.kinds), sizes)
-        return corners[own], _ints(self.places)[own], kinds[own[:, 0]]
+        if not self.materials:  # polygons were read without materials
+            faces = triangulated(vertices, corners, sizes)
+            return _ObjTriangles(faces, faces, np.zeros(len(faces), np.int64))
+        faces = triangulated(vertices[corners], np.arange(len(corners)), sizes)
+        materials = np.repeat(_ints(self.materials), sizes)
+        return _ObjTriangles(corners[faces], _ints(self.coordinates)[faces], materials[faces[:, 0]])
 
 
-def read_obj(data: bytes, path: Path, wanted: Wanted) -> Content:
+@dataclass
+class _ObjContent:
+    """Vertices, texture coordinates and polygons of a file."""
+
+    objects: dict[tuple[str, int], _ObjPolygons]  # {(name, number of the line 'o'): polygons}
+    positions: array[float] = field(default_factory=_float_array)  # x, y, z of each vertex
+    coordinates: array[float] = field(default_factory=_float_array)  # u, v
+    tints: array[float] = field(default_factory=_float_array)  # red, green, blue of vertices
+    materials: list[bytes] = field(default_factory=list)  # names
+
+    @cached_property
+    def vertices(self) -> Floats:
+        """Vertices, (v, 3)."""
+        return np.frombuffer(self.positions).reshape(-1, 3)
+
+    @cached_property
+    def uv(self) -> Floats:
+        """Texture coordinates, (c, 2)."""
+        return np.frombuffer(self.coordinates).reshape(-1, 2)
+
+    @cached_property
+    def vertex_colours(self) -> Bytes | None:
+        """Colours of the vertices, (v, 3); None unless all vertices have a colour."""
+        if not self.tints or len(self.tints) != len(self.positions):
+            return None
+        return as_bytes(_colour_shares(np.frombuffer(self.tints).reshape(-1, 3)))
+
+
+def read_obj(data: bytes, path: Path, options: ReadOptions) -> Content:
     """Read a Wavefront file: an object for each name after 'o', or 'g' without any 'o'.
 
-    A repeated name begins another object after 'o', and continues the group after 'g', as the
-    format says. Objects are in order of their first face; materials do not divide them. Without
-    masks, triangles are solid; without these, colours and wanted materials, neither files of
+    A repeated name starts another object after 'o', and continues the group after 'g', as the
+    format says. Objects are in order of their first face; materials do not divide objects. Without
+    the option masks, triangles are solid; without masks, colours and materials, neither files of
     materials nor images are read.
     """
-    masks = wanted.masks
-    colours = wanted.colours
     text = data.replace(b"\r\n", b"\n").replace(b"\r", b"\n")
     text = text.replace(b"\\\n", b" ").replace(b"\t", b" ")
-    divider = b"o" if re.search(rb"^ *o ", text, re.MULTILINE) else b"g"
-    libraries = _obj_names(b"mtllib", text) if masks or colours else []
-    materials = MtlMaterials(path, len(data), libraries, wanted)
-    dressed = materials.has_masks or colours or wanted.materials
-    numbers = array("d")
-    coordinates = array("d")
-    tints = array("d")
-    parts = {(path.stem, 0): _ObjPolygons()}  # {(name, number of the line 'o'): polygons}
-    # {material: its number}
-    part = parts[path.stem, 0]
-    kind = 0
-    kinds = {b"": 0}
-    for line in text.split(b"\n"):
-        key, _, rest = line.lstrip(b" ").partition(b" ")
-        if key == b"v":
-            words = rest.partition(b"#")[0].split()  # a weight or a colour may follow
-            if len(words) < 3:
-                raise ValueError(f"a vertex has {len(words)} numbers, '{_shown(line)}'")
-            numbers.extend(map(float, words[:3]))
-            if colours and len(words) >= 6:
-                tints.extend(map(float, words[-3:]))
-        elif key == b"f":
-            rest = rest.partition(b"#")[0]
-            corners = _obj_corners(rest, len(numbers) // 3, line)
-            part.corners.extend(corners)
-            part.sizes.append(len(corners))
-            if dressed:
-                part.places.extend(_obj_places(rest, len(coordinates) // 2))
-                part.kinds.append(kind)
-        elif key == divider:
-            key_of_part = as_text(rest.strip()) or path.stem, len(parts) if divider == b"o" else 0
-            part = parts.setdefault(key_of_part, _ObjPolygons())
-        elif key == b"usemtl":
-            kind = kinds.setdefault(rest.strip(), len(kinds))
-        elif key == b"vt" and dressed:
-            coordinates.extend(_obj_coordinates(rest))
-    vertices = np.frombuffer(numbers).reshape(-1, 3)
-    uv = np.frombuffer(coordinates).reshape(-1, 2)
-    tinted = None
-    if colours and len(tints) == len(numbers):
-        tinted = as_bytes(_shares(np.frombuffer(tints).reshape(-1, 3)))
-    names = list(kinds)
+    libraries = _obj_names(b"mtllib", text) if options.masks or options.colours else []
+    materials = MtlMaterials(path, len(data), libraries, options)
+    with_materials = materials.has_masks or options.colours or options.materials
+    content = _parse_obj(text, path.stem, options.colours, with_materials)
     meshes = list[SceneMesh]()
-    for (name, _), part in parts.items():
-        faces, at, kind_of = part.triangles(vertices)
-        pieces = []
-        for number in np.unique(kind_of).tolist():
-            rows = np.flatnonzero(kind_of == number)
-            material = names[number]
-            cutout = materials.cutout(material, uv, at[rows])
-            corners_of = None if tinted is None else tinted[faces[rows]]
-            shown = materials.colours(material, uv, at[rows], corners_of)
-            named = as_text(material) if wanted.materials else ""
-            pieces.append(Piece(vertices, faces[rows], cutout, shown, named))
-        meshes += joined(name, pieces)
+    for (name, _), polygons in content.objects.items():
+        pieces = _obj_pieces(content, polygons, materials, options)
+        meshes += join_pieces(name, pieces)
     return Content(meshes, notes=materials.notes.lines())
 
 
+def _parse_obj(text: bytes, stem: str, with_colours: bool, with_materials: bool) -> _ObjContent:
+    """Parse the lines of a file; without a name, polygons belong to the object `stem`."""
+    divider = b"o" if re.search(rb"^ *o ", text, re.MULTILINE) else b"g"
+    polygons = _ObjPolygons()
+    content = _ObjContent({(stem, 0): polygons})
+    positions = content.positions
+    material = 0
+    materials = {b"": 0}  # {name: number}
+    for line in text.split(b"\n"):
+        key, _, value = line.lstrip(b" ").partition(b" ")
+        if key == b"v":
+            words = value.partition(b"#")[0].split()  # a weight or a colour may follow
+            if len(words) < 3:
+                raise ValueError(f"a vertex has {len(words)} numbers, '{_shown(line)}'")
+            positions.extend(map(float, words[:3]))
+            if with_colours and len(words) >= 6:
+                content.tints.extend(map(float, words[-3:]))
+        elif key == b"f":
+            value = value.partition(b"#")[0]
+            corners = _obj_corners(value, len(positions) // 3, line)
+            polygons.corners.extend(corners)
+            polygons.sizes.append(len(corners))
+            if with_materials:
+                count = len(content.coordinates) // 2
+                polygons.coordinates.extend(_obj_coordinate_rows(value, count))
+                polygons.materials.append(material)
+        elif key == divider:
+            number = len(content.objects) if divider == b"o" else 0
+            name = as_text(value.strip()) or stem
+            polygons = content.objects.setdefault((name, number), _ObjPolygons())
+        elif key == b"usemtl":
+            material = materials.setdefault(value.strip(), len(materials))
+        elif key == b"vt" and with_materials:
+            content.coordinates.extend(_obj_coordinates(value))
+    content.materials = list(materials)
+    return content
+
+
+def _obj_pieces(
+    content: _ObjContent, polygons: _ObjPolygons, materials: MtlMaterials, options: ReadOptions
+) -> list[Piece]:
+    """Return the triangles of an object as a piece for each material."""
+    vertices = content.vertices
+    uv = content.uv
+    tints = content.vertex_colours
+    triangles = polygons.triangles(vertices)
+    pieces = []
+    for number in np.unique(triangles.materials).tolist():
+        rows = np.flatnonzero(triangles.materials == number)
+        material = content.materials[number]
+        faces = triangles.vertices[rows]
+        coordinates = triangles.coordinates[rows]
+        cutout = materials.cutout(material, uv, coordinates)
+        corner_colours = None if tints is None else tints[faces]
+        colours = materials.colours(material, uv, coordinates, corner_colours)
+        name = as_text(material) if options.materials else ""
+        pieces.append(Piece(vertices, faces, cutout, colours, name))
+    return pieces
+
+
 def _obj_names(key: bytes, text: bytes) -> list[bytes]:
-    """Find what follows a word at the beginning of lines, each once and in order."""
-    found = re.findall(rb"^ *%s +(.*)$" % key, text, re.MULTILINE)
-    return list(dict.fromkeys(name.strip() for name in found))
+    """Return the distinct values of lines that start with a word, in order."""
+    values = re.findall(rb"^ *%s +(.*)$" % key, text, re.MULTILINE)
+    return list(dict.fromkeys(name.strip() for name in values))
 
 
-def _obj_coordinates(rest: bytes) -> list[float]:
-    """Two texture coordinates; NaN where there is no number."""
+def _obj_coordinates(value: bytes) -> list[float]:
+    """Return two texture coordinates; NaN if a word is no number."""
     try:
-        u, v = [*map(float, rest.partition(b"#")[0].split()[:2]), 0.0][:2]
+        u, v = [*map(float, value.partition(b"#")[0].split()[:2]), 0.0][:2]
     except ValueError:
         u = v = np.nan
     return [u, v]
 
 
-def _obj_places(rest: bytes, count: int) -> list[int]:
-    """Texture coordinates of a face's corners, from 0, or below; `count` are known so far."""
-    words = [word.split(b"/") for word in rest.split()]
+def _obj_coordinate_rows(value: bytes, count: int) -> list[int]:
+    """Return the rows of texture coordinates of a face's corners, -1 for a missing row.
+
+    `count` texture coordinates have been read so far.
+    """
+    words = [word.split(b"/") for word in value.split()]
     try:
-        numbers = [min(int(word[1]), _MOST) for word in words]
+        numbers = [min(int(word[1]), _MAX_COORDINATE) for word in words]
     except (IndexError, ValueError):
         return [-1] * len(words)
     return [number - 1 if number >= 0 else max(-1, count + number) for number in numbers]
 
 
-def _obj_corners(rest: bytes, count: int, line: bytes) -> list[int]:
-    """Vertices of a face, from 0; `count` are known so far."""
-    words = rest.split()
-    if b"/" in rest:
+def _obj_corners(value: bytes, count: int, line: bytes) -> list[int]:
+    """Return the rows of vertices of a face; `count` vertices have been read so far."""
+    words = value.split()
+    if b"/" in value:
         words = [word.partition(b"/")[0] for word in words]
     numbers = list(map(int, words))
-    if numbers and min(numbers) <= 0:  # rare, and found by this one check
+    if numbers and min(numbers) <= 0:  # rare, so that this is the only check
         if 0 in numbers or min(numbers) < -count:
             raise ValueError(f"'{_shown(line)}' refers to a missing vertex")
         return [number - 1 if number > 0 else count + number for number in numbers]
@@ -167,6 +227,7 @@ def _obj_corners(rest: bytes, count: int, line: bytes) -> list[int]:
 
 
 def _shown(line: bytes) -> str:
+    """Return the start of a line, for messages."""
     return as_text(line.strip()[:60])
 
 
@@ -177,11 +238,11 @@ def _shown(line: bytes) -> str:
 _OFF = re.compile(rb"(?:ST)?C?N?OFF(?![A-Z])", re.IGNORECASE)
 
 
-def read_off(data: bytes, path: Path, wanted: Wanted) -> Content:
-    """Read an Object File Format file: one mesh; colours are those of vertices (COFF)."""
+def read_off(data: bytes, path: Path, options: ReadOptions) -> Content:
+    """Read an Object File Format file as a single mesh, with the colours of vertices (COFF)."""
     text = re.sub(rb"#[^\r\n]*", b"", data).lstrip()
-    found = _OFF.match(text)
-    text = text[found.end() if found else 0 :]
+    keyword = _OFF.match(text)
+    text = text[keyword.end() if keyword else 0 :]
     if text.lstrip().upper().startswith(b"BINARY"):
         raise MeshFileError("is binary OFF, which is not supported: export it as text, or as .ply")
     lines = [line.split() for line in text.splitlines() if line.strip()]
@@ -198,7 +259,7 @@ def read_off(data: bytes, path: Path, wanted: Wanted) -> Content:
     tints = array("d")
     corners = array("q")
     sizes = array("q")
-    coloured = wanted.colours and found is not None and found[0].upper() == b"COFF"
+    coloured = options.colours and keyword is not None and keyword[0].upper() == b"COFF"
     for line in lines[:points]:
         if len(line) < 3:
             raise ValueError(f"a vertex has {len(line)} numbers")
@@ -213,27 +274,27 @@ def read_off(data: bytes, path: Path, wanted: Wanted) -> Content:
         sizes.append(size)
     vertices = np.frombuffer(numbers).reshape(-1, 3)
     faces = triangulated(vertices, _ints(corners), _ints(sizes))
-    shown = None
+    colours = None
     if coloured and len(tints) == len(numbers):
-        shown = _tinted(_shares(np.frombuffer(tints).reshape(-1, 3)), faces)
-    return Content(joined(path.stem, [Piece(vertices, faces, None, shown)]))
+        colours = _vertex_colours(_colour_shares(np.frombuffer(tints).reshape(-1, 3)), faces)
+    return Content(join_pieces(path.stem, [Piece(vertices, faces, None, colours)]))
 
 
-def _shares(colours: Floats) -> Floats:
-    """Shares of colours that are written as 0 to 1 or, if one is above 1.5, as 0 to 255."""
+def _colour_shares(colours: Floats) -> Floats:
+    """Return colours as 0 to 1; if a number is above 1.5, all are written as 0 to 255."""
     return colours / (255 if (colours > 1.5).any() else 1)
 
 
-def _tinted(shares: Floats, faces: Ints) -> Colours:
-    """Colours of vertices, (v, 3), 0 to 1."""
+def _vertex_colours(shares: Floats, faces: Ints) -> Colours:
+    """Return the colours of faces whose vertices have colours (v, 3), 0 to 1."""
     return Colours.of_corners(as_bytes(shares)[faces])
 
 
 # -- .stl ----------------------------------------------------------------------------------------
 
 
-def read_stl(data: bytes, path: Path, wanted: Wanted) -> Content:
-    """Read a stereolithography file: one mesh if binary, one for each solid if text."""
+def read_stl(data: bytes, path: Path, options: ReadOptions) -> Content:
+    """Read a stereolithography file: a single mesh if binary, a mesh for each solid if text."""
     announced = int.from_bytes(data[80:84], "little")
     # A few more bytes may follow; in a text file the number does not fit.
     if len(data) >= 84 and 0 <= len(data) - 84 - 50 * announced < 50:
@@ -261,7 +322,7 @@ def read_stl(data: bytes, path: Path, wanted: Wanted) -> Content:
 
 
 def _stl_mesh(name: str, corners: Floats) -> list[SceneMesh]:
-    """One mesh of triangles that share no vertices."""
+    """Return a mesh of triangles that share no vertices, in a list; [] without triangles."""
     faces = np.arange(len(corners)).reshape(-1, 3)
     return [SceneMesh(name, corners, faces)] if len(faces) else []
 
@@ -283,27 +344,54 @@ class _Element:
 
     name: str
     count: int
-    # {name: (type of the number, type of the length where it is a list, else '')}
+    # {name: (type of the numbers, type of the length of a list, '' for a single number)}
     properties: dict[str, tuple[str, str]] = field(default_factory=dict)
 
 
-def read_ply_mesh(data: bytes, path: Path, wanted: Wanted) -> Content:
+class _PlyColumn(NamedTuple):
+    """Numbers of a property in all rows of an element."""
+
+    numbers: AnyArray  # (sum of sizes,)
+    sizes: Ints  # (rows,), numbers of each row
+
+
+_PlyRows = dict[str, dict[str, _PlyColumn]]  # {element: {property: column}}
+
+
+class _PlyHeader(NamedTuple):
+    """Header of a .ply file, and the bytes after the header."""
+
+    elements: list[_Element]
+    order: str  # byte order, '' of text
+    body: bytes
+
+
+def read_ply_mesh(data: bytes, path: Path, options: ReadOptions) -> Content:
     """Read a Stanford polygon file: text or binary, faces of any mixture.
 
     Colours are red, green and blue of its vertices: integers, or real numbers from 0 to 1 or 255.
     """
-    elements, order, body = _ply_header(data)
-    counts = {element.name: element.count for element in elements}
-    # Their types, before text is read as real numbers.
-    types = {element.name: element.properties for element in elements}
+    header = _ply_header(data)
+    counts = {element.name: element.count for element in header.elements}
+    # Types of the properties, before text is read as real numbers.
+    types = {element.name: element.properties for element in header.elements}
     if counts.get("tristrips"):
         raise MeshFileError("has triangle strips, which are not read: export it with faces")
     if not counts.get("face"):
         raise MeshFileError(
             "is a point cloud, it has no faces: make a mesh of it by lidarpool scene points"
         )
-    rows = _ply_rows(elements, order, body)
+    rows = _ply_rows(header)
     vertices = _ply_vertices(rows)
+    faces = _ply_faces(rows, vertices)
+    colours = None
+    if options.colours and all(name in rows["vertex"] for name in _PLY_COLOURS):
+        colours = _ply_colours(rows, types["vertex"]["red"][0], faces)
+    return Content(join_pieces(path.stem, [Piece(vertices, faces, None, colours)]))
+
+
+def _ply_faces(rows: _PlyRows, vertices: Floats) -> Ints:
+    """Return the triangles (t, 3) of all faces; ValueError if there are no indices."""
     name = next((name for name in _PLY_LISTS if name in rows["face"]), None)
     if name is None:
         raise ValueError(f"its faces have no {_PLY_LISTS[0]}")
@@ -311,44 +399,47 @@ def read_ply_mesh(data: bytes, path: Path, wanted: Wanted) -> Content:
     corners = numbers.astype(np.int64)
     if not np.array_equal(corners, numbers):
         raise ValueError("vertex indices of faces are not whole numbers")
-    faces = triangulated(vertices, corners, sizes)
-    shown = None
-    if wanted.colours and all(name in rows["vertex"] for name in _PLY_COLOURS):
-        given = np.stack([rows["vertex"][name][0] for name in _PLY_COLOURS], axis=1)
-        given = given.astype(np.float64)
-        kind = np.dtype(types["vertex"]["red"][0])
-        # Integers of four bytes hold 0 to 255, too.
-        small = kind.kind in "iu" and kind.itemsize < 4
-        shown = _tinted(given / np.iinfo(kind).max if small else _shares(given), faces)
-    return Content(joined(path.stem, [Piece(vertices, faces, None, shown)]))
+    return triangulated(vertices, corners, sizes)
+
+
+def _ply_colours(rows: _PlyRows, type_name: str, faces: Ints) -> Colours:
+    """Return the colours of faces whose vertices have colours of a type."""
+    columns = [rows["vertex"][name].numbers for name in _PLY_COLOURS]
+    colours = np.stack(columns, axis=1).astype(np.float64)
+    kind = np.dtype(type_name)
+    # Integers of four bytes hold 0 to 255, as real numbers may do.
+    if kind.kind in "iu" and kind.itemsize < 4:
+        return _vertex_colours(colours / np.iinfo(kind).max, faces)
+    return _vertex_colours(_colour_shares(colours), faces)
 
 
 def read_ply_points(data: bytes) -> Floats:
     """Read the vertices of a Stanford polygon file: (n, 3)."""
-    return _ply_vertices(_ply_rows(*_ply_header(data)))
+    return _ply_vertices(_ply_rows(_ply_header(data)))
 
 
 def read_ply_columns(data: bytes) -> dict[str, AnyArray]:
     """Read the properties of vertices of a Stanford polygon file, but lists: {name: (n,)}."""
-    rows = _ply_rows(*_ply_header(data)).get("vertex", {})
+    rows = _ply_rows(_ply_header(data)).get("vertex", {})
     return {name: values for name, (values, sizes) in rows.items() if (sizes == 1).all()}
 
 
-def _ply_vertices(rows: _Rows) -> Floats:
+def _ply_vertices(rows: _PlyRows) -> Floats:
+    """Return the positions of vertices, (v, 3); ValueError if an axis is missing."""
     if missing := [axis for axis in "xyz" if axis not in rows.get("vertex", {})]:
         raise ValueError(f"its vertices have no {', '.join(missing)}")
-    return np.stack([rows["vertex"][axis][0] for axis in "xyz"], axis=1).astype(np.float64)
+    return np.stack([rows["vertex"][axis].numbers for axis in "xyz"], axis=1).astype(np.float64)
 
 
-def _ply_header(data: bytes) -> tuple[list[_Element], str, bytes]:
-    """Elements, byte order ('' of text) and what follows the header."""
-    found = re.match(rb"ply[ \t]*\r?\n(.*?\n)??end_header[ \t]*\r?\n", data, re.DOTALL)
-    found = found or re.match(rb"ply\r(.*?\r)??end_header\r", data, re.DOTALL)
-    if not found:
+def _ply_header(data: bytes) -> _PlyHeader:
+    """Parse the header of a .ply file; ValueError if the header is broken."""
+    header_match = re.match(rb"ply[ \t]*\r?\n(.*?\n)??end_header[ \t]*\r?\n", data, re.DOTALL)
+    header_match = header_match or re.match(rb"ply\r(.*?\r)??end_header\r", data, re.DOTALL)
+    if not header_match:
         raise ValueError("no PLY header, or cut within it")
     elements: list[_Element] = []
     order = ""
-    for line in (found[1] or b"").decode("latin-1").splitlines():
+    for line in (header_match[1] or b"").decode("latin-1").splitlines():
         match line.split():
             case ["format", kind, *_]:
                 order = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}[kind]
@@ -364,94 +455,120 @@ def _ply_header(data: bytes) -> tuple[list[_Element], str, bytes]:
                 pass
             case _:
                 raise ValueError(f"'{line[:60]}' is not a line of a PLY header")
-    return elements, order, data[found.end() :]
+    return _PlyHeader(elements, order, data[header_match.end() :])
 
 
-# {element: {property: its numbers in all rows, how many each row has}}
-_Rows = dict[str, dict[str, tuple[AnyArray, Ints]]]
-
-
-def _ply_rows(elements: list[_Element], order: str, body: bytes) -> _Rows:
-    """All rows of all elements.
+def _ply_rows(header: _PlyHeader) -> _PlyRows:
+    """Return all rows of all elements.
 
     Text is read in double precision, whatever type its header states: georeferenced vertices are
     often declared `float` and have more digits.
     """
+    elements, order, body = header
     if not order:
         words = np.array(list(map(float, body.split())))
         body = words.tobytes()
         for element in elements:
             kinds = element.properties.items()
             element.properties = {name: ("f8", "f8" * bool(n)) for name, (_, n) in kinds}
-    rows: _Rows = {}
-    at = 0
+    rows: _PlyRows = {}
+    start = 0
     for element in elements:
         if element.count and not element.properties:
             raise ValueError(f"rows of {element.name[:20]} announced, without content")
-        rows[element.name], at = _element_rows(element, order or "=", body, at)
-    rest = body[at:].strip(b"\0\r\n\t ") if order else body[at:]
-    if rest:
-        raise ValueError(f"{len(rest):,} bytes more than announced")
+        reader = _PlyElementReader(element, order or "=", body)
+        rows[element.name], start = reader.read(start)
+    remaining = body[start:].strip(b"\0\r\n\t ") if order else body[start:]
+    if remaining:
+        raise ValueError(f"{len(remaining):,} bytes more than announced")
     return rows
 
 
-def _element_rows(
-    element: _Element, order: str, body: bytes, at: int
-) -> tuple[dict[str, tuple[AnyArray, Ints]], int]:
-    """Numbers and lengths of all properties, and the end of the rows."""
-    count = element.count
-    names = list(element.properties)
-    kinds = {name: np.dtype(order + kind) for name, (kind, _) in element.properties.items()}
-    first, end = (
-        _ply_row(element, kinds, order, body, at) if count else ([(at, 1)] * len(names), at)
-    )
-    # The type of a row as long as the first: usually all are, and are read at once.
-    row: list[Any] = []
-    for (name, (_, length)), (_, n) in zip(element.properties.items(), first, strict=True):
-        row += [(f"{name} length", order + length, (1,))] if length else []
-        row += [(name, kinds[name], (n,))]
-    if at + (end - at) * count <= len(body):
-        table = np.frombuffer(body, np.dtype(row), count, at)
-        found = {
-            name: (table[name].reshape(-1), np.full(count, n))
-            for name, (_, n) in zip(names, first, strict=True)
+class _PlyElementReader:
+    """Reader of the rows of an element from bytes."""
+
+    def __init__(self, element: _Element, order: str, body: bytes) -> None:
+        self._element = element
+        self._order = order
+        self._body = body
+        self._kinds = {
+            name: np.dtype(order + kind) for name, (kind, _) in element.properties.items()
         }
-        lists = [name for name in names if element.properties[name][1]]
-        if all((table[f"{name} length"][:, 0] == found[name][1]).all() for name in lists):
-            return found, at + (end - at) * count
-    spans = array("q")  # tuples would take ten times as much
-    for _ in range(count):
-        each, at = _ply_row(element, kinds, order, body, at)
-        spans.extend(chain.from_iterable(each))
-    raw = np.frombuffer(body, np.uint8)
-    found = {}
-    columns = np.frombuffer(spans, np.int64).reshape(count, len(names), 2)
-    for column, (name, kind) in enumerate(kinds.items()):
-        starts, sizes = columns[:, column].T
-        # Bytes of all numbers, in order.
-        within = np.arange(sizes.sum()) - np.repeat(np.cumsum(sizes) - sizes, sizes)
-        places = np.repeat(starts, sizes) + kind.itemsize * within
-        found[name] = raw[places[:, None] + np.arange(kind.itemsize)].view(kind)[:, 0], sizes
-    return found, at
 
+    def read(self, start: int) -> tuple[dict[str, _PlyColumn], int]:
+        """Return the columns of all properties, and the offset after the last row."""
+        count = self._element.count
+        sizes = [1] * len(self._kinds)
+        stop = start
+        if count:
+            spans, stop = self._row(start)
+            sizes = [size for _, size in spans]
+        table_stop = start + (stop - start) * count
+        if table_stop <= len(self._body):
+            columns = self._equal_rows(start, sizes)
+            if columns is not None:
+                return columns, table_stop
+        return self._unequal_rows(start)
 
-def _ply_row(
-    element: _Element, kinds: dict[str, np.dtype[Any]], order: str, body: bytes, at: int
-) -> tuple[list[tuple[int, int]], int]:
-    """Start and count of the numbers of each property of a row; the row's end."""
-    out = []
-    for name, (_, length) in element.properties.items():
-        n = 1
-        if length:
-            (n,) = struct.unpack_from(order + np.dtype(length).char, body, at)
-            if n < 0 or n != int(n):
-                raise ValueError(f"a list has the length {n}")
-            at = at + int(length[1])
-            n = int(n)
-        out.append((at, n))
-        at += n * kinds[name].itemsize
-    if at > len(body):
-        raise ValueError(
-            f"{element.count:,} rows of {element.name[:20]} announced, but there are fewer"
-        )
-    return out, at
+    def _equal_rows(self, start: int, sizes: list[int]) -> dict[str, _PlyColumn] | None:
+        """Return columns if all rows have as many numbers as the first, as most files; else None.
+
+        The rows are read at once as a table.
+        """
+        count = self._element.count
+        properties = self._element.properties
+        row: list[Any] = []
+        for (name, (_, length)), size in zip(properties.items(), sizes, strict=True):
+            row += [(f"{name} length", self._order + length, (1,))] if length else []
+            row += [(name, self._kinds[name], (size,))]
+        table = np.frombuffer(self._body, np.dtype(row), count, start)
+        columns = {
+            name: _PlyColumn(table[name].reshape(-1), np.full(count, size))
+            for name, size in zip(properties, sizes, strict=True)
+        }
+        lists = [name for name, (_, length) in properties.items() if length]
+        if all((table[f"{name} length"][:, 0] == columns[name].sizes).all() for name in lists):
+            return columns
+        return None
+
+    def _unequal_rows(self, start: int) -> tuple[dict[str, _PlyColumn], int]:
+        """Return columns of rows that differ in length, and the offset after the last row."""
+        count = self._element.count
+        spans = array("q")  # tuples would take ten times as much memory
+        offset = start
+        for _ in range(count):
+            row_spans, offset = self._row(offset)
+            spans.extend(chain.from_iterable(row_spans))
+        raw = np.frombuffer(self._body, np.uint8)
+        columns = {}
+        table = np.frombuffer(spans, np.int64).reshape(count, len(self._kinds), 2)
+        for column, (name, kind) in enumerate(self._kinds.items()):
+            starts, sizes = table[:, column].T
+            # Offsets of all numbers, in order.
+            within_row = np.arange(sizes.sum()) - np.repeat(np.cumsum(sizes) - sizes, sizes)
+            offsets = np.repeat(starts, sizes) + kind.itemsize * within_row
+            numbers = raw[offsets[:, None] + np.arange(kind.itemsize)].view(kind)[:, 0]
+            columns[name] = _PlyColumn(numbers, sizes)
+        return columns, offset
+
+    def _row(self, start: int) -> tuple[list[tuple[int, int]], int]:
+        """Return offset and count of the numbers of each property of a row, and the row's end."""
+        element = self._element
+        body = self._body
+        spans = []
+        offset = start
+        for name, (_, length) in element.properties.items():
+            size = 1
+            if length:
+                (size,) = struct.unpack_from(self._order + np.dtype(length).char, body, offset)
+                if size < 0 or size != int(size):
+                    raise ValueError(f"a list has the length {size}")
+                offset += int(length[1])
+                size = int(size)
+            spans.append((offset, size))
+            offset += size * self._kinds[name].itemsize
+        if offset > len(body):
+            raise ValueError(
+                f"{element.count:,} rows of {element.name[:20]} announced, but there are fewer"
+            )
+        return spans, offset

@@ -1,4 +1,4 @@
-"""Triangulates polygons, also non-convex ones, such as a wall with a door."""
+"""Triangulation of polygons, also non-convex polygons, such as a wall with a door."""
 
 from __future__ import annotations
 
@@ -8,81 +8,96 @@ import numpy as np
 from ...base.arrays import Bools, Floats, Ints
 from ...base.vectors import applied, length, turned
 
-# For an outline that crosses itself everywhere, the clipper's time grows with their cube: 20 s for
-# so many. Larger outlines are probably broken files.
-MOST_CORNERS = 5000
+# For an outline that crosses itself everywhere, the clipper's time grows with the cube of the
+# corners: 20 s for this number. Larger outlines are probably broken files.
+MAX_CORNERS = 5000
 
-_WARPED = 1e-5  # a polygon is plane if its corners lie this near a plane, over its size
+_WARPED = 1e-5  # largest distance of a plane polygon's corners from the plane, over its size
 _FLAT = 1e-12  # a corner turns back if its sine, of a plane polygon, is below minus this
 
 
 def triangulated(vertices: Floats, corners: Ints, sizes: Ints) -> Ints:
     """Cut polygons into triangles with the same corners and orientation.
 
-    Convex polygons and quadrangles become fans, all of one size at once; mapbox_earcut clips the
-    ears of others.
+    Convex polygons and quadrangles become fans, all of the same size at once; mapbox_earcut clips
+    the ears of other polygons.
 
-    `vertices` are (v, 3), `corners` (sum of sizes,) those of all polygons one after the other, and
-    `sizes` (p,) how many each has; polygons with fewer than three are dropped.
+    Parameters
+    ----------
+    vertices
+        (v, 3).
+    corners
+        (sum of sizes,): rows of `vertices` of all polygons in order.
+    sizes
+        (p,): number of corners of each polygon; polygons with fewer than three are dropped.
 
     Returns
     -------
-    (t, 3), in the order of the polygons: of each two triangles less than it has corners. There are
-    fewer if a plane outline crosses or touches itself or runs back on itself, such as around a
-    hole: the enclosed area is filled, and parts without area are left out.
+    (t, 3), rows of `vertices`, in the order of the polygons: for each polygon two triangles less
+    than corners. There are fewer triangles if a plane outline crosses or touches itself or runs
+    back on itself, such as around a hole: the enclosed area is filled, and parts without area are
+    left out.
 
     Raises
     ------
     ValueError
-        If a corner refers to no vertex, or a non-convex polygon has too many corners.
+        If a corner refers to a missing vertex, or a non-convex polygon has too many corners.
     """
     check_corners(corners, len(vertices))
     first = np.cumsum(sizes) - sizes
-    ends = np.cumsum(np.maximum(sizes - 2, 0))
-    out = np.full((int(ends[-1]) if len(ends) else 0, 3), -1, dtype=np.int64)
+    stops = np.cumsum(np.maximum(sizes - 2, 0))
+    triangles = np.full((int(stops[-1]) if len(stops) else 0, 3), -1, dtype=np.int64)
     for size in np.unique(sizes[sizes > 2]).tolist():
-        which = np.flatnonzero(sizes == size)
-        rows = corners[first[which, None] + np.arange(size)]
+        polygons = np.flatnonzero(sizes == size)
+        polygon_corners = corners[first[polygons, None] + np.arange(size)]
         if size == 4:
-            rows = _begun_well(vertices, rows)
-        places = ends[which, None] - (size - 2) + np.arange(size - 2)
-        out[places] = fanned(rows)
+            polygon_corners = _from_reflex_corner(vertices, polygon_corners)
+        triangle_rows = stops[polygons, None] - (size - 2) + np.arange(size - 2)
+        triangles[triangle_rows] = fanned(polygon_corners)
         if size > 4:
-            for i in np.flatnonzero(_turns(vertices[rows]).any(axis=1)).tolist():
-                clipped = with_holes(vertices, [rows[i]])
-                if len(clipped) < size - 2 and _lost(vertices[rows[i]], vertices[clipped]):
-                    clipped = rows[i][_all_triangles(vertices[rows[i]])]
-                if len(clipped):  # else it has no area, nor has the fan
-                    out[places[i]] = -1
-                    out[places[i, : len(clipped)]] = clipped
-    return out[out[:, 0] >= 0]
+            has_reflex = _reflex_corners(vertices[polygon_corners]).any(axis=1)
+            for i in np.flatnonzero(has_reflex).tolist():
+                clipped = _clipped_polygon(vertices, polygon_corners[i])
+                if len(clipped):  # else neither polygon nor fan have an area
+                    triangles[triangle_rows[i]] = -1
+                    triangles[triangle_rows[i, : len(clipped)]] = clipped
+    return triangles[triangles[:, 0] >= 0]
 
 
-def _begun_well(vertices: Floats, rows: Ints) -> Ints:
-    """Rotate quadrangles (p, 4) to begin at their reflex corner, if any, so that a fan fills them.
+def _clipped_polygon(vertices: Floats, corners: Ints) -> Ints:
+    """Return the triangles (t, 3) of a polygon with reflex corners; none without an area."""
+    clipped = with_holes(vertices, [corners])
+    if len(clipped) < len(corners) - 2 and _leaves_gaps(vertices[corners], vertices[clipped]):
+        return np.asarray(corners[_all_triangles(vertices[corners])])
+    return clipped
+
+
+def _from_reflex_corner(vertices: Floats, rows: Ints) -> Ints:
+    """Rotate the corners of quadrangles (p, 4) to start at a reflex corner, so that a fan fits.
 
     The clipper would leave out half of a quadrangle so warped that its projection crosses itself.
     """
-    back = _turns(vertices[rows])
-    begin = np.where(back.sum(axis=1) == 1, back.argmax(axis=1), 0)
-    return np.take_along_axis(rows, (begin[:, None] + np.arange(4)) % 4, axis=1)
+    reflex = _reflex_corners(vertices[rows])
+    start = np.where(reflex.sum(axis=1) == 1, reflex.argmax(axis=1), 0)
+    return np.take_along_axis(rows, (start[:, None] + np.arange(4)) % 4, axis=1)
 
 
 def with_holes(vertices: Floats, rings: list[Ints]) -> Ints:
-    """Clip the ears off one polygon: an outline, and the outlines of holes in it.
+    """Return the triangles (t, 3) of a polygon with holes.
 
-    The triangles (t, 3) have the orientation of the outline; none if it has no area.
+    The first of the `rings` is the outline, further rings are outlines of holes. The triangles have
+    the orientation of the outline; there are no triangles if the outline has no area.
 
     Raises
     ------
     ValueError
-        As `triangulated`.
+        If a corner refers to a missing vertex, or there are too many corners.
     """
     corners = np.concatenate(rings)
-    if len(corners) > MOST_CORNERS:
+    if len(corners) > MAX_CORNERS:
         raise ValueError(f"a face has {len(corners):,} corners and is not convex: triangulate it")
     check_corners(corners, len(vertices))
-    points = vertices[corners] - vertices[corners[0]]  # so that far ones lose no digits
+    points = vertices[corners] - vertices[corners[0]]  # so that large coordinates lose no digits
     outline = points[: len(rings[0])]
     normal = _newell(outline)
     drop = int(np.abs(normal).argmax())
@@ -94,83 +109,85 @@ def with_holes(vertices: Floats, rings: list[Ints]) -> Ints:
 
 
 def _clipped(flat: Floats, sizes: list[int]) -> Ints:
-    """Triangles (t, 3) of a plane outline (k, 2) and holes in it, of so many corners each."""
-    ends = np.cumsum(sizes).astype(np.uint32)
-    found = mapbox_earcut.triangulate_float64(np.ascontiguousarray(flat), ends)
-    return np.asarray(found, np.int64).reshape(-1, 3)
+    """Return the triangles (t, 3) of plane rings (k, 2): outline and holes, of `sizes` corners."""
+    stops = np.cumsum(sizes).astype(np.uint32)
+    triangles = mapbox_earcut.triangulate_float64(np.ascontiguousarray(flat), stops)
+    return np.asarray(triangles, np.int64).reshape(-1, 3)
 
 
 def unrolled(strip: Ints) -> Ints:
-    """Triangles (t, 3) of a strip of corners (t + 2,), all facing the same way."""
+    """Return the triangles (t, 3) of a strip of corners (t + 2,), all with the same orientation."""
     faces = np.stack([strip[:-2], strip[1:-1], strip[2:]], axis=1)
     faces[1::2] = faces[1::2, [1, 0, 2]]
     return faces
 
 
 def fanned(corners: Ints) -> Ints:
-    """Triangles (…, t, 3) of fans of corners (…, t + 2)."""
+    """Return the triangles (…, t, 3) of fans of corners (…, t + 2)."""
     first = np.broadcast_to(corners[..., :1], corners[..., 2:].shape)
     return np.stack([first, corners[..., 1:-1], corners[..., 2:]], axis=-1)
 
 
-def _lost(points: Floats, triangles: Floats) -> bool:
-    """Whether a polygon (k, 3) is warped, and triangles (t, 3, 3) of it do not fill it.
+def _leaves_gaps(points: Floats, triangles: Floats) -> bool:
+    """Return True if a polygon (k, 3) is warped and its triangles (t, 3, 3) leave gaps.
 
     The projection of a warped polygon may cross itself, where the clipper leaves triangles out.
-    All triangles together have the polygon's area vector, however it is cut.
+    The area vectors of all triangles add up to the polygon's, however the polygon is cut.
     """
     points = points - points[0]
     size = np.abs(points).max()
     normal = _newell(points)
-    off = np.ptp(applied(points, normal))
+    deviation = np.ptp(applied(points, normal))
     a, b, c = np.moveaxis(triangles, 1, 0)
     missing = normal - np.cross(b - a, c - a).sum(axis=0)
-    return bool(off > _WARPED * size * length(normal) and length(missing) > _WARPED * size * size)
+    return bool(
+        deviation > _WARPED * size * length(normal) and length(missing) > _WARPED * size * size
+    )
 
 
 def _all_triangles(points: Floats) -> Ints:
-    """Triangles (k - 2, 3) of a warped polygon (k, 3): clipped as seen along its normal, or a fan.
+    """Return triangles (k - 2, 3) of a warped polygon (k, 3): clipped along its normal, or a fan.
 
-    The fan is the one with the least area, which of a polygon with one reflex corner begins there.
+    The fan is the fan of the least area, which starts at the reflex corner if there is only one.
     """
     count = len(points)
     points = points - points[0]
     normal = _newell(points)
     normal = normal / length(normal)
     across = np.cross(normal, np.eye(3)[np.abs(normal).argmin()])
-    found = _clipped(turned(points, np.stack([across, np.cross(normal, across)])), [count])
-    if len(found) == count - 2:
-        return found
+    clipped = _clipped(turned(points, np.stack([across, np.cross(normal, across)])), [count])
+    if len(clipped) == count - 2:
+        return clipped
 
-    def area(begin: int) -> float:
-        rest = np.roll(points, -begin, axis=0) - points[begin]
-        return float(length(np.cross(rest[1:-1], rest[2:])).sum())
+    def area(start: int) -> float:
+        rotated = np.roll(points, -start, axis=0) - points[start]
+        return float(length(np.cross(rotated[1:-1], rotated[2:])).sum())
 
     best = min(range(count), key=area)
     return fanned((best + np.arange(count)) % count)
 
 
 def _newell(points: Floats) -> Floats:
-    """Twice the area vector of a polygon (k, 3) (Newell)."""
+    """Return twice the area vector of a polygon (k, 3) (Newell)."""
     return np.asarray(np.cross(points, np.roll(points, -1, axis=0)).sum(axis=0))
 
 
-def check_corners(corners: Ints, vertices: int) -> None:
-    """Check that corners refer to some of so many vertices; ValueError if not."""
-    if len(corners) and not 0 <= corners.min() <= corners.max() < vertices:
+def check_corners(corners: Ints, vertex_count: int) -> None:
+    """Check that corners refer to existing vertices, numbered from 0; ValueError if not."""
+    if len(corners) and not 0 <= corners.min() <= corners.max() < vertex_count:
         raise ValueError(
             f"faces refer to vertices {corners.min()} to {corners.max()}, counted from 0, of "
-            f"{vertices}"
+            f"{vertex_count}"
         )
 
 
-def _turns(points: Floats) -> Bools:
-    """Whether corners (p, k, 3) are reflex, against the sense of the polygon: (p, k)."""
+def _reflex_corners(points: Floats) -> Bools:
+    """Return the mask (p, k) of reflex corners of polygons (p, k, 3)."""
     points = points - points[:, :1]
     into = points - np.roll(points, 1, axis=1)
     out_of = np.roll(into, -1, axis=1)
-    turn = np.cross(into, out_of)
+    bend = np.cross(into, out_of)
     normal = np.cross(points, np.roll(points, -1, axis=1)).sum(axis=1)
-    along = (turn * normal[:, None]).sum(axis=2)
+    bend_along_normal = (bend * normal[:, None]).sum(axis=2)
     scale = length(into) * length(out_of)
-    return np.asarray(along < -_FLAT * scale * length(normal)[:, None])
+    return np.asarray(bend_along_normal < -_FLAT * scale * length(normal)[:, None])

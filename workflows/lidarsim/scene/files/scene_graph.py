@@ -23,70 +23,70 @@ from ..scene_instances import SceneInstance
 from ..scene_mesh import Cutout, SceneMesh, compacted, stacked
 from .polygons import check_corners
 
-# What helps if a file unpacks to too much, without and with an animation.
+# Advice on a file that unpacks to too much, without and with an animation.
 SMALLER = "export it in parts, or as .ply"
 SHORTER = "shorten its animation or simplify its mesh"
-# A mesh becomes one of instances if that saves so many triangles; single triangles are cast faster.
+# A mesh becomes instances if that saves as many triangles; triangles of faces are cast faster.
 SHARED_TRIANGLES = 100_000
-MOST_NODES = 200_000  # most nodes of a scene, counting every instance
-_NAMES = 16  # of nodes that a place remembers
-MOST_TRIANGLES = np.iinfo(np.int32).max  # of all places
+MAX_NODES = 200_000  # nodes of a scene, counting every instance
+_MAX_PATH_NAMES = 16  # names of nodes that a placed node remembers
+MAX_TRIANGLES = np.iinfo(np.int32).max  # of all placed meshes
 
 
 @dataclass(frozen=True)
 class Raster:
-    """What was taken of a raster of heights."""
+    """Description of a mesh read from a raster of heights."""
 
-    crs: str  # coordinate system of the mesh, as "EPSG:25832" or WKT; empty if it states none
+    crs: str  # coordinate system of the mesh, as "EPSG:25832" or WKT; empty if unknown
     epsg: int | None
-    told: str  # for users
+    summary: str  # size, step and coordinate system, for users
 
 
 class ObjectClass(NamedTuple):
     """A semantic class that a format gives to its objects."""
 
     name: str
-    patterns: tuple[str, ...]  # of the names of its objects
+    patterns: tuple[str, ...]  # patterns of the names of its objects
 
 
 class MeshFileError(Exception):
-    """An error of a mesh file, as a clause that follows its name."""
+    """An error of a mesh file, as a clause that follows the file's name."""
 
 
 Window = tuple[float, float, float, float]  # lowest x and y, highest x and y
 
 
 class RasterOptions(NamedTuple):
-    """How a raster of heights is read; see `read_raster`."""
+    """Options for reading a raster of heights; see `read_raster`."""
 
-    unit: str | None = None  # of its heights; None for that of the file
+    unit: str | None = None  # unit of the heights; None for the unit of the file
     step_m: float | None = None  # step of the grid of mean heights; None takes the pixels
     window: Window | None = None  # metres, in the coordinate system of the mesh; None takes all
-    epsg: int | None = None  # coordinate system of the mesh; None for one that suits the file
+    epsg: int | None = None  # coordinate system of the mesh; None chooses by the file
 
 
-class Wanted(NamedTuple):
-    """What to read of a mesh file, besides triangles."""
+class ReadOptions(NamedTuple):
+    """Content to read from a mesh file, besides triangles."""
 
     masks: bool
     colours: bool
-    folders: tuple[Path, ...]  # resolved; files that it names are read only from these and below
-    animation: str | None = None  # to bake, by its name; "" for the first
+    # Resolved folders: files that the mesh file names are read only from these and below.
+    folders: tuple[Path, ...]
+    animation: str | None = None  # name of the animation to bake; "" for the first
     materials: bool = False  # names of the materials of faces
     raster: RasterOptions = RasterOptions()
 
     def allows(self, file: Path) -> bool:
-        """Whether a file that is named may be read."""
+        """Return True if a file that the mesh file names may be read."""
         return any(file.resolve().is_relative_to(folder) for folder in self.folders)
 
 
 class RigidPart(NamedTuple):
-    """Objects that move as one, and how: turned, then moved."""
+    """Objects that move as a rigid body, and the poses of the body."""
 
     name: str
     objects: Sequence[SceneMesh | SceneInstance]
-    times_s: Floats  # (k,), ascending, since the survey's start; before and after
-    # them it stands
+    times_s: Floats  # (k,), ascending, since the survey's start; static before and after
     positions: Floats  # (k, 3)
     rotations: Floats  # (k, 3, 3), perhaps rounded or scaled
 
@@ -95,16 +95,16 @@ class RigidPart(NamedTuple):
 class Content:
     """Content of a mesh file.
 
-    `meshes` and `moving` are in the file's unit and axes.
+    `meshes` and `moving` are in the file's unit and frame.
     """
 
     meshes: Sequence[SceneMesh | SceneInstance]
     moving: list[RigidPart] = field(default_factory=list)
-    unit_m: float | None = None  # metres in its unit; None if unknown
-    up_axis: str | None = None  # 'x', 'y' or 'z'; None if neither it nor its format states one
-    generator: str = ""  # the program that wrote it, if known
-    turned: str = ""  # why a Y-up file is turned, if to be told
-    unit_note: str = ""  # clause on a unit that it does not state
+    unit_m: float | None = None  # metres in the file's unit; None if unknown
+    up_axis: str | None = None  # 'x', 'y' or 'z'; None if neither file nor format states an axis
+    generator: str = ""  # the program that wrote the file, if known
+    turned: str = ""  # why a Y-up file is rotated, for a note; empty for no note
+    unit_note: str = ""  # clause on a unit that the file does not state
     skipped: list[str] = field(default_factory=list)  # names of objects without an area
     notes: list[str] = field(default_factory=list)  # clauses that follow the file's name
     raster: Raster | None = None
@@ -114,191 +114,219 @@ class Content:
 
 @dataclass
 class Node:
-    """A node, which places meshes and other nodes."""
+    """A node, which places meshes and child nodes."""
 
-    name: str  # empty where the file has none
-    matrix: Floats  # (4, 4), from its coordinates to those of its parent
-    meshes: Sequence[SceneMesh] = ()  # in its coordinates; the same objects wherever a mesh is used
-    children: Iterable[Hashable] = ()  # keys of the nodes in it
-    # (k, 4, 4), to its coordinates: its meshes are in all these places; None for one
+    name: str  # empty where the file has no name
+    matrix: Floats  # (4, 4), from the node's coordinates to the parent's
+    # In the node's coordinates; nodes of the same mesh have the same object.
+    meshes: Sequence[SceneMesh] = ()
+    children: Iterable[Hashable] = ()  # keys of the child nodes
+    # (k, 4, 4), to the node's coordinates: poses of copies of the meshes; None for a single copy
     copies: Floats | None = None
-    skinned: bool = False  # its joints place its meshes, which are in coordinates of the file
+    skinned: bool = False  # joints place the meshes, which are in coordinates of the file
 
 
 class PlacedNode(NamedTuple):
-    """A mesh in its own coordinates, and where a scene graph places it."""
+    """A mesh, and the matrix by which a scene graph places the mesh."""
 
     mesh: SceneMesh
-    matrix: Floats  # (4, 4), to the coordinates of the file
+    matrix: Floats  # (4, 4), from the mesh's coordinates to the file's
     name: str
-    path: tuple[str, ...] = ()  # names of the nodes that it is in, of the innermost few
+    path: tuple[str, ...] = ()  # names of the innermost nodes that contain the mesh
 
 
-def instances(roots: Iterable[Any], node_of: Callable[[Any], Node], stem: str) -> list[PlacedNode]:
-    """Find all places of meshes in a scene graph; a node may be in several others.
+def placed_nodes(
+    roots: Iterable[Any], node_of: Callable[[Any], Node], stem: str
+) -> list[PlacedNode]:
+    """Return all placed meshes of a scene graph, in which a node may have several parents.
 
-    `roots` are keys of the outermost nodes, and `node_of` returns the node of a key. An instance is
-    named by the nearest node with a name, else by its mesh, else it gets `stem`.
+    `roots` are keys of the outermost nodes, and `node_of` returns the node of a key. A placed mesh
+    is named by the nearest node with a name, else by the mesh, else by `stem`.
 
     Raises
     ------
     MeshFileError
-        If nodes contain each other without end, or there are some hundred thousand places.
+        If nodes contain each other without end, or there are more than `MAX_NODES`.
     """
     node_of = cache(node_of)
     placed = []
-    begun = 0
+    visited = 0
     stack: list[Any] = [(key, np.eye(4), ()) for key in reversed(list(roots))]
     while stack:
-        key, above, path = stack.pop()
+        key, parent_matrix, path = stack.pop()
         node = node_of(key)
-        begun += 1 if node.copies is None else 1 + len(node.copies)
+        visited += 1 if node.copies is None else 1 + len(node.copies)
         # A few lines can make any number of nodes.
-        if begun + len(stack) > MOST_NODES:
+        if visited + len(stack) > MAX_NODES:
             raise MeshFileError(
-                f"has nodes that contain each other, or copies, more than {MOST_NODES:,} in all: "
+                f"has nodes that contain each other, or copies, more than {MAX_NODES:,} in all: "
                 "export it in parts"
             )
-        matrix = matmul(above, node.matrix)
-        path = (*path[1 - _NAMES :], node.name) if node.name else path
-        places = [matrix] if node.copies is None else matmul(matrix, node.copies)
-        places = [np.eye(4)] if node.skinned else places
+        matrix = matmul(parent_matrix, node.matrix)
+        path = (*path[1 - _MAX_PATH_NAMES :], node.name) if node.name else path
+        matrices = [matrix] if node.copies is None else matmul(matrix, node.copies)
+        matrices = [np.eye(4)] if node.skinned else matrices
         placed += [
-            PlacedNode(mesh, place, path[-1] if path else mesh.name or stem, path)
-            for place in places
+            PlacedNode(mesh, mesh_matrix, path[-1] if path else mesh.name or stem, path)
+            for mesh_matrix in matrices
             for mesh in node.meshes
         ]
         stack += [(child, matrix, path) for child in reversed(list(node.children))]
     return placed
 
 
-def settled(placed: Sequence[PlacedNode], *, copy_all: bool = False) -> Content:
-    """Make instances of meshes that many places share, and copy the others to their places.
+def placed_content(placed: Sequence[PlacedNode], *, copy_all: bool = False) -> Content:
+    """Return the content of placed meshes: instances of meshes that many share, and copies.
 
-    Meshes with masks are not copied either, since each copy would have a part of its own. With
-    `copy_all` there is a copy for each place, even of what is scaled to zero.
+    Meshes with masks that are placed twice become instances too, since each copy would have a part
+    of its own. With `copy_all` all meshes are copied, even meshes scaled to zero.
 
     Raises
     ------
     MeshFileError
-        If a matrix is none of a place, or the copies would take more than a quarter of the memory.
+        If a matrix is not finite or not affine, if there are too many triangles, or if the copies
+        would take more than a quarter of the memory.
     """
     objects: list[SceneMesh | SceneInstance] = []
     content = Content(objects)
     uses = Counter(mesh for mesh, *_ in placed)
-    shared = {
+    shared_meshes = {
         mesh
         for mesh, n in uses.items()
         if not copy_all and (n - 1) * len(mesh.faces) >= (1 if mesh.cutouts else SHARED_TRIANGLES)
     }
-    own = [mesh.vertices.nbytes + mesh.faces.nbytes for mesh, *_ in placed if mesh not in shared]
-    if sum(own) > memory_share():
+    copied_bytes = [
+        mesh.vertices.nbytes + mesh.faces.nbytes for mesh, *_ in placed if mesh not in shared_meshes
+    ]
+    if (total := sum(copied_bytes)) > memory_share():
         raise MeshFileError(
-            f"places {len(own):,} objects, which would take {bytes_of(sum(own))}, of at most "
+            f"places {len(copied_bytes):,} objects, which would take {bytes_of(total)}, of at most "
             f"{bytes_of(memory_share())}, a quarter of the memory: {SMALLER}"
         )
     triangles = sum(n * len(mesh.faces) for mesh, n in uses.items())
-    if triangles > MOST_TRIANGLES:
+    if triangles > MAX_TRIANGLES:
         raise MeshFileError(
             f"places {len(placed):,} objects of {triangles:,} triangles in all, of at most "
-            f"{MOST_TRIANGLES:,}: {SMALLER}"
+            f"{MAX_TRIANGLES:,}: {SMALLER}"
         )
-    matrices = np.array([place.matrix for place in placed]).reshape(-1, 4, 4)
-    good = np.isfinite(matrices).all(axis=(1, 2)) & (matrices[:, 3] == [0, 0, 0, 1]).all(axis=1)
-    if not good.all():
-        _, matrix, name, _ = placed[int(good.argmin())]
+    matrices = np.array([node.matrix for node in placed]).reshape(-1, 4, 4)
+    valid = np.isfinite(matrices).all(axis=(1, 2)) & (matrices[:, 3] == [0, 0, 0, 1]).all(axis=1)
+    if not valid.all():
+        _, matrix, name, _ = placed[int(valid.argmin())]
         raise MeshFileError(
             f"places {name[:80]!r} by a matrix that is none of a place: {matrix.tolist()}"
         )
     ranks = rank(matrices[:, :3, :3]).tolist()
     for (mesh, matrix, name, _), dimensions in zip(placed, ranks, strict=True):
-        if (dimensions < 2 or (mesh in shared and not mesh.has_area)) and not copy_all:
+        if (dimensions < 2 or (mesh in shared_meshes and not mesh.has_area)) and not copy_all:
             content.skipped.append(name)
-        elif mesh in shared and dimensions == 3:
+        elif mesh in shared_meshes and dimensions == 3:
             objects.append(SceneInstance(mesh, matrix, name))
         else:
             objects.append(mesh.moved(name, matrix[:3, :3], matrix[:3, 3]))
     return content
 
 
-def baked(poses: Iterable[Content], times_s: Sequence[float], allowance: Allowance) -> Content:
-    """Join poses of the same meshes, at times that are even, to one content that is animated."""
+def bake_animation(
+    contents: Iterable[Content], times_s: Sequence[float], allowance: Allowance
+) -> Content:
+    """Join contents of the same meshes at even times (k,) to a content of animated meshes.
+
+    Raises
+    ------
+    MeshFileError
+        If the animation has no duration, or the number of vertices changes.
+    """
     if not times_s[-1] > times_s[0]:
         raise MeshFileError("has an animation without a duration: give it two keys")
     content = Content(())
-    moves = list[Floats]()
+    pose_arrays = list[Floats]()
     count = len(times_s)
-    taken = 0
-    for number, pose in zip(range(count), poses, strict=False):
-        now = [mesh.vertices for mesh in pose.meshes if isinstance(mesh, SceneMesh)]
-        if not number:
-            allowance.take(count * sum(vertices.nbytes for vertices in now))
+    used_bytes = 0
+    for index, pose in zip(range(count), contents, strict=False):
+        vertices_now = [mesh.vertices for mesh in pose.meshes if isinstance(mesh, SceneMesh)]
+        if not index:
+            allowance.take(count * sum(vertices.nbytes for vertices in vertices_now))
             content = pose
-            taken = allowance.taken
-            moves = [np.empty((count, *vertices.shape)) for vertices in now]
-        allowance.taken = taken
-        if list(map(len, now)) != [len(own[0]) for own in moves]:
-            raise MeshFileError(f"has other vertices in pose {number}: leave out animation")
-        for own, vertices in zip(moves, now, strict=True):
-            own[number] = vertices
-    animations = iter([Animation(own, (times_s[-1] - times_s[0]) / (count - 1)) for own in moves])
+            used_bytes = allowance.used_bytes
+            pose_arrays = [np.empty((count, *vertices.shape)) for vertices in vertices_now]
+        allowance.used_bytes = used_bytes
+        if list(map(len, vertices_now)) != [len(poses[0]) for poses in pose_arrays]:
+            raise MeshFileError(f"has other vertices in pose {index}: leave out animation")
+        for poses, vertices in zip(pose_arrays, vertices_now, strict=True):
+            poses[index] = vertices
+    step_s = (times_s[-1] - times_s[0]) / (count - 1)
+    animations = iter([Animation(poses, step_s) for poses in pose_arrays])
     meshes = [mesh for mesh in content.meshes if isinstance(mesh, SceneMesh)]
     content.meshes = [replace(mesh, animation=next(animations)) for mesh in meshes]
     return content
 
 
 class Piece(NamedTuple):
-    """Triangles of a mesh, all opaque or all with one mask."""
+    """Triangles of a mesh: all opaque, or all with the same mask."""
 
     vertices: AnyArray  # (v, 3)
     faces: Ints  # (f, 3)
     cutout: Cutout | None = None
     colours: Colours | None = None
-    material: str = ""  # name of the material of all its faces, if names are wanted
+    material: str = ""  # name of the material of all faces, if `ReadOptions.materials`
 
 
-def joined(
+def join_pieces(
     name: str, pieces: Iterable[Piece], allowance: Allowance | None = None
 ) -> list[SceneMesh]:
-    """Join pieces to one mesh, those with masks last; none without faces.
+    """Join pieces to a mesh, in a list, which is empty if the pieces have no faces.
 
-    Formats whose files cannot unpack to much more than they hold need no allowance.
+    Pieces with masks are last. Formats whose files cannot unpack to much more than they hold need
+    no allowance.
 
     Raises
     ------
     ValueError
-        If a face refers to a missing vertex; LidarError if it takes more than allowed.
+        If a face refers to a missing vertex.
+    LidarError
+        If the pieces take more memory than allowed.
     """
     solid: list[Piece] = []
     masked: dict[int, list[Piece]] = {}  # {id of a mask: its pieces}
     for piece in pieces:
         if len(piece.faces):
-            own = _own(piece, allowance)
-            cut = own.cutout
-            (solid if cut is None else masked.setdefault(id(cut.mask), [])).append(own)
+            compact = _compacted_piece(piece, allowance)
+            cut = compact.cutout
+            group = solid if cut is None else masked.setdefault(id(cut.mask), [])
+            group.append(compact)
     if not solid and not masked:
         return []
     cutouts = []
-    for some in masked.values():
-        cuts = [piece.cutout for piece in some if piece.cutout]
+    for mask_pieces in masked.values():
+        cuts = [piece.cutout for piece in mask_pieces if piece.cutout]
         cutouts.append(Cutout(cuts[0].mask, np.concatenate([cut.uv for cut in cuts])))
     ordered = [*chain(solid, *masked.values())]
-    sizes = [len(one.faces) for one in ordered]
-    coloured = colours.joined([one.colours for one in ordered], sizes)
-    named = face_materials.joined([FaceMaterials.named(one.material) for one in ordered], sizes)
-    parts = stacked((one.vertices, one.faces) for one in ordered)
-    return [SceneMesh(name, *parts, tuple(cutouts), coloured, materials=named)]
+    sizes = [len(piece.faces) for piece in ordered]
+    vertices, faces = stacked((piece.vertices, piece.faces) for piece in ordered)
+    return [
+        SceneMesh(
+            name,
+            vertices,
+            faces,
+            tuple(cutouts),
+            colours.join_colours([piece.colours for piece in ordered], sizes),
+            materials=face_materials.join_materials(
+                [FaceMaterials.named(piece.material) for piece in ordered], sizes
+            ),
+        )
+    ]
 
 
-def _own(piece: Piece, allowance: Allowance | None) -> Piece:
-    """Return a piece without unused vertices; many pieces may share all of them."""
-    vertices, faces, cutout, painted, material = piece
+def _compacted_piece(piece: Piece, allowance: Allowance | None) -> Piece:
+    """Return a piece without unused vertices, which many pieces may share."""
+    vertices, faces, cutout, face_colours, material = piece
     check_corners(faces, len(vertices))
     if allowance is not None:
         extra = 0 if cutout is None else cutout.uv.nbytes
-        extra += 0 if painted is None else 40 * len(faces)
+        extra += 0 if face_colours is None else 40 * len(faces)
         allowance.take(faces.nbytes + extra)
     vertices, faces = compacted(vertices, faces)
     if allowance is not None:
         allowance.take(24 * len(vertices))  # in double precision
-    return Piece(vertices, faces, cutout, painted, material)
+    return Piece(vertices, faces, cutout, face_colours, material)
