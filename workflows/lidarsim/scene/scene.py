@@ -338,7 +338,7 @@ class Scene:
         scene = copy(self)
         for made_before in ("bounds", "object_bounds", "footprints"):
             vars(scene).pop(made_before, None)
-        moved = self.instances.moved(owner, np.array(pose.position), pose.turn)
+        moved = self.instances.moved(owner, np.array(pose.position), pose.rotation_matrix)
         object.__setattr__(scene, "instances", moved)
         return scene
 

@@ -57,7 +57,7 @@ class SceneInstance:
     def __post_init__(self) -> None:
         given = self.transform
         if isinstance(given, Pose):
-            given = Transform(given.turn, np.array(given.position))
+            given = Transform(given.rotation_matrix, np.array(given.position))
         placed = given if isinstance(given, Transform) else Transform.from_matrix(given)
         check_near(placed.offset)
         object.__setattr__(self, "transform", affine(placed.linear, placed.offset))

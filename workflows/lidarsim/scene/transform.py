@@ -100,7 +100,7 @@ class Transform:
             One factor, or one for each axis; not zero.
         """
         roll, pitch, yaw = rotation_deg
-        turn = Pose((0.0, 0.0, 0.0), yaw_deg=yaw, pitch_deg=pitch, roll_deg=roll).turn
+        turn = Pose((0.0, 0.0, 0.0), yaw_deg=yaw, pitch_deg=pitch, roll_deg=roll).rotation_matrix
         return cls(turn * np.broadcast_to(scale, 3), np.array(translation))
 
     @classmethod

@@ -1,4 +1,4 @@
-"""Noise of a sensor: errors of ranges and angles, lost returns and false ones."""
+"""Noise of a sensor: errors of ranges and angles, lost returns and false alarms."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from .random_numbers import named_seed
 # Detection threshold for signal plus noise, in standard deviations.
 THRESHOLD_SIGMAS = 5.0
 TARGET_REFLECTANCE = 0.1  # reflectance of stated ranges
-ALARMS_MOST = 20  # false alarms of a pulse on average: a ray has numbers for 255
+MAX_ALARMS = 20  # false alarms of a pulse on average: a ray has numbers for 255
 
 Metres = Annotated[float, Field(ge=0, le=1000)]
 Bias = Annotated[float, Field(ge=-1000, le=1000)]
@@ -29,17 +29,17 @@ AngleSigma = Annotated[float, Field(ge=0, le=10)]  # degrees
 @dataclass(frozen=True)
 @checked_fields
 class Noise:
-    """Noise of ranges and angles, lost returns and false ones; without arguments there is none.
+    """Noise of ranges and angles, lost returns and false alarms; no noise without arguments.
 
     The standard deviation of a range of r metres is ``range_m + range_per_m * r``, and
     `range_at_threshold_m` times the threshold of detection over the return's energy is added in
-    squares. Rays are cast in directions with noise, and reported with angles without. Stated
+    squares. Rays are cast in directions with noise, and reported with angles without noise. Stated
     detection ranges are for surfaces at right angles in clear air.
 
     Raises
     ------
     LidarError
-        If a number is outside its range, or needs a detection range and there is none.
+        If a number is outside its range, or needs a detection range that is not given.
     """
 
     range_m: Annotated[Metres, about("standard deviation of ranges, metres", 0.02)] = 0.0
@@ -148,14 +148,14 @@ class Noise:
 
     @property
     def threshold(self) -> float:
-        """Threshold of detection: the energy of returns of which half are detected, else 0."""
+        """Threshold of detection: the energy at which half of the returns are detected, else 0."""
         if self.detection_range_m is None:
             return 0.0
         return float(TARGET_REFLECTANCE * at_right_angles(self.detection_range_m))
 
     @property
     def full(self) -> float:
-        """Signal that fills the receiver: no recorded pulse is higher."""
+        """Signal that saturates the receiver: no recorded pulse is higher."""
         return inf if self.saturation is None else self.saturation * self.threshold
 
     @property
@@ -170,5 +170,5 @@ class Noise:
         return any((*random, self.walk_m, self.channel_bias_m, self.warm_up_m))
 
     def named(self, name: str) -> Noise:
-        """Return the noise of a sensor, whose name is part of all its random numbers."""
+        """Return the noise of a sensor, whose name becomes part of all its random numbers."""
         return replace(self, seed=named_seed(self.seed, name))

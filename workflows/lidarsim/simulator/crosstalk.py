@@ -63,8 +63,8 @@ class CrosstalkStep(PulseStep):
         super().__init__(setup, caster, surfaces)
         self._survey = setup.survey
         self._sensor = setup.sensor
-        wide, _ = setup.reporting.of(self._sensor.optics)
-        self._cosine = sin_cos_of(wide / 2)[1]
+        divergence = setup.reporting.divergence(self._sensor.optics)
+        self._cosine = sin_cos_of(divergence / 2)[1]
         nm = self._sensor.optics.wavelength_nm
         self._others = [
             other

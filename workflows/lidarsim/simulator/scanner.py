@@ -391,7 +391,9 @@ def _placed(poses: Any) -> tuple[Floats, Floats | None]:
         poses = [poses]
     if isinstance(poses, Sequence) and any(isinstance(pose, Pose) for pose in poses):
         made = [pose_of("a pose", pose) for pose in poses]
-        return np.array([pose.position for pose in made]), np.array([pose.turn for pose in made])
+        return np.array([pose.position for pose in made]), np.array(
+            [pose.rotation_matrix for pose in made]
+        )
     try:
         table = np.asarray(poses, np.float64)
     except (TypeError, ValueError):
