@@ -197,7 +197,7 @@ def _platform_rotation(kind: str, roll: float, pitch: float, yaw: float) -> Floa
 
 def _columns(text: str, settings: dict[str, str]) -> dict[str, Floats]:
     """Return the columns of a trajectory {name: values}, named by indices, header or default."""
-    usual = ["t", "roll", "pitch", "yaw", "x", "y", "z"]
+    default_names = ["t", "roll", "pitch", "yaw", "x", "y", "z"]
     lines = [line for line in text.splitlines() if line.strip() and line.strip()[0] != "#"]
     separator = settings.get("trajectory_seperator", ",")
     try:
@@ -208,27 +208,27 @@ def _columns(text: str, settings: dict[str, str]) -> dict[str, Floats]:
         raise LidarError("its trajectory is not a table of numbers.")
     width = rows.shape[1]
     header = re.search(r"^#\s*HEADER:(.*)$", text, re.MULTILINE)
-    if any(f"{name}Index" in settings for name in usual):
+    if any(f"{name}Index" in settings for name in default_names):
         index_names = {
-            int(number(settings, f"{name}Index", i)): name for i, name in enumerate(usual)
+            int(number(settings, f"{name}Index", i)): name for i, name in enumerate(default_names)
         }
         names = [index_names.get(index, "") for index in range(width)]
     elif header is not None:
         names = [word.strip(" \"'") for word in header[1].split(",")]
     else:
-        names = ["t", "x", "y", "z"] if width == 4 else usual
-    listed = f"its trajectory has {width} columns, named {', '.join(names)}"
+        names = ["t", "x", "y", "z"] if width == 4 else default_names
+    description = f"its trajectory has {width} columns, named {', '.join(names)}"
     if len(names) != width or not {"t", "x", "y", "z"} <= {*names}:
-        raise LidarError(f"{listed}; it needs t, x, y and z.")
+        raise LidarError(f"{description}; it needs t, x, y and z.")
     used = [name for name in names if name]  # indices may leave columns out
-    unknown = [name for name in used if name not in usual]
+    unknown = [name for name in used if name not in default_names]
     if unknown or len(set(used)) < len(used):
         fault = f"{unknown[0]!r} is not known" if unknown else "a name is there twice"
         raise LidarError(
-            f"{listed}, and {fault}: name those to read by their indices, such as tIndex and "
+            f"{description}, and {fault}: name those to read by their indices, such as tIndex and "
             "xIndex, in platformSettings."
         )
     angles = {"roll", "pitch", "yaw"}.intersection(used)
     if angles and len(angles) < 3:
-        raise LidarError(f"{listed}; it needs roll, pitch and yaw, or none of them.")
+        raise LidarError(f"{description}; it needs roll, pitch and yaw, or none of them.")
     return {name: column for name, column in zip(names, rows.T, strict=True) if name}

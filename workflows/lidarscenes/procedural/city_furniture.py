@@ -151,13 +151,15 @@ def _street_positions(
     yaws = []
     for quarter in range(4):
         length = size[quarter % 2]
-        deep = size[1 - quarter % 2] / 2 - inwards
+        distance = size[1 - quarter % 2] / 2 - inwards
         n = int((length - 2 * corner) / spacing) + 1
         shift = (np.arange(n) - (n - 1) / 2) * spacing
         cos = np.cos(quarter * np.pi / 2)
         sin = np.sin(quarter * np.pi / 2)
         # The edge at the block's lower side, turned.
-        positions.append(np.column_stack([cos * shift + sin * deep, sin * shift - cos * deep]))
+        positions.append(
+            np.column_stack([cos * shift + sin * distance, sin * shift - cos * distance])
+        )
         yaws.append(np.full(n, quarter * np.pi / 2 + np.pi))
     return np.concatenate(positions), np.concatenate(yaws)
 

@@ -134,16 +134,21 @@ def _front(storeys: int) -> list[Solid]:
 def _trees(seed: int) -> list[Solid]:
     """Return broad-leaved trees of several outlines, and conifers."""
     rng = np.random.default_rng(seed)
-    return [_broadleaf(rng, tall) for tall in (0.9, 1.1, 1.35, 1.6)] + [_conifer(3), _conifer(4)]
+    return [_broadleaf(rng, height_ratio) for height_ratio in (0.9, 1.1, 1.35, 1.6)] + [
+        _conifer(3),
+        _conifer(4),
+    ]
 
 
-def _broadleaf(rng: np.random.Generator, tall: float) -> Solid:
-    """Return a broad-leaved tree whose crown is `tall` times as high as wide."""
+def _broadleaf(rng: np.random.Generator, height_ratio: float) -> Solid:
+    """Return a broad-leaved tree whose crown is `height_ratio` times as high as wide."""
     trunk = loft(regular(6, 0.22), [(0, -0.1), (0.3, 0), (3, 0.08)])
     angle = np.linspace(-np.pi / 2, np.pi / 2, 8)
-    crown = revolve(np.stack([2.2 * np.cos(angle), 2.2 * tall * (1 + np.sin(angle))], axis=1), 10)
+    crown = revolve(
+        np.stack([2.2 * np.cos(angle), 2.2 * height_ratio * (1 + np.sin(angle))], axis=1), 10
+    )
     bumps = 1 + rng.uniform(-0.22, 0.22, (len(crown.vertices), 1))
-    middle = np.array([0, 0, 2.2 * tall])
+    middle = np.array([0, 0, 2.2 * height_ratio])
     leaves = Solid((crown.vertices - middle) * bumps + middle, crown.faces)
     return joined([trunk, leaves.moved(0, 0, 2)])
 

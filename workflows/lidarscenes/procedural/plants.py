@@ -88,13 +88,13 @@ def tree(species: Species, seed: int = 0, root_m: float = 0.1) -> SceneMesh:
     """
     rng = np.random.default_rng(seed)
     stem, radii = _stem(species, root_m, rng)
-    branches, thick = _branches(species, stem, radii, rng)
+    branches, branch_radii = _branches(species, stem, radii, rng)
     twigs = _twigs(species, branches, rng)
-    thin = np.tile([0.25 * thick.mean(), 0.004], (len(twigs), 1))
+    twig_radii = np.tile([0.25 * branch_radii.mean(), 0.004], (len(twigs), 1))
     parts = [
         _tubes(stem[None], radii[None], _STEM_SIDES),
-        _tubes(branches, thick, _BRANCH_SIDES),
-        _tubes(twigs, thin, _TWIG_SIDES),
+        _tubes(branches, branch_radii, _BRANCH_SIDES),
+        _tubes(twigs, twig_radii, _TWIG_SIDES),
         _leaves(species, twigs, rng),
     ]
     return SceneMesh(species.name, *stacked(parts))

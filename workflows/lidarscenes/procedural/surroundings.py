@@ -30,8 +30,8 @@ _FLOOR = 0.3
 _OPEN = 0.1  # openness from which on a surface is not closed
 _LEAVES = 0.4  # maximum openness of leaves
 # A closed body whose inside has a floor and upright walls is a room of these sizes.
-_WIDE_M = 2.0
-_HIGH_M = 15.0
+_MIN_ROOM_WIDTH_M = 2.0
+_MAX_ROOM_HEIGHT_M = 15.0
 # The room of a scene spans this share of the scene along each axis; smaller bodies are in it.
 _SPANS = 1 / 3
 # Directions by their z: up to 10 degrees above the horizon, within 60 degrees of straight up, and
@@ -168,7 +168,7 @@ class Surroundings:
             return True
         upright = np.abs(views.normals[:, 2]) < 0.01
         sides = np.ptp(self._scene.bounds, axis=0)
-        fits = sides[:2].min() >= _WIDE_M and sides[2] <= _HIGH_M
+        fits = sides[:2].min() >= _MIN_ROOM_WIDTH_M and sides[2] <= _MAX_ROOM_HEIGHT_M
         return bool(fits and np.mean(_is_level(views) | upright) >= _UPRIGHT)
 
     def cast(self, origins: Floats, directions: Floats) -> Views:

@@ -153,8 +153,8 @@ def _named(root: Element, kind: str) -> list[Element]:
     if len(elements) > _MAX_LINKS:
         raise LidarError(f"it has {len(elements):,} {kind}s; at most {_MAX_LINKS:,} are read.")
     names = [_name(element) for element in elements]
-    if twice := next((name for name in names if name and names.count(name) > 1), None):
-        raise LidarError(f"two {kind}s have the name {twice!r}: give each its own.")
+    if duplicate := next((name for name in names if name and names.count(name) > 1), None):
+        raise LidarError(f"two {kind}s have the name {duplicate!r}: give each its own.")
     if "" in names:
         raise LidarError(f"a {kind} has no name.")
     return elements
@@ -227,9 +227,9 @@ def _in_order(links: list[str], joints: Mapping[str, Joint]) -> list[str]:
         raise LidarError(
             f"links {roots[0]!r} and {roots[1]!r} are not connected: one root must hold all links."
         )
-    above = {link: [joints[link].parent] if link in joints else [] for link in links}
+    parents = {link: [joints[link].parent] if link in joints else [] for link in links}
     try:
-        return [*TopologicalSorter(above).static_order()]
+        return [*TopologicalSorter(parents).static_order()]
     except CycleError as error:
         raise LidarError(
             f"the joints of link {error.args[1][0]!r} go round in a circle."

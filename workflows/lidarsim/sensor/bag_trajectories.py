@@ -32,8 +32,8 @@ _GNSS = "sensor_msgs/msg/NavSatFix"
 _IMU = "sensor_msgs/msg/Imu"
 _FRAMES = "tf2_msgs/msg/TFMessage"
 _STATIC = "/tf_static"
-_SAME = 1e-6  # largest difference between the numbers of a pose that is sent twice
-_READ = ", ".join([*_POSES, _GNSS, _FRAMES])
+_MAX_DIFFERENCE = 1e-6  # largest difference between the numbers of a pose that is sent twice
+_READABLE_TYPES = ", ".join([*_POSES, _GNSS, _FRAMES])
 
 
 class TimedPoses(NamedTuple):
@@ -74,23 +74,25 @@ def read_bag(path: Path, topic: str | None, origin: Origin) -> TimedPoses:
         If the bag cannot be read, or the topic is not clear.
     """
     with opened_bag(path, "the bag") as bag:
-        kinds = {connection.topic: connection.msgtype for connection in bag.connections}
+        message_types = {connection.topic: connection.msgtype for connection in bag.connections}
         base_topic, _, frame = (topic or "").partition(":")
         base_topic, _, imu = base_topic.partition(" ")
-        pose_topics = [name for name, kind in kinds.items() if kind in (*_POSES, _GNSS)]
+        pose_topics = [
+            name for name, message_type in message_types.items() if message_type in (*_POSES, _GNSS)
+        ]
         if base_topic in pose_topics:
             chosen = base_topic
         else:
-            edges = _edges_of(bag, kinds)
+            edges = _edges_of(bag, message_types)
             if base_topic == "/tf" and frame in edges:  # even if only a frame above moves
                 return _frame_poses(edges, frame)
             labels = [*pose_topics, *(f"/tf:{name}" for name in _moving_frames(edges))]
             chosen = _chosen(labels, topic)
             if chosen.startswith("/tf:"):
                 return _frame_poses(edges, chosen.removeprefix("/tf:"))
-        if kinds[chosen] == _GNSS:
-            return _gnss_poses(bag, kinds, chosen, imu, origin)
-        return _topic_poses(bag, chosen, _POSES[kinds[chosen]])
+        if message_types[chosen] == _GNSS:
+            return _gnss_poses(bag, message_types, chosen, imu, origin)
+        return _topic_poses(bag, chosen, _POSES[message_types[chosen]])
 
 
 def _chosen(labels: Sequence[str], topic: str | None) -> str:
@@ -101,11 +103,11 @@ def _chosen(labels: Sequence[str], topic: str | None) -> str:
     if topic is None and len(labels) == 1:
         return labels[0]
     if not labels:
-        raise LidarError(f"it has no poses: topics of {_READ} are read.")
-    listed = f"it has the poses {', '.join(labels)}"
+        raise LidarError(f"it has no poses: topics of {_READABLE_TYPES} are read.")
+    available = f"it has the poses {', '.join(labels)}"
     if topic is None:
-        raise LidarError(f"{listed}: choose one with topic.")
-    raise LidarError(f"{listed}, not {topic!r}.{did_you_mean(topic, labels)}")
+        raise LidarError(f"{available}: choose one with topic.")
+    raise LidarError(f"{available}, not {topic!r}.{did_you_mean(topic, labels)}")
 
 
 def _row_of(pose: Any) -> list[float]:
@@ -135,8 +137,8 @@ def _in_order(times_ns: Sequence[int], rows: Sequence[Sequence[float]]) -> tuple
     order = np.argsort(times, kind="stable")
     times = times[order]
     table = table[order]
-    close = np.abs(table[1:] - table[:-1]).max(axis=1) <= _SAME
-    repeated = np.append(False, (np.diff(times) == 0) & close)
+    equal = np.abs(table[1:] - table[:-1]).max(axis=1) <= _MAX_DIFFERENCE
+    repeated = np.append(False, (np.diff(times) == 0) & equal)
     return times[~repeated], table[~repeated]
 
 
@@ -236,11 +238,11 @@ def _edges_of(bag: Reader, kinds: Mapping[str, str]) -> dict[str, _Edge]:
 def _chain(edges: Mapping[str, _Edge], frame: str) -> list[_Edge]:
     """Return the edges from a frame upwards to the root."""
     chain = []
-    passed = set[str]()
+    visited = set[str]()
     while frame in edges:
-        if frame in passed:
+        if frame in visited:
             raise LidarError(f"its frame {frame!r} is above itself.")
-        passed.add(frame)
+        visited.add(frame)
         chain.append(edges[frame])
         frame = edges[frame].parent
     return chain
@@ -248,11 +250,11 @@ def _chain(edges: Mapping[str, _Edge], frame: str) -> list[_Edge]:
 
 def _moving_frames(edges: Mapping[str, _Edge]) -> list[str]:
     """Return the frames whose poses in the parent frame change, else frames with several poses."""
-    several = [frame for frame, edge in edges.items() if len(set(edge.times_ns)) > 1]
+    repeated = [frame for frame, edge in edges.items() if len(set(edge.times_ns)) > 1]
     changing = [
-        frame for frame in several if any(row != edges[frame].rows[0] for row in edges[frame].rows)
+        frame for frame in repeated if any(row != edges[frame].rows[0] for row in edges[frame].rows)
     ]
-    return changing or several
+    return changing or repeated
 
 
 def _frame_poses(edges: Mapping[str, _Edge], frame: str) -> TimedPoses:

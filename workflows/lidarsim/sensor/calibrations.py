@@ -160,13 +160,13 @@ def _ouster_origin_mm(data: dict[str, Any], beam: dict[str, Any]) -> Floats:
     if "lidar_origin_to_beam_origin_mm" in beam:
         origin_mm[0] = beam["lidar_origin_to_beam_origin_mm"]
     elif "beam_to_lidar_transform" not in beam:  # firmware before 2.0
-        line = str(_ouster_section(data, "sensor_info", data).get("prod_line", ""))
-        origin_mm[0] = _OUSTER_ORIGINS_MM.get(line[:5], _OUSTER_FIRST_MM)
+        product_line = str(_ouster_section(data, "sensor_info", data).get("prod_line", ""))
+        origin_mm[0] = _OUSTER_ORIGINS_MM.get(product_line[:5], _OUSTER_FIRST_MM)
     lidar = _ouster_section(data, "lidar_intrinsics", data)
-    turned = np.diag([-1.0, -1.0, 1.0, 1.0])
-    turned[2, 3] = 36.18
-    pose = np.reshape(lidar.get("lidar_to_sensor_transform", turned), (4, 4))
-    if not np.allclose(pose[:3, :3], turned[:3, :3]) or pose[:2, 3].any():
+    half_turn = np.diag([-1.0, -1.0, 1.0, 1.0])
+    half_turn[2, 3] = 36.18
+    pose = np.reshape(lidar.get("lidar_to_sensor_transform", half_turn), (4, 4))
+    if not np.allclose(pose[:3, :3], half_turn[:3, :3]) or pose[:2, 3].any():
         raise ValueError("its lidar_to_sensor_transform is not half a turn and a height")
     origin_mm[2] += pose[2, 3]
     return np.asarray(origin_mm, np.float64)
@@ -188,8 +188,8 @@ def _table(name: str, text: str) -> Calibration:
         unknown = [word for word in header if word not in names]
         if unknown:
             raise ValueError(f"column {unknown[0]!r} is not one of {', '.join(names)}")
-        if twice := next((word for word in header if header.count(word) > 1), None):
-            raise ValueError(f"it has the column {twice!r} twice")
+        if duplicate := next((word for word in header if header.count(word) > 1), None):
+            raise ValueError(f"it has the column {duplicate!r} twice")
         columns = dict(zip(header, _rows(text, 1, len(header)).T, strict=True))
         zero = np.zeros(len(columns["elevation_deg"]))
         beams = Beams(
@@ -216,17 +216,17 @@ def _livox(name: str, rows: Floats) -> Calibration:
     """
     times = rows[:, 0]
     azimuth, zenith = np.radians(rows[:, 1:]).T
-    back = np.flatnonzero(np.diff(times) < 0)
-    if len(back):
-        raise ValueError(f"times go back in line {back[0] + 3}")
+    backward_rows = np.flatnonzero(np.diff(times) < 0)
+    if len(backward_rows):
+        raise ValueError(f"times go back in line {backward_rows[0] + 3}")
     level, up = sin_cos(zenith)
     sin, cos = sin_cos(azimuth)
     rays = np.column_stack([level * cos, level * sin, up])
     if times[-1] == times[0] or (np.diff(times) == 1).all():  # equal, or row numbers: not times
         return Calibration(name, "livox", rays=rays)
     shot_ns = (times - times[0]) * 1e9
-    every_us = Fraction(float(shot_ns[-1]) / (len(times) - 1) / 1000).limit_denominator(1000)
-    head = {"listed": True, "firing_us": every_us}
+    interval_us = Fraction(float(shot_ns[-1]) / (len(times) - 1) / 1000).limit_denominator(1000)
+    head = {"listed": True, "firing_us": interval_us}
     return Calibration(name, "livox", rays=rays, shot_ns=shot_ns, head=head)
 
 

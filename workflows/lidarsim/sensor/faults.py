@@ -79,11 +79,11 @@ class Fault:
         """Start and end of the fault, nanoseconds since the survey's start."""
         return self.from_s * 1e9, inf if self.to_s is None else self.to_s * 1e9
 
-    def during(self, begins_ns: Floats | Ints, ends_ns: Floats | Ints | None = None) -> Bools:
-        """Return whether the fault acts at times (n,), or in intervals to `ends_ns` (n,)."""
-        ends_ns = begins_ns if ends_ns is None else ends_ns
+    def during(self, starts_ns: Floats | Ints, stops_ns: Floats | Ints | None = None) -> Bools:
+        """Return whether the fault acts at times (n,), or in intervals to `stops_ns` (n,)."""
+        stops_ns = starts_ns if stops_ns is None else stops_ns
         begin, end = self.span_ns
-        return np.asarray((ends_ns >= begin) & (begins_ns < end))
+        return np.asarray((stops_ns >= begin) & (starts_ns < end))
 
     def jumps_ns(self, times_ns: Floats | Ints) -> Ints:
         """Return the shift of stamps at times (n,), nanoseconds."""

@@ -50,17 +50,19 @@ def density(leaf_angle: str | float, angle: Floats) -> Floats:
             "uniform": np.ones_like(angle),
         }[leaf_angle]
         return np.asarray(2 / np.pi * wave)
-    x = float(leaf_angle)
-    shape = sine / (cosine**2 + (x * sine) ** 2) ** 2
-    if x == 1:
+    axis_ratio = float(leaf_angle)
+    shape = sine / (cosine**2 + (axis_ratio * sine) ** 2) ** 2
+    if axis_ratio == 1:
         return np.asarray(shape)
-    if x < 1:
-        e = np.sqrt(1 - x * x)
-        axes = x + arcsin(e) / e
+    if axis_ratio < 1:
+        eccentricity = np.sqrt(1 - axis_ratio * axis_ratio)
+        axes = axis_ratio + arcsin(eccentricity) / eccentricity
     else:
-        e = np.sqrt(1 - 1 / (x * x))
-        axes = x + log((1 + e) / (1 - e)) / (2 * e * x)
-    return np.asarray(2 * (x * x * x) / axes * shape)
+        eccentricity = np.sqrt(1 - 1 / (axis_ratio * axis_ratio))
+        axes = axis_ratio + log((1 + eccentricity) / (1 - eccentricity)) / (
+            2 * eccentricity * axis_ratio
+        )
+    return np.asarray(2 * (axis_ratio * axis_ratio * axis_ratio) / axes * shape)
 
 
 class _LightTable(NamedTuple):

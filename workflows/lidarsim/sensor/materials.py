@@ -387,18 +387,18 @@ def first_matches(materials: Sequence[Material], kinds: SurfaceKinds) -> Indices
     """
     first = np.full(len(kinds.object), -1)
     object_rows = {name: row for row, name in enumerate(kinds.names)}
-    of_material: dict[str, list[int]] = {}  # {name of a material: its kinds}
+    kinds_by_material: dict[str, list[int]] = {}  # {name of a material: kinds}
     if any(entry.material is not None for entry in materials):
         for kind, name in enumerate(kinds.material):
             if name:
-                of_material.setdefault(name, []).append(kind)
+                kinds_by_material.setdefault(name, []).append(kind)
     for number, entry in enumerate(materials):
         if entry.for_all and number + 1 < len(materials):
             raise LidarError(
                 f"materials: the first entry for a surface counts, so that none after number "
                 f'{number + 1}, {{objects: "*"}}, would: put it last.'
             )
-        matches = _matching_kinds(entry, kinds, object_rows, of_material)
+        matches = _matching_kinds(entry, kinds, object_rows, kinds_by_material)
         first[matches[first[matches] < 0]] = number
     return first
 
@@ -407,11 +407,11 @@ def _matching_kinds(
     entry: Material,
     kinds: SurfaceKinds,
     object_rows: Mapping[str, int],
-    of_material: Mapping[str, Sequence[int]],
+    kinds_by_material: Mapping[str, Sequence[int]],
 ) -> Indices:
     """Return the kinds that a material applies to.
 
-    `object_rows` are {name of an object: row}, `of_material` {name of a material: kinds}.
+    `object_rows` are {name of an object: row}, `kinds_by_material` {name of a material: kinds}.
 
     Raises
     ------
@@ -425,7 +425,7 @@ def _matching_kinds(
     if entry.material is None:
         assert matches is not None, "a material applies to objects, or to materials"
         return matches
-    names = [*of_material]
+    names = [*kinds_by_material]
     with_material: list[int] = []
     for pattern in entry.material:
         rows_of_pattern = rows_named(pattern, names)
@@ -439,7 +439,7 @@ def _matching_kinds(
                 + measured * (pattern in reflectances())
             )
         for row in rows_of_pattern.tolist():
-            with_material += of_material[names[row]]
+            with_material += kinds_by_material[names[row]]
     kinds_with_material = np.array(with_material, np.intp)
     if matches is None:
         return kinds_with_material
@@ -483,14 +483,14 @@ def with_classes(
     for semantic_class, patterns in classes.items():
         for pattern in patterns:
             rows = rows_named(pattern, kinds.names)
-            of_pattern = kinds.of_rows(rows)
-            for number in np.unique(first[of_pattern]).tolist():
+            pattern_kinds = kinds.of_rows(rows)
+            for number in np.unique(first[pattern_kinds]).tolist():
                 entry = materials[number]
                 if number < 0 or entry.semantic_class:
                     continue
-                unclassified = of_pattern[first[of_pattern] == number]
+                unclassified = pattern_kinds[first[pattern_kinds] == number]
                 objects = [pattern]
-                if len(unclassified) < len(of_pattern):
+                if len(unclassified) < len(pattern_kinds):
                     objects_of_kinds = np.unique(kinds.object[unclassified]).tolist()
                     objects = [escape(kinds.names[row]) for row in objects_of_kinds]
                 classified = replace(entry, objects=objects, semantic_class=semantic_class)
@@ -510,13 +510,15 @@ def with_class(
         If a material applies to no kind.
     """
     first = first_matches(materials, kinds)
-    of_rows = kinds.of_rows(rows)
+    selected_kinds = kinds.of_rows(rows)
     entries: list[Material] = []
     for number in (*range(len(materials)), -1):
-        of_number = np.unique(kinds.object[of_rows[first[of_rows] == number]]).tolist()
-        if of_number:
+        object_rows = np.unique(
+            kinds.object[selected_kinds[first[selected_kinds] == number]]
+        ).tolist()
+        if object_rows:
             entry = materials[number] if number >= 0 else Material("*")
-            objects = [escape(kinds.names[row]) for row in of_number]
+            objects = [escape(kinds.names[row]) for row in object_rows]
             entries.append(replace(entry, objects=objects, semantic_class=semantic_class))
         if number >= 0:
             entries.append(materials[number])
@@ -561,11 +563,11 @@ class MaterialTable:
             material of an object with leaves is not for leaves.
         """
         first = first_matches(materials, kinds)
-        without = np.flatnonzero(first < 0)
-        if len(without) and materials:
-            uncovered = f" and {len(without) - 1} more" if without[1:].size else ""
+        unmatched = np.flatnonzero(first < 0)
+        if len(unmatched) and materials:
+            uncovered = f" and {len(unmatched) - 1} more" if unmatched[1:].size else ""
             raise LidarError(
-                f"materials: no entry names the object {kinds.describe(without[0])}{uncovered}: "
+                f"materials: no entry names the object {kinds.describe(unmatched[0])}{uncovered}: "
                 'end with one for all the others, such as {objects: "*"}.'
             )
         entries = [*materials, Material("*")]  # the last is of all, if there are no materials
@@ -573,8 +575,8 @@ class MaterialTable:
         angles = tuple(dict.fromkeys(m.leaf_angle for m in entries))
         leaf_area = np.array([m.leaf_area_density or 0.0 for m in entries])[first]
         has_voxels = np.zeros(len(first), np.bool_) if voxels is None else voxels[kinds.object]
-        angled = np.array([m.leaf_angle != "spherical" for m in entries])[first]
-        for row in np.flatnonzero(has_voxels | angled).tolist():
+        has_leaf_angle = np.array([m.leaf_angle != "spherical" for m in entries])[first]
+        for row in np.flatnonzero(has_voxels | has_leaf_angle).tolist():
             name = kinds.names[kinds.object[row]]
             entries[first[row]].check_leaves(name, bool(has_voxels[row]))
         leaf_area[has_voxels] = 1.0

@@ -239,17 +239,17 @@ class SensorModel(_ModelSection):
 
     def datasheet(self) -> Datasheet:
         """Return noise and returns by the data sheet; LidarError if the file has no performance."""
-        stated = self.performance
-        if stated is None:
+        performance = self.performance
+        if performance is None:
             raise LidarError(
                 f"{self.name} has no performance in its data file, since no source that could be "
                 "read states it: give noise yourself."
             )
         min_range_m, max_range_m = self.range_m or (0.0, float("inf"))
-        noise = stated.noise(2e-9 * (max_range_m - min_range_m) / LIGHT_M_NS)
+        noise = performance.noise(2e-9 * (max_range_m - min_range_m) / LIGHT_M_NS)
         subrays = 1 if self.optics.divergence_mrad is None else 7
         missing = tuple(words for name, words in STATED.items() if not getattr(noise, name))
-        return Datasheet(noise, Returns(stated.mode, subrays=subrays), missing)
+        return Datasheet(noise, Returns(performance.mode, subrays=subrays), missing)
 
     def firing_rates(self, rate_hz: float | None, columns: int | None) -> tuple[float, float]:
         """Return the firings in a revolution, and the revolutions a second.
@@ -462,51 +462,51 @@ def load_sensor(
     """
     unit = None if calibration is None else read_calibration(Path(calibration))
     if model is not None:
-        described = read_model(model)
+        sensor_model = read_model(model)
     elif unit is not None:
-        described = _model_of(unit, columns)
+        sensor_model = _model_of(unit, columns)
     else:
         raise LidarError("A sensor needs a model, a calibration, or both.")
     if unit is not None:
-        described = described.model_copy(update=unit.head)
-    elif described.needs_calibration:
+        sensor_model = sensor_model.model_copy(update=unit.head)
+    elif sensor_model.needs_calibration:
         raise LidarError(
-            f"{described.name} has no rays of its own: give calibration: FILE "
-            f"({next(iter(described.sources.values()), 'of the unit')})."
+            f"{sensor_model.name} has no rays of its own: give calibration: FILE "
+            f"({next(iter(sensor_model.sources.values()), 'of the unit')})."
         )
-    firings, rate = described.firing_rates(rate_hz, columns)
-    shortest_m, longest_m = described.range_m or (0.0, float("inf"))
-    common: dict[str, Any] = {
+    firings, rate = sensor_model.firing_rates(rate_hz, columns)
+    shortest_m, longest_m = sensor_model.range_m or (0.0, float("inf"))
+    common_fields: dict[str, Any] = {
         "min_range_m": shortest_m if min_range_m is None else min_range_m,
         "max_range_m": longest_m if max_range_m is None else max_range_m,
-        "name": _sensor_name(described, unit),
-        "optics": described.optics,
+        "name": _sensor_name(sensor_model, unit),
+        "optics": sensor_model.optics,
     }
-    user_sheet = described.performance is not None and str(model).endswith(MODEL_FILES)
+    user_sheet = sensor_model.performance is not None and str(model).endswith(MODEL_FILES)
     if performance == "datasheet" or (performance is None and user_sheet):
-        sheet = described.datasheet()
-        common |= {"noise": sheet.noise, "returns": sheet.returns}
-    head = Spin(firings, step_deg, rate, described.clockwise, described.zero_deg)
-    if unit is not None and (unit.rays is not None or described.listed or described.prisms):
-        return _listed(described, unit, head, common)
-    beams = described.beams.beams() if unit is None else _calibrated(described, unit)
-    if described.prisms:
-        mirror = described.turning_mirror
-        return PrismSensor(beams, head, prisms=described.prisms, mirror=mirror, **common)
-    if described.mirror is not None:
-        mirror_fields = described.mirror.model_dump()
+        sheet = sensor_model.datasheet()
+        common_fields |= {"noise": sheet.noise, "returns": sheet.returns}
+    head = Spin(firings, step_deg, rate, sensor_model.clockwise, sensor_model.zero_deg)
+    if unit is not None and (unit.rays is not None or sensor_model.listed or sensor_model.prisms):
+        return _listed(sensor_model, unit, head, common_fields)
+    beams = sensor_model.beams.beams() if unit is None else _calibrated(sensor_model, unit)
+    if sensor_model.prisms:
+        mirror = sensor_model.turning_mirror
+        return PrismSensor(beams, head, prisms=sensor_model.prisms, mirror=mirror, **common_fields)
+    if sensor_model.mirror is not None:
+        mirror_fields = sensor_model.mirror.model_dump()
         head = Mirror(firings, step_deg, rate, head.clockwise, head.zero_deg, **mirror_fields)
     else:
         beams = beams.turning(head.radians_per_ns)
-    kind = LineSensor if described.axis == "x" else Sensor
-    return kind(beams.lowest_first(), head, **common)
+    kind = LineSensor if sensor_model.axis == "x" else Sensor
+    return kind(beams.lowest_first(), head, **common_fields)
 
 
-def _sensor_name(described: SensorModel, unit: Calibration | None) -> str:
+def _sensor_name(sensor_model: SensorModel, unit: Calibration | None) -> str:
     """Return the name of a sensor for reports, with the source of its rays."""
     if unit is not None:
-        return f"{described.name}, {unit.file}"
-    return f"{described.name}, typical pattern" if described.typical else described.name
+        return f"{sensor_model.name}, {unit.file}"
+    return f"{sensor_model.name}, typical pattern" if sensor_model.typical else sensor_model.name
 
 
 def _model_of(unit: Calibration, columns: int | None) -> SensorModel:
@@ -529,33 +529,35 @@ def _model_of(unit: Calibration, columns: int | None) -> SensorModel:
 
 
 def _listed(
-    described: SensorModel, unit: Calibration, head: Spin, common: dict[str, Any]
+    sensor_model: SensorModel, unit: Calibration, head: Spin, common_fields: dict[str, Any]
 ) -> ListedSensor:
     """Return a sensor with a unit's list of rays, at the model's rate if the list has no times."""
-    if unit.rays is None or (described.beams.elevation_deg and not described.prisms):
+    if unit.rays is None or (sensor_model.beams.elevation_deg and not sensor_model.prisms):
         raise LidarError(
-            f"{unit.file} does not fit {described.name}: one lists rays, the other beams."
+            f"{unit.file} does not fit {sensor_model.name}: one lists rays, the other beams."
         )
     if not unit.head:  # a firing of the model has all beams, a firing of the list has one ray
-        firings = head.firings_per_turn * len(described.beams.beams())
+        firings = head.firings_per_turn * len(sensor_model.beams.beams())
         head = replace(head, firings_per_turn=firings)
     interval_ns = 1e9 / (head.firings_per_turn * head.rate_hz)
     times = unit.shot_ns
     if times is None:
         times = interval_ns * np.arange(len(unit.rays), dtype=np.float64)
     cycle_ns = float(times[-1]) + interval_ns
-    return ListedSensor(head=head, rays=unit.rays, shot_ns=times, cycle_ns=cycle_ns, **common)
+    return ListedSensor(
+        head=head, rays=unit.rays, shot_ns=times, cycle_ns=cycle_ns, **common_fields
+    )
 
 
-def _calibrated(described: SensorModel, unit: Calibration) -> Beams:
+def _calibrated(sensor_model: SensorModel, unit: Calibration) -> Beams:
     """Return the beams of a unit, fired at the times of its model."""
     beams = unit.beams
-    table = described.beams
+    table = sensor_model.beams
     assert beams is not None  # a file has beams or rays
     expected = len(table.elevation_deg) or len(table.time_us)
     if expected not in (0, len(beams)):
         raise LidarError(
-            f"{unit.file} has {len(beams)} beams, but {described.name} has {expected}."
+            f"{unit.file} has {len(beams)} beams, but {sensor_model.name} has {expected}."
         )
     times = beams.time_ns if beams.time_ns.any() else np.multiply(table.time_us, 1000.0)
     origin = beams.origin if beams.origin.any() else table.origins(len(beams))

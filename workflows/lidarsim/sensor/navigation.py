@@ -42,10 +42,10 @@ from .trajectory import (
 )
 
 WHITE = Purpose(41, "white noise of an instrument")
-DRIVEN = Purpose(42, "steps of its bias")
-WALK = Purpose(43, "steps of its random walk")
-SKEW = Purpose(44, "scale factors of its axes, and angles between them")
-OUTAGE = Purpose(45, "drift where there is no GNSS")
+DRIVEN = Purpose(42, "steps of an instrument's bias")
+WALK = Purpose(43, "steps of an instrument's random walk")
+SKEW = Purpose(44, "scale factors of an instrument's axes, and angles between axes")
+OUTAGE = Purpose(45, "drift in outages of GNSS")
 BLOCK = 1 << 14  # samples in a block
 RETURNS_IN_S = 1.0  # time after an outage in which its error falls to 37 %
 

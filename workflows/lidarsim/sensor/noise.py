@@ -137,9 +137,15 @@ class Noise:
         if np.ndim(self.channel_bias_m):
             biases = tuple(np.asarray(self.channel_bias_m, np.float64).tolist())
             object.__setattr__(self, "channel_bias_m", biases)
-        needs = "range_at_threshold_m", "walk_m", "false_alarm_hz", "stray_light", "crosstalk"
+        threshold_fields = (
+            "range_at_threshold_m",
+            "walk_m",
+            "false_alarm_hz",
+            "stray_light",
+            "crosstalk",
+        )
         if self.detection_range_m is None:
-            for name in (*needs, "saturation"):
+            for name in (*threshold_fields, "saturation"):
                 if getattr(self, name):
                     raise LidarError(
                         f"noise.{name} is measured by the threshold of detection: give "

@@ -188,26 +188,26 @@ class Sensor:
         revolutions = np.floor((starts_ns - self.start_ns) * (rate_hz / 1e9) + 1e-6)
         return revolutions.astype(np.int64)
 
-    def turn_ns(self, number: int) -> float:
+    def revolution_start_ns(self, number: int) -> float:
         """Return the start of a revolution, or frame, nanoseconds since the head started."""
         rate_hz = getattr(self.head, "rate_hz", None)
         if rate_hz is not None:
             return float(number * 1e9 / rate_hz)
         return float(self.head.times_ns(np.array([self.firings(number)[0]]))[0])
 
-    def steps_of_turn(self, number: int) -> range:
+    def steps_of_revolution(self, number: int) -> range:
         """Return the time steps of a revolution, or frame.
 
         Examples
         --------
-        >>> Sensor.grid(step_deg=10).steps_of_turn(2)
+        >>> Sensor.grid(step_deg=10).steps_of_revolution(2)
         range(72, 108)
         """
-        first = self._first_step(number, self._steps_in_turn)
-        return range(first, self._first_step(number + 1, self._steps_in_turn))
+        first = self._first_step(number, self._steps_in_revolution)
+        return range(first, self._first_step(number + 1, self._steps_in_revolution))
 
     @cached_property
-    def _steps_in_turn(self) -> int:
+    def _steps_in_revolution(self) -> int:
         """Number of time steps in the first revolution."""
         return self._first_step(1, 1)
 
@@ -219,13 +219,13 @@ class Sensor:
             return int(self.revolutions([step])[0])
 
         lower = upper = number * steps_per_revolution
-        back = ahead = 1
+        back_step = ahead_step = 1
         while lower and revolution_of(lower) >= number:
-            lower = max(0, lower - back)
-            back = 2 * back
+            lower = max(0, lower - back_step)
+            back_step = 2 * back_step
         while revolution_of(upper) < number:
-            upper = upper + ahead
-            ahead = 2 * ahead
+            upper = upper + ahead_step
+            ahead_step = 2 * ahead_step
         return bisect_left(range(upper + 1), number, lo=lower, key=revolution_of)
 
     def directions(self, firings: Ints) -> Floats:

@@ -265,8 +265,8 @@ class Survey(CloudOptions, Weather):
         self._fill_in("noise", Noise())
         if self.sensors:
             self._set(sensor=self.sensors[0].sensor)
-        extra = {"sensor": len(self.sensors) > 1, "class": self.classes}
-        columns = (*self.columns, *(name for name, present in extra.items() if present))
+        added = {"sensor": len(self.sensors) > 1, "class": self.classes}
+        columns = (*self.columns, *(name for name, present in added.items() if present))
         self._set(columns=chosen(columns), classes=dict(sorted(self.classes.items())))
         finest = min(mounted.sensor.optics.resolution_m or PRECISION_M for mounted in self.carried)
         for name, default in {"keep_every": 1, "precision_m": finest}.items():
@@ -382,11 +382,11 @@ class Survey(CloudOptions, Weather):
         sensor = carried.sensor
         name = f" of {carried.name}" if carried.name else ""
         if self.noise_each[number].detection_range_m is None:
-            lacks = "is not given" if carried.noise is None else "its data sheet does not state"
+            missing = "is not given" if carried.noise is None else "its data sheet does not state"
             guess = sensor.max_range_m / 2 if sensor.max_range_m < np.inf else 100
             raise LidarError(
                 f"Returns from rain, snow, spray, dust or fog need noise.detection_range_m{name}, "
-                f"the range at 10 % reflectance, which {lacks}: write what is known of it, or "
+                f"the range at 10 % reflectance, which {missing}: write what is known of it, or "
                 f"half of the sensor's range, noise: {{detection_range_m: {guess:.3g}}}."
             )
         divergences = (self.returns_each[number].divergence_mrad, sensor.optics.divergence_mrad)
@@ -403,7 +403,7 @@ class Survey(CloudOptions, Weather):
 
     def _check_duration(self, sensor: Sensor, steps: int) -> None:
         """Check that a sensor's steps fit into the trajectory, its rays and times into numbers."""
-        needed_s = _end_ns(sensor, steps) / 1e9
+        needed_s = _last_firing_ns(sensor, steps) / 1e9
         available_s = self.path.duration_ns / 1e9
         if needed_s > available_s:
             raise LidarError(
@@ -417,7 +417,7 @@ class Survey(CloudOptions, Weather):
                 f"A scan would have {rays:,} rays, more than {MAX_RAYS:,}: make step_deg smaller, "
                 "or take fewer rays."
             )
-        duration_ns = begin_ns(sensor, sensor.firings(steps - 1)[1]) * self.path.stations
+        duration_ns = firing_start_ns(sensor, sensor.firings(steps - 1)[1]) * self.path.stations
         if not duration_ns < MAX_DURATION_NS:
             raise LidarError(
                 f"The survey would last {duration_ns / 1e9:.3g} s, and times are counted in "
@@ -489,7 +489,7 @@ class Survey(CloudOptions, Weather):
                 counts.append(steps)
                 continue
             candidates = range(1, MAX_STEPS + 1)
-            end_ns = partial(_end_ns, carried.sensor)
+            end_ns = partial(_last_firing_ns, carried.sensor)
             counts.append(bisect_right(candidates, self.path.duration_ns, key=end_ns))
             if not counts[-1]:
                 raise LidarError(
@@ -546,7 +546,7 @@ class Survey(CloudOptions, Weather):
     def station_ns(self) -> int:
         """Duration of a station, nanoseconds: until the last sensor is done."""
         return max(
-            round(begin_ns(carried.sensor, carried.sensor.firings(steps - 1)[1]))
+            round(firing_start_ns(carried.sensor, carried.sensor.firings(steps - 1)[1]))
             for carried, steps in zip(self.carried, self.steps_each, strict=True)
         )
 
@@ -554,7 +554,7 @@ class Survey(CloudOptions, Weather):
     def duration_ns(self) -> float:
         """Time from the survey's start to the start of the last firing, nanoseconds."""
         pairs = zip(self.carried, self.steps_each, strict=True)
-        last = max(_end_ns(carried.sensor, steps) for carried, steps in pairs)
+        last = max(_last_firing_ns(carried.sensor, steps) for carried, steps in pairs)
         return (self.path.stations - 1) * self.station_ns + last
 
     def scan(self, index: int) -> ScanSpec:
@@ -610,7 +610,7 @@ class Survey(CloudOptions, Weather):
         """Return the start of scan `index`, nanoseconds since the survey's start."""
         spec = self.scan(index)
         sensor = self.carried[spec.sensor].sensor
-        return spec.start_ns + begin_ns(sensor, spec.firings[0]) + sensor.lead_ns
+        return spec.start_ns + firing_start_ns(sensor, spec.firings[0]) + sensor.lead_ns
 
 
 def _check_noise(noise: Noise, sensor: Sensor) -> None:
@@ -636,14 +636,14 @@ def _check_noise(noise: Noise, sensor: Sensor) -> None:
         )
 
 
-def begin_ns(sensor: Sensor, firing: int) -> float:
+def firing_start_ns(sensor: Sensor, firing: int) -> float:
     """Return the start of a firing, nanoseconds since the start of the station."""
     return float(sensor.begins_ns(np.array([firing], np.int64))[0])
 
 
-def _end_ns(sensor: Sensor, steps: int) -> float:
+def _last_firing_ns(sensor: Sensor, steps: int) -> float:
     """Return the start of the last firing of `steps` time steps, ns since the station's start."""
-    return begin_ns(sensor, sensor.firings(steps - 1)[1] - 1) + sensor.lead_ns
+    return firing_start_ns(sensor, sensor.firings(steps - 1)[1] - 1) + sensor.lead_ns
 
 
 def _poses(poses: Sequence[Any]) -> tuple[Pose, ...]:

@@ -352,9 +352,10 @@ class Track:
         _check_poses(~np.isfinite(times), "the time of pose {} is not finite")
         finite = np.isfinite(positions[:, 0] + positions[:, 1] + positions[:, 2])
         _check_poses(~finite, "the position of pose {} is not finite")
-        late = np.append(False, np.diff(times) <= 0)
+        not_ascending = np.append(False, np.diff(times) <= 0)
         _check_poses(
-            late, "times must ascend, and that of pose {} does not come after the one before"
+            not_ascending,
+            "times must ascend, and that of pose {} does not come after the one before",
         )
         if self.quaternions is None:
             if self.smooth:
@@ -584,13 +585,13 @@ def quaternions_of(rotations: Floats) -> Floats:
     iteration: plus one, the smaller eigenvalues are about as small as the matrices are rounded, and
     zero for exact rotations.
     """
-    m = np.moveaxis(rotations, 0, -1)
+    matrix = np.moveaxis(rotations, 0, -1)
     table = np.zeros((len(rotations), 4, 4))
     for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
-        table[:, i, i] = m[i, i] - m[j, j] - m[k, k]
-        table[:, i, j] = table[:, j, i] = m[i, j] + m[j, i]
-        table[:, k, 3] = table[:, 3, k] = m[j, i] - m[i, j]
-    table[:, 3, 3] = m[0, 0] + m[1, 1] + m[2, 2]
+        table[:, i, i] = matrix[i, i] - matrix[j, j] - matrix[k, k]
+        table[:, i, j] = table[:, j, i] = matrix[i, j] + matrix[j, i]
+        table[:, k, 3] = table[:, 3, k] = matrix[j, i] - matrix[i, j]
+    table[:, 3, 3] = matrix[0, 0] + matrix[1, 1] + matrix[2, 2]
     table += np.eye(4)
     best = np.diagonal(table, axis1=1, axis2=2).argmax(axis=1)
     vectors = table[np.arange(len(table)), best]

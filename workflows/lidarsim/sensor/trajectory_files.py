@@ -202,8 +202,8 @@ def _of_text(
     header = find_header(lines, _is_pose_column) if times is None else None
     if kind == "csv" or (kind in (None, "tum") and header is not None):
         # Rows of TUM are separated by spaces, and may have their header in a remark.
-        tum = header is not None and header.comment and header.separator is None
-        return "csv", _table(text, columns, ignore, tum or kind == "tum")
+        seconds_by_default = header is not None and header.comment and header.separator is None
+        return "csv", _table(text, columns, ignore, seconds_by_default or kind == "tum")
     return _of_rows(_numbers(text), kind, times, origin)
 
 
@@ -270,8 +270,10 @@ def _numbers(text: str, columns: int | None = None) -> Floats:
     return rows
 
 
-def _table(text: str, names: Mapping[str, str], ignore: Sequence[str], tum: bool) -> PoseTable:
-    """Return the poses of a table with a header; with `tum`, times without unit are seconds."""
+def _table(
+    text: str, names: Mapping[str, str], ignore: Sequence[str], seconds_by_default: bool
+) -> PoseTable:
+    """Return the poses of a table with a header; `seconds_by_default` is for times without unit."""
     quaternion = [quantity.name for quantity in QUATERNION]
 
     def required_columns(columns: Mapping[str, Floats]) -> tuple[str, ...]:
@@ -288,7 +290,7 @@ def _table(text: str, names: Mapping[str, str], ignore: Sequence[str], tum: bool
             ignore=ignore,
             formats=POSE_TABLES,
             refused=REFUSED_COLUMNS,
-            bare={"time_s": "s"} if tum else {},
+            bare={"time_s": "s"} if seconds_by_default else {},
         )
     )
     seconds = columns["time_s"]

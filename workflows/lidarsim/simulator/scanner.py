@@ -341,14 +341,16 @@ class Scanner:
         """Return the scans of a turn, and how late it is, nanoseconds; of `count` sweeps."""
         sensor = rig.survey.sensor
         ahead = 0
-        steps = sensor.steps_of_turn(number or 0)
+        steps = sensor.steps_of_revolution(number or 0)
         if steps.stop > SCANS_MOST:
             raise LidarError(f"number is {number}; scans are counted up to {SCANS_MOST:,}.")
         if number is None:
             with self._lock:
                 ahead = self._unnumbered * len(steps)
                 self._unnumbered += count
-        late_ns = 0 if start_s is None else round(start_s * 1e9 - sensor.turn_ns(number or 0))
+        late_ns = (
+            0 if start_s is None else round(start_s * 1e9 - sensor.revolution_start_ns(number or 0))
+        )
         specs = [
             ScanSpec(step, 0, sensor.firings(step), late_ns, 0, sensor.channels, ahead)
             for step in steps
