@@ -212,7 +212,7 @@ def _tilt(emitter: Floats) -> float | None:
     return float(np.degrees(np.arctan2(emitter[2, 1], emitter[1, 1])))
 
 
-def _us(pulses: int, pulse_hz: float) -> int | str:
+def _exact_us(pulses: int, pulse_hz: float) -> int | str:
     """Return the exact duration of `pulses`, microseconds; a fraction as text."""
     exact = Fraction(pulses * 1_000_000) / Fraction(pulse_hz)
     return exact.numerator if exact.denominator == 1 else str(exact)
@@ -222,13 +222,13 @@ def _us(pulses: int, pulse_hz: float) -> int | str:
 class _Line:
     """Pulses of a polygon's line.
 
-    A line has time for `of_total` pulses, of which `count` are within its angles.
+    A line has time for `pulses_per_line` pulses, of which `count` are within its angles.
     """
 
     first_deg: float
     step_deg: float
     count: int
-    of_total: int
+    pulses_per_line: int
     pulse_hz: float
     scan_hz: float  # 0 if the mirror stands
 
@@ -255,17 +255,22 @@ class _Line:
             lowest_deg = max(lowest_deg, -effective_deg)
             highest_deg = min(highest_deg, effective_deg)
         step_deg = 2 * max_deg * scan_hz / pulse_hz
-        of_total = ceil(pulse_hz / scan_hz - _SLACK)
+        pulses_per_line = ceil(pulse_hz / scan_hz - _SLACK)
         # Angles above the lowest, up to the highest; the next line starts before a full revolution.
         first = floor((lowest_deg + max_deg) / step_deg + _SLACK) + 1
-        last = min(floor((highest_deg + max_deg) / step_deg + _SLACK), of_total - 1)
+        last = min(floor((highest_deg + max_deg) / step_deg + _SLACK), pulses_per_line - 1)
         if last < first:
             raise LidarError(
                 f"lines of {scanner.name} from {lowest_deg:g} to {highest_deg:g} degrees hold no "
                 "pulse."
             )
         return cls(
-            first * step_deg - max_deg, step_deg, last - first + 1, of_total, pulse_hz, scan_hz
+            first * step_deg - max_deg,
+            step_deg,
+            last - first + 1,
+            pulses_per_line,
+            pulse_hz,
+            scan_hz,
         )
 
     def standing(self) -> ScannerSection:
@@ -282,10 +287,10 @@ class _Line:
         mirror = {
             "motion": "sawtooth",
             "width_deg": clean(min(width, 360)),
-            "duty": clean(self.count / self.of_total),
+            "duty": clean(self.count / self.pulses_per_line),
         }
         middle = self.first_deg + width / 2
-        return _mirror(self.count, self.pulse_hz / self.of_total, mirror, middle), _LINE
+        return _mirror(self.count, self.pulse_hz / self.pulses_per_line, mirror, middle), _LINE
 
     def turning(self, deg_per_s: float, tilt: float) -> dict[str, Any]:
         """Return a sensor with a head, whose firings are lines; `tilt` of the lines in degrees."""
@@ -293,7 +298,7 @@ class _Line:
         last = clean((self.count - 1) * between_us)
         times = {"time_us": {"first": 0, "last": last, "count": self.count}}
         data = {
-            "firing_us": _us(self.of_total, self.pulse_hz),
+            "firing_us": _exact_us(self.pulses_per_line, self.pulse_hz),
             "rate_hz": abs(deg_per_s) / 360,
             "beams": self._elevations(tilt) | times,
         }
@@ -349,7 +354,7 @@ def _cone(scanner: HeliosScanner, settings: dict[str, str], pulse_hz: float) -> 
     if rate_hz <= 0:
         raise LidarError(f"{scanner.name} has no scanFreqMax_Hz above 0.")
     beams = {"elevation_deg": [clean(90 - _half_angle_deg(scanner, settings))]}
-    return {"firing_us": _us(1, pulse_hz), "rate_hz": rate_hz, "beams": beams}, _CONE
+    return {"firing_us": _exact_us(1, pulse_hz), "rate_hz": rate_hz, "beams": beams}, _CONE
 
 
 def _prisms(scanner: HeliosScanner, settings: dict[str, str], pulse_hz: float) -> ScannerSection:
@@ -368,7 +373,7 @@ def _prisms(scanner: HeliosScanner, settings: dict[str, str], pulse_hz: float) -
     if not prisms:
         raise LidarError(f"{scanner.name} has no prisms.")
     section: dict[str, Any] = {
-        "firing_us": _us(1, pulse_hz),
+        "firing_us": _exact_us(1, pulse_hz),
         "rate_hz": _FRAME_HZ,
         "prisms": prisms,
     }

@@ -56,7 +56,7 @@ class HeliosPart:
         """Values that HELIOS++ reads of the materials of the faces, {name: values}."""
         text = _text(self.file) if self.file.suffix.lower() == ".obj" else ""
         used = {self.material, *re.findall(r"^\s*usemtl\s+(.+?)\s*$", text, re.MULTILINE)}
-        values_of: dict[str, dict[str, str]] = {}  # {name of a material: values}
+        values_by_material: dict[str, dict[str, str]] = {}  # {name of a material: values}
         names = re.findall(r"^\s*mtllib\s+(.+?)\s*$", text, re.MULTILINE)
         libraries = [self.file.parent / name for name in names]
         libraries += [self.library] if self.library else []
@@ -66,10 +66,10 @@ class HeliosPart:
                 words = line.split()
                 if words[:1] == ["newmtl"] and len(words) > 1:
                     name = line.split(maxsplit=1)[1].strip()  # names may have spaces
-                    values = values_of.setdefault(name, {})
+                    values = values_by_material.setdefault(name, {})
                 elif len(words) > 1 and words[0].startswith("helios_"):
                     values[words[0].removeprefix("helios_")] = words[1]
-        return {name: values for name, values in values_of.items() if name in used}
+        return {name: values for name, values in values_by_material.items() if name in used}
 
     def kinds(self, spectra: Callable[[str], float | None]) -> dict[str, dict[str, Any]]:
         """Return reflectance and class of each material, {name: fields of `materials`}.
@@ -123,7 +123,7 @@ class HeliosPart:
             "rotation_deg": (clean(degrees), [0.0, 0.0, 0.0]),
             "translation": (clean(self.offset), [0.0, 0.0, 0.0]),
         }
-        changed = {key: value for key, (value, usual) in placement.items() if value != usual}
+        changed = {key: value for key, (value, default) in placement.items() if value != default}
         return {"file": name, **changed}
 
 
@@ -216,15 +216,15 @@ class HeliosScene:
         """Return the entries of `materials` for objects, or for faces of several materials."""
         spectra = partial(self._reflectance, wavelength_nm)
         kinds = [part.kinds(spectra) for part in self.parts]
-        if not any(kind for of_part in kinds for kind in of_part.values()):
+        if not any(kind for part_kinds in kinds for kind in part_kinds.values()):
             return []
         meshes = [part.meshes() for part in self.parts]
         names = iter(unique_names([mesh.name for part_meshes in meshes for mesh in part_meshes]))
         entries = [
             entry
-            for part_meshes, of_part in zip(meshes, kinds, strict=True)
+            for part_meshes, part_kinds in zip(meshes, kinds, strict=True)
             for mesh in part_meshes
-            for entry in _entries(next(names), mesh, of_part)
+            for entry in _entries(next(names), mesh, part_kinds)
         ]
         return [*entries, {"objects": "*"}]
 
@@ -314,13 +314,13 @@ def _entries(
     objects = escape(name)
     if shape.materials is None:  # of a file without materials: the part has at most one
         return [{"objects": objects, **kind} for kind in kinds.values() if kind][:1]
-    of_object = {material: kinds.get(material, {}) for material in shape.materials.names}
-    first, *following = of_object.values()
+    object_kinds = {material: kinds.get(material, {}) for material in shape.materials.names}
+    first, *following = object_kinds.values()
     if all(kind == first for kind in following):
         return [{"objects": objects, **first}] if first else []
     return [
         {"objects": objects, "material": escape(material), **kind}
-        for material, kind in of_object.items()
+        for material, kind in object_kinds.items()
         if kind
     ]
 

@@ -199,9 +199,11 @@ class _Import:
             self._notes.append(
                 f"how a {kind} drives: it keeps its speed and goes straight from leg to leg"
             )
-        noisy = [e.tag for parent in (platform, self._element) for e in parent if "Noise" in e.tag]
-        if noisy:
-            self._notes.append(f"noise of the platform: {', '.join(noisy)}")
+        noise_tags = [
+            e.tag for parent in (platform, self._element) for e in parent if "Noise" in e.tag
+        ]
+        if noise_tags:
+            self._notes.append(f"noise of the platform: {', '.join(noise_tags)}")
         return kind in ("linearpath", "groundvehicle", "multicopter")
 
     def _devices(self, legs: Sequence[Leg]) -> dict[int, dict[str, Device]]:
@@ -308,13 +310,13 @@ class _Import:
         scanner = self._first
         detector = self._element.find("detectorSettings")
         detector_settings = {} if detector is None else detector.attrib
-        fwf = self._full_waveform()
-        quality = number(fwf, "beamSampleQuality", 3.0)
+        waveform_settings = self._full_waveform()
+        quality = number(waveform_settings, "beamSampleQuality", 3.0)
         sections = {
             "returns": {
                 "mode": "first" if scanner.number("maxNOR") == 1 else "all",
                 "subrays": SUBRAYS[int(np.clip(quality - 1, 0, len(SUBRAYS) - 1))],
-                **waveform(fwf, scanner.number("pulseLength_ns", 4)),
+                **waveform(waveform_settings, scanner.number("pulseLength_ns", 4)),
             },
             "noise": {
                 "range_m": clean(

@@ -44,15 +44,19 @@ class Fault:
         If a number is outside its range, or its fields do not fit together.
     """
 
-    kind: Annotated[FaultKind, about("what happens")]
-    from_s: Annotated[Time, about("when it begins, seconds since the survey's start")] = 0.0
-    to_s: Annotated[Time | None, about("when it ends; by default with the survey")] = None
-    sensor: Annotated[Text | None, about("its sensor's name; by default all have it")] = None
-    transmission: Annotated[UnitShare | None, about("of dirt: of energy, out and back")] = None
-    azimuth_deg: Annotated[Two[AngleDeg] | None, about("of dirt: counter-clockwise")] = None
+    kind: Annotated[FaultKind, about("kind of fault")]
+    from_s: Annotated[Time, about("start, seconds since the survey's start")] = 0.0
+    to_s: Annotated[Time | None, about("end; by default the survey's end")] = None
+    sensor: Annotated[Text | None, about("name of the faulty sensor; by default all")] = None
+    transmission: Annotated[UnitShare | None, about("of dirt: share of energy, out and back")] = (
+        None
+    )
+    azimuth_deg: Annotated[
+        Two[AngleDeg] | None, about("of dirt: start and end, counter-clockwise")
+    ] = None
     elevation_deg: Annotated[Ends[AngleDeg] | None, about("of dirt: lowest and highest")] = None
-    channels: Annotated[Channels | None, about("dead ones; 0 is the lowest")] = None
-    share: Annotated[UnitShare | None, about("of packets that are lost")] = None
+    channels: Annotated[Channels | None, about("dead channels; 0 is the lowest")] = None
+    share: Annotated[UnitShare | None, about("share of packets that are lost")] = None
     packet: Annotated[Count | None, about("consecutive firings in a packet")] = None
     by_s: Annotated[Shift | None, about("of a time jump: added to stamps, seconds")] = None
 

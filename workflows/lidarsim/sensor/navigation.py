@@ -78,7 +78,7 @@ class Imu:
     rate_hz: Annotated[
         float, about("samples a second; update_rate of kalibr", ge=0.001, le=100_000)
     ] = 200.0
-    mount: Annotated[Pose, AT_CENTRE, about("its pose in the carrier's axes")] = CENTRE
+    mount: Annotated[Pose, AT_CENTRE, about("pose in the carrier frame")] = CENTRE
     gyroscope_noise_density: Annotated[TurnNoise, about("angle random walk, rad/s/sqrt(Hz)")] = 0.0
     gyroscope_bias: Annotated[
         TurnNoise,
@@ -87,18 +87,22 @@ class Imu:
             "first order), rad/s"
         ),
     ] = 0.0
-    gyroscope_bias_time_s: Annotated[Correlation, about("its correlation time")] = 300.0
-    gyroscope_random_walk: Annotated[TurnNoise, about("of the bias, rad/s^2/sqrt(Hz)")] = 0.0
+    gyroscope_bias_time_s: Annotated[Correlation, about("correlation time of the bias")] = 300.0
+    gyroscope_random_walk: Annotated[
+        TurnNoise, about("random walk of the bias, rad/s^2/sqrt(Hz)")
+    ] = 0.0
     accelerometer_noise_density: Annotated[
         SpeedNoise, about("velocity random walk, m/s^2/sqrt(Hz)")
     ] = 0.0
     accelerometer_bias: Annotated[
         SpeedNoise, about("standard deviation of a bias that wanders about zero, m/s^2")
     ] = 0.0
-    accelerometer_bias_time_s: Annotated[Correlation, about("its correlation time")] = 300.0
-    accelerometer_random_walk: Annotated[SpeedNoise, about("of the bias, m/s^3/sqrt(Hz)")] = 0.0
+    accelerometer_bias_time_s: Annotated[Correlation, about("correlation time of the bias")] = 300.0
+    accelerometer_random_walk: Annotated[
+        SpeedNoise, about("random walk of the bias, m/s^3/sqrt(Hz)")
+    ] = 0.0
     scale: Annotated[UnitShare, about("standard deviation of each axis's scale factor")] = 0.0
-    misalignment_deg: Annotated[Skew, about("of angles between axes, standard deviation")] = 0.0
+    misalignment_deg: Annotated[Skew, about("standard deviation of angles between axes")] = 0.0
 
 
 @dataclass(frozen=True)
@@ -115,11 +119,11 @@ class Gnss:
     """
 
     rate_hz: Annotated[float, about("positions a second", ge=0.0001, le=1000)] = 10.0
-    mount: Annotated[Pose, AT_CENTRE, about("pose of its antenna in the carrier's axes")] = CENTRE
+    mount: Annotated[Pose, AT_CENTRE, about("pose of the antenna in the carrier frame")] = CENTRE
     horizontal_m: Annotated[
         Deviation, about("standard deviation of white noise to the east and north")
     ] = 0.0
-    vertical_m: Annotated[Deviation, about("the same, up")] = 0.0
+    vertical_m: Annotated[Deviation, about("standard deviation of white noise, up")] = 0.0
     drift_horizontal_m: Annotated[
         Deviation,
         about(
@@ -127,11 +131,15 @@ class Gnss:
             "to the east and north"
         ),
     ] = 0.0
-    drift_vertical_m: Annotated[Deviation, about("the same, up")] = 0.0
+    drift_vertical_m: Annotated[
+        Deviation, about("standard deviation of an error that drifts, up")
+    ] = 0.0
     drift_time_s: Annotated[Correlation, about("correlation time of the drift")] = 600.0
     outages: Annotated[
         Several[Ends[Span]],
-        about("begins and ends, seconds; the IMU bridges them, without one no positions are there"),
+        about(
+            "starts and ends, seconds; the IMU bridges outages, without it positions are missing"
+        ),
     ] = ()
     origin: Annotated[
         GeodeticPosition | None,

@@ -66,7 +66,7 @@ class Noise:
     overlap_m: Annotated[
         Metres,
         about(
-            "from here on the receiver sees the whole beam; nearer, rain, snow, fog "
+            "range from which on the receiver sees the whole beam; nearer, rain, snow, fog "
             "and dust do not return more"
         ),
     ] = 10.0
@@ -128,10 +128,10 @@ class Noise:
         about("constant errors of channels' ranges, metres: standard deviation, or one for each"),
     ] = 0.0
     warm_up_m: Annotated[Bias, about("error of ranges at the start, which decays, metres")] = 0.0
-    warm_up_s: Annotated[DecayTime, about("time in which it falls to 37 %, seconds")] = 600.0
+    warm_up_s: Annotated[DecayTime, about("time in which the error falls to 37 %, seconds")] = 600.0
     ripple_deg: Annotated[AngleSigma, about("greatest error of azimuths, as the head turns")] = 0.0
-    ripple_cycles: Annotated[int, about("how often it repeats in a turn", ge=1, le=100_000)] = 1
-    ripple_phase_deg: Annotated[AngleDeg, about("its phase where the head is at azimuth 0")] = 0.0
+    ripple_cycles: Annotated[int, about("repetitions in a revolution", ge=1, le=100_000)] = 1
+    ripple_phase_deg: Annotated[AngleDeg, about("phase where the head is at azimuth 0")] = 0.0
 
     def __post_init__(self) -> None:
         if np.ndim(self.channel_bias_m):

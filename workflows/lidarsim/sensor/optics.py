@@ -46,7 +46,7 @@ class Optics:
     """Light and resolution of a sensor."""
 
     wavelength_nm: Annotated[
-        float, about("of the laser; 905 if no source states it", ge=200, le=20_000)
+        float, about("wavelength of the laser; 905 if no source states it", ge=200, le=20_000)
     ] = 905.0
     divergence_mrad: Annotated[
         Divergence | None, about("full angle of the beam, or two, across and up; None if unknown")
@@ -54,7 +54,7 @@ class Optics:
     pulse_ns: Annotated[Pulse, about("length of a pulse")] = 5.0
     resolution_m: Annotated[
         Precision | None,
-        about("of reported ranges: default step for rounding positions; None if no source has it"),
+        about("step of ranges, the default for rounding positions; None if no source states it"),
     ] = None
     beam_profile: Annotated[
         Profile, about("how light is spread over the beam, where it has sub-rays")
@@ -64,7 +64,7 @@ class Optics:
     )
     reflectivity: Annotated[
         Literal[tuple(SCALES)],  # type: ignore[valid-type]
-        about("whose scale the column reflectivity has; Velodyne's if no source states it"),
+        about("scale of the column reflectivity; Velodyne's if no source states it"),
     ] = "velodyne"
 
     def __post_init__(self) -> None:
@@ -126,7 +126,7 @@ class Returns:
     bandwidth_mhz: Annotated[
         float | None,
         about(
-            "of the receiver of waveforms, at -3 dB; by default without limit",
+            "bandwidth of the receiver of waveforms, at -3 dB; by default without limit",
             300.0,
             ge=0.1,
             le=1e6,

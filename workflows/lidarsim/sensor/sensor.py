@@ -21,11 +21,14 @@ from .beams import MAX_CHANNELS, Beams, Head, Mirror, Rate, Spin, Step
 from .noise import Noise
 from .optics import LIGHT_M_NS, Optics, Returns
 
-RaysPerRevolution = Annotated[int, about("for a grid: azimuths in one turn", ge=1, le=10_000_000)]
+RaysPerRevolution = Annotated[
+    int, about("for a grid: azimuths in a revolution", ge=1, le=10_000_000)
+]
 Layers = Annotated[int, about("for a grid: elevations (rings)", ge=1, le=MAX_CHANNELS)]
 Fov = Annotated[float, about("for a grid: degrees, half of it below the horizon", ge=0, le=180)]
 Sector = Annotated[
-    float, about("for a grid: degrees that a turn sweeps, half of it left of +x", gt=0, le=360)
+    float,
+    about("for a grid: degrees that a revolution sweeps, half of it left of +x", gt=0, le=360),
 ]
 MinRange = Annotated[float, Field(ge=0, le=1e8)]
 MaxRange = Annotated[float, Field(gt=0, allow_inf_nan=True)]

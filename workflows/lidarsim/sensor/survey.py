@@ -142,7 +142,7 @@ class CloudOptions:
     ] = None  # type: ignore[assignment]
     coordinates: Annotated[
         Literal[COORDINATES],  # type: ignore[valid-type]
-        about("world; or sensor: its axes when it fired, as sensor drivers have them"),
+        about("world; or sensor: the sensor frame at the firing, as in sensor drivers"),
     ] = "world"
     columns: Annotated[
         Sequence[str | Column],
@@ -167,7 +167,7 @@ class CloudOptions:
         int | None,
         about(
             "EPSG code of the world's coordinate system, for LAS and LAZ, that rasters "
-            "are brought to; by default theirs",
+            "are converted to; by default the rasters'",
             25832,
             ge=1024,
             le=32767,

@@ -66,21 +66,19 @@ class Weather:
     fog_lidar_ratio_sr: Annotated[
         float | None,
         about(
-            "extinction over back-scatter of what limits visibility_km, for returns "
-            "from it: 65 (Hahner et al. 2021), of clean droplets 18.8; by default none return",
+            "extinction over back-scatter of fog or haze, for returns from it: "
+            "65 (Hahner et al. 2021), of clean droplets 18.8; by default none return",
             65.0,
             ge=1,
             le=1000,
         ),
     ] = None
-    rain_mm_h: Annotated[float, about("rain; drops return light, and take some", ge=0, le=300)] = (
-        0.0
-    )
+    rain_mm_h: Annotated[float, about("rain; drops attenuate and return light", ge=0, le=300)] = 0.0
     snow_mm_h: Annotated[
-        float, about("dry snow, melted; flakes return light, and take some", ge=0, le=50)
+        float, about("dry snow, melted; flakes attenuate and return light", ge=0, le=50)
     ] = 0.0
     dust_mg_m3: Annotated[
-        float, about("mineral dust; it returns light, and takes some", ge=0, le=1e5)
+        float, about("mineral dust; it attenuates and returns light", ge=0, le=1e5)
     ] = 0.0
 
     wet: Annotated[
@@ -92,7 +90,7 @@ class Weather:
         float,
         about(
             "water in the air behind vehicles at 90 km/h on ground that is all wet: 1 behind a "
-            "car, 20 behind a lorry; they have to move, and the ground to be wet",
+            "car, 20 behind a lorry; vehicles have to move, and the ground to be wet",
             5.0,
             ge=0,
             le=1000,
