@@ -19,7 +19,7 @@ from lidarpool import LidarError, Noise, Scanner, Scene, Sensor
 from lidarpool.compare.fit import fit
 from lidarpool.compare.recordings import Recording
 from lidarscenes.procedural.city import city
-from lidarscenes.procedural.plants import all_trees, placed
+from lidarscenes.procedural.plants import all_trees, place_instances
 from lidarsim.scene.scene_mesh import SceneMesh
 
 SWEEPS = 12
@@ -64,7 +64,11 @@ def place(name: str, seed: int) -> tuple[Scene, tuple[float, float, float]]:
         kind = rng.integers(0, len(trees), len(at))
         yaw = rng.uniform(0, 2 * np.pi, len(at))
         scale = rng.uniform(0.6, 1.2, len(at))
-        return Scene.from_meshes([ground, *placed(trees, kind, at, yaw, scale)]), (0, 0, 1.6)
+        return Scene.from_meshes([ground, *place_instances(trees, kind, at, yaw, scale)]), (
+            0,
+            0,
+            1.6,
+        )
     if name == "room":
         x = rng.uniform(5, 9)
         y = rng.uniform(4, 7)

@@ -74,7 +74,7 @@ class Ours:
 
     def __init__(self, scene: Scene, sensor: Sensor, backend: str) -> None:
         self.sensor = sensor
-        firings = sensor.steps_of_turn(0)
+        firings = sensor.steps_of_revolution(0)
         stop = sensor.firings(firings[-1])[1]
         self.directions = sensor.directions(np.arange(stop)).reshape(-1, 3)
         origins = sensor.origins(np.arange(stop))

@@ -73,7 +73,7 @@ def main():
         def on_pose(self, message):
             at, turn = message.pose.position, message.pose.orientation
             [rotation] = matrices(np.array([[turn.x, turn.y, turn.z, turn.w]]))
-            self.pose = Pose.of([at.x, at.y, at.z], rotation)
+            self.pose = Pose.from_rotation([at.x, at.y, at.z], rotation)
 
         def on_timer(self):
             header = Header(stamp=self.get_clock().now().to_msg(), frame_id=FRAME)

@@ -171,12 +171,12 @@ def test_materials_and_classes_are_those_of_the_names(made):
     ]
     tree = TREE | {"at": [[9, 0]], "class": 6}
     built = made(crate, tree, materials=materials)
-    table = MaterialTable.of(built.survey.materials, built.scene.surface_kinds)
+    table = MaterialTable.build(built.survey.materials, built.scene.surface_kinds)
     assert built.scene.names[2:] == ("Crate", "Crate.2", "Crate.3", "Tree")
     assert table.semantic_class.tolist() == [1, 1, 5, 5, 7, 6]
     assert table.reflectance.tolist() == [0.2, 0.2, 0.9, 0.9, 0.4, 0.2]
     built = made(crate)
-    table = MaterialTable.of(built.survey.materials, built.scene.surface_kinds)
+    table = MaterialTable.build(built.survey.materials, built.scene.surface_kinds)
     assert table.semantic_class.tolist() == [0, 0, 5, 5, 5]
 
 

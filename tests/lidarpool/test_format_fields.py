@@ -453,7 +453,7 @@ def test_normals_and_origins_are_in_the_axes_of_the_points(
         cosine = -(ray * normal).sum(axis=1) / points.range
         np.testing.assert_allclose(cosine, np.cos(np.radians(points.incidence_deg)), atol=5e-5)
         for row in range(0, len(points), 211):
-            fired = survey.path.pose(0, float(points.time[row])).then(survey.carried[0].mount)
+            fired = survey.path.pose(0, float(points.time[row])).compose(survey.carried[0].mount)
             pose = survey.pose(36 * sweep) if compensated else fired
             # In the world normals are those of the sides of the room, on which the points lie.
             upright = pose.rotation @ normal[row]

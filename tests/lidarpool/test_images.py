@@ -34,7 +34,7 @@ from lidarsim.base.yamlfile import load_yaml
 from lidarsim.columns.table import SCAN
 from lidarsim.sensor.beams import Mirror
 from lidarsim.sensor.models import model_names, read_model
-from lidarsim.sensor.plain_data import described, remade
+from lidarsim.sensor.plain_data import from_plain_data, to_plain_data
 from lidarsim.sensor.ray_sensors import ListedSensor
 from lidarsim.sensor.sensor import LineSensor
 from lidarsim.simulator.batch import columns_of
@@ -210,8 +210,8 @@ SENSORS = [name for name in model_names() if not read_model(name).needs_calibrat
 def test_a_described_sensor_fires_the_same_rays(name):
     sensor = LISTED if name == "listed" else load_sensor(name)
     arrays = {}
-    told = json.loads(json.dumps(described((sensor,), arrays)))
-    (again,) = remade(told, arrays)
+    told = json.loads(json.dumps(to_plain_data((sensor,), arrays)))
+    (again,) = from_plain_data(told, arrays)
     firings = np.arange(*sensor.firings(3))
     assert [again.firings(k) for k in range(5)] == [sensor.firings(k) for k in range(5)]
     np.testing.assert_array_equal(again.directions(firings), sensor.directions(firings))

@@ -166,7 +166,7 @@ def built_of(tmp_path, objects, **more):
 
 def table_of(tmp_path, objects, materials=()):
     built = built_of(tmp_path, objects, materials=list(materials))
-    table = MaterialTable.of(built.survey.materials, built.scene.surface_kinds)
+    table = MaterialTable.build(built.survey.materials, built.scene.surface_kinds)
     found = zip(built.scene.names, table.semantic_class, table.reflectance, strict=True)
     return {name: (number, reflectance) for name, number, reflectance in found}
 

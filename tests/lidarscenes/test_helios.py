@@ -334,7 +334,7 @@ def test_parts_turn_grow_move_and_fall_as_in_helios(imported):
     assert np.allclose(high[1:], [[7, 4, 2], [7, 6, 2]])
     ground = scenario_of(made).materials[0]
     assert (ground.objects, ground.reflectance, ground.semantic_class) == (("ground",), 0.3, 2)
-    MaterialTable.of(of.materials, built.surface_kinds)  # every object has one
+    MaterialTable.build(of.materials, built.surface_kinds)  # every object has one
 
 
 def test_classes_and_reflectances_are_those_of_the_faces(imported):
@@ -361,7 +361,7 @@ def test_classes_and_reflectances_are_those_of_the_faces(imported):
     assert "class" in scenario_of(made).cloud.columns
     assert scene.names == ("ground", "House", "Shed")
     kinds = scene.surface_kinds
-    table = MaterialTable.of(of.materials, scene.surface_kinds)
+    table = MaterialTable.build(of.materials, scene.surface_kinds)
     rows = zip(kinds.object, kinds.material, table.semantic_class, table.reflectance, strict=True)
     found = {(kinds.names[owner], name): (int(c), float(share)) for owner, name, c, share in rows}
     assert found == {
@@ -495,7 +495,7 @@ def test_voxels_are_scene_files_where_light_goes_through_them(survey, tmp_path):
     assert built.scene.has_voxels.tolist() == [False, True]
     bounds = built.scene.object_bounds[1]
     assert bounds == pytest.approx(np.array([[3, 4, 5], [4, 5, 7]]), abs=0.021)
-    table = MaterialTable.of(built.survey.materials, built.scene.surface_kinds)
+    table = MaterialTable.build(built.survey.materials, built.scene.surface_kinds)
     assert table.reflectance.tolist() == [0.3, 0.5]
     assert made.left_out[-2:] == [
         "part 1, ladlut: leaf angles are spherical",

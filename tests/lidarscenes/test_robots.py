@@ -393,7 +393,7 @@ def test_a_sensor_sees_its_own_robot_where_it_is_at_the_time_of_each_ray(ground)
     robot = load_robot(EXAMPLES / "rover.urdf")
     actors = robot.actors(DRIVE, MOTION, without=["lidar"])
     scene = ground.with_actors(actors)
-    mount = robot.path("lidar").pose(0).then(Pose((0, 0, 0.26), pitch_deg=35))
+    mount = robot.path("lidar").pose(0).compose(Pose((0, 0, 0.26), pitch_deg=35))
     assert np.allclose(mount.position, (-0.36, 0, 0.3 + 0.13 + 0.61 + 0.26))
     sensor = load_sensor("velodyne/vlp16", min_range_m=0)
     survey = Survey(

@@ -181,7 +181,7 @@ def test_frames_above_each_other(bag):
         load_trajectory(path)
     track = load_trajectory(path, topic="/tf:lidar")
     assert np.isclose(track.times_s[0] - START_NS / 1e9, 0.1)
-    expected = Pose((100.05, 0, 0), yaw_deg=90).then(TRACK.pose(0, 0.1e9)).then(mount)
+    expected = Pose((100.05, 0, 0), yaw_deg=90).compose(TRACK.pose(0, 0.1e9)).compose(mount)
     assert np.allclose(track.pose(0).position, expected.position, atol=1e-6)
     assert np.allclose(track.pose(0).rotation, expected.rotation, atol=1e-6)
 

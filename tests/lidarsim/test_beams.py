@@ -219,7 +219,7 @@ def nearer(meshes, sensor=None, at=(0, 0, 0), **options):
 @pytest.mark.parametrize("profile", PROFILES)
 @pytest.mark.parametrize("which", range(3))
 def test_shares_on_an_edge_are_as_wrong_as_stated(profile, which):
-    beam = Beam.of(SUBRAYS[1 + which], (2.0, 2.0), profile)
+    beam = Beam.from_divergences(SUBRAYS[1 + which], (2.0, 2.0), profile)
     share = disc_share if profile == "even" else (lambda x: normal_share(2 * x))
     worst = 0.0
     for turn in np.linspace(0, math.pi, 120, endpoint=False):
@@ -359,8 +359,8 @@ def test_returns_go_before_what_the_sensor_states():
     plain = other.beam(optics)
     assert not plain.oval
     assert plain.starts is None
-    assert np.array_equal(plain.angles, Beam.of(7, (2e-3, 2e-3)).angles)
-    assert Returns(subrays=7).of(optics)[0] == pytest.approx(math.sqrt(4.5) / 1000)
+    assert np.array_equal(plain.angles, Beam.from_divergences(7, (2e-3, 2e-3)).angles)
+    assert Returns(subrays=7).divergence(optics) == pytest.approx(math.sqrt(4.5) / 1000)
 
 
 @pytest.mark.parametrize(

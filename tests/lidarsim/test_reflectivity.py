@@ -30,9 +30,9 @@ def test_scales_are_inverted_exactly(maker):
     codes = np.arange(256)
     reflectances = scale.reflectances(codes)
     assert (np.diff(reflectances) > 0).all() and reflectances[0] == 0
-    assert reflectances[-1] == pytest.approx(scale.most)
+    assert reflectances[-1] == pytest.approx(scale.max_reflectance)
     assert scale.codes(reflectances).tolist() == codes.tolist()
-    assert scale.codes(np.array([2 * scale.most, 1e9])).tolist() == [255, 255]
+    assert scale.codes(np.array([2 * scale.max_reflectance, 1e9])).tolist() == [255, 255]
 
 
 @pytest.mark.parametrize(

@@ -119,7 +119,7 @@ def test_a_sweep_has_the_bytes_of_a_survey(scene, name, moves, physics):
     carried = given if isinstance(given, Mounted) else Mounted(given)
     options = {"columns": COLUMNS, "precision_m": 1e-3, **physics}
     where = {"trajectory": DRIVE} if moves else {"poses": [HERE]}
-    steps = carried.sensor.steps_of_turn(2).stop
+    steps = carried.sensor.steps_of_revolution(2).stop
     whole = surveyed(scene, Survey(sensors=[carried], steps=steps, **where, **options))
     scanner = Scanner(scene, given, backend="numpy", **options)
     sweeps = [scanner.sweep(DRIVE if moves else HERE, number=number) for number in (2, 0, 1)]
@@ -130,8 +130,8 @@ def test_a_sweep_has_the_bytes_of_a_survey(scene, name, moves, physics):
 
 def test_sweeps_are_those_that_exporters_find():
     for sensor in (VLP16, GRID, LATE, replace(GRID, head=Spin(120, step_deg=77))):
-        survey = Survey(sensor, [(0, 0, 1)], steps=sensor.steps_of_turn(40).stop)
-        firsts = [sensor.steps_of_turn(number).start for number in range(42)]
+        survey = Survey(sensor, [(0, 0, 1)], steps=sensor.steps_of_revolution(40).stop)
+        firsts = [sensor.steps_of_revolution(number).start for number in range(42)]
         assert Sweeps.of(survey, Scene.seed()).scans.tolist() == firsts
 
 
@@ -160,7 +160,7 @@ IMAGES = {
 
 def assert_image(image, sweep, sensor, number):
     """The nearest ranges of a sweep, firing by firing."""
-    steps = sensor.steps_of_turn(number)
+    steps = sensor.steps_of_revolution(number)
     begins = np.array([sensor.firings(step)[0] for step in steps]) * sensor.channels
     sweep = sweep[sweep.return_number == 1]
     expected = np.full(image.size, np.inf, np.float32)
@@ -216,7 +216,11 @@ def test_each_name_has_random_numbers_of_its_own(scene):
         assert len(rays[0]) > 10 and len(rays[0] - rays[1]) > 0.02 * len(rays[0]), cause
     mounted = Mounted(GRID, name="left")
     assert same(Scanner(scene, mounted, **given, **options).sweep(HERE), clouds[0])
-    options |= {"columns": given["columns"], "steps": GRID.steps_of_turn(0).stop, "poses": [HERE]}
+    options |= {
+        "columns": given["columns"],
+        "steps": GRID.steps_of_revolution(0).stop,
+        "poses": [HERE],
+    }
     assert same(surveyed(scene, Survey(sensors=[mounted], **options)), clouds[0])
 
 

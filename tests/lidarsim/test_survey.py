@@ -323,7 +323,7 @@ def test_each_sensor_may_start_later_and_take_steps_of_its_own():
 @pytest.mark.parametrize("yaw", [0, 30, 200])
 def test_a_pose_that_looks_straight_up_or_down_is_found_again(yaw, pitch):
     turned = Pose((0, 0, 0), yaw, pitch, 20).rotation
-    assert np.allclose(Pose.of((1, 2, 3), turned).rotation, turned, atol=1e-12)
+    assert np.allclose(Pose.from_rotation((1, 2, 3), turned).rotation, turned, atol=1e-12)
 
 
 @pytest.mark.parametrize(
@@ -338,7 +338,7 @@ def test_a_pose_that_looks_straight_up_or_down_is_found_again(yaw, pitch):
 )
 def test_matrices_that_are_no_rotations_are_no_poses(matrix, fault, tmp_path):
     with pytest.raises(LidarError, match=f"pose {fault}: .* the determinant 1"):
-        Pose.of((1, 2, 3), matrix)
+        Pose.from_rotation((1, 2, 3), matrix)
     rows = np.concatenate([np.eye(3), np.ones((3, 1))], axis=1)
     other = np.concatenate([matrix, np.ones((3, 1))], axis=1)
     np.savetxt(tmp_path / "poses.txt", [rows.ravel(), other.ravel()])

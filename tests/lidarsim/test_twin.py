@@ -74,7 +74,7 @@ def pulses_of(seed, each, airy=False, count=1000):
     """Pulses of so many sub-rays: {number: hits}; half may have some in the air."""
     rng = np.random.default_rng(seed)
     surface = 0
-    ahead = np.column_stack([np.ones(each), Beam.of(each, (0.02, 0.02)).angles])
+    ahead = np.column_stack([np.ones(each), Beam.from_divergences(each, (0.02, 0.02)).angles])
     ahead /= np.linalg.norm(ahead, axis=1)[:, None]
     pulses = {}
     for pulse in range(count):
@@ -290,7 +290,9 @@ def test_what_the_air_returns_is_as_in_the_twin(weather, each):
         if cloud is not None:
             table = cloud.peaks.reshape(-1, len(cloud.energy))
             peaks = table - np.arange(len(table))[:, None]
-            drawn += twin.fog(survey.scatters(905.0), air, 9, key, own, 0.5, cloud.cell_m, peaks)
+            drawn += twin.fog(
+                survey.backscatter_at(905.0), air, 9, key, own, 0.5, cloud.cell_m, peaks
+            )
         drawn.sort(key=lambda one: one.subray)
         expected += [(pulse * each + one.subray, one.distance, one.energy) for one in drawn]
     ray, distance, energy = map(np.array, zip(*expected, strict=True))

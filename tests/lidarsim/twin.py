@@ -95,7 +95,7 @@ def normal(seed: int, purpose: Purpose, key: Key, number: int = 0) -> float:
 @cache
 def neighbours(subrays: int) -> list[tuple[int, int]]:
     """Pairs of sub-rays with no other in their circle: none sees them at an obtuse angle."""
-    places = [complex(*place) for place in Beam.of(subrays, (2.0, 2.0)).angles]
+    places = [complex(*place) for place in Beam.from_divergences(subrays, (2.0, 2.0)).angles]
     return [
         (i, j)
         for i, j in combinations(range(subrays), 2)

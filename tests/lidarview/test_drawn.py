@@ -7,7 +7,7 @@ import pytest
 from tests.shapes import block, level
 
 from lidarpool import Scene
-from lidarscenes.procedural.plants import SPECIES, placed, tree
+from lidarscenes.procedural.plants import SPECIES, place_instances, tree
 from lidarsim.scene.actors import box
 from lidarsim.scene.scene_mesh import Cutout, SceneMesh, triangle_areas
 from lidarsim.scene.simplified import MIN_PART_TRIANGLES, SimplifiedScene, cut_masks
@@ -21,7 +21,7 @@ def avenue():
     x = 10.0 * np.arange(40)
     places = np.column_stack([x, np.zeros((40, 2))])
     kind = np.zeros(40, np.int64)
-    return Scene.from_meshes(placed([tree(SPECIES[2])], kind, places, x, np.ones(40)))
+    return Scene.from_meshes(place_instances([tree(SPECIES[2])], kind, places, x, np.ones(40)))
 
 
 def sizes(drawn):

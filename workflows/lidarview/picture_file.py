@@ -117,7 +117,7 @@ class PictureContent:
         drawn = SimplifiedScene.from_scene(cut_masks(scene), near_positions=positions)
         wavelength_nm = survey.carried[0].sensor.optics.wavelength_nm  # of the first sensor
         kinds = scene.surface_kinds
-        materials = MaterialTable.of(survey.materials, kinds, wavelength_nm, scene.has_voxels)
+        materials = MaterialTable.build(survey.materials, kinds, wavelength_nm, scene.has_voxels)
         content = cls(
             scene=replace(drawn.scene, actors=actors),
             sensors=sensors,

@@ -90,7 +90,7 @@ def counts(axes: Any, weather: dict[str, Any], farthest_m: float) -> None:
     size = np.linspace(0, kind.largest, 1500)[1:]
     # Of the light, at most as much as one that fills the beam.
     share = np.minimum(size / (1000 * air.width(middle[:, None])), 1) ** 2
-    signal = kind.reflectance * air.white(middle[:, None]) * share / noise.threshold
+    signal = kind.reflectance * air.white_energy(middle[:, None]) * share / noise.threshold
     grid = np.linspace(-3, 12, 3001)
     detected = np.interp(
         THRESHOLD_SIGMAS * (signal - 1), grid, [NormalDist().cdf(x) for x in grid]
@@ -122,7 +122,7 @@ def energies(axes: Any, weather: dict[str, Any]) -> None:
     axes.plot(distance, white, color=CURVE, lw=1, ls=":", label="surface of 50 %, clear air")
     here = white * np.exp(-2 * alpha * distance)
     axes.plot(distance, here, color=CURVE, lw=1.4, label="surface of 50 %, here")
-    scatters = survey.scatters(survey.sensor.optics.wavelength_nm)
+    scatters = survey.backscatter_at(survey.sensor.optics.wavelength_nm)
     half = 0.299792458 * survey.sensor.optics.pulse_ns / 2
     from_air = survey.air(0).cloud(scatters, distance - half / 2, distance + half / 2)
     axes.plot(distance, from_air, color=OBJECT_COLOURS[1], lw=1.8, label="half a pulse of the air")

@@ -108,7 +108,7 @@ def picture(path: Path) -> None:
     beam = Returns(
         subrays=19, divergence_mrad=OVAL, beam_profile="gaussian", exit_diameter_m=EXIT_M
     )
-    made = Beam.of(19, (OVAL[0] / 1000, OVAL[1] / 1000), "gaussian", EXIT_M)
+    made = Beam.from_divergences(19, (OVAL[0] / 1000, OVAL[1] / 1000), "gaussian", EXIT_M)
     assert made.starts is not None
     for axis, (label, colour) in enumerate((("across", ROUND), ("up", WIDE))):
         waist = EXIT_M / 2

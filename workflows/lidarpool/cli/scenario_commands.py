@@ -443,7 +443,7 @@ def _row(name: str) -> tuple[str, ...]:
     model = read_model(name)
     low, high = model.range_m or (0.0, float("inf"))
     rates = dict.fromkeys(model.rates_hz or (model.rate_hz,))
-    firings, rate = model.turn(None, None)
+    firings, rate = model.firing_rates(None, None)
     beams = model.beams
     channels = len(beams.elevation_deg) or len(beams.time_us) or 1
     if model.mirror:

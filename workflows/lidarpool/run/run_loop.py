@@ -219,7 +219,10 @@ class RunLoop:
         under_way = self._store.under_way  # without jobs that could not be made
         left = [(row, under_way[row.number]) for row in rows if row.number in under_way]
         self._store.name_sensors(
-            (carried.name or "lidar", f"{sensor.model}, {1e9 / sensor.turn_ns(1):.3g} Hz")
+            (
+                carried.name or "lidar",
+                f"{sensor.model}, {1e9 / sensor.revolution_start_ns(1):.3g} Hz",
+            )
             for row, job in left
             if row.done
             for carried in job.survey.carried

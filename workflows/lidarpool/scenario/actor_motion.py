@@ -302,7 +302,7 @@ class ActorSection(DeformingSection):
         if self.at is not None:
             # Of two poses: joints of a robot go by the clock of its trajectory.
             places = np.array([self.at.position] * 2) - standing.origin
-            turns = quaternions_of(np.array([self.at.turn] * 2))
+            turns = quaternions_of(np.array([self.at.rotation_matrix] * 2))
             times = start_s + np.arange(2.0)
             return Track(times, places, turns, start_s=start_s, beyond="hold")
         if self.trajectory is None:

@@ -105,7 +105,7 @@ def _of_colours(built: Built) -> str:
         )
     names = scene.all_names
     kinds = scene.surface_kinds
-    table = MaterialTable.of(built.survey.materials, kinds, voxels=scene.has_voxels)
+    table = MaterialTable.build(built.survey.materials, kinds, voxels=scene.has_voxels)
     textured = np.zeros(len(names), np.bool_)
     textured[kinds.object[table.scale > 0]] = True
     if not len(grey := np.flatnonzero(textured & ~scene.has_colours)):

@@ -105,7 +105,7 @@ class Job:
     def __post_init__(self) -> None:
         scene = self.scene
         survey = self.survey
-        MaterialTable.of(survey.materials, scene.surface_kinds, voxels=scene.has_voxels)
+        MaterialTable.build(survey.materials, scene.surface_kinds, voxels=scene.has_voxels)
         # The cells of the cloud's precision that the scene spans have numbers of 32 bits.
         reach = float(np.abs(scene.bounds).max(initial=0.0))
         if survey.spray_g_m3:
@@ -195,7 +195,7 @@ def build(
         with prefixed(scenario.source):
             classes = [entry.semantic_class for _, entry in vehicles]
             survey = survey_of(_materials(scenario, found, scene, classes), columns)
-        MaterialTable.of(survey.materials, scene.surface_kinds, voxels=scene.has_voxels)
+        MaterialTable.build(survey.materials, scene.surface_kinds, voxels=scene.has_voxels)
     with mistakes.noted(), prefixed(scenario.source):
         planning = _planning(scenario, scene) if plans else None
     mistakes.tell()
@@ -284,7 +284,7 @@ def _mount(section: SensorSection, shapes: Shapes) -> Pose:
             f"mount.link is {mount.link!r}, which {file} moves, and a mount is rigid: "
             "mount the sensor on a link that does not move, or leave out those joints' columns."
         )
-    return path.pose(0).then(mount.pose())
+    return path.pose(0).compose(mount.pose())
 
 
 def _joints(entry: ActorSection, scenario: Scenario) -> dict[str, Any]:

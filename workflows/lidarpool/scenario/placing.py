@@ -10,7 +10,7 @@ import numpy as np
 import yaml
 from numpy.typing import ArrayLike
 
-from lidarscenes.procedural.floor import heights_at, reaching, room_at
+from lidarscenes.procedural.floor import heights_at, room_at, triangles_reaching
 from lidarscenes.procedural.surroundings import Surroundings, in_the_way, is_open
 from lidarsim.base.arrays import Floats
 from lidarsim.base.words import plural
@@ -110,7 +110,7 @@ def place(
 
 def _narrowed(scene: Scene, looker: Surroundings, poses: Sequence[Pose]) -> dict[str, Any]:
     """Return what `Sensor.grid` takes to see an object from poses, with about `_POINTS` points."""
-    placed = [*zip(_local(poses, scene), [pose.turn for pose in poses], strict=True)]
+    placed = [*zip(_local(poses, scene), [pose.rotation_matrix for pose in poses], strict=True)]
     sides = np.zeros(2)  # the widest angles to either side, and up or down
     for at, turn in placed:
         x, y, z = ((scene.vertices - at) @ turn).T
@@ -157,7 +157,7 @@ def _aside(scene: Scene, middle: Floats, buildings: Sequence[str] = ()) -> tuple
     half = np.ptp(scene.bounds, axis=0) / 2
     reach = np.minimum(half, [max(_ASIDE_M) + 1.0] * 2 + [np.inf])
     local = middle - scene.origin
-    near = reaching(scene, local - reach, local + reach)
+    near = triangles_reaching(scene, local - reach, local + reach)
     around = replace(scene, faces=scene.faces[near], face_object=scene.face_object[near])
     built = _named(around, buildings) if buildings else None
     for far in _ASIDE_M:
@@ -244,7 +244,7 @@ def _field_deg(carried: Mounted) -> tuple[float, float]:
     sensor = carried.sensor
     count = min(sensor.period or _LOOKED_AT, _LOOKED_AT)
     firings = np.linspace(0, sensor.period or count, count, endpoint=False).astype(np.int64)
-    rays: Floats = sensor.directions(firings).reshape(-1, 3) @ carried.mount.turn.T
+    rays: Floats = sensor.directions(firings).reshape(-1, 3) @ carried.mount.rotation_matrix.T
     facing = np.abs(np.degrees(np.arctan2(rays[:, 1], rays[:, 0]))) <= _FACING_DEG
     if not facing.any():
         return -90.0, -90.0  # an airborne scanner, which looks down

@@ -107,7 +107,7 @@ def _places(survey: Survey) -> list[_Place]:
         stations = [(n, 0.0) for n in even_indices(path.stations, _POSITIONS).tolist()]
     stations = [stations[i] for i in even_indices(len(stations), max(1, _POSITIONS // len(mounts)))]
     return [
-        _Place(time, np.array(path.pose(station, time).then(mount).position))
+        _Place(time, np.array(path.pose(station, time).compose(mount).position))
         for station, time in stations
         for mount in mounts
     ]

@@ -19,7 +19,7 @@ from lidarsim.columns.table import COLOURS
 from lidarsim.sensor import Fault, Material, Navigation
 from lidarsim.sensor.materials import ClassNames
 from lidarsim.sensor.models import plugin_model_file
-from lidarsim.sensor.survey import SENSORS_MOST, CloudOptions, StepCount
+from lidarsim.sensor.survey import MAX_SENSORS, CloudOptions, StepCount
 from lidarsim.sensor.trajectory import CENTRE
 from lidarsim.sensor.trajectory_files import files_of_trajectory
 from lidarsim.sensor.weather import Weather
@@ -125,7 +125,7 @@ class Scenario(Section):
         about(
             "instead of sensor: several on one carrier, by name, each with its mount",
             {"front": {"model": "velodyne/vlp16", "mount": [2, 0, 0.5]}, "roof": "ouster/os1-64"},
-            max_length=SENSORS_MOST,
+            max_length=MAX_SENSORS,
         ),
     ] = {}  # noqa: RUF012 - of a frozen model
     actors: Annotated[
@@ -293,7 +293,7 @@ class Scenario(Section):
             if section.calibration is None:
                 with mistakes.noted(), prefixed(self._source):
                     one = section.mounted(self.path, CENTRE, self.noise, self.returns)
-                    (one.returns or self.returns).of(one.sensor.optics)
+                    (one.returns or self.returns).divergence(one.sensor.optics)
         mistakes.tell()
 
     @property

@@ -1,4 +1,4 @@
-"""Finds the XML files of HELIOS++, and reads their values."""
+"""XML files of HELIOS++: finding files, and reading values."""
 
 from __future__ import annotations
 
@@ -19,61 +19,63 @@ from lidarsim.base.words import did_you_mean
 from lidarsim.base.xmlfile import xml_root
 from lidarsim.scene.transform import rotation_about
 
-# Where a checkout of HELIOS++ has what its surveys call data/scanners_als.xml.
+# Folder in a checkout of HELIOS++ in which its surveys' data/scanners_als.xml lies.
 _PACKAGE = Path("python/pyhelios")
-_TEMPLATES_MOST = 10  # that name each other
+_MAX_TEMPLATES = 10  # in a chain
 
 
 class Asset(NamedTuple):
-    """An element, and the file that it is from, where names without a file are looked up."""
+    """An element of an XML file."""
 
     element: Element
-    home: Path
+    home: Path  # the file, in which names without a file are looked up
 
 
 class Assets:
-    """Files that a survey names: in the given folders, or in those that its own lies in."""
+    """Files that a survey names, in `folders` or in the folders above the survey."""
 
     def __init__(self, survey: Path, folders: Sequence[Path]) -> None:
         above = survey.resolve().parents
-        places = [*folders, Path(), *above, *(folder / _PACKAGE for folder in above)]
-        self.places = tuple(dict.fromkeys(places))
+        candidates = [*folders, Path(), *above, *(folder / _PACKAGE for folder in above)]
+        self.folders = tuple(dict.fromkeys(candidates))
         self.root = cache(_root)
 
     def file(self, name: str) -> Path:
-        """Find a file; LidarError if it is nowhere."""
-        for place in self.places:
-            if (place / name).is_file():
-                return place / name
+        """Return the path of a file by its name; LidarError if no folder has the file."""
+        for folder in self.folders:
+            if (folder / name).is_file():
+                return folder / name
         raise LidarError(
             f"there is no file {name!r} in the survey's folder or one above it: give the folder "
             "that it starts from, --assets DIR."
         )
 
     def asset(self, reference: str, kind: str, home: Path) -> Asset:
-        """Find the element of a kind that FILE.xml#ID names, or ID in the file `home`."""
+        """Return the element of a kind that FILE.xml#ID names, or ID in the file `home`."""
         file, _, name = reference.rpartition("#")
         path = self.file(file) if file else home
-        known = {element.get("id", ""): element for element in self.root(path).findall(kind)}
-        if name not in known:
-            raise LidarError(f"there is no <{kind}> {name!r} in {path}.{did_you_mean(name, known)}")
-        return Asset(known[name], path)
+        elements = {element.get("id", ""): element for element in self.root(path).findall(kind)}
+        if name not in elements:
+            raise LidarError(
+                f"there is no <{kind}> {name!r} in {path}.{did_you_mean(name, elements)}"
+            )
+        return Asset(elements[name], path)
 
     def settings(self, element: Element | None, home: Path, depth: int = 0) -> dict[str, str]:
-        """Attributes of settings, and beneath them those of the template that they name."""
+        """Return the attributes of settings, with the attributes of their template as defaults."""
         if element is None:
             return {}
-        own = dict(element.attrib)
-        if (template := own.pop("template", None)) is None:
-            return own
-        if depth == _TEMPLATES_MOST:
+        attributes = dict(element.attrib)
+        if (template := attributes.pop("template", None)) is None:
+            return attributes
+        if depth == _MAX_TEMPLATES:
             raise LidarError(f"the template {template!r} names itself, or too many others.")
-        under = self.asset(template, element.tag, home)
-        return self.settings(*under, depth + 1) | own
+        defaults = self.asset(template, element.tag, home)
+        return self.settings(*defaults, depth + 1) | attributes
 
 
 def _root(path: Path) -> Element:
-    """Return the <document> of a file; LidarError if it is none."""
+    """Return the <document> of a file; LidarError if the file is not a document of HELIOS++."""
     try:
         with explained(f"{path} cannot be read"):
             root = xml_root(read(path))
@@ -87,13 +89,13 @@ def _root(path: Path) -> Element:
 
 
 def read(path: Path) -> bytes:
-    """Read a file; LidarError if it is no plain file or larger than the memory."""
+    """Return the content of a plain file; LidarError for a larger file than the memory holds."""
     with explained(f"{path} cannot be read"), prefixed(path):
         return read_input(path)
 
 
 def number(values: Element | dict[str, str], name: str, default: float) -> float:
-    """Return an attribute as a finite number."""
+    """Return an attribute as a finite number; LidarError for text that is not a finite number."""
     text = values.get(name)
     if text is None:
         return default
@@ -109,28 +111,29 @@ def flag(values: dict[str, str], name: str, default: bool) -> bool:
 
 
 def vector(values: Element | dict[str, str] | None) -> Floats:
-    """Return x, y and z of an element or its attributes; zeros where there is none."""
+    """Return x, y and z of an element or its attributes: (3,); zeros for missing attributes."""
     return np.array([number({} if values is None else values, axis, 0.0) for axis in "xyz"])
 
 
 def rotation(element: Element | None) -> Floats:
-    """Return the rotation (3, 3) of the <rot> in an element, one after the other.
+    """Return the product (3, 3) of the rotations <rot> in an element, in their order.
 
-    About the axes around the element; with rotations="local" about its own.
+    Rotations are about the axes around the element; with rotations="local" about the axes that the
+    rotations before have rotated.
     """
-    out = np.eye(3)
+    total = np.eye(3)
     for step in () if element is None else element.findall("rot"):
         axis = step.get("axis", "").lower()
         if axis not in ("x", "y", "z"):
             raise LidarError(f"<rot> has the axis {axis!r}; it must be x, y or z.")
-        turn = rotation_about(np.eye(3)["xyz".index(axis)], number(step, "angle_deg", 0.0))
+        step_rotation = rotation_about(np.eye(3)["xyz".index(axis)], number(step, "angle_deg", 0.0))
         local = element is not None and element.get("rotations") == "local"
-        out = out @ turn if local else turn @ out
-    return out
+        total = total @ step_rotation if local else step_rotation @ total
+    return total
 
 
 def clean(values: Floats | float | Sequence[float]) -> list[float] | float:
-    """Numbers as a scenario has them: 12 digits, nothing that is 0 but for rounding."""
+    """Return numbers for a scenario, rounded to 12 digits; roundings of zero are zero."""
     array = np.asarray(values, np.float64)
     if array.ndim:
         return [clean(value) for value in array.tolist()]  # type: ignore[misc]

@@ -1,7 +1,7 @@
 """Scanners of HELIOS++ as sensors: data files, and rotations on their platforms.
 
-HELIOS++ looks along y with z up and x to the right. Every pulse is one step: mirrors and heads move
-by their step between two pulses, which is reproduced here, including rounded lines.
+HELIOS++ looks along y with z up and x to the right. Every pulse is a step: mirrors and heads move
+by their step between two pulses, which is reproduced, including the rounding of lines.
 """
 
 from __future__ import annotations
@@ -10,64 +10,65 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from fractions import Fraction
 from math import ceil, floor
-from typing import Any
+from typing import Any, NamedTuple
 from xml.etree.ElementTree import Element
 
 import numpy as np
 
 from lidarsim.base.arrays import Floats
 from lidarsim.base.errors import LidarError
-from lidarsim.scene.transform import rotation_about as about
+from lidarsim.scene.transform import rotation_about
 
 from .files import clean, number, rotation, vector
 
 _Z = np.array([0.0, 0.0, 1.0])
-# From the axes of our sensors to those of HELIOS++: of a line to both sides, of a cone about the
-# way ahead, of prisms before the eye.
-_LINE = about(np.array([1.0, 0.0, 0.0]), 90)
+# Rotations from the sensor frame to the frame of HELIOS++: of a line to both sides, of a cone about
+# the direction ahead, of prisms that look ahead, of a head.
+_LINE = rotation_about(np.array([1.0, 0.0, 0.0]), 90)
 _CONE = np.array([[0.0, 1, 0], [0, 0, 1], [1, 0, 0]])
 _PRISM = np.array([[0.0, 0, 1], [1, 0, 0], [0, 1, 0]])
-_HEAD = about(_Z, 90)
-_HEAD_STEP_DEG = 10.0  # of a head that turns, in one scan; of others it is a cycle at most
+_HEAD = rotation_about(_Z, 90)
+_HEAD_STEP_DEG = 10.0  # rotation of a head in a scan; without a head, a scan is at most a cycle
 _FRAME_HZ = 10.0  # prisms have no cycle
-_SLACK = 1e-9  # of divisions that should come out even
+_SLACK = 1e-9  # of divisions whose exact quotients are whole numbers
 
-# A data file but for its name and light, and the rotation from our axes to those of HELIOS++.
+# A data file without name and light, and the rotation from the sensor frame to HELIOS++'s frame.
 ScannerSection = tuple[dict[str, Any], Floats]
 
 
 @dataclass(frozen=True)
 class Device:
-    """A scanner, or one of its channels, with the settings of a leg.
+    """A scanner, or a channel of a scanner, with the settings of a leg.
 
     Parameters
     ----------
     data
-        Its data file.
-    turn, place
-        Rotation (3, 3) from the sensor's axes to those of the platform's mount, and where the
-        light leaves, metres beside the mount.
+        Content of the sensor's data file.
+    rotation
+        Rotation (3, 3) from the sensor frame to the frame of the platform's mount.
+    position
+        Start of the light (3,), metres beside the mount.
     head_s
-        How long its head takes from start to stop, seconds; None where it does not turn.
+        Duration of the head's rotation from start to stop, seconds; None without a head.
     range_m
-        The nearest and the farthest that it sees.
+        Minimum and maximum range.
     """
 
     data: dict[str, Any]
-    turn: Floats
-    place: Floats
+    rotation: Floats
+    position: Floats
     head_s: float | None
     range_m: tuple[float, float]
 
     def steps(self, seconds: float) -> tuple[float, int]:
-        """Degrees and number of the time steps that so many seconds are whole multiples of."""
+        """Return the rotation of a time step, degrees, and the number of steps in `seconds`."""
         turned = 360 * self.data["rate_hz"] * seconds
         count = max(ceil(turned / (360 if self.head_s is None else _HEAD_STEP_DEG) - _SLACK), 1)
         return turned / count, count
 
 
 class HeliosScanner:
-    """Attributes of a scanner, in its channels those of the channel before its own."""
+    """Attributes of a scanner; for a channel, its attributes take precedence over the scanner's."""
 
     def __init__(self, element: Element, channel: Element | None = None) -> None:
         self._elements = [element] if channel is None else [channel, element]
@@ -75,35 +76,35 @@ class HeliosScanner:
         self.values = {**element.attrib, **({} if channel is None else channel.attrib)}
 
     def child(self, tag: str) -> Element | None:
-        """Element within it."""
-        found = (element.find(tag) for element in self._elements)
-        return next((child for child in found if child is not None), None)
+        """Return the first element with a tag in the channel or the scanner, or None."""
+        candidates = (element.find(tag) for element in self._elements)
+        return next((child for child in candidates if child is not None), None)
 
     def number(self, name: str, default: float = 0.0) -> float:
-        """Attribute of it."""
+        """Return an attribute as a number."""
         return number(self.values, name, default)
 
 
 def channels(element: Element) -> dict[str, HeliosScanner]:
-    """List the channels of a scanner by id; "" is the only one of a scanner without any."""
-    found = element.findall("channels/channel")
-    if not found:
+    """Return the channels of a scanner {id: channel}; {"": scanner} without channels."""
+    elements = element.findall("channels/channel")
+    if not elements:
         return {"": HeliosScanner(element)}
     return {
         channel.get("id", str(index)): HeliosScanner(element, channel)
-        for index, channel in enumerate(found)
+        for index, channel in enumerate(elements)
     }
 
 
-def unread(scanner: HeliosScanner) -> Iterator[str]:
-    """List the features of a scanner that a scenario does not support."""
+def unsupported_features(scanner: HeliosScanner) -> Iterator[str]:
+    """Yield the features of a scanner that a scenario does not support, in words."""
     for tag in ("rangeError", "deflectionError", "headError"):
         if scanner.child(tag) is not None:
             yield f"<{tag}> of {scanner.name}: errors by a formula"
     if "receivedEnergyMin_W" in scanner.values:
         yield f"receivedEnergyMin_W of {scanner.name}: weak returns are kept"
-    if (most := int(scanner.number("maxNOR"))) > 1:
-        yield f"maxNOR={most} of {scanner.name}: all returns of a pulse are kept"
+    if (max_returns := int(scanner.number("maxNOR"))) > 1:
+        yield f"maxNOR={max_returns} of {scanner.name}: all returns of a pulse are kept"
     if scanner.values.get("optics") == "oscillating":
         yield f"the slow turns of the mirror of {scanner.name}: it goes to and fro evenly"
 
@@ -114,144 +115,197 @@ def device(scanner: HeliosScanner, settings: dict[str, str]) -> Device:
     Raises
     ------
     LidarError
-        If its optics are of a kind that there is no sensor for, or its settings make no line.
+        If no sensor has the kind of optics, or the settings make no line.
     """
     supported = scanner.values.get("pulseFreqs_Hz", "").split(",")[0] or "0"
-    pulses = number({"pulseFreq_hz": supported} | settings, "pulseFreq_hz", 0)
-    if pulses <= 0:
+    pulse_hz = number({"pulseFreq_hz": supported} | settings, "pulseFreq_hz", 0)
+    if pulse_hz <= 0:
         raise LidarError(f"{scanner.name} has no pulseFreq_hz above 0.")
     optics = scanner.values.get("optics", "")
     if optics not in ("rotating", *_OPTICS):
         raise LidarError(
             f"{scanner.name} has the optics {optics!r}; there are rotating, {', '.join(_OPTICS)}."
         )
-    axis = vector(scanner.child("headRotateAxis"))
-    axis = axis if np.linalg.norm(axis) > 0.1 else _Z
     emitter = scanner.child("beamOrigin")
-    start = number(settings, "headRotateStart_deg", 0)
-    range_deg = number(settings, "headRotateStop_deg", 0) - start
-    line = _Line.of(scanner, settings, pulses) if optics == "rotating" else None
-    most = scanner.number("headRotatePerSecMax_deg")
-    wished = number(settings, "headRotatePerSec_deg", 0)
-    if line is not None:  # by the distance of its lines, where that is given
-        wished = number(settings, "horizontalResolution_deg", 0) * line.scan_hz or wished
-    head = float(np.clip(wished, -most, most))
-    if head:
-        tilt = _tilt(rotation(emitter))
-        if line is None or tilt is None or abs(axis[2]) < (1 - 1e-12) * np.linalg.norm(axis):
-            raise LidarError(
-                f"the head of {scanner.name} turns; only one with rotating optics may, whose lines "
-                "hold the axis z that it turns about."
-            )
-        if range_deg * head <= 0:
-            raise LidarError(
-                f"the head of {scanner.name} turns at {head:g} degrees a second from {start:g}, "
-                f"never to {start + range_deg:g}."
-            )
-        head = head if axis[2] > 0 else -head
-        data = line.turning(head, tilt)
-        turn = _HEAD
+    line = _Line.from_settings(scanner, settings, pulse_hz) if optics == "rotating" else None
+    head = _Head.from_settings(scanner, settings, line)
+    if head.deg_per_s:
+        data, sensor_rotation = _turning_head(scanner, head, line)
+    elif line is not None:
+        data, line_rotation = line.standing()
+        sensor_rotation = rotation(emitter) @ line_rotation
     else:
-        data, turn = line.standing() if line else _OPTICS[optics](scanner, settings, pulses)
-        turn = rotation(emitter) @ turn
+        data, optics_rotation = _OPTICS[optics](scanner, settings, pulse_hz)
+        sensor_rotation = rotation(emitter) @ optics_rotation
+    return Device(
+        data={
+            "name": scanner.name,
+            "sources": {"all": "a HELIOS++ survey and what it names"},
+            **data,
+            "optics": {name: clean(value) for name, value in _light(scanner, settings).items()},
+        },
+        rotation=rotation_about(head.axis, head.start_deg) @ sensor_rotation,
+        position=vector(emitter),
+        head_s=abs(head.range_deg / head.deg_per_s) if head.deg_per_s else None,
+        range_m=(scanner.number("rangeMin_m"), number(scanner.values, "rangeMax_m", np.inf)),
+    )
+
+
+def _light(scanner: HeliosScanner, settings: dict[str, str]) -> dict[str, float]:
+    """Return the fields of `optics` of a scanner with the settings of a leg."""
     divergence = number(settings, "beamDivergence_rad", scanner.number("beamDivergence_rad", 3e-4))
-    light = {
+    return {
         "wavelength_nm": scanner.number("wavelength_nm", 1064),
         "divergence_mrad": 1e3 * divergence,
         "pulse_ns": scanner.number("pulseLength_ns", 4),
         "resolution_m": 0.001,
     }
-    return Device(
-        {
-            "name": scanner.name,
-            "sources": {"all": "a HELIOS++ survey and what it names"},
-            **data,
-            "optics": {name: clean(value) for name, value in light.items()},
-        },
-        about(axis, start) @ turn,
-        vector(emitter),
-        abs(range_deg / head) if head else None,
-        (scanner.number("rangeMin_m"), number(scanner.values, "rangeMax_m", np.inf)),
-    )
+
+
+class _Head(NamedTuple):
+    """Rotation of a scanner's head."""
+
+    axis: Floats  # (3,)
+    start_deg: float
+    range_deg: float  # from start to stop
+    deg_per_s: float  # 0 if the head stands
+
+    @classmethod
+    def from_settings(
+        cls, scanner: HeliosScanner, settings: dict[str, str], line: _Line | None
+    ) -> _Head:
+        """Return the head of a scanner with the settings of a leg; `line` of rotating optics."""
+        axis = vector(scanner.child("headRotateAxis"))
+        axis = axis if np.linalg.norm(axis) > 0.1 else _Z
+        start_deg = number(settings, "headRotateStart_deg", 0)
+        range_deg = number(settings, "headRotateStop_deg", 0) - start_deg
+        max_deg_per_s = scanner.number("headRotatePerSecMax_deg")
+        deg_per_s = number(settings, "headRotatePerSec_deg", 0)
+        if line is not None:  # a distance between lines takes precedence
+            by_lines = number(settings, "horizontalResolution_deg", 0) * line.scan_hz
+            deg_per_s = by_lines or deg_per_s
+        limited = float(np.clip(deg_per_s, -max_deg_per_s, max_deg_per_s))
+        return cls(axis, start_deg, range_deg, limited)
+
+
+def _turning_head(scanner: HeliosScanner, head: _Head, line: _Line | None) -> ScannerSection:
+    """Return a sensor whose head turns; LidarError if the head cannot turn as the settings say."""
+    tilt = _tilt(rotation(scanner.child("beamOrigin")))
+    vertical = abs(head.axis[2]) >= (1 - 1e-12) * np.linalg.norm(head.axis)
+    if line is None or tilt is None or not vertical:
+        raise LidarError(
+            f"the head of {scanner.name} turns; only one with rotating optics may, whose lines "
+            "hold the axis z that it turns about."
+        )
+    if head.range_deg * head.deg_per_s <= 0:
+        raise LidarError(
+            f"the head of {scanner.name} turns at {head.deg_per_s:g} degrees a second from "
+            f"{head.start_deg:g}, never to {head.start_deg + head.range_deg:g}."
+        )
+    return line.turning(head.deg_per_s if head.axis[2] > 0 else -head.deg_per_s, tilt), _HEAD
 
 
 def _tilt(emitter: Floats) -> float | None:
-    """Degrees that a rotation about x turns by; None for others."""
+    """Return the angle of a rotation (3, 3) about x, degrees; None for another axis."""
     if not np.allclose(emitter[0], [1, 0, 0], atol=1e-12):
         return None
     return float(np.degrees(np.arctan2(emitter[2, 1], emitter[1, 1])))
 
 
-def _us(pulses: int, pulse_hz: float) -> int | str:
-    """Exact duration of so many pulses, microseconds."""
+def _exact_us(pulses: int, pulse_hz: float) -> int | str:
+    """Return the exact duration of `pulses`, microseconds; a fraction as text."""
     exact = Fraction(pulses * 1_000_000) / Fraction(pulse_hz)
     return exact.numerator if exact.denominator == 1 else str(exact)
 
 
 @dataclass(frozen=True)
 class _Line:
-    """Pulses of a polygon's line: those within its angles, of all that there is time for."""
+    """Pulses of a polygon's line.
+
+    A line has time for `pulses_per_line` pulses, of which `count` are within its angles.
+    """
 
     first_deg: float
     step_deg: float
     count: int
-    of_all: int
+    pulses_per_line: int
     pulse_hz: float
-    scan_hz: float
+    scan_hz: float  # 0 if the mirror stands
 
     @classmethod
-    def of(cls, scanner: HeliosScanner, settings: dict[str, str], pulse_hz: float) -> _Line:
-        most = scanner.number("scanAngleMax_deg")
-        wide = scanner.number("scanAngleEffectiveMax_deg")
-        fine = number(settings, "verticalResolution_deg", 0)
-        least = scanner.number("scanFreqMin_Hz")
-        if not (fine or least or number(settings, "scanFreq_hz", 0)):
+    def from_settings(
+        cls, scanner: HeliosScanner, settings: dict[str, str], pulse_hz: float
+    ) -> _Line:
+        """Return the line of a scanner with the settings of a leg; LidarError without pulses."""
+        max_deg = scanner.number("scanAngleMax_deg")
+        effective_deg = scanner.number("scanAngleEffectiveMax_deg")
+        resolution_deg = number(settings, "verticalResolution_deg", 0)
+        min_hz = scanner.number("scanFreqMin_Hz")
+        if not (resolution_deg or min_hz or number(settings, "scanFreq_hz", 0)):
             return cls(0.0, 0.0, 1, 1, pulse_hz, 0.0)  # the mirror stands
-        scan_hz = _scan_hz(scanner, settings, pulse_hz * fine / (2 * most) if fine else None)
-        half = min(wide, _half(scanner, settings))
-        low = number(settings, "verticalAngleMin_deg", -half)
-        high = number(settings, "verticalAngleMax_deg", half)
-        if high - low > 2 * wide + _SLACK:  # HELIOS++ 1 leaves such pulses out, 2 refuses them
-            low = max(low, -wide)
-            high = min(high, wide)
-        step = 2 * most * scan_hz / pulse_hz
-        of_all = ceil(pulse_hz / scan_hz - _SLACK)
-        # Angles above `low`, up to `high`; a line begins anew before it is all round.
-        first = floor((low + most) / step + _SLACK) + 1
-        last = min(floor((high + most) / step + _SLACK), of_all - 1)
+        scan_hz = _scan_hz(
+            scanner, settings, pulse_hz * resolution_deg / (2 * max_deg) if resolution_deg else None
+        )
+        half_deg = min(effective_deg, _half_angle_deg(scanner, settings))
+        lowest_deg = number(settings, "verticalAngleMin_deg", -half_deg)
+        highest_deg = number(settings, "verticalAngleMax_deg", half_deg)
+        if (
+            highest_deg - lowest_deg > 2 * effective_deg + _SLACK
+        ):  # HELIOS++ 1 leaves such pulses out, 2 refuses them
+            lowest_deg = max(lowest_deg, -effective_deg)
+            highest_deg = min(highest_deg, effective_deg)
+        step_deg = 2 * max_deg * scan_hz / pulse_hz
+        pulses_per_line = ceil(pulse_hz / scan_hz - _SLACK)
+        # Angles above the lowest, up to the highest; the next line starts before a full revolution.
+        first = floor((lowest_deg + max_deg) / step_deg + _SLACK) + 1
+        last = min(floor((highest_deg + max_deg) / step_deg + _SLACK), pulses_per_line - 1)
         if last < first:
             raise LidarError(
-                f"lines of {scanner.name} from {low:g} to {high:g} degrees hold no pulse."
+                f"lines of {scanner.name} from {lowest_deg:g} to {highest_deg:g} degrees hold no "
+                "pulse."
             )
-        return cls(first * step - most, step, last - first + 1, of_all, pulse_hz, scan_hz)
+        return cls(
+            first * step_deg - max_deg,
+            step_deg,
+            last - first + 1,
+            pulses_per_line,
+            pulse_hz,
+            scan_hz,
+        )
 
     def standing(self) -> ScannerSection:
-        """Return a mirror whose firings are pulses."""
+        """Return a sensor with a mirror, whose firings are pulses.
+
+        Raises
+        ------
+        LidarError
+            If the mirror stands.
+        """
         if not self.scan_hz:
             raise LidarError("scanFreq_hz is 0, and no head turns.")
         width = self.count * self.step_deg
         mirror = {
             "motion": "sawtooth",
             "width_deg": clean(min(width, 360)),
-            "duty": clean(self.count / self.of_all),
+            "duty": clean(self.count / self.pulses_per_line),
         }
         middle = self.first_deg + width / 2
-        return _mirror(self.count, self.pulse_hz / self.of_all, mirror, middle), _LINE
+        return _mirror(self.count, self.pulse_hz / self.pulses_per_line, mirror, middle), _LINE
 
-    def turning(self, head: float, tilt: float) -> dict[str, Any]:
-        """Return a head whose firings are lines."""
+    def turning(self, deg_per_s: float, tilt: float) -> dict[str, Any]:
+        """Return a sensor with a head, whose firings are lines; `tilt` of the lines in degrees."""
         between_us = 1e6 / self.pulse_hz
         last = clean((self.count - 1) * between_us)
         times = {"time_us": {"first": 0, "last": last, "count": self.count}}
         data = {
-            "firing_us": _us(self.of_all, self.pulse_hz),
-            "rate_hz": abs(head) / 360,
+            "firing_us": _exact_us(self.pulses_per_line, self.pulse_hz),
+            "rate_hz": abs(deg_per_s) / 360,
             "beams": self._elevations(tilt) | times,
         }
-        return data if head > 0 else {"clockwise": True, **data}
+        return data if deg_per_s > 0 else {"clockwise": True, **data}
 
     def _elevations(self, tilt: float) -> dict[str, Any]:
-        """Return the angles of the pulses; those beyond the zenith go down on the other side."""
+        """Return the angles of the pulses; pulses beyond the zenith have the opposite azimuth."""
         angles = self.first_deg + tilt + self.step_deg * np.arange(self.count)
         if np.abs(angles).max() <= 90 + _SLACK:
             first, last = (clean(end) for end in angles[[0, -1]].clip(-90, 90))
@@ -268,6 +322,7 @@ class _Line:
 def _mirror(
     firings: int, rate_hz: float, mirror: dict[str, Any], middle: float = 0.0
 ) -> dict[str, Any]:
+    """Return a sensor with a mirror, whose lines have their middle at `middle` degrees."""
     data: dict[str, Any] = {"axis": "x", "firings_per_turn": firings, "rate_hz": rate_hz}
     return data | ({"zero_deg": clean(middle)} if clean(middle) else {}) | {"mirror": mirror}
 
@@ -275,35 +330,35 @@ def _mirror(
 def _oscillating(
     scanner: HeliosScanner, settings: dict[str, str], pulse_hz: float
 ) -> ScannerSection:
-    """Make a mirror that swings; the scan product limits its angle."""
+    """Return a sensor with a mirror that swings; the scan product limits its angle."""
     scan_hz = _scan_hz(scanner, settings)
-    most = scanner.number("scanProduct", 1e6) / scan_hz
-    half = min(number(settings, "scanAngle_deg", 0), most)
+    max_deg = scanner.number("scanProduct", 1e6) / scan_hz
+    half_deg = min(number(settings, "scanAngle_deg", 0), max_deg)
     firings = floor(pulse_hz / scan_hz + _SLACK)
-    if half <= 0 or not firings:
+    if half_deg <= 0 or not firings:
         raise LidarError(f"{scanner.name} has no scanAngle_deg above 0, or no pulse in a line.")
-    mirror = {"motion": "triangle", "width_deg": clean(2 * half)}
+    mirror = {"motion": "triangle", "width_deg": clean(2 * half_deg)}
     return _mirror(firings, pulse_hz / firings, mirror), _LINE
 
 
 def _fibers(scanner: HeliosScanner, settings: dict[str, str], pulse_hz: float) -> ScannerSection:
-    """Make fibres side by side, one pulse each."""
+    """Return a sensor with fibres side by side, each with a pulse in a line."""
     fibers = max(int(scanner.number("numFibers", 1)), 1)
-    mirror = {"motion": "sawtooth", "width_deg": clean(2 * _half(scanner, settings))}
+    mirror = {"motion": "sawtooth", "width_deg": clean(2 * _half_angle_deg(scanner, settings))}
     return _mirror(fibers, pulse_hz / fibers, mirror), _LINE
 
 
 def _cone(scanner: HeliosScanner, settings: dict[str, str], pulse_hz: float) -> ScannerSection:
-    """Make a wedge that turns (Palmer); always at its greatest rate, as in HELIOS++."""
+    """Return a sensor with a rotating wedge (Palmer), at its greatest rate, as in HELIOS++."""
     rate_hz = scanner.number("scanFreqMax_Hz")
     if rate_hz <= 0:
         raise LidarError(f"{scanner.name} has no scanFreqMax_Hz above 0.")
-    beams = {"elevation_deg": [clean(90 - _half(scanner, settings))]}
-    return {"firing_us": _us(1, pulse_hz), "rate_hz": rate_hz, "beams": beams}, _CONE
+    beams = {"elevation_deg": [clean(90 - _half_angle_deg(scanner, settings))]}
+    return {"firing_us": _exact_us(1, pulse_hz), "rate_hz": rate_hz, "beams": beams}, _CONE
 
 
 def _prisms(scanner: HeliosScanner, settings: dict[str, str], pulse_hz: float) -> ScannerSection:
-    """Make Risley prisms."""
+    """Return a sensor with Risley prisms."""
     air = scanner.number("refrIndex_air", 1)
     prisms = [
         {
@@ -317,16 +372,20 @@ def _prisms(scanner: HeliosScanner, settings: dict[str, str], pulse_hz: float) -
     ]
     if not prisms:
         raise LidarError(f"{scanner.name} has no prisms.")
-    made: dict[str, Any] = {"firing_us": _us(1, pulse_hz), "rate_hz": _FRAME_HZ, "prisms": prisms}
+    section: dict[str, Any] = {
+        "firing_us": _exact_us(1, pulse_hz),
+        "rate_hz": _FRAME_HZ,
+        "prisms": prisms,
+    }
     if (incident := scanner.child("incidentBeam")) is not None:
         x, y, z = _PRISM.T @ vector(incident)
         elevation = np.arctan2(z, np.hypot(x, y))
         azimuth = np.arctan2(y, x)
-        made["beams"] = {
+        section["beams"] = {
             "elevation_deg": [clean(np.degrees(elevation))],
             "azimuth_deg": [clean(np.degrees(azimuth))],
         }
-    return made, _PRISM
+    return section, _PRISM
 
 
 _OPTICS: dict[str, Callable[[HeliosScanner, dict[str, str], float], ScannerSection]] = {
@@ -337,25 +396,25 @@ _OPTICS: dict[str, Callable[[HeliosScanner, dict[str, str], float], ScannerSecti
 }
 
 
-def _half(scanner: HeliosScanner, settings: dict[str, str]) -> float:
-    """Scan angle to either side: at most the scanner's, which is also that of 0."""
-    most = scanner.number("scanAngleMax_deg")
-    half = min(max(number(settings, "scanAngle_deg", 0), 0), most) or most
-    if half <= 0:
+def _half_angle_deg(scanner: HeliosScanner, settings: dict[str, str]) -> float:
+    """Return the scan angle to either side, degrees: at most, and by default, the scanner's."""
+    max_deg = scanner.number("scanAngleMax_deg")
+    half_deg = min(max(number(settings, "scanAngle_deg", 0), 0), max_deg) or max_deg
+    if half_deg <= 0:
         raise LidarError(f"{scanner.name} has no scanAngleMax_deg above 0.")
-    return half
+    return half_deg
 
 
 def _scan_hz(
-    scanner: HeliosScanner, settings: dict[str, str], wished: float | None = None
+    scanner: HeliosScanner, settings: dict[str, str], requested_hz: float | None = None
 ) -> float:
-    """Lines a second, within the scanner's limits."""
-    rate_hz = number(settings, "scanFreq_hz", 0) if wished is None else wished
-    least = scanner.number("scanFreqMin_Hz")
-    most = scanner.number("scanFreqMax_Hz") or np.inf
-    if not least <= rate_hz <= most or rate_hz <= 0:
+    """Return the lines a second; LidarError if they are not within the scanner's limits."""
+    rate_hz = number(settings, "scanFreq_hz", 0) if requested_hz is None else requested_hz
+    min_hz = scanner.number("scanFreqMin_Hz")
+    max_hz = scanner.number("scanFreqMax_Hz") or np.inf
+    if not min_hz <= rate_hz <= max_hz or rate_hz <= 0:
         raise LidarError(
-            f"{scanner.name} cannot scan at scanFreq_hz {rate_hz:g}: {least:g} to {most:g}, above "
-            "0."
+            f"{scanner.name} cannot scan at scanFreq_hz {rate_hz:g}: {min_hz:g} to {max_hz:g}, "
+            "above 0."
         )
     return rate_hz

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, field
 from functools import cached_property, partial
 from glob import escape
 from itertools import cycle
@@ -30,8 +30,8 @@ from lidarsim.sensor import Pose
 from ..procedural.floor import heights_at
 from .files import Assets, clean, number, read, rotation
 
-# Makes a mesh of surfels of a file of points: path, points (n, 3) in metres, and the edge in metres
-# of the cubic cells, each of which has one surfel.
+# Makes a mesh of surfels, a surfel for each cubic cell with points: of the path of the file, points
+# (n, 3) in metres, and the edge of the cells in metres.
 SurfelMaker = Callable[[Path, Floats, float], SceneMesh]
 
 _LOADERS = ("objloader", "detailedvoxels", "geotiffloader", "xyzloader")
@@ -39,40 +39,43 @@ _LOADERS = ("objloader", "detailedvoxels", "geotiffloader", "xyzloader")
 
 @dataclass
 class HeliosPart:
-    """One mesh file of a scene and its placement: rotated, scaled, moved."""
+    """A mesh file of a scene and its placement: rotated, scaled, moved."""
 
     file: Path
     up_axis: str | None
-    turn: Floats
+    rotation: Floats  # (3, 3)
     scale: float
-    offset: Floats
-    falls: bool  # until it stands on the ground
-    library: Path | None = None  # of the material of what is no .obj, and its name there
-    material: str = ""
+    offset: Floats  # (3,): metres
+    falls: bool  # whether it is moved down or up to stand on the ground
+    library: Path | None = None  # for files other than .obj, with the material
+    material: str = ""  # name in the library
     surfels: SceneMesh | None = None  # of a file of points
 
     @cached_property
     def materials(self) -> dict[str, dict[str, str]]:
-        """Values that HELIOS++ reads of the materials of its faces, {name: values}."""
+        """Values that HELIOS++ reads of the materials of the faces, {name: values}."""
         text = _text(self.file) if self.file.suffix.lower() == ".obj" else ""
         used = {self.material, *re.findall(r"^\s*usemtl\s+(.+?)\s*$", text, re.MULTILINE)}
-        values_of: dict[str, dict[str, str]] = {}  # {name of a material: values}
-        named = re.findall(r"^\s*mtllib\s+(.+?)\s*$", text, re.MULTILINE)
-        libraries = [self.file.parent / name for name in named]
+        values_by_material: dict[str, dict[str, str]] = {}  # {name of a material: values}
+        names = re.findall(r"^\s*mtllib\s+(.+?)\s*$", text, re.MULTILINE)
+        libraries = [self.file.parent / name for name in names]
         libraries += [self.library] if self.library else []
         for library in libraries:
             values: dict[str, str] = {}
             for line in _text(library).splitlines():
                 words = line.split()
                 if words[:1] == ["newmtl"] and len(words) > 1:
-                    name = line.split(maxsplit=1)[1].strip()  # which may have spaces
-                    values = values_of.setdefault(name, {})
+                    name = line.split(maxsplit=1)[1].strip()  # names may have spaces
+                    values = values_by_material.setdefault(name, {})
                 elif len(words) > 1 and words[0].startswith("helios_"):
                     values[words[0].removeprefix("helios_")] = words[1]
-        return {name: values for name, values in values_of.items() if name in used}
+        return {name: values for name, values in values_by_material.items() if name in used}
 
     def kinds(self, spectra: Callable[[str], float | None]) -> dict[str, dict[str, Any]]:
-        """Reflectance and class of each material of its faces, {name: entries of a scenario}."""
+        """Return reflectance and class of each material, {name: fields of `materials`}.
+
+        `spectra` returns the reflectance by the name of a spectrum.
+        """
         kinds: dict[str, dict[str, Any]] = {}
         for name, values in self.materials.items():
             share = None
@@ -98,8 +101,8 @@ class HeliosPart:
         return any(ground in ("true", "1") for ground in grounds)
 
     def meshes(self) -> tuple[SceneMesh | SceneInstance, ...]:
-        """Read the meshes of the part, in world coordinates."""
-        placed = Transform(self.turn * self.scale, self.offset)
+        """Return the meshes of the part, in world coordinates."""
+        placed = Transform(self.rotation * self.scale, self.offset)
         if (points := self.surfels) is not None:
             return (points.moved(points.name, placed.linear, placed.offset),)
         return load_meshes(
@@ -111,8 +114,8 @@ class HeliosPart:
         )
 
     def entry(self, name: str) -> dict[str, Any]:
-        """Return the entry of `scene.files` for the part, whose file has a name."""
-        angles = Pose.of((0, 0, 0), self.turn)
+        """Return the entry of `scene.files` for the part, whose file is written as `name`."""
+        angles = Pose.from_rotation((0, 0, 0), self.rotation)
         degrees = (angles.roll_deg, angles.pitch_deg, angles.yaw_deg)
         placement = {
             "up_axis": (self.up_axis, None),
@@ -120,16 +123,18 @@ class HeliosPart:
             "rotation_deg": (clean(degrees), [0.0, 0.0, 0.0]),
             "translation": (clean(self.offset), [0.0, 0.0, 0.0]),
         }
-        changed = {key: value for key, (value, usual) in placement.items() if value != usual}
+        changed = {key: value for key, (value, default) in placement.items() if value != default}
         return {"file": name, **changed}
 
 
 class HeliosScene:
-    """The parts of a scene, and the ground among them; meshes of points go into a folder `out`."""
+    """The parts of a scene, and the ground among the parts; `folder` is for meshes of points."""
 
-    def __init__(self, element: Element, assets: Assets, out: Path, surfels: SurfelMaker) -> None:
+    def __init__(
+        self, element: Element, assets: Assets, folder: Path, surfels: SurfelMaker
+    ) -> None:
         self._assets = assets
-        self._out = out
+        self._folder = folder
         self._surfels = surfels
         self.unread: list[str] = []
         self._missing: set[str] = set()
@@ -138,7 +143,7 @@ class HeliosScene:
         name = f"scene {element.get('id')!r}"
         for index, part in enumerate(element.findall("part")):
             with prefixed(f"{name}, part {index}"):
-                self.parts += self._read(part, f"part {index}", assets)
+                self.parts += self._read(part, f"part {index}")
         if not self.parts:
             raise LidarError(
                 f"{name} has no part that can be read: only those of {' and '.join(_LOADERS)} are."
@@ -147,20 +152,12 @@ class HeliosScene:
             if falling.falls:
                 self._let_fall(falling)
 
-    def _read(self, part: Element, name: str, assets: Assets) -> Iterator[HeliosPart]:
-        """Read a <part>: one part for each file of its loader, placed by its filters."""
+    def _read(self, part: Element, name: str) -> list[HeliosPart]:
+        """Read a <part>: a part for each file of its loader, placed by its filters."""
         for tag, moving in self._moving.items():
             if part.find(tag) is not None:
                 moving.append(name)
-        files: list[Path] = []
-        up_axis: str | None = None
-        rotated = np.eye(3)
-        scale = 1.0
-        offset = np.zeros(3)
-        falls = False
-        library: Path | None = None
-        material = ""
-        points: list[SceneMesh | None] = [None]
+        draft = _PartDraft()
         for step in part.findall("filter"):
             kind = step.get("type", "").lower()
             params = {param.get("key", ""): param for param in step.findall("param")}
@@ -171,49 +168,33 @@ class HeliosScene:
                 self.unread.append(
                     f"{name}, {kind} of {files_text}: intersectionMode {mode}, left out"
                 )
-                return
+                return []
             if kind in _LOADERS:
-                files = _files(text, assets)
-                if kind == "objloader":
-                    up_axis = text.get("up")
-                else:
-                    material = text.get("matname", "")
-                    library = assets.file(text["matfile"]) if "matfile" in text else None
-                if kind == "xyzloader":
-                    points = [self._surfels(file, *_points(file, text)) for file in files]
-                    files = [self._out / f"{file.stem}-{name.split()[-1]}.glb" for file in files]
-                if "ladlut" in text:
-                    self.unread.append(f"{name}, ladlut: leaf angles are spherical")
-            elif kind == "rotate":
-                rotated = rotation(params.get("rotation")) @ rotated
-            elif kind == "scale":
-                (scale,) = _numbers(text.get("scale", ""), 1)
-                scale = scale or 1.0
-            elif kind == "translate":
-                offset = _numbers(text.get("offset", ""), 3)
-                falls = text.get("onGround", "0") != "0"
+                self._load(draft, kind, text, name)
             else:
-                raise LidarError(
-                    f"the filter {kind!r} is not known; there are {', '.join(_LOADERS)}, rotate, "
-                    "scale, translate."
-                )
-        if not files:
-            raise LidarError("no filter loads a file.")
-        for file, mesh in zip(files, cycle(points)):
-            yield HeliosPart(
-                file=file,
-                up_axis=up_axis if up_axis in ("y", "z") else None,
-                turn=rotated,
-                scale=float(scale),
-                offset=offset.copy(),
-                falls=falls,
-                library=library,
-                material=material,
-                surfels=mesh,
-            )
+                draft.transform(kind, text, params.get("rotation"))
+        return draft.parts()
+
+    def _load(self, draft: _PartDraft, kind: str, text: dict[str, str], name: str) -> None:
+        """Set the files of a part by a loader with the parameters {name: text}."""
+        draft.files = _files(text, self._assets)
+        if kind == "objloader":
+            draft.up_axis = text.get("up")
+        else:
+            draft.material = text.get("matname", "")
+            draft.library = self._assets.file(text["matfile"]) if "matfile" in text else None
+        if kind == "xyzloader":
+            draft.surfels = [self._surfels(file, *_points(file, text)) for file in draft.files]
+            number_of_part = name.split()[-1]
+            draft.files = [
+                self._folder / f"{file.stem}-{number_of_part}.glb" for file in draft.files
+            ]
+        if "ladlut" in text:
+            self.unread.append(f"{name}, ladlut: leaf angles are spherical")
 
     @cached_property
     def _ground(self) -> Scene | None:
+        """Simplified scene of the parts that are ground, or None."""
         meshes = [mesh for part in self.parts if part.is_ground for mesh in part.meshes()]
         return SimplifiedScene.from_scene(Scene.from_meshes(meshes)).scene if meshes else None
 
@@ -232,25 +213,25 @@ class HeliosScene:
         part.offset[2] += self.height(x, y) - z
 
     def materials(self, wavelength_nm: float) -> list[dict[str, Any]]:
-        """Return entries of `materials` for objects, or for faces with several materials."""
+        """Return the entries of `materials` for objects, or for faces of several materials."""
         spectra = partial(self._reflectance, wavelength_nm)
         kinds = [part.kinds(spectra) for part in self.parts]
-        if not any(kind for of_part in kinds for kind in of_part.values()):
+        if not any(kind for part_kinds in kinds for kind in part_kinds.values()):
             return []
         meshes = [part.meshes() for part in self.parts]
-        names = iter(unique_names([mesh.name for of in meshes for mesh in of]))
+        names = iter(unique_names([mesh.name for part_meshes in meshes for mesh in part_meshes]))
         entries = [
             entry
-            for of, of_part in zip(meshes, kinds, strict=True)
-            for mesh in of
-            for entry in _entries(next(names), mesh, of_part)
+            for part_meshes, part_kinds in zip(meshes, kinds, strict=True)
+            for mesh in part_meshes
+            for entry in _entries(next(names), mesh, part_kinds)
         ]
         return [*entries, {"objects": "*"}]
 
     def _reflectance(self, wavelength_nm: float, name: str) -> float | None:
         """Return the reflectance at a wavelength by a named spectrum; None without the spectrum."""
-        for place in self._assets.places:
-            for folder in (place / "spectra", place / "data" / "spectra"):
+        for root in self._assets.folders:
+            for folder in (root / "spectra", root / "data" / "spectra"):
                 text = _text(folder / f"{name}.txt")
                 rows = re.findall(r"^([\d.]+)\s+([\d.]+)\s*$", text, re.MULTILINE)
                 if rows:  # micrometres and per cent
@@ -260,7 +241,7 @@ class HeliosScene:
         return None
 
     def left_out(self) -> list[str]:
-        """List the unsupported features, after everything was read."""
+        """Return the unsupported features in words, after all parts have been read."""
         lines = []
         for tag, parts in self._moving.items():
             if len(parts) == 1:
@@ -275,27 +256,77 @@ class HeliosScene:
         return lines
 
 
+@dataclass
+class _PartDraft:
+    """A <part> whose filters are being read, in their order."""
+
+    files: list[Path] = field(default_factory=list)
+    up_axis: str | None = None
+    rotation: Floats = field(default_factory=lambda: np.eye(3))
+    scale: float = 1.0
+    offset: Floats = field(default_factory=lambda: np.zeros(3))
+    falls: bool = False
+    library: Path | None = None
+    material: str = ""
+    surfels: list[SceneMesh | None] = field(default_factory=lambda: [None])
+
+    def transform(self, kind: str, text: dict[str, str], rotations: Element | None) -> None:
+        """Rotate, scale or move the part by a filter with the parameters {name: text}."""
+        if kind == "rotate":
+            self.rotation = rotation(rotations) @ self.rotation
+        elif kind == "scale":
+            (scale,) = _numbers(text.get("scale", ""), 1)
+            self.scale = float(scale or 1.0)
+        elif kind == "translate":
+            self.offset = _numbers(text.get("offset", ""), 3)
+            self.falls = text.get("onGround", "0") != "0"
+        else:
+            raise LidarError(
+                f"the filter {kind!r} is not known; there are {', '.join(_LOADERS)}, rotate, "
+                "scale, translate."
+            )
+
+    def parts(self) -> list[HeliosPart]:
+        """Return a part for each file; LidarError without files."""
+        if not self.files:
+            raise LidarError("no filter loads a file.")
+        return [
+            HeliosPart(
+                file=file,
+                up_axis=self.up_axis if self.up_axis in ("y", "z") else None,
+                rotation=self.rotation,
+                scale=self.scale,
+                offset=self.offset.copy(),
+                falls=self.falls,
+                library=self.library,
+                material=self.material,
+                surfels=mesh,
+            )
+            for file, mesh in zip(self.files, cycle(self.surfels))
+        ]
+
+
 def _entries(
     name: str, mesh: SceneMesh | SceneInstance, kinds: dict[str, dict[str, Any]]
 ) -> list[dict[str, Any]]:
-    """Return entries of `materials` for an object of a part, whose materials have kinds."""
+    """Return the entries of `materials` for an object; `kinds` are {name of a material: fields}."""
     shape = mesh.mesh if isinstance(mesh, SceneInstance) else mesh
     objects = escape(name)
-    if shape.materials is None:  # of a file without materials, to which the part gives one
+    if shape.materials is None:  # of a file without materials: the part has at most one
         return [{"objects": objects, **kind} for kind in kinds.values() if kind][:1]
-    of_object = {material: kinds.get(material, {}) for material in shape.materials.names}
-    first, *others = of_object.values()
-    if all(kind == first for kind in others):
+    object_kinds = {material: kinds.get(material, {}) for material in shape.materials.names}
+    first, *following = object_kinds.values()
+    if all(kind == first for kind in following):
         return [{"objects": objects, **first}] if first else []
     return [
         {"objects": objects, "material": escape(material), **kind}
-        for material, kind in of_object.items()
+        for material, kind in object_kinds.items()
         if kind
     ]
 
 
 def _files(text: dict[str, str], assets: Assets) -> list[Path]:
-    """Return the files of a loader: by name, or in a folder by an expression for names."""
+    """Return the files of a loader: by name, or in a folder by a regular expression for names."""
     if "efilepath" not in text:
         return [assets.file(text.get("filepath", ""))]
     folder, _, names = text["efilepath"].rpartition("/")
@@ -303,7 +334,7 @@ def _files(text: dict[str, str], assets: Assets) -> list[Path]:
         fits = re.compile(names)
     except re.error as error:
         raise LidarError(f"efilepath is {text['efilepath']!r}: {error}.") from error
-    for root in assets.places:
+    for root in assets.folders:
         if (root / folder).is_dir():
             paths = sorted(p for p in (root / folder).iterdir() if fits.fullmatch(p.name))
             if paths:
@@ -312,9 +343,9 @@ def _files(text: dict[str, str], assets: Assets) -> list[Path]:
 
 
 def _points(path: Path, settings: dict[str, str]) -> tuple[Floats, float]:
-    """Read a file of points by the settings of an `xyzloader`.
+    """Return the points (n, 3) of a file for an `xyzloader`, and the edge of a surfel's cell.
 
-    Return the points (n, 3) and the edge of a surfel's cell, both in metres.
+    Both are in metres.
     """
     separators = dict.fromkeys(map(ord, settings.get("separator") or " "), " ")
     lines = read(path).decode("utf-8", "replace").translate(separators).splitlines()
@@ -334,7 +365,7 @@ def _text(path: Path) -> str:
 
 
 def _numbers(text: str, count: int) -> Floats:
-    """Read numbers separated by semicolons."""
+    """Return `count` finite numbers separated by semicolons; LidarError for wrong text."""
     try:
         values = np.array([float(word) for word in text.split(";")])
     except ValueError:

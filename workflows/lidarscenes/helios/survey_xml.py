@@ -1,4 +1,4 @@
-"""A survey of HELIOS++ as a scenario: one sensor for each leg that scans, on one trajectory."""
+"""Surveys of HELIOS++ as scenarios: a sensor for each leg that scans, on one trajectory."""
 
 from __future__ import annotations
 
@@ -21,13 +21,21 @@ from lidarsim.scene.scene import Scene
 from lidarsim.scene.transform import rotation_about
 from lidarsim.sensor import Pose
 from lidarsim.sensor.disc import SUBRAYS
-from lidarsim.sensor.survey import SENSORS_MOST
+from lidarsim.sensor.survey import MAX_SENSORS
 
 from ..writers.scene_file import write_scene
 from .files import Assets, clean, number, rotation, vector
-from .scanner_xml import Device, channels, device, unread
+from .scanner_xml import Device, channels, device, unsupported_features
 from .scene_xml import HeliosScene, SurfelMaker
-from .trajectory import HeliosTrajectory, Stretch, flown, read_legs, read_way, stood
+from .trajectory import (
+    HeliosTrajectory,
+    Leg,
+    Stretch,
+    moving_trajectory,
+    read_legs,
+    read_trajectory,
+    standing_trajectory,
+)
 
 SCENARIO_FILE = "scenario.yaml"
 # Carriers look along x, the platforms of HELIOS++ along y.
@@ -44,7 +52,7 @@ class Imported:
 
 def import_survey(
     survey: str | Path,
-    out: str | Path,
+    folder: str | Path,
     assets: Sequence[str | Path] = (),
     *,
     check: Callable[[Path], object],
@@ -59,8 +67,8 @@ def import_survey(
     ----------
     survey
         The XML file of the survey.
-    out
-        The folder.
+    folder
+        The new folder.
     assets
         Folders in which referenced files are looked for first, before the folder of the survey and
         the folders above.
@@ -76,43 +84,43 @@ def import_survey(
         the scenario; nothing is written then.
     """
     survey = Path(survey)
-    out = Path(out)
-    if out.exists():
-        raise LidarError(f"{out} exists: name another folder, --out DIR.")
+    folder = Path(folder)
+    if folder.exists():
+        raise LidarError(f"{folder} exists: name another folder, --out DIR.")
     try:
-        survey_import = _Import(survey, [Path(folder) for folder in assets], out, surfels)
+        survey_import = _Import(survey, [Path(path) for path in assets], folder, surfels)
     except LidarError as error:
         message = str(error)
         if not message.startswith(str(survey)):
             message = f"{survey}: {message}"
         raise LidarError(message) from error
-    out.parent.mkdir(parents=True, exist_ok=True)
-    partial = Path(tempfile.mkdtemp(prefix=f".{out.name}.", dir=out.parent))
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    partial = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", dir=folder.parent))
     try:
-        for name, text in survey_import.files(out).items():
+        for name, text in survey_import.files(folder).items():
             (partial / name).write_text(text, encoding="utf-8", newline="\n")
         for part in survey_import.scene.parts:
             if part.surfels is not None:
                 write_scene(partial / part.file.name, Scene.from_meshes([part.surfels]))
         check(partial / SCENARIO_FILE)
         partial.chmod(0o755)  # mkdtemp gives a folder to its owner alone
-        partial.rename(out)
+        partial.rename(folder)
     except LidarError as error:
-        message = str(error).replace(str(partial), str(out))
+        message = str(error).replace(str(partial), str(folder))
         raise LidarError(f"{survey} makes no scenario: {message}") from error
     finally:
         shutil.rmtree(partial, ignore_errors=True)
-    return Imported(out / SCENARIO_FILE, survey_import.left_out)
+    return Imported(folder / SCENARIO_FILE, survey_import.left_out)
 
 
 class _Import:
     """A survey whose XML files have been read; `files` returns the scenario's files."""
 
     def __init__(
-        self, survey: Path, folders: Sequence[Path], out: Path, surfels: SurfelMaker
+        self, survey: Path, asset_folders: Sequence[Path], folder: Path, surfels: SurfelMaker
     ) -> None:
         self._home = survey
-        self._assets = Assets(survey, folders)
+        self._assets = Assets(survey, asset_folders)
         element = self._assets.root(survey).find("survey")
         if element is None:
             raise LidarError("it has no <survey>.")
@@ -120,16 +128,16 @@ class _Import:
         self._name = element.get("name") or survey.stem
         self._scanners = channels(self._asset("scanner"))
         self._first = next(iter(self._scanners.values()))
-        self.scene = HeliosScene(self._asset("scene"), self._assets, out, surfels)
+        self.scene = HeliosScene(self._asset("scene"), self._assets, folder, surfels)
         self._notes: list[str] = []
         self._files: dict[str, dict[str, Any]] = {}  # {name: data of a sensor}
         self._sensors: dict[str, dict[str, Any]] = {}
-        self._way = self._carry()
+        self._trajectory = self._read_legs()
         if not self._sensors:
             raise LidarError("no leg scans anything.")
-        if len(self._sensors) > SENSORS_MOST:
+        if len(self._sensors) > MAX_SENSORS:
             raise LidarError(
-                f"{len(self._sensors)} legs and channels scan; a scenario has {SENSORS_MOST} "
+                f"{len(self._sensors)} legs and channels scan; a scenario has {MAX_SENSORS} "
                 "sensors at most."
             )
         self._materials = self.scene.materials(self._first.number("wavelength_nm", 1064))
@@ -139,76 +147,104 @@ class _Import:
             self._notes.append("numRuns: it is one run")
         if number(self._full_waveform(), "maxFullwaveRange_ns", 0) > 0:
             self._notes.append("maxFullwaveRange_ns: waveforms are as long as their echoes")
-        unsupported = (line for scanner in self._scanners.values() for line in unread(scanner))
+        unsupported = (
+            line for scanner in self._scanners.values() for line in unsupported_features(scanner)
+        )
         self.left_out = list(dict.fromkeys([*self._notes, *unsupported, *self.scene.left_out()]))
 
     def _asset(self, kind: str) -> Element:
+        """Return the element that the survey names for a kind, such as «scanner»."""
         if not (reference := self._element.get(kind)):
             raise LidarError(f"its <survey> names no {kind}.")
         return self._assets.asset(reference, kind, self._home).element
 
-    def _carry(self) -> HeliosTrajectory:
+    def _read_legs(self) -> HeliosTrajectory:
         """Read the legs and the platform; return the trajectory, and fill `_sensors`."""
-        survey = self._element
-        assets = self._assets
-        legs = read_legs(survey, assets, self._home, self.scene.height)
-        mount = survey.find("scannerMount")
-        kind = "interpolated"
-        way = None
-        if survey.get("platform") == kind:
-            base = survey.get("basePlatform")
-            if mount is None and base:
-                mount = assets.asset(base, "platform", self._home).element.find("scannerMount")
-            way = read_way(survey, legs, assets)
+        legs = read_legs(self._element, self._assets, self._home, self.scene.height)
+        trajectory = None
+        if self._element.get("platform") == "interpolated":
+            mount = self._interpolated_mount()
+            trajectory = read_trajectory(self._element, legs, self._assets)
+            moves = False
         else:
             platform = self._asset("platform")
             mount = platform.find("scannerMount")
-            kind = platform.get("type", "").lower()
-            if kind in ("groundvehicle", "multicopter"):
-                self._notes.append(
-                    f"how a {kind} drives: it keeps its speed and goes straight from leg to leg"
-                )
-            noisy = [e.tag for parent in (platform, survey) for e in parent if "Noise" in e.tag]
-            if noisy:
-                self._notes.append(f"noise of the platform: {', '.join(noisy)}")
-        moves = kind in ("linearpath", "groundvehicle", "multicopter")
-        devices: dict[int, dict[str, Device]] = {}  # {leg: {channel: …}}
-        for leg in legs[:-1] if moves else legs:  # the last one is only where a way ends
+            moves = self._moves(platform)
+        # The last leg of a moving platform is only the end of its trajectory.
+        devices = self._devices(legs[:-1] if moves else legs)
+        if trajectory is None and moves:
+            trajectory = moving_trajectory(legs)
+        elif trajectory is None:
+            heads = {
+                leg: max(mounted.head_s or 0.0 for mounted in by_channel.values())
+                for leg, by_channel in devices.items()
+            }
+            trajectory = standing_trajectory(legs, heads)
+        self._mount_devices(mount, devices, trajectory)
+        return trajectory
+
+    def _interpolated_mount(self) -> Element | None:
+        """Return the <scannerMount> of an interpolated platform, or of its base platform."""
+        mount = self._element.find("scannerMount")
+        base = self._element.get("basePlatform")
+        if mount is None and base:
+            platform = self._assets.asset(base, "platform", self._home).element
+            return platform.find("scannerMount")
+        return mount
+
+    def _moves(self, platform: Element) -> bool:
+        """Return whether a platform moves from leg to leg; note its unsupported features."""
+        kind = platform.get("type", "").lower()
+        if kind in ("groundvehicle", "multicopter"):
+            self._notes.append(
+                f"how a {kind} drives: it keeps its speed and goes straight from leg to leg"
+            )
+        noise_tags = [
+            e.tag for parent in (platform, self._element) for e in parent if "Noise" in e.tag
+        ]
+        if noise_tags:
+            self._notes.append(f"noise of the platform: {', '.join(noise_tags)}")
+        return kind in ("linearpath", "groundvehicle", "multicopter")
+
+    def _devices(self, legs: Sequence[Leg]) -> dict[int, dict[str, Device]]:
+        """Return the scanners of the legs that scan: {number of a leg: {channel: scanner}}."""
+        devices = {}
+        for leg in legs:
             with prefixed(f"leg {leg.number}"):
                 if leg.active:
                     devices[leg.number] = {
                         channel: device(scanner, leg.scanner)
                         for channel, scanner in self._scanners.items()
                     }
-        if way is None and moves:
-            way = flown(legs)
-        elif way is None:
-            heads = {
-                leg: max(mounted.head_s or 0.0 for mounted in by_channel.values())
-                for leg, by_channel in devices.items()
-            }
-            way = stood(legs, heads)
+        return devices
+
+    def _mount_devices(
+        self,
+        mount: Element | None,
+        devices: dict[int, dict[str, Device]],
+        trajectory: HeliosTrajectory,
+    ) -> None:
+        """Move the trajectory to the position of the scanners, and fill `_sensors`."""
         mount_rotation = rotation(mount)
         mount_position = vector(mount)
         positions = {
-            tuple(clean(mount_position + mounted.place))  # type: ignore[arg-type]
+            tuple(clean(mount_position + mounted.position))  # type: ignore[arg-type]
             for by_channel in devices.values()
             for mounted in by_channel.values()
         }
         if len(positions) > 1:
             self._notes.append("places of channels beside each other: all leave from the first's")
-        way.rows[:, 1:4] += min(positions, default=(0, 0, 0))
-        for stretch in way.stretches:
+        trajectory.rows[:, 1:4] += min(positions, default=(0, 0, 0))
+        for stretch in trajectory.stretches:
             for channel, mounted in devices[stretch.leg].items() if stretch.active else ():
                 name = f"leg{stretch.leg}" + (f"-{channel}" if channel else "")
                 self._sensors[name] = self._sensor(mounted, stretch, mount_rotation)
-        return way
 
     def _sensor(self, mounted: Device, stretch: Stretch, mount: Floats) -> dict[str, Any]:
         """Return the entry of `sensors` for a device on a stretch, rotated by its mount (3, 3)."""
         step_deg, steps = mounted.steps(stretch.seconds)
         min_range_m, max_range_m = mounted.range_m
-        pose = Pose.of((0, 0, 0), _AHEAD @ mount @ mounted.turn)
+        pose = Pose.from_rotation((0, 0, 0), _AHEAD @ mount @ mounted.rotation)
         angles = {name: clean(getattr(pose, name)) for name in ("yaw_deg", "pitch_deg", "roll_deg")}
         return {
             "model": self._file_of(mounted.data),
@@ -230,11 +266,13 @@ class _Import:
             name = f"{stem}-{number}.yaml"
         return name
 
-    def files(self, out: Path) -> dict[str, str]:
-        """Return the text files of the folder `out`: {name: text}."""
-        trajectory, files = self._way.written()
+    def files(self, folder: Path) -> dict[str, str]:
+        """Return the text files for the folder: {name: text}."""
+        trajectory, files = self._trajectory.section_and_files()
         light, range_m = self._light()
-        names = [os.path.relpath(part.file.resolve(), out.resolve()) for part in self.scene.parts]
+        names = [
+            os.path.relpath(part.file.resolve(), folder.resolve()) for part in self.scene.parts
+        ]
         entries = zip(self.scene.parts, names, strict=True)
         classes = ["class"] if any("class" in entry for entry in self._materials) else []
         data = {
@@ -259,7 +297,7 @@ class _Import:
         return {**files, **sensors, SCENARIO_FILE: text}
 
     def _full_waveform(self) -> dict[str, str]:
-        """Return FWFSettings of the scanner; settings of the survey take precedence."""
+        """Return the FWFSettings of the scanner; settings of the survey take precedence."""
         elements = (self._first.child("FWFSettings"), self._element.find("FWFSettings"))
         settings: dict[str, str] = {}
         for element in elements:
@@ -272,13 +310,13 @@ class _Import:
         scanner = self._first
         detector = self._element.find("detectorSettings")
         detector_settings = {} if detector is None else detector.attrib
-        fwf = self._full_waveform()
-        quality = number(fwf, "beamSampleQuality", 3.0)
+        waveform_settings = self._full_waveform()
+        quality = number(waveform_settings, "beamSampleQuality", 3.0)
         sections = {
             "returns": {
                 "mode": "first" if scanner.number("maxNOR") == 1 else "all",
                 "subrays": SUBRAYS[int(np.clip(quality - 1, 0, len(SUBRAYS) - 1))],
-                **waveform(fwf, scanner.number("pulseLength_ns", 4)),
+                **waveform(waveform_settings, scanner.number("pulseLength_ns", 4)),
             },
             "noise": {
                 "range_m": clean(
@@ -298,8 +336,8 @@ class _Import:
 def waveform(settings: dict[str, str], pulse_ns: float) -> dict[str, Any]:
     """Return the fields of `returns` by FWFSettings; none without settings of waveforms.
 
-    HELIOS++ has range over the speed of light for the time, which is half of the time that light
-    takes there and back.
+    The time of HELIOS++ is range over the speed of light: half of the time that light takes to a
+    surface and back.
     """
     if "binSize_ns" not in settings and "winSize_ns" not in settings:
         return {}
@@ -308,4 +346,5 @@ def waveform(settings: dict[str, str], pulse_ns: float) -> dict[str, Any]:
 
 
 def _dumped(data: dict[str, Any]) -> str:
+    """Return data as YAML."""
     return yaml.safe_dump(data, sort_keys=False, default_flow_style=None, width=100)

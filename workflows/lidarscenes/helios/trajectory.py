@@ -14,40 +14,40 @@ import numpy as np
 
 from lidarsim.base.arrays import Floats
 from lidarsim.base.errors import LidarError, prefixed
-from lidarsim.scene.transform import rotation_about as about
+from lidarsim.scene.transform import rotation_about
 from lidarsim.sensor.trajectory import quaternions_of
 
 from .files import Assets, clean, flag, number, read, vector
 
-_SPEED = 70.0  # metres a second, where nothing is said
-_BETWEEN_S = 0.001  # of legs, in which the carrier turns on the spot or goes to its next one
-_AFTER_S = 1.0  # that the trajectory lasts longer than the last leg
-_FACING_Y_DEG = 90.0  # platforms that do not turn
-WAY_FILE = "trajectory.tum"
+_SPEED = 70.0  # default, metres a second
+_BETWEEN_S = 0.001  # between legs, in which the carrier turns on the spot or goes to its next leg
+_AFTER_S = 1.0  # duration of the trajectory after the last leg
+_FACING_Y_DEG = 90.0  # yaw of platforms that do not turn
+TRAJECTORY_FILE = "trajectory.tum"
 _X, _Y, _Z = np.eye(3)
 
 
 @dataclass
 class Leg:
-    """A leg: its number, where it begins, and its settings."""
+    """A leg of a survey: its start and its settings."""
 
     number: int
-    place: Floats
-    scanner: dict[str, str]
-    platform: dict[str, str]
-    longest_s: float  # infinite where there is no limit
+    position: Floats  # (3,): of the start, metres
+    scanner: dict[str, str]  # settings
+    platform: dict[str, str]  # settings
+    longest_s: float  # maximum duration; infinite without a limit
 
     @property
     def active(self) -> bool:
-        """Whether it scans."""
+        """Whether the scanner scans during the leg."""
         return flag(self.scanner, "active", True)
 
 
 @dataclass
 class Stretch:
-    """Part of the trajectory of a leg."""
+    """Part of the trajectory: a leg, from its start to its end."""
 
-    leg: int
+    leg: int  # number
     active: bool
     start_s: float
     seconds: float
@@ -63,8 +63,8 @@ class HeliosTrajectory:
     rows: Floats
     stretches: list[Stretch]
 
-    def written(self) -> tuple[dict[str, Any] | str, dict[str, str]]:
-        """Return the section `trajectory`, and the files that it names."""
+    def section_and_files(self) -> tuple[dict[str, Any] | str, dict[str, str]]:
+        """Return the section `trajectory` of a scenario, and its files {name: text}."""
         if self.rows.shape[1] == 5:
             names = ("time_s", "position", "yaw_deg")
             rows = ((r[0], r[1:4], r[4]) for r in self.rows)
@@ -72,59 +72,62 @@ class HeliosTrajectory:
             return {"points": points}, {}
         text = io.StringIO()
         np.savetxt(text, self.rows, "%.9g")
-        return WAY_FILE, {WAY_FILE: text.getvalue()}
+        return TRAJECTORY_FILE, {TRAJECTORY_FILE: text.getvalue()}
 
 
 def read_legs(
     survey: Element, assets: Assets, home: Any, height: Callable[[float, float], float]
 ) -> list[Leg]:
-    """Read the legs of a survey; `height` tells where the ground is."""
+    """Return the legs of a survey; `height` returns the height of the ground at x, y, metres."""
     legs = []
     for index, element in enumerate(survey.findall("leg")):
         with prefixed(f"leg {index}"):
             platform = assets.settings(element.find("platformSettings"), home)
             scanner = assets.settings(element.find("scannerSettings"), home)
-            place = vector(platform)
+            position = vector(platform)
             if flag(platform, "onGround", False) and "trajectory" not in platform:
-                place[2] = height(place[0], place[1])
+                position[2] = height(position[0], position[1])
             longest = number(element, "maxDuration_s", number(scanner, "maxDuration_s", -1))
-        legs.append(Leg(index, place, scanner, platform, longest if longest > 0 else np.inf))
+        legs.append(Leg(index, position, scanner, platform, longest if longest > 0 else np.inf))
     if not legs:
         raise LidarError("its <survey> has no <leg>.")
     return legs
 
 
-def flown(legs: Sequence[Leg]) -> HeliosTrajectory:
-    """Go straight from each leg to the next, each at its speed, and turn on the spot."""
+def moving_trajectory(legs: Sequence[Leg]) -> HeliosTrajectory:
+    """Return a trajectory straight from leg to leg, at the speed of each, turning on the spot."""
     rows = []
     stretches = []
     clock = 0.0
-    here = legs[0].place
+    position = legs[0].position
     yaw = _FACING_Y_DEG
-    for leg, after in pairwise(legs):
-        way = after.place - here
-        length = float(np.linalg.norm(way))
+    for leg, next_leg in pairwise(legs):
+        displacement = next_leg.position - position
+        length = float(np.linalg.norm(displacement))
         if not length:
             continue
         speed = number(leg.platform, "movePerSec_m", _SPEED)
         if speed <= 0:
             raise LidarError(f"leg {leg.number}: movePerSec_m is {speed:g}; it never ends.")
         seconds = min(length / speed, leg.longest_s)
-        if way[:2].any():
-            yaw = float(np.degrees(np.arctan2(way[1], way[0])))
-        there = here + way * (seconds * speed / length)
-        rows += [[clock, *here, yaw], [clock + seconds, *there, yaw]]
+        if displacement[:2].any():
+            yaw = float(np.degrees(np.arctan2(displacement[1], displacement[0])))
+        target = position + displacement * (seconds * speed / length)
+        rows += [[clock, *position, yaw], [clock + seconds, *target, yaw]]
         stretches.append(Stretch(leg.number, leg.active, clock, seconds))
         clock = clock + seconds + _BETWEEN_S
-        here = there
+        position = target
     if not rows:
         raise LidarError("its platform moves, and no two legs are at different places.")
-    rows.append([clock + _AFTER_S, *here, yaw])
+    rows.append([clock + _AFTER_S, *position, yaw])
     return HeliosTrajectory(np.array(rows), stretches)
 
 
-def stood(legs: Sequence[Leg], heads: dict[int, float]) -> HeliosTrajectory:
-    """Stand at each leg until its head has turned: {number of a leg: seconds}."""
+def standing_trajectory(legs: Sequence[Leg], heads: dict[int, float]) -> HeliosTrajectory:
+    """Return a trajectory that stands at each leg until its head has turned.
+
+    `heads` are durations of the heads' rotations, {number of a leg: seconds}, 0 without rotation.
+    """
     rows = []
     stretches = []
     clock = 0.0
@@ -137,7 +140,7 @@ def stood(legs: Sequence[Leg], heads: dict[int, float]) -> HeliosTrajectory:
                 f"leg {leg.number}: nothing moves, neither platform nor head, and there is no "
                 "maxDuration_s; it never ends."
             )
-        pose = [*leg.place, _FACING_Y_DEG]
+        pose = [*leg.position, _FACING_Y_DEG]
         rows += [[clock, *pose], [clock + seconds, *pose]]
         stretches.append(Stretch(leg.number, True, clock, seconds))
         clock += seconds + _BETWEEN_S
@@ -147,8 +150,8 @@ def stood(legs: Sequence[Leg], heads: dict[int, float]) -> HeliosTrajectory:
     return HeliosTrajectory(np.array(rows), stretches)
 
 
-def read_way(survey: Element, legs: Sequence[Leg], assets: Assets) -> HeliosTrajectory:
-    """Read the file of an interpolated platform; each leg is a stretch of it."""
+def read_trajectory(survey: Element, legs: Sequence[Leg], assets: Assets) -> HeliosTrajectory:
+    """Return the trajectory in the file of an interpolated platform; legs are its stretches."""
     files = {leg.platform.get("trajectory", "") for leg in legs}
     if len(files) != 1 or "" in files:
         raise LidarError("an interpolated platform needs one trajectory, the same in all legs.")
@@ -161,38 +164,40 @@ def read_way(survey: Element, legs: Sequence[Leg], assets: Assets) -> HeliosTraj
     if len(times) < 2:
         raise LidarError(f"{path} is no trajectory: all its rows have one time.")
     columns = {name: column[first] for name, column in columns.items()}
-    turns = np.broadcast_to(np.eye(3), (len(times), 3, 3))
+    rotations = np.broadcast_to(np.eye(3), (len(times), 3, 3))
     if settings.get("interpolationDomain") != "position" and "yaw" in columns:
         scale = 1.0 if flag(settings, "toRadians", True) else 180 / np.pi
         angles = scale * np.stack([columns[name] for name in ("roll", "pitch", "yaw")], axis=1)
         kind = survey.get("rotationSpec", "ARINC 705")
-        turns = np.array([_turned(kind, *row) for row in angles.tolist()])
-    stretches = []
-    for leg in legs:
-        begin = max(number(leg.platform, "tStart", times[0]), times[0])
-        end = min(number(leg.platform, "tEnd", times[-1]), times[-1], begin + leg.longest_s)
-        if end <= begin:
-            raise LidarError(f"leg {leg.number}: tStart and tEnd lie outside the trajectory.")
-        start_s = float(begin - times[0])
-        stretches.append(Stretch(leg.number, leg.active, start_s, float(end - begin)))
-    places = [columns[axis] for axis in "xyz"]
-    quaternions = quaternions_of(turns @ about(_Z, _FACING_Y_DEG))
-    rows = np.column_stack([times - times[0], *places, quaternions])
+        rotations = np.array([_platform_rotation(kind, *row) for row in angles.tolist()])
+    stretches = [_stretch_between(leg, times[0], times[-1]) for leg in legs]
+    positions = [columns[axis] for axis in "xyz"]
+    quaternions = quaternions_of(rotations @ rotation_about(_Z, _FACING_Y_DEG))
+    rows = np.column_stack([times - times[0], *positions, quaternions])
     return HeliosTrajectory(np.vstack([rows, rows[-1] + [_AFTER_S, *7 * [0]]]), stretches)
 
 
-def _turned(kind: str, roll: float, pitch: float, yaw: float) -> Floats:
-    """Rotation (3, 3) of a platform, degrees, as HELIOS++ takes a file's angles."""
+def _stretch_between(leg: Leg, first_s: float, last_s: float) -> Stretch:
+    """Return the stretch of a leg in a trajectory from `first_s` to `last_s`."""
+    start = max(number(leg.platform, "tStart", first_s), first_s)
+    stop = min(number(leg.platform, "tEnd", last_s), last_s, start + leg.longest_s)
+    if stop <= start:
+        raise LidarError(f"leg {leg.number}: tStart and tEnd lie outside the trajectory.")
+    return Stretch(leg.number, leg.active, float(start - first_s), float(stop - start))
+
+
+def _platform_rotation(kind: str, roll: float, pitch: float, yaw: float) -> Floats:
+    """Return the rotation (3, 3) of a platform by angles in degrees, as HELIOS++ reads files."""
     if kind == "CANONICAL":
-        return about(_X, roll) @ about(_Y, pitch) @ about(_Z, yaw)
+        return rotation_about(_X, roll) @ rotation_about(_Y, pitch) @ rotation_about(_Z, yaw)
     if kind == "ARINC 705":
-        return about(-_Z, yaw) @ about(_Y, roll) @ about(_X, pitch)
+        return rotation_about(-_Z, yaw) @ rotation_about(_Y, roll) @ rotation_about(_X, pitch)
     raise LidarError(f"rotationSpec is {kind!r}; there are ARINC 705 and CANONICAL.")
 
 
 def _columns(text: str, settings: dict[str, str]) -> dict[str, Floats]:
-    """Columns of a trajectory by name: by indices, its header, or as usual."""
-    usual = ["t", "roll", "pitch", "yaw", "x", "y", "z"]
+    """Return the columns of a trajectory {name: values}, named by indices, header or default."""
+    default_names = ["t", "roll", "pitch", "yaw", "x", "y", "z"]
     lines = [line for line in text.splitlines() if line.strip() and line.strip()[0] != "#"]
     separator = settings.get("trajectory_seperator", ",")
     try:
@@ -203,25 +208,27 @@ def _columns(text: str, settings: dict[str, str]) -> dict[str, Floats]:
         raise LidarError("its trajectory is not a table of numbers.")
     width = rows.shape[1]
     header = re.search(r"^#\s*HEADER:(.*)$", text, re.MULTILINE)
-    if any(f"{name}Index" in settings for name in usual):
-        places = {int(number(settings, f"{name}Index", i)): name for i, name in enumerate(usual)}
-        names = [places.get(at, "") for at in range(width)]
+    if any(f"{name}Index" in settings for name in default_names):
+        index_names = {
+            int(number(settings, f"{name}Index", i)): name for i, name in enumerate(default_names)
+        }
+        names = [index_names.get(index, "") for index in range(width)]
     elif header is not None:
         names = [word.strip(" \"'") for word in header[1].split(",")]
     else:
-        names = ["t", "x", "y", "z"] if width == 4 else usual
-    listed = f"its trajectory has {width} columns, named {', '.join(names)}"
+        names = ["t", "x", "y", "z"] if width == 4 else default_names
+    description = f"its trajectory has {width} columns, named {', '.join(names)}"
     if len(names) != width or not {"t", "x", "y", "z"} <= {*names}:
-        raise LidarError(f"{listed}; it needs t, x, y and z.")
-    used = [name for name in names if name]  # indices leave out the others
-    unknown = [name for name in used if name not in usual]
+        raise LidarError(f"{description}; it needs t, x, y and z.")
+    used = [name for name in names if name]  # indices may leave columns out
+    unknown = [name for name in used if name not in default_names]
     if unknown or len(set(used)) < len(used):
         fault = f"{unknown[0]!r} is not known" if unknown else "a name is there twice"
         raise LidarError(
-            f"{listed}, and {fault}: name those to read by their indices, such as tIndex and "
+            f"{description}, and {fault}: name those to read by their indices, such as tIndex and "
             "xIndex, in platformSettings."
         )
     angles = {"roll", "pitch", "yaw"}.intersection(used)
     if angles and len(angles) < 3:
-        raise LidarError(f"{listed}; it needs roll, pitch and yaw, or none of them.")
+        raise LidarError(f"{description}; it needs roll, pitch and yaw, or none of them.")
     return {name: column for name, column in zip(names, rows.T, strict=True) if name}

@@ -11,9 +11,8 @@ from lidarsim.scene.scene_mesh import SceneMesh, stacked
 
 from .city_kinds import loft, lying, regular
 
-# of a window: depth, and share of its width that is frame
-_RECESS_M = 0.03
-_FRAME = 0.12
+_RECESS_M = 0.03  # depth of a window
+_FRAME = 0.12  # share of a window's width that is frame
 
 
 @dataclass(frozen=True)
@@ -67,7 +66,7 @@ MODELS = (
 
 
 def car(model: Model) -> SceneMesh:
-    """Make a car that stands on z = 0 around the origin.
+    """Return a car that stands on z = 0 around the origin.
 
     Examples
     --------
@@ -83,44 +82,44 @@ def car(model: Model) -> SceneMesh:
 
 
 def all_cars() -> tuple[SceneMesh, ...]:
-    """Make a car of each of `MODELS`."""
+    """Return a car of each of `MODELS`."""
     return tuple(car(model) for model in MODELS)
 
 
 def _body(model: Model) -> tuple[Floats, Ints]:
-    """Rings of eight corners around the stations, joined by quadrangles."""
+    """Return vertices and faces of a body: rings of eight corners, joined by quadrangles."""
     rings = []
     for x, half, belt, roof in model.stations:
         top = half * (0.74 if roof - belt > 0.2 else 0.86)
-        low = 0.62 * model.wheel_m
-        right = [(0.9 * half, low), (half, 0.55 * belt), (0.97 * half, belt), (top, roof)]
+        sill = 0.62 * model.wheel_m
+        right = [(0.9 * half, sill), (half, 0.55 * belt), (0.97 * half, belt), (top, roof)]
         rings.append([(x, -y, z) for y, z in right] + [(x, y, z) for y, z in right[::-1]])
     ring = np.array(rings)
     quads: list[Floats] = []
     for k in range(len(ring) - 1):
         for side in range(8):
-            after = (side + 1) % 8
-            quad = ring[[k, k + 1, k + 1, k], [after, after, side, side]]
+            next_side = (side + 1) % 8
+            quad = ring[[k, k + 1, k + 1, k], [next_side, next_side, side, side]]
             # 2 and 4 are beside the belt line, 3 is the roof, or a windscreen if it slopes.
             slopes = abs(ring[k, 3, 2] - ring[k + 1, 3, 2]) > 0.25
             glass = k in model.glazed and (side in (2, 4) or (side == 3 and slopes))
             quads += _window(quad) if glass else [quad]
-    for end, turn in ((ring[0], -1), (ring[-1], 1)):
-        quads += [end[[a, b, 7 - b, 7 - a][::turn]] for a, b in ((0, 1), (1, 2), (2, 3))]
+    for end, direction in ((ring[0], -1), (ring[-1], 1)):
+        quads += [end[[a, b, 7 - b, 7 - a][::direction]] for a, b in ((0, 1), (1, 2), (2, 3))]
     corners = np.array(quads)
     number = np.arange(4 * len(corners)).reshape(-1, 4)
     return corners.reshape(-1, 3), np.concatenate([number[:, :3], number[:, [0, 2, 3]]])
 
 
 def _window(quad: Floats) -> list[Floats]:
-    """Frame of four quadrangles, the sides of a recess, and the pane."""
+    """Return the quadrangles of a window: a pane, the sides of its recess, and a frame."""
     middle = quad.mean(axis=0)
     normal = np.cross(quad[2] - quad[0], quad[3] - quad[1])
     hole = quad + _FRAME * (middle - quad)
     pane = hole - _RECESS_M * normal / np.linalg.norm(normal)
-    out = [pane]
+    quads = [pane]
     for k in range(4):
-        after = (k + 1) % 4
-        out.append(np.array([quad[k], quad[after], hole[after], hole[k]]))
-        out.append(np.array([hole[k], hole[after], pane[after], pane[k]]))
-    return out
+        next_corner = (k + 1) % 4
+        quads.append(np.array([quad[k], quad[next_corner], hole[next_corner], hole[k]]))
+        quads.append(np.array([hole[k], hole[next_corner], pane[next_corner], pane[k]]))
+    return quads

@@ -1,4 +1,4 @@
-"""The kinds of things in a city, built from closed shapes."""
+"""The kinds of objects in a city, built from closed shapes."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ class Solid(NamedTuple):
     faces: Ints
 
     def moved(self, x: float = 0.0, y: float = 0.0, z: float = 0.0) -> Solid:
-        """Return a moved copy."""
+        """Return a copy, moved by x, y and z, metres."""
         return Solid(self.vertices + np.array([x, y, z]), self.faces)
 
 
@@ -33,7 +33,7 @@ TOWER_FLOORS = (6, 9, 13, 18, 25)
 
 
 def all_kinds(seed: int = 0) -> dict[str, list[Solid]]:
-    """Make all kinds of things: {group: solids}."""
+    """Return all kinds of objects: {group: solids}."""
     return {
         "pavement": [box(1, 1, 0.15)],
         "tower": _towers(),
@@ -45,12 +45,12 @@ def all_kinds(seed: int = 0) -> dict[str, list[Solid]]:
 
 
 def _towers() -> list[Solid]:
-    """Make office blocks: of `TOWER_FLOORS` floors, each square, stepped, round and L-shaped."""
+    """Return office blocks of `TOWER_FLOORS` floors: square, stepped, round and L-shaped."""
     corner = np.array([[0, 0], [0, 8], [-9, 8], [-9, -8], [9, -8], [9, 0]], dtype=np.float64)
     return [
-        made
+        tower
         for floors in TOWER_FLOORS
-        for made in (
+        for tower in (
             _with_plant_room(loft(rectangle(18, 16), _storeys(floors)), floors),
             _stepped(floors),
             _with_plant_room(loft(regular(14, 8.5), _storeys(floors)), floors),
@@ -60,7 +60,10 @@ def _towers() -> list[Solid]:
 
 
 def _storeys(floors: int, base: float = 0.0, inset: float = 0.0) -> list[tuple[float, float]]:
-    """Profile of a front with a band of windows, set back, in each storey, and a parapet."""
+    """Return the profile of a front with a recessed band of windows in each storey, and a parapet.
+
+    The profile has pairs of a height and an inset, metres.
+    """
     line = [(base, inset)]
     for floor in range(floors):
         z = base + floor * FLOOR_M
@@ -71,6 +74,7 @@ def _storeys(floors: int, base: float = 0.0, inset: float = 0.0) -> list[tuple[f
 
 
 def _with_plant_room(tower: Solid, floors: int) -> Solid:
+    """Return a tower with plant rooms and a mast on its roof."""
     top = floors * FLOOR_M
     return joined([
         tower,
@@ -81,7 +85,7 @@ def _with_plant_room(tower: Solid, floors: int) -> Solid:
 
 
 def _stepped(floors: int) -> Solid:
-    """Three parts, each narrower than the one below."""
+    """Return a tower of three parts, each narrower than the part below."""
     counts = [floors - 2 * (floors // 3), floors // 3, floors // 3]
     parts = []
     base = 0.0
@@ -92,25 +96,27 @@ def _stepped(floors: int) -> Solid:
 
 
 def _houses() -> list[Solid]:
-    """Make dwellings: with gabled and hipped roofs, with a wing, one to three storeys high."""
-    out = []
+    """Return dwellings of 1 to 3 storeys, with gabled and hipped roofs, with and without a wing."""
+    houses = []
     for storeys in (1, 2, 3):
         for hip in (0.0, 3.0):
             body = _dwelling(11, 8.5, storeys, hip)
-            out.append(
+            houses.append(
                 joined([body, *_front(storeys), box(0.8, 0.8, 2.6).moved(2.6, 1, _eaves(storeys))])
             )
             wing = _dwelling(6, 5, max(1, storeys - 1), 0.0)
             turned = Solid(wing.vertices[:, [1, 0, 2]] * [-1, 1, 1], wing.faces)
-            out.append(joined([body, *_front(storeys), turned.moved(2.4, -6, 0)]))
-    return out
+            houses.append(joined([body, *_front(storeys), turned.moved(2.4, -6, 0)]))
+    return houses
 
 
 def _eaves(storeys: int) -> float:
+    """Return the height of the eaves of a dwelling, metres."""
     return 0.4 + 2.8 * storeys
 
 
 def _dwelling(width: float, depth: float, storeys: int, hip: float) -> Solid:
+    """Return the walls and the roof of a dwelling; `hip` is the inset of the ridge's ends."""
     eaves = _eaves(storeys)
     walls = loft(rectangle(width, depth), [(0, -0.15), (0.4, -0.15), (0.4, 0), (eaves, 0)])
     roof = gable(width + 1, depth + 1, eaves - 0.05, 0.42 * depth, hip)
@@ -118,30 +124,37 @@ def _dwelling(width: float, depth: float, storeys: int, hip: float) -> Solid:
 
 
 def _front(storeys: int) -> list[Solid]:
-    """Windows that stand out a little on the long sides, and a door with a step."""
-    out = [box(1.1, 0.3, 2.1).moved(-1.2, -4.3, 0.3), box(1.8, 1.2, 0.3).moved(-1.2, -4.8, 0)]
+    """Return windows that stand out a little on the long sides, and a door with a step."""
+    door = [box(1.1, 0.3, 2.1).moved(-1.2, -4.3, 0.3), box(1.8, 1.2, 0.3).moved(-1.2, -4.8, 0)]
     window = box(1.3, 0.25, 1.4)
-    places = itertools.product((-4.0, 1.0, 4.0), (-4.25, 4.25), range(storeys))
-    return [*out, *(window.moved(x, y, 1.3 + 2.8 * storey) for x, y, storey in places)]
+    positions = itertools.product((-4.0, 1.0, 4.0), (-4.25, 4.25), range(storeys))
+    return [*door, *(window.moved(x, y, 1.3 + 2.8 * storey) for x, y, storey in positions)]
 
 
 def _trees(seed: int) -> list[Solid]:
-    """Make broad-leaved trees of several outlines, and conifers."""
+    """Return broad-leaved trees of several outlines, and conifers."""
     rng = np.random.default_rng(seed)
-    return [_broadleaf(rng, tall) for tall in (0.9, 1.1, 1.35, 1.6)] + [_conifer(3), _conifer(4)]
+    return [_broadleaf(rng, height_ratio) for height_ratio in (0.9, 1.1, 1.35, 1.6)] + [
+        _conifer(3),
+        _conifer(4),
+    ]
 
 
-def _broadleaf(rng: np.random.Generator, tall: float) -> Solid:
+def _broadleaf(rng: np.random.Generator, height_ratio: float) -> Solid:
+    """Return a broad-leaved tree whose crown is `height_ratio` times as high as wide."""
     trunk = loft(regular(6, 0.22), [(0, -0.1), (0.3, 0), (3, 0.08)])
     angle = np.linspace(-np.pi / 2, np.pi / 2, 8)
-    crown = revolve(np.stack([2.2 * np.cos(angle), 2.2 * tall * (1 + np.sin(angle))], axis=1), 10)
+    crown = revolve(
+        np.stack([2.2 * np.cos(angle), 2.2 * height_ratio * (1 + np.sin(angle))], axis=1), 10
+    )
     bumps = 1 + rng.uniform(-0.22, 0.22, (len(crown.vertices), 1))
-    middle = np.array([0, 0, 2.2 * tall])
+    middle = np.array([0, 0, 2.2 * height_ratio])
     leaves = Solid((crown.vertices - middle) * bumps + middle, crown.faces)
     return joined([trunk, leaves.moved(0, 0, 2)])
 
 
 def _conifer(tiers: int) -> Solid:
+    """Return a conifer of several tiers of branches."""
     parts = [loft(regular(6, 0.2), [(0, 0), (1.4, 0)])]
     for tier in range(tiers):
         radius = 2.0 - 1.3 * tier / tiers
@@ -151,15 +164,18 @@ def _conifer(tiers: int) -> Solid:
 
 
 def _cars() -> list[Solid]:
-    """Make a saloon, a hatchback and a van."""
+    """Return a saloon, a hatchback and a van."""
     saloon = [(0, 0.3), (2.2, 0.3), (2.25, 0.8), (1.1, 0.95), (0.55, 1.45), (-0.9, 1.45)]
     hatchback = [(0, 0.3), (2.0, 0.3), (2.0, 0.8), (1.0, 1.0), (0.4, 1.5), (-1.6, 1.5)]
     van = [(0, 0.35), (2.4, 0.35), (2.4, 1.0), (1.9, 1.2), (1.5, 2.1), (-2.3, 2.1)]
-    ends = [[(-1.6, 0.95), (-2.2, 0.9), (-2.2, 0.3)], [(-1.95, 0.9), (-1.95, 0.3)], [(-2.4, 0.35)]]
-    return [_car([*nose, *tail]) for nose, tail in zip((saloon, hatchback, van), ends, strict=True)]
+    tails = [[(-1.6, 0.95), (-2.2, 0.9), (-2.2, 0.3)], [(-1.95, 0.9), (-1.95, 0.3)], [(-2.4, 0.35)]]
+    return [
+        _car([*nose, *tail]) for nose, tail in zip((saloon, hatchback, van), tails, strict=True)
+    ]
 
 
 def _car(side: list[tuple[float, float]]) -> Solid:
+    """Return a car by the outline of its side: points x, z, metres."""
     body = lying(loft(side, [(-0.85, 0.08), (-0.75, 0), (0.75, 0), (0.85, 0.08)]))
     wheel = lying(loft(regular(8, 0.33), [(-0.12, 0), (0.12, 0)]))
     wheels = [wheel.moved(x, y, 0.31) for x in (-1.35, 1.35) for y in (-0.8, 0.8)]
@@ -167,7 +183,7 @@ def _car(side: list[tuple[float, float]]) -> Solid:
 
 
 def _lamp() -> Solid:
-    """Make a street lamp whose arm points along x."""
+    """Return a street lamp whose arm points along x."""
     pole = loft(regular(6, 0.09), [(0, -0.06), (0.5, 0), (6.2, 0.04)])
     return joined(
         [pole, box(1.6, 0.1, 0.1).moved(0.8, 0, 6.1), box(0.7, 0.3, 0.15).moved(1.6, 0, 6)]
@@ -175,62 +191,62 @@ def _lamp() -> Solid:
 
 
 def joined(parts: Iterable[Solid]) -> Solid:
-    """Join solids; where they touch or overlap, each keeps its surface."""
+    """Return a solid of several solids; touching or overlapping parts keep their surfaces."""
     return Solid(*stacked(parts))
 
 
 def loft(outline: ArrayLike, profile: Sequence[tuple[float, float]]) -> Solid:
-    """Extrude an outline along z, with insets, and close it at both ends.
+    """Return an outline extruded along z, with insets, and closed at both ends.
 
-    `outline` (n, 2) is a polygon, counter-clockwise, all of which can be seen from its first
-    point; `profile` has pairs of a height and an inset: how far the outline's sides move inwards
-    there, metres. Gives ``2 * n * len(profile) - 4`` triangles.
+    `outline` (n, 2) is a polygon, counter-clockwise, completely visible from its first point;
+    `profile` has pairs of a height and an inset of the outline's sides at that height, metres. The
+    solid has ``2 * n * len(profile) - 4`` triangles.
     """
     points = np.asarray(outline, dtype=np.float64)
     n = len(points)
     height, inset = np.asarray(profile, dtype=np.float64).T
-    along = np.roll(points, -1, axis=0) - points
-    along /= np.linalg.norm(along, axis=1, keepdims=True)
-    inward = np.stack([-along[:, 1], along[:, 0]], axis=1)
-    before = np.roll(inward, 1, axis=0)
+    tangent = np.roll(points, -1, axis=0) - points
+    tangent /= np.linalg.norm(tangent, axis=1, keepdims=True)
+    inward = np.stack([-tangent[:, 1], tangent[:, 0]], axis=1)
+    previous_inward = np.roll(inward, 1, axis=0)
     # A corner moves so that both its sides move by the inset.
-    mitre = (inward + before) / (1 + (inward * before).sum(axis=1, keepdims=True))
+    mitre = (inward + previous_inward) / (1 + (inward * previous_inward).sum(axis=1, keepdims=True))
     rings = np.empty((len(height), n, 3))
     rings[..., :2] = points + inset[:, None, None] * mitre
     rings[..., 2] = height[:, None]
-    here = np.arange(len(height) * n).reshape(-1, n)
-    beside = np.roll(here, -1, axis=1)
+    corners = np.arange(len(height) * n).reshape(-1, n)
+    next_corners = np.roll(corners, -1, axis=1)
     fan = np.arange(1, n - 1)
     lid = np.stack([np.zeros_like(fan), fan, fan + 1], axis=1)
     faces = [
-        np.stack([here[:-1], beside[:-1], beside[1:]], axis=-1).reshape(-1, 3),
-        np.stack([here[:-1], beside[1:], here[1:]], axis=-1).reshape(-1, 3),
+        np.stack([corners[:-1], next_corners[:-1], next_corners[1:]], axis=-1).reshape(-1, 3),
+        np.stack([corners[:-1], next_corners[1:], corners[1:]], axis=-1).reshape(-1, 3),
         lid[:, ::-1],
-        lid + here[-1, 0],
+        lid + corners[-1, 0],
     ]
     return Solid(rings.reshape(-1, 3), np.concatenate(faces))
 
 
 def rectangle(width: float, depth: float) -> Floats:
-    """Outline around zero: (4, 2)."""
+    """Return the outline of a rectangle around zero: (4, 2)."""
     return np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) * [width / 2, depth / 2]
 
 
 def regular(sides: int, radius: float) -> Floats:
-    """Outline of a regular polygon around zero: (sides, 2)."""
+    """Return the outline of a regular polygon around zero: (sides, 2)."""
     angle = 2 * np.pi * (np.arange(sides) + 0.5) / sides
     return radius * np.stack([np.cos(angle), np.sin(angle)], axis=1)
 
 
 def box(width: float, depth: float, height: float) -> Solid:
-    """Box on z = 0, twelve triangles."""
+    """Return a box on z = 0, of twelve triangles."""
     return loft(rectangle(width, depth), [(0, 0), (height, 0)])
 
 
 def gable(width: float, depth: float, eaves: float, rise: float, hip: float = 0.0) -> Solid:
-    """Pitched roof on a rectangle at height `eaves`, its ridge along x and `rise` above them.
+    """Return a pitched roof of eight triangles on a rectangle at height `eaves`.
 
-    The ends of the ridge stay behind those of the eaves by `hip`. Eight triangles.
+    The ridge is along x, `rise` above the eaves and shorter by `hip` at both ends.
     """
     x = width / 2
     y = depth / 2
@@ -241,5 +257,5 @@ def gable(width: float, depth: float, eaves: float, rise: float, hip: float = 0.
 
 
 def lying(solid: Solid) -> Solid:
-    """Lay it down: z becomes y, and y becomes z."""
+    """Return a solid laid down: z becomes y, and y becomes z."""
     return Solid(solid.vertices[:, [0, 2, 1]], solid.faces[:, ::-1])

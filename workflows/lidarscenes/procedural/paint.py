@@ -1,16 +1,17 @@
-"""Plain colours of generated scenes, by what their objects are."""
+"""Plain colours of generated scenes, by the classes of objects."""
 
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
-from lidarsim.base.arrays import Bools
+from lidarsim.base.arrays import Bools, Floats32, Ints32
 from lidarsim.scene.colours import Colours
 from lidarsim.scene.scene import Scene
 
-# {class of objects: sRGB colours, which its objects take in turn}
+# {class of objects: sRGB colours, used in turn}
 _PAINTS = {
     "ground": ["46464a"],
     "pavement": ["a5a097"],
@@ -24,54 +25,73 @@ _PAINTS = {
 _NAMES = tuple(_PAINTS)
 _FIRST = dict(zip(_NAMES, np.cumsum([0, *map(len, _PAINTS.values())]).tolist(), strict=False))
 _PALETTE = tuple(
-    np.array([[[*bytes.fromhex(one)]]], np.uint8) for some in _PAINTS.values() for one in some
+    np.array([[[*bytes.fromhex(colour)]]], np.uint8)
+    for colours in _PAINTS.values()
+    for colour in colours
 )
 _TRUNK_M = 0.6  # crowns begin higher
-# of normals along z: roofs, level ones; of ground: rock
-_UP = 0.2
-_FLAT = 0.98
-_STEEP = 0.65
+# z of normals
+_UP = 0.2  # minimum of roofs
+_FLAT = 0.98  # minimum of level roofs
+_STEEP = 0.65  # maximum of rock
 
 
 def painted(scene: Scene) -> Scene:
-    """Give a scene of `city` or `terrain` plain colours, by the names that these give objects."""
+    """Return a scene of `city` or `terrain` with plain colours, by the names of its objects."""
     numbered = [name.rpartition("-") for name in scene.names]
     kinds = [kind or name for kind, _, name in numbered]
-    turns = [int(number) if kind else 0 for kind, _, number in numbered]
+    numbers = [int(number) if kind else 0 for kind, _, number in numbered]
     paints = [
-        _FIRST[kind] + turn % len(_PAINTS[kind]) if kind in _PAINTS else 0
-        for kind, turn in zip(kinds, turns, strict=True)
+        _FIRST[kind] + number % len(_PAINTS[kind]) if kind in _PAINTS else 0
+        for kind, number in zip(kinds, numbers, strict=True)
     ]
-    owner = scene.face_object
+    image = np.array(paints, np.int32)[scene.face_object]
+    kind_of_object = np.array([_NAMES.index(kind) if kind in _PAINTS else -1 for kind in kinds])
+    face_kind = kind_of_object[scene.face_object]
+    faces = _face_geometry(scene)
+
+    def paint(kind: str, mask: Bools, colour: str) -> None:
+        """Paint the faces of a kind in a mask (f,)."""
+        image[(face_kind == _NAMES.index(kind)) & mask] = _FIRST[colour]
+
+    paint("building", faces.up > _UP, "tiles")
+    paint("building", faces.up > _FLAT, "roof")
+    paint("tree", faces.height < _TRUNK_M, "bark")
+    paint("terrain", faces.up < _STEEP, "rock")
+    instances = scene.instances
+    if instances is not None:
+        parts = [
+            part._replace(colours=Colours(_PALETTE, _part_paint(part.faces, number)))
+            for number, part in enumerate(instances.parts)
+        ]
+        instances = replace(instances, parts=tuple(parts))
+    return replace(scene, colours=Colours(_PALETTE, image), instances=instances)
+
+
+class _FaceGeometry(NamedTuple):
+    """Slopes and heights of the faces of a scene."""
+
+    up: Floats32  # (f,): z of the unit normal
+    height: Floats32  # (f,): of the lowest corner above the lowest point of the object, metres
+
+
+def _face_geometry(scene: Scene) -> _FaceGeometry:
+    """Return the slopes and heights of faces, computed in single precision."""
     x, y, z = (axis[scene.faces].T for axis in scene.vertices.T.astype(np.float32))
     (ax, bx), (ay, by), (az, bz) = ((axis[1] - axis[0], axis[2] - axis[0]) for axis in (x, y, z))
     normal = ax * by - ay * bx
     up = normal / np.sqrt((ay * bz - az * by) ** 2 + (az * bx - ax * bz) ** 2 + normal**2 + 1e-20)
     lowest = z.min(axis=0)
-    foot = np.full(len(kinds), np.inf, np.float32)
-    np.minimum.at(foot, owner, lowest)
-    above = lowest - foot[owner]
-    image = np.array(paints, np.int32)[owner]
-    kind = np.array([_NAMES.index(kind) if kind in _PAINTS else -1 for kind in kinds])[owner]
+    foot = np.full(len(scene.names), np.inf, np.float32)
+    np.minimum.at(foot, scene.face_object, lowest)
+    return _FaceGeometry(up, lowest - foot[scene.face_object])
 
-    def paint(which: str, where: Bools, colour: str) -> None:
-        image[(kind == _NAMES.index(which)) & where] = _FIRST[colour]
 
-    paint("building", up > _UP, "tiles")
-    paint("building", up > _FLAT, "roof")
-    paint("tree", above < _TRUNK_M, "bark")
-    paint("terrain", up < _STEEP, "rock")
-    shared = scene.instances
-    if shared is not None:
-        parts = []
-        for number, part in enumerate(shared.parts):
-            # A leaf shares no corner with others; cars have none.
-            leaf = np.bincount(part.faces.ravel())[part.faces].max(axis=1) == 1
-            cars = _PAINTS["car"]
-            leaves = _PAINTS["tree"]
-            of_car = np.full(len(leaf), _FIRST["car"] + number % len(cars))
-            of_tree = np.where(leaf, _FIRST["tree"] + number % len(leaves), _FIRST["bark"])
-            own = (of_tree if leaf.any() else of_car).astype(np.int32)
-            parts.append(part._replace(colours=Colours(_PALETTE, own)))
-        shared = replace(shared, parts=tuple(parts))
-    return replace(scene, colours=Colours(_PALETTE, image), instances=shared)
+def _part_paint(faces: Ints32, number: int) -> Ints32:
+    """Return the paints (f,) of a part of instances by its number: a tree with leaves, or a car."""
+    # A leaf shares no corner with other triangles; cars have no leaves.
+    leaf = np.bincount(faces.ravel())[faces].max(axis=1) == 1
+    if leaf.any():
+        leaf_paint = _FIRST["tree"] + number % len(_PAINTS["tree"])
+        return np.where(leaf, leaf_paint, _FIRST["bark"]).astype(np.int32)
+    return np.full(len(leaf), _FIRST["car"] + number % len(_PAINTS["car"])).astype(np.int32)

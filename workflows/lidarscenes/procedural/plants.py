@@ -1,7 +1,7 @@
 """Trees as a lidar sees them: trunk, branches, twigs, and leaves as single triangles.
 
 A stem carries branches, branches carry twigs and twigs leaves, by the proportions of a species, as
-of Weber and Penn (1995). A leaf's triangle is larger than a leaf: so few stand for all of a tree.
+of Weber and Penn (1995). A triangle is larger than a leaf, so that a few stand for all leaves.
 """
 
 from __future__ import annotations
@@ -15,8 +15,8 @@ from lidarsim.base.arrays import Floats, Ints
 from lidarsim.scene.scene_instances import SceneInstance
 from lidarsim.scene.scene_mesh import SceneMesh, stacked
 
-SCALES = (0.7, 1.3)  # least and most of trees in a scene
-MOST_TREES = 100_000  # readers of mesh files take 200,000 nodes
+SCALES = (0.7, 1.3)  # smallest and largest scale of trees in a scene
+MAX_TREES = 100_000  # readers of mesh files take 200,000 nodes
 _STEM_SIDES = 7
 _BRANCH_SIDES = 4
 _TWIG_SIDES = 3
@@ -34,13 +34,13 @@ class Species:
     trunk_m: float  # radius above the roots
     bare: float  # share of the height without branches
     crown: tuple[float, ...]  # lengths of branches, metres, at equal steps up the crown
-    angle_deg: tuple[float, float]  # of branches from the vertical, lowest and highest
-    rise_deg: float  # how far a branch turns up from its foot to its end
+    angle_deg: tuple[float, float]  # of the lowest and the highest branch from the vertical
+    rise_deg: float  # angle by which a branch bends up from its foot to its end
     branches: int
     twigs: int  # of a branch
     leaves: int  # of a twig
-    leaf_m: tuple[float, float]  # length and width of their triangles
-    hang: float = 0.0  # how much twigs and leaves hang
+    leaf_m: tuple[float, float]  # length and width of a triangle
+    hang: float = 0.0  # downward part of the directions of twigs and leaves
     conifer: bool = False
 
 
@@ -69,16 +69,16 @@ SPECIES = (
 
 
 def tree(species: Species, seed: int = 0, root_m: float = 0.1) -> SceneMesh:
-    """Make a tree that stands on (0, 0, 0).
+    """Return a tree that stands on (0, 0, 0).
 
     Parameters
     ----------
     species
-        One of `SPECIES`, or proportions of one's own.
+        A species of `SPECIES`, or a user's.
     seed
         The same seed gives the same tree.
     root_m
-        How far the trunk goes on below the ground, metres, above 0; for slopes some more.
+        Length of the trunk below the ground, metres, above 0; more for slopes.
 
     Examples
     --------
@@ -88,27 +88,39 @@ def tree(species: Species, seed: int = 0, root_m: float = 0.1) -> SceneMesh:
     """
     rng = np.random.default_rng(seed)
     stem, radii = _stem(species, root_m, rng)
-    branches, thick = _branches(species, stem, radii, rng)
+    branches, branch_radii = _branches(species, stem, radii, rng)
     twigs = _twigs(species, branches, rng)
-    thin = np.tile([0.25 * thick.mean(), 0.004], (len(twigs), 1))
+    twig_radii = np.tile([0.25 * branch_radii.mean(), 0.004], (len(twigs), 1))
     parts = [
         _tubes(stem[None], radii[None], _STEM_SIDES),
-        _tubes(branches, thick, _BRANCH_SIDES),
-        _tubes(twigs, thin, _TWIG_SIDES),
+        _tubes(branches, branch_radii, _BRANCH_SIDES),
+        _tubes(twigs, twig_radii, _TWIG_SIDES),
         _leaves(species, twigs, rng),
     ]
     return SceneMesh(species.name, *stacked(parts))
 
 
 def all_trees(seed: int, root_m: float) -> tuple[SceneMesh, ...]:
-    """Make a tree of each of `SPECIES`."""
+    """Return a tree of each of `SPECIES`."""
     return tuple(tree(species, seed, root_m) for species in SPECIES)
 
 
-def placed(
-    meshes: Sequence[SceneMesh], kind: Ints, places: Floats, yaw: Floats, scale: Floats
+def place_instances(
+    meshes: Sequence[SceneMesh], kind: Ints, positions: Floats, yaw: Floats, scale: Floats
 ) -> list[SceneInstance]:
-    """Place meshes upright: `kind` (n,) at places (n, 3), turned by `yaw` (n,), and scaled (n,)."""
+    """Return upright instances of meshes.
+
+    Parameters
+    ----------
+    kind
+        (n,): numbers of the meshes.
+    positions
+        (n, 3): metres.
+    yaw
+        (n,): rotations about z, radians.
+    scale
+        (n,): factors of the size.
+    """
     matrices = np.tile(np.eye(4), (len(kind), 1, 1))
     cos = scale * np.cos(yaw)
     sin = scale * np.sin(yaw)
@@ -117,12 +129,12 @@ def placed(
     matrices[:, 1, 0] = sin
     matrices[:, 1, 1] = cos
     matrices[:, 2, 2] = scale
-    matrices[:, :3, 3] = places
+    matrices[:, :3, 3] = positions
     return [SceneInstance(meshes[k], matrix) for k, matrix in zip(kind, matrices, strict=True)]
 
 
 def _stem(species: Species, root_m: float, rng: np.random.Generator) -> tuple[Floats, Floats]:
-    """Points (k, 3) from the root to the top, and radii (k,)."""
+    """Return the points (k, 3) of a stem from the root to the top, and radii (k,), metres."""
     share = np.linspace(0, 1, _STEM_STEPS)
     sway = np.cumsum(rng.normal(0, 0.012 * species.height_m, (_STEM_STEPS, 2)), axis=0)
     sway = (sway - sway[0]) * share[:, None]
@@ -137,89 +149,102 @@ def _stem(species: Species, root_m: float, rng: np.random.Generator) -> tuple[Fl
 def _branches(
     species: Species, stem: Floats, radii: Floats, rng: np.random.Generator
 ) -> tuple[Floats, Floats]:
-    """Points (n, k, 3) of the branches, and radii (n, k)."""
+    """Return the points (n, k, 3) of the branches, and radii (n, k), metres."""
     n = species.branches
-    # As many where they are long as fill the crown evenly.
-    steps = np.linspace(0, 1, 50)
-    lengths = np.interp(steps, np.linspace(0, 1, len(species.crown)), species.crown)
-    below = np.cumsum(lengths**1.5)
-    share = np.interp((np.arange(n) + rng.uniform(0, 1, n)) / n, below / below[-1], steps)
+    share, full_length = _branch_shares(species, rng)
     height = species.height_m * (species.bare + (0.97 - species.bare) * share)
     foot = np.stack([np.interp(height, stem[:, 2], axis) for axis in stem.T], axis=1)
-    around = _GOLDEN_ANGLE * np.arange(n) + rng.normal(0, 0.3, n)
-    length = np.interp(share, steps, lengths) * rng.uniform(0.75, 1.08, n)
-    low, high = np.radians(species.angle_deg)
-    lean = low + (high - low) * share + rng.normal(0, 0.12, n)
+    azimuth = _GOLDEN_ANGLE * np.arange(n) + rng.normal(0, 0.3, n)
+    length = full_length * rng.uniform(0.75, 1.08, n)
+    lowest, highest = np.radians(species.angle_deg)
+    lean = lowest + (highest - lowest) * share + rng.normal(0, 0.12, n)
     points = [foot]
     for step in range(_BRANCH_STEPS):
         tilt = lean - np.radians(species.rise_deg) * step / (_BRANCH_STEPS - 1)
         tilt = tilt + rng.normal(0, 0.1, n)
-        turn = around + rng.normal(0, 0.15, n) * step
-        along = [np.sin(tilt) * np.cos(turn), np.sin(tilt) * np.sin(turn), np.cos(tilt)]
-        points.append(points[-1] + np.stack(along, axis=1) * (length / _BRANCH_STEPS)[:, None])
-    # Half as thick as the stem there, at most in proportion to the length.
-    thick = np.minimum(0.5 * np.interp(height, stem[:, 2], radii), 0.006 + 0.022 * length)
-    return np.stack(points, axis=1), thick[:, None] * np.linspace(1, 0.25, _BRANCH_STEPS + 1)
+        direction = azimuth + rng.normal(0, 0.15, n) * step
+        ahead = np.stack(
+            [np.sin(tilt) * np.cos(direction), np.sin(tilt) * np.sin(direction), np.cos(tilt)],
+            axis=1,
+        )
+        points.append(points[-1] + ahead * (length / _BRANCH_STEPS)[:, None])
+    # Half as thick as the stem at the foot, at most in proportion to the length.
+    radius = np.minimum(0.5 * np.interp(height, stem[:, 2], radii), 0.006 + 0.022 * length)
+    return np.stack(points, axis=1), radius[:, None] * np.linspace(1, 0.25, _BRANCH_STEPS + 1)
+
+
+def _branch_shares(species: Species, rng: np.random.Generator) -> tuple[Floats, Floats]:
+    """Return the heights (n,) of branches as shares of the crown, and their lengths (n,), metres.
+
+    Branches are denser where they are long, so that they fill the crown evenly.
+    """
+    n = species.branches
+    steps = np.linspace(0, 1, 50)
+    lengths = np.interp(steps, np.linspace(0, 1, len(species.crown)), species.crown)
+    below = np.cumsum(lengths**1.5)
+    share = np.interp((np.arange(n) + rng.uniform(0, 1, n)) / n, below / below[-1], steps)
+    return share, np.interp(share, steps, lengths)
 
 
 def _twigs(species: Species, branches: Floats, rng: np.random.Generator) -> Floats:
-    """Return ends of the twigs, (n, 2, 3), which spread from the outer part of each branch."""
+    """Return the ends of the twigs, (n, 2, 3), which spread from the outer part of branches."""
     n = len(branches)
     m = species.twigs
-    at = np.sort(rng.uniform(0.2, 1, (n, m)), axis=1)
-    at[:, -1] = 1
-    place = at * _BRANCH_STEPS
-    step = np.minimum(place.astype(np.int64), _BRANCH_STEPS - 1)
+    share = np.sort(rng.uniform(0.2, 1, (n, m)), axis=1)
+    share[:, -1] = 1
+    position = share * _BRANCH_STEPS
+    step = np.minimum(position.astype(np.int64), _BRANCH_STEPS - 1)
     row = np.arange(n)[:, None]
     begin = branches[row, step]
     end = branches[row, step + 1]
-    foot = begin + (end - begin) * (place - step)[..., None]
-    along = _unit(_unit(end - begin) + 0.75 * rng.normal(size=(n, m, 3)) - [0, 0, species.hang])
+    foot = begin + (end - begin) * (position - step)[..., None]
+    axis = _unit(_unit(end - begin) + 0.75 * rng.normal(size=(n, m, 3)) - [0, 0, species.hang])
     reach = np.linalg.norm(branches[:, -1] - branches[:, 0], axis=1)[:, None]
-    length = np.maximum(0.4, 0.45 * reach * (1.3 - at)) * rng.uniform(0.7, 1.2, (n, m))
-    return np.stack([foot, foot + along * length[..., None]], axis=2).reshape(-1, 2, 3)
+    length = np.maximum(0.4, 0.45 * reach * (1.3 - share)) * rng.uniform(0.7, 1.2, (n, m))
+    return np.stack([foot, foot + axis * length[..., None]], axis=2).reshape(-1, 2, 3)
 
 
 def _leaves(species: Species, twigs: Floats, rng: np.random.Generator) -> tuple[Floats, Ints]:
-    """Triangles around the twigs, each by itself."""
+    """Return vertices and faces of the leaves around the twigs (n, 2, 3), not connected."""
     n = len(twigs)
     m = species.leaves
-    long, wide = species.leaf_m
-    along = twigs[:, 1:] - twigs[:, :1]
-    foot = twigs[:, :1] + along * rng.uniform(0.15, 1.05, (n, m, 1))
-    foot = foot + rng.normal(0, 0.4 * long, (n, m, 3))
-    ahead = _unit(_unit(along) + 0.8 * rng.normal(size=(n, m, 3)) - [0, 0, species.hang])
+    length, width = species.leaf_m
+    axis = twigs[:, 1:] - twigs[:, :1]
+    foot = twigs[:, :1] + axis * rng.uniform(0.15, 1.05, (n, m, 1))
+    foot = foot + rng.normal(0, 0.4 * length, (n, m, 3))
+    ahead = _unit(_unit(axis) + 0.8 * rng.normal(size=(n, m, 3)) - [0, 0, species.hang])
     across = _unit(np.cross(ahead, rng.normal([0, 0, 0.8], 1, (n, m, 3))))
     size = rng.uniform(0.75, 1.25, (n, m, 1))
-    tip = foot + ahead * long * size
-    side = across * wide / 2 * size
+    tip = foot + ahead * length * size
+    side = across * width / 2 * size
     corners = np.stack([foot - side, foot + side, tip], axis=2).reshape(-1, 3)
     return corners, np.arange(len(corners)).reshape(-1, 3)
 
 
 def _tubes(paths: Floats, radii: Floats, sides: int) -> tuple[Floats, Ints]:
-    """Open tubes along paths (n, k, 3) with radii (n, k)."""
+    """Return vertices and faces of open tubes along paths (n, k, 3) with radii (n, k)."""
     n, k = radii.shape
-    along = _unit(np.gradient(paths, axis=1))
-    # The same axis for a whole tube, so that it is not twisted.
-    upright = np.abs(along[:, :1, 2:]) > 0.8
-    first = _unit(np.cross(along, np.where(upright, [1.0, 0, 0], [0, 0, 1.0])))
-    second = np.cross(along, first)
+    tangents = _unit(np.gradient(paths, axis=1))
+    # The same axis along a tube, so that the tube is not twisted.
+    upright = np.abs(tangents[:, :1, 2:]) > 0.8
+    first = _unit(np.cross(tangents, np.where(upright, [1.0, 0, 0], [0, 0, 1.0])))
+    second = np.cross(tangents, first)
     angle = 2 * np.pi * np.arange(sides)[:, None] / sides
     round_ = np.cos(angle) * first[:, :, None] + np.sin(angle) * second[:, :, None]
     points = paths[:, :, None] + radii[..., None, None] * round_
-    here = np.arange(n * k * sides).reshape(n, k, sides)
-    beside = np.roll(here, -1, axis=2)
+    ring = np.arange(n * k * sides).reshape(n, k, sides)
+    next_in_ring = np.roll(ring, -1, axis=2)
     corners = [
-        here[:, :-1],
-        beside[:, :-1],
-        beside[:, 1:],
-        here[:, :-1],
-        beside[:, 1:],
-        here[:, 1:],
+        ring[:, :-1],
+        next_in_ring[:, :-1],
+        next_in_ring[:, 1:],
+        ring[:, :-1],
+        next_in_ring[:, 1:],
+        ring[:, 1:],
     ]
     return points.reshape(-1, 3), np.stack(corners, axis=-1).reshape(-1, 3)
 
 
 def _unit(vectors: Floats) -> Floats:
+    """Return unit vectors in the directions of vectors (..., 3)."""
     return vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)

@@ -1,4 +1,4 @@
-"""Whether a scene is a place to stand in, or an object to look at from outside."""
+"""Surroundings of a position: a scene to stand in, or an object to look at from outside."""
 
 from __future__ import annotations
 
@@ -12,75 +12,74 @@ from lidarsim.base.arrays import Bools, Floats
 from lidarsim.scene.scene import Scene
 from raybeam import RayCaster, available_backends
 
-from .floor import reaching
+from .floor import triangles_reaching
 
 RAYS = 1000  # from each position, and from outside
 HAND_M = 0.1  # surfaces nearer than this are in the way
-CLEAR_M = 0.5  # around a sensor in a place
+CLEAR_M = 0.5  # around a sensor in a scene
 BLOCK_FACES = 1 << 18  # triangles whose areas are added up at a time
 
-# Shares of rays. Of those that look down from 1, 2 and 3 m above a patch of ground, 0.4 meet it if
-# it is 5 m wide.
+# Shares of rays. Of the rays down from 1, 2 and 3 m above a patch of ground 5 m wide, 0.4 meet the
+# patch.
 _GROUND = 0.4
 _SKY = 0.3
 _ENCLOSED = 0.95
 _CLOSED = 0.8
 _UPRIGHT = 0.9
 _FLOOR = 0.3
-# Openness, from which a surface is not closed; and that of leaves at most.
-_OPEN = 0.1
-_LEAVES = 0.4
+_OPEN = 0.1  # openness from which on a surface is not closed
+_LEAVES = 0.4  # maximum openness of leaves
 # A closed body whose inside has a floor and upright walls is a room of these sizes.
-_WIDE_M = 2.0
-_HIGH_M = 15.0
+_MIN_ROOM_WIDTH_M = 2.0
+_MAX_ROOM_HEIGHT_M = 15.0
 # The room of a scene spans this share of the scene along each axis; smaller bodies are in it.
 _SPANS = 1 / 3
 # Directions by their z: up to 10 degrees above the horizon, within 60 degrees of straight up, and
-# within 30 degrees of straight down. Shares of such rays that meet what covers a position.
+# within 30 degrees of straight down. Shares of such rays that meet the cover of a position.
 _RAISED = 0.17
 _UPWARD = 0.5
 _DOWNWARD = -0.87
 _COVERED = 0.9
 _WIDELY_COVERED = 0.95
-# A body is around a position; a flat surface, however near, takes half of the directions.
+# Share of directions with surfaces inside a body; a flat surface fills at most half.
 _AROUND = 0.6
 
 
 def in_the_way(scene: Scene, positions: ArrayLike) -> bool:
-    """Whether there is a surface within `CLEAR_M` of one of some local positions (k, 3)."""
-    at = np.asarray(positions, np.float64).reshape(-1, 3)
-    near = reaching(scene, at.min(axis=0) - CLEAR_M, at.max(axis=0) + CLEAR_M)
-    if not len(near):
+    """Return whether a surface is within `CLEAR_M` of any of the local positions (k, 3)."""
+    points = np.asarray(positions, np.float64).reshape(-1, 3)
+    nearby = triangles_reaching(scene, points.min(axis=0) - CLEAR_M, points.max(axis=0) + CLEAR_M)
+    if not len(nearby):
         return False
-    caster = RayCaster(scene.vertices, scene.faces[near], "numpy")
-    around = np.tile(directions_around(RAYS), (len(at), 1))
-    return bool(caster.cast(np.repeat(at, RAYS, axis=0), around, t_max=CLEAR_M).hit.any())
+    caster = RayCaster(scene.vertices, scene.faces[nearby], "numpy")
+    directions = np.tile(directions_around(RAYS), (len(points), 1))
+    return bool(caster.cast(np.repeat(points, RAYS, axis=0), directions, t_max=CLEAR_M).hit.any())
 
 
 @dataclass(frozen=True, eq=False)
 class Views:
-    """What rays in all directions meet from some positions."""
+    """Hits of rays in all directions from a list of positions."""
 
     directions: Floats  # (n, 3), unit vectors
-    distance: Floats  # (n,), metres; infinite where there is nothing
+    distance: Floats  # (n,), metres; infinite without a hit
     back: Bools  # (n,), whether the back of a triangle was hit
-    normals: Floats  # (n, 3), unit normals of the triangles hit; 0 where there is nothing
+    normals: Floats  # (n, 3), unit normals of the triangles hit; 0 without a hit
     heights: Floats  # (n,), local z of the hits
 
     @property
     def hit(self) -> Bools:
-        """Which rays meet a surface that is not within a hand's breadth: (n,)."""
+        """Mask (n,) of rays that meet a surface farther than a hand's breadth."""
         return np.isfinite(self.distance) & (self.distance > HAND_M)
 
     @property
     def in_a_body(self) -> bool:
-        """Whether there are surfaces around, of which only backs are to see."""
-        around = np.mean(np.isfinite(self.distance)) > _AROUND
-        return bool(around and self.hit.any() and np.mean(self.back[self.hit]) > 1 - 1 / RAYS)
+        """Whether surfaces are around, with only their backs visible."""
+        enclosed = np.mean(np.isfinite(self.distance)) > _AROUND
+        return bool(enclosed and self.hit.any() and np.mean(self.back[self.hit]) > 1 - 1 / RAYS)
 
 
 class Surroundings:
-    """Casts a few thousand rays to see what is around a position in a scene without actors."""
+    """Caster of a few thousand rays around positions in a scene without actors."""
 
     def __init__(self, scene: Scene) -> None:
         self._scene = scene
@@ -89,29 +88,30 @@ class Surroundings:
         self._caster = RayCaster(scene.vertices, scene.faces, backend)
 
     def views(self, positions: ArrayLike) -> Views:
-        """Look in all directions from local positions (k, 3)."""
-        at = np.asarray(positions, np.float64).reshape(-1, 3)
-        around = directions_around(RAYS)
-        return self.cast(np.repeat(at, RAYS, axis=0), np.tile(around, (len(at), 1)))
+        """Return the views in all directions from local positions (k, 3)."""
+        points = np.asarray(positions, np.float64).reshape(-1, 3)
+        directions = directions_around(RAYS)
+        return self.cast(np.repeat(points, RAYS, axis=0), np.tile(directions, (len(points), 1)))
 
     def outside(self) -> Views:
-        """Look at the scene from all around it."""
-        low, high = self._scene.bounds
-        across = float(np.linalg.norm(high - low))
+        """Return the views of the scene from outside, from all directions."""
+        lower, upper = self._scene.bounds
+        across = float(np.linalg.norm(upper - lower))
         towards = -directions_around(RAYS)
-        # Parallel rays would meet thin things seldom: aim at a grid of points in the box.
+        # Parallel rays would meet thin objects seldom: aim at a grid of points in the box.
         shares = np.stack([np.arange(RAYS) * step % 1.0 for step in (0.755, 0.57, 0.431)], axis=1)
-        return self.cast(low + shares * (high - low) - 2 * across * towards, towards)
+        return self.cast(lower + shares * (upper - lower) - 2 * across * towards, towards)
 
-    def is_object(self, seen: Views) -> bool:
-        """Whether a scene is an object, judged by the views from where a sensor would stand in it.
+    def is_object(self, views: Views) -> bool:
+        """Return whether a scene is an object, by the views from positions of a sensor inside.
 
-        It is one if almost nothing is seen from there, or if all sides of the scene look outward
-        and the positions are within it: not on ground, and not in a room with a floor.
+        The scene is an object if almost no ray meets a surface, or if all sides of the scene look
+        outward and the positions are within the scene: not on ground, and not in a room with a
+        floor.
         """
-        down = seen.directions[:, 2] < 0
-        below = np.mean(seen.hit[down])
-        above = np.mean(seen.hit[~down])
+        down = views.directions[:, 2] < 0
+        below = np.mean(views.hit[down])
+        above = np.mean(views.hit[~down])
         if below < _GROUND and above < _GROUND:
             return True
         outside = self.outside()
@@ -120,15 +120,15 @@ class Surroundings:
             # A terrain from below, or the walls of a room. Of leaves and surfels, half are seen
             # from behind; ground of surfels is below the sensor only.
             leaves = back < _CLOSED and _openness(self._scene) < _LEAVES and above >= _SKY
-            return bool(leaves and not _has_floor(seen))
-        if np.mean(np.isfinite(seen.distance)) < _ENCLOSED:
-            ground = np.mean((seen.hit & ~seen.back)[down]) >= _GROUND
-            # Of a machine with openings there is something above the sensor, too.
-            return not (ground and (above < _SKY or _has_floor(seen)))
-        return not self._is_room(seen)
+            return bool(leaves and not _has_floor(views))
+        if np.mean(np.isfinite(views.distance)) < _ENCLOSED:
+            ground = np.mean((views.hit & ~views.back)[down]) >= _GROUND
+            # A machine with openings has surfaces above the sensor, too.
+            return not (ground and (above < _SKY or _has_floor(views)))
+        return not self._is_room(views)
 
     def in_a_body(self, position: ArrayLike) -> bool:
-        """Whether a local position (3,) is inside a closed body, which is not the room of a scene.
+        """Return whether a local position (3,) is inside a closed body that is not a room.
 
         A body that stands on the ground may lack a bottom.
         """
@@ -143,36 +143,36 @@ class Surroundings:
         return bool(closed and not spans and np.mean(views.back[raised & views.hit]) > 1 - 1 / RAYS)
 
     def is_covered(self, position: ArrayLike) -> bool:
-        """Whether a local position (3,) is under the scene: with nothing below, and ground above.
+        """Return whether a local position (3,) is under the scene: ground above, and empty below.
 
-        Of ground without a thickness the back is above. Under other things, such as a bridge, the
-        position is lower than the whole scene, and these things are above in almost all directions.
+        Under ground without thickness, backs are above. Under other objects, such as a bridge, the
+        position is lower than the scene, and objects are above in almost all directions.
         """
         views = self.views(position)
         up = views.directions[:, 2]
-        met = np.isfinite(views.distance)
-        if met[up < _DOWNWARD].any():
+        hits = np.isfinite(views.distance)
+        if hits[up < _DOWNWARD].any():
             return False
         above = up > _UPWARD
-        backs = views.back[above & met]
-        if np.mean(met[above]) >= _COVERED and np.mean(backs) >= _COVERED:
+        backs = views.back[above & hits]
+        if np.mean(hits[above]) >= _COVERED and np.mean(backs) >= _COVERED:
             return True
         lower = np.asarray(position, np.float64).reshape(3)[2] < self._scene.bounds[0, 2]
-        return bool(lower and np.mean(met[up > _RAISED]) >= _WIDELY_COVERED)
+        return bool(lower and np.mean(hits[up > _RAISED]) >= _WIDELY_COVERED)
 
-    def _is_room(self, seen: Views) -> bool:
-        """Whether what encloses some positions is a room, though all sides look outward."""
-        if not _has_floor(seen):
+    def _is_room(self, views: Views) -> bool:
+        """Return whether the body around the positions is a room, though all sides look outward."""
+        if not _has_floor(views):
             return False
-        if np.mean(seen.back) < 1 - _CLOSED:  # walls of some thickness
+        if np.mean(views.back) < 1 - _CLOSED:  # walls with a thickness
             return True
-        upright = np.abs(seen.normals[:, 2]) < 0.01
+        upright = np.abs(views.normals[:, 2]) < 0.01
         sides = np.ptp(self._scene.bounds, axis=0)
-        fits = sides[:2].min() >= _WIDE_M and sides[2] <= _HIGH_M
-        return bool(fits and np.mean(_is_level(seen) | upright) >= _UPRIGHT)
+        fits = sides[:2].min() >= _MIN_ROOM_WIDTH_M and sides[2] <= _MAX_ROOM_HEIGHT_M
+        return bool(fits and np.mean(_is_level(views) | upright) >= _UPRIGHT)
 
     def cast(self, origins: Floats, directions: Floats) -> Views:
-        """See what rays from local origins (n, 3) along unit directions (n, 3) meet."""
+        """Return the hits of rays from local origins (n, 3) along unit directions (n, 3)."""
         hits = self._caster.cast(origins, directions)
         a, b, c = self._scene.vertices[self._scene.faces[hits.triangle]].transpose(1, 0, 2)
         normals = np.cross(b - a, c - a)
@@ -183,27 +183,28 @@ class Surroundings:
         return Views(directions, hits.distance, back, normals, heights)
 
 
-def _is_level(seen: Views) -> Bools:
-    return np.asarray(np.abs(seen.normals[:, 2]) > 0.99)
+def _is_level(views: Views) -> Bools:
+    """Return a mask (n,) of rays that hit level surfaces."""
+    return np.asarray(np.abs(views.normals[:, 2]) > 0.99)
 
 
-def _has_floor(seen: Views) -> bool:
-    """Whether rays that go steeply down meet level surfaces of about one height."""
-    steep = (seen.directions[:, 2] < -0.7) & np.isfinite(seen.distance)
-    heights = seen.heights[steep & _is_level(seen)]
+def _has_floor(views: Views) -> bool:
+    """Return whether steep rays down meet level surfaces of about the same height."""
+    steep = (views.directions[:, 2] < -0.7) & np.isfinite(views.distance)
+    heights = views.heights[steep & _is_level(views)]
     floor = np.sum(np.abs(heights - np.median(heights)) < 0.3) if len(heights) else 0
     return int(floor) >= _FLOOR * int(np.sum(steep))
 
 
 def is_open(scene: Scene) -> bool:
-    """Whether a scene's surfaces are far from closed, as a terrain's; needs no rays."""
+    """Return whether a scene's surfaces are open, such as a terrain; casts no rays."""
     return _openness(scene) > _OPEN
 
 
 def _openness(scene: Scene) -> float:
-    """Length of the sum of all areas as vectors along the normals, over the area: 0 to 1.
+    """Return the length of the sum of area vectors over the sum of areas: 0 to 1.
 
-    Those of a closed surface add up to nothing.
+    Area vectors are along the normals; the area vectors of a closed surface add up to zero.
     """
     total = np.zeros(3)
     area = 0.0
@@ -216,9 +217,9 @@ def _openness(scene: Scene) -> float:
 
 
 def directions_around(count: int) -> Floats:
-    """Make unit vectors (count, 3), evenly spread over a sphere: Fibonacci's spiral."""
+    """Return unit vectors (count, 3), evenly spread over a sphere: Fibonacci's spiral."""
     numbers: Any = np.arange(count) + 0.5
     z = 1 - 2 * numbers / count
-    turn = np.pi * (1 + np.sqrt(5)) * numbers
+    angle = np.pi * (1 + np.sqrt(5)) * numbers
     flat = np.sqrt(1 - z * z)
-    return np.stack([flat * np.cos(turn), flat * np.sin(turn), z], axis=1)
+    return np.stack([flat * np.cos(angle), flat * np.sin(angle), z], axis=1)

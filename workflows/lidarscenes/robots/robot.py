@@ -1,4 +1,4 @@
-"""Robots: links, the joints that hold them, and where each link is at a time."""
+"""Robots: links, the joints between links, and the poses of links over time."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -38,24 +38,25 @@ _log = logging.getLogger(__name__)
 
 @dataclass(frozen=True, eq=False)
 class Joint:
-    """What holds a link.
+    """The connection of a link to its parent link.
 
     Attributes
     ----------
     name
-        Its name.
+        Name of the joint.
     kind
-        revolute, continuous or prismatic, if it moves; else fixed, floating or planar.
+        revolute, continuous or prismatic, if the joint moves; else fixed, floating or planar.
     parent
-        Link that it is on.
+        Name of the parent link.
     origin
-        float64 (4, 4): from its own axes, in which the held link is at zero, to the parent's.
+        float64 (4, 4): from the joint's frame, which is the link's frame at the value zero, to the
+        parent link's frame.
     axis
-        float64 (3,): unit vector about or along which it moves, in its own axes.
+        float64 (3,): unit vector about or along which the joint moves, in the joint's frame.
     limits
-        Least and largest value, radians or metres; None if there are none.
+        Smallest and largest value, radians or metres; None without limits.
     mimic
-        Another joint, and factor and offset of its value; None if it has a value of its own.
+        Another joint, and factor and offset of its value; None for a joint with its own value.
     """
 
     name: str
@@ -68,29 +69,29 @@ class Joint:
 
     @property
     def moves(self) -> bool:
-        """Whether it has a value."""
+        """Whether the joint moves, and so has a value."""
         return self.kind in MOVING
 
 
 @dataclass(frozen=True, eq=False)
 class Robot:
-    """Links, and the joints that hold them; read by `load_robot`.
+    """Links, and the joints between links; read by `load_robot`.
 
     Values of joints are radians or metres. `joints` of the methods are a table (a file with a
     header), or a mapping: of a joint's name to its value, or, with time_s, to its values at these
-    seconds by the trajectory's clock. Values between are linear in time. A joint without values
-    follows the one that it mimics, else it is at zero, or at its limit nearest to zero.
+    seconds by the trajectory's clock. Values in between are linear in time. A joint without values
+    follows the joint that it mimics, else it is at zero, or at its limit nearest to zero.
 
     Attributes
     ----------
     name
-        Its name.
+        Name of the robot.
     links
         Names of the links: the root first, each after its parent.
     joints
-        {link: what holds it}, of all but the root.
+        {link: joint that holds the link}, of all links but the root.
     meshes
-        {link: what is seen of it, in its axes}, of the links that have something.
+        {link: mesh in the link's frame}, of the links with a visual mesh.
     """
 
     name: str
@@ -103,7 +104,7 @@ class Robot:
 
     @property
     def summary(self) -> str:
-        """Links, joints that move, and triangles, in words."""
+        """Numbers of links, moving joints and triangles, in words."""
         triangles = sum(len(mesh.faces) for mesh in self.meshes.values())
         verb = "moves" if len(self.moving) == 1 else "move"
         moving = ", ".join(self.moving[:6]) + ", …" * (len(self.moving) > 6)
@@ -112,8 +113,9 @@ class Robot:
         )
 
     @cached_property
-    def _made(self) -> dict[frozenset[str], dict[str, SceneMesh]]:
-        return {}  # see `_bodies`
+    def _body_meshes(self) -> dict[frozenset[str], dict[str, SceneMesh]]:
+        """Results of `_bodies`, {links left out: result}."""
+        return {}
 
     @cached_property
     def moving(self) -> tuple[str, ...]:
@@ -128,14 +130,15 @@ class Robot:
         *,
         ignore: Sequence[str] = (),
     ) -> Trajectory:
-        """Trajectory of a link, whose root has a trajectory. It stands if nothing moves it.
+        """Return the trajectory of a link, by the trajectory of the root.
 
-        `ignore` are names of columns of a table of joints to leave out, with * and ?.
+        `joints` are values of joints, see `Robot`; `ignore` are names of columns of a table of
+        joints to leave out, with * and ?.
 
         Raises
         ------
         LidarError
-            If there is no such link, or the joints cannot be used.
+            If the robot has no such link, or the joints cannot be used.
         """
         if link not in self.joints and link != self.links[0]:
             raise LidarError(f"{self.name} has no link {link!r}.{did_you_mean(link, self.links)}")
@@ -152,16 +155,16 @@ class Robot:
         ignore: Sequence[str] = (),
         tell: Callable[[str], None] = _log.warning,
     ) -> tuple[Actor, ...]:
-        """Make an actor of each link that a joint moves, with the links that are fixed to it.
+        """Return an actor for each link that a joint moves, with the links fixed to the link.
 
         Parameters
         ----------
         trajectory
-            Of the root link.
+            Trajectory of the root link.
         joints
             Values of joints, see `Robot`.
         name
-            Of the robot. Actors are called NAME/LINK, by the first link that has triangles.
+            Name of the robot. Actors are called NAME/LINK, by the first link with triangles.
         without
             Links to leave out.
         ignore
@@ -175,10 +178,10 @@ class Robot:
             If the joints cannot be used.
         """
         times_s, values = self._values(joints, ignore, tell)
-        called = self.name if name is None else name
+        robot_name = self.name if name is None else name
         return tuple(
             Actor(
-                replace(mesh, name=f"{called}/{mesh.name}"),
+                replace(mesh, name=f"{robot_name}/{mesh.name}"),
                 self._path(body, trajectory, times_s, values),
                 spray=False,
             )
@@ -186,74 +189,83 @@ class Robot:
         )
 
     def _bodies(self, without: frozenset[str]) -> dict[str, SceneMesh]:
-        """Return {link that moves by itself: all that is fixed to it}, made once.
+        """Return the bodies: {moving link: mesh of the link with all links fixed on top}.
 
-        Actors that share arrays share a tree. Each is named by its first link with triangles.
+        A body is named by its first link with triangles. Meshes are joined once, since actors that
+        share arrays share a tree.
         """
-        if without not in self._made:
+        if without not in self._body_meshes:
             parts: dict[str, list[SceneMesh]] = {}
             names: dict[str, str] = {}
-            owner = {self.links[0]: (self.links[0], np.eye(4))}  # {link: its body, its place}
+            # {link: moving link of its body, matrix from the link's frame to the body's}
+            bodies = {self.links[0]: (self.links[0], np.eye(4))}
             for link in self.links:
                 if (joint := self.joints.get(link)) is not None:
-                    body, place = owner[joint.parent]
-                    owner[link] = (
-                        (link, np.eye(4)) if joint.moves else (body, matmul(place, joint.origin))
+                    body, matrix = bodies[joint.parent]
+                    bodies[link] = (
+                        (link, np.eye(4)) if joint.moves else (body, matmul(matrix, joint.origin))
                     )
                 if (mesh := self.meshes.get(link)) is not None:
-                    body, place = owner[link]
+                    body, matrix = bodies[link]
                     names.setdefault(body, link)
                     if link not in without:
-                        moved = mesh.moved(link, place[:3, :3], place[:3, 3])
+                        moved = mesh.moved(link, matrix[:3, :3], matrix[:3, 3])
                         parts.setdefault(body, []).append(moved)
-            self._made[without] = {
-                body: join_meshes(names[body], own) for body, own in parts.items()
+            self._body_meshes[without] = {
+                body: join_meshes(names[body], meshes) for body, meshes in parts.items()
             }
-        return self._made[without]
+        return self._body_meshes[without]
 
     def _path(
         self, link: str, base: Trajectory, times_s: Floats, values: Mapping[str, Floats]
     ) -> Trajectory:
-        """Trajectory of a link; joints whose values do not change are taken as rigid."""
+        """Return the trajectory of a link; joints whose values do not change are rigid."""
         chain: list[Joint] = []
         while link in self.joints:
             chain.insert(0, self.joints[link])
             link = chain[0].parent
         hinges: list[Hinge] = []
-        place = np.eye(4)
+        matrix = np.eye(4)
         for joint in chain:
-            place = matmul(place, joint.origin)
+            matrix = matmul(matrix, joint.origin)
             if joint.moves:
                 value = values[joint.name]
                 slides = joint.kind == "prismatic"
                 if np.ptp(value):
-                    hinges.append(Hinge(place, joint.axis, slides, value))
-                    place = np.eye(4)
+                    hinges.append(Hinge(matrix, joint.axis, slides, value))
+                    matrix = np.eye(4)
                 elif slides:
-                    place[:3, 3] += applied(place[:3, :3], joint.axis * value[0])
+                    matrix[:3, 3] += applied(matrix[:3, :3], joint.axis * value[0])
                 elif value[0]:
-                    turn = rotation_about(joint.axis, np.degrees(value[0]))
-                    place[:3, :3] = matmul(place[:3, :3], turn)
-        if not hinges and (place == np.eye(4)).all():
+                    rotation = rotation_about(joint.axis, np.degrees(value[0]))
+                    matrix[:3, :3] = matmul(matrix[:3, :3], rotation)
+        if not hinges and (matrix == np.eye(4)).all():
             return base
         if not hinges and isinstance(base, Stations):
-            own = Pose.of(place[:3, 3], place[:3, :3])
-            return Stations(tuple(pose.then(own) for pose in base.at))
-        return LinkPath(base, tuple(hinges), place, times_s, getattr(base, "start_s", None) or 0.0)
+            mount = Pose.from_rotation(matrix[:3, 3], matrix[:3, :3])
+            return Stations(tuple(pose.compose(mount) for pose in base.at))
+        return LinkPath(base, tuple(hinges), matrix, times_s, getattr(base, "start_s", None) or 0.0)
 
     def _values(
         self,
-        given: Joints | None,
+        joints: Joints | None,
         ignore: Sequence[str],
         tell: Callable[[str], None] = lambda line: None,
     ) -> tuple[Floats, dict[str, Floats]]:
-        """Return times (k,), and values (k,) of all joints that move."""
+        """Return times (k,), seconds, and values {joint: (k,)} of all joints that move."""
         table: dict[str, Any] = {}
-        if isinstance(given, (str, Path)):
-            table = self._read_values(Path(given), ignore)
-        elif given is not None:
-            table = {name: as_array(name, value).reshape(-1) for name, value in given.items()}
+        if isinstance(joints, (str, Path)):
+            table = self._read_values(Path(joints), ignore)
+        elif joints is not None:
+            table = {name: as_array(name, value).reshape(-1) for name, value in joints.items()}
         times = table.pop("time_s", np.zeros(1))
+        self._check_table(times, table)
+        self._add_missing(table, len(times))
+        self._tell_limits(table, tell)
+        return times, table
+
+    def _check_table(self, times: Floats, table: Mapping[str, Floats]) -> None:
+        """Check the times (k,) and values {joint: (k,)} of a table; LidarError if wrong."""
         for name, value in table.items():
             if name not in self.moving:
                 raise LidarError(
@@ -267,31 +279,41 @@ class Robot:
                 )
         if not (len(times) and np.isfinite(times).all() and (np.diff(times) > 0).all()):
             raise LidarError("time_s of joints must be finite, and ascend.")
-        joints = {joint.name: joint for joint in self.joints.values() if joint.moves}
+
+    def _moving_joints(self) -> dict[str, Joint]:
+        """Return the joints that move, {name: joint}."""
+        return {joint.name: joint for joint in self.joints.values() if joint.moves}
+
+    def _add_missing(self, table: dict[str, Floats], count: int) -> None:
+        """Add the values (count,) of joints that are not in a table: mimicked, or at rest."""
+        joints = self._moving_joints()
         for name in joints:
             chain = [joints[name]]
             while chain[-1].name not in table and (mimic := chain[-1].mimic) is not None:
                 chain.append(joints[mimic[0]])
             if chain[-1].name not in table:
-                low, high = chain[-1].limits or (0.0, 0.0)
-                table[chain[-1].name] = np.full(len(times), min(max(0.0, low), max(high, low)))
-            for one in chain[-2::-1]:
-                assert one.mimic is not None
-                other, factor, offset = one.mimic
-                table[one.name] = factor * table[other] + offset
-        for name, joint in joints.items():
-            low, high = joint.limits or (-np.inf, np.inf)
-            least = table[name].min()
-            most = table[name].max()
-            if least < low - 1e-6 or most > high + 1e-6:
+                lower, upper = chain[-1].limits or (0.0, 0.0)
+                nearest_zero = min(max(0.0, lower), max(upper, lower))
+                table[chain[-1].name] = np.full(count, nearest_zero)
+            for joint in chain[-2::-1]:
+                assert joint.mimic is not None
+                mimicked, factor, offset = joint.mimic
+                table[joint.name] = factor * table[mimicked] + offset
+
+    def _tell_limits(self, table: Mapping[str, Floats], tell: Callable[[str], None]) -> None:
+        """Tell of the joints whose values are beyond their limits."""
+        for name, joint in self._moving_joints().items():
+            lower, upper = joint.limits or (-np.inf, np.inf)
+            min_value = table[name].min()
+            max_value = table[name].max()
+            if min_value < lower - 1e-6 or max_value > upper + 1e-6:
                 tell(
-                    f"{self.name}: joint {name} goes from {least:.4g} to {most:.4g}, beyond its "
-                    f"limits of {low:.4g} to {high:.4g}"
+                    f"{self.name}: joint {name} goes from {min_value:.4g} to {max_value:.4g}, "
+                    f"beyond its limits of {lower:.4g} to {upper:.4g}"
                 )
-        return times, table
 
     def _read_values(self, path: Path, ignore: Sequence[str]) -> dict[str, Floats]:
-        """Read a table of values; LidarError if it cannot be used."""
+        """Return the values in a file with a table of joints; LidarError for an unusable file."""
         quantities = [
             Quantity(
                 joint.name,
@@ -325,148 +347,180 @@ class Robot:
 
 @dataclass(frozen=True, eq=False)
 class Hinge:
-    """A joint whose value changes, in a chain of them."""
+    """A joint whose value changes, in a chain of hinges."""
 
-    before: Floats  # (4, 4): from its axes to those of the link that the one before moves
-    axis: Floats  # (3,)
-    slides: bool
-    values: Floats  # (k,)
+    before: Floats  # (4, 4): from the joint's frame to the frame behind the hinge before
+    axis: Floats  # (3,): unit vector, in the joint's frame
+    slides: bool  # along its axis; else it turns
+    values: Floats  # (k,): radians or metres
 
 
 @dataclass(frozen=True, eq=False)
 class LinkPath:
-    """Trajectory of a link: that of the robot's root, and of each joint in between.
+    """Trajectory of a link, by the trajectory of the robot's root and the joints in between.
 
-    Poses are exact at any time: values of joints are linear between those given, and positions are
-    computed from them, not interpolated.
+    Poses are exact at any time: values of joints are linear between their times, and poses are
+    computed from these values, not interpolated.
     """
 
     base: Trajectory
     hinges: tuple[Hinge, ...]
-    last: Floats  # (4, 4): from the link's axes to those of the link that the last joint moves
+    last: Floats  # (4, 4): from the link's frame to the frame behind the last hinge
     times_s: Floats  # (k,): of the joints' values
-    start_s: float  # of the trajectory, by the same clock
+    start_s: float  # start of the trajectory, by the clock of `times_s`
 
     @property
     def stations(self) -> int:
-        """See `Trajectory.stations`."""
+        """Number of stations of the root's trajectory."""
         return self.base.stations
 
     @property
     def moves(self) -> bool:
-        """See `Trajectory.moves`."""
+        """Whether the link moves within a station."""
         return bool(self.hinges) or self.base.moves
 
     @property
     def duration_ns(self) -> float:
-        """See `Trajectory.duration_ns`."""
-        ends = (float(self.times_s[-1]) - self.start_s) * 1e9 if self.hinges else np.inf
-        return min(self.base.duration_ns, ends)
+        """Duration for which the root has poses and the joints have values, nanoseconds."""
+        if not self.hinges:
+            return self.base.duration_ns
+        return min(self.base.duration_ns, (float(self.times_s[-1]) - self.start_s) * 1e9)
 
     @property
     def presence_ns(self) -> tuple[float, float]:
-        """See `lidarsim.sensor.trajectory.presence_ns`."""
+        """First and last nanosecond at which the robot is in the scene."""
         return presence_ns(self.base)
 
     def pose(self, station: int, time_ns: float = 0.0) -> Pose:
-        """See `Trajectory.pose`."""
+        """Return the pose at a time since the start of a station, nanoseconds."""
         positions, rotations = self.poses(station, np.array([time_ns], np.float64))
-        return Pose.of(positions[0], rotations[0])
+        return Pose.from_rotation(positions[0], rotations[0])
 
     def poses(self, station: int, times_ns: Floats) -> tuple[Floats, Floats]:
-        """See `Trajectory.poses`.
+        """Return positions (k, 3) and rotations (k, 3, 3) at times (k,) of a station, ns.
 
-        All sums are in one order of rounding, however many times there are.
+        All sums are in one order of rounding, for any number of times.
 
         Raises
         ------
         LidarError
             If the trajectory or the joints have no values for a time.
         """
-        place, turn, *_ = self._along(station, times_ns, moving=False)
-        return place.T, turn.transpose(2, 0, 1)
+        times_ns = np.clip(times_ns, *self.presence_ns)  # poses while absent do not count
+        motion = self._root_motion(station, times_ns, moving=False)
+        moments_s = self._moments_s(times_ns)
+        for hinge in self.hinges:
+            value = interp(moments_s, self.times_s, hinge.values)
+            motion = motion.transformed(hinge.before).through(hinge, value)
+        motion = motion.transformed(self.last)
+        return motion.positions.T, motion.rotations.transpose(2, 0, 1)
 
     def velocities(self, station: int, times_ns: Floats) -> tuple[Floats, Floats]:
-        """See `lidarsim.sensor.trajectory.velocities`: exact, through all joints.
+        """Return velocities (k, 3), m/s, and angular velocities (k, 3), rad/s, at times (k,), ns.
 
-        At a given value of a joint they are those behind it.
+        Both are in the scene frame, and exact through all joints; at a time of the joints' values,
+        they are those of the interval that follows.
 
         Raises
         ------
         LidarError
             If the trajectory or the joints have no values for a time.
         """
-        _, _, velocity, rate = self._along(station, times_ns, moving=True)
-        return velocity.T, rate.T
-
-    def _along(
-        self, station: int, times_ns: Floats, moving: bool
-    ) -> tuple[Floats, Floats, Floats, Floats]:
-        """Return positions (3, k), rotations (3, 3, k), velocities and rates (3, k).
-
-        The last two are zero unless they are asked for.
-        """
-        appears, leaves = self.presence_ns
-        within = (appears <= times_ns) & (times_ns <= leaves)
-        times_ns = np.clip(times_ns, *self.presence_ns)  # elsewhere poses do not count
-        positions, rotations = full_poses(self.base, station, times_ns)
-        place = positions.T
-        turn = rotations.transpose(1, 2, 0)
-        velocity = rate = np.zeros((3, len(times_ns)))
-        if moving:
-            velocity, rate = (part.T for part in velocities(self.base, station, times_ns))
-        at = times_ns / 1e9 + self.start_s
-        low = at.min(initial=np.inf)
-        high = at.max(initial=-np.inf)
-        first, last = self.times_s[[0, -1]]
-        if self.hinges and max(first - low, high - last) > _LATE_S:
-            raise LidarError(
-                f"The joints have values from {first:.9g} to {last:.9g} s; poses are asked for "
-                f"from {low:.9g} to {high:.9g} s."
-            )
-        start = place
+        appears_ns, leaves_ns = self.presence_ns
+        within = (appears_ns <= times_ns) & (times_ns <= leaves_ns)
+        times_ns = np.clip(times_ns, appears_ns, leaves_ns)
+        motion = self._root_motion(station, times_ns, moving=True)
+        moments_s = self._moments_s(times_ns)
         for hinge in self.hinges:
-            place, turn = _then(place, turn, hinge.before)
-            value = interp(at, self.times_s, hinge.values)
-            if moving:
-                velocity = velocity + np.cross(rate, place - start, axis=0)
-                start = place
-                along = _times(turn, hinge.axis[:, None, None] * self._slopes(hinge, at))[:, 0]
-            if hinge.slides:
-                place = place + _times(turn, hinge.axis[:, None, None] * value)[:, 0]
-                if moving:
-                    velocity = velocity + along
-            else:  # Rodrigues, 1840
-                cross = np.cross(np.eye(3), hinge.axis)
-                square = matmul(cross, cross)
-                sine, cosine = sin_cos(value)
-                spin = sine * cross[..., None] + (1 - cosine) * square[..., None]
-                turn = _times(turn, spin + np.eye(3)[..., None])
-                if moving:
-                    rate = rate + along
-        place, turn = _then(place, turn, self.last)
-        if moving:
-            velocity = (velocity + np.cross(rate, place - start, axis=0)) * within
-        return place, turn, velocity, rate * within
+            value = interp(moments_s, self.times_s, hinge.values)
+            at_hinge = motion.transformed(hinge.before).anchored()
+            driven = at_hinge.driven(hinge, self._slopes(hinge, moments_s))
+            motion = driven.through(hinge, value)
+        motion = motion.transformed(self.last).anchored()
+        return (motion.velocities * within).T, (motion.rates * within).T
 
-    def _slopes(self, hinge: Hinge, at: Floats) -> Floats:
-        """Rates of a joint's value at times (k,), a second."""
+    def _root_motion(self, station: int, times_ns: Floats, moving: bool) -> _LinkMotion:
+        """Return the motion of the root at times (k,); velocities are zero unless `moving`."""
+        positions, rotations = full_poses(self.base, station, times_ns)
+        linear = angular = np.zeros((len(times_ns), 3))
+        if moving:
+            linear, angular = velocities(self.base, station, times_ns)
+        return _LinkMotion(
+            positions=positions.T,
+            rotations=rotations.transpose(1, 2, 0),
+            anchors=positions.T,
+            velocities=linear.T,
+            rates=angular.T,
+        )
+
+    def _moments_s(self, times_ns: Floats) -> Floats:
+        """Return times (k,) by the clock of the joints' values, seconds; LidarError if outside."""
+        moments_s = times_ns / 1e9 + self.start_s
+        first_s = moments_s.min(initial=np.inf)
+        last_s = moments_s.max(initial=-np.inf)
+        start_s, stop_s = self.times_s[[0, -1]]
+        if self.hinges and max(start_s - first_s, last_s - stop_s) > _LATE_S:
+            raise LidarError(
+                f"The joints have values from {start_s:.9g} to {stop_s:.9g} s; poses are asked for "
+                f"from {first_s:.9g} to {last_s:.9g} s."
+            )
+        return moments_s
+
+    def _slopes(self, hinge: Hinge, moments_s: Floats) -> Floats:
+        """Return the rates of change of a joint's value at times (k,), per second: (k,)."""
         if len(self.times_s) < 2:
-            return np.zeros(len(at))
+            return np.zeros(len(moments_s))
         slopes = np.diff(hinge.values) / np.diff(self.times_s)
-        segment = np.searchsorted(self.times_s, at, "right") - 1
-        inside = (self.times_s[0] <= at) & (at <= self.times_s[-1])
+        segment = np.searchsorted(self.times_s, moments_s, "right") - 1
+        inside = (self.times_s[0] <= moments_s) & (moments_s <= self.times_s[-1])
         return np.asarray(slopes[np.clip(segment, 0, len(slopes) - 1)] * inside)
 
 
-def _times(one: Floats, other: Floats) -> Floats:
-    """Product of matrices (3, 3, k) and (3, m, k); k may be 1."""
+class _LinkMotion(NamedTuple):
+    """Poses and velocities of a frame of the robot at k times, in the scene frame."""
+
+    positions: Floats  # (3, k): metres
+    rotations: Floats  # (3, 3, k)
+    anchors: Floats  # (3, k): points of the frame that have the velocities
+    velocities: Floats  # (3, k): m/s
+    rates: Floats  # (3, k): angular velocities, rad/s
+
+    def transformed(self, matrix: Floats) -> _LinkMotion:
+        """Return the motion of the frame with a constant pose (4, 4) in this frame."""
+        moved = _product(self.rotations, matrix[:3, :, None])
+        return self._replace(positions=self.positions + moved[:, 3], rotations=moved[:, :3])
+
+    def anchored(self) -> _LinkMotion:
+        """Return the motion with the velocities of the frame's origin."""
+        levers = self.positions - self.anchors
+        moved = self.velocities + np.cross(self.rates, levers, axis=0)
+        return self._replace(anchors=self.positions, velocities=moved)
+
+    def driven(self, hinge: Hinge, slopes: Floats) -> _LinkMotion:
+        """Return the motion with the velocity of a hinge, whose value changes by `slopes` (k,)."""
+        added = _product(self.rotations, hinge.axis[:, None, None] * slopes)[:, 0]
+        if hinge.slides:
+            return self._replace(velocities=self.velocities + added)
+        return self._replace(rates=self.rates + added)
+
+    def through(self, hinge: Hinge, value: Floats) -> _LinkMotion:
+        """Return the motion with the poses behind a hinge with values (k,)."""
+        if hinge.slides:
+            slide = _product(self.rotations, hinge.axis[:, None, None] * value)[:, 0]
+            return self._replace(positions=self.positions + slide)
+        cross = np.cross(np.eye(3), hinge.axis)  # Rodrigues, 1840
+        square = matmul(cross, cross)
+        sine, cosine = sin_cos(value)
+        spin = sine * cross[..., None] + (1 - cosine) * square[..., None]
+        return self._replace(rotations=_product(self.rotations, spin + np.eye(3)[..., None]))
+
+
+def _product(left_matrices: Floats, right_matrices: Floats) -> Floats:
+    """Return the products of matrices (3, 3, k) and (3, m, k); k may be 1."""
     return np.asarray(
-        (one[:, 0, None] * other[0] + one[:, 1, None] * other[1]) + one[:, 2, None] * other[2]
+        (
+            left_matrices[:, 0, None] * right_matrices[0]
+            + left_matrices[:, 1, None] * right_matrices[1]
+        )
+        + left_matrices[:, 2, None] * right_matrices[2]
     )
-
-
-def _then(place: Floats, turn: Floats, matrix: Floats) -> tuple[Floats, Floats]:
-    """Positions (3, k) and rotations (3, 3, k), followed by the same step (4, 4)."""
-    moved = _times(turn, matrix[:3, :, None])
-    return place + moved[:, 3], moved[:, :3]

@@ -1,9 +1,8 @@
 """Robots from URDF files, with the visual meshes of their links.
 
-After the specification at http://wiki.ros.org/urdf/XML, and urdfdom 4 where that leaves something
-open. This is not yourdfpy 0.0.60, which evaluates one pose at a time, reads meshes through trimesh,
-follows entities and takes mesh files from anywhere: what remained of it would be the names of forty
-attributes.
+After the specification at http://wiki.ros.org/urdf/XML, and urdfdom 4 where the specification
+leaves questions open. yourdfpy 0.0.60 is not used: it evaluates one pose at a time, reads meshes
+through trimesh, follows entities and reads mesh files in any folder.
 """
 
 from __future__ import annotations
@@ -37,10 +36,10 @@ from lidarsim.sensor.trajectory import rotations_of
 
 from .robot import HELD, MOVING, Joint, Robot
 
-_LINKS_MOST = 1000  # humanoids with hands have 150
+_MAX_LINKS = 1000  # humanoids with hands have 150
 _SIDES = 64  # of a cylinder: its faces are 0.12 % of the radius inside it at most
-_UP = 5  # folders above a robot's file in which its packages are looked for
-_FARTHEST = 1e8  # of any number in a file
+_MAX_FOLDERS_UP = 5  # folders above a robot's file in which its packages are looked for
+_MAX_NUMBER = 1e8  # in a file
 
 
 @checked
@@ -55,20 +54,22 @@ def load_robot(
     """Read a robot from a URDF file, with the visual meshes of its links.
 
     Mesh files are read from the robot's package only: the folder with a package.xml, at most five
-    above the file, or, where there is none, the folder above the file's. A name that begins with
-    package://NAME is looked for in folders called NAME, or whose package.xml has that name, beside
-    the file and at most five folders above. As in RViz, a mesh keeps its file's axes, whatever
-    up-axis that states, and a .dae its unit.
+    above the file, or, without a package.xml, the parent of the file's folder. A name that begins
+    with package://NAME is looked for in folders called NAME, or whose package.xml has that name,
+    beside the file and at most five folders above. As in RViz, a mesh keeps the axes of its file,
+    even if the file states an up-axis, and a .dae its unit.
 
     Parameters
     ----------
     path
         A .urdf file; a .xacro has to be expanded before.
-    opacity, colours, materials
-        As of `load_meshes`. A material of the URDF is for shapes, and meshes without colours, or
-        without materials.
+    opacity
+        Use of transparent textures: see `load_meshes`.
+    colours, materials
+        Whether colours and names of materials are read. A material of the URDF applies to shapes,
+        and to meshes without colours, or without materials.
     tell
-        Called with a line on what was left out.
+        Called with a line on content that is left out.
 
     Raises
     ------
@@ -76,18 +77,39 @@ def load_robot(
         If the file or a mesh cannot be read, or the joints do not make a tree.
     """
     path = Path(path)
+    root, size = _read_root(path)
+    with prefixed(path), np.errstate(all="ignore"):  # infinite values are refused
+        name = printable(root.get("name", "")) or path.stem
+        links = {_name(element): element for element in _named(root, "link")}
+        joints = _joints(root, links, lambda line: tell(f"{path}: {line}"))
+        order = _in_order(list(links), joints)
+        _check_mimics(joints)
+        reader = _LinkMeshes(path, root, size, opacity, colours, materials, tell)
+        meshes = {}
+        for link in order:
+            with prefixed(f"link {link!r}"):
+                if parts := list(reader.meshes_of(link, links[link])):
+                    meshes[link] = join_meshes(link, parts)
+        reader.tell_left_out()
+        if not meshes:
+            raise LidarError("no link has a <visual> with triangles: there is nothing to see.")
+    return Robot(name, tuple(order), {link: joints[link] for link in order[1:]}, meshes)
+
+
+def _read_root(path: Path) -> tuple[Element, int]:
+    """Return the <robot> of a URDF file, and the size of the file, bytes."""
     try:
         data = read_input(path)
     except (OSError, ValueError) as error:
         reason = getattr(error, "strerror", None) or error
         raise LidarError(f"{path} cannot be read: {reason}.") from error
     target = path.name.removesuffix(".xacro").removesuffix(".urdf")
-    target += ".expanded" * (path.suffix != ".xacro")  # not to write over what is read
+    target += ".expanded" * (path.suffix != ".xacro")  # so that the file is not overwritten
     expand = f"{path} is xacro: expand it first: xacro {path.name} > {target}.urdf"
     if path.suffix.lower() == ".xacro":
         raise LidarError(expand)
     try:
-        root = xml_root(data.lstrip())  # some begin with an empty line
+        root = xml_root(data.lstrip())  # some files begin with an empty line
     except (ParseError, ValueError, LookupError) as error:  # an unknown encoding
         if b"<xacro:" in data:
             raise LidarError(expand) from error
@@ -95,77 +117,69 @@ def load_robot(
     if any("xacro" in element.tag for element in root.iter()):
         raise LidarError(expand)
     if root.tag != "robot":
-        other = "; convert an SDF to URDF first" * (root.tag == "sdf")
-        raise LidarError(f"{path} is no URDF: it begins with <{root.tag[:40]}>{other}.")
-    with prefixed(path), np.errstate(all="ignore"):  # infinite values are refused
-        name = printable(root.get("name", "")) or path.stem
-        links = {_name(element): element for element in _named(root, "link")}
-        held = {}
-        for element in _named(root, "joint"):
-            with prefixed(f"joint {_name(element)!r}"):
-                child, joint = _joint(element, links)
-                if child in held:
-                    raise LidarError(f"link {child!r} has two joints that hold it.")
-                if joint.kind in HELD[1:]:
-                    tell(f"{path}: joint {joint.name} is {joint.kind}: it stays at zero")
-                held[child] = joint
-        order = _in_order(list(links), held)
-        _check_mimics(held)
-        looks = _Looks(path, root, len(data), opacity, colours, materials, tell)
-        meshes = {}
-        for link in order:
-            with prefixed(f"link {link!r}"):
-                if parts := list(looks.of(link, links[link])):
-                    meshes[link] = join_meshes(link, parts)
-        looks.tell_rest()
-        if not meshes:
-            raise LidarError("no link has a <visual> with triangles: there is nothing to see.")
-    return Robot(name, tuple(order), {link: held[link] for link in order[1:]}, meshes)
+        advice = "; convert an SDF to URDF first" * (root.tag == "sdf")
+        raise LidarError(f"{path} is no URDF: it begins with <{root.tag[:40]}>{advice}.")
+    return root, len(data)
+
+
+def _joints(root: Element, links: Collection[str], tell: Callable[[str], None]) -> dict[str, Joint]:
+    """Return the joints of a robot: {link that a joint holds: joint}."""
+    joints: dict[str, Joint] = {}
+    for element in _named(root, "joint"):
+        with prefixed(f"joint {_name(element)!r}"):
+            child, joint = _joint(element, links)
+            if child in joints:
+                raise LidarError(f"link {child!r} has two joints that hold it.")
+            if joint.kind in HELD[1:]:
+                tell(f"joint {joint.name} is {joint.kind}: it stays at zero")
+            joints[child] = joint
+    return joints
 
 
 def _name(element: Element) -> str:
+    """Return the name of an element, without characters that cannot be printed."""
     return printable(element.get("name", ""))
 
 
 def _material(visual: Element) -> FaceMaterials | None:
-    """Material of a visual, by its name; None without."""
+    """Return the material of a visual, by its name; None without a material."""
     material = visual.find("material")
     return None if material is None else FaceMaterials.named(material.get("name", ""))
 
 
 def _named(root: Element, kind: str) -> list[Element]:
-    """Elements of a kind, each with its own name."""
-    found = root.findall(kind)
-    if len(found) > _LINKS_MOST:
-        raise LidarError(f"it has {len(found):,} {kind}s; at most {_LINKS_MOST:,} are read.")
-    names = [_name(element) for element in found]
-    if twice := next((name for name in names if name and names.count(name) > 1), None):
-        raise LidarError(f"two {kind}s have the name {twice!r}: give each its own.")
+    """Return the elements of a kind; LidarError unless all have different names."""
+    elements = root.findall(kind)
+    if len(elements) > _MAX_LINKS:
+        raise LidarError(f"it has {len(elements):,} {kind}s; at most {_MAX_LINKS:,} are read.")
+    names = [_name(element) for element in elements]
+    if duplicate := next((name for name in names if name and names.count(name) > 1), None):
+        raise LidarError(f"two {kind}s have the name {duplicate!r}: give each its own.")
     if "" in names:
         raise LidarError(f"a {kind} has no name.")
-    return found
+    return elements
 
 
 def _numbers(element: Element | None, name: str, count: int, default: str) -> Floats:
-    """Read the numbers of an attribute; `default` if it, or the element, is not there."""
+    """Return `count` numbers of an attribute; of `default` without attribute or element."""
     text = default if element is None else element.get(name, default)
     try:
         values = np.array(text.split(), np.float64)
     except ValueError:
         values = np.zeros(0)
-    if len(values) != count or not (np.abs(values) <= _FARTHEST).all():  # nor NaN
+    if len(values) != count or not (np.abs(values) <= _MAX_NUMBER).all():  # nor NaN
         tag = "" if element is None else element.tag
-        what = "a finite number" if count == 1 else f"{count} finite numbers"
+        expected = "a finite number" if count == 1 else f"{count} finite numbers"
         hint = " Expand the file by xacro first." * ("$" in text)
-        raise LidarError(f"{name} of <{tag}> is {shown(text)}; it must be {what}.{hint}")
+        raise LidarError(f"{name} of <{tag}> is {shown(text)}; it must be {expected}.{hint}")
     return values
 
 
-def _place(element: Element) -> Floats:
-    """Matrix (4, 4) of an <origin>: rotated about the fixed x, y and z axes, then moved."""
+def _origin(element: Element) -> Floats:
+    """Return the matrix (4, 4) of an <origin>: rotated about fixed x, y and z axes, then moved."""
     origin = element.find("origin")
-    place, angles = (_numbers(origin, name, 3, "0 0 0") for name in ("xyz", "rpy"))
-    return affine(rotations_of(np.degrees(angles[::-1])) if angles.any() else np.eye(3), place)
+    position, angles = (_numbers(origin, name, 3, "0 0 0") for name in ("xyz", "rpy"))
+    return affine(rotations_of(np.degrees(angles[::-1])) if angles.any() else np.eye(3), position)
 
 
 def _joint(element: Element, links: Collection[str]) -> tuple[str, Joint]:
@@ -175,13 +189,13 @@ def _joint(element: Element, links: Collection[str]) -> tuple[str, Joint]:
         raise LidarError(
             f"its type is {shown(kind)}; it must be one of {', '.join((*MOVING, *HELD))}."
         )
-    ends = []
-    for which in ("parent", "child"):
-        found = element.find(which)
-        link = printable("" if found is None else found.get("link", ""))
+    end_links = []
+    for end in ("parent", "child"):
+        link_element = element.find(end)
+        link = printable("" if link_element is None else link_element.get("link", ""))
         if link not in links:
-            raise LidarError(f"its {which} {link!r} is no link of the file.")
-        ends.append(link)
+            raise LidarError(f"its {end} {link!r} is no link of the file.")
+        end_links.append(link)
     axis = np.array([1.0, 0.0, 0.0])
     limits = None
     mimic = None
@@ -192,55 +206,56 @@ def _joint(element: Element, links: Collection[str]) -> tuple[str, Joint]:
         axis = axis / size
         limit = element.find("limit")
         if kind != "continuous" and limit is not None:
-            low, high = (_numbers(limit, name, 1, "0").item() for name in ("lower", "upper"))
-            limits = (low, high) if low <= high else None
-        if (other := element.find("mimic")) is not None:
+            lower, upper = (_numbers(limit, name, 1, "0").item() for name in ("lower", "upper"))
+            limits = (lower, upper) if lower <= upper else None
+        if (mimicked := element.find("mimic")) is not None:
             factor, offset = (
-                _numbers(other, name, 1, default).item()
+                _numbers(mimicked, name, 1, default).item()
                 for name, default in (("multiplier", "1"), ("offset", "0"))
             )
-            mimic = (printable(other.get("joint", "")), factor, offset)
-    parent, child = ends
-    return child, Joint(_name(element), kind, parent, _place(element), axis, limits, mimic)
+            mimic = (printable(mimicked.get("joint", "")), factor, offset)
+    parent, child = end_links
+    return child, Joint(_name(element), kind, parent, _origin(element), axis, limits, mimic)
 
 
-def _in_order(links: list[str], held: Mapping[str, Joint]) -> list[str]:
-    """Links, each after its parent; LidarError if they are not one tree."""
-    roots = [link for link in links if link not in held]
+def _in_order(links: list[str], joints: Mapping[str, Joint]) -> list[str]:
+    """Return the links, each after its parent; LidarError unless links and joints are a tree."""
+    roots = [link for link in links if link not in joints]
     if not links:
         raise LidarError("it has no link.")
     if len(roots) > 1:
         raise LidarError(
             f"links {roots[0]!r} and {roots[1]!r} are not connected: one root must hold all links."
         )
-    above = {link: [held[link].parent] if link in held else [] for link in links}
+    parents = {link: [joints[link].parent] if link in joints else [] for link in links}
     try:
-        return [*TopologicalSorter(above).static_order()]
+        return [*TopologicalSorter(parents).static_order()]
     except CycleError as error:
         raise LidarError(
             f"the joints of link {error.args[1][0]!r} go round in a circle."
         ) from error
 
 
-def _check_mimics(held: Mapping[str, Joint]) -> None:
-    moving = {joint.name: joint.mimic for joint in held.values() if joint.moves}
-    others = {name: [mimic[0]] for name, mimic in moving.items() if mimic is not None}
-    for name, (other,) in others.items():
-        if other not in moving:
-            raise LidarError(f"joint {name!r} mimics {other!r}, which does not move.")
+def _check_mimics(joints: Mapping[str, Joint]) -> None:
+    """Check that joints mimic moving joints, and not themselves."""
+    moving = {joint.name: joint.mimic for joint in joints.values() if joint.moves}
+    mimicked_joints = {name: [mimic[0]] for name, mimic in moving.items() if mimic is not None}
+    for name, (mimicked,) in mimicked_joints.items():
+        if mimicked not in moving:
+            raise LidarError(f"joint {name!r} mimics {mimicked!r}, which does not move.")
     try:
-        TopologicalSorter(others).prepare()
+        TopologicalSorter(mimicked_joints).prepare()
     except CycleError as error:
         raise LidarError(f"joint {error.args[1][0]!r} mimics itself, in a circle.") from error
 
 
 @dataclass(eq=False)
-class _Looks:
-    """Reads what is seen of links."""
+class _LinkMeshes:
+    """Reader of the visual meshes of links."""
 
     path: Path
     root: Element
-    size: int
+    size: int  # of the file, bytes
     opacity: OpacityMode
     colours: bool
     materials: bool
@@ -254,12 +269,12 @@ class _Looks:
         materials = self.root.findall("material")
         self._shared = {entry.get("name", ""): entry.find("color") for entry in materials}
         folder = self.path.parent.resolve()
-        self._around = [folder, *folder.parents][: _UP + 1]
-        packages = (one for one in self._around if (one / "package.xml").is_file())
+        self._folders_above = [folder, *folder.parents][: _MAX_FOLDERS_UP + 1]
+        packages = (above for above in self._folders_above if (above / "package.xml").is_file())
         self._package = next(packages, folder.parent)
 
-    def of(self, link: str, element: Element) -> Iterator[SceneMesh]:
-        """Meshes of a link, in its axes."""
+    def meshes_of(self, link: str, element: Element) -> Iterator[SceneMesh]:
+        """Yield the meshes of a link, in the link's frame."""
         visuals = element.findall("visual")
         if not visuals and element.find("collision/geometry") is not None:
             self._collide.append(link)
@@ -267,7 +282,7 @@ class _Looks:
             shape = next(iter(visual.find("geometry") or ()), None)
             if shape is None:
                 raise LidarError("a <visual> has no <geometry>.")
-            place = _place(visual)
+            origin = _origin(visual)
             colour = self._colour(visual)
             scale, parts = self._shape(shape)
             if not scale.all():
@@ -275,25 +290,25 @@ class _Looks:
                 continue
             for part in parts:
                 self._allowance.take(part.vertices.nbytes + part.faces.nbytes)
-                mesh = part.moved(part.name, place[:3, :3] * scale, place[:3, 3])
+                mesh = part.moved(part.name, origin[:3, :3] * scale, origin[:3, 3])
                 if colour is not None and mesh.colours is None:
                     mesh = replace(mesh, colours=Colours.plain(colour, len(mesh.faces)))
                 if self.materials and mesh.materials is None:
                     mesh = replace(mesh, materials=_material(visual))
                 yield mesh
 
-    def tell_rest(self) -> None:
-        """Tell of what was left out."""
-        for links, what in (
+    def tell_left_out(self) -> None:
+        """Tell of the links that were left out."""
+        for links, reason in (
             (self._collide, "have collision shapes and no visual ones, and are left out"),
             (self._flat, "have shapes of size zero, which are left out"),
         ):
             if links:
                 names = ", ".join(dict.fromkeys(links[:3])) + ", …" * (len(links) > 3)
-                self.tell(f"{self.path}: links that {what}: {names}")
+                self.tell(f"{self.path}: links that {reason}: {names}")
 
     def _colour(self, visual: Element) -> Bytes | None:
-        """Colour (1, 1, 3) of a visual, by itself or by the name of a material of the robot."""
+        """Return the colour (1, 1, 3) of a visual, or of its material in the robot, or None."""
         material = visual.find("material")
         if not self.colours or material is None:
             return None
@@ -304,9 +319,9 @@ class _Looks:
         return as_bytes(_numbers(colour, "rgba", 4, "1 1 1 1")[:3]).reshape(1, 1, 3)
 
     def _shape(self, shape: Element) -> tuple[Floats, list[SceneMesh]]:
-        """Return factors (3,), one of which may be zero, and meshes that are to be scaled."""
+        """Return factors (3,) along the axes, which may be zero, and the meshes to be scaled."""
         if shape.tag == "mesh":
-            if len(factors := shape.get("scale", "").split()) == 4:  # as public files have it
+            if len(factors := shape.get("scale", "").split()) == 4:  # as in public files
                 shape.set("scale", " ".join(factors[:3]))
             scale = _numbers(shape, "scale", 3, "1 1 1")
             return scale, self._meshes(shape.get("filename", "")) if scale.all() else []
@@ -328,12 +343,13 @@ class _Looks:
         return np.ones(3), [capsule(radius, length, _SIDES, "capsule")]
 
     def _sizes(self, sizes: Floats) -> Floats:
+        """Return sizes of a shape; LidarError for a negative size."""
         if (sizes < 0).any():
             raise LidarError(f"a size is {sizes.min()}; it must not be negative.")
         return sizes
 
     def _meshes(self, name: str) -> list[SceneMesh]:
-        """Meshes of a file, in its own axes."""
+        """Return the meshes of a file, in the axes of the file."""
         path, package = self._find(name)
         if not path.resolve().is_relative_to(package):
             raise LidarError(
@@ -341,10 +357,10 @@ class _Looks:
                 "the folder of its package, or above it."
             )
         if path not in self._files:
-            # As RViz does, which lets assimp ignore Collada's up_axis
+            # Like RViz, which lets assimp ignore Collada's up_axis
             # (AI_CONFIG_IMPORT_COLLADA_IGNORE_UP_DIRECTION in rviz_rendering's assimp_loader.cpp),
-            # and not its unit. assimp turns no other format.
-            found = load_meshes(
+            # but not its unit. assimp rotates no other format.
+            meshes = load_meshes(
                 path,
                 up_axis="z",
                 opacity=self.opacity,
@@ -354,35 +370,35 @@ class _Looks:
             )
             self._allowance.add_file(path)
             self._files[path] = [
-                one.flat() if isinstance(one, SceneInstance) else one for one in found
+                mesh.flat() if isinstance(mesh, SceneInstance) else mesh for mesh in meshes
             ]
         return self._files[path]
 
     def _find(self, name: str) -> tuple[Path, Path]:
-        """Return the file that a URI names, and the folder that it must be in."""
-        scheme, mark, rest = unquote(name.strip()).partition("://")
+        """Return the file that a URI names, and the folder that must contain the file."""
+        scheme, mark, location = unquote(name.strip()).partition("://")
         if not mark:
             return self.path.parent / scheme, self._package
         if scheme == "file":
-            return Path(rest), self._package
+            return Path(location), self._package
         if scheme not in ("package", "model"):
             raise LidarError(
                 f"its mesh {name[:200]!r} must be a file's name, package://NAME/FILE or file://."
             )
-        called, _, file = rest.partition("/")
-        for folder in self._around if called not in ("", ".", "..") else ():
-            if folder.name == called or _package_name(folder) == called:
+        package, _, file = location.partition("/")
+        for folder in self._folders_above if package not in ("", ".", "..") else ():
+            if folder.name == package or _package_name(folder) == package:
                 return folder / file, folder
-            if (folder / called).is_dir():
-                return folder / called / file, (folder / called).resolve()
+            if (folder / package).is_dir():
+                return folder / package / file, (folder / package).resolve()
         raise LidarError(
             f"its mesh {name[:200]!r} is of a package that is not there: put the .urdf into the "
-            f"folder {called[:80]!r} of that package, or beside it."
+            f"folder {package[:80]!r} of that package, or beside it."
         )
 
 
 def _package_name(folder: Path) -> str:
-    """Name in the package.xml of a folder; empty if there is none."""
+    """Return the name in the package.xml of a folder; empty without a readable package.xml."""
     file = folder / "package.xml"
     try:
         return (xml_root(read_input(file)).findtext("name") or "").strip()
@@ -390,7 +406,7 @@ def _package_name(folder: Path) -> str:
         return ""
 
 
-# Of size 1, but for the radii.
+# Shapes of size 1, or of radius 1.
 _BOX = box("box", (1, 1, 1)).moved("box", np.eye(3), np.array([0, 0, -0.5]))
 _BALL = capsule(1, 0, _SIDES, "sphere")
 _ROD = cylinder(1, 1, _SIDES, "cylinder")

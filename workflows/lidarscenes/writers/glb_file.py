@@ -1,6 +1,6 @@
 """Scenes as .glb files: an object is a node, and its masks and colours are materials.
 
-This is not trimesh, which writes one material for a mesh.
+trimesh is not used: it writes one material for a mesh.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from lidarsim.base.arrays import AnyArray, Bytes, Floats, Indices
+from lidarsim.base.arrays import AnyArray, Bytes, Floats, Indices, Ints32
 from lidarsim.base.errors import LidarError
 from lidarsim.base.vectors import applied, matmul, turned
 from lidarsim.scene.colours import LINEAR
@@ -24,29 +24,29 @@ from lidarsim.scene.scene_instances import SceneInstance
 from lidarsim.scene.scene_mesh import SceneMesh
 from lidarsim.scene.transform import UP_AXES, affine
 
-_MOST_BYTES = 2**32 - 1
-_NEAREST = 9728
-_TYPES = {"f": 5126, "u": 5125}
+_MAX_BYTES = 2**32 - 1
+_NEAREST = 9728  # filter of textures
+_TYPES = {"f": 5126, "u": 5125}  # {kind of NumPy type: component type}
 
 
 def glb_of(scene: Scene) -> bytes:
-    """Content of a .glb file with all objects of a scene but the actors, in metres, Y-up.
+    """Return a .glb file with all objects of a scene but the actors, in metres, Y-up.
 
-    Nodes have the scene's origin, in double precision, so that far scenes lose no digits.
+    Nodes have the scene's origin, in double precision, so that scenes far from zero lose no digits.
 
     Raises
     ------
     LidarError
-        If it would have more than 4 GiB.
+        If the file would have more than 4 GiB.
     """
     writer = _Writer(scene.origin)
-    for name, parts in groupby(scene.meshes(), lambda one: one.name):
-        places: dict[bytes, list[SceneMesh | SceneInstance]] = {}
-        for one in parts:
-            key = one.matrix.tobytes() if isinstance(one, SceneInstance) else b""
-            places.setdefault(key, []).append(one)
-        for found in places.values():
-            writer.add(name, found)
+    for name, parts in groupby(scene.meshes(), lambda mesh: mesh.name):
+        instances: dict[bytes, list[SceneMesh | SceneInstance]] = {}
+        for part in parts:
+            key = part.matrix.tobytes() if isinstance(part, SceneInstance) else b""
+            instances.setdefault(key, []).append(part)
+        for same_place in instances.values():
+            writer.add(name, same_place)
     return writer.data()
 
 
@@ -60,7 +60,7 @@ class _Writer:
         self._meshes: dict[tuple[int, ...], int] = {}  # {ids of parts: number of the mesh}
         # {(id of a mask or image, name): number of the material}
         self._materials: dict[tuple[int, str], int] = {}
-        self._kept: list[Any] = []  # what has these ids
+        self._referenced: list[Any] = []  # parts and images, so that their ids are not reused
         self._tree: dict[str, Any] = {
             "asset": {"version": "2.0", "generator": GENERATOR},
             "scene": 0,
@@ -69,78 +69,95 @@ class _Writer:
         }
 
     def _put(self, kind: str, part: dict[str, Any]) -> int:
-        """Add a part of a kind; its number."""
+        """Add a part of a kind, such as «nodes»; return its number."""
         parts = self._tree.setdefault(kind, [])
         parts.append(part)
         return len(parts) - 1
 
     def add(self, name: str, parts: list[SceneMesh | SceneInstance]) -> None:
-        """Add an object of parts in one place."""
-        meshes = [one.mesh if isinstance(one, SceneInstance) else one for one in parts]
+        """Add an object, whose parts have a common matrix, as a node."""
+        meshes = [part.mesh if isinstance(part, SceneInstance) else part for part in parts]
         key = tuple(id(mesh) for mesh in meshes)
-        far = self._origin.any() and not isinstance(parts[0], SceneInstance)
+        translated = self._origin.any() and not isinstance(parts[0], SceneInstance)
         if key not in self._meshes:
-            self._kept += meshes
-            if far:
-                meshes = [one.moved(name, np.eye(3), -self._origin) for one in meshes]
+            self._referenced += meshes
+            if translated:
+                meshes = [mesh.moved(name, np.eye(3), -self._origin) for mesh in meshes]
             primitives = [primitive for mesh in meshes for primitive in self._primitives(mesh)]
             self._meshes[key] = self._put("meshes", {"name": name, "primitives": primitives})
         node: dict[str, Any] = {"name": name, "mesh": self._meshes[key]}
         if isinstance(parts[0], SceneInstance):
-            turn = affine(UP_AXES["y"].T, np.zeros(3))
-            node["matrix"] = matmul(matmul(turn, parts[0].matrix), turn.T).T.ravel().tolist()
-        elif far:
+            to_y_up = affine(UP_AXES["y"].T, np.zeros(3))
+            node["matrix"] = matmul(matmul(to_y_up, parts[0].matrix), to_y_up.T).T.ravel().tolist()
+        elif translated:
             node["translation"] = applied(UP_AXES["y"].T, self._origin).tolist()
         self._tree["scenes"][0]["nodes"].append(self._put("nodes", node))
 
     def _primitives(self, mesh: SceneMesh) -> list[dict[str, Any]]:
-        """Return opaque triangles by their images, then those of each mask."""
-        first = len(mesh.faces) - sum(len(cut.uv) for cut in mesh.cutouts)
-        colours = mesh.colours
-        out = []
-        image = np.full(first, -1) if colours is None else colours.image[:first]
+        """Return the primitives of opaque triangles by their images, then of each mask."""
+        opaque = len(mesh.faces) - sum(len(cut.uv) for cut in mesh.cutouts)
         names: tuple[str, ...] = ("",)
         index = np.zeros(len(mesh.faces), np.int32)
         if mesh.materials is not None:
             names = mesh.materials.names
             index = index if mesh.materials.index is None else mesh.materials.index
+        primitives = self._opaque_primitives(mesh, index[:opaque], names)
+        return primitives + self._masked_primitives(mesh, opaque, index, names)
+
+    def _opaque_primitives(
+        self, mesh: SceneMesh, index: Ints32, names: tuple[str, ...]
+    ) -> list[dict[str, Any]]:
+        """Return a primitive for each image and material of the first, opaque triangles.
+
+        `index` (n,) are rows of the triangles' materials in `names`.
+        """
+        colours = mesh.colours
+        image = np.full(len(index), -1) if colours is None else colours.image[: len(index)]
         points: int | None = None
-        looks = np.unique(np.column_stack([image, index[:first]]), axis=0)
-        for number, of_material in looks.tolist():
-            rows = np.flatnonzero((image == number) & (index[:first] == of_material))
-            one = uv = tints = None
+        primitives = []
+        appearances = np.unique(np.column_stack([image, index]), axis=0)
+        for number, material in appearances.tolist():
+            rows = np.flatnonzero((image == number) & (index == material))
+            texture = uv = tints = None
             if colours is not None:
                 shown = colours.take(rows)
-                one = colours.images[number]
-                uv = None if one.size == 3 else shown.uv
+                texture = colours.images[number]
+                uv = None if texture.size == 3 else shown.uv
                 if shown.corners is not None and (shown.corners < 255).any():
                     tints = shown.corners
             if uv is None and tints is None:
                 if points is None:
-                    points = self._array(
-                        turned(mesh.vertices, UP_AXES["y"].T).astype("<f4"), "VEC3"
-                    )
+                    vertices = turned(mesh.vertices, UP_AXES["y"].T).astype("<f4")
+                    points = self._array(vertices, "VEC3")
                 faces = self._array(mesh.faces[rows].astype("<u4").reshape(-1, 1), "SCALAR")
                 primitive: dict[str, Any] = {"attributes": {"POSITION": points}, "indices": faces}
             else:
                 primitive = {"attributes": self._corners(mesh, rows, uv, tints)}
-            if one is not None or names[of_material]:
-                primitive["material"] = self._material(one, names[of_material])
-            out.append(primitive)
+            if texture is not None or names[material]:
+                primitive["material"] = self._material(texture, names[material])
+            primitives.append(primitive)
+        return primitives
+
+    def _masked_primitives(
+        self, mesh: SceneMesh, first: int, index: Ints32, names: tuple[str, ...]
+    ) -> list[dict[str, Any]]:
+        """Return a primitive for each mask, whose triangles start at `first`."""
+        colours = mesh.colours
+        primitives = []
         for cut in mesh.cutouts:
             rows = np.arange(first, first + len(cut.uv))
-            # A texture has no room beside a mask, which has coordinates of its own.
+            # A material has room for one texture with its coordinates, which is the mask.
             tints = None if colours is None else colours.take(rows).means()[:, None].repeat(3, 1)
             attributes = self._corners(mesh, rows, cut.uv, tints)
             material = self._material(cut.mask, names[index[first]])
-            out.append({"attributes": attributes, "material": material})
+            primitives.append({"attributes": attributes, "material": material})
             first += len(cut.uv)
-        return out
+        return primitives
 
     def _corners(
         self, mesh: SceneMesh, rows: Indices, uv: AnyArray | None, tints: Bytes | None
     ) -> dict[str, int]:
-        """Attributes of some triangles (k,), whose corners have their own (k, 3, …)."""
+        """Return the attributes of triangles (k,) with separate corners (k, 3, …)."""
         corners = turned(mesh.vertices[mesh.faces[rows]].reshape(-1, 3), UP_AXES["y"].T)
         attributes = {"POSITION": self._array(corners.astype("<f4"), "VEC3")}
         if uv is not None:
@@ -151,7 +168,7 @@ class _Writer:
         return attributes
 
     def _array(self, rows: AnyArray, kind: str) -> int:
-        """Add an accessor of attributes, or of indices (scalars); its number."""
+        """Add an accessor of attributes, or of indices (scalars); return its number."""
         view = self._view(rows.tobytes(), target=34963 if kind == "SCALAR" else 34962)
         limits = {"min": rows.min(axis=0).tolist(), "max": rows.max(axis=0).tolist()}
         return self._put(
@@ -160,18 +177,22 @@ class _Writer:
              "type": kind, **limits},
         )  # fmt: skip
 
-    def _view(self, data: bytes, **more: Any) -> int:
-        view = {"buffer": 0, "byteOffset": self._size, "byteLength": len(data), **more}
+    def _view(self, data: bytes, **fields: Any) -> int:
+        """Add a view of data in the buffer; return its number."""
+        view = {"buffer": 0, "byteOffset": self._size, "byteLength": len(data), **fields}
         data += b"\0" * (-len(data) % 4)
         self._pieces.append(data)
         self._size += len(data)
         return self._put("bufferViews", view)
 
     def _material(self, image: AnyArray | None, name: str) -> int:
-        """Return the number of the material of a mask, bool (h, w), an image, colour or name."""
+        """Return the number of the material of a mask, bool (h, w), an image, colour or name.
+
+        The material is added on its first use.
+        """
         key = id(image), name
         if key not in self._materials:
-            self._kept.append(image)
+            self._referenced.append(image)
             matt: dict[str, Any] = {"metallicFactor": 0, "roughnessFactor": 1}
             material: dict[str, Any] = {"pbrMetallicRoughness": matt}
             material |= {"name": name} if name else {}
@@ -190,6 +211,7 @@ class _Writer:
         return self._materials[key]
 
     def _texture(self, image: Image.Image) -> int:
+        """Add a texture of an image; return its number."""
         png = io.BytesIO()
         image.save(png, "png")
         view = self._view(png.getvalue())
@@ -199,12 +221,12 @@ class _Writer:
         return self._put("textures", {"source": source, "sampler": 0})
 
     def data(self) -> bytes:
-        """Content of the file."""
+        """Return the content of the file; LidarError for more than 4 GiB."""
         self._tree["buffers"] = [{"byteLength": self._size}]
         text = json.dumps(self._tree, separators=(",", ":")).encode()
         text += b" " * (-len(text) % 4)
         total = 28 + len(text) + self._size
-        if total > _MOST_BYTES:
+        if total > _MAX_BYTES:
             raise LidarError("it would have more than 4 GiB, the most of .glb: write a .ply.")
         head = struct.pack("<4sIII4s", b"glTF", 2, total, len(text), b"JSON")
         return b"".join([head, text, struct.pack("<I4s", self._size, b"BIN\0"), *self._pieces])

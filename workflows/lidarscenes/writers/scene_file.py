@@ -28,16 +28,18 @@ def write_scene(path: str | Path, scene: Scene) -> Path:
     """Write a scene to a mesh file that `Scene.load` can read.
 
     A .ply holds one object without a name; .glb and .obj keep objects and names. Masks and colours
-    are kept in .glb only: in the others, triangles are solid and grey. Where a triangle has both a
-    mask and a texture, its colour is the texture's mean. All store metres; .glb is Y-up, by its
-    standard, the others are Z-up. Coordinates are those of the world; .ply and .glb have single
-    precision, .glb from the scene's origin. A comment, or the generator of .glb, tells
-    `load_meshes` who wrote it. An existing file is replaced only by a complete one.
+    are kept in .glb only: in .ply and .obj, triangles are solid and grey. Where a triangle has both
+    a mask and a texture, its colour is the texture's mean. All formats store metres; .glb is Y-up,
+    by its standard, .ply and .obj are Z-up. Coordinates are world coordinates; .ply and .glb have
+    single precision, .glb from the scene's origin. A comment, or the generator of .glb, tells
+    `load_meshes` that this package wrote the file. An existing file is replaced only by a complete
+    file.
 
     Raises
     ------
     LidarError
-        As for `check_target`, if the disk is full, or a .ply is too coarse for so far a scene.
+        If the path has another suffix, the folder is missing or not writable, the disk is full, or
+        a .ply is too coarse for a scene far from zero.
     """
     path = Path(path)
     check_target(path)
@@ -48,12 +50,12 @@ def write_scene(path: str | Path, scene: Scene) -> Path:
 
 
 def check_target(path: Path) -> None:
-    """Check that a scene can be written to a path, before it is made.
+    """Check that a scene can be written to a path, before the scene is made.
 
     Raises
     ------
     LidarError
-        If the ending is not one of `SUFFIXES`, or the folder is missing or not writable.
+        If the path has another suffix than `SUFFIXES`, or the folder is missing or not writable.
     """
     if path.suffix.lower() not in SUFFIXES:
         raise LidarError(
@@ -67,7 +69,7 @@ def check_target(path: Path) -> None:
 
 
 def _encoded(suffix: str, scene: Scene) -> bytes:
-    """Content of a file of one of `SUFFIXES`."""
+    """Return the content of a file with a suffix of `SUFFIXES`."""
     if scene.has_voxels.any():
         name = scene.all_names[scene.has_voxels.argmax()]
         raise LidarError(f"{name!r} is of voxels, which cannot be written: name its .vox file.")
@@ -80,15 +82,15 @@ def _encoded(suffix: str, scene: Scene) -> bytes:
                 f"y {y:.0f}, because they are in single precision: write a .glb or .obj."
             )
         drawn = SimplifiedScene.from_scene(scene, scene.triangles).scene
-        whole = trimesh.Trimesh(drawn.vertices + drawn.origin, drawn.faces, process=False)
-        data = bytes(export_ply(whole, vertex_normal=False))
-        head, _, rest = data.partition(b"\ncomment ")
-        return head + f"\ncomment {FORMAT_COMMENT}\n".encode() + rest.partition(b"\n")[2]
+        joined = trimesh.Trimesh(drawn.vertices + drawn.origin, drawn.faces, process=False)
+        data = bytes(export_ply(joined, vertex_normal=False))
+        head, _, tail = data.partition(b"\ncomment ")
+        return head + f"\ncomment {FORMAT_COMMENT}\n".encode() + tail.partition(b"\n")[2]
     if suffix == ".glb":
         return glb_of(scene)
     objects = trimesh.Scene()
-    for name, parts in groupby(scene.meshes(), lambda one: one.name):
-        flat = [one.flat() if isinstance(one, SceneInstance) else one for one in parts]
+    for name, parts in groupby(scene.meshes(), lambda mesh: mesh.name):
+        flat = [part.flat() if isinstance(part, SceneInstance) else part for part in parts]
         vertices, faces = stacked((mesh.vertices, mesh.faces) for mesh in flat)
         objects.add_geometry(trimesh.Trimesh(vertices, faces, process=False), name, name)
     text = export_obj(objects, include_normals=False, include_texture=False)

@@ -299,7 +299,7 @@ class Scene:
         scene = copy(self)
         for cached in ("bounds", "object_bounds", "footprints"):
             vars(scene).pop(cached, None)
-        moved = self.instances.moved(owner, np.array(pose.position), pose.turn)
+        moved = self.instances.moved(owner, np.array(pose.position), pose.rotation_matrix)
         object.__setattr__(scene, "instances", moved)
         return scene
 

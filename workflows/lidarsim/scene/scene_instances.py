@@ -57,7 +57,7 @@ class SceneInstance:
     def __post_init__(self) -> None:
         transform = self.transform
         if isinstance(transform, Pose):
-            transform = Transform(transform.turn, np.array(transform.position))
+            transform = Transform(transform.rotation_matrix, np.array(transform.position))
         if not isinstance(transform, Transform):
             transform = Transform.from_matrix(transform)
         check_coordinate(transform.offset)

@@ -100,7 +100,9 @@ class Transform:
             A factor for all axes, or three factors; not zero.
         """
         roll, pitch, yaw = rotation_deg
-        rotation = Pose((0.0, 0.0, 0.0), yaw_deg=yaw, pitch_deg=pitch, roll_deg=roll).turn
+        rotation = Pose(
+            (0.0, 0.0, 0.0), yaw_deg=yaw, pitch_deg=pitch, roll_deg=roll
+        ).rotation_matrix
         return cls(rotation * np.broadcast_to(scale, 3), np.array(translation))
 
     @classmethod

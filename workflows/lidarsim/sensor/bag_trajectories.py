@@ -32,8 +32,8 @@ _GNSS = "sensor_msgs/msg/NavSatFix"
 _IMU = "sensor_msgs/msg/Imu"
 _FRAMES = "tf2_msgs/msg/TFMessage"
 _STATIC = "/tf_static"
-_SAME = 1e-6  # between numbers of a pose that is sent twice
-_READ = ", ".join([*_POSES, _GNSS, _FRAMES])
+_MAX_DIFFERENCE = 1e-6  # largest difference between the numbers of a pose that is sent twice
+_READABLE_TYPES = ", ".join([*_POSES, _GNSS, _FRAMES])
 
 
 class TimedPoses(NamedTuple):
@@ -46,7 +46,7 @@ class TimedPoses(NamedTuple):
 
 @dataclass
 class _Edge:
-    """Poses of a frame in the frame above it."""
+    """Poses of a frame in its parent frame."""
 
     parent: str
     times_ns: list[int] = field(default_factory=list)
@@ -61,10 +61,11 @@ def read_bag(path: Path, topic: str | None, origin: Origin) -> TimedPoses:
     path
         An .mcap or .db3, or the folder of a bag.
     topic
-        A topic of `_POSES` or NavSatFix; of NavSatFix and Imu, separated by a space; or, for a
-        frame of /tf, «/tf:FRAME». None for the only one.
+        A topic of a type of `_POSES`, or of NavSatFix; topics of NavSatFix and Imu, separated by a
+        space; or, for a frame of /tf, «/tf:FRAME». None if the bag has poses of one topic or
+        frame.
     origin
-        Of NavSatFix: latitude and longitude, degrees, and height, metres, of the world's zero.
+        For NavSatFix: latitude and longitude, degrees, and height, metres, of the world's zero.
         None for the first fix.
 
     Raises
@@ -73,61 +74,72 @@ def read_bag(path: Path, topic: str | None, origin: Origin) -> TimedPoses:
         If the bag cannot be read, or the topic is not clear.
     """
     with opened_bag(path, "the bag") as bag:
-        kinds = {one.topic: one.msgtype for one in bag.connections}
-        wanted, _, frame = (topic or "").partition(":")
-        wanted, _, imu = wanted.partition(" ")
-        posed = [one for one, kind in kinds.items() if kind in (*_POSES, _GNSS)]
-        if wanted in posed:
-            chosen = wanted
+        message_types = {connection.topic: connection.msgtype for connection in bag.connections}
+        base_topic, _, frame = (topic or "").partition(":")
+        base_topic, _, imu = base_topic.partition(" ")
+        pose_topics = [
+            name for name, message_type in message_types.items() if message_type in (*_POSES, _GNSS)
+        ]
+        if base_topic in pose_topics:
+            chosen = base_topic
         else:
-            edges = _edges_of(bag, kinds)
-            if wanted == "/tf" and frame in edges:  # of a frame that moves only with others, too
+            edges = _edges_of(bag, message_types)
+            if base_topic == "/tf" and frame in edges:  # even if only a frame above moves
                 return _frame_poses(edges, frame)
-            labels = [*posed, *(f"/tf:{one}" for one in _moving(edges))]
+            labels = [*pose_topics, *(f"/tf:{name}" for name in _moving_frames(edges))]
             chosen = _chosen(labels, topic)
             if chosen.startswith("/tf:"):
                 return _frame_poses(edges, chosen.removeprefix("/tf:"))
-        if kinds[chosen] == _GNSS:
-            return _gnss_poses(bag, kinds, chosen, imu, origin)
-        return _topic_poses(bag, chosen, _POSES[kinds[chosen]])
+        if message_types[chosen] == _GNSS:
+            return _gnss_poses(bag, message_types, chosen, imu, origin)
+        return _topic_poses(bag, chosen, _POSES[message_types[chosen]])
 
 
 def _chosen(labels: Sequence[str], topic: str | None) -> str:
-    """Return the only label, or the only frame if the topic is /tf."""
+    """Return the only label, or the only frame if the topic is /tf; LidarError if several fit."""
     frames = [label for label in labels if label.startswith("/tf:")]
     if topic == "/tf" and len(frames) == 1:
         return frames[0]
     if topic is None and len(labels) == 1:
         return labels[0]
     if not labels:
-        raise LidarError(f"it has no poses: topics of {_READ} are read.")
-    listed = f"it has the poses {', '.join(labels)}"
+        raise LidarError(f"it has no poses: topics of {_READABLE_TYPES} are read.")
+    available = f"it has the poses {', '.join(labels)}"
     if topic is None:
-        raise LidarError(f"{listed}: choose one with topic.")
-    raise LidarError(f"{listed}, not {topic!r}.{did_you_mean(topic, labels)}")
+        raise LidarError(f"{available}: choose one with topic.")
+    raise LidarError(f"{available}, not {topic!r}.{did_you_mean(topic, labels)}")
 
 
 def _row_of(pose: Any) -> list[float]:
-    """Return x, y, z and the quaternion of a Pose or a Transform."""
-    place = pose.position if hasattr(pose, "position") else pose.translation
-    turn = pose.orientation if hasattr(pose, "orientation") else pose.rotation
-    return [place.x, place.y, place.z, turn.x, turn.y, turn.z, turn.w]
+    """Return x, y, z (metres) and the quaternion x, y, z, w of a Pose or a Transform message."""
+    position = pose.position if hasattr(pose, "position") else pose.translation
+    orientation = pose.orientation if hasattr(pose, "orientation") else pose.rotation
+    return [
+        position.x,
+        position.y,
+        position.z,
+        orientation.x,
+        orientation.y,
+        orientation.z,
+        orientation.w,
+    ]
 
 
 def _stamp_ns(header: Any) -> int:
+    """Return the time stamp of a message's header, nanoseconds."""
     return int(header.stamp.sec) * 1_000_000_000 + int(header.stamp.nanosec)
 
 
 def _in_order(times_ns: Sequence[int], rows: Sequence[Sequence[float]]) -> tuple[Ints, Floats]:
-    """Return times and rows in the order of time; rows that are sent twice count once."""
+    """Return times (k,) and rows (k, n) in the order of time, without rows that are sent twice."""
     times = np.array(times_ns, np.int64)
     table = np.array(rows, np.float64)
     order = np.argsort(times, kind="stable")
     times = times[order]
     table = table[order]
-    close = np.abs(table[1:] - table[:-1]).max(axis=1) <= _SAME
-    again = np.append(False, (np.diff(times) == 0) & close)
-    return times[~again], table[~again]
+    equal = np.abs(table[1:] - table[:-1]).max(axis=1) <= _MAX_DIFFERENCE
+    repeated = np.append(False, (np.diff(times) == 0) & equal)
+    return times[~repeated], table[~repeated]
 
 
 def _topic_poses(bag: Reader, topic: str, pose_of: Callable[[Any], Any]) -> TimedPoses:
@@ -153,42 +165,42 @@ def _topic_poses(bag: Reader, topic: str, pose_of: Callable[[Any], Any]) -> Time
 def _gnss_poses(
     bag: Reader, kinds: Mapping[str, str], topic: str, imu: str, origin: Origin
 ) -> TimedPoses:
-    """Return positions of a GNSS receiver, with the orientations of an IMU if the bag has some."""
+    """Return positions of a GNSS receiver, with the orientations of an IMU if the bag has any."""
     times_ns = []
     fixes = []
     for _, _, fix in messages_of(bag, [topic]):
-        place = [fix.latitude, fix.longitude, fix.altitude]
-        if fix.status.status >= 0 and np.isfinite(place).all():
+        geodetic = [fix.latitude, fix.longitude, fix.altitude]
+        if fix.status.status >= 0 and np.isfinite(geodetic).all():
             times_ns.append(_stamp_ns(fix.header))
-            fixes.append(place)
+            fixes.append(geodetic)
     if len(fixes) < 2:
         raise LidarError(f"{topic} has {len(fixes)} fixes, and a trajectory needs two.")
-    times, places = _in_order(times_ns, fixes)
-    zero = places[0] if origin is None else np.asarray(origin, np.float64)
-    latitude, longitude, height = zero.tolist()
-    positions = local_positions(places, (latitude, longitude, height))
+    times, table = _in_order(times_ns, fixes)
+    origin_row = table[0] if origin is None else np.asarray(origin, np.float64)
+    latitude, longitude, height = origin_row.tolist()
+    positions = local_positions(table, (latitude, longitude, height))
     orientations = _orientations(bag, kinds, imu)
     if orientations is None:
         return TimedPoses(times / 1e9, positions, None)
     within = (times >= orientations[0][0]) & (times <= orientations[0][-1])
     if within.sum() < 2:
         raise LidarError(f"{topic} and the orientations of its Imu are not of the same time.")
-    _, turns = _edge_poses(*orientations, times[within])
-    return TimedPoses(times[within] / 1e9, positions[within], quaternions_of(turns))
+    _, rotations = _edge_poses(*orientations, times[within])
+    return TimedPoses(times[within] / 1e9, positions[within], quaternions_of(rotations))
 
 
 def _orientations(bag: Reader, kinds: Mapping[str, str], imu: str) -> tuple[Ints, Floats] | None:
     """Return times (k,), ns, and rows (k, 7) with orientations of an IMU; None without any."""
-    topics = [one for one, kind in kinds.items() if kind == _IMU]
+    topics = [topic for topic, kind in kinds.items() if kind == _IMU]
     if imu and imu not in topics:
         raise LidarError(f"it has no Imu {imu!r}.{did_you_mean(imu, topics)}")
     measured: dict[str, tuple[list[int], list[list[float]]]] = {}
     for topic, _, message in messages_of(bag, [imu] if imu else topics):
         if message.orientation_covariance[0] != -1:  # an IMU without orientation, by its definition
-            turn = message.orientation
+            orientation = message.orientation
             times, rows = measured.setdefault(topic, ([], []))
             times.append(_stamp_ns(message.header))
-            rows.append([0.0, 0.0, 0.0, turn.x, turn.y, turn.z, turn.w])
+            rows.append([0.0, 0.0, 0.0, orientation.x, orientation.y, orientation.z, orientation.w])
     if len(measured) > 1:
         raise LidarError(
             f"it has several Imu with orientations, {', '.join(measured)}: give topic both names, "
@@ -202,9 +214,9 @@ def _orientations(bag: Reader, kinds: Mapping[str, str], imu: str) -> tuple[Ints
 
 
 def _edges_of(bag: Reader, kinds: Mapping[str, str]) -> dict[str, _Edge]:
-    """Return {frame: its poses in the frame above it} of all topics of frames."""
+    """Return {frame: poses in its parent frame} of all topics of frames."""
     edges: dict[str, _Edge] = {}
-    topics = [one for one, kind in kinds.items() if kind == _FRAMES]
+    topics = [topic for topic, kind in kinds.items() if kind == _FRAMES]
     for topic, _, message in messages_of(bag, topics):
         for stamped in message.transforms:
             parent, child = (
@@ -226,29 +238,29 @@ def _edges_of(bag: Reader, kinds: Mapping[str, str]) -> dict[str, _Edge]:
 def _chain(edges: Mapping[str, _Edge], frame: str) -> list[_Edge]:
     """Return the edges from a frame upwards to the root."""
     chain = []
-    passed = set[str]()
+    visited = set[str]()
     while frame in edges:
-        if frame in passed:
+        if frame in visited:
             raise LidarError(f"its frame {frame!r} is above itself.")
-        passed.add(frame)
+        visited.add(frame)
         chain.append(edges[frame])
         frame = edges[frame].parent
     return chain
 
 
-def _moving(edges: Mapping[str, _Edge]) -> list[str]:
-    """Return the frames whose poses in the frame above change, or else those with several."""
-    several = [frame for frame, edge in edges.items() if len(set(edge.times_ns)) > 1]
+def _moving_frames(edges: Mapping[str, _Edge]) -> list[str]:
+    """Return the frames whose poses in the parent frame change, else frames with several poses."""
+    repeated = [frame for frame, edge in edges.items() if len(set(edge.times_ns)) > 1]
     changing = [
-        frame for frame in several if any(row != edges[frame].rows[0] for row in edges[frame].rows)
+        frame for frame in repeated if any(row != edges[frame].rows[0] for row in edges[frame].rows)
     ]
-    return changing or several
+    return changing or repeated
 
 
 def _frame_poses(edges: Mapping[str, _Edge], frame: str) -> TimedPoses:
     """Return the poses of a frame in the root of its tree.
 
-    Their times are those of the lowest frame that moves, as far as all others have poses then.
+    The times are the times of the lowest frame that moves, while all frames above have poses.
     """
     chain = _chain(edges, frame)
     tables = [_in_order(edge.times_ns, edge.rows) for edge in chain]
@@ -263,14 +275,17 @@ def _frame_poses(edges: Mapping[str, _Edge], frame: str) -> TimedPoses:
     positions = np.zeros((len(times), 3))
     rotations = np.broadcast_to(np.eye(3), (len(times), 3, 3))
     for edge_times, rows in tables:
-        origins, turns = _edge_poses(edge_times, rows, times)
-        positions = origins + applied(turns, positions)
-        rotations = matmul(turns, rotations)
+        edge_positions, edge_rotations = _edge_poses(edge_times, rows, times)
+        positions = edge_positions + applied(edge_rotations, positions)
+        rotations = matmul(edge_rotations, rotations)
     return TimedPoses(times / 1e9, positions, quaternions_of(rotations))
 
 
 def _edge_poses(edge_times: Ints, rows: Floats, times: Ints) -> tuple[Floats, Floats]:
-    """Return positions (k, 3) and rotations (k, 3, 3) at times (k,), ns, within those of rows."""
+    """Return positions (k, 3) and rotations (k, 3, 3) at times (k,), ns.
+
+    The times are within `edge_times` (n,), ns, the times of `rows` (n, 7).
+    """
     if len(edge_times) == 1:  # a static frame
         edge_times = edge_times + np.arange(2)
         rows = rows.repeat(2, axis=0)

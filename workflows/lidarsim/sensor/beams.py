@@ -17,14 +17,14 @@ from ..base.elementary import cos, sin_cos
 from ..base.errors import LidarError
 from ..base.validation import as_array, checked, checked_fields
 
-CHANNELS_MOST = 65_535  # the type of the column
+MAX_CHANNELS = 65_535  # of the type of the column
 
 
 @dataclass(frozen=True, eq=False)
 class Beams:
-    """The beams of a sensor; each firing fires all of them once.
+    """The beams of a sensor, which a firing fires all once.
 
-    Channel 0 is the first of them, usually the lowest.
+    Channel 0 is the first beam, usually the lowest.
 
     Parameters
     ----------
@@ -35,8 +35,8 @@ class Beams:
     time_ns
         float64 (c,): time of a beam within a firing, nanoseconds; 0 by default.
     origin
-        float64 (c, 3): start of a beam with the head at azimuth 0, metres, in the sensor's axes;
-        the sensor's centre by default.
+        float64 (c, 3): start of a beam with the head at azimuth 0, metres, in the sensor frame; the
+        sensor's centre by default.
 
     Raises
     ------
@@ -51,8 +51,8 @@ class Beams:
 
     def __post_init__(self) -> None:
         count = as_array("Beams.elevation", self.elevation).size
-        if not 1 <= count <= CHANNELS_MOST:
-            raise LidarError(f"A sensor has 1 to {CHANNELS_MOST} beams, not {count}.")
+        if not 1 <= count <= MAX_CHANNELS:
+            raise LidarError(f"A sensor has 1 to {MAX_CHANNELS} beams, not {count}.")
         for name, shape in (
             ("elevation", (count,)),
             ("azimuth", (count,)),
@@ -65,15 +65,15 @@ class Beams:
         return len(self.elevation)
 
     def __repr__(self) -> str:
-        low, high = np.degrees([self.elevation.min(), self.elevation.max()])
-        return f"<Beams: {len(self)}, {low:.4g} to {high:.4g} deg>"
+        min_deg, max_deg = np.degrees([self.elevation.min(), self.elevation.max()])
+        return f"<Beams: {len(self)}, {min_deg:.4g} to {max_deg:.4g} deg>"
 
     @classmethod
     @checked
     def even(cls, layers: int, vertical_fov_deg: float) -> Beams:
-        """Beams evenly spaced over a vertical field of view, both ends included.
+        """Return beams evenly spaced over a vertical field of view, both ends included.
 
-        Half of it is below the horizon; a single beam looks straight ahead.
+        Half of the field of view is below the horizon; a single beam looks straight ahead.
         """
         half = np.radians(vertical_fov_deg) / 2
         return cls(np.linspace(-half, half, layers) if layers > 1 else np.zeros(1))
@@ -81,11 +81,12 @@ class Beams:
     def turning(self, radians_per_ns: float) -> Beams:
         """Return the beams for a head that keeps turning within a firing, counter-clockwise.
 
-        Each is rotated by the head's angle at its time, so that the rotation within a firing takes
-        no time later.
+        Each beam is rotated by the head's angle at its time within the firing, so that casting need
+        not rotate it.
         """
         angle = radians_per_ns * self.time_ns
-        (x, y, z), (sin, cos) = self.origin.T, sin_cos(angle)
+        x, y, z = self.origin.T
+        sin, cos = sin_cos(angle)
         origin = np.column_stack([cos * x - sin * y, sin * x + cos * y, z])
         return Beams(self.elevation, self.azimuth + angle, self.time_ns, origin)
 
@@ -96,20 +97,20 @@ class Beams:
 
 
 class Head(Protocol):
-    """Moves the beams; each time step has some firings, numbered from 0."""
+    """Mechanism that moves the beams, with the firings of each time step, numbered from 0."""
 
     @property
     def period(self) -> int | None:
-        """Firings after which it repeats; None if it never does exactly."""
+        """Number of firings after which azimuths repeat exactly; None if they never do."""
 
     def firings(self, step: int) -> tuple[int, int]:
-        """First firing of a time step, and one past the last; steps have no gaps."""
+        """Return the half-open range of the firings of a time step; steps have no gaps."""
 
     def times_ns(self, firings: Ints) -> Floats:
-        """When firings begin, nanoseconds since the head started: (k,)."""
+        """Return the starts of firings (k,), nanoseconds since the head started: (k,)."""
 
     def azimuths(self, firings: Ints) -> Floats:
-        """Azimuth of the head at firings, radians: (k,)."""
+        """Return the azimuths of the head at firings (k,), radians: (k,)."""
 
 
 Step = Annotated[float, about("degrees that the head turns in one time step", gt=0, le=360)]
@@ -127,11 +128,11 @@ class Spin:
     Parameters
     ----------
     firings_per_turn
-        Firings in one turn: firing rate over turning rate, not always a whole number.
+        Firings in one revolution: firing rate over revolution rate, not always a whole number.
     step_deg
         Rotation in one time step, in (0, 360].
     rate_hz
-        Turns a second.
+        Revolutions a second.
     clockwise
         Direction of rotation, seen from above.
     zero_deg
@@ -168,8 +169,8 @@ class Spin:
         """Exact number of firings in a time step.
 
         Neither 0.1 nor 360/7 degrees is exact in binary. The nearest fraction with a denominator
-        of at most a million is the intended one, for decimals and for parts of a turn; with it,
-        the steps of a turn have each firing once.
+        of at most a million is the intended number, for decimals and for parts of a revolution;
+        then the steps of a revolution have each firing once.
         """
         step = Fraction(self.step_deg).limit_denominator(1_000_000)
         per_turn = Fraction(self.firings_per_turn).limit_denominator(1_000_000)
@@ -177,69 +178,72 @@ class Spin:
 
     @property
     def period(self) -> int | None:
-        """See `Head.period`."""
-        whole = int(self.firings_per_turn)
-        return whole if whole == self.firings_per_turn else None
+        """Number of firings in a revolution; None without a whole number."""
+        count = int(self.firings_per_turn)
+        return count if count == self.firings_per_turn else None
 
     def firings(self, step: int) -> tuple[int, int]:
-        """See `Head.firings`; numbers continue after one turn."""
+        """Return the half-open range of the firings of a time step; numbers go on after 360°."""
         # Rounded up, in whole numbers: fractions would take as long as a small scan.
         count, steps = self._firings_per_step.as_integer_ratio()
         return -(-step * count // steps), -(-(step + 1) * count // steps)
 
     def times_ns(self, firings: Ints) -> Floats:
-        """See `Head.times_ns`."""
+        """Return the starts of firings (k,), nanoseconds since the head started: (k,)."""
         return np.asarray(firings, np.float64) * (1e9 / (self.rate_hz * self.firings_per_turn))
 
     def azimuths(self, firings: Ints) -> Floats:
-        """See `Head.azimuths`."""
+        """Return the azimuths of the head at firings (k,), radians: (k,)."""
         turned = 2 * np.pi * self._within(firings) / self.firings_per_turn
         return np.radians(self.zero_deg) + (-turned if self.clockwise else turned)
 
     def _within(self, firings: Ints) -> Floats:
-        """Count firings since the turn began; fractional if a turn begins between two."""
+        """Return the firings (k,) since the start of their revolution: (k,).
+
+        Numbers are fractional if revolutions start between two firings.
+        """
         return np.asarray(firings % self.firings_per_turn, np.float64)
 
     @property
     def radians_per_ns(self) -> float:
-        """Radians in a nanosecond, counter-clockwise."""
+        """Angular velocity of the head, radians a nanosecond, counter-clockwise."""
         return 2 * np.pi * self.rate_hz / 1e9 * (-1 if self.clockwise else 1)
 
 
 @dataclass(frozen=True)
 @checked_fields
 class Mirror(Spin):
-    """A mirror that sweeps the beams over a line, to and fro or in one direction.
+    """A mirror that sweeps the beams over a line, to and fro or in a single direction.
 
-    A turn is one cycle: two lines of a swinging mirror, one of a polygon's facet.
+    A revolution is a cycle: two lines of a swinging mirror, one line of a polygon's facet.
     Azimuth 0 is in the middle of a line.
     """
 
     motion: MirrorMotion = "triangle"  # "sine" and "triangle" swing, "sawtooth" is a polygon
     width_deg: Width = 60.0  # length of a line
-    # Share of each cycle in which it fires: a polygon's facets cover more than is used.
+    # Share of each cycle in which the sensor fires: a polygon's facets sweep more than the line.
     duty: Duty = 1.0
 
     def times_ns(self, firings: Ints) -> Floats:
-        """See `Head.times_ns`."""
+        """Return the starts of firings (k,), nanoseconds since the mirror started: (k,)."""
         pause = self._within(firings) * (1 - self.duty)
         return (firings - pause) * (1e9 / (self.rate_hz * self.firings_per_turn))
 
     def azimuths(self, firings: Ints) -> Floats:
-        """See `Head.azimuths`."""
+        """Return the azimuths of the line at firings (k,), radians: (k,)."""
         phase = self._within(firings) / self.firings_per_turn
         if self.motion == "sine":
-            place = -cos(2 * np.pi * phase) / 2
+            line_share = -cos(2 * np.pi * phase) / 2
         elif self.motion == "triangle":
-            place = 0.5 - np.abs(2 * phase - 1)
+            line_share = 0.5 - np.abs(2 * phase - 1)
         else:
-            place = phase - 0.5
-        turned = np.radians(self.width_deg) * place
+            line_share = phase - 0.5
+        turned = np.radians(self.width_deg) * line_share
         return np.radians(self.zero_deg) + (-turned if self.clockwise else turned)
 
 
 def _table(name: str, values: ArrayLike, shape: tuple[int, ...]) -> Floats:
-    """Read-only float64 array of a shape; zeros where none were given."""
+    """Return values as a read-only float64 array of a shape; zeros for an empty array."""
     array = as_array(f"Beams.{name}", values).copy()
     if not array.size:
         array = np.zeros(shape)

@@ -32,9 +32,9 @@ class Calibration:
 
     file: str  # its name
     maker: str | None  # of the format; None for a plain table of beams
-    beams: Beams | None = None  # in the maker's order, with the file's times, if any
-    rays: Floats | None = None  # instead, unit directions (n, 3) as they are fired
-    shot_ns: Floats | None = None  # their times (n,), if the file has them
+    beams: Beams | None = None  # in the maker's order, with the times in the file, if any
+    rays: Floats | None = None  # instead of beams, unit directions (n, 3) in the order of firing
+    shot_ns: Floats | None = None  # times (n,) of the rays, if the file has times
     head: dict[str, Any] = field(default_factory=dict)  # fields of `SensorModel`
 
 
@@ -53,7 +53,8 @@ def read_calibration(path: Path) -> Calibration:
     Raises
     ------
     LidarError
-        If it is none of these, or numbers are missing, not finite or in the wrong order.
+        If the file has none of these formats, or numbers are missing, not finite or in the wrong
+        order.
     """
     try:
         text = read_text(path)
@@ -67,14 +68,14 @@ def read_calibration(path: Path) -> Calibration:
 
 
 def _velodyne(name: str, data: Any) -> Calibration:
-    """Beams of Velodyne's YAML; geometry as in ros-drivers/velodyne, rawdata.cc."""
+    """Return the beams of Velodyne's YAML; geometry as in ros-drivers/velodyne, rawdata.cc."""
     if not isinstance(data, dict) or not isinstance(data.get("lasers"), list):
         raise ValueError("it has no list of lasers, as Velodyne's calibrations have")
     lasers = sorted(data["lasers"], key=lambda laser: laser["laser_id"])
     count = data.get("num_lasers", len(lasers))
     if len(lasers) != count or any(laser["laser_id"] != i for i, laser in enumerate(lasers)):
         raise ValueError(f"it must have lasers 0 to {count - 1}, each once")
-    elevation, azimuth, up, left = np.array(
+    elevation, azimuth, upwards, leftwards = np.array(
         [
             [
                 float(laser["vert_correction"]),
@@ -86,70 +87,51 @@ def _velodyne(name: str, data: Any) -> Calibration:
         ]
     ).T
     # Offsets at right angles to the beam, upwards and to the left.
-    (rise, level), (sin, cos) = sin_cos(elevation), sin_cos(azimuth)
-    ahead = -up * rise
-    origin = [ahead * cos - left * sin, ahead * sin + left * cos, up * level]
+    rise, level = sin_cos(elevation)
+    sin, cos = sin_cos(azimuth)
+    ahead = -upwards * rise
+    origin = [ahead * cos - leftwards * sin, ahead * sin + leftwards * cos, upwards * level]
     beams = Beams(elevation, azimuth, origin=np.column_stack(origin))
     return Calibration(name, "velodyne", beams)
 
 
-# From the axis to where the beams leave, by product line, and else that of the first generation:
-# default_lidar_origin_to_beam_origin in ouster_core/src/sensor_info.cpp of ouster-sdk 1.0.
+# Distance from the axis to the start of the beams, by product line; by default of the first
+# generation: default_lidar_origin_to_beam_origin in ouster_core/src/sensor_info.cpp of
+# ouster-sdk 1.0.
 _OUSTER_ORIGINS_MM = {"OS-0-": 27.67, "OS-1-": 15.806, "OS-2-": 13.762}
 _OUSTER_FIRST_MM = 12.163
 
 
 def _ouster(name: str, data: Any) -> Calibration:
-    """Beams of Ouster's metadata, old and new; geometry as in its sensor manual.
+    """Return the beams of Ouster's metadata, old and new; geometry as in Ouster's sensor manual.
 
-    Ranges begin at the beam's start, as everywhere here; Ouster's own begin at the axis.
+    Ranges are measured from the beam's start, as of all sensors; Ouster's ranges from the axis.
     """
     if not isinstance(data, dict):
         raise ValueError("it is not Ouster metadata")
-
-    def section(name: str, old: Any = data) -> Any:
-        """Return a section of the new layout; firmware before 1.14 writes an error in its place."""
-        found = data.get(name, old)
-        return found if isinstance(found, dict) else {}
-
-    beam = section("beam_intrinsics")
+    beam = _ouster_section(data, "beam_intrinsics", data)
     if "beam_altitude_angles" not in beam:
         raise ValueError("it has no beam_altitude_angles, as Ouster's metadata have")
     elevation = np.array(beam["beam_altitude_angles"], np.float64)
     azimuth = np.array(beam["beam_azimuth_angles"], np.float64)
-    layout = section("lidar_data_format", None) or section("data_format", None)
+    layout = _ouster_section(data, "lidar_data_format") or _ouster_section(data, "data_format")
     rows = layout.get("pixels_per_column", len(elevation))
     if elevation.shape != azimuth.shape or len(elevation) != rows:
         raise ValueError(
             f"it has {elevation.size} altitude and {azimuth.size} azimuth angles of {rows} beams"
         )
-    there = (elevation != 0) | (azimuth != 0)  # older firmware writes zeros for beams it lacks
-    beam_pose = np.reshape(beam.get("beam_to_lidar_transform", np.eye(4)), (4, 4))
-    if not np.allclose(beam_pose[:3, :3], np.eye(3)):
-        raise ValueError("its beam_to_lidar_transform turns the beams; a translation is expected")
-    beam_at = beam_pose[:3, 3].copy()
-    if "lidar_origin_to_beam_origin_mm" in beam:
-        beam_at[0] = beam["lidar_origin_to_beam_origin_mm"]
-    elif "beam_to_lidar_transform" not in beam:  # firmware before 2.0
-        line = str(section("sensor_info").get("prod_line", ""))
-        beam_at[0] = _OUSTER_ORIGINS_MM.get(line[:5], _OUSTER_FIRST_MM)
-    lidar = section("lidar_intrinsics")
-    turned = np.diag([-1.0, -1.0, 1.0, 1.0])
-    turned[2, 3] = 36.18
-    pose = np.reshape(lidar.get("lidar_to_sensor_transform", turned), (4, 4))
-    if not np.allclose(pose[:3, :3], turned[:3, :3]) or pose[:2, 3].any():
-        raise ValueError("its lidar_to_sensor_transform is not half a turn and a height")
-    beam_at[2] += pose[2, 3]
-    mode = str(section("config_params").get("lidar_mode", "1024x10"))
+    present = (elevation != 0) | (azimuth != 0)  # older firmware writes zeros for missing beams
+    origin_mm = _ouster_origin_mm(data, beam)
+    mode = str(_ouster_section(data, "config_params", data).get("lidar_mode", "1024x10"))
     columns, rate = (int(number) for number in mode.split("x"))
-    count = int(there.sum())
+    count = int(present.sum())
     return Calibration(
         name,
         "ouster",
         Beams(
-            np.radians(elevation[there]),
-            -np.radians(azimuth[there]),
-            origin=np.tile(beam_at / 1000, (count, 1)),
+            np.radians(elevation[present]),
+            -np.radians(azimuth[present]),
+            origin=np.tile(origin_mm / 1000, (count, 1)),
         ),
         head={
             "clockwise": True,
@@ -160,8 +142,38 @@ def _ouster(name: str, data: Any) -> Calibration:
     )
 
 
+def _ouster_section(data: dict[str, Any], name: str, default: Any = None) -> dict[str, Any]:
+    """Return a section of Ouster's metadata; `default` for metadata in the layout without sections.
+
+    Firmware before 1.14 writes an error in place of a section: then it is empty.
+    """
+    content = data.get(name, default)
+    return content if isinstance(content, dict) else {}
+
+
+def _ouster_origin_mm(data: dict[str, Any], beam: dict[str, Any]) -> Floats:
+    """Return the start (3,) of Ouster's beams at azimuth 0, in the sensor frame, millimetres."""
+    beam_pose = np.reshape(beam.get("beam_to_lidar_transform", np.eye(4)), (4, 4))
+    if not np.allclose(beam_pose[:3, :3], np.eye(3)):
+        raise ValueError("its beam_to_lidar_transform turns the beams; a translation is expected")
+    origin_mm = beam_pose[:3, 3].copy()
+    if "lidar_origin_to_beam_origin_mm" in beam:
+        origin_mm[0] = beam["lidar_origin_to_beam_origin_mm"]
+    elif "beam_to_lidar_transform" not in beam:  # firmware before 2.0
+        product_line = str(_ouster_section(data, "sensor_info", data).get("prod_line", ""))
+        origin_mm[0] = _OUSTER_ORIGINS_MM.get(product_line[:5], _OUSTER_FIRST_MM)
+    lidar = _ouster_section(data, "lidar_intrinsics", data)
+    half_turn = np.diag([-1.0, -1.0, 1.0, 1.0])
+    half_turn[2, 3] = 36.18
+    pose = np.reshape(lidar.get("lidar_to_sensor_transform", half_turn), (4, 4))
+    if not np.allclose(pose[:3, :3], half_turn[:3, :3]) or pose[:2, 3].any():
+        raise ValueError("its lidar_to_sensor_transform is not half a turn and a height")
+    origin_mm[2] += pose[2, 3]
+    return np.asarray(origin_mm, np.float64)
+
+
 def _table(name: str, text: str) -> Calibration:
-    """One of the comma-separated formats, chosen by the header."""
+    """Read a comma-separated calibration in the format of its header."""
     header = [word.strip().lower() for word in text.partition("\n")[0].split(",")]
     if header == ["time/s", "azimuth/deg", "zenith/deg"]:
         return _livox(name, _rows(text, 1, 3))
@@ -172,12 +184,12 @@ def _table(name: str, text: str) -> Calibration:
         elevation, azimuth = np.radians(rows[:, 1:]).T
         return Calibration(name, "hesai", Beams(elevation, -azimuth))
     if "elevation_deg" in header:
-        known = ("elevation_deg", "azimuth_deg", "time_us", "x_m", "y_m", "z_m")
-        other = [word for word in header if word not in known]
-        if other:
-            raise ValueError(f"column {other[0]!r} is not one of {', '.join(known)}")
-        if twice := next((word for word in header if header.count(word) > 1), None):
-            raise ValueError(f"it has the column {twice!r} twice")
+        names = ("elevation_deg", "azimuth_deg", "time_us", "x_m", "y_m", "z_m")
+        unknown = [word for word in header if word not in names]
+        if unknown:
+            raise ValueError(f"column {unknown[0]!r} is not one of {', '.join(names)}")
+        if duplicate := next((word for word in header if header.count(word) > 1), None):
+            raise ValueError(f"it has the column {duplicate!r} twice")
         columns = dict(zip(header, _rows(text, 1, len(header)).T, strict=True))
         zero = np.zeros(len(columns["elevation_deg"]))
         beams = Beams(
@@ -198,23 +210,34 @@ def _table(name: str, text: str) -> Calibration:
 
 
 def _livox(name: str, rows: Floats) -> Calibration:
-    """Rays of Livox's list. Zenith is counted from the z axis; Time may only number the rows."""
-    times, azimuth, zenith = rows[:, 0], *np.radians(rows[:, 1:]).T
-    back = np.flatnonzero(np.diff(times) < 0)
-    if len(back):
-        raise ValueError(f"times go back in line {back[0] + 3}")
-    (level, up), (sin, cos) = sin_cos(zenith), sin_cos(azimuth)
+    """Return the rays of Livox's list, rows of time, azimuth and zenith angle: (n, 3).
+
+    Zenith is counted from the z axis; the times may only number the rows.
+    """
+    times = rows[:, 0]
+    azimuth, zenith = np.radians(rows[:, 1:]).T
+    backward_rows = np.flatnonzero(np.diff(times) < 0)
+    if len(backward_rows):
+        raise ValueError(f"times go back in line {backward_rows[0] + 3}")
+    level, up = sin_cos(zenith)
+    sin, cos = sin_cos(azimuth)
     rays = np.column_stack([level * cos, level * sin, up])
-    if times[-1] == times[0] or (np.diff(times) == 1).all():  # or it is filled with one number
+    if times[-1] == times[0] or (np.diff(times) == 1).all():  # equal, or row numbers: not times
         return Calibration(name, "livox", rays=rays)
     shot_ns = (times - times[0]) * 1e9
-    every_us = Fraction(float(shot_ns[-1]) / (len(times) - 1) / 1000).limit_denominator(1000)
-    head = {"listed": True, "firing_us": every_us}
+    interval_us = Fraction(float(shot_ns[-1]) / (len(times) - 1) / 1000).limit_denominator(1000)
+    head = {"listed": True, "firing_us": interval_us}
     return Calibration(name, "livox", rays=rays, shot_ns=shot_ns, head=head)
 
 
 def _rows(text: str, skip: int, columns: int) -> Floats:
-    """Numbers of the lines after the header, (n, columns); ValueError naming a bad line."""
+    """Return the numbers of the lines after the header, (n, columns).
+
+    Raises
+    ------
+    ValueError
+        If there are no such lines, or a number is not finite; the message names the line.
+    """
     rows = np.loadtxt(io.StringIO(text), delimiter=",", skiprows=skip, ndmin=2)
     if not len(rows) or rows.shape[1] != columns:
         raise ValueError(f"it needs lines of {columns} numbers")

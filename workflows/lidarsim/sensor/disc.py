@@ -1,4 +1,4 @@
-"""Sub-rays of a beam: places in its cross-section, directions and starts."""
+"""Sub-rays of a beam: positions in its cross-section, directions and starts."""
 
 from __future__ import annotations
 
@@ -11,11 +11,12 @@ import numpy as np
 from ..base.arrays import Floats, Indices
 from ..base.elementary import log1p, sin_cos
 
-# {sub-rays: distance from the middle, as a share of the radius, and angle in degrees, of a sixth of
-# them}; the others are turned by multiples of 60 degrees, and one is in the middle. They were found
-# by local search, for the least error of the share of sub-rays on one side of a straight edge, at
-# whatever angle and offset: 0.214 of the beam with 7, 0.089 with 19, 0.055 with 37, 0.037 with 61,
-# 0.028, 0.022, 0.018, and 0.0148 with 217. Hexagonal rings have 0.054 with 217, spirals 0.020.
+# {number of sub-rays: distances from the middle, as a share of the radius, and angles in degrees,
+# of a sixth of the sub-rays}; the next sixths are rotated by multiples of 60 degrees, and one
+# sub-ray is in the middle. The positions are results of a local search, for the least error of the
+# share of sub-rays on one side of a straight edge, at any angle and offset: 0.214 of the beam with
+# 7, 0.089 with 19, 0.055 with 37, 0.037 with 61, 0.028, 0.022, 0.018, and 0.0148 with 217.
+# Hexagonal rings have 0.054 with 217, spirals 0.020.
 _SIXTH = {
     7: "0.7638 11.00",
     19: "0.4522 2.26, 0.7266 41.89, 0.9224 16.09",
@@ -57,13 +58,13 @@ Profile = Literal["even", "gaussian"]
 
 
 @cache
-def _places(count: int) -> Floats:
-    """Places in the unit disc: (count, 2), the middle first."""
+def _disc_points(count: int) -> Floats:
+    """Return the positions of sub-rays in the unit disc: (count, 2), the middle first."""
     if count == 1:
         return np.zeros((1, 2))
     radius, angle = np.array([pair.split() for pair in _SIXTH[count].split(",")], float).T
-    # The second moment of the disc. With that and the symmetry, polynomials to the third degree
-    # have the disc's mean; the energy of a return from any plane, and its range, are such.
+    # Positions with the second moment of the disc. With that and the symmetry, polynomials to the
+    # third degree have the disc's mean; the energy and range of a return from a plane are such.
     radius *= np.sqrt(count / 2 / (6 * (radius**2).sum()))
     angles = np.radians(angle + 60 * np.arange(6)[:, None])
     sines, cosines = sin_cos(angles)
@@ -72,20 +73,21 @@ def _places(count: int) -> Floats:
 
 
 @cache
-def _gaussian_places(count: int) -> Floats:
-    """Places with equal shares of a Gaussian beam's light, in units of its radius at 1/e².
+def _gaussian_points(count: int) -> Floats:
+    """Return positions with equal shares of a Gaussian beam's light: (count, 2), the middle first.
 
-    Those of the disc, moved outwards: where the disc within a place has a share q of the area, the
-    beam within it has the share q of the light, 1 - exp(-2 r²). Their second moment is the beam's.
-    On a straight edge they are wrong by at most 0.212 of the beam with 7, 0.107 with 19, 0.072,
-    0.053, 0.043, 0.039, 0.037, and 0.023 with 217. Weights on evenly spread places, out to the best
-    radius, are wrong by 0.280, 0.143, 0.103, …, and 0.034 with 217.
+    Positions are in units of the beam's radius at 1/e². The positions of the disc are moved
+    outwards: where the disc within a position has a share q of the area, the beam within it has the
+    share q of the light, 1 - exp(-2 r²). Their second moment is the beam's. At a straight edge, the
+    share of the light is wrong by at most 0.212 of the beam with 7, 0.107 with 19, 0.072, 0.053,
+    0.043, 0.039, 0.037, and 0.023 with 217. With weights on evenly spread positions, out to the
+    best radius, it is wrong by 0.280, 0.143, 0.103, …, and 0.034 with 217.
     """
-    places = _places(count)
-    share = (places**2).sum(axis=1)
+    points = _disc_points(count)
+    share = (points**2).sum(axis=1)
     outwards = np.sqrt(-log1p(-share[1:]) / 2 / share[1:])
-    places = np.concatenate([places[:1], places[1:] * outwards[:, None]])
-    return np.asarray(places * np.sqrt(count / 2 / (places**2).sum()))
+    points = np.concatenate([points[:1], points[1:] * outwards[:, None]])
+    return np.asarray(points * np.sqrt(count / 2 / (points**2).sum()))
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,10 +99,11 @@ class Beam:
     angles
         float64 (k, 2): angles off the axis, across and up, radians.
     starts
-        float64 (k, 2): where they leave the sensor, across and up, metres off the axis; None if all
-        start on it.
+        float64 (k, 2): starts at the sensor, across and up, metres off the axis; None if all
+        sub-rays start on the axis.
     oval
-        Whether the two directions differ, so that across and up have to be those of the sensor.
+        Whether the beam is wider in one direction, so that across and up are directions of the
+        sensor.
     """
 
     angles: Floats
@@ -111,43 +114,55 @@ class Beam:
         return len(self.angles)
 
     @classmethod
-    def of(
+    def from_divergences(
         cls,
         count: int,
         divergence: tuple[float, float],
         profile: Profile = "even",
         exit_m: float = 0.0,
     ) -> Beam:
-        """Make one: the number of sub-rays, of `SUBRAYS`, and full angles across and up, radians.
+        """Return the sub-rays of a beam by its full angles across and up, radians.
 
         Sub-rays of a beam that is wide at its start are skew lines. Off the axis, each starts at a
-        right angle to where it goes, so that the beam's radius in the distance R is
-        sqrt(w0² + (θ R / 2)²), that of a Gaussian beam: the hyperboloid is made of straight lines
+        right angle to its direction, so that the beam's radius in the distance R is
+        sqrt(w0² + (θ R / 2)²), as of a Gaussian beam: the hyperboloid consists of straight lines
         (Herloski, Marshall and Antos 1983).
+
+        Parameters
+        ----------
+        count
+            Number of sub-rays, of `SUBRAYS`.
+        divergence
+            Full angles across and up, radians.
+        profile
+            Distribution of the light over the beam.
+        exit_m
+            Width of the beam at the sensor, metres.
         """
         even = profile == "even" or count == 1
-        places = _places(count) if even else _gaussian_places(count)
+        points = _disc_points(count) if even else _gaussian_points(count)
         across, up = divergence
         starts = None
         if exit_m and count > 1:
-            starts = exit_m / 2 * np.stack([places[:, 1], -places[:, 0]], axis=1)
+            starts = exit_m / 2 * np.stack([points[:, 1], -points[:, 0]], axis=1)
             if across != up:
-                # All to one side, sub-rays would turn the oval on its way; of one sixth, skew it.
+                # All skewed to one side, sub-rays would rotate the oval along the beam; a sixth of
+                # them alone would skew it.
                 starts[1:] *= 1 - np.add.outer(range(6), range(count // 6)).reshape(-1, 1) % 2 * 2
-        return cls(np.array([across, up]) / 2 * places, starts, across != up and count > 1)
+        return cls(np.array([across, up]) / 2 * points, starts, across != up and count > 1)
 
 
 @cache
 def neighbours(count: int) -> Indices:
-    """Pairs of sub-rays with no other one between them: (m, 2).
+    """Return the pairs of neighbouring sub-rays: (m, 2).
 
-    The circle whose diameter connects them is empty (Gabriel and Sokal 1969).
+    The circle whose diameter connects a pair is empty (Gabriel and Sokal 1969).
     """
-    places = _places(count)
-    one, other = np.triu_indices(count, 1)
-    middle = (places[one] + places[other]) / 2
-    reach2 = ((places[one] - middle) ** 2).sum(axis=1)
-    apart2 = ((middle[:, None] - places) ** 2).sum(axis=2)
-    # The two themselves are on the circle.
+    points = _disc_points(count)
+    first, second = np.triu_indices(count, 1)
+    middle = (points[first] + points[second]) / 2
+    reach2 = ((points[first] - middle) ** 2).sum(axis=1)
+    apart2 = ((middle[:, None] - points) ** 2).sum(axis=2)
+    # The pair itself is on the circle.
     empty = (apart2 < reach2[:, None] * (1 - 1e-9)).sum(axis=1) == 0
-    return np.stack([one[empty], other[empty]], axis=1)
+    return np.stack([first[empty], second[empty]], axis=1)

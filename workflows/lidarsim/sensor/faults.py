@@ -1,4 +1,4 @@
-"""Faults of sensors, to test what reads their data: which, of which sensor, and when."""
+"""Faults of sensors, to test programs that read sensor data."""
 
 from __future__ import annotations
 
@@ -23,8 +23,8 @@ Channels = Annotated[Several[Annotated[int, Field(ge=0)]], Field(min_length=1)]
 Count = Annotated[int, Field(ge=1, le=1_000_000)]
 Shift = Annotated[float, Field(ge=-1e6, le=1e6)]
 
-# {kind: its own fields}; sectors may be left out
-_OWN: dict[str, tuple[str, ...]] = {
+# {kind: fields that only this kind has}; sectors may be left out
+_KIND_FIELDS: dict[str, tuple[str, ...]] = {
     "dirt": ("transmission", "azimuth_deg", "elevation_deg"),
     "dead_channels": ("channels",),
     "dropped_packets": ("share", "packet"),
@@ -36,7 +36,7 @@ _OWN: dict[str, tuple[str, ...]] = {
 @dataclass(frozen=True)
 @checked_fields
 class Fault:
-    """A fault of a sensor for some time; labels keep the truth, and list it.
+    """A fault of a sensor, for a time; labels keep the truth, and list the faults.
 
     Raises
     ------
@@ -44,15 +44,19 @@ class Fault:
         If a number is outside its range, or its fields do not fit together.
     """
 
-    kind: Annotated[FaultKind, about("what happens")]
-    from_s: Annotated[Time, about("when it begins, seconds since the survey's start")] = 0.0
-    to_s: Annotated[Time | None, about("when it ends; by default with the survey")] = None
-    sensor: Annotated[Text | None, about("its sensor's name; by default all have it")] = None
-    transmission: Annotated[UnitShare | None, about("of dirt: of energy, out and back")] = None
-    azimuth_deg: Annotated[Two[AngleDeg] | None, about("of dirt: counter-clockwise")] = None
+    kind: Annotated[FaultKind, about("kind of fault")]
+    from_s: Annotated[Time, about("start, seconds since the survey's start")] = 0.0
+    to_s: Annotated[Time | None, about("end; by default the survey's end")] = None
+    sensor: Annotated[Text | None, about("name of the faulty sensor; by default all")] = None
+    transmission: Annotated[UnitShare | None, about("of dirt: share of energy, out and back")] = (
+        None
+    )
+    azimuth_deg: Annotated[
+        Two[AngleDeg] | None, about("of dirt: start and end, counter-clockwise")
+    ] = None
     elevation_deg: Annotated[MinMax[AngleDeg] | None, about("of dirt: lowest and highest")] = None
-    channels: Annotated[Channels | None, about("dead ones; 0 is the lowest")] = None
-    share: Annotated[UnitShare | None, about("of packets that are lost")] = None
+    channels: Annotated[Channels | None, about("dead channels; 0 is the lowest")] = None
+    share: Annotated[UnitShare | None, about("share of packets that are lost")] = None
     packet: Annotated[Count | None, about("consecutive firings in a packet")] = None
     by_s: Annotated[Shift | None, about("of a time jump: added to stamps, seconds")] = None
 
@@ -60,17 +64,18 @@ class Fault:
         for name, value in self.words().items():  # labels have them as JSON
             listed = np.iterable(value) and not isinstance(value, str)
             object.__setattr__(self, name, without_numpy(tuple(value) if listed else value))
-        own = _OWN[self.kind]
-        given = self.words().keys() - {"kind", "from_s", "to_s", "sensor"}
-        for name in sorted((given ^ {*own}) - {one for one in own if one.endswith("_deg")}):
-            advice = f"leave {name} out" if name in given else f"give {name}"
-            takes = f"takes {', '.join(own)}" if own else "has times only"
+        kind_fields = _KIND_FIELDS[self.kind]
+        present = self.words().keys() - {"kind", "from_s", "to_s", "sensor"}
+        optional = {name for name in kind_fields if name.endswith("_deg")}
+        for name in sorted((present ^ {*kind_fields}) - optional):
+            advice = f"leave {name} out" if name in present else f"give {name}"
+            takes = f"takes {', '.join(kind_fields)}" if kind_fields else "has times only"
             raise LidarError(f"{self.kind} {takes}: {advice}.")
         if self.to_s is not None and self.to_s <= self.from_s:
             raise LidarError(f"to_s is {self.to_s:g}; give more than from_s, {self.from_s:g}.")
 
     def words(self) -> dict[str, Any]:
-        """Return what is given, for labels: {field: value}."""
+        """Return the fields that are not None, for labels: {field: value}."""
         return {name: value for name, value in vars(self).items() if value is not None}
 
     @property
@@ -78,11 +83,11 @@ class Fault:
         """Start and end of the fault, nanoseconds since the survey's start."""
         return self.from_s * 1e9, inf if self.to_s is None else self.to_s * 1e9
 
-    def during(self, begins_ns: Floats | Ints, ends_ns: Floats | Ints | None = None) -> Bools:
-        """Return whether the fault acts at times (n,), or in intervals to `ends_ns` (n,)."""
-        ends_ns = begins_ns if ends_ns is None else ends_ns
+    def during(self, starts_ns: Floats | Ints, stops_ns: Floats | Ints | None = None) -> Bools:
+        """Return whether the fault acts at times (n,), or in intervals to `stops_ns` (n,)."""
+        stops_ns = starts_ns if stops_ns is None else stops_ns
         begin, end = self.span_ns
-        return np.asarray((ends_ns >= begin) & (begins_ns < end))
+        return np.asarray((stops_ns >= begin) & (starts_ns < end))
 
     def jumps_ns(self, times_ns: Floats | Ints) -> Ints:
         """Return the shift of stamps at times (n,), nanoseconds."""
@@ -92,30 +97,39 @@ class Fault:
 def check_faults(
     faults: Sequence[Fault], sensors: Mapping[str, Sensor], duration_ns: float
 ) -> None:
-    """Check that faults fit the sensors and the duration of a survey; LidarError if not.
+    """Check that faults fit the sensors and the duration of a survey.
 
-    `sensors` are by their names.
+    `sensors` are {name: sensor}.
+
+    Raises
+    ------
+    LidarError
+        If a fault does not fit.
     """
-    duration_s = duration_ns / 1e9
     for number, fault in enumerate(faults):
         with prefixed(f"faults[{number}]"):
-            faulty = [sensor for name, sensor in sensors.items() if fault.sensor in (None, name)]
-            if not faulty:
-                known = " Leave it out."
-                if any(sensors):
-                    known = f" There are {', '.join(sensors)}."
-                hint = did_you_mean(str(fault.sensor), sensors) or known
-                raise LidarError(f"there is no sensor {fault.sensor!r}.{hint}")
-            first_firing = np.zeros(1, np.int64)
-            starts_ns = [sensor.begins_ns(first_firing)[0] + sensor.lead_ns for sensor in faulty]
-            if fault.kind == "frozen" and fault.from_s <= max(starts_ns) / 1e9:
-                raise LidarError("a frozen sensor repeats a sweep: give a later from_s.")
-            if fault.from_s > duration_s:
-                raise LidarError(
-                    f"from_s is {fault.from_s:g}, and the survey lasts {duration_s:.6g} s: make "
-                    "from_s smaller."
-                )
-            channels = min(sensor.channels for sensor in faulty)
-            highest = max(fault.channels or (0,))
-            if highest >= channels:
-                raise LidarError(f"there is no channel {highest}, but 0 to {channels - 1}.")
+            _check_fault(fault, sensors, duration_ns / 1e9)
+
+
+def _check_fault(fault: Fault, sensors: Mapping[str, Sensor], duration_s: float) -> None:
+    """Check that a fault fits the sensors {name: sensor} and the duration of a survey."""
+    faulty = [sensor for name, sensor in sensors.items() if fault.sensor in (None, name)]
+    if not faulty:
+        advice = " Leave it out."
+        if any(sensors):
+            advice = f" There are {', '.join(sensors)}."
+        hint = did_you_mean(str(fault.sensor), sensors) or advice
+        raise LidarError(f"there is no sensor {fault.sensor!r}.{hint}")
+    first_firing = np.zeros(1, np.int64)
+    starts_ns = [sensor.begins_ns(first_firing)[0] + sensor.lead_ns for sensor in faulty]
+    if fault.kind == "frozen" and fault.from_s <= max(starts_ns) / 1e9:
+        raise LidarError("a frozen sensor repeats a sweep: give a later from_s.")
+    if fault.from_s > duration_s:
+        raise LidarError(
+            f"from_s is {fault.from_s:g}, and the survey lasts {duration_s:.6g} s: make "
+            "from_s smaller."
+        )
+    channels = min(sensor.channels for sensor in faulty)
+    highest = max(fault.channels or (0,))
+    if highest >= channels:
+        raise LidarError(f"there is no channel {highest}, but 0 to {channels - 1}.")

@@ -31,8 +31,8 @@ RETRO_GAIN = 220.0
 GLASS_INDEX = 1.5
 # Of water, from 905 to 1550 nm (Hale and Querry 1973: 1.328 to 1.318).
 WATER_INDEX = 1.328
-# Share of diffuse light in water that its surface sends back, 1 - (1 - r) / n², where r is the mean
-# of Fresnel's reflection outside, over a half space (Lekner and Dorf 1988).
+# Share of diffuse light in water that the water's surface reflects, 1 - (1 - r) / n², where r is
+# the mean of Fresnel's reflection outside, over a half space (Lekner and Dorf 1988).
 WATER_INWARDS = 0.4702
 NEAREST_M = 1e-3  # energies do not grow below this distance
 # wavelengths of the table of reflectances
@@ -45,17 +45,17 @@ SemanticClass = Annotated[int, Field(ge=0, le=65_535)]
 Transparent = Literal["none", "pass"]
 
 
-def _checked_names(given: Any, handler: Callable[[Any], Any]) -> Any:
-    """Refuse names of classes that files cannot hold, or that two classes share."""
-    for number, name in given.items() if isinstance(given, Mapping) else ():
-        known = type(number) is int and 0 <= number <= 65_535 and isinstance(name, str)
-        alone = [*given.values()].count(name) == 1
-        if not (known and alone and 0 < len(name) < 100 and name.isprintable()):
+def _checked_names(names: Any, handler: Callable[[Any], Any]) -> Any:
+    """Raise ValueError for names of classes that files cannot hold, or that two classes share."""
+    for number, name in names.items() if isinstance(names, Mapping) else ():
+        valid = type(number) is int and 0 <= number <= 65_535 and isinstance(name, str)
+        unique = [*names.values()].count(name) == 1
+        if not (valid and unique and 0 < len(name) < 100 and name.isprintable()):
             raise ValueError(
                 f"{shown({number: name})} is no class with a name of its own: give whole numbers "
                 "of 0 to 65535 and a different text for each, such as {10: car}."
             )
-    return handler(given)
+    return handler(names)
 
 
 ClassNames = Annotated[Mapping[SemanticClass, str], WrapValidator(_checked_names)]
@@ -71,7 +71,7 @@ class Measured(NamedTuple):
 
 @cache
 def reflectances() -> dict[str, Measured]:
-    """Return the table of reflectances: {name of a material: what was measured}."""
+    """Return the table of reflectances: {name of a material: measurement}."""
     text = (files("lidarsim.sensor") / "reflectances.csv").read_text("utf-8")
     return {
         row["name"]: Measured(
@@ -86,17 +86,17 @@ def reflectances() -> dict[str, Measured]:
 class Material:
     """Optical properties and class of surfaces; of several entries for a face, the first counts.
 
-    An entry is for objects by their names, for faces by the names that their materials have in the
-    scene's files, or for the faces of some objects that have some materials.
+    An entry applies to objects by their names, to faces by the names of their materials in the
+    scene's files, or to faces by both.
 
-    Reflectance is that at the sensor's wavelength, in all directions but for a gloss. Of light that
-    is not scattered, a share is mirrored; the rest passes, or is lost with "none".
+    Reflectance is at the sensor's wavelength, equal in all directions but for a gloss. Of light
+    that is not scattered, a share is mirrored; the rest passes, or is lost with "none".
 
     Raises
     ------
     LidarError
-        If it is for nothing, a value is outside its range, the table of reflectances has no such
-        spectrum, or two values contradict each other.
+        If the entry has neither objects nor material, a value is outside its range, the table of
+        reflectances has no such spectrum, or two values contradict each other.
     """
 
     objects: Annotated[
@@ -188,18 +188,28 @@ class Material:
                 'a material is for nothing: give objects, such as objects: "*", or material, a '
                 "name of the scene's file."
             )
-        for field_name in ("objects", "material"):
-            given = getattr(self, field_name)
-            if given is None:
-                continue
-            names = (given,) if isinstance(given, str) else tuple(given)
-            if not names or not all(names):
-                raise LidarError(f"{field_name} is {given!r}; it must be names of {field_name}.")
-            object.__setattr__(self, field_name, names)
+        self._set_names("objects")
+        self._set_names("material")
+        self._check_reflectance()
+        self._check_roughness()
+        self._check_medium()
+
+    def _set_names(self, field_name: str) -> None:
+        """Replace a name by a tuple of names; LidarError for no or empty names."""
+        value = getattr(self, field_name)
+        if value is None:
+            return
+        names = (value,) if isinstance(value, str) else tuple(value)
+        if not names or not all(names):
+            raise LidarError(f"{field_name} is {value!r}; it must be names of {field_name}.")
+        object.__setattr__(self, field_name, names)
+
+    def _check_reflectance(self) -> None:
+        """Check that reflectance, spectrum and scale fit together."""
         if self.spectrum is not None:
-            if self.spectrum not in (known := reflectances()):
-                there = _materials_like(self.spectrum, [*known])
-                raise LidarError(f"There is no spectrum {self.spectrum!r}.{there}")
+            if self.spectrum not in (spectra := reflectances()):
+                hint = _materials_like(self.spectrum, [*spectra])
+                raise LidarError(f"There is no spectrum {self.spectrum!r}.{hint}")
             if self.reflectance is not None:
                 raise LidarError("give either spectrum or reflectance, not both.")
         if self.reflectance == "texture":
@@ -211,6 +221,8 @@ class Material:
         elif self.scale != 1:
             raise LidarError("scale is a factor of colours: give reflectance texture with it.")
 
+    def _check_roughness(self) -> None:
+        """Check that only a matt, opaque surface has a gloss."""
         if self.roughness is None and self.metalness:
             raise LidarError("metalness needs a roughness: give 0.1 (polished) to 1 (matt).")
         smooth = self.transparent != "none" or self.specular_reflectance is not None
@@ -218,10 +230,9 @@ class Material:
             raise LidarError(
                 "roughness is for opaque surfaces without retro and specular_reflectance."
             )
-        self._check_within()
 
-    def _check_within(self) -> None:
-        """Refuse what contradicts the medium within a surface, or the light that passes it."""
+    def _check_medium(self) -> None:
+        """Check that mirrored and passing light, the medium within a surface and leaves agree."""
         mirrors = self.specular_reflectance
         if mirrors is not None and (mirrors == "fresnel") != (self.transparent == "pass"):
             raise LidarError(
@@ -243,11 +254,20 @@ class Material:
 
     @property
     def _suits_leaves(self) -> bool:
-        other = self.transparent != "none" or self.retro or self.roughness is not None
-        return not (other or self.specular_reflectance) and self.reflectance != "texture"
+        """Whether leaves can have this material, which only scatters light and needs no colours."""
+        scatters_otherwise = self.transparent != "none" or self.retro or self.roughness is not None
+        return (
+            not (scatters_otherwise or self.specular_reflectance) and self.reflectance != "texture"
+        )
 
     def check_leaves(self, name: str, voxels: bool) -> None:
-        """Check that it suits an object, by whether that has voxels; LidarError if not."""
+        """Check that the material suits an object `name`, which may have `voxels`.
+
+        Raises
+        ------
+        LidarError
+            If the material has leaves of its own and the object has voxels, or the like.
+        """
         if voxels and (self.leaf_area_density is not None or not self._suits_leaves):
             raise LidarError(
                 f"materials: {name!r} is of voxels, whose file has the leaf area: give it an entry "
@@ -260,11 +280,11 @@ class Material:
             )
 
     def share(self, wavelength_nm: float) -> float:
-        """Share of light that is scattered; of textures, that of what has no colour."""
+        """Return the share of light that is scattered; with a texture, where there is no colour."""
         if self.spectrum is not None:
-            near, far = reflectances()[self.spectrum].shares
-            # The nearer of the two was measured; between them, leaves absorb more than either says.
-            return near if wavelength_nm < (NEAR_NM + FAR_NM) / 2 else far
+            at_905_nm, at_1550_nm = reflectances()[self.spectrum].shares
+            # The nearer measurement: between both wavelengths, leaves absorb more than at either.
+            return at_905_nm if wavelength_nm < (NEAR_NM + FAR_NM) / 2 else at_1550_nm
         if self.reflectance == "texture":
             return min(1.0, self.scale * REFLECTANCE)
         if self.reflectance is None:
@@ -275,12 +295,12 @@ class Material:
 
     @property
     def specular(self) -> float:
-        """Share of what is not scattered that is mirrored at right angles; 1 for "fresnel"."""
+        """Share of the light not scattered that is mirrored at right angles; 1 for "fresnel"."""
         return float(self.specular_reflectance == "fresnel" or self.specular_reflectance or 0)
 
     def named(self, name: str, materials: Collection[str] = ("",)) -> bool:
-        """Whether this material applies to an object, or some of its faces, of some materials."""
-        return _fits(name, self.objects) and any(_fits(one, self.material) for one in materials)
+        """Return whether this entry applies to an object `name` with faces of `materials`."""
+        return _fits(name, self.objects) and any(_fits(face, self.material) for face in materials)
 
     @property
     def for_all(self) -> bool:
@@ -289,20 +309,25 @@ class Material:
 
 
 def _fits(name: str, patterns: str | Sequence[str] | None) -> bool:
-    """Whether a name fits one of some patterns, of which None stands for all."""
-    return patterns is None or any(name == one or fnmatchcase(name, one) for one in patterns)
+    """Return whether a name fits a pattern; None fits all names."""
+    return patterns is None or any(
+        name == pattern or fnmatchcase(name, pattern) for pattern in patterns
+    )
 
 
-def _materials_like(name: str, known: Sequence[str]) -> str:
-    """Name the materials that contain a word, such as «asphalt», or else the nearest, or all."""
-    some = [one for one in known if name.lower() in one.lower()]
-    if len(some) > 1:
-        return f" There are: {'; '.join(some)}."
-    return did_you_mean(name, some or known) or f" There are: {'; '.join(some or known)}."
+def _materials_like(name: str, materials: Sequence[str]) -> str:
+    """Return a hint with the materials that contain a word, else the most similar, else all."""
+    containing = [material for material in materials if name.lower() in material.lower()]
+    if len(containing) > 1:
+        return f" There are: {'; '.join(containing)}."
+    return (
+        did_you_mean(name, containing or materials)
+        or f" There are: {'; '.join(containing or materials)}."
+    )
 
 
 def rows_named(pattern: str, names: Sequence[str]) -> Indices:
-    """Rows of names that are a name, or fit it as a pattern with * and ?."""
+    """Return the rows of the names that equal or fit a pattern with * and ?."""
     if not any(sign in pattern for sign in "*?["):
         return np.array([row for row, name in enumerate(names) if name == pattern], np.intp)
     fits = re.compile(translate(pattern)).match
@@ -311,16 +336,16 @@ def rows_named(pattern: str, names: Sequence[str]) -> Indices:
 
 @dataclass(frozen=True, eq=False)
 class SurfaceKinds:
-    """Kinds of surfaces: each object, or of an object of several materials each of these.
+    """Kinds of surfaces: a kind for each object, or for each material of an object.
 
     Parameters
     ----------
     names
         Names of all objects.
     object
-        int (k,), ascending: row of `names` for each kind. Each object has one kind at least.
+        int (k,), ascending: row of `names` for each kind. Each object has at least one kind.
     material
-        Names (k,) that the materials have in the scene's files; "" for none.
+        Names (k,) of the materials in the scene's files; "" for none.
     """
 
     names: Sequence[str]
@@ -329,7 +354,7 @@ class SurfaceKinds:
 
     @classmethod
     def of_objects(cls, names: Sequence[str]) -> SurfaceKinds:
-        """Return one kind for each object, without a material."""
+        """Return a kind for each object, without materials."""
         return cls(names, np.arange(len(names)), ("",) * len(names))
 
     @cached_property
@@ -338,7 +363,7 @@ class SurfaceKinds:
         return np.searchsorted(self.object, np.arange(len(self.names) + 1))
 
     def of_rows(self, rows: Indices) -> Indices:
-        """Kinds of some objects."""
+        """Return the kinds of objects, by the objects' rows (m,)."""
         if len(self.object) == len(self.names):
             return rows
         starts = self.first[rows]
@@ -347,30 +372,33 @@ class SurfaceKinds:
         return np.concatenate([np.zeros(0, np.intp), *ranges])
 
     def describe(self, kind: int) -> str:
-        """Name of a kind for errors: of its object, and of its material."""
+        """Return the name of a kind for errors, with its object and its material."""
         name = repr(self.names[self.object[kind]])
         return f"{name}, material {self.material[kind]!r}" if self.material[kind] else name
 
 
 def first_matches(materials: Sequence[Material], kinds: SurfaceKinds) -> Indices:
-    """First material that is for each kind of surface, -1 for none: (k,).
+    """Return the number of the first material that applies to each kind, -1 for none: (k,).
 
-    LidarError if a material is for nothing in the scene, or hides those after it.
+    Raises
+    ------
+    LidarError
+        If a material applies to no kind, or to all kinds although materials follow.
     """
     first = np.full(len(kinds.object), -1)
-    known = {name: row for row, name in enumerate(kinds.names)}
-    of_material: dict[str, list[int]] = {}  # {name of a material: its kinds}
+    object_rows = {name: row for row, name in enumerate(kinds.names)}
+    kinds_by_material: dict[str, list[int]] = {}  # {name of a material: kinds}
     if any(entry.material is not None for entry in materials):
         for kind, name in enumerate(kinds.material):
             if name:
-                of_material.setdefault(name, []).append(kind)
+                kinds_by_material.setdefault(name, []).append(kind)
     for number, entry in enumerate(materials):
         if entry.for_all and number + 1 < len(materials):
             raise LidarError(
                 f"materials: the first entry for a surface counts, so that none after number "
                 f'{number + 1}, {{objects: "*"}}, would: put it last.'
             )
-        matches = _matching_kinds(entry, kinds, known, of_material)
+        matches = _matching_kinds(entry, kinds, object_rows, kinds_by_material)
         first[matches[first[matches] < 0]] = number
     return first
 
@@ -378,18 +406,26 @@ def first_matches(materials: Sequence[Material], kinds: SurfaceKinds) -> Indices
 def _matching_kinds(
     entry: Material,
     kinds: SurfaceKinds,
-    known: Mapping[str, int],
-    of_material: Mapping[str, Sequence[int]],
+    object_rows: Mapping[str, int],
+    kinds_by_material: Mapping[str, Sequence[int]],
 ) -> Indices:
-    """Kinds that a material is for; LidarError if a name fits nothing in the scene."""
+    """Return the kinds that a material applies to.
+
+    `object_rows` are {name of an object: row}, `kinds_by_material` {name of a material: kinds}.
+
+    Raises
+    ------
+    LidarError
+        If a name fits no object or no material of the scene.
+    """
     matches: Indices | None = None
     if entry.objects is not None:
-        rows = [_matching_rows(pattern, kinds.names, known) for pattern in entry.objects]
+        rows = [_matching_rows(pattern, kinds.names, object_rows) for pattern in entry.objects]
         matches = kinds.of_rows(np.concatenate(rows))
     if entry.material is None:
-        assert matches is not None, "a material is for objects, or for materials"
+        assert matches is not None, "a material applies to objects, or to materials"
         return matches
-    names = [*of_material]
+    names = [*kinds_by_material]
     with_material: list[int] = []
     for pattern in entry.material:
         rows_of_pattern = rows_named(pattern, names)
@@ -403,23 +439,23 @@ def _matching_kinds(
                 + measured * (pattern in reflectances())
             )
         for row in rows_of_pattern.tolist():
-            with_material += of_material[names[row]]
-    some = np.array(with_material, np.intp)
+            with_material += kinds_by_material[names[row]]
+    kinds_with_material = np.array(with_material, np.intp)
     if matches is None:
-        return some
-    both = np.intersect1d(matches, some)
-    if not len(both):
+        return kinds_with_material
+    common = np.intersect1d(matches, kinds_with_material)
+    if not len(common):
         raise LidarError(
             f"materials: no face of {', '.join(map(repr, entry.objects or ()))} has the material "
             f"{', '.join(map(repr, entry.material))}."
         )
-    return both
+    return common
 
 
-def _matching_rows(pattern: str, names: Sequence[str], known: Mapping[str, int]) -> Indices:
-    """Rows of objects that a pattern fits; LidarError if there are none."""
-    if pattern in known and not any(sign in pattern for sign in "*?["):
-        return np.array([known[pattern]])
+def _matching_rows(pattern: str, names: Sequence[str], object_rows: Mapping[str, int]) -> Indices:
+    """Return the rows of the objects that fit a pattern; LidarError if no object fits."""
+    if pattern in object_rows and not any(sign in pattern for sign in "*?["):
+        return np.array([object_rows[pattern]])
     rows = rows_named(pattern, names)
     if not len(rows):
         listed = f" There are {', '.join(names[:5])}{', …' * (len(names) > 5)}."
@@ -433,56 +469,65 @@ def _matching_rows(pattern: str, names: Sequence[str], known: Mapping[str, int])
 def with_classes(
     materials: Sequence[Material], classes: Mapping[int, Sequence[str]], kinds: SurfaceKinds
 ) -> list[Material]:
-    """Give objects whose material has no class one by their names: {class: patterns}.
+    """Return materials with classes for objects by their names, where a material has no class.
 
-    LidarError if a material is for nothing in the scene.
+    `classes` are {class: patterns}.
+
+    Raises
+    ------
+    LidarError
+        If a material applies to no kind.
     """
     first = first_matches(materials, kinds)
-    before: list[list[Material]] = [[] for _ in materials]  # what comes before each
+    insertions: list[list[Material]] = [[] for _ in materials]  # new entries before each entry
     for semantic_class, patterns in classes.items():
         for pattern in patterns:
             rows = rows_named(pattern, kinds.names)
-            of_pattern = kinds.of_rows(rows)
-            for number in np.unique(first[of_pattern]).tolist():
+            pattern_kinds = kinds.of_rows(rows)
+            for number in np.unique(first[pattern_kinds]).tolist():
                 entry = materials[number]
                 if number < 0 or entry.semantic_class:
                     continue
-                some = of_pattern[first[of_pattern] == number]
+                unclassified = pattern_kinds[first[pattern_kinds] == number]
                 objects = [pattern]
-                if len(some) < len(of_pattern):
-                    of_some = np.unique(kinds.object[some]).tolist()
-                    objects = [escape(kinds.names[row]) for row in of_some]
-                with_its_class = replace(entry, objects=objects, semantic_class=semantic_class)
-                before[number].insert(0, with_its_class)
-    return [
-        made for entry, others in zip(materials, before, strict=True) for made in (*others, entry)
-    ]
+                if len(unclassified) < len(pattern_kinds):
+                    objects_of_kinds = np.unique(kinds.object[unclassified]).tolist()
+                    objects = [escape(kinds.names[row]) for row in objects_of_kinds]
+                classified = replace(entry, objects=objects, semantic_class=semantic_class)
+                insertions[number].insert(0, classified)
+    pairs = zip(materials, insertions, strict=True)
+    return [entry for material, inserted in pairs for entry in (*inserted, material)]
 
 
 def with_class(
     materials: Sequence[Material], semantic_class: int, rows: Indices, kinds: SurfaceKinds
 ) -> list[Material]:
-    """Give some objects a class, and leave the rest of their materials.
+    """Return materials with a class for objects, by their rows (m,), and otherwise unchanged.
 
-    LidarError if a material is for nothing in the scene.
+    Raises
+    ------
+    LidarError
+        If a material applies to no kind.
     """
     first = first_matches(materials, kinds)
-    of_rows = kinds.of_rows(rows)
-    out: list[Material] = []
+    selected_kinds = kinds.of_rows(rows)
+    entries: list[Material] = []
     for number in (*range(len(materials)), -1):
-        of_number = np.unique(kinds.object[of_rows[first[of_rows] == number]]).tolist()
-        if of_number:
+        object_rows = np.unique(
+            kinds.object[selected_kinds[first[selected_kinds] == number]]
+        ).tolist()
+        if object_rows:
             entry = materials[number] if number >= 0 else Material("*")
-            objects = [escape(kinds.names[row]) for row in of_number]
-            out.append(replace(entry, objects=objects, semantic_class=semantic_class))
+            objects = [escape(kinds.names[row]) for row in object_rows]
+            entries.append(replace(entry, objects=objects, semantic_class=semantic_class))
         if number >= 0:
-            out.append(materials[number])
-    return out
+            entries.append(materials[number])
+    return entries
 
 
 @dataclass(frozen=True, eq=False)
 class MaterialTable:
-    """Materials of kinds of surfaces: each array has one value for each."""
+    """Materials of kinds of surfaces: arrays with a value for each kind."""
 
     reflectance: Floats
     scale: Floats  # of the luminance of colours; 0 where the reflectance is a number
@@ -490,7 +535,7 @@ class MaterialTable:
     metalness: Floats
     retro: Bools
     passes: Bools
-    specular: Floats  # share of what is not scattered that is mirrored at right angles
+    specular: Floats  # share of the light not scattered that is mirrored at right angles
     semantic_class: NDArray[np.uint16]
     refractive_index: Floats  # within; 0 where light goes straight on
     attenuation: Floats  # within, 1/m
@@ -499,74 +544,78 @@ class MaterialTable:
     leaf_angles: tuple[str | float, ...]
 
     @classmethod
-    def of(
+    def build(
         cls,
         materials: Sequence[Material],
         kinds: SurfaceKinds,
         wavelength_nm: float = NEAR_NM,
         voxels: Bools | None = None,
     ) -> MaterialTable:
-        """Find the materials of kinds of surfaces: the first that is for a kind counts.
+        """Return the materials of kinds of surfaces: the first that applies to a kind counts.
 
-        `voxels` (objects,) says which have voxels, and so leaves of their own; None for none.
+        `voxels` (objects,) says whether objects have voxels, and so leaves of their own; None if no
+        object has voxels.
 
         Raises
         ------
         LidarError
-            If a name fits nothing, there are materials and a kind has none, or one is not for
-            leaves, and its object has some.
+            If a name fits no object or material, some but not all kinds have a material, or the
+            material of an object with leaves is not for leaves.
         """
         first = first_matches(materials, kinds)
-        without = np.flatnonzero(first < 0)
-        if len(without) and materials:
-            more = f" and {len(without) - 1} more" if without[1:].size else ""
+        unmatched = np.flatnonzero(first < 0)
+        if len(unmatched) and materials:
+            uncovered = f" and {len(unmatched) - 1} more" if unmatched[1:].size else ""
             raise LidarError(
-                f"materials: no entry names the object {kinds.describe(without[0])}{more}: end "
-                'with one for all the others, such as {objects: "*"}.'
+                f"materials: no entry names the object {kinds.describe(unmatched[0])}{uncovered}: "
+                'end with one for all the others, such as {objects: "*"}.'
             )
-        found = [*materials, Material("*")]  # the last is of all, if there are no materials
-        textured = [m.scale * (m.reflectance == "texture") for m in found]
-        angles = tuple(dict.fromkeys(m.leaf_angle for m in found))
-        leaf_area = np.array([m.leaf_area_density or 0.0 for m in found])[first]
-        own = np.zeros(len(first), np.bool_) if voxels is None else voxels[kinds.object]
-        angled = np.array([m.leaf_angle != "spherical" for m in found])[first]
-        for row in np.flatnonzero(own | angled).tolist():
+        entries = [*materials, Material("*")]  # the last is of all, if there are no materials
+        textured = [m.scale * (m.reflectance == "texture") for m in entries]
+        angles = tuple(dict.fromkeys(m.leaf_angle for m in entries))
+        leaf_area = np.array([m.leaf_area_density or 0.0 for m in entries])[first]
+        has_voxels = np.zeros(len(first), np.bool_) if voxels is None else voxels[kinds.object]
+        has_leaf_angle = np.array([m.leaf_angle != "spherical" for m in entries])[first]
+        for row in np.flatnonzero(has_voxels | has_leaf_angle).tolist():
             name = kinds.names[kinds.object[row]]
-            found[first[row]].check_leaves(name, bool(own[row]))
-        leaf_area[own] = 1.0
+            entries[first[row]].check_leaves(name, bool(has_voxels[row]))
+        leaf_area[has_voxels] = 1.0
         return cls(
-            np.array([m.share(wavelength_nm) for m in found], np.float64)[first],
+            np.array([m.share(wavelength_nm) for m in entries], np.float64)[first],
             np.array(textured, np.float64)[first],
-            np.array([m.roughness or 0.0 for m in found])[first],
-            np.array([m.metalness for m in found])[first],
-            np.array([m.retro for m in found], np.bool_)[first],
-            np.array([m.transparent == "pass" for m in found], np.bool_)[first],
-            np.array([m.specular for m in found], np.float64)[first],
-            np.array([m.semantic_class for m in found], np.uint16)[first],
-            np.array([m.refractive_index or 0.0 for m in found])[first],
-            np.array([m.attenuation_per_m for m in found], np.float64)[first],
+            np.array([m.roughness or 0.0 for m in entries])[first],
+            np.array([m.metalness for m in entries])[first],
+            np.array([m.retro for m in entries], np.bool_)[first],
+            np.array([m.transparent == "pass" for m in entries], np.bool_)[first],
+            np.array([m.specular for m in entries], np.float64)[first],
+            np.array([m.semantic_class for m in entries], np.uint16)[first],
+            np.array([m.refractive_index or 0.0 for m in entries])[first],
+            np.array([m.attenuation_per_m for m in entries], np.float64)[first],
             leaf_area,
-            np.array([angles.index(m.leaf_angle) for m in found], np.intp)[first],
+            np.array([angles.index(m.leaf_angle) for m in entries], np.intp)[first],
             angles,
         )
 
     @property
     def leafy(self) -> Bools:
-        """Whether surfaces are full of leaves."""
+        """Whether surfaces are full of leaves: (k,)."""
         return self.leaf_area > 0
 
     @property
     def refracts(self) -> Bools:
-        """Whether light is refracted at surfaces."""
+        """Whether light is refracted at surfaces: (k,)."""
         return self.refractive_index > 0
 
     @property
     def textured(self) -> bool:
-        """Whether the colours of a surface are its reflectance."""
+        """Whether the reflectance of any surface is its colour."""
         return bool(self.scale.any())
 
     def shares(self, rows: Integers, luminance: Floats | None) -> Floats:
-        """Share of light that kinds of surfaces (n,) scatter; `luminance` as of `scattered`."""
+        """Return the share of light that surfaces scatter, by their kinds (n,): (n,).
+
+        `luminance` (n,) is the luminance of the hit colours, if the table is `textured`.
+        """
         shares = self.reflectance[rows]
         if luminance is not None:
             scale = self.scale[rows]
@@ -575,28 +624,30 @@ class MaterialTable:
         return shares
 
     def scattered(self, rows: Integers, cosine: Floats, luminance: Floats | None = None) -> Floats:
-        """Share of the light returned by kinds of surfaces (n,): 1 for white at right angles.
+        """Return the share of light that surfaces return, by their kinds (n,): (n,).
 
-        `luminance` (n,) is that of the colours that were hit, if the table is `textured`.
+        The share is 1 for a white surface hit at right angles. `cosine` (n,) is the cosine of the
+        angle of incidence; `luminance` (n,) is the luminance of the hit colours, if the table is
+        `textured`.
         """
         shares = self.shares(rows, luminance)
         back = shares * np.where(self.retro[rows], RETRO_GAIN, cosine)
         if self.roughness.any():
-            on = np.flatnonzero(self.roughness[rows])
-            metal = self.metalness[rows[on]]
-            some = shares[on]
-            front = POLISHED * (1 - metal) + some * metal
-            back[on] *= 1 - metal
-            back[on] += front * gloss(cosine[on], self.roughness[rows[on]])
+            rough = np.flatnonzero(self.roughness[rows])
+            metal = self.metalness[rows[rough]]
+            diffuse = shares[rough]
+            front = POLISHED * (1 - metal) + diffuse * metal
+            back[rough] *= 1 - metal
+            back[rough] += front * gloss(cosine[rough], self.roughness[rows[rough]])
         return back
 
 
 def gloss(cosine: Floats, roughness: Floats) -> Floats:
-    """Light that facets of a rough surface mirror back to where it came from, of a white diffuser.
+    """Return the light that facets of a rough surface mirror back, relative to a white diffuser.
 
     Facets are distributed after Walter et al. 2007 (GGX), with shadowing after Smith, and the width
-    is the square of the roughness, as in glTF 2.0. With light and receiver in one direction, their
-    π D G / (4 cos θ) is what is left here. Multiply it by the reflection at right angles.
+    is the square of the roughness, as in glTF 2.0. With light and receiver in one direction, the
+    light is π D G / (4 cos θ). Multiply it by the reflection at right angles.
     """
     width = np.square(roughness**2)
     square = cosine**2
@@ -605,19 +656,19 @@ def gloss(cosine: Floats, roughness: Floats) -> Floats:
 
 
 def fresnel(cosine: Any, index: Any = GLASS_INDEX) -> Any:
-    """Share of unpolarised light that a surface reflects (Fresnel's equations).
+    """Return the share of unpolarised light that a surface reflects (Fresnel's equations).
 
-    `index` is the refractive index behind the surface over that before it; all light is reflected
-    where it is below 1 and the cosine is small.
+    `index` is the refractive index behind the surface over the index before it. Where `index` is
+    below 1 and the cosine is small, all light is reflected.
     """
     inside = np.sqrt(np.maximum(1 - (1 - cosine**2) / (index * index), 0.0))
-    across = (cosine - index * inside) / (cosine + index * inside)
-    along = (inside - index * cosine) / (inside + index * cosine)
-    return (across**2 + along**2) / 2
+    perpendicular = (cosine - index * inside) / (cosine + index * inside)
+    parallel = (inside - index * cosine) / (inside + index * cosine)
+    return (perpendicular**2 + parallel**2) / 2
 
 
 def below_water(cosine: Any, reflectance: Any) -> Any:
-    """Light that matt surfaces below a film of water return, relative to dry ones: (n,).
+    """Return the light from matt surfaces below a film of water, relative to dry surfaces: (n,).
 
     ``T² / (n² (1 - p ρ))``: light passes the film's surface twice, with Fresnel's transmittance T;
     in the water it is spread by n², and the share p is sent back to the ground (Lekner and Dorf
@@ -627,23 +678,26 @@ def below_water(cosine: Any, reflectance: Any) -> Any:
 
 
 def within_water(mirrored: Any, reflectance: Any) -> Any:
-    """See `below_water`; of light of which the film mirrors a share."""
+    """Return the light from matt surfaces below a film of water that mirrors a share of light.
+
+    The light is relative to dry surfaces, as in `below_water`.
+    """
     through = (1 - mirrored) / WATER_INDEX
     return through * through / (1 - WATER_INWARDS * reflectance)
 
 
 def at_right_angles(distance: Any, extinction: float = 0.0) -> Any:
-    """Energy returned by white surfaces hit at right angles, by distance in metres."""
+    """Return the energy from white surfaces hit at right angles, by distance in metres."""
     distance = np.maximum(distance, NEAREST_M)
     nearer = np.square(REFERENCE_M / distance)
     return nearer * exp(-2 * extinction * distance) if extinction else nearer
 
 
 def extinction(visibility_km: float | None, wavelength_nm: float) -> float:
-    """Extinction of the air, 1/m (Kruse, McGlauchlin and McQuistan 1962).
+    """Return the extinction of the air, 1/m (Kruse, McGlauchlin and McQuistan 1962).
 
     At the meteorological visibility, a contrast has fallen to 2 %; None is clear air without
-    extinction. The wavelength is that of the laser.
+    extinction. The wavelength is the laser's.
 
     Examples
     --------

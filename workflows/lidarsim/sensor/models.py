@@ -1,4 +1,4 @@
-"""Sensor models by name: reads their data files and makes sensors."""
+"""Sensor models by name: reading their data files, and making sensors."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ from .ray_sensors import ListedSensor, Prism, PrismSensor, TurningMirror
 from .sensor import LineSensor, MaxRange, MinRange, Sensor
 
 _BUILT_IN = files("lidarsim.sensor") / "data"
-# Plug-ins are packages with data files, as MAKER/MODEL.yaml; the name of each is that of the maker.
+# Plug-ins are packages with data files, as MAKER/MODEL.yaml; the maker is the plug-in's name.
 GROUP = "lidarsim.sensors"
 MODEL_FILES = (".yaml", ".yml")
 Sheet = Literal["ideal", "datasheet"]
@@ -43,15 +43,15 @@ class _ModelSection(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
 
-_BEAMS_MOST = 1_000_000
+_MAX_BEAMS = 1_000_000
 
 
 def _numbers(value: Any) -> Any:
     """Expand {first, last, count} to evenly spaced numbers, both ends included."""
     if isinstance(value, dict):
         count = value.get("count")
-        if isinstance(count, int) and count > _BEAMS_MOST:
-            raise ValueError(f"count is {count:,}; a sensor has {_BEAMS_MOST:,} beams at most")
+        if isinstance(count, int) and count > _MAX_BEAMS:
+            raise ValueError(f"count is {count:,}; a sensor has {_MAX_BEAMS:,} beams at most")
         try:
             return np.linspace(value["first"], value["last"], value["count"]).tolist()
         except (KeyError, TypeError, ValueError):
@@ -67,7 +67,7 @@ Positive = Annotated[float, Field(gt=0)]
 
 
 class BeamTable(_ModelSection):
-    """Beams in the maker's order; see `Beams`."""
+    """Beams in the maker's order, as in `Beams`."""
 
     elevation_deg: Numbers = ()
     azimuth_deg: Numbers = ()
@@ -75,7 +75,7 @@ class BeamTable(_ModelSection):
     origin_m: OffsetXYZ | tuple[OffsetXYZ, ...] = ()
 
     def beams(self) -> Beams:
-        """Make them; one straight ahead if there are no elevations."""
+        """Return the beams; a single beam straight ahead if the table has no elevations."""
         count = len(self.elevation_deg)
         if not count:
             return Beams(np.zeros(1))
@@ -87,13 +87,13 @@ class BeamTable(_ModelSection):
         )
 
     def origins(self, count: int) -> Floats:
-        """Origins of so many beams: (count, 3), or (0, 3) if there are none."""
+        """Return the starts of `count` beams: (count, 3), metres, or (0, 3) without origins."""
         origin = np.array(self.origin_m, np.float64).reshape(-1, 3)
         return np.repeat(origin, count, axis=0) if len(origin) == 1 else origin
 
 
 class MirrorPart(_ModelSection):
-    """See `Mirror`."""
+    """Motion of a mirror that sweeps lines, as in `Mirror`."""
 
     motion: MirrorMotion
     width_deg: Width
@@ -118,12 +118,12 @@ class Detection(_ModelSection):
     @property
     def threshold_m(self) -> float:
         """Range at which a surface of 10 % reflectance returns half of the pulses."""
-        same = self.range_m * math.sqrt(TARGET_REFLECTANCE / self.reflectance)
-        needed = 1 + NormalDist().inv_cdf(self.probability) / THRESHOLD_SIGMAS
-        return float(same * math.sqrt(max(needed, 0.0)))
+        range_m = self.range_m * math.sqrt(TARGET_REFLECTANCE / self.reflectance)
+        energy = 1 + NormalDist().inv_cdf(self.probability) / THRESHOLD_SIGMAS
+        return float(range_m * math.sqrt(max(energy, 0.0)))
 
 
-# What a data sheet may state: {field of its noise: words}.
+# Figures that a data sheet may state: {field of `Noise`: words}.
 STATED = {
     "range_m": "precision of ranges",
     "detection_range_m": "detection range at a reflectance",
@@ -133,10 +133,10 @@ STATED = {
 
 
 class Performance(_ModelSection):
-    """What a data sheet says of a sensor's noise and returns; see `SensorModel.datasheet`.
+    """Figures of a data sheet on a sensor's noise and returns; see `SensorModel.datasheet`.
 
-    The precision of ranges is either that of `Noise`, by the same names, or that of two surfaces,
-    which say how it depends on energy.
+    The precision of ranges is given either by the fields of `Noise`, with the same names, or for
+    two surfaces, from which its dependence on energy follows.
     """
 
     range_m: Annotated[float, Field(ge=0)] | None = None
@@ -150,36 +150,40 @@ class Performance(_ModelSection):
     mode: Mode = "strongest"
 
     @model_validator(mode="after")
-    def _whole(self) -> Performance:
+    def _check_consistency(self) -> Performance:
+        """Check that the figures fit together."""
         if self.precision and (self.range_m or self.range_per_m or self.range_at_threshold_m):
             raise ValueError("precision takes the place of the other figures of ranges")
         for name in ("precision", "false_alarms", "range_at_threshold_m"):
             if getattr(self, name) and self.detection is None:
                 raise ValueError(f"{name} needs detection")
-        self.noise(1.0)  # LidarError if it cannot be made
+        self.noise(1.0)  # LidarError if figures are impossible
         return self
 
     def noise(self, gate_s: float) -> Noise:
-        """Return the noise of a sensor whose receiver waits so many seconds for returns."""
-        made = self.model_dump(include={one.name for one in fields(Noise)}, exclude_none=True)
+        """Return the noise of a sensor whose receiver waits `gate_s` seconds for returns."""
+        figures = self.model_dump(
+            include={field.name for field in fields(Noise)}, exclude_none=True
+        )
         if self.detection is not None:
-            made["detection_range_m"] = self.detection.threshold_m
+            figures["detection_range_m"] = self.detection.threshold_m
             if self.precision is not None:
-                near, far = self._by_energy(self.detection.threshold_m)
-                made |= {"range_m": near, "range_at_threshold_m": far}
+                strong_m, weak_m = self._by_energy(self.detection.threshold_m)
+                figures |= {"range_m": strong_m, "range_at_threshold_m": weak_m}
         if self.false_alarms is not None:
-            made["false_alarm_hz"] = -float(log1p(-self.false_alarms)) / gate_s
-        return Noise(**made)
+            figures["false_alarm_hz"] = -float(log1p(-self.false_alarms)) / gate_s
+        return Noise(**figures)
 
     def _by_energy(self, threshold_m: float) -> tuple[float, float]:
-        """Fit the standard deviations of strong returns, and of those at the threshold."""
+        """Return the standard deviations of strong returns, and of returns at the threshold."""
         assert self.precision is not None
         # The threshold over the energy: it grows with the square of the range.
-        weak = [
-            TARGET_REFLECTANCE / one.reflectance * np.square(one.range_m / threshold_m)
-            for one in self.precision
+        weakness = [
+            TARGET_REFLECTANCE / surface.reflectance * np.square(surface.range_m / threshold_m)
+            for surface in self.precision
         ]
-        (x, y), (s, t) = np.square(weak), np.square([one.sigma_m for one in self.precision])
+        x, y = np.square(weakness)
+        s, t = np.square([surface.sigma_m for surface in self.precision])
         slope = (t - s) / (y - x)
         if not (slope >= 0 and s - slope * x >= 0):
             raise LidarError("performance.precision does not fall as the energy grows.")
@@ -187,7 +191,7 @@ class Performance(_ModelSection):
 
 
 class SensorModel(_ModelSection):
-    """Data file of a sensor. `docs/how-to/sensor.md` describes its fields."""
+    """Data file of a sensor, with the fields that `docs/how-to/sensor.md` describes."""
 
     name: str
     sources: dict[str, str] = {}
@@ -203,13 +207,14 @@ class SensorModel(_ModelSection):
     mirror: MirrorPart | None = None
     prisms: tuple[Prism, ...] = ()
     turning_mirror: TurningMirror | None = None  # behind the prisms
-    typical: bool = False  # whether units differ: its rays are like those of a unit, not the same
+    typical: bool = False  # whether units differ, so that the rays are only similar to a unit's
     optics: Optics = Optics()
     performance: Performance | None = None
     listed: bool = False
 
     @model_validator(mode="after")
-    def _whole(self) -> SensorModel:
+    def _check_consistency(self) -> SensorModel:
+        """Check that the fields fit together."""
         if (self.firing_us is None) == (self.firings_per_turn is None):
             raise ValueError("give either firing_us or firings_per_turn")
         if self.range_m is not None and not 0 <= self.range_m[0] < self.range_m[1]:
@@ -218,36 +223,40 @@ class SensorModel(_ModelSection):
             )
         if any(abs(angle) > 90 for angle in self.beams.elevation_deg):
             raise ValueError("beams.elevation_deg goes beyond 90 degrees")
-        others = {"axis", "clockwise", "mirror", "zero_deg"}
-        unused = self.model_dump(include=others, exclude_defaults=True)
+        head_fields = {"axis", "clockwise", "mirror", "zero_deg"}
+        unused = self.model_dump(include=head_fields, exclude_defaults=True)
         if self.prisms and unused:
             raise ValueError(f"prisms turn about x: leave {min(unused)} out, and turn the sensor")
         if self.turning_mirror and not self.prisms:
             raise ValueError("turning_mirror needs prisms: a mirror that sweeps lines is mirror")
-        self.beams.beams()  # LidarError if it cannot be made
+        self.beams.beams()  # LidarError if beams are impossible
         return self
 
     @property
     def needs_calibration(self) -> bool:
-        """Whether its rays need a calibration file."""
+        """Whether the rays of the model need a calibration file."""
         return not (self.beams.elevation_deg or self.mirror or self.prisms)
 
     def datasheet(self) -> Datasheet:
-        """Return its noise and returns; LidarError if its file states no performance."""
-        stated = self.performance
-        if stated is None:
+        """Return noise and returns by the data sheet; LidarError if the file has no performance."""
+        performance = self.performance
+        if performance is None:
             raise LidarError(
                 f"{self.name} has no performance in its data file, since no source that could be "
                 "read states it: give noise yourself."
             )
-        low, high = self.range_m or (0.0, float("inf"))
-        noise = stated.noise(2e-9 * (high - low) / LIGHT_M_NS)
+        min_range_m, max_range_m = self.range_m or (0.0, float("inf"))
+        noise = performance.noise(2e-9 * (max_range_m - min_range_m) / LIGHT_M_NS)
         subrays = 1 if self.optics.divergence_mrad is None else 7
         missing = tuple(words for name, words in STATED.items() if not getattr(noise, name))
-        return Datasheet(noise, Returns(stated.mode, subrays=subrays), missing)
+        return Datasheet(noise, Returns(performance.mode, subrays=subrays), missing)
 
-    def turn(self, rate_hz: float | None, columns: int | None) -> tuple[float, float]:
-        """Return the firings in a turn, and turns a second."""
+    def firing_rates(self, rate_hz: float | None, columns: int | None) -> tuple[float, float]:
+        """Return the firings in a revolution, and the revolutions a second.
+
+        `rate_hz` and `columns` (firings in a revolution) take the place of the model's figures, if
+        they are not None.
+        """
         rate = self.rate_hz if rate_hz is None else rate_hz
         if self.firing_us is not None:
             if columns is not None:
@@ -262,23 +271,23 @@ class SensorModel(_ModelSection):
 
 @cache
 def model_names() -> tuple[str, ...]:
-    """Names of the models that come with the package, in order."""
+    """Return the names of the models that come with the package, in order."""
     makers = (entry for entry in _BUILT_IN.iterdir() if entry.is_dir())
     return tuple(sorted(name for maker in makers for name in _names_in(maker)))
 
 
 def _names_in(maker: Traversable) -> list[str]:
-    """Names of the models in the folder of a maker, in order."""
-    files_there = sorted(entry.name for entry in maker.iterdir())
+    """Return the names of the models in the folder of a maker, in order."""
+    file_names = sorted(entry.name for entry in maker.iterdir())
     return [
         f"{maker.name}/{file.removesuffix('.yaml')}"
-        for file in files_there
+        for file in file_names
         if file.endswith(".yaml")
     ]
 
 
 def plugin_model_names() -> tuple[str, ...]:
-    """Names of the models of plug-ins, in order, but for those that come with the package.
+    """Return the names of the models of plug-ins, in order, except models of the package.
 
     Raises
     ------
@@ -291,12 +300,12 @@ def plugin_model_names() -> tuple[str, ...]:
 
 
 def plugin_of_model(name: str | None) -> Plugin | None:
-    """Return the plug-in that a model of a name is of, or None.
+    """Return the plug-in with a model of a name, or None.
 
     Raises
     ------
     LidarError
-        If two plug-ins have models of its maker.
+        If two plug-ins have models of the maker.
     """
     if not name or name.endswith(MODEL_FILES) or full_name(name) in model_names():
         return None
@@ -304,7 +313,7 @@ def plugin_of_model(name: str | None) -> Plugin | None:
 
 
 def plugin_model_file(name: str | None) -> Path | None:
-    """Return the data file of a plug-in's model; None for other models.
+    """Return the data file of a plug-in's model; None for a model of the package or of a file.
 
     Raises
     ------
@@ -315,7 +324,7 @@ def plugin_model_file(name: str | None) -> Path | None:
     if plugin is None or name is None:
         return None
     file = _maker_folder(plugin) / f"{name.partition('/')[2]}.yaml"
-    return file if isinstance(file, Path) else None  # it may be in an archive
+    return file if isinstance(file, Path) else None  # the package may be in an archive
 
 
 def _maker_folder(plugin: Plugin) -> Traversable:
@@ -328,37 +337,36 @@ def _maker_folder(plugin: Plugin) -> Traversable:
 
 
 def full_name(name: str) -> str:
-    """Name of a model with its maker, where the name alone says which: riegl-vz400."""
-    found = [model for model in model_names() if model.partition("/")[2] == name]
-    return found[0] if len(found) == 1 else name
+    """Return the name of a model with its maker, if the name alone is unambiguous: riegl-vz400."""
+    matches = [model for model in model_names() if model.partition("/")[2] == name]
+    return matches[0] if len(matches) == 1 else name
 
 
 def read_model(name: str | Path) -> SensorModel:
-    """Read a model: one that comes with the package or a plug-in, or a file (.yaml).
+    """Read a model by its name, from the package or a plug-in, or by the path of its file (.yaml).
 
     The maker may be left out of the name of a model that comes with the package.
 
     Raises
     ------
     LidarError
-        If there is none of that name, its plug-in cannot be used, or the file is not one of a
-        sensor.
+        If no model has that name, its plug-in cannot be used, or the file is not of a sensor.
     """
     if str(name).endswith(MODEL_FILES):
         return _read(Path(name))
-    known = model_names()
+    models = model_names()
     name = full_name(str(name))
-    if name in known:
+    if name in models:
         return _built_in(name)
     plugin = plugin_of_model(name)
     if plugin is not None:
         folder = _maker_folder(plugin)
-        known = (*known, *_names_in(folder))
-        if name in known:
+        models = (*models, *_names_in(folder))
+        if name in models:
             return _read(folder / f"{name.partition('/')[2]}.yaml")
-    near = [model for model in known if _plain(name) in _plain(model)][:3]
-    hint = f" Did you mean {' or '.join(map(repr, near))}?" if near else ""
-    names = [*known, *(model.partition("/")[2] for model in known)]
+    similar = [model for model in models if _plain(name) in _plain(model)][:3]
+    hint = f" Did you mean {' or '.join(map(repr, similar))}?" if similar else ""
+    names = [*models, *(model.partition("/")[2] for model in models)]
     raise LidarError(
         f"There is no sensor model {name!r}.{hint or did_you_mean(name, names)} "
         "lidarpool sensors lists them; give your own as a file, such as mine.yaml."
@@ -366,16 +374,18 @@ def read_model(name: str | Path) -> SensorModel:
 
 
 def _plain(name: str) -> str:
-    """Return letters and digits of a name: «VLP-16» and «velodyne/vlp16» have them in common."""
+    """Return the lower-case letters and digits of a name, such as vlp16 of «VLP-16»."""
     return "".join(filter(str.isalnum, name.lower()))
 
 
 @cache
 def _built_in(name: str) -> SensorModel:
+    """Read a model that comes with the package."""
     return _read(_BUILT_IN / f"{name}.yaml")
 
 
 def _read(path: Path | Traversable) -> SensorModel:
+    """Read the data file of a model; LidarError if the file cannot be used."""
     try:
         text = read_input_text(path) if isinstance(path, Path) else path.read_text("utf-8")
         with sentences(SensorModel, path):
@@ -385,15 +395,15 @@ def _read(path: Path | Traversable) -> SensorModel:
 
 
 class Datasheet(NamedTuple):
-    """Noise and returns of a sensor by its data sheet, and what the sheet leaves out."""
+    """Noise and returns of a sensor by its data sheet."""
 
     noise: Noise
     returns: Returns
-    missing: tuple[str, ...]
+    missing: tuple[str, ...]  # figures that the sheet does not state, in words
 
 
 def shown_noise(noise: Noise) -> str:
-    """Fields of noise that are not their defaults, as in a scenario."""
+    """Return the fields of noise that differ from their defaults, as in a scenario."""
     shown = (
         f"{field.name}: {value:.4g}"
         for field in fields(noise)
@@ -414,34 +424,35 @@ def load_sensor(
     max_range_m: MaxRange | None = None,
     performance: Sheet | None = None,
 ) -> Sensor:
-    """Make a sensor from a model, or from the calibration of a unit.
+    """Return a sensor of a model, or of the calibration of a unit.
 
     Parameters
     ----------
     model
-        Name, such as "velodyne/vlp16", or your own data file (.yaml). With a calibration only,
-        the model whose beams are nearest to it.
+        Name, such as "velodyne/vlp16", or the path of a data file (.yaml). By default, the model
+        whose beams are nearest to the calibration.
     calibration
         File of the unit: Velodyne YAML, Ouster metadata, Hesai angle corrections, RoboSense
         angle.csv, Livox list of rays, or a table of beams; see `read_calibration`.
     columns
-        Firings in a turn, if the model, or a table of beams, leaves a choice.
+        Firings in a revolution, if the model, or a table of beams, leaves a choice.
     rate_hz
-        Turns, lines or frames a second.
+        Revolutions, lines or frames a second.
     step_deg
-        Part of a turn that is one scan. Ten degrees are 800 rays of a VLP-16 and 3,600 of an
+        Part of a revolution that is one scan. Ten degrees are 800 rays of a VLP-16 and 3,600 of an
         OS1-128: a scan then costs little by itself, because batches join consecutive scans, and
-        several workers can share a turn.
+        several workers can share a revolution.
     min_range_m, max_range_m
         Instead of the model's.
     performance
-        "datasheet": with noise and returns of its data sheet, for surveys that give none. By
-        default "ideal" of a model by name, and of a file that states no performance.
+        "datasheet": with noise and returns of the data sheet, for surveys that give none. By
+        default "ideal" for a model by name, and for a file that states no performance.
 
     Raises
     ------
     LidarError
-        If there is no such model, a file cannot be used, or they do not fit together.
+        If the model does not exist, a file cannot be used, or model and calibration do not fit
+        together.
 
     Examples
     --------
@@ -451,63 +462,63 @@ def load_sensor(
     """
     unit = None if calibration is None else read_calibration(Path(calibration))
     if model is not None:
-        described = read_model(model)
+        sensor_model = read_model(model)
     elif unit is not None:
-        described = _model_of(unit, columns)
+        sensor_model = _model_of(unit, columns)
     else:
         raise LidarError("A sensor needs a model, a calibration, or both.")
     if unit is not None:
-        described = described.model_copy(update=unit.head)
-    elif described.needs_calibration:
+        sensor_model = sensor_model.model_copy(update=unit.head)
+    elif sensor_model.needs_calibration:
         raise LidarError(
-            f"{described.name} has no rays of its own: give calibration: FILE "
-            f"({next(iter(described.sources.values()), 'of the unit')})."
+            f"{sensor_model.name} has no rays of its own: give calibration: FILE "
+            f"({next(iter(sensor_model.sources.values()), 'of the unit')})."
         )
-    firings, rate = described.turn(rate_hz, columns)
-    low, high = described.range_m or (0.0, float("inf"))
-    common: dict[str, Any] = {
-        "min_range_m": low if min_range_m is None else min_range_m,
-        "max_range_m": high if max_range_m is None else max_range_m,
-        "name": _sensor_name(described, unit),
-        "optics": described.optics,
+    firings, rate = sensor_model.firing_rates(rate_hz, columns)
+    shortest_m, longest_m = sensor_model.range_m or (0.0, float("inf"))
+    common_fields: dict[str, Any] = {
+        "min_range_m": shortest_m if min_range_m is None else min_range_m,
+        "max_range_m": longest_m if max_range_m is None else max_range_m,
+        "name": _sensor_name(sensor_model, unit),
+        "optics": sensor_model.optics,
     }
-    own = described.performance is not None and str(model).endswith(MODEL_FILES)
-    if performance == "datasheet" or (performance is None and own):
-        sheet = described.datasheet()
-        common |= {"noise": sheet.noise, "returns": sheet.returns}
-    head = Spin(firings, step_deg, rate, described.clockwise, described.zero_deg)
-    if unit is not None and (unit.rays is not None or described.listed or described.prisms):
-        return _listed(described, unit, head, common)
-    beams = described.beams.beams() if unit is None else _calibrated(described, unit)
-    if described.prisms:
-        mirror = described.turning_mirror
-        return PrismSensor(beams, head, prisms=described.prisms, mirror=mirror, **common)
-    if described.mirror is not None:
-        mirror_fields = described.mirror.model_dump()
+    user_sheet = sensor_model.performance is not None and str(model).endswith(MODEL_FILES)
+    if performance == "datasheet" or (performance is None and user_sheet):
+        sheet = sensor_model.datasheet()
+        common_fields |= {"noise": sheet.noise, "returns": sheet.returns}
+    head = Spin(firings, step_deg, rate, sensor_model.clockwise, sensor_model.zero_deg)
+    if unit is not None and (unit.rays is not None or sensor_model.listed or sensor_model.prisms):
+        return _listed(sensor_model, unit, head, common_fields)
+    beams = sensor_model.beams.beams() if unit is None else _calibrated(sensor_model, unit)
+    if sensor_model.prisms:
+        mirror = sensor_model.turning_mirror
+        return PrismSensor(beams, head, prisms=sensor_model.prisms, mirror=mirror, **common_fields)
+    if sensor_model.mirror is not None:
+        mirror_fields = sensor_model.mirror.model_dump()
         head = Mirror(firings, step_deg, rate, head.clockwise, head.zero_deg, **mirror_fields)
     else:
         beams = beams.turning(head.radians_per_ns)
-    kind = LineSensor if described.axis == "x" else Sensor
-    return kind(beams.lowest_first(), head, **common)
+    kind = LineSensor if sensor_model.axis == "x" else Sensor
+    return kind(beams.lowest_first(), head, **common_fields)
 
 
-def _sensor_name(described: SensorModel, unit: Calibration | None) -> str:
+def _sensor_name(sensor_model: SensorModel, unit: Calibration | None) -> str:
     """Return the name of a sensor for reports, with the source of its rays."""
     if unit is not None:
-        return f"{described.name}, {unit.file}"
-    return f"{described.name}, typical pattern" if described.typical else described.name
+        return f"{sensor_model.name}, {unit.file}"
+    return f"{sensor_model.name}, typical pattern" if sensor_model.typical else sensor_model.name
 
 
 def _model_of(unit: Calibration, columns: int | None) -> SensorModel:
-    """Find the model whose beams are nearest, else use the file alone."""
-    off = {}  # {model: distance of its elevations from those of the unit, degrees}
+    """Return the model whose beams are nearest to a unit's, else a model of the file alone."""
+    deviations_deg = {}  # {model: greatest difference between its elevations and the unit's}
     for name in model_names():
-        ours = read_model(name).beams.elevation_deg
-        if name.startswith(f"{unit.maker}/") and unit.beams and len(ours) == len(unit.beams):
-            theirs = np.degrees(unit.beams.elevation)
-            off[name] = float(np.abs(np.sort(theirs) - np.sort(ours)).max())
-    if off and min(off.values()) < 5:  # units of one model differ by far less
-        return read_model(min(off, key=off.__getitem__))
+        model_deg = read_model(name).beams.elevation_deg
+        if name.startswith(f"{unit.maker}/") and unit.beams and len(model_deg) == len(unit.beams):
+            unit_deg = np.degrees(unit.beams.elevation)
+            deviations_deg[name] = float(np.abs(np.sort(unit_deg) - np.sort(model_deg)).max())
+    if deviations_deg and min(deviations_deg.values()) < 5:  # units of one model differ by far less
+        return read_model(min(deviations_deg, key=deviations_deg.__getitem__))
     head = {"firings_per_turn": columns} if columns and unit.maker is None else unit.head
     if not head:
         raise LidarError(
@@ -518,33 +529,35 @@ def _model_of(unit: Calibration, columns: int | None) -> SensorModel:
 
 
 def _listed(
-    described: SensorModel, unit: Calibration, head: Spin, common: dict[str, Any]
+    sensor_model: SensorModel, unit: Calibration, head: Spin, common_fields: dict[str, Any]
 ) -> ListedSensor:
-    """Rays of a unit's list, at the model's rate if the list has no times."""
-    if unit.rays is None or (described.beams.elevation_deg and not described.prisms):
+    """Return a sensor with a unit's list of rays, at the model's rate if the list has no times."""
+    if unit.rays is None or (sensor_model.beams.elevation_deg and not sensor_model.prisms):
         raise LidarError(
-            f"{unit.file} does not fit {described.name}: one lists rays, the other beams."
+            f"{unit.file} does not fit {sensor_model.name}: one lists rays, the other beams."
         )
-    if not unit.head:  # a firing of the model is of all beams, and of the list one ray
-        firings = head.firings_per_turn * len(described.beams.beams())
+    if not unit.head:  # a firing of the model has all beams, a firing of the list has one ray
+        firings = head.firings_per_turn * len(sensor_model.beams.beams())
         head = replace(head, firings_per_turn=firings)
-    each_ns = 1e9 / (head.firings_per_turn * head.rate_hz)
+    interval_ns = 1e9 / (head.firings_per_turn * head.rate_hz)
     times = unit.shot_ns
     if times is None:
-        times = each_ns * np.arange(len(unit.rays), dtype=np.float64)
-    cycle_ns = float(times[-1]) + each_ns
-    return ListedSensor(head=head, rays=unit.rays, shot_ns=times, cycle_ns=cycle_ns, **common)
+        times = interval_ns * np.arange(len(unit.rays), dtype=np.float64)
+    cycle_ns = float(times[-1]) + interval_ns
+    return ListedSensor(
+        head=head, rays=unit.rays, shot_ns=times, cycle_ns=cycle_ns, **common_fields
+    )
 
 
-def _calibrated(described: SensorModel, unit: Calibration) -> Beams:
-    """Beams of a unit, fired at the times of its model."""
+def _calibrated(sensor_model: SensorModel, unit: Calibration) -> Beams:
+    """Return the beams of a unit, fired at the times of its model."""
     beams = unit.beams
-    table = described.beams
+    table = sensor_model.beams
     assert beams is not None  # a file has beams or rays
     expected = len(table.elevation_deg) or len(table.time_us)
     if expected not in (0, len(beams)):
         raise LidarError(
-            f"{unit.file} has {len(beams)} beams, but {described.name} has {expected}."
+            f"{unit.file} has {len(beams)} beams, but {sensor_model.name} has {expected}."
         )
     times = beams.time_ns if beams.time_ns.any() else np.multiply(table.time_us, 1000.0)
     origin = beams.origin if beams.origin.any() else table.origins(len(beams))

@@ -1,4 +1,4 @@
-"""Noise of a sensor: errors of ranges and angles, lost returns and false ones."""
+"""Noise of a sensor: errors of ranges and angles, lost returns and false alarms."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from .random_numbers import named_seed
 # Detection threshold for signal plus noise, in standard deviations.
 THRESHOLD_SIGMAS = 5.0
 TARGET_REFLECTANCE = 0.1  # reflectance of stated ranges
-ALARMS_MOST = 20  # false alarms of a pulse on average: a ray has numbers for 255
+MAX_ALARMS = 20  # false alarms of a pulse on average: a ray has numbers for 255
 
 Metres = Annotated[float, Field(ge=0, le=1000)]
 Bias = Annotated[float, Field(ge=-1000, le=1000)]
@@ -29,17 +29,17 @@ AngleSigma = Annotated[float, Field(ge=0, le=10)]  # degrees
 @dataclass(frozen=True)
 @checked_fields
 class Noise:
-    """Noise of ranges and angles, lost returns and false ones; without arguments there is none.
+    """Noise of ranges and angles, lost returns and false alarms; no noise without arguments.
 
     The standard deviation of a range of r metres is ``range_m + range_per_m * r``, and
     `range_at_threshold_m` times the threshold of detection over the return's energy is added in
-    squares. Rays are cast in directions with noise, and reported with angles without. Stated
+    squares. Rays are cast in directions with noise, and reported with angles without noise. Stated
     detection ranges are for surfaces at right angles in clear air.
 
     Raises
     ------
     LidarError
-        If a number is outside its range, or needs a detection range and there is none.
+        If a number is outside its range, or needs a detection range that is not given.
     """
 
     range_m: Annotated[Metres, about("standard deviation of ranges, metres", 0.02)] = 0.0
@@ -66,7 +66,7 @@ class Noise:
     overlap_m: Annotated[
         Metres,
         about(
-            "from here on the receiver sees the whole beam; nearer, rain, snow, fog "
+            "range from which on the receiver sees the whole beam; nearer, rain, snow, fog "
             "and dust do not return more"
         ),
     ] = 10.0
@@ -128,18 +128,24 @@ class Noise:
         about("constant errors of channels' ranges, metres: standard deviation, or one for each"),
     ] = 0.0
     warm_up_m: Annotated[Bias, about("error of ranges at the start, which decays, metres")] = 0.0
-    warm_up_s: Annotated[DecayTime, about("time in which it falls to 37 %, seconds")] = 600.0
+    warm_up_s: Annotated[DecayTime, about("time in which the error falls to 37 %, seconds")] = 600.0
     ripple_deg: Annotated[AngleSigma, about("greatest error of azimuths, as the head turns")] = 0.0
-    ripple_cycles: Annotated[int, about("how often it repeats in a turn", ge=1, le=100_000)] = 1
-    ripple_phase_deg: Annotated[AngleDeg, about("its phase where the head is at azimuth 0")] = 0.0
+    ripple_cycles: Annotated[int, about("repetitions in a revolution", ge=1, le=100_000)] = 1
+    ripple_phase_deg: Annotated[AngleDeg, about("phase where the head is at azimuth 0")] = 0.0
 
     def __post_init__(self) -> None:
         if np.ndim(self.channel_bias_m):
             biases = tuple(np.asarray(self.channel_bias_m, np.float64).tolist())
             object.__setattr__(self, "channel_bias_m", biases)
-        needs = "range_at_threshold_m", "walk_m", "false_alarm_hz", "stray_light", "crosstalk"
+        threshold_fields = (
+            "range_at_threshold_m",
+            "walk_m",
+            "false_alarm_hz",
+            "stray_light",
+            "crosstalk",
+        )
         if self.detection_range_m is None:
-            for name in (*needs, "saturation"):
+            for name in (*threshold_fields, "saturation"):
                 if getattr(self, name):
                     raise LidarError(
                         f"noise.{name} is measured by the threshold of detection: give "
@@ -148,14 +154,14 @@ class Noise:
 
     @property
     def threshold(self) -> float:
-        """Threshold of detection: the energy of returns of which half are detected, else 0."""
+        """Threshold of detection: the energy at which half of the returns are detected, else 0."""
         if self.detection_range_m is None:
             return 0.0
         return float(TARGET_REFLECTANCE * at_right_angles(self.detection_range_m))
 
     @property
     def full(self) -> float:
-        """Signal that fills the receiver: no recorded pulse is higher."""
+        """Signal that saturates the receiver: no recorded pulse is higher."""
         return inf if self.saturation is None else self.saturation * self.threshold
 
     @property
@@ -170,5 +176,5 @@ class Noise:
         return any((*random, self.walk_m, self.channel_bias_m, self.warm_up_m))
 
     def named(self, name: str) -> Noise:
-        """Return the noise of a sensor, whose name is part of all its random numbers."""
+        """Return the noise of a sensor, whose name becomes part of all its random numbers."""
         return replace(self, seed=named_seed(self.seed, name))

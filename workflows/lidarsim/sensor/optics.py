@@ -20,8 +20,8 @@ from .reflectivity import SCALES
 
 LIGHT_M_NS = 0.299792458  # in vacuum; in air it is slower by 0.03 %
 FWHM = sqrt(8 * log_of(2.0))  # full width at half maximum of a Gaussian, in standard deviations
-WINDOW_SIGMAS = 10  # that an echo takes in a waveform, to both sides together
-CUT = WINDOW_SIGMAS / 2  # standard deviations of the system waveform: beyond, an echo is 0 (4e-6)
+WINDOW_SIGMAS = 10  # width of a return in a waveform, standard deviations of the system waveform
+CUT = WINDOW_SIGMAS / 2  # standard deviations of the system waveform: beyond, a return is 0 (4e-6)
 # Standard deviation of the response of a Gaussian receiver times its bandwidth at -3 dB.
 _RESPONSE = sqrt(log_of(2.0)) / (2 * pi)
 
@@ -30,7 +30,7 @@ Mode = Literal["strongest", "first", "last", "dual", "all"]
 
 
 AngleMrad = Annotated[float, Field(ge=0, le=1000)]
-# Full angle of a beam's cone, at 1/e² of its maximum; or two, across and up.
+# Full angle of a beam's cone, at 1/e² of the maximum; or two angles, across and up.
 Divergence = Annotated[
     AngleMrad | Annotated[Sequence[AngleMrad], Field(min_length=2, max_length=2)],
     allowed("0 to 1000, or two such: [across, up]"),
@@ -46,7 +46,7 @@ class Optics:
     """Light and resolution of a sensor."""
 
     wavelength_nm: Annotated[
-        float, about("of the laser; 905 if no source states it", ge=200, le=20_000)
+        float, about("wavelength of the laser; 905 if no source states it", ge=200, le=20_000)
     ] = 905.0
     divergence_mrad: Annotated[
         Divergence | None, about("full angle of the beam, or two, across and up; None if unknown")
@@ -54,7 +54,7 @@ class Optics:
     pulse_ns: Annotated[Pulse, about("length of a pulse")] = 5.0
     resolution_m: Annotated[
         Precision | None,
-        about("of reported ranges: default step for rounding positions; None if no source has it"),
+        about("step of ranges, the default for rounding positions; None if no source states it"),
     ] = None
     beam_profile: Annotated[
         Profile, about("how light is spread over the beam, where it has sub-rays")
@@ -64,7 +64,7 @@ class Optics:
     )
     reflectivity: Annotated[
         Literal[tuple(SCALES)],  # type: ignore[valid-type]
-        about("whose scale the column reflectivity has; Velodyne's if no source states it"),
+        about("scale of the column reflectivity; Velodyne's if no source states it"),
     ] = "velodyne"
 
     def __post_init__(self) -> None:
@@ -75,14 +75,15 @@ class Optics:
 @dataclass(frozen=True)
 @checked_fields
 class Returns:
-    """Sub-rays of a beam, and which of its returns are reported.
+    """Sub-rays of a beam, and the returns of a pulse that the sensor reports.
 
-    "dual" reports the strongest and the last return, or the two strongest if those are one.
+    "dual" reports the strongest and the last return, or the two strongest if the last return is
+    the strongest.
 
     Raises
     ------
     LidarError
-        If there is no such mode, or a number is outside its range.
+        If the mode does not exist, or a number is outside its range.
     """
 
     mode: Annotated[
@@ -125,7 +126,7 @@ class Returns:
     bandwidth_mhz: Annotated[
         float | None,
         about(
-            "of the receiver of waveforms, at -3 dB; by default without limit",
+            "bandwidth of the receiver of waveforms, at -3 dB; by default without limit",
             300.0,
             ge=0.1,
             le=1e6,
@@ -136,53 +137,67 @@ class Returns:
         if isinstance(self.divergence_mrad, (Sequence, np.ndarray)):
             object.__setattr__(self, "divergence_mrad", tuple(self.divergence_mrad))
 
-    def of(self, optics: Optics) -> tuple[float, float]:
-        """Divergence, radians, and least distance of two returns, metres.
-
-        The divergence of an oval beam is that of a round one of the same area.
+    def divergence(self, optics: Optics) -> float:
+        """Return the full angle of the beam, radians; of an oval beam, of a circle of equal area.
 
         Raises
         ------
         LidarError
-            If there are sub-rays, and the divergence is unknown.
+            If the beam has several sub-rays, and its divergence is unknown.
         """
-        across, up = self._divergence(optics)
-        wide = across if across == up else float(np.sqrt(across * up))
-        return wide, LIGHT_M_NS * self.length_ns(optics) / 2
+        across, up = self._divergences(optics)
+        return across if across == up else float(np.sqrt(across * up))
+
+    def min_gap_m(self, optics: Optics) -> float:
+        """Return the smallest distance between two returns, metres: half of the pulse's length."""
+        return LIGHT_M_NS * self.length_ns(optics) / 2
 
     def beam(self, optics: Optics) -> Beam:
-        """Sub-rays of a sensor's beam; raises as `of`."""
+        """Return the sub-rays of a sensor's beam.
+
+        Raises
+        ------
+        LidarError
+            If the beam has several sub-rays, and its divergence is unknown.
+        """
         profile = optics.beam_profile if self.beam_profile is None else self.beam_profile
-        return Beam.of(self.subrays, self._divergence(optics), profile, self.exit_m(optics))
+        divergences = self._divergences(optics)
+        return Beam.from_divergences(self.subrays, divergences, profile, self.exit_m(optics))
 
     def exit_m(self, optics: Optics) -> float:
-        """Width of the beam where it leaves the sensor, metres; 0 if it is unknown."""
+        """Return the width of the beam at the sensor, metres; 0 if the width is unknown."""
         return optics.exit_diameter_m if self.exit_diameter_m is None else self.exit_diameter_m
 
-    def _divergence(self, optics: Optics) -> tuple[float, float]:
-        """Across and up, radians."""
-        wide = optics.divergence_mrad if self.divergence_mrad is None else self.divergence_mrad
-        if wide is None and self.subrays > 1:
+    def _divergences(self, optics: Optics) -> tuple[float, float]:
+        """Return the full angles of the beam across and up, radians."""
+        divergence_mrad = (
+            optics.divergence_mrad if self.divergence_mrad is None else self.divergence_mrad
+        )
+        if divergence_mrad is None and self.subrays > 1:
             raise LidarError(
                 f"returns.subrays is {self.subrays}, but the sensor has no divergence: give "
                 "returns.divergence_mrad."
             )
-        across, up = wide if isinstance(wide, Sequence) else (wide or 0.0, wide or 0.0)
+        if isinstance(divergence_mrad, Sequence):
+            across, up = divergence_mrad
+        else:
+            across = up = divergence_mrad or 0.0
         return across / 1000, up / 1000
 
     def length_ns(self, optics: Optics) -> float:
-        """Length of the pulse."""
+        """Return the length of the pulse, nanoseconds."""
         return optics.pulse_ns if self.pulse_ns is None else self.pulse_ns
 
     def system_ns(self, optics: Optics) -> float:
         """Return the standard deviation of the system waveform, ns.
 
-        That is the pulse as the receiver sees it: both are Gaussian, and convolved.
+        The system waveform is the convolution of the pulse and the receiver's response, which are
+        both Gaussian.
 
         Raises
         ------
         LidarError
-            If the samples are too far apart for it.
+            If the samples are too far apart for the waveform.
         """
         response = 0.0 if self.bandwidth_mhz is None else 1000 * _RESPONSE / self.bandwidth_mhz
         sigma = hypot(self.length_ns(optics) / FWHM, response)

@@ -26,7 +26,7 @@ OXTS_TIMES = "timestamps.txt"
 
 
 def find_oxts(path: Path) -> Path | None:
-    """Return the folder «oxts» that a path is or holds, or None."""
+    """Return the folder «oxts» at or in a path, or None."""
     for folder in (path, path / "oxts", path.parent if path.name == "data" else path):
         if (folder / "data").is_dir() and (folder / OXTS_TIMES).is_file():
             return folder
@@ -34,7 +34,7 @@ def find_oxts(path: Path) -> Path | None:
 
 
 def oxts_files(folder: Path) -> list[Path]:
-    """Return the files of a folder «oxts», a row each, in the order of their numbers."""
+    """Return the files of a folder «oxts», each with a row, in the order of their numbers."""
     return sorted((folder / "data").glob("*.txt"), key=lambda file: natural(file.name))
 
 
@@ -43,7 +43,13 @@ def read_oxts(folder: Path, origin: Sequence[float] | None) -> tuple[Floats, Flo
 
     Returns
     -------
-    seconds since 1970 (k,), and positions (k, 3) and quaternions (k, 4) as of `oxts_poses`.
+    seconds since 1970 (k,), positions east, north and up of the origin (k, 3), metres, and
+    quaternions (k, 4), x, y, z, w.
+
+    Raises
+    ------
+    ValueError
+        If the folder has no rows, a row has another number of values, or times do not fit.
     """
     files = oxts_files(folder)
     if not files:
@@ -62,23 +68,30 @@ def read_oxts(folder: Path, origin: Sequence[float] | None) -> tuple[Floats, Flo
 
 
 def oxts_poses(rows: Floats, origin: Sequence[float] | None) -> tuple[Floats, Floats]:
-    """Return positions east, north and up of an origin (k, 3) and quaternions (k, 4) of rows.
+    """Return positions east, north and up of an origin (k, 3), metres, and quaternions (k, 4).
 
-    KITTI's Mercator projection, whose scale is true at the latitude of the origin: latitude and
-    longitude in degrees and altitude in metres, by default those of the first row.
+    Positions are in KITTI's Mercator projection, whose scale is true at the latitude of the origin.
+
+    Parameters
+    ----------
+    rows
+        (k, 30): rows of the files.
+    origin
+        Latitude and longitude, degrees, and altitude, metres; by default of the first row.
     """
     latitude, longitude, altitude = rows[:, :3].T
     if not ((np.abs(latitude) < 90) & (np.abs(longitude) <= 360)).all():
         raise ValueError("its first two numbers are not latitude and longitude in degrees")
-    zero = rows[0, :3] if origin is None else np.asarray(origin, np.float64)
-    scale = sin_cos_of(np.radians(float(zero[0])))[1]
+    origin_row = rows[0, :3] if origin is None else np.asarray(origin, np.float64)
+    scale = sin_cos_of(np.radians(float(origin_row[0])))[1]
 
     def projected(latitude: Floats, longitude: Floats) -> Floats:
+        """Return metres east and north (k, 2) of a latitude and longitude in degrees (k,)."""
         sine, cosine = sin_cos((90.0 + latitude) * (np.pi / 360.0))
         north = log(sine / cosine)
         return scale * _RADIUS_M * np.stack([np.radians(longitude), north], axis=-1)
 
-    level = projected(latitude, longitude) - projected(zero[0], zero[1])
-    positions = np.column_stack([level, altitude - zero[2]])
+    level = projected(latitude, longitude) - projected(origin_row[0], origin_row[1])
+    positions = np.column_stack([level, altitude - origin_row[2]])
     angles_deg = np.degrees(rows[:, [5, 4, 3]])
     return positions, quaternions_of(rotations_of(angles_deg))

@@ -1,4 +1,4 @@
-"""Sensors as plain data, so that a file says where each of its rays points."""
+"""Sensors as plain data, so that a file contains the directions and times of its rays."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from .beams import Beams, Mirror, Spin
 from .ray_sensors import ListedSensor, Prism, PrismSensor, TurningMirror
 from .sensor import LineSensor, Sensor
 
-# What directions and times of rays depend on; nothing else is made from a file.
+# The classes that directions and times of rays depend on; no other class is made from a file.
 _KINDS = {
     kind.__name__: kind
     for kind in (
@@ -31,38 +31,50 @@ _KINDS = {
 _LEFT_OUT = ("optics", "noise", "returns")
 
 
-def described(thing: Any, arrays: MutableMapping[str, AnyArray]) -> Any:
-    """Return sensors as data for JSON, their arrays in `arrays`; None with classes of a user."""
+def to_plain_data(value: Any, arrays: MutableMapping[str, AnyArray]) -> Any:
+    """Return sensors as data for JSON, and put their arrays into `arrays` {name: array}.
+
+    None if a sensor has a class that is not of this package.
+    """
     try:
-        return _described(thing, arrays)
+        return _to_plain_data(value, arrays)
     except TypeError:
         return None
 
 
-def _described(thing: Any, arrays: MutableMapping[str, AnyArray]) -> Any:
-    if isinstance(thing, np.ndarray):
+def _to_plain_data(value: Any, arrays: MutableMapping[str, AnyArray]) -> Any:
+    """Return a value as data for JSON; TypeError for a class that is not of this package."""
+    if isinstance(value, np.ndarray):
         name = f"rays{len(arrays)}"
-        arrays[name] = thing
+        arrays[name] = value
         return {"array": name}
-    if isinstance(thing, (tuple, list)):
-        return [_described(one, arrays) for one in thing]
-    if isinstance(thing, np.generic):
-        return thing.item()
-    if _KINDS.get(type(thing).__name__) is type(thing):
-        names = [field.name for field in fields(thing) if field.name not in _LEFT_OUT]
-        of_fields = {name: _described(getattr(thing, name), arrays) for name in names}
-        return {"kind": type(thing).__name__, **of_fields}
-    if not isinstance(thing, (str, int, float, type(None))):
+    if isinstance(value, (tuple, list)):
+        return [_to_plain_data(item, arrays) for item in value]
+    if isinstance(value, np.generic):
+        return value.item()
+    if _KINDS.get(type(value).__name__) is type(value):
+        names = [field.name for field in fields(value) if field.name not in _LEFT_OUT]
+        of_fields = {name: _to_plain_data(getattr(value, name), arrays) for name in names}
+        return {"kind": type(value).__name__, **of_fields}
+    if not isinstance(value, (str, int, float, type(None))):
         raise TypeError("a class of a user's own, which no file describes")
-    return thing
+    return value
 
 
-def remade(told: Any, arrays: Mapping[str, AnyArray]) -> Any:
-    """Return what `described` was given; any exception if the data are not such."""
-    if isinstance(told, list):
-        return tuple(remade(one, arrays) for one in told)
-    if not isinstance(told, dict):
-        return told
-    if "array" in told:
-        return arrays[told["array"]]
-    return _KINDS[told.pop("kind")](**{name: remade(one, arrays) for name, one in told.items()})
+def from_plain_data(data: Any, arrays: Mapping[str, AnyArray]) -> Any:
+    """Return the sensors of the data and arrays of `to_plain_data`.
+
+    Raises
+    ------
+    Exception
+        Of any class, if the data are not of `to_plain_data`.
+    """
+    if isinstance(data, list):
+        return tuple(from_plain_data(item, arrays) for item in data)
+    if not isinstance(data, dict):
+        return data
+    if "array" in data:
+        return arrays[data["array"]]
+    return _KINDS[data.pop("kind")](
+        **{name: from_plain_data(item, arrays) for name, item in data.items()}
+    )

@@ -9,7 +9,8 @@ import numpy as np
 from ..base.arrays import Floats
 from ..base.tables import DEGREES, METRES, NUMBERS, SECONDS, Quantity, TableFormat
 
-# What programs write before x, y and z of a position, and before x, y, z and w of a quaternion.
+# Prefixes that programs write before x, y and z of a position, and before the letters of a
+# quaternion.
 _POSITIONS = (
     "", "p", "t", "pos", "position", "translation", "pose_position", "pose_pose_position",
     "transform_translation", "p_RS_R",
@@ -20,12 +21,13 @@ _QUATERNIONS = (
 )  # fmt: skip
 
 
-def _spelled(prefixes: tuple[str, ...], axis: str, *others: str) -> tuple[str, ...]:
-    return *(f"{prefix}_{axis}" for prefix in prefixes), *others
+def _spelled(prefixes: tuple[str, ...], axis: str, *spellings: str) -> tuple[str, ...]:
+    """Return the spellings of an axis: with each prefix, and further `spellings`."""
+    return *(f"{prefix}_{axis}" for prefix in prefixes), *spellings
 
 
 # Quantity; its spellings (case, spaces, underscores, hyphens and dots do not count); units that a
-# header may state, the first of which is returned; the unit of a header without one.
+# header may state, of which values are returned in the first; the unit of a header without unit.
 TIME = Quantity("time_s", ("time", "t", "timestamp", "stamp"), SECONDS, None)
 # World coordinates of the scene: z is up. Of compass directions, x is east and y north.
 POSITION = (
@@ -33,7 +35,7 @@ POSITION = (
     Quantity("y", _spelled(_POSITIONS, "y", "northing", "north"), METRES, "m"),
     Quantity("z", _spelled(_POSITIONS, "z", "height", "up"), METRES, "m"),
 )
-# Rotation from the carrier's axes (x ahead, y left, z up) to the world's.
+# Rotation from the carrier frame (x ahead, y left, z up) to the world frame.
 QUATERNION = tuple(
     Quantity(f"q{axis}", _spelled(_QUATERNIONS, axis), NUMBERS, "") for axis in "xyzw"
 )
@@ -70,7 +72,13 @@ REFUSED_COLUMNS = {
 
 
 def with_yaw(columns: Mapping[str, Floats]) -> dict[str, Floats]:
-    """Return the columns of a table with yaw in place of a heading; ValueError if it has both."""
+    """Return the columns of a table with yaw in place of a heading, degrees.
+
+    Raises
+    ------
+    ValueError
+        If the table has both.
+    """
     angles = dict(columns)
     if "heading_deg" not in angles:
         return angles
@@ -85,4 +93,4 @@ def with_yaw(columns: Mapping[str, Floats]) -> dict[str, Floats]:
 def angles_of(columns: Mapping[str, Floats], count: int) -> Floats:
     """Return yaw, pitch and roll in degrees (count, 3); angles that a table lacks are zero."""
     zero = np.zeros(count)
-    return np.stack([columns.get(one.name, zero) for one in (YAW, PITCH, ROLL)], axis=1)
+    return np.stack([columns.get(quantity.name, zero) for quantity in (YAW, PITCH, ROLL)], axis=1)

@@ -1,4 +1,4 @@
-"""Sensors without conical beams: behind prisms, or with listed rays."""
+"""Sensors whose beams do not sweep cones: behind prisms, or with listed rays."""
 
 from __future__ import annotations
 
@@ -25,19 +25,19 @@ class Prism:
 
     wedge_deg: float  # angle between its two faces
     index: Annotated[float, Field(gt=0)]  # refractive
-    rpm: float  # turns a minute about x, from y to z
-    phase_deg: float = 0.0  # angle of its thin edge at time 0, likewise
-    inclined_first: bool = False  # light enters through the inclined face; else the flat one
+    rpm: float  # revolutions a minute about x, from y to z
+    phase_deg: float = 0.0  # angle of its thin edge at time 0, from y to z
+    inclined_first: bool = False  # light enters through the inclined face, else the flat face
 
 
 @dataclass(frozen=True)
 @checked_fields
 class TurningMirror:
-    """A plane mirror behind the prisms, which turns about their axis and looks up."""
+    """A plane mirror behind prisms, which turns about the axis of the prisms and looks up."""
 
     tilt_deg: Annotated[float, Field(gt=0, lt=90)]  # angle between its normal and the axis
-    rpm: float  # turns a minute about the axis, from x to y of the sensor
-    phase_deg: float = 0.0  # azimuth of its normal at time 0, likewise
+    rpm: float  # revolutions a minute about the axis, from x to y of the sensor
+    phase_deg: float = 0.0  # azimuth of its normal at time 0, from x to y
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,9 +49,9 @@ class PrismSensor(Sensor):
     Prisms are thin: all rays start at the sensor's centre. The pattern has no useful period.
     """
 
-    # One along x by default; others enter the first prism at an angle.
+    # A beam along x by default; several beams enter the first prism at angles.
     beams: Beams = field(default_factory=lambda: Beams(np.zeros(1)))
-    # In the order in which light passes them.
+    # In the order of the light's path.
     prisms: tuple[Prism, ...] = (Prism(18, 1.5, 7294), Prism(18, 1.5, -4664, 0, True))
     mirror: TurningMirror | None = None
     cycle: ClassVar[str] = "frame"
@@ -62,16 +62,16 @@ class PrismSensor(Sensor):
 
     @property
     def period(self) -> int | None:
-        """See `Sensor.period`."""
+        """None: the pattern does not repeat."""
         return None
 
     def directions(self, firings: Ints) -> Floats:
-        """See `Sensor.directions`."""
+        """Return the unit directions of firings (k,), in the sensor frame: (k, channels, 3)."""
         minutes = self.head.times_ns(firings) / 60e9
         flat = np.array([1.0, 0, 0])[:, None, None]
         ray = np.repeat(self.ahead.T[:, None, :], len(firings), axis=1)
         for prism in self.prisms:
-            # Reduced to a turn first: the cosine of a large angle loses digits.
+            # Reduced to one revolution first: the cosine of a large angle loses digits.
             angle = 2 * np.pi * ((prism.rpm * minutes + prism.phase_deg / 360) % 1)
             # Normals along the light's direction; the faces diverge towards the thick edge.
             sine, cosine = sin_cos_of(math.radians(prism.wedge_deg))
@@ -88,7 +88,7 @@ class PrismSensor(Sensor):
         return np.ascontiguousarray(ray.transpose(1, 2, 0))
 
     def _reflected(self, rays: Floats, minutes: Floats) -> Floats:
-        """Reflect rays (3, k, c) at the mirror, at times (k,): (3, k, c), z along the axis."""
+        """Reflect rays (3, k, c) at the mirror at times (k,), minutes: (3, k, c), z on the axis."""
         assert self.mirror is not None
         angle = 2 * np.pi * ((self.mirror.rpm * minutes + self.mirror.phase_deg / 360) % 1)
         sine, cosine = sin_cos_of(math.radians(self.mirror.tilt_deg))
@@ -100,24 +100,25 @@ class PrismSensor(Sensor):
 
 
 def _refracted(rays: Floats, normals: Floats, ratio: float) -> Floats:
-    """Rays (3, k, c) behind a face, by Snell's law; `ratio` is the index before over that behind.
+    """Return the rays (3, k, c) behind a face, by Snell's law.
 
-    The normals (3, k, 1), or (3, 1, 1), point along the light's direction.
+    `ratio` is the refractive index before the face over the index behind it. The normals
+    (3, k, 1), or (3, 1, 1), point along the light's direction.
     """
-    along = (rays * normals).sum(axis=0)
-    behind = 1 - ratio * ratio * (1 - along * along)
+    cosine = (rays * normals).sum(axis=0)
+    behind = 1 - ratio * ratio * (1 - cosine * cosine)
     if not (behind >= 0).all():
         raise LidarError(
             "A prism reflects light back at its inner face, so that no ray leaves the sensor: "
             "make its wedge or its index smaller."
         )
     behind = np.sqrt(behind)
-    return ratio * rays + (behind - ratio * along) * normals
+    return ratio * rays + (behind - ratio * cosine) * normals
 
 
 @dataclass(frozen=True, eq=False)
 class ListedSensor(Sensor):
-    """Rays listed one by one, as in a maker's file: one beam, each firing another direction.
+    """A sensor with a list of rays, as in a maker's file: each firing is the next ray of the list.
 
     The list repeats. The head's time steps are parts of the list; its times and azimuths are
     not used.
@@ -132,15 +133,15 @@ class ListedSensor(Sensor):
 
     @property
     def period(self) -> int | None:
-        """See `Sensor.period`."""
+        """Number of rays in the list, after which directions repeat."""
         return len(self.rays)
 
     def directions(self, firings: Ints) -> Floats:
-        """See `Sensor.directions`."""
+        """Return the unit directions of firings (k,), in the sensor frame: (k, 1, 3)."""
         return self.rays[firings % len(self.rays)][:, None, :]
 
     def begins_ns(self, firings: Ints) -> Floats:
-        """See `Sensor.begins_ns`."""
+        """Return the starts of firings (k,), nanoseconds since the start of the station: (k,)."""
         cycles, shots = np.divmod(firings, len(self.rays))
         times: Floats = self.start_ns + cycles * self.cycle_ns + self.shot_ns[shots]
         return times

@@ -1,4 +1,4 @@
-"""Reflectivity as makers of sensors publish it: a byte for a reflectance that is known by range."""
+"""Reflectivity as makers of sensors define it: bytes for reflectances, calibrated by range."""
 
 from __future__ import annotations
 
@@ -15,32 +15,32 @@ _BEST = 8 * RETRO_GAIN  # reflectance of the best retro-reflective sheets
 
 
 class ByteScale(NamedTuple):
-    """Codes of reflectances: linear up to `code`, which has a `reflectance`, then logarithmic."""
+    """Codes of reflectances: linear up to `code`, then logarithmic."""
 
     code: int
-    reflectance: float
-    most: float  # reflectance of 255
+    reflectance: float  # of `code`
+    max_reflectance: float  # of the code 255
 
     def codes(self, reflectance: Floats) -> Bytes:
-        """Codes (n,) of reflectances (n,); 255 of all beyond the scale."""
+        """Return the codes (n,) of reflectances (n,); 255 for reflectances beyond the scale."""
         share = reflectance / self.reflectance
         code = self.code * np.minimum(share, 1) + log(np.maximum(share, 1)) / self._step
         return np.rint(np.minimum(code, 255)).astype(np.uint8)
 
     def reflectances(self, codes: Bytes) -> Floats:
-        """Reflectances (n,) of codes (n,): the inverse of `codes`, but for rounding."""
+        """Return the reflectances (n,) of codes (n,): the inverse of `codes`, but for rounding."""
         linear = np.minimum(codes, self.code)
         return self.reflectance * (linear / self.code) * exp(self._step * (codes - linear))
 
     @property
     def _step(self) -> float:
-        """Logarithm of the ratio of neighbouring codes."""
-        return log_of(self.most / self.reflectance) / max(255 - self.code, 1) or 1.0
+        """Logarithm of the ratio of the reflectances of neighbouring codes."""
+        return log_of(self.max_reflectance / self.reflectance) / max(255 - self.code, 1) or 1.0
 
 
-# Of the makers' manuals. Only Hesai publishes all of its scale: the others say that it is
-# logarithmic above white, or ends with an ideal retro-reflector.
-COUNTS = 10_000  # of an intensity of 1 in the column signal: makers publish no such figure
+COUNTS = 10_000  # value of an intensity of 1 in the column signal: makers publish no such figure
+# From the makers' manuals. Only Hesai publishes its scale completely: other makers say that the
+# scale is logarithmic above white, or ends with an ideal retro-reflector.
 SCALES = {
     "velodyne": ByteScale(100, 1.0, _BEST),
     "vls128": ByteScale(110, 1.0, _BEST),

@@ -1,56 +1,43 @@
-"""Curves through values that are twice continuously differentiable, and stand still at stops.
+"""Twice continuously differentiable curves through values, which stand still at stops.
 
-Between two times a value is a polynomial of fifth degree with given first and second derivatives
-at both ends: those of the cubic spline, which the curve then equals, and zero at stops. Sums,
-products, quotients and roots have one order, so that every processor has the same bits.
+Between two times a value is a polynomial of fifth degree. Its first and second derivatives at both
+ends are the derivatives of the cubic spline, which the curve then equals, and zero at stops. Sums,
+products, quotients and roots have one order, so that every processor computes the same bits.
 """
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
-from ..base.arrays import Floats, Indices
+from ..base.arrays import Bools, Floats, Indices
+
+_PAD = 32  # empty equations before the first and after the last: the last distance of reduction
 
 
 def knots_of(times: Floats, values: Floats) -> Floats:
-    """Values (d, n) at times (n,), which stop together, and two derivatives there: (3, d, n)."""
+    """Return values (d, n) at times (n,) and their first two derivatives: (3, d, n).
+
+    The d values stop together.
+    """
     steps = np.diff(times)
     slopes = np.diff(values) / steps
-    speeds = np.sqrt((slopes * slopes).sum(axis=0))
-    rests = speeds * steps <= 1e-9  # metres, or halves of radians
-    # Steps ten times as long as their neighbour, and as slow, are pauses without values, in which
-    # a curve with the neighbour's speed would swing far out.
-    for one, other in ((np.s_[1:], np.s_[:-1]), (np.s_[:-1], np.s_[1:])):
-        rests[one] |= (steps[one] > 10 * steps[other]) & (10 * speeds[one] < speeds[other])
-    still = np.append(rests, False) | np.append(False, rests)
-    # Equal second derivatives on both sides: v[i] + before[i] v[i - 1] + after[i] v[i + 1] = given
-    rows = np.zeros((2 + len(values), 32 + len(times) + 32))
-    own = rows[:, 32:-32]
-    before = own[0]
-    after = own[1]
-    first = own[2:]
-    before[1:-1] = steps[1:] / (steps[1:] + steps[:-1]) / 2
-    after[1:-1] = 0.5 - before[1:-1]
-    first[:, 1:-1] = 3 * (before[1:-1] * slopes[:, :-1] + after[1:-1] * slopes[:, 1:])
-    for end, few in ((0, np.s_[:4]), (-1, np.s_[:-5:-1])):
-        # The slope there of the cubic through four (Newton).
-        time = times[few]
-        part = values[:, few]
-        factor = 1.0
-        for count in range(1, len(time)):
-            part = np.diff(part) / (time[count:] - time[:-count])
-            first[:, end] += factor * part[:, 0]
-            factor *= time[0] - time[count]
-    own[:, still] = 0
-    # Cyclic reduction (Hockney, 1965) of all rows at once: `before` and `after`, 1/2 at most, are
-    # squared each time, and at last below a rounding.
-    for far in (1, 2, 4, 8, 16, 32):
-        left, right = (rows[:, 32 + k : 32 + k + len(times)] for k in (-far, far))
-        scale = 1 - before * left[1] - after * right[0]
-        found = (first - before * left[2:] - after * right[2:]) / scale
-        before[:] = -before * left[0] / scale
-        after[:] = -after * right[1] / scale
-        first[:] = found
+    still = _stops(steps, slopes)
+    # Equal second derivatives on both sides of a knot, of its slope v[i]:
+    # v[i] + lower[i] v[i - 1] + upper[i] v[i + 1] = first[i]
+    rows = np.zeros((2 + len(values), _PAD + len(times) + _PAD))
+    equations = rows[:, _PAD:-_PAD]
+    lower = equations[0]
+    upper = equations[1]
+    first = equations[2:]
+    lower[1:-1] = steps[1:] / (steps[1:] + steps[:-1]) / 2
+    upper[1:-1] = 0.5 - lower[1:-1]
+    first[:, 1:-1] = 3 * (lower[1:-1] * slopes[:, :-1] + upper[1:-1] * slopes[:, 1:])
+    first[:, 0] += _end_slopes(times[:4], values[:, :4])
+    first[:, -1] += _end_slopes(times[:-5:-1], values[:, :-5:-1])
+    equations[:, still] = 0
+    _reduce(rows)
     second = np.zeros_like(first)
     second[:, :-1] = (6 * slopes - 4 * first[:, :-1] - 2 * first[:, 1:]) / steps
     second[:, -1] = (4 * first[:, -1] + 2 * first[:, -2] - 6 * slopes[:, -1]) / steps[-1]
@@ -58,26 +45,109 @@ def knots_of(times: Floats, values: Floats) -> Floats:
     return np.array([values, first, second])
 
 
+def _stops(steps: Floats, slopes: Floats) -> Bools:
+    """Return whether values stand still at times (n,), by the steps (n - 1,) between the times.
+
+    `slopes` (d, n - 1) are the mean slopes in each step.
+    """
+    speeds = np.sqrt((slopes * slopes).sum(axis=0))
+    rests = speeds * steps <= 1e-9  # metres, or halves of radians
+    # Steps ten times as long as their neighbour, and as slow, are pauses without values, in which
+    # a curve with the neighbour's speed would swing far out.
+    for step, neighbour in ((np.s_[1:], np.s_[:-1]), (np.s_[:-1], np.s_[1:])):
+        longer = steps[step] > 10 * steps[neighbour]
+        rests[step] |= longer & (10 * speeds[step] < speeds[neighbour])
+    return np.append(rests, False) | np.append(False, rests)
+
+
+def _end_slopes(times: Floats, values: Floats) -> Floats:
+    """Return the slopes (d,), at the first time, of the cubics through values (d, 4) (Newton)."""
+    slopes = np.zeros(len(values))
+    differences = values
+    factor = 1.0
+    for order in range(1, len(times)):
+        differences = np.diff(differences) / (times[order:] - times[:-order])
+        slopes += factor * differences[:, 0]
+        factor *= times[0] - times[order]
+    return slopes
+
+
+def _reduce(rows: Floats) -> None:
+    """Solve padded tridiagonal equations (2 + d, n) in place, by cyclic reduction (Hockney, 1965).
+
+    Row 0 is the factor of the unknown before, row 1 of the unknown after; the others are the right
+    sides, and then the solutions. The factors, 1/2 at most, are squared in each step, and at last
+    are below a rounding.
+    """
+    count = rows.shape[1] - 2 * _PAD
+    lower = rows[0, _PAD:-_PAD]
+    upper = rows[1, _PAD:-_PAD]
+    right_sides = rows[2:, _PAD:-_PAD]
+    for distance in (1, 2, 4, 8, 16, _PAD):
+        rows_before = rows[:, _PAD - distance : _PAD - distance + count]
+        rows_after = rows[:, _PAD + distance : _PAD + distance + count]
+        scale = 1 - lower * rows_before[1] - upper * rows_after[0]
+        reduced = (right_sides - lower * rows_before[2:] - upper * rows_after[2:]) / scale
+        lower[:] = -lower * rows_before[0] / scale
+        upper[:] = -upper * rows_after[1] / scale
+        right_sides[:] = reduced
+
+
+class _Polynomials(NamedTuple):
+    """Coefficients of polynomials of fifth degree, each (d, m), in the share of a segment."""
+
+    constant: Floats
+    linear: Floats
+    square: Floats
+    cubic: Floats
+    quartic: Floats
+    quintic: Floats
+
+
 def on_curve(
     knots: Floats, steps: Floats, segment: Indices, since: Floats, slopes: bool
 ) -> tuple[Floats, Floats]:
-    """Values and, if asked for, slopes (d, k), `since` (k,) after the knots `segment` (k,)."""
-    # Times mostly come in order: coefficients are computed once for all in one segment.
-    begins = np.flatnonzero(np.diff(segment, prepend=-1))
-    counts = np.diff(begins, append=len(segment))
-    used = segment.take(begins)
-    step = steps.take(used)
-    powers = np.stack([step / step, step, step * step / 2])[:, None]
-    (p, v, a), (q, w, b) = (knots.take(used + k, axis=2) * powers for k in (0, 1))
+    """Return values (d, k) and slopes (d, k) of a curve, `since` (k,) after knots `segment` (k,).
+
+    Parameters
+    ----------
+    knots
+        (3, d, n): of `knots_of`.
+    steps
+        (n - 1,): times from each knot to the next, in the unit of all times.
+    segment
+        (k,): numbers of the knots before the points.
+    since
+        (k,): times since these knots.
+    slopes
+        Whether slopes are computed; they are 0 otherwise.
+    """
+    # Times mostly come in order: coefficients are computed once for all points of a run in one
+    # segment.
+    run_starts = np.flatnonzero(np.diff(segment, prepend=-1))
+    counts = np.diff(run_starts, append=len(segment))
+    run_segments = segment.take(run_starts)
+    step = steps.take(run_segments)
     share = since / step.repeat(counts)
-    change = q - p
-    value, slope = np.zeros((2, len(p), len(segment)))
-    # Of the polynomial in the share of the segment, by Horner.
-    c = 10 * change - 6 * v - 4 * w - 3 * a + b
-    d = 8 * v + 7 * w + 3 * a - 2 * b - 15 * change
-    e = 6 * change - 3 * (v + w) - a + b
-    for term in (e, d, c, a, v, p):
+    value, slope = np.zeros((2, knots.shape[1], len(segment)))
+    for term in reversed(_polynomials(knots, run_segments, step)):  # Horner's method
         if slopes:
             slope = slope * share + value
         value = value * share + term.repeat(counts, axis=1)
     return value, slope / step.repeat(counts)
+
+
+def _polynomials(knots: Floats, segments: Indices, step: Floats) -> _Polynomials:
+    """Return the polynomials of segments (m,), which take `step` (m,)."""
+    powers = np.stack([step / step, step, step * step / 2])[:, None]
+    # p, v, a: values and scaled derivatives at the start; q, w, b: at the end.
+    (p, v, a), (q, w, b) = (knots.take(segments + k, axis=2) * powers for k in (0, 1))
+    change = q - p
+    return _Polynomials(
+        constant=p,
+        linear=v,
+        square=a,
+        cubic=10 * change - 6 * v - 4 * w - 3 * a + b,
+        quartic=8 * v + 7 * w + 3 * a - 2 * b - 15 * change,
+        quintic=6 * change - 3 * (v + w) - a + b,
+    )

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Annotated, Any, ClassVar, Literal, Protocol
+from typing import Annotated, Any, ClassVar, Literal, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -24,7 +24,7 @@ CLOCK_S = 1e-6
 _FIRING_S = 1e-3
 
 _ROUNDS = 8  # of the power iteration: rotations are rounded by 2e-3 at most
-_STEP_NS = 5e5  # half of what difference quotients are taken over
+_STEP_NS = 5e5  # half of the interval of difference quotients
 
 ALWAYS = (-np.inf, np.inf)
 
@@ -34,7 +34,7 @@ Beyond = Literal["refuse", "hold", "absent"]
 @dataclass(frozen=True)
 @checked_fields
 class Pose:
-    """Position and rotation of a sensor, in the scene's own coordinates.
+    """Position and rotation of a sensor, in scene coordinates.
 
     Angles are in degrees, in aerospace order.
     """
@@ -49,62 +49,76 @@ class Pose:
 
     @property
     def rotation(self) -> Floats | None:
-        """Rotation from sensor to scene axes, (3, 3); None without rotation."""
+        """Rotation from the sensor frame to the scene frame, (3, 3); None without rotation."""
         if not (self.yaw_deg or self.pitch_deg or self.roll_deg):
             return None
         return rotations_of(np.array([self.yaw_deg, self.pitch_deg, self.roll_deg]))
 
     @property
-    def turn(self) -> Floats:
-        """`rotation`; the identity matrix without one."""
+    def rotation_matrix(self) -> Floats:
+        """Rotation from the sensor frame to the scene frame, (3, 3); identity without rotation."""
         return np.eye(3) if self.rotation is None else self.rotation
 
-    def then(self, mount: Pose) -> Pose:
-        """Pose of something mounted at `mount` in the axes of this one."""
+    def compose(self, mount: Pose) -> Pose:
+        """Return the scene pose of an instrument whose pose in this pose's frame is `mount`."""
         if mount == CENTRE:
             return self
-        turn = self.turn
-        return Pose.of(self.position + applied(turn, mount.position), matmul(turn, mount.turn))
+        rotation = self.rotation_matrix
+        position = self.position + applied(rotation, mount.position)
+        return Pose.from_rotation(position, matmul(rotation, mount.rotation_matrix))
 
     @classmethod
-    def of(cls, position: ArrayLike, rotation: Floats | None) -> Pose:
-        """Make a pose of a position and a rotation matrix (3, 3), or None.
+    def from_rotation(cls, position: ArrayLike, rotation: Floats | None) -> Pose:
+        """Return the pose with a position and a rotation matrix (3, 3), or None for no rotation.
 
-        LidarError if the matrix mirrors or deforms.
+        Raises
+        ------
+        LidarError
+            If the matrix mirrors or deforms.
         """
-        place = tuple(np.asarray(position, np.float64).tolist())
+        coordinates = tuple(np.asarray(position, np.float64).tolist())
         if rotation is None:
-            return cls(place)
+            return cls(coordinates)
         check_rotations(np.asarray(rotation, np.float64)[None])
         level = hypot(rotation[0, 0], rotation[1, 0])
         pitch = arctan2(-rotation[2, 0], level)
         if level > 1e-9:
             yaw = arctan2(rotation[1, 0], rotation[0, 0])
             roll = arctan2(rotation[2, 1], rotation[2, 2])
-        else:  # straight up or down: yaw and roll have the same axis
+        else:  # +x points straight up or down: yaw and roll have the same axis
             yaw = arctan2(-rotation[0, 1], rotation[1, 1])
             roll = np.zeros(())
-        return cls(place, *np.degrees([yaw, pitch, roll]).tolist())
+        return cls(coordinates, *np.degrees([yaw, pitch, roll]).tolist())
 
 
 def rotations_of(angles_deg: Floats) -> Floats:
-    """Rotations (k, 3, 3) of yaw, pitch and roll in degrees (k, 3), as of `Pose`; or of one."""
+    """Return the rotations (k, 3, 3) of yaw, pitch and roll in degrees (k, 3), in aerospace order.
+
+    Angles (3,) give one rotation (3, 3).
+    """
     angles = np.radians(angles_deg.T)
     (sy, sp, sr), (cy, cp, cr) = sin_cos(angles)
-    made = np.array(
+    rotations = np.array(
         [
             [cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr],
             [sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr],
             [-sp, cp * sr, cp * cr],
         ]
     )
-    return made if made.ndim == 2 else np.ascontiguousarray(np.moveaxis(made, 2, 0))
+    if rotations.ndim == 2:
+        return rotations
+    return np.ascontiguousarray(np.moveaxis(rotations, 2, 0))
 
 
 def check_rotations(rotations: Floats, slack: float = 1e-6) -> None:
-    """Check matrices (k, 3, 3) of poses; LidarError for one that mirrors or deforms.
+    """Check that matrices (k, 3, 3) of poses are rotations.
 
-    Products of their columns may differ by `slack` from those of a rotation.
+    Products of their columns may differ by `slack` from the products of a rotation's columns.
+
+    Raises
+    ------
+    LidarError
+        If a matrix mirrors or deforms.
     """
     products = matmul(rotations.transpose(0, 2, 1), rotations)
     # Written so that NaN is an error.
@@ -121,30 +135,36 @@ def check_rotations(rotations: Floats, slack: float = 1e-6) -> None:
         )
 
 
-def pose_of(name: str, given: Any) -> Pose:
-    """Return a pose as given, or of x, y and z; LidarError with its name if it is neither."""
-    if isinstance(given, Pose):
-        return given
+def pose_of(name: str, value: Any) -> Pose:
+    """Return a pose as it is, or the pose at x, y and z.
+
+    Raises
+    ------
+    LidarError
+        With `name`, if the value is neither a pose nor three numbers.
+    """
+    if isinstance(value, Pose):
+        return value
     try:
-        return Pose(tuple(map(float, given)))  # type: ignore[arg-type]  # it counts them
+        return Pose(tuple(map(float, value)))  # type: ignore[arg-type]  # it counts them
     except (TypeError, ValueError) as error:
         raise LidarError(
-            f"{name} is {shown(given)}; it must be a Pose, or x, y and z in metres, such as "
+            f"{name} is {shown(value)}; it must be a Pose, or x, y and z in metres, such as "
             "(0, 0, 1)."
         ) from error
 
 
-CENTRE = Pose((0.0, 0.0, 0.0))  # mount of a sensor without a carrier
+CENTRE = Pose((0.0, 0.0, 0.0))  # mount of a sensor without carrier
 
 
 @dataclass(frozen=True)
 class InstrumentPose(Pose):
-    """Position and angles of an instrument in the carrier's axes, as a file has them."""
+    """Position and angles of an instrument in the carrier frame, as written in a file."""
 
     position: Annotated[Triple, about("x, y and z, metres")] = (0, 0, 0)
 
 
-# A pose in a file whose position may be left out, or is all that is given.
+# A pose in a file, which may leave out the position, or be the position alone.
 AT_CENTRE = short(
     lambda v: isinstance(v, (dict, list)),
     lambda v: {"position": v} if isinstance(v, list) else {"position": [0] * 3} | v,
@@ -153,7 +173,7 @@ AT_CENTRE = short(
 
 
 class Trajectory(Protocol):
-    """Poses over time. A survey has stations: it jumps between them, and may move within one.
+    """Poses over time, at stations: a survey jumps between stations, and may move within each.
 
     Scans of one station follow one another, while the head keeps turning.
     """
@@ -171,26 +191,29 @@ class Trajectory(Protocol):
         """Longest duration of a station, nanoseconds; may be infinite."""
 
     def pose(self, station: int, time_ns: float = 0.0) -> Pose:
-        """Pose at a time since the start of a station."""
+        """Return the pose at a time since the start of a station, nanoseconds."""
 
     def poses(self, station: int, times_ns: Floats) -> tuple[Floats, Floats | None]:
-        """Positions (k, 3) and rotations (k, 3, 3) at times (k,) of a station that moves.
+        """Return positions (k, 3) and rotations (k, 3, 3) at times (k,) of a moving station.
 
-        They are fastest if each of their numbers is contiguous over the poses.
+        Casting is fastest if each number of the poses is contiguous over the poses.
         """
 
 
 def presence_ns(path: Trajectory) -> tuple[float, float]:
-    """Return when an actor on a trajectory is in the scene: first and last nanosecond.
+    """Return the first and the last nanosecond at which an actor on a trajectory is in the scene.
 
-    Always, unless its class has a `presence_ns` that says otherwise.
+    Without a property `presence_ns` of its class, the actor is always in the scene.
     """
     first, last = getattr(path, "presence_ns", ALWAYS)
     return float(first), float(last)
 
 
 def full_poses(path: Trajectory, station: int, times_ns: Floats) -> tuple[Floats, Floats]:
-    """Return poses as `Trajectory.poses` does; rotations are identities where it has none."""
+    """Return positions (k, 3) and rotations (k, 3, 3) at times (k,), ns, of a station.
+
+    Rotations are identities if the trajectory has none.
+    """
     positions, rotations = path.poses(station, times_ns)
     if rotations is None:
         rotations = np.broadcast_to(np.eye(3), (len(times_ns), 3, 3))
@@ -200,35 +223,43 @@ def full_poses(path: Trajectory, station: int, times_ns: Floats) -> tuple[Floats
 def velocities(path: Trajectory, station: int, times_ns: Floats) -> tuple[Floats, Floats]:
     """Return velocities and angular velocities on a trajectory, derivatives of its poses.
 
-    Those of its own method `velocities` with the same arguments and values, which the classes of
-    this package have. For another class they are difference quotients over 1 ms.
+    A class with a method `velocities(station, times_ns)`, as the classes of this package, computes
+    them itself. For other classes, velocities are difference quotients over 1 ms.
 
     Returns
     -------
     velocities
-        (k, 3): of the origin of its axes, m/s, in the scene's axes.
+        (k, 3): velocities of the carrier's origin, m/s, in the scene frame.
     rates
-        (k, 3): angular velocities, rad/s, in the scene's axes.
+        (k, 3): angular velocities, rad/s, in the scene frame.
     """
     if not path.moves:
         return np.zeros((len(times_ns), 3)), np.zeros((len(times_ns), 3))
-    own = getattr(path, "velocities", None)
-    if own is not None:
-        linear, angular = own(station, times_ns)
+    exact_velocities = getattr(path, "velocities", None)
+    if exact_velocities is not None:
+        linear, angular = exact_velocities(station, times_ns)
         return linear, angular
-    early, late = (np.clip(times_ns + h, 0, path.duration_ns) for h in (-_STEP_NS, _STEP_NS))
-    seconds = np.maximum(late - early, 1)[:, None] / 1e9
-    (one, before), (other, after) = (path.poses(station, at) for at in (early, late))
-    if before is None or after is None:
-        return (other - one) / seconds, np.zeros((len(times_ns), 3))
-    turn = matmul(after, before.transpose(0, 2, 1))
-    sines = np.stack([turn[:, k, j] - turn[:, j, k] for j, k in ((1, 2), (2, 0), (0, 1))], axis=1)
-    return (other - one) / seconds, sines / (2 * seconds)
+    early_ns = np.clip(times_ns - _STEP_NS, 0, path.duration_ns)
+    late_ns = np.clip(times_ns + _STEP_NS, 0, path.duration_ns)
+    seconds = np.maximum(late_ns - early_ns, 1)[:, None] / 1e9
+    early_positions, early_rotations = path.poses(station, early_ns)
+    late_positions, late_rotations = path.poses(station, late_ns)
+    speeds = (late_positions - early_positions) / seconds
+    if early_rotations is None or late_rotations is None:
+        return speeds, np.zeros((len(times_ns), 3))
+    change = matmul(late_rotations, early_rotations.transpose(0, 2, 1))
+    return speeds, rotation_sines(change) / (2 * seconds)
+
+
+def rotation_sines(rotations: Floats) -> Floats:
+    """Return the axes of rotations (k, 3, 3), times twice the sines of their angles: (k, 3)."""
+    differences = [rotations[:, k, j] - rotations[:, j, k] for j, k in ((1, 2), (2, 0), (0, 1))]
+    return np.stack(differences, axis=1)
 
 
 @dataclass(frozen=True)
 class Stations:
-    """The simplest trajectory: the sensor stands at one pose after the other."""
+    """A trajectory of a sensor that stands at a list of poses, in turn."""
 
     at: tuple[Pose, ...]
     moves: ClassVar[bool] = False
@@ -237,42 +268,45 @@ class Stations:
 
     @property
     def stations(self) -> int:
-        """See `Trajectory.stations`."""
+        """Number of stations: of the poses."""
         return len(self.at)
 
     def pose(self, station: int, time_ns: float = 0.0) -> Pose:
-        """See `Trajectory.pose`."""
+        """Return the pose of a station, at any time."""
         return self.at[station]
 
     def poses(self, station: int, times_ns: Floats) -> tuple[Floats, Floats | None]:
-        """See `Trajectory.poses`."""
+        """Return the pose of a station for each of k times: positions (k, 3), rotations (k, 3, 3).
+
+        Rotations are None if the pose has no rotation.
+        """
         pose = self.at[station]
         count = len(times_ns)
         rotation = pose.rotation
-        turned = None if rotation is None else np.broadcast_to(rotation, (count, 3, 3))
-        return np.broadcast_to(np.array(pose.position), (count, 3)), turned
+        rotations = None if rotation is None else np.broadcast_to(rotation, (count, 3, 3))
+        return np.broadcast_to(np.array(pose.position), (count, 3)), rotations
 
 
 @dataclass(frozen=True, eq=False)
 @checked_fields
 class Track:
-    """Poses at times, with a straight or smooth path between them: one station.
+    """Poses at times, with a straight or smooth path in between: a single station.
 
     Parameters
     ----------
     times_s
         float64 (k,): times of the poses, seconds, ascending; by any clock.
     positions
-        float64 (k, 3): metres, in the scene's own coordinates.
+        float64 (k, 3): metres, in scene coordinates.
     quaternions
-        float64 (k, 4): x, y, z, w of the rotations from the carrier's axes to the scene's, of unit
-        length within 1e-3. None if the carrier is level and faces its direction of travel.
+        float64 (k, 4): x, y, z, w of the rotations from the carrier frame to the scene frame, of
+        unit length within 1e-3. None if the carrier is level and faces its direction of travel.
     smooth
         Positions and quaternions follow cubic splines, whose accelerations do not jump, and stand
-        still between equal poses. Otherwise positions follow straight lines, and rotations turn
-        evenly about one axis from each pose to the next (Shoemake, 1985).
+        still between equal poses. Otherwise positions follow straight lines, and the carrier
+        rotates evenly about one axis from each pose to the next (Shoemake, 1985).
     start_s
-        Start of the station, by the same clock; by default the first time.
+        Start of the station, by the clock of `times_s`; by default the first time.
     duration_s
         Duration of the station; by default until the last time.
     beyond
@@ -303,44 +337,60 @@ class Track:
     moves: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
+        self._set_poses()
+        self._set_span()
+
+    def _set_poses(self) -> None:
+        """Check and freeze the times, positions and quaternions; compute missing quaternions."""
         times = as_array("times_s", self.times_s).copy()
-        places = as_array("positions", self.positions).copy()
-        if times.ndim != 1 or len(times) < 2 or places.shape != (len(times), 3):
+        positions = as_array("positions", self.positions).copy()
+        if times.ndim != 1 or len(times) < 2 or positions.shape != (len(times), 3):
             raise LidarError(
                 f"A trajectory needs two poses at least, with x, y and z each; there are "
-                f"{times.size} times and positions of {places.shape}."
+                f"{times.size} times and positions of {positions.shape}."
             )
-        _refuse(~np.isfinite(times), "the time of pose {} is not finite")
-        finite = np.isfinite(places[:, 0] + places[:, 1] + places[:, 2])
-        _refuse(~finite, "the position of pose {} is not finite")
-        late = np.append(False, np.diff(times) <= 0)
-        _refuse(late, "times must ascend, and that of pose {} does not come after the one before")
+        _check_poses(~np.isfinite(times), "the time of pose {} is not finite")
+        finite = np.isfinite(positions[:, 0] + positions[:, 1] + positions[:, 2])
+        _check_poses(~finite, "the position of pose {} is not finite")
+        not_ascending = np.append(False, np.diff(times) <= 0)
+        _check_poses(
+            not_ascending,
+            "times must ascend, and that of pose {} does not come after the one before",
+        )
         if self.quaternions is None:
-            slopes = np.gradient(places, times, axis=0).T
-            turns = _along(knots_of(times, places.T)[1] if self.smooth else slopes)
+            if self.smooth:
+                slopes = knots_of(times, positions.T)[1]
+            else:
+                slopes = np.gradient(positions, times, axis=0).T
+            quaternions = _travel_quaternions(slopes)
         else:
-            turns = as_array("quaternions", self.quaternions).copy()
-            if turns.shape != (len(times), 4):
+            quaternions = as_array("quaternions", self.quaternions).copy()
+            if quaternions.shape != (len(times), 4):
                 raise LidarError(
                     f"quaternions are x, y, z and w of each of the {len(times)} poses, not "
-                    f"{turns.shape}."
+                    f"{quaternions.shape}."
                 )
-        lengths = length(turns)
+        lengths = length(quaternions)
         # Written so that NaN is an error.
         bad = ~(np.abs(lengths - 1) <= QUATERNION_SLACK)
-        _refuse(bad, "the quaternion of pose {} is not of length 1")
-        turns /= lengths[:, None]
-        for name, array in (("times_s", times), ("positions", places), ("quaternions", turns)):
+        _check_poses(bad, "the quaternion of pose {} is not of length 1")
+        quaternions /= lengths[:, None]
+        arrays = {"times_s": times, "positions": positions, "quaternions": quaternions}
+        for name, array in arrays.items():
             array.flags.writeable = False
             object.__setattr__(self, name, array)
+
+    def _set_span(self) -> None:
+        """Check that the station is within the times, and fill in its start and duration."""
+        times = self.times_s
         start = times[0] if self.start_s is None else self.start_s
         last = times[-1] if self.duration_s is None else start + self.duration_s
-        most = CLOCK_S if self.beyond == "refuse" else np.inf
-        for what, time in (("start_s", start), ("the end by duration_s", last)):
+        max_gap_s = CLOCK_S if self.beyond == "refuse" else np.inf
+        for label, time in (("start_s", start), ("the end by duration_s", last)):
             gap = max(times[0] - time, time - times[-1])
-            if not gap <= most:  # or NaN
+            if not gap <= max_gap_s:  # or NaN
                 raise LidarError(
-                    f"{what} is {time:.9g} s, {gap:.6g} s outside the trajectory, which goes from "
+                    f"{label} is {time:.9g} s, {gap:.6g} s outside the trajectory, which goes from "
                     f"{times[0]:.9g} to {times[-1]:.9g} s."
                 )
         if self.beyond == "refuse" and last <= start:
@@ -350,13 +400,13 @@ class Track:
 
     @property
     def duration_ns(self) -> float:
-        """See `Trajectory.duration_ns`."""
+        """Duration of the station, nanoseconds."""
         assert self.duration_s is not None  # set above
         return self.duration_s * 1e9
 
     @property
     def presence_ns(self) -> tuple[float, float]:
-        """First and last nanosecond at which an actor is in the scene, see `beyond`."""
+        """First and last nanosecond at which an actor is in the scene, by `beyond`."""
         if self.beyond != "absent":
             return ALWAYS
         assert self.start_s is not None  # set above
@@ -365,113 +415,148 @@ class Track:
 
     @property
     def slack_s(self) -> float:
-        """How far outside the trajectory a time may be, seconds."""
+        """Time outside the trajectory that poses may have, seconds."""
         return _FIRING_S if self.beyond == "refuse" else np.inf
 
     def pose(self, station: int, time_ns: float = 0.0) -> Pose:
-        """See `Trajectory.pose`."""
+        """Return the pose at a time since the start of the station, nanoseconds."""
         positions, rotations = self.poses(station, np.array([time_ns], np.float64))
-        return Pose.of(positions[0], rotations[0])
+        return Pose.from_rotation(positions[0], rotations[0])
 
     def poses(self, station: int, times_ns: Floats) -> tuple[Floats, Floats]:
-        """See `Trajectory.poses`.
+        """Return positions (k, 3) and rotations (k, 3, 3) at times (k,) since the start, ns.
 
         Raises
         ------
         LidarError
             If a time is not within the trajectory.
         """
-        segment, since, _ = self._at(times_ns)
+        segment, since, _ = self._segments_at(times_ns)
         if self.smooth:
             values, _ = on_curve(*self._spline, segment, since, False)
-            turns = values[3:] / np.sqrt((values[3:] ** 2).sum(axis=0))
-            return values[:3].T, matrices(turns.T)
+            quaternions = values[3:] / np.sqrt((values[3:] ** 2).sum(axis=0))
+            return values[:3].T, matrices(quaternions.T)
         if len(segment) and segment.max() == segment.min():
-            segment = segment[:1]  # all are in one
-        start, speed, turn, rates, _ = self.segments
-        positions = speed.take(segment, axis=1) * since + start.take(segment, axis=1)
-        angle = since * rates.take(segment)
-        rotations = turn[0].take(segment, axis=1)
-        for factor, table in zip(sin_cos(angle), turn[1:], strict=True):
+            segment = segment[:1]  # all times are in one segment
+        segments = self.segments
+        moved = segments.velocities.take(segment, axis=1) * since
+        positions = moved + segments.starts.take(segment, axis=1)
+        angle = since * segments.rates.take(segment)
+        rotations = segments.rotation_terms[0].take(segment, axis=1)
+        for factor, table in zip(sin_cos(angle), segments.rotation_terms[1:], strict=True):
             rotations = rotations + factor * table.take(segment, axis=1)
         return positions.T, rotations.reshape(3, 3, -1).transpose(2, 0, 1)
 
     def velocities(self, station: int, times_ns: Floats) -> tuple[Floats, Floats]:
-        """See `velocities`: exact derivatives of its curves, at a given pose those behind it.
+        """Return velocities (k, 3), m/s, and angular velocities (k, 3), rad/s, at times (k,), ns.
+
+        Both are in the scene frame, and exact derivatives of the curves; at a pose of the track,
+        derivatives of the segment that follows.
 
         Raises
         ------
         LidarError
             If a time is not within the trajectory.
         """
-        segment, since, within = self._at(times_ns)
+        segment, since, within = self._segments_at(times_ns)
         if self.smooth:
             q, p = on_curve(*self._spline, segment, since, True)
-            # 2 p conjugate(q); the length of q may be any, and change.
-            turn = q[6] * p[3:6] - p[6] * q[3:6] - np.cross(p[3:6], q[3:6], axis=0)
+            # 2 p conjugate(q); q may have any length, and the length may change.
+            vector_part = q[6] * p[3:6] - p[6] * q[3:6] - np.cross(p[3:6], q[3:6], axis=0)
             speeds = p[:3]
-            rates = 2 * turn / (q[3:] ** 2).sum(axis=0)
+            rates = 2 * vector_part / (q[3:] ** 2).sum(axis=0)
         else:
-            speeds, rates = (self.segments[k].take(segment, axis=1) for k in (1, 4))
+            speeds = self.segments.velocities.take(segment, axis=1)
+            rates = self.segments.spins.take(segment, axis=1)
         return (speeds * within).T, (rates * within).T
 
-    def _at(self, times_ns: Floats) -> tuple[Indices, Floats, Bools]:
-        """Return segments of times (k,), seconds since these began, and whether it moves then."""
+    def _segments_at(self, times_ns: Floats) -> _SegmentTimes:
+        """Return the segments of times (k,), nanoseconds since the start."""
         assert self.start_s is not None  # set above
         times = self.times_s
-        at = times_ns / 1e9 + self.start_s
-        low = at.min(initial=np.inf)
-        high = at.max(initial=-np.inf)
-        gap = max(times[0] - low, high - times[-1])
-        within = np.ones(len(at), np.bool_)
+        moments_s = times_ns / 1e9 + self.start_s
+        first_s = moments_s.min(initial=np.inf)
+        last_s = moments_s.max(initial=-np.inf)
+        gap = max(times[0] - first_s, last_s - times[-1])
+        within = np.ones(len(moments_s), np.bool_)
         if self.beyond != "refuse":
-            within = (times[0] <= at) & (at <= times[-1])
-            at = at.clip(times[0], times[-1])
+            within = (times[0] <= moments_s) & (moments_s <= times[-1])
+            moments_s = moments_s.clip(times[0], times[-1])
         elif gap > self.slack_s:
             raise LidarError(
                 f"The trajectory goes from {times[0]:.9g} to {times[-1]:.9g} s; poses are asked "
-                f"for from {low:.9g} to {high:.9g} s, {gap:.6g} s outside."
+                f"for from {first_s:.9g} to {last_s:.9g} s, {gap:.6g} s outside."
             )
-        segment = np.clip(np.searchsorted(times, at, "right") - 1, 0, len(times) - 2)
-        return segment, at - times.take(segment), within
+        segment = np.clip(np.searchsorted(times, moments_s, "right") - 1, 0, len(times) - 2)
+        return _SegmentTimes(segment, moments_s - times.take(segment), within)
 
     @cached_property
     def _spline(self) -> tuple[Floats, Floats]:
-        """Knots of positions and quaternions, of which each is the nearer to the last; steps."""
-        turns = self.quaternions
-        assert turns is not None  # set above
-        flips = np.cumsum((turns[1:] * turns[:-1]).sum(axis=1) < 0)
-        groups = self.positions.T, turns.T * (1.0 - 2 * np.append(0, flips % 2))
+        """Knots (3, 7, k) of positions and quaternions, and steps (k - 1,), s, for `on_curve`.
+
+        Of the two quaternions of a rotation, each knot has the nearer to the knot before.
+        """
+        quaternions = self.quaternions
+        assert quaternions is not None  # set above
+        flips = np.cumsum((quaternions[1:] * quaternions[:-1]).sum(axis=1) < 0)
+        groups = self.positions.T, quaternions.T * (1.0 - 2 * np.append(0, flips % 2))
         knots = [knots_of(self.times_s, group) for group in groups]
         return np.concatenate(knots, axis=1), np.diff(self.times_s)
 
     @cached_property
-    def segments(self) -> tuple[Floats, ...]:
-        """Coefficients of poses on straight ways, one column for each of s segments.
-
-        Positions at their starts and velocities (3, s); of the rotation (3, 9, s), which is
-        ``turn[0] + sin(a) turn[1] + cos(a) turn[2]`` (Rodrigues, 1840), a the angle since then;
-        and rates, radians a second, of that angle (s,) and about the scene's axes (3, s).
-        """
-        speeds = np.diff(self.positions, axis=0) / np.diff(self.times_s)[:, None]
-        turns = self.quaternions
-        assert turns is not None  # set above
-        axis, rates = _between(turns, self.times_s)
-        x, y, z = axis.T
-        zero = np.zeros_like(x)
-        about = np.stack([zero, -z, y, z, zero, -x, -y, x, zero], axis=1).reshape(-1, 3, 3)
-        start = matrices(turns[:-1])
-        tilted = matmul(start, about)
-        square = matmul(tilted, about)
-        table = np.stack([start + square, tilted, -square]).reshape(3, -1, 9)
-        spins = applied(start, axis * rates)
-        parts = self.positions[:-1], speeds, spins
-        begin, speed, spin = (np.ascontiguousarray(part.T) for part in parts)
-        return begin, speed, np.ascontiguousarray(table.transpose(0, 2, 1)), rates[:, 0], spin
+    def segments(self) -> Segments:
+        """Coefficients of poses on straight lines."""
+        quaternions = self.quaternions
+        assert quaternions is not None  # set above
+        velocities = np.diff(self.positions, axis=0) / np.diff(self.times_s)[:, None]
+        axes, rates = _rotations_between(quaternions, self.times_s)
+        rotations = matrices(quaternions[:-1])
+        spins = applied(rotations, axes * rates)
+        return Segments(
+            starts=np.ascontiguousarray(self.positions[:-1].T),
+            velocities=np.ascontiguousarray(velocities.T),
+            rotation_terms=_rotation_terms(rotations, axes),
+            rates=rates[:, 0],
+            spins=np.ascontiguousarray(spins.T),
+        )
 
 
-def _between(quaternions: Floats, times_s: Floats) -> tuple[Floats, Floats]:
-    """Axes (s, 3) and rates (s, 1), rad/s, of turns from each pose to the next, in its axes."""
+class Segments(NamedTuple):
+    """Coefficients of poses between the poses of a track: a column for each of s segments."""
+
+    starts: Floats  # (3, s): positions at the start, metres
+    velocities: Floats  # (3, s): m/s
+    # (3, 9, s): the rotation is terms[0] + sin(a) terms[1] + cos(a) terms[2] (Rodrigues, 1840),
+    # with a the angle since the start
+    rotation_terms: Floats
+    rates: Floats  # (s,): of that angle, rad/s
+    spins: Floats  # (3, s): angular velocities in the scene frame, rad/s
+
+
+class _SegmentTimes(NamedTuple):
+    """Times on a track, by its segments."""
+
+    segment: Indices  # (k,): numbers of segments
+    since: Floats  # (k,): seconds since the segments' starts
+    within: Bools  # (k,): whether the time is within the track, so that the carrier moves
+
+
+def _rotation_terms(rotations: Floats, axes: Floats) -> Floats:
+    """Return the terms (3, 9, s) of rotations (s, 3, 3) that go on about unit axes (s, 3)."""
+    x, y, z = axes.T
+    zero = np.zeros_like(x)
+    cross_matrix = np.stack([zero, -z, y, z, zero, -x, -y, x, zero], axis=1).reshape(-1, 3, 3)
+    tilted = matmul(rotations, cross_matrix)
+    square = matmul(tilted, cross_matrix)
+    terms = np.stack([rotations + square, tilted, -square]).reshape(3, -1, 9)
+    return np.ascontiguousarray(terms.transpose(0, 2, 1))
+
+
+def _rotations_between(quaternions: Floats, times_s: Floats) -> tuple[Floats, Floats]:
+    """Return the axes (s, 3) and rates (s, 1), rad/s, of rotations from each pose to the next.
+
+    Axes are in the frame of the first of the two poses.
+    """
     # conjugate(p) q
     (p, pw), (q, qw) = ((t[:, :3], t[:, 3:]) for t in (quaternions[:-1], quaternions[1:]))
     axis = pw * q - qw * p - np.cross(p, q)
@@ -483,7 +568,7 @@ def _between(quaternions: Floats, times_s: Floats) -> tuple[Floats, Floats]:
 
 
 def matrices(quaternions: Floats) -> Floats:
-    """Rotation matrices (k, 3, 3) of unit quaternions x, y, z, w (k, 4)."""
+    """Return the rotation matrices (k, 3, 3) of unit quaternions x, y, z, w (k, 4)."""
     x, y, z, w = quaternions.T
     rows = [
         [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
@@ -496,28 +581,30 @@ def matrices(quaternions: Floats) -> Floats:
 def quaternions_of(rotations: Floats) -> Floats:
     """Return unit quaternions x, y, z, w (k, 4) of matrices (k, 3, 3), which may be rounded.
 
-    The eigenvector of the greatest eigenvalue (Bar-Itzhack, 2000), by power iteration: plus one,
-    the others are about as small as the matrices are rounded, and zero for exact rotations.
+    A quaternion is the eigenvector of the greatest eigenvalue (Bar-Itzhack, 2000), by power
+    iteration: plus one, the smaller eigenvalues are about as small as the matrices are rounded, and
+    zero for exact rotations.
     """
-    m = np.moveaxis(rotations, 0, -1)
+    matrix = np.moveaxis(rotations, 0, -1)
     table = np.zeros((len(rotations), 4, 4))
     for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
-        table[:, i, i] = m[i, i] - m[j, j] - m[k, k]
-        table[:, i, j] = table[:, j, i] = m[i, j] + m[j, i]
-        table[:, k, 3] = table[:, 3, k] = m[j, i] - m[i, j]
-    table[:, 3, 3] = m[0, 0] + m[1, 1] + m[2, 2]
+        table[:, i, i] = matrix[i, i] - matrix[j, j] - matrix[k, k]
+        table[:, i, j] = table[:, j, i] = matrix[i, j] + matrix[j, i]
+        table[:, k, 3] = table[:, 3, k] = matrix[j, i] - matrix[i, j]
+    table[:, 3, 3] = matrix[0, 0] + matrix[1, 1] + matrix[2, 2]
     table += np.eye(4)
     best = np.diagonal(table, axis1=1, axis2=2).argmax(axis=1)
-    found = table[np.arange(len(table)), best]
+    vectors = table[np.arange(len(table)), best]
     for _ in range(_ROUNDS):
-        found = applied(table, found / length(found)[:, None])
-    return np.asarray(found / length(found)[:, None])
+        vectors = applied(table, vectors / length(vectors)[:, None])
+    return np.asarray(vectors / length(vectors)[:, None])
 
 
-def _along(slopes: Floats) -> Floats:
-    """Quaternions (k, 4) of a level carrier that faces its direction of travel.
+def _travel_quaternions(slopes: Floats) -> Floats:
+    """Return the quaternions (k, 4) of a level carrier that faces its direction of travel.
 
-    While it stands it keeps its direction; before it first moves it faces its first direction.
+    `slopes` (3, k) are its velocities. While it stands, the carrier keeps its direction; before it
+    first moves, it faces its first direction.
     """
     x, y, _ = slopes
     moving = np.flatnonzero(hypot(x, y) > 1e-9)
@@ -528,7 +615,7 @@ def _along(slopes: Floats) -> Floats:
     return np.stack([np.zeros_like(half), np.zeros_like(half), *sin_cos(half)], axis=1)
 
 
-def _refuse(bad: Bools, words: str) -> None:
-    """Raise LidarError if any is bad, with the number of the first."""
+def _check_poses(bad: Bools, words: str) -> None:
+    """Raise LidarError if any pose is bad (k,): `words` with the number of the first bad pose."""
     if bad.any():
         raise LidarError(f"{words.format(int(bad.argmax()))} (poses are counted from 0).")

@@ -46,7 +46,7 @@ Longitude = Annotated[float, Field(ge=-360, le=360)]
 Height = Annotated[float, Field(ge=-1e5, le=1e6)]
 # Cameras look along z with y down; carriers look along x with z up.
 _CAMERA = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
-# A .trj of HELIOS++ says neither units nor the order of rotations: its survey does.
+# A .trj of HELIOS++ states neither units nor the order of rotations: its survey does.
 _HELIOS = " `lidarpool import` reads a .trj of HELIOS++ with its survey."
 
 
@@ -84,14 +84,14 @@ def load_trajectory(
         a header, separated by commas, semicolons, tabs or spaces, as EuRoC's data.csv; a folder
         «oxts» of KITTI; or a bag of ROS 2 (.mcap, .db3 or its folder), which needs
         ``lidarpool[ros]``. A table has time_s (or time_ns), x, y, z, and qx, qy, qz, qw, or
-        yaw_deg (or heading_deg, clockwise from y), and with it pitch_deg and roll_deg; without
-        them the carrier faces its direction of travel.
+        yaw_deg (or heading_deg, clockwise from y) with pitch_deg and roll_deg; without rotations
+        the carrier faces its direction of travel.
     format
         "tum", "kitti", "csv", "oxts" or "bag"; by default by the content.
     times
-        For a KITTI file, or one of rows of oxts: the file with the seconds of its rows.
+        For a KITTI file, or a file of rows of oxts: the file with the seconds of its rows.
     columns
-        For a table, {name as above: name in the file}, if they differ.
+        For a table, {name as above: name in the file}, if the names differ.
     ignore
         For a table, names of columns to leave out, with * and ?; a column that is neither used nor
         named here is an error.
@@ -100,20 +100,24 @@ def load_trajectory(
         TransformStamped or NavSatFix; "/tf:FRAME" for a frame; or two topics, of NavSatFix and of
         the Imu with its orientation, separated by a space.
     origin
-        For latitudes and longitudes: those of the world's zero, degrees, and its height, metres.
-        By default the first position.
+        For latitudes and longitudes: latitude and longitude of the world's zero, degrees, and its
+        height, metres. By default the first position.
     camera_axes
-        Whether to convert poses from camera axes (z ahead, y down) to a carrier's (x ahead,
+        Whether to convert poses from a camera frame (z ahead, y down) to a carrier frame (x ahead,
         z up); by default for KITTI.
     offset_s
         Added to all times.
-    smooth, start_s, duration_s, beyond
-        As of `Track`.
+    smooth
+        Whether the carrier follows smooth curves; see `Track`.
+    start_s, duration_s
+        Start and duration of the survey within the times of the file; by default all of them.
+    beyond
+        Use of the trajectory before its first and after its last time; see `Track`.
 
     Raises
     ------
     LidarError
-        If it cannot be read, has something that is not understood, or is invalid; the message
+        If the file cannot be read, has content that is not understood, or is invalid; the message
         names the file.
     """
     path = Path(path)
@@ -135,12 +139,12 @@ def load_trajectory(
             track = _from_camera(track)
         return track
     except (OSError, ValueError, LidarError) as error:
-        more = _HELIOS if path.suffix.lower() == ".trj" else ""
-        raise LidarError(f"{path} is not a usable trajectory: {message_of(error)}{more}") from error
+        note = _HELIOS if path.suffix.lower() == ".trj" else ""
+        raise LidarError(f"{path} is not a usable trajectory: {message_of(error)}{note}") from error
 
 
 def files_of_trajectory(path: Path) -> list[Path]:
-    """Return the files that a trajectory is read from: of a folder those in it, else the path."""
+    """Return the files of a trajectory: the path itself, or the files in a folder."""
     if not path.is_dir():
         return [path]
     if is_bag(path):
@@ -150,6 +154,7 @@ def files_of_trajectory(path: Path) -> list[Path]:
 
 
 def _refuse_topic(topic: str | None) -> None:
+    """Raise ValueError if a topic is given for a file that is not a bag."""
     if topic is not None:
         raise ValueError("topic is of bags, and it is none")
 
@@ -161,7 +166,7 @@ def _of_container(
     topic: str | None,
     origin: Sequence[float] | None,
 ) -> tuple[str, PoseTable]:
-    """Read a folder or a bag; return its format and its poses."""
+    """Return the format and the poses of a folder or a bag."""
     if not path.exists():
         raise FileNotFoundError(2, "No such file or directory")
     if is_bag(path) and kind in (None, "bag"):
@@ -190,16 +195,25 @@ def _of_text(
     ignore: Sequence[str],
     origin: Sequence[float] | None,
 ) -> tuple[str, PoseTable]:
-    """Read a text file; return its format and its poses."""
+    """Return the format and the poses of a text file."""
     lines = text.splitlines()
     if times is not None and kind not in (None, "kitti", "oxts"):
         raise ValueError(f"times are of KITTI's poses, and format says {kind}")
     header = find_header(lines, _is_pose_column) if times is None else None
     if kind == "csv" or (kind in (None, "tum") and header is not None):
         # Rows of TUM are separated by spaces, and may have their header in a remark.
-        tum = header is not None and header.comment and header.separator is None
-        return "csv", _table(text, columns, ignore, tum or kind == "tum")
-    rows = _numbers(text)
+        seconds_by_default = header is not None and header.comment and header.separator is None
+        return "csv", _table(text, columns, ignore, seconds_by_default or kind == "tum")
+    return _of_rows(_numbers(text), kind, times, origin)
+
+
+def _of_rows(
+    rows: Floats,
+    kind: TrajectoryFormat | None,
+    times: str | Path | None,
+    origin: Sequence[float] | None,
+) -> tuple[str, PoseTable]:
+    """Return the format and the poses of rows of numbers (k, n) without header."""
     width = rows.shape[1]
     if kind is None:
         kind = "oxts" if width == WIDTH else "kitti" if times or width == 12 else "tum"
@@ -223,12 +237,13 @@ def _of_text(
         raise ValueError(f"it has {len(rows)} poses and {times} {len(seconds)} times")
     if kind == "oxts":
         return kind, PoseTable(seconds, *oxts_poses(rows, origin))
-    places = rows.reshape(-1, 3, 4)
-    check_rotations(places[..., :3], slack=2 * QUATERNION_SLACK)
-    return kind, PoseTable(seconds, places[..., 3], quaternions_of(places[..., :3]))
+    poses = rows.reshape(-1, 3, 4)
+    check_rotations(poses[..., :3], slack=2 * QUATERNION_SLACK)
+    return kind, PoseTable(seconds, poses[..., 3], quaternions_of(poses[..., :3]))
 
 
 def _is_pose_column(cell: str) -> bool:
+    """Return whether a cell of a header names a quantity of poses."""
     words = column_name(cell).words
     return any(
         words in {column_name(name).words for name in quantity.spellings}
@@ -237,7 +252,7 @@ def _is_pose_column(cell: str) -> bool:
 
 
 def _numbers(text: str, columns: int | None = None) -> Floats:
-    """Rows of numbers, by `np.loadtxt`; lines that begin with # are comments."""
+    """Return the rows of numbers in a text, (k, columns); lines that begin with # are comments."""
     lines = [line for line in text.splitlines() if line.strip() and line.strip()[0] != "#"]
     if not lines:
         raise ValueError("it has no rows of numbers")
@@ -255,24 +270,27 @@ def _numbers(text: str, columns: int | None = None) -> Floats:
     return rows
 
 
-def _table(text: str, names: Mapping[str, str], ignore: Sequence[str], tum: bool) -> PoseTable:
-    """Read a table with a header; `tum` says that bare times are seconds."""
+def _table(
+    text: str, names: Mapping[str, str], ignore: Sequence[str], seconds_by_default: bool
+) -> PoseTable:
+    """Return the poses of a table with a header; `seconds_by_default` is for times without unit."""
     quaternion = [quantity.name for quantity in QUATERNION]
 
-    def needed(columns: Mapping[str, Floats]) -> tuple[str, ...]:
-        turns = quaternion if any(name in columns for name in quaternion) else ()
-        return ("time_s", "x", "y", "z", *turns)
+    def required_columns(columns: Mapping[str, Floats]) -> tuple[str, ...]:
+        """Return the columns that a table with these columns must have."""
+        rotation_columns = quaternion if any(name in columns for name in quaternion) else ()
+        return ("time_s", "x", "y", "z", *rotation_columns)
 
     columns = with_yaw(
         read_table(
             text,
             (TIME, *POSITION, *QUATERNION, *ANGLES),
-            required=needed,
+            required=required_columns,
             columns=names,
             ignore=ignore,
             formats=POSE_TABLES,
             refused=REFUSED_COLUMNS,
-            bare={"time_s": "s"} if tum else {},
+            bare={"time_s": "s"} if seconds_by_default else {},
         )
     )
     seconds = columns["time_s"]
@@ -281,8 +299,8 @@ def _table(text: str, names: Mapping[str, str], ignore: Sequence[str], tum: bool
     if "qx" in columns:
         if angles:
             raise ValueError(f"it has both a quaternion and {angles[0]}: ignore one of these")
-        turns = np.stack([columns[name] for name in quaternion], axis=1)
-        return PoseTable(seconds, positions, turns)
+        quaternions = np.stack([columns[name] for name in quaternion], axis=1)
+        return PoseTable(seconds, positions, quaternions)
     if not angles:
         return PoseTable(seconds, positions, None)
     if "yaw_deg" not in angles:
@@ -296,9 +314,9 @@ def _table(text: str, names: Mapping[str, str], ignore: Sequence[str], tum: bool
 
 
 def _from_camera(track: Track) -> Track:
-    """Convert poses of a camera in camera axes to those of a carrier."""
+    """Convert poses of a camera frame (z ahead, y down) to a carrier frame (x ahead, z up)."""
     assert track.quaternions is not None  # of every track
     x, y, z, w = track.quaternions.T
-    turns = np.stack([z, -x, -y, w], axis=1)  # the axis is rotated, the angle is the same
-    places = turned(track.positions, _CAMERA)
-    return replace(track, positions=places, quaternions=turns)
+    quaternions = np.stack([z, -x, -y, w], axis=1)  # the axis is rotated, the angle is the same
+    positions = turned(track.positions, _CAMERA)
+    return replace(track, positions=positions, quaternions=quaternions)

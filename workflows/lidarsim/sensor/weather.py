@@ -1,7 +1,7 @@
-"""Weather: what the air takes from the light of a pulse, and what it sends back.
+"""Weather: extinction of a pulse's light in the air, and back-scatter from it.
 
 Fog and dust are too fine to be seen one by one: they have an extinction and a back-scatter. Drops
-of rain and flakes of snow are seen one by one, by their size and place in the beam. Light is
+of rain and flakes of snow are seen one by one, by their size and position in the beam. Light is
 scattered once.
 """
 
@@ -28,29 +28,30 @@ SNOW_LIDAR_RATIO_SR = 25.0  # of ice clouds (Young and Vaughan 2009)
 DUST_M2_G = 0.6  # mass extinction of mineral dust (Ansmann et al. 2019: 0.57 to 0.63)
 DUST_LIDAR_RATIO_SR = 60.0  # Haarig et al. 2022: 46 to 50 at 532 nm, 57 to 69 at 1064 nm
 DROPS_LIDAR_RATIO_SR = 18.8  # of clean droplets (O'Connor et al. 2004)
-# diameters, of clumps the mean
+# diameters; of clumps, the mean
 SPRAY_DROP_MM = 0.2
 CLUMP_MM = 20.0
 CLUMP_LARGEST_MM = 100.0
 EXIT_M = 0.01  # the beam's diameter at the sensor, if it is unknown: 5 to 13 mm
 NODES = 4096  # ranges at which tables and integrals are made
-# Share of the detection threshold below which particles are left out: 0.6 % of those that return
-# half of it are detected. That misses 2 % of the returns from rain, and 0.3 % of those from snow.
+# Share of the detection threshold below which particles are left out: 0.6 % of the particles that
+# return half of the threshold are detected. Leaving the fainter particles out misses 2 % of the
+# returns from rain, and 0.3 % of the returns from snow.
 FAINTEST = 0.5
-# where particles are looked for
+# ranges between which particles are simulated
 NEAREST_M = 0.1
 FARTHEST_M = 1e4
-LEAST_LEFT = 1e-200  # of the light, so that one can divide by it
-LARGE = 2.0  # light that a large particle takes, in its cross-sections: half of it by diffraction
+MIN_TRANSMISSION = 1e-200  # of the light, so that divisions by an energy are finite
+LARGE = 2.0  # extinction of a large particle, in its cross-sections: half of it by diffraction
 
 
 @dataclass(frozen=True, kw_only=True)
 @checked_fields
 class Weather:
-    """Extinction of the air, and returns from it.
+    """Extinction of the air, and returns from the air.
 
     Rain, snow, dust, and fog with a lidar ratio return light: they need `Noise.detection_range_m`,
-    which says what a sensor detects.
+    by which a sensor detects returns.
     """
 
     visibility_km: Annotated[
@@ -65,21 +66,19 @@ class Weather:
     fog_lidar_ratio_sr: Annotated[
         float | None,
         about(
-            "extinction over back-scatter of what limits visibility_km, for returns "
-            "from it: 65 (Hahner et al. 2021), of clean droplets 18.8; by default none return",
+            "extinction over back-scatter of fog or haze, for returns from it: "
+            "65 (Hahner et al. 2021), of clean droplets 18.8; by default none return",
             65.0,
             ge=1,
             le=1000,
         ),
     ] = None
-    rain_mm_h: Annotated[float, about("rain; drops return light, and take some", ge=0, le=300)] = (
-        0.0
-    )
+    rain_mm_h: Annotated[float, about("rain; drops attenuate and return light", ge=0, le=300)] = 0.0
     snow_mm_h: Annotated[
-        float, about("dry snow, melted; flakes return light, and take some", ge=0, le=50)
+        float, about("dry snow, melted; flakes attenuate and return light", ge=0, le=50)
     ] = 0.0
     dust_mg_m3: Annotated[
-        float, about("mineral dust; it returns light, and takes some", ge=0, le=1e5)
+        float, about("mineral dust; it attenuates and returns light", ge=0, le=1e5)
     ] = 0.0
 
     wet: Annotated[
@@ -91,7 +90,7 @@ class Weather:
         float,
         about(
             "water in the air behind vehicles at 90 km/h on ground that is all wet: 1 behind a "
-            "car, 20 behind a lorry; they have to move, and the ground to be wet",
+            "car, 20 behind a lorry; vehicles have to move, and the ground to be wet",
             5.0,
             ge=0,
             le=1000,
@@ -100,27 +99,31 @@ class Weather:
 
     @property
     def returns_light(self) -> bool:
-        """Whether there may be returns from the air."""
+        """Whether the air may return light."""
         fog = self.visibility_km is not None and self.fog_lidar_ratio_sr is not None
         return bool(fog or self.rain_mm_h or self.snow_mm_h or self.dust_mg_m3)
 
     @property
     def particles(self) -> tuple[Particles, ...]:
-        """Drops and flakes in the air."""
-        some = [rain(self.rain_mm_h)] if self.rain_mm_h else []
-        return (*some, snow(self.snow_mm_h)) if self.snow_mm_h else tuple(some)
+        """Kinds of particles in the air: drops and flakes."""
+        kinds = []
+        if self.rain_mm_h:
+            kinds.append(rain(self.rain_mm_h))
+        if self.snow_mm_h:
+            kinds.append(snow(self.snow_mm_h))
+        return tuple(kinds)
 
-    def takes(self, wavelength_nm: float) -> float:
-        """Extinction of the air, 1/m."""
+    def extinction_at(self, wavelength_nm: float) -> float:
+        """Return the extinction of the air at a wavelength, 1/m."""
         alpha = extinction(self.visibility_km, wavelength_nm)
-        for one in self.particles:
-            alpha += one.extinction
+        for kind in self.particles:
+            alpha += kind.extinction
         if self.dust_mg_m3:
             alpha += dust(self.dust_mg_m3)[0]
         return alpha
 
-    def scatters(self, wavelength_nm: float) -> float:
-        """Back-scatter of fog and dust, 1/(m sr)."""
+    def backscatter_at(self, wavelength_nm: float) -> float:
+        """Return the back-scatter of fog and dust at a wavelength, 1/(m sr)."""
         beta = dust(self.dust_mg_m3)[1]
         if self.fog_lidar_ratio_sr is not None:
             beta += extinction(self.visibility_km, wavelength_nm) / self.fog_lidar_ratio_sr
@@ -128,9 +131,9 @@ class Weather:
 
 
 class Particles(NamedTuple):
-    """Drops or flakes: ``number * exp(-slope * D)`` of them, by diameter D, up to the largest.
+    """Drops or flakes, ``number * exp(-slope * D)`` by diameter D, up to the largest diameter.
 
-    Light returns from one as from a white, matt disc of its cross-section, but for the reflectance.
+    A particle returns as much light as a matt disc of its cross-section and `reflectance`.
     """
 
     number: float  # 1/(m³ mm)
@@ -140,20 +143,20 @@ class Particles(NamedTuple):
 
     @property
     def extinction(self) -> float:
-        """Extinction, 1/m: all take light in proportion to their cross-sections."""
+        """Extinction, 1/m, in proportion to the cross-sections of the particles."""
         slope = self.slope
         x = self.slope * self.largest
         squares = 2 / (slope * slope * slope) * (1 - exp_of(-x) * (1 + x + x * x / 2))
         return LARGE * math.pi / 4 * self.number * squares * 1e-6
 
     def above(self, diameter_mm: Floats) -> Floats:
-        """Particles above diameters (n,), 1/m³: (n,)."""
-        some = exp(-self.slope * np.minimum(diameter_mm, self.largest))
-        return np.asarray(self.number / self.slope * (some - exp_of(-self.slope * self.largest)))
+        """Return the density of particles above diameters (n,), 1/m³: (n,)."""
+        tail = exp(-self.slope * np.minimum(diameter_mm, self.largest))
+        return np.asarray(self.number / self.slope * (tail - exp_of(-self.slope * self.largest)))
 
 
 def rain(mm_h: float) -> Particles:
-    """Make drops of rain (Marshall and Palmer 1948).
+    """Return the drops of a rain of `mm_h` millimetres an hour (Marshall and Palmer 1948).
 
     A drop mirrors light at its front and, on the axis, at its back, by geometrical optics: with
     Fresnel's r = ((n-1)/(n+1))², its reflectance is (r + r (1-r)² (n/(2-n))²) / 4.
@@ -171,35 +174,38 @@ def rain(mm_h: float) -> Particles:
 
 
 def snow(mm_h: float) -> Particles:
-    """Make flakes of dry snow, by the melted water that falls (Gunn and Marshall 1958).
+    """Return the flakes of dry snow, by its melted water in mm/h (Gunn and Marshall 1958).
 
-    Their distribution is that of the drops that flakes melt to; a flake of density 0.1 is 2.15
-    times as wide. The reflectance follows from the lidar ratio of ice.
+    The flakes are distributed as the drops that they melt to; a flake of density 0.1 is 2.15 times
+    as wide as its drop. The reflectance follows from the lidar ratio of ice.
 
     Examples
     --------
     >>> f"{1000 * snow(1.0).extinction:.2f}"  # 1/km
     '3.34'
     """
-    wider = float(power(SNOW_DENSITY, -1 / 3))
-    number, slope = (a * float(power(mm_h, b)) for a, b in ((3800.0, -0.87), (2.55, -0.48)))
+    widening = float(power(SNOW_DENSITY, -1 / 3))
+    number = 3800.0 * float(power(mm_h, -0.87))
+    slope = 2.55 * float(power(mm_h, -0.48))
     reflectance = LARGE * math.pi / SNOW_LIDAR_RATIO_SR
-    return Particles(number / wider, slope / wider, SNOW_LARGEST_MM, reflectance)
+    return Particles(number / widening, slope / widening, SNOW_LARGEST_MM, reflectance)
 
 
 def spray(g_m3: float) -> Particles:
-    """Make clumps of drops behind a vehicle, by the mass of the water.
+    """Return the clumps of drops behind a vehicle, by the mass of the water in the air, g/m³.
 
-    Drops take light from twice their cross-sections. They are in clumps that are taken to be
-    opaque; from an opaque cloud of drops half of the inverse lidar ratio returns.
+    The extinction of drops is twice their cross-sections. Drops are in clumps that are assumed to
+    be opaque; an opaque cloud of drops returns half of the inverse lidar ratio.
     """
     alpha = LARGE * 1.5e-3 * g_m3 / SPRAY_DROP_MM
-    one = Particles(1.0, 1 / CLUMP_MM, CLUMP_LARGEST_MM, math.pi / (2 * DROPS_LIDAR_RATIO_SR))
-    return one._replace(number=alpha * LARGE / one.extinction)
+    unit_cloud = Particles(
+        1.0, 1 / CLUMP_MM, CLUMP_LARGEST_MM, math.pi / (2 * DROPS_LIDAR_RATIO_SR)
+    )
+    return unit_cloud._replace(number=alpha * LARGE / unit_cloud.extinction)
 
 
 def dust(mg_m3: float) -> tuple[float, float]:
-    """Extinction, 1/m, and back-scatter, 1/(m sr), of mineral dust.
+    """Return the extinction, 1/m, and the back-scatter, 1/(m sr), of mineral dust.
 
     Examples
     --------
@@ -212,52 +218,65 @@ def dust(mg_m3: float) -> tuple[float, float]:
 
 
 def reach(min_range_m: float, max_range_m: float) -> tuple[float, float]:
-    """Ranges between which particles are looked for."""
+    """Return the shortest and the longest range of particles, metres, for a sensor's ranges."""
     return max(min_range_m, NEAREST_M), min(max_range_m, FARTHEST_M)
 
 
 class Air(NamedTuple):
-    """Air as one sensor sees it. Energies are as of a return: 1 for a white surface at 10 m.
+    """Air along the beams of a sensor. Energies are relative: 1 for a white surface at 10 m.
 
-    The beam is evenly bright and round. Nearer than `overlap_m` the receiver sees a part of it,
-    (R / overlap_m)², as one does that is focused far away: what it receives stays the same
-    (Harms, Lahmann and Weitkamp 1978).
+    The beam is evenly bright and round. Nearer than `overlap_m` the receiver sees the part
+    (R / overlap_m)² of the beam, as a receiver does that is focused at a long range: the received
+    energy is constant there (Harms, Lahmann and Weitkamp 1978).
     """
 
     extinction: float  # 1/m
-    exit_m: float  # the beam's diameter there
+    exit_m: float  # diameter of the beam where it leaves the sensor, metres
     divergence: float  # full angle, radians
-    overlap_m: float
+    overlap_m: float  # range from which on the receiver sees the beam completely
 
     def width(self, distance: Floats) -> Floats:
-        """Diameter of the beam, metres."""
+        """Return the diameters of the beam at distances (n,), metres: (n,)."""
         return np.asarray(hypot(self.exit_m, self.divergence * distance))
 
-    def white(self, distance: Any) -> Any:
-        """Energy of a white disc that fills the beam."""
-        seen = np.maximum(distance, max(self.overlap_m, 1e-3))
-        left = exp(-2 * self.extinction * distance)
-        return np.square(REFERENCE_M / seen) * np.maximum(left, LEAST_LEFT)
+    def white_energy(self, distance: Any) -> Any:
+        """Return the energy of a white disc that fills the beam, at distances in metres."""
+        effective_m = np.maximum(distance, max(self.overlap_m, 1e-3))
+        transmission = exp(-2 * self.extinction * distance)
+        return np.square(REFERENCE_M / effective_m) * np.maximum(transmission, MIN_TRANSMISSION)
 
     def smallest(self, particles: Particles, energy: float, distance: Floats) -> Floats:
-        """Diameters of particles that return an energy, millimetres; inf if none returns it."""
-        share = energy / (particles.reflectance * self.white(distance))
-        wide = 1000 * self.width(distance) * np.sqrt(share)
-        return np.where(share <= 1, wide, np.inf)
+        """Return the diameters of particles that return an energy, millimetres: (n,).
+
+        `distance` (n,) is in metres; the diameter is inf where no particle returns the energy.
+        """
+        share = energy / (particles.reflectance * self.white_energy(distance))
+        diameter_mm = 1000 * self.width(distance) * np.sqrt(share)
+        return np.where(share <= 1, diameter_mm, np.inf)
 
     def rate(self, particles: Particles, energy: float, distance: Floats) -> Floats:
-        """Particles in the beam that return at least an energy, in each metre: 1/m."""
+        """Return the number of particles in the beam that return at least an energy: (n,), 1/m."""
         area = math.pi / 4 * np.square(self.width(distance))
         return area * particles.above(self.smallest(particles, energy, distance))
 
-    def met(self, particles: Particles, energy: float, begins: float, ends: float) -> float:
-        """Particles in a beam between two ranges that return at least an energy, on the average."""
-        distance = geomspace(begins, max(ends, begins * 1.001), NODES)
+    def mean_particles(
+        self, particles: Particles, energy: float, start_m: float, stop_m: float
+    ) -> float:
+        """Return the mean number of particles in a beam that return at least an energy.
+
+        Particles are counted from `start_m` to `stop_m`, ranges in metres.
+        """
+        distance = geomspace(start_m, max(stop_m, start_m * 1.001), NODES)
         return float(np.trapezoid(self.rate(particles, energy, distance), distance))
 
-    def cloud(self, backscatter: float, begins: Floats, ends: Floats) -> Floats:
-        """Energies that fog or dust returns from slabs that fill the beam, by Simpson's rule."""
-        middle = (begins + ends) / 2
-        slab = ends - begins
-        mean = (self.white(begins) + 4 * self.white(middle) + self.white(ends)) / 6
+    def cloud(self, backscatter: float, starts: Floats, stops: Floats) -> Floats:
+        """Return the energies (n,) that fog or dust returns from slabs that fill the beam.
+
+        `starts` and `stops` (n,) are ranges in metres; energies are means by Simpson's rule.
+        """
+        middle = (starts + stops) / 2
+        slab = stops - starts
+        mean = (
+            self.white_energy(starts) + 4 * self.white_energy(middle) + self.white_energy(stops)
+        ) / 6
         return np.asarray(math.pi * backscatter * slab * mean)

@@ -99,7 +99,7 @@ class WeatherStep(PulseStep):
         self._kinds = [_detectable(air, kind, faintest, begins, ends) for kind in survey.particles]
         names = [f"kind {kind}" if kind else "" for kind in range(len(self._kinds))]
         self._seeds = [named_seed(noise.seed, name) for name in names]
-        scatters = survey.scatters(self._wavelength_nm)
+        scatters = survey.backscatter_at(self._wavelength_nm)
         self._fog = _fog_cells(air, scatters, noise.threshold, begins, ends, setup.gap_m)
 
     @staticmethod
@@ -110,8 +110,8 @@ class WeatherStep(PulseStep):
     @staticmethod
     def added(setup: Setup) -> float:
         """See `PulseStep.added`."""
-        scatters = setup.survey.scatters(setup.sensor.optics.wavelength_nm)
-        return setup.survey.met(setup.number) + bool(scatters)
+        scatters = setup.survey.backscatter_at(setup.sensor.optics.wavelength_nm)
+        return setup.survey.mean_particles(setup.number) + bool(scatters)
 
     @staticmethod
     def memory(setup: Setup, sizes: Sizes) -> Memory:
@@ -301,7 +301,7 @@ def seen_by_range(
     distance = single(interp(shares, sums / sums[-1], distance))
     smallest = np.minimum(air.smallest(kind, energy, distance), kind.largest)
     larger = -expm1(-kind.slope * (kind.largest - smallest))
-    most = kind.reflectance * air.white(distance)
+    most = kind.reflectance * air.white_energy(distance)
     one = most / (1000 * air.width(distance)) ** 2
     tables = distance, single(smallest), single(larger), single(one), single(most)
     return float(sums[-1]), np.stack(tables)

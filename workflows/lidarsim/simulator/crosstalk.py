@@ -19,7 +19,7 @@ from ..sensor import Sensor, Survey
 from ..sensor.materials import at_right_angles
 from ..sensor.optics import LIGHT_M_NS
 from ..sensor.random_numbers import Purpose
-from ..sensor.survey import begin_ns
+from ..sensor.survey import firing_start_ns
 from .detection import passes
 from .motion import CastPoses, Clock
 from .returns import OF_RETURNS, PulseReturns, merged, numbers, unreal
@@ -63,8 +63,8 @@ class CrosstalkStep(PulseStep):
         super().__init__(setup, caster, surfaces)
         self._survey = setup.survey
         self._sensor = setup.sensor
-        wide, _ = setup.reporting.of(self._sensor.optics)
-        self._cosine = sin_cos_of(wide / 2)[1]
+        divergence = setup.reporting.divergence(self._sensor.optics)
+        self._cosine = sin_cos_of(divergence / 2)[1]
         nm = self._sensor.optics.wavelength_nm
         self._others = [
             other
@@ -239,7 +239,7 @@ def _expanded(first: Indices, stop: Indices) -> tuple[Indices, Indices]:
 def _fired_in(sensor: Sensor, steps: int, span: tuple[float, float]) -> tuple[int, int]:
     """First firing within a span of time, and one past the last."""
     last = range(sensor.firings(steps - 1)[1])
-    begins = partial(begin_ns, sensor)
+    begins = partial(firing_start_ns, sensor)
     early = span[0] - float(sensor.beams.time_ns.max())  # its slowest beam is in the span
     return bisect_left(last, early, key=begins), bisect_left(last, span[1], key=begins)
 

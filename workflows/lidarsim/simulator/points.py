@@ -184,8 +184,8 @@ class BatchPoints:
         before, now = map(self.survey.pose, self.specs[0].repeats)
         if before == now:
             return points
-        inside = turned(np.subtract(points, before.position), before.turn.T)
-        return turned(inside, now.turn) + now.position
+        inside = turned(np.subtract(points, before.position), before.rotation_matrix.T)
+        return turned(inside, now.rotation_matrix) + now.position
 
     @cached_property
     def ray_origins(self) -> Floats:

@@ -341,14 +341,16 @@ class Scanner:
         """Return the scans of a turn, and how late it is, nanoseconds; of `count` sweeps."""
         sensor = rig.survey.sensor
         ahead = 0
-        steps = sensor.steps_of_turn(number or 0)
+        steps = sensor.steps_of_revolution(number or 0)
         if steps.stop > SCANS_MOST:
             raise LidarError(f"number is {number}; scans are counted up to {SCANS_MOST:,}.")
         if number is None:
             with self._lock:
                 ahead = self._unnumbered * len(steps)
                 self._unnumbered += count
-        late_ns = 0 if start_s is None else round(start_s * 1e9 - sensor.turn_ns(number or 0))
+        late_ns = (
+            0 if start_s is None else round(start_s * 1e9 - sensor.revolution_start_ns(number or 0))
+        )
         specs = [
             ScanSpec(step, 0, sensor.firings(step), late_ns, 0, sensor.channels, ahead)
             for step in steps
@@ -391,7 +393,9 @@ def _placed(poses: Any) -> tuple[Floats, Floats | None]:
         poses = [poses]
     if isinstance(poses, Sequence) and any(isinstance(pose, Pose) for pose in poses):
         made = [pose_of("a pose", pose) for pose in poses]
-        return np.array([pose.position for pose in made]), np.array([pose.turn for pose in made])
+        return np.array([pose.position for pose in made]), np.array(
+            [pose.rotation_matrix for pose in made]
+        )
     try:
         table = np.asarray(poses, np.float64)
     except (TypeError, ValueError):

@@ -69,7 +69,7 @@ class Setup:
     @property
     def gap_m(self) -> float:
         """Half of the pulse's length, metres."""
-        return self.reporting.of(self.sensor.optics)[1]
+        return self.reporting.min_gap_m(self.sensor.optics)
 
     @property
     def moving(self) -> bool:

@@ -90,7 +90,7 @@ class Surfaces:
         self.counters = scene.counters
         kinds = scene.surface_kinds
         self._tables = {
-            nm: MaterialTable.of(materials, kinds, nm, scene.has_voxels) for nm in wavelengths
+            nm: MaterialTable.build(materials, kinds, nm, scene.has_voxels) for nm in wavelengths
         }
         self.material_kinds = kinds
         self.grids = Grids.of(scene.instances)

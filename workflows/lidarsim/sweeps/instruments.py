@@ -90,6 +90,6 @@ class Instruments:
 
 
 def _instrument(mount: Pose, variances: list[float]) -> Instrument:
-    quaternion = quaternions_of(mount.turn[None])[0]
+    quaternion = quaternions_of(mount.rotation_matrix[None])[0]
     quaternion *= -1 if quaternion[3] < 0 else 1
     return Instrument([*mount.position], quaternion.tolist(), variances)

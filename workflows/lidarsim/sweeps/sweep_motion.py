@@ -145,7 +145,7 @@ def _relative(
     places, rotations = full_poses(path, station, flat)
     shape = times_ns.shape
     places = (places + rotations @ np.array(mount.position)).reshape(*shape, 3)
-    rotations = (rotations @ mount.turn).reshape(*shape, 3, 3)
+    rotations = (rotations @ mount.rotation_matrix).reshape(*shape, 3, 3)
     starts = rotations[:, :1]
     # In the axes of the sensor at the start of the sweep that was cast, then of the one sent.
     apart = (places - places[:, :1]) @ starts[:, 0]

@@ -21,7 +21,7 @@ from ..columns.table import NORMAL, ORIGIN, TABLE
 from ..scene.scene import Scene
 from ..scene.transform import affine
 from ..sensor import Fault, Sensor, Survey
-from ..sensor.plain_data import described, remade
+from ..sensor.plain_data import from_plain_data, to_plain_data
 from ..sensor.survey import nanoseconds
 from ..sensor.trajectory import full_poses, matrices, presence_ns, quaternions_of
 from .instruments import Instruments
@@ -257,7 +257,7 @@ class Sweeps:
         for number, carried in enumerate(survey.carried):
             (firsts, begins, _), mount = each[number], carried.mount
             since = begins[: len(begins) // path.stations]
-            turned = mount.turn
+            turned = mount.rotation_matrix
             mounts.append((mount.position, turned))
             for station in range(path.stations):
                 positions, rotations = full_poses(path, station, since)
@@ -381,7 +381,7 @@ class Sweeps:
         for prefix, poses in placed.items():
             arrays[f"{prefix}positions"] = poses.positions
             arrays[f"{prefix}quaternions"] = poses.quaternions
-        if self.fired is not None and (told := described(self.fired.sensors, arrays)):
+        if self.fired is not None and (told := to_plain_data(self.fired.sensors, arrays)):
             rays = {"sensors": told, "returns": self.fired.returns}
             arrays["rays"] = np.frombuffer(json.dumps(rays).encode(), np.uint8)
             arrays["steps"] = self.fired.steps
@@ -409,7 +409,7 @@ class Sweeps:
             fired = None
             if "rays" in arrays:
                 rays = json.loads(arrays["rays"].tobytes())
-                sensors = remade(rays["sensors"], arrays)
+                sensors = from_plain_data(rays["sensors"], arrays)
                 fired = Fired(sensors, tuple(rays["returns"]), arrays["steps"])
             return cls(
                 fired=fired,
