@@ -503,7 +503,7 @@ def test_a_scenario_has_its_robot_and_its_sensor_on_a_link(folder):
     assert kinds["Arm/base_link"].semantic_class != 7
     notes = advice(built)
     assert "Rover: link lidar is left out: a sensor is mounted on it" in notes
-    assert built.found.sources["rover.urdf"].startswith(
+    assert built.findings.sources["rover.urdf"].startswith(
         "14 links, 6,720 triangles; 9 of its joints move"
     )
 

@@ -75,7 +75,7 @@ def look_at(
             )
         figures["notes"] += advice(built)
         figures["warnings"] += implausibilities(built)
-        figures["sources"] = dict(built.found.sources)
+        figures["sources"] = dict(built.findings.sources)
         if campaign is not None:
             figures["notes"] += campaign.keep.of_jobs.contradictions(scenario.cloud.coordinates)
             figures["job"] = _job_figures(campaign, job_number, figures)

@@ -1,4 +1,4 @@
-"""Campaigns: many jobs from one description, each with values of its own."""
+"""Campaigns: many jobs from a description, each with its values."""
 
 from __future__ import annotations
 
@@ -37,10 +37,10 @@ SHOWN_MOST = 5  # files of a command that are named
 
 
 class CampaignSpec:
-    """Many jobs (surveys) from a description, into a data set.
+    """Jobs (surveys) from a description, into a data set.
 
     `Campaign.load` reads a campaign file, `Campaign.of_scenarios` takes scenario files as they
-    are, and this one asks a function of Python for each job.
+    are, and the constructor asks a function of Python for each job.
 
     Parameters
     ----------
@@ -49,7 +49,7 @@ class CampaignSpec:
         values. `rng` is a ``numpy.random.Generator`` that depends on the seed and the number alone:
         a job is the same however often, in whatever order and wherever it is made.
     count
-        How many jobs.
+        Number of jobs.
     seed
         Another seed gives other random numbers.
     keep
@@ -63,7 +63,7 @@ class CampaignSpec:
     Raises
     ------
     LidarError
-        If an argument cannot be meant.
+        If an argument is not valid.
 
     Notes
     -----
@@ -143,12 +143,12 @@ class CampaignSpec:
         license: str = "",  # noqa: A002 - as in the file
         title: str = "",
     ) -> CampaignSpec:
-        """Take scenario or mesh files as jobs, as they are; a job has the name of its file.
+        """Take scenario or mesh files as jobs, unchanged; a job has the name of its file.
 
         Raises
         ------
         LidarError
-            If one of them cannot be used; or an argument cannot be meant.
+            If a file cannot be used, or an argument is not valid.
         """
         jobs = ScenarioJobs([Path(path) for path in paths])
         self = cls.__new__(cls)
@@ -158,7 +158,7 @@ class CampaignSpec:
         return self
 
     def of_shard(self, shard: Shard) -> Self:
-        """Return the same campaign, of which a run does the jobs of a shard."""
+        """Return the campaign restricted to the jobs of a shard."""
         campaign = self if shard == self.shard else copy(self)
         campaign.shard = shard
         return campaign
@@ -187,22 +187,22 @@ class CampaignSpec:
 
         A value of None is left out. Of a function, the job is made.
         """
-        return self._jobs.values(self._known(number))
+        return self._jobs.values(self._checked_number(number))
 
     def name(self, number: int) -> str:
         """Return the name of a job in files: the name of its scenario file, else «0017»."""
-        return self._jobs.name(self._known(number))
+        return self._jobs.name(self._checked_number(number))
 
     def split(self, number: int) -> str:
         """Return the name of a job's split; empty without splits."""
-        return self._splits(self._known(number))
+        return self._splits(self._checked_number(number))
 
     def scenario(self, number: int) -> Scenario | None:
         """Return the scenario of a job; None if a function makes the job.
 
         LidarError if its values do not fit together; the message names job and values.
         """
-        return self._jobs.scenario(self._known(number))
+        return self._jobs.scenario(self._checked_number(number))
 
     @property
     def pool(self) -> PoolSection:
@@ -211,14 +211,14 @@ class CampaignSpec:
         return PoolSection() if scenario is None else scenario.pool
 
     def job(self, number: int, cache: SceneCache | None = None, columns: Sequence[str] = ()) -> Job:
-        """Make a job; the same number gives the same job. Jobs plan no paths.
+        """Make a job; equal numbers give equal jobs. Jobs plan no paths.
 
-        `cache` has static scenes of other jobs, which this one may share; `columns` are names of
+        `cache` has static scenes of other jobs, which this job may share; `columns` are names of
         columns that the data set needs.
 
-        LidarError if there is no such job, or it cannot be made; the message says why.
+        LidarError if the number is not a job's, or the job cannot be made; the message says why.
         """
-        number = self._known(number)
+        number = self._checked_number(number)
         fields = {"number": number, "name": self.name(number), "split": self.split(number)}
         job = self._jobs.job(number, cache, columns, fields)
         if job.survey.navigation is not None:
@@ -229,7 +229,7 @@ class CampaignSpec:
         survey = with_laser_scans(job.survey, [self.keep.format])
         return job if survey is job.survey else replace(job, survey=survey)
 
-    def _known(self, number: int) -> int:
+    def _checked_number(self, number: int) -> int:
         if not 0 <= number < self.count:
             raise LidarError(
                 f"there is no job {number}: the campaign has jobs 0 to {self.count - 1}."
@@ -237,7 +237,7 @@ class CampaignSpec:
         return int(number)  # of NumPy, perhaps
 
     def check_files(self) -> None:
-        """Check that all files are there that jobs may be made of, or raise LidarError."""
+        """Raise LidarError if a file that jobs may be made of does not exist."""
         mistakes = Mistakes()
         # `Path.exists` fails at names that no file can have.
         lost = [path for path in self.files if not os.path.exists(path)]  # noqa: PTH110
@@ -263,8 +263,8 @@ class CampaignSpec:
         }
 
 
-def _head(**given: Any) -> CampaignSection:
-    """Check the fields that Python gives."""
-    plain = {name: dict(v) if isinstance(v, Mapping) else v for name, v in given.items()}
+def _head(**fields: Any) -> CampaignSection:
+    """Return a checked section of arguments from Python."""
+    plain = {name: dict(v) if isinstance(v, Mapping) else v for name, v in fields.items()}
     with sentences(CampaignSection):
         return CampaignSection.model_validate({"base": "-", **plain})

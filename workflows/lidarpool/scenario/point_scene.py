@@ -90,12 +90,12 @@ def scene_of_points(
 
 
 def surfels(path: Path, points: Floats, voxel_m: float | None, size: float = 1.0) -> SceneMesh:
-    """Return the surfels of the points (n, 3) of a file, as `scene_of_points` makes them."""
-    # Open3D's covariances lose the digits of points far from zero.
+    """Return the surfels of the points (n, 3) of a file."""
+    # Covariances of Open3D lose the digits of points far from zero.
     origin = np.round((points.min(axis=0) + points.max(axis=0)) / 2)
     points = points - origin
     o3d = load_open3d()
-    voxel_m = voxel_m or _spacing(o3d, points)
+    voxel_m = voxel_m or _spacing_m(o3d, points)
     cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points))
     del points
     if not voxel_m:
@@ -118,31 +118,33 @@ def surfels(path: Path, points: Floats, voxel_m: float | None, size: float = 1.0
             f"{_NEIGHBOURS} are needed: give a smaller voxel_m, or another cloud."
         )
     cloud.estimate_covariances(o3d.geometry.KDTreeSearchParamKNN(_NEIGHBOURS))
-    corners = _corners(np.asarray(cloud.points), np.asarray(cloud.covariances), voxel_m, size)
+    corners = _surfel_corners(
+        np.asarray(cloud.points), np.asarray(cloud.covariances), voxel_m, size
+    )
     faces = 4 * np.arange(count)[:, None, None] + np.array([[0, 1, 2], [0, 2, 3]])
     return SceneMesh(path.stem, corners.reshape(-1, 3) + origin, faces.reshape(-1, 3))
 
 
-def _corners(points: Floats, covariances: Floats, voxel_m: float, size: float) -> Floats:
-    """Corners (n, 4, 3) of surfels."""
-    out = np.empty((len(points), 4, 3))
-    for begin in range(0, len(points), 1 << 18):
-        some = slice(begin, begin + (1 << 18))
-        variances, axes = np.linalg.eigh(covariances[some])
+def _surfel_corners(points: Floats, covariances: Floats, voxel_m: float, size: float) -> Floats:
+    """Return the corners (n, 4, 3) of surfels."""
+    corners = np.empty((len(points), 4, 3))
+    for start in range(0, len(points), 1 << 18):
+        block = slice(start, start + (1 << 18))
+        variances, axes = np.linalg.eigh(covariances[block])
         halves = size * _EXTENT * np.sqrt(np.maximum(variances[:, 1:], 0))
         halves = np.minimum(halves, _MOST_VOXELS * voxel_m)
-        across, along = np.moveaxis(axes[:, :, 1:] * halves[:, None], 2, 0)
+        half_widths, half_lengths = np.moveaxis(axes[:, :, 1:] * halves[:, None], 2, 0)
         for corner, (a, b) in enumerate(((-1, -1), (1, -1), (1, 1), (-1, 1))):
-            out[some, corner] = points[some] + a * along + b * across
-    return out
+            corners[block, corner] = points[block] + a * half_lengths + b * half_widths
+    return corners
 
 
-def _spacing(o3d: Any, points: Floats) -> float:
-    """Median distance of points to the eighth of their neighbours."""
+def _spacing_m(o3d: Any, points: Floats) -> float:
+    """Return the median distance of points to the eighth of their neighbours."""
     tree = o3d.core.nns.NearestNeighborSearch(o3d.core.Tensor(points))
     tree.knn_index()
-    some = points[:: -(-len(points) // _SAMPLE)]
-    _, squares = tree.knn_search(o3d.core.Tensor(np.ascontiguousarray(some)), _NEAREST)
+    sampled = points[:: -(-len(points) // _SAMPLE)]
+    _, squares = tree.knn_search(o3d.core.Tensor(np.ascontiguousarray(sampled)), _NEAREST)
     return float(np.sqrt(np.median(squares.numpy()[:, -1])))
 
 
@@ -159,7 +161,7 @@ def _read(path: Path, unit: str | None, tell: Callable[[str], None]) -> Floats:
     try:
         with explained(f"{path} cannot be read"), prefixed(path):
             check_input(path)
-            metres = _metres(path, unit, tell)
+            metres = _unit_lengths_m(path, unit, tell)
             points = _READERS[suffix](path) * metres
     except LidarError:
         raise
@@ -180,7 +182,7 @@ def _read(path: Path, unit: str | None, tell: Callable[[str], None]) -> Floats:
     return points
 
 
-def _metres(path: Path, unit: str | None, tell: Callable[[str], None]) -> Floats:
+def _unit_lengths_m(path: Path, unit: str | None, tell: Callable[[str], None]) -> Floats:
     """Return the metres in the units of x, y and z of a file, (3,)."""
     if unit is not None:
         return np.full(3, UNITS_M[unit])
@@ -193,9 +195,9 @@ def _metres(path: Path, unit: str | None, tell: Callable[[str], None]) -> Floats
 
 
 def _read_pcd(path: Path) -> Floats:
-    """Read text here, the other kinds by Open3D.
+    """Read points of a .pcd; Open3D reads all encodings but text.
 
-    Of truncated text, Open3D returns uninitialised memory as points.
+    Open3D returns uninitialised memory as points for truncated text.
     """
     header = checked_pcd(path)
     count = int(header["POINTS"][0])
