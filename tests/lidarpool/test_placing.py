@@ -63,7 +63,9 @@ OBJECTS = {
 def test_an_object_is_seen_from_around_it_and_only_from_outside(name, far):
     scene = scene_of(*OBJECTS[name], at=(far, far, 0))
     placed = place_sensor(scene, GRID)
-    assert placed.surrounds_object and "looks like an object" in placed.note and len(placed.poses) == 5
+    assert (
+        placed.surrounds_object and "looks like an object" in placed.note and len(placed.poses) == 5
+    )
     poses = [np.subtract(pose.position, scene.origin) for pose in placed.poses]
     middle = scene.bounds.mean(axis=0)
     sides = np.ptp(scene.bounds, axis=0)
@@ -296,7 +298,9 @@ def test_on_the_ground_of_a_terrain():
     assert floor == pytest.approx(scene.vertices[nearest, 2], abs=5)
     # Half of its triangles face down, as surfels of a cloud do.
     mixed = np.concatenate([scene.faces[::2], scene.faces[1::2, ::-1]])
-    assert not place_sensor(Scene.from_meshes([SceneMesh("m", scene.vertices, mixed)]), GRID).surrounds_object
+    assert not place_sensor(
+        Scene.from_meshes([SceneMesh("m", scene.vertices, mixed)]), GRID
+    ).surrounds_object
 
 
 def test_on_a_slab_and_not_on_the_roof():
