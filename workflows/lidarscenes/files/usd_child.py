@@ -98,7 +98,7 @@ class StageNodes:
             self.nodes.append(self._node(prim, inherited))
 
     def _number(self, prim: Any, inherited: _Inherited) -> int:
-        """Return the number of a node, which is added if it is new."""
+        """Return the number of a node, a new number for a new node."""
         key = _shared(prim).GetPath(), inherited
         if key not in self._numbers:
             self._numbers[key] = len(self._numbers)
@@ -176,7 +176,7 @@ class StageNodes:
         return False
 
     def _motion(self, prim: Any) -> NDArray[np.float64] | None:
-        """Return time codes and poses in the world, (k, 13), see `motions`; None if it stands.
+        """Return time codes and poses in the world, (k, 13), or None for a standing prim.
 
         Between the poses, a straight path that turns evenly about one axis deviates from OpenUSD's
         by `_MAX_OFFSET_M` and `_MAX_ANGLE_RAD` at most.
@@ -220,7 +220,8 @@ class StageNodes:
         matrices = np.array(transforms, np.float64).reshape(-1, 4, 4).transpose(0, 2, 1)
         if len(matrices) != len(prototype_numbers):
             raise ValueError(
-                f"{instancer.GetPath()} has {len(prototype_numbers)} copies, and places for {len(matrices)}"
+                f"{instancer.GetPath()} has {len(prototype_numbers)} copies, and places for "
+                f"{len(matrices)}"
             )
         mask = np.array(
             instancer.ComputeMaskAtTime(self._time) or np.ones(len(prototype_numbers)), bool
@@ -287,7 +288,7 @@ class _TimedPose:
 
 
 def _sample_codes(prim: Any) -> list[float]:
-    """Return the time codes of the samples of a prim and of the prims that move it."""
+    """Return the time codes of the samples of a prim and of the prims above, ascending."""
     codes: set[float] = set()
     above = prim
     while above:
@@ -395,7 +396,7 @@ class Looks:
         return self._materials[path]
 
     def _material(self, material: Any) -> tuple[int | None, list[str]]:
-        """Write a material if it is new; return its number, and the names of the values it reads.
+        """Write a new material; return its number and the names of the values read.
 
         The number is None for a material without properties that are asked for.
         """
@@ -507,7 +508,7 @@ class Looks:
         return {"unread": "its texture coordinates are computed in a way that is not read"}
 
     def _image(self, asset: Any) -> int:
-        """Write an image if it is new; return its number."""
+        """Write a new image; return its number."""
         path = getattr(asset, "resolvedPath", "") or getattr(asset, "path", "")
         number = self._images.setdefault(path, len(self._images))
         if number < len(self._images) - 1:
@@ -541,7 +542,7 @@ def _surface_shader(material: Any) -> tuple[Any, str]:
 
 
 def _constant(shader_input: Any) -> Any:
-    """Return the value of an input that no shader computes; None if it is not set."""
+    """Return the value of an input that no shader computes; None for an unset input."""
     attributes = UsdShade.Utils.GetValueProducingAttributes(shader_input) if shader_input else ()
     return attributes[0].Get() if attributes else None
 
@@ -575,8 +576,8 @@ def _shared(prim: Any) -> Any:
 
 
 def _transform_varies(prim: Any) -> bool:
-    place = UsdGeom.Xformable(prim)
-    return bool(place and place.TransformMightBeTimeVarying())
+    xformable = UsdGeom.Xformable(prim)
+    return bool(xformable and xformable.TransformMightBeTimeVarying())
 
 
 def _has_surface(prim: Any) -> bool:
@@ -732,11 +733,11 @@ def main(path: str, request: dict[str, Any]) -> None:
 
 if __name__ == "__main__":
     file = sys.argv[1]
-    wanted = json.loads(sys.argv[2])
+    message = json.loads(sys.argv[2])
     signal.alarm(MAX_WAIT_S)
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
-    _, most_memory = resource.getrlimit(resource.RLIMIT_DATA)
-    limit = wanted["memory"] if most_memory < 0 else min(wanted["memory"], most_memory)
-    resource.setrlimit(resource.RLIMIT_DATA, (limit, most_memory))
-    main(file, wanted)
+    _, hard_limit = resource.getrlimit(resource.RLIMIT_DATA)
+    max_bytes = message["memory"] if hard_limit < 0 else min(message["memory"], hard_limit)
+    resource.setrlimit(resource.RLIMIT_DATA, (max_bytes, hard_limit))
+    main(file, message)
     os._exit(0)  # at once: taking a large stage down takes long
