@@ -34,8 +34,8 @@ from ..scenario import campaign as described
 from ..scenario.build import Job
 from .result import Result
 
-# Options that are meaningless in a call: a survey has no data set, a campaign plans no paths, and
-# its run is kept beside the data set; a stream keeps nothing and has no stages 1 and 4.
+# Options without a meaning in a call: a survey has no data set, a campaign plans no paths, and its
+# run is stored beside the data set; a stream stores nothing and has no stages 1 and 4.
 _NOT_OF_SURVEYS = ("fresh", "retry_failed", "verify", "overwrite")
 _NOT_OF_CAMPAIGNS = ("folder", "other_workers")
 _NOT_OF_STREAMS = (
@@ -136,8 +136,8 @@ def simulate(
     >>> print(len(result.cloud), "points")                            # doctest: +SKIP
     1613 points
     """
-    given = given_options("simulate", options, without=_NOT_OF_SURVEYS)
-    run_options = RunOptions(**given)
+    chosen = given_options("simulate", options, without=_NOT_OF_SURVEYS)
+    run_options = RunOptions(**chosen)
     jobs = OneJob(Job(scene, survey, planning))
     if run_options.own:  # before anything is made in the folder
         check_backend_here(run_options.backend)
@@ -211,13 +211,13 @@ class Campaign(described.CampaignSpec):  # noqa: D101 - as there
             If the cluster lacks something, or `out` holds something else, or the unfinished run of
             another campaign or version; one or two lines say which and what to do.
         """
-        place = output_place(out)
-        given = given_options("run", options, without=_NOT_OF_CAMPAIGNS)
-        folder = Storage.at(place).below(RUN_FOLDER)
-        run_options = RunOptions(out=place, folder=folder, **given).with_pool(self.pool, given)
+        target = output_place(out)
+        chosen = given_options("run", options, without=_NOT_OF_CAMPAIGNS)
+        folder = Storage.at(target).below(RUN_FOLDER)
+        run_options = RunOptions(out=target, folder=folder, **chosen).with_pool(self.pool, chosen)
         jobs = self.of_shard(Shard(*shard))
         with page_of(jobs, run_options.live) as page:
-            output = DataSetOutput(place, jobs)
+            output = DataSetOutput(target, jobs)
             return Run(jobs, run_options, output, Screen(on_progress), page).execute()
 
     @checked
@@ -255,12 +255,12 @@ class Campaign(described.CampaignSpec):  # noqa: D101 - as there
         LidarError
             If there is no such split; in the loop, if the cluster lacks something or is lost.
         """
-        given = given_options("stream", options, without=_NOT_OF_STREAMS)
+        chosen = given_options("stream", options, without=_NOT_OF_STREAMS)
         if split is not None and split not in self.splits:
-            known = (
+            hint = (
                 did_you_mean(split, self.splits) or f" It has {', '.join(self.splits) or 'none'}."
             )
-            raise LidarError(f"The campaign has no split {split!r}.{known}")
+            raise LidarError(f"The campaign has no split {split!r}.{hint}")
         numbers = [n for n in range(self.count) if split in (None, self.split(n))]
-        run_options = RunOptions(**given).with_pool(self.pool, given)
+        run_options = RunOptions(**chosen).with_pool(self.pool, chosen)
         return SweepStream(self, numbers, ahead, run_options)
