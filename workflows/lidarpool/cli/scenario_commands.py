@@ -385,9 +385,10 @@ def _write(file: Path, make: Callable[[], Scene], overwrite: bool, paint: bool =
         )
     write_scene(file, scene)
     lower, upper = scene.bounds
+    size = " x ".join(f"{length:.0f}" for length in upper - lower)
     click.echo(
-        f"{scene.triangles:,} triangles, {plural(len(scene.names), 'object')}, "
-        f"{' x '.join(f'{length:.0f}' for length in upper - lower)} m: {click.format_filename(file)}"
+        f"{scene.triangles:,} triangles, {plural(len(scene.names), 'object')}, {size} m: "
+        f"{click.format_filename(file)}"
     )
 
 
