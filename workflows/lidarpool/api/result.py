@@ -152,6 +152,7 @@ class Result(RunResult):
 
     @cached_property
     def _pictured(self) -> PictureContent:
+        """Content of the pictures."""
         from ..report.picture_content import picture_content
 
         return picture_content(self)
@@ -180,6 +181,7 @@ class Result(RunResult):
 
     @cached_property
     def _images(self) -> str:
+        """Pictures of the result as HTML."""
         with TemporaryDirectory(prefix="lidarpool-") as folder:
             drawn = self.pictures(folder, only=_SHOWN, size=_SIZE)
             data = [b64encode(path.read_bytes()).decode() for path in drawn]

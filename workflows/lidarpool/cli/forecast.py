@@ -59,6 +59,7 @@ def forecast_scenario(
     terminal = Terminal(quiet)
 
     def forecast_job(job_number: int = 0) -> tuple[Job, dict[str, Any]]:
+        """Return a job and the figures of its forecast."""
         scenario = (
             Scenario.load(path, of_mesh) if campaign is None else campaign.scenario(job_number)
         )

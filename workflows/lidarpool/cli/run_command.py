@@ -179,6 +179,7 @@ def run_job(
         terminal.warn(warning)
 
     def compare_with_dataset(result: RunResult) -> str:
+        """Return a note that the points are the data set's, or raise LidarError."""
         rows = read_table(target) if of_dataset else ()
         hashes = [row.sha256 for row in rows if row.number == number and row.done]
         if not hashes:

@@ -589,12 +589,12 @@ def stations(
 
 def _shortfalls(plan: StationPlan, count: int | None, coverage: float | None) -> Iterator[str]:
     """Yield notes on a plan with less than `coverage`, or fewer stations than `count`."""
-    from ..plan.stations import STATIONS_MOST
+    from ..plan.stations import MAX_STATIONS
 
     reached = float(plan.coverage[-1])
     if coverage is not None and reached < coverage:
         yield (
-            f"{coverage:.0%} is not reached: {STATIONS_MOST} stations, which is the most, cover "
+            f"{coverage:.0%} is not reached: {MAX_STATIONS} stations, which is the most, cover "
             f"{reached:.1%}; try a greater --height, --slant or --spacing"
         )
     if count is not None and len(plan.stations) < count:

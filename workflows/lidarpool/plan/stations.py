@@ -19,7 +19,7 @@ from lidarsim.scene.simplified import Drawn
 from lidarsim.sensor import Sensor, Spin
 from raybeam import RayCaster
 
-STATIONS_MOST = 100
+MAX_STATIONS = 100
 MIN_GAIN = 0.01  # share of the visible area that each adds, if no number or coverage is given
 _CANDIDATES = 600  # about this number, in a scene without obstacles
 _MAX_CANDIDATES = 50_000
@@ -107,7 +107,7 @@ def plan_stations(
     scene: Scene,
     sensor: Sensor,
     *,
-    count: Annotated[int | None, Field(ge=1, le=STATIONS_MOST)] = None,
+    count: Annotated[int | None, Field(ge=1, le=MAX_STATIONS)] = None,
     coverage: Annotated[float | None, Field(gt=0, le=1)] = None,
     height_m: Annotated[float, Field(gt=0, le=1e6)] = 1.7,
     spacing_m: Annotated[float | None, Field(gt=0, le=1e6)] = None,
@@ -165,7 +165,7 @@ def plan_stations(
             "of the scene, the range of the sensor, and the slant."
         )
     min_gain = MIN_GAIN if count is None and coverage is None else 0.0
-    choice = _choose_rows(visibility, count or STATIONS_MOST, coverage or 1.0, min_gain)
+    choice = _choose_rows(visibility, count or MAX_STATIONS, coverage or 1.0, min_gain)
     owner = visibility.owner
     objects = len(scene.names)
     covered_m2 = visibility.area_m2 * choice.covered

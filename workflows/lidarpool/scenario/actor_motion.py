@@ -302,6 +302,7 @@ class ActorSection(DeformingSection):
 
     @model_validator(mode="after")
     def _check_actor(self) -> ActorSection:
+        """Raise ValueError if fields of an actor or robot do not fit together."""
         trajectory = self.trajectory
         if trajectory is not None and self.at is not None:
             raise ValueError("give either trajectory or at, not both.")
@@ -346,7 +347,7 @@ class ActorSection(DeformingSection):
             return self.trajectory.track(path, standing, start_s)
 
 
-ACTORS_MOST = 10_000
+MAX_ACTORS = 10_000
 _PIECE_BYTES = 1 << 20  # bytes of a file that are read at a time
 _MOVING = ("vehicle", "person", "container")
 _ROW = ("x", "y", "angle", "z", "slope")
@@ -580,9 +581,9 @@ def actors_of(
         offset_s = 0.0 if entry.animation is None else entry.animation.offset_s
         offset_s += 0.0 if mesh.animation is None else share * mesh.animation.duration_s
         actors += [(Actor(named, piece, offset_s), entry) for piece in tracks]
-        if len(actors) > ACTORS_MOST:
+        if len(actors) > MAX_ACTORS:
             raise LidarError(
-                f"{section.file} has more than {ACTORS_MOST:,} vehicles and persons during the "
+                f"{section.file} has more than {MAX_ACTORS:,} vehicles and persons during the "
                 "survey: make the survey shorter, or simulate a part of the network."
             )
     return actors

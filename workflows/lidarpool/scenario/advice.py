@@ -62,6 +62,7 @@ def advice(built: Built) -> list[str]:
 
 
 def _writes_bags(scenario: Scenario) -> bool:
+    """Return whether the output has a bag with messages of 2D scanners."""
     return any(entry.row.laser_scans for entry in scenario.output.write)
 
 

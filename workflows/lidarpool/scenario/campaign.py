@@ -27,13 +27,13 @@ from ..datasets.job_table import Value
 from ..export.laser_scan import with_laser_scans
 from .build import Job
 from .campaign_jobs import FunctionJobs, JobSource, ScenarioJobs, VariedJobs
-from .campaign_sections import COUNT_MOST, CampaignSection, Keep, Splits
+from .campaign_sections import MAX_JOBS, CampaignSection, Keep, Splits
 from .scenario import Scenario
 from .sections import PoolSection
 from .static_scene import SceneCache
 
 _FORM = "a campaign has base:, count:, vary:, keep:, splits:"
-SHOWN_MOST = 5  # files of a command that are named
+MAX_SHOWN_FILES = 5  # files of a command that are named
 
 
 class CampaignSpec:
@@ -87,7 +87,7 @@ class CampaignSpec:
     def __init__(
         self,
         make: Callable[[int, np.random.Generator], Job],
-        count: Annotated[int, Field(ge=1, le=COUNT_MOST)],
+        count: Annotated[int, Field(ge=1, le=MAX_JOBS)],
         *,
         seed: Seed = 0,
         keep: str | Keep | Mapping[str, Any] = "kitti",
@@ -99,6 +99,7 @@ class CampaignSpec:
         self._begin(FunctionJobs(make, count, seed), head)
 
     def _begin(self, jobs: JobSource, head: CampaignSection) -> None:
+        """Set the fields of a campaign from its jobs and its head."""
         self.seed = head.seed
         self.keep = head.keep
         self.splits = dict(head.splits)  # a read-only view of it cannot be pickled
@@ -153,8 +154,8 @@ class CampaignSpec:
         jobs = ScenarioJobs([Path(path) for path in paths])
         self = cls.__new__(cls)
         self._begin(jobs, _head(keep=keep, splits=splits, seed=seed, license=license, title=title))
-        self.command = shlex.join(path.name for path in jobs.paths[:SHOWN_MOST])
-        self.command += " …" * (jobs.count > SHOWN_MOST)
+        self.command = shlex.join(path.name for path in jobs.paths[:MAX_SHOWN_FILES])
+        self.command += " …" * (jobs.count > MAX_SHOWN_FILES)
         return self
 
     def of_shard(self, shard: Shard) -> Self:
@@ -230,6 +231,7 @@ class CampaignSpec:
         return job if survey is job.survey else replace(job, survey=survey)
 
     def _checked_number(self, number: int) -> int:
+        """Return the number of a job as an integer, or raise LidarError."""
         if not 0 <= number < self.count:
             raise LidarError(
                 f"there is no job {number}: the campaign has jobs 0 to {self.count - 1}."

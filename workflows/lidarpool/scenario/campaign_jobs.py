@@ -29,7 +29,7 @@ from ..datasets.job_table import Value
 from ..export.format_table import check_whole
 from .build import Job, build
 from .campaign_sections import (
-    COUNT_MOST,
+    MAX_JOBS,
     CampaignSection,
     Choice,
     JobRandom,
@@ -236,10 +236,10 @@ class VariedJobs(JobSource):
             raise LidarError(
                 f"{path}: count is missing: {drawn[0]} is drawn, so say how many jobs."
             )
-        if section.count is None and grid > COUNT_MOST:
+        if section.count is None and grid > MAX_JOBS:
             raise LidarError(
                 f"{path}: count is missing: all values of each are {grid:,} jobs, of at most "
-                f"{COUNT_MOST:,}."
+                f"{MAX_JOBS:,}."
             )
         self.count = section.count or grid
         self.choices = {text: choice.words for text, choice in section.vary.items()}

@@ -57,7 +57,7 @@ from ..export.formats import Format
 from .sections import IgnoredColumns, Section, may_be_empty
 
 SIGMAS = 6.0  # a normal number beyond is drawn again, 2 of a billion
-SHARE_LEAST = 0.01  # of a normal distribution that lies within limits
+MIN_SHARE = 0.01  # of a normal distribution that lies within limits
 
 _CAMPAIGN_SUFFIXES = (".yaml", ".yml")
 _KEYS = re.compile(r"""^(?:["']?(?:base|vary)["']?\s*:|\{)""", re.MULTILINE)  # or one mapping {…}
@@ -167,18 +167,21 @@ class JobRandom:
 
 
 def _share(bits: int) -> Decimal:
+    """Return a number of 53 random bits as a decimal share of 1."""
     return _EXACT.divide(Decimal(bits), Decimal(2**53))
 
 
 def _short(value: float) -> float:
+    """Return a number rounded to `_DIGITS` digits."""
     return float(f"{value:.{_DIGITS}g}")
 
 
 def _within(value: float, minimum: float, maximum: float) -> float:
+    """Return the nearest number between two limits."""
     return min(max(value, minimum), maximum)
 
 
-COUNT_MOST = 10_000_000
+MAX_JOBS = 10_000_000
 _SHOWN = 60  # letters of a list or mapping in the table of jobs; longer ones by their position
 
 Options = Annotated[
@@ -202,11 +205,12 @@ class Normal(Section):
 
     @model_validator(mode="after")
     def _check_room(self) -> Normal:
+        """Raise ValueError if the limits exclude nearly all numbers, or numbers overflow."""
         if self.limits is not None:
             lower_share, upper_share = map(NormalDist(self.mean, self.std).cdf, self.limits)
-            if upper_share - lower_share < SHARE_LEAST:
+            if upper_share - lower_share < MIN_SHARE:
                 raise ValueError(
-                    f"limits must have at least {SHARE_LEAST:.0%} of the distribution between them."
+                    f"limits must have at least {MIN_SHARE:.0%} of the distribution between them."
                 )
         if not isfinite(self.limit_values[1] - self.limit_values[0]):
             raise ValueError("its numbers are too large.")
@@ -277,6 +281,7 @@ class Choice(Section):
 
     @model_validator(mode="after")
     def _check_weights(self) -> Choice:
+        """Raise ValueError if the weights do not fit the values of `choice`."""
         if self.weights is not None:
             if self.choice is None or len(self.weights) != len(self.choice):
                 raise ValueError("give as many weights as there are values of choice.")
@@ -342,6 +347,7 @@ class Choice(Section):
 
 
 def _choice(value: Any) -> Any:
+    """Return an entry of `vary`, or raise an error if it is no choice."""
     if not isinstance(value, (dict, Choice)):
         raise must_be("a way of choosing, {uniform: [0, 1]} or {choice: [1, 4]}")
     return value
@@ -351,6 +357,7 @@ ChoiceEntry = Annotated[Choice, BeforeValidator(_choice, json_schema_input_type=
 
 
 def _in_table(value: Any, position: int) -> Value | None:
+    """Return the label of a value in the table of jobs, by its position in a list."""
     if isinstance(value, (list, dict)):
         text = json.dumps(value, ensure_ascii=False, default=str)
         return text if len(text) <= _SHOWN else f"choice {position + 1}"
@@ -416,7 +423,7 @@ class CampaignSection(Section):
             "how many jobs; by default one for each base and value of each, if nothing is drawn",
             1000,
             ge=1,
-            le=COUNT_MOST,
+            le=MAX_JOBS,
         ),
     ] = None
     seed: Annotated[Seed, about("another seed draws other values")] = 0
@@ -442,6 +449,7 @@ class CampaignSection(Section):
 
     @model_validator(mode="after")
     def _check_splits(self) -> CampaignSection:
+        """Raise ValueError if names or shares of splits are not valid."""
         for name in self.splits:
             if not re.fullmatch(r"[A-Za-z0-9_-]+", name):
                 raise ValueError(
@@ -461,14 +469,14 @@ class Splits:
     number of jobs: of 0.8, 0.1 and 0.1 each ten jobs have 8, 1 and 1.
     """
 
-    BLOCK_MOST = 1000
+    MAX_BLOCK = 1000
 
     def __init__(self, shares: Mapping[str, float], seed: int) -> None:
         self._seed = seed
         exact = {name: Fraction(str(share)) for name, share in shares.items()}
         total = sum(exact.values())
         exact = {name: share / total for name, share in exact.items()}
-        size = min(lcm(*(share.denominator for share in exact.values())), self.BLOCK_MOST)
+        size = min(lcm(*(share.denominator for share in exact.values())), self.MAX_BLOCK)
         self._block: list[str] = []
         cumulative = Fraction(0)
         for name, share in exact.items():
@@ -485,6 +493,7 @@ class Splits:
 
 @lru_cache
 def _order(seed: int, block: int, count: int) -> list[int]:
+    """Return the random order of the jobs of a block."""
     return JobRandom(seed, block, "splits").order(count)
 
 

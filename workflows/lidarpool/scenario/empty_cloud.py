@@ -97,9 +97,11 @@ def _effects(survey: Survey) -> Iterator[str]:
 
 
 def _span(ranges: Floats) -> str:
+    """Return the smallest and largest range in words."""
     return f"{np.min(ranges):,.4g} to {np.max(ranges):,.4g} m"
 
 
 def _start(scene: Scene, survey: Survey) -> str:
+    """Return the first position of the sensor in words, world coordinates."""
     (x, y, z) = survey.pose(0).position + scene.origin
     return f"the sensor begins at ({x:,.3f}, {y:,.3f}, {z:,.3f})"

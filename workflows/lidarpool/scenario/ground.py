@@ -19,7 +19,7 @@ from lidarsim.sensor.trajectory import quaternions_of
 from raybeam import RayCaster, available_backends
 
 STEP_M = 0.5  # of a trajectory that follows a surface
-STEPS_MOST = 1_000_000
+MAX_STEPS = 1_000_000
 
 
 class StandingSurfaces:
@@ -83,6 +83,7 @@ class StandingSurfaces:
 
     @cached_property
     def _caster(self) -> RayCaster:
+        """Ray caster of the surfaces."""
         # Never CUDA, whose context would stay in this process.
         backend = "numpy" if available_backends()["embree"] else "embree"
         corners = self._tops[0].reshape(-1, 3)
@@ -163,10 +164,10 @@ def _step_times(track: Track) -> Floats:
     """Return times in seconds at steps of at most `STEP_M`; LidarError if there are too many."""
     distances_m = np.linalg.norm(np.diff(track.positions, axis=0), axis=1)
     steps = np.maximum(np.ceil(distances_m / STEP_M), 1).astype(np.int64)
-    if steps.sum() > STEPS_MOST:
+    if steps.sum() > MAX_STEPS:
         raise LidarError(
             f"the trajectory is {distances_m.sum() / 1000:,.0f} km long; at most "
-            f"{STEPS_MOST * STEP_M / 1000:,.0f} km can follow surfaces."
+            f"{MAX_STEPS * STEP_M / 1000:,.0f} km can follow surfaces."
         )
     shares = np.concatenate([np.arange(n) / n for n in steps.tolist()])
     segments = np.repeat(np.arange(len(steps)), steps)

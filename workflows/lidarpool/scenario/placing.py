@@ -37,14 +37,14 @@ _FACING_DEG = 45.0  # azimuth of the rays of that field, to either side
 # Points of a grid around an object, and its largest number of rays, of all poses. A trial grid has
 # rows of `_TRIAL_RAYS` rays; the field of view is `_MARGIN` times wider than the object.
 _POINTS = 100_000
-_RAYS_MOST = 5_000_000
+_MAX_RAYS = 5_000_000
 _TRIAL_RAYS = 64
 _MARGIN = 1.02
 
 # Larger scenes are not examined, nor sheets such as terrains of more triangles than the second,
 # and instances are simplified to it: a tree takes 300 bytes and some microseconds a triangle.
-_TRIANGLES_MOST = 2_000_000
-_SHEETS_MOST = 200_000
+_MAX_TRIANGLES = 2_000_000
+_MAX_SHEET_TRIANGLES = 200_000
 
 
 @dataclass(frozen=True)
@@ -133,7 +133,7 @@ def _narrow_grid(scene: Scene, looker: Surroundings, poses: Sequence[Pose]) -> d
         looker.cast(np.tile(position, (len(rays), 1)), rays @ rotation.T).distance
         for position, rotation in placed
     ]
-    count = min(_POINTS / max(np.mean(np.isfinite(distances)).item(), 1e-6), _RAYS_MOST)
+    count = min(_POINTS / max(np.mean(np.isfinite(distances)).item(), 1e-6), _MAX_RAYS)
     rays_per_degree = (count / (len(poses) * width * height)) ** 0.5
     azimuths, layers = (int(side * rays_per_degree / 10) * 10 for side in (width, height))
     return {
@@ -286,12 +286,12 @@ def _field_deg(carried: Mounted) -> tuple[float, float]:
 
 def _draw_instances(scene: Scene, positions: ArrayLike) -> Scene:
     """Draw instances as meshes, with fewer triangles far from local positions (k, 3)."""
-    return Drawn.of(scene, _SHEETS_MOST, [np.reshape(positions, (-1, 3))]).scene
+    return Drawn.of(scene, _MAX_SHEET_TRIANGLES, [np.reshape(positions, (-1, 3))]).scene
 
 
 def _surroundings(scene: Scene) -> Surroundings | None:
     """Return the surroundings in a scene; None if the scene has too many triangles."""
     count = len(scene.faces)
-    if count > _TRIANGLES_MOST or (count > _SHEETS_MOST and is_open(scene)):
+    if count > _MAX_TRIANGLES or (count > _MAX_SHEET_TRIANGLES and is_open(scene)):
         return None
     return Surroundings(scene)

@@ -254,6 +254,7 @@ def _speed_warnings(motion: _Motion, *, flies: bool) -> Iterator[str]:
 
 
 def _time(motion: _Motion, row: int) -> str:
+    """Return the time of a row in words."""
     return f"{motion.times_ns[row] / 1e9:,.4g} s"
 
 

@@ -37,7 +37,7 @@ from ..base.open3d_module import load_open3d
 # between points, and makes surfels reach farther beyond edges.
 _NEIGHBOURS = 12
 _EXTENT = 0.85
-_MOST_VOXELS = 3  # that half a surfel is long: distant and stray points have no neighbours
+_MAX_HALF_VOXELS = 3  # that half a surfel is long: distant and stray points have no neighbours
 _SAMPLE = 20_000  # points whose neighbours tell the spacing
 _NEAREST = 9  # a point itself, and the eight around it on a square grid
 _BYTES = 700  # for a point while its surfel is made and written
@@ -132,7 +132,7 @@ def _surfel_corners(points: Floats, covariances: Floats, voxel_m: float, size: f
         block = slice(start, start + (1 << 18))
         variances, axes = np.linalg.eigh(covariances[block])
         halves = size * _EXTENT * np.sqrt(np.maximum(variances[:, 1:], 0))
-        halves = np.minimum(halves, _MOST_VOXELS * voxel_m)
+        halves = np.minimum(halves, _MAX_HALF_VOXELS * voxel_m)
         half_widths, half_lengths = np.moveaxis(axes[:, :, 1:] * halves[:, None], 2, 0)
         for corner, (a, b) in enumerate(((-1, -1), (1, -1), (1, 1), (-1, 1))):
             corners[block, corner] = points[block] + a * half_lengths + b * half_widths
@@ -217,10 +217,12 @@ def _read_pcd(path: Path) -> Floats:
 
 
 def _read_xyz(path: Path) -> Floats:
+    """Read the first three numbers of each line."""
     return np.loadtxt(io.StringIO(read_input_text(path)), usecols=(0, 1, 2), ndmin=2)
 
 
 def _read_las(path: Path) -> Floats:
+    """Read the points of a .las or .laz; LidarError if they exceed the memory."""
     with open_las(path) as reader:
         if (size := reader.header.point_count * _BYTES) > memory():
             raise LidarError(

@@ -61,6 +61,7 @@ def campaign_schema() -> dict[str, Any]:
 
 
 def _section_schema(section: type[Section], title: str) -> dict[str, Any]:
+    """Return the JSON Schema of a section, with a title."""
     schema = section.model_json_schema(schema_generator=_Plain)
     return {"$schema": GenerateJsonSchema.schema_dialect, **schema, "title": title}
 

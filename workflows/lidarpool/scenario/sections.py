@@ -42,7 +42,7 @@ from lidarsim.sensor.sensor import Fov, Layers, MaxRange, MinRange, RaysPerRevol
 from ..export.formats import Format
 from ..plan.planning import Search
 
-COPIES_MOST = 1_000_000  # of one entry
+MAX_COPIES = 1_000_000  # of one entry
 PathOf = Callable[[str], Path]  # of a file that a scenario names
 
 IgnoredColumns = Annotated[
@@ -53,6 +53,7 @@ Pair = Two[Coordinate]
 
 
 def _upright(sides: tuple[float, float, float, float]) -> tuple[float, float, float, float]:
+    """Return a rectangle, or raise an error if its lowest x and y are not first."""
     if sides[0] >= sides[2] or sides[1] >= sides[3]:
         raise must_be("[x0, y0, x1, y1], the lowest x and y first")
     return sides
@@ -129,7 +130,8 @@ class MeshFile(Section):
     ] = None
 
     @model_validator(mode="after")
-    def _one_placement(self) -> MeshFile:
+    def _check_placement(self) -> MeshFile:
+        """Raise ValueError for two placements of a mesh, or a scale of 0."""
         placed = self.model_fields_set & {"translation", "rotation_deg", "scale"}
         if self.matrix is not None and placed:
             raise ValueError(f"give either matrix or {', '.join(sorted(placed))}, not both.")
@@ -149,6 +151,7 @@ MeshEntries = Several[MeshEntry]
 
 
 def _pose(value: Any) -> Any:
+    """Return a pose as a mapping; a list is its position."""
     if isinstance(value, list):
         return {"position": value}
     if not isinstance(value, (dict, Pose)):
@@ -192,7 +195,7 @@ class CopyTable(Section):
 class Scatter(Section):
     """Copies that stand upright on surfaces, at random; the same fields give the same copies."""
 
-    count: Annotated[int, about("how many", ge=1, le=COPIES_MOST)]
+    count: Annotated[int, about("how many", ge=1, le=MAX_COPIES)]
     surfaces: Annotated[  # not "on", which YAML takes for true
         TextOrTexts,
         about("names of the objects to stand on, with * and ?; by default all", min_length=1),
@@ -265,7 +268,8 @@ class DeformingSection(ShapeSection):
     ] = None
 
     @model_validator(mode="after")
-    def _of_file(self) -> DeformingSection:
+    def _check_deformation(self) -> DeformingSection:
+        """Raise ValueError for a deformation without a file, or two deformations."""
         deformations = [name for name in ("animation", "wheels") if getattr(self, name) is not None]
         if deformations and self.file is None:
             raise ValueError(f"{deformations[0]} is of a mesh file: give its file.")
@@ -280,7 +284,7 @@ class CopiesSection(ShapeSection):
     name: Annotated[Text, about("name of the first; the others are numbered: Tree, Tree.2, …")]
     at: Annotated[
         Several[Annotated[CopySection, by_position(CopySection, PointXYZ)]],
-        about("places: [x, y], [x, y, z], or with angles and scale", max_length=COPIES_MOST),
+        about("places: [x, y], [x, y, z], or with angles and scale", max_length=MAX_COPIES),
     ] = ()
     table: Annotated[
         Annotated[CopyTable, by_text("file", CopyTable)] | None,
@@ -341,7 +345,8 @@ class SceneSection(Section):
     ] = None
 
     @model_validator(mode="after")
-    def _something(self) -> SceneSection:
+    def _check_not_empty(self) -> SceneSection:
+        """Raise ValueError for a scene without meshes."""
         if self.preset == "none" and not (self.files or self.copies):
             raise ValueError("the scene is empty: give files, or preset: seed.")
         return self
@@ -404,7 +409,8 @@ class SensorSection(Section):
     ] = None
 
     @model_validator(mode="after")
-    def _one_source(self) -> SensorSection:
+    def _check_source(self) -> SensorSection:
+        """Raise ValueError if fields of the sensor contradict each other."""
         sources = [name for name in ("model", "calibration") if getattr(self, name) is not None]
         # Defaults are allowed, because `lidarpool init --all` writes them.
         fields = SensorSection.model_fields
@@ -471,6 +477,7 @@ _grid = lru_cache(Sensor.grid)
 
 @lru_cache
 def _loaded(_: object, **options: Any) -> Sensor:
+    """Return the sensor of files in some states, from the cache if it is known."""
     return load_sensor(**options)
 
 
@@ -483,7 +490,8 @@ class OutputSection(Section):
     ] = ()
 
     @model_validator(mode="after")
-    def _each_once(self) -> OutputSection:
+    def _check_formats(self) -> OutputSection:
+        """Raise ValueError for a format that is written twice."""
         names = [entry.format for entry in self.write]
         if twice := next((name for name in names if names.count(name) > 1), None):
             raise ValueError(
@@ -517,7 +525,8 @@ class Obstacle(Section):
     radius_m: Annotated[float | None, about("radius of the disc, metres", gt=0, le=1e6)] = None
 
     @model_validator(mode="after")
-    def _one_kind(self) -> Obstacle:
+    def _check_kind(self) -> Obstacle:
+        """Raise ValueError unless the obstacle is either an object or a disc."""
         disc = self.centre is not None and self.radius_m is not None
         if (self.object is None) != disc or (
             self.object is not None and self.model_fields_set > {"object"}

@@ -33,7 +33,7 @@ from lidarsim.sensor.trajectory import rotations_of
 from .ground import StandingSurfaces
 from .scenario import Scenario
 from .sections import (
-    COPIES_MOST,
+    MAX_COPIES,
     CopiesSection,
     CopyTable,
     MeshFile,
@@ -285,10 +285,11 @@ def _ground_mesh(section: SceneSection, scene: Scene | None) -> SceneMesh:
     return SceneMesh("Ground", corners, np.array([[0, 1, 2], [0, 2, 3]]))
 
 
-SCALE_LEAST = 1e-6
+MIN_SCALE = 1e-6
 DRAW_SIZE = 1 << 14  # positions that are drawn at a time
-DRAWS_MOST = 200  # positions that are drawn for each copy, at least `DRAWS_LEAST` in all
-DRAWS_LEAST = 1 << 21
+# Positions that are drawn: the larger of the two limits.
+MAX_DRAWS_PER_COPY = 200
+MAX_DRAWS = 1 << 21
 
 _POSITION = ("x", "y", "z")
 _ANGLES = ("yaw_deg", "pitch_deg", "roll_deg")
@@ -350,10 +351,10 @@ class _CopyPoses(NamedTuple):
     def check_scales(self) -> None:
         """Raise LidarError if a scale is nearly 0."""
         scales = self.scales
-        if (np.abs(scales) < SCALE_LEAST).any():
+        if (np.abs(scales) < MIN_SCALE).any():
             raise LidarError(
                 f"a scale of {scales.flat[np.abs(scales).argmin()]:g} would flatten the mesh: give "
-                f"at least {SCALE_LEAST:g}."
+                f"at least {MIN_SCALE:g}."
             )
 
 
@@ -375,8 +376,8 @@ def _read_copies(path: Path, table: CopyTable) -> _CopyPoses:
     except (OSError, ValueError, LidarError) as error:
         raise LidarError(f"{path} is not a usable table of copies: {message_of(error)}") from error
     count = len(columns["x"])
-    if count > COPIES_MOST:
-        raise LidarError(f"{path} has {count:,} rows; at most {COPIES_MOST:,} are allowed.")
+    if count > MAX_COPIES:
+        raise LidarError(f"{path} has {count:,} rows; at most {MAX_COPIES:,} are allowed.")
 
     def columns_of(names: Sequence[str], default: Any) -> Floats:
         return np.stack([columns.get(name, np.full(count, default)) for name in names], axis=1)
@@ -412,7 +413,7 @@ def _scatter_positions(scatter: Scatter, seeds: list[int], standing: StandingSur
     positions: list[Floats] = []
     drawn_count = 0
     while len(positions) < scatter.count:
-        if drawn_count > max(DRAWS_LEAST, DRAWS_MOST * scatter.count):
+        if drawn_count > max(MAX_DRAWS, MAX_DRAWS_PER_COPY * scatter.count):
             raise LidarError(
                 f"only {len(positions):,} of {scatter.count:,} found room on "
                 f"{', '.join(scatter.surfaces)} within x {x0:.6g} to {x1:.6g}, y {y0:.6g} to "

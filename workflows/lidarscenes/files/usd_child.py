@@ -548,6 +548,7 @@ def _constant(shader_input: Any) -> Any:
 
 
 def _numbers(value: Any) -> Any:
+    """Return a number, or the numbers of a vector."""
     return [float(number) for number in value] if hasattr(value, "__len__") else float(value)
 
 
@@ -576,11 +577,13 @@ def _shared(prim: Any) -> Any:
 
 
 def _transform_varies(prim: Any) -> bool:
+    """Return whether the transform of a prim may vary over time."""
     xformable = UsdGeom.Xformable(prim)
     return bool(xformable and xformable.TransformMightBeTimeVarying())
 
 
 def _has_surface(prim: Any) -> bool:
+    """Return whether a prim is a shape, or copies shapes."""
     return bool(prim.IsA(UsdGeom.Gprim) or prim.IsA(UsdGeom.PointInstancer))
 
 
@@ -676,6 +679,7 @@ def main(path: str, request: dict[str, Any]) -> None:
     os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
 
     def write(frame: dict[str, Any], *arrays: NDArray[Any]) -> None:
+        """Write a frame: a line of JSON, and the bytes of arrays."""
         signal.alarm(0)  # who reads this may take long
         kinds = [(array.dtype.str, array.shape) for array in arrays]
         output.write(json.dumps(frame | {"arrays": kinds}).encode() + b"\n")

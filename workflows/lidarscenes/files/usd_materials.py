@@ -46,6 +46,7 @@ class _Use(NamedTuple):
 
     @classmethod
     def from_source(cls, source: ColourSource) -> _Use:
+        """Return the use of an image by a source."""
         scale = tuple(source.get("scale", (1,) * 4))
         bias = tuple(source.get("bias", (0,) * 4))
         raw = source.get("raw", False)

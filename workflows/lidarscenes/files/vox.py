@@ -108,6 +108,7 @@ def _grid(header: dict[str, str]) -> _Grid:
     """Read the grid of a header; MeshFileError if numbers are missing or wrong."""
 
     def three(name: str, times: int = 1) -> Floats:
+        """Return three numbers of the header, or raise MeshFileError."""
         try:
             values = np.array([float(word) for word in header[name].split()] * times)[:3]
         except (KeyError, ValueError):
@@ -170,4 +171,5 @@ def _check_rows(indices: Floats, density: Floats, shape: Floats) -> None:
 
 
 def _in_words(numbers: Floats) -> str:
+    """Return numbers with spaces between."""
     return " ".join(f"{number:g}" for number in numbers)
