@@ -118,7 +118,7 @@ def _object_note(scene: Scene, poses: Sequence[Pose], grid: Mapping[str, Any]) -
     return note
 
 
-def _narrow_grid(scene: Scene, looker: Surroundings, poses: Sequence[Pose]) -> dict[str, Any]:
+def _narrow_grid(scene: Scene, surroundings: Surroundings, poses: Sequence[Pose]) -> dict[str, Any]:
     """Return arguments of `Sensor.grid` for about `_POINTS` points on an object."""
     placed = [*zip(_local_positions(poses, scene), [pose.turn for pose in poses], strict=True)]
     sides = np.zeros(2)  # the largest angles to either side, and up or down, radians
@@ -130,7 +130,7 @@ def _narrow_grid(scene: Scene, looker: Surroundings, poses: Sequence[Pose]) -> d
     trial = Sensor.grid(_TRIAL_RAYS, _TRIAL_RAYS, height, horizontal_fov_deg=width)
     rays = trial.directions(np.arange(_TRIAL_RAYS)).reshape(-1, 3)
     distances = [
-        looker.cast(np.tile(position, (len(rays), 1)), rays @ rotation.T).distance
+        surroundings.cast(np.tile(position, (len(rays), 1)), rays @ rotation.T).distance
         for position, rotation in placed
     ]
     count = min(_POINTS / max(np.mean(np.isfinite(distances)).item(), 1e-6), _MAX_RAYS)
@@ -201,10 +201,10 @@ def surroundings_of(scene: Scene, positions: ArrayLike) -> Surroundings | None:
 
 
 def _inside_note(
-    looker: Surroundings | None, positions: ArrayLike, scene: Scene, carried: Mounted
+    surroundings: Surroundings | None, positions: ArrayLike, scene: Scene, carried: Mounted
 ) -> str:
     """Return a note if a local position (k, 3) lies inside a closed body, else an empty string."""
-    if looker is None or not looker.views(positions).in_a_body:
+    if surroundings is None or not surroundings.views(positions).in_a_body:
         return ""
     return (
         "the sensor is inside a closed body, and hits only the backs of its surfaces; "

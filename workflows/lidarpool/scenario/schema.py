@@ -77,7 +77,7 @@ _WIDTH = 100
 _COMMENT_COLUMN = 30  # column of the comments that stand beside a field
 
 _HEAD = f"# yaml-language-server: $schema={SCHEMA_FILE}"
-_EVERY = f"""\
+_FULL_HEAD = f"""\
 {_HEAD}
 # A lidar survey for lidarpool, with path planning. Every field has its default here, and may be
 # left out. A name after "# " is an example for a field whose default lidarpool chooses. Lengths
@@ -85,7 +85,7 @@ _EVERY = f"""\
 #
 #     lidarpool check {SCENARIO_FILE}
 #     lidarpool run {SCENARIO_FILE}"""
-_FEW = f"""\
+_SHORT_HEAD = f"""\
 {_HEAD}
 # A lidar survey for lidarpool; lengths are in metres, Z is up. Fields that are left out have their
 # defaults; lidarpool init DIR --all writes all of them."""
@@ -104,7 +104,7 @@ def short_scenario(data: Mapping[str, Any], note: str) -> str:
 
     `data` is the result of `mesh_data`, `note` a remark on its poses.
     """
-    lines = [_FEW, ""]
+    lines = [_SHORT_HEAD, ""]
     data = {"scene": "seed"} | dict(data)
     for name, (example, words) in _SECTIONS.items():
         has_data = name in data
@@ -119,7 +119,7 @@ def scenario_template(data: Mapping[str, Any], note: str) -> str:
 
     `data` is the result of `mesh_data`, and replaces defaults; `note` is a remark on its poses.
     """
-    lines = [_EVERY]
+    lines = [_FULL_HEAD]
     values = dict(data)
     if isinstance(values.get("sensor"), str):
         values["sensor"] = {"model": values["sensor"]}
