@@ -43,7 +43,7 @@ PROGRAM = "lidarpool"
 PLUGINS = "lidarpool.commands"  # each is a click.Command
 
 # Common options of `demo` and `run`; each is a field of RunOptions.
-_common_options = shared.together(
+_common_options = shared.combine(
     shared.flag("--tls", help="Encrypt the traffic of the local cluster."),
     shared.flag("--live", help="Show the live page in the browser; it stays until Ctrl-C."),
     click.option(

@@ -384,7 +384,7 @@ def _sample_surfaces(scene: Scene) -> _SurfaceSamples:
     corners = scene.vertices[scene.faces[order]]
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     doubled = np.linalg.norm(normals, axis=1)
-    areas = np.bincount(scene.face_object[order], doubled / 2, len(scene.names))
+    areas = np.bincount(scene.face_object[order], doubled / 2, len(scene.names)).astype(np.float64)
     min_count = max(1, min(_OBJECT_POINTS, _POINTS // len(scene.names)))
     counts = np.round(_POINTS * areas / areas.sum()).astype(int)
     counts = np.maximum(counts, np.where(areas > 0, min_count, 0))

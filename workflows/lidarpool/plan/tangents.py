@@ -168,8 +168,9 @@ def _graph(tangents: _Tangents, centres: Floats, radii: Floats) -> Graph:
     nodes = np.where(owners < 2, owners, 2 + np.arange(len(owners)))
     spans = tangents.contacts[:, 1] - tangents.contacts[:, 0]
     lengths = np.sqrt((spans**2).sum(axis=1))
-    for pair, length in zip(nodes.reshape(-1, 2).tolist(), lengths.tolist(), strict=True):
-        connect(*pair, length)
+    pairs = nodes.reshape(-1, 2).tolist()
+    for (node, neighbour), length in zip(pairs, lengths.tolist(), strict=True):
+        connect(node, neighbour, length)
     points = tangents.contacts.reshape(-1, 2)
     for circle in range(2, len(radii)):
         on_circle = np.flatnonzero(owners == circle)
@@ -177,8 +178,8 @@ def _graph(tangents: _Tangents, centres: Floats, radii: Floats) -> Graph:
         angles = np.arctan2(offsets[:, 1], offsets[:, 0])
         order = np.argsort(angles, kind="stable")
         for first, second, angle in _open_arcs(angles[order], circle, centres, radii):
-            pair = (int(nodes[on_circle[order[p]]]) for p in (first, second))
-            connect(*pair, angle * float(radii[circle]))
+            node, neighbour = (int(nodes[on_circle[order[p]]]) for p in (first, second))
+            connect(node, neighbour, angle * float(radii[circle]))
     return graph
 
 

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from lidarsim.base.allowance import Allowance
-from lidarsim.base.arrays import Floats
+from lidarsim.base.arrays import Floats, Floats32
 from lidarsim.base.words import plural
 from lidarsim.scene.actors import box
 from lidarsim.scene.files.scene_graph import Content, MeshFileError, Wanted
@@ -94,9 +94,9 @@ def _read_table(data: bytes) -> _Table:
     return _Table(header, grid, columns[column], indices, densities)
 
 
-def _box_around(name: str, densities: Floats, min_corner: Floats, edges_m: Floats) -> SceneMesh:
+def _box_around(name: str, densities: Floats32, min_corner: Floats, edges_m: Floats) -> SceneMesh:
     """Return a box around voxels (x, y, z) that start at a corner (3,), metres."""
-    sides_m = densities.shape * edges_m
+    sides_m = np.array(densities.shape) * edges_m
     margin_m = _MARGIN * edges_m.min()
     shell = box(name, tuple(sides_m + 2 * margin_m))
     middle = min_corner + sides_m * (0.5, 0.5, 0) - (0, 0, margin_m)
