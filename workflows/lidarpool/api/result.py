@@ -34,7 +34,7 @@ _SIZE = (800, 500)
 class Result(RunResult):
     """A run's result, with the outputs of `lidarpool run`.
 
-    A notebook shows it as a table with two pictures.
+    A notebook shows the result as a table with two pictures.
     """
 
     @property
@@ -100,9 +100,9 @@ class Result(RunResult):
         Parameters
         ----------
         folder
-            Their folder; made if it does not exist.
+            Folder of the pictures; made if it does not exist.
         only
-            Which: scene, hits, intensity, cloud, path; by default all there are.
+            Names of pictures: scene, hits, intensity, cloud, path; by default all.
         size
             Width and height in pixels.
         colour
@@ -110,12 +110,12 @@ class Result(RunResult):
 
         Returns
         -------
-        Their files.
+        Files of the pictures.
 
         Raises
         ------
         LidarError
-            If there is no such picture, size or column, or a file cannot be written.
+            If a picture, size or column is unknown, or a file cannot be written.
         """
         from ..report.result_pictures import draw_pictures
 
@@ -131,7 +131,7 @@ class Result(RunResult):
         Parameters
         ----------
         port
-            Port on 127.0.0.1, or the next free one; 0 for any.
+            Port on 127.0.0.1, or the next free port; 0 for any.
         browser
             Whether to open a browser where there is a desktop.
         """

@@ -1,6 +1,6 @@
 """The command `lidarpool`.
 
-The modules of commands import what they need within functions, so that help and completion are
+The modules of commands import within functions, so that help and completion are
 immediate: the imports of a run take a second.
 """
 

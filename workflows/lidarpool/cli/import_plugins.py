@@ -49,7 +49,7 @@ def import_by(
 ) -> list[str]:
     """Write a survey as a scenario into a new folder, completely or not at all.
 
-    `check` reads the scenario and raises LidarError if it cannot be simulated.
+    `check` reads the scenario and raises LidarError for a scenario that cannot be simulated.
 
     Returns
     -------

@@ -157,7 +157,7 @@ def export(
                 )
         sweeps = Sweeps.load(source / SWEEPS_FILE)
         cloud = CloudFile(source / "cloud.ply")
-        # Formats that have the option; all of them, which refuse it, if none has it.
+        # Formats that have the option; if no format has the option, all, which refuse it.
         compensated_names = {name for name in formats if row_of(name).raw_or_compensated} or {
             *formats
         }

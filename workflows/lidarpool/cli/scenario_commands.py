@@ -376,7 +376,7 @@ def _write(file: Path, make: Callable[[], Scene], overwrite: bool, paint: bool =
     if file.exists() and not overwrite:
         raise LidarError(f"{file} exists: give another name, or --overwrite.")
     scene = make()
-    if file.suffix.lower() == ".glb":  # others keep no colours
+    if file.suffix.lower() == ".glb":  # other formats hold no colours
         scene = painted(scene) if paint else scene
     elif scene.instances and scene.triangles > MAX_COPIED_TRIANGLES:
         raise LidarError(

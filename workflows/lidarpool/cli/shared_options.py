@@ -203,6 +203,6 @@ def set_logs(shown: bool) -> None:
     logging.disable(logging.NOTSET if shown else logging.CRITICAL)
     if shown:
         for handler in logging.getLogger("distributed").handlers:
-            handler.setLevel(logging.INFO)  # a local cluster has raised it
+            handler.setLevel(logging.INFO)  # a local cluster has raised the level
     elif not sys.warnoptions:
         warnings.simplefilter("ignore")

@@ -55,7 +55,7 @@ class PathAxes:
     def __init__(self, start: tuple[float, float], target: tuple[float, float]) -> None:
         run = target[0] - start[0]
         rise = target[1] - start[1]
-        self.unit_m = math.sqrt(run * run + rise * rise)  # metres in one unit of these axes
+        self.unit_m = math.sqrt(run * run + rise * rise)  # metres in a unit of these axes
         self._axis = run / self.unit_m, rise / self.unit_m  # x, in the plane
         self._middle = (np.array(start) + np.array(target)) / 2
 

@@ -1,4 +1,4 @@
-"""A planning problem: two ends, the discs between them, and the effort of the search."""
+"""A planning problem: two end points, discs, and the effort of the search."""
 
 from __future__ import annotations
 
@@ -22,8 +22,8 @@ from .geometry import segment_distances
 class Search:
     """Effort of a search by particle swarms.
 
-    More waypoints let a path turn about more discs; the time is proportional to them, and the
-    swarms converge more slowly.
+    More waypoints let a path turn about more discs; the time is proportional to their number, and
+    the swarms converge more slowly.
     """
 
     trials: Annotated[int, about("particle swarms, each with its own seed", ge=1, le=10**6)] = 100

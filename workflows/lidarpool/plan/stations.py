@@ -393,7 +393,7 @@ def _sample_surfaces(scene: Scene) -> _SurfaceSamples:
     a, b = np.sort(rng.random((2, len(triangle))), axis=0)[..., None]
     sides = corners[triangle].swapaxes(0, 1)
     points = a * sides[0] + (b - a) * sides[1] + (1 - b) * sides[2]
-    # Rounding may give a point to the last triangle of the object before, or one without area.
+    # Rounding may give a point to the last triangle of the object before, or without area.
     owner = scene.face_object[order][triangle].astype(np.int64)
     units = normals[triangle] / np.where(doubled > 0, doubled, 1.0)[triangle, None]
     return _SurfaceSamples(points, units, owner, (areas / np.maximum(counts, 1))[owner])

@@ -66,7 +66,7 @@ class Swarm:
     constriction (Shi and Eberhart 1998, Clerc and Kennedy 2002) it finds equally good paths, in
     scenes of 6 to 25 discs, with two thirds of the arithmetic.
 
-    Discs can be passed on either side, and a swarm with one common best settles early on one
+    Discs can be passed on either side, and a swarm with one common best settles early on a
     choice of sides. Groups with different initial spreads settle on several: up to `widest` about
     the straight line, in units of its length. The `waypoints` of `paths` are the positions of the
     particles.
@@ -83,7 +83,7 @@ class Swarm:
         self._positions[:] = start.reshape(rows, particles)
         self._best = self._positions.copy()  # of each particle
         self._best_cost = np.full(particles, np.inf, np.float32)
-        self._jump = np.zeros_like(self._best)  # from a particle's best to where it is
+        self._jump = np.zeros_like(self._best)  # from a particle's best to its position
         self._better = np.empty(particles, np.float32)
         self._leaders = np.empty((rows, self.groups), np.float32)
         self._leader_numbers = np.empty(self.groups, np.intp)

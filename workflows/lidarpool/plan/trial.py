@@ -91,8 +91,8 @@ class Plan:
         Length in metres of the shortest path, computed from the discs' tangents; inf if discs cut
         off the target.
     clearance
-        Least distance in metres from the path to a disc; negative if it enters one, inf without
-        discs.
+        Smallest distance in metres from the path to a disc; negative if the path enters a disc,
+        inf without discs.
     trial
         Number of the trial that found the path.
     trials

@@ -351,7 +351,7 @@ MAX_ACTORS = 10_000
 _PIECE_BYTES = 1 << 20  # bytes of a file that are read at a time
 _MOVING = ("vehicle", "person", "container")
 _ROW = ("x", "y", "angle", "z", "slope")
-# Attributes that SUMO's documentation of --fcd-output defines, and that nothing here uses.
+# Attributes that SUMO's documentation of --fcd-output defines, and that are not used here.
 _UNUSED = frozenset((
     "acceleration", "accelerationLat", "arrivalDelay", "blockTime", "boardingTime", "delay",
     "distance", "edge", "entryTime", "eventTime", "lane", "leaderGap", "leaderID", "leaderSpeed",
@@ -451,7 +451,7 @@ class _PassageCollector:
         xy = attributes["x"], attributes["y"]
         if tag == "vehicle":
             self._vehicle_xy = xy
-        elif xy == self._vehicle_xy:  # SUMO writes who rides in a vehicle after it
+        elif xy == self._vehicle_xy:  # SUMO writes the riders of a vehicle after the vehicle
             return
         passage = self._passage(tag, attributes)
         if self.time_s <= self._first_s:  # of the rows before the first time the last is needed
@@ -468,7 +468,7 @@ class _PassageCollector:
         """Return the passage that an element continues, or a new passage."""
         traveller = tag, attributes["id"]
         last_step, passage = self.travellers.get(traveller, (-2, None))
-        # SUMO takes vehicles out while it moves them.
+        # SUMO omits vehicles while they are teleported.
         if passage is None or last_step < self.step - 1:
             passage = Passage(attributes["id"], attributes.get("type") or tag)
             self.passages.append(passage)

@@ -21,7 +21,7 @@ from .scenario import Scenario
 from .sections import SensorSection
 
 # Sizes of scenes in metres are between these. An .stl is mostly a part, in millimetres; an object
-# to look at from outside is rarely longer than a bus. glTF is in metres, and some exporters write
+# seen from outside is rarely longer than a bus. glTF is in metres, and some exporters write
 # millimetres.
 LARGE_M = 500.0
 LARGE_STL_M = 20.0

@@ -1,4 +1,4 @@
-"""Builds what a scenario describes: the scene, the survey and the planning."""
+"""Builds the scene, the survey and the planning of a scenario."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ SEED_START = (25.0, 25.0)
 SEED_TARGET = (-30.0, -20.0)
 SEED_POSES = tuple(Pose((0.0, 0.0, height)) for height in (1.0, 2.0, 3.0))
 
-# The cloud of a scene with the default objects keeps one of this number of hits.
+# Of the hits in a scene with the default objects, every fifth is in the cloud.
 SEED_KEEP_EVERY = 5
 
 # Class of buildings by ASPRS LAS: sensors are not placed in objects that a file gives this class.
@@ -566,7 +566,7 @@ def _obstacle_discs(scenario: Scenario, scene: Scene) -> tuple[Floats, list[str]
             centre = np.subtract(entry.centre, scene.origin[:2])
             rows[f"planning.obstacles[{number}]"] = [*centre, entry.radius_m]
             continue
-        # An exact name comes first, even with brackets; else it is a pattern.
+        # An exact name comes first, even with brackets; else the text is a pattern.
         matches = [i for i, name in enumerate(scene.names) if name == entry.object] or [
             i for i, name in enumerate(scene.names) if fnmatchcase(name, entry.object)
         ]

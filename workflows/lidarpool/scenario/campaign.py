@@ -47,7 +47,7 @@ class CampaignSpec:
     make
         ``make(number, rng)`` returns the `Job` of a number from 0 on, with its scene, survey and
         values. `rng` is a ``numpy.random.Generator`` that depends on the seed and the number alone:
-        a job is the same however often, in whatever order and wherever it is made.
+        equal numbers give equal jobs, in any order and on any worker.
     count
         Number of jobs.
     seed
@@ -76,12 +76,12 @@ class CampaignSpec:
     splits: Mapping[str, float]
     license: str
     title: str
-    command: str = ""  # what follows ``lidarpool run``; empty for a function
-    description: str = ""  # the file's text, where there is one
-    files: Set[Path]  # that its jobs may be made of; some may be missing
+    command: str = ""  # arguments of ``lidarpool run``; empty for a function
+    description: str = ""  # text of the campaign file, or empty
+    files: Set[Path]  # that jobs may be made of, existing or not
     choices: Mapping[str, str]  # {name: how its value is chosen, «0.2 to 20, log_uniform»}
     shard = ALL  # whose jobs a run does
-    only_job: None = None  # a survey has one, as `lidarpool.run.job_source.Jobs` says
+    only_job: None = None  # surveys have one, see `lidarpool.run.job_source.Jobs`
 
     @checked
     def __init__(
@@ -102,7 +102,7 @@ class CampaignSpec:
         """Set the fields of a campaign from its jobs and its head."""
         self.seed = head.seed
         self.keep = head.keep
-        self.splits = dict(head.splits)  # a read-only view of it cannot be pickled
+        self.splits = dict(head.splits)  # a read-only view cannot be pickled
         self.license = head.license
         self.title = head.title
         self.count = jobs.count
@@ -255,7 +255,7 @@ class CampaignSpec:
         """Hashes of the content that the data set depends on: {name: SHA-256, hexadecimal}.
 
         Campaigns of the same content have the same hashes, in any folder and with any number of
-        jobs. Of files, tables of rows are included; other files belong to the jobs that use them.
+        jobs. Tables of rows are included; other files belong to the jobs that use them.
         """
         return {
             "seed": fingerprint(self.seed),

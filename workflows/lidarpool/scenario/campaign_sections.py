@@ -60,7 +60,7 @@ SIGMAS = 6.0  # a normal number beyond is drawn again, 2 of a billion
 MIN_SHARE = 0.01  # of a normal distribution that lies within limits
 
 _CAMPAIGN_SUFFIXES = (".yaml", ".yml")
-_KEYS = re.compile(r"""^(?:["']?(?:base|vary)["']?\s*:|\{)""", re.MULTILINE)  # or one mapping {…}
+_KEYS = re.compile(r"""^(?:["']?(?:base|vary)["']?\s*:|\{)""", re.MULTILINE)  # or a mapping {…}
 _EXACT = Context(prec=40)
 _DIGITS = 12  # that numbers are rounded to, so that tables are readable and hold the exact number
 
@@ -74,7 +74,7 @@ class JobRandom:
 
     They are made of integers, of single operations on floats, and of the logarithms, roots and
     powers of `decimal`, which are rounded correctly everywhere. The functions of C and of NumPy
-    differ in the last bit from one processor or library to the next.
+    differ in the last bit between processors and libraries.
 
     Examples
     --------
@@ -182,7 +182,7 @@ def _within(value: float, minimum: float, maximum: float) -> float:
 
 
 MAX_JOBS = 10_000_000
-_SHOWN = 60  # letters of a list or mapping in the table of jobs; longer ones by their position
+_SHOWN = 60  # letters of a list or mapping in the table of jobs; else its position
 
 Options = Annotated[
     Annotated[Several[Any], Field(min_length=1)]
@@ -347,7 +347,7 @@ class Choice(Section):
 
 
 def _choice(value: Any) -> Any:
-    """Return an entry of `vary`, or raise an error if it is no choice."""
+    """Return an entry of `vary`, or raise an error for an entry that is no choice."""
     if not isinstance(value, (dict, Choice)):
         raise must_be("a way of choosing, {uniform: [0, 1]} or {choice: [1, 4]}")
     return value
@@ -615,7 +615,7 @@ def _value(cell: str) -> Any:
         return float(cell)
     if cell[0] in "[{":
         with suppress(ValueError):
-            return json.loads(cell)  # a hundred times as fast, where it will do
+            return json.loads(cell)  # a hundred times as fast as YAML
         with suppress(yaml.YAMLError, ValueError, OverflowError, RecursionError):
             return load_yaml(cell)
     return _WORDS.get(cell.lower(), cell)
@@ -664,4 +664,4 @@ def is_campaign(path: str | Path) -> bool:
             return False  # without reading all poses of a scenario as YAML
         return bool({"base", "vary"} & read_yaml(path).keys())
     except (OSError, ValueError, LidarError):
-        return False  # the reader of scenarios says what is wrong
+        return False  # the reader of scenarios reports the error

@@ -54,7 +54,7 @@ class Placing:
     poses: tuple[Pose, ...]  # in world coordinates
     note: str = ""  # for users, on poses that they may not expect
     surrounds_object: bool = False  # whether the poses are around an object
-    grid: Mapping[str, Any] = field(default_factory=dict)  # of `Sensor.grid`, if narrowed to it
+    grid: Mapping[str, Any] = field(default_factory=dict)  # arguments of `Sensor.grid`, if narrowed
 
 
 def place_sensor(
@@ -164,7 +164,7 @@ def _select_objects(scene: Scene, patterns: Sequence[str]) -> Scene:
 def _poses_beside(scene: Scene, middle: Floats, buildings: Sequence[str] = ()) -> tuple[Pose, ...]:
     """Return free poses beside the middle (3,) of a scene, world coordinates; perhaps none.
 
-    In a scene with `buildings`, patterns of names, poses are outdoors: above some surface, and
+    In a scene with `buildings`, patterns of names, poses are outdoors: above a surface, and
     neither in a building nor on a building.
     """
     half = np.ptp(scene.bounds, axis=0) / 2
@@ -263,7 +263,7 @@ def _direction(azimuth_deg: float, elevation_deg: float) -> Floats:
 
 
 def _viewing_distance_m(carried: Mounted, diagonal_m: float, field_deg: float) -> float:
-    """Return the distance in metres from which an object of some diagonal fills the view."""
+    """Return the distance in metres from which an object with a diagonal fills the view."""
     sensor = carried.sensor
     half = np.radians(max(field_deg, 1e-3) / 2)
     diagonals = float(np.clip(0.5 / np.sin(half), *_DIAGONALS))

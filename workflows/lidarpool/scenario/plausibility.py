@@ -20,7 +20,7 @@ from lidarsim.sensor.trajectory import full_poses, matrices, quaternions_of, vel
 from .build import Built
 from .placing import seen_from, surroundings_of
 
-GROUND_SPEED_M_S = 150.0  # faster than trains, except those on test tracks
+GROUND_SPEED_M_S = 150.0  # faster than trains, except on test tracks
 AIR_SPEED_M_S = 350.0  # faster than the aircraft that carry lidars
 AIRBORNE_M = 50.0  # height above the ground from which a carrier flies
 MAX_RATE_DEG_S = 720.0  # two rotations a second
@@ -33,7 +33,7 @@ _CONSTANT = 0.95
 # below these speeds and lengths directions of travel are noise
 _MOVES_M_S = 0.1
 _TRAVELS_M = 2.0
-# Cosines of tilt, on the average: a carrier that is level, and one that lies on its side.
+# Cosines of tilt, on the average: a level carrier, and a carrier that lies on its side.
 _LEVEL = 0.9
 _TILTED = 0.5
 # A path that rises and falls by more than these metres and this share of its length, while it
@@ -261,7 +261,7 @@ def _time(motion: _Motion, row: int) -> str:
 def _up_axis_warnings(motion: _Motion, lowest_m: float) -> Iterator[str]:
     """Warn of a path that rises and falls as roads do not, and is flat along x or y.
 
-    A path straight up is that of a lift or drone, unless it begins below the scene.
+    A path straight up is a lift's or drone's, unless the path starts below the scene.
     """
     extent_m = np.ptp(motion.positions, axis=0)
     length_m = motion.speeds @ motion.durations_s

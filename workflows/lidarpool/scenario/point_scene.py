@@ -2,7 +2,7 @@
 
 Poisson surfaces (Kazhdan and Hoppe 2013), which Open3D makes, too, were compared by casting: of a
 simulated scan of a city they took twenty times as long, needed the side that each point was seen
-from, and closed what is open, so that a tenth of the ranges were wrong by more than 0.3 m.
+from, and closed openings, so that a tenth of the ranges were wrong by more than 0.3 m.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ def scene_of_points(
     """Make a scene of a point cloud, for example a scan of a real place.
 
     A surfel lies where a principal component analysis of the 12 nearest points puts their plane,
-    and is about as large as the gaps between them along and across.
+    and is about as large as the gaps between the points in both directions.
 
     Parameters
     ----------
@@ -66,7 +66,7 @@ def scene_of_points(
         Edge of the cubes in each of which all points become their mean. By default the median
         distance of points to the eighth of their neighbours.
     size
-        A factor of the surfels' sides: larger ones close gaps, and reach farther beyond edges.
+        A factor of the surfels' sides: larger surfels close gaps, and reach farther beyond edges.
     unit
         Unit of x, y and z, in place of metres or of the units that a .las or .laz states.
     tell
@@ -74,7 +74,7 @@ def scene_of_points(
 
     Returns
     -------
-    A scene of one object, named by the file; each surfel is two triangles.
+    A scene of a single object, named by the file; each surfel is two triangles.
 
     Raises
     ------
@@ -168,7 +168,8 @@ def _read(path: Path, unit: str | None, tell: Callable[[str], None]) -> Floats:
     except Exception as error:  # readers raise whatever they stumble over
         reason = printable(str(error))[:200] or type(error).__name__
         raise LidarError(f"{path} is broken or cut short ({reason}).") from error
-    points = points[np.isfinite(points).all(axis=1)]  # depth cameras write NaN where nothing is
+    # Depth cameras write NaN for pixels without a return.
+    points = points[np.isfinite(points).all(axis=1)]
     if len(points) < _NEIGHBOURS:
         raise LidarError(
             f"{path} has {len(points)} points, and at least {_NEIGHBOURS} are needed: it is empty, "

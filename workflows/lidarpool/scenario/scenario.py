@@ -1,4 +1,4 @@
-"""Scenario files: all of a survey as data, checked before anything runs."""
+"""Scenario files: surveys as data, checked before a run."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ from .sections import (
     scene_in_short,
 )
 
-# Options of a mesh file without a scenario, and where a scenario has them.
+# Options of a mesh file without a scenario, and the fields of a scenario for them.
 MESH_OPTIONS = {
     "sensor": "sensor",
     "unit": "unit of scene.files",
@@ -86,8 +86,8 @@ class Scenario(Section):
     planning, pool
         See `lidarpool.scenario.sections`.
     poses
-        Poses of the sensor, in world coordinates. By default it stands at the origin (default
-        objects), 1, 2 and 3 metres above the ground; in mesh files where `place` puts it: in the
+        Poses of the sensor, in world coordinates. By default the sensor is at the origin (default
+        objects), 1, 2 and 3 metres above the ground; in mesh files chosen by `place_sensor`: in the
         middle of a room or landscape, or around an object.
     steps, classes
         Time steps from each pose, and names of semantic classes, {number: name}.

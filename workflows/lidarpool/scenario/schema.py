@@ -45,7 +45,7 @@ class _Plain(GenerateJsonSchema):
 def scenario_schema() -> dict[str, Any]:
     """Return the JSON Schema of scenario files, short forms and empty sections included.
 
-    It does not check combinations of fields (a range that ends before it begins):
+    The schema does not check combinations of fields (a range that stops before its start):
     `Scenario.load` does.
     """
     schema = _section_schema(Scenario, "lidarpool scenario")

@@ -42,7 +42,7 @@ from lidarsim.sensor.sensor import Fov, Layers, MaxRange, MinRange, RaysPerRevol
 from ..export.formats import Format
 from ..plan.planning import Search
 
-MAX_COPIES = 1_000_000  # of one entry
+MAX_COPIES = 1_000_000  # of an entry
 PathOf = Callable[[str], Path]  # of a file that a scenario names
 
 IgnoredColumns = Annotated[
@@ -477,7 +477,7 @@ _grid = lru_cache(Sensor.grid)
 
 @lru_cache
 def _loaded(_: object, **options: Any) -> Sensor:
-    """Return the sensor of files in some states, from the cache if it is known."""
+    """Return the sensor of files in some states, cached by these states."""
     return load_sensor(**options)
 
 

@@ -392,7 +392,7 @@ def _scatter_copies(scatter: Scatter, name: str, standing: StandingSurfaces) -> 
     Positions are drawn in a rectangle, and are valid where the highest surface is one of the
     scatter's: only sums, products and comparisons, so that all machines draw the same.
     """
-    # The name, so that trees and rocks of one seed do not share positions.
+    # The name, so that trees and rocks of the same seed do not share positions.
     seeds = [scatter.seed, *name.encode()]
     positions = _scatter_positions(scatter, seeds, standing)
     count = scatter.count

@@ -47,7 +47,7 @@ _MAX_BESIDE_BYTES = 65536  # of a file beside a raster
 _OPEN_OPTIONS = {"AAIGrid": {"DATATYPE": "Float64"}}
 
 _BLOCK_VERTICES = 100_000  # that are reprojected at a time, through lists
-_PIXEL_BYTES = 100  # of a mesh of pixels: vertices, two triangles, and what makes them
+_PIXEL_BYTES = 100  # of a mesh of pixels: vertices, two triangles, and temporary arrays
 _MAX_UNASKED = 5_000_000  # pixels that are read without a window and a step; more take long
 _MAX_READ = 1_000_000_000  # pixels that make a coarser grid, which takes two minutes
 _WIDEST_DEG = 12.0  # of longitude in a UTM zone, which is 6 wide
@@ -522,7 +522,7 @@ def _crs_key(crs: Any) -> tuple[str, int | None]:
     """Return a text that identifies a coordinate system, and its EPSG code if that is certain."""
     if crs is None:
         return "", None
-    code = crs.to_epsg(confidence_threshold=90)  # with 70 it guesses the datum of an unknown one
+    code = crs.to_epsg(confidence_threshold=90)  # 70 would guess an unknown datum
     return f"EPSG:{code}" if code else crs.to_wkt(), code
 
 

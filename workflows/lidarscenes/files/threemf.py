@@ -66,7 +66,7 @@ class _MeshObject:
     vertices: array[float] = field(default_factory=lambda: array("d"))
     faces: array[int] = field(default_factory=lambda: array("q"))
     components: list[_Placement] = field(default_factory=list)
-    # Number of a group of colours, and index in it, of triangles that name none.
+    # Number of a group of colours, and index in it, of triangles without.
     default_property: tuple[str, str] = ("", "0")
     shades: array[int] = field(default_factory=lambda: array("B"))  # of corners, if read
     materials: list[str] = field(default_factory=list)  # names of triangles, if read

@@ -1,6 +1,6 @@
 """OpenUSD scenes, .usd .usda .usdc .usdz, through usd-core (Pixar, licence TOST-1.0).
 
-`usd_child.py` reads the scenes in a process of its own, for the reasons that it states. References
+`usd_child.py` reads the scenes in a process of its own, and states the reasons. References
 to other files are resolved by usd-core; content from outside the scene's folder is refused.
 `usd_materials.py` reads masks and colours.
 """
@@ -227,7 +227,7 @@ def _plain_shape(frame: dict[str, Any]) -> SceneMesh | None:
     else:
         shape = cylinder if kind == "Cylinder" else capsule
         mesh = shape(size["radius"], size.get("height", 0), _SEGMENTS, name)
-    # Shapes are made along z; turn them to their own axis.
+    # Shapes are made along z; turn their axis.
     return SceneMesh(name, np.roll(mesh.vertices, axis + 1, axis=1), mesh.faces)
 
 

@@ -1,7 +1,7 @@
 """Reads an OpenUSD scene with usd-core, in a process that `usd.py` starts: a script, not a module.
 
-usd-core ends its process on some broken files, and takes any amount of memory for others; here both
-end this process only. The script imports nothing of lidarpool, to start fast. Standard output gets
+usd-core ends its process on some broken files, and needs unlimited memory for other files; here
+both end this process only. The script imports nothing of lidarpool, to start fast. Standard output gets
 frames, each a line of JSON and the bytes of arrays: first of the stage, then of each mesh, after
 the images and materials that the mesh is the first to use, last of the nodes. Content that several
 prims share is written once. Of an animation, meshes and nodes come again for each pose.
@@ -40,7 +40,7 @@ _EXCLUDED_PURPOSES = (UsdGeom.Tokens.proxy, UsdGeom.Tokens.guide)  # purposes
 _SHOWN = (
     Usd.PrimIsActive
     & Usd.PrimIsLoaded
-    & Usd.PrimHasDefiningSpecifier  # PrimIsDefined would ask it of the prims above, too
+    & Usd.PrimHasDefiningSpecifier  # PrimIsDefined would require the prims above, too
     & ~Usd.PrimIsAbstract
 )
 
@@ -53,8 +53,8 @@ class _Inherited(NamedTuple):
     """Properties of a node that the prims above set; with its path, the key of the node."""
 
     excluded: bool  # its purpose is left out
-    still: bool  # it stands although it is animated, as prims that an instancer copies do
-    instance: Any  # look or path of an instance around it, which prototypes do not know
+    still: bool  # its animation is ignored, as for prims that an instancer copies
+    instance: Any  # look or path of the instance around the prim, which prototypes lack
 
 
 class StageNodes:
@@ -77,7 +77,7 @@ class StageNodes:
         self.nodes: list[Any] = []
         self.matrices: list[NDArray[np.float64]] = []
         self.copies: list[NDArray[np.float64]] = []
-        self.moving: list[int] = []  # nodes that move; no nodes have them as children
+        self.moving: list[int] = []  # nodes that move, which are no children
         self.motions: list[NDArray[np.float64]] = []  # (k, 13) of each: time code, then 3 rows of 4
         self.counts: Counter[str] = Counter()  # for notes
 
@@ -601,7 +601,7 @@ def _select_animation(stage: Any, request: dict[str, Any]) -> _Animation:
     rate_hz = stage.GetTimeCodesPerSecond()
     while name is not None and (proxies := [p for p in stage.Traverse() if p.IsInstance()]):
         for prim in proxies:
-            prim.SetInstanceable(False)  # nothing bends what is in them
+            prim.SetInstanceable(False)  # prims in instances are not skinned
     prims = [p for p in stage.Traverse() if name is not None or p.IsA(UsdSkel.Animation)]
     # If the rate is 0, usd-core would look for samples for ever.
     attributes = [a for prim in prims if rate_hz > 0 for a in prim.GetAuthoredAttributes()]
@@ -651,7 +651,7 @@ def _checked_layers(path: str) -> list[Any]:
     """Open a layer and its sublayers, and check the kind of every file that they name.
 
     Opening a pipe waits for a writer. Layers that references of other layers name are not checked:
-    the composition decides which of them are opened.
+    the composition decides which files are opened.
 
     Raises
     ------
@@ -719,7 +719,7 @@ def main(path: str, request: dict[str, Any]) -> None:
             nodes.read()
             write({
                 "what": "nodes",
-                "files": _stage_files(stage),  # with those of value clips
+                "files": _stage_files(stage),  # with the files of value clips
                 "roots": nodes.roots,
                 "nodes": nodes.nodes,
                 "counts": nodes.counts,

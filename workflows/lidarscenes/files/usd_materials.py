@@ -38,7 +38,7 @@ class _Use(NamedTuple):
     """A use of an image, which meshes share."""
 
     image: int
-    channels: str  # "rgb", or one of r, g, b and a
+    channels: str  # "rgb", or a letter of "rgba"
     scale: tuple[float, ...]  # (4,); light is multiplied by the scale,
     bias: tuple[float, ...]  # (4,); then the bias is added
     raw: bool  # its numbers are light, not sRGB
@@ -117,7 +117,8 @@ class UsdMaterials:
         self._allowance = allowance
         self.coloured = options.colours
         self._names_materials = options.materials
-        self._images: dict[int, tuple[str, bytes]] = {}  # {number: (why it is not read, content)}
+        # {number: (reason if the image is not read, content)}
+        self._images: dict[int, tuple[str, bytes]] = {}
         self._materials: dict[int | None, dict[str, Any]] = {None: {"name": "displayColor"}}
         self._shades = remembered(self._read_shades)
         self._mask = remembered(self._read_mask)
