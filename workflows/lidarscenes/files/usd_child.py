@@ -1,10 +1,10 @@
 """Reads an OpenUSD scene with usd-core, in a process that `usd.py` starts: a script, not a module.
 
 usd-core ends its process on some broken files, and needs unlimited memory for other files; here
-both end this process only. The script imports nothing of lidarpool, to start fast. Standard output gets
-frames, each a line of JSON and the bytes of arrays: first of the stage, then of each mesh, after
-the images and materials that the mesh is the first to use, last of the nodes. Content that several
-prims share is written once. Of an animation, meshes and nodes come again for each pose.
+both end this process only. The script imports nothing of lidarpool, to start fast. Standard output
+gets frames, each a line of JSON and the bytes of arrays: first of the stage, then of each mesh,
+after the images and materials that the mesh is the first to use, last of the nodes. Content that
+several prims share is written once. Of an animation, meshes and nodes come again for each pose.
 """
 
 from __future__ import annotations
