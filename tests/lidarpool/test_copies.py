@@ -229,7 +229,7 @@ WRONG = {
 
 @pytest.mark.parametrize("name", WRONG)
 def test_what_cannot_be_is_told_in_a_line(made, folder, name, monkeypatch):
-    monkeypatch.setattr("lidarpool.scenario.static_scene.DRAWS_LEAST", 0)
+    monkeypatch.setattr("lidarpool.scenario.static_scene.MAX_DRAWS", 0)
     entry, says = WRONG[name]
     (folder / "a.csv").write_text("x,z\n1,nan\n")
     (folder / "some.csv").write_text("x,y,z\n# first\n1,2,3\n\n4,5,\n")

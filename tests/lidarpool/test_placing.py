@@ -15,7 +15,7 @@ from trimesh import creation
 
 from lidarpool.scenario.advice import advice
 from lidarpool.scenario.build import build
-from lidarpool.scenario.placing import place, poses_around
+from lidarpool.scenario.placing import place_sensor, poses_around
 from lidarpool.scenario.plausibility import implausibilities
 from lidarpool.scenario.scenario import Scenario
 from lidarscenes.procedural.city import city
@@ -62,8 +62,10 @@ OBJECTS = {
 )
 def test_an_object_is_seen_from_around_it_and_only_from_outside(name, far):
     scene = scene_of(*OBJECTS[name], at=(far, far, 0))
-    placed = place(scene, GRID)
-    assert placed.around and "looks like an object" in placed.note and len(placed.poses) == 5
+    placed = place_sensor(scene, GRID)
+    assert (
+        placed.surrounds_object and "looks like an object" in placed.note and len(placed.poses) == 5
+    )
     poses = [np.subtract(pose.position, scene.origin) for pose in placed.poses]
     middle = scene.bounds.mean(axis=0)
     sides = np.ptp(scene.bounds, axis=0)
@@ -126,7 +128,7 @@ def test_a_sensor_of_the_users_stays_as_it_is(tmp_path):
     for data in ({"sensor": {"layers": 40}}, {"mount": {"pitch_deg": 5}}):
         scenario = Scenario.from_data({"scene": "a.stl", **data}, folder=tmp_path)
         built = build(scenario)
-        assert built.placing.around and not built.placing.grid
+        assert built.placing.surrounds_object and not built.placing.grid
         assert built.survey.ray_count == 200_000
 
 
@@ -170,8 +172,8 @@ def flipped(scene):
 @pytest.mark.parametrize("name", PLACES)
 def test_in_a_place_the_sensor_stands_in_the_middle(name):
     scene = PLACES[name]()
-    placed = place(scene, GRID)
-    assert len(placed.poses) == 3 and not placed.around
+    placed = place_sensor(scene, GRID)
+    assert len(placed.poses) == 3 and not placed.surrounds_object
     middle = (scene.bounds + scene.origin).mean(axis=0)
     assert all(pose.position[:2] == pytest.approx(middle[:2]) for pose in placed.poses)
     assert ("only the backs" in placed.note) == (name == "box hall")
@@ -180,14 +182,14 @@ def test_in_a_place_the_sensor_stands_in_the_middle(name):
 @pytest.mark.parametrize("species", SPECIES, ids=lambda species: species.name)
 def test_a_tree_is_an_object_and_on_ground_the_sensor_stands_beside_it(species):
     alone = tree(species)
-    assert place(Scene.from_meshes([alone]), GRID).around
+    assert place_sensor(Scene.from_meshes([alone]), GRID).surrounds_object
     lawn = level("lawn", 0, 20)
     for far in (0.0, 4_000_000.0):
         meshes = [mesh.moved(mesh.name, np.eye(3), np.full(3, far)) for mesh in (lawn, alone)]
         scene = Scene.from_meshes(meshes)
-        placed = place(scene, GRID)
+        placed = place_sensor(scene, GRID)
         at = np.array([pose.position for pose in placed.poses]) - scene.origin
-        assert not placed.around and not placed.note
+        assert not placed.surrounds_object and not placed.note
         assert not in_the_way(scene, at)
         assert 1.9 < np.linalg.norm(at[0, :2] + scene.origin[:2] - far) < 8.1
         assert at[:, 2] + scene.origin[2] - far == pytest.approx([1, 2, 3])
@@ -296,7 +298,9 @@ def test_on_the_ground_of_a_terrain():
     assert floor == pytest.approx(scene.vertices[nearest, 2], abs=5)
     # Half of its triangles face down, as surfels of a cloud do.
     mixed = np.concatenate([scene.faces[::2], scene.faces[1::2, ::-1]])
-    assert not place(Scene.from_meshes([SceneMesh("m", scene.vertices, mixed)]), GRID).around
+    assert not place_sensor(
+        Scene.from_meshes([SceneMesh("m", scene.vertices, mixed)]), GRID
+    ).surrounds_object
 
 
 def test_on_a_slab_and_not_on_the_roof():

@@ -503,7 +503,7 @@ def test_a_scenario_has_its_robot_and_its_sensor_on_a_link(folder):
     assert kinds["Arm/base_link"].semantic_class != 7
     notes = advice(built)
     assert "Rover: link lidar is left out: a sensor is mounted on it" in notes
-    assert built.found.sources["rover.urdf"].startswith(
+    assert built.findings.sources["rover.urdf"].startswith(
         "14 links, 6,720 triangles; 9 of its joints move"
     )
 
@@ -559,7 +559,7 @@ def test_a_robot_that_leaves_needs_joints_for_its_stay_only(folder):
 def test_a_robot_alone_stands_still_with_its_joints_at_zero(folder):
     alone = build(Scenario.load(folder / "rover.urdf"))
     robot = load_robot(folder / "rover.urdf")
-    assert alone.placing.around and not alone.scene.actors
+    assert alone.placing.surrounds_object and not alone.scene.actors
     assert alone.scene.names == tuple(actor.name for actor in robot.actors())
     assert "has its joints at zero" in advice(alone)[0]
     entry = {"file": "rover.urdf", "rotation_deg": [0, 0, 90], "translation": [5, 0, 0]}

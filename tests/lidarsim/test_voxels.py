@@ -384,7 +384,7 @@ planning: {enabled: false}
         "oak": True, "Oak": True, "Ground": False
     }  # fmt: skip
     assert scene.object_bounds[0] == pytest.approx(np.array([[4, -1, 1], [6, 1, 4]]), abs=0.021)
-    (line,) = built.found.sources.values()
+    (line,) = built.findings.sources.values()
     assert "2 x 2 x 3 voxels" in line
     job = build(scenario).job()
     plain = Scene.from_meshes([box("Ground", (0, 0, 0), (1, 1, 1))])

@@ -40,7 +40,7 @@ def of(job, columns, name):
 
 def test_all_sources_are_in_one_scene_and_meshes_are_kept_once(scanned):
     built, job, _ = scanned
-    assert [*built.found.sources] == [
+    assert [*built.findings.sources] == [
         "block.usdc", "block-hills.tif", "rover.urdf", "car.obj", "block-traffic.xml.gz"
     ]  # fmt: skip
     assert job.survey.epsg == 25832

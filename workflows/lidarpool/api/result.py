@@ -24,7 +24,7 @@ from ..run.run_result import RunResult
 if TYPE_CHECKING:
     from lidarview.picture_file import PictureContent
 
-# In a notebook: what is drawn of a result, and how large in pixels; scaled down by much, their
+# In a notebook: the pictures of a result, and their size in pixels; scaled down by much, their
 # letters could not be read.
 _SHOWN = ("hits", "cloud")
 _SIZE = (800, 500)
@@ -34,7 +34,7 @@ _SIZE = (800, 500)
 class Result(RunResult):
     """A run's result, with the outputs of `lidarpool run`.
 
-    A notebook shows it as a table with two pictures.
+    A notebook shows the result as a table with two pictures.
     """
 
     @property
@@ -52,13 +52,13 @@ class Result(RunResult):
         formats: Sequence[str | Mapping[str, Any]] = (),
         overwrite: bool = False,
     ) -> None:
-        """Write what `lidarpool run` does: cloud, pictures and report, all of them or none.
+        """Write the files of `lidarpool run`: cloud, pictures and report, completely or not at all.
 
         Parameters
         ----------
         folder
-            Made if it is not there; or a URL that fsspec opens. An earlier result of the same
-            survey in it is replaced.
+            Made if it does not exist; or a URL that fsspec opens. An earlier result of the same
+            survey in the folder is replaced.
         only_cloud
             Leave `report.html` and `pictures.npz` out.
         pictures
@@ -79,9 +79,9 @@ class Result(RunResult):
         from ..export.formats import Format
         from ..report.output import SurveyOutput
 
-        wanted = [Format.of(entry) for entry in formats]
+        further_formats = [Format.of(entry) for entry in formats]
         extent = "cloud" if only_cloud else "pictures" if pictures else "page"
-        output = SurveyOutput(output_place(folder), self.survey, wanted, extent)
+        output = SurveyOutput(output_place(folder), self.survey, further_formats, extent)
         with output.held():
             output.refuse(lambda: self.identity, overwrite=overwrite)
             output.write(self)
@@ -100,9 +100,9 @@ class Result(RunResult):
         Parameters
         ----------
         folder
-            Their folder; made if it does not exist.
+            Folder of the pictures; made if it does not exist.
         only
-            Which: scene, hits, intensity, cloud, path; by default all there are.
+            Names of pictures: scene, hits, intensity, cloud, path; by default all.
         size
             Width and height in pixels.
         colour
@@ -110,28 +110,28 @@ class Result(RunResult):
 
         Returns
         -------
-        Their files.
+        Files of the pictures.
 
         Raises
         ------
         LidarError
-            If there is no such picture, size or column, or a file cannot be written.
+            If a picture, size or column is unknown, or a file cannot be written.
         """
         from ..report.result_pictures import draw_pictures
 
-        made = self._cloud_file.parent
-        return list(draw_pictures(self._pictured, made, folder, only, size, colour))
+        cloud_folder = self._cloud_file.parent
+        return list(draw_pictures(self._pictured, cloud_folder, folder, only, size, colour))
 
     @checked
     def view(self, *, port: int = 8080, browser: bool = True) -> None:
-        """Show it in the browser, as `lidarpool view` does, until Ctrl-C.
+        """Show the result in the browser, as `lidarpool view` does, until Ctrl-C.
 
         In a notebook the page is shown in the cell, and stays as long as the result is in use.
 
         Parameters
         ----------
         port
-            Port on 127.0.0.1, or the next free one; 0 for any.
+            Port on 127.0.0.1, or the next free port; 0 for any.
         browser
             Whether to open a browser where there is a desktop.
         """
@@ -152,6 +152,7 @@ class Result(RunResult):
 
     @cached_property
     def _pictured(self) -> PictureContent:
+        """Content of the pictures."""
         from ..report.picture_content import picture_content
 
         return picture_content(self)
@@ -166,11 +167,11 @@ class Result(RunResult):
         return path
 
     def __repr__(self) -> str:
-        survey, cloud, *others = (f"{name}: {value}" for name, value in self._figures())
-        return "\n".join([survey, cloud, "; ".join(others)]).rstrip()
+        survey, cloud, *further = (f"{name}: {value}" for name, value in self._figures())
+        return "\n".join([survey, cloud, "; ".join(further)]).rstrip()
 
     def _repr_html_(self) -> str:
-        """Table and pictures that notebooks show."""
+        """Return the table and pictures that notebooks show."""
         rows = (
             f"<tr><th style='text-align:left'>{escape(name)}</th>"
             f"<td style='text-align:left'>{escape(value)}</td></tr>"
@@ -180,17 +181,18 @@ class Result(RunResult):
 
     @cached_property
     def _images(self) -> str:
+        """Pictures of the result as HTML."""
         with TemporaryDirectory(prefix="lidarpool-") as folder:
             drawn = self.pictures(folder, only=_SHOWN, size=_SIZE)
             data = [b64encode(path.read_bytes()).decode() for path in drawn]
         style = f"display:block;width:100%;max-width:{_SIZE[0]}px"
         return "".join(
-            f'<img alt="{name}" src="data:image/png;base64,{one}" style="{style}">'
-            for name, one in zip(_SHOWN, data, strict=True)
+            f'<img alt="{name}" src="data:image/png;base64,{image}" style="{style}">'
+            for name, image in zip(_SHOWN, data, strict=True)
         )
 
     def _figures(self) -> Iterator[tuple[str, str]]:
-        """Names and values of the main figures."""
+        """Yield names and values of the main figures."""
         yield (
             "survey",
             f"{self.survey.scan_count:,} scans, {self.rays:,} rays, {self.hits:,} hits on "

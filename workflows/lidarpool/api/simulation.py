@@ -1,4 +1,4 @@
-"""Whole runs from Python: `simulate`, and campaigns of many jobs into one data set."""
+"""Runs from Python: `simulate`, and campaigns of many jobs into a data set."""
 
 from __future__ import annotations
 
@@ -34,8 +34,8 @@ from ..scenario import campaign as described
 from ..scenario.build import Job
 from .result import Result
 
-# Options that are meaningless in a call: a survey has no data set, a campaign plans no paths, and
-# its run is kept beside the data set; a stream keeps nothing and has no stages 1 and 4.
+# Options without a meaning in a call: a survey has no data set, a campaign plans no paths, and its
+# run is stored beside the data set; a stream stores nothing and has no stages 1 and 4.
 _NOT_OF_SURVEYS = ("fresh", "retry_failed", "verify", "overwrite")
 _NOT_OF_CAMPAIGNS = ("folder", "other_workers")
 _NOT_OF_STREAMS = (
@@ -72,7 +72,7 @@ def simulate(
         then, see `ScanFrame.points`. It is called in this thread: a slow callback makes the
         pipeline wait, and nothing is lost.
     on_progress
-        Called some ten times a second with the progress. Without it there are bars in a notebook
+        Called about ten times a second with the progress. Without it there are bars in a notebook
         and at a terminal.
 
     Other Parameters
@@ -96,25 +96,23 @@ def simulate(
     gpu_workers, other_workers
         Workers of a local cluster; by default chosen for the machine.
     tls
-        Encrypt the traffic of a local cluster, with a certificate made for it.
+        Encrypt the traffic of a local cluster, with a certificate made for the cluster.
     wait_s, patience_s
-        How long to wait for partitions that are empty at the start, and for those that become
-        empty later, seconds. A client waits for its scheduler by itself:
-        ``Client(address, timeout=600)``.
+        Seconds to wait for partitions that are empty at the start, and for partitions that become
+        empty later. A client waits for its scheduler by itself: ``Client(address, timeout=600)``.
     folder
-        A folder to keep the run in, so that nothing is lost if this process or its machine dies;
-        its parent must exist. The run stays there at the end: remove it with `remove_run` once
-        the result is saved. Without a folder, the points are in a temporary one as long as the
-        result is in use. It may be a URL that fsspec opens, such as ``s3://bucket/run``.
+        A folder for the run, so that the run can be resumed if this process or its machine dies;
+        its parent must exist. The run stays in the folder at the end: remove it with `remove_run`
+        once the result is saved. By default the points are in a temporary folder as long as the
+        result is in use. The folder may be a URL that fsspec opens, such as ``s3://bucket/run``.
     parts
-        Place of the parts: a folder that the workers see, or a URL that fsspec opens, such as
+        Storage of the parts: a folder that the workers see, or a URL that fsspec opens, such as
         ``s3://bucket/survey``. It needs a `folder`, whose database lists the parts; `remove_run`
-        removes both. By default they are in `folder`.
+        removes both. By default the parts are in `folder`.
     resume
-        Go on from what an earlier run has left in `folder`; from the beginning if there is
-        nothing. `on_frame` gets the frames that it has not had yet, but for those of the last
-        second before the earlier run died, of the last seconds where `folder` is a URL, which it
-        gets again.
+        Continue an unfinished run in `folder`; without an unfinished run, start from the
+        beginning. `on_frame` gets the frames that it has not had yet. It gets frames of the last
+        second before the earlier run died again, of the last seconds if `folder` is a URL.
 
     Returns
     -------
@@ -124,10 +122,10 @@ def simulate(
     Raises
     ------
     LidarError
-        If the cluster lacks something or a task fails, if `folder` has an unfinished run and
-        `resume` is not set, if that is damaged, or of another scene, survey, planning or
-        version; one or two lines say which and what to do. KeyboardInterrupt passes through
-        once everything has been stopped.
+        If the cluster lacks a resource or a task fails, if `folder` has an unfinished run and
+        `resume` is not set, if that run is damaged, or of another scene, survey, planning or
+        version; the message says which and what to do. KeyboardInterrupt passes through once
+        the run has been stopped.
 
     Examples
     --------
@@ -136,10 +134,10 @@ def simulate(
     >>> print(len(result.cloud), "points")                            # doctest: +SKIP
     1613 points
     """
-    given = given_options("simulate", options, without=_NOT_OF_SURVEYS)
-    run_options = RunOptions(**given)
+    chosen = given_options("simulate", options, without=_NOT_OF_SURVEYS)
+    run_options = RunOptions(**chosen)
     jobs = OneJob(Job(scene, survey, planning))
-    if run_options.own:  # before anything is made in the folder
+    if run_options.own:  # before the folder is changed
         check_backend_here(run_options.backend)
     with page_of(jobs, run_options.live) as page:
         result = Run(jobs, run_options, Kept(), Screen(on_progress), page, on_frame).execute()
@@ -165,7 +163,7 @@ class Campaign(described.CampaignSpec):  # noqa: D101 - as there
         out
             Its folder, or a URL that fsspec opens.
         on_progress
-            Called some ten times a second. Without it there are bars in a notebook and at a
+            Called about ten times a second. Without it there are bars in a notebook and at a
             terminal.
         shard
             (3, 10): do the third of ten equal shares of the jobs, for `lidarpool.merge`.
@@ -174,26 +172,26 @@ class Campaign(described.CampaignSpec):  # noqa: D101 - as there
         ----------------
         client
             Client of a cluster whose workers declare the resources GPU and LIDAR; without one, a
-            local cluster is started. LIDAR needs a slot more than a survey does: jobs are written
-            in it.
+            local cluster is started. LIDAR needs a slot more than for a survey, in which jobs are
+            written.
         backend, collectors, queue_capacity, batch_mb
-            As for `simulate`; by default those of the scenario.
+            As for `simulate`; by default as in the scenario.
         gpu_workers
             Workers of a local cluster that cast; by default as many as the scenario says.
         parts
-            Place of the points during the run, as for `simulate`.
+            Storage of the points during the run, as for `simulate`.
         resume
-            Go on from what an earlier run has left in `out`, from the beginning if there is
-            nothing.
+            Continue an unfinished run in `out`; without an unfinished run, start from the
+            beginning.
         fresh
-            Remove first what an unfinished run of a campaign has left in `out`.
+            Remove an unfinished run of a campaign in `out` first.
         retry_failed
             Resume, and do the jobs that have failed again.
         verify
-            Resume, and compare every byte of the jobs that are done: those with others are damaged,
-            and made again.
+            Resume, and compare every byte of the jobs that are done: jobs with other bytes are
+            damaged, and done again.
         overwrite
-            Replace a finished data set, too; if jobs of it have failed, with `fresh`.
+            Replace a finished data set, too; with `fresh`, also if some of its jobs have failed.
         live
             Show the jobs in the browser meanwhile, as `lidarpool run --live` does; in a notebook,
             in the cell.
@@ -203,21 +201,21 @@ class Campaign(described.CampaignSpec):  # noqa: D101 - as there
         Returns
         -------
         CampaignRun
-            What was done, and which jobs have failed: a job that fails does not stop the others.
+            Counts of the jobs, and the jobs that have failed: a failed job does not stop the run.
 
         Raises
         ------
         LidarError
-            If the cluster lacks something, or `out` holds something else, or the unfinished run of
-            another campaign or version; one or two lines say which and what to do.
+            If the cluster lacks a resource, or `out` holds other files, or the unfinished run of
+            another campaign or version; the message says which and what to do.
         """
-        place = output_place(out)
-        given = given_options("run", options, without=_NOT_OF_CAMPAIGNS)
-        folder = Storage.at(place).below(RUN_FOLDER)
-        run_options = RunOptions(out=place, folder=folder, **given).with_pool(self.pool, given)
+        target = output_place(out)
+        chosen = given_options("run", options, without=_NOT_OF_CAMPAIGNS)
+        folder = Storage.at(target).below(RUN_FOLDER)
+        run_options = RunOptions(out=target, folder=folder, **chosen).with_pool(self.pool, chosen)
         jobs = self.of_shard(Shard(*shard))
         with page_of(jobs, run_options.live) as page:
-            output = DataSetOutput(place, jobs)
+            output = DataSetOutput(target, jobs)
             return Run(jobs, run_options, output, Screen(on_progress), page).execute()
 
     @checked
@@ -230,15 +228,16 @@ class Campaign(described.CampaignSpec):  # noqa: D101 - as there
     ) -> SweepStream:
         """Stream the sweeps of the jobs while they are cast, without a data set.
 
-        They are those of a data set of the campaign, with all columns, in the order of jobs,
-        sensors and time. Points go from the workers to this process, past the scheduler. The sweeps
-        of a worker that dies are cast again. A job that fails is left out, and the log says why.
+        The sweeps are the same as in a data set of the campaign, with all columns, in the order of
+        jobs, sensors and time. Points go from the workers to this process, past the scheduler. The
+        sweeps of a worker that dies are cast again. A job that fails is left out, and the log says
+        why.
 
         Parameters
         ----------
         ahead
-            Most sweeps that are being cast or wait to be read, which bounds the memory: give twice
-            as many as there are casting workers, or more.
+            Largest number of sweeps that are being cast or wait to be read, which bounds the
+            memory: give twice the number of casting workers, or more.
         split
             Only the jobs of this split.
 
@@ -253,14 +252,14 @@ class Campaign(described.CampaignSpec):  # noqa: D101 - as there
         Raises
         ------
         LidarError
-            If there is no such split; in the loop, if the cluster lacks something or is lost.
+            If the split is unknown; in the loop, if the cluster lacks a resource or is lost.
         """
-        given = given_options("stream", options, without=_NOT_OF_STREAMS)
+        chosen = given_options("stream", options, without=_NOT_OF_STREAMS)
         if split is not None and split not in self.splits:
-            known = (
+            hint = (
                 did_you_mean(split, self.splits) or f" It has {', '.join(self.splits) or 'none'}."
             )
-            raise LidarError(f"The campaign has no split {split!r}.{known}")
+            raise LidarError(f"The campaign has no split {split!r}.{hint}")
         numbers = [n for n in range(self.count) if split in (None, self.split(n))]
-        run_options = RunOptions(**given).with_pool(self.pool, given)
+        run_options = RunOptions(**chosen).with_pool(self.pool, chosen)
         return SweepStream(self, numbers, ahead, run_options)

@@ -1,6 +1,6 @@
 """The command `lidarpool`.
 
-The modules of commands import what they need within functions, so that help and completion are
+The modules of commands import within functions, so that help and completion are
 immediate: the imports of a run take a second.
 """
 
@@ -42,8 +42,8 @@ if TYPE_CHECKING:
 PROGRAM = "lidarpool"
 PLUGINS = "lidarpool.commands"  # each is a click.Command
 
-# What `demo` and `run` have in common; each is a field of RunOptions.
-_shown = shared.together(
+# Common options of `demo` and `run`; each is a field of RunOptions.
+_common_options = shared.combine(
     shared.flag("--tls", help="Encrypt the traffic of the local cluster."),
     shared.flag("--live", help="Show the live page in the browser; it stays until Ctrl-C."),
     click.option(
@@ -70,28 +70,28 @@ def _seconds(text: str) -> float:
     try:
         return float(text[:-1]) * unit if unit else float(text)
     except ValueError as error:
-        told = f"{text!r} is not a time: give a number with s, m or h."
-        raise click.BadParameter(told) from error
+        message = f"{text!r} is not a time: give a number with s, m or h."
+        raise click.BadParameter(message) from error
 
 
-def _runs(command: Callable[..., None]) -> Callable[..., None]:
-    """Give a command a Terminal and RunOptions, and other options by their names.
+def _with_run_options(command: Callable[..., None]) -> Callable[..., None]:
+    """Pass a Terminal and RunOptions to a command, and further options by their names.
 
-    What workers need is imported meanwhile in the background.
+    The modules that workers need are imported meanwhile in the background.
     """
 
     @wraps(command)
     def prepared(
         *, quiet: bool, verbose: bool, as_json: bool, cluster: Path | None = None,
-        only: str | None, strict: bool, pictures: bool = False, **given: Any,
+        only: str | None, strict: bool, pictures: bool = False, **settings: Any,
     ) -> None:  # fmt: skip
         if only and pictures:
             raise click.UsageError("--only leaves out what --pictures draws: give one of them.")
-        given["extent"] = "pictures" if pictures else only
+        settings["extent"] = "pictures" if pictures else only
         from ..base.fork_server import keep_freed_memory, start_fork_server, stop_fork_server
 
         keep_freed_memory()
-        if cluster is None and given.get("scheduler") is None:
+        if cluster is None and settings.get("scheduler") is None:
             start_fork_server()
         try:
             with deferred_interrupts():  # an interrupted import cannot be repeated
@@ -100,16 +100,22 @@ def _runs(command: Callable[..., None]) -> Callable[..., None]:
                 from . import run_command  # noqa: F401
                 from .terminal import Terminal
             set_logs(verbose)
-            own: dict[str, Any] = {}
+            run_settings: dict[str, Any] = {}
             if cluster is not None:
-                own = {"cluster": ClusterFile.load(cluster), "wait_s": QUEUE_S}
-                own["patience_s"] = QUEUE_S
-            # A scenario may say the backend, too.
+                run_settings = {"cluster": ClusterFile.load(cluster), "wait_s": QUEUE_S}
+                run_settings["patience_s"] = QUEUE_S
+            # A scenario may give the backend, too.
             names = {field.name for field in fields(RunOptions)} - {"backend"}
-            own |= {name: one for name, one in given.items() if name in names and one is not None}
-            others = {name: one for name, one in given.items() if name not in names}
+            run_settings |= {
+                name: value
+                for name, value in settings.items()
+                if name in names and value is not None
+            }
+            further_settings = {
+                name: value for name, value in settings.items() if name not in names
+            }
             terminal = Terminal(quiet, verbose, as_json)
-            command(terminal, RunOptions(**own), **others)
+            command(terminal, RunOptions(**run_settings), **further_settings)
             terminal.end(strict=strict)
         finally:
             stop_fork_server()
@@ -118,7 +124,7 @@ def _runs(command: Callable[..., None]) -> Callable[..., None]:
 
 
 class _Commands(click.Group):
-    """The commands of this package and, for names that it has not, those of plug-ins."""
+    """The commands of this package, and the commands of plug-ins."""
 
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
         """Return the command of a name; LidarError if its plug-in cannot be used."""
@@ -155,8 +161,8 @@ def cli() -> None:
 
 @cli.command()
 @shared.out
-@_shown
-@_runs
+@_common_options
+@_with_run_options
 def demo(terminal: Terminal, options: RunOptions, extent: str | None) -> None:
     """Run the default survey and plan a path, on this machine, and draw the pictures.
 
@@ -207,8 +213,8 @@ def demo(terminal: Terminal, options: RunOptions, extent: str | None) -> None:
     help="How long to wait for partitions that become empty later; by default "
     f"{PATIENCE_S:g}s, with --cluster {QUEUE_S / 3600:g}h.",
 )
-@_shown
-@_runs
+@_common_options
+@_with_run_options
 def run(
     terminal: Terminal,
     options: RunOptions,
@@ -217,7 +223,7 @@ def run(
     extent: str | None,
     number: int | None,
     backend: str | None,
-    **given: Any,
+    **settings: Any,
 ) -> None:
     """Run the survey of a scenario or mesh file, or a campaign of many.
 
@@ -248,7 +254,7 @@ def run(
 
     if options.fresh and (options.resume or options.verify):
         raise click.UsageError("--resume continues the run that --fresh deletes: give one of them.")
-    if number is not None and given["shard"] is not None:
+    if number is not None and settings["shard"] is not None:
         raise click.UsageError("--job does one job, and --shard a share: give one of them.")
     if options.retry_failed and (options.fresh or number is not None):
         raise click.UsageError("--retry-failed goes on with a campaign: not with --fresh or --job.")
@@ -258,13 +264,13 @@ def run(
         return
     assert options.out is not None, "it has a default"
     options = replace(options, folder=Storage.at(options.out).below(RUN_FOLDER))
-    several = len(paths) > 1
-    if of_mesh and several:
+    is_several = len(paths) > 1
+    if of_mesh and is_several:
         raise click.UsageError(
             "--sensor, --pose and the like are for one mesh: run each by itself."
         )
-    if several or (not of_mesh and is_campaign(paths[0])):
-        campaign = CampaignSpec.of_scenarios(paths) if several else CampaignSpec.load(paths[0])
+    if is_several or (not of_mesh and is_campaign(paths[0])):
+        campaign = CampaignSpec.of_scenarios(paths) if is_several else CampaignSpec.load(paths[0])
         if number is not None:
             run_job(campaign, number, terminal, options, backend, extent)
         elif extent is not None:
@@ -272,13 +278,13 @@ def run(
                 "--only and --pictures are for one survey: a data set is written as a whole."
             )
         else:
-            run_campaign(campaign.of_shard(given["shard"] or ALL), terminal, options, backend)
+            run_campaign(campaign.of_shard(settings["shard"] or ALL), terminal, options, backend)
     elif options.retry_failed or options.verify or number is not None:
         raise click.UsageError("--job, --retry-failed and --verify are for campaigns.")
     else:
         scenario = Scenario.load(paths[0], of_mesh)
-        given["made_of"] = {"path": str(paths[0].absolute()), "options": of_mesh}
-        run_scenario(scenario, terminal, options, backend, extent=extent, **given)
+        settings["made_of"] = {"path": str(paths[0].absolute()), "options": of_mesh}
+        run_scenario(scenario, terminal, options, backend, extent=extent, **settings)
 
 
 @cli.command()
@@ -292,9 +298,9 @@ def run(
 @shared.strict
 @shared.as_json
 def merge(
-    shards: tuple[Any, ...], out: Any, quiet: bool, strict: bool, as_json: bool, **given: Any
+    shards: tuple[Any, ...], out: Any, quiet: bool, strict: bool, as_json: bool, **settings: Any
 ) -> None:
-    """Make one data set or result of shards; after a kill, the same command goes on.
+    """Merge shards into a data set or result; after a kill, the same command goes on.
 
     \b
     Examples:
@@ -305,7 +311,7 @@ def merge(
     from .terminal import Terminal
 
     screen = Terminal(quiet, False, as_json)
-    report = merge_shards(shards, out, screen=screen, **given)
+    report = merge_shards(shards, out, screen=screen, **settings)
     points = report["points"] if "points" in report else report["totals"]["points"]
     lines = [*screen.notes(report["notes"]), f"{plural(points, 'point')} in {out}"]
     shared.show({"folder": str(out), **report}, lines, as_json)
@@ -335,27 +341,29 @@ def info(scheduler: str | None, files: TlsFiles, as_json: bool) -> None:
         with connected(scheduler, files) as client:
             pool = Pool.from_client(client)
     workers = sorted(pool or (), key=lambda worker: (sorted(worker.resources), worker.name))
-    told: dict[str, Any] = {
+    figures: dict[str, Any] = {
         "versions": versions(),
         "gpus": list(visible_gpus()),
         "backends": {name: reason or "ready" for name, reason in available_backends().items()},
         "workers": [asdict(worker) for worker in workers],
     }
-    lines = [f"{name:<14} {number}" for name, number in told["versions"].items()]
-    lines += [f"{'GPUs here':<14} {', '.join(told['gpus']) or 'none'}", "backends"]
-    lines += [f"  {name:<12} {state}" for name, state in told["backends"].items()]
+    lines = [f"{name:<14} {number}" for name, number in figures["versions"].items()]
+    lines += [f"{'GPUs here':<14} {', '.join(figures['gpus']) or 'none'}", "backends"]
+    lines += [f"  {name:<12} {state}" for name, state in figures["backends"].items()]
     if pool is not None:
         hosts = plural(len({worker.host for worker in workers}), "host")
         lines.append(f"cluster: {plural(len(workers), 'worker')} on {hosts}")
     for worker in workers:
-        held = ", ".join(f"{name}={slots:g}" for name, slots in sorted(worker.resources.items()))
+        partitions = ", ".join(
+            f"{name}={slots:g}" for name, slots in sorted(worker.resources.items())
+        )
         name = f"{worker.name}  " if worker.name != worker.address else ""
         lines.append(
-            f"  {held or 'no partition':<12} {name}{worker.address}  "
+            f"  {partitions or 'no partition':<12} {name}{worker.address}  "
             f"{plural(worker.nthreads, 'thread')}  {worker.memory / 2**30:.1f} GiB  "
             f"{plural(len(worker.gpus), 'GPU')}"
         )
-    shared.show(told, lines, as_json)
+    shared.show(figures, lines, as_json)
 
 
 def main(arguments: list[str] | None = None) -> NoReturn:
@@ -369,19 +377,19 @@ def main(arguments: list[str] | None = None) -> NoReturn:
     except (KeyboardInterrupt, click.Abort) as error:
         _die(f"{STOPPED}." if _notes(error) else UNTOUCHED, error, INTERRUPTED)
     except Exception as error:
-        if (told := _explanation(error)) is None:  # a defect
+        if (message := _explanation(error)) is None:  # a defect
             raise
-        _die(told, error)
+        _die(message, error)
     sys.exit(0)
 
 
 def _explanation(error: Exception) -> str | None:
-    """Say what a user can correct; None if it is a defect."""
+    """Return the message for an error that users can correct; None for a defect."""
     match error:
         case click.MissingParameter():
             usage = error.ctx.get_usage() if error.ctx else ""
-            told = " ".join(error.format_message().split())  # click gives each choice a line
-            return f"{told}\n{usage}"
+            message = " ".join(error.format_message().split())  # click gives each choice a line
+            return f"{message}\n{usage}"
         case click.ClickException():
             return error.format_message()
         case OSError(filename=str() | Path() as name):
@@ -399,7 +407,7 @@ def _explanation(error: Exception) -> str | None:
 
 
 def _notes(error: BaseException | None) -> list[str]:
-    """List the notes of an error or its cause: what was kept, and how to continue."""
+    """Return the notes of an error or its cause: on kept results, and on how to continue."""
     while error is not None:
         if notes := getattr(error, "__notes__", []):
             return list(notes)
@@ -408,6 +416,7 @@ def _notes(error: BaseException | None) -> list[str]:
 
 
 def _die(message: str, error: BaseException | None = None, code: int = 2) -> NoReturn:
+    """Print a message with the notes of an error, and end the process."""
     message = " ".join([message, *_notes(error)])
     # Names may come from files, and control characters would reach the terminal.
     message = "".join(c if c.isprintable() or c == "\n" else "\ufffd" for c in message)

@@ -1,4 +1,4 @@
-"""What `lidarpool check` prints: the forecast of a survey, or of some jobs of a campaign."""
+"""Output of `lidarpool check`: the forecast of a survey, or of some jobs of a campaign."""
 
 from __future__ import annotations
 
@@ -29,10 +29,10 @@ from ..scenario.plausibility import implausibilities
 from ..scenario.scenario import Scenario
 from .terminal import Terminal
 
-LOOKED_AT = 5  # jobs of a campaign
+FORECAST_JOBS = 5  # of a campaign
 
 
-def look_at(
+def forecast_scenario(
     path: Path,
     of_mesh: Mapping[str, Any],
     number: int | None,
@@ -45,12 +45,12 @@ def look_at(
 ) -> tuple[dict[str, Any], Iterator[str]]:
     """Forecast the run of a scenario, of a campaign or of a job of a campaign.
 
-    `of_mesh` are arguments of `mesh_data`. Of a campaign, some jobs are forecast, the first and the
-    last among them; jobs of campaigns plan no paths.
+    `of_mesh` are arguments of `mesh_data`. Some jobs of a campaign are forecast, among them the
+    first and the last; jobs of campaigns plan no paths.
 
     Returns
     -------
-    Plain data for JSON, and the same as lines of text.
+    Plain data for JSON, and the same data as lines of text.
     """
     campaign = CampaignSpec.load(path) if not of_mesh and is_campaign(path) else None
     if campaign is None and number is not None:
@@ -58,7 +58,8 @@ def look_at(
 
     terminal = Terminal(quiet)
 
-    def look(job_number: int = 0) -> tuple[Job, dict[str, Any]]:
+    def forecast_job(job_number: int = 0) -> tuple[Job, dict[str, Any]]:
+        """Return a job and the figures of its forecast."""
         scenario = (
             Scenario.load(path, of_mesh) if campaign is None else campaign.scenario(job_number)
         )
@@ -75,24 +76,24 @@ def look_at(
             )
         figures["notes"] += advice(built)
         figures["warnings"] += implausibilities(built)
-        figures["sources"] = dict(built.found.sources)
+        figures["sources"] = dict(built.findings.sources)
         if campaign is not None:
             figures["notes"] += campaign.keep.of_jobs.contradictions(scenario.cloud.coordinates)
             figures["job"] = _job_figures(campaign, job_number, figures)
         return job, figures
 
     if campaign is None or number is not None:
-        job, figures = look(number or 0)
-        return figures, _of_job(job, figures)
+        job, figures = forecast_job(number or 0)
+        return figures, _job_lines(job, figures)
     campaign.check_files()
     jobs: list[dict[str, Any]] = []
     notes: list[str] = []
     warnings: list[str] = []
     mistakes = Mistakes()
     last = campaign.count - 1
-    for job_number in dict.fromkeys(last * i // (LOOKED_AT - 1) for i in range(LOOKED_AT)):
+    for job_number in dict.fromkeys(last * i // (FORECAST_JOBS - 1) for i in range(FORECAST_JOBS)):
         with mistakes.noted():
-            _, figures = look(job_number)
+            _, figures = forecast_job(job_number)
             jobs.append(figures["job"])
             notes += figures["notes"]
             warnings += figures["warnings"]
@@ -110,7 +111,7 @@ def look_at(
         "keep": asdict(campaign.keep),
         "jobs": jobs,
     }
-    return figures, _of_campaign(campaign, figures)
+    return figures, _campaign_lines(campaign, figures)
 
 
 def _job_figures(campaign: CampaignSpec, number: int, figures: dict[str, Any]) -> dict[str, Any]:
@@ -130,17 +131,17 @@ def _refuse_other_result(job: Job, options: RunOptions) -> None:
     SurveyOutput(options.out, job.survey, job.outputs).refuse(lambda: identity_of(job))
 
 
-def _holds_files(out: Path | Storage | None) -> bool:
+def _holds_files(folder: Path | Storage | None) -> bool:
     """Return whether the folder of the result holds files."""
     with suppress(NotADirectoryError):
-        return bool(out and Storage.at(out).entries())
+        return bool(folder and Storage.at(folder).entries())
     return False
 
 
-def _of_campaign(campaign: CampaignSpec, figures: dict[str, Any]) -> Iterator[str]:
+def _campaign_lines(campaign: CampaignSpec, figures: dict[str, Any]) -> Iterator[str]:
     """Yield the forecast of a campaign as lines of text."""
-    kept = campaign.keep.format + f", {campaign.keep.layout}" * (campaign.keep.format == "mcap")
-    yield f"campaign    {plural(campaign.count, 'job')}, seed {campaign.seed}, kept as {kept}"
+    data_set = campaign.keep.format + f", {campaign.keep.layout}" * (campaign.keep.format == "mcap")
+    yield f"campaign    {plural(campaign.count, 'job')}, seed {campaign.seed}, kept as {data_set}"
     for name, words in campaign.choices.items():
         yield f"varied      {name}: {words}"
     if campaign.splits:
@@ -183,67 +184,97 @@ def _in_words(job: dict[str, Any]) -> str:
     return f"{job['name']}{split}{': ' if values else ''}{values}"
 
 
-def _of_job(job: Job, figures: dict[str, Any]) -> Iterator[str]:
+def _job_lines(job: Job, figures: dict[str, Any]) -> Iterator[str]:
     """Yield the forecast of a survey as lines of text."""
-    sensor = job.survey.sensor
-    estimate = figures["estimate"]
-    disk = figures["disk"]
     if "job" in figures:
         yield f"job         {_in_words(figures['job'])}"
-    turn = f"{sensor.channels:,} a firing"
-    if len(job.survey.carried) > 1:
-        turn = f"{len(job.survey.carried)} sensors"
-    elif sensor.period is not None and sensor.cycle != "frame":
-        turn = f"{sensor.period:,} x {sensor.channels:,} a {sensor.cycle}"
+    yield from _scene_lines(figures)
+    yield from _survey_lines(job, figures)
+    if drive := figures["drive"]:
+        yield from _drive_lines(drive)
+    yield from _return_lines(job, figures)
+    yield f"planning    {f'{job.trials:,} trials' if job.trials else 'none'}"
+    yield from _need_lines(figures)
+    yield from _remarks(figures)
+
+
+def _scene_lines(figures: dict[str, Any]) -> Iterator[str]:
+    """Yield objects, files, size and masks of the scene."""
     yield f"scene       {', '.join(plural(figures[f'{n}s'], n) for n in ('object', 'triangle'))}"
-    for file, taken in figures["sources"].items():
-        yield f"file        {file}: {taken}"
+    for file, content in figures["sources"].items():
+        yield f"file        {file}: {content}"
     sides = list(zip("xyz", *figures["bounds"], strict=True))
-    spans = ", ".join(f"{axis} {low:,.2f} to {high:,.2f}" for axis, low, high in sides)
-    yield f"size        {' x '.join(f'{high - low:,.2f}' for _, low, high in sides)} m; {spans}"
+    spans = ", ".join(f"{axis} {lower:,.2f} to {upper:,.2f}" for axis, lower, upper in sides)
+    lengths = " x ".join(f"{upper - lower:,.2f}" for _, lower, upper in sides)
+    yield f"size        {lengths} m; {spans}"
     if masked := figures["masked"]:
         shown = ", ".join(masked[:3]) + ", …" * (len(masked) > 3)
         have = plural(len(masked), "object has masks", "objects have masks")
         yield f"masks       {have}: {shown}"
-    drive = figures["drive"]
-    where = "along a trajectory" if drive else f"from {plural(figures['poses'], 'pose')}"
+
+
+def _survey_lines(job: Job, figures: dict[str, Any]) -> Iterator[str]:
+    """Yield scans, poses and rays of the survey."""
+    sensor = job.survey.sensor
+    pattern = f"{sensor.channels:,} a firing"
+    if len(job.survey.carried) > 1:
+        pattern = f"{len(job.survey.carried)} sensors"
+    elif sensor.period is not None and sensor.cycle != "frame":
+        pattern = f"{sensor.period:,} x {sensor.channels:,} a {sensor.cycle}"
+    path = f"from {plural(figures['poses'], 'pose')}"
+    if figures["drive"]:
+        path = "along a trajectory"
     scans = plural(figures["scans"], "scan")
-    yield f"survey      {scans} {where}, {figures['rays']:,} rays ({turn})"
-    if drive:
-        yield f"trajectory  {drive['metres']:,.2f} m in {drive['seconds']:,.3f} s"
-        for one in drive["sensors"]:
-            turns = ""
-            if one["turns"]:
-                turns = f", {one['turns']:,.2f} {one['cycle']}s; in one the carrier moves "
-                turns += f"{one['metres_a_turn']:,.3f} m"
-            firings = plural(one["firings"], "firing")
-            yield f"{one['name'] or 'sensor':<11} {one['model']}, {firings}{turns}"
-    returns = job.survey.returns_each[0]
-    if drive or returns != type(returns)():
+    yield f"survey      {scans} {path}, {figures['rays']:,} rays ({pattern})"
+
+
+def _drive_lines(drive: dict[str, Any]) -> Iterator[str]:
+    """Yield the length of the trajectory, and the firings of each sensor."""
+    yield f"trajectory  {drive['metres']:,.2f} m in {drive['seconds']:,.3f} s"
+    for sensor in drive["sensors"]:
+        cycles = ""
+        if sensor["turns"]:
+            cycles = f", {sensor['turns']:,.2f} {sensor['cycle']}s; in one the carrier moves "
+            cycles += f"{sensor['metres_a_turn']:,.3f} m"
+        firings = plural(sensor["firings"], "firing")
+        yield f"{sensor['name'] or 'sensor':<11} {sensor['model']}, {firings}{cycles}"
+
+
+def _return_lines(job: Job, figures: dict[str, Any]) -> Iterator[str]:
+    """Yield the reported returns, the extinction of air, and the estimated number of points."""
+    survey = job.survey
+    returns = survey.returns_each[0]
+    if figures["drive"] or returns != type(returns)():
         rays = f", {returns.subrays} sub-rays a beam" if returns.subrays > 1 else ""
         yield f"returns     {returns.mode} of each pulse{rays}"
-    if alpha := job.survey.extinction(sensor):
-        left = f"{100 * math.exp(-100 * alpha):.2g} % of the light from 50 m is left"
-        yield f"air         takes {1000 * alpha:.3g}/km: {left}"
-    if estimate:
-        without = job.survey.faults and 2 * estimate["rays"] < job.survey.ray_count
+    if extinction := survey.extinction(survey.sensor):
+        light = f"{100 * math.exp(-100 * extinction):.2g} % of the light from 50 m is left"
+        yield f"air         takes {1000 * extinction:.3g}/km: {light}"
+    if estimate := figures["estimate"]:
+        without = survey.faults and 2 * estimate["rays"] < survey.ray_count
         yield (
             f"points      about {estimate['points']:,} of {estimate['hits']:,} hits, rounded to "
-            f"{job.survey.precision_m:g} m; an estimate from {estimate['rays']:,} rays cast here"
+            f"{survey.precision_m:g} m; an estimate from {estimate['rays']:,} rays cast here"
             f"{', without faults' if without else ''}"
         )
-    yield f"planning    {f'{job.trials:,} trials' if job.trials else 'none'}"
+
+
+def _need_lines(figures: dict[str, Any]) -> Iterator[str]:
+    """Yield the workers, slots, memory and disk that the run needs."""
     backend = figures["backend"]
     device = {None: "backend not known yet", "cuda": "GPU, cuda"}.get(backend, f"CPU, {backend}")
     yield f"cast by     {plural(figures['casters'], 'casting worker')} ({device})"
     for name, slots in figures["slots"].items():
-        # The partition is called GPU, also where its workers have none.
-        label, of = ("casting", " of partition GPU") if name == GPU else (name, "")
+        label = name
+        partition = ""
+        if name == GPU:  # the partition is called GPU, also where its workers have no GPU
+            label = "casting"
+            partition = " of partition GPU"
         count = plural(slots["there"], "slot")
-        yield f"{label:<10}  {count}{of}, at least {slots['needed']:,} needed"
-    there = figures["memory"]["there"]
-    limit = f" of {format_bytes(there)}" if there else ""
+        yield f"{label:<10}  {count}{partition}, at least {slots['needed']:,} needed"
+    available = figures["memory"]["there"]
+    limit = f" of {format_bytes(available)}" if available else ""
     yield f"memory      about {format_bytes(figures['memory']['needed'])}{limit}"
+    disk = figures["disk"]
     parts, result, free = (format_bytes(disk[name]) for name in ("parts", "result", "free"))
     yield f"disk        about {parts} during the run and {result} for the result; {free} free"
-    yield from _remarks(figures)

@@ -15,13 +15,14 @@ from lidarsim.base.plugins import Plugin, find_plugin
 from lidarsim.base.words import printable
 from lidarsim.base.xmlfile import xml_root
 
-# Names are tags of the outermost elements of XML files, without namespaces, or endings of others.
+# Names are tags of the outermost elements of XML files, without namespaces, or endings of other
+# files.
 GROUP = "lidarpool.importers"
 SCENARIO_FILE = "scenario.yaml"
 _HELIOS = "document"  # root of a survey of HELIOS++
 
-# Of a survey, the folder that it writes SCENARIO_FILE and further files into, and folders where
-# references start. It returns the features that are not supported, a line each.
+# Arguments: a survey, the folder for SCENARIO_FILE and further files, and folders where references
+# start. Returns the features that are not supported, a line each.
 Importer = Callable[[Path, Path, Sequence[Path]], Iterable[str]]
 
 
@@ -31,7 +32,7 @@ def importer_of(survey: Path) -> Plugin | None:
     Raises
     ------
     LidarError
-        If two plug-ins import it.
+        If two plug-ins import the survey.
     """
     name = survey.suffix.lower()
     with suppress(OSError, LidarError, ParseError, ValueError, LookupError):
@@ -42,13 +43,13 @@ def importer_of(survey: Path) -> Plugin | None:
 def import_by(
     plugin: Plugin,
     survey: Path,
-    out: Path,
+    folder: Path,
     assets: Sequence[Path],
     check: Callable[[Path], object],
 ) -> list[str]:
-    """Write a survey as a scenario, completely or not at all, into a new folder `out`.
+    """Write a survey as a scenario into a new folder, completely or not at all.
 
-    `check` reads the scenario and raises LidarError if it cannot be simulated.
+    `check` reads the scenario and raises LidarError for a scenario that cannot be simulated.
 
     Returns
     -------
@@ -59,20 +60,20 @@ def import_by(
     LidarError
         If the folder exists, the plug-in fails, or the scenario is refused.
     """
-    if out.exists():
-        raise LidarError(f"{out} exists: name another folder, --out DIR.")
+    if folder.exists():
+        raise LidarError(f"{folder} exists: name another folder, --out DIR.")
     write: Importer = plugin.load(Callable)  # type: ignore[arg-type]
-    out.parent.mkdir(parents=True, exist_ok=True)
-    partial = Path(tempfile.mkdtemp(prefix=f".{out.name}.", dir=out.parent))
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    partial = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", dir=folder.parent))
     try:
         left_out = [*map(str, write(survey, partial, assets))]
         if not (partial / SCENARIO_FILE).is_file():
             raise LidarError(f"{plugin} wrote no {SCENARIO_FILE}.")
         check(partial / SCENARIO_FILE)
         partial.chmod(0o755)  # temporary folders are their owner's alone
-        partial.rename(out)
+        partial.rename(folder)
     except LidarError as error:
-        message = str(error).replace(str(partial), str(out))
+        message = str(error).replace(str(partial), str(folder))
         raise LidarError(f"{survey} makes no scenario: {message}") from error
     except Exception as error:  # a plug-in may raise anything
         reason = printable(str(error)) or type(error).__name__

@@ -20,8 +20,8 @@ from . import shared_options as options
 
 def _size(text: str) -> tuple[int, int]:
     """Parse width and height in pixels from a text such as 1600x1000."""
-    if found := re.fullmatch(r"(\d{1,6})[xX×](\d{1,6})", text):
-        return int(found[1]), int(found[2])
+    if match := re.fullmatch(r"(\d{1,6})[xX×](\d{1,6})", text):
+        return int(match[1]), int(match[2])
     raise click.BadParameter(
         f"{text!r} is not a picture size: give width x height in pixels, such as 1600x1000."
     )
@@ -34,7 +34,7 @@ class _FormatName(click.Choice[str]):
         super().__init__(EXPORTS)
 
     def convert(self, value: str, param: Any, ctx: Any) -> str:
-        """Return the name; an error if there is no such format, or its plug-in cannot be used."""
+        """Return the name; LidarError for an unknown format, or a plug-in that cannot be used."""
         if value in EXPORTS or value == "ply":
             return super().convert(value, param, ctx)
         row_of(value)
@@ -65,7 +65,7 @@ class _FormatName(click.Choice[str]):
     show_default=True,
     help="Column to colour the points of the cloud by; rgb for red, green and blue.",
 )
-def plot(result: Path | Storage, out: Path | Storage | None, **given: Any) -> None:
+def plot(result: Path | Storage, out: Path | Storage | None, **settings: Any) -> None:
     """Draw the pictures of a result, also into its report.html.
 
     \b
@@ -80,20 +80,20 @@ def plot(result: Path | Storage, out: Path | Storage | None, **given: Any) -> No
     from ..report.output import CLOUD, PAGE
     from ..report.result_pictures import draw_pictures
 
-    place = result if out is None else out
-    with local_result(result, (PICTURE_FILE, CLOUD, PAGE)) as made:
-        if not (made / PICTURE_FILE).exists():
+    target = result if out is None else out
+    with local_result(result, (PICTURE_FILE, CLOUD, PAGE)) as folder_of_result:
+        if not (folder_of_result / PICTURE_FILE).exists():
             raise LidarError(
                 f"{result} holds no {PICTURE_FILE}, the data of the pictures: give the "
                 "folder of a finished run (its --out)."
             )
         keep_freed_memory()
-        shown = PictureContent.load(made / PICTURE_FILE)
-        with nullcontext(made) if out is None else local_folder(out) as folder:
-            for path in draw_pictures(shown, made, folder, **given):
-                click.echo(click.format_filename(send(path, place)))
-            if out is None and (made / PAGE).exists():
-                send(made / PAGE, place)
+        content = PictureContent.load(folder_of_result / PICTURE_FILE)
+        with nullcontext(folder_of_result) if out is None else local_folder(out) as folder:
+            for path in draw_pictures(content, folder_of_result, folder, **settings):
+                click.echo(click.format_filename(send(path, target)))
+            if out is None and (folder_of_result / PAGE).exists():
+                send(folder_of_result / PAGE, target)
 
 
 @click.command()
@@ -129,7 +129,7 @@ def export(
     out: Path | Storage | None,
     overwrite: bool,
 ) -> None:
-    """Write the cloud of a finished result in other formats.
+    """Write the cloud of a finished result in further formats.
 
     \b
     Examples:
@@ -144,39 +144,45 @@ def export(
     from ..export.formats import Format
 
     # The report of a result is moved into place last.
-    needed = ("cloud.ply", SWEEPS_FILE, "report.json")
-    place = result if out is None else out
+    required = ("cloud.ply", SWEEPS_FILE, "report.json")
+    target = result if out is None else out
     if isinstance(result, Path) and result.is_file():
         raise LidarError(f"{result} is a file: give its folder, {result.parent}.")
-    with local_result(result, (*needed, *INSTRUMENT_FILES)) as made:
-        for name in needed:
-            if not (made / name).exists():
+    with local_result(result, (*required, *INSTRUMENT_FILES)) as source:
+        for name in required:
+            if not (source / name).exists():
                 raise LidarError(
                     f"{result} holds no {name}: give the folder of a finished run (its --out); "
                     "lidarpool run --resume continues an unfinished one."
                 )
-        sweeps = Sweeps.load(made / SWEEPS_FILE)
-        cloud = CloudFile(made / "cloud.ply")
-        # As the layout, for the formats that have the option; refused if none has.
-        choosing = {name for name in formats if row_of(name).raw_or_compensated} or {*formats}
-        wanted = [
-            Format(name, layout, compensated and name in choosing)
+        sweeps = Sweeps.load(source / SWEEPS_FILE)
+        cloud = CloudFile(source / "cloud.ply")
+        # Formats that have the option; if no format has the option, all, which refuse it.
+        compensated_names = {name for name in formats if row_of(name).raw_or_compensated} or {
+            *formats
+        }
+        chosen_formats = [
+            Format(name, layout, compensated and name in compensated_names)
             for name in dict.fromkeys(formats)
         ]
         written: list[str] = []
-        with result_folder(place) as folder:
-            for one in wanted:  # before any is written, which may take long
-                one.check(folder / one.row.file, cloud, overwrite=overwrite)
-                if isinstance(place, Storage) and not overwrite and one.row.file in place.entries():
+        with result_folder(target) as folder:
+            for chosen in chosen_formats:  # before any is written, which may take long
+                chosen.check(folder / chosen.row.file, cloud, overwrite=overwrite)
+                if (
+                    isinstance(target, Storage)
+                    and not overwrite
+                    and chosen.row.file in target.entries()
+                ):
                     raise LidarError(
-                        f"{place.path(one.row.file)} is there already: give another place with "
+                        f"{target.path(chosen.row.file)} is there already: give another place with "
                         "--out, or --overwrite."
                     )
             try:
-                for one in wanted:
-                    one.write(folder / one.row.file, cloud, sweeps, overwrite=overwrite)
-                    written.append(click.format_filename(send(folder / one.row.file, place)))
-                    for note in one.notes(cloud, sweeps):
+                for chosen in chosen_formats:
+                    chosen.write(folder / chosen.row.file, cloud, sweeps, overwrite=overwrite)
+                    written.append(click.format_filename(send(folder / chosen.row.file, target)))
+                    for note in chosen.notes(cloud, sweeps):
                         click.echo(f"note: {note}", err=True)
                     click.echo(written[-1])
             except (LidarError, KeyboardInterrupt) as error:
@@ -204,7 +210,7 @@ def view(
     film: Path | None,
     export: Path | None,
 ) -> None:
-    """Show a result or a cloud in the browser, or write it as a file to share.
+    """Show a result or a cloud in the browser, or write a file to share.
 
     Several results are shown in one view, with a colour each.
 
@@ -283,7 +289,7 @@ def view(
     help="Points of a cloud without sweeps that are held in memory.",
 )
 @options.as_json
-def compare(a: Path, b: Path, out: Path, as_json: bool, **given: Any) -> None:
+def compare(a: Path, b: Path, out: Path, as_json: bool, **settings: Any) -> None:
     """Compare two clouds or recordings of the same place; B is the reference.
 
     A and B: results, data sets, .ply, .pcd or folders of them, .las, .laz, bags of ROS 2, .pcap and
@@ -300,10 +306,10 @@ def compare(a: Path, b: Path, out: Path, as_json: bool, **given: Any) -> None:
     from ..compare.comparison import compare as compared
 
     keep_freed_memory()
-    found = compared(a, b, **given)
-    page = next(path for path in found.save(out) if path.suffix == ".html")
-    words = [repr(found), f"page     {click.format_filename(page)}"]
-    options.show(found.figures, words, as_json)
+    comparison = compared(a, b, **settings)
+    page = next(path for path in comparison.save(out) if path.suffix == ".html")
+    lines = [repr(comparison), f"page     {click.format_filename(page)}"]
+    options.show(comparison.figures, lines, as_json)
 
 
 @click.command()
@@ -316,7 +322,7 @@ def compare(a: Path, b: Path, out: Path, as_json: bool, **given: Any) -> None:
 @click.option("--intensity", metavar="COLUMN", help="Column of the intensity.")
 @click.option("--white", type=float, help="Intensity of white, if it is the same at all ranges.")
 @options.as_json
-def fit(recording: Path, out: Path, as_json: bool, **given: Any) -> None:
+def fit(recording: Path, out: Path, as_json: bool, **settings: Any) -> None:
     """Fit a sensor to a recording of a unit that stands: noise, lost returns, false alarms.
 
     RECORDING is one that `lidarpool compare` reads, with sweeps and rings.
@@ -331,6 +337,6 @@ def fit(recording: Path, out: Path, as_json: bool, **given: Any) -> None:
     from ..compare.fit import fit as fitted
 
     keep_freed_memory()
-    found = fitted(recording, **given)
-    words = [repr(found), *map(click.format_filename, found.save(out))]
-    options.show(found.figures, words, as_json)
+    fitted_sensor = fitted(recording, **settings)
+    lines = [repr(fitted_sensor), *map(click.format_filename, fitted_sensor.save(out))]
+    options.show(fitted_sensor.figures, lines, as_json)

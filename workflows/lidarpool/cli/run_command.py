@@ -1,4 +1,4 @@
-"""The commands `run` and `demo` without their options: surveys, campaigns, and what is printed."""
+"""The commands `run` and `demo` without their options: surveys, campaigns and their output."""
 
 from __future__ import annotations
 
@@ -52,8 +52,8 @@ def run_scenario(
 ) -> None:
     """Run a scenario, write the result and print a summary.
 
-    Of a `shard`, the run stays, and says what it is `made_of`. LidarError if the run fails;
-    notes of the error say what was kept.
+    With a `shard`, the run stays, and stores `made_of` with it. LidarError if the run fails; notes
+    of the error say what was kept.
     """
     options = options.with_pool(scenario.pool, {"backend": backend})
     if options.own:  # before reading the scene, which may take long
@@ -67,17 +67,17 @@ def run_scenario(
         _run_survey(built, job, options, terminal, extent)
         return
     assert options.out is not None, "commands write"
-    more = {"plans": not no_plan, "extent": extent or "page", "scans": job.survey.scan_count}
+    run_notes = {"plans": not no_plan, "extent": extent or "page", "scans": job.survey.scan_count}
     jobs = OneJob(job, shard)
-    output = Kept({**made_of, **more})
+    output = Kept({**made_of, **run_notes})
     with result_folder(options.out), page_of(jobs, options.live) as page:
         result = Run(jobs, options, output, terminal, page).execute()
     points = len(result.points)
     lines = [*terminal.notes(result.notes)]
     words = shard_in_words(str(shard))
     lines.append(f"{words} in {options.out}: {plural(points, 'point')}, for lidarpool merge")
-    told = {"folder": str(options.out), "shard": str(shard), "points": points}
-    show(told, lines, terminal.as_json)
+    figures = {"folder": str(options.out), "shard": str(shard), "points": points}
+    show(figures, lines, terminal.as_json)
 
 
 def _run_survey(
@@ -86,18 +86,18 @@ def _run_survey(
     options: RunOptions,
     terminal: Terminal,
     extent: str | None,
-    judge: Callable[[RunResult], str] = lambda result: "",
+    note_on: Callable[[RunResult], str] = lambda result: "",
 ) -> None:
-    """Run a job, and write it as the result of a survey; `judge` returns a note on it."""
+    """Run a job, and write the result of a survey; `note_on` returns a note on the result."""
     assert options.out is not None, "commands write"
     for note in advice(built):
         terminal.tell(note)
     jobs = OneJob(job)
     extent = extent or "page"
-    output = SurveyOutput(options.out, job.survey, job.outputs, extent, built.scenario, judge)
+    output = SurveyOutput(options.out, job.survey, job.outputs, extent, built.scenario, note_on)
     with page_of(jobs, options.live) as page:
         result, report = Run(jobs, options, output, terminal, page).execute()
-        lines = _of_result(options.out, result, job, report, terminal)
+        lines = _result_lines(options.out, result, job, report, terminal)
         show(summary(options.out, report), lines, terminal.as_json)
         if options.live and options.stay:
             with local_result(options.out, [CLOUD]) as folder:
@@ -107,7 +107,7 @@ def _run_survey(
 def run_campaign(
     campaign: CampaignSpec, terminal: Terminal, options: RunOptions, backend: str | None
 ) -> None:
-    """Run a campaign, and print a summary; LidarError if it or a job fails."""
+    """Run a campaign, and print a summary; LidarError if the run or a job fails."""
     options = options.with_pool(campaign.pool, {"backend": backend})
     assert options.out is not None, "commands write"
     for warning in _first_job_warnings(campaign, terminal):
@@ -116,16 +116,16 @@ def run_campaign(
         output = DataSetOutput(options.out, campaign)
         run = Run(campaign, options, output, terminal, page).execute()
         names = ("points", "rays", "seconds", "casting_seconds", "resumed", "notes")
-        told = {"folder": str(options.out), "jobs": run.done}
-        told |= {"failed": [row.name for row in run.failed]}
-        told |= {name: getattr(run, name) for name in names}
+        figures = {"folder": str(options.out), "jobs": run.done}
+        figures |= {"failed": [row.name for row in run.failed]}
+        figures |= {name: getattr(run, name) for name in names}
         lines = [
             *terminal.notes(run.notes),
             f"{plural(run.done, 'job')}, {plural(run.rays, 'ray')}, "
             f"{plural(run.points, 'point')} in the data set ({run.seconds:.1f} s)",
             f"data set in {click.format_filename(str(options.out))}: see README.md there",
         ]
-        show(told, lines, terminal.as_json)
+        show(figures, lines, terminal.as_json)
         if options.live and options.stay:
             page.stay()
     if run.failed:
@@ -133,7 +133,7 @@ def run_campaign(
 
 
 def _first_job_warnings(campaign: CampaignSpec, terminal: Terminal) -> list[str]:
-    """Return what is implausible in the first job of a campaign, or of its shard.
+    """Return warnings of implausible settings in the first job of a campaign or shard.
 
     Jobs that cannot be made are reported by the run.
     """
@@ -155,22 +155,22 @@ def run_job(
     backend: str | None,
     extent: str | None,
 ) -> None:
-    """Run one job of a campaign again, and write it as the result of a survey.
+    """Run a job of a campaign again, and write the result of a survey.
 
-    Where the place is the data set of the campaign, the result is a folder in it, and its points
-    must be those of the data set. LidarError if they are not, or cannot be: it was made by
-    other software, or its files there are damaged.
+    If the target is the data set of the campaign, the result is a folder in the data set, and its
+    points must be the same. LidarError if they differ, or cannot be compared: the data set was made
+    by other software, or its files of the job are damaged.
     """
     assert options.out is not None, "commands write"
-    place = Storage.at(options.out)
+    target = Storage.at(options.out)
     name = campaign.name(number)
-    dataset = DataSet(place, **asdict(campaign.keep))
-    of_dataset = CAMPAIGN_FILE in place.entries()
+    dataset = DataSet(target, **asdict(campaign.keep))
+    of_dataset = CAMPAIGN_FILE in target.entries()
     if of_dataset:
-        backend = check_same(place, campaign)["backend"]
-        verify(place, number)
-        out = output_place(f"{options.out}/job-{name}")
-        options = replace(options, out=out, folder=Storage.at(out).below(RUN_FOLDER))
+        backend = check_same(target, campaign)["backend"]
+        verify(target, number)
+        folder = output_place(f"{options.out}/job-{name}")
+        options = replace(options, out=folder, folder=Storage.at(folder).below(RUN_FOLDER))
     scenario = campaign.scenario(number)
     assert scenario is not None, "of a file"
     built = build(scenario, plans=False)
@@ -178,45 +178,46 @@ def run_job(
     for warning in implausibilities(built):
         terminal.warn(warning)
 
-    def compare(result: RunResult) -> str:
-        rows = read_table(place) if of_dataset else ()
-        known = [row.sha256 for row in rows if row.number == number and row.done]
-        if not known:
+    def compare_with_dataset(result: RunResult) -> str:
+        """Return a note that the points are the data set's, or raise LidarError."""
+        rows = read_table(target) if of_dataset else ()
+        hashes = [row.sha256 for row in rows if row.number == number and row.done]
+        if not hashes:
             return ""
-        if Tally.of(result.points).sha256 not in known:
+        if Tally.of(result.points).sha256 not in hashes:
             raise LidarError(
-                f"job {name} has other points than those in {place}: files that it is "
+                f"job {name} has other points than those in {target}: files that it is "
                 "made of have changed, such as images of a mesh."
             )
-        return f"the points are those of job {name} in {place}, bit for bit"
+        return f"the points are those of job {name} in {target}, bit for bit"
 
     options = options.with_pool(scenario.pool, {"backend": backend})
-    _run_survey(built, replace(job, number=0), options, terminal, extent, compare)
+    _run_survey(built, replace(job, number=0), options, terminal, extent, compare_with_dataset)
 
 
-def _of_result(
-    out: Path | Storage,
+def _result_lines(
+    target: Path | Storage,
     result: RunResult,
     job: Job,
     report: dict[str, Any],
     terminal: Terminal,
 ) -> Iterator[str]:
-    """Say in lines of text what a survey has given."""
+    """Yield the outcome of a survey as lines of text."""
     yield from terminal.notes(report["notes"])
-    on = report["hits_on_surfaces"]
+    surface_hits = report["hits_on_surfaces"]
     yield (
         f"{plural(job.survey.scan_count, 'scan')}, {plural(result.rays, 'ray')}, "
-        f"{plural(on, 'hit')} on {plural(len(job.scene.all_names), 'object')}"
-        f"{f' and {result.hits - on:,} on none' if result.hits > on else ''}, "
+        f"{plural(surface_hits, 'hit')} on {plural(len(job.scene.all_names), 'object')}"
+        f"{f' and {result.hits - surface_hits:,} on none' if result.hits > surface_hits else ''}, "
         f"{plural(len(result.points), 'point')} in the cloud{result.thinned} "
         f"({result.backend}, {result.survey_seconds:.1f} s)"
     )
     if (plan := result.plan) is not None:
-        found = "no path free of collisions was found"
+        outcome = "no path free of collisions was found"
         if plan.collision_free:
-            found = f"path of {plan.length:.2f} m, free of collisions"
+            outcome = f"path of {plan.length:.2f} m, free of collisions"
         possible = "no path is possible, the obstacles leave no way"
         if math.isfinite(plan.shortest_possible):
             possible = f"the shortest possible is {plan.shortest_possible:.2f} m"
-        yield f"{found}; {possible} ({plan.trials} trials, {result.planning_seconds:.1f} s)"
-    yield f"results in {click.format_filename(str(out))}: {', '.join(report['files'])}"
+        yield f"{outcome}; {possible} ({plan.trials} trials, {result.planning_seconds:.1f} s)"
+    yield f"results in {click.format_filename(str(target))}: {', '.join(report['files'])}"

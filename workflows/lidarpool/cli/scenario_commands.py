@@ -21,20 +21,21 @@ from lidarsim.base.vocabulary import UNITS_M
 from lidarsim.base.words import plural, without_common_prefix
 
 from . import shared_options as options
-from .shared_options import WARNED, Command, overwrite, together
+from .shared_options import WARNED, Command, combine, overwrite
 
 if TYPE_CHECKING:
     from lidarsim.base.storage import Storage
     from lidarsim.scene.scene import Scene
+    from lidarsim.sensor.models import SensorModel
 
     from ..plan.stations import StationPlan
     from ..run.cluster.connection import TlsFiles
     from ..scenario.scenario import Scenario
 
-MOST_COPIED = 20_000_000  # triangles of files that cannot share them
+MAX_COPIED_TRIANGLES = 20_000_000  # of files that cannot share triangles
 PLAN_FILE = "stations.yaml"
 PICTURE_FILE = "stations.png"
-_OBJECTS_TOLD = 12
+_SHOWN_OBJECTS = 12
 
 
 @click.command()
@@ -47,7 +48,7 @@ _OBJECTS_TOLD = 12
 @options.mesh_options
 @options.flag("--all", "every", help="Write every field with its default and a description.")
 def init(folder: Path, meshes: tuple[Path, ...], of_mesh: dict[str, Any], every: bool) -> None:
-    """Write a commented scenario file: what you say, and poses; the rest has defaults.
+    """Write a commented scenario file with your options and poses; the rest has defaults.
 
     Its JSON Schema is written beside it, so that editors complete and check it. An existing
     scenario is not overwritten.
@@ -79,8 +80,8 @@ def init(folder: Path, meshes: tuple[Path, ...], of_mesh: dict[str, Any], every:
     notes = []
     if data and not target.exists():
         # From here: the scenario's folder need not be there yet.
-        read = Scenario.from_data(mesh_data(meshes, Path(), of_mesh), source=str(target))
-        built = build(read, plans=False)
+        scenario = Scenario.from_data(mesh_data(meshes, Path(), of_mesh), source=str(target))
+        built = build(scenario, plans=False)
         notes = advice(built)
         if (placing := built.placing) is not None:
             note = placing.note
@@ -171,6 +172,7 @@ def import_(survey: Path, assets: tuple[Path, ...], out: Path | None) -> None:
 @options.strict
 @options.as_json
 def check(
+    *,
     scenario: Path,
     of_mesh: dict[str, Any],
     out: Path | Storage,
@@ -183,7 +185,7 @@ def check(
     strict: bool,
     as_json: bool,
 ) -> None:
-    """Show what a run would do and need.
+    """Show the forecast and the needs of a run.
 
     The scenario is checked; nothing is started. Of a campaign, the values that vary, and five of
     its jobs.
@@ -202,42 +204,49 @@ def check(
     from ..run.cluster.cluster_file import ClusterFile
     from ..run.cluster.connection import connected
     from ..run.options import RunOptions
-    from .forecast import look_at
+    from .forecast import forecast_scenario
 
     try:
         file = None if cluster is None else ClusterFile.load(cluster)
         with nullcontext() if scheduler is None else connected(scheduler, files) as client:
-            asked = RunOptions(out=out, cluster=file)
-            found, lines = look_at(
-                scenario, of_mesh, number, client, asked, backend, no_plan=no_plan, quiet=as_json
+            run_options = RunOptions(out=out, cluster=file)
+            figures, lines = forecast_scenario(
+                scenario,
+                of_mesh,
+                number,
+                client,
+                run_options,
+                backend,
+                no_plan=no_plan,
+                quiet=as_json,
             )
     except LidarError as error:
         if as_json:
             reasons = {"reasons": [str(error)], "notes": [], "warnings": []}
             options.show({"can_run": False, **reasons}, (), True)
         raise
-    options.show(found, lines, as_json)
-    if found["reasons"]:
-        raise LidarError("it cannot run. " + " ".join(found["reasons"]))
+    options.show(figures, lines, as_json)
+    if figures["reasons"]:
+        raise LidarError("it cannot run. " + " ".join(figures["reasons"]))
     if not as_json:
         words = ["lidarpool", "run", str(scenario), *options.as_words(of_mesh)]
-        given: dict[str, object] = {"out": out, "scheduler": scheduler, "cluster": cluster}
-        given |= {"backend": backend, "job": number}
-        if found["occupied"]:
-            given["out"] = _free_place(out)
-        for name, value in given.items():
+        settings: dict[str, object] = {"out": out, "scheduler": scheduler, "cluster": cluster}
+        settings |= {"backend": backend, "job": number}
+        if figures["occupied"]:
+            settings["out"] = _free_target(out)
+        for name, value in settings.items():
             if value is not None and str(value) != "lidarpool-out":
                 words += [f"--{name}", str(value)]
         click.echo(f"it can run: {shlex.join([*words, *['--no-plan'] * no_plan])}")
-    if strict and found["warnings"]:
+    if strict and figures["warnings"]:
         sys.exit(WARNED)
 
 
-def _free_place(out: Path | Storage) -> str:
-    """Name a place beside one that holds another result, in which nothing is."""
+def _free_target(target: Path | Storage) -> str:
+    """Return the name of a free target beside a target that holds another result."""
     from lidarsim.base.storage import Storage
 
-    names = (f"{str(out).rstrip('/')}-{number}" for number in count(2))
+    names = (f"{str(target).rstrip('/')}-{number}" for number in count(2))
     return next(name for name in names if not Storage.at(name).entries())
 
 
@@ -264,15 +273,15 @@ def schema(campaign: bool) -> None:
 
 @click.group(name="scene")
 def scene() -> None:
-    """Make scenes as mesh files: generated ones, or of a point cloud."""
+    """Make scenes as mesh files: generated, or of a point cloud."""
 
 
 _out = click.argument("out", type=click.Path(path_type=Path), metavar="OUT.ply|.glb|.obj")
 
 
-def _made(triangles: int) -> Callable[[Command], Command]:
+def _generated_scene_options(triangles: int) -> Callable[[Command], Command]:
     """Add the output file, the number of triangles, and a seed."""
-    return together(
+    return combine(
         _out,
         overwrite,
         click.option("--triangles", default=triangles, help="Approximate number."),
@@ -281,11 +290,11 @@ def _made(triangles: int) -> Callable[[Command], Command]:
 
 
 @scene.command(context_settings={"show_default": True})
-@_made(triangles=100_000)
+@_generated_scene_options(triangles=100_000)
 @click.option("--trees", default=0, help="Number of detailed trees, instead of the simple ones.")
 @click.option("--cars", default=0, help="Number of detailed cars, instead of the simple ones.")
 def city(out: Path, triangles: int, seed: int, overwrite: bool, trees: int, cars: int) -> None:
-    """Make a city: streets, houses, towers, trees, cars; more triangles make it larger.
+    """Make a city: streets, houses, towers, trees, cars; larger with more triangles.
 
     \b
     Examples:
@@ -299,11 +308,11 @@ def city(out: Path, triangles: int, seed: int, overwrite: bool, trees: int, cars
 
 
 @scene.command(context_settings={"show_default": True})
-@_made(triangles=2_000_000)
+@_generated_scene_options(triangles=2_000_000)
 @click.option("--side", default=1000.0, help="Length of a side in metres.")
 @click.option("--trees", default=0, help="Number of trees, in woods on ground that is not steep.")
 def terrain(out: Path, triangles: int, seed: int, side: float, overwrite: bool, trees: int) -> None:
-    """Make a square of hills and mountains; more triangles make it finer.
+    """Make a square of hills and mountains; finer with more triangles.
 
     \b
     Examples:
@@ -354,31 +363,32 @@ def points(
     """  # noqa: D301 - click wants the character, not its name
     from ..scenario.point_scene import scene_of_points
 
-    made = partial(scene_of_points, cloud, voxel_m=voxel_m, size=size, unit=unit)
-    _write(out, made, overwrite)
+    make = partial(scene_of_points, cloud, voxel_m=voxel_m, size=size, unit=unit)
+    _write(out, make, overwrite)
 
 
-def _write(out: Path, make: Callable[[], Scene], overwrite: bool, paint: bool = False) -> None:
-    """Make a scene and write it to a file; `paint` gives a generated scene its colours."""
+def _write(file: Path, make: Callable[[], Scene], overwrite: bool, paint: bool = False) -> None:
+    """Make a scene and write the scene to a file; `paint` gives a generated scene its colours."""
     from lidarscenes.procedural.paint import painted
     from lidarscenes.writers.scene_file import check_target, write_scene
 
-    check_target(out)
-    if out.exists() and not overwrite:
-        raise LidarError(f"{out} exists: give another name, or --overwrite.")
-    made = make()
-    if out.suffix.lower() == ".glb":  # others keep no colours
-        made = painted(made) if paint else made
-    elif made.instances and made.triangles > MOST_COPIED:
+    check_target(file)
+    if file.exists() and not overwrite:
+        raise LidarError(f"{file} exists: give another name, or --overwrite.")
+    scene = make()
+    if file.suffix.lower() == ".glb":  # other formats hold no colours
+        scene = painted(scene) if paint else scene
+    elif scene.instances and scene.triangles > MAX_COPIED_TRIANGLES:
         raise LidarError(
-            f"{out} would hold {made.triangles:,} triangles, because only .glb files have a tree "
+            f"{file} would hold {scene.triangles:,} triangles, because only .glb files have a tree "
             "once for many places: write one."
         )
-    write_scene(out, made)
-    low, high = made.bounds
+    write_scene(file, scene)
+    lower, upper = scene.bounds
+    size = " x ".join(f"{length:.0f}" for length in upper - lower)
     click.echo(
-        f"{made.triangles:,} triangles, {plural(len(made.names), 'object')}, "
-        f"{' x '.join(f'{length:.0f}' for length in high - low)} m: {click.format_filename(out)}"
+        f"{scene.triangles:,} triangles, {plural(len(scene.names), 'object')}, {size} m: "
+        f"{click.format_filename(file)}"
     )
 
 
@@ -386,7 +396,7 @@ def _write(out: Path, make: Callable[[], Scene], overwrite: bool, paint: bool = 
 @click.argument("model", required=False, metavar="[MODEL|FILE.yaml]")
 @options.path("--out", metavar="FILE.png", help="Draw the model's beams into this file.")
 def sensors(model: str | None, out: Path | None) -> None:
-    """List sensor models, or show the figures of one and draw its beams.
+    """List sensor models, or show the figures of a model and draw its beams.
 
     \b
     Examples:
@@ -435,33 +445,41 @@ def sensors(model: str | None, out: Path | None) -> None:
 
 
 def _row(name: str) -> tuple[str, ...]:
-    """Name of a model, channels, field of view, range, rates, points a second."""
-    import numpy as np
-
-    from lidarsim.sensor.models import load_sensor, read_model
+    """Return name, channels, field of view, range, rates and points a second of a model."""
+    from lidarsim.sensor.models import read_model
 
     model = read_model(name)
-    low, high = model.range_m or (0.0, float("inf"))
+    min_range_m, max_range_m = model.range_m or (0.0, float("inf"))
     rates = dict.fromkeys(model.rates_hz or (model.rate_hz,))
     firings, rate = model.firing_rates(None, None)
     beams = model.beams
     channels = len(beams.elevation_deg) or len(beams.time_us) or 1
-    if model.mirror:
-        view = f"{model.mirror.width_deg:g}° across, below"
-    elif model.prisms:
-        x, y, z = load_sensor(name).directions(np.arange(20_000)).reshape(-1, 3).T
-        up = np.degrees(np.arcsin(np.clip([z.min(), z.max()], -1, 1)))
-        across = 2 * np.degrees(np.abs(np.arctan2(y, x)).max())
-        view = f"{across:.0f}° x {up[0]:.1f}° to {up[1]:.1f}°"
-        if len(beams.elevation_deg) < 2:
-            view = f"{2 * np.degrees(np.arccos(x.min())):.1f}° circle ahead"
-    else:
-        view = f"360° x {min(beams.elevation_deg):.1f}° to {max(beams.elevation_deg):.1f}°"
+    view = _field_of_view(name, model)
     if model.typical:
         view += ", typical"
-    turns = " to ".join(f"{one:g}" for one in rates)
+    rates_text = " to ".join(f"{rate_hz:g}" for rate_hz in rates)
     points = f"{firings * rate * channels:,.0f}"
-    return name, f"{channels:,}", view, f"{low:g} to {high:g} m", turns, points
+    ranges = f"{min_range_m:g} to {max_range_m:g} m"
+    return name, f"{channels:,}", view, ranges, rates_text, points
+
+
+def _field_of_view(name: str, model: SensorModel) -> str:
+    """Return the field of view of a model in words."""
+    import numpy as np
+
+    from lidarsim.sensor.models import load_sensor
+
+    elevations_deg = model.beams.elevation_deg
+    if model.mirror:
+        return f"{model.mirror.width_deg:g}° across, below"
+    if not model.prisms:
+        return f"360° x {min(elevations_deg):.1f}° to {max(elevations_deg):.1f}°"
+    x, y, z = load_sensor(name).directions(np.arange(20_000)).reshape(-1, 3).T
+    if len(elevations_deg) < 2:
+        return f"{2 * np.degrees(np.arccos(x.min())):.1f}° circle ahead"
+    lowest, highest = np.degrees(np.arcsin(np.clip([z.min(), z.max()], -1, 1)))
+    width = 2 * np.degrees(np.abs(np.arctan2(y, x)).max())
+    return f"{width:.0f}° x {lowest:.1f}° to {highest:.1f}°"
 
 
 def _share(text: str) -> float:
@@ -514,7 +532,7 @@ def _share(text: str) -> float:
 @overwrite
 @options.as_json
 def stations(
-    scene: Path, model: str, out: Path | None, overwrite: bool, as_json: bool, **given: Any
+    scene: Path, model: str, out: Path | None, overwrite: bool, as_json: bool, **settings: Any
 ) -> None:
     """Choose stations for a terrestrial scan.
 
@@ -527,13 +545,13 @@ def stations(
       lidarpool stations hall.glb --sensor riegl-vz400 --coverage 95%
       lidarpool stations hall/scenario.yaml --sensor riegl-vz400 --count 6 --out hall/stations
     """  # noqa: D301 - click wants the character, not its name
-    count = given["count"]
-    coverage = given["coverage"]
+    count = settings["count"]
+    coverage = settings["coverage"]
     if count is not None and coverage is not None:
         raise click.UsageError("--count and --coverage both say when to stop: give one of them.")
     from lidarsim.sensor.models import full_name, load_sensor
 
-    from ..plan.stations import STATIONS_MOST, plan_stations
+    from ..plan.stations import plan_stations
     from ..report.result_pictures import draw_stations
     from ..scenario.advice import advice
     from ..scenario.build import build
@@ -542,33 +560,26 @@ def stations(
     from .terminal import Terminal
 
     folder = Path(f"{scene.stem}-stations") if out is None else out
-    there = [folder / name for name in (PLAN_FILE, PICTURE_FILE) if (folder / name).exists()]
-    if there and not overwrite:
-        raise LidarError(f"{there[0]} exists: give another folder, --out, or --overwrite.")
+    existing = [folder / name for name in (PLAN_FILE, PICTURE_FILE) if (folder / name).exists()]
+    if existing and not overwrite:
+        raise LidarError(f"{existing[0]} exists: give another folder, --out, or --overwrite.")
     model = full_name(model)
     sensor = load_sensor(model)
-    read = Scenario.load(scene)
+    scenario = Scenario.load(scene)
     terminal = Terminal(quiet=as_json)
     with terminal.status("reading the scene", logged=False):
-        built = build(read, plans=False)
+        built = build(scenario, plans=False)
     with terminal.status("looking from all places", logged=False):
-        plan = plan_stations(built.scene, sensor, **given)
+        plan = plan_stations(built.scene, sensor, **settings)
     with terminal.status("drawing the picture", logged=False):
         page = draw_stations(built.scene, plan)
     folder.mkdir(parents=True, exist_ok=True)
     file = folder / PLAN_FILE
-    file.write_text(_scenario(read, folder, model, plan), "utf-8", newline="\n")
+    file.write_text(_stations_scenario(scenario, folder, model, plan), "utf-8", newline="\n")
     page.save(folder / PICTURE_FILE)
-    notes = advice(replace(built, placing=Placing(())))  # stations take the place of its poses
-    reached = float(plan.coverage[-1])
-    if coverage is not None and reached < coverage:
-        notes.append(
-            f"{coverage:.0%} is not reached: {STATIONS_MOST} stations, which is the most, cover "
-            f"{reached:.1%}; try a greater --height, --slant or --spacing"
-        )
-    if count is not None and len(plan.stations) < count:
-        notes.append(f"{len(plan.stations)} of {count} stations already see all that can be seen")
-    figures = _figures(plan, built.scene.names, sensor.model, notes)
+    notes = advice(replace(built, placing=Placing(())))  # stations replace its poses
+    notes += _shortfalls(plan, count, coverage)
+    figures = _plan_figures(plan, built.scene.names, sensor.model, notes)
     lines = [*_plan_lines(plan, built.scene.names), *(f"note: {note}" for note in notes)]
     options.show(figures, lines, as_json)
     if not as_json:
@@ -576,23 +587,37 @@ def stations(
         click.echo(f"next: lidarpool check {shlex.quote(str(file))}")
 
 
-def _scenario(read: Scenario, folder: Path, model: str, plan: StationPlan) -> str:
+def _shortfalls(plan: StationPlan, count: int | None, coverage: float | None) -> Iterator[str]:
+    """Yield notes on a plan with less than `coverage`, or fewer stations than `count`."""
+    from ..plan.stations import MAX_STATIONS
+
+    reached = float(plan.coverage[-1])
+    if coverage is not None and reached < coverage:
+        yield (
+            f"{coverage:.0%} is not reached: {MAX_STATIONS} stations, which is the most, cover "
+            f"{reached:.1%}; try a greater --height, --slant or --spacing"
+        )
+    if count is not None and len(plan.stations) < count:
+        yield f"{len(plan.stations)} of {count} stations already see all that can be seen"
+
+
+def _stations_scenario(scenario: Scenario, folder: Path, model: str, plan: StationPlan) -> str:
     """Return the text of a scenario whose poses are the stations."""
     import yaml
 
-    def moved(file: Path) -> str:
+    def relative(file: Path) -> str:
         return Path(os.path.relpath(file.resolve(), folder.resolve())).as_posix()
 
-    entry = read.scene.model_dump(exclude_unset=True, mode="json", by_alias=True)
+    entry = scenario.scene.model_dump(exclude_unset=True, mode="json", by_alias=True)
     copies = entry.get("copies", [])
     named = [*entry.get("files", []), *(c.get(kind) for c in copies for kind in ("file", "table"))]
-    for one in filter(None, named):
-        one["file"] = moved(read.path(one["file"]))
-    own = model.endswith((".yaml", ".yml"))
+    for file_entry in filter(None, named):
+        file_entry["file"] = relative(scenario.path(file_entry["file"]))
+    is_file = model.endswith((".yaml", ".yml"))
     data = {
         **({"scene": entry} if entry else {}),
-        "sensor": {"model": moved(Path(model)) if own else model},
-        "poses": [[round(float(part), 3) for part in place] for place in plan.stations],
+        "sensor": {"model": relative(Path(model)) if is_file else model},
+        "poses": [[round(float(part), 3) for part in position] for position in plan.stations],
         "steps": 36,
         "cloud": {"columns": ["range"]},
     }
@@ -604,17 +629,17 @@ def _scenario(read: Scenario, folder: Path, model: str, plan: StationPlan) -> st
     return head + yaml.safe_dump(data, sort_keys=False, default_flow_style=None, width=100)
 
 
-def _figures(
+def _plan_figures(
     plan: StationPlan, names: tuple[str, ...], sensor: str, notes: list[str]
 ) -> dict[str, Any]:
-    """Return what --json prints."""
+    """Return the figures of a plan for --json."""
     return {
         "sensor": sensor,
         "places": len(plan.candidates),
         "spacing_m": plan.spacing_m,
         "stations": [
-            {"position": [round(float(part), 3) for part in place], "coverage": float(share)}
-            for place, share in zip(plan.stations, plan.coverage, strict=True)
+            {"position": [round(float(part), 3) for part in position], "coverage": float(share)}
+            for position, share in zip(plan.stations, plan.coverage, strict=True)
         ],
         "objects": {
             name: {"visible_m2": float(visible), "covered_m2": float(covered)}
@@ -625,30 +650,31 @@ def _figures(
 
 
 def _plan_lines(plan: StationPlan, names: tuple[str, ...]) -> Iterator[str]:
-    """Print a plan as lines of text: stations, then objects, those with most left first."""
+    """Yield a plan as lines of text: stations, then objects, the largest uncovered area first."""
     yield (
         f"{plural(len(plan.candidates), 'place')} on a grid of {plan.spacing_m:g} m, which see "
         f"{plan.visible_m2.sum():,.0f} m²"
     )
     yield "station        x          y          z   covered     added"
-    before = 0.0
+    previous_share = 0.0
     rows = zip(plan.stations.tolist(), plan.coverage.tolist(), strict=True)
     for number, ((x, y, z), share) in enumerate(rows, 1):
-        yield f"{number:7} {x:10,.2f} {y:10,.2f} {z:10,.2f} {share:9.1%} {share - before:9.1%}"
-        before = share
-    left = plan.visible_m2 - plan.covered_m2
-    order = [k for k in (-left).argsort(kind="stable").tolist() if plan.visible_m2[k] > 0]
-    shown = order[:_OBJECTS_TOLD]
+        gain = share - previous_share
+        yield f"{number:7} {x:10,.2f} {y:10,.2f} {z:10,.2f} {share:9.1%} {gain:9.1%}"
+        previous_share = share
+    uncovered_m2 = plan.visible_m2 - plan.covered_m2
+    order = [k for k in (-uncovered_m2).argsort(kind="stable").tolist() if plan.visible_m2[k] > 0]
+    shown = order[:_SHOWN_OBJECTS]
     labels = without_common_prefix(names)
     groups = [(labels[k], [k]) for k in shown]
-    if others := order[_OBJECTS_TOLD:]:
-        groups.append((f"{len(others):,} others", others))
-    wide = max(6, *(len(label) for label, _ in groups))
-    yield f"{'object':<{wide}}  can be seen   covered"
-    for label, those in groups:
-        visible = plan.visible_m2[those].sum()
-        covered = plan.covered_m2[those].sum()
-        yield f"{label:<{wide}} {visible:9,.1f} m² {covered / visible:9.1%}"
+    if further := order[_SHOWN_OBJECTS:]:
+        groups.append((f"{len(further):,} others", further))
+    width = max(6, *(len(label) for label, _ in groups))
+    yield f"{'object':<{width}}  can be seen   covered"
+    for label, members in groups:
+        visible = plan.visible_m2[members].sum()
+        covered = plan.covered_m2[members].sum()
+        yield f"{label:<{width}} {visible:9,.1f} m² {covered / visible:9.1%}"
     blind = len(names) - len(order)
     if blind:
         yield f"out of sight from all places: {plural(blind, 'object')}"

@@ -30,7 +30,7 @@ class StoragePath(click.Path):
         super().__init__(path_type=Path, **options)
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
-        """Give a Path, or a Storage."""
+        """Return a Path, or a Storage."""
         return Storage.at(value) if is_url(value) else super().convert(value, param, ctx)
 
 
@@ -73,83 +73,97 @@ copies = click.option(
 )
 
 
-def together(*added: Callable[[Command], Command]) -> Callable[[Command], Command]:
-    """Return what adds options to a command, in their order."""
-    return lambda command: reduce(lambda made, option: option(made), reversed(added), command)
+def combine(*options: Callable[[Command], Command]) -> Callable[[Command], Command]:
+    """Return a decorator that adds options to a command, in their order."""
+    return lambda command: reduce(
+        lambda decorated, option: option(decorated), reversed(options), command
+    )
 
 
 def _position(text: str) -> list[float]:
-    """Parse x,y,z; whole numbers stay so, to be written as they were."""
+    """Parse x,y,z; whole numbers stay integers, to be written without a decimal point."""
     try:
         x, y, z = map(float, text.split(","))
     except ValueError as error:
-        told = f"{text!r} is no place: give x,y,z, such as 0,0,1.9; angles are for scenario files."
-        raise click.BadParameter(told) from error
-    return [int(one) if one.is_integer() else one for one in (x, y, z)]
+        message = (
+            f"{text!r} is no place: give x,y,z, such as 0,0,1.9; angles are for scenario files."
+        )
+        raise click.BadParameter(message) from error
+    return [int(number) if number.is_integer() else number for number in (x, y, z)]
 
 
 def _names(text: str) -> list[str]:
+    """Parse names that commas separate."""
     return [name.strip() for name in text.split(",")]
 
 
-def _of_mesh(name: str, what: str, **more: Any) -> Callable[[Command], Command]:
-    return click.option(f"--{name}", help=f"Of a mesh: {what}.", **more)
+def _mesh_option(name: str, description: str, **settings: Any) -> Callable[[Command], Command]:
+    """Return an option of a mesh file."""
+    return click.option(f"--{name}", help=f"Of a mesh: {description}.", **settings)
 
 
-_list_of_mesh = partial(_of_mesh, metavar="NAME,…", type=_names, multiple=True)
+_mesh_list_option = partial(_mesh_option, metavar="NAME,…", type=_names, multiple=True)
 pose = click.option("--pose", metavar="X,Y,Z", type=_position, default="0,0,0",
                     help="Place of the sensor in the scene, metres.")  # fmt: skip
-_mesh_options = together(
-    _of_mesh("sensor", "sensor, one of lidarpool sensors or a file", metavar="MODEL|FILE.yaml"),
-    _of_mesh("unit", "length unit; by default its own, or m", type=click.Choice([*UNITS_M])),
-    _of_mesh("up-axis", "upward axis; by default its own, or z", type=click.Choice([*"xyz"])),
-    _list_of_mesh("pose", "place of the sensor, metres", metavar="X,Y,Z", type=_position),
-    _list_of_mesh("columns", "further columns of its points, such as range,intensity"),
-    _list_of_mesh("format", "further formats of the cloud, such as las"),
+_mesh_options = combine(
+    _mesh_option("sensor", "sensor, one of lidarpool sensors or a file", metavar="MODEL|FILE.yaml"),
+    _mesh_option("unit", "length unit; by default its own, or m", type=click.Choice([*UNITS_M])),
+    _mesh_option("up-axis", "upward axis; by default its own, or z", type=click.Choice([*"xyz"])),
+    _mesh_list_option("pose", "place of the sensor, metres", metavar="X,Y,Z", type=_position),
+    _mesh_list_option("columns", "further columns of its points, such as range,intensity"),
+    _mesh_list_option("format", "further formats of the cloud, such as las"),
 )
 
 
 def mesh_options(command: Command) -> Command:
-    """Add what may be said of a mesh file; the command gets a dict of it, see `mesh_data`."""
+    """Add the options of a mesh file, which the command gets as a mapping for `mesh_data`."""
 
     @wraps(command)
-    def with_options(*arguments: Any, pose: Any, columns: Any, format: Any, **given: Any) -> None:  # noqa: A002
-        said = {name: given.pop(name) for name in ("sensor", "unit", "up_axis")}
-        said |= {"pose": [*pose], "columns": [*chain(*columns)], "format": [*chain(*format)]}
-        said = {name: value for name, value in said.items() if value not in (None, [])}
-        command(*arguments, of_mesh=said, **given)
+    def with_options(
+        *arguments: Any,
+        pose: Any,
+        columns: Any,
+        format: Any,  # noqa: A002 - the name of the option
+        **settings: Any,
+    ) -> None:
+        values = {name: settings.pop(name) for name in ("sensor", "unit", "up_axis")}
+        values |= {"pose": [*pose], "columns": [*chain(*columns)], "format": [*chain(*format)]}
+        values = {name: value for name, value in values.items() if value not in (None, [])}
+        command(*arguments, of_mesh=values, **settings)
 
     return _mesh_options(with_options)
 
 
 def as_words(of_mesh: Mapping[str, Any]) -> Iterator[str]:
-    """Yield the words of a command that give these options."""
+    """Yield the words of a command line that give these options."""
     for name, value in of_mesh.items():
-        for one in value if name == "pose" else [value]:
+        for item in value if name == "pose" else [value]:
             yield f"--{name.replace('_', '-')}"
-            yield one if isinstance(one, str) else ",".join(map(str, one))
+            yield item if isinstance(item, str) else ",".join(map(str, item))
 
 
 def scheduler(command: Command) -> Command:
     """Add --scheduler and its certificates, which the command gets as `scheduler` and `files`."""
 
     @wraps(command)
-    def with_files(*arguments: Any, **given: Any) -> None:
+    def with_files(*arguments: Any, **settings: Any) -> None:
         from lidarsim.base.input_files import input_size
 
         from ..run.cluster.connection import TlsFiles
 
-        if given.get("cluster") is not None and given["scheduler"] is not None:
+        if settings.get("cluster") is not None and settings["scheduler"] is not None:
             raise click.UsageError(
                 "--cluster starts a cluster, --scheduler is for one that runs: give one of them."
             )
-        if given.get("tls") and (given["cluster"] is not None or given["scheduler"] is not None):
+        if settings.get("tls") and (
+            settings["cluster"] is not None or settings["scheduler"] is not None
+        ):
             raise click.UsageError(
                 "--tls is for a cluster of this machine: that of --cluster is encrypted if its "
                 "file says so, that of --scheduler if its address begins with tls://."
             )
-        files = TlsFiles(*(given.pop(f"tls_{part}") for part in ("ca", "cert", "key")))
-        if any(files) and given["scheduler"] is None:
+        files = TlsFiles(*(settings.pop(f"tls_{part}") for part in ("ca", "cert", "key")))
+        if any(files) and settings["scheduler"] is None:
             raise click.UsageError(
                 "--tls-ca, --tls-cert and --tls-key are for the cluster of --scheduler: give its "
                 "address, tls://host:8786."
@@ -157,22 +171,22 @@ def scheduler(command: Command) -> Command:
         for file in filter(None, files):
             with explained(f"{file} cannot be read"):
                 input_size(file)
-        command(*arguments, files=files, **given)
+        command(*arguments, files=files, **settings)
 
     pem = click.Path(exists=True, dir_okay=False, path_type=Path)
-    for name, what in (
+    for name, description in (
         ("key", "Private key of that certificate, if its file does not hold it."),
         ("cert", "Own certificate for an encrypted cluster, a PEM file."),
         ("ca", "Certificate of the authority of an encrypted cluster, a PEM file."),
     ):
-        click.option(f"--tls-{name}", type=pem, help=what)(with_files)
+        click.option(f"--tls-{name}", type=pem, help=description)(with_files)
     return click.option(
         "--scheduler", metavar="ADDRESS", help="Use this Dask cluster, tcp://host:8786."
     )(with_files)
 
 
 def show(figures: Mapping[str, Any], lines: Iterable[str], as_json: bool) -> None:
-    """Print figures as one JSON document, or else what they say as lines of text."""
+    """Print figures as a JSON document, or lines of text in its place."""
     if as_json:
         lines = [json.dumps(figures, indent=1, allow_nan=False, default=str)]
     for line in lines:
@@ -180,15 +194,15 @@ def show(figures: Mapping[str, Any], lines: Iterable[str], as_json: bool) -> Non
 
 
 def set_logs(shown: bool) -> None:
-    """Show log messages and warnings of libraries in this process, or drop them.
+    """Show or drop log messages and warnings of libraries in this process.
 
-    The command itself tells users what matters. For a log file, redirect the output of `-v`. In
-    workers that share the terminal, too: the driver reports a failed task once, and Dask's worker
-    would log it as well, with a traceback.
+    The command itself tells users what matters. For a log file, redirect the output of `-v`. This
+    is also called in workers that share the terminal: the driver reports a failed task once, and
+    Dask's worker would log the task as well, with a traceback.
     """
     logging.disable(logging.NOTSET if shown else logging.CRITICAL)
     if shown:
         for handler in logging.getLogger("distributed").handlers:
-            handler.setLevel(logging.INFO)  # a local cluster has raised it
+            handler.setLevel(logging.INFO)  # a local cluster has raised the level
     elif not sys.warnoptions:
         warnings.simplefilter("ignore")

@@ -1,4 +1,4 @@
-"""What a command tells at the terminal while it works."""
+"""Output of a command at the terminal while the command works."""
 
 from __future__ import annotations
 
@@ -20,28 +20,28 @@ from ..base.streams import Unheard
 from ..run.progress import Pace, Progress, Screen, Show, bars, rows, standing_still
 from .shared_options import WARNED, set_logs
 
-# Plain lines come after another tenth of the elapsed time, within these bounds, so that a survey
-# of hours does not fill a log.
+# Plain lines follow after a tenth of the elapsed time, within these bounds, so that a survey of
+# hours does not fill a log.
 PLAIN_EVERY_S = (2.0, 60.0)
 
 
 @dataclass(frozen=True)
 class Terminal(Screen):
-    """Tells the user of a command, on stderr."""
+    """Messages and progress for the user of a command, on stderr."""
 
     quiet: bool = False
     verbose: bool = False
     as_json: bool = False
-    warnings: list[str] = field(default_factory=list, init=False)  # those that were printed
+    warnings: list[str] = field(default_factory=list, init=False)  # that were printed
 
     @property
     def _stream(self) -> Any:
-        """Stream for what is told; None to tell nothing."""
+        """Stream for messages; None for a quiet command."""
         return None if self.quiet or sys.stderr is None else Unheard(sys.stderr)
 
     @property
     def _console(self) -> Console | None:
-        """Console of a terminal that can move its cursor; None without one."""
+        """Console of a terminal with a movable cursor, or None."""
         console = Console(file=self._stream) if self._stream else None
         return console if console and console.is_terminal and not console.is_dumb_terminal else None
 
@@ -51,23 +51,23 @@ class Terminal(Screen):
             self._stream.write(f"note: {words}\n")
 
     def warn(self, words: str) -> None:
-        """Print a warning once, also in a quiet command; `warnings` lists it."""
+        """Print a warning once, also in a quiet command, and append the warning to `warnings`."""
         if words not in self.warnings:
             self.warnings.append(words)
             click.echo(f"warning: {words}", err=True)
 
     def end(self, *, strict: bool) -> None:
-        """End the process with exit code 1 if it is `strict` and a warning was printed."""
+        """End the process with exit code 1 if `strict` is set and a warning was printed."""
         if strict and self.warnings:
             sys.exit(WARNED)
 
     def notes(self, notes: Iterable[str]) -> Iterator[str]:
-        """Return lines of notes, without those that were printed as warnings."""
+        """Return lines of notes, without notes that were printed as warnings."""
         return (f"note: {note}" for note in notes if note not in self.warnings)
 
     @contextmanager
     def status(self, words: str, *, logged: bool = True) -> Iterator[None]:
-        """Show what is going on while the body runs; in a log, too, if it is `logged`."""
+        """Show a status while the body runs; in a log, too, if the status is `logged`."""
         console = self._console
         if logged and console is None and self._stream:
             _tell(self._stream, words)
@@ -76,7 +76,7 @@ class Terminal(Screen):
 
     @contextmanager
     def writing(self, words: str) -> Iterator[WritingProgress]:
-        """Show a bar for each output while the body writes them; in a log, `words` and lines."""
+        """Show a bar for each output that the body writes; in a log, `words` and lines."""
         console = self._console
         if console is not None:
             with rows(console) as show:
@@ -87,7 +87,7 @@ class Terminal(Screen):
 
     @contextmanager
     def progress(self) -> Iterator[Show]:
-        """Show bars by stage with rates and time left; elsewhere than on a terminal, some lines."""
+        """Show bars by stage with rates and time left; lines of text if not on a terminal."""
         if (console := self._console) is not None:
             with bars(console) as show:
                 yield show
@@ -109,61 +109,62 @@ class Terminal(Screen):
 
 
 def _tell(stream: Any, line: str) -> None:
+    """Write a line with the time of day."""
     stream.write(f"{time.strftime('%H:%M:%S')}  {line}\n")
 
 
 class WrittenLines:
-    """Progress of what is written as lines of text in a stream; call it as `WritingProgress`."""
+    """Progress of written outputs as lines of text in a stream; called as `WritingProgress`."""
 
     def __init__(self, stream: Any) -> None:
         self.stream = stream
         self._started = time.monotonic()
         self._next = PLAIN_EVERY_S[0]  # seconds since the start of the next line
 
-    def __call__(self, name: str, done: int, total: int, unit: str) -> None:
-        """Write a line, if it is time."""
-        now = time.monotonic() - self._started
-        if now >= self._next and done < total:
-            least, most = PLAIN_EVERY_S
-            self._next = now + min(max(least, now / 10), most)
-            _tell(self.stream, f"{name}  {done:,} of {total:,} {unit}")
+    def __call__(self, name: str, completed: int, total: int, unit: str) -> None:
+        """Write a line if a line is due."""
+        elapsed_s = time.monotonic() - self._started
+        if elapsed_s >= self._next and completed < total:
+            min_s, max_s = PLAIN_EVERY_S
+            self._next = elapsed_s + min(max(min_s, elapsed_s / 10), max_s)
+            _tell(self.stream, f"{name}  {completed:,} of {total:,} {unit}")
 
 
 class PlainLines:
-    """Progress as lines of text in a stream; call it with each `Progress`."""
+    """Progress as lines of text in a stream; called with each `Progress`."""
 
     def __init__(self, stream: Any) -> None:
         self.stream = stream
         self._next = PLAIN_EVERY_S[0]  # seconds since the start of the next line
         self._paces = {"survey": Pace(), "planning": Pace(), "campaign": Pace()}
-        self._done: set[str] = set()
-        self._standing = ""  # the last line about it
+        self._completed: set[str] = set()
+        self._standing_still = ""  # the last line about it
 
     def __call__(self, progress: Progress) -> None:
-        """Write a line, if it is time or something has been completed."""
-        now = progress.seconds
-        if (standing := standing_still(progress)) != self._standing:
-            self._standing = standing
+        """Write a line if a line is due or a stage has been completed."""
+        elapsed_s = progress.seconds
+        if (standing := standing_still(progress)) != self._standing_still:
+            self._standing_still = standing
             jobs = f"{progress.jobs_done:,} jobs" if progress.jobs else ""
             ready = jobs or f"{progress.collected:,} scans"
             _tell(self.stream, f"run  {standing or 'continues'}, {ready} are done")
-        due = now >= self._next
+        due = elapsed_s >= self._next
         if due:
-            least, most = PLAIN_EVERY_S
-            self._next = now + min(max(least, now / 10), most)
+            min_s, max_s = PLAIN_EVERY_S
+            self._next = elapsed_s + min(max(min_s, elapsed_s / 10), max_s)
         scans = progress.scans
-        done = min(progress.collected, progress.framed)
-        whole = f"{scans:,} scans, {progress.points:,} points"
+        scans_done = min(progress.collected, progress.framed)
+        survey_summary = f"{scans:,} scans, {progress.points:,} points"
         trials = progress.trials
-        for what, count, total, unit, all_ in (
-            ("survey", done, scans, f"scans, {progress.points:,} points", whole),
+        for stage, count, total, unit, stage_summary in (
+            ("survey", scans_done, scans, f"scans, {progress.points:,} points", survey_summary),
             ("planning", progress.trials_done, trials, "trials", f"{trials:,} trials"),
             ("campaign", progress.jobs_done, progress.jobs, "jobs", f"{progress.jobs:,} jobs"),
         ):
-            pace = self._paces[what].told(now, count, total)
-            if total and count == total and what not in self._done:
-                self._done.add(what)
-                _tell(self.stream, f"{what}  done: {all_} in {now:.1f} s")
+            pace = self._paces[stage].told(elapsed_s, count, total)
+            if total and count == total and stage not in self._completed:
+                self._completed.add(stage)
+                _tell(self.stream, f"{stage}  done: {stage_summary} in {elapsed_s:.1f} s")
             elif due and count < total:
-                line = f"{what}  {count:,} of {total:,} {unit}  {pace}"
+                line = f"{stage}  {count:,} of {total:,} {unit}  {pace}"
                 _tell(self.stream, line.rstrip())

@@ -1,9 +1,9 @@
 """Cost of a path: its length, and a penalty for entering discs that exceeds any short cut.
 
-It is evaluated hundreds of thousands of times a second by one thread: single precision, particles
-along the last, contiguous axis, results in preallocated buffers. Only + - x / and square roots are
-used, and sums run over leading axes only, which fixes the order of additions: the same numbers on
-every machine.
+The cost is evaluated hundreds of thousands of times a second by one thread: single precision,
+particles along the last, contiguous axis, results in preallocated buffers. Only + - x / and square
+roots are used, and sums run over leading axes only, which fixes the order of additions: the same
+numbers on every machine.
 """
 
 from __future__ import annotations
@@ -19,20 +19,21 @@ from lidarsim.base.arrays import Floats, Floats32
 _MARGIN = 4e-6
 _SLOPE = 8.0  # penalty of a depth of 1; a waypoint 1 inside a disc shortens the path by < 2
 _TOUCH = np.float32(1e-5)  # penalty below which an entry is a rounding error, well under _MARGIN
-_NOTHING = np.float32(1e-15)  # added to steps, so that one of length 0 has a direction too
-# Most elements of a buffer, to limit the memory. Smaller blocks, which fit a second-level cache,
-# were slower: NumPy takes 0.7 µs to start each of some 35 operations on a block.
+_TINY = np.float32(1e-15)  # added to steps, so that a step of length 0 has a direction too
+# Largest number of elements of a buffer, to limit the memory. Smaller blocks, which fit a
+# second-level cache, were slower: NumPy takes 0.7 µs to start each of some 35 operations.
 _BLOCK_ELEMENTS = 160_000
-_BLOCK_DISCS = 16  # least in a block, if there are so many; more particles make longer loops
+_BLOCK_DISCS = 16  # smallest number in a block; more particles make longer loops
 
 
 class PathCost:
     """The cost of many paths between the same two ends, in the coordinates of `PathAxes`.
 
-    A path that enters no disc costs its length. A path that does also costs more than the longest
-    detour around all discs, and `_SLOPE` to twice that for each unit of depth in each disc: it
-    never beats a free path, and its cost falls on the way out. The discs, (m, 2) and (m,), are on
-    `PathAxes`; each of the `particles` paths has `waypoints` corners between the two ends.
+    A path that enters no disc costs its length. A path that enters discs also costs more than the
+    longest detour around all discs, and `_SLOPE` to twice that for each unit of depth in each disc:
+    it never beats a free path, and its cost falls on the way out. The discs, (m, 2) and (m,), are
+    in the coordinates of `PathAxes`; each of the `particles` paths has `waypoints` corners between
+    the two ends.
     """
 
     def __init__(self, centres: Floats, radii: Floats, waypoints: int, particles: int) -> None:
@@ -47,33 +48,33 @@ class PathCost:
         self._cost = np.empty(particles, np.float32)
         pairs = min(len(radii), _BLOCK_DISCS) * (waypoints + 1) * particles
         blocks = min(particles, max(1, -(-pairs // _BLOCK_ELEMENTS)))  # rounded up
-        ends = [particles * block // blocks for block in range(blocks + 1)]
-        self._blocks = [slice(*span) for span in itertools.pairwise(ends)]
-        # One for each width, at most two: their loops run over whole, contiguous buffers, which is
-        # twice as fast as over parts of wider ones.
+        starts = [particles * block // blocks for block in range(blocks + 1)]
+        self._blocks = [slice(*span) for span in itertools.pairwise(starts)]
+        # A workspace for each width, at most two: their loops run over whole, contiguous buffers,
+        # which is twice as fast as over parts of wider buffers.
         self._workspaces = {
-            width: _Workspace(centres, _grown(centres, radii), waypoints + 1, width)
+            width: _Workspace(centres, _enlarged_radii(centres, radii), waypoints + 1, width)
             for width in {block.stop - block.start for block in self._blocks}
         }
 
     def evaluate(self) -> Floats32:
-        """Costs of the paths in `waypoints`: (particles,), the same buffer at every call."""
+        """Return the costs (particles,) of `waypoints`, the same buffer at every call."""
         for block in self._blocks:
             workspace = self._workspaces[block.stop - block.start]
             workspace.evaluate(self._points[..., block], self._cost[block], self.entry_price)
         return self._cost
 
 
-def _grown(centres: Floats, radii: Floats) -> Floats:
-    """Radii with a margin for rounding, which does not reach either end of the path."""
+def _enlarged_radii(centres: Floats, radii: Floats) -> Floats:
+    """Return radii with a margin for rounding, which does not reach either end of the path."""
     distance = np.sqrt(centres[:, 0] ** 2 + centres[:, 1] ** 2)
-    to_ends = [np.sqrt((centres[:, 0] - x) ** 2 + centres[:, 1] ** 2) for x in (-0.5, 0.5)]
-    nearest = np.maximum(np.minimum(*to_ends), radii)
+    end_distances = [np.sqrt((centres[:, 0] - x) ** 2 + centres[:, 1] ** 2) for x in (-0.5, 0.5)]
+    nearest = np.maximum(np.minimum(*end_distances), radii)
     return np.asarray(np.minimum(radii + _MARGIN * (1 + distance + radii), nearest))
 
 
 class _Workspace:
-    """Buffers for a block of paths and some discs at a time, and the arithmetic on them.
+    """Buffers for a block of paths and a block of discs, and the arithmetic on these buffers.
 
     For a segment with unit direction e, middle M and half length h, and a disc around C, let
     u = (C - M) · e and c = (C - M) x e. The point of the segment closest to C is
@@ -89,26 +90,28 @@ class _Workspace:
         def singles(*shape: int) -> Floats32:
             return np.empty(shape, np.float32)
 
-        discs = min(len(radii), max(1, _BLOCK_ELEMENTS // (segments * width)))  # at a time
-        self._parts = [slice(i, i + discs) for i in range(0, len(radii), discs or 1)]
+        discs = min(len(radii), max(1, _BLOCK_ELEMENTS // (segments * width)))  # in a block
+        self._disc_blocks = [slice(i, i + discs) for i in range(0, len(radii), discs or 1)]
         doubled = (2 * centres).astype(np.float32)
         self._x = doubled[:, 0, None, None]
         self._y = doubled[:, 1, None, None]
         self._squared_radii = (4 * radii**2).astype(np.float32)[:, None]
         self._weights = (_SLOPE / (4 * radii)).astype(np.float32)[:, None]
-        # (x and y, segment, particle)
+        # Axes: x and y, segment, particle.
         self._direction, self._middle, self._products = (
             singles(2, segments, width) for _ in range(3)
         )
-        self._length, self._along_middle, self._across_middle = (
+        self._length, self._parallel_middle, self._perpendicular_middle = (
             singles(segments, width) for _ in range(3)
         )
-        # (disc, segment, particle)
-        self._along, self._across, self._spare = (singles(discs, segments, width) for _ in range(3))
-        self._prices = singles(1 + discs, width)  # of the discs before, and of each of these
+        # Axes: disc, segment, particle.
+        self._parallel, self._perpendicular, self._scratch = (
+            singles(discs, segments, width) for _ in range(3)
+        )
+        self._prices = singles(1 + discs, width)  # of all blocks before, and of each disc
         self._price = singles(width)
         self._entered = np.empty(width, np.bool_)
-        self._zeros = np.zeros(width, np.float32)  # as an array, see above
+        self._zeros = np.zeros(width, np.float32)  # as an array, see the class
 
     def evaluate(self, points: Floats32, cost: Floats32, entry_price: float) -> None:
         """Write to `cost`, (width,), the costs of paths through `points`, (k + 2, 2, width)."""
@@ -118,23 +121,23 @@ class _Workspace:
         first = points[:-1].transpose(1, 0, 2)
         last = points[1:].transpose(1, 0, 2)
         np.subtract(last, first, out=direction)
-        np.add(direction[0], _NOTHING, out=direction[0])
+        np.add(direction[0], _TINY, out=direction[0])
         np.square(direction, out=products)
         np.add(products[0], products[1], out=length)
         np.sqrt(length, out=length)
         np.add.reduce(length, axis=0, out=cost)
-        if not self._parts:
+        if not self._disc_blocks:
             return
         middle = self._middle
         price = self._price
         np.divide(direction, length, out=direction)
         np.add(last, first, out=middle)
         np.multiply(middle, direction, out=products)
-        np.add(products[0], products[1], out=self._along_middle)
+        np.add(products[0], products[1], out=self._parallel_middle)
         np.multiply(middle, direction[::-1], out=products)
-        np.subtract(products[0], products[1], out=self._across_middle)
+        np.subtract(products[0], products[1], out=self._perpendicular_middle)
         price.fill(0)
-        for discs in self._parts:
+        for discs in self._disc_blocks:
             self._add_price(discs)
         np.greater(price, _TOUCH, out=self._entered)
         np.add(cost, price, out=cost)
@@ -142,37 +145,38 @@ class _Workspace:
         np.add(cost, price, out=cost)
 
     def _add_price(self, discs: slice) -> None:
-        """Add to `_price` the penalty for entering some discs."""
+        """Add to `_price` the penalty for entering the discs of a block."""
         x = self._x[discs]
         y = self._y[discs]
         squared_radii = self._squared_radii[discs]
         count = len(x)
-        along = self._along[:count]
-        across = self._across[:count]
-        spare = self._spare[:count]
-        (east, north), prices = self._direction, self._prices[: 1 + count]
+        parallel = self._parallel[:count]
+        perpendicular = self._perpendicular[:count]
+        scratch = self._scratch[:count]
+        east, north = self._direction
+        prices = self._prices[: 1 + count]
 
-        np.multiply(x, east, out=along)
-        np.multiply(y, north, out=spare)
-        np.add(along, spare, out=along)
-        np.subtract(along, self._along_middle, out=along)
+        np.multiply(x, east, out=parallel)
+        np.multiply(y, north, out=scratch)
+        np.add(parallel, scratch, out=parallel)
+        np.subtract(parallel, self._parallel_middle, out=parallel)
 
-        np.multiply(x, north, out=across)
-        np.multiply(y, east, out=spare)
-        np.subtract(across, spare, out=across)
-        np.subtract(across, self._across_middle, out=across)
+        np.multiply(x, north, out=perpendicular)
+        np.multiply(y, east, out=scratch)
+        np.subtract(perpendicular, scratch, out=perpendicular)
+        np.subtract(perpendicular, self._perpendicular_middle, out=perpendicular)
 
-        np.abs(along, out=along)
-        np.minimum(along, self._length, out=spare)
-        np.subtract(along, spare, out=along)
-        np.square(along, out=along)
-        np.square(across, out=across)
-        np.add(along, across, out=along)
-        nearest = np.minimum.reduce(along, axis=1, out=prices[1:])  # squared distances, times 4
+        np.abs(parallel, out=parallel)
+        np.minimum(parallel, self._length, out=scratch)
+        np.subtract(parallel, scratch, out=parallel)
+        np.square(parallel, out=parallel)
+        np.square(perpendicular, out=perpendicular)
+        np.add(parallel, perpendicular, out=parallel)
+        nearest = np.minimum.reduce(parallel, axis=1, out=prices[1:])  # squared distances, times 4
 
         # (r² - d²) / r lies between the depth and twice the depth
         np.subtract(squared_radii, nearest, out=nearest)
         np.multiply(nearest, self._weights[discs], out=nearest)
         np.maximum(nearest, self._zeros, out=nearest)
-        prices[0] = self._price  # added one after the other, whatever the parts
+        prices[0] = self._price  # added in the order of the discs, whatever the blocks
         np.add.reduce(prices, axis=0, out=self._price)

@@ -10,34 +10,34 @@ from lidarsim.base.arrays import Floats
 
 
 def segment_distances(first: Floats, last: Floats, centres: Floats) -> Floats:
-    """Distance of every segment to every centre.
+    """Return the distance of every segment to every centre.
 
-    Segments (s, 2) and (s, 2), which may be single points, and centres (m, 2): returns the distance
-    from each centre to the closest point of each segment, (s, m).
+    Segments (s, 2) and (s, 2), which may be single points, and centres (m, 2): the distance from
+    each centre to the closest point of each segment is (s, m).
     """
-    along = last - first
-    squared = along[:, 0] ** 2 + along[:, 1] ** 2
+    direction = last - first
+    squared = direction[:, 0] ** 2 + direction[:, 1] ** 2
     to_centre = centres[None, :, :] - first[:, None, :]
-    reach = to_centre[..., 0] * along[:, None, 0] + to_centre[..., 1] * along[:, None, 1]
-    # A segment of length 0 has reach 0: whatever the divisor, its one point is closest.
+    reach = to_centre[..., 0] * direction[:, None, 0] + to_centre[..., 1] * direction[:, None, 1]
+    # A segment of length 0 has reach 0: whatever the divisor, its point is closest.
     share = np.clip(reach / np.where(squared > 0, squared, 1.0)[:, None], 0.0, 1.0)
-    gap_x = to_centre[..., 0] - share * along[:, None, 0]
-    gap_y = to_centre[..., 1] - share * along[:, None, 1]
+    gap_x = to_centre[..., 0] - share * direction[:, None, 0]
+    gap_y = to_centre[..., 1] - share * direction[:, None, 1]
     return np.asarray(np.sqrt(gap_x**2 + gap_y**2))
 
 
 def path_length(points: Floats) -> float:
-    """Length of the path through `points`, (p, 2)."""
+    """Return the length of the path through `points`, (p, 2)."""
     steps = np.diff(points, axis=0)
     # Not np.sum, whose order of additions varies: the length is the same on any machine.
     return float(sum(np.sqrt(steps[:, 0] ** 2 + steps[:, 1] ** 2).tolist()))
 
 
 def clearance(points: Floats, centres: Floats, radii: Floats) -> float:
-    """Least distance from the path through `points`, (p, 2), to the edge of a disc.
+    """Return the smallest distance from the path through `points`, (p, 2), to the edge of a disc.
 
-    Negative if the path enters a disc, by its greatest depth; 0 if it touches one; inf without
-    discs, (m, 2) and (m,).
+    The distance is negative if the path enters a disc, by its greatest depth; 0 if the path touches
+    a disc; inf without discs. Discs are (m, 2) and (m,).
     """
     if not len(radii):
         return float("inf")
@@ -55,16 +55,18 @@ class PathAxes:
     def __init__(self, start: tuple[float, float], target: tuple[float, float]) -> None:
         run = target[0] - start[0]
         rise = target[1] - start[1]
-        self.unit_m = math.sqrt(run * run + rise * rise)  # metres in one unit of these axes
+        self.unit_m = math.sqrt(run * run + rise * rise)  # metres in a unit of these axes
         self._axis = run / self.unit_m, rise / self.unit_m  # x, in the plane
         self._middle = (np.array(start) + np.array(target)) / 2
 
     def to_local(self, points: Floats) -> Floats:
         """Convert points of the plane, (p, 2), to these axes."""
-        (cos, sin), (x, y) = self._axis, (points - self._middle).T / self.unit_m
+        cos, sin = self._axis
+        x, y = (points - self._middle).T / self.unit_m
         return np.stack([cos * x + sin * y, cos * y - sin * x], axis=1)
 
     def to_plane(self, points: Floats) -> Floats:
         """Convert points on these axes, (p, 2), to the plane."""
-        (cos, sin), (x, y) = self._axis, points.T * self.unit_m
+        cos, sin = self._axis
+        x, y = points.T * self.unit_m
         return np.stack([cos * x - sin * y, sin * x + cos * y], axis=1) + self._middle

@@ -1,4 +1,4 @@
-"""A planning problem: two ends, the discs between them, and the effort of the search."""
+"""A planning problem: two end points, discs, and the effort of the search."""
 
 from __future__ import annotations
 
@@ -22,8 +22,8 @@ from .geometry import segment_distances
 class Search:
     """Effort of a search by particle swarms.
 
-    More waypoints let a path turn about more discs; the time is proportional to them, and the
-    swarms converge more slowly.
+    More waypoints let a path turn about more discs; the time is proportional to their number, and
+    the swarms converge more slowly.
     """
 
     trials: Annotated[int, about("particle swarms, each with its own seed", ge=1, le=10**6)] = 100
@@ -40,7 +40,7 @@ class Search:
 class Planning(Search):
     """Search for a path in the plane from `start` to `target` that enters no disc.
 
-    It uses `trials` independent particle swarms; see `run_trial`.
+    The search uses `trials` independent particle swarms; see `run_trial`.
 
     Parameters
     ----------
@@ -49,7 +49,7 @@ class Planning(Search):
     centres
         Centres of the discs to keep out of: (m, 2), metres; m may be 0.
     radii
-        Their radii in metres, above 0: (m,), or one number for all.
+        Radii in metres, above 0: (m,), or a number for all discs.
     **search
         The fields of `Search`. The same seed gives the same plan, to the bit, wherever the trials
         run.
@@ -101,19 +101,24 @@ class Planning(Search):
             object.__setattr__(self, name, value)
 
 
-def _checked(name: str, value: ArrayLike, fits: Callable[[Floats], bool], what: str) -> Floats:
-    """Convert `value` to a new array of finite numbers; the error says what it must be."""
+def _checked(
+    name: str, value: ArrayLike, fits: Callable[[Floats], bool], requirement: str
+) -> Floats:
+    """Convert `value` to a new array of finite numbers, or raise LidarError."""
     try:
         numbers = np.array(value, dtype=np.float64)
     except (TypeError, ValueError):
         numbers = np.array(np.nan)
     if not (np.isfinite(numbers).all() and fits(numbers)):
-        raise LidarError(f"planning: {name} is {reprlib.repr(value)}; it must be {what}.")
+        raise LidarError(f"planning: {name} is {reprlib.repr(value)}; it must be {requirement}.")
     return numbers
 
 
-def _check_outside(ends: dict[str, tuple[float, float]], centres: Floats, radii: Floats) -> None:
-    for name, end in ends.items():
+def _check_outside(
+    end_points: dict[str, tuple[float, float]], centres: Floats, radii: Floats
+) -> None:
+    """Raise LidarError if an end of the path, {name: x and y}, lies in a disc."""
+    for name, end in end_points.items():
         point = np.array([end])
         within = np.flatnonzero(segment_distances(point, point, centres)[0] < radii)
         if len(within):

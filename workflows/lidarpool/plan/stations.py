@@ -1,10 +1,10 @@
-"""Stations of a terrestrial scan: places on the floor from which a sensor sees most surfaces."""
+"""Stations of a terrestrial scan: positions from which a sensor sees most surfaces."""
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Annotated
+from typing import Annotated, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,26 +19,27 @@ from lidarsim.scene.simplified import SimplifiedScene
 from lidarsim.sensor import Sensor, Spin
 from raybeam import RayCaster
 
-STATIONS_MOST = 100
-LEAST_GAIN = 0.01  # of what can be seen, that each adds if no number and no coverage is given
-_PLACES = 600  # about so many candidates, in a scene without obstacles
-_PLACES_MOST = 50_000
-_LEAST_SPACING_M = 0.5
-# samples by area; at least so many of each object, if few
+MAX_STATIONS = 100
+MIN_GAIN = 0.01  # share of the visible area that each adds, if no number or coverage is given
+_CANDIDATES = 600  # about this number, in a scene without obstacles
+_MAX_CANDIDATES = 50_000
+_MIN_SPACING_M = 0.5
+# Samples by area, and the smallest number for an object of few.
 _POINTS = 20_000
 _OBJECT_POINTS = 60
-_CLEAR_M = 0.3  # nothing is nearer to the instrument, nor this close above it
-_STEP_M = 0.2  # what is lower than this is stepped on
-_FOOT_M = 0.01  # a ray that starts so far above the floor does not hit it
-_AROUND = 128  # rays that look around a candidate
+_CLEARANCE_M = 0.3  # no surface is nearer to the instrument, nor this close above it
+_STEP_M = 0.2  # lower surfaces are stepped on
+_FOOT_M = 0.01  # a ray that starts at this height above the floor does not hit the floor
+_SPHERE_RAYS = 128  # rays in all directions from a candidate
 _SECTORS = 36  # in all of which a sensor that turns has rays
 
 
 class Sight:
-    """What a sensor sees from a station: surfaces in its range and field of view, not hidden.
+    """Visibility of surfaces from a station: within range and field of view, and not hidden.
 
-    Its lowest and highest rays limit the field of view, `slant_deg` the angle of incidence, from
-    the normal of a surface. Actors are left out. LidarError if it does not look all around.
+    The sensor's lowest and highest rays limit the field of view, `slant_deg` the angle of
+    incidence, from the normal of a surface. Actors are left out. LidarError if the sensor does not
+    look all around.
     """
 
     def __init__(self, scene: Scene, sensor: Sensor, slant_deg: float) -> None:
@@ -48,13 +49,13 @@ class Sight:
         # Single precision of ray casters, and of points in pictures.
         self._slack = max(2e-3, 2e-5 * float(np.linalg.norm(np.ptp(scene.bounds, axis=0))))
         head = sensor.head
-        turn = math.ceil(head.firings_per_turn) if isinstance(head, Spin) else sensor.period
-        turn = turn or 20_000  # firings of a head that never repeats
-        count = min(turn, max(4 * _SECTORS, 20_000 // sensor.channels))
-        firings = np.linspace(0, turn, count, endpoint=False).astype(np.int64)
+        revolution = math.ceil(head.firings_per_turn) if isinstance(head, Spin) else sensor.period
+        revolution = revolution or 20_000  # firings of a head that never repeats
+        count = min(revolution, max(4 * _SECTORS, 20_000 // sensor.channels))
+        firings = np.linspace(0, revolution, count, endpoint=False).astype(np.int64)
         x, y, z = sensor.directions(firings).reshape(-1, 3).T
         sectors = np.floor(np.arctan2(y, x) / (2 * np.pi) * _SECTORS).astype(int) % _SECTORS
-        if len(np.unique(sectors)) < min(_SECTORS, turn):
+        if len(np.unique(sectors)) < min(_SECTORS, revolution):
             raise LidarError(
                 f"{sensor.model} does not look all around, as it has to on a station: give "
                 "another sensor, such as terrestrial/riegl-vz400."
@@ -63,31 +64,31 @@ class Sight:
         self._highest = float(z.max()) + 1e-9
 
     def sides(self, station: Floats, points: Floats, normals: Floats) -> NDArray[np.int8]:
-        """Return which side of surfaces a station (3,) sees at points (n, 3): int8 (n,).
+        """Return the visible sides of surfaces at points (n, 3) from a station (3,): int8 (n,).
 
-        In local metres. The points are on triangles of the scene, with unit normals (n, 3). 1 is
-        the side that the normal points to, -1 the other, 0 a point that is not seen.
+        Positions are local, in metres. The points are on triangles of the scene, with unit normals
+        (n, 3). 1 is the side that the normal points to, -1 the opposite side, 0 a hidden point.
         """
-        ways = points - station
-        far = np.sqrt(np.einsum("ij,ij->i", ways, ways))
-        facing = -np.einsum("ij,ij->i", ways, normals)
-        some = np.flatnonzero(
-            (far >= max(self.sensor.min_range_m, self._slack))
-            & (far <= self.sensor.max_range_m)
-            & (np.abs(facing) >= np.cos(np.radians(self.slant_deg)) * far)
-            & (ways[:, 2] >= self._lowest * far)
-            & (ways[:, 2] <= self._highest * far)
+        offsets = points - station
+        distance_m = np.sqrt(np.einsum("ij,ij->i", offsets, offsets))
+        facing = -np.einsum("ij,ij->i", offsets, normals)
+        facing_points = np.flatnonzero(
+            (distance_m >= max(self.sensor.min_range_m, self._slack))
+            & (distance_m <= self.sensor.max_range_m)
+            & (np.abs(facing) >= np.cos(np.radians(self.slant_deg)) * distance_m)
+            & (offsets[:, 2] >= self._lowest * distance_m)
+            & (offsets[:, 2] <= self._highest * distance_m)
         )
-        met = self.caster.cast(station, ways[some]).distance
-        some = some[met >= far[some] - self._slack]
-        out = np.zeros(len(points), np.int8)
-        out[some] = np.sign(facing[some])
-        return out
+        hit_distance_m = self.caster.cast(station, offsets[facing_points]).distance
+        facing_points = facing_points[hit_distance_m >= distance_m[facing_points] - self._slack]
+        sides = np.zeros(len(points), np.int8)
+        sides[facing_points] = np.sign(facing[facing_points])
+        return sides
 
 
 @dataclass(frozen=True, eq=False)
 class StationPlan:
-    """Stations in the order in which they were chosen, and what they cover.
+    """Stations in the order of their choice, and the area that they cover.
 
     Coverage is by area, of the sides of surfaces that at least one candidate sees.
     """
@@ -96,7 +97,7 @@ class StationPlan:
     coverage: Floats  # (s,) share in 0 to 1, after each station
     candidates: Floats  # (c, 3) world metres
     spacing_m: float  # of the candidates
-    visible_m2: Floats  # (objects,) area that some candidate sees
+    visible_m2: Floats  # (objects,) area that candidates see
     covered_m2: Floats  # (objects,) area that the stations see
     sight: Sight
 
@@ -106,7 +107,7 @@ def plan_stations(
     scene: Scene,
     sensor: Sensor,
     *,
-    count: Annotated[int | None, Field(ge=1, le=STATIONS_MOST)] = None,
+    count: Annotated[int | None, Field(ge=1, le=MAX_STATIONS)] = None,
     coverage: Annotated[float | None, Field(gt=0, le=1)] = None,
     height_m: Annotated[float, Field(gt=0, le=1e6)] = 1.7,
     spacing_m: Annotated[float | None, Field(gt=0, le=1e6)] = None,
@@ -115,12 +116,12 @@ def plan_stations(
     """Choose stations for a terrestrial scan.
 
     Candidates stand on a grid, on the lowest floor, where there is room for the instrument; see
-    `candidates`. Whichever adds most area comes next.
+    `candidates`. The candidate that adds most area comes next.
 
     Parameters
     ----------
     scene
-        What to scan; actors are ignored.
+        Scene to scan; actors are ignored.
     sensor
         The instrument, upright. Its range and field of view count.
     count
@@ -138,8 +139,8 @@ def plan_stations(
     Raises
     ------
     LidarError
-        If a value is out of range, the sensor does not look all around, or there is nowhere to
-        stand, or nothing to see.
+        If a value is out of range, the sensor does not look all around, or no candidate stands on
+        a floor or sees a surface.
 
     Examples
     --------
@@ -155,203 +156,256 @@ def plan_stations(
     scene = SimplifiedScene.from_scene(scene).scene
     sight = Sight(scene, sensor, slant_deg)
     if spacing_m is None:
-        spacing_m = _spacing(scene)
-    places = candidates(scene, sight.caster, height_m, spacing_m)
-    points, normals, owner, area = _samples(scene)
-    sides = np.stack([sight.sides(place, points, normals) for place in places])
-    # Each side of a surface counts by itself: of a thin wall, that in each room.
-    seen = np.concatenate([sides > 0, sides < 0], axis=1)
-    visible = np.flatnonzero(seen.any(axis=0))
-    if not len(visible):
+        spacing_m = _default_spacing_m(scene)
+    positions = candidates(scene, sight.caster, height_m, spacing_m)
+    visibility = _visibility(scene, sight, positions)
+    if not len(visibility.area_m2):
         raise LidarError(
-            f"Nothing is visible from {len(places):,} places at {height_m:g} m: check the unit of "
-            "the scene, the range of the sensor, and the slant."
+            f"Nothing is visible from {len(positions):,} places at {height_m:g} m: check the unit "
+            "of the scene, the range of the sensor, and the slant."
         )
-    seen = seen[:, visible]
-    owner = np.tile(owner, 2)[visible]
-    area = np.tile(area, 2)[visible]
-    least = LEAST_GAIN if count is None and coverage is None else 0.0
-    chosen, shares, covered = _greedy(seen, area, count or STATIONS_MOST, coverage or 1.0, least)
+    min_gain = MIN_GAIN if count is None and coverage is None else 0.0
+    choice = _choose_rows(visibility, count or MAX_STATIONS, coverage or 1.0, min_gain)
+    owner = visibility.owner
     objects = len(scene.names)
+    covered_m2 = visibility.area_m2 * choice.covered
     return StationPlan(
-        stations=places[chosen] + scene.origin,
-        coverage=np.array(shares),
-        candidates=places + scene.origin,
+        stations=positions[choice.rows] + scene.origin,
+        coverage=np.array(choice.shares),
+        candidates=positions + scene.origin,
         spacing_m=spacing_m,
-        visible_m2=np.bincount(owner, area, objects).astype(np.float64),
-        covered_m2=np.bincount(owner, area * covered, objects).astype(np.float64),
+        visible_m2=np.bincount(owner, visibility.area_m2, objects).astype(np.float64),
+        covered_m2=np.bincount(owner, covered_m2, objects).astype(np.float64),
         sight=sight,
     )
 
 
-def _greedy(
-    seen: Bools, area: Floats, most: int, enough: float, least: float
-) -> tuple[list[int], list[float], Bools]:
-    """Choose rows of `seen` (c, n) by the area (n,) they add; with the shares after each.
+class _Visibility(NamedTuple):
+    """Sides of surfaces at points that a candidate sees."""
 
-    It ends with `most` rows, when a share of `enough` is covered, or before a row adds less than
-    the share `least`.
+    visible: Bools  # (c, n), whether a candidate sees a side
+    owner: Ints  # (n,), objects of the sides
+    area_m2: Floats  # (n,), area that a side stands for
+
+
+def _visibility(scene: Scene, sight: Sight, positions: Floats) -> _Visibility:
+    """Return the sides of surfaces that candidates at local positions (c, 3) see."""
+    samples = _sample_surfaces(scene)
+    sides = np.stack([sight.sides(p, samples.points, samples.normals) for p in positions])
+    # Each side of a surface counts by itself: of a thin wall, the side in each room.
+    visible = np.concatenate([sides > 0, sides < 0], axis=1)
+    columns = np.flatnonzero(visible.any(axis=0))
+    owner = np.tile(samples.owner, 2)[columns]
+    return _Visibility(visible[:, columns], owner, np.tile(samples.area_m2, 2)[columns])
+
+
+class _Choice(NamedTuple):
+    """Chosen rows of `_Visibility`, in order."""
+
+    rows: list[int]
+    shares: list[float]  # of the area, covered after each row
+    covered: Bools  # (n,)
+
+
+def _choose_rows(
+    visibility: _Visibility, max_rows: int, max_share: float, min_gain: float
+) -> _Choice:
+    """Choose candidates by the area they add, the largest gain first.
+
+    The choice ends with `max_rows`, when `max_share` of the area is covered, or before a candidate
+    adds less than the share `min_gain`.
     """
-    area = area / area.sum()
+    visible = visibility.visible
+    area = visibility.area_m2 / visibility.area_m2.sum()
     covered = np.zeros(len(area), np.bool_)
-    gain = np.array([area[row].sum() for row in seen])
+    gain = np.array([area[row].sum() for row in visible])
     chosen: list[int] = []
     shares: list[float] = []
-    while len(chosen) < most and not covered.all():
+    while len(chosen) < max_rows and not covered.all():
         best = int(gain.argmax())
-        if chosen and gain[best] < least:
+        if chosen and gain[best] < min_gain:
             break
-        new = np.flatnonzero(seen[best] & ~covered)
+        new = np.flatnonzero(visible[best] & ~covered)
         covered[new] = True
-        gain -= np.array([area[new[row[new]]].sum() for row in seen])
+        gain -= np.array([area[new[row[new]]].sum() for row in visible])
         gain[best] = -np.inf
         chosen.append(best)
         shares.append(1.0 if covered.all() else float(area[covered].sum()))
-        if shares[-1] >= enough:
+        if shares[-1] >= max_share:
             break
-    return chosen, shares, covered
+    return _Choice(chosen, shares, covered)
 
 
-def _spacing(scene: Scene) -> float:
-    """Return a round spacing of candidates for the scene's ground."""
-    wide, deep, _ = np.ptp(scene.bounds, axis=0)
-    spacing = max(math.sqrt(wide * deep / _PLACES), _LEAST_SPACING_M)
-    digit = 10.0 ** math.floor(math.log10(spacing))
-    return round(spacing / digit, 1) * digit
+def _default_spacing_m(scene: Scene) -> float:
+    """Return a round spacing of candidates for the scene's ground, metres."""
+    width_m, depth_m, _ = np.ptp(scene.bounds, axis=0)
+    spacing = max(math.sqrt(width_m * depth_m / _CANDIDATES), _MIN_SPACING_M)
+    power = 10.0 ** math.floor(math.log10(spacing))
+    return round(spacing / power, 1) * power
 
 
 def candidates(scene: Scene, caster: RayCaster, height_m: float, spacing_m: float) -> Floats:
-    """Return places (c, 3), local metres, where an instrument can stand, on a grid.
+    """Return local positions (c, 3), metres, where an instrument can stand, on a grid.
 
     The floor is the lowest surface, or the top of a slab if that is lowest. Floors that are
     reached only by a climb of more than 45 degrees, such as eaves where there is no ground, are
-    left out; so are places with something within 0.3 m of the instrument, or between it and the
-    floor, and those inside objects.
+    left out; so are positions with a surface within 0.3 m of the instrument, or between the
+    instrument and the floor, and positions inside objects.
 
     Raises
     ------
     LidarError
-        If there is none, or the grid is too fine.
+        If there is no such position, or the grid is too fine.
     """
-    low, high = scene.bounds
-    across, along = np.maximum((high - low)[:2] / spacing_m, 1).astype(int).tolist()
-    if across * along > _PLACES_MOST:
+    positions, shape = _grid_positions(scene, spacing_m)
+    floor = _floor_heights(scene, caster, positions)
+    walkable = _largest_level(floor.reshape(shape), spacing_m).ravel()
+    rows = np.flatnonzero(walkable)
+    positions[rows, 2] = floor[rows] + _FOOT_M
+    up = np.tile([0.0, 0.0, 1.0], (len(rows), 1))
+    room = caster.cast(positions[rows], up).distance
+    rows = rows[room > height_m + _CLEARANCE_M - _FOOT_M]
+    positions = positions[rows]
+    positions[:, 2] = floor[rows] + height_m
+    positions = positions[_free_positions(scene, caster, positions)]
+    if not len(positions):
+        fault = "The scene has no floor" if not walkable.any() else "There is no room on the floor"
         raise LidarError(
-            f"A grid of {spacing_m:g} m has {across * along:,} places, more than "
-            f"{_PLACES_MOST:,}: give a larger spacing."
-        )
-    x, y = np.meshgrid(
-        (np.arange(across) - (across - 1) / 2) * spacing_m,
-        (np.arange(along) - (along - 1) / 2) * spacing_m,
-        indexing="ij",
-    )
-    places = np.stack([x.ravel(), y.ravel(), np.zeros(x.size)], axis=1) + (low + high) / 2
-    up = np.tile([0.0, 0.0, 1.0], (len(places), 1))
-    places[:, 2] = low[2] - 1
-    lowest = caster.cast(places, up)
-    floor = places[:, 2] + lowest.distance  # infinite where there is none
-    there = np.flatnonzero(lowest.hit)
-    # A surface that faces down is the underside of a slab, if something is close above it.
-    a, b, c = scene.vertices[scene.faces[lowest.triangle[there]]].swapaxes(0, 1)
-    under = there[np.cross(b - a, c - a)[:, 2] < 0]
-    places[:, 2] = floor
-    above = caster.cast(places[under], up[under], t_min=_FOOT_M, t_max=SLAB_M).distance
-    floor[under] += np.where(np.isfinite(above), above, 0.0)
-    # Kerbs and pavements are stepped on.
-    places[there, 2] = floor[there] + _STEP_M
-    down = caster.cast(places[there], -up[there], t_max=_STEP_M).distance
-    floor[there] += np.where(np.isfinite(down), _STEP_M - down, 0.0)
-    walkable = _largest_level(floor.reshape(across, along), spacing_m).ravel()
-    kept = np.flatnonzero(walkable)
-    places[kept, 2] = floor[kept] + _FOOT_M
-    room = caster.cast(places[kept], up[kept]).distance
-    kept = kept[room > height_m + _CLEAR_M - _FOOT_M]
-    places = places[kept]
-    places[:, 2] = floor[kept] + height_m
-    places = places[_clear(scene, caster, places)]
-    if not len(places):
-        what = "The scene has no floor" if not walkable.any() else "There is no room on the floor"
-        raise LidarError(
-            f"{what} for an instrument at {height_m:g} m, on a grid of {spacing_m:g} m: check the "
+            f"{fault} for an instrument at {height_m:g} m, on a grid of {spacing_m:g} m: check the "
             "scene's unit and up axis, give another height or spacing, or add scene.ground."
         )
-    return places
+    return positions
+
+
+def _grid_positions(scene: Scene, spacing_m: float) -> tuple[Floats, tuple[int, int]]:
+    """Return local positions (c, 3) on a grid over a scene, and the grid's shape along x and y."""
+    lower, upper = scene.bounds
+    columns, rows = np.maximum((upper - lower)[:2] / spacing_m, 1).astype(int).tolist()
+    if columns * rows > _MAX_CANDIDATES:
+        raise LidarError(
+            f"A grid of {spacing_m:g} m has {columns * rows:,} places, more than "
+            f"{_MAX_CANDIDATES:,}: give a larger spacing."
+        )
+    x, y = np.meshgrid(
+        (np.arange(columns) - (columns - 1) / 2) * spacing_m,
+        (np.arange(rows) - (rows - 1) / 2) * spacing_m,
+        indexing="ij",
+    )
+    positions = np.stack([x.ravel(), y.ravel(), np.zeros(x.size)], axis=1) + (lower + upper) / 2
+    return positions, (columns, rows)
+
+
+def _floor_heights(scene: Scene, caster: RayCaster, positions: Floats) -> Floats:
+    """Return the heights (c,) of the floor at x and y of positions, local; infinite for none."""
+    origins = positions.copy()
+    up = np.tile([0.0, 0.0, 1.0], (len(origins), 1))
+    origins[:, 2] = scene.bounds[0, 2] - 1
+    lowest = caster.cast(origins, up)
+    floor: Floats = origins[:, 2] + lowest.distance
+    hit_rays = np.flatnonzero(lowest.hit)
+    # A surface that faces down is the underside of a slab, if a surface is close above.
+    a, b, c = scene.vertices[scene.faces[lowest.triangle[hit_rays]]].swapaxes(0, 1)
+    undersides = hit_rays[np.cross(b - a, c - a)[:, 2] < 0]
+    origins[:, 2] = floor
+    above = caster.cast(origins[undersides], up[undersides], t_min=_FOOT_M, t_max=SLAB_M).distance
+    floor[undersides] += np.where(np.isfinite(above), above, 0.0)
+    # Kerbs and pavements are stepped on.
+    origins[hit_rays, 2] = floor[hit_rays] + _STEP_M
+    below = caster.cast(origins[hit_rays], -up[hit_rays], t_max=_STEP_M).distance
+    floor[hit_rays] += np.where(np.isfinite(below), _STEP_M - below, 0.0)
+    return floor
 
 
 def _largest_level(floor: Floats, spacing_m: float) -> Bools:
-    """Of floors (k, m) on a grid, infinite for none, the largest part without steep climbs."""
+    """Return the largest connected part of floors (k, m) on a grid without steep climbs."""
+    # Heights are infinite where there is no floor.
     group = np.full(floor.shape, -1)
     sizes: list[int] = []
-    for start in zip(*np.nonzero(np.isfinite(floor)), strict=True):
-        if group[start] >= 0:
+    for first_cell in zip(*np.nonzero(np.isfinite(floor)), strict=True):
+        if group[first_cell] >= 0:
             continue
-        group[start] = len(sizes)
+        group[first_cell] = len(sizes)
         sizes.append(0)
-        ahead = [start]
-        while ahead:
-            i, j = here = ahead.pop()
+        to_visit = [first_cell]
+        while to_visit:
+            i, j = cell = to_visit.pop()
             sizes[-1] += 1
-            for beside in ((i - 1, j), (i + 1, j), (i, j - 1), (i, j + 1)):
-                within = 0 <= beside[0] < floor.shape[0] and 0 <= beside[1] < floor.shape[1]
-                if within and group[beside] < 0 and abs(floor[beside] - floor[here]) <= spacing_m:
-                    group[beside] = len(sizes) - 1
-                    ahead.append(beside)
+            for neighbour in ((i - 1, j), (i + 1, j), (i, j - 1), (i, j + 1)):
+                within = 0 <= neighbour[0] < floor.shape[0] and 0 <= neighbour[1] < floor.shape[1]
+                if (
+                    within
+                    and group[neighbour] < 0
+                    and abs(floor[neighbour] - floor[cell]) <= spacing_m
+                ):
+                    group[neighbour] = len(sizes) - 1
+                    to_visit.append(neighbour)
     return group == int(np.argmax(sizes)) if sizes else group >= 0
 
 
-def _clear(scene: Scene, caster: RayCaster, places: Floats) -> Ints:
-    """Which places (c, 3) have room around them and are not inside an object.
+def _free_positions(scene: Scene, caster: RayCaster, positions: Floats) -> Ints:
+    """Return the indices of positions (c, 3) with room around, and not inside an object.
 
     Inside an object most rays above the horizon meet back faces. A hall that is modelled by its
-    outside is no such object: most places are in it.
+    outside is no such object: most positions are inside.
     """
-    n = np.arange(_AROUND)
-    z = 1 - (2 * n + 1) / _AROUND  # evenly spread over the sphere, by the golden angle
-    turn = np.pi * (3 - 5**0.5) * n
+    n = np.arange(_SPHERE_RAYS)
+    z = 1 - (2 * n + 1) / _SPHERE_RAYS  # evenly spread over the sphere, by the golden angle
+    azimuths = np.pi * (3 - 5**0.5) * n
     level = np.sqrt(1 - z * z)
-    rays = np.stack([level * np.cos(turn), level * np.sin(turn), z], axis=1)
-    ways = np.tile(rays, (len(places), 1))
-    hits = caster.cast(np.repeat(places, _AROUND, axis=0), ways)
-    free = hits.distance.reshape(-1, _AROUND).min(axis=1, initial=np.inf) >= _CLEAR_M
+    rays = np.stack([level * np.cos(azimuths), level * np.sin(azimuths), z], axis=1)
+    directions = np.tile(rays, (len(positions), 1))
+    hits = caster.cast(np.repeat(positions, _SPHERE_RAYS, axis=0), directions)
+    free = hits.distance.reshape(-1, _SPHERE_RAYS).min(axis=1, initial=np.inf) >= _CLEARANCE_M
     corners = scene.vertices[scene.faces[hits.triangle]]
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    back = hits.hit & (np.einsum("ij,ij->i", normals, ways) > 0)
-    upper = back.reshape(-1, _AROUND)[:, : _AROUND // 2]
-    owner = scene.face_object[hits.triangle].reshape(-1, _AROUND)[:, : _AROUND // 2]
-    inside = np.full(len(places), -1)
-    for place in np.flatnonzero(upper.mean(axis=1) > 0.5):
-        inside[place] = np.bincount(owner[place, upper[place]]).argmax()
+    back = hits.hit & (np.einsum("ij,ij->i", normals, directions) > 0)
+    upper = back.reshape(-1, _SPHERE_RAYS)[:, : _SPHERE_RAYS // 2]
+    owner = scene.face_object[hits.triangle].reshape(-1, _SPHERE_RAYS)[:, : _SPHERE_RAYS // 2]
+    inside = np.full(len(positions), -1)
+    for index in np.flatnonzero(upper.mean(axis=1) > 0.5):
+        inside[index] = np.bincount(owner[index, upper[index]]).argmax()
     counts = np.bincount(inside + 1, minlength=len(scene.names) + 1)
-    counts[0] = len(places)
-    return np.flatnonzero(free & (counts[inside + 1] > len(places) / 2))
+    counts[0] = len(positions)
+    return np.flatnonzero(free & (counts[inside + 1] > len(positions) / 2))
 
 
-def _samples(scene: Scene) -> tuple[Floats, Floats, Ints, Floats]:
-    """Points on the surfaces, evenly spread by area within each object, always the same.
+class _SurfaceSamples(NamedTuple):
+    """Points on the surfaces of a scene."""
 
-    Returns points (n, 3) in local metres, unit normals there (n, 3), the number of the object (n,),
-    and the m² that a point stands for (n,).
-    """
+    points: Floats  # (n, 3), local metres
+    normals: Floats  # (n, 3), of length 1
+    owner: Ints  # (n,), objects
+    area_m2: Floats  # (n,), area that a point stands for
+
+
+def _sample_surfaces(scene: Scene) -> _SurfaceSamples:
+    """Return points evenly spread by area within each object, the same at every call."""
     order = np.argsort(scene.face_object, kind="stable")
     corners = scene.vertices[scene.faces[order]]
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     doubled = np.linalg.norm(normals, axis=1)
-    objects = len(scene.names)
-    areas = np.bincount(scene.face_object[order], doubled / 2, objects)
-    least = np.where(areas > 0, max(1, min(_OBJECT_POINTS, _POINTS // objects)), 0)
-    number = np.maximum(np.round(_POINTS * areas / areas.sum()).astype(int), least)
-    owner = np.repeat(np.arange(objects), number)
+    areas = np.bincount(scene.face_object[order], doubled / 2, len(scene.names)).astype(np.float64)
+    min_count = max(1, min(_OBJECT_POINTS, _POINTS // len(scene.names)))
+    counts = np.round(_POINTS * areas / areas.sum()).astype(int)
+    counts = np.maximum(counts, np.where(areas > 0, min_count, 0))
     rng = np.random.default_rng(0)
-    nth = np.arange(len(owner)) - np.repeat(np.cumsum(number) - number, number)
-    along = (nth + rng.random(len(owner))) / number[owner] * areas[owner]
-    ends = np.cumsum(doubled / 2)
-    starts = np.cumsum(areas) - areas
-    triangle = np.searchsorted(ends, starts[owner] + along, side="right").clip(0, len(ends) - 1)
-    a, b = np.sort(rng.random((2, len(owner))), axis=0)[..., None]
+    triangle = _sample_triangles(rng, doubled / 2, areas, counts)
+    a, b = np.sort(rng.random((2, len(triangle))), axis=0)[..., None]
     sides = corners[triangle].swapaxes(0, 1)
     points = a * sides[0] + (b - a) * sides[1] + (1 - b) * sides[2]
-    # Rounding may give a point to the last triangle of the object before, or one without area.
+    # Rounding may give a point to the last triangle of the object before, or without area.
     owner = scene.face_object[order][triangle].astype(np.int64)
-    length = np.where(doubled > 0, doubled, 1.0)[triangle, None]
-    weights = (areas / np.maximum(number, 1))[owner]
-    return points, normals[triangle] / length, owner, weights
+    units = normals[triangle] / np.where(doubled > 0, doubled, 1.0)[triangle, None]
+    return _SurfaceSamples(points, units, owner, (areas / np.maximum(counts, 1))[owner])
+
+
+def _sample_triangles(
+    rng: np.random.Generator, face_areas: Floats, areas: Floats, counts: Ints
+) -> Ints:
+    """Draw triangles (n,) by their areas, `counts` for each object; triangles are by object."""
+    owner = np.repeat(np.arange(len(counts)), counts)
+    nth = np.arange(len(owner)) - np.repeat(np.cumsum(counts) - counts, counts)
+    offsets = (nth + rng.random(len(owner))) / counts[owner] * areas[owner]
+    stops = np.cumsum(face_areas)
+    starts = np.cumsum(areas) - areas
+    return np.searchsorted(stops, starts[owner] + offsets, side="right").clip(0, len(stops) - 1)

@@ -12,12 +12,12 @@ from lidarsim.base.arrays import Floats, Floats32
 from .cost import PathCost
 
 _GROUPS = 5
-_LEAST_GROUP = 20  # particles
-_NARROWEST = 0.05  # spread of the first group; the unit is the distance from start to target
-_LEAST_WIDEST = 0.2  # spread of the last group, at least
+_MIN_GROUP = 20  # particles
+_MIN_SPREAD = 0.05  # spread of the first group; the unit is the distance from start to target
+_MIN_LAST_SPREAD = 0.2  # spread of the last group, at least
 # New random numbers for each move would cost as much as all other arithmetic. So they are drawn
-# once, into a table of so many moves, and each move takes a part of it from a random start. Parts
-# overlap, but a number serves another particle and coordinate in each.
+# once, into a table for `_TABLE_MOVES` moves, and each move takes a block of the table from a
+# random start. Blocks overlap, but a number serves another particle and coordinate in each block.
 _TABLE_MOVES = 2
 _STARTS = 1021  # before they repeat
 
@@ -26,22 +26,22 @@ class Randoms:
     """Single-precision random numbers from a seed.
 
     NumPy guarantees the raw output of its bit generators, but not that of its `Generator`
-    (NEP 19), so the last step is done here. The seed is below 2**64.
+    (NEP 19), so the last step is computed here. The seed is below 2**64.
     """
 
     def __init__(self, seed: int) -> None:
         self._bits = np.random.SFC64(seed)
 
     def uniform(self, count: int) -> Floats32:
-        """Numbers uniform in [0, 1), multiples of 2**-24: (count,)."""
-        high = self._bits.random_raw(count) >> np.uint64(40)
-        return high.astype(np.float32) * np.float32(2**-24)
+        """Return numbers uniform in [0, 1), multiples of 2**-24: (count,)."""
+        leading_bits = self._bits.random_raw(count) >> np.uint64(40)
+        return leading_bits.astype(np.float32) * np.float32(2**-24)
 
     def normal(self, count: int) -> Floats32:
-        """Numbers of mean 0 and variance 1, nearly normal: (count,).
+        """Return numbers of mean 0 and variance 1, nearly normal: (count,).
 
-        Each is the sum of four uniform ones (Irwin-Hall), the four quarters of a raw number,
-        so none is beyond 3.5. The exact distribution would need logarithms, which are not the
+        Each is the sum of four uniform numbers (Irwin-Hall), the four quarters of a raw number,
+        so all are within 3.5. The exact distribution would need logarithms, which are not the
         same on every machine.
         """
         raw = self._bits.random_raw(count)
@@ -66,7 +66,7 @@ class Swarm:
     constriction (Shi and Eberhart 1998, Clerc and Kennedy 2002) it finds equally good paths, in
     scenes of 6 to 25 discs, with two thirds of the arithmetic.
 
-    Discs can be passed on either side, and a swarm with one common best settles early on one
+    Discs can be passed on either side, and a swarm with one common best settles early on a
     choice of sides. Groups with different initial spreads settle on several: up to `widest` about
     the straight line, in units of its length. The `waypoints` of `paths` are the positions of the
     particles.
@@ -77,13 +77,13 @@ class Swarm:
         rows = corners * axes
         self.paths = paths
         self.groups = _group_count(particles)
-        self._at = paths.waypoints.reshape(rows, particles)  # positions, a view
+        self._positions = paths.waypoints.reshape(rows, particles)  # positions, a view
         spreads = _spreads(self.groups, widest)
-        start = _scattered(corners, particles, spreads, randoms)
-        self._at[:] = start.reshape(rows, particles)
-        self._best = self._at.copy()  # of each particle
+        start = _scatter_paths(corners, particles, spreads, randoms)
+        self._positions[:] = start.reshape(rows, particles)
+        self._best = self._positions.copy()  # of each particle
         self._best_cost = np.full(particles, np.inf, np.float32)
-        self._jump = np.zeros_like(self._best)  # from a particle's best to where it is
+        self._jump = np.zeros_like(self._best)  # from a particle's best to its position
         self._better = np.empty(particles, np.float32)
         self._leaders = np.empty((rows, self.groups), np.float32)
         self._leader_numbers = np.empty(self.groups, np.intp)
@@ -92,9 +92,10 @@ class Swarm:
         size = rows * particles
         self._shares = randoms.normal(_TABLE_MOVES * size) + np.float32(0.5)
         starts = randoms.below(len(self._shares) - size + 1, _STARTS)
-        self._parts = itertools.cycle([slice(start, start + size) for start in starts])
+        self._share_blocks = itertools.cycle([slice(start, start + size) for start in starts])
         # Other views of the same memory: one long axis is fastest.
-        self._flat_at, self._flat_best = self._at.reshape(-1), self._best.reshape(-1)
+        self._flat_positions = self._positions.reshape(-1)
+        self._flat_best = self._best.reshape(-1)
         self._flat_jump = self._jump.reshape(-1)
         self._best_by_group = self._best.reshape(rows, self.groups, -1)
         self._jump_by_group = self._jump.reshape(rows, self.groups, -1)
@@ -106,14 +107,15 @@ class Swarm:
         self._move()
 
     def best(self) -> Floats32:
-        """Corners of the best path so far: (waypoints, 2)."""
+        """Return the corners of the best path so far: (waypoints, 2)."""
         return self._best[:, self._best_cost.argmin()].reshape(-1, 2)
 
     def _remember(self, cost: Floats32) -> None:
+        """Record the positions that are the best of their particles, and the groups' leaders."""
         np.less(cost, self._best_cost, out=self._better)  # 1.0 or 0.0
         np.minimum(cost, self._best_cost, out=self._best_cost)
         # A product and a sum take half the time of a masked copy. The sum equals the position from
-        # `_move`, so the best is exactly what was evaluated.
+        # `_move`, so the best is exactly the position that was evaluated.
         np.multiply(self._jump, self._better, out=self._jump)
         np.add(self._flat_best, self._flat_jump, out=self._flat_best)
         leaders = self._best_cost_by_group.argmin(axis=1, out=self._leader_numbers)
@@ -122,9 +124,10 @@ class Swarm:
         self._best.take(leaders, axis=1, out=self._leaders, mode="clip")
 
     def _move(self) -> None:
+        """Let all particles jump."""
         np.subtract(self._leaders[..., None], self._best_by_group, out=self._jump_by_group)
-        np.multiply(self._flat_jump, self._shares[next(self._parts)], out=self._flat_jump)
-        np.add(self._flat_best, self._flat_jump, out=self._flat_at)
+        np.multiply(self._flat_jump, self._shares[next(self._share_blocks)], out=self._flat_jump)
+        np.add(self._flat_best, self._flat_jump, out=self._flat_positions)
 
 
 def _group_count(particles: int) -> int:
@@ -132,36 +135,36 @@ def _group_count(particles: int) -> int:
     return max(
         groups
         for groups in range(1, _GROUPS + 1)
-        if groups == 1 or (particles % groups == 0 and particles // groups >= _LEAST_GROUP)
+        if groups == 1 or (particles % groups == 0 and particles // groups >= _MIN_GROUP)
     )
 
 
 def _spreads(groups: int, widest: float) -> Floats:
     """Return each group's initial spread about the straight line: (groups,)."""
-    widest = max(_LEAST_WIDEST, widest)
+    widest = max(_MIN_LAST_SPREAD, widest)
     if groups == 1:
         return np.array([widest])
     share = np.arange(groups) / (groups - 1)
-    return _NARROWEST + (widest - _NARROWEST) * share * share
+    return _MIN_SPREAD + (widest - _MIN_SPREAD) * share * share
 
 
-def _scattered(corners: int, particles: int, spreads: Floats, randoms: Randoms) -> Floats32:
-    """First positions: polylines about the straight line, (corners, 2, groups, size).
+def _scatter_paths(corners: int, particles: int, spreads: Floats, randoms: Randoms) -> Floats32:
+    """Return first positions: polylines about the straight line, (corners, 2, groups, size).
 
-    A group's paths turn at 1, 2, 3, … points, drawn within its spread about the straight line, and
-    their corners are evenly spaced. With few turns, paths lead between discs more often than with
+    A group's paths bend at 1, 2, 3, … points, drawn within its spread about the straight line, and
+    their corners are evenly spaced. With few bends, paths lead between discs more often than with
     independent corners.
     """
     groups = len(spreads)
     size = particles // groups
-    turns = 2 * randoms.uniform(2 * corners * particles).reshape(groups, corners, 1, 2, size) - 1
-    place = np.arange(1, corners + 1) / (corners + 1)
-    at = np.empty((corners, 2, groups, size), np.float32)
+    bends = 2 * randoms.uniform(2 * corners * particles).reshape(groups, corners, 1, 2, size) - 1
+    fractions = np.arange(1, corners + 1) / (corners + 1)
+    positions = np.empty((corners, 2, groups, size), np.float32)
     for group, spread in enumerate(spreads):
         count = group % corners + 1
-        # 1 where a corner is at a turn, 0 from the turns on either side of it
-        apart = np.abs(place * (count + 1) - np.arange(1, count + 1)[:, None])
+        # 1 where a corner is at a bend, 0 from the bends on either side of it.
+        apart = np.abs(fractions * (count + 1) - np.arange(1, count + 1)[:, None])
         shares = (spread * np.maximum(1 - apart, 0)).astype(np.float32)[..., None, None]
-        np.add.reduce(shares * turns[group, :count], axis=0, out=at[:, :, group])
-    at[:, 0] += (place - 0.5).astype(np.float32)[:, None, None]
-    return at
+        np.add.reduce(shares * bends[group, :count], axis=0, out=positions[:, :, group])
+    positions[:, 0] += (fractions - 0.5).astype(np.float32)[:, None, None]
+    return positions

@@ -38,20 +38,20 @@ class _Tangents(NamedTuple):
 def shortest_path_length(
     start: tuple[float, float], target: tuple[float, float], centres: ArrayLike, radii: ArrayLike
 ) -> float:
-    """Length of the shortest path from `start` to `target` that enters no disc.
+    """Return the length of the shortest path from `start` to `target` that enters no disc.
 
     Discs may overlap, touch and contain one another; a path may touch a disc's edge.
 
     Centres are (m, 2), and radii above 0 (m,); m may be 0. The length is inf if discs separate
-    target and start, or contain one of them.
+    target and start, or contain one of the two.
 
     Notes
     -----
     A path no longer than some limit stays within an ellipse about its ends, and so meets only
-    the discs that reach into that. At first the limit is the straight line; where the way
-    around the discs in question is longer than the limit, so is the way around all, and the
+    the discs that reach into the ellipse. At first the limit is the straight line; where the path
+    around the discs in question is longer than the limit, so is the path around all, and the
     limit is raised. With k discs in question in the end it takes some k³ distance checks. Of
-    thousands of discs these are few, unless the way is barred and leads far around.
+    thousands of discs these are few, unless discs bar the way and the path leads far around.
 
     Examples
     --------
@@ -60,48 +60,48 @@ def shortest_path_length(
     """
     if start == target:
         return 0.0
-    centres_, radii_ = _outermost(
+    centres_, radii_ = _remove_nested(
         np.asarray(centres, float).reshape(-1, 2), np.asarray(radii, float).reshape(-1)
     )
-    ends = np.asarray([start, target], float)
-    size = float(np.ptp(np.vstack([ends, centres_]), axis=0).max() + radii_.max(initial=0.0))
+    end_points = np.asarray([start, target], float)
+    size = float(np.ptp(np.vstack([end_points, centres_]), axis=0).max() + radii_.max(initial=0.0))
     tolerance = _TOLERANCE * size
-    # A path by way of a disc is at least as long as one by way of the square around it: by the
-    # corner or side of that which is nearest to the straight line and its middle.
+    # A path by way of a disc is at least as long as by way of the square around the disc: by the
+    # corner or side of the square that is nearest to the straight line and its middle.
     axes = PathAxes(start, target)
     beside = np.abs(axes.to_local(centres_)) * axes.unit_m - radii_[:, None]
     x, y = np.maximum(beside, 0.0).T
     limit = axes.unit_m
-    by_way = np.hypot(x + limit / 2, y) + np.hypot(x - limit / 2, y)
-    by_way_sorted = np.sort(by_way)
+    bounds = np.hypot(x + limit / 2, y) + np.hypot(x - limit / 2, y)
+    sorted_bounds = np.sort(bounds)
     while True:
-        near = by_way <= limit + tolerance
-        length = _around(ends, centres_[near], radii_[near], tolerance)
-        if np.isinf(length) or not (by_way[~near] <= length + tolerance).any():
+        in_question = bounds <= limit + tolerance
+        length = _length_around(end_points, centres_[in_question], radii_[in_question], tolerance)
+        if np.isinf(length) or not (bounds[~in_question] <= length + tolerance).any():
             return length
-        # At least a quarter more of them, lest a long wall be looked at disc by disc.
-        more = min(int(near.sum() * 1.25) + 1, len(by_way)) - 1
-        limit = max(length, float(by_way_sorted[more]))
+        # At least a quarter more of them, lest a long wall be examined disc by disc.
+        next_bound = min(int(in_question.sum() * 1.25) + 1, len(bounds)) - 1
+        limit = max(length, float(sorted_bounds[next_bound]))
 
 
-def _around(ends: Floats, centres: Floats, radii: Floats, tolerance: float) -> float:
-    """Length of the shortest path between two ends (2, 2) around all of some discs."""
+def _length_around(end_points: Floats, centres: Floats, radii: Floats, tolerance: float) -> float:
+    """Return the length of the shortest path between two ends (2, 2) around discs."""
     # The two ends are circles without radius, numbers 0 and 1.
-    circles = np.vstack([ends, centres])
+    circles = np.vstack([end_points, centres])
     widths = np.concatenate([[0.0, 0.0], radii])
-    tangents = _unblocked(_all_tangents(circles, widths), circles, widths, tolerance)
+    tangents = _free_tangents(_all_tangents(circles, widths), circles, widths, tolerance)
     return _dijkstra(_graph(tangents, circles, widths), source=0, sink=1)
 
 
-def _outermost(centres: Floats, radii: Floats) -> tuple[Floats, Floats]:
-    """Return the discs without those that lie within another."""
+def _remove_nested(centres: Floats, radii: Floats) -> tuple[Floats, Floats]:
+    """Return the discs that lie in no larger disc."""
     order = np.argsort(-radii, kind="stable")
-    kept: list[int] = []
+    outermost: list[int] = []
     for disc in order:
-        gaps = centres[kept] - centres[disc]
-        if not (np.sqrt((gaps**2).sum(axis=1)) + radii[disc] <= radii[kept]).any():
-            kept.append(int(disc))
-    return centres[kept], radii[kept]
+        gaps = centres[outermost] - centres[disc]
+        if not (np.sqrt((gaps**2).sum(axis=1)) + radii[disc] <= radii[outermost]).any():
+            outermost.append(int(disc))
+    return centres[outermost], radii[outermost]
 
 
 def _all_tangents(centres: Floats, radii: Floats) -> _Tangents:
@@ -130,24 +130,27 @@ def _all_tangents(centres: Floats, radii: Floats) -> _Tangents:
         cosine = np.clip((radii[first] - side * radii[second])[:, None] / gap, -1.0, 1.0)
         for sine in (np.sqrt(1 - cosine**2), -np.sqrt(1 - cosine**2)):
             normal = cosine * unit + sine * across
-            ends = [
+            touched = [
                 centres[first] + radii[first, None] * normal,
                 centres[second] + side * radii[second, None] * normal,
             ]
             circles.append(np.stack([first, second], axis=1))
-            contacts.append(np.stack(ends, axis=1))
+            contacts.append(np.stack(touched, axis=1))
     return _Tangents(np.concatenate(circles), np.concatenate(contacts))
 
 
-def _unblocked(tangents: _Tangents, centres: Floats, radii: Floats, tolerance: float) -> _Tangents:
+def _free_tangents(
+    tangents: _Tangents, centres: Floats, radii: Floats, tolerance: float
+) -> _Tangents:
     """Return the tangents that enter no disc."""
     free = []
-    for begin in range(0, len(tangents.circles), _TANGENTS_AT_ONCE):
-        part = slice(begin, begin + _TANGENTS_AT_ONCE)
-        ends = tangents.contacts[part]
-        own = tangents.circles[part]
-        enters = segment_distances(ends[:, 0], ends[:, 1], centres) < radii - tolerance
-        np.put_along_axis(enters, own, False, axis=1)  # it touches these two by construction
+    for start in range(0, len(tangents.circles), _TANGENTS_AT_ONCE):
+        part = slice(start, start + _TANGENTS_AT_ONCE)
+        contacts = tangents.contacts[part]
+        touched_circles = tangents.circles[part]
+        enters = segment_distances(contacts[:, 0], contacts[:, 1], centres) < radii - tolerance
+        # A tangent touches its two circles by construction.
+        np.put_along_axis(enters, touched_circles, False, axis=1)
         free.append(~enters.any(axis=1))
     chosen = np.concatenate(free)
     return _Tangents(tangents.circles[chosen], tangents.contacts[chosen])
@@ -157,35 +160,37 @@ def _graph(tangents: _Tangents, centres: Floats, radii: Floats) -> Graph:
     """Return the graph of tangents and arcs; nodes 0 and 1 are start and target."""
     graph: Graph = defaultdict(list)
 
-    def connect(one: int, other: int, length: float) -> None:
-        graph[one].append((other, length))
-        graph[other].append((one, length))
+    def connect(node: int, neighbour: int, length: float) -> None:
+        graph[node].append((neighbour, length))
+        graph[neighbour].append((node, length))
 
     owners = tangents.circles.reshape(-1)
     nodes = np.where(owners < 2, owners, 2 + np.arange(len(owners)))
     spans = tangents.contacts[:, 1] - tangents.contacts[:, 0]
     lengths = np.sqrt((spans**2).sum(axis=1))
-    for (one, other), length in zip(nodes.reshape(-1, 2).tolist(), lengths.tolist(), strict=True):
-        connect(one, other, length)
+    pairs = nodes.reshape(-1, 2).tolist()
+    for (node, neighbour), length in zip(pairs, lengths.tolist(), strict=True):
+        connect(node, neighbour, length)
     points = tangents.contacts.reshape(-1, 2)
     for circle in range(2, len(radii)):
         on_circle = np.flatnonzero(owners == circle)
         offsets = points[on_circle] - centres[circle]
         angles = np.arctan2(offsets[:, 1], offsets[:, 0])
         order = np.argsort(angles, kind="stable")
-        for place, next_place, angle in _open_arcs(angles[order], circle, centres, radii):
-            one, other = (int(nodes[on_circle[order[p]]]) for p in (place, next_place))
-            connect(one, other, angle * float(radii[circle]))
+        for first, second, angle in _open_arcs(angles[order], circle, centres, radii):
+            node, neighbour = (int(nodes[on_circle[order[p]]]) for p in (first, second))
+            connect(node, neighbour, angle * float(radii[circle]))
     return graph
 
 
 def _open_arcs(
     angles: Floats, circle: int, centres: Floats, radii: Floats
 ) -> list[tuple[int, int, float]]:
-    """Arcs of `circle` between neighbours of the sorted `angles` that no disc blocks.
+    """Return the arcs of `circle` between neighbours of the sorted `angles` that no disc blocks.
 
-    A contact lies in no other disc, so a disc that overlaps the circle covers a stretch between
-    two contacts: the arc that holds the middle of that stretch is blocked.
+    Arcs are indices of two angles, and the angle between them. A contact lies in no other disc, so
+    a disc that overlaps the circle covers a stretch between two contacts: the arc that holds the
+    middle of the stretch is blocked.
     """
     if len(angles) < 2:
         return []
@@ -196,15 +201,15 @@ def _open_arcs(
     middles = np.arctan2(gaps[overlaps, 1], gaps[overlaps, 0])
     blocked = np.zeros(len(angles), bool)
     blocked[np.searchsorted(angles, middles) - 1] = True  # before the first: the last arc, -1
-    turns = np.diff(angles, append=angles[0] + 2 * np.pi)
+    arc_angles = np.diff(angles, append=angles[0] + 2 * np.pi)
     return [
-        (place, (place + 1) % len(angles), float(turns[place]))
-        for place in np.flatnonzero(~blocked).tolist()
+        (arc, (arc + 1) % len(angles), float(arc_angles[arc]))
+        for arc in np.flatnonzero(~blocked).tolist()
     ]
 
 
 def _dijkstra(graph: Graph, source: int, sink: int) -> float:
-    """Length of the shortest path of `graph` from `source` to `sink`; inf without one."""
+    """Return the length of the shortest path from `source` to `sink`; inf without a path."""
     best = {source: 0.0}
     queue = [(0.0, source)]
     while queue:
@@ -213,9 +218,9 @@ def _dijkstra(graph: Graph, source: int, sink: int) -> float:
             return length
         if length > best[node]:
             continue
-        for neighbour, step in graph[node]:
-            further = length + step
-            if further < best.get(neighbour, float("inf")):
-                best[neighbour] = further
-                heapq.heappush(queue, (further, neighbour))
+        for neighbour, edge in graph[node]:
+            total = length + edge
+            if total < best.get(neighbour, float("inf")):
+                best[neighbour] = total
+                heapq.heappush(queue, (total, neighbour))
     return float("inf")

@@ -1,4 +1,4 @@
-"""One trial: a swarm run to its end, on whatever worker; and the plan, the best of the trials."""
+"""A trial, which runs a swarm on any worker; and the plan, the best of the trials."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from .tangents import shortest_path_length
 
 @dataclass(frozen=True, eq=False)
 class Trial:
-    """What one swarm found.
+    """Result of a particle swarm.
 
     The same `Planning` and number give the same trial, to the bit, except for `seconds`.
     """
@@ -35,13 +35,13 @@ class Trial:
 
 
 def run_trial(planning: Planning, trial: int) -> Trial:
-    """Search for a path with one particle swarm.
+    """Search for a path with a particle swarm.
 
     A pure function on one thread: the result depends on `planning` and the number of the trial
-    alone, not on where or beside what it runs.
+    alone, not on the worker or its other tasks.
     """
-    begun = time.perf_counter()
-    # Independent of the seeds of all others.
+    started = time.perf_counter()
+    # Independent of the seeds of all other trials.
     sequence = np.random.SeedSequence(entropy=planning.seed, spawn_key=(trial,))
     seed = int(sequence.generate_state(1, np.uint64)[0])
     axes = PathAxes(planning.start, planning.target)
@@ -56,7 +56,7 @@ def run_trial(planning: Planning, trial: int) -> Trial:
         length=path_length(path),
         waypoints=waypoints,
         collision_free=clearance(path, planning.centres, planning.radii) >= 0,
-        seconds=time.perf_counter() - begun,
+        seconds=time.perf_counter() - started,
     )
 
 
@@ -66,7 +66,7 @@ def with_ends(planning: Planning, waypoints: Floats) -> Floats:
 
 
 def prepare_swarm(planning: Planning, axes: PathAxes, seed: int) -> Swarm:
-    """Return the swarm of `planning`, spread as widely as a way around the discs may reach."""
+    """Return the swarm of `planning`, spread as widely as a path around the discs may reach."""
     centres = axes.to_local(planning.centres)
     radii = planning.radii / axes.unit_m
     cost = PathCost(centres, radii, planning.waypoints, planning.particles)
@@ -79,7 +79,7 @@ def prepare_swarm(planning: Planning, axes: PathAxes, seed: int) -> Swarm:
 
 @dataclass(frozen=True, eq=False)
 class Plan:
-    """The best path found.
+    """Best path of the trials.
 
     Parameters
     ----------
@@ -91,8 +91,8 @@ class Plan:
         Length in metres of the shortest path, computed from the discs' tangents; inf if discs cut
         off the target.
     clearance
-        Least distance in metres from the path to a disc; negative if it enters one, inf without
-        discs.
+        Smallest distance in metres from the path to a disc; negative if the path enters a disc,
+        inf without discs.
     trial
         Number of the trial that found the path.
     trials
@@ -119,32 +119,32 @@ class Plan:
 
 
 def best(trials: Iterable[Trial], planning: Planning) -> Plan:
-    """Choose the best path of `trials`: the shortest of those that enter no disc.
+    """Return the best path of `trials`: the shortest that enters no disc.
 
-    Each path is checked again, segment by segment against each disc. If none is free of
-    collisions, the one that enters discs least is chosen, with `collision_free` False. The order
-    of `trials` does not matter; of equal ones the lowest number wins.
+    Each path is checked again, segment by segment against each disc. If no path is free of
+    collisions, the path with the smallest depth in discs is chosen, with `collision_free` False.
+    The order of `trials` does not matter; of equal paths the lowest number wins.
 
     Raises
     ------
     LidarError
         If there are no trials.
     """
-    candidates = []
+    ranked = []
     for trial in trials:
         path = with_ends(planning, trial.waypoints)
-        room = clearance(path, planning.centres, planning.radii)
-        candidates.append((max(0.0, -room), path_length(path), trial.trial, room, path))
-    if not candidates:
+        clearance_m = clearance(path, planning.centres, planning.radii)
+        ranked.append((max(0.0, -clearance_m), path_length(path), trial.trial, clearance_m, path))
+    if not ranked:
         raise LidarError("No planning trial was finished, so there is no best path.")
-    _, length, number, room, path = min(candidates, key=lambda candidate: candidate[:3])
+    _, length, number, clearance_m, path = min(ranked, key=lambda candidate: candidate[:3])
     return Plan(
         path=path,
         length=length,
         shortest_possible=shortest_path_length(
             planning.start, planning.target, planning.centres, planning.radii
         ),
-        clearance=room,
+        clearance=clearance_m,
         trial=number,
-        trials=len(candidates),
+        trials=len(ranked),
     )

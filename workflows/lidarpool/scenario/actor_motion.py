@@ -1,4 +1,4 @@
-"""What moves in a scenario: sensors on carriers, actors on trajectories, traffic of SUMO."""
+"""Motion in a scenario: sensors on carriers, actors on trajectories, traffic of SUMO."""
 
 from __future__ import annotations
 
@@ -47,21 +47,23 @@ from lidarsim.sensor.trajectory_files import (
     TrajectoryFormat,
 )
 
-from .ground import Standing, following
+from .ground import StandingSurfaces, follow_surfaces
 from .sections import (
     DeformingSection,
     IgnoredColumns,
     MeshEntry,
     MeshFile,
+    NoiseSection,
     PathOf,
     PoseEntry,
+    ReturnsSection,
     Section,
     SensorSection,
     by_position,
 )
 
-_READING = {"format", "columns", "ignore", "topic", "origin", "camera_axes", "offset_s"}
-_OF_ROBOTS = {"file", "opacity"}  # fields of a mesh file that robots have
+_READING_OPTIONS = {"format", "columns", "ignore", "topic", "origin", "camera_axes", "offset_s"}
+_ROBOT_FIELDS = {"file", "opacity"}  # fields of a mesh file that apply to robots
 
 
 class MountSection(Section, InstrumentPose):
@@ -77,7 +79,7 @@ class MountSection(Section, InstrumentPose):
     ] = None
 
     def pose(self) -> Pose:
-        """Return it as a pose."""
+        """Return position and angles as a pose."""
         return Pose(**declared(self, Pose))
 
 
@@ -85,7 +87,7 @@ MountEntry = Annotated[MountSection, by_position(MountSection)]
 
 
 class CarriedSection(SensorSection):
-    """One of several sensors: its mount, and when it scans; in YAML also just the model."""
+    """A sensor of a carrier: its mount, start and steps; in YAML also just the model."""
 
     mount: MountEntry = MountSection()
     start_s: Annotated[
@@ -95,11 +97,23 @@ class CarriedSection(SensorSection):
         StepCount | None, about("its time steps (scans), instead of the survey's", 120)
     ] = None
 
-    def mounted(self, *given: Any) -> Mounted:
-        """Return it on its carrier, as `SensorSection` does, with its own start and time steps."""
-        made = super().mounted(*given)
-        sensor = replace(made.sensor, start_ns=self.start_s * 1e9) if self.start_s else made.sensor
-        return replace(made, sensor=sensor, steps=self.steps)
+    def mounted(
+        self,
+        path: PathOf,
+        mount: Pose,
+        noise: NoiseSection,
+        returns: ReturnsSection,
+        name: str = "",
+    ) -> Mounted:
+        """Return the sensor on its carrier, with its start and time steps.
+
+        `path` returns the path of a file in the scenario. LidarError if a file cannot be used.
+        """
+        mounted = super().mounted(path, mount, noise, returns, name)
+        sensor = mounted.sensor
+        if self.start_s:
+            sensor = replace(sensor, start_ns=self.start_s * 1e9)
+        return replace(mounted, sensor=sensor, steps=self.steps)
 
 
 CarriedEntry = Annotated[CarriedSection, by_text("model", CarriedSection)]
@@ -182,32 +196,45 @@ class TrajectorySection(Section):
 
     _one_source = one_of("file", "points")
 
-    def track(self, path: PathOf, standing: Standing, start_s: float | None = None) -> Track:
-        """Return it in a scene's local coordinates; LidarError if it cannot be used.
+    def track(
+        self, path: PathOf, standing: StandingSurfaces, start_s: float | None = None
+    ) -> Track:
+        """Return the trajectory in a scene's local coordinates.
 
-        `path` returns that of a file, `standing` is what there is to follow; `start_s` is that of
-        a survey, of whose clock it is.
+        Parameters
+        ----------
+        path
+            Returns the path of a file in the scenario.
+        standing
+            Surfaces of the scene, for a trajectory that follows surfaces.
+        start_s
+            Start of the survey, in seconds by the clock of its trajectory.
+
+        Raises
+        ------
+        LidarError
+            If a file cannot be read, or the trajectory leaves its surfaces.
         """
-        way = self._level(path, standing.origin, start_s)
+        track = self._track_without_surfaces(path, standing.origin, start_s)
         if self.surfaces is None:
-            return way
+            return track
         # Pieces may end before the survey does.
-        pieces = following(replace(way, beyond="hold"), standing.only(self.surfaces))
+        pieces = follow_surfaces(replace(track, beyond="hold"), standing.of_objects(self.surfaces))
         if len(pieces) == 1 and self.beyond == "absent":
             return replace(pieces[0], beyond="absent")
-        assert way.start_s is not None  # of every track
-        begin = way.start_s
-        end = way.start_s + way.duration_ns / 1e9
+        assert track.start_s is not None  # of every track
+        start = track.start_s
+        stop = track.start_s + track.duration_ns / 1e9
         for piece in pieces:
-            if piece.times_s[0] <= begin + CLOCK_S and end - CLOCK_S <= piece.times_s[-1]:
-                return replace(piece, beyond=way.beyond)
+            if piece.times_s[0] <= start + CLOCK_S and stop - CLOCK_S <= piece.times_s[-1]:
+                return replace(piece, beyond=track.beyond)
         raise LidarError(
             f"the trajectory leaves its surfaces ({', '.join(self.surfaces)}): let it end before."
         )
 
-    def _level(self, path: PathOf, origin: Floats, start_s: float | None) -> Track:
-        """Return it without surfaces."""
-        own: dict[str, Any] = {
+    def _track_without_surfaces(self, path: PathOf, origin: Floats, start_s: float | None) -> Track:
+        """Return the trajectory in local coordinates, with heights as given."""
+        options: dict[str, Any] = {
             "smooth": self.interpolation == "smooth",
             "start_s": self.start_s if start_s is None else start_s,
             "duration_s": self.duration_s,
@@ -217,17 +244,19 @@ class TrajectorySection(Section):
             track = load_trajectory(
                 path(self.file),
                 times=None if self.times is None else path(self.times),
-                **self.model_dump(include=_READING),
-                **own,
+                **self.model_dump(include=_READING_OPTIONS),
+                **options,
             )
             return replace(track, positions=track.positions - origin)
         angles = [[p.yaw_deg, p.pitch_deg, p.roll_deg] for p in self.points]
-        turned = any({"yaw_deg", "pitch_deg", "roll_deg"} & p.model_fields_set for p in self.points)
+        has_angles = any(
+            {"yaw_deg", "pitch_deg", "roll_deg"} & p.model_fields_set for p in self.points
+        )
         return Track(
             np.array([p.time_s + self.offset_s for p in self.points]),
             np.array([p.position for p in self.points]) - origin,
-            quaternions_of(rotations_of(np.array(angles))) if turned else None,
-            **own,
+            quaternions_of(rotations_of(np.array(angles))) if has_angles else None,
+            **options,
         )
 
 
@@ -272,39 +301,45 @@ class ActorSection(DeformingSection):
     ] = None
 
     @model_validator(mode="after")
-    def _of_actor(self) -> ActorSection:
-        way = self.trajectory
-        if way is not None and self.at is not None:
+    def _check_actor(self) -> ActorSection:
+        """Raise ValueError if fields of an actor or robot do not fit together."""
+        trajectory = self.trajectory
+        if trajectory is not None and self.at is not None:
             raise ValueError("give either trajectory or at, not both.")
-        if way is not None and (way.start_s is not None or way.duration_s is not None):
+        if trajectory is not None and (
+            trajectory.start_s is not None or trajectory.duration_s is not None
+        ):
             raise ValueError("an actor starts with the survey: give offset_s, not start_s.")
         if not self.robot and self.joints is not None:
             raise ValueError("joints are those of a robot: give a .urdf as its file.")
         if self.robot and (self.animation or self.wheels):
             raise ValueError("a robot has joints: leave out animation and wheels.")
-        if self.robot and self.robot.model_fields_set - _OF_ROBOTS:
+        if self.robot and self.robot.model_fields_set - _ROBOT_FIELDS:
             raise ValueError("a robot is in metres and in its own axes: give just its file.")
         return self
 
     @property
     def is_carrier(self) -> bool:
-        """Whether it has the survey's trajectory, and carries its sensors."""
+        """Whether the actor has the survey's trajectory, and carries its sensors."""
         return self.trajectory is None and self.at is None
 
     @property
     def robot(self) -> MeshFile | None:
-        """Its file, if that is one of a robot."""
+        """File of the actor, if the file is a robot's; else None."""
         return self.file if self.file and self.file.file.lower().endswith(ROBOTS) else None
 
-    def way(self, path: PathOf, standing: Standing, carrier: Track | None) -> Track:
-        """Return its trajectory from the survey's start on."""
+    def track(self, path: PathOf, standing: StandingSurfaces, carrier: Track | None) -> Track:
+        """Return the trajectory of the actor from the survey's start, in local coordinates.
+
+        `path` returns the path of a file in the scenario; `carrier` is the survey's trajectory.
+        """
         start_s = 0.0 if carrier is None else carrier.start_s or 0.0
         if self.at is not None:
-            # Of two poses: joints of a robot go by the clock of its trajectory.
-            places = np.array([self.at.position] * 2) - standing.origin
-            turns = quaternions_of(np.array([self.at.rotation_matrix] * 2))
+            # Two poses: joints of a robot go by the clock of its trajectory.
+            positions = np.array([self.at.position] * 2) - standing.origin
+            rotations = quaternions_of(np.array([self.at.rotation_matrix] * 2))
             times = start_s + np.arange(2.0)
-            return Track(times, places, turns, start_s=start_s, beyond="hold")
+            return Track(times, positions, rotations, start_s=start_s, beyond="hold")
         if self.trajectory is None:
             assert carrier is not None, "checked with the scenario"
             return carrier
@@ -312,11 +347,11 @@ class ActorSection(DeformingSection):
             return self.trajectory.track(path, standing, start_s)
 
 
-ACTORS_MOST = 10_000
-_PIECE = 1 << 20  # bytes of a file that are read at a time
+MAX_ACTORS = 10_000
+_PIECE_BYTES = 1 << 20  # bytes of a file that are read at a time
 _MOVING = ("vehicle", "person", "container")
 _ROW = ("x", "y", "angle", "z", "slope")
-# Attributes that SUMO's documentation of --fcd-output defines, and that nothing here uses.
+# Attributes that SUMO's documentation of --fcd-output defines, and that are not used here.
 _UNUSED = frozenset((
     "acceleration", "accelerationLat", "arrivalDelay", "blockTime", "boardingTime", "delay",
     "distance", "edge", "entryTime", "eventTime", "lane", "leaderGap", "leaderID", "leaderSpeed",
@@ -327,7 +362,7 @@ _KNOWN = _UNUSED.union(_ROW, ("id", "type"))
 
 
 class VehicleSection(DeformingSection):
-    """What vehicles and persons of some types look like."""
+    """Shapes of vehicles and persons, by their types in SUMO."""
 
     types: Annotated[
         TextOrTexts,
@@ -339,7 +374,7 @@ class VehicleSection(DeformingSection):
 
 
 class TrafficSection(Section):
-    """Vehicles and persons that SUMO has moved; each is an actor while it is in the simulation."""
+    """Vehicles and persons of a SUMO simulation; actors while they are in the simulation."""
 
     file: Annotated[Text, about("what sumo --fcd-output writes, .xml or .xml.gz")]
     vehicles: Annotated[
@@ -361,20 +396,20 @@ class TrafficSection(Section):
         "linear"
     )
 
-    def shape_of(self, kind: str) -> VehicleSection:
-        """Return the entry of a type; LidarError if there is none."""
+    def shape_of(self, vehicle_type: str) -> VehicleSection:
+        """Return the entry of a type of vehicles; LidarError if no entry fits."""
         for entry in self.vehicles:
-            if any(fnmatchcase(kind, one) for one in entry.types):
+            if any(fnmatchcase(vehicle_type, pattern) for pattern in entry.types):
                 return entry
         raise LidarError(
-            f"{self.file} has vehicles of type {kind!r}, but no entry of traffic.vehicles fits: "
-            f"add one, such as {{types: {kind!r}, box: [4.5, 1.8, 1.5]}}."
+            f"{self.file} has vehicles of type {vehicle_type!r}, but no entry of traffic.vehicles "
+            f"fits: add one, such as {{types: {vehicle_type!r}, box: [4.5, 1.8, 1.5]}}."
         )
 
 
 @dataclass(frozen=True, eq=False)
 class Passage:
-    """A vehicle or person that is there without a break."""
+    """Consecutive time steps of a vehicle or person."""
 
     name: str
     kind: str
@@ -382,98 +417,130 @@ class Passage:
     rows: array[float] = field(default_factory=lambda: array("d"))  # `_ROW` at each time
 
 
+class _PassageCollector:
+    """Collects passages from the elements of floating car data, time step by time step.
+
+    Rows before the first time are dropped, but for the last.
+    """
+
+    def __init__(self, first_s: float, ignore: Sequence[str]) -> None:
+        self.passages: list[Passage] = []
+        # {(tag, identity): (last step, passage)}
+        self.travellers: dict[tuple[str, str], tuple[int, Passage]] = {}
+        self.step = -1
+        self.time_s = -math.inf
+        self._first_s = first_s
+        self._ignore = ignore
+        self._known_attributes = set(_KNOWN)
+        self._vehicle_xy: tuple[str, str] | None = None  # of the time step's last vehicle
+
+    def begin_step(self, time_s: float) -> None:
+        """Begin a time step; ValueError if its time is not after the last time step's."""
+        if not self.time_s < time_s < math.inf:
+            raise ValueError(f"the time {time_s} does not come after the one before")
+        self.time_s = time_s
+        self.step += 1
+        self._vehicle_xy = None
+
+    def add(self, tag: str, attributes: Mapping[str, str]) -> None:
+        """Add the row of a vehicle or person; ValueError or KeyError if the row is not valid."""
+        if not attributes.keys() <= self._known_attributes:
+            unknown = attributes.keys() - self._known_attributes
+            _check_ignored(tag, unknown, self._ignore)
+            self._known_attributes |= unknown
+        xy = attributes["x"], attributes["y"]
+        if tag == "vehicle":
+            self._vehicle_xy = xy
+        elif xy == self._vehicle_xy:  # SUMO writes the riders of a vehicle after the vehicle
+            return
+        passage = self._passage(tag, attributes)
+        if self.time_s <= self._first_s:  # of the rows before the first time the last is needed
+            del passage.times_s[:], passage.rows[:]
+        row = [float(attributes[key]) for key in _ROW[:3]]
+        row += [float(attributes.get(key) or 0) for key in _ROW[3:]]
+        if not all(map(math.isfinite, row)):
+            identity = attributes["id"]
+            raise ValueError(f"{tag} {identity!r} has no finite position at {self.time_s:g} s")
+        passage.times_s.append(self.time_s)
+        passage.rows.extend(row)
+
+    def _passage(self, tag: str, attributes: Mapping[str, str]) -> Passage:
+        """Return the passage that an element continues, or a new passage."""
+        traveller = tag, attributes["id"]
+        last_step, passage = self.travellers.get(traveller, (-2, None))
+        # SUMO omits vehicles while they are teleported.
+        if passage is None or last_step < self.step - 1:
+            passage = Passage(attributes["id"], attributes.get("type") or tag)
+            self.passages.append(passage)
+        self.travellers[traveller] = self.step, passage
+        return passage
+
+
 def read_fcd(
     path: Path, first_s: float, last_s: float, ignore: Sequence[str] = ()
 ) -> tuple[list[Passage], int]:
-    """Read what is there between two times, with the time steps before and after.
+    """Read the vehicles and persons between two times, with the time steps before and after.
 
-    The file may be of any length: only these rows are kept. `ignore` are names of attributes to
-    leave out, with * and ?.
+    The file may be of any length: only these rows stay in memory. `ignore` are names of attributes
+    to leave out, with * and ?.
 
     Returns
     -------
-    Passages in the order in which they begin, and how many vehicles and persons came by.
+    Passages in the order of their starts, and the number of vehicles and persons until the end.
 
     Raises
     ------
     LidarError
-        If it cannot be read, is no floating car data, or has attributes that are not known.
+        If the file cannot be read, is no floating car data, or has unknown attributes.
     """
-    known_attributes = set(_KNOWN)
-    passages: list[Passage] = []
-    known: dict[tuple[str, str], tuple[int, Passage]] = {}  # {who: last step, passage}
-    step = -1
-    time = -math.inf
-    vehicle: tuple[str, str] | None = None  # place of the last one of the time step
+    collector = _PassageCollector(first_s, ignore)
     try:
-        for tag, at in _elements(path):
+        for tag, attributes in _elements(path):
             if tag == "timestep":
-                before = time
-                time = float(at["time"])
-                if not before < time < math.inf:
-                    raise ValueError(f"the time {time} does not come after the one before")
-                if before > last_s:  # the first time step after the last time is needed as well
+                previous_s = collector.time_s
+                collector.begin_step(float(attributes["time"]))
+                if previous_s > last_s:  # the first time step after the last time is needed as well
                     break
-                step = step + 1
-                vehicle = None
-            elif tag in _MOVING and step >= 0:
-                if not at.keys() <= known_attributes:
-                    known_attributes |= _ignored(tag, at.keys() - known_attributes, ignore)
-                place = at["x"], at["y"]
-                if tag == "vehicle":
-                    vehicle = place
-                elif place == vehicle:  # SUMO writes who rides in a vehicle after it
-                    continue
-                who = tag, at["id"]
-                last, passage = known.get(who, (-2, None))
-                # SUMO takes vehicles out while it moves them.
-                if passage is None or last < step - 1:
-                    passage = Passage(at["id"], at.get("type") or tag)
-                    passages.append(passage)
-                known[who] = step, passage
-                if time <= first_s:  # of those before the first time the last is needed
-                    del passage.times_s[:], passage.rows[:]
-                row = [float(at[key]) for key in _ROW[:3]]
-                row += [float(at.get(key) or 0) for key in _ROW[3:]]
-                if not all(map(math.isfinite, row)):
-                    raise ValueError(f"{tag} {at['id']!r} has no finite position at {time:g} s")
-                passage.times_s.append(time)
-                passage.rows.extend(row)
-        if step < 0:
+            elif tag in _MOVING and collector.step >= 0:
+                collector.add(tag, attributes)
+        if collector.step < 0:
             raise ValueError("it has no time steps")
     except (OSError, EOFError, zlib.error, ValueError, KeyError, expat.ExpatError) as error:
         raise LidarError(
             f"{path} is not usable as floating car data, which sumo --fcd-output writes: "
             f"{message_of(error)}"
         ) from error
-    there = [one for one in passages if len(one.times_s) > 1 and one.times_s[-1] >= first_s]
-    return there, len(known)
+    present = [
+        passage
+        for passage in collector.passages
+        if len(passage.times_s) > 1 and passage.times_s[-1] >= first_s
+    ]
+    return present, len(collector.travellers)
 
 
-def _ignored(tag: str, names: Set[str], ignore: Sequence[str]) -> Set[str]:
-    """Return names of attributes that are all ignored; ValueError for one that is not."""
+def _check_ignored(tag: str, names: Set[str], ignore: Sequence[str]) -> None:
+    """Raise ValueError for a name of an attribute that fits no pattern to ignore."""
     for name in sorted(names):
         if not any(fnmatchcase(name, pattern) for pattern in ignore):
             raise ValueError(
                 f"its {tag} has the attribute {printable(name)!r}, which --fcd-output does not "
                 f"define: give ignore: [{printable(name)}] to leave it out"
             )
-    return names
 
 
 def _elements(path: Path) -> Iterator[tuple[str, Mapping[str, str]]]:
-    """Yield tags and attributes of the elements of a file, of which it holds a piece at a time."""
-    begun: list[tuple[str, Mapping[str, str]]] = []
+    """Yield tags and attributes of the elements of an XML file, which is read in pieces."""
+    elements: list[tuple[str, Mapping[str, str]]] = []
     parser = expat.ParserCreate()
     parser.EntityDeclHandler = refuse_entity
-    parser.StartElementHandler = lambda tag, at: begun.append((tag, at))
+    parser.StartElementHandler = lambda tag, attributes: elements.append((tag, attributes))
     with open_input(path) as file:
         is_packed = path.suffix.lower() == ".gz"
         content: BufferedIOBase = gzip.GzipFile(fileobj=file) if is_packed else file
-        while piece := content.read(_PIECE):
+        while piece := content.read(_PIECE_BYTES):
             parser.Parse(piece)
-            yield from begun
-            begun.clear()
+            yield from elements
+            elements.clear()
     parser.Parse(b"", True)
 
 
@@ -481,7 +548,7 @@ def actors_of(
     section: TrafficSection,
     passages: list[Passage],
     shape_of: Callable[[VehicleSection], SceneMesh],
-    standing: Standing,
+    standing: StandingSurfaces,
     start_s: float,
 ) -> list[tuple[Actor, VehicleSection]]:
     """Make actors of passages, in a scene's local coordinates, each with its entry.
@@ -491,43 +558,50 @@ def actors_of(
     shape_of
         Returns the mesh of an entry of `section.vehicles`.
     standing
-        What they stand on, if `section.surfaces` are given; where there is nothing, they are not
-        in the scene.
+        Surfaces of the scene, for `section.surfaces`; vehicles off these surfaces are not in the
+        scene.
     start_s
         Start of the survey.
 
     Raises
     ------
     LidarError
-        If a type has no shape, or there are too many.
+        If a type has no shape, or there are too many actors.
     """
     actors: list[tuple[Actor, VehicleSection]] = []
-    follows = section.surfaces and standing.only(section.surfaces)
-    for one in passages:
-        entry = section.shape_of(one.kind)
+    surfaces = section.surfaces and standing.of_objects(section.surfaces)
+    for passage in passages:
+        entry = section.shape_of(passage.kind)
         mesh = shape_of(entry)
-        times = np.array(one.times_s) + section.offset_s
-        x, y, angle, z, slope = np.array(one.rows).reshape(-1, len(_ROW)).T
-        fronts = np.column_stack([x, y, z]) + section.translation
-        if follows:
-            fronts[:, 2] = section.translation[2]
-            slope = 0 * slope
-        # Angles are clockwise from north, and slopes positive uphill.
-        turns = rotations_of(np.column_stack([90.0 - angle, -slope, np.zeros(len(x))]))
-        # SUMO places the middle of the front bumper.
-        places = fronts - turns[:, :, 0] * mesh.vertices[:, 0].max() - standing.origin
-        smooth = section.interpolation == "smooth"
-        way = Track(times, places, quaternions_of(turns), smooth, start_s, beyond="absent")
-        ways = following(way, follows) if follows else [way]
-        named = replace(mesh, name=f"{entry.name or one.kind} ({one.name})")
-        # Those of one entry do not walk in step.
-        share = zlib.crc32(one.name.encode()) / 2**32
+        track = _passage_track(section, passage, mesh, standing.origin, start_s)
+        tracks = follow_surfaces(track, surfaces) if surfaces else [track]
+        named = replace(mesh, name=f"{entry.name or passage.kind} ({passage.name})")
+        # Actors of an entry do not walk in step.
+        share = zlib.crc32(passage.name.encode()) / 2**32
         offset_s = 0.0 if entry.animation is None else entry.animation.offset_s
         offset_s += 0.0 if mesh.animation is None else share * mesh.animation.duration_s
-        actors += [(Actor(named, way, offset_s), entry) for way in ways]
-        if len(actors) > ACTORS_MOST:
+        actors += [(Actor(named, piece, offset_s), entry) for piece in tracks]
+        if len(actors) > MAX_ACTORS:
             raise LidarError(
-                f"{section.file} has more than {ACTORS_MOST:,} vehicles and persons during the "
+                f"{section.file} has more than {MAX_ACTORS:,} vehicles and persons during the "
                 "survey: make the survey shorter, or simulate a part of the network."
             )
     return actors
+
+
+def _passage_track(
+    section: TrafficSection, passage: Passage, mesh: SceneMesh, origin: Floats, start_s: float
+) -> Track:
+    """Return the local trajectory of a mesh, above `section.surfaces` if there are any."""
+    times = np.array(passage.times_s) + section.offset_s
+    x, y, angle, z, slope = np.array(passage.rows).reshape(-1, len(_ROW)).T
+    fronts = np.column_stack([x, y, z]) + section.translation
+    if section.surfaces:
+        fronts[:, 2] = section.translation[2]
+        slope = 0 * slope
+    # Angles are clockwise from north, and slopes positive uphill.
+    rotations = rotations_of(np.column_stack([90.0 - angle, -slope, np.zeros(len(x))]))
+    # SUMO's position is the middle of the front bumper.
+    positions = fronts - rotations[:, :, 0] * mesh.vertices[:, 0].max() - origin
+    smooth = section.interpolation == "smooth"
+    return Track(times, positions, quaternions_of(rotations), smooth, start_s, beyond="absent")

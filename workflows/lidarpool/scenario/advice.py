@@ -21,24 +21,24 @@ from .scenario import Scenario
 from .sections import SensorSection
 
 # Sizes of scenes in metres are between these. An .stl is mostly a part, in millimetres; an object
-# to look at from outside is rarely longer than a bus. glTF is in metres, and some exporters write
+# seen from outside is rarely longer than a bus. glTF is in metres, and some exporters write
 # millimetres.
 LARGE_M = 500.0
 LARGE_STL_M = 20.0
 LARGE_OBJECT_M = 10.0
 LARGE_STATED_M = 100.0
 SMALL_M = 0.2
-FINE = 100  # a scene is at least so many steps of the precision long
+MIN_STEPS = 100  # smallest length of a scene, in steps of the precision
 
 
 def advice(built: Built) -> list[str]:
     """Return notes on likely mistakes, such as a size that suggests another unit.
 
-    Also on objects that were left out, on files whose axes were guessed, on poses that were chosen,
-    on figures that data sheets lack, and on settings without effect.
+    There are also notes on objects that were left out, files whose axes were guessed, poses that
+    were chosen, figures that data sheets lack, and settings without effect.
     """
-    notes = built.found.notes
-    remarks = built.found.remarks
+    notes = built.findings.notes
+    remarks = built.findings.remarks
     axes = [f"{remark} (--up-axis AXIS with a mesh file)" for remark in remarks[:1]]
     if remarks[1:]:
         axes = [f"{axes[0]}; {plural(len(remarks) - 1, 'more file')}, too"]
@@ -46,8 +46,8 @@ def advice(built: Built) -> list[str]:
     step = built.survey.precision_m
     every = built.survey.keep_every
     placed = "" if built.placing is None else built.placing.note
-    likely = filter(None, (_of_size(built, side), placed, _of_colours(built)))
-    unstated = dict.fromkeys(_of_datasheets(built))
+    likely = filter(None, (_size_note(built, side), placed, _colour_note(built)))
+    unstated = dict.fromkeys(_unstated_figures(built))
     scanners = [
         "bags have a LaserScan of a 2D scanner only if every return is kept: set cloud.keep_every "
         "to 1"
@@ -55,46 +55,49 @@ def advice(built: Built) -> list[str]:
     coarse = [
         f"points are rounded to {step:g} m, and the scene is {side:.3g} m long: give a smaller "
         "cloud.precision_m in a scenario"
-    ] * (side < FINE * step)
+    ] * (side < MIN_STEPS * step)
     settings = (*coarse, *scanners, *_without_effect(built.scenario))
-    lines = (*notes, *axes, *likely, *unstated, *settings, *_ended(built))
+    lines = (*notes, *axes, *likely, *unstated, *settings, *_timing_notes(built))
     return [as_scenario(line) for line in lines]
 
 
 def _writes_bags(scenario: Scenario) -> bool:
+    """Return whether the output has a bag with messages of 2D scanners."""
     return any(entry.row.laser_scans for entry in scenario.output.write)
 
 
-def _of_size(built: Built, side: float) -> str:
+def _size_note(built: Built, side: float) -> str:
+    """Return a note if the longest side of the scene (metres) suggests another unit, else ""."""
     scenario = built.scenario
     placing = built.placing
     files = [entry.file for entry in scenario.scene.files if entry.unit is None]
-    files = [file for file in files if file not in built.found.classes]  # towns are large
+    files = [file for file in files if file not in built.findings.classes]  # towns are large
     unitless = [file for file in files if _lacks_unit(scenario.path(file))]
     parts = any(file.lower().endswith(".stl") for file in unitless)
-    least = SMALL_M
-    large = LARGE_STL_M if parts else LARGE_M
-    if around := placing is not None and placing.around:
-        least = 0.0
-        large = LARGE_OBJECT_M if unitless else LARGE_STATED_M
-    if not (unitless or (around and files)) or least <= side <= large:
+    min_m = SMALL_M
+    max_m = LARGE_STL_M if parts else LARGE_M
+    if surrounded := placing is not None and placing.surrounds_object:
+        min_m = 0.0
+        max_m = LARGE_OBJECT_M if unitless else LARGE_STATED_M
+    if not (unitless or (surrounded and files)) or min_m <= side <= max_m:
         return ""
-    unit = "mm" if side > large else "km"
-    said = "states no unit" if unitless else "is in metres by its format"
+    unit = "mm" if side > max_m else "km"
+    stated = "states no unit" if unitless else "is in metres by its format"
     return (
-        f"{(unitless or files)[0]} {said}, and in metres the scene is {side:,.5g} m long. If "
+        f"{(unitless or files)[0]} {stated}, and in metres the scene is {side:,.5g} m long. If "
         f"that is wrong, give the file's unit ({unit}?) in scene.files, or --unit {unit} with a "
         "mesh file"
     )
 
 
 def _lacks_unit(path: Path) -> bool:
-    """Whether a mesh file states no unit, nor does its format."""
+    """Return whether neither a mesh file nor its format states a unit."""
     row = format_of(path)
     return row is not None and row.unitless and not written_by_lidarpool(path)
 
 
-def _of_colours(built: Built) -> str:
+def _colour_note(built: Built) -> str:
+    """Return a note on objects that lack the colours that settings need, or an empty string."""
     scene = built.scene
     if not built.scenario.coloured:
         return ""
@@ -117,20 +120,20 @@ def _of_colours(built: Built) -> str:
     )
 
 
-def _of_datasheets(built: Built) -> Iterator[str]:
-    """Name what the data sheets of sensors do not state, and the scenario does not give."""
+def _unstated_figures(built: Built) -> Iterator[str]:
+    """Name the figures that neither the data sheets of sensors nor the scenario give."""
     scenario = built.scenario
-    given = built.scenario.noise.model_fields_set
+    scenario_fields = built.scenario.noise.model_fields_set
     sections: Mapping[str, SensorSection] = scenario.sensors or {"": scenario.sensor}
     for section, carried in zip(sections.values(), built.survey.carried, strict=True):
         lacking = (name for name in STATED if not getattr(carried.noise, name, True))
-        if left := [name for name in lacking if name not in given]:
-            lacks = ", ".join(f"{STATED[name]} (noise.{name})" for name in left)
+        if missing := [name for name in lacking if name not in scenario_fields]:
+            lacks = ", ".join(f"{STATED[name]} (noise.{name})" for name in missing)
             yield f"{section.model} gives no {lacks}: they have no effect"
 
 
 def _without_effect(scenario: Scenario) -> Iterator[str]:
-    """Tell of settings that another one keeps from having an effect, or contradicts."""
+    """Yield notes on settings without effect, and on contradictions between settings."""
     for entry in scenario.output.write:
         yield from entry.contradictions(scenario.cloud.coordinates)
     written = {entry.format for entry in scenario.output.write}
@@ -145,30 +148,30 @@ def _without_effect(scenario: Scenario) -> Iterator[str]:
         yield "weather.spray_g_m3 needs actors or traffic that move, and there are none"
     if scenario.noise.stray_light and not any(entry.retro for entry in scenario.materials):
         yield "noise.stray_light needs materials with retro: true, and there are none"
-    way = scenario.trajectory
+    trajectory = scenario.trajectory
     imu = scenario.navigation and scenario.navigation.imu
-    if imu and way and way.interpolation == "linear" and len(way.points) != 2:
+    if imu and trajectory and trajectory.interpolation == "linear" and len(trajectory.points) != 2:
         yield "navigation.imu has jumps at linear poses: give trajectory.interpolation: smooth"
     if scenario.noise.velocity_m_s and VELOCITY not in scenario.cloud.columns:
         yield f"noise.velocity_m_s is that of the column {VELOCITY}: add it to cloud.columns"
 
 
-def _ended(built: Built) -> Iterator[str]:
-    """Tell of frozen sensors without sweeps, and of actors that are not there, or end early."""
+def _timing_notes(built: Built) -> Iterator[str]:
+    """Yield notes on faults without sweeps, and on actors that are absent or end early."""
     survey = built.survey
     end = np.array([built.survey.duration_ns])
-    for number, (_, begins, _) in enumerate(survey.sweeps_each):
-        for place, fault in survey.faults_of(number, "frozen").items():
-            if not fault.during(begins).any():
+    for number, (_, starts, _) in enumerate(survey.sweeps_each):
+        for index, fault in survey.faults_of(number, "frozen").items():
+            if not fault.during(starts).any():
                 sensor = survey.carried[number].name or "the sensor"
-                yield f"faults[{place}] does not freeze {sensor}: no sweep begins meanwhile"
+                yield f"faults[{index}] does not freeze {sensor}: no sweep begins meanwhile"
     for actor in built.scene.actors:
         first, last = presence_ns(actor.trajectory)
         if first > end[0] or last < 0:
             yield f"{actor.name} is not in the scene during the survey: check its times"
-        own = actor.mesh.animation
-        if own and not own.repeat and actor.seconds(end)[0][0] > own.duration_s:
+        animation = actor.mesh.animation
+        if animation and not animation.repeat and actor.seconds(end)[0][0] > animation.duration_s:
             yield (
-                f"{actor.name}: its animation of {own.duration_s:.3g} s ends before the survey "
-                "does, and its last pose remains: give repeat: true"
+                f"{actor.name}: its animation of {animation.duration_s:.3g} s ends before the "
+                "survey does, and its last pose remains: give repeat: true"
             )

@@ -1,4 +1,4 @@
-"""Campaigns: many jobs from one description, each with values of its own."""
+"""Campaigns: many jobs from a description, each with its values."""
 
 from __future__ import annotations
 
@@ -27,29 +27,29 @@ from ..datasets.job_table import Value
 from ..export.laser_scan import with_laser_scans
 from .build import Job
 from .campaign_jobs import FunctionJobs, JobSource, ScenarioJobs, VariedJobs
-from .campaign_sections import COUNT_MOST, CampaignSection, Keep, Splits
+from .campaign_sections import MAX_JOBS, CampaignSection, Keep, Splits
 from .scenario import Scenario
 from .sections import PoolSection
 from .static_scene import SceneCache
 
 _FORM = "a campaign has base:, count:, vary:, keep:, splits:"
-SHOWN_MOST = 5  # files of a command that are named
+MAX_SHOWN_FILES = 5  # files of a command that are named
 
 
 class CampaignSpec:
-    """Many jobs (surveys) from a description, into a data set.
+    """Jobs (surveys) from a description, into a data set.
 
     `Campaign.load` reads a campaign file, `Campaign.of_scenarios` takes scenario files as they
-    are, and this one asks a function of Python for each job.
+    are, and the constructor asks a function of Python for each job.
 
     Parameters
     ----------
     make
         ``make(number, rng)`` returns the `Job` of a number from 0 on, with its scene, survey and
         values. `rng` is a ``numpy.random.Generator`` that depends on the seed and the number alone:
-        a job is the same however often, in whatever order and wherever it is made.
+        equal numbers give equal jobs, in any order and on any worker.
     count
-        How many jobs.
+        Number of jobs.
     seed
         Another seed gives other random numbers.
     keep
@@ -63,7 +63,7 @@ class CampaignSpec:
     Raises
     ------
     LidarError
-        If an argument cannot be meant.
+        If an argument is not valid.
 
     Notes
     -----
@@ -76,18 +76,18 @@ class CampaignSpec:
     splits: Mapping[str, float]
     license: str
     title: str
-    command: str = ""  # what follows ``lidarpool run``; empty for a function
-    description: str = ""  # the file's text, where there is one
-    files: Set[Path]  # that its jobs may be made of; some may be missing
+    command: str = ""  # arguments of ``lidarpool run``; empty for a function
+    description: str = ""  # text of the campaign file, or empty
+    files: Set[Path]  # that jobs may be made of, existing or not
     choices: Mapping[str, str]  # {name: how its value is chosen, «0.2 to 20, log_uniform»}
     shard = ALL  # whose jobs a run does
-    only_job: None = None  # a survey has one, as `lidarpool.run.job_source.Jobs` says
+    only_job: None = None  # surveys have one, see `lidarpool.run.job_source.Jobs`
 
     @checked
     def __init__(
         self,
         make: Callable[[int, np.random.Generator], Job],
-        count: Annotated[int, Field(ge=1, le=COUNT_MOST)],
+        count: Annotated[int, Field(ge=1, le=MAX_JOBS)],
         *,
         seed: Seed = 0,
         keep: str | Keep | Mapping[str, Any] = "kitti",
@@ -99,9 +99,10 @@ class CampaignSpec:
         self._begin(FunctionJobs(make, count, seed), head)
 
     def _begin(self, jobs: JobSource, head: CampaignSection) -> None:
+        """Set the fields of a campaign from its jobs and its head."""
         self.seed = head.seed
         self.keep = head.keep
-        self.splits = dict(head.splits)  # a read-only view of it cannot be pickled
+        self.splits = dict(head.splits)  # a read-only view cannot be pickled
         self.license = head.license
         self.title = head.title
         self.count = jobs.count
@@ -143,22 +144,22 @@ class CampaignSpec:
         license: str = "",  # noqa: A002 - as in the file
         title: str = "",
     ) -> CampaignSpec:
-        """Take scenario or mesh files as jobs, as they are; a job has the name of its file.
+        """Take scenario or mesh files as jobs, unchanged; a job has the name of its file.
 
         Raises
         ------
         LidarError
-            If one of them cannot be used; or an argument cannot be meant.
+            If a file cannot be used, or an argument is not valid.
         """
         jobs = ScenarioJobs([Path(path) for path in paths])
         self = cls.__new__(cls)
         self._begin(jobs, _head(keep=keep, splits=splits, seed=seed, license=license, title=title))
-        self.command = shlex.join(path.name for path in jobs.paths[:SHOWN_MOST])
-        self.command += " …" * (jobs.count > SHOWN_MOST)
+        self.command = shlex.join(path.name for path in jobs.paths[:MAX_SHOWN_FILES])
+        self.command += " …" * (jobs.count > MAX_SHOWN_FILES)
         return self
 
     def of_shard(self, shard: Shard) -> Self:
-        """Return the same campaign, of which a run does the jobs of a shard."""
+        """Return the campaign restricted to the jobs of a shard."""
         campaign = self if shard == self.shard else copy(self)
         campaign.shard = shard
         return campaign
@@ -187,22 +188,22 @@ class CampaignSpec:
 
         A value of None is left out. Of a function, the job is made.
         """
-        return self._jobs.values(self._known(number))
+        return self._jobs.values(self._checked_number(number))
 
     def name(self, number: int) -> str:
         """Return the name of a job in files: the name of its scenario file, else «0017»."""
-        return self._jobs.name(self._known(number))
+        return self._jobs.name(self._checked_number(number))
 
     def split(self, number: int) -> str:
         """Return the name of a job's split; empty without splits."""
-        return self._splits(self._known(number))
+        return self._splits(self._checked_number(number))
 
     def scenario(self, number: int) -> Scenario | None:
         """Return the scenario of a job; None if a function makes the job.
 
         LidarError if its values do not fit together; the message names job and values.
         """
-        return self._jobs.scenario(self._known(number))
+        return self._jobs.scenario(self._checked_number(number))
 
     @property
     def pool(self) -> PoolSection:
@@ -211,14 +212,14 @@ class CampaignSpec:
         return PoolSection() if scenario is None else scenario.pool
 
     def job(self, number: int, cache: SceneCache | None = None, columns: Sequence[str] = ()) -> Job:
-        """Make a job; the same number gives the same job. Jobs plan no paths.
+        """Make a job; equal numbers give equal jobs. Jobs plan no paths.
 
-        `cache` has static scenes of other jobs, which this one may share; `columns` are names of
+        `cache` has static scenes of other jobs, which this job may share; `columns` are names of
         columns that the data set needs.
 
-        LidarError if there is no such job, or it cannot be made; the message says why.
+        LidarError if the number is not a job's, or the job cannot be made; the message says why.
         """
-        number = self._known(number)
+        number = self._checked_number(number)
         fields = {"number": number, "name": self.name(number), "split": self.split(number)}
         job = self._jobs.job(number, cache, columns, fields)
         if job.survey.navigation is not None:
@@ -229,7 +230,8 @@ class CampaignSpec:
         survey = with_laser_scans(job.survey, [self.keep.format])
         return job if survey is job.survey else replace(job, survey=survey)
 
-    def _known(self, number: int) -> int:
+    def _checked_number(self, number: int) -> int:
+        """Return the number of a job as an integer, or raise LidarError."""
         if not 0 <= number < self.count:
             raise LidarError(
                 f"there is no job {number}: the campaign has jobs 0 to {self.count - 1}."
@@ -237,7 +239,7 @@ class CampaignSpec:
         return int(number)  # of NumPy, perhaps
 
     def check_files(self) -> None:
-        """Check that all files are there that jobs may be made of, or raise LidarError."""
+        """Raise LidarError if a file that jobs may be made of does not exist."""
         mistakes = Mistakes()
         # `Path.exists` fails at names that no file can have.
         lost = [path for path in self.files if not os.path.exists(path)]  # noqa: PTH110
@@ -253,7 +255,7 @@ class CampaignSpec:
         """Hashes of the content that the data set depends on: {name: SHA-256, hexadecimal}.
 
         Campaigns of the same content have the same hashes, in any folder and with any number of
-        jobs. Of files, tables of rows are included; other files belong to the jobs that use them.
+        jobs. Tables of rows are included; other files belong to the jobs that use them.
         """
         return {
             "seed": fingerprint(self.seed),
@@ -263,8 +265,8 @@ class CampaignSpec:
         }
 
 
-def _head(**given: Any) -> CampaignSection:
-    """Check the fields that Python gives."""
-    plain = {name: dict(v) if isinstance(v, Mapping) else v for name, v in given.items()}
+def _head(**fields: Any) -> CampaignSection:
+    """Return a checked section of arguments from Python."""
+    plain = {name: dict(v) if isinstance(v, Mapping) else v for name, v in fields.items()}
     with sentences(CampaignSection):
         return CampaignSection.model_validate({"base": "-", **plain})

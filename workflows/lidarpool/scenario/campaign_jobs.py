@@ -29,14 +29,14 @@ from ..datasets.job_table import Value
 from ..export.format_table import check_whole
 from .build import Job, build
 from .campaign_sections import (
-    COUNT_MOST,
+    MAX_JOBS,
     CampaignSection,
     Choice,
     JobRandom,
     is_campaign,
     read_rows,
 )
-from .field_paths import FieldSteps, find_field, put
+from .field_paths import FieldSteps, find_field, replace_value
 from .scenario import Scenario
 from .sections import file_states
 from .static_scene import SceneCache
@@ -67,7 +67,7 @@ class JobSource:
         return None
 
     def named_in(self, file: Path) -> str:
-        """Return the table and line that name a file, to begin a message; empty without table."""
+        """Return the table and line that name a file, to start a message; empty without table."""
         return ""
 
     def job(
@@ -140,7 +140,7 @@ class FunctionJobs(JobSource):
         return Job(job.scene, survey, values=values, **fields)
 
     def _call(self, number: int) -> Job:
-        """Call the function; LidarError if it raises any error or returns no job."""
+        """Call the function; LidarError if the function fails or returns no job."""
         with prefixed(f"job {number}"):
             try:
                 job = self._make(number, JobRandom(self._seed, number, "make").generator())
@@ -157,7 +157,7 @@ class FunctionJobs(JobSource):
 
 
 class ScenarioJobs(JobSource):
-    """Jobs of scenario and mesh files, one a file."""
+    """Jobs of scenario and mesh files: a job for each file."""
 
     def __init__(self, paths: Sequence[Path]) -> None:
         if not paths:
@@ -182,7 +182,7 @@ class ScenarioJobs(JobSource):
         self._names = _unique([path.stem for path in paths])
 
     def name(self, number: int) -> str:
-        """Return the name of a job: that of its file."""
+        """Return the name of a job: the name of its file without suffix."""
         return self._names[number]
 
     def scenario(self, number: int) -> Scenario:
@@ -191,7 +191,7 @@ class ScenarioJobs(JobSource):
 
 
 def _unique(stems: Iterable[str]) -> list[str]:
-    """Return names for files, each once: «hall», «hall-2»."""
+    """Return different names for files: «hall», «hall-2»."""
     unique_names: list[str] = []
     lower_case: set[str] = set()  # some systems do not distinguish capitals
     for stem in stems:
@@ -204,7 +204,7 @@ def _unique(stems: Iterable[str]) -> list[str]:
 
 
 class VariedJobs(JobSource):
-    """Jobs of a campaign file: its bases with other values."""
+    """Jobs of a campaign file: its bases with drawn values."""
 
     def __init__(self, section: CampaignSection, path: Path) -> None:
         self._vary = section.vary
@@ -236,10 +236,10 @@ class VariedJobs(JobSource):
             raise LidarError(
                 f"{path}: count is missing: {drawn[0]} is drawn, so say how many jobs."
             )
-        if section.count is None and grid > COUNT_MOST:
+        if section.count is None and grid > MAX_JOBS:
             raise LidarError(
                 f"{path}: count is missing: all values of each are {grid:,} jobs, of at most "
-                f"{COUNT_MOST:,}."
+                f"{MAX_JOBS:,}."
             )
         self.count = section.count or grid
         self.choices = {text: choice.words for text, choice in section.vary.items()}
@@ -258,7 +258,7 @@ class VariedJobs(JobSource):
         }
 
     def named_in(self, file: Path) -> str:
-        """Return the field, table and line that name a file, to begin a message."""
+        """Return the field, table and line that name a file, to start a message."""
         tables = {path: text for base in self._bases for text, path in base.table_files.items()}
         for table, text in tables.items():
             for number, line in enumerate(read_text(table).splitlines(), 1):
@@ -268,37 +268,37 @@ class VariedJobs(JobSource):
 
     def values(self, number: int) -> dict[str, Value]:
         """Return the values that a job has for the table of jobs."""
-        return self._drawn(number)[0]
+        return self._draw(number)[0]
 
     def scenario(self, number: int) -> Scenario:
         """Return the base of a job with the values of the job."""
-        values, changes = self._drawn(number)
+        values, changes = self._draw(number)
         base = self._bases[number % len(self._bases)]
-        seed = _noise_seed(self._seed, number)
+        noise_seed = _noise_seed(self._seed, number)
         try:
-            return base.changed(changes, f"{self._source}: job {number}", seed)
+            return base.changed(changes, f"{self._source}: job {number}", noise_seed)
         except LidarError as error:
             listed = ", ".join(f"{name}: {value}" for name, value in values.items())
             raise LidarError(f"{error}\nIts values are {listed or 'those of the base'}.") from error
 
-    def _drawn(self, number: int) -> tuple[dict[str, Value], dict[str, Any]]:
+    def _draw(self, number: int) -> tuple[dict[str, Value], dict[str, Any]]:
         """Draw the values of a job: for the table of jobs, and for the scenario."""
         base = self._bases[number % len(self._bases)]
         values: dict[str, Value | None] = {"base": base.name} if len(self._bases) > 1 else {}
         changes: dict[str, Any] = {}  # {path: value, or rows to be added}
         for text, choice in self._vary.items():
-            draw = JobRandom(self._seed, number, text)
+            rng = JobRandom(self._seed, number, text)
             if choice.sample is not None:
-                chosen = draw.integer(*choice.sample.count)
+                chosen = rng.integer(*choice.sample.count)
                 table = base.tables[text]
-                rows = [table[i] for i in draw.subset(len(table), chosen)]
+                rows = [table[i] for i in rng.subset(len(table), chosen)]
                 changes[text] = rows
                 values[text] = chosen
             elif choice.each is not None:
                 option = number // self._strides[text] % len(choice.options)
                 changes[text], values[text] = choice.options[option]
             else:
-                changes[text], values[text] = choice.drawn(draw)
+                changes[text], values[text] = choice.draw(rng)
         return {name: value for name, value in values.items() if value is not None}, changes
 
 
@@ -334,10 +334,10 @@ class _Base:
                         rows = plural(len(tables[key]), "row")
                         raise LidarError(f"count is up to {max_rows:,}, and {table} has {rows}.")
         with mistakes.noted(), prefixed(label):
-            self._check_apart()
+            self._check_disjoint()
         mistakes.tell()
 
-    def _check_apart(self) -> None:
+    def _check_disjoint(self) -> None:
         """Refuse paths that lead to the same field, or into a field that is replaced as a whole."""
         keys = {text: tuple(key for key, _ in steps) for text, steps in self._steps.items()}
         for first, second in combinations(keys, 2):
@@ -351,10 +351,10 @@ class _Base:
                 )
 
     def check(self, source: str, mistakes: Mistakes) -> None:
-        """Note values that are not valid, and find out which files jobs may be made of.
+        """Note values that are not valid, and collect the files that jobs may be made of.
 
         The first values of all paths are tried together, then the second, and so on; only if
-        something is wrong, each alone, to find out which.
+        a trial fails, each path alone, to name the value.
         """
         trials = {text: self._trials(text) for text in self._vary}
         for index in range(max([1, *map(len, trials.values())])):
@@ -362,28 +362,28 @@ class _Base:
             try:
                 scenario = self.changed(changes, f"{source}: {self._label}")
             except LidarError as error:
-                wrong = [line for text in self._vary for line in islice(self._tried(text), 1)]
+                wrong = [line for text in self._vary for line in islice(self._mistakes(text), 1)]
                 mistakes.lines += [f"{source}: {self._label}: {line}" for line in wrong]
                 mistakes.lines += () if wrong else str(error).splitlines()
                 return
             self.files.update(scenario.files)
 
     def _trials(self, text: str) -> list[Any]:
-        """Return values for a path, valid if all jobs are; of a table, all rows in pieces."""
+        """Return values for a path that are valid if all jobs are; rows of a table in pieces."""
         choice = self._vary[text]
         if choice.sample is None:
-            return choice.ends
+            return choice.limit_values
         min_rows, max_rows = choice.sample.count
         table = self.tables[text]
         starts = range(0, len(table), max(1, max_rows)) if max_rows else ()
         pieces = [table[start : start + max_rows] for start in starts]
         return [table[:min_rows], *pieces]
 
-    def _tried(self, text: str) -> Iterator[str]:
+    def _mistakes(self, text: str) -> Iterator[str]:
         """Yield lines on the values of a path that are not valid in the base."""
         choice = self._vary[text]
         field = dotted([key for key, _ in self._steps[text]])
-        for value in () if choice.sample else choice.ends:
+        for value in () if choice.sample else choice.limit_values:
             try:
                 self.changed({text: value}, "")
             except LidarError as error:
@@ -396,21 +396,21 @@ class _Base:
                     yield f"{value_line}: {message}"
 
     def changed(self, changes: Mapping[str, Any], source: str, noise_seed: int = 0) -> Scenario:
-        """Return the scenario with other values; noise without a seed gets `noise_seed`."""
+        """Return the scenario with drawn values; noise without a seed gets `noise_seed`."""
 
-        def changed(text: str, value: Any) -> Any:
+        def new_value(text: str, value: Any) -> Any:
             if text not in changes:  # the seed
                 return value or noise_seed
-            added = self._vary[text].sample is not None
-            return [*(value or ()), *changes[text]] if added else changes[text]
+            adds_rows = self._vary[text].sample is not None
+            return [*(value or ()), *changes[text]] if adds_rows else changes[text]
 
-        all_steps = {text: self._steps[text] for text in changes}
+        steps_by_path = {text: self._steps[text] for text in changes}
         if noise_seed:
-            all_steps.setdefault(_NOISE, self._noise)
-        mapping: Any = self.scenario
-        for text, steps in all_steps.items():
-            mapping = put(mapping, steps, partial(changed, text))
-        sections = {str(name): mapping[name] for (name, _), *_ in all_steps.values()}
+            steps_by_path.setdefault(_NOISE, self._noise)
+        result: Any = self.scenario
+        for text, steps in steps_by_path.items():
+            result = replace_value(result, steps, partial(new_value, text))
+        sections = {str(name): result[name] for (name, _), *_ in steps_by_path.values()}
         return self.scenario.with_sections(sections, source=source)
 
 
@@ -430,9 +430,9 @@ def _fingerprint(scenario: Scenario) -> str:
 
 
 def file_hashes(files: Iterable[Path]) -> list[tuple[str, str]]:
-    """Return name and SHA-256 of files that can be read, sorted: the same in any folder.
+    """Return name and SHA-256 of readable files, sorted: the same in any folder.
 
-    Beside a mesh file that a plug-in reads stand the plug-in's distribution, version and sources.
+    For a mesh file that a plug-in reads, the plug-in's distribution, version and sources follow.
     Files that mesh files refer to (images, buffers) are not read.
     """
     pairs = set()
@@ -446,6 +446,6 @@ def file_hashes(files: Iterable[Path]) -> list[tuple[str, str]]:
 
 @cache
 def _hash(path: Path, *_: int) -> str:
-    """Return the SHA-256 of a file, which is read once for each of its states."""
+    """Return the SHA-256 of a file; a file is read once for each of its states."""
     with open_input(path) as file:
         return hashlib.file_digest(file, "sha256").hexdigest()

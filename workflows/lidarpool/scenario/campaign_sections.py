@@ -1,4 +1,4 @@
-"""The sections of a campaign file, and what its jobs draw: values, and rows of tables."""
+"""Sections of a campaign file, and the draws of its jobs: values, and rows of tables."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from itertools import accumulate
 from math import isclose, isfinite, lcm
 from pathlib import Path
 from statistics import NormalDist
-from typing import Annotated, Any, Literal, get_args, get_origin
+from typing import Annotated, Any, Literal, NamedTuple, get_args, get_origin
 
 import numpy as np
 import yaml
@@ -56,25 +56,25 @@ from ..export.format_table import DATA_SETS, LAYOUTS
 from ..export.formats import Format
 from .sections import IgnoredColumns, Section, may_be_empty
 
-SIGMAS = 6.0  # normal numbers are drawn again beyond, one of 500 million
-SHARE_LEAST = 0.01  # of a normal distribution that lies within limits
+SIGMAS = 6.0  # a normal number beyond is drawn again, 2 of a billion
+MIN_SHARE = 0.01  # of a normal distribution that lies within limits
 
 _CAMPAIGN_SUFFIXES = (".yaml", ".yml")
-_KEYS = re.compile(r"""^(?:["']?(?:base|vary)["']?\s*:|\{)""", re.MULTILINE)  # or one mapping {…}
+_KEYS = re.compile(r"""^(?:["']?(?:base|vary)["']?\s*:|\{)""", re.MULTILINE)  # or a mapping {…}
 _EXACT = Context(prec=40)
 _DIGITS = 12  # that numbers are rounded to, so that tables are readable and hold the exact number
 
 
 class JobRandom:
-    """Random numbers of one job for one purpose; each call draws the next.
+    """Random numbers of a job for a purpose; each call draws the next.
 
-    They are hashes, the same on every machine and in every year: of the campaign's seed, the job's
-    number, what they are for, and how many were drawn for that before. So a quantity that is added,
-    removed or moved leaves the others as they are, and so does the number of jobs.
+    The numbers are hashes, the same on every machine and in every year: of the campaign's seed,
+    the job's number, the purpose, and the count of earlier draws for the purpose. A quantity that
+    is added, removed or moved does not change the others, nor does the number of jobs.
 
     They are made of integers, of single operations on floats, and of the logarithms, roots and
-    powers of `decimal`, which are rounded correctly everywhere. Those of C and of NumPy differ in
-    the last bit from one processor or library to the next.
+    powers of `decimal`, which are rounded correctly everywhere. The functions of C and of NumPy
+    differ in the last bit between processors and libraries.
 
     Examples
     --------
@@ -87,7 +87,7 @@ class JobRandom:
         self._drawn = 0
 
     def bits(self, count: int = 64) -> int:
-        """Draw so many bits, 256 at most."""
+        """Draw a number of random bits, 256 at most, as an integer."""
         self._drawn += 1
         digest = self._hash.copy()
         digest.update(str(self._drawn).encode())
@@ -97,35 +97,39 @@ class JobRandom:
         """Draw a whole number from 0 to count - 1."""
         return self.bits(128) * count >> 128
 
-    def integer(self, low: int, high: int) -> int:
-        """Draw a whole number, both ends included."""
-        return low + self.below(high - low + 1)
+    def integer(self, minimum: int, maximum: int) -> int:
+        """Draw a whole number between two limits, both included."""
+        return minimum + self.below(maximum - minimum + 1)
 
     def unit(self) -> float:
         """Draw a number from 0 to 1, without 1."""
         return self.bits(53) * 2.0**-53
 
-    def uniform(self, low: float, high: float) -> float:
+    def uniform(self, minimum: float, maximum: float) -> float:
         """Draw a number from an interval."""
-        return _within(_short(low + (high - low) * self.unit()), low, high)
+        return _within(_short(minimum + (maximum - minimum) * self.unit()), minimum, maximum)
 
-    def log_uniform(self, low: float, high: float) -> float:
+    def log_uniform(self, minimum: float, maximum: float) -> float:
         """Draw a number whose logarithm is uniform."""
-        begin, end = (_EXACT.ln(Decimal(one)) for one in (low, high))
+        log_minimum, log_maximum = (_EXACT.ln(Decimal(limit)) for limit in (minimum, maximum))
         share = _share(self.bits(53))
-        drawn = _EXACT.exp(_EXACT.add(begin, _EXACT.multiply(share, _EXACT.subtract(end, begin))))
-        return _within(_short(float(drawn)), low, high)
+        number = _EXACT.exp(
+            _EXACT.add(
+                log_minimum, _EXACT.multiply(share, _EXACT.subtract(log_maximum, log_minimum))
+            )
+        )
+        return _within(_short(float(number)), minimum, maximum)
 
     def normal(self, mean: float, std: float, limits: tuple[float, float] | None = None) -> float:
-        """Draw a normally distributed number; outside the limits it is drawn again."""
-        low, high = limits or (mean - SIGMAS * std, mean + SIGMAS * std)
+        """Draw a normally distributed number; numbers outside the limits are drawn again."""
+        minimum, maximum = limits or (mean - SIGMAS * std, mean + SIGMAS * std)
         while True:
-            drawn = _short(mean + std * self._standard())
-            if low <= drawn <= high:
-                return drawn
+            number = _short(mean + std * self._standard())
+            if minimum <= number <= maximum:
+                return number
 
     def _standard(self) -> float:
-        """Polar method of Marsaglia and Bray (1964)."""
+        """Draw a standard normal number, by the polar method of Marsaglia and Bray (1964)."""
         while True:
             x, y = (_share(2 * self.bits(53) + 1 - 2**53) for _ in range(2))
             square = _EXACT.fma(x, x, _EXACT.multiply(y, y))
@@ -134,48 +138,51 @@ class JobRandom:
                 return float(_EXACT.multiply(x, _EXACT.sqrt(ratio)))
 
     def position(self, count: int, weights: Sequence[float] = ()) -> int:
-        """Draw the position of one of several things, all alike or with weights."""
+        """Draw an index below `count`, uniformly or with weights."""
         if not weights:
             return self.below(count)
-        ends = list(accumulate(weights))
-        drawn = self.unit() * ends[-1]
-        return next((i for i, end in enumerate(ends) if drawn < end), count - 1)
+        cumulative = list(accumulate(weights))
+        number = self.unit() * cumulative[-1]
+        return next((i for i, upper in enumerate(cumulative) if number < upper), count - 1)
 
     def subset(self, count: int, chosen: int) -> list[int]:
-        """Draw different numbers below `count`, in order (Floyd 1987)."""
-        found: set[int] = set()
+        """Draw a number of different integers below `count`, ascending (Floyd 1987)."""
+        numbers: set[int] = set()
         for last in range(count - chosen, count):
-            drawn = self.below(last + 1)
-            found.add(last if drawn in found else drawn)
-        return sorted(found)
+            number = self.below(last + 1)
+            numbers.add(last if number in numbers else number)
+        return sorted(numbers)
 
     def order(self, count: int) -> list[int]:
-        """Draw an order of the numbers below `count` (Fisher and Yates)."""
-        found = list(range(count))
+        """Draw a permutation of the integers below `count` (Fisher and Yates)."""
+        numbers = list(range(count))
         for last in range(count - 1, 0, -1):
-            other = self.below(last + 1)
-            found[last], found[other] = found[other], found[last]
-        return found
+            partner = self.below(last + 1)
+            numbers[last], numbers[partner] = numbers[partner], numbers[last]
+        return numbers
 
     def generator(self) -> np.random.Generator:
-        """Return a generator of NumPy, for functions that draw for themselves."""
+        """Return a generator of NumPy, for functions that draw their own numbers."""
         return np.random.Generator(np.random.Philox(key=self.bits(128)))
 
 
 def _share(bits: int) -> Decimal:
+    """Return a number of 53 random bits as a decimal share of 1."""
     return _EXACT.divide(Decimal(bits), Decimal(2**53))
 
 
 def _short(value: float) -> float:
+    """Return a number rounded to `_DIGITS` digits."""
     return float(f"{value:.{_DIGITS}g}")
 
 
-def _within(value: float, low: float, high: float) -> float:
-    return min(max(value, low), high)
+def _within(value: float, minimum: float, maximum: float) -> float:
+    """Return the nearest number between two limits."""
+    return min(max(value, minimum), maximum)
 
 
-COUNT_MOST = 10_000_000
-_SHOWN = 60  # letters of a list or mapping in the table of jobs; longer ones by their position
+MAX_JOBS = 10_000_000
+_SHOWN = 60  # letters of a list or mapping in the table of jobs; else its position
 
 Options = Annotated[
     Annotated[Several[Any], Field(min_length=1)]
@@ -197,20 +204,21 @@ class Normal(Section):
     ] = None
 
     @model_validator(mode="after")
-    def _room(self) -> Normal:
+    def _check_room(self) -> Normal:
+        """Raise ValueError if the limits exclude nearly all numbers, or numbers overflow."""
         if self.limits is not None:
-            low, high = map(NormalDist(self.mean, self.std).cdf, self.limits)
-            if high - low < SHARE_LEAST:
+            lower_share, upper_share = map(NormalDist(self.mean, self.std).cdf, self.limits)
+            if upper_share - lower_share < MIN_SHARE:
                 raise ValueError(
-                    f"limits must have at least {SHARE_LEAST:.0%} of the distribution between them."
+                    f"limits must have at least {MIN_SHARE:.0%} of the distribution between them."
                 )
-        if not isfinite(self.ends[1] - self.ends[0]):
+        if not isfinite(self.limit_values[1] - self.limit_values[0]):
             raise ValueError("its numbers are too large.")
         return self
 
     @property
-    def ends(self) -> tuple[float, float]:
-        """Least and largest number."""
+    def limit_values(self) -> tuple[float, float]:
+        """Smallest and largest number that is drawn."""
         reach = SIGMAS * self.std
         return self.limits or (self.mean - reach, self.mean + reach)
 
@@ -238,7 +246,7 @@ _KINDS = ("uniform", "log_uniform", "normal", "integer", "choice", "each", "samp
 
 
 class Choice(Section):
-    """How a value is chosen for each job: one of these."""
+    """Choice of a value for each job; a single field is given."""
 
     uniform: Annotated[
         MinMax[float] | None, about("a number between two, all equally likely", [0.5, 2])
@@ -272,7 +280,8 @@ class Choice(Section):
     _one_kind = one_of(*_KINDS)
 
     @model_validator(mode="after")
-    def _weighted(self) -> Choice:
+    def _check_weights(self) -> Choice:
+        """Raise ValueError if the weights do not fit the values of `choice`."""
         if self.weights is not None:
             if self.choice is None or len(self.weights) != len(self.choice):
                 raise ValueError("give as many weights as there are values of choice.")
@@ -282,62 +291,63 @@ class Choice(Section):
 
     @property
     def kind(self) -> str:
-        """Name of the field that is given."""
+        """Name of the field that is given, such as «uniform»."""
         return next(name for name in _KINDS if getattr(self, name) is not None)
 
     @cached_property
     def options(self) -> list[tuple[Any, Value | None]]:
-        """Values of `choice` or `each`, and what the table of jobs says of each."""
-        given = self.choice if self.choice is not None else self.each
-        if isinstance(given, Mapping):
-            return [(value, name) for name, value in given.items()]
-        return [(value, _in_table(value, number)) for number, value in enumerate(given or ())]
+        """Values of `choice` or `each`, with their labels in the table of jobs."""
+        values = self.choice if self.choice is not None else self.each
+        if isinstance(values, Mapping):
+            return [(value, name) for name, value in values.items()]
+        return [(value, _in_table(value, number)) for number, value in enumerate(values or ())]
 
     @property
-    def ends(self) -> list[Any]:
-        """Values that are valid if all are: the ends of a range, or all of a list."""
+    def limit_values(self) -> list[Any]:
+        """Values that are valid if all drawn values are: the limits of a range, or a list."""
         if self.normal is not None:
-            return list(self.normal.ends)
+            return list(self.normal.limit_values)
         chosen = [value for value, _ in self.options]
         return list(self.uniform or self.log_uniform or self.integer or chosen)
 
-    def drawn(self, draw: JobRandom) -> tuple[Any, Value | None]:
-        """Draw a value, and what the table of jobs says of it; None for an empty cell.
+    def draw(self, rng: JobRandom) -> tuple[Any, Value | None]:
+        """Draw a value and its label in the table of jobs, None for an empty cell.
 
-        Not of `each` and `sample`, which need more than a job's random numbers.
+        `each` and `sample` are not drawn here: they need more than a job's random numbers.
         """
         if self.choice is not None:
-            return self.options[draw.position(len(self.options), self.weights or ())]
+            return self.options[rng.position(len(self.options), self.weights or ())]
         if self.normal is not None:
-            value = draw.normal(self.normal.mean, self.normal.std, self.normal.limits)
+            value = rng.normal(self.normal.mean, self.normal.std, self.normal.limits)
         else:
-            value = getattr(draw, self.kind)(*self.ends)
+            value = getattr(rng, self.kind)(*self.limit_values)
         return value, value
 
     def hint(self, error: str) -> str:
-        """Advice on an end that a field does not take."""
+        """Return advice on a limit that a field refuses, to end a message."""
         if self.integer is None and "whole number" in error and not self.options:
             return " Take integer: [least, largest]."
         return " Give limits." if self.normal is not None and self.normal.limits is None else ""
 
     @property
     def words(self) -> str:
-        """The values that there are: «0.2 to 20, log_uniform»."""
+        """Range of the values in words: «0.2 to 20, log_uniform»."""
         if self.sample is not None:
-            low, high = self.sample.count
-            rows = f"{low:,}" if low == high else f"{low:,} to {high:,}"
+            min_rows, max_rows = self.sample.count
+            rows = f"{min_rows:,}" if min_rows == max_rows else f"{min_rows:,} to {max_rows:,}"
             return f"{rows} of {self.sample.file}"
         if self.normal is not None:
-            least, most = self.normal.ends
-            about = f"normal, {self.normal.mean:g} ± {self.normal.std:g}"
-            return f"{least:g} to {most:g}, {about}"
-        if ends := self.uniform or self.log_uniform or self.integer:
-            return f"{ends[0]:.12g} to {ends[1]:.12g}, {self.kind}"
+            minimum, maximum = self.normal.limit_values
+            shape = f"normal, {self.normal.mean:g} ± {self.normal.std:g}"
+            return f"{minimum:g} to {maximum:g}, {shape}"
+        if limits := self.uniform or self.log_uniform or self.integer:
+            return f"{limits[0]:.12g} to {limits[1]:.12g}, {self.kind}"
         shown = ["none" if label is None else str(label) for _, label in self.options]
         return f"{', '.join(shown[:8])}{', …' * (len(shown) > 8)}, {self.kind} of {len(shown):,}"
 
 
 def _choice(value: Any) -> Any:
+    """Return an entry of `vary`, or raise an error for an entry that is no choice."""
     if not isinstance(value, (dict, Choice)):
         raise must_be("a way of choosing, {uniform: [0, 1]} or {choice: [1, 4]}")
     return value
@@ -347,11 +357,12 @@ ChoiceEntry = Annotated[Choice, BeforeValidator(_choice, json_schema_input_type=
 
 
 def _in_table(value: Any, position: int) -> Value | None:
+    """Return the label of a value in the table of jobs, by its position in a list."""
     if isinstance(value, (list, dict)):
         text = json.dumps(value, ensure_ascii=False, default=str)
         return text if len(text) <= _SHOWN else f"choice {position + 1}"
-    known = value is None or isinstance(value, (bool, int, float, str))
-    return value if known else str(value)  # a date or time
+    is_plain = value is None or isinstance(value, (bool, int, float, str))
+    return value if is_plain else str(value)  # a date or time
 
 
 @dataclass(frozen=True)
@@ -397,9 +408,9 @@ KeepEntry = Annotated[
 
 
 class CampaignSection(Section):
-    """Many jobs from one description: scenarios, and what differs from job to job.
+    """Many jobs from a description: base scenarios, and fields that differ between jobs.
 
-    Relative names of files start from the base's folder; that of the base from the campaign's.
+    Names of files start from the base's folder; the name of the base from the campaign's.
     """
 
     base: Annotated[
@@ -412,7 +423,7 @@ class CampaignSection(Section):
             "how many jobs; by default one for each base and value of each, if nothing is drawn",
             1000,
             ge=1,
-            le=COUNT_MOST,
+            le=MAX_JOBS,
         ),
     ] = None
     seed: Annotated[Seed, about("another seed draws other values")] = 0
@@ -437,7 +448,8 @@ class CampaignSection(Section):
     title: Annotated[str, about("title of the data set; by default the file's name")] = ""
 
     @model_validator(mode="after")
-    def _whole(self) -> CampaignSection:
+    def _check_splits(self) -> CampaignSection:
+        """Raise ValueError if names or shares of splits are not valid."""
         for name in self.splits:
             if not re.fullmatch(r"[A-Za-z0-9_-]+", name):
                 raise ValueError(
@@ -451,41 +463,42 @@ class CampaignSection(Section):
 
 
 class Splits:
-    """Which job is of which split: in each block of jobs exactly the shares, in random order.
+    """Splits of jobs: each block of jobs has exactly the shares, in random order.
 
-    The block is the shortest that the shares divide, so a job's split does not depend on how many
-    jobs there are: of 0.8, 0.1 and 0.1 each ten jobs have 8, 1 and 1.
+    The block is the shortest that the shares divide, so a job's split does not depend on the
+    number of jobs: of 0.8, 0.1 and 0.1 each ten jobs have 8, 1 and 1.
     """
 
-    BLOCK_MOST = 1000
+    MAX_BLOCK = 1000
 
     def __init__(self, shares: Mapping[str, float], seed: int) -> None:
         self._seed = seed
         exact = {name: Fraction(str(share)) for name, share in shares.items()}
         total = sum(exact.values())
         exact = {name: share / total for name, share in exact.items()}
-        size = min(lcm(*(share.denominator for share in exact.values())), self.BLOCK_MOST)
+        size = min(lcm(*(share.denominator for share in exact.values())), self.MAX_BLOCK)
         self._block: list[str] = []
-        done = Fraction(0)
+        cumulative = Fraction(0)
         for name, share in exact.items():
-            done += share
-            self._block += [name] * (round(done * size) - len(self._block))
+            cumulative += share
+            self._block += [name] * (round(cumulative * size) - len(self._block))
 
     def __call__(self, number: int) -> str:
-        """Name of a job's split; empty if there are none."""
+        """Return the split of a job; empty without splits."""
         if not self._block:
             return ""
-        block, place = divmod(number, len(self._block))
-        return self._block[_order(self._seed, block, len(self._block))[place]]
+        block, offset = divmod(number, len(self._block))
+        return self._block[_order(self._seed, block, len(self._block))[offset]]
 
 
 @lru_cache
 def _order(seed: int, block: int, count: int) -> list[int]:
+    """Return the random order of the jobs of a block."""
     return JobRandom(seed, block, "splits").order(count)
 
 
-_MARKS = ",;\t"  # between cells
-_WHOLE = re.compile(r"[-+]?[0-9]+")
+_DELIMITERS = ",;\t"  # between cells
+_INTEGER = re.compile(r"[-+]?[0-9]+")
 _REAL = re.compile(r"[-+]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][-+]?[0-9]+)?")
 _WORDS = {"true": True, "false": False}
 
@@ -493,7 +506,7 @@ _WORDS = {"true": True, "false": False}
 def read_rows(path: Path, kind: Any, ignore: Sequence[str] = ()) -> list[Any]:
     """Read entries of a list from a table, whose columns are their fields: box, at.0.position.
 
-    A cell is a number, true or false, or a list or mapping as in YAML, else text; an empty one
+    A cell is a number, true or false, or a list or mapping as in YAML, else text; an empty cell
     leaves the field out. Lines that begin with # are remarks.
 
     Parameters
@@ -506,31 +519,20 @@ def read_rows(path: Path, kind: Any, ignore: Sequence[str] = ()) -> list[Any]:
     Raises
     ------
     LidarError
-        If the file cannot be read, the field is no list, or a row is no entry of it; the message
-        has the line.
+        If the file cannot be read, the field is no list, or a row is not a valid entry; the
+        message has the line.
     """
     entry = next(_entries(kind), None)
     if entry is None:
         raise LidarError("sample adds entries to a list, such as actors, and this is none.")
     try:
-        lines = read_text(path).splitlines()
-        first = next((line for line in lines if line.strip() and line.lstrip()[0] != "#"), "")
-        mark = max(_MARKS, key=first.count)
-        reader = csv.reader(lines, delimiter=mark)
-        cells = [
-            (reader.line_num, [cell.strip() for cell in row])
-            for row in reader
-            if any(cell.strip() for cell in row) and not row[0].lstrip().startswith("#")
-        ]
-        if not cells:
-            raise ValueError("it is empty")
-        (_, header), *cells = cells
-        left_out = ignored_columns(header, ignore)
-        head = [name for index, name in enumerate(header) if index not in left_out]
-        if twice := next((name for name in head if head.count(name) > 1), None):
+        table = _read_cells(path)
+        ignored = ignored_columns(table.header, ignore)
+        names = [name for index, name in enumerate(table.header) if index not in ignored]
+        if twice := next((name for name in names if names.count(name) > 1), None):
             raise ValueError(f"it has the column {twice!r} twice")
         model = next(sections_in(entry), BaseModel)
-        _check_columns(head, model)
+        _check_columns(names, model)
     except FileNotFoundError as error:
         raise LidarError(f"{path} does not exist: check the name and the folder.") from error
     except (OSError, ValueError, csv.Error, LidarError) as error:
@@ -538,19 +540,44 @@ def read_rows(path: Path, kind: Any, ignore: Sequence[str] = ()) -> list[Any]:
     adapter = TypeAdapter(entry)
     mistakes = Mistakes()
     rows = []
-    for line, row in cells:
-        where = f"{path}, line {line}"
-        with mistakes.noted(), sentences(model, where):
-            if len(row) > len(header):
-                raise LidarError(f"{where}: it has {len(row)} cells, and the header {len(header)}.")
-            read = [cell for index, cell in enumerate(row) if index not in left_out]
-            rows.append(_checked(adapter, dict(zip(head, read, strict=False))))
+    for line, cells in table.rows:
+        source = f"{path}, line {line}"
+        with mistakes.noted(), sentences(model, source):
+            if len(cells) > len(table.header):
+                raise LidarError(
+                    f"{source}: it has {len(cells)} cells, and the header {len(table.header)}."
+                )
+            values = [cell for index, cell in enumerate(cells) if index not in ignored]
+            rows.append(_checked(adapter, dict(zip(names, values, strict=False))))
     mistakes.tell()
     return rows
 
 
+class _Cells(NamedTuple):
+    """The cells of a table."""
+
+    header: list[str]
+    rows: list[tuple[int, list[str]]]  # line in the file, and cells without outer spaces
+
+
+def _read_cells(path: Path) -> _Cells:
+    """Read the cells of a table; ValueError if the table is empty."""
+    lines = read_text(path).splitlines()
+    first = next((line for line in lines if line.strip() and line.lstrip()[0] != "#"), "")
+    reader = csv.reader(lines, delimiter=max(_DELIMITERS, key=first.count))
+    cells = [
+        (reader.line_num, [cell.strip() for cell in row])
+        for row in reader
+        if any(cell.strip() for cell in row) and not row[0].lstrip().startswith("#")
+    ]
+    if not cells:
+        raise ValueError("it is empty")
+    (_, header), *rows = cells
+    return _Cells(header, rows)
+
+
 def _check_columns(names: Sequence[str], model: Any) -> None:
-    """Check that columns are fields of an entry, or numbers of one that is a list."""
+    """Raise ValueError unless the columns are fields of an entry, or indices of a list."""
     fields = [field.alias or name for name, field in getattr(model, "model_fields", {}).items()]
     unknown = [
         name
@@ -567,6 +594,7 @@ def _check_columns(names: Sequence[str], model: Any) -> None:
 
 
 def _checked(adapter: TypeAdapter[Any], cells: dict[str, str]) -> Any:
+    """Return the entry of a row's cells, {column: cell}, or raise ValidationError."""
     values = {name: _value(cell) for name, cell in cells.items() if cell}
     try:
         return adapter.validate_python(_nested(values))
@@ -580,13 +608,14 @@ def _checked(adapter: TypeAdapter[Any], cells: dict[str, str]) -> Any:
 
 
 def _value(cell: str) -> Any:
-    if _WHOLE.fullmatch(cell):
+    """Return the value of a cell: a number, truth value, list, mapping or text."""
+    if _INTEGER.fullmatch(cell):
         return int(cell)
     if _REAL.fullmatch(cell):
         return float(cell)
     if cell[0] in "[{":
         with suppress(ValueError):
-            return json.loads(cell)  # a hundred times as fast, where it will do
+            return json.loads(cell)  # a hundred times as fast as YAML
         with suppress(yaml.YAMLError, ValueError, OverflowError, RecursionError):
             return load_yaml(cell)
     return _WORDS.get(cell.lower(), cell)
@@ -594,19 +623,20 @@ def _value(cell: str) -> Any:
 
 def _nested(values: dict[str, Any]) -> Any:
     """Return mappings and lists of names with dots: {"box.0": 4} is {"box": [4]}."""
-    out: dict[str, Any] = {}
+    result: dict[str, Any] = {}
     for name, value in values.items():
         *outer, last = name.split(".")
-        node = out
+        node = result
         for step in outer:
             node = node.setdefault(step, {})
             if not isinstance(node, dict):
-                return out | {name: value}  # refused as a name that is no field
+                return result | {name: value}  # refused as a name that is no field
         node[last] = value
-    return _lists(out)
+    return _lists(result)
 
 
 def _lists(node: Any) -> Any:
+    """Return mappings with the keys "0", "1", … as lists, at any depth."""
     if not isinstance(node, dict):
         return node
     inner = {key: _lists(value) for key, value in node.items()}
@@ -615,7 +645,7 @@ def _lists(node: Any) -> Any:
 
 
 def _entries(kind: Any) -> Iterator[Any]:
-    """Annotations of the entries of lists in an annotation, such as `tuple[X, ...] | None`."""
+    """Yield the entries' annotations of lists in an annotation, such as `tuple[X, ...] | None`."""
     args = get_args(kind)
     if get_origin(kind) is tuple and len(args) == 2 and args[1] is Ellipsis:
         yield args[0]
@@ -634,4 +664,4 @@ def is_campaign(path: str | Path) -> bool:
             return False  # without reading all poses of a scenario as YAML
         return bool({"base", "vary"} & read_yaml(path).keys())
     except (OSError, ValueError, LidarError):
-        return False  # the reader of scenarios says what is wrong
+        return False  # the reader of scenarios reports the error

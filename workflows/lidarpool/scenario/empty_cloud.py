@@ -27,8 +27,8 @@ def empty_cloud_reason(scene: Scene, survey: Survey, scans: range | None = None)
     """Return the most likely reason why a survey gives no points, as a clause.
 
     Some rays are cast without limits of range and without effects: if these rays meet nothing, the
-    reason is the pose, or the unit of the scene; else the range, or an effect. `scans` are those
-    that were cast, by default all.
+    reason is the pose, or the unit of the scene; else the range, or an effect. `scans` are the
+    scans that were cast, by default all.
     """
     if survey.scan_count == 0 or (scans is not None and not len(scans)):
         return "no scan was cast"
@@ -37,10 +37,10 @@ def empty_cloud_reason(scene: Scene, survey: Survey, scans: range | None = None)
     ranges = sample_ranges(scene, survey, scans)
     if not len(ranges):
         faults = "faults, " * bool(survey.faults)
-        seen = seen_from(scene, survey.carried[0])
+        poses_note = seen_from(scene, survey.carried[0])
         return (
             f"no ray hit anything at any distance: check {faults}poses and units; "
-            f"{_start(scene, survey)}; {seen}"
+            f"{_start(scene, survey)}; {poses_note}"
         )
     limits = [*dict.fromkeys(_limits(survey, ranges))]
     if not limits:
@@ -51,32 +51,32 @@ def empty_cloud_reason(scene: Scene, survey: Survey, scans: range | None = None)
 
 
 def empty_jobs_warning(empty: Sequence[JobRow], reason: str) -> str:
-    """Return a warning that jobs have no points; `reason` is of the first of them, or empty."""
+    """Return a warning that jobs have no points; `reason` is the first job's, or empty."""
     names = ", ".join(row.name for row in empty[:NAMED_JOBS])
-    if more := len(empty) - NAMED_JOBS:
-        names += f" and {more:,} more" * (more > 0)
+    if unnamed := len(empty) - NAMED_JOBS:
+        names += f" and {unnamed:,} more" * (unnamed > 0)
     jobs = f"{plural(len(empty), 'job has', 'jobs have')} {NO_POINTS}{names}"
     advice = "; lidarpool check CAMPAIGN --job N says the most likely reason"
     return f"{jobs}; in job {empty[0].name} {reason}" if reason else jobs + advice
 
 
 def _limits(survey: Survey, ranges: Floats) -> Iterator[str]:
-    """Say which limits of range exclude the surfaces; nothing if some are within the limits."""
+    """Yield the limits of range that exclude all surfaces."""
     lower = [carried.sensor.min_range_m for carried in survey.carried]
     upper = [carried.sensor.max_range_m for carried in survey.carried]
-    near = ranges < min(lower)
-    far = ranges > max(upper)
-    if not (near | far).all():
+    too_near = ranges < min(lower)
+    too_far = ranges > max(upper)
+    if not (too_near | too_far).all():
         return
-    if near.any():
+    if too_near.any():
         yield (
-            f"{'all' if near.all() else 'some'} surfaces are nearer than the sensor's minimum "
-            f"range: min_range_m is {min(lower):g}, and they are at {_span(ranges[near])}"
+            f"{'all' if too_near.all() else 'some'} surfaces are nearer than the sensor's minimum "
+            f"range: min_range_m is {min(lower):g}, and they are at {_span(ranges[too_near])}"
         )
-    if far.any():
+    if too_far.any():
         yield (
-            f"{'all' if far.all() else 'some'} surfaces are farther than the sensor's maximum "
-            f"range: max_range_m is {max(upper):g}, and they are at {_span(ranges[far])}"
+            f"{'all' if too_far.all() else 'some'} surfaces are farther than the sensor's maximum "
+            f"range: max_range_m is {max(upper):g}, and they are at {_span(ranges[too_far])}"
         )
 
 
@@ -97,9 +97,11 @@ def _effects(survey: Survey) -> Iterator[str]:
 
 
 def _span(ranges: Floats) -> str:
+    """Return the smallest and largest range in words."""
     return f"{np.min(ranges):,.4g} to {np.max(ranges):,.4g} m"
 
 
 def _start(scene: Scene, survey: Survey) -> str:
+    """Return the first position of the sensor in words, world coordinates."""
     (x, y, z) = survey.pose(0).position + scene.origin
     return f"the sensor begins at ({x:,.3f}, {y:,.3f}, {z:,.3f})"

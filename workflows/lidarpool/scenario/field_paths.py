@@ -13,8 +13,8 @@ from lidarsim.base.words import did_you_mean, plural
 
 from .scenario import Scenario
 
-# Keys of fields and numbers of entries, each with its value. A section that is left out
-# has defaults as its value.
+# Keys of fields and numbers of entries, each with its value. The value of a section that is left
+# out is the section of its defaults.
 FieldSteps = tuple[tuple[str | int, Any], ...]
 
 
@@ -32,24 +32,24 @@ def find_field(scenario: Scenario, text: str) -> tuple[FieldSteps, Any]:
     """
     node: Any = scenario
     kind: Any = type(scenario)
-    parts = text.split(".")  # that are left
+    remaining = text.split(".")
     steps: list[tuple[str | int, Any]] = []
     key: str | int
-    while parts:
-        path = ".".join(text.split(".")[: -len(parts)])  # of the node
-        if node is None and not parts[0].isdecimal() and (sections := list(sections_in(kind))):
+    while remaining:
+        path = ".".join(text.split(".")[: -len(remaining)])  # of the node
+        if node is None and not remaining[0].isdecimal() and (sections := list(sections_in(kind))):
             model = issubclass(sections[0], BaseModel)  # of defaults
             node = sections[0].model_construct() if model else object.__new__(sections[0])
             steps[-1] = (steps[-1][0], node)
         if is_section(type(node)):
-            key, node, kind = _field(node, parts[0], path)
-            used = 1
+            key, node, kind = _field(node, remaining[0], path)
+            part_count = 1
         elif isinstance(node, dict):
             keys = {str(key): key for key in node}  # of classes, numbers
-            name, used = _named([*keys], parts, path)
+            name, part_count = _match_name([*keys], remaining, path)
             node = node[key := keys[name]]
         elif isinstance(node, (tuple, list)):
-            key, used = _entry(node, parts, path)
+            key, part_count = _match_entry(node, remaining, path)
             node = node[key]
         else:
             reason = f"{path} has no fields of its own"
@@ -57,7 +57,7 @@ def find_field(scenario: Scenario, text: str) -> tuple[FieldSteps, Any]:
                 reason = f"the base has no {path}"
             raise LidarError(f"{text} leads to no field: {reason}.")
         steps.append((key, node))
-        parts = parts[used:]
+        remaining = remaining[part_count:]
     return tuple(steps), kind
 
 
@@ -73,20 +73,20 @@ def _field(node: BaseModel, name: str, path: str) -> tuple[str, Any, Any]:
     return name, getattr(node, attribute, None), fields_of(type(node))[attribute].annotation
 
 
-def _named(names: Sequence[str], parts: Sequence[str], path: str) -> tuple[str, int]:
-    """Return the longest of some names that parts of a path begin with, and its number of parts.
+def _match_name(names: Sequence[str], parts: Sequence[str], path: str) -> tuple[str, int]:
+    """Return the longest name that leading parts of a path make, and the number of parts.
 
     Names may have dots.
     """
-    for used in range(len(parts), 0, -1):
-        if (name := ".".join(parts[:used])) in names:
-            return name, used
+    for part_count in range(len(parts), 0, -1):
+        if (name := ".".join(parts[:part_count])) in names:
+            return name, part_count
     hint = did_you_mean(parts[0], names) or (f" It has {', '.join(names[:5])}." if names else "")
     raise LidarError(f"{path} of the base has no {parts[0]!r}.{hint}")
 
 
-def _entry(entries: Sequence[Any], parts: Sequence[str], path: str) -> tuple[int, int]:
-    """Return the index of the entry that parts of a path name, and the number of these parts."""
+def _match_entry(entries: Sequence[Any], parts: Sequence[str], path: str) -> tuple[int, int]:
+    """Return the index of the entry that leading parts of a path name, and the number of parts."""
     if parts[0].isdecimal():
         if (index := int(parts[0])) < len(entries):
             return index, 1
@@ -95,19 +95,19 @@ def _entry(entries: Sequence[Any], parts: Sequence[str], path: str) -> tuple[int
             f"and no entry {index}."
         )
     names = [getattr(entry, "name", None) for entry in entries]
-    name, used = _named([name for name in names if isinstance(name, str)], parts, path)
-    return names.index(name), used
+    name, part_count = _match_name([name for name in names if isinstance(name, str)], parts, path)
+    return names.index(name), part_count
 
 
-def put(node: Any, steps: FieldSteps, change: Callable[[Any], Any]) -> Any:
-    """Return a section in which `change` has replaced the value that the steps lead to.
+def replace_value(node: Any, steps: FieldSteps, change: Callable[[Any], Any]) -> Any:
+    """Return a section with the value at the end of the steps replaced by `change(value)`.
 
     The section itself is not changed. Sections along the steps become mappings of their fields, to
     be checked again; other sections stay as they are.
     """
     if not steps:
         return change(node)
-    (key, base), *following = steps
+    (key, base), *inner_steps = steps
     values: Any
     if is_section(type(node)):
         set_fields = getattr(node, "model_fields_set", vars(node))
@@ -118,6 +118,6 @@ def put(node: Any, steps: FieldSteps, change: Callable[[Any], Any]) -> Any:
         }
     else:
         values = list(node) if isinstance(node, (tuple, list)) else dict(node)
-    below = values[key] if isinstance(values, list) else values.get(key, base)  # type: ignore[index]
-    values[key] = put(base if below is None else below, tuple(following), change)
+    value = values[key] if isinstance(values, list) else values.get(key, base)  # type: ignore[index]
+    values[key] = replace_value(base if value is None else value, tuple(inner_steps), change)
     return values

@@ -1,4 +1,4 @@
-"""What copies, traffic and carriers stand on: surfaces of a scene that face up."""
+"""Surfaces of a scene that face up, which copies, traffic and carriers stand on."""
 
 from __future__ import annotations
 
@@ -19,70 +19,71 @@ from lidarsim.sensor.trajectory import quaternions_of
 from raybeam import RayCaster, available_backends
 
 STEP_M = 0.5  # of a trajectory that follows a surface
-STEPS_MOST = 1_000_000
+MAX_STEPS = 1_000_000
 
 
-class Standing:
-    """What one can stand on in a scene: the triangles of some objects that face up.
+class StandingSurfaces:
+    """The triangles of a scene that face up, of all objects or of a selection.
 
-    Of several above a place the highest counts. None is a scene without triangles.
+    The highest of several surfaces counts. `scene` is None for a scene without triangles.
     """
 
     def __init__(self, scene: Scene | None, objects: Indices | None = None) -> None:
         self._scene = scene
         self._objects = objects
-        self._parts: dict[tuple[str, ...], Standing] = {}  # {names: of these objects}
+        self._selections: dict[tuple[str, ...], StandingSurfaces] = {}  # {names: their surfaces}
 
     @property
     def origin(self) -> Floats:
-        """Of the scene, (3,)."""
+        """Origin of the scene, (3,), world metres."""
         return np.zeros(3) if self._scene is None else self._scene.origin
 
-    def only(self, names: Sequence[str]) -> Standing:
-        """Return the same of some objects; LidarError if there is nothing to stand on."""
+    def of_objects(self, names: Sequence[str]) -> StandingSurfaces:
+        """Return the surfaces of the objects that fit names; LidarError if no triangle faces up."""
         key = tuple(names)
         scene = self._scene
-        if key in self._parts:
-            return self._parts[key]
+        if key in self._selections:
+            return self._selections[key]
         if scene is None:
             raise LidarError(
                 "there is nothing to stand on: add scene.files, or scene.ground and a rectangle "
                 "(within)."
             )
         rows = [rows_named(name, scene.names) for name in names]
-        for name, found in zip(names, rows, strict=True):
-            if not len(found):
+        for name, matches in zip(names, rows, strict=True):
+            if not len(matches):
                 hint = (
                     did_you_mean(name, scene.names) or f" There are {', '.join(scene.names[:5])}."
                 )
                 raise LidarError(f"surfaces names {name!r}, but no object has that name.{hint}")
-        found = np.unique(np.concatenate(rows))
-        made = self if len(found) == len(scene.names) else Standing(scene, found)
-        if not len(made._tops[0]):
+        matches = np.unique(np.concatenate(rows))
+        selected = self if len(matches) == len(scene.names) else StandingSurfaces(scene, matches)
+        if not len(selected._tops[0]):
             raise LidarError(f"nothing of {', '.join(map(repr, names))} faces up.")
-        self._parts[key] = made
-        return made
+        self._selections[key] = selected
+        return selected
 
     @cached_property
     def _tops(self) -> tuple[Floats, Ints32]:
         """Triangles that face up, local (f, 3, 3), and their objects (f,)."""
         assert self._scene is not None
-        drawn = self._scene
+        scene = self._scene
         shared = self._scene.instances
         if shared and (self._objects is None or np.isin(shared.owner, self._objects).any()):
-            drawn = SimplifiedScene.from_scene(drawn).scene
-        corners = drawn.vertices[drawn.faces]
-        owner = drawn.face_object
+            scene = SimplifiedScene.from_scene(scene).scene
+        corners = scene.vertices[scene.faces]
+        owner = scene.face_object
         if self._objects is not None:
-            own = np.isin(owner, self._objects)
-            corners = corners[own]
-            owner = owner[own]
+            of_objects = np.isin(owner, self._objects)
+            corners = corners[of_objects]
+            owner = owner[of_objects]
         (ax, ay), (bx, by) = ((corners[:, k] - corners[:, 0]).T[:2] for k in (1, 2))
         up = ax * by - ay * bx > 0
         return corners[up], owner[up]
 
     @cached_property
     def _caster(self) -> RayCaster:
+        """Ray caster of the surfaces."""
         # Never CUDA, whose context would stay in this process.
         backend = "numpy" if available_backends()["embree"] else "embree"
         corners = self._tops[0].reshape(-1, 3)
@@ -90,39 +91,42 @@ class Standing:
 
     @property
     def rectangle(self) -> Floats:
-        """Lowest and highest x and y, world metres: (4,)."""
+        """Lowest x and y, highest x and y of the surfaces, world metres: (4,)."""
         assert self._scene is not None
         x, y = self._tops[0][..., :2].reshape(-1, 2).T
-        at = self._scene.origin[[0, 1, 0, 1]]
-        return np.array([x.min(), y.min(), x.max(), y.max()]) + at
+        origin = self._scene.origin[[0, 1, 0, 1]]
+        return np.array([x.min(), y.min(), x.max(), y.max()]) + origin
 
     @cached_property
     def owners(self) -> Ints32:
-        """Objects that have triangles here."""
+        """Indices of the objects that have triangles facing up, ascending."""
         return np.unique(self._tops[1])
 
-    def under(self, places: Floats) -> tuple[Floats, Ints32]:
-        """Heights below places (n, 2), world metres, nan for none; and their objects, -1."""
-        heights = np.full(len(places), np.nan)
-        objects = np.full(len(places), -1, np.int32)
+    def heights_below(self, positions: Floats) -> tuple[Floats, Ints32]:
+        """Return the heights of the surface below positions (n, 2), and its objects, world metres.
+
+        Both are (n,): nan and -1 where there is no surface.
+        """
+        heights = np.full(len(positions), np.nan)
+        objects = np.full(len(positions), -1, np.int32)
         if self._scene is None or not len(self._tops[0]):
             return heights, objects
         corners, owner = self._tops
         origin = self._scene.origin
         top = float(corners[..., 2].max()) + 1.0
-        origins = np.column_stack([places - origin[:2], np.full(len(places), top)])
+        origins = np.column_stack([positions - origin[:2], np.full(len(positions), top)])
         hits = self._caster.cast(origins, np.broadcast_to([0.0, 0.0, -1.0], origins.shape))
-        on = hits.hit
-        heights[on] = top - hits.distance[on] + origin[2]
-        objects[on] = owner[hits.triangle[on]]
+        hit_rays = hits.hit
+        heights[hit_rays] = top - hits.distance[hit_rays] + origin[2]
+        objects[hit_rays] = owner[hits.triangle[hit_rays]]
         return heights, objects
 
 
-def following(track: Track, standing: Standing) -> list[Track]:
+def follow_surfaces(track: Track, standing: StandingSurfaces) -> list[Track]:
     """Return the pieces of a trajectory that are on surfaces, with a pose every 0.5 m.
 
-    Its heights are added to those of the surface, which its axes lean with: their z is the mean
-    normal of a metre around. Headings are kept.
+    Heights of the trajectory are above the surface. The z axes of the poses are the mean normal
+    of the surface within a metre; headings stay.
 
     Parameters
     ----------
@@ -132,40 +136,63 @@ def following(track: Track, standing: Standing) -> list[Track]:
     Raises
     ------
     LidarError
-        If it is too long.
+        If the trajectory is too long.
     """
-    ways = np.linalg.norm(np.diff(track.positions, axis=0), axis=1)
-    steps = np.maximum(np.ceil(ways / STEP_M), 1).astype(np.int64)
-    if steps.sum() > STEPS_MOST:
+    times = _step_times(track)
+    moved = replace(track, start_s=float(times[0]), duration_s=None)
+    positions, rotations = moved.poses(0, (times - times[0]) * 1e9)
+    positions = positions.copy()
+    ahead = rotations[:, :2, 0] / np.linalg.norm(rotations[:, :2, 0], axis=1)[:, None]
+    heights, axes = _surface_poses(positions[:, :2], ahead, standing)
+    positions[:, 2] += heights  # of the world: the heights they are added to lack the origin
+    edges = np.flatnonzero(np.diff(np.isfinite(heights), prepend=False, append=False))
+    stretches = [
+        slice(start, stop) for start, stop in edges.reshape(-1, 2).tolist() if stop - start > 1
+    ]
+    return [
+        replace(
+            track,
+            times_s=times[rows],
+            positions=positions[rows],
+            quaternions=quaternions_of(axes[rows]),
+        )
+        for rows in stretches
+    ]
+
+
+def _step_times(track: Track) -> Floats:
+    """Return times in seconds at steps of at most `STEP_M`; LidarError if there are too many."""
+    distances_m = np.linalg.norm(np.diff(track.positions, axis=0), axis=1)
+    steps = np.maximum(np.ceil(distances_m / STEP_M), 1).astype(np.int64)
+    if steps.sum() > MAX_STEPS:
         raise LidarError(
-            f"the trajectory is {ways.sum() / 1000:,.0f} km long; at most "
-            f"{STEPS_MOST * STEP_M / 1000:,.0f} km can follow surfaces."
+            f"the trajectory is {distances_m.sum() / 1000:,.0f} km long; at most "
+            f"{MAX_STEPS * STEP_M / 1000:,.0f} km can follow surfaces."
         )
     shares = np.concatenate([np.arange(n) / n for n in steps.tolist()])
-    begins = np.repeat(np.arange(len(steps)), steps)
-    times = track.times_s[begins] + shares * np.diff(track.times_s)[begins]
-    times = np.append(times, track.times_s[-1])
-    moved = replace(track, start_s=float(times[0]), duration_s=None)
-    places, turns = moved.poses(0, (times - times[0]) * 1e9)
-    places = places.copy()
-    ahead = turns[:, :2, 0] / np.linalg.norm(turns[:, :2, 0], axis=1)[:, None]
-    left = np.column_stack([-ahead[:, 1], ahead[:, 0]])
-    probes = [places[:, :2] + STEP_M * way for way in (0 * ahead, ahead, -ahead, left, -left)]
+    segments = np.repeat(np.arange(len(steps)), steps)
+    times = track.times_s[segments] + shares * np.diff(track.times_s)[segments]
+    return np.append(times, track.times_s[-1])
+
+
+def _surface_poses(
+    positions: Floats, ahead: Floats, standing: StandingSurfaces
+) -> tuple[Floats, Floats]:
+    """Return the heights (n,) of surfaces below positions, and the axes (n, 3, 3) of the slope.
+
+    `positions` (n, 2) are local, in metres; `ahead` (n, 2) are the unit directions of travel.
+    """
+    leftward = np.column_stack([-ahead[:, 1], ahead[:, 0]])
+    probes = [
+        positions + STEP_M * direction
+        for direction in (0 * ahead, ahead, -ahead, leftward, -leftward)
+    ]
     origin = standing.origin
-    heights = [standing.under(probe + origin[:2])[0] for probe in probes]
+    heights = [standing.heights_below(probe + origin[:2])[0] for probe in probes]
     middle, front, back, port, starboard = (np.where(np.isnan(h), heights[0], h) for h in heights)
     x = np.column_stack([2 * STEP_M * ahead, front - back])
-    y = np.column_stack([2 * STEP_M * left, port - starboard])
+    y = np.column_stack([2 * STEP_M * leftward, port - starboard])
     x /= np.linalg.norm(x, axis=1)[:, None]
     z = np.cross(x, y)
     z /= np.linalg.norm(z, axis=1)[:, None]
-    places[:, 2] += middle  # of the world: what it is added to is less the origin
-    axes = np.stack([x, np.cross(z, x), z], axis=2)
-    edges = np.flatnonzero(np.diff(np.isfinite(middle), prepend=False, append=False))
-    runs = [slice(*ends) for ends in edges.reshape(-1, 2).tolist() if ends[1] - ends[0] > 1]
-    return [
-        replace(
-            track, times_s=times[run], positions=places[run], quaternions=quaternions_of(axes[run])
-        )
-        for run in runs
-    ]
+    return middle, np.stack([x, np.cross(z, x), z], axis=2)

@@ -1,4 +1,4 @@
-"""Where a sensor goes if nobody says: on the floor of a place, or around an object."""
+"""Default poses of a sensor in a scene: above the floor or ground, or around an object."""
 
 from __future__ import annotations
 
@@ -19,32 +19,32 @@ from lidarsim.scene.simplified import SimplifiedScene
 from lidarsim.sensor import Mounted, Pose, Sensor
 from lidarsim.sensor.materials import rows_named
 
-# Heights above a floor; and the least distance from the ceiling.
+# Heights above a floor; and the smallest distance from the ceiling.
 _HEIGHTS_M = (1.0, 2.0, 3.0)
 _BELOW_M = 0.2
 
-# Distances from the middle that are tried in turn if something is in the way there, or a building.
+# Distances from the middle, tried in this order if an object or a building is in the way there.
 _ASIDE_M = (2.0, 4.0, 8.0, 16.0, 32.0, 64.0)
 
-# Poses around an object: azimuths, which see two sides of a box each; degrees above its middle; and
-# distance from its middle, in its diagonals, the least and the most.
+# Poses around an object: azimuths from which two sides of a box are seen, elevation above its
+# middle, and limits of the distance from its middle, in its diagonals.
 _AZIMUTHS_DEG = (45, 135, 225, 315)
 _ABOVE_DEG = 20.0
-_FAR = (1.5, 3.0)
-_LOOKED_AT = 1000  # firings that tell a sensor's field of view
-_FACING_DEG = 45.0  # rays of that field
+_DIAGONALS = (1.5, 3.0)
+_MAX_FIRINGS = 1000  # firings that sample a sensor's field of view
+_FACING_DEG = 45.0  # azimuth of the rays of that field, to either side
 
-# A grid around an object has about so many points, but not more rays; of all poses. Rays that are
-# tried are so many in a row, and the field of view is so much wider than the object.
+# Points of a grid around an object, and its largest number of rays, of all poses. A trial grid has
+# rows of `_TRIAL_RAYS` rays; the field of view is `_MARGIN` times wider than the object.
 _POINTS = 100_000
-_RAYS_MOST = 5_000_000
-_TRIED = 64
+_MAX_RAYS = 5_000_000
+_TRIAL_RAYS = 64
 _MARGIN = 1.02
 
-# Larger scenes are not looked at, nor sheets such as terrains of more triangles than the second,
-# and instances have no more: a tree takes 300 bytes and some microseconds a triangle.
-_TRIANGLES_MOST = 2_000_000
-_SHEETS_MOST = 200_000
+# Larger scenes are not examined, nor sheets such as terrains of more triangles than the second,
+# and instances are simplified to it: a tree takes 300 bytes and some microseconds a triangle.
+_MAX_TRIANGLES = 2_000_000
+_MAX_SHEET_TRIANGLES = 200_000
 
 
 @dataclass(frozen=True)
@@ -53,11 +53,11 @@ class Placing:
 
     poses: tuple[Pose, ...]  # in world coordinates
     note: str = ""  # for users, on poses that they may not expect
-    around: bool = False  # whether the poses are around an object
-    grid: Mapping[str, Any] = field(default_factory=dict)  # of `Sensor.grid`, if narrowed to it
+    surrounds_object: bool = False  # whether the poses are around an object
+    grid: Mapping[str, Any] = field(default_factory=dict)  # arguments of `Sensor.grid`, if narrowed
 
 
-def place(
+def place_sensor(
     scene: Scene,
     carried: Mounted,
     *,
@@ -67,37 +67,47 @@ def place(
 ) -> Placing:
     """Choose poses in a scene from mesh files; a landscape is not taken for an object.
 
-    In a room or a landscape they are in the middle, or beside what stands there, such as a tree; 1,
-    2 and 3 m above the floor or ground, or at a quarter, half and three quarters of the height of
-    a lower room. Around an object they are on four sides and above it; a grid to `narrow` is
-    narrowed to it. Objects whose names fit a pattern of `buildings` are not entered: poses are on
-    ground beside the buildings, or around all of them.
+    In a room or a landscape the poses are in the middle, or beside an object in the middle such as
+    a tree; 1, 2 and 3 m above the floor or ground, or at a quarter, half and three quarters of the
+    height of a lower room. Around an object they are on four sides and above; with `narrow`, the
+    sensor is a grid that is as wide as the object. Objects whose names fit a pattern of
+    `buildings` are not entered: poses are on ground beside the buildings, or around all of them.
     """
-    low, high = scene.bounds + scene.origin
-    middle = (low + high) / 2
-    drawn = _simple(scene, middle - scene.origin)
+    lower_m, upper_m = scene.bounds + scene.origin
+    middle = (lower_m + upper_m) / 2
+    drawn = _draw_instances(scene, middle - scene.origin)
     if landscape and not len(heights_at(drawn, middle[0], middle[1])):  # a hole
         ground = drawn.vertices[drawn.faces].mean(axis=1) + drawn.origin
         middle = ground[np.argmin(np.hypot(*(ground - middle)[:, :2].T))]
-    standing = _standing(drawn, middle)
-    looker = None if landscape else _looker(drawn)
-    if buildings and len(heights_at(_named(drawn, buildings), middle[0], middle[1])):
-        standing = _aside(drawn, middle, buildings)
+    standing = _poses_above_floor(drawn, middle)
+    surroundings = None if landscape else _surroundings(drawn)
+    if buildings and len(heights_at(_select_objects(drawn, buildings), middle[0], middle[1])):
+        standing = _poses_beside(drawn, middle, buildings)
         is_object = not standing
     else:
-        is_object = looker is not None and looker.is_object(looker.views(_local(standing, scene)))
+        is_object = surroundings is not None and surroundings.is_object(
+            surroundings.views(_local_positions(standing, scene))
+        )
     if not is_object:
-        if in_the_way(drawn, _local(standing, scene)):
-            standing = _aside(drawn, middle, buildings) or standing
-        return Placing(standing, _inside(looker, _local(standing, scene), scene, carried))
+        if in_the_way(drawn, _local_positions(standing, scene)):
+            standing = _poses_beside(drawn, middle, buildings) or standing
+        positions = _local_positions(standing, scene)
+        return Placing(standing, _inside_note(surroundings, positions, scene, carried))
     poses = poses_around(scene, carried)
-    far = np.linalg.norm(poses[-1].position - (low + high) / 2)
-    *sides, away = (f"{float(f'{length:.3g}'):,g}" for length in (*(high - low), far))
+    grid = _narrow_grid(drawn, surroundings, poses) if narrow and surroundings else {}
+    return Placing(poses, _object_note(scene, poses, grid), surrounds_object=True, grid=grid)
+
+
+def _object_note(scene: Scene, poses: Sequence[Pose], grid: Mapping[str, Any]) -> str:
+    """Return a note on poses around an object, and on the sensor's grid, if any."""
+    lower_m, upper_m = scene.bounds + scene.origin
+    distance_m = np.linalg.norm(poses[-1].position - (lower_m + upper_m) / 2)
+    lengths_m = (*(upper_m - lower_m), distance_m)
+    *sides, distance = (f"{float(f'{length:.3g}'):,g}" for length in lengths_m)
     note = (
         f"this looks like an object of {' x '.join(sides)} m, not a place to stand in: "
-        f"{plural(len(poses), 'pose')} around and above it, {away} m from its middle"
+        f"{plural(len(poses), 'pose')} around and above it, {distance} m from its middle"
     )
-    grid = _narrowed(drawn, looker, poses) if narrow and looker else {}
     if grid:
         width = grid["horizontal_fov_deg"]
         height = grid["vertical_fov_deg"]
@@ -105,35 +115,40 @@ def place(
             f"; as no sensor is given, a grid of {grid['rays_per_revolution']:,} x "
             f"{grid['layers']:,} rays from each, over {width:g} x {height:g} degrees around it"
         )
-    return Placing(poses, note, around=True, grid=grid)
+    return note
 
 
-def _narrowed(scene: Scene, looker: Surroundings, poses: Sequence[Pose]) -> dict[str, Any]:
-    """Return what `Sensor.grid` takes to see an object from poses, with about `_POINTS` points."""
-    placed = [*zip(_local(poses, scene), [pose.rotation_matrix for pose in poses], strict=True)]
-    sides = np.zeros(2)  # the widest angles to either side, and up or down
-    for at, turn in placed:
-        x, y, z = ((scene.vertices - at) @ turn).T
+def _narrow_grid(scene: Scene, surroundings: Surroundings, poses: Sequence[Pose]) -> dict[str, Any]:
+    """Return arguments of `Sensor.grid` for about `_POINTS` points on an object."""
+    placed = [
+        *zip(_local_positions(poses, scene), [pose.rotation_matrix for pose in poses], strict=True)
+    ]
+    sides = np.zeros(2)  # the largest angles to either side, and up or down, radians
+    for position, rotation in placed:
+        x, y, z = ((scene.vertices - position) @ rotation).T
         angles = np.abs([np.arctan2(y, x), np.arctan2(z, np.hypot(x, y))])
         sides = np.maximum(sides, angles.max(axis=1))
     width, height = np.clip(np.ceil(np.degrees(sides) * 20 * _MARGIN) / 10, 0.1, 179.0).tolist()
-    tried = Sensor.grid(_TRIED, _TRIED, height, horizontal_fov_deg=width)
-    rays = tried.directions(np.arange(_TRIED)).reshape(-1, 3)
-    met = [looker.cast(np.tile(at, (len(rays), 1)), rays @ turn.T).distance for at, turn in placed]
-    count = min(_POINTS / max(np.mean(np.isfinite(met)).item(), 1e-6), _RAYS_MOST)
-    a_degree = (count / (len(poses) * width * height)) ** 0.5
-    azimuths, layers = (int(side * a_degree / 10) * 10 for side in (width, height))
+    trial = Sensor.grid(_TRIAL_RAYS, _TRIAL_RAYS, height, horizontal_fov_deg=width)
+    rays = trial.directions(np.arange(_TRIAL_RAYS)).reshape(-1, 3)
+    distances = [
+        surroundings.cast(np.tile(position, (len(rays), 1)), rays @ rotation.T).distance
+        for position, rotation in placed
+    ]
+    count = min(_POINTS / max(np.mean(np.isfinite(distances)).item(), 1e-6), _MAX_RAYS)
+    rays_per_degree = (count / (len(poses) * width * height)) ** 0.5
+    azimuths, layers = (int(side * rays_per_degree / 10) * 10 for side in (width, height))
     return {
-        "rays_per_revolution": max(40, azimuths),  # a time step has one at least
+        "rays_per_revolution": max(40, azimuths),  # at least one ray a time step
         "layers": max(10, layers),
         "vertical_fov_deg": height,
         "horizontal_fov_deg": width,
     }
 
 
-def _standing(scene: Scene, at: Floats) -> tuple[Pose, ...]:
-    """Poses above the floor at a place (3,), of which x and y count, in world coordinates."""
-    x, y, _ = at.tolist()
+def _poses_above_floor(scene: Scene, position: Floats) -> tuple[Pose, ...]:
+    """Return poses above the floor at x and y of a position (3,), world coordinates."""
+    x, y, _ = position.tolist()
     floor, ceiling = room_at(scene, x, y)
     heights = [*_HEIGHTS_M]
     if floor + heights[-1] > ceiling - _BELOW_M:
@@ -141,52 +156,57 @@ def _standing(scene: Scene, at: Floats) -> tuple[Pose, ...]:
     return tuple(Pose((x, y, float(floor + height))) for height in heights)
 
 
-def _named(scene: Scene, patterns: Sequence[str]) -> Scene:
-    """Return the triangles of the objects whose names fit one of some patterns."""
+def _select_objects(scene: Scene, patterns: Sequence[str]) -> Scene:
+    """Return the triangles of the objects whose names fit a pattern."""
     objects = np.concatenate([rows_named(pattern, scene.names) for pattern in patterns])
     selected = np.isin(scene.face_object, objects)
     return replace(scene, faces=scene.faces[selected], face_object=scene.face_object[selected])
 
 
-def _aside(scene: Scene, middle: Floats, buildings: Sequence[str] = ()) -> tuple[Pose, ...]:
+def _poses_beside(scene: Scene, middle: Floats, buildings: Sequence[str] = ()) -> tuple[Pose, ...]:
     """Return free poses beside the middle (3,) of a scene, world coordinates; perhaps none.
 
-    In a scene with `buildings`, patterns of names, poses are outdoors: above some surface, and
+    In a scene with `buildings`, patterns of names, poses are outdoors: above a surface, and
     neither in a building nor on a building.
     """
     half = np.ptp(scene.bounds, axis=0) / 2
     reach = np.minimum(half, [max(_ASIDE_M) + 1.0] * 2 + [np.inf])
     local = middle - scene.origin
-    near = triangles_reaching(scene, local - reach, local + reach)
-    around = replace(scene, faces=scene.faces[near], face_object=scene.face_object[near])
-    built = _named(around, buildings) if buildings else None
-    for far in _ASIDE_M:
+    in_reach = triangles_reaching(scene, local - reach, local + reach)
+    surroundings = replace(
+        scene, faces=scene.faces[in_reach], face_object=scene.face_object[in_reach]
+    )
+    building_scene = _select_objects(surroundings, buildings) if buildings else None
+    for distance_m in _ASIDE_M:
         for angle in np.arange(8) * np.pi / 4:
-            step = far * np.array([np.cos(angle), np.sin(angle), 0.0])
+            step = distance_m * np.array([np.cos(angle), np.sin(angle), 0.0])
             if (np.abs(step[:2]) < half[:2]).all():
                 x, y, _ = middle + step
-                if built and (len(heights_at(built, x, y)) or not len(heights_at(around, x, y))):
+                if building_scene and (
+                    len(heights_at(building_scene, x, y)) or not len(heights_at(surroundings, x, y))
+                ):
                     continue
-                poses = _standing(around, middle + step)
-                if not in_the_way(around, _local(poses, scene)):
+                poses = _poses_above_floor(surroundings, middle + step)
+                if not in_the_way(surroundings, _local_positions(poses, scene)):
                     return poses
     return ()
 
 
-def _local(poses: Sequence[Pose], scene: Scene) -> Floats:
-    """Positions in a scene's coordinates, (k, 3)."""
+def _local_positions(poses: Sequence[Pose], scene: Scene) -> Floats:
+    """Return the positions of poses in a scene's local coordinates, (k, 3)."""
     return np.array([pose.position for pose in poses]) - scene.origin
 
 
 def surroundings_of(scene: Scene, positions: ArrayLike) -> Surroundings | None:
-    """Return what looks around from local positions (k, 3); None if the scene is too large."""
-    return _looker(_simple(scene, positions))
+    """Return the surroundings of local positions (k, 3); None if the scene is too large."""
+    return _surroundings(_draw_instances(scene, positions))
 
 
-def _inside(
-    looker: Surroundings | None, positions: ArrayLike, scene: Scene, carried: Mounted
+def _inside_note(
+    surroundings: Surroundings | None, positions: ArrayLike, scene: Scene, carried: Mounted
 ) -> str:
-    if looker is None or not looker.views(positions).in_a_body:
+    """Return a note if a local position (k, 3) lies inside a closed body, else an empty string."""
+    if surroundings is None or not surroundings.views(positions).in_a_body:
         return ""
     return (
         "the sensor is inside a closed body, and hits only the backs of its surfaces; "
@@ -195,7 +215,7 @@ def _inside(
 
 
 def seen_from(scene: Scene, carried: Mounted) -> str:
-    """Name two poses that see a scene from outside, as a scenario has them."""
+    """Name two poses that see a scene from outside, in the form of a scenario."""
     poses = [as_entry(pose) for pose in poses_around(scene, carried)[0:4:2]]
     return f"from outside it is seen by poses: {on_one_line(poses)}"
 
@@ -207,42 +227,56 @@ def on_one_line(value: Any) -> str:
 
 
 def as_entry(pose: Pose) -> list[float] | dict[str, object]:
-    """Return a level or pitched pose as a scenario has it, in short if it has no angles."""
+    """Return a level or pitched pose in the form of a scenario, short if all angles are 0."""
     if pose.rotation is None:
         return [*pose.position]
     return {"position": [*pose.position], "yaw_deg": pose.yaw_deg, "pitch_deg": pose.pitch_deg}
 
 
 def poses_around(scene: Scene, carried: Mounted) -> tuple[Pose, ...]:
-    """Poses on four sides of a scene and above it that look at its middle, world coordinates.
+    """Return poses on four sides of a scene and above, facing its middle, world coordinates.
 
-    They are at 1.5 times the diagonal from the middle, farther if the sensor's field of view is
-    too narrow for the whole scene, nearer if that is out of its range.
+    The poses are at 1.5 times the diagonal from the middle, farther if the sensor's field of view
+    is too narrow for the scene, nearer if that is out of its range.
     """
-    low, high = scene.bounds + scene.origin
-    middle = (low + high) / 2
-    diagonal = float(np.linalg.norm(high - low))
-    sensor, (down, up) = carried.sensor, _field_deg(carried)
-    half = np.radians(max(up - down, 1e-3) / 2)
-    far = max(diagonal * float(np.clip(0.5 / np.sin(half), *_FAR)), sensor.min_range_m + diagonal)
-    far = min(far, max(0.9 * sensor.max_range_m, 0.6 * diagonal))  # outside, and in range
-    digits = max(0, 3 - int(np.floor(np.log10(diagonal))))
+    lower_m, upper_m = scene.bounds + scene.origin
+    middle = (lower_m + upper_m) / 2
+    extent_m = upper_m - lower_m
+    diagonal_m = float(np.linalg.norm(extent_m))
+    down_deg, up_deg = _field_deg(carried)
+    distance_m = _viewing_distance_m(carried, diagonal_m, up_deg - down_deg)
+    digits = max(0, 3 - int(np.floor(np.log10(diagonal_m))))
+    # A revolution sweeps the longer side, seen from above.
+    azimuth_above = 270 if extent_m[0] > extent_m[1] else 180
     poses = []
-    wide = high[0] - low[0] > high[1] - low[1]  # a turn sweeps the longer side, seen from above
-    for azimuth, above in (*((a, _ABOVE_DEG) for a in _AZIMUTHS_DEG), (270 if wide else 180, 90.0)):
-        angles = np.radians([azimuth, above])
-        (ca, ce), (sa, se) = np.cos(angles), np.sin(angles)
-        at = np.round(middle + far * np.array([ca * ce, sa * ce, se]), digits) + 0.0
-        x, y, z = at.tolist()
-        pitch = round(above + (down + up) / 2, 1)
-        poses.append(Pose((x, y, z), (azimuth + 180.0) % 360.0, pitch))
+    for azimuth, above in (*((a, _ABOVE_DEG) for a in _AZIMUTHS_DEG), (azimuth_above, 90.0)):
+        position = np.round(middle + distance_m * _direction(azimuth, above), digits) + 0.0
+        pitch = round(above + (down_deg + up_deg) / 2, 1)
+        poses.append(Pose(tuple(position.tolist()), (azimuth + 180.0) % 360.0, pitch))
     return tuple(poses)
 
 
-def _field_deg(carried: Mounted) -> tuple[float, float]:
-    """Lowest and highest elevation of the rays that go forward, in the carrier's axes."""
+def _direction(azimuth_deg: float, elevation_deg: float) -> Floats:
+    """Return the unit vector (3,) of an azimuth and an elevation."""
+    angles = np.radians([azimuth_deg, elevation_deg])
+    cosines = np.cos(angles)
+    sines = np.sin(angles)
+    return np.array([cosines[0] * cosines[1], sines[0] * cosines[1], sines[1]])
+
+
+def _viewing_distance_m(carried: Mounted, diagonal_m: float, field_deg: float) -> float:
+    """Return the distance in metres from which an object with a diagonal fills the view."""
     sensor = carried.sensor
-    count = min(sensor.period or _LOOKED_AT, _LOOKED_AT)
+    half = np.radians(max(field_deg, 1e-3) / 2)
+    diagonals = float(np.clip(0.5 / np.sin(half), *_DIAGONALS))
+    distance_m = max(diagonal_m * diagonals, sensor.min_range_m + diagonal_m)
+    return min(distance_m, max(0.9 * sensor.max_range_m, 0.6 * diagonal_m))  # outside, in range
+
+
+def _field_deg(carried: Mounted) -> tuple[float, float]:
+    """Return the lowest and highest elevation of the forward rays, degrees in the carrier frame."""
+    sensor = carried.sensor
+    count = min(sensor.period or _MAX_FIRINGS, _MAX_FIRINGS)
     firings = np.linspace(0, sensor.period or count, count, endpoint=False).astype(np.int64)
     rays: Floats = sensor.directions(firings).reshape(-1, 3) @ carried.mount.rotation_matrix.T
     facing = np.abs(np.degrees(np.arctan2(rays[:, 1], rays[:, 0]))) <= _FACING_DEG
@@ -252,14 +286,16 @@ def _field_deg(carried: Mounted) -> tuple[float, float]:
     return float(elevations.min()), float(elevations.max())
 
 
-def _simple(scene: Scene, near: ArrayLike) -> Scene:
-    """Copy instances to their places, with fewer triangles far from local positions (k, 3)."""
-    return SimplifiedScene.from_scene(scene, _SHEETS_MOST, [np.reshape(near, (-1, 3))]).scene
+def _draw_instances(scene: Scene, positions: ArrayLike) -> Scene:
+    """Draw instances as meshes, with fewer triangles far from local positions (k, 3)."""
+    return SimplifiedScene.from_scene(
+        scene, _MAX_SHEET_TRIANGLES, [np.reshape(positions, (-1, 3))]
+    ).scene
 
 
-def _looker(scene: Scene) -> Surroundings | None:
-    """Return what looks around in a scene; None if that takes too long."""
+def _surroundings(scene: Scene) -> Surroundings | None:
+    """Return the surroundings in a scene; None if the scene has too many triangles."""
     count = len(scene.faces)
-    if count > _TRIANGLES_MOST or (count > _SHEETS_MOST and is_open(scene)):
+    if count > _MAX_TRIANGLES or (count > _MAX_SHEET_TRIANGLES and is_open(scene)):
         return None
     return Surroundings(scene)

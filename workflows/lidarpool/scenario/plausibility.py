@@ -1,4 +1,4 @@
-"""Warnings of what real surveys do not have: poses, motions and noise that are likely mistakes."""
+"""Warnings of implausible surveys: poses, motions and noise that are likely mistakes."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ from lidarsim.sensor.trajectory import full_poses, matrices, quaternions_of, vel
 from .build import Built
 from .placing import seen_from, surroundings_of
 
-GROUND_SPEED_M_S = 150.0  # faster than trains, except those on test tracks
+GROUND_SPEED_M_S = 150.0  # faster than trains, except on test tracks
 AIR_SPEED_M_S = 350.0  # faster than the aircraft that carry lidars
 AIRBORNE_M = 50.0  # height above the ground from which a carrier flies
-MAX_RATE_DEG_S = 720.0  # two turns a second
+MAX_RATE_DEG_S = 720.0  # two rotations a second
 NOISE_SHARE = 0.1  # of the range
 
 # Orientation against the direction of travel: angles of this size are no drift of a vehicle, if
@@ -33,17 +33,17 @@ _CONSTANT = 0.95
 # below these speeds and lengths directions of travel are noise
 _MOVES_M_S = 0.1
 _TRAVELS_M = 2.0
-# Cosines of tilt, on the average: a carrier that is level, and one that lies on its side.
+# Cosines of tilt, on the average: a level carrier, and a carrier that lies on its side.
 _LEVEL = 0.9
 _TILTED = 0.5
-# A path that rises and falls by more than so many metres and this share of its length, while it
+# A path that rises and falls by more than these metres and this share of its length, while it
 # stays within a share of that height along x or y, has another axis up.
 _RISE_M = 5.0
 _RISE_SHARE = 0.3
 _FLAT = 0.1
 
-_POSITIONS = 24  # that are looked around from
-_TIMES = 20_000  # of a trajectory that are looked at
+_POSITIONS = 24  # sampled positions of the sensors
+_TIMES = 20_000  # sampled times of a trajectory
 _FAR_PERCENT = 95  # percentile of distances that stands for the range of a sensor without a limit
 
 
@@ -53,7 +53,7 @@ class _Motion(NamedTuple):
     times_ns: Floats  # (k,)
     durations_s: Floats  # (k,): between the poses
     positions: Floats  # (k, 3), metres
-    rotations: Floats  # (k, 3, 3), from the carrier's axes to the scene's
+    rotations: Floats  # (k, 3, 3), from the carrier frame to the scene frame
     velocities: Floats  # (k, 3), m/s
     rates: Floats  # (k, 3), rad/s
 
@@ -63,7 +63,7 @@ class _Motion(NamedTuple):
         return np.asarray(np.linalg.norm(self.velocities, axis=1))
 
 
-class _Place(NamedTuple):
+class _SensorPosition(NamedTuple):
     """A position of a sensor at a time."""
 
     time_ns: float
@@ -73,31 +73,31 @@ class _Place(NamedTuple):
 def implausibilities(built: Built) -> list[str]:
     """Return warnings of poses, motions and noise that real surveys do not have.
 
-    Poses that were chosen for the user are not judged. Some thousand rays are cast in scenes that
-    are not too large.
+    Poses that were chosen for the user are not judged. Some thousand rays are cast in scenes with
+    a moderate number of triangles.
     """
     scene = built.scene
     survey = built.survey
     chosen = built.scenario.poses is None and built.scenario.trajectory is None
-    places = [] if chosen else _places(survey)
-    positions = np.array([place.position for place in places]).reshape(-1, 3)
-    looker = surroundings_of(scene, positions) if places else None
-    warnings = [*_of_noise(survey, _seen_m(scene, looker, positions))]
+    samples = [] if chosen else _sample_positions(survey)
+    positions = np.array([sample.position for sample in samples]).reshape(-1, 3)
+    surroundings = surroundings_of(scene, positions) if samples else None
+    warnings = [*_noise_warnings(survey, _sight_m(scene, surroundings, positions))]
     if not chosen:
-        warnings += _of_positions(scene, survey, looker, places)
+        warnings += _position_warnings(scene, survey, surroundings, samples)
     if survey.path.moves:
         motion = _motion(survey)
-        warnings += _of_speed(motion, flies=_flies(scene, survey, looker, positions))
-        warnings += _of_up_axis(motion, scene.bounds[0, 2])
-        warnings += _of_orientation(motion)
+        warnings += _speed_warnings(motion, flies=_flies(scene, survey, surroundings, positions))
+        warnings += _up_axis_warnings(motion, scene.bounds[0, 2])
+        warnings += _orientation_warnings(motion)
     return [as_scenario(warning) for warning in dict.fromkeys(warnings)]
 
 
 # -- positions -------------------------------------------------------------------------------
 
 
-def _places(survey: Survey) -> list[_Place]:
-    """Return some positions of the sensors, in local coordinates."""
+def _sample_positions(survey: Survey) -> list[_SensorPosition]:
+    """Return sampled positions of the sensors, in local coordinates."""
     path = survey.path
     mounts = [carried.mount for carried in survey.carried]
     if path.moves:
@@ -107,79 +107,82 @@ def _places(survey: Survey) -> list[_Place]:
         stations = [(n, 0.0) for n in even_indices(path.stations, _POSITIONS).tolist()]
     stations = [stations[i] for i in even_indices(len(stations), max(1, _POSITIONS // len(mounts)))]
     return [
-        _Place(time, np.array(path.pose(station, time).compose(mount).position))
+        _SensorPosition(time, np.array(path.pose(station, time).compose(mount).position))
         for station, time in stations
         for mount in mounts
     ]
 
 
-def _of_positions(
-    scene: Scene, survey: Survey, looker: Surroundings | None, places: list[_Place]
+def _position_warnings(
+    scene: Scene, survey: Survey, surroundings: Surroundings | None, samples: list[_SensorPosition]
 ) -> Iterator[str]:
     """Warn of positions under the scene, or inside its bodies or actors."""
-    if looker is not None:
-        under = np.array([looker.is_covered(place.position) for place in places])
-        inside = np.array([looker.in_a_body(place.position) for place in places])
-        seen = seen_from(scene, survey.carried[0]) if (under | inside).any() else ""
+    if surroundings is not None:
+        under = np.array([surroundings.is_covered(sample.position) for sample in samples])
+        inside = np.array([surroundings.in_a_body(sample.position) for sample in samples])
+        poses_note = seen_from(scene, survey.carried[0]) if (under | inside).any() else ""
         if under.any():
             yield (
-                f"the sensor is under the scene{_where(scene, places, under)}: check z, heights "
-                f"and up_axis; {seen}"
+                f"the sensor is under the scene{_bad_positions(scene, samples, under)}: check z, "
+                f"heights and up_axis; {poses_note}"
             )
-        if (inside & ~under).any():
-            yield (
-                f"the sensor is inside a closed body{_where(scene, places, inside & ~under)}, and "
-                f"hits only the backs of its surfaces; {seen}"
-            )
-    for actor in scene.actors:
-        inside = _inside_actor(actor, places)
+        inside &= ~under
         if inside.any():
             yield (
-                f"the sensor is inside {actor.name}{_where(scene, places, inside)}: check its "
-                "mount, and the trajectories"
+                f"the sensor is inside a closed body{_bad_positions(scene, samples, inside)}, and "
+                f"hits only the backs of its surfaces; {poses_note}"
+            )
+    for actor in scene.actors:
+        inside = _inside_actor(actor, samples)
+        if inside.any():
+            yield (
+                f"the sensor is inside {actor.name}{_bad_positions(scene, samples, inside)}: check "
+                "its mount, and the trajectories"
             )
 
 
-def _where(scene: Scene, places: list[_Place], bad: Bools) -> str:
-    """Return the first bad position, and how many there are if there are good ones."""
-    x, y, z = places[int(bad.argmax())].position + scene.origin
-    share = f" at {bad.sum()} of {len(bad)} positions that were tried, first" * (not bad.all())
+def _bad_positions(scene: Scene, samples: list[_SensorPosition], is_bad: Bools) -> str:
+    """Return the first bad position in words, with the number of bad positions."""
+    x, y, z = samples[int(is_bad.argmax())].position + scene.origin
+    share = f" at {is_bad.sum()} of {len(is_bad)} positions that were tried, first" * (
+        not is_bad.all()
+    )
     return f"{share} at ({x:,.3f}, {y:,.3f}, {z:,.3f})"
 
 
-def _inside_actor(actor: Actor, places: list[_Place]) -> Bools:
-    """Return at which places the sensor is inside an actor's closed mesh: (k,)."""
-    times = np.array([place.time_ns for place in places])
-    inside = np.zeros(len(places), np.bool_)
-    if not places:
+def _inside_actor(actor: Actor, samples: list[_SensorPosition]) -> Bools:
+    """Return whether the sensor is inside an actor's closed mesh, for each position: (k,)."""
+    times = np.array([sample.time_ns for sample in samples])
+    inside = np.zeros(len(samples), np.bool_)
+    if not samples:
         return inside
     positions, rotations = full_poses(actor.trajectory, 0, times)
-    offsets = np.array([place.position for place in places]) - positions
-    local = np.einsum("kji,kj->ki", rotations, offsets)  # in the actor's axes
-    low, high = actor.mesh.bounds
-    near = np.flatnonzero(((local > low) & (local < high)).all(axis=1))
-    if len(near):
-        looker = Surroundings(Scene.from_meshes([actor.mesh]))
-        inside[near] = [looker.views(local[k]).in_a_body for k in near]
+    offsets = np.array([sample.position for sample in samples]) - positions
+    local = np.einsum("kji,kj->ki", rotations, offsets)  # in the actor's frame
+    lower_m, upper_m = actor.mesh.bounds
+    in_bounds = np.flatnonzero(((local > lower_m) & (local < upper_m)).all(axis=1))
+    if len(in_bounds):
+        surroundings = Surroundings(Scene.from_meshes([actor.mesh]))
+        inside[in_bounds] = [surroundings.views(local[k]).in_a_body for k in in_bounds]
     return inside
 
 
 # -- noise -----------------------------------------------------------------------------------
 
 
-def _seen_m(scene: Scene, looker: Surroundings | None, positions: Floats) -> float:
-    """Return how far a sensor without a limit of range sees, metres."""
-    if looker is not None:
-        distances = looker.views(positions).distance
+def _sight_m(scene: Scene, surroundings: Surroundings | None, positions: Floats) -> float:
+    """Return the range of a sensor without a limit of range, metres."""
+    if surroundings is not None:
+        distances = surroundings.views(positions).distance
         if len(distances := distances[np.isfinite(distances)]):
             return float(np.percentile(distances, _FAR_PERCENT))
     return float(np.linalg.norm(np.ptp(scene.bounds, axis=0)))
 
 
-def _of_noise(survey: Survey, seen_m: float) -> Iterator[str]:
+def _noise_warnings(survey: Survey, sight_m: float) -> Iterator[str]:
     """Warn of noise above a tenth of the range."""
     for carried, noise in zip(survey.carried, survey.noise_each, strict=True):
-        range_m = min(carried.sensor.max_range_m, seen_m)
+        range_m = min(carried.sensor.max_range_m, sight_m)
         name = f" of {carried.name}" * bool(carried.name)
         for field in ("range_m", "range_at_threshold_m", "channel_bias_m", "warm_up_m"):
             value = float(np.max(np.abs(getattr(noise, field))))
@@ -199,7 +202,7 @@ def _of_noise(survey: Survey, seen_m: float) -> Iterator[str]:
 
 
 def _motion(survey: Survey) -> _Motion:
-    """Return the motion of the carrier of a survey that moves, also after the last scan."""
+    """Return the motion of the carrier of a moving survey, also after the last scan."""
     path = survey.path
     end_ns = path.duration_ns if np.isfinite(path.duration_ns) else survey.duration_ns
     if isinstance(path, Track):
@@ -214,28 +217,32 @@ def _motion(survey: Survey) -> _Motion:
     return _Motion(times, durations_s, *full_poses(path, 0, times), *velocities(path, 0, times))
 
 
-def _flies(scene: Scene, survey: Survey, looker: Surroundings | None, positions: Floats) -> bool:
-    """Whether the carrier is airborne, judged by its sensors and its height above the ground."""
+def _flies(
+    scene: Scene, survey: Survey, surroundings: Surroundings | None, positions: Floats
+) -> bool:
+    """Return whether the carrier is airborne, judged by its sensors and its height above ground."""
     if any(isinstance(carried.sensor, LineSensor) for carried in survey.carried):
         return True
     heights = positions[:, 2] - scene.bounds[1, 2]
-    if looker is not None and len(positions):
+    if surroundings is not None and len(positions):
         down = np.broadcast_to([0.0, 0.0, -1.0], positions.shape)
-        below = looker.cast(positions, down).distance
+        below = surroundings.cast(positions, down).distance
         heights = np.where(np.isfinite(below), below, heights)
     return bool(len(heights) and np.median(heights) > AIRBORNE_M)
 
 
-def _of_speed(motion: _Motion, *, flies: bool) -> Iterator[str]:
+def _speed_warnings(motion: _Motion, *, flies: bool) -> Iterator[str]:
     """Warn of speeds and angular rates that carriers do not have."""
-    limit, what = (AIR_SPEED_M_S, "in the air") if flies else (GROUND_SPEED_M_S, "on the ground")
+    limit_m_s = AIR_SPEED_M_S if flies else GROUND_SPEED_M_S
+    medium = "in the air" if flies else "on the ground"
     speeds = motion.speeds
     rates = np.degrees(np.linalg.norm(motion.rates, axis=1))
-    if (speeds > limit).any():
+    if (speeds > limit_m_s).any():
         fastest = int(speeds.argmax())
         yield (
             f"the carrier moves at {speeds[fastest]:,.4g} m/s at {_time(motion, fastest)}, and "
-            f"carriers {what} stay below {limit:g} m/s: check the units of positions and times"
+            f"carriers {medium} stay below {limit_m_s:g} m/s: check the units of positions and "
+            "times"
         )
     if (rates > MAX_RATE_DEG_S).any():
         fastest = int(rates.argmax())
@@ -247,34 +254,39 @@ def _of_speed(motion: _Motion, *, flies: bool) -> Iterator[str]:
 
 
 def _time(motion: _Motion, row: int) -> str:
+    """Return the time of a row in words."""
     return f"{motion.times_ns[row] / 1e9:,.4g} s"
 
 
-def _of_up_axis(motion: _Motion, lowest_m: float) -> Iterator[str]:
+def _up_axis_warnings(motion: _Motion, lowest_m: float) -> Iterator[str]:
     """Warn of a path that rises and falls as roads do not, and is flat along x or y.
 
-    A path straight up is that of a lift or drone, unless it begins below the scene.
+    A path straight up is a lift's or drone's, unless the path starts below the scene.
     """
-    across = np.ptp(motion.positions, axis=0)
-    metres = motion.speeds @ motion.durations_s
-    rise = np.abs(motion.velocities[:, 2]) @ motion.durations_s
-    flat = int(across[:2].argmin())
-    if across[:2].max() < _FLAT * across[2] and motion.positions[:, 2].min() >= lowest_m:
+    extent_m = np.ptp(motion.positions, axis=0)
+    length_m = motion.speeds @ motion.durations_s
+    climb_m = np.abs(motion.velocities[:, 2]) @ motion.durations_s
+    flat_axis = int(extent_m[:2].argmin())
+    if extent_m[:2].max() < _FLAT * extent_m[2] and motion.positions[:, 2].min() >= lowest_m:
         return
-    if across[2] > _RISE_M and rise > _RISE_SHARE * metres and across[flat] < _FLAT * across[2]:
+    if (
+        extent_m[2] > _RISE_M
+        and climb_m > _RISE_SHARE * length_m
+        and extent_m[flat_axis] < _FLAT * extent_m[2]
+    ):
         yield (
-            f"the trajectory rises and falls by {across[2]:,.4g} m, and stays within "
-            f"{across[flat]:,.3g} m along {'xy'[flat]}: give positions with z up, in metres "
-            f"(is {'xy'[flat]} the up axis of its file?)"
+            f"the trajectory rises and falls by {extent_m[2]:,.4g} m, and stays within "
+            f"{extent_m[flat_axis]:,.3g} m along {'xy'[flat_axis]}: give positions with z up, in "
+            f"metres (is {'xy'[flat_axis]} the up axis of its file?)"
         )
 
 
-def _of_orientation(motion: _Motion) -> Iterator[str]:
-    """Warn of carriers that lie on their sides, or face another direction than they travel in."""
-    as_given = _Facing.of(motion, motion.rotations)
+def _orientation_warnings(motion: _Motion) -> Iterator[str]:
+    """Warn of carriers that lie on their sides, or do not face their direction of travel."""
+    as_given = _Facing.measure(motion, motion.rotations)
     # Of a file in the order w, x, y, z, w was read as x, x as y, and so on.
     quaternions = quaternions_of(motion.rotations)
-    w_first = _Facing.of(motion, matrices(quaternions[:, [1, 2, 3, 0]]))
+    w_first = _Facing.measure(motion, matrices(quaternions[:, [1, 2, 3, 0]]))
     tilted = as_given.level <= _TILTED
     is_w_first = as_given.level <= _LEVEL < w_first.level and not w_first.askew
     if not (tilted or as_given.askew or is_w_first):
@@ -300,29 +312,29 @@ def _of_orientation(motion: _Motion) -> Iterator[str]:
 
 
 class _Facing(NamedTuple):
-    """How a carrier is oriented along its path."""
+    """Mean orientation of a carrier along its path."""
 
     level: float  # mean cosine between its z axis and up
     angle_deg: float  # mean angle from its direction of travel to its x axis, to the left
-    constancy: float  # of that angle, 0 to 1; 0 if it hardly travels
+    constancy: float  # of that angle, 0 to 1; 0 if the carrier hardly travels
 
     @property
     def askew(self) -> bool:
-        """Whether the carrier faces another direction than the one it travels in, all along."""
+        """Whether the carrier constantly faces away from its direction of travel."""
         return self.constancy > _CONSTANT and abs(self.angle_deg) > _ASKEW_DEG
 
     @classmethod
-    def of(cls, motion: _Motion, rotations: Floats) -> _Facing:
-        """Measure the orientation by rotations (k, 3, 3) along a path."""
+    def measure(cls, motion: _Motion, rotations: Floats) -> _Facing:
+        """Return the mean orientation by rotations (k, 3, 3) along a path."""
         level = float(np.average(rotations[:, 2, 2], weights=motion.durations_s))
         ahead = rotations[:, :2, 0]
         travel = motion.velocities[:, :2]
         speeds = np.linalg.norm(travel, axis=1)
-        metres = np.where(speeds > _MOVES_M_S, speeds * motion.durations_s, 0.0)
-        if metres.sum() < _TRAVELS_M:
+        lengths_m = np.where(speeds > _MOVES_M_S, speeds * motion.durations_s, 0.0)
+        if lengths_m.sum() < _TRAVELS_M:
             return cls(level, 0.0, 0.0)
-        left = travel[:, 0] * ahead[:, 1] - travel[:, 1] * ahead[:, 0]
+        sines = travel[:, 0] * ahead[:, 1] - travel[:, 1] * ahead[:, 0]
         cosines = (travel * ahead).sum(axis=1)
-        angles = np.arctan2(left, cosines)
-        mean = np.average(np.exp(1j * angles), weights=metres)
+        angles = np.arctan2(sines, cosines)
+        mean = np.average(np.exp(1j * angles), weights=lengths_m)
         return cls(level, float(np.degrees(np.angle(mean))), float(np.abs(mean)))

@@ -2,7 +2,7 @@
 
 Poisson surfaces (Kazhdan and Hoppe 2013), which Open3D makes, too, were compared by casting: of a
 simulated scan of a city they took twenty times as long, needed the side that each point was seen
-from, and closed what is open, so that a tenth of the ranges were wrong by more than 0.3 m.
+from, and closed openings, so that a tenth of the ranges were wrong by more than 0.3 m.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ from ..base.open3d_module import load_open3d
 # between points, and makes surfels reach farther beyond edges.
 _NEIGHBOURS = 12
 _EXTENT = 0.85
-_MOST_VOXELS = 3  # that half a surfel is long: distant and stray points have no neighbours
+_MAX_HALF_VOXELS = 3  # that half a surfel is long: distant and stray points have no neighbours
 _SAMPLE = 20_000  # points whose neighbours tell the spacing
 _NEAREST = 9  # a point itself, and the eight around it on a square grid
 _BYTES = 700  # for a point while its surfel is made and written
@@ -55,7 +55,7 @@ def scene_of_points(
     """Make a scene of a point cloud, for example a scan of a real place.
 
     A surfel lies where a principal component analysis of the 12 nearest points puts their plane,
-    and is about as large as the gaps between them along and across.
+    and is about as large as the gaps between the points in both directions.
 
     Parameters
     ----------
@@ -66,7 +66,7 @@ def scene_of_points(
         Edge of the cubes in each of which all points become their mean. By default the median
         distance of points to the eighth of their neighbours.
     size
-        A factor of the surfels' sides: larger ones close gaps, and reach farther beyond edges.
+        A factor of the surfels' sides: larger surfels close gaps, and reach farther beyond edges.
     unit
         Unit of x, y and z, in place of metres or of the units that a .las or .laz states.
     tell
@@ -74,7 +74,7 @@ def scene_of_points(
 
     Returns
     -------
-    A scene of one object, named by the file; each surfel is two triangles.
+    A scene of a single object, named by the file; each surfel is two triangles.
 
     Raises
     ------
@@ -90,12 +90,12 @@ def scene_of_points(
 
 
 def surfels(path: Path, points: Floats, voxel_m: float | None, size: float = 1.0) -> SceneMesh:
-    """Return the surfels of the points (n, 3) of a file, as `scene_of_points` makes them."""
-    # Open3D's covariances lose the digits of points far from zero.
+    """Return the surfels of the points (n, 3) of a file."""
+    # Covariances of Open3D lose the digits of points far from zero.
     origin = np.round((points.min(axis=0) + points.max(axis=0)) / 2)
     points = points - origin
     o3d = load_open3d()
-    voxel_m = voxel_m or _spacing(o3d, points)
+    voxel_m = voxel_m or _spacing_m(o3d, points)
     cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points))
     del points
     if not voxel_m:
@@ -118,31 +118,33 @@ def surfels(path: Path, points: Floats, voxel_m: float | None, size: float = 1.0
             f"{_NEIGHBOURS} are needed: give a smaller voxel_m, or another cloud."
         )
     cloud.estimate_covariances(o3d.geometry.KDTreeSearchParamKNN(_NEIGHBOURS))
-    corners = _corners(np.asarray(cloud.points), np.asarray(cloud.covariances), voxel_m, size)
+    corners = _surfel_corners(
+        np.asarray(cloud.points), np.asarray(cloud.covariances), voxel_m, size
+    )
     faces = 4 * np.arange(count)[:, None, None] + np.array([[0, 1, 2], [0, 2, 3]])
     return SceneMesh(path.stem, corners.reshape(-1, 3) + origin, faces.reshape(-1, 3))
 
 
-def _corners(points: Floats, covariances: Floats, voxel_m: float, size: float) -> Floats:
-    """Corners (n, 4, 3) of surfels."""
-    out = np.empty((len(points), 4, 3))
-    for begin in range(0, len(points), 1 << 18):
-        some = slice(begin, begin + (1 << 18))
-        variances, axes = np.linalg.eigh(covariances[some])
+def _surfel_corners(points: Floats, covariances: Floats, voxel_m: float, size: float) -> Floats:
+    """Return the corners (n, 4, 3) of surfels."""
+    corners = np.empty((len(points), 4, 3))
+    for start in range(0, len(points), 1 << 18):
+        block = slice(start, start + (1 << 18))
+        variances, axes = np.linalg.eigh(covariances[block])
         halves = size * _EXTENT * np.sqrt(np.maximum(variances[:, 1:], 0))
-        halves = np.minimum(halves, _MOST_VOXELS * voxel_m)
-        across, along = np.moveaxis(axes[:, :, 1:] * halves[:, None], 2, 0)
+        halves = np.minimum(halves, _MAX_HALF_VOXELS * voxel_m)
+        half_widths, half_lengths = np.moveaxis(axes[:, :, 1:] * halves[:, None], 2, 0)
         for corner, (a, b) in enumerate(((-1, -1), (1, -1), (1, 1), (-1, 1))):
-            out[some, corner] = points[some] + a * along + b * across
-    return out
+            corners[block, corner] = points[block] + a * half_lengths + b * half_widths
+    return corners
 
 
-def _spacing(o3d: Any, points: Floats) -> float:
-    """Median distance of points to the eighth of their neighbours."""
+def _spacing_m(o3d: Any, points: Floats) -> float:
+    """Return the median distance of points to the eighth of their neighbours."""
     tree = o3d.core.nns.NearestNeighborSearch(o3d.core.Tensor(points))
     tree.knn_index()
-    some = points[:: -(-len(points) // _SAMPLE)]
-    _, squares = tree.knn_search(o3d.core.Tensor(np.ascontiguousarray(some)), _NEAREST)
+    sampled = points[:: -(-len(points) // _SAMPLE)]
+    _, squares = tree.knn_search(o3d.core.Tensor(np.ascontiguousarray(sampled)), _NEAREST)
     return float(np.sqrt(np.median(squares.numpy()[:, -1])))
 
 
@@ -159,14 +161,15 @@ def _read(path: Path, unit: str | None, tell: Callable[[str], None]) -> Floats:
     try:
         with explained(f"{path} cannot be read"), prefixed(path):
             check_input(path)
-            metres = _metres(path, unit, tell)
+            metres = _unit_lengths_m(path, unit, tell)
             points = _READERS[suffix](path) * metres
     except LidarError:
         raise
     except Exception as error:  # readers raise whatever they stumble over
         reason = printable(str(error))[:200] or type(error).__name__
         raise LidarError(f"{path} is broken or cut short ({reason}).") from error
-    points = points[np.isfinite(points).all(axis=1)]  # depth cameras write NaN where nothing is
+    # Depth cameras write NaN for pixels without a return.
+    points = points[np.isfinite(points).all(axis=1)]
     if len(points) < _NEIGHBOURS:
         raise LidarError(
             f"{path} has {len(points)} points, and at least {_NEIGHBOURS} are needed: it is empty, "
@@ -180,7 +183,7 @@ def _read(path: Path, unit: str | None, tell: Callable[[str], None]) -> Floats:
     return points
 
 
-def _metres(path: Path, unit: str | None, tell: Callable[[str], None]) -> Floats:
+def _unit_lengths_m(path: Path, unit: str | None, tell: Callable[[str], None]) -> Floats:
     """Return the metres in the units of x, y and z of a file, (3,)."""
     if unit is not None:
         return np.full(3, UNITS_M[unit])
@@ -193,9 +196,9 @@ def _metres(path: Path, unit: str | None, tell: Callable[[str], None]) -> Floats
 
 
 def _read_pcd(path: Path) -> Floats:
-    """Read text here, the other kinds by Open3D.
+    """Read points of a .pcd; Open3D reads all encodings but text.
 
-    Of truncated text, Open3D returns uninitialised memory as points.
+    Open3D returns uninitialised memory as points for truncated text.
     """
     header = checked_pcd(path)
     count = int(header["POINTS"][0])
@@ -215,10 +218,12 @@ def _read_pcd(path: Path) -> Floats:
 
 
 def _read_xyz(path: Path) -> Floats:
+    """Read the first three numbers of each line."""
     return np.loadtxt(io.StringIO(read_input_text(path)), usecols=(0, 1, 2), ndmin=2)
 
 
 def _read_las(path: Path) -> Floats:
+    """Read the points of a .las or .laz; LidarError if they exceed the memory."""
     with open_las(path) as reader:
         if (size := reader.header.point_count * _BYTES) > memory():
             raise LidarError(

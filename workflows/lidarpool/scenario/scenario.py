@@ -1,10 +1,10 @@
-"""Scenario files: all of a survey as data, checked before anything runs."""
+"""Scenario files: surveys as data, checked before a run."""
 
 from __future__ import annotations
 
 import os
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
 from typing import Annotated, Any
@@ -40,7 +40,7 @@ from .sections import (
     scene_in_short,
 )
 
-# Options of a mesh file without a scenario, and where a scenario has them.
+# Options of a mesh file without a scenario, and the fields of a scenario for them.
 MESH_OPTIONS = {
     "sensor": "sensor",
     "unit": "unit of scene.files",
@@ -52,21 +52,22 @@ MESH_OPTIONS = {
 
 
 def mesh_data(files: Sequence[Path], folder: Path, options: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the scenario of mesh files as data, as its YAML would have it.
+    """Return the data that a scenario file of mesh files would have.
 
-    Names of files start from `folder`, that of the scenario. `options` are {name in
-    `MESH_OPTIONS`: value}; what is not among them is left out, and so is the scene without files.
+    Names of files start from `folder`, the scenario's. `options` are {name in `MESH_OPTIONS`:
+    value}. Sections without an option are left out, and the scene if there are no files.
     """
 
-    def moved(file: str | Path) -> str:
+    def relative(file: str | Path) -> str:
         return Path(os.path.relpath(file, folder)).as_posix()
 
-    read = {name: options[name] for name in ("unit", "up_axis") if name in options}
-    entries = [{"file": name} | read if read else name for name in map(moved, files)]
+    settings = {name: options[name] for name in ("unit", "up_axis") if name in options}
+    names = [relative(file) for file in files]
+    entries = [{"file": name} | settings if settings else name for name in names]
     model = options.get("sensor")
     data = {
         "scene": {"files": entries} if files else None,
-        "sensor": moved(model) if model and model.endswith((".yaml", ".yml")) else model,
+        "sensor": relative(model) if model and model.endswith((".yaml", ".yml")) else model,
         "poses": options.get("pose"),
         "cloud": {"columns": options["columns"]} if "columns" in options else None,
         "output": {"write": options["format"]} if "format" in options else None,
@@ -85,8 +86,8 @@ class Scenario(Section):
     planning, pool
         See `lidarpool.scenario.sections`.
     poses
-        Poses of the sensor, in world coordinates. By default it stands at the origin (default
-        objects), 1, 2 and 3 metres above the ground; in mesh files where `place` puts it: in the
+        Poses of the sensor, in world coordinates. By default the sensor is at the origin (default
+        objects), 1, 2 and 3 metres above the ground; in mesh files chosen by `place_sensor`: in the
         middle of a room or landscape, or around an object.
     steps, classes
         Time steps from each pose, and names of semantic classes, {number: name}.
@@ -197,7 +198,7 @@ class Scenario(Section):
 
     @classmethod
     def load(cls, path: str | Path, options: Mapping[str, Any] = MappingProxyType({})) -> Scenario:
-        """Read a scenario file (YAML), or make a scenario of a mesh file; see `mesh_data`.
+        """Read a scenario file (YAML), or make the scenario of a mesh file by `mesh_data`.
 
         Raises
         ------
@@ -240,14 +241,14 @@ class Scenario(Section):
     def with_sections(
         self, data: dict[str, Any], *, source: str, folder: Path | None = None
     ) -> Scenario:
-        """Return the scenario with other sections; the rest of it is not checked again.
+        """Return the scenario with sections replaced; unchanged sections are not validated again.
 
         LidarError as `load`.
         """
         with sentences(Scenario, source):
-            made = Scenario.model_validate(data)
-        given = {name: getattr(made, name) for name in made.model_fields_set}
-        scenario = self.model_copy(update=given)
+            sections = Scenario.model_validate(data)
+        changes = {name: getattr(sections, name) for name in sections.model_fields_set}
+        scenario = self.model_copy(update=changes)
         scenario._folder = self._folder if folder is None else folder
         scenario._source = source
         scenario._check()
@@ -256,49 +257,60 @@ class Scenario(Section):
     def _check(self) -> None:
         """Raise LidarError if fields do not fit together."""
         mistakes = Mistakes()
-        wrong = []
-        planning = self.planning
-        # The default objects have a start and a target.
-        lacking = 0 if self.scene.has_seed else [planning.start, planning.target].count(None)
-        if planning.enabled and lacking:
-            wrong.append("planning is enabled: give planning.start and planning.target.")
-        if planning.enabled is None and lacking == 1:
-            wrong.append("give both planning.start and planning.target, or neither.")
-        if self.trajectory is not None and self.trajectory.beyond != "refuse":
-            wrong.append("trajectory.beyond is for actors; the carrier's has to cover the survey.")
-        if self.trajectory is not None and self.poses is not None:
-            wrong.append("give either poses or a trajectory, not both.")
-        carried = [entry for entry in self.actors if entry.is_carrier]
-        if carried and self.trajectory is None:
-            wrong.append(
-                f"actor {carried[0].name!r} has no trajectory: give it one, or at: [x, y, z] if it "
-                "stands, or give the survey a trajectory in place of poses, to be its carrier."
-            )
-        if self.links and not any(entry.robot for entry in carried):
-            wrong.append(
-                "mount names a link, and no robot is the carrier: give an actor with a .urdf as "
-                "its file, and without a trajectory."
-            )
+        for reason in self._contradictions():
+            mistakes.lines.append(f"{self._source}: {reason}")
+        for section in self.sensors.values() or (self.sensor,):
+            if section.calibration is None:
+                with mistakes.noted(), prefixed(self._source):
+                    mounted = section.mounted(self.path, CENTRE, self.noise, self.returns)
+                    (mounted.returns or self.returns).of(mounted.sensor.optics)
+        mistakes.tell()
+
+    def _contradictions(self) -> Iterator[str]:
+        """Yield the reasons why fields do not fit together, each a sentence."""
+        yield from self._planning_contradictions()
+        yield from self._carrier_contradictions()
         copies = [entry.name for entry in self.scene.copies]
-        named = Counter([*copies, *(entry.name for entry in self.actors)])
-        if twice := next((name for name in copies if named[name] > 1), None):
-            wrong.append(
+        name_counts = Counter([*copies, *(entry.name for entry in self.actors)])
+        if twice := next((name for name in copies if name_counts[name] > 1), None):
+            yield (
                 f"{twice!r} is the name of two entries of scene.copies and actors: give each its "
                 "own."
             )
         if self.sensors and (self.sensor != SensorSection() or self.mount):
-            wrong.append("give either sensor and mount, or sensors, each with a mount.")
-        mistakes.lines += [f"{self._source}: {words}" for words in wrong]
-        for section in self.sensors.values() or (self.sensor,):
-            if section.calibration is None:
-                with mistakes.noted(), prefixed(self._source):
-                    one = section.mounted(self.path, CENTRE, self.noise, self.returns)
-                    (one.returns or self.returns).divergence(one.sensor.optics)
-        mistakes.tell()
+            yield "give either sensor and mount, or sensors, each with a mount."
+
+    def _planning_contradictions(self) -> Iterator[str]:
+        """Yield the reasons why the planning lacks a start or target."""
+        planning = self.planning
+        # The default objects have a start and a target.
+        lacking = 0 if self.scene.has_seed else [planning.start, planning.target].count(None)
+        if planning.enabled and lacking:
+            yield "planning is enabled: give planning.start and planning.target."
+        if planning.enabled is None and lacking == 1:
+            yield "give both planning.start and planning.target, or neither."
+
+    def _carrier_contradictions(self) -> Iterator[str]:
+        """Yield the reasons why trajectory, poses, carrier and mounts do not fit together."""
+        if self.trajectory is not None and self.trajectory.beyond != "refuse":
+            yield "trajectory.beyond is for actors; the carrier's has to cover the survey."
+        if self.trajectory is not None and self.poses is not None:
+            yield "give either poses or a trajectory, not both."
+        carriers = [entry for entry in self.actors if entry.is_carrier]
+        if carriers and self.trajectory is None:
+            yield (
+                f"actor {carriers[0].name!r} has no trajectory: give it one, or at: [x, y, z] if "
+                "it stands, or give the survey a trajectory in place of poses, to be its carrier."
+            )
+        if self.links and not any(entry.robot for entry in carriers):
+            yield (
+                "mount names a link, and no robot is the carrier: give an actor with a .urdf as "
+                "its file, and without a trajectory."
+            )
 
     @property
     def files(self) -> tuple[Path, ...]:
-        """Files that it names, each once: meshes, tables, trajectories, data of sensors."""
+        """Files of the scenario, each once: meshes, tables, trajectories, data of sensors."""
         shaped = (*self.placed, *(self.traffic.vehicles if self.traffic else ()))
         entries = [*self.scene.files, *(entry.file for entry in shaped if entry.file)]
         files: list[str | None] = [entry.file for entry in entries]
@@ -325,11 +337,11 @@ class Scenario(Section):
 
     @property
     def source(self) -> str:
-        """Its name in messages."""
+        """Name of the scenario in messages."""
         return self._source
 
     def path(self, file: str) -> Path:
-        """Path of a file that it names."""
+        """Return the path of a file, which starts from the scenario's folder."""
         # `Path.expanduser` fails at users who are not known.
         return self._folder / os.path.expanduser(file)  # noqa: PTH111
 
@@ -341,12 +353,12 @@ class Scenario(Section):
 
     @property
     def coloured(self) -> bool:
-        """Whether colours of meshes are read: a column or a material needs them."""
+        """Whether colours of meshes are read: for a column, or a reflectance of the texture."""
         columns = {*self.cloud.columns, *self.output.needs}
         return bool(columns & {*COLOURS}) or any(m.reflectance == "texture" for m in self.materials)
 
     @property
     def names_materials(self) -> bool:
-        """Whether faces keep the names of their materials: a column or an entry needs them."""
+        """Whether faces keep the names of their materials: for a column or for materials."""
         columns = {*self.cloud.columns, *self.output.needs}
         return "material" in columns or any(m.material is not None for m in self.materials)

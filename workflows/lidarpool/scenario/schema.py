@@ -1,4 +1,4 @@
-"""What users and editors start from: JSON Schemas, and the scenario of `lidarpool init`."""
+"""JSON Schemas of scenarios and campaigns, and the scenario that `lidarpool init` writes."""
 
 from __future__ import annotations
 
@@ -36,20 +36,20 @@ class _Plain(GenerateJsonSchema):
         return super().dataclass_schema(schema) | {"description": summary}
 
     def default_schema(self, schema: Any) -> dict[str, Any]:
-        made = super().default_schema(schema)
-        if isinstance(made.get("default"), dict) or made.get("default") == float("inf"):
-            del made["default"]
-        return made
+        result = super().default_schema(schema)
+        if isinstance(result.get("default"), dict) or result.get("default") == float("inf"):
+            del result["default"]
+        return result
 
 
 def scenario_schema() -> dict[str, Any]:
     """Return the JSON Schema of scenario files, short forms and empty sections included.
 
-    It does not check combinations of fields (a range that ends before it begins):
+    The schema does not check combinations of fields (a range that stops before its start):
     `Scenario.load` does.
     """
-    made = _schema_of(Scenario, "lidarpool scenario")
-    return made | {"description": "A lidar survey of a scene, and path planning."}
+    schema = _section_schema(Scenario, "lidarpool scenario")
+    return schema | {"description": "A lidar survey of a scene, and path planning."}
 
 
 def campaign_schema() -> dict[str, Any]:
@@ -57,12 +57,13 @@ def campaign_schema() -> dict[str, Any]:
 
     `Campaign.load` also checks that paths lead to fields, and that these take the values.
     """
-    return _schema_of(CampaignSection, "lidarpool campaign")
+    return _section_schema(CampaignSection, "lidarpool campaign")
 
 
-def _schema_of(section: type[Section], title: str) -> dict[str, Any]:
-    made = section.model_json_schema(schema_generator=_Plain)
-    return {"$schema": GenerateJsonSchema.schema_dialect, **made, "title": title}
+def _section_schema(section: type[Section], title: str) -> dict[str, Any]:
+    """Return the JSON Schema of a section, with a title."""
+    schema = section.model_json_schema(schema_generator=_Plain)
+    return {"$schema": GenerateJsonSchema.schema_dialect, **schema, "title": title}
 
 
 def schema_text(schema: dict[str, Any]) -> str:
@@ -73,10 +74,10 @@ def schema_text(schema: dict[str, Any]) -> str:
 SCENARIO_FILE = "scenario.yaml"
 
 _WIDTH = 100
-_COMMENT_AT = 30  # column of the comments that stand beside a field
+_COMMENT_COLUMN = 30  # column of the comments that stand beside a field
 
 _HEAD = f"# yaml-language-server: $schema={SCHEMA_FILE}"
-_EVERY = f"""\
+_FULL_HEAD = f"""\
 {_HEAD}
 # A lidar survey for lidarpool, with path planning. Every field has its default here, and may be
 # left out. A name after "# " is an example for a field whose default lidarpool chooses. Lengths
@@ -84,11 +85,11 @@ _EVERY = f"""\
 #
 #     lidarpool check {SCENARIO_FILE}
 #     lidarpool run {SCENARIO_FILE}"""
-_FEW = f"""\
+_SHORT_HEAD = f"""\
 {_HEAD}
 # A lidar survey for lidarpool; lengths are in metres, Z is up. Fields that are left out have their
 # defaults; lidarpool init DIR --all writes all of them."""
-# {section of a short scenario: (an example, what it is)}
+# {section of a short scenario: (an example, its meaning)}
 _SECTIONS = {
     "scene": ("seed", "mesh files, named from this folder; seed is six objects"),
     "sensor": ("ouster/os1-64", "a model of `lidarpool sensors`, or your own .yaml"),
@@ -99,78 +100,82 @@ _SECTIONS = {
 
 
 def short_scenario(data: Mapping[str, Any], note: str) -> str:
-    """Return a commented scenario in YAML of a few sections, those not in `data` as examples.
+    """Return a short commented scenario in YAML; sections that `data` lacks are examples.
 
-    `data` is what `mesh_data` returns, `note` a remark on its poses.
+    `data` is the result of `mesh_data`, `note` a remark on its poses.
     """
-    lines = [_FEW, ""]
+    lines = [_SHORT_HEAD, ""]
     data = {"scene": "seed"} | dict(data)
     for name, (example, words) in _SECTIONS.items():
-        given = name in data
-        code = f"{name}: {on_one_line(data[name])}" if given else f"# {name}: {example}"
-        placed = name == "poses" and given
-        lines += _poses(data[name], note) if placed else _beside(code, words, "")
+        has_data = name in data
+        code = f"{name}: {on_one_line(data[name])}" if has_data else f"# {name}: {example}"
+        placed = name == "poses" and has_data
+        lines += _pose_lines(data[name], note) if placed else _commented(code, words, "")
     return "\n".join([*lines, ""])
 
 
 def scenario_template(data: Mapping[str, Any], note: str) -> str:
     """Return a commented scenario in YAML that holds all defaults.
 
-    `data` is what `mesh_data` returns, in place of some of them, `note` a remark on its poses.
+    `data` is the result of `mesh_data`, and replaces defaults; `note` is a remark on its poses.
     """
-    lines = [_EVERY]
-    given = dict(data)
-    if isinstance(given.get("sensor"), str):
-        given["sensor"] = {"model": given["sensor"]}
+    lines = [_FULL_HEAD]
+    values = dict(data)
+    if isinstance(values.get("sensor"), str):
+        values["sensor"] = {"model": values["sensor"]}
     for name, field in Scenario.model_fields.items():
         lines.append("")
-        placed = name == "poses" and name in given
-        lines += _poses(given[name], note) if placed else _top(name, field, given.get(name, {}))
+        placed = name == "poses" and name in values
+        lines += (
+            _pose_lines(values[name], note)
+            if placed
+            else _section_lines(name, field, values.get(name, {}))
+        )
     return "\n".join([*lines, ""])
 
 
-def _top(name: str, field: FieldInfo, given: dict[str, Any]) -> Iterator[str]:
-    """Yield the lines of a section or a top-level field, `given` in place of some defaults."""
+def _section_lines(name: str, field: FieldInfo, values: dict[str, Any]) -> Iterator[str]:
+    """Yield the lines of a section or a top-level field; `values` replace defaults."""
     section = field.annotation
     if not (isinstance(section, type) and is_section(section)):
-        yield from _lines(name, field, "", given)
+        yield from _field_lines(name, field, "", values)
         return
     summary = (section.__doc__ or "").partition("\n")[0].partition(";")[0].rstrip(".")
-    yield from _beside(f"{name}:", summary, "")
+    yield from _commented(f"{name}:", summary, "")
     for inner, content in fields_of(section).items():
-        yield from _lines(inner, content, "  ", given)
+        yield from _field_lines(inner, content, "  ", values)
 
 
-def _poses(poses: Sequence[Any], note: str) -> Iterator[str]:
-    """Yield poses, a line each, below a remark on where the sensor is."""
+def _pose_lines(poses: Sequence[Any], note: str) -> Iterator[str]:
+    """Yield poses, a line each, below a remark on the sensor's position."""
     if note:
         note = f"{note[:1].upper()}{note[1:]}."
         # A pose stays on one line, to be copied.
-        text, mark, others = note.partition("poses: ")
+        text, mark, poses_text = note.partition("poses: ")
         yield from textwrap.wrap(text, _WIDTH, initial_indent="# ", subsequent_indent="# ")
         if mark:
-            yield f"# poses: {others.removesuffix('.')}"
-    yield from _beside("poses:", _SECTIONS["poses"][1], "")
+            yield f"# poses: {poses_text.removesuffix('.')}"
+    yield from _commented("poses:", _SECTIONS["poses"][1], "")
     yield from (f"  - {on_one_line(pose)}" for pose in poses)
 
 
-def _lines(name: str, field: FieldInfo, indent: str, given: dict[str, Any]) -> Iterator[str]:
-    """Yield a field with what is given or its default, or with examples if that is computed."""
+def _field_lines(name: str, field: FieldInfo, indent: str, values: dict[str, Any]) -> Iterator[str]:
+    """Yield a field with its value or default, or with examples if the default is computed."""
     text = field.description or ""
-    if name in given or not field.examples:
-        value = on_one_line(given.get(name, field.default))
-        yield from _beside(f"{name}: {value}", text, indent)
+    if name in values or not field.examples:
+        value = on_one_line(values.get(name, field.default))
+        yield from _commented(f"{name}: {value}", text, indent)
         return
-    first, *others = field.examples
-    yield from _beside(f"# {name}: {on_one_line(first)}", text, indent)
-    for other in others:
-        yield f"{indent}# {name}: {on_one_line(other)}"
+    first, *further_examples = field.examples
+    yield from _commented(f"# {name}: {on_one_line(first)}", text, indent)
+    for example in further_examples:
+        yield f"{indent}# {name}: {on_one_line(example)}"
 
 
-def _beside(code: str, comment: str, indent: str) -> Iterator[str]:
-    """Return code with its comment to the right, or above it where there is no room."""
-    line = f"{indent}{code}".ljust(_COMMENT_AT - 1) + f" # {comment}"
-    if len(line) <= _WIDTH and len(indent + code) < _COMMENT_AT:
+def _commented(code: str, comment: str, indent: str) -> Iterator[str]:
+    """Yield code with its comment to the right, or above if there is no room."""
+    line = f"{indent}{code}".ljust(_COMMENT_COLUMN - 1) + f" # {comment}"
+    if len(line) <= _WIDTH and len(indent + code) < _COMMENT_COLUMN:
         yield line
         return
     mark = f"{indent}# "

@@ -42,7 +42,7 @@ from lidarsim.sensor.sensor import Fov, Layers, MaxRange, MinRange, RaysPerRevol
 from ..export.formats import Format
 from ..plan.planning import Search
 
-COPIES_MOST = 1_000_000  # of one entry
+MAX_COPIES = 1_000_000  # of an entry
 PathOf = Callable[[str], Path]  # of a file that a scenario names
 
 IgnoredColumns = Annotated[
@@ -53,6 +53,7 @@ Pair = Two[Coordinate]
 
 
 def _upright(sides: tuple[float, float, float, float]) -> tuple[float, float, float, float]:
+    """Return a rectangle, or raise an error if its lowest x and y are not first."""
     if sides[0] >= sides[2] or sides[1] >= sides[3]:
         raise must_be("[x0, y0, x1, y1], the lowest x and y first")
     return sides
@@ -67,7 +68,7 @@ Length = Annotated[float, Field(gt=0, le=1e4)]
 
 
 class Section(BaseModel):
-    """Fields of a scenario: no others, finite numbers, no conversion of text to numbers."""
+    """Fields of a scenario: unknown fields are refused, numbers are finite, text is no number."""
 
     model_config = STRICT | ConfigDict(frozen=True)
 
@@ -129,7 +130,8 @@ class MeshFile(Section):
     ] = None
 
     @model_validator(mode="after")
-    def _one_placement(self) -> MeshFile:
+    def _check_placement(self) -> MeshFile:
+        """Raise ValueError for two placements of a mesh, or a scale of 0."""
         placed = self.model_fields_set & {"translation", "rotation_deg", "scale"}
         if self.matrix is not None and placed:
             raise ValueError(f"give either matrix or {', '.join(sorted(placed))}, not both.")
@@ -149,6 +151,7 @@ MeshEntries = Several[MeshEntry]
 
 
 def _pose(value: Any) -> Any:
+    """Return a pose as a mapping; a list is its position."""
     if isinstance(value, list):
         return {"position": value}
     if not isinstance(value, (dict, Pose)):
@@ -169,7 +172,7 @@ PointXYZ = Annotated[Several[Coordinate], Field(min_length=2, max_length=3)]  # 
 
 
 class CopySection(Section, Pose):
-    """Where one of several copies stands; in YAML also just [x, y] or [x, y, z]."""
+    """Position, angles and scale of a copy; in YAML also just [x, y] or [x, y, z]."""
 
     position: Annotated[  # type: ignore[assignment]  # a copy's z may be left out
         PointXYZ,
@@ -179,7 +182,7 @@ class CopySection(Section, Pose):
 
 
 class CopyTable(Section):
-    """Places of copies from a table; in YAML also just the file's name."""
+    """Poses of copies from a table; in YAML also just the file's name."""
 
     file: Annotated[Text, about("a table with a header, from the scenario's folder")]
     columns: Annotated[
@@ -190,9 +193,9 @@ class CopyTable(Section):
 
 
 class Scatter(Section):
-    """Copies that stand upright on surfaces, at random; the same fields give the same places."""
+    """Copies that stand upright on surfaces, at random; the same fields give the same copies."""
 
-    count: Annotated[int, about("how many", ge=1, le=COPIES_MOST)]
+    count: Annotated[int, about("how many", ge=1, le=MAX_COPIES)]
     surfaces: Annotated[  # not "on", which YAML takes for true
         TextOrTexts,
         about("names of the objects to stand on, with * and ?; by default all", min_length=1),
@@ -211,7 +214,7 @@ class Scatter(Section):
 
 
 class ShapeSection(Section):
-    """What something looks like, a file or a box, and the class of its points."""
+    """Shape of an object, a file or a box, and the class of its points."""
 
     name: Annotated[Text | None, about("name of the object")] = None
     file: Annotated[
@@ -249,7 +252,7 @@ class AnimationSection(Section):
 
 
 class DeformingSection(ShapeSection):
-    """A shape that may deform while it moves."""
+    """A shape, possibly animated or on wheels."""
 
     animation: Annotated[
         Annotated[AnimationSection, by_text("name", AnimationSection)] | None,
@@ -265,22 +268,23 @@ class DeformingSection(ShapeSection):
     ] = None
 
     @model_validator(mode="after")
-    def _of_file(self) -> DeformingSection:
-        given = [name for name in ("animation", "wheels") if getattr(self, name) is not None]
-        if given and self.file is None:
-            raise ValueError(f"{given[0]} is of a mesh file: give its file.")
-        if len(given) > 1:
+    def _check_deformation(self) -> DeformingSection:
+        """Raise ValueError for a deformation without a file, or two deformations."""
+        deformations = [name for name in ("animation", "wheels") if getattr(self, name) is not None]
+        if deformations and self.file is None:
+            raise ValueError(f"{deformations[0]} is of a mesh file: give its file.")
+        if len(deformations) > 1:
             raise ValueError("give either animation or wheels, not both.")
         return self
 
 
 class CopiesSection(ShapeSection):
-    """An object that stands in many places, its mesh kept once; each copy is an object."""
+    """An object that stands at many positions, its mesh stored once; each copy is an object."""
 
     name: Annotated[Text, about("name of the first; the others are numbered: Tree, Tree.2, …")]
     at: Annotated[
         Several[Annotated[CopySection, by_position(CopySection, PointXYZ)]],
-        about("places: [x, y], [x, y, z], or with angles and scale", max_length=COPIES_MOST),
+        about("places: [x, y], [x, y, z], or with angles and scale", max_length=MAX_COPIES),
     ] = ()
     table: Annotated[
         Annotated[CopyTable, by_text("file", CopyTable)] | None,
@@ -303,7 +307,7 @@ class Ground(Section):
 
 
 class SceneSection(Section):
-    """The scene: mesh files, copies of meshes, the six default objects, or all of them.
+    """The scene: mesh files, copies of meshes, the six default objects, or a mixture.
 
     `preset` is 'seed' without files and copies, else 'none'.
     """
@@ -341,21 +345,23 @@ class SceneSection(Section):
     ] = None
 
     @model_validator(mode="after")
-    def _something(self) -> SceneSection:
+    def _check_not_empty(self) -> SceneSection:
+        """Raise ValueError for a scene without meshes."""
         if self.preset == "none" and not (self.files or self.copies):
             raise ValueError("the scene is empty: give files, or preset: seed.")
         return self
 
     @property
     def has_seed(self) -> bool:
-        """Whether the six default objects are in it."""
+        """Whether the scene has the six default objects."""
         return self.preset == "seed" or (self.preset is None and not (self.files or self.copies))
 
 
 class SensorSection(Section):
     """The lidar: a model, a calibrated unit, or a turning head with evenly spaced beams.
 
-    In YAML also just the model. See `load_sensor` for the first two, and `Sensor` for the grid.
+    In YAML also just the model. `load_sensor` reads models and calibrations; `Sensor` describes
+    the grid.
     """
 
     model: Annotated[
@@ -403,14 +409,15 @@ class SensorSection(Section):
     ] = None
 
     @model_validator(mode="after")
-    def _one_source(self) -> SensorSection:
-        own = [name for name in ("model", "calibration") if getattr(self, name) is not None]
+    def _check_source(self) -> SensorSection:
+        """Raise ValueError if fields of the sensor contradict each other."""
+        sources = [name for name in ("model", "calibration") if getattr(self, name) is not None]
         # Defaults are allowed, because `lidarpool init --all` writes them.
-        known = SensorSection.model_fields
+        fields = SensorSection.model_fields
         names = ("rays_per_revolution", "layers", "vertical_fov_deg", "horizontal_fov_deg")
-        grid = [name for name in names if getattr(self, name) != known[name].default]
-        if own and grid:
-            raise ValueError(f"a {own[0]} defines the beams: leave out {grid[0]}.")
+        grid = [name for name in names if getattr(self, name) != fields[name].default]
+        if sources and grid:
+            raise ValueError(f"a {sources[0]} defines the beams: leave out {grid[0]}.")
         if self.performance == "datasheet" and self.model is None:
             raise ValueError("performance: datasheet needs a model: give its name.")
         if self.columns is not None and "rays_per_revolution" in grid:
@@ -419,7 +426,7 @@ class SensorSection(Section):
 
     @property
     def has_own_model(self) -> bool:
-        """Whether its model is a file of the user's."""
+        """Whether the model is a file of the user's."""
         return self.model is not None and self.model.endswith(MODEL_FILES)
 
     def mounted(
@@ -432,36 +439,36 @@ class SensorSection(Section):
     ) -> Mounted:
         """Return the lidar on its carrier; LidarError if its files cannot be used.
 
-        `path` returns those of files. Equal sections have the same sensor, unless their files have
-        changed. A sensor with a data sheet has noise and returns of its own: those of the sheet,
-        but for the fields that the sections give.
+        `path` returns the path of a file in the scenario. Equal sections have the same sensor,
+        unless their files have changed. A sensor with a data sheet has noise and returns of its
+        own: the sheet's, with the fields that the sections give.
         """
-        own = {"rate_hz", "min_range_m", "max_range_m"}
-        limits = self.model_dump(include=own, exclude_none=True)
+        limit_names = {"rate_hz", "min_range_m", "max_range_m"}
+        limits = self.model_dump(include=limit_names, exclude_none=True)
         model = path(self.model) if self.model and self.has_own_model else self.model
-        unit = None if self.calibration is None else path(self.calibration)
-        if model is None and unit is None:
+        calibration = None if self.calibration is None else path(self.calibration)
+        if model is None and calibration is None:
             grid = {"layers", "vertical_fov_deg", "horizontal_fov_deg", "step_deg"}
             azimuths = self.columns or self.rays_per_revolution
             sensor = _grid(azimuths, **self.model_dump(include=grid), **limits)
         else:
-            states = file_states(file for file in (model, unit) if isinstance(file, Path))
-            given = self.model_dump(include={"columns", "step_deg", "performance"})
-            sensor = _loaded(states, model=model, calibration=unit, **given, **limits)
+            states = file_states(file for file in (model, calibration) if isinstance(file, Path))
+            options = self.model_dump(include={"columns", "step_deg", "performance"})
+            sensor = _loaded(states, model=model, calibration=calibration, **options, **limits)
         if sensor.noise is None or sensor.returns is None:
             return Mounted(sensor, mount, name)
-        own_returns = replace(sensor.returns, **returns.model_dump(exclude_unset=True))
-        own_noise = replace(sensor.noise, **noise.model_dump(exclude_unset=True))
-        return Mounted(sensor, mount, name, returns=own_returns, noise=own_noise)
+        sheet_returns = replace(sensor.returns, **returns.model_dump(exclude_unset=True))
+        sheet_noise = replace(sensor.noise, **noise.model_dump(exclude_unset=True))
+        return Mounted(sensor, mount, name, returns=sheet_returns, noise=sheet_noise)
 
 
 def file_states(files: Iterable[Path]) -> tuple[tuple[Path, int, int], ...]:
-    """Return times and sizes of files that are there: others once a file has changed."""
+    """Return path, modification time and size of the files that exist, to detect changed files."""
     states = []
     for path in files:
-        with suppress(OSError, ValueError):  # which reading the file reports
-            found = path.stat()
-            states.append((path, found.st_mtime_ns, found.st_size))
+        with suppress(OSError, ValueError):  # reported when the file is read
+            status = path.stat()
+            states.append((path, status.st_mtime_ns, status.st_size))
     return tuple(states)
 
 
@@ -469,12 +476,13 @@ _grid = lru_cache(Sensor.grid)
 
 
 @lru_cache
-def _loaded(_: object, **given: Any) -> Sensor:
-    return load_sensor(**given)
+def _loaded(_: object, **options: Any) -> Sensor:
+    """Return the sensor of files in some states, cached by these states."""
+    return load_sensor(**options)
 
 
 class OutputSection(Section):
-    """Further files of the result; the columns that they need are kept."""
+    """Further files of the result; the columns that they need are written."""
 
     write: Annotated[
         Several[Annotated[Format, by_text("format", Format)]],
@@ -482,8 +490,9 @@ class OutputSection(Section):
     ] = ()
 
     @model_validator(mode="after")
-    def _each_once(self) -> OutputSection:
-        names = [one.format for one in self.write]
+    def _check_formats(self) -> OutputSection:
+        """Raise ValueError for a format that is written twice."""
+        names = [entry.format for entry in self.write]
         if twice := next((name for name in names if names.count(name) > 1), None):
             raise ValueError(
                 f"write has {twice} twice, which are the same file: lidarpool export --out writes "
@@ -494,15 +503,15 @@ class OutputSection(Section):
     @property
     def needs(self) -> tuple[str, ...]:
         """Names of the columns that the formats need."""
-        return tuple(dict.fromkeys(name for one in self.write for name in one.needs))
+        return tuple(dict.fromkeys(name for entry in self.write for name in entry.needs))
 
 
 class ReturnsSection(Section, Returns):
-    """Sub-rays of a beam, and which of its returns are reported."""
+    """Sub-rays of a beam, and the choice of its reported returns."""
 
 
 class NoiseSection(Section, Noise):
-    """Noise of ranges and angles, lost returns and false ones."""
+    """Noise of ranges and angles, lost and false returns."""
 
 
 class Obstacle(Section):
@@ -516,7 +525,8 @@ class Obstacle(Section):
     radius_m: Annotated[float | None, about("radius of the disc, metres", gt=0, le=1e6)] = None
 
     @model_validator(mode="after")
-    def _one_kind(self) -> Obstacle:
+    def _check_kind(self) -> Obstacle:
+        """Raise ValueError unless the obstacle is either an object or a disc."""
         disc = self.centre is not None and self.radius_m is not None
         if (self.object is None) != disc or (
             self.object is not None and self.model_fields_set > {"object"}
@@ -529,7 +539,7 @@ Obstacles = Several[Annotated[Obstacle, by_text("object", Obstacle)]]
 
 
 class _Route:
-    """Fields of a planning that a scenario has in other words than `Planning`; they come first."""
+    """Fields that a scenario gives in world coordinates and by names; before fields of `Search`."""
 
     enabled: Annotated[
         bool | None, about("by default true if start and target are given", True)
@@ -565,7 +575,7 @@ class PlanningSection(Section, Search, _Route):
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class TaskOptions:
-    """Tasks of a run, on whatever cluster."""
+    """Tasks of a run, on any cluster."""
 
     collectors: Annotated[int, about("tasks that write the parts", ge=1, le=64)] = 2
     queue_capacity: Annotated[
@@ -600,13 +610,13 @@ class _Workers:
 class PoolSection(Section, TaskOptions, _Workers):
     """The partitions and their tasks; default sizes depend on the machine.
 
-    `gpu` and `other` set the workers of a local cluster, not of one that is running already.
-    The others apply to both.
+    `gpu` and `other` set the workers of a local cluster, not of a cluster that is already
+    running. The fields of `TaskOptions` apply to both.
     """
 
 
 def may_be_empty(kind: Any) -> Any:
-    """Treat a section or mapping with all lines commented out as one of defaults."""
+    """Read a section or mapping with all lines commented out as its defaults."""
     return short(lambda v: v is None, lambda v: {}, kind | None)
 
 

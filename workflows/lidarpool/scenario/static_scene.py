@@ -30,10 +30,10 @@ from lidarsim.scene.wheels import rolling
 from lidarsim.sensor.pose_columns import ANGLES, POSITION, REFUSED_COLUMNS, angles_of, with_yaw
 from lidarsim.sensor.trajectory import rotations_of
 
-from .ground import Standing
+from .ground import StandingSurfaces
 from .scenario import Scenario
 from .sections import (
-    COPIES_MOST,
+    MAX_COPIES,
     CopiesSection,
     CopyTable,
     MeshFile,
@@ -50,18 +50,18 @@ _OF_ROBOTS = {"file", "opacity", "translation", "rotation_deg", "scale", "matrix
 
 @dataclass
 class Findings:
-    """What was noted when a scene was built."""
+    """Notes about a scene, collected while its files are read."""
 
     notes: list[str] = field(default_factory=list)  # about objects left out of the scene
     remarks: list[str] = field(default_factory=list)  # about axes of files
-    sources: dict[str, str] = field(default_factory=dict)  # {file: what it gave}
+    sources: dict[str, str] = field(default_factory=dict)  # {file: its content in words}
     rasters: list[tuple[MeshFile, Raster]] = field(default_factory=list)
     # {file of the scene: {number: class}} of files whose format gives classes to objects
     classes: dict[str, Mapping[int, ObjectClass]] = field(default_factory=dict)
 
     def copy(self) -> Findings:
-        """Return the same, to be added to."""
-        return Findings(*(found.copy() for found in vars(self).values()))
+        """Return a copy whose lists and dictionaries can be extended separately."""
+        return Findings(*(values.copy() for values in vars(self).values()))
 
     def named(self, number: int) -> tuple[str, ...]:
         """Return the patterns of the names of objects that files give a class by its number."""
@@ -77,42 +77,44 @@ class Findings:
     def class_names(self) -> dict[int, str]:
         """Names of the classes that files give to objects, by their numbers in ascending order."""
         names = {
-            number: one.name for classes in self.classes.values() for number, one in classes.items()
+            number: entry.name
+            for classes in self.classes.values()
+            for number, entry in classes.items()
         }
         return dict(sorted(names.items()))
 
 
 class StaticScene(NamedTuple):
-    """A scene without the actors and traffic of its scenario, and what was noted about it."""
+    """A scene without the actors and traffic of its scenario, and notes from reading the files."""
 
     scene: Scene
-    standing: Standing
-    found: Findings
+    standing: StandingSurfaces
+    findings: Findings
 
 
 class SceneCache:
-    """The static scenes that scenarios had last, for others that have the same."""
+    """The static scenes of the last scenarios, for scenarios with the same files and sections."""
 
-    def __init__(self, most: int = 4) -> None:
-        self._most = most
-        self._kept = dict[object, StaticScene]()
+    def __init__(self, max_scenes: int = 4) -> None:
+        self._max_scenes = max_scenes
+        self._scenes = dict[object, StaticScene]()
 
     def find(self, scenario: Scenario) -> StaticScene:
-        """Return the static scene of a scenario, which is read if it is not kept."""
+        """Return the static scene of a scenario, from the cache or read from its files."""
         key = _key(scenario)
-        found = self._kept.pop(key, None) or read_static_scene(scenario)
-        self._kept[key] = found  # the last used
-        while len(self._kept) > self._most:
-            del self._kept[next(iter(self._kept))]
-        return found
+        static = self._scenes.pop(key, None) or read_static_scene(scenario)
+        self._scenes[key] = static  # at the end: the last used
+        while len(self._scenes) > self._max_scenes:
+            del self._scenes[next(iter(self._scenes))]
+        return static
 
 
 def _key(scenario: Scenario) -> object:
-    """Return what a static scene is made of: equal for scenarios that may share it."""
+    """Return the key of a static scene: equal for scenarios that may share the scene."""
     section = scenario.scene
     names: list[str] = [entry.file for entry in section.files]
     for copies in section.copies:
-        names += [one.file for one in (copies.file, copies.table) if one is not None]
+        names += [entry.file for entry in (copies.file, copies.table) if entry is not None]
     states = file_states(map(scenario.path, names))
     read_by = scenario.path(""), scenario.coloured, scenario.names_materials, scenario.cloud.epsg
     return section.model_dump_json(), *read_by, states
@@ -124,11 +126,11 @@ def read_static_scene(scenario: Scenario) -> StaticScene:
     Raises
     ------
     LidarError
-        If a file cannot be read, or copies have no place.
+        If a file cannot be read, or copies have no position.
     """
     section = scenario.scene
-    found = Findings()
-    shapes = Shapes(scenario, found)
+    findings = Findings()
+    shapes = Shapes(scenario, findings)
     meshes: list[SceneMesh | SceneInstance] = list(seed_objects()) if section.has_seed else []
     moving: list[Actor] = []
     mistakes = Mistakes()
@@ -138,69 +140,69 @@ def read_static_scene(scenario: Scenario) -> StaticScene:
             meshes += objects.static
             moving += objects.actors
             if objects.classes:
-                found.classes[entry.file] = objects.classes
+                findings.classes[entry.file] = objects.classes
     mistakes.tell()
-    meshes = resolve_same_names(meshes, section.same_names, found.notes.append)
+    meshes = resolve_same_names(meshes, section.same_names, findings.notes.append)
     if section.copies:
-        meshes += _copies(shapes, meshes)
+        meshes += _place_copies(shapes, meshes)
     objects = Objects(tuple(meshes), tuple(moving))
     if section.ground is not None:
         below = Scene.from_meshes(meshes or objects.at_start(lambda _: None))
-        objects = objects._replace(static=(*meshes, _ground(section, below)))
-    scene = Scene.from_objects(objects, found.notes.append)
-    return StaticScene(scene, Standing(scene), found)
+        objects = objects._replace(static=(*meshes, _ground_mesh(section, below)))
+    scene = Scene.from_objects(objects, findings.notes.append)
+    return StaticScene(scene, StandingSurfaces(scene), findings)
 
 
 class Shapes:
-    """Meshes and robots of a scenario, each file read once; `found` is added to."""
+    """Meshes and robots of a scenario, each file read once; notes go to `findings`."""
 
-    def __init__(self, scenario: Scenario, found: Findings) -> None:
+    def __init__(self, scenario: Scenario, findings: Findings) -> None:
         self.scenario = scenario
-        self.found = found
-        self._made: dict[Any, SceneMesh] = {}  # {file or size: mesh}
+        self.findings = findings
+        self._meshes: dict[Any, SceneMesh] = {}  # {file or size: mesh}
         self._robots: dict[MeshFile, Robot] = {}
 
-    def of(self, entry: ShapeSection) -> SceneMesh:
-        """Return the mesh of a copy, an actor or vehicles, under any name."""
+    def mesh_of(self, entry: ShapeSection) -> SceneMesh:
+        """Return the mesh of a copy, an actor or vehicles; the name of the mesh is arbitrary."""
         shape = entry.file or entry.box or (1.0, 1.0, 1.0)
-        made = self._made
+        meshes = self._meshes
         animation, wheels = (getattr(entry, name, None) for name in ("animation", "wheels"))
         played = animation and (animation.name, animation.speed_m_s, animation.repeat)
         key = shape, played, wheels
-        if key not in made:
+        if key not in meshes:
             name = entry.name or "vehicle"
             if not isinstance(shape, MeshFile):
-                return made.setdefault(key, box(name, shape))
+                return meshes.setdefault(key, box(name, shape))
             read = self.read(shape, animation and (animation.name or ""))
             path = self.scenario.path(shape.file)
-            still = read.at_start(lambda line: self.found.notes.append(f"{path} moves {line}"))
+            still = read.at_start(lambda line: self.findings.notes.append(f"{path} moves {line}"))
             if wheels is not None:
                 with prefixed(path):
-                    still = (*rolling(still, wheels, self.found.notes.append),)
-            mesh = made[key] = join_meshes(name, still)
+                    still = (*rolling(still, wheels, self.findings.notes.append),)
+            mesh = meshes[key] = join_meshes(name, still)
             if animation is not None and mesh.animation is not None:
-                own = {"speed_m_s": animation.speed_m_s, "repeat": animation.repeat}
-                made[key] = replace(mesh, animation=replace(mesh.animation, **own))
-        return made[key]
+                settings = {"speed_m_s": animation.speed_m_s, "repeat": animation.repeat}
+                meshes[key] = replace(mesh, animation=replace(mesh.animation, **settings))
+        return meshes[key]
 
     def robot(self, entry: MeshFile) -> Robot:
-        """Return the robot of a file; LidarError if it cannot be used."""
+        """Return the robot of a file; LidarError if the file cannot be used."""
         if entry not in self._robots:
             path = self.scenario.path(entry.file)
-            tell = self.found.notes.append
+            tell = self.findings.notes.append
             colours = self.scenario.coloured
-            named = self.scenario.names_materials
-            made = load_robot(
-                path, opacity=entry.opacity, colours=colours, materials=named, tell=tell
+            name_materials = self.scenario.names_materials
+            robot = load_robot(
+                path, opacity=entry.opacity, colours=colours, materials=name_materials, tell=tell
             )
-            self._robots[entry] = made
-            self.found.sources[entry.file] = made.summary
+            self._robots[entry] = robot
+            self.findings.sources[entry.file] = robot.summary
         return self._robots[entry]
 
     def read(self, entry: MeshFile, animation: str | None = None) -> Objects:
-        """Read the objects of a file, with an animation; LidarError if it cannot be used."""
+        """Read the objects of a file, with an animation; LidarError if the file cannot be used."""
         scenario = self.scenario
-        found = self.found
+        findings = self.findings
         with prefixed(scenario.source):
             transform = entry.transform()
         if entry.file.lower().endswith(ROBOTS):
@@ -214,80 +216,82 @@ class Shapes:
             epsg=scenario.cloud.epsg,
             assets=None if entry.assets is None else scenario.path(entry.assets),
             animation=animation,
-            tell=found.notes.append,
-            axes=found.remarks.append,
+            tell=findings.notes.append,
+            axes=findings.remarks.append,
         )
-        found.sources.setdefault(entry.file, objects.summary)
+        findings.sources.setdefault(entry.file, objects.summary)
         if objects.raster is not None:
-            found.rasters.append((entry, objects.raster))
+            findings.rasters.append((entry, objects.raster))
         return objects
 
     def _still_robot(self, entry: MeshFile, transform: Transform) -> Objects:
         """Return a robot with its joints at zero."""
-        if other := sorted(entry.model_fields_set - _OF_ROBOTS):
+        if refused_fields := sorted(entry.model_fields_set - _OF_ROBOTS):
             raise LidarError(
                 f"{self.scenario.path(entry.file)} is a robot, which is in metres and Z-up: leave "
-                f"out {' and '.join(other)}."
+                f"out {' and '.join(refused_fields)}."
             )
         robot = self.robot(entry)
-        tell = self.found.notes.append
+        tell = self.findings.notes.append
         if robot.moving:
             tell(f"{entry.file} has its joints at zero; joints of an actor move them")
         links = Objects((), robot.actors(tell=tell)).at_start(lambda _: None)
         return Objects(tuple(o.moved(o.name, transform.linear, transform.offset) for o in links))
 
 
-def _copies(shapes: Shapes, base: list[SceneMesh | SceneInstance]) -> list[SceneInstance]:
-    """Place the copies; they stand on other objects and on the ground, not on one another."""
+def _place_copies(shapes: Shapes, base: list[SceneMesh | SceneInstance]) -> list[SceneInstance]:
+    """Place the copies, which stand on files' objects and on the ground, not on copies."""
     scenario = shapes.scenario
     section = shapes.scenario.scene
     scene = Scene.from_meshes(base) if base else None
-    if section.ground is not None and (base or _copied_to(section)):
-        scene = Scene.from_meshes([*base, _ground(section, scene)])
-    standing = Standing(scene)
-    out: list[SceneInstance] = []
+    if section.ground is not None and (base or _copy_extents(section)):
+        scene = Scene.from_meshes([*base, _ground_mesh(section, scene)])
+    standing = StandingSurfaces(scene)
+    copies: list[SceneInstance] = []
     mistakes = Mistakes()
     for number, entry in enumerate(section.copies):
         with mistakes.noted():
-            mesh = shapes.of(entry)
+            mesh = shapes.mesh_of(entry)
             with prefixed(f"{scenario.source}: scene.copies[{number}]"):
-                made = copies_of(entry, mesh, standing, scenario.path)
+                instances = copies_of(entry, mesh, standing, scenario.path)
             if entry.file is not None:
-                words = f", {plural(len(made), 'copy', 'copies')}"
-                shapes.found.sources[entry.file.file] += words
-            out += made
+                words = f", {plural(len(instances), 'copy', 'copies')}"
+                shapes.findings.sources[entry.file.file] += words
+            copies += instances
     mistakes.tell()
-    return out
+    return copies
 
 
-def _copied_to(section: SceneSection) -> list[Floats]:
-    """Corners of where copies are scattered, and places of lists, each (n, 2)."""
-    scattered = [entry.scatter for entry in section.copies if entry.scatter is not None]
-    listed = [[one.position[:2] for one in entry.at] for entry in section.copies]
+def _copy_extents(section: SceneSection) -> list[Floats]:
+    """Return the corners of scatter rectangles and the positions of lists, (n, 2) each, metres."""
+    scatters = [entry.scatter for entry in section.copies if entry.scatter is not None]
+    position_lists = [[copy.position[:2] for copy in entry.at] for entry in section.copies]
     return [
-        *(np.reshape(one.within, (2, 2)) for one in scattered if one.within is not None),
-        *(np.array(places, np.float64) for places in listed if places),
+        *(np.reshape(scatter.within, (2, 2)) for scatter in scatters if scatter.within is not None),
+        *(np.array(positions, np.float64) for positions in position_lists if positions),
     ]
 
 
-def _ground(section: SceneSection, scene: Scene | None) -> SceneMesh:
-    """Two triangles under a scene, and under where copies are scattered or listed."""
+def _ground_mesh(section: SceneSection, scene: Scene | None) -> SceneMesh:
+    """Return two triangles under a scene, and under the extents of copies."""
     ground = section.ground
     assert ground is not None, "of a section with a ground"
-    ends = [] if scene is None else [(scene.bounds + scene.origin)[:, :2]]
-    points = np.concatenate([*ends, *_copied_to(section)])
-    (x0, y0), (x1, y1) = points.min(axis=0) - ground.margin_m, points.max(axis=0) + ground.margin_m
+    corners_xy = [] if scene is None else [(scene.bounds + scene.origin)[:, :2]]
+    points = np.concatenate([*corners_xy, *_copy_extents(section)])
+    x0, y0 = points.min(axis=0) - ground.margin_m
+    x1, y1 = points.max(axis=0) + ground.margin_m
     z = ground.height_m
     corners = np.array([[x0, y0, z], [x1, y0, z], [x1, y1, z], [x0, y1, z]])
     return SceneMesh("Ground", corners, np.array([[0, 1, 2], [0, 2, 3]]))
 
 
-SCALE_LEAST = 1e-6
-DRAWN = 1 << 14  # places that are drawn at a time
-DRAWS_MOST = 200  # places that are drawn for each copy, if not fewer than
-DRAWS_LEAST = 1 << 21
+MIN_SCALE = 1e-6
+DRAW_SIZE = 1 << 14  # positions that are drawn at a time
+# Positions that are drawn: the larger of the two limits.
+MAX_DRAWS_PER_COPY = 200
+MAX_DRAWS = 1 << 21
 
-_PLACE = ("x", "y", "z")
+_POSITION = ("x", "y", "z")
 _ANGLES = ("yaw_deg", "pitch_deg", "roll_deg")
 _SCALES = ("scale_x", "scale_y", "scale_z")
 _COPY_COLUMNS = (
@@ -298,44 +302,64 @@ _COPY_COLUMNS = (
 
 
 def copies_of(
-    entry: CopiesSection, mesh: SceneMesh, standing: Standing, path: PathOf
+    entry: CopiesSection, mesh: SceneMesh, standing: StandingSurfaces, path: PathOf
 ) -> list[SceneInstance]:
-    """Place the copies of an entry; `path` returns that of its table.
+    """Place the copies of an entry; `path` returns the path of a file in the scenario.
 
     Raises
     ------
     LidarError
-        If a table cannot be read, a place has no surface to stand on, or there is no room.
+        If a table cannot be read, no surface is below a position, or there is no room.
     """
     if entry.scatter is not None:
-        places, angles, scales = _scattered(entry.scatter, entry.name, standing)
+        poses = _scatter_copies(entry.scatter, entry.name, standing)
     else:
         if entry.table is not None:
-            places, angles, scales = _of_table(path(entry.table.file), entry.table)
+            poses = _read_copies(path(entry.table.file), entry.table)
         else:
-            places = np.array([(*one.position, np.nan)[:3] for one in entry.at])
-            angles = np.array([[getattr(one, name) for name in _ANGLES] for one in entry.at])
-            scales = np.array([one.scale for one in entry.at])
-        low = np.flatnonzero(np.isnan(places[:, 2]))
-        if len(low):
-            places[low, 2], _ = standing.under(places[low, :2])
-        if len(low := np.flatnonzero(np.isnan(places[:, 2]))):
-            x, y = places[low[0], :2].tolist()
-            raise LidarError(
-                f"below x {x:g}, y {y:g} nothing of the scene's files or ground faces up to stand "
-                f"on ({plural(len(low), 'copy', 'copies')}): give z."
+            poses = _CopyPoses(
+                np.array([(*copy.position, np.nan)[:3] for copy in entry.at]),
+                np.array([[getattr(copy, name) for name in _ANGLES] for copy in entry.at]),
+                np.array([copy.scale for copy in entry.at]),
             )
-        if (np.abs(scales) < SCALE_LEAST).any():
-            raise LidarError(
-                f"a scale of {scales.flat[np.abs(scales).argmin()]:g} would flatten the mesh: give "
-                f"at least {SCALE_LEAST:g}."
-            )
-    matrices = affine(rotations_of(angles) * scales[:, None], places)
+        poses.set_missing_heights(standing)
+        poses.check_scales()
+    matrices = affine(rotations_of(poses.angles_deg) * poses.scales[:, None], poses.positions)
     return SceneInstance.from_matrices(mesh, matrices, entry.name)
 
 
-def _of_table(path: Path, table: CopyTable) -> tuple[Floats, Floats, Floats]:
-    """Read positions, z nan if there is none, angles in degrees, and scales: (n, 3) each."""
+class _CopyPoses(NamedTuple):
+    """Poses and scales of the copies of an entry."""
+
+    positions: Floats  # (n, 3), world metres; z is nan for copies that stand on a surface
+    angles_deg: Floats  # (n, 3): yaw, pitch, roll
+    scales: Floats  # (n, 3)
+
+    def set_missing_heights(self, standing: StandingSurfaces) -> None:
+        """Put copies without z onto the surface below; LidarError if there is no surface."""
+        positions = self.positions
+        rows = np.flatnonzero(np.isnan(positions[:, 2]))
+        if len(rows):
+            positions[rows, 2], _ = standing.heights_below(positions[rows, :2])
+        if len(rows := np.flatnonzero(np.isnan(positions[:, 2]))):
+            x, y = positions[rows[0], :2].tolist()
+            raise LidarError(
+                f"below x {x:g}, y {y:g} nothing of the scene's files or ground faces up to stand "
+                f"on ({plural(len(rows), 'copy', 'copies')}): give z."
+            )
+
+    def check_scales(self) -> None:
+        """Raise LidarError if a scale is nearly 0."""
+        scales = self.scales
+        if (np.abs(scales) < MIN_SCALE).any():
+            raise LidarError(
+                f"a scale of {scales.flat[np.abs(scales).argmin()]:g} would flatten the mesh: give "
+                f"at least {MIN_SCALE:g}."
+            )
+
+
+def _read_copies(path: Path, table: CopyTable) -> _CopyPoses:
+    """Read the poses and scales of copies from a table."""
     try:
         columns = with_yaw(
             read_table(
@@ -352,77 +376,83 @@ def _of_table(path: Path, table: CopyTable) -> tuple[Floats, Floats, Floats]:
     except (OSError, ValueError, LidarError) as error:
         raise LidarError(f"{path} is not a usable table of copies: {message_of(error)}") from error
     count = len(columns["x"])
-    if count > COPIES_MOST:
-        raise LidarError(f"{path} has {count:,} rows; at most {COPIES_MOST:,} are allowed.")
+    if count > MAX_COPIES:
+        raise LidarError(f"{path} has {count:,} rows; at most {MAX_COPIES:,} are allowed.")
 
-    def some(names: Sequence[str], default: Any) -> Floats:
+    def columns_of(names: Sequence[str], default: Any) -> Floats:
         return np.stack([columns.get(name, np.full(count, default)) for name in names], axis=1)
 
-    scales = some(("scale",) * 3 if "scale" in columns else _SCALES, 1.0)
-    return some(_PLACE, np.nan), angles_of(columns, count), scales
+    scales = columns_of(("scale",) * 3 if "scale" in columns else _SCALES, 1.0)
+    return _CopyPoses(columns_of(_POSITION, np.nan), angles_of(columns, count), scales)
 
 
-def _scattered(given: Scatter, name: str, standing: Standing) -> tuple[Floats, Floats, Floats]:
-    """Places, angles in degrees and scales of copies at random: (n, 3) each.
+def _scatter_copies(scatter: Scatter, name: str, standing: StandingSurfaces) -> _CopyPoses:
+    """Draw the poses and scales of copies at random.
 
-    Places are drawn in a rectangle and kept if the highest surface there is one of those named:
-    only sums, products and comparisons, so that all machines draw the same.
+    Positions are drawn in a rectangle, and are valid where the highest surface is one of the
+    scatter's: only sums, products and comparisons, so that all machines draw the same.
     """
-    own = standing.only(given.surfaces)
-    x0, y0, x1, y1 = own.rectangle if given.within is None else given.within
-    # The name, so that trees and rocks of one seed are not at the same places.
-    seeds = [given.seed, *name.encode()]
-    draw = np.random.Generator(np.random.PCG64([0, *seeds]))
-    room = _TakenPlaces(given.spacing_m)
-    found: list[Floats] = []
-    drawn = 0
-    while len(found) < given.count:
-        if drawn > max(DRAWS_LEAST, DRAWS_MOST * given.count):
+    # The name, so that trees and rocks of the same seed do not share positions.
+    seeds = [scatter.seed, *name.encode()]
+    positions = _scatter_positions(scatter, seeds, standing)
+    count = scatter.count
+    looks = np.random.Generator(np.random.PCG64([1, *seeds])).random((count, 2))
+    yaw = 360.0 * looks[:, 0] if scatter.yaw_deg is None else np.full(count, scatter.yaw_deg)
+    min_scale, max_scale = scatter.scale
+    scales = min_scale + looks[:, 1] * (max_scale - min_scale)
+    angles = np.column_stack([yaw, np.zeros((count, 2))])
+    return _CopyPoses(positions, angles, np.repeat(scales[:, None], 3, axis=1))
+
+
+def _scatter_positions(scatter: Scatter, seeds: list[int], standing: StandingSurfaces) -> Floats:
+    """Draw positions (n, 3) on surfaces, world metres; LidarError if there is no room."""
+    surfaces = standing.of_objects(scatter.surfaces)
+    x0, y0, x1, y1 = surfaces.rectangle if scatter.within is None else scatter.within
+    rng = np.random.Generator(np.random.PCG64([0, *seeds]))
+    occupied = _OccupiedPositions(scatter.spacing_m)
+    positions: list[Floats] = []
+    drawn_count = 0
+    while len(positions) < scatter.count:
+        if drawn_count > max(MAX_DRAWS, MAX_DRAWS_PER_COPY * scatter.count):
             raise LidarError(
-                f"only {len(found):,} of {given.count:,} found room on {', '.join(given.surfaces)} "
-                f"within x {x0:.6g} to {x1:.6g}, y {y0:.6g} to {y1:.6g}: take fewer, a smaller "
-                "spacing_m, or other surfaces."
+                f"only {len(positions):,} of {scatter.count:,} found room on "
+                f"{', '.join(scatter.surfaces)} within x {x0:.6g} to {x1:.6g}, y {y0:.6g} to "
+                f"{y1:.6g}: take fewer, a smaller spacing_m, or other surfaces."
             )
-        block = draw.random((DRAWN, 2)) * [x1 - x0, y1 - y0] + [x0, y0]
-        heights, objects = standing.under(block)
-        on = np.flatnonzero(np.isin(objects, own.owners))
-        if not drawn and not len(on):  # they are under a roof: draw the same again without it
-            standing = own
-            heights, objects = standing.under(block)
-            on = np.flatnonzero(objects >= 0)
-        drawn += DRAWN
-        for row in on:
-            x, y = block[row].tolist()
-            if room.takes(x, y):
-                found.append(np.array([x, y, heights[row]]))
-                if len(found) == given.count:
+        draws = rng.random((DRAW_SIZE, 2)) * [x1 - x0, y1 - y0] + [x0, y0]
+        heights, objects = standing.heights_below(draws)
+        on_surfaces = np.flatnonzero(np.isin(objects, surfaces.owners))
+        if not drawn_count and not len(on_surfaces):  # a roof is above: leave it out
+            standing = surfaces
+            heights, objects = standing.heights_below(draws)
+            on_surfaces = np.flatnonzero(objects >= 0)
+        drawn_count += DRAW_SIZE
+        for row in on_surfaces:
+            if occupied.occupy(*draws[row].tolist()):
+                positions.append(np.array([*draws[row], heights[row]]))
+                if len(positions) == scatter.count:
                     break
-    looks = np.random.Generator(np.random.PCG64([1, *seeds])).random((given.count, 2))
-    yaw = 360.0 * looks[:, 0] if given.yaw_deg is None else np.full(given.count, given.yaw_deg)
-    least, largest = given.scale
-    scales = least + looks[:, 1] * (largest - least)
-    angles = np.column_stack([yaw, np.zeros((given.count, 2))])
-    return np.array(found), angles, np.repeat(scales[:, None], 3, axis=1)
+    return np.array(positions)
 
 
-class _TakenPlaces:
-    """Places that are taken, each with so much room around it."""
+class _OccupiedPositions:
+    """Occupied positions in the plane, at least `spacing_m` apart."""
 
     def __init__(self, spacing_m: float) -> None:
-        self._apart = spacing_m
-        self._taken: dict[tuple[int, int], list[tuple[float, float]]] = {}  # {cell: places}
+        self._spacing_m = spacing_m
+        self._cells: dict[tuple[int, int], list[tuple[float, float]]] = {}  # {cell: positions}
 
-    def takes(self, x: float, y: float) -> bool:
-        """Take a place, if no other is too near."""
-        apart = self._apart
-        if not apart:
+    def occupy(self, x: float, y: float) -> bool:
+        """Occupy a position and return True, or return False if there is no room."""
+        spacing_m = self._spacing_m
+        if not spacing_m:
             return True
-        column = int(x // apart)
-        row = int(y // apart)
+        column = int(x // spacing_m)
+        row = int(y // spacing_m)
         for i in (column - 1, column, column + 1):
             for j in (row - 1, row, row + 1):
-                for u, v in self._taken.get((i, j), ()):
-                    if (x - u) * (x - u) + (y - v) * (y - v) < apart * apart:
+                for u, v in self._cells.get((i, j), ()):
+                    if (x - u) * (x - u) + (y - v) * (y - v) < spacing_m * spacing_m:
                         return False
-        self._taken.setdefault((column, row), []).append((x, y))
+        self._cells.setdefault((column, row), []).append((x, y))
         return True

@@ -11,7 +11,7 @@ import re
 from collections import Counter, defaultdict
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -55,7 +55,7 @@ CLASSES = {
     17: ObjectClass("bridge deck", ("Bridge* *",)),
 }
 
-# How deep surfaces are nested in the boundaries of a geometry.
+# Depth of the surfaces in the nested boundaries of a geometry.
 _DEPTHS = {
     "MultiSurface": 1,
     "CompositeSurface": 1,
@@ -63,25 +63,37 @@ _DEPTHS = {
     "MultiSolid": 3,
     "CompositeSolid": 3,
 }
-_OPEN = ("ClosureSurface", "WaterClosureSurface")  # that nothing is where they are
-# Geographic reference systems of CityJSON files that were seen, and those of countries.
-_DEGREES = {4167, 4171, 4258, 4267, 4269, 4283, 4326, 4490, 4612, 4617, 4674, 4937, 4939, 4979,
-            6667, 6668, 6697, 7789, 7843, 7844, 7912, 9518, 9755, 9989}  # fmt: skip
-_STEEP = 100  # a city is not so many times as high as it is wide, unless in degrees
+_OPEN_SURFACES = ("ClosureSurface", "WaterClosureSurface")  # through which light passes
+# EPSG codes of geographic reference systems: of published CityJSON files, and of countries.
+_GEOGRAPHIC_SYSTEMS = {
+    4167, 4171, 4258, 4267, 4269, 4283, 4326, 4490, 4612, 4617, 4674, 4937, 4939, 4979,
+    6667, 6668, 6697, 7789, 7843, 7844, 7912, 9518, 9755, 9989,
+}  # fmt: skip
+_MAX_SLOPE = 100  # largest ratio of a city's height to its width, unless in degrees
 _PARTS = "convert it to CityJSONSeq (.jsonl), which is read line by line, or export it in parts"
 
 _Json = dict[str, Any]
 
 
-def read_cityjson(data: bytes, path: Path, wanted: ReadOptions) -> Content:
+class _Polygons(NamedTuple):
+    """Polygons of the objects of a document; an owner is (number of the object, material)."""
+
+    corners: list[Ints]  # vertices of the polygons without holes, an array for each object
+    sizes: list[int]  # number of corners of each polygon without holes
+    owners: list[tuple[int, int]]  # of each polygon without holes
+    holed_faces: list[Ints]  # triangles of the polygons with holes
+    holed_owners: list[tuple[int, int]]  # of each of these triangles
+
+
+def read_cityjson(data: bytes, path: Path, options: ReadOptions) -> Content:
     """Read the highest level of detail of each city object; a .jsonl line by line."""
     allowance = Allowance(len(data), _PARTS)
 
     def lines() -> Iterator[bytes]:
-        whole = path.suffix.lower() != ".jsonl"
-        return iter([data]) if whole else filter(bytes.strip, io.BytesIO(data))
+        is_single = path.suffix.lower() != ".jsonl"
+        return iter([data]) if is_single else filter(bytes.strip, io.BytesIO(data))
 
-    allowance.take(max(map(_unpacked, lines()), default=0))  # one is there at a time
+    allowance.take(max(map(_unpacked_bytes, lines()), default=0))  # one line at a time
     city = None
     for line in lines():
         document = json.loads(line)
@@ -92,7 +104,7 @@ def read_cityjson(data: bytes, path: Path, wanted: ReadOptions) -> Content:
                     'is JSON, but not CityJSON: it does not begin with "type": "CityJSON" (a '
                     "scenario has the ending .yaml)"
                 )
-            city = _CityFile(document, allowance, wanted)
+            city = _CityFile(document, allowance, options)
         elif kind != "CityJSONFeature":
             raise ValueError(f"a line is of the type {str(kind)[:40]!r}, not CityJSONFeature")
         city.add(document)
@@ -101,13 +113,13 @@ def read_cityjson(data: bytes, path: Path, wanted: ReadOptions) -> Content:
     return city.content()
 
 
-def _unpacked(text: bytes) -> int:
-    """Bytes that JSON takes at most while it is read."""
+def _unpacked_bytes(text: bytes) -> int:
+    """Return the largest memory that reading JSON takes, in bytes."""
     return 5 * len(text) + 100 * text.count(b"[") + 300 * text.count(b"{") + 48 * text.count(b",")
 
 
 class _CityFile:
-    """Places of the objects in one file.
+    """The objects of a file, placed as nodes.
 
     Parameters
     ----------
@@ -115,11 +127,11 @@ class _CityFile:
         The file, or the first line of a sequence.
     """
 
-    def __init__(self, head: _Json, allowance: Allowance, wanted: ReadOptions) -> None:
+    def __init__(self, head: _Json, allowance: Allowance, options: ReadOptions) -> None:
         self._head = head
         self._allowance = allowance
-        self._colours = wanted.colours
-        self._named = wanted.materials
+        self._colours = options.colours
+        self._names_materials = options.materials
         version = str(head.get("version"))
         if not re.match(r"1\.[01]|2\.0", version):
             raise MeshFileError(
@@ -133,7 +145,7 @@ class _CityFile:
         self._placed: list[PlacedNode] = []
         self._templates: list[list[SceneMesh]] | None = None
         self._levels: Counter[float] = Counter()  # {level of detail: objects}
-        self._left: Counter[str] = Counter()  # {what is not read: how often}
+        self._unread: Counter[str] = Counter()  # {kind of unread content: count}
 
     def add(self, document: _Json) -> None:
         """Add the objects of a file or line."""
@@ -141,32 +153,32 @@ class _CityFile:
         objects: dict[str, _Json] = document["CityObjects"]
         levels: dict[str, list[tuple[float, _Json]]] = {}
         parts: dict[str, float] = defaultdict(lambda: -np.inf)  # {object: finest of its parts}
-        for key, one in objects.items():
-            levels[key] = list(self._levelled(one.get("geometry") or ()))
-            if one["type"].endswith("Part"):
+        for key, entry in objects.items():
+            levels[key] = list(self._with_levels(entry.get("geometry") or ()))
+            if entry["type"].endswith("Part"):
                 finest = max((level for level, _ in levels[key]), default=-np.inf)
-                for parent in one.get("parents") or ():
+                for parent in entry.get("parents") or ():
                     parts[parent] = max(parts[parent], finest)
-        wanted: list[tuple[str, list[_Json]]] = []
-        for key, found in levels.items():
-            # A building is a coarse whole if its parts are finer, else what they are not.
-            best = max((level for level, _ in found), default=-np.inf)
-            if not found or best < parts.get(key, -np.inf):
+        surfaces_of_objects: list[tuple[str, list[_Json]]] = []
+        for key, levelled in levels.items():
+            # A building stands for its parts unless they are finer.
+            best = max((level for level, _ in levelled), default=-np.inf)
+            if not levelled or best < parts.get(key, -np.inf):
                 continue
             self._levels[best] += 1
             name = f"{objects[key]['type']} {key}"
-            surfaces = []
-            for level, geometry in found:
+            geometries_of_best = []
+            for level, geometry in levelled:
                 if level == best and geometry["type"] == "GeometryInstance":
-                    self._place(name, geometry, points)
+                    self._place_template(name, geometry, points)
                 elif level == best:
-                    surfaces.append(geometry)
-            wanted.append((name, surfaces))
-        for meshes in self._built(points, wanted, document):
+                    geometries_of_best.append(geometry)
+            surfaces_of_objects.append((name, geometries_of_best))
+        for meshes in self._meshes(points, surfaces_of_objects, document):
             self._placed += [PlacedNode(mesh, np.eye(4), mesh.name) for mesh in meshes]
 
-    def _levelled(self, geometries: Sequence[_Json]) -> Iterator[tuple[float, _Json]]:
-        """Surfaces, also of templates, and their levels of detail; counts what is not read."""
+    def _with_levels(self, geometries: Sequence[_Json]) -> Iterator[tuple[float, _Json]]:
+        """Yield geometries with their levels of detail, and count geometries that are not read."""
         for geometry in geometries:
             kind = geometry["type"]
             if kind == "GeometryInstance":
@@ -175,119 +187,135 @@ class _CityFile:
             elif kind in _DEPTHS:
                 yield _level(geometry), geometry
             else:
-                self._left[str(kind)[:40]] += 1
+                self._unread[str(kind)[:40]] += 1
 
-    def _place(self, name: str, geometry: _Json, points: Floats) -> None:
+    def _place_template(self, name: str, geometry: _Json, points: Floats) -> None:
         """Place a template at a point."""
         if self._templates is None:
-            given = self._head["geometry-templates"]
-            shapes = [(f"template {k}", [one]) for k, one in enumerate(given["templates"])]
-            vertices = _points(given["vertices-templates"])
-            self._templates = self._built(vertices, shapes, self._head)
+            templates = self._head["geometry-templates"]
+            shapes = [(f"template {k}", [shape]) for k, shape in enumerate(templates["templates"])]
+            vertices = _points(templates["vertices-templates"])
+            self._templates = self._meshes(vertices, shapes, self._head)
         (point,) = geometry["boundaries"]
         matrix = np.array(geometry["transformationMatrix"], np.float64).reshape(4, 4)
         matrix[:3, 3] += _item(points, point)
         meshes = _item(self._templates, geometry["template"])
         self._placed += [PlacedNode(mesh, matrix, name) for mesh in meshes]
 
-    def _built(
-        self, points: Floats, wanted: list[tuple[str, list[_Json]]], document: _Json
+    def _meshes(
+        self, points: Floats, objects: list[tuple[str, list[_Json]]], document: _Json
     ) -> list[list[SceneMesh]]:
-        """Make a mesh of the surfaces of each object, or none if it has no triangles.
+        """Return the mesh of each object, in a list; an empty list without triangles.
 
-        All polygons of a document are cut at once, which takes a tenth of the time.
+        `objects` are names and geometries. All polygons of a document are cut at once, which takes
+        a tenth of the time.
         """
-        # of polygons without holes
-        corners = [np.zeros(0, np.int64)]
-        sizes = []
-        owners: list[tuple[int, int]] = []  # of each its object and material
-        cut: list[Ints] = []  # triangles of those with holes
-        cut_owners: list[tuple[int, int]] = []
-        for number, (name, geometries) in enumerate(wanted):
-            own: list[int] = []
+        faces, owners = self._triangles(points, self._polygons(points, objects))
+        if not len(faces):
+            return [[] for _ in objects]
+        order = np.lexsort(owners.T[::-1])
+        faces = faces[order]
+        owners = owners[order]
+        starts = np.flatnonzero(np.diff(owners, axis=0, prepend=-2).any(axis=1))
+        groups = np.split(faces, starts[1:])
+        pieces: list[list[Piece]] = [[] for _ in objects]
+        for group, (number, material) in zip(groups, owners[starts].tolist(), strict=True):
+            pieces[number].append(self._piece(points, group, material, document))
+        return [
+            joined(name, object_pieces, self._allowance)
+            for (name, _), object_pieces in zip(objects, pieces, strict=True)
+        ]
+
+    def _polygons(self, points: Floats, objects: list[tuple[str, list[_Json]]]) -> _Polygons:
+        """Collect the polygons of objects; polygons with holes as triangles."""
+        polygons = _Polygons([np.zeros(0, np.int64)], [], [], [], [])
+        for number, (name, geometries) in enumerate(objects):
+            corners: list[int] = []
             try:
                 for (outline, *holes), material in self._surfaces(geometries):
                     if holes:
-                        rings = [_whole(ring) for ring in (outline, *holes)]
-                        found = with_holes(
+                        rings = [_integers(ring) for ring in (outline, *holes)]
+                        faces = with_holes(
                             points, [r for r in rings if r is rings[0] or len(r) > 2]
                         )
-                        cut.append(found)
-                        cut_owners += [(number, material)] * len(found)
+                        polygons.holed_faces.append(faces)
+                        polygons.holed_owners.extend([(number, material)] * len(faces))
                     else:
-                        own += outline
-                        sizes.append(len(outline))
-                        owners.append((number, material))
-                corners.append(_whole(own))
-                check_corners(corners[-1], len(points))
+                        corners += outline
+                        polygons.sizes.append(len(outline))
+                        polygons.owners.append((number, material))
+                polygons.corners.append(_integers(corners))
+                check_corners(polygons.corners[-1], len(points))
             except (ArithmeticError, AttributeError, LookupError, TypeError, ValueError) as error:
                 raise ValueError(f"{name[:80]!r}: {error}") from error
-        at = np.concatenate(corners)
-        each = np.array(sizes, np.int64)
-        self._allowance.take(100 * len(at))
-        # With corners of its own for each polygon, a triangle tells which one it is of.
-        simple = triangulated(points[at], np.arange(len(at)), each)
-        polygon = np.searchsorted(np.cumsum(each), simple[:, 0], side="right")
-        faces = np.concatenate([at[simple], *cut])
-        owner = np.concatenate(
-            [np.reshape(owners, (-1, 2))[polygon], np.reshape(cut_owners, (-1, 2))]
+        return polygons
+
+    def _triangles(self, points: Floats, polygons: _Polygons) -> tuple[Ints, Ints]:
+        """Cut polygons into triangles (t, 3); return these and their owners (t, 2)."""
+        corners = np.concatenate(polygons.corners)
+        sizes = np.array(polygons.sizes, np.int64)
+        self._allowance.take(100 * len(corners))
+        # Each polygon has corners of its own, so that triangles belong to the polygon of a corner.
+        simple = triangulated(points[corners], np.arange(len(corners)), sizes)
+        polygon = np.searchsorted(np.cumsum(sizes), simple[:, 0], side="right")
+        faces = np.concatenate([corners[simple], *polygons.holed_faces])
+        owners = np.concatenate(
+            [
+                np.reshape(polygons.owners, (-1, 2))[polygon],
+                np.reshape(polygons.holed_owners, (-1, 2)),
+            ]
         ).astype(np.int64)
-        if not len(faces):
-            return [[] for _ in wanted]
-        order = np.lexsort(owner.T[::-1])
-        faces = faces[order]
-        owner = owner[order]
-        begins = np.flatnonzero(np.diff(owner, axis=0, prepend=-2).any(axis=1))
-        pieces: list[list[Piece]] = [[] for _ in wanted]
-        for some, (number, material) in zip(
-            np.split(faces, begins[1:]), owner[begins].tolist(), strict=True
-        ):
-            painted = None
-            named = ""
-            if material >= 0:
-                entry = document["appearance"]["materials"][material]
-                if self._colours:
-                    colour = as_bytes(entry.get("diffuseColor") or (0.8, 0.8, 0.8))
-                    painted = Colours.plain(colour.reshape(1, 1, 3), len(some))
-                named = str(entry.get("name") or "") if self._named else ""
-            pieces[number].append(Piece(points, some, None, painted, named))
-        return [
-            join_pieces(name, some, self._allowance)
-            for (name, _), some in zip(wanted, pieces, strict=True)
-        ]
+        return faces, owners
+
+    def _piece(self, points: Floats, faces: Ints, material: int, document: _Json) -> Piece:
+        """Return triangles with colour and name of a material; -1 is no material."""
+        colours = None
+        name = ""
+        if material >= 0:
+            entry = document["appearance"]["materials"][material]
+            if self._colours:
+                colour = as_bytes(entry.get("diffuseColor") or (0.8, 0.8, 0.8))
+                colours = Colours.plain(colour.reshape(1, 1, 3), len(faces))
+            name = str(entry.get("name") or "") if self._names_materials else ""
+        return Piece(points, faces, None, colours, name)
 
     def _surfaces(self, geometries: Sequence[_Json]) -> Iterator[tuple[list[list[int]], int]]:
-        """Rings of polygons and the numbers of their materials, -1 for none."""
+        """Yield the rings of polygons and the numbers of their materials, -1 for none."""
         for geometry in geometries:
             if geometry["type"] not in _DEPTHS:  # of a template
-                self._left[str(geometry["type"])[:40]] += 1
+                self._unread[str(geometry["type"])[:40]] += 1
                 continue
             semantics = geometry.get("semantics") or {}
-            kinds = dict(enumerate(one["type"] for one in semantics.get("surfaces") or ()))
+            kinds = dict(enumerate(surface["type"] for surface in semantics.get("surfaces") or ()))
             paint: _Json = {}
-            if self._colours or self._named:  # of the first theme
+            if self._colours or self._names_materials:  # of the first theme
                 paint = next(iter((geometry.get("material") or {}).values()), {})
-            marks = semantics.get("values"), paint.get("values", paint.get("value"))
+            values = semantics.get("values"), paint.get("values", paint.get("value"))
             if self._colours and geometry.get("texture"):
-                self._left["texture"] += 1
-            for rings, kind, material in _flat(
-                geometry["boundaries"], _DEPTHS[geometry["type"]], *marks
+                self._unread["texture"] += 1
+            for rings, kind, material in _surfaces_at(
+                geometry["boundaries"], _DEPTHS[geometry["type"]], *values
             ):
-                if kinds.get(kind) in _OPEN:
-                    self._left[kinds[kind]] += 1
+                if kinds.get(kind) in _OPEN_SURFACES:
+                    self._unread[kinds[kind]] += 1
                     continue
                 yield rings, -1 if material is None else int(material)
 
     def content(self) -> Content:
-        """All objects, in metres."""
+        """Return all objects, in metres."""
         reference = (self._head.get("metadata") or {}).get("referenceSystem")
-        found = re.search(r"EPSG\b.*?(\d+)$", str(reference))
-        epsg = int(found[1]) if found else None
-        ends = [np.zeros((1, 3)), *(one.mesh.bounds + one.matrix[:3, 3] for one in self._placed)]
-        corners = np.concatenate(ends)[bool(self._placed) :]
+        match = re.search(r"EPSG\b.*?(\d+)$", str(reference))
+        epsg = int(match[1]) if match else None
+        bounds = [
+            np.zeros((1, 3)),
+            *(node.mesh.bounds + node.matrix[:3, 3] for node in self._placed),
+        ]
+        corners = np.concatenate(bounds)[bool(self._placed) :]
         width, depth, height = np.ptp(corners, axis=0)
-        near = np.abs(corners[:, :2]).max() <= 360
-        if epsg in _DEGREES or (near and height > _STEEP * max(width, depth)):
+        in_degrees_range = np.abs(corners[:, :2]).max() <= 360
+        if epsg in _GEOGRAPHIC_SYSTEMS or (
+            in_degrees_range and height > _MAX_SLOPE * max(width, depth)
+        ):
             raise MeshFileError(
                 f"has coordinates in degrees{f' (EPSG:{epsg})' if epsg else ''}, and metres are "
                 "needed: reproject it, for example by cjio FILE crs_reproject EPSG save NEW"
@@ -306,22 +334,22 @@ class _CityFile:
             content.notes.append(f"is in EPSG:{epsg}: <cloud.epsg={epsg}> writes that to LAS")
         if len(levels) > 1:
             content.notes.append(f"has {', '.join(levels)}, which is the highest of each")
-        if self._left:
-            listed = ", ".join(f"{n} {kind}" for kind, n in self._left.items())
+        if self._unread:
+            listed = ", ".join(f"{n} {kind}" for kind, n in self._unread.items())
             content.notes.append(f"is read without {listed}")
         return content
 
 
 def _points(rows: Any) -> Floats:
-    """Coordinates (v, 3); ValueError if they are not."""
+    """Return coordinates (v, 3); ValueError for another shape."""
     points = np.array(rows or np.zeros((0, 3)), np.float64)
     if points.ndim != 2 or points.shape[1] != 3:
         raise ValueError(f"its vertices are of the shape {points.shape}, not (v, 3)")
     return points
 
 
-def _whole(numbers: Sequence[int]) -> Ints:
-    """Whole numbers (n,); ValueError if they are not."""
+def _integers(numbers: Sequence[int]) -> Ints:
+    """Return whole numbers (n,), or raise ValueError."""
     array = np.array(numbers or np.zeros(0, np.int64))
     if array.ndim != 1 or array.dtype != np.int64:
         raise ValueError("its boundaries are not nested as those of its type, or not whole numbers")
@@ -329,26 +357,28 @@ def _whole(numbers: Sequence[int]) -> Ints:
 
 
 def _item(items: Any, number: Any) -> Any:
+    """Return an item by its number; ValueError if the number is none of theirs."""
     if type(number) is not int or not 0 <= number < len(items):
         raise ValueError(f"{str(number)[:20]} is none of {len(items)} templates or vertices")
     return items[number]
 
 
 def _level(geometry: _Json) -> float:
+    """Return the level of detail of a geometry, -1 if the level is unknown."""
     try:
         return float(geometry["lod"])
     except (KeyError, TypeError, ValueError):
         return -1.0
 
 
-def _flat(tree: Any, depth: int, *marks: Any) -> Iterator[tuple[Any, ...]]:
-    """All that is so deep in nested lists, with its marks, which may be of all in a list."""
+def _surfaces_at(tree: Any, depth: int, *values: Any) -> Iterator[tuple[Any, ...]]:
+    """Yield the lists at a depth of nested lists, with their nested or shared values."""
     if not depth:
-        yield (tree, *marks)
+        yield (tree, *values)
         return
     for k, below in enumerate(tree):
-        inner = [
-            mark if not isinstance(mark, list) else mark[k] if k < len(mark) else None
-            for mark in marks
+        inner_values = [
+            value if not isinstance(value, list) else value[k] if k < len(value) else None
+            for value in values
         ]
-        yield from _flat(below, depth - 1, *inner)
+        yield from _surfaces_at(below, depth - 1, *inner_values)

@@ -13,6 +13,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping
 from functools import cache
 from pathlib import Path
+from typing import NamedTuple
 from urllib.parse import unquote
 from xml.etree.ElementTree import Element
 
@@ -44,16 +45,24 @@ _WRAPS: dict[str, Wrap] = {"CLAMP": "clamp", "BORDER": "clamp", "MIRROR": "mirro
 _SURFACES = ("triangles", "polylist", "polygons", "tristrips", "trifans")
 
 
-def read_dae(data: bytes, path: Path, wanted: ReadOptions) -> Content:
-    """Read the visual scene of a file; colours and names are those of its materials."""
+class _Inputs(NamedTuple):
+    """Points of a primitive, and the layout of the numbers in <p>."""
+
+    points: Floats  # (v, 3)
+    offset: int  # of the indices of points in the numbers of a corner
+    stride: int  # count of numbers of a corner
+
+
+def read_dae(data: bytes, path: Path, options: ReadOptions) -> Content:
+    """Read the visual scene of a file, with colours and names of its materials."""
     root = xml_root(data)
     for element in root.iter():
         element.tag = element.tag.rpartition("}")[2]
     if root.tag != "COLLADA":
         raise MeshFileError(f"is XML, but not COLLADA: it begins with <{root.tag[:40]}>")
     allowance = Allowance(len(data), SMALLER)
-    paint = _Effects(path, wanted, allowance) if wanted.colours else None
-    document = _Document(root, allowance, paint, named=wanted.materials)
+    paint = _Effects(path, options, allowance) if options.colours else None
+    document = _Document(root, allowance, paint, name_materials=options.materials)
     content = placed_content(placed_nodes(document.roots(), document.node, path.stem))
     content.notes = paint.notes.lines() if paint else []
     unit = root.find("asset/unit[@meter]")
@@ -67,15 +76,15 @@ def read_dae(data: bytes, path: Path, wanted: ReadOptions) -> Content:
 
 
 class _Document:
-    """Elements by their ids; each geometry is read once."""
+    """Elements of a file by their ids; each geometry is read once."""
 
     def __init__(
-        self, root: Element, allowance: Allowance, paint: _Effects | None, *, named: bool
+        self, root: Element, allowance: Allowance, paint: _Effects | None, *, name_materials: bool
     ) -> None:
         self._root = root
         self._allowance = allowance
         self._paint = paint
-        self._named = named  # whether names of materials are wanted
+        self._names_materials = name_materials
         # By kind, too: some programs give a scene and a node in it the same id.
         self._ids: dict[tuple[str, str], Element] = {}
         for element in root.iter():
@@ -85,14 +94,14 @@ class _Document:
         self._floats = cache(_numbers)
 
     def roots(self) -> list[Element]:
-        """Visual scene of the file; by default the first."""
+        """Return the visual scene of the file, in a list; by default the first."""
         shown = self._root.find("scene/instance_visual_scene")
         if shown is not None:
             return [self._target(shown, "visual_scene")]
         return self._root.findall("library_visual_scenes/visual_scene")[:1]
 
     def node(self, element: Element) -> Node:
-        """<node>, or the <visual_scene> around all."""
+        """Return the node of a <node>, or of the <visual_scene>."""
         meshes: list[SceneMesh] = []
         children = []
         matrix = np.eye(4)
@@ -102,7 +111,7 @@ class _Document:
             elif child.tag == "instance_node":
                 children.append(self._target(child, "node"))
             elif child.tag == "instance_geometry":
-                bound = self._bound(child) if self._paint or self._named else ()
+                bound = self._bound_materials(child) if self._paint or self._names_materials else ()
                 meshes += self._geometry(self._target(child, "geometry"), bound)
             elif child.tag == "instance_controller":
                 raise MeshFileError(
@@ -117,21 +126,21 @@ class _Document:
         return Node(name, matrix, meshes, children)
 
     def _target(self, element: Element, kind: str) -> Element:
-        """Element of a kind that another one names."""
+        """Return the element of a kind that an element names, or raise MeshFileError."""
         url = element.get("source", element.get("url", ""))
-        found = self._ids.get((kind, url[1:]), self._ids.get((kind, unquote(url[1:]))))
-        if found is None or not url.startswith("#"):
+        target = self._ids.get((kind, url[1:]), self._ids.get((kind, unquote(url[1:]))))
+        if target is None or not url.startswith("#"):
             raise MeshFileError(
                 f"has an <{element.tag}> of {url[:80]!r}, which is not in the file: export it again"
             )
-        return found
+        return target
 
     def _read_geometry(
         self, geometry: Element, bound: tuple[tuple[str, Element], ...]
     ) -> list[SceneMesh]:
-        """One mesh of all primitives, which differ by material only; none without triangles.
+        """Return the mesh of all primitives, which differ by material only, or an empty list.
 
-        `bound` are symbols of materials, and the elements for which they stand.
+        `bound` are symbols of materials, and the elements they stand for.
         """
         name = geometry.get("name") or geometry.get("id") or ""
         for kind in ("convex_mesh", "brep"):
@@ -148,50 +157,58 @@ class _Document:
         return join_pieces(name, pieces, self._allowance)
 
     def _material_name(self, primitive: Element, materials: Mapping[str, Element]) -> str:
-        """Name of the material of a primitive, if names are wanted; else, or for none, empty."""
+        """Return the name of a primitive's material, or an empty string."""
         symbol = primitive.get("material", "")
-        if not self._named or not symbol:
+        if not self._names_materials or not symbol:
             return ""
         bound = materials.get(symbol)
         return symbol if bound is None else bound.get("name") or bound.get("id") or symbol
 
-    def _bound(self, instance: Element) -> tuple[tuple[str, Element], ...]:
-        """Materials that an instance of a geometry gives to its symbols."""
+    def _bound_materials(self, instance: Element) -> tuple[tuple[str, Element], ...]:
+        """Return the materials that an instance of a geometry gives to its symbols."""
         entries = instance.findall("bind_material/technique_common/instance_material")
-        found = [
+        materials = [
             (entry.get("symbol", ""), self._ids.get(("material", entry.get("target", "")[1:])))
             for entry in entries
         ]
-        return tuple((symbol, material) for symbol, material in found if material is not None)
+        return tuple((symbol, material) for symbol, material in materials if material is not None)
 
     def _piece(self, primitive: Element, material: Element | None) -> Piece:
-        """Triangles of a primitive, in the colours of a material."""
+        """Return the triangles of a primitive, in the colours of a material."""
         points, offset, stride = self._inputs(primitive)
         lists = [e for e in primitive.iter() if e.tag in ("p", "h")]
         numbers = map(_integers, lists)
         tables = [row[: len(row) // stride * stride].reshape(-1, stride) for row in numbers]
         corners = np.concatenate([np.zeros((0, stride), np.int64), *tables])
-        ends = np.cumsum([0, *map(len, tables)])
-        own_corners = {e: np.arange(*ends[at : at + 2]) for at, e in enumerate(lists)}
+        bounds = np.cumsum([0, *map(len, tables)])
+        list_corners = {e: np.arange(*bounds[k : k + 2]) for k, e in enumerate(lists)}
         check_corners(corners[:, offset], len(points))
-        made = _faces(primitive, points[corners[:, offset]], own_corners.__getitem__)
-        own = np.concatenate([np.zeros((0, 3), np.int64), *made])
-        faces = corners[:, offset][own]
+        triangles = _triangles(primitive, points[corners[:, offset]], list_corners.__getitem__)
+        rows = np.concatenate([np.zeros((0, 3), np.int64), *triangles])
+        faces = corners[:, offset][rows]
         colours = None
         if self._paint and material is not None and len(faces):
             with self._paint.notes.without_colour(material.get("name") or material.get("id") or ""):
-                url = material.find("instance_effect[@url]")
-                assert url is not None
-                shade = self._paint.shade(self._target(url, "effect"), self._ids)
-                if isinstance(shade, Texture):
-                    uv, at = self._coordinates(primitive)
-                    colours = shade.colours(uv, corners[:, at][own])
-                elif shade is not None:
-                    colours = Colours.plain(shade, len(faces))
+                colours = self._colours(self._paint, primitive, material, corners, rows)
         return Piece(points, faces, colours=colours)
 
+    def _colours(
+        self, paint: _Effects, primitive: Element, material: Element, corners: Ints, rows: Ints
+    ) -> Colours | None:
+        """Return the colours of triangles by a material; None if its effect has no colour.
+
+        `corners` (c, stride) are the numbers in <p>, `rows` (t, 3) the triangles' corners.
+        """
+        url = material.find("instance_effect[@url]")
+        assert url is not None
+        shade = paint.shade(self._target(url, "effect"), self._ids)
+        if isinstance(shade, Texture):
+            uv, offset = self._coordinates(primitive)
+            return shade.colours(uv, corners[:, offset][rows])
+        return None if shade is None else Colours.plain(shade, len(rows))
+
     def _coordinates(self, primitive: Element) -> tuple[Floats, int]:
-        """Texture coordinates (c, 2) of a primitive, and the place of their numbers in <p>."""
+        """Return texture coordinates (c, 2), and the offset of their indices in <p>."""
         inputs = [e for e in primitive.findall("input") if e.get("semantic") == "TEXCOORD"]
         if not inputs:
             raise MaskError("texture coordinates are missing")
@@ -199,21 +216,23 @@ class _Document:
         s, t = self._rows(self._target(first, "source"))[:, :2].T
         return np.column_stack([s, 1 - t]), int(first.get("offset", 0))
 
-    def _inputs(self, primitive: Element) -> tuple[Floats, int, int]:
-        """Points of a primitive; place of their numbers in <p>, and numbers of each corner."""
+    def _inputs(self, primitive: Element) -> _Inputs:
+        """Return the points of a primitive; ValueError without points."""
         stride = 0
-        found = None
+        points = None
+        offset = 0
         for entry in primitive.findall("input"):
-            offset = int(entry.get("offset", 0))
-            stride = max(stride, offset + 1)
+            entry_offset = int(entry.get("offset", 0))
+            stride = max(stride, entry_offset + 1)
             if entry.get("semantic") == "VERTEX":
-                found = self._points(self._target(entry, "vertices")), offset
-        if found is None:
+                points = self._points(self._target(entry, "vertices"))
+                offset = entry_offset
+        if points is None:
             raise ValueError(f"<{primitive.tag}> has no vertices")
-        return *found, stride
+        return _Inputs(points, offset, stride)
 
     def _read_points(self, vertices: Element) -> Floats:
-        """Positions (v, 3) of <vertices>."""
+        """Return the positions (v, 3) of <vertices>."""
         entry = vertices.find("input[@semantic='POSITION']")
         if entry is None:
             raise ValueError("<vertices> without positions")
@@ -229,7 +248,7 @@ class _Document:
         return rows[:, columns]
 
     def _rows(self, source: Element) -> Floats:
-        """Numbers (count, stride) of a <source>."""
+        """Return the numbers (count, stride) of a <source>."""
         accessor = source.find("technique_common/accessor")
         if accessor is None:
             raise ValueError("positions without <accessor>")
@@ -245,17 +264,17 @@ class _Document:
 
 
 class _Effects:
-    """Diffuse colours of effects, whose images are read once."""
+    """Diffuse colours of effects; each image is read once."""
 
-    def __init__(self, path: Path, wanted: ReadOptions, allowance: Allowance) -> None:
+    def __init__(self, path: Path, options: ReadOptions, allowance: Allowance) -> None:
         self.notes = MaskNotes()
         self._path = path
-        self._wanted = wanted
+        self._options = options
         self._allowance = allowance
         self._texture = remembered(self._read_texture)
 
     def shade(self, effect: Element, ids: dict[tuple[str, str], Element]) -> Texture | Bytes | None:
-        """Image or colour, (1, 1, 3), of an effect; None if it has none."""
+        """Return the image or colour (1, 1, 3) of an effect; None for an effect without colour."""
         diffuse = effect.find(".//technique/*/diffuse")
         if diffuse is None:
             return None
@@ -265,72 +284,80 @@ class _Effects:
             if colour is None:
                 return None
             return as_bytes(np.array(colour.split()[:3], np.float64)).reshape(1, 1, 3)
-        # A sampler's surface names an image; some programs leave out one or both of them.
+        # A sampler's surface names an image; some programs leave out the sampler or both.
         parameters = {e.get("sid", ""): e for e in effect.iter("newparam")}
         name = texture.get("texture", "")
-        along = ""
-        across = ""
+        wrap_s = ""
+        wrap_t = ""
         for _ in range(2):
-            if (found := parameters.get(name)) is not None:
-                along = found.findtext(".//wrap_s", along)
-                across = found.findtext(".//wrap_t", across)
-                named = found.findtext(".//source") or found.findtext(".//init_from") or ""
-                linked = found.find(".//instance_image")
-                name = named.strip() if linked is None else linked.get("url", "")[1:]
+            if (parameter := parameters.get(name)) is not None:
+                wrap_s = parameter.findtext(".//wrap_s", wrap_s)
+                wrap_t = parameter.findtext(".//wrap_t", wrap_t)
+                image_name = (
+                    parameter.findtext(".//source") or parameter.findtext(".//init_from") or ""
+                )
+                image_link = parameter.find(".//instance_image")
+                name = image_name.strip() if image_link is None else image_link.get("url", "")[1:]
         image = ids.get(("image", name))
         if image is None:
             raise MaskError(f"its image {name[-80:]!r} is not in the file")
         file = image.findtext("init_from/ref") or image.findtext("init_from") or ""
-        return self._texture((file.strip(), along, across))
+        return self._texture((file.strip(), wrap_s, wrap_t))
 
     def _read_texture(self, key: tuple[str, str, str]) -> Texture:
+        """Read the texture of an image; `key` is its name and the wraps along s and t."""
         name, *wraps = key
-        file = image_file(self._path, name, self._wanted, self._allowance)
-        along, across = (_WRAPS.get(wrap, "repeat") for wrap in wraps)
+        file = image_file(self._path, name, self._options, self._allowance)
+        wrap_s, wrap_t = (_WRAPS.get(wrap, "repeat") for wrap in wraps)
         image = read_colours(file, self._allowance, self.notes)
-        return Texture(image, (along, across), self._allowance)
+        return Texture(image, (wrap_s, wrap_t), self._allowance)
 
 
-def _faces(
+def _triangles(
     primitive: Element, points: Floats, corners: Callable[[Element], Ints]
 ) -> Iterator[Ints]:
-    """Triangles (t, 3) of a primitive, piece by piece; `corners` are those of a <p> or <h>."""
+    """Yield the triangles (t, 3) of a primitive; `corners` returns the corners of a <p> or <h>."""
     lists = [corners(p) for p in primitive.findall("p")]
     if primitive.tag == "triangles":
-        yield from (some[: len(some) // 3 * 3].reshape(-1, 3) for some in lists)
+        yield from (row[: len(row) // 3 * 3].reshape(-1, 3) for row in lists)
     elif primitive.tag == "tristrips":
         yield from map(unrolled, lists)
     elif primitive.tag == "trifans":
         yield from map(fanned, lists)
     elif primitive.tag == "polylist" and lists:
         sizes = np.array((primitive.findtext("vcount") or "").split(), np.int64)
-        some = np.concatenate(lists)
-        if (sizes < 0).any() or sizes.sum() != len(some):
-            raise ValueError(f"polygons of {sizes.sum():,} corners, {len(some):,} are there")
-        yield triangulated(points, some, sizes)
+        joined_corners = np.concatenate(lists)
+        if (sizes < 0).any() or sizes.sum() != len(joined_corners):
+            raise ValueError(
+                f"polygons of {sizes.sum():,} corners, {len(joined_corners):,} are there"
+            )
+        yield triangulated(points, joined_corners, sizes)
     elif primitive.tag == "polygons":
         if lists:
-            sizes = np.array([len(some) for some in lists])
+            sizes = np.array([len(row) for row in lists])
             yield triangulated(points, np.concatenate(lists), sizes)
         for holed in primitive.findall("ph"):
             yield with_holes(points, [corners(ring) for ring in holed])
 
 
 def _integers(element: Element) -> Ints:
+    """Return the integers in the text of an element."""
     return np.array((element.text or "").split(), np.int64)
 
 
 def _numbers(element: Element) -> Floats:
+    """Return the numbers in the text of an element."""
     return np.array((element.text or "").split(), np.float64)
 
 
 def _rotate(numbers: Floats) -> Floats:
-    """Rotation about an axis, in degrees; some programs write no axis."""
+    """Return the rotation about an axis, in degrees; without an axis, the identity."""
     *axis, degrees = numbers
     return affine(rotation_about(axis, degrees) if np.any(axis) else np.eye(3), np.zeros(3))
 
 
 def _look_at(numbers: Floats) -> Floats:
+    """Return the matrix of a camera position, its target and up, (9,)."""
     eye, target, up = numbers.reshape(3, 3)
     z = (eye - target) / length(eye - target)
     x = np.cross(up, z) / length(np.cross(up, z))

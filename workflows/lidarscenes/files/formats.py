@@ -1,11 +1,11 @@
-"""Mesh formats beyond those of the core: `mesh_formats` finds this table by its name."""
+"""Mesh formats that lidarscenes adds: `mesh_formats` finds this table by its name."""
 
 from __future__ import annotations
 
 from lidarsim.scene.files.mesh_formats import MeshFormat
 
 CITYJSON = (".json", ".cityjson", ".jsonl")
-ROBOTS = (".urdf", ".xacro")  # of which `urdf` refuses the latter, with what to do
+ROBOTS = (".urdf", ".xacro")  # `urdf` refuses .xacro, and says what to do
 
 _USD = "lidarscenes.files.usd:read_usd"
 _RASTER = "lidarscenes.files.rasters:read_raster"

@@ -1,7 +1,7 @@
 """Rasters of heights, such as GeoTIFF, through rasterio and its GDAL.
 
-Files are opened with the driver of their ending, which sees no files beside them; those that could
-name others themselves are read from memory. So nothing that a file names is opened, nor fetched.
+Files are opened with the driver of their ending, which sees no files beside them; formats that
+could name other files are read from memory. So no file that a raster names is opened, nor fetched.
 """
 
 from __future__ import annotations
@@ -41,25 +41,26 @@ DRIVERS = {  # {ending: GDAL's name of the driver}
     ".dem": "USGSDEM", ".dt0": "DTED", ".dt1": "DTED", ".dt2": "DTED",
 }  # fmt: skip
 
-_BESIDE_MOST = 65536  # bytes of a file beside a raster
+_MAX_BESIDE_BYTES = 65536  # of a file beside a raster
 
-_OPTIONS = {"AAIGrid": {"DATATYPE": "Float64"}}  # or a file that begins with integers has no others
+# Without this, a file that begins with integers is read as integers.
+_OPEN_OPTIONS = {"AAIGrid": {"DATATYPE": "Float64"}}
 
-_AT_ONCE = 100_000  # vertices that are reprojected, through lists
-_PIXEL_BYTES = 100  # of a mesh of pixels: vertices, two triangles, and what makes them
-_UNASKED = 5_000_000  # pixels that are taken without a window and a step; more take long
-_MOST_READ = 1_000_000_000  # pixels of which a coarser grid is made, which takes two minutes
+_BLOCK_VERTICES = 100_000  # that are reprojected at a time, through lists
+_PIXEL_BYTES = 100  # of a mesh of pixels: vertices, two triangles, and temporary arrays
+_MAX_UNASKED = 5_000_000  # pixels that are read without a window and a step; more take long
+_MAX_READ = 1_000_000_000  # pixels that make a coarser grid, which takes two minutes
 _WIDEST_DEG = 12.0  # of longitude in a UTM zone, which is 6 wide
 
 PixelRange = tuple[int, int]  # half-open
 
-# of the Earth's surface
+# Heights of the Earth's surface.
 _LOWEST_M = -12_000.0
 _HIGHEST_M = 9_000.0
 _NO_DATA = -9999.0  # which many programs write without saying so in the file
 _FOOT_M = 0.3048
 _US_FOOT_M = 1200 / 3937
-_UNIT_NAMES = {  # of heights, as files have them
+_UNIT_NAMES = {  # of heights, as files spell the names
     **dict.fromkeys(("m", "metre", "meter", "metres", "meters"), 1.0),
     **dict.fromkeys(("ft", "foot", "feet", "international foot"), _FOOT_M),
     **dict.fromkeys(("us survey foot", "us survey feet", "us-ft", "ftus", "us_ft"), _US_FOOT_M),
@@ -67,49 +68,75 @@ _UNIT_NAMES = {  # of heights, as files have them
 }
 
 
-def read_raster(_data: bytes, path: Path, wanted: ReadOptions) -> Content:
+def read_raster(_data: bytes, path: Path, options: ReadOptions) -> Content:
     """Read the first band as a mesh: a vertex at the middle of each pixel, two triangles a cell.
 
-    Cells with a pixel that has no height are holes. Coordinates are those of `epsg` in
-    `wanted.raster`; else the raster's own if they are in metres, or of the UTM zone of its middle.
-    The window has the pixels whose middles are in it.
+    Cells with a pixel without height are holes. Coordinates are of the system `epsg` in
+    `options.raster`; else the raster's own if they are in metres, or of the UTM zone of its middle.
+    The window has the pixels whose middles are within.
     """
-    unit, step_m, window, epsg = wanted.raster
     if find_spec("rasterio") is None:
         raise MeshFileError('is a raster, which rasterio reads: pip install "lidarpool[geo]"')
+    request = options.raster
+    window = request.window
+    chosen = request.step_m is not None or window is not None
     with ExitStack() as stack:
-        source = stack.enter_context(_opened(path))
-        own, up_m = _systems(source)
-        place = _place(source, path)
-        grid = _RasterGrid(source, place, own, _target(source, place, own, epsg))
-        chosen = step_m is not None or window is not None
-        if step_m is not None:
-            grid = stack.enter_context(_coarser(grid, step_m, window))
+        source = _source(stack.enter_context(_open_raster(path)), path)
+        target_crs = _target_crs(source, request.epsg)
+        grid = _RasterGrid(source.file, source.affine, source.crs, target_crs)
+        if request.step_m is not None:
+            grid = stack.enter_context(_coarser_grid(grid, request.step_m, window))
             window = None
-        columns, rows = grid.part(window)
+        columns, rows = grid.pixels_in(window)
         _check_size(grid, columns, rows, path.name, chosen=chosen)
-        band = grid.file.read(1, window=(rows, columns), masked=True)
-        heights = np.ma.getdata(band).astype(np.float64)
-        valid = ~np.ma.getmaskarray(band) & np.isfinite(heights)
-        del band
-        notes = _notes(source, place, own, path)
-        metre = UNITS_M[unit] if unit else _unit_m(source.units[0], own, up_m, notes)
-        heights = (heights * source.scales[0] + source.offsets[0]) * metre
-        mesh = _mesh(path.stem, grid, columns, rows, heights, valid)
-        told = _raster_summary(source, own, grid, step_m, valid)
-    low, high = mesh.bounds[:, 2]
-    if not _LOWEST_M <= low <= high <= _HIGHEST_M or low == _NO_DATA * metre:
-        notes.append(
-            f"has heights from {low:,.6g} to {high:,.6g} m: if one of them stands for no data, say "
-            "so in the file (rio edit-info --nodata VALUE FILE)"
-        )
-    raster = Raster(*_key(grid.target), told)
+        heights, valid = _read_heights(grid, columns, rows)
+        notes = _notes(source, path)
+        unit_m = UNITS_M[request.unit] if request.unit else _height_unit_m(source, notes)
+        heights = (heights * source.file.scales[0] + source.file.offsets[0]) * unit_m
+        mesh = _grid_mesh(path.stem, grid, columns, rows, heights, valid)
+        summary = _summary(source, grid, request.step_m, valid)
+    notes += _height_notes(mesh, unit_m)
+    raster = Raster(*_crs_key(target_crs), summary)
     return Content([mesh], unit_m=1.0, up_axis="z", notes=notes, raster=raster)
 
 
+def _read_heights(grid: _RasterGrid, columns: PixelRange, rows: PixelRange) -> tuple[Floats, Bools]:
+    """Return the values of the first band (rows, columns), and whether they are valid."""
+    band = grid.file.read(1, window=(rows, columns), masked=True)
+    heights = np.ma.getdata(band).astype(np.float64)
+    return heights, ~np.ma.getmaskarray(band) & np.isfinite(heights)
+
+
+def _height_notes(mesh: SceneMesh, unit_m: float) -> list[str]:
+    """Return a note on heights that are not of the Earth's surface, or no note."""
+    lowest_m, highest_m = mesh.bounds[:, 2]
+    if _LOWEST_M <= lowest_m <= highest_m <= _HIGHEST_M and lowest_m != _NO_DATA * unit_m:
+        return []
+    return [
+        f"has heights from {lowest_m:,.6g} to {highest_m:,.6g} m: if one of them stands for no "
+        "data, say so in the file (rio edit-info --nodata VALUE FILE)"
+    ]
+
+
+@dataclass(frozen=True)
+class _Source:
+    """An open raster, with the coordinates of its pixels."""
+
+    file: Any
+    affine: Any  # from columns and rows to x and y
+    crs: Any  # horizontal coordinate system of x and y; None for none on Earth
+    up_m: float | None  # unit of heights of the vertical system, metres
+
+
+def _source(file: Any, path: Path) -> _Source:
+    """Return an open raster with the coordinates of its pixels."""
+    crs, up_m = _systems(file)
+    return _Source(file, _affine(file, path), crs, up_m)
+
+
 @contextmanager
-def _opened(path: Path) -> Iterator[Any]:
-    """Open a file with the driver of its ending."""
+def _open_raster(path: Path) -> Iterator[Any]:
+    """Open a file with the driver of its ending, and yield the dataset of rasterio."""
     import rasterio
     from rasterio.errors import NotGeoreferencedWarning, RasterioError
     from rasterio.io import MemoryFile
@@ -119,8 +146,8 @@ def _opened(path: Path) -> Iterator[Any]:
     with ExitStack() as stack:
         stack.enter_context(warnings.catch_warnings())
         warnings.simplefilter("ignore", NotGeoreferencedWarning)
-        alone = {"GDAL_PAM_ENABLED": False, "GDAL_DISABLE_READDIR_ON_OPEN": "EMPTY_DIR"}
-        stack.enter_context(rasterio.Env(GDAL_CACHEMAX=MIN_LIMIT_BYTES, **alone))
+        settings = {"GDAL_PAM_ENABLED": False, "GDAL_DISABLE_READDIR_ON_OPEN": "EMPTY_DIR"}
+        stack.enter_context(rasterio.Env(GDAL_CACHEMAX=MIN_LIMIT_BYTES, **settings))
         try:
             if driver == "GTiff":  # which may be larger than the memory, and reads a window
                 input_size(path)
@@ -128,14 +155,15 @@ def _opened(path: Path) -> Iterator[Any]:
             else:
                 name = uuid4().hex
                 folder = f"/vsimem/{name}/"
-                stem = path.stem if driver == "SRTMHGT" else "raster"  # whose place is in the name
-                for one, content in (
-                    (".prj", _beside(path, ".prj")),
+                # SRTMHGT has the position in the name of the file.
+                stem = path.stem if driver == "SRTMHGT" else "raster"
+                for ending, content in (
+                    (".prj", _read_beside(path, ".prj")),
                     (path.suffix.lower(), read_input(path)),
                 ):
-                    memory = MemoryFile(content, dirname=name, filename=f"{stem}{one}")
+                    memory = MemoryFile(content, dirname=name, filename=f"{stem}{ending}")
                     stack.enter_context(memory)
-                source = memory.open(driver=driver, **_OPTIONS.get(driver, {}))
+                source = memory.open(driver=driver, **_OPEN_OPTIONS.get(driver, {}))
             stack.enter_context(source)
             _check_kind(source)
             yield source
@@ -143,16 +171,16 @@ def _opened(path: Path) -> Iterator[Any]:
             raise ValueError(str(error.__cause__ or error).replace(folder, "")) from error
 
 
-def _beside(path: Path, suffix: str) -> bytes:
-    """Content of a small file beside a raster; empty if there is none."""
-    for one in (suffix, suffix.upper()):
-        if (file := path.with_suffix(one)).is_file():
-            return read_input(file, _BESIDE_MOST)
+def _read_beside(path: Path, suffix: str) -> bytes:
+    """Return the content of a small file beside a raster; empty without such a file."""
+    for ending in (suffix, suffix.upper()):
+        if (file := path.with_suffix(ending)).is_file():
+            return read_input(file, _MAX_BESIDE_BYTES)
     return b""
 
 
 def _check_kind(source: Any) -> None:
-    """Refuse what are no heights, or takes too much to unpack."""
+    """Raise MeshFileError for bands without heights, and blocks that exceed the memory."""
     if not source.dtypes[0].startswith(("int", "uint", "float")):
         raise MeshFileError(f"has pixels of the type {source.dtypes[0]}, which are no heights")
     if source.width < 2 or source.height < 2:
@@ -160,8 +188,8 @@ def _check_kind(source: Any) -> None:
     if source.gcps[0] and source.transform.is_identity:
         raise MeshFileError("is placed by control points: rectify it first (gdalwarp -tps)")
     rows, columns = source.block_shapes[0]
-    together = source.count if source.interleaving and source.interleaving.name == "pixel" else 1
-    size = rows * columns * np.dtype(source.dtypes[0]).itemsize * together
+    interleaved = source.count if source.interleaving and source.interleaving.name == "pixel" else 1
+    size = rows * columns * np.dtype(source.dtypes[0]).itemsize * interleaved
     if size > memory_share():
         raise MeshFileError(
             f"has blocks of {columns:,} x {rows:,} pixels, each {bytes_of(size)}, of at most "
@@ -170,163 +198,167 @@ def _check_kind(source: Any) -> None:
 
 
 def _systems(source: Any) -> tuple[Any, float | None]:
-    """Horizontal coordinate system, None for none on Earth, and metres in its unit of heights."""
+    """Return the horizontal system, None for none on Earth, and metres in its unit of heights."""
     from rasterio.crs import CRS
 
     if source.crs is None or not (source.crs.is_projected or source.crs.is_geographic):
         return None, None
-    described = _described(source.crs)
+    described = _projjson(source.crs)
     parts = described.get("components", [described])
     axes = [axis for part in parts for axis in part["coordinate_system"]["axis"]]
     units = [axis["unit"] for axis in axes if axis["direction"] == "up"]
-    own = CRS.from_user_input(json.dumps(parts[0])) if len(parts) > 1 else source.crs
+    horizontal = CRS.from_user_input(json.dumps(parts[0])) if len(parts) > 1 else source.crs
     if not units:
-        return own, None
-    return own, 1.0 if units[0] == "metre" else float(units[0]["conversion_factor"])
+        return horizontal, None
+    return horizontal, 1.0 if units[0] == "metre" else float(units[0]["conversion_factor"])
 
 
-def _described(crs: Any) -> dict[str, Any]:
-    """PROJJSON of a coordinate system, without the datum that it may be bound to."""
-    found: dict[str, Any] = crs.to_dict(projjson=True)
-    return found.get("source_crs", found)
+def _projjson(crs: Any) -> dict[str, Any]:
+    """Return the PROJJSON of a coordinate system, without a datum bound to the system."""
+    projjson: dict[str, Any] = crs.to_dict(projjson=True)
+    return projjson.get("source_crs", projjson)
 
 
-def _target(source: Any, place: Any, own: Any, epsg: int | None) -> Any:
-    """Coordinate system of the mesh."""
+def _target_crs(source: _Source, epsg: int | None) -> Any:
+    """Return the coordinate system of the mesh, in metres, or raise MeshFileError."""
     from rasterio.crs import CRS
     from rasterio.errors import CRSError
     from rasterio.warp import transform
 
     if epsg is not None:
         try:
-            given = CRS.from_epsg(epsg)
+            target = CRS.from_epsg(epsg)
         except CRSError as error:
             raise MeshFileError(
                 f"cannot be brought to EPSG:{epsg}, a code that rasterio does not know: check "
                 "cloud.epsg"
             ) from error
-        if not given.is_projected or given.linear_units_factor[1] != 1:
+        if not target.is_projected or target.linear_units_factor[1] != 1:
             raise MeshFileError(
-                f"cannot be brought to EPSG:{epsg} ({_described(given)['name']}), which "
+                f"cannot be brought to EPSG:{epsg} ({_projjson(target)['name']}), which "
                 "is not in metres: give cloud.epsg another code"
             )
-        return given
-    if own is None or (own.is_projected and own.linear_units_factor[1] == 1):
-        return own
-    corners = _corners(source, place)
-    if own.is_geographic and (wide := np.ptp(corners[:, 0])) > _WIDEST_DEG:
+        return target
+    crs = source.crs
+    if crs is None or (crs.is_projected and crs.linear_units_factor[1] == 1):
+        return crs
+    corners = _corners(source.file, source.affine)
+    if crs.is_geographic and (width_deg := np.ptp(corners[:, 0])) > _WIDEST_DEG:
         raise MeshFileError(
-            f"spans {wide:.4g} degrees, too wide for a UTM zone: give cloud.epsg, the code of a "
-            "projection in metres"
+            f"spans {width_deg:.4g} degrees, too wide for a UTM zone: give cloud.epsg, the code of "
+            "a projection in metres"
         )
     x, y = corners.mean(axis=0)
-    (longitude,), (latitude,) = transform(own, CRS.from_epsg(4326), [x], [y])
+    (longitude,), (latitude,) = transform(crs, CRS.from_epsg(4326), [x], [y])
     zone = math.floor((longitude + 180) / 6) % 60 + 1
     return CRS.from_epsg((32600 if latitude >= 0 else 32700) + zone)
 
 
-def _place(source: Any, path: Path) -> Any:
-    """Affine from columns and rows to x and y; pixels of 1 m, the first on top, if it has none."""
+def _affine(file: Any, path: Path) -> Any:
+    """Return the affine from columns and rows to x and y; by default for pixels of 1 m."""
     from rasterio.transform import Affine
 
-    place = source.transform
-    if place.is_identity:
-        place = Affine(1, 0, 0, 0, -1, source.height)
-        if numbers := _beside(path, ".tfw").split():  # of the middle of the first pixel
+    affine = file.transform
+    if affine.is_identity:
+        affine = Affine(1, 0, 0, 0, -1, file.height)
+        if numbers := _read_beside(path, ".tfw").split():  # of the middle of the first pixel
             a, d, b, e, c, f = map(float, numbers)
-            place = Affine(a, b, c - (a + b) / 2, d, e, f - (d + e) / 2)
-    if not np.isfinite(place).all() or place.determinant == 0:
-        raise MeshFileError(f"places its pixels by {[*place][:6]}, which gives them no area")
-    return place
+            affine = Affine(a, b, c - (a + b) / 2, d, e, f - (d + e) / 2)
+    if not np.isfinite(affine).all() or affine.determinant == 0:
+        raise MeshFileError(f"places its pixels by {[*affine][:6]}, which gives them no area")
+    return affine
 
 
-def _at(affine: Any, x: Any, y: Any) -> tuple[Any, Any]:
-    """Apply an affine; its own operators differ from version to version."""
+def _apply(affine: Any, x: Any, y: Any) -> tuple[Any, Any]:
+    """Return x and y by an affine; its own operators differ from version to version."""
     a, b, c, d, e, f = [*affine][:6]
     return a * x + b * y + c, d * x + e * y + f
 
 
-def _corners(file: Any, place: Any) -> Floats:
-    """Corners (4, 2) of a file, in its own coordinates."""
-    return np.array([_at(place, x, y) for x in (0, file.width) for y in (0, file.height)])
+def _corners(file: Any, affine: Any) -> Floats:
+    """Return the corners (4, 2) of a file, in its coordinate system."""
+    return np.array([_apply(affine, x, y) for x in (0, file.width) for y in (0, file.height)])
 
 
 @dataclass(frozen=True)
 class _RasterGrid:
-    """Pixels, and where they are."""
+    """Pixels of a raster, and their coordinates in the file and in the mesh."""
 
     file: Any
-    place: Any  # affine from columns and rows to x and y
-    own: Any  # coordinate system of these
-    target: Any  # and that of the mesh
+    affine: Any  # from columns and rows to x and y
+    crs: Any  # coordinate system of x and y
+    target_crs: Any  # coordinate system of the mesh
 
     @property
-    def same(self) -> bool:
+    def keeps_crs(self) -> bool:
         """Whether the mesh has the coordinates of the file."""
-        return self.own is None or bool(self.own == self.target)
+        return self.crs is None or bool(self.crs == self.target_crs)
 
-    def at(self, column: AnyArray, row: AnyArray) -> tuple[AnyArray, AnyArray]:
-        """X and y in the mesh's coordinates."""
+    def coordinates(self, column: AnyArray, row: AnyArray) -> tuple[AnyArray, AnyArray]:
+        """Return x and y in the mesh's coordinates."""
         from rasterio.warp import transform
 
-        x, y = _at(self.place, column, row)
-        for first in range(0, 0 if self.same else len(x), _AT_ONCE):
-            some = slice(first, first + _AT_ONCE)
-            x[some], y[some] = transform(self.own, self.target, x[some], y[some])
+        x, y = _apply(self.affine, column, row)
+        for first in range(0, 0 if self.keeps_crs else len(x), _BLOCK_VERTICES):
+            block = slice(first, first + _BLOCK_VERTICES)
+            x[block], y[block] = transform(self.crs, self.target_crs, x[block], y[block])
         return x, y
 
     @cached_property
-    def reach(self) -> Floats:
+    def extent(self) -> Floats:
         """Lowest and highest x and y in the mesh's coordinates, (2, 2)."""
         from rasterio.warp import transform_bounds
 
-        corners = _corners(self.file, self.place)
-        ends = np.array([corners.min(axis=0), corners.max(axis=0)])
-        if not self.same:
-            ends = np.reshape(transform_bounds(self.own, self.target, *ends.ravel()), (2, 2))
-        return ends
+        corners = _corners(self.file, self.affine)
+        extent = np.array([corners.min(axis=0), corners.max(axis=0)])
+        if not self.keeps_crs:
+            extent = np.reshape(
+                transform_bounds(self.crs, self.target_crs, *extent.ravel()), (2, 2)
+            )
+        return extent
 
     @cached_property
     def pixel_m(self) -> float:
         """Side of a square as large as the pixel in the middle, metres."""
         column = np.array([0.0, 1.0, 0.0])
         row = np.array([0.0, 0.0, 1.0])
-        x, y = self.at(column + self.file.width // 2, row + self.file.height // 2)
+        x, y = self.coordinates(column + self.file.width // 2, row + self.file.height // 2)
         return math.sqrt(abs((x[1] - x[0]) * (y[2] - y[0]) - (x[2] - x[0]) * (y[1] - y[0])))
 
-    def part(self, window: Window | None) -> tuple[PixelRange, PixelRange]:
-        """Columns and rows whose middles are in a window, or in a box around it, half-open."""
+    def pixels_in(self, window: Window | None) -> tuple[PixelRange, PixelRange]:
+        """Return the columns and rows whose middles are in a window or its box, half-open."""
         from rasterio.warp import transform_bounds
 
-        sides = np.array([self.file.width, self.file.height])
+        size = np.array([self.file.width, self.file.height])
         if window is None:
-            return (0, int(sides[0])), (0, int(sides[1]))
+            return (0, int(size[0])), (0, int(size[1]))
         self.check_overlap(window)
-        if not self.same:
-            window = transform_bounds(self.target, self.own, *window)
+        if not self.keeps_crs:
+            window = transform_bounds(self.target_crs, self.crs, *window)
         x, y = np.meshgrid(window[::2], window[1::2])
-        corners = np.stack(_at(~self.place, x.ravel(), y.ravel()))
+        corners = np.stack(_apply(~self.affine, x.ravel(), y.ravel()))
         first = np.maximum(np.ceil(corners.min(axis=1) - 0.5 - 1e-6), 0)
-        end = np.minimum(np.floor(corners.max(axis=1) + 0.5 + 1e-6), sides)
-        if (end - first < 2).any():
+        stop = np.minimum(np.floor(corners.max(axis=1) + 0.5 + 1e-6), size)
+        if (stop - first < 2).any():
             raise MeshFileError("has fewer than 2 x 2 pixels in the window: give a larger one")
-        (c0, r0), (c1, r1) = first.astype(int).tolist(), end.astype(int).tolist()
-        return (c0, c1), (r0, r1)
+        first_column, first_row = first.astype(int).tolist()
+        stop_column, stop_row = stop.astype(int).tolist()
+        return (first_column, stop_column), (first_row, stop_row)
 
     def check_overlap(self, window: Window) -> None:
-        """Refuse a window beside all pixels."""
-        low, high = self.reach
-        if (np.maximum(low, window[:2]) >= np.minimum(high, window[2:])).any():
-            (left, right), (bottom, top) = self.reach.T.tolist()
+        """Raise MeshFileError for a window beside all pixels."""
+        lower, upper = self.extent
+        if (np.maximum(lower, window[:2]) >= np.minimum(upper, window[2:])).any():
+            (x_min, x_max), (y_min, y_max) = self.extent.T.tolist()
             raise MeshFileError(
-                f"has nothing in the window {[*window]}: it reaches from x {left:,.10g} to "
-                f"{right:,.10g} and from y {bottom:,.10g} to {top:,.10g}"
+                f"has nothing in the window {[*window]}: it reaches from x {x_min:,.10g} to "
+                f"{x_max:,.10g} and from y {y_min:,.10g} to {y_max:,.10g}"
             )
 
 
 @contextmanager
-def _coarser(grid: _RasterGrid, step_m: float, window: Window | None) -> Iterator[_RasterGrid]:
-    """Make a grid of mean heights, along the axes of the mesh's coordinates."""
+def _coarser_grid(grid: _RasterGrid, step_m: float, window: Window | None) -> Iterator[_RasterGrid]:
+    """Yield a grid of mean heights, along the axes of the mesh's coordinates."""
     from rasterio.crs import CRS
     from rasterio.enums import Resampling
     from rasterio.transform import Affine
@@ -334,29 +366,31 @@ def _coarser(grid: _RasterGrid, step_m: float, window: Window | None) -> Iterato
 
     if step_m < grid.pixel_m * (1 - 1e-6):
         raise MeshFileError(f"has pixels of {grid.pixel_m:.6g} m: step_m must not be less")
-    low, high = grid.reach
+    lower, upper = grid.extent
     if window is not None:
         grid.check_overlap(window)
-        low = np.maximum(low, window[:2])
-        high = np.minimum(high, window[2:])
-    if (count := float(np.prod((high - low) / grid.pixel_m))) > _MOST_READ:
+        lower = np.maximum(lower, window[:2])
+        upper = np.minimum(upper, window[2:])
+    if (count := float(np.prod((upper - lower) / grid.pixel_m))) > _MAX_READ:
         raise MeshFileError(
-            f"would be made coarser from {count:,.0f} pixels, of at most {_MOST_READ:,}: give a "
+            f"would be made coarser from {count:,.0f} pixels, of at most {_MAX_READ:,}: give a "
             "window too, or make it coarser first (gdal_translate -tr)"
         )
-    columns, rows = np.ceil((high - low) / step_m - 1e-6).astype(int).tolist()
+    columns, rows = np.ceil((upper - lower) / step_m - 1e-6).astype(int).tolist()
     if min(columns, rows) < 2:
         raise MeshFileError("has fewer than 2 x 2 steps of step_m: give a smaller one")
-    wide, deep = (high - low) / (columns, rows)  # whole cells have their middle at their mean
-    place = Affine(wide, 0, low[0], 0, -deep, high[1])
-    plane = grid.target or CRS.from_epsg(32631)  # any: GDAL wants one, the same on both sides
-    options: dict[str, Any] = {"src_crs": grid.own or plane, "crs": plane}
+    # Whole cells have their middle at their mean.
+    width_m, height_m = (upper - lower) / (columns, rows)
+    affine = Affine(width_m, 0, lower[0], 0, -height_m, upper[1])
+    # GDAL wants a system, the same on both sides; which is arbitrary.
+    plane = grid.target_crs or CRS.from_epsg(32631)
+    options: dict[str, Any] = {"src_crs": grid.crs or plane, "crs": plane}
     if grid.file.nodata is None and grid.file.dtypes[0].startswith("float"):
         options["src_nodata"] = np.nan
     with WarpedVRT(
         grid.file,
-        src_transform=grid.place,
-        transform=place,
+        src_transform=grid.affine,
+        transform=affine,
         width=columns,
         height=rows,
         resampling=Resampling.average,
@@ -364,50 +398,50 @@ def _coarser(grid: _RasterGrid, step_m: float, window: Window | None) -> Iterato
         nodata=np.nan,
         tolerance=0.01,  # pixels
         **options,
-    ) as made:
-        yield _RasterGrid(made, place, grid.target, grid.target)
+    ) as warped:
+        yield _RasterGrid(warped, affine, grid.target_crs, grid.target_crs)
 
 
 def _check_size(
     grid: _RasterGrid, columns: PixelRange, rows: PixelRange, name: str, *, chosen: bool
 ) -> None:
-    """Refuse more pixels than the memory has room for, with a window and a step that fit.
+    """Raise MeshFileError for too many pixels, with a window and a step that fit the memory.
 
-    Fewer are refused if no window or step is `chosen`, for they take long to read and to show.
+    Without a `chosen` window or step the limit is lower, for a mesh that is quick to read and show.
     """
     sides = np.array([columns[1] - columns[0], rows[1] - rows[0]])
     count = int(np.prod(sides.astype(object)))
-    room = most = min(memory_share() // _PIXEL_BYTES, MAX_TRIANGLES // 2)
+    max_read = max_pixels = min(memory_share() // _PIXEL_BYTES, MAX_TRIANGLES // 2)
     if not chosen:
-        most = min(most, _UNASKED)
-    if count <= most:
+        max_pixels = min(max_pixels, _MAX_UNASKED)
+    if count <= max_pixels:
         return
-    low, high = grid.reach
-    x, y = grid.at(np.array([sum(columns) / 2]), np.array([sum(rows) / 2]))
-    # Less by a tenth, for what is askew.
-    half = np.minimum(0.9 * math.sqrt(most), sides) * grid.pixel_m / 2
+    lower, upper = grid.extent
+    x, y = grid.coordinates(np.array([sum(columns) / 2]), np.array([sum(rows) / 2]))
+    # Less by a tenth, for pixels that are askew.
+    half = np.minimum(0.9 * math.sqrt(max_pixels), sides) * grid.pixel_m / 2
     window = [round(float(side), 1) for side in (x[0] - half[0], y[0] - half[1])]
     window += [round(float(side), 1) for side in (x[0] + half[0], y[0] + half[1])]
     step = grid.pixel_m
-    while np.prod(np.ceil((high - low) / step) + 1) > 0.9 * most:
+    while np.prod(np.ceil((upper - lower) / step) + 1) > 0.9 * max_pixels:
         step *= 1.1
     scale = float(f"1e{2 - decade(step)}")
     step = math.ceil(step * scale) / scale
-    if count <= room:
-        whole = [*np.floor(low).tolist(), *np.ceil(high).tolist()]
+    if count <= max_read:
+        extent = [*np.floor(lower).tolist(), *np.ceil(upper).tolist()]
         raise MeshFileError(
             f"has {sides[0]:,} x {sides[1]:,} pixels, {2 * count / 1e6:.0f} million triangles. In "
             f"a scenario, scene: [{{file: {name}, step_m: {step:g}}}] takes means\nof them; not "
-            f"step_m but window: {window} takes the middle, and window: {whole} all"
+            f"step_m but window: {window} takes the middle, and window: {extent} all"
         )
     raise MeshFileError(
         f"has {sides[0]:,} x {sides[1]:,} pixels, a mesh of {bytes_of(count * _PIXEL_BYTES)}, of "
         f"at most {bytes_of(memory_share())}, a quarter of the memory: give window: {window}"
-        f"{f' or step_m: {step:g}' * (count <= _MOST_READ)} in scene.files"
+        f"{f' or step_m: {step:g}' * (count <= _MAX_READ)} in scene.files"
     )
 
 
-def _mesh(
+def _grid_mesh(
     name: str,
     grid: _RasterGrid,
     columns: PixelRange,
@@ -415,7 +449,7 @@ def _mesh(
     heights: Floats,
     valid: Bools,
 ) -> SceneMesh:
-    """Vertices at the middles of pixels, and two triangles, seen from above, for each full cell.
+    """Return the mesh of pixels' middles, with two triangles, seen from above, for a full cell.
 
     Middles of pixels are transformed and keep their heights: GDAL's bilinear warp widens its kernel
     where pixels grow along an axis, and rasterio does not pass XSCALE on.
@@ -428,80 +462,85 @@ def _mesh(
         part |= cells
     row, column = np.nonzero(used)
     vertices = np.empty((len(row), 3))
-    vertices[:, 0], vertices[:, 1] = grid.at(column + (columns[0] + 0.5), row + (rows[0] + 0.5))
+    x, y = grid.coordinates(column + (columns[0] + 0.5), row + (rows[0] + 0.5))
+    vertices[:, 0] = x
+    vertices[:, 1] = y
     vertices[:, 2] = heights[used]
     number = np.cumsum(used).reshape(used.shape) - 1
     faces = np.empty((np.count_nonzero(cells), 2, 3), np.int64)
-    below, right = (1, 2) if grid.place.determinant < 0 else (2, 1)  # rows go down, or up
+    down, right = (1, 2) if grid.affine.determinant < 0 else (2, 1)  # rows go down, or up
     faces[:, :, 0] = number[:-1, :-1][cells][:, None]
-    faces[:, 0, below] = number[1:, :-1][cells]
+    faces[:, 0, down] = number[1:, :-1][cells]
     faces[:, 1, right] = number[:-1, 1:][cells]
-    faces[:, 0, right] = faces[:, 1, below] = number[1:, 1:][cells]
+    faces[:, 0, right] = faces[:, 1, down] = number[1:, 1:][cells]
     return SceneMesh(name, vertices, faces.reshape(-1, 3))
 
 
-def _unit_m(stated: str | None, own: Any, up_m: float | None, notes: list[str]) -> float:
-    """Metres in the unit of heights: the band's, else that of the vertical system."""
+def _height_unit_m(source: _Source, notes: list[str]) -> float:
+    """Return the metres in the unit of heights: of the band, else of the vertical system."""
+    stated = source.file.units[0]
     if stated:
-        if (metre := _UNIT_NAMES.get(stated.strip().lower())) is not None:
-            return metre
+        if (unit_m := _UNIT_NAMES.get(stated.strip().lower())) is not None:
+            return unit_m
         notes.append(f"has heights in {stated[:40]!r}, which is no known unit: taken in metres")
         return 1.0
-    if up_m is not None:
-        return up_m
-    if own is not None and own.is_projected and own.linear_units_factor[1] != 1:
-        name, metre = own.linear_units_factor
+    if source.up_m is not None:
+        return source.up_m
+    crs = source.crs
+    if crs is not None and crs.is_projected and crs.linear_units_factor[1] != 1:
+        name, factor = crs.linear_units_factor
         notes.append(
             f"states no unit of heights: taken in {name}, as its coordinates are; "
             '<file.unit="m"> takes them in metres'
         )
-        return float(metre)
+        return float(factor)
     return 1.0
 
 
-def _notes(source: Any, place: Any, own: Any, path: Path) -> list[str]:
-    """Clauses on what is missing or left."""
+def _notes(source: _Source, path: Path) -> list[str]:
+    """Return notes on missing coordinates, further bands and files that are not read."""
+    file = source.file
     notes = []
-    if source.transform.is_identity and place.f == source.height:
+    if file.transform.is_identity and source.affine.f == file.height:
         notes.append("states no place: its pixels are taken as 1 m, from x and y 0")
-    if own is None:
+    if source.crs is None:
         notes.append(
             "states no coordinate system: its coordinates are taken in metres (gdal_translate "
             "-a_srs EPSG:CODE gives it one)"
         )
-    if source.count > 1:
-        notes.append(f"has {source.count} bands: the first is taken for heights")
-    endings = (".msk", ".aux.xml") if own is None else (".msk",)
-    beside = [path.name + ending for ending in endings if Path(f"{path}{ending}").is_file()]
-    if beside:
-        notes.append(f"is read without {' and '.join(beside)}: gdal_translate makes one file of it")
+    if file.count > 1:
+        notes.append(f"has {file.count} bands: the first is taken for heights")
+    endings = (".msk", ".aux.xml") if source.crs is None else (".msk",)
+    neglected = [path.name + ending for ending in endings if Path(f"{path}{ending}").is_file()]
+    if neglected:
+        listed = " and ".join(neglected)
+        notes.append(f"is read without {listed}: gdal_translate makes one file of it")
     return notes
 
 
-def _key(crs: Any) -> tuple[str, int | None]:
-    """Text that tells a coordinate system from others, and its EPSG code if that is certain."""
+def _crs_key(crs: Any) -> tuple[str, int | None]:
+    """Return a text that identifies a coordinate system, and its EPSG code if that is certain."""
     if crs is None:
         return "", None
-    code = crs.to_epsg(confidence_threshold=90)  # with 70 it guesses the datum of an unknown one
+    code = crs.to_epsg(confidence_threshold=90)  # 70 would guess an unknown datum
     return f"EPSG:{code}" if code else crs.to_wkt(), code
 
 
-def _name(crs: Any) -> str:
-    key, code = _key(crs)
-    return key if code else f"{_described(crs)['name'][:80]} (no EPSG code)"
+def _crs_name(crs: Any) -> str:
+    """Return the name of a coordinate system for messages."""
+    key, code = _crs_key(crs)
+    return key if code else f"{_projjson(crs)['name'][:80]} (no EPSG code)"
 
 
-def _raster_summary(
-    source: Any, own: Any, grid: _RasterGrid, step_m: float | None, valid: Bools
-) -> str:
-    """Say what was taken."""
+def _summary(source: _Source, grid: _RasterGrid, step_m: float | None, valid: Bools) -> str:
+    """Return the size and the coordinate systems of a mesh in words."""
     rows, columns = valid.shape
     words = f"{columns:,} x {rows:,} {'means' if step_m else 'pixels'} of {grid.pixel_m:.6g} m"
-    if (rows, columns) != source.shape:
-        words += f" out of {source.width:,} x {source.height:,} pixels"
-    if grid.target is not None:
-        words += f", {_name(grid.target)}"
-    if own is not None and own != grid.target:
-        words += f" from {_name(own)}"
+    if (rows, columns) != source.file.shape:
+        words += f" out of {source.file.width:,} x {source.file.height:,} pixels"
+    if grid.target_crs is not None:
+        words += f", {_crs_name(grid.target_crs)}"
+    if source.crs is not None and source.crs != grid.target_crs:
+        words += f" from {_crs_name(source.crs)}"
     holes = valid.size - int(np.count_nonzero(valid))
     return words + (f", {plural(holes, 'pixel')} without height" if holes else "")

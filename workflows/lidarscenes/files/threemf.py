@@ -13,7 +13,7 @@ import io
 import re
 import zipfile
 from array import array
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -48,9 +48,9 @@ _UNITS_M = {
     "meter": 1.0,
 }
 # Required extensions that do not change shapes, or that are supported here.
-_READ = re.compile(r"/(material|production|securecontent)/")
+_SUPPORTED = re.compile(r"/(material|production|securecontent)/")
 
-_PIECE = 1 << 20
+_PIECE_BYTES = 1 << 20
 _OBJECT_BYTES = 1000  # of an object or its placement, which a few letters make
 
 _COLOUR = re.compile(r"#([0-9A-Fa-f]{6})([0-9A-Fa-f]{2})?")  # sRGB, and an alpha that is not read
@@ -60,19 +60,20 @@ _Key = tuple[str, str]  # inner file and number of an object
 
 @dataclass
 class _MeshObject:
+    """An object of a model: a mesh, or components."""
+
     name: str
     vertices: array[float] = field(default_factory=lambda: array("d"))
     faces: array[int] = field(default_factory=lambda: array("q"))
     components: list[_Placement] = field(default_factory=list)
-    # Group of colours, and number in it, of triangles that name none.
-    usual: tuple[str, str] = ("", "0")
-    # Of corners, where they are read.
-    shades: array[int] = field(default_factory=lambda: array("B"))
-    materials: list[str] = field(default_factory=list)  # of triangles, where names are wanted
+    # Number of a group of colours, and index in it, of triangles without.
+    default_property: tuple[str, str] = ("", "0")
+    shades: array[int] = field(default_factory=lambda: array("B"))  # of corners, if read
+    materials: list[str] = field(default_factory=list)  # names of triangles, if read
 
     @cached_property
     def meshes(self) -> list[SceneMesh]:
-        """The mesh; none without triangles."""
+        """The mesh of the object, in a list; an empty list without triangles."""
         if not self.faces:
             return []
         vertices = np.frombuffer(self.vertices, np.float64).reshape(-1, 3)
@@ -93,41 +94,50 @@ class _MeshObject:
 
 @dataclass(frozen=True, eq=False)
 class _Placement:
+    """A component or build item: an object with a matrix (4, 4)."""
+
     key: _Key
     name: str
     matrix: Floats
 
 
-def read_3mf(data: bytes, path: Path, wanted: ReadOptions) -> Content:
+def read_3mf(data: bytes, path: Path, options: ReadOptions) -> Content:
     """Read the build items of a file, and colours of base materials and colour groups."""
     with zipfile.ZipFile(io.BytesIO(data)) as archive:
-        package = _Package(archive, Allowance(len(data), SMALLER), wanted)
+        package = _Package(archive, Allowance(len(data), SMALLER), options)
         root = package.model(package.start())
 
-        def node(place: _Placement) -> Node:
-            made = package.object(place.key)
-            return Node(place.name or made.name, place.matrix, made.meshes, made.components)
+        def node(placement: _Placement) -> Node:
+            mesh_object = package.object(placement.key)
+            return Node(
+                placement.name or mesh_object.name,
+                placement.matrix,
+                mesh_object.meshes,
+                mesh_object.components,
+            )
 
         content = placed_content(placed_nodes(root.items, node, path.stem))
     content.unit_m = _UNITS_M[root.unit]
     content.up_axis = "z"
-    if bare := sum(model.bare for model in package.models.values()):
-        words = plural(bare, "triangle")
+    if grey_count := sum(model.grey_count for model in package.models.values()):
+        words = plural(grey_count, "triangle")
         content.notes.append(f"has textures or lacks colours, which leaves {words} grey")
     return content
 
 
 class _Package:
-    """The inner files of an archive, each read when an object of it is placed."""
+    """The inner files of an archive, each read when an object of the file is placed."""
 
-    def __init__(self, archive: zipfile.ZipFile, allowance: Allowance, wanted: ReadOptions) -> None:
+    def __init__(
+        self, archive: zipfile.ZipFile, allowance: Allowance, options: ReadOptions
+    ) -> None:
         self._archive = archive
         self._allowance = allowance
-        self._wanted = wanted
+        self._options = options
         self.models: dict[str, _Model] = {}
 
     def start(self) -> str:
-        """Inner file of the model that is to be built."""
+        """Return the inner file of the model to build."""
         names = self._archive.namelist()
         relations = ""
         if "_rels/.rels" in names:
@@ -142,23 +152,25 @@ class _Package:
         raise ValueError("a ZIP archive without 3D/3dmodel.model")
 
     def model(self, name: str) -> _Model:
+        """Return an inner file, which is read on its first use."""
         name = name.lstrip("/")
         if name not in self.models:
             pieces = self._pieces(name)
-            self.models[name] = _Model(name, pieces, self._allowance, self._wanted)
+            self.models[name] = _Model(name, pieces, self._allowance, self._options)
         return self.models[name]
 
     def _pieces(self, name: str) -> Iterator[bytes]:
-        """Content of an inner file, which is never longer than announced."""
+        """Yield the content of an inner file; the content is never longer than announced."""
         entry = self._archive.getinfo(name)
         if entry.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
             raise MeshFileError("is packed by a method other than Deflate: export it again")
         self._allowance.take(entry.file_size)
         with self._archive.open(entry) as file:
-            while piece := file.read(_PIECE):
+            while piece := file.read(_PIECE_BYTES):
                 yield piece
 
     def object(self, key: _Key) -> _MeshObject:
+        """Return an object; ValueError if the object is missing."""
         objects = self.model(key[0]).objects
         if key[1] not in objects:
             raise ValueError(f"object {key[1][:20]!r} is placed, but missing")
@@ -172,12 +184,12 @@ class _Model:
     """
 
     def __init__(
-        self, name: str, text: Iterable[bytes], allowance: Allowance, wanted: ReadOptions
+        self, name: str, text: Iterable[bytes], allowance: Allowance, options: ReadOptions
     ) -> None:
         self.unit = "millimeter"
-        self.bare = 0  # triangles whose colours are not here
-        self._colours = wanted.colours
-        self._named = wanted.materials
+        self.grey_count = 0  # triangles whose colours are not in the file
+        self._colours = options.colours
+        self._names_materials = options.materials
         self._groups: dict[str, list[bytes]] = {}  # {number of a group: its colours}
         self._group: list[bytes] = []
         self._names: dict[str, list[str]] = {}  # {number of a group: names of its materials}
@@ -188,6 +200,16 @@ class _Model:
         self._allowance = allowance
         self._object = _MeshObject("")
         # Without namespaces, because slicers omit the declaration of some.
+        self._readers: dict[str, Callable[[dict[str, str]], None]] = {
+            "basematerials": self._begin_group,
+            "colorgroup": self._begin_group,
+            "base": self._add_colour,
+            "color": self._add_colour,
+            "object": self._begin_object,
+            "component": lambda a: self._object.components.append(self._placement(a)),
+            "item": lambda a: self.items.append(self._placement(a)),
+            "model": self._begin_model,
+        }
         parser = expat.ParserCreate()
         parser.StartElementHandler = self._begin
         parser.EntityDeclHandler = refuse_entity
@@ -196,6 +218,7 @@ class _Model:
         parser.Parse(b"", True)
 
     def _begin(self, tag: str, attributes: dict[str, str]) -> None:
+        """Read the start of an element."""
         tag = tag.rpartition(":")[2]
         if tag == "vertex":
             self._object.vertices.extend([float(attributes[axis]) for axis in "xyz"])
@@ -203,53 +226,61 @@ class _Model:
             self._object.faces.extend([int(attributes[corner]) for corner in ("v1", "v2", "v3")])
             if self._colours:
                 self._shade(attributes)
-            if self._named:
+            if self._names_materials:
                 self._object.materials.append(self._material(attributes))
-        elif tag in ("basematerials", "colorgroup"):
-            self._group = self._groups.setdefault(attributes["id"], [])
-            self._names_of_group = self._names.setdefault(attributes["id"], [])
-        elif tag in ("base", "color"):
-            found = _COLOUR.fullmatch(attributes.get("displaycolor", attributes.get("color", "")))
-            self._group.append(bytes.fromhex(found[1]) if found else GREY.tobytes())
-            self._names_of_group.append(attributes.get("name", ""))
-        elif tag == "object":
-            self._allowance.take(_OBJECT_BYTES)
-            self._object = _MeshObject(attributes.get("name", ""))
-            self._object.usual = attributes.get("pid", ""), attributes.get("pindex", "0")
-            self.objects[attributes["id"]] = self._object
-        elif tag == "component":
-            self._object.components.append(self._placement(attributes))
-        elif tag == "item":
-            self.items.append(self._placement(attributes))
-        elif tag == "model":
-            self.unit = attributes.get("unit", self.unit)
-            for prefix in attributes.get("requiredextensions", "").split():
-                extension = attributes.get(f"xmlns:{prefix}", prefix)
-                if not _READ.search(extension):
-                    raise MeshFileError(f"needs {extension[:80]}, which is not supported")
+        elif tag in self._readers:
+            self._readers[tag](attributes)
         elif tag in ("beamlattice", "booleanshape", "levelset"):
             raise MeshFileError(f"has a <{tag}>, which is not supported: export it as triangles")
 
+    def _begin_group(self, attributes: dict[str, str]) -> None:
+        """Begin a group of colours or materials."""
+        self._group = self._groups.setdefault(attributes["id"], [])
+        self._names_of_group = self._names.setdefault(attributes["id"], [])
+
+    def _add_colour(self, attributes: dict[str, str]) -> None:
+        """Add a colour and its name to the group."""
+        colour = attributes.get("displaycolor", attributes.get("color", ""))
+        match = _COLOUR.fullmatch(colour)
+        self._group.append(bytes.fromhex(match[1]) if match else GREY.tobytes())
+        self._names_of_group.append(attributes.get("name", ""))
+
+    def _begin_object(self, attributes: dict[str, str]) -> None:
+        """Begin an object."""
+        self._allowance.take(_OBJECT_BYTES)
+        self._object = _MeshObject(attributes.get("name", ""))
+        self._object.default_property = attributes.get("pid", ""), attributes.get("pindex", "0")
+        self.objects[attributes["id"]] = self._object
+
+    def _begin_model(self, attributes: dict[str, str]) -> None:
+        """Read the unit of the model; MeshFileError if an extension is not supported."""
+        self.unit = attributes.get("unit", self.unit)
+        for prefix in attributes.get("requiredextensions", "").split():
+            extension = attributes.get(f"xmlns:{prefix}", prefix)
+            if not _SUPPORTED.search(extension):
+                raise MeshFileError(f"needs {extension[:80]}, which is not supported")
+
     def _material(self, attributes: dict[str, str]) -> str:
-        """Name of the material of a triangle, that of its first corner; empty for none."""
-        group, number = self._object.usual
-        place = int(attributes.get("p1", number))
+        """Return the name of the material of a triangle's first corner, or an empty string."""
+        group, number = self._object.default_property
+        index = int(attributes.get("p1", number))
         names = self._names.get(attributes.get("pid", group), [])
-        return names[place] if 0 <= place < len(names) else ""
+        return names[index] if 0 <= index < len(names) else ""
 
     def _shade(self, attributes: dict[str, str]) -> None:
-        """Add the colours of a triangle's corners, grey if it has none."""
-        group, number = self._object.usual
+        """Add the colours of a triangle's corners; grey for a triangle without colours."""
+        group, number = self._object.default_property
         group = attributes.get("pid", group)
         first = attributes.get("p1", number)
-        places = [int(attributes.get(name, first)) for name in ("p1", "p2", "p3")]
+        indices = [int(attributes.get(name, first)) for name in ("p1", "p2", "p3")]
         colours = self._groups.get(group, [])
-        known = all(0 <= place < len(colours) for place in places)
-        self.bare += bool(group) and not known
-        for place in places:
-            self._object.shades.frombytes(colours[place] if known else GREY.tobytes())
+        has_colours = all(0 <= index < len(colours) for index in indices)
+        self.grey_count += bool(group) and not has_colours
+        for index in indices:
+            self._object.shades.frombytes(colours[index] if has_colours else GREY.tobytes())
 
     def _placement(self, attributes: dict[str, Any]) -> _Placement:
+        """Read a component or build item."""
         self._allowance.take(_OBJECT_BYTES)
         path = next((v for k, v in attributes.items() if k.rpartition(":")[2] == "path"), "")
         matrix = np.eye(4)

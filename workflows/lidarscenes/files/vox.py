@@ -5,105 +5,139 @@ from __future__ import annotations
 import io
 import re
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
 from lidarsim.base.allowance import Allowance
-from lidarsim.base.arrays import Floats
+from lidarsim.base.arrays import Floats, Floats32
 from lidarsim.base.words import plural
 from lidarsim.scene.actors import box
 from lidarsim.scene.files.scene_graph import Content, MeshFileError, ReadOptions
 from lidarsim.scene.scene_mesh import MAX_LEAF_DENSITY, MAX_VOXELS, SceneMesh, Voxels
 
 DENSITY = "PadBVTotal"
-_OFF = 2  # voxels by which the corners may contradict the counts; HELIOS++'s own writer makes 1.5
-# The box is so much larger on all sides, as a share of a voxel's edge: its sides are not those of
-# the ground or of a neighbouring grid, which light would miss.
+_MAX_COUNT_ERROR = 2  # voxels between corners and counts; HELIOS++'s own writer makes 1.5
+# The box is larger on all sides by this share of a voxel's edge: its sides do not coincide with the
+# ground or a neighbouring grid, which light would miss.
 _MARGIN = 0.02
 
 
-def read_vox(data: bytes, path: Path, wanted: ReadOptions) -> Content:
-    """Read a voxel file: one object, a box around all voxels with leaves.
+def read_vox(data: bytes, path: Path, options: ReadOptions) -> Content:
+    """Read a voxel file as an object: a box around the voxels with leaves.
 
-    The first voxel begins at `min_corner`, and each has the edge `res`, as in HELIOS++. Voxels that
-    are not named, or whose density is NaN, have no leaves.
+    The first voxel starts at `min_corner`, and each has the edge `res`, as in HELIOS++. Voxels that
+    are not listed, or whose density is NaN, have no leaves.
     """
     if data.startswith(b"VOX "):
         raise MeshFileError("is a model of MagicaVoxel: export it as .obj or .ply")
     if not data.lstrip().startswith(b"VOXEL SPACE"):
         raise MeshFileError("is broken, or not of AMAPVox: it does not begin with VOXEL SPACE")
-    found = re.search(rb"^[ \t]*i[ \t]+j[ \t]+k[ \t].*$", data, re.MULTILINE)
-    if found is None:
-        raise MeshFileError("has no row of names that begins with i j k")
-    text = data[: found.start()].decode("utf-8", "replace")
-    head = {k.lower(): v for k, v in re.findall(r"#[ \t]*([\w-]+)[ \t]*[:=]([^#\n]*)", text)}
-    columns = found[0].decode("utf-8", "replace").split()
-    rows = data[found.end() :]
-    if len(last := rows[rows.rstrip().rfind(b"\n") :].split()) < len(columns):
-        raise MeshFileError(f"is cut short: its last row has {len(last)} of {len(columns)} numbers")
-    shape, low, size = _grid(head)
-    column = _column(columns)
-    *where, density = np.loadtxt(io.BytesIO(rows), usecols=(0, 1, 2, column), unpack=True, ndmin=2)
-    places = np.stack(where, axis=1)
-    _check(places, density, shape)
-    unknown = int(np.isnan(density).sum())
-    full = density > 0
+    table = _read_table(data)
+    unknown = int(np.isnan(table.densities).sum())
+    full = table.densities > 0
     if not full.any():
-        raise MeshFileError(f"has no voxel whose {columns[column]} is above 0")
-    places = places[full].astype(np.int64)
-    first = places.min(axis=0)
-    stop = places.max(axis=0) + 1
+        raise MeshFileError(f"has no voxel whose {table.density_name} is above 0")
+    indices = table.indices[full].astype(np.int64)
+    first = indices.min(axis=0)
+    stop = indices.max(axis=0) + 1
     Allowance(len(data), "take larger voxels, or a part").take(4 * int(np.prod(stop - first)))
-    grid = np.zeros(stop - first, np.float32)
-    grid[tuple((places - first).T)] = density[full]
-    low = low + first * size
-    sides = (stop - first) * size
-    margin = _MARGIN * size.min()
-    shell = box(path.stem, tuple(sides + 2 * margin))
-    middle = low + sides * (0.5, 0.5, 0) - (0, 0, margin)
-    voxels = Voxels(grid, np.column_stack([np.diag(size), low]))
-    mesh = SceneMesh(path.stem, shell.vertices + middle, shell.faces, voxels=voxels)
+    densities = np.zeros(stop - first, np.float32)
+    densities[tuple((indices - first).T)] = table.densities[full]
+    grid = table.grid
+    mesh = _box_around(path.stem, densities, grid.min_corner + first * grid.edges_m, grid.edges_m)
     notes = []
     if unknown:
         notes.append(f"knows nothing of {plural(unknown, 'voxel')} (NaN), which stay empty")
-    angles = head.get("lad_type", "").strip()
+    angles = table.header.get("lad_type", "").strip()
     if angles and angles.lower() != "spherical":
         notes.append(f"has densities for {angles} leaves: give its object that leaf_angle")
     return Content([mesh], unit_m=1.0, up_axis="z", notes=notes)
 
 
-def _grid(head: dict[str, str]) -> tuple[Floats, Floats, Floats]:
-    """Return the counts of voxels, where the first begins, and their edges: (3,) each."""
+class _Grid(NamedTuple):
+    """Grid of a voxel file."""
+
+    counts: Floats  # (3,), voxels along x, y and z
+    min_corner: Floats  # (3,), metres: start of the first voxel
+    edges_m: Floats  # (3,), edges of a voxel
+
+
+class _Table(NamedTuple):
+    """Header and rows of a voxel file."""
+
+    header: dict[str, str]
+    grid: _Grid
+    density_name: str
+    indices: Floats  # (n, 3), of the voxels in the grid
+    densities: Floats  # (n,), m²/m³
+
+
+def _read_table(data: bytes) -> _Table:
+    """Read header and rows of a voxel file; MeshFileError if they are not valid."""
+    heading = re.search(rb"^[ \t]*i[ \t]+j[ \t]+k[ \t].*$", data, re.MULTILINE)
+    if heading is None:
+        raise MeshFileError("has no row of names that begins with i j k")
+    text = data[: heading.start()].decode("utf-8", "replace")
+    header = {k.lower(): v for k, v in re.findall(r"#[ \t]*([\w-]+)[ \t]*[:=]([^#\n]*)", text)}
+    columns = heading[0].decode("utf-8", "replace").split()
+    rows = data[heading.end() :]
+    if len(last := rows[rows.rstrip().rfind(b"\n") :].split()) < len(columns):
+        raise MeshFileError(f"is cut short: its last row has {len(last)} of {len(columns)} numbers")
+    grid = _grid(header)
+    column = _density_column(columns)
+    i, j, k, densities = np.loadtxt(
+        io.BytesIO(rows), usecols=(0, 1, 2, column), unpack=True, ndmin=2
+    )
+    indices = np.stack([i, j, k], axis=1)
+    _check_rows(indices, densities, grid.counts)
+    return _Table(header, grid, columns[column], indices, densities)
+
+
+def _box_around(name: str, densities: Floats32, min_corner: Floats, edges_m: Floats) -> SceneMesh:
+    """Return a box around voxels (x, y, z) that start at a corner (3,), metres."""
+    sides_m = np.array(densities.shape) * edges_m
+    margin_m = _MARGIN * edges_m.min()
+    shell = box(name, tuple(sides_m + 2 * margin_m))
+    middle = min_corner + sides_m * (0.5, 0.5, 0) - (0, 0, margin_m)
+    voxels = Voxels(densities, np.column_stack([np.diag(edges_m), min_corner]))
+    return SceneMesh(name, shell.vertices + middle, shell.faces, voxels=voxels)
+
+
+def _grid(header: dict[str, str]) -> _Grid:
+    """Read the grid of a header; MeshFileError if numbers are missing or wrong."""
 
     def three(name: str, times: int = 1) -> Floats:
+        """Return three numbers of the header, or raise MeshFileError."""
         try:
-            values = np.array([float(word) for word in head[name].split()] * times)[:3]
+            values = np.array([float(word) for word in header[name].split()] * times)[:3]
         except (KeyError, ValueError):
             values = np.full(0, np.nan)
         if values.shape != (3,) or not np.isfinite(values).all():
             raise MeshFileError(f"has no header #{name} with three numbers")
         return values
 
-    low = three("min_corner")
-    high = three("max_corner")
+    min_corner = three("min_corner")
+    max_corner = three("max_corner")
     split = three("split")
     if (split != np.floor(split)).any() or (split < 1).any() or (split > MAX_VOXELS).any():
         raise MeshFileError(
             f"has #split {_in_words(split)}; it must be whole numbers of 1 to {MAX_VOXELS:,}"
         )
-    size = three("res", 3) if "res" in head else (high - low) / split
-    if not (size > 0).all():
+    edges_m = three("res", 3) if "res" in header else (max_corner - min_corner) / split
+    if not (edges_m > 0).all():
         raise MeshFileError("has voxels without a size: #res, or #max_corner, is wrong")
-    if not (np.abs((high - low) / size - split) <= _OFF).all():
+    between = (max_corner - min_corner) / edges_m
+    if not (np.abs(between - split) <= _MAX_COUNT_ERROR).all():
         raise MeshFileError(
-            f"contradicts itself: {_in_words((high - low) / size)} voxels of #res are between its "
-            f"corners, and #split is {_in_words(split)}"
+            f"contradicts itself: {_in_words(between)} voxels of #res are between its corners, and "
+            f" #split is {_in_words(split)}"
         )
-    return split, low, size
+    return _Grid(split, min_corner, edges_m)
 
 
-def _column(columns: list[str]) -> int:
-    """Column of plant area density: that of AMAPVox 1, or the one of AMAPVox 2."""
+def _density_column(columns: list[str]) -> int:
+    """Return the column of plant area density, of AMAPVox 1 or 2."""
     if DENSITY in columns:
         return columns.index(DENSITY)
     named = [row for row, name in enumerate(columns) if name.lower().startswith("pad")]
@@ -115,24 +149,27 @@ def _column(columns: list[str]) -> int:
     return named[0]
 
 
-def _check(where: Floats, density: Floats, shape: Floats) -> None:
-    """Refuse rows that are of no voxel or of the same, and densities that cannot be."""
-    bad = ~((where == np.floor(where)) & (where >= 0) & (where < shape)).all(axis=1)
-    if bad.any():
+def _check_rows(indices: Floats, density: Floats, shape: Floats) -> None:
+    """Raise MeshFileError for rows outside the grid, repeated voxels, and impossible densities."""
+    is_bad = ~((indices == np.floor(indices)) & (indices >= 0) & (indices < shape)).all(axis=1)
+    if is_bad.any():
         raise MeshFileError(
-            f"has a voxel {_in_words(where[bad][0])}, but #split is {_in_words(shape)}"
+            f"has a voxel {_in_words(indices[is_bad][0])}, but #split is {_in_words(shape)}"
         )
     _, ny, nz = shape
-    again = np.diff(np.sort((where[:, 0] * ny + where[:, 1]) * nz + where[:, 2])) == 0
-    if again.any():
-        raise MeshFileError(f"has {plural(int(again.sum()), 'row')} of voxels that it had before")
-    bad = (density < 0) | (density > MAX_LEAF_DENSITY)
-    if bad.any():
+    repeated = np.diff(np.sort((indices[:, 0] * ny + indices[:, 1]) * nz + indices[:, 2])) == 0
+    if repeated.any():
         raise MeshFileError(
-            f"has {density[bad][0]:g} m²/m³ in voxel {_in_words(where[bad][0])}; a density is 0 to "
-            f"{MAX_LEAF_DENSITY:g}"
+            f"has {plural(int(repeated.sum()), 'row')} of voxels that it had before"
+        )
+    is_bad = (density < 0) | (density > MAX_LEAF_DENSITY)
+    if is_bad.any():
+        raise MeshFileError(
+            f"has {density[is_bad][0]:g} m²/m³ in voxel {_in_words(indices[is_bad][0])}; a density "
+            f"is 0 to {MAX_LEAF_DENSITY:g}"
         )
 
 
 def _in_words(numbers: Floats) -> str:
+    """Return numbers with spaces between."""
     return " ".join(f"{number:g}" for number in numbers)
