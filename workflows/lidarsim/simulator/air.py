@@ -120,7 +120,7 @@ class WeatherStep(PulseStep):
 
     def apply(self, returns: PulseReturns, batch: PulseBatch) -> PulseReturns:
         """See `PulseStep.apply`."""
-        drawn = self.sampled(returns, (batch.start, batch.stop), batch.keys, batch.each)
+        drawn = self.sampled(returns, (batch.start, batch.stop), batch.keys, batch.subrays_per_beam)
         return returns if drawn is None else in_the_air(self.setup, returns, batch, drawn)
 
     def sampled(
@@ -208,8 +208,8 @@ def in_the_air(
 ) -> PulseReturns:
     """Leave hits in the air for `SeparationStep`, or insert them for waveforms."""
     if returns.velocity is not None:  # the air is at rest
-        rays = batch.here.rays(batch.beams, drawn.ray, batch.window[0])
-        drawn = drawn._replace(velocity=approach(batch.here, drawn.ray, *rays))
+        rays = batch.subray_poses.rays(batch.beams, drawn.ray, batch.window[0])
+        drawn = drawn._replace(velocity=approach(batch.subray_poses, drawn.ray, *rays))
     if setup.in_waveforms or setup.recorded:
         batch.hits, batch.planes = inserted(returns, batch.planes, drawn)
         return batch.hits

@@ -37,7 +37,7 @@ class AngleNoiseStep(PulseStep):
         beams = np.arange(batch.start, batch.stop)
         scan, ray = batch.keys.of(beams)
         across, up = angle_errors(self.setup.noise, scan, ray)
-        batch.turn(np.column_stack([across, up]))
+        batch.deflect(np.column_stack([across, up]))
         return returns
 
 
@@ -66,7 +66,7 @@ class RippleStep(PulseStep):
         # A degree of azimuth is less across a beam, the steeper the beam looks.
         level = hypot(*sensor.ahead.T[:2])
         across = ((np.radians(noise.ripple_deg) * sin)[:, None] * level).reshape(-1)
-        batch.turn(np.column_stack([across, np.zeros(len(across))]))
+        batch.deflect(np.column_stack([across, np.zeros(len(across))]))
         return returns
 
 
@@ -82,4 +82,4 @@ def turned_beams(setup: Setup, sizes: Sizes) -> Memory:
     """Return the memory of beams with directions of their own."""
     if setup.several:  # then only the beams of a batch are turned at a time
         return Memory()
-    return Memory(kept=32 * sizes.rays, casting=20 * sizes.rays)
+    return Memory(retained=32 * sizes.rays, casting=20 * sizes.rays)

@@ -81,12 +81,12 @@ class CrosstalkStep(PulseStep):
     def memory(setup: Setup, sizes: Sizes) -> Memory:
         """See `PulseStep.memory`: a cause of each return, rays, and pulses of others."""
         others = _pulses_meanwhile(setup.survey, setup.sensor)
-        return Memory(kept=10 * sizes.returns, casting=(120 + 200 * others) * sizes.beams)
+        return Memory(retained=10 * sizes.returns, casting=(120 + 200 * others) * sizes.beams)
 
     def apply(self, returns: PulseReturns, batch: PulseBatch) -> PulseReturns:
         """See `PulseStep.apply`."""
         rays = np.arange(batch.start, batch.stop)
-        row, distance, energy = self.received(batch.keys.scan, rays, *batch.middles, batch.here)
+        row, distance, energy = self.received(batch.keys.scan, rays, *batch.middles, batch.subray_poses)
         order = np.lexsort((distance, row))
         ray = rays[row[order]]
         distance = distance[order]
@@ -134,7 +134,7 @@ class CrosstalkStep(PulseStep):
             far = far[:count]
             towards = spots.place[spot] - origins[row]
             when = fired[row] + spec.start_ns
-            free = self.caster.free(origins[row], towards, far, when, poses.ways)
+            free = self.caster.free(origins[row], towards, far, when, poses.actor_trajectories)
             energy = self._energy(spots, spot[free], towards[free], far[free])
             found.append((row[free], distance[free], energy))
         if not found:
@@ -199,7 +199,7 @@ class CrosstalkStep(PulseStep):
             ahead = into_axes(ahead, back)
             starts = into_axes(starts, back)
         starts = starts + np.repeat(places, sensor.channels, axis=0)
-        now = CastPoses(np.zeros(3), clock=Clock(fired + start_ns, np.zeros(1), poses.ways))
+        now = CastPoses(np.zeros(3), clock=Clock(fired + start_ns, np.zeros(1), poses.actor_trajectories))
         low = sensor.min_range_m
         high = sensor.max_range_m
         found = self.caster.scan(Pattern(ahead, starts), now, t_min=low, t_max=high)
@@ -209,7 +209,7 @@ class CrosstalkStep(PulseStep):
         return _Spots(
             fired[ray] + distance / LIGHT_M_NS,
             starts[ray] + distance[:, None] * ahead[ray],
-            self.surfaces.normals(found.triangle, times, poses.ways),
+            self.surfaces.normals(found.triangle, times, poses.actor_trajectories),
             found.triangle,
             distance,
         )

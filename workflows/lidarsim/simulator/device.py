@@ -146,10 +146,10 @@ class DeviceColumns:
         every = survey.keep_every
         reach = (sensor.min_range_m, sensor.max_range_m)
         scan = check_scan(
-            pattern, **poses.given, window=window, t_min=reach[0], t_max=reach[1],
+            pattern, **poses.caster_arguments, window=window, t_min=reach[0], t_max=reach[1],
             keep_every=every, groups=groups, tally=True,
         )  # fmt: skip
-        others = self._caster.on_actors(scan, poses) if poses.ways else None
+        others = self._caster.on_actors(scan, poses) if poses.actor_trajectories else None
         if others is not None:  # rows of the actors' body
             others = replace(others, triangle=others.triangle - np.int32(self.bodies[-1, 0]))
         making = _Making(self, specs, groups, most=-(-len(scan) // every) + len(groups))
@@ -210,7 +210,7 @@ class _Making:
         made = {c: cp.empty(len(hits) if c in asked else 1, c.dtype) for c in _MADE}
         wanted = np.int32(sum(1 << _MADE.index(column) for column in asked))
         found = hits.ray, hits.distance, hits.triangle, hits.instance, *hits.rays(), count
-        given = (*found, wanted, *begun.given, *made.values())
+        given = (*found, wanted, *begun.caster_arguments, *made.values())
         begun.kernel((-(-len(hits) // _BLOCK),), (_BLOCK,), given)
         rows = slice(self._count, self._count + len(hits))
         pairs = [(made[column], out[rows]) for column, out in begun.out.items()]
@@ -275,7 +275,7 @@ class _Begun:
     """What a batch needs from its first hits on."""
 
     kernel: Any
-    given: tuple[Any, ...]  # arguments between hits and columns
+    caster_arguments: tuple[Any, ...]  # arguments between hits and columns
     outbox: Outbox
     out: dict[Column, AnyArray]  # page-locked, as all of these
     hits: list[AnyArray]  # as `_HITS`, if NumPy needs all of them

@@ -60,8 +60,8 @@ def radial_velocities(
     """
     origins, directions = rays
     out = approach(poses, ray, origins, directions)
-    if poses.ways:
-        velocity = velocities_of_ends(surfaces, poses.ways, rays, distance, triangle, times)
+    if poses.actor_trajectories:
+        velocity = velocities_of_ends(surfaces, poses.actor_trajectories, rays, distance, triangle, times)
         out += products(velocity.T, directions.T)
     return out
 

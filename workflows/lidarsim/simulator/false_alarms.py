@@ -41,7 +41,7 @@ class FalseAlarmStep(PulseStep):
     @staticmethod
     def memory(setup: Setup, sizes: Sizes) -> Memory:
         """See `PulseStep.memory`: a cause of each return, and rays."""
-        return Memory(kept=10 * sizes.returns, casting=120 * sizes.beams)
+        return Memory(retained=10 * sizes.returns, casting=120 * sizes.beams)
 
     def apply(self, returns: PulseReturns, batch: PulseBatch) -> PulseReturns:
         """See `PulseStep.apply`."""

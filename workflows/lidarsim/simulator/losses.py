@@ -44,7 +44,7 @@ class DirtStep(PulseStep):
             if one.from_s or one.to_s is not None:
                 there &= one.during(batch.firings.times(beams))
             share[there] *= made(one.transmission)
-        share = share.repeat(batch.each)
+        share = share.repeat(batch.subrays_per_beam)
         batch.hits, batch.air = (
             one and one._replace(energy=made(one.energy) * share.take(one.ray))
             for one in (returns, batch.air)

@@ -112,7 +112,7 @@ def _bytes(setup: Setup, scans: int, on_device: bool) -> float:
     made = 0 if repeats else rays
     textured = any(material.reflectance == "texture" for material in survey.materials)
     bodies = RAY_AMONG_BODIES * bool(scene.actors or scene.instances)
-    own = Memory(kept=(RAY + COLOUR * textured) * here + POSE_KEPT * poses + RAY_MADE_KEPT * made)
+    own = Memory(retained=(RAY + COLOUR * textured) * here + POSE_KEPT * poses + RAY_MADE_KEPT * made)
     total = Memory(*map(sum, zip(own, *(step.memory(setup, sizes) for step in steps), strict=True)))
     casting: float = POSE * poses + RAY_MADE * made + bodies * (rays if scene.actors else here)
     casting += max(total.casting, total.counting)
@@ -122,7 +122,7 @@ def _bytes(setup: Setup, scans: int, on_device: bool) -> float:
     else:  # as if NumPy made all columns, and once more those of the device
         point = POINT + POINT_BYTE * columns + columns * on_device
     small = SCAN * scans + STATION * (1 + scans // survey.steps_each[setup.number])
-    return total.kept + max(casting, point * sizes.points) + small
+    return total.retained + max(casting, point * sizes.points) + small
 
 
 def _returns(setup: Setup) -> float:

@@ -28,18 +28,18 @@ class Clock:
     Actors move by times since the survey's start, a carrier by those since its station's.
     """
 
-    begins: Floats  # (f,): of each firing
+    firing_starts: Floats  # (f,): of each firing
     delays: Floats  # (m,): of each ray of a firing
-    ways: ActorTrajectories  # of the actors, or that of the carrier
+    trajectories: ActorTrajectories  # of the actors, or that of the carrier
     start: int = 0  # first ray
     subrays: int = 1  # of each ray
 
-    def of(self, ray: Integers) -> Floats:
+    def times(self, ray: Integers) -> Floats:
         """Return the firing times of rays (n,): (n,)."""
         from . import surface_loops  # not before: numba takes half a second to import
 
         out = np.empty(len(ray))
-        tables = (owned(self.begins), owned(self.delays))
+        tables = (owned(self.firing_starts), owned(self.delays))
         surface_loops.times(owned(ray, np.int64), self.start, self.subrays, *tables, out)
         return out
 
@@ -53,7 +53,7 @@ class Firings:
     spec: ScanSpec  # of the first of them
 
     @classmethod
-    def of(cls, sensor: Sensor, specs: Sequence[ScanSpec], times: int = 1) -> Firings:
+    def from_scans(cls, sensor: Sensor, specs: Sequence[ScanSpec], times: int = 1) -> Firings:
         """Return the firings of consecutive scans, so many times in turn."""
         numbers = np.arange(specs[0].firings[0], specs[-1].firings[1], dtype=np.int64)
         return cls(sensor, np.tile(numbers, times), specs[0])
@@ -63,7 +63,7 @@ class Firings:
         clock = Clock(
             self.sensor.begins_ns(self.numbers), self.sensor.beams.time_ns, ActorTrajectories()
         )
-        times = clock.of(ray)
+        times = clock.times(ray)
         return self.spec.start_ns + np.rint(times, out=times).astype(np.int64)
 
 
@@ -81,7 +81,7 @@ class CastPoses:
     station: int = 0  # of the carrier
 
     @cached_property
-    def given(self) -> dict[str, Any]:
+    def caster_arguments(self) -> dict[str, Any]:
         """Arguments of `RayCaster.scan` and `pattern_rays`."""
         if self.rays_per_pose is None:
             return {"positions": self.positions, "rotations": self.rotations}
@@ -93,13 +93,13 @@ class CastPoses:
         }
 
     @property
-    def ways(self) -> ActorTrajectories:
+    def actor_trajectories(self) -> ActorTrajectories:
         """Trajectories of the actors."""
-        return ActorTrajectories() if self.clock is None else self.clock.ways
+        return ActorTrajectories() if self.clock is None else self.clock.trajectories
 
     def times(self, ray: Integers) -> Floats:
         """Return firing times of rays, nanoseconds since the survey's start; for actors."""
-        return np.zeros(len(ray)) if self.clock is None else self.clock.of(ray)
+        return np.zeros(len(ray)) if self.clock is None else self.clock.times(ray)
 
     def part(self, start: int, stop: int, subrays: int) -> CastPoses:
         """Poses of the sub-rays of rays `start` to `stop`; `start` is the first of a pose."""
@@ -134,14 +134,14 @@ class CastPoses:
         """
         if self.carrier is None:
             return np.zeros((len(ray), 3))
-        (path,), times = self.carrier.ways, self.carrier.of(ray)
+        (path,), times = self.carrier.trajectories, self.carrier.times(ray)
         velocity, rate = velocities(path, self.station, times)
         places, _ = path.poses(self.station, times)
         return velocity + np.cross(rate, origins - places)
 
     def rays(self, pattern: Pattern, ray: Integers, start: int = 0) -> tuple[Floats, Floats]:
         """Origins and directions of rays of a pattern, see `pattern_rays`."""
-        return pattern_rays(pattern, ray, start=start, **self.given)
+        return pattern_rays(pattern, ray, start=start, **self.caster_arguments)
 
 
 def along_rings(beam: Ints, channels: int) -> Indices:

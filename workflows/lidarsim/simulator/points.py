@@ -69,7 +69,7 @@ class BatchPoints:
         self._pattern = pattern
         self._start = start
         self._poses = poses
-        self._fired = Firings.of(self.sensor, specs)
+        self._fired = Firings.from_scans(self.sensor, specs)
 
     def __len__(self) -> int:
         return len(self.found.ray)
@@ -141,7 +141,7 @@ class BatchPoints:
     @property
     def _times(self) -> Ints:
         """Firing times, where they matter, for actors."""
-        return self._fired_ns if self._poses.ways else np.zeros(len(self), np.int64)
+        return self._fired_ns if self._poses.actor_trajectories else np.zeros(len(self), np.int64)
 
     @cached_property
     def _number(self) -> Ints:
@@ -350,7 +350,7 @@ class BatchPoints:
         rows = np.flatnonzero(on_surface)
         for begin in range(0, len(rows), BLOCK_HITS):
             block = rows[begin : begin + BLOCK_HITS]
-            facing = surfaces.normals(triangle[block], self._times[block], self._poses.ways)
+            facing = surfaces.normals(triangle[block], self._times[block], self._poses.actor_trajectories)
             along = products(facing.T, self.directions[block].T)
             facing[along > 0] *= -1
             normals[block] = facing
@@ -394,7 +394,7 @@ class BatchPoints:
             some = slice(begin, begin + BLOCK_HITS)
             found = self.found.triangle[some], self.directions[some], self.found.distance[some]
             more = None if colours is None else colours[some]
-            lit = self._surfaces.lit(*found, light, self._times[some], self._poses.ways, more)
+            lit = self._surfaces.lit(*found, light, self._times[some], self._poses.actor_trajectories, more)
             along[some] = lit.along
             energy[some] = lit.energy
         return along, energy
@@ -414,7 +414,7 @@ class BatchPoints:
         points = self._ends
         if self.found.reported is not self.found.distance:
             points = self.directions * self.found.distance[:, None] + self._rays[0]
-        return self._surfaces.colours(self.found.triangle, points, self._times, self._poses.ways)
+        return self._surfaces.colours(self.found.triangle, points, self._times, self._poses.actor_trajectories)
 
     @property
     def red(self) -> Bytes:

@@ -159,10 +159,10 @@ class PulseCaster:
         if surfaces.materials.textured:
             ends = directions * distance[:, None]
             ends += origins
-            colour = surfaces.colours(triangle, ends, times, poses.ways)
+            colour = surfaces.colours(triangle, ends, times, poses.actor_trajectories)
             del ends  # which takes as much memory as the normals
         light = light_of(setup.survey, setup.sensor)
-        lit = surfaces.lit(triangle, directions, distance, light, times, poses.ways, colour)
+        lit = surfaces.lit(triangle, directions, distance, light, times, poses.actor_trajectories, colour)
         return returns._replace(energy=lit.energy, colour=colour, velocity=velocity)
 
     def _kept(self, returns: PulseReturns, groups: Ints, tally: bool) -> Scanned:

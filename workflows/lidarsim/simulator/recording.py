@@ -50,7 +50,7 @@ class RecordingStep(PulseStep):
         """
         assert batch.hits is not None  # as there are sub-rays
         hits = batch.hits
-        each = batch.each
+        each = batch.subrays_per_beam
         noise = self.setup.noise
         digitizer = Digitizer.of(self.setup)
         count = self.setup.recorded

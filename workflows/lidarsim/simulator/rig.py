@@ -199,7 +199,7 @@ class Rig:
         else:
             pose = path.pose(specs[0].station)
             poses = CastPoses(np.array(pose.position), pose.rotation)
-        fired = Firings.of(carried.sensor, specs)
+        fired = Firings.from_scans(carried.sensor, specs)
         poses = self._timed(poses, fired)
         if path.moves:
             begins = carried.sensor.begins_ns(fired.numbers) + late_ns
@@ -251,7 +251,7 @@ class Rig:
             poses = CastPoses(
                 positions[block], None if rotations is None else rotations[block], rays
             )
-            fired = Firings.of(sensor, specs, count)
+            fired = Firings.from_scans(sensor, specs, count)
             poses = self._timed(poses, fired)
             groups = (rays * np.arange(count)[:, None] + begin_rays).reshape(-1)
             scan = specs[0].scan + specs[0].ahead + begin * len(specs)

@@ -124,7 +124,7 @@ class SceneCaster:
         """See `RayCaster.scan`; the poses have a clock if there are actors."""
         start, stop = (0, len(pattern)) if window is None else window
         common: dict[str, Any] = {
-            **poses.given, "window": (start, stop), "t_min": t_min, "t_max": t_max, "room": room,
+            **poses.caster_arguments, "window": (start, stop), "t_min": t_min, "t_max": t_max, "room": room,
         }  # fmt: skip
         if self._begins is None and self._shapes is None:
             return self.caster.scan(
@@ -206,7 +206,7 @@ class SceneCaster:
         """
         assert self._shapes is not None
         casters, boxes, parts, shape = self._shapes
-        ways = poses.ways
+        ways = poses.actor_trajectories
         frames = lambda body, times: ways.played(body, times)[0]  # noqa: E731
         moving = Moving(casters, boxes, shape, ways.presence_ns, ways.table, frames)
         return hits_on(moving, scan, poses.times, before), (parts, shape, self._firsts)

@@ -158,7 +158,7 @@ class SeparationStep(PulseStep):
         setup = self.setup
         shown = "all" if setup.receives_more else setup.reporting.mode  # then `SelectionStep`
         report = Report(shown, setup.noise, batch.keys, batch.start)
-        return separated(returns, setup.gap_m, batch.each, batch.planes, batch.air, report)
+        return separated(returns, setup.gap_m, batch.subrays_per_beam, batch.planes, batch.air, report)
 
 
 class SelectionStep(PulseStep):

@@ -151,7 +151,7 @@ class Sizes(NamedTuple):
 class Memory(NamedTuple):
     """Peak memory of casting, in bytes."""
 
-    kept: float = 0.0  # until columns are made
+    retained: float = 0.0  # until columns are made
     casting: float = 0.0  # while some beams are cast
     counting: float = 0.0  # then, while all returns are counted and thinned out
 
@@ -207,7 +207,7 @@ class PulseBatch:
     planes: Planes | None = None  # of `hits`
     air: PulseReturns | None = None  # hits in the air, which are not among `hits`
 
-    def turn(self, offsets: Floats) -> None:
+    def deflect(self, offsets: Floats) -> None:
         """Add angles to the directions of the beams before they are cast, (n, 2), radians.
 
         With `Role.ABOUT_AXIS` these are angles of azimuth and elevation, else across and up.
@@ -225,7 +225,7 @@ class PulseBatch:
         return self.hits
 
     @property
-    def each(self) -> int:
+    def subrays_per_beam(self) -> int:
         """Sub-rays of a beam."""
         return len(self.emitter)
 
@@ -245,19 +245,19 @@ class PulseBatch:
     @property
     def window(self) -> tuple[int, int]:
         """First row of the sub-rays in `beams`, and one past the last."""
-        row = 0 if self.offsets is not None else (self.first + self.start) * self.each
-        return row, row + (self.stop - self.start) * self.each
+        row = 0 if self.offsets is not None else (self.first + self.start) * self.subrays_per_beam
+        return row, row + (self.stop - self.start) * self.subrays_per_beam
 
     @cached_property
-    def here(self) -> CastPoses:
+    def subray_poses(self) -> CastPoses:
         """Poses of the sub-rays."""
-        return self.poses.part(self.start, self.stop, self.each)
+        return self.poses.part(self.start, self.stop, self.subrays_per_beam)
 
     @cached_property
     def middles(self) -> tuple[Floats, Floats]:
         """Origins and directions (n, 3) of the rays in the middles of the beams."""
-        rows = np.arange(self.stop - self.start) * self.each
-        origins, directions = self.here.rays(self.beams, rows, self.window[0])
+        rows = np.arange(self.stop - self.start) * self.subrays_per_beam
+        origins, directions = self.subray_poses.rays(self.beams, rows, self.window[0])
         return np.broadcast_to(origins, directions.shape), directions
 
 
