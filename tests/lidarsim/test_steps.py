@@ -203,7 +203,7 @@ class Aside(Everywhere):
 class Farther(Everywhere):
     """Reports all ranges a metre longer."""
 
-    role = Role.OF_KEPT
+    role = Role.ON_REPORTED
 
     def apply(self, returns, batch):
         return returns._replace(reported=returns.reported + 1)

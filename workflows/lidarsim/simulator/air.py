@@ -100,7 +100,7 @@ class WeatherStep(PulseStep):
         names = [f"kind {kind}" if kind else "" for kind in range(len(self._kinds))]
         self._seeds = [named_seed(noise.seed, name) for name in names]
         scatters = survey.scatters(self._wavelength_nm)
-        self._fog = _fog_cells(air, scatters, noise.threshold, begins, ends, setup.gap_m)
+        self._fog = _fog_cells(air, scatters, noise.threshold, begins, ends, setup.half_pulse_m)
 
     @staticmethod
     def applies(setup: Setup) -> bool:
@@ -181,7 +181,7 @@ class WeatherStep(PulseStep):
         out = np.full(len(rows), np.inf)
         same = ray[1:] == ray[:-1]
         out[:-1][same] = where[1:][same]
-        enters = (numbers(ray) % 2 == 0) & (out - where > self.setup.gap_m)
+        enters = (numbers(ray) % 2 == 0) & (out - where > self.setup.half_pulse_m)
         reach = reach.copy()
         np.minimum.at(reach, ray[enters], where[enters])
         return reach
@@ -210,7 +210,7 @@ def in_the_air(
     if returns.velocity is not None:  # the air is at rest
         rays = batch.subray_poses.rays(batch.beams, drawn.ray, batch.window[0])
         drawn = drawn._replace(velocity=approach(batch.subray_poses, drawn.ray, *rays))
-    if setup.in_waveforms or setup.recorded:
+    if setup.in_waveforms or setup.waveform_samples:
         batch.hits, batch.planes = inserted(returns, batch.planes, drawn)
         return batch.hits
     if batch.air is not None:

@@ -86,7 +86,9 @@ class CrosstalkStep(PulseStep):
     def apply(self, returns: PulseReturns, batch: PulseBatch) -> PulseReturns:
         """See `PulseStep.apply`."""
         rays = np.arange(batch.start, batch.stop)
-        row, distance, energy = self.received(batch.keys.scan, rays, *batch.middles, batch.subray_poses)
+        row, distance, energy = self.received(
+            batch.keys.scan, rays, *batch.central_rays, batch.subray_poses
+        )
         order = np.lexsort((distance, row))
         ray = rays[row[order]]
         distance = distance[order]
@@ -199,7 +201,9 @@ class CrosstalkStep(PulseStep):
             ahead = into_axes(ahead, back)
             starts = into_axes(starts, back)
         starts = starts + np.repeat(places, sensor.channels, axis=0)
-        now = CastPoses(np.zeros(3), clock=Clock(fired + start_ns, np.zeros(1), poses.actor_trajectories))
+        now = CastPoses(
+            np.zeros(3), clock=Clock(fired + start_ns, np.zeros(1), poses.actor_trajectories)
+        )
         low = sensor.min_range_m
         high = sensor.max_range_m
         found = self.caster.scan(Pattern(ahead, starts), now, t_min=low, t_max=high)

@@ -81,7 +81,7 @@ class MediaStack:
         self.triangles[rows[free], depth[free]] = triangles[free]
 
     def leave(self, rows: Indices, kinds: Ints32) -> Bools:
-        """Remove a medium from the stack of each of `rows`; return whether the stack had the medium."""
+        """Remove a medium from the stack of each of `rows`; return True where it was there."""
         matches = self.kinds[rows] == kinds[:, None]
         in_stack = matches.any(axis=1)
         rows = rows[in_stack]

@@ -112,7 +112,9 @@ def _bytes(setup: Setup, scans: int, on_device: bool) -> float:
     made = 0 if repeats else rays
     textured = any(material.reflectance == "texture" for material in survey.materials)
     bodies = RAY_AMONG_BODIES * bool(scene.actors or scene.instances)
-    own = Memory(retained=(RAY + COLOUR * textured) * here + POSE_KEPT * poses + RAY_MADE_KEPT * made)
+    own = Memory(
+        retained=(RAY + COLOUR * textured) * here + POSE_KEPT * poses + RAY_MADE_KEPT * made
+    )
     total = Memory(*map(sum, zip(own, *(step.memory(setup, sizes) for step in steps), strict=True)))
     casting: float = POSE * poses + RAY_MADE * made + bodies * (rays if scene.actors else here)
     casting += max(total.casting, total.counting)
@@ -131,7 +133,7 @@ def _returns(setup: Setup) -> float:
     mode = setup.reporting.mode
     more = [step.added(setup) for step in steps_of(setup)]
     added = {"all": sum(more), "dual": sum(min(one, 1.0) for one in more)}.get(mode, 0.0)
-    if mode not in ("all", "dual") or not (subrays > 1 or setup.passing):
+    if mode not in ("all", "dual") or not (subrays > 1 or setup.has_onward_light):
         return 1 + added
     in_leaves = setup.leafy and subrays > 1 and mode == "all"
     return max(RETURNS_LEAFY if in_leaves else RETURNS, 1 + added)

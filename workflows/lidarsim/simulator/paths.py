@@ -160,24 +160,27 @@ class CastStep(PulseStep):
         self._coloured = shown or surfaces.materials.textured
         # Whether the origins of rays are needed, and not only their directions.
         self._needs_origins = (
-            self._coloured or setup.moving or setup.passing or self._media is not None
+            self._coloured
+            or setup.has_velocities
+            or setup.has_onward_light
+            or self._media is not None
         )
 
     @staticmethod
     def applies(setup: Setup) -> bool:
         """Return True if a ray may have several returns, or no return."""
-        return setup.several
+        return setup.has_several_returns
 
     @staticmethod
     def added(setup: Setup) -> float:
         """Return the greatest number of ghosts of a pulse: each reflection may add a ghost."""
-        return MAX_REFLECTIONS * setup.mirroring
+        return MAX_REFLECTIONS * setup.has_mirrors
 
     @staticmethod
     def memory(setup: Setup, sizes: Sizes) -> Memory:
         """Return the memory of sub-rays and hits, which is more if light continues or is bent."""
-        subray = 200 if not setup.passing else 1350 if setup.refracting else 650
-        casting = (subray + 200 * setup.moving) * sizes.subrays + 30 * sizes.returns
+        subray = 200 if not setup.has_onward_light else 1350 if setup.refracts else 650
+        casting = (subray + 200 * setup.has_velocities) * sizes.subrays + 30 * sizes.returns
         return Memory(casting=casting, counting=75 * sizes.returns + 40 * sizes.points)
 
     def apply(self, returns: PulseReturns, batch: PulseBatch) -> PulseReturns:
@@ -252,11 +255,11 @@ class CastStep(PulseStep):
         times = poses.times(ray)
         light = LightPaths(ray, times, origins, directions, np.ones(count), np.zeros(count))
         media = self._media
-        if setup.moving:
+        if setup.has_velocities:
             light.range_rate = approach(poses, ray, origins, directions)
-        if setup.mirroring:
+        if setup.has_mirrors:
             light.mirrored = np.zeros(count, np.uint8)
-        deflected = setup.mirroring or (media is not None and media.refracts)
+        deflected = setup.has_mirrors or (media is not None and media.refracts)
         if batch.subrays_per_beam > 1 and deflected:
             light.mirror_matrices = np.broadcast_to(np.eye(3), (count, 3, 3))
         if media is not None:
@@ -408,7 +411,7 @@ class CastStep(PulseStep):
         subrays_per_beam: int,
     ) -> OnwardLight | None:
         """Return the light that surfaces transmit or mirror; None if there is no such light."""
-        if not self.setup.passing:
+        if not self.setup.has_onward_light:
             return None
         transmitted = np.flatnonzero(visible.transmits)
         rows = np.concatenate([transmitted, np.flatnonzero(visible.mirrors)])

@@ -350,7 +350,9 @@ class BatchPoints:
         rows = np.flatnonzero(on_surface)
         for begin in range(0, len(rows), BLOCK_HITS):
             block = rows[begin : begin + BLOCK_HITS]
-            facing = surfaces.normals(triangle[block], self._times[block], self._poses.actor_trajectories)
+            facing = surfaces.normals(
+                triangle[block], self._times[block], self._poses.actor_trajectories
+            )
             along = products(facing.T, self.directions[block].T)
             facing[along > 0] *= -1
             normals[block] = facing
@@ -394,7 +396,9 @@ class BatchPoints:
             some = slice(begin, begin + BLOCK_HITS)
             found = self.found.triangle[some], self.directions[some], self.found.distance[some]
             more = None if colours is None else colours[some]
-            lit = self._surfaces.lit(*found, light, self._times[some], self._poses.actor_trajectories, more)
+            lit = self._surfaces.lit(
+                *found, light, self._times[some], self._poses.actor_trajectories, more
+            )
             along[some] = lit.along
             energy[some] = lit.energy
         return along, energy
@@ -414,7 +418,9 @@ class BatchPoints:
         points = self._ends
         if self.found.reported is not self.found.distance:
             points = self.directions * self.found.distance[:, None] + self._rays[0]
-        return self._surfaces.colours(self.found.triangle, points, self._times, self._poses.actor_trajectories)
+        return self._surfaces.colours(
+            self.found.triangle, points, self._times, self._poses.actor_trajectories
+        )
 
     @property
     def red(self) -> Bytes:

@@ -32,13 +32,13 @@ class RecordingStep(PulseStep):
     @staticmethod
     def applies(setup: Setup) -> bool:
         """See `PulseStep.applies`."""
-        return setup.recorded > 0
+        return setup.waveform_samples > 0
 
     @staticmethod
     def memory(setup: Setup, sizes: Sizes) -> Memory:
         """See `PulseStep.memory`: samples that are made at a time, and the records."""
-        recorded = record(setup.recorded).itemsize * sizes.returns
-        made = 40 * min(sizes.subrays * setup.recorded, BLOCK_SAMPLES)
+        recorded = record(setup.waveform_samples).itemsize * sizes.returns
+        made = 40 * min(sizes.subrays * setup.waveform_samples, BLOCK_SAMPLES)
         return Memory(casting=made + recorded, counting=2.3 * recorded)
 
     def apply(self, returns: PulseReturns, batch: PulseBatch) -> PulseReturns:
@@ -53,7 +53,7 @@ class RecordingStep(PulseStep):
         each = batch.subrays_per_beam
         noise = self.setup.noise
         digitizer = Digitizer.of(self.setup)
-        count = self.setup.recorded
+        count = self.setup.waveform_samples
         beams = returns.ray - batch.start
         keys = batch.keys
         here = Keys(keys.scan, keys.begins - batch.start)

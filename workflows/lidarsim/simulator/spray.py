@@ -136,8 +136,10 @@ class SprayStep(PulseStep):
         assert self._clumps is not None
         place = along_rings(np.arange(batch.stop - batch.start), self.setup.sensor.channels)
         times = batch.subray_poses.times(place * batch.subrays_per_beam)
-        boxes, there, density = self._boxes(batch.subray_poses.actor_trajectories, times.min(), times.max())
-        rays = np.concatenate([one.T.take(place, axis=1) for one in batch.middles])
+        boxes, there, density = self._boxes(
+            batch.subray_poses.actor_trajectories, times.min(), times.max()
+        )
+        rays = np.concatenate([one.T.take(place, axis=1) for one in batch.central_rays])
         far = np.minimum(far[place], self._clumps[1][0, -1])
         cell, which, size = near_boxes(rays, times, boxes, there, float(far.max()))
         order = np.argsort(cell, kind="stable")

@@ -61,7 +61,7 @@ class StrayLightStep(PulseStep):
 
         rays = np.arange(batch.start, batch.stop)
         poses = batch.subray_poses
-        origins, directions = batch.middles
+        origins, directions = batch.central_rays
         times = poses.times((rays - batch.start) * batch.subrays_per_beam)
         # seen from the origins
         best = np.zeros(len(rays))
@@ -100,7 +100,9 @@ class StrayLightStep(PulseStep):
         within = (distance >= low) & (distance <= high)
         row = row[within]
         distance = distance[within]
-        free = self.caster.free(origins[row], ends[row], distance, times[row], poses.actor_trajectories)
+        free = self.caster.free(
+            origins[row], ends[row], distance, times[row], poses.actor_trajectories
+        )
         free &= ~self._beside(returns, rays[row], distance)
         row = row[free]
         return merged(returns, unreal(returns, rays[row], distance[free], best[row], BLOOMING))
@@ -113,7 +115,7 @@ class StrayLightStep(PulseStep):
         for number in range(int((last - first).max(initial=0))):
             some = np.flatnonzero(first + number < last)
             own = returns.distance[first[some] + number]
-            beside[some] |= np.abs(own - distance[some]) <= self.setup.gap_m
+            beside[some] |= np.abs(own - distance[some]) <= self.setup.half_pulse_m
         return beside
 
 
