@@ -54,7 +54,7 @@ class RippleStep(PulseStep):
 
     @staticmethod
     def memory(setup: Setup, sizes: Sizes) -> Memory:
-        """Return the memory of the directions of beams, unless `AngleNoiseStep` returns this memory."""
+        """Return the memory of the directions of beams; 0 if `AngleNoiseStep` counts the memory."""
         return Memory() if setup.noise.angle_deg else turned_beams(setup, sizes)
 
     def apply(self, returns: PulseReturns, batch: PulseBatch) -> PulseReturns:

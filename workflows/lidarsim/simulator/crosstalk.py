@@ -136,7 +136,9 @@ class CrosstalkStep(PulseStep):
             far = far[:count]
             towards = spots.place[spot] - origins[row]
             when = fired[row] + spec.start_ns
-            free = self.caster.free(origins[row], towards, far, when, poses.actor_trajectories)
+            free = self.caster.is_visible(
+                origins[row], towards, far, when, poses.actor_trajectories
+            )
             energy = self._energy(spots, spot[free], towards[free], far[free])
             found.append((row[free], distance[free], energy))
         if not found:

@@ -240,7 +240,7 @@ class PulseBatch:
 
     @cached_property
     def beams(self) -> Pattern:
-        """Sub-rays of the beams; without offsets, the sub-rays of the whole pattern, see `window`."""
+        """Sub-rays of the beams; without offsets, of the whole pattern: see `window`."""
         rows = np.arange(self.first + self.start, self.first + self.stop)
         pattern_rows = None if self.offsets is None else rows
         return self.emitter.subrays_of(

@@ -100,7 +100,7 @@ class StrayLightStep(PulseStep):
         within = (distance >= low) & (distance <= high)
         row = row[within]
         distance = distance[within]
-        free = self.caster.free(
+        free = self.caster.is_visible(
             origins[row], ends[row], distance, times[row], poses.actor_trajectories
         )
         free &= ~self._beside(returns, rays[row], distance)
