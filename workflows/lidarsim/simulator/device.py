@@ -92,10 +92,10 @@ class DevicePoints:
         value = {"sensor": self.specs[0].sensor, "cause": SURFACE}.get(column.name, 1)
         return np.full(len(self), value, column.dtype)
 
-    def ends(self, rows: Ints) -> Floats:
+    def positions_of(self, rows: Ints) -> Floats:
         """Positions of some points (k,), at least to the survey's precision: (k, 3)."""
         if self.returns is not None:
-            return self.returns.ends(rows)
+            return self.returns.positions_of(rows)
         cells = np.stack([self.columns[axis.name][rows] for axis in AXES], axis=1)
         return cells * self.survey.precision_m
 
