@@ -27,12 +27,12 @@ MB = 1_000_000
 # tests/lidarsim/test_memory.py measures some of it again. Steps say their own, of that.
 RAY = 28  # its hit
 # if it is not repeated: while it is made, and after that
-RAY_MADE = 92
-RAY_MADE_KEPT = 32
+COMPUTED_RAY = 92
+COMPUTED_RAY_RETAINED = 32
 RAY_AMONG_BODIES = 70  # in a scene with instances or actors
 # of a firing that has its own: while it is made, and after that
 POSE = 140
-POSE_KEPT = 100
+POSE_RETAINED = 100
 RETURNS = 1.5  # of a pulse, where all or two are reported; 1.1 to 1.6 in generated woods
 RETURNS_LEAFY = 3.8  # where all are, and each sub-ray meets a leaf by itself; 3.3 in a high canopy
 # a point, and each byte of its columns: their sources are float64
@@ -108,19 +108,25 @@ def _bytes(setup: Setup, scans: int, on_device: bool) -> float:
     sizes = Sizes(rays, beams, chunk, returns, returns / survey.keep_every)
     repeats, by_head = rays_repeat(sensor, survey.path.moves)
     poses = firings if survey.path.moves or by_head else 0
-    here = 0 if on_device else rays  # rays whose hits are on the host
-    made = 0 if repeats else rays
+    host_rays = 0 if on_device else rays  # rays whose hits are on the host
+    computed_rays = 0 if repeats else rays
     textured = any(material.reflectance == "texture" for material in survey.materials)
     bodies = RAY_AMONG_BODIES * bool(scene.actors or scene.instances)
-    own = Memory(
-        retained=(RAY + COLOUR * textured) * here + POSE_KEPT * poses + RAY_MADE_KEPT * made
+    rig_memory = Memory(
+        retained=(RAY + COLOUR * textured) * host_rays
+        + POSE_RETAINED * poses
+        + COMPUTED_RAY_RETAINED * computed_rays
     )
-    total = Memory(*map(sum, zip(own, *(step.memory(setup, sizes) for step in steps), strict=True)))
-    casting: float = POSE * poses + RAY_MADE * made + bodies * (rays if scene.actors else here)
+    total = Memory(
+        *map(sum, zip(rig_memory, *(step.memory(setup, sizes) for step in steps), strict=True))
+    )
+    casting: float = (
+        POSE * poses + COMPUTED_RAY * computed_rays + bodies * (rays if scene.actors else host_rays)
+    )
     casting += max(total.casting, total.counting)
     if on_device and not needs_hits(scene, survey):
-        one_run = scans <= survey.steps_each[setup.number] and len(survey.carried) == 1
-        point: float = (PAGE_LOCKED + (0 if one_run else JOINED)) * columns
+        single_run = scans <= survey.steps_each[setup.number] and len(survey.carried) == 1
+        point: float = (PAGE_LOCKED + (0 if single_run else JOINED)) * columns
     else:  # as if NumPy made all columns, and once more those of the device
         point = POINT + POINT_BYTE * columns + columns * on_device
     small = SCAN * scans + STATION * (1 + scans // survey.steps_each[setup.number])
@@ -131,8 +137,11 @@ def _returns(setup: Setup) -> float:
     """Count the reported returns of a pulse that hits something, on average."""
     subrays = setup.reporting.subrays
     mode = setup.reporting.mode
-    more = [step.added(setup) for step in steps_of(setup)]
-    added = {"all": sum(more), "dual": sum(min(one, 1.0) for one in more)}.get(mode, 0.0)
+    added_by_step = [step.added(setup) for step in steps_of(setup)]
+    added = {
+        "all": sum(added_by_step),
+        "dual": sum(min(count, 1.0) for count in added_by_step),
+    }.get(mode, 0.0)
     if mode not in ("all", "dual") or not (subrays > 1 or setup.has_onward_light):
         return 1 + added
     in_leaves = setup.leafy and subrays > 1 and mode == "all"
@@ -146,7 +155,7 @@ def scans_that_fit(scene: Scene, survey: Survey, limit: float, *, on_device: boo
     takes them, and smaller ones would take no less.
     """
     limit += TRIANGLE * scene.counters
-    takes = partial(cast_bytes, scene, survey, on_device=on_device)
-    if (whole := takes(survey.scan_count)) <= limit:
-        return int(survey.scan_count * limit / whole)
-    return max(1, bisect_right(range(1, survey.scan_count + 1), limit, key=takes))
+    memory_of = partial(cast_bytes, scene, survey, on_device=on_device)
+    if (survey_bytes := memory_of(survey.scan_count)) <= limit:
+        return int(survey.scan_count * limit / survey_bytes)
+    return max(1, bisect_right(range(1, survey.scan_count + 1), limit, key=memory_of))

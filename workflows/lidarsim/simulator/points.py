@@ -30,14 +30,14 @@ from .returns import made
 from .steps import received_causes
 from .surfaces import Surfaces, light_of
 
-BLOCK_HITS = 1 << 16  # that are looked at a time
-MIN_REMAINING = 1e-30  # of the light, so that what is divided by it is finite in single precision
+BLOCK_HITS = 1 << 16  # hits whose normals are computed at a time
+MIN_REMAINING = 1e-30  # share of light, so that quotients are finite in single precision
 
 
 class BatchPoints:
-    """Kept returns of some consecutive scans of one station, in (scan, ray) order.
+    """Reported returns of consecutive scans of a station, in (scan, ray) order.
 
-    Its attributes are arrays (n,) with a value for each return, computed on first use: the
+    The attributes are arrays (n,) with a value for each return, computed on first use: the
     sources of columns (`lidarsim.columns.table`).
     """
 
@@ -46,8 +46,9 @@ class BatchPoints:
         scene: Scene,
         survey: Survey,
         surfaces: Surfaces,
-        specs: list[ScanSpec],  # the firings of each follow those of the one before
+        specs: list[ScanSpec],  # of consecutive firings
         scanned: Scanned,  # rays are numbered from 0 at the first firing
+        *,
         pattern: Pattern,
         start: int,  # number of ray 0 within the pattern
         poses: CastPoses,
@@ -57,14 +58,13 @@ class BatchPoints:
         self.carried = survey.carried[specs[0].sensor]
         self.sensor = self.carried.sensor
         self.specs = specs
-        # Triangles that were hit and their hits, (k,) each: a count for every triangle of the scene
-        # would be kept for each station of a batch.
+        # Triangles that were hit and their hits, (k,) each: counts of all triangles of the scene
+        # would take much memory, since they are stored for each station of a batch.
         hits = np.zeros(0, np.int64) if scanned.tally is None else scanned.tally
         triangles = np.flatnonzero(hits)
         self.tally = triangles, hits[triangles]
-        # (scans,): of each, kept or not
         self.pulse_returns = scanned.returns
-        self.hits = scanned.hits
+        self.hits = scanned.hits  # (scans,): hits of each scan, also without a reported return
         self._surfaces = surfaces
         self._pattern = pattern
         self._start = start
@@ -79,7 +79,7 @@ class BatchPoints:
         return column.make(self)
 
     def positions_of(self, rows: Ints) -> Floats:
-        """Positions of some returns (k,): (k, 3)."""
+        """Return the positions of the returns `rows` (k,), as `positions`: (k, 3)."""
         return self.positions[rows]
 
     # -- the ray -----------------------------------------------------------------------------
@@ -125,11 +125,12 @@ class BatchPoints:
 
     @cached_property
     def _firing_times_ns(self) -> Ints:
+        """Firing times, nanoseconds since the survey's start."""
         return self._firings.times(self.pulse_returns.ray)
 
     @cached_property
     def time(self) -> Ints:
-        """Time of the ray as the sensor states it, nanoseconds since the survey's start."""
+        """Time of the ray by the sensor's clock, nanoseconds since the survey's start."""
         spec = self.specs[0]
         stamp = self._firing_times_ns
         if spec.repeats is not None:
@@ -140,7 +141,7 @@ class BatchPoints:
 
     @property
     def _actor_times_ns(self) -> Ints:
-        """Firing times, where they matter, for actors."""
+        """Firing times, nanoseconds since the survey's start; zeros if there are no actors."""
         return (
             self._firing_times_ns
             if self._poses.actor_trajectories
@@ -149,13 +150,14 @@ class BatchPoints:
 
     @cached_property
     def _firing_in_run(self) -> Ints:
-        """Number of the firing, from that of the first scan."""
+        """Number of the firing, counted from the first firing of the first scan."""
         return self.pulse_returns.ray // np.int64(self.sensor.channels)
 
     # -- positions ---------------------------------------------------------------------------
 
     @cached_property
     def _rays(self) -> tuple[Floats, Floats]:
+        """Origins, (n, 3) or (3,), and directions (n, 3) of the rays, in the scene frame."""
         return self._poses.rays(self._pattern, self.pulse_returns.ray, self._start)
 
     @property
@@ -165,7 +167,7 @@ class BatchPoints:
 
     @property
     def directions(self) -> Floats:
-        """Unit directions in the scene's axes: (n, 3)."""
+        """Unit directions in the scene frame: (n, 3)."""
         return self._rays[1]
 
     @property
@@ -177,12 +179,12 @@ class BatchPoints:
     def positions(self) -> Floats:
         """Ends of the rays, metres, the scene's local coordinates: (n, 3).
 
-        A frozen sensor's points stay in its axes, and move with it.
+        Points of a frozen sensor stay fixed in the sensor frame, and move with the sensor.
         """
         return self._after_freezing(self._scene_positions)
 
     def _after_freezing(self, points: Floats) -> Floats:
-        """Move points (n, 3) with the axes of a frozen sensor, since the sweep that it repeats."""
+        """Move points (n, 3) with a frozen sensor from the repeated sweep to the current sweep."""
         if self.specs[0].repeats is None:
             return points
         frozen_pose, current_pose = map(self.survey.pose, self.specs[0].repeats)
@@ -215,6 +217,7 @@ class BatchPoints:
 
     @cached_property
     def _scene_positions(self) -> Floats:
+        """Ends of the rays when they were fired, metres, scene frame: (n, 3)."""
         origins, directions = self._rays
         positions = directions * self.range[:, None]
         return np.add(positions, origins, out=positions)
@@ -254,20 +257,21 @@ class BatchPoints:
 
     @cached_property
     def _pattern_rows(self) -> Ints:
-        """Of the pattern."""
+        """Row of the ray in the pattern."""
         return (self._start + self.pulse_returns.ray.astype(np.int64)) % len(self._pattern)
 
     @cached_property
     def _sensor_directions(self) -> Floats:
+        """Unit directions in the sensor frame: (n, 3)."""
         return self._to_sensor(self._pattern.directions[self._pattern_rows])
 
     @cached_property
     def sensor_positions(self) -> Floats:
-        """Ends of the rays in the axes of the sensor at their firing, metres: (n, 3)."""
+        """Ends of the rays in the sensor frame at the firing, metres: (n, 3)."""
         return self._in_sensor(self.range)
 
     def _in_sensor(self, distance: Floats) -> Floats:
-        """Points of the rays at distances (n,), in the axes of the sensor, metres: (n, 3)."""
+        """Return points of the rays at distances (n,), sensor frame, metres: (n, 3)."""
         origins = self._pattern.origins
         points = self._pattern.directions[self._pattern_rows] * distance[:, None]
         if origins is not None:
@@ -279,23 +283,24 @@ class BatchPoints:
         return self._to_sensor(points)
 
     def _to_sensor(self, vectors: Floats) -> Floats:
-        """Turn vectors (n, 3) in the axes of the carrier, or the head, to those of the sensor."""
+        """Rotate vectors (n, 3) from the frame of the carrier, or the head, to the sensor frame."""
         if self._poses.by_head:
             spins = self.sensor.spins(self._firings.numbers)
             assert spins is not None  # or the rig would not cast by head
-            (cos, sin), (x, y, z) = (a.take(self._firing_in_run) for a in spins), vectors.T
-            looks = np.stack([x * cos - y * sin, x * sin + y * cos, z], axis=1)
-            return turned(looks, self.sensor.axes)
+            cos, sin = (values.take(self._firing_in_run) for values in spins)
+            x, y, z = vectors.T
+            in_head = np.stack([x * cos - y * sin, x * sin + y * cos, z], axis=1)
+            return turned(in_head, self.sensor.axes)
         mount = self.carried.mount.rotation
         return turned(vectors, None if mount is None else mount.T)
 
     def _world_to_sensor(self, vectors: Floats) -> Floats:
-        """Turn vectors (n, 3) in the scene's axes to those of the sensor at the firing."""
-        inside = np.empty(vectors.shape[::-1])
+        """Rotate vectors (n, 3) from the scene frame to the sensor frame at the firing."""
+        in_carrier = np.empty(vectors.shape[::-1])
         for axis, unit in enumerate(np.eye(3)):
             _, axes = self._poses.rays(Pattern(unit[None]), self.pulse_returns.ray, self._start)
-            inside[axis] = products(vectors.T, axes.T)
-        return self._to_sensor(inside.T)
+            in_carrier[axis] = products(vectors.T, axes.T)
+        return self._to_sensor(in_carrier.T)
 
     @cached_property
     def azimuth(self) -> Floats:
@@ -331,16 +336,16 @@ class BatchPoints:
     def cosine(self) -> Floats:
         """Cosine of the angle between the ray and the normal of its triangle, 0 to 1.
 
-        It means nothing where there is no surface.
+        Undefined for returns without a surface.
         """
         return np.abs(self._lit[0])
 
     @cached_property
     def _facing(self) -> tuple[Floats, Floats]:
-        """Unit normals (n, 3), scene's axes, on the side that was hit, and cosines of incidence.
+        """Unit normals (n, 3), scene frame, on the side that was hit, and cosines of incidence.
 
-        NaN where there is no surface, of leaves within a crown, and of ghosts, whose rays arrive
-        from elsewhere.
+        NaN for returns without a surface, leaves within a crown, and ghosts, whose last ray starts
+        at a mirror.
         """
         triangle = self.pulse_returns.triangle
         surfaces = self._surfaces
@@ -365,7 +370,7 @@ class BatchPoints:
 
     @cached_property
     def normals(self) -> Floats:
-        """Unit normals on the side that was hit, in the axes of the survey's points: (n, 3)."""
+        """Unit normals on the side that was hit, in the frame of the survey's points: (n, 3)."""
         normals, _ = self._facing
         if self.survey.coordinates == "sensor":
             return self._world_to_sensor(normals)
@@ -388,28 +393,25 @@ class BatchPoints:
 
     @property
     def incidence_deg(self) -> Floats:
-        """Angle between the ray and the normal of its surface, degrees; NaN as of `normals`."""
+        """Angle between the ray and the normal of its surface, degrees; NaN as in `normals`."""
         return np.degrees(arccos(np.minimum(self._facing[1], 1.0)))
 
     @cached_property
     def _lit(self) -> tuple[Floats, Floats]:
-        """Cosines of incidence, of either sign, and energies; in blocks, for normals take room."""
-        light, (cosines, energy) = light_of(self.survey, self.sensor), np.empty((2, len(self)))
+        """Cosines of incidence, of either sign, and energies; in blocks, to save memory."""
+        light = light_of(self.survey, self.sensor)
+        cosines, energy = np.empty((2, len(self)))
         colours = self._colours if self._surfaces.materials.textured else None
         for begin in range(0, len(self), BLOCK_HITS):
             block = slice(begin, begin + BLOCK_HITS)
-            found = (
+            lit = self._surfaces.lit(
                 self.pulse_returns.triangle[block],
                 self.directions[block],
                 self.pulse_returns.distance[block],
-            )
-            block_colours = None if colours is None else colours[block]
-            lit = self._surfaces.lit(
-                *found,
                 light,
                 self._actor_times_ns[block],
                 self._poses.actor_trajectories,
-                block_colours,
+                None if colours is None else colours[block],
             )
             cosines[block] = lit.along
             energy[block] = lit.energy
@@ -417,14 +419,14 @@ class BatchPoints:
 
     @cached_property
     def intensity(self) -> Floats:
-        """Received energy, see `Surfaces.energy`."""
+        """Received energy, on the scale of `Surfaces.energy`."""
         if self.pulse_returns.energy is not None:
             return self.pulse_returns.energy
         return self._lit[1]
 
     @cached_property
     def _colours(self) -> UInts32:
-        """Packed colours."""
+        """Packed colours of the surfaces, see `Surfaces.colours`."""
         if self.pulse_returns.colour is not None:
             return self.pulse_returns.colour
         points = self._scene_positions
@@ -454,44 +456,46 @@ class BatchPoints:
 
     @property
     def _clipped_energy(self) -> Floats:
-        """Received energy, at most what fills the receiver."""
+        """Received energy, clipped at saturation."""
         return np.minimum(self.intensity, self.survey.noise_each[self.specs[0].sensor].full)
 
     @property
     def signal(self) -> NDArray[np.uint16]:
-        """Counts in proportion to the recorded energy."""
+        """Counts in proportion to the clipped energy."""
         return np.minimum(np.rint(self._clipped_energy * COUNTS), 65_535).astype(np.uint16)
 
     @property
     def reflectivity(self) -> Bytes:
-        """Recorded energy without the loss by distance, on the scale of the sensor's maker."""
-        lost = at_right_angles(self.pulse_returns.distance)
-        return SCALES[self.sensor.optics.reflectivity].codes(self._clipped_energy / lost)
+        """Clipped energy, corrected for the loss by distance, on the scale of the manufacturer."""
+        remaining = at_right_angles(self.pulse_returns.distance)
+        return SCALES[self.sensor.optics.reflectivity].codes(self._clipped_energy / remaining)
 
     @property
     def reflectance(self) -> Floats:
-        """Intensity without the loss by distance and air."""
-        lost = at_right_angles(self.pulse_returns.distance, self.survey.extinction(self.sensor))
-        # In thick fog or dust nothing is left of the light from where a false alarm seems to be.
-        return np.asarray(self.intensity / np.maximum(lost, MIN_REMAINING))
+        """Intensity, corrected for the loss by distance and air."""
+        remaining = at_right_angles(
+            self.pulse_returns.distance, self.survey.extinction(self.sensor)
+        )
+        # In thick fog or dust, no light returns from the distance at which a false alarm appears.
+        return np.asarray(self.intensity / np.maximum(remaining, MIN_REMAINING))
 
     @cached_property
     def radial_velocity(self) -> Floats:
-        """How fast the range grows, m/s, with noise; NaN of what no light returned from."""
-        found = self.pulse_returns
-        velocity = self.pulse_returns.velocity
+        """Growth of the range, m/s, with noise; NaN for returns that the receiver adds."""
+        returns = self.pulse_returns
+        velocity = returns.velocity
         if velocity is None:
             velocity = radial_velocities(
                 self._surfaces,
                 self._poses,
-                found.ray.astype(np.int64),
+                returns.ray.astype(np.int64),
                 self._rays,
-                found.distance,
-                found.triangle,
+                returns.distance,
+                returns.triangle,
                 self._actor_times_ns,
             )
-            if found.cause is not None:
-                velocity[np.isin(found.cause, received_causes())] = np.nan
+            if returns.cause is not None:
+                velocity[np.isin(returns.cause, received_causes())] = np.nan
         noise = self.survey.noise_each[self.specs[0].sensor]
         if noise.velocity_m_s:
             scan = self.scan.astype(np.int64) + self.specs[0].ahead
@@ -501,14 +505,14 @@ class BatchPoints:
 
     @property
     def amplitude(self) -> Floats:
-        """Height of the echo in the waveform; without waveforms its energy."""
+        """Height of the pulse in the waveform; without waveforms the energy."""
         return (
             self.intensity if self.pulse_returns.amplitude is None else self.pulse_returns.amplitude
         )
 
     @property
     def pulse_width(self) -> Floats:
-        """Full width at half maximum of the echo in the waveform, nanoseconds."""
+        """Full width at half maximum of the pulse in the waveform, nanoseconds."""
         if self.pulse_returns.width is None:
             returns = self.survey.returns_each[self.specs[0].sensor]
             return np.full(len(self), returns.length_ns(self.sensor.optics))
@@ -537,7 +541,7 @@ class BatchPoints:
 
     @property
     def cause(self) -> Bytes:
-        """Why the return is there, see `CAUSES` of the table of columns."""
+        """Cause of the return, see `CAUSES` in `lidarsim.columns.table`."""
         if self.pulse_returns.cause is None:
             return np.zeros(len(self), np.uint8)
         return self.pulse_returns.cause
@@ -552,5 +556,5 @@ class BatchPoints:
 
     @property
     def material_number(self) -> Ints32:
-        """Number of the material's name among those of the scene; -1 for none."""
+        """Number of the material's name among the names of the scene; -1 without a material."""
         return self._surfaces.material_numbers(self.pulse_returns.triangle)

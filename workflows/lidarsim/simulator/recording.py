@@ -38,8 +38,8 @@ class RecordingStep(PulseStep):
     def memory(setup: Setup, sizes: Sizes) -> Memory:
         """See `PulseStep.memory`: samples that are made at a time, and the records."""
         recorded = record(setup.waveform_samples).itemsize * sizes.returns
-        made = 40 * min(sizes.subrays * setup.waveform_samples, BLOCK_SAMPLES)
-        return Memory(casting=made + recorded, counting=2.3 * recorded)
+        sampled = 40 * min(sizes.subrays * setup.waveform_samples, BLOCK_SAMPLES)
+        return Memory(casting=sampled + recorded, counting=2.3 * recorded)
 
     def apply(self, returns: PulseReturns, batch: PulseBatch) -> PulseReturns:
         """See `PulseStep.apply`.
@@ -50,72 +50,82 @@ class RecordingStep(PulseStep):
         """
         assert batch.hits is not None  # as there are sub-rays
         hits = batch.hits
-        each = batch.subrays_per_beam
+        subrays_per_beam = batch.subrays_per_beam
         noise = self.setup.noise
         digitizer = Digitizer.of(self.setup)
         count = self.setup.waveform_samples
         beams = returns.ray - batch.start
         keys = batch.keys
-        here = Keys(keys.scan, keys.begins - batch.start)
-        out = np.zeros(len(beams), record(count))
-        out["sample_ps"] = round(1000 * digitizer.sample_ns)
-        when = returns.distance * digitizer.per_m
-        first = np.maximum(np.floor(when).astype(np.int64) - digitizer.reach, 0)
-        last = np.ceil(when).astype(np.int64) + digitizer.reach
-        place = numbers(beams)
+        batch_keys = Keys(keys.scan, keys.begins - batch.start)
+        records = np.zeros(len(beams), record(count))
+        records["sample_ps"] = round(1000 * digitizer.sample_ns)
+        time = returns.distance * digitizer.per_m
+        first = np.maximum(np.floor(time).astype(np.int64) - digitizer.reach, 0)
+        last = np.ceil(time).astype(np.int64) + digitizer.reach
+        pulse_row = numbers(beams)
         begin = first.copy()
-        for number in range(1, int(place.max(initial=0)) + 1):
-            rows = np.flatnonzero(place == number)
+        for number in range(1, int(pulse_row.max(initial=0)) + 1):
+            rows = np.flatnonzero(pulse_row == number)
             shared = (last[rows] < begin[rows - 1] + count) & (first[rows] >= begin[rows - 1])
             begin[rows] = np.where(shared, begin[rows - 1], first[rows])
-        new = (place == 0) | (np.diff(begin, prepend=-1) != 0)
-        window = np.cumsum(new) - 1
-        beam = beams[new]
-        begins = begin[new]
-        low, high = (np.searchsorted(hits.ray, (beam + step) * each) for step in (0, 1))
-        unit = max(count, each * (2 * digitizer.reach + 1))
+        starts_window = (pulse_row == 0) | (np.diff(begin, prepend=-1) != 0)
+        window = np.cumsum(starts_window) - 1
+        beam = beams[starts_window]
+        window_begin = begin[starts_window]
+        first_hit, stop_hit = (
+            np.searchsorted(hits.ray, (beam + step) * subrays_per_beam) for step in (0, 1)
+        )
+        unit = max(count, subrays_per_beam * (2 * digitizer.reach + 1))
         size = max(1, BLOCK_SAMPLES // unit)
-        out["begin"] = begin
+        records["begin"] = begin
         for start in range(0, len(beam), size):
             block = slice(start, start + size)
-            samples = _window(hits, digitizer, each, begins[block], low[block], high[block], count)
+            samples = _window(
+                hits,
+                digitizer,
+                subrays_per_beam,
+                window_begin[block],
+                first_hit[block],
+                stop_hit[block],
+                count,
+            )
             if noise.threshold:
-                scan, ray = here.of(beam[block])
+                scan, ray = batch_keys.of(beam[block])
                 stream = raw(noise.seed, SAMPLES, scan, ray)[:, None]
-                number = begins[block, None] + np.arange(count)
+                number = window_begin[block, None] + np.arange(count)
                 drawn = normal(noise.seed, SAMPLE, stream, number >> 8, number & 255)
                 samples += (noise.threshold / THRESHOLD_SIGMAS) * drawn
             steps, exponents = digitised(np.minimum(samples, noise.full))
             low_row, high_row = np.searchsorted(window, [start, start + size])
-            mine = window[low_row:high_row] - start
-            out["samples"][low_row:high_row] = steps[mine]
-            out["exponent"][low_row:high_row] = exponents[mine]
-        return returns._replace(waveform=out)
+            window_row = window[low_row:high_row] - start
+            records["samples"][low_row:high_row] = steps[window_row]
+            records["exponent"][low_row:high_row] = exponents[window_row]
+        return returns._replace(waveform=records)
 
 
 def _window(
     hits: PulseReturns,
     digitizer: Digitizer,
-    each: int,
-    begins: Ints,
-    low: Ints,
-    high: Ints,
+    subrays_per_beam: int,
+    begin: Ints,
+    first_hit: Ints,
+    stop_hit: Ints,
     count: int,
 ) -> Floats:
-    """Sample the waveforms of some windows, of the hits from `low` to `high`: (windows, count)."""
-    sizes = high - low
-    mine = np.repeat(np.arange(len(begins)), sizes)
-    rows = np.arange(len(mine)) + np.repeat(low - np.cumsum(sizes) + sizes, sizes)
+    """Sample the waveforms of some windows, of the hits from `first_hit` to `stop_hit`: (windows, count)."""
+    sizes = stop_hit - first_hit
+    window = np.repeat(np.arange(len(begin)), sizes)
+    rows = np.arange(len(window)) + np.repeat(first_hit - np.cumsum(sizes) + sizes, sizes)
     when = hits.distance[rows] * digitizer.per_m
     first = np.ceil(when - CUT * digitizer.sigma).astype(np.int64)  # that is not 0
-    time = first[:, None] + np.arange(int(2 * CUT * digitizer.sigma) + 1)
-    height = exp(-0.5 * ((time - when[:, None]) / digitizer.sigma) ** 2)
-    height *= made(hits.energy)[rows, None] / each
-    place = time - begins[mine, None]
-    inside = (place >= 0) & (place < count)
-    place += count * mine[:, None]
-    samples = np.bincount(place[inside], height[inside], minlength=len(begins) * count)
-    return samples.reshape(len(begins), count).astype(np.float64)
+    sample_times = first[:, None] + np.arange(int(2 * CUT * digitizer.sigma) + 1)
+    height = exp(-0.5 * ((sample_times - when[:, None]) / digitizer.sigma) ** 2)
+    height *= made(hits.energy)[rows, None] / subrays_per_beam
+    sample = sample_times - begin[window, None]
+    inside = (sample >= 0) & (sample < count)
+    sample += count * window[:, None]
+    samples = np.bincount(sample[inside], height[inside], minlength=len(begin) * count)
+    return samples.reshape(len(begin), count).astype(np.float64)
 
 
 def digitised(samples: Floats) -> tuple[NDArray[np.uint16], NDArray[np.int8]]:
@@ -123,8 +133,8 @@ def digitised(samples: Floats) -> tuple[NDArray[np.uint16], NDArray[np.int8]]:
 
     Returns them, uint16 (n, k), and the exponents (n,).
     """
-    most = np.maximum(samples.max(axis=1) / (65_535 - ZERO), -samples.min(axis=1) / ZERO)
-    _, exponents = np.frexp(most)
-    exponents = np.clip(np.where(most > 0, exponents, SILENT), SILENT, 127)
+    scale = np.maximum(samples.max(axis=1) / (65_535 - ZERO), -samples.min(axis=1) / ZERO)
+    _, exponents = np.frexp(scale)
+    exponents = np.clip(np.where(scale > 0, exponents, SILENT), SILENT, 127)
     steps = np.rint(np.ldexp(samples, -exponents[:, None])) + ZERO
     return np.clip(steps, 0, 65_535).astype(np.uint16), exponents.astype(np.int8)

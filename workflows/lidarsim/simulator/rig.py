@@ -217,7 +217,14 @@ class Rig:
             specs[0].scan + specs[0].ahead, pattern, poses, window, groups, firings, tally=tally
         )
         return BatchPoints(
-            self.scene, self.survey, self._surfaces, specs, scanned, pattern, start, poses
+            self.scene,
+            self.survey,
+            self._surfaces,
+            specs,
+            scanned,
+            pattern=pattern,
+            start=start,
+            poses=poses,
         )
 
     def _poses(

@@ -41,10 +41,10 @@ from .rig import Rig
 from .scene_caster import check_backend_here
 from .surfaces import warn_of_grey
 
-SCANS_MOST = 1 << 31  # the type of the column `scan`
-START_MOST_S = 9e9  # times are int64, nanoseconds
-Number = Annotated[int, Field(ge=0, lt=SCANS_MOST)]
-Start = Annotated[float | None, Field(ge=0, lt=START_MOST_S)]
+MAX_SCANS = 1 << 31  # the type of the column `scan`
+MAX_START_S = 9e9  # times are int64, nanoseconds
+Number = Annotated[int, Field(ge=0, lt=MAX_SCANS)]
+Start = Annotated[float | None, Field(ge=0, lt=MAX_START_S)]
 
 
 class Scanner:
@@ -139,9 +139,9 @@ class Scanner:
             spray_g_m3=spray_g_m3,
         )
         warn_of_grey(scene, survey)
-        self._begin(scene, survey, {"backend": backend, "threads": threads, "device": device})
+        self._assemble(scene, survey, {"backend": backend, "threads": threads, "device": device})
 
-    def _begin(self, scene: Scene, survey: Survey, options: dict[str, Any]) -> None:
+    def _assemble(self, scene: Scene, survey: Survey, options: dict[str, Any]) -> None:
         """Make the rig; `options` are those of `Rig`."""
         check_backend_here(options["backend"])
         try:
@@ -168,7 +168,7 @@ class Scanner:
             return {"made_of": made_of, "unnumbered": self._unnumbered}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        self._begin(**state["made_of"])
+        self._assemble(**state["made_of"])
         self._unnumbered = state["unnumbered"]
 
     def __repr__(self) -> str:
@@ -213,7 +213,7 @@ class Scanner:
         LidarError
             If the trajectory, or that of an actor, does not last as long as the sweep.
         """
-        path = _path(pose)
+        path = _trajectory_of(pose)
         with self._casting() as rig:
             specs, late_ns = self._specs(rig, number, start_s, 1)
             begin_ns, end_ns = _span_ns(rig, specs)
@@ -233,9 +233,9 @@ class Scanner:
         table = (SCAN, *(column for column in survey.stored_columns if column not in AXES))
         part = columns_of([returns])
         # A device writes to page-locked memory with room for all rays: the next sweep needs it.
-        made = {column.name: part.columns[column.name] for column in table[1:]}
-        own = {name: v if v.flags.owndata else v.copy() for name, v in made.items()}
-        part = replace(part, columns={**part.columns, **own})
+        columns = {column.name: part.columns[column.name] for column in table[1:]}
+        owned_columns = {name: v if v.flags.owndata else v.copy() for name, v in columns.items()}
+        part = replace(part, columns={**part.columns, **owned_columns})
         return part.cloud(table, survey.precision_m, origin)
 
     @checked
@@ -268,7 +268,7 @@ class Scanner:
             If the poses are no such list or array, a number is not finite, or a matrix mirrors or
             deforms.
         """
-        positions, rotations = _placed(poses)
+        positions, rotations = _poses_of(poses)
         with self._casting() as rig:
             specs, _ = self._specs(rig, number, start_s, len(positions))
             if not len(positions):
@@ -276,10 +276,10 @@ class Scanner:
                 return np.empty((0, firings, specs[0].channels), np.float32)
             rays = sum(spec.ray_count for spec in specs)
             try:
-                made = check_poses(positions, rotations, rays, rays * len(positions), None)
+                checked_poses = check_poses(positions, rotations, rays, rays * len(positions), None)
             except ValueError as error:
                 raise LidarError(str(error)) from error
-            return rig.ranges(specs, made.positions, made.rotations)
+            return rig.ranges(specs, checked_poses.positions, checked_poses.rotations)
 
     @checked
     def move(self, name: str, pose: Pose | Trajectory | Sequence[float]) -> None:
@@ -301,7 +301,7 @@ class Scanner:
             If there is no such actor or instance, an instance would move during a sweep, or a
             rotation of the trajectory mirrors or deforms.
         """
-        path = _path(pose)
+        path = _trajectory_of(pose)
         scene = self._rig.scene
         standing = len(scene.names)
         number = self._numbers.get(name, -1)
@@ -342,8 +342,8 @@ class Scanner:
         sensor = rig.survey.sensor
         ahead = 0
         steps = sensor.steps_of_turn(number or 0)
-        if steps.stop > SCANS_MOST:
-            raise LidarError(f"number is {number}; scans are counted up to {SCANS_MOST:,}.")
+        if steps.stop > MAX_SCANS:
+            raise LidarError(f"number is {number}; scans are counted up to {MAX_SCANS:,}.")
         if number is None:
             with self._lock:
                 ahead = self._unnumbered * len(steps)
@@ -375,23 +375,25 @@ class Scanner:
 def _span_ns(rig: Rig, specs: list[ScanSpec]) -> tuple[float, float]:
     """When the first and the last firing of scans begin, nanoseconds."""
     sensor = rig.survey.sensor
-    ends = np.array([specs[0].firings[0], specs[-1].firings[1] - 1], np.int64)
-    begin, end = (sensor.begins_ns(ends) + (sensor.lead_ns + specs[0].start_ns)).tolist()
+    first_and_last = np.array([specs[0].firings[0], specs[-1].firings[1] - 1], np.int64)
+    begin, end = (sensor.begins_ns(first_and_last) + (sensor.lead_ns + specs[0].start_ns)).tolist()
     return begin, end
 
 
-def _path(given: Any) -> Trajectory:
-    path: Trajectory = given if hasattr(given, "poses") else Stations((pose_of("pose", given),))
+def _trajectory_of(pose: Any) -> Trajectory:
+    path: Trajectory = pose if hasattr(pose, "poses") else Stations((pose_of("pose", pose),))
     return path
 
 
-def _placed(poses: Any) -> tuple[Floats, Floats | None]:
+def _poses_of(poses: Any) -> tuple[Floats, Floats | None]:
     """Positions (k, 3) and rotations (k, 3, 3), or None."""
     if isinstance(poses, Pose):
         poses = [poses]
     if isinstance(poses, Sequence) and any(isinstance(pose, Pose) for pose in poses):
-        made = [pose_of("a pose", pose) for pose in poses]
-        return np.array([pose.position for pose in made]), np.array([pose.turn for pose in made])
+        valid_poses = [pose_of("a pose", pose) for pose in poses]
+        return np.array([pose.position for pose in valid_poses]), np.array(
+            [pose.turn for pose in valid_poses]
+        )
     try:
         table = np.asarray(poses, np.float64)
     except (TypeError, ValueError):
