@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -17,7 +19,20 @@ from .waveform import Digitizer
 
 SAMPLES = Purpose(50, "stream of the samples of a waveform")
 SAMPLE = Purpose(51, "noise of a sample")
-BLOCK_SAMPLES = 1 << 20  # that are made at a time
+BLOCK_SAMPLES = 1 << 20  # samples that are computed at a time
+
+
+class Windows(NamedTuple):
+    """Windows of consecutive samples of waveforms: arrays (n,)."""
+
+    beam: Ints  # counted from the first beam of the batch
+    begin: Ints  # first sample, counted from firing
+    first_hit: Ints  # row of the first hit of the beam
+    stop_hit: Ints  # one past the row of the last hit of the beam
+
+    def take(self, rows: slice) -> Windows:
+        """Return the windows of a slice."""
+        return Windows(*(column[rows] for column in self))
 
 
 class RecordingStep(PulseStep):
@@ -31,107 +46,108 @@ class RecordingStep(PulseStep):
 
     @staticmethod
     def applies(setup: Setup) -> bool:
-        """See `PulseStep.applies`."""
+        """Return True if waveforms are recorded."""
         return setup.waveform_samples > 0
 
     @staticmethod
     def memory(setup: Setup, sizes: Sizes) -> Memory:
-        """See `PulseStep.memory`: samples that are made at a time, and the records."""
+        """Return the memory of a block of samples, and of the records, in bytes."""
         recorded = record(setup.waveform_samples).itemsize * sizes.returns
         sampled = 40 * min(sizes.subrays * setup.waveform_samples, BLOCK_SAMPLES)
         return Memory(casting=sampled + recorded, counting=2.3 * recorded)
 
     def apply(self, returns: PulseReturns, batch: PulseBatch) -> PulseReturns:
-        """See `PulseStep.apply`.
+        """Return the returns with their recorded waveforms.
 
-        A window begins where the echo of its first return does, and returns of the same pulse share
-        it as long as their echoes end within. Windows of a pulse that overlap hold the same
+        A window starts where the signal of its first return does. Later returns of the pulse share
+        the window while their signals stop within. Overlapping windows of a pulse hold the same
         samples.
         """
-        assert batch.hits is not None  # as there are sub-rays
-        hits = batch.hits
-        subrays_per_beam = batch.subrays_per_beam
-        noise = self.setup.noise
         digitizer = Digitizer.of(self.setup)
         count = self.setup.waveform_samples
-        beams = returns.ray - batch.start
-        keys = batch.keys
-        batch_keys = Keys(keys.scan, keys.begins - batch.start)
-        records = np.zeros(len(beams), record(count))
+        records = np.zeros(len(returns.ray), record(count))
         records["sample_ps"] = round(1000 * digitizer.sample_ns)
-        time = returns.distance * digitizer.per_m
-        first = np.maximum(np.floor(time).astype(np.int64) - digitizer.reach, 0)
-        last = np.ceil(time).astype(np.int64) + digitizer.reach
-        pulse_row = numbers(beams)
-        begin = first.copy()
-        for number in range(1, int(pulse_row.max(initial=0)) + 1):
-            rows = np.flatnonzero(pulse_row == number)
-            shared = (last[rows] < begin[rows - 1] + count) & (first[rows] >= begin[rows - 1])
-            begin[rows] = np.where(shared, begin[rows - 1], first[rows])
-        starts_window = (pulse_row == 0) | (np.diff(begin, prepend=-1) != 0)
-        window = np.cumsum(starts_window) - 1
-        beam = beams[starts_window]
-        window_begin = begin[starts_window]
-        first_hit, stop_hit = (
-            np.searchsorted(hits.ray, (beam + step) * subrays_per_beam) for step in (0, 1)
-        )
-        unit = max(count, subrays_per_beam * (2 * digitizer.reach + 1))
-        size = max(1, BLOCK_SAMPLES // unit)
-        records["begin"] = begin
-        for start in range(0, len(beam), size):
-            block = slice(start, start + size)
-            samples = _window(
-                hits,
-                digitizer,
-                subrays_per_beam,
-                window_begin[block],
-                first_hit[block],
-                stop_hit[block],
-                count,
-            )
-            if noise.threshold:
-                scan, ray = batch_keys.of(beam[block])
-                stream = raw(noise.seed, SAMPLES, scan, ray)[:, None]
-                number = window_begin[block, None] + np.arange(count)
-                drawn = normal(noise.seed, SAMPLE, stream, number >> 8, number & 255)
-                samples += (noise.threshold / THRESHOLD_SIGMAS) * drawn
-            steps, exponents = digitised(np.minimum(samples, noise.full))
-            low_row, high_row = np.searchsorted(window, [start, start + size])
-            window_row = window[low_row:high_row] - start
-            records["samples"][low_row:high_row] = steps[window_row]
-            records["exponent"][low_row:high_row] = exponents[window_row]
+        windows, window_of_return = _windows(returns, batch, digitizer, count)
+        records["begin"] = windows.begin[window_of_return]
+        samples_per_window = max(count, batch.subrays_per_beam * (2 * digitizer.reach + 1))
+        size = max(1, BLOCK_SAMPLES // samples_per_window)
+        for start in range(0, len(windows.beam), size):
+            block = windows.take(slice(start, start + size))
+            samples = _sampled(batch, digitizer, block, count)
+            steps, exponents = digitised(self._received(samples, block, batch))
+            first, stop = np.searchsorted(window_of_return, [start, start + size])
+            rows = window_of_return[first:stop] - start
+            records["samples"][first:stop] = steps[rows]
+            records["exponent"][first:stop] = exponents[rows]
         return returns._replace(waveform=records)
 
+    def _received(self, samples: Floats, windows: Windows, batch: PulseBatch) -> Floats:
+        """Add the receiver's noise to samples (windows, count) in place; return clipped samples."""
+        noise = self.setup.noise
+        if noise.threshold:
+            keys = Keys(batch.keys.scan, batch.keys.begins - batch.start)
+            scan, ray = keys.of(windows.beam)
+            stream = raw(noise.seed, SAMPLES, scan, ray)[:, None]
+            number = windows.begin[:, None] + np.arange(samples.shape[1])
+            errors = normal(noise.seed, SAMPLE, stream, number >> 8, number & 255)
+            samples += (noise.threshold / THRESHOLD_SIGMAS) * errors
+        return np.minimum(samples, noise.full)
 
-def _window(
-    hits: PulseReturns,
-    digitizer: Digitizer,
-    subrays_per_beam: int,
-    begin: Ints,
-    first_hit: Ints,
-    stop_hit: Ints,
-    count: int,
-) -> Floats:
-    """Sample the waveforms of some windows, of the hits from `first_hit` to `stop_hit`: (windows, count)."""
-    sizes = stop_hit - first_hit
-    window = np.repeat(np.arange(len(begin)), sizes)
-    rows = np.arange(len(window)) + np.repeat(first_hit - np.cumsum(sizes) + sizes, sizes)
-    when = hits.distance[rows] * digitizer.per_m
-    first = np.ceil(when - CUT * digitizer.sigma).astype(np.int64)  # that is not 0
+
+def _window_starts(distance: Floats, pulse_row: Ints, digitizer: Digitizer, count: int) -> Ints:
+    """Return the first sample of the window of each return (n,), in samples after firing.
+
+    `pulse_row` numbers the returns of a pulse; windows have `count` samples.
+    """
+    time = distance * digitizer.per_m
+    first = np.maximum(np.floor(time).astype(np.int64) - digitizer.reach, 0)
+    last = np.ceil(time).astype(np.int64) + digitizer.reach
+    begin = first.copy()
+    for number in range(1, int(pulse_row.max(initial=0)) + 1):
+        rows = np.flatnonzero(pulse_row == number)
+        shared = (last[rows] < begin[rows - 1] + count) & (first[rows] >= begin[rows - 1])
+        begin[rows] = np.where(shared, begin[rows - 1], first[rows])
+    return begin
+
+
+def _windows(
+    returns: PulseReturns, batch: PulseBatch, digitizer: Digitizer, count: int
+) -> tuple[Windows, Ints]:
+    """Return the windows of returns, of `count` samples each, and the window of each return."""
+    pulse_row = numbers(returns.ray)
+    begin = _window_starts(returns.distance, pulse_row, digitizer, count)
+    starts_window = (pulse_row == 0) | (np.diff(begin, prepend=-1) != 0)
+    beam = returns.ray[starts_window] - batch.start
+    ray = made(batch.hits).ray
+    first_hit = np.searchsorted(ray, beam * batch.subrays_per_beam)
+    stop_hit = np.searchsorted(ray, (beam + 1) * batch.subrays_per_beam)
+    windows = Windows(beam, begin[starts_window], first_hit, stop_hit)
+    return windows, np.cumsum(starts_window) - 1
+
+
+def _sampled(batch: PulseBatch, digitizer: Digitizer, windows: Windows, count: int) -> Floats:
+    """Return the samples of the signals of hits in windows, without noise: (windows, count)."""
+    hits = made(batch.hits)
+    hit_counts = windows.stop_hit - windows.first_hit
+    window = np.repeat(np.arange(len(hit_counts)), hit_counts)
+    first_rows = windows.first_hit - np.cumsum(hit_counts) + hit_counts
+    rows = np.arange(len(window)) + np.repeat(first_rows, hit_counts)
+    time = hits.distance[rows] * digitizer.per_m
+    first = np.ceil(time - CUT * digitizer.sigma).astype(np.int64)  # first sample above 0
     sample_times = first[:, None] + np.arange(int(2 * CUT * digitizer.sigma) + 1)
-    height = exp(-0.5 * ((sample_times - when[:, None]) / digitizer.sigma) ** 2)
-    height *= made(hits.energy)[rows, None] / subrays_per_beam
-    sample = sample_times - begin[window, None]
+    height = exp(-0.5 * ((sample_times - time[:, None]) / digitizer.sigma) ** 2)
+    height *= made(hits.energy)[rows, None] / batch.subrays_per_beam
+    sample = sample_times - windows.begin[window, None]
     inside = (sample >= 0) & (sample < count)
     sample += count * window[:, None]
-    samples = np.bincount(sample[inside], height[inside], minlength=len(begin) * count)
-    return samples.reshape(len(begin), count).astype(np.float64)
+    samples = np.bincount(sample[inside], height[inside], minlength=len(hit_counts) * count)
+    return samples.reshape(len(hit_counts), count).astype(np.float64)
 
 
 def digitised(samples: Floats) -> tuple[NDArray[np.uint16], NDArray[np.int8]]:
-    """Round samples (n, k) to whole numbers from `ZERO`, of a power of two that holds all of each.
+    """Round samples (n, k) to integers around `ZERO`, in steps of a power of two for each row.
 
-    Returns them, uint16 (n, k), and the exponents (n,).
+    Returns the integers, uint16 (n, k), and the exponents of the steps (n,).
     """
     scale = np.maximum(samples.max(axis=1) / (65_535 - ZERO), -samples.min(axis=1) / ZERO)
     _, exponents = np.frexp(scale)
