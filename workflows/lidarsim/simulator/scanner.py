@@ -188,7 +188,7 @@ class Scanner:
         number: Number | None = None,
         start_s: Start = None,
     ) -> Cloud:
-        """Scan one sweep: a revolution of the head, or a frame.
+        """Scan a sweep: a revolution of the head, or a frame.
 
         Parameters
         ----------
@@ -398,9 +398,8 @@ def _poses_of(poses: Any) -> tuple[Floats, Floats | None]:
         poses = [poses]
     if isinstance(poses, Sequence) and any(isinstance(pose, Pose) for pose in poses):
         valid_poses = [pose_of("a pose", pose) for pose in poses]
-        return np.array([pose.position for pose in valid_poses]), np.array(
-            [pose.turn for pose in valid_poses]
-        )
+        positions = np.array([pose.position for pose in valid_poses])
+        return positions, np.array([pose.turn for pose in valid_poses])
     try:
         table = np.asarray(poses, np.float64)
     except (TypeError, ValueError):
