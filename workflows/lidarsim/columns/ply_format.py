@@ -28,20 +28,22 @@ _PLY_TYPES = {
 
 
 # Types in files: types that Open3D writes, or wider types.
-_HELD = {"u1": "u1", "u2": "<u2", "i1": "<i4", "i2": "<i4", "i4": "<i4", "f4": "<f4", "f8": "<f8",
-         "u4": "<f8", "i8": "<f8", "u8": "<f8"}  # fmt: skip
+_FILE_TYPES = {
+    "u1": "u1", "u2": "<u2", "i1": "<i4", "i2": "<i4", "i4": "<i4", "f4": "<f4", "f8": "<f8",
+    "u4": "<f8", "i8": "<f8", "u8": "<f8",
+}  # fmt: skip
 _NAMES = {"<f4": "float", "<f8": "double", "<i4": "int", "<u2": "uint16", "|u1": "uchar"}
 _EXACT = 2**53  # integers up to this limit are exact in double precision
 
 
-def held_type(column: Column) -> np.dtype[Any]:
+def file_type(column: Column) -> np.dtype[Any]:
     """Return the type of a column in a file."""
-    return np.dtype(_HELD.get(np.dtype(column.dtype).str[1:], "<f8"))
+    return np.dtype(_FILE_TYPES.get(np.dtype(column.dtype).str[1:], "<f8"))
 
 
-def as_held(column: Column, values: AnyArray) -> AnyArray:
+def as_file_type(column: Column, values: AnyArray) -> AnyArray:
     """Convert values of a column to the type in a file; LidarError if a value would be inexact."""
-    dtype = held_type(column)
+    dtype = file_type(column)
     if dtype == np.float64 and values.dtype.kind in "iu" and len(values):
         largest = max(abs(int(values.min())), abs(int(values.max())))
         if largest > _EXACT:
@@ -58,7 +60,7 @@ def row_type(position_type: np.dtype[np.floating], table: Sequence[Column]) -> n
     A row of Open3D has the same size and a different order, that of a hash table.
     """
     kind = "<f8" if position_type == np.float64 else "<f4"
-    return np.dtype([(axis, kind) for axis in AXES] + [(c.in_files, held_type(c)) for c in table])
+    return np.dtype([(axis, kind) for axis in AXES] + [(c.in_files, file_type(c)) for c in table])
 
 
 def header(row: np.dtype[np.void], count: int, comments: str = "") -> bytes:

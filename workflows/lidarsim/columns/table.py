@@ -232,7 +232,7 @@ COLOURS = ("red", "green", "blue")
 TABLE = {column.name: column for column in (SCAN, *ALWAYS, *OPTIONAL)}  # {name: column}
 
 
-def chosen(columns: Iterable[str | Column]) -> tuple[Column, ...]:
+def optional_columns(columns: Iterable[str | Column]) -> tuple[Column, ...]:
     """Return the columns in addition to `ALWAYS`, without repetitions; names are of `TABLE`.
 
     LidarError if a name is unknown, two columns have the same name, a vector lacks an axis, or a
@@ -283,7 +283,7 @@ def check_names(columns: Iterable[Column]) -> None:
         used_names.add(name)
 
 
-def by_value(names: Mapping[int, str]) -> list[str]:
+def value_names(names: Mapping[int, str]) -> list[str]:
     """Return the names of the values 0, 1, 2, … of a column; empty for values not in `names`."""
     return [names.get(value, "") for value in range(max(names, default=-1) + 1)]
 

@@ -34,7 +34,7 @@ def record(samples: int) -> np.dtype[np.void]:
     )
 
 
-_REST = record(0).itemsize
+_RECORD_BYTES = record(0).itemsize
 
 
 def column_type(samples: int) -> str:
@@ -44,7 +44,7 @@ def column_type(samples: int) -> str:
 
 def records(column: AnyArray) -> Records:
     """Return a column (n,) as records, see `record`."""
-    return column.view(record((column.dtype.itemsize - _REST) // 2))
+    return column.view(record((column.dtype.itemsize - _RECORD_BYTES) // 2))
 
 
 @dataclass(frozen=True, eq=False)

@@ -22,7 +22,7 @@ from ..sensor.noise import THRESHOLD_SIGMAS
 from ..sensor.random_numbers import Purpose, named_seed, starts
 from ..sensor.weather import FAINTEST, FARTHEST_M, NODES, Air, Particles
 from ..sensor.weather import reach as reach_of
-from .doppler import approach
+from .doppler import range_rates_of_origins
 from .returns import OF_RETURNS, SURFACE, Keys, Planes, PulseReturns, joined, numbers, unreal
 from .scene_caster import SceneCaster
 from .step import Memory, PulseBatch, PulseStep, Role, Setup, Sizes
@@ -209,7 +209,9 @@ def in_the_air(
     """Leave hits in the air for `SeparationStep`, or insert them for waveforms."""
     if returns.velocity is not None:  # the air is at rest
         rays = batch.subray_poses.rays(batch.beams, drawn.ray, batch.window[0])
-        drawn = drawn._replace(velocity=approach(batch.subray_poses, drawn.ray, *rays))
+        drawn = drawn._replace(
+            velocity=range_rates_of_origins(batch.subray_poses, drawn.ray, *rays)
+        )
     if setup.in_waveforms or setup.waveform_samples:
         batch.hits, batch.planes = inserted(returns, batch.planes, drawn)
         return batch.hits

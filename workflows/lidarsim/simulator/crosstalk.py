@@ -27,7 +27,7 @@ from .scene_caster import SceneCaster
 from .step import Memory, PulseBatch, PulseStep, Role, Setup, Sizes
 from .surfaces import Surfaces
 
-OTHER = Purpose(23, "noise of the energy of another sensor's pulse")
+FOREIGN_PULSE = Purpose(23, "noise of the energy of another sensor's pulse")
 CROSSTALK = CAUSES.index("crosstalk")
 CELL_RAYS = 1 << 6  # rays that are compared with a spot at a time
 FILTER_NM = 20.0  # wavelengths that differ by more do not pass a receiver's filter
@@ -84,7 +84,7 @@ class CrosstalkStep(PulseStep):
     reads = "ray", "distance"
     writes = OF_RETURNS
     causes = (CROSSTALK,)
-    purposes = (OTHER,)
+    purposes = (FOREIGN_PULSE,)
 
     def __init__(self, setup: Setup, caster: SceneCaster, surfaces: Surfaces) -> None:
         super().__init__(setup, caster, surfaces)
@@ -123,7 +123,7 @@ class CrosstalkStep(PulseStep):
         distance = distance[order]
         energy = energy[order]
         scan, number = batch.keys.of(ray)
-        detected = passes(self.setup.noise, OTHER, energy, scan, number, numbers(ray))
+        detected = passes(self.setup.noise, FOREIGN_PULSE, energy, scan, number, numbers(ray))
         foreign_returns = unreal(
             returns, ray[detected], distance[detected], energy[detected], CROSSTALK
         )

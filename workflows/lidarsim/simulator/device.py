@@ -49,16 +49,22 @@ _NO_HITS = (np.zeros(0, np.int64), *(np.zeros(0, kind) for kind in _HITS))
 def _device_column_names(scene: Scene, survey: Survey) -> set[str]:
     """Return the names of the columns that a device can compute for a survey of a scene."""
     hazy = any(survey.extinction(carried.sensor) for carried in survey.carried)
-    several = len({carried.sensor.optics.wavelength_nm for carried in survey.carried}) > 1
-    shining = any(
-        m.reflectance == "texture" or m.roughness is not None or (several and m.spectrum)
+    several_wavelengths = (
+        len({carried.sensor.optics.wavelength_nm for carried in survey.carried}) > 1
+    )
+    textured_or_rough = any(
+        m.reflectance == "texture"
+        or m.roughness is not None
+        or (several_wavelengths and m.spectrum)
         for m in survey.materials
     )
-    able = {column.name for column in _DEVICE_COLUMNS} - {*(_ENERGIES if hazy or shining else ())}
+    computable = {column.name for column in _DEVICE_COLUMNS} - {
+        *(_ENERGIES if hazy or textured_or_rough else ())
+    }
     if scene.has_mixed_objects:  # the device has no materials of faces
-        able -= {*_ENERGIES, "class"}
-    able -= {"time"} if any(fault.by_s for fault in survey.faults) else set()
-    return able - {axis.name for axis in AXES if survey.coordinates == "sensor"}
+        computable -= {*_ENERGIES, "class"}
+    computable -= {"time"} if any(fault.by_s for fault in survey.faults) else set()
+    return computable - {axis.name for axis in AXES if survey.coordinates == "sensor"}
 
 
 def needs_hits(scene: Scene, survey: Survey) -> bool:
@@ -111,11 +117,13 @@ class DeviceColumns:
         self._surfaces = surfaces
         self.survey = survey
         stored = {column.name for column in survey.stored_columns}
-        able = _device_column_names(scene, survey)
+        computable = _device_column_names(scene, survey)
         self.all_hits = needs_hits(scene, survey)
         if self.all_hits and scene.actors:
-            able -= {*_ENERGIES}
-        self.device_columns = [column for column in _DEVICE_COLUMNS if column.name in stored & able]
+            computable -= {*_ENERGIES}
+        self.device_columns = [
+            column for column in _DEVICE_COLUMNS if column.name in stored & computable
+        ]
         self.energies = [column for column in self.device_columns if column.name in _ENERGIES]
         # Whether NumPy needs hits on actors.
         self.some_hits = bool(scene.actors and self.energies)
@@ -147,14 +155,14 @@ class DeviceColumns:
         """
         survey = self.survey
         sensor = survey.carried[specs[0].sensor].sensor
-        every = survey.keep_every
+        keep_every = survey.keep_every
         scan = check_scan(
             pattern,
             **poses.caster_arguments,
             window=window,
             t_min=sensor.min_range_m,
             t_max=sensor.max_range_m,
-            keep_every=every,
+            keep_every=keep_every,
             groups=groups,
             tally=True,
         )
@@ -163,7 +171,7 @@ class DeviceColumns:
             actor_hits = replace(
                 actor_hits, triangle=actor_hits.triangle - np.int32(self.bodies[-1, 0])
             )
-        transfer = _ColumnTransfer(self, specs, groups, -(-len(scan) // every) + len(groups))
+        transfer = _ColumnTransfer(self, specs, groups, -(-len(scan) // keep_every) + len(groups))
         try:
             hits, tally = self._caster.caster.visit(scan, transfer.make, self._counters, actor_hits)
         finally:  # else the device would write to memory that goes back to the pool
@@ -187,7 +195,7 @@ class DeviceColumns:
             self._scene,
             survey,
             specs,
-            -(-hits // every),
+            -(-hits // keep_every),
             hits,
             tally,
             columns,

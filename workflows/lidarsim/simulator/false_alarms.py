@@ -72,10 +72,10 @@ def false_alarms(
     while len(rows) or not alarms:
         number = len(alarms)
         # The time until the next false alarm is exponentially distributed.
-        drawn = uniform(noise.seed, ALARM, scan[rows], ray[rows], number)
-        in_gate = np.flatnonzero(drawn > exp(-noise.false_alarm_hz * (gate_s - since_s)))
+        uniform_numbers = uniform(noise.seed, ALARM, scan[rows], ray[rows], number)
+        in_gate = np.flatnonzero(uniform_numbers > exp(-noise.false_alarm_hz * (gate_s - since_s)))
         rows = rows[in_gate]
-        since_s = since_s[in_gate] - log(drawn[in_gate]) / noise.false_alarm_hz
+        since_s = since_s[in_gate] - log(uniform_numbers[in_gate]) / noise.false_alarm_hz
         since_s = np.minimum(since_s, gate_s)
         share = 1 - uniform(noise.seed, PEAK, scan[rows], ray[rows], number)
         peak = np.sqrt(1 - 2 / (THRESHOLD_SIGMAS * THRESHOLD_SIGMAS) * log(share))

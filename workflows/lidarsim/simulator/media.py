@@ -89,8 +89,8 @@ class MediaStack:
         column = np.arange(MAX_MEDIA)
         column = column + (column >= depth[:, None])
         for table in (self.kinds, self.triangles):
-            ended = np.pad(table[rows], ((0, 0), (0, 1)), constant_values=-1)
-            table[rows] = np.take_along_axis(ended, column, axis=1)
+            padded = np.pad(table[rows], ((0, 0), (0, 1)), constant_values=-1)
+            table[rows] = np.take_along_axis(padded, column, axis=1)
         return in_stack
 
 

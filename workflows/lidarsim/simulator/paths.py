@@ -20,7 +20,7 @@ from ..scene.colours import luminance
 from ..sensor.random_numbers import Purpose, raw
 from ..sensor.weather import FAINTEST
 from .actor_trajectories import ActorTrajectories
-from .doppler import approach, velocities_of_ends
+from .doppler import range_rates_of_origins, velocities_of_ends
 from .media import CROWN, LEAF, Draw, Leaves, LightInMedia, Media, Rays, depths
 from .motion import CastPoses, Clock, along_rings
 from .returns import OF_RETURNS, SURFACE, PulseReturns, joined, selected
@@ -189,8 +189,8 @@ class CastStep(PulseStep):
         first_light = cast.light
         parts: list[VisibleHits] = []
         for _ in range(MAX_LEAFY_PASSES if self._leafy else MAX_PASSES):
-            surface_hits = self._meet(cast, batch)
-            parts.append(self._see(cast.light, surface_hits))
+            surface_hits = self._surface_hits(cast, batch)
+            parts.append(self._visible_hits(cast.light, surface_hits))
             onward = self._continue(cast.light, surface_hits, parts[-1], batch.subrays_per_beam)
             if onward is None:
                 break
@@ -256,7 +256,7 @@ class CastStep(PulseStep):
         light = LightPaths(ray, times, origins, directions, np.ones(count), np.zeros(count))
         media = self._media
         if setup.has_velocities:
-            light.range_rate = approach(poses, ray, origins, directions)
+            light.range_rate = range_rates_of_origins(poses, ray, origins, directions)
         if setup.has_mirrors:
             light.mirrored = np.zeros(count, np.uint8)
         deflected = setup.has_mirrors or (media is not None and media.refracts)
@@ -270,7 +270,7 @@ class CastStep(PulseStep):
 
     # -- hits --------------------------------------------------------------------------------
 
-    def _meet(self, cast: CastLight, batch: PulseBatch) -> SurfaceHits:
+    def _surface_hits(self, cast: CastLight, batch: PulseBatch) -> SurfaceHits:
         """Return the hits of light on surfaces, or on leaves before the surfaces."""
         surfaces = self.surfaces
         actor_trajectories = batch.subray_poses.actor_trajectories
@@ -361,7 +361,7 @@ class CastStep(PulseStep):
             light.times,
         )
 
-    def _see(self, light: LightPaths, surface_hits: SurfaceHits) -> VisibleHits:
+    def _visible_hits(self, light: LightPaths, surface_hits: SurfaceHits) -> VisibleHits:
         """Return the hits that the sensor may see, and the surfaces from which light continues."""
         materials = self.surfaces.at(self._light.wavelength_nm)
         velocity = None

@@ -64,7 +64,11 @@ class Rig:
         self._assemble(scene, survey, options, None)
 
     def _assemble(
-        self, scene: Scene, survey: Survey, options: dict[str, Any], like: SceneCaster | None
+        self,
+        scene: Scene,
+        survey: Survey,
+        options: dict[str, Any],
+        shared_caster: SceneCaster | None,
     ) -> None:
         self.scene = scene
         self.survey = survey
@@ -72,7 +76,7 @@ class Rig:
         self._actor_trajectories = ActorTrajectories.of(scene.actors)
         wavelengths = {carried.sensor.optics.wavelength_nm for carried in survey.carried}
         self._surfaces = Surfaces(scene, tuple(survey.materials), sorted(wavelengths))
-        self._caster = SceneCaster(scene, self._surfaces, like, **options)
+        self._caster = SceneCaster(scene, self._surfaces, shared_caster, **options)
         self._device: DeviceColumns | None = None
         self._prepare()
         check_trajectory(survey.path)

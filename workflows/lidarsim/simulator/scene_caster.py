@@ -75,7 +75,11 @@ class SceneCaster:
     """
 
     def __init__(
-        self, scene: Scene, surfaces: Surfaces, like: SceneCaster | None = None, **options: Any
+        self,
+        scene: Scene,
+        surfaces: Surfaces,
+        shared_caster: SceneCaster | None = None,
+        **options: Any,
     ) -> None:
         self._surfaces = surfaces
         self._shared = scene.instances
@@ -90,11 +94,11 @@ class SceneCaster:
         reach = np.float32(np.abs(scene.bounds).max())
         self.clear_m = max(1e-5, 4 * float(np.spacing(reach)))
         self._media = surfaces.media
-        if like is None or like._media != self._media:
+        if shared_caster is None or shared_caster._media != self._media:
             vertices = surfaces.spread_out(1.5 * self.clear_m)
             self.caster: RayCaster = _caster_of(scene, vertices, options)
         else:
-            self.caster = like.caster
+            self.caster = shared_caster.caster
         self._shapes = _shapes(scene.actors, options)
         sizes = [len(actor.mesh.faces) for actor in scene.actors]
         # First triangle of each actor.

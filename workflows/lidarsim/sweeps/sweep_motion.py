@@ -109,7 +109,7 @@ def knots_of(survey: Survey, lidars: Sequence[LidarTraits], rotations: Floats) -
             for part in np.array_split(rows, -(-len(rows) * count // _POSES) or 1):
                 times_ns = begins_ns[part, None] + np.linspace(0, 1, count) * span[part, None]
                 mount = survey.carried[number].mount
-                knots[first + part] = _relative(
+                knots[first + part] = _relative_poses(
                     path, station, times_ns, mount, rotations[first + part]
                 )
         first += len(span)
@@ -141,7 +141,7 @@ def _cast_at(survey: Survey, number: int) -> tuple[Ints, Floats]:
     return stations, begins_ns
 
 
-def _relative(
+def _relative_poses(
     path: Trajectory, station: int, times_ns: Floats, mount: Pose, sent_rotations: Floats
 ) -> Floats:
     """Return the knots (k, m, 7) of sweeps at times (k, m), see `knots_of`.
@@ -156,12 +156,12 @@ def _relative(
     rotations = (rotations @ mount.turn).reshape(*shape, 3, 3)
     starts = rotations[:, :1]
     # In the sensor frame at the start of the cast sweep, then of the sent sweep.
-    apart = (positions - positions[:, :1]) @ starts[:, 0]
+    displacement = (positions - positions[:, :1]) @ starts[:, 0]
     since = starts.swapaxes(2, 3) @ rotations
     quaternions = quaternions_of(since.reshape(-1, 3, 3)).reshape(*shape, 4)
     flips = (quaternions[:, 1:] * quaternions[:, :-1]).sum(axis=2) < 0
     quaternions[:, 1:] *= 1 - 2 * (np.cumsum(flips, axis=1)[..., None] % 2)
-    return np.concatenate([apart @ sent_rotations.transpose(0, 2, 1), quaternions], axis=2)
+    return np.concatenate([displacement @ sent_rotations.transpose(0, 2, 1), quaternions], axis=2)
 
 
 def poses_at(knots: Floats32, position: Floats, rotation: Floats, shares: Floats) -> FiringPoses:

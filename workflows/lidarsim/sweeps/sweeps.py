@@ -40,8 +40,8 @@ IN_WORLD = "points in the axes of the world"
 _PIECE = 250_000  # points that a thread or task reads at a time; several may read
 _FORMAT = 6
 # Fields of `Sweeps` in a file, by their names: as arrays, and as JSON.
-_ARRAYS = ("scans", "begins_ns", "ends_ns", "sensor", "actor_bounds", "actor_there", "knots")
-_WORDS = (
+_ARRAY_FIELDS = ("scans", "begins_ns", "ends_ns", "sensor", "actor_bounds", "actor_there", "knots")
+_JSON_FIELDS = (
     "sensors", "objects", "actors", "coordinates", "precision_m", "epsg", "start_ns", "stations",
     "station_ns",
 )  # fmt: skip
@@ -197,16 +197,16 @@ class Sweeps:
             jump for jump in self.faults if jump.kind == "time_jump" and jump.sensor in sensors
         ]
         since_begin = stamps - begin_ns
-        gap = np.full(len(stamps), np.inf)
+        smallest_distance = np.full(len(stamps), np.inf)
         for count in range(1 + len(jumps)) if jumps else ():
             for faults in combinations(jumps, count):
                 candidate = stamps - sum(round((fault.by_s or 0) * 1e9) for fault in faults)
-                stated = sum((fault.jumps_ns(candidate) for fault in jumps), candidate)
+                stated_stamps = sum((fault.jumps_ns(candidate) for fault in jumps), candidate)
                 # If several times give a stamp, the time closest to the point's scan counts.
                 distance = np.abs(candidate - begin_ns - by_scan)
-                better = (stated == stamps) & (distance < gap)
+                better = (stated_stamps == stamps) & (distance < smallest_distance)
                 since_begin = np.where(better, candidate - begin_ns, since_begin)
-                gap = np.where(better, distance, gap)
+                smallest_distance = np.where(better, distance, smallest_distance)
         return np.asarray(since_begin, np.float64)
 
     def bounds(self, sweep: int) -> Floats:
@@ -221,8 +221,8 @@ class Sweeps:
         """Poses of the carrier at the start of each sweep."""
         mounts = matrices(self.mounts.quaternions)[self.sensor]
         rotations = matrices(self.pose.quaternions) @ mounts.transpose(0, 2, 1)
-        levers = np.einsum("nij,nj->ni", rotations, self.mounts.positions[self.sensor])
-        return _poses_of(self.pose.positions - levers, rotations)
+        lever_arms = np.einsum("nij,nj->ni", rotations, self.mounts.positions[self.sensor])
+        return _poses_of(self.pose.positions - lever_arms, rotations)
 
     @cached_property
     def all_names(self) -> tuple[str, ...]:
@@ -350,7 +350,7 @@ class Sweeps:
 
     def packed(self) -> bytes:
         """Return the sweeps as a NumPy archive: equal sweeps have equal bytes."""
-        values = {"format": _FORMAT, **{name: getattr(self, name) for name in _WORDS}}
+        values = {"format": _FORMAT, **{name: getattr(self, name) for name in _JSON_FIELDS}}
         values["lidars"] = [lidar.to_json() for lidar in self.lidars]
         if self.instruments is not None:
             values["instruments"] = self.instruments.to_json()
@@ -358,7 +358,7 @@ class Sweeps:
         values |= {"materials": self.materials} if self.materials else {}
         values |= {"faults": [fault.words() for fault in self.faults]} if self.faults else {}
         arrays: dict[str, Any] = {"words": np.frombuffer(json.dumps(values).encode(), np.uint8)}
-        arrays |= {name: getattr(self, name) for name in _ARRAYS}
+        arrays |= {name: getattr(self, name) for name in _ARRAY_FIELDS}
         poses_by_prefix = {"": self.pose, "mount_": self.mounts, "actor_": self.actor_poses}
         for prefix, poses in poses_by_prefix.items():
             arrays[f"{prefix}positions"] = poses.positions
@@ -405,8 +405,8 @@ class Sweeps:
                 lidars=tuple(LidarTraits.from_json(lidar) for lidar in values["lidars"]),
                 faults=tuple(Fault(**fault) for fault in values.get("faults", ())),
                 materials=tuple(values.get("materials", ())),
-                **{name: arrays[name] for name in _ARRAYS},
-                **{name: values[name] for name in _WORDS},
+                **{name: arrays[name] for name in _ARRAY_FIELDS},
+                **{name: values[name] for name in _JSON_FIELDS},
             )
 
 
