@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -34,6 +34,14 @@ _FILE_TYPES = {
 }  # fmt: skip
 _NAMES = {"<f4": "float", "<f8": "double", "<i4": "int", "<u2": "uint16", "|u1": "uchar"}
 _EXACT = 2**53  # integers up to this limit are exact in double precision
+
+
+class PlyLayout(NamedTuple):
+    """Layout of the points in a PLY file."""
+
+    start: int  # offset of the first point, bytes
+    points: int  # number of points
+    row: np.dtype[np.void]  # type of a point
 
 
 def file_type(column: Column) -> np.dtype[Any]:
@@ -70,8 +78,8 @@ def header(row: np.dtype[np.void], count: int, comments: str = "") -> bytes:
     return (_MAGIC + "\n".join([*lines, "end_header\n"])).encode()
 
 
-def layout(path: Path) -> tuple[int, int, np.dtype[np.void]]:
-    """Return the offset of the points in a PLY file, their number, and the type of a row.
+def layout(path: Path) -> PlyLayout:
+    """Return the layout of the points in a PLY file.
 
     Raises
     ------
@@ -94,7 +102,7 @@ def layout(path: Path) -> tuple[int, int, np.dtype[np.void]]:
     announced = start + count * dtype.itemsize
     if size != announced:
         raise ValueError(f"{count:,} points in {announced:,} bytes announced, {size:,} bytes there")
-    return start, count, dtype
+    return PlyLayout(start, count, dtype)
 
 
 def mapped_rows(path: Path) -> Records:

@@ -62,6 +62,14 @@ class _Spots(NamedTuple):
     distance: Floats  # from the sensor, metres
 
 
+class _Candidates(NamedTuple):
+    """Spots, and consecutive rays that may see each spot: arrays (k,)."""
+
+    spot: Indices
+    start: Indices  # row of the first ray in `_WaitingRays.order`
+    stop: Indices  # one past the row of the last ray
+
+
 class _Sightings(NamedTuple):
     """Rays and spots in their field of view: arrays (k,)."""
 
@@ -173,12 +181,14 @@ class CrosstalkStep(PulseStep):
         """Return the spots in the fields of view of rays while the rays wait."""
         from . import stray_loops  # not before: numba takes half a second to import
 
-        pairs = self._candidates(waiting, spots)
-        max_count = int(np.maximum(pairs[2] - pairs[1], 0).sum())
+        candidates = self._candidates(waiting, spots)
+        max_count = int(np.maximum(candidates.stop - candidates.start, 0).sum())
         row, spot = np.empty((2, max_count), np.int64)
         distance, path_m = np.empty((2, max_count))
         count = stray_loops.received(
-            *pairs,
+            candidates.spot,
+            candidates.start,
+            candidates.stop,
             waiting.order,
             owned(waiting.fired),
             owned(waiting.origins),
@@ -195,11 +205,10 @@ class CrosstalkStep(PulseStep):
         )
         return _Sightings(row[:count], spot[:count], distance[:count], path_m[:count])
 
-    def _candidates(self, waiting: _WaitingRays, spots: _Spots) -> tuple[Indices, Indices, Indices]:
-        """Return spots, and for each spot the rays that may receive its light.
+    def _candidates(self, waiting: _WaitingRays, spots: _Spots) -> _Candidates:
+        """Return spots, and for each spot the rays that may receive the light of the spot.
 
         The rays wait while the light of the spot arrives, and their cell looks towards the spot.
-        They are consecutive in `waiting.order`: returns start and stop.
         """
         times = waiting.fired[waiting.order]
         nearest_firing = np.minimum(np.searchsorted(times, spots.time), len(times) - 1)
@@ -217,7 +226,7 @@ class CrosstalkStep(PulseStep):
         spot = spot[in_view]
         cell = cell[in_view]
         first_row = np.maximum(first[spot], cell * CELL_RAYS)
-        return spot, first_row, np.minimum(stop[spot], (cell + 1) * CELL_RAYS)
+        return _Candidates(spot, first_row, np.minimum(stop[spot], (cell + 1) * CELL_RAYS))
 
     def _cells(self, directions: Floats) -> tuple[Floats, Floats]:
         """Return the axes (c, 3) and opening angles (c,), radians, of cones of consecutive rays.

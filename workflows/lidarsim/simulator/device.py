@@ -209,9 +209,13 @@ class DeviceColumns:
             materials = self._surfaces.materials
             normals = surfaces.unit_normals if self.energies else np.zeros((1, 3), np.float32)
             tables = (
-                self.bodies, surfaces.owners, normals, materials.reflectance,
-                materials.retro.astype(np.uint8), materials.semantic_class,
-            )  # fmt: skip
+                self.bodies,
+                surfaces.owners,
+                normals,
+                materials.reflectance,
+                materials.retro.astype(np.uint8),
+                materials.semantic_class,
+            )
             self._surface_tables = tuple(to_device(cupy, table) for table in tables)
         if self._rotations is None:
             self._rotations = to_device(cupy, self._surfaces.bodies()[1])
@@ -258,17 +262,28 @@ class _ColumnTransfer:
         }
         flags = sum(1 << _DEVICE_COLUMNS.index(column) for column in computed)
         arguments = (
-            hits.ray, hits.distance, hits.triangle, hits.instance, *hits.rays(),
-            np.int64(len(hits)), np.int32(flags), *transfer.kernel_arguments, *arrays.values(),
-        )  # fmt: skip
+            hits.ray,
+            hits.distance,
+            hits.triangle,
+            hits.instance,
+            *hits.rays(),
+            np.int64(len(hits)),
+            np.int32(flags),
+            *transfer.kernel_arguments,
+            *arrays.values(),
+        )
         transfer.kernel((-(-len(hits) // _BLOCK),), (_BLOCK,), arguments)
         return arrays
 
     def _actor_hits(self, hits: DeviceHits) -> tuple[AnyArray, ...]:
         """Return the rows of the hits on actors, and their rays, distances and triangles."""
         on_actors = hits.cupy.flatnonzero(hits.instance == len(self._maker.bodies) - 1)
-        columns = (on_actors, hits.ray[on_actors], hits.distance[on_actors],
-                   hits.triangle[on_actors])  # fmt: skip
+        columns = (
+            on_actors,
+            hits.ray[on_actors],
+            hits.distance[on_actors],
+            hits.triangle[on_actors],
+        )
         rows, ray, distance, triangle = (array.get() for array in columns)
         triangle += np.int32(self._maker.bodies[-1, 0])
         return self._count + rows, ray, distance, triangle
@@ -316,13 +331,23 @@ class _ColumnTransfer:
         firings = np.arange(specs[0].firings[0], specs[-1].firings[1], dtype=np.int64)
         return (
             np.float64(maker.survey.precision_m),
-            cupy.asarray(self._groups), np.int32(len(specs)),
-            cupy.asarray(sensor.begins_ns(firings)), cupy.asarray(sensor.beams.time_ns),
-            np.int32(sensor.channels), np.int64(specs[0].start_ns),
-            bodies, owners, normals, rotations,
-            reflectance, retro, np.float64(RETRO_GAIN), np.float64(REFERENCE_M),
-            np.float64(NEAREST_M), classes,
-        )  # fmt: skip
+            cupy.asarray(self._groups),
+            np.int32(len(specs)),
+            cupy.asarray(sensor.begins_ns(firings)),
+            cupy.asarray(sensor.beams.time_ns),
+            np.int32(sensor.channels),
+            np.int64(specs[0].start_ns),
+            bodies,
+            owners,
+            normals,
+            rotations,
+            reflectance,
+            retro,
+            np.float64(RETRO_GAIN),
+            np.float64(REFERENCE_M),
+            np.float64(NEAREST_M),
+            classes,
+        )
 
 
 @dataclass(frozen=True, eq=False)

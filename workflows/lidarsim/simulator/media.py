@@ -179,9 +179,9 @@ class Media:
         self._angles = table.leaf_angles
         # The value of the kind -1, no surface, is 0: the last entry.
         self._area, self._index, self._attenuation = (
-            np.append(values, 0.0) for values in (table.leaf_area, table.refractive_index,
-                                                  table.attenuation)
-        )  # fmt: skip
+            np.append(values, 0.0)
+            for values in (table.leaf_area, table.refractive_index, table.attenuation)
+        )
         self._angle = np.append(table.leaf_angle, 0)
         closed, self._inwards = surfaces.solids
         for number in np.flatnonzero(table.leafy).tolist():

@@ -113,6 +113,14 @@ class Crossings(NamedTuple):
     velocities: Floats | None  # of the surfaces: a moving surface that bends light shifts the range
 
 
+class OnwardRows(NamedTuple):
+    """Rows of light that continues: arrays (k,)."""
+
+    rows: Indices
+    reflected: Bools  # whether a surface mirrors the light
+    share: Floats  # of the energy that returns
+
+
 class Deflection(NamedTuple):
     """Light behind surfaces that refract or mirror: arrays (n,), vectors (n, 3)."""
 
@@ -435,11 +443,10 @@ class CastStep(PulseStep):
 
     def _divide(
         self, light: LightPaths, surface_hits: SurfaceHits, rows: Indices, reflected: Bools
-    ) -> tuple[Indices, Bools, Floats]:
-        """Compute the shares of the energy of light that surfaces transmit or mirror.
+    ) -> OnwardRows:
+        """Compute the energy of light that surfaces transmit or mirror; drop faint light.
 
-        Returns the rows of light that is not too faint, whether the light is reflected, and its
-        share: (k,) each. `rows` and `reflected` are overwritten.
+        The arrays `rows` and `reflected` are overwritten.
         """
         from . import surface_loops  # not before: numba takes half a second to import
 
@@ -454,13 +461,25 @@ class CastStep(PulseStep):
         share = np.empty(len(rows))
         film = np.zeros(0, np.bool_) if surface_hits.film is None else surface_hits.film
         count = surface_loops.onward(
-            rows, reflected, surface_hits.kinds, surface_hits.cosines,
-            materials.shares(surface_hits.kinds[rows], bright), self._light.wet, film, light.share,
-            surface_hits.distance, materials.specular, materials.passes, ~materials.refracts,
-            materials.leafy, self._brightest, self._light.extinction,
-            self._faintest if drops_faint else -1.0, share,
-        )  # fmt: skip
-        return rows[:count], reflected[:count], share[:count]
+            rows,
+            reflected,
+            surface_hits.kinds,
+            surface_hits.cosines,
+            materials.shares(surface_hits.kinds[rows], bright),
+            self._light.wet,
+            film,
+            light.share,
+            surface_hits.distance,
+            materials.specular,
+            materials.passes,
+            ~materials.refracts,
+            materials.leafy,
+            self._brightest,
+            self._light.extinction,
+            self._faintest if drops_faint else -1.0,
+            share,
+        )
+        return OnwardRows(rows[:count], reflected[:count], share[:count])
 
     def _cast_again(self, onward: OnwardLight, actor_trajectories: ActorTrajectories) -> CastLight:
         """Cast the light behind surfaces; return the light that hits a surface within the range."""

@@ -43,6 +43,14 @@ AUTO_TAKES = "Backend 'auto' takes one that works."
 SHORT = 1e-3  # share of a distance: a ray that ends by so little before a point reaches the point
 
 
+class _NearestHits(NamedTuple):
+    """Nearest hits of rays: arrays (k,), in the order of rays."""
+
+    ray: Ints
+    distance: Floats  # metres
+    triangle: Ints32
+
+
 class _ActorShapes(NamedTuple):
     """Shapes of actors; actors of the same mesh share a shape."""
 
@@ -201,10 +209,8 @@ class SceneCaster:
             visible[hits.ray] = hits.distance > distance[hits.ray] * (1 - SHORT)
         return visible
 
-    def _with_actors(
-        self, static_hits: ScanReturns, scan: Scan, poses: CastPoses
-    ) -> tuple[Ints, Floats, Ints32]:
-        """Return rays, distances and triangles of the nearest hits on static bodies and actors."""
+    def _with_actors(self, static_hits: ScanReturns, scan: Scan, poses: CastPoses) -> _NearestHits:
+        """Return the nearest hits on static bodies and actors."""
         from . import surface_loops  # not before: numba takes half a second to import
 
         static_distance = np.full(len(scan), np.inf)
@@ -224,7 +230,7 @@ class SceneCaster:
             distance,
             triangle,
         )
-        return ray[:count], distance[:count], triangle[:count]
+        return _NearestHits(ray[:count], distance[:count], triangle[:count])
 
     def on_actors(self, scan: Scan, poses: CastPoses) -> OtherHits:
         """Find the nearest hits of rays on actors."""

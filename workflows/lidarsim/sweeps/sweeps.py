@@ -244,9 +244,21 @@ class Sweeps:
         """Return no sweeps, for points of an unknown survey, in steps of a millimetre."""
         none = SweepPoses(np.empty((0, 3)), np.empty((0, 4)))
         return cls(
-            np.zeros(1, np.int64), np.empty(0), np.empty(0), np.empty(0, np.uint8), none, none,
-            (), (), (), none, np.empty((0, 2, 3)), np.empty((0, 0), bool), "world", 0.001,
-        )  # fmt: skip
+            np.zeros(1, np.int64),
+            np.empty(0),
+            np.empty(0),
+            np.empty(0, np.uint8),
+            none,
+            none,
+            (),
+            (),
+            (),
+            none,
+            np.empty((0, 2, 3)),
+            np.empty((0, 0), bool),
+            "world",
+            0.001,
+        )
 
     @classmethod
     def from_survey(cls, survey: Survey, scene: Scene) -> Sweeps:
