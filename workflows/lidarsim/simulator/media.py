@@ -81,7 +81,7 @@ class MediaStack:
         self.triangles[rows[free], depth[free]] = triangles[free]
 
     def leave(self, rows: Indices, kinds: Ints32) -> Bools:
-        """Remove a medium from the stack of each of `rows`; return True where it was there."""
+        """Remove a medium from the stacks of `rows`; return False for rows without the medium."""
         matches = self.kinds[rows] == kinds[:, None]
         in_stack = matches.any(axis=1)
         rows = rows[in_stack]

@@ -589,11 +589,11 @@ def _range_rate_behind(
     velocities: Floats | None,
     outgoing: Floats,
 ) -> Floats | None:
-    """Return the growth of the optical path behind surfaces that move, m/s: (n,).
+    """Return the growth of the optical path behind moving surfaces and mirrors, m/s: (n,).
 
     `incoming_index` is the refractive index before the surfaces, `light.index` behind them.
     """
-    if light.range_rate is None or velocities is None:  # a mirror that moves shifts it, too
+    if light.range_rate is None or velocities is None:
         return light.range_rate
     incoming_speed = products(velocities.T, light.directions.T)
     outgoing_speed = products(velocities.T, outgoing.T)

@@ -80,10 +80,10 @@ class Rig:
         self._device: DeviceColumns | None = None
         self._prepare()
         check_trajectory(survey.path)
-        self._repeated_rays: dict[
-            tuple[int, bool], _Rays
-        ] = {}  # {(sensor, whether it moves): rays}
-        self._patterns: dict[tuple[int, int, int], Pattern] = {}  # {(sensor, first, stop): rays}
+        # {(sensor, whether it moves): rays}
+        self._repeated_rays: dict[tuple[int, bool], _Rays] = {}
+        # {(sensor, first firing, stop): rays}
+        self._patterns: dict[tuple[int, int, int], Pattern] = {}
         for number in range(len(survey.carried)):
             self._rays_of_sensor(number, survey.path.moves)
 

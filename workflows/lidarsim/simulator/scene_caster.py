@@ -40,7 +40,7 @@ from .motion import CastPoses, Clock
 from .surfaces import Surfaces
 
 AUTO_TAKES = "Backend 'auto' takes one that works."
-SHORT = 1e-3  # share of a distance: a ray that ends by so little before a point reaches the point
+REACHED = 1e-3  # share of a distance: a ray that ends this close before a point reaches the point
 
 
 class _NearestHits(NamedTuple):
@@ -206,7 +206,7 @@ class SceneCaster:
         if len(distance):
             poses = CastPoses(np.zeros(3), clock=Clock(times, np.zeros(1), actor_trajectories))
             hits = self.scan(Pattern(towards / distance[:, None], origins), poses)
-            visible[hits.ray] = hits.distance > distance[hits.ray] * (1 - SHORT)
+            visible[hits.ray] = hits.distance > distance[hits.ray] * (1 - REACHED)
         return visible
 
     def _with_actors(self, static_hits: ScanReturns, scan: Scan, poses: CastPoses) -> _NearestHits:
