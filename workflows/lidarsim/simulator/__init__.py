@@ -1,4 +1,4 @@
-"""The simulator: scene, sensors and physics make returns, and those make columns."""
+"""The simulator: from a scene and sensors to returns, and from returns to columns."""
 
 from .scanner import Scanner
 

@@ -22,7 +22,7 @@ from ..sensor.noise import THRESHOLD_SIGMAS
 from ..sensor.random_numbers import Purpose, named_seed, starts
 from ..sensor.weather import FAINTEST, FARTHEST_M, NODES, Air, Particles
 from ..sensor.weather import reach as reach_of
-from .doppler import approach
+from .doppler import range_rates_of_origins
 from .returns import OF_RETURNS, SURFACE, Keys, Planes, PulseReturns, joined, numbers, unreal
 from .scene_caster import SceneCaster
 from .step import Memory, PulseBatch, PulseStep, Role, Setup, Sizes
@@ -100,7 +100,7 @@ class WeatherStep(PulseStep):
         names = [f"kind {kind}" if kind else "" for kind in range(len(self._kinds))]
         self._seeds = [named_seed(noise.seed, name) for name in names]
         scatters = survey.backscatter_at(self._wavelength_nm)
-        self._fog = _fog_cells(air, scatters, noise.threshold, begins, ends, setup.gap_m)
+        self._fog = _fog_cells(air, scatters, noise.threshold, begins, ends, setup.half_pulse_m)
 
     @staticmethod
     def applies(setup: Setup) -> bool:
@@ -120,7 +120,7 @@ class WeatherStep(PulseStep):
 
     def apply(self, returns: PulseReturns, batch: PulseBatch) -> PulseReturns:
         """See `PulseStep.apply`."""
-        drawn = self.sampled(returns, (batch.start, batch.stop), batch.keys, batch.each)
+        drawn = self.sampled(returns, (batch.start, batch.stop), batch.keys, batch.subrays_per_beam)
         return returns if drawn is None else in_the_air(self.setup, returns, batch, drawn)
 
     def sampled(
@@ -181,7 +181,7 @@ class WeatherStep(PulseStep):
         out = np.full(len(rows), np.inf)
         same = ray[1:] == ray[:-1]
         out[:-1][same] = where[1:][same]
-        enters = (numbers(ray) % 2 == 0) & (out - where > self.setup.gap_m)
+        enters = (numbers(ray) % 2 == 0) & (out - where > self.setup.half_pulse_m)
         reach = reach.copy()
         np.minimum.at(reach, ray[enters], where[enters])
         return reach
@@ -208,9 +208,11 @@ def in_the_air(
 ) -> PulseReturns:
     """Leave hits in the air for `SeparationStep`, or insert them for waveforms."""
     if returns.velocity is not None:  # the air is at rest
-        rays = batch.here.rays(batch.beams, drawn.ray, batch.window[0])
-        drawn = drawn._replace(velocity=approach(batch.here, drawn.ray, *rays))
-    if setup.in_waveforms or setup.recorded:
+        rays = batch.subray_poses.rays(batch.beams, drawn.ray, batch.window[0])
+        drawn = drawn._replace(
+            velocity=range_rates_of_origins(batch.subray_poses, drawn.ray, *rays)
+        )
+    if setup.in_waveforms or setup.waveform_samples:
         batch.hits, batch.planes = inserted(returns, batch.planes, drawn)
         return batch.hits
     if batch.air is not None:

@@ -68,7 +68,7 @@ class PulseCaster:
             return PulseBatch(keys, start, stop, pattern, first, poses, firings, self.emitter)
 
         whole = batch(0, rays)
-        if self._setup.several:
+        if self._setup.has_several_returns:
             unit = poses.rays_per_pose or self._setup.sensor.channels
             size = max(1, CHUNK_RAYS // (len(self.emitter) * unit)) * unit
             begins = range(0, rays, size)
@@ -78,7 +78,7 @@ class PulseCaster:
             found = self._once(whole, groups, tally)
         returns = found.returns
         for step in self.steps:
-            if Role.OF_KEPT in step.role:
+            if Role.ON_REPORTED in step.role:
                 returns = step.apply(returns, whole)
         return self._in_range(found._replace(returns=returns), groups)
 
@@ -117,7 +117,7 @@ class PulseCaster:
         """Take the pulses of a batch through all steps."""
         returns = PulseReturns.none()
         for step in self.steps:
-            if Role.OF_KEPT not in step.role:
+            if Role.ON_REPORTED not in step.role:
                 returns = step.apply(returns, batch)
         return returns
 
@@ -153,16 +153,18 @@ class PulseCaster:
         distance = returns.distance
         triangle = returns.triangle
         colour = velocity = None
-        if setup.moving:
+        if setup.has_velocities:
             given = returns.ray, rays, distance, triangle, times
             velocity = radial_velocities(surfaces, poses, *given)
         if surfaces.materials.textured:
             ends = directions * distance[:, None]
             ends += origins
-            colour = surfaces.colours(triangle, ends, times, poses.ways)
+            colour = surfaces.colours(triangle, ends, times, poses.actor_trajectories)
             del ends  # which takes as much memory as the normals
         light = light_of(setup.survey, setup.sensor)
-        lit = surfaces.lit(triangle, directions, distance, light, times, poses.ways, colour)
+        lit = surfaces.lit(
+            triangle, directions, distance, light, times, poses.actor_trajectories, colour
+        )
         return returns._replace(energy=lit.energy, colour=colour, velocity=velocity)
 
     def _kept(self, returns: PulseReturns, groups: Ints, tally: bool) -> Scanned:

@@ -30,7 +30,7 @@ class SaturationStep(PulseStep):
     @staticmethod
     def memory(setup: Setup, sizes: Sizes) -> Memory:
         """See `PulseStep.memory`: widths, amplitudes, and what is made of them."""
-        return Memory(kept=16 * sizes.returns, casting=120 * sizes.beams)
+        return Memory(retained=16 * sizes.returns, casting=120 * sizes.beams)
 
     def apply(self, returns: PulseReturns, batch: PulseBatch) -> PulseReturns:
         """See `PulseStep.apply`."""

@@ -151,14 +151,18 @@ class SeparationStep(PulseStep):
     @staticmethod
     def applies(setup: Setup) -> bool:
         """See `PulseStep.applies`."""
-        return setup.several and not setup.in_waveforms
+        return setup.has_several_returns and not setup.in_waveforms
 
     def apply(self, returns: PulseReturns, batch: PulseBatch) -> PulseReturns:
         """See `PulseStep.apply`."""
         setup = self.setup
-        shown = "all" if setup.receives_more else setup.reporting.mode  # then `SelectionStep`
+        shown = (
+            "all" if setup.has_received_returns else setup.reporting.mode
+        )  # then `SelectionStep`
         report = Report(shown, setup.noise, batch.keys, batch.start)
-        return separated(returns, setup.gap_m, batch.each, batch.planes, batch.air, report)
+        return separated(
+            returns, setup.half_pulse_m, batch.subrays_per_beam, batch.planes, batch.air, report
+        )
 
 
 class SelectionStep(PulseStep):
@@ -170,7 +174,7 @@ class SelectionStep(PulseStep):
     @staticmethod
     def applies(setup: Setup) -> bool:
         """See `PulseStep.applies`."""
-        return setup.receives_more
+        return setup.has_received_returns
 
     def apply(self, returns: PulseReturns, batch: PulseBatch) -> PulseReturns:
         """See `PulseStep.apply`."""

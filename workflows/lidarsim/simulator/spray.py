@@ -102,7 +102,7 @@ class SprayStep(PulseStep):
             return returns
         from . import pulse_loops, spray_loops  # not before: numba takes half a second to import
 
-        each = batch.each
+        each = batch.subrays_per_beam
         count = (batch.stop - batch.start) * each
         reach_m = reached(self._materials, self.surfaces, returns, count)
         crossings = self._crossings(batch, reach_m.reshape(-1, each).max(axis=1))
@@ -135,9 +135,11 @@ class SprayStep(PulseStep):
 
         assert self._clumps is not None
         place = along_rings(np.arange(batch.stop - batch.start), self.setup.sensor.channels)
-        times = batch.here.times(place * batch.each)
-        boxes, there, density = self._boxes(batch.here.ways, times.min(), times.max())
-        rays = np.concatenate([one.T.take(place, axis=1) for one in batch.middles])
+        times = batch.subray_poses.times(place * batch.subrays_per_beam)
+        boxes, there, density = self._boxes(
+            batch.subray_poses.actor_trajectories, times.min(), times.max()
+        )
+        rays = np.concatenate([one.T.take(place, axis=1) for one in batch.central_rays])
         far = np.minimum(far[place], self._clumps[1][0, -1])
         cell, which, size = near_boxes(rays, times, boxes, there, float(far.max()))
         order = np.argsort(cell, kind="stable")

@@ -51,7 +51,7 @@ class StrayLightStep(PulseStep):
     @staticmethod
     def memory(setup: Setup, sizes: Sizes) -> Memory:
         """See `PulseStep.memory`: a cause of each return, and rays."""
-        return Memory(kept=10 * sizes.returns, casting=120 * sizes.beams)
+        return Memory(retained=10 * sizes.returns, casting=120 * sizes.beams)
 
     def apply(self, returns: PulseReturns, batch: PulseBatch) -> PulseReturns:
         """See `PulseStep.apply`."""
@@ -60,9 +60,9 @@ class StrayLightStep(PulseStep):
         from . import stray_loops  # not before: numba takes half a second to import
 
         rays = np.arange(batch.start, batch.stop)
-        poses = batch.here
-        origins, directions = batch.middles
-        times = poses.times((rays - batch.start) * batch.each)
+        poses = batch.subray_poses
+        origins, directions = batch.central_rays
+        times = poses.times((rays - batch.start) * batch.subrays_per_beam)
         # seen from the origins
         best = np.zeros(len(rays))
         ends = np.zeros((len(rays), 3))
@@ -79,7 +79,7 @@ class StrayLightStep(PulseStep):
             turns = None
             places = np.zeros(3)
             if actor is not None:
-                places, turns = poses.ways[actor].poses(0, times)
+                places, turns = poses.actor_trajectories[actor].poses(0, times)
             seen = into_axes(origins - places, turns), into_axes(directions, turns)
             beams = [owned(vectors.T) for vectors in seen]
             cells = np.empty((-(-len(rays) // stray_loops.CELL_RAYS), 5))
@@ -100,7 +100,9 @@ class StrayLightStep(PulseStep):
         within = (distance >= low) & (distance <= high)
         row = row[within]
         distance = distance[within]
-        free = self.caster.free(origins[row], ends[row], distance, times[row], poses.ways)
+        free = self.caster.is_visible(
+            origins[row], ends[row], distance, times[row], poses.actor_trajectories
+        )
         free &= ~self._beside(returns, rays[row], distance)
         row = row[free]
         return merged(returns, unreal(returns, rays[row], distance[free], best[row], BLOOMING))
@@ -113,7 +115,7 @@ class StrayLightStep(PulseStep):
         for number in range(int((last - first).max(initial=0))):
             some = np.flatnonzero(first + number < last)
             own = returns.distance[first[some] + number]
-            beside[some] |= np.abs(own - distance[some]) <= self.setup.gap_m
+            beside[some] |= np.abs(own - distance[some]) <= self.setup.half_pulse_m
         return beside
 
 

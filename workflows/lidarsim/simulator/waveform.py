@@ -35,7 +35,7 @@ class WaveformStep(PulseStep):
 
     def apply(self, returns: PulseReturns, batch: PulseBatch) -> PulseReturns:
         """See `PulseStep.apply`."""
-        found = returns_in(returns, Digitizer.of(self.setup), batch.each, batch.planes)
+        found = returns_in(returns, Digitizer.of(self.setup), batch.subrays_per_beam, batch.planes)
         return found._replace(ray=batch.start + found.ray)
 
 
