@@ -32,5 +32,5 @@ def commit(store, first, counts, triangles, hits, job=None):
     name = part_name(store.db.meta["mark"], job.number, first, part.stop)
     store.storage.prepare()
     store.storage.write(name, data)
-    receipt = Receipt.of_part(part, job.number, name, len(data))
+    receipt = Receipt.from_part(part, job.number, name, len(data))
     return bool(store.db.commit([(store.under_way[job.number], receipt)]))

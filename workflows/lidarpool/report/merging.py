@@ -216,7 +216,7 @@ def _of_survey(place: Storage, run: Storage) -> _Part:
                 scans = shard.scans(scan_count)
                 job = CommittedJob(0, scans)
                 db.read(job)
-                if job.left:
+                if job.missing_count:
                     raise LookupError("scans are missing")
                 parts = job.parts.ordered
                 return _Part(place, record, [shard], scan_count, parts, job.trials)

@@ -43,7 +43,7 @@ from .cluster.checks import check_memory, check_workers, find_workers, gpu_note,
 from .cluster.connection import default_workers
 from .options import RunOptions
 from .pipeline.names import GPU, LIDAR, OTHER
-from .pipeline.policies import most_scans
+from .pipeline.policies import max_scans_per_batch
 from .store.database import FILE
 from .store.run_store import RUN_FOLDER
 
@@ -111,7 +111,7 @@ def forecast(
     points = estimate["points"] if estimate else job.survey.ray_count // job.survey.keep_every
     # Scans of the largest batches; small ones take less.
     fit = scans_that_fit(job.scene, job.survey, options.batch_mb * MB, on_device=backend == "cuda")
-    batch = most_scans(fit, job.survey.scan_count, max(1, cluster.slots[GPU]["there"]))
+    batch = max_scans_per_batch(fit, job.survey.scan_count, max(1, cluster.slots[GPU]["there"]))
     disk = _disk(job, points, batch, len(formats), out)
     stored = isinstance(out, Storage)
     disk_needed = disk["result"] + (0 if stored else disk["parts"])

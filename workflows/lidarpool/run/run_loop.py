@@ -186,7 +186,7 @@ class RunLoop:
         self._jobs_begun += 1
         self._scans_begun += len(job.scans)
         to_come = max(0, jobs_left - len(self._store.under_way))
-        self._pipeline.later = to_come * self._scans_begun // self._jobs_begun
+        self._pipeline.scans_to_come = to_come * self._scans_begun // self._jobs_begun
 
     def _files_of(self, under_way: JobUnderWay) -> JobFiles:
         """Return what a job that is committed is written from."""

@@ -282,7 +282,7 @@ class _Casting:
         for order in orders:
             results = fetch_available(self._client, [order.key], at=order.worker)
             if order.key not in results:
-                self._dispatcher.lost(ColumnsLost(order.key))
+                self._dispatcher.recast_columns(ColumnsLost(order.key))
                 continue
             batches = {(batch.job, batch.part.first): batch for batch in results[order.key]}
             receipts = []
@@ -290,7 +290,7 @@ class _Casting:
                 streamed = self._jobs[job]
                 batch = batches[job, first]
                 streamed.columns[first] = batch.part
-                receipt = Receipt.of_part(batch.part, job, name, 0, batch.record)
+                receipt = Receipt.from_part(batch.part, job, name, 0, batch.record)
                 receipts.append((streamed, receipt))
             self._dispatcher.release(receipts)
         return bool(orders)

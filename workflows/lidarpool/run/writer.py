@@ -63,9 +63,9 @@ def write_jobs(
     """
     recorder = Recorder(EXPORT, LIDAR)
     if not all(place.sees(*probe) for place, *probe in probes):
-        return None, recorder.done()
+        return None, recorder.finish()
     written = [_written(dataset, job) for job in jobs]
-    return written, recorder.done(sum(int(job.sweeps.scans[-1]) for job in jobs))
+    return written, recorder.finish(sum(int(job.sweeps.scans[-1]) for job in jobs))
 
 
 def _written(dataset: DataSet, job: JobFiles) -> JobOutcome:
@@ -270,6 +270,6 @@ def _fetched(key: str) -> RangeWriter:
 def _write_range(key: str, span: PieceRange) -> tuple[Range | None, TaskRecord]:
     """Write a range on a worker."""
     recorder = Recorder(EXPORT, LIDAR)
-    with explained(f"the worker {recorder.done().worker} cannot write there"):
+    with explained(f"the worker {recorder.finish().worker} cannot write there"):
         made = _fetched(key)(span)
-    return made, recorder.done(span[1] - span[0])
+    return made, recorder.finish(span[1] - span[0])

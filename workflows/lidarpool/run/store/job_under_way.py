@@ -65,7 +65,7 @@ class JobUnderWay(PipelineJob):
         """Return the receipt of a part in storage; None if the part is damaged."""
         try:
             data = self.storage.read(name)
-            return Receipt.of_part(unpack(data), self.number, name, len(data))
+            return Receipt.from_part(unpack(data), self.number, name, len(data))
         except LidarError:
             return None
         except OSError as error:
