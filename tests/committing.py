@@ -15,7 +15,7 @@ def commit(store, first, counts, triangles, hits, job=None):
     It is of the only job of a run, or of one that is under way.
     """
     rng = np.random.default_rng(first)
-    job = job or store.only.job
+    job = job or store.only_job.job
     counts = np.array(counts)
     survey = job.survey
     columns = {

@@ -17,7 +17,7 @@ from rich.console import Console
 from lidarsim.base.writing_progress import WritingProgress
 
 from ..base.streams import Unheard
-from ..run.progress import Pace, Progress, Screen, Show, bars, rows, standing_still
+from ..run.progress import Pace, Progress, Screen, Show, bars, progress_rows, standing_still
 from .shared_options import WARNED, set_logs
 
 # Plain lines come after another tenth of the elapsed time, within these bounds, so that a survey
@@ -79,7 +79,7 @@ class Terminal(Screen):
         """Show a bar for each output while the body writes them; in a log, `words` and lines."""
         console = self._console
         if console is not None:
-            with rows(console) as show:
+            with progress_rows(console) as show:
                 yield show
         else:
             with self.status(words):
@@ -96,13 +96,13 @@ class Terminal(Screen):
 
     @contextmanager
     def starting(
-        self, cluster: AbstractContextManager[Client], words: str, *, own: bool = False
+        self, cluster: AbstractContextManager[Client], words: str, *, shares_terminal: bool = False
     ) -> Iterator[Client]:
         """Show a status until the cluster has started; its workers log as this process does."""
         with ExitStack() as stack:
             with self.status(words):
                 client = stack.enter_context(cluster)
-            if own:  # its workers share the terminal
+            if shares_terminal:
                 set_logs(self.verbose)
                 client.register_worker_callbacks(partial(set_logs, self.verbose))
             yield client
@@ -160,7 +160,7 @@ class PlainLines:
             ("planning", progress.trials_done, trials, "trials", f"{trials:,} trials"),
             ("campaign", progress.jobs_done, progress.jobs, "jobs", f"{progress.jobs:,} jobs"),
         ):
-            pace = self._paces[what].told(now, count, total)
+            pace = self._paces[what].text(now, count, total)
             if total and count == total and what not in self._done:
                 self._done.add(what)
                 _tell(self.stream, f"{what}  done: {all_} in {now:.1f} s")

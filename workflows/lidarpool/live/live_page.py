@@ -108,7 +108,7 @@ class LivePage(RunPage):
 
     def begun(self, job: JobUnderWay) -> None:
         """Show the only job: what is committed from now on, and the scans of an earlier run."""
-        if job.kept:
+        if job.committed_in_words:
             self._progress = job.progress()
         self._jobs = {0: LiveJob(job)}
         self._state = "starting: workers, each with its own Python"
@@ -144,7 +144,7 @@ class LivePage(RunPage):
         if rate := self._pace.rate(progress.seconds, counts[0]):
             each, rate = ("min", 60 * rate) if unit and rate < 1 else ("s", rate)
             self._rate = f"{in_words(rate)}{unit}/{each}"
-            self._left = self._pace.left(progress.seconds, *counts)
+            self._left = self._pace.time_left(progress.seconds, *counts)
         over = 0 < progress.jobs == progress.jobs_done
         if now >= self._list_at or over:
             self._list_at = now + LIST_EVERY_S

@@ -125,7 +125,7 @@ class DataSetOutput(Output[CampaignRun]):
         for row in self._rows:
             run.page.ended(row)
         notes = tuple(run.warn_of_empty_jobs(self._rows))
-        sums = CampaignRun.of(self._rows, time.monotonic() - run.started, notes=notes)
+        sums = CampaignRun.from_rows(self._rows, time.monotonic() - run.started, notes=notes)
         run.page.finish(sums.seconds)
         return sums
 
@@ -141,10 +141,12 @@ class DataSetOutput(Output[CampaignRun]):
         elif run.resume:
             store.notes += [self._lost_record] * bool(self._lost_record)
             self._take_over(store)
-        dataset_files(out, begun=store.begun or bool(store.kept))  # some were perhaps taken over
+        dataset_files(
+            out, begun=store.begun or bool(store.committed_in_words)
+        )  # some were perhaps taken over
         if self._made is None:
             _, self._wrong = _look(self.dataset, store.rows(), options.verify, self.campaign)
-        if not store.kept:
+        if not store.committed_in_words:
             self.campaign.check_files()
         retried = store.db.failed() if options.retry_failed else ()
         store.forget([*self._wrong, *retried])
@@ -178,7 +180,9 @@ class DataSetOutput(Output[CampaignRun]):
         warnings = run.warn_of_empty_jobs(store.rows())
         if self.campaign.shard == ALL:  # else the merged data set has this note
             more["notes"] = (*more["notes"], *warnings)
-        sums = CampaignRun.of(store.rows(), seconds, store.resumed, sensors=store.sensors, **more)
+        sums = CampaignRun.from_rows(
+            store.rows(), seconds, store.resumed, sensors=store.sensors, **more
+        )
         record: dict[str, Any] = {"identity": dict(store.identity), "casting": store.casting}
         record |= {"backend": store.backend, "sensors": sums.sensors}
         record |= {"files": file_hashes(self.campaign.files), "campaign": self.campaign.described}
@@ -187,7 +191,7 @@ class DataSetOutput(Output[CampaignRun]):
         replace(self.dataset, made_with=store.made_with).write_failed(store.rows())
         sums, _ = write_shared(self.dataset, record, sums, store.rows)
         if sums.failed:
-            store.save(now=True)
+            store.save(force=True)
             store.db.close()
         else:
             store.remove()

@@ -313,7 +313,7 @@ def _merge_dataset(
             screen.warn(notes[-1])
         record["notes"] = notes
         more = {"sensors": sensors, "notes": tuple(notes)}
-        run = CampaignRun.of(_merged(files), 0.0, 0, **more)
+        run = CampaignRun.from_rows(_merged(files), 0.0, 0, **more)
         report = write_shared(dataset, record, run, lambda: _merged(files))[1]
     if own:  # a run with failed jobs, which would go on with what it knows of them
         remove_run(out.below(RUN_FOLDER))
@@ -458,7 +458,7 @@ class _Merged(SurveyOutput):
         """Take all points into the run's store; LidarError names damaged files."""
         store = run.store
         damaged = list[str]()
-        only = store.only
+        only = store.only_job
         mark = store.db.meta["mark"]
         assert only is not None, "of a survey"
 

@@ -71,7 +71,7 @@ class SurveyOutput(Output[tuple[RunResult, dict[str, Any]]]):
 
     def begin(self, run: Run[tuple[RunResult, dict[str, Any]]]) -> None:
         """Refuse the result of another survey."""
-        if not run.goes_on:
+        if not run.continues_run:
             self.refuse(lambda: run.jobs.identity, overwrite=run.options.overwrite)
 
     def refuse(self, identity: Callable[[], Mapping[str, str]], *, overwrite: bool = False) -> None:

@@ -371,7 +371,7 @@ def _pickled(value: object) -> bytes:
 
 
 def share(partition: Partition, value: Any, **options: Any) -> Future:
-    """Submit a task that returns `value` for other tasks; Dask repeats the task if a worker dies."""
+    """Submit a task that returns `value` for other tasks; Dask repeats it if a worker dies."""
     with warnings.catch_warnings():
         # A large value makes a large graph, which is the only way to have it recomputed.
         warnings.filterwarnings("ignore", message="Sending large graph")

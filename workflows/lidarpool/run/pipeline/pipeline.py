@@ -170,7 +170,7 @@ class Pipeline:
         self._look()
 
     def step(self) -> bool:
-        """Process messages, workers and batches once; return True if anything changed.
+        """Process messages, workers and batches once; return True if there were changes.
 
         LidarError if a failure concerns all jobs.
         """
