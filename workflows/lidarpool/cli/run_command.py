@@ -183,7 +183,7 @@ def run_job(
         known = [row.sha256 for row in rows if row.number == number and row.done]
         if not known:
             return ""
-        if Tally.of(result.points).sha256 not in known:
+        if Tally.from_cloud(result.points).sha256 not in known:
             raise LidarError(
                 f"job {name} has other points than those in {place}: files that it is "
                 "made of have changed, such as images of a mesh."

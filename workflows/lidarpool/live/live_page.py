@@ -116,8 +116,8 @@ class LivePage(RunPage):
     def follow(self, partitions: Mapping[str, Partition], dataset: DataSet | None = None) -> None:
         """Show the jobs under way, the busy slots of partitions, and jobs that were written."""
         self._partitions = partitions
-        if dataset is not None and dataset.format == "folder" and dataset.place.is_local:
-            self._written = dataset.place
+        if dataset is not None and dataset.format == "folder" and dataset.storage.is_local:
+            self._written = dataset.storage
         self._state = "starting: workers read the scene and make their trees"
 
     def on_parts(self, receipts: Sequence[Receipt]) -> None:

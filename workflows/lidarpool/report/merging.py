@@ -23,7 +23,7 @@ from ..base.fingerprint import fingerprint
 from ..base.shard import ALL, Shard
 from ..base.software import software
 from ..columns.parts import part_name
-from ..datasets.dataset import INDEX_FILE, DataSet, ahead, manifest_file
+from ..datasets.dataset import INDEX_FILE, DataSet, manifest_file, read_ahead
 from ..datasets.job_table import TABLE_FILE, JobRow, read_table
 from ..datasets.loader import read_index
 from ..export.folder import LAST_FILE, output_place, result_folder
@@ -85,7 +85,7 @@ class _Part:
         found |= {f"the file {name}": digest for name, digest in record["files"]}
         if record["casting"]:  # else it has cast nothing
             found |= {f"{name} of workers": value for name, value in record["casting"].items()}
-        return found | ({"the number of shards": self.shards[0].of} if self.shards else {})
+        return found | ({"the number of shards": self.shards[0].total} if self.shards else {})
 
 
 @checked
@@ -265,7 +265,7 @@ def _check(parts: Sequence[_Part], partial: bool, own: _Part | None = None) -> l
 
 def _missing(parts: Sequence[_Part]) -> list[Shard]:
     """List the shards that are not there, or lack jobs by which the campaign has grown."""
-    of = parts[-1].shards[0].of
+    of = parts[-1].shards[0].total
     parts = sorted(parts, key=lambda part: part.whole)
     have = {shard.number: len(part.done(shard)) for part in parts for shard in part.shards}
     have.setdefault(1, -1)  # which plans the path, even if it has no scans
@@ -279,7 +279,7 @@ def _merge_dataset(
     """Take the jobs of all parts into a data set, and write what all jobs share."""
     begun = CAMPAIGN_FILE in out.sizes()
     dataset_files(out, begun=begun)
-    own = _of_dataset(out, of=parts[0].shards[0].of) if begun else None
+    own = _of_dataset(out, of=parts[0].shards[0].total) if begun else None
     known = [own, *parts] if own else parts
     notes = _check(known, partial, own)
     sensors = dict[str, str]()
@@ -361,7 +361,7 @@ class _RowFile:
             with self._path.open("rb") as file:
                 for _, offset in sorted(self._offsets.items()):
                     file.seek(offset)
-                    yield JobRow.of(json.loads(file.readline()))
+                    yield JobRow.from_json(json.loads(file.readline()))
 
 
 def _taken(part: _Part, dataset: DataSet, damaged: list[str]) -> Iterator[JobRow]:
@@ -480,7 +480,7 @@ class _Merged(SurveyOutput):
                 store.db.add_trials(only, part.trials)
             source = parts_of(part.place.below(RUN_FOLDER), part.record["parts"])
             left = (one for one in part.points if only.parts.missing(one.first, one.stop))
-            for one, receipt in ahead(partial(take, source), left):
+            for one, receipt in read_ahead(partial(take, source), left):
                 if receipt is None or not store.db.commit([(only, receipt)]):
                     damaged.append(source.path(one.name))
         if damaged:

@@ -187,7 +187,7 @@ class SurveyOutput(Output[tuple[RunResult, dict[str, Any]]]):
                 file = one.row.file
                 if storage and workers and one.row.in_pieces:
                     clear()
-                    one.put(storage, points(file), sweeps, workers)
+                    one.write_to_storage(storage, points(file), sweeps, workers)
                 else:
                     there = None if storage else workers
                     one.write(staged / file, points(file), sweeps, workers=there)

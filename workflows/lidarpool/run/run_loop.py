@@ -271,7 +271,7 @@ class RunLoop:
         self.stages = tuple(totals for book in books for totals in book.stages.values())
         self._store.notes += pipeline.notes
         if self._writer is not None and self._writer.hidden:
-            storage = self._writer.dataset.place
+            storage = self._writer.dataset.storage
             note = f"no worker of {LIDAR} sees {storage}: the driver wrote the data set"
             self._store.notes.append(note)
 

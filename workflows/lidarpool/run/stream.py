@@ -151,10 +151,10 @@ class StreamedJob(PipelineJob):
         columns = {column.name: np.array(in_sensor[column.name]) for column in table}
         if self.data_format == "kitti":  # as in files of this format
             columns["intensity"] = intensity_of(cloud)
-        boxes = Boxes.of(sweeps, number, cloud) if sweeps.actors else None
+        boxes = Boxes.from_points(sweeps, number, cloud) if sweeps.actors else None
         boxes = boxes and boxes.inward(sweeps.pose, number)
         row = JobRow(job.number, job.name, job.split, job.values)
-        return Sweep.of(row, sweeps, number, (positions, columns), boxes)
+        return Sweep.from_points(row, sweeps, number, (positions, columns), boxes)
 
 
 class _Casting:
@@ -287,7 +287,7 @@ class _Casting:
         orders = self._orders
         self._orders = []
         for order in orders:
-            results = fetch_available(self._client, [order.key], at=order.worker)
+            results = fetch_available(self._client, [order.key], holder=order.worker)
             if order.key not in results:
                 self._dispatcher.recast_columns(ColumnsLost(order.key))
                 continue

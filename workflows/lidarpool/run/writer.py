@@ -69,7 +69,7 @@ def write_jobs(
 
 def _write_job(dataset: DataSet, job: JobFiles) -> JobOutcome:
     """Write a job; return its row, or a JobError, or a LidarError if the storage is the cause."""
-    listing = Listing.of(dataset.place)
+    listing = Listing.from_storage(dataset.storage)
     try:
         return dataset.write_job(*job, listing=listing)
     except Exception as error:
@@ -98,7 +98,7 @@ class JobWriter:
         parts_probe: tuple[str, bytes],
     ) -> None:
         self.tasks = tasks
-        storage = dataset.place
+        storage = dataset.storage
         mark = store.db.meta["mark"]
         self.dataset = replace(dataset, made_with=store.made_with)
         # The name of a temporary file: later writers remove the file of a killed run.
@@ -241,7 +241,7 @@ class LidarWorkers:
                     span = waiting.popleft()
                     self._tasks.submit(span, _write_range, shared.key, span)
                 for future in (shared, *running):
-                    raise_if_failed(future, f"Writing {writer.place}")
+                    raise_if_failed(future, f"Writing {writer.storage}")
                 finished = self._tasks.take_done()
                 written |= {
                     span: written_range
@@ -252,7 +252,7 @@ class LidarWorkers:
                 if not finished:
                     time.sleep(LOOK_EVERY_S)
         except OSError as error:
-            raise LidarError(f"The cluster was lost while it wrote {writer.place}.") from error
+            raise LidarError(f"The cluster was lost while it wrote {writer.storage}.") from error
         finally:
             if running:
                 writer.stop()

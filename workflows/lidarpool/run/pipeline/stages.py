@@ -208,7 +208,7 @@ def _write_parts(
     start: StageStart, storage: Storage | None, order: CollectOrder, client: Client
 ) -> Iterator[Receipt | ColumnsLost | Failed]:
     """Write the parts of a casting task, and yield the messages to the driver."""
-    results = fetch_available(client, [order.key], FETCH_PATIENCE_S, at=order.worker)
+    results = fetch_available(client, [order.key], FETCH_PATIENCE_S, holder=order.worker)
     if order.key not in results:
         yield ColumnsLost(order.key)
         return

@@ -22,7 +22,7 @@ import numpy as np
 from lidarsim.base.errors import LidarError
 
 from ...columns.parts import part_name
-from ...datasets.job_table import JOBS_MOST
+from ...datasets.job_table import MAX_JOBS
 from ...plan import Trial
 from ..pipeline.committed_job import CommittedJob
 from ..pipeline.messages import Receipt
@@ -312,7 +312,7 @@ class RunDatabase:
             self._sql.executemany(f"DELETE FROM {table} WHERE job = ?", parameters)
 
     def _mark_ended(self, number: int, ended: bool = True) -> None:
-        if not 0 <= number < JOBS_MOST:
+        if not 0 <= number < MAX_JOBS:
             raise ValueError(f"{number} is not the number of a job")
         if number >= len(self._ended):
             self._ended.extend(bytes(number + 1 - len(self._ended)))

@@ -331,7 +331,7 @@ class RunStore:
     def rows(self) -> Iterator[JobRow]:
         """Yield the rows of the jobs that have ended, by number."""
         for row in self.db.job_rows():
-            yield JobRow.of(row)
+            yield JobRow.from_json(row)
 
     @property
     def sensors(self) -> dict[str, str]:
