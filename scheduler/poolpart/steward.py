@@ -150,7 +150,7 @@ class Steward(SchedulerPlugin):
             self.put(seat, name, seat.original[name])
 
     def resize(self, name: str | None, change: int) -> None:
-        """Change the number of workers in a rule `n_workers`; do nothing for further kinds of rules."""
+        """Change the number of workers in a rule `n_workers`; or do nothing for further rules."""
         if name in self.rules and isinstance(rule := self.rules[name], n_workers):
             workers = rule.workers + change
             self.rules[name] = replace(rule, workers=workers, minimum=min(rule.minimum, workers))
