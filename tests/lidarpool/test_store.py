@@ -419,7 +419,7 @@ def test_a_survey_and_a_campaign_do_not_take_each_others_folder(left, folder, un
     remove_run(folder)
     store, job = campaign(folder)
     if left == "a job under way":
-        store.take_on(job)
+        store.open_job(job)
         add(store, 0, 2, job)
     else:
         store.end([JobRow(0, "0000")])
@@ -434,14 +434,14 @@ def test_a_survey_and_a_campaign_do_not_take_each_others_folder(left, folder, un
 @pytest.mark.parametrize("change", ["none", "another height", "of unknown content"])
 def test_a_job_under_way_is_gone_on_with_if_its_content_is_the_same(change, folder):
     store, job = campaign(folder)
-    store.take_on(job)
+    store.open_job(job)
     add(store, 0, 2, job)
     if change != "of unknown content":
         store.save()
     store.db.close()
     again, job = campaign(folder, height=2.0 if change == "another height" else 1.0, resume=True)
     same = change == "none"
-    assert again.take_on(job).resumed == (2 if same else 0)
+    assert again.open_job(job).resumed == (2 if same else 0)
     assert any(name.endswith(".npz") for name in again.storage.sizes()) == same
 
 
@@ -455,7 +455,7 @@ def test_a_lost_database_is_made_again_though_drivers_end_meanwhile(folder):
         assert store.begun and not store.committed_in_words  # nothing is taken over yet
         if end != "alive":
             store.close() if end == "interrupted" else store.db.close()
-    store.take_on(job)
+    store.open_job(job)
     add(store, 0, 2, job)
     store.close()
     store, _ = campaign(folder, resume=True)

@@ -106,7 +106,7 @@ def _files_of(package: str) -> Iterator[tuple[str, Path]]:
             yield f"{package}/{name}", files[name]
 
 
-def software_there(
+def software_query(
     backend: str = "", plugins: Sequence[Plugin] = ()
 ) -> Callable[[], dict[str, str]]:
     """Return a function that describes a worker's software.
@@ -141,7 +141,7 @@ def plugin_versions(plugins: Iterable[Plugin]) -> dict[Plugin, str]:
     return {plugin: _version_of(plugin) for plugin in plugins}
 
 
-def call_alike(required: str, function: Callable[..., T], *arguments: Any) -> T:
+def call_with_same_sources(required: str, function: Callable[..., T], *arguments: Any) -> T:
     """Call a function in a task, if its worker has the sources of the run.
 
     `required` is ``lidarpool`` in the `software` of the run's driver. LidarError for different

@@ -7,7 +7,7 @@ from contextlib import suppress
 from typing import Any, TextIO
 
 
-class Unheard:
+class TolerantStream:
     """A stream whose writes succeed after its reader has gone, so that a run goes on.
 
     `reader_gone` is the kind of error of such writes. Each write is flushed; other errors are

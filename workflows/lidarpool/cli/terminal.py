@@ -16,8 +16,8 @@ from rich.console import Console
 
 from lidarsim.base.writing_progress import WritingProgress
 
-from ..base.streams import Unheard
-from ..run.progress import Pace, Progress, Screen, Show, bars, progress_rows, standing_still
+from ..base.streams import TolerantStream
+from ..run.progress import Pace, Progress, Screen, Show, bars, progress_rows, waiting_reason
 from .shared_options import WARNED, set_logs
 
 # Plain lines come after another tenth of the elapsed time, within these bounds, so that a survey
@@ -37,7 +37,7 @@ class Terminal(Screen):
     @property
     def _stream(self) -> Any:
         """Stream for what is told; None to tell nothing."""
-        return None if self.quiet or sys.stderr is None else Unheard(sys.stderr)
+        return None if self.quiet or sys.stderr is None else TolerantStream(sys.stderr)
 
     @property
     def _console(self) -> Console | None:
@@ -142,7 +142,7 @@ class PlainLines:
     def __call__(self, progress: Progress) -> None:
         """Write a line, if it is time or something has been completed."""
         now = progress.seconds
-        if (standing := standing_still(progress)) != self._standing:
+        if (standing := waiting_reason(progress)) != self._standing:
             self._standing = standing
             jobs = f"{progress.jobs_done:,} jobs" if progress.jobs else ""
             ready = jobs or f"{progress.collected:,} scans"

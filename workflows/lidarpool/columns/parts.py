@@ -65,7 +65,7 @@ def mark_name(mark: str) -> str:
     return f"{mark}-mark"
 
 
-def own_files(storage: Storage, mark: str | None) -> list[str]:
+def deletable_files(storage: Storage, mark: str | None) -> list[str]:
     """Return the names of the files that a run may delete, including files of killed writers.
 
     `mark` is the mark of the run; None for each mark that the folder has. Without the mark in the

@@ -49,7 +49,7 @@ from ..plan import best
 from ..report.charts import draw_results, draw_varied
 from ..report.picture_content import planning_picture
 from ..run.pipeline.messages import Receipt, ScanFrame
-from ..run.progress import STAGES, Pace, Progress, in_words, standing_still, time_in_words
+from ..run.progress import STAGES, Pace, Progress, in_words, time_in_words, waiting_reason
 from ..run.run_page import RunPage
 from ..run.run_result import RunResult
 from ..run.store.job_under_way import JobUnderWay
@@ -260,7 +260,7 @@ class LivePage(RunPage):
             if self.stopped.is_set():
                 state = "stopping"
             elif progress is not None:
-                state = standing_still(progress) or state
+                state = waiting_reason(progress) or state
         return dict(self._sums) | {
             "title": self._title,
             "names": list(self._names),

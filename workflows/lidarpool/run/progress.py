@@ -90,7 +90,7 @@ class Pace:
         return f"{in_words(rate)}/s{f'  {time_left} left' if time_left else ''}" if rate else ""
 
 
-def standing_still(progress: Progress) -> str:
+def waiting_reason(progress: Progress) -> str:
     """Return why the run waits; empty if the run does not wait."""
     slots = progress.waits_for
     return f"waits for slots of {slots}, which other runs hold" if slots else ""
@@ -130,7 +130,7 @@ def bars(console: Console) -> Iterator[Show]:
                 if total:
                     pace = paces[label].text(progress.seconds, count, total)
                     if total_name == "scans" and count < total:
-                        pace = standing_still(progress) or pace
+                        pace = waiting_reason(progress) or pace
                     move(label, count, total, total_name, pace)
 
         yield show

@@ -154,7 +154,7 @@ class RunLoop:
 
     def _begin(self, job: Job) -> None:
         """Begin a job, unless its scans are too large for the workers."""
-        under_way = self._store.take_on(job)
+        under_way = self._store.open_job(job)
         try:
             if self._writer is not None:  # the only job of a run was checked at the start
                 self._cluster.check(job)

@@ -20,7 +20,7 @@ from poolpart.task_locations import look_for_tasks
 from poolpart.workers import ask_workers, worker_identities
 from raybeam import available_backends
 
-from ...base.software import difference, software, software_there
+from ...base.software import difference, software, software_query
 from ...export.formats import Format
 from ...scenario.build import Job
 from ...scenario.sections import TaskOptions
@@ -187,7 +187,7 @@ def _check_versions(client: Client, workers: Sequence[str]) -> None:
                 "install the same one on both sides."
             )
     driver_sources = software()["lidarpool"]
-    for address, answer in _answers(client, software_there(), workers).items():
+    for address, answer in _answers(client, software_query(), workers).items():
         if not answer:
             raise LidarError(
                 f"The worker at {address} does not have lidarpool: install lidarpool "
@@ -217,7 +217,7 @@ def check_formats(client: Client, pool: Pool, formats: Iterable[Format]) -> None
     ]
     required = software(plugins=plugins)
     writing = [worker.address for worker in pool if worker.resources.get(LIDAR)]
-    for address, answer in _answers(client, software_there(plugins=plugins), writing).items():
+    for address, answer in _answers(client, software_query(plugins=plugins), writing).items():
         if differs := difference(answer, required):
             raise LidarError(
                 f"The worker at {address} has {differs}: install the same on both sides, and start "
@@ -242,7 +242,7 @@ def common_software(
     Workers with different software are refused when they are prepared. LidarError if no worker has
     the `earlier` software.
     """
-    answers = _answers(client, software_there(backend), [worker.address for worker in workers])
+    answers = _answers(client, software_query(backend), [worker.address for worker in workers])
     if earlier and dict(earlier) not in answers.values():
         address, installed = next(iter(answers.items()))
         raise LidarError(

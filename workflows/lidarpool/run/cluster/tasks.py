@@ -12,7 +12,7 @@ from poolpart import Partition
 from poolpart.fetch import fetch_available
 from poolpart.task_locations import TaskLocations, look_for_tasks
 
-from ...base.software import call_alike, call_with_plugins
+from ...base.software import call_with_plugins, call_with_same_sources
 from ..pipeline.task_book import TaskBook
 
 T = TypeVar("T")
@@ -38,7 +38,9 @@ class Tasks(Generic[T]):
     ) -> None:
         """Submit a task with its purpose; `options` as of `Partition.submit`."""
         call = (call_with_plugins, self.plugins, function) if self.plugins else (function,)
-        future = self.partition.submit(call_alike, self._sources, *call, *arguments, **options)
+        future = self.partition.submit(
+            call_with_same_sources, self._sources, *call, *arguments, **options
+        )
         self.running[future] = purpose
 
     def take_done(self) -> list[tuple[T, Any]]:

@@ -21,7 +21,7 @@ from poolpart.fetch import fetch_available
 from poolpart.task_locations import TaskLocations, look_for_tasks
 from poolpart.workers import worker_identities
 
-from ...base.software import difference, software_there
+from ...base.software import difference, software_query
 from .batches import Outcome
 from .failures import JobError, error_of, memory_clause, raise_if_failed, was_killed
 from .messages import BatchRange
@@ -140,7 +140,7 @@ class CastingWorkers:
             self._scenes[key] = static_scene  # the last used
             plan = static_scene.name, scene.actors, packed, self._backend
             self._jobs[job] = self._payload(str(job), lambda: _pickled(plan)), static_scene
-        except _UNSENT as error:  # of pickling what a user has defined
+        except _UNSENT as error:  # raised by pickling classes of the user
             raise JobError(f"The survey cannot be sent to the workers: {error}") from error
         return packed, static_scene.name
 
@@ -269,7 +269,7 @@ class CastingWorkers:
         for address in sorted(self.locations.free.keys() - known_workers - self._refused.keys()):
             self._name_count += 1
             self._setups[address] = self._partition.submit(
-                software_there(self._backend),
+                software_query(self._backend),
                 key=f"check-{self.run}-{self._name_count}",
                 priority=10,
                 workers=address,

@@ -123,7 +123,9 @@ class Dispatcher:
             advice = policies.scans_per_batch(
                 self._recent_casts, job.scans_per_task, job.scans_of_run, slots
             )
-            if abs(advice - self.advice) > MIN_ADVICE_CHANGE * self.advice:  # it is a request
+            if (
+                abs(advice - self.advice) > MIN_ADVICE_CHANGE * self.advice
+            ):  # advice costs a request
                 self.advice = advice
                 self._stages.advise(advice)
 

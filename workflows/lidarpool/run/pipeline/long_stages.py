@@ -30,7 +30,7 @@ from poolpart.fetch import fetch_available, take_held
 from poolpart.pipe import forget_pipes, take_news
 from poolpart.task_locations import TaskLocations, look_for_tasks
 
-from ...base.software import call_alike
+from ...base.software import call_with_same_sources
 from ...columns.parts import probe_name
 from .failures import memory_clause, raise_if_failed, storing, was_killed
 from .messages import CollectOrder, Description, Message, Receipt, StageStart, Summaries
@@ -348,7 +348,7 @@ class LongStages:
             COLLECT: (collect, start, self._storage, self.probe, inlet, self._news),
         }
         future = self.partition.submit(
-            call_alike,
+            call_with_same_sources,
             self._sources,
             *work[start.stage],
             key=f"{name}-{self.run}-{number}",

@@ -21,7 +21,7 @@ from lidarsim.simulator.scene_caster import AUTO_TAKES
 from ...base.fingerprint import fingerprint
 from ...base.shard import shard_in_words
 from ...base.software import software
-from ...columns.parts import mark_name, own_files, scans_of
+from ...columns.parts import deletable_files, mark_name, scans_of
 from ...datasets.job_table import JobRow
 from ...scenario.build import Job
 from ..job_source import CONTENT, Jobs, identity_of
@@ -340,7 +340,7 @@ class RunStore:
 
     # -- jobs --------------------------------------------------------------------------------
 
-    def take_on(self, job: Job) -> JobUnderWay:
+    def open_job(self, job: Job) -> JobUnderWay:
         """Return a job under way; parts of an earlier run are checked first."""
         if job.number in self.under_way:
             return self.under_way[job.number]
@@ -418,7 +418,9 @@ class RunStore:
         part_names = [part.name for job in self.under_way.values() for part in job.parts.ordered]
         needed_names = {mark_name(mark), *part_names}
         with suppress(OSError, LidarError):
-            self.storage.remove([n for n in own_files(self.storage, mark) if n not in needed_names])
+            self.storage.remove(
+                [n for n in deletable_files(self.storage, mark) if n not in needed_names]
+            )
 
     def remove(self) -> None:
         """Remove the store after the result is in place, but not files of other runs."""
@@ -528,6 +530,6 @@ def _remove(location: Storage, parts: Storage, mark: str | None) -> None:
     parts counts.
     """
     with explained(f"The run in {location} cannot be removed"):
-        names = own_files(parts, mark)  # an error if they are behind a link
+        names = deletable_files(parts, mark)  # an error if they are behind a link
         parts.remove(names, folder=True)
         location.remove([FILE, f"{FILE}-journal", OWNER], folder=True)
