@@ -15,7 +15,7 @@ def main() -> NoReturn:
     from .cli.commands import main as command
 
     if sys.stdout is not None:  # `lidarpool run … | head -3` runs to its end
-        sys.stdout = cast(TextIO, Unheard(sys.stdout, BrokenPipeError))
+        sys.stdout = cast(TextIO, TolerantStream(sys.stdout, BrokenPipeError))
     command()
 
 
